@@ -114,7 +114,7 @@ class Pool:
             self._progress.message("other generators make the rest; waiting for them")
 
     def _publish(self) -> bool:
-        shard = self._writer.publish_next()
+        shard = self._writer.publish_next(wait=False)  # more episodes are staged while it is packed
         if shard is not None:
             self._progress.shard(shard.name, len(shard.episodes), self._writer.manifest.revision)
         return shard is not None

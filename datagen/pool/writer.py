@@ -196,24 +196,27 @@ class DatasetWriter:
         """Whether shards are being packed, for `publish_next` to publish."""
         return bool(self._packing)
 
-    def publish_next(self) -> ShardEntry | None:
-        """Publishes one claimed shard whose episodes are all staged; None when there is no such shard, or while they
-        are being packed: more episodes can be staged meanwhile.
+    def publish_next(self, wait: bool = True) -> ShardEntry | None:
+        """Publishes one claimed shard whose episodes are all staged; None when there is no such shard, or, unless it
+        is to `wait`, while they are being packed.
 
         Raises: OSError (a full disk): nothing half-written is left and what was published stays untouched.
         """
         ready = [
             shard for shard in self._claimed if all((shard.split, index) in self._staged for index in shard.indices)
         ]
+        if not ready:
+            return None
         # two rounds, so that no packer waits while this thread lists what is packed
-        for shard in ready[: 2 * PACKED_AT_ONCE]:
+        for shard in ready[: 2 * PACKED_AT_ONCE] if len(ready) > 1 or not wait else []:
             if shard not in self._packing:
                 self._packing[shard] = self._packers.submit(self._pack, shard)
-        packed = next((shard for shard in ready if shard in self._packing and self._packing[shard].done()), None)
-        if packed is None:
-            return None
-        entry = self._publish(packed)
-        self._forget(packed)
+        if not wait:
+            ready = [shard for shard in ready if shard in self._packing and self._packing[shard].done()]
+            if not ready:
+                return None
+        entry = self._publish(ready[0])
+        self._forget(ready[0])
         return entry
 
     def _pack(self, shard: ShardRange) -> _Packed:
@@ -227,13 +230,15 @@ class DatasetWriter:
             return stack.pop_all(), temporary, entry
 
     def _publish(self, shard: ShardRange) -> ShardEntry:
-        target, packing = self.folder / shard.name, self._packing.pop(shard)
-        winner = self._winner(shard)
-        if winner is not None and packing.exception() is not None:  # it has removed what was to be packed
+        packing = self._packing.pop(shard, None)
+        if winner := self._winner(shard):
+            if packing is not None:
+                packing.result()[0].close()
             return winner
-        stack, temporary, entry = packing.result()
+        target = self.folder / shard.name
+        stack, temporary, entry = self._pack(shard) if packing is None else packing.result()
         with stack, self._locks.manifest():
-            if winner := winner or self._winner(shard):
+            if winner := self._winner(shard):
                 return winner
             if not _link(temporary, target):
                 entry = inspect_shard(target, shard, self.config)

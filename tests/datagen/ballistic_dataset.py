@@ -1,7 +1,5 @@
 """Whole data sets of the ballistic stand-in, made in this process."""
 
-import time
-
 import ballistic_solver
 
 from datagen.pool.shard import stage_episode
@@ -22,19 +20,12 @@ def stage(writer, split, index):
     writer.add_staged(split, index)
 
 
-def publish(writer):
-    """The next shard that is published, once it is packed; none where the episodes of none are all staged."""
-    while (entry := writer.publish_next()) is None and writer.packing:
-        time.sleep(0.001)
-    return entry
-
-
 def make_dataset(config):
     """Makes a whole data set, or what is missing of it, without any worker process."""
     with DatasetWriter(config) as writer:
         while writer.claim_next():
             for split, index in writer.remaining():
                 stage(writer, split, index)
-            publish(writer)
+            writer.publish_next()
         assert writer.complete
     return writer.folder

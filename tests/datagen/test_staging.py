@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from ballistic_dataset import publish
 from written_files import claim_all, hashes, simulated_once, snapshot
 
 import datagen.pool.shard
@@ -89,7 +88,7 @@ def test_asking_for_less_ends_an_unfinished_dataset(make_config, stage):
     """A folder begun for five episodes and asked for one is complete when that one is there."""
     with DatasetWriter(make_config()) as writer:
         stage(writer, "train", 0)
-        publish(writer)
+        writer.publish_next()
     with DatasetWriter(make_config(training_scenes=1, validation_scenes=0, test_scenes=0)) as writer:
         assert writer.complete
     assert Manifest.load(writer.folder).complete
@@ -133,14 +132,14 @@ def test_generators_share_a_folder(make_config, small_dataset, stage, control):
             stage(writer, first.split, first.first)
             partial = writer.folder / f".{second.name}.77.partial"
             partial.touch()
-            assert publish(writer)
+            assert writer.publish_next()
             assert claim_all(writer) and other.claim_next() is None and not other.complete
         assert partial.exists() and (other.folder / ".staging").exists()
         other.refresh()
         assert other.done == 1
         for split, index in claim_all(other):
             stage(other, split, index)
-        while publish(other):
+        while other.publish_next():
             pass
         assert other.complete
     assert not partial.exists() and not (other.folder / ".staging").exists()
@@ -156,9 +155,9 @@ def test_first_writer_wins(make_config, stage, monkeypatch):
         assert writer.claim_next() == other.claim_next()
         stage(writer, "train", 0)
         stage(other, "train", 0)
-        assert publish(writer)
+        assert writer.publish_next()
         before = snapshot(writer.folder)
-        assert publish(other) == writer.manifest.shards[0]
+        assert other.publish_next() == writer.manifest.shards[0]
         assert snapshot(writer.folder) == before
     assert messages == ["train-000000-000001.tar was published by another generator; this copy is dropped"]
     assert len(Manifest.load(writer.folder).shards) == 1
@@ -188,7 +187,7 @@ def test_no_clock_is_asked(make_config, make_dataset, small_dataset, stage, seco
                 stage(other, "train", index)
                 (writer.folder / ".staging" / f".train-00000{index}.tar.77.partial").touch()
                 turn_back(writer.folder)
-                publish(other)
+                other.publish_next()
                 turn_back(writer.folder)
             store = store or EpisodeStore(writer.folder, "train")
             store.refresh()
@@ -229,7 +228,7 @@ def test_staged_file_that_changes_later_is_not_published(make_config, stage):
         content[1000] ^= 1
         staged.write_bytes(content)
         with pytest.raises(ConfigError, match=r"train-000000\.tar must end with the sha256"):
-            publish(writer)
+            writer.publish_next()
     assert not list(writer.folder.glob("*.tar"))
 
 
@@ -250,7 +249,7 @@ def test_what_is_staged_is_on_the_disk(make_config, stage, monkeypatch):
     monkeypatch.setattr(Path, "replace", replace)
     with DatasetWriter(make_config()) as writer:
         stage(writer, "train", 0)
-        assert publish(writer)
+        assert writer.publish_next()
 
 
 def test_locks_that_exclude_nobody(make_config, monkeypatch):
@@ -269,7 +268,7 @@ def test_quarantined_seed_is_replaced(make_config, stage):
     with DatasetWriter(config) as writer:
         assert writer.task("train", 0) == replacement
         stage(writer, "train", 0)
-        publish(writer)
+        writer.publish_next()
     manifest = Manifest.load(writer.folder)
     (failure,) = manifest.quarantined
     first_seed = scene_seed(0, "train", 0, attempt=0)

@@ -11,7 +11,6 @@ from threading import Event, Lock, current_thread
 import numpy as np
 import pytest
 import webdataset
-from ballistic_dataset import publish
 from written_files import claim_all, hashes
 
 from datagen.pool.writer import DatasetWriter
@@ -164,13 +163,13 @@ def test_full_disk_leaves_nothing_half_written(make_config, make_dataset, stage,
     """A full disk at any step keeps what was there and leaves no partial file; with space the run goes on."""
     with DatasetWriter(make_config()) as writer:
         stage(writer, "train", 0)
-        publish(writer)
+        writer.publish_next()
         before = hashes(writer.folder)
     with pytest.raises(OSError, match=r"No space left on device: .*data"), DatasetWriter(make_config()) as writer:
         full_disk(after)
         for index in (1, 2, 3):
             stage(writer, "train", index)
-            publish(writer)
+            writer.publish_next()
     assert before.items() <= hashes(writer.folder).items()
     assert not list(writer.folder.rglob("*.partial"))
     assert len(Manifest.load(writer.folder).shards) in (1, 2)
@@ -199,7 +198,7 @@ def test_packing_is_not_waited_for(make_config, stage, monkeypatch):
         monkeypatch.setattr(writer, "_pack", pack)
         published: list[str] = []
         while len(published) < len(shards):
-            entry = writer.publish_next()
+            entry = writer.publish_next(wait=False)
             published += [entry.name] if entry else []
             if len(published) == len(shards) - 1:
                 assert shards[0].name not in published and writer.packing and not writer.complete
@@ -218,7 +217,7 @@ def test_shards_that_wait_are_packed_together(make_config, small_dataset, stage,
         monkeypatch.setattr(
             writer, "_pack", lambda shard, pack=writer._pack: (packed_by.append(current_thread()), pack(shard))[1]
         )
-        while publish(writer):
+        while writer.publish_next():
             pass
         assert writer.complete and len(set(packed_by)) > 1
     assert hashes(writer.folder) == hashes(small_dataset)
@@ -231,7 +230,7 @@ def test_full_disk_while_several_are_packed(make_config, make_dataset, stage, fu
         for split, index in claim_all(writer):
             stage(writer, split, index)
         full_disk(after)
-        while publish(writer):
+        while writer.publish_next():
             pass
     assert not list(writer.folder.rglob("*.partial"))
     make_dataset(make_config())
