@@ -63,11 +63,13 @@ def simulate(
     """Simulates `scenes` side by side and returns `frames` frames of each, the initial state among them.
 
     The scenes may differ in particles, materials, obstacles and gravity, but share domain and cell size. With
-    an adaptive time step particles and grid exchange velocities every min(dx / transfer_speed_m_s, speed_fraction
-    dx / |v|max), spread evenly over what is left of the frame, and each scene takes its own steps of stress between:
-    at most stability_fraction dx sqrt(rho / (3 lambda_h + 2 mu_h)). A fixed time step, each with its transfer, is
-    taken ceil(frame / step) times a frame in full, as Taichi Elements does: 54 times at 60 Hz and 3.125e-4 s,
-    which is 1.25 % more than the frame. `on_frame(t)` is called when frame t of all scenes is complete, from 0.
+    an adaptive time step particles and grid exchange velocities every dx / transfer_speed_m_s, or every step of stress
+    where that is longer, at most every speed_fraction dx / |v|max, spread evenly over what is left of the frame. Each
+    scene takes its own steps of stress between: at most stability_fraction dx sqrt(rho / (3 lambda_h + 2 mu_h)). A
+    fixed time step, each with its transfer, is taken ceil(frame / step) times a frame in full, as Taichi Elements does:
+    54 times at 60 Hz and 3.125e-4 s, which is 1.25 % more than the frame.
+
+    `on_frame(t)` is called when frame t of all scenes is complete, from 0.
     `cpu_threads` counts from the process's first simulation; see `initialise`. `colliders` are the scenes' own from
     `build_collider`, where they were built before. `team` says who runs a scene; none takes what suits the device and
     the scenes. `stability_fractions` are the scenes' own where they differ from the config's.

@@ -21,6 +21,7 @@ from hgn.export import ExportConfig
 from hgn.runtime.weights import load_weights, shipped_weights
 from hgn.schema import from_mapping
 from tools.error_vs_time.settings import ErrorVsTimeConfig
+from tools.stability.network_cases import StabilityNetworkConfig
 
 JOBS = Path(__file__).resolve().parents[2] / "jobs"
 # the arguments of each call, as a line of JSON; succeeds
@@ -281,8 +282,11 @@ def settings(lines, monkeypatch):
     """What each module of a line is given, by its name."""
     mappings: dict[str, dict[str, Any]] = {}
     for module, *arguments in lines:
+        command = module.rpartition(".")[2]
+        if command == "stability":
+            command += f"_{arguments.pop(0)}"
         monkeypatch.setattr("sys.argv", [module, *arguments])
-        (mappings[module],) = _compose(module.rpartition(".")[2])
+        (mappings[module],) = _compose(command)
     return mappings
 
 
@@ -341,6 +345,28 @@ def test_mechanics(tmp_path, monkeypatch):
     assert (score.weights, score.data) == (export.out, config.dataset.folder)
     assert score.scenes == config.dataset.validation_scenes
     assert load_weights(shipped_weights()[Path(export.out).stem])[1].network == config.network
+
+
+def test_judged(tmp_path, monkeypatch):
+    """jobs/judged.txt trains on both data sets that it makes, judges what it exports by each question, and reports it
+    on fresh scenes that are drawn behind it."""
+    lines = calls(tmp_path, "judged.txt")
+    assert list(lines)[-2:] == ["fresh", "report"]
+    mappings = {name: settings(line, monkeypatch) for name, line in lines.items()}
+    mappings["judged"]["hgn.train"].pop("name")
+    frozen = mappings["fresh"]["datagen"].pop("frozen")
+    made = [datagen_config(mappings[name]["datagen"]) for name in ("rest_data", "motion_data", "fresh")]
+    config = from_mapping(TrainConfig, mappings["judged"]["hgn.train"])
+    weights = from_mapping(ExportConfig, mappings["judged"]["hgn.export"]).out
+    assert dataset_identity(config.datagen) == dataset_identity(made[1])
+    assert config.training.more_data == (made[0].dataset.folder,) and made[0].mpm == made[1].mpm
+    assert frozen == [weights]
+    scored = [from_mapping(EvaluateConfig, mappings[name]["hgn.evaluate"]) for name in ("errors_rest", "errors_motion")]
+    assert [score.data for score in scored] == [made[0].dataset.folder, config.dataset.folder]
+    stability = [from_mapping(StabilityNetworkConfig, mappings[name]["tools.stability"]) for name in ("rest", "flight")]
+    assert {score.weights for score in (*scored, *stability)} == {weights}
+    report = from_mapping(ErrorVsTimeConfig, mappings["report"]["tools.error_vs_time"])
+    assert report.data == made[2].dataset.folder and report.weights is not None and weights in report.weights
 
 
 def test_pushforward(tmp_path, monkeypatch):

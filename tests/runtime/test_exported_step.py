@@ -141,7 +141,7 @@ def exported(folder, name, kind):
     network = network_of(torch.float32, levels=2, message_passing_steps=1, **NETWORKS[name])
     save_weights(folder / "w.safetensors", network, WeightsInfo(network.config, 60.0, 1 / 64))
     path = folder / "new" / ("step.onnx" if kind == "onnx" else "step.pt2")
-    options = {kind: str(path), "scene": SCENE, "arrays": str(path.parent / "arrays"), "device": "cpu"}
+    options = {kind: str(path), "scene": SCENE, "arrays": str(folder / "arrays"), "device": "cpu"}
     assert export.main({"weights": str(folder / "w.safetensors"), **options}) == 0
     return Written(network, path)
 
