@@ -49,6 +49,7 @@ from datagen.mpm.layout import (
     BLOCK_NODES,
     CONSTANT,
     COUNT,
+    MARK,
     SETTING,
     SHAPE,
     STATUS,
@@ -61,6 +62,7 @@ from hgn.scene.material import FLUIDS, SNOW
 
 MANY = 32  # substeps at most of a step of a particle's own
 SLACK = 1e-3  # of a substep, within which times are the same
+SOON = 0.9  # of a substep, within which what a step covers ends for a particle that looks at that end
 SMALLEST_MASS = 1e-10  # of a particle; lighter nodes are at the rounding of the weights
 
 Scalars = ti.types.ndarray(dtype=ti.f32, ndim=1)
@@ -154,6 +156,24 @@ def _corner_block(first, last, n: ti.template(), scene: ti.i32, shape: ti.templa
 
 
 @ti.func
+def mark_blocks(
+    x,
+    scene: ti.i32,
+    what: ti.i32,
+    inverse_dx: ti.f32,
+    shape: ti.template(),
+    block: ti.template(),
+    begin: ti.i32,
+):
+    """Raises the entries from block[begin] on of the blocks of a particle's nodes to `what`."""
+    base = base_node(x, inverse_dx)
+    for n in ti.static(range(8)):
+        index = begin + _corner_block(base >> 2, (base + 2) >> 2, n, scene, shape)
+        if block[index] < what:
+            ti.atomic_max(block[index], what)
+
+
+@ti.func
 def mark_changed(
     x,
     scene: ti.i32,
@@ -165,14 +185,9 @@ def mark_changed(
     begin: ti.i32,
 ):
     """Writes down, from block[begin] on, that the blocks of the particle's nodes change in the substep `now`, and for
-    how many substeps, the fewest of all that change them (see change_of).
+    how many substeps, the fewest of all that change them.
     """
-    base = base_node(x, inverse_dx)
-    change = now * MANY + MANY - ti.cast(many, ti.i32)
-    for n in ti.static(range(8)):
-        index = begin + _corner_block(base >> 2, (base + 2) >> 2, n, scene, shape)
-        if block[index] < change:
-            ti.atomic_max(block[index], change)
+    mark_blocks(x, scene, now * MANY + MANY - ti.cast(many, ti.i32), inverse_dx, shape, block, begin)
 
 
 @ti.func
@@ -209,12 +224,90 @@ def _alike_around(
 
 
 @ti.func
-def change_of(mark: ti.i32, now: ti.i32) -> ti.f32:
-    """For how many substeps a block changes in the substep `now`; 0 where it does not."""
-    many = 0.0
-    if mark // MANY == now:
-        many = ti.cast(MANY - mark % MANY, ti.f32)
-    return many
+def mark_awaited(
+    x,
+    covered: ti.f32,
+    scene: ti.i32,
+    counter: ti.template(),
+    shape: ti.template(),
+    block: ti.template(),
+    marks: ti.i32,
+    scene_value: ti.template(),
+    setting: ti.template(),
+):
+    """Writes down that a particle looks at its blocks at the end of this substep, where what its step covers ends."""
+    soon = scene_value[scene, VALUE.interval_elapsed] + SOON * scene_value[scene, VALUE.whole_step]
+    if waits(scene, scene_value) and covered < soon:
+        now = ti.cast(counter[scene, COUNT.substeps], ti.i32)
+        awaited = marks + MARK.awaited * shape[SHAPE.all_blocks]
+        mark_blocks(x, scene, now, setting[SETTING.inverse_cell_size], shape, block, awaited)
+
+
+@ti.func
+def mark_step(
+    x,
+    until: ti.f32,
+    many: ti.f32,
+    spreads: ti.i32,
+    begins: ti.f32,
+    scene: ti.i32,
+    counter: ti.template(),
+    shape: ti.template(),
+    block: ti.template(),
+    marks: ti.i32,
+    scene_value: ti.template(),
+    setting: ti.template(),
+):
+    """Writes down what a particle's step, as `own_step` gave it, asks of its blocks: see `change_of`."""
+    if waits(scene, scene_value):
+        inverse_dx = setting[SETTING.inverse_cell_size]
+        if not spreads:
+            now = ti.cast(counter[scene, COUNT.substeps], ti.i32)
+            mark_changed(x, scene, now, ti.min(many, MANY), inverse_dx, shape, block, marks)
+        elif begins == 1.0:
+            interval = ti.cast(counter[scene, COUNT.transfers], ti.i32)
+            mark_blocks(x, scene, interval, inverse_dx, shape, block, marks + MARK.mixed * shape[SHAPE.all_blocks])
+        if begins == 0.0:
+            mark_awaited(x, until, scene, counter, shape, block, marks, scene_value, setting)
+
+
+@ti.func
+def change_of(
+    touched: ti.i32,
+    synchronised: ti.f32,
+    begins: ti.f32,
+    ends: ti.i32,
+    now: ti.i32,
+    interval: ti.i32,
+    shape: ti.template(),
+    block: ti.template(),
+    marks: ti.i32,
+):
+    """For how many substeps a block changes in the substep `now`, 0 where it does not; and whether stress acts evenly
+    there. Where it does, the block goes on to the end of a substep when a particle looks at it then, or one that gives
+    impulses has done so.
+    """
+    many = 1.0
+    mixed = 0
+    if synchronised == 1.0:
+        blocks = shape[SHAPE.all_blocks]
+        if block[marks + MARK.mixed * blocks + touched] == interval:
+            mixed = 1
+        if not ends:
+            many = 0.0
+            change = block[marks + touched]
+            if change // MANY == now:
+                many = ti.cast(MANY - change % MANY, ti.f32)
+            if mixed:
+                awaited = block[marks + MARK.awaited * blocks + touched] == now
+                many = 1.0 if begins == 1.0 or many > 0.0 or awaited else 0.0
+    return many, mixed
+
+
+@ti.func
+def waits(scene: ti.i32, scene_value: ti.template()) -> ti.i32:
+    """Whether particles may have steps of their own in this substep: not in an interval's last, which ends all."""
+    return scene_value[scene, VALUE.synchronised] == 1.0 and scene_value[scene, VALUE.interval_remaining] > 0.0
 
 
 @ti.func
@@ -275,7 +368,7 @@ def own_step(
     many = 1.0
     acting = step
     until = elapsed
-    if scene_value[scene, VALUE.synchronised] == 1.0 and left > 0.0:
+    if waits(scene, scene_value):
         whole = scene_value[scene, VALUE.whole_step]
         inverse_dx = setting[SETTING.inverse_cell_size]
         stiffness = foreseen_stiffness(C, volume, material, left + step, inverse_dx, law, row, variant)
@@ -289,7 +382,7 @@ def own_step(
             many = ti.floor(0.5 * total / ti.ceil(total / alike - 1e-3) + 0.501)
             until = begin
             interval = ti.cast(counter[scene, COUNT.transfers], ti.i32)
-            others = marks + shape[SHAPE.all_blocks]
+            others = marks + MARK.alike * shape[SHAPE.all_blocks]
             if not _alike_around(x, scene, interval, alike, inverse_dx, shape, block, others):
                 spreads = 1
         elif steps <= 1.0:
@@ -299,8 +392,6 @@ def own_step(
             many = ti.floor(2.0 * (before + (elapsed + left - before) / steps - begin) / whole + 1e-3)
             many = ti.min(ti.max(many, 1.0), ti.round(left / whole + 0.5))
             until = begin + 0.5 * many * whole
-        now = ti.cast(counter[scene, COUNT.substeps], ti.i32)
-        mark_changed(x, scene, now, 1.0 if spreads else ti.min(many, MANY), inverse_dx, shape, block, marks)
         acting = step + ti.min((many - 1.0) * whole, left)
     acts_until = begin + acting
     length = until - before

@@ -7,7 +7,7 @@ and z of momentum, and mass): together they add up whole sectors of memory.
 import taichi as ti
 
 from datagen.mpm.device_memory import add, load, load4, store4
-from datagen.mpm.layout import BLOCK_NODES, CONSTANT, FIELD, LIVE, SETTING, SHAPE, TAG, VARIANT
+from datagen.mpm.layout import BLOCK_NODES, CONSTANT, FIELD, LISTED, LIVE, SETTING, SHAPE, TAG, VARIANT
 from datagen.mpm.mls_mpm import (
     base_node,
     change_of,
@@ -103,6 +103,15 @@ def _next_acting(p: ti.i32, end: ti.i32, first: ti.i32, begins: ti.f32, covered:
 
 
 @ti.func
+def _section(p: ti.i32, velocities: ti.i32, begins: ti.f32, spread: ti.template()) -> ti.i32:
+    """Where what a particle gives goes to in `node`: to momentum, or to forces that act evenly."""
+    section = 0
+    if begins == 0.0 and spread[p] != 0:
+        section = 2 * velocities
+    return section
+
+
+@ti.func
 def scatter(
     owned: ti.i32,
     part: ti.i32,
@@ -114,10 +123,12 @@ def scatter(
     particles: ti.i32,
     tags: ti.i32,
     stride: ti.i32,
+    velocities: ti.i32,
     begins: ti.f32,
     state: ti.template(),
     tag: ti.template(),
     covered: ti.template(),
+    spread: ti.template(),
     hidden: ti.template(),
     node: ti.template(),
     setting: ti.template(),
@@ -129,8 +140,9 @@ def scatter(
     run: ti.template(),
 ):
     """Adds what each particle that acts gives to its 27 nodes: momentum and mass, in later steps of an interval what
-    forces change in momentum. A thread adds up what `run` particles in their order give, in a window of nodes that goes
-    up a column with them; what it leaves goes to the nodes.
+    forces change in momentum, or, of stress that acts evenly, how the forces themselves change. A thread adds up what
+    `run` particles in their order give, in a window of nodes that goes up a column with them; what it leaves goes to
+    the nodes.
     """
     dx = setting[SETTING.cell_size]
     inverse_dx = setting[SETTING.inverse_cell_size]
@@ -148,9 +160,11 @@ def scatter(
         gain = ti.Vector([0.0 for _ in range(27)])
         base = ti.Vector([0, 0, 0])
         x = ti.Vector([0.0, 0.0, 0.0])
+        section = 0
         if p < end:
             x = get_vector(state, particles + p, stride, FIELD.position)
             base = base_node(x, inverse_dx)
+            section = _section(first + p, velocities, begins, spread)
         while p < end:
             place = particles + p
             fx = x * inverse_dx - ti.cast(base, ti.f32)
@@ -186,17 +200,19 @@ def scatter(
                         away = ti.cast(corner, ti.f32)
                         weight = spline(away[0] - fx[0]) * spline(away[1] - fx[1]) * spline(away[2] - fx[2])
                         ghost = ghost_place(base + corner, scene, contact, shape)
-                        add(node, LANES * ghost + component, weight * (v + A.dot(away)))
+                        add(node, section + LANES * ghost + component, weight * (v + A.dot(away)))
                     bits >>= 1
                     n += 1
             p = _next_acting(p + 1, end, first, begins, covered)
             following = base
+            next_section = section
             if p < end:
                 x = get_vector(state, particles + p, stride, FIELD.position)
                 following = base_node(x, inverse_dx)
-            if p == end or (following != base).any():
-                climbs = p < end and (following == base + ti.Vector([0, 1, 0])).all()
-                index_x, index_y, index_z = node_places(base, first_entry + component, shape, LANES)
+                next_section = _section(first + p, velocities, begins, spread)
+            if p == end or (following != base).any() or next_section != section:
+                climbs = p < end and (following == base + ti.Vector([0, 1, 0])).all() and next_section == section
+                index_x, index_y, index_z = node_places(base, section + first_entry + component, shape, LANES)
                 for i, k in ti.static(ti.ndrange(3, 3)):
                     add(node, index_x[i] + index_y[0] + index_z[k], gain[9 * i + k])
                     gain[9 * i + k] = gain[9 * i + 3 + k]
@@ -207,19 +223,25 @@ def scatter(
                         add(node, index_x[i] + index_y[j + 1] + index_z[k], gain[9 * i + 3 * j + k])
                         gain[9 * i + 3 * j + k] = 0.0
                 base = following
+                section = next_section
         task += threads
 
 
 @ti.func
-def _read_node(place: ti.i32, velocities: ti.i32, begins: ti.f32, node: ti.template()):
+def _read_node(place: ti.i32, velocities: ti.i32, begins: ti.f32, mixed: ti.i32, node: ti.template()):
     """What came to its momentum, its mass, and its velocity before (none where an interval begins), with the time that
-    it has fallen in this interval.
+    it has fallen in this interval; and the force that acts evenly, none yet where it begins.
     """
     before = ti.Vector([0.0, 0.0, 0.0, 0.0])
+    force = ti.Vector([0.0, 0.0, 0.0])
     if begins == 0.0:
         before = load4(node, velocities + place)
+        if mixed:
+            force = _vector(load4(node, 2 * velocities + place))
+    elif mixed:
+        store4(node, 2 * velocities + place, 0.0, 0.0, 0.0, 0.0)
     gain = load4(node, place)
-    return _vector(gain), gain[MASS], before
+    return _vector(gain), gain[MASS], before, force
 
 
 @ti.func
@@ -235,6 +257,7 @@ def _update(
     gain,
     mass: ti.f32,
     before,
+    force,
     velocities: ti.i32,
     local: ti.i32,
     corner: ti.i32,
@@ -251,9 +274,21 @@ def _update(
     variant: ti.template(),
 ):
     ahead = before[MASS] - fallen if begins == 0.0 else 0.0
-    fall = falls(gravity_time + lead - ahead, scene, scene_value)
+    time = gravity_time + lead - ahead  # since the node was updated
+    fall = falls(time, scene, scene_value)
     v = node_velocity(
-        _vector(before), gain, mass, local, facing, corner, fall, scene, scene_value, shape, contact_normal, variant
+        _vector(before),
+        gain + time * force,
+        mass,
+        local,
+        facing,
+        corner,
+        fall,
+        scene,
+        scene_value,
+        shape,
+        contact_normal,
+        variant,
     )
     _write_node(place, velocities, v, mass, ends, fallen + gravity_time + lead, node)
 
@@ -265,8 +300,9 @@ def update_nodes(
     velocities: ti.i32,
     begins: ti.f32,
     ends: ti.i32,
-    some_wait: ti.i32,
+    synchronised: ti.f32,
     now: ti.i32,
+    interval: ti.i32,
     whole_step: ti.f32,
     left: ti.f32,
     gravity_time: ti.f32,
@@ -282,7 +318,7 @@ def update_nodes(
     members: ti.i32,
 ):
     """New velocities of the nodes of all blocks that particles touch; within an interval of those alone whose particles
-    act.
+    act, or look at them in the next substep.
     """
     block_list = shape[SHAPE.all_blocks] + scene * shape[SHAPE.scene_blocks]
     count = live[scene * LIVE.length + LIVE.blocks] * BLOCK_NODES
@@ -292,30 +328,30 @@ def update_nodes(
         corner = block[block_list + shape[SHAPE.all_blocks] + n // BLOCK_NODES]
         local = n % BLOCK_NODES
         n += members
-        many = 1.0
-        if some_wait:
-            many = change_of(block[3 * shape[SHAPE.all_blocks] + touched], now)
-            if many == 0.0:
-                continue
+        many, mixed = change_of(
+            touched, synchronised, begins, ends, now, interval, shape, block, LISTED * shape[SHAPE.all_blocks]
+        )
+        if many == 0.0:
+            continue
         lead = ti.min((many - 1.0) * whole_step, left)
         # all that is read, before anything is written: Taichi looks up where an array lies anew after each store
         place = LANES * (touched * BLOCK_NODES + local)
         entry = -1
         if ti.static(bool(variant & VARIANT.contact)):
             entry = contact[touched * BLOCK_NODES + local]
-        gain, mass, before = _read_node(place, velocities, begins, node)
+        gain, mass, before, force = _read_node(place, velocities, begins, mixed, node)
         if local == 0:
             block[touched] = 0
         if mass > 0.0:  # others keep a velocity of before, in which no particle has a share
             _update(
-                place, 2 * entry, gain, mass, before, velocities, local, corner, scene, begins, ends, gravity_time,
-                lead, fallen, node, scene_value, shape, contact_normal, variant,
+                place, 2 * entry, gain, mass, before, force, velocities, local, corner, scene, begins, ends,
+                gravity_time, lead, fallen, node, scene_value, shape, contact_normal, variant,
             )  # fmt: skip
         if ti.static(bool(variant & VARIANT.sheets)):  # noqa: SIM102 (this one is the compiler's)
             if entry >= 0 and entry < shape[SHAPE.ghosts]:
                 ghost = LANES * (shape[SHAPE.ghost_begin] + entry)
-                gain_there, mass_there, before_there = _read_node(ghost, velocities, begins, node)
+                gain_there, mass_there, before_there, force_there = _read_node(ghost, velocities, begins, mixed, node)
                 _update(
-                    ghost, 2 * entry + 1, gain_there, mass_there, before_there, velocities, local, corner, scene,
-                    begins, ends, gravity_time, lead, fallen, node, scene_value, shape, contact_normal, variant,
+                    ghost, 2 * entry + 1, gain_there, mass_there, before_there, force_there, velocities, local, corner,
+                    scene, begins, ends, gravity_time, lead, fallen, node, scene_value, shape, contact_normal, variant,
                 )  # fmt: skip
