@@ -7,7 +7,7 @@ of threads at work. On a GPU all particles scatter at once into one copy with at
 
 import taichi as ti
 
-from datagen.mpm.layout import BLOCK_NODES, CONSTANT, COUNT, SETTING, SHAPE, STATUS, VALUE, VARIANT, has_solid
+from datagen.mpm.layout import BLOCK_NODES, CONSTANT, COUNT, LISTED, SETTING, SHAPE, STATUS, VALUE, VARIANT, has_solid
 from datagen.mpm.mls_mpm import (
     Integers,
     Matrices,
@@ -22,6 +22,7 @@ from datagen.mpm.mls_mpm import (
     interpolate,
     interpolate_hidden,
     is_fluid,
+    looks_next,
     mark,
     mark_awaited,
     mark_step,
@@ -84,7 +85,7 @@ def _particle_to_grid(
             elapsed = scene_value[scene, VALUE.frame] - scene_value[scene, VALUE.remaining] - step
             hidden[p] = find_hidden(position[p], scene, elapsed, contact, contact_normal, setting, shape, variant)
         hidden_here = hidden[p]
-    marks = 3 * shape[SHAPE.all_blocks] + 2
+    marks = LISTED * shape[SHAPE.all_blocks] + 2
     A = ti.Matrix.zero(ti.f32, 3, 3)
     if acts(covered[p], begins, step, scene, scene_value):
         F = ti.Matrix.identity(ti.f32, 3)
@@ -131,7 +132,8 @@ def _particle_to_grid(
         raise_maximum(counter, scene, COUNT.stiffness_bits, stiffness)
     else:
         A = step * response[p]
-        mark_awaited(position[p], covered[p], scene, counter, shape, block, marks, scene_value, setting)
+        if looks_next(covered[p], scene, scene_value):
+            mark_awaited(position[p], scene, counter, shape, block, marks, setting)
 
     x = position[p] * inverse_dx
     base = ti.floor(x - 0.5, ti.i32)
@@ -283,11 +285,9 @@ def substep(
                     response, label, law_row, hidden, node, gain, block, scene_value, counter, setting, law, shape,
                     contact, contact_normal, variant,
                 )  # fmt: skip
-            elif step > 0.0:
-                mark_awaited(
-                    position[p], covered[p], scene, counter, shape, block, 3 * shape[SHAPE.all_blocks] + 2, scene_value,
-                    setting,
-                )  # fmt: skip
+            elif step > 0.0 and looks_next(covered[p], scene, scene_value):
+                marks = LISTED * shape[SHAPE.all_blocks] + 2
+                mark_awaited(position[p], scene, counter, shape, block, marks, setting)
     else:
         for task in range(scene_value.shape[0] * ti.static(variant // VARIANT.parts)):
             parts = ti.static(variant // VARIANT.parts)
@@ -305,11 +305,9 @@ def substep(
                                 covered, spread, response, label, law_row, hidden, node, gain, block, scene_value,
                                 counter, setting, law, shape, contact, contact_normal, variant,
                             )  # fmt: skip
-                        else:
-                            mark_awaited(
-                                position[p], covered[p], scene, counter, shape, block, 3 * shape[SHAPE.all_blocks] + 2,
-                                scene_value, setting,
-                            )  # fmt: skip
+                        elif looks_next(covered[p], scene, scene_value):
+                            marks = LISTED * shape[SHAPE.all_blocks] + 2
+                            mark_awaited(position[p], scene, counter, shape, block, marks, setting)
 
     for n in range(block[3 * shape[SHAPE.all_blocks]] * BLOCK_NODES):
         global_block = block[shape[SHAPE.all_blocks] + (n >> 6)]
@@ -322,7 +320,7 @@ def substep(
         many, _ = change_of(
             global_block, scene_value[scene, VALUE.synchronised], scene_value[scene, VALUE.begins],
             scene_value[scene, VALUE.interval_remaining] == 0.0, ti.cast(counter[scene, COUNT.substeps], ti.i32),
-            ti.cast(counter[scene, COUNT.transfers], ti.i32), shape, block, 3 * shape[SHAPE.all_blocks] + 2,
+            ti.cast(counter[scene, COUNT.transfers], ti.i32), shape, block, LISTED * shape[SHAPE.all_blocks] + 2,
         )  # fmt: skip
         if scene_value[scene, VALUE.time_step] > 0.0 and many > 0.0:
             lead = ti.min(

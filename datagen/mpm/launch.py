@@ -201,6 +201,7 @@ class Launch(ABC):
             + VARIANT.rate_of_sand * bool(config.sand_grain_diameter_m > 0 and SAND in label & MATERIAL_MASK)
             + VARIANT.taichi_elements_water * (config.water_volume_update == "taichi_elements")
             + VARIANT.stiffening_water * (config.water_equation == "stiffening")
+            + VARIANT.each_step * (config.time_step == "fixed" or config.transfer_speed_m_s is None)
             + VARIANT.several_laws * (len(laws) > 1)
             + VARIANT.parts * self.copies
         )

@@ -148,7 +148,8 @@ class Variant(NamedTuple):
     moving: int = 2048  # obstacles move
     elastic: int = 4096
     rate_of_sand: int = 8192  # friction grows with the rate of flow
-    parts: int = 16384  # times the number of parts: the last, so it moves up where a flag is added
+    each_step: int = 16384  # is an interval of its own
+    parts: int = 32768  # times the number of parts: the last, so it moves up where a flag is added
 
 
 class Field(NamedTuple):

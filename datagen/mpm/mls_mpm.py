@@ -224,23 +224,26 @@ def _alike_around(
 
 
 @ti.func
+def looks_next(covered: ti.f32, scene: ti.i32, scene_value: ti.template()) -> ti.i32:
+    """Whether a particle looks at its nodes in the next substep, since what its step covers ends with this one."""
+    soon = scene_value[scene, VALUE.interval_elapsed] + SOON * scene_value[scene, VALUE.whole_step]
+    return waits(scene, scene_value) and covered < soon
+
+
+@ti.func
 def mark_awaited(
     x,
-    covered: ti.f32,
     scene: ti.i32,
     counter: ti.template(),
     shape: ti.template(),
     block: ti.template(),
     marks: ti.i32,
-    scene_value: ti.template(),
     setting: ti.template(),
 ):
-    """Writes down that a particle looks at its blocks at the end of this substep, where what its step covers ends."""
-    soon = scene_value[scene, VALUE.interval_elapsed] + SOON * scene_value[scene, VALUE.whole_step]
-    if waits(scene, scene_value) and covered < soon:
-        now = ti.cast(counter[scene, COUNT.substeps], ti.i32)
-        awaited = marks + MARK.awaited * shape[SHAPE.all_blocks]
-        mark_blocks(x, scene, now, setting[SETTING.inverse_cell_size], shape, block, awaited)
+    """Writes down that the blocks of a particle's nodes are looked at in the next substep: see `change_of`."""
+    now = ti.cast(counter[scene, COUNT.substeps], ti.i32)
+    awaited = marks + MARK.awaited * shape[SHAPE.all_blocks]
+    mark_blocks(x, scene, now, setting[SETTING.inverse_cell_size], shape, block, awaited)
 
 
 @ti.func
@@ -267,8 +270,8 @@ def mark_step(
         elif begins == 1.0:
             interval = ti.cast(counter[scene, COUNT.transfers], ti.i32)
             mark_blocks(x, scene, interval, inverse_dx, shape, block, marks + MARK.mixed * shape[SHAPE.all_blocks])
-        if begins == 0.0:
-            mark_awaited(x, until, scene, counter, shape, block, marks, scene_value, setting)
+        if begins == 0.0 and looks_next(until, scene, scene_value):
+            mark_awaited(x, scene, counter, shape, block, marks, setting)
 
 
 @ti.func

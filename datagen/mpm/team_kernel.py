@@ -37,6 +37,7 @@ from datagen.mpm.mls_mpm import (
     acts,
     find_hidden,
     initial_stiffness,
+    looks_next,
     mark,
     mark_awaited,
     mark_step,
@@ -123,6 +124,7 @@ def _strain(
     substeps its share. `covered` is less than 0 for what gives to nodes now.
     """
     solid = ti.static(has_solid(variant))
+    intervals = ti.static(not variant & VARIANT.each_step)
     marks = LISTED * shape[SHAPE.all_blocks]
     largest = 0.0
     held = 0.0
@@ -131,18 +133,21 @@ def _strain(
     while own < owned:
         p = dealt(own, part, chunk, blocks)
         own += threads
-        last = covered[first + p]
-        reached = ti.abs(last)
         place = particles + p
-        if not acts(reached, begins, step, scene, scene_value):
-            if spread[first + p] == SPREADS_FROM_HERE:
-                put_matrix(state, place, stride, FIELD.affine, _response(response, first + p, stride))
-                spread[first + p] = SPREADS
-            elif last < 0.0:
-                covered[first + p] = reached
-            x_now = get_vector(state, place, stride, FIELD.position)
-            mark_awaited(x_now, reached, scene, counter, shape, block, marks, scene_value, setting)
-            continue
+        reached = 0.0
+        if ti.static(intervals):
+            last = covered[first + p]
+            reached = ti.abs(last)
+            if not acts(reached, begins, step, scene, scene_value):
+                if spread[first + p] == SPREADS_FROM_HERE:
+                    put_matrix(state, place, stride, FIELD.affine, _response(response, first + p, stride))
+                    spread[first + p] = SPREADS
+                elif last < 0.0:
+                    covered[first + p] = reached
+                if looks_next(reached, scene, scene_value):
+                    x_now = get_vector(state, place, stride, FIELD.position)
+                    mark_awaited(x_now, scene, counter, shape, block, marks, setting)
+                continue
         x = get_vector(state, place, stride, FIELD.position)
         C = ti.Matrix.zero(ti.f32, 3, 3)
         stretch = ti.Matrix.zero(ti.f32, 3, 3)
@@ -171,31 +176,37 @@ def _strain(
             row = tag[tags + TAG.law_row * stride + p]
         material = tag[tags + TAG.material * stride + p]
         old_volume = load(state, place + FIELD.volume * stride)
-        length, until, acts_until, many, spreads, acting = own_step(
-            strained[first + p], reached, spread[first + p], x, C, old_volume, material, row, begins, step, scene,
-            counter, shape, block, marks, scene_value, setting, law, variant,
-        )  # fmt: skip
-        mark_step(x, acts_until, many, spreads, begins, scene, counter, shape, block, marks, scene_value, setting)
-        strained[first + p] = until
-        covered[first + p] = -acts_until
+        length, many, spreads, acting = step, 1.0, 0, step
+        if ti.static(intervals):
+            length, until, acts_until, many, spreads, acting = own_step(
+                strained[first + p], reached, spread[first + p], x, C, old_volume, material, row, begins, step, scene,
+                counter, shape, block, marks, scene_value, setting, law, variant,
+            )  # fmt: skip
+            mark_step(x, acts_until, many, spreads, begins, scene, counter, shape, block, marks, scene_value, setting)
+            strained[first + p] = until
+            covered[first + p] = -acts_until
         answer, new_stretch, new_F, volume, stiffness = respond(
             C, stretch, F, old_volume, material, row, length, scene, counter, setting, law, variant
         )
         given = begins * C + acting * answer
-        if spreads:
-            if begins == 0.0:
-                given = answer
-                if spread[first + p] == SPREADS:
-                    given -= _response(response, first + p, stride)
-            for i, j, k in ti.static(((0, 0, 0), (1, 1, 1), (2, 2, 2), (3, 0, 1), (4, 0, 2), (5, 1, 2))):
-                response[first + p + i * stride] = answer[j, k]
-        spread[first + p] = 0
-        if spreads:
-            spread[first + p] = SPREADS_FROM_HERE if begins == 1.0 else SPREADS
+        if ti.static(intervals):
+            before = spread[first + p]
+            now_spread = 0
+            if spreads:
+                now_spread = SPREADS_FROM_HERE
+                if begins == 0.0:
+                    now_spread = SPREADS
+                    given = answer
+                    if before == SPREADS:
+                        given -= _response(response, first + p, stride)
+                for i, j, k in ti.static(((0, 0, 0), (1, 1, 1), (2, 2, 2), (3, 0, 1), (4, 0, 2), (5, 1, 2))):
+                    response[first + p + i * stride] = answer[j, k]
+            spread[first + p] = now_spread
         put_matrix(state, place, stride, FIELD.affine, given)
         if ti.static(solid):
             put_matrix(state, place, stride, FIELD.deformation, new_F)
-            put_symmetric(state, place, stride, FIELD.stretch, new_stretch)
+            if ti.static(intervals):
+                put_symmetric(state, place, stride, FIELD.stretch, new_stretch)
         store(state, place + FIELD.volume * stride, volume)
         largest = ti.max(largest, stiffness)
         if many > 1.0:
@@ -359,11 +370,13 @@ def advance(
                 tags = copy * TAG.length * stride + first
                 while going:
                     step = scene_value[scene, VALUE.time_step]
-                    begins = scene_value[scene, VALUE.begins]
-                    left = scene_value[scene, VALUE.interval_remaining]
+                    begins, left, synchronised = 1.0, 0.0, 0.0
+                    if ti.static(not variant & VARIANT.each_step):
+                        begins = scene_value[scene, VALUE.begins]
+                        left = scene_value[scene, VALUE.interval_remaining]
+                        synchronised = scene_value[scene, VALUE.synchronised]
                     ends = left == 0.0
                     whole = scene_value[scene, VALUE.whole_step]
-                    synchronised = scene_value[scene, VALUE.synchronised]
                     gravity_time = scene_value[scene, VALUE.gravity_time]
                     fallen = scene_value[scene, VALUE.fallen]
                     now = ti.cast(counter[scene, COUNT.substeps], ti.i32)

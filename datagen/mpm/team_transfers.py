@@ -23,6 +23,7 @@ from datagen.mpm.time_step import falls
 
 LANES = 4  # components of a node, and threads that share a particle where it gives to nodes
 MASS = 3  # the component
+AT_ONCE = 2  # nodes of a block that a thread updates
 
 
 @ti.func
@@ -229,25 +230,17 @@ def scatter(
 
 @ti.func
 def _read_node(place: ti.i32, velocities: ti.i32, begins: ti.f32, mixed: ti.i32, node: ti.template()):
-    """What came to its momentum, its mass, and its velocity before (none where an interval begins), with the time that
+    """What came to its momentum, with its mass; its velocity before (none where an interval begins), with the time that
     it has fallen in this interval; and the force that acts evenly, none yet where it begins.
     """
-    before = ti.Vector([0.0, 0.0, 0.0, 0.0])
-    force = ti.Vector([0.0, 0.0, 0.0])
+    zero = ti.Vector([0.0 for _ in range(LANES)])
+    before, force = zero, zero
+    gain = load4(node, place)
     if begins == 0.0:
         before = load4(node, velocities + place)
         if mixed:
-            force = _vector(load4(node, 2 * velocities + place))
-    elif mixed:
-        store4(node, 2 * velocities + place, 0.0, 0.0, 0.0, 0.0)
-    gain = load4(node, place)
-    return _vector(gain), gain[MASS], before, force
-
-
-@ti.func
-def _write_node(place: ti.i32, velocities: ti.i32, v, mass: ti.f32, ends: ti.i32, fallen: ti.f32, node: ti.template()):
-    store4(node, place, 0.0, 0.0, 0.0, 0.0 if ends else mass)
-    store4(node, velocities + place, v[0], v[1], v[2], mass if ends else fallen)
+            force = load4(node, 2 * velocities + place)
+    return gain, before, force
 
 
 @ti.func
@@ -255,9 +248,9 @@ def _update(
     place: ti.i32,
     facing: ti.i32,
     gain,
-    mass: ti.f32,
     before,
     force,
+    mixed: ti.i32,
     velocities: ti.i32,
     local: ti.i32,
     corner: ti.i32,
@@ -275,22 +268,15 @@ def _update(
 ):
     ahead = before[MASS] - fallen if begins == 0.0 else 0.0
     time = gravity_time + lead - ahead  # since the node was updated
-    fall = falls(time, scene, scene_value)
+    mass = gain[MASS]
     v = node_velocity(
-        _vector(before),
-        gain + time * force,
-        mass,
-        local,
-        facing,
-        corner,
-        fall,
-        scene,
-        scene_value,
-        shape,
-        contact_normal,
-        variant,
-    )
-    _write_node(place, velocities, v, mass, ends, fallen + gravity_time + lead, node)
+        _vector(before), _vector(gain) + time * _vector(force), mass, local, facing, corner,
+        falls(time, scene, scene_value), scene, scene_value, shape, contact_normal, variant,
+    )  # fmt: skip
+    store4(node, place, 0.0, 0.0, 0.0, 0.0 if ends else mass)
+    store4(node, velocities + place, v[0], v[1], v[2], mass if ends else fallen + gravity_time + lead)
+    if begins == 1.0 and mixed:
+        store4(node, 2 * velocities + place, 0.0, 0.0, 0.0, 0.0)
 
 
 @ti.func
@@ -321,12 +307,13 @@ def update_nodes(
     act, or look at them in the next substep.
     """
     block_list = shape[SHAPE.all_blocks] + scene * shape[SHAPE.scene_blocks]
-    count = live[scene * LIVE.length + LIVE.blocks] * BLOCK_NODES
+    apart = ti.static(BLOCK_NODES // AT_ONCE)
+    count = live[scene * LIVE.length + LIVE.blocks] * apart
     n = member
     while n < count:
-        touched = block[block_list + n // BLOCK_NODES]
-        corner = block[block_list + shape[SHAPE.all_blocks] + n // BLOCK_NODES]
-        local = n % BLOCK_NODES
+        touched = block[block_list + n // apart]
+        corner = block[block_list + shape[SHAPE.all_blocks] + n // apart]
+        first_local = n % apart
         n += members
         many, mixed = change_of(
             touched, synchronised, begins, ends, now, interval, shape, block, LISTED * shape[SHAPE.all_blocks]
@@ -334,24 +321,36 @@ def update_nodes(
         if many == 0.0:
             continue
         lead = ti.min((many - 1.0) * whole_step, left)
-        # all that is read, before anything is written: Taichi looks up where an array lies anew after each store
-        place = LANES * (touched * BLOCK_NODES + local)
-        entry = -1
+        # all that is read, of all nodes at once, before anything is written: each is a way to memory, and Taichi looks
+        # up where an array lies anew after each store
+        first_node = touched * BLOCK_NODES + first_local
+        entry = ti.Vector([-1 for _ in range(AT_ONCE)])
         if ti.static(bool(variant & VARIANT.contact)):
-            entry = contact[touched * BLOCK_NODES + local]
-        gain, mass, before, force = _read_node(place, velocities, begins, mixed, node)
-        if local == 0:
+            for i in ti.static(range(AT_ONCE)):
+                entry[i] = contact[first_node + i * apart]
+        read = ti.Matrix.zero(ti.f32, AT_ONCE, 3 * LANES)
+        for i in ti.static(range(AT_ONCE)):
+            gain, before, force = _read_node(LANES * (first_node + i * apart), velocities, begins, mixed, node)
+            for j in ti.static(range(LANES)):
+                read[i, j], read[i, LANES + j], read[i, 2 * LANES + j] = gain[j], before[j], force[j]
+        if first_local == 0:
             block[touched] = 0
-        if mass > 0.0:  # others keep a velocity of before, in which no particle has a share
-            _update(
-                place, 2 * entry, gain, mass, before, force, velocities, local, corner, scene, begins, ends,
-                gravity_time, lead, fallen, node, scene_value, shape, contact_normal, variant,
-            )  # fmt: skip
-        if ti.static(bool(variant & VARIANT.sheets)):  # noqa: SIM102 (this one is the compiler's)
-            if entry >= 0 and entry < shape[SHAPE.ghosts]:
-                ghost = LANES * (shape[SHAPE.ghost_begin] + entry)
-                gain_there, mass_there, before_there, force_there = _read_node(ghost, velocities, begins, mixed, node)
+        for i in ti.static(range(AT_ONCE)):
+            gain = ti.Vector([read[i, j] for j in range(LANES)])
+            before = ti.Vector([read[i, LANES + j] for j in range(LANES)])
+            force = ti.Vector([read[i, 2 * LANES + j] for j in range(LANES)])
+            if gain[MASS] > 0.0:  # others keep a velocity of before, in which no particle has a share
                 _update(
-                    ghost, 2 * entry + 1, gain_there, mass_there, before_there, force_there, velocities, local, corner,
-                    scene, begins, ends, gravity_time, lead, fallen, node, scene_value, shape, contact_normal, variant,
+                    LANES * (first_node + i * apart), 2 * entry[i], gain, before, force, mixed, velocities,
+                    first_local + i * apart, corner, scene, begins, ends, gravity_time, lead, fallen, node, scene_value,
+                    shape, contact_normal, variant,
                 )  # fmt: skip
+            if ti.static(bool(variant & VARIANT.sheets)):  # noqa: SIM102 (this one is the compiler's)
+                if entry[i] >= 0 and entry[i] < shape[SHAPE.ghosts]:
+                    ghost = LANES * (shape[SHAPE.ghost_begin] + entry[i])
+                    gain_there, before_there, force_there = _read_node(ghost, velocities, begins, mixed, node)
+                    _update(
+                        ghost, 2 * entry[i] + 1, gain_there, before_there, force_there, mixed, velocities,
+                        first_local + i * apart, corner, scene, begins, ends, gravity_time, lead, fallen, node,
+                        scene_value, shape, contact_normal, variant,
+                    )  # fmt: skip

@@ -45,6 +45,16 @@ def test_teams_agree_with_the_other_launch():
     assert np.abs(alone.position_TN3 - found[1].position_TN3).max() < 1e-3
 
 
+def test_teams_agree_where_each_step_is_an_interval():
+    """Kernels then have no steps of particles' own: a frame agrees to 1e-6."""
+    config = MpmConfig(device="cpu", time_step="fixed", fixed_time_step_s=1e-3)
+    one, other = (simulate([HEAVY], config, 6, 60.0, team=team)[0] for team in (Team(0), Team(1, 1, 4)))
+    assert isinstance(one, Simulated) and isinstance(other, Simulated)
+    assert np.abs(one.position_TN3[1] - other.position_TN3[1]).max() < 1e-6
+    assert np.abs(one.position_TN3 - other.position_TN3).max() < 1e-3
+    assert one.counters["substeps"] == other.counters["substeps"]
+
+
 def test_blocks_that_wait_for_each_other_agree_with_the_other_launch():
     """A scene of two blocks ends where one launch a substep does, particles added up one by one, beside one that
     fails.
