@@ -7,7 +7,7 @@ of threads at work. On a GPU all particles scatter at once into one copy with at
 
 import taichi as ti
 
-from datagen.mpm.layout import BLOCK_NODES, CONSTANT, COUNT, LISTED, SETTING, SHAPE, STATUS, VALUE, VARIANT, has_solid
+from datagen.mpm.layout import BLOCK_NODES, CONSTANT, COUNT, SETTING, SHAPE, STATUS, VALUE, VARIANT, has_solid
 from datagen.mpm.mls_mpm import (
     Integers,
     Matrices,
@@ -22,10 +22,8 @@ from datagen.mpm.mls_mpm import (
     interpolate,
     interpolate_hidden,
     is_fluid,
-    looks_next,
     mark,
-    mark_awaited,
-    mark_step,
+    mark_changed,
     move,
     node_places,
     node_velocity,
@@ -85,7 +83,7 @@ def _particle_to_grid(
             elapsed = scene_value[scene, VALUE.frame] - scene_value[scene, VALUE.remaining] - step
             hidden[p] = find_hidden(position[p], scene, elapsed, contact, contact_normal, setting, shape, variant)
         hidden_here = hidden[p]
-    marks = LISTED * shape[SHAPE.all_blocks] + 2
+    marks = 3 * shape[SHAPE.all_blocks] + 2
     A = ti.Matrix.zero(ti.f32, 3, 3)
     if acts(covered[p], begins, step, scene, scene_value):
         F = ti.Matrix.identity(ti.f32, 3)
@@ -109,9 +107,6 @@ def _particle_to_grid(
             strained[p], covered[p], spread[p], position[p], C, volume[p], material, row, begins, step, scene, counter,
             shape, block, marks, scene_value, setting, law, variant,
         )  # fmt: skip
-        mark_step(
-            position[p], acts_until, many, spreads, begins, scene, counter, shape, block, marks, scene_value, setting
-        )
         strained[p] = until
         covered[p] = acts_until
         spread[p] = spreads
@@ -132,8 +127,9 @@ def _particle_to_grid(
         raise_maximum(counter, scene, COUNT.stiffness_bits, stiffness)
     else:
         A = step * response[p]
-        if looks_next(covered[p], scene, scene_value):
-            mark_awaited(position[p], scene, counter, shape, block, marks, setting)
+        if scene_value[scene, VALUE.interval_remaining] > 0.0:
+            now = ti.cast(counter[scene, COUNT.substeps], ti.i32)
+            mark_changed(position[p], scene, now, 1.0, inverse_dx, shape, block, marks)
 
     x = position[p] * inverse_dx
     base = ti.floor(x - 0.5, ti.i32)
@@ -285,9 +281,6 @@ def substep(
                     response, label, law_row, hidden, node, gain, block, scene_value, counter, setting, law, shape,
                     contact, contact_normal, variant,
                 )  # fmt: skip
-            elif step > 0.0 and looks_next(covered[p], scene, scene_value):
-                marks = LISTED * shape[SHAPE.all_blocks] + 2
-                mark_awaited(position[p], scene, counter, shape, block, marks, setting)
     else:
         for task in range(scene_value.shape[0] * ti.static(variant // VARIANT.parts)):
             parts = ti.static(variant // VARIANT.parts)
@@ -296,18 +289,14 @@ def substep(
             if step > 0.0:
                 copy = (task - scene * parts) * shape[SHAPE.all_blocks]
                 for p in range(shape[SHAPE.part_begin + task], shape[SHAPE.part_begin + task + 1]):
-                    if label[p] >> MATERIAL_BITS == scene:
-                        if spread[p] == 1 or acts(
-                            covered[p], scene_value[scene, VALUE.begins], step, scene, scene_value
-                        ):
-                            _particle_to_grid(
-                                p, copy, scene, step, position, velocity, affine, deformation, volume, strained,
-                                covered, spread, response, label, law_row, hidden, node, gain, block, scene_value,
-                                counter, setting, law, shape, contact, contact_normal, variant,
-                            )  # fmt: skip
-                        elif looks_next(covered[p], scene, scene_value):
-                            marks = LISTED * shape[SHAPE.all_blocks] + 2
-                            mark_awaited(position[p], scene, counter, shape, block, marks, setting)
+                    if label[p] >> MATERIAL_BITS == scene and (
+                        spread[p] == 1 or acts(covered[p], scene_value[scene, VALUE.begins], step, scene, scene_value)
+                    ):
+                        _particle_to_grid(
+                            p, copy, scene, step, position, velocity, affine, deformation, volume, strained,
+                            covered, spread, response, label, law_row, hidden, node, gain, block, scene_value, counter,
+                            setting, law, shape, contact, contact_normal, variant,
+                        )  # fmt: skip
 
     for n in range(block[3 * shape[SHAPE.all_blocks]] * BLOCK_NODES):
         global_block = block[shape[SHAPE.all_blocks] + (n >> 6)]
@@ -317,11 +306,10 @@ def substep(
         place = global_block * BLOCK_NODES + (n & 63)
         scene = global_block // shape[SHAPE.scene_blocks]
         begins = scene_value[scene, VALUE.begins] == 1.0
-        many, _ = change_of(
-            global_block, scene_value[scene, VALUE.synchronised], scene_value[scene, VALUE.begins],
-            scene_value[scene, VALUE.interval_remaining] == 0.0, ti.cast(counter[scene, COUNT.substeps], ti.i32),
-            ti.cast(counter[scene, COUNT.transfers], ti.i32), shape, block, LISTED * shape[SHAPE.all_blocks] + 2,
-        )  # fmt: skip
+        many = 1.0
+        if scene_value[scene, VALUE.synchronised] == 1.0 and scene_value[scene, VALUE.interval_remaining] > 0.0:
+            now = ti.cast(counter[scene, COUNT.substeps], ti.i32)
+            many = change_of(block[3 * shape[SHAPE.all_blocks] + 2 + global_block], now)
         if scene_value[scene, VALUE.time_step] > 0.0 and many > 0.0:
             lead = ti.min(
                 (many - 1.0) * scene_value[scene, VALUE.whole_step], scene_value[scene, VALUE.interval_remaining]

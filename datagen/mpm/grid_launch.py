@@ -12,7 +12,7 @@ import numpy as np
 from datagen.mpm.collider import MOVE_CELLS, build_collider
 from datagen.mpm.device import Device
 from datagen.mpm.launch import Launch, device_array, device_vectors
-from datagen.mpm.layout import COUNT, LISTED, MARK, STATUS, VALUE, VARIANT, has_solid
+from datagen.mpm.layout import COUNT, STATUS, VALUE, VARIANT, has_solid
 from hgn.scene.scene import Scene
 from hgn.schema import require
 
@@ -73,7 +73,7 @@ class GridLaunch(Launch):
         self.covered.fill(0)
         self.spread = device_array(np.zeros(self.particles, np.int32))
         self.response = ti.Matrix.ndarray(3, 3, ti.f32, self.particles)
-        self.block = device_array(np.zeros((LISTED + MARK.length) * self.all_blocks + 2, np.int32))
+        self.block = device_array(np.zeros(8 * self.all_blocks + 2, np.int32))
         grid_kernel.start(
             self.velocity, self.affine, self.deformation, self.volume, self.label, self.law_row, self.counter,
             self.law,

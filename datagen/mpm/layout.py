@@ -14,7 +14,6 @@ from hgn.scene.material import FLUIDS, MATERIALS
 
 BLOCK = 4  # nodes along the side of a block of the grid
 BLOCK_NODES = BLOCK**3
-LISTED = 3  # integers of each block before what is written down of it: a flag, the list, and where its blocks lie
 SOLID_FRACTION = 0.6  # of sand: grains are denser by as much
 
 
@@ -174,16 +173,6 @@ class Tag(NamedTuple):
     length: int = 3
 
 
-class Mark(NamedTuple):
-    """What is written down of each block of nodes."""
-
-    changed: int = 0  # when impulses came last, and for how long: see mls_mpm.mark_changed
-    alike: int = 1  # 1 to 4: the fewest and the most substeps of particles' own steps, in even and in odd intervals
-    mixed: int = 5  # the last interval in which stress acts evenly there
-    awaited: int = 6  # the last substep whose end a particle looks at
-    length: int = 7
-
-
 class Live(NamedTuple):
     """Positions in the int32 state of a scene that its team shares."""
 
@@ -196,7 +185,7 @@ class Live(NamedTuple):
 
 CONSTANT, COUNT, VALUE, STATUS = Constant(), Count(), SceneValue(), Status()
 SETTING, SHAPE, VARIANT = Setting(), Shape(), Variant()
-FIELD, TAG, MARK, LIVE = Field(), Tag(), Mark(), Live()
+FIELD, TAG, LIVE = Field(), Tag(), Live()
 MATERIAL_VARIANTS: tuple[int, ...] = tuple(getattr(VARIANT, name) for name in MATERIALS)
 SOLID_VARIANTS = sum(bit for material, bit in enumerate(MATERIAL_VARIANTS) if material not in FLUIDS)
 

@@ -49,7 +49,6 @@ from datagen.mpm.layout import (
     BLOCK_NODES,
     CONSTANT,
     COUNT,
-    MARK,
     SETTING,
     SHAPE,
     STATUS,
@@ -62,7 +61,6 @@ from hgn.scene.material import FLUIDS, SNOW
 
 MANY = 32  # substeps at most of a step of a particle's own
 SLACK = 1e-3  # of a substep, within which times are the same
-SOON = 0.9  # of a substep, within which what a step covers ends for a particle that looks at that end
 SMALLEST_MASS = 1e-10  # of a particle; lighter nodes are at the rounding of the weights
 
 Scalars = ti.types.ndarray(dtype=ti.f32, ndim=1)
@@ -156,24 +154,6 @@ def _corner_block(first, last, n: ti.template(), scene: ti.i32, shape: ti.templa
 
 
 @ti.func
-def mark_blocks(
-    x,
-    scene: ti.i32,
-    what: ti.i32,
-    inverse_dx: ti.f32,
-    shape: ti.template(),
-    block: ti.template(),
-    begin: ti.i32,
-):
-    """Raises the entries from block[begin] on of the blocks of a particle's nodes to `what`."""
-    base = base_node(x, inverse_dx)
-    for n in ti.static(range(8)):
-        index = begin + _corner_block(base >> 2, (base + 2) >> 2, n, scene, shape)
-        if block[index] < what:
-            ti.atomic_max(block[index], what)
-
-
-@ti.func
 def mark_changed(
     x,
     scene: ti.i32,
@@ -185,9 +165,14 @@ def mark_changed(
     begin: ti.i32,
 ):
     """Writes down, from block[begin] on, that the blocks of the particle's nodes change in the substep `now`, and for
-    how many substeps, the fewest of all that change them.
+    how many substeps, the fewest of all that change them (see change_of).
     """
-    mark_blocks(x, scene, now * MANY + MANY - ti.cast(many, ti.i32), inverse_dx, shape, block, begin)
+    base = base_node(x, inverse_dx)
+    change = now * MANY + MANY - ti.cast(many, ti.i32)
+    for n in ti.static(range(8)):
+        index = begin + _corner_block(base >> 2, (base + 2) >> 2, n, scene, shape)
+        if block[index] < change:
+            ti.atomic_max(block[index], change)
 
 
 @ti.func
@@ -224,93 +209,12 @@ def _alike_around(
 
 
 @ti.func
-def looks_next(covered: ti.f32, scene: ti.i32, scene_value: ti.template()) -> ti.i32:
-    """Whether a particle looks at its nodes in the next substep, since what its step covers ends with this one."""
-    soon = scene_value[scene, VALUE.interval_elapsed] + SOON * scene_value[scene, VALUE.whole_step]
-    return waits(scene, scene_value) and covered < soon
-
-
-@ti.func
-def mark_awaited(
-    x,
-    scene: ti.i32,
-    counter: ti.template(),
-    shape: ti.template(),
-    block: ti.template(),
-    marks: ti.i32,
-    setting: ti.template(),
-):
-    """Writes down that the blocks of a particle's nodes are looked at in the next substep: see `change_of`."""
-    now = ti.cast(counter[scene, COUNT.substeps], ti.i32)
-    awaited = marks + MARK.awaited * shape[SHAPE.all_blocks]
-    mark_blocks(x, scene, now, setting[SETTING.inverse_cell_size], shape, block, awaited)
-
-
-@ti.func
-def mark_step(
-    x,
-    until: ti.f32,
-    many: ti.f32,
-    spreads: ti.i32,
-    begins: ti.f32,
-    scene: ti.i32,
-    counter: ti.template(),
-    shape: ti.template(),
-    block: ti.template(),
-    marks: ti.i32,
-    scene_value: ti.template(),
-    setting: ti.template(),
-):
-    """Writes down what a particle's step, as `own_step` gave it, asks of its blocks: see `change_of`."""
-    if waits(scene, scene_value):
-        inverse_dx = setting[SETTING.inverse_cell_size]
-        if not spreads:
-            now = ti.cast(counter[scene, COUNT.substeps], ti.i32)
-            mark_changed(x, scene, now, ti.min(many, MANY), inverse_dx, shape, block, marks)
-        elif begins == 1.0:
-            interval = ti.cast(counter[scene, COUNT.transfers], ti.i32)
-            mark_blocks(x, scene, interval, inverse_dx, shape, block, marks + MARK.mixed * shape[SHAPE.all_blocks])
-        if begins == 0.0 and looks_next(until, scene, scene_value):
-            mark_awaited(x, scene, counter, shape, block, marks, setting)
-
-
-@ti.func
-def change_of(
-    touched: ti.i32,
-    synchronised: ti.f32,
-    begins: ti.f32,
-    ends: ti.i32,
-    now: ti.i32,
-    interval: ti.i32,
-    shape: ti.template(),
-    block: ti.template(),
-    marks: ti.i32,
-):
-    """For how many substeps a block changes in the substep `now`, 0 where it does not; and whether stress acts evenly
-    there. Where it does, the block goes on to the end of a substep when a particle looks at it then, or one that gives
-    impulses has done so.
-    """
-    many = 1.0
-    mixed = 0
-    if synchronised == 1.0:
-        blocks = shape[SHAPE.all_blocks]
-        if block[marks + MARK.mixed * blocks + touched] == interval:
-            mixed = 1
-        if not ends:
-            many = 0.0
-            change = block[marks + touched]
-            if change // MANY == now:
-                many = ti.cast(MANY - change % MANY, ti.f32)
-            if mixed:
-                awaited = block[marks + MARK.awaited * blocks + touched] == now
-                many = 1.0 if begins == 1.0 or many > 0.0 or awaited else 0.0
-    return many, mixed
-
-
-@ti.func
-def waits(scene: ti.i32, scene_value: ti.template()) -> ti.i32:
-    """Whether particles may have steps of their own in this substep: not in an interval's last, which ends all."""
-    return scene_value[scene, VALUE.synchronised] == 1.0 and scene_value[scene, VALUE.interval_remaining] > 0.0
+def change_of(mark: ti.i32, now: ti.i32) -> ti.f32:
+    """For how many substeps a block changes in the substep `now`; 0 where it does not."""
+    many = 0.0
+    if mark // MANY == now:
+        many = ti.cast(MANY - mark % MANY, ti.f32)
+    return many
 
 
 @ti.func
@@ -371,7 +275,7 @@ def own_step(
     many = 1.0
     acting = step
     until = elapsed
-    if waits(scene, scene_value):
+    if scene_value[scene, VALUE.synchronised] == 1.0 and left > 0.0:
         whole = scene_value[scene, VALUE.whole_step]
         inverse_dx = setting[SETTING.inverse_cell_size]
         stiffness = foreseen_stiffness(C, volume, material, left + step, inverse_dx, law, row, variant)
@@ -385,7 +289,7 @@ def own_step(
             many = ti.floor(0.5 * total / ti.ceil(total / alike - 1e-3) + 0.501)
             until = begin
             interval = ti.cast(counter[scene, COUNT.transfers], ti.i32)
-            others = marks + MARK.alike * shape[SHAPE.all_blocks]
+            others = marks + shape[SHAPE.all_blocks]
             if not _alike_around(x, scene, interval, alike, inverse_dx, shape, block, others):
                 spreads = 1
         elif steps <= 1.0:
@@ -395,6 +299,8 @@ def own_step(
             many = ti.floor(2.0 * (before + (elapsed + left - before) / steps - begin) / whole + 1e-3)
             many = ti.min(ti.max(many, 1.0), ti.round(left / whole + 0.5))
             until = begin + 0.5 * many * whole
+        now = ti.cast(counter[scene, COUNT.substeps], ti.i32)
+        mark_changed(x, scene, now, 1.0 if spreads else ti.min(many, MANY), inverse_dx, shape, block, marks)
         acting = step + ti.min((many - 1.0) * whole, left)
     acts_until = begin + acting
     length = until - before

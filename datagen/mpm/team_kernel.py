@@ -17,19 +17,7 @@ With one thread a block it runs on a CPU too; the tests check it there against t
 import taichi as ti
 
 from datagen.mpm.device_memory import load, store
-from datagen.mpm.layout import (
-    COUNT,
-    FIELD,
-    LISTED,
-    LIVE,
-    SETTING,
-    SHAPE,
-    STATUS,
-    TAG,
-    VALUE,
-    VARIANT,
-    has_solid,
-)
+from datagen.mpm.layout import COUNT, FIELD, LIVE, SETTING, SHAPE, STATUS, TAG, VALUE, VARIANT, has_solid
 from datagen.mpm.mls_mpm import (
     Integers,
     Scalars,
@@ -37,10 +25,8 @@ from datagen.mpm.mls_mpm import (
     acts,
     find_hidden,
     initial_stiffness,
-    looks_next,
     mark,
-    mark_awaited,
-    mark_step,
+    mark_changed,
     move,
     own_step,
     respond,
@@ -74,14 +60,6 @@ from hgn.scene.material import MATERIAL_BITS, MATERIAL_MASK, SAND, WATER
 
 CPU_ITEMS = 512  # of a loop, that Taichi gives to a thread of a CPU at once: a block of one thread
 CHUNK = 32  # particles that follow each other, of one block of a team
-# of a particle whose stress acts evenly: it will from the next substep on, or does
-SPREADS_FROM_HERE, SPREADS = 2, 1
-
-
-@ti.func
-def _response(response: ti.template(), p: ti.i32, stride: ti.i32):
-    six = ti.Vector([response[p + i * stride] for i in range(6)])
-    return ti.Matrix([[six[0], six[3], six[4]], [six[3], six[1], six[5]], [six[4], six[5], six[2]]])
 
 
 @ti.func
@@ -125,7 +103,6 @@ def _strain(
     """
     solid = ti.static(has_solid(variant))
     intervals = ti.static(not variant & VARIANT.each_step)
-    marks = LISTED * shape[SHAPE.all_blocks]
     largest = 0.0
     held = 0.0
     fastest = 0.0
@@ -139,14 +116,18 @@ def _strain(
             last = covered[first + p]
             reached = ti.abs(last)
             if not acts(reached, begins, step, scene, scene_value):
-                if spread[first + p] == SPREADS_FROM_HERE:
-                    put_matrix(state, place, stride, FIELD.affine, _response(response, first + p, stride))
-                    spread[first + p] = SPREADS
+                if spread[first + p] == 1:
+                    six = ti.Vector([step * response[first + p + i * stride] for i in range(6)])
+                    A = ti.Matrix([[six[0], six[3], six[4]], [six[3], six[1], six[5]], [six[4], six[5], six[2]]])
+                    put_matrix(state, place, stride, FIELD.affine, A)
+                    if scene_value[scene, VALUE.interval_remaining] > 0.0:
+                        mark_changed(
+                            get_vector(state, place, stride, FIELD.position), scene,
+                            ti.cast(counter[scene, COUNT.substeps], ti.i32), 1.0, setting[SETTING.inverse_cell_size],
+                            shape, block, 3 * shape[SHAPE.all_blocks],
+                        )  # fmt: skip
                 elif last < 0.0:
                     covered[first + p] = reached
-                if looks_next(reached, scene, scene_value):
-                    x_now = get_vector(state, place, stride, FIELD.position)
-                    mark_awaited(x_now, scene, counter, shape, block, marks, setting)
                 continue
         x = get_vector(state, place, stride, FIELD.position)
         C = ti.Matrix.zero(ti.f32, 3, 3)
@@ -176,33 +157,22 @@ def _strain(
             row = tag[tags + TAG.law_row * stride + p]
         material = tag[tags + TAG.material * stride + p]
         old_volume = load(state, place + FIELD.volume * stride)
-        length, many, spreads, acting = step, 1.0, 0, step
+        length, acting, many, spreads = step, step, 1.0, 0
         if ti.static(intervals):
             length, until, acts_until, many, spreads, acting = own_step(
                 strained[first + p], reached, spread[first + p], x, C, old_volume, material, row, begins, step, scene,
-                counter, shape, block, marks, scene_value, setting, law, variant,
+                counter, shape, block, 3 * shape[SHAPE.all_blocks], scene_value, setting, law, variant,
             )  # fmt: skip
-            mark_step(x, acts_until, many, spreads, begins, scene, counter, shape, block, marks, scene_value, setting)
             strained[first + p] = until
             covered[first + p] = -acts_until
+            spread[first + p] = spreads
         answer, new_stretch, new_F, volume, stiffness = respond(
             C, stretch, F, old_volume, material, row, length, scene, counter, setting, law, variant
         )
-        given = begins * C + acting * answer
-        if ti.static(intervals):
-            before = spread[first + p]
-            now_spread = 0
-            if spreads:
-                now_spread = SPREADS_FROM_HERE
-                if begins == 0.0:
-                    now_spread = SPREADS
-                    given = answer
-                    if before == SPREADS:
-                        given -= _response(response, first + p, stride)
-                for i, j, k in ti.static(((0, 0, 0), (1, 1, 1), (2, 2, 2), (3, 0, 1), (4, 0, 2), (5, 1, 2))):
-                    response[first + p + i * stride] = answer[j, k]
-            spread[first + p] = now_spread
-        put_matrix(state, place, stride, FIELD.affine, given)
+        if ti.static(intervals) and spreads:
+            for i, j, k in ti.static(((0, 0, 0), (1, 1, 1), (2, 2, 2), (3, 0, 1), (4, 0, 2), (5, 1, 2))):
+                response[first + p + i * stride] = answer[j, k]
+        put_matrix(state, place, stride, FIELD.affine, begins * C + acting * answer)
         if ti.static(solid):
             put_matrix(state, place, stride, FIELD.deformation, new_F)
             if ti.static(intervals):
@@ -310,13 +280,12 @@ def advance(
 
     Each of `teams` has `blocks` blocks of `threads` threads, and takes one scene after another; with `several`
     blocks all of the launch have to run at once. Particles are sorted at the begin of each frame. With P particles
-    and G nodes of all scenes there are at addresses (see device_memory) state [2 * fields * P], and node [3, G, 4],
-    which holds what comes to momentum in a step and to mass in an interval, zero between them; then velocities,
-    with the mass for an interval's end; then forces that act evenly. Arrays: tag [2 * 3 * P]; rank, spread,
-    response [6 * P], hidden (see grid_kernel.substep) and column_list [P] are work space; cell_count [G],
-    column_count [G / 4], the flags in block [10 * G / 64], columns [3 * blocks * teams] and
-    meeting [MEETING * (teams + 1)] are zero at first; turn [scenes] says which scene comes when (long ones first).
-    A scene that failed keeps still.
+    and G nodes of all scenes there are at addresses (see device_memory) state [2 * fields * P], and node [2, G, 4],
+    which holds what comes to momentum in a step and to mass in an interval, zero between them, and then velocities,
+    with the mass for an interval's end. Arrays: tag [2 * 3 * P]; rank, spread, response [6 * P], hidden (see
+    grid_kernel.substep) and column_list [P] are work space; cell_count [G], column_count [G / 4], the flags in
+    block [8 * G / 64], columns [3 * blocks * teams] and meeting [MEETING * (teams + 1)] are zero at first; turn
+    [scenes] says which scene comes when (long ones first). A scene that failed keeps still.
     """
     ti.loop_config(block_dim=threads)
     for item in range(teams * (blocks * ti.static(threads if threads > 1 else CPU_ITEMS))):
@@ -329,7 +298,7 @@ def advance(
         lane = item % items
         member = part * threads + lane
         stride = rank.shape[0]
-        velocities = node_entries // 3
+        velocities = node_entries // 2
         state = state_address
         node = node_address
         meetings = 0
@@ -370,17 +339,16 @@ def advance(
                 tags = copy * TAG.length * stride + first
                 while going:
                     step = scene_value[scene, VALUE.time_step]
-                    begins, left, synchronised = 1.0, 0.0, 0.0
+                    begins, left, some_wait = 1.0, 0.0, False
                     if ti.static(not variant & VARIANT.each_step):
                         begins = scene_value[scene, VALUE.begins]
                         left = scene_value[scene, VALUE.interval_remaining]
-                        synchronised = scene_value[scene, VALUE.synchronised]
+                        some_wait = left > 0.0 and scene_value[scene, VALUE.synchronised] == 1.0
                     ends = left == 0.0
                     whole = scene_value[scene, VALUE.whole_step]
                     gravity_time = scene_value[scene, VALUE.gravity_time]
                     fallen = scene_value[scene, VALUE.fallen]
                     now = ti.cast(counter[scene, COUNT.substeps], ti.i32)
-                    interval = ti.cast(counter[scene, COUNT.transfers], ti.i32)
                     going = step > 0.0 and columns[segment + LEAVES] == 0
                     if going:
                         if begins == 1.0 and not sorted_already:
@@ -400,18 +368,16 @@ def advance(
                         )  # fmt: skip
                         wait(threads)
                         scatter(
-                            owned, part, chunk, blocks, lane, scene, first, particles, tags, stride, velocities,
-                            begins, state, tag, covered, spread, hidden, node, setting, law, shape, contact, variant,
-                            threads, run,
+                            owned, part, chunk, blocks, lane, scene, first, particles, tags, stride, begins, state,
+                            tag, covered, hidden, node, setting, law, shape, contact, variant, threads, run,
                         )  # fmt: skip
                         meet_team(at, lane, meetings, meeting, columns, segment, patience, threads, several, blocks)
                         # a thread that hardly has nodes of its own, while the others are at theirs
                         if not ends and member == members - 1:
                             choose(scene, scene_value, counter, setting, shape, live)
                         update_nodes(
-                            member, scene, velocities, begins, ends, synchronised, now, interval, whole, left,
-                            gravity_time, fallen, block, live, node, scene_value, shape, contact, contact_normal,
-                            variant, members,
+                            member, scene, velocities, begins, ends, some_wait, now, whole, left, gravity_time, fallen,
+                            block, live, node, scene_value, shape, contact, contact_normal, variant, members,
                         )  # fmt: skip
                         meet_team(at, lane, meetings, meeting, columns, segment, patience, threads, several, blocks)
                         if ends:

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from datagen.mpm.launch import Launch, device_array
-from datagen.mpm.layout import BLOCK, BLOCK_NODES, COUNT, FIELD, LISTED, LIVE, MARK, TAG, has_solid
+from datagen.mpm.layout import BLOCK, BLOCK_NODES, COUNT, FIELD, LIVE, TAG, has_solid
 from hgn.schema import ConfigError
 
 import taichi as ti  # isort: skip
@@ -43,7 +43,7 @@ class BlocksApartError(Exception):
 class TeamLaunch(Launch):
     """Particles in one array, field by field, in two copies."""
 
-    entries_a_node = 3 * LANES
+    entries_a_node = 2 * LANES
 
     def __init__(self, team: Team, teams: int, *batch: Any) -> None:
         super().__init__(*batch)
@@ -66,7 +66,7 @@ class TeamLaunch(Launch):
         self.covered = ti.ndarray(ti.f32, self.particles)
         self.spread = ti.ndarray(ti.i32, self.particles)
         self.response = ti.ndarray(ti.f32, 6 * self.particles)
-        self.block = ti.ndarray(ti.i32, (LISTED + MARK.length) * self.all_blocks)
+        self.block = ti.ndarray(ti.i32, 8 * self.all_blocks)
         self.turn = ti.ndarray(ti.i32, len(self.scenes))
         self.meeting = ti.ndarray(ti.i32, (self.teams + 1) * MEETING)
         self.columns = ti.ndarray(ti.i32, SEGMENT * self.teams * team.blocks)

@@ -7,7 +7,7 @@ and z of momentum, and mass): together they add up whole sectors of memory.
 import taichi as ti
 
 from datagen.mpm.device_memory import add, load, load4, store4
-from datagen.mpm.layout import BLOCK_NODES, CONSTANT, FIELD, LISTED, LIVE, SETTING, SHAPE, TAG, VARIANT
+from datagen.mpm.layout import BLOCK_NODES, CONSTANT, FIELD, LIVE, SETTING, SHAPE, TAG, VARIANT
 from datagen.mpm.mls_mpm import (
     base_node,
     change_of,
@@ -23,7 +23,6 @@ from datagen.mpm.time_step import falls
 
 LANES = 4  # components of a node, and threads that share a particle where it gives to nodes
 MASS = 3  # the component
-AT_ONCE = 2  # nodes of a block that a thread updates
 
 
 @ti.func
@@ -104,15 +103,6 @@ def _next_acting(p: ti.i32, end: ti.i32, first: ti.i32, begins: ti.f32, covered:
 
 
 @ti.func
-def _section(p: ti.i32, velocities: ti.i32, begins: ti.f32, spread: ti.template()) -> ti.i32:
-    """Where what a particle gives goes to in `node`: to momentum, or to forces that act evenly."""
-    section = 0
-    if begins == 0.0 and spread[p] != 0:
-        section = 2 * velocities
-    return section
-
-
-@ti.func
 def scatter(
     owned: ti.i32,
     part: ti.i32,
@@ -124,12 +114,10 @@ def scatter(
     particles: ti.i32,
     tags: ti.i32,
     stride: ti.i32,
-    velocities: ti.i32,
     begins: ti.f32,
     state: ti.template(),
     tag: ti.template(),
     covered: ti.template(),
-    spread: ti.template(),
     hidden: ti.template(),
     node: ti.template(),
     setting: ti.template(),
@@ -141,9 +129,8 @@ def scatter(
     run: ti.template(),
 ):
     """Adds what each particle that acts gives to its 27 nodes: momentum and mass, in later steps of an interval what
-    forces change in momentum, or, of stress that acts evenly, how the forces themselves change. A thread adds up what
-    `run` particles in their order give, in a window of nodes that goes up a column with them; what it leaves goes to
-    the nodes.
+    forces change in momentum. A thread adds up what `run` particles in their order give, in a window of nodes that goes
+    up a column with them; what it leaves goes to the nodes.
     """
     dx = setting[SETTING.cell_size]
     inverse_dx = setting[SETTING.inverse_cell_size]
@@ -161,11 +148,9 @@ def scatter(
         gain = ti.Vector([0.0 for _ in range(27)])
         base = ti.Vector([0, 0, 0])
         x = ti.Vector([0.0, 0.0, 0.0])
-        section = 0
         if p < end:
             x = get_vector(state, particles + p, stride, FIELD.position)
             base = base_node(x, inverse_dx)
-            section = _section(first + p, velocities, begins, spread)
         while p < end:
             place = particles + p
             fx = x * inverse_dx - ti.cast(base, ti.f32)
@@ -201,19 +186,17 @@ def scatter(
                         away = ti.cast(corner, ti.f32)
                         weight = spline(away[0] - fx[0]) * spline(away[1] - fx[1]) * spline(away[2] - fx[2])
                         ghost = ghost_place(base + corner, scene, contact, shape)
-                        add(node, section + LANES * ghost + component, weight * (v + A.dot(away)))
+                        add(node, LANES * ghost + component, weight * (v + A.dot(away)))
                     bits >>= 1
                     n += 1
             p = _next_acting(p + 1, end, first, begins, covered)
             following = base
-            next_section = section
             if p < end:
                 x = get_vector(state, particles + p, stride, FIELD.position)
                 following = base_node(x, inverse_dx)
-                next_section = _section(first + p, velocities, begins, spread)
-            if p == end or (following != base).any() or next_section != section:
-                climbs = p < end and (following == base + ti.Vector([0, 1, 0])).all() and next_section == section
-                index_x, index_y, index_z = node_places(base, section + first_entry + component, shape, LANES)
+            if p == end or (following != base).any():
+                climbs = p < end and (following == base + ti.Vector([0, 1, 0])).all()
+                index_x, index_y, index_z = node_places(base, first_entry + component, shape, LANES)
                 for i, k in ti.static(ti.ndrange(3, 3)):
                     add(node, index_x[i] + index_y[0] + index_z[k], gain[9 * i + k])
                     gain[9 * i + k] = gain[9 * i + 3 + k]
@@ -224,23 +207,25 @@ def scatter(
                         add(node, index_x[i] + index_y[j + 1] + index_z[k], gain[9 * i + 3 * j + k])
                         gain[9 * i + 3 * j + k] = 0.0
                 base = following
-                section = next_section
         task += threads
 
 
 @ti.func
-def _read_node(place: ti.i32, velocities: ti.i32, begins: ti.f32, mixed: ti.i32, node: ti.template()):
-    """What came to its momentum, with its mass; its velocity before (none where an interval begins), with the time that
-    it has fallen in this interval; and the force that acts evenly, none yet where it begins.
+def _read_node(place: ti.i32, velocities: ti.i32, begins: ti.f32, node: ti.template()):
+    """What came to its momentum, its mass, and its velocity before (none where an interval begins), with the time that
+    it has fallen in this interval.
     """
-    zero = ti.Vector([0.0 for _ in range(LANES)])
-    before, force = zero, zero
-    gain = load4(node, place)
+    before = ti.Vector([0.0, 0.0, 0.0, 0.0])
     if begins == 0.0:
         before = load4(node, velocities + place)
-        if mixed:
-            force = load4(node, 2 * velocities + place)
-    return gain, before, force
+    gain = load4(node, place)
+    return _vector(gain), gain[MASS], before
+
+
+@ti.func
+def _write_node(place: ti.i32, velocities: ti.i32, v, mass: ti.f32, ends: ti.i32, fallen: ti.f32, node: ti.template()):
+    store4(node, place, 0.0, 0.0, 0.0, 0.0 if ends else mass)
+    store4(node, velocities + place, v[0], v[1], v[2], mass if ends else fallen)
 
 
 @ti.func
@@ -248,9 +233,8 @@ def _update(
     place: ti.i32,
     facing: ti.i32,
     gain,
+    mass: ti.f32,
     before,
-    force,
-    mixed: ti.i32,
     velocities: ti.i32,
     local: ti.i32,
     corner: ti.i32,
@@ -267,16 +251,11 @@ def _update(
     variant: ti.template(),
 ):
     ahead = before[MASS] - fallen if begins == 0.0 else 0.0
-    time = gravity_time + lead - ahead  # since the node was updated
-    mass = gain[MASS]
+    fall = falls(gravity_time + lead - ahead, scene, scene_value)
     v = node_velocity(
-        _vector(before), _vector(gain) + time * _vector(force), mass, local, facing, corner,
-        falls(time, scene, scene_value), scene, scene_value, shape, contact_normal, variant,
-    )  # fmt: skip
-    store4(node, place, 0.0, 0.0, 0.0, 0.0 if ends else mass)
-    store4(node, velocities + place, v[0], v[1], v[2], mass if ends else fallen + gravity_time + lead)
-    if begins == 1.0 and mixed:
-        store4(node, 2 * velocities + place, 0.0, 0.0, 0.0, 0.0)
+        _vector(before), gain, mass, local, facing, corner, fall, scene, scene_value, shape, contact_normal, variant
+    )
+    _write_node(place, velocities, v, mass, ends, fallen + gravity_time + lead, node)
 
 
 @ti.func
@@ -286,9 +265,8 @@ def update_nodes(
     velocities: ti.i32,
     begins: ti.f32,
     ends: ti.i32,
-    synchronised: ti.f32,
+    some_wait: ti.i32,
     now: ti.i32,
-    interval: ti.i32,
     whole_step: ti.f32,
     left: ti.f32,
     gravity_time: ti.f32,
@@ -304,53 +282,40 @@ def update_nodes(
     members: ti.i32,
 ):
     """New velocities of the nodes of all blocks that particles touch; within an interval of those alone whose particles
-    act, or look at them in the next substep.
+    act.
     """
     block_list = shape[SHAPE.all_blocks] + scene * shape[SHAPE.scene_blocks]
-    apart = ti.static(BLOCK_NODES // AT_ONCE)
-    count = live[scene * LIVE.length + LIVE.blocks] * apart
+    count = live[scene * LIVE.length + LIVE.blocks] * BLOCK_NODES
     n = member
     while n < count:
-        touched = block[block_list + n // apart]
-        corner = block[block_list + shape[SHAPE.all_blocks] + n // apart]
-        first_local = n % apart
+        touched = block[block_list + n // BLOCK_NODES]
+        corner = block[block_list + shape[SHAPE.all_blocks] + n // BLOCK_NODES]
+        local = n % BLOCK_NODES
         n += members
-        many, mixed = change_of(
-            touched, synchronised, begins, ends, now, interval, shape, block, LISTED * shape[SHAPE.all_blocks]
-        )
-        if many == 0.0:
-            continue
+        many = 1.0
+        if some_wait:
+            many = change_of(block[3 * shape[SHAPE.all_blocks] + touched], now)
+            if many == 0.0:
+                continue
         lead = ti.min((many - 1.0) * whole_step, left)
-        # all that is read, of all nodes at once, before anything is written: each is a way to memory, and Taichi looks
-        # up where an array lies anew after each store
-        first_node = touched * BLOCK_NODES + first_local
-        entry = ti.Vector([-1 for _ in range(AT_ONCE)])
+        # all that is read, before anything is written: Taichi looks up where an array lies anew after each store
+        place = LANES * (touched * BLOCK_NODES + local)
+        entry = -1
         if ti.static(bool(variant & VARIANT.contact)):
-            for i in ti.static(range(AT_ONCE)):
-                entry[i] = contact[first_node + i * apart]
-        read = ti.Matrix.zero(ti.f32, AT_ONCE, 3 * LANES)
-        for i in ti.static(range(AT_ONCE)):
-            gain, before, force = _read_node(LANES * (first_node + i * apart), velocities, begins, mixed, node)
-            for j in ti.static(range(LANES)):
-                read[i, j], read[i, LANES + j], read[i, 2 * LANES + j] = gain[j], before[j], force[j]
-        if first_local == 0:
+            entry = contact[touched * BLOCK_NODES + local]
+        gain, mass, before = _read_node(place, velocities, begins, node)
+        if local == 0:
             block[touched] = 0
-        for i in ti.static(range(AT_ONCE)):
-            gain = ti.Vector([read[i, j] for j in range(LANES)])
-            before = ti.Vector([read[i, LANES + j] for j in range(LANES)])
-            force = ti.Vector([read[i, 2 * LANES + j] for j in range(LANES)])
-            if gain[MASS] > 0.0:  # others keep a velocity of before, in which no particle has a share
+        if mass > 0.0:  # others keep a velocity of before, in which no particle has a share
+            _update(
+                place, 2 * entry, gain, mass, before, velocities, local, corner, scene, begins, ends, gravity_time,
+                lead, fallen, node, scene_value, shape, contact_normal, variant,
+            )  # fmt: skip
+        if ti.static(bool(variant & VARIANT.sheets)):  # noqa: SIM102 (this one is the compiler's)
+            if entry >= 0 and entry < shape[SHAPE.ghosts]:
+                ghost = LANES * (shape[SHAPE.ghost_begin] + entry)
+                gain_there, mass_there, before_there = _read_node(ghost, velocities, begins, node)
                 _update(
-                    LANES * (first_node + i * apart), 2 * entry[i], gain, before, force, mixed, velocities,
-                    first_local + i * apart, corner, scene, begins, ends, gravity_time, lead, fallen, node, scene_value,
-                    shape, contact_normal, variant,
+                    ghost, 2 * entry + 1, gain_there, mass_there, before_there, velocities, local, corner, scene,
+                    begins, ends, gravity_time, lead, fallen, node, scene_value, shape, contact_normal, variant,
                 )  # fmt: skip
-            if ti.static(bool(variant & VARIANT.sheets)):  # noqa: SIM102 (this one is the compiler's)
-                if entry[i] >= 0 and entry[i] < shape[SHAPE.ghosts]:
-                    ghost = LANES * (shape[SHAPE.ghost_begin] + entry[i])
-                    gain_there, before_there, force_there = _read_node(ghost, velocities, begins, mixed, node)
-                    _update(
-                        ghost, 2 * entry[i] + 1, gain_there, before_there, force_there, mixed, velocities,
-                        first_local + i * apart, corner, scene, begins, ends, gravity_time, lead, fallen, node,
-                        scene_value, shape, contact_normal, variant,
-                    )  # fmt: skip
