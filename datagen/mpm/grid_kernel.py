@@ -14,8 +14,6 @@ from datagen.mpm.mls_mpm import (
     Nodes,
     Scalars,
     Vectors,
-    acts,
-    change_of,
     find_hidden,
     ghost_place,
     initial_stiffness,
@@ -23,16 +21,15 @@ from datagen.mpm.mls_mpm import (
     interpolate_hidden,
     is_fluid,
     mark,
-    mark_changed,
     move,
     node_places,
     node_velocity,
-    own_step,
     respond,
     settle,
     settles,
     weights,
 )
+from datagen.mpm.multiple_time_stepping import acts, change_of, mark_changed, own_step
 from datagen.mpm.time_step import choose_time_step, falls, raise_maximum
 from hgn.scene.material import MATERIAL_BITS, MATERIAL_MASK, SAND, WATER
 

@@ -12,18 +12,12 @@ from half a step before to half a step after the time that it is of: so transfer
 stresses (velocity Verlet). Were they half a step ahead, what is taken away from them would give energy to oscillations
 of half a period an interval, up to twice as much in each.
 
-Particles that bear longer steps take steps of their own of several substeps, as long as their own wave speed allows
-(multiple time stepping; Streett et al. 1978): their stress is found once a step and acts evenly over its substeps, for
-whatever takes others beside it looks at the nodes meanwhile, and would see of an impulse given at once velocities that
-nothing has, even of what is at rest. Where all that share a block of nodes take the same steps nobody looks: there the
-impulse of a step goes to the nodes in its first substep, with that of gravity, and until the next the block is left as
-it is.
-
 In an interval's first substep particles give mass and momentum to the nodes and force; in the others they stay where
 they are on the grid, take the gradient of the nodes' velocities for strain and stress, and give force alone, as in the
 Lagrangian phase of the classical method (Sulsky et al. 1994). After the last they take velocity and gradient, and move
 by the interval times that velocity: momentum and angular momentum are kept, as stresses are symmetric and each particle
-moves along its velocity. Within an interval no velocity is smoothed.
+moves along its velocity. Within an interval no velocity is smoothed. Which particles find a new stress in a substep is
+the subject of multiple_time_stepping.
 
 Positions belong to the ends of intervals, velocities to their middles (leapfrog): gravity acts for half the last and
 half the present interval, at first for half of the first, so that free fall is v t + g t² / 2 at the end of each,
@@ -38,7 +32,6 @@ import taichi as ti
 from datagen.mpm.constitutive import (
     STIFFENING_MARGIN,
     count_event,
-    foreseen_stiffness,
     hardening,
     settled,
     solid,
@@ -59,8 +52,6 @@ from datagen.mpm.layout import (
 from datagen.mpm.surface_kernel import MOVING_NODE_VECTORS, NODE_VECTORS, hidden_nodes, meet, stop_at_surface
 from hgn.scene.material import FLUIDS, SNOW
 
-MANY = 32  # substeps at most of a step of a particle's own
-SLACK = 1e-3  # of a substep, within which times are the same
 SMALLEST_MASS = 1e-10  # of a particle; lighter nodes are at the rounding of the weights
 
 Scalars = ti.types.ndarray(dtype=ti.f32, ndim=1)
@@ -143,175 +134,6 @@ def mark(
                 entry = list_begin + ti.atomic_add(length[length_at], 1)
                 block[entry] = index[n]
                 block[entry + shape[SHAPE.all_blocks]] = (corner[n, 0] << 20) | (corner[n, 1] << 10) | corner[n, 2]
-
-
-@ti.func
-def _corner_block(first, last, n: ti.template(), scene: ti.i32, shape: ti.template()) -> ti.i32:
-    """Of the blocks from `first` to `last` that a particle's nodes lie in, the one at corner n of eight."""
-    corner = ti.Vector([last[axis] if n >> (2 - axis) & 1 else first[axis] for axis in range(3)])
-    index = (corner[0] * shape[SHAPE.blocks + 1] + corner[1]) * shape[SHAPE.blocks + 2] + corner[2]
-    return index + scene * shape[SHAPE.scene_blocks]
-
-
-@ti.func
-def mark_changed(
-    x,
-    scene: ti.i32,
-    now: ti.i32,
-    many: ti.f32,
-    inverse_dx: ti.f32,
-    shape: ti.template(),
-    block: ti.template(),
-    begin: ti.i32,
-):
-    """Writes down, from block[begin] on, that the blocks of the particle's nodes change in the substep `now`, and for
-    how many substeps, the fewest of all that change them (see change_of).
-    """
-    base = base_node(x, inverse_dx)
-    change = now * MANY + MANY - ti.cast(many, ti.i32)
-    for n in ti.static(range(8)):
-        index = begin + _corner_block(base >> 2, (base + 2) >> 2, n, scene, shape)
-        if block[index] < change:
-            ti.atomic_max(block[index], change)
-
-
-@ti.func
-def _alike_around(
-    x,
-    scene: ti.i32,
-    interval: ti.i32,
-    own: ti.f32,
-    inverse_dx: ti.f32,
-    shape: ti.template(),
-    block: ti.template(),
-    begin: ti.i32,
-) -> ti.i32:
-    """Whether all particles in the blocks of a particle's nodes began the interval before with steps of `own` substeps;
-    what this one takes is written down for the next. Marks begin at block[begin]: of even intervals the fewest substeps
-    and the most, then of odd ones.
-    """
-    base = base_node(x, inverse_dx)
-    blocks = shape[SHAPE.all_blocks]
-    present = begin + 2 * (interval & 1) * blocks
-    former = begin + 2 * ((interval - 1) & 1) * blocks
-    many = ti.cast(own, ti.i32)
-    fewest, most = interval * MANY + MANY - many, interval * MANY + many - 1
-    alike = 1
-    for n in ti.static(range(8)):
-        index = _corner_block(base >> 2, (base + 2) >> 2, n, scene, shape)
-        if block[former + index] != fewest - MANY or block[former + blocks + index] != most - MANY:
-            alike = 0
-        if block[present + index] < fewest:
-            ti.atomic_max(block[present + index], fewest)
-        if block[present + blocks + index] < most:
-            ti.atomic_max(block[present + blocks + index], most)
-    return alike
-
-
-@ti.func
-def change_of(mark: ti.i32, now: ti.i32) -> ti.f32:
-    """For how many substeps a block changes in the substep `now`; 0 where it does not."""
-    many = 0.0
-    if mark // MANY == now:
-        many = ti.cast(MANY - mark % MANY, ti.f32)
-    return many
-
-
-@ti.func
-def acts(covered: ti.f32, begins: ti.f32, step: ti.f32, scene: ti.i32, scene_value: ti.template()) -> ti.i32:
-    """Whether a particle takes a step of its own in this substep: its last one ends within it."""
-    return begins == 1.0 or covered < scene_value[scene, VALUE.interval_elapsed] - SLACK * step
-
-
-@ti.func
-def own_step(
-    strained: ti.f32,
-    covered: ti.f32,
-    spread: ti.i32,
-    x,
-    C,
-    volume: ti.f32,
-    material: ti.i32,
-    row: ti.i32,
-    begins: ti.f32,
-    step: ti.f32,
-    scene: ti.i32,
-    counter: ti.template(),
-    shape: ti.template(),
-    block: ti.template(),
-    marks: ti.i32,
-    scene_value: ti.template(),
-    setting: ti.template(),
-    law: ti.template(),
-    variant: ti.template(),
-):
-    """The step of a particle that acts now: how long it is strained, and until when in the interval that is; until when
-    its stress then acts, over how many substeps, whether evenly over these, and for how long in this one: its share of
-    the step where it does, else all of it. Marks of all are left from block[marks] on.
-
-    In a synchronised interval stress acts from half a step before to half a step after the time that it is of: the
-    first, of what the interval before has left, and the last act for half a step. What is left is cut into as few
-    equal steps as the particle's own stiffness allows, rounded down to substeps. Particles of the same `alike` have the
-    same steps.
-
-    `strained` and `covered` are until when the steps before have strained it, and their stresses act; `spread` whether
-    evenly. `strained` is less than 0 before the first step of all.
-    """
-    elapsed = scene_value[scene, VALUE.interval_elapsed]
-    left = scene_value[scene, VALUE.interval_remaining]
-    begin = elapsed - step
-    before = strained
-    ahead = covered - begin
-    if begins == 1.0:
-        before -= scene_value[scene, VALUE.last_interval]
-        ahead -= scene_value[scene, VALUE.last_interval]
-    if strained < 0.0:
-        before, ahead = begin, 0.0
-    if spread:
-        ahead = 0.0
-    spreads = spread
-    if begins == 1.0:
-        spreads = 0
-    many = 1.0
-    acting = step
-    until = elapsed
-    if scene_value[scene, VALUE.synchronised] == 1.0 and left > 0.0:
-        whole = scene_value[scene, VALUE.whole_step]
-        inverse_dx = setting[SETTING.inverse_cell_size]
-        stiffness = foreseen_stiffness(C, volume, material, left + step, inverse_dx, law, row, variant)
-        longest = scene_value[scene, VALUE.stability_fraction] * setting[SETTING.cell_size]
-        longest /= ti.sqrt(ti.max(stiffness, 1e-3)) * whole
-        longest = ti.min(ti.max(ti.floor(longest + 1e-4), 1.0), ti.cast(MANY, ti.f32))
-        total = (elapsed + left) / whole
-        alike = ti.ceil(total / ti.ceil(total / longest - 1e-3) - 1e-3)
-        steps = ti.ceil((elapsed + left - before) / (whole * alike) - 1e-3)
-        if begins == 1.0:
-            many = ti.floor(0.5 * total / ti.ceil(total / alike - 1e-3) + 0.501)
-            until = begin
-            interval = ti.cast(counter[scene, COUNT.transfers], ti.i32)
-            others = marks + shape[SHAPE.all_blocks]
-            if not _alike_around(x, scene, interval, alike, inverse_dx, shape, block, others):
-                spreads = 1
-        elif steps <= 1.0:
-            many = 1.0 + ti.round(left / whole + 0.5)
-            until = elapsed + left
-        else:
-            many = ti.floor(2.0 * (before + (elapsed + left - before) / steps - begin) / whole + 1e-3)
-            many = ti.min(ti.max(many, 1.0), ti.round(left / whole + 0.5))
-            until = begin + 0.5 * many * whole
-        now = ti.cast(counter[scene, COUNT.substeps], ti.i32)
-        mark_changed(x, scene, now, 1.0 if spreads else ti.min(many, MANY), inverse_dx, shape, block, marks)
-        acting = step + ti.min((many - 1.0) * whole, left)
-    acts_until = begin + acting
-    length = until - before
-    if ti.abs(before - begin) <= SLACK * step and until == elapsed:
-        length = step
-    length = ti.max(length, SLACK * step)
-    if spreads:
-        acting = step
-    elif ahead > SLACK * step:
-        acting = ti.max(acting - ahead, 0.0)
-    return length, before + length, acts_until, many, spreads, acting
 
 
 @ti.func
