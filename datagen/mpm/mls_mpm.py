@@ -3,14 +3,14 @@
 APIC transfers with quadratic B-splines (Jiang et al. 2015; Hu et al. 2018): a particle at x touches the nodes
 base .. base + 2 with base = floor(x / dx - 1/2); node I lies at I dx. Nodes are stored by blocks of 4 x 4 x 4,
 [scene, block, node in block]. Only blocks that a particle touches are updated; what particles give to nodes is added
-up apart from the nodes' velocities, and is zero between substeps. Masses are in units of a particle of the config's
-density.
+up apart from the nodes' velocities. Masses are in units of a particle of the config's density.
 
 Transfers come at a rate of their own, since each smooths velocities: an interval between two holds as many substeps
-as the stiffest particle needs. Of three and more its first and last are half as long as the others, and stress acts
-from half a step before to half a step after the time that it is of: so transfers find velocities of the same time as
-stresses (velocity Verlet). Were they half a step ahead, what is taken away from them would give energy to oscillations
-of half a period an interval, up to twice as much in each.
+as the stiffest particle needs. Where that is three or more, and the time step adaptive, the interval is synchronised:
+it has one substep more, and its first and last are half as long as the others. Stress then acts from half a step before
+to half a step after the time that it is of, so that transfers find velocities of the same time as stresses (velocity
+Verlet). Were velocities half a step ahead, their smoothing would feed oscillations of half a period an interval, whose
+energy could double in each.
 
 In an interval's first substep particles give mass and momentum to the nodes and force; in the others they stay where
 they are on the grid, take the gradient of the nodes' velocities for strain and stress, and give force alone, as in the
@@ -73,7 +73,7 @@ def weights(fx):
 
 @ti.func
 def spline(distance: ti.f32) -> ti.f32:
-    """The same weight from the distance to a node, in (-1.5, 1.5) cells."""
+    """The weight of a node from the distance to it along one axis, in (-1.5, 1.5) cells."""
     away = ti.abs(distance)
     outer = 1.5 - away
     return 0.75 - away * away if away < 0.5 else 0.5 * outer * outer
@@ -81,7 +81,7 @@ def spline(distance: ti.f32) -> ti.f32:
 
 @ti.func
 def _node_of_axis(index, stride: ti.i32, local_stride: ti.i32):
-    """The share of one axis in a node's position; shares of the three axes add up."""
+    """What a node's index along one axis adds to its place in an array; those of the three axes add up."""
     return (index >> 2) * stride + (index & 3) * local_stride
 
 
@@ -108,8 +108,9 @@ def mark(
 ):
     """Adds the blocks that the particle's nodes lie in, up to eight, to a list.
 
-    `block` holds a flag for each block of all scenes; from `list_begin` on the list of touched ones, whose length is
-    length[length_at]; and as many entries after each, its block's place along x, y, z in ten bits each.
+    `block` begins with a flag for each of the all_blocks blocks of all scenes. From `list_begin` on it lists the
+    indices of touched ones, length[length_at] of them; all_blocks after each entry lies its block's place along x, y,
+    z, in ten bits each.
     """
     base = base_node(x, inverse_dx)
     first = base >> 2
@@ -138,8 +139,8 @@ def mark(
 
 @ti.func
 def node_places(base, first_entry: ti.i32, shape: ti.template(), entries: ti.template()):
-    """Shares of x, y, z in the place of nodes base .. base + 2, in an array that holds so many entries for each node;
-    the place is the sum of one of each.
+    """Where nodes base .. base + 2 lie in an array of `entries` numbers a node, by axis: node base + (i, j, k) begins
+    at the sum of the first result's i, the second's j and the third's k. The scene's nodes begin at `first_entry`.
     """
     stride_z = BLOCK_NODES * entries
     stride_y = shape[SHAPE.blocks + 2] * stride_z
@@ -167,12 +168,15 @@ def respond(
     law: ti.template(),
     variant: ti.template(),
 ):
-    """The material's answer to a step of the gradient C, taken on the grid as it was when the interval began.
+    """The material's answer to a step of `step` seconds with the velocity gradient C, 1/s.
 
-    `stretch` is the sum of dt (C + Cᵀ) / 2 over the interval's steps so far: per length of now C - (C + Cᵀ) / 2 stretch
-    is the gradient, in first order, so that the steps of an interval together stretch F as one step would.
-    Returns the response, - V0 (4 / dx²) stress / mass, by which stress changes C in a second; the new stretch and F,
-    both as they were for water, and volume; and the present (3 lambda + 2 mu) / density.
+    Particles stay where the interval began, so C is a gradient by positions of then. By those of now it is
+    C - (C + Cᵀ) / 2 stretch, in first order of `stretch`, the sum of dt (C + Cᵀ) / 2 over the interval's steps so far.
+    With it the steps of an interval together stretch F as one step would.
+
+    Returns the response, - V0 (4 / dx²) stress / mass, by which stress changes APIC's C in a second; the new stretch
+    and F, both as they were for water; the new volume (see constitutive); and the present (3 lambda + 2 mu) / density,
+    m²/s².
     """
     has_water = ti.static(bool(variant & VARIANT.water))
     solids = ti.static(has_solid(variant))
@@ -244,11 +248,11 @@ def node_velocity(
     contact_normal: ti.template(),
     variant: ti.template(),
 ):
-    """The velocity of a node's field from the one before and what came to its momentum: gravity, colliders and walls
-    too.
+    """The new velocity of a node's field: what colliders, then walls, leave of `before` + `momentum` / `mass` + `fall`;
+    the momentum is what came to it, `fall` is gravity's. 0 where the mass is at the rounding of the weights.
 
-    The node is the `local` one of a block whose place along x, y, z is `corner`, in ten bits each; `facing` is that of
-    the field's contact, or less than 0; `fall` is what gravity adds.
+    The node is the `local` one of a block whose place along x, y, z is `corner`, in ten bits each. `facing` is twice
+    the node's entry in `contact_normal`, plus 1 for its second field, or less than 0 where no collider is.
     """
     v = ti.Vector([0.0, 0.0, 0.0])
     if mass > SMALLEST_MASS:
@@ -298,7 +302,7 @@ def node_velocity(
 
 @ti.func
 def interpolate(x, first_node: ti.i32, node: ti.template(), inverse_dx: ti.f32, shape: ti.template()):
-    """Velocity and its gradient at x, from the nodes around."""
+    """The velocity at x from the nodes around, and its gradient, APIC's C, 1/s. The scene's begin at `first_node`."""
     scaled = x * inverse_dx
     base = ti.floor(scaled - 0.5, ti.i32)
     fx = scaled - ti.cast(base, ti.f32)
@@ -333,7 +337,9 @@ def interpolate(x, first_node: ti.i32, node: ti.template(), inverse_dx: ti.f32, 
 
 @ti.func
 def _room(fx, base: ti.i32, axis: ti.template(), shape: ti.template()) -> ti.f32:
-    """The share of a particle's nodes, by weight, that lies between the walls of an axis."""
+    """The share of a particle's nodes, by weight, that lies between the walls of an axis; of each node the share of its
+    own spline that does.
+    """
     w0, w1, w2 = weights(fx)
     wall = shape[SHAPE.wall_cells]
     room = 0.0
@@ -369,7 +375,9 @@ def settle(
     setting: ti.template(),
     shape: ti.template(),
 ) -> ti.f32:
-    """J of a particle of water after an interval, nearer to what the masses of the nodes around, interpolated, tell."""
+    """J of a particle of water after an interval, nearer to what its density tells: that of the nodes around, whose
+    masses are interpolated to `mass`.
+    """
     scaled = x * setting[SETTING.inverse_cell_size]
     base = ti.floor(scaled - 0.5, ti.i32)
     fx = scaled - ti.cast(base, ti.f32)
@@ -407,8 +415,8 @@ def find_hidden(
     shape: ti.template(),
     variant: ti.template(),
 ) -> ti.i32:
-    """Which of a particle's nodes sheets hide from it (see surface_kernel.hidden_nodes); it shares their second field
-    with the others that they hide them from. Contacts were placed `elapsed` seconds ago, where any move.
+    """Which of a particle's nodes sheets hide from it, in bits (see surface_kernel.hidden_nodes). A node's second field
+    is shared by all particles that it is hidden from. Contacts that move were placed `elapsed` seconds ago.
     """
     bits = 0
     list_at = _triangle_list(x, scene, contact, setting, shape)
@@ -437,7 +445,7 @@ def interpolate_hidden(
     shape: ti.template(),
     contact: ti.template(),
 ):
-    """What `interpolate` gave, with the second fields of hidden nodes in place of their first."""
+    """The v and C that `interpolate` gave, with the second fields of hidden nodes in place of their first."""
     scaled = x * inverse_dx
     base = ti.floor(scaled - 0.5, ti.i32)
     new_v = v
@@ -473,8 +481,9 @@ def move(
     contact_normal: ti.template(),
     variant: ti.template(),
 ):
-    """The particle's new position and velocity; stops a scene that is not finite or leaves the domain. Also v² (0 if
-    so).
+    """The particle's position and velocity at the end of an interval, as triangles and bounds leave them, and v².
+
+    What is not finite, or leaves the domain, stops its scene; v² is 0 then.
     """
     out = x + scene_value[scene, VALUE.interval_elapsed] * v
     speed = v

@@ -19,7 +19,7 @@ from datagen.mpm.constitutive import foreseen_stiffness
 from datagen.mpm.layout import COUNT, SETTING, SHAPE, VALUE
 from datagen.mpm.mls_mpm import base_node
 
-MANY = 32  # substeps at most of a step of a particle's own
+MANY = 32  # substeps of a step of a particle's own at most, and as far as marks count
 SLACK = 1e-3  # of a substep, within which times are the same
 
 
@@ -42,8 +42,10 @@ def mark_changed(
     block: ti.template(),
     begin: ti.i32,
 ):
-    """Writes down, from block[begin] on, that the blocks of the particle's nodes change in the substep `now`, and for
-    how many substeps, the fewest of all that change them (see change_of).
+    """Marks the blocks of the particle's nodes: in the substep `now` it gives them the impulse of `many` substeps.
+
+    A block's mark is block[begin + its index], the largest now MANY + MANY - many of all that change the block: of the
+    latest substep that anything did, by the fewest substeps. change_of reads it.
     """
     base = base_node(x, inverse_dx)
     change = now * MANY + MANY - ti.cast(many, ti.i32)
@@ -65,8 +67,11 @@ def _alike_around(
     begin: ti.i32,
 ) -> ti.i32:
     """Whether all particles in the blocks of a particle's nodes began the interval before with steps of `own` substeps;
-    what this one takes is written down for the next. Marks begin at block[begin]: of even intervals the fewest substeps
-    and the most, then of odd ones.
+    what this one takes is marked for the next.
+
+    A block has four marks, each in an array of all blocks, the first from block[begin] on: the fewest substeps in even
+    intervals, the most in them, and both in odd ones. A mark holds the number of its interval too, so that one from
+    earlier is no match.
     """
     base = base_node(x, inverse_dx)
     blocks = shape[SHAPE.all_blocks]
@@ -88,7 +93,9 @@ def _alike_around(
 
 @ti.func
 def change_of(mark: ti.i32, now: ti.i32) -> ti.f32:
-    """For how many substeps a block changes in the substep `now`; 0 where it does not."""
+    """Of how many substeps a block takes impulses in the substep `now`, by its mark (see mark_changed); 0 where nothing
+    changes it.
+    """
     many = 0.0
     if mark // MANY == now:
         many = ti.cast(MANY - mark % MANY, ti.f32)
@@ -97,7 +104,9 @@ def change_of(mark: ti.i32, now: ti.i32) -> ti.f32:
 
 @ti.func
 def acts(covered: ti.f32, begins: ti.f32, step: ti.f32, scene: ti.i32, scene_value: ti.template()) -> ti.i32:
-    """Whether a particle takes a step of its own in this substep: its last one ends within it."""
+    """Whether a particle begins a step of its own in this substep: all do in an interval's first, and later those whose
+    last stress acts until `covered` (s, within the interval), before the substep ends.
+    """
     return begins == 1.0 or covered < scene_value[scene, VALUE.interval_elapsed] - SLACK * step
 
 
@@ -123,17 +132,21 @@ def own_step(
     law: ti.template(),
     variant: ti.template(),
 ):
-    """The step of a particle that acts now: how long it is strained, and until when in the interval that is; until when
-    its stress then acts, over how many substeps, whether evenly over these, and for how long in this one: its share of
-    the step where it does, else all of it. Marks of all are left from block[marks] on.
+    """The step of its own that a particle begins in this substep (see acts). Times are in s, within the interval.
 
-    In a synchronised interval stress acts from half a step before to half a step after the time that it is of: the
-    first, of what the interval before has left, and the last act for half a step. What is left is cut into as few
-    equal steps as the particle's own stiffness allows, rounded down to substeps. Particles of the same `alike` have the
-    same steps.
+    `strained` says until when the steps before have strained the particle, less than 0 before the first of all;
+    `covered` until when their stress acts; `spread` whether evenly. From block[marks] on lie the marks of mark_changed,
+    one a block, then those of _alike_around.
 
-    `strained` and `covered` are until when the steps before have strained it, and their stresses act; `spread` whether
-    evenly. `strained` is less than 0 before the first step of all.
+    Returns how long the step strains the particle; the new `strained` and `covered`; how many substeps the stress acts
+    for; the new `spread`; and for how long the stress acts in this substep: for the substep where evenly, else for all
+    of the step that the one before did not cover.
+
+    In a synchronised interval stress acts from half a step before to half a step after the time that it is of. The
+    first, of the interval's begin, and the last, of its end, act for half a step. What is left to strain is cut into as
+    few equal steps as the particle's own stiffness allows, rounded down to substeps. `alike` is how many substeps such
+    a step has; particles that keep the same `alike` have the same steps. In an interval that is not synchronised, and
+    in the last substep of each, a step is a substep.
     """
     elapsed = scene_value[scene, VALUE.interval_elapsed]
     left = scene_value[scene, VALUE.interval_remaining]
