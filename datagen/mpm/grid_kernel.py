@@ -14,8 +14,6 @@ from datagen.mpm.mls_mpm import (
     Nodes,
     Scalars,
     Vectors,
-    acts,
-    change_of,
     find_hidden,
     ghost_place,
     initial_stiffness,
@@ -23,16 +21,15 @@ from datagen.mpm.mls_mpm import (
     interpolate_hidden,
     is_fluid,
     mark,
-    mark_changed,
     move,
     node_places,
     node_velocity,
-    own_step,
     respond,
     settle,
     settles,
     weights,
 )
+from datagen.mpm.multiple_time_stepping import acts, change_of, mark_changed, own_step
 from datagen.mpm.time_step import choose_time_step, falls, raise_maximum
 from hgn.scene.material import MATERIAL_BITS, MATERIAL_MASK, SAND, WATER
 
@@ -250,8 +247,9 @@ def substep(
     stress), gravity, colliders, walls; in the last grid to particles, advection. `label` holds scene and material of
     each particle, `node` [scenes * blocks * 64] velocity and mass of nodes, `gain` [parts * scenes * blocks * 64] what
     comes to them, a copy of the grid for each part; both end with the second fields of nodes that sheets hide from some
-    particles, which `hidden` names for each particle (see surface_kernel.hidden_nodes). `block` ends with the length of
-    the list of touched blocks, and whether it is made anew, for all scenes, because an interval begins in one.
+    particles, which `hidden` names for each particle (see surface_kernel.hidden_nodes). `block` holds flags and list of
+    touched blocks (see mark), the list's length, whether it is made anew, for all scenes, because an interval begins in
+    one, and the marks of own_step.
     `contact` begins with the entry of each node, or -1: the place of its vectors in `contact_normal` (see
     surface_kernel.NODE_VECTORS), and below SHAPE.ghosts that of its second field from SHAPE.ghost_begin on. Then comes,
     for each base node, where its list of triangles begins in `contact` itself, or -1; then those lists, with their

@@ -3,27 +3,21 @@
 APIC transfers with quadratic B-splines (Jiang et al. 2015; Hu et al. 2018): a particle at x touches the nodes
 base .. base + 2 with base = floor(x / dx - 1/2); node I lies at I dx. Nodes are stored by blocks of 4 x 4 x 4,
 [scene, block, node in block]. Only blocks that a particle touches are updated; what particles give to nodes is added
-up apart from the nodes' velocities, and is zero between substeps. Masses are in units of a particle of the config's
-density.
+up apart from the nodes' velocities. Masses are in units of a particle of the config's density.
 
 Transfers come at a rate of their own, since each smooths velocities: an interval between two holds as many substeps
-as the stiffest particle needs. Of three and more its first and last are half as long as the others, and stress acts
-from half a step before to half a step after the time that it is of: so transfers find velocities of the same time as
-stresses (velocity Verlet). Were they half a step ahead, what is taken away from them would give energy to oscillations
-of half a period an interval, up to twice as much in each.
-
-Particles that bear longer steps take steps of their own of several substeps, as long as their own wave speed allows
-(multiple time stepping; Streett et al. 1978): their stress is found once a step and acts evenly over its substeps, for
-whatever takes others beside it looks at the nodes meanwhile, and would see of an impulse given at once velocities that
-nothing has, even of what is at rest. Where all that share a block of nodes take the same steps nobody looks: there the
-impulse of a step goes to the nodes in its first substep, with that of gravity, and until the next the block is left as
-it is.
+as the stiffest particle needs. Where that is three or more, and the time step adaptive, the interval is synchronised:
+it has one substep more, and its first and last are half as long as the others. Stress then acts from half a step before
+to half a step after the time that it is of, so that transfers find velocities of the same time as stresses (velocity
+Verlet). Were velocities half a step ahead, their smoothing would feed oscillations of half a period an interval, whose
+energy could double in each.
 
 In an interval's first substep particles give mass and momentum to the nodes and force; in the others they stay where
 they are on the grid, take the gradient of the nodes' velocities for strain and stress, and give force alone, as in the
 Lagrangian phase of the classical method (Sulsky et al. 1994). After the last they take velocity and gradient, and move
 by the interval times that velocity: momentum and angular momentum are kept, as stresses are symmetric and each particle
-moves along its velocity. Within an interval no velocity is smoothed.
+moves along its velocity. Within an interval no velocity is smoothed. Which particles find a new stress in a substep is
+the subject of multiple_time_stepping.
 
 Positions belong to the ends of intervals, velocities to their middles (leapfrog): gravity acts for half the last and
 half the present interval, at first for half of the first, so that free fall is v t + g t² / 2 at the end of each,
@@ -38,7 +32,6 @@ import taichi as ti
 from datagen.mpm.constitutive import (
     STIFFENING_MARGIN,
     count_event,
-    foreseen_stiffness,
     hardening,
     settled,
     solid,
@@ -59,8 +52,6 @@ from datagen.mpm.layout import (
 from datagen.mpm.surface_kernel import MOVING_NODE_VECTORS, NODE_VECTORS, hidden_nodes, meet, stop_at_surface
 from hgn.scene.material import FLUIDS, SNOW
 
-MANY = 32  # substeps at most of a step of a particle's own
-SLACK = 1e-3  # of a substep, within which times are the same
 SMALLEST_MASS = 1e-10  # of a particle; lighter nodes are at the rounding of the weights
 
 Scalars = ti.types.ndarray(dtype=ti.f32, ndim=1)
@@ -82,7 +73,7 @@ def weights(fx):
 
 @ti.func
 def spline(distance: ti.f32) -> ti.f32:
-    """The same weight from the distance to a node, in (-1.5, 1.5) cells."""
+    """The weight of a node from the distance to it along one axis, in (-1.5, 1.5) cells."""
     away = ti.abs(distance)
     outer = 1.5 - away
     return 0.75 - away * away if away < 0.5 else 0.5 * outer * outer
@@ -90,7 +81,7 @@ def spline(distance: ti.f32) -> ti.f32:
 
 @ti.func
 def _node_of_axis(index, stride: ti.i32, local_stride: ti.i32):
-    """The share of one axis in a node's position; shares of the three axes add up."""
+    """What a node's index along one axis adds to its place in an array; those of the three axes add up."""
     return (index >> 2) * stride + (index & 3) * local_stride
 
 
@@ -117,8 +108,9 @@ def mark(
 ):
     """Adds the blocks that the particle's nodes lie in, up to eight, to a list.
 
-    `block` holds a flag for each block of all scenes; from `list_begin` on the list of touched ones, whose length is
-    length[length_at]; and as many entries after each, its block's place along x, y, z in ten bits each.
+    `block` begins with a flag for each of the all_blocks blocks of all scenes. From `list_begin` on it lists the
+    indices of touched ones, length[length_at] of them; all_blocks after each entry lies its block's place along x, y,
+    z, in ten bits each.
     """
     base = base_node(x, inverse_dx)
     first = base >> 2
@@ -146,178 +138,9 @@ def mark(
 
 
 @ti.func
-def _corner_block(first, last, n: ti.template(), scene: ti.i32, shape: ti.template()) -> ti.i32:
-    """Of the blocks from `first` to `last` that a particle's nodes lie in, the one at corner n of eight."""
-    corner = ti.Vector([last[axis] if n >> (2 - axis) & 1 else first[axis] for axis in range(3)])
-    index = (corner[0] * shape[SHAPE.blocks + 1] + corner[1]) * shape[SHAPE.blocks + 2] + corner[2]
-    return index + scene * shape[SHAPE.scene_blocks]
-
-
-@ti.func
-def mark_changed(
-    x,
-    scene: ti.i32,
-    now: ti.i32,
-    many: ti.f32,
-    inverse_dx: ti.f32,
-    shape: ti.template(),
-    block: ti.template(),
-    begin: ti.i32,
-):
-    """Writes down, from block[begin] on, that the blocks of the particle's nodes change in the substep `now`, and for
-    how many substeps, the fewest of all that change them (see change_of).
-    """
-    base = base_node(x, inverse_dx)
-    change = now * MANY + MANY - ti.cast(many, ti.i32)
-    for n in ti.static(range(8)):
-        index = begin + _corner_block(base >> 2, (base + 2) >> 2, n, scene, shape)
-        if block[index] < change:
-            ti.atomic_max(block[index], change)
-
-
-@ti.func
-def _alike_around(
-    x,
-    scene: ti.i32,
-    interval: ti.i32,
-    own: ti.f32,
-    inverse_dx: ti.f32,
-    shape: ti.template(),
-    block: ti.template(),
-    begin: ti.i32,
-) -> ti.i32:
-    """Whether all particles in the blocks of a particle's nodes began the interval before with steps of `own` substeps;
-    what this one takes is written down for the next. Marks begin at block[begin]: of even intervals the fewest substeps
-    and the most, then of odd ones.
-    """
-    base = base_node(x, inverse_dx)
-    blocks = shape[SHAPE.all_blocks]
-    present = begin + 2 * (interval & 1) * blocks
-    former = begin + 2 * ((interval - 1) & 1) * blocks
-    many = ti.cast(own, ti.i32)
-    fewest, most = interval * MANY + MANY - many, interval * MANY + many - 1
-    alike = 1
-    for n in ti.static(range(8)):
-        index = _corner_block(base >> 2, (base + 2) >> 2, n, scene, shape)
-        if block[former + index] != fewest - MANY or block[former + blocks + index] != most - MANY:
-            alike = 0
-        if block[present + index] < fewest:
-            ti.atomic_max(block[present + index], fewest)
-        if block[present + blocks + index] < most:
-            ti.atomic_max(block[present + blocks + index], most)
-    return alike
-
-
-@ti.func
-def change_of(mark: ti.i32, now: ti.i32) -> ti.f32:
-    """For how many substeps a block changes in the substep `now`; 0 where it does not."""
-    many = 0.0
-    if mark // MANY == now:
-        many = ti.cast(MANY - mark % MANY, ti.f32)
-    return many
-
-
-@ti.func
-def acts(covered: ti.f32, begins: ti.f32, step: ti.f32, scene: ti.i32, scene_value: ti.template()) -> ti.i32:
-    """Whether a particle takes a step of its own in this substep: its last one ends within it."""
-    return begins == 1.0 or covered < scene_value[scene, VALUE.interval_elapsed] - SLACK * step
-
-
-@ti.func
-def own_step(
-    strained: ti.f32,
-    covered: ti.f32,
-    spread: ti.i32,
-    x,
-    C,
-    volume: ti.f32,
-    material: ti.i32,
-    row: ti.i32,
-    begins: ti.f32,
-    step: ti.f32,
-    scene: ti.i32,
-    counter: ti.template(),
-    shape: ti.template(),
-    block: ti.template(),
-    marks: ti.i32,
-    scene_value: ti.template(),
-    setting: ti.template(),
-    law: ti.template(),
-    variant: ti.template(),
-):
-    """The step of a particle that acts now: how long it is strained, and until when in the interval that is; until when
-    its stress then acts, over how many substeps, whether evenly over these, and for how long in this one: its share of
-    the step where it does, else all of it. Marks of all are left from block[marks] on.
-
-    In a synchronised interval stress acts from half a step before to half a step after the time that it is of: the
-    first, of what the interval before has left, and the last act for half a step. What is left is cut into as few
-    equal steps as the particle's own stiffness allows, rounded down to substeps. Particles of the same `alike` have the
-    same steps.
-
-    `strained` and `covered` are until when the steps before have strained it, and their stresses act; `spread` whether
-    evenly. `strained` is less than 0 before the first step of all.
-    """
-    elapsed = scene_value[scene, VALUE.interval_elapsed]
-    left = scene_value[scene, VALUE.interval_remaining]
-    begin = elapsed - step
-    before = strained
-    ahead = covered - begin
-    if begins == 1.0:
-        before -= scene_value[scene, VALUE.last_interval]
-        ahead -= scene_value[scene, VALUE.last_interval]
-    if strained < 0.0:
-        before, ahead = begin, 0.0
-    if spread:
-        ahead = 0.0
-    spreads = spread
-    if begins == 1.0:
-        spreads = 0
-    many = 1.0
-    acting = step
-    until = elapsed
-    if scene_value[scene, VALUE.synchronised] == 1.0 and left > 0.0:
-        whole = scene_value[scene, VALUE.whole_step]
-        inverse_dx = setting[SETTING.inverse_cell_size]
-        stiffness = foreseen_stiffness(C, volume, material, left + step, inverse_dx, law, row, variant)
-        longest = scene_value[scene, VALUE.stability_fraction] * setting[SETTING.cell_size]
-        longest /= ti.sqrt(ti.max(stiffness, 1e-3)) * whole
-        longest = ti.min(ti.max(ti.floor(longest + 1e-4), 1.0), ti.cast(MANY, ti.f32))
-        total = (elapsed + left) / whole
-        alike = ti.ceil(total / ti.ceil(total / longest - 1e-3) - 1e-3)
-        steps = ti.ceil((elapsed + left - before) / (whole * alike) - 1e-3)
-        if begins == 1.0:
-            many = ti.floor(0.5 * total / ti.ceil(total / alike - 1e-3) + 0.501)
-            until = begin
-            interval = ti.cast(counter[scene, COUNT.transfers], ti.i32)
-            others = marks + shape[SHAPE.all_blocks]
-            if not _alike_around(x, scene, interval, alike, inverse_dx, shape, block, others):
-                spreads = 1
-        elif steps <= 1.0:
-            many = 1.0 + ti.round(left / whole + 0.5)
-            until = elapsed + left
-        else:
-            many = ti.floor(2.0 * (before + (elapsed + left - before) / steps - begin) / whole + 1e-3)
-            many = ti.min(ti.max(many, 1.0), ti.round(left / whole + 0.5))
-            until = begin + 0.5 * many * whole
-        now = ti.cast(counter[scene, COUNT.substeps], ti.i32)
-        mark_changed(x, scene, now, 1.0 if spreads else ti.min(many, MANY), inverse_dx, shape, block, marks)
-        acting = step + ti.min((many - 1.0) * whole, left)
-    acts_until = begin + acting
-    length = until - before
-    if ti.abs(before - begin) <= SLACK * step and until == elapsed:
-        length = step
-    length = ti.max(length, SLACK * step)
-    if spreads:
-        acting = step
-    elif ahead > SLACK * step:
-        acting = ti.max(acting - ahead, 0.0)
-    return length, before + length, acts_until, many, spreads, acting
-
-
-@ti.func
 def node_places(base, first_entry: ti.i32, shape: ti.template(), entries: ti.template()):
-    """Shares of x, y, z in the place of nodes base .. base + 2, in an array that holds so many entries for each node;
-    the place is the sum of one of each.
+    """Where nodes base .. base + 2 lie in an array of `entries` numbers a node, by axis: node base + (i, j, k) begins
+    at the sum of the first result's i, the second's j and the third's k. The scene's nodes begin at `first_entry`.
     """
     stride_z = BLOCK_NODES * entries
     stride_y = shape[SHAPE.blocks + 2] * stride_z
@@ -345,12 +168,15 @@ def respond(
     law: ti.template(),
     variant: ti.template(),
 ):
-    """The material's answer to a step of the gradient C, taken on the grid as it was when the interval began.
+    """The material's answer to a step of `step` seconds with the velocity gradient C, 1/s.
 
-    `stretch` is the sum of dt (C + Cᵀ) / 2 over the interval's steps so far: per length of now C - (C + Cᵀ) / 2 stretch
-    is the gradient, in first order, so that the steps of an interval together stretch F as one step would.
-    Returns the response, - V0 (4 / dx²) stress / mass, by which stress changes C in a second; the new stretch and F,
-    both as they were for water, and volume; and the present (3 lambda + 2 mu) / density.
+    Particles stay where the interval began, so C is a gradient by positions of then. By those of now it is
+    C - (C + Cᵀ) / 2 stretch, in first order of `stretch`, the sum of dt (C + Cᵀ) / 2 over the interval's steps so far.
+    With it the steps of an interval together stretch F as one step would.
+
+    Returns the response, - V0 (4 / dx²) stress / mass, by which stress changes APIC's C in a second; the new stretch
+    and F, both as they were for water; the new volume (see constitutive); and the present (3 lambda + 2 mu) / density,
+    m²/s².
     """
     has_water = ti.static(bool(variant & VARIANT.water))
     solids = ti.static(has_solid(variant))
@@ -422,11 +248,11 @@ def node_velocity(
     contact_normal: ti.template(),
     variant: ti.template(),
 ):
-    """The velocity of a node's field from the one before and what came to its momentum: gravity, colliders and walls
-    too.
+    """The new velocity of a node's field: what colliders, then walls, leave of `before` + `momentum` / `mass` + `fall`;
+    the momentum is what came to it, `fall` is gravity's. 0 where the mass is at the rounding of the weights.
 
-    The node is the `local` one of a block whose place along x, y, z is `corner`, in ten bits each; `facing` is that of
-    the field's contact, or less than 0; `fall` is what gravity adds.
+    The node is the `local` one of a block whose place along x, y, z is `corner`, in ten bits each. `facing` is twice
+    the node's entry in `contact_normal`, plus 1 for its second field, or less than 0 where no collider is.
     """
     v = ti.Vector([0.0, 0.0, 0.0])
     if mass > SMALLEST_MASS:
@@ -476,7 +302,7 @@ def node_velocity(
 
 @ti.func
 def interpolate(x, first_node: ti.i32, node: ti.template(), inverse_dx: ti.f32, shape: ti.template()):
-    """Velocity and its gradient at x, from the nodes around."""
+    """The velocity at x from the nodes around, and its gradient, APIC's C, 1/s. The scene's begin at `first_node`."""
     scaled = x * inverse_dx
     base = ti.floor(scaled - 0.5, ti.i32)
     fx = scaled - ti.cast(base, ti.f32)
@@ -511,7 +337,9 @@ def interpolate(x, first_node: ti.i32, node: ti.template(), inverse_dx: ti.f32, 
 
 @ti.func
 def _room(fx, base: ti.i32, axis: ti.template(), shape: ti.template()) -> ti.f32:
-    """The share of a particle's nodes, by weight, that lies between the walls of an axis."""
+    """The share of a particle's nodes, by weight, that lies between the walls of an axis; of each node the share of its
+    own spline that does.
+    """
     w0, w1, w2 = weights(fx)
     wall = shape[SHAPE.wall_cells]
     room = 0.0
@@ -547,7 +375,9 @@ def settle(
     setting: ti.template(),
     shape: ti.template(),
 ) -> ti.f32:
-    """J of a particle of water after an interval, nearer to what the masses of the nodes around, interpolated, tell."""
+    """J of a particle of water after an interval, nearer to what its density tells: that of the nodes around, whose
+    masses are interpolated to `mass`.
+    """
     scaled = x * setting[SETTING.inverse_cell_size]
     base = ti.floor(scaled - 0.5, ti.i32)
     fx = scaled - ti.cast(base, ti.f32)
@@ -585,8 +415,8 @@ def find_hidden(
     shape: ti.template(),
     variant: ti.template(),
 ) -> ti.i32:
-    """Which of a particle's nodes sheets hide from it (see surface_kernel.hidden_nodes); it shares their second field
-    with the others that they hide them from. Contacts were placed `elapsed` seconds ago, where any move.
+    """Which of a particle's nodes sheets hide from it, in bits (see surface_kernel.hidden_nodes). A node's second field
+    is shared by all particles that it is hidden from. Contacts that move were placed `elapsed` seconds ago.
     """
     bits = 0
     list_at = _triangle_list(x, scene, contact, setting, shape)
@@ -615,7 +445,7 @@ def interpolate_hidden(
     shape: ti.template(),
     contact: ti.template(),
 ):
-    """What `interpolate` gave, with the second fields of hidden nodes in place of their first."""
+    """The v and C that `interpolate` gave, with the second fields of hidden nodes in place of their first."""
     scaled = x * inverse_dx
     base = ti.floor(scaled - 0.5, ti.i32)
     new_v = v
@@ -651,8 +481,9 @@ def move(
     contact_normal: ti.template(),
     variant: ti.template(),
 ):
-    """The particle's new position and velocity; stops a scene that is not finite or leaves the domain. Also v² (0 if
-    so).
+    """The particle's position and velocity at the end of an interval, as triangles and bounds leave them, and v².
+
+    What is not finite, or leaves the domain, stops its scene; v² is 0 then.
     """
     out = x + scene_value[scene, VALUE.interval_elapsed] * v
     speed = v

@@ -22,17 +22,15 @@ from datagen.mpm.mls_mpm import (
     Integers,
     Scalars,
     Vectors,
-    acts,
     find_hidden,
     initial_stiffness,
     mark,
-    mark_changed,
     move,
-    own_step,
     respond,
     settle,
     settles,
 )
+from datagen.mpm.multiple_time_stepping import acts, mark_changed, own_step
 from datagen.mpm.team_meeting import (
     LEAVES,
     MEETING,

@@ -10,7 +10,6 @@ from datagen.mpm.device_memory import add, load, load4, store4
 from datagen.mpm.layout import BLOCK_NODES, CONSTANT, FIELD, LIVE, SETTING, SHAPE, TAG, VARIANT
 from datagen.mpm.mls_mpm import (
     base_node,
-    change_of,
     ghost_place,
     node_place,
     node_places,
@@ -18,6 +17,7 @@ from datagen.mpm.mls_mpm import (
     spline,
     weights,
 )
+from datagen.mpm.multiple_time_stepping import change_of
 from datagen.mpm.team_particles import dealt, get_vector
 from datagen.mpm.time_step import falls
 

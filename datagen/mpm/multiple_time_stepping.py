@@ -1,0 +1,205 @@
+"""Which particle takes steps of its own, and when, for Taichi kernels: multiple time stepping (Streett et al. 1978).
+
+The substeps of an interval between two transfers are as short as the stiffest particle of the scene needs. In a
+synchronised interval (see mls_mpm) particles that bear longer steps take steps of their own of several substeps, as
+long as their own wave speed allows. Strain and stress are found once a step.
+
+The stress acts evenly over the step's substeps: particles of shorter steps read the velocities of the same nodes in
+each of them. Were the impulse of the step given at once, they would read velocities that nothing has, even where all is
+at rest.
+
+Where all particles in a block of nodes take the same steps nobody reads its nodes within a step. There the impulse of
+the whole step goes to the nodes in its first substep, with that of gravity, and the block is left as it is until the
+next step.
+"""
+
+import taichi as ti
+
+from datagen.mpm.constitutive import foreseen_stiffness
+from datagen.mpm.layout import COUNT, SETTING, SHAPE, VALUE
+from datagen.mpm.mls_mpm import base_node
+
+MANY = 32  # substeps of a step of a particle's own at most, and as far as marks count
+SLACK = 1e-3  # of a substep, within which times are the same
+
+
+@ti.func
+def _corner_block(first, last, n: ti.template(), scene: ti.i32, shape: ti.template()) -> ti.i32:
+    """Of the blocks from `first` to `last` that a particle's nodes lie in, the one at corner n of eight."""
+    corner = ti.Vector([last[axis] if n >> (2 - axis) & 1 else first[axis] for axis in range(3)])
+    index = (corner[0] * shape[SHAPE.blocks + 1] + corner[1]) * shape[SHAPE.blocks + 2] + corner[2]
+    return index + scene * shape[SHAPE.scene_blocks]
+
+
+@ti.func
+def mark_changed(
+    x,
+    scene: ti.i32,
+    now: ti.i32,
+    many: ti.f32,
+    inverse_dx: ti.f32,
+    shape: ti.template(),
+    block: ti.template(),
+    begin: ti.i32,
+):
+    """Marks the blocks of the particle's nodes: in the substep `now` it gives them the impulse of `many` substeps.
+
+    A block's mark is block[begin + its index], the largest now MANY + MANY - many of all that change the block: of the
+    latest substep that anything did, by the fewest substeps. change_of reads it.
+    """
+    base = base_node(x, inverse_dx)
+    change = now * MANY + MANY - ti.cast(many, ti.i32)
+    for n in ti.static(range(8)):
+        index = begin + _corner_block(base >> 2, (base + 2) >> 2, n, scene, shape)
+        if block[index] < change:
+            ti.atomic_max(block[index], change)
+
+
+@ti.func
+def _alike_around(
+    x,
+    scene: ti.i32,
+    interval: ti.i32,
+    own: ti.f32,
+    inverse_dx: ti.f32,
+    shape: ti.template(),
+    block: ti.template(),
+    begin: ti.i32,
+) -> ti.i32:
+    """Whether all particles in the blocks of a particle's nodes began the interval before with steps of `own` substeps;
+    what this one takes is marked for the next.
+
+    A block has four marks, each in an array of all blocks, the first from block[begin] on: the fewest substeps in even
+    intervals, the most in them, and both in odd ones. A mark holds the number of its interval too, so that one from
+    earlier is no match.
+    """
+    base = base_node(x, inverse_dx)
+    blocks = shape[SHAPE.all_blocks]
+    present = begin + 2 * (interval & 1) * blocks
+    former = begin + 2 * ((interval - 1) & 1) * blocks
+    many = ti.cast(own, ti.i32)
+    fewest, most = interval * MANY + MANY - many, interval * MANY + many - 1
+    alike = 1
+    for n in ti.static(range(8)):
+        index = _corner_block(base >> 2, (base + 2) >> 2, n, scene, shape)
+        if block[former + index] != fewest - MANY or block[former + blocks + index] != most - MANY:
+            alike = 0
+        if block[present + index] < fewest:
+            ti.atomic_max(block[present + index], fewest)
+        if block[present + blocks + index] < most:
+            ti.atomic_max(block[present + blocks + index], most)
+    return alike
+
+
+@ti.func
+def change_of(mark: ti.i32, now: ti.i32) -> ti.f32:
+    """Of how many substeps a block takes impulses in the substep `now`, by its mark (see mark_changed); 0 where nothing
+    changes it.
+    """
+    many = 0.0
+    if mark // MANY == now:
+        many = ti.cast(MANY - mark % MANY, ti.f32)
+    return many
+
+
+@ti.func
+def acts(covered: ti.f32, begins: ti.f32, step: ti.f32, scene: ti.i32, scene_value: ti.template()) -> ti.i32:
+    """Whether a particle begins a step of its own in this substep: all do in an interval's first, and later those whose
+    last stress acts until `covered` (s, within the interval), before the substep ends.
+    """
+    return begins == 1.0 or covered < scene_value[scene, VALUE.interval_elapsed] - SLACK * step
+
+
+@ti.func
+def own_step(
+    strained: ti.f32,
+    covered: ti.f32,
+    spread: ti.i32,
+    x,
+    C,
+    volume: ti.f32,
+    material: ti.i32,
+    row: ti.i32,
+    begins: ti.f32,
+    step: ti.f32,
+    scene: ti.i32,
+    counter: ti.template(),
+    shape: ti.template(),
+    block: ti.template(),
+    marks: ti.i32,
+    scene_value: ti.template(),
+    setting: ti.template(),
+    law: ti.template(),
+    variant: ti.template(),
+):
+    """The step of its own that a particle begins in this substep (see acts). Times are in s, within the interval.
+
+    `strained` says until when the steps before have strained the particle, less than 0 before the first of all;
+    `covered` until when their stress acts; `spread` whether evenly. From block[marks] on lie the marks of mark_changed,
+    one a block, then those of _alike_around.
+
+    Returns how long the step strains the particle; the new `strained` and `covered`; how many substeps the stress acts
+    for; the new `spread`; and for how long the stress acts in this substep: for the substep where evenly, else for all
+    of the step that the one before did not cover.
+
+    In a synchronised interval stress acts from half a step before to half a step after the time that it is of. The
+    first, of the interval's begin, and the last, of its end, act for half a step. What is left to strain is cut into as
+    few equal steps as the particle's own stiffness allows, rounded down to substeps. `alike` is how many substeps such
+    a step has; particles that keep the same `alike` have the same steps. In an interval that is not synchronised, and
+    in the last substep of each, a step is a substep.
+    """
+    elapsed = scene_value[scene, VALUE.interval_elapsed]
+    left = scene_value[scene, VALUE.interval_remaining]
+    begin = elapsed - step
+    before = strained
+    ahead = covered - begin
+    if begins == 1.0:
+        before -= scene_value[scene, VALUE.last_interval]
+        ahead -= scene_value[scene, VALUE.last_interval]
+    if strained < 0.0:
+        before, ahead = begin, 0.0
+    if spread:
+        ahead = 0.0
+    spreads = spread
+    if begins == 1.0:
+        spreads = 0
+    many = 1.0
+    acting = step
+    until = elapsed
+    if scene_value[scene, VALUE.synchronised] == 1.0 and left > 0.0:
+        whole = scene_value[scene, VALUE.whole_step]
+        inverse_dx = setting[SETTING.inverse_cell_size]
+        stiffness = foreseen_stiffness(C, volume, material, left + step, inverse_dx, law, row, variant)
+        longest = scene_value[scene, VALUE.stability_fraction] * setting[SETTING.cell_size]
+        longest /= ti.sqrt(ti.max(stiffness, 1e-3)) * whole
+        longest = ti.min(ti.max(ti.floor(longest + 1e-4), 1.0), ti.cast(MANY, ti.f32))
+        total = (elapsed + left) / whole
+        alike = ti.ceil(total / ti.ceil(total / longest - 1e-3) - 1e-3)
+        steps = ti.ceil((elapsed + left - before) / (whole * alike) - 1e-3)
+        if begins == 1.0:
+            many = ti.floor(0.5 * total / ti.ceil(total / alike - 1e-3) + 0.501)
+            until = begin
+            interval = ti.cast(counter[scene, COUNT.transfers], ti.i32)
+            others = marks + shape[SHAPE.all_blocks]
+            if not _alike_around(x, scene, interval, alike, inverse_dx, shape, block, others):
+                spreads = 1
+        elif steps <= 1.0:
+            many = 1.0 + ti.round(left / whole + 0.5)
+            until = elapsed + left
+        else:
+            many = ti.floor(2.0 * (before + (elapsed + left - before) / steps - begin) / whole + 1e-3)
+            many = ti.min(ti.max(many, 1.0), ti.round(left / whole + 0.5))
+            until = begin + 0.5 * many * whole
+        now = ti.cast(counter[scene, COUNT.substeps], ti.i32)
+        mark_changed(x, scene, now, 1.0 if spreads else ti.min(many, MANY), inverse_dx, shape, block, marks)
+        acting = step + ti.min((many - 1.0) * whole, left)
+    acts_until = begin + acting
+    length = until - before
+    if ti.abs(before - begin) <= SLACK * step and until == elapsed:
+        length = step
+    length = ti.max(length, SLACK * step)
+    if spreads:
+        acting = step
+    elif ahead > SLACK * step:
+        acting = ti.max(acting - ahead, 0.0)
+    return length, before + length, acts_until, many, spreads, acting
