@@ -201,6 +201,13 @@ def test_flight_ends_before_the_walls():
                 assert ((place_N3 > 0.07) & (place_N3 < 0.93)).all() == clear or last == 60
 
 
+def test_flights_end_where_contacts_may_begin():
+    """With walls seen from three finest cells on flights are judged before: exact with random weights."""
+    network = network_of(torch.float32, inputs="relative", message_passing_steps=1, contact_reach_cells=3.0)
+    rows = motion_of(network, ("throw",))
+    assert rows and all(row.held for row in rows.values()), rows
+
+
 def test_turned_gravity(monkeypatch):
     """What hangs in the air is as far from a fall whichever way gravity points; with a wind along y it is nearer where
     that is down."""

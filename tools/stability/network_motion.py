@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from hgn.config import MpmConfig, SceneConfig
+from hgn.config import MpmConfig, NetworkConfig, SceneConfig
 from hgn.runtime.rollouts import RolloutResult, simulate_scenes
 from hgn.runtime.simulator import InitialState, Simulator
 from hgn.scene.scene import Scene
@@ -44,7 +44,7 @@ TURNS = {"-x": (1, 0, 2), "-z": (0, 2, 1)}  # exchanges of axes that turn uprigh
 AS_GOOD, TO_REST_FRAMES = 1.25, 90  # position MSE, of the upright rollout's
 KEPT_AT_LEAST, GRAVITY_WITHIN = 0.99, 0.02
 FLIGHT_FRAMES = 60  # at most
-REACH = 2.0  # finest cells of the network from a wall: beyond what a network has of it, and what the solver's walls do
+REACH, BEYOND = 2.0, 0.5  # finest cells of the network from a wall, and from where its contacts end: see judged_reach
 MEETING = (1.5, -0.5)  # domain units per second along x, of the two cubes
 MEETING_FRAMES = 40
 # Beside the solver, what it loses itself comes on top for angular momentum: spin that particles carry within a cell,
@@ -99,7 +99,7 @@ def flight_row(
     # full rollouts: the same throws again with other random places
     labels = list(islice(cycle(throws), together * -(-len(throws) // together)))
     scenes = [cube(scene, material, middle_3, throws[label], seed) for seed, label in enumerate(labels)]
-    frames = [flight_frames(item, rate, REACH * simulator.network.config.cell_size) for item in scenes]
+    frames = [flight_frames(item, rate, judged_reach(simulator.network.config)) for item in scenes]
     trials: list[RolloutResult] = []
     try:
         for first in range(0, len(scenes), together):
@@ -124,6 +124,13 @@ def flight_row(
         for label, one in zip(labels[: len(throws)], flights, strict=False)
     }
     return Row(name, GRAVITY_WITHIN, worst["error"], held, beyond, more)
+
+
+def judged_reach(config: NetworkConfig) -> float:
+    """How near to a wall flights are judged, in domain units: beyond what the solver's walls do, and what relative
+    inputs know of them.
+    """
+    return max(REACH, config.contact_reach_cells + BEYOND if config.relative else 0.0) * config.cell_size
 
 
 def flight_frames(scene: Scene, frame_rate_hz: float, reach: float) -> int:
@@ -202,7 +209,7 @@ def meeting_row(
         trials = _rollouts(simulator, scenes, MEETING_FRAMES)
     except ConfigError as refusal:
         return Row(name, MOMENTUM_WITHIN, "refused", False, str(refusal))
-    reach = REACH * simulator.network.config.cell_size
+    reach = judged_reach(simulator.network.config)
     figures = np.array([conserved(*item, reach, rate) for item in zip(trials, scenes, strict=True)])
     momentum, angular, met = (float(value) for value in (*figures[:, :2].max(axis=0), figures[:, 2].min()))
     particles = sum(item.particle_count for item in scenes)
