@@ -308,6 +308,30 @@ def test_gravity_that_the_metadata_contradict_is_refused(tmp_path):
         assert episode.gravity == pytest.approx(expected, abs=2e-3)
 
 
+def test_what_leaves_the_bounds_later_is_told(tmp_path, capsys):
+    """One line for the whole set says how many trajectories go out by more than a radius, and where the farthest
+    particle is; all of them are taken. Particles of obstacles do not count."""
+    walk = np.full((9, 4, 3), 0.5, np.float32)
+    slight, fallen, risen = (walk.copy() for _ in range(3))
+    slight[4:, 2, 1] = -0.02
+    fallen[6:, 1, 1] = -0.25
+    risen[3:, 3, 2] = 1.125
+    types = TYPES[[0, 1, 2, 0]]
+    wall_P3 = np.array([[-4.0, 0.5, 0.5]], np.float32)
+
+    def imported(out, *paths):
+        source = write(tmp_path / f"of_{out}", "plain", {"train": [(p, types, wall_P3) for p in paths]}, metadata())
+        assert import_trajectories.main(options(tmp_path / out, source)) == 0
+        assert len(EpisodeStore(tmp_path / out, "train")) == len(paths)
+        return [line for line in capsys.readouterr().err.splitlines() if "bounds" in line]
+
+    assert imported("kept", walk, slight) == []
+    (line,) = imported("left", slight, risen, fallen)
+    assert line.startswith("bounds: particles of 2 of 3 trajectories go farther out of them than a radius (0.035)")
+    assert "train.npz: 00002 to y = -0.25 in frame 6, where bounds are [0.0, 1.0]" in line
+    assert line.endswith("give bounds=… that hold all particles, or leave these trajectories out")
+
+
 def test_materials_that_are_no_mapping(tmp_path):
     """Names without their types are refused by name."""
     with pytest.raises(ConfigError, match="materials must be a mapping, got 3"):
