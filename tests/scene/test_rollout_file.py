@@ -356,7 +356,8 @@ def episode(specification):
 
 
 def test_cell_obstacles():
-    """Each cell becomes one square of the cell's size across the stored normal, around the cell's centre."""
+    """Each cell becomes one square of the cell's size around its centre: across the stored normal, of a flat set in
+    its plane."""
     normal = np.array([[0, 1, 0], [0.6, 0, 0.8]], np.float32)
     grid = ObstacleGrid(0.25, np.array([[0, 1, 2], [3, 0, 1]], np.int32), normal)
     (squares,) = cell_obstacles(grid)
@@ -366,6 +367,10 @@ def test_cell_obstacles():
     np.testing.assert_allclose(np.linalg.norm(cross, axis=1), 0.25**2)
     direction = cross / np.linalg.norm(cross, axis=1, keepdims=True)
     np.testing.assert_allclose(np.abs((direction * np.tile(normal, (2, 1))).sum(axis=1)), 1, rtol=1e-6)
+    (flat,) = cell_obstacles(grid, plane_z=0.6)
+    corner_K43 = flat.vertex_V3.reshape(2, 4, 3)
+    np.testing.assert_allclose(corner_K43[..., :2].mean(axis=1), (grid.cell_K3[:, :2] + 0.5) * 0.25)
+    assert (np.ptp(corner_K43, axis=1) == (0.25, 0.25, 0)).all() and (corner_K43[..., 2] == 0.6).all()
     assert cell_obstacles(ObstacleGrid(0.25, np.empty((0, 3), np.int32), np.empty((0, 3), np.float32))) == ()
 
 
