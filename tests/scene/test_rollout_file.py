@@ -85,6 +85,20 @@ def test_files_of_other_materials(tmp_path):
             assert read_rollout(path).materials == tuple(names)
 
 
+def test_files_of_flat_rollouts(tmp_path):
+    """A file keeps that all lies in a plane; older ones, which do not tell, have three dimensions."""
+    path, flat = tmp_path / "rollout.h5", dataclasses.replace(make_rollout(), dimensions=2)
+    write_rollout(path, flat)
+    assert read_rollout(path).dimensions == 2
+    with h5py.File(path, "a") as file:
+        file["hgn"].attrs["dimensions"] = 4
+    with pytest.raises(ConfigError, match=r"dimensions must be 2 or 3, got 4; write it again"):
+        read_rollout(path)
+    with h5py.File(path, "a") as file:
+        del file["hgn"].attrs["dimensions"]
+    assert read_rollout(path).dimensions == 3
+
+
 def test_diverged_rollout_is_kept(tmp_path):
     """NaN positions are written and read, so that a divergence can be looked at."""
     rollout = make_rollout()
