@@ -5,6 +5,7 @@ Reads DeepMind's TFRecords, geoelements' npz, LagrangeBench's and NeuralMPM's HD
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -26,7 +27,9 @@ def main(mapping: dict[str, Any]) -> int:
         mapping["materials"] = {str(key): value for key, value in mapping["materials"].items()}
     config = from_mapping(ImportConfig, mapping)
     with bar("importing", total=None, unit="episode") as progress:
-        manifest = import_set(Path(str(source)), config, lambda _: progress.update())
+        manifest, note = import_set(Path(str(source)), config, lambda _: progress.update())
+    if note is not None:
+        print(note, file=sys.stderr)
     own = manifest.config["imported"]
     counts = ", ".join(f"{count} {split}" for split, count in manifest.requested.items())
     gravity = ", ".join(f"{value:.4g}" for value in own["gravity"])

@@ -144,6 +144,7 @@ def rollout(config: RolloutConfig) -> tuple[Path, Rollout]:
         reference_TN3=reference_TN3,
         entry_frame_N=entry_frames(scene, simulator.frame_rate_hz) if scene is not None and scene.emits else None,
         materials=initial.materials,
+        dimensions=initial.dimensions,
     )
     return save_rollout(config.out or f"rollout/{name}.vtkhdf", result, config.surface), result
 

@@ -15,7 +15,7 @@ from collections import OrderedDict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, overload
 
 import numpy as np
 
@@ -31,28 +31,30 @@ MAPPED_SHARDS = 256  # at once; a process may have 1,024 files open where nothin
 
 
 class Episodes(Sequence[Episode], ABC):
-    """What reads as the list of its episodes, each opened on access."""
+    """What reads as the list of its episodes.
+
+    Each is opened, and its shard verified, on first use; its `position_TN3` is a read-only `np.memmap`. Raises on
+    access: ConfigError when a shard is missing or altered.
+    """
 
     @abstractmethod
     def open(self, index: int) -> Episode:
         """The episode at a place, from 0 on, below the number of them."""
 
-    def __getitem__(self, index: Any) -> Any:
+    @overload
+    def __getitem__(self, index: int) -> Episode: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> list[Episode]: ...
+
+    def __getitem__(self, index: int | slice) -> Episode | list[Episode]:
         if isinstance(index, slice):
             return [self.open(i) for i in range(len(self))[index]]
         return self.open(range(len(self))[index])
 
-    @property
-    def episodes(self) -> Sequence[Episode]:
-        """The episodes, in publication order; each is opened, and its shard verified, on first use.
-
-        `position_TN3` is a read-only `np.memmap`. Raises on access: ConfigError when a shard is missing or altered.
-        """
-        return self
-
 
 class EpisodeStore(Episodes):
-    """The published episodes of one split of a data set, in a folder or at a URL; it only grows.
+    """The published episodes of one split of a data set, in a folder or at a URL, in their order; it only grows.
 
     Picklable for spawned workers: the folder, split and manifest travel, open files and maps do not.
     """

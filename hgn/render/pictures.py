@@ -18,6 +18,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont, PngImagePlugin
 from scipy.spatial import KDTree
 
+from hgn.render.flat import FlatStage
 from hgn.render.renderer import BACKGROUND_COLOR, MATERIAL_COLORS, OBSTACLE_COLOR, PARTICLE_COLORS, Stage, to_bytes
 from hgn.scene.episode import Episode
 from hgn.scene.material import MATERIALS
@@ -267,6 +268,7 @@ def rollout_of_episode(episode: Episode, predicted_TN3: np.ndarray | None = None
         source={"episode": episode.key, "seed": episode.seed, "specification": episode.specification},
         reference_TN3=None if predicted_TN3 is None else episode.position_TN3,
         materials=episode.materials,
+        dimensions=episode.dimensions,
     )
 
 
@@ -281,8 +283,9 @@ def check_frames(frames: Sequence[int], frame_count: int) -> None:
 
 def _stage(rollout: Rollout, size: int) -> Stage:
     radius = rollout_spacing(rollout) * RADIUS_IN_SPACINGS
-    radius = min(radius, 0.03 * min(rollout.domain_size))
-    return Stage(rollout.domain_size, rollout.obstacles, radius, size)
+    radius = min(radius, 0.03 * min(rollout.domain_size[: rollout.dimensions]))
+    stage = FlatStage if rollout.dimensions == 2 else Stage
+    return stage(rollout.domain_size, rollout.obstacles, radius, size)
 
 
 def _place_obstacles(stage: Stage, rollout: Rollout, frame: int) -> None:

@@ -65,7 +65,7 @@ class Camera:
         self.axes = np.stack((right, np.cross(back, right), back))  # rows: right, up, towards the viewer
         box = np.array(domain_size)
         self.eye = box / 2 + back * CAMERA_DISTANCE * np.linalg.norm(box)
-        self.nearest = 0.3 * CAMERA_DISTANCE * np.linalg.norm(box)  # what comes closer is not drawn
+        self.nearest = float(0.3 * CAMERA_DISTANCE * np.linalg.norm(box))  # what comes closer is not drawn
         self.scale, self.offset = 1.0, np.zeros(2)
         corner_83 = box_corners(domain_size)
         xy, _ = self.project(corner_83)
@@ -97,6 +97,8 @@ class Stage:
     follows from the domain.
     """
 
+    camera_type: type[Camera] = Camera
+
     def __init__(
         self,
         domain_size: Vector,
@@ -105,9 +107,8 @@ class Stage:
         size: int,
     ) -> None:
         self.domain_size = domain_size
-        self.camera = Camera(domain_size, size)
+        self.camera = self.camera_type(domain_size, size)
         self.radius = particle_radius
-        self._prepare_shadow_map(domain_size)
         self._prepare_room(domain_size)
         self.place(obstacles)
 
@@ -220,6 +221,7 @@ class Stage:
 
     def _prepare_room(self, domain_size: Vector) -> None:
         """Floor and walls, without obstacles and shadows."""
+        self._prepare_shadow_map(domain_size)
         camera = self.camera
         ray_P3 = camera.rays()
         color_P3 = np.tile(BACKGROUND_COLOR, (len(ray_P3), 1))
@@ -354,7 +356,7 @@ class Stage:
         color_S3 += shine_S[:, None].astype(np.float32)
 
         depth_S = depth_N[particle_S]
-        for layer in reversed(range(LAYERS)):
+        for layer in reversed(range(len(self.layer_depth_LP))):
             before_S = self.layer_depth_LP[layer, pixel_S] < depth_S
             covered = np.flatnonzero(before_S)
             if len(covered):

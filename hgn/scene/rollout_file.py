@@ -21,7 +21,7 @@ import functools
 import json
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import h5py
 import numpy as np
@@ -35,7 +35,7 @@ from hgn.scene.obstacle_grid import ObstacleGrid, surface_points
 from hgn.scene.rotation import quaternion_rotation
 from hgn.scene.scene import Obstacle
 from hgn.scene.shapes import mesh_sha256, shape_obstacle
-from hgn.schema import BoxSize, ConfigError, Positive, Vector, require, require_bounds
+from hgn.schema import Bound, BoxSize, ConfigError, Positive, Vector, require, require_bounds
 from hgn.system.files import make_folder, sync_file, sync_folder, temporary_file
 
 FORMAT_NAME = "hgn rollout"
@@ -70,6 +70,8 @@ class Rollout:
     # and are read as NaN; None: all are there from the start
     entry_frame_N: np.ndarray | None = None
     materials: tuple[str, ...] = MATERIALS
+    # of its motion: with 2 all lies on a plane across z, in the middle of the domain
+    dimensions: Annotated[int, Bound("2 or 3", lambda count: count in (2, 3))] = 3
 
     def __post_init__(self) -> None:
         require_bounds(self)
@@ -135,7 +137,7 @@ def obstacles_of_episode(episode: Episode) -> tuple[Obstacle, ...]:
     """
     records = episode.specification.get("obstacles", ())
     if episode.specification.get("kind") != "random" or not all(_is_here(record) for record in records):
-        return cell_obstacles(episode.obstacle_grid)
+        return cell_obstacles(episode.obstacle_grid, episode.domain_size[2] / 2 if episode.dimensions == 2 else None)
     return tuple(
         shape_obstacle(
             record["shape"],
@@ -168,16 +170,23 @@ def episode_surface(episode: Episode, spacing_cells: float) -> np.ndarray:
     return surface_points(obstacles_of_episode(episode), grid.cell_size, 0, spacing_cells=spacing_cells)
 
 
-def cell_obstacles(grid: ObstacleGrid) -> tuple[Obstacle, ...]:
-    """One square in each obstacle cell, across its normal: a stand-in where only the cells are known."""
+def cell_obstacles(grid: ObstacleGrid, plane_z: float | None = None) -> tuple[Obstacle, ...]:
+    """One square in each obstacle cell: a stand-in where only the cells are known.
+
+    It lies across the cell's normal; of a flat set, whose plane is at `plane_z`, it is the part of the cell in there.
+    """
     if not len(grid.cell_K3):
         return ()
     center_K3 = (grid.cell_K3 + 0.5) * grid.cell_size
-    normal_K3 = grid.normal_K3.astype(np.float64)
-    least_K3 = np.eye(3)[np.abs(normal_K3).argmin(axis=1)]
-    side_K3 = np.cross(normal_K3, least_K3)
-    side_K3 /= np.maximum(np.linalg.norm(side_K3, axis=1, keepdims=True), 1e-12)
-    other_K3 = np.cross(normal_K3, side_K3)
+    if plane_z is None:
+        normal_K3 = grid.normal_K3.astype(np.float64)
+        least_K3 = np.eye(3)[np.abs(normal_K3).argmin(axis=1)]
+        side_K3 = np.cross(normal_K3, least_K3)
+        side_K3 /= np.maximum(np.linalg.norm(side_K3, axis=1, keepdims=True), 1e-12)
+        other_K3 = np.cross(normal_K3, side_K3)
+    else:
+        center_K3[:, 2] = plane_z
+        side_K3, other_K3 = np.eye(3)[:2, None]
     half = 0.5 * grid.cell_size
     corner_K43 = np.stack(
         [center_K3 + half * (a * side_K3 + b * other_K3) for a, b in ((-1, -1), (1, -1), (1, 1), (-1, 1))],
@@ -295,6 +304,7 @@ def _write_own(group: h5py.Group, rollout: Rollout) -> None:
     group.attrs["format"] = FORMAT_NAME
     group.attrs["format_version"] = FORMAT_VERSION
     group.attrs["materials"] = json.dumps(rollout.materials)
+    group.attrs["dimensions"] = rollout.dimensions
     group.attrs["frame_rate_hz"] = float(rollout.frame_rate_hz)
     group.attrs["domain_size"] = np.array(rollout.domain_size, np.float64)
     group.attrs["gravity"] = np.array(rollout.gravity, np.float64)
@@ -360,6 +370,7 @@ def _read(file: h5py.File) -> Rollout:
         reference_TN3=own["reference"][()] if "reference" in own else None,
         entry_frame_N=entry_N if "entry_frame" in own else None,
         materials=tuple(json.loads(own.attrs["materials"])),
+        dimensions=int(own.attrs.get("dimensions", 3)),  # of which older files do not tell
     )
 
 

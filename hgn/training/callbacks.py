@@ -1,7 +1,7 @@
 """What happens beside the updates: the same weights on all ranks, checkpoints, log lines, stopping.
 
-Files of a run: checkpoints/last.ckpt, checkpoints/best.ckpt (lowest one-step validation error), metrics.jsonl,
-tensorboard/, pictures/.
+Files of a run: checkpoints/last.ckpt, metrics.jsonl, tensorboard/; and where there are validation scenes
+checkpoints/best.ckpt (lowest one-step validation error) and pictures/.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from hgn.schema import ConfigError, to_mapping
 from hgn.system.files import TEMPORARY_SUFFIX
 from hgn.system.progress import bar
 from hgn.training import lightning_compat
-from hgn.training.checkpoint import LAST_NAMES
+from hgn.training.checkpoint import BEST_NAME, LAST_NAMES
 from hgn.training.checkpoint_writer import CheckpointWriter
 from hgn.training.data_module import EpisodeDataModule
 from hgn.training.distributed import checksum, same_on_all_ranks
@@ -105,7 +105,7 @@ class Checkpoints(Callback):
         if error < self.best_error:
             self.best_error = error
             self._saved_update = -1  # the last checkpoint is to know it, too
-            trainer.save_checkpoint(self.folder / "best.ckpt")
+            trainer.save_checkpoint(self.folder / BEST_NAME)
 
     def finish(self, trainer: Trainer) -> None:
         """All ranks call this at the end: the last checkpoint is on disk then."""

@@ -24,6 +24,7 @@ from hgn.schema import ConfigError, from_stored, to_mapping
 
 SECTION = "hgn"  # the checkpoint's key for what is ours
 LAST_NAMES = ("last.ckpt", "last-1.ckpt", "last-2.ckpt")  # newest first
+BEST_NAME = "best.ckpt"  # of the lowest one-step validation error; none where no validation scene was measured
 _ZIP_FAULTS = (zipfile.BadZipFile, zlib.error, NotImplementedError)
 NETWORK, AVERAGED = "network.", "averaged."  # prefixes of the tensors: as trained, and their moving average
 
@@ -55,7 +56,10 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
                 raise zlib.error(f"{damaged} has another CRC")
         checkpoint = torch.load(path, map_location="cpu", weights_only=True)
     except FileNotFoundError:
-        raise ConfigError(f"checkpoint must be an existing file, got {path}; hgn.train writes one") from None
+        last, remedy = path.with_name(LAST_NAMES[0]), "hgn.train writes one"
+        if path.name == BEST_NAME and last.is_file():
+            remedy = f"no validation scene was measured, so take {last}"
+        raise ConfigError(f"checkpoint must be an existing file, got {path}; {remedy}") from None
     except (RuntimeError, EOFError, ValueError, KeyError, OSError, pickle.UnpicklingError, *_ZIP_FAULTS) as error:
         reason = str(error).strip().split("\n")[0]
         raise DamagedError(f"checkpoint must be a whole checkpoint file, got {path}: {reason}") from None

@@ -83,19 +83,18 @@ class EpisodeDataModule(LightningDataModule):
             return (order.next_batch(), starts), order.state
 
         def read(drawn: tuple[list[Sample], Starts], state: SamplerState) -> Batch | UpdateSamples:
-            episodes = self.store.episodes
             samples = tuple(
                 BatchSample(
-                    episodes[sample.episode],
+                    self.store[sample.episode],
                     sample.frame,
-                    window(episodes[sample.episode], sample.frame, self.network.velocity_history),
+                    window(self.store[sample.episode], sample.frame, self.network.velocity_history),
                     sample.seed,
                     sample.weight,
                     sample.noise_scale,
                 )
                 for sample in self._weighted(drawn[0])
             )
-            update_samples = UpdateSamples(samples, state, tuple((episodes[i], frame) for i, frame in drawn[1]))
+            update_samples = UpdateSamples(samples, state, tuple((self.store[i], frame) for i, frame in drawn[1]))
             return update_samples if self.training.pushforward_fraction else update_samples.batch(self.network)
 
         yield from self._prefetched(draw, read)
@@ -162,7 +161,7 @@ class EpisodeDataModule(LightningDataModule):
         def read(episode: Episode) -> tuple[EpisodeTensors, FrameImportance | None]:
             return whole_episode(episode, self.network), FrameImportance.of(episode, fraction) if measured else None
 
-        opened = [self.store.episodes[index] for index in indices]
+        opened = [self.store[index] for index in indices]
         with ThreadPoolExecutor(READERS) as readers:
             results = dict(zip(indices, readers.map(read, opened), strict=True))
         self._importance.update({index: importance for index, (_, importance) in results.items() if importance})
@@ -182,7 +181,7 @@ class EpisodeDataModule(LightningDataModule):
         drawn = []
         for sample in samples:
             if sample.episode not in self._importance:
-                episode = self.store.episodes[sample.episode]
+                episode = self.store[sample.episode]
                 self._importance[sample.episode] = FrameImportance.of(episode, fraction)
             importance = self._importance[sample.episode]
             frame, weight = importance.draw(sample.frame, sample.seed) if fraction > 0 else (sample.frame, 1.0)

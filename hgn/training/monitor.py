@@ -78,7 +78,7 @@ class Monitor(Callback):
                 text = "the scenes to measure on are not all here, and their server does not send them now"
                 print(f"nothing is measured at update {trainer.global_step}: {text}", file=sys.stderr)
             return
-        scenes = {split: [store.episodes[i] for i in chosen[split]] for split, store in self.stores.items()}
+        scenes = {split: [store[i] for i in chosen[split]] for split, store in self.stores.items()}
         values: dict[str, float] = {}
         for split, episodes in scenes.items():
             if not episodes or self._interrupted(trainer):

@@ -22,7 +22,7 @@ from hgn.schema import to_mapping
 from hgn.system.device import keep_to_quota
 from hgn.system.files import make_folder, write_atomically
 from hgn.system.provenance import provenance
-from hgn.training.checkpoint import DataInfo
+from hgn.training.checkpoint import BEST_NAME, LAST_NAMES, DataInfo
 from hgn.training.distributed import first_on_machine, first_rank, layout
 from hgn.training.errors import format_ratio
 from hgn.training.stop import StopRequest
@@ -71,6 +71,10 @@ def train_network(
     backend, text = _backend(config)
     if first_rank():
         print(text, file=sys.stderr)
+        if not config.dataset.validation_scenes and not len(store.of_split("validation")):
+            print(
+                f"no validation scenes: there will be no {BEST_NAME}, nor errors and pictures of them", file=sys.stderr
+            )
     keep_to_quota()
     set_matmul_precision(training.precision)
     seed_everything(training.seed, verbose=False)
@@ -171,5 +175,8 @@ def _report(config: TrainConfig, updates: int, last: dict[str, float], stop: Sto
             f"one-step validation MSE {last['one_step/validation']:.3e}, "
             f"{format_ratio(last['baseline_ratio/validation'])} the best baseline's"
         )
+    folder = Path(config.run) / "checkpoints"
+    if not (folder / BEST_NAME).exists():
+        print(f"no {BEST_NAME}, for no validation scene was measured; export {folder / LAST_NAMES[0]}")
     if stop.requested:
         print("stopped; the same command resumes it")

@@ -27,7 +27,9 @@ class _Film:
 
     def __init__(self, server: viser.ViserServer, rollout: Rollout) -> None:
         self.rollout = rollout
-        self.stage = StageView(server, rollout.domain_size, rollout_spacing(rollout), "float16", rollout.materials)
+        self.stage = StageView(
+            server, rollout.domain_size, rollout_spacing(rollout), "float16", rollout.materials, rollout.dimensions
+        )
         self.moving = []
         for index, obstacle in enumerate(rollout.obstacles):
             mesh = self.stage.add_obstacle(f"{index}_{obstacle.name}", obstacle, *REST)

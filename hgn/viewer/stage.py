@@ -39,22 +39,28 @@ class StageView:
         spacing: float,
         precision: Literal["float16", "float32"] = "float32",
         materials: Sequence[str] = MATERIALS,
+        dimensions: int = 3,
     ) -> None:
         """`spacing` of particles at rest, domain units. With float16 positions are 2^-12 of the domain apart.
-        `materials` are what particles' indices mean.
+        `materials` are what particles' indices mean. With two dimensions the plane in the middle is looked at straight.
         """
         self.scene, self.domain_size = server.scene, domain_size
         self.scene.set_up_direction("+y")
         self.middle_3 = 0.5 * np.array(domain_size)
-        size = max(domain_size)
-        server.initial_camera.position = tuple(self.middle_3 + size * np.array([0.55, 0.45, 1.55]))
-        server.initial_camera.look_at = tuple(self.middle_3 - size * np.array([0.0, 0.08, 0.0]))
+        low_3, high_3 = np.zeros(3), np.array(domain_size)
+        size, eye, target = max(domain_size), (0.55, 0.45, 1.55), (0.0, -0.08, 0.0)
+        if dimensions == 2:
+            low_3[2], high_3[2] = self.middle_3[2] - spacing, self.middle_3[2] + spacing
+            size, eye, target = max(domain_size[:2]), (0.0, 0.0, 1.0), (0.0, 0.0, 0.0)
+        server.initial_camera.position = tuple(self.middle_3 + size * np.array(eye))
+        server.initial_camera.look_at = tuple(self.middle_3 + size * np.array(target))
         # seen from inside: its near walls are not there
-        box = trimesh.creation.box(bounds=((0.0, 0.0, 0.0), domain_size))
+        box = trimesh.creation.box(bounds=(low_3, high_3))
         self.room = self.scene.add_mesh_simple(
             "/room", box.vertices, box.faces, color=ROOM_COLOR, side="back", flat_shading=True, cast_shadow=False
         )
-        self.scene.add_line_segments("/edges", box_corners(domain_size)[np.array(BOX_EDGES)], BOX_COLOR)
+        edge_E23 = (low_3 + box_corners((1.0, 1.0, 1.0)) * (high_3 - low_3))[np.array(BOX_EDGES)]
+        self.scene.add_line_segments("/edges", edge_E23, BOX_COLOR)
         self.clouds = [
             self.scene.add_point_cloud(
                 f"/particles/{name}",

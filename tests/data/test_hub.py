@@ -89,7 +89,7 @@ def test_a_data_set_is_read_from_a_repository(hub, folder, monkeypatch):
     for url in ("hf://datasets/one/data", "hf://datasets/one/several@main/part", "hf://datasets/one/private"):
         remote, local = EpisodeStore(url, "train"), EpisodeStore(folder, "train")
         assert len(remote) == len(local) == 5
-        for left, right in zip(remote.episodes, local.episodes, strict=True):
+        for left, right in zip(remote, local, strict=True):
             assert np.array_equal(left.position_TN3, right.position_TN3)
     assert not EpisodeStore.available("hf://datasets/one/nothing")
     with pytest.raises(ConfigError, match=r"dataset.folder must be an address as hf://USER"):

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from data.foreign_writers import Hostile, metadata, pickled_npz, sequence_example, write
+from PIL import Image
 from training.runs import metrics, train_mapping
 
 from hgn import evaluate, import_trajectories, train
@@ -51,7 +52,7 @@ def own_simulations(data, boundary_P3=NOTHING):
     return {
         name: [
             (np.concatenate([frames_before(e, -5), e.position_TN3]), TYPES[e.material_N], boundary_P3)
-            for e in EpisodeStore(data.dataset.folder, split).episodes
+            for e in EpisodeStore(data.dataset.folder, split)
         ]
         for split, name in SPLITS.items()
     }
@@ -67,7 +68,7 @@ def test_own_episodes_come_back(name, data, tmp_path):
     for split in SPLITS:
         own, mine = (EpisodeStore(folder, split) for folder in (data.dataset.folder, tmp_path / "mine"))
         assert len(mine) == len(own) > 0
-        for left, right in zip(own.episodes, mine.episodes, strict=True):
+        for left, right in zip(own, mine, strict=True):
             for frame in range(left.frame_count - 1):
                 assert np.array_equal(window(left, frame, 5), window(right, frame, 5))
             assert np.array_equal(left.material_N, right.material_N) and left.gravity == right.gravity
@@ -77,7 +78,7 @@ def test_own_episodes_come_back(name, data, tmp_path):
             one, two = (getattr(store.statistics(), quantity) for store in (own, mine))
             assert one.count == two.count and one.mean == pytest.approx(two.mean, rel=1e-12)
             assert torch.equal(torch.tensor(one.std), torch.tensor(two.std))
-    (first, *_) = EpisodeStore(tmp_path / "mine", "train").episodes
+    (first, *_) = EpisodeStore(tmp_path / "mine", "train")
     again = decode_episode(first.key, encode_episode(first))
     assert again.past_HN3 is not None and np.array_equal(again.past_HN3, first.past_HN3)
 
@@ -304,8 +305,32 @@ def test_gravity_that_the_metadata_contradict_is_refused(tmp_path):
                 import_trajectories.main(arguments)
             continue
         import_trajectories.main(arguments)
-        (episode,) = EpisodeStore(tmp_path / f"mine{size}", "train").episodes
+        (episode,) = EpisodeStore(tmp_path / f"mine{size}", "train")
         assert episode.gravity == pytest.approx(expected, abs=2e-3)
+
+
+def test_what_leaves_the_bounds_later_is_told(tmp_path, capsys):
+    """One line for the whole set says how many trajectories go out by more than a radius, and where the farthest
+    particle is; all of them are taken. Particles of obstacles do not count."""
+    walk = np.full((9, 4, 3), 0.5, np.float32)
+    slight, fallen, risen = (walk.copy() for _ in range(3))
+    slight[4:, 2, 1] = -0.02
+    fallen[6:, 1, 1] = -0.25
+    risen[3:, 3, 2] = 1.125
+    types = TYPES[[0, 1, 2, 0]]
+    wall_P3 = np.array([[-4.0, 0.5, 0.5]], np.float32)
+
+    def imported(out, *paths):
+        source = write(tmp_path / f"of_{out}", "plain", {"train": [(p, types, wall_P3) for p in paths]}, metadata())
+        assert import_trajectories.main(options(tmp_path / out, source)) == 0
+        assert len(EpisodeStore(tmp_path / out, "train")) == len(paths)
+        return [line for line in capsys.readouterr().err.splitlines() if "bounds" in line]
+
+    assert imported("kept", walk, slight) == []
+    (line,) = imported("left", slight, risen, fallen)
+    assert line.startswith("bounds: particles of 2 of 3 trajectories go farther out of them than a radius (0.035)")
+    assert "train.npz: 00002 to y = -0.25 in frame 6, where bounds are [0.0, 1.0]" in line
+    assert line.endswith("give bounds=… that hold all particles, or leave these trajectories out")
 
 
 def test_materials_that_are_no_mapping(tmp_path):
@@ -337,7 +362,7 @@ def test_each_simulation_may_have_its_own_gravity(name, tmp_path):
 
     tell(1.0)
     import_trajectories.main(options(tmp_path / "mine", source, gravity=None))
-    assert [e.gravity for e in EpisodeStore(tmp_path / "mine", "train").episodes] == own
+    assert [e.gravity for e in EpisodeStore(tmp_path / "mine", "train")] == own
     if one_each:
         tell(2.0)
         with pytest.raises(ConfigError, match=r"sim_0.h5: gravity must be what flies there shows, .* got \[0.0, -1.0,"):
@@ -357,7 +382,7 @@ def test_what_published_files_have(tmp_path):
     source = write(tmp_path / "own", "geoelements", {}, metadata())
     pickled_npz(source / "train.npz", (path, types, np.arange(20.0).reshape(10, 2)))
     import_trajectories.main(options(tmp_path / "mine", source))
-    (episode,) = EpisodeStore(tmp_path / "mine", "train").episodes
+    (episode,) = EpisodeStore(tmp_path / "mine", "train")
     first, second = (episode.material_parameters[f"material_property{end}"] for end in ("", "_1"))
     assert np.array_equal(first, 2.0 * np.arange(10)) and np.array_equal(second, first + 1)
 
@@ -402,7 +427,7 @@ def test_a_flat_set_is_one_layer(flat):
     own = manifest.config["imported"]
     assert own["materials"] == ["water", "goop"] and own["dimensions"] == 2 and own["obstacles"]
     assert own["gravity"] == pytest.approx((0.0, -9.8, 0.0), rel=0.01)
-    episode = EpisodeStore(flat, "train").episodes[0]
+    episode = EpisodeStore(flat, "train")[0]
     assert episode.frame_rate_hz == 400 and episode.domain_size[:2] == pytest.approx((0.8, 0.8))
     assert episode.position_TN3[..., :2].min() > 0 and len(np.unique(episode.position_TN3[..., 2])) == 1
     normal_K3 = episode.obstacle_grid.normal_K3
@@ -437,7 +462,7 @@ def test_a_flat_simulation_stays_in_its_plane(changes, flat):
         for quantity in ("velocity", "acceleration"):
             moments = getattr(statistics, quantity)
             network.normaliser.set(quantity, torch.tensor(moments.mean), torch.tensor(moments.std), 1e-4, 2)
-    episode = EpisodeStore(flat, "train").episodes[0]
+    episode = EpisodeStore(flat, "train")[0]
     simulator = Simulator(network, episode.frame_rate_hz, "torch", "fp32")
     initial = InitialState.of_episode(episode)
     state = simulator.start([initial])
@@ -498,7 +523,7 @@ def test_an_own_layout_may_bring_obstacle_cells(tmp_path):
     source = write(tmp_path / "foreign", "plain", {"train": []}, metadata(obstacle_cell_size=1 / 64))
     np.savez(source / "train.npz", **{"a/position": path, "a/obstacle_cell": cell, "a/obstacle_normal": normal})
     import_trajectories.main(options(tmp_path / "mine", source))
-    (episode,) = EpisodeStore(tmp_path / "mine", "train").episodes
+    (episode,) = EpisodeStore(tmp_path / "mine", "train")
     grid = episode.obstacle_grid
     assert grid.cell_K3.tolist() == [[1, 5, 3], [9, 2, 2]] and grid.cell_size == 1 / 64
     assert grid.normal_K3.tolist() == [[1, 0, 0], [0, 1, 0]]
@@ -512,7 +537,8 @@ def test_a_flat_set_goes_the_whole_way(flat, tmp_path, make_config):
     monitored = {"pushforward_frames": 4, "monitor_rollout_frames": 4}
     mapping = train_mapping(make_config(folder=str(flat)), tmp_path / "run", **symmetric, **monitored)
     assert train.main(mapping | {"imported": True}) == 0
-    assert list((tmp_path / "run" / "pictures").glob("*.png"))
+    with Image.open(tmp_path / "run" / "pictures" / "rollout_000000012.png") as drawn:
+        assert drawn.height == 30 + 2 * (360 + 12) + 30  # two rows of squares, for the box is one; and text
     weights = tmp_path / "flat.safetensors"
     export(tmp_path / "run" / "checkpoints" / "last.ckpt", weights)
     network, _ = load_weights(weights)
@@ -534,7 +560,7 @@ def test_a_flat_set_goes_the_whole_way(flat, tmp_path, make_config):
     result = read_rollout(path)
     assert [result.materials[i] for i in np.unique(result.material_N)] == ["water", "goop"]
     assert len(np.unique(result.position_TN3[..., 2])) == 1
-    assert compare_picture(result, [0, 8]).width > 100
+    assert result.dimensions == 2 and compare_picture(result, [0, 8]).height == drawn.height
     for scene, message in (
         ("funnel", "dimensions must be the network's 2, got 3; take weights of 3D data"),
         (None, "data must be given with weights of imported data, which random scenes are not like"),

@@ -85,7 +85,7 @@ def test_costs_do_not_grow(make_config, stage, tmp_path, monkeypatch):
                 assert writer.publish_next()
             with Count() as look:
                 assert store.refresh()
-            assert store.episodes[-1].key == f"train-{published + 1:06d}"
+            assert store[-1].key == f"train-{published + 1:06d}"
         costs.append([(count.lines, count.read, count.written) for count in (claim, publication, look)])
         with Count() as start:
             assert sum(EpisodeStore(folder, "train").frames()) == 6 * (published + 2)
@@ -156,7 +156,7 @@ def test_first_releases_manifest_is_gone_on_with(make_config, make_dataset):
     first_release(folder)
     manifest = Manifest.load(folder)
     assert manifest == indexed and manifest.totals == indexed.totals and manifest.complete
-    assert [episode.key for episode in EpisodeStore(folder, "train").episodes] == [f"train-{i:06d}" for i in range(3)]
+    assert [episode.key for episode in EpisodeStore(folder, "train")] == [f"train-{i:06d}" for i in range(3)]
     before = hashes(folder)
     make_dataset(make_config())
     assert before.items() <= hashes(folder).items() and Manifest.load(folder).published("train") == 5
@@ -200,18 +200,18 @@ def test_index_that_was_altered(folder, pattern, text, message):
     path.write_text(re.sub(pattern, text, path.read_text(), count=1))
     store = EpisodeStore(folder, "train")
     if not message:
-        assert len(store.episodes[:]) == 5
+        assert len(store[:]) == 5
         return
     with pytest.raises(ConfigError, match=message):
-        store.episodes[0]
+        store[0]
 
 
 def test_maps_are_bounded(folder, monkeypatch):
     """Many shards need few open files; one that is cut while it is mapped is an error, not the end of the process."""
     monkeypatch.setattr(hgn.data.reader, "MAPPED_SHARDS", 2)
     store = EpisodeStore(folder, "train")
-    assert [episode.key for _ in range(2) for episode in store.episodes] == [f"train-{i:06d}" for i in range(5)] * 2
+    assert [episode.key for _ in range(2) for episode in store] == [f"train-{i:06d}" for i in range(5)] * 2
     assert len(store._open_shards) == 2
     os.truncate(folder / "train-000004-000005.tar", 1000)
     with pytest.raises(ConfigError, match=r"000005\.tar must have 10240 bytes, got 1000: it was cut while it was open"):
-        store.episodes[4]
+        store[4]

@@ -26,14 +26,14 @@ def test_the_sets_follow_each_other(configs, make_dataset):
     was there keeps its place."""
     stores = [EpisodeStore(make_dataset(config), "train") for config in configs]
     pooled = pickle.loads(pickle.dumps(PooledStore(stores[2], stores[:2])))
-    expected = [episode for store in (stores[0], stores[1], stores[2]) for episode in store.episodes]
+    expected = [episode for store in (stores[0], stores[1], stores[2]) for episode in store]
 
     def require_same(pooled, count):
-        assert len(pooled) == len(pooled.episodes) == len(list(pooled.entries)) == count
-        for found, episode in zip(pooled.episodes, expected, strict=False):
+        assert len(pooled) == len(list(pooled.entries)) == count
+        for found, episode in zip(pooled, expected, strict=False):
             assert found.seed == episode.seed and np.array_equal(found.position_TN3, episode.position_TN3)
-        assert pooled.frames() == [episode.frame_count for episode in pooled.episodes]
-        assert pooled.particles(range(count)[::-1]) == [e.particle_count for e in pooled.episodes][::-1]
+        assert pooled.frames() == [episode.frame_count for episode in pooled]
+        assert pooled.particles(range(count)[::-1]) == [e.particle_count for e in pooled][::-1]
 
     require_same(pooled, 9)
     assert pooled.frames(6) == [6, 6, 6, 9, 9, 5]

@@ -26,15 +26,15 @@ def test_positions_are_read_only_memory_maps(folder):
     """Positions stay on disk until used; everything else is loaded."""
     store = EpisodeStore(folder, "train")
     assert len(store) == 5 and [entry.key for entry in store.entries] == [f"train-{i:06d}" for i in range(5)]
-    for episode, entry in zip(store.episodes, store.entries, strict=True):
+    for episode, entry in zip(store, store.entries, strict=True):
         assert isinstance(episode.position_TN3, np.memmap) and not episode.position_TN3.flags.writeable
         assert not isinstance(episode.material_N, np.memmap)
         assert episode.position_TN3.shape == (entry.frames, entry.particles, 3) and episode.seed == entry.seed
         assert episode.position_TN3.ctypes.data % 64 == 0
-    assert store.episodes[-1].key == "train-000004"
-    assert [episode.key for episode in store.episodes[1:3]] == ["train-000001", "train-000002"]
+    assert store[-1].key == "train-000004"
+    assert [episode.key for episode in store[1:3]] == ["train-000001", "train-000002"]
     with pytest.raises(IndexError):
-        store.episodes[5]
+        store[5]
 
 
 def test_a_shard_of_no_bytes(tmp_path):
@@ -43,36 +43,36 @@ def test_a_shard_of_no_bytes(tmp_path):
     Manifest(identity_hash({}), {}, {"train": 1}, 1, ListedIndex([empty])).save(tmp_path)
     (tmp_path / empty.name).touch()
     with pytest.raises(ConfigError, match="must lie within 0 bytes"):
-        EpisodeStore(tmp_path, "train").episodes[0]
+        EpisodeStore(tmp_path, "train")[0]
 
 
 def test_one_map_a_shard(folder):
     """A thousand episodes do not need a thousand open files: a shard is mapped once."""
     store = EpisodeStore(folder, "train")
-    _ = list(store.episodes)
+    _ = list(store)
     assert len(store._open_shards) == store.manifest.totals["train"].shards == 4
-    assert store.episodes[2] is store.episodes[2]
+    assert store[2] is store[2]
 
 
 def test_store_travels_to_workers(folder):
     """A pickled store holds no episode data and opens the same episodes on the other side."""
     store = EpisodeStore(folder, "train")
-    _ = list(store.episodes)
+    _ = list(store)
     data = pickle.dumps(store)
     assert len(data) < 20_000
     there = pickle.loads(data)
-    assert np.array_equal(there.episodes[3].position_TN3, store.episodes[3].position_TN3)
+    assert np.array_equal(there[3].position_TN3, store[3].position_TN3)
 
 
 def test_store_grows_with_the_dataset(make_config, make_dataset):
     """Refreshing appends new episodes and keeps the places of those that were there."""
     folder = make_dataset(make_config(training_scenes=3))
     train, test = EpisodeStore(folder, "train"), EpisodeStore(folder, "test")
-    first = train.episodes[0]
+    first = train[0]
     assert not train.refresh()
     make_dataset(make_config(training_scenes=9))
     assert train.refresh() and not test.refresh()
-    assert len(train) == len(train.episodes) == 9 and train.episodes[0] is first
+    assert len(train) == 9 and train[0] is first
     assert train.manifest.revision == Manifest.load(folder).revision
     assert train.statistics() == Manifest.load(folder).statistics("train")
 
@@ -81,7 +81,7 @@ def test_store_opens_before_the_first_episode(make_config):
     """A data set that is being made can be opened while it holds nothing yet."""
     with DatasetWriter(make_config()) as writer:
         assert EpisodeStore.available(writer.folder)
-        assert len(EpisodeStore(writer.folder, "train").episodes) == 0
+        assert len(EpisodeStore(writer.folder, "train")) == 0
 
 
 def test_frames_of_episodes(make_config, make_dataset):
@@ -91,7 +91,7 @@ def test_frames_of_episodes(make_config, make_dataset):
     assert store.frames() == [6, 6, 9]
     make_dataset(make_config(long_fraction=0.4, long_frames=9))
     assert store.refresh() and store.frames(4) == [6, 6, 9, 6]
-    assert store.frames() == [episode.frame_count for episode in store.episodes] == [6, 6, 9, 6, 9]
+    assert store.frames() == [episode.frame_count for episode in store] == [6, 6, 9, 6, 9]
 
 
 def test_unknown_split(folder):
@@ -107,9 +107,9 @@ def test_shard_cut_at_a_member_boundary_is_refused(folder):
     cut = locate_members(shard)["train-000003"]["position.npy"][0] - 512
     os.truncate(shard, cut)
     store = EpisodeStore(folder, "train")
-    assert store.episodes[0].key == "train-000000"
+    assert store[0].key == "train-000000"
     with pytest.raises(ConfigError, match=rf"000004\.tar must have {size} bytes, got {cut}; delete it and run"):
-        store.episodes[2]
+        store[2]
 
 
 def test_shards_are_hashed_once(folder, monkeypatch):
@@ -118,7 +118,7 @@ def test_shards_are_hashed_once(folder, monkeypatch):
     real = hgn.data.verification.file_sha256
     monkeypatch.setattr(hgn.data.verification, "file_sha256", lambda path: hashed.append(path.name) or real(path))
     for _ in range(2):
-        _ = list(EpisodeStore(folder, "train").episodes)
+        _ = list(EpisodeStore(folder, "train"))
     assert len(hashed) == len(set(hashed)) == 4
 
 
@@ -136,7 +136,7 @@ def test_manifest_that_does_not_fit_its_shard(folder, changes, message):
     mapping["shards"][0]["episodes"][0] |= changes
     path.write_text(json.dumps(mapping))
     with pytest.raises(ConfigError, match=message):
-        EpisodeStore(folder, "train").episodes[0]
+        EpisodeStore(folder, "train")[0]
 
 
 def test_refresh_refuses_another_dataset(folder, make_config, make_dataset, tmp_path):

@@ -89,7 +89,7 @@ def answering(handler):
 
 
 def same_episodes(one, other):
-    pairs = zip(one.episodes, other.episodes, strict=True)
+    pairs = zip(one, other, strict=True)
     return all(a.key == b.key and np.array_equal(a.position_TN3, b.position_TN3) for a, b in pairs)
 
 
@@ -105,7 +105,7 @@ def test_service_gives_what_the_folder_holds(folder, serve, cache):
     """Over HTTP the same episodes come, memory-mapped from a cache that names shards by their sha256."""
     store = EpisodeStore(serve(), "train")
     assert same_episodes(store, EpisodeStore(folder, "train"))
-    assert all(isinstance(episode.position_TN3, np.memmap) for episode in store.episodes)
+    assert all(isinstance(episode.position_TN3, np.memmap) for episode in store)
     names = {f"{shard.sha256}.tar" for shard in store.manifest.shards_of("train")}
     assert {path.name for path in cache.iterdir()} == names
 
@@ -128,9 +128,9 @@ def test_manifest_is_sent_once(folder, serve, monkeypatch):
 def test_growing_data_set(make_config, make_dataset, serve, folder):
     """A data set that grows behind its URL is seen to grow; shards that are known stay where they are."""
     store = EpisodeStore(serve(), "train")
-    first = store.episodes[0]
+    first = store[0]
     make_dataset(make_config(training_scenes=9))
-    assert store.refresh() and len(store) == 9 and store.episodes[0] is first
+    assert store.refresh() and len(store) == 9 and store[0] is first
     store.fetch_ahead()
     assert same_episodes(store, EpisodeStore(folder, "train"))
 
@@ -140,14 +140,14 @@ def test_same_names_do_not_collide(make_config, make_dataset, tmp_path):
     folders = [make_dataset(make_config(folder=str(tmp_path / name), frames=n)) for name, n in (("a", 4), ("b", 7))]
     stores = [EpisodeStore(in_memory(folder, f"collide{i}"), "train") for i, folder in enumerate(folders)]
     assert [store.manifest.shards[0].name for store in stores] == ["train-000000-000001.tar"] * 2
-    assert [store.episodes[0].frame_count for store in stores] == [4, 7]
+    assert [store[0].frame_count for store in stores] == [4, 7]
     for store, folder in zip(stores, folders, strict=True):
         assert same_episodes(store, EpisodeStore(folder, "train"))
 
 
 def _read(url, barrier, results):
     barrier.wait()
-    results.put([episode.key for episode in EpisodeStore(url, "train").episodes])
+    results.put([episode.key for episode in EpisodeStore(url, "train")])
 
 
 def test_ranks_share_the_cache(folder, serve, cache):
@@ -216,12 +216,12 @@ def test_altered_or_cut_shards_are_refused(folder, cache):
     files.pipe(f"/altered/{second.name}", content[: second.bytes // 2])
     store = EpisodeStore(url, "train")
     with pytest.raises(ConfigError, match=r"memory://altered/train-.*\.tar must have sha256 [0-9a-f]{64}, got other"):
-        store.episodes[0]
+        store[0]
     with pytest.raises(ConfigError, match=rf"must have {second.bytes} bytes, got {second.bytes // 2}; it was cut"):
-        store.episodes[1]
+        store[1]
     files.rm(f"/altered/{second.name}")
     with pytest.raises(ConfigError, match="is listed in the manifest but missing"):
-        store.episodes[1]
+        store[1]
     assert list(cache.iterdir()) == []
 
 
@@ -308,7 +308,7 @@ def test_full_cache(folder, cache, monkeypatch, full):
     kept = sorted(cache.glob("*.tar"))
     assert 0 < store._fetched < len(store.manifest.shards) and len(kept) == 2
     for _ in range(2):
-        for mine, other in zip(store.episodes, expected.episodes, strict=True):
+        for mine, other in zip(store, expected, strict=True):
             assert np.array_equal(mine.position_TN3, other.position_TN3)
             assert sum(path.stat().st_size for path in cache.glob("*.tar")) <= room
         assert len(store._open_shards) <= 2
@@ -318,7 +318,7 @@ def test_full_cache(folder, cache, monkeypatch, full):
     for path in cache.glob("*.tar"):
         path.unlink()
     with pytest.raises(OSError, match="the cache is full"):
-        store.episodes[0]
+        store[0]
 
 
 def test_clock_that_was_set_back(folder, cache, monkeypatch):
@@ -413,9 +413,9 @@ def test_server_that_comes_back(folder, serve):
     """A reader waits for a service that is started again, and meanwhile goes on with what it has."""
     url = serve()
     store = EpisodeStore(url, "train")
-    _ = store.episodes[0]
+    _ = store[0]
     serve.stop()
-    assert not store.refresh() and store.episodes[0].key == "train-000000"
+    assert not store.refresh() and store[0].key == "train-000000"
     threading.Timer(0.5, serve, kwargs={"port": int(url.rpartition(":")[2])}).start()
     assert same_episodes(store, EpisodeStore(folder, "train"))
 
@@ -433,7 +433,7 @@ def test_server_that_is_away_is_not_asked_at_once_again(folder, serve, monkeypat
     """Looking for news at a machine that is off costs one wait in a while, and a split is read without it."""
     url = serve()
     store = EpisodeStore(url, "train")
-    _ = store.of_split("validation").episodes[:]
+    _ = store.of_split("validation")[:]
     serve.stop()
     assert not store.refresh()
     files = open_storage(url)._files
@@ -481,9 +481,9 @@ def test_a_cache_that_fails(folder, cache, monkeypatch, module, function, number
     with monkeypatch.context() as patch:
         patch.setattr(module, function, failing)
         with pytest.raises(error, match=message):
-            store.episodes[0]
+            store[0]
     assert function == "flock" or list(cache.iterdir()) == []
-    assert store.episodes[0].key == "train-000000"
+    assert store[0].key == "train-000000"
 
 
 def test_damage_at_the_service(folder, serve):
@@ -492,7 +492,7 @@ def test_damage_at_the_service(folder, serve):
     shard = folder / store.manifest.shards[0].name
     shard.write_bytes(shard.read_bytes()[:-1] + b"?")
     with pytest.raises(ConfigError, match=r"train-000000-000001.tar is damaged at its service; delete it there and"):
-        store.episodes[0]
+        store[0]
 
 
 def test_cache_folder(monkeypatch, tmp_path):
@@ -517,4 +517,4 @@ def test_a_cache_that_cannot_be(folder, tmp_path, monkeypatch):
     (tmp_path / "file").touch()
     monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "file"))
     with pytest.raises(ConfigError, match=rf"{CACHE_VARIABLE} must name a folder .* got .*shards \(Not a directory\)"):
-        EpisodeStore(in_memory(folder, "uncached"), "train").episodes[0]
+        EpisodeStore(in_memory(folder, "uncached"), "train")[0]

@@ -57,7 +57,7 @@ def test_long_episodes(make_config, backend):
     frames = [[entry.frames for entry in sorted(some, key=lambda entry: entry.index)] for some in entries]
     short = config.dataset.frames
     assert frames == [[short, short, 11] * 3, [short, short, 11]]
-    for episode in EpisodeStore(Path(config.dataset.folder), "train").episodes:
+    for episode in EpisodeStore(Path(config.dataset.folder), "train"):
         time_s, down = (episode.frame_count - 1) / 60, np.array(episode.gravity)
         moved_N3 = episode.position_TN3[-1] - episode.position_TN3[0] - time_s * episode.initial_velocity_N3
         np.testing.assert_allclose(moved_N3, np.tile(0.5 * time_s**2 * down, (len(moved_N3), 1)), atol=1e-6)
@@ -243,7 +243,7 @@ def test_positions_start_at_the_scene(make_config, backend):
     """Episodes hold what the solver returned, with seed, counters and physics beside."""
     config = make_config(training_scenes=1, validation_scenes=0, test_scenes=0)
     generate(config, backend)
-    (episode,) = EpisodeStore(config.dataset.folder, "train").episodes
+    (episode,) = EpisodeStore(config.dataset.folder, "train")
     assert episode.solver["counters"] == {"substeps": 6}
     assert episode.solver["settings"]["youngs_modulus_pa"] == 1e6 and "device" not in episode.solver["settings"]
     assert np.isfinite(episode.position_TN3).all() and episode.frame_count == 6

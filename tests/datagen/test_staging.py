@@ -71,7 +71,7 @@ def test_growth_keeps_what_is_there(make_config, make_dataset, tmp_path, control
     assert [(shard.first, shard.stop) for shard in after.shards_of("train")] == list(pairwise(ends))
     assert after.requested["train"] == 9 and after.complete and simulated_once(control) == 9 + 2 + 1
     direct = make_dataset(make_config(training_scenes=9, folder=str(tmp_path / "direct")))
-    for grown, made in zip(EpisodeStore(folder, "train").episodes, EpisodeStore(direct, "train").episodes, strict=True):
+    for grown, made in zip(EpisodeStore(folder, "train"), EpisodeStore(direct, "train"), strict=True):
         assert np.array_equal(grown.position_TN3, made.position_TN3) and grown.seed == made.seed
 
 
@@ -192,7 +192,7 @@ def test_no_clock_is_asked(make_config, make_dataset, small_dataset, stage, seco
             store = store or EpisodeStore(writer.folder, "train")
             store.refresh()
             writer.refresh()
-            assert len(store) == len(store.episodes[:]) == writer.done == index + 1
+            assert len(store) == len(store[:]) == writer.done == index + 1
     make_dataset(make_config())
     turn_back(writer.folder)
     assert hashes(make_dataset(make_config())) == hashes(small_dataset)

@@ -29,7 +29,7 @@ def store(tmp_path, monkeypatch):
 
 
 def keys(folder):
-    return [episode.key for episode in EpisodeStore(folder, "train").episodes]
+    return [episode.key for episode in EpisodeStore(folder, "train")]
 
 
 def test_copy_is_the_data_set(make_config, make_dataset, capsys):

@@ -63,7 +63,7 @@ def test_plain_tar_and_webdataset_read_shards(folder):
         for name in ("position.npy", "velocity.npy", "material.npy", "obstacle_cell.npy", "obstacle_normal.npy", "json")
     ]
     samples = list(webdataset.WebDataset(str(shard), shardshuffle=False).decode())
-    stored = EpisodeStore(folder, "train").episodes[2:4]
+    stored = EpisodeStore(folder, "train")[2:4]
     assert [sample["__key__"] for sample in samples] == ["train-000002", "train-000003"]
     for sample, episode in zip(samples, stored, strict=True):
         assert np.array_equal(sample["position.npy"], episode.position_TN3)
@@ -84,7 +84,7 @@ def test_offsets_lead_to_the_data(folder):
 def test_manifest_statistics_equal_direct_ones(folder):
     """Statistics over all shards of a split equal those computed from all its episodes at once."""
     statistics = Manifest.load(folder).statistics("train")
-    positions = [np.asarray(episode.position_TN3, np.float64) for episode in EpisodeStore(folder, "train").episodes]
+    positions = [np.asarray(episode.position_TN3, np.float64) for episode in EpisodeStore(folder, "train")]
     for moments, order in ((statistics.velocity, 1), (statistics.acceleration, 2)):
         values = np.concatenate([np.diff(position, n=order, axis=0).reshape(-1, 3) for position in positions])
         assert moments.count == len(values)

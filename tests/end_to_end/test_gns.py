@@ -47,7 +47,7 @@ def test_every_command_takes_a_baseline(data, tmp_path, kind):
 def test_training_and_rollout_see_the_same_surface(spacing_cells, data):
     """A batch and a simulation's start hold the same surface points, as far apart as asked, in the obstacles'
     cells; without obstacles there are none."""
-    plain = EpisodeStore(data.dataset.folder, "train").episodes[0]
+    plain = EpisodeStore(data.dataset.folder, "train")[0]
     grid = random_grid(3, 40)
     episode = replace(plain, obstacle_grid=grid, position_TN3=np.array(plain.position_TN3))
     network = NetworkConfig(kind="gns_particles", obstacle_features=False, static_spacing_cells=spacing_cells, **GNS)

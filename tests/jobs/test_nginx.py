@@ -23,7 +23,7 @@ from hgn.data.reader import EpisodeStore
 store = EpisodeStore(sys.argv[1], "train")
 for _ in sys.stdin:
     store.refresh()
-    print(len(store), sum(float(episode.position_TN3.sum()) for episode in store.episodes), flush=True)
+    print(len(store), sum(float(episode.position_TN3.sum()) for episode in store), flush=True)
 """
 pytestmark = pytest.mark.skipif(
     shutil.which("nginx") is None or shutil.which("openssl") is None, reason="needs nginx and openssl"

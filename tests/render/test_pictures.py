@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import trimesh
 from PIL import Image, ImageSequence
+from scipy.ndimage import center_of_mass, label
 
 from hgn.render.pictures import (
     animate,
@@ -17,7 +18,7 @@ from hgn.render.pictures import (
     rollout_of_episode,
     write_picture,
 )
-from hgn.render.renderer import Stage
+from hgn.render.renderer import OBSTACLE_COLOR, Stage, to_bytes
 from hgn.scene.episode import Episode
 from hgn.scene.motion import Motion
 from hgn.scene.obstacle_grid import ObstacleGrid
@@ -111,6 +112,53 @@ def test_obstacles_that_move_are_drawn_where_they_are(tmp_path):
         first, last = (np.asarray(frame.convert("RGB")).astype(int) for frame in ImageSequence.Iterator(film))
     grey = np.abs(first - last).max(axis=-1) > 25
     assert grey[:, :50].sum() > 50  # where the box came to
+
+
+def flat_rollout():
+    """Three particles of water in the plane of a box twice as wide as high, and two obstacle cells on its floor."""
+    position_N3 = np.array([[0.1, 0.1, 0.25], [0.7, 0.1, 0.25], [0.1, 0.3, 0.25]], np.float32)
+    grid = ObstacleGrid(0.05, np.array([[8, 0, 3], [9, 0, 3]], np.int32), np.array([[0, 1, 0]] * 2, np.float32))
+    episode = Episode(
+        key="train-000000",
+        position_TN3=np.stack([position_N3, position_N3]),
+        initial_velocity_N3=np.zeros((3, 3), np.float32),
+        material_N=np.zeros(3, np.uint8),
+        obstacle_grid=grid,
+        domain_size=(0.8, 0.4, 0.5),
+        gravity=(0.0, -9.8, 0.0),
+        frame_rate_hz=60.0,
+        seed=0,
+        specification={"kind": "imported", "dimensions": 2},
+        solver={},
+    )
+    return rollout_of_episode(episode)
+
+
+def test_flat_rollouts_are_drawn_in_their_plane(tmp_path):
+    """Seen straight on: places are in proportion along both axes, obstacle cells are filled, and nothing is shaded by
+    what lies above it. Animations and files keep that."""
+    rollout = flat_rollout()
+    write_rollout(tmp_path / "flat.vtkhdf", rollout)
+    rollout = read_rollout(tmp_path / "flat.vtkhdf")
+    picture = np.asarray(compare_picture(rollout, [0], size=400)).astype(int)[:-40]  # without the legend
+    red, _, blue = np.moveaxis(picture, -1, 0)
+    spot_PN, count = label(blue - red > 60)
+    assert count == 3
+    y_N, x_N = np.array(center_of_mass(spot_PN > 0, spot_PN, [1, 2, 3])).T
+    (highest, *low) = np.argsort(y_N)
+    left, right = sorted(low, key=lambda spot: x_N[spot])
+    scale = (x_N[right] - x_N[left]) / 0.6
+    assert scale == pytest.approx(400 * 0.96 / 0.8, rel=0.01)
+    assert y_N[left] == pytest.approx(y_N[right], abs=0.1) and x_N[highest] == pytest.approx(x_N[left], abs=0.1)
+    assert (y_N[left] - y_N[highest]) / 0.2 == pytest.approx(scale, rel=0.01)
+    grey = (np.abs(np.moveaxis(picture, -1, 0) - to_bytes(OBSTACLE_COLOR)[:, None, None].astype(int)) < 3).all(axis=0)
+    row_S, column_S = np.nonzero(grey)
+    assert grey.sum() == pytest.approx(2 * (0.05 * scale) ** 2, rel=0.1)
+    assert column_S.mean() - x_N[left] == pytest.approx((0.45 - 0.1) * scale, abs=1)
+    assert row_S.mean() - y_N[left] == pytest.approx((0.1 - 0.025) * scale, abs=1)
+    animate(rollout, tmp_path / "flat.webp", every=1, size=200)
+    with Image.open(tmp_path / "flat.webp") as film:
+        assert film.size == (200, 104 + 2 * 18)
 
 
 def test_pictures_are_reproducible():

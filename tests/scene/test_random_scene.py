@@ -350,7 +350,7 @@ def test_own_meshes_among_the_obstacles(tmp_path):
     for changed in (False, True):
         known = [record | {"sha256": "0" * 64} if changed else record for record in records]
         specification, grid = scene.specification | {"obstacles": known}, build_obstacle_grid(scene.obstacles, CELL, 0)
-        rebuilt = obstacles_of_episode(SimpleNamespace(specification=specification, obstacle_grid=grid))
+        rebuilt = obstacles_of_episode(SimpleNamespace(specification=specification, obstacle_grid=grid, dimensions=3))
         assert [item.name for item in rebuilt] == (["cells"] if changed else names)
         if not changed:
             np.testing.assert_array_equal(rebuilt[0].vertex_V3, scene.obstacles[0].vertex_V3)

@@ -85,6 +85,20 @@ def test_files_of_other_materials(tmp_path):
             assert read_rollout(path).materials == tuple(names)
 
 
+def test_files_of_flat_rollouts(tmp_path):
+    """A file keeps that all lies in a plane; older ones, which do not tell, have three dimensions."""
+    path, flat = tmp_path / "rollout.h5", dataclasses.replace(make_rollout(), dimensions=2)
+    write_rollout(path, flat)
+    assert read_rollout(path).dimensions == 2
+    with h5py.File(path, "a") as file:
+        file["hgn"].attrs["dimensions"] = 4
+    with pytest.raises(ConfigError, match=r"dimensions must be 2 or 3, got 4; write it again"):
+        read_rollout(path)
+    with h5py.File(path, "a") as file:
+        del file["hgn"].attrs["dimensions"]
+    assert read_rollout(path).dimensions == 3
+
+
 def test_diverged_rollout_is_kept(tmp_path):
     """NaN positions are written and read, so that a divergence can be looked at."""
     rollout = make_rollout()
@@ -356,7 +370,8 @@ def episode(specification):
 
 
 def test_cell_obstacles():
-    """Each cell becomes one square of the cell's size across the stored normal, around the cell's centre."""
+    """Each cell becomes one square of the cell's size around its centre: across the stored normal, of a flat set in
+    its plane."""
     normal = np.array([[0, 1, 0], [0.6, 0, 0.8]], np.float32)
     grid = ObstacleGrid(0.25, np.array([[0, 1, 2], [3, 0, 1]], np.int32), normal)
     (squares,) = cell_obstacles(grid)
@@ -366,6 +381,10 @@ def test_cell_obstacles():
     np.testing.assert_allclose(np.linalg.norm(cross, axis=1), 0.25**2)
     direction = cross / np.linalg.norm(cross, axis=1, keepdims=True)
     np.testing.assert_allclose(np.abs((direction * np.tile(normal, (2, 1))).sum(axis=1)), 1, rtol=1e-6)
+    (flat,) = cell_obstacles(grid, plane_z=0.6)
+    corner_K43 = flat.vertex_V3.reshape(2, 4, 3)
+    np.testing.assert_allclose(corner_K43[..., :2].mean(axis=1), (grid.cell_K3[:, :2] + 0.5) * 0.25)
+    assert (np.ptp(corner_K43, axis=1) == (0.25, 0.25, 0)).all() and (corner_K43[..., 2] == 0.6).all()
     assert cell_obstacles(ObstacleGrid(0.25, np.empty((0, 3), np.int32), np.empty((0, 3), np.float32))) == ()
 
 

@@ -38,7 +38,7 @@ def data(small_dataset):
 
 def test_baseline_errors_are_those_of_training(data):
     """One-step errors agree with what training measures, at every frame."""
-    (episode,) = EpisodeStore(data, "test").episodes
+    (episode,) = EpisodeStore(data, "test")
     gravity = BaselineContender("fall", lambda e: 0.9 * np.asarray(e.gravity) / e.frame_rate_hz**2, CPU)
     network = network_of(torch.float32, obstacle_features=False)
     batches = frame_batches([episode], network, 1, 100)
@@ -49,7 +49,7 @@ def test_baseline_errors_are_those_of_training(data):
 def test_the_fast_path_tells_its_own_errors(data):
     """One-step errors of backend triton come from its kernels, several frames at once: in float32 they are the plain
     network's; what is captured serves the next frames, and those of fewer particles too."""
-    (episode,) = EpisodeStore(data, "test").episodes
+    (episode,) = EpisodeStore(data, "test")
     fewer = replace(
         episode,
         key="fewer",
@@ -69,7 +69,7 @@ def test_the_fast_path_tells_its_own_errors(data):
 
 def test_ghost_acceleration_counts_particles_at_rest(data):
     """Only particles that have not moved count, each with the length of what is predicted for it."""
-    (episode,) = EpisodeStore(data, "test").episodes
+    (episode,) = EpisodeStore(data, "test")
     position_TN3 = np.repeat(np.array(episode.position_TN3[:1]), 9, axis=0)
     position_TN3[:, 0] += np.arange(9, dtype=np.float32)[:, None] * 0.01
     still = replace(
@@ -85,7 +85,7 @@ def test_ghost_acceleration_counts_particles_at_rest(data):
 
 def test_a_diverging_scene_ends_alone(data):
     """Beside one that diverges a scene goes on to the end; the other is kept as far as it came, with the cause."""
-    episodes = EpisodeStore(data, "validation").episodes
+    episodes = EpisodeStore(data, "validation")
     scenes = [InitialState.of_episode(episode) for episode in episodes]
     scenes = [replace(s, material_N=np.full_like(s.material_N, i)) for i, s in enumerate(scenes)]
     simulator = Simulator(network_of(torch.float32), 60.0)
@@ -163,7 +163,7 @@ def test_other_grids_keep_their_walls():
 
 def test_scenes_that_failed_leave_the_means(data):
     """Errors at a frame are means over the scenes that reached it, and say over how many."""
-    episodes = list(EpisodeStore(data, "validation").episodes)
+    episodes = list(EpisodeStore(data, "validation"))
     config = ErrorVsTimeConfig(data="d", out="x")
     paths = [np.array(episode.position_TN3) for episode in episodes]
     trials = [RolloutResult(paths[0] + np.float32(0.1)), RolloutResult(paths[1][:3] + np.float32(0.2), "why")]
@@ -177,7 +177,7 @@ def test_scenes_that_failed_leave_the_means(data):
 @pytest.mark.parametrize("kind", ["hgn", "gns"])
 def test_scenes_beside_one_that_diverges_go_their_way(data, kind):
     """Off backend triton they are simulated once, as if it had never been there."""
-    episodes = EpisodeStore(data, "validation").episodes
+    episodes = EpisodeStore(data, "validation")
     scenes = [InitialState.of_episode(episode) for episode in (*episodes, episodes[0])]
     scenes[1] = replace(scenes[1], velocity_N3=scenes[1].velocity_N3 + np.float32(60.0))
     simulator, calls = Simulator((network_of if kind == "hgn" else gns_of)(torch.float32), 60.0), []

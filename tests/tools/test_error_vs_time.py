@@ -172,7 +172,7 @@ def test_precisions_that_a_path_does_not_know(data, both, tmp_path, capsys):
     """The HGN in fp16 on backend torch is left out, and that is said; triton must run where it is asked for."""
     options = {"data": data, "out": str(tmp_path / "report"), "split": "test", "weights": both}
     config = from_mapping(ErrorVsTimeConfig, options | {"precisions": ["fp32", "fp16"]})
-    (episode,) = EpisodeStore(data, "test").episodes
+    (episode,) = EpisodeStore(data, "test")
     found = [(c.row["system"], c.row["precision"]) for c in network_contenders(config, CPU, [episode])]
     assert found == [("hgn", "fp32"), ("gns", "fp32"), ("gns", "fp16")]
     assert "left out: hgn.safetensors at fp16" in capsys.readouterr().err
@@ -247,7 +247,7 @@ def test_the_solver_is_timed_over_whole_rollouts(system, frames):
 
 def test_shipped_weights_that_fit(data, tmp_path, monkeypatch, capsys):
     """By default all shipped weights are compared that are for such data; what is left out is said."""
-    (episode,) = EpisodeStore(data, "test").episodes
+    (episode,) = EpisodeStore(data, "test")
     networks = {
         "a": network_of(levels=3),
         "b": gns_of(),
@@ -287,7 +287,7 @@ def test_what_launches_none_of_the_kernels_is_scored_beside_their_compilation(da
     config = ErrorVsTimeConfig(out=str(tmp_path / "report"), data=data)
     network = NetworkContender(weights_file(tmp_path / "hgn.safetensors", "hgn"), "fp32", "auto", CPU, 60.0)
     baseline = BaselineContender("nothing moves", lambda _: np.zeros(3), CPU)
-    run = Run(config, [network, *solvers, baseline], EpisodeStore(data, "test").episodes, CPU, {}, 0.0)
+    run = Run(config, [network, *solvers, baseline], EpisodeStore(data, "test"), CPU, {}, 0.0)
     run.score_beside(lambda: len(order) < 3)
     assert order == ["nothing moves", "MPM 32³, step 1", "MPM 48³, step 1"] and run.failed == 0
 

@@ -170,7 +170,7 @@ def test_data_larger_than_the_device(make_config, make_dataset):
         brought, most = brought + len(chunk.episodes), max(most, len(held))
         for sample in (sample for update in chunk.samples for sample in update):
             samples += 1
-            expected = store.episodes[sample.episode].position_TN3
+            expected = store[sample.episode].position_TN3
             assert np.array_equal(held[sample.episode].position_TN3[-len(expected) :].numpy(), expected)
         if samples >= 2 * 64 * 3:
             break

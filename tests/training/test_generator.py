@@ -50,7 +50,7 @@ def test_makes_what_is_missing(tmp_path):
     manifest = Manifest.load(config.dataset.folder)
     assert manifest.complete and sum(len(shard.episodes) for shard in manifest.shards) == 3
     assert generator.frames_done() <= 9
-    for episode in EpisodeStore(config.dataset.folder, "train").episodes:  # the real solver's
+    for episode in EpisodeStore(config.dataset.folder, "train"):  # the real solver's
         assert episode.solver["counters"]["substeps"] > 0 and len(episode.obstacle_grid.cell_K3) > 0
 
     other = Generator(replace(config, mpm=replace(config.mpm, poisson_ratio=0.3)), tmp_path / "other")

@@ -20,6 +20,7 @@ from hgn.config import TrainConfig
 from hgn.data.manifest import Manifest
 from hgn.data.reader import EpisodeStore
 from hgn.data.statistics import merge_statistics
+from hgn.export import export
 from hgn.runtime.rollouts import RolloutResult
 from hgn.schema import ConfigError, from_mapping
 from hgn.system.files import held
@@ -40,10 +41,11 @@ def weights(path):
     return read_checkpoint(path)["state_dict"]
 
 
-def test_a_run_leaves_what_it_promises(data, run):
+def test_a_run_leaves_what_it_promises(data, run, capsys):
     """Checkpoints, metrics with one-step and rollout errors of both splits, pictures, the resolved config; and in
     TensorBoard loss, errors by material, rate, gradient norm, speed, waiting, shards, pictures, hyper-parameters."""
     assert train.main(train_mapping(data, run, monitor_rollout_frames=4)) == 0
+    assert "best.ckpt" not in "".join(capsys.readouterr())  # what is there is not told of
     checkpoint = read_checkpoint(run / "checkpoints" / "last.ckpt")
     assert checkpoint["hgn"]["updates"] == 12 and (run / "checkpoints" / "best.ckpt").is_file()
     records = metrics(run)
@@ -239,6 +241,23 @@ def test_the_best_network_is_remembered(data, tmp_path):
     assert train.main(train_mapping(data, run, maximum_updates=5, monitor_every=1000)) == 0
     (error,) = (record["one_step/validation"] for record in metrics(run) if "one_step/validation" in record)
     assert read_checkpoint(run / "checkpoints" / "last.ckpt")["callbacks"]["Checkpoints"] == {"best_error": error}
+
+
+def test_without_validation_scenes_there_is_no_best(make_config, make_dataset, tmp_path, capsys):
+    """The start says so, the end says what to export instead, and so does an export of the one that is not there."""
+    config, run = make_config(validation_scenes=0), tmp_path / "run"
+    make_dataset(config)
+    assert train.main(train_mapping(config, run, maximum_updates=2)) == 0
+    said, last = capsys.readouterr(), run / "checkpoints" / "last.ckpt"
+    assert "no validation scenes: there will be no best.ckpt, nor errors and pictures of them" in said.err
+    assert f"no best.ckpt, for no validation scene was measured; export {last}" in said.out
+    missing = run / "checkpoints" / "best.ckpt"
+    assert last.is_file() and not missing.exists()
+    with pytest.raises(ConfigError, match=rf"got {missing}; no validation scene was measured, so take {last}"):
+        export(missing, tmp_path / "out.safetensors")
+    export(last, tmp_path / "out.safetensors")
+    with pytest.raises(ConfigError, match=r"got .*other.ckpt; hgn.train writes one"):
+        export(tmp_path / "other.ckpt", tmp_path / "out.safetensors")
 
 
 def test_a_resumed_run_has_the_rate_it_is_given(data, tmp_path):

@@ -295,6 +295,19 @@ def test_materials_of_imported_sets_are_shown():
         stop_server(server)
 
 
+def test_flat_rollouts_are_looked_at_straight():
+    """The camera stands before the middle of the plane, whose box is as deep as a particle."""
+    server, _ = start_server("127.0.0.1", 0, "stage")
+    try:
+        StageView(server, (0.8, 0.4, 0.5), 0.01, dimensions=2)
+        camera = server.initial_camera
+        np.testing.assert_allclose(camera.look_at, (0.4, 0.2, 0.25))
+        np.testing.assert_allclose(camera.position[:2], (0.4, 0.2))
+        assert camera.position[2] > 0.5
+    finally:
+        stop_server(server)
+
+
 def test_a_film_plays_by_itself(browser, play, tmp_path):
     """The static page draws the rollout's particles without any server."""
     play.do(lambda: setattr(play, "playing", False))

@@ -161,7 +161,7 @@ def differences(peaceful: Path, killed: Path) -> list[str]:
     if sorted(shard.name for shard in one.shards) != sorted(shard.name for shard in other.shards):
         faults.append("its shards have other names")
     for split in SPLITS:
-        first, second = ({e.key: e for e in EpisodeStore(folder, split).episodes} for folder in (peaceful, killed))
+        first, second = ({e.key: e for e in EpisodeStore(folder, split)} for folder in (peaceful, killed))
         if first.keys() != second.keys():
             faults.append(f"{split}: other episodes")
         both = first.keys() & second.keys()

@@ -30,9 +30,12 @@ SHARD_BYTES = 128 << 20
 LOOKED_AT = 4  # trajectories, for gravity and for the spacing of boundaries
 
 
-def import_set(source: Path, config: ImportConfig, progress: Callable[[Episode], Any] = lambda _: None) -> Manifest:
+def import_set(
+    source: Path, config: ImportConfig, progress: Callable[[Episode], Any] = lambda _: None
+) -> tuple[Manifest, str | None]:
     """Reads the trajectories of a folder and writes them as a data set; tells each episode to `progress`.
 
+    Returns: its manifest, and a line on trajectories that leave their bounds, where some do.
     Raises: ConfigError naming file and field for what cannot be read; OSError. The manifest is written last: without
     one an import that broke off is begun again.
     """
@@ -73,7 +76,8 @@ def import_set(source: Path, config: ImportConfig, progress: Callable[[Episode],
         "seed": 0,
     }
     requested = {split: sum(len(shard.episodes) for shard in shards if shard.split == split) for split in SPLITS}
-    return Manifest(identity_hash(identity), identity, requested, len(shards), ListedIndex(shards)).save(out)
+    manifest = Manifest(identity_hash(identity), identity, requested, len(shards), ListedIndex(shards)).save(out)
+    return manifest, converter.note_on_bounds(sum(requested.values()))
 
 
 def _gravity(first: list[Trajectory], info: SetInfo) -> tuple[float, ...]:

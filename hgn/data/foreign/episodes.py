@@ -25,6 +25,17 @@ AT_REST = 1e-3  # of the radius: by so much particles of the boundary may move
 OUTSIDE = 0.01  # of the particles may begin farther than a radius outside of the box
 
 
+@dataclass(frozen=True)
+class Outside:
+    """Where the particle of a trajectory that goes farthest out of the bounds is."""
+
+    trajectory: str
+    excess: float  # beyond the bound, the set's unit of length
+    axis: int
+    frame: int  # of the file
+    coordinate: float
+
+
 @dataclass(eq=False)
 class Converter:
     """Makes episodes of a set's trajectories, and notes what they hold."""
@@ -37,6 +48,7 @@ class Converter:
     gravities: set[Vector] = field(default_factory=set)
     maximum_initial_speed: float = 0.0  # length per second
     with_obstacles: bool = False
+    outside: list[Outside] = field(default_factory=list)  # one of each trajectory that leaves by more than a radius
 
     def __post_init__(self) -> None:
         names = self.info.materials.values()
@@ -72,6 +84,7 @@ class Converter:
             )
         self._require_inside(name, free_TN3[0])
         self._require_not_across(name, free_TN3)
+        self._note_outside(name, trajectory.position_TND[:, ~fixed_N])
         boundary_P3 = still_TP3[0]
         if trajectory.boundary_PD is not None:
             boundary_P3 = np.concatenate([boundary_P3, self._placed(trajectory.boundary_PD)])
@@ -135,6 +148,30 @@ class Converter:
                 f"bounds must hold the particles, got {[list(pair) for pair in self.info.bounds]} with {outside:.0%} "
                 f"of those of {name} outside, which lie in {extent}; give bounds=…"
             )
+
+    def _note_outside(self, name: str, position_TND: np.ndarray) -> None:
+        """Told, not refused: one splash over an edge is no fault of the set's other trajectories."""
+        low_D, high_D = np.array(self.info.bounds).T
+        excess_2D = np.stack([low_D - position_TND.min((0, 1)), position_TND.max((0, 1)) - high_D])
+        above, axis = (int(index) for index in np.unravel_index(excess_2D.argmax(), excess_2D.shape))
+        excess, path_TN = float(excess_2D[above, axis]), position_TND[..., axis]
+        if excess > self.info.radius:
+            place = path_TN.argmax() if above else path_TN.argmin()
+            frame = int(place) // path_TN.shape[1]
+            self.outside.append(Outside(name, excess, axis, frame, float(path_TN.flat[place])))
+
+    def note_on_bounds(self, converted: int) -> str | None:
+        """A line on the trajectories that left their bounds, of so many that were converted; none where none did."""
+        if not self.outside:
+            return None
+        farthest = max(self.outside, key=lambda outside: outside.excess)
+        low, high = self.info.bounds[farthest.axis]
+        return (
+            f"bounds: particles of {len(self.outside)} of {converted} trajectories go farther out of them than a "
+            f"radius ({self.info.radius:g}), those of {farthest.trajectory} to {'xyz'[farthest.axis]} = "
+            f"{farthest.coordinate:.4g} in frame {farthest.frame}, where bounds are [{low}, {high}]; networks take "
+            "them for walls: give bounds=… that hold all particles, or leave these trajectories out"
+        )
 
     def _require_not_across(self, name: str, free_TN3: np.ndarray) -> None:
         """What stays a radius away from a periodic side sees nothing behind it: LagrangeBench's dam has walls there."""
