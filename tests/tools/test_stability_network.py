@@ -10,7 +10,7 @@ from docs.pages import run_module
 from network.states import network_of
 from PIL import Image
 
-from hgn.config import MpmConfig, SceneConfig
+from hgn.config import MpmConfig, NetworkConfig, SceneConfig
 from hgn.runtime.rollouts import RolloutResult, simulate_scenes
 from hgn.runtime.simulator import InitialState, Simulator
 from hgn.runtime.weights import WeightsInfo, save_weights
@@ -23,10 +23,12 @@ from tools.stability.network import (
     STIR_FRAMES,
     case_row,
     case_trials,
+    collapse,
     energy_growth,
     guard_row,
     initial_states,
     main,
+    misfallen,
     share_of_way,
     solver_beside,
     solver_of,
@@ -206,6 +208,24 @@ def test_flights_end_where_contacts_may_begin():
     network = network_of(torch.float32, inputs="relative", message_passing_steps=1, contact_reach_cells=3.0)
     rows = motion_of(network, ("throw",))
     assert rows and all(row.held for row in rows.values()), rows
+
+
+def test_what_spreads_beside_the_solver():
+    """A cube of sand that spreads as the solver's does holds; spread a fifth less, or a cell higher, it does not."""
+    config = StabilityNetworkConfig("none", cases=("collapse",), frames=61, scene=SceneConfig(**SCENE))
+    made = list(cases(config, NetworkConfig(materials=("sand",))))
+    assert [case.frames for case in made] == [61] and made[0].spread_at == (30, 60)
+    case, solver = made[0], MpmConfig(device="cpu")
+    beside = solver_beside(made, solver, 60.0)[case.name]
+    low_N = [float(scene.position_N3[:, 1].min()) for scene in case.scenes]
+    assert low_N == pytest.approx([5 / 64, 20 / 64])
+    truth = collapse(beside, initial_states(case), case.spread_at)
+    assert misfallen(truth, truth) is None and len(truth) == 4
+    assert truth[1]["spread"] > 1.5 * truth[0]["spread"] > 6  # it falls apart
+    for change, beyond in (({"spread": 0.8}, "spreads by"), ({"height": 1.6}, "cells high")):
+        other = [row | {name: factor * row[name] for name, factor in change.items()} for row in truth]
+        assert beyond in misfallen(other, truth)
+    assert "did not come to the end" in misfallen(None, truth)
 
 
 def test_turned_gravity(monkeypatch):

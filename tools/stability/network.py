@@ -48,6 +48,9 @@ ENERGY_BOUND = 0.02  # how much energy may come from nowhere, of a fall through 
 WAY_BOUND = 0.2  # how far off a known way may be
 DENSITY_BOUND = 2.0  # times as many neighbours, or as few, may there be at rest after thousands of frames
 DRIFT_FACTOR, DRIFT_CELLS = 2.0, 1.0  # of the solver's own drift at rest, and so many of its cells, may there be
+# How far spread and mean height of what falls may be from the solver's. Its own differ by at most 2 % and 0.1 cells
+# over three fillings, water's late spread by 9 %.
+SPREAD_WITHIN, FALLEN_CELLS = 0.15, 0.5
 HEIGHT_CELLS = 0.1  # that the mean height at rest may differ from the solver's
 STIR_FRAMES = 60  # the last ones, over which the squared speed at rest is averaged
 # Of the solver's own squared speed about the mean at rest, and so many (domain units per second)^2, may there be: twice
@@ -203,6 +206,10 @@ def case_row(
     way = came(trials) if case.known_3 is not None else None
     more: dict[str, Any] = {"solver_share_of_way": came(beside)} if beside and way is not None else {}
     restless = None
+    if case.spread_at and beside is not None:
+        own, solvers = (collapse(some, initial, case.spread_at) for some in (trials, beside))
+        more |= {"collapse": own, "solver_collapse": solvers}
+        restless = misfallen(own, solvers)
     if case.settled is not None and beside is not None:
         own, solvers = (at_rest(some, initial, case.settled, simulator.frame_rate_hz) for some in (trials, beside))
         more |= {"rest": own, "solver_rest": solvers}
@@ -254,6 +261,36 @@ def share_of_way(trial: RolloutResult, scene: InitialState, frame_rate_hz: float
         return 1.0
     moved_N3 = trial.position_TN3[last].astype(np.float64) - trial.position_TN3[0] - seconds * scene.velocity_N3
     return float((moved_N3 @ known_3).mean() / (0.5 * seconds**2 * (known_3 @ known_3)))
+
+
+def collapse(
+    trials: Sequence[RolloutResult], scenes: Sequence[InitialState], frames: Sequence[int]
+) -> list[dict[str, float]] | None:
+    """Of each scene in some frames, in obstacle cells: how far particles have spread along x and z (root mean square
+    about their mean), and their mean height. None where a rollout ended early.
+    """
+    if any(trial.frame_count <= frames[-1] or trial.cause is not None for trial in trials):
+        return None
+    rows: list[dict[str, float]] = []
+    for number, (trial, scene) in enumerate(zip(trials, scenes, strict=True)):
+        for frame in frames:
+            place_N3 = trial.position_TN3[frame].astype(np.float64) / scene.obstacle_grid.cell_size
+            spread = float(np.sqrt(0.5 * place_N3[:, [0, 2]].var(axis=0).sum()))
+            rows.append({"scene": number, "frame": frame, "spread": spread, "height": float(place_N3[:, 1].mean())})
+    return rows
+
+
+def misfallen(own: list[dict[str, float]] | None, solvers: list[dict[str, float]] | None) -> str | None:
+    """The first spread or height that is beyond its bound beside the solver's; none where all hold."""
+    if own is None or solvers is None:
+        return f"the {'solver' if solvers is None else 'network'} did not come to the end"
+    for row, solver in zip(own, solvers, strict=True):
+        place = f"in frame {row['frame']} of scene {row['scene']}"
+        if not abs(row["spread"] / solver["spread"] - 1) <= SPREAD_WITHIN:
+            return f"spreads by {row['spread']:.2f} cells {place}, the solver {solver['spread']:.2f}"
+        if not abs(row["height"] - solver["height"]) <= FALLEN_CELLS:
+            return f"lies {row['height']:.2f} cells high {place}, the solver's {solver['height']:.2f}"
+    return None
 
 
 def at_rest(

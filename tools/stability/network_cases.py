@@ -22,8 +22,10 @@ from hgn.schema import ConfigError, FrameCount, Positive, one_of, require_bounds
 from tools.scenes import filled
 
 MOTION = ("throw", "gravity", "collision")  # tools/stability/network_motion.py
-CASES = (*MOTION, "rest", "particles", "domain", "speed", "single", "slope", "far", "guard")
+CASES = (*MOTION, "collapse", "rest", "particles", "domain", "speed", "single", "slope", "far", "guard")
 SLOPES_DEG = (15.0, 30.0, 45.0)
+COLLAPSE_CELLS = (5.0, 20.0)  # of the solver, from the lower plane to cubes that fall
+COLLAPSE_FRAMES = (30, 60, 150)  # in which they are looked at: as they spread, when walls are reached, and at rest
 SLOPE_SIDE, SLOPE_WAY = 0.6, 0.35  # of the domain's smallest side: the slope's, and what is slid along it
 FRAME_RATE_HZ = 60.0  # for how long cases are
 FALL_FRAMES = 12  # in which what falls meets nothing
@@ -39,13 +41,14 @@ class StabilityNetworkConfig:
     """The options of `python -m tools.stability network`."""
 
     weights: str  # a file of python -m hgn.export, or the name of shipped weights
-    # of throw, gravity, collision, rest, particles, domain, speed, single, slope, far, guard; null: all
+    # of throw, gravity, collision, collapse, rest, particles, domain, speed, single, slope, far, guard; null: all
     cases: tuple[Annotated[str, one_of(*CASES)], ...] | None = None
     frames: FrameCount = 300
     long_frames: FrameCount = 3000  # of the case rest
     # in each rollout of throw, gravity and collision; null: as many as a row has throws
     scenes_at_once: Positive[int] | None = None
-    # also ask the solver, which needs Taichi: for slope, collision and rest; without it rest is left out
+    # also ask the solver, which needs Taichi: for slope, collision, collapse and rest; without it the latter two are
+    # left out
     solver: bool = True
     solver_device: Processor = "auto"  # or cpu, gpu
     # that solver; sand should be what it was in the data that the weights were trained on (their cards say)
@@ -73,6 +76,7 @@ class Case:
     frames: int
     known_3: tuple[float, float, float] | None = None  # acceleration along which the particles' way is known
     known_frames: int = 0  # for so long
+    spread_at: tuple[int, ...] = ()  # frames in which spread and height are judged beside the solver
     settled: int | None = None  # frame from which on all rests: drift, density and height are judged beside the solver
     beside_solver: bool = False
 
@@ -89,6 +93,12 @@ def cases(config: StabilityNetworkConfig, network: NetworkConfig) -> Iterator[Ca
     def case(name: str, **change: Any) -> Case:
         return Case(name, (_scene(replace(base, **change)),), config.frames)
 
+    for material in base.materials if "collapse" in wanted and config.solver else ():
+        drops = tuple(_above_floor(base, material, cells) for cells in COLLAPSE_CELLS)
+        times = tuple(frame for frame in COLLAPSE_FRAMES if frame < config.frames)
+        name = f"falls and spreads, {material}"
+        if times:
+            yield Case(name, drops, times[-1] + 1, spread_at=times, beside_solver=True)
     for material in base.materials if "rest" in wanted and config.solver else ():
         rest = case(f"{config.long_frames} frames, {material}", obstacle_count=0, materials=(material,))
         settled = min(config.frames, config.long_frames) - 1
@@ -126,6 +136,14 @@ def cube_places(config: SceneConfig, seed: int = 0) -> np.ndarray:
     """A cube of a scene's group size about 0, filled as densely as the scene's groups, float64 [N, 3]."""
     count = int(config.particles_per_cell * (config.group_size / config.cell_size) ** 3) + 1
     return config.group_size * (np.random.default_rng(seed).random((count, 3)) - 0.5)
+
+
+def _above_floor(config: SceneConfig, material: str, cells: float) -> Scene:
+    """A cube at rest in the middle of an empty domain, so many of the solver's cells above the lower plane."""
+    places_N3 = cube_places(config)
+    middle_3 = 0.5 * np.array(config.domain_size)
+    middle_3[1] = cells * config.cell_size - places_N3[:, 1].min()
+    return body(config, material, middle_3 + places_N3, np.zeros(3), particles_per_cell=config.particles_per_cell)
 
 
 def _scene(config: SceneConfig) -> Scene:
