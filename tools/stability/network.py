@@ -207,9 +207,9 @@ def case_row(
     more: dict[str, Any] = {"solver_share_of_way": came(beside)} if beside and way is not None else {}
     restless = None
     if case.spread_at and beside is not None:
-        own, solvers = (collapse(some, initial, case.spread_at) for some in (trials, beside))
-        more |= {"collapse": own, "solver_collapse": solvers}
-        restless = misfallen(own, solvers)
+        fallen, solvers_fallen = (collapse(some, initial, case.spread_at) for some in (trials, beside))
+        more |= {"collapse": fallen, "solver_collapse": solvers_fallen}
+        restless = misfallen(fallen, solvers_fallen)
     if case.settled is not None and beside is not None:
         own, solvers = (at_rest(some, initial, case.settled, simulator.frame_rate_hz) for some in (trials, beside))
         more |= {"rest": own, "solver_rest": solvers}
