@@ -77,7 +77,7 @@ def _particle_to_grid(
     hidden_here = 0
     if ti.static(bool(variant & VARIANT.sheets)):
         if begins == 1.0:
-            elapsed = scene_value[scene, VALUE.frame] - scene_value[scene, VALUE.remaining] - step
+            elapsed = scene_value[scene, VALUE.part] - scene_value[scene, VALUE.remaining] - step
             hidden[p] = find_hidden(position[p], scene, elapsed, contact, contact_normal, setting, shape, variant)
         hidden_here = hidden[p]
     marks = 3 * shape[SHAPE.all_blocks] + 2
@@ -404,14 +404,16 @@ def enter(
 
 
 @ti.kernel
-def begin_frame(
-    frame_s: ti.f32,
+def begin_part(
+    part_s: ti.f32,
+    first: ti.i32,
     scene_value: ti.types.ndarray(dtype=ti.f32, ndim=2),
     counter: ti.types.ndarray(dtype=ti.i64, ndim=2),
 ):
-    """Gives every running scene a frame's time."""
+    """Gives every running scene the time of a part of a frame; substeps are counted from the frame's first part on."""
     for scene in range(scene_value.shape[0]):
-        counter[scene, COUNT.frame_substeps] = ti.cast(0, ti.i64)
+        if first == 1:
+            counter[scene, COUNT.frame_substeps] = ti.cast(0, ti.i64)
         if counter[scene, COUNT.status] == STATUS.running:
-            scene_value[scene, VALUE.remaining] = frame_s
-            scene_value[scene, VALUE.frame] = frame_s
+            scene_value[scene, VALUE.remaining] = part_s
+            scene_value[scene, VALUE.part] = part_s

@@ -98,8 +98,8 @@ class GridLaunch(Launch):
             for part in range(parts):
                 if motion or moved:
                     self._move((frame + part / parts) * self.frame_s, (frame + (part + 1) / parts) * self.frame_s)
-                grid_kernel.begin_frame(self.frame_s / parts, self.scene_value, self.counter)
-                self._run_frame()
+                grid_kernel.begin_part(self.frame_s / parts, int(part == 0), self.scene_value, self.counter)
+                self._run_part()
                 moved = motion > 0
             self._enter(frame + 1)
             completed += self.counter.to_numpy()[: len(self.scenes), COUNT.status] == STATUS.running
@@ -124,7 +124,7 @@ class GridLaunch(Launch):
         ti.lang.impl.get_runtime().prog.delete_ndarray(self.contact_normal.arr)
         self._place_contacts(begin, end)
 
-    def _run_frame(self) -> None:
+    def _run_part(self) -> None:
         """Substeps until no scene has time left; the host looks only when the last estimate has run out."""
         pending = 1
         while pending:

@@ -81,7 +81,7 @@ class SceneValue(NamedTuple):
     gravity_time: int = 14  # for which gravity acts in the present substep, s: see mls_mpm
     water_density: int = 15  # at rest, in masses of a particle a cell; 0 where it is not known
     wall_friction: int = 16  # 16, 17, 18: of the domain's walls across x, y, z
-    frame: int = 19  # length of the present frame, s
+    part: int = 19  # length of the present part of a frame, s: of all of it where nothing moves
     stiffness: int = 20  # largest in the step before, m²/s²
     last_interval: int = 21  # how long the interval before was, s
     fallen: int = 22  # for which gravity has acted in this interval before the present substep, s

@@ -494,7 +494,7 @@ def move(
             interval = scene_value[scene, VALUE.interval_elapsed]
             elapsed = 0.0
             if ti.static(moving):
-                elapsed = scene_value[scene, VALUE.frame] - scene_value[scene, VALUE.remaining] - interval
+                elapsed = scene_value[scene, VALUE.part] - scene_value[scene, VALUE.remaining] - interval
             out, speed = stop_at_surface(
                 x, out, v, list_at, elapsed, interval, scene, contact, contact_normal, counter, setting, moving
             )

@@ -75,8 +75,8 @@ def simulate(
     the scenes. `stability_fractions` are the scenes' own where they differ from the config's.
 
     On a CPU the result of a scene is the same, bitwise, whatever its batch mates do, and depends on
-    `cpu_threads` only through the number of parts that particles are summed in, min(cpu_threads, 4). On a GPU
-    sums are in no fixed order.
+    `cpu_threads` only through the number of parts that particles are summed in, min(cpu_threads, 4). Where obstacles
+    move, frames of all scenes are cut into parts (see grid_launch.motion_parts). On a GPU sums are in no fixed order.
 
     Particles with an entry time are NaN in the frames before; they enter in free flight from the place given.
 

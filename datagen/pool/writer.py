@@ -57,7 +57,7 @@ _Packed = tuple[ExitStack, Path, ShardEntry]
 class DatasetWriter:
     """One generator's hold on a data set folder; a context manager.
 
-    Entering recovers what earlier runs left: shards that are not yet in the manifest are checked and listed, and
+    Entering recovers what earlier runs left: shards that are not yet in the index are checked and listed, and
     partial files that nobody is writing are removed. Raises: ConfigError when the folder holds another data set, or
     a file that was altered.
 
@@ -276,7 +276,7 @@ class DatasetWriter:
     def _is_present(self, shard: ShardEntry) -> bool:
         path = self.folder / shard.name
         if not path.exists():
-            self._report(f"{path} is listed in the manifest but missing; its episodes are made again")
+            self._report(f"{path} is listed in the index but missing; its episodes are made again")
             return False
         size = path.stat().st_size
         if size != shard.bytes:

@@ -164,7 +164,7 @@ class EpisodeSampler:
         if episodes > len(frame_counts):
             raise ConfigError(
                 f"data set must still hold the {episodes} training episodes that epoch {epoch} began with, "
-                f"got {len(frame_counts)}; restore the missing shards or start another run"
+                f"got {len(frame_counts)}; restore the missing shards or training.more_data, or start another run"
             )
         frame_counts = frame_counts[: episodes or len(frame_counts)]
         if not frame_counts:
@@ -173,7 +173,7 @@ class EpisodeSampler:
         if digest not in ("", stored):
             raise ConfigError(
                 f"data set must still hold the shards that epoch {epoch} began with, in the order they were published "
-                "in, got others or another order; restore them, or start another run"
+                "in, got others or another order; restore them or training.more_data, or start another run"
             )
         self._first_sample = np.concatenate([[0], np.cumsum(np.asarray(frame_counts) - 1)])
         self._order = epoch_order(self.seed, epoch, self._first_sample, self._window)

@@ -122,7 +122,7 @@ class _Folder:
         try:
             verify_file(path, sha256, size, "delete it and run the generator again")
         except FileNotFoundError:
-            raise ConfigError(f"{path} is listed in the manifest but missing; run the generator again") from None
+            raise ConfigError(f"{path} is listed in the index but missing; run the generator again") from None
         return path
 
 
@@ -205,7 +205,7 @@ class _Remote:
                 self._fill_whole(file, name, sha256, size, patience_s)
             except FileNotFoundError:
                 raise ConfigError(
-                    f"{self._url}/{name} is listed in the manifest but missing; run the generator again"
+                    f"{self._url}/{name} is listed in the index but missing; run the generator again"
                 ) from None
 
         return cached_shard(f"{self._url}/{name}", sha256, size, patience_s, spared, fill)

@@ -220,7 +220,7 @@ def test_altered_or_cut_shards_are_refused(folder, cache):
     with pytest.raises(ConfigError, match=rf"must have {second.bytes} bytes, got {second.bytes // 2}; it was cut"):
         store[1]
     files.rm(f"/altered/{second.name}")
-    with pytest.raises(ConfigError, match="is listed in the manifest but missing"):
+    with pytest.raises(ConfigError, match="is listed in the index but missing"):
         store[1]
     assert list(cache.iterdir()) == []
 

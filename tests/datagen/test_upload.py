@@ -101,7 +101,7 @@ def test_what_is_refused(folder, make_config, make_dataset, tmp_path, monkeypatc
     with pytest.raises(ConfigError, match=r"must have sha256 .* it was altered"):
         main({"data": str(folder), "to": "memory://elsewhere"})
     shard.unlink()
-    with pytest.raises(ConfigError, match=r"train-000001-000002.tar is listed in the manifest but missing"):
+    with pytest.raises(ConfigError, match=r"train-000001-000002.tar is listed in the index but missing"):
         main({"data": str(folder), "to": "memory://elsewhere"})
     for mapping, message in (
         ({"data": str(folder), "to": str(tmp_path)}, "to must be a URL, got"),

@@ -117,7 +117,7 @@ def test_missing_shard_is_made_again(make_config, make_dataset, folder):
     messages: list[str] = []
     with DatasetWriter(make_config(), messages.append) as writer:
         assert claim_all(writer) == [("train", 2), ("train", 3)]
-    assert "train-000002-000004.tar is listed in the manifest but missing" in messages[0]
+    assert "train-000002-000004.tar is listed in the index but missing" in messages[0]
     make_dataset(make_config())
     assert hashes(folder) == before
 

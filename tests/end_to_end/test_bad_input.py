@@ -224,7 +224,7 @@ def alter(path):
     [
         (truncate, " bytes, got "),
         (alter, ": it was altered; delete it and run the generator again"),
-        (Path.unlink, " is listed in the manifest but missing; run the generator again"),
+        (Path.unlink, " is listed in the index but missing; run the generator again"),
     ],
     ids=["truncated", "altered", "missing"],
 )

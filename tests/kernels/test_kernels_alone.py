@@ -35,7 +35,8 @@ LOSS_SCALE = {"fp16": 256.0}
 ROOM = 2048 if NATIVE else 64  # for cells on each level
 
 # Without products, in integers, float32 or float64 at every precision: of grids and neighbours, batches, optimisers,
-# frames. Compared in test_network, test_relative, test_neighbours, test_update, test_gns_update and test_rollout.
+# frames. Compared in test_network, test_relative, test_neighbours, test_update, test_gns_update, test_training and
+# test_rollout.
 ELSEWHERE = {
     *("mark_cells", "fill_tables", "prepare_particles", "prepare_features"),
     *("sum_motion", "prepare_relative_features"),

@@ -3,7 +3,7 @@
 A tile has ROWS rows, eight for each cell of which six can hold an edge that ends in it, or six if
 DENSE (64 rows: ten cells instead of eight). A program takes one tile after the other and reads its weights once.
 Edge arrays are [capacity, 6, W], [c, d] for the edge to cell c from its neighbour in direction d. Sums over edges are
-made inside the tile and by gathers in fixed order: no atomics, the same result every time.
+made inside the tile and by gathers in fixed order, the same every time. Atomics add gradients of parameters alone.
 OVERLAP: a program starts while the kernel before still runs, reads its weights and what the grid's kernels left (count,
 neighbours; at least one kernel without OVERLAP lies between), and waits for that kernel's end before it reads or writes
 anything else; a program that has rows, and the first one always, waits, so that a kernel has ended only when all before

@@ -7,7 +7,7 @@ import pytest
 from mpm_scenes import BOX, CELL, QUAD, box_corners, particles, sheet, simulated
 
 from datagen.mpm.grid_launch import motion_parts
-from datagen.mpm.solver import simulate
+from datagen.mpm.solver import SceneFailure, simulate
 from hgn.config import MpmConfig
 from hgn.scene.material import ELASTIC, MATERIALS, SAND, SNOW
 from hgn.scene.motion import Motion, turned, turning
@@ -137,6 +137,19 @@ def test_poses_between_keyframes():
     assert np.allclose(turn, [0, np.pi / 2, 0]) and np.allclose(velocity, [2, 0, 0]) and np.allclose(pivot, [1.5, 0, 0])
     for turn in ([0, 0, 0], [1e-9, 0, 0], [0.3, -2, 1], [np.pi, 0, 0]):
         assert np.allclose(turning(turned(np.array(turn))), turn, atol=1e-8)
+
+
+def test_parts_of_a_frame_share_its_maximum_of_substeps():
+    """Where motion cuts a frame into parts, `maximum_substeps_per_frame` counts the substeps of all of them."""
+    lift = moving(wide_sheet(2.5), [0.0, 1.0], [np.zeros(3), np.array([0.0, 3.0, 0.0])])
+    place = CELL * np.array([[4.5, height, 4.5] for height in (5, 6, 7, 8)])
+    scene = particles(place, range(4), obstacles=(lift,), domain_size=(CELLS * CELL,) * 3)
+    assert motion_parts([scene], 0.0, 1 / RATE_HZ) == 8
+    (whole,) = simulated([scene])
+    needed = whole.counters["substeps"]
+    simulated([scene], MpmConfig(device="cpu", maximum_substeps_per_frame=needed))
+    (failed,) = simulate([scene], MpmConfig(device="cpu", maximum_substeps_per_frame=needed - 1), 2, RATE_HZ)
+    assert isinstance(failed, SceneFailure) and failed.cause.startswith("frame 1: the frame needs more than maximum")
 
 
 def test_bad_motion_is_refused():
