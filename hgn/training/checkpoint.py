@@ -99,8 +99,8 @@ def _require_equal(pairs: list[tuple[str, Any, Any]], why: str, remedy: str) -> 
 
 
 def network_of_weights(config: TrainConfig) -> ParticleNetwork:
-    """The network of training.init_weights, normaliser included, for a new run to begin with. Its contact gate and
-    forces may be others than these weights were trained with: tensors are the same, and training goes on from there.
+    """The network of training.init_weights, normaliser included, for a new run to begin with. What it makes of contacts
+    may be another than these weights were trained with: tensors are the same, and training goes on from there.
 
     Raises: ConfigError for a file that is none, and where the run wants another network or has other data.
     """
@@ -108,8 +108,8 @@ def network_of_weights(config: TrainConfig) -> ParticleNetwork:
     path = find_weights(config.training.init_weights, "training.init_weights")
     weights, info = load_weights(path, field="training.init_weights")
     remedy = "set it so, or take other training.init_weights"
-    free = ("network.contact_gate", "network.contact_forces", "network.rest_threshold")
-    pairs = [pair for pair in _network_pairs(info.network, config) if pair[0] not in free]
+    free = ("contact_gate", "contact_forces", "contact_reach_cells", "rest_threshold")
+    pairs = [pair for pair in _network_pairs(info.network, config) if pair[0].removeprefix("network.") not in free]
     pairs.append(("dataset.frame_rate_hz", info.frame_rate_hz, config.dataset.frame_rate_hz))
     if info.network.sees_obstacles:
         pairs.append(("scene.cell_size", info.obstacle_cell_size, config.scene.cell_size))

@@ -88,17 +88,18 @@ def test_other_weights_are_refused(data, tmp_path, file, message):
     assert {path.name for path in (tmp_path / "run").rglob("*")} <= {".lock"}
 
 
-def test_another_contact_gate_is_taken(tmp_path):
-    """Weights that were trained with a particle's own gate begin a network with the cells': the same tensors."""
+def test_another_sight_of_contacts_is_taken(tmp_path):
+    """Weights that were trained with a particle's own gate begin a network with the cells' and another reach: the same
+    tensors."""
     path = weights_file(tmp_path / "own.safetensors", "fp32", inputs="relative")
-    wanted = NetworkConfig(**NETWORK | {"inputs": "relative", "contact_gate": "cell"})
+    wanted = NetworkConfig(**NETWORK | {"inputs": "relative", "contact_gate": "cell", "contact_reach_cells": 3.0})
     config = TrainConfig(network=wanted, training=TrainingConfig(init_weights=str(path)))
     network, (own, info) = network_of_weights(config), load_weights(path)
     assert network.config == wanted and info.network.contact_gate == "particle"
     theirs = own.state_dict()
     assert all(torch.equal(tensor, theirs[name]) for name, tensor in network.state_dict().items())
-    with pytest.raises(ConfigError, match=r"network.contact_reach_cells must be 1.5, as in"):
-        network_of_weights(replace(config, network=replace(wanted, contact_reach_cells=2.0)))
+    with pytest.raises(ConfigError, match=r"network.cell_size must be .*, as in"):
+        network_of_weights(replace(config, network=replace(wanted, cell_size=0.05)))
 
 
 def test_warm_up():
