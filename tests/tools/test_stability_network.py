@@ -33,12 +33,11 @@ from tools.stability.network import (
     solver_beside,
     solver_of,
 )
-from tools.stability.network_cases import Case, StabilityNetworkConfig, cases
+from tools.stability.network_cases import Case, StabilityNetworkConfig, cases, cube
 from tools.stability.network_motion import (
     DIRECTIONS,
     GRAVITIES,
     conserved,
-    cube,
     flight_frames,
     flight_row,
     meeting,

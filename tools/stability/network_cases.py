@@ -138,12 +138,17 @@ def cube_places(config: SceneConfig, seed: int = 0) -> np.ndarray:
     return config.group_size * (np.random.default_rng(seed).random((count, 3)) - 0.5)
 
 
+def cube(scene: SceneConfig, material: str, centre_3: np.ndarray, velocity_3: np.ndarray, seed: int = 0) -> Scene:
+    """A cube of a scene's group size at random places, without obstacles."""
+    place_N3 = centre_3 + cube_places(scene, seed)
+    return body(scene, material, place_N3, velocity_3, particles_per_cell=scene.particles_per_cell)
+
+
 def _above_floor(config: SceneConfig, material: str, cells: float) -> Scene:
     """A cube at rest in the middle of an empty domain, so many of the solver's cells above the lower plane."""
-    places_N3 = cube_places(config)
     middle_3 = 0.5 * np.array(config.domain_size)
-    middle_3[1] = cells * config.cell_size - places_N3[:, 1].min()
-    return body(config, material, middle_3 + places_N3, np.zeros(3), particles_per_cell=config.particles_per_cell)
+    middle_3[1] = cells * config.cell_size - cube_places(config)[:, 1].min()
+    return cube(config, material, middle_3, np.zeros(3))
 
 
 def _scene(config: SceneConfig) -> Scene:

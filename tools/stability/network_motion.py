@@ -22,7 +22,7 @@ from hgn.schema import ConfigError
 from hgn.training.errors import position_mse
 from tools.scenes import joined
 from tools.solver_rollouts import solver_trials
-from tools.stability.network_cases import body, cube_places
+from tools.stability.network_cases import cube
 from tools.stability.row import Row
 
 EARTH = 9.8  # domain units per second squared
@@ -77,12 +77,6 @@ def motion_rows(
             yield from turned_rows(simulator, scene, material, solver)
         if "collision" in cases:
             yield meeting_row(simulator, scene, material, together or 1, solver)
-
-
-def cube(scene: SceneConfig, material: str, centre_3: np.ndarray, velocity_3: np.ndarray, seed: int = 0) -> Scene:
-    """A cube of a scene's group size at random places, without obstacles."""
-    place_N3 = centre_3 + cube_places(scene, seed)
-    return body(scene, material, place_N3, velocity_3, particles_per_cell=scene.particles_per_cell)
 
 
 def flight_row(
