@@ -32,6 +32,21 @@ def _corner_block(first, last, n: ti.template(), scene: ti.i32, shape: ti.templa
 
 
 @ti.func
+def _raise_marks(base, least: ti.i32, scene: ti.i32, shape: ti.template(), block: ti.template(), begin: ti.i32):
+    """Marks of all blocks that the nodes from `base` on lie in, from block[begin] on, become `least` at least."""
+    first, last = base >> 2, (base + 2) >> 2
+    index = ti.Vector([begin + _corner_block(first, last, n, scene, shape) for n in range(8)])
+    found = ti.Vector([block[index[n]] for n in range(8)])  # all at once: each is a way to memory
+    for n in ti.static(range(8)):
+        own = found[n] < least
+        for axis in ti.static(range(3)):
+            if ti.static(bool(n >> (2 - axis) & 1)):
+                own = own and first[axis] != last[axis]
+        if own:
+            ti.atomic_max(block[index[n]], least)
+
+
+@ti.func
 def mark_changed(
     x,
     scene: ti.i32,
@@ -49,10 +64,7 @@ def mark_changed(
     """
     base = base_node(x, inverse_dx)
     change = now * MANY + MANY - ti.cast(many, ti.i32)
-    for n in ti.static(range(8)):
-        index = begin + _corner_block(base >> 2, (base + 2) >> 2, n, scene, shape)
-        if block[index] < change:
-            ti.atomic_max(block[index], change)
+    _raise_marks(base, change, scene, shape, block, begin)
 
 
 @ti.func
@@ -81,13 +93,11 @@ def _alike_around(
     fewest, most = interval * MANY + MANY - many, interval * MANY + many - 1
     alike = 1
     for n in ti.static(range(8)):
-        index = _corner_block(base >> 2, (base + 2) >> 2, n, scene, shape)
-        if block[former + index] != fewest - MANY or block[former + blocks + index] != most - MANY:
+        index = former + _corner_block(base >> 2, (base + 2) >> 2, n, scene, shape)
+        if (block[index] != fewest - MANY) | (block[index + blocks] != most - MANY):
             alike = 0
-        if block[present + index] < fewest:
-            ti.atomic_max(block[present + index], fewest)
-        if block[present + blocks + index] < most:
-            ti.atomic_max(block[present + blocks + index], most)
+    _raise_marks(base, fewest, scene, shape, block, present)
+    _raise_marks(base, most, scene, shape, block, present + blocks)
     return alike
 
 

@@ -30,8 +30,10 @@ from datagen.mpm.mls_mpm import (
     settle,
     settles,
 )
-from datagen.mpm.multiple_time_stepping import acts, mark_changed, own_step
+from datagen.mpm.multiple_time_stepping import own_step
+from datagen.mpm.team_lists import list_acting, mark_going_on, start_lists
 from datagen.mpm.team_meeting import (
+    ACTING,
     LEAVES,
     MEETING,
     QUEUE,
@@ -72,11 +74,14 @@ def _strain(
     particles: ti.i32,
     tags: ti.i32,
     stride: ti.i32,
+    segment: ti.i32,
     velocities: ti.i32,
     step: ti.f32,
     begins: ti.f32,
     state: ti.template(),
     tag: ti.template(),
+    column_list: ti.template(),
+    columns: ti.template(),
     strained: ti.template(),
     covered: ti.template(),
     spread: ti.template(),
@@ -96,37 +101,26 @@ def _strain(
     threads: ti.template(),
 ):
     """The materials' answer of each particle that acts to the gradient of the nodes' velocities, left in place of C; in
-    the first step of an interval to C, and also which nodes it touches; of one whose stress is spread over several
-    substeps its share. `covered` is less than 0 for what gives to nodes now.
+    the first step of an interval to C, and also which nodes it touches. Those that act later in an interval are the
+    ones that list_acting found.
     """
     solid = ti.static(has_solid(variant))
     intervals = ti.static(not variant & VARIANT.each_step)
     largest = 0.0
     held = 0.0
     fastest = 0.0
+    acting_count = owned
+    if ti.static(intervals):  # noqa: SIM102 (this one is the compiler's)
+        if begins == 0.0:
+            acting_count = columns[segment + ACTING]
     own = lane
-    while own < owned:
+    while own < acting_count:
         p = dealt(own, part, chunk, blocks)
         own += threads
+        if ti.static(intervals):  # noqa: SIM102 (this one is the compiler's)
+            if begins == 0.0:
+                p = column_list[first + p]
         place = particles + p
-        reached = 0.0
-        if ti.static(intervals):
-            last = covered[first + p]
-            reached = ti.abs(last)
-            if not acts(reached, begins, step, scene, scene_value):
-                if spread[first + p] == 1:
-                    six = ti.Vector([step * response[first + p + i * stride] for i in range(6)])
-                    A = ti.Matrix([[six[0], six[3], six[4]], [six[3], six[1], six[5]], [six[4], six[5], six[2]]])
-                    put_matrix(state, place, stride, FIELD.affine, A)
-                    if scene_value[scene, VALUE.interval_remaining] > 0.0:
-                        mark_changed(
-                            get_vector(state, place, stride, FIELD.position), scene,
-                            ti.cast(counter[scene, COUNT.substeps], ti.i32), 1.0, setting[SETTING.inverse_cell_size],
-                            shape, block, 3 * shape[SHAPE.all_blocks],
-                        )  # fmt: skip
-                elif last < 0.0:
-                    covered[first + p] = reached
-                continue
         x = get_vector(state, place, stride, FIELD.position)
         C = ti.Matrix.zero(ti.f32, 3, 3)
         stretch = ti.Matrix.zero(ti.f32, 3, 3)
@@ -158,11 +152,11 @@ def _strain(
         length, acting, many, spreads = step, step, 1.0, 0
         if ti.static(intervals):
             length, until, acts_until, many, spreads, acting = own_step(
-                strained[first + p], reached, spread[first + p], x, C, old_volume, material, row, begins, step, scene,
-                counter, shape, block, 3 * shape[SHAPE.all_blocks], scene_value, setting, law, variant,
+                strained[first + p], covered[first + p], spread[first + p], x, C, old_volume, material, row, begins,
+                step, scene, counter, shape, block, 3 * shape[SHAPE.all_blocks], scene_value, setting, law, variant,
             )  # fmt: skip
             strained[first + p] = until
-            covered[first + p] = -acts_until
+            covered[first + p] = acts_until
             spread[first + p] = spreads
         answer, new_stretch, new_F, volume, stiffness = respond(
             C, stretch, F, old_volume, material, row, length, scene, counter, setting, law, variant
@@ -282,7 +276,7 @@ def advance(
     which holds what comes to momentum in a step and to mass in an interval, zero between them, and then velocities,
     with the mass for an interval's end. Arrays: tag [2 * 3 * P]; rank, spread, response [6 * P], hidden (see
     grid_kernel.substep) and column_list [P] are work space; cell_count [G], column_count [G / 4], the flags in
-    block [8 * G / 64], columns [3 * blocks * teams] and meeting [MEETING * (teams + 1)] are zero at first; turn
+    block [8 * G / 64], columns [6 * blocks * teams] and meeting [MEETING * (teams + 1)] are zero at first; turn
     [scenes] says which scene comes when (long ones first). A scene that failed keeps still.
     """
     ti.loop_config(block_dim=threads)
@@ -359,17 +353,32 @@ def advance(
                             particles = copy * fields * stride + first
                             tags = copy * TAG.length * stride + first
                             sorted_already = True
+                        if ti.static(not variant & VARIANT.each_step):  # noqa: SIM102 (this one is the compiler's)
+                            if begins == 0.0:
+                                list_acting(
+                                    owned, part, chunk, blocks, lane, scene, first, segment, begins, step, covered,
+                                    spread, column_list, rank, columns, scene_value, threads,
+                                )  # fmt: skip
+                                wait(threads)
+                                if some_wait:
+                                    mark_going_on(
+                                        owned, part, chunk, blocks, lane, scene, first, segment, particles, stride,
+                                        state, column_list, columns, block, counter, setting, shape, threads,
+                                    )  # fmt: skip
                         _strain(
-                            owned, part, chunk, blocks, lane, scene, first, particles, tags, stride, velocities, step,
-                            begins, state, tag, strained, covered, spread, response, hidden, node, block, live,
-                            scene_value, counter, setting, law, shape, contact, contact_normal, variant, threads,
+                            owned, part, chunk, blocks, lane, scene, first, particles, tags, stride, segment,
+                            velocities, step, begins, state, tag, column_list, columns, strained, covered, spread,
+                            response, hidden, node, block, live, scene_value, counter, setting, law, shape, contact,
+                            contact_normal, variant, threads,
                         )  # fmt: skip
                         wait(threads)
                         scatter(
-                            owned, part, chunk, blocks, lane, scene, first, particles, tags, stride, begins, state,
-                            tag, covered, hidden, node, setting, law, shape, contact, variant, threads, run,
+                            owned, part, chunk, blocks, lane, scene, first, particles, tags, stride, segment, begins,
+                            step, state, tag, rank, columns, response, hidden, node, setting, law, shape, contact,
+                            variant, threads, run,
                         )  # fmt: skip
                         meet_team(at, lane, meetings, meeting, columns, segment, patience, threads, several, blocks)
+                        start_lists(lane, segment, columns)
                         # a thread that hardly has nodes of its own, while the others are at theirs
                         if not ends and member == members - 1:
                             choose(scene, scene_value, counter, setting, shape, live)

@@ -14,7 +14,8 @@ from datagen.mpm.time_step import choose_time_step, raise_maximum
 WARP = 32
 MEETING = 96  # integers of a team, in thirds: how many blocks have come, how often all were let go, its next scene
 QUEUE, APART = 0, 1  # before the teams' own: scenes that were taken, and whether blocks are not at work at once
-SEGMENT, LEAVES = 3, 2  # integers of a block, and which of them says that it leaves
+SEGMENT, LEAVES = 6, 2  # integers of a block, and which of them says that it leaves
+ACTING, GOING_ON, GIVING = 3, 4, 5  # which of them are counts of its lists (see team_lists)
 LOOKS = 64  # at a counter, between two at whether all leave
 
 

@@ -18,11 +18,13 @@ from datagen.mpm.mls_mpm import (
     weights,
 )
 from datagen.mpm.multiple_time_stepping import change_of
+from datagen.mpm.team_meeting import GIVING
 from datagen.mpm.team_particles import dealt, get_vector
 from datagen.mpm.time_step import falls
 
 LANES = 4  # components of a node, and threads that share a particle where it gives to nodes
 MASS = 3  # the component
+AT_ONCE = 4  # nodes, of which a thread finds out at once where they lie
 
 
 @ti.func
@@ -93,13 +95,18 @@ def gather(
 
 
 @ti.func
-def _next_acting(p: ti.i32, end: ti.i32, first: ti.i32, begins: ti.f32, covered: ti.template()) -> ti.i32:
-    """The first particle from p on that acts in this substep, or the end."""
-    found = p
-    if begins == 0.0:
-        while found < end and covered[first + found] >= 0.0:
-            found += 1
-    return found
+def _entry(at: ti.i32, first: ti.i32, begins: ti.f32, giving: ti.template(), variant: ti.template()) -> ti.i32:
+    """A particle that gives in this substep, as team_lists has it: in an interval's first all do."""
+    entry = at
+    if ti.static(not variant & VARIANT.each_step):  # noqa: SIM102 (this one is the compiler's)
+        if begins == 0.0:
+            entry = giving[first + at]
+    return entry
+
+
+@ti.func
+def _particle(entry: ti.i32) -> ti.i32:
+    return ti.max(entry, -1 - entry)
 
 
 @ti.func
@@ -114,10 +121,14 @@ def scatter(
     particles: ti.i32,
     tags: ti.i32,
     stride: ti.i32,
+    segment: ti.i32,
     begins: ti.f32,
+    step: ti.f32,
     state: ti.template(),
     tag: ti.template(),
-    covered: ti.template(),
+    giving: ti.template(),
+    columns: ti.template(),
+    response: ti.template(),
     hidden: ti.template(),
     node: ti.template(),
     setting: ti.template(),
@@ -128,30 +139,30 @@ def scatter(
     threads: ti.template(),
     run: ti.template(),
 ):
-    """Adds what each particle that acts gives to its 27 nodes: momentum and mass, in later steps of an interval what
-    forces change in momentum. A thread adds up what `run` particles in their order give, in a window of nodes that goes
-    up a column with them; what it leaves goes to the nodes.
+    """Adds what particles give to their 27 nodes: momentum and mass; in later steps of an interval, of those alone that
+    team_lists has, what forces change in momentum. A thread adds up what `run` particles in their order give, in a
+    window of nodes that goes up a column with them; what it leaves goes to the nodes.
     """
     dx = setting[SETTING.cell_size]
     inverse_dx = setting[SETTING.inverse_cell_size]
     first_entry = LANES * scene * shape[SHAPE.scene_blocks] * BLOCK_NODES
+    lanes, count = LANES, owned
+    if ti.static(not variant & VARIANT.each_step):  # noqa: SIM102 (this one is the compiler's)
+        if begins == 0.0:
+            lanes, count = MASS, columns[segment + GIVING]
     task = lane
-    tasks = (owned + run - 1) // run * LANES
+    tasks = (count + run - 1) // run * lanes
     while task < tasks:
-        component = task % LANES
-        own = task // LANES * run
-        p = dealt(own, part, chunk, blocks)
-        end = p + ti.min(run, owned - own)
-        if begins == 0.0 and component == MASS:
-            p = end
-        p = _next_acting(p, end, first, begins, covered)
+        component = task % lanes
+        own = task // lanes * run
+        at = dealt(own, part, chunk, blocks)
+        end = at + ti.min(run, count - own)
+        entry = _entry(at, first, begins, giving, variant)
+        p = _particle(entry)
         gain = ti.Vector([0.0 for _ in range(27)])
-        base = ti.Vector([0, 0, 0])
-        x = ti.Vector([0.0, 0.0, 0.0])
-        if p < end:
-            x = get_vector(state, particles + p, stride, FIELD.position)
-            base = base_node(x, inverse_dx)
-        while p < end:
+        x = get_vector(state, particles + p, stride, FIELD.position)
+        base = base_node(x, inverse_dx)
+        while at < end:
             place = particles + p
             fx = x * inverse_dx - ti.cast(base, ti.f32)
             w0, w1, w2 = weights(fx)
@@ -159,7 +170,13 @@ def scatter(
             A = ti.Vector([0.0, 0.0, 0.0])
             v = 1.0
             if component < MASS:
-                A = dx * ti.Vector([load(state, place + (FIELD.affine + 3 * component + j) * stride) for j in range(3)])
+                if entry >= 0:
+                    A = ti.Vector([load(state, place + (FIELD.affine + 3 * component + j) * stride) for j in range(3)])
+                else:  # what acts evenly, of xx, yy, zz, xy, xz, yz
+                    for j in ti.static(range(3)):
+                        which = j if component == j else 2 + component + j
+                        A[j] = step * response[first + p + which * stride]
+                A *= dx
                 v = -A.dot(fx)
                 if begins == 1.0:
                     v += load(state, place + (FIELD.velocity + component) * stride)
@@ -189,13 +206,15 @@ def scatter(
                         add(node, LANES * ghost + component, weight * (v + A.dot(away)))
                     bits >>= 1
                     n += 1
-            p = _next_acting(p + 1, end, first, begins, covered)
+            at += 1
             following = base
-            if p < end:
+            if at < end:
+                entry = _entry(at, first, begins, giving, variant)
+                p = _particle(entry)
                 x = get_vector(state, particles + p, stride, FIELD.position)
                 following = base_node(x, inverse_dx)
-            if p == end or (following != base).any():
-                climbs = p < end and (following == base + ti.Vector([0, 1, 0])).all()
+            if at == end or (following != base).any():
+                climbs = at < end and (following == base + ti.Vector([0, 1, 0])).all()
                 index_x, index_y, index_z = node_places(base, first_entry + component, shape, LANES)
                 for i, k in ti.static(ti.ndrange(3, 3)):
                     add(node, index_x[i] + index_y[0] + index_z[k], gain[9 * i + k])
@@ -259,6 +278,50 @@ def _update(
 
 
 @ti.func
+def _update_node(
+    touched: ti.i32,
+    local: ti.i32,
+    corner: ti.i32,
+    scene: ti.i32,
+    velocities: ti.i32,
+    begins: ti.f32,
+    ends: ti.i32,
+    gravity_time: ti.f32,
+    lead: ti.f32,
+    fallen: ti.f32,
+    block: ti.template(),
+    node: ti.template(),
+    scene_value: ti.template(),
+    shape: ti.template(),
+    contact: ti.template(),
+    contact_normal: ti.template(),
+    variant: ti.template(),
+):
+    """A node of a block, and its second field where it has one."""
+    # all that is read, before anything is written: Taichi looks up where an array lies anew after each store
+    place = LANES * (touched * BLOCK_NODES + local)
+    entry = -1
+    if ti.static(bool(variant & VARIANT.contact)):
+        entry = contact[touched * BLOCK_NODES + local]
+    gain, mass, before = _read_node(place, velocities, begins, node)
+    if local == 0:
+        block[touched] = 0
+    if mass > 0.0:  # others keep a velocity of before, in which no particle has a share
+        _update(
+            place, 2 * entry, gain, mass, before, velocities, local, corner, scene, begins, ends, gravity_time, lead,
+            fallen, node, scene_value, shape, contact_normal, variant,
+        )  # fmt: skip
+    if ti.static(bool(variant & VARIANT.sheets)):  # noqa: SIM102 (this one is the compiler's)
+        if entry >= 0 and entry < shape[SHAPE.ghosts]:
+            ghost = LANES * (shape[SHAPE.ghost_begin] + entry)
+            gain_there, mass_there, before_there = _read_node(ghost, velocities, begins, node)
+            _update(
+                ghost, 2 * entry + 1, gain_there, mass_there, before_there, velocities, local, corner, scene, begins,
+                ends, gravity_time, lead, fallen, node, scene_value, shape, contact_normal, variant,
+            )  # fmt: skip
+
+
+@ti.func
 def update_nodes(
     member: ti.i32,
     scene: ti.i32,
@@ -288,34 +351,24 @@ def update_nodes(
     count = live[scene * LIVE.length + LIVE.blocks] * BLOCK_NODES
     n = member
     while n < count:
-        touched = block[block_list + n // BLOCK_NODES]
-        corner = block[block_list + shape[SHAPE.all_blocks] + n // BLOCK_NODES]
-        local = n % BLOCK_NODES
-        n += members
-        many = 1.0
+        # where a node's block lies and what changed it, several at once: each is a way to memory
+        touched = ti.Vector([-1 for _ in range(AT_ONCE)])
+        corner = ti.Vector([0 for _ in range(AT_ONCE)])
+        many = ti.Vector([1.0 for _ in range(AT_ONCE)])
+        for i in ti.static(range(AT_ONCE)):
+            if n + i * members < count:
+                entry = block_list + (n + i * members) // BLOCK_NODES
+                touched[i] = block[entry]
+                corner[i] = block[entry + shape[SHAPE.all_blocks]]
         if some_wait:
-            many = change_of(block[3 * shape[SHAPE.all_blocks] + touched], now)
-            if many == 0.0:
-                continue
-        lead = ti.min((many - 1.0) * whole_step, left)
-        # all that is read, before anything is written: Taichi looks up where an array lies anew after each store
-        place = LANES * (touched * BLOCK_NODES + local)
-        entry = -1
-        if ti.static(bool(variant & VARIANT.contact)):
-            entry = contact[touched * BLOCK_NODES + local]
-        gain, mass, before = _read_node(place, velocities, begins, node)
-        if local == 0:
-            block[touched] = 0
-        if mass > 0.0:  # others keep a velocity of before, in which no particle has a share
-            _update(
-                place, 2 * entry, gain, mass, before, velocities, local, corner, scene, begins, ends, gravity_time,
-                lead, fallen, node, scene_value, shape, contact_normal, variant,
-            )  # fmt: skip
-        if ti.static(bool(variant & VARIANT.sheets)):  # noqa: SIM102 (this one is the compiler's)
-            if entry >= 0 and entry < shape[SHAPE.ghosts]:
-                ghost = LANES * (shape[SHAPE.ghost_begin] + entry)
-                gain_there, mass_there, before_there = _read_node(ghost, velocities, begins, node)
-                _update(
-                    ghost, 2 * entry + 1, gain_there, mass_there, before_there, velocities, local, corner, scene,
-                    begins, ends, gravity_time, lead, fallen, node, scene_value, shape, contact_normal, variant,
+            mark = ti.Vector([block[3 * shape[SHAPE.all_blocks] + ti.max(touched[i], 0)] for i in range(AT_ONCE)])
+            for i in ti.static(range(AT_ONCE)):
+                many[i] = change_of(mark[i], now)
+        for i in ti.static(range(AT_ONCE)):
+            if touched[i] >= 0 and many[i] > 0.0:
+                _update_node(
+                    touched[i], (n + i * members) % BLOCK_NODES, corner[i], scene, velocities, begins, ends,
+                    gravity_time, ti.min((many[i] - 1.0) * whole_step, left), fallen, block, node, scene_value, shape,
+                    contact, contact_normal, variant,
                 )  # fmt: skip
+        n += AT_ONCE * members

@@ -1,0 +1,132 @@
+"""Which particles of a team's block act within an interval, as lists.
+
+Of a scene whose particles take steps of their own a third act in a substep. Were each looked at by a thread of its own,
+half of a warp's threads would wait for the others, so threads take what is listed, one entry after the other.
+
+A block lists its own particles, counted from the scene's first: in `column_list` those that begin a step of their own,
+and from its end backwards those that go on with a step whose stress acts evenly; in `giving` both, in their order, the
+latter as -1 - p. Entries lie where the block's own particles do (see team_particles.dealt). How many there are is in
+columns[segment + ACTING], + GOING_ON and + GIVING.
+"""
+
+import taichi as ti
+
+from datagen.mpm.layout import COUNT, FIELD, SETTING, SHAPE
+from datagen.mpm.multiple_time_stepping import acts, mark_changed
+from datagen.mpm.team_meeting import ACTING, GOING_ON, WARP
+from datagen.mpm.team_particles import dealt, get_vector
+
+FULL = 0xFFFFFFFF  # all threads of a warp
+
+
+@ti.func
+def _places(entry, columns: ti.template(), segment: ti.i32, lane: ti.i32, threads: ti.template()):
+    """Of each of three lists, whose new entries are 1 in `entry`, the place of this thread's: places are given to all
+    threads of a warp at once, in their order.
+    """
+    before = ti.Vector([0, 0, 0])
+    if ti.static(threads > 1):
+        # three counts of at most 32 in one number
+        own = entry[0] | entry[1] << 8 | entry[2] << 16
+        total = own
+        for step in ti.static((1, 2, 4, 8, 16)):
+            below = ti.simt.warp.shfl_up_i32(ti.u32(FULL), total, step)
+            if lane % WARP >= step:
+                total += below
+        begin = ti.Vector([0, 0, 0])
+        if lane % WARP == WARP - 1:
+            for i in ti.static(range(3)):
+                count = total >> (8 * i) & 255
+                if count > 0:
+                    begin[i] = ti.atomic_add(columns[segment + ACTING + i], count)
+        for i in ti.static(range(3)):
+            begin[i] = ti.simt.warp.shfl_sync_i32(ti.u32(FULL), begin[i], WARP - 1)
+            before[i] = begin[i] + ((total - own) >> (8 * i) & 255)
+    else:
+        for i in ti.static(range(3)):
+            if entry[i] == 1:
+                before[i] = ti.atomic_add(columns[segment + ACTING + i], 1)
+    return before
+
+
+@ti.func
+def list_acting(
+    owned: ti.i32,
+    part: ti.i32,
+    chunk: ti.i32,
+    blocks: ti.i32,
+    lane: ti.i32,
+    scene: ti.i32,
+    first: ti.i32,
+    segment: ti.i32,
+    begins: ti.f32,
+    step: ti.f32,
+    covered: ti.template(),
+    spread: ti.template(),
+    column_list: ti.template(),
+    giving: ti.template(),
+    columns: ti.template(),
+    scene_value: ti.template(),
+    threads: ti.template(),
+):
+    """Makes the block's lists for a substep within an interval; their counts are 0 before."""
+    rounds = (owned + threads - 1) // threads
+    for around in range(rounds):
+        own = around * threads + lane
+        entry = ti.Vector([0, 0, 0])
+        p = -1
+        if own < owned:
+            p = dealt(own, part, chunk, blocks)
+            spreads = spread[first + p]
+            if acts(covered[first + p], begins, step, scene, scene_value):
+                entry = ti.Vector([1, 0, 1])
+            elif spreads == 1:
+                entry = ti.Vector([0, 1, 1])
+        place = _places(entry, columns, segment, lane, threads)
+        if entry[0] == 1:
+            column_list[first + dealt(place[0], part, chunk, blocks)] = p
+        if entry[1] == 1:
+            column_list[first + dealt(owned - 1 - place[1], part, chunk, blocks)] = p
+        if entry[2] == 1:
+            giving[first + dealt(place[2], part, chunk, blocks)] = p if entry[0] == 1 else -1 - p
+
+
+@ti.func
+def mark_going_on(
+    owned: ti.i32,
+    part: ti.i32,
+    chunk: ti.i32,
+    blocks: ti.i32,
+    lane: ti.i32,
+    scene: ti.i32,
+    first: ti.i32,
+    segment: ti.i32,
+    particles: ti.i32,
+    stride: ti.i32,
+    state: ti.template(),
+    column_list: ti.template(),
+    columns: ti.template(),
+    block: ti.template(),
+    counter: ti.template(),
+    setting: ti.template(),
+    shape: ti.template(),
+    threads: ti.template(),
+):
+    """Marks the blocks of nodes of what goes on with a step whose stress acts evenly (see mark_changed)."""
+    now = ti.cast(counter[scene, COUNT.substeps], ti.i32)
+    count = columns[segment + GOING_ON]
+    own = lane
+    while own < count:
+        p = column_list[first + dealt(owned - 1 - own, part, chunk, blocks)]
+        own += threads
+        x = get_vector(state, particles + p, stride, FIELD.position)
+        marks = 3 * shape[SHAPE.all_blocks]
+        mark_changed(x, scene, now, 1.0, setting[SETTING.inverse_cell_size], shape, block, marks)
+
+
+@ti.func
+def start_lists(lane: ti.i32, segment: ti.i32, columns: ti.template()):
+    """Counts of 0, which the block sees after its next meeting."""
+    if lane == 0:
+        for i in ti.static(range(3)):
+            columns[segment + ACTING + i] = 0
