@@ -61,6 +61,7 @@ class SolverTargetsConfig:
     cases: tuple[str, ...] = tuple(TARGETS)
     frames: int = 60  # the second half is timed; of a million particles a tenth
     scenes: Positive[int] = 800  # of the data set
+    settings: tuple[str, ...] = ()  # more of the data set's command, as dataset.seed=1; its row names them
     folder: str | None = None  # a new one, in which the data set stays; null: it goes when it is timed
     seconds: Positive[float] | None = None  # of the data set, at most; then it is stopped, and its check tells how far
     device: Processor = "auto"  # or cpu, gpu
@@ -177,9 +178,10 @@ def _dataset(config: SolverTargetsConfig) -> dict[str, Any]:
     with ExitStack() as stack:
         folder = config.folder or f"{stack.enter_context(tempfile.TemporaryDirectory())}/data"
         begin = time.perf_counter()
-        process = subprocess.Popen([*GENERATOR, f"scenes={config.scenes}", f"out={folder}", "progress=off"])
+        settings = f"scenes={config.scenes}", f"out={folder}", "progress=off", *config.settings
+        process = subprocess.Popen([*GENERATOR, *settings])
         stack.callback(process.kill)
-        row: dict[str, Any] = {"scenes": config.scenes, "seconds": None}
+        row: dict[str, Any] = {"scenes": config.scenes, "settings": list(config.settings), "seconds": None}
         try:
             ended = process.wait(config.seconds)
         except subprocess.TimeoutExpired:
