@@ -31,7 +31,7 @@ from datagen.mpm.mls_mpm import (
     settles,
 )
 from datagen.mpm.multiple_time_stepping import own_step
-from datagen.mpm.team_lists import list_acting, mark_going_on, start_lists
+from datagen.mpm.team_lists import gives_now, list_acting, mark_going_on, start_lists
 from datagen.mpm.team_meeting import (
     ACTING,
     LEAVES,
@@ -78,9 +78,11 @@ def _strain(
     velocities: ti.i32,
     step: ti.f32,
     begins: ti.f32,
+    some_wait: ti.i32,
     state: ti.template(),
     tag: ti.template(),
     column_list: ti.template(),
+    giving: ti.template(),
     columns: ti.template(),
     strained: ti.template(),
     covered: ti.template(),
@@ -99,6 +101,7 @@ def _strain(
     contact_normal: ti.template(),
     variant: ti.template(),
     threads: ti.template(),
+    run: ti.template(),
 ):
     """The materials' answer of each particle that acts to the gradient of the nodes' velocities, left in place of C; in
     the first step of an interval to C, and also which nodes it touches. Those that act later in an interval are the
@@ -110,7 +113,7 @@ def _strain(
     held = 0.0
     fastest = 0.0
     acting_count = owned
-    if ti.static(intervals):  # noqa: SIM102 (this one is the compiler's)
+    if ti.static(intervals and run > 1):  # noqa: SIM102 (this one is the compiler's)
         if begins == 0.0:
             acting_count = columns[segment + ACTING]
     own = lane
@@ -119,7 +122,13 @@ def _strain(
         own += threads
         if ti.static(intervals):  # noqa: SIM102 (this one is the compiler's)
             if begins == 0.0:
-                p = column_list[first + p]
+                if ti.static(run > 1):
+                    p = column_list[first + p]
+                elif not gives_now(
+                    p, first, begins, step, scene, particles, stride, some_wait, state, covered, spread, giving, block,
+                    counter, scene_value, setting, shape,
+                ):  # fmt: skip
+                    continue
         place = particles + p
         x = get_vector(state, place, stride, FIELD.position)
         C = ti.Matrix.zero(ti.f32, 3, 3)
@@ -353,7 +362,8 @@ def advance(
                             particles = copy * fields * stride + first
                             tags = copy * TAG.length * stride + first
                             sorted_already = True
-                        if ti.static(not variant & VARIANT.each_step):  # noqa: SIM102 (this one is the compiler's)
+                        listed = ti.static(not variant & VARIANT.each_step and run > 1)
+                        if ti.static(listed):  # noqa: SIM102 (this one is the compiler's)
                             if begins == 0.0:
                                 list_acting(
                                     owned, part, chunk, blocks, lane, scene, first, segment, begins, step, covered,
@@ -367,9 +377,9 @@ def advance(
                                     )  # fmt: skip
                         _strain(
                             owned, part, chunk, blocks, lane, scene, first, particles, tags, stride, segment,
-                            velocities, step, begins, state, tag, column_list, columns, strained, covered, spread,
-                            response, hidden, node, block, live, scene_value, counter, setting, law, shape, contact,
-                            contact_normal, variant, threads,
+                            velocities, step, begins, some_wait, state, tag, column_list, rank, columns, strained,
+                            covered, spread, response, hidden, node, block, live, scene_value, counter, setting, law,
+                            shape, contact, contact_normal, variant, threads, run,
                         )  # fmt: skip
                         wait(threads)
                         scatter(
@@ -378,7 +388,8 @@ def advance(
                             variant, threads, run,
                         )  # fmt: skip
                         meet_team(at, lane, meetings, meeting, columns, segment, patience, threads, several, blocks)
-                        start_lists(lane, segment, columns)
+                        if ti.static(listed):
+                            start_lists(lane, segment, columns)
                         # a thread that hardly has nodes of its own, while the others are at theirs
                         if not ends and member == members - 1:
                             choose(scene, scene_value, counter, setting, shape, live)

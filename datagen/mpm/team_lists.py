@@ -1,7 +1,8 @@
 """Which particles of a team's block act within an interval, as lists.
 
 Of a scene whose particles take steps of their own a third act in a substep. Were each looked at by a thread of its own,
-half of a warp's threads would wait for the others, so threads take what is listed, one entry after the other.
+half of a warp's threads would wait for the others, so threads take what is listed, one entry after the other. Where a
+thread has one particle at most (`run` 1) none is put before another, and `giving` has IDLE for what gives nothing.
 
 A block lists its own particles, counted from the scene's first: in `column_list` those that begin a step of their own,
 and from its end backwards those that go on with a step whose stress acts evenly; in `giving` both, in their order, the
@@ -17,6 +18,7 @@ from datagen.mpm.team_meeting import ACTING, GOING_ON, WARP
 from datagen.mpm.team_particles import dealt, get_vector
 
 FULL = 0xFFFFFFFF  # all threads of a warp
+IDLE = -(2**31)
 
 
 @ti.func
@@ -113,15 +115,12 @@ def mark_going_on(
     threads: ti.template(),
 ):
     """Marks the blocks of nodes of what goes on with a step whose stress acts evenly (see mark_changed)."""
-    now = ti.cast(counter[scene, COUNT.substeps], ti.i32)
     count = columns[segment + GOING_ON]
     own = lane
     while own < count:
         p = column_list[first + dealt(owned - 1 - own, part, chunk, blocks)]
         own += threads
-        x = get_vector(state, particles + p, stride, FIELD.position)
-        marks = 3 * shape[SHAPE.all_blocks]
-        mark_changed(x, scene, now, 1.0, setting[SETTING.inverse_cell_size], shape, block, marks)
+        _mark(p, scene, particles, stride, state, block, counter, setting, shape)
 
 
 @ti.func
@@ -130,3 +129,55 @@ def start_lists(lane: ti.i32, segment: ti.i32, columns: ti.template()):
     if lane == 0:
         for i in ti.static(range(3)):
             columns[segment + ACTING + i] = 0
+
+
+@ti.func
+def gives_now(
+    p: ti.i32,
+    first: ti.i32,
+    begins: ti.f32,
+    step: ti.f32,
+    scene: ti.i32,
+    particles: ti.i32,
+    stride: ti.i32,
+    some_wait: ti.i32,
+    state: ti.template(),
+    covered: ti.template(),
+    spread: ti.template(),
+    giving: ti.template(),
+    block: ti.template(),
+    counter: ti.template(),
+    scene_value: ti.template(),
+    setting: ti.template(),
+    shape: ti.template(),
+) -> ti.i32:
+    """Whether a particle begins a step of its own, where none is put before another: its entry in `giving`, and the
+    marks of one that goes on.
+    """
+    begins_own = acts(covered[first + p], begins, step, scene, scene_value)
+    if begins_own:
+        giving[first + p] = p
+    elif spread[first + p] == 1:
+        giving[first + p] = -1 - p
+        if some_wait:
+            _mark(p, scene, particles, stride, state, block, counter, setting, shape)
+    else:
+        giving[first + p] = IDLE
+    return begins_own
+
+
+@ti.func
+def _mark(
+    p: ti.i32,
+    scene: ti.i32,
+    particles: ti.i32,
+    stride: ti.i32,
+    state: ti.template(),
+    block: ti.template(),
+    counter: ti.template(),
+    setting: ti.template(),
+    shape: ti.template(),
+):
+    x = get_vector(state, particles + p, stride, FIELD.position)
+    now = ti.cast(counter[scene, COUNT.substeps], ti.i32)
+    mark_changed(x, scene, now, 1.0, setting[SETTING.inverse_cell_size], shape, block, 3 * shape[SHAPE.all_blocks])

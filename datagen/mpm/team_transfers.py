@@ -18,6 +18,7 @@ from datagen.mpm.mls_mpm import (
     weights,
 )
 from datagen.mpm.multiple_time_stepping import change_of
+from datagen.mpm.team_lists import IDLE
 from datagen.mpm.team_meeting import GIVING
 from datagen.mpm.team_particles import dealt, get_vector
 from datagen.mpm.time_step import falls
@@ -149,7 +150,9 @@ def scatter(
     lanes, count = LANES, owned
     if ti.static(not variant & VARIANT.each_step):  # noqa: SIM102 (this one is the compiler's)
         if begins == 0.0:
-            lanes, count = MASS, columns[segment + GIVING]
+            lanes = MASS
+            if ti.static(run > 1):
+                count = columns[segment + GIVING]
     task = lane
     tasks = (count + run - 1) // run * lanes
     while task < tasks:
@@ -158,6 +161,9 @@ def scatter(
         at = dealt(own, part, chunk, blocks)
         end = at + ti.min(run, count - own)
         entry = _entry(at, first, begins, giving, variant)
+        task += threads
+        if entry == IDLE:
+            continue
         p = _particle(entry)
         gain = ti.Vector([0.0 for _ in range(27)])
         x = get_vector(state, particles + p, stride, FIELD.position)
@@ -226,7 +232,6 @@ def scatter(
                         add(node, index_x[i] + index_y[j + 1] + index_z[k], gain[9 * i + 3 * j + k])
                         gain[9 * i + 3 * j + k] = 0.0
                 base = following
-        task += threads
 
 
 @ti.func
