@@ -87,7 +87,8 @@ class SceneValue(NamedTuple):
     fallen: int = 22  # for which gravity has acted in this interval before the present substep, s
     synchronised: int = 23  # 1 where the interval's first and last substep are half as long as others, else 0
     whole_step: int = 24  # of the others, s
-    length: int = 25
+    catch_up: int = 25  # by how much strain is behind where an interval begins, s, less than 0 where ahead
+    length: int = 26
 
 
 class Status(NamedTuple):

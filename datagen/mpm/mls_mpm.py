@@ -6,11 +6,15 @@ base .. base + 2 with base = floor(x / dx - 1/2); node I lies at I dx. Nodes are
 up apart from the nodes' velocities. Masses are in units of a particle of the config's density.
 
 Transfers come at a rate of their own, since each smooths velocities: an interval between two holds as many substeps
-as the stiffest particle needs. Where that is three or more, and the time step adaptive, the interval is synchronised:
-it has one substep more, and its first and last are half as long as the others. Stress then acts from half a step before
-to half a step after the time that it is of, so that transfers find velocities of the same time as stresses (velocity
-Verlet). Were velocities half a step ahead, their smoothing would feed oscillations of half a period an interval, whose
-energy could double in each.
+as the stiffest particle needs. Where that is three or more, or something so fast that the interval is shorter for it,
+and the time step adaptive, the interval is synchronised: it has one substep more, and its first and last are half as
+long as the others. Stress then acts from half a step before to half a step after the time that it is of, so that
+transfers find velocities of the same time as stresses (velocity Verlet). Were velocities half a step ahead, their
+smoothing would feed oscillations of half a period an interval, whose energy could double in each.
+
+Where an interval that is not synchronised ends, strain is a step behind and velocity half a step. The first substep of
+a synchronised one that follows makes up for both (VALUE.catch_up); where it is the other way round, the first substep
+of the one that follows strains nothing, and its stress acts for half of it.
 
 In an interval's first substep particles give mass and momentum to the nodes and force; in the others they stay where
 they are on the grid, take the gradient of the nodes' velocities for strain and stress, and give force alone, as in the

@@ -207,9 +207,14 @@ def own_step(
     length = until - before
     if ti.abs(before - begin) <= SLACK * step and until == elapsed:
         length = step
-    length = ti.max(length, SLACK * step)
     if spreads:
         acting = step
     elif ahead > SLACK * step:
         acting = ti.max(acting - ahead, 0.0)
-    return length, before + length, acts_until, many, spreads, acting
+    length = ti.max(length, SLACK * step)
+    strained_until = before + length
+    if begins == 1.0:
+        catch_up = scene_value[scene, VALUE.catch_up]
+        length = ti.max(length + catch_up, SLACK * step)
+        acting += 0.5 * catch_up
+    return length, strained_until, acts_until, many, spreads, acting

@@ -10,7 +10,7 @@ from datagen.mpm import grid_kernel
 from hgn.config import MpmConfig
 from hgn.scene.material import ELASTIC, SAND, SNOW, WATER
 from hgn.schema import ConfigError
-from tools.stability.solver_scenes import block, height_cells
+from tools.stability.solver_scenes import block, centre_cells, height_cells
 
 EVERY_STEP = dataclasses.replace(CONFIG, transfer_speed_m_s=None)
 
@@ -168,6 +168,16 @@ def test_bodies_of_different_steps_that_meet():
         path_TN3 = run(free, CONFIG, 7, 240.0).position_TN3.astype(np.float64)
         velocity_T3 = 240 * np.diff(path_TN3.mean(1), axis=0)
         assert np.abs(velocity_T3 - scene.velocity_N3.mean(0)).max() < 1e-4, velocity_T3
+
+
+def test_half_the_step_in_fast_impacts():
+    """Half the step moves the centre of sand that hits the floor at 10 m/s by less than 3 %: intervals are synchronised
+    while something is fast, and those that follow take up strain and stress where these have left them.
+    """
+    half = dataclasses.replace(CONFIG, stability_fraction=CONFIG.stability_fraction / 2)
+    scenes = [block(SAND, (28, 4, 28), (8, 8, 8), (0, -10.0, 0)), cube((0, 0, 0), cell=1 / 64)]
+    whole, fine = (simulated(scenes, config, 9, 240.0)[0].position_TN3 for config in (CONFIG, half))
+    assert np.abs(centre_cells(fine[-1]) / centre_cells(whole[-1]) - 1) < 0.03
 
 
 def test_half_the_step():
