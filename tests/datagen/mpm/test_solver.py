@@ -109,12 +109,15 @@ def test_water_comes_to_rest():
 @pytest.mark.parametrize("material", range(len(MATERIALS)), ids=MATERIALS)
 @pytest.mark.parametrize("count", [1, 0], ids=["particle", "block"])
 def test_impact_at_ten_metres_per_second(material, count):
-    """The adaptive step bears an impact on the floor at 10 m/s, of a block and of a single particle."""
+    """The adaptive step bears an impact on the floor at 10 m/s, of a block and of a single particle: nothing is more
+    than 15 % faster than with an eighth of the step, of which a block of water throws something up at 15.1 m/s.
+    """
     scene = block(material, (0.4, 0.3, 0.4), (0.6, 0.45, 0.6), (0, -10, 0), count=count)
-    outcome = run(scene, ADAPTIVE, 13)
+    finer = dataclasses.replace(ADAPTIVE, stability_fraction=ADAPTIVE.stability_fraction / 8)
+    outcome, exact = (run(scene, config, 13) for config in (ADAPTIVE, finer))
     assert_inside(outcome.position_TN3, scene)
     assert outcome.counters["position_clamps"] == 0
-    assert outcome.counters["largest_speed"] < 15
+    assert outcome.counters["largest_speed"] < 1.15 * exact.counters["largest_speed"]
 
 
 def test_stiffening_water_bears_thirty_metres_per_second():
