@@ -125,7 +125,7 @@ def _strain(
                 if ti.static(run > 1):
                     p = column_list[first + p]
                 elif not gives_now(
-                    p, first, begins, step, scene, particles, stride, some_wait, state, covered, spread, giving, block,
+                    p, first, step, scene, particles, stride, some_wait, state, covered, spread, giving, block,
                     counter, scene_value, setting, shape,
                 ):  # fmt: skip
                     continue
@@ -366,7 +366,7 @@ def advance(
                         if ti.static(listed):  # noqa: SIM102 (this one is the compiler's)
                             if begins == 0.0:
                                 list_acting(
-                                    owned, part, chunk, blocks, lane, scene, first, segment, begins, step, covered,
+                                    owned, part, chunk, blocks, lane, scene, first, segment, step, covered,
                                     spread, column_list, rank, columns, scene_value, threads,
                                 )  # fmt: skip
                                 wait(threads)

@@ -61,7 +61,6 @@ def list_acting(
     scene: ti.i32,
     first: ti.i32,
     segment: ti.i32,
-    begins: ti.f32,
     step: ti.f32,
     covered: ti.template(),
     spread: ti.template(),
@@ -80,7 +79,7 @@ def list_acting(
         if own < owned:
             p = dealt(own, part, chunk, blocks)
             spreads = spread[first + p]
-            if acts(covered[first + p], begins, step, scene, scene_value):
+            if acts(covered[first + p], 0.0, step, scene, scene_value):
                 entry = ti.Vector([1, 0, 1])
             elif spreads == 1:
                 entry = ti.Vector([0, 1, 1])
@@ -135,7 +134,6 @@ def start_lists(lane: ti.i32, segment: ti.i32, columns: ti.template()):
 def gives_now(
     p: ti.i32,
     first: ti.i32,
-    begins: ti.f32,
     step: ti.f32,
     scene: ti.i32,
     particles: ti.i32,
@@ -154,7 +152,7 @@ def gives_now(
     """Whether a particle begins a step of its own, where none is put before another: its entry in `giving`, and the
     marks of one that goes on.
     """
-    begins_own = acts(covered[first + p], begins, step, scene, scene_value)
+    begins_own = acts(covered[first + p], 0.0, step, scene, scene_value)
     if begins_own:
         giving[first + p] = p
     elif spread[first + p] == 1:
