@@ -121,7 +121,7 @@ def simulate(
             team = Team(0)  # contacts that move are placed between launches, and particles enter there
         elif team is None:
             team = _team(device, [scene.particle_count for scene in batch[0]])
-        teams = _teams_at_once(device, team) if team.blocks > 1 else len(occupied)
+        teams = _teams_at_once(device, team) if team.threads else len(occupied)
         with _arrays_freed_here():
             try:
                 outcomes = _launched(
@@ -210,7 +210,7 @@ def _team(device: Device, counts: Sequence[int]) -> Team:
 
 
 def _teams_at_once(device: Device, team: Team) -> int:
-    """How many teams are at work at once: the blocks of one wait for each other."""
+    """How many teams are at work at once: the blocks of one wait for each other, and teams for who has their scene."""
     room = device.threads if device.kind == "cpu" else device.processors * (GPU_THREADS // team.threads)
     require(team.blocks <= room, "team.blocks", f"at most {room}, which run at once", team.blocks)
     return room // team.blocks

@@ -36,12 +36,15 @@ from datagen.mpm.team_meeting import (
     ACTING,
     LEAVES,
     MEETING,
-    QUEUE,
     SEGMENT,
+    TURN,
+    await_scene,
     choose,
+    leave_scene,
     meet_and_choose,
     meet_team,
     raise_by_warps,
+    take_turn,
     wait,
 )
 from datagen.mpm.team_particles import (
@@ -242,6 +245,7 @@ def _move(
 @ti.kernel
 def advance(
     frames: ti.i32,
+    stretch: ti.i32,
     teams: ti.i32,
     blocks: ti.i32,
     patience: ti.i32,
@@ -279,13 +283,13 @@ def advance(
 ):
     """Advances every scene by `frames` frames, and writes each frame's positions to output[frame, particle, axis].
 
-    Each of `teams` has `blocks` blocks of `threads` threads, and takes one scene after another; with `several`
-    blocks all of the launch have to run at once. Particles are sorted at the begin of each frame. With P particles
+    Each of `teams` has `blocks` blocks of `threads` threads, and takes one scene after another, `stretch` frames of
+    each until it is its turn again; with `several` blocks all of the launch have to run at once. Particles are sorted at the begin of each frame. With P particles
     and G nodes of all scenes there are at addresses (see device_memory) state [2 * fields * P], and node [2, G, 4],
     which holds what comes to momentum in a step and to mass in an interval, zero between them, and then velocities,
     with the mass for an interval's end. Arrays: tag [2 * 3 * P]; rank, spread, response [6 * P], hidden (see
     grid_kernel.substep) and column_list [P] are work space; cell_count [G], column_count [G / 4], the flags in
-    block [8 * G / 64], columns [6 * blocks * teams] and meeting [MEETING * (teams + 1)] are zero at first; turn
+    block [8 * G / 64], columns [6 * blocks * teams] and meeting [MEETING * (teams + 1) + scenes] are zero at first; turn
     [scenes] says which scene comes when (long ones first). A scene that failed keeps still.
     """
     ti.loop_config(block_dim=threads)
@@ -306,15 +310,19 @@ def advance(
         choices = 0
         at = (team + 1) * MEETING
         segment = SEGMENT * (team * blocks + part)
-        scenes = 0
+        scenes = turn.shape[0]
+        turns = 0
+        place_in_turn = 0
         if lane < threads:
+            if member == 0:
+                take_turn(at, meeting)
             # whether all blocks are at work at once shows before anything is simulated
             meet_team(at, lane, meetings, meeting, columns, segment, patience, threads, several, blocks)
             if frames > 0 and columns[segment + LEAVES] == 0:
-                scenes = turn.shape[0]
-        place_in_turn = team
-        while place_in_turn < scenes:
-            scene = turn[place_in_turn]
+                turns = scenes * ((frames + stretch - 1) // stretch)
+                place_in_turn = meeting[at + TURN]
+        while place_in_turn < turns:
+            scene = turn[place_in_turn % scenes]
             first = shape[SHAPE.part_begin + scene]
             count = shape[SHAPE.part_begin + scene + 1] - first
             chunk = (count + blocks - 1) // blocks
@@ -324,8 +332,9 @@ def advance(
             owned = count // round_of_all * chunk + ti.min(ti.max(count % round_of_all - part * chunk, 0), chunk)
             live_at = scene * LIVE.length
             copy = live[live_at + LIVE.copy]
-            frame = 0
-            while frame < frames:
+            frame = place_in_turn // scenes * stretch
+            end = ti.min(frame + stretch, frames)
+            while frame < end:
                 going = counter[scene, COUNT.status] == STATUS.running
                 sorted_already = False
                 if going:
@@ -419,13 +428,19 @@ def advance(
                     live[live_at + LIVE.frames] += 1
                 frame += 1
                 if columns[segment + LEAVES] != 0:
-                    frame = frames
-                    scenes = 0
+                    frame = end
+                    turns = 0
             if member == 0:
                 live[live_at + LIVE.copy] = copy
-                meeting[at + 2 * MEETING // 3] = teams + ti.atomic_add(meeting[QUEUE], 1)
+                take_turn(at, meeting)
+            leave_scene((teams + 1) * MEETING + scene, lane, meeting, threads)
             meet_team(at, lane, meetings, meeting, columns, segment, patience, threads, several, blocks)
-            place_in_turn = meeting[at + 2 * MEETING // 3]
+            place_in_turn = meeting[at + TURN]
+            if place_in_turn >= scenes and place_in_turn < turns:
+                await_scene(
+                    (teams + 1) * MEETING + turn[place_in_turn % scenes], place_in_turn // scenes * blocks, lane,
+                    meeting, columns, segment, threads,
+                )  # fmt: skip
             meet_team(at, lane, meetings, meeting, columns, segment, patience, threads, several, blocks)
 
 

@@ -68,7 +68,7 @@ class TeamLaunch(Launch):
         self.response = ti.ndarray(ti.f32, 6 * self.particles)
         self.block = ti.ndarray(ti.i32, 8 * self.all_blocks)
         self.turn = ti.ndarray(ti.i32, len(self.scenes))
-        self.meeting = ti.ndarray(ti.i32, (self.teams + 1) * MEETING)
+        self.meeting = ti.ndarray(ti.i32, (self.teams + 1) * MEETING + len(self.scenes))
         self.columns = ti.ndarray(ti.i32, SEGMENT * self.teams * team.blocks)
         for array in (
             self.cell_count, self.column_count, self.covered, self.spread, self.block, self.columns, self.node,
@@ -136,8 +136,10 @@ class TeamLaunch(Launch):
         output = ti.ndarray(ti.f32, 3 * max(frames, 1) * self.particles)
         self.turn.from_numpy(np.argsort(-work, kind="stable").astype(np.int32))
         self.meeting.fill(0)
+        # a frame in turn: else most teams had no scene while the last ones are done
+        stretch = 1 if self.teams < len(self.scenes) else max(frames, 1)
         team_kernel.advance(
-            frames, self.teams, self.team.blocks, PATIENCE[self.team.threads > 1], self.frame_s, address(self.state),
+            frames, stretch, self.teams, self.team.blocks, PATIENCE[self.team.threads > 1], self.frame_s, address(self.state),
             address(self.node), self.node.shape[0], self.tag, self.rank, self.strained, self.covered, self.spread,
             self.response, self.hidden, self.cell_count, self.column_count, self.column_list, self.block, self.live,
             self.columns, self.meeting, self.turn, self.scene_value, self.counter, self.setting, self.law, self.shape,

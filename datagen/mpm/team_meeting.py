@@ -12,10 +12,12 @@ from datagen.mpm.layout import LIVE, SHAPE, VALUE
 from datagen.mpm.time_step import choose_time_step, raise_maximum
 
 WARP = 32
-MEETING = 96  # integers of a team, in thirds: how many blocks have come, how often all were let go, its next scene
-QUEUE, APART = 0, 1  # before the teams' own: scenes that were taken, and whether blocks are not at work at once
+MEETING = 96  # integers of a team, in thirds: how many blocks have come, how often all were let go, its next turn
+TURN = 2 * MEETING // 3
+QUEUE, APART = 0, 1  # before the teams' own: turns that were taken, and whether blocks are not at work at once
 SEGMENT, LEAVES = 6, 2  # integers of a block, and which of them says that it leaves
 ACTING, GOING_ON, GIVING = 3, 4, 5  # which of them are counts of its lists (see team_lists)
+EVER = 2**31 - 1  # looks
 LOOKS = 64  # at a counter, between two at whether all leave
 
 
@@ -80,6 +82,40 @@ def meet_team(
             ti.atomic_add(meeting[at], 1)
             await_count(meeting, at, meetings * blocks, columns, segment, patience, threads)
         wait(threads)
+
+
+@ti.func
+def take_turn(at: ti.i32, meeting: ti.template()):
+    """The next turn of all, for the team whose integers begin at `at`; it is in their order that turns are taken, by
+    teams that are at work.
+    """
+    meeting[at + TURN] = ti.atomic_add(meeting[QUEUE], 1)
+
+
+@ti.func
+def leave_scene(entry: ti.i32, lane: ti.i32, meeting: ti.template(), threads: ti.template()):
+    """Counts at `entry`, which is the scene's, that this block has had a turn with it."""
+    wait(threads)
+    if lane == 0:
+        fence(threads)
+        ti.atomic_add(meeting[entry], 1)
+
+
+@ti.func
+def await_scene(
+    entry: ti.i32,
+    count: ti.i32,
+    lane: ti.i32,
+    meeting: ti.template(),
+    columns: ti.template(),
+    segment: ti.i32,
+    threads: ti.template(),
+):
+    """Until so many have left the scene, however long the team takes that has it: its turn came before, so it is at
+    work.
+    """
+    if lane == 0:
+        await_count(meeting, entry, count, columns, segment, EVER, threads)
 
 
 @ti.func
