@@ -182,7 +182,7 @@ class MpmConfig:
     collider_friction: NonNegative[float] = 0.0  # Coulomb coefficient; 0 separates without friction
     collider_projection: bool = True  # stop particles that would still cross an obstacle's triangle; counted
     device: Processor = "auto"  # or cpu, gpu
-    scenes_per_launch: OneOrMore | None = None  # null: 1 on a CPU, 208 on a GPU
+    scenes_per_launch: OneOrMore | None = None  # null: 1 on a CPU, 416 on a GPU
     maximum_substeps_per_frame: Positive[int] = 20_000  # beyond it a scene is stopped and reported
 
     def __post_init__(self) -> None:

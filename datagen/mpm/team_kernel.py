@@ -284,13 +284,13 @@ def advance(
     """Advances every scene by `frames` frames, and writes each frame's positions to output[frame, particle, axis].
 
     Each of `teams` has `blocks` blocks of `threads` threads, and takes one scene after another, `stretch` frames of
-    each until it is its turn again; with `several` blocks all of the launch have to run at once. Particles are sorted at the begin of each frame. With P particles
-    and G nodes of all scenes there are at addresses (see device_memory) state [2 * fields * P], and node [2, G, 4],
-    which holds what comes to momentum in a step and to mass in an interval, zero between them, and then velocities,
-    with the mass for an interval's end. Arrays: tag [2 * 3 * P]; rank, spread, response [6 * P], hidden (see
-    grid_kernel.substep) and column_list [P] are work space; cell_count [G], column_count [G / 4], the flags in
-    block [8 * G / 64], columns [6 * blocks * teams] and meeting [MEETING * (teams + 1) + scenes] are zero at first; turn
-    [scenes] says which scene comes when (long ones first). A scene that failed keeps still.
+    each until it is its turn again; with `several` blocks all of the launch have to run at once. Particles are sorted
+    at the begin of each frame. With P particles and G nodes of all scenes there are at addresses (see device_memory)
+    state [2 * fields * P], and node [2, G, 4], which holds what comes to momentum in a step and to mass in an interval,
+    zero between them, and then velocities, with the mass for an interval's end. Arrays: tag [2 * 3 * P]; rank, spread,
+    response [6 * P], hidden (see grid_kernel.substep) and column_list [P] are work space; cell_count [G], column_count
+    [G / 4], the flags in block [8 * G / 64], columns [6 * blocks * teams] and meeting [MEETING * (teams + 1) + scenes]
+    are zero at first; turn [scenes] says which scene comes when (long ones first). A scene that failed keeps still.
     """
     ti.loop_config(block_dim=threads)
     for item in range(teams * (blocks * ti.static(threads if threads > 1 else CPU_ITEMS))):

@@ -139,11 +139,11 @@ class TeamLaunch(Launch):
         # a frame in turn: else most teams had no scene while the last ones are done
         stretch = 1 if self.teams < len(self.scenes) else max(frames, 1)
         team_kernel.advance(
-            frames, stretch, self.teams, self.team.blocks, PATIENCE[self.team.threads > 1], self.frame_s, address(self.state),
-            address(self.node), self.node.shape[0], self.tag, self.rank, self.strained, self.covered, self.spread,
-            self.response, self.hidden, self.cell_count, self.column_count, self.column_list, self.block, self.live,
-            self.columns, self.meeting, self.turn, self.scene_value, self.counter, self.setting, self.law, self.shape,
-            self.contact, self.contact_normal, output, self.variant, self.team.threads, self.team.blocks > 1,
-            self.team.run,
+            frames, stretch, self.teams, self.team.blocks, PATIENCE[self.team.threads > 1], self.frame_s,
+            address(self.state), address(self.node), self.node.shape[0], self.tag, self.rank, self.strained,
+            self.covered, self.spread, self.response, self.hidden, self.cell_count, self.column_count,
+            self.column_list, self.block, self.live, self.columns, self.meeting, self.turn, self.scene_value,
+            self.counter, self.setting, self.law, self.shape, self.contact, self.contact_normal, output, self.variant,
+            self.team.threads, self.team.blocks > 1, self.team.run,
         )  # fmt: skip
         return output

@@ -88,9 +88,10 @@ class Pool:
         self._launch_size = min(self._largest_launch, self._share(0))
 
     def _share(self, taken: int) -> int:
-        """Scenes for each solver of those that none has, `taken` of which are about to be given to one."""
+        """Scenes of a launch, so that those that no solver has make even ones; `taken` are about to be given to one."""
         left = self._writer.total - self._writer.done - sum(len(solver.tasks) for solver in self._solvers) - taken
-        return max(1, math.ceil(left / len(self._solvers)))
+        share = max(1, math.ceil(left / len(self._solvers)))
+        return math.ceil(share / math.ceil(share / self._plan.scenes_per_launch))
 
     def _claim(self) -> None:
         """Claims shards as the makers need them, so that other generators on the folder find work too."""

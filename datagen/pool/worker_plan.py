@@ -10,7 +10,7 @@ from pathlib import Path
 
 from hgn.config import DatagenConfig
 
-GPU_SCENES_PER_LAUNCH = 208  # so that scenes are made, and episodes staged, while others are simulated
+GPU_SCENES_PER_LAUNCH = 416  # several for each team; while they are simulated others are made, and staged
 GPU_NODES_PER_LAUNCH = 832 * 64**3  # of the grids of all scenes, about 50 bytes each
 GPU_EARLY_LAUNCH = 2  # where episodes are wanted early: such a launch has the whole GPU for each substep
 MAXIMUM_MAKERS = 32

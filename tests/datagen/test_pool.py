@@ -69,6 +69,9 @@ def test_batches(make_config, backend, control):
     recorder = generate(config, backend, WorkerPlan(1, None, 2, 4, 2))
     assert recorder.launches == [2, 4, 3]
     assert sorted(simulated(control)) == sorted(scene_seed(0, "train", i, 0) for i in range(9))
+    for largest, launches in ((4, [3, 3, 3]), (8, [5, 4])):  # even ones: a small last one costs as much time
+        shutil.rmtree(config.dataset.folder)
+        assert generate(config, backend, WorkerPlan(1, None, 2, largest, largest)).launches == launches
 
 
 def test_scenes_are_spread_over_solvers(make_config, backend, control):
@@ -216,17 +219,17 @@ def test_worker_plans():
     default = DatagenConfig()
     assert plan_workers(default, (), 8, 2**36) == WorkerPlan(4, 2, 1, 1, 1)
     assert plan_workers(default, (), 1, 2**36) == WorkerPlan(1, 1, 1, 1, 1)
-    assert plan_workers(default, ("0",), 8, 2**36) == WorkerPlan(1, None, 7, 208, 208, ("0",))
+    assert plan_workers(default, ("0",), 8, 2**36) == WorkerPlan(1, None, 7, 416, 416, ("0",))
     assert plan_workers(DatagenConfig(mpm=MpmConfig(device="cpu")), ("0",), 4, 2**36).threads == 2
     many = DatagenConfig(dataset=DatasetConfig(workers=3), mpm=MpmConfig(scenes_per_launch=2))
     large = DatagenConfig(scene=SceneConfig(domain_size=(4.0, 1.0, 4.0)))
     assert plan_workers(large, ("0",), 8, 2**36).scenes_per_launch == 52
     assert plan_workers(default, ("0",), 8, 2**32).scenes_per_launch == 138  # of frames that fill half of 4 GB
     early = DatagenConfig(dataset=DatasetConfig(early_episodes=True))
-    assert plan_workers(early, ("0",), 8, 2**36) == WorkerPlan(1, None, 7, 208, 2, ("0",))
+    assert plan_workers(early, ("0",), 8, 2**36) == WorkerPlan(1, None, 7, 416, 2, ("0",))
     assert plan_workers(many, (), 8, 2**36) == WorkerPlan(3, 2, 1, 2, 2)
     assert plan_workers(many, ("4", "5"), 8, 2**36) == WorkerPlan(3, None, 7, 2, 2, ("4", "5"))
-    assert plan_workers(default, ("4", "5"), 8, 2**40) == WorkerPlan(2, None, 7, 208, 208, ("4", "5"))
+    assert plan_workers(default, ("4", "5"), 8, 2**40) == WorkerPlan(2, None, 7, 416, 416, ("4", "5"))
     assert plan_workers(default, ("4", "5"), 8, 2**33).scenes_per_launch == 138  # each holds its own frames
     alone = DatagenConfig(dataset=DatasetConfig(workers=1))
     assert plan_workers(alone, ("4", "5"), 8, 2**40).solvers == 1

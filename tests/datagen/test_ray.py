@@ -49,6 +49,6 @@ def test_cluster_plans():
     default = DatagenConfig()
     assert plan_cluster(default, [{"CPU": 4.0}, {"CPU": 3.0}, {}]) == WorkerPlan(3, 2, 3, 1, 1)
     assert plan_cluster(default, [{"CPU": 1.0}, {"CPU": 8.0}]) == WorkerPlan(9, 1, 9, 1, 1)
-    assert plan_cluster(default, [{"CPU": 8.0, "GPU": 2.0}] * 2) == WorkerPlan(4, None, 4, 208, 208)
+    assert plan_cluster(default, [{"CPU": 8.0, "GPU": 2.0}] * 2) == WorkerPlan(4, None, 4, 416, 416)
     few = DatagenConfig(dataset=DatasetConfig(workers=1), mpm=MpmConfig(device="cpu"))
     assert plan_cluster(few, [{"CPU": 8.0, "GPU": 2.0}]) == WorkerPlan(1, 2, 1, 1, 1)
