@@ -166,7 +166,7 @@ def next_tile(tile, ONCE: tl.constexpr):
 
 @triton.jit
 def leaky(h):
-    return tl.maximum(h, LEAKY * h)  # two instructions, where a choice by sign takes three
+    return tl.maximum(h, h * LEAKY)  # two instructions, where a choice by sign takes three
 
 
 @triton.jit
@@ -183,7 +183,7 @@ def leaky_operand(h, PRECISION: tl.constexpr):
 @triton.jit
 def leaky_backward(gradient, a):
     """The gradient before the activation; `a` is its output, which has the sign of its input."""
-    return tl.where(a > 0, gradient, LEAKY * gradient)
+    return tl.where(a > 0, gradient, gradient * LEAKY)
 
 
 @triton.jit

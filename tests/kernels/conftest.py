@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import pytest
+import triton.language as tl
 from kernels.engines import device
 
 from hgn.kernels.tuning import Tuning
@@ -21,6 +22,20 @@ def small_chunks(monkeypatch):
     """Of the weights' products: the interpreter takes as long for rows that are not there."""
     if not NATIVE:
         monkeypatch.setattr("hgn.kernels.backward.CHUNK_ROWS", (64, 128))
+
+
+@pytest.fixture(autouse=True)
+def constants_are_numbers(monkeypatch):
+    """The interpreter makes a constant of what a constant on a tensor's left yields, and in Triton 3.7 and 3.8 not
+    every function takes that. With the constant on the right it is a tensor in all versions."""
+    initialise = tl.constexpr.__init__
+
+    def checked(constant, value):
+        assert not isinstance(value, tl.tensor), "a constant stands on the left of a tensor"
+        initialise(constant, value)
+
+    if not NATIVE:
+        monkeypatch.setattr(tl.constexpr, "__init__", checked)
 
 
 @pytest.fixture

@@ -90,7 +90,7 @@ def _rotation(inertia, x, y, z):
     xx, yy, zz = inertia[0], inertia[1], inertia[2]
     determinant, turn = _adjugate(inertia, x, y, z)
     determinant = tl.maximum(determinant, 0.0)
-    least = THINNEST * ((xx + yy + zz) / 3 + SMALLEST)
+    least = ((xx + yy + zz) / 3 + SMALLEST) * THINNEST
     inverse = 1 / (determinant + least * least * least)
     return determinant * inverse, turn[0] * inverse, turn[1] * inverse, turn[2] * inverse
 

@@ -45,7 +45,7 @@ def draw_waves(
     index = tl.arange(0, WAVES)
     columns: tl.constexpr = 4 + 3 * HISTORY
     line = waves + (scene * WAVES + index) * columns
-    draw = WAVES_OFFSET + index
+    draw = index + WAVES_OFFSET
     x, y, z = tl.randn(seed, draw), tl.randn(seed, draw + WAVES), tl.randn(seed, draw + 2 * WAVES)
     number = largest_number * tl.exp(-log_range * tl.rand(seed, draw + 3 * WAVES))
     number /= tl.sqrt(x * x + y * y + z * z)
