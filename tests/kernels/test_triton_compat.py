@@ -10,8 +10,6 @@ from processes import run_compiled
 from hgn.kernels.triton_compat import TESTED_VERSIONS, unsupported_reason
 
 CHECKOUT = Path(__file__).parents[2]
-# Read: what is written there is not what a product reads, which lies 32 KB below.
-SAFE = {("particle_cell_backward", "tf32")}
 
 
 @pytest.fixture(scope="module")
@@ -63,8 +61,8 @@ def test_no_tile_is_copied_over_one_that_is_being_multiplied(lines):
 
 
 def test_no_group_overwrites_what_another_still_multiplies(lines):
-    """Kernels of eight warps have a barrier between a product and the next write to shared memory, for Triton's wait
-    for products holds four warps alone; but where what is written is nothing that is multiplied."""
+    """Kernels of eight warps have a barrier between a product and the next write to what a product reads, for the wait
+    for products of Triton 3.6 to 3.8 holds four warps alone."""
     scanned = [line[1:] for line in lines if line[0] == "HAZARDS"]
     assert {kernel for kernel, _, _ in scanned} >= {
         "weight_gradient",
@@ -73,7 +71,7 @@ def test_no_group_overwrites_what_another_still_multiplies(lines):
         "edge_backward",
         "cell_mlp_backward",
     }
-    assert {(kernel, precision) for kernel, precision, count in scanned if int(count)} <= SAFE, scanned
+    assert not [line for line in scanned if int(line[-1])], scanned
 
 
 def test_narrow_networks_fit_into_less_shared_memory(lines):
@@ -83,7 +81,7 @@ def test_narrow_networks_fit_into_less_shared_memory(lines):
     assert max(shared.values()) <= 101_376, shared
 
 
-@pytest.mark.parametrize(("between", "count"), [("bar.sync 0;", 0), ("add.s32 %r1, %r1, 1;", 1)])
+@pytest.mark.parametrize(("between", "count"), [("bar.sync 0;", 0), ("add.s32 %r3, %r4, 1;", 1)])
 def test_a_missing_barrier_is_seen(between, count):
     """Also behind a branch back, where the write stands before the wait."""
     ptx = f""".reqntid 256
@@ -96,3 +94,33 @@ def test_a_missing_barrier_is_seen(between, count):
     ret;
     """
     assert len(hazards(ptx)) == count and not hazards(ptx.replace("256", "128"))
+
+
+@pytest.mark.parametrize(
+    ("write", "count"),
+    [
+        ("st.shared.v4.b32 [%r3+9216], {%r4, %r4, %r4, %r4};", 0),  # above what is read
+        ("st.shared.v4.b32 [ %r3 + 9200 ], { %r4, %r4, %r4, %r4 };", 1),
+        ("@%p1 cp.async.cg.shared.global [ %r3 + 0 ], [ %rd2 + 0 ], 0x10, 0x10;", 1),
+        ("cp.async.bulk.shared::cluster.global [%r3+9216], [%rd2], %r4, [%r5];", 1),  # of a length that is not known
+        ("stmatrix.sync.aligned.m8n8.x1.shared.b16 [%r6], {%r4};", 1),  # nor its place
+    ],
+)
+def test_what_is_written_beside_does_no_harm(write, count):
+    """Of 4 KB that the threads write together, beside a product's operand in bytes 1,024 to 9,216. What is written
+    anywhere counts where a place is not known, the operand's or its own."""
+    ptx = f""".reqntid 256
+    mov.u32 %r1, %tid.x;
+    shl.b32 %r2, %r1, 4;
+    mov.b32 %r5, global_smem;
+    add.s32 %r3, %r2, %r5;
+    add.s32 %r6, %r2, %ctaid.x;
+    mov.b64 %rd1, {1 << 62 | 64 << 32 | 64};
+    wgmma.mma_async.sync.aligned.m64n64k16.f32.f16.f16 {{%r7}}, {{%r8}}, %rd1, 0, 1, 1, 1;
+    wgmma.wait_group.sync.aligned 0;
+    {write}
+    ret;
+    """
+    assert len(hazards(ptx)) == count
+    assert len(hazards(ptx.replace("mov.b64 %rd1", "ld.global.b64 %rd1"))) == 1
+    assert not hazards(ptx.replace(write, f"bar.sync 0;\n{write}"))
