@@ -28,6 +28,7 @@ from hgn.schema import ConfigError, require
 
 GPU_THREADS = 512  # that run on a processor at once, whatever they do (see device)
 TEAM_THREADS, TEAM_BLOCKS, TEAM_RUN = 256, 3, 4  # of many scenes, which teams take one after another
+MANY_BLOCKS, MANY_SCENES = 2, 3  # of a team, where there are so many scenes for each and more
 EVEN = 0.95  # of the time of a launch, that the mean scene takes at least where each has one block
 SHARED_THREADS, SHARED_BLOCKS = 128, 8  # of a block, where each of a few scenes has so many and more
 SHARED_PARTICLES = 8  # at least, of each of several
@@ -206,7 +207,9 @@ def _team(device: Device, counts: Sequence[int]) -> Team:
     rounds = -(-scenes // room)
     if scenes > EVEN * rounds * room and sum(counts) > EVEN * scenes * most:
         return Team(TEAM_THREADS)  # all are done at once
-    return Team(TEAM_THREADS, max(blocks, TEAM_BLOCKS), TEAM_RUN)
+    # a launch lasts as long as its longest scene: a larger team is done with that sooner, a smaller one waits less
+    many = scenes * MANY_BLOCKS >= MANY_SCENES * room
+    return Team(TEAM_THREADS, MANY_BLOCKS if many else max(blocks, TEAM_BLOCKS), TEAM_RUN)
 
 
 def _teams_at_once(device: Device, team: Team) -> int:

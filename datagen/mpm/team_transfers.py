@@ -25,7 +25,6 @@ from datagen.mpm.time_step import falls
 
 LANES = 4  # components of a node, and threads that share a particle where it gives to nodes
 MASS = 3  # the component
-AT_ONCE = 4  # nodes, of which a thread finds out at once where they lie
 
 
 @ti.func
@@ -356,24 +355,15 @@ def update_nodes(
     count = live[scene * LIVE.length + LIVE.blocks] * BLOCK_NODES
     n = member
     while n < count:
-        # where a node's block lies and what changed it, several at once: each is a way to memory
-        touched = ti.Vector([-1 for _ in range(AT_ONCE)])
-        corner = ti.Vector([0 for _ in range(AT_ONCE)])
-        many = ti.Vector([1.0 for _ in range(AT_ONCE)])
-        for i in ti.static(range(AT_ONCE)):
-            if n + i * members < count:
-                entry = block_list + (n + i * members) // BLOCK_NODES
-                touched[i] = block[entry]
-                corner[i] = block[entry + shape[SHAPE.all_blocks]]
+        touched = block[block_list + n // BLOCK_NODES]
+        corner = block[block_list + shape[SHAPE.all_blocks] + n // BLOCK_NODES]
+        many = 1.0
         if some_wait:
-            mark = ti.Vector([block[3 * shape[SHAPE.all_blocks] + ti.max(touched[i], 0)] for i in range(AT_ONCE)])
-            for i in ti.static(range(AT_ONCE)):
-                many[i] = change_of(mark[i], now)
-        for i in ti.static(range(AT_ONCE)):
-            if touched[i] >= 0 and many[i] > 0.0:
-                _update_node(
-                    touched[i], (n + i * members) % BLOCK_NODES, corner[i], scene, velocities, begins, ends,
-                    gravity_time, ti.min((many[i] - 1.0) * whole_step, left), fallen, block, node, scene_value, shape,
-                    contact, contact_normal, variant,
-                )  # fmt: skip
-        n += AT_ONCE * members
+            many = change_of(block[3 * shape[SHAPE.all_blocks] + touched], now)
+        if many > 0.0:
+            _update_node(
+                touched, n % BLOCK_NODES, corner, scene, velocities, begins, ends, gravity_time,
+                ti.min((many - 1.0) * whole_step, left), fallen, block, node, scene_value, shape, contact,
+                contact_normal, variant,
+            )  # fmt: skip
+        n += members

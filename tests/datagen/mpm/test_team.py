@@ -101,6 +101,7 @@ def test_who_runs_many_scenes():
     assert _team(gpu, [4_000] * 256) == Team(256)
     for counts in ([4_000, *[3_000] * 255], [4_000] * 100, [4_000] * 300):
         assert _team(gpu, counts) == Team(256, 3, 4)
+    assert _team(gpu, [4_000] * 412) == Team(256, 2, 4)
     assert _team(gpu, [4_000] * 50) == Team(256, 5, 4)
     assert _team(gpu, [4_000]) == Team(128, 264, 1)
 
