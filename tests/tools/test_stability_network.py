@@ -50,6 +50,7 @@ SCENE |= {"group_shapes": ["cube"], "group_count": 2, "group_size": 0.04}
 GRAVITY = (0.0, -9.8, 0.0)
 SMALL = {"frames": 3, "long_frames": 5, "scene": SCENE, "device": "cpu", "solver_device": "cpu"}
 MATERIAL_NAMES = ("water", "sand", "snow")
+RESTING = {"inputs": "relative", "contact_gate": "cell", "contact_forces": "normal", "rest_threshold": 0.1}
 
 
 @pytest.fixture
@@ -287,10 +288,11 @@ def test_failures_are_told(weights, monkeypatch):
     assert not row.held and row.beyond == "1e+02 % of the particles end outside of the domain"
 
 
-@pytest.mark.parametrize("inputs", ["absolute", "relative"])
-def test_the_guard_is_asked(inputs):
-    """A weight that explodes is noticed at the first frame, also where free flight leaves networks no answer."""
-    exploding = network_of(torch.float32, inputs=inputs, width=8, material_embedding=2, levels=2)
+@pytest.mark.parametrize("forces", [{"inputs": "absolute"}, {"inputs": "relative"}, RESTING])
+def test_the_guard_is_asked(forces):
+    """A weight that explodes is noticed at the first frame, also where free flight, floors that push along their
+    normals alone, or rest by construction leave networks no answer."""
+    exploding = network_of(torch.float32, width=8, material_embedding=2, levels=2, **forces)
     row = guard_row(Simulator(exploding, 60.0, "torch"), SceneConfig())
     assert row.held, row
 
