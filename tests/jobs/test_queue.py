@@ -5,6 +5,7 @@ import os
 import signal
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -334,17 +335,40 @@ def test_networks(tmp_path, monkeypatch):
 
 
 def test_mechanics(tmp_path, monkeypatch):
-    """jobs/mechanics.txt trains the network that ships on data that it makes, exports it and scores it on them."""
-    ((name, lines),) = calls(tmp_path, "mechanics.txt").items()
-    mappings = settings(lines, monkeypatch)
-    assert list(mappings) == ["hgn.train", "hgn.export", "hgn.evaluate"] and mappings["hgn.train"].pop("name") == name
-    config = from_mapping(TrainConfig, mappings["hgn.train"])
-    export = from_mapping(ExportConfig, mappings["hgn.export"])
-    score = from_mapping(EvaluateConfig, mappings["hgn.evaluate"])
-    assert config.run == f"runs/{name}" and export.checkpoint == f"runs/{name}/checkpoints/last.ckpt"
-    assert (score.weights, score.data) == (export.out, config.dataset.folder)
-    assert score.scenes == config.dataset.validation_scenes
-    assert load_weights(shipped_weights()[Path(export.out).stem])[1].network == config.network
+    """jobs/mechanics.txt: four trainings, each from the weights that the one before exports, on data that it makes; the
+    last one is the network that ships, but for its threshold of rest, and is scored."""
+    mappings = {name: settings(lines, monkeypatch) for name, lines in calls(tmp_path, "mechanics.txt").items()}
+    made = {name: datagen_config(mappings.pop(name)["datagen"]) for name in ("rest_data", "motion_data")}
+    assert list(mappings) == ["first", "second", "third", "mechanics"]
+    before = None
+    for name, commands in mappings.items():
+        assert commands["hgn.train"].pop("name") == "mechanics"
+        config = from_mapping(TrainConfig, commands["hgn.train"])
+        export = from_mapping(ExportConfig, commands["hgn.export"])
+        assert config.run == f"runs/{name}" and export.checkpoint == f"runs/{name}/checkpoints/last.ckpt"
+        assert config.training.init_weights == before
+        if before is not None:
+            assert dataset_identity(config.datagen) == dataset_identity(made["motion_data"])
+            assert config.dataset.folder == made["motion_data"].dataset.folder
+            assert config.training.more_data == (made["rest_data"].dataset.folder,)
+        if "hgn.evaluate" in commands:
+            score = from_mapping(EvaluateConfig, commands["hgn.evaluate"])
+            assert (score.weights, score.data) == (export.out, config.dataset.folder)
+            assert score.scenes == config.dataset.validation_scenes
+        before = export.out
+    assert name == Path(str(before)).stem and "hgn.evaluate" in mappings[name]
+    shipped = load_weights(shipped_weights()[name])[1].network
+    assert shipped == replace(config.network, rest_threshold=shipped.rest_threshold)
+
+
+def test_trial_of_mechanics(tmp_path):
+    """SCENES and SHARE shorten all data and all trainings."""
+    lines = calls(tmp_path, "mechanics.txt", SCENES="2", SHARE="1")
+    used = [argument for line in lines.values() for call in line for argument in call]
+    scenes = [argument for argument in used if argument.startswith(("scenes=", "dataset.training_scenes="))]
+    assert {argument.partition("=")[2] for argument in scenes} == {"2", "25", "100"}  # the last two are scored
+    updates = [int(argument.partition("=")[2]) for argument in used if argument.startswith("training.maximum_updates")]
+    assert len(updates) == 4 and max(updates) < 2000
 
 
 def test_judged(tmp_path, monkeypatch):
