@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,7 @@ from hgn.runtime.exported_step import initial_arrays, traced_step, write_onnx, w
 from hgn.runtime.simulator import Simulator
 from hgn.runtime.weights import WeightsInfo, find_weights, load_weights, save_weights
 from hgn.scene.scene_file import find_scene, load_scene
-from hgn.schema import FileName, from_mapping, require, require_bounds
+from hgn.schema import FileName, NonNegative, from_mapping, require, require_bounds
 from hgn.system.device import choose_device
 from hgn.system.extras import require_installed
 from hgn.system.files import require_place
@@ -29,6 +29,7 @@ class ExportConfig:
     checkpoint: str | None = None  # whose network is written to `out` as weights
     out: FileName | None = None
     stored_precision: StoredPrecision = "fp32"  # of the learned tensors; fp16: files half as large
+    rest_threshold: NonNegative[float] | None = None  # network.rest_threshold of `out`; null: as it was trained
     weights: str | None = None  # what onnx, package and arrays are of: a file or shipped weights; null: `out`
     onnx: FileName | None = None  # file of a step's graph, for ONNX Runtime
     package: str | None = None  # file of a step compiled for `device`, for PyTorch's C++ (.pt2)
@@ -41,6 +42,8 @@ class ExportConfig:
         both = (self.checkpoint is None) == (self.out is None)
         require(both, "out", "given with checkpoint, and only then", self.out, "give both or weights")
         require((self.arrays is None) == (self.scene is None), "scene", "given with arrays, and only then", self.scene)
+        set_there = self.rest_threshold is None or self.checkpoint is not None
+        require(set_there, "rest_threshold", "null without checkpoint", self.rest_threshold)
         steps = any(name is not None for name in (self.onnx, self.package, self.arrays))
         require(steps or self.weights is None, "onnx", "given with weights, or package or arrays", self.onnx)
         rule = "given, or weights with onnx, package or arrays"
@@ -59,7 +62,7 @@ def main(mapping: dict[str, Any]) -> int:
             require_place(Path(file))
     if config.checkpoint is not None:
         assert config.out is not None
-        export(Path(config.checkpoint), Path(config.out), config.stored_precision)
+        export(Path(config.checkpoint), Path(config.out), config.stored_precision, config.rest_threshold)
         print(config.out)
     if config.onnx is None and config.package is None and config.arrays is None:
         return 0
@@ -83,8 +86,13 @@ def main(mapping: dict[str, Any]) -> int:
     return 0
 
 
-def export(checkpoint_path: Path, out: Path, stored_precision: str = "fp32") -> None:
-    """Checkpoint to weights. Raises: ConfigError when the checkpoint is missing or not ours."""
+def export(
+    checkpoint_path: Path, out: Path, stored_precision: str = "fp32", rest_threshold: float | None = None
+) -> None:
+    """Checkpoint to weights, of the network as it was trained or with another threshold of rest (hgn.network.rest).
+
+    Raises: ConfigError when the checkpoint is missing or not ours, or holds a network that takes no threshold.
+    """
     # Lightning, which the other exports do without, is loaded here
     from hgn.training.checkpoint import (
         data_of_checkpoint,
@@ -95,9 +103,12 @@ def export(checkpoint_path: Path, out: Path, stored_precision: str = "fp32") -> 
 
     checkpoint = read_checkpoint(checkpoint_path)
     network = network_of_checkpoint(checkpoint, checkpoint_path)
+    built = network.config
+    if rest_threshold is not None:
+        built = replace(built, rest_threshold=rest_threshold)
     data = data_of_checkpoint(checkpoint)
     info = WeightsInfo(
-        network=network.config,
+        network=built,
         frame_rate_hz=data.frame_rate_hz,
         obstacle_cell_size=data.obstacle_cell_size,
         gravity=data.gravity,

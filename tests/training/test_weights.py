@@ -12,6 +12,7 @@ from hgn.data.lookup import first_episodes
 from hgn.data.reader import EpisodeStore
 from hgn.evaluate import EvaluateConfig, one_step_rows
 from hgn.export import export
+from hgn.export import main as export_main
 from hgn.network.build import build_network
 from hgn.runtime.torch_backend import Backend
 from hgn.runtime.weights import WeightsInfo, load_weights, save_weights
@@ -117,6 +118,25 @@ def test_warm_up():
         share = min(1.0, (update + 1) / 10)
         assert warm._rate(update) == pytest.approx(share * cold._rate(update), rel=1e-12)
     assert cold._rate(0) == 1e-3 and warm._rate(100) == pytest.approx(1e-5)
+
+
+def test_an_export_sets_a_threshold_of_rest(data, tmp_path):
+    """The tensors stay; networks that have no contacts to rest on are refused, as is a threshold of what exists."""
+    relative = {"network": {**NETWORK, "inputs": "relative"}}
+    for name, changes in (("relative", relative), ("absolute", {})):
+        assert train.main(train_mapping(data, tmp_path / name, maximum_updates=2) | changes) == 0
+    kept, absolute = (str(tmp_path / name / "checkpoints" / "last.ckpt") for name in ("relative", "absolute"))
+    outs = [tmp_path / f"{name}.safetensors" for name in ("as_trained", "rests")]
+    for out, options in zip(outs, ({}, {"rest_threshold": 0.1}), strict=True):
+        assert export_main({"checkpoint": kept, "out": str(out)} | options) == 0
+    (one, before), (other, after) = (load_weights(out) for out in outs)
+    assert before.network.rest_threshold == 0 and after.network == replace(before.network, rest_threshold=0.1)
+    for name, tensor in one.state_dict().items():
+        assert torch.equal(tensor, other.state_dict()[name])
+    with pytest.raises(ConfigError, match=r"rest_threshold must be 0 with inputs=absolute, got 0\.1"):
+        export_main({"checkpoint": absolute, "out": str(outs[0]), "rest_threshold": 0.1})
+    with pytest.raises(ConfigError, match=r"rest_threshold must be null without checkpoint, got 0\.1"):
+        export_main({"weights": str(outs[0]), "onnx": str(tmp_path / "step.onnx"), "rest_threshold": 0.1})
 
 
 def test_the_average_is_what_is_measured_and_exported(data, tmp_path, monkeypatch):
