@@ -27,7 +27,7 @@ from hgn.scene.shapes import shape_obstacle
 from hgn.schema import ConfigError, require
 
 GPU_THREADS = 512  # that run on a processor at once, whatever they do (see device)
-TEAM_THREADS, TEAM_BLOCKS, TEAM_RUN = 256, 3, 4  # of many scenes, which teams take one after another
+TEAM_THREADS, TEAM_BLOCKS, TEAM_RUN = 256, 3, 4  # of many scenes, which teams take in turn
 MANY_BLOCKS, MANY_SCENES = 2, 3  # of a team, where there are so many scenes for each and more
 EVEN = 0.95  # of the time of a launch, that the mean scene takes at least where each has one block
 SHARED_THREADS, SHARED_BLOCKS = 128, 8  # of a block, where each of a few scenes has so many and more
