@@ -103,12 +103,9 @@ def export(
 
     checkpoint = read_checkpoint(checkpoint_path)
     network = network_of_checkpoint(checkpoint, checkpoint_path)
-    built = network.config
-    if rest_threshold is not None:
-        built = replace(built, rest_threshold=rest_threshold)
     data = data_of_checkpoint(checkpoint)
     info = WeightsInfo(
-        network=built,
+        network=network.config if rest_threshold is None else replace(network.config, rest_threshold=rest_threshold),
         frame_rate_hz=data.frame_rate_hz,
         obstacle_cell_size=data.obstacle_cell_size,
         gravity=data.gravity,

@@ -122,11 +122,14 @@ def simulate(
             team = Team(0)  # contacts that move are placed between launches, and particles enter there
         elif team is None:
             team = _team(device, [scene.particle_count for scene in batch[0]])
-        teams = _teams_at_once(device, team) if team.threads else len(occupied)
         with _arrays_freed_here():
             try:
                 outcomes = _launched(
-                    TeamLaunch(team, teams, *batch) if team.threads else GridLaunch(device, *batch), frames, on_frame
+                    TeamLaunch(team, _teams_at_once(device, team), *batch)
+                    if team.threads
+                    else GridLaunch(device, *batch),
+                    frames,
+                    on_frame,
                 )
             except BlocksApartError:
                 warnings.warn(

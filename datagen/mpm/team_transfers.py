@@ -282,50 +282,6 @@ def _update(
 
 
 @ti.func
-def _update_node(
-    touched: ti.i32,
-    local: ti.i32,
-    corner: ti.i32,
-    scene: ti.i32,
-    velocities: ti.i32,
-    begins: ti.f32,
-    ends: ti.i32,
-    gravity_time: ti.f32,
-    lead: ti.f32,
-    fallen: ti.f32,
-    block: ti.template(),
-    node: ti.template(),
-    scene_value: ti.template(),
-    shape: ti.template(),
-    contact: ti.template(),
-    contact_normal: ti.template(),
-    variant: ti.template(),
-):
-    """A node of a block, and its second field where it has one."""
-    # all that is read, before anything is written: Taichi looks up where an array lies anew after each store
-    place = LANES * (touched * BLOCK_NODES + local)
-    entry = -1
-    if ti.static(bool(variant & VARIANT.contact)):
-        entry = contact[touched * BLOCK_NODES + local]
-    gain, mass, before = _read_node(place, velocities, begins, node)
-    if local == 0:
-        block[touched] = 0
-    if mass > 0.0:  # others keep a velocity of before, in which no particle has a share
-        _update(
-            place, 2 * entry, gain, mass, before, velocities, local, corner, scene, begins, ends, gravity_time, lead,
-            fallen, node, scene_value, shape, contact_normal, variant,
-        )  # fmt: skip
-    if ti.static(bool(variant & VARIANT.sheets)):  # noqa: SIM102 (this one is the compiler's)
-        if entry >= 0 and entry < shape[SHAPE.ghosts]:
-            ghost = LANES * (shape[SHAPE.ghost_begin] + entry)
-            gain_there, mass_there, before_there = _read_node(ghost, velocities, begins, node)
-            _update(
-                ghost, 2 * entry + 1, gain_there, mass_there, before_there, velocities, local, corner, scene, begins,
-                ends, gravity_time, lead, fallen, node, scene_value, shape, contact_normal, variant,
-            )  # fmt: skip
-
-
-@ti.func
 def update_nodes(
     member: ti.i32,
     scene: ti.i32,
@@ -357,13 +313,32 @@ def update_nodes(
     while n < count:
         touched = block[block_list + n // BLOCK_NODES]
         corner = block[block_list + shape[SHAPE.all_blocks] + n // BLOCK_NODES]
+        local = n % BLOCK_NODES
+        n += members
         many = 1.0
         if some_wait:
             many = change_of(block[3 * shape[SHAPE.all_blocks] + touched], now)
-        if many > 0.0:
-            _update_node(
-                touched, n % BLOCK_NODES, corner, scene, velocities, begins, ends, gravity_time,
-                ti.min((many - 1.0) * whole_step, left), fallen, block, node, scene_value, shape, contact,
-                contact_normal, variant,
+            if many == 0.0:
+                continue
+        lead = ti.min((many - 1.0) * whole_step, left)
+        # all that is read, before anything is written: Taichi looks up where an array lies anew after each store
+        place = LANES * (touched * BLOCK_NODES + local)
+        entry = -1
+        if ti.static(bool(variant & VARIANT.contact)):
+            entry = contact[touched * BLOCK_NODES + local]
+        gain, mass, before = _read_node(place, velocities, begins, node)
+        if local == 0:
+            block[touched] = 0
+        if mass > 0.0:  # others keep a velocity of before, in which no particle has a share
+            _update(
+                place, 2 * entry, gain, mass, before, velocities, local, corner, scene, begins, ends, gravity_time,
+                lead, fallen, node, scene_value, shape, contact_normal, variant,
             )  # fmt: skip
-        n += members
+        if ti.static(bool(variant & VARIANT.sheets)):  # noqa: SIM102 (this one is the compiler's)
+            if entry >= 0 and entry < shape[SHAPE.ghosts]:
+                ghost = LANES * (shape[SHAPE.ghost_begin] + entry)
+                gain_there, mass_there, before_there = _read_node(ghost, velocities, begins, node)
+                _update(
+                    ghost, 2 * entry + 1, gain_there, mass_there, before_there, velocities, local, corner, scene,
+                    begins, ends, gravity_time, lead, fallen, node, scene_value, shape, contact_normal, variant,
+                )  # fmt: skip

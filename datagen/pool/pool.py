@@ -85,9 +85,9 @@ class Pool:
         # a solver needs seconds to start, so all start before the first scene is asked for
         self._solvers = [self._factory.start_solver(i) for i in range(min(self._plan.solvers, missing))]
         self._makers = [self._factory.start_maker() for _ in range(min(self._plan.makers, missing))]
-        self._launch_size = min(self._largest_launch, self._share(0))
+        self._launch_size = min(self._largest_launch, self._even_launch(0))
 
-    def _share(self, taken: int) -> int:
+    def _even_launch(self, taken: int) -> int:
         """Scenes of a launch, so that those that no solver has make even ones; `taken` are about to be given to one."""
         left = self._writer.total - self._writer.done - sum(len(solver.tasks) for solver in self._solvers) - taken
         share = max(1, math.ceil(left / len(self._solvers)))
@@ -174,7 +174,7 @@ class Pool:
         self._launches += 1
         if self._launches % len(self._solvers) == 0:  # each has had one of this size
             self._largest_launch = min(_LAUNCH_GROWTH * self._largest_launch, self._plan.scenes_per_launch)
-            self._launch_size = min(self._largest_launch, self._share(len(batch)))
+            self._launch_size = min(self._largest_launch, self._even_launch(len(batch)))
         return batch
 
     def _receive(self, timeout: float) -> None:
