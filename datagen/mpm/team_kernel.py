@@ -81,6 +81,7 @@ def _strain(
     velocities: ti.i32,
     step: ti.f32,
     begins: ti.f32,
+    own_steps: ti.i32,
     some_wait: ti.i32,
     state: ti.template(),
     tag: ti.template(),
@@ -107,8 +108,8 @@ def _strain(
     run: ti.template(),
 ):
     """The materials' answer of each particle that acts to the gradient of the nodes' velocities, left in place of C; in
-    the first step of an interval to C, and also which nodes it touches. Those that act later in an interval are the
-    ones that list_acting found.
+    the first step of an interval to C, and also which nodes it touches. Where particles take steps of their own, those
+    act that list_acting found, else all.
     """
     solid = ti.static(has_solid(variant))
     intervals = ti.static(not variant & VARIANT.each_step)
@@ -117,14 +118,14 @@ def _strain(
     fastest = 0.0
     acting_count = owned
     if ti.static(intervals and run > 1):  # noqa: SIM102 (this one is the compiler's)
-        if begins == 0.0:
+        if own_steps:
             acting_count = columns[segment + ACTING]
     own = lane
     while own < acting_count:
         p = dealt(own, part, chunk, blocks)
         own += threads
         if ti.static(intervals):  # noqa: SIM102 (this one is the compiler's)
-            if begins == 0.0:
+            if own_steps:
                 if ti.static(run > 1):
                     p = column_list[first + p]
                 elif not gives_now(
@@ -349,10 +350,11 @@ def advance(
                 tags = copy * TAG.length * stride + first
                 while going:
                     step = scene_value[scene, VALUE.time_step]
-                    begins, left, some_wait = 1.0, 0.0, False
+                    begins, left, own_steps, some_wait = 1.0, 0.0, False, False
                     if ti.static(not variant & VARIANT.each_step):
                         begins = scene_value[scene, VALUE.begins]
                         left = scene_value[scene, VALUE.interval_remaining]
+                        own_steps = begins == 0.0 and scene_value[scene, VALUE.synchronised] == 1.0
                         some_wait = left > 0.0 and scene_value[scene, VALUE.synchronised] == 1.0
                     ends = left == 0.0
                     whole = scene_value[scene, VALUE.whole_step]
@@ -373,7 +375,7 @@ def advance(
                             sorted_already = True
                         listed = ti.static(not variant & VARIANT.each_step and run > 1)
                         if ti.static(listed):  # noqa: SIM102 (this one is the compiler's)
-                            if begins == 0.0:
+                            if own_steps:
                                 list_acting(
                                     owned, part, chunk, blocks, lane, scene, first, segment, step, covered,
                                     spread, column_list, rank, columns, scene_value, threads,
@@ -386,15 +388,15 @@ def advance(
                                     )  # fmt: skip
                         _strain(
                             owned, part, chunk, blocks, lane, scene, first, particles, tags, stride, segment,
-                            velocities, step, begins, some_wait, state, tag, column_list, rank, columns, strained,
-                            covered, spread, response, hidden, node, block, live, scene_value, counter, setting, law,
-                            shape, contact, contact_normal, variant, threads, run,
+                            velocities, step, begins, own_steps, some_wait, state, tag, column_list, rank, columns,
+                            strained, covered, spread, response, hidden, node, block, live, scene_value, counter,
+                            setting, law, shape, contact, contact_normal, variant, threads, run,
                         )  # fmt: skip
                         wait(threads)
                         scatter(
                             owned, part, chunk, blocks, lane, scene, first, particles, tags, stride, segment, begins,
-                            step, state, tag, rank, columns, response, hidden, node, setting, law, shape, contact,
-                            variant, threads, run,
+                            own_steps, step, state, tag, rank, columns, response, hidden, node, setting, law, shape,
+                            contact, variant, threads, run,
                         )  # fmt: skip
                         meet_team(at, lane, meetings, meeting, columns, segment, patience, threads, several, blocks)
                         if ti.static(listed):

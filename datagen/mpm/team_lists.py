@@ -3,6 +3,7 @@
 Of a scene whose particles take steps of their own a third act in a substep. Were each looked at by a thread of its own,
 half of a warp's threads would wait for the others, so threads take what is listed, one entry after the other. Where a
 thread has one particle at most (`run` 1) none is put before another, and `giving` has IDLE for what gives nothing.
+In an interval that is not synchronised all act in each substep, and nothing is listed.
 
 A block lists its own particles, counted from the scene's first: in `column_list` those that begin a step of their own,
 and from its end backwards those that go on with a step whose stress acts evenly; in `giving` both, in their order, the

@@ -95,11 +95,11 @@ def gather(
 
 
 @ti.func
-def _entry(at: ti.i32, first: ti.i32, begins: ti.f32, giving: ti.template(), variant: ti.template()) -> ti.i32:
-    """A particle that gives in this substep, as team_lists has it: in an interval's first all do."""
+def _entry(at: ti.i32, first: ti.i32, own_steps: ti.i32, giving: ti.template(), variant: ti.template()) -> ti.i32:
+    """A particle that gives in this substep: as team_lists has it where some take steps of their own, else all do."""
     entry = at
     if ti.static(not variant & VARIANT.each_step):  # noqa: SIM102 (this one is the compiler's)
-        if begins == 0.0:
+        if own_steps:
             entry = giving[first + at]
     return entry
 
@@ -123,6 +123,7 @@ def scatter(
     stride: ti.i32,
     segment: ti.i32,
     begins: ti.f32,
+    own_steps: ti.i32,
     step: ti.f32,
     state: ti.template(),
     tag: ti.template(),
@@ -147,10 +148,11 @@ def scatter(
     inverse_dx = setting[SETTING.inverse_cell_size]
     first_entry = LANES * scene * shape[SHAPE.scene_blocks] * BLOCK_NODES
     lanes, count = LANES, owned
-    if ti.static(not variant & VARIANT.each_step):  # noqa: SIM102 (this one is the compiler's)
+    if ti.static(not variant & VARIANT.each_step):
         if begins == 0.0:
             lanes = MASS
-            if ti.static(run > 1):
+        if ti.static(run > 1):  # noqa: SIM102 (this one is the compiler's)
+            if own_steps:
                 count = columns[segment + GIVING]
     task = lane
     tasks = (count + run - 1) // run * lanes
@@ -159,7 +161,7 @@ def scatter(
         own = task // lanes * run
         at = dealt(own, part, chunk, blocks)
         end = at + ti.min(run, count - own)
-        entry = _entry(at, first, begins, giving, variant)
+        entry = _entry(at, first, own_steps, giving, variant)
         task += threads
         if entry == IDLE:
             continue
@@ -214,7 +216,7 @@ def scatter(
             at += 1
             following = base
             if at < end:
-                entry = _entry(at, first, begins, giving, variant)
+                entry = _entry(at, first, own_steps, giving, variant)
                 p = _particle(entry)
                 x = get_vector(state, particles + p, stride, FIELD.position)
                 following = base_node(x, inverse_dx)
