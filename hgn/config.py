@@ -52,6 +52,7 @@ BackendName = Annotated[str, one_of(*BACKENDS)]
 Precision = Annotated[str, one_of(*PRECISIONS)]
 StoredPrecision = Annotated[str, one_of("fp32", "fp16")]
 Split = Annotated[str, one_of("train", "validation", "test")]
+WallClearance = tuple[NonNegative[float], NonNegative[float]]
 
 
 def config_directory() -> Path:
@@ -323,6 +324,9 @@ class NetworkConfig:
     contact_forces: Annotated[str, one_of(*CONTACT_FORCES)] = "any"
     # what touches and deforms by less than that many |g| a frame rests (hgn.network.rest); 0: nothing does
     rest_threshold: NonNegative[float] = 0.0
+    # at the end of a frame particles are no nearer to the domain's planes than that, at the near sides (0) and at the
+    # far ones, or than they were before it; null: nothing holds them but what was learned
+    wall_clearance: WallClearance | None = None
     materials: tuple[MaterialName, ...] = PAPER_MATERIALS
     # 2: z is that of a plane; imported data alone have it
     dimensions: Annotated[int, Bound("2 or 3", lambda count: count in (2, 3))] = 3

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from hgn.command import run_command
-from hgn.config import StoredPrecision
+from hgn.config import StoredPrecision, WallClearance
 from hgn.network.features import ParticleState
 from hgn.runtime.exported_step import initial_arrays, traced_step, write_onnx, write_package
 from hgn.runtime.simulator import Simulator
@@ -30,6 +30,7 @@ class ExportConfig:
     out: FileName | None = None
     stored_precision: StoredPrecision = "fp32"  # of the learned tensors; fp16: files half as large
     rest_threshold: NonNegative[float] | None = None  # network.rest_threshold of `out`; null: as it was trained
+    wall_clearance: WallClearance | None = None  # network.wall_clearance of `out`; null: as it was trained
     weights: str | None = None  # what onnx, package and arrays are of: a file or shipped weights; null: `out`
     onnx: FileName | None = None  # file of a step's graph, for ONNX Runtime
     package: str | None = None  # file of a step compiled for `device`, for PyTorch's C++ (.pt2)
@@ -42,14 +43,20 @@ class ExportConfig:
         both = (self.checkpoint is None) == (self.out is None)
         require(both, "out", "given with checkpoint, and only then", self.out, "give both or weights")
         require((self.arrays is None) == (self.scene is None), "scene", "given with arrays, and only then", self.scene)
-        set_there = self.rest_threshold is None or self.checkpoint is not None
-        require(set_there, "rest_threshold", "null without checkpoint", self.rest_threshold)
+        for name, value in self.network_changes.items():
+            require(self.checkpoint is not None, name, "null without checkpoint", value)
         steps = any(name is not None for name in (self.onnx, self.package, self.arrays))
         require(steps or self.weights is None, "onnx", "given with weights, or package or arrays", self.onnx)
         rule = "given, or weights with onnx, package or arrays"
         require(self.checkpoint is not None or self.weights is not None, "checkpoint", rule, self.checkpoint)
         if self.package is not None:
             require(self.package.endswith(".pt2"), "package", "a name that ends in .pt2", self.package)
+
+    @property
+    def network_changes(self) -> dict[str, Any]:
+        """What the network of `out` is to have otherwise than it was trained, by the names of NetworkConfig."""
+        chosen = {name: getattr(self, name) for name in ("rest_threshold", "wall_clearance")}
+        return {name: value for name, value in chosen.items() if value is not None}
 
 
 def main(mapping: dict[str, Any]) -> int:
@@ -62,7 +69,7 @@ def main(mapping: dict[str, Any]) -> int:
             require_place(Path(file))
     if config.checkpoint is not None:
         assert config.out is not None
-        export(Path(config.checkpoint), Path(config.out), config.stored_precision, config.rest_threshold)
+        export(Path(config.checkpoint), Path(config.out), config.stored_precision, **config.network_changes)
         print(config.out)
     if config.onnx is None and config.package is None and config.arrays is None:
         return 0
@@ -86,12 +93,11 @@ def main(mapping: dict[str, Any]) -> int:
     return 0
 
 
-def export(
-    checkpoint_path: Path, out: Path, stored_precision: str = "fp32", rest_threshold: float | None = None
-) -> None:
-    """Checkpoint to weights, of the network as it was trained or with another threshold of rest (hgn.network.rest).
+def export(checkpoint_path: Path, out: Path, stored_precision: str = "fp32", **network_changes: Any) -> None:
+    """Checkpoint to weights, of the network as it was trained but for `network_changes`, fields of NetworkConfig that
+    change no tensor.
 
-    Raises: ConfigError when the checkpoint is missing or not ours, or holds a network that takes no threshold.
+    Raises: ConfigError when the checkpoint is missing or not ours, or holds a network that does not take the changes.
     """
     # Lightning, which the other exports do without, is loaded here
     from hgn.training.checkpoint import (
@@ -105,7 +111,7 @@ def export(
     network = network_of_checkpoint(checkpoint, checkpoint_path)
     data = data_of_checkpoint(checkpoint)
     info = WeightsInfo(
-        network=network.config if rest_threshold is None else replace(network.config, rest_threshold=rest_threshold),
+        network=replace(network.config, **network_changes),
         frame_rate_hz=data.frame_rate_hz,
         obstacle_cell_size=data.obstacle_cell_size,
         gravity=data.gravity,

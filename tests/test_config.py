@@ -36,6 +36,12 @@ RULES = {
         (RELATIVE | {"rest_threshold": 0.3, "dimensions": 2}, "rest_threshold must be 0 with dimensions=2"),
         (RELATIVE | {"rest_threshold": float("nan")}, "rest_threshold must be a finite number >= 0"),
         (RELATIVE | {"rest_threshold": -0.1}, "rest_threshold must be a finite number >= 0, got -0.1"),
+        ({"wall_clearance": (-0.1, 0.1)}, r"wall_clearance\[0\] must be a finite number >= 0, got -0.1"),
+        (GNS | {"wall_clearance": (0.1, float("inf"))}, r"wall_clearance\[1\] must be a finite number >= 0, got inf"),
+        (
+            RELATIVE | {"wall_clearance": (float("nan"), 0)},
+            r"wall_clearance\[0\] must be a finite number >= 0, got nan",
+        ),
     ],
     SceneConfig: [
         ({"obstacle_shapes": ("torus",)}, r"obstacle_shapes\[0\] must be one of half_box, .*, or a mesh file"),

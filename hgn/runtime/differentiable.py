@@ -61,7 +61,7 @@ def simulate(
 
     def step(*variables: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         before = _with_variables(state, variables)
-        after = advanced(before, functional_call(network, weights, (before,)))
+        after = advanced(before, functional_call(network, weights, (before,)), network.config)
         return after.position_N3, after.velocity_NM3
 
     variables = _variables(state)

@@ -15,8 +15,12 @@ class DivergedError(RuntimeError):
 
 def diverged(position_N3: torch.Tensor, domain_N3: torch.Tensor) -> torch.Tensor:
     """Which particles are not finite or farther from the domain than its own size, bool [..., N]."""
-    inside = (position_N3 > -domain_N3) & (position_N3 < 2 * domain_N3)  # NaN is outside
-    return ~inside.all(-1)
+    return ~within_range(position_N3, domain_N3).all(-1)
+
+
+def within_range(position_N3: torch.Tensor, domain_N3: torch.Tensor) -> torch.Tensor:
+    """Which coordinates are finite, and no farther from the domain than its own size, bool [..., N, 3]."""
+    return (position_N3 > -domain_N3) & (position_N3 < 2 * domain_N3)  # NaN is not
 
 
 def describe_diverged(diverged_count: int, particle_count: int) -> str:

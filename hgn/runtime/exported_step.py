@@ -68,7 +68,7 @@ class Step(nn.Module):
             gravity_S3=gravity[None],
             obstacles=ObstacleCells(key_K, normal_K3, self.obstacle_cell_size),
         )
-        after = advanced(state, self.network(state))
+        after = advanced(state, self.network(state), self.network.config)
         return after.position_N3, after.velocity_NM3
 
 

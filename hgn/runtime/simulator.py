@@ -185,7 +185,7 @@ class Simulator:
 
     def step(self, state: ParticleState) -> ParticleState:
         """The state one frame later."""
-        return stepped(self.backend.predict, state)
+        return stepped(self.backend.predict, state, self.network.config)
 
     def rollout(
         self,

@@ -42,7 +42,7 @@ class Backend:
     def rollout(self, state: ParticleState, room: int = 0) -> AbstractContextManager[Rollout]:
         """A simulation that begins with a state; backend triton makes `room` for as many particles."""
         self.require_parity(state)
-        return nullcontext(SteppedRollout(self.predict, state))
+        return nullcontext(SteppedRollout(self.predict, state, self.network.config))
 
     def release(self) -> None:
         """Gives back the buffers that simulations keep for those that follow."""

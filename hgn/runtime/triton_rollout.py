@@ -262,13 +262,15 @@ class TritonRollout:
         self.fused.forward()
 
     def _integrate(self) -> None:
-        overlap = overlaps()
+        config, overlap = self.config, overlaps()
+        near, far = config.wall_clearance or (0.0, 0.0)
         integrate[(-(-self.particles // INTEGRATE_BLOCK),)](
             output=self.fused.output, position=self.position_N3, velocity=self.velocity_NV,
             scene_of=self.scene_N, domain=self.domain_S3, gravity=self.gravity_S3, mean=self.mean, std=self.std,
             particle_count=self.count, status=self.grid.status, lost=self.lost, frame=self.frame,
-            path=self.path_TN3, OUT=OUT, HISTORY=self.config.velocity_history,
-            COLUMNS=1 << (3 * self.config.velocity_history - 1).bit_length(), OVERLAP=overlap,
+            path=self.path_TN3, near=near, far=far, OUT=OUT, HISTORY=config.velocity_history,
+            COLUMNS=1 << (3 * config.velocity_history - 1).bit_length(),
+            WALLED_AXES=0 if config.wall_clearance is None else config.dimensions, OVERLAP=overlap,
             BLOCK=INTEGRATE_BLOCK, launch_pdl=overlap,
         )  # fmt: skip
         advance[(1,)](

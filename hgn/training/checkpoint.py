@@ -100,7 +100,8 @@ def _require_equal(pairs: list[tuple[str, Any, Any]], why: str, remedy: str) -> 
 
 def network_of_weights(config: TrainConfig) -> ParticleNetwork:
     """The network of training.init_weights, normaliser included, for a new run to begin with. What it makes of contacts
-    may be another than these weights were trained with: tensors are the same, and training goes on from there.
+    and its walls may be other than these weights were trained with: tensors are the same, and training goes on from
+    there.
 
     Raises: ConfigError for a file that is none, and where the run wants another network or has other data.
     """
@@ -108,7 +109,7 @@ def network_of_weights(config: TrainConfig) -> ParticleNetwork:
     path = find_weights(config.training.init_weights, "training.init_weights")
     weights, info = load_weights(path, field="training.init_weights")
     remedy = "set it so, or take other training.init_weights"
-    free = ("contact_gate", "contact_forces", "contact_reach_cells", "rest_threshold")
+    free = ("contact_gate", "contact_forces", "contact_reach_cells", "rest_threshold", "wall_clearance")
     pairs = [pair for pair in _network_pairs(info.network, config) if pair[0].removeprefix("network.") not in free]
     pairs.append(("dataset.frame_rate_hz", info.frame_rate_hz, config.dataset.frame_rate_hz))
     if info.network.sees_obstacles:

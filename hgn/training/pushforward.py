@@ -157,7 +157,7 @@ class PushforwardPool:
         begin = state = batch.state()
         path = []
         for _ in range(self.training.pushforward_frames):
-            state = stepped(self._backend.predict, state)
+            state = stepped(self._backend.predict, state, self.network.config)
             path.append(state.position_N3.cpu().clone())
             again_N = diverged_scenes(state.position_N3, state.scene_N, state.domain_S3)
             if bool(again_N.any()):

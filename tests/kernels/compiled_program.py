@@ -1,7 +1,7 @@
 """What Triton makes of a small training's kernels for an H100, a line each: CANARY and what of Triton's interface held,
-COMPILED and a kernel of a grid with relative inputs or the first of a name that starts early, EARLY, such a one, how
-often it waits, and its writes before, PRODUCT, kernel, tiles copied ahead and products under way meanwhile, HAZARDS,
-kernel, precision and their number, SHARED, kernel and its bytes of shared memory."""
+COMPILED and a kernel of a grid with relative inputs, of a rollout, or the first of a name that starts early, EARLY,
+such a one, how often it waits, and its writes before, PRODUCT, kernel, tiles copied ahead and products under way
+meanwhile, HAZARDS, kernel, precision and their number, SHARED, kernel and its bytes of shared memory."""
 
 import json
 import sys
@@ -45,7 +45,8 @@ CUDABackend.make_cubin = lambda *_: b""  # ptxas takes a fifth of the time, and 
 settings = UpdateSettings(2, 1e-3, True, 1 / 64)
 relative = NetworkConfig(inputs="relative", width=16, levels=2, message_passing_steps=1)
 of_relative = {}  # before any is compiled: what is would be launched
-for network in (relative, replace(relative, contact_gate="cell", contact_forces="normal", rest_threshold=0.3)):
+contacts = {"contact_gate": "cell", "contact_forces": "normal", "rest_threshold": 0.3, "wall_clearance": (0.02, 0.04)}
+for network in (relative, replace(relative, **contacts)):
     job = PrecompileJob(network, settings, "fp16", False, False, 9000, (9000, 3000), 90, (2,))
     of_relative |= launches_of(job)
 
@@ -77,8 +78,8 @@ triton_compat.use_target(90)
 seen = set()
 for function, data in of_relative.values():
     name, early = function.__name__, json.loads(data)["options"]["launch_pdl"]
-    of_grid = function.fn.__module__ in ("hgn.kernels.grid.kernel", "hgn.kernels.coarsest.kernel")
-    if not of_grid and (not early or name in seen):
+    varied = function.fn.__module__.split(".")[2] in ("grid", "coarsest", "rollout")  # by what those two differ in
+    if not varied and (not early or name in seen):
         continue
     seen.add(name)
     before, *after = triton_compat.preload(function, data).asm["ptx"].split("griddepcontrol.wait")

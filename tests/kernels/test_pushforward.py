@@ -53,11 +53,11 @@ def assert_same_pools(fast, plain):
         assert asked == pytest.approx(acceleration, abs=1e-6)
 
 
-@pytest.mark.parametrize("inputs", ["absolute", "relative"])
-def test_the_pool_is_that_of_the_plain_path(inputs):
+@pytest.mark.parametrize("changes", [{}, {"inputs": "relative", "wall_clearance": (0.45, 0.45)}])
+def test_the_pool_is_that_of_the_plain_path(changes):
     """Scenes with and without obstacles, first and later frames, one simulation after the other with other weights and
     other numbers of particles, in the same buffers where they suffice: both pools hold the same windows."""
-    network = network_of(torch.float32, width=16, levels=1, message_passing_steps=1, inputs=inputs).to(device())
+    network = network_of(torch.float32, width=16, levels=1, message_passing_steps=1, **changes).to(device())
     scenes = [scene_with_obstacles(0, 7), episode(5, seed=1), scene_with_obstacles(2, 6), scene_with_obstacles(3, 12)]
     training = training_of(precision="fp32", pushforward_frames=2, noise_std=0.5, noise_min_scale=0.1)
     fast, plain = GraphPushforwardPool(network, training, CELL_SIZE, 0), PushforwardPool(network, training, 0)

@@ -56,6 +56,49 @@ def test_frames_are_those_of_the_plain_loop(changes):
         np.testing.assert_allclose(path_TN3, expected_TN3, rtol=0, atol=1e-6)
 
 
+@pytest.mark.parametrize(
+    "changes", [{"wall_clearance": (0.06, 0.26)}, {"wall_clearance": (0.06, 0.2), "dimensions": 2}]
+)
+def test_walls_hold(changes):
+    """Particles that are thrown about stay between the walls, as in the plain simulator, whose histories they have too;
+    in two dimensions z has no walls. Some begin beyond them, and come no nearer."""
+    scenes = [replace(scene(6, seed), dimensions=changes.get("dimensions", 3)) for seed in (0, 1)]
+    near, far = changes["wall_clearance"]
+    motions = []
+    for backend in ("torch", "triton"):
+        walled = network(**changes)
+        walled.normaliser.acceleration_std.fill_(0.02)
+        simulator = Simulator(walled, 60.0, backend, "fp32")
+        state = simulator.start(scenes)
+        with simulator.backend.rollout(state) as rollout:
+            path_TN3 = rollout.run(3)
+            motions.append((path_TN3, *(x.numpy(force=True) for x in rollout.motion())))
+        begin_N3 = state.position_N3.numpy(force=True)
+        walls = slice(changes.get("dimensions", 3))
+        assert (path_TN3[..., walls] >= np.minimum(begin_N3, near)[..., walls] - 1e-7).all()
+        assert (path_TN3[..., walls] <= np.maximum(begin_N3, 0.4 - far)[..., walls] + 1e-7).all()
+        assert ("dimensions" in changes) == bool((path_TN3[..., 2] < np.minimum(begin_N3, near)[:, 2] - 1e-3).any())
+    held_N3 = motions[0][2][:, 0] == 0
+    assert held_N3.any() and not held_N3.all()
+    for expected, found in zip(*motions, strict=True):
+        np.testing.assert_allclose(found, expected, rtol=0, atol=2e-6)
+
+
+def test_divergence_is_seen_through_walls():
+    """What is no number, or would come farther from the domain than its own size, ends the simulation at the frame and
+    with the message of backend torch without walls."""
+    for value in (float("nan"), 0.9):
+        messages = []
+        for backend, walls in (("torch", None), ("torch", (0.01, 0.01)), ("triton", (0.01, 0.01))):
+            wild = network(wall_clearance=walls)
+            wild.normaliser.acceleration_mean.fill_(value)
+            wild.normaliser.acceleration_std.fill_(0.0)
+            with pytest.raises(DivergedError) as caught:
+                Simulator(wild, 60.0, backend).rollout([scene(4)], 4)
+            messages.append(str(caught.value))
+        assert len(set(messages)) == 1 and "diverged at frame 1: 4 of 4 particles" in messages[0]
+
+
 @pytest.mark.parametrize("precision", ["fp32", "fp16"])
 def test_free_flight_is_not_refused(precision):
     """What relative inputs put out in free flight is rounding alone, which differs as a whole; both loops fall with

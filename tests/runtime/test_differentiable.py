@@ -32,6 +32,8 @@ def scene():
 
 
 def network(kind, dtype=torch.float64):
+    if kind == "walled":  # some particles begin beyond the walls, some come to them
+        return network_of(dtype, levels=2, message_passing_steps=1, wall_clearance=(0.43, 0.1))
     if kind.startswith("gns"):
         return gns_of(dtype, kind=kind, message_passing_steps=2, static_spacing_cells=2.0)
     return network_of(dtype, inputs=kind)
@@ -54,7 +56,8 @@ def positions(simulator, inputs, smoothing):
 
 
 @pytest.mark.parametrize(
-    ("kind", "smoothing"), [("absolute", 0.0), ("absolute", 0.5), ("relative", 1.0), ("gns_particles", 0.0)]
+    ("kind", "smoothing"),
+    [("absolute", 0.0), ("absolute", 0.5), ("relative", 1.0), ("gns_particles", 0.0), ("walled", 0.0)],
 )
 def test_gradients_are_those_of_central_differences(kind, smoothing):
     """Over 30 frames, along a random direction of each input, where no particle changes a cell between both sides."""
@@ -82,7 +85,7 @@ def test_gradients_are_those_of_central_differences(kind, smoothing):
         )
 
 
-@pytest.mark.parametrize("kind", ["absolute", "relative", "gns_particles"])
+@pytest.mark.parametrize("kind", ["absolute", "relative", "gns_particles", "walled"])
 def test_positions_are_those_of_a_rollout(kind):
     """What nothing replaces moves as in a rollout."""
     simulator = Simulator(network(kind, torch.float32), 60.0, "torch")

@@ -48,7 +48,7 @@ def test_baseline_errors_are_those_of_training(data):
 
 def test_the_fast_path_tells_its_own_errors(data):
     """One-step errors of backend triton come from its kernels, several frames at once: in float32 they are the plain
-    network's; what is captured serves the next frames, and those of fewer particles too."""
+    network's, whatever its walls hold; what is captured serves the next frames, and those of fewer particles too."""
     (episode,) = EpisodeStore(data, "test")
     fewer = replace(
         episode,
@@ -57,7 +57,7 @@ def test_the_fast_path_tells_its_own_errors(data):
         initial_velocity_N3=episode.initial_velocity_N3[1:],
         material_N=episode.material_N[1:],
     )
-    network = network_of(torch.float32, width=16, levels=1, message_passing_steps=1)
+    network = network_of(torch.float32, width=16, levels=1, message_passing_steps=1, wall_clearance=(0.5, 0.5))
     predict, made = TritonPredictor(network, "fp32"), []
     with torch.inference_mode():
         for samples in ([(episode, 0), (episode, 2)], [(fewer, 1), (fewer, 3)], [(episode, 3)]):

@@ -90,10 +90,11 @@ def test_other_weights_are_refused(data, tmp_path, file, message):
 
 
 def test_another_sight_of_contacts_is_taken(tmp_path):
-    """Weights that were trained with a particle's own gate begin a network with the cells' and another reach: the same
-    tensors."""
+    """Weights that were trained with a particle's own gate begin a network with the cells', another reach and walls:
+    the same tensors."""
     path = weights_file(tmp_path / "own.safetensors", "fp32", inputs="relative")
-    wanted = NetworkConfig(**NETWORK | {"inputs": "relative", "contact_gate": "cell", "contact_reach_cells": 3.0})
+    contacts = {"contact_gate": "cell", "contact_reach_cells": 3.0, "wall_clearance": (0.02, 0.04)}
+    wanted = NetworkConfig(**NETWORK | {"inputs": "relative"} | contacts)
     config = TrainConfig(network=wanted, training=TrainingConfig(init_weights=str(path)))
     network, (own, info) = network_of_weights(config), load_weights(path)
     assert network.config == wanted and info.network.contact_gate == "particle"
@@ -120,23 +121,31 @@ def test_warm_up():
     assert cold._rate(0) == 1e-3 and warm._rate(100) == pytest.approx(1e-5)
 
 
-def test_an_export_sets_a_threshold_of_rest(data, tmp_path):
-    """The tensors stay; networks that have no contacts to rest on are refused, as is a threshold of what exists."""
+def test_an_export_sets_rest_and_walls(data, tmp_path):
+    """The tensors stay; networks that have no contacts to rest on are refused, and so is either for what exists."""
     relative = {"network": {**NETWORK, "inputs": "relative"}}
     for name, changes in (("relative", relative), ("absolute", {})):
         assert train.main(train_mapping(data, tmp_path / name, maximum_updates=2) | changes) == 0
     kept, absolute = (str(tmp_path / name / "checkpoints" / "last.ckpt") for name in ("relative", "absolute"))
-    outs = [tmp_path / f"{name}.safetensors" for name in ("as_trained", "rests")]
-    for out, options in zip(outs, ({}, {"rest_threshold": 0.1}), strict=True):
+    chosen = [{}, {"rest_threshold": 0.1}, {"wall_clearance": [0.02, 0.04]}]
+    outs = [tmp_path / f"{index}.safetensors" for index in range(3)]
+    for out, options in zip(outs, chosen, strict=True):
         assert export_main({"checkpoint": kept, "out": str(out)} | options) == 0
-    (one, before), (other, after) = (load_weights(out) for out in outs)
-    assert before.network.rest_threshold == 0 and after.network == replace(before.network, rest_threshold=0.1)
-    for name, tensor in one.state_dict().items():
-        assert torch.equal(tensor, other.state_dict()[name])
+    (one, trained), *others = (load_weights(out) for out in outs)
+    assert trained.network.rest_threshold == 0 and trained.network.wall_clearance is None
+    for (other, after), changes in zip(
+        others, ({"rest_threshold": 0.1}, {"wall_clearance": (0.02, 0.04)}), strict=True
+    ):
+        assert after.network == replace(trained.network, **changes) == other.config
+        for name, tensor in one.state_dict().items():
+            assert torch.equal(tensor, other.state_dict()[name])
     with pytest.raises(ConfigError, match=r"rest_threshold must be 0 with inputs=absolute, got 0\.1"):
         export_main({"checkpoint": absolute, "out": str(outs[0]), "rest_threshold": 0.1})
-    with pytest.raises(ConfigError, match=r"rest_threshold must be null without checkpoint, got 0\.1"):
-        export_main({"weights": str(outs[0]), "onnx": str(tmp_path / "step.onnx"), "rest_threshold": 0.1})
+    for name, value in (("rest_threshold", 0.1), ("wall_clearance", [0.02, 0.04])):
+        with pytest.raises(ConfigError, match=f"{name} must be null without checkpoint, got "):
+            export_main({"weights": str(outs[0]), "onnx": str(tmp_path / "step.onnx"), name: value})
+    with pytest.raises(ConfigError, match=r"wall_clearance\[1\] must be a finite number >= 0, got -0\.1"):
+        export_main({"checkpoint": absolute, "out": str(outs[0]), "wall_clearance": [0.1, -0.1]})
 
 
 def test_the_average_is_what_is_measured_and_exported(data, tmp_path, monkeypatch):

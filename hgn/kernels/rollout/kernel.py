@@ -16,12 +16,14 @@ DIVERGED = tl.constexpr(4)
 @triton.jit
 def integrate(
     output, position, velocity, scene_of, domain, gravity, mean, std, particle_count, status, lost, frame, path,
-    OUT: tl.constexpr, HISTORY: tl.constexpr, COLUMNS: tl.constexpr, OVERLAP: tl.constexpr, BLOCK: tl.constexpr,
+    near, far, OUT: tl.constexpr, HISTORY: tl.constexpr, COLUMNS: tl.constexpr, WALLED_AXES: tl.constexpr,
+    OVERLAP: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """v += a, x += v, and the new positions into path [T, N, 3] at `frame`; a is gravity and the restored output.
 
     Where the status is not zero, nothing changes. Particles that are not finite or farther from the domain than its
-    own size are counted in `lost`, once an axis; `advance` then ends the simulation.
+    own size are counted in `lost`, once an axis; `advance` then ends the simulation. All others are held between the
+    walls of the first WALLED_AXES axes, `near` and `far` from the planes; hgn.runtime.stepped_rollout has the rule.
 
     Reference: hgn.runtime.simulator.Simulator on the torch backend; test: tests/kernels/test_rollout.py.
     """
@@ -46,14 +48,21 @@ def integrate(
     scene = tl.load(scene_of + row, mask=row < count, other=0)
     a += tl.load(gravity + scene[:, None] * 3 + axis, mask=live_axis, other=0.0)
     v = tl.where(newest, v + a, v)
-    x = tl.load(position + entry, mask=live_axis, other=0.0) + v
+    before = tl.load(position + entry, mask=live_axis, other=0.0)
+    x = before + v
     size = tl.load(domain + scene[:, None] * 3 + axis, mask=live_axis, other=1.0)
+    inside = (x > -size) & (x < 2 * size)  # NaN is outside
+    if WALLED_AXES > 0:
+        low, high = tl.where(before < near, before, near), tl.where(before > size - far, before, size - far)
+        stopped = live_axis & (axis < WALLED_AXES) & inside & ((x < low) | (x > high))
+        limit = tl.where(x < low, low, high)
+        v = tl.where(stopped, limit - before, v)
+        x = tl.where(stopped, limit, x)
     now = tl.load(frame).to(tl.int64)
     tl.debug_barrier()  # all have read before one writes
     tl.store(at, v, mask=live)
     tl.store(position + entry, x, mask=live_axis)
     tl.store(path + now * count * 3 + entry, x, mask=live_axis)
-    inside = (x > -size) & (x < 2 * size)  # NaN is outside
     outside = tl.sum(tl.sum((live_axis & (inside == 0)).to(tl.int32), 1), 0)
     if outside > 0:
         tl.atomic_add(lost, outside)
