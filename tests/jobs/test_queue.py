@@ -336,7 +336,7 @@ def test_networks(tmp_path, monkeypatch):
 
 def test_mechanics(tmp_path, monkeypatch):
     """jobs/mechanics.txt: four trainings, each from the weights that the one before exports, on data that it makes; the
-    last one is the network that ships, with its threshold of rest, and is scored."""
+    last one is the network that ships, with its threshold of rest and its walls, and is scored."""
     mappings = {name: settings(lines, monkeypatch) for name, lines in calls(tmp_path, "mechanics.txt").items()}
     made = {name: datagen_config(mappings.pop(name)["datagen"]) for name in ("rest_data", "motion_data")}
     assert list(mappings) == ["first", "second", "third", "mechanics"]
@@ -358,7 +358,8 @@ def test_mechanics(tmp_path, monkeypatch):
         before = export.out
     assert name == Path(str(before)).stem and "hgn.evaluate" in mappings[name]
     shipped = load_weights(shipped_weights()[name])[1].network
-    assert shipped == replace(config.network, rest_threshold=export.rest_threshold)
+    assert shipped == replace(config.network, **export.network_changes)
+    assert set(export.network_changes) == {"rest_threshold", "wall_clearance"}
 
 
 def test_trial_of_mechanics(tmp_path):
