@@ -76,7 +76,6 @@ def initialise(device: str = "auto", cpu_threads: int | None = None) -> Device:
             default_fp=ti.f32,
             default_ip=ti.i32,
             fast_math=False,  # it reorders sums by what stands beside them, and drops tests for NaN
-            gpu_max_reg=128,  # 512 threads of the largest kernels run on a processor then
             # nine tenths of the time to compile, and LLVM does the same again
             cfg_optimization=False,
             opt_level=0,  # expressions that stand twice

@@ -26,14 +26,14 @@ from hgn.scene.scene import Scene
 from hgn.scene.shapes import shape_obstacle
 from hgn.schema import ConfigError, require
 
-GPU_THREADS = 512  # that run on a processor at once, whatever they do (see device)
+# that run on a processor at once, of any size: Taichi has kernels compiled with so many registers a thread that two do.
+# With 512 threads a block these are 64, with 256 they are 128, with 128 they are 255
+GPU_BLOCKS = 2
 TEAM_THREADS, TEAM_BLOCKS, TEAM_RUN = 256, 3, 4  # of many scenes, which teams take in turn
-MANY_BLOCKS, MANY_SCENES = 2, 3  # of a team, where there are so many scenes for each and more
 EVEN = 0.95  # of the time of a launch, that the mean scene takes at least where each has one block
 SHARED_THREADS, SHARED_BLOCKS = 128, 8  # of a block, where each of a few scenes has so many and more
 SHARED_PARTICLES = 8  # at least, of each of several
-LARGE_THREADS = 512  # where a scene has more particles for each processor than
-LARGE_PARTICLES = 4096
+LARGE_PARTICLES = 4096  # for each processor, from which on a scene's blocks are as large as those of many scenes
 WARM_SCENES = 16
 USUAL_PARTICLES = 4_000  # of a random scene
 CELL_TOLERANCE = 1e-3  # of a cell that a domain may be longer or shorter than whole cells
@@ -201,8 +201,8 @@ def _team(device: Device, counts: Sequence[int]) -> Team:
         return Team(0)
     share = device.processors // scenes
     if share > 1 and most > LARGE_PARTICLES * share:
-        return Team(LARGE_THREADS, share)
-    room = 2 * device.processors  # blocks
+        return Team(TEAM_THREADS, GPU_BLOCKS * share)
+    room = GPU_BLOCKS * device.processors
     blocks = min(room // scenes, -(-most // SHARED_PARTICLES))
     if blocks >= SHARED_BLOCKS:
         # where each thread has a particle at most, it is done sooner alone
@@ -211,13 +211,12 @@ def _team(device: Device, counts: Sequence[int]) -> Team:
     if scenes > EVEN * rounds * room and sum(counts) > EVEN * scenes * most:
         return Team(TEAM_THREADS)  # all are done at once
     # a launch lasts as long as its longest scene: a larger team is done with that sooner, a smaller one waits less
-    many = scenes * MANY_BLOCKS >= MANY_SCENES * room
-    return Team(TEAM_THREADS, MANY_BLOCKS if many else max(blocks, TEAM_BLOCKS), TEAM_RUN)
+    return Team(TEAM_THREADS, max(blocks, TEAM_BLOCKS), TEAM_RUN)
 
 
 def _teams_at_once(device: Device, team: Team) -> int:
     """How many teams are at work at once: the blocks of one wait for each other, and teams for who has their scene."""
-    room = device.threads if device.kind == "cpu" else device.processors * (GPU_THREADS // team.threads)
+    room = device.threads if device.kind == "cpu" else GPU_BLOCKS * device.processors
     require(team.blocks <= room, "team.blocks", f"at most {room}, which run at once", team.blocks)
     return room // team.blocks
 
