@@ -42,6 +42,7 @@ CONTACT_GATES = ("particle", "cell")
 CONTACT_FORCES = ("any", "normal")
 BACKENDS = ("auto", "torch", "triton", "cpu")
 PRECISIONS = ("fp32", "tf32", "fp16")
+DEFAULT_WEIGHTS = "mechanics"  # of the commands and of `Simulator.load`; shipped, by name
 Material = Annotated[str, one_of(*MATERIALS)]
 MaterialName = Annotated[
     str,

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from hgn.command import run_command
-from hgn.config import BackendName, Precision, Split
+from hgn.config import DEFAULT_WEIGHTS, BackendName, Precision, Split
 from hgn.data.fresh import set_record
 from hgn.data.lookup import first_episodes
 from hgn.data.reader import EpisodeStore
@@ -42,8 +42,8 @@ from hgn.training.errors import (
 class EvaluateConfig:
     """`python -m hgn.evaluate`: one-step and rollout errors on a split of a data set."""
 
-    weights: str  # a file of python -m hgn.export, or the name of shipped weights
     data: str
+    weights: str = DEFAULT_WEIGHTS  # a file of python -m hgn.export, or the name of shipped weights
     split: Split = "validation"  # or train, test
     scenes: Positive[int] = 5
     frame_stride: Positive[int] = 1

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from hgn.command import run_command
-from hgn.config import BackendName, Precision
+from hgn.config import DEFAULT_WEIGHTS, BackendName, Precision
 from hgn.runtime.simulator import Simulator
 from hgn.runtime.weights import shipped_weights
 from hgn.scene.rollout_file import read_rollout
@@ -25,12 +25,14 @@ from hgn.system.device import choose_device
 from hgn.system.extras import require_installed
 from hgn.system.files import write_atomically
 
+CPU_WEIGHTS = "obstacles_small"  # M = 2: a viewer waits for each frame
+
 
 @dataclass(frozen=True)
 class PlayConfig:
     """`python -m hgn.play`: a scene in the browser, live, or a rollout file."""
 
-    weights: str | None = None  # a file or the name of shipped ones; null: obstacles on a GPU, else obstacles_small
+    weights: str | None = None  # a file or the name of shipped ones; null: mechanics on a GPU, else obstacles_small
     scene: str = "play"  # a scene file, or the name of one in conf/example
     rollout: str | None = None  # a file of hgn.rollout to look at instead
     html: FileName | None = None  # with rollout: write a page that plays it by itself to this file, and end
@@ -73,7 +75,7 @@ def play_page(config: PlayConfig) -> Any:
     from hgn.viewer.session import PlaySession
 
     place = choose_device(config.device)
-    name = config.weights or ("obstacles_small" if place.type == "cpu" else "obstacles")
+    name = config.weights or (CPU_WEIGHTS if place.type == "cpu" else DEFAULT_WEIGHTS)
 
     def load(weights: str) -> Simulator:
         return Simulator.load(weights, config.device, config.backend, config.precision)

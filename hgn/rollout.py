@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from hgn.command import run_command
-from hgn.config import BackendName, Precision, SceneConfig, require_rollout_name
+from hgn.config import DEFAULT_WEIGHTS, BackendName, Precision, SceneConfig, require_rollout_name
 from hgn.data.lookup import find_episode
 from hgn.render.exchange import PLY_ENDING, USD_ENDINGS, require_exchange, save_rollout
 from hgn.render.pictures import animate, compare_picture, spread, write_picture
@@ -44,7 +44,7 @@ SAME_SPEED = 1e-5  # of it: velocities are stored in float32
 class RolloutConfig:
     """`python -m hgn.rollout`: simulates a random scene, a scene file, or an episode of a data set beside its truth."""
 
-    weights: str = "obstacles"  # a file of python -m hgn.export, or the name of shipped weights
+    weights: str = DEFAULT_WEIGHTS  # a file of python -m hgn.export, or the name of shipped weights
     # the file to write: .vtkhdf, .usdc, .usda, .usd (one stage) or .ply (one a frame); null: rollout/NAME.vtkhdf
     out: str | None = None
     surface: bool = False  # water also as a closed surface, in USD and PLY

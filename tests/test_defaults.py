@@ -1,15 +1,20 @@
 """What the commands compose to: defaults stand once, in the dataclasses, and experiments say what differs."""
 
+import inspect
 from collections.abc import Mapping
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import yaml
 
+from hgn import play
 from hgn.command import _compose
 from hgn.command_help import help_lines
-from hgn.config import TrainingConfig, config_directory
+from hgn.config import DEFAULT_WEIGHTS, TrainingConfig, config_directory
+from hgn.runtime.simulator import Simulator
+from hgn.runtime.weights import shipped_weights
 from hgn.schema import field_comments
 
 # of train every key, of the other command lines those with other values
@@ -56,6 +61,34 @@ def beginning(file):
         if other.is_file():
             values |= beginning(other) | (yaml.safe_load(other.read_text()) or {})
     return values
+
+
+def test_all_take_the_same_weights():
+    """Where nothing is said, a program and each command that simulates with one network take `mechanics`."""
+    assert DEFAULT_WEIGHTS == "mechanics" and DEFAULT_WEIGHTS in shipped_weights()
+    values = {}
+    for file in sorted((config_directory() / "command").glob("*.yaml")):
+        weights = (beginning(file) | yaml.safe_load(file.read_text())).get("weights")
+        if isinstance(weights, str) and weights != "???":
+            values[file.stem] = weights
+    values["Simulator.load"] = inspect.signature(Simulator.load).parameters["weights"].default
+    names = ("evaluate", "rollout", "stability_network", "Simulator.load")
+    assert values == dict.fromkeys(names, DEFAULT_WEIGHTS)
+
+
+@pytest.mark.parametrize(("device", "expected"), [("cuda", DEFAULT_WEIGHTS), ("cpu", "obstacles_small")])
+def test_weights_of_play(monkeypatch, device, expected):
+    """A page takes the weights of the other commands on a GPU, a smaller network on a CPU, and its help says so."""
+
+    def load(weights, *_):
+        raise LookupError(weights)
+
+    monkeypatch.setattr(play, "choose_device", lambda _: SimpleNamespace(type=device))
+    monkeypatch.setattr(play, "Simulator", SimpleNamespace(load=load))
+    for given, taken in ((None, expected), ("no_obstacles", "no_obstacles")):
+        with pytest.raises(LookupError, match=f"^{taken}$"):
+            play.play_page(play.PlayConfig(weights=given))
+    assert expected in field_comments(play.PlayConfig)["weights"]
 
 
 def test_help_shows_comments(monkeypatch):

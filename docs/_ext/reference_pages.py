@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import ast
 import dataclasses
+import functools
 import inspect
 import io
 import re
@@ -44,11 +45,22 @@ def fields_table(path: Path, name: str) -> str:
 
 
 def _row(item: ast.AnnAssign, comment: str) -> str:
-    default = "required" if item.value is None else ast.unparse(item.value)
+    value = item.value
+    if isinstance(value, ast.Name):
+        value = _config_constants().get(value.id, value)
+    default = "required" if value is None else ast.unparse(value)
     if default.startswith("field("):
         default = "the group's own"
     cells = (f"`{item.target.id}`", f"`{ast.unparse(item.annotation)}`", f"`{default}`", comment)  # type: ignore[union-attr]
     return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
+
+
+@functools.cache
+def _config_constants() -> dict[str, ast.expr]:
+    """The constants of hgn/config.py by name, for defaults are shown as values."""
+    body = ast.parse(CONFIG.read_text(encoding="utf-8")).body
+    named = [(node.targets[0], node.value) for node in body if isinstance(node, ast.Assign)]
+    return {target.id: value for target, value in named if isinstance(target, ast.Name)}
 
 
 def _comments(source: str) -> dict[int, str]:

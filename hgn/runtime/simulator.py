@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from hgn.config import DEFAULT_WEIGHTS
 from hgn.network.base import ParticleNetwork
 from hgn.network.features import ParticleState, material_rows
 from hgn.network.obstacles import ObstacleCells, SurfaceParticles
@@ -134,7 +135,7 @@ class Simulator:
 
     @staticmethod
     def load(
-        weights: str | Path = "obstacles", device: str = "auto", backend: str = "auto", precision: str = "tf32"
+        weights: str | Path = DEFAULT_WEIGHTS, device: str = "auto", backend: str = "auto", precision: str = "tf32"
     ) -> Simulator:
         """A simulator of exported weights: a file, or the name of shipped ones. The options are those of hgn.rollout.
 

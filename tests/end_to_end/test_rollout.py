@@ -6,7 +6,7 @@ import pytest
 from network.states import silent
 
 from hgn import rollout
-from hgn.config import NetworkConfig
+from hgn.config import DEFAULT_WEIGHTS, NetworkConfig
 from hgn.network.build import build_network
 from hgn.runtime.weights import WeightsInfo, find_weights, load_weights, save_weights, shipped_weights
 from hgn.scene.rollout_file import read_rollout
@@ -25,7 +25,7 @@ def weights(tmp_path):
 
 def test_shipped_weights_are_whole():
     """Each shipped file loads, is small enough to ship, and has a card that names it."""
-    assert "obstacles" in shipped_weights()
+    assert {"mechanics", "obstacles"} <= set(shipped_weights())
     for name, path in shipped_weights().items():
         assert find_weights(name) == path and path.stat().st_size <= MAXIMUM_BYTES
         _, info = load_weights(path)
@@ -45,13 +45,14 @@ def test_names_and_paths(tmp_path, monkeypatch):
 
 
 def test_nothing_said(tmp_path, monkeypatch, capsys):
-    """Without out, it draws: three files in rollout/, named by the scene, a random one with the shipped network."""
+    """Without out, it draws: three files in rollout/, named by the scene, a random one with the default network."""
     monkeypatch.chdir(tmp_path)
     assert rollout.main({"frames": 2}) == 0
     names = capsys.readouterr().out.split()
     assert names == [f"rollout/random_0.{ending}" for ending in ("vtkhdf", "png", "gif")]
     made = read_rollout(tmp_path / names[0])
     assert len(made.obstacles) == 5 and made.source["scene"] == "random, seed 0"
+    assert made.source["weights"] == f"{DEFAULT_WEIGHTS}.safetensors"
     assert all(Path(name).stat().st_size > 1000 for name in names)
 
 

@@ -12,6 +12,8 @@ import pytest
 import yaml
 from processes import PATIENCE_S
 
+from hgn.config import DEFAULT_WEIGHTS
+
 ROOT = Path(__file__).resolve().parents[2]
 
 
@@ -83,14 +85,14 @@ def test_commands_compose_their_config(python, tmp_path, module, key):
 
 
 def test_shipped_weights_simulate(python, tmp_path):
-    """A random scene with shipped weights, from an empty folder."""
+    """A random scene with the default weights, from an empty folder."""
     (here := tmp_path / "here").mkdir()
     out = tmp_path / "rollout.vtkhdf"
-    run(python, here, "-m", "hgn.rollout", "weights=obstacles", "frames=2", "device=cpu", "render=false", f"out={out}")
+    run(python, here, "-m", "hgn.rollout", "frames=2", "device=cpu", "render=false", f"out={out}")
     assert out.stat().st_size > 10_000
 
 
 def test_command_helps(python, tmp_path):
     """`--help` says what a command does and shows its keys with their comments, from an empty folder."""
     text = run(python, tmp_path, "-m", "hgn.rollout", "--help")
-    assert "weights: obstacles" in text and "# a f" in text and text.strip("`\n").startswith("python -m hgn.rollout")
+    assert f"weights: {DEFAULT_WEIGHTS} # a f" in text and text.strip("`\n").startswith("python -m hgn.rollout")

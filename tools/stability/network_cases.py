@@ -12,7 +12,7 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from hgn.config import BackendName, MpmConfig, NetworkConfig, Precision, Processor, SceneConfig
+from hgn.config import DEFAULT_WEIGHTS, BackendName, MpmConfig, NetworkConfig, Precision, Processor, SceneConfig
 from hgn.scene.material import MATERIALS
 from hgn.scene.random_scene import REPORT_SEED, generate_scene
 from hgn.scene.rotation import euler_rotation
@@ -40,7 +40,7 @@ FAR_CELLS = 64_000  # how long the domain is that particles lie at the far end o
 class StabilityNetworkConfig:
     """The options of `python -m tools.stability network`."""
 
-    weights: str  # a file of python -m hgn.export, or the name of shipped weights
+    weights: str = DEFAULT_WEIGHTS  # a file of python -m hgn.export, or the name of shipped weights
     # of throw, gravity, collision, collapse, rest, particles, domain, speed, single, slope, far, guard; null: all
     cases: tuple[Annotated[str, one_of(*CASES)], ...] | None = None
     frames: FrameCount = 300
