@@ -13,6 +13,7 @@ import subprocess
 import sys
 import tempfile
 import time
+import warnings
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import ExitStack
@@ -60,6 +61,9 @@ class SolverTargetsConfig:
 
     cases: tuple[str, ...] = tuple(TARGETS)
     frames: int = 60  # the second half is timed; of a million particles a tenth
+    # threads of a block, blocks and run of who runs a scene (datagen.mpm.team_launch.Team), to be compared in a few
+    # cases; null: what the solver takes
+    team: tuple[Positive[int], Positive[int], Positive[int]] | None = None
     scenes: Positive[int] = 800  # of the data set
     settings: tuple[str, ...] = ()  # more of the data set's command, as dataset.seed=1; its row names them
     folder: str | None = None  # a new one, in which the data set stays; null: it goes when it is timed
@@ -72,6 +76,8 @@ class SolverTargetsConfig:
         unknown = sorted(set(self.cases) - set(TARGETS))
         require(not unknown, "cases", f"some of {', '.join(TARGETS)}", unknown)
         require(self.frames >= COMPARED_FRAMES, "frames", f"at least {COMPARED_FRAMES}", self.frames)
+        rule = "null with dataset_800, whose solver takes its own"
+        require(self.team is None or "dataset_800" not in self.cases, "team", rule, self.team)
         new = self.folder is None or not (Path(self.folder) / MANIFEST_NAME).exists()
         require(new, "folder", "one without a data set, which would be gone on with", self.folder)
 
@@ -106,20 +112,18 @@ def table(rows: list[dict[str, Any]]) -> str:
 def _row(case: str, config: SolverTargetsConfig, kind: str) -> dict[str, Any]:
     if case == "dataset_800":
         return _dataset(config)
-    own, frames, many = MpmConfig(device=kind), config.frames, SIDE_BY_SIDE if "256" in case else 1
+    own, frames, many, team = MpmConfig(device=kind), config.frames, SIDE_BY_SIDE if "256" in case else 1, config.team
     if "random" in case:
         scenes, colliders = _random_scenes(many)
-        return timed(scenes, own, frames, colliders=colliders)
+        return timed(scenes, own, frames, colliders=colliders, team=team)
     if case == "particles_1m":
-        return timed([scene_of(Workload(1_000_000, 1), 0, 0.035)], own, max(COMPARED_FRAMES, frames // 10))
+        return timed([scene_of(Workload(1_000_000, 1), 0, 0.035)], own, max(COMPARED_FRAMES, frames // 10), team=team)
     if case == "one_scene":
-        return timed([_cubes()], own, frames)
+        return timed([_cubes()], own, frames, team=team)
     theirs, rate = _at_their_step(kind), 1 / (SUBSTEPS * STEP_S)
-    return (
-        _plain(many, theirs, rate, frames)
-        if case.startswith("plain")
-        else timed([_cubes()] * many, theirs, frames, rate)
-    )
+    if case.startswith("plain"):
+        return _plain(many, theirs, rate, frames)
+    return timed([_cubes()] * many, theirs, frames, rate, team=team)
 
 
 def timed(
@@ -128,16 +132,24 @@ def timed(
     frames: int,
     rate: float = FRAME_RATE_HZ,
     colliders: Sequence[Collider] | None = None,
+    team: tuple[int, int, int] | None = None,
 ) -> dict[str, Any]:
-    """Milliseconds a frame and scene, after a comparison of the first scene that compiles."""
+    """Milliseconds a frame and scene, after a comparison of the first scene that compiles; by `team`, or by what the
+    solver takes. Where its blocks are not at work at once it takes another way, of which no time is given.
+    """
     from datagen.mpm.solver import SceneFailure, Simulated, Team, simulate
 
     colliders = colliders or [build_collider(scenes[0], mpm.collider_band_cells)] * len(scenes)
     expected = simulate(scenes[:1], mpm, COMPARED_FRAMES, rate, colliders=colliders[:1], team=Team(0))[0]
-    simulate(scenes, mpm, 2, rate, colliders=colliders)
-    clock = FrameClock()
-    outcomes = simulate(scenes, mpm, frames, rate, clock, colliders=colliders)
     row: dict[str, Any] = {"scenes": len(scenes), "particles": sum(scene.particle_count for scene in scenes)}
+    chosen, clock = None if team is None else Team(*team), FrameClock()
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", RuntimeWarning)
+            simulate(scenes, mpm, 2, rate, colliders=colliders, team=chosen)
+            outcomes = simulate(scenes, mpm, frames, rate, clock, colliders=colliders, team=chosen)
+    except RuntimeWarning as warning:
+        return row | {"ms": None, "check": str(warning)}
     for outcome in (expected, *outcomes):
         if isinstance(outcome, SceneFailure):
             return row | {"ms": None, "check": outcome.cause}

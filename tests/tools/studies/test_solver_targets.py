@@ -5,6 +5,7 @@ import sys
 
 import pytest
 
+from datagen.mpm import solver, team_launch
 from hgn.config import MpmConfig
 from hgn.data.manifest import Manifest
 from hgn.schema import ConfigError
@@ -35,6 +36,18 @@ def test_no_time_for_a_failure(monkeypatch):
     assert "maximum_substeps_per_frame = 1" in table([{"case": "one_scene", "target": None} | row])
     monkeypatch.setattr(solver_targets, "LATER_FRAMES", -1.0)
     assert timed(scene, MpmConfig(device="cpu"), 4)["ms"] is None
+
+
+def test_a_team_that_is_compared(monkeypatch):
+    """A scene can be run by another team than the solver takes. Where blocks are not at work at once it has no time."""
+    scene, mpm = [scene_of(Workload(40, 1), 0, 0.035)], MpmConfig(device="cpu")
+    assert timed(scene, mpm, 4, team=(1, 1, 4))["check"] == "green"
+    monkeypatch.setattr(solver, "_teams_at_once", lambda *_: 1)
+    monkeypatch.setattr(team_launch, "PATIENCE", (10_000, 10_000))
+    row = timed(scene, mpm, 4, team=(1, 9, 4))
+    assert row["ms"] is None and "does not run 9 blocks" in row["check"]
+    with pytest.raises(ConfigError, match="team must be null with dataset_800"):
+        main({"cases": ["dataset_800"], "team": [256, 3, 4]})
 
 
 MAKES = """
