@@ -202,7 +202,7 @@ def _team(device: Device, counts: Sequence[int]) -> Team:
     share = device.processors // scenes
     if share > 1 and most > LARGE_PARTICLES * share:
         return Team(TEAM_THREADS, GPU_BLOCKS * share)
-    room = GPU_BLOCKS * device.processors
+    room = _blocks_at_once(device)
     blocks = min(room // scenes, -(-most // SHARED_PARTICLES))
     if blocks >= SHARED_BLOCKS:
         # where each thread has a particle at most, it is done sooner alone
@@ -214,9 +214,13 @@ def _team(device: Device, counts: Sequence[int]) -> Team:
     return Team(TEAM_THREADS, max(blocks, TEAM_BLOCKS), TEAM_RUN)
 
 
+def _blocks_at_once(device: Device) -> int:
+    return device.threads if device.kind == "cpu" else GPU_BLOCKS * device.processors
+
+
 def _teams_at_once(device: Device, team: Team) -> int:
     """How many teams are at work at once: the blocks of one wait for each other, and teams for who has their scene."""
-    room = device.threads if device.kind == "cpu" else GPU_BLOCKS * device.processors
+    room = _blocks_at_once(device)
     require(team.blocks <= room, "team.blocks", f"at most {room}, which run at once", team.blocks)
     return room // team.blocks
 

@@ -354,8 +354,9 @@ def advance(
                     if ti.static(not variant & VARIANT.each_step):
                         begins = scene_value[scene, VALUE.begins]
                         left = scene_value[scene, VALUE.interval_remaining]
-                        own_steps = begins == 0.0 and scene_value[scene, VALUE.synchronised] == 1.0
-                        some_wait = left > 0.0 and scene_value[scene, VALUE.synchronised] == 1.0
+                        synchronised = scene_value[scene, VALUE.synchronised] == 1.0
+                        own_steps = begins == 0.0 and synchronised
+                        some_wait = left > 0.0 and synchronised
                     ends = left == 0.0
                     whole = scene_value[scene, VALUE.whole_step]
                     gravity_time = scene_value[scene, VALUE.gravity_time]
