@@ -106,11 +106,12 @@ def test_what_may_surprise_is_said(tmp_path, weights, capsys):
 def test_what_is_faster_than_the_data_is_said(tmp_path, capsys):
     """Where the weights know how fast groups of their data began, a faster one is simulated and a line gives both."""
     config = NetworkConfig(width=8, levels=2, message_passing_steps=1)
+    still = silent(build_network(config))
     file, scene = tmp_path / "still.safetensors", tmp_path / "fast.yaml"
     group = "{shape: cube, size: 0.05, position: [0.5, 0.5, 0.5], material: sand, velocity: [3, 0, -4]}"
     scene.write_text(f"groups: [{group}]\n")
     for known, wanted in ((None, False), (5.0, False), (5 - 1e-6, False), (3.0, True)):
-        save_weights(file, build_network(config), WeightsInfo(config, 60.0, 1 / 64, maximum_initial_speed=known))
+        save_weights(file, still, WeightsInfo(config, 60.0, 1 / 64, maximum_initial_speed=known))
         given = {"weights": str(file), "frames": 2, "scene": str(scene), "out": str(tmp_path / "a.vtkhdf")}
         assert rollout.main(given) == 0
         line = "velocity: groups begin with up to 5 domain units per second, those of the data of still with up to 3;"
