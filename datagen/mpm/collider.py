@@ -25,13 +25,14 @@ friction.
 from __future__ import annotations
 
 import dataclasses
+import math
 from dataclasses import dataclass
 
 import numpy as np
 from scipy import ndimage
 
 from datagen.mpm.sweep import ON_TRIANGLE, Sweep, build_sweep, near_pairs, near_slabs
-from hgn.scene.distance import closest_points, contains
+from hgn.scene.distance import closest_points, contains, dot, square
 from hgn.scene.scene import Obstacle, Scene
 from hgn.schema import ConfigError
 
@@ -46,7 +47,8 @@ WIDENED = 1 + 1e-3  # triangles, since kernels look a ten-thousandth beyond thei
 REACH_CELLS = WIDENED * STENCIL_CELLS * np.sqrt(3.0)  # of a particle, in any direction
 # squared area over fourth power of the longest edge, below which a triangle has no direction
 FLAT_TRIANGLE = 1e-20
-# of nodes, flat index [P]: signed distance from the surface in cells [P], free direction [P, 3], least mass [P]
+# of nodes: flat index in a box [P], signed distance from the surface in cells [P], free direction [P, 3] and least
+# mass [P]
 Contacts = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 
 
@@ -92,15 +94,17 @@ def build_collider(scene: Scene, band_cells: float, time: float = 0.0) -> Collid
         owners[obstacle.closed].append(np.full(len(triangle_F33), index, np.int32))
         if not len(triangle_F33):
             continue
+        box = _Box(triangle_F33, max(band_cells, REACH_CELLS), shape)
         if obstacle.closed:
-            surfaces[SEEN].merge(index, _closed_contacts(obstacle, triangle_F33, band_cells, shape, scene.cell_size))
+            contacts = _closed_contacts(obstacle, triangle_F33, band_cells, box, scene.cell_size)
+            surfaces[SEEN].merge(index, box, contacts)
         else:
-            for surface, contacts in zip(surfaces, _sheet_contacts(triangle_F33, rim_F6, shape), strict=True):
-                surface.merge(index, contacts)
+            for surface, contacts in zip(surfaces, _sheet_contacts(triangle_F33, rim_F6, box), strict=True):
+                surface.merge(index, box, contacts)
             centre_F13 = triangle_F33.mean(axis=1, keepdims=True)
             reach = STENCIL_CELLS if obstacle.motion is None else STENCIL_CELLS + 2 * MOVE_CELLS
             for node, _ in near_slabs(centre_F13 + WIDENED * (triangle_F33 - centre_F13), reach, shape):
-                doubled[np.ravel_multi_index(node.T, shape)] = True
+                doubled[np.ravel_multi_index(tuple(node), shape)] = True
     node = np.flatnonzero(doubled | np.isfinite(surfaces[SEEN].distance))
     return Collider(
         np.stack(np.unravel_index(node, shape), axis=1).astype(np.int32),
@@ -125,6 +129,31 @@ def placed(obstacle: Obstacle, time: float) -> Obstacle:
     return dataclasses.replace(obstacle, vertex_V3=obstacle.motion.place(obstacle.vertex_V3, time))
 
 
+class _Box:
+    """The part of a grid of `grid` nodes around triangles that nodes up to `reach` cells away from them lie in."""
+
+    def __init__(self, triangle_F33: np.ndarray, reach: float, grid: tuple[int, ...]) -> None:
+        self.grid = grid
+        whole = np.array(grid)
+        self._low = np.clip(np.ceil(triangle_F33.min(axis=(0, 1)) - reach), 0, whole).astype(np.int64)
+        high = np.clip(np.floor(triangle_F33.max(axis=(0, 1)) + reach) + 1, self._low, whole).astype(np.int64)
+        self.shape = tuple((high - self._low).tolist())
+        self.count = math.prod(self.shape)
+
+    def flat(self, node_3P: np.ndarray) -> np.ndarray:
+        """Places [P] in a flat array of the box, of nodes of the grid in it."""
+        (x, y, z), (_, size_y, size_z) = self._low, self.shape
+        return np.asarray(((node_3P[0] - x) * size_y + node_3P[1] - y) * size_z + node_3P[2] - z)
+
+    def node(self, flat_P: np.ndarray) -> np.ndarray:
+        """The nodes of the grid at such places, int64 [P, 3]."""
+        return np.stack(np.unravel_index(flat_P, self.shape), axis=1) + self._low
+
+    def flat_in_grid(self, flat_P: np.ndarray) -> np.ndarray:
+        """The same places in a flat array of the whole grid."""
+        return np.ravel_multi_index(tuple(self.node(flat_P).T), self.grid)
+
+
 class _Surface:
     """Per node the closest surface: distance in cells (infinity where there is none), free direction, obstacle."""
 
@@ -134,8 +163,9 @@ class _Surface:
         self.obstacle = np.zeros(count, np.int32)
         self.least = np.zeros(count, np.float32)
 
-    def merge(self, obstacle: int, contacts: Contacts) -> None:
-        node, height, normal, least = contacts
+    def merge(self, obstacle: int, box: _Box, contacts: Contacts) -> None:
+        flat, height, normal, least = contacts
+        node = box.flat_in_grid(flat)
         distance = np.abs(height)
         nearer = distance < self.distance[node]
         node = node[nearer]
@@ -188,36 +218,37 @@ def _triangles(obstacle: Obstacle, index: int, cell_size: float) -> tuple[np.nda
     return corner, np.concatenate([rim_edge_F3, on_rim[place_F3]], axis=1)
 
 
-def _rasterise(triangle_F33: np.ndarray, band: float, shape: tuple[int, ...]) -> tuple[np.ndarray, ...]:
+def _rasterise(triangle_F33: np.ndarray, band: float, box: _Box) -> tuple[np.ndarray, ...]:
     """Nodes within `band` cells of the triangles: flat index [P], distance [P], closest point [P, 3], triangle [P].
 
     All in cells. Of triangles equally close the first counts.
     """
-    count = int(np.prod(shape))
-    best = np.full(count, np.inf)
-    closest = np.zeros((count, 3))
-    owner = np.full(count, -1, np.int64)
-    normal = _face_normals(triangle_F33)
+    best = np.full(box.count, np.inf)
+    closest = np.zeros((box.count, 3))
+    owner = np.full(box.count, -1, np.int64)
     centre = triangle_F33.mean(axis=1)
     radius = np.linalg.norm(triangle_F33 - centre[:, None], axis=2).max(axis=1)
+    centre_3F, corner_3F, normal_3F = (
+        np.ascontiguousarray(of_triangle.T) for of_triangle in (centre, triangle_F33[:, 0], _face_normals(triangle_F33))
+    )
     # a triangle counts at a node only if its sphere comes nearer than the nearest centre of all
-    bound = np.full(count, band)
-    for node, triangle in near_pairs(triangle_F33, band, shape):
-        np.minimum.at(bound, np.ravel_multi_index(node.T, shape), np.linalg.norm(node - centre[triangle], axis=1))
-    for node, triangle in near_pairs(triangle_F33, band, shape):
-        flat = np.ravel_multi_index(node.T, shape)
-        height = ((node - triangle_F33[triangle, 0]) * normal[triangle]).sum(axis=1)
-        reach = np.linalg.norm(node - centre[triangle], axis=1) - radius[triangle]
-        keep = np.maximum(np.abs(height), reach) <= bound[flat] + 1e-9
-        node, triangle, flat = node[keep], triangle[keep], flat[keep]
-        foot = closest_points(node, triangle_F33[triangle])
-        distance = np.linalg.norm(node - foot, axis=1)
-        nearer = (distance <= band) & (distance < best[flat])
-        flat, distance, foot, triangle = flat[nearer], distance[nearer], foot[nearer], triangle[nearer]
-        order = np.lexsort((triangle, distance, flat))
-        first = order[np.unique(flat[order], return_index=True)[1]]
-        node_first = flat[first]
-        best[node_first], closest[node_first], owner[node_first] = distance[first], foot[first], triangle[first]
+    bound = np.full(box.count, band)
+    for node_3P, triangle in near_pairs(triangle_F33, band, box.grid):
+        np.minimum.at(bound, box.flat(node_3P), np.sqrt(square(node_3P - centre_3F.take(triangle, axis=1))))
+    bound += 1e-9
+    for node_3P, triangle in near_pairs(triangle_F33, band, box.grid):
+        flat = box.flat(node_3P)
+        height = dot(node_3P - corner_3F.take(triangle, axis=1), normal_3F.take(triangle, axis=1))
+        reach = np.sqrt(square(node_3P - centre_3F.take(triangle, axis=1))) - radius[triangle]
+        keep = np.flatnonzero(np.maximum(np.abs(height), reach) <= bound[flat])
+        node, triangle, flat = node_3P.take(keep, axis=1).T, triangle[keep], flat[keep]
+        foot = closest_points(node, triangle_F33.take(triangle, axis=0))
+        distance = np.sqrt(square((node - foot).T))
+        nearer = np.flatnonzero((distance <= band) & (distance < best[flat]))
+        np.minimum.at(best, flat[nearer], distance[nearer])
+        # of several at a node the first is written last
+        nearest = nearer[distance[nearer] == best[flat[nearer]]][::-1]
+        closest[flat[nearest]], owner[flat[nearest]] = foot[nearest], triangle[nearest]
     near = np.flatnonzero(owner >= 0)
     return near, best[near], closest[near], owner[near]
 
@@ -227,15 +258,11 @@ def _face_normals(triangle_F33: np.ndarray) -> np.ndarray:
     return normal / np.linalg.norm(normal, axis=1, keepdims=True)
 
 
-def _points(flat: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    return np.stack(np.unravel_index(flat, shape), axis=1).astype(np.float64)
-
-
-def _sheet_contacts(triangle_F33: np.ndarray, rim_F6: np.ndarray, shape: tuple[int, ...]) -> tuple[Contacts, Contacts]:
+def _sheet_contacts(triangle_F33: np.ndarray, rim_F6: np.ndarray, box: _Box) -> tuple[Contacts, Contacts]:
     """Nodes near a sheet: what is free for particles on their own side of it, and on the other."""
-    node, distance, foot, owner = _rasterise(triangle_F33, REACH_CELLS, shape)
+    node, distance, foot, owner = _rasterise(triangle_F33, REACH_CELLS, box)
     face = _face_normals(triangle_F33)[owner]
-    offset = _points(node, shape) - foot
+    offset = box.node(node) - foot
     height = (offset * face).sum(axis=1)
     away = offset / np.where(distance < ON_SURFACE_CELLS, 1.0, distance)[:, None]
     # around the rim the way to the foot leads along the sheet, not through it
@@ -262,18 +289,18 @@ def _on_rim(foot_P3: np.ndarray, triangle_P33: np.ndarray, rim_P6: np.ndarray) -
 
 
 def _closed_contacts(
-    obstacle: Obstacle, triangle_F33: np.ndarray, band: float, shape: tuple[int, ...], cell_size: float
+    obstacle: Obstacle, triangle_F33: np.ndarray, band: float, box: _Box, cell_size: float
 ) -> Contacts:
     # of all nodes that a particle outside may reach the way out is exact
-    node, distance, foot, owner = _rasterise(triangle_F33, max(band, REACH_CELLS), shape)
-    within = contains(_points(node, shape) * cell_size, obstacle)
-    inside = np.zeros(shape, bool)
+    node, distance, foot, owner = _rasterise(triangle_F33, max(band, REACH_CELLS), box)
+    within = contains(box.node(node) * cell_size, obstacle)
+    inside = np.zeros(box.shape, bool)
     inside.ravel()[node[within]] = True
-    near = np.zeros(shape, bool)
+    near = np.zeros(box.shape, bool)
     near.ravel()[node] = True
-    _fill_inside(inside, near, obstacle, cell_size)
+    _fill_inside(inside, near, box, obstacle, cell_size)
 
-    point = _points(node, shape)
+    point = box.node(node)
     sign = np.where(within, -1.0, 1.0)
     on_surface = distance < ON_SURFACE_CELLS
     away = (point - foot) * (sign / np.where(on_surface, 1.0, distance))[:, None]
@@ -300,11 +327,11 @@ def _closed_contacts(
 
     deep = np.flatnonzero(inside.ravel() & ~near.ravel())
     if len(deep):  # the way out leads to the surface that is nearest to the nearest node of the band
-        feet = np.zeros((int(np.prod(shape)), 3))
+        feet = np.zeros((box.count, 3))
         feet[np.flatnonzero(near.ravel())] = foot
         nearest = ndimage.distance_transform_edt(~near, return_distances=False, return_indices=True)
-        source = np.ravel_multi_index([axis.ravel()[deep] for axis in nearest], shape)
-        out = feet[source] - _points(deep, shape)
+        source = np.ravel_multi_index([axis.ravel()[deep] for axis in nearest], box.shape)
+        out = feet[source] - box.node(deep)
         depth = np.linalg.norm(out, axis=1)
         node, height = np.concatenate([node, deep]), np.concatenate([height, -depth])
         normal = np.concatenate([normal, out / depth[:, None]])
@@ -312,12 +339,12 @@ def _closed_contacts(
     return node, height, normal, least
 
 
-def _fill_inside(inside: np.ndarray, near: np.ndarray, obstacle: Obstacle, cell_size: float) -> None:
+def _fill_inside(inside: np.ndarray, near: np.ndarray, box: _Box, obstacle: Obstacle, cell_size: float) -> None:
     """Marks the nodes inside that are not near the surface: one test for each connected region of them."""
     region, count = ndimage.label(~near)
     if count == 0:
         return
     index = np.arange(1, count + 1)
-    sample = np.array(ndimage.maximum_position(~near, region, index)).reshape(-1, 3)
-    holds = contains(sample * cell_size, obstacle)
+    sample = np.ravel_multi_index(tuple(np.array(ndimage.maximum_position(~near, region, index)).T), box.shape)
+    holds = contains(box.node(sample) * cell_size, obstacle)
     inside |= np.concatenate([[False], holds])[region]

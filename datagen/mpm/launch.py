@@ -223,22 +223,27 @@ class Launch(ABC):
     def _place_contacts(self, begin: float, end: float) -> None:
         """Puts the colliders' contacts where kernels read them; what moves does so at its mean rates of a time."""
         self.shape = device_array(self._shape())
-        places, values, vectors = [], [], [np.zeros((1, 3), np.float32)]
-        length = 1
-        if self.variant & (VARIANT.contact | VARIANT.sweep):
+        of_node = MOVING_NODE_VECTORS if self.moving else NODE_VECTORS
+        of_triangle = MOVING_TRIANGLE_VECTORS if self.moving else TRIANGLE_VECTORS
+        nodes = of_node * sum(len(collider.node_K3) for collider in self.colliders)
+        triangles = of_triangle * sum(len(collider.sweep.triangle_F43) for collider in self.colliders)
+        has_contacts = self.variant & (VARIANT.contact | VARIANT.sweep)
+        has_triangles = self.variant & (VARIANT.sweep | VARIANT.sheets)
+        vector = np.zeros((max(1, nodes + triangles), 3), np.float32)
+        entries, length = [], 1
+        if has_contacts:
             length = self.all_blocks * BLOCK_NODES
-            place, value, vector = self._contacts(begin, end)
-            places, values, vectors = [place], [value], [vector]
-        if self.variant & (VARIANT.sweep | VARIANT.sheets):
-            place, value, triangle, length = self._sweeps(sum(map(len, vectors)), begin, end)
-            places, values, vectors = [*places, place], [*values, value], [*vectors, triangle]
+            entries.append(self._contacts(begin, end, vector[:nodes].reshape(-1, of_node, 3)))
+        if has_triangles:
+            of_triangles = vector[nodes : nodes + triangles].reshape(-1, of_triangle, 3)
+            place, value, length = self._sweeps(nodes, begin, end, of_triangles)
+            entries.append((place, value))
         self.contact = ti.ndarray(ti.i32, length)
         self.contact.fill(-1)
-        for place, value in zip(places, values, strict=True):
+        for place, value in entries:
             if len(place):
                 place_contacts(self.contact, device_array(place), device_array(value))
-        vector = np.concatenate(vectors)
-        self.contact_normal = device_vectors(vector if len(vector) else np.zeros((1, 3), np.float32))
+        self.contact_normal = device_vectors(vector)
 
     @abstractmethod
     def _node_array(self, nodes: int) -> Any:
@@ -325,29 +330,31 @@ class Launch(ABC):
                     own[index] = obstacle.motion.rates(begin, end)
         return rates
 
-    def _contacts(self, begin: float, end: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Places of contact nodes, the entry of each (see grid_kernel.substep), and the entries' vectors."""
-        places = np.concatenate(
-            [
-                self._places(collider.node_K3) + np.int32(index * self.scene_nodes)
-                for index, collider in enumerate(self.colliders)
-            ]
-        )
-        order = np.argsort(~np.concatenate([collider.doubled_K for collider in self.colliders]), kind="stable")
-        vector = np.zeros((len(order), MOVING_NODE_VECTORS if self.moving else NODE_VECTORS, 3), np.float32)
-        vector[:, :2] = np.concatenate([collider.normal_K23 for collider in self.colliders])[order]
-        vector[:, 2, :2] = np.concatenate(
-            [friction[own.obstacle_K2] for friction, own in zip(self._frictions(), self.colliders, strict=True)]
-        )[order]
-        least = [cell_mass(scene) * own.least_K2 for scene, own in zip(self.scenes, self.colliders, strict=True)]
-        vector[:, 3, :2] = np.concatenate(least)[order]
-        if self.moving:
-            surface = []
-            for scene, rates, own in zip(self.scenes, self._rates(begin, end), self.colliders, strict=True):
-                turn, velocity, place = np.moveaxis(rates[own.obstacle_K2], 2, 0)
-                surface.append(velocity + np.cross(turn, own.node_K3[:, None] * scene.cell_size - place))
-            vector[:, 4:] = np.concatenate(surface)[order]
-        return places[order], np.arange(len(order), dtype=np.int32), vector.reshape(-1, 3)
+    def _contacts(self, begin: float, end: float, vector: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Places of contact nodes, and the entry of each (see grid_kernel.substep). Fills in the entries' vectors."""
+        # one scene after another, whose arrays stay in a core's cache; nodes of two fields have the first entries
+        places, entries = np.empty(len(vector), np.int32), np.empty(len(vector), np.int32)
+        rates = self._rates(begin, end) if self.moving else [None] * len(self.scenes)
+        filled, doubled, single = 0, 0, self.ghosts
+        for index, (scene, own, friction, moved) in enumerate(
+            zip(self.scenes, self.colliders, self._frictions(), rates, strict=True)
+        ):
+            count, ghosts = len(own.node_K3), int(own.doubled_K.sum())
+            entry = np.empty(count, np.int32)
+            entry[own.doubled_K] = np.arange(doubled, doubled + ghosts)
+            entry[~own.doubled_K] = np.arange(single, single + count - ghosts)
+            value = np.zeros((count, *vector.shape[1:]), np.float32)
+            value[:, :2] = own.normal_K23
+            value[:, 2, :2] = friction[own.obstacle_K2]
+            value[:, 3, :2] = cell_mass(scene) * own.least_K2
+            if moved is not None:
+                turn, velocity, place = np.moveaxis(moved[own.obstacle_K2], 2, 0)
+                value[:, 4:] = velocity + np.cross(turn, own.node_K3[:, None] * scene.cell_size - place)
+            vector[entry] = value
+            places[filled : filled + count] = self._places(own.node_K3) + np.int32(index * self.scene_nodes)
+            entries[filled : filled + count] = entry
+            filled, doubled, single = filled + count, doubled + ghosts, single + count - ghosts
+        return places, entries
 
     def _frictions(self) -> list[np.ndarray]:
         """Of each scene the Coulomb coefficients of its obstacles, one entry at least."""
@@ -363,13 +370,15 @@ class Launch(ABC):
         place = ((x // BLOCK) * np.int32(self.blocks[1]) + y // BLOCK) * np.int32(self.blocks[2]) + z // BLOCK
         return place * np.int32(BLOCK_NODES) + ((x % BLOCK) * BLOCK + y % BLOCK) * BLOCK + z % BLOCK
 
-    def _sweeps(self, first_vector: int, begin: float, end_s: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
-        """Entries of the contact array for the swept test (see grid_kernel.substep): places, values; the triangles'
-        vectors; the array's length.
+    def _sweeps(
+        self, first_vector: int, begin: float, end_s: float, vector: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, int]:
+        """Entries of the contact array for the swept test (see grid_kernel.substep): places, values; and the array's
+        length. Fills in the triangles' vectors.
         """
         all_nodes = self.all_blocks * BLOCK_NODES
         sweeps = [collider.sweep for collider in self.colliders]
-        length = MOVING_TRIANGLE_VECTORS if self.moving else TRIANGLE_VECTORS
+        length = vector.shape[1]
         lists = sum(len(sweep.begin_K) for sweep in sweeps)
         end = 2 * all_nodes + LIST_HEAD * lists + sum(len(sweep.triangle_L) for sweep in sweeps)
         if end >= 2**31:
@@ -395,7 +404,6 @@ class Launch(ABC):
                 filled += len(place)
             first_vector += length * len(sweep.triangle_F43)
             end += LIST_HEAD * len(count) + len(sweep.triangle_L)
-        vector = np.zeros((sum(len(sweep.triangle_F43) for sweep in sweeps), length, 3), np.float32)
         vector[:, :4] = np.concatenate([sweep.triangle_F43 for sweep in sweeps])
         vector[:, 4, 0] = np.concatenate(
             [friction[sweep.obstacle_F] for friction, sweep in zip(self._frictions(), sweeps, strict=True)]
@@ -406,12 +414,12 @@ class Launch(ABC):
             cell_size = self.scenes[0].cell_size
             vector[:, 5] = velocity / cell_size + np.cross(turn, vector[:, 0] - place / cell_size)
             vector[:, 6] = turn
-        return places, values, vector.reshape(-1, 3), end
+        return places, values, end
 
     @abstractmethod
     def _advance(self, frames: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        """Runs `frames` frames; gives, a few at a time, positions [frames, P, 3] and how many of all the frames so
-        far each scene has completed [B].
+        """Runs `frames` frames; gives, a few at a time, positions [frames, P, 3], which hold until the next are asked
+        for, and how many of all the frames so far each scene has completed [B].
         """
 
     def run(self, frames: int, on_frame: Callable[[int], None] | None) -> list[Simulated | SceneFailure]:

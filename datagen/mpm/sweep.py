@@ -14,9 +14,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hgn.scene.distance import dot
+
 # cells: a node so near to a triangle is on the side that its normal points to, whatever the rounding
 ON_TRIANGLE = 1e-4
-PAIRS_PER_CHUNK = 1_000_000  # (cell, triangle) pairs held at once
+COLUMNS_PER_CHUNK = 1 << 11  # of nodes along z, held at once: some 20,000 pairs, which stay in a core's cache
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +50,7 @@ def build_sweep(triangle_F33: np.ndarray, obstacle_F: np.ndarray, sheets: int, s
 
     flats, owners = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)]
     for base, owner in near_slabs(triangle_F33 - 1, 1.0, shape):
-        flats.append(np.ravel_multi_index(base.T, shape))
+        flats.append(np.ravel_multi_index(tuple(base), shape))
         owners.append(owner)
     flat, owner = np.concatenate(flats), np.concatenate(owners)
     order = np.argsort(flat, kind="stable")
@@ -69,23 +71,28 @@ def near_slabs(triangle_F33: np.ndarray, reach: float, shape: tuple[int, ...]) -
     normal = np.cross(triangle_F33[:, 1] - triangle_F33[:, 0], triangle_F33[:, 2] - triangle_F33[:, 0])
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     slab = reach * np.abs(normal).sum(axis=1) + 1e-9
-    for node, owner in near_pairs(triangle_F33, reach, shape):
-        keep = np.abs(((node - triangle_F33[owner, 0]) * normal[owner]).sum(axis=1)) <= slab[owner]
-        yield node[keep], owner[keep]
+    normal_3F, corner_3F = np.ascontiguousarray(normal.T), np.ascontiguousarray(triangle_F33[:, 0].T)
+    for node_3P, owner in near_pairs(triangle_F33, reach, shape):
+        height = dot(node_3P - corner_3F.take(owner, axis=1), normal_3F.take(owner, axis=1))
+        keep = np.flatnonzero(np.abs(height) <= slab[owner])
+        yield node_3P.take(keep, axis=1), owner[keep]
 
 
 def near_pairs(triangle_F33: np.ndarray, band: float, shape: tuple[int, ...]) -> Iterator[tuple[np.ndarray, ...]]:
-    """Chunks of (node, triangle index): the nodes in each triangle's box widened by `band` cells."""
+    """Chunks of (node, triangle index), int64 [3, P] and [P]: the nodes in each triangle's box widened by `band` cells,
+    one triangle after another.
+    """
     low = np.clip(np.ceil(triangle_F33.min(axis=1) - band), 0, np.array(shape)).astype(np.int64)
     high = np.clip(np.floor(triangle_F33.max(axis=1) + band) + 1, 0, np.array(shape)).astype(np.int64)
     size = np.maximum(high - low, 0)
-    count = size.prod(axis=1)
-    end = np.cumsum(count)
+    columns = size[:, 0] * size[:, 1]  # of nodes along z
+    end = np.cumsum(columns)
     total = int(end[-1]) if len(end) else 0
-    for start in range(0, total, PAIRS_PER_CHUNK):
-        pair = np.arange(start, min(start + PAIRS_PER_CHUNK, total))
-        owner = np.searchsorted(end, pair, side="right")
-        place = pair - (end[owner] - count[owner])
-        size_y, size_z = size[owner, 1], size[owner, 2]
-        offset = np.stack([place // (size_y * size_z), place // size_z % size_y, place % size_z], axis=1)
-        yield low[owner] + offset, owner
+    for start in range(0, total, COLUMNS_PER_CHUNK):
+        column = np.arange(start, min(start + COLUMNS_PER_CHUNK, total))
+        owner = np.searchsorted(end, column, side="right")
+        place, size_y, height = column - (end - columns)[owner], size[owner, 1], size[owner, 2]
+        below = low[owner, 2] - (np.cumsum(height) - height)
+        of_column = np.stack([low[owner, 0] + place // size_y, low[owner, 1] + place % size_y, below, owner])
+        x, y, z, triangle = np.repeat(of_column, height, axis=1)
+        yield np.stack([x, y, z + np.arange(len(z))]), triangle

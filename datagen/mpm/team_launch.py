@@ -17,6 +17,7 @@ import taichi as ti  # isort: skip
 
 from datagen.mpm import team_kernel  # isort: skip
 from datagen.mpm.device_memory import address  # isort: skip
+from datagen.mpm.host_copy import HostCopy  # isort: skip
 from datagen.mpm.team_meeting import APART, MEETING, SEGMENT  # isort: skip
 from datagen.mpm.team_transfers import LANES  # isort: skip
 
@@ -70,6 +71,7 @@ class TeamLaunch(Launch):
         self.turn = ti.ndarray(ti.i32, len(self.scenes))
         self.meeting = ti.ndarray(ti.i32, (self.teams + 1) * MEETING + len(self.scenes))
         self.columns = ti.ndarray(ti.i32, SEGMENT * self.teams * team.blocks)
+        self.host_copy = HostCopy()
         for array in (
             self.cell_count, self.column_count, self.covered, self.spread, self.block, self.columns, self.node,
         ):  # fmt: skip
@@ -92,6 +94,10 @@ class TeamLaunch(Launch):
             keys.append(column * BLOCK + base[:, 1] % BLOCK)
         return np.argsort(np.concatenate(keys), kind="stable").astype(np.int32)
 
+    def release(self) -> None:
+        self.host_copy.release()
+        super().release()
+
     def _node_array(self, nodes: int) -> ti.ScalarNdarray:
         return ti.ndarray(ti.f32, self.entries_a_node * nodes)
 
@@ -108,7 +114,7 @@ class TeamLaunch(Launch):
             if pause > SHORT_SECONDS:
                 time.sleep(max(0.0, begin + pause - time.perf_counter()))
             woken = time.perf_counter()
-            position = output.to_numpy().reshape(size, self.particles, 3)
+            position = self.host_copy.read(output).reshape(size, self.particles, 3)
             taken = time.perf_counter() - begin
             if pause > SHORT_SECONDS and taken < 1.05 * (woken - begin):  # it was done before, nobody knows when
                 taken *= 0.5

@@ -14,7 +14,8 @@ import numpy as np
 from hgn.scene.scene import Obstacle
 from hgn.scene.surface import area_vectors
 
-PAIRS_PER_CHUNK = 1 << 17  # bounds the temporaries of the dense solid-angle sums to some 20 MiB
+POINTS_PER_CHUNK = 1 << 14  # whose temporaries stay in a core's cache
+PAIRS_PER_CHUNK = 1 << 14  # of the dense solid-angle sums, likewise
 DIRECT_TRIANGLES = 1024  # above it the tree is faster than the dense sum
 LEAF_TRIANGLES = 16
 FAR_FIELD_RATIO = 2.5  # a cluster is far beyond this many of its radii
@@ -28,25 +29,14 @@ def closest_points(point_P3: np.ndarray, triangle_P33: np.ndarray) -> np.ndarray
     Real-Time Collision Detection, sec. 5.1.5, and needs no area: triangles that are a segment or a single
     point give the closest point of that segment or point.
     """
-    point = np.asarray(point_P3, np.float64)
-    corner = np.asarray(triangle_P33, np.float64)
-    a, b, c = corner[:, 0], corner[:, 1], corner[:, 2]
-    best = _closest_on_segment(point, a, b)
-    best_square = _square(point - best)
-    for start, end in ((b, c), (c, a)):
-        candidate = _closest_on_segment(point, start, end)
-        best, best_square = _nearer(point, best, best_square, candidate, np.ones(len(point), bool))
-
-    ab, ac, ap = b - a, c - a, point - a
-    normal = np.cross(ab, ac)
-    normal_square = _square(normal)
-    divisor = np.where(normal_square > 0, normal_square, 1.0)
-    u = _dot(np.cross(ap, ac), normal) / divisor
-    v = _dot(np.cross(ab, ap), normal) / divisor
-    inside = (normal_square > 0) & (u >= 0) & (v >= 0) & (u + v <= 1)
-    # measured from the corner, not the point, so that a sliver's poor normal cannot leave the triangle
-    foot = np.where(inside[:, None], a + u[:, None] * ab + v[:, None] * ac, a)
-    return _nearer(point, best, best_square, foot, inside)[0]
+    point, corner = np.asarray(point_P3, np.float64), np.asarray(triangle_P33, np.float64)
+    closest = np.empty(point.shape)
+    for start in range(0, len(point), POINTS_PER_CHUNK):
+        chunk = slice(start, start + POINTS_PER_CHUNK)
+        closest[chunk] = _closest_of_axes(
+            np.ascontiguousarray(point[chunk].T), np.ascontiguousarray(corner[chunk].transpose(1, 2, 0))
+        ).T
+    return closest
 
 
 def winding_numbers(point_P3: np.ndarray, triangle_F33: np.ndarray) -> np.ndarray:
@@ -65,9 +55,10 @@ def winding_numbers(point_P3: np.ndarray, triangle_F33: np.ndarray) -> np.ndarra
         return _tree_winding_numbers(point, triangle)
     winding = np.empty(len(point))
     rows = max(1, PAIRS_PER_CHUNK // len(triangle))
+    corner = np.ascontiguousarray(triangle.transpose(1, 2, 0))[:, :, None]
     for start in range(0, len(point), rows):
-        chunk = point[start : start + rows]
-        winding[start : start + rows] = _solid_angles(chunk[:, None, :], triangle[None]).sum(axis=1)
+        chunk = np.ascontiguousarray(point[start : start + rows].T)
+        winding[start : start + rows] = _solid_angles(chunk[:, :, None], corner).sum(axis=1)
     return winding / (4 * np.pi)
 
 
@@ -95,33 +86,46 @@ def share_inside(position_N3: np.ndarray, obstacles: Sequence[Obstacle]) -> floa
     return float(inside_N.mean()) if len(inside_N) else 0.0
 
 
-def _closest_on_segment(point: np.ndarray, start: np.ndarray, end: np.ndarray) -> np.ndarray:
-    edge = end - start
-    length_square = _square(edge)
-    along = _dot(point - start, edge) / np.where(length_square > 0, length_square, 1.0)
-    return start + np.clip(along, 0.0, 1.0)[:, None] * edge
+def _closest_of_axes(point: np.ndarray, corner: np.ndarray) -> np.ndarray:
+    """`closest_points`, with an array for each axis: points [3, P], corners [3, 3, P]."""
+    a, b, c = corner
+    ab, ac, ap = b - a, c - a, point - a
+    best = _closest_on_segment(ap, a, ab)
+    best_square = square(point - best)
+    for candidate in (_closest_on_segment(point - b, b, c - b), _closest_on_segment(point - c, c, a - c)):
+        candidate_square = square(point - candidate)
+        better = candidate_square < best_square
+        np.copyto(best, candidate, where=better)
+        np.copyto(best_square, candidate_square, where=better)
+
+    normal = cross(ab, ac)
+    normal_square = square(normal)
+    divisor = np.where(normal_square > 0, normal_square, 1.0)
+    u = dot(cross(ap, ac), normal) / divisor
+    v = dot(cross(ab, ap), normal) / divisor
+    # measured from the corner, not the point, so that a sliver's poor normal cannot leave the triangle
+    foot = a + u * ab + v * ac
+    better = (normal_square > 0) & (u >= 0) & (v >= 0) & (u + v <= 1) & (square(point - foot) < best_square)
+    np.copyto(best, foot, where=better)
+    return best
 
 
-def _nearer(
-    point: np.ndarray, best: np.ndarray, best_square: np.ndarray, candidate: np.ndarray, allowed: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    square = _square(point - candidate)
-    better = allowed & (square < best_square)
-    return np.where(better[:, None], candidate, best), np.where(better, square, best_square)
+def _closest_on_segment(from_start: np.ndarray, start: np.ndarray, edge: np.ndarray) -> np.ndarray:
+    length_square = square(edge)
+    along = dot(from_start, edge) / np.where(length_square > 0, length_square, 1.0)
+    return start + np.clip(along, 0.0, 1.0) * edge
 
 
 def _solid_angles(point: np.ndarray, triangle: np.ndarray) -> np.ndarray:
-    """Signed solid angle of each triangle seen from its point; leading axes broadcast.
+    """Signed solid angle of each triangle, corners [3, 3, ...], seen from its point, [3, ...]; what follows broadcasts.
 
     Seen from a point in its own plane a triangle has solid angle 0 outside and is undefined inside.
     """
-    a, b, c = (triangle[..., corner, :] - point for corner in range(3))
-    la, lb, lc = (np.sqrt(_square(side)) for side in (a, b, c))
-    # np.cross takes twice the time
-    (ax, ay, az), (bx, by, bz), (cx, cy, cz) = (np.moveaxis(side, -1, 0) for side in (a, b, c))
-    determinant = ax * (by * cz - bz * cy) + ay * (bz * cx - bx * cz) + az * (bx * cy - by * cx)
-    cosines = la * lb * lc + _dot(a, b) * lc + _dot(b, c) * la + _dot(c, a) * lb
-    return 2 * np.arctan2(determinant, cosines)
+    a, b, c = (corner - point for corner in triangle)
+    la, lb, lc = (np.sqrt(square(side)) for side in (a, b, c))
+    determinant = dot(a, cross(b, c))
+    cosines = la * lb * lc + dot(a, b) * lc + dot(b, c) * la + dot(c, a) * lb
+    return np.asarray(2 * np.arctan2(determinant, cosines))
 
 
 @dataclass(frozen=True)
@@ -162,7 +166,7 @@ def _build_tree(triangle_F33: np.ndarray) -> _Tree:
     first_T, last_T = np.array(first), np.array(last)
     sorted_F33 = triangle_F33[order]
     area_vector = area_vectors(sorted_F33)
-    area = np.sqrt(_square(area_vector)) + np.finfo(np.float64).tiny
+    area = np.sqrt(square(area_vector.T)) + np.finfo(np.float64).tiny
     dipole = _slice_sums(area_vector, first_T, last_T)
     weight = _slice_sums(area[:, None], first_T, last_T)
     centre = _slice_sums(area[:, None] * sorted_F33.mean(axis=1), first_T, last_T) / weight
@@ -175,7 +179,7 @@ def _build_tree(triangle_F33: np.ndarray) -> _Tree:
         else:
             low[node] = low[children[node]].min(axis=0)
             high[node] = high[children[node]].max(axis=0)
-    radius = np.sqrt(_square(np.maximum(high - centre, centre - low)))
+    radius = np.sqrt(square(np.maximum(high - centre, centre - low).T))
     return _Tree(first_T, last_T, np.array(children), centre, radius, dipole, sorted_F33)
 
 
@@ -194,9 +198,9 @@ def _tree_winding_numbers(point: np.ndarray, triangle_F33: np.ndarray) -> np.nda
         who, node = np.arange(len(chunk)), np.zeros(len(chunk), np.int64)
         while len(who):
             offset = tree.centre_T3[node] - chunk[who]
-            distance = np.sqrt(_square(offset))
+            distance = np.sqrt(square(offset.T))
             far = distance > FAR_FIELD_RATIO * tree.radius_T[node]
-            dipole = _dot(tree.dipole_T3[node[far]], offset[far]) / distance[far] ** 3
+            dipole = dot(tree.dipole_T3[node[far]].T, offset[far].T) / distance[far] ** 3
             total += np.bincount(who[far], dipole, len(chunk))
             leaf = ~far & (tree.child_T2[node, 0] < 0)
             total += _leaf_solid_angles(chunk, who[leaf], node[leaf], tree)
@@ -214,15 +218,22 @@ def _leaf_solid_angles(point: np.ndarray, who: np.ndarray, node: np.ndarray, tre
         pair_who, pair_node = who[start : start + rows], node[start : start + rows]
         index = tree.first_T[pair_node][:, None] + slot
         owned = index < tree.last_T[pair_node][:, None]
-        corners = tree.triangle_F33[np.where(owned, index, 0)]
-        angle = np.where(owned, _solid_angles(point[pair_who][:, None, :], corners), 0.0).sum(axis=1)
+        corner = np.moveaxis(tree.triangle_F33[np.where(owned, index, 0)], (2, 3), (0, 1))
+        angle = np.where(owned, _solid_angles(point[pair_who].T[:, :, None], corner), 0.0).sum(axis=1)
         total += np.bincount(pair_who, angle, len(point))
     return total
 
 
-def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    return a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1] + a[..., 2] * b[..., 2]
+def dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """The products of vectors [3, ...], as [...]: an array for each axis takes a third of the time of rows of three."""
+    return np.asarray(a[0] * b[0] + a[1] * b[1] + a[2] * b[2])
 
 
-def _square(a: np.ndarray) -> np.ndarray:
-    return _dot(a, a)
+def square(a: np.ndarray) -> np.ndarray:
+    """The squared lengths of vectors [3, ...], as [...]."""
+    return dot(a, a)
+
+
+def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """The cross products of vectors [3, ...], as [3, ...]."""
+    return np.stack([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])

@@ -182,7 +182,7 @@ def _count_crossings(start_P3: np.ndarray, way_P3: np.ndarray, triangle_F33: np.
     order = np.argsort(cell, kind="stable")
     cell = cell[order]
     for place, owner in near_pairs(triangle_F33 - low, 2.0, shape):
-        flat = np.ravel_multi_index(place.T, shape)
+        flat = np.ravel_multi_index(tuple(place), shape)
         begin, end = np.searchsorted(cell, flat), np.searchsorted(cell, flat, side="right")
         for part in np.array_split(np.arange(len(flat)), 1 + int((end - begin).sum()) // WAYS_AT_ONCE):
             many = (end - begin)[part]

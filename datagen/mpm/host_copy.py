@@ -1,0 +1,72 @@
+"""What a device has computed, in memory of the host.
+
+Taichi's to_numpy takes memory that is new each time, copies it to a GPU as it is, and then the result back into it,
+while the GPU has nothing else to do. Here the result alone is copied, into memory that is kept, and locked in its place
+where the system allows that: a GPU then writes to it at the speed of its bus.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+
+import numpy as np
+import taichi as ti
+
+from datagen.mpm.device_memory import address
+
+SUCCESS = 0  # CUresult
+
+
+class HostCopy:
+    """Memory that arrays of float32 are read into, one after another; it grows to the largest."""
+
+    def __init__(self) -> None:
+        self._on_gpu = ti.lang.impl.current_cfg().arch == ti.cuda
+        self._memory = np.empty(0, np.float32)
+        self._locked = False
+
+    def read(self, array: ti.ScalarNdarray) -> np.ndarray:
+        """What the array holds once all kernels are done, float32 [its length]; the next read writes over it.
+
+        Raises: RuntimeError where the GPU cannot be read, as after an error of a kernel.
+        """
+        ti.sync()
+        (count,) = array.shape
+        if count > len(self._memory):
+            self.release()
+            self._memory = np.empty(count, np.float32)
+            self._locked = self._on_gpu and self._lock()
+        values = self._memory[:count]
+        if self._on_gpu:
+            _require_success(
+                "cuMemcpyDtoH",
+                _driver().cuMemcpyDtoH_v2(
+                    ctypes.c_void_p(values.ctypes.data), ctypes.c_uint64(address(array)), ctypes.c_size_t(values.nbytes)
+                ),
+            )
+        else:
+            ctypes.memmove(values.ctypes.data, address(array), values.nbytes)
+        return values
+
+    def release(self) -> None:
+        """Lets the memory go."""
+        if self._locked:
+            memory = ctypes.c_void_p(self._memory.ctypes.data)
+            _require_success("cuMemHostUnregister", _driver().cuMemHostUnregister(memory))
+        self._memory, self._locked = np.empty(0, np.float32), False
+
+    def _lock(self) -> bool:
+        """Whether the system lets so much memory be locked; what is not locked is read as well, but slower."""
+        memory, size = ctypes.c_void_p(self._memory.ctypes.data), ctypes.c_size_t(self._memory.nbytes)
+        return bool(_driver().cuMemHostRegister_v2(memory, size, ctypes.c_uint(0)) == SUCCESS)
+
+
+@functools.cache
+def _driver() -> ctypes.CDLL:
+    return ctypes.CDLL("libcuda.so.1")
+
+
+def _require_success(call: str, status: int) -> None:
+    if status != SUCCESS:
+        raise RuntimeError(f"{call} failed with CUDA's error {status}")
