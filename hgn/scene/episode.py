@@ -34,11 +34,13 @@ _ARRAYS = {
     "material": ("|u1", "N"),
     "obstacle_cell": ("<i4", "K3"),
     "obstacle_normal": ("<f4", "K3"),
+    "obstacle_distance": ("<f4", "K"),
     "past": ("<f4", "HN3"),
     "boundary": ("<f4", "P3"),
 }
 _PARAMETER = ("<f4", "N")
-_OPTIONAL = ("past", "boundary")  # in imported episodes alone, where there are any
+# in imported episodes alone, where there are any; and what episodes of before have not
+_OPTIONAL = ("past", "boundary", "obstacle_distance")
 
 _NAME = re.compile(r"[A-Za-z0-9_-]+")
 
@@ -124,6 +126,7 @@ class Episode:
             "material": self.material_N,
             "obstacle_cell": self.obstacle_grid.cell_K3,
             "obstacle_normal": self.obstacle_grid.normal_K3,
+            "obstacle_distance": self.obstacle_grid.distance_K,
             "past": self.past_HN3,
             "boundary": self.boundary_P3,
         }
@@ -211,7 +214,9 @@ def decode_episode(key: str, members: Mapping[str, bytes | np.ndarray], scan_pos
         position_TN3=arrays["position"],
         initial_velocity_N3=arrays["velocity"],
         material_N=arrays["material"],
-        obstacle_grid=ObstacleGrid(description.cell_size, arrays["obstacle_cell"], arrays["obstacle_normal"]),
+        obstacle_grid=ObstacleGrid(
+            description.cell_size, arrays["obstacle_cell"], arrays["obstacle_normal"], arrays.get("obstacle_distance")
+        ),
         domain_size=description.domain_size,
         gravity=description.gravity,
         frame_rate_hz=description.frame_rate_hz,

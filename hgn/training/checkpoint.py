@@ -26,6 +26,7 @@ SECTION = "hgn"  # the checkpoint's key for what is ours
 LAST_NAMES = ("last.ckpt", "last-1.ckpt", "last-2.ckpt")  # newest first
 BEST_NAME = "best.ckpt"  # of the lowest one-step validation error; none where no validation scene was measured
 _ZIP_FAULTS = (zipfile.BadZipFile, zlib.error, NotImplementedError)
+_FIRST = "encode.first.weight"
 NETWORK, AVERAGED = "network.", "averaged."  # prefixes of the tensors: as trained, and their moving average
 
 
@@ -101,7 +102,7 @@ def _require_equal(pairs: list[tuple[str, Any, Any]], why: str, remedy: str) -> 
 def network_of_weights(config: TrainConfig) -> ParticleNetwork:
     """The network of training.init_weights, normaliser included, for a new run to begin with. What it makes of contacts
     and its walls may be other than these weights were trained with: tensors are the same, and training goes on from
-    there.
+    there. Distances of obstacles that they did not know count for nothing at first.
 
     Raises: ConfigError for a file that is none, and where the run wants another network or has other data.
     """
@@ -109,15 +110,32 @@ def network_of_weights(config: TrainConfig) -> ParticleNetwork:
     path = find_weights(config.training.init_weights, "training.init_weights")
     weights, info = load_weights(path, field="training.init_weights")
     remedy = "set it so, or take other training.init_weights"
-    free = ("contact_gate", "contact_forces", "contact_reach_cells", "rest_threshold", "wall_clearance")
+    free: tuple[str, ...] = (
+        "contact_gate",
+        "contact_forces",
+        "contact_reach_cells",
+        "rest_threshold",
+        "wall_clearance",
+    )
+    if not info.network.obstacle_distances:
+        free = (*free, "obstacle_distances")
     pairs = [pair for pair in _network_pairs(info.network, config) if pair[0].removeprefix("network.") not in free]
     pairs.append(("dataset.frame_rate_hz", info.frame_rate_hz, config.dataset.frame_rate_hz))
     if info.network.sees_obstacles:
         pairs.append(("scene.cell_size", info.obstacle_cell_size, config.scene.cell_size))
     _require_equal(pairs, f", as in training.init_weights {path}", remedy)
     network = build_network(config.network)
-    network.load_state_dict(weights.state_dict())
+    state = weights.state_dict()
+    if config.network.obstacle_distances and not info.network.obstacle_distances:
+        state[_FIRST] = _with_distances(state[_FIRST], config.network.material_embedding)
+    network.load_state_dict(state)
     return network
+
+
+def _with_distances(weight_HF: torch.Tensor, embedding: int) -> torch.Tensor:
+    """The encoder's first matrix with four columns of zeros before the material's."""
+    columns, own = weight_HF.shape[1] - embedding, weight_HF[:, :0].new_zeros(len(weight_HF), 4)
+    return torch.cat([weight_HF[:, :columns], own, weight_HF[:, columns:]], dim=1)
 
 
 def network_of_checkpoint(checkpoint: dict[str, Any], path: Path) -> ParticleNetwork:

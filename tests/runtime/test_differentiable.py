@@ -36,6 +36,12 @@ def network(kind, dtype=torch.float64):
         return network_of(dtype, levels=2, message_passing_steps=1, wall_clearance=(0.43, 0.1))
     if kind.startswith("gns"):
         return gns_of(dtype, kind=kind, message_passing_steps=2, static_spacing_cells=2.0)
+    if kind == "distances":
+        built = network_of(dtype, inputs="relative", obstacle_distances=True)
+        with torch.no_grad():
+            for parameter in built.decode.parameters():
+                parameter.mul_(0.3)  # else it diverges
+        return built
     return network_of(dtype, inputs=kind)
 
 
@@ -57,13 +63,20 @@ def positions(simulator, inputs, smoothing):
 
 @pytest.mark.parametrize(
     ("kind", "smoothing"),
-    [("absolute", 0.0), ("absolute", 0.5), ("relative", 1.0), ("gns_particles", 0.0), ("walled", 0.0)],
+    [
+        ("absolute", 0.0),
+        ("absolute", 0.5),
+        ("relative", 1.0),
+        ("distances", 0.0),
+        ("gns_particles", 0.0),
+        ("walled", 0.0),
+    ],
 )
 def test_gradients_are_those_of_central_differences(kind, smoothing):
     """Over 30 frames, along a random direction of each input, where no particle changes a cell between both sides."""
     simulator = Simulator(network(kind), 60.0, "torch")
     inputs = {name: value.clone().requires_grad_() for name, value in INPUTS.items()}
-    if kind != "relative":
+    if kind not in ("relative", "distances"):
         del inputs["gravity_3"]
     generator = torch.Generator().manual_seed(1)
     weight_TN3 = torch.randn(FRAMES, PARTICLES, 3, generator=generator, dtype=torch.float64)
@@ -85,7 +98,7 @@ def test_gradients_are_those_of_central_differences(kind, smoothing):
         )
 
 
-@pytest.mark.parametrize("kind", ["absolute", "relative", "gns_particles", "walled"])
+@pytest.mark.parametrize("kind", ["absolute", "relative", "distances", "gns_particles", "walled"])
 def test_positions_are_those_of_a_rollout(kind):
     """What nothing replaces moves as in a rollout."""
     simulator = Simulator(network(kind, torch.float32), 60.0, "torch")
