@@ -293,6 +293,8 @@ def _closed_contacts(
 ) -> Contacts:
     # of all nodes that a particle outside may reach the way out is exact
     node, distance, foot, owner = _rasterise(triangle_F33, max(band, REACH_CELLS), box)
+    if not len(node):  # the surface lies outside of the grid: there is no way out of a body around all of it
+        return node, distance, foot, distance
     within = contains(box.node(node) * cell_size, obstacle)
     inside = np.zeros(box.shape, bool)
     inside.ravel()[node[within]] = True

@@ -143,6 +143,12 @@ def test_odd_meshes():
         build_collider(scene_of(Obstacle("index", np.eye(3), np.array([[0, 1, 3]]), False)), 1.5)
 
 
+def test_a_body_around_the_domain():
+    """One whose surface lies outside of the grid on all sides has no contact nodes, since no way leads out of it."""
+    collider = build_collider(scene_of(box((-3,) * 3, (4,) * 3)), 0.25)
+    assert len(collider.node_K3) == len(collider.sweep.base_K3) == 0
+
+
 def test_one_huge_triangle_and_many_small_ones():
     """A triangle far larger than the domain, and its surface cut in 80,000, give the same contacts."""
     y, cells = 0.51, 200
