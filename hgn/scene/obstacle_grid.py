@@ -121,28 +121,34 @@ def surface_planes(grid: ObstacleGrid) -> tuple[np.ndarray, np.ndarray]:
             "network.obstacle_distances must be false for data without obstacle_distance, which older data are, and "
             "imported ones that name cells and normals; make the data set again, from meshes"
         )
-    own_K3, normal_K3 = grid.cell_K3.astype(np.int64), grid.normal_K3.astype(np.float64)
-    shift_Q3 = np.stack(np.meshgrid(*[np.arange(-1, 2)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+    around_Q3 = np.stack(np.meshgrid(*[np.arange(-1, 2)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+    normal_K3 = grid.normal_K3.astype(np.float64)
     place_K3 = -grid.distance_K[:, None] * normal_K3  # of the surface, from its cell's centre, in cells
-    cell_A3 = (own_K3[:, None] + shift_Q3).reshape(-1, 3)
-    way_A3 = (shift_Q3 - place_K3[:, None]).reshape(-1, 3)
-    # own surfaces first, then the nearest
-    far_A = np.where((shift_Q3 == 0).all(axis=1), -1.0, (way_A3**2).sum(axis=1).reshape(-1, len(shift_Q3))).ravel()
-    low = cell_A3.min(axis=0)
-    extent = tuple(cell_A3.max(axis=0) - low + 1)
-    key_A = np.ravel_multi_index(tuple((cell_A3 - low).T), extent)
-    order_A = np.lexsort((far_A, key_A))
-    key_P, first_P = np.unique(key_A[order_A], return_index=True)
-    chosen_P = order_A[first_P]
-    way_P3, normal_P3 = way_A3[chosen_P], normal_K3[chosen_P // len(shift_Q3)]
+    # squared distances of all cells around, [Q, K]; a cell's own surface comes first
+    far_QK = np.zeros((len(around_Q3), len(place_K3)))
+    for axis in range(3):
+        far_QK += (around_Q3[:, axis, None] - place_K3[:, axis]) ** 2
+    far_QK[len(around_Q3) // 2] = -1
+    low = grid.cell_K3.min(axis=0).astype(np.int64) - 1
+    extent = tuple((grid.cell_K3.max(axis=0) - low + 2).tolist())
+    stride_3 = np.array([extent[1] * extent[2], extent[2], 1])
+    key_QK = (around_Q3 @ stride_3)[:, None] + (grid.cell_K3 - low) @ stride_3
+    key_P, which_A = np.unique(key_QK.ravel(), return_inverse=True)
+    least_P = np.full(len(key_P), np.inf)
+    np.minimum.at(least_P, which_A, far_QK.ravel())
+    nearest_A = np.flatnonzero(far_QK.ravel() == least_P[which_A])
+    chosen_P = np.empty(len(key_P), np.int64)
+    chosen_P[which_A[nearest_A]] = nearest_A  # of several any
+    side_P, own_P = np.divmod(chosen_P, len(normal_K3))
+    way_P3, normal_P3 = around_Q3[side_P] - place_K3[own_P], normal_K3[own_P]
     height_P = (way_P3 * normal_P3).sum(axis=1)
     beside_P3 = way_P3 - height_P[:, None] * normal_P3
-    own_P = far_A[chosen_P] < 0
+    inside_P = side_P == len(around_Q3) // 2
     length_P = np.sqrt((way_P3**2).sum(axis=1))
-    past_P = ~own_P & ((beside_P3**2).sum(axis=1) > PAST_EDGE**2)
+    past_P = ~inside_P & ((beside_P3**2).sum(axis=1) > PAST_EDGE**2)
     normal_P3 = np.where(past_P[:, None], way_P3 / np.where(past_P, length_P, 1.0)[:, None], normal_P3)
     height_P = np.where(past_P, length_P, height_P)
-    behind_P = ~own_P & (height_P < 0)
+    behind_P = ~inside_P & (height_P < 0)
     normal_P3, height_P = np.where(behind_P[:, None], -normal_P3, normal_P3), np.where(behind_P, -height_P, height_P)
     cell_P3 = np.stack(np.unravel_index(key_P, extent), axis=1) + low
     return cell_P3.astype(np.int32), ((1 + height_P)[:, None] * normal_P3).astype(np.float32)
