@@ -94,7 +94,8 @@ def build_collider(scene: Scene, band_cells: float, time: float = 0.0) -> Collid
         owners[obstacle.closed].append(np.full(len(triangle_F33), index, np.int32))
         if not len(triangle_F33):
             continue
-        box = _Box(triangle_F33, max(band_cells, REACH_CELLS), shape)
+        # of all nodes that a particle outside may reach the way out is exact
+        box = _Box(triangle_F33, max(band_cells, REACH_CELLS) if obstacle.closed else REACH_CELLS, shape)
         if obstacle.closed:
             contacts = _closed_contacts(obstacle, triangle_F33, band_cells, box, scene.cell_size)
             surfaces[SEEN].merge(index, box, contacts)
@@ -133,7 +134,7 @@ class _Box:
     """The part of a grid of `grid` nodes around triangles that nodes up to `reach` cells away from them lie in."""
 
     def __init__(self, triangle_F33: np.ndarray, reach: float, grid: tuple[int, ...]) -> None:
-        self.grid = grid
+        self.grid, self.reach = grid, reach
         whole = np.array(grid)
         self._low = np.clip(np.ceil(triangle_F33.min(axis=(0, 1)) - reach), 0, whole).astype(np.int64)
         high = np.clip(np.floor(triangle_F33.max(axis=(0, 1)) + reach) + 1, self._low, whole).astype(np.int64)
@@ -218,8 +219,8 @@ def _triangles(obstacle: Obstacle, index: int, cell_size: float) -> tuple[np.nda
     return corner, np.concatenate([rim_edge_F3, on_rim[place_F3]], axis=1)
 
 
-def _rasterise(triangle_F33: np.ndarray, band: float, box: _Box) -> tuple[np.ndarray, ...]:
-    """Nodes within `band` cells of the triangles: flat index [P], distance [P], closest point [P, 3], triangle [P].
+def _rasterise(triangle_F33: np.ndarray, box: _Box) -> tuple[np.ndarray, ...]:
+    """Nodes within the box's reach of its triangles: flat index [P], distance [P], closest point [P, 3], triangle [P].
 
     All in cells. Of triangles equally close the first counts.
     """
@@ -232,11 +233,11 @@ def _rasterise(triangle_F33: np.ndarray, band: float, box: _Box) -> tuple[np.nda
         np.ascontiguousarray(of_triangle.T) for of_triangle in (centre, triangle_F33[:, 0], _face_normals(triangle_F33))
     )
     # a triangle counts at a node only if its sphere comes nearer than the nearest centre of all
-    bound = np.full(box.count, band)
-    for node_3P, triangle in near_pairs(triangle_F33, band, box.grid):
+    bound = np.full(box.count, box.reach)
+    for node_3P, triangle in near_pairs(triangle_F33, box.reach, box.grid):
         np.minimum.at(bound, box.flat(node_3P), np.sqrt(square(node_3P - centre_3F.take(triangle, axis=1))))
     bound += 1e-9
-    for node_3P, triangle in near_pairs(triangle_F33, band, box.grid):
+    for node_3P, triangle in near_pairs(triangle_F33, box.reach, box.grid):
         flat = box.flat(node_3P)
         height = dot(node_3P - corner_3F.take(triangle, axis=1), normal_3F.take(triangle, axis=1))
         reach = np.sqrt(square(node_3P - centre_3F.take(triangle, axis=1))) - radius[triangle]
@@ -244,7 +245,7 @@ def _rasterise(triangle_F33: np.ndarray, band: float, box: _Box) -> tuple[np.nda
         node, triangle, flat = node_3P.take(keep, axis=1).T, triangle[keep], flat[keep]
         foot = closest_points(node, triangle_F33.take(triangle, axis=0))
         distance = np.sqrt(square((node - foot).T))
-        nearer = np.flatnonzero((distance <= band) & (distance < best[flat]))
+        nearer = np.flatnonzero((distance <= box.reach) & (distance < best[flat]))
         np.minimum.at(best, flat[nearer], distance[nearer])
         # of several at a node the first is written last
         nearest = nearer[distance[nearer] == best[flat[nearer]]][::-1]
@@ -260,7 +261,7 @@ def _face_normals(triangle_F33: np.ndarray) -> np.ndarray:
 
 def _sheet_contacts(triangle_F33: np.ndarray, rim_F6: np.ndarray, box: _Box) -> tuple[Contacts, Contacts]:
     """Nodes near a sheet: what is free for particles on their own side of it, and on the other."""
-    node, distance, foot, owner = _rasterise(triangle_F33, REACH_CELLS, box)
+    node, distance, foot, owner = _rasterise(triangle_F33, box)
     face = _face_normals(triangle_F33)[owner]
     offset = box.node(node) - foot
     height = (offset * face).sum(axis=1)
@@ -291,8 +292,7 @@ def _on_rim(foot_P3: np.ndarray, triangle_P33: np.ndarray, rim_P6: np.ndarray) -
 def _closed_contacts(
     obstacle: Obstacle, triangle_F33: np.ndarray, band: float, box: _Box, cell_size: float
 ) -> Contacts:
-    # of all nodes that a particle outside may reach the way out is exact
-    node, distance, foot, owner = _rasterise(triangle_F33, max(band, REACH_CELLS), box)
+    node, distance, foot, owner = _rasterise(triangle_F33, box)
     if not len(node):  # the surface lies outside of the grid: there is no way out of a body around all of it
         return node, distance, foot, distance
     within = contains(box.node(node) * cell_size, obstacle)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import functools
 import io
 import os
 from dataclasses import dataclass
@@ -89,7 +90,13 @@ def _processors() -> int:
     """How many multiprocessors the GPU has that Taichi started."""
     count = ctypes.c_int()
     multiprocessors, device = 16, 0
-    status = ctypes.CDLL("libcuda.so.1").cuDeviceGetAttribute(ctypes.byref(count), multiprocessors, device)
+    status = cuda_driver().cuDeviceGetAttribute(ctypes.byref(count), multiprocessors, device)
     if status != 0:
         raise ConfigError(f"device must be one that CUDA tells about, got error {status}; choose cpu")
     return count.value
+
+
+@functools.cache
+def cuda_driver() -> ctypes.CDLL:
+    """CUDA's driver, for what Taichi does not ask it."""
+    return ctypes.CDLL("libcuda.so.1")

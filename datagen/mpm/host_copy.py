@@ -8,11 +8,11 @@ where the system allows that: a GPU then writes to it at the speed of its bus.
 from __future__ import annotations
 
 import ctypes
-import functools
 
 import numpy as np
 import taichi as ti
 
+from datagen.mpm.device import cuda_driver
 from datagen.mpm.device_memory import address
 
 SUCCESS = 0  # CUresult
@@ -41,7 +41,7 @@ class HostCopy:
         if self._on_gpu:
             _require_success(
                 "cuMemcpyDtoH",
-                _driver().cuMemcpyDtoH_v2(
+                cuda_driver().cuMemcpyDtoH_v2(
                     ctypes.c_void_p(values.ctypes.data), ctypes.c_uint64(address(array)), ctypes.c_size_t(values.nbytes)
                 ),
             )
@@ -53,18 +53,13 @@ class HostCopy:
         """Lets the memory go."""
         if self._locked:
             memory = ctypes.c_void_p(self._memory.ctypes.data)
-            _require_success("cuMemHostUnregister", _driver().cuMemHostUnregister(memory))
+            _require_success("cuMemHostUnregister", cuda_driver().cuMemHostUnregister(memory))
         self._memory, self._locked = np.empty(0, np.float32), False
 
     def _lock(self) -> bool:
         """Whether the system lets so much memory be locked; what is not locked is read as well, but slower."""
         memory, size = ctypes.c_void_p(self._memory.ctypes.data), ctypes.c_size_t(self._memory.nbytes)
-        return bool(_driver().cuMemHostRegister_v2(memory, size, ctypes.c_uint(0)) == SUCCESS)
-
-
-@functools.cache
-def _driver() -> ctypes.CDLL:
-    return ctypes.CDLL("libcuda.so.1")
+        return bool(cuda_driver().cuMemHostRegister_v2(memory, size, ctypes.c_uint(0)) == SUCCESS)
 
 
 def _require_success(call: str, status: int) -> None:

@@ -334,10 +334,9 @@ class Launch(ABC):
         """Places of contact nodes, and the entry of each (see grid_kernel.substep). Fills in the entries' vectors."""
         # one scene after another, whose arrays stay in a core's cache; nodes of two fields have the first entries
         places, entries = np.empty(len(vector), np.int32), np.empty(len(vector), np.int32)
-        rates = self._rates(begin, end) if self.moving else [None] * len(self.scenes)
         filled, doubled, single = 0, 0, self.ghosts
-        for index, (scene, own, friction, moved) in enumerate(
-            zip(self.scenes, self.colliders, self._frictions(), rates, strict=True)
+        for index, (scene, own, friction, rates) in enumerate(
+            zip(self.scenes, self.colliders, self._frictions(), self._rates(begin, end), strict=True)
         ):
             count, ghosts = len(own.node_K3), int(own.doubled_K.sum())
             entry = np.empty(count, np.int32)
@@ -347,8 +346,8 @@ class Launch(ABC):
             value[:, :2] = own.normal_K23
             value[:, 2, :2] = friction[own.obstacle_K2]
             value[:, 3, :2] = cell_mass(scene) * own.least_K2
-            if moved is not None:
-                turn, velocity, place = np.moveaxis(moved[own.obstacle_K2], 2, 0)
+            if self.moving:
+                turn, velocity, place = np.moveaxis(rates[own.obstacle_K2], 2, 0)
                 value[:, 4:] = velocity + np.cross(turn, own.node_K3[:, None] * scene.cell_size - place)
             vector[entry] = value
             places[filled : filled + count] = self._places(own.node_K3) + np.int32(index * self.scene_nodes)

@@ -15,7 +15,7 @@ from hgn.data.sampler import Sample, SamplerState
 from hgn.network.features import material_rows
 from hgn.scene.episode import Episode
 from hgn.scene.history import frames_before
-from hgn.scene.obstacle_grid import surface_planes
+from hgn.scene.obstacle_grid import shown_cells
 from hgn.scene.symmetry import Symmetry, Vector, scene_symmetries
 
 
@@ -46,8 +46,7 @@ class UpdateChunk:
 def whole_episode(episode: Episode, network: NetworkConfig) -> EpisodeTensors:
     """Reads an episode; its windows are those of `hgn.scene.history.window`."""
     past = frames_before(episode, -network.velocity_history)
-    grid = episode.obstacle_grid
-    cell_K3, vector_K3 = surface_planes(grid) if network.obstacle_distances else (grid.cell_K3, grid.normal_K3)
+    cell_K3, vector_K3 = shown_cells(episode.obstacle_grid, network.obstacle_distances)
     seen = len(cell_K3) if network.obstacle_features else 0
     return EpisodeTensors(
         torch.from_numpy(np.concatenate([past, episode.position_TN3], dtype=np.float32)),

@@ -18,7 +18,7 @@ import torch
 
 from hgn.config import NetworkConfig
 from hgn.network.cell_keys import find, of_scene, pack, unpack
-from hgn.scene.obstacle_grid import ObstacleGrid, surface_planes
+from hgn.scene.obstacle_grid import ObstacleGrid, shown_cells
 
 CELL_DIAGONAL = 3**0.5 + 1e-3  # points of two cells are at most this much nearer than the cells' corners
 CELLS_AT_ONCE = 1 << 12
@@ -40,7 +40,7 @@ class ObstacleCells:
             return None
         cell_size = grids[0].cell_size
         assert all(grid.cell_size == cell_size for grid in grids), "scenes of one batch share the cell size"
-        seen = [seen_cells(grid, planes) for grid in grids]
+        seen = [_keyed(grid, planes) for grid in grids]
         key_K = torch.cat([of_scene(own_K, scene) for scene, (own_K, _) in enumerate(seen)])
         return ObstacleCells(key_K, torch.cat([own_K3 for _, own_K3 in seen]), cell_size)
 
@@ -121,10 +121,10 @@ class SurfaceParticles:
 
 
 @lru_cache(REMEMBERED_SCENES)
-def seen_cells(grid: ObstacleGrid, planes: bool) -> tuple[torch.Tensor, torch.Tensor]:
+def _keyed(grid: ObstacleGrid, planes: bool) -> tuple[torch.Tensor, torch.Tensor]:
     """Keys of scene 0, int64 [K], and what a network sees there, normals or vectors of planes, float32 [K, 3]."""
-    cells_K3, vectors_K3 = surface_planes(grid) if planes else (grid.cell_K3, grid.normal_K3)
+    cells_K3, vector_K3 = shown_cells(grid, planes)
     cell_K3 = torch.from_numpy(cells_K3.astype(np.int64))
     key_K = pack(torch.zeros(len(cell_K3), dtype=torch.int64), cell_K3)
     assert bool((key_K[1:] > key_K[:-1]).all()), "obstacle cells come sorted and unique"
-    return key_K, torch.from_numpy(np.array(vectors_K3, np.float32))
+    return key_K, torch.from_numpy(vector_K3.astype(np.float32))

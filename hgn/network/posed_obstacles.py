@@ -58,6 +58,8 @@ class PosedObstacleCells(ObstacleCells):
         if len(self.key_K):
             normal_N3, height_N = super().planes(position_N3, scene_N)
         for cells, placement in self.placed:
+            if len(cells.key_K) == 0:
+                continue
             own_N3, own_N = cells.planes(placement.undo(position_N3), scene_N)
             nearer_N = own_N3.any(-1) & (~normal_N3.any(-1) | (own_N < height_N))
             normal_N3 = torch.where(nearer_N[:, None], own_N3 @ placement.rotation_33.T, normal_N3)

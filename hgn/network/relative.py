@@ -28,6 +28,7 @@ Shape legend: N particles, H velocities, L levels, C cells of a level, E directe
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
@@ -138,13 +139,23 @@ def obstacle_normals(
     position_N3: torch.Tensor, velocity_N3: torch.Tensor, scene_N: torch.Tensor, obstacles: ObstacleCells | None
 ) -> torch.Tensor:
     """The normal at the particle, and the first one at a quarter, a half … of the next frame's way, [N, 6]; else 0."""
-    here_N3, ahead_N3 = torch.zeros_like(position_N3), torch.zeros_like(position_N3)
-    if obstacles is not None:
-        here_N3 = obstacles.normals(position_N3, scene_N)
-        for step in range(STEPS_AHEAD, 0, -1):
-            normal_N3 = obstacles.normals(position_N3 + velocity_N3 * (step / STEPS_AHEAD), scene_N)
-            ahead_N3 = torch.where(normal_N3.any(-1, keepdim=True), normal_N3, ahead_N3)
-    return torch.cat([here_N3, ahead_N3], dim=-1)
+    if obstacles is None:
+        return position_N3.new_zeros(len(position_N3), 6)
+    cells = obstacles
+    return torch.cat(here_and_ahead(lambda way_N3: cells.normals(position_N3 + way_N3, scene_N), velocity_N3), dim=-1)
+
+
+def here_and_ahead(
+    look: Callable[[torch.Tensor], torch.Tensor], velocity_N3: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """What `look` sees at each particle, normals first, [N, 3 or more], and the first that it sees at a quarter, a half
+    … of the next frame's way; else 0."""
+    here_NK = look(torch.zeros_like(velocity_N3))
+    ahead_NK = torch.zeros_like(here_NK)
+    for step in range(STEPS_AHEAD, 0, -1):
+        seen_NK = look(velocity_N3 * (step / STEPS_AHEAD))
+        ahead_NK = torch.where(seen_NK[:, :3].any(-1, keepdim=True), seen_NK, ahead_NK)
+    return here_NK, ahead_NK
 
 
 def obstacle_surfaces(
@@ -155,21 +166,22 @@ def obstacle_surfaces(
     """
     if obstacles is None:
         return position_N3.new_zeros(len(position_N3), 6), position_N3.new_zeros(len(position_N3), 4)
-    here_N3, height_N = obstacles.planes(position_N3, scene_N)
-    ahead_N3, above_N = torch.zeros_like(here_N3), torch.zeros_like(height_N)
-    for step in range(STEPS_AHEAD, 0, -1):
-        way_N3 = velocity_N3 * (step / STEPS_AHEAD)
-        normal_N3, there_N = obstacles.planes(position_N3 + way_N3, scene_N)
-        found_N = normal_N3.any(-1)
-        ahead_N3 = torch.where(found_N[:, None], normal_N3, ahead_N3)
-        above_N = torch.where(found_N, there_N - (normal_N3 * way_N3).sum(-1), above_N)
-    columns = []
-    for normal_N3, distance_N in ((here_N3, height_N), (ahead_N3, above_N)):
+    cells = obstacles
+
+    def look(way_N3: torch.Tensor) -> torch.Tensor:
+        """Normals, and how high above their surfaces the particles are now."""
+        normal_N3, height_N = cells.planes(position_N3 + way_N3, scene_N)
+        return torch.cat([normal_N3, (height_N - (normal_N3 * way_N3).sum(-1))[:, None]], dim=-1)
+
+    normals, columns = [], []
+    for seen_N4 in here_and_ahead(look, velocity_N3):
+        normal_N3, height_N = seen_N4[:, :3], seen_N4[:, 3]
         closing_N = (normal_N3 * velocity_N3).sum(-1)
-        for later_N in (distance_N, distance_N + closing_N):
-            near_N = (1 - later_N / (OBSTACLE_REACH * obstacles.cell_size)).clamp(0.0, WALL_LIMIT)
+        for distance_N in (height_N, height_N + closing_N):
+            near_N = (1 - distance_N / (OBSTACLE_REACH * obstacles.cell_size)).clamp(0.0, WALL_LIMIT)
             columns.append(torch.where(normal_N3.any(-1), near_N, 0))
-    return torch.cat([here_N3, ahead_N3], dim=-1), torch.stack(columns, dim=-1)
+        normals.append(normal_N3)
+    return torch.cat(normals, dim=-1), torch.stack(columns, dim=-1)
 
 
 def contact_gate(wall_N6: torch.Tensor, normal_N6: torch.Tensor | None) -> torch.Tensor:

@@ -107,6 +107,11 @@ def grid_of_samples(point_S3: np.ndarray, normal_S3: np.ndarray, cell_size: floa
     )
 
 
+def shown_cells(grid: ObstacleGrid, planes: bool) -> tuple[np.ndarray, np.ndarray]:
+    """The cells that a network sees, int32 [K, 3], with their normals, or `surface_planes`, float32 [K, 3]."""
+    return surface_planes(grid) if planes else (grid.cell_K3, grid.normal_K3)
+
+
 def surface_planes(grid: ObstacleGrid) -> tuple[np.ndarray, np.ndarray]:
     """Cells that hold a surface or touch one that does, int32 [P, 3], sorted, and the surface that each sees, as a
     vector along its normal of length 1 + the distance of the cell's centre in cells, float32 [P, 3].
@@ -129,10 +134,11 @@ def surface_planes(grid: ObstacleGrid) -> tuple[np.ndarray, np.ndarray]:
     for axis in range(3):
         far_QK += (around_Q3[:, axis, None] - place_K3[:, axis]) ** 2
     far_QK[len(around_Q3) // 2] = -1
-    low = grid.cell_K3.min(axis=0).astype(np.int64) - 1
-    extent = tuple((grid.cell_K3.max(axis=0) - low + 2).tolist())
+    cell_K3 = grid.cell_K3.astype(np.int64)
+    _, low, extent = _lexicographic_keys(np.stack([cell_K3.min(axis=0) - 1, cell_K3.max(axis=0) + 1]))
+    # what is added to a cell is added to its key
     stride_3 = np.array([extent[1] * extent[2], extent[2], 1])
-    key_QK = (around_Q3 @ stride_3)[:, None] + (grid.cell_K3 - low) @ stride_3
+    key_QK = (around_Q3 @ stride_3)[:, None] + (cell_K3 - low) @ stride_3
     key_P, which_A = np.unique(key_QK.ravel(), return_inverse=True)
     least_P = np.full(len(key_P), np.inf)
     np.minimum.at(least_P, which_A, far_QK.ravel())

@@ -127,15 +127,11 @@ def network_of_weights(config: TrainConfig) -> ParticleNetwork:
     network = build_network(config.network)
     state = weights.state_dict()
     if config.network.obstacle_distances and not info.network.obstacle_distances:
-        state[_FIRST] = _with_distances(state[_FIRST], config.network.material_embedding)
+        more = config.network.feature_width - info.network.feature_width
+        known_HF, material_HE = state[_FIRST].tensor_split([-config.network.material_embedding], dim=1)
+        state[_FIRST] = torch.cat([known_HF, known_HF.new_zeros(len(known_HF), more), material_HE], dim=1)
     network.load_state_dict(state)
     return network
-
-
-def _with_distances(weight_HF: torch.Tensor, embedding: int) -> torch.Tensor:
-    """The encoder's first matrix with four columns of zeros before the material's."""
-    columns, own = weight_HF.shape[1] - embedding, weight_HF[:, :0].new_zeros(len(weight_HF), 4)
-    return torch.cat([weight_HF[:, :columns], own, weight_HF[:, columns:]], dim=1)
 
 
 def network_of_checkpoint(checkpoint: dict[str, Any], path: Path) -> ParticleNetwork:

@@ -127,6 +127,30 @@ def test_normals_turn_with_their_obstacle():
             np.testing.assert_allclose(normal_3.numpy(), [share, 0, 0], atol=1e-5)
 
 
+def test_planes_move_with_their_obstacle():
+    """A plate turned by a quarter is as far as it is along the turned axis; an obstacle without cells is not seen, and
+    of two the nearer is. Means over cubes are refused, for heights have gradients."""
+    cell_size, still = 1 / 64, torch.zeros(2, dtype=torch.int64)
+    grid = build_obstacle_grid([shape_obstacle("square", 0.2, (0.5, 0.4921875, 0.5))], cell_size, 0)
+    cells = ObstacleCells.of([grid], planes=True)
+    assert cells is not None
+    quarter = torch.tensor([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    centre = torch.tensor([0.5, 0.4921875, 0.5])
+    empty = ObstacleCells(torch.zeros(0, dtype=torch.int64), torch.zeros(0, 3), cell_size)
+    placed = [(own, Placement(quarter, centre, torch.tensor([by, 0.0, 0.0]))) for own, by in ((cells, 0.1), (empty, 0))]
+    posed = PosedObstacleCells(empty.key_K, empty.normal_K3, cell_size, tuple(placed))
+    point_N3 = torch.stack([centre + torch.tensor([0.1 + 0.8 * cell_size, 0.03, 0.0]), centre])
+    normal_N3, height_N = posed.planes(point_N3, still)
+    np.testing.assert_allclose(normal_N3.numpy(), [[1, 0, 0], [0, 0, 0]], atol=1e-5)
+    assert float(height_N[0]) == pytest.approx(0.8 * cell_size, rel=1e-3)
+    both = PosedObstacleCells(cells.key_K, cells.normal_K3, cell_size, tuple(placed))
+    near_N3, near_N = both.planes(point_N3 + torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.3 * cell_size, 0.0]]), still)
+    np.testing.assert_allclose(near_N3.numpy(), [[1, 0, 0], [0, 1, 0]], atol=1e-5)
+    np.testing.assert_allclose(near_N.numpy() / cell_size, [0.8, 0.3], atol=1e-3)
+    with pytest.raises(ConfigError, match=r"smoothing must be 0 for weights with network.obstacle_distances"):
+        Simulator(network("distances"), 60.0, "torch").differentiable(scene(), 2, smoothing=0.5)
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
