@@ -21,7 +21,7 @@ from datagen.mpm.host_copy import HostCopy  # isort: skip
 from datagen.mpm.team_meeting import APART, MEETING, SEGMENT  # isort: skip
 from datagen.mpm.team_transfers import LANES  # isort: skip
 
-LAUNCH_SECONDS = 3.0  # aimed at: one launch runs as many frames as fit in; scenes wait for each other at its end
+LAUNCH_SECONDS = 6.0  # aimed at: one launch runs as many frames as fit in; scenes wait for each other at its end
 MAXIMUM_OUTPUT_BYTES = 2**30  # of positions, a launch
 MAXIMUM_PARTICLES = (2**31 - 1) // (2 * FIELD.solid)  # whose fields kernels count in int32
 PAUSE = 0.8  # of the time that a launch is expected to take

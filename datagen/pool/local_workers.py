@@ -67,6 +67,10 @@ class LocalWorker(Worker):
 
     def give(self, message: object) -> None:
         self.idle, self.heard_at = False, time.monotonic()
+        if isinstance(message, list):
+            for made in message:  # those of a launch are a gigabyte, which in one piece would be copied several times
+                self.tell(made)
+            message = len(message)
         self.tell(message)
 
     def tell(self, message: object) -> None:
@@ -104,7 +108,8 @@ class LocalWorkerFactory:
         return LocalWorker(_make_scenes, self._config, self._backend)
 
     def start_solver(self, number: int) -> Worker:
-        """A process that simulates lists of MadeScene, and takes the BuiltGrid of those that lack one at any time.
+        """A process that simulates lists of MadeScene, told one by one and then how many they are, and takes the
+        BuiltGrid of those that lack one at any time.
 
         Of several it sees one CUDA device alone.
         """
@@ -163,7 +168,7 @@ def _make_scenes(connection: Connection, send: _Sender, config: DatagenConfig, b
 
 
 class _Inbox:
-    """What the pool sends to a solver, read while it simulates: lists of scenes, and grids."""
+    """What the pool sends to a solver, read while it simulates: scenes and their number, and grids."""
 
     def __init__(self, connection: Connection) -> None:
         self._batches: SimpleQueue[list[MadeScene] | None] = SimpleQueue()
@@ -190,11 +195,18 @@ class _Inbox:
             return self._grids[task]
 
     def _read(self, connection: Connection) -> None:
+        batch: list[MadeScene] = []
         for message in _received(connection):
             if isinstance(message, BuiltGrid):
                 self._coming(message.task).set_result(message.grid)
+            elif isinstance(message, MadeScene):
+                message.scene.open()
+                message.collider.open()
+                batch.append(message)
             else:
-                self._batches.put(message)
+                assert message == len(batch)
+                self._batches.put(batch)
+                batch = []
         self._batches.put(None)
         with self._lock:
             for grid in self._grids.values():

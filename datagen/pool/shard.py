@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import os
 import tarfile
@@ -49,6 +50,7 @@ def pack_episode(episode: Episode) -> bytes:
 def stage_parts(folder: Path, key: str, parts: Iterable[bytes]) -> None:
     """Writes the parts of an episode's tar file, whole or not at all, and behind its end their sha256.
 
+    It is not on the disk yet: `DatasetWriter` brings it there, unless its shard is packed before.
     Raises: OSError (a full disk).
     """
     target, digest = folder / STAGING_NAME / f"{key}.tar", hashlib.sha256()
@@ -60,8 +62,13 @@ def stage_parts(folder: Path, key: str, parts: Iterable[bytes]) -> None:
                 rest = memoryview(data)
                 while rest:  # a write takes 2 GB at most
                     rest = rest[file.write(rest) :]
-            sync_file(file)
         temporary.replace(target)
+
+
+def sync_staged(path: Path) -> None:
+    """Brings a staged file to the disk; nothing where it has gone, with its shard. Raises: OSError (a full disk)."""
+    with contextlib.suppress(FileNotFoundError), path.open("rb") as file:
+        sync_file(file)
 
 
 def require_sealed(path: Path) -> None:

@@ -5,13 +5,14 @@ datagen.pool.local_workers and datagen.pool.ray_workers say where workers run.
 
 from __future__ import annotations
 
+import pickle
 import pkgutil
 import time
 import traceback
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
 
@@ -39,14 +40,36 @@ class Backend:
     warm_up: str = "datagen.mpm.solver:warm_up"
 
 
+_Value = TypeVar("_Value")
+
+
+class Parcel(Generic[_Value]):
+    """A value that processes may pass on as the bytes that came: it is pickled once, and read where it is opened."""
+
+    def __init__(self, value: _Value) -> None:
+        self._value: _Value | None = value
+        self._bytes: bytes | None = None
+
+    def open(self) -> _Value:
+        if self._bytes is not None:
+            self._value, self._bytes = pickle.loads(self._bytes), None
+        return self._value  # type: ignore[return-value]
+
+    def __getstate__(self) -> bytes:
+        return pickle.dumps(self._value, pickle.HIGHEST_PROTOCOL) if self._bytes is None else self._bytes
+
+    def __setstate__(self, state: bytes) -> None:
+        self._value, self._bytes = None, state
+
+
 @dataclass(frozen=True)
 class MadeScene:
     """A scene ready for the solver."""
 
     task: SceneTask
-    scene: Scene
+    scene: Parcel[Scene]
     obstacle_grid: ObstacleGrid | None  # none: it follows, for the solver does not need it
-    collider: Any = None  # what the solver makes of the obstacles
+    collider: Parcel[Any] = Parcel(None)  # what the solver makes of the obstacles
 
 
 @dataclass(frozen=True)
@@ -54,7 +77,7 @@ class GridTask:
     """The obstacle grid of a made scene, to be built."""
 
     task: SceneTask
-    scene: Scene
+    scene: Parcel[Scene]
 
 
 @dataclass(frozen=True)
@@ -123,9 +146,9 @@ def make_scene(task: SceneTask, config: DatagenConfig, backend: Backend, with_gr
         collider = build_collider(scene, config.mpm.collider_band_cells)
     except ConfigError as error:  # no room for the obstacles, say: another seed may do
         return "failed", task.key, str(error)
-    made = MadeScene(task, scene, None, collider)
+    made = MadeScene(task, Parcel(scene), None, Parcel(collider))
     if with_grid:
-        grid = build_grid(GridTask(task, scene), backend).grid
+        grid = build_grid(GridTask(task, made.scene), backend).grid
         if isinstance(grid, str):
             return "failed", task.key, grid
         made = replace(made, obstacle_grid=grid)
@@ -134,7 +157,7 @@ def make_scene(task: SceneTask, config: DatagenConfig, backend: Backend, with_gr
 
 def build_grid(task: GridTask, backend: Backend) -> BuiltGrid:
     build_obstacle_grid = pkgutil.resolve_name(backend.build_obstacle_grid)
-    scene = task.scene
+    scene = task.scene.open()
     try:
         grid = build_obstacle_grid(scene.obstacles, scene.cell_size, scene.seed, scene.domain_size)
     except ConfigError as error:
@@ -157,13 +180,13 @@ def simulate_batch(
     for frames in sorted(set(lengths)):
         launch = [made for made, length in zip(batch, lengths, strict=True) if length == frames]
         of_launch = simulate(
-            [made.scene for made in launch],
+            [made.scene.open() for made in launch],
             config.mpm,
             frames,
             config.dataset.frame_rate_hz,
             on_frame=reporter and reporter(len(launch)),
             cpu_threads=threads,
-            colliders=[made.collider for made in launch],
+            colliders=[made.collider.open() for made in launch],
         )
         results |= zip((made.task for made in launch), of_launch, strict=True)
     return [results[made.task] for made in batch]
@@ -180,24 +203,25 @@ def failure_of(result: Any) -> str | None:
 def make_episode(made: MadeScene, result: Any, config: DatagenConfig, config_hash: str) -> Episode:
     """The episode of a scene with its grid and what the solver returned for it (`position_TN3`, `counters`)."""
     assert made.obstacle_grid is not None
+    scene = made.scene.open()
     return Episode(
         key=made.task.key,
         position_TN3=np.ascontiguousarray(result.position_TN3, np.float32),
-        initial_velocity_N3=made.scene.velocity_N3,
-        material_N=made.scene.material_N,
+        initial_velocity_N3=scene.velocity_N3,
+        material_N=scene.material_N,
         obstacle_grid=made.obstacle_grid,
-        domain_size=made.scene.domain_size,
-        gravity=made.scene.gravity,
+        domain_size=scene.domain_size,
+        gravity=scene.gravity,
         frame_rate_hz=config.dataset.frame_rate_hz,
         seed=made.task.seed,
         material_parameters={
             name: np.where(np.isnan(value), getattr(config.mpm, name), value).astype(np.float32)
-            for name, value in made.scene.material_parameters.items()
+            for name, value in scene.material_parameters.items()
         },
-        specification=made.scene.specification,
+        specification=scene.specification,
         solver={
             "settings": physics_settings(config),
-            "particles_per_cell": made.scene.particles_per_cell,
+            "particles_per_cell": scene.particles_per_cell,
             "counters": dict(result.counters),
             "dataset": {"config_hash": config_hash, "attempt": made.task.attempt},
         },

@@ -1,7 +1,8 @@
 """Episodes to shards: each finished episode is staged at once, a shard is published when its range is complete.
 
 Every file appears whole or not at all, in this order: `.staging/<key>.tar`, the shard, the manifest; staged files
-go last. So after a crash at any point the state of the folder alone says what is left to do, and no finished
+go last. What is published is on the disk; what is staged gets there when its shard lacks others for a while, so that
+most episodes are written once: a loss of power may take the last seconds of them, which are then made again. So after a crash at any point the state of the folder alone says what is left to do, and no finished
 episode is simulated again. Several generators may write to one folder: each claims the shards that it makes, the
 first to publish an episode wins, and the manifest is only changed under its lock, on top of what the others wrote.
 """
@@ -11,6 +12,7 @@ from __future__ import annotations
 import dataclasses
 import errno
 import shutil
+import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack
@@ -29,7 +31,7 @@ from datagen.pool.plan import (
     scene_seed,
     work_order,
 )
-from datagen.pool.shard import STAGING_NAME, inspect_shard, join_tars, require_sealed, staged_path
+from datagen.pool.shard import STAGING_NAME, inspect_shard, join_tars, require_sealed, staged_path, sync_staged
 from hgn.config import DatagenConfig
 from hgn.data.identity import dataset_identity, identity_hash, require_same_dataset
 from hgn.data.index import ListedIndex
@@ -48,6 +50,7 @@ from hgn.system.machine import available_cpus
 
 # seeds tried for one episode before the scene distribution itself is held to be at fault
 MAXIMUM_REPLACEMENTS = 20
+STAGED_SECONDS = 2.0  # that a staged episode waits for the rest of its shard before it goes to the disk itself
 PACKED_AT_ONCE = max(4, min(12, available_cpus() - 1))  # shards, where so many are ready; 0.1 GB each
 
 
@@ -81,6 +84,8 @@ class DatasetWriter:
         self._begun = 0  # so many shards at the share's beginning are published
         self._claimed: list[ShardRange] = []  # what of that this writer makes
         self._staged: set[tuple[str, int]] = set()  # and what of these waits in .staging
+        self._unsynced: dict[tuple[str, int], float] = {}  # of those, what is not on the disk yet: since when
+        self._syncing: list[Future[None]] = []
         self._packers = ThreadPoolExecutor(PACKED_AT_ONCE, "packer")
         self._packing: dict[ShardRange, Future[_Packed]] = {}  # of the shards to be published next
         self._content = b""  # of the manifest file that `manifest` was read from
@@ -105,6 +110,8 @@ class DatasetWriter:
     ) -> None:
         try:
             self._packers.shutdown(cancel_futures=True)
+            for episode in self._staged:  # who ends early leaves these for long, perhaps
+                sync_staged(staged_path(self.folder, *episode))
             for packing in self._packing.values():
                 if not packing.cancelled() and packing.exception() is None:
                     packing.result()[0].close()
@@ -186,6 +193,7 @@ class DatasetWriter:
     def add_staged(self, split: str, index: int) -> None:
         """Tells the writer that an episode was staged."""
         self._staged.add((split, index))
+        self._unsynced[split, index] = time.monotonic()
 
     def is_staged(self, split: str, index: int) -> bool:
         """Whether a staged file is there, told or not: a worker may die between the two."""
@@ -205,6 +213,7 @@ class DatasetWriter:
         ready = [
             shard for shard in self._claimed if all((shard.split, index) in self._staged for index in shard.indices)
         ]
+        self._sync_staged(ready, time.monotonic() - STAGED_SECONDS)
         if not ready:
             return None
         # two rounds, so that no packer waits while this thread lists what is packed
@@ -218,6 +227,17 @@ class DatasetWriter:
         entry = self._publish(ready[0])
         self._forget(ready[0])
         return entry
+
+    def _sync_staged(self, ready: Sequence[ShardRange], before: float) -> None:
+        """Has what was staged before that time brought to the disk, unless its shard is among the `ready` ones."""
+        packed = {(shard.split, index) for shard in ready for index in shard.indices}
+        for episode, since in list(self._unsynced.items()):
+            if since <= before and episode not in packed:
+                del self._unsynced[episode]
+                self._syncing.append(self._packers.submit(sync_staged, staged_path(self.folder, *episode)))
+        for done in [syncing for syncing in self._syncing if syncing.done()]:
+            self._syncing.remove(done)
+            done.result()
 
     def _pack(self, shard: ShardRange) -> _Packed:
         """A shard's file under a temporary name, which is gone when the stack is closed, and its checked entry."""
@@ -391,6 +411,7 @@ class DatasetWriter:
     def _forget(self, shard: ShardRange) -> None:
         for index in shard.indices:
             self._staged.discard((shard.split, index))
+            self._unsynced.pop((shard.split, index), None)
             staged_path(self.folder, shard.split, index).unlink(missing_ok=True)
         self._claimed.remove(shard)
         self._locks.free(shard)

@@ -279,7 +279,7 @@ def require_schema_version(mapping: object, name: str) -> None:
 
 def _require_finite_positions(episode: Episode) -> None:
     # frame by frame, so that a memory map is not read whole
-    for frame, position_N3 in enumerate(episode.position_TN3):
+    for frame, position_N3 in enumerate(np.asarray(episode.position_TN3)):
         if not np.isfinite(position_N3).all():
             raise ConfigError(
                 f"{episode.key}: position must be finite, got {_first_not_finite(position_N3)} in frame {frame}"
@@ -292,7 +292,7 @@ def _first_not_finite(array: np.ndarray) -> str:
 
 
 def _encode_array(array: np.ndarray, dtype: str) -> bytes:
-    buffer = io.BytesIO()
     plain = np.ascontiguousarray(np.asarray(array), dtype=dtype)
-    np.lib.format.write_array(buffer, plain, version=(1, 0), allow_pickle=False)
-    return buffer.getvalue()
+    header = io.BytesIO()
+    np.lib.format.write_array_header_1_0(header, np.lib.format.header_data_from_array_1_0(plain))
+    return b"".join((header.getvalue(), plain.data))  # copied once, where write_array does it three times

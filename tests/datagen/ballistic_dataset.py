@@ -3,7 +3,7 @@
 import ballistic_solver
 
 from datagen.pool.shard import stage_episode
-from datagen.pool.worker import MadeScene, make_episode
+from datagen.pool.worker import MadeScene, Parcel, make_episode
 from datagen.pool.writer import DatasetWriter
 
 
@@ -15,7 +15,7 @@ def stage(writer, split, index):
     scene = ballistic_solver.generate_scene(config.scene, task.seed)
     grid = ballistic_solver.build_obstacle_grid((), scene.cell_size, 0, scene.domain_size)
     (result,) = ballistic_solver.simulate([scene], config.mpm, config.dataset.frames_of(index), 60.0)
-    episode = make_episode(MadeScene(task, scene, grid), result, config, writer.config_hash)
+    episode = make_episode(MadeScene(task, Parcel(scene), grid), result, config, writer.config_hash)
     stage_episode(writer.folder, episode)
     writer.add_staged(split, index)
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 import os
+import time
 from itertools import pairwise
 from pathlib import Path
 
@@ -12,7 +13,7 @@ from written_files import claim_all, hashes, simulated_once, snapshot
 import datagen.pool.shard
 import datagen.pool.writer
 from datagen.pool.plan import scene_seed
-from datagen.pool.writer import MAXIMUM_REPLACEMENTS, DatasetWriter
+from datagen.pool.writer import MAXIMUM_REPLACEMENTS, STAGED_SECONDS, DatasetWriter
 from hgn.config import DatagenConfig, MpmConfig, SceneConfig
 from hgn.data.manifest import Manifest
 from hgn.data.reader import EpisodeStore
@@ -232,24 +233,45 @@ def test_staged_file_that_changes_later_is_not_published(make_config, stage):
     assert not list(writer.folder.glob("*.tar"))
 
 
-def test_what_is_staged_is_on_the_disk(make_config, stage, monkeypatch):
-    """No file of the folder gets its name before its bytes are on the disk."""
+def test_what_is_published_is_on_the_disk(make_config, stage, monkeypatch):
+    """No shard and no index gets its name before its bytes are on the disk. A staged episode gets there when its shard
+    has lacked others for a while, or the writer ends; not where its shard is packed at once."""
     synced: set[int] = set()
-    real_sync, real_replace = os.fsync, Path.replace
+    real_sync, real_link, real_replace = os.fsync, Path.hardlink_to, Path.replace
 
     def sync(descriptor):
         synced.add(os.fstat(descriptor).st_ino)
         real_sync(descriptor)
 
+    def link(path, target):
+        assert target.stat().st_ino in synced, path
+        real_link(path, target)
+
     def replace(path, target):
-        assert path.stat().st_ino in synced, target
+        assert target.parent.name == ".staging" or path.stat().st_ino in synced, target
         return real_replace(path, target)
 
+    def on_disk(index):
+        path = writer.folder / ".staging" / f"train-{index:06d}.tar"
+        return path.stat().st_ino in synced
+
     monkeypatch.setattr(os, "fsync", sync)
+    monkeypatch.setattr(Path, "hardlink_to", link)
     monkeypatch.setattr(Path, "replace", replace)
-    with DatasetWriter(make_config()) as writer:
+    now = [1000.0]
+    monkeypatch.setattr("time.monotonic", lambda: now[0])
+    with DatasetWriter(make_config(training_scenes=9)) as writer:
         stage(writer, "train", 0)
-        assert writer.publish_next()
+        assert not on_disk(0) and writer.publish_next()
+        synced.clear()  # numbers of files that are gone are given again
+        stage(writer, "train", 4)  # of a shard of four
+        assert writer.publish_next() is None and not on_disk(4)
+        now[0] += STAGED_SECONDS
+        assert writer.publish_next() is None
+        while not on_disk(4):  # or the test's time is over
+            time.sleep(0.01)
+        stage(writer, "train", 5)
+    assert on_disk(5)
 
 
 def test_locks_that_exclude_nobody(make_config, monkeypatch):
