@@ -316,8 +316,6 @@ class NetworkConfig:
     # absolute: velocities and wall distances, the paper's; relative: hgn.network.relative, where free motion and
     # gravity are exact
     inputs: Annotated[str, one_of("absolute", "relative")] = "absolute"
-    # relative inputs know how far obstacles' surfaces are, now and a frame later, and see them from the cells around on
-    obstacle_distances: bool = False
     contact_reach_cells: Positive[float] = 1.5  # of relative inputs: walls are seen from so many R on
     # what relative inputs show a particle's velocity against surfaces by: its own reach; or cell: that of all that is
     # in its coarsest cells and across their faces, so that it is known inside a pile too
@@ -345,7 +343,6 @@ class NetworkConfig:
             rule = "at least 2 with inputs=relative, which are of differences"
             require(self.velocity_history >= 2, "velocity_history", rule, self.velocity_history)
         else:
-            require(not self.obstacle_distances, "obstacle_distances", "false with inputs=absolute", True)
             require(not self.gates_by_cell, "contact_gate", "particle with inputs=absolute", self.contact_gate)
             require(not self.slips, "contact_forces", "any with inputs=absolute", self.contact_forces)
             require(not self.rests, "rest_threshold", "0 with inputs=absolute", self.rest_threshold)
@@ -354,8 +351,6 @@ class NetworkConfig:
             require(self.maximum_neighbours is None, "maximum_neighbours", "null for an hgn", self.maximum_neighbours)
         else:
             require(self.levels == 1, "levels", f"1 for {self.kind}: the particles themselves", self.levels)
-        rule = "false with obstacle_features=false"
-        require(self.obstacle_features or not self.obstacle_distances, "obstacle_distances", rule, True)
         require(
             not (self.obstacle_particles and self.obstacle_features),
             "obstacle_features",
@@ -398,8 +393,7 @@ class NetworkConfig:
         """Numbers per particle, the embedding last: paper sec. 3.1, or hgn.network.relative."""
         if self.relative:
             motion = 3 * (self.velocity_history - 1) + 3 * self.levels + 3
-            obstacles = 6 * self.obstacle_features + 4 * self.obstacle_distances
-            return motion + 6 + obstacles + self.material_embedding
+            return motion + 6 + 6 * self.obstacle_features + self.material_embedding
         return 3 * self.velocity_history + 3 * self.obstacle_features + 6 + self.material_embedding
 
 

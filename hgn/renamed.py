@@ -50,7 +50,7 @@ BEFORE: dict[str, Any] = {
 
 
 # Settings of relative inputs that left, and what they always are now.
-GONE = {"network.momentum": "angular"}
+GONE: dict[str, Any] = {"network.momentum": "angular", "network.obstacle_distances": False}
 
 
 # Prefixes of logged metrics, old to new: metrics.jsonl of earlier runs stays as it is.
@@ -106,8 +106,8 @@ def key_remedy(key: str, value: Any) -> str | None:
 
 def gone_remedy(key: str) -> str | None:
     """What to do about a key that left, whose name ends as in the configuration; none for another."""
-    always = GONE.get(".".join(key.split(".")[-2:]))
-    return f"it is always {always} now; leave it out, and train other weights anew" if always else None
+    key = ".".join(key.split(".")[-2:])
+    return f"it is always {GONE[key]} now; leave it out, and train other weights anew" if key in GONE else None
 
 
 def value_remedy(key: str, value: Any) -> str:

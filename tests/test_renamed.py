@@ -35,6 +35,7 @@ from hgn.schema import ConfigError, from_mapping, from_stored, to_mapping
             {"network": {"momentum": "linear"}},
             "network.momentum is not a known key; it is always angular now; leave it out, and train other weights anew",
         ),
+        (TrainConfig, {"network": {"obstacle_distances": True}}, "it is always False now; leave it out"),
     ],
 )
 def test_old_names_are_answered(config, mapping, message):
@@ -82,12 +83,16 @@ def test_files_with_settings_that_left():
         ("relative", {}, True),
         ("relative", {"momentum": "angular"}, True),
         ("relative", {"momentum": "linear"}, False),
+        ("absolute", {"obstacle_distances": False}, True),
+        ("relative", {"obstacle_distances": False}, True),
+        ("relative", {"obstacle_distances": True}, False),
     ):
         stored = to_mapping(NetworkConfig(inputs=inputs)) | told
         if loads:
             assert from_stored(NetworkConfig, stored, "network") == NetworkConfig(inputs=inputs)
             continue
-        with pytest.raises(ConfigError, match=r"network\.momentum is not a known key; it is always angular now"):
+        (name,) = told
+        with pytest.raises(ConfigError, match=rf"network\.{name} is not a known key; it is always .* now"):
             from_stored(NetworkConfig, stored, "network")
 
 

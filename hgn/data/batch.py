@@ -15,7 +15,7 @@ from hgn.config import NetworkConfig
 from hgn.data.episode_tensors import frame_gravity, shown_symmetries
 from hgn.data.sampler import SamplerState
 from hgn.network.features import ParticleState, material_rows
-from hgn.network.obstacles import ObstacleCells, SurfaceParticles, cells_of
+from hgn.network.obstacles import ObstacleCells, SurfaceParticles
 from hgn.scene.episode import Episode
 from hgn.scene.history import window
 from hgn.scene.rollout_file import episode_surface
@@ -124,7 +124,7 @@ def _joined(samples: Sequence[BatchSample], network: NetworkConfig, sampler_stat
         particles_S=particles,
         domain_S3=torch.tensor([episode.domain_size for episode in episodes], dtype=torch.float32),
         gravity_S3=torch.tensor([frame_gravity(episode) for episode in episodes], dtype=torch.float32),
-        obstacles=cells_of([episode.obstacle_grid for episode in episodes], network),
+        obstacles=ObstacleCells.of([e.obstacle_grid for e in episodes]) if network.obstacle_features else None,
         surface=surface,
         seeds_S=tuple(sample.seed for sample in samples),
         sampler_state=sampler_state,

@@ -15,7 +15,6 @@ from hgn.data.sampler import Sample, SamplerState
 from hgn.network.features import material_rows
 from hgn.scene.episode import Episode
 from hgn.scene.history import frames_before
-from hgn.scene.obstacle_grid import shown_cells
 from hgn.scene.symmetry import Symmetry, Vector, scene_symmetries
 
 
@@ -26,7 +25,7 @@ class EpisodeTensors:
     position_TN3: torch.Tensor  # float32, domain units
     material_N: torch.Tensor  # int32, index into the network's materials
     obstacle_cell_K3: torch.Tensor  # int32; empty where the network sees none
-    obstacle_normal_K3: torch.Tensor  # or vectors of planes (hgn.network.obstacles)
+    obstacle_normal_K3: torch.Tensor
     domain_size: Vector
     gravity: Vector  # domain units per frame squared
     symmetries: tuple[Symmetry, ...] = ()  # what training may show instead of the scene
@@ -46,13 +45,12 @@ class UpdateChunk:
 def whole_episode(episode: Episode, network: NetworkConfig) -> EpisodeTensors:
     """Reads an episode; its windows are those of `hgn.scene.history.window`."""
     past = frames_before(episode, -network.velocity_history)
-    cell_K3, vector_K3 = shown_cells(episode.obstacle_grid, network.obstacle_distances)
-    seen = len(cell_K3) if network.obstacle_features else 0
+    grid, seen = episode.obstacle_grid, len(episode.obstacle_grid.cell_K3) if network.obstacle_features else 0
     return EpisodeTensors(
         torch.from_numpy(np.concatenate([past, episode.position_TN3], dtype=np.float32)),
         material_rows(episode.material_N, network.materials, episode.materials).int(),
-        torch.from_numpy(np.array(cell_K3[:seen], np.int32)),
-        torch.from_numpy(np.array(vector_K3[:seen], np.float32)),
+        torch.from_numpy(np.array(grid.cell_K3[:seen], np.int32)),
+        torch.from_numpy(np.array(grid.normal_K3[:seen], np.float32)),
         episode.domain_size,
         frame_gravity(episode),
         shown_symmetries(episode, network),

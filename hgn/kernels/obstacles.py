@@ -55,9 +55,9 @@ def _from_axis(x, y, z, symmetry, axis: tl.constexpr):
 
 @triton.jit
 def obstacle_normals(x, y, z, line, live, obstacle_cell_size, SYMMETRY: tl.constexpr):
-    """The three parts of obstacle normals, or of vectors of planes (hgn.network.obstacles), at positions of any shape,
-    zeros where there is none; `line` is their scenes' row of the obstacle table. With SYMMETRY the positions are an
-    image of the scene that the table is of: looked up there, normals brought back."""
+    """The obstacle normals' three parts at positions of any shape, zeros where there is none; `line` is their scenes'
+    row of the obstacle table. With SYMMETRY the positions are an image of the scene that the table is of: looked up
+    there, normals brought back."""
     x = tl.floor(tl.div_rn(x, obstacle_cell_size))
     y = tl.floor(tl.div_rn(y, obstacle_cell_size))
     z = tl.floor(tl.div_rn(z, obstacle_cell_size))

@@ -1,8 +1,6 @@
 """Obstacles on the device: the normals of sparse cells, found by key, or particles on the obstacles' surfaces.
 
 Paper sec. 3: n_o is the normal of the solver-sized cell that contains the particle, zero where there is none.
-With `network.obstacle_distances` cells have planes instead: vectors along the normal, 1 + the distance of the cell's
-centre in cells long (hgn.scene.obstacle_grid.surface_planes).
 Sec. 4: GNS has static particles instead, sampled from the surfaces.
 Shape legend: K obstacle cells of all scenes, N particles, P surface particles of all scenes.
 """
@@ -16,9 +14,8 @@ from functools import lru_cache
 import numpy as np
 import torch
 
-from hgn.config import NetworkConfig
 from hgn.network.cell_keys import find, of_scene, pack, unpack
-from hgn.scene.obstacle_grid import ObstacleGrid, shown_cells
+from hgn.scene.obstacle_grid import ObstacleGrid
 
 CELL_DIAGONAL = 3**0.5 + 1e-3  # points of two cells are at most this much nearer than the cells' corners
 CELLS_AT_ONCE = 1 << 12
@@ -27,22 +24,22 @@ REMEMBERED_SCENES = 32  # whose keys are: batches of many frames of a scene need
 
 @dataclass(frozen=True, eq=False)
 class ObstacleCells:
-    """Sorted cell keys int64 [K] and unit normals, or vectors of planes, float32 [K, 3]."""
+    """Sorted cell keys int64 [K] and unit normals float32 [K, 3]."""
 
     key_K: torch.Tensor
     normal_K3: torch.Tensor
     cell_size: float
 
     @staticmethod
-    def of(grids: Sequence[ObstacleGrid], planes: bool = False) -> ObstacleCells | None:
+    def of(grids: Sequence[ObstacleGrid]) -> ObstacleCells | None:
         """The cells of a batch, scene s from grids[s]; none where no scene has an obstacle."""
         if not any(len(grid.cell_K3) for grid in grids):
             return None
         cell_size = grids[0].cell_size
         assert all(grid.cell_size == cell_size for grid in grids), "scenes of one batch share the cell size"
-        seen = [_keyed(grid, planes) for grid in grids]
-        key_K = torch.cat([of_scene(own_K, scene) for scene, (own_K, _) in enumerate(seen)])
-        return ObstacleCells(key_K, torch.cat([own_K3 for _, own_K3 in seen]), cell_size)
+        key_K = torch.cat([of_scene(_keys(grid), scene) for scene, grid in enumerate(grids)])
+        normal_K3 = np.concatenate([grid.normal_K3 for grid in grids]).astype(np.float32, copy=False)
+        return ObstacleCells(key_K, torch.from_numpy(normal_K3), cell_size)
 
     def to(self, device: torch.device, non_blocking: bool = False) -> ObstacleCells:
         return ObstacleCells(
@@ -56,22 +53,6 @@ class ObstacleCells:
         cell_N3 = torch.floor(position_N3 / self.cell_size).long()
         index_N, found_N = find(self.key_K, pack(scene_N, cell_N3))
         return (self.normal_K3[index_N] * found_N[:, None]).to(position_N3.dtype)
-
-    def planes(self, position_N3: torch.Tensor, scene_N: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Unit normals [N, 3] of the surfaces that places see, zero where they see none, and how high above them the
-        places are, [N], domain units.
-        """
-        vector_N3 = ObstacleCells.normals(self, position_N3, scene_N)
-        length_N = vector_N3.square().sum(-1).sqrt()
-        normal_N3 = vector_N3 / torch.where(length_N > 0, length_N, 1)[:, None]
-        centre_N3 = (torch.floor(position_N3 / self.cell_size) + 0.5) * self.cell_size
-        height_N = (normal_N3 * (position_N3 - centre_N3)).sum(-1) + (length_N - 1) * self.cell_size
-        return normal_N3, height_N
-
-
-def cells_of(grids: Sequence[ObstacleGrid], network: NetworkConfig) -> ObstacleCells | None:
-    """What a network sees of a batch's obstacles in cells; none where that is nothing."""
-    return ObstacleCells.of(grids, network.obstacle_distances) if network.obstacle_features else None
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,10 +102,9 @@ class SurfaceParticles:
 
 
 @lru_cache(REMEMBERED_SCENES)
-def _keyed(grid: ObstacleGrid, planes: bool) -> tuple[torch.Tensor, torch.Tensor]:
-    """Keys of scene 0, int64 [K], and what a network sees there, normals or vectors of planes, float32 [K, 3]."""
-    cells_K3, vector_K3 = shown_cells(grid, planes)
-    cell_K3 = torch.from_numpy(cells_K3.astype(np.int64))
+def _keys(grid: ObstacleGrid) -> torch.Tensor:
+    """Of scene 0, int64 [K]."""
+    cell_K3 = torch.from_numpy(grid.cell_K3.astype(np.int64))
     key_K = pack(torch.zeros(len(cell_K3), dtype=torch.int64), cell_K3)
     assert bool((key_K[1:] > key_K[:-1]).all()), "obstacle cells come sorted and unique"
-    return key_K, torch.from_numpy(vector_K3.astype(np.float32))
+    return key_K

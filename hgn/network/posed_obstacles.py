@@ -52,20 +52,6 @@ class PosedObstacleCells(ObstacleCells):
         square_N1 = normal_N3.square().sum(-1, keepdim=True)
         return torch.where(square_N1 > 1, normal_N3 * square_N1.clamp(min=1).rsqrt(), normal_N3)
 
-    def planes(self, position_N3: torch.Tensor, scene_N: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """As of ObstacleCells: the nearest surface of all obstacles. Heights have gradients, of poses too."""
-        normal_N3, height_N = torch.zeros_like(position_N3), torch.zeros_like(position_N3[:, 0])
-        if len(self.key_K):
-            normal_N3, height_N = super().planes(position_N3, scene_N)
-        for cells, placement in self.placed:
-            if len(cells.key_K) == 0:
-                continue
-            own_N3, own_N = cells.planes(placement.undo(position_N3), scene_N)
-            nearer_N = own_N3.any(-1) & (~normal_N3.any(-1) | (own_N < height_N))
-            normal_N3 = torch.where(nearer_N[:, None], own_N3 @ placement.rotation_33.T, normal_N3)
-            height_N = torch.where(nearer_N, own_N, height_N)
-        return normal_N3, height_N
-
 
 def smoothed_normals(
     cells: ObstacleCells, position_N3: torch.Tensor, scene_N: torch.Tensor, smoothing: float

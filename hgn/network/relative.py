@@ -12,7 +12,6 @@ ask:
 | 3 | G f(v^n): the velocity against what stands still, where that is within reach |
 | 6 | walls within reach, lower x, y, z, then upper |
 | 3 + 3 | obstacle normals, at the particle and where it is flying to; only with obstacle_features |
-| 2 + 2 | how near each of these surfaces is, now and a frame later; only with obstacle_distances |
 
 G is a particle's own `contact_gate`; or with `network.contact_gate: cell` sum_C w_pC t_C of what `disturbance` gives,
 which is nowhere less and knows a surface that is within reach of what the particle lies in. With
@@ -28,7 +27,6 @@ Shape legend: N particles, H velocities, L levels, C cells of a level, E directe
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
@@ -40,7 +38,6 @@ from hgn.network.obstacles import ObstacleCells
 
 WALL_LIMIT = 2.0  # of wall_nearness: beyond the plane by the reach
 STEPS_AHEAD = 4  # places looked at on the way of one frame
-OBSTACLE_REACH = 3.0  # obstacle cells, from which on an obstacle's surface that is seen is near
 QUIET = 0.01  # s_a: changes and differences of velocity below it count by their square; rounding leaves 1e-5 to 1e-4
 OUTPUTS = 9  # of the decoder, a particle: an acceleration, and a stress xx, yy, zz, yz, xz, xy
 STRESS_33 = ((3, 8, 7), (8, 4, 6), (7, 6, 5))  # its columns
@@ -75,10 +72,8 @@ def relative_features(
         state.domain_S3[state.scene_N],
         config.contact_reach_cells * config.cell_size,
     )
-    normal_N6, near_N4 = None, None
-    if config.obstacle_distances:
-        normal_N6, near_N4 = obstacle_surfaces(state.position_N3, velocity_N3, state.scene_N, state.obstacles)
-    elif config.obstacle_features:
+    normal_N6 = None
+    if config.obstacle_features:
         normal_N6 = obstacle_normals(state.position_N3, velocity_N3, state.scene_N, state.obstacles)
     motion_NK = torch.cat(
         [
@@ -93,8 +88,8 @@ def relative_features(
         contacts = replace(contacts, normal_C33=touched_normals(surface_normals(wall_N6, normal_N6), grid))
     if config.gates_by_cell:
         gate_N = (grid.weight_N8 * contacts.touched_C[coarsest_cells(grid)]).sum(1)
-    parts = [motion_NK, gate_N[:, None] * torch.asinh(velocity_N3 / scale), wall_N6, normal_N6, near_N4]
-    return torch.cat([part for part in parts if part is not None], dim=-1), contacts
+    parts = [motion_NK, gate_N[:, None] * torch.asinh(velocity_N3 / scale), wall_N6]
+    return torch.cat(parts if normal_N6 is None else [*parts, normal_N6], dim=-1), contacts
 
 
 def history(velocity_NH3: torch.Tensor, gravity_N3: torch.Tensor) -> torch.Tensor:
@@ -139,49 +134,13 @@ def obstacle_normals(
     position_N3: torch.Tensor, velocity_N3: torch.Tensor, scene_N: torch.Tensor, obstacles: ObstacleCells | None
 ) -> torch.Tensor:
     """The normal at the particle, and the first one at a quarter, a half … of the next frame's way, [N, 6]; else 0."""
-    if obstacles is None:
-        return position_N3.new_zeros(len(position_N3), 6)
-    cells = obstacles
-    return torch.cat(here_and_ahead(lambda way_N3: cells.normals(position_N3 + way_N3, scene_N), velocity_N3), dim=-1)
-
-
-def here_and_ahead(
-    look: Callable[[torch.Tensor], torch.Tensor], velocity_N3: torch.Tensor
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """What `look` sees at each particle, normals first, [N, 3 or more], and the first that it sees at a quarter, a half
-    … of the next frame's way; else 0."""
-    here_NK = look(torch.zeros_like(velocity_N3))
-    ahead_NK = torch.zeros_like(here_NK)
-    for step in range(STEPS_AHEAD, 0, -1):
-        seen_NK = look(velocity_N3 * (step / STEPS_AHEAD))
-        ahead_NK = torch.where(seen_NK[:, :3].any(-1, keepdim=True), seen_NK, ahead_NK)
-    return here_NK, ahead_NK
-
-
-def obstacle_surfaces(
-    position_N3: torch.Tensor, velocity_N3: torch.Tensor, scene_N: torch.Tensor, obstacles: ObstacleCells | None
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """As `obstacle_normals`, of planes; and how near these are, [N, 4]: the one at the particle now and a frame later,
-    then the one ahead. As of walls: 0 from OBSTACLE_REACH cells on, 1 at the surface, at most 2, and 0 where none is.
-    """
-    if obstacles is None:
-        return position_N3.new_zeros(len(position_N3), 6), position_N3.new_zeros(len(position_N3), 4)
-    cells = obstacles
-
-    def look(way_N3: torch.Tensor) -> torch.Tensor:
-        """Normals, and how high above their surfaces the particles are now."""
-        normal_N3, height_N = cells.planes(position_N3 + way_N3, scene_N)
-        return torch.cat([normal_N3, (height_N - (normal_N3 * way_N3).sum(-1))[:, None]], dim=-1)
-
-    normals, columns = [], []
-    for seen_N4 in here_and_ahead(look, velocity_N3):
-        normal_N3, height_N = seen_N4[:, :3], seen_N4[:, 3]
-        closing_N = (normal_N3 * velocity_N3).sum(-1)
-        for distance_N in (height_N, height_N + closing_N):
-            near_N = (1 - distance_N / (OBSTACLE_REACH * obstacles.cell_size)).clamp(0.0, WALL_LIMIT)
-            columns.append(torch.where(normal_N3.any(-1), near_N, 0))
-        normals.append(normal_N3)
-    return torch.cat(normals, dim=-1), torch.stack(columns, dim=-1)
+    here_N3, ahead_N3 = torch.zeros_like(position_N3), torch.zeros_like(position_N3)
+    if obstacles is not None:
+        here_N3 = obstacles.normals(position_N3, scene_N)
+        for step in range(STEPS_AHEAD, 0, -1):
+            normal_N3 = obstacles.normals(position_N3 + velocity_N3 * (step / STEPS_AHEAD), scene_N)
+            ahead_N3 = torch.where(normal_N3.any(-1, keepdim=True), normal_N3, ahead_N3)
+    return torch.cat([here_N3, ahead_N3], dim=-1)
 
 
 def contact_gate(wall_N6: torch.Tensor, normal_N6: torch.Tensor | None) -> torch.Tensor:

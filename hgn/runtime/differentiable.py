@@ -183,13 +183,8 @@ def _obstacles(
     placements = {i: _placement(scene.obstacles[i], pose, device, dtype) for i, pose in poses.items()}
     obstacles, surface = None, None
     if config.obstacle_features:
-        rule = "0 for weights with network.obstacle_distances, whose gradients know how near a surface is"
-        require(inputs.smoothing == 0 or not config.obstacle_distances, "smoothing", rule, inputs.smoothing)
-        planes = config.obstacle_distances
-        rest = _cells(scene, staying, planes, device)
-        placed = tuple(
-            (_cells(scene, [scene.obstacles[i]], planes, device), placement) for i, placement in placements.items()
-        )
+        rest = _cells(scene, staying, device)
+        placed = tuple((_cells(scene, [scene.obstacles[i]], device), placement) for i, placement in placements.items())
         obstacles = PosedObstacleCells(rest.key_K, rest.normal_K3, rest.cell_size, placed, inputs.smoothing)
     if config.obstacle_particles:
         points = [_points(scene, staying, config.static_spacing_cells, device, dtype)]
@@ -202,10 +197,10 @@ def _obstacles(
     return obstacles, surface
 
 
-def _cells(scene: Scene, obstacles: list[Obstacle], planes: bool, device: torch.device) -> ObstacleCells:
+def _cells(scene: Scene, obstacles: list[Obstacle], device: torch.device) -> ObstacleCells:
     # uncut by the domain: an obstacle may be moved into it
     grid: ObstacleGrid = build_obstacle_grid(obstacles, scene.cell_size, scene.seed)
-    cells = ObstacleCells.of([grid], planes)
+    cells = ObstacleCells.of([grid])
     if cells is None:
         cells = ObstacleCells(torch.zeros(0, dtype=torch.int64), torch.zeros(0, 3), scene.cell_size)
     return cells.to(device)

@@ -52,8 +52,7 @@ class Step(nn.Module):
         """Positions [N, 3] and velocities [N, H, 3], newest first, a frame later; units: domain units, frames.
 
         material int64 [N] indexes the network's materials; domain_size and gravity [3]; obstacle_cell int64 [K, 3],
-        each once, and obstacle_normal [K, 3], of planes where the network knows distances. Absolute inputs take no heed
-        of gravity.
+        each once, and obstacle_normal [K, 3]. Absolute inputs take no heed of gravity.
         """
         # a cell that no particle reaches, so that there always is one
         far_13 = torch.full_like(domain_size[None], COORDINATE_LIMIT - 1).to(torch.int64)

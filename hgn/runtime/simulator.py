@@ -16,7 +16,7 @@ import torch
 from hgn.config import DEFAULT_WEIGHTS
 from hgn.network.base import ParticleNetwork
 from hgn.network.features import ParticleState, material_rows
-from hgn.network.obstacles import SurfaceParticles, cells_of
+from hgn.network.obstacles import ObstacleCells, SurfaceParticles
 from hgn.runtime.backend import build, choose, set_matmul_precision
 from hgn.runtime.differentiable import Inputs, Pose, simulate
 from hgn.runtime.stepped_rollout import stepped
@@ -169,7 +169,7 @@ class Simulator:
         material_N = torch.cat([material_rows(s.material_N, config.materials, s.materials) for s in states])
         counts = [len(state.position_N3) for state in states]
         position_N3 = np.concatenate([state.position_N3 for state in states]).astype(np.float32)
-        obstacles = cells_of([state.obstacle_grid for state in states], config)
+        obstacles = ObstacleCells.of([state.obstacle_grid for state in states]) if config.obstacle_features else None
         surface = None
         if config.obstacle_particles:
             surface = SurfaceParticles.of([state.surface(config.static_spacing_cells) for state in states])

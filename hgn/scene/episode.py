@@ -34,13 +34,12 @@ _ARRAYS = {
     "material": ("|u1", "N"),
     "obstacle_cell": ("<i4", "K3"),
     "obstacle_normal": ("<f4", "K3"),
-    "obstacle_distance": ("<f4", "K"),
     "past": ("<f4", "HN3"),
     "boundary": ("<f4", "P3"),
 }
 _PARAMETER = ("<f4", "N")
-# in imported episodes alone, where there are any; and what episodes of before have not
-_OPTIONAL = ("past", "boundary", "obstacle_distance")
+_OPTIONAL = ("past", "boundary")  # in imported episodes alone, where there are any
+_IGNORED = ("obstacle_distance.npy",)  # members of a setting that left: some data sets have them
 
 _NAME = re.compile(r"[A-Za-z0-9_-]+")
 
@@ -126,7 +125,6 @@ class Episode:
             "material": self.material_N,
             "obstacle_cell": self.obstacle_grid.cell_K3,
             "obstacle_normal": self.obstacle_grid.normal_K3,
-            "obstacle_distance": self.obstacle_grid.distance_K,
             "past": self.past_HN3,
             "boundary": self.boundary_P3,
         }
@@ -203,7 +201,7 @@ def decode_episode(key: str, members: Mapping[str, bytes | np.ndarray], scan_pos
         if name != member and (name in _ARRAYS or name.startswith(PARAMETER_PREFIX)):
             dtype, axes = _ARRAYS.get(name, _PARAMETER)
             arrays[name] = decode_array(f"{key}.{member}", data, dtype, len(axes))
-        elif member != DESCRIPTION_MEMBER:
+        elif member != DESCRIPTION_MEMBER and member not in _IGNORED:
             known = ", ".join((*(f"{name}.npy" for name in _ARRAYS), "json"))
             raise ConfigError(f"{key}.{member} is not a known member; known: {known}")
     for name in _ARRAYS:
@@ -214,9 +212,7 @@ def decode_episode(key: str, members: Mapping[str, bytes | np.ndarray], scan_pos
         position_TN3=arrays["position"],
         initial_velocity_N3=arrays["velocity"],
         material_N=arrays["material"],
-        obstacle_grid=ObstacleGrid(
-            description.cell_size, arrays["obstacle_cell"], arrays["obstacle_normal"], arrays.get("obstacle_distance")
-        ),
+        obstacle_grid=ObstacleGrid(description.cell_size, arrays["obstacle_cell"], arrays["obstacle_normal"]),
         domain_size=description.domain_size,
         gravity=description.gravity,
         frame_rate_hz=description.frame_rate_hz,

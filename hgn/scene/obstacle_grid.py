@@ -2,10 +2,7 @@
 
 Paper sec. 3: sample the surface with points no closer than cell_size / 4, flip each sample's normal where it
 points away from the centre of its cell, sum per cell, normalise. Stored sparsely.
-Not the paper's: a cell's surface is a plane, across its normal and through the middle of its samples, and how far the
-cell's centre is from it is stored too. Networks with `network.obstacle_distances` see planes, those of the cells around
-too (`surface_planes`).
-Shape legend: K obstacle cells, S surface samples, F triangles, P planes.
+Shape legend: K obstacle cells, S surface samples, F triangles.
 """
 
 from __future__ import annotations
@@ -19,10 +16,6 @@ from hgn.scene.scene import Obstacle, all_corners
 from hgn.scene.surface import area_vectors, sample_surface, split_long_edges
 from hgn.schema import ConfigError, Vector, require
 
-# A plane's distance from the centre of its own cell, at most, in cells: behind the surface, too, where it is bent
-FARTHEST = 0.9
-# Beside its plane's place by more than that many cells, a cell is past an edge: it sees the way from the place instead
-PAST_EDGE = 0.75
 CANCELLED = 0.25  # below this mean length the normals of a cell cancel; three faces of a corner give 0.58
 NORMAL_SPACING_CELLS = 0.25  # of the samples that normals are made from
 SPLIT_CELLS = 16.0  # longest edge, in cells, of the pieces that are cut to the domain
@@ -35,8 +28,6 @@ class ObstacleGrid:
     cell_size: float
     cell_K3: np.ndarray  # int32, unique rows, lexicographically sorted
     normal_K3: np.ndarray  # float32, unit length
-    # float32: of the cell's centre from the surface, along the normal, in cells; none in data of before
-    distance_K: np.ndarray | None = None
 
 
 def build_obstacle_grid(
@@ -78,9 +69,7 @@ def surface_samples(
 def grid_of_samples(point_S3: np.ndarray, normal_S3: np.ndarray, cell_size: float) -> ObstacleGrid:
     """The mean normal of every cell that holds a sample, from points and unit normals of `surface_samples`."""
     if len(point_S3) == 0:
-        return ObstacleGrid(
-            cell_size, np.zeros((0, 3), np.int32), np.zeros((0, 3), np.float32), np.zeros(0, np.float32)
-        )
+        return ObstacleGrid(cell_size, np.zeros((0, 3), np.int32), np.zeros((0, 3), np.float32))
 
     floor_S3 = np.floor(point_S3 / cell_size)
     key_S, low, extent = _lexicographic_keys(floor_S3)
@@ -96,68 +85,8 @@ def grid_of_samples(point_S3: np.ndarray, normal_S3: np.ndarray, cell_size: floa
     cancelled_K = length_K < CANCELLED * count_K
     sum_K3[cancelled_K] = normal_S3[nearest_K[cancelled_K]]
     length_K[cancelled_K] = 1.0
-    normal_K3 = sum_K3 / length_K[:, None]
-    # the mean of a cell's samples lies between sheets that face each other: there the nearest one is meant
-    way_K3 = np.stack([np.bincount(cell_S, to_centre_S3[:, axis], len(key_K)) for axis in range(3)], axis=1)
-    way_K3 = np.where(cancelled_K[:, None], to_centre_S3[nearest_K], way_K3 / count_K[:, None])
-    distance_K = np.clip((normal_K3 * way_K3).sum(axis=1) / cell_size, -FARTHEST, FARTHEST)
     cell_K3 = np.stack(np.unravel_index(key_K, extent), axis=1) + low
-    return ObstacleGrid(
-        cell_size, cell_K3.astype(np.int32), normal_K3.astype(np.float32), distance_K.astype(np.float32)
-    )
-
-
-def shown_cells(grid: ObstacleGrid, planes: bool) -> tuple[np.ndarray, np.ndarray]:
-    """The cells that a network sees, int32 [K, 3], with their normals, or `surface_planes`, float32 [K, 3]."""
-    return surface_planes(grid) if planes else (grid.cell_K3, grid.normal_K3)
-
-
-def surface_planes(grid: ObstacleGrid) -> tuple[np.ndarray, np.ndarray]:
-    """Cells that hold a surface or touch one that does, int32 [P, 3], sorted, and the surface that each sees, as a
-    vector along its normal of length 1 + the distance of the cell's centre in cells, float32 [P, 3].
-
-    A cell without a surface sees the nearest of the cells around it, from its own side.
-    Raises: ConfigError for a grid without distances.
-    """
-    if len(grid.cell_K3) == 0:
-        return grid.cell_K3, grid.normal_K3
-    if grid.distance_K is None:
-        raise ConfigError(
-            "network.obstacle_distances must be false for data without obstacle_distance, which older data are, and "
-            "imported ones that name cells and normals; make the data set again, from meshes"
-        )
-    around_Q3 = np.stack(np.meshgrid(*[np.arange(-1, 2)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
-    normal_K3 = grid.normal_K3.astype(np.float64)
-    place_K3 = -grid.distance_K[:, None] * normal_K3  # of the surface, from its cell's centre, in cells
-    # squared distances of all cells around, [Q, K]; a cell's own surface comes first
-    far_QK = np.zeros((len(around_Q3), len(place_K3)))
-    for axis in range(3):
-        far_QK += (around_Q3[:, axis, None] - place_K3[:, axis]) ** 2
-    far_QK[len(around_Q3) // 2] = -1
-    cell_K3 = grid.cell_K3.astype(np.int64)
-    _, low, extent = _lexicographic_keys(np.stack([cell_K3.min(axis=0) - 1, cell_K3.max(axis=0) + 1]))
-    # what is added to a cell is added to its key
-    stride_3 = np.array([extent[1] * extent[2], extent[2], 1])
-    key_QK = (around_Q3 @ stride_3)[:, None] + (cell_K3 - low) @ stride_3
-    key_P, which_A = np.unique(key_QK.ravel(), return_inverse=True)
-    least_P = np.full(len(key_P), np.inf)
-    np.minimum.at(least_P, which_A, far_QK.ravel())
-    nearest_A = np.flatnonzero(far_QK.ravel() == least_P[which_A])
-    chosen_P = np.empty(len(key_P), np.int64)
-    chosen_P[which_A[nearest_A]] = nearest_A  # of several any
-    side_P, own_P = np.divmod(chosen_P, len(normal_K3))
-    way_P3, normal_P3 = around_Q3[side_P] - place_K3[own_P], normal_K3[own_P]
-    height_P = (way_P3 * normal_P3).sum(axis=1)
-    beside_P3 = way_P3 - height_P[:, None] * normal_P3
-    inside_P = side_P == len(around_Q3) // 2
-    length_P = np.sqrt((way_P3**2).sum(axis=1))
-    past_P = ~inside_P & ((beside_P3**2).sum(axis=1) > PAST_EDGE**2)
-    normal_P3 = np.where(past_P[:, None], way_P3 / np.where(past_P, length_P, 1.0)[:, None], normal_P3)
-    height_P = np.where(past_P, length_P, height_P)
-    behind_P = ~inside_P & (height_P < 0)
-    normal_P3, height_P = np.where(behind_P[:, None], -normal_P3, normal_P3), np.where(behind_P, -height_P, height_P)
-    cell_P3 = np.stack(np.unravel_index(key_P, extent), axis=1) + low
-    return cell_P3.astype(np.int32), ((1 + height_P)[:, None] * normal_P3).astype(np.float32)
+    return ObstacleGrid(cell_size, cell_K3.astype(np.int32), (sum_K3 / length_K[:, None]).astype(np.float32))
 
 
 def surface_points(

@@ -26,7 +26,6 @@ SECTION = "hgn"  # the checkpoint's key for what is ours
 LAST_NAMES = ("last.ckpt", "last-1.ckpt", "last-2.ckpt")  # newest first
 BEST_NAME = "best.ckpt"  # of the lowest one-step validation error; none where no validation scene was measured
 _ZIP_FAULTS = (zipfile.BadZipFile, zlib.error, NotImplementedError)
-_FIRST = "encode.first.weight"
 NETWORK, AVERAGED = "network.", "averaged."  # prefixes of the tensors: as trained, and their moving average
 
 
@@ -102,7 +101,7 @@ def _require_equal(pairs: list[tuple[str, Any, Any]], why: str, remedy: str) -> 
 def network_of_weights(config: TrainConfig) -> ParticleNetwork:
     """The network of training.init_weights, normaliser included, for a new run to begin with. What it makes of contacts
     and its walls may be other than these weights were trained with: tensors are the same, and training goes on from
-    there. Distances of obstacles that they did not know count for nothing at first.
+    there.
 
     Raises: ConfigError for a file that is none, and where the run wants another network or has other data.
     """
@@ -110,27 +109,14 @@ def network_of_weights(config: TrainConfig) -> ParticleNetwork:
     path = find_weights(config.training.init_weights, "training.init_weights")
     weights, info = load_weights(path, field="training.init_weights")
     remedy = "set it so, or take other training.init_weights"
-    free: tuple[str, ...] = (
-        "contact_gate",
-        "contact_forces",
-        "contact_reach_cells",
-        "rest_threshold",
-        "wall_clearance",
-    )
-    if not info.network.obstacle_distances:
-        free = (*free, "obstacle_distances")
+    free = ("contact_gate", "contact_forces", "contact_reach_cells", "rest_threshold", "wall_clearance")
     pairs = [pair for pair in _network_pairs(info.network, config) if pair[0].removeprefix("network.") not in free]
     pairs.append(("dataset.frame_rate_hz", info.frame_rate_hz, config.dataset.frame_rate_hz))
     if info.network.sees_obstacles:
         pairs.append(("scene.cell_size", info.obstacle_cell_size, config.scene.cell_size))
     _require_equal(pairs, f", as in training.init_weights {path}", remedy)
     network = build_network(config.network)
-    state = weights.state_dict()
-    if config.network.obstacle_distances and not info.network.obstacle_distances:
-        more = config.network.feature_width - info.network.feature_width
-        known_HF, material_HE = state[_FIRST].tensor_split([-config.network.material_embedding], dim=1)
-        state[_FIRST] = torch.cat([known_HF, known_HF.new_zeros(len(known_HF), more), material_HE], dim=1)
-    network.load_state_dict(state)
+    network.load_state_dict(weights.state_dict())
     return network
 
 

@@ -27,9 +27,9 @@ def flat(tensors):
     return torch.cat([tensor.double().cpu().flatten() for tensor in tensors])
 
 
-def float32_state(counts, obstacles=True, spread=0.3, seed=3, planes=False):
+def float32_state(counts, obstacles=True, spread=0.3, seed=3):
     """A state whose numbers float32 holds exactly, in float64."""
-    state = random_state(counts, seed, torch.float32, obstacles, spread, planes)
+    state = random_state(counts, seed, torch.float32, obstacles, spread)
     doubled = {name: getattr(state, name).double() for name in ("position_N3", "velocity_NM3", "domain_S3")}
     return replace(state, **doubled)
 

@@ -29,12 +29,10 @@ def relative_network(**changes: object) -> HierarchicalGraphNetwork:
     return network
 
 
-def moving_state(
-    counts: tuple[int, ...], obstacles: bool = True, spread: float = 0.3, planes: bool = False
-) -> ParticleState:
+def moving_state(counts: tuple[int, ...], obstacles: bool = True, spread: float = 0.3) -> ParticleState:
     """Scenes of different gravity, some of whose particles fly through several cells in a frame, out of the domain or
     lie on a cell's corner."""
-    state = float32_state(counts, obstacles, spread, planes=planes)
+    state = float32_state(counts, obstacles, spread)
     generator = torch.Generator().manual_seed(2)
     gravity_S3 = torch.randn(len(counts), 3, generator=generator) * 3e-3
     fast_N = torch.rand(len(state.position_N3), generator=generator) < 0.5
@@ -55,8 +53,6 @@ def features_of(network: HierarchicalGraphNetwork, state: ParticleState, origin_
     ("counts", "obstacles", "changes"),
     [
         (EVERYWHERE, True, {}),
-        (EVERYWHERE, True, {"obstacle_distances": True}),
-        ((3, 8), False, {"obstacle_distances": True}),
         (EVERYWHERE, False, {"velocity_history": 2}),
         ((1,), True, {"levels": 1}),
         ((7, 2), False, {"obstacle_features": False, "levels": 4, "materials": ("water", "snow", "sand")}),
@@ -67,8 +63,7 @@ def features_of(network: HierarchicalGraphNetwork, state: ParticleState, origin_
 def test_every_column(counts: tuple[int, ...], obstacles: bool, changes: dict, gate: str) -> None:
     """Each column is that of hgn.network.relative in float64, the material one-hot behind them, and zeros behind that;
     among the particles are some within a surface's reach and some beyond."""
-    network = relative_network(contact_gate=gate, **changes)
-    state = moving_state(counts, obstacles, 0.6, network.config.obstacle_distances)
+    network, state = relative_network(contact_gate=gate, **changes), moving_state(counts, obstacles, 0.6)
     state = replace(state, velocity_NM3=state.velocity_NM3[:, : network.config.velocity_history])
     origin_S3, _ = drawn(network, state)
     found = features_of(network, state, origin_S3)

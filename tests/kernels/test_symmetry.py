@@ -37,12 +37,7 @@ def small_network():
 
 @pytest.mark.parametrize(
     "kind",
-    [
-        "hgn",
-        "relative",
-        "distances",
-        pytest.param("gns", marks=pytest.mark.skipif(device().type == "cuda", reason="float32")),
-    ],
+    ["hgn", "relative", pytest.param("gns", marks=pytest.mark.skipif(device().type == "cuda", reason="float32"))],
 )
 def test_an_update_under_symmetries_is_the_plain_one(kind):
     """An update of eight scenes, each under another symmetry, one without obstacles, one without gravity: positions,
@@ -51,12 +46,10 @@ def test_an_update_under_symmetries_is_the_plain_one(kind):
     network: HierarchicalGraphNetwork | GraphNetworkSimulator = small_network()
     if kind == "gns":
         network = gns_of(message_passing_steps=1, cell_size=0.1)
-    relative = kind in ("relative", "distances")
-    if relative:
+    if kind == "relative":
         network = network_of(
-            width=16, levels=1, message_passing_steps=1, cell_size=0.1, inputs="relative", contact_gate="cell",
-            obstacle_distances=kind == "distances",
-        )  # fmt: skip
+            width=16, levels=1, message_passing_steps=1, cell_size=0.1, inputs="relative", contact_gate="cell"
+        )
     episodes = [scene_with_obstacles(i, 2 + i) for i in range(8)]
     bare = ObstacleGrid(CELL_SIZE, np.zeros((0, 3), np.int32), np.zeros((0, 3), np.float32))
     episodes[2] = replace(episodes[2], obstacle_grid=bare)
@@ -64,7 +57,7 @@ def test_an_update_under_symmetries_is_the_plain_one(kind):
     shown = [CYCLIC, *EIGHT[1:]]
     free = scene_symmetries((0.0, 0.0, 0.0), (1.0, 1.0, 1.0), CELL_SIZE)
     seeds = (*seeds_of([CYCLIC], free), *seeds_of(EIGHT[1:]))
-    if relative:
+    if kind == "relative":
         shown = [*free[1::6]]
         seeds = seeds_of(shown, free)
     batch = under_symmetries(doubled(make_batch([(e, FRAME) for e in episodes], network.config, seeds)), shown)
@@ -82,7 +75,7 @@ def test_an_update_under_symmetries_is_the_plain_one(kind):
     wholes = {i: whole_episode(made, network.config) for i, made in enumerate(episodes)}
     fast.run(UpdateChunk((samples,), wholes, SamplerState()), [0.0])
     updates, count = fast.updates, len(state.position_N3)
-    width = 3 * HISTORY + 9 * relative
+    width = 3 * HISTORY + (9 if kind == "relative" else 0)
     assert fast.parity is not None and max(fast.parity) < 1e-3
     near = {"rtol": 0, "atol": 1e-7}
     torch.testing.assert_close(updates.position_N3[:count].cpu().double(), state.position_N3, **near)
@@ -90,17 +83,14 @@ def test_an_update_under_symmetries_is_the_plain_one(kind):
     torch.testing.assert_close(updates.target_N3[:count].cpu().double(), target, rtol=0, atol=1e-4)
     assert state.obstacles is not None
     normal = state.obstacles.normals(state.position_N3, state.scene_N)
-    if kind == "distances":
-        normal = state.obstacles.planes(state.position_N3, state.scene_N)[0]
     assert normal.abs().sum(-1).gt(0).sum() > 10
     feature_NF = updates.feature_NF if isinstance(updates, GnsUpdates) else updates.grid.feature_NF
-    shown_N3 = feature_NF[:count, width : width + 3].cpu().double()
-    torch.testing.assert_close(shown_N3, normal, rtol=0, atol=1e-6 if kind == "distances" else 0)
+    assert torch.equal(feature_NF[:count, width : width + 3].cpu().double(), normal)
     assert float(loss_sum[0]) == pytest.approx(float(loss.detach()), rel=1e-5)
     found = [torch.zeros_like(parameter) for parameter in network.parameters()]
     updates.packed.scatter(updates.fused.totals[: updates.packed.size].cpu(), found)
     # differences of velocities have the rounding of positions in float32
-    assert relative_error(flat(found), expected) < (1e-3 if relative else 1e-4)
+    assert relative_error(flat(found), expected) < (1e-3 if kind == "relative" else 1e-4)
 
 
 def test_without_symmetry_nothing_changes():

@@ -17,17 +17,16 @@ GRAVITY = (0.0, -9.8 / 3600, 0.0)  # domain units per frame squared
 
 
 def random_grid(seed, cells, cell_size=1 / 64, extent=24):
-    """Random obstacle cells with random unit normals and distances."""
+    """Random obstacle cells with random unit normals."""
     rng = np.random.default_rng(seed)
     cell_K3 = np.unique(rng.integers(0, extent, (cells, 3)), axis=0).astype(np.int32)
     normal_K3 = rng.normal(size=cell_K3.shape)
     normal_K3 /= np.linalg.norm(normal_K3, axis=1, keepdims=True)
-    distance_K = rng.uniform(-0.1, 0.8, len(cell_K3)).astype(np.float32)
-    return ObstacleGrid(cell_size, cell_K3, normal_K3.astype(np.float32), distance_K)
+    return ObstacleGrid(cell_size, cell_K3, normal_K3.astype(np.float32))
 
 
-def random_state(counts, seed=0, dtype=torch.float64, obstacles=True, spread=0.3, planes=False):
-    """Particles of several scenes in a box of side `spread`, with obstacles' normals, or `planes`."""
+def random_state(counts, seed=0, dtype=torch.float64, obstacles=True, spread=0.3):
+    """Particles of several scenes in a box of side `spread`."""
     generator = torch.Generator().manual_seed(seed)
     total = sum(counts)
     grids = [random_grid(seed + i, 4_000) for i in range(len(counts))]
@@ -38,7 +37,7 @@ def random_state(counts, seed=0, dtype=torch.float64, obstacles=True, spread=0.3
         scene_N=torch.repeat_interleave(torch.arange(len(counts)), torch.tensor(counts)),
         domain_S3=torch.ones(len(counts), 3, dtype=dtype),
         gravity_S3=torch.tensor([GRAVITY]).repeat(len(counts), 1).to(dtype),
-        obstacles=ObstacleCells.of(grids, planes) if obstacles else None,
+        obstacles=ObstacleCells.of(grids) if obstacles else None,
     )
 
 

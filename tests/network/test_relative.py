@@ -24,7 +24,6 @@ from hgn.network.relative import (
     coarsest_cells,
     contact_gate,
     obstacle_normals,
-    obstacle_surfaces,
     touched_normals,
     wall_nearness,
 )
@@ -32,7 +31,7 @@ from hgn.scene.obstacle_grid import ObstacleGrid
 from hgn.scene.symmetry import Symmetry, scene_symmetries
 
 HISTORY, SURROUNDINGS, CONTACT = slice(0, 12), slice(12, 21), slice(21, 24)  # with five velocities and three levels
-WALLS, NORMALS, DISTANCES = slice(24, 30), slice(30, 36), slice(36, 40)
+WALLS, NORMALS = slice(24, 30), slice(30, 36)
 GATES = pytest.mark.parametrize("gate", CONTACT_GATES)
 ALL_48 = scene_symmetries((0.0, 0.0, 0.0), CUBE, 1 / 64)
 
@@ -298,11 +297,9 @@ def test_impulses_turn_with_the_scene(symmetry: Symmetry) -> None:
 def test_columns_turn_with_the_scene(symmetry: Symmetry) -> None:
     """Scene and gravity turned and mirrored together by what keeps a cube: columns of vectors do as they, walls change
     places; with obstacles and walls within reach. The grid's cells are their own images here."""
-    network = network_of(
-        inputs="relative", cell_size=1 / 8, contact_reach_cells=3.0, contact_gate="cell", obstacle_distances=True
-    )
-    grid = random_grid(3, 4_000, extent=64)
-    state = replace(random_state((200,), spread=0.95), obstacles=ObstacleCells.of([grid], planes=True))
+    network = network_of(inputs="relative", cell_size=1 / 8, contact_reach_cells=3.0, contact_gate="cell")
+    grid = random_grid(3, 40_000, extent=64)
+    state = replace(random_state((60,), spread=0.95), obstacles=ObstacleCells.of([grid]))
     state = replace(state, velocity_NM3=10 * state.velocity_NM3)
     turn_33 = torch.tensor(matrix_of(symmetry), dtype=torch.float64)
     centre_K3 = (grid.cell_K3 + 0.5) / 64 - 0.5
@@ -314,7 +311,7 @@ def test_columns_turn_with_the_scene(symmetry: Symmetry) -> None:
         position_N3=(state.position_N3 - 0.5) @ turn_33.T + 0.5,
         velocity_NM3=state.velocity_NM3 @ turn_33.T,
         gravity_S3=state.gravity_S3 @ turn_33.T,
-        obstacles=ObstacleCells.of([ObstacleGrid(1 / 64, cell_K3[order], normal_K3, grid.distance_K[order])], True),
+        obstacles=ObstacleCells.of([ObstacleGrid(1 / 64, cell_K3[order], normal_K3)]),
     )
     before, after = columns(network, state), columns(network, image)
     assert before.abs().amax(0).min() > 0, "every column shows something"
@@ -324,7 +321,6 @@ def test_columns_turn_with_the_scene(symmetry: Symmetry) -> None:
     outward_63 = torch.cat([-torch.eye(3), torch.eye(3)]).double()
     place_6 = (outward_63 @ turn_33.T @ outward_63.T).argmax(1)  # of each wall's image
     torch.testing.assert_close(after[:, WALLS][:, place_6], before[:, WALLS], rtol=0, atol=1e-12)
-    torch.testing.assert_close(after[:, DISTANCES], before[:, DISTANCES], rtol=0, atol=1e-6)
 
 
 def test_surfaces_beyond_reach_are_not_seen() -> None:
@@ -460,34 +456,6 @@ def test_a_sheet_ahead_is_seen() -> None:
     assert found.tolist() == [[0, 0, 0, 0, 1, 0], [0] * 6, [0, 1, 0, 0, 1, 0], [0] * 6]
     no_wall = torch.zeros(4, 6, dtype=torch.float64)
     assert contact_gate(no_wall, found).tolist() == [1, 0, 1, 0]
-
-
-def test_how_far_a_surface_is() -> None:
-    """Over a sheet 0.3 cells above the floor of its cells: nearness now and a frame later, of the surface at the
-    particle and of the one ahead, from the side that the particle is on; 0 from three cells on and where none is seen.
-    """
-    cell_K3 = np.array([[i, 20, k] for i in range(10, 54) for k in range(10, 54)], np.int32)
-    up = np.tile(np.array([[0, 1, 0]], np.float32), (len(cell_K3), 1))
-    sheet = ObstacleGrid(1 / 64, cell_K3, up, np.full(len(cell_K3), 0.2, np.float32))
-    # heights over the sheet and steps of a frame, in cells; the normal and the two distances that each surface shows
-    cases = [
-        (1.5, 0.0, (1, 1.5, 1.5), (1, 1.5, 1.5)),  # seen from the cell above
-        (2.5, -2.0, None, (1, 2.5, 0.5)),
-        (2.5, -3.5, None, (1, 2.5, -1.0)),  # through it
-        (2.5, 1.0, None, None),
-        (0.4, -0.8, (1, 0.4, -0.4), (1, 0.4, -0.4)),
-        (-1.0, 0.8, (-1, 1.0, 0.2), (-1, 1.0, 0.2)),  # from below
-    ]
-    place = torch.tensor([[0.5, (20.3 + height) / 64, 0.5] for height, *_ in cases], dtype=torch.float64)
-    velocity = torch.tensor([[1e-3, step / 64, 0.0] for _, step, *_ in cases], dtype=torch.float64)
-    cells = ObstacleCells.of([sheet], planes=True)
-    normal_N6, near_N4 = obstacle_surfaces(place, velocity, torch.zeros(len(cases), dtype=torch.int64), cells)
-    for row, (_, _, *surfaces) in enumerate(cases):
-        for number, seen in enumerate(surfaces):
-            normal, *distances = (0, 3, 3) if seen is None else seen
-            assert normal_N6[row, 3 * number : 3 * number + 3].tolist() == [0, normal, 0]
-            found = near_N4[row, 2 * number : 2 * number + 2]
-            np.testing.assert_allclose(found, [min(1 - far / 3, 2) for far in distances], atol=1e-6)
 
 
 def test_one_scale_for_all_axes() -> None:

@@ -36,12 +36,6 @@ def network(kind, dtype=torch.float64):
         return network_of(dtype, levels=2, message_passing_steps=1, wall_clearance=(0.43, 0.1))
     if kind.startswith("gns"):
         return gns_of(dtype, kind=kind, message_passing_steps=2, static_spacing_cells=2.0)
-    if kind == "distances":
-        built = network_of(dtype, inputs="relative", obstacle_distances=True)
-        with torch.no_grad():
-            for parameter in built.decode.parameters():
-                parameter.mul_(0.3)  # else it diverges
-        return built
     return network_of(dtype, inputs=kind)
 
 
@@ -63,20 +57,13 @@ def positions(simulator, inputs, smoothing):
 
 @pytest.mark.parametrize(
     ("kind", "smoothing"),
-    [
-        ("absolute", 0.0),
-        ("absolute", 0.5),
-        ("relative", 1.0),
-        ("distances", 0.0),
-        ("gns_particles", 0.0),
-        ("walled", 0.0),
-    ],
+    [("absolute", 0.0), ("absolute", 0.5), ("relative", 1.0), ("gns_particles", 0.0), ("walled", 0.0)],
 )
 def test_gradients_are_those_of_central_differences(kind, smoothing):
     """Over 30 frames, along a random direction of each input, where no particle changes a cell between both sides."""
     simulator = Simulator(network(kind), 60.0, "torch")
     inputs = {name: value.clone().requires_grad_() for name, value in INPUTS.items()}
-    if kind not in ("relative", "distances"):
+    if kind != "relative":
         del inputs["gravity_3"]
     generator = torch.Generator().manual_seed(1)
     weight_TN3 = torch.randn(FRAMES, PARTICLES, 3, generator=generator, dtype=torch.float64)
@@ -98,7 +85,7 @@ def test_gradients_are_those_of_central_differences(kind, smoothing):
         )
 
 
-@pytest.mark.parametrize("kind", ["absolute", "relative", "distances", "gns_particles", "walled"])
+@pytest.mark.parametrize("kind", ["absolute", "relative", "gns_particles", "walled"])
 def test_positions_are_those_of_a_rollout(kind):
     """What nothing replaces moves as in a rollout."""
     simulator = Simulator(network(kind, torch.float32), 60.0, "torch")
@@ -125,30 +112,6 @@ def test_normals_turn_with_their_obstacle():
             point_N3 = (centre + torch.tensor([0.1 + offset * cell_size, 0.03, 0.0]))[None]
             normal_3 = posed.normals(point_N3, still)[0].abs()
             np.testing.assert_allclose(normal_3.numpy(), [share, 0, 0], atol=1e-5)
-
-
-def test_planes_move_with_their_obstacle():
-    """A plate turned by a quarter is as far as it is along the turned axis; an obstacle without cells is not seen, and
-    of two the nearer is. Means over cubes are refused, for heights have gradients."""
-    cell_size, still = 1 / 64, torch.zeros(2, dtype=torch.int64)
-    grid = build_obstacle_grid([shape_obstacle("square", 0.2, (0.5, 0.4921875, 0.5))], cell_size, 0)
-    cells = ObstacleCells.of([grid], planes=True)
-    assert cells is not None
-    quarter = torch.tensor([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-    centre = torch.tensor([0.5, 0.4921875, 0.5])
-    empty = ObstacleCells(torch.zeros(0, dtype=torch.int64), torch.zeros(0, 3), cell_size)
-    placed = [(own, Placement(quarter, centre, torch.tensor([by, 0.0, 0.0]))) for own, by in ((cells, 0.1), (empty, 0))]
-    posed = PosedObstacleCells(empty.key_K, empty.normal_K3, cell_size, tuple(placed))
-    point_N3 = torch.stack([centre + torch.tensor([0.1 + 0.8 * cell_size, 0.03, 0.0]), centre])
-    normal_N3, height_N = posed.planes(point_N3, still)
-    np.testing.assert_allclose(normal_N3.numpy(), [[1, 0, 0], [0, 0, 0]], atol=1e-5)
-    assert float(height_N[0]) == pytest.approx(0.8 * cell_size, rel=1e-3)
-    both = PosedObstacleCells(cells.key_K, cells.normal_K3, cell_size, tuple(placed))
-    near_N3, near_N = both.planes(point_N3 + torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.3 * cell_size, 0.0]]), still)
-    np.testing.assert_allclose(near_N3.numpy(), [[1, 0, 0], [0, 1, 0]], atol=1e-5)
-    np.testing.assert_allclose(near_N.numpy() / cell_size, [0.8, 0.3], atol=1e-3)
-    with pytest.raises(ConfigError, match=r"smoothing must be 0 for weights with network.obstacle_distances"):
-        Simulator(network("distances"), 60.0, "torch").differentiable(scene(), 2, smoothing=0.5)
 
 
 @pytest.mark.parametrize(

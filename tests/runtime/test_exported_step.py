@@ -31,13 +31,7 @@ NETWORKS = {
     # at its walls random states begin, or end, for some particles
     "absolute": {"wall_clearance": (0.1, 0.7)},
     "relative": {"inputs": "relative"},
-    "contacts": {
-        "inputs": "relative",
-        "contact_gate": "cell",
-        "contact_forces": "normal",
-        "rest_threshold": 0.3,
-        "obstacle_distances": True,
-    },
+    "contacts": {"inputs": "relative", "contact_gate": "cell", "contact_forces": "normal", "rest_threshold": 0.3},
 }
 SIZES = [(particles, obstacles) for particles in (1, 216, 4_096, 30_000) for obstacles in (True, False)]
 SCENE = str(config_directory() / "example/own_mesh.yaml")

@@ -4,7 +4,7 @@ from scipy.spatial import cKDTree
 
 from hgn.config import OBSTACLE_SHAPES
 from hgn.scene.distance import closest_points
-from hgn.scene.obstacle_grid import ObstacleGrid, build_obstacle_grid, surface_planes
+from hgn.scene.obstacle_grid import build_obstacle_grid
 from hgn.scene.rotation import euler_rotation
 from hgn.scene.scene import Obstacle
 from hgn.scene.shapes import shape_obstacle
@@ -104,61 +104,6 @@ def test_grid_is_sorted_unique_unit_and_near_the_surface(seed):
     closest = closest_points(pairs, np.tile(corner, (len(centre), 1, 1)))
     distance = np.linalg.norm(closest - pairs, axis=1).reshape(len(centre), -1).min(axis=1)
     assert distance.max() <= np.sqrt(3) / 2 * CELL + 1e-12
-
-
-def distances(point_P3, obstacle):
-    """Of points from a mesh, in cells."""
-    distance_P = np.full(len(point_P3), np.inf)
-    for corner in obstacle.corners:
-        foot_P3 = closest_points(point_P3, np.broadcast_to(corner, (len(point_P3), 3, 3)))
-        distance_P = np.minimum(distance_P, np.linalg.norm(point_P3 - foot_P3, axis=1) / CELL)
-    return distance_P
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_planes_lie_in_a_sheet(seed):
-    """Of a tilted sheet cells and those around know the exact distance, from their own side, away from its rim; at the
-    rim and beyond it they see what is near it, within a cell."""
-    tilted = Obstacle("tilted", (sheet(0.0).vertex_V3 - 0.5) * 0.5 @ TILT.T + 0.5, sheet(0.0).triangle_F3, closed=False)
-    grid = build_obstacle_grid([tilted], CELL, seed)
-    cell_P3, vector_P3 = surface_planes(grid)
-    assert cell_P3.dtype == np.int32 and vector_P3.dtype == np.float32
-    assert len(np.unique(cell_P3, axis=0)) == len(cell_P3) and (np.unique(cell_P3, axis=0) == cell_P3).all()
-    own = {tuple(cell) for cell in grid.cell_K3.tolist()}
-    around = {tuple(np.add(cell, step)) for cell in own for step in np.ndindex(3, 3, 3)}
-    assert {tuple(np.add(cell, 1)) for cell in cell_P3.tolist()} == around
-    centre_P3 = (cell_P3 + 0.5) * CELL
-    length_P = np.linalg.norm(vector_P3.astype(np.float64), axis=1)
-    foot_P3 = centre_P3 - ((length_P - 1) * CELL / length_P)[:, None] * vector_P3
-    normal_3 = TILT[:, 1]
-    inside_P = (np.abs((foot_P3 - tilted.vertex_V3.mean(axis=0)) @ TILT)[:, [0, 2]] < 0.25 - 2 * CELL).all(axis=1)
-    assert inside_P.sum() > 500
-    height_P = (centre_P3 - tilted.vertex_V3[0]) @ normal_3
-    np.testing.assert_allclose(length_P[inside_P] - 1, np.abs(height_P)[inside_P] / CELL, atol=1e-5)
-    side_P = np.sign(height_P)[inside_P]
-    np.testing.assert_allclose((vector_P3 / length_P[:, None])[inside_P], side_P[:, None] * normal_3, atol=1e-5)
-    error_P = length_P - 1 - distances(centre_P3, tilted)
-    assert np.abs(error_P).max() < 1 and np.sqrt(np.mean(error_P**2)) < 0.15
-
-
-def test_planes_of_bodies():
-    """Around closed and open shapes planes are as far as their surfaces, to a tenth of a cell in the mean square."""
-    for shape in OBSTACLE_SHAPES:
-        obstacle = shape_obstacle(shape, 0.3, (0.5, 0.5, 0.5), TILT)
-        cell_P3, vector_P3 = surface_planes(build_obstacle_grid([obstacle], CELL, 0))
-        centre_P3, distance_P = (cell_P3 + 0.5) * CELL, np.linalg.norm(vector_P3, axis=1) - 1
-        error_P = np.abs(distance_P) - distances(centre_P3, obstacle)
-        assert np.sqrt(np.mean(error_P**2)) < 0.15, shape
-
-
-def test_planes_of_nothing_and_of_data_of_before():
-    """An empty grid has none; a grid without distances is refused."""
-    cell_P3, vector_P3 = surface_planes(build_obstacle_grid([], CELL, 0))
-    assert cell_P3.shape == vector_P3.shape == (0, 3)
-    grid = build_obstacle_grid([shape_obstacle("cone", 0.1)], CELL, 0)
-    message = "network.obstacle_distances must be false for data without obstacle_distance, .*; make the data set"
-    with pytest.raises(ConfigError, match=message):
-        surface_planes(ObstacleGrid(grid.cell_size, grid.cell_K3, grid.normal_K3))
 
 
 def test_sheet_normals_point_towards_the_cell_centres():

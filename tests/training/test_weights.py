@@ -16,7 +16,7 @@ from hgn.export import main as export_main
 from hgn.network.build import build_network
 from hgn.runtime.torch_backend import Backend
 from hgn.runtime.weights import WeightsInfo, load_weights, save_weights
-from hgn.schema import ConfigError, from_mapping
+from hgn.schema import ConfigError
 from hgn.training.checkpoint import DataInfo, network_of_checkpoint, network_of_weights, read_checkpoint
 from hgn.training.module import TrainingModule
 
@@ -67,30 +67,6 @@ def test_a_run_begins_with_weights(data, tmp_path, stored_precision, capsys):
     assert train.main(again) == 0
     assert "is not read: the run goes on from" in capsys.readouterr().err
     assert last(tmp_path / "run")["hgn"]["updates"] == 2
-
-
-def test_a_run_begins_to_know_distances(data, tmp_path):
-    """Weights that knew no distances of obstacles begin a run that does: with columns of zeros, before the material."""
-    relative = {"inputs": "relative"}
-    file = weights_file(tmp_path / "begin.safetensors", "fp32", **relative)
-    config = from_mapping(
-        TrainConfig,
-        {"training": {"init_weights": str(file)}, "network": NETWORK | relative | {"obstacle_distances": True}},
-    )
-    begun, own = network_of_weights(config).state_dict(), load_weights(file)[0].state_dict()
-    embedding = config.network.material_embedding
-    for name, tensor in begun.items():
-        if name == "encode.first.weight":
-            assert not tensor[:, -embedding - 4 : -embedding].any()
-            tensor = torch.cat([tensor[:, : -embedding - 4], tensor[:, -embedding:]], dim=1)
-        assert torch.equal(tensor, own[name])
-    known = weights_file(tmp_path / "known.safetensors", "fp32", **relative, obstacle_distances=True)
-    training = replace(config.training, init_weights=str(known))
-    assert network_of_weights(replace(config, training=training)).config.obstacle_distances
-    with pytest.raises(ConfigError, match=r"network.obstacle_distances must be True, as in training.init_weights"):
-        network_of_weights(
-            replace(config, training=training, network=replace(config.network, obstacle_distances=False))
-        )
 
 
 @pytest.mark.parametrize(

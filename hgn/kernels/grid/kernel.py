@@ -12,10 +12,9 @@ import triton.language as tl
 from hgn.kernels.geometry import FULLY, GEOMETRY_COLUMNS, most_around
 from hgn.kernels.obstacles import OBSTACLE_COLUMNS, obstacle_normals
 from hgn.kernels.triton_compat import gdc_launch_dependents, gdc_wait, settle_keys
-from hgn.network.relative import OBSTACLE_REACH, STEPS_AHEAD, WALL_LIMIT
+from hgn.network.relative import STEPS_AHEAD, WALL_LIMIT
 
 NEAREST, STEPS = tl.constexpr(WALL_LIMIT), tl.constexpr(STEPS_AHEAD)  # of relative inputs
-REACH_OF_OBSTACLES = tl.constexpr(OBSTACLE_REACH)
 OVERFLOW = tl.constexpr(1)  # more active cells than capacity
 OUT_OF_WINDOW = tl.constexpr(2)  # a particle is not finite or outside the window
 
@@ -218,11 +217,10 @@ def _with_column(value, number, x):
 @triton.jit
 def _surfaces(
     position, velocity, domain, row, live, scene, obstacle_table, obstacle_cell_size, reach,
-    HISTORY: tl.constexpr, OBSTACLES: tl.constexpr, DISTANCES: tl.constexpr, SYMMETRY: tl.constexpr,
+    HISTORY: tl.constexpr, OBSTACLES: tl.constexpr, SYMMETRY: tl.constexpr,
 ):  # fmt: skip
-    """How near the walls are, and the normals here and ahead, columns 0 to 11 of [N, 16]; with DISTANCES how near these
-    surfaces are, now and a frame later, in the others; and how near any surface is, from 0 beyond its reach to 1, [N].
-    """
+    """How near the walls are, and the normals here and ahead, columns 0 to 11 of [N, 16]; and how near any surface is,
+    from 0 beyond its reach to 1, [N]."""
     column = tl.arange(0, 16)
     axis, upper, walls = column % 3, (column >= 3)[None, :], live[:, None] & (column < 6)[None, :]
     v = tl.load(velocity + row[:, None] * (3 * HISTORY) + axis[None, :], mask=walls, other=0.0)
@@ -245,22 +243,6 @@ def _surfaces(
         normal = obstacle_normals(x, y, z, line, asked, obstacle_cell_size, SYMMETRY)
         found = (normal[0] != 0) | (normal[1] != 0) | (normal[2] != 0)
         ahead = tl.min(tl.where(found & (quarters > 0), quarters, 8), 1)
-        if DISTANCES:
-            length = tl.sqrt(normal[0] * normal[0] + normal[1] * normal[1] + normal[2] * normal[2])
-            divisor = tl.where(found, length, 1.0)
-            normal = (normal[0] / divisor, normal[1] / divisor, normal[2] / divisor)
-            height, closing = (length - 1) * obstacle_cell_size, tl.zeros_like(length)
-            places = (x, y, z)
-            for i in tl.static_range(3):
-                middle = (tl.floor(tl.div_rn(places[i], obstacle_cell_size)) + 0.5) * obstacle_cell_size
-                height += normal[i] * (places[i] - middle)
-                closing += normal[i] * tl.load(v_at + i, mask=asked, other=0.0)
-            height -= closing * time
-            for i in tl.static_range(2):
-                far = (height + closing * i) / (REACH_OF_OBSTACLES * obstacle_cell_size)
-                near = tl.where(found, tl.minimum(tl.maximum(1 - far, 0.0), NEAREST), 0.0)
-                value = _with_column(value, 12 + i, tl.sum(tl.where(quarters == 0, near, 0.0), 1))
-                value = _with_column(value, 14 + i, tl.sum(tl.where(quarters == ahead[:, None], near, 0.0), 1))
         for i in tl.static_range(3):
             value = _with_column(value, 6 + i, tl.sum(tl.where(quarters == 0, normal[i], 0.0), 1))
             there = tl.sum(tl.where(quarters == ahead[:, None], normal[i], 0.0), 1)
@@ -312,8 +294,8 @@ def prepare_particles(
     weight_of, fraction_of, motion, coarsest_of, share_of, place_of, moments, domain, obstacle_table,
     obstacle_cell_size, features, touch_of, disturbed, cell_size, reach, capacity,
     HISTORY: tl.constexpr, LEVELS: tl.constexpr, MOTION: tl.constexpr, SLIPS: tl.constexpr, COLUMNS: tl.constexpr,
-    NORMALS: tl.constexpr, OBSTACLES: tl.constexpr, DISTANCES: tl.constexpr, SYMMETRY: tl.constexpr,
-    FEATURES: tl.constexpr, OVERLAP: tl.constexpr, BLOCK: tl.constexpr,
+    NORMALS: tl.constexpr, OBSTACLES: tl.constexpr, SYMMETRY: tl.constexpr, FEATURES: tl.constexpr,
+    OVERLAP: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Each particle's 8 cells, their weights, and its fraction; with MOTION its parts of the finest cells' mass and
     momentum are added to `motion` [.., 4], and its coarsest cells are told: `coarsest_of` [N, 8], each once and -1
@@ -337,12 +319,12 @@ def prepare_particles(
     if MOTION:
         surfaces, touch = _surfaces(
             position, velocity, domain, row, live, scene, obstacle_table, obstacle_cell_size, reach,
-            HISTORY, OBSTACLES, DISTANCES, SYMMETRY,
+            HISTORY, OBSTACLES, SYMMETRY,
         )  # fmt: skip
         tl.store(touch_of + row, touch, mask=live)
         column = tl.arange(0, 16)[None, :]
         at = features + row[:, None] * FEATURES + (3 * (HISTORY + LEVELS) + column)
-        tl.store(at, surfaces, mask=live[:, None] & (column < 6 + 6 * NORMALS + 4 * DISTANCES))
+        tl.store(at, surfaces, mask=live[:, None] & (column < 6 + 6 * NORMALS))
     x, y, z, fx, fy, fz, inside = _base_cell(position, origin, scene, row, live, low, geometry, cell_size)
     slots = _slots_of(geometry, 0)
     # all corners at once, [BLOCK, 8]: what a thread stores lies side by side
@@ -501,7 +483,7 @@ def _asinh(x):
 def prepare_relative_features(
     velocity, scene_of, material_of, gravity, particle_count, scale, cell_of, weight_of, coarsest_of, share_of, motion,
     parent, geometry, features, touch_of, disturbed, felt, quiet,
-    HISTORY: tl.constexpr, LEVELS: tl.constexpr, NORMALS: tl.constexpr, DISTANCES: tl.constexpr, BY_CELL: tl.constexpr,
+    HISTORY: tl.constexpr, LEVELS: tl.constexpr, NORMALS: tl.constexpr, BY_CELL: tl.constexpr,
     FEATURES: tl.constexpr, OVERLAP: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Features of each particle that no boost and no shift changes, [N, FEATURES]: changes of velocity less gravity,
@@ -516,7 +498,7 @@ def prepare_relative_features(
     HISTORIES: tl.constexpr = 3 * (HISTORY - 1)
     CONTACT: tl.constexpr = HISTORIES + 3 * LEVELS
     WALLS: tl.constexpr = CONTACT + 3
-    MATERIAL: tl.constexpr = WALLS + 6 + 6 * NORMALS + 4 * DISTANCES
+    MATERIAL: tl.constexpr = WALLS + 6 + 6 * NORMALS
     count = tl.load(particle_count)
     if tl.program_id(0) * BLOCK >= count:
         if OVERLAP:

@@ -63,9 +63,7 @@ class Window:
 
 @dataclass(frozen=True, eq=False)
 class ObstacleHash:
-    """One scene's obstacle cells in hash buckets: entries of bucket b are rows bucket_B[b] to bucket_B[b + 1]. Their
-    normals, or vectors of planes (hgn.network.obstacles).
-    """
+    """One scene's obstacle cells in hash buckets: entries of bucket b are rows bucket_B[b] to bucket_B[b + 1]."""
 
     bucket_B: torch.Tensor  # int32
     key_K: torch.Tensor  # int64
@@ -268,8 +266,7 @@ class DeviceGrid:
             share_of=self.share_N8, place_of=self.place_N3, moments=self.moment_C, touch_of=self.touch_N,
             disturbed=self.disturbed_C2, cell_size=self.cell_size,
             reach=config.contact_reach_cells * config.cell_size, capacity=self.capacities[0], LEVELS=self.levels,
-            MOTION=config.relative, SLIPS=config.slips, DISTANCES=int(config.obstacle_distances), COLUMNS=SUMS,
-            OVERLAP=overlap, launch_pdl=overlap,
+            MOTION=config.relative, SLIPS=config.slips, COLUMNS=SUMS, OVERLAP=overlap, launch_pdl=overlap,
         )  # fmt: skip
         if not config.relative:
             wall_maximum = config.wall_distance_cells * config.cell_size
@@ -287,8 +284,8 @@ class DeviceGrid:
             share_of=self.share_N8, motion=self.motion_C4, parent=self._parent, geometry=self.geometry,
             features=self.feature_NF, touch_of=self.touch_N, disturbed=self.disturbed_C2, felt=self.felt_C2,
             quiet=QUIET, HISTORY=config.velocity_history, LEVELS=self.levels, NORMALS=int(config.obstacle_features),
-            DISTANCES=int(config.obstacle_distances), BY_CELL=config.gates_by_cell, FEATURES=self.features,
-            OVERLAP=overlap, BLOCK=PARTICLE_BLOCK, launch_pdl=overlap,
+            BY_CELL=config.gates_by_cell, FEATURES=self.features, OVERLAP=overlap, BLOCK=PARTICLE_BLOCK,
+            launch_pdl=overlap,
         )  # fmt: skip
 
     def balance(self, output: torch.Tensor, count: torch.Tensor) -> None:
