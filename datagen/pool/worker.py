@@ -11,7 +11,7 @@ import time
 import traceback
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
@@ -69,7 +69,7 @@ class MadeScene:
     task: SceneTask
     scene: Parcel[Scene]
     obstacle_grid: ObstacleGrid | None  # none: it follows, for the solver does not need it
-    collider: Parcel[Any] = Parcel(None)  # what the solver makes of the obstacles
+    collider: Parcel[Any] = field(default_factory=lambda: Parcel(None))  # what the solver makes of the obstacles
 
 
 @dataclass(frozen=True)

@@ -1,10 +1,11 @@
 """Episodes to shards: each finished episode is staged at once, a shard is published when its range is complete.
 
 Every file appears whole or not at all, in this order: `.staging/<key>.tar`, the shard, the manifest; staged files
-go last. What is published is on the disk; what is staged gets there when its shard lacks others for a while, so that
-most episodes are written once: a loss of power may take the last seconds of them, which are then made again. So after a crash at any point the state of the folder alone says what is left to do, and no finished
-episode is simulated again. Several generators may write to one folder: each claims the shards that it makes, the
-first to publish an episode wins, and the manifest is only changed under its lock, on top of what the others wrote.
+go last. So after a crash at any point the state of the folder alone says what is left to do, and no finished
+episode is simulated again. What is published is on the disk. What is staged is brought there when its shard lacks
+others for a while, so that most episodes are written once: a loss of power may take the last seconds of them.
+Several generators may write to one folder: each claims the shards that it makes, the first to publish an episode wins,
+and the manifest is only changed under its lock, on top of what the others wrote.
 """
 
 from __future__ import annotations
