@@ -1,6 +1,7 @@
 """The pool: whatever happens to its workers, the data set comes out whole, and no process is left behind."""
 
 import multiprocessing
+import pickle
 import shutil
 import tarfile
 from pathlib import Path
@@ -12,7 +13,7 @@ from written_files import Recorder, hashes, simulated
 from datagen.pool.local_workers import LocalWorker, LocalWorkerFactory
 from datagen.pool.plan import SceneTask, scene_seed
 from datagen.pool.pool import Pool, Stopped
-from datagen.pool.worker import Backend, MadeScene, Worker
+from datagen.pool.worker import Backend, MadeScene, Parcel, Worker
 from datagen.pool.worker_plan import WorkerPlan, plan_workers, visible_gpus
 from datagen.pool.writer import DatasetWriter
 from hgn.config import DatagenConfig, DatasetConfig, MpmConfig, SceneConfig
@@ -46,6 +47,27 @@ def test_whole_dataset(make_config, small_dataset, backend, tmp_path):
     assert hashes(Path(config.dataset.folder)) == hashes(small_dataset)
     assert len(recorder.episodes) == 8 and len(recorder.shards) == 7
     assert {path.suffix for path in Path(config.dataset.folder).iterdir()} == {".tar", ".json", ""}
+
+
+class Counted:
+    """Counts how often one was read."""
+
+    read = 0
+
+    def __init__(self):
+        self.kept = True
+
+    def __setstate__(self, state):
+        Counted.read += 1
+        self.__dict__.update(state)
+
+
+def test_a_parcel_is_read_where_it_is_opened():
+    """Who passes it on only copies its bytes, and who opens it twice reads it once."""
+    there = pickle.loads(pickle.dumps(pickle.loads(pickle.dumps(Parcel(Counted())))))
+    assert Counted.read == 0
+    assert there.open().kept and there.open() is there.open() and Counted.read == 1
+    assert pickle.loads(pickle.dumps(there)).open().kept and Counted.read == 2
 
 
 def test_long_episodes(make_config, backend):
