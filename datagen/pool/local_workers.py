@@ -170,11 +170,11 @@ def _make_scenes(connection: Connection, send: _Sender, config: DatagenConfig, b
 class _Inbox:
     """What the pool sends to a solver, read while it simulates: scenes and their number, and grids."""
 
-    def __init__(self, connection: Connection) -> None:
+    def __init__(self, connection: Connection, send: _Sender) -> None:
         self._batches: SimpleQueue[list[MadeScene] | None] = SimpleQueue()
         self._grids: defaultdict[SceneTask, Future[ObstacleGrid | str]] = defaultdict(Future)
         self._lock = threading.Lock()
-        threading.Thread(target=self._read, args=(connection,), name="inbox", daemon=True).start()
+        threading.Thread(target=self._read, args=(connection, send), name="inbox", daemon=True).start()
 
     def batches(self) -> Iterator[list[MadeScene]]:
         """Until the pool has gone."""
@@ -194,19 +194,22 @@ class _Inbox:
         with self._lock:
             return self._grids[task]
 
-    def _read(self, connection: Connection) -> None:
+    def _read(self, connection: Connection, send: _Sender) -> None:
         batch: list[MadeScene] = []
-        for message in _received(connection):
-            if isinstance(message, BuiltGrid):
-                self._coming(message.task).set_result(message.grid)
-            elif isinstance(message, MadeScene):
-                message.scene.open()
-                message.collider.open()
-                batch.append(message)
-            else:
-                assert message == len(batch)
-                self._batches.put(batch)
-                batch = []
+        try:
+            for message in _received(connection):
+                if isinstance(message, BuiltGrid):
+                    self._coming(message.task).set_result(message.grid)
+                elif isinstance(message, MadeScene):
+                    message.scene.open()
+                    message.collider.open()
+                    batch.append(message)
+                else:
+                    self._batches.put(batch)
+                    batch = []
+        except Exception as error:  # noqa: BLE001 - not swallowed: the parent stops with this text
+            send(*error_message(error))
+            os._exit(1)  # the parent may be sending, and would wait for ever for somebody who reads
         self._batches.put(None)
         with self._lock:
             for grid in self._grids.values():
@@ -225,7 +228,7 @@ def _solve(
     if gpu is not None:
         os.environ["CUDA_VISIBLE_DEVICES"] = gpu
     config_hash = identity_hash(dataset_identity(config))
-    inbox = _Inbox(connection)
+    inbox = _Inbox(connection, send)
     on_gpu = threads is None
     if on_gpu:  # it compiles while the first scenes are made
         pkgutil.resolve_name(backend.warm_up)(config.scene, config.mpm, first_launch)

@@ -22,7 +22,7 @@ from hgn.data.statistics import episode_statistics, merge_statistics
 from hgn.data.verification import file_sha256
 from hgn.scene.episode import Episode
 from hgn.schema import ConfigError
-from hgn.system.files import sync_file, temporary_file
+from hgn.system.files import errors_name, sync_file, temporary_file
 
 STAGING_NAME = ".staging"
 _COPY_BYTES = 1 << 22
@@ -67,7 +67,7 @@ def stage_parts(folder: Path, key: str, parts: Iterable[bytes]) -> None:
 
 def sync_staged(path: Path) -> None:
     """Brings a staged file to the disk; nothing where it has gone, with its shard. Raises: OSError (a full disk)."""
-    with contextlib.suppress(FileNotFoundError), path.open("rb") as file:
+    with errors_name(path), contextlib.suppress(FileNotFoundError), path.open("rb") as file:
         sync_file(file)
 
 

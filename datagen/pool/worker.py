@@ -51,12 +51,15 @@ class Parcel(Generic[_Value]):
         self._bytes: bytes | None = None
 
     def open(self) -> _Value:
-        if self._bytes is not None:
-            self._value, self._bytes = pickle.loads(self._bytes), None
+        data = self._bytes
+        if data is not None:
+            self._value = pickle.loads(data)
+            self._bytes = None
         return self._value  # type: ignore[return-value]
 
     def __getstate__(self) -> bytes:
-        return pickle.dumps(self._value, pickle.HIGHEST_PROTOCOL) if self._bytes is None else self._bytes
+        data = self._bytes
+        return pickle.dumps(self._value, pickle.HIGHEST_PROTOCOL) if data is None else data
 
     def __setstate__(self, state: bytes) -> None:
         self._value, self._bytes = None, state

@@ -3,7 +3,7 @@
 Every file appears whole or not at all, in this order: `.staging/<key>.tar`, the shard, the manifest; staged files
 go last. So after a crash at any point the state of the folder alone says what is left to do, and no finished
 episode is simulated again. What is published is on the disk. What is staged is brought there when its shard lacks
-others for a while, so that most episodes are written once: a loss of power may take the last seconds of them.
+others for a while, so that most episodes are written once: a loss of power may take others that wait to be packed.
 Several generators may write to one folder: each claims the shards that it makes, the first to publish an episode wins,
 and the manifest is only changed under its lock, on top of what the others wrote.
 """
@@ -111,8 +111,6 @@ class DatasetWriter:
     ) -> None:
         try:
             self._packers.shutdown(cancel_futures=True)
-            for episode in self._staged:  # who ends early leaves these for long, perhaps
-                sync_staged(staged_path(self.folder, *episode))
             for packing in self._packing.values():
                 if not packing.cancelled() and packing.exception() is None:
                     packing.result()[0].close()
@@ -341,7 +339,7 @@ class DatasetWriter:
                 self._report(f"{error}; the episode is made again")
                 path.unlink()
             else:
-                self._staged.add((shard.split, index))
+                self.add_staged(shard.split, index)
 
     def _sweep(self) -> None:
         """Removes partial files of writers that are gone: nobody else has claimed what they were to be."""

@@ -71,6 +71,20 @@ def build_obstacle_grid(obstacles, cell_size, seed, domain_size):
     return ObstacleGrid(cell_size, np.zeros((0, 3), np.int32), np.zeros((0, 3), np.float32))
 
 
+class Unreadable:
+    """More than a pipe holds, which nobody can read."""
+
+    def __init__(self):
+        self.content = bytes(1_000_000)
+
+    def __setstate__(self, state):
+        raise ValueError("a collider of another time")
+
+
+def unreadable_collider(scene, band_cells):
+    return Unreadable()
+
+
 def warm_up(scene, config, scenes):
     pass
 

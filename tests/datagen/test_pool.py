@@ -1,5 +1,6 @@
 """The pool: whatever happens to its workers, the data set comes out whole, and no process is left behind."""
 
+import dataclasses
 import multiprocessing
 import pickle
 import shutil
@@ -68,6 +69,13 @@ def test_a_parcel_is_read_where_it_is_opened():
     assert Counted.read == 0
     assert there.open().kept and there.open() is there.open() and Counted.read == 1
     assert pickle.loads(pickle.dumps(there)).open().kept and Counted.read == 2
+
+
+def test_scenes_that_cannot_be_read(make_config, backend):
+    """The solver's thread that reads them tells why and ends, else the parent would wait for it for ever."""
+    unreadable = dataclasses.replace(backend, build_collider="ballistic_solver:unreadable_collider")
+    with pytest.raises(RuntimeError, match=r"(?s)a worker failed.*a collider of another time"):
+        generate(make_config(), unreadable, WorkerPlan(1, 1, 2, 4, 4))
 
 
 def test_long_episodes(make_config, backend):

@@ -187,7 +187,8 @@ def _entries(folder: Path) -> dict[str, int]:
 
 
 class Generation:
-    """Four shards, one of them of a second seed; the second is lost in between, so the index is written anew."""
+    """Four shards, the last two of two episodes, the third of a second seed; the second is lost in between, so the
+    index is written anew. What is staged goes to the disk at once where its shard lacks others."""
 
     def write(self, folder: Path, promised: dict[str, str]) -> None:
         """Adds to what is `promised`, by name, what must be there from now on."""
@@ -195,14 +196,17 @@ class Generation:
             if lost is not None:
                 del promised[lost]
                 (folder / "data" / lost).unlink()
-            with self._writer(folder) as writer:
+            with mock.patch("datagen.pool.writer.STAGED_SECONDS", 0.0), self._writer(folder) as writer:
                 while (shard := writer.claim_next()) is not None:
                     attempt = writer.task("train", shard.first)
                     if shard.first == 2 and attempt.attempt == 0:
                         writer.quarantine(attempt, "drawn by lot")
                         promised["quarantined"] = attempt.key
-                    stage_small(writer, shard.first)
-                    entry = writer.publish_next()
+                    entry = None
+                    for _, index in writer.remaining():
+                        stage_small(writer, index)
+                        entry = writer.publish_next()
+                    entry = entry or writer.publish_next()  # of what an earlier run had staged
                     assert entry is not None
                     promised[entry.name] = entry.sha256
 
@@ -223,8 +227,8 @@ class Generation:
 
     def _writer(self, folder: Path) -> DatasetWriter:
         dataset = DatasetConfig(
-            folder=str(folder / "data"), training_scenes=SHARDS, validation_scenes=0, test_scenes=0, frames=3,
-            episodes_per_shard=1,
+            folder=str(folder / "data"), training_scenes=6, validation_scenes=0, test_scenes=0, frames=3,
+            episodes_per_shard=2,
         )  # fmt: skip
         return DatasetWriter(DatagenConfig(dataset=dataset))
 
