@@ -70,7 +70,7 @@ class LocalWorker(Worker):
         if isinstance(message, list):
             for made in message:  # those of a launch are a gigabyte, which in one piece would be copied several times
                 self.tell(made)
-            message = len(message)
+            message = None
         self.tell(message)
 
     def tell(self, message: object) -> None:
@@ -108,7 +108,7 @@ class LocalWorkerFactory:
         return LocalWorker(_make_scenes, self._config, self._backend)
 
     def start_solver(self, number: int) -> Worker:
-        """A process that simulates lists of MadeScene, told one by one and then how many they are, and takes the
+        """A process that simulates lists of MadeScene, told one by one with None behind the last, and takes the
         BuiltGrid of those that lack one at any time.
 
         Of several it sees one CUDA device alone.
@@ -168,7 +168,7 @@ def _make_scenes(connection: Connection, send: _Sender, config: DatagenConfig, b
 
 
 class _Inbox:
-    """What the pool sends to a solver, read while it simulates: scenes and their number, and grids."""
+    """What the pool sends to a solver, read while it simulates: scenes, None behind those of a launch, and grids."""
 
     def __init__(self, connection: Connection, send: _Sender) -> None:
         self._batches: SimpleQueue[list[MadeScene] | None] = SimpleQueue()
@@ -195,8 +195,8 @@ class _Inbox:
             return self._grids[task]
 
     def _read(self, connection: Connection, send: _Sender) -> None:
-        batch: list[MadeScene] = []
-        try:
+        with _errors_sent(send):
+            batch: list[MadeScene] = []
             for message in _received(connection):
                 if isinstance(message, BuiltGrid):
                     self._coming(message.task).set_result(message.grid)
@@ -207,13 +207,12 @@ class _Inbox:
                 else:
                     self._batches.put(batch)
                     batch = []
-        except Exception as error:  # noqa: BLE001 - not swallowed: the parent stops with this text
-            send(*error_message(error))
-            os._exit(1)  # the parent may be sending, and would wait for ever for somebody who reads
-        self._batches.put(None)
-        with self._lock:
-            for grid in self._grids.values():
-                grid.cancel()
+            self._batches.put(None)
+            with self._lock:
+                for grid in self._grids.values():
+                    grid.cancel()
+            return
+        os._exit(1)  # the parent may be sending, and would wait for ever for somebody who reads
 
 
 def _solve(

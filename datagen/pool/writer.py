@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import dataclasses
 import errno
+import math
 import shutil
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -84,8 +85,8 @@ class DatasetWriter:
             self._in_share[shard.split][shard.first : shard.stop] = b"\1" * len(shard.indices)
         self._begun = 0  # so many shards at the share's beginning are published
         self._claimed: list[ShardRange] = []  # what of that this writer makes
-        self._staged: set[tuple[str, int]] = set()  # and what of these waits in .staging
-        self._unsynced: dict[tuple[str, int], float] = {}  # of those, what is not on the disk yet: since when
+        # and what of these waits in .staging, and not on the disk yet: since when; inf: it is brought there
+        self._staged: dict[tuple[str, int], float] = {}
         self._syncing: list[Future[None]] = []
         self._packers = ThreadPoolExecutor(PACKED_AT_ONCE, "packer")
         self._packing: dict[ShardRange, Future[_Packed]] = {}  # of the shards to be published next
@@ -146,7 +147,7 @@ class DatasetWriter:
 
     def remaining(self) -> list[tuple[str, int]]:
         """The episodes (split, index) of the claimed shards that are not staged, in the order to simulate them."""
-        wanted = {(shard.split, index) for shard in self._claimed for index in shard.indices} - self._staged
+        wanted = {(shard.split, index) for shard in self._claimed for index in shard.indices} - self._staged.keys()
         return sorted(wanted, key=lambda item: generation_place(*item))
 
     @property
@@ -191,8 +192,7 @@ class DatasetWriter:
 
     def add_staged(self, split: str, index: int) -> None:
         """Tells the writer that an episode was staged."""
-        self._staged.add((split, index))
-        self._unsynced[split, index] = time.monotonic()
+        self._staged[split, index] = time.monotonic()
 
     def is_staged(self, split: str, index: int) -> bool:
         """Whether a staged file is there, told or not: a worker may die between the two."""
@@ -230,9 +230,9 @@ class DatasetWriter:
     def _sync_staged(self, ready: Sequence[ShardRange], before: float) -> None:
         """Has what was staged before that time brought to the disk, unless its shard is among the `ready` ones."""
         packed = {(shard.split, index) for shard in ready for index in shard.indices}
-        for episode, since in list(self._unsynced.items()):
+        for episode, since in self._staged.items():
             if since <= before and episode not in packed:
-                del self._unsynced[episode]
+                self._staged[episode] = math.inf
                 self._syncing.append(self._packers.submit(sync_staged, staged_path(self.folder, *episode)))
         for done in [syncing for syncing in self._syncing if syncing.done()]:
             self._syncing.remove(done)
@@ -409,8 +409,7 @@ class DatasetWriter:
 
     def _forget(self, shard: ShardRange) -> None:
         for index in shard.indices:
-            self._staged.discard((shard.split, index))
-            self._unsynced.pop((shard.split, index), None)
+            self._staged.pop((shard.split, index), None)
             staged_path(self.folder, shard.split, index).unlink(missing_ok=True)
         self._claimed.remove(shard)
         self._locks.free(shard)
