@@ -1,11 +1,12 @@
 """python -m tools.curves runs=[runs/obstacles] out=results/NAME: learning curves of runs as PNG and JSON.
 
 One run: loss, one-step errors beside the baselines, and rollout errors, over updates. Several: loss and
-one-step validation error over updates, and the latter over minutes of training, in one panel each.
+one-step validation error over the scenes that were trained on, and the latter over minutes, in one panel each.
 
 The JSON holds {"meta": provenance of the figure, "runs": [{"name", "meta": provenance and settings of the run,
 "rows"}, ...]}, a row for each measurement; `minutes` are those of training, without the time between a stop and the
-next start.
+next start. `scenes` are those of all updates so far: a scene that comes again counts again. Both count on from the
+end of the run that this one began with.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ from tools.report import as_png, new_figure
 # what of a record is kept
 BEGINNINGS = (
     *("update", "minutes", "loss", "learning_rate", "updates_per_second", "scenes_per_second", "gpu_memory_gb"),
-    *("one_step", "baseline", "rollout", "monitor"),
+    *("scenes", "one_step", "baseline", "rollout", "monitor"),
 )
 BASELINE_STYLES = {"constant_velocity": ":", "ballistic_motion": "--", "mean_acceleration": "-."}
 LOSS = "MSE of normalised acceleration"
@@ -45,12 +46,23 @@ class CurvesConfig:
     runs: tuple[str, ...]  # folders of python -m hgn.train, for example [runs/obstacles,runs/gns]
     out: str  # without ending: OUT.png and OUT.json
     names: tuple[str, ...] | None = None  # of the runs in the figure; null: those of the folders
+    # for each run the name of an earlier one that it began with the weights of, or null; null: none did
+    after: tuple[str | None, ...] | None = None
 
     def __post_init__(self) -> None:
         require(len(self.runs) > 0, "runs", "at least one folder of python -m hgn.train", self.runs)
         if self.names is not None:
             rule = f"one for each of the {len(self.runs)} runs"
             require(len(self.names) == len(self.runs), "names", rule, self.names)
+        after = self.after or (None,) * len(self.runs)
+        earlier = [name is None or name in self.labels[:i] for i, name in enumerate(after)]
+        rule = f"for each of the {len(self.runs)} runs null or the name of one before it"
+        require(len(after) == len(self.runs) and all(earlier), "after", rule, self.after)
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """The runs' names in the figure."""
+        return self.names or tuple(Path(run).name for run in self.runs)
 
 
 @dataclass(frozen=True)
@@ -59,14 +71,19 @@ class Run:
 
     name: str
     settings: Mapping[str, Any]
-    records: list[dict[str, float]]  # of metrics.jsonl, each update's last, with `minutes`
+    records: list[dict[str, float]]  # of metrics.jsonl, each update's last, with `minutes` and `scenes`
 
 
 def main(mapping: dict[str, Any]) -> int:
     """Writes <out>.png and <out>.json; returns the exit code."""
     config = from_mapping(CurvesConfig, mapping)
-    names = config.names or tuple(Path(run).name for run in config.runs)
-    runs = [read_run(Path(folder), name) for folder, name in zip(config.runs, names, strict=True)]
+    runs = [read_run(Path(folder), name) for folder, name in zip(config.runs, config.labels, strict=True)]
+    ends = {run.name: run.records[-1] for run in runs if run.records}
+    for run, before in zip(runs, config.after or (None,) * len(runs), strict=True):
+        if before in ends:
+            for record in run.records:
+                record["scenes"] += ends[before]["scenes"]
+                record["minutes"] += ends[before]["minutes"]
     parts = [
         {
             "name": run.name,
@@ -95,6 +112,7 @@ def read_run(folder: Path, name: str) -> Run:
         raise ConfigError(f"{rule}, got {folder} without {error.filename}") from None
     records = [current_metrics(json.loads(line)) for line in lines]
     _add_minutes(records)
+    _add_scenes(records, settings["training"]["batch_scenes"])
     # A run that was stopped and resumed may have repeated some updates: the later record holds.
     latest = {(record["update"], "loss" in record): record for record in records}
     return Run(name, settings, [latest[key] for key in sorted(latest)])
@@ -111,6 +129,14 @@ def _add_minutes(records: list[dict[str, float]]) -> None:
         record["minutes"] = seconds / 60
 
 
+def _add_scenes(records: list[dict[str, float]], of_a_device: int) -> None:
+    """Adds the scenes so far; how many an update had, over all devices, its rates say."""
+    rated = [record for record in records if record.get("updates_per_second")]
+    an_update = round(rated[0]["scenes_per_second"] / rated[0]["updates_per_second"]) if rated else of_a_device
+    for record in records:
+        record["scenes"] = record["update"] * an_update
+
+
 def measurements(records: list[dict[str, float]]) -> list[dict[str, float]]:
     """Records with errors in full, and at most LINES of the loss lines."""
     losses = [i for i, record in enumerate(records) if "loss" in record]
@@ -124,7 +150,7 @@ def measurements(records: list[dict[str, float]]) -> list[dict[str, float]]:
 
 def draw(runs: Sequence[Run]) -> bytes:
     """Of one run: loss and one-step errors over updates, the baselines as lines, and rollout errors. Of several: loss
-    and validation error over updates, and the latter over minutes. PNG bytes.
+    and validation error over scenes, and the latter over minutes. PNG bytes.
     """
     figure, (panels,) = new_figure(1, 3, (15, 4.5))
     last = {name: value for record in runs[0].records for name, value in record.items()}
@@ -162,13 +188,13 @@ def _draw_one(panels: Any, run: Run, last: Mapping[str, float]) -> None:
 
 def _draw_several(panels: Any, runs: Sequence[Run], last: Mapping[str, float]) -> None:
     for i, run in enumerate(runs):
-        label, color = f"{run.name}, {run.settings['training']['batch_scenes']} scenes", f"C{i}"
         losses = [record for record in run.records if "loss" in record]
-        _plot(panels[0], _means(losses, "loss"), "loss", label, color)
-        for panel, against in zip(panels[1:], ("update", "minutes"), strict=True):
-            _plot(panel, run.records, "one_step/validation", "", color, marker="o", against=against)
-    for panel, label in zip(panels, ("updates", "updates", "minutes of training"), strict=True):
+        _plot(panels[0], _means(losses, "loss"), "loss", run.name, f"C{i}", against="scenes")
+        for panel, against in zip(panels[1:], ("scenes", "minutes"), strict=True):
+            _plot(panel, run.records, "one_step/validation", "", f"C{i}", marker="o", against=against)
+    for panel, label in zip(panels, ("scenes trained on", "scenes trained on", "minutes of training"), strict=True):
         panel.set_xlabel(label)
+        panel.set_xscale("log")
     for panel in panels[1:]:
         _plot_baselines(panel, last)
         panel.set_ylabel(ONE_STEP + ", validation")
@@ -185,7 +211,7 @@ def _means(records: list[dict[str, float]], key: str, lines: int = 60) -> list[d
     """Means over neighbouring records, as many as are drawn."""
     step = max(1, len(records) // lines)
     parts = [records[i : i + step] for i in range(0, len(records), step)]
-    return [{"update": part[-1]["update"], key: sum(r[key] for r in part) / len(part)} for part in parts]
+    return [{"scenes": part[-1]["scenes"], key: sum(r[key] for r in part) / len(part)} for part in parts]
 
 
 def _origin(run: Run) -> str:

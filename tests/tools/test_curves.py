@@ -17,14 +17,15 @@ SETTINGS = {
 }
 
 
-def make_run(folder, updates=40, pause=0.0, repeated=0, error=1e-6):
+def make_run(folder, updates=40, pause=0.0, repeated=0, error=1e-6, ranks=1):
     """A run that logs each second; `pause` seconds away after half of its updates, the last `repeated` then again."""
     folder.mkdir(parents=True)
     numbers = [*range(updates // 2), *range(updates // 2 - repeated, updates)]
     lines, now = [], 100.0
     for i, update in enumerate(numbers):
         now += 1 + (pause if i == updates // 2 else 0)
-        lines.append({"update": update, "time": now, "loss": 1 / (i + 1), "episodes": 3})
+        rates = {"updates_per_second": 1.5, "scenes_per_second": 3.0 * ranks}
+        lines.append({"update": update, "time": now, "loss": 1 / (i + 1), "episodes": 3} | rates)
         if update % 10 == 9:
             errors = {"one_step/validation": error / update, "trivial/validation_constant_velocity": 1e-5}
             lines.append({"update": update, "time": now, "rollout/mse_frame_10": 1e-4} | errors)
@@ -53,6 +54,25 @@ def test_several_runs_have_a_colour_and_a_name_each(tmp_path):
     picture = Image.open(io.BytesIO((tmp_path / "curves.png").read_bytes())).convert("RGB")
     colours = {colour for _, colour in picture.getcolors(1 << 24)}
     assert {(31, 119, 180), (255, 127, 14)} <= colours  # both lines are drawn
+
+
+def test_runs_are_compared_over_scenes_and_one_goes_on_where_another_ended(tmp_path):
+    """Two ranks of two scenes: four an update; what began with the weights of `first` begins where it ended."""
+    first = make_run(tmp_path / "first", ranks=2)
+    names = ["first", "more", "alone"]
+    runs = [str(first), str(make_run(tmp_path / "more")), str(make_run(tmp_path / "alone"))]
+    options = {"runs": runs, "names": names, "after": [None, "first", None], "out": str(tmp_path / "curves")}
+    assert main(options) == 0
+    ends = [run["rows"][-1] for run in json.loads((tmp_path / "curves.json").read_text())["runs"]]
+    assert [row["update"] for row in ends] == [39, 39, 39]
+    assert [row["scenes"] for row in ends] == [39 * 4, 39 * 4 + 39 * 2, 39 * 2]
+    assert ends[1]["minutes"] == pytest.approx(2 * ends[0]["minutes"]) and ends[2]["minutes"] == ends[0]["minutes"]
+
+
+@pytest.mark.parametrize("after", [["x"], [None, "z"], ["y", None], [None, "y"]])
+def test_what_a_run_goes_on_from_comes_before_it(tmp_path, after):
+    with pytest.raises(ConfigError, match=r"after must be .* got"):
+        main({"runs": ["x", "y"], "names": ["x", "y"], "after": after, "out": str(tmp_path / "curves")})
 
 
 def test_time_of_a_stop_is_no_training(tmp_path):
