@@ -54,15 +54,19 @@ class CurvesConfig:
         if self.names is not None:
             rule = f"one for each of the {len(self.runs)} runs"
             require(len(self.names) == len(self.runs), "names", rule, self.names)
-        after = self.after or (None,) * len(self.runs)
-        earlier = [name is None or name in self.labels[:i] for i, name in enumerate(after)]
+        earlier = [name is None or name in self.labels[:i] for i, name in enumerate(self.begun_with)]
         rule = f"for each of the {len(self.runs)} runs null or the name of one before it"
-        require(len(after) == len(self.runs) and all(earlier), "after", rule, self.after)
+        require(len(earlier) == len(self.runs) and all(earlier), "after", rule, self.after)
 
     @property
     def labels(self) -> tuple[str, ...]:
         """The runs' names in the figure."""
         return self.names or tuple(Path(run).name for run in self.runs)
+
+    @property
+    def begun_with(self) -> tuple[str | None, ...]:
+        """For each run the name of the one whose weights it began with."""
+        return self.after or (None,) * len(self.runs)
 
 
 @dataclass(frozen=True)
@@ -79,7 +83,7 @@ def main(mapping: dict[str, Any]) -> int:
     config = from_mapping(CurvesConfig, mapping)
     runs = [read_run(Path(folder), name) for folder, name in zip(config.runs, config.labels, strict=True)]
     ends = {run.name: run.records[-1] for run in runs if run.records}
-    for run, before in zip(runs, config.after or (None,) * len(runs), strict=True):
+    for run, before in zip(runs, config.begun_with, strict=True):
         if before in ends:
             for record in run.records:
                 record["scenes"] += ends[before]["scenes"]
