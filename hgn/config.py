@@ -107,6 +107,9 @@ class SceneConfig:
     zero_gravity_fraction: Fraction[float] = 0.0  # of the scenes
     tilted_gravity_fraction: Fraction[float] = 0.0  # of the scenes, with gravity of any direction and …
     maximum_tilted_gravity: NonNegative[float] = 19.6  # … any size up to this, domain units per second squared
+    # of the scenes with gravity and without collisions, in which four obstacles are a funnel with the groups above it …
+    funnel_scene_fraction: Fraction[float] = 0.0
+    funnel_hole: tuple[float, float] = (0.035, 0.14)  # … that leaves a square hole, whose side is in this range
 
     def __post_init__(self) -> None:
         require_bounds(self)
@@ -116,8 +119,11 @@ class SceneConfig:
         for name in ("pure_direction_fraction", "colliding_scene_fraction"):
             moving = self.maximum_initial_speed > 0 or getattr(self, name) == 0
             require(moving, "maximum_initial_speed", f"above 0 where {name} is", self.maximum_initial_speed)
-        low, high = self.obstacle_size
-        require(0 < low <= high < math.inf, "obstacle_size", "0 < smallest <= largest", list(self.obstacle_size))
+        for name in ("obstacle_size", "funnel_hole"):
+            low, high = getattr(self, name)
+            require(0 < low <= high < math.inf, name, "0 < smallest <= largest", [low, high])
+        room = self.funnel_scene_fraction == 0 or self.obstacle_count >= 4
+        require(room, "obstacle_count", "at least 4 where funnel_scene_fraction is above 0", self.obstacle_count)
         for i, name in enumerate(self.obstacle_shapes):
             rule = f"one of {', '.join(OBSTACLE_SHAPES)}, or a mesh file ({', '.join(MESH_SUFFIXES)})"
             require(name in OBSTACLE_SHAPES or is_mesh_file(name), f"obstacle_shapes[{i}]", rule, name)

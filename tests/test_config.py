@@ -47,6 +47,11 @@ RULES = {
         ({"obstacle_shapes": ("torus",)}, r"obstacle_shapes\[0\] must be one of half_box, .*, or a mesh file"),
         ({"pure_direction_fraction": 1.5}, "pure_direction_fraction must be .*, got 1.5"),
         ({"colliding_scene_fraction": -0.1}, "colliding_scene_fraction must be .*, got -0.1"),
+        ({"funnel_hole": (0.1, 0.05)}, r"funnel_hole must be 0 < smallest <= largest, got \[0.1, 0.05\]"),
+        (
+            {"funnel_scene_fraction": 0.5, "obstacle_count": 3},
+            "obstacle_count must be at least 4 where funnel_scene_fraction is above 0, got 3",
+        ),
         ({"zero_gravity_fraction": float("nan")}, "zero_gravity_fraction must be .*, got nan"),
         ({"maximum_tilted_gravity": float("inf")}, "maximum_tilted_gravity must be .*, got inf"),
         (

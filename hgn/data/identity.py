@@ -23,7 +23,7 @@ _NOT_PHYSICS = ("device", "scenes_per_launch")
 # of scenes, younger than some data sets: where they are at their defaults the data set is as it was without them
 _LATER_OPTIONS = (
     "pure_direction_fraction", "colliding_scene_fraction", "zero_gravity_fraction", "tilted_gravity_fraction",
-    "maximum_tilted_gravity",
+    "maximum_tilted_gravity", "funnel_scene_fraction", "funnel_hole",
 )  # fmt: skip
 
 
@@ -37,8 +37,9 @@ def dataset_identity(config: DatagenConfig) -> dict[str, Any]:
     shapes = config.scene.obstacle_shapes
     named = [f"{Path(shape).name} {mesh_sha256(shape)}" if is_mesh_file(shape) else shape for shape in shapes]
     scene = stored_names(to_mapping(config.scene), "scene")
+    defaults = to_mapping(SceneConfig())
     for option in _LATER_OPTIONS:
-        if scene[option] == getattr(SceneConfig, option):
+        if scene[option] == defaults[option]:
             del scene[option]
     lengths: dict[str, float] = {"frames": config.dataset.frames}
     if config.dataset.long_fraction > 0:

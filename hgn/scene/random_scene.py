@@ -16,6 +16,7 @@ import numpy as np
 
 from hgn.config import SceneConfig, is_mesh_file
 from hgn.scene.distance import contains
+from hgn.scene.funnel import Funnel, draw_funnel
 from hgn.scene.group import WALL_CELLS, Region, fill, particle_count, points_in_ball, region_of
 from hgn.scene.material import material_index
 from hgn.scene.rotation import quaternion_rotation, rotate
@@ -60,8 +61,9 @@ def generate_scene(config: SceneConfig, seed: int) -> Scene:
     Its gravity is the config's, none, or a drawn one.
 
     Obstacles lie completely inside the domain, `clearance_cells` solver cells from each other and none inside
-    another; groups keep the same distance to obstacles, to each other and to the solver's walls. Items are
-    placed by rejection: a new place, then a new size, shape and orientation, then a new layout.
+    another, but for the four squares of a funnel, which cross; groups keep the same distance to obstacles, to
+    each other and to the solver's walls. Items are placed by rejection: a new place, then a new size, shape and
+    orientation, then a new layout.
     `Scene.specification` records every choice in plain JSON types.
 
     Raises: ConfigError when an item finds no room, with what to change.
@@ -69,16 +71,18 @@ def generate_scene(config: SceneConfig, seed: int) -> Scene:
     require(isinstance(seed, int) and seed >= 0, "seed", "a whole number >= 0", seed)
     rng = np.random.Generator(np.random.PCG64(seed))
     # the rest of a scene is the same without them
-    lone_rng, motion_rng = (np.random.Generator(np.random.PCG64([seed, stream])) for stream in (1, 2))
+    lone_rng, motion_rng, funnel_rng = (np.random.Generator(np.random.PCG64([seed, stream])) for stream in (1, 2, 3))
     gravity = _draw_gravity(config, motion_rng)
     colliding = motion_rng.random() < config.colliding_scene_fraction
     if colliding:
-        config = replace(config, obstacle_count=0)
+        config = replace(config, obstacle_count=0, funnel_scene_fraction=0.0)
+    funnelled = any(gravity) and funnel_rng.random() < config.funnel_scene_fraction
     failure = ""
     for _ in range(LAYOUTS):
         try:
-            obstacles = _place_obstacles(config, rng)
-            groups = _place_groups(config, obstacles, rng)
+            funnel, sheets = _place_funnel(config, gravity, funnel_rng) if funnelled else (None, [])
+            obstacles = _place_obstacles(config, sheets, rng)
+            groups = _place_groups(config, obstacles, funnel, rng)
             lone = _place_lone_particles(config, obstacles, [region for _, region in groups], lone_rng)
         except _NoRoomError as error:
             failure = str(error)
@@ -90,9 +94,53 @@ def generate_scene(config: SceneConfig, seed: int) -> Scene:
     raise ConfigError(f"{failure} ({LAYOUTS} layouts, seed {seed})")
 
 
-def _place_obstacles(config: SceneConfig, rng: np.random.Generator) -> list[_Placed]:
-    placed: list[_Placed] = []
-    for index in range(config.obstacle_count):
+@dataclass(frozen=True)
+class _PlacedFunnel:
+    """A funnel, and where the middle of its hole is."""
+
+    funnel: Funnel
+    hole_3: np.ndarray
+
+    def place(self, rng: np.random.Generator) -> np.ndarray:
+        """Above the hole and the inner part of the squares, uniform."""
+        low_3, high_3 = self.funnel.low_3, self.funnel.high_3
+        local_3 = low_3 + (high_3 - low_3) * rng.random(3)
+        return self.hole_3 + rotate(local_3[None], self.funnel.rotation_33)[0]
+
+
+def _place_funnel(
+    config: SceneConfig, gravity: Vector, rng: np.random.Generator
+) -> tuple[_PlacedFunnel, list[_Placed]]:
+    domain = np.array(config.domain_size)
+    for _ in range(SHAPES_PER_ITEM * PLACES_PER_SHAPE):
+        funnel = draw_funnel(config, gravity, rng)
+        first_3 = -funnel.room_P3.min(axis=0) + ROUNDING * domain
+        span_3 = domain - ROUNDING * domain - funnel.room_P3.max(axis=0) - first_3
+        if (span_3 >= 0).all():
+            hole_3 = first_3 + span_3 * rng.random(3)
+            return _PlacedFunnel(funnel, hole_3), [_place_square(funnel, hole_3, index) for index in range(4)]
+    raise _NoRoomError(
+        "funnel_scene_fraction must be 0 where no funnel has room, got "
+        f"{config.funnel_scene_fraction:g}; lower it, obstacle_size or group_size, or raise domain_size"
+    )
+
+
+def _place_square(funnel: Funnel, hole_3: np.ndarray, index: int) -> _Placed:
+    rotation_33, centre_3 = quaternion_rotation(funnel.quaternion[index]), hole_3 + funnel.centre_43[index]
+    position = _triple(centre_3)
+    square = shape_obstacle("square", funnel.size, position, rotation_33, f"obstacle_{index}_square")
+    unit_surface_P3, unit_gap = _unit_surface_points("square")
+    point_P3 = rotate(funnel.size * unit_surface_P3, rotation_33) + centre_3
+    low_3, high_3 = square.vertex_V3.min(axis=0), square.vertex_V3.max(axis=0)
+    record: dict[str, Any] = {"shape": "square", "size": funnel.size}
+    record |= {"position": list(position), "quaternion": list(funnel.quaternion[index])}
+    return _Placed(square, point_P3, funnel.size * unit_gap, point_tree(point_P3), low_3, high_3, record)
+
+
+def _place_obstacles(config: SceneConfig, sheets: list[_Placed], rng: np.random.Generator) -> list[_Placed]:
+    """`sheets` are placed, and count."""
+    placed = list(sheets)
+    for index in range(len(sheets), config.obstacle_count):
         placed.append(_place_obstacle(config, placed, index, rng))
     return placed
 
@@ -146,10 +194,12 @@ def _too_near(obstacle: Obstacle, point: np.ndarray, gap: float, other: _Placed,
     return bool(holds.any())
 
 
-def _place_groups(config: SceneConfig, obstacles: list[_Placed], rng: np.random.Generator) -> list[tuple[str, Region]]:
+def _place_groups(
+    config: SceneConfig, obstacles: list[_Placed], funnel: _PlacedFunnel | None, rng: np.random.Generator
+) -> list[tuple[str, Region]]:
     placed: list[tuple[str, Region]] = []
     for index in range(config.group_count):
-        placed.append(_place_group(config, obstacles, [region for _, region in placed], index, rng))
+        placed.append(_place_group(config, obstacles, [region for _, region in placed], funnel, index, rng))
     return placed
 
 
@@ -157,6 +207,7 @@ def _place_group(
     config: SceneConfig,
     obstacles: list[_Placed],
     groups: list[Region],
+    funnel: _PlacedFunnel | None,
     index: int,
     rng: np.random.Generator,
 ) -> tuple[str, Region]:
@@ -167,7 +218,10 @@ def _place_group(
     for _ in range(SHAPES_PER_ITEM if (span >= 0).all() else 0):
         shape = _choice(config.group_shapes, rng)
         for _ in range(PLACES_PER_SHAPE):
-            region = region_of(shape, size, _triple(margin + span * rng.random(3)))
+            centre_3 = margin + span * rng.random(3) if funnel is None else funnel.place(rng)
+            if (centre_3 < margin).any() or (centre_3 > margin + span).any():
+                continue
+            region = region_of(shape, size, _triple(centre_3))
             if any(region.distance(other) < clearance for other in groups):
                 continue
             if any(_blocked(region, item, clearance) for item in obstacles):

@@ -23,6 +23,19 @@ def quaternion_rotation(quaternion: tuple[float, float, float, float]) -> np.nda
     )
 
 
+def quaternion_product(
+    left: tuple[float, float, float, float], right: tuple[float, float, float, float]
+) -> tuple[float, float, float, float]:
+    """The quaternion (w, x, y, z) of the rotation by `right` and then by `left`."""
+    (a, b, c, d), (e, f, g, h) = left, right
+    return (
+        a * e - b * f - c * g - d * h,
+        a * f + b * e + c * h - d * g,
+        a * g - b * h + c * e + d * f,
+        a * h + b * g - c * f + d * e,
+    )
+
+
 def euler_rotation(degrees: Vector) -> np.ndarray:
     """The matrix, float64 [3, 3], that turns about the fixed x axis, then y, then z.
 

@@ -55,6 +55,7 @@ def settings_of_imported(mapping: Mapping[str, Any]) -> dict[str, Any]:
         "moving_group_fraction": 1.0,
         "pure_direction_fraction": 0.0,
         "colliding_scene_fraction": 0.0,
+        "funnel_scene_fraction": 0.0,
     }
     return mapping
 

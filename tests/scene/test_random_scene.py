@@ -241,6 +241,39 @@ def test_colliding_scenes():
     assert not lone.velocity_N3.any() and pairs > 0
 
 
+def test_funnels():
+    """Of the scenes with gravity all have a funnel: four squares within the domain, whose inner edges are a square of
+    the hole's side, and groups above the hole's plane. The same seed gives the same bits, and another obstacle keeps
+    its distance."""
+    config = replace(MOVING, obstacle_count=5, colliding_scene_fraction=0.0, funnel_scene_fraction=1.0)
+    holes = []
+    for seed in range(30):
+        scene = generate_scene(config, seed)
+        assert digest(scene) == digest(generate_scene(config, seed)) and len(scene.obstacles) == 5
+        if not any(scene.gravity):
+            continue
+        up_3 = -np.array(scene.gravity) / np.linalg.norm(scene.gravity)
+        corner_S43 = np.stack([square.vertex_V3 for square in scene.obstacles[:4]])
+        assert (corner_S43 >= 0).all() and (corner_S43 <= 1).all()
+        assert all(square.name.endswith("_square") for square in scene.obstacles[:4])
+        hole_S3 = corner_S43[:, :2].mean(axis=1)  # the middle of each inner edge
+        np.testing.assert_allclose(hole_S3 @ up_3, (hole_S3 @ up_3).mean(), atol=1e-6)
+        across = [np.linalg.norm(hole_S3[i] - hole_S3[i + 2]) for i in range(2)]
+        holes.append(across[0])
+        assert across[0] == pytest.approx(across[1], abs=1e-6) and abs(across[0] - 0.0875) < 0.0525 + 1e-6
+        assert (hole_S3[0] - hole_S3[2]) @ (hole_S3[1] - hole_S3[3]) == pytest.approx(0, abs=1e-6)
+        assert ((corner_S43 @ up_3) >= (hole_S3 @ up_3).min() - 1e-6).all()  # they rise outwards
+        for group in scene.specification["groups"]:
+            assert np.array(group["position"]) @ up_3 > (hole_S3 @ up_3).mean()
+        assert scene.obstacles[4].vertex_V3.min() >= 0
+    assert len(holes) > 15 and min(holes) < 0.06 and max(holes) > 0.115
+    some = [generate_scene(replace(config, funnel_scene_fraction=0.3), seed) for seed in range(40)]
+    shapes = [{record["shape"] for record in scene.specification["obstacles"][:4]} for scene in some]
+    assert 0.1 < np.mean([shape == {"square"} for shape in shapes]) < 0.5
+    with pytest.raises(ConfigError, match=r"funnel_scene_fraction must be 0 where no funnel has room, got 1;"):
+        generate_scene(replace(config, group_size=0.3, zero_gravity_fraction=0.0), 0)
+
+
 def test_draws_cover_their_ranges():
     """Over 60 scenes every shape and material appears, and sizes fill their range without a strong bias."""
     scenes = [generate_scene(PAPER, seed) for seed in range(60)]
@@ -371,6 +404,7 @@ def test_motion_is_identity_only_where_there_is_some():
     for config in (
         DatagenConfig(scene=SceneConfig(zero_gravity_fraction=0.1)),
         DatagenConfig(scene=SceneConfig(tilted_gravity_fraction=0.1, maximum_tilted_gravity=5.0)),
+        DatagenConfig(scene=SceneConfig(funnel_scene_fraction=0.1)),
         DatagenConfig(dataset=DatasetConfig(long_fraction=0.1)),
     ):
         assert identity_hash(dataset_identity(config)) != identity_hash(before)
