@@ -29,6 +29,8 @@ from tools.stability.network import (
     initial_states,
     main,
     misfallen,
+    mispassed,
+    passing,
     share_of_way,
     solver_beside,
     solver_of,
@@ -226,6 +228,77 @@ def test_what_spreads_beside_the_solver():
         other = [row | {name: factor * row[name] for name, factor in change.items()} for row in truth]
         assert beyond in misfallen(other, truth)
     assert "did not come to the end" in misfallen(None, truth)
+
+
+def test_funnels_have_the_holes_that_are_asked_for():
+    """Sheets leave a square hole of so many of the network's cells, at the height where what falls is counted. The cube
+    is above it, in the middle, and keeps the clearance of scenes from all sheets. Without the solver, obstacles in the
+    input, or enough frames there is no such case."""
+    config = StabilityNetworkConfig("", cases=("hole",), scene=SceneConfig(domain_size=(1.5, 1.0, 2.0)))
+    network = network_of(cell_size=0.03).config
+    made = list(cases(config, network))
+    assert [case.name for case in made] == [f"passes holes, {name}" for name in MATERIAL_NAMES]
+    assert all(case.beside_solver and case.frames == 150 for case in made)
+    for cells, scene in zip(made[0].hole_cells, made[0].scenes, strict=True):
+        middle_3 = 0.5 * np.array(scene.domain_size)
+        for sheet in scene.obstacles:
+            corner_43 = sheet.vertex_V3 - middle_3
+            lowest_23 = corner_43[np.argsort(corner_43[:, 1])[:2]]
+            assert middle_3[1] + lowest_23[:, 1] == pytest.approx(made[0].hole_height, abs=1e-6)
+            # an edge of the hole: across its axis at half the hole's width, and beyond the hole along it
+            aside_23 = np.sort(np.abs(lowest_23[:, [0, 2]]), axis=1)
+            assert aside_23 == pytest.approx(np.tile([0.5 * cells * 0.03, 0.18], (2, 1)), abs=1e-6)
+            plane_3 = np.cross(corner_43[1] - corner_43[0], corner_43[2] - corner_43[0])
+            off_N = (scene.position_N3 - middle_3 - corner_43[0]) @ (plane_3 / np.linalg.norm(plane_3))
+            assert np.abs(off_N).min() > 2 * scene.cell_size and abs(np.sign(off_N).sum()) == len(off_N)
+        assert scene.position_N3.mean(axis=0)[[0, 2]] == pytest.approx(middle_3[[0, 2]], abs=5e-3)
+    assert not list(cases(config, network_of(obstacle_features=False).config))
+    assert not any(list(cases(replace(config, **change), network)) for change in ({"solver": False}, {"frames": 149}))
+
+
+@pytest.mark.parametrize(
+    ("through", "leaked", "beyond"),
+    [
+        (0.7, 0.0, None),
+        (0.55, 0.4, None),
+        (0.1, 0.0, "lets 10 % through a hole of 2 R, the solver 70 %"),
+        (1.0, 0.0, "lets 100 % through a hole of 2 R, the solver 70 %"),
+        (0.1, 0.6, "lets 10 % through a hole of 2 R, the solver 70 %"),
+    ],
+)
+def test_holes_beside_the_solver(through, leaked, beyond):
+    """What falls through the hole is counted, what falls below it elsewhere is not, nor what stays above or comes back.
+    A hole may let through a fifth of all particles more or less than the solver; beyond that the row does not hold and
+    names it. Nor does it where a rollout ended early."""
+    scene = replace(
+        next(iter(cases(StabilityNetworkConfig("", cases=("single",)), network_of().config))).scenes[0],
+        position_N3=np.full((20, 3), 0.5, np.float32),
+        velocity_N3=np.zeros((20, 3), np.float32),
+        material_N=np.zeros(20, np.uint8),
+    )
+
+    def falls(through, leaked):
+        """Through the hole at 0.4 and then far aside; or past it and then to the middle; or in and out again."""
+        path_TN3 = np.stack([scene.position_N3] * 4)
+        ways = [[(0.52, 0.3), (0.9, 0.1), (0.9, 0.1)], [(0.6, 0.3), (0.5, 0.1), (0.5, 0.1)]]
+        ways.append([(0.5, 0.3), (0.5, 0.6), (0.5, 0.6)])
+        first, second = round(20 * through), round(20 * (through + leaked))
+        for some, way in zip((slice(first), slice(first, second), slice(second, None)), ways, strict=True):
+            path_TN3[1:, some, :2] = np.array(way)[:, None]
+        return RolloutResult(path_TN3)
+
+    case = Case("passes holes", (scene,) * 2, 4, hole_cells=(1.0, 2.0), hole_height=0.4)
+    simulator, initial = Simulator(network_of(), 60.0), initial_states(case)
+    own, solvers = [falls(0.0, 0.0), falls(through, leaked)], [falls(0.1, 0.0), falls(0.7, 0.1)]
+    (_, hole), (_, solver) = (passing(some, initial, case, 0.035) for some in (own, solvers))
+    assert hole == {"hole_cells": 2.0, "through": pytest.approx(through), "leaked": pytest.approx(leaked)}
+    assert mispassed([hole], [solver]) == beyond
+    row = case_row(simulator, case, initial, own, None, solvers)
+    assert row.more["passed"][1] == hole and row.more["solver_passed"][1] == solver
+    early = [own[0], RolloutResult(own[1].position_TN3[:3], "diverged at frame 3")]
+    row = case_row(simulator, case, initial, early, None, solvers)
+    assert not row.held and row.beyond == "diverged at frame 3" and row.more["passed"] is None
+    assert "the solver did not come to the end" in mispassed([hole], passing(early, initial, case, 0.035))
 
 
 def test_turned_gravity(monkeypatch):

@@ -51,6 +51,11 @@ DRIFT_FACTOR, DRIFT_CELLS = 2.0, 1.0  # of the solver's own drift at rest, and s
 # How far spread and mean height of what falls may be from the solver's. Its own differ by at most 2 % and 0.1 cells
 # over three fillings, water's late spread by 9 %.
 SPREAD_WITHIN, FALLEN_CELLS = 0.15, 0.5
+# How much more or less than with the solver may pass a hole, of all particles. The solver's own shares differ by at
+# most 0.012 over three fillings (holes of 1.5 R; of snow also 2 and 3). As much as a known way may be off: a hole that
+# is closed, or that wrongly opens, is off by far more.
+PASSED_WITHIN = 0.2
+HOLE_MARGIN_CELLS = 0.5  # of the solver, beyond a hole's edges, that still count as the hole: its sheets' band
 HEIGHT_CELLS = 0.1  # that the mean height at rest may differ from the solver's
 STIR_FRAMES = 60  # the last ones, over which the squared speed at rest is averaged
 # Of the solver's own squared speed about the mean at rest, and so many (domain units per second)^2, may there be: twice
@@ -210,6 +215,11 @@ def case_row(
         fallen, solvers_fallen = (collapse(some, initial, case.spread_at) for some in (trials, beside))
         more |= {"collapse": fallen, "solver_collapse": solvers_fallen}
         restless = misfallen(fallen, solvers_fallen)
+    if case.hole_cells and beside is not None:
+        cell_size = simulator.network.config.cell_size
+        passed, solvers_passed = (passing(some, initial, case, cell_size) for some in (trials, beside))
+        more |= {"passed": passed, "solver_passed": solvers_passed}
+        restless = mispassed(passed, solvers_passed)
     if case.settled is not None and beside is not None:
         own, solvers = (at_rest(some, initial, case.settled, simulator.frame_rate_hz) for some in (trials, beside))
         more |= {"rest": own, "solver_rest": solvers}
@@ -291,6 +301,43 @@ def misfallen(own: list[dict[str, float]] | None, solvers: list[dict[str, float]
         if not abs(row["height"] - solver["height"]) <= FALLEN_CELLS:
             return f"lies {row['height']:.2f} cells high {place}, the solver's {solver['height']:.2f}"
     return None
+
+
+def passing(
+    trials: Sequence[RolloutResult], scenes: Sequence[InitialState], case: Case, cell_size: float
+) -> list[dict[str, float]] | None:
+    """Of each scene, the shares of its particles that are below the edge of its hole at last: those that came through
+    the hole, and those that leaked elsewhere, by where they first crossed that height, straight from frame to frame.
+    `cell_size` is the network's finest. None where a rollout ended early.
+    """
+    if any(trial.frame_count < case.frames or trial.cause is not None for trial in trials):
+        return None
+    rows: list[dict[str, float]] = []
+    for cells, trial, scene in zip(case.hole_cells, trials, scenes, strict=True):
+        below_TN = trial.position_TN3[..., 1] < case.hole_height
+        passed_N = np.flatnonzero(below_TN[-1])
+        crossed_N = below_TN[:, passed_N].argmax(axis=0)
+        before_N3, after_N3 = (trial.position_TN3[crossed_N - i, passed_N].astype(np.float64) for i in (1, 0))
+        way_N1 = (case.hole_height - before_N3[:, 1:2]) / (after_N3 - before_N3)[:, 1:2]
+        aside_N3 = np.abs(before_N3 + way_N1 * (after_N3 - before_N3) - 0.5 * np.array(scene.domain_size))
+        half = 0.5 * cells * cell_size + HOLE_MARGIN_CELLS * scene.obstacle_grid.cell_size
+        within_N = (aside_N3[:, [0, 2]] <= half).all(axis=1)
+        through, leaked = (float(some_N.sum() / below_TN.shape[1]) for some_N in (within_N, ~within_N))
+        rows.append({"hole_cells": cells, "through": through, "leaked": leaked})
+    return rows
+
+
+def mispassed(own: list[dict[str, float]] | None, solvers: list[dict[str, float]] | None) -> str | None:
+    """The hole that is farthest off the solver's, where that is beyond its bound; none where all hold."""
+    if own is None or solvers is None:
+        return f"the {'solver' if solvers is None else 'network'} did not come to the end"
+    farthest, solver = max(
+        zip(own, solvers, strict=True), key=lambda pair: abs(pair[0]["through"] - pair[1]["through"])
+    )
+    if abs(farthest["through"] - solver["through"]) <= PASSED_WITHIN:
+        return None
+    own_percent, solver_percent = (f"{100 * row['through']:.0f} %" for row in (farthest, solver))
+    return f"lets {own_percent} through a hole of {farthest['hole_cells']:g} R, the solver {solver_percent}"
 
 
 def at_rest(

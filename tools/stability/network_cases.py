@@ -22,10 +22,13 @@ from hgn.schema import ConfigError, FrameCount, Positive, one_of, require_bounds
 from tools.scenes import filled
 
 MOTION = ("throw", "gravity", "collision")  # tools/stability/network_motion.py
-CASES = (*MOTION, "collapse", "rest", "particles", "domain", "speed", "single", "slope", "far", "guard")
+CASES = (*MOTION, "collapse", "hole", "rest", "particles", "domain", "speed", "single", "slope", "far", "guard")
 SLOPES_DEG = (15.0, 30.0, 45.0)
 COLLAPSE_CELLS = (5.0, 20.0)  # of the solver, from the lower plane to cubes that fall
 COLLAPSE_FRAMES = (30, 60, 150)  # in which they are looked at: as they spread, when walls are reached, and at rest
+HOLE_CELLS = (1.5, 2.0, 3.0, 4.0)  # of the network, its finest: how wide funnels' holes are
+HOLE_FRAMES = 150  # in which what falls into a funnel may pass its hole
+FUNNEL_SIDE, FUNNEL_TILT_DEG = 0.36, 45.0  # of the domain's smallest side: that of each of a funnel's squares
 SLOPE_SIDE, SLOPE_WAY = 0.6, 0.35  # of the domain's smallest side: the slope's, and what is slid along it
 FRAME_RATE_HZ = 60.0  # for how long cases are
 FALL_FRAMES = 12  # in which what falls meets nothing
@@ -41,14 +44,14 @@ class StabilityNetworkConfig:
     """The options of `python -m tools.stability network`."""
 
     weights: str = DEFAULT_WEIGHTS  # a file of python -m hgn.export, or the name of shipped weights
-    # of throw, gravity, collision, collapse, rest, particles, domain, speed, single, slope, far, guard; null: all
+    # of throw, gravity, collision, collapse, hole, rest, particles, domain, speed, single, slope, far, guard; null: all
     cases: tuple[Annotated[str, one_of(*CASES)], ...] | None = None
     frames: FrameCount = 300
     long_frames: FrameCount = 3000  # of the case rest
     # in each rollout of throw, gravity and collision; null: as many as a row has throws
     scenes_at_once: Positive[int] | None = None
-    # also ask the solver, which needs Taichi: for slope, collision, collapse and rest; without it the latter two are
-    # left out
+    # also ask the solver, which needs Taichi: for slope, collision, collapse, hole and rest; without it the latter
+    # three are left out
     solver: bool = True
     solver_device: Processor = "auto"  # or cpu, gpu
     # that solver; sand should be what it was in the data that the weights were trained on (their cards say)
@@ -77,6 +80,9 @@ class Case:
     known_3: tuple[float, float, float] | None = None  # acceleration along which the particles' way is known
     known_frames: int = 0  # for so long
     spread_at: tuple[int, ...] = ()  # frames in which spread and height are judged beside the solver
+    # width of each scene's hole in the network's finest cells: what passed it at last is judged beside the solver
+    hole_cells: tuple[float, ...] = ()
+    hole_height: float = 0.0  # of the holes' edges
     settled: int | None = None  # frame from which on all rests: drift, density and height are judged beside the solver
     beside_solver: bool = False
 
@@ -99,6 +105,9 @@ def cases(config: StabilityNetworkConfig, network: NetworkConfig) -> Iterator[Ca
         name = f"falls and spreads, {material}"
         if times:
             yield Case(name, drops, times[-1] + 1, spread_at=times, beside_solver=True)
+    judged = config.solver and network.sees_obstacles and config.frames >= HOLE_FRAMES
+    for material in base.materials if "hole" in wanted and judged else ():
+        yield _funnels(base, material, network.cell_size)
     for material in base.materials if "rest" in wanted and config.solver else ():
         rest = case(f"{config.long_frames} frames, {material}", obstacle_count=0, materials=(material,))
         settled = min(config.frames, config.long_frames) - 1
@@ -149,6 +158,34 @@ def _above_floor(config: SceneConfig, material: str, cells: float) -> Scene:
     middle_3 = 0.5 * np.array(config.domain_size)
     middle_3[1] = cells * config.cell_size - cube_places(config)[:, 1].min()
     return cube(config, material, middle_3, np.zeros(3))
+
+
+def _funnels(config: SceneConfig, material: str, network_cell: float) -> Case:
+    """A cube at rest above the hole of a funnel, for holes of several widths: four tilted squares about the middle of
+    the domain. It is as far from the sheets as a scene's groups are from obstacles, and half the hole's width more.
+    """
+    side, middle_3 = FUNNEL_SIDE * min(config.domain_size), 0.5 * np.array(config.domain_size)
+    tilt = math.radians(FUNNEL_TILT_DEG)
+    across, down = 0.5 * side * math.cos(tilt), 0.5 * side * math.sin(tilt)
+    edge, half = float(middle_3[1]) - down, 0.5 * config.group_size
+    clear = (half * math.sin(tilt) + config.clearance_cells * config.cell_size) / math.cos(tilt)
+    above = cube(config, material, np.array([middle_3[0], edge + clear + half, middle_3[2]]), np.zeros(3))
+    scenes = []
+    for cells in HOLE_CELLS:
+        aside = 0.5 * cells * network_cell + across
+        sheets = tuple(
+            shape_obstacle("square", side, tuple((middle_3 + sign * aside * axis_3).tolist()), euler_rotation(turn))
+            for sign in (-1.0, 1.0)
+            for axis_3, turn in (
+                (np.array([1.0, 0.0, 0.0]), (0.0, 0.0, sign * FUNNEL_TILT_DEG)),
+                (np.array([0.0, 0.0, 1.0]), (-sign * FUNNEL_TILT_DEG, 0.0, 0.0)),
+            )
+        )
+        scenes.append(replace(above, obstacles=sheets))
+    return Case(
+        f"passes holes, {material}", tuple(scenes), HOLE_FRAMES,
+        hole_cells=HOLE_CELLS, hole_height=edge, beside_solver=True,
+    )  # fmt: skip
 
 
 def _scene(config: SceneConfig) -> Scene:
