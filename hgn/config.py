@@ -81,6 +81,10 @@ def require_rollout_name(field: str, name: str | None, *more: str) -> None:
     require(ends, field, rule, name, f"tools.render makes {made} of a rollout file")
 
 
+FUNNEL_SQUARES = (0.5, 0.8)  # least and most of their side, of the largest obstacle
+FUNNEL_HEIGHT = (2.0, 5.0)  # below the hole and above it, in group sizes
+
+
 @dataclass(frozen=True)
 class SceneConfig:
     """The distribution that random scenes are drawn from (paper sec. 3.3). Lengths in domain units."""
@@ -107,9 +111,10 @@ class SceneConfig:
     zero_gravity_fraction: Fraction[float] = 0.0  # of the scenes
     tilted_gravity_fraction: Fraction[float] = 0.0  # of the scenes, with gravity of any direction and …
     maximum_tilted_gravity: NonNegative[float] = 19.6  # … any size up to this, domain units per second squared
-    # of the scenes with gravity and without collisions, in which four obstacles are a funnel with the groups above it …
+    # of the scenes with gravity and without collisions: four obstacles are a funnel with the groups above it. Its
+    # squares are 0.5 to 0.8 of the largest obstacle_size …
     funnel_scene_fraction: Fraction[float] = 0.0
-    funnel_hole: tuple[float, float] = (0.035, 0.14)  # … that leaves a square hole, whose side is in this range
+    funnel_hole: tuple[float, float] = (0.035, 0.14)  # … and leave a square hole, whose side is in this range
 
     def __post_init__(self) -> None:
         require_bounds(self)
@@ -122,8 +127,15 @@ class SceneConfig:
         for name in ("obstacle_size", "funnel_hole"):
             low, high = getattr(self, name)
             require(0 < low <= high < math.inf, name, "0 < smallest <= largest", [low, high])
-        room = self.funnel_scene_fraction == 0 or self.obstacle_count >= 4
-        require(room, "obstacle_count", "at least 4 where funnel_scene_fraction is above 0", self.obstacle_count)
+        if self.funnel_scene_fraction > 0:
+            remedy = "or set funnel_scene_fraction=0"
+            where = "where funnel_scene_fraction is above 0"
+            require(self.obstacle_count >= 4, "obstacle_count", f"at least 4 {where}", self.obstacle_count, remedy)
+            widest, height = FUNNEL_SQUARES[0] * self.obstacle_size[1], min(self.domain_size) / sum(FUNNEL_HEIGHT)
+            rule = f"at most {FUNNEL_SQUARES[0]:g} of the largest obstacle_size ({widest:g}) {where}"
+            require(self.funnel_hole[1] <= widest, "funnel_hole", rule, list(self.funnel_hole), remedy)
+            rule = f"at most {1 / sum(FUNNEL_HEIGHT):.3g} of the domain's smallest side ({height:.3g}) {where}"
+            require(self.group_size <= height, "group_size", rule, self.group_size, remedy)
         for i, name in enumerate(self.obstacle_shapes):
             rule = f"one of {', '.join(OBSTACLE_SHAPES)}, or a mesh file ({', '.join(MESH_SUFFIXES)})"
             require(name in OBSTACLE_SHAPES or is_mesh_file(name), f"obstacle_shapes[{i}]", rule, name)
@@ -506,7 +518,7 @@ class TrainConfig:
             "network.obstacle_features",
             "true for scenes with obstacles",
             False,
-            "or set scene.obstacle_count=0",
+            "or set scene.obstacle_count=0 scene.funnel_scene_fraction=0",
         )
         training, frames = self.training, self.dataset.frames
         require(

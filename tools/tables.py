@@ -15,7 +15,8 @@ stands between is written by this command:
           ms: "{row.ms:.3f}"
 
 In braces stands an expression of Python over the sources, the names of the row and the functions of `FUNCTIONS`, then
-a format. `rows(case='frame')` is the one item of a list whose fields are these; `every(rows, case='frame')` are all.
+a format. `rows(case='frame')` is the one item of a list whose fields are these; `every(rows, case='frame')` are all;
+`held(rows)` says how many hold, as in 35 of 36, and finds nothing where there are none.
 `let: {NAME: EXPRESSION}` in a table gives each row further names. A format that begins with `?` leaves the cell empty
 where there is nothing. Lists are joined by commas, and `%` multiplies by 100.
 """
@@ -27,7 +28,7 @@ import math
 import re
 import statistics
 import struct
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -184,6 +185,13 @@ def every(records: Iterable[Record], **fields: Any) -> Records:
     return Records(item for item in records if all(item.get(name) == value for name, value in fields.items()))
 
 
+def held(rows: Sequence[Record]) -> str:
+    """How many of the rows hold, for example 35 of 36. Raises: LookupError where there are none."""
+    if not rows:
+        raise LookupError("no rows of which some could hold")
+    return f"{sum(row.held for row in rows)} of {len(rows)}"
+
+
 def _node(value: Any) -> Any:
     if isinstance(value, dict):
         return Record({key: _node(item) for key, item in value.items()})
@@ -199,7 +207,10 @@ def _safetensors_header(path: Path) -> dict[str, Any]:
 
 
 FUNCTIONS: dict[str, Any] = {
-    **{function.__name__: function for function in (abs, any, dict, every, len, list, max, min, sorted, str, sum, zip)},
+    **{
+        function.__name__: function
+        for function in (abs, any, dict, every, held, len, list, max, min, sorted, str, sum, zip)
+    },
     **{"mean": statistics.fmean, "median": statistics.median, "stdev": statistics.stdev, "prod": math.prod},
     "rms": lambda values: math.sqrt(statistics.fmean(value**2 for value in values)),
 }
@@ -213,6 +224,8 @@ def _table(definition: Mapping[str, Any], sources: Mapping[str, Any]) -> str:
         for name, expression in definition.get("let", {}).items():
             scope[name] = _evaluate(expression, scope)
         scopes.append(scope)
+    if not scopes:
+        raise LookupError(f"no rows: {rows}")
     cells = [[_fill(template, scope) for template in columns.values()] for scope in scopes]
     rules = ["--:" if all(NUMERIC.match(text) for text in column) else "---" for column in zip(*cells, strict=True)]
     lines = ["|" + "".join(f" {text} |" if text else " |" for text in line) for line in (columns, rules, *cells)]

@@ -1,6 +1,7 @@
-"""Funnels: four tilted squares that leave a hole, towards which groups fall.
+"""Funnels: four tilted squares that leave a hole, with the groups above it.
 
-All numbers are sums, products and square roots of what is drawn, so that they are the same bits on every machine.
+All numbers are sums, products, quotients and square roots of what is drawn, so that they are the same bits on every
+machine. Shape legend: P points.
 """
 
 from __future__ import annotations
@@ -9,38 +10,40 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hgn.config import SceneConfig
+from hgn.config import FUNNEL_HEIGHT, FUNNEL_SQUARES, SceneConfig
 from hgn.scene.group import points_in_ball
 from hgn.scene.rotation import quaternion_product, quaternion_rotation
 from hgn.schema import Vector
 
 Quaternion = tuple[float, float, float, float]
 
-SIZES = (0.5, 0.8)  # of a square, in units of the largest obstacle
+SIZES = FUNNEL_SQUARES  # of a square, in units of the largest obstacle
 STEEPEST = 0.87  # sine of the slope, drawn from 0 on: 60 degrees
-BELOW, ABOVE = 2.0, 5.0  # group sizes of room under the hole, and over it
+BELOW, ABOVE = FUNNEL_HEIGHT  # group sizes that the domain reaches under the hole, and over it
 CAUGHT = 0.5  # of a square's width over the ground: groups are placed above that inner part
 
 
 @dataclass(frozen=True)
 class Funnel:
-    """Where things are about the middle of the hole. Domain units."""
+    """Where its parts are, from the middle of its hole. Domain units."""
 
-    hole: float  # side of the square that is left free
+    hole_width: float  # side of the square that is left free
     size: float  # side of the four squares
     quaternion: tuple[Quaternion, ...]  # of each square
     centre_43: np.ndarray
     low_3: np.ndarray  # of where groups are placed, in the funnel's axes, y against gravity
     high_3: np.ndarray
     rotation_33: np.ndarray  # from the funnel's axes
-    room_P3: np.ndarray  # corners of the squares, and points below and above: all must be in the domain
+    extent_P3: np.ndarray  # corners of the squares, and points below and above: all must be in the domain
 
 
 def draw_funnel(config: SceneConfig, gravity: Vector, rng: np.random.Generator) -> Funnel:
-    """Hole, size, slope and turn about gravity, each uniform in its range."""
+    """Width of the hole, size of the squares, sine of their slope and turn about gravity, each uniform in its range.
+    Gravity must not be zero.
+    """
     (narrow, wide), (small, large) = config.funnel_hole, SIZES
     hole_part, size_part, slope_part = rng.random(3).tolist()
-    hole = narrow + (wide - narrow) * hole_part
+    hole_width = narrow + (wide - narrow) * hole_part
     size = config.obstacle_size[1] * (small + (large - small) * size_part)
     sine = STEEPEST * slope_part
     cosine = float(np.sqrt(1 - sine * sine))
@@ -49,17 +52,17 @@ def draw_funnel(config: SceneConfig, gravity: Vector, rng: np.random.Generator) 
     upright = quaternion_product(_upwards(gravity), _turn(rng))
     quarter = (float(np.sqrt(0.5)), 0.0, float(np.sqrt(0.5)), 0.0)
     rotation_33, turned, quaternions, centres = quaternion_rotation(upright), upright, [], []
-    room = [-BELOW * config.group_size * rotation_33[:, 1], ABOVE * config.group_size * rotation_33[:, 1]]
+    extent = [-BELOW * config.group_size * rotation_33[:, 1], ABOVE * config.group_size * rotation_33[:, 1]]
     for _ in range(4):
         quaternions.append(quaternion_product(turned, slope))
         outwards_3, up_3, _ = quaternion_rotation(turned).T
-        centres.append((0.5 * hole + 0.5 * size * cosine) * outwards_3 + 0.5 * size * sine * up_3)
+        centres.append((0.5 * hole_width + 0.5 * size * cosine) * outwards_3 + 0.5 * size * sine * up_3)
         along_3, _, across_3 = 0.5 * size * quaternion_rotation(quaternions[-1]).T
-        room += [centres[-1] + a * along_3 + b * across_3 for a in (-1, 1) for b in (-1, 1)]
+        extent += [centres[-1] + a * along_3 + b * across_3 for a in (-1, 1) for b in (-1, 1)]
         turned = quaternion_product(turned, quarter)
-    caught = 0.5 * hole + CAUGHT * size * cosine
+    caught = 0.5 * hole_width + CAUGHT * size * cosine
     low_3, high_3 = np.array([-caught, 0.0, -caught]), np.array([caught, ABOVE * config.group_size, caught])
-    return Funnel(hole, size, tuple(quaternions), np.stack(centres), low_3, high_3, rotation_33, np.stack(room))
+    return Funnel(hole_width, size, tuple(quaternions), np.stack(centres), low_3, high_3, rotation_33, np.stack(extent))
 
 
 def _upwards(gravity: Vector) -> Quaternion:

@@ -33,6 +33,7 @@ REPORT_SEED = 1_000_000  # the first of scenes that reports draw for themselves:
 LAYOUTS = 5  # whole scenes begun afresh before giving up
 SHAPES_PER_ITEM = 20  # sizes, shapes and orientations drawn for one obstacle or group
 PLACES_PER_SHAPE = 50
+FUNNELS = 300  # drawn for one that fits
 SURFACE_DETAIL = 0.045  # longest edge, relative to the size, of the pieces that distances are taken between
 FEW = 32
 LONE_CELLS = 6  # solver cells from a lone particle to any other: beyond what a network looks at for neighbours
@@ -112,16 +113,16 @@ def _place_funnel(
     config: SceneConfig, gravity: Vector, rng: np.random.Generator
 ) -> tuple[_PlacedFunnel, list[_Placed]]:
     domain = np.array(config.domain_size)
-    for _ in range(SHAPES_PER_ITEM * PLACES_PER_SHAPE):
+    for _ in range(FUNNELS):
         funnel = draw_funnel(config, gravity, rng)
-        first_3 = -funnel.room_P3.min(axis=0) + ROUNDING * domain
-        span_3 = domain - ROUNDING * domain - funnel.room_P3.max(axis=0) - first_3
+        first_3 = -funnel.extent_P3.min(axis=0) + ROUNDING * domain
+        span_3 = domain - ROUNDING * domain - funnel.extent_P3.max(axis=0) - first_3
         if (span_3 >= 0).all():
             hole_3 = first_3 + span_3 * rng.random(3)
             return _PlacedFunnel(funnel, hole_3), [_place_square(funnel, hole_3, index) for index in range(4)]
     raise _NoRoomError(
-        "funnel_scene_fraction must be 0 where no funnel has room, got "
-        f"{config.funnel_scene_fraction:g}; lower it, obstacle_size or group_size, or raise domain_size"
+        f"funnel_scene_fraction must be 0 where no funnel of {FUNNELS} fits, got {config.funnel_scene_fraction:g}; "
+        "lower it, obstacle_size or group_size, or raise domain_size"
     )
 
 

@@ -335,11 +335,11 @@ def test_networks(tmp_path, monkeypatch):
 
 
 def test_mechanics(tmp_path, monkeypatch):
-    """jobs/mechanics.txt: five trainings, each from the weights that the one before exports, on data that it makes; the
+    """jobs/mechanics.txt: six trainings, each from the weights that the one before exports, on data that it makes; the
     last one is the network that ships, with its updates, threshold of rest and walls, and is scored."""
     mappings = {name: settings(lines, monkeypatch) for name, lines in calls(tmp_path, "mechanics.txt").items()}
-    made = {name: datagen_config(mappings.pop(name)["datagen"]) for name in ("rest_data", "motion_data")}
-    assert list(mappings) == ["first", "second", "third", "fourth", "mechanics"]
+    made = {name: datagen_config(mappings.pop(name)["datagen"]) for name in ("rest_data", "motion_data", "funnel_data")}
+    assert list(mappings) == ["first", "second", "third", "fourth", "fifth", "mechanics"]
     before = None
     for name, commands in mappings.items():
         assert commands["hgn.train"].pop("name") == "mechanics"
@@ -350,7 +350,7 @@ def test_mechanics(tmp_path, monkeypatch):
         if before is not None:
             assert dataset_identity(config.datagen) == dataset_identity(made["motion_data"])
             assert config.dataset.folder == made["motion_data"].dataset.folder
-            assert config.training.more_data == (made["rest_data"].dataset.folder,)
+            assert config.training.more_data[:1] == (made["rest_data"].dataset.folder,)
         if "hgn.evaluate" in commands:
             score = from_mapping(EvaluateConfig, commands["hgn.evaluate"])
             assert (score.weights, score.data) == (export.out, config.dataset.folder)
@@ -359,6 +359,7 @@ def test_mechanics(tmp_path, monkeypatch):
     assert name == Path(str(before)).stem and "hgn.evaluate" in mappings[name]
     shipped = load_weights(shipped_weights()[name])[1]
     assert shipped.network == replace(config.network, **export.network_changes)
+    assert config.training.more_data[1:] == (made["funnel_data"].dataset.folder,)
     assert shipped.updates == config.training.maximum_updates
     assert set(export.network_changes) == {"rest_threshold", "wall_clearance"}
 
@@ -370,7 +371,7 @@ def test_trial_of_mechanics(tmp_path):
     scenes = [argument for argument in used if argument.startswith(("scenes=", "dataset.training_scenes="))]
     assert {argument.partition("=")[2] for argument in scenes} == {"2", "25", "100"}  # the last two are scored
     updates = [int(argument.partition("=")[2]) for argument in used if argument.startswith("training.maximum_updates")]
-    assert len(updates) == 5 and max(updates) < 3000
+    assert len(updates) == 6 and max(updates) < 3000
 
 
 def test_judged(tmp_path, monkeypatch):

@@ -3,7 +3,7 @@ import pytest
 import trimesh
 
 from hgn.config import OBSTACLE_SHAPES
-from hgn.scene.rotation import euler_rotation, quaternion_rotation
+from hgn.scene.rotation import euler_rotation, quaternion_product, quaternion_rotation
 from hgn.scene.shapes import CLOSED_SHAPES, shape_obstacle, unit_shape
 from hgn.scene.surface import split_long_edges
 
@@ -63,6 +63,16 @@ def test_euler_turns_about_fixed_axes_in_order():
     assert set(np.abs(euler_rotation((-90.0, 450.0, 180.0))).ravel()) == {0.0, 1.0}
     turned = euler_rotation((0.0, 0.0, 30.0)) @ [1.0, 0.0, 0.0]
     np.testing.assert_allclose(turned, [np.sqrt(3) / 2, 0.5, 0.0], atol=1e-15)
+
+
+def test_products_of_quaternions():
+    """The product turns by the right one first, and is of length 1."""
+    left, right = (0.5, -0.5, 0.1, 0.7), (0.6, 0.0, 0.8, 0.0)
+    both = quaternion_product(left, right)
+    np.testing.assert_allclose(
+        quaternion_rotation(both), quaternion_rotation(left) @ quaternion_rotation(right), atol=1e-15
+    )
+    assert sum(value * value for value in both) == pytest.approx(1.0)
 
 
 def test_rotations_are_orthonormal():

@@ -7,7 +7,7 @@ import pytest
 
 import tools.tables
 from hgn.schema import ConfigError
-from tools.tables import ROOT, formatted, main, pages, specifications
+from tools.tables import ROOT, Record, Records, _fill, formatted, main, pages, specifications
 
 SPECIFICATION = """
 files: {bench: bench.json, weights: weights.safetensors}
@@ -113,6 +113,14 @@ def test_writes_tables_and_figures(tmp_path, monkeypatch, capsys):
         (("  chosen:", "  other:"), "has no table chosen; define it there or take the marker away"),
         (("bench.json", "none.json"), "FileNotFoundError: [Errno 2] No such file or directory: "),
         (("values:", "values:\n  more: '1'"), "no page has a marker for more"),
+        (
+            ("every(bench.rows, case='frame')", "every(bench.rows, case='no')"),
+            "table frames: LookupError: no rows: every(",
+        ),
+        (
+            ("{bench.rows(case='frame', particles=4296).ms:.3f} ms", "{held(every(bench.rows, case='no'))}"),
+            "figure frame: LookupError: no rows of which some could hold",
+        ),
     ],
 )
 def test_faulty_specifications(tmp_path, change, message):
@@ -121,6 +129,13 @@ def test_faulty_specifications(tmp_path, change, message):
     with pytest.raises(ConfigError) as error:
         pages(folder(tmp_path, SPECIFICATION.replace(*change)))
     assert message in str(error.value) and "tables.yaml" in str(error.value)
+
+
+def test_how_many_hold():
+    """Of no rows none can hold, which a format with `?` leaves empty."""
+    rows = Records([Record(held=True), Record(held=False), Record(held=True)])
+    assert _fill("{held(rows)}", {"rows": rows}) == "2 of 3"
+    assert _fill("{held(rows):?}", {"rows": Records()}) == ""
 
 
 @pytest.mark.parametrize("marker", ["<!--/-->", "<!-- end -->\n<!-- table: chosen"])

@@ -55,6 +55,7 @@ SPREAD_WITHIN, FALLEN_CELLS = 0.15, 0.5
 # most 0.012 over three fillings (holes of 1.5 R; of snow also 2 and 3). As much as a known way may be off: a hole that
 # is closed, or that wrongly opens, is off by far more.
 PASSED_WITHIN = 0.2
+LEAKED_WITHIN = 0.05  # of all particles, beyond what leaks with the solver, may come through a funnel's sheets
 HOLE_MARGIN_CELLS = 0.5  # of the solver, beyond a hole's edges, that still count as the hole: its sheets' band
 HEIGHT_CELLS = 0.1  # that the mean height at rest may differ from the solver's
 STIR_FRAMES = 60  # the last ones, over which the squared speed at rest is averaged
@@ -328,16 +329,20 @@ def passing(
 
 
 def mispassed(own: list[dict[str, float]] | None, solvers: list[dict[str, float]] | None) -> str | None:
-    """The hole that is farthest off the solver's, where that is beyond its bound; none where all hold."""
+    """The hole that is farthest off the solver's or leaks most, where that is beyond its bound; none where all hold."""
     if own is None or solvers is None:
         return f"the {'solver' if solvers is None else 'network'} did not come to the end"
     farthest, solver = max(
         zip(own, solvers, strict=True), key=lambda pair: abs(pair[0]["through"] - pair[1]["through"])
     )
-    if abs(farthest["through"] - solver["through"]) <= PASSED_WITHIN:
-        return None
-    own_percent, solver_percent = (f"{100 * row['through']:.0f} %" for row in (farthest, solver))
-    return f"lets {own_percent} through a hole of {farthest['hole_cells']:g} R, the solver {solver_percent}"
+    if not abs(farthest["through"] - solver["through"]) <= PASSED_WITHIN:
+        own_percent, solver_percent = (f"{100 * row['through']:.0f} %" for row in (farthest, solver))
+        return f"lets {own_percent} through a hole of {farthest['hole_cells']:g} R, the solver {solver_percent}"
+    leaky, solver = max(zip(own, solvers, strict=True), key=lambda pair: pair[0]["leaked"] - pair[1]["leaked"])
+    if not leaky["leaked"] - solver["leaked"] <= LEAKED_WITHIN:
+        own_percent, solver_percent = (f"{100 * row['leaked']:.0f} %" for row in (leaky, solver))
+        return f"leaks {own_percent} beside a hole of {leaky['hole_cells']:g} R, the solver {solver_percent}"
+    return None
 
 
 def at_rest(

@@ -56,7 +56,7 @@ class StabilityNetworkConfig:
     solver_device: Processor = "auto"  # or cpu, gpu
     # that solver; sand should be what it was in the data that the weights were trained on (their cards say)
     mpm: MpmConfig = field(default_factory=MpmConfig)
-    # a folder in which its trajectories of slope and rest stay, for other weights beside the same version of it
+    # a folder in which its trajectories of these cases stay, for other weights beside the same version of it
     solver_kept: str | None = None
     # the scenes as they are in training; obstacles only where the network sees them
     scene: SceneConfig = field(default_factory=SceneConfig)
@@ -93,7 +93,8 @@ def cases(config: StabilityNetworkConfig, network: NetworkConfig) -> Iterator[Ca
     Raises: ConfigError where a scene has no room for what it is to hold.
     """
     wanted = config.cases or CASES
-    base = config.scene if network.sees_obstacles else replace(config.scene, obstacle_count=0)
+    base = replace(config.scene, funnel_scene_fraction=0.0)
+    base = base if network.sees_obstacles else replace(base, obstacle_count=0)
     base = replace(base, materials=tuple(name for name in base.materials if name in network.materials))
 
     def case(name: str, **change: Any) -> Case:
@@ -162,7 +163,7 @@ def _above_floor(config: SceneConfig, material: str, cells: float) -> Scene:
 
 def _funnels(config: SceneConfig, material: str, network_cell: float) -> Case:
     """A cube at rest above the hole of a funnel, for holes of several widths: four tilted squares about the middle of
-    the domain. It is as far from the sheets as a scene's groups are from obstacles, and half the hole's width more.
+    the domain. Above a hole of no width it would be as far from the sheets as a scene's groups are from obstacles.
     """
     side, middle_3 = FUNNEL_SIDE * min(config.domain_size), 0.5 * np.array(config.domain_size)
     tilt = math.radians(FUNNEL_TILT_DEG)
