@@ -237,7 +237,10 @@ def test_funnels_have_the_holes_that_are_asked_for():
     config = StabilityNetworkConfig("", cases=("hole",), scene=SceneConfig(domain_size=(1.5, 1.0, 2.0)))
     network = network_of(cell_size=0.03).config
     made = list(cases(config, network))
-    assert [case.name for case in made] == [f"passes holes, {name}" for name in MATERIAL_NAMES]
+    loads = ("passes holes", "passes holes under load")
+    assert [case.name for case in made] == [f"{load}, {name}" for name in MATERIAL_NAMES for load in loads]
+    light, heavy = (case.scenes[0].particle_count for case in made[:2])
+    assert heavy == pytest.approx(1.5**3 * light, rel=1e-2)
     assert all(case.beside_solver and case.frames == 150 for case in made)
     for cells, scene in zip(made[0].hole_cells, made[0].scenes, strict=True):
         middle_3 = 0.5 * np.array(scene.domain_size)

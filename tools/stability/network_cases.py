@@ -26,7 +26,8 @@ CASES = (*MOTION, "collapse", "hole", "rest", "particles", "domain", "speed", "s
 SLOPES_DEG = (15.0, 30.0, 45.0)
 COLLAPSE_CELLS = (5.0, 20.0)  # of the solver, from the lower plane to cubes that fall
 COLLAPSE_FRAMES = (30, 60, 150)  # in which they are looked at: as they spread, when walls are reached, and at rest
-HOLE_CELLS = (1.5, 2.0, 3.0, 4.0)  # of the network, its finest: how wide funnels' holes are
+# how wide funnels' holes are, in the network's finest cells, by the side of the cube above them, in group sizes
+HOLE_CELLS = {1.0: (1.5, 2.0, 3.0, 4.0), 1.5: (2.0, 4.0)}
 HOLE_FRAMES = 150  # in which what falls into a funnel may pass its hole
 FUNNEL_SIDE, FUNNEL_TILT_DEG = 0.36, 45.0  # of the domain's smallest side: that of each of a funnel's squares
 SLOPE_SIDE, SLOPE_WAY = 0.6, 0.35  # of the domain's smallest side: the slope's, and what is slid along it
@@ -108,7 +109,10 @@ def cases(config: StabilityNetworkConfig, network: NetworkConfig) -> Iterator[Ca
             yield Case(name, drops, times[-1] + 1, spread_at=times, beside_solver=True)
     judged = config.solver and network.sees_obstacles and config.frames >= HOLE_FRAMES
     for material in base.materials if "hole" in wanted and judged else ():
-        yield _funnels(base, material, network.cell_size)
+        for side, hole_cells in HOLE_CELLS.items():
+            name = f"passes holes{'' if side == 1 else ' under load'}, {material}"
+            larger = replace(base, group_size=side * base.group_size)
+            yield _funnels(name, larger, material, hole_cells, network.cell_size)
     for material in base.materials if "rest" in wanted and config.solver else ():
         rest = case(f"{config.long_frames} frames, {material}", obstacle_count=0, materials=(material,))
         settled = min(config.frames, config.long_frames) - 1
@@ -161,7 +165,7 @@ def _above_floor(config: SceneConfig, material: str, cells: float) -> Scene:
     return cube(config, material, middle_3, np.zeros(3))
 
 
-def _funnels(config: SceneConfig, material: str, network_cell: float) -> Case:
+def _funnels(name: str, config: SceneConfig, material: str, hole_cells: tuple[float, ...], network_cell: float) -> Case:
     """A cube at rest above the hole of a funnel, for holes of several widths: four tilted squares about the middle of
     the domain. Above a hole of no width it would be as far from the sheets as a scene's groups are from obstacles.
     """
@@ -172,7 +176,7 @@ def _funnels(config: SceneConfig, material: str, network_cell: float) -> Case:
     clear = (half * math.sin(tilt) + config.clearance_cells * config.cell_size) / math.cos(tilt)
     above = cube(config, material, np.array([middle_3[0], edge + clear + half, middle_3[2]]), np.zeros(3))
     scenes = []
-    for cells in HOLE_CELLS:
+    for cells in hole_cells:
         aside = 0.5 * cells * network_cell + across
         sheets = tuple(
             shape_obstacle("square", side, tuple((middle_3 + sign * aside * axis_3).tolist()), euler_rotation(turn))
@@ -184,8 +188,8 @@ def _funnels(config: SceneConfig, material: str, network_cell: float) -> Case:
         )
         scenes.append(replace(above, obstacles=sheets))
     return Case(
-        f"passes holes, {material}", tuple(scenes), HOLE_FRAMES,
-        hole_cells=HOLE_CELLS, hole_height=edge, beside_solver=True,
+        name, tuple(scenes), HOLE_FRAMES,
+        hole_cells=hole_cells, hole_height=edge, beside_solver=True,
     )  # fmt: skip
 
 
