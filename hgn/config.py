@@ -81,8 +81,8 @@ def require_rollout_name(field: str, name: str | None, *more: str) -> None:
     require(ends, field, rule, name, f"tools.render makes {made} of a rollout file")
 
 
-FUNNEL_SQUARES = (0.5, 0.8)  # least and most of their side, of the largest obstacle
-FUNNEL_HEIGHT = (2.0, 5.0)  # below the hole and above it, in group sizes
+FUNNEL_SQUARES = (0.5, 0.8)  # least and most side of a funnel's squares, in units of the largest obstacle
+FUNNEL_HEIGHT = (2.0, 5.0)  # of the domain below a funnel's hole and above it, in group sizes
 
 
 @dataclass(frozen=True)

@@ -17,9 +17,7 @@ from hgn.schema import Vector
 
 Quaternion = tuple[float, float, float, float]
 
-SIZES = FUNNEL_SQUARES  # of a square, in units of the largest obstacle
 STEEPEST = 0.87  # sine of the slope, drawn from 0 on: 60 degrees
-BELOW, ABOVE = FUNNEL_HEIGHT  # group sizes that the domain reaches under the hole, and over it
 CAUGHT = 0.5  # of a square's width over the ground: groups are placed above that inner part
 
 
@@ -41,7 +39,8 @@ def draw_funnel(config: SceneConfig, gravity: Vector, rng: np.random.Generator) 
     """Width of the hole, size of the squares, sine of their slope and turn about gravity, each uniform in its range.
     Gravity must not be zero.
     """
-    (narrow, wide), (small, large) = config.funnel_hole, SIZES
+    (narrow, wide), (small, large) = config.funnel_hole, FUNNEL_SQUARES
+    below, above = (config.group_size * size for size in FUNNEL_HEIGHT)
     hole_part, size_part, slope_part = rng.random(3).tolist()
     hole_width = narrow + (wide - narrow) * hole_part
     size = config.obstacle_size[1] * (small + (large - small) * size_part)
@@ -52,7 +51,7 @@ def draw_funnel(config: SceneConfig, gravity: Vector, rng: np.random.Generator) 
     upright = quaternion_product(_upwards(gravity), _turn(rng))
     quarter = (float(np.sqrt(0.5)), 0.0, float(np.sqrt(0.5)), 0.0)
     rotation_33, turned, quaternions, centres = quaternion_rotation(upright), upright, [], []
-    extent = [-BELOW * config.group_size * rotation_33[:, 1], ABOVE * config.group_size * rotation_33[:, 1]]
+    extent = [-below * rotation_33[:, 1], above * rotation_33[:, 1]]
     for _ in range(4):
         quaternions.append(quaternion_product(turned, slope))
         outwards_3, up_3, _ = quaternion_rotation(turned).T
@@ -61,7 +60,7 @@ def draw_funnel(config: SceneConfig, gravity: Vector, rng: np.random.Generator) 
         extent += [centres[-1] + a * along_3 + b * across_3 for a in (-1, 1) for b in (-1, 1)]
         turned = quaternion_product(turned, quarter)
     caught = 0.5 * hole_width + CAUGHT * size * cosine
-    low_3, high_3 = np.array([-caught, 0.0, -caught]), np.array([caught, ABOVE * config.group_size, caught])
+    low_3, high_3 = np.array([-caught, 0.0, -caught]), np.array([caught, above, caught])
     return Funnel(hole_width, size, tuple(quaternions), np.stack(centres), low_3, high_3, rotation_33, np.stack(extent))
 
 
