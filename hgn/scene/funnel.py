@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hgn.config import FUNNEL_HEIGHT, FUNNEL_SQUARES, SceneConfig
-from hgn.scene.group import points_in_ball
+from hgn.scene.group import random_direction
 from hgn.scene.rotation import quaternion_product, quaternion_rotation
 from hgn.schema import Vector
 
@@ -25,7 +25,6 @@ CAUGHT = 0.5  # of a square's width over the ground: groups are placed above tha
 class Funnel:
     """Where its parts are, from the middle of its hole. Domain units."""
 
-    hole_width: float  # side of the square that is left free
     size: float  # side of the four squares
     quaternion: tuple[Quaternion, ...]  # of each square
     centre_43: np.ndarray
@@ -45,23 +44,36 @@ def draw_funnel(config: SceneConfig, gravity: Vector, rng: np.random.Generator) 
     hole_width = narrow + (wide - narrow) * hole_part
     size = config.obstacle_size[1] * (small + (large - small) * size_part)
     sine = STEEPEST * slope_part
+    turn_w, turn_y = random_direction(rng, 2).tolist()
+    upright = quaternion_product(_upwards(gravity), (turn_w, 0.0, turn_y, 0.0))
+    quaternions, centre_43 = funnel_squares(hole_width, size, sine, upright)
+    rotation_33 = quaternion_rotation(upright)
+    extent = [-below * rotation_33[:, 1], above * rotation_33[:, 1]]
+    for quaternion, centre_3 in zip(quaternions, centre_43, strict=True):
+        along_3, _, across_3 = 0.5 * size * quaternion_rotation(quaternion).T
+        extent += [centre_3 + a * along_3 + b * across_3 for a in (-1, 1) for b in (-1, 1)]
+    caught = 0.5 * hole_width + CAUGHT * size * float(np.sqrt(1 - sine * sine))
+    low_3, high_3 = np.array([-caught, 0.0, -caught]), np.array([caught, above, caught])
+    return Funnel(size, quaternions, centre_43, low_3, high_3, rotation_33, np.stack(extent))
+
+
+def funnel_squares(
+    hole_width: float, size: float, sine: float, upright: Quaternion = (1.0, 0.0, 0.0, 0.0)
+) -> tuple[tuple[Quaternion, ...], np.ndarray]:
+    """Rotations and centres, float64 [4, 3], of squares of that size that leave a square hole of that width about the
+    origin and rise outwards; `sine` is that of their slope, `upright` turns the y axis upwards.
+    """
     cosine = float(np.sqrt(1 - sine * sine))
     half_cosine = float(np.sqrt((1 + cosine) / 2))  # of half the slope's angle, as quaternions have it
     slope = (half_cosine, 0.0, 0.0, sine / (2 * half_cosine))
-    upright = quaternion_product(_upwards(gravity), _turn(rng))
     quarter = (float(np.sqrt(0.5)), 0.0, float(np.sqrt(0.5)), 0.0)
-    rotation_33, turned, quaternions, centres = quaternion_rotation(upright), upright, [], []
-    extent = [-below * rotation_33[:, 1], above * rotation_33[:, 1]]
+    turned, quaternions, centres = upright, [], []
     for _ in range(4):
         quaternions.append(quaternion_product(turned, slope))
         outwards_3, up_3, _ = quaternion_rotation(turned).T
         centres.append((0.5 * hole_width + 0.5 * size * cosine) * outwards_3 + 0.5 * size * sine * up_3)
-        along_3, _, across_3 = 0.5 * size * quaternion_rotation(quaternions[-1]).T
-        extent += [centres[-1] + a * along_3 + b * across_3 for a in (-1, 1) for b in (-1, 1)]
         turned = quaternion_product(turned, quarter)
-    caught = 0.5 * hole_width + CAUGHT * size * cosine
-    low_3, high_3 = np.array([-caught, 0.0, -caught]), np.array([caught, above, caught])
-    return Funnel(hole_width, size, tuple(quaternions), np.stack(centres), low_3, high_3, rotation_33, np.stack(extent))
+    return tuple(quaternions), np.stack(centres)
 
 
 def _upwards(gravity: Vector) -> Quaternion:
@@ -72,12 +84,3 @@ def _upwards(gravity: Vector) -> Quaternion:
         return (0.0, 1.0, 0.0, 0.0)  # half a turn about x
     scale = float(np.sqrt(2 + 2 * y))
     return (scale / 2, z / scale, 0.0, -x / scale)
-
-
-def _turn(rng: np.random.Generator) -> Quaternion:
-    """About the y axis, uniform."""
-    while True:
-        first, second = points_in_ball(1, 2, rng)[0].tolist()
-        length = float(np.sqrt(first * first + second * second))
-        if length > 0.1:  # dividing by less would magnify rounding
-            return (first / length, 0.0, second / length, 0.0)

@@ -77,3 +77,12 @@ def points_in_ball(count: int, dimensions: int, rng: np.random.Generator) -> np.
         candidate = 2 * rng.random((max(count, 16), dimensions)) - 1
         accepted = np.concatenate([accepted, candidate[(candidate * candidate).sum(axis=1) <= 1]])
     return accepted[:count]
+
+
+def random_direction(rng: np.random.Generator, dimensions: int = 3) -> np.ndarray:
+    """A uniformly random unit vector, by rejection in the ball; of four dimensions a rotation's quaternion."""
+    while True:
+        point = points_in_ball(1, dimensions, rng)[0]
+        length = float(np.sqrt((point * point).sum()))
+        if length > 0.1:  # dividing by less would magnify rounding
+            return point / length

@@ -17,7 +17,15 @@ import numpy as np
 from hgn.config import SceneConfig, is_mesh_file
 from hgn.scene.distance import contains
 from hgn.scene.funnel import Funnel, draw_funnel
-from hgn.scene.group import WALL_CELLS, Region, fill, particle_count, points_in_ball, region_of
+from hgn.scene.group import (
+    WALL_CELLS,
+    Region,
+    fill,
+    particle_count,
+    points_in_ball,
+    random_direction,
+    region_of,
+)
 from hgn.scene.material import material_index
 from hgn.scene.rotation import quaternion_rotation, rotate
 from hgn.scene.scene import Obstacle, Scene
@@ -153,7 +161,7 @@ def _place_obstacle(config: SceneConfig, placed: list[_Placed], index: int, rng:
     for _ in range(SHAPES_PER_ITEM):
         shape = _choice(config.obstacle_shapes, rng)
         size = smallest + (largest - smallest) * rng.random()
-        quaternion = _random_direction(rng, 4).tolist()
+        quaternion = random_direction(rng, 4).tolist()
         rotation = quaternion_rotation(quaternion)
         turned = shape_obstacle(shape, size, rotation_33=rotation)
         low, high = turned.vertex_V3.min(axis=0), turned.vertex_V3.max(axis=0)
@@ -301,7 +309,7 @@ def _fill_group(config: SceneConfig, shape: str, region: Region, rng: np.random.
 def _draw_gravity(config: SceneConfig, rng: np.random.Generator) -> Vector:
     """One of the three kinds; a tilted one is uniform in direction and in size."""
     kind, size = rng.random(2).tolist()
-    direction_3 = _random_direction(rng)
+    direction_3 = random_direction(rng)
     if kind < config.zero_gravity_fraction:
         return 0.0, 0.0, 0.0
     if kind < config.zero_gravity_fraction + config.tilted_gravity_fraction:
@@ -320,7 +328,7 @@ def _purify(config: SceneConfig, bodies: list[_Body], gravity: Vector, rng: np.r
     changed = []
     for body in bodies:
         chosen, kind, size = rng.random(3).tolist()
-        across_3 = _random_direction(rng)
+        across_3 = random_direction(rng)
         across_3 = across_3 - (across_3 * up_3).sum() * up_3
         across_3 /= np.sqrt((across_3 * across_3).sum())
         direction_3 = up_3 if kind < 0.25 else -up_3 if kind < 0.5 else across_3
@@ -385,15 +393,6 @@ def _unit_surface_points(shape: str) -> tuple[np.ndarray, float]:
     centroid = (pieces[:, 0] + pieces[:, 1] + pieces[:, 2]) / 3
     offset = pieces - centroid[:, None]  # the farthest point of a triangle from its centroid is a corner
     return centroid, float(np.sqrt((offset * offset).sum(axis=2).max())) + ROUNDING
-
-
-def _random_direction(rng: np.random.Generator, dimensions: int = 3) -> np.ndarray:
-    """A uniformly random unit vector, by rejection in the ball; of four dimensions a rotation's quaternion."""
-    while True:
-        point = points_in_ball(1, dimensions, rng)[0]
-        length = float(np.sqrt((point * point).sum()))
-        if length > 0.1:  # dividing by less would magnify rounding
-            return point / length
 
 
 def _choice(options: tuple[str, ...], rng: np.random.Generator) -> str:

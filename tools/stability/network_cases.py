@@ -13,9 +13,10 @@ from typing import Annotated, Any
 import numpy as np
 
 from hgn.config import DEFAULT_WEIGHTS, BackendName, MpmConfig, NetworkConfig, Precision, Processor, SceneConfig
+from hgn.scene.funnel import funnel_squares
 from hgn.scene.material import MATERIALS
 from hgn.scene.random_scene import REPORT_SEED, generate_scene
-from hgn.scene.rotation import euler_rotation
+from hgn.scene.rotation import euler_rotation, quaternion_rotation
 from hgn.scene.scene import Scene
 from hgn.scene.shapes import shape_obstacle
 from hgn.schema import ConfigError, FrameCount, Positive, one_of, require_bounds
@@ -171,22 +172,17 @@ def _funnels(name: str, config: SceneConfig, material: str, hole_cells: tuple[fl
     """
     side, middle_3 = FUNNEL_SIDE * min(config.domain_size), 0.5 * np.array(config.domain_size)
     tilt = math.radians(FUNNEL_TILT_DEG)
-    across, down = 0.5 * side * math.cos(tilt), 0.5 * side * math.sin(tilt)
-    edge, half = float(middle_3[1]) - down, 0.5 * config.group_size
+    edge, half = float(middle_3[1]) - 0.5 * side * math.sin(tilt), 0.5 * config.group_size
     clear = (half * math.sin(tilt) + config.clearance_cells * config.cell_size) / math.cos(tilt)
     above = cube(config, material, np.array([middle_3[0], edge + clear + half, middle_3[2]]), np.zeros(3))
+    hole_3 = np.array([middle_3[0], edge, middle_3[2]])
     scenes = []
     for cells in hole_cells:
-        aside = 0.5 * cells * network_cell + across
-        sheets = tuple(
-            shape_obstacle("square", side, tuple((middle_3 + sign * aside * axis_3).tolist()), euler_rotation(turn))
-            for sign in (-1.0, 1.0)
-            for axis_3, turn in (
-                (np.array([1.0, 0.0, 0.0]), (0.0, 0.0, sign * FUNNEL_TILT_DEG)),
-                (np.array([0.0, 0.0, 1.0]), (-sign * FUNNEL_TILT_DEG, 0.0, 0.0)),
-            )
+        squares = tuple(
+            shape_obstacle("square", side, tuple((hole_3 + centre_3).tolist()), quaternion_rotation(quaternion))
+            for quaternion, centre_3 in zip(*funnel_squares(cells * network_cell, side, math.sin(tilt)), strict=True)
         )
-        scenes.append(replace(above, obstacles=sheets))
+        scenes.append(replace(above, obstacles=squares))
     return Case(
         name, tuple(scenes), HOLE_FRAMES,
         hole_cells=hole_cells, hole_height=edge, beside_solver=True,
