@@ -346,6 +346,8 @@ class NetworkConfig:
     # at the end of a frame particles are no nearer to the domain's planes than that, at the near sides (0) and at the
     # far ones, or than they were before it; null: nothing holds them but what was learned
     wall_clearance: WallClearance | None = None
+    # and on its way in a frame none comes nearer to an obstacle's triangles than that, or passes them; null: as above
+    obstacle_clearance: Positive[float] | None = None
     materials: tuple[MaterialName, ...] = PAPER_MATERIALS
     # 2: z is that of a plane; imported data alone have it
     dimensions: Annotated[int, Bound("2 or 3", lambda count: count in (2, 3))] = 3
@@ -365,6 +367,8 @@ class NetworkConfig:
             require(not self.slips, "contact_forces", "any with inputs=absolute", self.contact_forces)
             require(not self.rests, "rest_threshold", "0 with inputs=absolute", self.rest_threshold)
         require(not self.rests or self.dimensions == 3, "rest_threshold", "0 with dimensions=2", self.rest_threshold)
+        held, rule = self.obstacle_clearance is not None, "null with dimensions=2"
+        require(not held or self.dimensions == 3, "obstacle_clearance", rule, self.obstacle_clearance)
         if self.kind == "hgn":
             require(self.maximum_neighbours is None, "maximum_neighbours", "null for an hgn", self.maximum_neighbours)
         else:

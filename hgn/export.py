@@ -15,11 +15,14 @@ from hgn.runtime.exported_step import initial_arrays, traced_step, write_onnx, w
 from hgn.runtime.simulator import Simulator
 from hgn.runtime.weights import WeightsInfo, find_weights, load_weights, save_weights
 from hgn.scene.scene_file import find_scene, load_scene
-from hgn.schema import FileName, NonNegative, from_mapping, require, require_bounds
+from hgn.schema import FileName, NonNegative, Positive, from_mapping, require, require_bounds
 from hgn.system.device import choose_device
 from hgn.system.extras import require_installed
 from hgn.system.files import require_place
 from hgn.system.provenance import provenance
+
+
+CHANGES = ("rest_threshold", "wall_clearance", "obstacle_clearance")
 
 
 @dataclass(frozen=True)
@@ -31,6 +34,7 @@ class ExportConfig:
     stored_precision: StoredPrecision = "fp32"  # of the learned tensors; fp16: files half as large
     rest_threshold: NonNegative[float] | None = None  # network.rest_threshold of `out`; null: as it was trained
     wall_clearance: WallClearance | None = None  # network.wall_clearance of `out`; null: as it was trained
+    obstacle_clearance: Positive[float] | None = None  # network.obstacle_clearance of `out`; null: as it was trained
     weights: str | None = None  # what onnx, package and arrays are of: a file or shipped weights; null: `out`
     onnx: FileName | None = None  # file of a step's graph, for ONNX Runtime
     package: str | None = None  # file of a step compiled for `device`, for PyTorch's C++ (.pt2)
@@ -55,7 +59,7 @@ class ExportConfig:
     @property
     def network_changes(self) -> dict[str, Any]:
         """What the network of `out` is to have otherwise than it was trained, by the names of NetworkConfig."""
-        chosen = {name: getattr(self, name) for name in ("rest_threshold", "wall_clearance")}
+        chosen = {name: getattr(self, name) for name in CHANGES}
         return {name: value for name, value in chosen.items() if value is not None}
 
 

@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from torch import nn
 
+from hgn.network.barriers import Barriers
 from hgn.network.obstacles import ObstacleCells, SurfaceParticles
 from hgn.scene.material import MATERIALS
 from hgn.schema import ConfigError
@@ -34,6 +35,7 @@ class ParticleState:
     gravity_S3: torch.Tensor  # of each scene, domain units per frame squared
     obstacles: ObstacleCells | None
     surface: SurfaceParticles | None = None  # where the network sees obstacles as particles
+    barriers: Barriers | None = None  # where nothing passes them (network.obstacle_clearance)
 
     @property
     def scene_count(self) -> int:

@@ -14,6 +14,7 @@ import numpy as np
 import torch
 
 from hgn.config import DEFAULT_WEIGHTS
+from hgn.network.barriers import Barriers
 from hgn.network.base import ParticleNetwork
 from hgn.network.features import ParticleState, material_rows
 from hgn.network.obstacles import ObstacleCells, SurfaceParticles
@@ -22,12 +23,13 @@ from hgn.runtime.differentiable import Inputs, Pose, simulate
 from hgn.runtime.stepped_rollout import stepped
 from hgn.runtime.torch_backend import Backend
 from hgn.runtime.weights import WeightsInfo, find_weights, load_weights
+from hgn.scene.barrier import Barrier, build_barrier
 from hgn.scene.episode import Episode
 from hgn.scene.history import ballistic_velocities, require_past
 from hgn.scene.material import MATERIALS
 from hgn.scene.obstacle_grid import ObstacleGrid, build_obstacle_grid, surface_points
-from hgn.scene.rollout_file import cell_obstacles, episode_surface
-from hgn.scene.scene import Obstacle, Scene
+from hgn.scene.rollout_file import cell_obstacles, episode_surface, known_obstacles
+from hgn.scene.scene import Obstacle, Scene, all_corners
 from hgn.schema import require
 from hgn.system.device import choose_device
 
@@ -48,6 +50,9 @@ class InitialState:
     # Points on the obstacles so many cells apart, for networks that see them as particles; none: of the cells alone, a
     # square each.
     sampled: Callable[[float], np.ndarray] | None = None
+    # Corners of the obstacles' triangles, float64 [F, 3, 3], for networks that pass none; none: nothing is known but
+    # cells, and these hold nothing.
+    corners: Callable[[], np.ndarray] | None = None
     materials: tuple[str, ...] = MATERIALS
     past_HN3: np.ndarray | None = None  # frames before this one, oldest first; none: free flight
     dimensions: int = 3
@@ -63,6 +68,7 @@ class InitialState:
             episode.domain_size,
             episode.gravity,
             lambda spacing_cells: episode_surface(episode, spacing_cells),
+            lambda: all_corners(known_obstacles(episode) or ()),
             episode.materials,
             episode.past_HN3,
             episode.dimensions,
@@ -86,6 +92,7 @@ class InitialState:
             scene.domain_size,
             scene.gravity,
             lambda spacing_cells: _surface(scene.obstacles, scene.cell_size, spacing_cells),
+            lambda: all_corners(scene.obstacles),
         )
 
     @staticmethod
@@ -110,6 +117,11 @@ class InitialState:
         if self.sampled is not None:
             return self.sampled(spacing_cells)
         return _surface(cell_obstacles(self.obstacle_grid), self.obstacle_grid.cell_size, spacing_cells)
+
+    def barrier(self, clearance: float) -> Barrier:
+        """What of the obstacles nothing passes. Raises: ConfigError for a clearance of more than a cell."""
+        corner_F33 = np.zeros((0, 3, 3)) if self.corners is None else self.corners()
+        return build_barrier(corner_F33, self.obstacle_grid.cell_size, clearance, self.domain_size)
 
 
 class Simulator:
@@ -173,6 +185,9 @@ class Simulator:
         surface = None
         if config.obstacle_particles:
             surface = SurfaceParticles.of([state.surface(config.static_spacing_cells) for state in states])
+        barriers = None
+        if config.obstacle_clearance is not None:
+            barriers = Barriers.of([state.barrier(config.obstacle_clearance) for state in states])
         return ParticleState(
             position_N3=torch.from_numpy(position_N3).to(self.device),
             velocity_NM3=torch.from_numpy(np.concatenate(velocities)).to(self.device),
@@ -182,6 +197,7 @@ class Simulator:
             gravity_S3=torch.from_numpy(gravity_S3.astype(np.float32)).to(self.device),
             obstacles=obstacles and obstacles.to(self.device),
             surface=surface and surface.to(self.device),
+            barriers=barriers and barriers.to(self.device),
         )
 
     def step(self, state: ParticleState) -> ParticleState:

@@ -16,7 +16,8 @@ import torch
 from hgn.config import NetworkConfig
 from hgn.network.features import ParticleState
 from hgn.network.grid import GridRangeError
-from hgn.runtime.divergence import DivergedError, describe_diverged, diverged, within_range
+from hgn.runtime.divergence import DivergedError, describe_diverged, diverged
+from hgn.runtime.holding import held
 
 
 class Rollout(Protocol):
@@ -47,35 +48,15 @@ def stepped(
 
 
 def advanced(state: ParticleState, acceleration_N3: torch.Tensor, config: NetworkConfig) -> ParticleState:
-    """One frame later: v += a, x += v, and what the walls hold. Velocity is kept as state, not as a difference of
-    positions.
+    """One frame later: v += a, x += v, and what walls and obstacles hold. Velocity is kept as state, not as a
+    difference of positions.
     """
     velocity_N3 = state.velocity_NM3[:, 0] + acceleration_N3
     position_N3 = state.position_N3 + velocity_N3
-    if config.wall_clearance is not None:
+    if config.wall_clearance is not None or config.obstacle_clearance is not None:
         position_N3, velocity_N3 = held(state, position_N3, velocity_N3, config)
     history_NM3 = torch.cat([velocity_N3[:, None], state.velocity_NM3[:, :-1]], dim=1)
     return replace(state, position_N3=position_N3, velocity_NM3=history_NM3)
-
-
-def held(
-    state: ParticleState, position_N3: torch.Tensor, velocity_N3: torch.Tensor, config: NetworkConfig
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """The next positions and velocities as `wall_clearance` lets them be; `state` is that of before the frame.
-
-    Positions are no nearer to the planes at 0 and at the domain's size than the clearances, or than they were: so what
-    is between two walls that leave no room stays. Where that changes a position, the velocity is what was moved. Axes
-    from `dimensions` on have no walls. What is not `within_range` is not held, so that divergence is seen by positions.
-    """
-    assert config.wall_clearance is not None
-    near, far = config.wall_clearance
-    before_N3, domain_N3 = state.position_N3, state.domain_S3[state.scene_N]
-    low_N3 = torch.where(before_N3 < near, before_N3, near)
-    high_N3 = torch.where(before_N3 > domain_N3 - far, before_N3, domain_N3 - far)
-    walled_3 = torch.arange(3, device=position_N3.device) < config.dimensions
-    stopped_N3 = ((position_N3 < low_N3) | (position_N3 > high_N3)) & within_range(position_N3, domain_N3) & walled_3
-    limit_N3 = torch.where(position_N3 < low_N3, low_N3, high_N3)
-    return torch.where(stopped_N3, limit_N3, position_N3), torch.where(stopped_N3, limit_N3 - before_N3, velocity_N3)
 
 
 class SteppedRollout:

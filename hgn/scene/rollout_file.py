@@ -130,14 +130,22 @@ def rollout_velocity(rollout: Rollout) -> np.ndarray:
 
 
 def obstacles_of_episode(episode: Episode) -> tuple[Obstacle, ...]:
+    """The meshes of an episode's obstacles; where only its cells are known, a square each."""
+    known = known_obstacles(episode)
+    if known is None:
+        return cell_obstacles(episode.obstacle_grid, episode.domain_size[2] / 2 if episode.dimensions == 2 else None)
+    return known
+
+
+def known_obstacles(episode: Episode) -> tuple[Obstacle, ...] | None:
     """The meshes of an episode's obstacles, which shards do not hold.
 
     A random scene's specification has the shape and place of each, so its meshes are built again. Where that names
-    mesh files that are not here, and of any other scene, only the obstacle cells are known: a square each.
+    mesh files that are not here, and of any other scene, only the obstacle cells are known: none.
     """
     records = episode.specification.get("obstacles", ())
     if episode.specification.get("kind") != "random" or not all(_is_here(record) for record in records):
-        return cell_obstacles(episode.obstacle_grid, episode.domain_size[2] / 2 if episode.dimensions == 2 else None)
+        return None
     return tuple(
         shape_obstacle(
             record["shape"],

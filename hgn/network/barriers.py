@@ -1,0 +1,145 @@
+"""Obstacles that nothing passes, on the device: what stops a particle's way at the end of a frame.
+
+The rule, for a way from x to y in a frame. Of a triangle a particle keeps to the side that it begins on. Where it comes
+nearer to the triangle's plane than the clearance, over what the triangle covers (hgn.scene.barrier), or passes the
+plane there, it is stopped by it; of several triangles, by the first. Then y is moved along the triangle's normal until
+it is as far from the plane as the clearance, or as x: what is along the triangle is kept, as on a surface without
+friction.
+Shape legend: N particles, Q cells of all scenes, E entries of their lists, F triangles, P pairs of both.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch.compiler import is_exporting
+
+from hgn.network.cell_keys import COORDINATE_LIMIT, find, pack
+from hgn.scene.barrier import Barrier
+
+
+@dataclass(frozen=True, eq=False)
+class Barriers:
+    """The barriers of a batch: sorted cell keys, and the triangles that each cell lists."""
+
+    key_Q: torch.Tensor  # int64
+    start_Q: torch.Tensor  # int64 [Q + 1]
+    triangle_E: torch.Tensor  # int64
+    row_F24: torch.Tensor  # as in hgn.scene.barrier
+    scene_F: torch.Tensor  # int64
+    cell_size: float
+    clearance: float
+
+    @staticmethod
+    def of(barriers: Sequence[Barrier]) -> Barriers | None:
+        """Of a batch, scene s from barriers[s]; none where no scene has an obstacle."""
+        if not any(len(barrier.row_F24) for barrier in barriers):
+            return None
+        cell_size, clearance = barriers[0].cell_size, barriers[0].clearance
+        assert all((b.cell_size, b.clearance) == (cell_size, clearance) for b in barriers)
+        keys = [
+            pack(torch.full((len(b.cell_Q3),), scene), torch.from_numpy(b.cell_Q3.astype(np.int64)))
+            for scene, b in enumerate(barriers)
+        ]
+        triangles = np.cumsum([0, *(len(b.row_F24) for b in barriers)])
+        entries = np.cumsum([0, *(len(b.triangle_E) for b in barriers)])
+        starts = [b.start_Q[:-1] + first for b, first in zip(barriers, entries, strict=False)]
+        lists = [b.triangle_E + first for b, first in zip(barriers, triangles, strict=False)]
+        return Barriers(
+            torch.cat(keys),
+            torch.from_numpy(np.concatenate([*starts, entries[-1:]]).astype(np.int64)),
+            torch.from_numpy(np.concatenate(lists).astype(np.int64)),
+            torch.from_numpy(np.concatenate([b.row_F24 for b in barriers])),
+            torch.from_numpy(np.repeat(np.arange(len(barriers)), np.diff(triangles))),
+            cell_size,
+            clearance,
+        )
+
+    def to(self, device: torch.device, non_blocking: bool = False) -> Barriers:
+        names = ("key_Q", "start_Q", "triangle_E", "row_F24", "scene_F")
+        moved = [getattr(self, name).to(device, non_blocking=non_blocking) for name in names]
+        return Barriers(*moved, self.cell_size, self.clearance)
+
+    def stopped(
+        self, before_N3: torch.Tensor, after_N3: torch.Tensor, scene_N: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Which ways the first triangle on them stops, bool [N], and where they end then, [N, 3]; others as they are.
+
+        Positions are finite. The way to where one ends may be stopped by another triangle.
+        """
+        particle_P, triangle_P = self._pairs(before_N3, after_N3, scene_N)
+        row_P24 = self.row_F24.to(before_N3.dtype)[triangle_P]
+        before_P3, way_P3 = before_N3[particle_P], (after_N3 - before_N3)[particle_P]
+        normal_P3 = row_P24[:, :3]
+        distance_P = (normal_P3 * before_P3).sum(-1) - row_P24[:, 3]
+        side_P = torch.where(distance_P >= 0, 1.0, -1.0).to(distance_P.dtype)
+        distance_P = side_P * distance_P
+        approach_P = -side_P * (normal_P3 * way_P3).sum(-1)
+        end_P, closing_P = distance_P - approach_P, approach_P.clamp(min=1e-30)
+        comes_P = ((distance_P - self.clearance) / closing_P).clamp(0, 1)
+        passes_P = (distance_P / closing_P).clamp(0, 1)
+        here_P = _covers(row_P24, before_P3 + comes_P[:, None] * way_P3)
+        there_P = _covers(row_P24, before_P3 + passes_P[:, None] * way_P3) & (end_P < 0)
+        stops_P = (approach_P > 0) & (end_P < self.clearance) & (here_P | there_P)
+        time_P = torch.where(stops_P, torch.where(here_P, comes_P, passes_P), 2.0)
+        least_N = torch.full_like(before_N3[:, 0], 2.0).scatter_reduce(0, particle_P, time_P.detach(), "amin")
+        first_P = stops_P & (time_P == least_N[particle_P])
+        # of several at one time that of the least number
+        count, pairs = self.row_F24.shape[0], particle_P.shape[0]
+        number_P = torch.where(first_P, triangle_P, count)
+        number_N = torch.full_like(scene_N, count).scatter_reduce(0, particle_P, number_P, "amin")
+        first_P = first_P & (triangle_P == number_N[particle_P])
+        # the pair of each particle, a last one that moves nothing for the others
+        place_P = torch.where(first_P, torch.arange(pairs, device=scene_N.device), pairs)
+        pair_N = torch.full_like(scene_N, pairs).scatter_reduce(0, particle_P, place_P, "amin")
+        wanted_P = torch.minimum(distance_P, torch.full_like(distance_P, self.clearance))
+        move_P3 = (side_P * (wanted_P - end_P))[:, None] * normal_P3
+        move_P3 = torch.cat([move_P3, torch.zeros_like(after_N3[:1])])
+        hit_N = pair_N < pairs
+        return hit_N, torch.where(hit_N[:, None], after_N3 + move_P3[pair_N], after_N3)
+
+    def _pairs(
+        self, before_N3: torch.Tensor, after_N3: torch.Tensor, scene_N: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Particles and triangles int64 [P] among which are all that meet."""
+        if is_exporting():
+            return self._pairs_of_boxes(before_N3, after_N3)
+        before_N3, after_N3 = before_N3.detach(), after_N3.detach()
+        way_N3 = after_N3 - before_N3
+        pieces_N = torch.ceil(torch.linalg.vector_norm(way_N3, dim=-1) / self.cell_size).clamp(min=1)
+        particles, triangles = [scene_N[:0]], [scene_N[:0]]
+        for piece in range(int(pieces_N.max()) if len(pieces_N) else 0):
+            here_N = torch.nonzero(pieces_N > piece).flatten() if piece else torch.arange(len(way_N3)).to(scene_N)
+            share_N1 = ((piece + 0.5) / pieces_N[here_N])[:, None]
+            cell_N3 = torch.floor((before_N3[here_N] + share_N1 * way_N3[here_N]) / self.cell_size)
+            cell_N3 = cell_N3.clamp(-COORDINATE_LIMIT, COORDINATE_LIMIT - 1).long()
+            index_N, found_N = find(self.key_Q, pack(scene_N[here_N], cell_N3))
+            index_N, here_N = index_N[found_N], here_N[found_N]
+            count_N = self.start_Q[index_N + 1] - self.start_Q[index_N]
+            before = torch.repeat_interleave(count_N.cumsum(0) - count_N, count_N)
+            entry = torch.arange(len(before), device=before.device) - before
+            triangles.append(self.triangle_E[torch.repeat_interleave(self.start_Q[index_N], count_N) + entry])
+            particles.append(torch.repeat_interleave(here_N, count_N))
+        return torch.cat(particles), torch.cat(triangles)
+
+    def _pairs_of_boxes(self, before_N3: torch.Tensor, after_N3: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Those whose boxes meet: as a graph without loops has it, of one scene."""
+        low_N3, high_N3 = torch.minimum(before_N3, after_N3), torch.maximum(before_N3, after_N3)
+        low_F3, high_F3 = self.row_F24[:, 16:19], self.row_F24[:, 20:23]
+        meets_NF = (low_N3[:, None, 0] <= high_F3[None, :, 0]) & (high_N3[:, None, 0] >= low_F3[None, :, 0])
+        for axis in (1, 2):
+            meets_NF = meets_NF & (low_N3[:, None, axis] <= high_F3[None, :, axis])
+            meets_NF = meets_NF & (high_N3[:, None, axis] >= low_F3[None, :, axis])
+        particle_P, triangle_P = torch.nonzero(meets_NF, as_tuple=True)
+        return particle_P, triangle_P
+
+
+def _covers(row_P24: torch.Tensor, place_P3: torch.Tensor) -> torch.Tensor:
+    """Whether a triangle covers a place in its plane, bool [P]."""
+    inside_P = ((place_P3 >= row_P24[:, 16:19]) & (place_P3 <= row_P24[:, 20:23])).all(-1)
+    for plane in (4, 8, 12):
+        inside_P = inside_P & ((row_P24[:, plane : plane + 3] * place_P3).sum(-1) <= row_P24[:, plane + 3])
+    return inside_P

@@ -1,0 +1,267 @@
+"""Obstacles that nothing passes: where ways end that meet triangles, and that none is passed."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from network.states import network_of
+
+from hgn.network.barriers import Barriers
+from hgn.network.features import ParticleState
+from hgn.runtime.holding import held
+from hgn.scene.barrier import build_barrier
+from hgn.scene.rotation import euler_rotation
+from hgn.scene.scene import Obstacle, all_corners
+from hgn.scene.shapes import shape_obstacle
+from hgn.schema import ConfigError
+
+CELL, CLEARANCE = 1 / 64, 1e-3
+DOMAIN = (1.0, 1.0, 1.0)
+
+
+def square(at, normal_axis, size=0.25):
+    """A square of two triangles about a place, across an axis: corners [2, 3, 3]."""
+    first, second = [axis for axis in range(3) if axis != normal_axis]
+    corner_43 = np.tile(np.asarray(at, float), (4, 1))
+    for corner, (a, b) in enumerate(((-1, -1), (1, -1), (1, 1), (-1, 1))):
+        corner_43[corner, first] += 0.5 * size * a
+        corner_43[corner, second] += 0.5 * size * b
+    return corner_43[[[0, 1, 2], [0, 2, 3]]]
+
+
+def barriers_of(*scenes, clearance=CLEARANCE):
+    return Barriers.of([build_barrier(corner_F33, CELL, clearance, DOMAIN) for corner_F33 in scenes])
+
+
+def ended(before, after, barriers, dtype=torch.float64, scene=None, **changes):
+    """Where straight ways end that are held, [N, 3], and the velocities."""
+    before_N3, after_N3 = (torch.as_tensor(np.atleast_2d(x), dtype=dtype) for x in (before, after))
+    count = len(before_N3)
+    scene_N = torch.zeros(count, dtype=torch.int64) if scene is None else torch.as_tensor(scene)
+    domain_S3 = torch.ones(int(scene_N.max()) + 1, 3, dtype=dtype)
+    velocity_NM3 = torch.zeros(count, 5, 3, dtype=dtype)
+    state = ParticleState(
+        before_N3, velocity_NM3, scene_N, scene_N, domain_S3, torch.zeros_like(domain_S3), None, barriers=barriers
+    )
+    config = network_of(**({"obstacle_clearance": CLEARANCE} | changes)).config
+    position_N3, velocity_N3 = held(state, after_N3, after_N3 - before_N3, config)
+    return position_N3.numpy(), velocity_N3.numpy()
+
+
+def crossings(before_N3, after_N3, corner_F33):
+    """How many ways pass a triangle (Moeller and Trumbore 1997), by determinants alone."""
+    count = 0
+    for a, b, c in corner_F33:
+        way_N3, e1, e2 = after_N3 - before_N3, b - a, c - a
+        p_N3, t_N3 = np.cross(way_N3, e2), before_N3 - a
+        determinant_N = p_N3 @ e1
+        with np.errstate(divide="ignore", invalid="ignore"):
+            q_N3 = np.cross(t_N3, e1)
+            u_N, v_N = (t_N3 * p_N3).sum(-1) / determinant_N, (way_N3 * q_N3).sum(-1) / determinant_N
+            time_N = q_N3 @ e2 / determinant_N
+            count += int(((u_N >= 0) & (v_N >= 0) & (u_N + v_N <= 1) & (time_N >= 0) & (time_N <= 1)).sum())
+    return count
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+@pytest.mark.parametrize("axis", [0, 1, 2])
+@pytest.mark.parametrize(
+    ("before", "after", "end"),
+    [  # distance from the square's plane, and a place along it
+        ((0.05, 0.0), (-0.05, 0.02), (CLEARANCE, 0.02)),  # stopped, and what is along it is kept
+        ((0.05, 0.0), (0.02, 0.02), (0.02, 0.02)),  # does not come so far
+        ((0.05, 0.0), (CLEARANCE / 2, 0.0), (CLEARANCE, 0.0)),  # comes too near
+        ((CLEARANCE / 4, 0.0), (-0.1, 0.01), (CLEARANCE / 4, 0.01)),  # begins nearer: stays as near
+        ((CLEARANCE / 4, 0.0), (CLEARANCE / 2, 0.0), (CLEARANCE / 2, 0.0)),  # or leaves
+        ((0.3, 0.0), (-0.6, 0.0), (CLEARANCE, 0.0)),  # many cells in a frame
+        ((0.05, 0.13), (-0.05, 0.13), (-0.05, 0.13)),  # beyond the rim
+        ((0.05, 0.125 + CLEARANCE / 2), (-0.05, 0.125 + CLEARANCE / 2), (CLEARANCE, 0.125 + CLEARANCE / 2)),
+        ((CLEARANCE / 4, 0.135), (-CLEARANCE / 4, 0.115), (CLEARANCE / 4, 0.115)),  # nearly along it, from beyond
+    ],
+)
+def test_a_square(before, after, end, axis, sign):
+    """In closed form, from both sides, across each axis."""
+
+    def place(distance, along):
+        at = np.full(3, 0.5)
+        at[axis] += sign * distance
+        at[(axis + 1) % 3] += along
+        return at
+
+    position_13, velocity_13 = ended(place(*before), place(*after), barriers_of(square((0.5,) * 3, axis)))
+    assert position_13[0] == pytest.approx(place(*end), rel=0, abs=1e-7)  # rows are float32
+    assert velocity_13[0] == pytest.approx(position_13[0] - place(*before), rel=0, abs=1e-12)
+
+
+def test_corners_stop_on_each_side():
+    """A way into a corner of two and of three squares ends at the clearance from each; what is left is along them."""
+    floor, wall = square((0.5, 0.4, 0.5), 1), square((0.4, 0.5, 0.5), 0)
+    back = square((0.5, 0.5, 0.4), 2)
+    into = ((0.45, 0.45, 0.45), (0.35, 0.33, 0.41))
+    assert ended(*into, barriers_of(np.concatenate([floor, wall])))[0][0] == pytest.approx(
+        (0.401, 0.401, 0.41), abs=1e-7
+    )
+    assert ended(into[0], (0.35, 0.33, 0.31), barriers_of(np.concatenate([floor, wall, back])))[0][0] == pytest.approx(
+        (0.401,) * 3, abs=1e-7
+    )
+
+
+def test_where_there_is_no_room_nothing_moves():
+    """Between two slopes that meet below, and a wall across them that it is pushed to: a way that nothing else stops
+    ends where it began, and the velocity is zero."""
+    angles = np.radians([0, 60, 120, 180, 240, 300])
+    centre = np.array([0.5, 0.5, 0.5])
+    sides = []
+    for angle in angles:  # a narrow tube, smaller than the clearance
+        normal = np.array([np.cos(angle), 0.0, np.sin(angle)])
+        along = np.array([-normal[2], 0.0, normal[0]])
+        at = centre + 0.3 * CLEARANCE * normal
+        up = np.array([0.0, 1.0, 0.0])
+        corner_43 = np.stack([at + 0.1 * (a * along + b * up) for a, b in ((-1, -1), (1, -1), (1, 1), (-1, 1))])
+        sides.append(corner_43[[[0, 1, 2], [0, 2, 3]]])
+    barriers = barriers_of(np.concatenate(sides))
+    position_13, velocity_13 = ended(centre, centre + (0.1, 0.02, 0.05), barriers)
+    assert position_13[0] == pytest.approx(centre, abs=1e-3) and abs(velocity_13[0]).max() <= 0.021
+
+
+def scattered(seed, count=2000):
+    """Obstacles of three kinds somewhere, and ways of all lengths around them."""
+    generator = np.random.default_rng(seed)
+    meshes = [
+        shape_obstacle(
+            shape, size, tuple(generator.uniform(0.3, 0.7, 3)), euler_rotation(tuple(generator.uniform(0, 360, 3)))
+        )
+        for shape, size in (("pyramid", 0.3), ("half_sphere", 0.25), ("square", 0.4))
+    ]
+    before_N3 = generator.uniform(0.2, 0.8, (count, 3))
+    way_N3 = generator.normal(size=(count, 3)) * 10.0 ** generator.uniform(-4, -0.7, (count, 1))
+    return all_corners(meshes), before_N3, before_N3 + way_N3
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("walls", [None, (0.3, 0.3)])
+def test_no_triangle_is_passed(dtype, walls):
+    """Of ways of 1e-4 to half the domain none passes a triangle, by another test of it than the one that stops them;
+    without it dozens do. Walls hold too."""
+    for seed in range(3):
+        corner_F33, before_N3, after_N3 = scattered(seed)
+        assert crossings(before_N3, after_N3, corner_F33) > 60
+        begun_N3 = before_N3.astype(np.float32).astype(np.float64)
+        position_N3, velocity_N3 = ended(begun_N3, after_N3, barriers_of(corner_F33), dtype, wall_clearance=walls)
+        assert crossings(begun_N3, position_N3.astype(np.float64), corner_F33) == 0
+        free_N = (position_N3 == after_N3.astype(position_N3.dtype)).all(-1)
+        assert 0.4 < free_N.mean() < 0.98
+        moved_N3 = position_N3.astype(np.float64) - begun_N3
+        assert velocity_N3 == pytest.approx(moved_N3, abs=2e-7)
+        if walls is not None:
+            low_N3, high_N3 = np.minimum(begun_N3, walls[0]), np.maximum(begun_N3, 1 - walls[1])
+            assert (position_N3 >= low_N3 - 1e-6).all() and (position_N3 <= high_N3 + 1e-6).all()
+
+
+def test_lists_hold_all_that_is_met():
+    """Particles end where they do when each is asked against all triangles."""
+    for seed in range(3):
+        corner_F33, before_N3, after_N3 = scattered(seed)
+        barriers = barriers_of(corner_F33)
+        everything = AllPairs(**vars(barriers))
+        listed, asked = (ended(before_N3, after_N3, b)[0] for b in (barriers, everything))
+        assert np.array_equal(listed, asked)
+
+
+class AllPairs(Barriers):
+    """Each particle against each triangle."""
+
+    def _pairs(self, before_N3, after_N3, scene_N):
+        particles, triangles = len(before_N3), len(self.row_F24)
+        return torch.arange(particles).repeat_interleave(triangles), torch.arange(triangles).repeat(particles)
+
+
+class Boxes(Barriers):
+    """The pairs of an exported graph."""
+
+    def _pairs(self, before_N3, after_N3, scene_N):
+        return self._pairs_of_boxes(before_N3, after_N3)
+
+
+def test_the_pairs_of_an_exported_graph():
+    """They stop the same ways in the same places."""
+    corner_F33, before_N3, after_N3 = scattered(7)
+    barriers = barriers_of(corner_F33)
+    listed, boxed = (ended(before_N3, after_N3, b)[0] for b in (barriers, Boxes(**vars(barriers))))
+    assert np.array_equal(listed, boxed)
+
+
+def test_scenes_side_by_side():
+    """Each scene has its own obstacles, one of them none."""
+    corners, befores, afters = zip(*(scattered(seed, 300) for seed in (0, 1, 2)), strict=True)
+    corners = (corners[0], np.zeros((0, 3, 3)), corners[2])
+    scene_N = np.repeat(np.arange(3), 300)
+    together = ended(np.concatenate(befores), np.concatenate(afters), barriers_of(*corners), scene=scene_N)[0]
+    alone = [
+        ended(before, after, barriers_of(corner))[0]
+        for corner, before, after in zip(corners, befores, afters, strict=True)
+    ]
+    assert np.array_equal(together, np.concatenate(alone))
+    assert np.array_equal(alone[1], afters[1])
+
+
+def test_without_obstacles_there_is_no_barrier():
+    nothing = np.zeros((0, 3, 3))
+    assert barriers_of(nothing, nothing) is None
+    flat = np.array([[[0.2, 0.2, 0.2], [0.3, 0.3, 0.3], [0.4, 0.4, 0.4]]])
+    assert barriers_of(flat) is None  # a triangle without area
+
+
+@pytest.mark.parametrize("clearance", [0.0, 0.02, float("nan")])
+def test_bad_clearances(clearance):
+    with pytest.raises(ConfigError, match=r"obstacle_clearance must be above 0, up to a cell \(0.015625\), got"):
+        build_barrier(square((0.5,) * 3, 0), CELL, clearance, DOMAIN)
+
+
+def test_gradients_are_those_of_what_is_left():
+    """Along a surface a held particle moves as it would without; across it, it does not move."""
+    barriers = barriers_of(square((0.5,) * 3, 1))
+    after_N3 = torch.tensor([[0.52, 0.45, 0.5]], dtype=torch.float64, requires_grad=True)
+    before_N3 = torch.tensor([[0.5, 0.55, 0.5]], dtype=torch.float64)
+    hit_N, end_N3 = barriers.stopped(before_N3, after_N3, torch.zeros(1, dtype=torch.int64))
+    assert bool(hit_N[0])
+    for axis, expected in ((0, (1.0, 0.0, 0.0)), (1, (0.0, 0.0, 0.0))):
+        (gradient,) = torch.autograd.grad(end_N3[0, axis], after_N3, retain_graph=True)
+        assert gradient[0].numpy() == pytest.approx(expected, abs=1e-6)
+
+
+def test_what_has_come_apart_is_not_held():
+    barriers = barriers_of(square((0.5,) * 3, 1))
+    far = ((0.5, 0.55, 0.5), (0.5, -2.0, 0.5))
+    assert np.array_equal(ended(*far, barriers)[0][0], far[1])
+    assert np.isnan(ended(far[0], (np.nan,) * 3, barriers)[0]).all()
+
+
+def test_obstacles_that_are_split_hold_where_they_were_split():
+    """Triangles larger than 16 cells are cut; ways through the cuts are stopped."""
+    corner_F33 = square((0.5, 0.5, 0.5), 1, size=0.9)
+    generator = np.random.default_rng(0)
+    before_N3 = np.stack([generator.uniform(0.1, 0.9, 4000), np.full(4000, 0.52), generator.uniform(0.1, 0.9, 4000)], 1)
+    before_N3[:2000, 0] = before_N3[:2000, 2]  # along a diagonal, where cuts are
+    position_N3, _ = ended(before_N3, before_N3 - (0.0, 0.05, 0.0), barriers_of(corner_F33))
+    assert position_N3[:, 1] == pytest.approx(0.5 + CLEARANCE, abs=1e-7)
+
+
+def test_mesh_files_are_obstacles_too():
+    """An obstacle of any triangles: a tetrahedron keeps inside what is inside."""
+    vertex_V3 = 0.4 + 0.2 * np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
+    mesh = Obstacle("tetrahedron", vertex_V3, np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], np.int32), True)
+    barriers = barriers_of(mesh.corners)
+    generator = np.random.default_rng(1)
+    begin_N3 = np.tile(0.4 + 0.2 * np.full(3, 0.2), (500, 1))
+    position_N3 = begin_N3
+    for _ in range(30):
+        position_N3, _ = ended(position_N3, position_N3 + generator.normal(size=(500, 3)) * 0.05, barriers)
+    share_N3 = (position_N3 - 0.4) / 0.2
+    assert (share_N3 > 0).all() and (share_N3.sum(-1) < 1).all()
+
+
+def test_moved_to_a_device_and_back():
+    barriers = barriers_of(square((0.5,) * 3, 1))
+    assert replace(barriers.to(torch.device("cpu"))).key_Q.equal(barriers.key_Q)
