@@ -17,6 +17,7 @@ from hgn.scene.surface import area_vectors, split_long_edges
 from hgn.schema import Vector, require
 
 ROW = 24  # numbers of a triangle: four planes of four, then the box, lowest and highest corner with a zero behind each
+CELLS = 2  # obstacle cells to a cell here: narrower ones have lists as long, and more of them
 LEAST_HEIGHT = 1e-9  # domain units: of a triangle above its longest edge; thinner ones cover nothing that others do not
 CELLS_AT_ONCE = 1 << 20  # candidates of triangles, which bounds memory
 
@@ -38,8 +39,8 @@ class Barrier:
 
 
 def build_barrier(corner_F33: np.ndarray, cell_size: float, clearance: float, domain_size: Vector) -> Barrier:
-    """The barrier of triangles, corners [F, 3, 3] in domain units; what is more than a cell outside the domain is not
-    in it.
+    """The barrier of triangles, corners [F, 3, 3] in domain units; `cell_size` is that of the obstacle cells. What is
+    more than one of these outside the domain is not in it.
 
     Raises: ConfigError for a clearance that is none.
     """
@@ -49,7 +50,7 @@ def build_barrier(corner_F33: np.ndarray, cell_size: float, clearance: float, do
     area = np.linalg.norm(area_vectors(corner_F33), axis=1)
     longest = np.linalg.norm(np.roll(corner_F33, -1, axis=1) - corner_F33, axis=2).max(axis=1, initial=0.0)
     corner_F33 = corner_F33[2 * area > LEAST_HEIGHT * longest]
-    row_F24 = _rows(corner_F33, clearance)
+    row_F24, cell_size = _rows(corner_F33, clearance), CELLS * cell_size
     cell_E3, triangle_E = _lists(row_F24, cell_size, clearance)
     order = np.lexsort((triangle_E, *cell_E3.T[::-1]))
     cell_E3, triangle_E = cell_E3[order], triangle_E[order]
