@@ -8,22 +8,30 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
+from hgn.kernels.barriers import BARRIER_COLUMNS, kept_apart, wall_limit
 from hgn.kernels.triton_compat import gdc_launch_dependents, gdc_wait, settle_keys
 
 DIVERGED = tl.constexpr(4)
 
 
 @triton.jit
+def _axis(x, column, axis: tl.constexpr):
+    """A column of [BLOCK, COLUMNS] as a vector."""
+    return tl.sum(tl.where(column == axis, x, 0.0), 1)
+
+
+@triton.jit
 def integrate(
     output, position, velocity, scene_of, domain, gravity, mean, std, particle_count, status, lost, frame, path,
-    near, far, OUT: tl.constexpr, HISTORY: tl.constexpr, COLUMNS: tl.constexpr, WALLED_AXES: tl.constexpr,
-    OVERLAP: tl.constexpr, BLOCK: tl.constexpr,
+    near, far, barrier_table, within, slack, OUT: tl.constexpr, HISTORY: tl.constexpr, COLUMNS: tl.constexpr,
+    WALLED_AXES: tl.constexpr, SURFACES: tl.constexpr, OVERLAP: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """v += a, x += v, and the new positions into path [T, N, 3] at `frame`; a is gravity and the restored output.
 
     Where the status is not zero, nothing changes. Particles that are not finite or farther from the domain than its
     own size are counted in `lost`, once an axis; `advance` then ends the simulation. All others are held between the
-    walls of the first WALLED_AXES axes, `near` and `far` from the planes; hgn.runtime.stepped_rollout has the rule.
+    walls of the first WALLED_AXES axes, `near` and `far` from the planes, and, with SURFACES, by obstacles, as
+    hgn.kernels.barriers says of `barrier_table`, `within` and `slack`; hgn.runtime.holding has the rule.
 
     Reference: hgn.runtime.simulator.Simulator on the torch backend; test: tests/kernels/test_rollout.py.
     """
@@ -52,12 +60,23 @@ def integrate(
     x = before + v
     size = tl.load(domain + scene[:, None] * 3 + axis, mask=live_axis, other=1.0)
     inside = (x > -size) & (x < 2 * size)  # NaN is outside
+    free_v, free_x = v, x
     if WALLED_AXES > 0:
-        low, high = tl.where(before < near, before, near), tl.where(before > size - far, before, size - far)
-        stopped = live_axis & (axis < WALLED_AXES) & inside & ((x < low) | (x > high))
-        limit = tl.where(x < low, low, high)
+        stopped, limit = wall_limit(x, before, size, near, far)
+        stopped = stopped & live_axis & (axis < WALLED_AXES)
         v = tl.where(stopped, limit - before, v)
         x = tl.where(stopped, limit, x)
+    if SURFACES > 0:
+        line = barrier_table + scene.to(tl.int64) * BARRIER_COLUMNS
+        ends = kept_apart(
+            _axis(before, column, 0), _axis(before, column, 1), _axis(before, column, 2),
+            _axis(x, column, 0), _axis(x, column, 1), _axis(x, column, 2),
+            _axis(size, column, 0), _axis(size, column, 1), _axis(size, column, 2),
+            line, row < count, within, slack, near, far, SURFACES, WALLED_AXES > 0,
+        )  # fmt: skip
+        for k in tl.static_range(3):
+            x = tl.where(column == k, ends[k][:, None], x)
+        v = tl.where(live_axis & (x != free_x), x - before, free_v)
     now = tl.load(frame).to(tl.int64)
     tl.debug_barrier()  # all have read before one writes
     tl.store(at, v, mask=live)
