@@ -12,9 +12,8 @@ import numpy as np
 import torch
 
 from hgn.kernels import barriers as barrier_lookup
-from hgn.kernels.cell_hash import in_buckets
 from hgn.network.barriers import Barriers
-from hgn.network.cell_keys import unpack
+from hgn.network.cell_keys import in_buckets, unpack
 from hgn.scene.barrier import Barrier
 
 BARRIER_COLUMNS = barrier_lookup.BARRIER_COLUMNS.value
@@ -22,7 +21,7 @@ BARRIER_COLUMNS = barrier_lookup.BARRIER_COLUMNS.value
 
 @dataclass(frozen=True, eq=False)
 class BarrierHash:
-    """One scene's barrier, its cells in hash buckets (hgn.kernels.cell_hash)."""
+    """One scene's barrier, its cells in hash buckets."""
 
     bucket_B: torch.Tensor  # int32
     key_Q: torch.Tensor  # int64
@@ -37,7 +36,8 @@ class BarrierHash:
         if not len(barrier.row_F24):
             return None
         parts = (barrier.cell_Q3, barrier.start_Q, barrier.triangle_E, barrier.row_F24)
-        return BarrierHash._of(*map(torch.from_numpy, parts), barrier.cell_size)
+        cell_Q3, start_Q, triangle_E, row_F24 = map(torch.from_numpy, parts)
+        return BarrierHash._of(cell_Q3, start_Q, triangle_E, row_F24, barrier.cell_size)
 
     @staticmethod
     def _of(
@@ -52,8 +52,10 @@ class BarrierHash:
         return BarrierHash(bucket_B, key_Q, span_Q2, triangle_E.int(), row_F24.float().contiguous(), cell_size)
 
     def to(self, device: torch.device) -> BarrierHash:
-        tensors = (self.bucket_B, self.key_Q, self.span_Q2, self.triangle_E, self.row_F24)
-        return BarrierHash(*(tensor.to(device) for tensor in tensors), self.cell_size)
+        bucket_B, key_Q, span_Q2 = self.bucket_B.to(device), self.key_Q.to(device), self.span_Q2.to(device)
+        return BarrierHash(
+            bucket_B, key_Q, span_Q2, self.triangle_E.to(device), self.row_F24.to(device), self.cell_size
+        )
 
     def row(self) -> list[int]:
         """This scene's row of a barrier table; valid as long as this object lives."""
@@ -83,18 +85,14 @@ class BarrierTable:
         scene_Q, cell_Q3 = unpack(barriers.key_Q)
         cells = torch.bincount(scene_Q, minlength=scenes).tolist()
         triangles = torch.bincount(barriers.scene_F, minlength=scenes).tolist()
-        first_cells, first_triangles = np.cumsum([0, *cells]).tolist(), np.cumsum([0, *triangles]).tolist()
-        entries = barriers.start_Q[first_cells].tolist()
+        first_cell, first_triangle = np.cumsum([0, *cells]).tolist(), np.cumsum([0, *triangles]).tolist()
+        first_entry = barriers.start_Q[first_cell].tolist()
         hashes: list[BarrierHash | None] = []
         for scene in range(scenes):
-            own = slice(*first_cells[scene : scene + 2])
-            listed = slice(*entries[scene : scene + 2])
-            rows = slice(*first_triangles[scene : scene + 2])
-            if not triangles[scene]:
-                hashes.append(None)
-                continue
-            start_Q = torch.cat([barriers.start_Q[own], barriers.start_Q[own.stop][None]]) - listed.start
-            triangle_E = barriers.triangle_E[listed] - rows.start
-            row_F24 = barriers.row_F24[rows]
-            hashes.append(BarrierHash._of(cell_Q3[own], start_Q, triangle_E, row_F24, barriers.cell_size))
+            (q, q_end), (e, e_end), (f, f_end) = (
+                first[scene : scene + 2] for first in (first_cell, first_entry, first_triangle)
+            )
+            start_Q, triangle_E = barriers.start_Q[q : q_end + 1] - e, barriers.triangle_E[e:e_end] - f
+            parts = cell_Q3[q:q_end], start_Q, triangle_E, barriers.row_F24[f:f_end], barriers.cell_size
+            hashes.append(BarrierHash._of(*parts) if triangles[scene] else None)
         return BarrierTable(hashes, barriers.key_Q.device)

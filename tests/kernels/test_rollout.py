@@ -102,8 +102,8 @@ def thrown(backend, **changes):
 
 @pytest.mark.parametrize("walls", [None, (0.06, 0.2)])
 def test_obstacles_hold(walls):
-    """Particles that are thrown about pass no obstacle, as in the plain simulator, whose histories they have too. In the
-    scene beside them, which has none, particles pass there."""
+    """Particles that are thrown about pass no obstacle, as in the plain simulator, whose histories they have too. In
+    the scene beside them, which has none, particles pass there."""
     scenes = [scene(12, seed) for seed in (0, 1, 2)]
     corner_F33 = crossed((0.1, 0.1, 0.1))
     held_scenes = [replace(scenes[i], corners=lambda: corner_F33) if i != 1 else scenes[i] for i in range(3)]

@@ -15,11 +15,10 @@ import triton
 
 from hgn.config import NetworkConfig
 from hgn.kernels import obstacles as obstacle_lookup
-from hgn.kernels.cell_hash import in_buckets
 from hgn.kernels.coarsest import kernel as coarsest_kernel
 from hgn.kernels.grid import kernel
 from hgn.kernels.triton_compat import interpreting, overlaps
-from hgn.network.cell_keys import SCENE_LIMIT, unpack
+from hgn.network.cell_keys import SCENE_LIMIT, in_buckets, unpack
 from hgn.network.obstacles import ObstacleCells
 from hgn.network.relative import FEW, OUTPUTS, QUIET, RARE
 
