@@ -12,7 +12,7 @@ Shape legend: N particles, Q cells of all scenes, E entries of their lists, F tr
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -63,8 +63,8 @@ class Barriers:
 
     def to(self, device: torch.device, non_blocking: bool = False) -> Barriers:
         names = ("key_Q", "start_Q", "triangle_E", "row_F24", "scene_F")
-        moved = [getattr(self, name).to(device, non_blocking=non_blocking) for name in names]
-        return Barriers(*moved, self.cell_size, self.clearance)
+        moved = {name: getattr(self, name).to(device, non_blocking=non_blocking) for name in names}
+        return replace(self, **moved)
 
     def stopped(
         self, before_N3: torch.Tensor, after_N3: torch.Tensor, scene_N: torch.Tensor
