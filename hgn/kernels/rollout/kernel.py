@@ -15,9 +15,10 @@ DIVERGED = tl.constexpr(4)
 
 
 @triton.jit
-def _axis(x, column, axis: tl.constexpr):
-    """A column of [BLOCK, COLUMNS] as a vector."""
-    return tl.sum(tl.where(column == axis, x, 0.0), 1)
+def _axes(at, live):
+    """The three coordinates of each particle, a vector each."""
+    x, y = tl.load(at, mask=live, other=0.0), tl.load(at + 1, mask=live, other=0.0)
+    return x, y, tl.load(at + 2, mask=live, other=0.0)
 
 
 @triton.jit
@@ -60,23 +61,14 @@ def integrate(
     x = before + v
     size = tl.load(domain + scene[:, None] * 3 + axis, mask=live_axis, other=1.0)
     inside = (x > -size) & (x < 2 * size)  # NaN is outside
-    free_v, free_x = v, x
     if WALLED_AXES > 0:
         stopped, limit = wall_limit(x, before, size, near, far)
         stopped = stopped & live_axis & (axis < WALLED_AXES)
         v = tl.where(stopped, limit - before, v)
         x = tl.where(stopped, limit, x)
     if SURFACES > 0:
-        line = barrier_table + scene.to(tl.int64) * BARRIER_COLUMNS
-        ends = kept_apart(
-            _axis(before, column, 0), _axis(before, column, 1), _axis(before, column, 2),
-            _axis(x, column, 0), _axis(x, column, 1), _axis(x, column, 2),
-            _axis(size, column, 0), _axis(size, column, 1), _axis(size, column, 2),
-            line, row < count, within, slack, near, far, SURFACES, WALLED_AXES > 0,
-        )  # fmt: skip
-        for k in tl.static_range(3):
-            x = tl.where(column == k, ends[k][:, None], x)
-        v = tl.where(live_axis & (x != free_x), x - before, free_v)
+        begin = position + row * 3
+        bx, by, bz = _axes(begin, row < count)
     now = tl.load(frame).to(tl.int64)
     tl.debug_barrier()  # all have read before one writes
     tl.store(at, v, mask=live)
@@ -85,6 +77,21 @@ def integrate(
     outside = tl.sum(tl.sum((live_axis & (inside == 0)).to(tl.int32), 1), 0)
     if outside > 0:
         tl.atomic_add(lost, outside)
+    if SURFACES > 0:
+        tl.debug_barrier()  # what other threads wrote is read: as columns of the above, each number would be in 16
+        x, y, z = _axes(begin, row < count)
+        width, height, depth = _axes(domain + scene * 3, row < count)
+        line = barrier_table + scene * BARRIER_COLUMNS
+        ends = kept_apart(
+            bx, by, bz, x, y, z, width, height, depth, line, row < count, within, slack, near, far, SURFACES,
+            WALLED_AXES > 0,
+        )  # fmt: skip
+        begins, free = (bx, by, bz), (x, y, z)
+        for k in tl.static_range(3):
+            moved = (row < count) & (ends[k] != free[k])
+            tl.store(begin + k, ends[k], mask=moved)
+            tl.store(path + now * count * 3 + row * 3 + k, ends[k], mask=moved)
+            tl.store(velocity + row * (3 * HISTORY) + k, ends[k] - begins[k], mask=moved)
 
 
 @triton.jit
