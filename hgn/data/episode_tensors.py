@@ -13,8 +13,10 @@ import torch
 from hgn.config import NetworkConfig
 from hgn.data.sampler import Sample, SamplerState
 from hgn.network.features import material_rows
+from hgn.scene.barrier import Barrier
 from hgn.scene.episode import Episode
 from hgn.scene.history import frames_before
+from hgn.scene.rollout_file import episode_barrier
 from hgn.scene.symmetry import Symmetry, Vector, scene_symmetries
 
 
@@ -29,6 +31,7 @@ class EpisodeTensors:
     domain_size: Vector
     gravity: Vector  # domain units per frame squared
     symmetries: tuple[Symmetry, ...] = ()  # what training may show instead of the scene
+    barrier: Barrier | None = None  # of the scene, where simulations of it hold by its obstacles
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,8 +45,9 @@ class UpdateChunk:
     starts: tuple[tuple[int, int], ...] = ()  # episodes and frames that the network is to simulate from before it
 
 
-def whole_episode(episode: Episode, network: NetworkConfig) -> EpisodeTensors:
-    """Reads an episode; its windows are those of `hgn.scene.history.window`."""
+def whole_episode(episode: Episode, network: NetworkConfig, simulated: bool = False) -> EpisodeTensors:
+    """Reads an episode, which may be `simulated`; its windows are those of `hgn.scene.history.window`."""
+    clearance = network.obstacle_clearance if simulated else None
     past = frames_before(episode, -network.velocity_history)
     grid, seen = episode.obstacle_grid, len(episode.obstacle_grid.cell_K3) if network.obstacle_features else 0
     return EpisodeTensors(
@@ -54,6 +58,7 @@ def whole_episode(episode: Episode, network: NetworkConfig) -> EpisodeTensors:
         episode.domain_size,
         frame_gravity(episode),
         shown_symmetries(episode, network),
+        None if clearance is None else episode_barrier(episode, clearance),
     )
 
 

@@ -7,35 +7,13 @@ mask of the buckets, and the symmetry that it is seen under (hgn.scene.symmetry.
 import triton
 import triton.language as tl
 
+from hgn.kernels.cell_hash import LIMIT, find_cell
 from hgn.kernels.triton_compat import settle_keys
-from hgn.network.cell_keys import COORDINATE_LIMIT, HASH_PRIMES
 from hgn.scene import symmetry as codes
 
 OBSTACLE_COLUMNS = tl.constexpr(5)
 CODE_BITS = tl.constexpr(codes.CODE_BITS)
 CODE_MASK = tl.constexpr((1 << codes.CELL_BITS) - 1)  # of the cells in a symmetry's code
-LIMIT = tl.constexpr(COORDINATE_LIMIT)
-PRIME_X, PRIME_Y, PRIME_Z = (tl.constexpr(prime) for prime in HASH_PRIMES)
-
-
-@triton.jit
-def _find_obstacle(x, y, z, line, live):
-    """Row of the obstacle cell (x, y, z) in its scene's hash table, -1 where there is none."""
-    key = ((x + LIMIT) * (2 * LIMIT) + y + LIMIT) * (2 * LIMIT) + z + LIMIT
-    mixed = (x + LIMIT) * PRIME_X ^ (y + LIMIT) * PRIME_Y ^ (z + LIMIT) * PRIME_Z
-    place = (mixed ^ mixed >> 15) & tl.load(line + 3, mask=live, other=0)
-    bucket = tl.load(line, mask=live, other=0).to(tl.pointer_type(tl.int32))
-    entry_key = tl.load(line + 1, mask=live, other=0).to(tl.pointer_type(tl.int64))
-    start = tl.load(bucket + place, mask=live, other=0)
-    end = tl.load(bucket + place + 1, mask=live, other=0)
-    entry = tl.zeros_like(start) - 1
-    ask = live & (start < end)
-    while tl.max(ask.to(tl.int32)) > 0:
-        here = tl.load(entry_key + start, mask=ask, other=-1)
-        entry = tl.where(ask & (here == key), start, entry)
-        start += 1
-        ask = ask & (start < end)
-    return entry
 
 
 @triton.jit
@@ -72,7 +50,7 @@ def obstacle_normals(x, y, z, line, live, obstacle_cell_size, SYMMETRY: tl.const
     y = tl.where(near, y, 0.0).to(tl.int64)
     z = tl.where(near, z, 0.0).to(tl.int64)
     near = near & (tl.load(line, mask=near, other=0) != 0)
-    entry = _find_obstacle(x, y, z, line, near)
+    entry = find_cell(x, y, z, line, near)
     at = tl.load(line + 2, mask=near, other=0).to(tl.pointer_type(tl.float32)) + entry * 3
     found = ()
     for axis in tl.static_range(3):

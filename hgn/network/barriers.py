@@ -4,14 +4,15 @@ The rule, for a way from x to y in a frame. Of a triangle a particle keeps to th
 nearer to the triangle's plane than the clearance, over what the triangle covers (hgn.scene.barrier), or passes the
 plane there, it is stopped by it; of several triangles, by the first. Then y is moved along the triangle's normal until
 it is as far from the plane as the clearance, or as x: what is along the triangle is kept, as on a surface without
-friction.
+friction. What stops it is SLACK of the clearance nearer than where it ends then, so that rounding does not let a
+triangle stop the way to where it has put a particle.
 Shape legend: N particles, Q cells of all scenes, E entries of their lists, F triangles, P pairs of both.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -19,6 +20,8 @@ from torch.compiler import is_exporting
 
 from hgn.network.cell_keys import COORDINATE_LIMIT, find, pack
 from hgn.scene.barrier import Barrier
+
+SLACK = 1e-3  # of the clearance; what begins nearer leaves by that in a frame that would bring it nearer
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,8 +63,8 @@ class Barriers:
 
     def to(self, device: torch.device, non_blocking: bool = False) -> Barriers:
         names = ("key_Q", "start_Q", "triangle_E", "row_F24", "scene_F")
-        moved = [getattr(self, name).to(device, non_blocking=non_blocking) for name in names]
-        return Barriers(*moved, self.cell_size, self.clearance)
+        moved = {name: getattr(self, name).to(device, non_blocking=non_blocking) for name in names}
+        return replace(self, **moved)
 
     def stopped(
         self, before_N3: torch.Tensor, after_N3: torch.Tensor, scene_N: torch.Tensor
@@ -79,11 +82,12 @@ class Barriers:
         distance_P = side_P * distance_P
         approach_P = -side_P * (normal_P3 * way_P3).sum(-1)
         end_P, closing_P = distance_P - approach_P, approach_P.clamp(min=1e-30)
-        comes_P = ((distance_P - self.clearance) / closing_P).clamp(0, 1)
+        within, slack = (1 - SLACK) * self.clearance, SLACK * self.clearance
+        comes_P = ((distance_P - within) / closing_P).clamp(0, 1)
         passes_P = (distance_P / closing_P).clamp(0, 1)
         here_P = _covers(row_P24, before_P3 + comes_P[:, None] * way_P3)
         there_P = _covers(row_P24, before_P3 + passes_P[:, None] * way_P3) & (end_P < 0)
-        stops_P = (approach_P > 0) & (end_P < self.clearance) & (here_P | there_P)
+        stops_P = (approach_P > 0) & (end_P < within) & (here_P | there_P)
         time_P = torch.where(stops_P, torch.where(here_P, comes_P, passes_P), 2.0)
         least_N = torch.full_like(before_N3[:, 0], 2.0).scatter_reduce(0, particle_P, time_P.detach(), "amin")
         first_P = stops_P & (time_P == least_N[particle_P])
@@ -95,7 +99,7 @@ class Barriers:
         # the pair of each particle, a last one that moves nothing for the others
         place_P = torch.where(first_P, torch.arange(pairs, device=scene_N.device), pairs)
         pair_N = torch.full_like(scene_N, pairs).scatter_reduce(0, particle_P, place_P, "amin")
-        wanted_P = torch.minimum(distance_P, torch.full_like(distance_P, self.clearance))
+        wanted_P = distance_P.clamp(max=within) + slack
         move_P3 = (side_P * (wanted_P - end_P))[:, None] * normal_P3
         move_P3 = torch.cat([move_P3, torch.zeros_like(after_N3[:1])])
         hit_N = pair_N < pairs

@@ -1,10 +1,12 @@
 """Integer keys of grid cells: scene index and cell coordinates packed into one int64.
 
 Sorted keys group cells by scene, and neighbours differ by a constant, so that a batch of scenes needs no
-other structure than one sorted list. Shape legend: … any leading shape.
+other structure than one sorted list. Shape legend: … any leading shape, B hash buckets.
 """
 
 from __future__ import annotations
+
+import math
 
 import torch
 from torch.compiler import is_exporting
@@ -40,6 +42,23 @@ def unpack(key: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     shifts = (2 * COORDINATE_BITS, COORDINATE_BITS, 0)
     cell_3 = torch.stack([(key >> shift) & mask for shift in shifts], dim=-1) - COORDINATE_LIMIT
     return key >> (3 * COORDINATE_BITS), cell_3
+
+
+def in_buckets(cell_K3: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """A scene's cells int [K, 3] in hash buckets: where each begins and ends in their order, int32 [B + 1], and in that
+    order the keys of the cells, as of scene 0, and which they were, both int64 [K].
+    """
+    count = len(cell_K3)
+    mask = (1 << max(4, math.ceil(math.log2(2 * max(count, 1))))) - 1
+    shifted_K3 = cell_K3.long() + COORDINATE_LIMIT
+    x, y, z = (shifted_K3 * torch.tensor(HASH_PRIMES, device=shifted_K3.device)).unbind(-1)
+    mixed = x ^ y ^ z
+    place_K = (mixed ^ mixed >> 15) & mask
+    order_K = torch.argsort(place_K, stable=True)
+    size_B = torch.bincount(place_K, minlength=mask + 1)
+    bucket_B = torch.cat([size_B.new_zeros(1), size_B.cumsum(0)]).int()
+    key_K = pack(torch.zeros_like(place_K), cell_K3.long())[order_K]
+    return bucket_B, key_K, order_K
 
 
 def unique(key: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:

@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
+from hgn.kernels.barrier_table import BarrierTable
 from hgn.kernels.buffers import OUT
 from hgn.kernels.capture import captured
 from hgn.kernels.forward import FusedNetwork, feature_columns
@@ -24,11 +25,13 @@ from hgn.kernels.packing import pack_network
 from hgn.kernels.rollout.kernel import DIVERGED, advance, integrate
 from hgn.kernels.triton_compat import overlaps
 from hgn.kernels.tuning import Tuning
+from hgn.network.barriers import SLACK
 from hgn.network.cell_keys import COORDINATE_LIMIT, pack
 from hgn.network.features import ParticleState
 from hgn.network.grid import build_hierarchy
 from hgn.network.hgn import HierarchicalGraphNetwork
 from hgn.runtime.divergence import DivergedError, describe_diverged, diverged
+from hgn.runtime.holding import SURFACES
 from hgn.runtime.parity import LEAST_OUTPUT, OUTPUT_BOUND, relative_error, require_bound
 from hgn.runtime.triton_host import kernel_precision
 
@@ -95,10 +98,12 @@ class TritonRollout:
         capacities: tuple[int, ...] | None = None,
         room: int = 0,
         obstacles: ObstacleTable | None = None,
+        barriers: BarrierTable | None = None,
     ) -> None:
         """`capacities` are cells of each level to begin with.
 
-        `room` is for particles of states that `begin` brings later. `obstacles` replace those of the state.
+        `room` is for particles of states that `begin` brings later. `obstacles` and `barriers` replace those of the
+        state.
         """
         self.config, self.device = network.config, state.position_N3.device
         self.precision = kernel_precision(precision, self.device)
@@ -121,6 +126,9 @@ class TritonRollout:
         self.obstacles = obstacles
         if obstacles is None and state.obstacles is not None:
             self.obstacles = ObstacleTable.of(state.obstacles, state.scene_count)
+        self.barriers = None
+        if self.config.obstacle_clearance is not None:
+            self.barriers = barriers or BarrierTable.of(state.barriers, self.scenes, self.device)
         affordable = PATH_BYTES // (2 * 3 * 4 * max(1, self.particles))
         self.look_frames = max(FEWEST_FRAMES, min(LOOK_FRAMES, affordable))
         self.path_TN3 = torch.zeros(2 * self.look_frames, self.particles, 3, device=self.device)
@@ -149,8 +157,11 @@ class TritonRollout:
     def begin(self, state: ParticleState, new_obstacles: bool = False) -> None:
         """Goes on with another state that `fits`.
 
-        Obstacles are those of the rows of `self.obstacles`, which the caller may write, or those of the state.
+        Obstacles are those of the rows of `self.obstacles` and `self.barriers`, which the caller may write, or those of
+        the state.
         """
+        if new_obstacles and self.barriers is not None:
+            self.barriers.take(BarrierTable.of(state.barriers, self.scenes, self.device))
         if new_obstacles and state.obstacles is not None:
             assert self.obstacles is not None
             self.obstacles.take(ObstacleTable.of(state.obstacles, state.scene_count))
@@ -264,14 +275,18 @@ class TritonRollout:
     def _integrate(self) -> None:
         config, overlap = self.config, overlaps()
         near, far = config.wall_clearance or (0.0, 0.0)
+        clearance = config.obstacle_clearance or 0.0
         integrate[(-(-self.particles // INTEGRATE_BLOCK),)](
             output=self.fused.output, position=self.position_N3, velocity=self.velocity_NV,
             scene_of=self.scene_N, domain=self.domain_S3, gravity=self.gravity_S3, mean=self.mean, std=self.std,
             particle_count=self.count, status=self.grid.status, lost=self.lost, frame=self.frame,
-            path=self.path_TN3, near=near, far=far, OUT=OUT, HISTORY=config.velocity_history,
+            path=self.path_TN3, near=near, far=far,
+            barrier_table=self.count if self.barriers is None else self.barriers.row_S7,
+            within=(1 - SLACK) * clearance, slack=SLACK * clearance, OUT=OUT, HISTORY=config.velocity_history,
             COLUMNS=1 << (3 * config.velocity_history - 1).bit_length(),
-            WALLED_AXES=0 if config.wall_clearance is None else config.dimensions, OVERLAP=overlap,
-            BLOCK=INTEGRATE_BLOCK, launch_pdl=overlap,
+            WALLED_AXES=0 if config.wall_clearance is None else config.dimensions,
+            SURFACES=0 if self.barriers is None else SURFACES, OVERLAP=overlap, BLOCK=INTEGRATE_BLOCK,
+            launch_pdl=overlap,
         )  # fmt: skip
         advance[(1,)](
             status=self.grid.status, lost=self.lost, frame=self.frame, OVERLAP=overlap, num_warps=1, launch_pdl=overlap

@@ -157,9 +157,11 @@ class EpisodeDataModule(LightningDataModule):
     def _whole(self, indices: Sequence[int]) -> dict[int, EpisodeTensors]:
         """Reads episodes, several at once: a data set's first pass is gigabytes, and copies release Python's lock."""
         fraction, measured = self.training.frame_importance, self._measures_frames
+        simulated = self.training.pushforward_fraction > 0
 
         def read(episode: Episode) -> tuple[EpisodeTensors, FrameImportance | None]:
-            return whole_episode(episode, self.network), FrameImportance.of(episode, fraction) if measured else None
+            whole = whole_episode(episode, self.network, simulated)
+            return whole, FrameImportance.of(episode, fraction) if measured else None
 
         opened = [self.store[index] for index in indices]
         with ThreadPoolExecutor(READERS) as readers:

@@ -17,6 +17,7 @@ from dataclasses import replace
 import torch
 
 from hgn.config import TrainingConfig
+from hgn.kernels.barrier_table import BarrierTable
 from hgn.kernels.grid.op import ObstacleTable
 from hgn.kernels.rollout.kernel import DIVERGED
 from hgn.kernels.update.op import DeviceEpisode, DeviceSample
@@ -92,7 +93,7 @@ class GraphPushforwardPool:
         self.figures = pool_figures(self.training, len(self._samples), squares, time.monotonic() - begin_s)
 
     def _state(self, episodes: Sequence[DeviceEpisode], truths: Sequence[torch.Tensor]) -> ParticleState:
-        """The true state that the simulation starts from; obstacles have a table of their own."""
+        """The true state that the simulation starts from; obstacles have tables of their own."""
         history, device = self.network.config.velocity_history, truths[0].device
         past_TN3 = torch.cat([truth[: history + 1] for truth in truths], dim=1)
         counts = torch.tensor([episode.particles for episode in episodes], device=device)
@@ -126,11 +127,17 @@ class GraphPushforwardPool:
         table = None
         if config.obstacle_features:
             table = ObstacleTable([episode.obstacles for episode in episodes], self.obstacle_cell_size, device)
+        barriers = None
+        if config.obstacle_clearance is not None:
+            barriers = BarrierTable([episode.barrier for episode in episodes], device)
         rollout = self._rollout
         if rollout is not None and len(state.position_N3) <= rollout.particles:
             if table is not None:
                 assert rollout.obstacles is not None
                 rollout.obstacles.take(table)
+            if barriers is not None:
+                assert rollout.barriers is not None
+                rollout.barriers.take(barriers)
             rollout.use_values(values)
             rollout.begin(state)
             return rollout
@@ -139,7 +146,7 @@ class GraphPushforwardPool:
             capacities = rollout.grid.capacities
             self._rollout = rollout = None  # before the new one is allocated
         particles = 16 * math.ceil(SPARE * len(state.position_N3) / 16)
-        rollout = TritonRollout(self.network, state, self.training.precision, capacities, particles, table)
+        rollout = TritonRollout(self.network, state, self.training.precision, capacities, particles, table, barriers)
         if capacities is None:
             first = self._first_scenes(episodes, state)
             if first is not None:

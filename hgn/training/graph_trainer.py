@@ -15,6 +15,7 @@ import torch
 
 from hgn.config import TrainingConfig
 from hgn.data.episode_tensors import EpisodeTensors, UpdateChunk
+from hgn.kernels.barrier_table import BarrierHash
 from hgn.kernels.grid.op import ObstacleHash
 from hgn.kernels.triton_compat import JitMisses
 from hgn.kernels.update.op import DeviceEpisode, DeviceSample, UpdateSettings
@@ -145,9 +146,15 @@ class GraphTrainer:
             position_TN3 = position_TN3.to(self.device) if fits else position_TN3.pin_memory()
         cells, normals = episode.obstacle_cell_K3, episode.obstacle_normal_K3
         obstacles = ObstacleHash.of(cells, normals).to(self.device) if len(cells) else None
-        material_N = episode.material_N.to(self.device)
+        barrier = BarrierHash.of(episode.barrier) if episode.barrier is not None else None
         return DeviceEpisode(
-            position_TN3, material_N, obstacles, episode.domain_size, episode.gravity, episode.symmetries
+            position_TN3,
+            episode.material_N.to(self.device),
+            obstacles,
+            episode.domain_size,
+            episode.gravity,
+            episode.symmetries,
+            barrier and barrier.to(self.device),
         )
 
     def _take_over(self) -> None:

@@ -23,12 +23,14 @@ import torch
 
 from hgn.config import TrainingConfig
 from hgn.data.batch import BatchSample, UpdateSamples, make_batch
+from hgn.network.barriers import Barriers
 from hgn.network.base import ParticleNetwork
 from hgn.runtime.backend import fastest_stepped
 from hgn.runtime.divergence import diverged
 from hgn.runtime.stepped_rollout import stepped
 from hgn.scene.episode import Episode
 from hgn.scene.history import window
+from hgn.scene.rollout_file import episode_barrier
 from hgn.schema import ConfigError
 from hgn.training.noise import noise_scale, target_acceleration
 
@@ -153,11 +155,12 @@ class PushforwardPool:
 
     def _simulate(self, starts: Sequence[tuple[Episode, int]]) -> list[torch.Tensor]:
         """Positions [F, N, 3] of each scene; of a scene that diverged, whatever came after."""
-        batch = make_batch(starts, self.network.config).to(self._backend.device)
-        begin = state = batch.state()
+        config = self.network.config
+        batch = make_batch(starts, config).to(self._backend.device)
+        begin = state = replace(batch.state(), barriers=self._barriers([episode for episode, _ in starts]))
         path = []
         for _ in range(self.training.pushforward_frames):
-            state = stepped(self._backend.predict, state, self.network.config)
+            state = stepped(self._backend.predict, state, config)
             path.append(state.position_N3.cpu().clone())
             again_N = diverged_scenes(state.position_N3, state.scene_N, state.domain_S3)
             if bool(again_N.any()):
@@ -165,6 +168,14 @@ class PushforwardPool:
                 velocity_NM3 = torch.where(again_N[:, None, None], 0.0, state.velocity_NM3)
                 state = replace(state, position_N3=position_N3, velocity_NM3=velocity_NM3)
         return list(torch.stack(path).split(list(batch.particles_S), dim=1))
+
+    def _barriers(self, episodes: Sequence[Episode]) -> Barriers | None:
+        """What of the obstacles simulations hold by; windows are trained on without."""
+        clearance = self.network.config.obstacle_clearance
+        if clearance is None:
+            return None
+        barriers = Barriers.of([episode_barrier(episode, clearance) for episode in episodes])
+        return barriers and barriers.to(self._backend.device)
 
     def _take(self, episode: Episode, frame: int, simulated_FN3: torch.Tensor) -> list[float]:
         """Adds a scene's windows; its mean squared distance at the end, where it is there until then."""

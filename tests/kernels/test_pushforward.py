@@ -11,11 +11,12 @@ from kernels.test_training import run_mapping
 from network.states import network_of
 from training.runs import metrics
 from training.test_noise import episode
-from training.test_pushforward import falling, training_of, wild_network
+from training.test_pushforward import falling, training_of, wild_network, with_square
 from training.test_symmetry import scene_with_obstacles
 
 from hgn import train
 from hgn.data.episode_tensors import whole_episode
+from hgn.kernels.barrier_table import BarrierHash
 from hgn.kernels.grid.op import ObstacleHash
 from hgn.kernels.packing import pack_network
 from hgn.kernels.update.op import DeviceEpisode, DeviceSample
@@ -32,11 +33,13 @@ CELL_SIZE = 1 / 64
 
 
 def placed(made, network):
-    whole, where = whole_episode(made, network.config), device()
+    whole, where = whole_episode(made, network.config, simulated=True), device()
     cells, normals = whole.obstacle_cell_K3, whole.obstacle_normal_K3
     obstacles = ObstacleHash.of(cells, normals).to(where) if len(cells) else None
+    barrier = BarrierHash.of(whole.barrier) if whole.barrier is not None else None
     position_TN3, material_N = whole.position_TN3.to(where), whole.material_N.to(where)
-    return DeviceEpisode(position_TN3, material_N, obstacles, whole.domain_size, whole.gravity, whole.symmetries)
+    scene = whole.domain_size, whole.gravity, whole.symmetries
+    return DeviceEpisode(position_TN3, material_N, obstacles, *scene, barrier and barrier.to(where))
 
 
 def values_of(network):
@@ -53,7 +56,9 @@ def assert_same_pools(fast, plain):
         assert asked == pytest.approx(acceleration, abs=1e-6)
 
 
-@pytest.mark.parametrize("changes", [{}, {"inputs": "relative", "wall_clearance": (0.45, 0.45)}])
+@pytest.mark.parametrize(
+    "changes", [{}, {"inputs": "relative", "wall_clearance": (0.45, 0.45)}, {"obstacle_clearance": 5e-3}]
+)
 def test_the_pool_is_that_of_the_plain_path(changes):
     """Scenes with and without obstacles, first and later frames, one simulation after the other with other weights and
     other numbers of particles, in the same buffers where they suffice: both pools hold the same windows."""
@@ -61,6 +66,14 @@ def test_the_pool_is_that_of_the_plain_path(changes):
     scenes = [scene_with_obstacles(0, 7), episode(5, seed=1), scene_with_obstacles(2, 6), scene_with_obstacles(3, 12)]
     training = training_of(precision="fp32", pushforward_frames=2, noise_std=0.5, noise_min_scale=0.1)
     fast, plain = GraphPushforwardPool(network, training, CELL_SIZE, 0), PushforwardPool(network, training, 0)
+    if "obstacle_clearance" in changes:
+        scenes = [with_square(made, (0.25, 0.25, 0.25)) if made is not scenes[1] else made for made in scenes]
+        free_network = network_of(torch.float32, width=16, levels=1, message_passing_steps=1).to(device())
+        plain.refresh([(scenes[0], 0)])
+        free = PushforwardPool(free_network, training, 0)
+        free.refresh([(scenes[0], 0)])
+        ends = [pool._samples[-1][0].window_WN3[-2] for pool in (plain, free)]
+        assert 0 < (abs(ends[0] - ends[1]).max(-1) > 3e-4).sum() < 7  # others feel those that are held
     rollouts = []
     for starts in ([(0, 0), (1, 4)], [(1, 0), (2, 6)], [(0, 5), (3, 2)]):
         fast.refresh([(placed(scenes[i], network), frame) for i, frame in starts], values_of(network))

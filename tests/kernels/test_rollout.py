@@ -1,18 +1,22 @@
 """The simulation loop on the device against the plain one."""
 
 import gc
+import itertools
 import weakref
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
 import torch
 from kernels.engines import device
 from kernels.memory import living_tensors
+from network.barrier_scenes import crossings, square
 from network.states import network_of, on_device, random_state
 from runtime.scenes import random_scene
 
 from hgn.config import NetworkConfig
+from hgn.kernels.barrier_table import BarrierTable
 from hgn.kernels.grid.op import DeviceGrid, Window
 from hgn.network.features import ParticleState
 from hgn.network.hgn import HierarchicalGraphNetwork
@@ -82,6 +86,66 @@ def test_walls_hold(changes):
     assert held_N3.any() and not held_N3.all()
     for expected, found in zip(*motions, strict=True):
         np.testing.assert_allclose(found, expected, rtol=0, atol=2e-6)
+
+
+def crossed(*places):
+    """Corners of two sheets that cross at each place."""
+    return np.concatenate([square(at, axis, 0.3) for at in places for axis in (0, 1)])
+
+
+def thrown(backend, **changes):
+    """A simulator of a network that throws particles about."""
+    wild = network(**changes)
+    wild.normaliser.acceleration_std.fill_(0.02)
+    return Simulator(wild, 60.0, backend, "fp32")
+
+
+@pytest.mark.parametrize("walls", [None, (0.06, 0.2)])
+def test_obstacles_hold(walls):
+    """Particles that are thrown about pass no obstacle, as in the plain simulator, whose histories they have too. In
+    the scene beside them, which has none, particles pass there."""
+    scenes = [scene(12, seed) for seed in (0, 1, 2)]
+    corner_F33 = crossed((0.1, 0.1, 0.1))
+    held_scenes = [replace(scenes[i], corners=lambda: corner_F33) if i != 1 else scenes[i] for i in range(3)]
+    motions = []
+    for backend, clearance in (("torch", None), ("torch", 2e-3), ("triton", 2e-3)):
+        simulator = thrown(backend, wall_clearance=walls, obstacle_clearance=clearance)
+        state = simulator.start(held_scenes)
+        with simulator.backend.rollout(state) as rollout:
+            path_TN3 = rollout.run(3)
+            motions.append((path_TN3, *(x.numpy(force=True) for x in rollout.motion())))
+        whole_TN3 = np.concatenate([state.position_N3.numpy(force=True)[None], path_TN3]).astype(np.float64)
+        passed_S = [
+            sum(crossings(*ways, corner_F33) for ways in itertools.pairwise(whole_TN3[:, 12 * i : 12 * i + 12]))
+            for i in range(3)
+        ]
+        assert passed_S[1] > 0 and (passed_S[0] + passed_S[2] > 4 if clearance is None else passed_S[::2] == [0, 0])
+    free, *both = motions
+    changed_N = (free[0] != both[0][0]).any((0, 2))
+    assert 4 < changed_N.sum() < 36
+    for expected, found in zip(*both, strict=True):
+        np.testing.assert_allclose(found, expected, rtol=0, atol=2e-6)
+
+
+def test_obstacles_that_hold_change():
+    """A simulation that began among no obstacles goes on with others, captured once, and with none again; what is
+    given it replaces those of the state. The frames are bitwise those of new simulations."""
+    changes = {"obstacle_clearance": 2e-3}
+    places = ((0.1, 0.1, 0.1), (0.08, 0.12, 0.1))
+    scenes = [scene(12), *(replace(scene(12), corners=partial(crossed, at)) for at in places)]
+    simulator = thrown("triton", **changes)
+    states = [simulator.start([each]) for each in scenes]
+    paths = [thrown("triton", **changes).rollout([each], 3)[0][1:] for each in scenes]
+    assert not np.array_equal(paths[0], paths[1]) and not np.array_equal(paths[1], paths[2])
+    rollout = TritonRollout(simulator.network, states[0], "fp32")
+    for index in (0, 1, 2, 0):
+        assert rollout.take(states[index])
+        np.testing.assert_array_equal(rollout.run(2), paths[index])
+    given = BarrierTable.of(states[2].barriers, 1, device())
+    rollout = TritonRollout(simulator.network, states[1], "fp32", barriers=given)
+    np.testing.assert_array_equal(rollout.run(2), paths[2])
+    rollout.begin(states[1])
+    np.testing.assert_array_equal(rollout.run(2), paths[2])
 
 
 def test_divergence_is_seen_through_walls():

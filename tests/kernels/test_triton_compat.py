@@ -35,8 +35,8 @@ def test_the_interface_is_as_it_was(lines):
 
 
 def test_what_the_interpreter_forgives(lines):
-    """All kernels of grids and relative inputs compile, of an update and of a frame, which has walls or none: the
-    interpreter takes what Triton does not, a constant that is defined twice say."""
+    """All kernels of grids and relative inputs compile, of an update and of a frame, held by walls and obstacles or by
+    nothing: the interpreter takes what Triton does not, a constant that is defined twice say."""
     compiled = [line[1] for line in lines if line[0] == "COMPILED"]
     names = {"sum_motion", "prepare_relative_features", "sum_coarsest", "balance", "balance_backward", "add_coarsest"}
     assert set(compiled) > names and len(compiled) > len(set(compiled)), compiled

@@ -5,33 +5,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from network.barrier_scenes import CELL, CLEARANCE, DOMAIN, barriers_of, crossings, scattered, square
 from network.states import network_of
 
-from hgn.network.barriers import Barriers
+from hgn.network.barriers import SLACK, Barriers
 from hgn.network.features import ParticleState
 from hgn.runtime.holding import held
 from hgn.scene.barrier import build_barrier
 from hgn.scene.rotation import euler_rotation
-from hgn.scene.scene import Obstacle, all_corners
-from hgn.scene.shapes import shape_obstacle
+from hgn.scene.scene import Obstacle
 from hgn.schema import ConfigError
 
-CELL, CLEARANCE = 1 / 64, 1e-3
-DOMAIN = (1.0, 1.0, 1.0)
-
-
-def square(at, normal_axis, size=0.25):
-    """A square of two triangles about a place, across an axis: corners [2, 3, 3]."""
-    first, second = [axis for axis in range(3) if axis != normal_axis]
-    corner_43 = np.tile(np.asarray(at, float), (4, 1))
-    for corner, (a, b) in enumerate(((-1, -1), (1, -1), (1, 1), (-1, 1))):
-        corner_43[corner, first] += 0.5 * size * a
-        corner_43[corner, second] += 0.5 * size * b
-    return corner_43[[[0, 1, 2], [0, 2, 3]]]
-
-
-def barriers_of(*scenes, clearance=CLEARANCE):
-    return Barriers.of([build_barrier(corner_F33, CELL, clearance, DOMAIN) for corner_F33 in scenes])
+MORE = SLACK * CLEARANCE
 
 
 def ended(before, after, barriers, dtype=torch.float64, scene=None, **changes):
@@ -49,21 +34,6 @@ def ended(before, after, barriers, dtype=torch.float64, scene=None, **changes):
     return position_N3.numpy(), velocity_N3.numpy()
 
 
-def crossings(before_N3, after_N3, corner_F33):
-    """How many ways pass a triangle (Moeller and Trumbore 1997), by determinants alone."""
-    count = 0
-    for a, b, c in corner_F33:
-        way_N3, e1, e2 = after_N3 - before_N3, b - a, c - a
-        p_N3, t_N3 = np.cross(way_N3, e2), before_N3 - a
-        determinant_N = p_N3 @ e1
-        with np.errstate(divide="ignore", invalid="ignore"):
-            q_N3 = np.cross(t_N3, e1)
-            u_N, v_N = (t_N3 * p_N3).sum(-1) / determinant_N, (way_N3 * q_N3).sum(-1) / determinant_N
-            time_N = q_N3 @ e2 / determinant_N
-            count += int(((u_N >= 0) & (v_N >= 0) & (u_N + v_N <= 1) & (time_N >= 0) & (time_N <= 1)).sum())
-    return count
-
-
 @pytest.mark.parametrize("sign", [1, -1])
 @pytest.mark.parametrize("axis", [0, 1, 2])
 @pytest.mark.parametrize(
@@ -72,12 +42,16 @@ def crossings(before_N3, after_N3, corner_F33):
         ((0.05, 0.0), (-0.05, 0.02), (CLEARANCE, 0.02)),  # stopped, and what is along it is kept
         ((0.05, 0.0), (0.02, 0.02), (0.02, 0.02)),  # does not come so far
         ((0.05, 0.0), (CLEARANCE / 2, 0.0), (CLEARANCE, 0.0)),  # comes too near
-        ((CLEARANCE / 4, 0.0), (-0.1, 0.01), (CLEARANCE / 4, 0.01)),  # begins nearer: stays as near
+        ((CLEARANCE / 4, 0.0), (-0.1, 0.01), (CLEARANCE / 4 + MORE, 0.01)),  # begins nearer: stays as near
         ((CLEARANCE / 4, 0.0), (CLEARANCE / 2, 0.0), (CLEARANCE / 2, 0.0)),  # or leaves
         ((0.3, 0.0), (-0.6, 0.0), (CLEARANCE, 0.0)),  # many cells in a frame
         ((0.05, 0.13), (-0.05, 0.13), (-0.05, 0.13)),  # beyond the rim
         ((0.05, 0.125 + CLEARANCE / 2), (-0.05, 0.125 + CLEARANCE / 2), (CLEARANCE, 0.125 + CLEARANCE / 2)),
-        ((CLEARANCE / 4, 0.135), (-CLEARANCE / 4, 0.115), (CLEARANCE / 4, 0.115)),  # nearly along it, from beyond
+        (
+            (CLEARANCE / 4, 0.135),
+            (-CLEARANCE / 4, 0.115),
+            (CLEARANCE / 4 + MORE, 0.115),
+        ),  # along it, from beyond
     ],
 )
 def test_a_square(before, after, end, axis, sign):
@@ -121,22 +95,22 @@ def test_where_there_is_no_room_nothing_moves():
         corner_43 = np.stack([at + 0.1 * (a * along + b * up) for a, b in ((-1, -1), (1, -1), (1, 1), (-1, 1))])
         sides.append(corner_43[[[0, 1, 2], [0, 2, 3]]])
     barriers = barriers_of(np.concatenate(sides))
-    position_13, velocity_13 = ended(centre, centre + (0.1, 0.02, 0.05), barriers)
+    position_13, velocity_13 = ended(centre, centre + np.array([0.1, 0.02, 0.05]), barriers)
     assert position_13[0] == pytest.approx(centre, abs=1e-3) and abs(velocity_13[0]).max() <= 0.021
 
 
-def scattered(seed, count=2000):
-    """Obstacles of three kinds somewhere, and ways of all lengths around them."""
-    generator = np.random.default_rng(seed)
-    meshes = [
-        shape_obstacle(
-            shape, size, tuple(generator.uniform(0.3, 0.7, 3)), euler_rotation(tuple(generator.uniform(0, 360, 3)))
-        )
-        for shape, size in (("pyramid", 0.3), ("half_sphere", 0.25), ("square", 0.4))
-    ]
-    before_N3 = generator.uniform(0.2, 0.8, (count, 3))
-    way_N3 = generator.normal(size=(count, 3)) * 10.0 ** generator.uniform(-4, -0.7, (count, 1))
-    return all_corners(meshes), before_N3, before_N3 + way_N3
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_a_triangle_stops_a_way_once(dtype):
+    """Whatever its slope and the rounding, the way to where it puts a particle is free of it."""
+    generator = np.random.default_rng(2)
+    for _ in range(8):
+        turn_33 = euler_rotation(tuple(generator.uniform(0, 360, 3)))
+        corner_F33 = (square((0.0,) * 3, 1, 0.6) @ turn_33.T + 0.5)[:1]
+        before_N3, way_N3 = generator.uniform(0.2, 0.8, (2000, 3)), 0.2 * generator.normal(size=(2000, 3))
+        before_N3, after_N3 = (torch.as_tensor(x, dtype=dtype) for x in (before_N3, before_N3 + way_N3))
+        scene_N, barriers = torch.zeros(2000, dtype=torch.int64), barriers_of(corner_F33)
+        hit_N, end_N3 = barriers.stopped(before_N3, after_N3, scene_N)
+        assert hit_N.sum() > 100 and not barriers.stopped(before_N3, end_N3, scene_N)[0].any()
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])

@@ -25,4 +25,6 @@ both = replace(frames, networks=(*frames.networks, (network, "tf32")))
 shallow = replace(frames, networks=(*frames.networks, (replace(network, levels=1), "fp16")))
 found = set(launches_of(frames, "cpu"))
 assert set(launches_of(frames)) == found and len(found) > len(set(launches_of(replace(frames, sizes=frames.sizes[:1]))))
+held = replace(frames, networks=(*frames.networks, (replace(network, obstacle_clearance=1e-3), "fp16")))
+assert set(launches_of(held)) == set(launches_of(held, "cpu")) and len(set(launches_of(held)) - found) == 1
 assert set(launches_of(both)) > found and len(set(launches_of(shallow)) - found) < 8

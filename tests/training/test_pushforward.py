@@ -1,11 +1,13 @@
 """Pushforward on backend torch."""
 
+import itertools
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 from equality import assert_same
+from network.barrier_scenes import crossings
 from network.states import gns_of, network_of
 from training.runs import metrics, train_mapping
 from training.test_noise import episode
@@ -18,6 +20,8 @@ from hgn.data.batch import BatchSample, UpdateSamples, make_batch
 from hgn.data.sampler import SamplerState
 from hgn.runtime.simulator import Simulator
 from hgn.scene.history import window
+from hgn.scene.rollout_file import known_obstacles
+from hgn.scene.scene import all_corners
 from hgn.schema import ConfigError
 from hgn.training.checkpoint import read_checkpoint
 from hgn.training.pushforward import PushforwardPool, drawn_pool_samples, drawn_starts, pushforward_windows
@@ -145,6 +149,31 @@ def wild_network():
         network.normaliser.acceleration_mean.fill_(0.02)
         network.normaliser.acceleration_std.fill_(0.0)
     return network
+
+
+def with_square(episode, at, size=0.6):
+    """The episode among one obstacle that its specification tells of: a square across y."""
+    record = {"shape": "square", "size": size, "position": [*at], "quaternion": [1.0, 0.0, 0.0, 0.0]}
+    return replace(episode, specification={"kind": "random", "obstacles": [record]})
+
+
+def test_obstacles_hold():
+    """Where obstacles let nothing pass, nothing of what the network does in a scene passes its own; in another scene it
+    does, and without clearance in both."""
+    network = wild_network()
+    scenes = [with_square(episode(6, seed=1), (0.5, 0.53, 0.5)), episode(6, seed=2)]
+    corner_F33 = all_corners(known_obstacles(scenes[0]) or ())
+    for clearance, expected in ((None, [6, 6]), (2e-3, [0, 6])):
+        network.config = replace(network.config, obstacle_clearance=clearance)
+        own = pool_of(network)
+        own.refresh([(scene, 2) for scene in scenes])
+        passed = []
+        for scene in scenes:
+            windows = [sample.window_WN3 for sample, _ in own._samples if sample.episode is scene]
+            assert len(windows) == 3
+            path_TN3 = np.stack([windows[0][-3], *(window_WN3[-2] for window_WN3 in windows)]).astype(np.float64)
+            passed.append(sum(crossings(*ways, corner_F33) for ways in itertools.pairwise(path_TN3)))
+        assert passed == expected
 
 
 def test_lost_scenes_are_dropped():

@@ -18,7 +18,7 @@ from hgn.kernels import obstacles as obstacle_lookup
 from hgn.kernels.coarsest import kernel as coarsest_kernel
 from hgn.kernels.grid import kernel
 from hgn.kernels.triton_compat import interpreting, overlaps
-from hgn.network.cell_keys import COORDINATE_LIMIT, HASH_PRIMES, SCENE_LIMIT, pack, unpack
+from hgn.network.cell_keys import SCENE_LIMIT, in_buckets, unpack
 from hgn.network.obstacles import ObstacleCells
 from hgn.network.relative import FEW, OUTPUTS, QUIET, RARE
 
@@ -72,17 +72,8 @@ class ObstacleHash:
     @staticmethod
     def of(cell_K3: torch.Tensor, normal_K3: torch.Tensor) -> ObstacleHash:
         """Of cells int [K, 3] with normals [K, 3], on their device."""
-        count = len(cell_K3)
-        mask = (1 << max(4, math.ceil(math.log2(2 * max(count, 1))))) - 1
-        shifted_K3 = cell_K3.long() + COORDINATE_LIMIT
-        x, y, z = (shifted_K3 * torch.tensor(HASH_PRIMES, device=shifted_K3.device)).unbind(-1)
-        mixed = x ^ y ^ z
-        place_K = (mixed ^ mixed >> 15) & mask
-        order = torch.argsort(place_K, stable=True)
-        size_B = torch.bincount(place_K, minlength=mask + 1)
-        bucket_B = torch.cat([size_B.new_zeros(1), size_B.cumsum(0)]).int()
-        key_K = pack(torch.zeros_like(place_K), cell_K3.long())
-        return ObstacleHash(bucket_B, key_K[order].contiguous(), normal_K3[order].float().contiguous())
+        bucket_B, key_K, order_K = in_buckets(cell_K3)
+        return ObstacleHash(bucket_B, key_K, normal_K3[order_K].float().contiguous())
 
     def to(self, device: torch.device) -> ObstacleHash:
         return ObstacleHash(self.bucket_B.to(device), self.key_K.to(device), self.normal_K3.to(device))

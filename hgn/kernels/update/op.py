@@ -20,6 +20,7 @@ import triton
 
 from hgn.config import CORRELATED_WAVELENGTHS, CORRELATED_WAVES, TrainingConfig
 from hgn.kernels.backward import FusedTrainingNetwork
+from hgn.kernels.barrier_table import BarrierHash
 from hgn.kernels.capture import captured
 from hgn.kernels.forward import feature_columns
 from hgn.kernels.grid.op import OBSTACLE_COLUMNS, OUT_OF_WINDOW, DeviceGrid, ObstacleHash, ObstacleTable, Window
@@ -53,6 +54,7 @@ class DeviceEpisode:
     domain_size: Vector
     gravity: Vector = (0.0, 0.0, 0.0)  # domain units per frame squared; for relative inputs alone
     symmetries: tuple[Symmetry, ...] = ()  # of which one is drawn for each sample, where that is asked
+    barrier: BarrierHash | None = None  # that its simulations hold by
 
     def __post_init__(self) -> None:
         position_TN3, material_N = self.position_TN3, self.material_N

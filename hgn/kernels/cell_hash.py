@@ -1,0 +1,37 @@
+"""How the device finds a cell in its scene's hash buckets, which hgn.network.cell_keys.in_buckets makes.
+
+Row of a table of scenes, int64: it begins with the addresses of the buckets (0: no cells), of their keys, and of what
+belongs to each, and the mask of the buckets.
+"""
+
+import triton
+import triton.language as tl
+
+from hgn.kernels.triton_compat import settle_keys
+from hgn.network.cell_keys import COORDINATE_LIMIT, HASH_PRIMES
+
+LIMIT = tl.constexpr(COORDINATE_LIMIT)
+PRIME_X, PRIME_Y, PRIME_Z = (tl.constexpr(prime) for prime in HASH_PRIMES)
+
+
+@triton.jit
+def find_cell(x, y, z, line, live):
+    """Place of the cell (x, y, z) among its scene's, -1 where it is not there; `line` is the scene's row."""
+    key = ((x + LIMIT) * (2 * LIMIT) + y + LIMIT) * (2 * LIMIT) + z + LIMIT
+    mixed = (x + LIMIT) * PRIME_X ^ (y + LIMIT) * PRIME_Y ^ (z + LIMIT) * PRIME_Z
+    place = (mixed ^ mixed >> 15) & tl.load(line + 3, mask=live, other=0)
+    bucket = tl.load(line, mask=live, other=0).to(tl.pointer_type(tl.int32))
+    entry_key = tl.load(line + 1, mask=live, other=0).to(tl.pointer_type(tl.int64))
+    start = tl.load(bucket + place, mask=live, other=0)
+    end = tl.load(bucket + place + 1, mask=live, other=0)
+    entry = tl.zeros_like(start) - 1
+    ask = live & (start < end)
+    while tl.max(ask.to(tl.int32)) > 0:
+        here = tl.load(entry_key + start, mask=ask, other=-1)
+        entry = tl.where(ask & (here == key), start, entry)
+        start += 1
+        ask = ask & (start < end)
+    return entry
+
+
+settle_keys(globals())

@@ -1,0 +1,129 @@
+"""Obstacles that nothing passes, on the device against hgn.runtime.holding."""
+
+import numpy as np
+import pytest
+import torch
+import triton
+import triton.language as tl
+from kernels.engines import device
+from network.barrier_scenes import CELL, CLEARANCE, DOMAIN, barriers_of, crossings, scattered, square
+from network.states import network_of
+
+from hgn.kernels.barrier_table import BarrierHash, BarrierTable
+from hgn.kernels.barriers import BARRIER_COLUMNS, kept_apart
+from hgn.network.barriers import SLACK
+from hgn.network.features import ParticleState
+from hgn.runtime.holding import SURFACES, held
+from hgn.scene.barrier import build_barrier
+
+BLOCK = 1024
+NO_CORNERS = np.zeros((0, 3, 3))
+
+
+@triton.jit
+def hold(
+    before, after, scene_of, table, out, count, within, slack, near, far, SURFACES: tl.constexpr, WALLED: tl.constexpr,
+    BLOCK: tl.constexpr,
+):  # fmt: skip
+    row = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    live = row < count
+    line = table + tl.load(scene_of + row, mask=live, other=0) * BARRIER_COLUMNS
+    bx = tl.load(before + 3 * row, mask=live, other=0.0)
+    by = tl.load(before + 3 * row + 1, mask=live, other=0.0)
+    bz = tl.load(before + 3 * row + 2, mask=live, other=0.0)
+    x = tl.load(after + 3 * row, mask=live, other=0.0)
+    y = tl.load(after + 3 * row + 1, mask=live, other=0.0)
+    z = tl.load(after + 3 * row + 2, mask=live, other=0.0)
+    size = tl.zeros_like(x) + 1.0
+    ends = kept_apart(
+        bx, by, bz, x, y, z, size, size, size, line, live, within, slack, near, far, SURFACES, WALLED
+    )  # fmt: skip
+    for axis in tl.static_range(3):
+        tl.store(out + 3 * row + axis, ends[axis], mask=live)
+
+
+def both(before_N3, after_N3, scene_N, barriers, table, walls=None):
+    """Where ways end by PyTorch, and on the device, float32 [N, 3]."""
+    where, count = device(), len(before_N3)
+    before_N3, after_N3 = (torch.as_tensor(x, dtype=torch.float32).to(where) for x in (before_N3, after_N3))
+    scene_N = torch.as_tensor(scene_N).to(where)
+    domain_S3 = torch.ones(int(scene_N.max()) + 1, 3, device=where)
+    velocity_NM3 = torch.zeros(count, 5, 3, device=where)
+    state = ParticleState(
+        before_N3, velocity_NM3, scene_N, scene_N, domain_S3, torch.zeros_like(domain_S3), None, barriers=barriers
+    )
+    config = network_of(obstacle_clearance=CLEARANCE, wall_clearance=walls).config
+    expected_N3, _ = held(state, after_N3, after_N3 - before_N3, config)
+    if walls is not None:
+        config = network_of(wall_clearance=walls).config
+        after_N3, _ = held(state, after_N3, after_N3 - before_N3, config)
+    found_N3 = torch.full_like(after_N3, torch.nan)
+    near, far = walls or (0.0, 0.0)
+    hold[(triton.cdiv(count, BLOCK),)](
+        before=before_N3, after=after_N3, scene_of=scene_N, table=table.row_S7, out=found_N3, count=count,
+        within=(1 - SLACK) * CLEARANCE, slack=SLACK * CLEARANCE, near=near, far=far, SURFACES=SURFACES,
+        WALLED=walls is not None, BLOCK=BLOCK,
+    )  # fmt: skip
+    return expected_N3.cpu().numpy(), found_N3.cpu().numpy()
+
+
+def table_of(*scenes):
+    """Of the scenes' corners, each scene by itself."""
+    hashes = [BarrierHash.of(build_barrier(corner_F33, CELL, CLEARANCE, DOMAIN)) for corner_F33 in scenes]
+    return BarrierTable(hashes, device())
+
+
+def on_device(barriers):
+    return barriers and barriers.to(device())
+
+
+def met(seed):
+    """Of ways among scattered obstacles those that are stopped, and the first hundred others; float32."""
+    corner_F33, *ways = scattered(seed)
+    before_N3, after_N3 = (torch.as_tensor(x, dtype=torch.float32) for x in ways)
+    hit_N, _ = barriers_of(corner_F33).stopped(before_N3, after_N3, torch.zeros(len(before_N3), dtype=torch.int64))
+    chosen_N = hit_N | (torch.cumsum(~hit_N, 0) <= 100)
+    return corner_F33, before_N3[chosen_N].numpy(), after_N3[chosen_N].numpy()
+
+
+@pytest.mark.parametrize("walls", [None, (0.3, 0.3)])
+def test_ways_end_where_the_reference_ends_them(walls):
+    """Scenes side by side, one without obstacles: ways of all lengths end where they do by PyTorch, to rounding, and
+    pass no triangle. A table of a batch's barriers is as good as one of each scene's own."""
+    corners, befores, afters = (list(x) for x in zip(*(met(seed) for seed in (0, 1, 2)), strict=True))
+    corners[1] = NO_CORNERS
+    scene_N = np.repeat(np.arange(3), [len(before_N3) for before_N3 in befores])
+    before_N3, after_N3, barriers = np.concatenate(befores), np.concatenate(afters), on_device(barriers_of(*corners))
+    table = table_of(*corners) if walls is None else BarrierTable.of(barriers, 3, device())
+    expected_N3, found_N3 = both(before_N3, after_N3, scene_N, barriers, table, walls)
+    np.testing.assert_allclose(found_N3, expected_N3, rtol=0, atol=1e-6)
+    for scene, corner_F33 in enumerate(corners):
+        own = scene_N == scene
+        begin_N3, free_N3, end_N3 = (x[own].astype(np.float64) for x in (before_N3, after_N3, found_N3))
+        assert crossings(begin_N3, end_N3, corner_F33) == 0
+        assert ((end_N3 != free_N3).any(-1).sum() > 60) == (scene != 1 or walls is not None)
+
+
+def test_where_nothing_stops_nothing_changes():
+    """Bitwise: ways between the obstacles, and whatever has come apart."""
+    corner_F33, before_N3, after_N3 = met(4)
+    after_N3[::7], after_N3[3::7] = np.nan, 2.5
+    barriers, scene_N = on_device(barriers_of(corner_F33)), np.zeros(len(after_N3), np.int64)
+    expected_N3, found_N3 = both(before_N3, after_N3, scene_N, barriers, table_of(corner_F33))
+    free_N = ~(expected_N3 != after_N3).any(-1) | np.isnan(after_N3[:, 0])
+    assert 100 < free_N.sum() < len(free_N) - 30
+    np.testing.assert_array_equal(found_N3[free_N], after_N3[free_N])
+
+
+def test_a_table_takes_the_rows_of_another():
+    """In place: obstacles come where none were, others take their place, and go."""
+    first, second = square((0.5,) * 3, 1), square((0.5, 0.4, 0.5), 1)
+    before_N3, after_N3 = np.full((1, 3), (0.5, 0.6, 0.52)), np.full((1, 3), (0.5, 0.3, 0.52))
+    table = BarrierTable.of(None, 1, device())
+    address = table.row_S7.data_ptr()
+    for corners, height in ((None, 0.3), ((first,), 0.501), ((second,), 0.401), (None, 0.3)):
+        barriers = None if corners is None else on_device(barriers_of(*corners))
+        table.take(BarrierTable.of(barriers, 1, device()))
+        expected_N3, found_N3 = both(before_N3, after_N3, np.zeros(1, np.int64), barriers, table)
+        assert found_N3[0] == pytest.approx((0.5, height, 0.52), abs=1e-6)
+        assert found_N3 == pytest.approx(expected_N3, abs=1e-6) and table.row_S7.data_ptr() == address
