@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hgn.scene.obstacle_grid import SPLIT_CELLS
+from hgn.scene.rotation import round_to_float32
 from hgn.scene.surface import area_vectors, split_long_edges
 from hgn.schema import Vector, require
 
@@ -49,12 +50,13 @@ def build_barrier(corner_F33: np.ndarray, cell_size: float, clearance: float, do
 def barrier_pieces(corner_F33: np.ndarray, cell_size: float, domain_size: Vector | None = None) -> np.ndarray:
     """The triangles of a barrier, corners float64 [F', 3, 3]: long ones in pieces, without those that have no area.
 
-    With the domain's size, without what is more than a cell outside it.
+    With the domain's size, without what is more than a cell outside it. Corners are float32's, so that what is given
+    them in that precision has the same rows.
     """
     box = None
     if domain_size is not None:
         box = (np.full(3, -cell_size), np.array(domain_size, np.float64) + cell_size)
-    corner_F33 = split_long_edges(corner_F33, SPLIT_CELLS * cell_size, box)
+    corner_F33 = round_to_float32(split_long_edges(corner_F33, SPLIT_CELLS * cell_size, box))
     area = np.linalg.norm(area_vectors(corner_F33), axis=1)
     longest = np.linalg.norm(np.roll(corner_F33, -1, axis=1) - corner_F33, axis=2).max(axis=1, initial=0.0)
     return np.asarray(corner_F33[2 * area > LEAST_HEIGHT * longest])
