@@ -20,6 +20,9 @@ from torch.compiler import is_exporting
 from hgn.network.cell_keys import COORDINATE_LIMIT, LARGEST_EXPORTED, find, pack
 from hgn.scene.barrier import LEAST_HEIGHT, Barrier
 
+# What is stopped ends where it is wanted but for rounding, and must not be stopped there again: so a way that ends nearer
+# by less than this share of the distance is not.
+SLACK = 0.01
 NOWHERE = 1e30  # domain units: lowest corner of a box that nothing meets, its highest is at minus that
 
 
@@ -80,12 +83,13 @@ class Barriers:
         side_P = torch.where(distance_P >= 0, 1.0, -1.0).to(distance_P.dtype)
         distance_P = side_P * distance_P
         approach_P = -side_P * (normal_P3 * way_P3).sum(-1)
+        wanted_P = distance_P.clamp(max=self.clearance)
         end_P, closing_P = distance_P - approach_P, approach_P.clamp(min=1e-30)
         comes_P = ((distance_P - self.clearance) / closing_P).clamp(0, 1)
         passes_P = (distance_P / closing_P).clamp(0, 1)
         here_P = _covers(row_P24, before_P3 + comes_P[:, None] * way_P3)
         there_P = _covers(row_P24, before_P3 + passes_P[:, None] * way_P3) & (end_P < 0)
-        stops_P = (approach_P > 0) & (end_P < self.clearance) & (here_P | there_P)
+        stops_P = (approach_P > 0) & (end_P < (1 - SLACK) * wanted_P) & (here_P | there_P)
         time_P = torch.where(stops_P, torch.where(here_P, comes_P, passes_P), 2.0)
         least_N = torch.full_like(before_N3[:, 0], 2.0).scatter_reduce(0, particle_P, time_P.detach(), "amin")
         first_P = stops_P & (time_P == least_N[particle_P])
@@ -97,7 +101,6 @@ class Barriers:
         # the pair of each particle, a last one that moves nothing for the others
         place_P = torch.where(first_P, torch.arange(pairs, device=scene_N.device), pairs)
         pair_N = torch.full_like(scene_N, pairs).scatter_reduce(0, particle_P, place_P, "amin")
-        wanted_P = torch.minimum(distance_P, torch.full_like(distance_P, self.clearance))
         move_P3 = (side_P * (wanted_P - end_P))[:, None] * normal_P3
         move_P3 = torch.cat([move_P3, torch.zeros_like(after_N3[:1])])
         hit_N = pair_N < pairs

@@ -159,6 +159,22 @@ def test_no_triangle_is_passed(dtype, walls):
             assert (position_N3 >= low_N3 - 1e-6).all() and (position_N3 <= high_N3 + 1e-6).all()
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_a_slope_stops_a_way_once(dtype):
+    """What a turned square stops slides along it, whatever rounding does: nothing that has room stays where it was."""
+    generator = np.random.default_rng(3)
+    turn_33 = euler_rotation((20, 40, 70))
+    corner_F33 = (square((0.0,) * 3, 1, 0.6) @ turn_33.T + 0.5).astype(np.float32)
+    begun_N3 = generator.uniform(-0.1, 0.1, (2000, 3))
+    begun_N3[:, 1] = CLEARANCE * 10 ** generator.uniform(-1, 1, 2000)
+    way_N3 = np.array([0.02, -0.05, 0.01]) * generator.uniform(0.5, 1, (2000, 1))
+    before_N3, after_N3 = (x_N3 @ turn_33.T + 0.5 for x_N3 in (begun_N3, begun_N3 + way_N3))
+    position_N3, _ = ended(before_N3, after_N3, barriers_of(corner_F33), dtype)
+    expected_N3 = begun_N3 + way_N3 * (1, 0, 1)
+    expected_N3[:, 1] = np.minimum(begun_N3[:, 1], CLEARANCE)
+    assert (position_N3 - 0.5) @ turn_33 == pytest.approx(expected_N3, rel=0, abs=3e-7)
+
+
 def test_lists_hold_all_that_is_met():
     """Particles end where they do when each is asked against all triangles."""
     for seed in range(3):
