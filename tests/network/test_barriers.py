@@ -7,10 +7,10 @@ import pytest
 import torch
 from network.states import network_of
 
-from hgn.network.barriers import Barriers
+from hgn.network.barriers import Barriers, barrier_rows
 from hgn.network.features import ParticleState
 from hgn.runtime.holding import held
-from hgn.scene.barrier import build_barrier
+from hgn.scene.barrier import barrier_of_pieces, barrier_pieces, build_barrier
 from hgn.scene.rotation import euler_rotation
 from hgn.scene.scene import Obstacle, all_corners
 from hgn.scene.shapes import shape_obstacle
@@ -206,6 +206,19 @@ def test_the_pairs_of_an_exported_graph():
     barriers = barriers_of(corner_F33)
     listed, boxed = (ended(before_N3, after_N3, b)[0] for b in (barriers, Boxes(**vars(barriers))))
     assert np.array_equal(listed, boxed)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_rows_of_an_exported_graph(dtype):
+    """Those of the lists' triangles, from corners in either precision; nothing meets a triangle without area."""
+    corner_F33, _, _ = scattered(8)
+    pieces_F33 = barrier_pieces(corner_F33, CELL, DOMAIN)
+    barrier = barrier_of_pieces(pieces_F33, CELL, CLEARANCE)
+    row_F24 = barrier_rows(torch.from_numpy(pieces_F33).to(dtype), CLEARANCE)
+    np.testing.assert_allclose(row_F24.numpy(), barrier.row_F24, rtol=0, atol=6e-8)  # a rounding to float32
+    flat_F33 = torch.tensor([[[0.5] * 3] * 3, [[0.3] * 3, [0.5] * 3, [0.7] * 3]], dtype=dtype)
+    flat = replace(Barriers.of([barrier]), row_F24=barrier_rows(flat_F33, CLEARANCE))
+    assert not len(flat._pairs_of_boxes(torch.zeros(1, 3), torch.ones(1, 3))[0])
 
 
 def test_scenes_side_by_side():
