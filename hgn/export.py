@@ -23,7 +23,6 @@ from hgn.system.extras import require_installed
 from hgn.system.files import require_place
 from hgn.system.provenance import provenance
 
-
 CHANGES = ("rest_threshold", "wall_clearance", "obstacle_clearance")
 
 

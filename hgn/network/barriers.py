@@ -11,7 +11,7 @@ Shape legend: N particles, Q cells of all scenes, E entries of their lists, F tr
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -20,8 +20,8 @@ from torch.compiler import is_exporting
 from hgn.network.cell_keys import COORDINATE_LIMIT, LARGEST_EXPORTED, find, pack
 from hgn.scene.barrier import LEAST_HEIGHT, Barrier
 
-# What is stopped ends where it is wanted but for rounding, and must not be stopped there again: so a way that ends nearer
-# by less than this share of the distance is not.
+# What is stopped ends where it is wanted but for rounding, and must not be stopped there again. So a way that ends
+# nearer by less than this share of the distance is not.
 SLACK = 0.01
 NOWHERE = 1e30  # domain units: lowest corner of a box that nothing meets, its highest is at minus that
 
@@ -65,8 +65,8 @@ class Barriers:
 
     def to(self, device: torch.device, non_blocking: bool = False) -> Barriers:
         names = ("key_Q", "start_Q", "triangle_E", "row_F24", "scene_F")
-        moved = [getattr(self, name).to(device, non_blocking=non_blocking) for name in names]
-        return Barriers(*moved, self.cell_size, self.clearance)
+        moved = {name: getattr(self, name).to(device, non_blocking=non_blocking) for name in names}
+        return replace(self, **moved)
 
     def stopped(
         self, before_N3: torch.Tensor, after_N3: torch.Tensor, scene_N: torch.Tensor

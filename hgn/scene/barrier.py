@@ -1,8 +1,8 @@
 """Obstacles that nothing passes: their triangles, and which of them a particle's way may meet in a cell.
 
-A triangle covers what is within `clearance` of it, in its plane too. Its row has four planes, a unit normal and an offset
-each: its own, then those of its edges, which point outwards and lie `clearance` farther out; and the box of its corners,
-twice as much wider. It covers what is on the inner side of the edges, in the box.
+A triangle covers what is within `clearance` of it, in its plane too. Its row has four planes, a unit normal and an
+offset each: its own, then those of its edges, which point outwards and lie `clearance` farther out; and the box of its
+corners, twice as much wider. It covers what is on the inner side of the edges, in the box.
 Shape legend: F triangles, Q cells, E entries of their lists.
 """
 

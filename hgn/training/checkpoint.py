@@ -109,8 +109,8 @@ def network_of_weights(config: TrainConfig) -> ParticleNetwork:
     path = find_weights(config.training.init_weights, "training.init_weights")
     weights, info = load_weights(path, field="training.init_weights")
     remedy = "set it so, or take other training.init_weights"
-    free = ("contact_gate", "contact_forces", "contact_reach_cells", "rest_threshold")
-    free += ("wall_clearance", "obstacle_clearance")
+    of_contacts = ("contact_gate", "contact_forces", "contact_reach_cells", "rest_threshold")
+    free = (*of_contacts, "wall_clearance", "obstacle_clearance")
     pairs = [pair for pair in _network_pairs(info.network, config) if pair[0].removeprefix("network.") not in free]
     pairs.append(("dataset.frame_rate_hz", info.frame_rate_hz, config.dataset.frame_rate_hz))
     if info.network.sees_obstacles:

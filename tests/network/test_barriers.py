@@ -121,7 +121,7 @@ def test_where_there_is_no_room_nothing_moves():
         corner_43 = np.stack([at + 0.1 * (a * along + b * up) for a, b in ((-1, -1), (1, -1), (1, 1), (-1, 1))])
         sides.append(corner_43[[[0, 1, 2], [0, 2, 3]]])
     barriers = barriers_of(np.concatenate(sides))
-    position_13, velocity_13 = ended(centre, centre + (0.1, 0.02, 0.05), barriers)
+    position_13, velocity_13 = ended(centre, np.add(centre, (0.1, 0.02, 0.05)), barriers)
     assert position_13[0] == pytest.approx(centre, abs=1e-3) and abs(velocity_13[0]).max() <= 0.021
 
 

@@ -94,7 +94,7 @@ def test_spout(session):
 
 
 def test_obstacles_that_are_moved_hold(session):
-    """With `obstacle_clearance` what falls rests on an obstacle where it was dragged to, and on none that was removed."""
+    """With `obstacle_clearance` what falls rests on an obstacle where it was dragged to, on none that was removed."""
     clearance = 1e-3
     session.use_weights(free_flight(obstacle_clearance=clearance))
     for obstacle in session.obstacles:
