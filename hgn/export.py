@@ -14,6 +14,8 @@ from hgn.network.features import ParticleState
 from hgn.runtime.exported_step import initial_arrays, traced_step, write_onnx, write_package
 from hgn.runtime.simulator import Simulator
 from hgn.runtime.weights import WeightsInfo, find_weights, load_weights, save_weights
+from hgn.scene.barrier import barrier_pieces
+from hgn.scene.scene import all_corners
 from hgn.scene.scene_file import find_scene, load_scene
 from hgn.schema import FileName, NonNegative, Positive, from_mapping, require, require_bounds
 from hgn.system.device import choose_device
@@ -83,7 +85,9 @@ def main(mapping: dict[str, Any]) -> int:
     if config.arrays is not None:
         assert config.scene is not None
         simulator = Simulator(network, info.frame_rate_hz, "torch", info=info)
-        write_arrays(Path(config.arrays), simulator.start([load_scene(find_scene(config.scene))]))
+        scene = load_scene(find_scene(config.scene))
+        corner_F33 = barrier_pieces(all_corners(scene.obstacles), scene.cell_size, scene.domain_size)
+        write_arrays(Path(config.arrays), simulator.start([scene]), corner_F33)
         print(config.arrays)
     if config.onnx is not None or config.package is not None:
         program = traced_step(network, info)
@@ -125,10 +129,10 @@ def export(checkpoint_path: Path, out: Path, stored_precision: str = "fp32", **n
     save_weights(out, network, info, stored_precision)
 
 
-def write_arrays(folder: Path, state: ParticleState) -> None:
-    """What a step is first given, an .npy file each."""
+def write_arrays(folder: Path, state: ParticleState, corner_F33: np.ndarray) -> None:
+    """What a step is first given, an .npy file each; corners as `initial_arrays` takes them."""
     folder.mkdir(parents=True, exist_ok=True)
-    for name, array in initial_arrays(state).items():
+    for name, array in initial_arrays(state, corner_F33).items():
         np.save(folder / f"{name}.npy", array)
 
 

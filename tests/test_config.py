@@ -42,6 +42,9 @@ RULES = {
             RELATIVE | {"wall_clearance": (float("nan"), 0)},
             r"wall_clearance\[0\] must be a finite number >= 0, got nan",
         ),
+        ({"obstacle_clearance": 0.0}, "obstacle_clearance must be a finite number > 0, got 0.0"),
+        (GNS | {"obstacle_clearance": float("nan")}, "obstacle_clearance must be a finite number > 0, got nan"),
+        ({"obstacle_clearance": 1e-3, "dimensions": 2}, "obstacle_clearance must be null with dimensions=2, got 0.001"),
     ],
     SceneConfig: [
         ({"obstacle_shapes": ("torus",)}, r"obstacle_shapes\[0\] must be one of half_box, .*, or a mesh file"),

@@ -18,10 +18,11 @@ import numpy as np
 import torch
 from torch.compiler import is_exporting
 
-from hgn.network.cell_keys import COORDINATE_LIMIT, find, pack
-from hgn.scene.barrier import Barrier
+from hgn.network.cell_keys import COORDINATE_LIMIT, LARGEST_EXPORTED, find, pack
+from hgn.scene.barrier import LEAST_HEIGHT, Barrier
 
 SLACK = 1e-3  # of the clearance; what begins nearer leaves by that in a frame that would bring it nearer
+NOWHERE = 1e30  # domain units: lowest corner of a box that nothing meets, its highest is at minus that
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,7 +139,35 @@ class Barriers:
             meets_NF = meets_NF & (low_N3[:, None, axis] <= high_F3[None, :, axis])
             meets_NF = meets_NF & (high_N3[:, None, axis] >= low_F3[None, :, axis])
         particle_P, triangle_P = torch.nonzero(meets_NF, as_tuple=True)
+        if is_exporting():
+            torch._check(particle_P.shape[0] <= LARGEST_EXPORTED)
         return particle_P, triangle_P
+
+
+def barrier_rows(corner_F33: torch.Tensor, clearance: float) -> torch.Tensor:
+    """The rows of triangles as hgn.scene.barrier computes them, float64 [F, 24], with gradients by the corners.
+
+    Nothing meets the row of a triangle without area.
+    """
+    corner_F33 = corner_F33.double()
+    a_F3, b_F3, c_F3 = corner_F33.unbind(1)
+    normal_F3 = torch.linalg.cross(b_F3 - a_F3, c_F3 - a_F3)
+    double_area_F1 = torch.linalg.vector_norm(normal_F3, dim=-1, keepdim=True)
+    edges = (b_F3 - a_F3, c_F3 - b_F3, a_F3 - c_F3)
+    longest_F1 = torch.stack([torch.linalg.vector_norm(edge_F3, dim=-1) for edge_F3 in edges]).amax(0)[:, None]
+    normal_F3 = _unit(normal_F3)
+    planes = [normal_F3, (normal_F3 * c_F3).sum(-1, keepdim=True)]
+    for edge_F3, corner_F3 in zip(edges, (a_F3, b_F3, c_F3), strict=True):
+        outward_F3 = _unit(torch.linalg.cross(edge_F3, normal_F3))
+        planes += [outward_F3, (outward_F3 * corner_F3).sum(-1, keepdim=True) + clearance]
+    exists_F1, zero_F1 = double_area_F1 > LEAST_HEIGHT * longest_F1, torch.zeros_like(double_area_F1)
+    low_F3 = torch.where(exists_F1, corner_F33.amin(1) - 2 * clearance, NOWHERE)
+    high_F3 = torch.where(exists_F1, corner_F33.amax(1) + 2 * clearance, -NOWHERE)
+    return torch.cat([*planes, low_F3, zero_F1, high_F3, zero_F1], dim=1)
+
+
+def _unit(direction_F3: torch.Tensor) -> torch.Tensor:
+    return direction_F3 / torch.linalg.vector_norm(direction_F3, dim=-1, keepdim=True).clamp(min=1e-300)
 
 
 def _covers(row_P24: torch.Tensor, place_P3: torch.Tensor) -> torch.Tensor:

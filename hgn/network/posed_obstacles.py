@@ -27,9 +27,12 @@ class Placement:
     pivot_3: torch.Tensor  # c, domain units
     translation_3: torch.Tensor  # t, domain units
 
-    def place(self, position_N3: torch.Tensor) -> torch.Tensor:
-        """Points of the obstacle where it was, to where it is."""
-        return (position_N3 - self.pivot_3) @ self.rotation_33.T + self.pivot_3 + self.translation_3
+    def place(self, position_3: torch.Tensor) -> torch.Tensor:
+        """Points […, 3] of the obstacle where it was, to where it is."""
+        return (position_3 - self.pivot_3) @ self.rotation_33.T + self.pivot_3 + self.translation_3
+
+    def to(self, dtype: torch.dtype) -> Placement:
+        return Placement(*(tensor.to(dtype) for tensor in (self.rotation_33, self.pivot_3, self.translation_3)))
 
     def undo(self, position_N3: torch.Tensor) -> torch.Tensor:
         """The inverse: points into the frame in which the obstacle's cells were made."""

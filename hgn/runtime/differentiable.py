@@ -1,7 +1,7 @@
 """A simulation through which PyTorch takes gradients, by what it starts from and where its obstacles are.
 
 What has exact gradients, what only within a cell, and how long they can be trusted: docs/how_to/gradients.md.
-Shape legend: T frames, N particles, H velocities, P surface particles.
+Shape legend: T frames, N particles, H velocities, P surface particles, F triangles.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from torch.func import functional_call
 
+from hgn.network.barriers import Barriers, barrier_rows
 from hgn.network.base import ParticleNetwork
 from hgn.network.features import ParticleState
 from hgn.network.grid import GridRangeError
@@ -20,6 +21,7 @@ from hgn.network.obstacles import ObstacleCells, SurfaceParticles
 from hgn.network.posed_obstacles import Placement, PosedObstacleCells
 from hgn.runtime.divergence import DivergedError, describe_diverged, diverged
 from hgn.runtime.stepped_rollout import advanced
+from hgn.scene.barrier import barrier_of_pieces, barrier_pieces
 from hgn.scene.obstacle_grid import ObstacleGrid, build_obstacle_grid, surface_points
 from hgn.scene.scene import Obstacle, Scene
 from hgn.schema import ConfigError, require
@@ -109,7 +111,9 @@ def _variables(state: ParticleState) -> list[torch.Tensor]:
     if isinstance(state.obstacles, PosedObstacleCells):
         for _, placement in state.obstacles.placed:
             tensors += [placement.rotation_33, placement.translation_3]
-    return tensors if state.surface is None else [*tensors, state.surface.position_P3]
+    if state.surface is not None:
+        tensors.append(state.surface.position_P3)
+    return tensors if state.barriers is None else [*tensors, state.barriers.row_F24]
 
 
 def _with_variables(state: ParticleState, variables: Sequence[torch.Tensor]) -> ParticleState:
@@ -130,6 +134,7 @@ def _with_variables(state: ParticleState, variables: Sequence[torch.Tensor]) -> 
         gravity_S3=gravity_S3,
         obstacles=obstacles,
         surface=state.surface and replace(state.surface, position_P3=next(rest)),
+        barriers=state.barriers and replace(state.barriers, row_F24=next(rest)),
     )
 
 
@@ -158,7 +163,7 @@ def _started(
     gravity_3 = given("gravity_3", inputs.gravity_3, np.array(scene.gravity), (3,)) / frame_rate_hz**2
     domain_3 = given("domain_size_3", inputs.domain_size_3, np.array(scene.domain_size), (3,))
     age_H1 = torch.arange(config.velocity_history, device=device, dtype=torch.float64)[:, None] + 0.5
-    obstacles, surface = _obstacles(network, start, scene, inputs, dtype)
+    obstacles, surface, barriers = _obstacles(network, start, scene, inputs, dtype)
     return replace(
         start,
         position_N3=position_N3.to(dtype),
@@ -167,21 +172,22 @@ def _started(
         gravity_S3=gravity_3[None].to(dtype),
         obstacles=obstacles,
         surface=surface,
+        barriers=barriers,
     )
 
 
 def _obstacles(
     network: ParticleNetwork, start: ParticleState, scene: Scene, inputs: Inputs, dtype: torch.dtype
-) -> tuple[ObstacleCells | None, SurfaceParticles | None]:
+) -> tuple[ObstacleCells | None, SurfaceParticles | None, Barriers | None]:
     poses, config, device = inputs.poses or {}, network.config, start.position_N3.device
     for number in poses:
         rule = f"0 to {len(scene.obstacles) - 1}" if scene.obstacles else "left out: the scene has no obstacles"
         require(number in range(len(scene.obstacles)), "poses", rule, number)
     if not poses and inputs.smoothing == 0:
-        return start.obstacles, start.surface
+        return start.obstacles, start.surface, start.barriers
     staying = [obstacle for i, obstacle in enumerate(scene.obstacles) if i not in poses]
     placements = {i: _placement(scene.obstacles[i], pose, device, dtype) for i, pose in poses.items()}
-    obstacles, surface = None, None
+    obstacles, surface, barriers = None, None, start.barriers
     if config.obstacle_features:
         rest = _cells(scene, staying, device)
         placed = tuple((_cells(scene, [scene.obstacles[i]], device), placement) for i, placement in placements.items())
@@ -194,7 +200,25 @@ def _obstacles(
         position_P3 = torch.cat(points)
         scene_P = torch.zeros(len(position_P3), dtype=torch.int64, device=device)
         surface = SurfaceParticles(position_P3, scene_P) if len(position_P3) else None
-    return obstacles, surface
+    if config.obstacle_clearance is not None and placements:
+        barriers = _barriers(scene, placements, config.obstacle_clearance, device, dtype)
+    return obstacles, surface, barriers
+
+
+def _barriers(
+    scene: Scene, placements: Mapping[int, Placement], clearance: float, device: torch.device, dtype: torch.dtype
+) -> Barriers | None:
+    """Those of the obstacles where they are: rows with gradients by their poses, lists of where these have them now."""
+    cell_size, parts = scene.cell_size, []
+    for i, obstacle in enumerate(scene.obstacles):
+        staying = i not in placements
+        # uncut by the domain: an obstacle may be moved into it
+        piece_F33 = barrier_pieces(obstacle.corners, cell_size, scene.domain_size if staying else None)
+        corner_F33 = torch.from_numpy(piece_F33).to(device)
+        parts.append(corner_F33 if staying else placements[i].to(torch.float64).place(corner_F33))
+    corner_F33 = torch.cat(parts)
+    barriers = Barriers.of([barrier_of_pieces(corner_F33.detach().cpu().numpy(), cell_size, clearance)])
+    return barriers and replace(barriers.to(device), row_F24=barrier_rows(corner_F33, clearance).to(dtype))
 
 
 def _cells(scene: Scene, obstacles: list[Obstacle], device: torch.device) -> ObstacleCells:

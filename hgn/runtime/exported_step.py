@@ -1,9 +1,10 @@
 """One frame of a network as a graph that runs without this package: ONNX, or a compiled package (AOTInductor).
 
-The graph is traced from the reference, hgn.network, and holds all of it: features, grid, network, integration. Numbers
-of particles and of obstacle cells are free, up to LARGEST_EXPORTED. It raises nothing: who runs it checks that
-positions are finite. INPUTS and OUTPUTS name its tensors; `initial_arrays` gives those of a scene.
-Shape legend: N particles, H velocities, K obstacle cells.
+The graph is traced from the reference, hgn.network, and holds all of it: features, grid, network, integration, and what
+walls and obstacles hold. Numbers of particles, obstacle cells and triangles are free, up to LARGEST_EXPORTED. It raises
+nothing: who runs it checks that positions are finite. INPUTS and OUTPUTS name its tensors; `initial_arrays` gives those
+of a scene.
+Shape legend: N particles, H velocities, K obstacle cells, F triangles of obstacles.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ import numpy as np
 import torch
 from torch import nn
 
+from hgn.network.barriers import Barriers, barrier_rows
 from hgn.network.base import ParticleNetwork
 from hgn.network.cell_keys import COORDINATE_LIMIT, LARGEST_EXPORTED, pack, unpack
 from hgn.network.features import ParticleState
@@ -27,9 +29,12 @@ from hgn.runtime.weights import WeightsInfo
 from hgn.schema import require, to_mapping
 from hgn.system.files import make_folder, sync_folder, sync_written, write_atomically
 
-INPUTS = ("position", "velocity", "material", "domain_size", "gravity", "obstacle_cell", "obstacle_normal")
+INPUTS = (
+    "position", "velocity", "material", "domain_size", "gravity", "obstacle_cell", "obstacle_normal",
+    "obstacle_triangle",
+)  # fmt: skip
 OUTPUTS = ("next_position", "next_velocity")
-EXAMPLE_PARTICLES, EXAMPLE_CELLS = 64, 32  # of the trace; any others would do
+EXAMPLE_PARTICLES, EXAMPLE_CELLS, EXAMPLE_TRIANGLES = 64, 32, 16  # of the trace; any others would do
 
 
 class Step(nn.Module):
@@ -48,11 +53,13 @@ class Step(nn.Module):
         gravity: torch.Tensor,
         obstacle_cell: torch.Tensor,
         obstacle_normal: torch.Tensor,
+        obstacle_triangle: torch.Tensor,
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Positions [N, 3] and velocities [N, H, 3], newest first, a frame later; units: domain units, frames.
 
         material int64 [N] indexes the network's materials; domain_size and gravity [3]; obstacle_cell int64 [K, 3],
-        each once, and obstacle_normal [K, 3]. Absolute inputs take no heed of gravity.
+        each once, and obstacle_normal [K, 3]; obstacle_triangle [F, 3, 3], corners. Absolute inputs take no heed of
+        gravity, and networks without `obstacle_clearance` none of triangles.
         """
         # a cell that no particle reaches, so that there always is one
         far_13 = torch.full_like(domain_size[None], COORDINATE_LIMIT - 1).to(torch.int64)
@@ -67,20 +74,37 @@ class Step(nn.Module):
             domain_S3=domain_size[None],
             gravity_S3=gravity[None],
             obstacles=ObstacleCells(key_K, normal_K3, self.obstacle_cell_size),
+            barriers=self._barriers(obstacle_triangle),
         )
         after = advanced(state, self.network(state), self.network.config)
         return after.position_N3, after.velocity_NM3
 
+    def _barriers(self, corner_F33: torch.Tensor) -> Barriers | None:
+        """Without lists of cells: the graph looks for pairs by boxes."""
+        clearance = self.network.config.obstacle_clearance
+        if clearance is None:
+            return None
+        # one without area, which nothing meets, so that there always is one
+        corner_F33 = torch.cat([corner_F33, torch.zeros_like(corner_F33[0:1])])
+        row_F24 = barrier_rows(corner_F33, clearance).to(corner_F33.dtype)
+        none = torch.zeros(0, dtype=torch.int64, device=corner_F33.device)
+        return Barriers(none, none, none, row_F24, none, self.obstacle_cell_size, clearance)
 
-def initial_arrays(state: ParticleState) -> dict[str, np.ndarray]:
-    """What the graph of a step is first given, by the names of INPUTS: a simulator's state of one scene."""
+
+def initial_arrays(state: ParticleState, corner_F33: np.ndarray | None = None) -> dict[str, np.ndarray]:
+    """What the graph of a step is first given, by the names of INPUTS: a simulator's state of one scene.
+
+    corner_F33: the corners of its obstacles' triangles in domain units, as `hgn.scene.barrier.barrier_pieces` has them
+    for the simulator; none: no triangles.
+    """
     require(state.scene_count == 1, "scenes", "one", state.scene_count)
     cells, normals = np.zeros((0, 3), np.int64), np.zeros((0, 3), np.float32)
     if state.obstacles is not None:
         cells = unpack(state.obstacles.key_K)[1].cpu().numpy()
         normals = state.obstacles.normal_K3.cpu().numpy()
+    triangles = np.zeros((0, 3, 3), np.float32) if corner_F33 is None else corner_F33.astype(np.float32)
     tensors = (state.position_N3, state.velocity_NM3, state.material_N, state.domain_S3[0], state.gravity_S3[0])
-    arrays = [*(tensor.cpu().numpy() for tensor in tensors), cells, normals]
+    arrays = [*(tensor.cpu().numpy() for tensor in tensors), cells, normals, triangles]
     return dict(zip(INPUTS, arrays, strict=True))
 
 
@@ -98,11 +122,13 @@ def traced_step(network: ParticleNetwork, info: WeightsInfo) -> torch.export.Exp
         torch.zeros(3),
         torch.arange(EXAMPLE_CELLS)[:, None] * torch.tensor([0, 0, 1]),
         torch.ones(EXAMPLE_CELLS, 3),
+        torch.rand(EXAMPLE_TRIANGLES, 3, 3, generator=generator),
     )
     particles = {0: torch.export.Dim("particles", min=1, max=LARGEST_EXPORTED)}
     cells = {0: torch.export.Dim("obstacle_cells", min=0, max=LARGEST_EXPORTED)}
+    triangles = {0: torch.export.Dim("obstacle_triangles", min=0, max=LARGEST_EXPORTED)}
     step = Step(network, info.obstacle_cell_size).eval()
-    # one graph for 0, 1 and more of both
+    # one graph for 0, 1 and more of each
     with (
         torch.no_grad(),
         torch.fx.experimental._config.patch(  # type: ignore[attr-defined]
@@ -112,7 +138,7 @@ def traced_step(network: ParticleNetwork, info: WeightsInfo) -> torch.export.Exp
         return torch.export.export(
             step,
             tuple(tensor.to(device) for tensor in example),
-            dynamic_shapes=(particles, particles, particles, None, None, cells, cells),
+            dynamic_shapes=(particles, particles, particles, None, None, cells, cells, triangles),
             strict=False,
         )
 

@@ -97,7 +97,7 @@ class LiveSimulation:
             require(not len(unusable), name, "finite", float(unusable[0]) if len(unusable) else 0.0)
         require(material_A.dtype.kind in "iu", "material_A", "whole numbers", str(material_A.dtype))
         entering = replace(self.scene, position_N3=position_A3, velocity_N3=velocity_A3, material_N=material_A)
-        new = self.simulator.start([entering])
+        new = self.simulator.start([replace(entering, corners=None)])  # barriers stay, and would take time
         if count:
             old = self.state
             names = ("position_N3", "velocity_NM3", "material_N", "scene_N")
@@ -111,7 +111,9 @@ class LiveSimulation:
         Raises: ConfigError as `Simulator.start`.
         """
         other = InitialState.of(scene)
-        self._change_scene(replace(self.scene, obstacle_grid=other.obstacle_grid, sampled=other.sampled))
+        of_obstacles = ("obstacle_grid", "sampled", "corners")
+        obstacles: dict[str, Any] = {name: getattr(other, name) for name in of_obstacles}
+        self._change_scene(replace(self.scene, **obstacles))
 
     def set_gravity(self, gravity: tuple[float, float, float]) -> None:
         """Gravity from now on, domain units per second squared.
@@ -146,7 +148,9 @@ class LiveSimulation:
         nobody: dict[str, Any] = {name: getattr(scene, name)[:0] for name in of_particles}
         new = self.simulator.start([replace(scene, **nobody)])
         self.scene = scene
-        self._go_on_with(replace(self.state, gravity_S3=new.gravity_S3, obstacles=new.obstacles, surface=new.surface))
+        of_scene = ("gravity_S3", "obstacles", "surface", "barriers")
+        changed: dict[str, Any] = {name: getattr(new, name) for name in of_scene}
+        self._go_on_with(replace(self.state, **changed))
 
     def _go_on_with(self, state: ParticleState) -> None:
         self._state = state

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hgn.scene.obstacle_grid import SPLIT_CELLS
+from hgn.scene.rotation import round_to_float32
 from hgn.scene.surface import area_vectors, split_long_edges
 from hgn.schema import Vector, require
 
@@ -44,12 +45,27 @@ def build_barrier(corner_F33: np.ndarray, cell_size: float, clearance: float, do
 
     Raises: ConfigError for a clearance that is none.
     """
-    require(0 < clearance <= cell_size, "obstacle_clearance", f"above 0, up to a cell ({cell_size:g})", clearance)
-    box = (np.full(3, -cell_size), np.array(domain_size, np.float64) + cell_size)
-    corner_F33 = split_long_edges(corner_F33, SPLIT_CELLS * cell_size, box)
+    return barrier_of_pieces(barrier_pieces(corner_F33, cell_size, domain_size), cell_size, clearance)
+
+
+def barrier_pieces(corner_F33: np.ndarray, cell_size: float, domain_size: Vector | None = None) -> np.ndarray:
+    """The triangles of a barrier, corners float64 [F', 3, 3]: long ones in pieces, without those that have no area.
+
+    With the domain's size, without what is more than a cell outside it. Corners are float32's, so that what is given
+    them in that precision has the same rows.
+    """
+    box = None
+    if domain_size is not None:
+        box = (np.full(3, -cell_size), np.array(domain_size, np.float64) + cell_size)
+    corner_F33 = round_to_float32(split_long_edges(corner_F33, SPLIT_CELLS * cell_size, box))
     area = np.linalg.norm(area_vectors(corner_F33), axis=1)
     longest = np.linalg.norm(np.roll(corner_F33, -1, axis=1) - corner_F33, axis=2).max(axis=1, initial=0.0)
-    corner_F33 = corner_F33[2 * area > LEAST_HEIGHT * longest]
+    return np.asarray(corner_F33[2 * area > LEAST_HEIGHT * longest])
+
+
+def barrier_of_pieces(corner_F33: np.ndarray, cell_size: float, clearance: float) -> Barrier:
+    """The barrier of `barrier_pieces`, row f from triangle f. Raises: ConfigError for a clearance that is none."""
+    require(0 < clearance <= cell_size, "obstacle_clearance", f"above 0, up to a cell ({cell_size:g})", clearance)
     row_F24, cell_size = _rows(corner_F33, clearance), CELLS * cell_size
     cell_E3, triangle_E = _lists(row_F24, cell_size, clearance)
     order = np.lexsort((triangle_E, *cell_E3.T[::-1]))

@@ -21,7 +21,7 @@ from hgn.scene.mesh import load_mesh
 from hgn.scene.motion import Motion
 from hgn.scene.obstacle_grid import grid_of_samples, surface_points, surface_samples
 from hgn.scene.rotation import euler_rotation, rotate, round_to_float32
-from hgn.scene.scene import Obstacle
+from hgn.scene.scene import Obstacle, all_corners
 from hgn.scene.scene_file import ObstacleEntry
 from hgn.scene.shapes import shape_obstacle
 from hgn.schema import Vector
@@ -122,4 +122,5 @@ def with_obstacles(scene: InitialState, obstacles: Sequence[PlacedObstacle]) -> 
         sampled=lambda spacing_cells: surface_points(
             [obstacle.mesh() for obstacle in obstacles], cell_size, 0, scene.domain_size, spacing_cells
         ),
+        corners=lambda: all_corners([obstacle.mesh() for obstacle in obstacles]),
     )

@@ -8,10 +8,10 @@ import torch
 from network.barrier_scenes import CELL, CLEARANCE, DOMAIN, barriers_of, crossings, scattered, square
 from network.states import network_of
 
-from hgn.network.barriers import SLACK, Barriers
+from hgn.network.barriers import SLACK, Barriers, barrier_rows
 from hgn.network.features import ParticleState
 from hgn.runtime.holding import held
-from hgn.scene.barrier import build_barrier
+from hgn.scene.barrier import barrier_of_pieces, barrier_pieces, build_barrier
 from hgn.scene.rotation import euler_rotation
 from hgn.scene.scene import Obstacle
 from hgn.schema import ConfigError
@@ -133,6 +133,22 @@ def test_no_triangle_is_passed(dtype, walls):
             assert (position_N3 >= low_N3 - 1e-6).all() and (position_N3 <= high_N3 + 1e-6).all()
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_a_slope_stops_a_way_once(dtype):
+    """What a turned square stops slides along it, whatever rounding does: nothing that has room stays where it was."""
+    generator = np.random.default_rng(3)
+    turn_33 = euler_rotation((20, 40, 70))
+    corner_F33 = (square((0.0,) * 3, 1, 0.6) @ turn_33.T + 0.5).astype(np.float32)
+    begun_N3 = generator.uniform(-0.1, 0.1, (2000, 3))
+    begun_N3[:, 1] = CLEARANCE * 10 ** generator.uniform(-1, 1, 2000)
+    way_N3 = np.array([0.02, -0.05, 0.01]) * generator.uniform(0.5, 1, (2000, 1))
+    before_N3, after_N3 = (x_N3 @ turn_33.T + 0.5 for x_N3 in (begun_N3, begun_N3 + way_N3))
+    position_N3, _ = ended(before_N3, after_N3, barriers_of(corner_F33), dtype)
+    expected_N3 = begun_N3 + way_N3 * (1, 0, 1)
+    expected_N3[:, 1] = np.minimum(begun_N3[:, 1], CLEARANCE - MORE) + MORE
+    assert (position_N3 - 0.5) @ turn_33 == pytest.approx(expected_N3, rel=0, abs=3e-7)
+
+
 def test_lists_hold_all_that_is_met():
     """Particles end where they do when each is asked against all triangles."""
     for seed in range(3):
@@ -164,6 +180,19 @@ def test_the_pairs_of_an_exported_graph():
     barriers = barriers_of(corner_F33)
     listed, boxed = (ended(before_N3, after_N3, b)[0] for b in (barriers, Boxes(**vars(barriers))))
     assert np.array_equal(listed, boxed)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_rows_of_an_exported_graph(dtype):
+    """Those of the lists' triangles, from corners in either precision; nothing meets a triangle without area."""
+    corner_F33, _, _ = scattered(8)
+    pieces_F33 = barrier_pieces(corner_F33, CELL, DOMAIN)
+    barrier = barrier_of_pieces(pieces_F33, CELL, CLEARANCE)
+    row_F24 = barrier_rows(torch.from_numpy(pieces_F33).to(dtype), CLEARANCE)
+    np.testing.assert_allclose(row_F24.numpy(), barrier.row_F24, rtol=0, atol=6e-8)  # a rounding to float32
+    flat_F33 = torch.tensor([[[0.5] * 3] * 3, [[0.3] * 3, [0.5] * 3, [0.7] * 3]], dtype=dtype)
+    flat = replace(Barriers.of([barrier]), row_F24=barrier_rows(flat_F33, CLEARANCE))
+    assert not len(flat._pairs_of_boxes(torch.zeros(1, 3), torch.ones(1, 3))[0])
 
 
 def test_scenes_side_by_side():

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from network.states import gns_of, network_of
+from network.states import gns_of, network_of, silent
 
 from hgn.network.obstacles import ObstacleCells
 from hgn.network.posed_obstacles import Placement, PosedObstacleCells
@@ -18,6 +18,7 @@ from hgn.schema import ConfigError
 FRAMES = 30
 STEP = 1e-8  # of the central differences in float64: roundoff leaves about 1e-7 of the slope
 PARTICLES = 12
+CLEARANCE = 1e-3
 
 
 def scene():
@@ -34,6 +35,9 @@ def scene():
 def network(kind, dtype=torch.float64):
     if kind == "walled":  # some particles begin beyond the walls, some come to them
         return network_of(dtype, levels=2, message_passing_steps=1, wall_clearance=(0.43, 0.1))
+    if kind == "held":  # the cone holds some particles, and walls too
+        changes = {"wall_clearance": (0.3, 0.1), "obstacle_clearance": CLEARANCE}
+        return network_of(dtype, levels=2, message_passing_steps=1, **changes)
     if kind.startswith("gns"):
         return gns_of(dtype, kind=kind, message_passing_steps=2, static_spacing_cells=2.0)
     return network_of(dtype, inputs=kind)
@@ -47,6 +51,7 @@ INPUTS = {
     "rotation_3": torch.tensor([0.1, 0.2, -0.3], dtype=torch.float64),
     "translation_3": torch.tensor([0.01, -0.02, 0.015], dtype=torch.float64),
 }
+INPUTS_OF_ABSOLUTE = {name: value for name, value in INPUTS.items() if name != "gravity_3"}
 
 
 def positions(simulator, inputs, smoothing):
@@ -57,7 +62,7 @@ def positions(simulator, inputs, smoothing):
 
 @pytest.mark.parametrize(
     ("kind", "smoothing"),
-    [("absolute", 0.0), ("absolute", 0.5), ("relative", 1.0), ("gns_particles", 0.0), ("walled", 0.0)],
+    [("absolute", 0.0), ("absolute", 0.5), ("relative", 1.0), ("gns_particles", 0.0), ("walled", 0.0), ("held", 0.0)],
 )
 def test_gradients_are_those_of_central_differences(kind, smoothing):
     """Over 30 frames, along a random direction of each input, where no particle changes a cell between both sides."""
@@ -85,7 +90,7 @@ def test_gradients_are_those_of_central_differences(kind, smoothing):
         )
 
 
-@pytest.mark.parametrize("kind", ["absolute", "relative", "gns_particles", "walled"])
+@pytest.mark.parametrize("kind", ["absolute", "relative", "gns_particles", "walled", "held"])
 def test_positions_are_those_of_a_rollout(kind):
     """What nothing replaces moves as in a rollout."""
     simulator = Simulator(network(kind, torch.float32), 60.0, "torch")
@@ -93,6 +98,41 @@ def test_positions_are_those_of_a_rollout(kind):
     found_TN3 = simulator.differentiable(scene(), 6)
     assert not found_TN3.requires_grad
     np.testing.assert_allclose(found_TN3.numpy(), expected_TN3, rtol=0, atol=2e-6)
+
+
+@pytest.mark.parametrize("smoothing", [0.0, 0.5])
+def test_obstacles_hold_where_they_are_put(smoothing):
+    """A square that is turned and shifted into a particle's way stops it there: it ends at the clearance, where it came
+    to along the square. A shift moves it along the normal alone, its own start along the square alone."""
+    free = silent(network_of(inputs="relative", obstacle_clearance=CLEARANCE))
+    down_13 = np.array([[0.0, -6.0, 0.0]], np.float32)  # 0.1 in a frame
+    square = shape_obstacle("square", 0.2, (0.5, 0.125, 0.5))
+    falling = Scene(np.full((1, 3), 0.5, np.float32), down_13, np.zeros(1, np.uint8), (square,), gravity=(0.0,) * 3)
+    shift_3 = torch.tensor([0.0, 0.325, 0.0], dtype=torch.float64, requires_grad=True)
+    start_13 = torch.full((1, 3), 0.5, dtype=torch.float64, requires_grad=True)
+    pose = Pose(torch.tensor([0.0, 0.0, 0.5], dtype=torch.float64), shift_3)
+
+    def end(**inputs):
+        simulator = Simulator(free, 60.0, "torch")
+        return simulator.differentiable(falling, 2, position_N3=start_13, smoothing=smoothing, **inputs)[1, 0]
+
+    normal_3 = torch.tensor([-np.sin(0.5), np.cos(0.5), 0.0])
+    free_3 = torch.tensor([0.5, 0.4, 0.5], dtype=torch.float64)
+    torch.testing.assert_close(end(), free_3, rtol=0, atol=1e-7)
+    end_3 = end(poses={0: pose})
+    torch.testing.assert_close(end_3, free_3 + (CLEARANCE + 0.05 * np.cos(0.5)) * normal_3, rtol=0, atol=1e-7)
+    slopes = [torch.autograd.grad(x, (shift_3, start_13), retain_graph=True) for x in end_3]
+    shifted_33, started_33 = (torch.stack([slope[i].view(3) for slope in slopes]) for i in (0, 1))
+    across_33 = normal_3[:, None] * normal_3
+    torch.testing.assert_close(shifted_33, across_33, rtol=0, atol=1e-6)
+    torch.testing.assert_close(started_33, torch.eye(3, dtype=torch.float64) - across_33, rtol=0, atol=1e-6)
+
+
+def test_the_cone_holds_particles():
+    """In the scene of the central differences, so that these see it."""
+    held, free = (network_of(levels=2, message_passing_steps=1, obstacle_clearance=c) for c in (CLEARANCE, None))
+    held_TN3, free_TN3 = (positions(Simulator(n, 60.0, "torch"), INPUTS_OF_ABSOLUTE, 0.0) for n in (held, free))
+    assert ((held_TN3 - free_TN3).abs().amax(dim=(0, 2)) > CLEARANCE).sum() > 2
 
 
 def test_normals_turn_with_their_obstacle():

@@ -5,6 +5,7 @@ import os
 import runpy
 import shutil
 import subprocess
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -13,14 +14,17 @@ import onnxruntime
 import pytest
 import torch
 from network.states import network_of, random_state
+from network.test_barriers import scattered
 
 from hgn import export
 from hgn.config import config_directory
+from hgn.network.barriers import Barriers
 from hgn.network.hgn import HierarchicalGraphNetwork
 from hgn.runtime.exported_step import INPUTS, initial_arrays, write_package
 from hgn.runtime.simulator import Simulator
 from hgn.runtime.stepped_rollout import stepped
 from hgn.runtime.weights import WeightsInfo, save_weights
+from hgn.scene.barrier import barrier_of_pieces, barrier_pieces
 from hgn.scene.scene_file import load_scene
 from hgn.schema import ConfigError, to_mapping
 
@@ -28,20 +32,31 @@ EXAMPLES = Path(__file__).resolve().parents[2] / "tools/deploy"
 TOLERANCE = 1e-6  # of positions and displacements in a frame, domain units
 FRAMES = 4
 NETWORKS = {
-    # at its walls random states begin, or end, for some particles
-    "absolute": {"wall_clearance": (0.1, 0.7)},
+    # at its walls random states begin, or end, for some particles, and their ways meet the triangles below
+    "absolute": {"wall_clearance": (0.1, 0.7), "obstacle_clearance": 1e-3},
     "relative": {"inputs": "relative"},
     "contacts": {"inputs": "relative", "contact_gate": "cell", "contact_forces": "normal", "rest_threshold": 0.3},
 }
 SIZES = [(particles, obstacles) for particles in (1, 216, 4_096, 30_000) for obstacles in (True, False)]
-SCENE = str(config_directory() / "example/own_mesh.yaml")
+CELL = 1 / 64
+SCENE = """
+obstacles:
+  - {shape: cone, size: 0.3, position: [0.5, 0.3, 0.5], rotation: [0, 20, 10]}
+  - {mesh: ramp.obj, scale: 0.4, rotation: [0, 90, 0], position: [0.5, 0.1, 0.2]}
+groups:
+  - {shape: cube, size: 0.08, position: [0.5, 0.5, 0.5], material: water, velocity: [0, -4, 0]}
+"""
 
 
 class Written(NamedTuple):
-    """A network, and the file that holds its step; beside its folder the folder `arrays`."""
+    """A network, and the file that holds its step; beside its folder the folder `arrays` of a scene, and its file."""
 
     network: HierarchicalGraphNetwork
     path: Path
+
+    @property
+    def scene(self):
+        return load_scene(self.path.parents[1] / "scene.yaml")
 
 
 @pytest.fixture(autouse=True)
@@ -69,8 +84,8 @@ ALL = pytest.mark.parametrize(
 
 @ALL
 def test_onnx_is_the_step(onnx_step):
-    """ONNX Runtime computes the step to 1e-6 at any number of particles, with and without obstacles; the file says
-    what its weights say of themselves; the example in Python simulates a scene's arrays."""
+    """ONNX Runtime computes the step to 1e-6 at any number of particles, with and without obstacles, which hold some of
+    them; the file says what its weights say of themselves; the example in Python simulates a scene's arrays."""
     network, path = onnx_step
     session = onnxruntime.InferenceSession(path)
     assert [item.name for item in session.get_inputs()] == list(INPUTS)
@@ -78,7 +93,7 @@ def test_onnx_is_the_step(onnx_step):
     assert declared["frame_rate_hz"] == 60.0 and declared["network"] == to_mapping(network.config)
     compare(network, lambda arrays: session.run(None, arrays))
     simulate = runpy.run_path(str(EXAMPLES / "step_onnx.py"))["simulate"]
-    assert_rollout(network, simulate(str(path), str(path.parents[1] / "arrays"), FRAMES))
+    assert_rollout(onnx_step, simulate(str(path), str(path.parents[1] / "arrays"), FRAMES))
 
 
 @pytest.mark.slow
@@ -90,20 +105,20 @@ def test_onnx_is_the_step(onnx_step):
 def test_onnx_runs_in_cpp(onnx_step):
     """The example in C++ simulates a scene's arrays."""
     options = [f"-DONNXRUNTIME_FOLDER={os.environ['ONNXRUNTIME_FOLDER']}", "-DCMAKE_DISABLE_FIND_PACKAGE_Torch=ON"]
-    assert_rollout(onnx_step.network, built_and_run("step_onnx", onnx_step.path, options))
+    assert_rollout(onnx_step, built_and_run("step_onnx", onnx_step.path, options))
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", NETWORKS)
 def test_package_is_the_step(tmp_path, name):
     """The same of a package that PyTorch compiled, and of the example in C++."""
-    network, path = exported(tmp_path, name, "package")
-    package = torch._inductor.aoti_load_package(str(path))
-    compare(network, lambda arrays: [x.numpy() for x in package(*map(torch.from_numpy, arrays.values()))])
+    written = exported(tmp_path, name, "package")
+    package = torch._inductor.aoti_load_package(str(written.path))
+    compare(written.network, lambda arrays: [x.numpy() for x in package(*map(torch.from_numpy, arrays.values()))])
     if shutil.which("cmake") is None:
         pytest.skip("the C++ example needs cmake")
     options = [f"-DCMAKE_PREFIX_PATH={torch.utils.cmake_prefix_path}"]
-    assert_rollout(network, built_and_run("step_package", path, options))
+    assert_rollout(written, built_and_run("step_package", written.path, options))
 
 
 @pytest.mark.parametrize(
@@ -138,27 +153,45 @@ def test_a_package_that_is_cut_off_leaves_nothing(tmp_path, monkeypatch):
 
 
 def exported(folder, name, kind):
-    """What the command writes of a small network, and beside it a scene's arrays."""
+    """What the command writes of a small network, and beside it a scene and its arrays."""
     network = network_of(torch.float32, levels=2, message_passing_steps=1, **NETWORKS[name])
-    save_weights(folder / "w.safetensors", network, WeightsInfo(network.config, 60.0, 1 / 64))
+    save_weights(folder / "w.safetensors", network, WeightsInfo(network.config, 60.0, CELL))
+    shutil.copy(config_directory() / "example/ramp.obj", folder)
+    (folder / "scene.yaml").write_text(SCENE)
     path = folder / "new" / ("step.onnx" if kind == "onnx" else "step.pt2")
-    options = {kind: str(path), "scene": SCENE, "arrays": str(folder / "arrays"), "device": "cpu"}
+    options = {kind: str(path), "scene": str(folder / "scene.yaml"), "arrays": str(folder / "arrays"), "device": "cpu"}
     assert export.main({"weights": str(folder / "w.safetensors"), **options}) == 0
     return Written(network, path)
 
 
 def compare(network, step):
+    corner_F33, _, _ = scattered(0)
+    corner_F33 = barrier_pieces(0.2 + 0.5 * (corner_F33 - 0.5), CELL)  # where the particles are
+    clearance = network.config.obstacle_clearance
     for particles, obstacles in SIZES:
         state = random_state((particles,), dtype=torch.float32, obstacles=obstacles)
-        position_N3, velocity_NM3 = step(initial_arrays(state))
+        state = replace(state, velocity_NM3=10 * state.velocity_NM3)
+        if obstacles and clearance is not None:
+            state = replace(state, barriers=Barriers.of([barrier_of_pieces(corner_F33, CELL, clearance)]))
+        position_N3, velocity_NM3 = step(initial_arrays(state, corner_F33 if obstacles else None))
         after = stepped(network, state, network.config)
         np.testing.assert_allclose(position_N3, after.position_N3.numpy(), rtol=0, atol=TOLERANCE)
         np.testing.assert_allclose(velocity_NM3, after.velocity_NM3.numpy(), rtol=0, atol=TOLERANCE)
+        if state.barriers is not None and particles > 1:
+            free = stepped(network, replace(state, barriers=None), network.config)
+            assert (free.position_N3 != after.position_N3).any(-1).float().mean() > 0.01
 
 
-def assert_rollout(network, found_TN3):
-    (expected_TN3,) = Simulator(network, 60.0, "torch").rollout([load_scene(SCENE)], FRAMES)
+def assert_rollout(written, found_TN3):
+    """The frames of backend torch, in some of which obstacles hold particles where the network asks for it."""
+    simulator = Simulator(written.network, 60.0, "torch")
+    (expected_TN3,) = simulator.rollout([written.scene], FRAMES)
     np.testing.assert_allclose(found_TN3, expected_TN3, rtol=0, atol=FRAMES * TOLERANCE)
+    if written.network.config.obstacle_clearance is not None:
+        state = replace(simulator.start([written.scene]), barriers=None)
+        for _ in range(FRAMES - 1):
+            state = simulator.step(state)
+        assert np.abs(state.position_N3.numpy() - found_TN3[-1]).max() > 0.01
 
 
 def built_and_run(program, model, options):

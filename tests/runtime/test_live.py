@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from network.states import network_of, silent
+from network.test_barriers import square
 from runtime.scenes import EMPTY_GRID
 from runtime.scenes import random_scene as scene
 
@@ -96,6 +97,30 @@ def test_obstacles_are_replaced():
     np.testing.assert_array_equal(frames(live, 3), simulator.rollout([bare], 4)[0][1:])
     live.replace_obstacles(scene(0, 5))
     assert np.abs(live.step() - simulator.rollout([bare], 5)[0][-1]).max() > 1e-6
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_obstacles_that_come_hold(backend):
+    """With `obstacle_clearance` particles in free flight rest on a square that is put under them, those that enter
+    later and under other gravity too, and fall on when it is gone; without the setting they fall through."""
+    still = replace(scene(20, low=0.5), velocity_N3=np.zeros((20, 3), np.float32), obstacle_grid=EMPTY_GRID)
+    later = replace(still, position_N3=still.position_N3 + np.float32(0.15))
+    under = replace(still, corners=lambda: square((0.6, 0.45, 0.6), 1, 0.6))
+    for clearance in (1e-3, None):
+        simulator = Simulator(silent(small(inputs="relative", obstacle_clearance=clearance)), 60.0, backend)
+        with LiveSimulation(simulator, still) as live:
+            live.step()
+            live.replace_obstacles(under)
+            live.step()
+            live.set_gravity((0.0, -20.0, 0.0))
+            entering(live, later)
+            low_N = frames(live, 14)[-1, :, 1]
+            if clearance is None:
+                assert (low_N < 0.4).all()
+                continue
+            assert low_N == pytest.approx(0.45 + clearance, rel=0, abs=0.02 * clearance)
+            live.replace_obstacles(still)
+            assert (frames(live, 2)[-1, :, 1] < 0.45 - clearance).all()
 
 
 def test_gravity_changes_between_frames():

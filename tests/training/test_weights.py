@@ -90,11 +90,12 @@ def test_other_weights_are_refused(data, tmp_path, file, message):
 
 
 def test_another_sight_of_contacts_is_taken(tmp_path):
-    """Weights that were trained with a particle's own gate begin a network with the cells', another reach and walls:
-    the same tensors."""
+    """Weights that were trained with a particle's own gate begin a network with the cells', another reach, walls and
+    obstacles that hold: the same tensors."""
     path = weights_file(tmp_path / "own.safetensors", "fp32", inputs="relative")
-    contacts = {"contact_gate": "cell", "contact_reach_cells": 3.0, "wall_clearance": (0.02, 0.04)}
-    wanted = NetworkConfig(**NETWORK | {"inputs": "relative"} | contacts)
+    contacts = {"contact_gate": "cell", "contact_reach_cells": 3.0}
+    holding = {"wall_clearance": (0.02, 0.04), "obstacle_clearance": 1e-3}
+    wanted = NetworkConfig(**NETWORK | {"inputs": "relative"} | contacts | holding)
     config = TrainConfig(network=wanted, training=TrainingConfig(init_weights=str(path)))
     network, (own, info) = network_of_weights(config), load_weights(path)
     assert network.config == wanted and info.network.contact_gate == "particle"
@@ -121,27 +122,28 @@ def test_warm_up():
     assert cold._rate(0) == 1e-3 and warm._rate(100) == pytest.approx(1e-5)
 
 
-def test_an_export_sets_rest_and_walls(data, tmp_path):
-    """The tensors stay; networks that have no contacts to rest on are refused, and so is either for what exists."""
+def test_an_export_sets_rest_walls_and_obstacles(data, tmp_path):
+    """The tensors stay; networks that have no contacts to rest on are refused, and so is each for what exists."""
     relative = {"network": {**NETWORK, "inputs": "relative"}}
     for name, changes in (("relative", relative), ("absolute", {})):
         assert train.main(train_mapping(data, tmp_path / name, maximum_updates=2) | changes) == 0
     kept, absolute = (str(tmp_path / name / "checkpoints" / "last.ckpt") for name in ("relative", "absolute"))
-    chosen = [{}, {"rest_threshold": 0.1}, {"wall_clearance": [0.02, 0.04]}]
-    outs = [tmp_path / f"{index}.safetensors" for index in range(3)]
+    chosen = [{}, {"rest_threshold": 0.1}, {"wall_clearance": [0.02, 0.04]}, {"obstacle_clearance": 1e-3}]
+    outs = [tmp_path / f"{index}.safetensors" for index in range(4)]
     for out, options in zip(outs, chosen, strict=True):
         assert export_main({"checkpoint": kept, "out": str(out)} | options) == 0
     (one, trained), *others = (load_weights(out) for out in outs)
-    assert trained.network.rest_threshold == 0 and trained.network.wall_clearance is None
-    for (other, after), changes in zip(
-        others, ({"rest_threshold": 0.1}, {"wall_clearance": (0.02, 0.04)}), strict=True
-    ):
+    assert trained.network.rest_threshold == 0
+    assert trained.network.wall_clearance is None and trained.network.obstacle_clearance is None
+    expected = ({"rest_threshold": 0.1}, {"wall_clearance": (0.02, 0.04)}, {"obstacle_clearance": 1e-3})
+    for (other, after), changes in zip(others, expected, strict=True):
         assert after.network == replace(trained.network, **changes) == other.config
         for name, tensor in one.state_dict().items():
             assert torch.equal(tensor, other.state_dict()[name])
     with pytest.raises(ConfigError, match=r"rest_threshold must be 0 with inputs=absolute, got 0\.1"):
         export_main({"checkpoint": absolute, "out": str(outs[0]), "rest_threshold": 0.1})
-    for name, value in (("rest_threshold", 0.1), ("wall_clearance", [0.02, 0.04])):
+    for options in chosen[1:]:
+        ((name, value),) = options.items()
         with pytest.raises(ConfigError, match=f"{name} must be null without checkpoint, got "):
             export_main({"weights": str(outs[0]), "onnx": str(tmp_path / "step.onnx"), name: value})
     with pytest.raises(ConfigError, match=r"wall_clearance\[1\] must be a finite number >= 0, got -0\.1"):

@@ -29,9 +29,9 @@ groups:
 """
 
 
-def free_flight():
+def free_flight(**changes):
     """A network of relative inputs whose output is zero."""
-    return Simulator(silent(network_of(torch.float32, width=16, levels=2, inputs="relative")), 60.0, "cpu")
+    return Simulator(silent(network_of(torch.float32, width=16, levels=2, inputs="relative", **changes)), 60.0, "cpu")
 
 
 def simulator(factor=1.0):
@@ -91,6 +91,19 @@ def test_spout(session):
     count = session.drop("water", (0.75, 0.8, 0.25), 0.2)
     session.spout = Spout((0.75, 0.8, 0.25))
     assert len(steps(session, 5)) == before + len(poured_A3) + count
+
+
+def test_obstacles_that_are_moved_hold(session):
+    """With `obstacle_clearance` what falls rests on an obstacle where it was dragged to, on none that was removed."""
+    clearance = 1e-3
+    session.use_weights(free_flight(obstacle_clearance=clearance))
+    for obstacle in session.obstacles:
+        session.remove_obstacle(obstacle.body.number)
+    plate = session.add_obstacle(ObstacleEntry(shape="square", size=0.4, position=(0.2, 0.2, 0.2)), Path())
+    session.move_obstacle(replace(plate, position=(0.5, 0.3, 0.5)))
+    assert steps(session, 30)[:, 1] == pytest.approx(0.3 + clearance, rel=0, abs=0.02 * clearance)
+    session.remove_obstacle(plate.body.number)
+    assert (steps(session, 2)[:, 1] < 0.3).all()
 
 
 def test_nothing_enters_where_there_is_no_place(session):

@@ -54,7 +54,7 @@ inline void write_positions(const std::string& path, const std::vector<float>& v
 
 // Order and names of a step's inputs; the first two are replaced by its two outputs.
 inline const std::vector<std::string> INPUTS = {
-    "position", "velocity", "material", "domain_size", "gravity", "obstacle_cell", "obstacle_normal"};
+    "position", "velocity", "material", "domain_size", "gravity", "obstacle_cell", "obstacle_normal", "obstacle_triangle"};
 
 inline std::vector<Array> read_arrays(const std::string& folder) {
     std::vector<Array> arrays;
