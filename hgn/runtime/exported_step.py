@@ -85,7 +85,7 @@ class Step(nn.Module):
         if clearance is None:
             return None
         # one without area, which nothing meets, so that there always is one
-        corner_F33 = torch.cat([corner_F33, torch.zeros_like(corner_F33[0:1])])
+        corner_F33 = torch.cat([corner_F33, corner_F33.new_zeros(1, 3, 3)])
         row_F24 = barrier_rows(corner_F33, clearance).to(corner_F33.dtype)
         none = torch.zeros(0, dtype=torch.int64, device=corner_F33.device)
         return Barriers(none, none, none, row_F24, none, self.obstacle_cell_size, clearance)
