@@ -16,7 +16,7 @@ from hgn.network.features import ParticleState
 from hgn.runtime.holding import SURFACES, held
 from hgn.scene.barrier import build_barrier
 
-BLOCK = 1024
+BLOCK = 1024 if device().type == "cpu" else 64  # the interpreter's time goes by programs
 NO_CORNERS = np.zeros((0, 3, 3))
 
 
