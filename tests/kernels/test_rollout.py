@@ -129,23 +129,24 @@ def test_obstacles_hold(walls):
 
 def test_obstacles_that_hold_change():
     """A simulation that began among no obstacles goes on with others, captured once, and with none again; what is
-    given it replaces those of the state. The frames are bitwise those of new simulations."""
+    given it replaces those of the state. The frames are those of new simulations, to the rounding of a GPU's sums."""
     changes = {"obstacle_clearance": 2e-3}
     places = ((0.1, 0.1, 0.1), (0.08, 0.12, 0.1))
     scenes = [scene(12), *(replace(scene(12), corners=partial(crossed, at)) for at in places)]
     simulator = thrown("triton", **changes)
     states = [simulator.start([each]) for each in scenes]
     paths = [thrown("triton", **changes).rollout([each], 3)[0][1:] for each in scenes]
-    assert not np.array_equal(paths[0], paths[1]) and not np.array_equal(paths[1], paths[2])
+    assert all(abs(paths[i] - paths[i + 1]).max() > 1e-3 for i in (0, 1))
+    same = partial(np.testing.assert_allclose, rtol=0, atol=1e-7)
     rollout = TritonRollout(simulator.network, states[0], "fp32")
     for index in (0, 1, 2, 0):
         assert rollout.take(states[index])
-        np.testing.assert_array_equal(rollout.run(2), paths[index])
+        same(rollout.run(2), paths[index])
     given = BarrierTable.of(states[2].barriers, 1, device())
     rollout = TritonRollout(simulator.network, states[1], "fp32", barriers=given)
-    np.testing.assert_array_equal(rollout.run(2), paths[2])
+    same(rollout.run(2), paths[2])
     rollout.begin(states[1])
-    np.testing.assert_array_equal(rollout.run(2), paths[2])
+    same(rollout.run(2), paths[2])
 
 
 def test_divergence_is_seen_through_walls():
