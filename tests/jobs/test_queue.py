@@ -361,7 +361,7 @@ def test_mechanics(tmp_path, monkeypatch):
     assert shipped.network == replace(config.network, **export.network_changes)
     assert config.training.more_data[1:] == (made["funnel_data"].dataset.folder,)
     assert shipped.updates == config.training.maximum_updates
-    assert set(export.network_changes) == {"rest_threshold", "wall_clearance"}
+    assert set(export.network_changes) == {"rest_threshold", "wall_clearance", "obstacle_clearance"}
 
 
 def test_trial_of_mechanics(tmp_path):
