@@ -156,7 +156,7 @@ def draw(runs: Sequence[Run]) -> bytes:
     """Of one run: loss and one-step errors over updates, the baselines as lines, and rollout errors. Of several: loss
     and validation error over scenes, and the latter over minutes. PNG bytes.
     """
-    figure, (panels,) = new_figure(1, 3, (15, 4.5))
+    figure, (panels,) = new_figure(1, 3, (15, 5 if len(runs) > 1 else 4.5))
     last = {name: value for record in runs[0].records for name, value in record.items()}
     title = "; ".join(sorted({_origin(run) for run in runs}))
     if len(runs) == 1:
@@ -171,7 +171,13 @@ def draw(runs: Sequence[Run]) -> bytes:
         panel.grid(alpha=0.3, which="both")
         if panel.lines:
             panel.set_yscale("log")
-            panel.legend(fontsize=8)
+            if len(runs) == 1:
+                panel.legend(fontsize=8)
+    if len(runs) > 1:
+        # of all panels and below them: within one it would cover lines of several runs
+        named = {line.get_label(): line for panel in panels for line in panel.lines}
+        shown = {label: line for label, line in named.items() if label and not label.startswith("_")}
+        figure.legend(shown.values(), shown.keys(), fontsize=8, loc="outside lower center", ncols=5)
     figure.suptitle(title, fontsize=10)
     return as_png(figure)
 
