@@ -19,7 +19,7 @@ import torch
 from torch.compiler import is_exporting
 
 from hgn.network.cell_keys import COORDINATE_LIMIT, LARGEST_EXPORTED, find, pack
-from hgn.scene.barrier import LEAST_HEIGHT, Barrier
+from hgn.scene.barrier import LEAST_HEIGHT, MARGIN, Barrier
 
 SLACK = 1e-3  # of the clearance; what begins nearer leaves by that in a frame that would bring it nearer
 NOWHERE = 1e30  # domain units: lowest corner of a box that nothing meets, its highest is at minus that
@@ -159,7 +159,7 @@ def barrier_rows(corner_F33: torch.Tensor, clearance: float) -> torch.Tensor:
     planes = [normal_F3, (normal_F3 * c_F3).sum(-1, keepdim=True)]
     for edge_F3, corner_F3 in zip(edges, (a_F3, b_F3, c_F3), strict=True):
         outward_F3 = _unit(torch.linalg.cross(edge_F3, normal_F3))
-        planes += [outward_F3, (outward_F3 * corner_F3).sum(-1, keepdim=True) + clearance]
+        planes += [outward_F3, (outward_F3 * corner_F3).sum(-1, keepdim=True) + MARGIN * clearance]
     exists_F1, zero_F1 = double_area_F1 > LEAST_HEIGHT * longest_F1, torch.zeros_like(double_area_F1)
     low_F3 = torch.where(exists_F1, corner_F33.amin(1) - 2 * clearance, NOWHERE)
     high_F3 = torch.where(exists_F1, corner_F33.amax(1) + 2 * clearance, -NOWHERE)

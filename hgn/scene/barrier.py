@@ -1,8 +1,9 @@
-"""Obstacles that nothing passes: their triangles, and which of them a particle's way may meet in a cell.
+"""Rigid surfaces of obstacles: their triangles, and which of them a particle's way may meet in a cell.
 
-A triangle covers what is within `clearance` of it, in its plane too. Its row has four planes, a unit normal and an
-offset each: its own, then those of its edges, which point outwards and lie `clearance` farther out; and the box of its
-corners, twice as much wider. It covers what is on the inner side of the edges, in the box.
+A triangle covers a place that is within `clearance` of its plane and no farther than MARGIN of that beside it. Its row
+has four planes, a unit normal and an offset each: its own, then those of its edges, which point outwards and lie that
+margin farther out; and the box of its corners, widened by 2 * clearance. It covers what is on the inner side of the
+edges, in the box.
 Shape legend: F triangles, Q cells, E entries of their lists.
 """
 
@@ -19,6 +20,9 @@ from hgn.schema import Vector, require
 
 ROW = 24  # numbers of a triangle: four planes of four, then the box, lowest and highest corner with a zero behind each
 CELLS = 2  # obstacle cells to a cell here: narrower ones have lists as long, and more of them
+# of the clearance: enough for rounding at the edges that triangles share; as wide as the clearance it would be a lip
+# at convex edges, which stops what slides off
+MARGIN = 0.1
 LEAST_HEIGHT = 1e-9  # domain units: of a triangle above its longest edge; thinner ones cover nothing that others do not
 CELLS_AT_ONCE = 1 << 20  # candidates of triangles, which bounds memory
 
@@ -91,7 +95,7 @@ def _rows(corner_F33: np.ndarray, clearance: float) -> np.ndarray:
             direction_F3 = np.cross(corner_F33[:, plane % 3] - corner_F3, normal_F3)
             direction_F3 = direction_F3 / np.maximum(np.linalg.norm(direction_F3, axis=1, keepdims=True), 1e-300)
         row_F24[:, 4 * plane : 4 * plane + 3] = direction_F3
-        row_F24[:, 4 * plane + 3] = (direction_F3 * corner_F3).sum(axis=1) + (clearance if plane else 0.0)
+        row_F24[:, 4 * plane + 3] = (direction_F3 * corner_F3).sum(axis=1) + (MARGIN * clearance if plane else 0.0)
     row_F24[:, 16:19] = corner_F33.min(axis=1) - 2 * clearance
     row_F24[:, 20:23] = corner_F33.max(axis=1) + 2 * clearance
     return row_F24
