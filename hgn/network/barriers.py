@@ -1,11 +1,11 @@
-"""Obstacles that nothing passes, on the device: what stops a particle's way at the end of a frame.
+"""Rigid surfaces of obstacles, on the device: what stops a particle's straight way at the end of a frame.
 
-The rule, for a way from x to y in a frame. Of a triangle a particle keeps to the side that it begins on. Where it comes
-nearer to the triangle's plane than the clearance, over what the triangle covers (hgn.scene.barrier), or passes the
-plane there, it is stopped by it; of several triangles, by the first. Then y is moved along the triangle's normal until
-it is as far from the plane as the clearance, or as x: what is along the triangle is kept, as on a surface without
-friction. What stops it is SLACK of the clearance nearer than where it ends then, so that rounding does not let a
-triangle stop the way to where it has put a particle.
+The rule, for a way from x to y. A particle keeps to the side of each triangle that it begins on; exactly on a plane,
+to that of the normal. Where its way comes nearer to the triangle's plane than the clearance, over what the triangle
+covers (hgn.scene.barrier), or crosses the plane there, the triangle stops it; of several triangles, the first. What
+stops it is SLACK of the clearance nearer than where it is to end, so that for rounding no triangle stops a way twice.
+It is to end as far from the plane as the clearance, or as x where that is nearer: y is to be shifted along the
+triangle's normal (hgn.runtime.holding), and keeps what is along the triangle, as on a surface without friction.
 Shape legend: N particles, Q cells of all scenes, E entries of their lists, F triangles, P pairs of both.
 """
 
@@ -69,10 +69,12 @@ class Barriers:
 
     def stopped(
         self, before_N3: torch.Tensor, after_N3: torch.Tensor, scene_N: torch.Tensor
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Which ways the first triangle on them stops, bool [N], and where they end then, [N, 3]; others as they are.
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Which ways a triangle stops, bool [N]; by how much their ends are to be shifted, [N, 1], and along which unit
+        normals, [N, 3]; and the share of a way on which nothing is met, [N, 1].
 
-        Positions are finite. The way to where one ends may be stopped by another triangle.
+        Shifts and normals are zero where nothing stops a way. Positions are finite. The way to a shifted end may be
+        stopped by another triangle.
         """
         particle_P, triangle_P = self._pairs(before_N3, after_N3, scene_N)
         row_P24 = self.row_F24.to(before_N3.dtype)[triangle_P]
@@ -84,12 +86,12 @@ class Barriers:
         approach_P = -side_P * (normal_P3 * way_P3).sum(-1)
         end_P, closing_P = distance_P - approach_P, approach_P.clamp(min=1e-30)
         within, slack = (1 - SLACK) * self.clearance, SLACK * self.clearance
-        comes_P = ((distance_P - within) / closing_P).clamp(0, 1)
-        passes_P = (distance_P / closing_P).clamp(0, 1)
-        here_P = _covers(row_P24, before_P3 + comes_P[:, None] * way_P3)
-        there_P = _covers(row_P24, before_P3 + passes_P[:, None] * way_P3) & (end_P < 0)
-        stops_P = (approach_P > 0) & (end_P < within) & (here_P | there_P)
-        time_P = torch.where(stops_P, torch.where(here_P, comes_P, passes_P), 2.0)
+        contact_P = ((distance_P - within) / closing_P).clamp(0, 1)
+        crossing_P = (distance_P / closing_P).clamp(0, 1)
+        meets_P = _covers(row_P24, before_P3 + contact_P[:, None] * way_P3)
+        crosses_P = _covers(row_P24, before_P3 + crossing_P[:, None] * way_P3) & (end_P < 0)
+        stops_P = (approach_P > 0) & (end_P < within) & (meets_P | crosses_P)
+        time_P = torch.where(stops_P, torch.where(meets_P, contact_P, crossing_P), 2.0)
         least_N = torch.full_like(before_N3[:, 0], 2.0).scatter_reduce(0, particle_P, time_P.detach(), "amin")
         first_P = stops_P & (time_P == least_N[particle_P])
         # of several at one time that of the least number
@@ -100,11 +102,11 @@ class Barriers:
         # the pair of each particle, a last one that moves nothing for the others
         place_P = torch.where(first_P, torch.arange(pairs, device=scene_N.device), pairs)
         pair_N = torch.full_like(scene_N, pairs).scatter_reduce(0, particle_P, place_P, "amin")
-        wanted_P = distance_P.clamp(max=within) + slack
-        move_P3 = (side_P * (wanted_P - end_P))[:, None] * normal_P3
-        move_P3 = torch.cat([move_P3, torch.zeros_like(after_N3[:1])])
-        hit_N = pair_N < pairs
-        return hit_N, torch.where(hit_N[:, None], after_N3 + move_P3[pair_N], after_N3)
+        push_P4 = torch.cat([(distance_P.clamp(max=within) + slack - end_P)[:, None], side_P[:, None] * normal_P3], 1)
+        push_N4 = torch.cat([push_P4, before_N3.new_zeros(1, 4)])[pair_N]
+        free_P = torch.where(stops_P, contact_P, 1.0).detach()
+        free_N = torch.ones_like(before_N3[:, 0]).scatter_reduce(0, particle_P, free_P, "amin")
+        return pair_N < pairs, push_N4[:, :1], push_N4[:, 1:], free_N[:, None]
 
     def _pairs(
         self, before_N3: torch.Tensor, after_N3: torch.Tensor, scene_N: torch.Tensor

@@ -11,12 +11,12 @@ from network.states import network_of
 from hgn.network.barriers import SLACK, Barriers, barrier_rows
 from hgn.network.features import ParticleState
 from hgn.runtime.holding import held
-from hgn.scene.barrier import barrier_of_pieces, barrier_pieces, build_barrier
+from hgn.scene.barrier import CELLS, MARGIN, barrier_of_pieces, barrier_pieces, build_barrier
 from hgn.scene.rotation import euler_rotation
 from hgn.scene.scene import Obstacle
 from hgn.schema import ConfigError
 
-MORE = SLACK * CLEARANCE
+MORE, RIM = SLACK * CLEARANCE, MARGIN * CLEARANCE
 
 
 def ended(before, after, barriers, dtype=torch.float64, scene=None, **changes):
@@ -46,7 +46,8 @@ def ended(before, after, barriers, dtype=torch.float64, scene=None, **changes):
         ((CLEARANCE / 4, 0.0), (CLEARANCE / 2, 0.0), (CLEARANCE / 2, 0.0)),  # or leaves
         ((0.3, 0.0), (-0.6, 0.0), (CLEARANCE, 0.0)),  # many cells in a frame
         ((0.05, 0.13), (-0.05, 0.13), (-0.05, 0.13)),  # beyond the rim
-        ((0.05, 0.125 + CLEARANCE / 2), (-0.05, 0.125 + CLEARANCE / 2), (CLEARANCE, 0.125 + CLEARANCE / 2)),
+        ((0.05, 0.125 + RIM / 2), (-0.05, 0.125 + RIM / 2), (CLEARANCE, 0.125 + RIM / 2)),  # at the rim
+        ((0.05, 0.125 + 2 * RIM), (-0.05, 0.125 + 2 * RIM), (-0.05, 0.125 + 2 * RIM)),
         (
             (CLEARANCE / 4, 0.135),
             (-CLEARANCE / 4, 0.115),
@@ -81,36 +82,92 @@ def test_corners_stop_on_each_side():
     )
 
 
-def test_where_there_is_no_room_nothing_moves():
-    """Between two slopes that meet below, and a wall across them that it is pushed to: a way that nothing else stops
-    ends where it began, and the velocity is zero."""
-    angles = np.radians([0, 60, 120, 180, 240, 300])
-    centre = np.array([0.5, 0.5, 0.5])
-    sides = []
-    for angle in angles:  # a narrow tube, smaller than the clearance
-        normal = np.array([np.cos(angle), 0.0, np.sin(angle)])
-        along = np.array([-normal[2], 0.0, normal[0]])
-        at = centre + 0.3 * CLEARANCE * normal
-        up = np.array([0.0, 1.0, 0.0])
-        corner_43 = np.stack([at + 0.1 * (a * along + b * up) for a, b in ((-1, -1), (1, -1), (1, 1), (-1, 1))])
-        sides.append(corner_43[[[0, 1, 2], [0, 2, 3]]])
-    barriers = barriers_of(np.concatenate(sides))
-    position_13, velocity_13 = ended(centre, centre + np.array([0.1, 0.02, 0.05]), barriers)
-    assert position_13[0] == pytest.approx(centre, abs=1e-3) and abs(velocity_13[0]).max() <= 0.021
+def quad(*corners):
+    """Two triangles of four corners, [2, 3, 3]."""
+    return np.array(corners, float)[[[0, 1, 2], [0, 2, 3]]]
+
+
+def rolled(begin_N3, velocity_N3, gravity_3, barriers, frames, dtype=torch.float32, **changes):
+    """Where particles without any other forces are after so many frames, and their velocities."""
+    position_N3, velocity_N3 = np.asarray(begin_N3, float), np.asarray(velocity_N3, float)
+    for _ in range(frames):
+        after_N3 = position_N3 + velocity_N3 + gravity_3
+        position_N3, velocity_N3 = (
+            x_N3.astype(float) for x_N3 in ended(position_N3, after_N3, barriers, dtype, **changes)
+        )
+    return position_N3, velocity_N3
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_a_triangle_stops_a_way_once(dtype):
-    """Whatever its slope and the rounding, the way to where it puts a particle is free of it."""
-    generator = np.random.default_rng(2)
-    for _ in range(8):
-        turn_33 = euler_rotation(tuple(generator.uniform(0, 360, 3)))
-        corner_F33 = (square((0.0,) * 3, 1, 0.6) @ turn_33.T + 0.5)[:1]
-        before_N3, way_N3 = generator.uniform(0.2, 0.8, (2000, 3)), 0.2 * generator.normal(size=(2000, 3))
-        before_N3, after_N3 = (torch.as_tensor(x, dtype=dtype) for x in (before_N3, before_N3 + way_N3))
-        scene_N, barriers = torch.zeros(2000, dtype=torch.int64), barriers_of(corner_F33)
-        hit_N, end_N3 = barriers.stopped(before_N3, after_N3, scene_N)
-        assert hit_N.sum() > 100 and not barriers.stopped(before_N3, end_N3, scene_N)[0].any()
+@pytest.mark.parametrize("turn", [(0, 0, 0), (20, 40, 70)])
+@pytest.mark.parametrize("clearance", [1e-3, 4e-3])
+def test_what_slides_leaves_a_table(clearance, turn, dtype):
+    """A convex edge of 90 degrees has no lip: all that slides on a table's top falls beside it, and none through it."""
+    turn_33, generator = euler_rotation(turn), np.random.default_rng(0)
+    top = quad((-0.2, 0, -0.2), (0, 0, -0.2), (0, 0, 0.2), (-0.2, 0, 0.2))
+    side = quad((0, 0, -0.2), (0, -0.2, -0.2), (0, -0.2, 0.2), (0, 0, 0.2))
+    barriers = barriers_of(np.concatenate([top, side]) @ turn_33.T + 0.5, clearance=clearance)
+    begin_N3 = generator.uniform((-0.08, clearance / 2, -0.1), (-0.04, 3 * clearance, 0.1), (200, 3))
+    velocity_N3 = np.tile((0.004, -0.0005, 0.0), (200, 1)) @ turn_33.T
+    gravity_3 = turn_33 @ (0.0, -0.0002, 0.0)
+    position_N3, _ = rolled(
+        begin_N3 @ turn_33.T + 0.5, velocity_N3, gravity_3, barriers, 40, dtype, obstacle_clearance=clearance
+    )
+    place_N3 = (position_N3 - 0.5) @ turn_33
+    assert (place_N3[:, 0] > 0).all() and (place_N3[:, 1] < 0).all()
+
+
+@pytest.mark.parametrize("degrees", [40, 60, 80, 90, 120, 170])
+def test_what_flows_along_a_gutter_does_not_stop(degrees):
+    """Between two sheets that meet below at an angle: what is along the crease is kept."""
+    half, sheet = np.radians(degrees / 2), square((0.2, 0, 0), 1, 0.4)
+    sides = [sheet @ euler_rotation((0, 0, 90 - sign * degrees / 2)).T for sign in (1, -1)]
+    barriers, generator = barriers_of(np.add(np.concatenate(sides), (0.5, 0.4, 0.5))), np.random.default_rng(0)
+    begin_N3 = np.stack(
+        [np.full(50, 0.5), np.full(50, 0.4 + 0.0015 / np.sin(half)), generator.uniform(0.4, 0.45, 50)], 1
+    )
+    position_N3, velocity_N3 = rolled(begin_N3, np.tile((0.0, 0.0, 0.003), (50, 1)), (0.0, -3e-4, 0.0), barriers, 30)
+    assert position_N3[:, 2] - begin_N3[:, 2] == pytest.approx(0.09, rel=1e-3)
+    assert (position_N3[:, 1] > 0.4).all() and velocity_N3[:, 2] == pytest.approx(0.003, rel=1e-3)
+
+
+def ball(rings, radius):
+    """A ball about the origin of rings of triangles."""
+    polar, around = np.linspace(0, np.pi, rings + 1)[:, None], np.linspace(0, 2 * np.pi, 2 * rings + 1)
+    place = np.stack([np.sin(polar) * np.cos(around), np.cos(polar) + 0 * around, np.sin(polar) * np.sin(around)], -1)
+    place *= radius
+    a, b, c, d = place[:-1, :-1], place[1:, :-1], place[1:, 1:], place[:-1, 1:]
+    return np.concatenate([np.stack([a, b, c], -2).reshape(-1, 3, 3), np.stack([a, c, d], -2).reshape(-1, 3, 3)])
+
+
+@pytest.mark.parametrize(("speed", "kept"), [(0.003, 0.99), (0.01, 0.95), (0.03, 0.5)])
+def test_fine_bowls_do_not_stop_what_slides(speed, kept):
+    """Within a ball of 14,400 triangles, of which a frame's way passes up to five: speed along it is kept, most
+    of it where a way passes more than three."""
+    barriers, generator = barriers_of(ball(60, 0.3) + 0.5), np.random.default_rng(0)
+    angle_N, height_N = generator.uniform(0, 2 * np.pi, 50), generator.uniform(-0.05, 0.05, 50)
+    radius_N = np.sqrt((0.3 * np.cos(np.pi / 60) ** 2 - 0.0015) ** 2 - height_N**2)
+    begin_N3 = 0.5 + np.stack([radius_N * np.cos(angle_N), height_N, radius_N * np.sin(angle_N)], 1)
+    velocity_N3 = speed * np.stack([-np.sin(angle_N), 0 * angle_N, np.cos(angle_N)], 1)
+    position_N3, velocity_N3 = rolled(begin_N3, velocity_N3, np.zeros(3), barriers, 20)
+    assert (np.linalg.norm(velocity_N3, axis=1) > kept * speed).all()
+    assert (np.linalg.norm(position_N3 - 0.5, axis=1) < 0.3).all()
+
+
+def test_the_first_triangle_stops():
+    """A way that meets a slope and, behind it, a floor slides down the slope: the floor would have it elsewhere."""
+    slope = square((0.0,) * 3, 1, 0.2) @ euler_rotation((0, 0, 30)).T + 0.5
+    floor = square((0.6, 0.35, 0.5), 1, 0.4)
+    position_13, _ = ended((0.5, 0.6, 0.5), (0.55, 0.33, 0.5), barriers_of(np.concatenate([floor, slope])))
+    assert position_13[0] == pytest.approx((0.4634, 0.4800, 0.5), abs=1e-4)
+
+
+def test_narrow_channels_hold_what_is_in_them():
+    """Between sheets nearer to each other than the clearance there is no room: nothing comes through them, and a way
+    across them ends where it meets one."""
+    sheets = np.concatenate([square((0.5, 0.5 + offset * CLEARANCE, 0.5), 1) for offset in (0, 0.8)])
+    position_13, velocity_13 = ended((0.5, 0.5 + 0.4 * CLEARANCE, 0.5), (0.51, 0.45, 0.5), barriers_of(sheets))
+    assert 0.5 < position_13[0, 1] < 0.5 + 0.8 * CLEARANCE and abs(velocity_13[0, 1]) < CLEARANCE
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -147,6 +204,20 @@ def test_a_slope_stops_a_way_once(dtype):
     expected_N3 = begun_N3 + way_N3 * (1, 0, 1)
     expected_N3[:, 1] = np.minimum(begun_N3[:, 1], CLEARANCE - MORE) + MORE
     assert (position_N3 - 0.5) @ turn_33 == pytest.approx(expected_N3, rel=0, abs=3e-7)
+
+
+def test_lists_reach_as_far_as_pieces_do():
+    """Ways as long as a list's cell, whose middles lie just within a cell, meet small squares at their ends, half a
+    cell away in the next: each is held, as when all triangles are asked."""
+    generator, size, count = np.random.default_rng(0), CELLS * CELL, 150
+    axis_N, cell_N3 = generator.integers(0, 3, count), generator.integers(8, 24, (count, 3))
+    along_N3 = np.eye(3)[axis_N] * generator.choice([-1, 1], (count, 1))
+    middle_N3 = (cell_N3 + 0.5 + 0.499 * along_N3) * size
+    before_N3, after_N3 = middle_N3 - 0.499 * size * along_N3, middle_N3 + 0.499 * size * along_N3
+    squares = [square(at, axis, 0.002) for at, axis in zip(middle_N3 + 0.495 * size * along_N3, axis_N, strict=True)]
+    barriers = barriers_of(np.concatenate(squares))
+    listed, asked = (ended(before_N3, after_N3, b)[0] for b in (barriers, AllPairs(**vars(barriers))))
+    assert np.array_equal(listed, asked) and (listed != after_N3).any(1).all()
 
 
 def test_lists_hold_all_that_is_met():
@@ -227,7 +298,8 @@ def test_gradients_are_those_of_what_is_left():
     barriers = barriers_of(square((0.5,) * 3, 1))
     after_N3 = torch.tensor([[0.52, 0.45, 0.5]], dtype=torch.float64, requires_grad=True)
     before_N3 = torch.tensor([[0.5, 0.55, 0.5]], dtype=torch.float64)
-    hit_N, end_N3 = barriers.stopped(before_N3, after_N3, torch.zeros(1, dtype=torch.int64))
+    hit_N, shift_N1, normal_N3, _ = barriers.stopped(before_N3, after_N3, torch.zeros(1, dtype=torch.int64))
+    end_N3 = after_N3 + shift_N1 * normal_N3
     assert bool(hit_N[0])
     for axis, expected in ((0, (1.0, 0.0, 0.0)), (1, (0.0, 0.0, 0.0))):
         (gradient,) = torch.autograd.grad(end_N3[0, axis], after_N3, retain_graph=True)
@@ -263,8 +335,3 @@ def test_mesh_files_are_obstacles_too():
         position_N3, _ = ended(position_N3, position_N3 + generator.normal(size=(500, 3)) * 0.05, barriers)
     share_N3 = (position_N3 - 0.4) / 0.2
     assert (share_N3 > 0).all() and (share_N3.sum(-1) < 1).all()
-
-
-def test_moved_to_a_device_and_back():
-    barriers = barriers_of(square((0.5,) * 3, 1))
-    assert replace(barriers.to(torch.device("cpu"))).key_Q.equal(barriers.key_Q)
