@@ -57,7 +57,8 @@ def _covers(row, x, y, z, live):
 
 @triton.jit
 def _stopped(bx, by, bz, x, y, z, line, live, within, slack):
-    """Which ways from (bx, by, bz) to (x, y, z) the first triangle on them stops, and where they end then."""
+    """Which ways from (bx, by, bz) to (x, y, z) a triangle stops; by how much their ends are to be shifted along which
+    unit normals; and the share of a way on which nothing is met."""
     bits = tl.load(line + 6, mask=live, other=ONE)
     cell_size = bits.to(tl.int32).to(tl.float32, bitcast=True)
     span = tl.load(line + 2, mask=live, other=0).to(tl.pointer_type(tl.int32))
@@ -66,9 +67,9 @@ def _stopped(bx, by, bz, x, y, z, line, live, within, slack):
     wx, wy, wz = x - bx, y - by, z - bz
     length = tl.sqrt_rn(wx * wx + wy * wy + wz * wz)
     pieces = tl.maximum(tl.ceil(tl.div_rn(length, cell_size)), 1.0)
-    piece, least = tl.zeros_like(x), tl.zeros_like(x) + 2.0
+    piece, least, free = tl.zeros_like(x), tl.zeros_like(x) + 2.0, tl.zeros_like(x) + 1.0
     first = tl.zeros_like(x).to(tl.int32) + NO_TRIANGLE
-    ex, ey, ez = x, y, z
+    shift, sx, sy, sz = tl.zeros_like(x), tl.zeros_like(x), tl.zeros_like(x), tl.zeros_like(x)
     while tl.max(live.to(tl.int32)) > 0:
         share = tl.div_rn(piece + 0.5, pieces)  # at the piece's middle
         cx = tl.floor(tl.div_rn(bx + share * wx, cell_size))
@@ -95,37 +96,41 @@ def _stopped(bx, by, bz, x, y, z, line, live, within, slack):
             left = distance - approach
             comes_near = ask & (approach > 0) & (left < within)
             closing = tl.maximum(approach, 1e-30)
-            comes = tl.minimum(tl.maximum(tl.div_rn(distance - within, closing), 0.0), 1.0)
-            passes = tl.minimum(tl.maximum(tl.div_rn(distance, closing), 0.0), 1.0)
-            here = _covers(row, bx + comes * wx, by + comes * wy, bz + comes * wz, comes_near)
-            passing = comes_near & (left < 0) & (here == 0)
-            there = _covers(row, bx + passes * wx, by + passes * wy, bz + passes * wz, passing)
-            time = tl.where(here, comes, passes)
+            contact = tl.minimum(tl.maximum(tl.div_rn(distance - within, closing), 0.0), 1.0)
+            crossing = tl.minimum(tl.maximum(tl.div_rn(distance, closing), 0.0), 1.0)
+            meets = _covers(row, bx + contact * wx, by + contact * wy, bz + contact * wz, comes_near)
+            passing = comes_near & (left < 0) & (meets == 0)
+            crosses = _covers(row, bx + crossing * wx, by + crossing * wy, bz + crossing * wz, passing)
+            time = tl.where(meets, contact, crossing)
             sooner = (time < least) | ((time == least) & (triangle < first))
-            sooner = sooner & (here | there)
-            shift = side * (tl.minimum(distance, within) + slack - left)
-            ex = tl.where(sooner, x + shift * nx, ex)
-            ey = tl.where(sooner, y + shift * ny, ey)
-            ez = tl.where(sooner, z + shift * nz, ez)
+            sooner = sooner & (meets | crosses)
+            shift = tl.where(sooner, tl.minimum(distance, within) + slack - left, shift)
+            sx, sy, sz = (
+                tl.where(sooner, side * nx, sx),
+                tl.where(sooner, side * ny, sy),
+                tl.where(sooner, side * nz, sz),
+            )
+            free = tl.where(meets | crosses, tl.minimum(free, contact), free)
             least, first = tl.where(sooner, time, least), tl.where(sooner, triangle, first)
             entry += 1
             ask = ask & (entry < end)
         piece += 1.0
         live = live & (piece < pieces)
-    return first < NO_TRIANGLE, ex, ey, ez
+    return first < NO_TRIANGLE, shift, sx, sy, sz, free
 
 
 @triton.jit
 def kept_apart(
-    bx, by, bz, x, y, z, width, height, depth, line, live, within, slack, near, far,
+    bx, by, bz, x, y, z, width, height, depth, line, live, within, slack, least_crease, near, far,
     SURFACES: tl.constexpr, WALLED: tl.constexpr,
 ):  # fmt: skip
     """Where ways from (bx, by, bz) to (x, y, z) end, which are between the walls, in domains of so much width, height
-    and depth: up to SURFACES triangles stop one after the other, and walls, where WALLED, again; what others are then
-    in the way of stays where it was. `line` is the scenes' row of the barrier table; all are vectors of particles.
-    What is out of range is not held.
+    and depth: up to SURFACES triangles stop one after the other, and walls, where WALLED, again; what a further one
+    stops ends where it meets one. `line` is the scenes' row of the barrier table; all are vectors of particles. What is
+    out of range is not held.
 
-    Triangles stop what comes within `within` of them, and put it farther by `slack`.
+    Triangles stop what comes within `within` of them, and put it farther by `slack`. Planes whose squared sine is at
+    most `least_crease` are one.
     """
     live = live & (x > -width) & (x < 2 * width) & (y > -height) & (y < 2 * height)
     live = live & (z > -depth) & (z < 2 * depth)  # NaN is not
@@ -133,17 +138,24 @@ def kept_apart(
     bx, by, bz = tl.where(live, bx, 0.0), tl.where(live, by, 0.0), tl.where(live, bz, 0.0)
     ex, ey, ez = tl.where(live, x, 0.0), tl.where(live, y, 0.0), tl.where(live, z, 0.0)
     ask, surface = live, tl.zeros_like(ex)
+    lx, ly, lz = tl.zeros_like(ex), tl.zeros_like(ex), tl.zeros_like(ex)  # the normals of the shifts before
     while tl.max(ask.to(tl.int32)) > 0:
-        hit, mx, my, mz = _stopped(bx, by, bz, ex, ey, ez, line, ask, within, slack)
+        hit, shift, nx, ny, nz, free = _stopped(bx, by, bz, ex, ey, ez, line, ask, within, slack)
         ask = ask & hit
-        mx = _between_walls(mx, bx, width, near, far, WALLED)
-        my = _between_walls(my, by, height, near, far, WALLED)
-        mz = _between_walls(mz, bz, depth, near, far, WALLED)
-        free = surface < SURFACES
-        ex = tl.where(ask, tl.where(free, mx, bx), ex)
-        ey = tl.where(ask, tl.where(free, my, by), ey)
-        ez = tl.where(ask, tl.where(free, mz, bz), ez)
-        ask = ask & free
+        cosine = nx * lx + ny * ly + nz * lz
+        ax, ay, az = nx - cosine * lx, ny - cosine * ly, nz - cosine * lz  # along the last planes
+        square = ax * ax + ay * ay + az * az
+        crease = (cosine < 0) & (square > least_crease)
+        farther = tl.div_rn(shift, tl.maximum(square, least_crease))
+        mx = _between_walls(tl.where(crease, ex + farther * ax, ex + shift * nx), bx, width, near, far, WALLED)
+        my = _between_walls(tl.where(crease, ey + farther * ay, ey + shift * ny), by, height, near, far, WALLED)
+        mz = _between_walls(tl.where(crease, ez + farther * az, ez + shift * nz), bz, depth, near, far, WALLED)
+        slides = surface < SURFACES
+        ex = tl.where(ask, tl.where(slides, mx, bx + free * (ex - bx)), ex)
+        ey = tl.where(ask, tl.where(slides, my, by + free * (ey - by)), ey)
+        ez = tl.where(ask, tl.where(slides, mz, bz + free * (ez - bz)), ez)
+        lx, ly, lz = nx, ny, nz
+        ask = ask & slides
         surface += 1.0
     return tl.where(live, ex, x), tl.where(live, ey, y), tl.where(live, ez, z)
 

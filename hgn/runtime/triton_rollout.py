@@ -31,7 +31,7 @@ from hgn.network.features import ParticleState
 from hgn.network.grid import build_hierarchy
 from hgn.network.hgn import HierarchicalGraphNetwork
 from hgn.runtime.divergence import DivergedError, describe_diverged, diverged
-from hgn.runtime.holding import SURFACES
+from hgn.runtime.holding import LEAST_CREASE, SURFACES
 from hgn.runtime.parity import LEAST_OUTPUT, OUTPUT_BOUND, relative_error, require_bound
 from hgn.runtime.triton_host import kernel_precision
 
@@ -282,8 +282,8 @@ class TritonRollout:
             particle_count=self.count, status=self.grid.status, lost=self.lost, frame=self.frame,
             path=self.path_TN3, near=near, far=far,
             barrier_table=self.count if self.barriers is None else self.barriers.row_S7,
-            within=(1 - SLACK) * clearance, slack=SLACK * clearance, OUT=OUT, HISTORY=config.velocity_history,
-            COLUMNS=1 << (3 * config.velocity_history - 1).bit_length(),
+            within=(1 - SLACK) * clearance, slack=SLACK * clearance, least_crease=LEAST_CREASE, OUT=OUT,
+            HISTORY=config.velocity_history, COLUMNS=1 << (3 * config.velocity_history - 1).bit_length(),
             WALLED_AXES=0 if config.wall_clearance is None else config.dimensions,
             SURFACES=0 if self.barriers is None else SURFACES, OVERLAP=overlap, BLOCK=INTEGRATE_BLOCK,
             launch_pdl=overlap,

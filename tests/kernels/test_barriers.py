@@ -6,14 +6,14 @@ import torch
 import triton
 import triton.language as tl
 from kernels.engines import device
-from network.barrier_scenes import CELL, CLEARANCE, DOMAIN, barriers_of, crossings, scattered, square
+from network.barrier_scenes import CELL, CLEARANCE, DOMAIN, ball, barriers_of, crossings, gutter, scattered, square
 from network.states import network_of
 
 from hgn.kernels.barrier_table import BarrierHash, BarrierTable
 from hgn.kernels.barriers import BARRIER_COLUMNS, kept_apart
 from hgn.network.barriers import SLACK
 from hgn.network.features import ParticleState
-from hgn.runtime.holding import SURFACES, held
+from hgn.runtime.holding import LEAST_CREASE, SURFACES, held
 from hgn.scene.barrier import build_barrier
 
 BLOCK = 1024 if device().type == "cpu" else 64  # the interpreter's time goes by programs
@@ -22,8 +22,8 @@ NO_CORNERS = np.zeros((0, 3, 3))
 
 @triton.jit
 def hold(
-    before, after, scene_of, table, out, count, within, slack, near, far, SURFACES: tl.constexpr, WALLED: tl.constexpr,
-    BLOCK: tl.constexpr,
+    before, after, scene_of, table, out, count, within, slack, least_crease, near, far, SURFACES: tl.constexpr,
+    WALLED: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     row = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     live = row < count
@@ -36,7 +36,7 @@ def hold(
     z = tl.load(after + 3 * row + 2, mask=live, other=0.0)
     size = tl.zeros_like(x) + 1.0
     ends = kept_apart(
-        bx, by, bz, x, y, z, size, size, size, line, live, within, slack, near, far, SURFACES, WALLED
+        bx, by, bz, x, y, z, size, size, size, line, live, within, slack, least_crease, near, far, SURFACES, WALLED
     )  # fmt: skip
     for axis in tl.static_range(3):
         tl.store(out + 3 * row + axis, ends[axis], mask=live)
@@ -61,8 +61,8 @@ def both(before_N3, after_N3, scene_N, barriers, table, walls=None):
     near, far = walls or (0.0, 0.0)
     hold[(triton.cdiv(count, BLOCK),)](
         before=before_N3, after=after_N3, scene_of=scene_N, table=table.row_S7, out=found_N3, count=count,
-        within=(1 - SLACK) * CLEARANCE, slack=SLACK * CLEARANCE, near=near, far=far, SURFACES=SURFACES,
-        WALLED=walls is not None, BLOCK=BLOCK,
+        within=(1 - SLACK) * CLEARANCE, slack=SLACK * CLEARANCE, least_crease=LEAST_CREASE, near=near, far=far,
+        SURFACES=SURFACES, WALLED=walls is not None, BLOCK=BLOCK,
     )  # fmt: skip
     return expected_N3.cpu().numpy(), found_N3.cpu().numpy()
 
@@ -81,7 +81,7 @@ def met(seed):
     """Of ways among scattered obstacles those that are stopped, and the first hundred others; float32."""
     corner_F33, *ways = scattered(seed)
     before_N3, after_N3 = (torch.as_tensor(x, dtype=torch.float32) for x in ways)
-    hit_N, _ = barriers_of(corner_F33).stopped(before_N3, after_N3, torch.zeros(len(before_N3), dtype=torch.int64))
+    hit_N, *_ = barriers_of(corner_F33).stopped(before_N3, after_N3, torch.zeros(len(before_N3), dtype=torch.int64))
     chosen_N = hit_N | (torch.cumsum(~hit_N, 0) <= 100)
     return corner_F33, before_N3[chosen_N].numpy(), after_N3[chosen_N].numpy()
 
@@ -102,6 +102,26 @@ def test_ways_end_where_the_reference_ends_them(walls):
         begin_N3, free_N3, end_N3 = (x[own].astype(np.float64) for x in (before_N3, after_N3, found_N3))
         assert crossings(begin_N3, end_N3, corner_F33) == 0
         assert ((end_N3 != free_N3).any(-1).sum() > 60) == (scene != 1 or walls is not None)
+
+
+def test_what_several_triangles_stop():
+    """In a gutter of 60 degrees, where ends move along its crease, and in a ball of 3,600 triangles, where a way passes
+    more than stop it: ways end where they do by PyTorch, and within."""
+    generator, count = np.random.default_rng(0), 200
+    begin_N3 = generator.uniform((0.498, 0.404, 0.45), (0.502, 0.406, 0.55), (count, 3))
+    angle_N = generator.uniform(0, 2 * np.pi, count)
+    around_N3 = np.stack([np.cos(angle_N), 0 * angle_N, np.sin(angle_N)], 1)
+    befores = [begin_N3, 0.5 + 0.29 * around_N3]
+    afters = [begin_N3 + generator.normal((0, -0.01, 0.01), 0.002, (count, 3)), 0.5 + 0.32 * np.roll(around_N3, 1, 0)]
+    corners, scene_N = [gutter(60), ball(30, 0.3) + 0.5], np.repeat((0, 1), count)
+    barriers, before_N3 = on_device(barriers_of(*corners)), np.concatenate(befores).astype(np.float32)
+    after_N3 = np.concatenate(afters).astype(np.float32)
+    expected_N3, found_N3 = both(before_N3, after_N3, scene_N, barriers, table_of(*corners))
+    np.testing.assert_allclose(found_N3, expected_N3, rtol=0, atol=2e-6)
+    assert (found_N3[:count, 2] - after_N3[:count, 2] == pytest.approx(0, abs=1e-6)) and (
+        found_N3[:count, 1] > 0.4
+    ).all()
+    assert (np.linalg.norm(found_N3[count:] - 0.5, axis=1) < 0.3).all()
 
 
 def test_where_nothing_stops_nothing_changes():

@@ -40,6 +40,22 @@ def scattered(seed, count=2000):
     return all_corners(meshes), before_N3, before_N3 + way_N3
 
 
+def gutter(degrees):
+    """Two sheets that meet at an angle of so much below, along z: corners [4, 3, 3]."""
+    sheet = square((0.2, 0, 0), 1, 0.4)
+    sides = [sheet @ euler_rotation((0, 0, 90 - sign * degrees / 2)).T for sign in (1, -1)]
+    return np.add(np.concatenate(sides), (0.5, 0.4, 0.5))
+
+
+def ball(rings, radius):
+    """A ball about the origin of rings of triangles."""
+    polar, around = np.linspace(0, np.pi, rings + 1)[:, None], np.linspace(0, 2 * np.pi, 2 * rings + 1)
+    place = np.stack([np.sin(polar) * np.cos(around), np.cos(polar) + 0 * around, np.sin(polar) * np.sin(around)], -1)
+    place *= radius
+    a, b, c, d = place[:-1, :-1], place[1:, :-1], place[1:, 1:], place[:-1, 1:]
+    return np.concatenate([np.stack([a, b, c], -2).reshape(-1, 3, 3), np.stack([a, c, d], -2).reshape(-1, 3, 3)])
+
+
 def crossings(before_N3, after_N3, corner_F33):
     """How many ways pass a triangle (Moeller and Trumbore 1997), by determinants alone."""
     count = 0

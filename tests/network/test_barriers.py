@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from network.barrier_scenes import CELL, CLEARANCE, DOMAIN, barriers_of, crossings, scattered, square
+from network.barrier_scenes import CELL, CLEARANCE, DOMAIN, ball, barriers_of, crossings, gutter, scattered, square
 from network.states import network_of
 
 from hgn.network.barriers import SLACK, Barriers, barrier_rows
@@ -120,24 +120,13 @@ def test_what_slides_leaves_a_table(clearance, turn, dtype):
 @pytest.mark.parametrize("degrees", [40, 60, 80, 90, 120, 170])
 def test_what_flows_along_a_gutter_does_not_stop(degrees):
     """Between two sheets that meet below at an angle: what is along the crease is kept."""
-    half, sheet = np.radians(degrees / 2), square((0.2, 0, 0), 1, 0.4)
-    sides = [sheet @ euler_rotation((0, 0, 90 - sign * degrees / 2)).T for sign in (1, -1)]
-    barriers, generator = barriers_of(np.add(np.concatenate(sides), (0.5, 0.4, 0.5))), np.random.default_rng(0)
+    half, barriers, generator = np.radians(degrees / 2), barriers_of(gutter(degrees)), np.random.default_rng(0)
     begin_N3 = np.stack(
         [np.full(50, 0.5), np.full(50, 0.4 + 0.0015 / np.sin(half)), generator.uniform(0.4, 0.45, 50)], 1
     )
     position_N3, velocity_N3 = rolled(begin_N3, np.tile((0.0, 0.0, 0.003), (50, 1)), (0.0, -3e-4, 0.0), barriers, 30)
     assert position_N3[:, 2] - begin_N3[:, 2] == pytest.approx(0.09, rel=1e-3)
     assert (position_N3[:, 1] > 0.4).all() and velocity_N3[:, 2] == pytest.approx(0.003, rel=1e-3)
-
-
-def ball(rings, radius):
-    """A ball about the origin of rings of triangles."""
-    polar, around = np.linspace(0, np.pi, rings + 1)[:, None], np.linspace(0, 2 * np.pi, 2 * rings + 1)
-    place = np.stack([np.sin(polar) * np.cos(around), np.cos(polar) + 0 * around, np.sin(polar) * np.sin(around)], -1)
-    place *= radius
-    a, b, c, d = place[:-1, :-1], place[1:, :-1], place[1:, 1:], place[:-1, 1:]
-    return np.concatenate([np.stack([a, b, c], -2).reshape(-1, 3, 3), np.stack([a, c, d], -2).reshape(-1, 3, 3)])
 
 
 @pytest.mark.parametrize(("speed", "kept"), [(0.003, 0.99), (0.01, 0.95), (0.03, 0.5)])

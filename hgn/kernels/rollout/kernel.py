@@ -24,15 +24,16 @@ def _axes(at, live):
 @triton.jit
 def integrate(
     output, position, velocity, scene_of, domain, gravity, mean, std, particle_count, status, lost, frame, path,
-    near, far, barrier_table, within, slack, OUT: tl.constexpr, HISTORY: tl.constexpr, COLUMNS: tl.constexpr,
-    WALLED_AXES: tl.constexpr, SURFACES: tl.constexpr, OVERLAP: tl.constexpr, BLOCK: tl.constexpr,
+    near, far, barrier_table, within, slack, least_crease, OUT: tl.constexpr, HISTORY: tl.constexpr,
+    COLUMNS: tl.constexpr, WALLED_AXES: tl.constexpr, SURFACES: tl.constexpr, OVERLAP: tl.constexpr,
+    BLOCK: tl.constexpr,
 ):  # fmt: skip
     """v += a, x += v, and the new positions into path [T, N, 3] at `frame`; a is gravity and the restored output.
 
     Where the status is not zero, nothing changes. Particles that are not finite or farther from the domain than its
     own size are counted in `lost`, once an axis; `advance` then ends the simulation. All others are held between the
     walls of the first WALLED_AXES axes, `near` and `far` from the planes, and, with SURFACES, by obstacles, as
-    hgn.kernels.barriers says of `barrier_table`, `within` and `slack`; hgn.runtime.holding has the rule.
+    hgn.kernels.barriers says of `barrier_table` and the numbers behind it; hgn.runtime.holding has the rule.
 
     Reference: hgn.runtime.simulator.Simulator on the torch backend; test: tests/kernels/test_rollout.py.
     """
@@ -83,8 +84,8 @@ def integrate(
         width, height, depth = _axes(domain + scene * 3, row < count)
         line = barrier_table + scene * BARRIER_COLUMNS
         ends = kept_apart(
-            bx, by, bz, x, y, z, width, height, depth, line, row < count, within, slack, near, far, SURFACES,
-            WALLED_AXES > 0,
+            bx, by, bz, x, y, z, width, height, depth, line, row < count, within, slack, least_crease, near, far,
+            SURFACES, WALLED_AXES > 0,
         )  # fmt: skip
         begins, free = (bx, by, bz), (x, y, z)
         for k in tl.static_range(3):
