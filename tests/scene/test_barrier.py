@@ -2,9 +2,11 @@
 
 import numpy as np
 import pytest
-from network.barrier_scenes import CELL, CLEARANCE, DOMAIN
+from network.barrier_scenes import CELL, CLEARANCE, DOMAIN, square
 
-from hgn.scene.barrier import CELLS, barrier_of_pieces, barrier_pieces
+from hgn.network.barriers import Barriers
+from hgn.scene.barrier import CELLS, barrier_of_pieces, barrier_pieces, build_barrier
+from hgn.schema import ConfigError
 
 
 def triangles(count, largest):
@@ -49,3 +51,16 @@ def test_cells_list_the_triangles_that_are_near(count, largest, clearance):
     np.testing.assert_array_equal(barrier.cell_Q3, cell_C3[filled_C])
     np.testing.assert_array_equal(barrier.start_Q, np.append(0, near_CF[filled_C].sum(axis=1).cumsum()))
     np.testing.assert_array_equal(barrier.triangle_E, np.nonzero(near_CF)[1])
+
+
+def test_scenes_of_a_batch_have_one_cell_size():
+    """It is refused by name where those with obstacles differ; the cells of a scene without any do not matter."""
+    corner_F33 = square((0.5,) * 3, 1)
+    fine, coarse = (build_barrier(corner_F33, size, CLEARANCE, DOMAIN) for size in (CELL, 2 * CELL))
+    empty = build_barrier(corner_F33[:0], 2 * CELL, CLEARANCE, DOMAIN)
+    rule = (
+        r"cell_size must be one for all scenes of a batch with obstacle_clearance, got \(0.015625, 0.03125\); simulate"
+    )
+    with pytest.raises(ConfigError, match=rule):
+        Barriers.of([coarse, fine])
+    assert Barriers.of([empty, fine]).cell_size == fine.cell_size
