@@ -16,7 +16,6 @@ from hgn.network.features import material_rows
 from hgn.scene.barrier import Barrier
 from hgn.scene.episode import Episode
 from hgn.scene.history import frames_before
-from hgn.scene.rollout_file import episode_barrier
 from hgn.scene.symmetry import Symmetry, Vector, scene_symmetries
 
 
@@ -45,9 +44,8 @@ class UpdateChunk:
     starts: tuple[tuple[int, int], ...] = ()  # episodes and frames that the network is to simulate from before it
 
 
-def whole_episode(episode: Episode, network: NetworkConfig, simulated: bool = False) -> EpisodeTensors:
-    """Reads an episode, which may be `simulated`; its windows are those of `hgn.scene.history.window`."""
-    clearance = network.obstacle_clearance if simulated else None
+def whole_episode(episode: Episode, network: NetworkConfig, barrier: Barrier | None = None) -> EpisodeTensors:
+    """Reads an episode; its windows are those of `hgn.scene.history.window`. `barrier` is what simulations hold by."""
     past = frames_before(episode, -network.velocity_history)
     grid, seen = episode.obstacle_grid, len(episode.obstacle_grid.cell_K3) if network.obstacle_features else 0
     return EpisodeTensors(
@@ -58,7 +56,7 @@ def whole_episode(episode: Episode, network: NetworkConfig, simulated: bool = Fa
         episode.domain_size,
         frame_gravity(episode),
         shown_symmetries(episode, network),
-        None if clearance is None else episode_barrier(episode, clearance),
+        barrier,
     )
 
 

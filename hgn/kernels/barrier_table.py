@@ -71,11 +71,16 @@ class BarrierTable:
         self._hashes = [entry.to(device) if entry is not None else None for entry in hashes]
         rows = [entry.row() if entry is not None else [0] * BARRIER_COLUMNS for entry in self._hashes]
         self.row_S7 = torch.tensor(rows, dtype=torch.int64, device=device)
+        self._barriers: Barriers | None = None  # that it was made of, unless of hashes
+
+    def is_of(self, barriers: Barriers | None) -> bool:
+        """Whether it was made of this very object; never of none, for which a table takes no time."""
+        return barriers is not None and self._barriers is barriers
 
     def take(self, other: BarrierTable) -> None:
         """Makes its rows those of another table, in place."""
         self.row_S7.copy_(other.row_S7)
-        self._hashes = other._hashes
+        self._hashes, self._barriers = other._hashes, other._barriers
 
     @staticmethod
     def of(barriers: Barriers | None, scenes: int, device: torch.device) -> BarrierTable:
@@ -95,4 +100,6 @@ class BarrierTable:
             start_Q, triangle_E = barriers.start_Q[q : q_end + 1] - e, barriers.triangle_E[e:e_end] - f
             parts = cell_Q3[q:q_end], start_Q, triangle_E, barriers.row_F24[f:f_end], barriers.cell_size
             hashes.append(BarrierHash._of(*parts) if triangles[scene] else None)
-        return BarrierTable(hashes, barriers.key_Q.device)
+        table = BarrierTable(hashes, barriers.key_Q.device)
+        table._barriers = barriers
+        return table

@@ -19,7 +19,8 @@ import torch
 from torch.compiler import is_exporting
 
 from hgn.network.cell_keys import COORDINATE_LIMIT, LARGEST_EXPORTED, find, pack
-from hgn.scene.barrier import LEAST_HEIGHT, MARGIN, Barrier
+from hgn.scene.barrier import CELLS, LEAST_HEIGHT, MARGIN, Barrier
+from hgn.schema import require
 
 SLACK = 1e-3  # of the clearance; what begins nearer leaves by that in a frame that would bring it nearer
 NOWHERE = 1e30  # domain units: lowest corner of a box that nothing meets, its highest is at minus that
@@ -39,11 +40,18 @@ class Barriers:
 
     @staticmethod
     def of(barriers: Sequence[Barrier]) -> Barriers | None:
-        """Of a batch, scene s from barriers[s]; none where no scene has an obstacle."""
+        """Of a batch, scene s from barriers[s]; none where no scene has an obstacle.
+
+        Raises: ConfigError where those that have some have cells of more than one size.
+        """
         if not any(len(barrier.row_F24) for barrier in barriers):
             return None
-        cell_size, clearance = barriers[0].cell_size, barriers[0].clearance
-        assert all((b.cell_size, b.clearance) == (cell_size, clearance) for b in barriers)
+        clearance = barriers[0].clearance
+        assert all(barrier.clearance == clearance for barrier in barriers)
+        cell_size, *others = sorted({barrier.cell_size for barrier in barriers if len(barrier.row_F24)})
+        values = tuple(size / CELLS for size in (cell_size, *others))
+        rule = "one for all scenes of a batch with obstacle_clearance"
+        require(not others, "cell_size", rule, values, "simulate scenes of other cells by themselves")
         keys = [
             pack(torch.full((len(b.cell_Q3),), scene), torch.from_numpy(b.cell_Q3.astype(np.int64)))
             for scene, b in enumerate(barriers)

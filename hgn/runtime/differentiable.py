@@ -101,7 +101,10 @@ class _Frame(torch.autograd.Function):
         with torch.enable_grad():
             outputs = context.step(*variables)
         wanted = [tensor for tensor in variables if tensor.requires_grad]
-        computed = iter(torch.autograd.grad(outputs, wanted, gradients, allow_unused=True))
+        # a frame in which no obstacle holds does not depend on where they are
+        reached = [pair for pair in zip(outputs, gradients, strict=True) if pair[0].requires_grad]
+        ends, slopes = [output for output, _ in reached], [gradient for _, gradient in reached]
+        computed = iter(torch.autograd.grad(ends, wanted, slopes, allow_unused=True))
         return None, *(next(computed) if tensor.requires_grad else None for tensor in variables)
 
 

@@ -113,14 +113,14 @@ class LiveSimulation:
         other = InitialState.of(scene)
         of_obstacles = ("obstacle_grid", "sampled", "corners")
         obstacles: dict[str, Any] = {name: getattr(other, name) for name in of_obstacles}
-        self._change_scene(replace(self.scene, **obstacles))
+        self._change_scene(replace(self.scene, **obstacles), ("obstacles", "surface", "barriers"))
 
     def set_gravity(self, gravity: tuple[float, float, float]) -> None:
         """Gravity from now on, domain units per second squared.
 
         Raises: ConfigError for what the weights cannot take: absolute inputs know that of their data alone.
         """
-        self._change_scene(replace(self.scene, gravity=gravity))
+        self._change_scene(replace(self.scene, gravity=gravity), ("gravity_S3",))
 
     def restore(self, position_N3: np.ndarray, velocity_NM3: np.ndarray, frame: int) -> None:
         """Goes back to what the first particles of the simulation did at an earlier frame: those that entered later
@@ -143,13 +143,15 @@ class LiveSimulation:
             )
         )
 
-    def _change_scene(self, scene: InitialState) -> None:
+    def _change_scene(self, scene: InitialState, names: tuple[str, ...]) -> None:
+        """Another scene's are those parts of the state that have these names; the others stay."""
         of_particles = ("position_N3", "velocity_N3", "material_N")
-        nobody: dict[str, Any] = {name: getattr(scene, name)[:0] for name in of_particles}
-        new = self.simulator.start([replace(scene, **nobody)])
+        started: dict[str, Any] = {name: getattr(scene, name)[:0] for name in of_particles}
+        if "barriers" not in names:
+            started["corners"] = None  # barriers stay, and would take time
+        new = self.simulator.start([replace(scene, **started)])
         self.scene = scene
-        of_scene = ("gravity_S3", "obstacles", "surface", "barriers")
-        changed: dict[str, Any] = {name: getattr(new, name) for name in of_scene}
+        changed: dict[str, Any] = {name: getattr(new, name) for name in names}
         self._go_on_with(replace(self.state, **changed))
 
     def _go_on_with(self, state: ParticleState) -> None:

@@ -160,7 +160,7 @@ class TritonRollout:
         Obstacles are those of the rows of `self.obstacles` and `self.barriers`, which the caller may write, or those of
         the state.
         """
-        if new_obstacles and self.barriers is not None:
+        if new_obstacles and self.barriers is not None and not self.barriers.is_of(state.barriers):
             self.barriers.take(BarrierTable.of(state.barriers, self.scenes, self.device))
         if new_obstacles and state.obstacles is not None:
             assert self.obstacles is not None

@@ -4,11 +4,12 @@ A triangle covers a place that is within `clearance` of its plane and no farther
 has four planes, a unit normal and an offset each: its own, then those of its edges, which point outwards and lie that
 margin farther out; and the box of its corners, widened by 2 * clearance. It covers what is on the inner side of the
 edges, in the box.
-Shape legend: F triangles, Q cells, E entries of their lists.
+Shape legend: F triangles, Q cells, E entries of their lists, C cells of a box.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,7 +25,7 @@ CELLS = 2  # obstacle cells to a cell here: narrower ones have lists as long, an
 # at convex edges, which stops what slides off
 MARGIN = 0.1
 LEAST_HEIGHT = 1e-9  # domain units: of a triangle above its longest edge; thinner ones cover nothing that others do not
-CELLS_AT_ONCE = 1 << 20  # candidates of triangles, which bounds memory
+CELLS_AT_ONCE = 1 << 18  # of triangles' boxes, which bounds memory
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,15 +72,12 @@ def barrier_of_pieces(corner_F33: np.ndarray, cell_size: float, clearance: float
     """The barrier of `barrier_pieces`, row f from triangle f. Raises: ConfigError for a clearance that is none."""
     require(0 < clearance <= cell_size, "obstacle_clearance", f"above 0, up to a cell ({cell_size:g})", clearance)
     row_F24, cell_size = _rows(corner_F33, clearance), CELLS * cell_size
-    cell_E3, triangle_E = _lists(row_F24, cell_size, clearance)
-    order = np.lexsort((triangle_E, *cell_E3.T[::-1]))
-    cell_E3, triangle_E = cell_E3[order], triangle_E[order]
-    first = np.flatnonzero(np.diff(cell_E3, axis=0, prepend=np.iinfo(np.int64).min // 2).any(axis=1))
+    cell_Q3, start_Q, triangle_E = _lists(row_F24, cell_size, clearance)
     return Barrier(
         cell_size,
         clearance,
-        cell_E3[first].astype(np.int32),
-        np.append(first, len(triangle_E)).astype(np.int32),
+        cell_Q3.astype(np.int32),
+        start_Q.astype(np.int32),
         triangle_E.astype(np.int32),
         row_F24.astype(np.float32),
     )
@@ -101,31 +99,52 @@ def _rows(corner_F33: np.ndarray, clearance: float) -> np.ndarray:
     return row_F24
 
 
-def _lists(row_F24: np.ndarray, cell_size: float, clearance: float) -> tuple[np.ndarray, np.ndarray]:
-    """Cells int64 [E, 3] and the triangle of each, int64 [E]: those that a triangle's planes and box come to within
-    half a cell, for a piece of a way may reach half a cell beyond the cell that its middle is in.
+def _lists(row_F24: np.ndarray, cell_size: float, clearance: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Cells [Q, 3], where the list of each begins [Q + 1], and the triangles of all lists [E]: of a cell those whose
+    planes and box come to within half a cell, for a piece of a way may reach half a cell beyond the cell that its
+    middle is in.
     """
     reach = 0.5 * cell_size * (1 + 1e-3)
     low_F3 = np.floor((row_F24[:, 16:19] - reach) / cell_size).astype(np.int64)
     extent_F3 = np.floor((row_F24[:, 20:23] + reach) / cell_size).astype(np.int64) - low_F3 + 1
-    count_F = extent_F3.prod(axis=1)
-    cells, owners = [np.zeros((0, 3), np.int64)], [np.zeros(0, np.int64)]
-    block_F = np.cumsum(count_F) // CELLS_AT_ONCE
-    for block in range(int(block_F[-1]) + 1 if len(block_F) else 0):
-        chosen = np.flatnonzero(block_F == block)
-        count = count_F[chosen]
-        owner_E = np.repeat(chosen, count)
-        place_E = np.arange(len(owner_E)) - np.repeat(np.cumsum(count) - count, count)
-        extent_E3 = extent_F3[owner_E]
-        x_E, rest_E = np.divmod(place_E, extent_E3[:, 1] * extent_E3[:, 2])
-        cell_E3 = low_F3[owner_E] + np.stack([x_E, *np.divmod(rest_E, extent_E3[:, 2])], axis=1)
-        centre_E3, half = (cell_E3 + 0.5) * cell_size, 0.5 * cell_size + reach
-        near_E = np.ones(len(owner_E), bool)
-        for plane in range(4):
-            plane_E4 = row_F24[owner_E, 4 * plane : 4 * plane + 4]
-            distance_E = (plane_E4[:, :3] * centre_E3).sum(axis=1) - plane_E4[:, 3]
-            spread_E = half * np.abs(plane_E4[:, :3]).sum(axis=1)
-            near_E &= (np.abs(distance_E) <= spread_E + clearance) if plane == 0 else (distance_E <= spread_E)
-        cells.append(cell_E3[near_E])
-        owners.append(owner_E[near_E])
-    return np.concatenate(cells), np.concatenate(owners)
+    origin_3 = low_F3.min(axis=0, initial=0)
+    all_cells = tuple((low_F3 + extent_F3).max(axis=0, initial=1) - origin_3)  # in which a cell has one number
+    low_F = np.ravel_multi_index(tuple((low_F3 - origin_3).T), all_cells)
+    numbers, triangles = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)]
+    for triangle_F, cell_3C in _alike(extent_F3):
+        cell_C = np.ravel_multi_index(tuple(cell_3C), all_cells)
+        f, c = np.nonzero(_near(row_F24[triangle_F], low_F3[triangle_F], cell_3C, cell_size, reach, clearance))
+        numbers.append(low_F[triangle_F[f]] + cell_C[c])
+        triangles.append(triangle_F[f])
+    number_E, triangle_E = np.concatenate(numbers), np.concatenate(triangles)
+    order_E = np.lexsort((triangle_E, number_E))
+    number_E, triangle_E = number_E[order_E], triangle_E[order_E]
+    first_Q = np.flatnonzero(np.diff(number_E, prepend=-1))
+    cell_Q3 = np.stack(np.unravel_index(number_E[first_Q], all_cells), axis=1) + origin_3
+    return cell_Q3, np.append(first_Q, len(number_E)), triangle_E
+
+
+def _alike(extent_F3: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Triangles [F'] whose boxes have as many cells on each axis, and these cells as seen from the lowest, [3, C]."""
+    shape = tuple(extent_F3.max(axis=0, initial=0) + 1)
+    extent_F = np.ravel_multi_index(tuple(extent_F3.T), shape)
+    for extent in np.unique(extent_F):
+        cell_3C = np.indices(np.unravel_index(extent, shape)).reshape(3, -1)
+        triangle_F, count = np.flatnonzero(extent_F == extent), max(1, CELLS_AT_ONCE // cell_3C.shape[1])
+        for first in range(0, len(triangle_F), count):
+            yield triangle_F[first : first + count], cell_3C
+
+
+def _near(
+    row_F24: np.ndarray, low_F3: np.ndarray, cell_3C: np.ndarray, cell_size: float, reach: float, clearance: float
+) -> np.ndarray:
+    """Whether what a triangle covers may come to within `reach` of a cell by its planes, bool [F, C]."""
+    centre_F3, half = (low_F3 + 0.5) * cell_size, 0.5 * cell_size + reach
+    near_FC = np.ones((len(row_F24), cell_3C.shape[1]), bool)
+    for plane in range(4):
+        normal_F3, offset_F = row_F24[:, 4 * plane : 4 * plane + 3], row_F24[:, 4 * plane + 3]
+        distance_FC = (normal_F3 * cell_size) @ cell_3C
+        distance_FC += ((normal_F3 * centre_F3).sum(axis=1) - offset_F)[:, None]
+        spread_F1 = half * np.abs(normal_F3).sum(axis=1, keepdims=True)
+        near_FC &= (np.abs(distance_FC) <= spread_F1 + clearance) if plane == 0 else (distance_FC <= spread_F1)
+    return near_FC

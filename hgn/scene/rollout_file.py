@@ -27,14 +27,13 @@ import h5py
 import numpy as np
 
 from hgn.config import is_mesh_file
-from hgn.scene.barrier import Barrier, build_barrier
 from hgn.scene.episode import Episode
 from hgn.scene.hdf5 import damage_named, open_hdf5
 from hgn.scene.material import MATERIALS, require_materials
 from hgn.scene.motion import Motion
 from hgn.scene.obstacle_grid import ObstacleGrid, surface_points
 from hgn.scene.rotation import quaternion_rotation
-from hgn.scene.scene import Obstacle, all_corners
+from hgn.scene.scene import Obstacle
 from hgn.scene.shapes import mesh_sha256, shape_obstacle
 from hgn.schema import Bound, BoxSize, ConfigError, Positive, Vector, require, require_bounds
 from hgn.system.files import make_folder, sync_file, sync_folder, temporary_file
@@ -157,15 +156,6 @@ def known_obstacles(episode: Episode) -> tuple[Obstacle, ...] | None:
         )
         for index, record in enumerate(records)
     )
-
-
-def episode_barrier(episode: Episode, clearance: float) -> Barrier:
-    """What of an episode's obstacles nothing passes: where only their cells are known, nothing holds.
-
-    Raises: ConfigError for a clearance of more than a cell.
-    """
-    corner_F33 = all_corners(known_obstacles(episode) or ())
-    return build_barrier(corner_F33, episode.obstacle_grid.cell_size, clearance, episode.domain_size)
 
 
 def _is_here(record: dict[str, Any]) -> bool:

@@ -25,7 +25,7 @@ from hgn.scene.history import window
 from hgn.schema import ConfigError
 from hgn.system.patience import without_patience
 from hgn.training.noise import noise_scale
-from hgn.training.pushforward import Starts, drawn_starts
+from hgn.training.pushforward import Starts, drawn_starts, simulated_barrier
 
 T = TypeVar("T")
 SHARED_FOLDER_PATIENCE_S = 300.0
@@ -157,10 +157,11 @@ class EpisodeDataModule(LightningDataModule):
     def _whole(self, indices: Sequence[int]) -> dict[int, EpisodeTensors]:
         """Reads episodes, several at once: a data set's first pass is gigabytes, and copies release Python's lock."""
         fraction, measured = self.training.frame_importance, self._measures_frames
-        simulated = self.training.pushforward_fraction > 0
+        clearance = self.network.obstacle_clearance if self.training.pushforward_fraction > 0 else None
 
         def read(episode: Episode) -> tuple[EpisodeTensors, FrameImportance | None]:
-            whole = whole_episode(episode, self.network, simulated)
+            barrier = None if clearance is None else simulated_barrier(episode, clearance)
+            whole = whole_episode(episode, self.network, barrier)
             return whole, FrameImportance.of(episode, fraction) if measured else None
 
         opened = [self.store[index] for index in indices]

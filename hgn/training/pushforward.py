@@ -14,6 +14,7 @@ Shape legend: H velocity history, F simulated frames, W = H + 2 frames of a wind
 
 from __future__ import annotations
 
+import functools
 import time
 from collections.abc import Sequence
 from dataclasses import replace
@@ -27,10 +28,11 @@ from hgn.network.barriers import Barriers
 from hgn.network.base import ParticleNetwork
 from hgn.runtime.backend import fastest_stepped
 from hgn.runtime.divergence import diverged
+from hgn.runtime.simulator import InitialState
 from hgn.runtime.stepped_rollout import stepped
+from hgn.scene.barrier import Barrier
 from hgn.scene.episode import Episode
 from hgn.scene.history import window
-from hgn.scene.rollout_file import episode_barrier
 from hgn.schema import ConfigError
 from hgn.training.noise import noise_scale, target_acceleration
 
@@ -111,6 +113,16 @@ def diverged_scenes(position_N3: torch.Tensor, scene_N: torch.Tensor, domain_S3:
     return diverged_S[scene_N] > 0
 
 
+@functools.lru_cache(maxsize=256)
+def simulated_barrier(episode: Episode, clearance: float) -> Barrier:
+    """What of an episode's obstacles its simulations hold by: where only their cells are known, nothing.
+
+    Kept for the episodes used last; that of a large mesh takes some tenths of a second.
+    Raises: ConfigError for a clearance of more than a cell.
+    """
+    return InitialState.of_episode(episode).barrier(clearance)
+
+
 class PushforwardPool:
     """The pool on backend torch, which serves every network; see GraphPushforwardPool for triton's."""
 
@@ -174,7 +186,7 @@ class PushforwardPool:
         clearance = self.network.config.obstacle_clearance
         if clearance is None:
             return None
-        barriers = Barriers.of([episode_barrier(episode, clearance) for episode in episodes])
+        barriers = Barriers.of([simulated_barrier(episode, clearance) for episode in episodes])
         return barriers and barriers.to(self._backend.device)
 
     def _take(self, episode: Episode, frame: int, simulated_FN3: torch.Tensor) -> list[float]:

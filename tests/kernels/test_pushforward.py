@@ -25,7 +25,7 @@ from hgn.training.checkpoint import read_checkpoint
 from hgn.training.graph_pushforward import GraphPushforwardPool
 from hgn.training.module import TrainingModule
 from hgn.training.noise import noise_scale
-from hgn.training.pushforward import PushforwardPool
+from hgn.training.pushforward import PushforwardPool, simulated_barrier
 
 pytestmark = pytest.mark.usefixtures("large_tiles")
 
@@ -33,13 +33,15 @@ CELL_SIZE = 1 / 64
 
 
 def placed(made, network):
-    whole, where = whole_episode(made, network.config, simulated=True), device()
+    clearance = network.config.obstacle_clearance
+    barrier = None if clearance is None else simulated_barrier(made, clearance)
+    whole, where = whole_episode(made, network.config, barrier), device()
     cells, normals = whole.obstacle_cell_K3, whole.obstacle_normal_K3
     obstacles = ObstacleHash.of(cells, normals).to(where) if len(cells) else None
-    barrier = BarrierHash.of(whole.barrier) if whole.barrier is not None else None
+    hashed = BarrierHash.of(whole.barrier) if whole.barrier is not None else None
     position_TN3, material_N = whole.position_TN3.to(where), whole.material_N.to(where)
     scene = whole.domain_size, whole.gravity, whole.symmetries
-    return DeviceEpisode(position_TN3, material_N, obstacles, *scene, barrier and barrier.to(where))
+    return DeviceEpisode(position_TN3, material_N, obstacles, *scene, hashed and hashed.to(where))
 
 
 def values_of(network):

@@ -149,6 +149,21 @@ def test_obstacles_that_hold_change():
     same(rollout.run(2), paths[2])
 
 
+def test_obstacles_that_hold_stay(monkeypatch):
+    """A simulation that goes on among the same barriers makes no other table of them, with others it does once."""
+    simulator = thrown("triton", obstacle_clearance=2e-3)
+    state, other = (
+        simulator.start([replace(scene(12), corners=partial(crossed, at))])
+        for at in ((0.1, 0.1, 0.1), (0.08, 0.12, 0.1))
+    )
+    hashed, real = [], BarrierTable.of
+    monkeypatch.setattr(BarrierTable, "of", lambda barriers, *rest: hashed.append(barriers) or real(barriers, *rest))
+    rollout = TritonRollout(simulator.network, state, "fp32")
+    for next_state in (state, replace(state, gravity_S3=2 * state.gravity_S3), other, other, state):
+        assert rollout.take(next_state)
+    assert [barriers is state.barriers for barriers in hashed] == [True, False, True]
+
+
 def test_divergence_is_seen_through_walls():
     """What is no number, or would come farther from the domain than its own size, ends the simulation at the frame and
     with the message of backend torch without walls."""

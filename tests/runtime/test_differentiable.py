@@ -128,6 +128,26 @@ def test_obstacles_hold_where_they_are_put(smoothing):
     torch.testing.assert_close(started_33, torch.eye(3, dtype=torch.float64) - across_33, rtol=0, atol=1e-6)
 
 
+@pytest.mark.parametrize(
+    ("height", "ends", "slope"),
+    [
+        (0.25, (0.4, 0.3, 0.25 + CLEARANCE, 0.25 + CLEARANCE), 1.0),  # it comes to the square in the third frame
+        (0.8, (0.4, 0.3, 0.2, 0.1), None),  # above it, and in no frame's way
+    ],
+)
+def test_frames_in_which_no_obstacle_holds(height, ends, slope):
+    """A network that sees no obstacles falls on a square that is shifted there: the frames before and behind do not
+    depend on the shift, and its gradient is that of the frame that does. Where none does there is no gradient."""
+    blind = silent(network_of(inputs="relative", obstacle_features=False, obstacle_clearance=CLEARANCE))
+    down_13, square = np.array([[0.0, -6.0, 0.0]], np.float32), shape_obstacle("square", 0.2, (0.5, 0.125, 0.5))
+    falling = Scene(np.full((1, 3), 0.5, np.float32), down_13, np.zeros(1, np.uint8), (square,), gravity=(0.0,) * 3)
+    shift_3 = torch.tensor([0.0, height - 0.125, 0.0], dtype=torch.float64, requires_grad=True)
+    path_T13 = Simulator(blind, 60.0, "torch").differentiable(falling, 5, poses={0: Pose(None, shift_3)})
+    assert path_T13[1:, 0, 1].tolist() == pytest.approx(ends, abs=1e-7)
+    (gradient_3,) = torch.autograd.grad(path_T13[-1, 0, 1], shift_3, allow_unused=True)
+    assert gradient_3 is None if slope is None else gradient_3.tolist() == pytest.approx([0.0, slope, 0.0], abs=1e-6)
+
+
 def test_the_cone_holds_particles():
     """In the scene of the central differences, so that these see it."""
     held, free = (network_of(levels=2, message_passing_steps=1, obstacle_clearance=c) for c in (CLEARANCE, None))

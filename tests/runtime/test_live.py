@@ -10,6 +10,7 @@ from network.test_barriers import square
 from runtime.scenes import EMPTY_GRID
 from runtime.scenes import random_scene as scene
 
+from hgn.runtime import simulator as simulator_module
 from hgn.runtime.divergence import DivergedError
 from hgn.runtime.live import LiveSimulation, run_scene
 from hgn.runtime.simulator import InitialState, Simulator
@@ -121,6 +122,24 @@ def test_obstacles_that_come_hold(backend):
             assert low_N == pytest.approx(0.45 + clearance, rel=0, abs=0.02 * clearance)
             live.replace_obstacles(still)
             assert (frames(live, 2)[-1, :, 1] < 0.45 - clearance).all()
+
+
+def test_barriers_stay_where_obstacles_do(monkeypatch):
+    """Nothing is built for particles that enter, other gravity, and going back in time, and all hold as before."""
+    still = replace(scene(5, low=0.5), velocity_N3=np.zeros((5, 3), np.float32), obstacle_grid=EMPTY_GRID)
+    under = replace(still, corners=lambda: square((0.6, 0.45, 0.6), 1, 0.6))
+    built, real = [], simulator_module.build_barrier
+    monkeypatch.setattr(simulator_module, "build_barrier", lambda *given: built.append(len(given[0])) or real(*given))
+    simulator = Simulator(silent(small(inputs="relative", obstacle_clearance=1e-3)), 60.0)
+    with LiveSimulation(simulator, under) as live:
+        barriers, begin = live.state.barriers, live.state
+        live.set_gravity((0.0, -20.0, 0.0))
+        entering(live, still)
+        live.restore(begin.position_N3.numpy(), begin.velocity_NM3.numpy(), 0)
+        assert live.state.barriers is barriers and sum(built) == 2
+        assert frames(live, 14)[-1, :, 1] == pytest.approx(0.451, rel=0, abs=2e-5)
+        live.replace_obstacles(under)
+        assert live.state.barriers is not barriers and sum(built) == 4
 
 
 def test_gravity_changes_between_frames():

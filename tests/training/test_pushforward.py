@@ -18,6 +18,7 @@ from hgn import train
 from hgn.config import TrainingConfig
 from hgn.data.batch import BatchSample, UpdateSamples, make_batch
 from hgn.data.sampler import SamplerState
+from hgn.runtime import simulator
 from hgn.runtime.simulator import Simulator
 from hgn.scene.history import window
 from hgn.scene.rollout_file import known_obstacles
@@ -174,6 +175,22 @@ def test_obstacles_hold():
             path_TN3 = np.stack([windows[0][-3], *(window_WN3[-2] for window_WN3 in windows)]).astype(np.float64)
             passed.append(sum(crossings(*ways, corner_F33) for ways in itertools.pairwise(path_TN3)))
         assert passed == expected
+
+
+def test_barriers_are_remembered(monkeypatch):
+    """The pool is made anew, from other frames of the same episodes, without their obstacles' lists being built again;
+    another clearance has its own."""
+    built = []
+    real = simulator.build_barrier
+    monkeypatch.setattr(simulator, "build_barrier", lambda *given: built.append(given[2]) or real(*given))
+    scenes = [with_square(episode(8, seed=seed), (0.5, 0.53, 0.5)) for seed in (1, 2)]
+    network = wild_network()
+    for clearance in (2e-3, 1e-3):
+        network.config = replace(network.config, obstacle_clearance=clearance)
+        own = pool_of(network)
+        for frame in (2, 3, 4):
+            own.refresh([(scene, frame) for scene in scenes])
+    assert built == [2e-3, 2e-3, 1e-3, 1e-3]
 
 
 def test_lost_scenes_are_dropped():
