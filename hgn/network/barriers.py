@@ -22,7 +22,7 @@ from hgn.network.cell_keys import COORDINATE_LIMIT, LARGEST_EXPORTED, find, pack
 from hgn.scene.barrier import CELLS, LEAST_HEIGHT, MARGIN, Barrier
 from hgn.schema import require
 
-SLACK = 1e-3  # of the clearance; what begins nearer leaves by that in a frame that would bring it nearer
+SLACK = 0.02  # of the clearance; what begins nearer leaves by that in a frame that would bring it nearer
 NOWHERE = 1e30  # domain units: lowest corner of a box that nothing meets, its highest is at minus that
 
 
