@@ -112,7 +112,7 @@ class Barriers:
         pair_N = torch.full_like(scene_N, pairs).scatter_reduce(0, particle_P, place_P, "amin")
         push_P4 = torch.cat([(distance_P.clamp(max=within) + slack - end_P)[:, None], side_P[:, None] * normal_P3], 1)
         push_N4 = torch.cat([push_P4, before_N3.new_zeros(1, 4)])[pair_N]
-        free_P = torch.where(stops_P, contact_P, 1.0).detach()
+        free_P = torch.where(stops_P, contact_P, 1.0)
         free_N = torch.ones_like(before_N3[:, 0]).scatter_reduce(0, particle_P, free_P, "amin")
         return pair_N < pairs, push_N4[:, :1], push_N4[:, 1:], free_N[:, None]
 
