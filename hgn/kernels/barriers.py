@@ -10,7 +10,7 @@ the bits of the cells' size in float32.
 import triton
 import triton.language as tl
 
-from hgn.kernels.cell_hash import LIMIT, find_cell
+from hgn.kernels.cell_hash import find_cell
 from hgn.kernels.triton_compat import settle_keys
 from hgn.scene import barrier
 
@@ -75,11 +75,7 @@ def _stopped(bx, by, bz, x, y, z, line, live, within, slack):
         cx = tl.floor(tl.div_rn(bx + share * wx, cell_size))
         cy = tl.floor(tl.div_rn(by + share * wy, cell_size))
         cz = tl.floor(tl.div_rn(bz + share * wz, cell_size))
-        near = live & (tl.abs(cx) < LIMIT) & (tl.abs(cy) < LIMIT) & (tl.abs(cz) < LIMIT)
-        cx = tl.where(near, cx, 0.0).to(tl.int64)
-        cy = tl.where(near, cy, 0.0).to(tl.int64)
-        cz = tl.where(near, cz, 0.0).to(tl.int64)
-        cell = find_cell(cx, cy, cz, line, near)
+        cell = find_cell(cx, cy, cz, line, live)
         entry = tl.load(span + 2 * cell, mask=cell >= 0, other=0)
         end = tl.load(span + 2 * cell + 1, mask=cell >= 0, other=0)
         ask = entry < end

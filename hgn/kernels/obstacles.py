@@ -7,7 +7,7 @@ mask of the buckets, and the symmetry that it is seen under (hgn.scene.symmetry.
 import triton
 import triton.language as tl
 
-from hgn.kernels.cell_hash import LIMIT, find_cell
+from hgn.kernels.cell_hash import find_cell
 from hgn.kernels.triton_compat import settle_keys
 from hgn.scene import symmetry as codes
 
@@ -45,13 +45,8 @@ def obstacle_normals(x, y, z, line, live, obstacle_cell_size, SYMMETRY: tl.const
         x = _from_axis(ix, iy, iz, symmetry, 0)
         y = _from_axis(ix, iy, iz, symmetry, 1)
         z = _from_axis(ix, iy, iz, symmetry, 2)
-    near = live & (tl.abs(x) < LIMIT) & (tl.abs(y) < LIMIT) & (tl.abs(z) < LIMIT)
-    x = tl.where(near, x, 0.0).to(tl.int64)
-    y = tl.where(near, y, 0.0).to(tl.int64)
-    z = tl.where(near, z, 0.0).to(tl.int64)
-    near = near & (tl.load(line, mask=near, other=0) != 0)
-    entry = find_cell(x, y, z, line, near)
-    at = tl.load(line + 2, mask=near, other=0).to(tl.pointer_type(tl.float32)) + entry * 3
+    entry = find_cell(x, y, z, line, live)
+    at = tl.load(line + 2, mask=entry >= 0, other=0).to(tl.pointer_type(tl.float32)) + entry * 3
     found = ()
     for axis in tl.static_range(3):
         if SYMMETRY:
