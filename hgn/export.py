@@ -31,13 +31,14 @@ class ExportConfig:
     """`python -m hgn.export`."""
 
     checkpoint: str | None = None  # whose network is written to `out` as weights
+    weights: str | None = None  # or, without checkpoint: a file or the name of shipped weights
     out: FileName | None = None
     stored_precision: StoredPrecision = "fp32"  # of the learned tensors; fp16: files half as large
-    rest_threshold: NonNegative[float] | None = None  # network.rest_threshold of `out`; null: as it was trained
-    wall_clearance: WallClearance | None = None  # network.wall_clearance of `out`; null: as it was trained
-    obstacle_clearance: Positive[float] | None = None  # network.obstacle_clearance of `out`; null: as it was trained
-    weights: str | None = None  # what onnx, package and arrays are of: a file or shipped weights; null: `out`
-    onnx: FileName | None = None  # file of a step's graph, for ONNX Runtime
+    rest_threshold: NonNegative[float] | None = None  # network.rest_threshold of `out`; null: as it was
+    wall_clearance: WallClearance | None = None  # network.wall_clearance of `out`; null: as it was
+    obstacle_clearance: Positive[float] | None = None  # network.obstacle_clearance of `out`; null: as it was
+    # of `out`, or else of `weights`: file of a step's graph, for ONNX Runtime
+    onnx: FileName | None = None
     package: str | None = None  # file of a step compiled for `device`, for PyTorch's C++ (.pt2)
     device: str = "cpu"  # or cuda, cuda:1
     arrays: str | None = None  # folder of what a step is first given for `scene`, as .npy files
@@ -45,15 +46,15 @@ class ExportConfig:
 
     def __post_init__(self) -> None:
         require_bounds(self)
-        both = (self.checkpoint is None) == (self.out is None)
-        require(both, "out", "given with checkpoint, and only then", self.out, "give both or weights")
+        given = self.checkpoint is not None or self.weights is not None
+        require(given, "checkpoint", "given, or else weights", self.checkpoint)
+        require(self.checkpoint is None or self.weights is None, "weights", "null with checkpoint", self.weights)
+        require(self.checkpoint is None or self.out is not None, "out", "given with checkpoint", self.out)
         require((self.arrays is None) == (self.scene is None), "scene", "given with arrays, and only then", self.scene)
         for name, value in self.network_changes.items():
-            require(self.checkpoint is not None, name, "null without checkpoint", value)
-        steps = any(name is not None for name in (self.onnx, self.package, self.arrays))
-        require(steps or self.weights is None, "onnx", "given with weights, or package or arrays", self.onnx)
-        rule = "given, or weights with onnx, package or arrays"
-        require(self.checkpoint is not None or self.weights is not None, "checkpoint", rule, self.checkpoint)
+            require(self.out is not None, name, "null without out, the file that it is for", value)
+        some = any(name is not None for name in (self.out, self.onnx, self.package, self.arrays))
+        require(some, "out", "given with weights, or onnx, package or arrays", self.out)
         if self.package is not None:
             require(self.package.endswith(".pt2"), "package", "a name that ends in .pt2", self.package)
 
@@ -72,14 +73,17 @@ def main(mapping: dict[str, Any]) -> int:
     for file in (config.out, config.onnx, config.package):
         if file is not None:
             require_place(Path(file))
-    if config.checkpoint is not None:
-        assert config.out is not None
-        export(Path(config.checkpoint), Path(config.out), config.stored_precision, **config.network_changes)
+    if config.out is not None:
+        if config.checkpoint is not None:
+            export(Path(config.checkpoint), Path(config.out), config.stored_precision, **config.network_changes)
+        else:
+            assert config.weights is not None
+            change(find_weights(config.weights), Path(config.out), config.stored_precision, **config.network_changes)
         print(config.out)
     if config.onnx is None and config.package is None and config.arrays is None:
         return 0
     device = choose_device(config.device)
-    weights = config.weights or config.out
+    weights = config.out or config.weights
     assert weights is not None
     network, info = load_weights(find_weights(weights), device)
     if config.arrays is not None:
@@ -127,6 +131,19 @@ def export(checkpoint_path: Path, out: Path, stored_precision: str = "fp32", **n
         provenance=provenance() | {"checkpoint": checkpoint_path.name, "data_config_hash": data.config_hash},
     )
     save_weights(out, network, info, stored_precision)
+
+
+def change(file: Path, out: Path, stored_precision: str = "fp32", **network_changes: Any) -> None:
+    """Weights to weights, with `network_changes` as in `export`. The provenance of `out` holds that of `file`.
+
+    Raises: ConfigError when the file is missing or not ours, or holds a network that does not take the changes.
+    """
+    network, info = load_weights(file)
+    changed = {"file": file.name, "network": network_changes, "provenance": info.provenance}
+    changed_info = replace(
+        info, network=replace(info.network, **network_changes), provenance=provenance() | {"changed": changed}
+    )
+    save_weights(out, network, changed_info, stored_precision)
 
 
 def write_arrays(folder: Path, state: ParticleState, corner_F33: np.ndarray) -> None:

@@ -144,7 +144,7 @@ EVALUATE = ["weights=weights.safetensors", "data=data", "rollout_frames=3", "jso
         ("train", ["+experiment=moon"], "Could not find 'experiment/moon'"),
         ("export", ["checkpoint=none.ckpt", "out=x"], "checkpoint must be an existing file, got none.ckpt; hgn.train"),
         ("export", ["checkpoint=none.ckpt", "out="], "out must be a file name, got ''"),
-        ("export", ["out=x"], "out must be given with checkpoint, and only then, got 'x'"),
+        ("export", ["out=x"], "checkpoint must be given, or else weights, got None"),
         ("rollout", [*ROLLOUT, "frames=1"], "frames must be at least 2, got 1"),
         ("rollout", ["--frames", "3"], "--frames is not an option; settings are given as frames=VALUE"),
         ("rollout", ["--weights=obstacles"], "--weights=obstacles is not an option; settings are given as weights=obs"),

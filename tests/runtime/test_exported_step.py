@@ -124,9 +124,10 @@ def test_package_is_the_step(tmp_path, name):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({}, "checkpoint must be given, or weights with onnx, package or arrays, got None"),
-        ({"checkpoint": "a"}, "out must be given with checkpoint, and only then, got None"),
-        ({"weights": "gns"}, "onnx must be given with weights, or package or arrays, got None"),
+        ({}, "checkpoint must be given, or else weights, got None"),
+        ({"checkpoint": "a"}, "out must be given with checkpoint, got None"),
+        ({"checkpoint": "a", "weights": "gns"}, "weights must be null with checkpoint, got 'gns'"),
+        ({"weights": "gns"}, "out must be given with weights, or onnx, package or arrays, got None"),
         ({"weights": "gns", "onnx": "a.onnx"}, "weights must be an hgn network, got 'gns'"),
         ({"weights": "obstacles", "package": "a.so"}, "package must be a name that ends in .pt2, got 'a.so'"),
         ({"weights": "obstacles", "arrays": "a"}, "scene must be given with arrays, and only then, got None"),

@@ -144,10 +144,35 @@ def test_an_export_sets_rest_walls_and_obstacles(data, tmp_path):
         export_main({"checkpoint": absolute, "out": str(outs[0]), "rest_threshold": 0.1})
     for options in chosen[1:]:
         ((name, value),) = options.items()
-        with pytest.raises(ConfigError, match=f"{name} must be null without checkpoint, got "):
+        with pytest.raises(ConfigError, match=f"{name} must be null without out, the file that it is for, got "):
             export_main({"weights": str(outs[0]), "onnx": str(tmp_path / "step.onnx"), name: value})
     with pytest.raises(ConfigError, match=r"wall_clearance\[1\] must be a finite number >= 0, got -0\.1"):
         export_main({"checkpoint": absolute, "out": str(outs[0]), "wall_clearance": [0.1, -0.1]})
+
+
+def test_weights_are_changed_without_a_checkpoint(tmp_path):
+    """Tensors, updates and what else is known of them stay, also in a file that is its own origin; the provenance says
+    what was changed, of which file, and holds that file's own. Shipped weights go by their name."""
+    file = weights_file(tmp_path / "trained.safetensors")
+    network, info = load_weights(file)
+    save_weights(file, network, replace(info, updates=7, provenance={"commit": "abc"}), "fp16")
+    for out in (tmp_path / "out.safetensors", file):
+        options = {"obstacle_clearance": 1e-3, "stored_precision": "fp16"}
+        assert export_main({"weights": str(file), "out": str(out)} | options) == 0
+        changed, after = load_weights(out)
+        assert after.network == replace(info.network, obstacle_clearance=1e-3) == changed.config
+        assert (after.updates, after.frame_rate_hz, after.gravity) == (7, info.frame_rate_hz, info.gravity)
+        told = after.provenance["changed"]
+        assert told == {"file": file.name, "network": {"obstacle_clearance": 1e-3}, "provenance": {"commit": "abc"}}
+        for name, tensor in network.state_dict().items():
+            assert torch.equal(tensor, changed.state_dict()[name])
+    before = file.read_bytes()
+    with pytest.raises(ConfigError, match=r"rest_threshold must be 0 with inputs=absolute, got 0\.1"):
+        export_main({"weights": str(file), "out": str(file), "rest_threshold": 0.1})
+    assert file.read_bytes() == before
+    small = tmp_path / "small.safetensors"
+    assert export_main({"weights": "obstacles_small", "out": str(small), "obstacle_clearance": 5e-4}) == 0
+    assert load_weights(small)[1].network.obstacle_clearance == 5e-4
 
 
 def test_the_average_is_what_is_measured_and_exported(data, tmp_path, monkeypatch):
