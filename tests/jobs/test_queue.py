@@ -341,31 +341,32 @@ def test_mechanics(tmp_path, monkeypatch):
     mappings = {name: settings(lines, monkeypatch) for name, lines in calls(tmp_path, "mechanics.txt").items()}
     made = [datagen_config(mappings.pop(name)["datagen"]) for name in list(mappings) if name.endswith("_data")]
     folders = {each.dataset.folder: each for each in made}
-    chain = ["first", "second", "third", "mechanics"]
-    assert list(mappings) == [*chain, "repeat_2", "repeat_3"]
-    trained, exported, seen = {}, {}, set()
+    shipping = ["mechanics", "repeat_2", "repeat_3"]
+    begins_with = {"first": None, "second": "first", "third": "second"} | dict.fromkeys(shipping, "third")
+    assert list(mappings) == list(begins_with)
+    trained, exported = {}, {}
     for name, commands in mappings.items():
         assert commands["hgn.train"].pop("name") == "mechanics"
         config = trained[name] = from_mapping(TrainConfig, commands["hgn.train"])
         export = exported[name] = from_mapping(ExportConfig, commands["hgn.export"])
         assert config.run == f"runs/{name}" and export.checkpoint == f"runs/{name}/checkpoints/last.ckpt"
         assert export.out == f"runs/{name}/{name}.safetensors"
-        before = None if name == "first" else exported[chain[min(len(exported), len(chain)) - 2]].out
-        assert config.training.init_weights == before
+        before = begins_with[name]
+        assert config.training.init_weights == (before and exported[before].out)
         assert dataset_identity(config.datagen) == dataset_identity(folders[config.dataset.folder])
         assert set(config.training.more_data) < set(folders)
-        seen |= {config.dataset.folder, *config.training.more_data}
-        if "hgn.evaluate" in commands:
+        assert ("hgn.evaluate" in commands) == (name in shipping)
+        if name in shipping:
             score = from_mapping(EvaluateConfig, commands["hgn.evaluate"])
             assert (score.weights, score.data) == (export.out, config.dataset.folder)
             assert score.scenes == config.dataset.validation_scenes
-    assert seen == set(folders)
     last, export = trained["mechanics"], exported["mechanics"]
+    assert {last.dataset.folder, *last.training.more_data} == set(folders)
     shipped = load_weights(shipped_weights()["mechanics"])[1]
     assert shipped.network == replace(last.network, **export.network_changes)
     assert shipped.updates == last.training.maximum_updates
     assert set(export.network_changes) == {"rest_threshold", "wall_clearance"}
-    repeats = [trained[name] for name in ("mechanics", "repeat_2", "repeat_3")]
+    repeats = [trained[name] for name in shipping]
     assert len({each.training.seed for each in repeats}) == 3
     for each in repeats:
         assert replace(each, run=last.run, training=replace(each.training, seed=last.training.seed)) == last
