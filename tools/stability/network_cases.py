@@ -28,7 +28,7 @@ SLOPES_DEG = (15.0, 30.0, 45.0)
 COLLAPSE_CELLS = (5.0, 20.0)  # of the solver, from the lower plane to cubes that fall
 COLLAPSE_FRAMES = (30, 60, 150)  # in which they are looked at: as they spread, when walls are reached, and at rest
 # how wide funnels' holes are, in the network's finest cells, by the side of the cube above them, in group sizes
-HOLE_CELLS = {1.0: (1.5, 2.0, 3.0, 4.0), 1.5: (2.0, 4.0)}
+HOLE_CELLS = {1.0: (1.5, 2.0, 3.0, 4.0), 1.5: (1.7, 2.0, 4.0)}
 HOLE_FRAMES = 150  # in which what falls into a funnel may pass its hole
 FUNNEL_SIDE, FUNNEL_TILT_DEG = 0.36, 45.0  # of the domain's smallest side: that of each of a funnel's squares
 SLOPE_SIDE, SLOPE_WAY = 0.6, 0.35  # of the domain's smallest side: the slope's, and what is slid along it
