@@ -13,6 +13,7 @@ from typing import Annotated
 
 from hgn.scene.material import MATERIAL_NAME, MATERIALS, PAPER_MATERIALS
 from hgn.schema import (
+    AtLeastOne,
     AtMostOne,
     BelowOne,
     Bound,
@@ -450,6 +451,9 @@ class TrainingConfig:
     # squared errors of such a frame count by 1 / scale to this power; 2: in units of the noise, so that rest is learned
     # before slow slides; 0: all alike
     noise_weight_power: NonNegative[float] = 2.0
+    # domain units per frame squared; squared errors of a frame of rms acceleration a below it count by the quotient …
+    quiet_acceleration: NonNegative[float] = 0.0
+    quiet_weight: AtLeastOne[float] = 4.0  # … at most so much: what errs little at rest does so for thousands of frames
     grid_jitter: bool = True
     # fraction of an episode's samples drawn by its frames' accelerations, with weights that keep the loss; 0:
     # all frames alike

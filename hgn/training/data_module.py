@@ -173,7 +173,8 @@ class EpisodeDataModule(LightningDataModule):
     @property
     def _measures_frames(self) -> bool:
         """Whether it matters how much happens in a frame."""
-        return self.training.frame_importance > 0 or self.training.noise_min_scale < 1
+        training = self.training
+        return training.frame_importance > 0 or training.noise_min_scale < 1 or training.quiet_acceleration > 0
 
     def _weighted(self, samples: Sequence[Sample]) -> tuple[Sample, ...]:
         """The same samples with frames drawn as `training.frame_importance` says, the scale of their noise as

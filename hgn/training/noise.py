@@ -19,6 +19,8 @@ from hgn.system.splitmix import splitmix64
 # Of other streams than the particles' own noise: the same seed would tie them to the first particles' noise.
 JITTER_STREAM, WAVE_STREAM, SCALE_STREAM = 0x5DEECE66D, 0x2545F4914F, 0x9E6D62D06F6A9A9B
 
+SMALLEST_ACCELERATION = 1e-30  # that anything is divided by
+
 
 def noise_scale(training: TrainingConfig, acceleration: float, seed: int) -> tuple[float, float]:
     """Scale of a sample's noise in units of `noise_std`, and the weight of its loss.
@@ -29,15 +31,28 @@ def noise_scale(training: TrainingConfig, acceleration: float, seed: int) -> tup
     so that each scale weighs the same, and what slides slowly is taken for what rests; 0 counts all alike.
     `acceleration` is the root mean square of the target, domain units per frame squared. Where it is a fraction
     r < 1 of `noise_std`, the scale is log-uniform between max(r, training.noise_min_scale) and 1, drawn from the
-    sample's seed alone, and the weight is 1 / scale^power; elsewhere both are 1.
+    sample's seed alone, and the weight is 1 / scale^power; elsewhere both are 1. The weight is also that of
+    `quiet_weight`.
     """
+    quiet = quiet_weight(training, acceleration)
     if training.noise_min_scale == 1.0 or training.noise_std == 0.0:
-        return 1.0, 1.0
+        return 1.0, quiet
     smallest = max(acceleration / training.noise_std, training.noise_min_scale)
     if not smallest < 1.0:
-        return 1.0, 1.0
+        return 1.0, quiet
     scale = smallest ** (splitmix64(seed ^ SCALE_STREAM) / 2.0**64)
-    return scale, 1.0 / scale**training.noise_weight_power
+    return scale, quiet / scale**training.noise_weight_power
+
+
+def quiet_weight(training: TrainingConfig, acceleration: float) -> float:
+    """How often a sample's squared error counts whose target has this root mean square.
+
+    A network's error at rest is small beside that of impacts, and so it counts for nothing in their mean; but it is the
+    same in every frame, and what should lie still creeps over thousands of them.
+    """
+    if not acceleration < training.quiet_acceleration:
+        return 1.0
+    return min(training.quiet_weight, training.quiet_acceleration / max(acceleration, SMALLEST_ACCELERATION))
 
 
 def target_acceleration(window_FWN3: torch.Tensor) -> torch.Tensor:

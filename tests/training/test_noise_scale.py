@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from hgn.config import TrainingConfig
-from hgn.training.noise import noise_scale, target_acceleration
+from hgn.training.noise import noise_scale, quiet_weight, target_acceleration
 
 
 @pytest.mark.parametrize(
@@ -42,3 +42,16 @@ def test_what_is_asked_for():
     still_7N3 = window_7N3[:, [1, 1, 1, 1]] + time[:, None, None]
     found = target_acceleration(torch.stack([window_7N3, still_7N3]))
     torch.testing.assert_close(found, torch.tensor([0.6 / 12**0.5, 0.0]))
+
+
+def test_what_rests_counts_more():
+    """Below `quiet_acceleration` a sample counts as often as its acceleration is smaller, up to `quiet_weight`, without
+    noise and beside the weight that noise gives it; by default all count alike."""
+    quiet = TrainingConfig(noise_std=0.0, quiet_acceleration=1e-3, quiet_weight=16.0)
+    asked = (1.0, 1e-3, 5e-4, 1e-4, 1e-6, 0.0)
+    assert [quiet_weight(quiet, acceleration) for acceleration in asked] == pytest.approx([1, 1, 2, 10, 16, 16])
+    assert noise_scale(quiet, 5e-4, 5) == (1.0, quiet_weight(quiet, 5e-4))
+    assert quiet_weight(quiet, float("nan")) == quiet_weight(TrainingConfig(), 0.0) == 1.0
+    noisy = TrainingConfig(noise_std=1e-3, noise_min_scale=0.02, quiet_acceleration=1e-3, quiet_weight=16.0)
+    scale, weight = noise_scale(noisy, 1e-4, 5)
+    assert scale < 1 and weight == pytest.approx(10 / scale**2)
