@@ -43,6 +43,7 @@ CONTACT_GATES = ("particle", "cell")
 CONTACT_FORCES = ("any", "normal")
 BACKENDS = ("auto", "torch", "triton", "cpu")
 PRECISIONS = ("fp32", "tf32", "fp16")
+SIMULATED_FRAMES = 3  # of an episode at least for pushforward: one to start from, one simulated, one that answers it
 DEFAULT_WEIGHTS = "mechanics"  # of the commands and of `Simulator.load`; shipped, by name
 Material = Annotated[str, one_of(*MATERIALS)]
 MaterialName = Annotated[
@@ -469,7 +470,7 @@ class TrainingConfig:
     pushforward_fraction: BelowOne[float] = 0.0
     pushforward_every: Positive[int] = 500  # updates between such simulations
     pushforward_scenes: Positive[int] = 64  # simulated at once, on each device, from random frames of the data on …
-    pushforward_frames: Positive[int] = 16  # … for so many frames, each of which can be trained on
+    pushforward_frames: Positive[int] = 16  # … for so many frames at most, as the truth goes; each can be trained on
     pushforward_pull: Fraction[float] = 0.1  # fraction of the distance from the truth to be taken back in a frame
     seed: NonNegative[int] = 0
     accelerator: Processor = "auto"  # or cpu, gpu
@@ -528,13 +529,9 @@ class TrainConfig:
             False,
             "or set scene.obstacle_count=0 scene.funnel_scene_fraction=0",
         )
-        training, frames = self.training, self.dataset.frames
-        require(
-            training.pushforward_fraction == 0 or training.pushforward_frames <= frames - 2,
-            "training.pushforward_frames",
-            f"at most dataset.frames - 2 = {frames - 2} where pushforward_fraction > 0",
-            training.pushforward_frames,
-        )
+        simulates, frames = self.training.pushforward_fraction > 0, self.dataset.frames
+        rule = f"at least {SIMULATED_FRAMES} where training.pushforward_fraction > 0"
+        require(not simulates or frames >= SIMULATED_FRAMES, "dataset.frames", rule, frames)
         names = () if self.imported else self.scene.materials
         unknown = [name for name in names if name not in self.network.materials]
         require(not unknown, "network.materials", "all of scene.materials", list(self.network.materials))

@@ -71,10 +71,6 @@ RULES = {
         ({"pushforward_fraction": 1.0}, "pushforward_fraction must be 0 or more and below 1, got 1.0"),
         ({"pushforward_pull": 1.5}, "pushforward_pull must be from 0 to 1, got 1.5"),
         ({"pushforward_every": 0}, "pushforward_every must be .*got 0"),
-        (
-            {"pushforward_fraction": 0.5, "pushforward_frames": 5},
-            "pushforward_frames must be at most dataset.frames - 2 = 4 .*got 5",
-        ),
     ],
     average_of: [
         ({"count": 1}, "weights must be at least two files, got 1"),

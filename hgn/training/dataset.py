@@ -65,10 +65,6 @@ def _require_goes_with(config: TrainConfig, store: EpisodeStore, field: str) -> 
     require(network.relative or upright, field, "of dataset's gravity where network.inputs=absolute", folder)
     differences = identity_differences(stored["mpm"], physics_settings(config.datagen), "mpm")
     require(not differences, field, "of the same physics", f"{folder}, where {'; '.join(differences[:3])}")
-    if config.training.pushforward_fraction > 0:
-        least = config.training.pushforward_frames + 2
-        rule = f"of at least training.pushforward_frames + 2 = {least} frames"
-        require(min(store.frames()) >= least, field, rule, min(store.frames()))
 
 
 def wait_for_episodes(

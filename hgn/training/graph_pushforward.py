@@ -30,6 +30,7 @@ from hgn.training.noise import noise_scale, target_acceleration
 from hgn.training.pushforward import (
     diverged_scenes,
     drawn_pool_samples,
+    known_frames,
     pool_figures,
     pushforward_windows,
     usable_frames,
@@ -68,12 +69,19 @@ class GraphPushforwardPool:
         """
         begin_s = time.monotonic()
         self._samples = []  # frees the memory
-        frames, config, device = self.training.pushforward_frames, self.network.config, values.device
-        length = config.velocity_history + frames + 2
-        truths = [episode.position_TN3[frame : frame + length].to(device) for episode, frame in starts]
+        config, device = self.network.config, values.device
+        before = config.velocity_history  # frames of a DeviceEpisode that come before frame 0
+        known = [
+            known_frames(self.training.pushforward_frames, episode.frames - before, frame) for episode, frame in starts
+        ]
+        truths = [
+            episode.position_TN3[frame : frame + before + frames + 2].to(device)
+            for (episode, frame), frames in zip(starts, known, strict=True)
+        ]
         episodes = [episode for episode, _ in starts]
         path_FN3 = self._simulate(episodes, self._state(episodes, truths), values)
-        parts = path_FN3.split([episode.particles for episode in episodes], dim=1)
+        paths = path_FN3.split([episode.particles for episode in episodes], dim=1)
+        parts = [path_FN3[:frames] for path_FN3, frames in zip(paths, known, strict=True)]
         domain_S3 = torch.tensor([episode.domain_size for episode in episodes], device=device)
         counts_and_squares = [
             torch.stack([x.double() for x in usable_frames(truth, part, domain_3, config.cell_size)])
@@ -89,8 +97,8 @@ class GraphPushforwardPool:
             self._samples += [
                 (replace(episode, position_TN3=w), a) for w, a in zip(windows, accelerations, strict=True)
             ]
-            squares += [square] if count == frames else []
-        self.figures = pool_figures(self.training, len(self._samples), squares, time.monotonic() - begin_s)
+            squares += [square] if count == len(part) else []
+        self.figures = pool_figures(len(self._samples), sum(known), squares, time.monotonic() - begin_s)
 
     def _state(self, episodes: Sequence[DeviceEpisode], truths: Sequence[torch.Tensor]) -> ParticleState:
         """The true state that the simulation starts from; obstacles have tables of their own."""

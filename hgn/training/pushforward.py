@@ -2,10 +2,11 @@
 
 The idea of Brandstetter et al. 2022, collected like DAgger (Ross et al. 2011). Every `pushforward_every` updates the
 present weights (their moving average where there is one) simulate `pushforward_scenes` scenes, each from a random true
-frame on, and each simulated frame becomes a window in a pool; until the next simulation a fraction of the samples is
-taken from the pool. Noise shows a network errors that are drawn; its own are biased, and common to a body. Everything
-is drawn from seed, update and rank. The pool is not part of a checkpoint: a training that goes on makes a new one,
-which is the old one where the checkpoint lies at a multiple of `pushforward_every`.
+frame on for `pushforward_frames` or as long as the truth goes, and each simulated frame becomes a window in a pool;
+until the next simulation a fraction of the samples is taken from the pool. Noise shows a network errors that are drawn;
+its own are biased, and common to a body. Everything is drawn from seed, update and rank. The pool is not part of a
+checkpoint: a training that goes on makes a new one, which is the old one where the checkpoint lies at a multiple of
+`pushforward_every`.
 
 The rule is here, and the pool of the torch backend; that of the triton backend is in hgn.training.graph_pushforward.
 Both replace samples before a batch is made of them.
@@ -22,7 +23,7 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from hgn.config import TrainingConfig
+from hgn.config import SIMULATED_FRAMES, TrainingConfig
 from hgn.data.batch import BatchSample, UpdateSamples, make_batch
 from hgn.network.barriers import Barriers
 from hgn.network.base import ParticleNetwork
@@ -47,15 +48,16 @@ PULLED_WITHIN = 1.0  # finest cells on an axis; no particle is pulled as if it w
 def drawn_starts(training: TrainingConfig, update: int, rank: int, frame_counts: Sequence[int]) -> Starts:
     """Episode and frame that each simulation before `update` starts from, of episodes of so many frames.
 
-    Every episode once before one comes twice; the truth is known for one frame longer than is simulated.
+    Every episode once before one comes twice, from a frame from which on the truth goes on for `pushforward_frames`, or
+    for half of what it has, where that is less: it has to be known for one frame longer than is trained on.
     Raises: ConfigError when all episodes are too short.
     """
-    last = {i: count - 2 - training.pushforward_frames for i, count in enumerate(frame_counts)}
-    long_enough = [i for i, frame in last.items() if frame >= 0]
+    last = {i: count - 2 - min(training.pushforward_frames, (count - 1) // 2) for i, count in enumerate(frame_counts)}
+    long_enough = [i for i, count in enumerate(frame_counts) if count >= SIMULATED_FRAMES]
     if not long_enough:
         raise ConfigError(
-            "training.pushforward_frames must be at most the frames of an episode - 2, got "
-            f"{training.pushforward_frames} where episodes have up to {max(frame_counts, default=0)} frames"
+            f"training.pushforward_fraction must be 0 where no episode has {SIMULATED_FRAMES} frames, got "
+            f"{training.pushforward_fraction:g} for episodes of up to {max(frame_counts, default=0)} frames"
         )
     generator = np.random.default_rng([training.seed, START_STREAM, update, rank])
     drawn: list[int] = []
@@ -71,6 +73,11 @@ def drawn_pool_samples(training: TrainingConfig, update: int, rank: int, pool_si
     generator = np.random.default_rng([training.seed, SAMPLE_STREAM, update, rank])
     count = int(training.pushforward_fraction * training.batch_scenes + generator.random())
     return [int(place * pool_size) for place in generator.random(count)]
+
+
+def known_frames(simulated: int, frame_count: int, frame: int) -> int:
+    """How many of the frames simulated from `frame` on the truth of an episode of `frame_count` frames answers."""
+    return min(simulated, frame_count - 2 - frame)
 
 
 def pushforward_windows(
@@ -137,11 +144,13 @@ class PushforwardPool:
         """Simulates from these frames, and makes the pool of that."""
         begin_s = time.monotonic()
         self._samples = []
-        squares = []
+        squares, known = [], 0
         for group in self._groups(starts):
             for (episode, frame), simulated_FN3 in zip(group, self._simulate(group), strict=True):
-                squares += self._take(episode, frame, simulated_FN3)
-        self.figures = pool_figures(self.training, len(self._samples), squares, time.monotonic() - begin_s)
+                frames = known_frames(len(simulated_FN3), episode.frame_count, frame)
+                squares += self._take(episode, frame, simulated_FN3[:frames])
+                known += frames
+        self.figures = pool_figures(len(self._samples), known, squares, time.monotonic() - begin_s)
 
     def replaced(self, update_samples: UpdateSamples, update: int) -> UpdateSamples:
         """The samples of an update with a fraction from the pool; seeds stay, and with them noise, jitter, symmetry."""
@@ -202,10 +211,11 @@ class PushforwardPool:
         return [float(square)] if count == frames else []
 
 
-def pool_figures(training: TrainingConfig, windows: int, squares: Sequence[float], seconds: float) -> dict[str, float]:
-    """What is logged of a pool; `squares` are mean squared distances of whole simulations in their last frame."""
-    dropped = training.pushforward_scenes * training.pushforward_frames - windows
-    values = {"windows": float(windows), "dropped": float(dropped), "seconds": seconds}
+def pool_figures(windows: int, known: int, squares: Sequence[float], seconds: float) -> dict[str, float]:
+    """What is logged of a pool of so many windows, where the truth is known of so many frames; `squares` are mean
+    squared distances of whole simulations in their last frame.
+    """
+    values = {"windows": float(windows), "dropped": float(known - windows), "seconds": seconds}
     if squares:
         values["mse"] = float(np.mean(squares))
     return {f"pushforward/{name}": value for name, value in values.items()}

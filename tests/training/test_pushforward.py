@@ -59,19 +59,20 @@ def test_windows_are_those_of_the_simulation():
 
 
 def test_what_is_simulated_is_drawn_from_seed_and_update():
-    """Every episode long enough comes once before one comes twice, from any frame whose truth is known long enough, the
-    first included; the same for the same update and rank, another for another. Without any it is refused."""
+    """Every episode of three frames comes once before one comes twice, from any frame from which on the truth is known
+    for long enough, the first included, or for half of what it has; the same for the same update and rank, another for
+    another. Without any episode it is refused."""
     training = training_of(pushforward_scenes=5)
-    frames = [10, 4, 12, 6]  # 4: no frame 5 ahead of any start
+    frames, last = [10, 2, 12, 6, 3], [5, None, 7, 2, 0]  # from frame 2 of 6 on two frames have an answer, of three
     drawn = [drawn_starts(training, update, 0, frames) for update in range(200)]
     for starts in drawn:
-        assert len(starts) == 5 and {index for index, _ in starts[:3]} == {0, 2, 3}
-    for index in (0, 2, 3):
-        assert {frame for starts in drawn for i, frame in starts if i == index} == set(range(frames[index] - 4))
+        assert len(starts) == 5 and {index for index, _ in starts[:4]} == {0, 2, 3, 4}
+    for index in (0, 2, 3, 4):
+        assert {frame for starts in drawn for i, frame in starts if i == index} == set(range(last[index] + 1))
     assert drawn_starts(training, 7, 0, frames) == drawn[7] != drawn[8]
     assert drawn_starts(training, 7, 1, frames) != drawn[7]
-    with pytest.raises(ConfigError, match="pushforward_frames must be at most the frames of an episode - 2, got 3"):
-        drawn_starts(training, 0, 0, [4, 4])
+    with pytest.raises(ConfigError, match=r"pushforward_fraction must be 0 where no episode has 3 frames, got 0.5"):
+        drawn_starts(training, 0, 0, [2, 1])
 
 
 @pytest.mark.parametrize(("share", "scenes"), [(0.3, 4), (0.25, 8), (0.1, 1), (0.0, 4)])
@@ -96,6 +97,21 @@ def samples_of(episodes, frame, seeds):
 
 def pool_of(network, training=None):
     return PushforwardPool(network, training or training_of(), 0)
+
+
+def test_short_episodes_are_simulated_as_far_as_the_truth_goes():
+    """Of frames that no truth answers there is no window; what is dropped is counted of the others."""
+    network = network_of(torch.float32, levels=1, message_passing_steps=1)
+    long, short = episode(7, frames=9, seed=1), episode(7, frames=4, seed=2)
+    alone = pool_of(network)
+    alone.refresh([(long, 1)])
+    for frame, answered in ((0, 2), (1, 1)):
+        own = pool_of(network)
+        own.refresh([(long, 1), (short, frame)])
+        assert [sample.episode is short for sample, _ in own._samples] == [False] * 3 + [True] * answered
+        assert own.figures["pushforward/windows"] == 3 + answered and own.figures["pushforward/dropped"] == 0
+        for (found, _), (expected, _) in zip(own._samples[:3], alone._samples, strict=True):
+            np.testing.assert_allclose(found.window_WN3, expected.window_WN3, rtol=0, atol=1e-7)
 
 
 @pytest.mark.parametrize(

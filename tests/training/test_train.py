@@ -381,17 +381,12 @@ def test_more_data(data, other, run, tmp_path):
         ({"scene": {"cell_size": 1 / 32}}, {}, r"more_data\[0\] must be of solver cells of 0.015625, got 0.03125"),
         ({"scene": {"gravity": (0.0, -1.0, 0.0)}}, {}, r"more_data\[0\] must be of dataset's gravity where"),
         ({"mpm": {"poisson_ratio": 0.3}}, {}, r"must be of the same physics, got .*mpm.poisson_ratio is 0.3 there"),
-        (
-            {},
-            {"pushforward_fraction": 0.5, "pushforward_frames": 4, "frames": 5},
-            r"more_data\[0\] must be of at least training.pushforward_frames \+ 2 = 6 frames, got 5",
-        ),
     ],
 )
 def test_data_that_do_not_go_together(data, make_config, make_dataset, tmp_path, changes, training, message):
     """Are refused by what differs, before anything is started."""
     training = dict(training)
-    dataset = {"frames": training.pop("frames", 9)} | changes.get("dataset", {})
+    dataset = {"frames": 9} | changes.get("dataset", {})
     config = make_config(folder=str(tmp_path / "other"), seed=1, **dataset)
     for section in ("scene", "mpm"):
         config = replace(config, **{section: replace(getattr(config, section), **changes.get(section, {}))})
