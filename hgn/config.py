@@ -345,6 +345,9 @@ class NetworkConfig:
     contact_forces: Annotated[str, one_of(*CONTACT_FORCES)] = "any"
     # what touches and deforms by less than that many |g| a frame rests (hgn.network.rest); 0: nothing does
     rest_threshold: NonNegative[float] = 0.0
+    # … between coarsest cells, and cells of so many sizes in all, each twice the one before: larger ones hold what
+    # covers a floor
+    rest_levels: FewLayers = 1
     # at the end of a frame particles are no nearer to the domain's planes than that, at the near sides (0) and at the
     # far ones, or than they were before it; null: nothing holds them but what was learned
     wall_clearance: WallClearance | None = None
@@ -369,6 +372,8 @@ class NetworkConfig:
             require(not self.slips, "contact_forces", "any with inputs=absolute", self.contact_forces)
             require(not self.rests, "rest_threshold", "0 with inputs=absolute", self.rest_threshold)
         require(not self.rests or self.dimensions == 3, "rest_threshold", "0 with dimensions=2", self.rest_threshold)
+        rule = "1 with rest_threshold=0, where nothing rests"
+        require(self.rests or self.rest_levels == 1, "rest_levels", rule, self.rest_levels)
         held, rule = self.obstacle_clearance is not None, "null with dimensions=2"
         require(not held or self.dimensions == 3, "obstacle_clearance", rule, self.obstacle_clearance)
         if self.kind == "hgn":

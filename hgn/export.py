@@ -17,13 +17,13 @@ from hgn.runtime.weights import WeightsInfo, find_weights, load_weights, save_we
 from hgn.scene.barrier import barrier_pieces
 from hgn.scene.scene import all_corners
 from hgn.scene.scene_file import find_scene, load_scene
-from hgn.schema import FileName, NonNegative, Positive, from_mapping, require, require_bounds
+from hgn.schema import FileName, NonNegative, OneOrMore, Positive, from_mapping, require, require_bounds
 from hgn.system.device import choose_device
 from hgn.system.extras import require_installed
 from hgn.system.files import require_place
 from hgn.system.provenance import provenance
 
-CHANGES = ("rest_threshold", "wall_clearance", "obstacle_clearance")
+CHANGES = ("rest_threshold", "rest_levels", "wall_clearance", "obstacle_clearance")
 
 
 @dataclass(frozen=True)
@@ -35,6 +35,7 @@ class ExportConfig:
     out: FileName | None = None
     stored_precision: StoredPrecision = "fp32"  # of the learned tensors; fp16: files half as large
     rest_threshold: NonNegative[float] | None = None  # network.rest_threshold of `out`; null: as it was
+    rest_levels: OneOrMore | None = None  # network.rest_levels of `out`; null: as it was
     wall_clearance: WallClearance | None = None  # network.wall_clearance of `out`; null: as it was
     obstacle_clearance: Positive[float] | None = None  # network.obstacle_clearance of `out`; null: as it was
     # of `out`, or else of `weights`: file of a step's graph, for ONNX Runtime

@@ -96,8 +96,10 @@ class HierarchicalGraphNetwork(ParticleNetwork):
         acceleration_N3 = balanced(output_N9, contacts, grid)
         if not self.config.rests:
             return acceleration_N3
-        scale = self.normaliser.acceleration_std[0]
-        return rested(acceleration_N3, state, contacts.touched_C, grid, self.config.rest_threshold, scale)
+        scale, config = self.normaliser.acceleration_std[0], self.config
+        return rested(
+            acceleration_N3, state, contacts.touched_C, grid, config.rest_threshold, scale, config.rest_levels
+        )
 
     def grid(self, state: ParticleState, origin_S3: torch.Tensor | None = None) -> GridHierarchy:
         """The cells of all levels around a state's particles."""

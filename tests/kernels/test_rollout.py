@@ -47,7 +47,9 @@ def spreading():
     return fast, Simulator(fast, 60.0, "torch").start([scene(5)])
 
 
-@pytest.mark.parametrize("changes", [{}, {"inputs": "relative"}, {"inputs": "relative", "rest_threshold": 2.0}])
+@pytest.mark.parametrize(
+    "changes", [{}, {"inputs": "relative"}, {"inputs": "relative", "rest_threshold": 2.0, "rest_levels": 2}]
+)
 def test_frames_are_those_of_the_plain_loop(changes):
     """Two scenes at once, of different gravity, move as in the plain simulator, frame by frame, and each frame is
     announced once."""

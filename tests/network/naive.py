@@ -96,12 +96,15 @@ def _one_scene(network, state, members, scene, origin_S3):
         return output
     output = _balanced(config, *felt, pairs, output)
     scale = network.normaliser.acceleration_std[0]
-    moving = [value + state.velocity_NM3[i, 0] / scale for i, value in zip(members, output, strict=True)]
-    slow = []
-    for rate in _deforming(config, felt[0], pairs, moving):
-        ratio = rate.norm() * scale / (config.rest_threshold * state.gravity_S3[scene].norm() + 1e-300)
-        slow.append((2 - ratio**2).clamp(0, 1) * rate)
-    return [value - part for value, part in zip(output, _deforming(config, felt[0], pairs, slow), strict=True)]
+    for level in range(config.rest_levels):
+        moving = [value + state.velocity_NM3[i, 0] / scale for i, value in zip(members, output, strict=True)]
+        slow = []
+        for rate in _deforming(config, felt[0], pairs, moving, level):
+            ratio = rate.norm() * scale / (config.rest_threshold * state.gravity_S3[scene].norm() + 1e-300)
+            slow.append((2 - ratio**2).clamp(0, 1) * rate)
+        stopped = _deforming(config, felt[0], pairs, slow, level)
+        output = [value - part for value, part in zip(output, stopped, strict=True)]
+    return output
 
 
 def _relative(network, state, i, scene, row, members, pairs):
@@ -203,15 +206,15 @@ def _free(top, place):
     return free
 
 
-def _deforming(config, touched, pairs, values):
-    """The part of values that deforms what touches (rest.Deformation)."""
+def _deforming(config, touched, pairs, values, level):
+    """The part of values that deforms what touches, between cells 2^level times the coarsest (rest.Deformation)."""
     span, hats = 2 ** (config.levels - 1), []
     for row in range(len(values)):
         mine = [(cell, weight, offset) for i, cell, weight, offset in pairs if i == row]
         gate = sum(weight * touched(tuple(k >> config.levels - 1 for k in cell)) for cell, weight, _ in mine)
-        place = (torch.tensor(mine[0][0]) + 0.5 - mine[0][2]) / span
+        place = ((torch.tensor(mine[0][0]) + 0.5 - mine[0][2]) / span - 0.5) / 2**level
         for corner in itertools.product((0, 1), repeat=3):
-            middle = torch.floor(place - 0.5) + 0.5 + torch.tensor(corner)
+            middle = torch.floor(place) + torch.tensor(corner)
             hats.append((row, tuple(middle.tolist()), gate * (1 - (place - middle).abs()).prod(), place))
     top = [hat[:3] for hat in hats if float(hat[2]) > 0]
     free = _free(top, [hat[3] for hat in hats if float(hat[2]) > 0])

@@ -53,6 +53,7 @@ def test_fcn_halves_equal_the_definition():
         ((13, 2), {"inputs": "relative", "levels": 1, "contact_gate": "cell"}),
         ((14, 4), {"inputs": "relative", "levels": 2, "contact_forces": "normal"}),
         ((14, 4), {"inputs": "relative", "rest_threshold": 2.0}),
+        ((14, 4), {"inputs": "relative", "levels": 1, "rest_threshold": 2.0, "rest_levels": 3}),
     ],
 )
 def test_network_equals_the_literal_definition(counts, changes):

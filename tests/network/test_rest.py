@@ -1,5 +1,6 @@
 """Slow deformations of what touches rest: what holds for any weights, in float64."""
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -38,9 +39,9 @@ def within_a_cell(count=30):
 
 
 @THRESHOLDS
-@pytest.mark.parametrize("levels", [1, 3])
+@pytest.mark.parametrize(("levels", "sizes"), [(1, 1), (3, 1), (1, 4), (3, 2)])
 @pytest.mark.parametrize("body", range(len(ODD_BODIES) + 1))
-def test_momenta_stay_and_energy_never_grows(body, levels, threshold):
+def test_momenta_stay_and_energy_never_grows(body, levels, sizes, threshold):
     """Of a body over many cells, of lines, planes and points, whatever moves: momentum and angular momentum are as
     without rest to rounding, and the next displacements have at most the energy that they had."""
     place_N3 = [*ODD_BODIES, torch.cat([within_a_cell(), 4 * within_a_cell(80) - 1.6])][body]
@@ -48,7 +49,7 @@ def test_momenta_stay_and_energy_never_grows(body, levels, threshold):
     velocity_N13 = drawn_outputs(len(place_N3))[:, None, 3:6] + torch.tensor([3.0, 0.0, 1.0])
     state = replace(state, velocity_NM3=velocity_N13)
     acceleration_N3 = drawn_outputs(len(place_N3))[:, :3]
-    found_N3 = rested(acceleration_N3, state, touched_C, grid, threshold, ONE)
+    found_N3 = rested(acceleration_N3, state, touched_C, grid, threshold, ONE, sizes)
     change_N3 = found_N3 - acceleration_N3
     assert float(change_N3.sum(0).abs().max()) < 1e-11
     assert float(torch.linalg.cross(place_N3 - 0.4, change_N3).sum(0).abs().max()) < 1e-11
@@ -98,6 +99,30 @@ def test_a_pile_comes_to_rest(shift):
     torch.testing.assert_close(rested(swift_N3, moving, touched_C, grid, 0.3, ONE), swift_N3, rtol=0, atol=0)
 
 
+@pytest.mark.parametrize("shift", [0.0, 0.05, 0.31])
+def test_what_is_larger_than_coarsest_cells_rests(shift):
+    """A sheet of four by eight coarsest cells whose middle slowly moves against both its ends: between coarsest cells
+    little of that is a deformation, and it goes on; between cells of four sizes it comes to rest, and a rigid motion of
+    the whole goes on, as does what is faster."""
+    steps = torch.arange(0.0, 0.56, 0.02, dtype=torch.float64)
+    place_N3 = torch.cartesian_prod(steps + shift, torch.tensor([0.1, 0.12]).double(), 2 * steps + shift)
+    state, grid, touched_C = on_cells(place_N3)  # of 0.14
+    along_N, across_N = place_N3[:, 2] - shift, place_N3[:, 0] - shift
+    speed_N3 = torch.zeros_like(place_N3)
+    speed_N3[:, 0] = torch.cos(2 * math.pi * along_N / 1.1) * torch.sin(math.pi * across_N / 0.56) ** 2
+    rigid_N3 = torch.linalg.cross(torch.tensor([[0.0, 2.0, 0.0]]).double(), place_N3 - place_N3.mean(0)) + 0.5
+    left = {}
+    for sizes in (1, 4):
+        for size in (0.1, 100.0):
+            velocity_N3 = size * speed_N3 + rigid_N3
+            for _ in range(20):
+                moving = replace(state, velocity_NM3=velocity_N3[:, None])
+                velocity_N3 = velocity_N3 + rested(0 * place_N3, moving, touched_C, grid, 0.3, ONE, sizes)
+            left[sizes, size] = float((velocity_N3 - rigid_N3).norm() / (size * speed_N3).norm())
+    assert left[1, 0.1] > 0.5 and left[4, 0.1] < 0.15
+    assert left[1, 100.0] == pytest.approx(1, abs=2e-2) == left[4, 100.0]
+
+
 @THRESHOLDS
 def test_no_boost_is_seen(threshold):
     """A common velocity or rate of rotation more of all within a cell changes nothing."""
@@ -118,7 +143,7 @@ def test_gradients_of_rest():
     def of(place_N3, acceleration_N3, velocity_N3):
         state, grid, touched_C = on_cells(place_N3, 2)
         state = replace(state, velocity_NM3=velocity_N3[:, None])
-        return rested(acceleration_N3, state, touched_C, grid, 1.3, ONE)
+        return rested(acceleration_N3, state, touched_C, grid, 1.3, ONE, 2)
 
     inputs = [x.clone().requires_grad_() for x in (place_N3, output_N9[:, :3], output_N9[:, 3:6])]
     changed_N = (of(*inputs) - inputs[1]).norm(dim=1)

@@ -35,7 +35,13 @@ NETWORKS = {
     # at its walls random states begin, or end, for some particles, and their ways meet the triangles below
     "absolute": {"wall_clearance": (0.1, 0.7), "obstacle_clearance": 1e-3},
     "relative": {"inputs": "relative"},
-    "contacts": {"inputs": "relative", "contact_gate": "cell", "contact_forces": "normal", "rest_threshold": 0.3},
+    "contacts": {
+        "inputs": "relative",
+        "contact_gate": "cell",
+        "contact_forces": "normal",
+        "rest_threshold": 0.3,
+        "rest_levels": 2,
+    },
 }
 SIZES = [(particles, obstacles) for particles in (1, 216, 4_096, 30_000) for obstacles in (True, False)]
 CELL = 1 / 64

@@ -128,14 +128,23 @@ def test_an_export_sets_rest_walls_and_obstacles(data, tmp_path):
     for name, changes in (("relative", relative), ("absolute", {})):
         assert train.main(train_mapping(data, tmp_path / name, maximum_updates=2) | changes) == 0
     kept, absolute = (str(tmp_path / name / "checkpoints" / "last.ckpt") for name in ("relative", "absolute"))
-    chosen = [{}, {"rest_threshold": 0.1}, {"wall_clearance": [0.02, 0.04]}, {"obstacle_clearance": 1e-3}]
+    chosen = [
+        {},
+        {"rest_threshold": 0.1, "rest_levels": 3},
+        {"wall_clearance": [0.02, 0.04]},
+        {"obstacle_clearance": 1e-3},
+    ]
     outs = [tmp_path / f"{index}.safetensors" for index in range(4)]
     for out, options in zip(outs, chosen, strict=True):
         assert export_main({"checkpoint": kept, "out": str(out)} | options) == 0
     (one, trained), *others = (load_weights(out) for out in outs)
     assert trained.network.rest_threshold == 0
     assert trained.network.wall_clearance is None and trained.network.obstacle_clearance is None
-    expected = ({"rest_threshold": 0.1}, {"wall_clearance": (0.02, 0.04)}, {"obstacle_clearance": 1e-3})
+    expected = (
+        {"rest_threshold": 0.1, "rest_levels": 3},
+        {"wall_clearance": (0.02, 0.04)},
+        {"obstacle_clearance": 1e-3},
+    )
     for (other, after), changes in zip(others, expected, strict=True):
         assert after.network == replace(trained.network, **changes) == other.config
         for name, tensor in one.state_dict().items():
@@ -143,7 +152,7 @@ def test_an_export_sets_rest_walls_and_obstacles(data, tmp_path):
     with pytest.raises(ConfigError, match=r"rest_threshold must be 0 with inputs=absolute, got 0\.1"):
         export_main({"checkpoint": absolute, "out": str(outs[0]), "rest_threshold": 0.1})
     for options in chosen[1:]:
-        ((name, value),) = options.items()
+        name, value = next(iter(options.items()))
         with pytest.raises(ConfigError, match=f"{name} must be null without out, the file that it is for, got "):
             export_main({"weights": str(outs[0]), "onnx": str(tmp_path / "step.onnx"), name: value})
     with pytest.raises(ConfigError, match=r"wall_clearance\[1\] must be a finite number >= 0, got -0\.1"):

@@ -361,20 +361,33 @@ def add_coarsest(
 
 
 @triton.jit
-def _lowest(base_of, gate_of, row, live):
-    return tl.load(base_of + row, mask=live, other=0), tl.load(gate_of + row, mask=live, other=0.0)
+def _lowest(base_of, gate_of, spot_of, row, live):
+    """The slots of the lowest middles around particles, their gates, and their places from there, in edges."""
+    spot = _three(spot_of, row, 0, live, 1.0, 3)
+    return tl.load(base_of + row, mask=live, other=0), tl.load(gate_of + row, mask=live, other=0.0), spot
 
 
 @triton.jit
-def _middles(base, gate, place_of, geometry, row, live, LEVELS: tl.constexpr):
-    """From the lowest slots and the gates of particles, the slots [N, 8] of all middles of coarsest cells around them,
-    their places from there, and their weights."""
+def _split(k, axis: tl.constexpr, low, place_of, row, live, LEVELS: tl.constexpr, SHIFT: tl.constexpr):
+    """Along an axis, from the number in the window of a particle's own coarsest cell: the number of the lowest middle
+    around it, of cells 2^SHIFT times as large, from 0 on, and its place from there, in their edges."""
+    first = tl.load(low + axis) >> LEVELS - 1
+    place = tl.load(place_of + row * 3 + axis, mask=live, other=0.0)
+    lowest = tl.floor(place)
+    k += first + lowest.to(tl.int32)
+    wide = k >> SHIFT
+    return wide - (first - 1 >> SHIFT), ((k - (wide << SHIFT)).to(tl.float32) + place - lowest) * (1.0 / (1 << SHIFT))
+
+
+@triton.jit
+def _middles(base, gate, spot, geometry, LEVELS: tl.constexpr):
+    """From the lowest slots, the gates and the spots of particles, the slots [N, 8] of all middles around them, their
+    places from there, and their weights."""
     line = geometry + (LEVELS - 1) * GEOMETRY_COLUMNS
     corner = tl.arange(0, 8)[None, :]
     axes, weight = (), gate[:, None]
     for i in tl.static_range(3):
-        place = tl.load(place_of + row * 3 + i, mask=live, other=0.0)
-        place = (place - tl.floor(place))[:, None] - (corner >> 2 - i & 1).to(tl.float32)
+        place = spot[i][:, None] - (corner >> 2 - i & 1).to(tl.float32)
         weight = weight * (1 - tl.abs(place))
         axes = axes + (place,)  # noqa: RUF005 - Triton knows no unpacking here
     across = (corner >> 2 & 1) * tl.load(line + 2) + (corner >> 1 & 1)
@@ -431,14 +444,15 @@ def _displaced(x, velocity, scale, row, live, OUT: tl.constexpr, HISTORY: tl.con
 
 @triton.jit
 def sum_displacements(
-    x, velocity, scale, coarsest_of, share_of, place_of, felt, slot_of_cell, geometry, base_of, gate_of, sums,
-    particle_count,
-    OUT: tl.constexpr, HISTORY: tl.constexpr, LEVELS: tl.constexpr, COLUMNS: tl.constexpr, FORWARD: tl.constexpr,
-    OVERLAP: tl.constexpr, BLOCK: tl.constexpr,
+    x, velocity, scale, coarsest_of, share_of, place_of, felt, slot_of_cell, geometry, low, base_of, gate_of, spot_of,
+    sums, particle_count,
+    OUT: tl.constexpr, HISTORY: tl.constexpr, LEVELS: tl.constexpr, SHIFT: tl.constexpr, COLUMNS: tl.constexpr,
+    FORWARD: tl.constexpr, OVERLAP: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Adds the particles' next displacements over `scale`, or with FORWARD off their gradients alone, to the sums
-    [K, COLUMNS] of the middles of coarsest cells around them, moments too; forward with the bodies' own. There the
-    lowest of these slots goes into `base_of` [N], and the gate into `gate_of` [N].
+    [K, COLUMNS] of the middles around them of cells 2^SHIFT times as large as coarsest ones, moments too; forward with
+    the bodies' own. There the lowest of these slots goes into `base_of` [N], the place from there into `spot_of`
+    [N, 3], and the gate into `gate_of` [N].
 
     Reference: hgn.network.rest; test: tests/kernels/test_relative.py.
     """
@@ -449,25 +463,25 @@ def sum_displacements(
         cell, share = _coarsest_cells(coarsest_of, share_of, row, live)
         gate = tl.sum(share * tl.load(felt + cell * 2 + 1, mask=cell >= 0, other=0.0), 1)
         own = tl.load(coarsest_of + row * 8, mask=live, other=-1)
-        base = tl.load(slot_of_cell + tl.load(line + 6) + own, mask=own >= 0, other=0)
-        for i in tl.static_range(3):
-            below = live & (tl.load(place_of + row * 3 + i, mask=live, other=0.0) < 0)
-            stride = 1
-            if i < 2:
-                stride = tl.load(line + 3)
-            if i == 0:
-                stride = stride * tl.load(line + 2)
-            base -= tl.where(below, stride, 0)
-        base, gate = tl.maximum(base, 0), tl.where(own >= 0, gate, 0.0)
+        local = tl.load(slot_of_cell + tl.load(line + 6) + own, mask=own >= 0, other=0)
+        ny, nz, stride = tl.load(line + 2), tl.load(line + 3), tl.load(line + 4)
+        scene, local = local // stride, local % stride
+        bx, x_spot = _split(local // (ny * nz) - 1, 0, low, place_of, row, live, LEVELS, SHIFT)
+        by, y_spot = _split(local // nz % ny - 1, 1, low, place_of, row, live, LEVELS, SHIFT)
+        bz, z_spot = _split(local % nz - 1, 2, low, place_of, row, live, LEVELS, SHIFT)
+        base, spot = scene * stride + (bx * ny + by) * nz + bz, (x_spot, y_spot, z_spot)
+        base, gate = tl.where(own >= 0, base, 0), tl.where(own >= 0, gate, 0.0)
     else:
-        base, gate = _lowest(base_of, gate_of, row, live)
-    slot, place, weight = _middles(base, gate, place_of, geometry, row, live, LEVELS)
+        base, gate, spot = _lowest(base_of, gate_of, spot_of, row, live)
+    slot, place, weight = _middles(base, gate, spot, geometry, LEVELS)
     if OVERLAP:
         gdc_wait()
         gdc_launch_dependents()
     if FORWARD:
         tl.store(base_of + row, base, mask=live)
         tl.store(gate_of + row, gate, mask=live)
+        for i in tl.static_range(3):
+            tl.store(spot_of + row * 3 + i, spot[i], mask=live)
     value = _displaced(x, velocity, scale, row, live, OUT, HISTORY, FORWARD)
     _add_bodies(sums, slot, place, weight, value, FORWARD, COLUMNS)
 
@@ -477,7 +491,7 @@ def find_deformation(
     bodies, sums, table, count,
     AT: tl.constexpr, COLUMNS: tl.constexpr, BODIES: tl.constexpr, OVERLAP: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """From a field's sums [K, COLUMNS] at the middles of coarsest cells, from column AT on, and `bodies` [K, BODIES] to
+    """From a field's sums [K, COLUMNS] at the middles of cells, from column AT on, and `bodies` [K, BODIES] to
     their table [K, RATES]: what is subtracted there, the factor of a particle's own in column 3, and the rate of
     rotation that is subtracted in columns 4 to 6.
 
@@ -507,7 +521,7 @@ def find_deformation(
 
 @triton.jit
 def slow_displacements(
-    x, velocity, scale, scene_of, gravity, threshold, rate, slow, table, place_of, base_of, gate_of, geometry, sums,
+    x, velocity, scale, scene_of, gravity, threshold, rate, slow, table, base_of, gate_of, spot_of, geometry, sums,
     particle_count,
     OUT: tl.constexpr, HISTORY: tl.constexpr, LEVELS: tl.constexpr, FORWARD: tl.constexpr, OVERLAP: tl.constexpr,
     BLOCK: tl.constexpr,
@@ -525,8 +539,8 @@ def slow_displacements(
     if OVERLAP:
         gdc_wait()
         gdc_launch_dependents()
-    base, gate = _lowest(base_of, gate_of, row, live)
-    slot, place, weight = _middles(base, gate, place_of, geometry, row, live, LEVELS)
+    base, gate, spot = _lowest(base_of, gate_of, spot_of, row, live)
+    slot, place, weight = _middles(base, gate, spot, geometry, LEVELS)
     part = _deforming(table, slot, place, weight, value)
     d = part
     if not FORWARD:
@@ -548,7 +562,7 @@ def slow_displacements(
 
 @triton.jit
 def stop_slow(
-    x, slow, table, place_of, base_of, gate_of, geometry, particle_count,
+    x, slow, table, base_of, gate_of, spot_of, geometry, particle_count,
     OUT: tl.constexpr, LEVELS: tl.constexpr, OVERLAP: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Takes what of `slow` [N, 3] deforms, by the middles' table, off columns 0 to 2 of x [N, OUT].
@@ -557,8 +571,8 @@ def stop_slow(
     """
     row = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     live = row < tl.load(particle_count)
-    base, gate = _lowest(base_of, gate_of, row, live)
-    slot, place, weight = _middles(base, gate, place_of, geometry, row, live, LEVELS)
+    base, gate, spot = _lowest(base_of, gate_of, spot_of, row, live)
+    slot, place, weight = _middles(base, gate, spot, geometry, LEVELS)
     own = _three(x, row, 0, live, 1.0, OUT)
     value = _three(slow, row, 0, live, 1.0, 3)
     if OVERLAP:
