@@ -345,7 +345,7 @@ class NetworkConfig:
     contact_forces: Annotated[str, one_of(*CONTACT_FORCES)] = "any"
     # what touches and deforms by less than that many |g| a frame rests (hgn.network.rest); 0: nothing does
     rest_threshold: NonNegative[float] = 0.0
-    # … between coarsest cells, and cells of so many sizes in all, each twice the one before: larger ones hold what
+    # … between coarsest cells, and cells of so many sizes in all, each four times the one before: larger ones hold what
     # covers a floor
     rest_levels: FewLayers = 1
     # at the end of a frame particles are no nearer to the domain's planes than that, at the near sides (0) and at the

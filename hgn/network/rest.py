@@ -11,9 +11,9 @@ mass, and q_K says how well rotation is known (`rotation`). Weights overlap, so 
 in the grid; bodies far larger than these cells deform as they like. With the next displacement u = v + a and d = P u
 accelerations become a - P (phi d), where phi = 2 - |d|^2 / (threshold |g|)^2 within 0 and 1.
 
-With `network.rest_levels` above 1 the same follows between cells of twice that size, and so on, each with what the one
-before has left: what is larger than coarsest cells, as sand that covers a floor, rests too. What touches within two of
-the largest cells then shares its slow motion, whether it is one body or several.
+With `network.rest_levels` above 1 the same follows between cells of four times that size, and so on, each with what the
+one before has left: what is larger than coarsest cells, as sand that covers a floor, rests too. What touches within two
+of the largest cells then shares its slow motion, whether it is one body or several.
 
 So momentum and angular momentum stay, whatever the weights; as P is symmetric and within 0 and 1, no motion gains
 energy, in any frame; no boost is seen; and nothing changes where nothing touches, without gravity, and beyond sqrt(2)
@@ -32,25 +32,26 @@ from hgn.network.relative import SMALLEST_MASS, coarsest_cells, coarsest_places,
 
 SURE = 0.5  # q from which on rotation counts as known
 LEAST = 1e-30  # of a limit squared
+LEVEL_SHIFT = 2  # cells of the next of `network.rest_levels` are 2^that times as large
 
 
 class Deformation:
-    """P of a grid whose coarsest cells are `touched_C`, between cells 2^level times as large as these: called with a
+    """P of a grid whose coarsest cells are `touched_C`, between cells 2^shift times as large as these: called with a
     field [N, 3], it gives the part that deforms.
     """
 
-    def __init__(self, touched_C: torch.Tensor, grid: GridHierarchy, level: int = 0) -> None:
+    def __init__(self, touched_C: torch.Tensor, grid: GridHierarchy, shift: int = 0) -> None:
         cell_N8, corner_83 = coarsest_cells(grid), CORNER_83.to(grid.cell_N8)
         gate_N = (grid.weight_N8 * touched_C[cell_N8]).sum(1)
         scene_N, coordinate_N3 = unpack(grid.levels[-1].key_C[cell_N8[:, 0]])
         place_N3 = coarsest_places(grid)[:, 0]
         low_N3 = torch.floor(place_N3)
         low_N3, place_N3 = coordinate_N3 + low_N3.long(), place_N3 - low_N3
-        wide_N3 = low_N3 >> level
+        wide_N3 = low_N3 >> shift
         key_N8 = pack(scene_N[:, None], wide_N3[:, None] + corner_83)
         key_K, self.middle_N8 = unique(key_N8)
         self.count = key_K.shape[0]
-        self.place_N83 = ((low_N3 - (wide_N3 << level) + place_N3) / 2**level)[:, None] - corner_83
+        self.place_N83 = ((low_N3 - (wide_N3 << shift) + place_N3) / 2**shift)[:, None] - corner_83
         self.weight_N8 = gate_N[:, None] * (1 - self.place_N83.abs()).prod(-1)
         square_N89 = (self.place_N83[..., :, None] * self.place_N83[..., None, :]).flatten(2)
         sum_KX = self._sums(torch.cat([torch.ones_like(square_N89[..., :1]), self.place_N83, square_N89], -1))
@@ -92,7 +93,7 @@ def rested(
     """
     limit_N = ((threshold / scale) ** 2 * state.gravity_S3.square().sum(-1))[state.scene_N]
     for level in range(levels):
-        deformation = Deformation(touched_C, grid, level)
+        deformation = Deformation(touched_C, grid, level * LEVEL_SHIFT)
         # gravity, which is the same for all of a scene, is no part of a deformation
         rate_N3 = deformation(acceleration_N3 + state.velocity_NM3[:, 0] / scale)
         acceleration_N3 = acceleration_N3 - deformation(slow(rate_N3, limit_N))

@@ -207,12 +207,12 @@ def _free(top, place):
 
 
 def _deforming(config, touched, pairs, values, level):
-    """The part of values that deforms what touches, between cells 2^level times the coarsest (rest.Deformation)."""
+    """The part of values that deforms what touches, between cells 4^level times the coarsest (rest.Deformation)."""
     span, hats = 2 ** (config.levels - 1), []
     for row in range(len(values)):
         mine = [(cell, weight, offset) for i, cell, weight, offset in pairs if i == row]
         gate = sum(weight * touched(tuple(k >> config.levels - 1 for k in cell)) for cell, weight, _ in mine)
-        place = ((torch.tensor(mine[0][0]) + 0.5 - mine[0][2]) / span - 0.5) / 2**level
+        place = ((torch.tensor(mine[0][0]) + 0.5 - mine[0][2]) / span - 0.5) / 4**level
         for corner in itertools.product((0, 1), repeat=3):
             middle = torch.floor(place) + torch.tensor(corner)
             hats.append((row, tuple(middle.tolist()), gate * (1 - (place - middle).abs()).prod(), place))

@@ -39,7 +39,7 @@ def within_a_cell(count=30):
 
 
 @THRESHOLDS
-@pytest.mark.parametrize(("levels", "sizes"), [(1, 1), (3, 1), (1, 4), (3, 2)])
+@pytest.mark.parametrize(("levels", "sizes"), [(1, 1), (3, 1), (1, 3), (3, 2)])
 @pytest.mark.parametrize("body", range(len(ODD_BODIES) + 1))
 def test_momenta_stay_and_energy_never_grows(body, levels, sizes, threshold):
     """Of a body over many cells, of lines, planes and points, whatever moves: momentum and angular momentum are as
@@ -102,8 +102,8 @@ def test_a_pile_comes_to_rest(shift):
 @pytest.mark.parametrize("shift", [0.0, 0.05, 0.31])
 def test_what_is_larger_than_coarsest_cells_rests(shift):
     """A sheet of four by eight coarsest cells whose middle slowly moves against both its ends: between coarsest cells
-    little of that is a deformation, and it goes on; between cells of four sizes it comes to rest, and a rigid motion of
-    the whole goes on, as does what is faster."""
+    little of that is a deformation, and it goes on; between cells of three sizes it comes to rest, and a rigid motion
+    of the whole goes on, as does what is faster."""
     steps = torch.arange(0.0, 0.56, 0.02, dtype=torch.float64)
     place_N3 = torch.cartesian_prod(steps + shift, torch.tensor([0.1, 0.12]).double(), 2 * steps + shift)
     state, grid, touched_C = on_cells(place_N3)  # of 0.14
@@ -112,15 +112,15 @@ def test_what_is_larger_than_coarsest_cells_rests(shift):
     speed_N3[:, 0] = torch.cos(2 * math.pi * along_N / 1.1) * torch.sin(math.pi * across_N / 0.56) ** 2
     rigid_N3 = torch.linalg.cross(torch.tensor([[0.0, 2.0, 0.0]]).double(), place_N3 - place_N3.mean(0)) + 0.5
     left = {}
-    for sizes in (1, 4):
+    for sizes in (1, 3):
         for size in (0.1, 100.0):
             velocity_N3 = size * speed_N3 + rigid_N3
             for _ in range(20):
                 moving = replace(state, velocity_NM3=velocity_N3[:, None])
                 velocity_N3 = velocity_N3 + rested(0 * place_N3, moving, touched_C, grid, 0.3, ONE, sizes)
             left[sizes, size] = float((velocity_N3 - rigid_N3).norm() / (size * speed_N3).norm())
-    assert left[1, 0.1] > 0.5 and left[4, 0.1] < 0.15
-    assert left[1, 100.0] == pytest.approx(1, abs=2e-2) == left[4, 100.0]
+    assert left[1, 0.1] > 0.5 and left[3, 0.1] < 0.1
+    assert left[1, 100.0] == pytest.approx(1, abs=2e-2) == left[3, 100.0]
 
 
 @THRESHOLDS

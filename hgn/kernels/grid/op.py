@@ -21,6 +21,7 @@ from hgn.kernels.triton_compat import interpreting, overlaps
 from hgn.network.cell_keys import SCENE_LIMIT, in_buckets, unpack
 from hgn.network.obstacles import ObstacleCells
 from hgn.network.relative import FEW, OUTPUTS, QUIET, RARE
+from hgn.network.rest import LEVEL_SHIFT
 
 MARK_BLOCK = 128
 PARTICLE_BLOCK = 32
@@ -365,7 +366,7 @@ class DeviceGrid:
         # behind what is not a kernel in a backward pass
         coarsest_kernel.sum_displacements[blocks](
             **pairs, **moving, **sizes, coarsest_of=self.coarsest_N8, share_of=self.share_N8, place_of=self.place_N3,
-            felt=self.felt_C2, slot_of_cell=self.slot_of_cell, low=self.low, sums=first, SHIFT=level,
+            felt=self.felt_C2, slot_of_cell=self.slot_of_cell, low=self.low, sums=first, SHIFT=level * LEVEL_SHIFT,
             COLUMNS=SUMS if forward else RATES, launch_pdl=overlap and forward,
         )  # fmt: skip
         find(first)
