@@ -55,6 +55,7 @@ BackendName = Annotated[str, one_of(*BACKENDS)]
 Precision = Annotated[str, one_of(*PRECISIONS)]
 StoredPrecision = Annotated[str, one_of("fp32", "fp16")]
 Split = Annotated[str, one_of("train", "validation", "test")]
+RestLevels = Annotated[Positive[int], Bound("at most 8", lambda value: value <= 8)]  # the last are beyond any scene
 WallClearance = tuple[NonNegative[float], NonNegative[float]]
 
 
@@ -347,7 +348,7 @@ class NetworkConfig:
     rest_threshold: NonNegative[float] = 0.0
     # … between coarsest cells, and cells of so many sizes in all, each four times the one before: larger ones hold what
     # covers a floor
-    rest_levels: FewLayers = 1
+    rest_levels: RestLevels = 1
     # at the end of a frame particles are no nearer to the domain's planes than that, at the near sides (0) and at the
     # far ones, or than they were before it; null: nothing holds them but what was learned
     wall_clearance: WallClearance | None = None

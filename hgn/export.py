@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from hgn.command import run_command
-from hgn.config import StoredPrecision, WallClearance
+from hgn.config import RestLevels, StoredPrecision, WallClearance
 from hgn.network.features import ParticleState
 from hgn.runtime.exported_step import initial_arrays, traced_step, write_onnx, write_package
 from hgn.runtime.simulator import Simulator
@@ -17,7 +17,7 @@ from hgn.runtime.weights import WeightsInfo, find_weights, load_weights, save_we
 from hgn.scene.barrier import barrier_pieces
 from hgn.scene.scene import all_corners
 from hgn.scene.scene_file import find_scene, load_scene
-from hgn.schema import FileName, NonNegative, OneOrMore, Positive, from_mapping, require, require_bounds
+from hgn.schema import FileName, NonNegative, Positive, from_mapping, require, require_bounds
 from hgn.system.device import choose_device
 from hgn.system.extras import require_installed
 from hgn.system.files import require_place
@@ -35,7 +35,7 @@ class ExportConfig:
     out: FileName | None = None
     stored_precision: StoredPrecision = "fp32"  # of the learned tensors; fp16: files half as large
     rest_threshold: NonNegative[float] | None = None  # network.rest_threshold of `out`; null: as it was
-    rest_levels: OneOrMore | None = None  # network.rest_levels of `out`; null: as it was
+    rest_levels: RestLevels | None = None  # network.rest_levels of `out`; null: as it was
     wall_clearance: WallClearance | None = None  # network.wall_clearance of `out`; null: as it was
     obstacle_clearance: Positive[float] | None = None  # network.obstacle_clearance of `out`; null: as it was
     # of `out`, or else of `weights`: file of a step's graph, for ONNX Runtime

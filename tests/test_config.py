@@ -33,6 +33,7 @@ RULES = {
         ({"contact_gate": "cell"}, "contact_gate must be particle with inputs=absolute, got 'cell'"),
         ({"contact_forces": "normal"}, "contact_forces must be any with inputs=absolute, got 'normal'"),
         ({"rest_threshold": 0.3}, "rest_threshold must be 0 with inputs=absolute, got 0.3"),
+        (RELATIVE | {"rest_threshold": 0.1, "rest_levels": 9}, "rest_levels must be at most 8, got 9"),
         (RELATIVE | {"rest_levels": 2}, "rest_levels must be 1 with rest_threshold=0, where nothing rests, got 2"),
         (RELATIVE | {"rest_threshold": 0.3, "dimensions": 2}, "rest_threshold must be 0 with dimensions=2"),
         (RELATIVE | {"rest_threshold": float("nan")}, "rest_threshold must be a finite number >= 0"),
