@@ -419,6 +419,11 @@ class NetworkConfig:
         return self.rest_threshold > 0
 
     @property
+    def rest_sizes(self) -> int:
+        """Between cells of how many sizes they do; 0 where nothing rests."""
+        return self.rest_levels * self.rests
+
+    @property
     def feature_width(self) -> int:
         """Numbers per particle, the embedding last: paper sec. 3.1, or hgn.network.relative."""
         if self.relative:

@@ -10,8 +10,9 @@ GNS = {"kind": "gns", "levels": 1}
 RELATIVE = {"inputs": "relative"}
 
 
-def train_on_six_frames(**training):
-    return TrainConfig(dataset=DatasetConfig(frames=6), network=NetworkConfig(), training=TrainingConfig(**training))
+def train_on_six_frames(frames=6, **training):
+    dataset = DatasetConfig(frames=frames)
+    return TrainConfig(dataset=dataset, network=NetworkConfig(), training=TrainingConfig(**training))
 
 
 def average_of(count, coefficients=None):
@@ -73,6 +74,10 @@ RULES = {
         ({"pushforward_fraction": 1.0}, "pushforward_fraction must be 0 or more and below 1, got 1.0"),
         ({"pushforward_pull": 1.5}, "pushforward_pull must be from 0 to 1, got 1.5"),
         ({"pushforward_every": 0}, "pushforward_every must be .*got 0"),
+        (
+            {"pushforward_fraction": 0.5, "frames": 2},
+            "dataset.frames must be at least 3 where training.pushforward_fraction > 0, got 2",
+        ),
     ],
     average_of: [
         ({"count": 1}, "weights must be at least two files, got 1"),

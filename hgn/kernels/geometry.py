@@ -14,6 +14,13 @@ FULLY = tl.constexpr(1 << 24)  # how disturbed a coarsest cell is, where it is s
 
 
 @triton.jit
+def split_slot(local, ny, nz, stride):
+    """Of a slot of a level, counted from its first: the scene, and the cell in its window, which borders are -1 of."""
+    inside = local % stride
+    return local // stride, inside // (ny * nz) - 1, inside // nz % ny - 1, inside % nz - 1
+
+
+@triton.jit
 def most_around(disturbed, felt, part: tl.constexpr, neighbour, cell, there, capacity):
     """What a coarsest cell and those across its faces have at most in one column of `disturbed` [C, 2], in units of
     FULLY, goes into that of `felt` [C, 2], from 0 to 1."""

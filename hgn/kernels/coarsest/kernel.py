@@ -8,7 +8,7 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
-from hgn.kernels.geometry import GEOMETRY_COLUMNS, most_around
+from hgn.kernels.geometry import GEOMETRY_COLUMNS, most_around, split_slot
 from hgn.kernels.triton_compat import gdc_launch_dependents, gdc_wait, settle_keys
 from hgn.network.relative import OUTPUTS, POINT, THIN
 from hgn.network.rest import LEAST, SURE
@@ -465,10 +465,10 @@ def sum_displacements(
         own = tl.load(coarsest_of + row * 8, mask=live, other=-1)
         local = tl.load(slot_of_cell + tl.load(line + 6) + own, mask=own >= 0, other=0)
         ny, nz, stride = tl.load(line + 2), tl.load(line + 3), tl.load(line + 4)
-        scene, local = local // stride, local % stride
-        bx, x_spot = _split(local // (ny * nz) - 1, 0, low, place_of, row, live, LEVELS, SHIFT)
-        by, y_spot = _split(local // nz % ny - 1, 1, low, place_of, row, live, LEVELS, SHIFT)
-        bz, z_spot = _split(local % nz - 1, 2, low, place_of, row, live, LEVELS, SHIFT)
+        scene, kx, ky, kz = split_slot(local, ny, nz, stride)
+        bx, x_spot = _split(kx, 0, low, place_of, row, live, LEVELS, SHIFT)
+        by, y_spot = _split(ky, 1, low, place_of, row, live, LEVELS, SHIFT)
+        bz, z_spot = _split(kz, 2, low, place_of, row, live, LEVELS, SHIFT)
         base, spot = scene * stride + (bx * ny + by) * nz + bz, (x_spot, y_spot, z_spot)
         base, gate = tl.where(own >= 0, base, 0), tl.where(own >= 0, gate, 0.0)
     else:

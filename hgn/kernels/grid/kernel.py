@@ -9,7 +9,7 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
-from hgn.kernels.geometry import FULLY, GEOMETRY_COLUMNS, most_around
+from hgn.kernels.geometry import FULLY, GEOMETRY_COLUMNS, most_around, split_slot
 from hgn.kernels.obstacles import OBSTACLE_COLUMNS, obstacle_normals
 from hgn.kernels.triton_compat import gdc_launch_dependents, gdc_wait, settle_keys
 from hgn.network.relative import STEPS_AHEAD, WALL_LIMIT
@@ -181,9 +181,7 @@ def fill_tables(
             step = -step
         slots_of = slots_of + (slot + step,)  # noqa: RUF005
     _write_cells(neighbour + 6 * at, cell, live, occupied, prefix_sum, slots_of, first, capacity, capacity, 6)
-    scene = local // stride
-    inside = local % stride
-    x, y, z = inside // (ny * nz) - 1, inside // nz % ny - 1, inside % nz - 1
+    scene, x, y, z = split_slot(local, ny, nz, stride)
     tl.store(octant + at + cell, ((x & 1) * 2 + (y & 1)) * 2 + (z & 1), mask=live)
     if level < LEVELS - 1:
         above = line + GEOMETRY_COLUMNS
