@@ -482,6 +482,8 @@ class TrainingConfig:
     pushforward_every: Positive[int] = 500  # updates between such simulations
     pushforward_scenes: Positive[int] = 64  # simulated at once, on each device, from random frames of the data on …
     pushforward_frames: Positive[int] = 16  # … for so many frames at most, as the truth goes; each can be trained on
+    # … or for this fraction of an episode's frames, where that is more: slow drifts show in long episodes alone
+    pushforward_episode_fraction: BelowOne[float] = 0.0
     pushforward_pull: Fraction[float] = 0.1  # fraction of the distance from the truth to be taken back in a frame
     seed: NonNegative[int] = 0
     accelerator: Processor = "auto"  # or cpu, gpu

@@ -28,6 +28,7 @@ from hgn.network.obstacles import ObstacleCells
 from hgn.runtime.triton_rollout import CHECKED_PARTICLES, TritonRollout
 from hgn.training.noise import noise_scale, target_acceleration
 from hgn.training.pushforward import (
+    by_frames,
     diverged_scenes,
     drawn_pool_samples,
     known_frames,
@@ -69,19 +70,34 @@ class GraphPushforwardPool:
         """
         begin_s = time.monotonic()
         self._samples = []  # frees the memory
+        squares, known = [], 0
+        before = self.network.config.velocity_history  # frames of a DeviceEpisode that come before frame 0
+        for frames, alike in by_frames(self.training, starts, [episode.frames - before for episode, _ in starts]):
+            answered = [known_frames(frames, episode.frames - before, frame) for episode, frame in alike]
+            squares += self._taken(alike, answered, frames, len(starts), values)
+            known += sum(answered)
+        self.figures = pool_figures(len(self._samples), known, squares, time.monotonic() - begin_s)
+
+    def _taken(
+        self,
+        starts: Sequence[tuple[DeviceEpisode, int]],
+        answered: Sequence[int],
+        frames: int,
+        scenes: int,
+        values: torch.Tensor,
+    ) -> list[float]:
+        """Simulates so many frames and adds the windows of those that the truth answers; the mean squared distance at
+        the end of each scene that is there until then. The buffers are for `scenes`, of which the last may be empty.
+        """
         config, device = self.network.config, values.device
-        before = config.velocity_history  # frames of a DeviceEpisode that come before frame 0
-        known = [
-            known_frames(self.training.pushforward_frames, episode.frames - before, frame) for episode, frame in starts
-        ]
         truths = [
-            episode.position_TN3[frame : frame + before + frames + 2].to(device)
-            for (episode, frame), frames in zip(starts, known, strict=True)
+            episode.position_TN3[frame : frame + config.velocity_history + known + 2].to(device)
+            for (episode, frame), known in zip(starts, answered, strict=True)
         ]
         episodes = [episode for episode, _ in starts]
-        path_FN3 = self._simulate(episodes, self._state(episodes, truths), values)
+        path_FN3 = self._simulate(episodes, self._state(episodes, truths, scenes), frames, values)
         paths = path_FN3.split([episode.particles for episode in episodes], dim=1)
-        parts = [path_FN3[:frames] for path_FN3, frames in zip(paths, known, strict=True)]
+        parts = [path_FN3[:known] for path_FN3, known in zip(paths, answered, strict=True)]
         domain_S3 = torch.tensor([episode.domain_size for episode in episodes], device=device)
         counts_and_squares = [
             torch.stack([x.double() for x in usable_frames(truth, part, domain_3, config.cell_size)])
@@ -98,29 +114,32 @@ class GraphPushforwardPool:
                 (replace(episode, position_TN3=w), a) for w, a in zip(windows, accelerations, strict=True)
             ]
             squares += [square] if count == len(part) else []
-        self.figures = pool_figures(len(self._samples), sum(known), squares, time.monotonic() - begin_s)
+        return squares
 
-    def _state(self, episodes: Sequence[DeviceEpisode], truths: Sequence[torch.Tensor]) -> ParticleState:
+    def _state(self, episodes: Sequence[DeviceEpisode], truths: Sequence[torch.Tensor], scenes: int) -> ParticleState:
         """The true state that the simulation starts from; obstacles have tables of their own."""
         history, device = self.network.config.velocity_history, truths[0].device
         past_TN3 = torch.cat([truth[: history + 1] for truth in truths], dim=1)
         counts = torch.tensor([episode.particles for episode in episodes], device=device)
+        placed = [*episodes, *[episodes[0]] * (scenes - len(episodes))]  # empty scenes have the domain of any
         return ParticleState(
             position_N3=past_TN3[-1],
             velocity_NM3=past_TN3.diff(dim=0).flip(0).transpose(0, 1),
             material_N=torch.cat([episode.material_N for episode in episodes]),
             scene_N=torch.arange(len(episodes), device=device).repeat_interleave(counts),
-            domain_S3=torch.tensor([episode.domain_size for episode in episodes], device=device),
-            gravity_S3=torch.tensor([episode.gravity for episode in episodes], device=device),
+            domain_S3=torch.tensor([episode.domain_size for episode in placed], device=device),
+            gravity_S3=torch.tensor([episode.gravity for episode in placed], device=device),
             obstacles=None,
         )
 
-    def _simulate(self, episodes: Sequence[DeviceEpisode], state: ParticleState, values: torch.Tensor) -> torch.Tensor:
+    def _simulate(
+        self, episodes: Sequence[DeviceEpisode], state: ParticleState, frames: int, values: torch.Tensor
+    ) -> torch.Tensor:
         """Positions [F, N, 3]; of a scene that diverged, whatever came after."""
         rollout = self._begun(episodes, state, values)
         pieces, done = [], 0
-        while done < self.training.pushforward_frames:
-            path_TN3, status = rollout.look(self.training.pushforward_frames - done)
+        while done < frames:
+            path_TN3, status = rollout.look(frames - done)
             pieces.append(path_TN3.clone())
             done += len(path_TN3)
             if status & DIVERGED.value:
@@ -132,12 +151,14 @@ class GraphPushforwardPool:
     def _begun(self, episodes: Sequence[DeviceEpisode], state: ParticleState, values: torch.Tensor) -> TritonRollout:
         """A simulation at its start; that of before, where there is room in it."""
         config, device = self.network.config, values.device
-        table = None
+        table, empty = None, state.scene_count - len(episodes)
         if config.obstacle_features:
-            table = ObstacleTable([episode.obstacles for episode in episodes], self.obstacle_cell_size, device)
+            table = ObstacleTable(
+                [*(episode.obstacles for episode in episodes), *[None] * empty], self.obstacle_cell_size, device
+            )
         barriers = None
         if config.obstacle_clearance is not None:
-            barriers = BarrierTable([episode.barrier for episode in episodes], device)
+            barriers = BarrierTable([*(episode.barrier for episode in episodes), *[None] * empty], device)
         rollout = self._rollout
         if rollout is not None and len(state.position_N3) <= rollout.particles:
             if table is not None:

@@ -2,7 +2,8 @@
 
 The idea of Brandstetter et al. 2022, collected like DAgger (Ross et al. 2011). Every `pushforward_every` updates the
 present weights (their moving average where there is one) simulate `pushforward_scenes` scenes, each from a random true
-frame on for `pushforward_frames` or as long as the truth goes, and each simulated frame becomes a window in a pool;
+frame on for `pushforward_frames` (of long episodes for `pushforward_episode_fraction` of their frames) or as long as
+the truth goes, and each simulated frame becomes a window in a pool;
 until the next simulation a fraction of the samples is taken from the pool. Noise shows a network errors that are drawn;
 its own are biased, and common to a body. Everything is drawn from seed, update and rank. The pool is not part of a
 checkpoint: a training that goes on makes a new one, which is the old one where the checkpoint lies at a multiple of
@@ -19,6 +20,7 @@ import functools
 import time
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -37,6 +39,7 @@ from hgn.scene.history import window
 from hgn.schema import ConfigError
 from hgn.training.noise import noise_scale, target_acceleration
 
+S = TypeVar("S")
 Starts = tuple[tuple[int, int], ...]  # episodes and frames that the network simulates from
 START_STREAM, SAMPLE_STREAM = 0x57A7, 0xE217
 # finest cells; farther from the truth (rms over a scene) its motion is no answer any more, and the loss would be made
@@ -45,14 +48,21 @@ DROPPED_BEYOND = 0.5
 PULLED_WITHIN = 1.0  # finest cells on an axis; no particle is pulled as if it were farther away
 
 
+def simulated_frames(training: TrainingConfig, frame_count: int) -> int:
+    """How many frames are simulated of an episode of so many, where its truth goes on for as long."""
+    return max(training.pushforward_frames, int(training.pushforward_episode_fraction * frame_count))
+
+
 def drawn_starts(training: TrainingConfig, update: int, rank: int, frame_counts: Sequence[int]) -> Starts:
     """Episode and frame that each simulation before `update` starts from, of episodes of so many frames.
 
-    Every episode once before one comes twice, from a frame from which on the truth goes on for `pushforward_frames`, or
-    for half of what it has, where that is less: it has to be known for one frame longer than is trained on.
+    Every episode once before one comes twice, from a frame from which on the truth goes on for as long as is simulated,
+    or for half of what it has, where that is less: it has to be known for one frame longer than is trained on.
     Raises: ConfigError when all episodes are too short.
     """
-    last = {i: count - 2 - min(training.pushforward_frames, (count - 1) // 2) for i, count in enumerate(frame_counts)}
+    last = {
+        i: count - 2 - min(simulated_frames(training, count), (count - 1) // 2) for i, count in enumerate(frame_counts)
+    }
     long_enough = [i for i, count in enumerate(frame_counts) if count >= SIMULATED_FRAMES]
     if not long_enough:
         raise ConfigError(
@@ -73,6 +83,14 @@ def drawn_pool_samples(training: TrainingConfig, update: int, rank: int, pool_si
     generator = np.random.default_rng([training.seed, SAMPLE_STREAM, update, rank])
     count = int(training.pushforward_fraction * training.batch_scenes + generator.random())
     return [int(place * pool_size) for place in generator.random(count)]
+
+
+def by_frames(training: TrainingConfig, starts: Sequence[S], frame_counts: Sequence[int]) -> list[tuple[int, list[S]]]:
+    """The starts that are simulated for as many frames, with that number; the most of them first."""
+    groups: dict[int, list[S]] = {}
+    for start, count in zip(starts, frame_counts, strict=True):
+        groups.setdefault(simulated_frames(training, count), []).append(start)
+    return sorted(groups.items(), key=lambda group: -len(group[1]))
 
 
 def known_frames(simulated: int, frame_count: int, frame: int) -> int:
@@ -145,11 +163,12 @@ class PushforwardPool:
         begin_s = time.monotonic()
         self._samples = []
         squares, known = [], 0
-        for group in self._groups(starts):
-            for (episode, frame), simulated_FN3 in zip(group, self._simulate(group), strict=True):
-                frames = known_frames(len(simulated_FN3), episode.frame_count, frame)
-                squares += self._take(episode, frame, simulated_FN3[:frames])
-                known += frames
+        for frames, alike in by_frames(self.training, starts, [episode.frame_count for episode, _ in starts]):
+            for group in self._groups(alike):
+                for (episode, frame), simulated_FN3 in zip(group, self._simulate(group, frames), strict=True):
+                    answered = known_frames(frames, episode.frame_count, frame)
+                    squares += self._take(episode, frame, simulated_FN3[:answered])
+                    known += answered
         self.figures = pool_figures(len(self._samples), known, squares, time.monotonic() - begin_s)
 
     def replaced(self, update_samples: UpdateSamples, update: int) -> UpdateSamples:
@@ -174,13 +193,13 @@ class PushforwardPool:
             left -= len(start[0].material_N)
         return groups
 
-    def _simulate(self, starts: Sequence[tuple[Episode, int]]) -> list[torch.Tensor]:
+    def _simulate(self, starts: Sequence[tuple[Episode, int]], frames: int) -> list[torch.Tensor]:
         """Positions [F, N, 3] of each scene; of a scene that diverged, whatever came after."""
         config = self.network.config
         batch = make_batch(starts, config).to(self._backend.device)
         begin = state = replace(batch.state(), barriers=self._barriers([episode for episode, _ in starts]))
         path = []
-        for _ in range(self.training.pushforward_frames):
+        for _ in range(frames):
             state = stepped(self._backend.predict, state, config)
             path.append(state.position_N3.cpu().clone())
             again_N = diverged_scenes(state.position_N3, state.scene_N, state.domain_S3)

@@ -96,6 +96,18 @@ def test_the_pool_is_that_of_the_plain_path(changes):
     assert len({sample.noise_scale for sample in mixed[:2]} | {1.0}) == 3
 
 
+def test_long_episodes_are_simulated_for_longer():
+    """Groups of scenes for different times, one after the other in the same buffers: the windows of the plain path."""
+    network = network_of(torch.float32, width=16, levels=1, message_passing_steps=1).to(device())
+    scenes = [episode(8, frames=12, seed=1), episode(7, frames=6, seed=2), episode(5, frames=6, seed=3)]
+    training = training_of(precision="fp32", pushforward_frames=2, pushforward_episode_fraction=0.4)
+    fast, plain = GraphPushforwardPool(network, training, CELL_SIZE, 0), PushforwardPool(network, training, 0)
+    fast.refresh([(placed(made, network), 1) for made in scenes], values_of(network))
+    plain.refresh([(made, 1) for made in scenes])
+    assert_same_pools(fast, plain)
+    assert [found.particles for found, _ in fast._samples] == [7, 7, 5, 5, 8, 8, 8, 8]
+
+
 def test_lost_scenes_are_dropped():
     """A scene that leaves its domain, or is no longer made of numbers, ends alone: the other's frames are the plain
     path's, and the next simulation is whole again."""

@@ -15,7 +15,8 @@ from hgn.runtime.rollouts import RolloutResult, simulate_scenes
 from hgn.runtime.simulator import InitialState, Simulator
 from hgn.runtime.weights import WeightsInfo, save_weights
 from hgn.scene.obstacle_grid import ObstacleGrid
-from hgn.schema import from_mapping
+from hgn.scene.random_scene import REPORT_SEED
+from hgn.schema import ConfigError, from_mapping
 from tools.measures import neighbours
 from tools.solver_rollouts import solver_trials
 from tools.stability import network, network_cases, network_motion
@@ -479,6 +480,20 @@ def test_the_solver_is_asked_once(tmp_path, monkeypatch):
     solver_beside(made, MpmConfig(poisson_ratio=0.3), 60.0, kept)
     solver_beside([replace(made[0], frames=6)], MpmConfig(), 60.0, kept)
     assert asked[1:] == [(3, 5), (1, 6)]
+
+
+def test_rest_is_judged_on_a_scene_of_each_seed():
+    """The report's own scene is one of them, and stays what it is beside others."""
+    scene = SceneConfig(group_size=0.03)
+    (own, *_), (both, *_) = (
+        cases(StabilityNetworkConfig("", cases=("rest",), rest_seeds=seeds, scene=scene), network_of().config)
+        for seeds in ((REPORT_SEED,), (REPORT_SEED, 7))
+    )
+    first, second = both.scenes
+    assert np.array_equal(first.position_N3, own.scenes[0].position_N3)
+    assert not np.array_equal(first.position_N3, second.position_N3)
+    with pytest.raises(ConfigError, match="rest_seeds must be at least one"):
+        StabilityNetworkConfig("", rest_seeds=())
 
 
 def test_scenes_follow_the_network():

@@ -71,6 +71,10 @@ def test_what_is_simulated_is_drawn_from_seed_and_update():
         assert {frame for starts in drawn for i, frame in starts if i == index} == set(range(last[index] + 1))
     assert drawn_starts(training, 7, 0, frames) == drawn[7] != drawn[8]
     assert drawn_starts(training, 7, 1, frames) != drawn[7]
+    long = training_of(pushforward_scenes=5, pushforward_episode_fraction=0.5)  # of 10 and 12 frames 4 and 5, half each
+    starts = {start for update in range(200) for start in drawn_starts(long, update, 0, frames)}
+    for index, latest in ((0, 4), (2, 5), (3, 2), (4, 0)):
+        assert {frame for i, frame in starts if i == index} == set(range(latest + 1))
     with pytest.raises(ConfigError, match=r"pushforward_fraction must be 0 where no episode has 3 frames, got 0.5"):
         drawn_starts(training, 0, 0, [2, 1])
 
@@ -111,6 +115,24 @@ def test_short_episodes_are_simulated_as_far_as_the_truth_goes():
         assert [sample.episode is short for sample, _ in own._samples] == [False] * 3 + [True] * answered
         assert own.figures["pushforward/windows"] == 3 + answered and own.figures["pushforward/dropped"] == 0
         for (found, _), (expected, _) in zip(own._samples[:3], alone._samples, strict=True):
+            np.testing.assert_allclose(found.window_WN3, expected.window_WN3, rtol=0, atol=1e-7)
+
+
+def test_long_episodes_are_simulated_for_longer():
+    """Of each episode its fraction, where that is more than what all have: as they are by themselves, in whatever order
+    they come."""
+    network = network_of(torch.float32, levels=1, message_passing_steps=1)
+    training = training_of(pushforward_episode_fraction=0.35)
+    long, short, other = episode(7, frames=12, seed=1), episode(7, frames=6, seed=2), episode(5, frames=6, seed=3)
+    own = pool_of(network, training)
+    own.refresh([(long, 1), (short, 1), (other, 0)])
+    assert own.figures["pushforward/windows"] == 3 + 3 + 4 and own.figures["pushforward/dropped"] == 0
+    for made, frame, count in ((long, 1, 4), (short, 1, 3), (other, 0, 3)):
+        alone = pool_of(network, training_of(pushforward_frames=count))
+        alone.refresh([(made, frame)])
+        mine = [sample for sample, _ in own._samples if sample.episode is made]
+        for found, (expected, _) in zip(mine, alone._samples, strict=True):
+            assert found.frame == expected.frame
             np.testing.assert_allclose(found.window_WN3, expected.window_WN3, rtol=0, atol=1e-7)
 
 

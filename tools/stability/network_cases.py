@@ -19,7 +19,7 @@ from hgn.scene.random_scene import REPORT_SEED, generate_scene
 from hgn.scene.rotation import euler_rotation, quaternion_rotation
 from hgn.scene.scene import Scene
 from hgn.scene.shapes import shape_obstacle
-from hgn.schema import ConfigError, FrameCount, Positive, one_of, require_bounds
+from hgn.schema import ConfigError, FrameCount, Positive, one_of, require, require_bounds
 from tools.scenes import filled
 
 MOTION = ("throw", "gravity", "collision")  # tools/stability/network_motion.py
@@ -50,6 +50,8 @@ class StabilityNetworkConfig:
     cases: tuple[Annotated[str, one_of(*CASES)], ...] | None = None
     frames: FrameCount = 300
     long_frames: FrameCount = 3000  # of the case rest
+    # of its scenes, one each of every material, judged together; others than the first are for choices
+    rest_seeds: tuple[Positive[int], ...] = (REPORT_SEED,)
     # in each rollout of throw, gravity and collision; null: as many as a row has throws
     scenes_at_once: Positive[int] | None = None
     # also ask the solver, which needs Taichi: for slope, collision, collapse, hole and rest; without it the latter
@@ -70,6 +72,7 @@ class StabilityNetworkConfig:
 
     def __post_init__(self) -> None:
         require_bounds(self)
+        require(len(self.rest_seeds) > 0, "rest_seeds", "at least one", list(self.rest_seeds))
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,9 +118,11 @@ def cases(config: StabilityNetworkConfig, network: NetworkConfig) -> Iterator[Ca
             larger = replace(base, group_size=side * base.group_size)
             yield _funnels(name, larger, material, hole_cells, network.cell_size)
     for material in base.materials if "rest" in wanted and config.solver else ():
-        rest = case(f"{config.long_frames} frames, {material}", obstacle_count=0, materials=(material,))
+        alone = replace(base, obstacle_count=0, materials=(material,))
+        scenes = tuple(_scene(alone, seed) for seed in config.rest_seeds)
         settled = min(config.frames, config.long_frames) - 1
-        yield replace(rest, frames=config.long_frames, settled=settled, beside_solver=True)
+        name = f"{config.long_frames} frames, {material}"
+        yield Case(name, scenes, config.long_frames, settled=settled, beside_solver=True)
     if "particles" in wanted:
         yield case(f"particles x{PARTICLE_FACTOR:g}", group_size=base.group_size * PARTICLE_FACTOR ** (1 / 3))
     for side in DOMAIN_SIDES if "domain" in wanted else ():
@@ -189,14 +194,14 @@ def _funnels(name: str, config: SceneConfig, material: str, hole_cells: tuple[fl
     )  # fmt: skip
 
 
-def _scene(config: SceneConfig) -> Scene:
+def _scene(config: SceneConfig, seed: int = REPORT_SEED) -> Scene:
     """The first of some scenes that has room for everything."""
     for attempt in range(1, ATTEMPTS):
         try:
-            return generate_scene(config, attempt * REPORT_SEED)
+            return generate_scene(config, attempt * seed)
         except ConfigError:
             continue
-    return generate_scene(config, ATTEMPTS * REPORT_SEED)
+    return generate_scene(config, ATTEMPTS * seed)
 
 
 def _slope(config: SceneConfig, material: str, frames: int, degrees: float) -> Case:
