@@ -349,6 +349,8 @@ class NetworkConfig:
     # … between coarsest cells, and cells of so many sizes in all, each four times the one before: larger ones hold what
     # covers a floor
     rest_levels: RestLevels = 1
+    # … materials that rest between these larger cells, too; null: all. What has no friction, as water, spreads on
+    rest_large_materials: tuple[MaterialName, ...] | None = None
     # at the end of a frame particles are no nearer to the domain's planes than that, at the near sides (0) and at the
     # far ones, or than they were before it; null: nothing holds them but what was learned
     wall_clearance: WallClearance | None = None
@@ -375,6 +377,10 @@ class NetworkConfig:
         require(not self.rests or self.dimensions == 3, "rest_threshold", "0 with dimensions=2", self.rest_threshold)
         rule = "1 with rest_threshold=0, where nothing rests"
         require(self.rests or self.rest_levels == 1, "rest_levels", rule, self.rest_levels)
+        if self.rest_large_materials is not None:
+            known = set(self.rest_large_materials) <= set(self.materials)
+            rule = f"of the materials {', '.join(self.materials)}, or null with rest_levels=1"
+            require(known and self.rest_levels > 1, "rest_large_materials", rule, list(self.rest_large_materials))
         held, rule = self.obstacle_clearance is not None, "null with dimensions=2"
         require(not held or self.dimensions == 3, "obstacle_clearance", rule, self.obstacle_clearance)
         if self.kind == "hgn":
@@ -422,6 +428,11 @@ class NetworkConfig:
     def rest_sizes(self) -> int:
         """Between cells of how many sizes they do; 0 where nothing rests."""
         return self.rest_levels * self.rests
+
+    @property
+    def rests_large(self) -> tuple[bool, ...]:
+        """Which of the materials rest between the larger of these cells."""
+        return tuple(self.rest_large_materials is None or name in self.rest_large_materials for name in self.materials)
 
     @property
     def feature_width(self) -> int:

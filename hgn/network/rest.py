@@ -13,7 +13,8 @@ accelerations become a - P (phi d), where phi = 2 - |d|^2 / (threshold |g|)^2 wi
 
 With `network.rest_levels` above 1 the same follows between cells of four times that size, and so on, each with what the
 one before has left: what is larger than coarsest cells, as sand that covers a floor, rests too. What touches within two
-of the largest cells then shares its slow motion, whether it is one body or several.
+of the largest cells then shares its slow motion, whether it is one body or several. Of other materials than
+`network.rest_large_materials` these larger cells see nothing: what has no friction, as water, spreads on.
 
 So momentum and angular momentum stay, whatever the weights; as P is symmetric and within 0 and 1, no motion gains
 energy, in any frame; no boost is seen; and nothing changes where nothing touches, without gravity, and beyond sqrt(2)
@@ -36,13 +37,17 @@ LEVEL_SHIFT = 2  # cells of the next of `network.rest_levels` are 2^that times a
 
 
 class Deformation:
-    """P of a grid whose coarsest cells are `touched_C`, between cells 2^shift times as large as these: called with a
-    field [N, 3], it gives the part that deforms.
+    """P of a grid whose coarsest cells are `touched_C`, between cells 2^shift times as large as these, of the particles
+    that `share_N` is 1 for: called with a field [N, 3], it gives the part that deforms.
     """
 
-    def __init__(self, touched_C: torch.Tensor, grid: GridHierarchy, shift: int = 0) -> None:
+    def __init__(
+        self, touched_C: torch.Tensor, grid: GridHierarchy, shift: int = 0, share_N: torch.Tensor | None = None
+    ) -> None:
         cell_N8, corner_83 = coarsest_cells(grid), CORNER_83.to(grid.cell_N8)
         gate_N = (grid.weight_N8 * touched_C[cell_N8]).sum(1)
+        if share_N is not None:
+            gate_N = share_N * gate_N
         scene_N, coordinate_N3 = unpack(grid.levels[-1].key_C[cell_N8[:, 0]])
         place_N3 = coarsest_places(grid)[:, 0]
         low_N3 = torch.floor(place_N3)
@@ -87,13 +92,16 @@ def rested(
     threshold: float,
     scale: torch.Tensor,
     levels: int = 1,
+    large_M: torch.Tensor | None = None,
 ) -> torch.Tensor:
     """Accelerations less gravity after `balanced`, and after that without slow deformations between cells of so many
-    sizes, [N, 3]; both are in units of `scale`, the normaliser's.
+    sizes, [N, 3], those larger than the first of the materials alone that `large_M` is 1 of; accelerations are in units
+    of `scale`, the normaliser's.
     """
+    large_N = None if large_M is None else large_M[state.material_N]
     limit_N = ((threshold / scale) ** 2 * state.gravity_S3.square().sum(-1))[state.scene_N]
     for level in range(levels):
-        deformation = Deformation(touched_C, grid, level * LEVEL_SHIFT)
+        deformation = Deformation(touched_C, grid, level * LEVEL_SHIFT, large_N if level else None)
         # gravity, which is the same for all of a scene, is no part of a deformation
         rate_N3 = deformation(acceleration_N3 + state.velocity_NM3[:, 0] / scale)
         acceleration_N3 = acceleration_N3 - deformation(slow(rate_N3, limit_N))

@@ -110,7 +110,7 @@ def network_of_weights(config: TrainConfig) -> ParticleNetwork:
     weights, info = load_weights(path, field="training.init_weights")
     remedy = "set it so, or take other training.init_weights"
     contacts = ("contact_gate", "contact_forces", "contact_reach_cells")
-    free = (*contacts, "rest_threshold", "rest_levels", "wall_clearance", "obstacle_clearance")
+    free = (*contacts, "rest_threshold", "rest_levels", "rest_large_materials", "wall_clearance", "obstacle_clearance")
     pairs = [pair for pair in _network_pairs(info.network, config) if pair[0].removeprefix("network.") not in free]
     pairs.append(("dataset.frame_rate_hz", info.frame_rate_hz, config.dataset.frame_rate_hz))
     if info.network.sees_obstacles:

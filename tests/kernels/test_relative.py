@@ -93,19 +93,21 @@ def test_outputs_and_gradients(counts: tuple[int, ...], obstacles: bool, levels:
 
 
 @pytest.mark.parametrize(
-    ("counts", "obstacles", "levels", "sizes"),
+    ("counts", "obstacles", "levels", "sizes", "large"),
     [
-        *((EVERYWHERE, True, 2, 1), ((9, 33), False, 1, 1), ((1,), False, 2, 1), ((40,), False, 3, 1)),
-        *((EVERYWHERE, True, 1, 3), ((9, 33), False, 2, 2)),
+        *((EVERYWHERE, True, 2, 1, None), ((9, 33), False, 1, 1, None), ((1,), False, 2, 1, None)),
+        *(((40,), False, 3, 1, None), (EVERYWHERE, True, 1, 3, None), ((9, 33), False, 2, 2, None)),
+        ((9, 33), True, 1, 2, ("snow", "water")),
     ],
 )
-def test_rest(counts, obstacles, levels, sizes):
+def test_rest(counts, obstacles, levels, sizes, large):
     """Outputs and every gradient with deformations that are slow, nearly so, and fast, to 1e-4: of cells that hold few
     particles the rounding of inertia counts, as it does in PyTorch; to 1e-3 between cells of several sizes, where it
     counts several times (PyTorch in float32: 2e-3). What rest changes is more, and keeps momenta."""
     changes = {"levels": levels, "contact_forces": "normal"}
     without, network = (
-        relative_network(**resting, **changes) for resting in ({}, {"rest_threshold": 1.0, "rest_levels": sizes})
+        relative_network(**resting, **changes)
+        for resting in ({}, {"rest_threshold": 1.0, "rest_levels": sizes, "rest_large_materials": large})
     )
     state = moving_state(counts, obstacles, 0.1)
     state = replace(state, velocity_NM3=state.velocity_NM3.clamp(-2e-3, 2e-3))

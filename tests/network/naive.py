@@ -99,10 +99,11 @@ def _one_scene(network, state, members, scene, origin_S3):
     for level in range(config.rest_levels):
         moving = [value + state.velocity_NM3[i, 0] / scale for i, value in zip(members, output, strict=True)]
         slow = []
-        for rate in _deforming(config, felt[0], pairs, moving, level):
+        large = [config.rests_large[int(state.material_N[i])] or not level for i in members]
+        for rate in _deforming(config, felt[0], pairs, moving, level, large):
             ratio = rate.norm() * scale / (config.rest_threshold * state.gravity_S3[scene].norm() + 1e-300)
             slow.append((2 - ratio**2).clamp(0, 1) * rate)
-        stopped = _deforming(config, felt[0], pairs, slow, level)
+        stopped = _deforming(config, felt[0], pairs, slow, level, large)
         output = [value - part for value, part in zip(output, stopped, strict=True)]
     return output
 
@@ -206,12 +207,15 @@ def _free(top, place):
     return free
 
 
-def _deforming(config, touched, pairs, values, level):
-    """The part of values that deforms what touches, between cells 4^level times the coarsest (rest.Deformation)."""
+def _deforming(config, touched, pairs, values, level, resting):
+    """The part of values that deforms what touches and is `resting`, between cells 4^level times the coarsest
+    (rest.Deformation)."""
     span, hats = 2 ** (config.levels - 1), []
     for row in range(len(values)):
         mine = [(cell, weight, offset) for i, cell, weight, offset in pairs if i == row]
-        gate = sum(weight * touched(tuple(k >> config.levels - 1 for k in cell)) for cell, weight, _ in mine)
+        gate = resting[row] * sum(
+            weight * touched(tuple(k >> config.levels - 1 for k in cell)) for cell, weight, _ in mine
+        )
         place = ((torch.tensor(mine[0][0]) + 0.5 - mine[0][2]) / span - 0.5) / 4**level
         for corner in itertools.product((0, 1), repeat=3):
             middle = torch.floor(place) + torch.tensor(corner)

@@ -54,6 +54,16 @@ def test_fcn_halves_equal_the_definition():
         ((14, 4), {"inputs": "relative", "levels": 2, "contact_forces": "normal"}),
         ((14, 4), {"inputs": "relative", "rest_threshold": 2.0}),
         ((14, 4), {"inputs": "relative", "levels": 1, "rest_threshold": 2.0, "rest_levels": 3}),
+        (
+            (14, 4),
+            {
+                "inputs": "relative",
+                "levels": 1,
+                "rest_threshold": 2.0,
+                "rest_levels": 2,
+                "rest_large_materials": ("sand", "snow"),
+            },
+        ),
     ],
 )
 def test_network_equals_the_literal_definition(counts, changes):

@@ -130,7 +130,7 @@ def test_an_export_sets_rest_walls_and_obstacles(data, tmp_path):
     kept, absolute = (str(tmp_path / name / "checkpoints" / "last.ckpt") for name in ("relative", "absolute"))
     chosen = [
         {},
-        {"rest_threshold": 0.1, "rest_levels": 3},
+        {"rest_threshold": 0.1, "rest_levels": 3, "rest_large_materials": ["sand"]},
         {"wall_clearance": [0.02, 0.04]},
         {"obstacle_clearance": 1e-3},
     ]
@@ -141,7 +141,7 @@ def test_an_export_sets_rest_walls_and_obstacles(data, tmp_path):
     assert trained.network.rest_threshold == 0
     assert trained.network.wall_clearance is None and trained.network.obstacle_clearance is None
     expected = (
-        {"rest_threshold": 0.1, "rest_levels": 3},
+        {"rest_threshold": 0.1, "rest_levels": 3, "rest_large_materials": ("sand",)},
         {"wall_clearance": (0.02, 0.04)},
         {"obstacle_clearance": 1e-3},
     )

@@ -444,15 +444,15 @@ def _displaced(x, velocity, scale, row, live, OUT: tl.constexpr, HISTORY: tl.con
 
 @triton.jit
 def sum_displacements(
-    x, velocity, scale, coarsest_of, share_of, place_of, felt, slot_of_cell, geometry, low, base_of, gate_of, spot_of,
-    sums, particle_count,
-    OUT: tl.constexpr, HISTORY: tl.constexpr, LEVELS: tl.constexpr, SHIFT: tl.constexpr, COLUMNS: tl.constexpr,
-    FORWARD: tl.constexpr, OVERLAP: tl.constexpr, BLOCK: tl.constexpr,
+    x, velocity, scale, material_of, coarsest_of, share_of, place_of, felt, slot_of_cell, geometry, low, base_of,
+    gate_of, spot_of, sums, particle_count,
+    OUT: tl.constexpr, HISTORY: tl.constexpr, LEVELS: tl.constexpr, SHIFT: tl.constexpr, RESTING: tl.constexpr,
+    COLUMNS: tl.constexpr, FORWARD: tl.constexpr, OVERLAP: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Adds the particles' next displacements over `scale`, or with FORWARD off their gradients alone, to the sums
     [K, COLUMNS] of the middles around them of cells 2^SHIFT times as large as coarsest ones, moments too; forward with
     the bodies' own. There the lowest of these slots goes into `base_of` [N], the place from there into `spot_of`
-    [N, 3], and the gate into `gate_of` [N].
+    [N, 3], and the gate into `gate_of` [N]: 0 for materials whose bit is not in RESTING; with -1 all are.
 
     Reference: hgn.network.rest; test: tests/kernels/test_relative.py.
     """
@@ -462,6 +462,8 @@ def sum_displacements(
         line = geometry + (LEVELS - 1) * GEOMETRY_COLUMNS
         cell, share = _coarsest_cells(coarsest_of, share_of, row, live)
         gate = tl.sum(share * tl.load(felt + cell * 2 + 1, mask=cell >= 0, other=0.0), 1)
+        if RESTING != -1:
+            gate *= (RESTING >> tl.load(material_of + row, mask=live, other=0) & 1).to(tl.float32)
         own = tl.load(coarsest_of + row * 8, mask=live, other=-1)
         local = tl.load(slot_of_cell + tl.load(line + 6) + own, mask=own >= 0, other=0)
         ny, nz, stride = tl.load(line + 2), tl.load(line + 3), tl.load(line + 4)

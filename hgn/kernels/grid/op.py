@@ -273,6 +273,9 @@ class DeviceGrid:
         if config.rests:
             self._rest = {"velocity": velocity, "scale": std_3, "scene_of": scene_N, "gravity": gravity_S3}
             self._rest |= {"threshold": config.rest_threshold, "HISTORY": config.velocity_history}
+            large = config.rests_large
+            bits = sum(resting << material for material, resting in enumerate(large))
+            self._rest |= {"material_of": material_N, "large": -1 if all(large) else bits}
         arguments = feature_arguments(
             config, position, velocity, scene_N, material_N, domain_S3, count, obstacles, symmetry, self.feature_NF
         )
@@ -367,6 +370,7 @@ class DeviceGrid:
         coarsest_kernel.sum_displacements[blocks](
             **pairs, **moving, **sizes, coarsest_of=self.coarsest_N8, share_of=self.share_N8, place_of=self.place_N3,
             felt=self.felt_C2, slot_of_cell=self.slot_of_cell, low=self.low, sums=first, SHIFT=level * LEVEL_SHIFT,
+            material_of=rest["material_of"], RESTING=rest["large"] if level else -1,
             COLUMNS=SUMS if forward else RATES, launch_pdl=overlap and forward,
         )  # fmt: skip
         find(first)
