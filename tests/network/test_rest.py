@@ -123,6 +123,25 @@ def test_what_is_larger_than_coarsest_cells_rests(shift):
     assert left[1, 100.0] == pytest.approx(1, abs=2e-2) == left[3, 100.0]
 
 
+def test_what_flows_is_not_stopped_by_larger_cells():
+    """Of two materials in one pile, the one that does not rest between larger cells is left as coarsest cells alone
+    leave it; the other is slowed further, and momenta stay."""
+    place_N3 = torch.cat([within_a_cell(), 4 * within_a_cell(80) - 1.6])
+    state, grid, touched_C = on_cells(place_N3)
+    flows_N = torch.arange(len(place_N3)) % 2
+    state = replace(state, material_N=flows_N, velocity_NM3=0.3 * drawn_outputs(len(place_N3))[:, None, 3:6])
+    acceleration_N3 = drawn_outputs(len(place_N3))[:, :3]
+    one, all_N3, some_N3 = (
+        rested(acceleration_N3, state, touched_C, grid, 1e3, ONE, sizes, large_M)
+        for sizes, large_M in ((1, None), (2, None), (2, torch.tensor([1.0, 0.0], dtype=torch.float64)))
+    )
+    assert torch.equal(some_N3[flows_N == 1], one[flows_N == 1])
+    change_N3 = some_N3 - one
+    assert float(change_N3.abs().max()) > 0.1 and float((some_N3 - all_N3).abs().max()) > 0.1
+    assert float(change_N3.sum(0).abs().max()) < 1e-11
+    assert float(torch.linalg.cross(place_N3 - 0.4, change_N3).sum(0).abs().max()) < 1e-11
+
+
 @THRESHOLDS
 def test_no_boost_is_seen(threshold):
     """A common velocity or rate of rotation more of all within a cell changes nothing."""
