@@ -379,8 +379,8 @@ class NetworkConfig:
         require(self.rests or self.rest_levels == 1, "rest_levels", rule, self.rest_levels)
         if self.rest_large_materials is not None:
             known = set(self.rest_large_materials) <= set(self.materials)
-            rule = f"of the materials {', '.join(self.materials)}, or null with rest_levels=1"
-            require(known and self.rest_levels > 1, "rest_large_materials", rule, list(self.rest_large_materials))
+            rule = f"of the materials {', '.join(self.materials)}"
+            require(known, "rest_large_materials", rule, list(self.rest_large_materials))
         held, rule = self.obstacle_clearance is not None, "null with dimensions=2"
         require(not held or self.dimensions == 3, "obstacle_clearance", rule, self.obstacle_clearance)
         if self.kind == "hgn":

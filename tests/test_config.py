@@ -36,12 +36,8 @@ RULES = {
         ({"rest_threshold": 0.3}, "rest_threshold must be 0 with inputs=absolute, got 0.3"),
         (RELATIVE | {"rest_threshold": 0.1, "rest_levels": 9}, "rest_levels must be at most 8, got 9"),
         (
-            RELATIVE | {"rest_threshold": 0.1, "rest_levels": 2, "rest_large_materials": ("mud",)},
-            "rest_large_materials must be of the materials water, sand, snow, or null with rest_levels=1",
-        ),
-        (
-            RELATIVE | {"rest_threshold": 0.1, "rest_large_materials": ("sand",)},
-            "rest_large_materials must be of the materials water, sand, snow, or null with rest_levels=1",
+            {"rest_large_materials": ("sand", "mud")},
+            r"rest_large_materials must be of the materials water, sand, snow, got \['sand', 'mud'\]",
         ),
         (RELATIVE | {"rest_levels": 2}, "rest_levels must be 1 with rest_threshold=0, where nothing rests, got 2"),
         (RELATIVE | {"rest_threshold": 0.3, "dimensions": 2}, "rest_threshold must be 0 with dimensions=2"),

@@ -32,6 +32,7 @@ from tools.stability.network import (
     misfallen,
     mispassed,
     passing,
+    pulled,
     share_of_way,
     solver_beside,
     solver_of,
@@ -300,10 +301,29 @@ def test_holes_beside_the_solver(through, leaked, beyond):
     assert mispassed([hole], [solver]) == beyond
     row = case_row(simulator, case, initial, own, None, solvers)
     assert row.more["passed"][1] == hole and row.more["solver_passed"][1] == solver
+    assert row.more["pull"] == row.more["solver_pull"] == [None, None]  # four frames are fewer than a history
     early = [own[0], RolloutResult(own[1].position_TN3[:3], "diverged at frame 3")]
     row = case_row(simulator, case, initial, early, None, solvers)
     assert not row.held and row.beyond == "diverged at frame 3" and row.more["passed"] is None
     assert "the solver did not come to the end" in mispassed([hole], passing(early, initial, case, 0.035))
+
+
+def test_pull_in_a_hole():
+    """Of what is in the hole in the solver's film, and nothing else: without contacts the network's falls with gravity,
+    whatever the weights; what followed hung there, or fell."""
+    network = network_of(torch.float32, inputs="relative", obstacle_features=False)
+    scene = next(iter(cases(StabilityNetworkConfig("", cases=("single",)), network.config))).scenes[0]
+    place_N3 = np.array([[0.5, 0.4, 0.49], [0.51, 0.405, 0.5], [0.5, 0.6, 0.5], [0.8, 0.4, 0.5]], np.float32)
+    scene = replace(scene, position_N3=place_N3, velocity_N3=np.zeros_like(place_N3), material_N=np.zeros(4, np.uint8))
+    case = Case("passes holes", (scene,) * 2, 20, hole_cells=(2.0, 2.0), hole_height=0.4)
+    fall_T = 0.5 * scene.gravity[1] / 60**2 * np.arange(20.0) ** 2
+    films = [np.stack([place_N3] * 20), np.stack([place_N3] * 20)]
+    films[1][:, :2, 1] += (0.5 * (fall_T - fall_T[10]))[
+        :, None
+    ]  # half as fast as a free fall, and in the hole for a while
+    own, true = pulled(Simulator(network, 60.0), initial_states(case), [RolloutResult(film) for film in films], case)
+    assert own == [pytest.approx(1, abs=1e-3)] * 2
+    assert true == [pytest.approx(0, abs=1e-3), pytest.approx(0.5, abs=1e-3)]
 
 
 def test_turned_gravity(monkeypatch):

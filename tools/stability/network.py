@@ -57,6 +57,7 @@ SPREAD_WITHIN, FALLEN_CELLS = 0.15, 0.5
 PASSED_WITHIN = 0.2
 LEAKED_WITHIN = 0.05  # of all particles, beyond what leaks with the solver, may come through a funnel's sheets
 HOLE_MARGIN_CELLS = 0.5  # of the solver, beyond a hole's edges, that still count as the hole: its sheets' band
+PULLED_CELLS, PULLED_EVERY = 0.3, 5  # finest cells from a hole's edge is what is in it; frames that are asked
 HEIGHT_CELLS = 0.1  # that the mean height at rest may differ from the solver's
 STIR_FRAMES = 60  # the last ones, over which the squared speed at rest is averaged
 # Of the solver's own squared speed about the mean at rest, and so many (domain units per second)^2, may there be: twice
@@ -220,6 +221,7 @@ def case_row(
         cell_size = simulator.network.config.cell_size
         passed, solvers_passed = (passing(some, initial, case, cell_size) for some in (trials, beside))
         more |= {"passed": passed, "solver_passed": solvers_passed}
+        more |= dict(zip(("pull", "solver_pull"), pulled(simulator, initial, beside, case), strict=True))
         restless = mispassed(passed, solvers_passed)
     if case.settled is not None and beside is not None:
         own, solvers = (at_rest(some, initial, case.settled, simulator.frame_rate_hz) for some in (trials, beside))
@@ -326,6 +328,40 @@ def passing(
         through, leaked = (float(some_N.sum() / below_TN.shape[1]) for some_N in (within_N, ~within_N))
         rows.append({"hole_cells": cells, "through": through, "leaked": leaked})
     return rows
+
+
+def pulled(
+    simulator: Simulator, scenes: Sequence[InitialState], films: Sequence[RolloutResult], case: Case
+) -> tuple[list[float | None], list[float | None]]:
+    """Of each scene, the mean acceleration along gravity, in gravities, of what is in its hole in the solver's `films`:
+    what the network makes of these states, a frame each, and what followed. None where nothing is there. A rollout
+    passes a hole or is stuck by little; this says by how much.
+    """
+    history, reach = simulator.network.config.velocity_history, PULLED_CELLS * simulator.network.config.cell_size
+    own: list[float | None] = []
+    true: list[float | None] = []
+    for cells, scene, film in zip(case.hole_cells, scenes, films, strict=True):
+        start = simulator.start([scene])
+        position_TN3 = torch.from_numpy(film.position_TN3).to(start.position_N3)
+        aside_TN3 = (position_TN3 - 0.5 * torch.tensor(scene.domain_size).to(position_TN3)).abs()
+        within_TN = (aside_TN3[..., [0, 2]] <= 0.5 * cells * simulator.network.config.cell_size).all(-1)
+        within_TN &= (position_TN3[..., 1] - case.hole_height).abs() <= reach
+        pulls: list[torch.Tensor] = []
+        for frame in range(history, len(position_TN3) - 1, PULLED_EVERY):
+            within_N = within_TN[frame]
+            if not bool(within_N.any()):
+                continue
+            past_TN3 = position_TN3[frame - history : frame + 1]
+            velocity_NM3 = past_TN3.diff(dim=0).flip(0).transpose(0, 1).contiguous()
+            state = replace(start, position_N3=past_TN3[-1].clone(), velocity_NM3=velocity_NM3)
+            nexts = torch.stack([simulator.step(state).position_N3, position_TN3[frame + 1]])
+            change_2N = (nexts - past_TN3[-1] - velocity_NM3[:, 0])[..., 1]
+            pulls.append(change_2N[:, within_N].double())
+        if pulls:
+            gravity = float(start.gravity_S3[0, 1])
+        for side, means in enumerate((own, true)):
+            means.append(float(torch.cat(pulls, dim=1)[side].mean()) / gravity if pulls else None)
+    return own, true
 
 
 def mispassed(own: list[dict[str, float]] | None, solvers: list[dict[str, float]] | None) -> str | None:
