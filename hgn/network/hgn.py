@@ -97,7 +97,9 @@ class HierarchicalGraphNetwork(ParticleNetwork):
         if not self.config.rests:
             return acceleration_N3
         scale, config = self.normaliser.acceleration_std[0], self.config
-        large_M = torch.tensor(config.rests_large, dtype=scale.dtype, device=scale.device)
+        large_M = None
+        if config.rest_large_materials is not None:
+            large_M = torch.tensor(config.rests_large, dtype=scale.dtype, device=scale.device)
         return rested(
             acceleration_N3, state, contacts.touched_C, grid, config.rest_threshold, scale, config.rest_levels, large_M
         )
