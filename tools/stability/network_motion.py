@@ -176,31 +176,33 @@ def turned_rows(simulator: Simulator, scene: SceneConfig, material: str, solver:
     places_K3 = begun_K3 * np.array(scene.domain_size)
     upright = [cube(scene, material, place_3, np.zeros(3), seed) for seed, place_3 in enumerate(places_K3)]
     reference: list[RolloutResult] = []
+    straight: list[RolloutResult] = []
     for way, order in TURNS.items():
         name = f"to rest in gravity along {way}, {material}"
         x, y, z = (upright[0].gravity[axis] for axis in order)
         turned = [replace(each, position_N3=each.position_N3[:, order], gravity=(x, y, z)) for each in upright]
         try:
-            trials = _rollouts(simulator, [*upright, *turned], TO_REST_FRAMES)
+            back = _rollouts(simulator, turned, TO_REST_FRAMES)
         except ConfigError as refusal:
             yield Row(name, AS_GOOD, "refused", False, str(refusal))
             continue
         if not reference:  # seconds on a GPU, a minute on a CPU
+            straight = _rollouts(simulator, upright, TO_REST_FRAMES)
             reference = solver_trials(upright, solver, TO_REST_FRAMES, simulator.frame_rate_hz)
-        causes = [trial.cause for trial in (*trials, *reference) if trial.cause is not None]
+        causes = [trial.cause for trial in (*straight, *back, *reference) if trial.cause is not None]
         if causes:
             yield Row(name, AS_GOOD, "diverged", False, causes[0])
             continue
-        truths = [trial.position_TN3 for trial in reference]
-        straight = [trial.position_TN3 for trial in trials[:TURNED_CUBES]]
-        back = [trial.position_TN3[..., order] for trial in trials[TURNED_CUBES:]]
-        own, other = (
-            float(np.mean([position_mse(*pair) for pair in zip(paths, truths, strict=True)]))
-            for paths in (straight, back)
-        )
+        own, other = _mean_mse(straight, reference, (0, 1, 2)), _mean_mse(back, reference, order)
         more = {"upright_mse": own, "turned_mse": other, "cubes": TURNED_CUBES}
         beyond = "times the upright rollouts' position MSE to the solver"
         yield Row(name, AS_GOOD, other / own, other <= AS_GOOD * own, beyond, more)
+
+
+def _mean_mse(trials: Sequence[RolloutResult], reference: Sequence[RolloutResult], order: tuple[int, ...]) -> float:
+    """Of all frames and scenes, once the trials' axes are put in this order."""
+    pairs = zip(trials, reference, strict=True)
+    return float(np.mean([position_mse(own.position_TN3[..., order], true.position_TN3) for own, true in pairs]))
 
 
 def meeting_row(
