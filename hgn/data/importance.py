@@ -19,6 +19,15 @@ from hgn.scene.history import frames_before
 PARTICLES = 512  # of an episode that are looked at, about
 
 
+def chance_by_size(size_F: np.ndarray, fraction: float) -> np.ndarray:
+    """How often each is drawn, 1 on average, where a `fraction` of the draws is in proportion to size, the others even.
+
+    Its inverse is the weight that leaves a mean over draws as it is.
+    """
+    mean = size_F.mean() if len(size_F) else 0.0
+    return (1 - fraction) + fraction * (size_F / mean if mean > 0 else np.ones(len(size_F)))
+
+
 @dataclass(frozen=True, eq=False)
 class FrameImportance:
     """An episode's frames with the fraction of its samples that each gets, a distribution over F frames."""
@@ -34,10 +43,7 @@ class FrameImportance:
         position_TN3 = np.concatenate([past_1N3, episode.position_TN3[:, ::step]], dtype=np.float64)
         square_FN3 = np.diff(position_TN3, 2, axis=0) ** 2
         size_F = np.sqrt(square_FN3.mean(axis=(1, 2))) if square_FN3.size else np.zeros(len(square_FN3))
-        total = size_F.sum()
-        even_F = np.full(len(size_F), 1 / len(size_F))
-        chance_F = (1 - fraction) * even_F + fraction * (size_F / total if total > 0 else even_F)
-        cumulative_F = chance_F.cumsum()
+        cumulative_F = chance_by_size(size_F, fraction).cumsum()
         return FrameImportance(cumulative_F / cumulative_F[-1], size_F)
 
     def draw(self, slot: int, seed: int) -> tuple[int, float]:

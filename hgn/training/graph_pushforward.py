@@ -28,9 +28,9 @@ from hgn.network.obstacles import ObstacleCells
 from hgn.runtime.triton_rollout import CHECKED_PARTICLES, TritonRollout
 from hgn.training.noise import noise_scale, target_acceleration
 from hgn.training.pushforward import (
+    PoolDraws,
     by_frames,
     diverged_scenes,
-    drawn_pool_samples,
     known_frames,
     pool_figures,
     pushforward_windows,
@@ -51,16 +51,17 @@ class GraphPushforwardPool:
         self.obstacle_cell_size = obstacle_cell_size
         self._rollout: TritonRollout | None = None
         self._samples: list[tuple[DeviceEpisode, float]] = []  # with the rms of the target acceleration
+        self._draws = PoolDraws(training, rank, [])
         self.figures: dict[str, float] = {}
 
     def replaced(self, samples: list[DeviceSample], update: int) -> list[DeviceSample]:
         """The samples of an update with a fraction from the pool; seeds stay."""
         samples = list(samples)
-        for slot, number in enumerate(drawn_pool_samples(self.training, update, self.rank, len(self._samples))):
+        for slot, (number, rarity) in enumerate(self._draws.drawn(update)):
             episode, acceleration = self._samples[number]
             seed = samples[slot].seed
             scale, weight = noise_scale(self.training, acceleration, seed)
-            samples[slot] = DeviceSample(episode, 0, seed, weight, scale)
+            samples[slot] = DeviceSample(episode, 0, seed, rarity * weight, scale)
         return samples
 
     def refresh(self, starts: Sequence[tuple[DeviceEpisode, int]], values: torch.Tensor) -> None:
@@ -76,6 +77,7 @@ class GraphPushforwardPool:
             answered = [known_frames(frames, episode.frames - before, frame) for episode, frame in alike]
             squares += self._taken(alike, answered, frames, len(starts), values)
             known += sum(answered)
+        self._draws = PoolDraws(self.training, self.rank, [acceleration for _, acceleration in self._samples])
         self.figures = pool_figures(len(self._samples), known, squares, time.monotonic() - begin_s)
 
     def _taken(
@@ -99,8 +101,9 @@ class GraphPushforwardPool:
         paths = path_FN3.split([episode.particles for episode in episodes], dim=1)
         parts = [path_FN3[:known] for path_FN3, known in zip(paths, answered, strict=True)]
         domain_S3 = torch.tensor([episode.domain_size for episode in episodes], device=device)
+        farthest = self.training.pushforward_drop_cells * config.cell_size
         counts_and_squares = [
-            torch.stack([x.double() for x in usable_frames(truth, part, domain_3, config.cell_size)])
+            torch.stack([x.double() for x in usable_frames(truth, part, domain_3, farthest)])
             for truth, part, domain_3 in zip(truths, parts, domain_S3, strict=True)
         ]
         squares = []

@@ -27,6 +27,7 @@ import torch
 
 from hgn.config import SIMULATED_FRAMES, TrainingConfig
 from hgn.data.batch import BatchSample, UpdateSamples, make_batch
+from hgn.data.importance import chance_by_size
 from hgn.network.barriers import Barriers
 from hgn.network.base import ParticleNetwork
 from hgn.runtime.backend import fastest_stepped
@@ -42,9 +43,6 @@ from hgn.training.noise import noise_scale, target_acceleration
 S = TypeVar("S")
 Starts = tuple[tuple[int, int], ...]  # episodes and frames that the network simulates from
 START_STREAM, SAMPLE_STREAM = 0x57A7, 0xE217
-# finest cells; farther from the truth (rms over a scene) its motion is no answer any more, and the loss would be made
-# of such frames alone: they are dropped, and with an untrained network most are
-DROPPED_BEYOND = 0.5
 PULLED_WITHIN = 1.0  # finest cells on an axis; no particle is pulled as if it were farther away
 
 
@@ -76,13 +74,27 @@ def drawn_starts(training: TrainingConfig, update: int, rank: int, frame_counts:
     return tuple((i, int(generator.integers(last[i] + 1))) for i in drawn[: training.pushforward_scenes])
 
 
-def drawn_pool_samples(training: TrainingConfig, update: int, rank: int, pool_size: int) -> list[int]:
-    """Which windows of the pool replace the first samples of an update, `pushforward_fraction` of them on average."""
-    if pool_size == 0:
-        return []
-    generator = np.random.default_rng([training.seed, SAMPLE_STREAM, update, rank])
-    count = int(training.pushforward_fraction * training.batch_scenes + generator.random())
-    return [int(place * pool_size) for place in generator.random(count)]
+class PoolDraws:
+    """Which windows of a pool are drawn, and how often: by the accelerations that they ask for where
+    `training.pushforward_importance` says so."""
+
+    def __init__(self, training: TrainingConfig, rank: int, accelerations: Sequence[float]) -> None:
+        self._training, self._rank = training, rank
+        chance_W = chance_by_size(np.array(accelerations, np.float64), training.pushforward_importance)
+        self._weight_W = 1 / chance_W
+        self._cumulative_W = chance_W.cumsum()
+
+    def drawn(self, update: int) -> list[tuple[int, float]]:
+        """The windows that replace the first samples of an update, `pushforward_fraction` of them on average, each
+        with the weight of its loss.
+        """
+        if not len(self._weight_W):
+            return []
+        generator = np.random.default_rng([self._training.seed, SAMPLE_STREAM, update, self._rank])
+        count = int(self._training.pushforward_fraction * self._training.batch_scenes + generator.random())
+        places = generator.random(count) * self._cumulative_W[-1]
+        numbers = np.searchsorted(self._cumulative_W, places, side="right").clip(max=len(self._weight_W) - 1)
+        return [(number, float(self._weight_W[number])) for number in numbers.tolist()]
 
 
 def by_frames(training: TrainingConfig, starts: Sequence[S], frame_counts: Sequence[int]) -> list[tuple[int, list[S]]]:
@@ -118,14 +130,15 @@ def pushforward_windows(
 
 
 def usable_frames(
-    true_TN3: torch.Tensor, simulated_FN3: torch.Tensor, domain_3: torch.Tensor, cell_size: float
+    true_TN3: torch.Tensor, simulated_FN3: torch.Tensor, domain_3: torch.Tensor, farthest: float
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """How many frames from the first on can be trained on, and the mean squared distance from the truth in the last of
-    them, both [] on the device.
+    them, both [] on the device. Those farther from the truth than `farthest` (rms) cannot, nor those behind: with an
+    untrained network most are, and the loss would be made of them alone.
     """
     now_FN3 = true_TN3[len(true_TN3) - len(simulated_FN3) - 1 : -1]
     square_F = (simulated_FN3 - now_FN3).square().sum(-1).mean(-1)
-    good_F = (square_F <= (DROPPED_BEYOND * cell_size) ** 2) & ~diverged(simulated_FN3, domain_3).any(-1)  # NaN is not
+    good_F = (square_F <= farthest**2) & ~diverged(simulated_FN3, domain_3).any(-1)  # NaN is not
     count = good_F.int().cumprod(0).sum()
     return count, square_F[(count - 1).clamp(min=0)]
 
@@ -156,6 +169,7 @@ class PushforwardPool:
         self.network, self.training, self.rank = network, training, rank
         self._backend = fastest_stepped(network)
         self._samples: list[tuple[BatchSample, float]] = []  # with the rms of the target acceleration
+        self._draws = PoolDraws(training, rank, [])
         self.figures: dict[str, float] = {}
 
     def refresh(self, starts: Sequence[tuple[Episode, int]]) -> None:
@@ -169,16 +183,17 @@ class PushforwardPool:
                     answered = known_frames(frames, episode.frame_count, frame)
                     squares += self._take(episode, frame, simulated_FN3[:answered])
                     known += answered
+        self._draws = PoolDraws(self.training, self.rank, [acceleration for _, acceleration in self._samples])
         self.figures = pool_figures(len(self._samples), known, squares, time.monotonic() - begin_s)
 
     def replaced(self, update_samples: UpdateSamples, update: int) -> UpdateSamples:
         """The samples of an update with a fraction from the pool; seeds stay, and with them noise, jitter, symmetry."""
         samples = list(update_samples.samples)
-        for slot, number in enumerate(drawn_pool_samples(self.training, update, self.rank, len(self._samples))):
+        for slot, (number, rarity) in enumerate(self._draws.drawn(update)):
             own, acceleration = self._samples[number]
             seed = samples[slot].seed
             scale, weight = noise_scale(self.training, acceleration, seed)
-            samples[slot] = replace(own, seed=seed, weight=weight, noise_scale=scale)
+            samples[slot] = replace(own, seed=seed, weight=rarity * weight, noise_scale=scale)
         return replace(update_samples, samples=tuple(samples))
 
     def _groups(self, starts: Sequence[tuple[Episode, int]]) -> list[list[tuple[Episode, int]]]:
@@ -221,7 +236,8 @@ class PushforwardPool:
         """Adds a scene's windows; its mean squared distance at the end, where it is there until then."""
         config, frames = self.network.config, len(simulated_FN3)
         true_TN3 = torch.from_numpy(window(episode, frame, config.velocity_history, frames + 1))
-        count, square = usable_frames(true_TN3, simulated_FN3, torch.tensor(episode.domain_size), config.cell_size)
+        farthest = self.training.pushforward_drop_cells * config.cell_size
+        count, square = usable_frames(true_TN3, simulated_FN3, torch.tensor(episode.domain_size), farthest)
         windows = pushforward_windows(true_TN3, simulated_FN3, self.training.pushforward_pull, config.cell_size)
         accelerations = target_acceleration(windows).tolist()
         self._samples += [

@@ -66,7 +66,8 @@ def test_the_pool_is_that_of_the_plain_path(changes):
     other numbers of particles, in the same buffers where they suffice: both pools hold the same windows."""
     network = network_of(torch.float32, width=16, levels=1, message_passing_steps=1, **changes).to(device())
     scenes = [scene_with_obstacles(0, 7), episode(5, seed=1), scene_with_obstacles(2, 6), scene_with_obstacles(3, 12)]
-    training = training_of(precision="fp32", pushforward_frames=2, noise_std=0.5, noise_min_scale=0.1)
+    drawn = {"noise_std": 0.5, "noise_min_scale": 0.1, "pushforward_importance": 0.5}
+    training = training_of(precision="fp32", pushforward_frames=2, **drawn)
     fast, plain = GraphPushforwardPool(network, training, CELL_SIZE, 0), PushforwardPool(network, training, 0)
     if "obstacle_clearance" in changes:
         scenes = [with_square(made, (0.25, 0.25, 0.25)) if made is not scenes[1] else made for made in scenes]
@@ -90,9 +91,11 @@ def test_the_pool_is_that_of_the_plain_path(changes):
     mixed = fast.replaced(samples, 11)
     assert [sample.seed for sample in mixed] == [5, 6, 7, 8] and mixed[2:] == samples[2:]
     asked = dict(fast._samples)
+    mean = sum(asked.values()) / len(asked)
     for sample in mixed[:2]:
-        drawn = sample.noise_scale, sample.weight
-        assert drawn == noise_scale(training, asked[sample.episode], sample.seed) and sample.frame == 0
+        scale, weight = noise_scale(training, asked[sample.episode], sample.seed)
+        assert sample.noise_scale == scale and sample.frame == 0
+        assert sample.weight == pytest.approx(weight / (0.5 + 0.5 * asked[sample.episode] / mean))
     assert len({sample.noise_scale for sample in mixed[:2]} | {1.0}) == 3
 
 

@@ -516,6 +516,28 @@ def test_rest_is_judged_on_a_scene_of_each_seed():
         StabilityNetworkConfig("", rest_seeds=())
 
 
+def test_rest_goes_on_from_the_solvers_own_film():
+    """The film stays as it is until then; from its last velocity on the network flies, whatever came before it."""
+    network = network_of(torch.float32, inputs="relative", velocity_history=3)
+    simulator = Simulator(network, 60.0, "torch", "fp32")
+    scene = SceneConfig(group_size=0.03, group_count=1, gravity=(0.0, 0.0, 0.0))
+    config = StabilityNetworkConfig("", cases=("rest",), frames=8, long_frames=12, rest_from=5, scene=scene)
+    (case, *_) = cases(config, network.config)
+    assert case.name == "12 frames, water, from frame 5 of the solver's" and case.begun == 5
+    initial = initial_states(case)
+    middle_N3 = 0.5 + 0.1 * (initial[0].position_N3 - initial[0].position_N3.mean(axis=0))
+    velocity_3, sign_T = np.array([3e-3, -2e-3, 1e-3]), np.array([-1, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11])
+    film_TN3 = (middle_N3 + sign_T[:, None, None] * velocity_3).astype(np.float32)
+    film_TN3[0] += 0.2  # which no velocity from frame 5 on has seen
+    (trial,), _ = case_trials(simulator, case, initial, [RolloutResult(film_TN3)])
+    assert trial.frame_count == 12 and trial.cause is None
+    assert np.array_equal(trial.position_TN3[:6], film_TN3[:6])
+    np.testing.assert_allclose(trial.position_TN3[6:], film_TN3[6:], rtol=0, atol=1e-6)
+    for refused in (2, 8):
+        with pytest.raises(ConfigError, match=r"rest_from must be 0, or from 3 to 7, where all rests, got"):
+            list(cases(replace(config, rest_from=refused), network.config))
+
+
 def test_scenes_follow_the_network():
     """A network that sees no obstacles gets none, and one that knows two materials gets those."""
     blind = network_of(obstacle_features=False, materials=("water", "snow")).config

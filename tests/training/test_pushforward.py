@@ -25,7 +25,7 @@ from hgn.scene.rollout_file import known_obstacles
 from hgn.scene.scene import all_corners
 from hgn.schema import ConfigError
 from hgn.training.checkpoint import read_checkpoint
-from hgn.training.pushforward import PushforwardPool, drawn_pool_samples, drawn_starts, pushforward_windows
+from hgn.training.pushforward import PoolDraws, PushforwardPool, drawn_starts, pushforward_windows
 
 HISTORY, CELL = 5, 0.1
 
@@ -84,13 +84,31 @@ def test_the_share_is_kept(share, scenes):
     """On average this share of the samples is replaced, at most one sample more or less in an update, by windows of the
     whole pool; with an empty pool none is."""
     training = training_of(pushforward_fraction=share, batch_scenes=scenes)
-    drawn = [drawn_pool_samples(training, update, 0, 10) for update in range(2000)]
+    pool = PoolDraws(training, 0, [0.0, *range(9)])  # alike, whatever they ask for
+    drawn = [pool.drawn(update) for update in range(2000)]
     counts = [len(entries) for entries in drawn]
     assert np.mean(counts) == pytest.approx(share * scenes, abs=0.03)
     assert all(abs(count - share * scenes) < 1 for count in counts)
     if share:
-        assert {entry for entries in drawn for entry in entries} == set(range(10))
-    assert drawn_pool_samples(training, 3, 0, 0) == []
+        assert {entry for entries in drawn for entry in entries} == {(number, 1.0) for number in range(10)}
+    assert PoolDraws(training, 0, []).drawn(3) == []
+
+
+def test_windows_that_ask_for_more_come_more_often():
+    """A fraction of the draws is in proportion to the acceleration asked for; weighted means stay those of the pool.
+    Where nothing accelerates, all come alike."""
+    accelerations = [0.0, 1.0, 2.0, 5.0]
+    training = training_of(pushforward_importance=0.6)
+    drawn = [entry for update in range(5000) for entry in PoolDraws(training, 0, accelerations).drawn(update)]
+    assert len(drawn) == 10_000
+    for number, acceleration in enumerate(accelerations):
+        chance = 0.4 / 4 + 0.6 * acceleration / 8
+        assert sum(i == number for i, _ in drawn) / 10_000 == pytest.approx(chance, abs=0.015)
+        assert all(weight == pytest.approx(1 / (4 * chance)) for i, weight in drawn if i == number)
+    for number in range(4):
+        assert sum(weight for i, weight in drawn if i == number) / 10_000 == pytest.approx(0.25, abs=0.02)
+    still = [entry for update in range(400) for entry in PoolDraws(training, 0, [0.0] * 3).drawn(update)]
+    assert set(still) == {(0, 1.0), (1, 1.0), (2, 1.0)}
 
 
 def samples_of(episodes, frame, seeds):
@@ -167,9 +185,9 @@ def test_the_pool_is_what_the_network_does(network):
         np.testing.assert_allclose(sample.window_WN3, wanted.numpy(), rtol=0, atol=1e-7)
     samples = samples_of([*episodes, *episodes], 3, seeds=(5, 6, 7, 8))
     replaced = own.replaced(samples, 11).samples
-    chosen = drawn_pool_samples(own.training, 11, 0, 6)
+    chosen = PoolDraws(own.training, 0, [acceleration for _, acceleration in own._samples]).drawn(11)
     assert len(chosen) == 2 and [sample.seed for sample in replaced] == [5, 6, 7, 8]
-    for slot, number in enumerate(chosen):
+    for slot, (number, _) in enumerate(chosen):
         assert replaced[slot].window_WN3 is own._samples[number][0].window_WN3
     assert replaced[2:] == samples.samples[2:]
     batch = own.replaced(samples, 11).batch(network.config)
@@ -233,7 +251,8 @@ def test_barriers_are_remembered(monkeypatch):
 
 def test_lost_scenes_are_dropped():
     """A scene whose particles leave its domain by more than its size, or are no longer numbers, gives the windows
-    before that and none after; the others give all, and one too far from the truth none from there on."""
+    before that and none after; the others give all, and one too far from the truth none from there on, but where
+    that is allowed."""
     network = wild_network()
     small, large = falling(episode(4, seed=1), 0.27), episode(4, seed=2)  # both around 0.5: 0.02, 0.06, 0.12 on
     own = pool_of(network)
@@ -243,6 +262,9 @@ def test_lost_scenes_are_dropped():
     network.config = replace(network.config, cell_size=0.1)  # 0.02 sqrt(3) < 0.05 < 0.06 sqrt(3)
     own.refresh([(small, 2), (large, 2)])
     assert [sample.episode is small for sample, _ in own._samples] == [True, False]
+    patient = pool_of(network, training_of(pushforward_drop_cells=1.1))  # 0.06 sqrt(3) < 0.11 < 0.12 sqrt(3)
+    patient.refresh([(small, 2), (large, 2)])
+    assert [sample.episode is small for sample, _ in patient._samples] == [True, False, False]
     with torch.no_grad():
         network.normaliser.acceleration_mean.fill_(torch.nan)
     own.refresh([(small, 2), (large, 2)])

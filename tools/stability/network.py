@@ -116,7 +116,7 @@ def main(mapping: dict[str, Any]) -> int:
     with bar("cases", total=len(made), unit="case") as progress:
         for case in made:
             started, growths, compiled, states = time.monotonic(), backend.growths, late(), initial[case.name]
-            trials, milliseconds = case_trials(simulator, case, states)
+            trials, milliseconds = case_trials(simulator, case, states, beside.get(case.name))
             row = case_row(simulator, case, states, trials, milliseconds, beside.get(case.name))
             if config.picture is not None:
                 pictures.append(case_picture(simulator, case, trials[0], weights))
@@ -168,11 +168,26 @@ def initial_states(case: Case) -> list[InitialState]:
 
 
 def case_trials(
-    simulator: Simulator, case: Case, initial: Sequence[InitialState]
+    simulator: Simulator, case: Case, initial: Sequence[InitialState], films: Sequence[RolloutResult] | None = None
 ) -> tuple[list[RolloutResult], float | None]:
-    """Simulates a case; the milliseconds of a frame too."""
+    """Simulates a case, where it says so from a frame of the solver's `films` on, which then come before; the
+    milliseconds of a frame too.
+    """
     clock = FrameClock()
-    return simulate_scenes(simulator, initial, case.frames, clock), clock.milliseconds()
+    if not case.begun:
+        return simulate_scenes(simulator, initial, case.frames, clock), clock.milliseconds()
+    assert films is not None
+    history, begun = simulator.network.config.velocity_history, case.begun
+    states = [
+        replace(scene, position_N3=film.position_TN3[begun], past_HN3=film.position_TN3[begun - history : begun])
+        for scene, film in zip(initial, films, strict=True)
+    ]
+    trials = simulate_scenes(simulator, states, case.frames - begun, clock)
+    joined = [
+        replace(trial, position_TN3=np.concatenate([film.position_TN3[:begun], trial.position_TN3]))
+        for trial, film in zip(trials, films, strict=True)
+    ]
+    return joined, clock.milliseconds()
 
 
 def case_picture(simulator: Simulator, case: Case, trial: RolloutResult, weights: str) -> Image.Image:

@@ -19,7 +19,7 @@ from hgn.scene.random_scene import REPORT_SEED, generate_scene
 from hgn.scene.rotation import euler_rotation, quaternion_rotation
 from hgn.scene.scene import Scene
 from hgn.scene.shapes import shape_obstacle
-from hgn.schema import ConfigError, FrameCount, Positive, one_of, require, require_bounds
+from hgn.schema import ConfigError, FrameCount, NonNegative, Positive, one_of, require, require_bounds
 from tools.scenes import filled
 
 MOTION = ("throw", "gravity", "collision")  # tools/stability/network_motion.py
@@ -52,6 +52,8 @@ class StabilityNetworkConfig:
     long_frames: FrameCount = 3000  # of the case rest
     # of its scenes, one each of every material, judged together; others than the first are for choices
     rest_seeds: tuple[Positive[int], ...] = (REPORT_SEED,)
+    # frame of the solver's own film of these scenes that the network goes on from; 0: it simulates them from the first
+    rest_from: NonNegative[int] = 0
     # in each rollout of throw, gravity and collision; null: as many as a row has throws
     scenes_at_once: Positive[int] | None = None
     # also ask the solver, which needs Taichi: for slope, collision, collapse, hole and rest; without it the latter
@@ -89,6 +91,7 @@ class Case:
     hole_cells: tuple[float, ...] = ()
     hole_height: float = 0.0  # of the holes' edges
     settled: int | None = None  # frame from which on all rests: drift, density and height are judged beside the solver
+    begun: int = 0  # frame of the solver's film that the network goes on from
     beside_solver: bool = False
 
 
@@ -121,8 +124,12 @@ def cases(config: StabilityNetworkConfig, network: NetworkConfig) -> Iterator[Ca
         alone = replace(base, obstacle_count=0, materials=(material,))
         scenes = tuple(_scene(alone, seed) for seed in config.rest_seeds)
         settled = min(config.frames, config.long_frames) - 1
-        name = f"{config.long_frames} frames, {material}"
-        yield Case(name, scenes, config.long_frames, settled=settled, beside_solver=True)
+        name, begun = f"{config.long_frames} frames, {material}", config.rest_from
+        if begun:
+            rule = f"0, or from {network.velocity_history} to {settled}, where all rests"
+            require(network.velocity_history <= begun <= settled, "rest_from", rule, begun)
+            name += f", from frame {begun} of the solver's"
+        yield Case(name, scenes, config.long_frames, settled=settled, begun=begun, beside_solver=True)
     if "particles" in wanted:
         yield case(f"particles x{PARTICLE_FACTOR:g}", group_size=base.group_size * PARTICLE_FACTOR ** (1 / 3))
     for side in DOMAIN_SIDES if "domain" in wanted else ():
