@@ -10,9 +10,10 @@ from hgn.schema import ConfigError
 
 GRADIENT_BOUND = 0.3  # relative error of all gradients, of the norm
 OUTPUT_BOUND = 0.05  # relative error of the network's outputs; both round, and wrong kernels miss it by far
-# of normalised accelerations, root mean square: what relative inputs put out in free flight is rounding and far less,
-# and differs as a whole
-LEAST_OUTPUT = 0.01
+# Of normalised accelerations, root mean square: smaller outputs are compared with this. Latents are of size 1, whatever
+# comes of them, so rounding to 11 bits (fp16, tf32) changes outputs by about 5e-4: measured 6e-4, on an H100, of a start
+# in which almost nothing is accelerated. The bound is 2.5 times that here.
+LEAST_OUTPUT = 0.03
 
 
 def relative_error(computed: torch.Tensor, expected: torch.Tensor, least: float = 0.0) -> float:
