@@ -496,8 +496,6 @@ class TrainingConfig:
     # … or for this fraction of an episode's frames, where that is more: slow drifts show in long episodes alone
     pushforward_episode_fraction: BelowOne[float] = 0.0
     pushforward_pull: Fraction[float] = 0.1  # fraction of the distance from the truth to be taken back in a frame
-    # finest cells; a scene farther from the truth (rms) gives no more frames: its truth is no answer any more
-    pushforward_drop_cells: Positive[float] = 0.5
     # fraction of these samples drawn by the acceleration that they ask for, with weights that keep the loss; 0: all
     # alike
     pushforward_importance: BelowOne[float] = 0.0

@@ -11,8 +11,8 @@ from hgn.schema import ConfigError
 GRADIENT_BOUND = 0.3  # relative error of all gradients, of the norm
 OUTPUT_BOUND = 0.05  # relative error of the network's outputs; both round, and wrong kernels miss it by far
 # Of normalised accelerations, root mean square: smaller outputs are compared with this. Latents are of size 1, whatever
-# comes of them, so rounding to 11 bits (fp16, tf32) changes outputs by about 5e-4: measured 6e-4, on an H100, of a start
-# in which almost nothing is accelerated. The bound is 2.5 times that here.
+# comes of them, so rounding to 11 bits (fp16, tf32) changes outputs by about 5e-4: 6e-4 was measured on an H100, of a
+# start in which almost nothing is accelerated. The bound is 2.5 times that here.
 LEAST_OUTPUT = 0.03
 
 

@@ -101,9 +101,8 @@ class GraphPushforwardPool:
         paths = path_FN3.split([episode.particles for episode in episodes], dim=1)
         parts = [path_FN3[:known] for path_FN3, known in zip(paths, answered, strict=True)]
         domain_S3 = torch.tensor([episode.domain_size for episode in episodes], device=device)
-        farthest = self.training.pushforward_drop_cells * config.cell_size
         counts_and_squares = [
-            torch.stack([x.double() for x in usable_frames(truth, part, domain_3, farthest)])
+            torch.stack([x.double() for x in usable_frames(truth, part, domain_3, config.cell_size)])
             for truth, part, domain_3 in zip(truths, parts, domain_S3, strict=True)
         ]
         squares = []

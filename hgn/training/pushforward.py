@@ -43,6 +43,9 @@ from hgn.training.noise import noise_scale, target_acceleration
 S = TypeVar("S")
 Starts = tuple[tuple[int, int], ...]  # episodes and frames that the network simulates from
 START_STREAM, SAMPLE_STREAM = 0x57A7, 0xE217
+# finest cells; farther from the truth (rms over a scene) its motion is no answer any more, and the loss would be made
+# of such frames alone: they are dropped, and with an untrained network most are
+DROPPED_BEYOND = 0.5
 PULLED_WITHIN = 1.0  # finest cells on an axis; no particle is pulled as if it were farther away
 
 
@@ -130,15 +133,14 @@ def pushforward_windows(
 
 
 def usable_frames(
-    true_TN3: torch.Tensor, simulated_FN3: torch.Tensor, domain_3: torch.Tensor, farthest: float
+    true_TN3: torch.Tensor, simulated_FN3: torch.Tensor, domain_3: torch.Tensor, cell_size: float
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """How many frames from the first on can be trained on, and the mean squared distance from the truth in the last of
-    them, both [] on the device. Those farther from the truth than `farthest` (rms) cannot, nor those behind: with an
-    untrained network most are, and the loss would be made of them alone.
+    them, both [] on the device.
     """
     now_FN3 = true_TN3[len(true_TN3) - len(simulated_FN3) - 1 : -1]
     square_F = (simulated_FN3 - now_FN3).square().sum(-1).mean(-1)
-    good_F = (square_F <= farthest**2) & ~diverged(simulated_FN3, domain_3).any(-1)  # NaN is not
+    good_F = (square_F <= (DROPPED_BEYOND * cell_size) ** 2) & ~diverged(simulated_FN3, domain_3).any(-1)  # NaN is not
     count = good_F.int().cumprod(0).sum()
     return count, square_F[(count - 1).clamp(min=0)]
 
@@ -236,8 +238,7 @@ class PushforwardPool:
         """Adds a scene's windows; its mean squared distance at the end, where it is there until then."""
         config, frames = self.network.config, len(simulated_FN3)
         true_TN3 = torch.from_numpy(window(episode, frame, config.velocity_history, frames + 1))
-        farthest = self.training.pushforward_drop_cells * config.cell_size
-        count, square = usable_frames(true_TN3, simulated_FN3, torch.tensor(episode.domain_size), farthest)
+        count, square = usable_frames(true_TN3, simulated_FN3, torch.tensor(episode.domain_size), config.cell_size)
         windows = pushforward_windows(true_TN3, simulated_FN3, self.training.pushforward_pull, config.cell_size)
         accelerations = target_acceleration(windows).tolist()
         self._samples += [
