@@ -335,14 +335,15 @@ def test_networks(tmp_path, monkeypatch):
 
 
 def test_mechanics(tmp_path, monkeypatch):
-    """jobs/mechanics.txt: four trainings, each from the weights that the one before exports, on data that it makes; the
-    last one is the network that ships, with its updates, threshold of rest and walls, and is scored. Its repeats differ
-    in name and seed alone."""
+    """jobs/mechanics.txt: seven trainings, each from weights that the one before exports, on data that it makes; the
+    last one is the network that ships, with its updates, rest and walls, and is scored. The repeats of the fourth,
+    which is scored too, differ in name and seed alone."""
     mappings = {name: settings(lines, monkeypatch) for name, lines in calls(tmp_path, "mechanics.txt").items()}
     made = [datagen_config(mappings.pop(name)["datagen"]) for name in list(mappings) if name.endswith("_data")]
     folders = {each.dataset.folder: each for each in made}
-    shipping = ["mechanics", "repeat_2", "repeat_3"]
-    begins_with = {"first": None, "second": "first", "third": "second"} | dict.fromkeys(shipping, "third")
+    repeated = ["fourth", "repeat_2", "repeat_3"]
+    begins_with = {"first": None, "second": "first", "third": "second"} | dict.fromkeys(repeated, "third")
+    begins_with |= {"fifth": "fourth", "sixth": "fifth", "mechanics": "sixth"}
     assert list(mappings) == list(begins_with)
     trained, exported = {}, {}
     for name, commands in mappings.items():
@@ -355,21 +356,23 @@ def test_mechanics(tmp_path, monkeypatch):
         assert config.training.init_weights == (before and exported[before].out)
         assert dataset_identity(config.datagen) == dataset_identity(folders[config.dataset.folder])
         assert set(config.training.more_data) < set(folders)
-        assert ("hgn.evaluate" in commands) == (name in shipping)
-        if name in shipping:
+        assert ("hgn.evaluate" in commands) == (name in (*repeated, "mechanics"))
+        if "hgn.evaluate" in commands:
             score = from_mapping(EvaluateConfig, commands["hgn.evaluate"])
             assert (score.weights, score.data) == (export.out, config.dataset.folder)
             assert score.scenes == config.dataset.validation_scenes
     last, export = trained["mechanics"], exported["mechanics"]
-    assert {last.dataset.folder, *last.training.more_data} == set(folders)
+    used = [{each.dataset.folder, *each.training.more_data} for each in trained.values()]
+    assert set().union(*used) == set(folders)
     shipped = load_weights(shipped_weights()["mechanics"])[1]
     assert shipped.network == replace(last.network, **export.network_changes)
     assert shipped.updates == last.training.maximum_updates
-    assert set(export.network_changes) == {"rest_threshold", "wall_clearance"}
-    repeats = [trained[name] for name in shipping]
+    assert set(export.network_changes) == {"rest_threshold", "rest_levels", "rest_large_materials", "wall_clearance"}
+    assert not any(exported[name].network_changes for name in exported if name != "mechanics")
+    repeats, one = [trained[name] for name in repeated], trained["fourth"]
     assert len({each.training.seed for each in repeats}) == 3
     for each in repeats:
-        assert replace(each, run=last.run, training=replace(each.training, seed=last.training.seed)) == last
+        assert replace(each, run=one.run, training=replace(each.training, seed=one.training.seed)) == one
 
 
 def test_trial_of_mechanics(tmp_path):
@@ -379,7 +382,7 @@ def test_trial_of_mechanics(tmp_path):
     scenes = [argument for argument in used if argument.startswith(("scenes=", "dataset.training_scenes="))]
     assert {argument.partition("=")[2] for argument in scenes} == {"2", "25"}  # the last are scored
     updates = [int(argument.partition("=")[2]) for argument in used if argument.startswith("training.maximum_updates")]
-    assert len(updates) == 6 and max(updates) < 3000
+    assert len(updates) == 9 and max(updates) < 3000
 
 
 def test_judged(tmp_path, monkeypatch):
