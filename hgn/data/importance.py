@@ -19,20 +19,38 @@ from hgn.scene.history import frames_before
 PARTICLES = 512  # of an episode that are looked at, about
 
 
-def chance_by_size(size_F: np.ndarray, fraction: float) -> np.ndarray:
-    """How often each is drawn, 1 on average, where a `fraction` of the draws is in proportion to size, the others even.
+@dataclass(frozen=True, eq=False)
+class DrawnBySize:
+    """A distribution over F things of some size, and weights that leave a mean over draws as it is."""
 
-    Its inverse is the weight that leaves a mean over draws as it is.
-    """
-    mean = size_F.mean() if len(size_F) else 0.0
-    return (1 - fraction) + fraction * (size_F / mean if mean > 0 else np.ones(len(size_F)))
+    cumulative_F: np.ndarray  # float64, ends with 1
+    weight_F: np.ndarray  # the inverse of how often each is drawn, where 1 is even
+
+    @staticmethod
+    def of(size_F: np.ndarray, fraction: float) -> DrawnBySize:
+        """A `fraction` of the draws in proportion to size, the others evenly."""
+        total = size_F.sum()
+        often_F = (1 - fraction) + fraction * (size_F * len(size_F) / total if total > 0 else np.ones(len(size_F)))
+        cumulative_F = often_F.cumsum()
+        return DrawnBySize(cumulative_F / cumulative_F[-1:], 1 / often_F)
+
+    def at(self, place: float) -> tuple[int, float]:
+        """Which lies at this place of the distribution, in [0, 1), and its weight."""
+        cumulative, weights = self._lists
+        number = min(bisect_right(cumulative, place), len(cumulative) - 1)
+        return number, weights[number]
+
+    @cached_property
+    def _lists(self) -> tuple[list[float], list[float]]:
+        """A single number is found faster in a list than in an array."""
+        return self.cumulative_F.tolist(), self.weight_F.tolist()
 
 
 @dataclass(frozen=True, eq=False)
 class FrameImportance:
     """An episode's frames with the fraction of its samples that each gets, a distribution over F frames."""
 
-    cumulative_F: np.ndarray  # float64, ends with 1
+    draws: DrawnBySize
     acceleration_F: np.ndarray  # root mean square over axes and particles
 
     @staticmethod
@@ -43,29 +61,19 @@ class FrameImportance:
         position_TN3 = np.concatenate([past_1N3, episode.position_TN3[:, ::step]], dtype=np.float64)
         square_FN3 = np.diff(position_TN3, 2, axis=0) ** 2
         size_F = np.sqrt(square_FN3.mean(axis=(1, 2))) if square_FN3.size else np.zeros(len(square_FN3))
-        cumulative_F = chance_by_size(size_F, fraction).cumsum()
-        return FrameImportance(cumulative_F / cumulative_F[-1], size_F)
+        return FrameImportance(DrawnBySize.of(size_F, fraction), size_F)
 
     def draw(self, slot: int, seed: int) -> tuple[int, float]:
         """The frame for sample number `slot` of F, and its weight; together the slots cover the distribution.
 
         Stratified: each slot has its own F-th of the distribution, in which `seed` chooses.
         """
-        cumulative, weights = self._lists
-        place = (slot + _fraction(seed)) / len(cumulative)
-        frame = min(bisect_right(cumulative, place), len(cumulative) - 1)
-        return frame, weights[frame]
+        return self.draws.at((slot + _fraction(seed)) / len(self.acceleration_F))
 
     @cached_property
     def accelerations(self) -> list[float]:
         """Of each frame, root mean square, domain units per frame squared."""
         return self.acceleration_F.tolist()
-
-    @cached_property
-    def _lists(self) -> tuple[list[float], list[float]]:
-        """The distribution, and each frame's weight: a single number is found faster in a list than in an array."""
-        chance_F = np.diff(self.cumulative_F, prepend=0.0)
-        return self.cumulative_F.tolist(), (1 / (len(chance_F) * chance_F)).tolist()
 
 
 def _fraction(seed: int) -> float:

@@ -27,7 +27,7 @@ import torch
 
 from hgn.config import SIMULATED_FRAMES, TrainingConfig
 from hgn.data.batch import BatchSample, UpdateSamples, make_batch
-from hgn.data.importance import chance_by_size
+from hgn.data.importance import DrawnBySize
 from hgn.network.barriers import Barriers
 from hgn.network.base import ParticleNetwork
 from hgn.runtime.backend import fastest_stepped
@@ -83,21 +83,18 @@ class PoolDraws:
 
     def __init__(self, training: TrainingConfig, rank: int, accelerations: Sequence[float]) -> None:
         self._training, self._rank = training, rank
-        chance_W = chance_by_size(np.array(accelerations, np.float64), training.pushforward_importance)
-        self._weight_W = 1 / chance_W
-        self._cumulative_W = chance_W.cumsum()
+        self._windows = len(accelerations)
+        self._by_size = DrawnBySize.of(np.array(accelerations, np.float64), training.pushforward_importance)
 
     def drawn(self, update: int) -> list[tuple[int, float]]:
         """The windows that replace the first samples of an update, `pushforward_fraction` of them on average, each
         with the weight of its loss.
         """
-        if not len(self._weight_W):
+        if not self._windows:
             return []
         generator = np.random.default_rng([self._training.seed, SAMPLE_STREAM, update, self._rank])
         count = int(self._training.pushforward_fraction * self._training.batch_scenes + generator.random())
-        places = generator.random(count) * self._cumulative_W[-1]
-        numbers = np.searchsorted(self._cumulative_W, places, side="right").clip(max=len(self._weight_W) - 1)
-        return [(number, float(self._weight_W[number])) for number in numbers.tolist()]
+        return [self._by_size.at(place) for place in generator.random(count)]
 
 
 def by_frames(training: TrainingConfig, starts: Sequence[S], frame_counts: Sequence[int]) -> list[tuple[int, list[S]]]:

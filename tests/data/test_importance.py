@@ -31,7 +31,7 @@ def test_what_happens_is_drawn_more_often(share):
     weights times chances are 1/F, so sums over what is drawn expect the even mean."""
     frames, at = 21, 7
     importance = FrameImportance.of(stopped(frames, at), share)
-    chance = np.diff(importance.cumulative_F, prepend=0.0)
+    chance = np.diff(importance.draws.cumulative_F, prepend=0.0)
     assert chance[at] == pytest.approx(share + (1 - share) / 20, rel=1e-3)
     assert chance[np.arange(20) != at] == pytest.approx((1 - share) / 20, rel=0.05)
     values = np.random.default_rng(1).random(20)
@@ -44,7 +44,7 @@ def test_what_happens_is_drawn_more_often(share):
 def test_one_epoch_covers_the_distribution():
     """Slots are strata: in every epoch a frame comes as often as its chance says, to within one."""
     importance = FrameImportance.of(stopped(31, 12), 0.6)
-    chance = np.diff(importance.cumulative_F, prepend=0.0)
+    chance = np.diff(importance.draws.cumulative_F, prepend=0.0)
     for epoch in range(5):
         drawn = [importance.draw(slot, 1_000_003 * epoch + slot)[0] for slot in range(30)]
         assert (np.abs(np.bincount(drawn, minlength=30) - 30 * chance) < 2).all()

@@ -177,17 +177,18 @@ def case_trials(
     if not case.begun:
         return simulate_scenes(simulator, initial, case.frames, clock), clock.milliseconds()
     assert films is not None
-    history, begun = simulator.network.config.velocity_history, case.begun
-    states = [
-        replace(scene, position_N3=film.position_TN3[begun], past_HN3=film.position_TN3[begun - history : begun])
-        for scene, film in zip(initial, films, strict=True)
-    ]
-    trials = simulate_scenes(simulator, states, case.frames - begun, clock)
+    states = [in_film(scene, film, case.begun) for scene, film in zip(initial, films, strict=True)]
+    trials = simulate_scenes(simulator, states, case.frames - case.begun, clock)
     joined = [
-        replace(trial, position_TN3=np.concatenate([film.position_TN3[:begun], trial.position_TN3]))
+        replace(trial, position_TN3=np.concatenate([film.position_TN3[: case.begun], trial.position_TN3]))
         for trial, film in zip(trials, films, strict=True)
     ]
     return joined, clock.milliseconds()
+
+
+def in_film(scene: InitialState, film: RolloutResult, frame: int) -> InitialState:
+    """A frame of a scene's film, with all before it as its past."""
+    return replace(scene, position_N3=film.position_TN3[frame], past_HN3=film.position_TN3[:frame])
 
 
 def case_picture(simulator: Simulator, case: Case, trial: RolloutResult, weights: str) -> Image.Image:
@@ -356,8 +357,7 @@ def pulled(
     own: list[float | None] = []
     true: list[float | None] = []
     for cells, scene, film in zip(case.hole_cells, scenes, films, strict=True):
-        start = simulator.start([scene])
-        position_TN3 = torch.from_numpy(film.position_TN3).to(start.position_N3)
+        position_TN3 = torch.from_numpy(film.position_TN3).to(simulator.device)
         aside_TN3 = (position_TN3 - 0.5 * torch.tensor(scene.domain_size).to(position_TN3)).abs()
         within_TN = (aside_TN3[..., [0, 2]] <= 0.5 * cells * simulator.network.config.cell_size).all(-1)
         within_TN &= (position_TN3[..., 1] - case.hole_height).abs() <= reach
@@ -366,14 +366,11 @@ def pulled(
             within_N = within_TN[frame]
             if not bool(within_N.any()):
                 continue
-            past_TN3 = position_TN3[frame - history : frame + 1]
-            velocity_NM3 = past_TN3.diff(dim=0).flip(0).transpose(0, 1).contiguous()
-            state = replace(start, position_N3=past_TN3[-1].clone(), velocity_NM3=velocity_NM3)
+            state = simulator.start([in_film(scene, film, frame)])
             nexts = torch.stack([simulator.step(state).position_N3, position_TN3[frame + 1]])
-            change_2N = (nexts - past_TN3[-1] - velocity_NM3[:, 0])[..., 1]
+            change_2N = (nexts - state.position_N3 - state.velocity_NM3[:, 0])[..., 1]
             pulls.append(change_2N[:, within_N].double())
-        if pulls:
-            gravity = float(start.gravity_S3[0, 1])
+        gravity = scene.gravity[1] / simulator.frame_rate_hz**2
         for side, means in enumerate((own, true)):
             means.append(float(torch.cat(pulls, dim=1)[side].mean()) / gravity if pulls else None)
     return own, true
