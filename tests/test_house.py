@@ -1,0 +1,312 @@
+"""Limits on the size and the shape of the code. Each limit may be lowered, never raised without a reason in the commit.
+
+The lists of exceptions name what is over a limit today. An entry leaves its list when the code is mended.
+"""
+
+import ast
+import functools
+import re
+import subprocess
+import tokenize
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+PACKAGES = ("hgn", "datagen", "tools")
+
+LINES = {  # of Python, in tracked files
+    "hgn": 29_176,
+    "datagen": 8_855,
+    "tools": 7_705,
+    "tests": 27_800,
+}
+SETTINGS = 352  # fields of the dataclasses behind the commands, *Config
+
+LINES_OF_A_FILE = 450
+LONG_FILES = {
+    "datagen/mpm/launch.py": 494,
+    "datagen/mpm/mls_mpm.py": 553,
+    "datagen/mpm/team_kernel.py": 482,
+    "hgn/config.py": 568,
+    "hgn/data/index.py": 468,
+    "hgn/kernels/coarsest/kernel.py": 588,
+    "hgn/kernels/grid/kernel.py": 552,
+    "hgn/kernels/update/op.py": 503,
+    "hgn/render/pictures.py": 461,
+    "tools/stability/network.py": 465,
+}
+
+NARROW_PACKAGES = ("hgn/training/", "hgn/runtime/")
+PARAMETERS, POSITIONAL_ARGUMENTS = 8, 4
+MANY_PARAMETERS: dict[str, int] = {
+    "hgn/training/graph_trainer.py:__init__": 10,
+}
+# the number of such calls in a file
+MANY_POSITIONAL_ARGUMENTS: dict[str, int] = {
+    "hgn/runtime/differentiable.py": 7,
+    "hgn/runtime/exported_step.py": 1,
+    "hgn/runtime/precompile_program.py": 4,
+    "hgn/runtime/simulator.py": 10,
+    "hgn/runtime/triton_backend.py": 1,
+    "hgn/runtime/triton_rollout.py": 5,
+    "hgn/runtime/weights.py": 1,
+    "hgn/training/data_module.py": 4,
+    "hgn/training/graph_pushforward.py": 3,
+    "hgn/training/graph_trainer.py": 3,
+    "hgn/training/imported.py": 2,
+    "hgn/training/module.py": 3,
+    "hgn/training/monitor.py": 2,
+    "hgn/training/noise.py": 1,
+    "hgn/training/parity.py": 3,
+    "hgn/training/precompile.py": 1,
+    "hgn/training/session.py": 2,
+}
+
+UNCOMMENTED: set[str] = {
+    "AverageConfig.out",
+    "DatasetConfig.array_tasks",
+    "DatasetConfig.folder",
+    "DatasetConfig.frame_rate_hz",
+    "DatasetConfig.long_frames",
+    "DatasetConfig.seed",
+    "DatasetConfig.test_scenes",
+    "DatasetConfig.training_scenes",
+    "DatasetConfig.validation_scenes",
+    "ErrorVsTimeConfig.device",
+    "ErrorVsTimeConfig.frames",
+    "ErrorVsTimeConfig.scenes",
+    "ErrorVsTimeConfig.split",
+    "ErrorVsTimeConfig.timed_scenes",
+    "EvaluateConfig.data",
+    "EvaluateConfig.frame_stride",
+    "EvaluateConfig.particles_per_batch",
+    "EvaluateConfig.scenes",
+    "ExportConfig.out",
+    "ImportConfig.dimensions",
+    "KillsConfig.json",
+    "KillsConfig.kill_seed",
+    "KillsConfig.kills",
+    "LargeConfig.json",
+    "LargeConfig.particles",
+    "LargeConfig.precision",
+    "MpmConfig.density_kg_m3",
+    "MpmConfig.fixed_time_step_s",
+    "MpmConfig.poisson_ratio",
+    "MpmConfig.sand_volume_correction",
+    "MpmConfig.snow_critical_compression",
+    "MpmConfig.snow_critical_stretch",
+    "MpmConfig.snow_hardening",
+    "MpmConfig.youngs_modulus_pa",
+    "NetworkConfig.materials",
+    "NetworkConfig.obstacle_features",
+    "PowerLossConfig.json",
+    "PowerLossConfig.out",
+    "PowerLossConfig.seed",
+    "RenderConfig.gif",
+    "RolloutConfig.frames",
+    "SceneConfig.domain_size",
+    "SceneConfig.group_count",
+    "SceneConfig.group_shapes",
+    "SceneConfig.materials",
+    "SceneConfig.obstacle_count",
+    "SceneConfig.obstacle_size",
+    "SceneConfig.particles_per_cell",
+    "ServiceConfig.host",
+    "SolveConfig.frame_rate_hz",
+    "SolveConfig.frames",
+    "SolverTargetsConfig.cases",
+    "StabilityNetworkConfig.device",
+    "StabilityNetworkConfig.frames",
+    "TrainConfig.run",
+    "TrainingConfig.grid_jitter",
+    "TrainingConfig.learning_rate",
+    "TrainingConfig.maximum_updates",
+    "TrainingConfig.monitor_particles_per_batch",
+    "TrainingConfig.seed",
+}
+UNMENTIONED: set[str] = {
+    "BenchConfig.rounds",
+    "CompareConfig.rounds",
+    "DatasetConfig.early_episodes",
+    "DatasetConfig.ray_address",
+    "ErrorVsTimeConfig.mpm_steps",
+    "ErrorVsTimeConfig.mpm_timed_frames",
+    "ErrorVsTimeConfig.rounds",
+    "ErrorVsTimeConfig.sinkhorn_scenes",
+    "ErrorVsTimeConfig.timed_batches",
+    "ErrorVsTimeConfig.timed_frames",
+    "ErrorVsTimeConfig.timed_scenes",
+    "ErrorVsTimeConfig.timed_seconds",
+    "EvaluateConfig.particles_per_batch",
+    "MpmConfig.collider_projection",
+    "MpmConfig.minimum_singular_value",
+    "MpmConfig.wall_cells",
+    "MpmConfig.wall_contact",
+    "MpmConfig.water_equation",
+    "MpmConfig.water_minimum_volume_ratio",
+    "NetworkConfig.material_embedding",
+    "NetworkConfig.maximum_neighbours",
+    "NetworkConfig.wall_distance_cells",
+    "PowerLossConfig.rounds",
+    "RenderConfig.fps",
+    "ScalingConfig.rounds",
+    "SceneConfig.clearance_cells",
+    "StabilityNetworkConfig.rest_from",
+    "StabilityNetworkConfig.rest_seeds",
+    "StabilityNetworkConfig.scenes_at_once",
+    "StabilityNetworkConfig.solver_device",
+    "StabilityNetworkConfig.solver_kept",
+    "StabilitySolverConfig.column_grains",
+    "StabilitySolverConfig.grid_cells",
+    "StabilitySolverConfig.leak_band_cells",
+    "StabilitySolverConfig.leak_block_cells",
+    "StabilitySolverConfig.leak_offsets",
+    "StabilitySolverConfig.leak_seconds",
+    "TrainingConfig.accelerator",
+    "TrainingConfig.grid_jitter",
+    "TrainingConfig.log_every",
+    "TrainingConfig.monitor_particles_per_batch",
+    "UploadConfig.poll_s",
+}
+
+BYTES_OF_A_FILE = 500_000
+LARGE_FILES = {  # shipped weights, and results that pages show
+    "hgn/weights/gns.safetensors",
+    "hgn/weights/gns_no_obstacles.safetensors",
+    "hgn/weights/gns_particles.safetensors",
+    "hgn/weights/mechanics.safetensors",
+    "hgn/weights/no_obstacles.safetensors",
+    "hgn/weights/obstacles.safetensors",
+    "hgn/weights/obstacles_levels_3.safetensors",
+    "hgn/weights/obstacles_small.safetensors",
+    "hgn/weights/obstacles_steps_1.safetensors",
+    "results/recipe/side_by_side.webp",
+    "results/stability/network_h100.json",
+    "results/stability/obstacles_h100.png",
+    "results/stability/thrown.webp",
+}
+
+
+@functools.cache
+def tracked(*patterns: str) -> tuple[str, ...]:
+    """Names of the tracked files that exist, relative to the root."""
+    if not (ROOT / ".git").exists():
+        pytest.skip("needs a checkout")
+    command = ["git", "-C", str(ROOT), "ls-files", "-z", *patterns]
+    names = subprocess.run(command, check=True, capture_output=True, text=True).stdout.split("\0")
+    return tuple(name for name in names if name and (ROOT / name).is_file())
+
+
+@functools.cache
+def line_counts() -> dict[str, int]:
+    return {name: (ROOT / name).read_bytes().count(b"\n") for name in tracked("*.py")}
+
+
+@functools.cache
+def tree(name: str) -> ast.Module:
+    return ast.parse((ROOT / name).read_bytes())
+
+
+def in_packages(*folders: str) -> list[str]:
+    return [name for name in tracked("*.py") if name.startswith(folders)]
+
+
+@functools.cache
+def settings() -> dict[str, tuple[str, ast.AnnAssign]]:
+    """File and definition of each setting, by `Class.field`."""
+    result = {}
+    for name in in_packages(*(f"{package}/" for package in PACKAGES)):
+        if b"Config:\n" not in (ROOT / name).read_bytes():
+            continue
+        classes = [node for node in tree(name).body if isinstance(node, ast.ClassDef)]
+        for owner in (node for node in classes if node.name.endswith("Config")):
+            for field in owner.body:
+                if isinstance(field, ast.AnnAssign):
+                    result[f"{owner.name}.{ast.unparse(field.target)}"] = (name, field)
+    return result
+
+
+def is_section(field: ast.AnnAssign) -> bool:
+    """Whether a field holds another dataclass of settings."""
+    return "Config" in ast.unparse(field.annotation)
+
+
+@functools.cache
+def comments(name: str) -> dict[int, str]:
+    """The comment on each line of a file."""
+    with (ROOT / name).open("rb") as file:
+        tokens = list(tokenize.tokenize(file.readline))
+    return {token.start[0]: token.string.lstrip("# ") for token in tokens if token.type == tokenize.COMMENT}
+
+
+def comment_of(name: str, field: ast.AnnAssign) -> str:
+    """The comment above a field and beside it."""
+    texts = comments(name)
+    lines = (ROOT / name).read_text(encoding="utf-8").splitlines()
+    first = field.lineno
+    while lines[first - 2].strip().startswith("#"):
+        first -= 1
+    found = [texts[line] for line in range(first, (field.end_lineno or field.lineno) + 1) if line in texts]
+    return " ".join(found)
+
+
+def over(counts: dict[str, int], limit: int, exceptions: dict[str, int]) -> dict[str, int]:
+    """The entries that exceed the limit, or their own number among the exceptions."""
+    return {name: count for name, count in counts.items() if count > max(limit, exceptions.get(name, 0))}
+
+
+def test_lines_of_packages():
+    """Each package stays within its number of lines."""
+    totals = {package: sum(line_counts()[name] for name in in_packages(f"{package}/")) for package in LINES}
+    assert over(totals, 0, LINES) == {}
+
+
+def test_lines_of_files():
+    """No file of the packages has more than 450 lines."""
+    counts = {name: line_counts()[name] for name in in_packages(*(f"{package}/" for package in PACKAGES))}
+    assert over(counts, LINES_OF_A_FILE, LONG_FILES) == {}
+
+
+def test_number_of_settings():
+    """Commands have no more settings than today."""
+    assert len(settings()) <= SETTINGS
+
+
+def test_settings_are_explained():
+    """Each setting has a comment that stands alone, and a config, a launch file or a page names it."""
+    fields = {key: value for key, value in settings().items() if not is_section(value[1])}
+    uncommented = {key for key, (name, field) in fields.items() if comment_of(name, field).strip(" …") == ""}
+    assert uncommented <= UNCOMMENTED, "write a comment above or beside the field"
+    pages = [name for name in tracked("conf", "jobs", "docs/*.md", "README.md", "Makefile") if "docs/log/" not in name]
+    words = {word for name in pages for word in re.findall(rb"\w+", (ROOT / name).read_bytes())}
+    unmentioned = {key for key in fields if key.partition(".")[2].encode() not in words}
+    assert unmentioned <= UNMENTIONED, "fix the setting to its value, or tell users what it is for"
+
+
+def test_narrow_signatures():
+    """Functions of the training and the runtime take at most eight arguments."""
+    counts: dict[str, int] = {}
+    for name in in_packages(*NARROW_PACKAGES):
+        for node in ast.walk(tree(name)):
+            if isinstance(node, ast.FunctionDef):
+                given = node.args
+                names = [each.arg for each in (*given.posonlyargs, *given.args, *given.kwonlyargs)]
+                count = len(names) - (names[:1] in (["self"], ["cls"]))
+                counts[f"{name}:{node.name}"] = max(count, counts.get(f"{name}:{node.name}", 0))
+    assert over(counts, PARAMETERS, MANY_PARAMETERS) == {}
+
+
+def test_named_arguments():
+    """Calls in the training and the runtime pass at most four arguments by position."""
+    counts = dict.fromkeys(in_packages(*NARROW_PACKAGES), 0)
+    for name in counts:
+        calls = (node for node in ast.walk(tree(name)) if isinstance(node, ast.Call))
+        counts[name] = sum(len(call.args) > POSITIONAL_ARGUMENTS for call in calls)
+    assert over(counts, 0, MANY_POSITIONAL_ARGUMENTS) == {}
+
+
+def test_large_files():
+    """No tracked file exceeds 500 kB, except the listed weights and results."""
+    large = {name for name in tracked() if (ROOT / name).stat().st_size > BYTES_OF_A_FILE}
+    assert large <= LARGE_FILES, "draw it from its data, keep it out of the repository, or list it here"
