@@ -14,6 +14,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from hgn.renamed import CHOICES
 from hgn.schema import ConfigError, default_mapping
 
 OPTIONS = (
@@ -116,6 +117,8 @@ def _override(argument: str, folder: Path) -> str:
     key, equals, value = argument.partition("=")
     if not equals or key.startswith("-"):
         return argument
+    if new := CHOICES.get(argument.lstrip("+")):
+        raise ConfigError(f"{argument} is called {new} now")
     if value and not _understood(value):
         value = _in_quotes(value)
     if re.fullmatch(r"[A-Za-z][\w.]*", key) and not key.startswith("hydra"):

@@ -39,6 +39,9 @@ VALUES: dict[str, dict[Any, str]] = {
     "system": {"trivial": "baseline"},  # in reports of tools.error_vs_time
 }
 
+# Choices of config groups, old to new, as on a command line: the name `mechanics` is that of an experiment and weights.
+CHOICES = {"scene=mechanics": "scene=motion", "dataset=mechanics": "dataset=motion"}
+
 
 # Settings younger than some data sets, of the solver: what it did before it had them.
 BEFORE: dict[str, Any] = {

@@ -3,6 +3,7 @@
 import pytest
 
 from hgn.hydra_compat import compose
+from hgn.renamed import CHOICES
 from hgn.schema import ConfigError
 
 
@@ -25,3 +26,10 @@ def test_canary(tmp_path):
     with pytest.raises(ConfigError, match="weights is missing; it must be given, as in weights=…"):
         compose(tmp_path, "made", ["made"])
     assert compose(tmp_path, "made", ["made"], complete=False)[0]["weights"] == "???"
+
+
+@pytest.mark.parametrize(("old", "new"), CHOICES.items())
+def test_renamed_choices(old, new, tmp_path):
+    """A choice of a group that was renamed is answered with its name of today."""
+    with pytest.raises(ConfigError, match=f"^{old} is called {new} now$"):
+        compose(tmp_path, "made", ["made", old])
