@@ -15,7 +15,7 @@ LONGEST_FILES = (  # five seconds and more of one core; begun last, one of them 
     *("datagen/test_service", "training/test_resume", "training/test_live_service", "kernels/test_memory"),
     *("test_command", "kernels/test_symmetry", "kernels/test_network", "training/test_precompile"),
     *("test_defaults", "data/test_import", "cpu/test_rows", "kernels/test_pushforward", "docs/test_notebooks"),
-    *("docs/test_pages", "tools/studies/test_solver_targets", "data/test_index"),
+    *("docs/test_pages", "data/test_index"),
 )
 GENERATING = ("training/test_generator", "docs/test_tutorials")  # water around a solid
 PLACES = {name: number for number, name in enumerate(LONGEST_FILES)}

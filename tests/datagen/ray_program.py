@@ -11,6 +11,7 @@ from pathlib import Path
 
 from ballistic_dataset import make_dataset
 from ballistic_solver import BALLISTIC
+from kills import differences, equal_shards
 from ray.cluster_utils import Cluster
 
 from datagen.generate import generate
@@ -18,7 +19,6 @@ from datagen.pool.progress import Progress
 from hgn.config import DatagenConfig, DatasetConfig
 from hgn.data.manifest import Manifest
 from hgn.system.provenance import provenance
-from tools.studies.kills import differences, equal_shards
 
 STORE_BYTES = 80 * 2**20
 

@@ -1,39 +1,71 @@
-"""python -m tools.studies.large: many blocks of particles move like one alone; tensors of more than 2^31 elements."""
+"""Scenes beyond int32: many blocks of particles move like a single one; tensors of more than 2^31 elements."""
 
-from typing import Any
+import math
+from dataclasses import replace
 
 import pytest
 import torch
 import triton
 import triton.language as tl
 
+from hgn.config import NetworkConfig
 from hgn.kernels import forward
 from hgn.kernels.blocks import elements
+from hgn.network.features import ParticleState
+from hgn.runtime.parity import relative_error
+from hgn.runtime.triton_rollout import TritonRollout
 from hgn.schema import ConfigError
-from tools.studies.large import main
+from tools.bench.contenders import BOUNDS, bench_network
+from tools.bench.states import Workload, state_of
 
-SMALL: dict[str, Any] = {
-    "particles": 24,
-    "block": 6,
-    "precision": "fp32",
-    "network": {"width": 16, "levels": 2, "message_passing_steps": 2},
-}
+CPU = torch.device("cpu")
+NETWORK = NetworkConfig(width=16, levels=2, message_passing_steps=2)
+BLOCK, BLOCKS = 6, 4  # particles, and copies of them
+GAP_CELLS = 4  # of the coarsest level between two blocks, and around all
+interpreted = pytest.mark.skipif(
+    torch.cuda.is_available(), reason="the interpreter, which takes tensors of the CPU, is off here"
+)
 
 
+def states():
+    """One block alone, and copies of it that are whole coarse cells apart and do not interact."""
+    block = state_of(Workload(BLOCK, 1), NETWORK, CPU)
+    coarsest = NETWORK.cell_size * 2 ** (NETWORK.levels - 1)
+    gap = GAP_CELLS * coarsest
+    pitch = coarsest * math.ceil((float(block.domain_S3[0, 0]) + gap) / coarsest)
+    place_B3 = torch.cartesian_prod(*[torch.arange(2)] * 3)[:BLOCKS]
+    position_N3 = block.position_N3 + gap
+    everywhere_N3 = (position_N3[None] + (pitch * place_B3.double()).float()[:, None]).view(-1, 3)
+    one_S3, all_S3 = (torch.full_like(block.domain_S3, blocks * pitch + gap) for blocks in (1, 2))
+    scene = ParticleState(
+        everywhere_N3, block.velocity_NM3.repeat(BLOCKS, 1, 1), block.material_N.repeat(BLOCKS),
+        block.scene_N.repeat(BLOCKS), all_S3, block.gravity_S3, None,
+    )  # fmt: skip
+    return replace(block, position_N3=position_N3, domain_S3=one_S3), scene
+
+
+@interpreted
 @pytest.mark.usefixtures("large_tiles")
-@pytest.mark.skipif(torch.cuda.is_available(), reason="the interpreter, which takes tensors of the CPU, is off here")
 @pytest.mark.parametrize("addressed", [2**31, 4000])
 def test_blocks_are_alike(addressed, monkeypatch):
-    """The check passes; also where edges are addressed in 64 bits, as with 10 million particles."""
+    """Each block gets the accelerations of a single one, also with the 64-bit addresses that 10 million particles
+    need."""
     monkeypatch.setattr(forward, "ADDRESSED", addressed)
-    assert main(SMALL) == 0
+    network, (block, scene) = bench_network(NETWORK, CPU), states()
+    rollout = TritonRollout(network, scene, "fp32")
+    rollout._network_pass()
+    with torch.no_grad():
+        expected_N3 = network.normalised_acceleration(block)
+    for found_N3 in rollout.fused.output[:, :3].view(-1, BLOCK, 3)[:BLOCKS]:
+        assert relative_error(found_N3, expected_N3) < BOUNDS["fp32"]
 
 
-def test_too_many_are_refused(monkeypatch):
-    """What int32 cannot address is refused by name and number, before anything is computed."""
+@pytest.mark.parametrize(("scene", "message"), [(0, "cells .* at most 23, got 48"), (1, "particles .* 23, got 24")])
+def test_too_many_are_refused(scene, message, monkeypatch):
+    """A scene with more cells or particles than int32 can address is refused before anything is computed."""
     monkeypatch.setattr(forward, "ADDRESSED", 16 * 24)
-    with pytest.raises(ConfigError, match=r"cells of a simulation .* at most 23, got 48; take fewer at once"):
-        main(SMALL)
+    with pytest.raises(ConfigError, match=message + "; take fewer at once"):
+        TritonRollout(bench_network(NETWORK, CPU), states()[scene], "fp32")
 
 
 @triton.jit
@@ -41,10 +73,10 @@ def _write(into, row_at, WIDTH: tl.constexpr, WIDE: tl.constexpr):
     tl.store(into + elements(tl.load(row_at + tl.arange(0, 2)), WIDTH, WIDE), 1.0)
 
 
-@pytest.mark.skipif(torch.cuda.is_available(), reason="the interpreter, which takes tensors of the CPU, is off here")
+@interpreted
 def test_rows_beyond_int32():
-    """Rows whose elements int32 cannot count are written where they are; nothing else of the tensor is touched."""
+    """Rows whose elements int32 cannot count are written at the right address."""
     rows, width = 2**31 // 16 + 2, 16
-    into = torch.empty(rows, width, dtype=torch.int8)  # pages that nobody touches take no memory
+    into = torch.empty(rows, width, dtype=torch.int8)  # untouched pages take no memory
     _write[(1,)](into, torch.tensor([3, rows - 1], dtype=torch.int32), WIDTH=width, WIDE=True)
     assert bool((into[[3, rows - 1]] == 1).all())

@@ -6,21 +6,17 @@ import pytest
 
 from hgn.schema import ConfigError, from_mapping
 from tools.bench.config import BenchConfig
-from tools.compare import CompareConfig
 from tools.curves import CurvesConfig
 from tools.error_vs_time.settings import ErrorVsTimeConfig
 from tools.scaling.measure import ScalingConfig
 from tools.stability.network_cases import StabilityNetworkConfig
 from tools.stability.solver import StabilitySolverConfig
-from tools.studies.solver_targets import SolverTargetsConfig
 
 GIVEN = {  # what each must be given
     BenchConfig: {},
-    CompareConfig: {"trees": ["."], "out": "c.json"},
     CurvesConfig: {"runs": ["a"], "out": "curves"},
     ErrorVsTimeConfig: {"data": "d", "out": "o"},
     ScalingConfig: {},
-    SolverTargetsConfig: {},
     StabilityNetworkConfig: {"weights": "w"},
     StabilitySolverConfig: {},
 }
@@ -40,10 +36,6 @@ GIVEN = {  # what each must be given
             {"cases": ["public_gns_train"]},
             "public_gns must be a folder with the public code for public_gns_t",
         ),
-        (CompareConfig, {"trees": []}, "trees must be a list with at least one tree"),
-        (CompareConfig, {"trees": [".", "."]}, "trees must be a list of different trees"),
-        (CompareConfig, {"rounds": 0}, "rounds must be"),
-        (CompareConfig, {"bench": ["json=x"]}, "bench[0] must be KEY=VALUE other than json"),
         (CurvesConfig, {"names": ["x", "y"]}, "names must be one for each of the 1 runs"),
         (ErrorVsTimeConfig, {"data": None}, "data must be a data set, got None; make one with python -m datagen, or"),
         (ErrorVsTimeConfig, {"mpm_steps": [0.0]}, "mpm_steps[0] must be above 0"),
@@ -61,7 +53,6 @@ GIVEN = {  # what each must be given
         (ScalingConfig, {"backends": ["slow"]}, "backends[0] must be torch or triton"),
         (ScalingConfig, {"particle_spread": -1}, "particle_spread must be"),
         (ScalingConfig, {"network": {"kind": "gns", "levels": 1}}, "network.kind must be hgn"),
-        (SolverTargetsConfig, {"cases": ["two_scenes"]}, "cases must be some of one_scene_te_step, one_scene"),
         (StabilityNetworkConfig, {"cases": ["wide"]}, "cases[0] must be one of throw"),
         (StabilityNetworkConfig, {"frames": 1}, "frames must be at least 2"),
         (StabilityNetworkConfig, {"precision": "fp8"}, "precision must be one of fp32, tf32, fp16"),

@@ -124,9 +124,7 @@ class Train(Contender):
 
 
 class MpmFrame(Timed):
-    """One frame of the solver that makes the data, at its converged step: of the same particles at rest. What it takes
-    with landed and random scenes is measured by tools.studies.solver_targets.
-    """
+    """One frame of the solver that generates the data, at its converged step; the same particles start at rest."""
 
     def __init__(self, work: Workload, config: BenchConfig, device: torch.device) -> None:
         self.scenes = [scene_of(work, seed, config.network.cell_size) for seed in range(work.scenes)]

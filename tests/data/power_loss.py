@@ -1,10 +1,9 @@
-"""python -m tools.studies.power_loss out=data/power_loss: the machine loses its power, or its disk fails, at any step.
+"""Loses the power, or fails the disk, before any call of a generation, a checkpoint or a reader's cache.
 
-A generation, a training's checkpoints and a reader's cache are written while every call that changes the folder is
-followed. Before each of them the folder is laid out anew as a disk may have it after a loss of power: bytes are there
-that were brought to it by fsync, names that were brought to it by fsync of their folder; of all others any may be
-there, lost, cut or zeroed. POSIX promises no more (Pillai et al., OSDI 2014, found file systems that do no more). What
-was said to be published or saved must be in each of these folders, and a next run must complete it, bitwise.
+Python's file system calls are intercepted while data are written. Before each call the folder is copied as a disk may
+contain it after a power loss: bytes are there if the file was synced, names if their folder was; all others may be
+there, lost, cut or zeroed. POSIX guarantees no more, nor do some file systems (Pillai et al., OSDI 2014). Everything
+published or saved must be in each copy, and the next run must complete it, bitwise.
 """
 
 from __future__ import annotations
@@ -13,7 +12,6 @@ import builtins
 import errno
 import hashlib
 import io
-import json
 import os
 import random
 import shutil
@@ -21,7 +19,6 @@ import tempfile
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 from unittest import mock
@@ -31,42 +28,26 @@ import torch
 
 from datagen.pool.shard import stage_episode
 from datagen.pool.writer import DatasetWriter
-from hgn.command import run_command
 from hgn.config import DatagenConfig, DatasetConfig
 from hgn.data.manifest import Manifest
 from hgn.data.shard_cache import CACHE_VARIABLE
 from hgn.data.storage import open_storage
 from hgn.scene.episode import Episode
 from hgn.scene.obstacle_grid import ObstacleGrid
-from hgn.schema import ConfigError, NonNegative, Positive, from_mapping, require_bounds
-from hgn.system.files import TEMPORARY_SUFFIX, write_json
+from hgn.schema import ConfigError
+from hgn.system.files import TEMPORARY_SUFFIX
 from hgn.training.checkpoint import LAST_NAMES, SECTION, read_checkpoint
 from hgn.training.checkpoint_writer import CheckpointWriter
-from tools.report import EXIT_RED, meta_of
 
-SPLITS = (0.0, 1.0, 0.5)  # of what is not synced: nothing is there; all names are; each thing is or is not
+KEPT = (0.0, 1.0, 0.5)  # probability that anything not synced is on the disk
 SHARDS = 4
 CALLS = ("replace", "rename", "link", "unlink", "remove", "mkdir", "rmdir", "truncate")
 
 
-@dataclass(frozen=True)
-class PowerLossConfig:
-    """`python -m tools.studies.power_loss`: how many folders are laid out."""
-
-    out: str
-    every: Positive[int] = 1  # call
-    rounds: Positive[int] = 9  # of drawing what is lost, for each call
-    seed: NonNegative[int] = 0
-    json: str | None = None
-
-    def __post_init__(self) -> None:
-        require_bounds(self)
-
-
 class Disk:
-    """Follows what of a folder is on the disk, and calls `before` before each call that changes it.
+    """Tracks which parts of a folder are on the disk, and calls `before` before each call that changes the folder.
 
-    With `piece` a call reads or writes so many bytes at most; what `before` raises, the call raises.
+    `piece` is the largest number of bytes that one call reads or writes. An error of `before` is the call's error.
     """
 
     def __init__(self, folder: Path, before: Callable[[], None] = lambda: None, piece: int | None = None) -> None:
@@ -80,7 +61,7 @@ class Disk:
 
     @contextmanager
     def followed(self) -> Iterator[None]:
-        """While it is entered Python's calls are followed, in all threads."""
+        """Intercepts Python's calls in all threads."""
         with self._stack as stack:
             for name in CALLS:
                 stack.enter_context(mock.patch.object(os, name, self._followed(getattr(os, name))))
@@ -91,12 +72,11 @@ class Disk:
             yield
 
     def step(self) -> None:
-        """A call is about to be made."""
         with self._lock:
             self._before()
 
     def lay_out(self, target: Path, kept: float, draw: random.Random) -> None:
-        """The folder as the disk may have it now; `kept` is the chance of what is not synced."""
+        """Copies the folder as the disk may contain it; `kept` is the probability of anything that is not synced."""
         paths = {path.stat().st_ino: path for path in (self.folder, *self.folder.rglob("*"))}
 
         def lay_out(inode: int, target: Path) -> None:
@@ -135,7 +115,7 @@ class Disk:
         path = Path(f"/proc/self/fd/{descriptor}").readlink()
         if not path.is_relative_to(self.folder):
             return
-        self.step()  # the study itself is not brought to the disk
+        self.step()  # the data are not really synced: that would be slow
         with self._lock:
             inode = os.fstat(descriptor).st_ino
             self._stack.callback(os.close, os.dup(descriptor))  # so that no other file gets the inode's number
@@ -187,11 +167,10 @@ def _entries(folder: Path) -> dict[str, int]:
 
 
 class Generation:
-    """Four shards, the last two of two episodes, the third of a second seed; the second is lost in between, so the
-    index is written anew. What is staged goes to the disk at once where its shard lacks others."""
+    """Four shards; one scene is quarantined and drawn again, and the second shard is lost and generated again."""
 
     def write(self, folder: Path, promised: dict[str, str]) -> None:
-        """Adds to what is `promised`, by name, what must be there from now on."""
+        """Adds the names and hashes that must be there from now on to `promised`."""
         for lost in (None, "train-000001-000002.tar"):
             if lost is not None:
                 del promised[lost]
@@ -211,7 +190,7 @@ class Generation:
                     promised[entry.name] = entry.sha256
 
     def check(self, folder: Path, promised: dict[str, str]) -> None:
-        """Raises: whatever is wrong."""
+        """Raises an error if anything promised is missing."""
         if (folder / "data" / "manifest.json").exists():
             manifest = Manifest.load(folder / "data")
             listed = {shard.name: shard.sha256 for shard in manifest.shards}
@@ -234,10 +213,10 @@ class Generation:
 
 
 class Checkpoints:
-    """Four checkpoints of a run in a new folder; the last that was saved is there, or a later one."""
+    """Four checkpoints of a run in a new folder; the last saved one must be there, or a later one."""
 
     def write(self, folder: Path, promised: dict[str, int]) -> None:
-        """Adds how many updates are saved."""
+        """Adds the number of saved updates to `promised`."""
         writer = CheckpointWriter()
         for updates in range(1, 5):
             content = {SECTION: {"updates": updates}, "state_dict": {"weight": torch.full((64,), float(updates))}}
@@ -247,7 +226,7 @@ class Checkpoints:
         writer.teardown()
 
     def check(self, folder: Path, promised: dict[str, int]) -> None:
-        """Raises: whatever is wrong."""
+        """Raises an error if anything promised is missing."""
         paths = [folder / "runs" / "one" / "checkpoints" / name for name in LAST_NAMES]
         last = next((path for path in paths if path.exists()), None)
         found = 0 if last is None else read_checkpoint(last)[SECTION]["updates"]
@@ -255,12 +234,12 @@ class Checkpoints:
 
 
 class Cache:
-    """A shard that a reader keeps: it is there as it was published, or not at all."""
+    """A cached shard is there as it was published, or not at all."""
 
     content = random.Random(0).randbytes(10_000)
 
     def write(self, folder: Path, promised: dict[str, str]) -> None:
-        """Promises nothing: what is lost is fetched again."""
+        """Promises nothing: a lost shard is fetched again."""
         digest = hashlib.sha256(self.content).hexdigest()
         with tempfile.TemporaryDirectory() as served, mock.patch.dict(os.environ, {CACHE_VARIABLE: f"{folder}/cache"}):
             (Path(served) / "a.tar").write_bytes(self.content)
@@ -268,25 +247,25 @@ class Cache:
             assert path.read_bytes() == self.content
 
     def check(self, folder: Path, promised: dict[str, str]) -> None:
-        """Raises: whatever is wrong."""
+        """Raises an error if anything promised is missing."""
         self.write(folder, promised)
 
 
 SCENARIOS = {"generation": Generation(), "checkpoints": Checkpoints(), "cache": Cache()}
 
 
-def lose_power(scenario: Any, folder: Path, every: int, rounds: int, seed: int) -> tuple[int, int, list[str]]:
-    """Calls that were made, folders that were laid out, and what was wrong with them."""
+def lose_power(scenario: Any, folder: Path, every: int, rounds: int = 1) -> tuple[int, int, list[str]]:
+    """Loses power before every `every`-th call, `rounds` times; returns counts of calls and copies, and the faults."""
     calls, faults, promised = 0, list[str](), dict[str, Any]()
     laid_out: list[tuple[Path, dict[str, Any]]] = []
 
     def before() -> None:
         nonlocal calls
         calls += 1
-        for number in range(0 if (calls + seed) % every else rounds):
-            draw = random.Random(f"{seed}/{calls}/{number}")
+        for number in range(0 if calls % every else rounds):
+            draw = random.Random(f"0/{calls}/{number}")
             place = folder / f"{calls}-{number}"
-            disk.lay_out(place, SPLITS[(calls // every + number) % len(SPLITS)], draw)
+            disk.lay_out(place, KEPT[(calls // every + number) % len(KEPT)], draw)
             laid_out.append((place, dict(promised)))
 
     (folder / "disk").mkdir(parents=True)
@@ -300,7 +279,7 @@ def lose_power(scenario: Any, folder: Path, every: int, rounds: int, seed: int) 
 
 
 def broken(scenario: Any, place: Path, promised: dict[str, Any], when: str) -> list[str]:
-    """What a folder does not hold of what was promised, none or one."""
+    """Returns why a folder breaks a promise, as a list of one or none."""
     try:
         scenario.check(place, promised)
     except (AssertionError, ConfigError, OSError, LookupError, ValueError) as error:
@@ -309,7 +288,7 @@ def broken(scenario: Any, place: Path, promised: dict[str, Any], when: str) -> l
 
 
 def fail(scenario: Any, folder: Path, every: int, piece: int | None) -> tuple[int, list[str]]:
-    """How many of the calls failed with EIO, one a run, and what was wrong afterwards; calls move `piece` bytes."""
+    """Lets one call a run fail with EIO; returns the number of failed calls and the faults."""
     faults, failed = list[str](), 0
     while True:
         calls, number, promised = 0, 1 + failed * every, dict[str, Any]()
@@ -325,7 +304,7 @@ def fail(scenario: Any, folder: Path, every: int, piece: int | None) -> tuple[in
         try:
             with Disk(place, before, piece).followed():
                 scenario.write(place, promised)
-        except Exception as error:  # noqa: BLE001 - a fault: it is told
+        except Exception as error:  # noqa: BLE001 - any other error is a fault
             if not (isinstance(error, OSError) and error.errno == errno.EIO):
                 faults.append(f"call {number}: {error!r}")
         if calls < number:
@@ -333,21 +312,6 @@ def fail(scenario: Any, folder: Path, every: int, piece: int | None) -> tuple[in
         failed += 1
         faults += broken(scenario, place, promised, f"after call {number}")
         shutil.rmtree(place)
-
-
-def main(mapping: dict[str, Any]) -> int:
-    """Prints what was tried and what was wrong; the exit code is 1 where anything was."""
-    config, rows = from_mapping(PowerLossConfig, mapping), []
-    for name, scenario in SCENARIOS.items():
-        folder = Path(config.out) / name
-        calls, tried, faults = lose_power(scenario, folder, config.every, config.rounds, config.seed)
-        failed, wrong = fail(scenario, folder, config.every, piece=1000)
-        counts = {"calls": calls, "power_losses": tried, "failed_calls": failed}
-        rows.append({"what": name, **counts, "faults": faults + wrong})
-        print(json.dumps(rows[-1]))
-    if config.json is not None:
-        write_json(config.json, {"meta": meta_of(config), "rows": rows})
-    return EXIT_RED if any(row["faults"] for row in rows) else 0
 
 
 def stage_small(writer: DatasetWriter, number: int) -> None:
@@ -371,7 +335,3 @@ def stage_small(writer: DatasetWriter, number: int) -> None:
     )
     stage_episode(writer.folder, episode)
     writer.add_staged("train", number)
-
-
-if __name__ == "__main__":
-    run_command(main, "power_loss")
