@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from hgn.renamed import CHOICES
+from hgn.renamed import CHOICES, REMOVED_CHOICES
 from hgn.schema import ConfigError, default_mapping
 
 OPTIONS = (
@@ -119,6 +119,8 @@ def _override(argument: str, folder: Path) -> str:
         return argument
     if new := CHOICES.get(argument.lstrip("+")):
         raise ConfigError(f"{argument} is called {new} now")
+    if remedy := REMOVED_CHOICES.get(key.lstrip("+"), {}).get(value):
+        raise ConfigError(f"{argument} was removed; {remedy}")
     if value and not _understood(value):
         value = _in_quotes(value)
     if re.fullmatch(r"[A-Za-z][\w.]*", key) and not key.startswith("hydra"):

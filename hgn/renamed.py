@@ -1,13 +1,41 @@
-"""Names of earlier releases: the one table by which they are answered with today's, and by which old files load.
+"""Settings of earlier releases: the one table that answers their names and lets old files load.
 
-A command line or YAML file with an old name is refused, and the message gives the new one. Checkpoints, weights and
-manifests keep the names that they were written with, and load.
+| what changed | table | on a command line | in checkpoints, weights and manifests |
+|---|---|---|---|
+| a key | KEYS | refused with the new key | loads |
+| a value | VALUES | refused with the new value | loads |
+| a setting was removed | REMOVED | refused with the reason | loads with the fixed value, else refused |
+| a choice of a config group was renamed | CHOICES | refused with the new choice | |
+| a value or a choice was removed | REMOVED_CHOICES | refused with the reason | refused |
+| a setting of the solver was added | BEFORE | | gets what the solver did before |
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
+
+ANY = object()
+
+
+@dataclass(frozen=True)
+class Removed:
+    """The value that a removed setting always has now, and what to do instead of setting it.
+
+    With ANY a setting has no fixed value, and stored files load whatever they say of it.
+    """
+
+    value: Any = ANY
+    remedy: str = "leave it out"
+
+
+# `section.key`; the section is the name of the dataclass without Config: network, mpm, scene, dataset, training,
+# train, evaluate, rollout, error_vs_time. Fixed values of `scene` and `mpm` stay in the identity of data sets.
+REMOVED: dict[str, Removed] = {}
+
+# Values that a setting or a config group no longer takes, by the last part of its key, and what to do instead.
+REMOVED_CHOICES: dict[str, dict[Any, str]] = {}
 
 # Old key to new key, as on a command line; a key stays in its section.
 KEYS = {
@@ -27,7 +55,8 @@ KEYS = {
     "shares": "coefficients",  # of hgn.average
     "cursor": "sampler_state",  # in checkpoints
 }
-# Old value to new value, by the new key's last name.
+
+# Old value to new value, by the last part of the new key.
 _BACKENDS = {"plain": "torch", "fast": "triton"}
 _PRECISIONS = {"highest": "fp32", "high": "tf32", "half": "fp16"}
 VALUES: dict[str, dict[Any, str]] = {
@@ -39,29 +68,22 @@ VALUES: dict[str, dict[Any, str]] = {
     "system": {"trivial": "baseline"},  # in reports of tools.error_vs_time
 }
 
-# Choices of config groups, old to new, as on a command line: the name `mechanics` is that of an experiment and weights.
+# Choices of config groups, old to new, as on a command line.
 CHOICES = {"scene=mechanics": "scene=motion", "dataset=mechanics": "dataset=motion"}
 
-
-# Settings younger than some data sets, of the solver: what it did before it had them.
+# Settings of the solver that data sets of 0.1.0 lack, and what the solver did then.
 BEFORE: dict[str, Any] = {
-    "mpm.transfer_speed_m_s": None,
     "mpm.time_integration": "symplectic_euler",
     "mpm.water_density_relaxation_s": None,
     "mpm.sand_grain_diameter_m": 0.0,
 }
 
-
-# Settings of relative inputs that left, and what they always are now.
-GONE: dict[str, Any] = {"network.momentum": "angular", "network.obstacle_distances": False}
-
-
-# Prefixes of logged metrics, old to new: metrics.jsonl of earlier runs stays as it is.
+# Prefixes of metrics in metrics.jsonl.
 METRICS = {"trivial/": "baseline/", "one_step_gain/": "baseline_ratio/", "own_states/": "pushforward/"}
 
 
 def current_metrics(record: Mapping[str, float]) -> dict[str, float]:
-    """A record of metrics.jsonl under today's names."""
+    """Returns a record of metrics.jsonl under today's names."""
     result = {}
     for name, value in record.items():
         old = next((prefix for prefix in METRICS if name.startswith(prefix)), "")
@@ -70,36 +92,39 @@ def current_metrics(record: Mapping[str, float]) -> dict[str, float]:
 
 
 def current_value(key: str, value: Any) -> Any:
-    """A value as it is called today; `key` may be dotted, and of an item of a list."""
-    values = VALUES.get(key.rpartition(".")[2].partition("[")[0], {})
+    """Returns today's name of a value; `key` may be dotted, or that of an item of a list."""
+    values = VALUES.get(_last(key), {})
     return values.get(value, value) if isinstance(value, (str, bool)) else value
 
 
 def current_names(mapping: Mapping[str, Any], section: str = "") -> dict[str, Any]:
-    """A stored mapping with today's keys and values; `section` is its dotted name in the configuration. What a setting
-    did before there was one stands where it is missing.
+    """Returns a stored mapping with today's keys and values.
+
+    `section` is its dotted name in the configuration. Settings of the solver that are younger than the file are added,
+    removed ones are dropped. A removed one with another value than the fixed one stays, for `from_mapping` to refuse.
     """
     result = {key.removeprefix("mpm."): value for key, value in BEFORE.items()} if section == "mpm" else {}
     for old, value in mapping.items():
         key = KEYS.get(_join(section, old), _join(section, old))
-        inner = current_names(value, key) if isinstance(value, Mapping) else current_value(key, value)
-        result[key.rpartition(".")[2]] = inner
-    for key, always in GONE.items():
-        owner, _, name = key.rpartition(".")
-        # another value is that of no network of today, and refused by the key's name
-        if section == owner and (result.get(name) == always or result.get("inputs") != "relative"):
-            result.pop(name, None)
+        removed = REMOVED.get(key)
+        if removed is None or removed.value not in (ANY, value):
+            inner = current_names(value, key) if isinstance(value, Mapping) else current_value(key, value)
+            result[key.rpartition(".")[2]] = inner
     return result
 
 
 def stored_names(mapping: Mapping[str, Any], section: str) -> dict[str, Any]:
-    """A section of today's configuration with the keys that data sets are identified by: those they began with."""
+    """Returns a section of today's configuration as it identifies a data set: with the first release's keys, and with
+    the fixed values of removed settings.
+    """
     old_keys = {new: old.rpartition(".")[2] for old, new in KEYS.items()}
-    return {old_keys.get(_join(section, key), key): value for key, value in mapping.items()}
+    owners = {key.rpartition("."): removed.value for key, removed in REMOVED.items()}
+    fixed = {name: value for (owner, _, name), value in owners.items() if owner == section and value is not ANY}
+    return fixed | {old_keys.get(_join(section, key), key): value for key, value in mapping.items()}
 
 
-def key_remedy(key: str, value: Any) -> str | None:
-    """What to write instead of an old key, which is dotted; none for a key that was not renamed."""
+def renamed_remedy(key: str, value: Any) -> str | None:
+    """Returns what to write instead of an old key, which is dotted, or None for a key that was not renamed."""
     if key not in KEYS:
         return None
     value = current_value(KEYS[key], value)
@@ -107,16 +132,26 @@ def key_remedy(key: str, value: Any) -> str | None:
     return f"it is called {KEYS[key]} now; write {KEYS[key]}{example}"
 
 
-def gone_remedy(key: str) -> str | None:
-    """What to do about a key that left, whose name ends as in the configuration; none for another."""
-    key = ".".join(key.split(".")[-2:])
-    return f"it is always {GONE[key]} now; leave it out, and train other weights anew" if key in GONE else None
+def removed_remedy(section: str, key: str) -> str | None:
+    """Returns what to do about a removed setting, or None for any other."""
+    removed = REMOVED.get(_join(section, key))
+    if removed is None:
+        return None
+    return f"it was removed{'' if removed.value is ANY else f' and is always {removed.value} now'}; {removed.remedy}"
 
 
 def value_remedy(key: str, value: Any) -> str:
-    """What to write instead of an old value; empty for a value that was not renamed."""
+    """Returns what to write instead of an old value, or an empty text for any other value."""
+    if not isinstance(value, (str, bool)):
+        return ""
     new = current_value(key, value)
-    return "" if new is value else f"{value} is called {new} now"
+    renamed = "" if new is value else f"{value} is called {new} now"
+    return REMOVED_CHOICES.get(_last(key), {}).get(value, renamed)
+
+
+def _last(key: str) -> str:
+    """The last part of a dotted key, without the number of an item."""
+    return key.rpartition(".")[2].partition("[")[0]
 
 
 def _join(section: str, key: str) -> str:

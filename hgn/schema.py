@@ -19,7 +19,7 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
-from hgn.renamed import KEYS, current_names, gone_remedy, key_remedy, value_remedy
+from hgn.renamed import KEYS, current_names, removed_remedy, renamed_remedy, value_remedy
 
 T = TypeVar("T")
 # of a value: its owner's and its own name or place, joined where a message needs it
@@ -82,7 +82,8 @@ def from_mapping(cls: type[T], mapping: object, path: _Path = "") -> T:
         if key not in fields:
             name = _text((path, str(key)))
             renamed = KEYS.get(name, "").rpartition(".")[2] in fields
-            remedy = gone_remedy(name) or (key_remedy(name, value) if renamed else known_keys(str(key), fields))
+            remedy = removed_remedy(section_of(cls), str(key)) or (renamed_remedy(name, value) if renamed else None)
+            remedy = remedy or known_keys(str(key), fields)
             raise ConfigError(f"{name} is not a known key; {remedy}")
         values[key] = _convert(hints[key], value, (path, key))
     for name, needed in fields.items():
@@ -104,6 +105,11 @@ def _fields(cls: type) -> tuple[dict[str, Any], dict[str, bool]]:
     return typing.get_type_hints(cls), {
         k: f.default is missing and f.default_factory is missing for k, f in given.items()
     }
+
+
+def section_of(cls: type) -> str:
+    """Returns the section of the configuration that a dataclass is, as in error_vs_time for ErrorVsTimeConfig."""
+    return re.sub(r"(?<=[a-z])(?=[A-Z])", "_", cls.__name__.removesuffix("Config")).lower()
 
 
 @functools.cache

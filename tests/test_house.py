@@ -16,10 +16,10 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 29_176,
+    "hgn": 29_400,
     "datagen": 8_855,
     "tools": 7_705,
-    "tests": 27_800,
+    "tests": 28_000,
 }
 SETTINGS = 352  # fields of the dataclasses behind the commands, *Config
 
@@ -195,7 +195,7 @@ def tracked(*patterns: str) -> tuple[str, ...]:
         pytest.skip("needs a checkout")
     command = ["git", "-C", str(ROOT), "ls-files", "-z", *patterns]
     names = subprocess.run(command, check=True, capture_output=True, text=True).stdout.split("\0")
-    return tuple(name for name in names if name and (ROOT / name).is_file())
+    return tuple(name for name in dict.fromkeys(names) if name and (ROOT / name).is_file())
 
 
 @functools.cache

@@ -3,7 +3,7 @@
 import pytest
 
 from hgn.hydra_compat import compose
-from hgn.renamed import CHOICES
+from hgn.renamed import CHOICES, REMOVED_CHOICES
 from hgn.schema import ConfigError
 
 
@@ -28,8 +28,12 @@ def test_canary(tmp_path):
     assert compose(tmp_path, "made", ["made"], complete=False)[0]["weights"] == "???"
 
 
-@pytest.mark.parametrize(("old", "new"), CHOICES.items())
-def test_renamed_choices(old, new, tmp_path):
-    """A choice of a group that was renamed is answered with its name of today."""
-    with pytest.raises(ConfigError, match=f"^{old} is called {new} now$"):
-        compose(tmp_path, "made", ["made", old])
+def test_renamed_choices(tmp_path, monkeypatch):
+    """A choice of a group that was renamed is answered with its new name, one that was removed with the reason."""
+    monkeypatch.setitem(REMOVED_CHOICES, "experiment", {"moon": "take +experiment=obstacles"})
+    answers = {old: f"{old} is called {new} now" for old, new in CHOICES.items()}
+    answers["+experiment=moon"] = "+experiment=moon was removed; take +experiment=obstacles"
+    for argument, answer in answers.items():
+        with pytest.raises(ConfigError) as caught:
+            compose(tmp_path, "made", ["made", argument])
+        assert str(caught.value) == answer

@@ -37,7 +37,7 @@ def dataset_identity(config: DatagenConfig) -> dict[str, Any]:
     shapes = config.scene.obstacle_shapes
     named = [f"{Path(shape).name} {mesh_sha256(shape)}" if is_mesh_file(shape) else shape for shape in shapes]
     scene = stored_names(to_mapping(config.scene), "scene")
-    defaults = to_mapping(SceneConfig())
+    defaults = stored_names(to_mapping(SceneConfig()), "scene")
     for option in _LATER_OPTIONS:
         if scene[option] == defaults[option]:
             del scene[option]
