@@ -13,7 +13,6 @@ from typing import Annotated
 
 from hgn.scene.material import MATERIAL_NAME, MATERIALS, PAPER_MATERIALS
 from hgn.schema import (
-    AtLeastOne,
     AtMostOne,
     BelowOne,
     Bound,
@@ -471,13 +470,8 @@ class TrainingConfig:
     # in a frame whose rms acceleration is a below noise_std, the noise's scale is drawn down to max(a /
     # noise_std, this); 1: the same noise everywhere
     noise_min_scale: AtMostOne[Positive[float]] = 1.0
-    # squared errors of such a frame count by 1 / scale to this power; 2: in units of the noise, so that rest is learned
-    # before slow slides; 0: all alike
-    noise_weight_power: NonNegative[float] = 2.0
-    # domain units per frame squared; squared errors of a frame of rms acceleration a below it count by the quotient …
+    # domain units per frame squared; squared errors of a frame of rms acceleration a below it weigh this / a, at most 4
     quiet_acceleration: NonNegative[float] = 0.0
-    quiet_weight: AtLeastOne[float] = 4.0  # … at most so much: what errs little at rest does so for thousands of frames
-    grid_jitter: bool = True
     # fraction of an episode's samples drawn by its frames' accelerations, with weights that keep the loss; 0:
     # all frames alike
     frame_importance: BelowOne[float] = 0.0
@@ -502,22 +496,15 @@ class TrainingConfig:
     seed: NonNegative[int] = 0
     accelerator: Processor = "auto"  # or cpu, gpu
     devices: OneOrMore | None = None  # on each machine; null: as launched, without a launcher all GPUs, or one CPU
-    nodes: OneOrMore | None = None  # machines; null: as launched, without a launcher one
-    # between ranks; bf16: half the bytes, for slow networks
-    gradient_messages: Annotated[str, one_of("fp32", "bf16")] = "fp32"
     precision: Precision = "tf32"  # of matrix products: fp32, tf32 (on a GPU), fp16 (backend triton, and GNS)
     # torch, triton (kernels in CUDA graphs); auto: triton where it runs
     backend: Annotated[str, one_of("auto", "torch", "triton")] = "auto"
     minimum_episodes: Positive[int] = 1  # training starts once that many training episodes are published
     generate: bool = True  # start the generator where the data set is missing or incomplete
-    maximum_skipped_updates: Positive[int] = 100  # in a row, for gradients that are not finite; then training ends
     log_every: Positive[int] = 50  # updates
     checkpoint_every: Positive[int] = 1_000  # updates
     monitor_every: Positive[int] = 100_000  # updates between measurements of one-step and rollout errors
-    monitor_scenes: Positive[int] = 5  # fixed scenes of each split
-    monitor_frame_stride: Positive[int] = 1  # every frame
     monitor_rollout_frames: NonNegative[int] = 300  # 0: no rollouts
-    monitor_particles_per_batch: Positive[int] = 32_768
 
     def __post_init__(self) -> None:
         require_bounds(self)

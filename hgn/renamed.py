@@ -32,7 +32,17 @@ class Removed:
 
 # `section.key`; the section is the name of the dataclass without Config: network, mpm, scene, dataset, training,
 # train, evaluate, rollout, error_vs_time. Fixed values of `scene` and `mpm` stay in the identity of data sets.
-REMOVED: dict[str, Removed] = {}
+REMOVED: dict[str, Removed] = {
+    "training.gradient_messages": Removed("fp32"),
+    "training.grid_jitter": Removed(True),
+    "training.maximum_skipped_updates": Removed(100),
+    "training.monitor_frame_stride": Removed(4),
+    "training.monitor_particles_per_batch": Removed(32_768),
+    "training.monitor_scenes": Removed(5),
+    "training.nodes": Removed(remedy="leave it out: the launcher starts processes on every machine"),
+    "training.noise_weight_power": Removed(2.0),
+    "training.quiet_weight": Removed(4.0),
+}
 
 # Values that a setting or a config group no longer takes, by the last part of its key, and what to do instead.
 REMOVED_CHOICES: dict[str, dict[Any, str]] = {}

@@ -119,10 +119,8 @@ UNCOMMENTED: set[str] = {
     "StabilityNetworkConfig.device",
     "StabilityNetworkConfig.frames",
     "TrainConfig.run",
-    "TrainingConfig.grid_jitter",
     "TrainingConfig.learning_rate",
     "TrainingConfig.maximum_updates",
-    "TrainingConfig.monitor_particles_per_batch",
     "TrainingConfig.seed",
 }
 UNMENTIONED: set[str] = {
@@ -164,9 +162,7 @@ UNMENTIONED: set[str] = {
     "StabilitySolverConfig.leak_offsets",
     "StabilitySolverConfig.leak_seconds",
     "TrainingConfig.accelerator",
-    "TrainingConfig.grid_jitter",
     "TrainingConfig.log_every",
-    "TrainingConfig.monitor_particles_per_batch",
     "UploadConfig.poll_s",
 }
 

@@ -58,25 +58,22 @@ def default_run(name: str) -> Path:
 
 
 def layout(training: TrainingConfig) -> tuple[int, int]:
-    """(processes on each machine, machines): as configured, else as launched, else all GPUs of one machine.
+    """Returns (processes on each machine, machines): as launched, else as configured, else all GPUs of this machine.
 
     Raises: ConfigError when there are not as many GPUs, or the launcher started another number of processes.
     """
     _check_restarts()
-    launched = _launched()
-    devices, nodes = training.devices, training.nodes
-    if launched is not None:
-        devices, nodes = devices or launched[0], nodes or launched[1]
-    devices, nodes = _devices(training.accelerator, devices), nodes or 1
-    if launched is not None and devices * nodes != launched[0] * launched[1]:
+    launched = _launched(training.devices)
+    devices = _devices(training.accelerator, training.devices or (launched and launched[0]))
+    if launched is None:
+        return devices, 1
+    if devices != launched[0]:
         # each process would train alone and write over the others' checkpoints, or wait for ever
         raise ConfigError(
-            f"training.devices x training.nodes must be the {launched[0] * launched[1]} processes that the launcher "
-            f"started, got {devices} x {nodes}; leave both out, or set training.devices to the processes of one "
-            "machine and training.nodes to the number of machines, and under Slurm start one task for each device "
-            "with srun"
+            f"training.devices must be the {launched[0]} processes that the launcher started on each of {launched[1]} "
+            f"machines, got {devices}; leave it out, and under Slurm start one task for each device with srun"
         )
-    return devices, nodes
+    return launched
 
 
 def averaging_options() -> dict[str, Any]:
@@ -96,56 +93,6 @@ def averaging_options() -> dict[str, Any]:
 def sum_over_ranks(tensor: torch.Tensor) -> None:
     """Sums a tensor over all ranks, in place. Backend triton does so with an update's gradients, in one message."""
     torch.distributed.all_reduce(tensor)
-
-
-class RoundedSum:
-    """Sums tensors over all ranks in bfloat16; what rounding left out is sent the next time.
-
-    So what was sent stays within one rounding of what was to be sent, over all updates together: error feedback (Seide
-    et al. 2014; Karimireddy et al. 2019). What is left is of this process: a training that is gone on with begins
-    without, and is not bitwise that of one without a break.
-    """
-
-    def __init__(self, flag: int | None = None) -> None:
-        """`flag` is the place of an element that is above zero where what was summed is void and comes again."""
-        self._flag = flag
-        self._left: dict[int, torch.Tensor] = {}
-
-    def __call__(self, tensor: torch.Tensor) -> None:
-        """Sums a tensor in place."""
-        message = self.message(tensor)
-        torch.distributed.all_reduce(message)
-        self.take(tensor, message)
-
-    def message(self, tensor: torch.Tensor, key: int = 0) -> torch.Tensor:
-        """What to sum instead of a tensor, bfloat16; of each `key` one is under way at a time."""
-        if key not in self._left or self._left[key].shape != tensor.shape:
-            self._left[key] = torch.zeros_like(tensor)
-        tensor += self._left[key]
-        return tensor.bfloat16()
-
-    def take(self, tensor: torch.Tensor, total: torch.Tensor, key: int = 0) -> None:
-        """Writes the sum into the tensor that the message was of. An update that is skipped leaves nothing."""
-        counts = total.isfinite().all()
-        if self._flag is not None:
-            counts &= total[self._flag] == 0
-        rest = tensor - tensor.bfloat16()
-        self._left[key] = torch.where(counts, rest, self._left[key])
-        tensor.copy_(total)
-
-
-# torch reads annotations, and takes none for right but not those that are strings
-def rounded_average(sums, bucket):  # type: ignore[no-untyped-def]
-    """A DistributedDataParallel's way to average gradients in bfloat16, with a RoundedSum."""
-    tensor, key, ranks = bucket.buffer(), bucket.index(), torch.distributed.get_world_size()
-    message = sums.message(tensor, key)
-    work = torch.distributed.all_reduce(message, async_op=True)
-
-    def averaged(_: object) -> torch.Tensor:
-        sums.take(tensor, message, key)
-        return tensor.div_(ranks)
-
-    return work.get_future().then(averaged)
 
 
 def checksum(tensors: Iterable[torch.Tensor]) -> torch.Tensor:
@@ -184,16 +131,21 @@ def _devices(accelerator: str, wanted: int | None) -> int:
     return wanted
 
 
-def _launched() -> tuple[int, int] | None:
-    """(processes on each machine, machines) that a launcher started."""
+def _launched(devices: int | None) -> tuple[int, int] | None:
+    """Returns (processes on each machine, machines) that a launcher started, None without one.
+
+    Where the launcher reports the sum only, `devices` are on each machine if they divide it.
+    """
     if "RANK" in os.environ and "WORLD_SIZE" in os.environ:
-        processes = int(os.environ["WORLD_SIZE"])
-        here = int(os.environ.get("LOCAL_WORLD_SIZE", processes))
-        return here, processes // here
-    if _inside_slurm_step():
-        processes, nodes = int(os.environ["SLURM_NTASKS"]), int(os.environ.get("SLURM_NNODES", "1"))
-        return processes // nodes, nodes
-    return None
+        processes, here, nodes = int(os.environ["WORLD_SIZE"]), os.environ.get("LOCAL_WORLD_SIZE"), None
+    elif _inside_slurm_step():
+        processes, here, nodes = int(os.environ["SLURM_NTASKS"]), None, os.environ.get("SLURM_NNODES")
+    else:
+        return None
+    if here is None:
+        known = processes // int(nodes) if nodes else devices
+        here = known if known and processes % known == 0 else processes
+    return int(here), processes // int(here)
 
 
 def _inside_slurm_step() -> bool:

@@ -20,6 +20,8 @@ from hgn.scene.episode import Episode
 
 REPORTED_FRAMES = (10, 50, 150, 299)  # of rollouts
 FRAMES_AT_ONCE = 16  # in float64
+MONITORED_SCENES = 5  # of each split, while a training runs
+PARTICLES_PER_BATCH = 32_768  # bounds the memory of frames that are computed together
 Predictor = Callable[[Batch], torch.Tensor]  # accelerations [N, 3] in frame units
 
 

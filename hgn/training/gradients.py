@@ -14,6 +14,8 @@ from lightning.pytorch import Callback, LightningModule, Trainer
 
 from hgn.schema import ConfigError
 
+MAXIMUM_SKIPPED = 100  # updates in a row, after which a training ends
+
 
 class GradientGuard(Callback):
     """Norms of the gradients, and the skipping of updates that would put a NaN into the weights.
@@ -23,8 +25,7 @@ class GradientGuard(Callback):
     rate decays; weights and moments stay as they were.
     """
 
-    def __init__(self, maximum_in_a_row: int) -> None:
-        self.maximum_in_a_row = maximum_in_a_row
+    def __init__(self) -> None:
         self._skipped_before = 0
         self._counters: torch.Tensor | None = None
         self._skip: torch.Tensor | None = None
@@ -71,7 +72,7 @@ class GradientGuard(Callback):
     def take(self, update: int) -> dict[str, float]:
         """Mean norm of the finite gradients since the last call (if there were any), and updates skipped in all.
 
-        Raises: ConfigError when `maximum_in_a_row` updates in a row had to be skipped.
+        Raises: ConfigError when MAXIMUM_SKIPPED updates in a row had to be skipped.
         """
         if self._counters is None:
             return {}
@@ -79,11 +80,11 @@ class GradientGuard(Callback):
         self._counters[:3] = 0
         self._counters[4] = 0
         self._skipped_before += int(skipped)
-        if most_in_a_row >= self.maximum_in_a_row:
+        if most_in_a_row >= MAXIMUM_SKIPPED:
             raise ConfigError(
                 f"gradients must be finite, got {most_in_a_row:.0f} updates in a row without, up to update {update}; "
                 "the weights are as before them: lower training.learning_rate or look for damaged episodes, and go on "
-                "from the last checkpoint (training.maximum_skipped_updates is the limit)"
+                "from the last checkpoint"
             )
         values = {"skipped_updates": float(self._skipped_before)}
         return values | ({"gradient_norm": norm_sum / finite} if finite else {})

@@ -14,9 +14,8 @@ from typing import Any
 import torch
 from lightning.pytorch import Trainer
 from lightning.pytorch.strategies import DDPStrategy
-from torch.nn.parallel import DistributedDataParallel
 
-from hgn.training.distributed import RoundedSum, averaging_options, rounded_average
+from hgn.training.distributed import averaging_options
 
 
 def quieten() -> None:
@@ -27,11 +26,9 @@ def quieten() -> None:
     warnings.filterwarnings("ignore", ".*GPU available but not used.*")  # training.accelerator=cpu says so
 
 
-def gradient_averaging(backend: str, messages: str) -> DDPStrategy:
-    """The strategy of a training on several ranks; `backend` is torch or triton, `messages` fp32 or bf16."""
-    if backend == "triton":
-        return _Unwrapped()
-    return (_Rounded if messages == "bf16" else DDPStrategy)(**averaging_options())
+def gradient_averaging(backend: str) -> DDPStrategy:
+    """Returns the strategy of a training on several ranks; `backend` is torch or triton."""
+    return _Unwrapped() if backend == "triton" else DDPStrategy(**averaging_options())
 
 
 class _Unwrapped(DDPStrategy):
@@ -39,15 +36,6 @@ class _Unwrapped(DDPStrategy):
 
     def configure_ddp(self) -> None:
         pass
-
-
-class _Rounded(DDPStrategy):
-    """Averages gradients in bfloat16. Lightning's own option for such a hook is silent on a CPU."""
-
-    def configure_ddp(self) -> None:
-        super().configure_ddp()
-        assert isinstance(self.model, DistributedDataParallel)
-        self.model.register_comm_hook(RoundedSum(), rounded_average)
 
 
 @contextmanager

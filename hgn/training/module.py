@@ -31,7 +31,7 @@ from hgn.training.checkpoint import (
     sampler_state_of_checkpoint,
     updates_of_checkpoint,
 )
-from hgn.training.distributed import RoundedSum, sum_over_ranks
+from hgn.training.distributed import sum_over_ranks
 from hgn.training.muon import Muon
 from hgn.training.noise import jittered_origin, perturbed_window
 from hgn.training.pushforward import PushforwardPool
@@ -104,7 +104,7 @@ class TrainingModule(LightningModule):
             weights = [parameter.detach() for parameter in self.network.parameters()]
             torch._foreach_lerp_(averaged, weights, self._average_weight(update))
 
-    def loss(self, batch: Batch) -> torch.Tensor:
+    def loss(self, batch: Batch, jitter: bool = True) -> torch.Tensor:
         """Mean squared error of the normalised acceleration: over axes, over particles, over scenes.
 
         Noise, jitter and symmetry are drawn here for the torch backend; hgn.kernels.update does so for triton.
@@ -114,7 +114,7 @@ class TrainingModule(LightningModule):
             batch = under_symmetries(batch, drawn_symmetries(batch))
         cell_size, axes = self.network.config.cell_size, self.network.config.dimensions
         window_WN3 = perturbed_window(batch, config.noise_std, config.noise_correlated_fraction, cell_size, axes)
-        origin_S3 = jittered_origin(batch, cell_size, axes) if config.grid_jitter else None
+        origin_S3 = jittered_origin(batch, cell_size, axes) if jitter else None
         target_N3 = self.network.target(batch.acceleration(window_WN3), batch.gravity_S3[batch.scene_N])
         predicted_N3 = (self.backend or self.network).normalised_acceleration(batch.state(window_WN3), origin_S3)
         return batch.mean_over_scenes((predicted_N3 - target_N3).square().mean(-1))
@@ -143,10 +143,8 @@ class TrainingModule(LightningModule):
             self._pool = PushforwardPool(self.result, config, self.trainer.global_rank)
         if not self.automatic_optimization:
             # Triton, which backend torch does without, is loaded here.
-            from hgn.kernels.update.op import TAIL
             from hgn.training.graph_trainer import GraphTrainer
 
-            sums = RoundedSum(-TAIL) if self.training_config.gradient_messages == "bf16" else sum_over_ranks
             optimizer = self.optimizers(use_pl_optimizer=False)
             assert isinstance(optimizer, torch.optim.Adam)
             self._graph_trainer = GraphTrainer(
@@ -156,7 +154,7 @@ class TrainingModule(LightningModule):
                 self.data.obstacle_cell_size,
                 self.loss_sum,
                 self.gradient_counters,
-                sums if self.trainer.world_size > 1 else None,
+                sum_over_ranks if self.trainer.world_size > 1 else None,
                 self.trainer.world_size,
                 self.averaged,
                 self.trainer.global_rank,

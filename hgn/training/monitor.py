@@ -23,6 +23,8 @@ from hgn.scene.episode import Episode
 from hgn.training.callbacks import Checkpoints, log
 from hgn.training.data_module import agreed_count
 from hgn.training.errors import (
+    MONITORED_SCENES,
+    PARTICLES_PER_BATCH,
     REPORTED_FRAMES,
     SquaredError,
     baselines,
@@ -34,6 +36,8 @@ from hgn.training.errors import (
 from hgn.training.module import TrainingModule
 from hgn.training.stop import StopRequest
 from hgn.training.tensorboard import show_rollout
+
+FRAME_STRIDE = 4  # neighbouring frames say the same
 
 
 class Monitor(Callback):
@@ -63,12 +67,12 @@ class Monitor(Callback):
         if self._measured_update == trainer.global_step:
             return
         self._measured_update = trainer.global_step
-        config, network = module.training_config, module.result
+        network = module.result
         network.eval()
         started = time.monotonic()
         self.stores["validation"].refresh()
         chosen = {
-            split: first_indices(store, config.monitor_scenes, agreed_count(store, trainer))
+            split: first_indices(store, MONITORED_SCENES, agreed_count(store, trainer))
             for split, store in self.stores.items()
         }
         here = all(store.within_reach(chosen[split], patience_s) for split, store in self.stores.items())
@@ -85,8 +89,9 @@ class Monitor(Callback):
                 continue
             values |= self._one_step(trainer, module, split, episodes)
         if "one_step/validation" in values and not self._interrupted(trainer):
-            if config.monitor_rollout_frames >= 2 and trainer.is_global_zero:
-                values |= self._rollout(trainer, module, scenes["validation"], config.monitor_rollout_frames)
+            frames = module.training_config.monitor_rollout_frames
+            if frames >= 2 and trainer.is_global_zero:
+                values |= self._rollout(trainer, module, scenes["validation"], frames)
             self.checkpoints.offer(trainer, values["one_step/validation"])
         values["monitor/seconds"] = time.monotonic() - started
         network.train()
@@ -96,12 +101,12 @@ class Monitor(Callback):
     def _one_step(
         self, trainer: Trainer, module: TrainingModule, split: str, episodes: list[Episode]
     ) -> dict[str, float]:
-        config, network = module.training_config, module.result
+        network = module.result
         batches = frame_batches(
             episodes,
             network,
-            config.monitor_frame_stride,
-            config.monitor_particles_per_batch,
+            FRAME_STRIDE,
+            PARTICLES_PER_BATCH,
             trainer.global_rank,
             trainer.world_size,
         )

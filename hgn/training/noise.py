@@ -20,6 +20,7 @@ from hgn.system.splitmix import splitmix64
 JITTER_STREAM, WAVE_STREAM, SCALE_STREAM = 0x5DEECE66D, 0x2545F4914F, 0x9E6D62D06F6A9A9B
 
 SMALLEST_ACCELERATION = 1e-30  # that anything is divided by
+QUIET_WEIGHT = 4.0  # of a frame below training.quiet_acceleration, at most
 
 
 def noise_scale(training: TrainingConfig, acceleration: float, seed: int) -> tuple[float, float]:
@@ -27,11 +28,11 @@ def noise_scale(training: TrainingConfig, acceleration: float, seed: int) -> tup
 
     Noise hides from a network what it errs by less: at rest its bias stays at a twentieth of the noise, and over
     thousands of frames what should lie still creeps. Where little happens, the noise's scale is drawn from a wide range
-    (as the levels of a denoiser are: Song & Ermon 2019). `training.noise_weight_power` 2 counts errors in units of it,
-    so that each scale weighs the same, and what slides slowly is taken for what rests; 0 counts all alike.
+    (as the levels of a denoiser are: Song & Ermon 2019), and squared errors count in units of it, so that each scale
+    weighs the same.
     `acceleration` is the root mean square of the target, domain units per frame squared. Where it is a fraction
     r < 1 of `noise_std`, the scale is log-uniform between max(r, training.noise_min_scale) and 1, drawn from the
-    sample's seed alone, and the weight is 1 / scale^power; elsewhere both are 1. The weight is also that of
+    sample's seed alone, and the weight is 1 / scale^2; elsewhere both are 1. The weight is also that of
     `quiet_weight`.
     """
     quiet = quiet_weight(training, acceleration)
@@ -41,7 +42,7 @@ def noise_scale(training: TrainingConfig, acceleration: float, seed: int) -> tup
     if not smallest < 1.0:
         return 1.0, quiet
     scale = smallest ** (splitmix64(seed ^ SCALE_STREAM) / 2.0**64)
-    return scale, quiet / scale**training.noise_weight_power
+    return scale, quiet / scale**2.0
 
 
 def quiet_weight(training: TrainingConfig, acceleration: float) -> float:
@@ -52,7 +53,7 @@ def quiet_weight(training: TrainingConfig, acceleration: float) -> float:
     """
     if not acceleration < training.quiet_acceleration:
         return 1.0
-    return min(training.quiet_weight, training.quiet_acceleration / max(acceleration, SMALLEST_ACCELERATION))
+    return min(QUIET_WEIGHT, training.quiet_acceleration / max(acceleration, SMALLEST_ACCELERATION))
 
 
 def target_acceleration(window_FWN3: torch.Tensor) -> torch.Tensor:

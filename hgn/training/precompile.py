@@ -5,6 +5,7 @@ from __future__ import annotations
 from hgn.config import SceneConfig, TrainConfig
 from hgn.kernels.update.op import UpdateSettings
 from hgn.runtime.precompile_program import PrecompileJob
+from hgn.training.errors import MONITORED_SCENES
 
 NEIGHBOURS = 100  # of a particle of GNS, about
 
@@ -26,7 +27,7 @@ def job_of_training(config: TrainConfig, capability: tuple[int, int], several_ra
         training.batch_scenes * particles,
         tuple(training.batch_scenes * count for count in cells),
         10 * capability[0] + capability[1],
-        tuple(own + ([training.monitor_scenes] if monitored else [])),
+        tuple(own + ([MONITORED_SCENES] if monitored else [])),
     )
 
 

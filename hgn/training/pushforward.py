@@ -38,6 +38,7 @@ from hgn.scene.barrier import Barrier
 from hgn.scene.episode import Episode
 from hgn.scene.history import window
 from hgn.schema import ConfigError
+from hgn.training.errors import PARTICLES_PER_BATCH
 from hgn.training.noise import noise_scale, target_acceleration
 
 S = TypeVar("S")
@@ -202,7 +203,7 @@ class PushforwardPool:
         for start in starts:
             if left <= 0:
                 groups.append([])
-                left = self.training.monitor_particles_per_batch
+                left = PARTICLES_PER_BATCH
             groups[-1].append(start)
             left -= len(start[0].material_N)
         return groups

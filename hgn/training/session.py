@@ -92,16 +92,14 @@ def train_network(
     writer = CheckpointWriter()
     checkpoints = Checkpoints(run / "checkpoints", training.checkpoint_every, writer)
     monitor = Monitor(run, store, stop, checkpoints)
-    guard = GradientGuard(training.maximum_skipped_updates)
+    guard = GradientGuard()
     lines = LogLines(run, monitor.last, guard, feed, published)
     final = FinalMetrics(to_mapping(config), monitor.last, stop)
     trainer = Trainer(
         accelerator=training.accelerator,
         devices=devices,
         num_nodes=nodes,
-        strategy=(
-            lightning_compat.gradient_averaging(backend, training.gradient_messages) if devices * nodes > 1 else "auto"
-        ),
+        strategy=lightning_compat.gradient_averaging(backend) if devices * nodes > 1 else "auto",
         max_steps=training.maximum_updates,
         max_epochs=-1,
         callbacks=[SameWeights(feed), guard, lines, monitor, checkpoints, Stopper(stop, checkpoints), final],

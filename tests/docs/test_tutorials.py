@@ -37,7 +37,6 @@ TRAINING = [
     "training.log_every=1",
     "training.checkpoint_every=2",
     "training.monitor_every=2",
-    "training.monitor_scenes=1",
     "training.monitor_rollout_frames=0",
     "training.accelerator=cpu",
 ]

@@ -7,7 +7,7 @@ import pytest
 import torch
 from kernels.engines import device
 from kernels.test_training import data as data
-from kernels.test_training import run_mapping
+from kernels.test_training import run_mapping, without_jitter
 from network.states import network_of
 from training.runs import metrics
 from training.test_noise import episode
@@ -150,7 +150,8 @@ def test_fast_training_is_the_plain_one(data, tmp_path, monkeypatch, capsys):
     what is logged of the pool agree. The fast one tells where the time of its first updates went."""
     monkeypatch.setattr("hgn.training.graph_trainer.REPORTED_UPDATES", 2)
     monkeypatch.setattr("hgn.runtime.backend.triton_unsupported_reason", lambda *_: None)  # in float32
-    same = {"noise_std": 0.0, "grid_jitter": False, "ema_decay": 0.7, "symmetry": "gravity"}
+    without_jitter(monkeypatch)
+    same = {"noise_std": 0.0, "ema_decay": 0.7, "symmetry": "gravity"}
     own = {"pushforward_fraction": 0.5, "pushforward_every": 1, "pushforward_scenes": 2, "pushforward_frames": 2}
     counts = {"maximum_updates": 2, "log_every": 2, "checkpoint_every": 2, "monitor_every": 2}
     original = TrainingModule.set_statistics

@@ -9,6 +9,7 @@ import torch
 from kernels.engines import device
 from kernels.test_network import flat
 from kernels.test_pushforward import placed
+from kernels.test_training import without_jitter
 from kernels.test_update import HISTORY, parameters_of, updates_of
 from network.states import gns_of, network_of
 from training.test_symmetry import CELL_SIZE, CYCLIC, EIGHT, doubled, scene_with_obstacles, seeds_of
@@ -39,7 +40,7 @@ def small_network():
     "kind",
     ["hgn", "relative", pytest.param("gns", marks=pytest.mark.skipif(device().type == "cuda", reason="float32"))],
 )
-def test_an_update_under_symmetries_is_the_plain_one(kind):
+def test_an_update_under_symmetries_is_the_plain_one(kind, monkeypatch):
     """An update of eight scenes, each under another symmetry, one without obstacles, one without gravity: positions,
     velocities, targets, normals, loss and gradients are those of backend torch in float64, and the check passes. With
     relative inputs the symmetries are any of the cube's, which turn gravity."""
@@ -67,9 +68,10 @@ def test_an_update_under_symmetries_is_the_plain_one(kind):
     expected = flat(list(torch.autograd.grad(loss, list(network.parameters()))))
 
     trained = copy.deepcopy(network).float().to(device())
-    training = TrainingConfig(batch_scenes=8, noise_std=0.0, grid_jitter=False, symmetry="gravity", precision="fp32")
+    training = TrainingConfig(batch_scenes=8, noise_std=0.0, symmetry="gravity", precision="fp32")
     loss_sum, counters = torch.zeros(2, device=device()), torch.zeros(5, device=device())
     optimizer = torch.optim.Adam(trained.parameters())
+    without_jitter(monkeypatch)
     fast = GraphTrainer(trained, optimizer, training, CELL_SIZE, loss_sum, counters)
     samples = tuple(Sample(i, FRAME, seed) for i, seed in enumerate(seeds))
     wholes = {i: whole_episode(made, network.config) for i, made in enumerate(episodes)}

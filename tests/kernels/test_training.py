@@ -11,6 +11,7 @@ from training.test_weights import data as data
 
 from hgn import train
 from hgn.config import NetworkConfig, TrainingConfig
+from hgn.kernels.update.op import UpdateSettings
 from hgn.network.build import build_network
 from hgn.runtime.backend import choose, pick, training_unsupported_reason, triton_unsupported_reason
 from hgn.schema import ConfigError
@@ -24,17 +25,25 @@ NETWORK = {"width": 16, "levels": 1, "message_passing_steps": 1, "material_embed
 
 
 def run_mapping(config, run, **training):
-    values = {"maximum_updates": 4, "log_every": 4, "checkpoint_every": 4, "monitor_every": 4, "monitor_scenes": 1}
-    values |= {"backend": "triton", "precision": "fp32", "monitor_frame_stride": 3, "accelerator": "auto"} | training
+    values = {"maximum_updates": 4, "log_every": 4, "checkpoint_every": 4, "monitor_every": 4}
+    values |= {"backend": "triton", "precision": "fp32", "accelerator": "auto"} | training
     mapping = train_mapping(config, run, **values)
     return mapping | {"network": NETWORK}
+
+
+def without_jitter(monkeypatch):
+    """Both backends draw the grid's origin from random streams of their own."""
+    settings = UpdateSettings.of
+    monkeypatch.setattr("hgn.training.module.jittered_origin", lambda *_: None)
+    monkeypatch.setattr(UpdateSettings, "of", lambda *arguments: replace(settings(*arguments), grid_jitter=False))
 
 
 def test_fast_training_is_the_plain_one(data, tmp_path, monkeypatch, capsys):
     """Without noise and jitter both backends make the same updates: every count and log line is there, weights,
     their average and moments agree; a training may change backend at any checkpoint, and ends where the others do."""
     monkeypatch.setattr("hgn.runtime.backend.triton_unsupported_reason", lambda *_: None)  # in float32
-    same = {"noise_std": 0.0, "grid_jitter": False, "warmup_updates": 3, "ema_decay": 0.7}
+    without_jitter(monkeypatch)
+    same = {"noise_std": 0.0, "warmup_updates": 3, "ema_decay": 0.7}
     ends = {}
     for name, parts in {
         "torch": [("torch", 4)],
@@ -104,7 +113,8 @@ def test_fast_training_of_gns_is_the_plain_one(data, tmp_path, monkeypatch, caps
     on_cpu = device().type == "cpu"
     if on_cpu:  # kernels run in the interpreter
         monkeypatch.setattr("hgn.training.session.training_unsupported_reason", lambda *_: None)
-    same = {"noise_std": 0.0, "grid_jitter": False, "optimizer": "muon", "ema_decay": 0.7, "maximum_updates": 3}
+    without_jitter(monkeypatch)
+    same = {"noise_std": 0.0, "optimizer": "muon", "ema_decay": 0.7, "maximum_updates": 3}
     same |= {"log_every": 3, "checkpoint_every": 3, "monitor_every": 3, "precision": "fp32" if on_cpu else "fp16"}
     ends = {}
     for name, parts in {"torch": [("torch", 3)], "mixed": [("torch", 1), ("triton", 3)]}.items():

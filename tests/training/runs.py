@@ -14,7 +14,6 @@ TRAINING = {
     "log_every": 4,
     "checkpoint_every": 5,
     "monitor_every": 6,
-    "monitor_scenes": 2,
     "monitor_rollout_frames": 0,
     "generate": False,
 }

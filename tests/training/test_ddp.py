@@ -240,25 +240,28 @@ def test_one_process_leads(first):
 
 
 @pytest.mark.parametrize(
-    ("variables", "accepted"),
+    ("variables", "started"),
     [
-        ({}, True),
-        ({"RANK": "0", "WORLD_SIZE": "4"}, True),
-        ({"RANK": "0", "WORLD_SIZE": "2"}, False),
-        ({"SLURM_PROCID": "0", "SLURM_NTASKS": "4"}, True),
-        ({"SLURM_PROCID": "0", "SLURM_NTASKS": "8"}, False),
-        ({"SLURM_PROCID": "0", "SLURM_NTASKS": "8", "SLURM_JOB_NAME": "bash"}, True),
-        ({"SLURM_PROCID": "1", "SLURM_NTASKS": "2", "RANK": "3", "WORLD_SIZE": "4"}, True),
+        ({}, (2, 1)),
+        ({"RANK": "0", "WORLD_SIZE": "4"}, (2, 2)),
+        ({"RANK": "0", "WORLD_SIZE": "3"}, (3, 1)),
+        ({"RANK": "0", "WORLD_SIZE": "4", "LOCAL_WORLD_SIZE": "4"}, (4, 1)),
+        ({"SLURM_PROCID": "0", "SLURM_NTASKS": "4"}, (2, 2)),
+        ({"SLURM_PROCID": "0", "SLURM_NTASKS": "8", "SLURM_NNODES": "2"}, (4, 2)),
+        ({"SLURM_PROCID": "0", "SLURM_NTASKS": "8", "SLURM_JOB_NAME": "bash"}, (2, 1)),
+        ({"SLURM_PROCID": "1", "SLURM_NTASKS": "2", "RANK": "3", "WORLD_SIZE": "4"}, (2, 2)),
     ],
 )
 @pytest.mark.usefixtures("launched")
-def test_launcher_and_configuration_agree(accepted):
-    """A launcher that started another number of processes than devices x nodes is refused: each would train alone."""
-    training = TrainingConfig(accelerator="cpu", devices=2, nodes=2)
-    if accepted:
-        assert layout(training) == (2, 2)
+def test_launcher_and_configuration_agree(started):
+    """A launcher that started another number of processes on a machine than devices is refused: each would train
+    alone."""
+    training = TrainingConfig(accelerator="cpu", devices=2)
+    if started[0] == 2:
+        assert layout(training) == started
         return
-    with pytest.raises(ConfigError, match=r"training\.devices x training\.nodes must be the \d processes .* 2 x 2;"):
+    message = rf"devices must be the {started[0]} processes that the launcher started on each of {started[1]} machines"
+    with pytest.raises(ConfigError, match=message):
         layout(training)
 
 

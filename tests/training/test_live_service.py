@@ -85,7 +85,7 @@ def test_service_restarted_midway(make_config, service, control, tmp_path):
     steering = threading.Thread(target=steer)
     steering.start()
     try:
-        options = {"maximum_updates": 10**6, "minimum_episodes": 1, "monitor_every": 8, "monitor_scenes": 1}
+        options = {"maximum_updates": 10**6, "minimum_episodes": 1, "monitor_every": 8}
         code = train.main(train_mapping(config, run, **options))
     finally:
         ended.set()

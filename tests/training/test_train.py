@@ -24,7 +24,7 @@ from hgn.export import export
 from hgn.runtime.rollouts import RolloutResult
 from hgn.schema import ConfigError, from_mapping
 from hgn.system.files import held
-from hgn.training import monitor
+from hgn.training import gradients, monitor
 from hgn.training.callbacks import LogLines
 from hgn.training.checkpoint import LAST_NAMES, read_checkpoint, sampler_state_of_checkpoint
 from hgn.training.dataset import PublishedEpisodes
@@ -119,7 +119,7 @@ def test_a_scene_that_diverges_leaves_the_others_measured(data, run, monkeypatch
         return [RolloutResult(first.position_TN3[:2], "diverged"), *others]
 
     monkeypatch.setattr(monitor, "simulate_scenes", cut_short)
-    assert train.main(train_mapping(data, run, monitor_rollout_frames=4, monitor_scenes=2)) == 0
+    assert train.main(train_mapping(data, run, monitor_rollout_frames=4)) == 0
     last = [record for record in metrics(run) if "rollout/finished" in record][-1]
     assert (last["rollout/finished"], last["rollout/frames"]) == (0.5, 2.0)
     assert all(math.isfinite(value) for name, value in last.items() if name.startswith("rollout/mse"))
@@ -137,7 +137,8 @@ def test_updates_without_a_finite_gradient_are_skipped(data, run, monkeypatch):
 
     monkeypatch.setattr(TrainingModule, "on_train_batch_start", remember)
     gradients_with_faults(monkeypatch, {2, 3, 9})
-    assert train.main(train_mapping(data, run, maximum_skipped_updates=3)) == 0
+    monkeypatch.setattr(gradients, "MAXIMUM_SKIPPED", 3)
+    assert train.main(train_mapping(data, run)) == 0
     changed = [
         any(not torch.equal(before[n][name], before[n + 1][name]) for name in before[n]) for n in range(len(before) - 1)
     ]
@@ -152,8 +153,9 @@ def test_updates_without_a_finite_gradient_are_skipped(data, run, monkeypatch):
 def test_training_ends_when_no_gradient_is_finite(data, run, monkeypatch):
     """At the limit of updates skipped in a row the training ends with a message; the stored weights are finite."""
     gradients_with_faults(monkeypatch, range(3, 100))
+    monkeypatch.setattr(gradients, "MAXIMUM_SKIPPED", 5)
     with pytest.raises(ConfigError, match="gradients must be finite, got 5 updates in a row without, up to update 8"):
-        train.main(train_mapping(data, run, maximum_skipped_updates=5))
+        train.main(train_mapping(data, run))
     stored = read_checkpoint(run / "checkpoints" / "last.ckpt")
     assert stored["hgn"]["updates"] == 5
     assert all(tensor.isfinite().all() for tensor in stored["state_dict"].values())

@@ -114,11 +114,11 @@ class Train(Contender):
         self.optimizer.step()
 
     def check(self, precision: str) -> str:
-        plain = replace(self.module.training_config, noise_std=0.0, grid_jitter=False)
+        plain = replace(self.module.training_config, noise_std=0.0)
         module = TrainingModule(self.module.network, plain, DATA)
         module.backend = self.module.backend
         module.network.zero_grad()
-        loss = module.loss(self.batch)
+        loss = module.loss(self.batch, jitter=False)
         loss.backward()
         return check_update(loss.detach(), _gradients(module.network), module.network, self.batch, precision)
 

@@ -80,16 +80,17 @@ def device_samples(batch: Batch) -> list[tuple[DeviceEpisode, int, int]]:
 
 
 def triton_updates(
-    network: ParticleNetwork, scenes: int, precision: str, device: torch.device, training: TrainingConfig
+    network: ParticleNetwork, scenes: int, precision: str, device: torch.device, noise_std: float | None = None
 ) -> Callable[..., Any]:
-    """Makes training updates of so many scenes, each of a copy of the network."""
+    """Makes training updates of so many scenes, each of a copy of the network; without jitter if `noise_std` is 0."""
     from hgn.kernels.update.op import UpdateSettings  # loads Triton
     from hgn.runtime.triton_backend import updates_of
 
+    noise_std = TrainingConfig.noise_std if noise_std is None else noise_std
     return partial(
         updates_of(network),
         copy.deepcopy(network),
-        UpdateSettings(scenes, training.noise_std, training.grid_jitter, OBSTACLE_CELL_SIZE),
+        UpdateSettings(scenes, noise_std, noise_std > 0, OBSTACLE_CELL_SIZE),
         kernel_precision(precision, device),
         torch.zeros(2, device=device),
         torch.zeros(5, device=device),
@@ -106,16 +107,16 @@ class TritonTrain(Contender):
         self.batch = batch_of(work, config, device)
         self.network = bench_network(config, device)
         self.samples = device_samples(self.batch)
-        self.updates = self._updates(TrainingConfig())
+        self.updates = self._updates()
 
-    def _updates(self, training: TrainingConfig) -> Any:
-        return triton_updates(self.network, len(self.samples), self.precision, self.device, training)()
+    def _updates(self, noise_std: float | None = None) -> Any:
+        return triton_updates(self.network, len(self.samples), self.precision, self.device, noise_std)()
 
     def run(self) -> None:
         self.updates.run([self.samples] * UPDATES_AT_ONCE, [TrainingConfig.learning_rate] * UPDATES_AT_ONCE)
 
     def check(self, precision: str) -> str:
-        plain = self._updates(TrainingConfig(noise_std=0.0, grid_jitter=False))
+        plain = self._updates(noise_std=0.0)
         plain.run([self.samples], [0.0])
         gradients = [torch.zeros_like(parameter) for parameter in self.network.parameters()]
         plain.packed.scatter(plain.first_moment / FIRST_MOMENT_FRACTION, gradients)

@@ -62,7 +62,7 @@ def _compile_ahead(config: ScalingConfig, device_type: str, count: int) -> None:
     from hgn.runtime.precompile_program import PrecompileJob
 
     training = TrainingConfig(batch_scenes=config.scenes)
-    settings = UpdateSettings(config.scenes, training.noise_std, training.grid_jitter, OBSTACLE_CELL_SIZE)
+    settings = UpdateSettings(config.scenes, training.noise_std, True, OBSTACLE_CELL_SIZE)
     particles = config.scenes * config.particles
     cells = tuple(max(1, int(CELL_FRACTION * particles) >> 2 * level) for level in range(config.network.levels))
     major, minor = torch.cuda.get_device_capability()

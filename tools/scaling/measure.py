@@ -109,7 +109,7 @@ class TorchUpdates:
         self.batches, self.device = batches, device
         module = training_module(config.network, config.scenes, device)
         self.optimizer: torch.optim.Optimizer = module.configure_optimizers()["optimizer"]
-        self.guard = GradientGuard(module.training_config.maximum_skipped_updates)
+        self.guard = GradientGuard()
         self.loss: nn.Module = _Loss(module)
         self.parameters = list(module.network.parameters())
 
@@ -153,11 +153,11 @@ class TritonUpdates:
     """The same with hgn.kernels.update, on episodes of one window each."""
 
     def __init__(self, config: ScalingConfig, batches: list[Batch], device: torch.device) -> None:
-        training, network = TrainingConfig(), bench_network(config.network, device)
-        self.make = triton_updates(network, config.scenes, config.precision, device, training)
+        network = bench_network(config.network, device)
+        self.make = triton_updates(network, config.scenes, config.precision, device)
         self.ours = self.make()
         self.chunk = [device_samples(batch) for batch in batches]
-        self.rates = [training.learning_rate] * len(self.chunk)
+        self.rates = [TrainingConfig.learning_rate] * len(self.chunk)
 
     def average(self, group: dist.ProcessGroup, one_graph: bool = False) -> list[int]:
         """From now on gradients are averaged over the ranks of `group`; the bytes of the messages that this takes."""

@@ -108,7 +108,7 @@ class UpdateSettings:
     @staticmethod
     def of(training: TrainingConfig, obstacle_cell_size: float) -> UpdateSettings:
         return UpdateSettings(
-            training.batch_scenes, training.noise_std, training.grid_jitter, obstacle_cell_size,
+            training.batch_scenes, training.noise_std, True, obstacle_cell_size,
             training.symmetry != "none", training.noise_correlated_fraction, optimizer=training.optimizer,
         )  # fmt: skip
 
