@@ -12,6 +12,7 @@ import re
 from pathlib import Path
 from typing import Any
 
+from figures import with_figures
 from sphinx.application import Sphinx
 
 DOCS = Path(__file__).resolve().parents[1]
@@ -40,6 +41,7 @@ def _read(app: Sphinx, name: str, source: list[str]) -> None:
         file = _file(page, match[1])
         app.env.note_dependency(str(file))
         text = file.read_text()
+    text = with_figures(text, file)
     source[0] = TARGET.sub(lambda link: _moved(link, file, page, app.env.repository_pages), text)  # type: ignore[attr-defined]
 
 

@@ -75,6 +75,26 @@ def test_paths_exist(page):
             assert (ROOT / path).exists(), f"{page.relative_to(ROOT)}:{number}: {path}"
 
 
+def test_figures_are_drawn():
+    """Each figure that a results page places has a report beside it, and each figure that can be drawn is placed."""
+    figures = extension("figures")
+    placed = set()
+    for page in PAGES:
+        for match in figures.MARKER.finditer(page.read_text()):
+            placed.add(str((page.parent / match["name"]).relative_to(ROOT)))
+    assert placed == set(figures.FIGURES)
+    assert all((ROOT / report).is_file() for report, _ in figures.FIGURES.values())
+
+
+def extension(name):
+    """A module of docs/_ext."""
+    spec = importlib.util.spec_from_file_location(name, ROOT / "docs" / "_ext" / f"{name}.py")
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
 def test_names_exist():
     """What a page says to be in a file is there: "`NAME` in `FILE`", and names in brackets behind a file of tests."""
     checked = 0
@@ -176,10 +196,7 @@ def test_changelog_form():
 
 def test_every_command_is_listed():
     """The reference of commands names each module that can be run, and no other."""
-    spec = importlib.util.spec_from_file_location("reference_pages", ROOT / "docs" / "_ext" / "reference_pages.py")
-    assert spec is not None and spec.loader is not None
-    reference_pages = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(reference_pages)
+    reference_pages = extension("reference_pages")
     page = (ROOT / "docs" / "reference" / "commands.md").read_text()
     listed = set(re.findall(r"^\| `python -m ([\w.]+)", page, re.MULTILINE))
     parents = {name.removesuffix(".network") for name in reference_pages.command_names()}  # tools.stability network
