@@ -179,7 +179,7 @@ def test_readme_is_short():
 
 
 def test_changelog_form():
-    """Releases, in them Added, Changed and Fixed, in those entries of at most two lines."""
+    """Releases with Migration, Added, Changed, Removed and Fixed; entries of at most two lines."""
     lines = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8").splitlines()
     releases = [line for line in lines if line.startswith("## ")]
     assert releases[0] == "## Unreleased"
@@ -191,7 +191,7 @@ def test_changelog_form():
         entry = 1 if line.startswith("- ") else entry + 1 if entry and line.startswith("  ") else 0
         assert entry <= ENTRY_LINES, f"CHANGELOG.md:{number}"
         if line.startswith("### "):
-            assert re.match(r"### (Added|Changed|Fixed)", line), f"CHANGELOG.md:{number}"
+            assert re.match(r"### (Migration|Added|Changed|Removed|Fixed)", line), f"CHANGELOG.md:{number}"
 
 
 def test_every_command_is_listed():
