@@ -38,8 +38,6 @@ MESH_SUFFIXES = (".stl", ".obj", ".ply", ".glb")
 ROLLOUT_ENDINGS = (".vtkhdf", ".hdf", ".hdf5", ".h5")
 GROUP_SHAPES = ("cube", "sphere")
 NETWORK_KINDS = ("hgn", "gns", "gns_particles")
-CONTACT_GATES = ("particle", "cell")
-CONTACT_FORCES = ("any", "normal")
 BACKENDS = ("auto", "torch", "triton", "cpu")
 PRECISIONS = ("fp32", "tf32", "fp16")
 SIMULATED_FRAMES = 3  # of an episode at least for pushforward: one to start from, one simulated, one that answers it
@@ -54,7 +52,7 @@ BackendName = Annotated[str, one_of(*BACKENDS)]
 Precision = Annotated[str, one_of(*PRECISIONS)]
 StoredPrecision = Annotated[str, one_of("fp32", "fp16")]
 Split = Annotated[str, one_of("train", "validation", "test")]
-RestLevels = Annotated[Positive[int], Bound("at most 8", lambda value: value <= 8)]  # the last are beyond any scene
+MATERIAL_EMBEDDING = 16  # numbers that a network learns for each material (paper: E)
 WallClearance = tuple[NonNegative[float], NonNegative[float]]
 
 
@@ -330,26 +328,12 @@ class NetworkConfig:
     message_passing_steps: FewLayers = 4  # M, in each of the 2 L - 1 blocks
     width: LayerSize = 128  # latent and hidden
     velocity_history: FewLayers = 5  # m
-    material_embedding: LayerSize = 16  # E
-    wall_distance_cells: Positive[float] = 8.0  # d_max / R
     obstacle_features: bool = True
     # absolute: velocities and wall distances, the paper's; relative: hgn.network.relative, where free motion and
     # gravity are exact
     inputs: Annotated[str, one_of("absolute", "relative")] = "absolute"
-    contact_reach_cells: Positive[float] = 1.5  # of relative inputs: walls are seen from so many R on
-    # what relative inputs show a particle's velocity against surfaces by: its own reach; or cell: that of all that is
-    # in its coarsest cells and across their faces, so that it is known inside a pile too
-    contact_gate: Annotated[str, one_of(*CONTACT_GATES)] = "particle"
-    # what the mean force of surfaces on a coarsest cell may be: any; or normal: only along the normals of what is
-    # touched there, so that bodies slip as in solvers without friction, whatever the weights
-    contact_forces: Annotated[str, one_of(*CONTACT_FORCES)] = "any"
-    # what touches and deforms by less than that many |g| a frame rests (hgn.network.rest); 0: nothing does
+    # particles in contact that deform by less than this many |g| a frame stop (hgn.network.rest); 0: none do
     rest_threshold: NonNegative[float] = 0.0
-    # … between coarsest cells, and cells of so many sizes in all, each four times the one before: larger ones hold what
-    # covers a floor
-    rest_levels: RestLevels = 1
-    # … materials that rest between these larger cells, too; null: all. What has no friction, as water, spreads on
-    rest_large_materials: tuple[MaterialName, ...] | None = None
     # at the end of a frame particles are no nearer to the domain's planes than that, at the near sides (0) and at the
     # far ones, or than they were before it; null: nothing holds them but what was learned
     wall_clearance: WallClearance | None = None
@@ -370,16 +354,8 @@ class NetworkConfig:
             rule = "at least 2 with inputs=relative, which are of differences"
             require(self.velocity_history >= 2, "velocity_history", rule, self.velocity_history)
         else:
-            require(not self.gates_by_cell, "contact_gate", "particle with inputs=absolute", self.contact_gate)
-            require(not self.slips, "contact_forces", "any with inputs=absolute", self.contact_forces)
             require(not self.rests, "rest_threshold", "0 with inputs=absolute", self.rest_threshold)
         require(not self.rests or self.dimensions == 3, "rest_threshold", "0 with dimensions=2", self.rest_threshold)
-        rule = "1 with rest_threshold=0, where nothing rests"
-        require(self.rests or self.rest_levels == 1, "rest_levels", rule, self.rest_levels)
-        if self.rest_large_materials is not None:
-            known = set(self.rest_large_materials) <= set(self.materials)
-            rule = f"of the materials {', '.join(self.materials)}"
-            require(known, "rest_large_materials", rule, list(self.rest_large_materials))
         held, rule = self.obstacle_clearance is not None, "null with dimensions=2"
         require(not held or self.dimensions == 3, "obstacle_clearance", rule, self.obstacle_clearance)
         if self.kind == "hgn":
@@ -409,37 +385,17 @@ class NetworkConfig:
         return self.inputs == "relative"
 
     @property
-    def gates_by_cell(self) -> bool:
-        """Whether a particle knows its velocity against a surface that its coarsest cells alone reach."""
-        return self.contact_gate == "cell"
-
-    @property
-    def slips(self) -> bool:
-        """Whether surfaces push coarsest cells along their normals alone."""
-        return self.contact_forces == "normal"
-
-    @property
     def rests(self) -> bool:
         """Whether slow deformations of what touches stop."""
         return self.rest_threshold > 0
-
-    @property
-    def rest_sizes(self) -> int:
-        """Between cells of how many sizes they do; 0 where nothing rests."""
-        return self.rest_levels * self.rests
-
-    @property
-    def rests_large(self) -> tuple[bool, ...]:
-        """Which of the materials rest between the larger of these cells."""
-        return tuple(self.rest_large_materials is None or name in self.rest_large_materials for name in self.materials)
 
     @property
     def feature_width(self) -> int:
         """Numbers per particle, the embedding last: paper sec. 3.1, or hgn.network.relative."""
         if self.relative:
             motion = 3 * (self.velocity_history - 1) + 3 * self.levels + 3
-            return motion + 6 + 6 * self.obstacle_features + self.material_embedding
-        return 3 * self.velocity_history + 3 * self.obstacle_features + 6 + self.material_embedding
+            return motion + 6 + 6 * self.obstacle_features + MATERIAL_EMBEDDING
+        return 3 * self.velocity_history + 3 * self.obstacle_features + 6 + MATERIAL_EMBEDDING
 
 
 # Plane waves of the correlated noise, and the lengths that they are drawn from, in finest cells: short ones stir a

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from hgn.command import run_command
-from hgn.config import MaterialName, RestLevels, StoredPrecision, WallClearance
+from hgn.config import StoredPrecision, WallClearance
 from hgn.network.features import ParticleState
 from hgn.runtime.exported_step import initial_arrays, traced_step, write_onnx, write_package
 from hgn.runtime.simulator import Simulator
@@ -23,7 +23,7 @@ from hgn.system.extras import require_installed
 from hgn.system.files import require_place
 from hgn.system.provenance import provenance
 
-CHANGES = ("rest_threshold", "rest_levels", "rest_large_materials", "wall_clearance", "obstacle_clearance")
+CHANGES = ("rest_threshold", "wall_clearance", "obstacle_clearance")
 
 
 @dataclass(frozen=True)
@@ -35,9 +35,6 @@ class ExportConfig:
     out: FileName | None = None
     stored_precision: StoredPrecision = "fp32"  # of the learned tensors; fp16: files half as large
     rest_threshold: NonNegative[float] | None = None  # network.rest_threshold of `out`; null: as it was
-    rest_levels: RestLevels | None = None  # network.rest_levels of `out`; null: as it was
-    # network.rest_large_materials of `out`; null: as it was
-    rest_large_materials: tuple[MaterialName, ...] | None = None
     wall_clearance: WallClearance | None = None  # network.wall_clearance of `out`; null: as it was
     obstacle_clearance: Positive[float] | None = None  # network.obstacle_clearance of `out`; null: as it was
     # of `out`, or else of `weights`: file of a step's graph, for ONNX Runtime

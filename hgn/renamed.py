@@ -12,7 +12,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -23,16 +23,47 @@ ANY = object()
 class Removed:
     """The value that a removed setting always has now, and what to do instead of setting it.
 
-    With ANY a setting has no fixed value, and stored files load whatever they say of it.
+    With ANY a setting has no fixed value, and stored files load whatever they say of it; so do files whose section
+    gives it no effect.
     """
 
     value: Any = ANY
     remedy: str = "leave it out"
+    has_effect: Callable[[Mapping[str, Any]], bool] = lambda section: True
+
+    def allows(self, value: Any, section: Mapping[str, Any]) -> bool:
+        """Whether a stored section with this value computes what is computed now."""
+        return self.value is ANY or value == self.value or not self.has_effect(section)
+
+
+def _relative(network: Mapping[str, Any]) -> bool:
+    return network.get("inputs") == "relative"
+
+
+def _rests(network: Mapping[str, Any]) -> bool:
+    return bool(network.get("rest_threshold"))
+
+
+def _rests_otherwise(network: Mapping[str, Any]) -> bool:
+    """Whether other materials than those with friction rest between larger cells."""
+    materials = set(network.get("materials", ()))
+    large = network.get("rest_large_materials")
+    return _rests(network) and (materials if large is None else set(large)) != materials - {"water"}
+
+
+TRAIN_ANEW = "leave it out; weights with another value must be trained anew"
 
 
 # `section.key`; the section is the name of the dataclass without Config: network, mpm, scene, dataset, training,
 # train, evaluate, rollout, error_vs_time. Fixed values of `scene` and `mpm` stay in the identity of data sets.
 REMOVED: dict[str, Removed] = {
+    "network.contact_forces": Removed("normal", TRAIN_ANEW, _relative),
+    "network.contact_gate": Removed("cell", TRAIN_ANEW, _relative),
+    "network.contact_reach_cells": Removed(3.0, TRAIN_ANEW, _relative),
+    "network.material_embedding": Removed(16, TRAIN_ANEW),
+    "network.rest_large_materials": Removed("all but water", "leave it out", _rests_otherwise),
+    "network.rest_levels": Removed(2, "leave it out", _rests),
+    "network.wall_distance_cells": Removed(8.0, TRAIN_ANEW, lambda network: not _relative(network)),
     "training.gradient_messages": Removed("fp32"),
     "training.grid_jitter": Removed(True),
     "training.maximum_skipped_updates": Removed(100),
@@ -81,8 +112,13 @@ VALUES: dict[str, dict[Any, str]] = {
 # Choices of config groups, old to new, as on a command line.
 CHOICES = {"scene=mechanics": "scene=motion", "dataset=mechanics": "dataset=motion"}
 
-# Settings of the solver that data sets of 0.1.0 lack, and what the solver did then.
+# Settings that data sets and weights of 0.1.0 lack, and their values then.
 BEFORE: dict[str, Any] = {
+    "network.contact_forces": "any",
+    "network.contact_gate": "particle",
+    "network.contact_reach_cells": 1.5,
+    "network.rest_large_materials": None,
+    "network.rest_levels": 1,
     "mpm.time_integration": "symplectic_euler",
     "mpm.water_density_relaxation_s": None,
     "mpm.sand_grain_diameter_m": 0.0,
@@ -110,14 +146,18 @@ def current_value(key: str, value: Any) -> Any:
 def current_names(mapping: Mapping[str, Any], section: str = "") -> dict[str, Any]:
     """Returns a stored mapping with today's keys and values.
 
-    `section` is its dotted name in the configuration. Settings of the solver that are younger than the file are added,
-    removed ones are dropped. A removed one with another value than the fixed one stays, for `from_mapping` to refuse.
+    `section` is its dotted name in the configuration. Settings that are younger than the file are added, removed ones
+    are dropped. A removed one with another value than the fixed one stays, for `from_mapping` to refuse.
     """
-    result = {key.removeprefix("mpm."): value for key, value in BEFORE.items()} if section == "mpm" else {}
+    # Networks of 0.1.0 have this key; the solver's settings must all be given by now.
+    if section == "mpm" or (section == "network" and "material_embedding" in mapping):
+        before = {_last(key): value for key, value in BEFORE.items() if key.startswith(f"{section}.")}
+        mapping = before | dict(mapping)
+    result = {}
     for old, value in mapping.items():
         key = KEYS.get(_join(section, old), _join(section, old))
         removed = REMOVED.get(key)
-        if removed is None or removed.value not in (ANY, value):
+        if removed is None or not removed.allows(value, mapping):
             inner = current_names(value, key) if isinstance(value, Mapping) else current_value(key, value)
             result[key.rpartition(".")[2]] = inner
     return result
@@ -142,12 +182,15 @@ def renamed_remedy(key: str, value: Any) -> str | None:
     return f"it is called {KEYS[key]} now; write {KEYS[key]}{example}"
 
 
-def removed_remedy(section: str, key: str) -> str | None:
-    """Returns what to do about a removed setting, or None for any other."""
+def removed_remedy(section: str, key: str, value: Any) -> str | None:
+    """Returns what to do about a removed setting that was given this value, or None for any other setting."""
     removed = REMOVED.get(_join(section, key))
     if removed is None:
         return None
-    return f"it was removed{'' if removed.value is ANY else f' and is always {removed.value} now'}; {removed.remedy}"
+    if removed.value is ANY:
+        return f"it was removed; {removed.remedy}"
+    other = "" if value == removed.value else f", not {value}"
+    return f"it was removed and is always {removed.value} now{other}; {removed.remedy}"
 
 
 def value_remedy(key: str, value: Any) -> str:

@@ -41,8 +41,10 @@ def removed(monkeypatch):
         (
             TrainConfig,
             {"network": {"depth": 4}},
-            "network.depth is not a known key; it was removed and is always 3 now; train other weights",
+            "network.depth is not a known key; it was removed and is always 3 now, not 4; train other weights",
         ),
+        (TrainConfig, {"network": {"contact_gate": "cell"}}, "it was removed and is always cell now; leave it out"),
+        (TrainConfig, {"network": {"rest_levels": 1}}, "it was removed and is always 2 now, not 1; leave it out"),
         (RolloutConfig, {"film": 3}, "film is not a known key; it was removed; render with tools.render"),
         (RolloutConfig, {"backend": "abacus"}, "backend must be one of .*, got 'abacus'; take backend=cpu"),
     ],
@@ -80,8 +82,39 @@ def test_files_of_before(tmp_path, monkeypatch, removed):
     assert load_weights(tmp_path / "old.safetensors")[1] == info
     stored["depth"] = 4
     save_weights(tmp_path / "other.safetensors", network, info)
-    with pytest.raises(ConfigError, match=r"network\.depth is not a known key; it was removed and is always 3 now"):
+    with pytest.raises(ConfigError, match=r"network\.depth is not a known key; it was removed and is always 3 now, not 4"):
         load_weights(tmp_path / "other.safetensors")
+
+
+def test_networks_of_before():
+    """They load where removed settings say what is always so now, or where these have no effect; others are refused by
+    the setting's name."""
+    contacts = {"contact_gate": "cell", "contact_forces": "normal", "contact_reach_cells": 3.0}
+    older = {"material_embedding": 16, "wall_distance_cells": 8.0}  # keys of 0.1.0
+    rests = {"rest_levels": 2, "rest_large_materials": ["sand", "snow"]}
+    relative, resting = NetworkConfig(inputs="relative"), NetworkConfig(inputs="relative", rest_threshold=0.1)
+    for config, told, refused in (
+        (NetworkConfig(), {}, None),
+        (NetworkConfig(), older, None),
+        (NetworkConfig(), older | {"contact_gate": "particle", "contact_reach_cells": 1.5, "rest_levels": 1}, None),
+        (NetworkConfig(), older | {"wall_distance_cells": 6.0}, "wall_distance_cells"),
+        (NetworkConfig(), older | {"material_embedding": 8}, "material_embedding"),
+        (relative, {}, None),
+        (relative, older | contacts | {"rest_levels": 3}, None),
+        (relative, older | contacts | {"contact_forces": "any"}, "contact_forces"),
+        (relative, older | contacts | {"contact_reach_cells": 2.0}, "contact_reach_cells"),
+        (relative, older | {"contact_forces": "normal", "contact_reach_cells": 3.0}, "contact_gate"),  # younger
+        (resting, older | contacts | rests, None),
+        (resting, older | contacts | rests | {"rest_levels": 1}, "rest_levels"),
+        (resting, older | contacts | rests | {"rest_large_materials": None}, "rest_large_materials"),
+        (resting, older | contacts | {"rest_large_materials": ["sand", "snow"]}, "rest_levels"),
+    ):
+        stored = to_mapping(config) | told
+        if refused is None:
+            assert from_stored(NetworkConfig, stored, "network") == config
+            continue
+        with pytest.raises(ConfigError, match=rf"network\.{refused} is not a known key; it was removed and is always"):
+            from_stored(NetworkConfig, stored, "network")
 
 
 def test_identity_keeps_its_names(monkeypatch, removed):

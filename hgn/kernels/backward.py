@@ -13,7 +13,7 @@ from typing import Any
 
 import torch
 
-from hgn.config import NetworkConfig
+from hgn.config import MATERIAL_EMBEDDING, NetworkConfig
 from hgn.kernels.buffers import OUT, Block, Stored
 from hgn.kernels.cell_mlp.kernel import cell_mlp_backward
 from hgn.kernels.edges.kernel import edge_backward
@@ -298,7 +298,7 @@ class FusedTrainingNetwork(FusedNetwork):
     def _encode_gradients(self) -> None:
         """Takes the gradient of the encoder's combined first layer apart: features, embedding, bias."""
         config = self.config
-        used, materials = config.feature_width - config.material_embedding, len(config.materials)
+        used, materials = config.feature_width - MATERIAL_EMBEDDING, len(config.materials)
         size = self.width * self.grid.features
         combined = self.totals[self.packed.size : self.packed.size + size].view(self.width, self.grid.features)
         table = combined[:, used : used + materials]

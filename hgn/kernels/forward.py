@@ -11,7 +11,7 @@ from typing import Any
 import torch
 import triton
 
-from hgn.config import NetworkConfig
+from hgn.config import MATERIAL_EMBEDDING, NetworkConfig
 from hgn.kernels.buffers import Block, Buffers, Stored
 from hgn.kernels.cell_mlp.kernel import cell_mlp_forward
 from hgn.kernels.edges.kernel import edge_forward
@@ -32,7 +32,7 @@ NONE = -1  # where a product has no bias
 
 def feature_columns(config: NetworkConfig) -> int:
     """Columns of the encoder's input: features, one-hot material, padding to a power of two that matrix units take."""
-    used = config.feature_width - config.material_embedding + len(config.materials)
+    used = config.feature_width - MATERIAL_EMBEDDING + len(config.materials)
     return max(16, triton.next_power_of_2(used))
 
 
@@ -91,7 +91,7 @@ class FusedNetwork(Buffers):
     def refresh_encoder(self) -> None:
         """The encoder's first layer on features and one-hot materials: embedding and bias are multiplied out."""
         first, embedding, bias = self._encode_views(self.values)
-        used = self.config.feature_width - self.config.material_embedding
+        used = self.config.feature_width - MATERIAL_EMBEDDING
         materials = len(self.config.materials)
         self.encode_weights[:, :used].copy_(first[:, :used])
         torch.addmm(bias[:, None], first[:, used:], embedding.T, out=self.encode_weights[:, used : used + materials])
@@ -108,7 +108,7 @@ class FusedNetwork(Buffers):
         config, packed, width = self.config, self.packed, self.width
         at, columns = packed.encode.parts[0], config.feature_width
         first = flat[at : at + width * columns].view(width, columns)
-        rows, embedding = len(config.materials), config.material_embedding
+        rows, embedding = len(config.materials), MATERIAL_EMBEDDING
         table = flat[packed.embedding : packed.embedding + rows * embedding].view(rows, embedding)
         return first, table, flat[packed.encode.first_bias : packed.encode.first_bias + width]
 

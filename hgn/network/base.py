@@ -10,8 +10,8 @@ from abc import ABC, abstractmethod
 import torch
 from torch import nn
 
-from hgn.config import NetworkConfig
-from hgn.network.features import Normaliser, ParticleState, wall_distances
+from hgn.config import MATERIAL_EMBEDDING, NetworkConfig
+from hgn.network.features import WALL_DISTANCE_CELLS, Normaliser, ParticleState, wall_distances
 from hgn.network.grid import GridHierarchy
 from hgn.network.mlp import LEAKY_SLOPE, MLP
 from hgn.network.relative import Contacts, relative_features
@@ -25,11 +25,11 @@ class ParticleNetwork(nn.Module, ABC):
         super().__init__()
         self.config = config
         self.normaliser = Normaliser()
-        self.embedding = nn.Embedding(embeddings or len(config.materials), config.material_embedding)
+        self.embedding = nn.Embedding(embeddings or len(config.materials), MATERIAL_EMBEDDING)
         normal_width = 3 if config.obstacle_features else 0
-        parts: tuple[int, ...] = (3 * config.velocity_history, normal_width, 6, config.material_embedding)
+        parts: tuple[int, ...] = (3 * config.velocity_history, normal_width, 6, MATERIAL_EMBEDDING)
         if config.relative:
-            parts = (config.feature_width - config.material_embedding, config.material_embedding)
+            parts = (config.feature_width - MATERIAL_EMBEDDING, MATERIAL_EMBEDDING)
         self.encode = MLP(parts, config.width, config.width, slope=slope)
 
     @property
@@ -76,7 +76,7 @@ class ParticleNetwork(nn.Module, ABC):
             assert grid is not None
             return self.encode_features(self.relative_features(state, grid)[0], state.material_N)
         velocity_NV = self.normaliser.normalise_velocity(state.velocity_NM3).flatten(1)
-        maximum = self.config.wall_distance_cells * self.config.cell_size
+        maximum = WALL_DISTANCE_CELLS * self.config.cell_size
         wall_N6 = wall_distances(state.position_N3, state.domain_S3[state.scene_N], maximum)
         material_MH = self.encode.project(3, self.embedding.weight) + self.encode.first.bias
         hidden_NH = material_MH.index_select(0, state.material_N)

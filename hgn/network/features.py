@@ -19,6 +19,7 @@ from hgn.network.obstacles import ObstacleCells, SurfaceParticles
 from hgn.scene.material import MATERIALS
 from hgn.schema import ConfigError
 
+WALL_DISTANCE_CELLS = 8.0  # d_max / R of the paper
 # The standard deviation of accelerations along an axis without motion: positions end with it, divisions do not.
 STILL = 1e-30
 

@@ -19,7 +19,7 @@ from hgn.network.features import ParticleState
 from hgn.network.grid import CORNER_83, DIRECTION_63, GridHierarchy, Level, build_hierarchy
 from hgn.network.mlp import MLP
 from hgn.network.relative import OUTPUTS, balanced
-from hgn.network.rest import rested
+from hgn.network.rest import rested, rests_widely
 
 
 class MessagePassing(nn.Module):
@@ -96,13 +96,9 @@ class HierarchicalGraphNetwork(ParticleNetwork):
         acceleration_N3 = balanced(output_N9, contacts, grid)
         if not self.config.rests:
             return acceleration_N3
-        scale, config = self.normaliser.acceleration_std[0], self.config
-        large_M = None
-        if config.rest_large_materials is not None:
-            large_M = torch.tensor(config.rests_large, dtype=scale.dtype, device=scale.device)
-        return rested(
-            acceleration_N3, state, contacts.touched_C, grid, config.rest_threshold, scale, config.rest_levels, large_M
-        )
+        scale = self.normaliser.acceleration_std[0]
+        widely_M = torch.tensor(rests_widely(self.config), dtype=scale.dtype, device=scale.device)
+        return rested(acceleration_N3, state, contacts.touched_C, grid, self.config.rest_threshold, scale, widely_M)
 
     def grid(self, state: ParticleState, origin_S3: torch.Tensor | None = None) -> GridHierarchy:
         """The cells of all levels around a state's particles."""

@@ -9,13 +9,12 @@ ask:
 |---|---|
 | 3 (H - 1) | f(v^{n-k} - v^{n-k-1} - g), k = 0 … H - 2: zero in free flight |
 | 3 L | f(v_p - U_l(x_p)) on each level, finest first, U_l the momentum over the mass of the cells around |
-| 3 | G f(v^n): the velocity against what stands still, where that is within reach |
-| 6 | walls within reach, lower x, y, z, then upper |
+| 3 | G f(v^n): the velocity against what stands still, near a surface |
+| 6 | walls within CONTACT_REACH_CELLS R, lower x, y, z, then upper |
 | 3 + 3 | obstacle normals, at the particle and where it is flying to; only with obstacle_features |
 
-G is a particle's own `contact_gate`; or with `network.contact_gate: cell` sum_C w_pC t_C of what `disturbance` gives,
-which is nowhere less and knows a surface that is within reach of what the particle lies in. With
-`network.contact_forces: normal` surfaces push along their normals alone (`balanced`).
+G = sum_C w_pC t_C, with t_C of `disturbance`: at least the particle's own `surface_gate`, and above 0 inside a pile
+whose foot alone is within reach of a surface. Surfaces push along their normals only (`balanced`).
 
 The decoder's nine numbers are an acceleration r and a stress sigma of each particle; `balanced` makes of them what is
 added to gravity. It is 0 where nothing moves against anything: what flies freely in one piece has exactly the
@@ -27,7 +26,7 @@ Shape legend: N particles, H velocities, L levels, C cells of a level, E directe
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 
@@ -36,6 +35,7 @@ from hgn.network.features import ParticleState
 from hgn.network.grid import CORNER_83, DIRECTION_63, GridHierarchy
 from hgn.network.obstacles import ObstacleCells
 
+CONTACT_REACH_CELLS = 3.0  # R within which walls are seen
 WALL_LIMIT = 2.0  # of wall_nearness: beyond the plane by the reach
 STEPS_AHEAD = 4  # places looked at on the way of one frame
 QUIET = 0.01  # s_a: changes and differences of velocity below it count by their square; rounding leaves 1e-5 to 1e-4
@@ -52,25 +52,24 @@ POINT = 1e-3  # of a coarsest cell's edge squared: a cube has it whose edge is a
 
 @dataclass(frozen=True, eq=False)
 class Contacts:
-    """Of coarsest cells: what `disturbance` says, 0 to 1, [C] each; and where surfaces push along normals alone, their
-    `touched_normals` [C, 3, 3]."""
+    """Contacts of the coarsest cells: the two values of `disturbance`, 0 to 1, [C], and `touched_normals` [C, 3, 3]."""
 
     disturbed_C: torch.Tensor
     touched_C: torch.Tensor
-    normal_C33: torch.Tensor | None = None
+    normal_C33: torch.Tensor
 
 
 def relative_features(
     state: ParticleState, grid: GridHierarchy, config: NetworkConfig, scale: torch.Tensor
 ) -> tuple[torch.Tensor, Contacts]:
-    """All columns but the embedding, [N, feature_width - material_embedding], and what the coarsest cells know of them;
+    """Returns all columns but the embedding, [N, feature_width - 16], and the coarsest cells' contacts;
     `scale` is s_a, frame units."""
     velocity_N3 = state.velocity_NM3[:, 0]
     wall_N6 = wall_nearness(
         state.position_N3,
         velocity_N3,
         state.domain_S3[state.scene_N],
-        config.contact_reach_cells * config.cell_size,
+        CONTACT_REACH_CELLS * config.cell_size,
     )
     normal_N6 = None
     if config.obstacle_features:
@@ -82,12 +81,9 @@ def relative_features(
         ],
         dim=-1,
     )
-    gate_N = contact_gate(wall_N6, normal_N6)
-    contacts = Contacts(*disturbance(motion_NK, gate_N, grid))
-    if config.slips:
-        contacts = replace(contacts, normal_C33=touched_normals(surface_normals(wall_N6, normal_N6), grid))
-    if config.gates_by_cell:
-        gate_N = (grid.weight_N8 * contacts.touched_C[coarsest_cells(grid)]).sum(1)
+    normal_C33 = touched_normals(surface_normals(wall_N6, normal_N6), grid)
+    contacts = Contacts(*disturbance(motion_NK, surface_gate(wall_N6, normal_N6), grid), normal_C33)
+    gate_N = (grid.weight_N8 * contacts.touched_C[coarsest_cells(grid)]).sum(1)
     parts = [motion_NK, gate_N[:, None] * torch.asinh(velocity_N3 / scale), wall_N6]
     return torch.cat(parts if normal_N6 is None else [*parts, normal_N6], dim=-1), contacts
 
@@ -143,14 +139,14 @@ def obstacle_normals(
     return torch.cat([here_N3, ahead_N3], dim=-1)
 
 
-def contact_gate(wall_N6: torch.Tensor, normal_N6: torch.Tensor | None) -> torch.Tensor:
-    """G [N]: exactly 0 where no surface is within reach, 1 where a normal is, rising to 1 half way to a wall."""
+def surface_gate(wall_N6: torch.Tensor, normal_N6: torch.Tensor | None) -> torch.Tensor:
+    """Returns how near a particle is to a surface, [N]: 0 beyond reach, 1 at a normal and from half way to a wall on."""
     gate_N = (2 * wall_N6.amax(-1)).clamp(max=1)
     return gate_N if normal_N6 is None else torch.where(normal_N6.any(-1), 1, gate_N)
 
 
 def surface_normals(wall_N6: torch.Tensor, normal_N6: torch.Tensor | None) -> torch.Tensor:
-    """sum n n^T of the walls within reach, gated as in `contact_gate`, and of the obstacle's normal, at the particle or
+    """sum n n^T of the walls within reach, gated as in `surface_gate`, and of the obstacle's normal, at the particle or
     else where it is flying to, [N, 3, 3]: no sign, so that nothing jumps where surfaces face each other."""
     near_N6 = (2 * wall_N6).clamp(max=1)
     normal_N33 = torch.diag_embed(near_N6[:, :3] + near_N6[:, 3:])
@@ -192,7 +188,7 @@ def disturbance(
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """How far what is around each coarsest cell is from free flight in one piece, and from flight, 0 to 1, [C] each.
 
-    A particle is disturbed by a surface within reach (`contact_gate`), or if a column of history or surroundings is
+    A particle is disturbed by a surface within reach (`surface_gate`), or if a column of history or surroundings is
     not small against QUIET (rounding leaves 0). A coarsest cell is as disturbed as the most disturbed particle in it
     and in the cells across its faces: within a frame an impact is felt through a body. The second is of surfaces alone.
     """
@@ -231,8 +227,8 @@ def balanced(output_N9: torch.Tensor, contacts: Contacts, grid: GridHierarchy) -
     both have about their common centre is taken out: with (q, W) of I f + I' f' + f f' (D^2 - D D^T) and of -f f' D x T
     a cell gets f' (q T + W x D) - W x y_p. That is a projection: nothing grows, however small or thin contents are.
 
-    With `touched_normals` t_C Q_C R_C, Q = `slip`, is taken out, too: what surfaces give a cell on the mean lies along
-    their normals, and bodies slide on a plane without friction, or any drive, whatever the weights.
+    t_C Q_C R_C, Q = `slip` of the `touched_normals`, is taken out, too: what surfaces give a cell on the mean lies
+    along their normals, and bodies slide on a plane without friction, or any drive, whatever the weights.
     """
     disturbed_C, touched_C = contacts.disturbed_C, contacts.touched_C
     level, cell_N8, weight_N8 = grid.levels[-1], coarsest_cells(grid), grid.weight_N8
@@ -264,8 +260,7 @@ def balanced(output_N9: torch.Tensor, contacts: Contacts, grid: GridHierarchy) -
     known_E, turn_E3 = rotation(inertia_E33, -both_E[:, None] * torch.linalg.cross(apart_E3, traction_E3))
     push_E3 = known_E[:, None] * traction_E3 + torch.linalg.cross(turn_E3, apart_E3)
     change_C3 = (free_C * known_C)[:, None] * -mean_C3
-    if contacts.normal_C33 is not None:
-        change_C3 = change_C3 - touched_C[:, None] * (slip(contacts.normal_C33) @ mean_C3[..., None]).squeeze(-1)
+    change_C3 = change_C3 - touched_C[:, None] * (slip(contacts.normal_C33) @ mean_C3[..., None]).squeeze(-1)
     change_C3 = disturbed_C[:, None] * change_C3.index_add(0, receiver_E, share_E[:, None] * push_E3)
     felt_E = 0.5 * disturbed_C[sender_E]
     turn_C3 = (free_C[:, None] * turn_C3).index_add(0, receiver_E, felt_E[:, None] * turn_E3)

@@ -11,10 +11,9 @@ mass, and q_K says how well rotation is known (`rotation`). Weights overlap, so 
 in the grid; bodies far larger than these cells deform as they like. With the next displacement u = v + a and d = P u
 accelerations become a - P (phi d), where phi = 2 - |d|^2 / (threshold |g|)^2 within 0 and 1.
 
-With `network.rest_levels` above 1 the same follows between cells of four times that size, and so on, each with what the
-one before has left: what is larger than coarsest cells, as sand that covers a floor, rests too. What touches within two
-of the largest cells then shares its slow motion, whether it is one body or several. Of other materials than
-`network.rest_large_materials` these larger cells see nothing: what has no friction, as water, spreads on.
+The same follows between cells of four times that size, with what the first has left: sand that covers a floor, which is
+larger than a coarsest cell, rests too. Particles in contact within two of these larger cells share their slow motion,
+in one body or in several. FRICTIONLESS materials are not part of it: water spreads on.
 
 So momentum and angular momentum stay, whatever the weights; as P is symmetric and within 0 and 1, no motion gains
 energy, in any frame; no boost is seen; and nothing changes where nothing touches, without gravity, and beyond sqrt(2)
@@ -26,6 +25,7 @@ from __future__ import annotations
 
 import torch
 
+from hgn.config import NetworkConfig
 from hgn.network.cell_keys import pack, unique, unpack
 from hgn.network.features import ParticleState
 from hgn.network.grid import CORNER_83, GridHierarchy
@@ -33,7 +33,8 @@ from hgn.network.relative import SMALLEST_MASS, coarsest_cells, coarsest_places,
 
 SURE = 0.5  # q from which on rotation counts as known
 LEAST = 1e-30  # of a limit squared
-LEVEL_SHIFT = 2  # cells of the next of `network.rest_levels` are 2^that times as large
+REST_SIZES, LEVEL_SHIFT = 2, 2  # sizes of cells, and the shift from one to the next: 2^LEVEL_SHIFT times as large
+FRICTIONLESS = ("water",)  # materials that do not rest between the larger cells
 
 
 class Deformation:
@@ -91,21 +92,24 @@ def rested(
     grid: GridHierarchy,
     threshold: float,
     scale: torch.Tensor,
-    levels: int = 1,
-    large_M: torch.Tensor | None = None,
+    widely_M: torch.Tensor,
 ) -> torch.Tensor:
-    """Accelerations less gravity after `balanced`, and after that without slow deformations between cells of so many
-    sizes, [N, 3], those larger than the first of the materials alone that `large_M` is 1 of; accelerations are in units
-    of `scale`, the normaliser's.
+    """Returns accelerations less gravity, as `balanced` gives them, without slow deformations, [N, 3], in units of the
+    normaliser's `scale`. `widely_M` is 1 for the materials that rest between larger cells, too.
     """
-    large_N = None if large_M is None else large_M[state.material_N]
+    widely_N = widely_M[state.material_N]
     limit_N = ((threshold / scale) ** 2 * state.gravity_S3.square().sum(-1))[state.scene_N]
-    for level in range(levels):
-        deformation = Deformation(touched_C, grid, level * LEVEL_SHIFT, large_N if level else None)
+    for level in range(REST_SIZES):
+        deformation = Deformation(touched_C, grid, level * LEVEL_SHIFT, widely_N if level else None)
         # gravity, which is the same for all of a scene, is no part of a deformation
         rate_N3 = deformation(acceleration_N3 + state.velocity_NM3[:, 0] / scale)
         acceleration_N3 = acceleration_N3 - deformation(slow(rate_N3, limit_N))
     return acceleration_N3
+
+
+def rests_widely(config: NetworkConfig) -> list[bool]:
+    """Returns whether each of the network's materials rests between cells larger than the coarsest, too."""
+    return [name not in FRICTIONLESS for name in config.materials]
 
 
 def slow(rate_N3: torch.Tensor, limit_N: torch.Tensor) -> torch.Tensor:

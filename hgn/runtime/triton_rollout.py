@@ -225,7 +225,7 @@ class TritonRollout:
         rounded = tuple(16 * math.ceil(max(1, min(c, m)) / 16) for c, m in zip(capacities, limits, strict=True))
         self.grid = DeviceGrid(
             window, self.scenes, rounded, self.particles, feature_columns(config), config.cell_size,
-            self.device, config.relative, config.rest_sizes,
+            self.device, config.relative, config.rests,
         )  # fmt: skip
         tuning = Tuning.of(self.precision)
         tuning = replace(tuning, half_sums=tuning.half_sums and not self._careful)

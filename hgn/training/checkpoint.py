@@ -99,9 +99,8 @@ def _require_equal(pairs: list[tuple[str, Any, Any]], why: str, remedy: str) -> 
 
 
 def network_of_weights(config: TrainConfig) -> ParticleNetwork:
-    """The network of training.init_weights, normaliser included, for a new run to begin with. What it makes of contacts
-    and its walls may be other than these weights were trained with: tensors are the same, and training goes on from
-    there.
+    """The network of training.init_weights, normaliser included, for a new run to begin with. Rest, walls and
+    obstacles' clearance may differ from those of the weights: they change no tensor.
 
     Raises: ConfigError for a file that is none, and where the run wants another network or has other data.
     """
@@ -109,8 +108,7 @@ def network_of_weights(config: TrainConfig) -> ParticleNetwork:
     path = find_weights(config.training.init_weights, "training.init_weights")
     weights, info = load_weights(path, field="training.init_weights")
     remedy = "set it so, or take other training.init_weights"
-    contacts = ("contact_gate", "contact_forces", "contact_reach_cells")
-    free = (*contacts, "rest_threshold", "rest_levels", "rest_large_materials", "wall_clearance", "obstacle_clearance")
+    free = ("rest_threshold", "wall_clearance", "obstacle_clearance")
     pairs = [pair for pair in _network_pairs(info.network, config) if pair[0].removeprefix("network.") not in free]
     pairs.append(("dataset.frame_rate_hz", info.frame_rate_hz, config.dataset.frame_rate_hz))
     if info.network.sees_obstacles:

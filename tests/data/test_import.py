@@ -415,7 +415,7 @@ def flat(tmp_path):
 
 def network_of(manifest, **changes):
     own = manifest.config["imported"]
-    sizes: dict[str, Any] = {"width": 8, "message_passing_steps": 1, "material_embedding": 2}
+    sizes: dict[str, Any] = {"width": 8, "message_passing_steps": 1}
     return NetworkConfig(
         cell_size=own["radius"], dimensions=2, materials=tuple(own["materials"]), **(sizes | changes)
     )  # fmt: skip

@@ -18,7 +18,7 @@ from hgn.runtime.simulator import InitialState
 from hgn.runtime.weights import load_weights
 from hgn.schema import ConfigError
 
-GNS = {"levels": 1, "message_passing_steps": 2, "width": 8, "material_embedding": 2}
+GNS = {"levels": 1, "message_passing_steps": 2, "width": 8}
 
 
 @pytest.mark.parametrize("kind", ["gns", "gns_particles"])

@@ -367,7 +367,7 @@ def test_mechanics(tmp_path, monkeypatch):
     shipped = load_weights(shipped_weights()["mechanics"])[1]
     assert shipped.network == replace(last.network, **export.network_changes)
     assert shipped.updates == last.training.maximum_updates
-    assert set(export.network_changes) == {"rest_threshold", "rest_levels", "rest_large_materials", "wall_clearance"}
+    assert set(export.network_changes) == {"rest_threshold", "wall_clearance"}
     assert not any(exported[name].network_changes for name in exported if name != "mechanics")
     repeats, one = [trained[name] for name in repeated], trained["fourth"]
     assert len({each.training.seed for each in repeats}) == 3

@@ -45,7 +45,7 @@ CUDABackend.make_cubin = lambda *_: b""  # ptxas takes a fifth of the time, and 
 settings = UpdateSettings(2, 1e-3, True, 1 / 64)
 relative = NetworkConfig(inputs="relative", width=16, levels=2, message_passing_steps=1)
 of_relative = {}  # before any is compiled: what is would be launched
-contacts = {"contact_gate": "cell", "contact_forces": "normal", "rest_threshold": 0.3, "rest_levels": 2}
+contacts = {"rest_threshold": 0.3}
 contacts |= {"wall_clearance": (0.02, 0.04), "obstacle_clearance": 1e-3}
 for network in (relative, replace(relative, **contacts)):
     job = PrecompileJob(network, settings, "fp16", False, False, 9000, (9000, 3000), 90, (2,))

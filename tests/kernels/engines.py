@@ -32,7 +32,7 @@ def engine_of(network, state, precision="fp32", capacities=(), spare_particles=3
         config.cell_size,
         where,
         config.relative,
-        config.rest_sizes,
+        config.rests,
     )
     packed = pack_network(network)
     values = packed.gather(list(network.parameters())).to(where)

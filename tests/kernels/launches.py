@@ -12,6 +12,7 @@ import torch
 from kernels.interpreter import dropped_bits
 from triton.runtime.jit import KernelInterface
 
+from hgn.config import MATERIAL_EMBEDDING
 from hgn.kernels.gns.op import FusedEdges
 from hgn.kernels.reference import Added, ProgramSums, rows
 
@@ -112,7 +113,7 @@ def watched_edges(see):
 def _encoder(engine, values):
     """Its first layer on features and one-hot materials."""
     first, embedding, bias = engine._encode_views(values)
-    used = engine.config.feature_width - engine.config.material_embedding
+    used = engine.config.feature_width - MATERIAL_EMBEDDING
     combined = torch.zeros_like(engine.encode_weights, dtype=torch.float64)
     combined[:, :used] = first[:, :used]
     combined[:, used : used + len(embedding)] = bias[:, None] + first[:, used:] @ embedding.T

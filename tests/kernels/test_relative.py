@@ -10,7 +10,6 @@ from kernels.engines import engine_of, inference_of, prepare, run_forward
 from kernels.test_network import compare, drawn, float32_state
 from network.states import network_of
 
-from hgn.config import CONTACT_GATES
 from hgn.network.cell_keys import unpack
 from hgn.network.features import ParticleState
 from hgn.network.hgn import HierarchicalGraphNetwork
@@ -19,11 +18,12 @@ from hgn.runtime.parity import relative_error
 pytestmark = pytest.mark.usefixtures("large_tiles")
 
 EVERYWHERE = (17, 1, 6)  # particles of three scenes
+MATERIALS = ("water", "sand", "snow")
 PRECISIONS = {"fp32": 1e-5, "tf32": 2e-3, "fp16": 2e-3}
 
 
 def relative_network(**changes: object) -> HierarchicalGraphNetwork:
-    config = {"width": 16, "levels": 3, "message_passing_steps": 1, "contact_reach_cells": 2.0}
+    config = {"width": 16, "levels": 3, "message_passing_steps": 1}
     network = network_of(inputs="relative", **{**config, **changes})
     network.normaliser.velocity_std.fill_(7.0)  # which nothing depends on
     return network
@@ -59,11 +59,10 @@ def features_of(network: HierarchicalGraphNetwork, state: ParticleState, origin_
         ((150, 9), False, {"levels": 1}),
     ],
 )
-@pytest.mark.parametrize("gate", CONTACT_GATES)
-def test_every_column(counts: tuple[int, ...], obstacles: bool, changes: dict, gate: str) -> None:
+def test_every_column(counts: tuple[int, ...], obstacles: bool, changes: dict) -> None:
     """Each column is that of hgn.network.relative in float64, the material one-hot behind them, and zeros behind that;
     among the particles are some within a surface's reach and some beyond."""
-    network, state = relative_network(contact_gate=gate, **changes), moving_state(counts, obstacles, 0.6)
+    network, state = relative_network(**changes), moving_state(counts, obstacles, 0.6)
     state = replace(state, velocity_NM3=state.velocity_NM3[:, : network.config.velocity_history])
     origin_S3, _ = drawn(network, state)
     found = features_of(network, state, origin_S3)
@@ -81,33 +80,31 @@ def test_every_column(counts: tuple[int, ...], obstacles: bool, changes: dict, g
 @pytest.mark.parametrize(
     ("counts", "obstacles", "levels"), [(EVERYWHERE, True, 2), ((9, 33), False, 1), ((1,), False, 2), ((40,), False, 3)]
 )
-@pytest.mark.parametrize(("gate", "forces"), [("particle", "any"), ("cell", "any"), ("particle", "normal")])
-def test_outputs_and_gradients(counts: tuple[int, ...], obstacles: bool, levels: int, gate: str, forces: str) -> None:
-    """In float32 outputs and every gradient are those of the reference network in float64 to 2e-5, among walls within
-    reach and beyond, with one coarsest cell a particle and with few for all; to 4e-5 where forces lie along normals,
-    in whose weights the rounding of distances counts tenfold (FEW)."""
-    network = relative_network(levels=levels, contact_gate=gate, contact_forces=forces)
+def test_outputs_and_gradients(counts: tuple[int, ...], obstacles: bool, levels: int) -> None:
+    """In float32 outputs and every gradient are those of the reference network in float64 to 4e-5, among walls within
+    reach and beyond, with one coarsest cell a particle and with few for all: in the weights of normals the rounding of
+    distances counts tenfold (FEW)."""
+    network = relative_network(levels=levels)
     state = moving_state(counts, obstacles)
     output, together, each = compare(network, state, "fp32", 1.0, 512)
-    assert max(output, together, *each) < {"any": 2e-5, "normal": 4e-5}[forces]
+    assert max(output, together, *each) < 4e-5
 
 
 @pytest.mark.parametrize(
-    ("counts", "obstacles", "levels", "sizes", "large"),
+    ("counts", "obstacles", "levels", "materials"),
     [
-        *((EVERYWHERE, True, 2, 1, None), ((9, 33), False, 1, 1, None), ((1,), False, 2, 1, None)),
-        *(((40,), False, 3, 1, None), (EVERYWHERE, True, 1, 3, None), ((9, 33), False, 2, 2, None)),
-        ((9, 33), True, 1, 2, ("snow", "water")),
+        (EVERYWHERE, True, 2, MATERIALS),
+        ((1,), False, 2, MATERIALS),
+        ((40,), False, 3, ("sand", "snow", "water")),
+        ((9, 33), True, 1, ("sand", "snow", "goop")),
     ],
 )
-def test_rest(counts, obstacles, levels, sizes, large):
-    """Outputs and every gradient with deformations that are slow, nearly so, and fast, to 1e-4: of cells that hold few
-    particles the rounding of inertia counts, as it does in PyTorch; to 1e-3 between cells of several sizes, where it
-    counts several times (PyTorch in float32: 2e-3). What rest changes is more, and keeps momenta."""
-    changes = {"levels": levels, "contact_forces": "normal"}
+def test_rest(counts, obstacles, levels, materials):
+    """Outputs and every gradient with deformations that are slow, nearly so, and fast, to 1e-3: of cells that hold few
+    particles the rounding of inertia counts, between cells of two sizes twice (PyTorch in float32: 2e-3). What rest
+    changes is more, and keeps momenta."""
     without, network = (
-        relative_network(**resting, **changes)
-        for resting in ({}, {"rest_threshold": 1.0, "rest_levels": sizes, "rest_large_materials": large})
+        relative_network(levels=levels, materials=materials, rest_threshold=threshold) for threshold in (0.0, 1.0)
     )
     state = moving_state(counts, obstacles, 0.1)
     state = replace(state, velocity_NM3=state.velocity_NM3.clamp(-2e-3, 2e-3))
@@ -119,7 +116,7 @@ def test_rest(counts, obstacles, levels, sizes, large):
         for scene in range(len(counts)):
             assert float(kept_N3[state.scene_N == scene].sum(0).abs().max()) < 1e-5 * float(found[0].abs().sum())
     output, together, each = compare(network, state, "fp32", 1.0, 512)
-    assert max(output, together, *each) < (1e-4 if sizes == 1 else 1e-3)
+    assert max(output, together, *each) < 1e-3
 
 
 @pytest.mark.parametrize("precision", list(PRECISIONS))
@@ -127,7 +124,7 @@ def test_rest(counts, obstacles, levels, sizes, large):
 def test_momentum_is_kept_where_nothing_touches(counts: tuple[int, ...], precision: str) -> None:
     """Away from surfaces what inference adds to gravity sums to 0 in each scene, to float32's rounding; and so do its
     moments."""
-    network = relative_network(levels=2, contact_gate="cell")
+    network = relative_network(levels=2)
     state = moving_state(counts, obstacles=False)
     state = replace(state, position_N3=state.position_N3 + 0.4, velocity_NM3=state.velocity_NM3.clamp(-5e-3, 5e-3))
     origin_S3, _ = drawn(network, state)
@@ -170,7 +167,7 @@ def test_what_flies_in_one_piece() -> None:
 def test_a_boost_changes_nothing(precision: str) -> None:
     """Away from surfaces 3 m/s more for all, in any direction, and another gravity in free flight, leave the output of
     inference as it was to the rounding of velocities in float32."""
-    network = relative_network(contact_gate="cell")
+    network = relative_network()
     state = moving_state((23, 5), obstacles=False, spread=0.1)
     state = replace(state, position_N3=state.position_N3 + 0.4, velocity_NM3=state.velocity_NM3.clamp(-5e-3, 5e-3))
     origin_S3, _ = drawn(network, state)

@@ -47,9 +47,7 @@ def spreading():
     return fast, Simulator(fast, 60.0, "torch").start([scene(5)])
 
 
-@pytest.mark.parametrize(
-    "changes", [{}, {"inputs": "relative"}, {"inputs": "relative", "rest_threshold": 2.0, "rest_levels": 2}]
-)
+@pytest.mark.parametrize("changes", [{}, {"inputs": "relative"}, {"inputs": "relative", "rest_threshold": 2.0}])
 def test_frames_are_those_of_the_plain_loop(changes):
     """Two scenes at once, of different gravity, move as in the plain simulator, frame by frame, and each frame is
     announced once."""
@@ -217,9 +215,7 @@ def test_later_simulations_begin_anew():
     """What a simulator has captured it uses again, for a scene of fewer particles, other obstacles and other gravity
     too; the frames are bitwise those of a new simulator, after one that diverged as well."""
     first, second = scene(3), scene(2, 1, gravity=(0.0, 2.0, 0.0))
-    again, *others = (
-        Simulator(network(inputs="relative", contact_gate="cell"), 60.0, "triton", "fp32") for _ in range(3)
-    )
+    again, *others = (Simulator(network(inputs="relative"), 60.0, "triton", "fp32") for _ in range(3))
     again.rollout([first], 2)
     kept = again.backend.idle[1]
     for one, other in zip((second, first), others, strict=True):
@@ -242,7 +238,7 @@ def test_scenes_that_change():
     captured is used for all of them while there is room, and captured anew where there is not."""
     paths, growing = [], []
     for backend, precision in (("torch", "fp32"), ("triton", "fp32")):
-        simulator = Simulator(network(2, inputs="relative", contact_gate="cell"), 60.0, backend, precision)
+        simulator = Simulator(network(2, inputs="relative"), 60.0, backend, precision)
         live = LiveSimulation(simulator, scene(4), room=6)
         first = live._rollout
         path = [live.step()]

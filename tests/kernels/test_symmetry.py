@@ -48,9 +48,7 @@ def test_an_update_under_symmetries_is_the_plain_one(kind, monkeypatch):
     if kind == "gns":
         network = gns_of(message_passing_steps=1, cell_size=0.1)
     if kind == "relative":
-        network = network_of(
-            width=16, levels=1, message_passing_steps=1, cell_size=0.1, inputs="relative", contact_gate="cell"
-        )
+        network = network_of(width=16, levels=1, message_passing_steps=1, cell_size=0.1, inputs="relative")
     episodes = [scene_with_obstacles(i, 2 + i) for i in range(8)]
     bare = ObstacleGrid(CELL_SIZE, np.zeros((0, 3), np.int32), np.zeros((0, 3), np.float32))
     episodes[2] = replace(episodes[2], obstacle_grid=bare)

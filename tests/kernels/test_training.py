@@ -21,7 +21,7 @@ from hgn.training.graph_trainer import GraphTrainer
 
 pytestmark = pytest.mark.usefixtures("large_tiles")
 
-NETWORK = {"width": 16, "levels": 1, "message_passing_steps": 1, "material_embedding": 2, "cell_size": 0.2}
+NETWORK = {"width": 16, "levels": 1, "message_passing_steps": 1, "cell_size": 0.2}
 
 
 def run_mapping(config, run, **training):

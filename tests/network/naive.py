@@ -30,7 +30,7 @@ def naive_normalised_acceleration(
 
 def _one_scene(network, state, members, scene, origin_S3):
     config, size = network.config, network.config.cell_size
-    maximum = config.wall_distance_cells * size
+    maximum = 8.0 * size
     latent = []
     for i in members:
         x = state.position_N3[i]
@@ -96,10 +96,10 @@ def _one_scene(network, state, members, scene, origin_S3):
         return output
     output = _balanced(config, *felt, pairs, output)
     scale = network.normaliser.acceleration_std[0]
-    for level in range(config.rest_levels):
+    for level in range(2 * config.rests):
         moving = [value + state.velocity_NM3[i, 0] / scale for i, value in zip(members, output, strict=True)]
         slow = []
-        large = [config.rests_large[int(state.material_N[i])] or not level for i in members]
+        large = [config.materials[int(state.material_N[i])] != "water" or not level for i in members]
         for rate in _deforming(config, felt[0], pairs, moving, level, large):
             ratio = rate.norm() * scale / (config.rest_threshold * state.gravity_S3[scene].norm() + 1e-300)
             slow.append((2 - ratio**2).clamp(0, 1) * rate)
@@ -132,7 +132,7 @@ def _relative(network, state, i, scene, row, members, pairs):
             if other == row:
                 mean = [m + float(weight) * p / mass[at] for m, p in zip(mean, momentum[at], strict=True)]
         surroundings += [f(v[0][a] - mean[a]) for a in range(3)]
-    reach, walls = config.contact_reach_cells * config.cell_size, []
+    reach, walls = 3.0 * config.cell_size, []
     for side in (0, 1):
         for a in range(3):
             distance = x[a] if side == 0 else float(state.domain_S3[scene, a]) - x[a]
@@ -163,9 +163,7 @@ def _gated(config, columns, pairs):
         return max([values[cell], *(values[side] for side in sides if side in values)])
 
     for i, line in enumerate(columns):
-        gate = touch[i]
-        if config.contact_gate == "cell":
-            gate = sum(float(weight) * around(touched, cell) for row, cell, weight in top if row == i)
+        gate = sum(float(weight) * around(touched, cell) for row, cell, weight in top if row == i)
         line[motion : motion + 3] = [gate * value for value in line[motion : motion + 3]]
 
     def slip(cell):
@@ -178,8 +176,7 @@ def _gated(config, columns, pairs):
             first_3 = next((n for n in normals if n.any()), normals[-1])
             if at == cell:
                 matrix += float(weight) * (torch.diag(near_6[:3] + near_6[3:]) + torch.outer(first_3, first_3))
-        slips = torch.linalg.inv(torch.eye(3).double() + matrix / (0.1 + 1e-3 * matrix.trace()))
-        return slips if config.contact_forces == "normal" else 0 * slips
+        return torch.linalg.inv(torch.eye(3).double() + matrix / (0.1 + 1e-3 * matrix.trace()))
 
     return partial(around, touched), partial(around, disturbed), slip
 

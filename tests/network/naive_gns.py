@@ -48,7 +48,7 @@ def naive_gns_acceleration(network, state):
 
 def _encode(network, state, position, scene, velocity, kind, normal):
     config = network.config
-    maximum = config.wall_distance_cells * config.cell_size
+    maximum = 8.0 * config.cell_size
     parts = [velocity.flatten()]
     if config.obstacle_features:
         parts.append(torch.zeros_like(position) if normal is None else normal)

@@ -47,23 +47,11 @@ def test_fcn_halves_equal_the_definition():
         ((12,), {"levels": 4, "message_passing_steps": 1, "width": 7}),
         ((15,), {"obstacle_features": False, "velocity_history": 5}),
         ((9, 4), {"inputs": "relative"}),
-        ((14, 4), {"inputs": "relative", "levels": 2, "obstacle_features": False, "contact_gate": "cell"}),
-        ((1, 12), {"inputs": "relative", "levels": 1, "contact_reach_cells": 4.0}),
-        ((15, 1), {"inputs": "relative", "obstacle_features": False}),
-        ((13, 2), {"inputs": "relative", "levels": 1, "contact_gate": "cell"}),
-        ((14, 4), {"inputs": "relative", "levels": 2, "contact_forces": "normal"}),
+        ((14, 4), {"inputs": "relative", "levels": 2, "obstacle_features": False}),
+        ((1, 12), {"inputs": "relative", "levels": 1}),
         ((14, 4), {"inputs": "relative", "rest_threshold": 2.0}),
-        ((14, 4), {"inputs": "relative", "levels": 1, "rest_threshold": 2.0, "rest_levels": 3}),
-        (
-            (14, 4),
-            {
-                "inputs": "relative",
-                "levels": 1,
-                "rest_threshold": 2.0,
-                "rest_levels": 2,
-                "rest_large_materials": ("sand", "snow"),
-            },
-        ),
+        ((14, 4), {"inputs": "relative", "levels": 1, "rest_threshold": 2.0}),
+        ((14, 4), {"inputs": "relative", "levels": 1, "rest_threshold": 2.0, "materials": ("snow", "sand", "goop")}),
     ],
 )
 def test_network_equals_the_literal_definition(counts, changes):

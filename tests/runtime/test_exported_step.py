@@ -37,11 +37,7 @@ NETWORKS = {
     "relative": {"inputs": "relative"},
     "contacts": {
         "inputs": "relative",
-        "contact_gate": "cell",
-        "contact_forces": "normal",
         "rest_threshold": 0.3,
-        "rest_levels": 2,
-        "rest_large_materials": ("sand", "snow"),
     },
 }
 SIZES = [(particles, obstacles) for particles in (1, 216, 4_096, 30_000) for obstacles in (True, False)]

@@ -56,7 +56,7 @@ def fake_simulate(scenes, config, frames, frame_rate_hz, on_frame=None, collider
 
 
 def weights_file(path, kind):
-    network = (network_of if kind == "hgn" else gns_of)(torch.float32, width=8, material_embedding=2)
+    network = (network_of if kind == "hgn" else gns_of)(torch.float32, width=8)
     save_weights(path, network, WeightsInfo(network.config, 60.0, 1 / 64, updates=7))
     return path
 

@@ -54,12 +54,12 @@ SCENE |= {"group_shapes": ["cube"], "group_count": 2, "group_size": 0.04}
 GRAVITY = (0.0, -9.8, 0.0)
 SMALL = {"frames": 3, "long_frames": 5, "scene": SCENE, "device": "cpu", "solver_device": "cpu"}
 MATERIAL_NAMES = ("water", "sand", "snow")
-RESTING = {"inputs": "relative", "contact_gate": "cell", "contact_forces": "normal", "rest_threshold": 0.1}
+RESTING = {"inputs": "relative", "rest_threshold": 0.1}
 
 
 @pytest.fixture
 def weights(tmp_path):
-    network = network_of(torch.float32, width=8, material_embedding=2, message_passing_steps=1, levels=2)
+    network = network_of(torch.float32, width=8, message_passing_steps=1, levels=2)
     with torch.no_grad():  # nothing accelerates: whatever happens is the scene's
         network.decode.second.weight.zero_()
         network.decode.second.bias.zero_()
@@ -178,7 +178,7 @@ def test_scenes_of_a_rollout(together, rollouts, monkeypatch):
 
 def test_relative_inputs_take_any_gravity():
     """A network in relative inputs whose own answer is nothing flies exactly: the judges are green where they can."""
-    network = network_of(torch.float32, inputs="relative", width=8, material_embedding=2, levels=2)
+    network = network_of(torch.float32, inputs="relative", width=8, levels=2)
     with torch.no_grad():
         network.decode.second.weight.zero_()
         network.decode.second.bias.zero_()
@@ -209,7 +209,7 @@ def test_flight_ends_before_the_walls():
 
 def test_flights_end_where_contacts_may_begin():
     """With walls seen from three finest cells on flights are judged before: exact with random weights."""
-    network = network_of(torch.float32, inputs="relative", message_passing_steps=1, contact_reach_cells=3.0)
+    network = network_of(torch.float32, inputs="relative", message_passing_steps=1)
     rows = motion_of(network, ("throw",))
     assert rows and all(row.held for row in rows.values()), rows
 
@@ -390,7 +390,7 @@ def test_failures_are_told(weights, monkeypatch):
 def test_the_guard_is_asked(forces):
     """A weight that explodes is noticed at the first frame, also where free flight, floors that push along their
     normals alone, or rest by construction leave networks no answer."""
-    exploding = network_of(torch.float32, width=8, material_embedding=2, levels=2, **forces)
+    exploding = network_of(torch.float32, width=8, levels=2, **forces)
     row = guard_row(Simulator(exploding, 60.0, "torch"), SceneConfig())
     assert row.held, row
 

@@ -4,7 +4,7 @@ import json
 
 from hgn.schema import to_mapping
 
-NETWORK = {"width": 8, "levels": 2, "message_passing_steps": 1, "material_embedding": 2}
+NETWORK = {"width": 8, "levels": 2, "message_passing_steps": 1}
 TRAINING = {
     "maximum_updates": 12,
     "batch_scenes": 2,

@@ -89,16 +89,14 @@ def test_other_weights_are_refused(data, tmp_path, file, message):
     assert {path.name for path in (tmp_path / "run").rglob("*")} <= {".lock"}
 
 
-def test_another_sight_of_contacts_is_taken(tmp_path):
-    """Weights that were trained with a particle's own gate begin a network with the cells', another reach, walls and
-    obstacles that hold: the same tensors."""
+def test_other_constraints_are_taken(tmp_path):
+    """Weights without rest, walls and obstacles' clearance begin a network with these: the same tensors."""
     path = weights_file(tmp_path / "own.safetensors", "fp32", inputs="relative")
-    contacts = {"contact_gate": "cell", "contact_reach_cells": 3.0}
-    holding = {"wall_clearance": (0.02, 0.04), "obstacle_clearance": 1e-3}
-    wanted = NetworkConfig(**NETWORK | {"inputs": "relative"} | contacts | holding)
+    constraints = {"rest_threshold": 0.1, "wall_clearance": (0.02, 0.04), "obstacle_clearance": 1e-3}
+    wanted = NetworkConfig(**NETWORK | {"inputs": "relative"} | constraints)
     config = TrainConfig(network=wanted, training=TrainingConfig(init_weights=str(path)))
     network, (own, info) = network_of_weights(config), load_weights(path)
-    assert network.config == wanted and info.network.contact_gate == "particle"
+    assert network.config == wanted and info.network.rest_threshold == 0
     theirs = own.state_dict()
     assert all(torch.equal(tensor, theirs[name]) for name, tensor in network.state_dict().items())
     with pytest.raises(ConfigError, match=r"network.cell_size must be .*, as in"):
@@ -130,7 +128,7 @@ def test_an_export_sets_rest_walls_and_obstacles(data, tmp_path):
     kept, absolute = (str(tmp_path / name / "checkpoints" / "last.ckpt") for name in ("relative", "absolute"))
     chosen = [
         {},
-        {"rest_threshold": 0.1, "rest_levels": 3, "rest_large_materials": ["sand"]},
+        {"rest_threshold": 0.1},
         {"wall_clearance": [0.02, 0.04]},
         {"obstacle_clearance": 1e-3},
     ]
@@ -141,7 +139,7 @@ def test_an_export_sets_rest_walls_and_obstacles(data, tmp_path):
     assert trained.network.rest_threshold == 0
     assert trained.network.wall_clearance is None and trained.network.obstacle_clearance is None
     expected = (
-        {"rest_threshold": 0.1, "rest_levels": 3, "rest_large_materials": ("sand",)},
+        {"rest_threshold": 0.1},
         {"wall_clearance": (0.02, 0.04)},
         {"obstacle_clearance": 1e-3},
     )

@@ -23,8 +23,9 @@ import numpy as np
 import torch
 from torch import nn
 
-from hgn.config import NetworkConfig, TrainingConfig
+from hgn.config import MATERIAL_EMBEDDING, NetworkConfig, TrainingConfig
 from hgn.data.batch import Batch
+from hgn.network.features import WALL_DISTANCE_CELLS
 from hgn.network.gns import GraphNetworkSimulator, InteractionStep
 from hgn.network.mlp import MLP
 from hgn.network.neighbours import neighbour_list
@@ -70,7 +71,7 @@ def public_simulator(module: ModuleType, network: GraphNetworkSimulator, domain_
     }
     return module.LearnedSimulator(
         particle_dimensions=3,
-        nnode_in=3 * config.velocity_history + 6 + config.material_embedding,
+        nnode_in=3 * config.velocity_history + 6 + MATERIAL_EMBEDDING,
         nedge_in=4,
         latent_dim=config.width,
         nmessage_passing_steps=config.message_passing_steps,
@@ -80,8 +81,8 @@ def public_simulator(module: ModuleType, network: GraphNetworkSimulator, domain_
         boundaries=np.stack([np.zeros(3), domain_3.cpu().numpy()], axis=1),
         normalization_stats=statistics,
         nparticle_types=len(config.materials),
-        particle_type_embedding_size=config.material_embedding,
-        boundary_clamp_limit=config.wall_distance_cells,
+        particle_type_embedding_size=MATERIAL_EMBEDDING,
+        boundary_clamp_limit=WALL_DISTANCE_CELLS,
         device=str(domain_3.device),
     ).to(domain_3)
 
@@ -103,7 +104,7 @@ def copy_weights(simulator: nn.Module, network: GraphNetworkSimulator) -> None:
     velocity, wall, material = first.split([parts[0], parts[2], parts[3]], dim=1)
     velocity = velocity.unflatten(1, (history, 3)).flip(1).flatten(1)
     normal = velocity.new_zeros(len(velocity), parts[1])
-    network.encode.first.weight.copy_(torch.cat([velocity, normal, config.wall_distance_cells * wall, material], 1))
+    network.encode.first.weight.copy_(torch.cat([velocity, normal, WALL_DISTANCE_CELLS * wall, material], 1))
     _copy(theirs._encoder.edge_fn, network.encode_edges)
     for step, public_step in zip(network.steps, theirs._processor.gnn_stacks, strict=True):
         assert isinstance(step, InteractionStep)

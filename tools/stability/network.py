@@ -447,7 +447,7 @@ def guard_row(simulator: Simulator, config: SceneConfig) -> Row:
     broken = copy.deepcopy(simulator.network)
     with torch.no_grad():
         # Not NaN: backends that are compared with each other before they run could not agree on that. Upwards: with
-        # contact_forces=normal nothing comes of it along the floor.
+        # relative inputs nothing comes of it along the floor.
         thrown = FAR_DOMAINS * max(config.domain_size) / broken.normaliser.acceleration_std[1]
         dict(broken.named_parameters())["decode.second.bias"][1] = thrown
     floor_13 = 0.5 * np.array([config.domain_size]) * (1.0, ON_THE_FLOOR, 1.0)

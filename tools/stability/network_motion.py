@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from hgn.config import MpmConfig, NetworkConfig, SceneConfig
+from hgn.network.relative import CONTACT_REACH_CELLS
 from hgn.runtime.rollouts import RolloutResult, simulate_scenes
 from hgn.runtime.simulator import InitialState, Simulator
 from hgn.scene.scene import Scene
@@ -127,7 +128,7 @@ def judged_reach(config: NetworkConfig) -> float:
     """How near to a wall flights are judged, in domain units: beyond what the solver's walls do, and what relative
     inputs know of them.
     """
-    return max(REACH, config.contact_reach_cells + BEYOND if config.relative else 0.0) * config.cell_size
+    return max(REACH, CONTACT_REACH_CELLS + BEYOND if config.relative else 0.0) * config.cell_size
 
 
 def flight_frames(scene: Scene, frame_rate_hz: float, reach: float) -> int:

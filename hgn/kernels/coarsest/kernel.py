@@ -176,7 +176,7 @@ def _pairs(
 @triton.jit
 def balance(
     sums, moments, felt, motion, neighbour, geometry, counts, table, capacity, few, rare,
-    LEVELS: tl.constexpr, SLIPS: tl.constexpr, OUT: tl.constexpr, OVERLAP: tl.constexpr, BLOCK: tl.constexpr,
+    LEVELS: tl.constexpr, OUT: tl.constexpr, OVERLAP: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """What the coarsest cells add to their particles' accelerations at their middles, of the sums of what these put
     out, in columns 0 to 2 of table [C, OUT], the factor of these particles' own in column 3, and the rate of rotation
@@ -221,12 +221,10 @@ def balance(
     )
     lever = _cross(turn, centre)
     line = table + cell * OUT
-    if SLIPS:
-        along = _slip(moments, cell, there, few, rare, mean, OUT)
+    along = _slip(moments, cell, there, few, rare, mean, OUT)
     for i in tl.static_range(3):
         pushed = tl.sum(share * (felt_by * traction[i] + swing[i]), 1) - free * known * mean[i]
-        if SLIPS:
-            pushed -= touched * along[i]
+        pushed -= touched * along[i]
         tl.store(line + i, disturbed * pushed - lever[i], mask=there)
         tl.store(line + 4 + i, turn[i], mask=there)
     tl.store(line + 3, disturbed * (touched + free * known), mask=there)
@@ -235,7 +233,7 @@ def balance(
 @triton.jit
 def balance_backward(
     sums, moments, felt, motion, neighbour, geometry, counts, table, capacity, few, rare,
-    LEVELS: tl.constexpr, SLIPS: tl.constexpr, OUT: tl.constexpr, OVERLAP: tl.constexpr, BLOCK: tl.constexpr,
+    LEVELS: tl.constexpr, OUT: tl.constexpr, OVERLAP: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """The same of the sums of the gradients of what `balance` leads to, and of their moments: in columns 0 to 8 of
     table [C, OUT] what coarsest cells add to the gradients of their particles' outputs at their middles, in column 9
@@ -268,12 +266,10 @@ def balance_backward(
     turn = (factor * wx, factor * wy, factor * wz)
     lever = _cross(turn, centre)
     line = table + cell * OUT
-    if SLIPS:
-        along = _slip(moments, cell, there, few, rare, mean, OUT)
+    along = _slip(moments, cell, there, few, rare, mean, OUT)
     for i in tl.static_range(3):
         own = factor * known * mean[i] - lever[i]
-        if SLIPS:
-            own -= disturbed * touched * along[i]
+        own -= disturbed * touched * along[i]
         tl.store(line + i, own, mask=there)
         tl.store(line + 10 + i, turn[i], mask=there)
     tl.store(line + 9, disturbed * (touched + free * known), mask=there)

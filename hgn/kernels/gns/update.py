@@ -23,7 +23,7 @@ from hgn.kernels.grid.op import OUT_OF_WINDOW, PARTICLE_BLOCK, feature_arguments
 from hgn.kernels.neighbours.op import DeviceNeighbours
 from hgn.kernels.update.op import TAIL, Layout, Tables, TrainedNetwork, Updates
 from hgn.network.cell_keys import COORDINATE_LIMIT
-from hgn.network.features import ParticleState
+from hgn.network.features import WALL_DISTANCE_CELLS, ParticleState
 from hgn.network.gns import GraphNetworkSimulator
 from hgn.network.gns_edges import PlainEdges
 from hgn.schema import ConfigError
@@ -176,7 +176,7 @@ class GnsUpdates(Updates):
             ),
             mean=self.velocity_mean,
             std=self.velocity_std,
-            wall_maximum=config.wall_distance_cells * config.cell_size,
+            wall_maximum=WALL_DISTANCE_CELLS * config.cell_size,
         )
 
     def _make_room(self, status: int, needed: list[int]) -> None:

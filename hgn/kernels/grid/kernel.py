@@ -291,7 +291,7 @@ def prepare_particles(
     position, velocity, scene_of, origin, particle_count, low, geometry, occupied, prefix_sum, cell_of,
     weight_of, fraction_of, motion, coarsest_of, share_of, place_of, moments, domain, obstacle_table,
     obstacle_cell_size, features, touch_of, disturbed, cell_size, reach, capacity,
-    HISTORY: tl.constexpr, LEVELS: tl.constexpr, MOTION: tl.constexpr, SLIPS: tl.constexpr, COLUMNS: tl.constexpr,
+    HISTORY: tl.constexpr, LEVELS: tl.constexpr, MOTION: tl.constexpr, COLUMNS: tl.constexpr,
     NORMALS: tl.constexpr, OBSTACLES: tl.constexpr, SYMMETRY: tl.constexpr, FEATURES: tl.constexpr,
     OVERLAP: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
@@ -300,8 +300,8 @@ def prepare_particles(
     elsewhere, its shares of them, and its place [N, 3] in the lowest, from the middle, in edges. Surfaces need no sums:
     their columns of the features are written here, with `touch_of` [N], how near a particle is to any, to which the
     second numbers of its coarsest cells in `disturbed` [C, 2] are raised, over FULLY. Sums of places and of
-    their products xx, yy, zz, yz, xz, xy are added to the coarsest cells' `moments` [C, COLUMNS], and with SLIPS those
-    of the normals of what is touched behind them. OBSTACLES and SYMMETRY as in prepare_features.
+    their products xx, yy, zz, yz, xz, xy are added to the coarsest cells' `moments` [C, COLUMNS], and those of the
+    normals of touched surfaces behind them. OBSTACLES and SYMMETRY as in prepare_features.
 
     Reference: hgn.network.grid.build_hierarchy and hgn.network.relative; test: tests/kernels/test_network.py,
     tests/kernels/test_relative.py.
@@ -370,13 +370,11 @@ def prepare_particles(
         one = tl.where((part == 1) | (part == 4) | (part == 6), py, tl.where((part == 2) | (part == 5), pz, px))
         other = tl.where(part == 3, px, tl.where((part == 4) | (part == 8), py, tl.where(part < 3, 1.0, pz)))
         added = tl.where(part < 9, share[:, :, None] * one * other, 0.0)
+        product = _surface_normals(surfaces)
+        for i in tl.static_range(6):
+            added = tl.where(part == 9 + i, share[:, :, None] * product[i][:, None, None], added)
         # up to a multiple of four, which are added at once
-        adds = (coarsest >= 0)[:, :, None] & (part < 12)
-        if SLIPS:
-            product = _surface_normals(surfaces)
-            for i in tl.static_range(6):
-                added = tl.where(part == 9 + i, share[:, :, None] * product[i][:, None, None], added)
-            adds = (coarsest >= 0)[:, :, None] & ((part < 12) | (touch > 0)[:, None, None])
+        adds = (coarsest >= 0)[:, :, None] & ((part < 12) | (touch > 0)[:, None, None])
         tl.atomic_add(moments + coarsest[:, :, None] * COLUMNS + part, added, mask=adds, sem="relaxed")
         _raise(disturbed + 1, coarsest, touch)
     if OVERLAP:
@@ -481,12 +479,12 @@ def _asinh(x):
 def prepare_relative_features(
     velocity, scene_of, material_of, gravity, particle_count, scale, cell_of, weight_of, coarsest_of, share_of, motion,
     parent, geometry, features, touch_of, disturbed, felt, quiet,
-    HISTORY: tl.constexpr, LEVELS: tl.constexpr, NORMALS: tl.constexpr, BY_CELL: tl.constexpr,
+    HISTORY: tl.constexpr, LEVELS: tl.constexpr, NORMALS: tl.constexpr,
     FEATURES: tl.constexpr, OVERLAP: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Features of each particle that no boost and no shift changes, [N, FEATURES]: changes of velocity less gravity,
     velocity relative to the cells around on each level (`motion`: mass and momentum of the cells of all levels), and
-    near a surface velocity, by the particle's own touch or BY_CELL by what its coarsest cells feel; behind the columns
+    near a surface velocity, by what its coarsest cells feel; behind the columns
     of surfaces, which are there already, the one-hot material. Differences of velocity are in units of `scale`, and
     their asinh. `disturbed` [C, 2] of the coarsest cells, whose first numbers are raised to how disturbed their
     particles are, over FULLY.
@@ -536,10 +534,8 @@ def prepare_relative_features(
     value = _asinh(tl.div_rn(value, tl.load(scale) + tl.zeros_like(value)))
     touch = tl.load(touch_of + row, mask=live, other=0.0)
     coarsest = tl.load(coarsest_of + row[:, None] * 8 + corner, mask=corners, other=-1)
-    gate = touch
-    if BY_CELL:
-        share = tl.load(share_of + row[:, None] * 8 + corner, mask=coarsest >= 0, other=0.0)
-        gate = tl.sum(share * tl.load(felt + coarsest * 2 + 1, mask=coarsest >= 0, other=0.0), 1)
+    share = tl.load(share_of + row[:, None] * 8 + corner, mask=coarsest >= 0, other=0.0)
+    gate = tl.sum(share * tl.load(felt + coarsest * 2 + 1, mask=coarsest >= 0, other=0.0), 1)
     value = tl.where(is_contact, value * gate[:, None], value)
     moved = tl.where((column < CONTACT)[None, :], value / quiet, 0.0)
     _raise(disturbed, coarsest, tl.minimum(touch + tl.sum(moved * moved, 1), 1.0))

@@ -19,9 +19,10 @@ from hgn.kernels.coarsest import kernel as coarsest_kernel
 from hgn.kernels.grid import kernel
 from hgn.kernels.triton_compat import interpreting, overlaps
 from hgn.network.cell_keys import SCENE_LIMIT, in_buckets, unpack
+from hgn.network.features import WALL_DISTANCE_CELLS
 from hgn.network.obstacles import ObstacleCells
-from hgn.network.relative import FEW, OUTPUTS, QUIET, RARE
-from hgn.network.rest import LEVEL_SHIFT
+from hgn.network.relative import CONTACT_REACH_CELLS, FEW, OUTPUTS, QUIET, RARE
+from hgn.network.rest import LEVEL_SHIFT, REST_SIZES, rests_widely
 
 MARK_BLOCK = 128
 PARTICLE_BLOCK = 32
@@ -157,7 +158,7 @@ class DeviceGrid:
         cell_size: float,
         device: torch.device,
         relative: bool = False,
-        rest_levels: int = 0,
+        rests: bool = False,
     ) -> None:
         assert scenes < SCENE_LIMIT
         self.window, self.scenes, self.capacities, self.particles = window, scenes, tuple(capacities), particles
@@ -178,19 +179,18 @@ class DeviceGrid:
         self.low = torch.tensor(window.low, dtype=torch.int32, device=device)
         coarsest = self.capacities[-1] if relative else 0
         middles = rows[-1][1]  # slots of the coarsest cells, and as many for larger ones, which need fewer
-        each = len(REST_SUMS)
-        parts = [4 * at if relative else 4, *[columns * middles for columns in REST_SUMS * rest_levels]]
+        each, rest_sizes = len(REST_SUMS), REST_SIZES * rests
+        parts = [4 * at if relative else 4, *[columns * middles for columns in REST_SUMS * rest_sizes]]
         parts += [*[SUMS * coarsest] * 3, 2 * coarsest, start]
         self._cleared = integers(sum(parts))  # one piece, cleared at once
         motion, *sums, moments, disturbed, self.occupied = self._cleared.split(parts)
-        rest_sums, sums = [x.view(torch.float32) for x in sums[: each * rest_levels]], sums[each * rest_levels :]
+        rest_sums, sums = [x.view(torch.float32) for x in sums[: each * rest_sizes]], sums[each * rest_sizes :]
         self.prefix_sum = integers(start)
         self.slot_of_cell, self._parent, self._octant = integers(at), integers(at), integers(at)
         self._neighbour, self._children = integers(6 * at), integers(8 * at)
         self.counts_L, self.needed_L = integers(self.levels), integers(self.levels)
         self.status = integers(1)
-        self.slips = False  # the network last prepared for: whether surfaces push along their normals alone
-        self._rest: dict[str, Any] | None = None  # and what its deformations rest by
+        self._rest: dict[str, Any] | None = None  # what its deformations rest by, of the network last prepared for
         self.cell_N8 = integers(particles, 8)
         self.weight_N8 = torch.zeros(particles, 8, device=device)
         self.fraction_N3 = torch.zeros(particles, 3, device=device)
@@ -205,7 +205,7 @@ class DeviceGrid:
         self.felt_C2 = torch.zeros(coarsest, 2, device=device)
         self.table_C = torch.zeros(coarsest, SUMS, device=device)
         self._rest_levels = [
-            RestLevel.of(particles, middles, rest_sums[each * level :][:each], device) for level in range(rest_levels)
+            RestLevel.of(particles, middles, rest_sums[each * level :][:each], device) for level in range(rest_sizes)
         ]
         self._at = [row[6] for row in rows]
 
@@ -269,13 +269,13 @@ class DeviceGrid:
         `symmetry` the obstacles are seen under the symmetries in their rows.
         """
         blocks, overlap = (triton.cdiv(self.particles, PARTICLE_BLOCK),), overlaps()
-        self.slips, self._rest = config.slips, None
+        self._rest = None
         if config.rests:
             self._rest = {"velocity": velocity, "scale": std_3, "scene_of": scene_N, "gravity": gravity_S3}
             self._rest |= {"threshold": config.rest_threshold, "HISTORY": config.velocity_history}
-            large = config.rests_large
-            bits = sum(resting << material for material, resting in enumerate(large))
-            self._rest |= {"material_of": material_N, "large": -1 if all(large) else bits}
+            widely = rests_widely(config)
+            bits = sum(resting << material for material, resting in enumerate(widely))
+            self._rest |= {"material_of": material_N, "widely": -1 if all(widely) else bits}
         arguments = feature_arguments(
             config, position, velocity, scene_N, material_N, domain_S3, count, obstacles, symmetry, self.feature_NF
         )
@@ -286,11 +286,11 @@ class DeviceGrid:
             fraction_of=self.fraction_N3, motion=self.motion_C4, coarsest_of=self.coarsest_N8,
             share_of=self.share_N8, place_of=self.place_N3, moments=self.moment_C, touch_of=self.touch_N,
             disturbed=self.disturbed_C2, cell_size=self.cell_size,
-            reach=config.contact_reach_cells * config.cell_size, capacity=self.capacities[0], LEVELS=self.levels,
-            MOTION=config.relative, SLIPS=config.slips, COLUMNS=SUMS, OVERLAP=overlap, launch_pdl=overlap,
+            reach=CONTACT_REACH_CELLS * config.cell_size, capacity=self.capacities[0], LEVELS=self.levels,
+            MOTION=config.relative, COLUMNS=SUMS, OVERLAP=overlap, launch_pdl=overlap,
         )  # fmt: skip
         if not config.relative:
-            wall_maximum = config.wall_distance_cells * config.cell_size
+            wall_maximum = WALL_DISTANCE_CELLS * config.cell_size
             kernel.prepare_features[blocks](**arguments, mean=mean_3, std=std_3, wall_maximum=wall_maximum)
             return
         kernel.sum_motion[(triton.cdiv(self.capacities[0], MARK_BLOCK), 2)](
@@ -305,7 +305,7 @@ class DeviceGrid:
             share_of=self.share_N8, motion=self.motion_C4, parent=self._parent, geometry=self.geometry,
             features=self.feature_NF, touch_of=self.touch_N, disturbed=self.disturbed_C2, felt=self.felt_C2,
             quiet=QUIET, HISTORY=config.velocity_history, LEVELS=self.levels, NORMALS=int(config.obstacle_features),
-            BY_CELL=config.gates_by_cell, FEATURES=self.features, OVERLAP=overlap, BLOCK=PARTICLE_BLOCK,
+            FEATURES=self.features, OVERLAP=overlap, BLOCK=PARTICLE_BLOCK,
             launch_pdl=overlap,
         )  # fmt: skip
 
@@ -341,7 +341,7 @@ class DeviceGrid:
         )  # fmt: skip
         between[(triton.cdiv(capacity, PARTICLE_BLOCK),)](
             sums=sums, felt=self.felt_C2, motion=self.motion_C4, geometry=self.geometry, moments=self.moment_C, **cells,
-            table=self.table_C, few=FEW, rare=RARE, SLIPS=self.slips, **sizes, launch_pdl=overlap,
+            table=self.table_C, few=FEW, rare=RARE, **sizes, launch_pdl=overlap,
         )  # fmt: skip
         coarsest_kernel.add_coarsest[(triton.cdiv(particles, PARTICLE_BLOCK),)](
             x=x, table=self.table_C, **pairs, USED=left, COLUMNS=triton.next_power_of_2(left + 1), **sizes,
@@ -370,7 +370,7 @@ class DeviceGrid:
         coarsest_kernel.sum_displacements[blocks](
             **pairs, **moving, **sizes, coarsest_of=self.coarsest_N8, share_of=self.share_N8, place_of=self.place_N3,
             felt=self.felt_C2, slot_of_cell=self.slot_of_cell, low=self.low, sums=first, SHIFT=level * LEVEL_SHIFT,
-            material_of=rest["material_of"], RESTING=rest["large"] if level else -1,
+            material_of=rest["material_of"], RESTING=rest["widely"] if level else -1,
             COLUMNS=SUMS if forward else RATES, launch_pdl=overlap and forward,
         )  # fmt: skip
         find(first)

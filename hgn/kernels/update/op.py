@@ -467,7 +467,7 @@ class Updates:
         config = self.config
         return DeviceGrid(
             self._window(), self.settings.scenes, capacities, self.particles, feature_columns(config),
-            config.cell_size, self.device, config.relative, config.rest_sizes,
+            config.cell_size, self.device, config.relative, config.rests,
         )  # fmt: skip
 
     def _make_room(self, status: int, needed: list[int]) -> None:
