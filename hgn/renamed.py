@@ -149,7 +149,7 @@ def current_names(mapping: Mapping[str, Any], section: str = "") -> dict[str, An
     `section` is its dotted name in the configuration. Settings that are younger than the file are added, removed ones
     are dropped. A removed one with another value than the fixed one stays, for `from_mapping` to refuse.
     """
-    # Networks of 0.1.0 have this key; the solver's settings must all be given by now.
+    # Of the networks, only those of 0.1.0 have this key.
     if section == "mpm" or (section == "network" and "material_embedding" in mapping):
         before = {_last(key): value for key, value in BEFORE.items() if key.startswith(f"{section}.")}
         mapping = before | dict(mapping)

@@ -82,7 +82,9 @@ def from_mapping(cls: type[T], mapping: object, path: _Path = "") -> T:
         if key not in fields:
             name = _text((path, str(key)))
             renamed = KEYS.get(name, "").rpartition(".")[2] in fields
-            remedy = removed_remedy(section_of(cls), str(key), value) or (renamed_remedy(name, value) if renamed else None)
+            remedy = removed_remedy(section_of(cls), str(key), value) or (
+                renamed_remedy(name, value) if renamed else None
+            )
             remedy = remedy or known_keys(str(key), fields)
             raise ConfigError(f"{name} is not a known key; {remedy}")
         values[key] = _convert(hints[key], value, (path, key))

@@ -82,7 +82,9 @@ def test_files_of_before(tmp_path, monkeypatch, removed):
     assert load_weights(tmp_path / "old.safetensors")[1] == info
     stored["depth"] = 4
     save_weights(tmp_path / "other.safetensors", network, info)
-    with pytest.raises(ConfigError, match=r"network\.depth is not a known key; it was removed and is always 3 now, not 4"):
+    with pytest.raises(
+        ConfigError, match=r"network\.depth is not a known key; it was removed and is always 3 now, not 4"
+    ):
         load_weights(tmp_path / "other.safetensors")
 
 
