@@ -140,7 +140,7 @@ def obstacle_normals(
 
 
 def surface_gate(wall_N6: torch.Tensor, normal_N6: torch.Tensor | None) -> torch.Tensor:
-    """Returns how near particles are to a surface, [N]: 0 beyond reach, 1 at a normal and from half way to a wall on."""
+    """Returns how near particles are to a surface, [N]: 0 beyond reach, 1 at a normal and from half way to a wall."""
     gate_N = (2 * wall_N6.amax(-1)).clamp(max=1)
     return gate_N if normal_N6 is None else torch.where(normal_N6.any(-1), 1, gate_N)
 
