@@ -33,7 +33,6 @@ LONG_FILES = {
     "hgn/kernels/coarsest/kernel.py": 588,
     "hgn/kernels/grid/kernel.py": 552,
     "hgn/kernels/update/op.py": 503,
-    "hgn/render/pictures.py": 461,
     "tools/stability/network.py": 465,
 }
 

@@ -18,6 +18,7 @@ import numpy as np
 from hgn.command import run_command
 from hgn.data.lookup import find_episode
 from hgn.render import pictures
+from hgn.render.error_curve import error_curve, position_error
 from hgn.render.exchange import PLY_ENDING, USD_ENDINGS, save_rollout
 from hgn.scene.rollout_file import Rollout, read_rollout
 from hgn.schema import ConfigError, OneOrMore, Positive, from_mapping, require, require_bounds
@@ -96,7 +97,7 @@ def main(mapping: Mapping[str, Any]) -> int:
             _write_animation(config, versions, out / f"{versions.name}.gif")
         if versions.truth_TN3 is not None:
             path = out / f"{versions.name}_error.png"
-            curve = pictures.error_curve(_errors(versions), rollout.frame_rate_hz)
+            curve = error_curve(_errors(versions), rollout.frame_rate_hz)
             pictures.write_picture(path, curve, rollout.source)
             print(path)
     return 0
@@ -153,12 +154,12 @@ def _errors(versions: Versions) -> dict[str, np.ndarray]:
     """Position error over time: of each material, or of each of several rollouts."""
     rollout, truth_TN3 = versions.rollout, versions.truth_TN3
     if not versions.others:
-        return pictures.position_error(rollout)
+        return position_error(rollout)
     errors = {}
     for name, position_TN3 in {versions.label: rollout.position_TN3, **versions.others}.items():
         if position_TN3 is not truth_TN3:
             version = replace(rollout, position_TN3=position_TN3, reference_TN3=truth_TN3)
-            errors[name] = pictures.position_error(version)["all"]
+            errors[name] = position_error(version)["all"]
     return errors
 
 

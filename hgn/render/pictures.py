@@ -1,4 +1,4 @@
-"""Pictures of rollouts: a grid of frames, an animation beside the ground truth, and the error over time.
+"""Pictures of rollouts: a grid of frames and an animation, each with the ground truth where there is one.
 
 Shape legend: T frames, N particles.
 """
@@ -21,7 +21,6 @@ from scipy.spatial import KDTree
 from hgn.render.flat import FlatStage
 from hgn.render.renderer import BACKGROUND_COLOR, MATERIAL_COLORS, OBSTACLE_COLOR, PARTICLE_COLORS, Stage, to_bytes
 from hgn.scene.episode import Episode
-from hgn.scene.material import MATERIALS
 from hgn.scene.rollout_file import Rollout, obstacles_of_episode
 from hgn.schema import ConfigError
 from hgn.system.files import write_atomically
@@ -41,12 +40,12 @@ def compare_picture(
     label: str = "prediction",
     others: Mapping[str, np.ndarray] = NO_OTHERS,
 ) -> Image.Image:
-    """A grid: a column each frame, the prediction above, the ground truth below where there is one.
+    """Draws a grid with one column for each frame: the prediction in the first row, the ground truth in the last.
 
-    size: width of one panel in pixels. label: what stands beside the first row. others: positions
-    float32 [T, N, 3] of the same particles as simulated otherwise, by name: rows between these two.
+    size: width of a panel in pixels. label: name of the first row. others: positions float32 [T, N, 3] of the same
+    particles from other simulations, by name; each is a row between the two.
 
-    Raises: ConfigError when a frame lies outside the rollout, or others hold other particles.
+    Raises: ConfigError if a frame lies outside the rollout or an entry of `others` has other particles.
     """
     check_frames(frames, rollout.frame_count)
     stage = _stage(rollout, size)
@@ -77,7 +76,7 @@ def compare_picture(
 
 
 def stacked(pictures: Sequence[Image.Image]) -> Image.Image:
-    """Pictures below each other."""
+    """Returns one picture with the given ones below each other."""
     size = max(picture.width for picture in pictures), sum(picture.height for picture in pictures)
     whole, y = Image.new("RGB", size, _background()), 0
     for picture in pictures:
@@ -96,14 +95,14 @@ def animate(
     label: str = "prediction",
     others: Mapping[str, np.ndarray] = NO_OTHERS,
 ) -> None:
-    """Writes every `every`-th frame, the prediction beside the ground truth where there is one.
+    """Writes an animation of every `every`-th frame, with the prediction and the ground truth in adjacent panels.
 
-    path: ends in .gif, or in .webp, which takes half the space and keeps all colours. fps: pictures per second, none
-    for real time; GIF counts in hundredths of a second, WebP in thousandths. size: width of one panel in pixels.
-    progress: called with (pictures drawn, pictures in all). label, others: as in compare_picture.
+    path: a .gif or .webp file; WebP is half as large and keeps all colours. fps: pictures per second, None for real
+    time; GIF rounds the duration of a picture to 1/100 s, WebP to 1/1000 s. size: width of a panel in pixels.
+    progress: called with the number of pictures drawn and their total. label, others: as in `compare_picture`.
 
-    Raises: ConfigError when fps is beyond what viewers keep (50, WebP 60), every is below 1, or others hold other
-    particles.
+    Raises: ConfigError if fps exceeds what viewers play (GIF 50, WebP 60), if every is below 1, or if an entry of
+    `others` has other particles.
     """
     webp = Path(path).suffix == ".webp"
     fastest = 60 if webp else 50
@@ -155,72 +154,8 @@ def animate(
     write_picture(path, buffer.getvalue())
 
 
-def error_curve(
-    error_T: Mapping[str, np.ndarray], frame_rate_hz: float, size: tuple[int, int] = (720, 400)
-) -> Image.Image:
-    """Position error over time, one line an entry of `error_T` (as `position_error` gives it), log scale.
-
-    size in pixels.
-    """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(size[0] / 100, size[1] / 100), dpi=100, layout="constrained")
-    canvas = FigureCanvasAgg(figure)
-    axes = figure.add_subplot()
-    shown = False
-    for name, error in error_T.items():
-        seconds = np.arange(len(error)) / frame_rate_hz
-        positive = np.where(error > 0, error, np.nan)  # frame 0 agrees exactly; a log scale has no zero
-        shown |= bool(np.isfinite(positive).any())
-        if name in MATERIALS:
-            color = tuple(MATERIAL_COLORS[MATERIALS.index(name)] * (0.85 if name == "snow" else 1.0))
-            axes.plot(seconds, positive, label=name, color=color, linewidth=1.8)
-        else:
-            axes.plot(seconds, positive, label=name, color="0.2" if name == "all" else None, linewidth=2.2)
-    if shown:
-        axes.set_yscale("log")
-    axes.set_xlabel("time (s)")
-    axes.set_ylabel("position MSE (squared domain units)")
-    axes.set_title("summed over axes, mean over particles", fontsize=9, color="0.4")
-    axes.grid(True, which="major", color="0.9")
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.legend(frameon=False, ncols=max(1, len(error_T)), loc="lower right")
-    canvas.draw()
-    return Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3].copy(), "RGB")
-
-
-def position_error(rollout: Rollout) -> dict[str, np.ndarray]:
-    """Position MSE against the ground truth at each frame, float64 [T] in squared domain units.
-
-    Keys: `all`, and each material of the scene where there is more than one. Squares are summed over axes and
-    averaged over particles, up to the shorter of the two.
-
-    Raises: ConfigError when the rollout has no ground truth.
-    """
-    if rollout.reference_TN3 is None:
-        raise ConfigError("reference must be there to measure an error, got a rollout without ground truth")
-    frames = min(len(rollout.position_TN3), len(rollout.reference_TN3))
-    difference = rollout.position_TN3[:frames].astype(np.float64) - rollout.reference_TN3[:frames]
-    square_TN = (difference**2).sum(axis=2)
-    shown_TN = np.arange(square_TN.shape[1]) < [[rollout.present(frame)] for frame in range(frames)]
-
-    def mean(mine_N: np.ndarray) -> np.ndarray:
-        mine_TN = shown_TN & mine_N
-        total_T = np.where(mine_TN, square_TN, 0.0).sum(axis=1)
-        return np.asarray(
-            np.divide(total_T, mine_TN.sum(axis=1), out=np.full(frames, np.nan), where=mine_TN.any(axis=1))
-        )
-
-    error = {"all": mean(rollout.material_N == rollout.material_N)}
-    present = np.unique(rollout.material_N)
-    if len(present) > 1:
-        error |= {rollout.materials[i]: mean(rollout.material_N == i) for i in present}
-    return error
-
-
 def write_picture(path: str | Path, picture: Image.Image | bytes, source: Mapping[str, object] | None = None) -> None:
-    """Writes a PNG (or the given bytes) whole or not at all; `source` goes into the PNG's Description."""
+    """Writes a PNG, or the given bytes, atomically. `source` is stored as JSON in the PNG's Description."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     if isinstance(picture, Image.Image):
@@ -234,9 +169,9 @@ def write_picture(path: str | Path, picture: Image.Image | bytes, source: Mappin
 
 
 def particle_spacing(position_N3: np.ndarray) -> float:
-    """The distance between neighbours in the bulk, in the unit of the positions.
+    """Returns the distance between neighbours in the bulk, in the unit of the positions.
 
-    The median distance to the third neighbour: exact on a cubic lattice, up to its corners; 11 % low for
+    It is the median distance to the third neighbour: exact in a cubic lattice away from its corners, 11 % too small for
     random points.
     """
     position_N3 = position_N3[np.isfinite(position_N3).all(axis=1)]
@@ -247,15 +182,15 @@ def particle_spacing(position_N3: np.ndarray) -> float:
 
 
 def rollout_spacing(rollout: Rollout, of_N: np.ndarray | slice = slice(None)) -> float:
-    """`particle_spacing` in the first frame, or where particles enter in the last, of all particles or some."""
+    """Returns `particle_spacing` of the first frame, or of the last frame if particles enter during the rollout."""
     frame = 0 if rollout.entry_frame_N is None else -1
     return particle_spacing(rollout.position_TN3[frame, of_N])
 
 
 def rollout_of_episode(episode: Episode, predicted_TN3: np.ndarray | None = None) -> Rollout:
-    """An episode of a data set as a rollout: alone, or as the ground truth of a prediction float32 [T, N, 3].
+    """Returns an episode as a rollout, or as the ground truth of the given prediction, float32 [T, N, 3].
 
-    The episode's positions stay memory-mapped.
+    The positions of the episode remain memory-mapped.
     """
     return Rollout(
         position_TN3=episode.position_TN3 if predicted_TN3 is None else predicted_TN3,
@@ -273,7 +208,7 @@ def rollout_of_episode(episode: Episode, predicted_TN3: np.ndarray | None = None
 
 
 def check_frames(frames: Sequence[int], frame_count: int) -> None:
-    """Raises ConfigError unless there is a frame and all lie in [0, frame_count)."""
+    """Raises ConfigError if `frames` is empty or has an entry outside [0, frame_count)."""
     if not len(frames):
         raise ConfigError("frames must name at least one frame, got []")
     for i, frame in enumerate(frames):
@@ -289,7 +224,7 @@ def _stage(rollout: Rollout, size: int) -> Stage:
 
 
 def _place_obstacles(stage: Stage, rollout: Rollout, frame: int) -> None:
-    """Obstacles that move are drawn where they are in a frame."""
+    """Moves the obstacles with keyframes to their pose in this frame."""
     if all(obstacle.motion is None for obstacle in rollout.obstacles):
         return
     time_s = frame / rollout.frame_rate_hz
@@ -319,11 +254,11 @@ def _panel(stage: Stage, position_TN3: np.ndarray, frame: int, rollout: Rollout)
 
 
 def _versions(rollout: Rollout, label: str, others: Mapping[str, np.ndarray]) -> list[tuple[str, np.ndarray]]:
-    """Names and positions of what is drawn side by side; an episode that stands alone needs no name."""
+    """Returns name and positions of each panel. The name is empty for an episode without a prediction."""
     for name, position_TN3 in others.items():
         if position_TN3.shape[1:] != rollout.position_TN3.shape[1:]:
             raise ConfigError(
-                f"{name} must hold the same {rollout.position_TN3.shape[1]} particles, got {position_TN3.shape[1]}"
+                f"{name} must have the same {rollout.position_TN3.shape[1]} particles, got {position_TN3.shape[1]}"
             )
     predicted = "weights" in rollout.source or rollout.reference_TN3 is not None or len(others) > 0
     truth = [] if rollout.reference_TN3 is None else [("ground truth", rollout.reference_TN3)]
@@ -342,7 +277,7 @@ def _animation_picture(
         picture.paste(_panel(stage, position_TN3, frame, rollout), (x, header))
         _write(picture, (x + width / 2, header / 2), label, 6 * text // 5)
     seconds = f"t = {frame / rollout.frame_rate_hz:.2f} s"
-    if len(versions) == 1:  # whose legend is as wide as the picture
+    if len(versions) == 1:  # the legend is as wide as the picture
         _write(picture, (width - gap, header / 2), seconds, text, anchor="rm")
     else:
         _write(picture, (gap, picture.height - header / 2), seconds, text, anchor="lm")
@@ -353,8 +288,8 @@ def _animation_picture(
 class _Palette:
     """The 256 colours of an animation.
 
-    Flat colours and ramps of the materials are taken exactly; the rest is chosen by median cut, half of the
-    samples from where the pictures differ, so that few particles on a large floor still get their share.
+    Flat colours and the shades of each material are exact. Median cut chooses the others; half of its samples are
+    pixels that change, so that a few particles on a large floor keep their colours.
     """
 
     def __init__(self, pictures: Sequence[Image.Image]) -> None:
@@ -371,31 +306,31 @@ class _Palette:
         chosen = Image.fromarray(np.concatenate(samples)[None], "RGB").quantize(free_colors).getpalette() or []
         exact = np.concatenate((flat, [TEXT_COLOR])).astype(np.uint8)
         self.colors = np.concatenate((exact, np.reshape(chosen, (-1, 3))[:free_colors].astype(np.uint8)))
-        # nearest colour for the upper six bits of each channel; Pillow's own search is coarser
+        # the nearest colour for the upper six bits of each channel; the search of Pillow is coarser
         center = np.stack(np.meshgrid(*[np.arange(64) * 4 + 1.5] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
         self.nearest = KDTree(self.colors.astype(np.float64)).query(center)[1].astype(np.uint8)
         self.nearest[_upper_bits(exact)] = np.arange(len(exact))
 
     def apply(self, picture: Image.Image) -> Image.Image:
-        """The picture in these colours, mode P."""
+        """Returns the picture in these colours, in mode P."""
         result = Image.fromarray(self.nearest[_upper_bits(np.asarray(picture))], "P")
         result.putpalette(self.colors.tobytes())
         return result
 
 
 def _upper_bits(color: np.ndarray) -> np.ndarray:
-    """The upper six bits of the three channels, as one number."""
+    """Returns the upper six bits of the three channels as one number."""
     bits = color.astype(np.int32) >> 2
     return (bits[..., 0] << 12) | (bits[..., 1] << 6) | bits[..., 2]
 
 
 def spread(count: int, wanted: int) -> list[int]:
-    """At most `wanted` of `count` indices, the first and the last among them, evenly spread."""
+    """Returns at most `wanted` evenly spaced indices below `count`, with the first and the last."""
     return sorted({round(i) for i in np.linspace(0, count - 1, min(count, wanted))})
 
 
 def _legend(picture: Image.Image, y: float, rollout: Rollout, text_size: int) -> None:
-    """Swatches of what is in the scene, in the middle of the line at height y."""
+    """Draws a swatch for each material and for obstacles, centred at height y."""
     present = np.unique(rollout.material_N)
     entries: list[tuple[str, np.ndarray]] = [(rollout.materials[i], PARTICLE_COLORS[i]) for i in present]
     if rollout.obstacles:
@@ -428,7 +363,7 @@ def _write(
     anchor: str = "mm",
     halo: int = 0,
 ) -> None:
-    """halo: pixels of background around the letters, for text over obstacles."""
+    """Draws text. halo: width in pixels of a border in the background colour, for text over obstacles."""
     ImageDraw.Draw(picture).text(
         place,
         text,
@@ -442,7 +377,7 @@ def _write(
 
 @functools.cache
 def _font(size: int) -> ImageFont.FreeTypeFont:
-    """The one that comes with Pillow."""
+    """Returns the font that Pillow contains."""
     font = ImageFont.load_default(size)
     assert isinstance(font, ImageFont.FreeTypeFont)
     return font

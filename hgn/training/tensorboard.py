@@ -10,7 +10,8 @@ from lightning.pytorch import Callback, LightningModule, Trainer
 from lightning.pytorch.loggers import TensorBoardLogger
 from PIL import Image
 
-from hgn.render.pictures import animate, compare_picture, error_curve, write_picture
+from hgn.render.error_curve import error_curve
+from hgn.render.pictures import animate, compare_picture, write_picture
 from hgn.scene.rollout_file import Rollout
 from hgn.training.stop import StopRequest
 

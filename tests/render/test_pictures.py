@@ -9,15 +9,8 @@ import trimesh
 from PIL import Image, ImageSequence
 from scipy.ndimage import center_of_mass, label
 
-from hgn.render.pictures import (
-    animate,
-    compare_picture,
-    error_curve,
-    particle_spacing,
-    position_error,
-    rollout_of_episode,
-    write_picture,
-)
+from hgn.render.error_curve import error_curve, position_error
+from hgn.render.pictures import animate, compare_picture, particle_spacing, rollout_of_episode, write_picture
 from hgn.render.renderer import OBSTACLE_COLOR, Stage, to_bytes
 from hgn.scene.episode import Episode
 from hgn.scene.motion import Motion
