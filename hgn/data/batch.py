@@ -24,7 +24,7 @@ from hgn.scene.symmetry import Symmetry
 
 @dataclass(frozen=True, eq=False)
 class Batch:
-    """Windows x^{n-H} … x^{n+1}; the last frame is the answer, the others the question."""
+    """Windows x^{n-H} … x^{n+1}: the last frame is the target, the others are the input."""
 
     window_WN3: torch.Tensor  # float32, domain units
     material_N: torch.Tensor  # int64, index into the network's materials
@@ -33,10 +33,10 @@ class Batch:
     domain_S3: torch.Tensor
     gravity_S3: torch.Tensor  # domain units per frame squared
     obstacles: ObstacleCells | None
-    surface: SurfaceParticles | None  # where the network sees obstacles as particles
+    surface: SurfaceParticles | None  # for networks with obstacles as particles
     seeds_S: tuple[int, ...]  # of noise, jitter and symmetry
-    sampler_state: SamplerState | None = None  # the sampler's state once this batch is trained on
-    symmetries_S: tuple[tuple[Symmetry, ...], ...] = ()  # of each scene: what training may show instead of it
+    sampler_state: SamplerState | None = None  # after this batch
+    symmetries_S: tuple[tuple[Symmetry, ...], ...] = ()  # of each scene, that training may apply
     weight_S: tuple[float, ...] = ()  # of each scene's loss; empty: 1
     noise_scale_S: tuple[float, ...] = ()  # of each scene, in units of training.noise_std; empty: 1
 
@@ -48,7 +48,7 @@ class Batch:
         return replace(self, obstacles=obstacles, surface=surface, **moved)
 
     def state(self, window_WN3: torch.Tensor | None = None) -> ParticleState:
-        """The network's input at frame n, from this window or a perturbed copy of it."""
+        """Returns the network's input at frame n, from this window or a perturbed copy of it."""
         if window_WN3 is None:
             window_WN3 = self.window_WN3
         velocity_MN3 = (window_WN3[1:-1] - window_WN3[:-2]).flip(0)
@@ -64,13 +64,13 @@ class Batch:
         )
 
     def acceleration(self, window_WN3: torch.Tensor | None = None) -> torch.Tensor:
-        """v^{n+1} - v^n in frame units, [N, 3]."""
+        """Returns v^{n+1} - v^n in frame units, [N, 3]."""
         if window_WN3 is None:
             window_WN3 = self.window_WN3
         return (window_WN3[-1] - window_WN3[-2]) - (window_WN3[-2] - window_WN3[-3])
 
     def mean_over_scenes(self, value_N: torch.Tensor) -> torch.Tensor:
-        """The mean over scenes of each scene's mean over its particles times its weight: a scalar."""
+        """Returns the mean over scenes of each scene's weight times its mean over particles: a scalar."""
         weight_S = self.weight_S or (1.0,) * len(self.particles_S)
         pairs = zip(weight_S, self.particles_S, strict=True)
         factor_S = torch.tensor([weight / (len(weight_S) * max(count, 1)) for weight, count in pairs])
@@ -79,11 +79,11 @@ class Batch:
 
 @dataclass(frozen=True, eq=False)
 class BatchSample:
-    """A frame of an episode to train on, as hgn.kernels.update.op.DeviceSample is for the triton backend."""
+    """A frame of an episode to train on; hgn.kernels.update.op.DeviceSample is its counterpart in backend triton."""
 
     episode: Episode
     frame: int
-    window_WN3: np.ndarray  # the positions that stand for the episode's own around the frame
+    window_WN3: np.ndarray  # positions around the frame, the episode's or simulated ones
     seed: int = 0  # of noise, jitter and symmetry
     weight: float = 1.0  # of its loss
     noise_scale: float = 1.0  # of its noise, in units of training.noise_std
@@ -91,21 +91,21 @@ class BatchSample:
 
 @dataclass(frozen=True, eq=False)
 class UpdateSamples:
-    """The samples of an update before they are a batch: the pushforward pool may replace some of them."""
+    """The samples of an update, some of which the pushforward pool may replace."""
 
     samples: tuple[BatchSample, ...]
-    sampler_state: SamplerState  # the order's state once these are trained on
-    starts: tuple[tuple[Episode, int], ...] = ()  # where the network is to simulate from before this update
+    sampler_state: SamplerState  # after this update
+    starts: tuple[tuple[Episode, int], ...] = ()  # where simulations start before this update
 
     def batch(self, network: NetworkConfig) -> Batch:
-        """The samples as tensors."""
+        """Returns the samples as tensors."""
         return _joined(self.samples, network, self.sampler_state)
 
 
 def make_batch(
     frames: Sequence[tuple[Episode, int]], network: NetworkConfig, seeds: Sequence[int] | None = None
 ) -> Batch:
-    """The windows of (episode, frame) pairs, with what the network sees of the obstacles."""
+    """Returns the windows of (episode, frame) pairs, with the obstacle inputs of the network."""
     pairs = zip(frames, seeds or [0] * len(frames), strict=True)
     history = network.velocity_history
     return _joined([BatchSample(e, frame, window(e, frame, history), seed) for (e, frame), seed in pairs], network)

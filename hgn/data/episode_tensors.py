@@ -1,4 +1,4 @@
-"""What training with backend triton reads: the samples of many updates, and whole episodes instead of windows.
+"""Inputs of training with backend triton: the samples of many updates, and whole episodes instead of windows.
 
 Shape legend: H velocity history, T frames, N particles, K obstacle cells.
 """
@@ -21,7 +21,7 @@ from hgn.scene.symmetry import Symmetry, Vector, scene_symmetries
 
 @dataclass(frozen=True, eq=False)
 class EpisodeTensors:
-    """An episode in memory. The first H of the H + T frames are the ballistic past."""
+    """An episode as tensors. The first H of the H + T frames are the ballistic past."""
 
     position_TN3: torch.Tensor  # float32, domain units
     material_N: torch.Tensor  # int32, index into the network's materials
@@ -29,23 +29,23 @@ class EpisodeTensors:
     obstacle_normal_K3: torch.Tensor
     domain_size: Vector
     gravity: Vector  # domain units per frame squared
-    symmetries: tuple[Symmetry, ...] = ()  # what training may show instead of the scene
-    barrier: Barrier | None = None  # of the scene, where simulations of it hold by its obstacles
+    symmetries: tuple[Symmetry, ...] = ()  # that training may apply to the scene
+    barrier: Barrier | None = None  # of the scene's obstacles, where simulations respect them
 
 
 @dataclass(frozen=True, eq=False)
 class UpdateChunk:
-    """The samples of successive updates, and the episodes among them that are not held since a chunk before."""
+    """The samples of successive updates, and their episodes that are not on the device yet."""
 
     samples: tuple[tuple[Sample, ...], ...]
     episodes: dict[int, EpisodeTensors]
-    sampler_state: SamplerState  # the order's state once these are trained on
-    dropped: tuple[int, ...] = ()  # episodes that need not be held any more, before these are placed
-    starts: tuple[tuple[int, int], ...] = ()  # episodes and frames that the network is to simulate from before it
+    sampler_state: SamplerState  # the sampler's state after these updates
+    dropped: tuple[int, ...] = ()  # that leave the device before the new ones are placed
+    starts: tuple[tuple[int, int], ...] = ()  # episodes and frames to start simulations from
 
 
 def whole_episode(episode: Episode, network: NetworkConfig, barrier: Barrier | None = None) -> EpisodeTensors:
-    """Reads an episode; its windows are those of `hgn.scene.history.window`. `barrier` is what simulations hold by."""
+    """Reads an episode; its windows are those of `hgn.scene.history.window`. `barrier` is that of its obstacles."""
     past = frames_before(episode, -network.velocity_history)
     grid, seen = episode.obstacle_grid, len(episode.obstacle_grid.cell_K3) if network.obstacle_features else 0
     return EpisodeTensors(
@@ -61,13 +61,13 @@ def whole_episode(episode: Episode, network: NetworkConfig, barrier: Barrier | N
 
 
 def frame_gravity(episode: Episode) -> Vector:
-    """In domain units per frame squared."""
+    """Returns gravity in domain units per frame squared."""
     x, y, z = (value / episode.frame_rate_hz**2 for value in episode.gravity)
     return x, y, z
 
 
 def shown_symmetries(episode: Episode, network: NetworkConfig) -> tuple[Symmetry, ...]:
-    """What training may show instead of the scene: where inputs are relative, gravity turns with it."""
+    """Returns the symmetries that training may apply to the scene; with relative inputs gravity turns with it."""
     gravity = (0.0, 0.0, 0.0) if network.relative else episode.gravity
     size, cell_size = episode.domain_size, episode.obstacle_grid.cell_size
     return scene_symmetries(gravity, size, cell_size, int(not episode.imported), episode.dimensions)

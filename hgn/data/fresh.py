@@ -1,6 +1,6 @@
-"""A test set that no choice has seen: its seed is drawn when the weights are frozen, and kept with their hashes.
+"""A test set that no choice has seen: its seed is drawn when the weights are frozen, and stored with their hashes.
 
-`fresh.json` in the data set's folder is written before the first scene is made, and never again.
+`fresh.json` in the data set's folder is written once, before the first scene is generated.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ FRESH_NAME = "fresh.json"
 
 @dataclass(frozen=True)
 class FreshSeed:
-    """A seed, when it was drawn (UTC, ISO 8601), and the sha256 of the weights that were frozen then, by file name."""
+    """A seed, its time (UTC, ISO 8601), and the sha256 of the weights that were frozen then, by file name."""
 
     seed: int
     drawn: str
@@ -32,7 +32,7 @@ class FreshSeed:
 
 
 def draw_fresh(folder: Path | str, weights: Sequence[str]) -> FreshSeed:
-    """Draws the seed of a data set that is to be made in a folder, or reads it where it was drawn for these weights.
+    """Draws the seed of a new data set, or reads the one that was drawn for these weights.
 
     Raises: ConfigError for a file that is not there, for a data set that is there already, and for other weights.
     """
@@ -59,7 +59,7 @@ def draw_fresh(folder: Path | str, weights: Sequence[str]) -> FreshSeed:
 
 
 def read_fresh(folder: Path | str) -> FreshSeed | None:
-    """What a folder says of its seed; none where it was chosen, or the folder is at a server."""
+    """Returns the seed record of a folder; None for a chosen seed, and for a remote folder."""
     path = local_folder(folder) / FRESH_NAME
     if is_remote(folder) or not path.is_file():
         return None
@@ -70,7 +70,7 @@ def read_fresh(folder: Path | str) -> FreshSeed | None:
 
 
 def set_record(folder: Path | str, seed: int, files: Iterable[Path]) -> dict[str, Any]:
-    """For a report's meta: the seed, when it was drawn (none: chosen), and which weights were not frozen then."""
+    """Returns a report's record: the seed, when it was drawn (None: chosen), and weights that were not frozen then."""
     fresh, drawn = read_fresh(folder), None
     later = [file.name for file in files if fresh is None or fresh.weights.get(file.name) != file_sha256(file)]
     if fresh is not None:

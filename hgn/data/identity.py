@@ -1,4 +1,4 @@
-"""What makes two data sets the same: everything that the trajectories depend on, and nothing else.
+"""The identity of a data set: everything that its trajectories depend on, and nothing else.
 
 Counts, folder, workers, device and launch size are left out, so a data set can grow, move to another machine and
 be completed there.
@@ -18,9 +18,9 @@ from hgn.scene.episode import SCHEMA_VERSION
 from hgn.scene.shapes import mesh_sha256
 from hgn.schema import ConfigError, to_mapping
 
-# of the solver's settings: where and how many at once, which no trajectory depends on beyond rounding
+# settings of the solver that change trajectories by no more than rounding
 _NOT_PHYSICS = ("device", "scenes_per_launch")
-# of scenes, younger than some data sets: where they are at their defaults the data set is as it was without them
+# settings of scenes that older data sets lack, and which are left out at their defaults
 _LATER_OPTIONS = (
     "pure_direction_fraction", "colliding_scene_fraction", "zero_gravity_fraction", "tilted_gravity_fraction",
     "maximum_tilted_gravity", "funnel_scene_fraction", "funnel_hole",
@@ -28,11 +28,10 @@ _LATER_OPTIONS = (
 
 
 def dataset_identity(config: DatagenConfig) -> dict[str, Any]:
-    """The plain mapping that defines the episodes: scene distribution, physics, frames, rate, seed, schema.
+    """Returns the mapping that defines the episodes: scene distribution, physics, frames, rate, seed, schema.
 
-    Keys are those of the first release, whatever they are called since: a data set stays the same.
-
-    Mesh files count by their content. Raises: ConfigError for one that cannot be read.
+    Keys are those of the first release, so that the identity does not change. Mesh files count by their content.
+    Raises: ConfigError for one that cannot be read.
     """
     shapes = config.scene.obstacle_shapes
     named = [f"{Path(shape).name} {mesh_sha256(shape)}" if is_mesh_file(shape) else shape for shape in shapes]
@@ -55,19 +54,19 @@ def dataset_identity(config: DatagenConfig) -> dict[str, Any]:
 
 
 def physics_settings(config: DatagenConfig) -> dict[str, Any]:
-    """The solver's settings that trajectories depend on, as stored with each episode."""
+    """Returns the solver's settings that trajectories depend on, as stored with each episode."""
     settings = stored_names(to_mapping(config.mpm), "mpm")
     return {key: value for key, value in settings.items() if key not in _NOT_PHYSICS}
 
 
 def identity_hash(identity: Mapping[str, Any]) -> str:
-    """sha256 of the identity as canonical JSON."""
+    """Returns the sha256 of the identity as canonical JSON."""
     text = json.dumps(identity, sort_keys=True, allow_nan=False, separators=(",", ":"))
     return hashlib.sha256(text.encode()).hexdigest()
 
 
 def identity_differences(stored: Mapping[str, Any], asked: Mapping[str, Any], path: str = "") -> list[str]:
-    """One line for each key in which two identities differ: `scene.obstacle_count is 5 there, 3 is asked for`."""
+    """Returns a line for each key that differs: `scene.obstacle_count is 5 there, 3 is asked for`."""
     lines = []
     for key in sorted(stored.keys() | asked.keys()):
         name = f"{path}.{key}" if path else key
@@ -80,7 +79,7 @@ def identity_differences(stored: Mapping[str, Any], asked: Mapping[str, Any], pa
 
 
 def require_same_dataset(stored: Mapping[str, Any], config: DatagenConfig, folder: object) -> None:
-    """A folder's data set (its manifest's `config`) is the one that a configuration asks for.
+    """Checks that a folder's data set (its manifest's `config`) is that of a configuration.
 
     Raises: ConfigError naming the first keys that differ, and the remedy.
     """

@@ -1,8 +1,8 @@
-"""Frames drawn by how much happens in them, with weights that leave the loss's expectation as it is.
+"""Importance sampling of frames by acceleration, with loss weights that keep the expected loss.
 
-Most of the error is made in the few frames in which bodies hit something; drawn evenly, most samples teach little.
-Importance sampling (Kahn & Marshall 1953; for gradients Katharopoulos & Fleuret 2018) shows those frames more often and
-counts them less. Shape legend: T frames, N particles, F = T - 1 frames with a successor.
+Most of the error arises in the few frames with collisions. Importance sampling (Kahn & Marshall 1953; for gradients
+Katharopoulos & Fleuret 2018) draws those frames more often and weights them less.
+Shape legend: T frames, N particles, F = T - 1 frames with a successor.
 """
 
 from __future__ import annotations
@@ -16,46 +16,46 @@ import numpy as np
 from hgn.scene.episode import Episode
 from hgn.scene.history import frames_before
 
-PARTICLES = 512  # of an episode that are looked at, about
+PARTICLES = 512  # of an episode, about, that accelerations are computed from
 
 
 @dataclass(frozen=True, eq=False)
 class DrawnBySize:
-    """A distribution over F things of some size, and weights that leave a mean over draws as it is."""
+    """A distribution over F items by size, and weights that keep the mean over draws unbiased."""
 
     cumulative_F: np.ndarray  # float64, ends with 1
-    weight_F: np.ndarray  # the inverse of how often each is drawn, where 1 is even
+    weight_F: np.ndarray  # the inverse of the relative frequency, 1 for uniform draws
 
     @staticmethod
     def of(size_F: np.ndarray, fraction: float) -> DrawnBySize:
-        """A `fraction` of the draws in proportion to size, the others evenly."""
+        """Draws a `fraction` in proportion to size, the others uniformly."""
         total = size_F.sum()
         often_F = (1 - fraction) + fraction * (size_F * len(size_F) / total if total > 0 else np.ones(len(size_F)))
         cumulative_F = often_F.cumsum()
         return DrawnBySize(cumulative_F / cumulative_F[-1:], 1 / often_F)
 
     def at(self, place: float) -> tuple[int, float]:
-        """Which lies at this place of the distribution, in [0, 1), and its weight."""
+        """Returns the item at a place in [0, 1) of the distribution, and its weight."""
         cumulative, weights = self._lists
         number = min(bisect_right(cumulative, place), len(cumulative) - 1)
         return number, weights[number]
 
     @cached_property
     def _lists(self) -> tuple[list[float], list[float]]:
-        """A single number is found faster in a list than in an array."""
+        """Plain lists, in which a single number is found faster than in an array."""
         return self.cumulative_F.tolist(), self.weight_F.tolist()
 
 
 @dataclass(frozen=True, eq=False)
 class FrameImportance:
-    """An episode's frames with the fraction of its samples that each gets, a distribution over F frames."""
+    """A distribution over the F frames of an episode."""
 
     draws: DrawnBySize
     acceleration_F: np.ndarray  # root mean square over axes and particles
 
     @staticmethod
     def of(episode: Episode, fraction: float) -> FrameImportance:
-        """A `fraction` of the samples in proportion to the frames' root mean square acceleration, the others evenly."""
+        """Draws a `fraction` in proportion to root mean square acceleration, the others uniformly."""
         step = max(1, episode.particle_count // PARTICLES)
         past_1N3 = frames_before(episode, -1)[:, ::step]
         position_TN3 = np.concatenate([past_1N3, episode.position_TN3[:, ::step]], dtype=np.float64)
@@ -64,18 +64,18 @@ class FrameImportance:
         return FrameImportance(DrawnBySize.of(size_F, fraction), size_F)
 
     def draw(self, slot: int, seed: int) -> tuple[int, float]:
-        """The frame for sample number `slot` of F, and its weight; together the slots cover the distribution.
+        """Returns the frame for sample number `slot` of F, and its weight; together the slots cover the distribution.
 
-        Stratified: each slot has its own F-th of the distribution, in which `seed` chooses.
+        Stratified: each slot has its own F-th of the distribution, within which `seed` chooses.
         """
         return self.draws.at((slot + _fraction(seed)) / len(self.acceleration_F))
 
     @cached_property
     def accelerations(self) -> list[float]:
-        """Of each frame, root mean square, domain units per frame squared."""
+        """Root mean square acceleration of each frame, domain units per frame squared."""
         return self.acceleration_F.tolist()
 
 
 def _fraction(seed: int) -> float:
-    """A number in [0, 1) of its own for each seed, in another stream than noise and symmetry: Fibonacci hashing."""
+    """Returns a number in [0, 1) by Fibonacci hashing, independent of noise and symmetry for the same seed."""
     return (seed * 0x9E3779B97F4A7C15 % (1 << 64) >> 11) / (1 << 53)

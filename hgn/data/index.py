@@ -1,14 +1,14 @@
-"""The index of a data set: one line of JSON a shard, in publication order, in files that are only ever appended to.
+"""The index of a data set: a line of JSON for each shard, in publication order, in append-only files.
 
-| file in `index/` | what | |
-|---|---|---|
-| `G-NNNNNN.jsonl` | segment N of generation G: its shards | SEGMENT_SHARDS lines, but the last one |
-| `G-segments.jsonl` | what is published up to the end of each full segment | a line a segment |
-| `G-quarantined.jsonl` | scenes that could not be simulated | |
+| file in `index/` | content |
+|---|---|
+| `G-NNNNNN.jsonl` | segment N of generation G: SEGMENT_SHARDS shards, fewer in the last one |
+| `G-segments.jsonl` | the totals up to the end of each full segment |
+| `G-quarantined.jsonl` | scenes that could not be simulated |
 
-`manifest.json`, the head, says how many bytes of the last segment and of the other two count. What is behind these was
-not yet published, and is written over. So a publication costs the same whatever the number of shards, and a reader
-that knows some shards reads only what came after. A list that loses a shard is written anew, as the next generation.
+`manifest.json`, the head, contains the valid sizes of the last segment and of the other two files. Bytes beyond them
+are not published and are overwritten. A publication costs the same for any number of shards, and a reader reads only
+the shards that it does not know. A list that loses a shard is written again as the next generation.
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ from hgn.system.files import errors_name, make_folder, sync_file, sync_folder
 SPLITS = ("train", "validation", "test")
 INDEX_NAME = "index"
 SEGMENT_SHARDS = 128
-_IN_MEMORY = 0  # a generation that has no files
-_SEGMENTS_HELD = 64  # of the segments that were read: 8,192 shards
+_IN_MEMORY = 0  # the generation of an index without files
+_SEGMENTS_HELD = 64  # segments that stay in memory: 8,192 shards
 _FILE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,200}")
 _SHA256 = re.compile(r"[0-9a-f]{64}")
 _REMEDY = "delete manifest.json and run the generator again: published shards are found and kept"
@@ -47,20 +47,20 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class EpisodeEntry:
-    """One episode inside a shard."""
+    """An episode in a shard."""
 
     key: str
     index: int  # within its split
     seed: int
-    attempt: int  # 0 unless earlier seeds of this index were quarantined
+    attempt: int  # 0, or the number of quarantined seeds of this index
     particles: int
     frames: int
-    members: dict[str, tuple[int, int]]  # name after `<key>.` -> offset of its data in the tar, bytes
+    members: dict[str, tuple[int, int]]  # name after `<key>.` -> offset in the tar, bytes
 
 
 @dataclass(frozen=True)
 class ShardEntry:
-    """One published tar file: episodes [first, stop) of a split."""
+    """A published tar file with the episodes [first, stop) of a split."""
 
     name: str
     split: Split
@@ -73,7 +73,7 @@ class ShardEntry:
 
     def __post_init__(self) -> None:
         require_bounds(self)
-        # both become file names, and an index may come from anywhere
+        # both become file names, and an index may come from any server
         require(_FILE_NAME.fullmatch(self.name) is not None, "name", "a plain file name", self.name)
         require(_SHA256.fullmatch(self.sha256) is not None, "sha256", "64 hexadecimal digits", self.sha256)
         numbers = [episode.index for episode in self.episodes]
@@ -84,7 +84,7 @@ class ShardEntry:
 
 @dataclass(frozen=True)
 class QuarantinedScene:
-    """A scene that could not be simulated; the next attempt's seed took its place."""
+    """A scene that could not be simulated, and was replaced by the next attempt's seed."""
 
     key: str
     attempt: int
@@ -94,16 +94,16 @@ class QuarantinedScene:
 
 @dataclass(frozen=True)
 class SplitTotals:
-    """What is published of a split."""
+    """The published part of a split."""
 
     shards: int = 0
     episodes: int = 0
     bytes: int = 0
-    digest: str = ""  # over the shards' sha256, in publication order: what the order of samples stands on
-    statistics: Statistics | None = None  # in the head alone
+    digest: str = ""  # over the shards' sha256 in publication order; identifies the order of samples
+    statistics: Statistics | None = None  # only in the head
 
     def plus(self, shard: ShardEntry) -> SplitTotals:
-        """With one more shard; statistics are kept where there are some."""
+        """Returns the totals with one more shard."""
         return SplitTotals(
             self.shards + 1,
             self.episodes + len(shard.episodes),
@@ -118,7 +118,7 @@ Totals = dict[str, SplitTotals]
 
 @dataclass(frozen=True)
 class IndexState:
-    """How much of the index's files counts."""
+    """The valid sizes of the index's files."""
 
     generation: NonNegative[int] = 1
     shards: NonNegative[int] = 0
@@ -131,12 +131,12 @@ class IndexState:
         require_bounds(self)
 
     def path(self, kind: int | str) -> str:
-        """The name of segment number `kind`, or of another file."""
+        """Returns the name of segment number `kind`, or of another file."""
         return f"{INDEX_NAME}/{self.generation}-{kind if isinstance(kind, str) else f'{kind:06d}'}.jsonl"
 
 
 def require_sound(statistics: Statistics) -> None:
-    """Raises ConfigError where a number of the statistics is not finite, or a count or a square is below zero."""
+    """Raises ConfigError for numbers that are not finite, and for negative counts or squares."""
     for name in ("velocity", "acceleration"):
         moments: Moments = getattr(statistics, name)
         numbers = (moments.count, *moments.mean, *moments.squared_deviation)
@@ -147,12 +147,12 @@ def require_sound(statistics: Statistics) -> None:
 
 
 def no_totals() -> Totals:
-    """Of an empty data set."""
+    """Returns the totals of an empty data set."""
     return {split: SplitTotals(statistics=Statistics()) for split in SPLITS}
 
 
 def totals_of(shards: Iterable[ShardEntry], totals: Totals | None = None) -> Totals:
-    """What these add up to, on top of `totals`."""
+    """Adds shards to `totals`."""
     totals = dict(totals or no_totals())
     for shard in shards:
         totals[shard.split] = totals[shard.split].plus(shard)
@@ -169,7 +169,7 @@ class _SegmentEnd:
 
 @dataclass(frozen=True)
 class _Segment:
-    """What was read of a segment."""
+    """The lines that were read of a segment."""
 
     shards: list[ShardEntry]
     bytes: int
@@ -177,19 +177,20 @@ class _Segment:
 
 
 class _Read:
-    """What was read of an index; one for all that continue it."""
+    """The cache of an index, shared by the later states of the same index."""
 
     def __init__(self) -> None:
         self.lock = threading.RLock()
         self.ends: list[_SegmentEnd] = []  # of the full segments
         self.ends_bytes = 0
         self.segments: OrderedDict[int, _Segment] = OrderedDict()
-        self.ranges: dict[str, list[tuple[int, int]]] = {split: [] for split in SPLITS}  # of the shards seen, in order
-        self.seen: dict[int, int] = {}  # how many of a segment's shards are among these
-        self.particles = {split: array("i") for split in SPLITS}  # of each episode; -1: not looked at
+        # the episodes of each shard that was read, sorted
+        self.ranges: dict[str, list[tuple[int, int]]] = {split: [] for split in SPLITS}
+        self.seen: dict[int, int] = {}  # number of shards by segment in `ranges`
+        self.particles = {split: array("i") for split in SPLITS}  # of each episode; -1: not read
 
     def see(self, segment: int, shards: Sequence[ShardEntry]) -> None:
-        """Raises: ConfigError where an episode is listed twice."""
+        """Records the shards of a segment. Raises: ConfigError where an episode is listed twice."""
         for shard in shards[self.seen.get(segment, 0) :]:
             ranges, own = self.ranges[shard.split], (shard.first, shard.stop)
             place = bisect_left(ranges, own)
@@ -201,10 +202,9 @@ class _Read:
 
 
 class Index(Sequence[ShardEntry]):
-    """The published shards of a data set, in publication order; read as they are asked for.
+    """The published shards of a data set, in publication order; segments are read when needed.
 
-    Raises on access: ConfigError where a line is wrong, or the lines do not add up to what the head says;
-    UnreachableError.
+    Raises on access: ConfigError where a line is invalid or the lines contradict the head; UnreachableError.
     """
 
     def __init__(self, folder: Path | str, state: IndexState, totals: Totals) -> None:
@@ -212,7 +212,7 @@ class Index(Sequence[ShardEntry]):
         self._read = _Read()
 
     def continued(self, later: Index) -> Index:
-        """`later`, with what was read here, where that was only appended to."""
+        """Passes the cache to a later state of the same index, and returns that."""
         if later.state.generation == self.state.generation != _IN_MEMORY and len(later) >= len(self):
             later._read = self._read
         return later
@@ -241,14 +241,14 @@ class Index(Sequence[ShardEntry]):
         return self.since(0)
 
     def since(self, count: int) -> Iterator[ShardEntry]:
-        """All shards but the first `count`."""
+        """Yields all shards but the first `count`."""
         while count < len(self):
             rest = self._segment(count // SEGMENT_SHARDS)[count % SEGMENT_SHARDS :][: len(self) - count]
             yield from rest
             count += len(rest)
 
     def locate(self, split: str, episode: int) -> tuple[ShardEntry, EpisodeEntry]:
-        """The episode at this place of the split, in publication order. Raises: IndexError."""
+        """Returns shard and episode at a place of the split. Raises: IndexError."""
         if not 0 <= episode < self.totals[split].episodes:
             raise IndexError(episode)
         segment = self._first_beyond(split, episode)
@@ -261,7 +261,7 @@ class Index(Sequence[ShardEntry]):
         return shard, shard.episodes[episode - before]
 
     def particles(self, split: str, episodes: Sequence[int]) -> list[int]:
-        """How many particles these have, by their places in the split; a segment is read for it once."""
+        """Returns particle counts by place in the split; reads a segment once."""
         particles = self._read.particles[split]
         with self._read.lock:
             particles.extend([-1] * (self.totals[split].episodes - len(particles)))
@@ -274,7 +274,7 @@ class Index(Sequence[ShardEntry]):
         return [particles[episode] for episode in episodes]
 
     def digest(self, split: str, episodes: int) -> str | None:
-        """The digest of the shards that hold the first `episodes` of a split; none where no shard ends there."""
+        """Returns the digest of the shards with the first `episodes`, or None where no shard ends there."""
         totals = self.totals[split]
         if episodes < totals.episodes:
             segment = self._first_beyond(split, episodes)
@@ -290,23 +290,23 @@ class Index(Sequence[ShardEntry]):
         return self.digest(split, before.episodes) == before.digest
 
     def quarantined(self) -> list[QuarantinedScene]:
-        """The scenes that could not be simulated, the first one first."""
+        """Returns the scenes that could not be simulated, in order."""
         return self._rows(QuarantinedScene, "quarantined", 0, self.state.quarantine_bytes, self.state.quarantined)
 
     def files(self) -> Iterator[tuple[str, int]]:
-        """Names and sizes of the files that hold it, what is read first last."""
+        """Yields names and sizes of the files, in the order in which they are to be written."""
         for kind in (*range(len(self) // SEGMENT_SHARDS + 1), "segments", "quarantined"):
             if size := self._bytes(kind):
                 yield self.state.path(kind), size
 
     def size(self, name: str) -> int | None:
-        """How many bytes of a file count; none where the index has no such file. Slow once, for a full segment."""
+        """Returns the valid size of a file, or None if it is not part of the index."""
         match = re.fullmatch(r".*-(\d{6,}|segments|quarantined)\.jsonl", name)
         kind: int | str = "" if match is None else int(match[1]) if match[1].isdecimal() else match[1]
         return self._bytes(kind) or None if name == self.state.path(kind) else None
 
     def _bytes(self, kind: int | str) -> int:
-        """Of segment number `kind`, or of another file; 0 of what is not there."""
+        """Returns the valid size of a segment or another file; 0 for a missing one."""
         state, full = self.state, len(self) // SEGMENT_SHARDS
         if isinstance(kind, int) and kind < full:
             return self._ends()[kind].bytes
@@ -333,7 +333,7 @@ class Index(Sequence[ShardEntry]):
         return rows
 
     def _ends(self) -> list[_SegmentEnd]:
-        """Of the full segments, and of later ones that are known already."""
+        """Returns the ends of the full segments, and of later ones that were read."""
         read, full = self._read, len(self) // SEGMENT_SHARDS
         with read.lock:
             if len(read.ends) < full:
@@ -347,11 +347,11 @@ class Index(Sequence[ShardEntry]):
         return self._ends()[segment - 1].totals if segment else {split: SplitTotals() for split in SPLITS}
 
     def _first_beyond(self, split: str, episode: int) -> int:
-        """The segment with the episode at this place of the split."""
+        """Returns the segment with an episode."""
         return bisect_right(self._ends(), episode, key=lambda end: end.totals[split].episodes)
 
     def _segment(self, number: int) -> list[ShardEntry]:
-        """The shards of a segment, and perhaps later ones."""
+        """Returns the shards of a segment, perhaps with later ones."""
         read, count = self._read, min(SEGMENT_SHARDS, len(self) - number * SEGMENT_SHARDS)
         with read.lock:
             segment = read.segments.get(number) or _Segment([], 0, self._before(number))
@@ -375,7 +375,7 @@ class Index(Sequence[ShardEntry]):
 
 
 class ListedIndex(Index):
-    """One that is in memory as a whole, from a manifest of the first release say."""
+    """An index in memory, for example of a manifest of the first release."""
 
     def __init__(self, shards: Sequence[ShardEntry], quarantined: Sequence[QuarantinedScene] = ()) -> None:
         state = IndexState(_IN_MEMORY, len(shards), quarantined=len(quarantined))
@@ -403,7 +403,7 @@ class ListedIndex(Index):
 def extend(
     folder: Path, index: Index, shards: Iterable[ShardEntry], quarantined: Sequence[QuarantinedScene] = ()
 ) -> Index:
-    """Appends to the files of an index. What is appended counts once a head with the state returned is written.
+    """Appends to the files of an index. The lines count once a head with the returned state is written.
 
     Raises: OSError; ConfigError where the files are shorter than the index says.
     """
@@ -427,8 +427,8 @@ def extend(
 
 
 def begin(folder: Path, current: int = 0) -> Index:
-    """An empty index beside those that are there. Those before the `current` generation, the head's, go: nobody reads
-    them any more. A later one, whose head was never written, may be there too."""
+    """Returns an empty index of a new generation. Removes generations before the head's (`current`), which nobody
+    reads; keeps later ones, whose heads were not written."""
     files = {path: int(path.name.partition("-")[0]) for path in (folder / INDEX_NAME).glob("[0-9]*-*.jsonl")}
     for path, generation in files.items():
         if generation < current:
@@ -437,7 +437,7 @@ def begin(folder: Path, current: int = 0) -> Index:
 
 
 def parse_json(content: bytes, path: str) -> Any:
-    """Strict JSON. Raises: ConfigError, for NaN and infinities too."""
+    """Parses strict JSON. Raises: ConfigError, for NaN and infinities too."""
     try:
         return json.loads(content, parse_constant=_refuse)
     except (ValueError, RecursionError) as error:
@@ -449,12 +449,12 @@ def _refuse(constant: str) -> None:
 
 
 def _append(path: Path, at: int, rows: Sequence[Any]) -> int:
-    """Writes lines at a place of a file, where it then ends, to the disk; returns its size."""
+    """Writes lines at an offset of a file, truncates it there and syncs it; returns its size."""
     content = b"".join(
         json.dumps(to_mapping(row), sort_keys=True, allow_nan=False, separators=(",", ":")).encode() + b"\n"
         for row in rows
     )
-    # not asked whether it is there: a network file system may remember that it was not
+    # no check that the file exists: a network file system may have cached that it does not
     flags = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC
     with errors_name(path), os.fdopen(os.open(path, flags, 0o644), "r+b") as file:
         if file.seek(0, 2) < at:

@@ -1,4 +1,4 @@
-"""Picking episodes out of a data set."""
+"""Selection of episodes from a data set."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from hgn.schema import ConfigError
 
 
 def first_indices(store: AnyStore, count: int, published: int | None = None) -> list[int]:
-    """Where in the store the episodes of lowest index among the first `published` (all if absent) are."""
+    """Returns the places of the episodes with the lowest indices among the first `published` (None: all)."""
     places = ((entry.index, place) for place, entry in enumerate(islice(store.entries, published)))
     return [place for _, place in nsmallest(count, places)]
 
 
 def first_episodes(store: EpisodeStore, count: int) -> list[Episode]:
-    """These episodes.
+    """Returns the `count` episodes of lowest index.
 
     Raises: ConfigError when there are none.
     """
@@ -32,7 +32,7 @@ def first_episodes(store: EpisodeStore, count: int) -> list[Episode]:
 
 
 def find_episode(folder: Path | str, key: str) -> Episode:
-    """The episode of that key, for example validation-000000.
+    """Returns the episode with a key, for example validation-000000.
 
     Raises: ConfigError when the data set does not hold it.
     """

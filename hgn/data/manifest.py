@@ -1,8 +1,8 @@
-"""The manifest of a data set: which shards are published, what is in them, and how they were made.
+"""The manifest of a data set: its published shards, their content, and how they were made.
 
-`manifest.json` is written last and atomically, so whatever it lists is there whole. It is of one size, whatever the
-number of shards: these are in the files of `hgn.data.index`, in the order they were published in, so a reader that
-knows some of them only ever sees others appended. Manifests of the first release list the shards themselves.
+`manifest.json` is written last and atomically, so all that it lists is complete. Its size does not depend on the number
+of shards, which are in the append-only files of `hgn.data.index`. Manifests of the first release list the shards
+themselves.
 """
 
 from __future__ import annotations
@@ -42,19 +42,18 @@ MANIFEST_NAME = "manifest.json"
 
 @dataclass(frozen=True)
 class _Identity:
-    """What manifests of every release say. `requested` counts episodes per split; `config` is the mapping whose hash is
-    `config_hash`."""
+    """Fields of the manifests of every release."""
 
-    config_hash: str
-    config: dict[str, Any]
-    requested: dict[str, int]
+    config_hash: str  # of `config`
+    config: dict[str, Any]  # `hgn.data.identity.dataset_identity`
+    requested: dict[str, int]  # episodes per split
     revision: int = 0  # grows by one with each publication
     schema_version: int = field(default=SCHEMA_VERSION, kw_only=True)
 
 
 @dataclass(frozen=True)
 class _Head(_Identity):
-    """`manifest.json`."""
+    """The file `manifest.json`."""
 
     index: IndexState = field(kw_only=True)
     totals: dict[str, SplitTotals] = field(kw_only=True)
@@ -62,7 +61,7 @@ class _Head(_Identity):
 
 @dataclass(frozen=True)
 class _Listing(_Identity):
-    """`manifest.json` of the first release."""
+    """The file `manifest.json` of the first release."""
 
     shards: tuple[ShardEntry, ...] = ()
     quarantined: tuple[QuarantinedScene, ...] = ()
@@ -70,13 +69,13 @@ class _Listing(_Identity):
 
 @dataclass(frozen=True)
 class Manifest(_Identity):
-    """What is published of a data set."""
+    """The published part of a data set."""
 
     shards: Index = field(default_factory=lambda: ListedIndex(()))  # in publication order
 
     @staticmethod
     def load(folder: Path | str, patience_s: float = PATIENCE_S) -> Manifest:
-        """Reads `<folder>/manifest.json`, where `folder` may be a URL whose server may be away for `patience_s`.
+        """Reads `<folder>/manifest.json`; a server may be away for `patience_s`.
 
         Raises: ConfigError when it is missing, no JSON, of another schema version, or wrong in any field;
         UnreachableError when the server stays away.
@@ -93,7 +92,7 @@ class Manifest(_Identity):
 
     @staticmethod
     def parse(content: bytes, folder: Path | str) -> Manifest:
-        """The manifest in a file's bytes; its index is read in `folder`.
+        """Parses the bytes of a manifest, whose index lies in `folder`.
 
         Raises: ConfigError when they are no JSON, of another schema version, or wrong in any field.
         """
@@ -118,7 +117,7 @@ class Manifest(_Identity):
         return Manifest(head.config_hash, head.config, head.requested, head.revision, shards)
 
     def save(self, folder: Path | str) -> Manifest:
-        """Replaces what the folder lists by this, in an index of a new generation; returns it as it is read there."""
+        """Replaces the folder's list by this one, as a new generation; returns the manifest as it is read there."""
         try:
             current = json.loads((Path(folder) / MANIFEST_NAME).read_bytes())["index"]["generation"]
         except (FileNotFoundError, ValueError, LookupError, TypeError):  # none, or of the first release
@@ -134,10 +133,9 @@ class Manifest(_Identity):
         quarantined: Sequence[QuarantinedScene] = (),
         **changes: Any,
     ) -> Manifest:
-        """Publishes more in this manifest's folder, at a cost that does not depend on what is there; `changes` are
-        other fields.
+        """Publishes more in this manifest's folder, at a cost independent of its size; `changes` are other fields.
 
-        Raises: OSError; ConfigError where the index is not what was read.
+        Raises: OSError; ConfigError where the index was changed by another program.
         """
         if isinstance(self.shards, ListedIndex):
             whole = ListedIndex([*self.shards, *shards], [*self.quarantined, *quarantined])
@@ -151,24 +149,24 @@ class Manifest(_Identity):
 
     @property
     def totals(self) -> Totals:
-        """What is published of each split."""
+        """The totals of each split."""
         return self.shards.totals
 
     @property
     def quarantined(self) -> list[QuarantinedScene]:
-        """The scenes that could not be simulated, the first one first; read anew each time."""
+        """The scenes that could not be simulated, in order; read each time."""
         return self.shards.quarantined()
 
     def statistics(self, split: str = "train") -> Statistics:
-        """Velocity and acceleration over all published episodes of a split, in frame units."""
+        """Returns mean and spread of velocity and acceleration of a split, in frame units."""
         return self.totals[split].statistics or Statistics()
 
     def shards_of(self, split: str) -> Iterator[ShardEntry]:
-        """The published shards of a split, in publication order."""
+        """Yields the published shards of a split in publication order."""
         return (shard for shard in self.shards if shard.split == split)
 
     def published(self, split: str) -> int:
-        """How many episodes of a split can be read."""
+        """Returns the number of published episodes of a split."""
         return self.totals[split].episodes
 
     @property

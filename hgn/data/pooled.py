@@ -1,4 +1,4 @@
-"""Several data sets as one: those that stand still come first, whole, then one that may grow."""
+"""Several data sets as one: fixed ones first, then one that may grow."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from hgn.scene.episode import Episode
 
 
 class PooledStore(Episodes):
-    """One split of `own`, behind the same of `others`: of these what was published when they were opened.
+    """One split of `own` after the same split of `others`, which are fixed once opened.
 
-    Read as an EpisodeStore is: places of episodes count over all of them, and only ever `own` grows.
+    It is used like an EpisodeStore: places count over all data sets, and only `own` grows.
     """
 
     def __init__(self, own: EpisodeStore, others: Sequence[EpisodeStore]) -> None:
@@ -33,15 +33,15 @@ class PooledStore(Episodes):
 
     @property
     def manifest(self) -> Manifest:
-        """Of the set that may grow."""
+        """The manifest of the data set that may grow."""
         return self.own.manifest
 
     def of_split(self, split: str) -> PooledStore:
-        """Another split of the same data sets."""
+        """Returns another split of the same data sets."""
         return PooledStore(self.own.of_split(split), [store.of_split(split) for store in self.others])
 
     def refresh(self) -> bool:
-        """As EpisodeStore.refresh, of the set that may grow."""
+        """Refreshes the data set that may grow."""
         return self.own.refresh()
 
     def within_reach(self, indices: Sequence[int], patience_s: float) -> bool:
@@ -58,7 +58,7 @@ class PooledStore(Episodes):
                 store.fetch_ahead(places)
 
     def digest(self, count: int) -> str | None:
-        """As EpisodeStore.digest: over those of all sets."""
+        """Combines the digests of all data sets."""
         parts = [*(store.digest(len(store)) for store in self.others), self.own.digest(count - self._still)]
         if any(part is None for part in parts):
             return None
@@ -66,20 +66,20 @@ class PooledStore(Episodes):
 
     @property
     def entries(self) -> Iterator[EpisodeEntry]:
-        """What the indices say of each episode."""
+        """The index entries of all episodes."""
         return chain.from_iterable(store.entries for store in (*self.others, self.own))
 
     def frames(self, count: int | None = None) -> list[int]:
-        """Frames of each episode, of the first `count` only, which holds all `others` have."""
+        """Returns the frames of the first `count` episodes, which include all of `others`."""
         own = None if count is None else count - self._still
         return [*chain.from_iterable(store.frames() for store in self.others), *self.own.frames(own)]
 
     def particles(self, episodes: Sequence[int]) -> list[int]:
-        """How many each of these has, by the indices."""
+        """Returns the particle counts of these episodes."""
         return [store.particles([place])[0] for store, place in map(self._place, episodes)]
 
     def statistics(self) -> Statistics:
-        """Velocity and acceleration of all sets together, in frame units."""
+        """Returns the merged statistics of all data sets."""
         return merge_statistics(store.statistics() for store in (*self.others, self.own))
 
     def __len__(self) -> int:
@@ -90,7 +90,7 @@ class PooledStore(Episodes):
         return store.open(place)
 
     def _place(self, index: int) -> tuple[EpisodeStore, int]:
-        """The store of an episode, and where it is in there."""
+        """Returns the store of an episode, and its place there."""
         number = int(np.searchsorted(self._ends, index, side="right"))
         if number == len(self.others):
             return self.own, index - self._still

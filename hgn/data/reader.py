@@ -1,8 +1,7 @@
-"""Reads published episodes. Positions are memory-mapped, so a window of frames costs only its own pages.
+"""Published episodes of a data set. Positions are memory-mapped, so a window of frames reads only its own pages.
 
-Each shard is checked against the manifest (size, then sha256) before anything in it is used: a tar cut at a
-member boundary would otherwise read as fewer samples without any error. Shards of a URL are read from the cache that
-`hgn.data.shard_cache` keeps on this machine.
+Each shard is checked against the manifest (size, then sha256) before it is used: a tar cut at a member boundary would
+otherwise read as fewer samples without an error. Remote shards are read from a cache (`hgn.data.shard_cache`).
 """
 
 from __future__ import annotations
@@ -27,19 +26,19 @@ from hgn.scene.episode import POSITION_MEMBER, Episode, decode_episode
 from hgn.schema import ConfigError, require
 from hgn.system.patience import UnreachableError
 
-MAPPED_SHARDS = 256  # at once; a process may have 1,024 files open where nothing else is said
+MAPPED_SHARDS = 256  # mapped at once; the default limit of open files is 1,024
 
 
 class Episodes(Sequence[Episode], ABC):
-    """What reads as the list of its episodes.
+    """A sequence of episodes.
 
-    Each is opened, and its shard verified, on first use; its `position_TN3` is a read-only `np.memmap`. Raises on
-    access: ConfigError when a shard is missing or altered.
+    An episode is opened, and its shard verified, on first use; `position_TN3` is a read-only `np.memmap`.
+    Raises on access: ConfigError when a shard is missing or altered.
     """
 
     @abstractmethod
     def open(self, index: int) -> Episode:
-        """The episode at a place, from 0 on, below the number of them."""
+        """Returns the episode at a place from 0 on."""
 
     @overload
     def __getitem__(self, index: int) -> Episode: ...
@@ -54,15 +53,15 @@ class Episodes(Sequence[Episode], ABC):
 
 
 class EpisodeStore(Episodes):
-    """The published episodes of one split of a data set, in a folder or at a URL, in their order; it only grows.
+    """The published episodes of one split of a data set, in publication order; it only grows.
 
     Picklable for spawned workers: the folder, split and manifest travel, open files and maps do not.
     """
 
     _fetcher: threading.Thread | None = None
     _lock: threading.Lock
-    _wanted: list[ShardEntry]  # to be brought here next
-    _spared: frozenset[str]  # their sha256, and those of others that are needed soon
+    _wanted: list[ShardEntry]  # to be fetched next
+    _spared: frozenset[str]  # sha256 of shards that stay in a full cache
 
     def __init__(self, folder: Path | str, split: str) -> None:
         """Raises: ConfigError when there is no readable manifest or the split is unknown; UnreachableError."""
@@ -74,7 +73,7 @@ class EpisodeStore(Episodes):
 
     @staticmethod
     def available(folder: Path | str) -> bool:
-        """Whether there is a data set (perhaps not yet complete, perhaps not yet with any shard) to open.
+        """Whether a data set exists there, complete or not, with shards or not.
 
         Raises: ConfigError where access is refused; UnreachableError.
         """
@@ -85,17 +84,17 @@ class EpisodeStore(Episodes):
         return True
 
     def of_split(self, split: str) -> EpisodeStore:
-        """Another split of the same data set, as it is known here: without asking a server."""
+        """Returns another split of the same data set without asking the server."""
         require(split in SPLITS, "split", f"one of {', '.join(SPLITS)}", split)
         store = EpisodeStore.__new__(EpisodeStore)
         store.__setstate__(self.__getstate__() | {"split": split})
         return store
 
     def refresh(self) -> bool:
-        """Reads the manifest again; True when this split has more episodes than before.
+        """Reads the manifest again; returns whether this split has more episodes than before.
 
-        A server that does not answer is no fault: what was known stays.
-        Raises: ConfigError when the folder now holds another data set, or published shards were taken away.
+        When a server does not answer, the known episodes stay.
+        Raises: ConfigError when the folder contains another data set, or published shards were removed.
         """
         try:
             manifest = Manifest.load(self.folder, patience_s=0.0)
@@ -117,7 +116,7 @@ class EpisodeStore(Episodes):
         return len(self) > before
 
     def within_reach(self, indices: Sequence[int], patience_s: float) -> bool:
-        """Whether these episodes can be read without waiting longer for a server; their shards are brought here.
+        """Fetches the shards of these episodes; returns False if a server does not answer within the patience.
 
         Raises: ConfigError when a shard is missing or altered.
         """
@@ -129,10 +128,8 @@ class EpisodeStore(Episodes):
         return True
 
     def fetch_ahead(self, episodes: Sequence[int] | None = None) -> None:
-        """Begins to bring shards to this machine, one after the other, beside their use: all that are known by now; or
-        those of these `episodes` alone, in their order, for which others leave a full cache.
-
-        Does nothing for a folder.
+        """Starts to fetch shards in the background, one after the other: all that are published, or those of `episodes`
+        in their order. Only the latter remove older shards from a full cache. Does nothing for a folder.
         """
         if not is_remote(self.folder):
             return
@@ -147,7 +144,7 @@ class EpisodeStore(Episodes):
                 self._fetcher = threading.Thread(target=target, name="shards", daemon=True)
                 self._fetcher.start()
 
-    # whoever needs a shard that cannot be had meets the same error again, and says so
+    # a reader that needs a shard which cannot be fetched gets the same error, and reports it
 
     def _fetch_all(self) -> None:
         with contextlib.suppress(ConfigError, OSError):
@@ -167,16 +164,16 @@ class EpisodeStore(Episodes):
                 self._bring(shard, spared=spared)
 
     def digest(self, count: int) -> str | None:
-        """Tells the first `count` episodes from any others; none where no shard ends with the last of them."""
+        """Returns a digest of the first `count` episodes, or None where no shard ends with the last of them."""
         return self.manifest.shards.digest(self.split, count)
 
     @property
     def entries(self) -> Iterator[EpisodeEntry]:
-        """What the index says of each episode (key, particles, frames), without opening any shard."""
+        """The index entries of all episodes (key, particles, frames), read without opening a shard."""
         return (entry for shard in self.manifest.shards_of(self.split) for entry in shard.episodes)
 
     def frames(self, count: int | None = None) -> list[int]:
-        """Frames of each episode, of the first `count` only. Where all have as many the index is not read for it."""
+        """Returns the frames of the first `count` episodes (None: all), from the index only where they differ."""
         count, config = len(self) if count is None else count, self.manifest.config
         if "frames" in config and "long_fraction" not in config:
             return [config["frames"]] * count
@@ -186,11 +183,11 @@ class EpisodeStore(Episodes):
         return self._frames[:count]
 
     def particles(self, episodes: Sequence[int]) -> list[int]:
-        """How many each of these has, by the index."""
+        """Returns the particle counts of these episodes from the index."""
         return self.manifest.shards.particles(self.split, episodes)
 
     def statistics(self) -> Statistics:
-        """Velocity and acceleration of this split in frame units."""
+        """Returns mean and spread of velocity and acceleration of this split, in frame units."""
         return self.manifest.statistics(self.split)
 
     def __len__(self) -> int:
@@ -206,41 +203,41 @@ class EpisodeStore(Episodes):
     def _reset(self) -> None:
         self._open_shards: OrderedDict[str, _OpenShard] = OrderedDict()
         self._fetcher = None
-        self._frames: list[int] = []  # of the episodes of the data set's first shards, where they may differ
-        self._measured = 0  # how many shards these are
-        self._fetched = 0  # of the data set's shards, how many were brought here one after the other
+        self._frames: list[int] = []  # of the episodes in the first shards, where lengths differ
+        self._measured = 0  # number of these shards
+        self._fetched = 0  # number of shards that were fetched ahead
         self._wanted, self._spared = [], frozenset()
         self._lock = threading.Lock()
         holders.add(self)
 
     def _bring(self, shard: ShardEntry, **options: Any) -> Path:
-        """A shard's verified file on this machine; options and errors are those of `Storage.shard`."""
+        """Returns a shard's verified file on this machine; options and errors as for `Storage.shard`."""
         return open_storage(self.folder).shard(shard.name, shard.sha256, shard.bytes, **options)
 
     def _locate(self, index: int) -> tuple[ShardEntry, EpisodeEntry]:
         return self.manifest.shards.locate(self.split, index)
 
     def _shards(self, indices: Sequence[int]) -> list[ShardEntry]:
-        """Those of some episodes, once each, in their order."""
+        """Returns the shards of these episodes, each once, in order."""
         return list({shard.name: shard for shard, _ in map(self._locate, indices)}.values())
 
     def open(self, index: int) -> Episode:
         shard, entry = self._locate(index)
         while True:
             opened = self._open_shards.get(shard.name)
-            if opened is None:  # outside of the lock: this may wait for a server
+            if opened is None:  # outside the lock, because this may wait for a server
                 opened = _OpenShard(self._bring(shard))
             with self._lock:
                 opened = self._open_shards.setdefault(shard.name, opened)
                 self._open_shards.move_to_end(shard.name)
-                # each map holds a file descriptor; episodes that are in use keep theirs
+                # each map uses a file descriptor; episodes in use keep theirs
                 if len(self._open_shards) > MAPPED_SHARDS:
                     self._open_shards.popitem(last=False)
                 size = opened.size()
-                if size is None and is_remote(self.folder):  # it left a full cache, and comes again
+                if size is None and is_remote(self.folder):  # it was removed from a full cache, and is fetched again
                     del self._open_shards[shard.name]
                     continue
-                if size is not None and size < shard.bytes:  # to read what is mapped there would end the process
+                if size is not None and size < shard.bytes:  # reading beyond the file's end would kill the process
                     raise ConfigError(
                         f"{opened.path} must have {shard.bytes} bytes, got {size}: it was cut while it was open"
                     )
@@ -249,7 +246,7 @@ class EpisodeStore(Episodes):
                 return opened.episodes[entry.key]
 
     def release(self, path: Path) -> None:
-        """Closes a shard; episodes of it that are in use stay readable."""
+        """Closes a shard; its episodes that are in use stay readable."""
         with self._lock:
             for name in [name for name, opened in self._open_shards.items() if opened.path == path]:
                 del self._open_shards[name]
@@ -259,7 +256,7 @@ class EpisodeStore(Episodes):
         actual = (episode.seed, episode.particle_count, episode.frame_count)
         expected = (entry.seed, entry.particles, entry.frames)
         config = self.manifest.config
-        # imported episodes are of any length
+        # imported episodes have any length
         frames = config.get("frames", entry.frames)
         lengths = {frames, config.get("long_frames", frames)}
         if actual != expected or entry.frames not in lengths:
@@ -271,16 +268,16 @@ class EpisodeStore(Episodes):
 
 
 class _OpenShard:
-    """One map a shard, not one an episode."""
+    """A mapped shard and the episodes that were read from it."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        # of an empty file there is no map
+        # an empty file cannot be mapped
         self.content = np.memmap(path, np.uint8, mode="r") if path.stat().st_size else np.zeros(0, np.uint8)
         self.episodes: dict[str, Episode] = {}
 
     def size(self) -> int | None:
-        """Of the file now; none where it is gone."""
+        """Returns the current size of the file, or None if it was removed."""
         try:
             return self.path.stat().st_size
         except FileNotFoundError:
@@ -294,7 +291,7 @@ def read_episode(
     located: Mapping[str, tuple[int, int]],
     scan_positions: bool = False,
 ) -> Episode:
-    """One episode of a shard whose bytes (flat uint8, mapped or in memory) are given; positions stay a view of them.
+    """Decodes an episode from a shard's bytes (flat uint8, mapped or in memory); positions stay a view of them.
 
     `located` gives offset and size of each member. Raises: ConfigError when it does not fit the bytes.
     """

@@ -1,4 +1,4 @@
-"""The order in which samples are trained on: a pure function of seed, epoch, episodes, batch and world size.
+"""The order of training samples: a pure function of seed, epoch, episodes, batch and world size.
 
 A sample is one frame of one episode. An epoch is a permutation of all samples of the episodes that were
 published when it began; epochs follow each other without a gap, so that every sample comes exactly once an
@@ -19,17 +19,17 @@ from hgn.system.splitmix import splitmix64
 
 @dataclass(frozen=True)
 class SamplerState:
-    """How far the order has been consumed, over all ranks together."""
+    """The position in the order, over all ranks together."""
 
     epoch: int = 0
     position: int = 0  # samples of this epoch already taken
-    episodes: int = 0  # episodes in this epoch; 0: not decided yet
-    digest: str = ""  # of the shards that hold these; none: not known (checkpoints of 0.1.0)
+    episodes: int = 0  # in this epoch; 0: not fixed yet
+    digest: str = ""  # of the shards with these episodes; empty: unknown (checkpoints of 0.1.0)
     window: int = 0  # episodes whose samples are shuffled together; 0: all
-    seed: int | None = None  # of the order; null: not known (checkpoints of 0.1.0)
+    seed: int | None = None  # of the order; None: unknown (checkpoints of 0.1.0)
 
 
-class Sample(NamedTuple):  # which Python makes faster than other classes: a thousand in a second are drawn
+class Sample(NamedTuple):  # faster to construct than a dataclass: a thousand are drawn a second
     """Frame n of an episode: the network sees frames up to n and predicts n + 1."""
 
     episode: int
@@ -39,15 +39,15 @@ class Sample(NamedTuple):  # which Python makes faster than other classes: a tho
     noise_scale: float = 1.0  # of its noise, in units of training.noise_std, see hgn.training.noise
 
 
-BLOCK_EPISODES = 8  # that follow each other in publication order: as many as most shards have
+BLOCK_EPISODES = 8  # consecutive in publication order; as many as most shards have
 
 
 def epoch_order(seed: int, epoch: int, first_sample: np.ndarray, window: int = 0) -> np.ndarray:
-    """The order of an epoch, int64 [samples]; `first_sample` of each episode, and behind the last one their number.
+    """Returns the order of an epoch, int64 [samples]; `first_sample` is that of each episode, then the total.
 
-    All samples are shuffled together; with a `window`, those of about so many episodes at a time: blocks of
-    BLOCK_EPISODES are shuffled, and then the samples of as many blocks as make a window. So a rank needs the shards of
-    two windows at most at a time, and each once an epoch; twice where it lies in two blocks.
+    Without a `window` all samples are shuffled together. With one, blocks of BLOCK_EPISODES are shuffled, then the
+    samples of as many blocks as make a window. A rank then needs the shards of at most two windows at a time, and each
+    shard once an epoch (twice where it lies in two blocks).
     """
     generator = np.random.Generator(np.random.PCG64([seed, epoch]))
     episodes = len(first_sample) - 1
@@ -66,10 +66,10 @@ def epoch_order(seed: int, epoch: int, first_sample: np.ndarray, window: int = 0
 
 
 def balanced_parts(size_K: np.ndarray, ranks: int) -> np.ndarray:
-    """Which of K samples each rank takes, int64 [ranks, K / ranks]: as many each, of about the same total size.
+    """Assigns K samples to ranks, int64 [ranks, K / ranks]: equal counts, about equal total sizes.
 
-    The largest that are left, one for each rank, go to the ranks with the least so far (longest processing time first,
-    Graham 1969, with equal counts). Equal sizes keep their order, so that all ranks find the same.
+    The largest remaining samples, one for each rank, go to the ranks with the smallest sums so far (longest processing
+    time first, Graham 1969, with equal counts). Equal sizes keep their order, so that all ranks agree.
     """
     row_order = np.argsort(-size_K, kind="stable").reshape(-1, ranks)
     load, parts = np.zeros(ranks), np.empty_like(row_order)
@@ -80,13 +80,13 @@ def balanced_parts(size_K: np.ndarray, ranks: int) -> np.ndarray:
 
 
 class EpisodeSampler:
-    """Walks through epochs in batches and tells each rank its part.
+    """Iterates over epochs in batches and returns each rank's part.
 
-    `published(epoch)` is asked once when an epoch begins and returns the number of frames of each published
-    episode, oldest publication first; it must return the same on every rank, and a list that continues the
-    one of the epoch before. After a resume it may return more than the state's epoch knew: the surplus waits
-    for the next epoch. `digest(count)` tells the first so many from others; see `hgn.data.index`. `particles(episodes)`
-    is how large these are: with it each rank gets scenes of as many particles, so that none waits for the slowest.
+    `published(epoch)` is called when an epoch begins and returns the number of frames of each published episode, in
+    publication order. It must return the same list on every rank, and continue the list of the epoch before. Episodes
+    published after a resumed epoch began wait for the next epoch. `digest(count)` identifies the first `count`
+    episodes (`hgn.data.index`). `particles(episodes)` returns particle counts, by which scenes are balanced over ranks
+    so that no rank waits for the slowest.
     """
 
     def __init__(
@@ -101,7 +101,7 @@ class EpisodeSampler:
         window: int = 0,
         particles: Callable[[Sequence[int]], Sequence[int]] | None = None,
     ) -> None:
-        """Raises: ConfigError where the state's epoch cannot be gone on with; see `epoch_order` for `window`."""
+        """Raises: ConfigError where the state's epoch cannot be resumed; see `epoch_order` for `window`."""
         assert 0 <= rank < world_size and batch_scenes >= 1
         self.seed, self.batch_scenes, self.rank, self.world_size = seed, batch_scenes, rank, world_size
         self.state = state or SamplerState()
@@ -119,14 +119,14 @@ class EpisodeSampler:
             )
         self._order = np.zeros(0, np.int64)
         self._first_sample = np.zeros(1, np.int64)
-        self._first_seed = np.uint64(0)  # of an epoch's samples, which have one after the other
+        self._first_seed = np.uint64(0)  # of an epoch's first sample; the seeds of the others follow
         self._begin_epoch(self.state.epoch, self.state.position, self.state.episodes, self.state.digest)
 
     def next_batch(self) -> list[Sample]:
-        """This rank's `batch_scenes` samples of the next global batch; advances the state."""
+        """Returns this rank's `batch_scenes` samples of the next global batch, and advances the state."""
         total = self.batch_scenes * self.world_size
         parts: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []  # episodes, frames and seeds of each epoch's
-        taken = 0  # of the global batch, which may run over the end of an epoch
+        taken = 0  # of the global batch, which may span two epochs
         while taken < total:
             if self.state.position == len(self._order):
                 self._begin_epoch(self.state.epoch + 1, 0, 0, "")
@@ -142,19 +142,19 @@ class EpisodeSampler:
         return [Sample(episode, frame, splitmix64(seed) >> 1) for episode, frame, seed in rows]
 
     def upcoming(self, samples: int) -> list[int]:
-        """The episodes of this epoch's next samples, those of all ranks, in the order that they are needed in."""
+        """Returns the episodes of this epoch's next samples, of all ranks, in the order in which they are needed."""
         ahead = self._order[self.state.position :][:samples]
         return list(dict.fromkeys((self._first_sample.searchsorted(ahead, side="right") - 1).tolist()))
 
     @property
     def window_samples(self) -> int:
-        """How many samples are shuffled together, on average; 0: all."""
+        """The mean number of samples that are shuffled together; 0: all."""
         blocks = max(1, self._window // BLOCK_EPISODES) * BLOCK_EPISODES
         windowed = 0 < self._window < self.state.episodes
         return -(-len(self._order) * blocks // self.state.episodes) if windowed else 0
 
     def _part(self, episode_K: np.ndarray) -> np.ndarray:
-        """Which of a global batch's samples are this rank's."""
+        """Returns the indices of this rank's samples in a global batch."""
         if self._particles is None:
             return np.arange(self.batch_scenes * self.rank, self.batch_scenes * (self.rank + 1))
         return np.sort(balanced_parts(np.asarray(self._particles(episode_K.tolist())), self.world_size)[self.rank])

@@ -1,4 +1,4 @@
-"""Shards as files: the tar of an episode, the same bytes wherever it is made, and where members lie in one."""
+"""Shards as tar files: deterministic bytes of an episode, and the offsets of members."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from hgn.schema import ConfigError
 
 
 def episode_tar(episode: Episode) -> Iterator[bytes]:
-    """The parts of its tar: the same episode gives the same bytes, for there are no times, no owners, a fixed mode."""
+    """Yields the parts of an episode's tar; without times and owners, the same episode gives the same bytes."""
     written = 0
     for name, data in encode_episode(episode).items():
         info = tarfile.TarInfo(f"{episode.key}.{name}")
@@ -23,13 +23,13 @@ def episode_tar(episode: Episode) -> Iterator[bytes]:
 
 
 def tar_end(written: int) -> bytes:
-    """What follows the last member: two empty blocks, and as many as fill a record."""
+    """Returns the end of a tar: two empty blocks, padded to a whole record."""
     end = 2 * tarfile.BLOCKSIZE
     return bytes(end + -(written + end) % tarfile.RECORDSIZE)
 
 
 def locate_members(path: Path) -> dict[str, dict[str, tuple[int, int]]]:
-    """Where each member's data lies in a tar: key -> name after `<key>.` -> (offset, bytes).
+    """Returns where each member's data lies in a tar: key -> name after `<key>.` -> (offset, bytes).
 
     Raises: ConfigError when the file is not a whole tar.
     """

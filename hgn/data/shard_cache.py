@@ -1,8 +1,7 @@
-"""Shards of URLs on this machine, under their sha256, so that no two data sets collide there.
+"""A cache of remote shards, named by their sha256, so that data sets do not collide.
 
-One process of the machine brings a shard, the others wait for it. `HGN_CACHE` names the cache's folder (default
-`~/.cache/hgn`), `HGN_CACHE_GB` how much may be in it (default: all that fits on its disk; the shard that was brought
-first makes room).
+One process fetches a shard, the others of this machine wait for it. `HGN_CACHE` is the cache's folder (default
+`~/.cache/hgn`), `HGN_CACHE_GB` its limit (default: none but the disk). A full cache drops the oldest shards.
 """
 
 from __future__ import annotations
@@ -16,6 +15,7 @@ import sys
 import time
 import weakref
 from collections.abc import Callable, Collection, Iterator
+from dataclasses import dataclass
 from io import BufferedRandom
 from pathlib import Path
 from typing import Protocol
@@ -29,13 +29,14 @@ from hgn.system.patience import UnreachableError
 CACHE_VARIABLE = "HGN_CACHE"
 LIMIT_VARIABLE = "HGN_CACHE_GB"
 _LOCK_PAUSE_S = 0.05
+_FULL = (errno.ENOSPC, errno.EDQUOT)
 
 
 class Holder(Protocol):
-    """Who has files of the cache open, which take their room until they are closed."""
+    """A reader with open files of the cache, which occupy the disk until they are closed."""
 
     def release(self, path: Path) -> None:
-        """Closes a file that is about to go."""
+        """Closes a file that is about to be removed."""
         ...
 
 
@@ -43,10 +44,7 @@ holders: weakref.WeakSet[Holder] = weakref.WeakSet()
 
 
 def cache_folder() -> Path:
-    """Where shards of URLs are kept.
-
-    Raises: ConfigError where nothing is named and there is no home folder.
-    """
+    """Returns the folder of cached shards. Raises: ConfigError without $HGN_CACHE and without a home folder."""
     named = os.environ.get(CACHE_VARIABLE)
     if named:
         return Path(named) / "shards"
@@ -58,72 +56,69 @@ def cache_folder() -> Path:
         ) from None
 
 
-def cached_shard(
-    url: str,
-    sha256: str,
-    size: int,
-    patience_s: float,
-    spared: Collection[str] | None,
-    fill: Callable[[BufferedRandom], None],
-) -> Path:
-    """A shard's verified file. Where it is not here, `fill` completes a file that may hold its beginning; others leave
-    a full cache for it, but those whose sha256 is `spared` (none: all are).
+@dataclass(frozen=True)
+class CachedShard:
+    """A shard at a URL."""
 
-    Raises: ConfigError; UnreachableError, while another process has the file and brings nothing; OSError (a full disk,
-    or cache); what `fill` raises.
+    url: str
+    sha256: str
+    size: int  # bytes
+
+
+Fill = Callable[[BufferedRandom], None]
+
+
+def cached_shard(shard: CachedShard, patience_s: float, spared: Collection[str] | None, fill: Fill) -> Path:
+    """Returns the verified file of a shard. For a missing one, `fill` completes a file that may hold its beginning.
+
+    A full cache makes room for it, except of shards whose sha256 is in `spared`; with None it removes nothing.
+    Raises: ConfigError; UnreachableError while another process fetches the file without progress; OSError (full disk or
+    cache); the exceptions of `fill`.
     """
-    path = cache_folder() / f"{sha256}.tar"
-    for again in (True, False):
+    path = cache_folder() / f"{shard.sha256}.tar"
+    for last_try in (False, True):
         if not path.exists():
-            _bring(path, url, sha256, size, patience_s, spared, fill)
+            _fetch(path, shard, patience_s, spared, fill)
         try:
-            verify_file(path, sha256, size, "it is fetched again")
+            verify_file(path, shard.sha256, shard.size, "it is fetched again")
             break
-        except (ConfigError, FileNotFoundError) as error:  # this machine's disk, or somebody cleaning up
-            if not again:
+        except (ConfigError, FileNotFoundError) as error:  # damaged on this disk, or removed by another process
+            if last_try:
                 raise
             print(error, file=sys.stderr)
             path.unlink(missing_ok=True)
     return path
 
 
-def _bring(
-    path: Path,
-    url: str,
-    sha256: str,
-    size: int,
-    patience_s: float,
-    spared: Collection[str] | None,
-    fill: Callable[[BufferedRandom], None],
-) -> None:
+def _fetch(path: Path, shard: CachedShard, patience_s: float, spared: Collection[str] | None, fill: Fill) -> None:
     _make_folder(path.parent)
-    with _owned(path, url, patience_s) as file:
+    with _locked_partial(path, shard.url, patience_s) as file:
         if file is None:
             return
-        while True:  # room is made by the file's owner alone: two that need one shard would make it twice
-            over = _bytes_over(path.parent, size)
+        while True:  # only the process that has the lock makes room: two that need one shard would do it twice
+            over = _bytes_over(path.parent, shard.size)
             try:
                 if over > 0:
                     raise OSError(errno.ENOSPC, f"the cache is full ({LIMIT_VARIABLE})", str(path))
                 fill(file)
                 break
             except OSError as error:
-                if error.errno not in (errno.ENOSPC, errno.EDQUOT) or spared is None:
+                if error.errno not in _FULL or spared is None:
                     raise
-                if not _make_room(path.parent, max(over, size), spared):
+                if not _make_room(path.parent, max(over, shard.size), spared):
                     raise
         os.fsync(file.fileno())
-        # it is the last one that was brought, wherever this machine's clock stood before
+        # the newest shard must have the latest time, wherever this machine's clock stood before
         latest = max((time_ns for time_ns, _, _ in _cached(path.parent)), default=0)
         if os.fstat(file.fileno()).st_mtime_ns <= latest:
             os.utime(file.fileno(), ns=(latest + 1, latest + 1))
         Path(file.name).replace(path)
     sync_folder(path.parent)
-    note_verified(path, sha256)
+    note_verified(path, shard.sha256)
 
 
 def _make_folder(folder: Path) -> None:
-    """Raises: ConfigError, which says what to name, where it may not be."""
+    """Raises: ConfigError naming the variable, where the folder cannot be created."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -136,7 +131,7 @@ def _make_folder(folder: Path) -> None:
 
 
 def _cached(folder: Path) -> list[tuple[int, int, Path]]:
-    """Of each shard in the cache when it was brought, its bytes and path; others may take them away meanwhile."""
+    """Returns time, bytes and path of each cached shard, oldest first; other processes may remove some meanwhile."""
     shards = []
     for path in folder.glob("*.tar"):
         with contextlib.suppress(FileNotFoundError):
@@ -146,7 +141,7 @@ def _cached(folder: Path) -> list[tuple[int, int, Path]]:
 
 
 def _bytes_over(folder: Path, size: int) -> float:
-    """By how much the cache would be over its limit with one more file. Raises: ConfigError."""
+    """Returns by how many bytes one more file would exceed the cache's limit. Raises: ConfigError."""
     limit = os.environ.get(LIMIT_VARIABLE)
     if not limit:
         return 0
@@ -159,7 +154,7 @@ def _bytes_over(folder: Path, size: int) -> float:
 
 
 def _make_room(folder: Path, size: float, spared: Collection[str]) -> bool:
-    """Removes the shards that were brought first, but those that are spared; whether there was any."""
+    """Removes the oldest shards that are not spared; returns whether there was any."""
     freed = 0
     for _, cached, path in _cached(folder):
         if freed >= size:
@@ -174,52 +169,43 @@ def _make_room(folder: Path, size: float, spared: Collection[str]) -> bool:
 
 
 @contextlib.contextmanager
-def _owned(path: Path, url: str, patience_s: float) -> Iterator[BufferedRandom | None]:
-    """The partial file of `path`, for this process alone and with what others had written; none when `path` is there.
+def _locked_partial(path: Path, url: str, patience_s: float) -> Iterator[BufferedRandom | None]:
+    """The partial file of `path`, locked, with the bytes that others had written; None once `path` exists.
 
-    The kernel frees a process's hold when it ends, so the next one goes on.
-    Raises: UnreachableError when another one has it, and brings nothing for as long as there is patience.
+    The kernel releases the lock of a process that ends, so the next one continues the file.
+    Raises: UnreachableError when another process has the lock and writes nothing for `patience_s`.
     """
     partial = path.with_name(f".{path.name}{TEMPORARY_SUFFIX}")
     while True:
         try:
-            opened = open(partial, "a+b", opener=_open_file)  # noqa: SIM115 - a path's takes no opener
+            opened = open(partial, "a+b", opener=_open_file)  # noqa: SIM115 - Path.open takes no opener
         except OSError as error:
             if error.errno != errno.ELOOP:
                 raise
             raise ConfigError(f"{partial} must be a file, got a symbolic link to another; delete it") from None
         with opened as file:
-            try:
-                _take(file, url, patience_s)
-            except OSError as error:
-                if error.errno not in NO_LOCKS:
-                    raise
-                raise ConfigError(
-                    f"{CACHE_VARIABLE} must name a folder on a file system with file locks, got {path.parent} "
-                    f"({error.strerror}); take one of this machine's own disks"
-                ) from None
+            _lock(file, path.parent, url, patience_s)
             if not _is_same(file, partial):
-                continue  # whoever had it before has given it its name
+                continue  # another process removed it, or gave it its final name
             if path.exists():
                 partial.unlink()
                 yield None
                 return
             try:
                 yield file
-            except ConfigError:
-                partial.unlink(missing_ok=True)
-                raise
-            except OSError as error:
-                if error.errno in (errno.ENOSPC, errno.EDQUOT):
+            except (ConfigError, OSError) as error:
+                full = isinstance(error, OSError) and error.errno in _FULL
+                if isinstance(error, OSError) and full:
                     error.filename = error.filename or str(path)
+                if full or isinstance(error, ConfigError):
                     partial.unlink(missing_ok=True)
                 raise
             return
 
 
-def _take(file: BufferedRandom, url: str, patience_s: float) -> None:
-    """The file's lock. A process that was stopped may have it: it is waited for while what it brings grows."""
-    size, begin = -1, time.monotonic()
+def _lock(file: BufferedRandom, folder: Path, url: str, patience_s: float) -> None:
+    """Locks a file; waits for another process as long as the file grows, since that process may have been stopped."""
+    size, start = -1, time.monotonic()
     while True:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -227,10 +213,17 @@ def _take(file: BufferedRandom, url: str, patience_s: float) -> None:
         except BlockingIOError:
             before, size = size, os.fstat(file.fileno()).st_size
             if before != size:
-                begin = time.monotonic()
-            if time.monotonic() - begin >= patience_s or patience.without.is_set():
+                start = time.monotonic()
+            if time.monotonic() - start >= patience_s or patience.without.is_set():
                 raise UnreachableError(url, patience_s, "another process is fetching it") from None
             patience.without.wait(_LOCK_PAUSE_S)
+        except OSError as error:
+            if error.errno not in NO_LOCKS:
+                raise
+            raise ConfigError(
+                f"{CACHE_VARIABLE} must name a folder on a file system with file locks, got {folder} "
+                f"({error.strerror}); take one of this machine's own disks"
+            ) from None
 
 
 def _open_file(name: str, flags: int) -> int:

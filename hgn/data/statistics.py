@@ -1,4 +1,4 @@
-"""Mean and spread of velocity and acceleration, mergeable episode by episode and shard by shard.
+"""Mean and spread of velocity and acceleration, merged over episodes and shards.
 
 In frame units, as the network sees them: v^n = x^n - x^(n-1), a^n = v^(n+1) - v^n.
 Shape legend: T frames, N particles.
@@ -30,7 +30,7 @@ class Moments:
 
     @staticmethod
     def of(values: np.ndarray) -> Moments:
-        """The moments of an array [..., 3]."""
+        """Returns the moments of an array [..., 3]."""
         flat = np.asarray(values, dtype=np.float64).reshape(-1, 3)
         if not len(flat):
             return Moments()
@@ -38,7 +38,7 @@ class Moments:
         return Moments(len(flat), _vector(mean), _vector(_sums(flat, mean, 2)))
 
     def merge(self, other: Moments) -> Moments:
-        """The moments of both sets of values together."""
+        """Returns the moments of the union."""
         if self.count == 0 or other.count == 0:
             return other if self.count == 0 else self
         count = self.count + other.count
@@ -53,7 +53,7 @@ class Moments:
 
     @property
     def std(self) -> Vector:
-        """Per axis, of the values themselves (divided by the count); zero where there are none."""
+        """Standard deviation per axis (divided by the count); zero without values."""
         return _vector(np.sqrt(np.array(self.squared_deviation) / max(self.count, 1)))
 
 
@@ -69,7 +69,7 @@ class Statistics:
 
 
 def episode_statistics(position_TN3: np.ndarray) -> Statistics:
-    """The statistics of one trajectory.
+    """Returns the statistics of one trajectory.
 
     Differences are taken in float64, over blocks of frames so that memory stays bounded; the blocks depend on the
     number of particles alone, so the result does not depend on how a data set is cut into shards.
@@ -88,7 +88,7 @@ def episode_statistics(position_TN3: np.ndarray) -> Statistics:
 
 
 def merge_statistics(parts: Iterable[Statistics]) -> Statistics:
-    """All parts together, merged in the order given."""
+    """Merges all parts in the order given."""
     total = Statistics()
     for part in parts:
         total = total.merge(part)
@@ -96,7 +96,7 @@ def merge_statistics(parts: Iterable[Statistics]) -> Statistics:
 
 
 def _sums(flat: np.ndarray, origin: np.ndarray, power: int) -> np.ndarray:
-    """The sum of (flat - origin)^power per axis. Many rows side by side, since NumPy is slow on rows of three."""
+    """Returns the sum of (flat - origin)^power per axis, many rows at once: NumPy is slow on rows of three."""
     total = np.zeros(3)
     whole = len(flat) // _ROWS_ABREAST * _ROWS_ABREAST
     for part, abreast in ((flat[:whole], _ROWS_ABREAST), (flat[whole:], 1)):

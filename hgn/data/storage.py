@@ -1,7 +1,7 @@
 """Where a data set lies: a folder of this machine, or a URL (a dataset service, a file server, an object store).
 
-Shards of a URL are kept on this machine (`hgn.data.shard_cache`). `HGN_DATASET_TOKEN` is the token that a dataset
-service asks for, `HGN_DATASET_HOST` the only host (or host:port) that it is for.
+Shards of a URL are cached on this machine (`hgn.data.shard_cache`). `HGN_DATASET_TOKEN` is the token of a dataset
+service; with `HGN_DATASET_HOST` only that host (or host:port) receives it.
 """
 
 from __future__ import annotations
@@ -12,13 +12,14 @@ import hashlib
 import os
 import threading
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection
 from io import BufferedRandom
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import Any, TypeVar
 from urllib.parse import urlsplit
 
-from hgn.data.shard_cache import cached_shard
+from hgn.data.shard_cache import CachedShard, cached_shard
 from hgn.data.verification import verify_file
 from hgn.schema import ConfigError, require
 from hgn.system.extras import missing_extra
@@ -28,51 +29,51 @@ from hgn.system.patience import UnreachableError, patiently
 
 TOKEN_VARIABLE = "HGN_DATASET_TOKEN"
 TOKEN_HOST_VARIABLE = "HGN_DATASET_HOST"
-PATIENCE_S = 300.0  # with a server that does not answer: time enough to start a service again
-_CHUNK_BYTES = 16 * 2**20  # of a shard at a time: what is lost when a connection is
+PATIENCE_S = 300.0  # for a server that does not answer: time enough to restart a service
+_CHUNK_BYTES = 16 * 2**20  # of a shard in one request; a lost connection costs at most one
 _CONNECT_S, _SILENCE_S = 10.0, 60.0
-_AWAY_S = 10.0
+_AWAY_S = 10.0  # after a server did not answer, callers without patience do not ask it
 _NETWORK_PACKAGES = {"aiohttp", "botocore", "aiobotocore", "gcsfs", "google", "azure"}
 
 T = TypeVar("T")
 
 
-class Storage(Protocol):
-    """A data set's files, wherever they are."""
+class Storage(ABC):
+    """The files of a data set, wherever they are."""
 
+    @abstractmethod
     def manifest(self, name: str, patience_s: float = PATIENCE_S) -> bytes:
-        """The manifest's bytes. Raises: FileNotFoundError; UnreachableError; ConfigError (no access)."""
-        ...
+        """Returns the manifest's bytes. Raises: FileNotFoundError; UnreachableError; ConfigError (no access)."""
 
+    @abstractmethod
     def read(self, name: str, start: int, stop: int) -> bytes:
-        """Some bytes of a file. Raises: FileNotFoundError; UnreachableError; ConfigError (no access, too short)."""
-        ...
+        """Returns a range of a file. Raises: as `manifest`; ConfigError for a file that is too short."""
 
+    @abstractmethod
     def shard(
         self, name: str, sha256: str, size: int, patience_s: float = PATIENCE_S, spared: Collection[str] | None = ()
     ) -> Path:
-        """The path of a shard on this machine, verified; others leave a full cache for it, but those whose sha256 is
-        `spared` (none: all are).
+        """Returns the path of a verified shard on this machine.
 
-        Raises: ConfigError; UnreachableError; OSError (a full disk, or cache).
+        A full cache makes room for it, except of shards whose sha256 is in `spared`; with None it removes nothing.
+        Raises: ConfigError; UnreachableError; OSError (full disk or cache).
         """
-        ...
 
 
 def is_remote(folder: Path | str) -> bool:
-    """Whether a data set is given by a URL."""
+    """Whether a data set lies at a URL."""
     return "://" in str(folder) and not str(folder).startswith("file://")
 
 
 def local_folder(folder: Path | str) -> Path:
-    """The path of a data set that is no remote one."""
+    """Returns the path of a data set that is not remote."""
     return Path(str(folder).removeprefix("file://"))
 
 
 def open_storage(folder: Path | str) -> Storage:
-    """The storage of a data set; of a URL the same one each time.
+    """Returns the storage of a data set, the same object for the same URL.
 
-    Raises: ConfigError for a URL whose protocol is not known or not installed.
+    Raises: ConfigError for a URL with an unknown protocol, or one whose package is not installed.
     """
     if is_remote(folder):
         return _remote(str(folder).rstrip("/"))
@@ -80,12 +81,12 @@ def open_storage(folder: Path | str) -> Storage:
 
 
 def write_remote(url: str, name: str, source: Path | bytes) -> None:
-    """Writes a file, or bytes, to a data set's URL. Raises: ConfigError when that cannot be; UnreachableError."""
+    """Writes a file, or bytes, to a data set's URL. Raises: ConfigError where writing fails; UnreachableError."""
     _remote(url.rstrip("/")).write(name, source)
 
 
 def dataset_token() -> str | None:
-    """The token of $HGN_DATASET_TOKEN. Raises: ConfigError when it could not stand in a header."""
+    """Returns the token of $HGN_DATASET_TOKEN. Raises: ConfigError for one that an HTTP header cannot carry."""
     token = os.environ.get(TOKEN_VARIABLE)
     if token is None:
         return None
@@ -101,7 +102,7 @@ def _token_is_for(url: str) -> bool:
     return not named or named in (address.hostname, f"{address.hostname}:{address.port}")
 
 
-class _Folder:
+class _Folder(Storage):
     """A folder of this machine."""
 
     def __init__(self, folder: Path) -> None:
@@ -122,7 +123,7 @@ class _Folder:
         try:
             verify_file(path, sha256, size, "delete it and run the generator again")
         except FileNotFoundError:
-            raise ConfigError(f"{path} is listed in the index but missing; run the generator again") from None
+            raise _missing(path) from None
         return path
 
 
@@ -131,11 +132,11 @@ def _remote(url: str) -> _Remote:
     return _Remote(url)
 
 
-class _Remote:
+class _Remote(Storage):
     """A URL that fsspec reads."""
 
     def __init__(self, url: str) -> None:
-        import fsspec  # loads for a while, and local data sets need none of it
+        import fsspec  # slow to import, and local data sets do not need it
 
         self._url, hub = url, url.startswith(PREFIX)
         address = HubPlace.parse(url, "dataset.folder").address if hub else url
@@ -148,7 +149,7 @@ class _Remote:
 
             token = hub_token() if hub else dataset_token() if _token_is_for(url) else None
             timeout = aiohttp.ClientTimeout(total=None, connect=_CONNECT_S, sock_read=_SILENCE_S)
-            # packed, a small answer could become a large one
+            # a small compressed answer could expand without limit
             headers = {"Accept-Encoding": "identity"}
             if token is not None:
                 headers["Authorization"] = f"Bearer {token}"
@@ -162,14 +163,14 @@ class _Remote:
         try:
             self._files, self._root = fsspec.core.url_to_fs(address, **options)
         except (ValueError, ImportError) as error:
-            cause = error.__cause__  # of fsspec's ImportError: which package is missing
+            cause = error.__cause__  # fsspec's ImportError is caused by the missing package's
             reason = (isinstance(cause, ModuleNotFoundError) and missing_extra(cause)) or error
             raise ConfigError(
                 f"dataset.folder must be a folder or a URL that fsspec can read, got {url!r} ({reason})"
             ) from None
-        self._manifest: tuple[bytes, str] | None = None  # the manifest last read, and its ETag at a dataset service
+        self._manifest: tuple[bytes, str] | None = None  # the last one, and its ETag at a dataset service
         self._lock = threading.Lock()
-        self._away = (0.0, "")  # until when, and why, who has no patience need not ask
+        self._away = (0.0, "")  # when callers without patience may ask again, and the cause
 
     def manifest(self, name: str, patience_s: float = PATIENCE_S) -> bytes:
         with self._lock:
@@ -184,10 +185,8 @@ class _Remote:
             return content
 
     def read(self, name: str, start: int, stop: int) -> bytes:
-        read = _read_range(self._files, start, stop)
-
         def whole(path: str) -> bytes:
-            data = read(path)
+            data: bytes = self._files.cat_file(path, start=start, end=stop)
             if self._http and len(data) < stop - start:
                 raise ConnectionError(f"{len(data)} bytes instead of {stop - start}: a proxy may have an older file")
             return data
@@ -201,14 +200,21 @@ class _Remote:
         self, name: str, sha256: str, size: int, patience_s: float = PATIENCE_S, spared: Collection[str] | None = ()
     ) -> Path:
         def fill(file: BufferedRandom) -> None:
+            self._require_not_away(name, patience_s)
             try:
-                self._fill_whole(file, name, sha256, size, patience_s)
+                # a second time from the start, in case the disk did not keep what another process had fetched
+                if self._fill(file, name, size, patience_s) == sha256:
+                    return
+                file.truncate(0)
+                if self._fill(file, name, size, patience_s) == sha256:
+                    return
             except FileNotFoundError:
-                raise ConfigError(
-                    f"{self._url}/{name} is listed in the index but missing; run the generator again"
-                ) from None
+                raise _missing(f"{self._url}/{name}") from None
+            raise ConfigError(
+                f"{self._url}/{name} must have sha256 {sha256}, got other bytes: it was altered; generate it again"
+            )
 
-        return cached_shard(f"{self._url}/{name}", sha256, size, patience_s, spared, fill)
+        return cached_shard(CachedShard(f"{self._url}/{name}", sha256, size), patience_s, spared, fill)
 
     def write(self, name: str, source: Path | bytes) -> None:
         def put(path: str) -> None:
@@ -224,26 +230,14 @@ class _Remote:
             written = self._files.info(f"{self._root}/{name}")["size"]
         except (NotImplementedError, FileNotFoundError) as error:
             raise ConfigError(
-                f"{self._url} must be a place to write to, got {type(error).__name__} for {name}; see that it exists, "
-                "and that its protocol knows writing"
+                f"{self._url} must be a place to write to, got {type(error).__name__} for {name}; check that it exists "
+                "and that its protocol supports writing"
             ) from None
         if written != expected:
             raise ConfigError(f"{self._url}/{name} must have {expected} bytes, got {written}; copy it again")
 
-    def _fill_whole(self, file: BufferedRandom, name: str, sha256: str, size: int, patience_s: float) -> None:
-        self._require_not_away(name, patience_s)
-        # what a process that ended had fetched is gone on with, unless the disk did not keep it
-        for resume in (True, False):
-            if not resume:
-                file.truncate(0)
-            if self._fill(file, name, size, patience_s) == sha256:
-                return
-        raise ConfigError(
-            f"{self._url}/{name} must have sha256 {sha256}, got other bytes: it was altered; generate it again"
-        )
-
     def _fill(self, file: BufferedRandom, name: str, size: int, patience_s: float) -> str:
-        """Appends what is missing and returns the sha256 of the whole."""
+        """Appends the missing bytes and returns the sha256 of the whole file."""
         if os.fstat(file.fileno()).st_size > size:
             file.truncate(0)
         file.seek(0)
@@ -251,13 +245,12 @@ class _Remote:
         have = file.seek(0, os.SEEK_END)
         while have < size:
             stop = min(have + _CHUNK_BYTES, size)
-            data = self._patiently(name, patience_s, _read_range(self._files, have, stop))
+            read = functools.partial(self._files.cat_file, start=have, end=stop)
+            data = self._patiently(name, patience_s, read)
             if len(data) == size > stop - have:  # from a server without ranges
                 data = data[have:]
             elif len(data) != stop - have:
-                raise ConfigError(
-                    f"{self._url}/{name} must have {size} bytes, got {have + len(data)}; it was cut: generate it again"
-                )
+                raise _cut(f"{self._url}/{name}", size, have + len(data))
             file.write(data)
             digest.update(data)
             have += len(data)
@@ -269,12 +262,12 @@ class _Remote:
             raise UnreachableError(f"{self._url}/{name}", patience_s, self._away[1])
 
     def _patiently(self, name: str, patience_s: float, read: Callable[[str], T]) -> T:
-        """Reads, again and again while the server is away. Raises: as `Storage.manifest`."""
+        """Reads, and retries while the server is away. Raises: as `Storage.manifest`."""
         url, path = f"{self._url}/{name}", f"{self._root}/{name}"
         try:
             result = patiently(lambda: read(path), lambda error: _transient(error, url), url, self._url, patience_s)
         except UnreachableError as error:
-            # a machine that is switched off costs _CONNECT_S at each asking
+            # each request to a machine that is off would take _CONNECT_S
             self._away = time.monotonic() + _AWAY_S, error.cause
             raise
         self._away = 0.0, ""
@@ -283,28 +276,32 @@ class _Remote:
 
 def _whole(data: bytes, path: str, start: int, stop: int) -> bytes:
     if len(data) != stop - start:
-        raise ConfigError(f"{path} must have {stop} bytes, got {start + len(data)}; it was cut: generate it again")
+        raise _cut(path, stop, start + len(data))
     return data
 
 
-def _read_range(files: Any, start: int, stop: int) -> Callable[[str], bytes]:
-    return lambda path: files.cat_file(path, start=start, end=stop)
+def _cut(path: str, size: int, got: int) -> ConfigError:
+    return ConfigError(f"{path} must have {size} bytes, got {got}; it was cut: generate it again")
+
+
+def _missing(path: Path | str) -> ConfigError:
+    return ConfigError(f"{path} is listed in the index but missing; run the generator again")
 
 
 def _transient(error: Exception, url: str) -> str | None:
-    """What to say of an error that may pass; none of one that is not the network's. Raises: ConfigError (refused)."""
+    """Returns the cause of an error that may pass, or None for any other. Raises: ConfigError (access refused)."""
     if isinstance(error, FileNotFoundError):
         return None
     status = getattr(error, "status", None)
     if status in (401, 403) or isinstance(error, PermissionError):
         raise ConfigError(
             f"{url} must be open to this program, got refused; set {TOKEN_VARIABLE} to the service's token, which "
-            f"goes to {TOKEN_HOST_VARIABLE} alone where that is set (an object store asks for its own credentials, the "
-            "Hugging Face Hub for HF_TOKEN)"
+            f"only {TOKEN_HOST_VARIABLE} receives where that is set (object stores need their own credentials, the "
+            "Hugging Face Hub HF_TOKEN)"
         ) from None
     if status == 410:
         raise ConfigError(f"{url} is damaged at its service; delete it there and run the generator again") from None
-    # 416: beyond the end of an index file that a proxy remembers
+    # 416: a proxy has an older, shorter index file
     if isinstance(status, int) and 400 <= status < 500 and status not in (408, 416, 425, 429):
         raise ConfigError(
             f"{url} must be a file of a data set, got the answer {status}; check dataset.folder"

@@ -1,4 +1,4 @@
-"""Files that are what they should be: size and sha256, looked at once."""
+"""Verification of files by size and sha256, once a process."""
 
 from __future__ import annotations
 
@@ -7,17 +7,17 @@ from pathlib import Path
 
 from hgn.schema import ConfigError
 
-_verified: set[tuple[str | int, ...]] = set()  # the files that this process has verified
+_verified: set[tuple[str | int, ...]] = set()  # identities of the files that this process has verified
 
 
 def file_sha256(path: Path) -> str:
-    """The sha256 of a file's bytes, in hexadecimal."""
+    """Returns the sha256 of a file in hexadecimal."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def verify_file(path: Path, sha256: str, size: int, remedy: str) -> None:
-    """Checks size and sha256 of a file, once a process as long as the file does not change.
+    """Checks size and sha256 of a file, once a process as long as it does not change.
 
     Raises: ConfigError naming the file, what was expected and found, and the remedy; FileNotFoundError.
     """
@@ -34,12 +34,12 @@ def verify_file(path: Path, sha256: str, size: int, remedy: str) -> None:
 
 
 def note_verified(path: Path, sha256: str) -> None:
-    """For whoever has hashed a file while writing it."""
+    """Records a file as verified whose bytes were hashed while they were written."""
     _verified.add(_identity(path, sha256))
 
 
 def _identity(path: Path, sha256: str) -> tuple[str | int, ...]:
-    """Another one as soon as the file may have changed: a modification time can be set back, a change's cannot."""
+    """Returns an identity that changes with the file: a modification time can be set back, a change time cannot."""
     status = path.stat()
     times = status.st_mtime_ns, status.st_ctime_ns
     return str(path.resolve()), status.st_dev, status.st_ino, status.st_size, *times, sha256

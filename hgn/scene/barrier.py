@@ -1,9 +1,8 @@
-"""Rigid surfaces of obstacles: their triangles, and which of them a particle's way may meet in a cell.
+"""Obstacle triangles near each cell, for the step constraint that keeps particles outside obstacles.
 
-A triangle covers a place that is within `clearance` of its plane and no farther than MARGIN of that beside it. Its row
-has four planes, a unit normal and an offset each: its own, then those of its edges, which point outwards and lie that
-margin farther out; and the box of its corners, widened by 2 * clearance. It covers what is on the inner side of the
-edges, in the box.
+A triangle covers the points within `clearance` of its plane and at most MARGIN * clearance beyond its edges. Its row
+contains four planes (unit normal and offset): its own, then one for each edge, pointing outwards and moved out by that
+margin; and the box of its corners, widened by 2 * clearance. The covered points are inside the edge planes and the box.
 Shape legend: F triangles, Q cells, E entries of their lists, C cells of a box.
 """
 
@@ -19,21 +18,21 @@ from hgn.scene.rotation import round_to_float32
 from hgn.scene.surface import area_vectors, split_long_edges
 from hgn.schema import Vector, require
 
-ROW = 24  # numbers of a triangle: four planes of four, then the box, lowest and highest corner with a zero behind each
-CELLS = 2  # obstacle cells to a cell here: narrower ones have lists as long, and more of them
-# of the clearance: enough for rounding at the edges that triangles share; as wide as the clearance it would be a lip
-# at convex edges, which stops what slides off
+ROW = 24  # numbers of a triangle: four planes of four; the box, its corners padded with zeros
+CELLS = 2  # obstacle cells per cell: narrower cells have equally long lists, and more of them
+# of the clearance: enough for rounding at shared edges; a margin as wide as the clearance would form a lip at convex
+# edges that stops sliding particles
 MARGIN = 0.1
-LEAST_HEIGHT = 1e-9  # domain units: of a triangle above its longest edge; thinner ones cover nothing that others do not
-CELLS_AT_ONCE = 1 << 18  # of triangles' boxes, which bounds memory
+LEAST_HEIGHT = 1e-9  # domain units, of a triangle above its longest edge; thinner ones are covered by others
+CELLS_AT_ONCE = 1 << 18  # of triangles' boxes, to bound memory
 
 
 @dataclass(frozen=True, eq=False)
 class Barrier:
-    """One scene's obstacles; cell q spans [q, q + 1) * cell_size.
+    """The obstacles of one scene; cell q spans [q, q + 1) * cell_size.
 
-    Where a way is cut into pieces no longer than a cell, whatever is covered of it is in the lists of the cells that
-    the pieces' middles lie in.
+    For a path cut into pieces no longer than a cell, the lists of the cells at the pieces' midpoints contain every
+    triangle that covers a part of it.
     """
 
     cell_size: float
@@ -45,19 +44,19 @@ class Barrier:
 
 
 def build_barrier(corner_F33: np.ndarray, cell_size: float, clearance: float, domain_size: Vector) -> Barrier:
-    """The barrier of triangles, corners [F, 3, 3] in domain units; `cell_size` is that of the obstacle cells. What is
-    more than one of these outside the domain is not in it.
+    """Returns the barrier of triangles, corners [F, 3, 3] in domain units; `cell_size` is that of obstacle cells. Parts
+    more than a cell outside the domain are left out.
 
-    Raises: ConfigError for a clearance that is none.
+    Raises: ConfigError for an invalid clearance.
     """
     return barrier_of_pieces(barrier_pieces(corner_F33, cell_size, domain_size), cell_size, clearance)
 
 
 def barrier_pieces(corner_F33: np.ndarray, cell_size: float, domain_size: Vector | None = None) -> np.ndarray:
-    """The triangles of a barrier, corners float64 [F', 3, 3]: long ones in pieces, without those that have no area.
+    """Returns the triangles of a barrier, corners float64 [F', 3, 3]: long ones cut to pieces, none without area.
 
-    With the domain's size, without what is more than a cell outside it. Corners are float32's, so that what is given
-    them in that precision has the same rows.
+    With `domain_size`, pieces more than a cell outside are dropped. Corners are rounded to float32, so that float32
+    input gives the same rows.
     """
     box = None
     if domain_size is not None:
@@ -69,7 +68,7 @@ def barrier_pieces(corner_F33: np.ndarray, cell_size: float, domain_size: Vector
 
 
 def barrier_of_pieces(corner_F33: np.ndarray, cell_size: float, clearance: float) -> Barrier:
-    """The barrier of `barrier_pieces`, row f from triangle f. Raises: ConfigError for a clearance that is none."""
+    """Returns the barrier of `barrier_pieces`, row f from triangle f. Raises: ConfigError for an invalid clearance."""
     require(0 < clearance <= cell_size, "obstacle_clearance", f"above 0, up to a cell ({cell_size:g})", clearance)
     row_F24, cell_size = _rows(corner_F33, clearance), CELLS * cell_size
     cell_Q3, start_Q, triangle_E = _lists(row_F24, cell_size, clearance)
@@ -100,15 +99,16 @@ def _rows(corner_F33: np.ndarray, clearance: float) -> np.ndarray:
 
 
 def _lists(row_F24: np.ndarray, cell_size: float, clearance: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Cells [Q, 3], where the list of each begins [Q + 1], and the triangles of all lists [E]: of a cell those whose
-    planes and box come to within half a cell, for a piece of a way may reach half a cell beyond the cell that its
-    middle is in.
+    """Returns cells [Q, 3], the start of each cell's list [Q + 1], and the triangles of all lists [E].
+
+    A list contains the triangles within half a cell, because a piece of a path may reach half a cell beyond the cell of
+    its midpoint.
     """
     reach = 0.5 * cell_size * (1 + 1e-3)
     low_F3 = np.floor((row_F24[:, 16:19] - reach) / cell_size).astype(np.int64)
     extent_F3 = np.floor((row_F24[:, 20:23] + reach) / cell_size).astype(np.int64) - low_F3 + 1
     origin_3 = low_F3.min(axis=0, initial=0)
-    all_cells = tuple((low_F3 + extent_F3).max(axis=0, initial=1) - origin_3)  # in which a cell has one number
+    all_cells = tuple((low_F3 + extent_F3).max(axis=0, initial=1) - origin_3)  # extents, for numbering cells
     low_F = np.ravel_multi_index(tuple((low_F3 - origin_3).T), all_cells)
     numbers, triangles = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)]
     for triangle_F, cell_3C in _alike(extent_F3):
@@ -125,7 +125,7 @@ def _lists(row_F24: np.ndarray, cell_size: float, clearance: float) -> tuple[np.
 
 
 def _alike(extent_F3: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Triangles [F'] whose boxes have as many cells on each axis, and these cells as seen from the lowest, [3, C]."""
+    """Yields triangles [F'] whose boxes have equal extents, and the cells of such a box, [3, C]."""
     shape = tuple(extent_F3.max(axis=0, initial=0) + 1)
     extent_F = np.ravel_multi_index(tuple(extent_F3.T), shape)
     for extent in np.unique(extent_F):
@@ -138,7 +138,7 @@ def _alike(extent_F3: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
 def _near(
     row_F24: np.ndarray, low_F3: np.ndarray, cell_3C: np.ndarray, cell_size: float, reach: float, clearance: float
 ) -> np.ndarray:
-    """Whether what a triangle covers may come to within `reach` of a cell by its planes, bool [F, C]."""
+    """Whether the volume covered by a triangle may come within `reach` of a cell, by its planes, bool [F, C]."""
     centre_F3, half = (low_F3 + 0.5) * cell_size, 0.5 * cell_size + reach
     near_FC = np.ones((len(row_F24), cell_3C.shape[1]), bool)
     for plane in range(4):

@@ -1,6 +1,6 @@
 """Exact distances to triangles, and inside tests for closed meshes.
 
-Pure numpy in float64, without any loop over points or triangles.
+NumPy in float64, without loops over points or triangles.
 Shape legend: P points (or point-triangle pairs), F triangles, T tree nodes.
 """
 
@@ -14,15 +14,15 @@ import numpy as np
 from hgn.scene.scene import Obstacle
 from hgn.scene.surface import area_vectors
 
-POINTS_PER_CHUNK = 1 << 14  # whose temporaries stay in a core's cache
-PAIRS_PER_CHUNK = 1 << 14  # of the dense solid-angle sums, likewise
-DIRECT_TRIANGLES = 1024  # above it the tree is faster than the dense sum
+POINTS_PER_CHUNK = 1 << 14  # temporaries stay in a core's cache
+PAIRS_PER_CHUNK = 1 << 14  # of dense solid-angle sums, for the same reason
+DIRECT_TRIANGLES = 1024  # with more the tree is faster than the dense sum
 LEAF_TRIANGLES = 16
-FAR_FIELD_RATIO = 2.5  # a cluster is far beyond this many of its radii
+FAR_FIELD_RATIO = 2.5  # in radii of a cluster
 
 
 def closest_points(point_P3: np.ndarray, triangle_P33: np.ndarray) -> np.ndarray:
-    """The point of each triangle that is closest to its partner point, as float64 [P, 3].
+    """Returns the point of each triangle that is closest to its partner point, float64 [P, 3].
 
     `triangle_P33` holds corners, [pair, corner, axis]. The nearest of the foot of the perpendicular
     (where it lies inside) and of the nearest points of the three edges; it equals the region walk of Ericson,
@@ -40,7 +40,7 @@ def closest_points(point_P3: np.ndarray, triangle_P33: np.ndarray) -> np.ndarray
 
 
 def winding_numbers(point_P3: np.ndarray, triangle_F33: np.ndarray) -> np.ndarray:
-    """The generalised winding number of the triangles about each point, as float64 [P].
+    """Returns the generalised winding number of the triangles about each point, float64 [P].
 
     +1 or -1 inside a closed mesh (by its orientation), 0 outside; between for meshes with holes. Zero-area
     triangles add nothing. Up to DIRECT_TRIANGLES the solid angles are summed exactly (van Oosterom and
@@ -63,7 +63,7 @@ def winding_numbers(point_P3: np.ndarray, triangle_F33: np.ndarray) -> np.ndarra
 
 
 def contains(point_P3: np.ndarray, obstacle: Obstacle) -> np.ndarray:
-    """Whether each point lies inside the obstacle, as bool [P]; nothing lies inside a sheet.
+    """Whether each point lies inside the obstacle, bool [P]; no point is inside a sheet.
 
     Triangle orientation does not matter: inside is |winding number| > 0.5.
     """
@@ -79,7 +79,7 @@ def contains(point_P3: np.ndarray, obstacle: Obstacle) -> np.ndarray:
 
 
 def share_inside(position_N3: np.ndarray, obstacles: Sequence[Obstacle]) -> float:
-    """Share of the particles within closed obstacles; nothing is within a sheet."""
+    """Returns the fraction of particles inside closed obstacles."""
     inside_N = np.zeros(len(position_N3), bool)
     for obstacle in obstacles:
         inside_N |= contains(position_N3, obstacle)
@@ -103,7 +103,7 @@ def _closest_of_axes(point: np.ndarray, corner: np.ndarray) -> np.ndarray:
     divisor = np.where(normal_square > 0, normal_square, 1.0)
     u = dot(cross(ap, ac), normal) / divisor
     v = dot(cross(ab, ap), normal) / divisor
-    # measured from the corner, not the point, so that a sliver's poor normal cannot leave the triangle
+    # measured from the corner, so that a sliver's inaccurate normal cannot leave the triangle
     foot = a + u * ab + v * ac
     better = (normal_square > 0) & (u >= 0) & (v >= 0) & (u + v <= 1) & (square(point - foot) < best_square)
     np.copyto(best, foot, where=better)
@@ -117,7 +117,7 @@ def _closest_on_segment(from_start: np.ndarray, start: np.ndarray, edge: np.ndar
 
 
 def _solid_angles(point: np.ndarray, triangle: np.ndarray) -> np.ndarray:
-    """Signed solid angle of each triangle, corners [3, 3, ...], seen from its point, [3, ...]; what follows broadcasts.
+    """Returns the signed solid angle of triangles, corners [3, 3, ...], from points [3, ...]; trailing axes broadcast.
 
     Seen from a point in its own plane a triangle has solid angle 0 outside and is undefined inside.
     """
@@ -170,7 +170,7 @@ def _build_tree(triangle_F33: np.ndarray) -> _Tree:
     dipole = _slice_sums(area_vector, first_T, last_T)
     weight = _slice_sums(area[:, None], first_T, last_T)
     centre = _slice_sums(area[:, None] * sorted_F33.mean(axis=1), first_T, last_T) / weight
-    # the box of the corners bounds the sphere about the centre
+    # the box of the corners bounds the sphere
     low, high = np.empty_like(centre), np.empty_like(centre)
     for node in range(len(first_T) - 1, -1, -1):  # children come after their parent
         if children[node][0] < 0:
@@ -191,7 +191,7 @@ def _slice_sums(value: np.ndarray, first: np.ndarray, last: np.ndarray) -> np.nd
 def _tree_winding_numbers(point: np.ndarray, triangle_F33: np.ndarray) -> np.ndarray:
     tree = _build_tree(triangle_F33)
     solid_angle = np.zeros(len(point))
-    rows = 4096  # points at once, which bounds the frontier
+    rows = 4096  # points at once, to bound memory
     for start in range(0, len(point), rows):
         chunk = point[start : start + rows]
         total = solid_angle[start : start + rows]
@@ -225,15 +225,15 @@ def _leaf_solid_angles(point: np.ndarray, who: np.ndarray, node: np.ndarray, tre
 
 
 def dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """The products of vectors [3, ...], as [...]: an array for each axis takes a third of the time of rows of three."""
+    """Returns scalar products of vectors [3, ...]; arrays of axes take a third of the time of rows of three."""
     return np.asarray(a[0] * b[0] + a[1] * b[1] + a[2] * b[2])
 
 
 def square(a: np.ndarray) -> np.ndarray:
-    """The squared lengths of vectors [3, ...], as [...]."""
+    """Returns squared lengths of vectors [3, ...]."""
     return dot(a, a)
 
 
 def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """The cross products of vectors [3, ...], as [3, ...]."""
+    """Returns cross products of vectors [3, ...], as [3, ...]."""
     return np.stack([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])

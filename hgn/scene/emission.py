@@ -1,4 +1,4 @@
-"""Emitters: faces that material enters through at a speed, as a train of particles that fills its way evenly.
+"""Emitters: faces through which particles enter at a given velocity and density.
 
 Shape legend: N particles, E particles of an emitter, P points, F triangles.
 """
@@ -15,17 +15,17 @@ from hgn.scene.group import points_in_ball
 from hgn.scene.scene import Scene
 from hgn.schema import Vector, require
 
-WAYS = 256  # of particles that enter, that are tried for obstacles
+WAYS = 256  # entering particles whose paths are checked for obstacles
 
 
 @dataclass(frozen=True)
 class Face:
-    """A disc, or a rectangle where `edges` are not zero, across a velocity. Domain units."""
+    """A disc, or a rectangle where `edges` are not zero, perpendicular to a velocity. Domain units."""
 
     centre: Vector
-    velocity: Vector  # domain units per second, of what enters
+    velocity: Vector  # domain units per second, of entering particles
     radius: float = 0.0
-    edges: tuple[float, float] = (0.0, 0.0)  # the first is level, along x where the velocity is upright
+    edges: tuple[float, float] = (0.0, 0.0)  # the first is horizontal, along x for a vertical velocity
 
     @property
     def area(self) -> float:
@@ -48,14 +48,14 @@ class Face:
         return np.asarray(0.5 * np.array(self.edges) @ np.abs(self.axes))
 
     def count(self, seconds: float, particles_per_cell: float, cell_size: float) -> int:
-        """How many particles enter in so long, as densely as groups are filled."""
+        """Returns the number of particles that enter in this time, at the density of groups."""
         volume = self.area * float(np.linalg.norm(self.velocity)) * seconds
         return round(particles_per_cell * volume / cell_size**3)
 
     def draw(self, start: float, stop: float, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-        """Where and when particles enter: points of the face, float32 [E, 3], and times in order, float64 [E].
+        """Draws entry points on the face, float32 [E, 3], and sorted entry times, float64 [E].
 
-        One enters in each of `count` equal parts of the time.
+        One particle enters in each of `count` equal intervals.
         """
         if self.radius:
             place = points_in_ball(count, 2, rng) * self.radius
@@ -66,14 +66,14 @@ class Face:
 
 
 def entry_frames(scene: Scene, frame_rate_hz: float) -> np.ndarray:
-    """The frame in which each particle is seen first, int64 [N]: the first at its time of entry or after it."""
+    """Returns the first frame of each particle, int64 [N], at its time of entry or after it."""
     if scene.entry_s_N is None:
         return np.zeros(scene.particle_count, np.int64)
     return np.maximum(np.ceil(scene.entry_s_N * frame_rate_hz - 1e-9), 0).astype(np.int64)
 
 
 def at_entry(scene: Scene, frame_rate_hz: float) -> Scene:
-    """The scene with each particle as it is in the frame in which it is seen first: in free flight from the face."""
+    """Returns the scene with each particle at its first frame, in free flight from the face."""
     if scene.entry_s_N is None:
         return scene
     time_N1 = (entry_frames(scene, frame_rate_hz) / frame_rate_hz - scene.entry_s_N)[:, None]
@@ -88,7 +88,7 @@ def at_entry(scene: Scene, frame_rate_hz: float) -> Scene:
 
 
 def at_start(scene: Scene) -> Scene:
-    """The scene with the particles alone that are there from the start."""
+    """Returns the scene with only the particles that are present from the start."""
     count = int((scene.entry_s_N <= 0).sum()) if scene.entry_s_N is not None else scene.particle_count
     return dataclasses.replace(
         scene,
@@ -101,8 +101,8 @@ def at_start(scene: Scene) -> Scene:
 
 
 def require_free_entries(scene: Scene, entered: Scene) -> None:
-    """Raises ConfigError where an obstacle, as it lies at first, stands in the way from an emitter to where particles
-    are seen first (`entered`, of `at_entry`).
+    """Raises ConfigError where an obstacle in its initial pose blocks the path from an emitter to the particles' first
+    positions (`entered`, from `at_entry`).
     """
     if scene.entry_s_N is None:
         return
@@ -112,13 +112,13 @@ def require_free_entries(scene: Scene, entered: Scene) -> None:
     for obstacle in scene.obstacles:
         corner_F33 = obstacle.corners
         hits = sum(_crosses(point, step.astype(np.float64), corner_F33) for point, step in zip(start, way, strict=True))
-        rule = "clear of obstacles for the first frame of what enters"
-        share = f"{hits / max(len(late), 1):.0%} of it through {obstacle.name}"
+        rule = "clear of obstacles for the first frame of entering particles"
+        share = f"{hits / max(len(late), 1):.0%} of them pass {obstacle.name}"
         require(not hits, "emitters", rule, share, "move one of them")
 
 
 def _crosses(start_3: np.ndarray, way_3: np.ndarray, corner_F33: np.ndarray) -> bool:
-    """Whether a way meets a triangle (Möller and Trumbore 1997)."""
+    """Whether a path meets a triangle (Möller and Trumbore 1997)."""
     edge_1, edge_2 = corner_F33[:, 1] - corner_F33[:, 0], corner_F33[:, 2] - corner_F33[:, 0]
     across = np.cross(way_3, edge_2)
     determinant = (edge_1 * across).sum(axis=1)

@@ -1,7 +1,7 @@
 """An episode: one scene's simulated trajectory, as stored in shards and read by the trainer.
 
-Stored as plain members, one file a field (`position.npy`, `material.npy`, ..., `json`), so that any WebDataset
-or tar client reads it and a trainer can memory-map the positions. Nothing is ever unpickled.
+Each field is a member of its own (`position.npy`, `material.npy`, ..., `json`), so that any WebDataset or tar client
+reads it and a trainer can memory-map the positions. No pickles are used.
 Shape legend: T frames, N particles, K obstacle cells, H frames before frame 0, P particles of obstacles.
 """
 
@@ -27,7 +27,7 @@ SCHEMA_VERSION = 1
 POSITION_MEMBER = "position.npy"
 DESCRIPTION_MEMBER = "json"
 PARAMETER_PREFIX = "parameter_"
-# the arrays, each a member NAME.npy: type as stored, and axes by the shape legend
+# arrays, each a member NAME.npy: stored type, and axes by the shape legend
 _ARRAYS = {
     "position": ("<f4", "TN3"),
     "velocity": ("<f4", "N3"),
@@ -38,19 +38,17 @@ _ARRAYS = {
     "boundary": ("<f4", "P3"),
 }
 _PARAMETER = ("<f4", "N")
-_OPTIONAL = ("past", "boundary")  # in imported episodes alone, where there are any
-_IGNORED = ("obstacle_distance.npy",)  # members of a setting that left: some data sets have them
+_OPTIONAL = ("past", "boundary")  # only in imported episodes
 
 _NAME = re.compile(r"[A-Za-z0-9_-]+")
 
 
 @dataclass(frozen=True, eq=False)
 class Episode:
-    """Frame 0 is the initial state, so T frames hold T - 1 steps of 1 / frame_rate_hz seconds.
+    """A trajectory. Frame 0 is the initial state, so T frames are T - 1 steps of 1 / frame_rate_hz seconds.
 
-    Raises: ConfigError for a wrong shape, type or value. Only the positions are not scanned for values that are
-    not finite (they may be a memory map of a file that was checked by its hash); `encode_episode` and
-    `decode_episode` scan them.
+    Raises: ConfigError for a wrong shape, type or value. Positions are not checked to be finite here (they may be a
+    memory map of a verified file), but by `encode_episode` and `decode_episode`.
     """
 
     key: str  # sample name inside the data set, without dots: train-000012
@@ -66,9 +64,9 @@ class Episode:
     solver: dict[str, Any]  # settings and counters: substeps, projections, floors hit
     # per-particle material parameters that differ from the solver's defaults, float32 [N] by name
     material_parameters: dict[str, np.ndarray] = field(default_factory=dict)
-    materials: tuple[str, ...] = MATERIALS  # imported sets bring names of their own, behind these
-    past_HN3: np.ndarray | None = None  # float32, the frames before frame 0, oldest first; none: free flight
-    boundary_P3: np.ndarray | None = None  # float32, particles at rest that obstacles were given as
+    materials: tuple[str, ...] = MATERIALS  # imported sets append names of their own
+    past_HN3: np.ndarray | None = None  # float32, the frames before frame 0, oldest first; None: free flight
+    boundary_P3: np.ndarray | None = None  # float32, particles at rest that represent obstacles
 
     def __post_init__(self) -> None:
         if not _NAME.fullmatch(self.key):
@@ -101,12 +99,12 @@ class Episode:
 
     @property
     def imported(self) -> bool:
-        """Whether another program made it: hgn.import_trajectories."""
+        """Whether the episode was imported (hgn.import_trajectories)."""
         return self.specification.get("kind") == "imported"
 
     @property
     def dimensions(self) -> int:
-        """Of its motion: 2 where z is that of a plane, always."""
+        """Dimensions of the motion; 2 where z is constant."""
         return int(self.specification.get("dimensions", 3))
 
     @property
@@ -118,7 +116,7 @@ class Episode:
         return int(self.position_TN3.shape[1])
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """By the names of their members, in the order they are stored in."""
+        """Returns the arrays by member name, in storage order."""
         arrays = {
             "position": self.position_TN3,
             "velocity": self.initial_velocity_N3,
@@ -134,7 +132,7 @@ class Episode:
 
 @dataclass(frozen=True)
 class _Description:
-    """The `json` member: what an episode holds beside its arrays."""
+    """The `json` member: the fields of an episode that are not arrays."""
 
     schema_version: int
     seed: int
@@ -148,7 +146,7 @@ class _Description:
 
 
 def encode_episode(episode: Episode) -> dict[str, bytes]:
-    """The members of an episode by the part of their name after `<key>.`, in the order they are stored in.
+    """Returns the members of an episode by their name after `<key>.`, in storage order.
 
     The same episode gives the same bytes on every machine: plain `.npy` (version 1.0, little-endian, C order)
     and JSON with sorted keys.
@@ -184,11 +182,10 @@ def encode_episode(episode: Episode) -> dict[str, bytes]:
 
 
 def decode_episode(key: str, members: Mapping[str, bytes | np.ndarray], scan_positions: bool = True) -> Episode:
-    """The inverse of `encode_episode`.
+    """Decodes the members of `encode_episode`.
 
-    Members are bytes or flat uint8 arrays. Arrays are views of the members, not copies: a slice of a memory map
-    stays a memory map. `scan_positions=False` leaves out the check for finite positions, for bytes whose hash was
-    checked.
+    Members are bytes or flat uint8 arrays. Arrays are views of the members: a slice of a memory map stays a memory map.
+    `scan_positions=False` skips the check for finite positions, for verified bytes.
 
     Raises: ConfigError for a missing or unknown member, another schema version, a wrong shape, type or value.
     """
@@ -201,7 +198,7 @@ def decode_episode(key: str, members: Mapping[str, bytes | np.ndarray], scan_pos
         if name != member and (name in _ARRAYS or name.startswith(PARAMETER_PREFIX)):
             dtype, axes = _ARRAYS.get(name, _PARAMETER)
             arrays[name] = decode_array(f"{key}.{member}", data, dtype, len(axes))
-        elif member != DESCRIPTION_MEMBER and member not in _IGNORED:
+        elif member != DESCRIPTION_MEMBER:
             known = ", ".join((*(f"{name}.npy" for name in _ARRAYS), "json"))
             raise ConfigError(f"{key}.{member} is not a known member; known: {known}")
     for name in _ARRAYS:
@@ -232,7 +229,7 @@ def decode_episode(key: str, members: Mapping[str, bytes | np.ndarray], scan_pos
 
 
 def decode_array(name: str, data: bytes | np.ndarray, dtype: str, dimensions: int) -> np.ndarray:
-    """The array in a plain `.npy` file held in memory (bytes or a flat uint8 array), as a view of it.
+    """Returns the array of a plain `.npy` file in memory (bytes or a flat uint8 array), as a view.
 
     Raises: ConfigError naming the member when it is no such file, of another type or number of dimensions, cut, or
     longer than its header says.
@@ -250,7 +247,7 @@ def decode_array(name: str, data: bytes | np.ndarray, dtype: str, dimensions: in
         raise ConfigError(f"{name} must hold {size} bytes for shape {shape}, got {len(raw) - start}")
     try:
         return raw[start:].view(stored).reshape(shape)
-    except ValueError as error:  # one length is 0, another beyond all bounds
+    except ValueError as error:  # one length is 0, another is too large
         raise ConfigError(f"{name} must have another shape, got {shape} ({error})") from None
 
 
@@ -264,7 +261,7 @@ def _decode_description(key: str, text: bytes) -> _Description:
 
 
 def require_schema_version(mapping: object, name: str) -> None:
-    """Raises ConfigError unless `mapping["schema_version"]` is this version's, before anything else is looked at."""
+    """Raises ConfigError unless `mapping["schema_version"]` is the current version; to be checked first."""
     version = mapping.get("schema_version") if isinstance(mapping, Mapping) else None
     if version != SCHEMA_VERSION:
         raise ConfigError(
@@ -274,7 +271,7 @@ def require_schema_version(mapping: object, name: str) -> None:
 
 
 def _require_finite_positions(episode: Episode) -> None:
-    # frame by frame, so that a memory map is not read whole
+    # frame by frame, so that a memory map is not loaded as a whole
     for frame, position_N3 in enumerate(np.asarray(episode.position_TN3)):
         if not np.isfinite(position_N3).all():
             raise ConfigError(
@@ -291,4 +288,4 @@ def _encode_array(array: np.ndarray, dtype: str) -> bytes:
     plain = np.ascontiguousarray(np.asarray(array), dtype=dtype)
     header = io.BytesIO()
     np.lib.format.write_array_header_1_0(header, np.lib.format.header_data_from_array_1_0(plain))
-    return b"".join((header.getvalue(), plain.data))  # copied once, where write_array does it three times
+    return b"".join((header.getvalue(), plain.data))  # one copy; write_array makes three

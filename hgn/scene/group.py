@@ -1,4 +1,4 @@
-"""Groups of particles: the solid shapes they fill, and the random points inside.
+"""Groups of particles: solid shapes filled with random points.
 
 Every number comes from `Generator.random()` through sums, products and square roots, so that the same seed
 gives the same bits on every machine. Shape legend: N particles, P points.
@@ -13,7 +13,7 @@ import numpy as np
 
 from hgn.schema import Vector
 
-WALL_CELLS = 3  # thickness of the solver's walls (MpmConfig.wall_cells); no particle starts inside them
+WALL_CELLS = 3  # of the solver's walls (MpmConfig.wall_cells); no particle starts inside them
 
 
 @dataclass(frozen=True)
@@ -30,26 +30,26 @@ class Region:
         return np.array(self.half_width) + self.radius
 
     def distances(self, point_P3: np.ndarray) -> np.ndarray:
-        """From the region to each point, float64 [P]; negative or zero inside."""
+        """Returns distances from the region to points, float64 [P]; negative or zero inside."""
         outside = np.maximum(np.abs(point_P3 - np.array(self.centre)) - np.array(self.half_width), 0.0)
         return np.sqrt((outside * outside).sum(axis=1)) - self.radius
 
     def distance(self, other: Region) -> float:
-        """Between the two regions; negative or zero where they overlap."""
+        """Returns the distance to another region; negative or zero where they overlap."""
         width = np.array(self.half_width) + np.array(other.half_width)
         outside = np.maximum(np.abs(np.array(self.centre) - np.array(other.centre)) - width, 0.0)
         return float(np.sqrt((outside * outside).sum())) - self.radius - other.radius
 
 
 def region_of(shape: str, size: Vector, centre: Vector) -> Region:
-    """The region of a cube, box (edges) or sphere (diameter, three times)."""
+    """Returns the region of a cube, box (edges) or sphere (diameter, three times)."""
     if shape == "sphere":
         return Region(centre, radius=0.5 * size[0])
     return Region(centre, half_width=(0.5 * size[0], 0.5 * size[1], 0.5 * size[2]))
 
 
 def particle_count(region: Region, particles_per_cell: float, cell_size: float) -> int:
-    """How many particles fill a region, by the rule of Taichi Elements: int(n + 1) in boxes, ceil(n) in balls.
+    """Returns the particles that fill a region, as in Taichi Elements: int(n + 1) in boxes, ceil(n) in balls.
 
     At 8 per cell of 1/64 a cube of 0.08 has 1,074 particles: four make the 4,296 of the paper's scenes
     without obstacles (sec. 4).
@@ -62,7 +62,7 @@ def particle_count(region: Region, particles_per_cell: float, cell_size: float) 
 
 
 def fill(region: Region, count: int, rng: np.random.Generator) -> np.ndarray:
-    """Uniformly random points inside a region, float32 [N, 3]."""
+    """Returns uniformly random points inside a region, float32 [N, 3]."""
     if region.radius > 0:
         local = points_in_ball(count, 3, rng) * region.radius
     else:
@@ -71,7 +71,7 @@ def fill(region: Region, count: int, rng: np.random.Generator) -> np.ndarray:
 
 
 def points_in_ball(count: int, dimensions: int, rng: np.random.Generator) -> np.ndarray:
-    """Uniformly random points of the unit ball, float64 [P, dimensions], by rejection from the cube."""
+    """Returns uniformly random points of the unit ball, float64 [P, dimensions], by rejection."""
     accepted = np.zeros((0, dimensions))
     while len(accepted) < count:
         candidate = 2 * rng.random((max(count, 16), dimensions)) - 1
@@ -80,9 +80,9 @@ def points_in_ball(count: int, dimensions: int, rng: np.random.Generator) -> np.
 
 
 def random_direction(rng: np.random.Generator, dimensions: int = 3) -> np.ndarray:
-    """A uniformly random unit vector, by rejection in the ball; of four dimensions a rotation's quaternion."""
+    """Returns a uniformly random unit vector by rejection; with four dimensions, a rotation's quaternion."""
     while True:
         point = points_in_ball(1, dimensions, rng)[0]
         length = float(np.sqrt((point * point).sum()))
-        if length > 0.1:  # dividing by less would magnify rounding
+        if length > 0.1:  # a smaller divisor would amplify rounding
             return point / length

@@ -1,4 +1,4 @@
-"""HDF5 files from anywhere: none of their data may lie in other files, and damage ends in one message."""
+"""Reads untrusted HDF5 files: links to other files are refused, damage ends in one message."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ import h5py
 from hgn.schema import ConfigError
 
 _DEPTH = 8  # of groups
-# what h5py raises for damage, and NumPy for a size that is claimed
+# exceptions of h5py for damage, and of NumPy for a size in a damaged file
 _DAMAGE = (LookupError, OSError, ValueError, RuntimeError, TypeError, AttributeError, ArithmeticError, MemoryError)
 
 
 @contextlib.contextmanager
 def damage_named(rule: str, remedy: str) -> Iterator[None]:
-    """While it is entered, what reading raises of a damaged file becomes a ConfigError `<rule>, got <cause>; <remedy>`.
+    """Turns exceptions of reading a damaged file into a ConfigError `<rule>, got <cause>; <remedy>`.
 
     `rule` names the file, as in `a.h5: position must be whole`.
     """
@@ -30,7 +30,7 @@ def damage_named(rule: str, remedy: str) -> Iterator[None]:
 
 
 def open_hdf5(path: Path, rule: str, remedy: str) -> h5py.File:
-    """A file, open for reading, that holds all its data itself. Raises: ConfigError, as `damage_named` does."""
+    """Opens a file that contains all its data itself. Raises: ConfigError, as `damage_named` does."""
     with damage_named(rule, remedy), contextlib.ExitStack() as stack:
         file = stack.enter_context(h5py.File(path, "r"))
         _require_own_data(file, path)
@@ -39,10 +39,10 @@ def open_hdf5(path: Path, rule: str, remedy: str) -> h5py.File:
 
 
 def _require_own_data(group: h5py.Group, path: Path, depth: int = 0) -> None:
-    """Raises ConfigError where a file names others, which HDF5 would read with this one's reader's rights."""
+    """Raises ConfigError where a file refers to others, which HDF5 would read with this reader's rights."""
     for name in group:
         if not isinstance(group.get(name, getlink=True), h5py.HardLink) or depth > _DEPTH:
-            raise ConfigError(f"{path}: {group.name} must hold its data itself, got a link in {name}")
+            raise ConfigError(f"{path}: {group.name} must contain its data itself, got a link in {name}")
         item = group[name]
         if isinstance(item, h5py.Group):
             _require_own_data(item, path, depth + 1)

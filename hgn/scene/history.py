@@ -1,7 +1,7 @@
-"""The past that a simulation lacks when it starts: ballistic motion into the initial state.
+"""The frames before the start of a simulation: ballistic motion into the initial state.
 
-Method: history before frame 0 is the ballistic back-extrapolation of the initial state, in training episodes
-and rollouts alike, so that a network can start a scene by itself.
+The history before frame 0 is the ballistic back-extrapolation of the initial state, in training and in rollouts, so
+that a network can start from any scene.
 Shape legend: H history steps, N particles, W = H + 2 window frames.
 """
 
@@ -22,7 +22,7 @@ def ballistic_positions(
     frame_rate_hz: float,
     frame_indices: Sequence[int],
 ) -> np.ndarray:
-    """Positions at the given frames (0 is now, negative is the past) of particles in free flight.
+    """Returns positions of particles in free flight at the given frames (0 is now, negative is the past).
 
     Units: domain units, domain units per second (squared). Returns float32 [len(frame_indices), N, 3];
     computed in float64.
@@ -33,7 +33,7 @@ def ballistic_positions(
 
 
 def ballistic_velocities(velocity_N3: np.ndarray, gravity_3: np.ndarray, history: int) -> np.ndarray:
-    """Displacements in the frames up to now of particles in free flight, newest first, float32 [N, history, 3].
+    """Returns displacements in the last frames of free flight, newest first, float32 [N, history, 3].
 
     Units: domain units per frame (squared). Over a frame that ends k frames ago a particle moves v - (k + 1/2) g;
     computed in float64, so that two of them differ by g to rounding of the velocity, not of the position.
@@ -43,11 +43,11 @@ def ballistic_velocities(velocity_N3: np.ndarray, gravity_3: np.ndarray, history
 
 
 def frames_before(episode: Episode, first: int) -> np.ndarray:
-    """The frames `first` (negative) to -1 of an episode, float32 [-first, N, 3].
+    """Returns the frames `first` (negative) to -1 of an episode, float32 [-first, N, 3].
 
-    Where free flight came from, or what an imported episode has of them.
+    They are ballistic, or stored in imported episodes.
 
-    Raises: ConfigError when that is too little.
+    Raises: ConfigError when too few are stored.
     """
     if episode.past_HN3 is not None:
         require_past(episode.past_HN3, -first)
@@ -62,14 +62,14 @@ def frames_before(episode: Episode, first: int) -> np.ndarray:
 
 
 def require_past(past_HN3: np.ndarray, history: int) -> None:
-    """Raises ConfigError unless there are as many frames before frame 0 as a network wants velocities."""
+    """Raises ConfigError unless an imported episode has as many frames before frame 0 as the network's history."""
     remedy = "import the trajectories again with a larger history=…"
     rule = f"at most the {len(past_HN3)} frames that the imported episodes have before their first"
     require(history <= len(past_HN3), "network.velocity_history", rule, history, remedy)
 
 
 def window(episode: Episode, frame: int, history: int, ahead: int = 1) -> np.ndarray:
-    """Positions x^{n-H} … x^{n+ahead} around frame n of an episode, float32 [H + 1 + ahead, N, 3], a fresh array.
+    """Returns positions x^{n-H} … x^{n+ahead} around frame n, float32 [H + 1 + ahead, N, 3], a new array.
 
     0 <= frame <= T - 1 - ahead. Frames before 0 are the ballistic back-extrapolation.
     """

@@ -1,7 +1,6 @@
-"""The materials that scenes are made of; an episode stores the index into `MATERIALS`.
+"""The materials of scenes; episodes store the index into `MATERIALS`.
 
-To add one: docs/how_to/add_material.md lists the places. Its name goes to the end here, for old episodes keep their
-indices. Data, networks, training and reports go by the index.
+docs/how_to/add_material.md lists what a new material needs. Append its name here: old episodes keep their indices.
 """
 
 from __future__ import annotations
@@ -15,12 +14,12 @@ from hgn.schema import ConfigError, require
 
 MATERIALS: tuple[str, ...] = ("water", "sand", "snow", "elastic")
 WATER, SAND, SNOW, ELASTIC = range(4)
-PAPER_MATERIALS = MATERIALS[:3]  # of data and networks, unless they say otherwise
-FLUIDS: tuple[int, ...] = (WATER,)  # without a deformation gradient: all that they remember is their volume
-MATERIAL_BITS = 4  # of the solver's label of a particle, which holds its material in these and its scene above
+PAPER_MATERIALS = MATERIALS[:3]  # defaults of data and networks
+FLUIDS: tuple[int, ...] = (WATER,)  # without a deformation gradient: their only memory is their volume
+MATERIAL_BITS = 4  # of a particle's label in the solver: the material, below the scene
 MATERIAL_MASK = (1 << MATERIAL_BITS) - 1
 assert len(MATERIALS) <= 1 << MATERIAL_BITS
-# what particles of one material may differ in, by the names that MpmConfig gives the defaults
+# constants that may differ between particles of one material; MpmConfig has the defaults
 MATERIAL_PARAMETERS: tuple[str, ...] = (
     "youngs_modulus_pa",
     "poisson_ratio",
@@ -35,7 +34,7 @@ MATERIAL_PARAMETERS: tuple[str, ...] = (
 
 
 def material_index(name: str) -> int:
-    """The index of a material name in `MATERIALS`.
+    """Returns the index of a material name in `MATERIALS`.
 
     Raises: ConfigError when the name is unknown.
     """
@@ -48,7 +47,7 @@ MATERIAL_NAME = re.compile(r"[a-z][a-z0-9_]{0,31}")  # of an imported set's mate
 
 
 def require_materials(owner: str, material_N: np.ndarray, materials: Sequence[str]) -> None:
-    """Raises ConfigError unless field `owner` holds indices into `materials`, and these are names."""
+    """Raises ConfigError unless field `owner` contains indices into `materials`, and these are valid names."""
     for name in materials:
         if MATERIAL_NAME.fullmatch(name) is None:
             raise ConfigError(f"{owner}: materials must be names of lower-case letters, digits and _, got {name!r}")

@@ -1,4 +1,4 @@
-"""Users' meshes as obstacles: STL, OBJ, PLY and GLB files through trimesh.
+"""Mesh files as obstacles: STL, OBJ, PLY and GLB through trimesh.
 
 Shape legend: V vertices, F triangles, E directed triangle edges (3 F).
 """
@@ -19,7 +19,7 @@ from hgn.scene.scene import Obstacle
 from hgn.scene.surface import area_vectors
 from hgn.schema import ConfigError, Vector, require
 
-# what trimesh raises for damaged files of these formats
+# exceptions of trimesh for damaged files
 _READ_ERRORS = (
     *(ValueError, LookupError, TypeError, AttributeError, EOFError, struct.error, ImportError),
     *(ArithmeticError, MemoryError, RecursionError, NotImplementedError, OSError),
@@ -27,12 +27,12 @@ _READ_ERRORS = (
 
 
 class _Beside(trimesh.resolvers.FilePathResolver):
-    """What a mesh file may name: plain files in its own folder or below, no pipes, devices or files elsewhere."""
+    """Resolves references of a mesh file, only to plain files in its own folder or below."""
 
     def get(self, name: str) -> bytes:
         path = (Path(self.parent) / name).resolve()
         if not (path.is_file() and path.is_relative_to(Path(self.parent).resolve())):
-            raise FileNotFoundError(f"it names {name!r}, which is no file beside it")
+            raise FileNotFoundError(f"it names {name!r}, which is no file in its folder")
         return path.read_bytes()
 
 
@@ -46,10 +46,9 @@ def load_mesh(
 ) -> Obstacle:
     """Reads a mesh file: scaled, then turned about the fixed x, y and z axes (degrees, in this order), then moved.
 
-    All parts of a file become one obstacle. Corners at equal float32 coordinates are welded, zero-area and
-    repeated triangles dropped. A watertight mesh (two triangles at every edge, orientable) is closed and its
-    flipped triangles are turned to agree with their neighbours; every other mesh is a sheet. It may reach
-    outside the domain.
+    All parts of a file become one obstacle. Corners with equal float32 coordinates are merged, zero-area and repeated
+    triangles dropped. A watertight mesh (two triangles at every edge, orientable) becomes a solid with consistent
+    orientation; every other mesh is a sheet. It may reach outside the domain.
 
     Raises: ConfigError naming `field` for a missing or unreadable file, an unknown suffix, no triangles,
     non-finite coordinates, only zero-area triangles, or a bad scale, translation or rotation.
@@ -87,7 +86,7 @@ def _read(path: Path, field: str) -> tuple[np.ndarray, np.ndarray]:
     if not path.is_file():
         raise ConfigError(f"{field} must be an existing file, got {path}; in a scene file paths are relative to it")
     try:
-        # process=False: trimesh would silently remove non-finite vertices
+        # else trimesh would silently remove non-finite vertices
         beside = _Beside(str(path))
         mesh = trimesh.load_scene(path, process=False, skip_materials=True, resolver=beside).to_mesh()
         vertex = np.array(mesh.vertices, np.float64).reshape(-1, 3)
@@ -107,7 +106,7 @@ def _read(path: Path, field: str) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _weld(vertex_V3: np.ndarray, triangle_F3: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Merges equal vertices and drops zero-area triangles, repeated triangles and unused vertices."""
+    """Merges equal vertices; drops zero-area and repeated triangles and unused vertices."""
     unique, index = np.unique(vertex_V3 + 0.0, axis=0, return_inverse=True)  # + 0.0 turns -0 to 0
     triangle = index.reshape(-1)[triangle_F3]
     triangle = triangle[(area_vectors(unique[triangle]) != 0).any(axis=1)]
@@ -118,11 +117,11 @@ def _weld(vertex_V3: np.ndarray, triangle_F3: np.ndarray) -> tuple[np.ndarray, n
 
 
 def _orientation(triangle_F3: np.ndarray) -> np.ndarray | None:
-    """Which triangles to flip, bool [F], so that neighbours agree; None unless the mesh is watertight.
+    """Returns the triangles to flip, bool [F], so that neighbours agree; None for a mesh that is not watertight.
 
-    Each part keeps the orientation of most of its triangles. Two copies of every triangle, one per
-    orientation, are joined to the copies of the neighbours that agree with them: an orientable part falls into
-    two components, a one-sided part (which bounds nothing) into one.
+    Each part keeps the orientation of most of its triangles. Two copies of every triangle, one per orientation, are
+    connected to the copies of the neighbours that agree with them: an orientable part has two components, a one-sided
+    part has one.
     """
     count = len(triangle_F3)
     start_E, end_E = triangle_F3.T.reshape(-1), np.roll(triangle_F3, -1, axis=1).T.reshape(-1)

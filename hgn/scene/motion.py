@@ -1,4 +1,4 @@
-"""How an obstacle moves: poses at keyframes, and what lies between them.
+"""Motion of obstacles: interpolation between poses at keyframes.
 
 Shape legend: T keyframes, P points.
 """
@@ -16,10 +16,10 @@ from hgn.schema import Vector, require
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """Rigid motion: turned about `pivot`, then moved, from where the obstacle lies in its scene.
+    """Rigid motion: rotation about `pivot`, then translation, relative to the pose in the scene.
 
-    Between keyframes translation is linear and the rate of turning constant, by the shorter way round; before the
-    first and after the last the obstacle stands still.
+    Between keyframes translation is linear and angular velocity constant, by the shorter way; before the first and
+    after the last keyframe the obstacle is at rest.
     """
 
     time_T: np.ndarray  # float64, seconds, increasing
@@ -37,7 +37,7 @@ class Motion:
         )
 
     def pose(self, time: float) -> tuple[np.ndarray, np.ndarray]:
-        """Rotation, float64 [3, 3], and translation, float64 [3], at a time in seconds."""
+        """Returns rotation, float64 [3, 3], and translation, float64 [3], at a time in seconds."""
         last = len(self.time_T) - 1
         after = int(np.searchsorted(self.time_T, time, side="right"))
         if after == 0 or after > last:
@@ -49,17 +49,17 @@ class Motion:
         return turned(share * turn) @ self.rotation_T33[after - 1], begin + share * (end - begin)
 
     def place(self, point_P3: np.ndarray, time: float) -> np.ndarray:
-        """Where points of the obstacle as its scene has it are at a time, float64 [P, 3]."""
+        """Returns the places of the obstacle's points at a time, float64 [P, 3]."""
         rotation, translation = self.pose(time)
         return rotate(np.asarray(point_P3, np.float64) - self.pivot, rotation) + self.pivot + translation
 
     def transform(self, time: float) -> tuple[np.ndarray, np.ndarray]:
-        """R, float64 [3, 3], and t, float64 [3], that take a point x of the obstacle to R x + t at a time."""
+        """Returns R, float64 [3, 3], and t, float64 [3], that map a point x of the obstacle to R x + t at a time."""
         return self.pose(time)[0], self.place(np.zeros((1, 3)), time)[0]
 
     def rates(self, begin: float, end: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Mean rates from one time to another: angular velocity, rad/s [3]; velocity [3] of the pivot, and its place
-        [3] at the beginning.
+        """Returns mean angular velocity, rad/s [3], and mean velocity [3] of the pivot between two times, and the
+        pivot's position [3] at the first.
         """
         rotation, translation = self.pose(begin)
         later_rotation, later_translation = self.pose(end)
@@ -69,7 +69,7 @@ class Motion:
 
 
 def turning(rotation_33: np.ndarray) -> np.ndarray:
-    """The axis of a rotation times its angle in radians, at most pi, float64 [3]."""
+    """Returns the axis of a rotation times its angle in radians, at most pi, float64 [3]."""
     axis = np.array(
         [
             rotation_33[2, 1] - rotation_33[1, 2],
@@ -83,13 +83,13 @@ def turning(rotation_33: np.ndarray) -> np.ndarray:
         return np.asarray(axis * (0.5 * angle / sine))
     if cosine > 0:
         return np.asarray(0.5 * axis)
-    # half a turn: R + I is twice the projection on the axis
+    # an angle of pi: R + I is twice the projection on the axis
     column = (rotation_33 + np.eye(3))[:, int(np.argmax(np.diag(rotation_33)))]
     return np.asarray(angle * column / np.linalg.norm(column))
 
 
 def turned(turn: np.ndarray) -> np.ndarray:
-    """The rotation, float64 [3, 3], about an axis by its length in radians (Rodrigues)."""
+    """Returns the rotation, float64 [3, 3], about an axis by its length in radians (Rodrigues)."""
     angle = float(np.linalg.norm(turn))
     cross = np.array([[0, -turn[2], turn[1]], [turn[2], 0, -turn[0]], [-turn[1], turn[0], 0]])
     if angle < 1e-12:

@@ -1,7 +1,7 @@
-"""NumPy's files, read without trusting them: what a header claims is checked, and pickles make arrays alone.
+"""Reads untrusted NumPy files: headers are checked, and pickles can create arrays only.
 
-geoelements/gns keeps trajectories as object arrays, which NumPy pickles. To load such a file in the usual way would run
-whatever its writer put there, and a state that no array has makes NumPy write beyond its memory.
+geoelements/gns stores trajectories as object arrays, which NumPy pickles. NumPy's loader would run any code in such a
+file, and an invalid array state makes it write outside its memory.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from hgn.schema import ConfigError
 
 _MULTIARRAY = ("numpy.core.multiarray", "numpy._core.multiarray")
 _PLAIN_TYPE = re.compile(r"b1|[iu][1248]|f[248]|O8?")
-# of a header, which NumPy evaluates as Python, of sizes that it claims, and of what pickles make of the pieces they get
+# of headers, which NumPy evaluates as Python, of the sizes in them, and of unpickling
 _ERRORS = (
     *(pickle.UnpicklingError, ValueError, TypeError, OverflowError, EOFError, OSError, AttributeError, LookupError),
     *(SyntaxError, tokenize.TokenError, RecursionError, MemoryError),
@@ -31,7 +31,7 @@ _ERRORS = (
 
 
 class _Type:
-    """The type of a pickled array: NumPy's own would take any state, and is shared by the whole process."""
+    """The type of a pickled array. NumPy's own would accept any state, and is shared by the whole process."""
 
     def __init__(self, name: str, *_: Any) -> None:
         if _PLAIN_TYPE.fullmatch(name) is None:
@@ -43,7 +43,7 @@ class _Type:
 
 
 class _Array(np.ndarray):
-    """An array that takes no state but one of its own size."""
+    """An array that accepts only a state of its own size."""
 
     def __setstate__(self, state: Any) -> None:
         _, shape, kind, fortran_order, content = state
@@ -62,7 +62,7 @@ class _ArraysAlone(pickle.Unpickler):
         if module in _MULTIARRAY and name in ("_reconstruct", "scalar"):
             return _empty_array if name == "_reconstruct" else _scalar
         if module == "numpy" and name in ("ndarray", "dtype"):
-            return _Type if name == "dtype" else name  # of arrays all are _Array
+            return _Type if name == "dtype" else name  # every array becomes an _Array
         raise pickle.UnpicklingError(f"{module}.{name}, which is no part of an array")
 
     def persistent_load(self, pid: Any) -> Any:
@@ -78,10 +78,10 @@ def _scalar(kind: _Type, content: bytes) -> Any:
 
 
 def read_npz(path: Path | BinaryIO, objects: bool = False) -> Iterator[tuple[str, np.ndarray]]:
-    """Names and arrays of an archive, one after the other, read-only. With `objects` arrays may hold arrays, numbers,
-    tuples and lists.
+    """Yields names and read-only arrays of an archive. With `objects` arrays may contain arrays, numbers, tuples and
+    lists.
 
-    Raises: ConfigError naming the file and the array that is cut, altered, or holds anything else.
+    Raises: ConfigError naming the file and the array that is cut, altered, or contains other objects.
     """
     try:
         with zipfile.ZipFile(path) as archive:
@@ -98,9 +98,9 @@ def read_npz(path: Path | BinaryIO, objects: bool = False) -> Iterator[tuple[str
 def read_header(
     file: BinaryIO, name: str, newest: tuple[int, int] = (2, 0)
 ) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
-    """Shape, whether in Fortran order, and type of a `.npy` file's array, which follows.
+    """Returns shape, Fortran order and type of the array that follows a `.npy` header.
 
-    Raises: ConfigError in the name of `name` for what is no such file, or of a version after the `newest` to be read.
+    Raises: ConfigError naming `name` for another file, or a version after `newest`.
     """
     try:
         version = np.lib.format.read_magic(file)

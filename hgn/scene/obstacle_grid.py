@@ -1,4 +1,4 @@
-"""Obstacles as the network sees them: one mean normal in each grid cell that an obstacle passes through.
+"""Obstacle cells, the network's input: a mean normal in each cell that an obstacle passes through.
 
 Paper sec. 3: sample the surface with points no closer than cell_size / 4, flip each sample's normal where it
 points away from the centre of its cell, sum per cell, normalise. Stored sparsely.
@@ -16,9 +16,9 @@ from hgn.scene.scene import Obstacle, all_corners
 from hgn.scene.surface import area_vectors, sample_surface, split_long_edges
 from hgn.schema import ConfigError, Vector, require
 
-CANCELLED = 0.25  # below this mean length the normals of a cell cancel; three faces of a corner give 0.58
-NORMAL_SPACING_CELLS = 0.25  # of the samples that normals are made from
-SPLIT_CELLS = 16.0  # longest edge, in cells, of the pieces that are cut to the domain
+CANCELLED = 0.25  # mean length below which normals cancel; three faces of a corner give 0.58
+NORMAL_SPACING_CELLS = 0.25  # of the samples for normals
+SPLIT_CELLS = 16.0  # longest edge of the pieces that are cut to the domain
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,14 +36,13 @@ def build_obstacle_grid(
     seed: int,
     domain_size: Vector | None = None,
 ) -> ObstacleGrid:
-    """The mean obstacle normal of every cell that a surface passes through (Paper sec. 3).
+    """Returns the mean obstacle normal of every cell that a surface passes through (Paper sec. 3).
 
-    Samples no two closer than cell_size / 4, over all obstacles together; each gives its triangle's normal,
-    negated where it points away from the cell's centre; summed per cell and normalised. Where the sum cancels
-    (two sheets facing each other across the centre) the cell takes the corrected normal of the sample nearest
-    to its centre, for a sum near zero says nothing about direction and zero would say "no obstacle".
-    Zero-area triangles are skipped. Cells may lie outside the domain; with `domain_size` those more than a
-    cell outside are left out, which keeps a mesh much larger than the domain affordable. Deterministic.
+    Samples of all obstacles are at least cell_size / 4 apart. Each contributes its triangle's normal, negated where it
+    points away from the cell's centre; the sum per cell is normalised. Where the sum cancels (two sheets on both sides
+    of the centre) the cell takes the normal of the sample nearest to its centre, because zero would mean "no obstacle".
+    Zero-area triangles are skipped. With `domain_size`, cells more than a cell outside the domain are left out, which
+    bounds the cost of large meshes. Deterministic.
 
     Raises: ConfigError for a bad cell size, or a surface too large to sample.
     """
@@ -56,9 +55,9 @@ def surface_samples(
     seed: int,
     domain_size: Vector | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The points that `build_obstacle_grid` takes normals from, float64 [S, 3], and their triangles' unit normals.
+    """Returns the samples of `build_obstacle_grid`, float64 [S, 3], and the unit normals of their triangles.
 
-    They may be turned and moved with an obstacle, to have the cells of other places without sampling it again.
+    They can be moved with an obstacle, to compute its cells elsewhere without sampling it again.
     Raises: ConfigError as `build_obstacle_grid`.
     """
     corner_F33, point_S3, owner_S = _samples(obstacles, cell_size, seed, domain_size)
@@ -67,7 +66,7 @@ def surface_samples(
 
 
 def grid_of_samples(point_S3: np.ndarray, normal_S3: np.ndarray, cell_size: float) -> ObstacleGrid:
-    """The mean normal of every cell that holds a sample, from points and unit normals of `surface_samples`."""
+    """Returns the mean normal of every cell with a sample, from points and normals of `surface_samples`."""
     if len(point_S3) == 0:
         return ObstacleGrid(cell_size, np.zeros((0, 3), np.int32), np.zeros((0, 3), np.float32))
 
@@ -111,7 +110,7 @@ def _samples(
     domain_size: Vector | None,
     spacing_cells: float = NORMAL_SPACING_CELLS,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Triangle corners, surface points no closer than `spacing_cells` cells, and the triangle of each."""
+    """Returns triangle corners, surface points at least `spacing_cells` cells apart, and the triangle of each."""
     require(0 < cell_size < np.inf, "cell_size", "a finite number > 0", cell_size, "the paper uses 1/64")
     corner_F33 = all_corners(obstacles)
     if domain_size is not None:
@@ -126,7 +125,7 @@ def _samples(
 
 
 def _lexicographic_keys(floor_S3: np.ndarray) -> tuple[np.ndarray, np.ndarray, tuple[int, ...]]:
-    """One integer per cell that sorts like the cell's coordinates; with the lowest cell and the extent."""
+    """Returns an integer per cell that sorts like its coordinates, the lowest cell and the extent."""
     low, high = floor_S3.min(axis=0), floor_S3.max(axis=0)
     extent = [int(length) + 1 for length in high - low]
     if max(abs(low).max(), abs(high).max()) >= 2**31 or extent[0] * extent[1] * extent[2] >= 2**63:

@@ -3,14 +3,13 @@
 Two top-level groups:
 
 /VTKHDF  a temporal PolyData of the VTKHDF specification (version 2): the obstacles' triangles, whose vertices come
-         first in each step, and one vertex cell a particle. PointData `material` (255 on obstacles) and `velocity`,
-         CellData `obstacle` (the number of each, -1 of particles). Topology and materials are stored once; every step
-         points at them again, at the first of the particles where some enter later.
-/hgn     what VTK has no place for: domain, gravity, obstacles, how the rollout was made, the ground truth.
-         The specification leaves groups outside /VTKHDF to the writer.
+         first in each step, and a vertex cell for each particle. PointData `material` (255 on obstacles) and
+         `velocity`, CellData `obstacle` (its number, -1 for particles). Topology and materials are stored once; each
+         step refers to as many of the particles as are present.
+/hgn     data without a place in VTK: domain, gravity, obstacles, source, ground truth. The specification leaves groups
+         outside /VTKHDF to the writer.
 
-ParaView picks its VTKHDF reader by the endings .vtkhdf and .hdf; a file with another ending opens as well,
-once that reader is chosen in the dialogue.
+ParaView selects its VTKHDF reader by the endings .vtkhdf and .hdf; for other endings choose it in the dialogue.
 
 Shape legend: T frames, N particles, R frames of ground truth, V vertices, F triangles.
 """
@@ -42,16 +41,15 @@ FORMAT_NAME = "hgn rollout"
 FORMAT_VERSION = 2  # 1 had no obstacles in /VTKHDF
 OBSTACLE_MATERIAL = 255
 MOTION_FIELDS = ("time_T", "translation_T3", "rotation_T33")
-VTKHDF_VERSION = (2, 0)  # the oldest that knows temporal PolyData, so that older ParaViews open the file too
+VTKHDF_VERSION = (2, 0)  # the oldest with temporal PolyData, so that older ParaViews open the file too
 CELL_CATEGORIES = ("Vertices", "Lines", "Polygons", "Strips")  # in the order of Steps/CellOffsets
 
 
 @dataclass(frozen=True, eq=False)
 class Rollout:
-    """A simulated trajectory with all that is needed to draw it. Frame 0 is the initial state.
+    """A simulated trajectory with all data for drawing it. Frame 0 is the initial state.
 
-    Positions may hold NaN: a rollout that diverged is kept as it is. The ground truth may be shorter or
-    longer than the rollout.
+    Positions of a diverged rollout may be NaN. The ground truth may be shorter or longer than the rollout.
 
     Raises: ConfigError on shapes or materials that do not fit together, and on numbers out of bounds.
     """
@@ -62,15 +60,15 @@ class Rollout:
     domain_size: BoxSize
     frame_rate_hz: Positive[float]
     gravity: Vector = (0.0, -9.8, 0.0)  # domain units per second squared
-    cell_size: Positive[float] = 1 / 64  # of the obstacle cells
+    cell_size: Positive[float] = 1 / 64  # of obstacle cells
     # JSON-able: weights and their sha256, the scene's specification, settings
     source: dict[str, Any] = field(default_factory=dict)
     reference_TN3: np.ndarray | None = None  # float32 [R, N, 3], ground truth at the same frame rate
-    # int64 [N], in order: the frame in which each particle is seen first, before which its positions count for nothing
-    # and are read as NaN; None: all are there from the start
+    # int64 [N], sorted: the first frame of each particle, before which its positions are ignored and read as NaN; None:
+    # all particles are present from the start
     entry_frame_N: np.ndarray | None = None
     materials: tuple[str, ...] = MATERIALS
-    # of its motion: with 2 all lies on a plane across z, in the middle of the domain
+    # of the motion; with 2 all particles lie on the plane in the middle of the domain across z
     dimensions: Annotated[int, Bound("2 or 3", lambda count: count in (2, 3))] = 3
 
     def __post_init__(self) -> None:
@@ -99,14 +97,14 @@ class Rollout:
         return self.position_TN3.shape[1]
 
     def present(self, frame: int) -> int:
-        """How many particles are there in a frame: the first of all."""
+        """Returns the number of particles present in a frame, which are the first of all."""
         if self.entry_frame_N is None:
             return self.particle_count
         return int(np.searchsorted(self.entry_frame_N, frame, side="right"))
 
 
 def frame_velocity(position_TN3: np.ndarray, frame_rate_hz: float) -> np.ndarray:
-    """Velocities that led to each frame, float32 [T, N, 3] in domain units per second.
+    """Returns the velocity into each frame, float32 [T, N, 3] in domain units per second.
 
     Backward differences, the network's own definition (paper sec. 3.1); frame 0 repeats the first step.
     """
@@ -118,7 +116,7 @@ def frame_velocity(position_TN3: np.ndarray, frame_rate_hz: float) -> np.ndarray
 
 
 def rollout_velocity(rollout: Rollout) -> np.ndarray:
-    """`frame_velocity` of a rollout; what enters has in its first frame the velocity of its second, or none."""
+    """Returns `frame_velocity`, where entering particles take the velocity of their second frame, or zero."""
     velocity_TN3 = frame_velocity(rollout.position_TN3, rollout.frame_rate_hz)
     if rollout.entry_frame_N is not None:
         last = rollout.frame_count - 1
@@ -130,7 +128,7 @@ def rollout_velocity(rollout: Rollout) -> np.ndarray:
 
 
 def obstacles_of_episode(episode: Episode) -> tuple[Obstacle, ...]:
-    """The meshes of an episode's obstacles; where only its cells are known, a square each."""
+    """Returns the meshes of an episode's obstacles; where only its cells are known, a square for each cell."""
     known = known_obstacles(episode)
     if known is None:
         return cell_obstacles(episode.obstacle_grid, episode.domain_size[2] / 2 if episode.dimensions == 2 else None)
@@ -138,10 +136,10 @@ def obstacles_of_episode(episode: Episode) -> tuple[Obstacle, ...]:
 
 
 def known_obstacles(episode: Episode) -> tuple[Obstacle, ...] | None:
-    """The meshes of an episode's obstacles, which shards do not hold.
+    """Returns the meshes of an episode's obstacles, which shards do not contain, or None.
 
-    A random scene's specification has the shape and place of each, so its meshes are built again. Where that names
-    mesh files that are not here, and of any other scene, only the obstacle cells are known: none.
+    The meshes of a random scene are rebuilt from its specification. They are unknown where that names a mesh file that
+    is missing, and for all other scenes.
     """
     records = episode.specification.get("obstacles", ())
     if episode.specification.get("kind") != "random" or not all(_is_here(record) for record in records):
@@ -179,9 +177,9 @@ def episode_surface(episode: Episode, spacing_cells: float) -> np.ndarray:
 
 
 def cell_obstacles(grid: ObstacleGrid, plane_z: float | None = None) -> tuple[Obstacle, ...]:
-    """One square in each obstacle cell: a stand-in where only the cells are known.
+    """Returns one square in each obstacle cell, for episodes without meshes.
 
-    It lies across the cell's normal; of a flat set, whose plane is at `plane_z`, it is the part of the cell in there.
+    The square is perpendicular to the cell's normal; for a 2D set it is the cell's section with the plane at `plane_z`.
     """
     if not len(grid.cell_K3):
         return ()
@@ -206,7 +204,7 @@ def cell_obstacles(grid: ObstacleGrid, plane_z: float | None = None) -> tuple[Ob
 
 
 def write_rollout(path: str | Path, rollout: Rollout) -> None:
-    """Writes `rollout` to `path`; the file appears whole or not at all, and replaces one that was there.
+    """Writes `rollout` to `path`, atomically; makes missing folders.
 
     Folders are made as needed.
     """
@@ -223,7 +221,7 @@ def write_rollout(path: str | Path, rollout: Rollout) -> None:
 
 
 def read_rollout(path: str | Path) -> Rollout:
-    """Reads what `write_rollout` wrote.
+    """Reads a file of `write_rollout`.
 
     Raises: ConfigError when the file is missing, damaged, or not a rollout of this version.
     """
@@ -242,7 +240,7 @@ def read_rollout(path: str | Path) -> Rollout:
 def _write_vtkhdf(group: h5py.Group, rollout: Rollout) -> None:
     frames, particles = rollout.frame_count, rollout.particle_count
     group.attrs["Version"] = np.array(VTKHDF_VERSION, np.int64)
-    # VTK compares a fixed-length ASCII string; h5py would otherwise write one of variable length
+    # VTK requires a fixed-length ASCII string; h5py would write one of variable length
     group.attrs.create("Type", np.bytes_("PolyData"))
     time_T = np.arange(frames) / rollout.frame_rate_hz  # seconds
     vertex_TV3, triangle_F3, obstacle_F = _triangles(rollout.obstacles, time_T)
@@ -285,7 +283,7 @@ def _write_vtkhdf(group: h5py.Group, rollout: Rollout) -> None:
 
 
 def _triangles(obstacles: tuple[Obstacle, ...], time_T: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Vertices of all obstacles at each time, float32 [T, V, 3], the triangles [F, 3], and the obstacle of each [F]."""
+    """Returns vertices of all obstacles at each time, float32 [T, V, 3], triangles [F, 3], and obstacle numbers [F]."""
     places = [np.zeros((len(time_T), 0, 3), np.float32)]
     triangles, first = [np.zeros((0, 3), np.int64)], 0
     for obstacle in obstacles:
@@ -300,7 +298,7 @@ def _triangles(obstacles: tuple[Obstacle, ...], time_T: np.ndarray) -> tuple[np.
 
 
 def _stacked(value_TV3: np.ndarray, value_TN3: np.ndarray, present_T: np.ndarray) -> np.ndarray:
-    """The vertices' and the first particles' rows of each frame, one frame after another, float32 [rows, 3]."""
+    """Returns the vertices' and the present particles' rows, frame by frame, float32 [rows, 3]."""
     if not value_TV3.shape[1] and (present_T == value_TN3.shape[1]).all():
         return value_TN3.reshape(-1, 3).astype(np.float32, copy=False)
     parts = zip(value_TV3, value_TN3, present_T, strict=True)
@@ -317,7 +315,7 @@ def _write_own(group: h5py.Group, rollout: Rollout) -> None:
     group.attrs["domain_size"] = np.array(rollout.domain_size, np.float64)
     group.attrs["gravity"] = np.array(rollout.gravity, np.float64)
     group.attrs["cell_size"] = float(rollout.cell_size)
-    group["source"] = json.dumps(rollout.source)  # a dataset: attributes end at 64 KiB
+    group["source"] = json.dumps(rollout.source)  # a dataset, because attributes are limited to 64 KiB
     obstacles = group.create_group("obstacles")
     for index, obstacle in enumerate(rollout.obstacles):
         entry = obstacles.create_group(f"{index:04d}")
@@ -355,7 +353,7 @@ def _read(file: h5py.File) -> Rollout:
     own, vtk = file["hgn"], file["VTKHDF"]
     count_T = vtk["NumberOfPoints"][()]
     points, material_P = vtk["Points"], vtk["PointData/material"][()]
-    vertices = len(material_P) - len(vtk["Vertices/Connectivity"])  # of the obstacles, before the particles
+    vertices = len(material_P) - len(vtk["Vertices/Connectivity"])  # of obstacles, stored before the particles
     material_N = material_P[vertices:]
     shape = (len(count_T), len(material_N), 3)
     entry_N = own["entry_frame"][()] if "entry_frame" in own else np.zeros(shape[1], np.int64)
@@ -378,7 +376,7 @@ def _read(file: h5py.File) -> Rollout:
         reference_TN3=own["reference"][()] if "reference" in own else None,
         entry_frame_N=entry_N if "entry_frame" in own else None,
         materials=tuple(json.loads(own.attrs["materials"])),
-        dimensions=int(own.attrs.get("dimensions", 3)),  # of which older files do not tell
+        dimensions=int(own.attrs.get("dimensions", 3)),  # missing in older files
     )
 
 

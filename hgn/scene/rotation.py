@@ -1,4 +1,4 @@
-"""Rotations and placements of points by plain sums and products, so that results do not depend on a BLAS."""
+"""Rotations of points by plain sums and products, so that results do not depend on a BLAS."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _QUARTER_TURNS = {0.0: (1.0, 0.0), 90.0: (0.0, 1.0), 180.0: (-1.0, 0.0), 270.0: 
 
 
 def quaternion_rotation(quaternion: tuple[float, float, float, float]) -> np.ndarray:
-    """The rotation matrix, float64 [3, 3], of a unit quaternion (w, x, y, z)."""
+    """Returns the rotation matrix, float64 [3, 3], of a unit quaternion (w, x, y, z)."""
     w, x, y, z = quaternion
     return np.array(
         [
@@ -26,7 +26,7 @@ def quaternion_rotation(quaternion: tuple[float, float, float, float]) -> np.nda
 def quaternion_product(
     left: tuple[float, float, float, float], right: tuple[float, float, float, float]
 ) -> tuple[float, float, float, float]:
-    """The quaternion (w, x, y, z) of the rotation by `right` and then by `left`."""
+    """Returns the quaternion (w, x, y, z) of the rotation by `right` and then by `left`."""
     (a, b, c, d), (e, f, g, h) = left, right
     return (
         a * e - b * f - c * g - d * h,
@@ -37,7 +37,7 @@ def quaternion_product(
 
 
 def euler_rotation(degrees: Vector) -> np.ndarray:
-    """The matrix, float64 [3, 3], that turns about the fixed x axis, then y, then z.
+    """Returns the matrix, float64 [3, 3], that turns about the fixed x axis, then y, then z.
 
     Quarter turns are exact: an axis-aligned mesh stays axis-aligned.
     """
@@ -55,11 +55,11 @@ def euler_rotation(degrees: Vector) -> np.ndarray:
 
 
 def rotate(point_P3: np.ndarray, rotation_33: np.ndarray) -> np.ndarray:
-    """Each row multiplied by the matrix from the left, float64 [P, 3]."""
+    """Multiplies each row by the matrix from the left, float64 [P, 3]."""
     x, y, z = point_P3[:, 0], point_P3[:, 1], point_P3[:, 2]
     return np.stack([row[0] * x + row[1] * y + row[2] * z for row in rotation_33], axis=1)
 
 
 def round_to_float32(point_P3: np.ndarray) -> np.ndarray:
-    """float64 values that float32 holds exactly: last-bit differences between maths libraries vanish."""
+    """Rounds to float32 values, as float64: last-bit differences between maths libraries vanish."""
     return point_P3.astype(np.float32).astype(np.float64)

@@ -1,6 +1,6 @@
-"""What is simulated: particles at their initial state, and obstacles as triangle meshes.
+"""Scenes: particles in their initial state, and obstacles as triangle meshes.
 
-A scene is fixed once made. Lengths are in domain units (the paper's domain is 1 x 1 x 1), y points up.
+A scene is immutable. Lengths are in domain units (the paper's domain is 1 x 1 x 1), y points up.
 Shape legend: N particles, V vertices, F triangles.
 """
 
@@ -20,9 +20,9 @@ from hgn.schema import ConfigError, Vector, require
 
 @dataclass(frozen=True, eq=False)
 class Obstacle:
-    """A triangle mesh, at rest or with the motion that is given.
+    """A triangle mesh, at rest or in motion.
 
-    `closed` tells a solid (watertight) body from a sheet; the solver treats the two differently.
+    `closed` means a watertight solid; the solver treats solids and sheets differently.
     """
 
     name: str
@@ -34,18 +34,18 @@ class Obstacle:
 
     @property
     def corners(self) -> np.ndarray:
-        """Of its triangles, float64 [F, 3, 3]."""
+        """The corners of its triangles, float64 [F, 3, 3]."""
         return np.asarray(self.vertex_V3, np.float64)[self.triangle_F3]
 
 
 def all_corners(obstacles: Sequence[Obstacle]) -> np.ndarray:
-    """Those of all triangles of several obstacles, float64 [F, 3, 3]."""
+    """Returns the triangle corners of several obstacles, float64 [F, 3, 3]."""
     return np.concatenate([np.zeros((0, 3, 3)), *(obstacle.corners for obstacle in obstacles)])
 
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """One scene, ready for the solver and for the network's rollout."""
+    """A scene, input of the solver and of a network's rollout."""
 
     position_N3: np.ndarray  # float32, domain units
     velocity_N3: np.ndarray  # float32, domain units per second
@@ -54,17 +54,16 @@ class Scene:
     domain_size: Vector = (1.0, 1.0, 1.0)
     cell_size: float = 1 / 64  # spacing of the solver's grid and of the obstacle cells
     gravity: Vector = (0.0, -9.8, 0.0)  # domain units per second squared
-    seed: int = 0  # of the obstacle surface samples
+    seed: int = 0  # of the obstacles' surface samples
     specification: dict[str, Any] = field(default_factory=dict)  # JSON-able: how the scene was made
-    # float32 [N] by name (hgn.scene.material.MATERIAL_PARAMETERS), where they differ from the solver's settings;
-    # NaN where they do not
+    # float32 [N] by name (hgn.scene.material.MATERIAL_PARAMETERS), in place of the solver's settings; NaN: as these
     material_parameters: dict[str, np.ndarray] = field(default_factory=dict)
-    # of material at rest, where its filling is known: the solver then holds water to it
+    # of the initial filling, where it is known: the solver then relaxes the density of water towards it
     particles_per_cell: float | None = None
     # Coulomb coefficients of the domain's walls across x, y (floor and ceiling) and z
     wall_friction: Vector = (0.0, 0.0, 0.0)
-    # float64 [N], seconds, in order: when each particle enters, at the position and with the velocity given; 0: it is
-    # there from the start. None: all are
+    # float64 [N], seconds, sorted: the time at which each particle enters at its position and velocity; 0: present from
+    # the start. None: all are present
     entry_s_N: np.ndarray | None = None
 
     def __post_init__(self) -> None:
@@ -94,7 +93,7 @@ class Scene:
 
     @property
     def moves(self) -> bool:
-        """Whether any obstacle does."""
+        """Whether any obstacle moves."""
         return any(obstacle.motion is not None for obstacle in self.obstacles)
 
     @property

@@ -1,4 +1,4 @@
-"""Scenes that users write: a YAML file of obstacles (built-in shapes or meshes) and groups of particles.
+"""Scene files: YAML with obstacles (built-in shapes or meshes) and groups of particles.
 
 See conf/example/ for examples. Lengths are in domain units, angles in degrees, y points up.
 """
@@ -42,12 +42,12 @@ GROUP_SHAPES = ("cube", "sphere", "box")
 EMITTER_SHAPES = ("disc", "rectangle")
 MAXIMUM_PARTICLES = 50_000_000
 MAXIMUM_NODES = 100_000  # of a scene file
-EMITTER_STREAM = 2**31  # of random numbers, apart from those of groups
+EMITTER_STREAM = 2**31  # of random numbers, separate from those of groups
 
 
 @dataclass(frozen=True)
 class KeyframeEntry:
-    """A pose of an obstacle, from where its entry places it."""
+    """A pose of an obstacle, relative to where its entry places it."""
 
     time: NonNegative[float]  # seconds
     translation: Vector = (0.0, 0.0, 0.0)
@@ -62,13 +62,13 @@ class ObstacleEntry:
     """Either `mesh` (a file, with `scale`) or `shape` (a built-in one, with `size`)."""
 
     mesh: str | None = None  # path relative to the scene file
-    scale: Positive[float] | None = None  # of the mesh; 1 if absent
+    scale: Positive[float] | None = None  # of the mesh; null: 1
     shape: str | None = None
     size: Positive[float] | None = None  # side, diameter, or base width and height
-    position: Vector | None = None  # moves a mesh (origin if absent); the centre of a shape
+    position: Vector | None = None  # translation of a mesh (null: none), or centre of a shape
     rotation: Vector = (0.0, 0.0, 0.0)  # degrees about the fixed x axis, then y, then z
     friction: NonNegative[float] | None = None  # Coulomb coefficient; null: mpm.collider_friction
-    keyframes: tuple[KeyframeEntry, ...] = ()  # poses in order of time; none: at rest
+    keyframes: tuple[KeyframeEntry, ...] = ()  # poses in order of time; empty: at rest
 
     def __post_init__(self) -> None:
         require_bounds(self)
@@ -85,7 +85,7 @@ class ObstacleEntry:
         self.motion()
 
     def motion(self) -> Motion | None:
-        """How the obstacle moves, if it does."""
+        """The motion of the obstacle, or None."""
         if not self.keyframes:
             return None
         return Motion(
@@ -98,7 +98,7 @@ class ObstacleEntry:
 
 @dataclass(frozen=True, kw_only=True)
 class MaterialEntry:
-    """One material, and its constants in the solver; what is left out is as the solver's settings have it."""
+    """A material, and constants that replace the solver's settings."""
 
     material: str
     youngs_modulus_pa: float | None = None
@@ -113,24 +113,24 @@ class MaterialEntry:
 
     def __post_init__(self) -> None:
         require_bounds(self)
-        MpmConfig(**self.parameters)  # refuses what the solver cannot bear
+        MpmConfig(**self.parameters)  # validates the constants
         material_index(self.material)
 
     @property
     def parameters(self) -> dict[str, Any]:
-        """The constants of the material that are given, by name."""
+        """The given constants of the material, by name."""
         given = {name: getattr(self, name) for name in MATERIAL_PARAMETERS}
         return {name: value for name, value in given.items() if value is not None}
 
 
 @dataclass(frozen=True, kw_only=True)
 class GroupEntry(MaterialEntry):
-    """A solid of one material, filled with random particles; or `particles`, a file of them."""
+    """A solid of one material, filled with random particles; or `particles`, a file of particles."""
 
     shape: str | None = None  # cube, sphere or box
     size: float | tuple[float, float, float] | None = None  # side, diameter, or the three edges of a box
     position: Vector | None = None  # of the centre
-    particles: str | None = None  # .npz with position and perhaps velocity [N, 3], relative to the scene file
+    particles: str | None = None  # .npz with position and optionally velocity [N, 3], relative to the scene file
     velocity: Vector = (0.0, 0.0, 0.0)  # domain units per second
 
     def __post_init__(self) -> None:
@@ -156,19 +156,19 @@ class GroupEntry(MaterialEntry):
 
     @property
     def region(self) -> Region:
-        """What a shape fills."""
+        """The region that the shape fills."""
         assert self.shape is not None and self.position is not None
         return region_of(self.shape, self.edges, self.position)
 
 
 @dataclass(frozen=True, kw_only=True)
 class EmitterEntry(MaterialEntry):
-    """A face that particles enter through, as densely as groups are filled."""
+    """A face that particles enter through, at the density of groups."""
 
     shape: str  # disc or rectangle, across the velocity
-    size: float | tuple[float, float]  # diameter, or the two edges of a rectangle: the first is level
+    size: float | tuple[float, float]  # diameter, or the two edges of a rectangle, the first horizontal
     position: Vector  # of the centre
-    velocity: Vector  # domain units per second, of what enters
+    velocity: Vector  # domain units per second, of entering particles
     stop: NonNegative[float]  # seconds
     start: NonNegative[float] = 0.0
 
@@ -179,7 +179,7 @@ class EmitterEntry(MaterialEntry):
         require(isinstance(self.size, tuple) == (self.shape == "rectangle"), "size", rule, self.size)
         for edge in self.size if isinstance(self.size, tuple) else (self.size,):
             require(0 < edge < math.inf, "size", "finite and > 0", self.size)
-        require(any(self.velocity), "velocity", "other than zero, for it brings the particles in", self.velocity)
+        require(any(self.velocity), "velocity", "other than zero, because particles enter along it", self.velocity)
         require(self.stop > self.start, "stop", f"later than start ({self.start:g})", self.stop)
 
     @property
@@ -191,17 +191,17 @@ class EmitterEntry(MaterialEntry):
 
 @dataclass(frozen=True)
 class SceneFile:
-    """What a scene file may say; the defaults are the paper's."""
+    """The content of a scene file; the defaults are the paper's."""
 
     groups: tuple[GroupEntry, ...] = ()
     emitters: tuple[EmitterEntry, ...] = ()
     obstacles: tuple[ObstacleEntry, ...] = ()
     domain_size: BoxSize = (1.0, 1.0, 1.0)
-    cell_size: Positive[float] = 1 / 64  # of the solver's grid and of the obstacle cells
+    cell_size: Positive[float] = 1 / 64  # of the solver's grid and of obstacle cells
     gravity: Vector = (0.0, -9.8, 0.0)  # domain units per second squared
     particles_per_cell: Positive[float] = 8.0
-    floor_friction: NonNegative[float] = 0.0  # Coulomb coefficient of the domain's floor, and of its ceiling
-    wall_friction: NonNegative[float] = 0.0  # of its walls
+    floor_friction: NonNegative[float] = 0.0  # Coulomb coefficient of the domain's floor and ceiling
+    wall_friction: NonNegative[float] = 0.0  # Coulomb coefficient of the side walls
     seed: int = 0  # of the particles and of the obstacle samples
 
     def __post_init__(self) -> None:
@@ -211,20 +211,20 @@ class SceneFile:
 
 
 class _Loader(yaml.SafeLoader):
-    """Reads 1e5 as a number, as YAML 1.2 and the commands do; PyYAML wants it as 1.0e+5.
+    """Reads 1e5 as a number, as YAML 1.2 does; PyYAML requires 1.0e+5.
 
-    Raises: yaml.YAMLError, too, where aliases stand for more than MAXIMUM_NODES values, or one for itself.
+    Raises: yaml.YAMLError, also where aliases expand to more than MAXIMUM_NODES values.
     """
 
     def get_single_node(self) -> yaml.Node | None:
         node = super().get_single_node()
         if _node_count(node, {}) > MAXIMUM_NODES:
-            raise yaml.YAMLError(f"its aliases stand for more than {MAXIMUM_NODES} values")
+            raise yaml.YAMLError(f"its aliases expand to more than {MAXIMUM_NODES} values")
         return node
 
 
 def _node_count(node: Any, counts: dict[int, float]) -> float:
-    """Values that a node stands for, aliases resolved; infinitely many of one that contains itself."""
+    """Returns the number of values of a node with its aliases resolved; infinity for one that contains itself."""
     if not isinstance(node, yaml.CollectionNode):
         return 1
     if id(node) not in counts:
@@ -240,9 +240,9 @@ _Loader.add_implicit_resolver(
 
 
 def find_scene(name: str) -> Path:
-    """The file that `name` means: a path, or an example by its name, as in `funnel`.
+    """Returns the file of a path, or of an example by its name, as in `funnel`.
 
-    Raises: ConfigError for what is neither a file nor an example, and has no ending.
+    Raises: ConfigError for a name without an ending that is neither a file nor an example.
     """
     if Path(name).is_file() or not re.fullmatch(r"\w+", name):
         return Path(name)
@@ -254,10 +254,10 @@ def find_scene(name: str) -> Path:
 def load_scene(path: str | Path) -> Scene:
     """Reads a scene file.
 
-    Each group has its own random stream, so that editing one leaves the others' particles in place.
+    Each group has its own random stream, so that editing one does not move the particles of others.
 
-    Raises: ConfigError, beginning with the file's path, for whatever is wrong in it or in a mesh it names:
-    unknown keys, bad values, groups that reach into the solver's walls (3 cells) or into closed obstacles.
+    Raises: ConfigError, starting with the path, for unknown keys, invalid values, unreadable meshes, and groups that
+    reach into the solver's walls (3 cells) or into closed obstacles.
     """
     path = Path(path)
     if not path.is_file():
@@ -274,8 +274,8 @@ def load_scene(path: str | Path) -> Scene:
 
 
 def notes_on_meshes(scene: Scene) -> list[str]:
-    """What may surprise about the mesh files of a scene file, a line each: which are sheets, and which, in another unit
-    perhaps, no particle can touch or are smaller than a cell.
+    """Returns warnings about a scene's mesh files: sheets, and meshes (in another unit, perhaps) that lie outside the
+    domain or are smaller than a cell.
     """
     notes = []
     entries = scene.specification.get("obstacles", ())
@@ -284,12 +284,12 @@ def notes_on_meshes(scene: Scene) -> list[str]:
         if name is None:
             continue
         if not obstacle.closed:
-            notes.append(f"a sheet, not a solid, for it is not watertight: {name}")
+            notes.append(f"a sheet, not a solid, because it is not watertight: {name}")
         low_3, high_3 = obstacle.vertex_V3.min(axis=0), obstacle.vertex_V3.max(axis=0)
         place = f"x {low_3[0]:.3g} to {high_3[0]:.3g}, y {low_3[1]:.3g} to {high_3[1]:.3g}, "
         place += f"z {low_3[2]:.3g} to {high_3[2]:.3g}"
         if obstacle.motion is None and ((low_3 > scene.domain_size) | (high_3 < 0)).any():
-            notes.append(f"outside of the domain, so that nothing touches it: {name} ({place}); see scale and position")
+            notes.append(f"outside the domain, out of reach of particles: {name} ({place}); see scale and position")
         elif (high_3 - low_3).max() < scene.cell_size:
             notes.append(f"smaller than a cell of {scene.cell_size:.3g}: {name} ({place}); see scale")
     return notes
@@ -307,7 +307,7 @@ def _build(file: SceneFile, folder: Path) -> Scene:
         ]
         entering = [e.face.count(e.stop - e.start, *filling) for e in file.emitters]
         total = sum(counts) + sum(entering)
-    except ArithmeticError:  # of sizes or cells that leave the range of floats
+    except ArithmeticError:  # sizes or cells beyond the range of floats
         total = math.inf
     rule = f"at most {MAXIMUM_PARTICLES} particles together, with those of emitters"
     require(total <= MAXIMUM_PARTICLES, "groups", rule, total, "lower size or particles_per_cell")
@@ -363,7 +363,7 @@ def _build(file: SceneFile, folder: Path) -> Scene:
 
 
 def _read_particles(entry: GroupEntry, index: int, folder: Path, file: SceneFile) -> tuple[np.ndarray, np.ndarray]:
-    """Positions and velocities, float32 [N, 3], as a file has them."""
+    """Reads positions and velocities, float32 [N, 3]."""
     assert entry.particles is not None
     path, field = folder / entry.particles, f"groups[{index}].particles"
     require(
@@ -388,7 +388,7 @@ def _read_particles(entry: GroupEntry, index: int, folder: Path, file: SceneFile
 
 
 def _material_parameters(groups: Sequence[MaterialEntry], counts: list[int]) -> dict[str, np.ndarray]:
-    """What any group gives, per particle, float32 [N]; NaN where its group leaves it open."""
+    """Returns the constants that any group gives, float32 [N]; NaN for groups without them."""
     names = [name for name in MATERIAL_PARAMETERS if any(name in group.parameters for group in groups)]
     return {
         name: np.repeat(np.array([group.parameters.get(name, np.nan) for group in groups], np.float32), counts)
@@ -405,7 +405,7 @@ def _obstacle(entry: ObstacleEntry, index: int, folder: Path) -> Obstacle:
         finite = bool(np.isfinite(obstacle.vertex_V3).all())
         require(finite, f"obstacles[{index}].size", "in the range of float32", entry.size)
     else:
-        # trimesh takes a second to load
+        # trimesh takes a second to import
         from hgn.scene.mesh import load_mesh
 
         obstacle = load_mesh(

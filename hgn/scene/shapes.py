@@ -1,4 +1,4 @@
-"""The five obstacles of the paper (sec. 3.3) as small triangle meshes, and mesh files that take their place.
+"""The five obstacles of the paper (sec. 3.3) as small triangle meshes, and mesh files in their place.
 
 Half box and half sphere are bowls without a lid, the square is a sheet; cone and pyramid are closed and
 oriented outwards. The open sides and the tips point along +y before rotation.
@@ -20,7 +20,7 @@ from hgn.schema import Vector
 
 CLOSED_SHAPES = frozenset({"cone", "pyramid"})
 SEGMENTS = 32  # around a cone
-SPHERE_SEGMENTS, SPHERE_RINGS = 24, 6  # facets stay within 0.9 % of the radius of the true sphere
+SPHERE_SEGMENTS, SPHERE_RINGS = 24, 6  # facets deviate by at most 0.9 % of the radius
 
 
 def shape_obstacle(
@@ -30,7 +30,7 @@ def shape_obstacle(
     rotation_33: np.ndarray | None = None,
     name: str | None = None,
 ) -> Obstacle:
-    """One obstacle of a known shape, with the middle of its unrotated bounding box at `position`.
+    """Returns an obstacle of a known shape; `position` is the middle of its unrotated bounding box.
 
     `size` in domain units is the side of the square and of the half box (which is half as high), the diameter
     of the half sphere, the base width and the height of cone and pyramid, the longest side of a mesh file's bounding
@@ -48,11 +48,11 @@ def shape_obstacle(
 
 @functools.cache
 def unit_shape(shape: str) -> tuple[np.ndarray, np.ndarray, bool]:
-    """Vertices, float64 [V, 3], of the shape of size 1 about the origin, triangles, int32 [F, 3], and whether it is
-    closed."""
+    """Returns the shape of size 1 about the origin: vertices, float64 [V, 3], triangles, int32 [F, 3], and whether it
+    is closed."""
     closed = shape in CLOSED_SHAPES
     if is_mesh_file(shape):
-        # trimesh takes half a second to load, and few need it here
+        # trimesh takes half a second to import, and few scenes need it
         from hgn.scene.mesh import load_mesh
 
         mesh = load_mesh(shape, "obstacle_shapes")
@@ -70,7 +70,7 @@ def unit_shape(shape: str) -> tuple[np.ndarray, np.ndarray, bool]:
 
 @functools.cache
 def mesh_sha256(shape: str) -> str:
-    """The content of a mesh file: what tells data sets and their meshes apart, wherever the file lies.
+    """Returns the sha256 of a mesh file, which identifies it in data sets.
 
     Raises: ConfigError for a mesh that cannot be read.
     """

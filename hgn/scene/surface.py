@@ -1,4 +1,4 @@
-"""Points on triangle surfaces: Poisson-disk samples, and splitting of long triangles.
+"""Poisson-disk samples on triangle surfaces, and splitting of long triangles.
 
 Shape legend: F triangles, S samples.
 """
@@ -14,7 +14,7 @@ from hgn.schema import ConfigError
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree
 
-CANDIDATES = 1.0  # per spacing^2 and round; a dense Poisson-disk set holds about 0.7
+CANDIDATES = 1.0  # per spacing^2 and round; a dense Poisson-disk set has about 0.7
 MINIMUM_ROUNDS, MAXIMUM_ROUNDS = 4, 12
 SETTLED = 0.02  # rounds end when one adds less than this fraction
 MINIMUM_CANDIDATES = 64
@@ -22,11 +22,11 @@ MAXIMUM_SAMPLES = 5_000_000
 
 
 def sample_surface(corner_F33: np.ndarray, spacing: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Random points of triangles, no two closer than `spacing` (Paper sec. 3: Poisson disks).
+    """Returns random points of triangles, no two closer than `spacing` (Paper sec. 3: Poisson disks).
 
-    Returns float64 [S, 3] and the triangle of each, int64 [S]. Candidates are drawn by area, slivers narrower
-    than about the spacing by length, and kept unless too near to an earlier one, in rounds until nearly
-    nothing is added. Zero-area triangles get no samples. The result follows from the state of `rng`.
+    Returns float64 [S, 3] and the triangle of each, int64 [S]. Candidates are drawn by area (slivers narrower than
+    about the spacing by length) and kept unless too close to an earlier one, in rounds until few are added. Zero-area
+    triangles get no samples. The result is determined by the state of `rng`.
 
     Raises: ConfigError when the surface is too large for the spacing.
     """
@@ -64,7 +64,7 @@ def split_long_edges(
 ) -> np.ndarray:
     """Bisects triangles at their longest edge until no edge exceeds `longest`: corners, float64 [F', 3, 3].
 
-    With `box` (lowest and highest corner) pieces whose bounding box misses it are dropped.
+    Pieces whose bounding box misses `box` (lowest and highest corner) are dropped.
     """
     corner = np.asarray(corner_F33, np.float64)
     pieces = [corner[:0]]
@@ -85,7 +85,7 @@ def split_long_edges(
 
 
 def area_vectors(corner_F33: np.ndarray) -> np.ndarray:
-    """Normals with the length of the area, float64 [F, 3]."""
+    """Returns normals with the length of the area, float64 [F, 3]."""
     return 0.5 * np.cross(corner_F33[:, 1] - corner_F33[:, 0], corner_F33[:, 2] - corner_F33[:, 0])
 
 
@@ -98,7 +98,7 @@ def _weights(corner: np.ndarray, spacing: float) -> np.ndarray:
 
 
 def point_tree(point_S3: np.ndarray) -> cKDTree:
-    """A nearest-neighbour tree; SciPy's take half a second to load, and most commands need none."""
+    """Returns a nearest-neighbour tree. SciPy's take half a second to import, and most commands need none."""
     from scipy.spatial import cKDTree
 
     return cKDTree(point_S3, balanced_tree=False)
@@ -111,7 +111,7 @@ def _uniform_in_triangles(corner_S33: np.ndarray, rng: np.random.Generator) -> n
 
 
 def _spread_out(point: np.ndarray, spacing: float) -> np.ndarray:
-    """Indices that a loop over the points would keep, each unless it is too near to one kept before."""
+    """Returns the points that a loop would keep that drops each point too close to one kept before."""
     if len(point) == 0:
         return np.zeros(0, np.int64)
     pair = point_tree(point).query_pairs(spacing, output_type="ndarray").astype(np.int64)

@@ -1,10 +1,10 @@
-"""The symmetries of a scene's box that keep gravity: what training may show a network instead of the scene itself.
+"""The symmetries of a scene's box that keep gravity, for augmentation in training.
 
-Each exchanges axes or mirrors them. Where gravity points along an axis and the other two sides are equal there are
-eight, a square's: four quarter turns about gravity, each mirrored too; four where those sides differ.
-The box is the solver's, from its first node to its last: (n - 1) cells on an axis of n nodes. Its walls are the same
-number of nodes at both ends, so what rests on them rests at 2 and at 61 cells of 64. A mirror therefore takes x to
-(n - 1) cells minus x, nodes to nodes; about the middle of the domain it would move the walls by a cell.
+Each exchanges axes or mirrors them. With gravity along an axis there are eight if the other two sides are equal (four
+quarter turns about gravity, each also mirrored), else four.
+The box spans the solver's nodes: (n - 1) cells on an axis of n nodes. Its walls have the same number of nodes at both
+ends, so particles rest at 2 and at 61 of 64 cells. A mirror therefore maps x to (n - 1) cells minus x, nodes to nodes;
+a mirror at the middle of the domain would move the walls by a cell.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from hgn.schema import Vector
 from hgn.system.splitmix import splitmix64
 
 CELL_BITS = 17  # as in a cell's key
-CODE_BITS = 3 + CELL_BITS  # of an axis: where it comes from in two bits, whether mirrored, the box's cells
+CODE_BITS = 3 + CELL_BITS  # of an axis: two bits for the source, one for the mirror, the box's cells
 
 
 @dataclass(frozen=True)
@@ -31,18 +31,18 @@ class Symmetry:
 
     @property
     def mirror_sum(self) -> Vector:
-        """A mirrored coordinate and its image add up to this, domain units."""
+        """The sum of a mirrored coordinate and its image, domain units."""
         x, y, z = (count * self.cell_size for count in self.cells)
         return x, y, z
 
     def direction(self, vector: Vector) -> Vector:
-        """The image of a vector that has no place, as gravity."""
+        """Returns the image of a direction, for example of gravity."""
         x, y, z = (-vector[s] if m else vector[s] for s, m in zip(self.source, self.mirrored, strict=True))
         return x, y, z
 
     @cached_property
     def code(self) -> int:
-        """All but the cell size in one integer below 2^60, for the kernels."""
+        """The symmetry without the cell size as an integer below 2^60, for the kernels."""
         assert min(self.cells) >= 0 and max(self.cells) < 1 << CELL_BITS
         axes = zip(self.source, self.mirrored, self.cells, strict=True)
         return sum((s | m << 2 | cells << 3) << CODE_BITS * i for i, (s, m, cells) in enumerate(axes))
@@ -52,11 +52,11 @@ class Symmetry:
 def scene_symmetries(
     gravity: Vector, domain_size: Vector, cell_size: float, less: int = 1, dimensions: int = 3
 ) -> tuple[Symmetry, ...]:
-    """All exchanges and mirrors of axes that keep gravity and the domain; the identity first.
+    """Returns all exchanges and mirrors of axes that keep gravity and the domain, the identity first.
 
-    Any gravity is allowed: without one all 48 symmetries of a cube remain, with an oblique one perhaps the identity
-    alone. `cell_size` is the solver's, whose box is `less` than the domain by a cell. An imported set's is the domain;
-    where that is no whole number of cells, an axis is not mirrored. Axes from `dimensions` on stay as they are.
+    Without gravity all 48 symmetries of a cube remain, with an oblique one perhaps only the identity. `cell_size` is
+    the solver's, whose box is `less` cells smaller than the domain; the box of an imported set is its domain. An axis
+    that is no whole number of cells is not mirrored. Axes from `dimensions` on are unchanged.
     """
     x, y, z = (round(length / cell_size) - less for length in domain_size)
     cells = x, y, z
@@ -76,6 +76,6 @@ def scene_symmetries(
 
 
 def drawn_symmetry(symmetries: tuple[Symmetry, ...], seed: int) -> Symmetry:
-    """One of them, each as likely; a function of the sample's seed alone, in another stream than noise and jitter."""
+    """Draws a symmetry uniformly by the sample's seed, independent of noise and grid jitter."""
     assert symmetries, "the scene's symmetries are not known"
     return symmetries[(splitmix64(seed) * len(symmetries)) >> 64]

@@ -1,4 +1,4 @@
-"""Choosing the device a command computes on."""
+"""Choice of the device that a command computes on."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from hgn.system.machine import available_cpus
 
 
 def choose_device(name: str) -> torch.device:
-    """`auto` takes a CUDA device where there is one; otherwise torch's names (cpu, cuda, cuda:1).
+    """Returns a torch device: `auto` is CUDA where available; else torch's names (cpu, cuda, cuda:1).
 
-    What stays on the CPU keeps to a container's quota from now on. Raises: ConfigError when the device does not exist.
+    Also limits CPU threads to a container's quota. Raises: ConfigError when the device does not exist.
     """
     keep_to_quota()
     if name == "auto":
@@ -28,9 +28,9 @@ def choose_device(name: str) -> torch.device:
 
 
 def keep_to_quota() -> None:
-    """No more of PyTorch's threads than a container's quota has cores: beyond it all of them are held back together.
+    """Limits PyTorch's threads to a container's CPU quota, beyond which all threads are throttled together.
 
-    OMP_NUM_THREADS, where it is set, is what somebody wants.
+    A value of OMP_NUM_THREADS is kept.
     """
     if "OMP_NUM_THREADS" not in os.environ and available_cpus() < torch.get_num_threads():
         torch.set_num_threads(available_cpus())

@@ -1,11 +1,11 @@
-"""Which of the package's extras brings a package that a command needs and does not find."""
+"""The extra that installs a missing package."""
 
 from __future__ import annotations
 
 import importlib.util
 import sys
 
-# as pyproject.toml lists them
+# as in pyproject.toml
 EXTRA_OF = {
     "taichi": "datagen",
     "lightning": "train",
@@ -30,16 +30,16 @@ EXTRA_OF = {
 
 
 def missing_extra(error: ModuleNotFoundError) -> str | None:
-    """What to install, in words, where the package that is missing belongs to an extra; None for any other."""
+    """Returns the command that installs a missing package of an extra, or None for any other package."""
     package = (error.name or "").split(".")[0]
     if package not in EXTRA_OF:
         return None
     if package == "taichi" and sys.version_info >= (3, 13):
-        return "this needs taichi, which is published for Python 3.11 and 3.12 alone; use one of them"
+        return "this needs taichi, which is published only for Python 3.11 and 3.12; use one of them"
     return f"this needs {package}, which is not installed; pip install 'hgn[{EXTRA_OF[package]}]'"
 
 
 def require_installed(package: str) -> None:
-    """For commands that import the package hours after their start. Raises: ModuleNotFoundError."""
+    """Checks for a package that is imported hours after a command's start. Raises: ModuleNotFoundError."""
     if importlib.util.find_spec(package) is None:
         raise ModuleNotFoundError(f"No module named {package!r}", name=package)

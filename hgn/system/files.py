@@ -1,4 +1,4 @@
-"""Files that appear whole or not at all."""
+"""Atomic file operations: files appear whole or not at all."""
 
 from __future__ import annotations
 
@@ -15,28 +15,28 @@ from typing import Any, BinaryIO
 from hgn.schema import ConfigError
 
 TEMPORARY_SUFFIX = ".partial"
-_LOST_AT_MOST = 10  # times one after the other
-NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP, errno.EINVAL)  # of file systems that know none
+_LOST_AT_MOST = 10  # retries
+NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP, errno.EINVAL)  # of file systems without locks
 
 
 def temporary_path(path: Path) -> Path:
-    """A name beside `path` for writing it; a crash leaves a file that ends in `.partial`, never a cut `path`.
+    """Returns a unique name beside `path` for writing it; a crash leaves only a file that ends in `.partial`.
 
-    No two are the same, on several machines and in containers that count their processes alike.
+    Names are random, because containers on several machines may have equal process numbers.
     """
     return path.with_name(f".{path.name}.{secrets.token_hex(6)}{TEMPORARY_SUFFIX}")
 
 
 def temporary_target(path: Path) -> str:
-    """The name that a file of `temporary_path` was to get."""
+    """Returns the final name of a file of `temporary_path`."""
     return path.name.removeprefix(".").removesuffix(TEMPORARY_SUFFIX).rpartition(".")[0]
 
 
 @contextlib.contextmanager
 def temporary_file(path: Path) -> Iterator[Path]:
-    """A temporary name beside `path` for writing it. It is gone at the end unless the caller gave it its final name.
+    """A temporary name beside `path` for writing it, removed at the end unless the caller renamed it.
 
-    An OSError on the way that names no file (a full disk) is made to name `path`.
+    An OSError that names no file (a full disk) names `path`.
     """
     temporary = temporary_path(path)
     try:
@@ -60,7 +60,7 @@ def write_atomically(path: Path, data: bytes) -> None:
 
 
 def read_replaced(path: Path) -> bytes:
-    """The bytes of a file that others replace. Where NFS has lost the one that was opened, those of its successor.
+    """Reads a file that other machines replace; retries where NFS has lost the file that was opened.
 
     Raises: OSError.
     """
@@ -74,7 +74,7 @@ def read_replaced(path: Path) -> bytes:
 
 
 def write_json(path: Path | str, value: Any, allow_nan: bool = True) -> None:
-    """Writes `value` for people and programs to read, whole or not at all; makes the folder where it is missing.
+    """Writes `value` as indented JSON, atomically; makes the folder where it is missing.
 
     Raises: OSError as write_atomically does; ValueError for a number that JSON does not know, unless `allow_nan`.
     """
@@ -85,10 +85,10 @@ def write_json(path: Path | str, value: Any, allow_nan: bool = True) -> None:
 
 @contextlib.contextmanager
 def held(path: Path, field: str, refusal: str) -> Iterator[None]:
-    """A lock file that one process at a time has; the kernel frees it when that ends, however it ends.
+    """Locks a file for this process; the kernel releases the lock when the process ends.
 
-    Raises: ConfigError `<field> must be ...`, with `refusal`, when another one has it. A file system without locks lets
-    everybody in.
+    Raises: ConfigError `<field> must be ...`, with `refusal`, when another process has the lock. On a file system
+    without locks every process succeeds.
     """
     make_folder(path.parent)
     with path.open("ab") as file:
@@ -105,7 +105,7 @@ def held(path: Path, field: str, refusal: str) -> Iterator[None]:
 
 
 def require_place(path: Path) -> None:
-    """Asked before long work whose result is to be written to `path`; makes nothing.
+    """Checks, before long work, that `path` can be written; creates nothing.
 
     Raises: OSError, as writing would, where `path` is a folder, leads through a file, or its folder is closed to us.
     """
@@ -120,28 +120,28 @@ def require_place(path: Path) -> None:
 
 
 def make_folder(path: Path) -> None:
-    """Makes a folder where it is missing, and those above it; a loss of power does not take them away again."""
+    """Makes a folder and its missing parents, and syncs them, so that a power loss does not remove them."""
     missing = [folder for folder in (path, *path.parents) if not folder.exists()]
     path.mkdir(parents=True, exist_ok=True)
     for folder in missing:
-        with contextlib.suppress(PermissionError):  # to list the folder above
+        with contextlib.suppress(PermissionError):  # to open the folder above
             sync_folder(folder.parent)
 
 
 def sync_file(file: BinaryIO) -> None:
-    """Brings what was written to the disk itself."""
+    """Flushes and syncs a file to the disk."""
     file.flush()
     os.fsync(file.fileno())
 
 
 def sync_written(path: Path) -> None:
-    """Brings to the disk itself what a library has written to a file."""
+    """Syncs a file that a library has written."""
     with path.open("rb") as file:
         os.fsync(file.fileno())
 
 
 def sync_folder(folder: Path) -> None:
-    """Makes renames inside `folder` survive a loss of power."""
+    """Syncs a folder, so that renames in it survive a power loss."""
     descriptor = os.open(folder, os.O_RDONLY)
     try:
         with errors_name(folder):
@@ -152,7 +152,7 @@ def sync_folder(folder: Path) -> None:
 
 @contextlib.contextmanager
 def errors_name(path: Path) -> Iterator[None]:
-    """While it is entered, an OSError that names no file (a full disk) is made to name `path`."""
+    """Adds `path` to an OSError that names no file (a full disk)."""
     try:
         yield
     except OSError as error:

@@ -1,7 +1,7 @@
 """The Hugging Face Hub: `hf://USER/NAME[@REVISION][/PATH]` is weights, `hf://datasets/USER/NAME` a data set.
 
-Data sets are read as from any web server, by ranges, through the Hub's addresses of files. Weights are brought by
-huggingface_hub into its cache. $HF_ENDPOINT names another server, $HF_TOKEN is what private repositories ask for.
+Data sets are read by HTTP ranges from the Hub's file addresses. Weights are downloaded by huggingface_hub to its cache.
+$HF_ENDPOINT is another server, $HF_TOKEN the token for private repositories.
 """
 
 from __future__ import annotations
@@ -30,16 +30,16 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class HubPlace:
-    """A place in a repository."""
+    """A place in a repository of the Hub."""
 
     repository: str  # USER/NAME
     revision: str
-    path: str  # in it; empty: its root
+    path: str  # in the repository; empty: its root
     is_dataset: bool
 
     @staticmethod
     def parse(url: str, field: str) -> HubPlace:
-        """Raises: ConfigError in the name of `field` for what is no such address."""
+        """Parses an address. Raises: ConfigError naming `field`."""
         match = _PATTERN.fullmatch(url)
         if match is None:
             rule = "an address as hf://USER/NAME or hf://datasets/USER/NAME, @REVISION and /PATH may follow"
@@ -48,28 +48,28 @@ class HubPlace:
 
     @property
     def address(self) -> str:
-        """Where its files are served."""
+        """The URL of its files."""
         kind = "datasets/" if self.is_dataset else ""
         return f"{endpoint()}/{kind}{self.repository}/resolve/{quote(self.revision, safe='')}/{self.path}".rstrip("/")
 
 
 def endpoint() -> str:
-    """The Hub's server."""
+    """Returns the Hub's server."""
     return os.environ.get("HF_ENDPOINT", "https://huggingface.co").rstrip("/")
 
 
 def hub_token() -> str | None:
-    """The token of $HF_TOKEN."""
+    """Returns the token of $HF_TOKEN."""
     return os.environ.get("HF_TOKEN") or None
 
 
 @functools.lru_cache(maxsize=64)
 def hub_weights(url: str, field: str = "weights", patience_s: float = _PATIENCE_S) -> Path:
-    """A weights file of a repository, in huggingface_hub's cache: the one that is named, or its only one.
+    """Downloads a weights file of a repository, the named or the only one, to huggingface_hub's cache.
 
     Raises: ConfigError where there is none, or several, or access is refused, or the server stays away.
     """
-    import huggingface_hub  # loads for a while, and is an extra
+    import huggingface_hub  # slow to import, and an extra
 
     place = HubPlace.parse(url, field)
     if place.is_dataset:
@@ -90,7 +90,7 @@ def hub_weights(url: str, field: str = "weights", patience_s: float = _PATIENCE_
 
 
 def _patiently(ask: Callable[[], T], url: str, field: str, patience_s: float) -> T:
-    """Asks again while the server is away: huggingface_hub's and httpx' errors are none of OSError's kinds."""
+    """Retries while the server is away: huggingface_hub's and httpx' errors are no OSErrors."""
     try:
         return patiently(ask, lambda error: _passing(error, url, field), url, endpoint(), patience_s)
     except UnreachableError as error:
@@ -101,13 +101,13 @@ def _patiently(ask: Callable[[], T], url: str, field: str, patience_s: float) ->
 
 
 def _passing(error: Exception, url: str, field: str) -> str | None:
-    """What to say of an error that may pass; none of another program's. Raises: ConfigError for one that stays."""
+    """Returns the cause of an error that may pass, or None for any other. Raises: ConfigError for a permanent one."""
     from huggingface_hub import errors
 
     status = getattr(getattr(error, "response", None), "status_code", None)
     refused = isinstance(error, errors.RepositoryNotFoundError) or status in (401, 403)
     if refused:
-        remedy = "check the name; a private one asks for a token in HF_TOKEN"
+        remedy = "check the name; a private one needs a token in HF_TOKEN"
         raise ConfigError(f"{field} must be open to this program, got {url} refused or not there; {remedy}") from None
     missing = isinstance(error, errors.EntryNotFoundError) and not isinstance(error, errors.LocalEntryNotFoundError)
     if missing or (isinstance(status, int) and 400 <= status < 500 and status not in _PASSING):

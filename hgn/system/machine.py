@@ -1,7 +1,7 @@
-"""What of the machine this process may use: cores and memory, a container's limits among them, and folders.
+"""The cores, the memory and the folders that this process may use, within a container's limits.
 
-Containers are limited by control groups (Linux, cgroups(7)): a process sees all cores and all memory of the machine,
-is held back when it uses more cores than its quota, and killed when it uses more memory than its limit.
+Containers are limited by control groups (Linux, cgroups(7)): a process sees all cores and all memory of the machine, is
+throttled beyond its CPU quota, and killed beyond its memory limit.
 """
 
 from __future__ import annotations
@@ -17,22 +17,22 @@ ROOT = Path("/")  # of the file system
 
 
 def available_cpus() -> int:
-    """The cores that this process may keep busy: those that it may run on, at most its groups' quota, rounded up."""
+    """Returns the cores that this process may use: its CPU affinity, at most its groups' quota, rounded up."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     quotas = [quota for group in _groups("cpu") if (quota := _quota(group)) is not None]
     return max(1, min([cores, *(math.ceil(quota) for quota in quotas)]))
 
 
 def available_memory() -> int:
-    """Bytes of memory that this process may use: the machine's, or the least of its groups' limits."""
+    """Returns the bytes of memory that this process may use: the machine's, or its groups' smallest limit."""
     machine = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     limits = [_read(group / name) for group in _groups("memory") for name in ("memory.max", "memory.limit_in_bytes")]
     return min([machine, *(int(limit) for limit in limits if limit not in (None, "max"))])
 
 
 def writable_folder(usual: Path, name: str) -> Path:
-    """A cache's usual folder, or where that cannot be written to, as in a container, one of this user's own among
-    temporary files, NAME-UID, which nobody else can have put there.
+    """Returns a cache's usual folder, or where that cannot be written to (in a container, say) a temporary folder
+    NAME-UID that belongs to this user.
     """
     existing = next((folder for folder in (usual, *usual.parents) if os.path.lexists(folder)), usual)
     if usual.is_absolute() and existing.is_dir() and os.access(existing, os.W_OK | os.X_OK):
@@ -44,13 +44,11 @@ def writable_folder(usual: Path, name: str) -> Path:
 
 
 def _groups(controller: str) -> Iterator[Path]:
-    """Folders of the control groups that this process is in: its own, and those around it up to the outermost that can
-    be seen.
-    """
+    """Yields the folders of this process's control groups, down from the outermost visible one."""
     folder = ROOT / "sys" / "fs" / "cgroup"
     for line in (_read(ROOT / "proc" / "self" / "cgroup") or "").splitlines():
         _, controllers, own = line.split(":", 2)
-        if not controllers:  # version 2, where all controllers share one tree
+        if not controllers:  # version 2: one tree for all controllers
             mount = folder
         elif controller in controllers.split(","):
             mount = folder / controllers if (folder / controllers).is_dir() else folder / controller
@@ -60,13 +58,13 @@ def _groups(controller: str) -> Iterator[Path]:
         group = mount
         for part in Path(own.lstrip("/")).parts:
             group = group / part
-            if part == ".." or not group.is_dir():  # a container may see its own group alone, as the outermost
+            if part == ".." or not group.is_dir():  # a container may see only its own group, as the outermost
                 break
             yield group
 
 
 def _quota(group: Path) -> float | None:
-    """Cores' time that a group may use; none without a limit of its own."""
+    """Returns the CPU quota of a group in cores, or None without a limit."""
     limit = _read(group / "cpu.max")
     if limit is None:
         limit = f"{_read(group / 'cpu.cfs_quota_us') or 'max'} {_read(group / 'cpu.cfs_period_us') or 0}"
@@ -75,7 +73,7 @@ def _quota(group: Path) -> float | None:
 
 
 def _read(file: Path) -> str | None:
-    """Its text; none where a system, or a group, has no such file or does not show it: nothing known limits then."""
+    """Returns the text of a file, or None where it does not exist or cannot be read: no known limit."""
     try:
         return file.read_text(encoding="ascii").strip()
     except OSError:
@@ -83,7 +81,7 @@ def _read(file: Path) -> str | None:
 
 
 def allow_open_files(wanted: int) -> int:
-    """Raises this process's limit of open files towards `wanted`, as far as it may; returns the limit."""
+    """Raises this process's limit of open files towards `wanted`; returns the limit."""
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     limit = max(soft, min(wanted, hard)) if hard != resource.RLIM_INFINITY else max(soft, wanted)
     resource.setrlimit(resource.RLIMIT_NOFILE, (limit, hard))

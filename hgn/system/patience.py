@@ -1,4 +1,4 @@
-"""Waiting for servers that are away: asked again and again, with pauses that grow, until patience ends."""
+"""Retries for servers that do not answer, with growing pauses, until patience ends."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from typing import TypeVar
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.25, 10.0
 
 T = TypeVar("T")
-without = threading.Event()  # set: nobody waits any more
+without = threading.Event()  # set: no thread waits any more
 
 
 class UnreachableError(OSError):
-    """A server did not answer for as long as it was waited for."""
+    """A server did not answer within the patience."""
 
     def __init__(self, url: str, patience_s: float, cause: str) -> None:
         self.cause = cause
@@ -27,7 +27,7 @@ class UnreachableError(OSError):
 
 @contextlib.contextmanager
 def without_patience() -> Iterator[None]:
-    """While it is entered no thread of this process waits for a server that does not answer: nobody needs it now."""
+    """Inside it no thread of this process waits for a server that does not answer."""
     without.set()
     try:
         yield
@@ -38,9 +38,9 @@ def without_patience() -> Iterator[None]:
 def patiently(
     ask: Callable[[], T], passing: Callable[[Exception], str | None], url: str, server: str, patience_s: float
 ) -> T:
-    """What `ask` returns, asked again while what it raises may pass: `passing` says why, and nothing of what stays.
+    """Returns `ask()`, retried while `passing` returns the cause of its error; None marks a permanent error.
 
-    Raises: UnreachableError in the name of `url`; what stays.
+    Raises: UnreachableError naming `url`; a permanent error.
     """
     begin, pause, told = time.monotonic(), FIRST_PAUSE_S, False
     while True:
@@ -54,6 +54,6 @@ def patiently(
                 raise UnreachableError(url, patience_s, cause) from error
             if not told and pause > 1:
                 told = True
-                print(f"{server} does not answer ({cause}); trying for {patience_s:.0f} s", file=sys.stderr)
-            without.wait(pause * random.uniform(0.5, 1.0))  # no two readers come back at the same moment
+                print(f"{server} does not answer ({cause}); retrying for {patience_s:.0f} s", file=sys.stderr)
+            without.wait(pause * random.uniform(0.5, 1.0))  # readers must not return all at the same moment
             pause = min(2 * pause, LONGEST_PAUSE_S)

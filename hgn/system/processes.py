@@ -1,4 +1,4 @@
-"""Child processes that do not outlive their parent."""
+"""Child processes that end with their parent."""
 
 from __future__ import annotations
 
@@ -9,6 +9,6 @@ PR_SET_PDEATHSIG = 1  # linux/prctl.h
 
 
 def die_with_parent(number: int) -> None:
-    """Runs in the child: Linux sends it the signal `number` when its parent is gone, however that ended."""
+    """To be called in the child: Linux sends it the signal `number` when its parent ends for any reason."""
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, number)

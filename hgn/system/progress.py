@@ -1,4 +1,4 @@
-"""Progress for people: a bar on a terminal, a line every now and then elsewhere."""
+"""Progress: a bar on a terminal, a line every 15 seconds elsewhere."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ LINE_INTERVAL_S = 15.0
 
 
 class _Lines:
-    """Turns a bar's redrawing into lines of their own, so that a log file stays readable."""
+    """Turns a bar's updates into separate lines, so that a log file stays readable."""
 
     def write(self, text: str) -> None:
         text = text.replace("\r", "").strip()
@@ -23,7 +23,7 @@ class _Lines:
 
 
 def bar(what: str, total: int | None, initial: int = 0, unit: str = "it") -> tqdm[Any]:
-    """A tqdm bar on stderr. Where stderr is no terminal: one line at most every 15 seconds."""
+    """Returns a tqdm bar on stderr; without a terminal it prints at most a line every 15 seconds."""
     terminal = sys.stderr.isatty()
     return tqdm(
         total=total,

@@ -1,4 +1,4 @@
-"""Where a file or a figure comes from: versions, commit, date, machine."""
+"""The origin of a file or a figure: versions, commit, date, machine."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ from typing import Any
 import torch
 
 PACKAGES = ("torch", "triton", "lightning", "taichi", "numpy")
-# /a/b/c, but no URL's path
+# matches /a/b/c, but not the path of a URL
 _ABSOLUTE_PATH = re.compile(r"(?<![\w.:/~-])/(?:[^/\s,='\"\[\](){}]+/)*([^/\s,='\"\[\](){}]+)/?")
 
 
 def commit() -> str:
-    """The checkout's commit, with `+changes` where files differ from it; HGN_COMMIT where it is set, for copies
-    without their history; else `unknown`.
+    """Returns $HGN_COMMIT (for copies without history), else the checkout's commit, with `+changes` where files differ
+    from it, else `unknown`.
     """
     return os.environ.get("HGN_COMMIT") or commit_of(Path(__file__).resolve().parents[2])
 
 
 def commit_of(folder: Path) -> str:
-    """The commit of the checkout in `folder`, with `+changes` where files differ from it; `unknown` if it is none."""
+    """Returns the commit of a checkout, with `+changes` where files differ from it; `unknown` for another folder."""
     if not (folder / ".git").exists():
         return "unknown"
     try:
@@ -40,14 +40,14 @@ def commit_of(folder: Path) -> str:
 
 
 def device_name(device: torch.device | str) -> str:
-    """The GPU's name, or the processor's kind and the number of threads."""
+    """Returns the GPU's name, or the processor's type and the number of threads."""
     if torch.device(device).type == "cuda":
         return torch.cuda.get_device_name(device)
     return f"CPU {platform.machine()}, {torch.get_num_threads()} threads"
 
 
 def provenance(device: torch.device | str = "cpu") -> dict[str, Any]:
-    """{"device", "versions", "commit", "date", "command"}, ready for JSON."""
+    """Returns {"device", "versions", "commit", "date", "command"}, ready for JSON."""
     versions = {"python": platform.python_version()}
     for name in PACKAGES:
         try:
@@ -64,12 +64,12 @@ def provenance(device: torch.device | str = "cpu") -> dict[str, Any]:
 
 
 def command_line() -> str:
-    """How this process was started, without the folders that are this machine's."""
+    """Returns the command line of this process, without folders of this machine."""
     return shlex.join(without_folders(sys.orig_argv))
 
 
 def without_folders(value: Any) -> Any:
-    """Plain containers with the last part alone of each absolute path in their texts: folders are a machine's own."""
+    """Reduces each absolute path in the texts of plain containers to its last part."""
     if isinstance(value, str):
         return _ABSOLUTE_PATH.sub(r"\1", value)
     if isinstance(value, dict):

@@ -1,7 +1,7 @@
 """Lets idle threads of PyTorch sleep instead of spinning on a CPU; must be imported before torch.
 
-A frame is thousands of short products, each shared by all threads. Where other programs want the cores too, threads
-that spin take them from the one that is waited for: on two busy cores a frame took 4 s instead of 0.1.
+A frame consists of thousands of short parallel products. Spinning threads take cores from the thread that the others
+wait for when other programs run too: on two busy cores a frame took 4 s instead of 0.1.
 """
 
 from __future__ import annotations

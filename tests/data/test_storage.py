@@ -8,7 +8,6 @@ import functools
 import gzip
 import http.server
 import json
-import multiprocessing
 import os
 import threading
 import urllib.request
@@ -145,29 +144,25 @@ def test_same_names_do_not_collide(make_config, make_dataset, tmp_path):
         assert same_episodes(store, EpisodeStore(folder, "train"))
 
 
-def _read(url, barrier, results):
-    barrier.wait()
-    results.put([episode.key for episode in EpisodeStore(url, "train")])
-
-
 def test_ranks_share_the_cache(folder, serve, cache):
-    """Processes of one machine that want the same shards at once each get them whole; each is fetched once."""
-    url = serve()
-    context = multiprocessing.get_context("spawn")
-    barrier, results = context.Barrier(2), context.Queue()
-    processes = [context.Process(target=_read, args=(url, barrier, results)) for _ in range(2)]
-    for process in processes:
-        process.start()
-    keys = [results.get(timeout=PATIENCE_S) for _ in processes]
-    for process in processes:
-        process.join()
-    results.close()
-    results.join_thread()
+    """Readers of one machine that want the same shards at once each get them whole; each is fetched once."""
+    url, barrier, keys = serve(), threading.Barrier(2), []
+
+    def read():
+        store = EpisodeStore(url, "train")
+        barrier.wait()
+        keys.append([episode.key for episode in store])
+
+    readers = [threading.Thread(target=read) for _ in range(2)]
+    for reader in readers:
+        reader.start()
+    for reader in readers:
+        reader.join(PATIENCE_S)
     assert keys[0] == keys[1] == [entry.key for entry in EpisodeStore(folder, "train").entries]
     with urllib.request.urlopen(f"{url}/metrics") as answer:
         text = answer.read().decode()
     (line,) = [line for line in text.splitlines() if line.startswith('hgn_http_responses_total{code="206"}')]
-    segments = len(keys)  # which each reads for itself
+    segments = len(readers)  # each reader reads the index
     assert int(line.split()[-1]) == Manifest.load(folder).totals["train"].shards + segments
     assert not list(cache.glob("*.partial"))
 
@@ -423,7 +418,7 @@ def test_server_that_comes_back(folder, serve):
 def test_command_without_its_server(monkeypatch, capsys):
     """A command whose server stays away ends with one line that says what to do, and exit code 1."""
     url = f"http://127.0.0.1:{free_port()}"
-    assert exit_code(lambda _: Manifest.load(url, patience_s=0.01), "kills", [], monkeypatch) == 1
+    assert exit_code(lambda _: Manifest.load(url, patience_s=0.01), "datagen", [], monkeypatch) == 1
     error = capsys.readouterr().err
     assert error.startswith("error: no answer for 0 s (at last: ") and error.count("\n") == 1
     assert error.endswith(f"{url}/manifest.json; see that its server runs and run the same command again\n")

@@ -44,8 +44,8 @@ BOMB = "a: &a [x, x, x, x, x, x, x, x, x]\n" + "".join(
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        (BOMB, "its aliases stand for more than 100000 values"),
-        ("groups: &a [*a]", "its aliases stand for more than 100000 values"),
+        (BOMB, "its aliases expand to more than 100000 values"),
+        ("groups: &a [*a]", "its aliases expand to more than 100000 values"),
         ("groups: " + 1000 * "[", "must be a YAML file"),
         ("cell_size: " + 5000 * "9", "must be a YAML file: Exceeds the limit"),
         ("cell_size: " + 400 * "9", "cell_size must be a number of at most 63 bits, got one of 1329"),

@@ -1,1 +1,1 @@
-"""Trajectories of other programs, read without running or unpickling anything of theirs."""
+"""Import of trajectories of other programs; no code of theirs is run, no pickle is loaded."""

@@ -1,4 +1,4 @@
-"""Obstacles that are given as particles: cells with normals for the networks, and the particles for GNS.
+"""Obstacles given as particles: cells with normals for the networks.
 
 Shape legend: P particles of the boundary, D dimensions, K obstacle cells.
 """
@@ -10,23 +10,23 @@ from scipy.spatial import KDTree
 
 from hgn.scene.obstacle_grid import ObstacleGrid, grid_of_samples
 
-NEAR = 1.9  # spacings around a particle that its surface is found from: two layers, not three
-THIN = 0.1  # of the spread along a surface: what is less is one layer, at its rim too
-ONE_SIDED = 0.25  # of a spacing: where neighbours lie on one side by more, that is where the body is
+NEAR = 1.9  # spacings: the neighbourhood that normals are computed from, two layers and not three
+THIN = 0.1  # ratio of the spreads across and along a surface, below which it is one layer
+ONE_SIDED = 0.25  # spacings: a mean neighbour offset above it points into a body
 
 
 def spacing(point_PD: np.ndarray) -> float:
-    """The median distance of a particle to the next one."""
+    """Returns the median distance of a particle to its nearest neighbour."""
     if len(point_PD) < 2:
         return 0.0
     return float(np.median(KDTree(point_PD).query(point_PD, k=2)[0][:, 1]))
 
 
 def boundary_grid(point_P3: np.ndarray, dimensions: int, cell_size: float) -> ObstacleGrid:
-    """The cells that particles of the boundary lie in, with their surface's normal.
+    """Returns the cells that contain particles of the boundary, with the normals of its surface.
 
-    At a body's surface it points away from its other particles. In a thin layer it is the direction in which those
-    around spread least. Its sign is taken as for meshes: towards the centre of the cell.
+    At the surface of a body a normal points away from the other particles. In a thin layer it is the direction of least
+    spread. As for meshes, its sign is chosen towards the centre of the cell.
     """
     point_PD = point_P3[:, :dimensions].astype(np.float64)
     normal_P3 = np.zeros((len(point_PD), 3))

@@ -1,4 +1,4 @@
-"""An imported set as a data set's folder: shards, index and, last, the manifest."""
+"""Writes an imported set as a data set: shards, index and, last, the manifest."""
 
 from __future__ import annotations
 
@@ -27,17 +27,17 @@ from hgn.schema import ConfigError, require
 from hgn.system.files import make_folder, sync_file, sync_folder, temporary_file
 
 SHARD_BYTES = 128 << 20
-LOOKED_AT = 4  # trajectories, for gravity and for the spacing of boundaries
+LOOKED_AT = 4  # trajectories from which gravity and the spacing of boundaries are estimated
 
 
 def import_set(
     source: Path, config: ImportConfig, progress: Callable[[Episode], Any] = lambda _: None
 ) -> tuple[Manifest, str | None]:
-    """Reads the trajectories of a folder and writes them as a data set; tells each episode to `progress`.
+    """Reads the trajectories of a folder and writes them as a data set; calls `progress` for each episode.
 
-    Returns: its manifest, and a line on trajectories that leave their bounds, where some do.
-    Raises: ConfigError naming file and field for what cannot be read; OSError. The manifest is written last: without
-    one an import that broke off is begun again.
+    Returns: the manifest, and a warning about trajectories that leave their bounds, or None.
+    Raises: ConfigError naming file and field that cannot be read; OSError. The manifest is written last, so that an
+    interrupted import starts again.
     """
     out = Path(config.out)
     require(not (out / MANIFEST_NAME).exists(), "out", "a new folder", config.out, "this holds a data set")
@@ -81,20 +81,20 @@ def import_set(
 
 
 def _gravity(first: list[Trajectory], info: SetInfo) -> tuple[float, ...]:
-    """Of trajectories without their own; where all have one, the first one's."""
+    """Returns the gravity of trajectories without their own, or else that of the first one."""
     without = [trajectory for trajectory in first if trajectory.gravity is None]
     if without:
         return _estimated(without, info)
-    for trajectory in first if info.format == "neuralmpm" else ():  # whose units nobody has written down
+    for trajectory in first if info.format == "neuralmpm" else ():  # whose units are not documented
         stored_3 = np.array(trajectory.gravity)
         try:
             estimated_3 = np.array(_estimated([trajectory], info))
-        except ConfigError:  # too little flies
+        except ConfigError:  # too few particles in free flight
             continue
         if np.linalg.norm(estimated_3 - stored_3) > 0.1 * np.linalg.norm(stored_3):
             raise ConfigError(
-                f"{trajectory.name}: gravity must be what flies there shows, length per second squared, got "
-                f"{stored_3.tolist()} where it shows {estimated_3.round(3).tolist()}; check dt, or give gravity=…"
+                f"{trajectory.name}: gravity must be that of particles in free flight, length per second squared, got "
+                f"{stored_3.tolist()} where they show {estimated_3.round(3).tolist()}; check dt, or give gravity=…"
             )
     assert first[0].gravity is not None
     return first[0].gravity
@@ -106,7 +106,7 @@ def _estimated(first: list[Trajectory], info: SetInfo) -> tuple[float, ...]:
     size = float(np.linalg.norm(gravity))
     if info.gravity_size is not None and abs(size - info.gravity_size) > 0.1 * info.gravity_size:
         raise ConfigError(
-            f"gravity must be given where what flies does not show metadata.json's g_ext_magnitude of "
+            f"gravity must be given where particles in free flight contradict metadata.json's g_ext_magnitude of "
             f"{info.gravity_size:g}, got {size:.3g}; as in gravity=[0,-{info.gravity_size:g}]"
         )
     return gravity
@@ -121,7 +121,7 @@ def _boundary(trajectory: Trajectory, info: SetInfo) -> np.ndarray:
 def _shards(
     folder: Path, split: str, episodes: Iterator[Episode], progress: Callable[[Episode], Any]
 ) -> Iterator[ShardEntry]:
-    """Writes shard after shard, each whole or not at all."""
+    """Writes and yields shards; each file appears whole or not at all."""
     following = next(episodes, None)
     first = 0
     while following is not None:

@@ -1,8 +1,8 @@
-"""Trajectories as episodes of this project.
+"""Converts trajectories to episodes.
 
-Lengths keep the set's unit, and the box begins at the origin. Networks' cells are the set's radius wide, obstacle cells
-in proportion (`obstacle_cell_size`). A flat set lies on a plane across z that runs through centres of cells, so that a
-grid hierarchy has one layer of cells on each level; its walls across z are out of reach.
+Lengths keep the set's unit, and the box starts at the origin. Network cells have the width of the set's radius,
+obstacle cells are in proportion (`obstacle_cell_size`). A 2D set lies on a plane of constant z through cell centres, so
+that each level of the hierarchy has one layer of cells; its walls in z are out of reach.
 Shape legend: T frames, N particles, P particles of the boundary, K obstacle cells, H frames before frame 0.
 """
 
@@ -20,14 +20,14 @@ from hgn.scene.material import MATERIALS
 from hgn.scene.obstacle_grid import ObstacleGrid
 from hgn.schema import ConfigError, Vector, require
 
-CELL_OF_RADIUS = 1 / 64 / NetworkConfig.cell_size  # the paper's obstacle cells, in its networks' cells
-AT_REST = 1e-3  # of the radius: by so much particles of the boundary may move
-OUTSIDE = 0.01  # of the particles may begin farther than a radius outside of the box
+CELL_OF_RADIUS = 1 / 64 / NetworkConfig.cell_size  # ratio of the paper's obstacle cells to its networks' cells
+AT_REST = 1e-3  # of the radius: particles of a boundary may move by no more
+OUTSIDE = 0.01  # of the particles: no more may start farther than a radius outside the box
 
 
 @dataclass(frozen=True)
 class Outside:
-    """Where the particle of a trajectory that goes farthest out of the bounds is."""
+    """The particle of a trajectory that goes farthest out of the bounds."""
 
     trajectory: str
     excess: float  # beyond the bound, the set's unit of length
@@ -38,17 +38,18 @@ class Outside:
 
 @dataclass(eq=False)
 class Converter:
-    """Makes episodes of a set's trajectories, and notes what they hold."""
+    """Converts the trajectories of a set, and records what they contain."""
 
     info: SetInfo
-    gravity: tuple[float, ...]  # length per second squared, of trajectories without their own
+    gravity: tuple[float, ...]  # length per second squared, for trajectories without their own
     history: int
     obstacle_cell_size: float
     present: set[str] = field(default_factory=set)  # materials
     gravities: set[Vector] = field(default_factory=set)
     maximum_initial_speed: float = 0.0  # length per second
     with_obstacles: bool = False
-    outside: list[Outside] = field(default_factory=list)  # one of each trajectory that leaves by more than a radius
+    # one for each trajectory that leaves the bounds by more than a radius
+    outside: list[Outside] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         names = self.info.materials.values()
@@ -91,7 +92,7 @@ class Converter:
         grid = self._grid(trajectory, boundary_P3)
         gravity = trajectory.gravity or self.gravity
         x, y, z = (*gravity, 0.0)[:3]
-        # what takes frame 0 from the frame before it, in free flight
+        # the velocity that takes frame -1 to frame 0 in free flight
         velocity_N3 = (free_TN3[first].astype(np.float64) - free_TN3[first - 1]) / info.frame_dt_s
         velocity_N3 += 0.5 * info.frame_dt_s * np.array((x, y, z))
         material_N = self._materials(name, trajectory.type_N[~fixed_N])
@@ -119,7 +120,7 @@ class Converter:
                 "format": info.format,
                 "trajectory": name,
                 "dimensions": info.dimensions,
-                "offset": list(self.offset),  # what was taken from positions
+                "offset": list(self.offset),  # that was subtracted from positions
             },
             solver={},
             material_parameters=properties,
@@ -129,7 +130,7 @@ class Converter:
         )
 
     def _placed(self, position_xD: np.ndarray) -> np.ndarray:
-        """Positions from the box's corner on, float32 [..., 3]; those of a box at the origin as they are."""
+        """Returns positions relative to the box's corner, float32 [..., 3]."""
         offset_D = np.array(self.offset[: self.info.dimensions])
         placed = np.empty((*position_xD.shape[:-1], 3), np.float32)
         placed[..., 2] = self.plane
@@ -150,7 +151,7 @@ class Converter:
             )
 
     def _note_outside(self, name: str, position_TND: np.ndarray) -> None:
-        """Told, not refused: one splash over an edge is no fault of the set's other trajectories."""
+        """Records a trajectory that leaves its bounds: one splash over an edge is no reason to refuse a set."""
         low_D, high_D = np.array(self.info.bounds).T
         excess_2D = np.stack([low_D - position_TND.min((0, 1)), position_TND.max((0, 1)) - high_D])
         above, axis = (int(index) for index in np.unravel_index(excess_2D.argmax(), excess_2D.shape))
@@ -161,7 +162,7 @@ class Converter:
             self.outside.append(Outside(name, excess, axis, frame, float(path_TN.flat[place])))
 
     def note_on_bounds(self, converted: int) -> str | None:
-        """A line on the trajectories that left their bounds, of so many that were converted; none where none did."""
+        """Returns a warning about the trajectories that left their bounds, or None."""
         if not self.outside:
             return None
         farthest = max(self.outside, key=lambda outside: outside.excess)
@@ -170,11 +171,11 @@ class Converter:
             f"bounds: particles of {len(self.outside)} of {converted} trajectories go farther out of them than a "
             f"radius ({self.info.radius:g}), those of {farthest.trajectory} to {'xyz'[farthest.axis]} = "
             f"{farthest.coordinate:.4g} in frame {farthest.frame}, where bounds are [{low}, {high}]; networks take "
-            "them for walls: give bounds=… that hold all particles, or leave these trajectories out"
+            "them for walls: give bounds=… around all particles, or leave these trajectories out"
         )
 
     def _require_not_across(self, name: str, free_TN3: np.ndarray) -> None:
-        """What stays a radius away from a periodic side sees nothing behind it: LagrangeBench's dam has walls there."""
+        """Refuses particles near a periodic side; others do not see it (LagrangeBench's dam break has walls there)."""
         for axis, periodic in enumerate(self.info.periodic):
             path_TN, high = free_TN3[..., axis], self.domain_size[axis]
             if periodic and path_TN.size and min(path_TN.min(), high - path_TN.max()) < self.info.radius:
@@ -207,9 +208,9 @@ class Converter:
 
 
 def obstacle_cell_size(info: SetInfo, boundaries: list[np.ndarray]) -> float:
-    """The width of obstacle cells: the paper's in proportion to the radius, and none between particles of a boundary.
+    """Returns the width of obstacle cells: in proportion to the radius, and at least a boundary's spacing.
 
-    Mirrors keep cells and box where it is a whole number of cells wide, so the width is brought there on x.
+    It divides the box on x into a whole number of cells, so that mirrors map cells to cells.
     """
     if info.obstacle_cell_size is not None:
         return float(info.obstacle_cell_size)
@@ -220,11 +221,10 @@ def obstacle_cell_size(info: SetInfo, boundaries: list[np.ndarray]) -> float:
 
 
 def flat_plane(radius: float, obstacle_cell: float) -> float:
-    """A z in the middle between two faces of cells of both sizes, whose cell networks find exactly.
+    """Returns a z in the middle between two cell faces of both sizes, whose cell is computed exactly.
 
-    (z / radius - 1/2) is a whole number in float32, however it is computed: a division, a product with the reciprocal,
-    either with or without rounding before the subtraction. It is 16 radii or more away from the origin, beyond what
-    walls are seen from.
+    (z / radius - 1/2) is a whole number in float32 for a division and for a product with the reciprocal, with or
+    without rounding before the subtraction. z is at least 16 radii, beyond the reach of walls.
     """
     cell = np.float32(radius)
     inverse = np.float32(1) / cell

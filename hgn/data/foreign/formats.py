@@ -1,4 +1,4 @@
-"""The formats of particle trajectories: which files, what is in them, and what their numbers mean.
+"""The formats of particle trajectories: their files, their content and their units.
 
 | format | files | made by |
 |---|---|---|
@@ -28,13 +28,13 @@ from hgn.scene.npz import read_npz
 from hgn.schema import ConfigError, require
 
 SPLIT_NAMES = {"train": ("train",), "validation": ("valid", "validation"), "test": ("test",)}
-# types of particles: of DeepMind's sets, which geoelements and NeuralMPM keep, and of LagrangeBench's
+# particle types of DeepMind's sets, which geoelements and NeuralMPM share, and of LagrangeBench's
 _DEEPMIND = {0: "rigid", FLUID: "fluid", 5: "water", 6: "sand", 7: "goop"}
-_LAGRANGEBENCH = {0: "fluid", 3: "rigid", 5: "water", 6: "sand", 7: "goop"}  # the last three: its copies of DeepMind's
+_LAGRANGEBENCH = {0: "fluid", 3: "rigid", 5: "water", 6: "sand", 7: "goop"}  # 5 to 7: its copies of DeepMind's sets
 
 
 def find_format(folder: Path, asked: str) -> str:
-    """The format of a folder's files. Raises: ConfigError where there are none, or none of the format asked for."""
+    """Returns the format of a folder's files. Raises: ConfigError where there are none, or of another format."""
     require(folder.is_dir(), "from", "a folder with trajectories", str(folder))
     formats = []
     if _file(folder, "train", ".tfrecord"):
@@ -60,12 +60,12 @@ def find_format(folder: Path, asked: str) -> str:
 
 
 def set_info(folder: Path, name: str, config: ImportConfig) -> SetInfo:
-    """What the metadata say of a set, and the command line instead of it.
+    """Reads the metadata of a set; settings of the command line replace them.
 
     Raises: ConfigError naming what is missing or wrong, and for forces that change with time.
     """
     raw = _metadata(folder)
-    if isinstance(raw.get("train"), Mapping):  # geoelements' may differ between training and rollout
+    if isinstance(raw.get("train"), Mapping):  # geoelements' metadata may differ between training and rollout
         raw = dict(raw["train"])
     if "context_mean" in raw:
         raise ConfigError(
@@ -75,7 +75,7 @@ def set_info(folder: Path, name: str, config: ImportConfig) -> SetInfo:
     types, boundary = (_LAGRANGEBENCH, [1, 2]) if name == "lagrangebench" else (_DEEPMIND, [3])
 
     def given(key: str, option: Any, shape: tuple[int | None, ...], standard: Any = None) -> Any:
-        """Numbers of the command line, or else of the metadata, as lists of floats."""
+        """Returns numbers of the command line, or else of the metadata, as lists of floats."""
         value = option if option is not None else raw.get(key)
         return standard if value is None else _numbers(f"{folder}/metadata.json: {key}", value, shape)
 
@@ -98,7 +98,7 @@ def set_info(folder: Path, name: str, config: ImportConfig) -> SetInfo:
         every = given("write_every", None, (), 1.0)
         require(every > 0, f"{folder}/metadata.json: write_every", "> 0", every)
         dt *= every
-    # LagrangeBench says it of three axes, also where there are two; then the third means nothing
+    # LagrangeBench gives three axes for 2D sets too; the third is ignored
     key = "periodic_boundary_conditions"
     sides = raw.get(key, False)
     periodic = _numbers(f"{folder}/metadata.json: {key}", [sides] * 3 if isinstance(sides, bool) else sides, (None,))
@@ -120,7 +120,7 @@ def set_info(folder: Path, name: str, config: ImportConfig) -> SetInfo:
 
 
 def _numbers(name: str, value: Any, shape: tuple[int | None, ...]) -> Any:
-    """A float, or nested lists of them, of this shape, where None stands for any length."""
+    """Returns a float, or nested lists of floats, of this shape, where None stands for any length."""
     try:
         array = np.asarray(value, np.float64)
     except (TypeError, ValueError, OverflowError):
@@ -138,7 +138,7 @@ def _material(value: object, folder: Path) -> str:
 
 
 def read_split(folder: Path, split: str, info: SetInfo) -> Iterator[Trajectory]:
-    """The trajectories of a split, one after the other, in the order of their names; none where there is no file.
+    """Yields the trajectories of a split in the order of their names; none where there is no file.
 
     Raises: ConfigError naming the file, the trajectory and the field that is missing, cut, altered or of a wrong type.
     """
@@ -154,7 +154,7 @@ def _read_deepmind(folder: Path, split: str, info: SetInfo) -> Iterator[Trajecto
         flat = _joined(f"{name}: position", lists.get("position"), "<f4")
         frames: Any = info.raw.get("sequence_length")
         require(isinstance(frames, int), f"{folder}/metadata.json: sequence_length", "a whole number", frames)
-        shape = (int(frames) + 1, len(types), info.dimensions)  # one frame more, from which the first velocity comes
+        shape = (int(frames) + 1, len(types), info.dimensions)  # with the frame before the first velocity
         if flat.size != np.prod(shape):
             rule = f"{np.prod(shape)} numbers for sequence_length + 1, particles and dim {shape}"
             raise ConfigError(f"{name}: position must have {rule}, got {flat.size}")
@@ -217,7 +217,7 @@ def _read_plain_npz(path: Path, info: SetInfo) -> Iterator[Trajectory]:
 
 
 def _of_members(name: str, members: Mapping[str, np.ndarray], info: SetInfo) -> Trajectory:
-    position = members.get("position", members.get("positions"))  # geoelements' HDF5 has the other
+    position = members.get("position", members.get("positions"))  # the name in geoelements' HDF5
     if position is None:
         raise ConfigError(f"{name}: position is missing; it has {', '.join(members) or 'nothing'}")
     types = members.get("particle_type")
@@ -259,7 +259,7 @@ def _require_cells(name: str, cell_K3: np.ndarray, normal_K3: np.ndarray) -> Non
 
 
 def _properties(name: str, given: Any, count: int) -> np.ndarray | None:
-    """One number for all particles, one for each, or several for each, as float32 [N, K]."""
+    """Returns numbers of each particle, float32 [N, K], from one for all, one for each or several for each."""
     if given is None:
         return None
     array = as_array(f"{name}: material_property", given)
@@ -279,13 +279,13 @@ def _read_neuralmpm(folder: Path, split: str, info: SetInfo) -> Iterator[Traject
             particles, boundary = (_wide(path, file, key, axes) for key in ("particles", "boundary"))
             types = _dataset(str(path), file, "types") if "types" in file else np.full((), FLUID)
             own = next((_dataset(str(path), file, key) for key in ("grav", "gravity") if key in file), None)
-        if types.ndim == 1 and len(types) == particles.shape[1] + boundary.shape[1]:  # the boundary's come first
+        if types.ndim == 1 and len(types) == particles.shape[1] + boundary.shape[1]:  # the boundary's types come first
             types = types[boundary.shape[1] :]
         position_TND, type_N = checked(str(path), particles, types, axes)
         moved = np.abs(boundary - boundary[:1]).max(initial=0)
         require(moved <= 1e-3 * info.radius, f"{path}: boundary", "at rest", f"a motion by {moved:.3g}")
         gravity = None
-        if own is not None and info.gravity is None:  # of its set with a gravity for each simulation
+        if own is not None and info.gravity is None:  # from sets with a gravity for each simulation
             gravity = tuple(floats(f"{path}: grav", own, (axes,)).tolist())
         yield Trajectory(
             str(path), position_TND, type_N, boundary[0] if boundary.size else None, gravity=gravity
@@ -293,7 +293,7 @@ def _read_neuralmpm(folder: Path, split: str, info: SetInfo) -> Iterator[Traject
 
 
 def _wide(path: Path, file: h5py.File, key: str, axes: int) -> np.ndarray:
-    """The first columns of an array [frames, particles, columns]; there may be none of a boundary's particles."""
+    """Returns the first columns of an array [frames, particles, columns]; a boundary may have no particles."""
     array = _dataset(str(path), file, key)
     rule = f"[frames, particles, {axes} or more columns]"
     require(array.ndim == 3 and array.shape[2] >= axes, f"{path}: {key}", rule, list(array.shape))

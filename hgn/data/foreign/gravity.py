@@ -1,4 +1,4 @@
-"""Gravity, where no file says it: what flies freely has it as its acceleration.
+"""Estimates gravity from particles in free flight, for sets that do not contain it.
 
 Shape legend: T frames, N particles, D dimensions, S stretches, W frames of a stretch.
 """
@@ -11,19 +11,19 @@ import numpy as np
 
 from hgn.schema import ConfigError
 
-STRETCH = 6  # accelerations in a row that are to be the same
-CONSTANT = 0.02  # of their mean: by so much they may differ in a stretch
-ALIKE = 0.05  # of the median: as near are stretches that show the same gravity
+STRETCH = 6  # consecutive accelerations that must agree
+CONSTANT = 0.02  # of their mean: the largest deviation in a stretch
+ALIKE = 0.05  # of the median: the largest deviation of stretches that agree
 FEWEST = 20  # stretches
-LARGEST = 4_000_000  # numbers of a trajectory looked at at once
+LARGEST = 4_000_000  # numbers of a trajectory that are processed
 
 
 def estimate_gravity(paths: Sequence[np.ndarray], frame_dt_s: float) -> tuple[float, ...]:
-    """The constant acceleration of particles in free flight, length per second squared, from positions [T, N, D].
+    """Returns the acceleration of free flight, length per second squared, from positions [T, N, D].
 
-    A stretch is in flight where its accelerations stay the same and are not zero: what rests, slides evenly or collides
-    is left out. Positions in float32 bound the accuracy.
-    Raises: ConfigError where too little flies, or different ways.
+    A stretch is in flight if its accelerations are equal and not zero, which excludes rest, even sliding and
+    collisions. The accuracy is that of positions in float32.
+    Raises: ConfigError where too few particles fly, or their accelerations differ.
     """
     acceleration_SD = np.concatenate([_flights(path_TND) for path_TND in paths])
     count = len(acceleration_SD)
@@ -39,12 +39,12 @@ def estimate_gravity(paths: Sequence[np.ndarray], frame_dt_s: float) -> tuple[fl
         )
     mean_D = acceleration_SD[alike_S].mean(axis=0) / frame_dt_s**2
     size = np.linalg.norm(mean_D)
-    # an axis across it: what is there is rounding
+    # a component of less than 1 % is rounding
     return tuple(float(value) if abs(value) > 0.01 * size else 0.0 for value in mean_D)
 
 
 def _flights(position_TND: np.ndarray) -> np.ndarray:
-    """The mean acceleration of each stretch in flight, domain units per frame squared, [stretches, D]."""
+    """Returns the mean acceleration of each stretch in flight, domain units per frame squared, [stretches, D]."""
     frames, count, axes = position_TND.shape
     step = max(1, frames * count * axes // LARGEST)
     path_TND = np.asarray(position_TND[:, ::step], np.float64)
@@ -55,7 +55,7 @@ def _flights(position_TND: np.ndarray) -> np.ndarray:
     mean_SND = parts_SWND.mean(axis=1)
     spread_SN = np.linalg.norm(parts_SWND - mean_SND[:, None], axis=-1).max(axis=1)
     size_SN = np.linalg.norm(mean_SND, axis=-1)
-    # of a second difference of rounded positions
+    # the rounding error of a second difference of positions
     rounding = 4 * float(np.spacing(np.float32(np.abs(path_TND).max(initial=0))))
     flying_SN = (spread_SN <= CONSTANT * size_SN + 2 * rounding) & (size_SN > 4 * rounding)
     return mean_SND[flying_SN]

@@ -22,7 +22,7 @@ _VARINT, _FIXED64, _BYTES, _FIXED32 = 0, 1, 2, 5
 
 
 def read_records(path: Path) -> Iterator[bytes]:
-    """The records of a file, one after the other. Raises: ConfigError naming the record that is cut or altered."""
+    """Yields the records of a file. Raises: ConfigError naming the record that is cut or altered."""
     with path.open("rb") as file:
         number, size = 0, path.stat().st_size
         while head := file.read(12):
@@ -44,8 +44,8 @@ def _checked(file: BinaryIO, length: int, name: str) -> bytes:
 
 
 def masked_crc(data: bytes) -> int:
-    """CRC-32C, turned and shifted as TFRecord has it."""
-    import google_crc32c  # an extra: only TFRecords need it
+    """Returns the CRC-32C, rotated and offset as TFRecord defines it."""
+    import google_crc32c  # an extra that only TFRecords need
 
     crc = google_crc32c.value(data)
     return ((crc >> 15 | crc << 17) + 0xA282EAD8) & 0xFFFFFFFF
@@ -58,7 +58,7 @@ def _require_crc(name: str, data: bytes, stored: bytes) -> None:
 
 
 def parse_sequence_example(data: bytes, name: str) -> tuple[dict[str, list[bytes]], dict[str, list[bytes]]]:
-    """The bytes values of a message: of its context, and of its feature lists, joined, by key.
+    """Returns the bytes values of a message by key: of its context, and of its feature lists, joined.
 
     Features that hold numbers instead have no values here. Raises: ConfigError where it is no such message.
     """

@@ -1,4 +1,4 @@
-"""What every format is read into, checked once for all of them.
+"""The common form of all formats, checked in one place.
 
 Shape legend: T frames, N particles of all kinds, P particles of the boundary, D dimensions, 2 or 3.
 """
@@ -14,41 +14,41 @@ import numpy as np
 
 from hgn.schema import ConfigError, require
 
-MOST_RADII = 1 << 14  # across the box, for cells are counted in integers
-FLUID = 1  # the type of particles in files that give none
+MOST_RADII = 1 << 14  # across the box, because cells are indexed by integers
+FLUID = 1  # the type of particles in files without types
 
 
 @dataclass(frozen=True, eq=False)
 class Trajectory:
-    """One simulation as a file has it, in the file's own units."""
+    """One simulation in the file's own units."""
 
-    name: str  # file and place in it, for messages
+    name: str  # file and position in it, for messages
     position_TND: np.ndarray  # float32 or float64
     type_N: np.ndarray  # int64, the set's own numbers
-    boundary_PD: np.ndarray | None = None  # at rest, beside the particles; none: they are among them, by their types
+    boundary_PD: np.ndarray | None = None  # at rest; None: they are among the particles
     property_NK: np.ndarray | None = None  # float32, geoelements' material_property
-    obstacle_cell_K3: np.ndarray | None = None  # of the plain layout: cells and normals as this project has them
+    obstacle_cell_K3: np.ndarray | None = None  # of the plain format: obstacle cells and normals
     obstacle_normal_K3: np.ndarray | None = None
     gravity: tuple[float, ...] | None = None  # of this trajectory, length per second squared
 
 
 @dataclass(frozen=True)
 class SetInfo:
-    """What is the same for all trajectories of a set: from its metadata, its format, or the command line."""
+    """Properties common to all trajectories of a set, from metadata, format or command line."""
 
     format: str
     dimensions: int
     frame_dt_s: float
-    bounds: tuple[tuple[float, float], ...]  # of the box on each axis, the set's units of length
-    radius: float  # of neighbours, in them
+    bounds: tuple[tuple[float, float], ...]  # of the box on each axis, in the set's unit of length
+    radius: float  # of neighbours, in the set's unit of length
     materials: Mapping[int, str]  # names by type
     boundary_types: frozenset[int]
     ignored_types: frozenset[int] = frozenset()  # padding
-    gravity: tuple[float, ...] | None = None  # length per second squared; none: to be estimated
-    gravity_size: float | None = None  # where only that is known
+    gravity: tuple[float, ...] | None = None  # length per second squared; None: estimated
+    gravity_size: float | None = None  # where only the magnitude is known
     obstacle_cell_size: float | None = None
     periodic: tuple[bool, ...] = ()  # of each axis
-    raw: Mapping[str, Any] = field(default_factory=dict)  # the metadata as they are
+    raw: Mapping[str, Any] = field(default_factory=dict)  # the unprocessed metadata
 
     def __post_init__(self) -> None:
         require(self.dimensions in (2, 3), "metadata.json: dim", "2 or 3", self.dimensions)
@@ -72,7 +72,7 @@ class SetInfo:
 
 
 def checked(name: str, position: Any, types: Any, dimensions: int) -> tuple[np.ndarray, np.ndarray]:
-    """Positions [T, N, D] and types int64 [N] of a file, where `types` may be one number for all particles.
+    """Returns positions [T, N, D] and types int64 [N] of a file; `types` may be one number for all particles.
 
     Raises: ConfigError naming the file and the field, for another type or shape, and for what is not finite.
     """
@@ -80,7 +80,7 @@ def checked(name: str, position: Any, types: Any, dimensions: int) -> tuple[np.n
     type_N = as_array(f"{name}: particle_type", types)
     if type_N.dtype.kind not in "iu":
         whole = type_N.dtype.kind == "f" and bool((np.isfinite(type_N) & (type_N == np.round(type_N))).all())
-        if not whole:  # geoelements' own writers keep some as float64
+        if not whole:  # geoelements' writers store some as float64
             raise ConfigError(f"{name}: particle_type must be whole numbers, got {type_N.dtype}")
     count = position_TND.shape[1]
     if type_N.ndim == 0 or (type_N.shape == (1,) and count != 1):
@@ -91,7 +91,7 @@ def checked(name: str, position: Any, types: Any, dimensions: int) -> tuple[np.n
 
 
 def as_array(name: str, value: Any) -> np.ndarray:
-    """A file's value as an array. Raises: ConfigError in the name of `name` for lists of different lengths."""
+    """Returns a file's value as an array. Raises: ConfigError naming `name` for lists of different lengths."""
     try:
         return np.asarray(value)
     except ValueError as error:  # lists of different lengths
@@ -99,7 +99,7 @@ def as_array(name: str, value: Any) -> np.ndarray:
 
 
 def floats(name: str, array: Any, shape: tuple[int | None, ...]) -> np.ndarray:
-    """A finite array of float32 or float64 of this shape, where None stands for any length above 0.
+    """Returns a finite array of float32 or float64 of this shape, where None stands for any length above 0.
 
     Raises: ConfigError naming the file and the field.
     """
