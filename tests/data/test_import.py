@@ -330,7 +330,7 @@ def test_what_leaves_the_bounds_later_is_told(tmp_path, capsys):
     (line,) = imported("left", slight, risen, fallen)
     assert line.startswith("bounds: particles of 2 of 3 trajectories go farther out of them than a radius (0.035)")
     assert "train.npz: 00002 to y = -0.25 in frame 6, where bounds are [0.0, 1.0]" in line
-    assert line.endswith("give bounds=… that hold all particles, or leave these trajectories out")
+    assert line.endswith("give bounds=… around all particles, or leave these trajectories out")
 
 
 def test_materials_that_are_no_mapping(tmp_path):
@@ -365,7 +365,8 @@ def test_each_simulation_may_have_its_own_gravity(name, tmp_path):
     assert [e.gravity for e in EpisodeStore(tmp_path / "mine", "train")] == own
     if one_each:
         tell(2.0)
-        with pytest.raises(ConfigError, match=r"sim_0.h5: gravity must be what flies there shows, .* got \[0.0, -1.0,"):
+        message = r"sim_0.h5: gravity must be that of particles in free flight, .* got \[0.0, -1.0,"
+        with pytest.raises(ConfigError, match=message):
             import_trajectories.main(options(tmp_path / "other", source, gravity=None))
 
 

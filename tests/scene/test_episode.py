@@ -57,15 +57,6 @@ def test_material_parameters_roundtrip():
     assert_same(episode, decode_episode(episode.key, members))
 
 
-def test_a_member_that_left_is_ignored():
-    """Distances of obstacle cells, which some data sets have, are not read, and not written again."""
-    episode = make_episode()
-    members = encode_episode(episode)
-    decoded = decode_episode(episode.key, members | {"obstacle_distance.npy": npy(np.zeros(3, np.float32))})
-    assert_same(episode, decoded)
-    assert encode_episode(decoded) == members
-
-
 def test_bytes_are_a_function_of_the_content():
     """Memory layout and key order of the input leave no trace in the stored bytes."""
     episode = make_episode()
