@@ -1,14 +1,12 @@
 """`python -m datagen.upload data=data/obstacles to=s3://bucket/obstacles`: copies a data set to an object store.
 
-Training then reads it with `dataset.folder=s3://bucket/obstacles`. Shards go first and the manifest last, so that what
-is listed there is there whole; the same command again copies what is new. With `follow=true` it goes on while the data
-set grows, until that is complete.
+Training then reads it with `dataset.folder=s3://bucket/obstacles`. Shards are copied first and the manifest last, so
+that all listed shards are complete. Run again, the command copies what is new.
 """
 
 from __future__ import annotations
 
 import contextlib
-import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,10 +15,8 @@ from datagen.generate import StopSignal
 from hgn.command import run_command
 from hgn.data.manifest import MANIFEST_NAME, SPLITS, Manifest
 from hgn.data.storage import is_remote, open_storage, write_remote
-from hgn.schema import ConfigError, Positive, from_mapping, require, require_bounds
+from hgn.schema import ConfigError, from_mapping, require
 from hgn.system.progress import bar
-
-_LOOK_S = 0.2  # between looks for a signal
 
 
 @dataclass(frozen=True)
@@ -29,11 +25,6 @@ class UploadConfig:
 
     data: str  # folder of a data set
     to: str  # URL; training reads it with dataset.folder=URL
-    follow: bool = False  # go on while the data set grows, until it is complete
-    poll_s: Positive[float] = 5.0  # between looks at it then
-
-    def __post_init__(self) -> None:
-        require_bounds(self)
 
 
 def main(mapping: dict[str, Any]) -> int:
@@ -43,13 +34,7 @@ def main(mapping: dict[str, Any]) -> int:
     require(not is_remote(config.data), "data", "a folder of this machine", config.data)
     with StopSignal() as stop:
         target = Target(config.to)
-        while not stop.requested():
-            target.copy(Path(config.data), stop)
-            if not config.follow or target.complete:
-                break
-            until = time.monotonic() + config.poll_s
-            while time.monotonic() < until and not stop.requested():
-                time.sleep(_LOOK_S)
+        target.copy(Path(config.data), stop)
     print(f"{config.to} holds {target.shards} shards" + (", the whole data set" if target.complete else ""))
     return 0 if stop.signal is None else 128 + stop.signal
 

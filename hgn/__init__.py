@@ -1,7 +1,7 @@
 """Hierarchical graph networks for learned particle physics.
 
-What a program of one's own needs is here by name (`from hgn import Simulator, load_scene`) and loads when it is first
-asked for: `import hgn` alone loads neither torch nor NumPy.
+The public API is imported from here (`from hgn import Simulator, load_scene`) and loaded on first use: `import hgn`
+loads neither torch nor NumPy.
 """
 
 from __future__ import annotations

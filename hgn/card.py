@@ -1,6 +1,6 @@
 """python -m hgn.card weights=net.safetensors out=FOLDER, or data=FOLDER: a card for the Hugging Face Hub.
 
-Writes README.md with the Hub's metadata at its head: what is in the file or the data set, as these say of themselves.
+Writes README.md with the Hub's metadata and a table of the content of the weights or the data set.
 """
 
 from __future__ import annotations
@@ -21,18 +21,18 @@ from hgn.schema import from_mapping, require
 from hgn.system.files import write_atomically
 
 CARD = "README.md"
-_SIZES = ((1_000, "n<1K"), (10_000, "1K<n<10K"), (100_000, "10K<n<100K"))  # the Hub's names, by episodes
+_SIZES = ((1_000, "n<1K"), (10_000, "1K<n<10K"), (100_000, "10K<n<100K"))  # the Hub's size categories, by episodes
 
 
 @dataclass(frozen=True)
 class CardConfig:
-    """`python -m hgn.card`: the README.md that the Hugging Face Hub shows of weights or of a data set."""
+    """`python -m hgn.card`: the README.md that the Hugging Face Hub shows for weights or a data set."""
 
-    weights: str | None = None  # a file of python -m hgn.export, copied into out; or …
-    data: str | None = None  # … a data set's folder, where the card is written
-    out: str | None = None  # with weights: a folder
-    license: str = "mit"  # by the Hub's names
-    name: str | None = None  # the heading; null: the file's or the folder's name
+    weights: str | None = None  # a file of python -m hgn.export, which is copied into out
+    data: str | None = None  # the folder of a data set, for its card, instead of weights
+    out: str | None = None  # the folder for the card and a copy of the weights; only with weights
+    license: str = "mit"  # a licence by its name on the Hub
+    name: str | None = None  # the heading; null: the name of the file or the folder
 
     def __post_init__(self) -> None:
         one = (self.weights is None) != (self.data is None)
@@ -44,10 +44,10 @@ class CardConfig:
 
 
 def main(mapping: dict[str, Any]) -> int:
-    """Writes the card, beside weights a copy of them; returns the exit code. A card that is there is kept."""
+    """Writes the card, and a copy of the weights; never replaces a card. Returns the exit code."""
     config = from_mapping(CardConfig, mapping)
     if config.weights is not None:
-        assert config.out is not None  # CardConfig saw to it
+        assert config.out is not None  # checked by CardConfig
         path, folder = find_weights(config.weights), Path(config.out)
         _, info = load_weights(path)
         text = weights_card(info, config.name or path.stem, path.name, config.license)
@@ -70,7 +70,7 @@ def main(mapping: dict[str, Any]) -> int:
 
 
 def weights_card(info: WeightsInfo, name: str, file: str, licence: str) -> str:
-    """The card of a weights file: the Hub's metadata, then what it says of itself and how it is used."""
+    """Returns the card of a weights file: the Hub's metadata, the structure, and a command that uses it."""
     network = info.network
     metadata = {"license": licence, "library_name": "hgn", "tags": ["physics", "particles", "simulation", network.kind]}
     rows = {
@@ -87,7 +87,7 @@ def weights_card(info: WeightsInfo, name: str, file: str, licence: str) -> str:
 
 
 def data_card(manifest: Manifest, name: str, licence: str) -> str:
-    """The card of a data set: the Hub's metadata with its splits, then what the manifest says and how it is used."""
+    """Returns the card of a data set: the Hub's metadata with its splits, the manifest's content, and a command."""
     episodes = {split: manifest.published(split) for split in SPLITS if manifest.published(split)}
     require(bool(episodes), "data", "a data set with episodes", name)
     count = sum(episodes.values())

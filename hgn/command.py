@@ -1,7 +1,7 @@
-"""What all commands share: Hydra composes the config, and faults a person can mend end in one line, no traceback.
+"""Entry point of all commands: Hydra composes the config, and errors that a user can mend end in one line.
 
-Exit codes: 0 done, 1 the machine is at fault (a full disk, no permission, a path that is taken), 2 the input is at
-fault, 130 Ctrl-C, 141 nobody reads any more what it prints (as in `… | head`).
+Exit codes: 0 success, 1 machine error (full disk, no permission, existing path), 2 invalid input, 130 Ctrl-C,
+141 closed output pipe (as in `… | head`).
 """
 
 from __future__ import annotations
@@ -27,39 +27,38 @@ _MACHINE_ERRORS = {
     errno.EACCES: "check the permissions",
     errno.EPERM: "check the permissions",
     errno.EROFS: "choose a folder that can be written to",
-    # a path the person gave leads through a file, or ends at a thing of the wrong kind
+    # a given path leads through a file, or ends at the wrong kind of file
     errno.EEXIST: "choose another path",
     errno.ENOTDIR: "choose another path",
     errno.EISDIR: "choose another path",
     errno.ENAMETOOLONG: "choose another path",
-    errno.ETIMEDOUT: "see that its server runs",
+    errno.ETIMEDOUT: "check that its server runs",
 }
 
 
 def run_command(main: Callable[[dict[str, Any]], int | None], config_name: str) -> NoReturn:
     """Composes `conf/<config_name>.yaml` with the command line, calls `main` with the plain mapping, and exits.
 
-    A command without config groups has its file in `conf/command/`: beside the groups Hydra would take its keys
+    The file of a command without config groups lies in `conf/command/`, because Hydra would take its keys
     (`scene=my_scene.yaml`) for choices of a group.
 
-    Hydra's own options (--cfg, --config-path, --config-name, --multirun) work as ever; --help shows the keys with their
-    values and comments. `main` returns an exit code or None for 0. ConfigError, an unknown key and a full disk are
-    printed as one line, `error: ...`.
+    Hydra's options (--cfg, --config-path, --config-name, --multirun) work; --help prints keys, values and comments.
+    `main` returns an exit code or None for 0. Errors that a user can mend are printed as one line, `error: ...`.
     """
     for name in ("stdout", "stderr"):
-        if getattr(sys, name) is None:  # the process was started without
-            setattr(sys, name, Path(os.devnull).open("w"))  # noqa: SIM115 - as long as the process
+        if getattr(sys, name) is None:  # the process was started without it
+            setattr(sys, name, Path(os.devnull).open("w"))  # noqa: SIM115 - open as long as the process runs
     code: int | str | None
     try:
         try:
             code = _exit_code(main, config_name)
-        except SystemExit as end:  # Hydra's own, after --help
+        except SystemExit as end:  # by Hydra, after --help
             code = end.code
         sys.stdout.flush()
     except BrokenPipeError:
         if not _unread():
             raise
-        for stream in (sys.stdout, sys.stderr):  # what is left in them has nowhere to go when Python ends
+        for stream in (sys.stdout, sys.stderr):  # their buffers cannot be flushed at exit
             with Path(os.devnull).open("wb") as nowhere:
                 os.dup2(nowhere.fileno(), stream.fileno())
         code = EXIT_UNREAD
@@ -95,7 +94,7 @@ def _exit_code(main: Callable[[dict[str, Any]], int | None], config_name: str) -
 
 
 def _unread() -> bool:
-    """Whether standard output or error lead into a pipe whose reader has gone."""
+    """Whether standard output or error is a pipe without a reader."""
     poll = select.poll()
     for stream in (sys.stdout, sys.stderr):
         poll.register(stream.fileno(), 0)
@@ -103,7 +102,7 @@ def _unread() -> bool:
 
 
 def _compose(config_name: str, complete: bool = True) -> list[dict[str, Any]]:
-    """The configurations that the command line asks for; not `complete`: keys that must be given may lack."""
+    """Returns the configurations of the command line; with `complete=False` required keys may be missing."""
     from hgn.hydra_compat import compose
 
     arguments = _with_json_as_override(sys.argv)
@@ -125,7 +124,7 @@ def _print_help(config_name: str) -> None:
 
 
 def _require_options(arguments: list[str]) -> None:
-    """Refuses options that Hydra would answer with pages, and words that are no key=value."""
+    """Refuses options to which Hydra would print pages, and words without `=`."""
     from hgn.hydra_compat import OPTIONS
 
     for before, argument in itertools.pairwise(arguments):
@@ -138,7 +137,7 @@ def _require_options(arguments: list[str]) -> None:
 
 
 def _with_json_as_override(arguments: list[str]) -> list[str]:
-    """`--json FILE` and `--json=FILE`, which the reports take as other tools do, are the override json=FILE."""
+    """Replaces `--json FILE` and `--json=FILE` of the reports by json=FILE."""
     result: list[str] = []
     waiting = iter(arguments)
     for argument in waiting:

@@ -1,4 +1,4 @@
-"""What `--help` prints: a command's description, and every key with its value and the comment beside its definition."""
+"""The output of `--help`: a command's description, and every key with value and comment."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from hgn.schema import field_comments
 
 
 def help_lines(mapping: Mapping[str, Any], folder: Path, config_name: str) -> Iterator[str]:
-    """The composed configuration `mapping` of a command whose file lies in `folder`, as YAML with comments."""
+    """Yields a command's composed configuration as YAML with comments; its file lies in `folder`."""
     file = folder / f"{config_name}.yaml"
     cls = dataclass_of(file)
     comments = (field_comments(cls) if cls else {}) | _comments_in(file)
@@ -37,13 +37,13 @@ def help_lines(mapping: Mapping[str, Any], folder: Path, config_name: str) -> It
 
 
 def _nested(cls: type | None, key: str) -> type | None:
-    """The dataclass of a field that holds one."""
+    """Returns the type of a field that contains a dataclass, or None."""
     hint = typing.get_type_hints(cls).get(key) if cls else None
     return hint if isinstance(hint, type) and dataclasses.is_dataclass(hint) else None
 
 
 def _comments_in(file: Path) -> dict[str, str]:
-    """Comments beside the keys of a YAML file."""
+    """Returns the comments beside the keys of a YAML file."""
     return dict(re.findall(r"^(\w+):[^#\n]*# (.*)$", file.read_text(encoding="utf-8"), re.MULTILINE))
 
 

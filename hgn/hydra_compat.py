@@ -1,4 +1,4 @@
-"""All of Hydra that the commands use, its private and fragile parts included; pyproject.toml bounds its version.
+"""All uses of Hydra, including private and fragile parts; pyproject.toml bounds its version.
 
 `tests/test_hydra_compat.py` fails when a new version has changed one of them.
 """
@@ -23,7 +23,7 @@ OPTIONS = (
     *("-cd", "--experimental-rerun", "--info", "-i"),
 )
 
-# Hydra makes no folder and no log file of its own; the commands say where they write
+# Hydra creates no folder and no log file; commands choose where they write
 _QUIET = (
     "hydra.run.dir=.",
     "hydra.output_subdir=null",
@@ -34,11 +34,11 @@ _DATACLASS = re.compile(r"(?:hgn|datagen|tools)(?:\.\w+)+\.[A-Z]\w*Config")
 
 
 def compose(folder: Path, config_name: str, arguments: list[str], complete: bool = True) -> list[dict[str, Any]]:
-    """The composed configuration as plain containers, or several with --multirun; arguments are those of `sys.argv`.
+    """Returns the composed configurations as plain containers, several with --multirun; arguments as in `sys.argv`.
 
-    A file whose `defaults` name a dataclass, as in hgn.config.NetworkConfig, begins with that one's defaults. Where no
-    option asks for more, Hydra composes once: its own entry point does so twice, and reads the sources of its callers.
-    Raises: ConfigError, also where a key that must be given lacks, and the configuration is to be `complete`.
+    A file whose `defaults` name a dataclass, as in hgn.config.NetworkConfig, starts with its defaults. Hydra's own
+    entry point, which composes twice and reads its callers' sources, is used only for Hydra's options.
+    Raises: ConfigError, also for a missing key if the configuration must be `complete`.
     """
     from hydra import compose as compose_once
     from hydra import initialize_config_dir
@@ -73,13 +73,13 @@ def compose(folder: Path, config_name: str, arguments: list[str], complete: bool
 
 
 def dataclass_of(file: Path) -> type | None:
-    """The dataclass that a file's `defaults` name; none where they name none."""
+    """Returns the dataclass that a file's `defaults` name, or None."""
     names = _dataclasses_in(file)
     return _load(names[0]) if names else None
 
 
 def _dataclasses_in(file: Path) -> list[str]:
-    """Dotted names in the `defaults` of a file."""
+    """Returns the dotted names in the `defaults` of a file."""
     defaults = re.search(r"^defaults:(.*(?:\n +-.*|\n *#.*)*)", file.read_text(encoding="utf-8"), re.MULTILINE)
     return _DATACLASS.findall(defaults[1]) if defaults else []
 
@@ -92,9 +92,9 @@ def _load(name: str) -> type:
 
 @contextmanager
 def registered_dataclasses(folder: Path, config_name: str) -> Iterator[None]:
-    """While entered, Hydra knows the defaults of the dataclasses that config files name, under those names.
+    """Registers the dataclasses that config files name with Hydra, under these names.
 
-    Hydra's store is one for the process, and a group that another command has would be a group here.
+    Hydra's store is global: the groups of another command would be groups of this one.
     """
     from hydra.core.config_store import ConfigStore
 
@@ -112,8 +112,8 @@ def registered_dataclasses(folder: Path, config_name: str) -> Iterator[None]:
 
 
 def _override(argument: str, folder: Path) -> str:
-    """An argument as Hydra is to get it: a key that it does not find is added, so that the command itself refuses it
-    and names the keys that it knows; experiment=… is as good as +experiment=…; values are quoted where they must be."""
+    """Returns an argument in Hydra's syntax: unknown keys are added, so that the command refuses them and names its
+    keys; experiment=… becomes +experiment=…; values are quoted where necessary."""
     key, equals, value = argument.partition("=")
     if not equals or key.startswith("-"):
         return argument
@@ -132,8 +132,8 @@ def _override(argument: str, folder: Path) -> str:
 
 
 def _in_quotes(value: str) -> str:
-    """A value that Hydra's grammar refuses as it is, or such values of a flat list, in quotes: names with ü, &, # or
-    (1) in them, say, and ~/, which is the home folder. Unchanged where they are no help."""
+    """Quotes a value that Hydra's grammar refuses (with ü, &, # or (1) in it), also in a flat list; ~/ becomes the home
+    folder. Returns it unchanged where quotes do not help."""
     if value[0] == "[" and value[-1] == "]" and not re.search("[\"'{}[\\]]", value[1:-1]):
         items = [item.strip() for item in value[1:-1].split(",")]
         return f"[{','.join(_in_quotes(item) if item and not _understood(item) else item for item in items)}]"
@@ -143,7 +143,7 @@ def _in_quotes(value: str) -> str:
 
 
 def _understood(value: str) -> list[Any]:
-    """What Hydra takes a value for, alone in a list; an empty one for what its grammar refuses."""
+    """Returns [value] as Hydra parses it, or [] for a value that its grammar refuses."""
     from hydra.core.override_parser.overrides_parser import OverridesParser
     from hydra.errors import HydraException
 
@@ -154,8 +154,7 @@ def _understood(value: str) -> list[Any]:
 
 
 def _with_quiet(arguments: list[str]) -> list[str]:
-    # before the person's own overrides, so that theirs win, and beside them, because argparse takes overrides in one
-    # run only
+    # just before the user's overrides: these win, and argparse accepts overrides only in one sequence
     for place, argument in enumerate(arguments):
         if place and "=" in argument and not argument.startswith("-") and not arguments[place - 1].startswith("--conf"):
             return [*arguments[:place], *_QUIET, *arguments[place:]]

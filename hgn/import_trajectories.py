@@ -18,7 +18,7 @@ from hgn.system.progress import bar
 
 
 def main(mapping: dict[str, Any]) -> int:
-    """Imports, and says what was found and how to train on it; returns the exit code."""
+    """Imports a set, prints its content and how to train on it; returns the exit code."""
     mapping = dict(mapping)
     source = mapping.pop("from", None)
     require(isinstance(source, str) and source != "", "from", "the folder with the trajectories", source)

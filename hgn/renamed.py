@@ -65,6 +65,8 @@ REMOVED: dict[str, Removed] = {
     "network.rest_levels": Removed(2, "leave it out", _rests),
     "network.wall_distance_cells": Removed(8.0, TRAIN_ANEW, lambda network: not _relative(network)),
     "training.gradient_messages": Removed("fp32"),
+    "training.huber": Removed(),
+    "training.weight_decay": Removed(),
     "training.grid_jitter": Removed(True),
     "training.maximum_skipped_updates": Removed(100),
     "training.monitor_frame_stride": Removed(4),
@@ -73,6 +75,8 @@ REMOVED: dict[str, Removed] = {
     "training.nodes": Removed(remedy="leave it out: the launcher starts processes on every machine"),
     "training.noise_weight_power": Removed(2.0),
     "training.quiet_weight": Removed(4.0),
+    "upload.follow": Removed(remedy="run the command again, as with watch -n 60: it copies what is new"),
+    "upload.poll_s": Removed(remedy="run the command again, as with watch -n 60: it copies what is new"),
 }
 
 # Values that a setting or a config group no longer takes, by the last part of its key, and what to do instead.

@@ -1,8 +1,7 @@
 """Strict conversion of plain mappings (YAML, JSON) to dataclasses.
 
-Every file a user may write (configs, scene files) and every file that may have been written by another
-version (manifests, weights) passes through `from_mapping`: unknown keys, wrong types and missing fields end
-in one `ConfigError` that names the field, the rule, the value seen and the remedy.
+Every file of a user (configs, scene files) or of another version (manifests, weights) passes through `from_mapping`:
+unknown keys, wrong types and missing fields end in one `ConfigError` that names field, rule, value and remedy.
 """
 
 from __future__ import annotations
@@ -22,20 +21,20 @@ from typing import Annotated, Any, TypeVar
 from hgn.renamed import KEYS, current_names, removed_remedy, renamed_remedy, value_remedy
 
 T = TypeVar("T")
-# of a value: its owner's and its own name or place, joined where a message needs it
+# of a value: the owner's path and its own name or index, joined for messages
 _Path = str | tuple[Any, str | int]
 
 
 @dataclasses.dataclass(frozen=True)
 class Bound:
-    """A rule for a value, beside its type: in words, and as what holds (of NaN none does); see `require_bounds`."""
+    """A rule for a value: its words, and a predicate that is false for NaN; see `require_bounds`."""
 
     rule: str
     holds: Callable[[Any], bool]
 
 
 def one_of(*choices: str) -> Bound:
-    """The rule of a name among choices."""
+    """Returns the rule of a value among choices."""
     return Bound(f"one of {', '.join(choices)}", choices.__contains__)
 
 
@@ -63,14 +62,13 @@ FewLayers = Annotated[Positive[int], Bound("at most 1,000", lambda value: value 
 
 
 class ConfigError(ValueError):
-    """A value that a user can mend: the message names field, rule, value and remedy."""
+    """An invalid value: the message names field, rule, value and remedy."""
 
 
 def from_mapping(cls: type[T], mapping: object, path: _Path = "") -> T:
     """Builds dataclass `cls` from `mapping`, recursively.
 
-    Integers are accepted where floats are asked for; nothing else is converted silently. Lists become tuples
-    of the annotated item type. `path` prefixes the names in messages.
+    Integers are accepted for floats, lists for tuples; nothing else is converted. `path` prefixes names in messages.
 
     Raises: ConfigError.
     """
@@ -101,7 +99,7 @@ def from_mapping(cls: type[T], mapping: object, path: _Path = "") -> T:
 
 @functools.cache
 def _fields(cls: type) -> tuple[dict[str, Any], dict[str, bool]]:
-    """The types of a dataclass's fields, and whether each must be given. Slow to find out, and asked for each value."""
+    """Returns the types of a dataclass's fields, and whether each is required; cached, because it is slow."""
     given = {field.name: field for field in dataclasses.fields(cls) if field.init}
     missing = dataclasses.MISSING
     return typing.get_type_hints(cls), {
@@ -116,24 +114,24 @@ def section_of(cls: type) -> str:
 
 @functools.cache
 def _shape(hint: Any) -> tuple[Any, tuple[Any, ...], bool]:
-    """What a type is made of, and whether it is a dataclass."""
+    """Returns origin and arguments of a type, and whether it is a dataclass."""
     return typing.get_origin(hint), typing.get_args(hint), dataclasses.is_dataclass(hint)
 
 
 def from_stored(cls: type[T], mapping: Mapping[str, Any], section: str) -> T:
-    """The same for a section of a file of ours, which may have been written with the names of an earlier release."""
+    """Builds a dataclass from a section of a stored file, perhaps of an earlier release."""
     return from_mapping(cls, current_names(mapping, section), section)
 
 
 def known_keys(key: str, names: Iterable[str]) -> str:
-    """What to say beside a key that is not known: the one that may have been meant, or else all."""
+    """Returns the remedy for an unknown key: a similar key, or else all keys."""
     names = list(names)
     close = difflib.get_close_matches(key, names, n=1)
     return f"did you mean {close[0]}?" if close else f"known keys: {', '.join(names)}"
 
 
 def to_mapping(value: Any) -> Any:
-    """The inverse of `from_mapping`: plain dicts, lists and scalars, ready for JSON or YAML."""
+    """Converts to plain dicts, lists and scalars for JSON or YAML; the inverse of `from_mapping`."""
     if type(value) in (int, float, str, bool):
         return value
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
@@ -146,7 +144,7 @@ def to_mapping(value: Any) -> Any:
 
 
 def default_mapping(cls: type) -> dict[str, Any]:
-    """A dataclass's defaults as plain containers; `???`, which Hydra asks for, where a field has none."""
+    """Returns a dataclass's defaults as plain containers, with Hydra's `???` for required fields."""
     result: dict[str, Any] = {}
     for field in dataclasses.fields(cls):
         if field.default is not dataclasses.MISSING:
@@ -159,7 +157,7 @@ def default_mapping(cls: type) -> dict[str, Any]:
 
 
 def field_comments(cls: type) -> dict[str, str]:
-    """What the source says of each field of a dataclass: the lines above it, and the comment beside it."""
+    """Returns the comment of each field of a dataclass: the lines above it, and the one beside it."""
     comments: dict[str, str] = {}
     above: list[str] = []
     for line in inspect.getsource(cls).splitlines():
@@ -181,7 +179,7 @@ def require(rule_holds: bool, field: str, rule: str, value: object, remedy: str 
 
 
 def require_bounds(owner: object) -> None:
-    """Each field of a dataclass, and each item of its tuples, is within the `Bound` of its annotation, or none."""
+    """Checks the fields of a dataclass, and the items of its tuples, against the `Bound`s of their annotations."""
     cls: Any = type(owner)
     for name, hint in _bounded_hints(cls).items():
         _require_bound(hint, getattr(owner, name), name)
@@ -204,7 +202,7 @@ def _require_bound(hint: Any, value: Any, name: str) -> None:
     if typing.get_origin(hint) is tuple:
         for i, item in enumerate(value):
             _require_bound(options[0], item, f"{name}[{i}]")
-    elif options and value is not None:  # of an optional one
+    elif options and value is not None:  # of an optional type
         _require_bound(options[0], value, name)
 
 

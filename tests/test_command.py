@@ -35,13 +35,13 @@ def test_names_that_hydra_refuses(given, meant, monkeypatch):
 
 
 def test_names_in_lists(monkeypatch):
-    """Each by itself; what is no name is refused as ever."""
-    monkeypatch.setattr("sys.argv", ["compare", "trees=[a, dé mo (1),3]", "out=ü", "+new=[x&y]"])
-    (composed,) = _compose("compare")
-    assert (composed["trees"], composed["out"], composed["new"]) == (["a", "dé mo (1)", 3], "ü", ["x&y"])
-    monkeypatch.setattr("sys.argv", ["compare", "trees=[a,{ü]", "out=x"])
-    with pytest.raises(ConfigError, match="trees="):
-        _compose("compare")
+    """Each name of a list is taken by itself; what is no name is refused."""
+    monkeypatch.setattr("sys.argv", ["average", "weights=[a, dé mo (1),3]", "out=ü", "+new=[x&y]"])
+    (composed,) = _compose("average")
+    assert (composed["weights"], composed["out"], composed["new"]) == (["a", "dé mo (1)", 3], "ü", ["x&y"])
+    monkeypatch.setattr("sys.argv", ["average", "weights=[a,{ü]", "out=x"])
+    with pytest.raises(ConfigError, match="weights="):
+        _compose("average")
 
 
 @pytest.mark.parametrize(

@@ -19,7 +19,7 @@ LINES = {  # of Python, in tracked files
     "hgn": 29_400,
     "datagen": 8_855,
     "tools": 7_705,
-    "tests": 28_000,
+    "tests": 28_200,
 }
 SETTINGS = 352  # fields of the dataclasses behind the commands, *Config
 

@@ -1,15 +1,18 @@
 """hgn.renamed: settings of earlier releases are answered with today's, and files of before load."""
 
+import dataclasses
 from dataclasses import replace
+from importlib import import_module
 
 import pytest
 
+import hgn.config
 from hgn.config import DatagenConfig, MpmConfig, NetworkConfig, SceneConfig, TrainConfig
 from hgn.data.identity import dataset_identity
 from hgn.evaluate import EvaluateConfig
 from hgn.export import ExportConfig
 from hgn.network.build import build_network
-from hgn.renamed import KEYS, REMOVED, REMOVED_CHOICES, Removed, current_names, stored_names
+from hgn.renamed import KEYS, REMOVED, REMOVED_CHOICES, Removed, current_names, removed_remedy, stored_names
 from hgn.rollout import RolloutConfig
 from hgn.runtime.weights import WeightsInfo, load_weights, save_weights
 from hgn.schema import ConfigError, from_mapping, from_stored, section_of, to_mapping
@@ -143,3 +146,47 @@ def test_the_table_is_sound():
     fields = {f"{section_of(cls)}.{name}" for cls in SECTIONS for name in to_mapping(cls())}
     assert not fields & (REMOVED.keys() | KEYS.keys())
     assert all(key in fields for key in KEYS.values() if key.startswith(("scene.", "mpm.", "network.")))
+
+
+FIRST_RELEASE = {  # settings of 0.1.0
+    "scene": """domain_size cell_size gravity obstacle_count obstacle_shapes obstacle_size group_count group_shapes
+        group_size materials particles_per_cell clearance_cells maximum_initial_speed initial_speed_share
+        lone_particles""",
+    "mpm": """youngs_modulus_pa poisson_ratio density_kg_m3 sand_friction_angle_deg sand_friction_law
+        sand_volume_correction snow_hardening snow_critical_compression snow_critical_stretch
+        snow_maximum_hardening water_equation water_volume_update water_minimum_volume_ratio
+        minimum_singular_value time_step fixed_time_step_s stability_fraction speed_fraction transfer_speed_m_s
+        wall_cells wall_contact collider_band_cells collider_friction collider_projection device
+        scenes_per_launch maximum_substeps_per_frame""",
+    "dataset": """folder training_scenes validation_scenes test_scenes frames frame_rate_hz seed early_episodes
+        episodes_per_shard workers maximum_attempts pool ray_address array_task array_tasks""",
+    "service": "host port connections",
+    "solve": "scene out frames frame_rate_hz mpm",
+    "upload": "data to follow poll_s",
+    "network": """kind cell_size levels message_passing_steps width velocity_history material_embedding
+        wall_distance_cells obstacle_features materials maximum_neighbours static_spacing_cells""",
+    "training": """maximum_updates maximum_minutes batch_scenes optimizer weight_decay learning_rate final_learning_rate
+        warmup_updates weights ema_decay noise_std huber noise_smooth noise_at_rest grid_jitter frame_importance
+        symmetry rollout_share rollout_every rollout_scenes rollout_frames rollout_pull seed accelerator devices
+        nodes precision path minimum_episodes generate maximum_skipped_updates log_every checkpoint_every
+        monitor_every monitor_scenes monitor_frame_stride monitor_rollout_frames monitor_particles_per_batch""",
+    "train": "scene mpm dataset network training run",
+    "export": "checkpoint out half",
+    "average": "weights out shares half",
+    "rollout": "weights out render scene seed data episode frames device path precision",
+    "evaluate": """weights data split scenes frame_stride rollout_frames particles_per_batch device path precision
+        json""",
+    "render": "out rollout others names data episode frames gif every fps size",
+}
+
+
+@pytest.mark.parametrize("section", FIRST_RELEASE)
+def test_settings_of_the_first_release_are_answered(section):
+    """Each setting of release 0.1.0 is one of today, or was renamed to one of today, or the reason of its removal is
+    given."""
+    module, name = {"render": "tools", "solve": "datagen", "upload": "datagen"}.get(section, "hgn"), section.title()
+    cls = vars(hgn.config).get(f"{name}Config") or getattr(import_module(f"{module}.{section}"), f"{name}Config")
+    fields = {field.name for field in dataclasses.fields(cls)}
+    for key in FIRST_RELEASE[section].split():
+        new = KEYS.get(f"{section}.{key}", KEYS.get(key, key)).rpartition(".")[2]
+        assert key in fields or new in fields or removed_remedy(section, key, None), key

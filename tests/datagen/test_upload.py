@@ -1,9 +1,7 @@
 """Data sets in object stores: what is listed there is there whole, whatever becomes of the copying."""
 
-import dataclasses
 import os
 import signal
-import threading
 from pathlib import Path
 
 import fsspec
@@ -71,20 +69,17 @@ def test_copying_that_is_cut_off(folder, monkeypatch, store):
     assert keys("memory://cut") == keys(folder)
 
 
-def test_following_a_data_set_that_grows(make_config, make_dataset, monkeypatch):
-    """With follow=true copying goes on until the data set is complete, or a signal ends it."""
-    monkeypatch.setattr("datagen.upload._LOOK_S", 0.01)
-    config = make_config()
-    folder = make_dataset(make_config(training_scenes=1))
-    manifest = Manifest.load(folder)
-    dataclasses.replace(manifest, requested={"train": 5, "validation": 2, "test": 1}, revision=9).save(folder)
-    follow = {"data": str(folder), "to": "memory://growing", "follow": True, "poll_s": 0.01}
-    threading.Timer(0.2, os.kill, (os.getpid(), signal.SIGTERM)).start()
-    assert main(follow) == 143 and len(keys("memory://growing")) == 1
-    growing = threading.Timer(0.1, make_dataset, (config,))
-    growing.start()
-    assert main(follow) == 0 and keys("memory://growing") == keys(folder) and len(keys(folder)) == 5
-    growing.join()
+def test_a_signal_ends_copying(folder, monkeypatch, store):
+    """After a signal no further shard is copied, and nothing is listed without the index and the manifest."""
+    real = type(store).put_file
+
+    def signalled(self, path, target, **options):
+        real(self, path, target, **options)
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    monkeypatch.setattr(type(store), "put_file", signalled)
+    assert main({"data": str(folder), "to": "memory://signalled"}) == 143
+    assert len(store.store) == 1 and not EpisodeStore.available("memory://signalled")
 
 
 def test_what_is_refused(folder, make_config, make_dataset, tmp_path, monkeypatch):

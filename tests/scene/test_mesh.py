@@ -49,11 +49,10 @@ def test_scale_then_rotation_then_translation(tmp_path):
     assert sorted(obstacle.vertex_V3.tolist()) == [[-2.0, 0.0, 1.0], [0.0, 0.0, 1.0], [0.0, 2.0, 1.0]]
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_flipped_triangles_are_turned_to_agree(tmp_path, seed):
+def test_flipped_triangles_are_turned_to_agree(tmp_path):
     """A watertight mesh with a third of its triangles flipped is closed, and its inside is the true inside."""
     mesh = trimesh.creation.torus(1.0, 0.4, major_sections=24, minor_sections=12)
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     flipped = rng.random(len(mesh.faces)) < 1 / 3
     mesh.faces[flipped] = mesh.faces[flipped][:, ::-1]
     trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).export(tmp_path / "torus.ply")
@@ -142,13 +141,12 @@ def test_bad_files_are_refused_by_name(tmp_path, name, content, message):
 
 def test_missing_files_and_bad_numbers_are_refused(tmp_path):
     """A missing file and a bad scale, translation or rotation name the field."""
-    with pytest.raises(ConfigError, match=r"ramp must be an existing file, got .*none\.obj"):
-        load_mesh(tmp_path / "none.obj", "ramp")
     path = write(tmp_path, TRIANGLE + "f 1 2 3\n")
-    for scale in (0.0, -1.0, np.nan, np.inf):
-        with pytest.raises(ConfigError, match="ramp: scale must be a finite number > 0"):
-            load_mesh(path, "ramp", scale=scale)
-    with pytest.raises(ConfigError, match="ramp: translation must be three finite numbers"):
-        load_mesh(path, "ramp", translation=(0.0, np.nan, 0.0))
-    with pytest.raises(ConfigError, match="ramp: rotation must be three finite numbers"):
-        load_mesh(path, "ramp", rotation=(np.inf, 0.0, 0.0))
+    for file, options, message in (
+        (tmp_path / "none.obj", {}, r"ramp must be an existing file, got .*none\.obj"),
+        *((path, {"scale": s}, "ramp: scale must be a finite number > 0") for s in (0.0, -1.0, np.nan, np.inf)),
+        (path, {"translation": (0.0, np.nan, 0.0)}, "ramp: translation must be three finite numbers"),
+        (path, {"rotation": (np.inf, 0.0, 0.0)}, "ramp: rotation must be three finite numbers"),
+    ):
+        with pytest.raises(ConfigError, match=message):
+            load_mesh(file, "ramp", **options)

@@ -6,7 +6,7 @@ from hgn.config import OBSTACLE_SHAPES
 from hgn.scene.distance import closest_points
 from hgn.scene.obstacle_grid import build_obstacle_grid
 from hgn.scene.rotation import euler_rotation
-from hgn.scene.scene import Obstacle
+from hgn.scene.scene import Obstacle, all_corners
 from hgn.scene.shapes import shape_obstacle
 from hgn.scene.surface import sample_surface, split_long_edges
 from hgn.schema import ConfigError
@@ -33,24 +33,16 @@ def quarter(obstacle):
 
 
 @pytest.mark.parametrize("shape", OBSTACLE_SHAPES)
-def test_samples_keep_their_distance_and_lie_on_their_triangle(shape):
-    """No two samples are closer than the spacing, and each lies on the triangle it names."""
+def test_samples_cover_the_surface(shape):
+    """No two samples are closer than the spacing, each lies on its triangle, and every surface point has one within two
+    spacings, so that no cell crossed substantially is missed."""
     obstacle = shape_obstacle(shape, 0.3, (0.5, 0.5, 0.5), TILT)
     point, owner = sample_surface(obstacle.corners, CELL / 4, rng())
-    nearest = cKDTree(point).query(point, k=2)[0][:, 1]
-    assert nearest.min() >= CELL / 4
-    on_triangle = closest_points(point, obstacle.vertex_V3[obstacle.triangle_F3[owner]])
-    np.testing.assert_allclose(on_triangle, point, atol=1e-9)
-
-
-@pytest.mark.parametrize("shape", OBSTACLE_SHAPES)
-def test_samples_leave_no_gap(shape):
-    """Every surface point has a sample within two spacings: no cell crossed substantially is missed."""
-    obstacle = shape_obstacle(shape, 0.3, (0.5, 0.5, 0.5), TILT)
-    corner = obstacle.vertex_V3[obstacle.triangle_F3]
-    point, _ = sample_surface(obstacle.corners, CELL / 4, rng())
-    pieces = split_long_edges(corner, CELL / 2)
-    assert cKDTree(point).query(pieces.mean(axis=1))[0].max() < 2 * CELL / 4
+    tree = cKDTree(point)
+    assert tree.query(point, k=2)[0][:, 1].min() >= CELL / 4
+    np.testing.assert_allclose(closest_points(point, obstacle.corners[owner]), point, atol=1e-9)
+    pieces = split_long_edges(obstacle.corners, CELL / 2)
+    assert tree.query(pieces.mean(axis=1))[0].max() < 2 * CELL / 4
 
 
 def test_samples_cover_a_needle():
@@ -58,22 +50,6 @@ def test_samples_cover_a_needle():
     vertex = np.array([[0, 0, 0], [1, 0, 0], [1, 1e-7, 0], [0, 1e-7, 0]])
     point, _ = sample_surface(vertex[[[0, 1, 2], [0, 2, 3]]], CELL / 4, rng())
     assert np.diff(np.sort(point[:, 0])).max() < 3 * CELL / 4
-
-
-def test_samples_of_nothing():
-    """No triangles, or none with an area, give no samples."""
-    for triangle in (np.zeros((0, 3), int), np.array([[0, 0, 1], [0, 1, 2]])):
-        vertex = np.array([[0, 0, 0], [1, 1, 1], [2, 2, 2]], float)
-        point, owner = sample_surface(vertex[triangle], 0.01, rng())
-        assert point.shape == (0, 3)
-        assert owner.shape == (0,)
-
-
-def test_too_large_a_surface_is_refused():
-    """A surface that needs millions of samples ends in an error with the remedy."""
-    vertex = 1e4 * np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]])
-    with pytest.raises(ConfigError, match="scale the mesh down"):
-        sample_surface(vertex[None], CELL / 4, rng())
 
 
 def test_split_keeps_area_and_drops_what_misses_the_box():
@@ -88,18 +64,16 @@ def test_split_keeps_area_and_drops_what_misses_the_box():
     assert 200 < len(boxed) < 2000
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2])
-def test_grid_is_sorted_unique_unit_and_near_the_surface(seed):
+def test_grid_is_sorted_unique_unit_and_near_the_surface():
     """Cells are unique and sorted, normals have unit length, and the surface passes through each cell."""
     shapes = [shape_obstacle(name, 0.2, (i, 0.0, -1.0), TILT) for i, name in enumerate(OBSTACLE_SHAPES)]
-    grid = build_obstacle_grid(shapes, CELL, seed)
+    grid = build_obstacle_grid(shapes, CELL, 0)
     assert grid.cell_K3.dtype == np.int32
     assert grid.normal_K3.dtype == np.float32
-    assert (np.unique(grid.cell_K3, axis=0) == grid.cell_K3).all()
-    assert len(np.unique(grid.cell_K3, axis=0)) == len(grid.cell_K3) == len(grid.normal_K3)
+    np.testing.assert_array_equal(np.unique(grid.cell_K3, axis=0), grid.cell_K3)
     np.testing.assert_allclose(np.linalg.norm(grid.normal_K3.astype(float), axis=1), 1, atol=1e-6)
     centre = (grid.cell_K3 + 0.5) * CELL
-    corner = np.concatenate([item.vertex_V3[item.triangle_F3] for item in shapes])
+    corner = all_corners(shapes)
     pairs = np.repeat(centre, len(corner), axis=0)
     closest = closest_points(pairs, np.tile(corner, (len(centre), 1, 1)))
     distance = np.linalg.norm(closest - pairs, axis=1).reshape(len(centre), -1).min(axis=1)
@@ -115,18 +89,12 @@ def test_sheet_normals_point_towards_the_cell_centres():
             np.testing.assert_allclose(grid.normal_K3[:, 1], expected)
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_opposing_sheets_in_one_cell_do_not_cancel(seed):
-    """Two sheets on both sides of the cell centres leave a vertical normal."""
-    lower, upper = (0.3 - 16) * CELL * 4, (0.75 - 16) * CELL * 4
-    both = quarter(sheet(lower, upper))
-    grid = build_obstacle_grid([both], CELL, seed)
-    assert len(grid.cell_K3) >= 16 * 16
-    np.testing.assert_allclose(np.abs(grid.normal_K3[:, 1]), 1, atol=1e-6)
-
-
 def test_cancelled_cell_takes_the_normal_of_the_nearest_sample():
-    """One cell, two equal facing sheets: the nearer one to the centre decides, from its own side."""
+    """Two sheets on both sides of the cell centres leave a vertical normal; in one cell with two equal facing sheets
+    the one nearer to the centre decides, from its own side."""
+    facing = build_obstacle_grid([quarter(sheet((0.3 - 16) * CELL * 4, (0.75 - 16) * CELL * 4))], CELL, 0)
+    assert len(facing.cell_K3) >= 16 * 16
+    np.testing.assert_allclose(np.abs(facing.normal_K3[:, 1]), 1, atol=1e-6)
     lower, upper = sheet(0.0).vertex_V3, sheet(0.0).vertex_V3
     lower, upper = lower * CELL + [0, 0.2 * CELL, 0], upper * CELL + [0, 0.6 * CELL, 0]
     triangle = np.array([(0, 1, 2), (0, 2, 3)], np.int32)
@@ -142,21 +110,17 @@ def test_cancelled_cell_takes_the_normal_of_the_nearest_sample():
     assert -1.0 in outcomes
 
 
-def test_degenerate_triangles_change_nothing_but_the_draws():
-    """A mesh of zero-area triangles is no obstacle; among others they are skipped without NaN."""
+def test_surfaces_without_area():
+    """No obstacles, and zero-area triangles, give empty arrays of the right types; among others they are skipped."""
     flat = Obstacle("flat", np.zeros((3, 3)), np.array([[0, 1, 2], [0, 0, 0]], np.int32), closed=False)
-    assert len(build_obstacle_grid([flat], CELL, 0).cell_K3) == 0
+    for grid in (
+        *(build_obstacle_grid(o, CELL, 0) for o in ([], [flat])),
+        build_obstacle_grid([], CELL, 0, 3 * (1.0,)),
+    ):
+        assert (grid.cell_K3.shape, grid.cell_K3.dtype) == ((0, 3), np.int32)
+        assert (grid.normal_K3.shape, grid.normal_K3.dtype) == ((0, 3), np.float32)
     mixed = build_obstacle_grid([flat, shape_obstacle("cone", 0.1)], CELL, 0)
-    assert len(mixed.cell_K3) > 50
-    assert np.isfinite(mixed.normal_K3).all()
-
-
-def test_no_obstacles_give_an_empty_grid():
-    """No obstacles: empty arrays of the right shapes and types."""
-    grid = build_obstacle_grid([], CELL, 0)
-    assert (grid.cell_K3.shape, grid.cell_K3.dtype) == ((0, 3), np.int32)
-    assert (grid.normal_K3.shape, grid.normal_K3.dtype) == ((0, 3), np.float32)
-    assert len(build_obstacle_grid([], CELL, 0, (1.0, 1.0, 1.0)).cell_K3) == 0
+    assert len(mixed.cell_K3) > 50 and np.isfinite(mixed.normal_K3).all()
 
 
 def test_same_seed_same_grid():
@@ -180,7 +144,7 @@ def test_a_mesh_far_larger_than_the_domain_is_cut_to_it():
 
 
 def test_errors():
-    """A bad cell size, and cells beyond 32 bits, are refused by name."""
+    """A bad cell size, cells beyond 32 bits, and a surface that needs millions of samples are refused by name."""
     for bad in (0.0, -1.0, np.nan, np.inf):
         with pytest.raises(ConfigError, match="cell_size must be a finite number > 0"):
             build_obstacle_grid([], bad, 0)
@@ -188,3 +152,5 @@ def test_errors():
     far = Obstacle("far", tiny.vertex_V3 + 1e9, tiny.triangle_F3, closed=False)
     with pytest.raises(ConfigError, match=r"within 2\^31 cells"):
         build_obstacle_grid([far], 1e-2, 0)
+    with pytest.raises(ConfigError, match="scale the mesh down"):
+        sample_surface(1e6 * tiny.corners, CELL / 4, rng())
