@@ -29,7 +29,6 @@ LONG_FILES = {
     "datagen/mpm/mls_mpm.py": 553,
     "datagen/mpm/team_kernel.py": 482,
     "hgn/config.py": 568,
-    "hgn/data/index.py": 468,
     "hgn/kernels/coarsest/kernel.py": 588,
     "hgn/kernels/grid/kernel.py": 552,
     "hgn/kernels/update/op.py": 503,

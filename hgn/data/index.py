@@ -13,9 +13,7 @@ the shards that it does not know. A list that loses a shard is written again as 
 
 from __future__ import annotations
 
-import hashlib
 import json
-import math
 import os
 import re
 import threading
@@ -27,93 +25,27 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar, overload
 
-from hgn.config import Split
-from hgn.data.statistics import Moments, Statistics
+from hgn.data.entries import (
+    REMEDY,
+    SPLITS,
+    EpisodeEntry,
+    QuarantinedScene,
+    ShardEntry,
+    SplitTotals,
+    Totals,
+    no_totals,
+    totals_of,
+)
 from hgn.data.storage import open_storage
-from hgn.schema import ConfigError, NonNegative, from_mapping, require, require_bounds, to_mapping
+from hgn.schema import ConfigError, NonNegative, from_mapping, require_bounds, to_mapping
 from hgn.system.files import errors_name, make_folder, sync_file, sync_folder
 
-SPLITS = ("train", "validation", "test")
 INDEX_NAME = "index"
 SEGMENT_SHARDS = 128
 _IN_MEMORY = 0  # the generation of an index without files
 _SEGMENTS_HELD = 64  # segments that stay in memory: 8,192 shards
-_FILE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,200}")
-_SHA256 = re.compile(r"[0-9a-f]{64}")
-_REMEDY = "delete manifest.json and run the generator again: published shards are found and kept"
 
 T = TypeVar("T")
-
-
-@dataclass(frozen=True)
-class EpisodeEntry:
-    """An episode in a shard."""
-
-    key: str
-    index: int  # within its split
-    seed: int
-    attempt: int  # 0, or the number of quarantined seeds of this index
-    particles: int
-    frames: int
-    members: dict[str, tuple[int, int]]  # name after `<key>.` -> offset in the tar, bytes
-
-
-@dataclass(frozen=True)
-class ShardEntry:
-    """A published tar file with the episodes [first, stop) of a split."""
-
-    name: str
-    split: Split
-    first: int
-    stop: int
-    sha256: str
-    bytes: NonNegative[int]
-    episodes: tuple[EpisodeEntry, ...]
-    statistics: Statistics
-
-    def __post_init__(self) -> None:
-        require_bounds(self)
-        # both become file names, and an index may come from any server
-        require(_FILE_NAME.fullmatch(self.name) is not None, "name", "a plain file name", self.name)
-        require(_SHA256.fullmatch(self.sha256) is not None, "sha256", "64 hexadecimal digits", self.sha256)
-        numbers = [episode.index for episode in self.episodes]
-        if numbers != list(range(self.first, self.stop)):
-            raise ConfigError(f"episodes must be numbers {self.first} to {self.stop - 1}, got {numbers}; {_REMEDY}")
-        require_sound(self.statistics)
-
-
-@dataclass(frozen=True)
-class QuarantinedScene:
-    """A scene that could not be simulated, and was replaced by the next attempt's seed."""
-
-    key: str
-    attempt: int
-    seed: int
-    cause: str
-
-
-@dataclass(frozen=True)
-class SplitTotals:
-    """The published part of a split."""
-
-    shards: int = 0
-    episodes: int = 0
-    bytes: int = 0
-    digest: str = ""  # over the shards' sha256 in publication order; identifies the order of samples
-    statistics: Statistics | None = None  # only in the head
-
-    def plus(self, shard: ShardEntry) -> SplitTotals:
-        """Returns the totals with one more shard."""
-        return SplitTotals(
-            self.shards + 1,
-            self.episodes + len(shard.episodes),
-            self.bytes + shard.bytes,
-            hashlib.sha256(f"{self.digest}{shard.sha256}".encode()).hexdigest(),
-            self.statistics and self.statistics.merge(shard.statistics),
-        )
-
-
-Totals = dict[str, SplitTotals]
 
 
 @dataclass(frozen=True)
@@ -133,30 +65,6 @@ class IndexState:
     def path(self, kind: int | str) -> str:
         """Returns the name of segment number `kind`, or of another file."""
         return f"{INDEX_NAME}/{self.generation}-{kind if isinstance(kind, str) else f'{kind:06d}'}.jsonl"
-
-
-def require_sound(statistics: Statistics) -> None:
-    """Raises ConfigError for numbers that are not finite, and for negative counts or squares."""
-    for name in ("velocity", "acceleration"):
-        moments: Moments = getattr(statistics, name)
-        numbers = (moments.count, *moments.mean, *moments.squared_deviation)
-        if not (all(map(math.isfinite, numbers)) and min(moments.count, *moments.squared_deviation) >= 0):
-            raise ConfigError(
-                f"statistics.{name} must be finite, with count and squares >= 0, got {moments}; {_REMEDY}"
-            )
-
-
-def no_totals() -> Totals:
-    """Returns the totals of an empty data set."""
-    return {split: SplitTotals(statistics=Statistics()) for split in SPLITS}
-
-
-def totals_of(shards: Iterable[ShardEntry], totals: Totals | None = None) -> Totals:
-    """Adds shards to `totals`."""
-    totals = dict(totals or no_totals())
-    for shard in shards:
-        totals[shard.split] = totals[shard.split].plus(shard)
-    return totals
 
 
 @dataclass(frozen=True)
@@ -196,7 +104,7 @@ class _Read:
             place = bisect_left(ranges, own)
             for other in ranges[max(place - 1, 0) : place + 1]:
                 if max(other[0], own[0]) < min(other[1], own[1]) or other == own:
-                    raise ConfigError(f"{shard.name} must be listed once, got its episodes twice; {_REMEDY}")
+                    raise ConfigError(f"{shard.name} must be listed once, got its episodes twice; {REMEDY}")
             ranges.insert(place, own)
         self.seen[segment] = len(shards)
 
@@ -324,11 +232,11 @@ class Index(Sequence[ShardEntry]):
         try:
             content = open_storage(self.folder).read(name, start, stop) if stop > start else b""
         except FileNotFoundError:
-            raise ConfigError(f"{self.folder}/{name} must be there, got no such file; {_REMEDY}") from None
+            raise ConfigError(f"{self.folder}/{name} must be there, got no such file; {REMEDY}") from None
         rows = [from_mapping(cls, parse_json(line, name), name) for line in content.splitlines()]
         if len(rows) != count:
             raise ConfigError(
-                f"{self.folder}/{name} must have {count} lines from byte {start}, got {len(rows)}; {_REMEDY}"
+                f"{self.folder}/{name} must have {count} lines from byte {start}, got {len(rows)}; {REMEDY}"
             )
         return rows
 
@@ -364,7 +272,7 @@ class Index(Sequence[ShardEntry]):
                     if replace(expected, statistics=None) != segment.totals[split]:
                         raise ConfigError(
                             f"{self.folder}/{self.state.path(number)} must hold the {split} shards that were "
-                            f"published, got others; {_REMEDY}"
+                            f"published, got others; {REMEDY}"
                         )
                 read.see(number, segment.shards)
                 read.segments[number] = segment
@@ -441,7 +349,7 @@ def parse_json(content: bytes, path: str) -> Any:
     try:
         return json.loads(content, parse_constant=_refuse)
     except (ValueError, RecursionError) as error:
-        raise ConfigError(f"{path} must be JSON written by python -m datagen, got {error}; {_REMEDY}") from None
+        raise ConfigError(f"{path} must be JSON written by python -m datagen, got {error}; {REMEDY}") from None
 
 
 def _refuse(constant: str) -> None:
@@ -458,7 +366,7 @@ def _append(path: Path, at: int, rows: Sequence[Any]) -> int:
     flags = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC
     with errors_name(path), os.fdopen(os.open(path, flags, 0o644), "r+b") as file:
         if file.seek(0, 2) < at:
-            raise ConfigError(f"{path} must have {at} bytes or more, got {file.tell()}; {_REMEDY}")
+            raise ConfigError(f"{path} must have {at} bytes or more, got {file.tell()}; {REMEDY}")
         file.truncate(at)
         file.seek(at)
         file.write(content)

@@ -13,23 +13,18 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from hgn.data.identity import identity_hash
-from hgn.data.index import (
+from hgn.data.entries import (
     SPLITS,
     EpisodeEntry,
-    Index,
-    IndexState,
-    ListedIndex,
     QuarantinedScene,
     ShardEntry,
     SplitTotals,
     Totals,
-    begin,
-    extend,
     no_totals,
-    parse_json,
     require_sound,
 )
+from hgn.data.identity import identity_hash
+from hgn.data.index import Index, IndexState, ListedIndex, begin, extend, parse_json
 from hgn.data.statistics import Statistics
 from hgn.data.storage import PATIENCE_S, open_storage
 from hgn.scene.episode import SCHEMA_VERSION, require_schema_version

@@ -14,8 +14,9 @@ from written_files import first_release, hashes
 import hgn.data.index
 import hgn.data.reader
 from datagen.pool.writer import DatasetWriter
+from hgn.data.entries import EpisodeEntry, ShardEntry
 from hgn.data.identity import dataset_identity, identity_hash
-from hgn.data.index import EpisodeEntry, Index, ListedIndex, ShardEntry, begin, extend
+from hgn.data.index import Index, ListedIndex, begin, extend
 from hgn.data.manifest import Manifest
 from hgn.data.reader import EpisodeStore
 from hgn.data.statistics import Moments, Statistics

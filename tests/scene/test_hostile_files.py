@@ -23,9 +23,10 @@ from scene.test_rollout_file import make_rollout
 
 from datagen.solve import SolveConfig
 from hgn.config import ImportConfig, NetworkConfig
+from hgn.data.entries import SPLITS, QuarantinedScene
 from hgn.data.foreign.formats import read_split, set_info
 from hgn.data.identity import identity_hash
-from hgn.data.index import SPLITS, ListedIndex, QuarantinedScene, parse_json
+from hgn.data.index import ListedIndex, parse_json
 from hgn.data.manifest import Manifest
 from hgn.data.shard import locate_members
 from hgn.scene.mesh import load_mesh

@@ -12,13 +12,14 @@ from typing import Any
 import numpy as np
 
 from hgn.config import ImportConfig
+from hgn.data.entries import SPLITS, EpisodeEntry, ShardEntry
 from hgn.data.foreign.episodes import Converter, obstacle_cell_size
 from hgn.data.foreign.formats import find_format, read_split, set_info
 from hgn.data.foreign.gravity import estimate_gravity
 from hgn.data.foreign.trajectory import SetInfo, Trajectory
 from hgn.data.identity import identity_hash
-from hgn.data.index import EpisodeEntry, ListedIndex, ShardEntry
-from hgn.data.manifest import MANIFEST_NAME, SPLITS, Manifest
+from hgn.data.index import ListedIndex
+from hgn.data.manifest import MANIFEST_NAME, Manifest
 from hgn.data.shard import episode_tar, locate_members, tar_end
 from hgn.data.statistics import Statistics, episode_statistics
 from hgn.data.verification import file_sha256

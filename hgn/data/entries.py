@@ -1,0 +1,111 @@
+"""Entries of a data set's index: episodes, shards and their totals."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import re
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from hgn.config import Split
+from hgn.data.statistics import Moments, Statistics
+from hgn.schema import ConfigError, NonNegative, require, require_bounds
+
+SPLITS = ("train", "validation", "test")
+REMEDY = "delete manifest.json and run the generator again: published shards are found and kept"
+_FILE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,200}")
+_SHA256 = re.compile(r"[0-9a-f]{64}")
+
+
+@dataclass(frozen=True)
+class EpisodeEntry:
+    """An episode in a shard."""
+
+    key: str
+    index: int  # within its split
+    seed: int
+    attempt: int  # 0, or the number of quarantined seeds of this index
+    particles: int
+    frames: int
+    members: dict[str, tuple[int, int]]  # name after `<key>.` -> offset in the tar, bytes
+
+
+@dataclass(frozen=True)
+class ShardEntry:
+    """A published tar file with the episodes [first, stop) of a split."""
+
+    name: str
+    split: Split
+    first: int
+    stop: int
+    sha256: str
+    bytes: NonNegative[int]
+    episodes: tuple[EpisodeEntry, ...]
+    statistics: Statistics
+
+    def __post_init__(self) -> None:
+        require_bounds(self)
+        # both become file names, and an index may come from any server
+        require(_FILE_NAME.fullmatch(self.name) is not None, "name", "a plain file name", self.name)
+        require(_SHA256.fullmatch(self.sha256) is not None, "sha256", "64 hexadecimal digits", self.sha256)
+        numbers = [episode.index for episode in self.episodes]
+        if numbers != list(range(self.first, self.stop)):
+            raise ConfigError(f"episodes must be numbers {self.first} to {self.stop - 1}, got {numbers}; {REMEDY}")
+        require_sound(self.statistics)
+
+
+@dataclass(frozen=True)
+class QuarantinedScene:
+    """A scene that could not be simulated, and was replaced by the next attempt's seed."""
+
+    key: str
+    attempt: int
+    seed: int
+    cause: str
+
+
+@dataclass(frozen=True)
+class SplitTotals:
+    """The published part of a split."""
+
+    shards: int = 0
+    episodes: int = 0
+    bytes: int = 0
+    digest: str = ""  # over the shards' sha256 in publication order; identifies the order of samples
+    statistics: Statistics | None = None  # only in the head
+
+    def plus(self, shard: ShardEntry) -> SplitTotals:
+        """Returns the totals with one more shard."""
+        return SplitTotals(
+            self.shards + 1,
+            self.episodes + len(shard.episodes),
+            self.bytes + shard.bytes,
+            hashlib.sha256(f"{self.digest}{shard.sha256}".encode()).hexdigest(),
+            self.statistics and self.statistics.merge(shard.statistics),
+        )
+
+
+Totals = dict[str, SplitTotals]
+
+
+def require_sound(statistics: Statistics) -> None:
+    """Raises ConfigError for numbers that are not finite, and for negative counts or squares."""
+    for name in ("velocity", "acceleration"):
+        moments: Moments = getattr(statistics, name)
+        numbers = (moments.count, *moments.mean, *moments.squared_deviation)
+        if not (all(map(math.isfinite, numbers)) and min(moments.count, *moments.squared_deviation) >= 0):
+            raise ConfigError(f"statistics.{name} must be finite, with count and squares >= 0, got {moments}; {REMEDY}")
+
+
+def no_totals() -> Totals:
+    """Returns the totals of an empty data set."""
+    return {split: SplitTotals(statistics=Statistics()) for split in SPLITS}
+
+
+def totals_of(shards: Iterable[ShardEntry], totals: Totals | None = None) -> Totals:
+    """Adds shards to `totals`."""
+    totals = dict(totals or no_totals())
+    for shard in shards:
+        totals[shard.split] = totals[shard.split].plus(shard)
+    return totals
