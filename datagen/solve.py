@@ -27,8 +27,8 @@ class SolveConfig:
 
     scene: str  # a scene file, or the name of one in conf/example, for example funnel
     out: str | None = None  # the file to write; null: rollout/NAME_solver.vtkhdf
-    frames: FrameCount = 300
-    frame_rate_hz: Positive[float] = 60.0
+    frames: FrameCount = 300  # frame 0 is the initial state
+    frame_rate_hz: Positive[float] = 60.0  # frames per simulated second
     mpm: MpmConfig = field(default_factory=MpmConfig)
 
     def __post_init__(self) -> None:

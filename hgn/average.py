@@ -25,12 +25,12 @@ SHARED = ("network", "frame_rate_hz", "obstacle_cell_size", "gravity")  # of wei
 
 @dataclass(frozen=True)
 class AverageConfig:
-    """`python -m hgn.average`."""
+    """`python -m hgn.average`: the mean of several networks."""
 
     # files of python -m hgn.export or names of shipped weights, as in [a.safetensors,b.safetensors]
     weights: tuple[str, ...]
-    out: FileName
-    coefficients: tuple[float, ...] | None = None  # of each, together 1, as in [0.7,0.3]; null: equal ones
+    out: FileName  # the weights file to write
+    coefficients: tuple[float, ...] | None = None  # of each file, with the sum 1, as in [0.7,0.3]; null: equal
     stored_precision: StoredPrecision = "fp32"  # of the learned tensors; fp16: files half as large
 
     def __post_init__(self) -> None:

@@ -66,13 +66,13 @@ def config_directory() -> Path:
 
 
 def is_mesh_file(name: str | Path) -> bool:
-    """Whether a name is that of a mesh file, rather than of a built-in shape."""
+    """Whether a name is that of a mesh file, and not of a built-in shape."""
     return Path(name).suffix.lower() in MESH_SUFFIXES
 
 
 def require_rollout_name(field: str, name: str | None, *more: str) -> None:
-    """Refuses names of folders, pictures and other formats, which people give where a rollout file is to be; `more` are
-    endings of formats that are written beside ROLLOUT_ENDINGS.
+    """Refuses names of folders, pictures and other formats for a rollout file; `more` are accepted endings in addition
+    to ROLLOUT_ENDINGS.
     """
     *some, last = (*ROLLOUT_ENDINGS, *more)
     made = "pictures" if more else "pictures, USD and PLY"
@@ -81,40 +81,40 @@ def require_rollout_name(field: str, name: str | None, *more: str) -> None:
     require(ends, field, rule, name, f"tools.render makes {made} of a rollout file")
 
 
-FUNNEL_SQUARES = (0.5, 0.8)  # least and most side of a funnel's squares, in units of the largest obstacle
-FUNNEL_HEIGHT = (2.0, 5.0)  # of the domain below a funnel's hole and above it, in group sizes
+FUNNEL_SQUARES = (0.5, 0.8)  # smallest and largest side of a funnel's squares, in units of the largest obstacle
+FUNNEL_HEIGHT = (2.0, 5.0)  # of the domain below and above a funnel's hole, in group sizes
 
 
 @dataclass(frozen=True)
 class SceneConfig:
     """The distribution that random scenes are drawn from (paper sec. 3.3). Lengths in domain units."""
 
-    domain_size: BoxSize = (1.0, 1.0, 1.0)
+    domain_size: BoxSize = (1.0, 1.0, 1.0)  # edges of the box from the origin
     cell_size: Positive[float] = 1 / 64  # of the solver
     gravity: Vector = (0.0, -9.8, 0.0)  # domain units per second squared
-    obstacle_count: NonNegative[int] = 5
+    obstacle_count: NonNegative[int] = 5  # obstacles in a scene
     obstacle_shapes: tuple[str, ...] = OBSTACLE_SHAPES  # or mesh files, scaled so that the longest side is the size
-    obstacle_size: tuple[float, float] = (0.1, 0.5)
-    group_count: NonNegative[int] = 4
-    group_shapes: tuple[Annotated[str, one_of(*GROUP_SHAPES)], ...] = GROUP_SHAPES
+    obstacle_size: tuple[float, float] = (0.1, 0.5)  # smallest and largest size
+    group_count: NonNegative[int] = 4  # groups of particles in a scene
+    group_shapes: tuple[Annotated[str, one_of(*GROUP_SHAPES)], ...] = GROUP_SHAPES  # drawn for each group
     group_size: Positive[float] = 0.08  # side or diameter
-    materials: tuple[Material, ...] = PAPER_MATERIALS
-    particles_per_cell: Positive[float] = 8.0
+    materials: tuple[Material, ...] = PAPER_MATERIALS  # drawn for each group
+    particles_per_cell: Positive[float] = 8.0  # of the solver, at the start
     clearance_cells: NonNegative[float] = 2.0  # between obstacles, groups and walls, in solver cells
-    maximum_initial_speed: NonNegative[float] = 0.0  # domain units per second; each group draws one velocity
-    # of the groups, that begin with a velocity where maximum_initial_speed is above 0
+    maximum_initial_speed: NonNegative[float] = 0.0  # domain units per second; each moving group draws a velocity
+    # fraction of groups with an initial velocity, where maximum_initial_speed is above 0
     moving_group_fraction: Fraction[float] = 1.0
-    lone_particles: NonNegative[int] = 0  # far from all others; else a network learns that what is alone lies still
-    # of the groups that begin with a velocity, those whose is exactly along gravity or against it, or across it
+    lone_particles: NonNegative[int] = 0  # far from all others; without them networks learn that lone particles rest
+    # fraction of moving groups whose velocity is exactly along gravity, against it or perpendicular to it
     pure_direction_fraction: Fraction[float] = 0.0
-    colliding_scene_fraction: Fraction[float] = 0.0  # of scenes without obstacles and with groups thrown at each other
-    zero_gravity_fraction: Fraction[float] = 0.0  # of the scenes
+    colliding_scene_fraction: Fraction[float] = 0.0  # fraction of scenes with colliding groups and no obstacles
+    zero_gravity_fraction: Fraction[float] = 0.0  # fraction of scenes without gravity
     tilted_gravity_fraction: Fraction[float] = 0.0  # of the scenes, with gravity of any direction and …
     maximum_tilted_gravity: NonNegative[float] = 19.6  # … any size up to this, domain units per second squared
-    # of the scenes with gravity and without collisions: four obstacles are a funnel with the groups above it. Its
-    # squares are 0.5 to 0.8 of the largest obstacle_size …
+    # fraction of scenes (with gravity, without collisions) in which four square obstacles, of 0.5 to 0.8 times the
+    # largest obstacle_size, form a funnel below the groups
     funnel_scene_fraction: Fraction[float] = 0.0
-    funnel_hole: tuple[float, float] = (0.035, 0.14)  # … and leave a square hole, whose side is in this range
+    funnel_hole: tuple[float, float] = (0.035, 0.14)  # smallest and largest side of a funnel's square hole
 
     def __post_init__(self) -> None:
         require_bounds(self)
@@ -214,35 +214,35 @@ class MpmConfig:
 
 
 def _spread(number: int, fraction: float) -> bool:
-    """Whether the item of this number, from 1, is among a fraction of all, as evenly spread as can be."""
+    """Whether item `number`, from 1, belongs to an evenly spread fraction of all."""
     return math.floor(number * fraction + 1e-9) > math.floor((number - 1) * fraction + 1e-9)
 
 
 @dataclass(frozen=True)
 class DatasetConfig:
-    """How many episodes, how long, where they are kept, and who makes them."""
+    """The episodes of a data set: their number, length, folder and generation."""
 
-    folder: FolderName = "data/obstacles"
-    training_scenes: NonNegative[int] = 800
-    validation_scenes: NonNegative[int] = 5
-    test_scenes: NonNegative[int] = 20
-    frames: FrameCount = 300  # frame 0 is the initial state
-    long_fraction: Fraction[float] = 0.0  # of the episodes of each split, evenly spread, that have long_frames
-    long_frames: FrameCount = 300
-    frame_rate_hz: Positive[float] = 60.0
-    seed: NonNegative[int] = 0
+    folder: FolderName = "data/obstacles"  # of shards, index and manifest; or a URL to read from
+    training_scenes: NonNegative[int] = 800  # episodes of the split train
+    validation_scenes: NonNegative[int] = 5  # episodes of the split validation
+    test_scenes: NonNegative[int] = 20  # episodes of the split test
+    frames: FrameCount = 300  # of an episode; frame 0 is the initial state
+    long_fraction: Fraction[float] = 0.0  # fraction of each split's episodes, evenly spread, that have long_frames
+    long_frames: FrameCount = 300  # of a long episode
+    frame_rate_hz: Positive[float] = 60.0  # frames per simulated second
+    seed: NonNegative[int] = 0  # of all scenes of the data set
     # true: a GPU begins with few scenes, which takes longer in all; training and the service set it
     early_episodes: bool = False
-    episodes_per_shard: Positive[int] = 8  # the first training shards are smaller, so that training can start early
-    workers: OneOrMore | None = None  # null: one for each GPU, or for two cores of a CPU; 1 leaves other GPUs alone
+    episodes_per_shard: Positive[int] = 8  # the first shards are smaller, so that training can start early
+    workers: OneOrMore | None = None  # processes that simulate; null: one per GPU, or per two cores of a CPU
     maximum_attempts: Positive[int] = 3  # per scene before it is quarantined and replaced
-    worker_silence_s: Positive[float] = 600.0  # after which a process of this machine that has work is replaced
-    pool: Annotated[str, one_of("local", "ray")] = "local"  # processes of this machine; or ray: of a Ray cluster
+    worker_silence_s: Positive[float] = 600.0  # seconds without progress after which a worker is replaced
+    pool: Annotated[str, one_of("local", "ray")] = "local"  # local: processes of this machine; ray: of a Ray cluster
     # of the cluster, as in 10.0.0.1:6379; null: $RAY_ADDRESS, else the cluster that this machine is in
     ray_address: str | None = None
-    # 0 to array_tasks - 1: of so many generators on one folder, each makes its own shards alone
+    # number of this generator, 0 to array_tasks - 1, as in a Slurm array; each generates its own shards of one folder
     array_task: int | None = None
-    array_tasks: OneOrMore | None = None
+    array_tasks: OneOrMore | None = None  # number of generators on one folder
 
     def __post_init__(self) -> None:
         require_bounds(self)
@@ -254,11 +254,11 @@ class DatasetConfig:
 
     @property
     def most_frames(self) -> int:
-        """Of the longest episode."""
+        """The frames of the longest episode."""
         return max(self.frames, self.long_frames) if self.long_fraction > 0 else self.frames
 
     def frames_of(self, index: int) -> int:
-        """Of an episode by its index within its split."""
+        """Returns the frames of an episode by its index within its split."""
         return self.long_frames if _spread(index + 1, self.long_fraction) else self.frames
 
     def scenes(self, split: str) -> int:
@@ -281,12 +281,12 @@ class DatagenConfig:
 
 @dataclass(frozen=True)
 class ServiceConfig:
-    """`python -m datagen.service`: where the data set is served, beside what `python -m datagen` takes."""
+    """`python -m datagen.service`: the server, in addition to the settings of `python -m datagen`."""
 
-    host: str = "127.0.0.1"
-    port: Port = 8000  # 0: any free one
-    health_port: Port | None = None  # answers /healthz beside `port`, from a process of its own; null: none
-    connections: Positive[int] = 1024  # at once; more are told to come back
+    host: str = "127.0.0.1"  # address to listen on; 0.0.0.0: all
+    port: Port = 8000  # 0: any free port
+    health_port: Port | None = None  # of a second process that answers /healthz; null: none
+    connections: Positive[int] = 1024  # simultaneous connections; others are answered with 503
 
     def __post_init__(self) -> None:
         require_bounds(self)
@@ -294,21 +294,21 @@ class ServiceConfig:
 
 @dataclass(frozen=True)
 class ImportConfig:
-    """`python -m hgn.import_trajectories`, beside `from`: the folder to read."""
+    """`python -m hgn.import_trajectories`, which also takes `from`: the folder to read."""
 
-    out: FolderName  # a new one, for a data set
-    # deepmind, geoelements, lagrangebench, neuralmpm or plain; auto: by the files
+    out: FolderName  # a new folder for the data set
+    # file format; auto: recognised by the files
     format: Annotated[str, one_of("auto", "deepmind", "geoelements", "lagrangebench", "neuralmpm", "plain")] = "auto"
-    history: OneOrMore = 5  # first frames, which a network is shown before it predicts; network.velocity_history
-    # names by particle type, as in {7: goop}, beside those that the format gives
+    history: OneOrMore = 5  # frames before frame 0, at least network.velocity_history
+    # names by particle type, as in {7: goop}, in addition to the format's
     materials: dict[str, str] = field(default_factory=dict)
-    boundary_types: tuple[int, ...] | None = None  # types of particles that are obstacles; null: the format's
-    # of metadata.json where null; the set's own unit of length, seconds
-    bounds: tuple[tuple[float, float], ...] | None = None  # low and high of each axis
-    dimensions: int | None = None
-    dt: Positive[float] | None = None  # between frames
-    radius: Positive[float] | None = None  # of neighbours: the networks' cells
-    gravity: tuple[float, ...] | None = None  # length per second squared; null: the metadata's, or estimated
+    boundary_types: tuple[int, ...] | None = None  # particle types that are obstacles; null: the format's
+    # low and high of each axis, in the set's unit of length; null: as in metadata.json
+    bounds: tuple[tuple[float, float], ...] | None = None
+    dimensions: int | None = None  # 2 or 3; null: as in metadata.json
+    dt: Positive[float] | None = None  # seconds between frames; null: as in metadata.json
+    radius: Positive[float] | None = None  # of neighbours, the size of network cells; null: as in metadata.json
+    gravity: tuple[float, ...] | None = None  # length per second squared; null: as in metadata.json, or estimated
 
     def __post_init__(self) -> None:
         require_bounds(self)
@@ -481,8 +481,8 @@ class TrainConfig:
     dataset: DatasetConfig = field(default_factory=DatasetConfig)
     network: NetworkConfig = field(default_factory=NetworkConfig)
     training: TrainingConfig = field(default_factory=TrainingConfig)
-    run: FolderName = "runs/obstacles"
-    # the data set is one of hgn.import_trajectories, which says what `scene` and `dataset` are: +experiment=imported
+    run: FolderName = "runs/obstacles"  # folder of checkpoints, logs and pictures
+    # the data set was imported (hgn.import_trajectories) and determines `scene` and `dataset`: +experiment=imported
     imported: bool = False
 
     def __post_init__(self) -> None:

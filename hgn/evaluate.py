@@ -42,13 +42,13 @@ from hgn.training.errors import (
 class EvaluateConfig:
     """`python -m hgn.evaluate`: one-step and rollout errors on a split of a data set."""
 
-    data: str
+    data: str  # folder or URL of a data set
     weights: str = DEFAULT_WEIGHTS  # a file of python -m hgn.export, or the name of shipped weights
-    split: Split = "validation"  # or train, test
-    scenes: Positive[int] = 5
-    frame_stride: Positive[int] = 1
-    rollout_frames: NonNegative[int] = 300  # 0: none
-    particles_per_batch: Positive[int] = 32_768
+    split: Split = "validation"  # train, validation or test
+    scenes: Positive[int] = 5  # the first of the split, by index
+    frame_stride: Positive[int] = 1  # distance of the frames whose one-step errors are measured
+    rollout_frames: NonNegative[int] = 300  # of each rollout; 0: no rollouts
+    particles_per_batch: Positive[int] = 32_768  # of one-step errors; more need more memory
     device: str = "auto"  # or cpu, cuda, cuda:1
     backend: BackendName = "auto"  # of the rollouts: torch, triton, cpu; auto: the fastest that runs
     precision: Precision = "tf32"  # of matrix products: fp32, tf32, fp16 (rollouts of backend triton, and GNS)

@@ -30,9 +30,9 @@ CHANGES = ("rest_threshold", "wall_clearance", "obstacle_clearance")
 class ExportConfig:
     """`python -m hgn.export`."""
 
-    checkpoint: str | None = None  # whose network is written to `out` as weights
-    weights: str | None = None  # or, without checkpoint: a file or the name of shipped weights
-    out: FileName | None = None
+    checkpoint: str | None = None  # of the network that is exported
+    weights: str | None = None  # a file or the name of shipped weights; only without checkpoint
+    out: FileName | None = None  # the weights file to write
     stored_precision: StoredPrecision = "fp32"  # of the learned tensors; fp16: files half as large
     rest_threshold: NonNegative[float] | None = None  # network.rest_threshold of `out`; null: as it was
     wall_clearance: WallClearance | None = None  # network.wall_clearance of `out`; null: as it was

@@ -49,12 +49,12 @@ class RolloutConfig:
     out: str | None = None
     surface: bool = False  # water also as a closed surface, in USD and PLY
     render: bool | None = None  # also draw pictures beside it, a PNG and a GIF; null: where out is null
-    # a scene file, or the name of one in conf/example, for example funnel; null: a random scene …
+    # a scene file, or the name of one in conf/example, for example funnel; null: a random scene, or an episode
     scene: str | None = None
-    seed: NonNegative[int] = 0  # … drawn with this number, as the training's scenes are
-    data: str | None = None  # or a data set …
-    episode: str | None = None  # … and an episode of it, for example validation-000000
-    frames: FrameCount = 300
+    seed: NonNegative[int] = 0  # of a random scene, drawn from the distribution of the training scenes
+    data: str | None = None  # folder or URL of a data set, for episode
+    episode: str | None = None  # an episode of data to simulate, for example validation-000000
+    frames: FrameCount = 300  # frame 0 is the initial state
     device: str = "auto"  # or cpu, cuda, cuda:1, …
     backend: BackendName = "auto"  # torch, triton (kernels in CUDA graphs), cpu (compiled C); auto: the fastest
     precision: Precision = "tf32"  # of matrix products: fp32, tf32 (on a GPU), fp16 (backend triton, and GNS)
