@@ -187,7 +187,7 @@ def test_changelog_form():
     assert any(line.startswith("## 0.1.0 ") for line in releases)
     entry = 0
     for number, line in enumerate(lines, start=1):
-        assert len(line) <= COLUMNS, f"CHANGELOG.md:{number}"
+        assert len(line) <= COLUMNS or line.startswith("| "), f"CHANGELOG.md:{number}"
         entry = 1 if line.startswith("- ") else entry + 1 if entry and line.startswith("  ") else 0
         assert entry <= ENTRY_LINES, f"CHANGELOG.md:{number}"
         if line.startswith("### "):
