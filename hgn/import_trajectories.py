@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from hgn.command import run_command
-from hgn.config import ImportConfig
 from hgn.data.foreign.dataset import import_set
+from hgn.data.foreign.settings import ImportConfig
 from hgn.schema import from_mapping, require
 from hgn.system.progress import bar
 

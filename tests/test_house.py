@@ -16,8 +16,8 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 29_200,
-    "datagen": 8_850,
+    "hgn": 29_150,
+    "datagen": 8_900,
     "tools": 6_450,
     "tests": 28_100,
 }
@@ -28,7 +28,7 @@ LONG_FILES = {
     "datagen/mpm/launch.py": 494,
     "datagen/mpm/mls_mpm.py": 553,
     "datagen/mpm/team_kernel.py": 482,
-    "hgn/config.py": 568,
+    "hgn/config.py": 472,
     "hgn/kernels/coarsest/kernel.py": 588,
     "hgn/kernels/grid/kernel.py": 552,
     "hgn/kernels/update/op.py": 503,

@@ -184,8 +184,9 @@ FIRST_RELEASE = {  # settings of 0.1.0
 def test_settings_of_the_first_release_are_answered(section):
     """Each setting of release 0.1.0 is one of today, or was renamed to one of today, or the reason of its removal is
     given."""
-    module, name = {"render": "tools", "solve": "datagen", "upload": "datagen"}.get(section, "hgn"), section.title()
-    cls = vars(hgn.config).get(f"{name}Config") or getattr(import_module(f"{module}.{section}"), f"{name}Config")
+    name, others = f"{section.title()}Config", {"render": "tools.render", "service": "datagen.service.__main__"}
+    others |= {"solve": "datagen.solve", "upload": "datagen.upload"}
+    cls = vars(hgn.config).get(name) or getattr(import_module(others.get(section, f"hgn.{section}")), name)
     fields = {field.name for field in dataclasses.fields(cls)}
     for key in FIRST_RELEASE[section].split():
         new = KEYS.get(f"{section}.{key}", KEYS.get(key, key)).rpartition(".")[2]

@@ -10,7 +10,7 @@ import errno
 import ipaddress
 import socket
 from contextlib import ExitStack
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,15 +21,27 @@ from datagen.service.health import HealthPage
 from datagen.service.log import UnhurriedLog
 from datagen.service.supervisor import Supervisor
 from hgn.command import run_command
-from hgn.config import ServiceConfig
 from hgn.data.identity import require_same_dataset
 from hgn.data.manifest import MANIFEST_NAME, Manifest
 from hgn.data.storage import TOKEN_VARIABLE, dataset_token
-from hgn.schema import ConfigError, from_mapping, require
+from hgn.schema import ConfigError, Port, Positive, from_mapping, require, require_bounds
 from hgn.system.machine import allow_open_files
 
 _OPEN_FILES = 65536
 _SERVICE_KEYS = ("host", "port", "health_port", "connections")
+
+
+@dataclass(frozen=True)
+class ServiceConfig:
+    """`python -m datagen.service`: the server, in addition to the settings of `python -m datagen`."""
+
+    host: str = "127.0.0.1"  # address to listen on; 0.0.0.0: all
+    port: Port = 8000  # 0: any free port
+    health_port: Port | None = None  # of a second process that answers /healthz; null: none
+    connections: Positive[int] = 1024  # simultaneous connections; others are answered with 503
+
+    def __post_init__(self) -> None:
+        require_bounds(self)
 
 
 def main(mapping: dict[str, Any], backend: Backend | None = None) -> int:

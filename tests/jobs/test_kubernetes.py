@@ -16,10 +16,11 @@ import yaml
 from kubeflow_trainer_api.models import TrainerV1alpha1TrainJob
 
 from datagen.generate import datagen_config
+from datagen.service.__main__ import ServiceConfig
 from datagen.service.server import _GRACE_S
 from datagen.service.supervisor import _STOP_PATIENCE_S
 from hgn.command import _compose
-from hgn.config import ServiceConfig, TrainConfig
+from hgn.config import TrainConfig
 from hgn.data.storage import TOKEN_VARIABLE
 from hgn.schema import from_mapping
 

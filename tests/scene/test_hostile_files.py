@@ -22,9 +22,10 @@ from hypothesis import strategies as st
 from scene.test_rollout_file import make_rollout
 
 from datagen.solve import SolveConfig
-from hgn.config import ImportConfig, NetworkConfig
+from hgn.config import NetworkConfig
 from hgn.data.entries import SPLITS, QuarantinedScene
 from hgn.data.foreign.formats import read_split, set_info
+from hgn.data.foreign.settings import ImportConfig
 from hgn.data.identity import identity_hash
 from hgn.data.index import ListedIndex, parse_json
 from hgn.data.manifest import Manifest

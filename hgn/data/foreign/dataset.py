@@ -11,11 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from hgn.config import ImportConfig
 from hgn.data.entries import SPLITS, EpisodeEntry, ShardEntry
 from hgn.data.foreign.episodes import Converter, obstacle_cell_size
 from hgn.data.foreign.formats import find_format, read_split, set_info
 from hgn.data.foreign.gravity import estimate_gravity
+from hgn.data.foreign.settings import ImportConfig
 from hgn.data.foreign.trajectory import SetInfo, Trajectory
 from hgn.data.identity import identity_hash
 from hgn.data.index import ListedIndex

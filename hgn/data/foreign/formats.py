@@ -19,7 +19,7 @@ from typing import Any
 import h5py
 import numpy as np
 
-from hgn.config import ImportConfig
+from hgn.data.foreign.settings import ImportConfig
 from hgn.data.foreign.tfrecord import parse_sequence_example, read_records
 from hgn.data.foreign.trajectory import FLUID, SetInfo, Trajectory, as_array, checked, floats
 from hgn.scene.hdf5 import damage_named, open_hdf5
