@@ -77,7 +77,7 @@ def weights_card(info: WeightsInfo, name: str, file: str, licence: str) -> str:
         "network": f"{network.kind}, {network.dimensions}D, width {network.width}, {network.levels} levels",
         "materials": ", ".join(network.materials),
         "cells": f"{network.cell_size:g}",
-        "obstacles": "seen" if network.sees_obstacles else "not seen",
+        "obstacles": "seen" if network.obstacle_features else "not seen",
         "frames a second": f"{info.frame_rate_hz:g}",
         "gravity": "any" if network.relative else _vector(info.gravity),
         "updates": str(info.updates),

@@ -36,7 +36,7 @@ OBSTACLE_SHAPES = ("half_box", "square", "half_sphere", "cone", "pyramid")
 MESH_SUFFIXES = (".stl", ".obj", ".ply", ".glb")
 ROLLOUT_ENDINGS = (".vtkhdf", ".hdf", ".hdf5", ".h5")
 GROUP_SHAPES = ("cube", "sphere")
-NETWORK_KINDS = ("hgn", "gns", "gns_particles")
+NETWORK_KINDS = ("hgn", "gns")
 BACKENDS = ("auto", "torch", "triton", "cpu")
 PRECISIONS = ("fp32", "tf32", "fp16")
 SIMULATED_FRAMES = 3  # of an episode at least for pushforward: one to start from, one simulated, one that answers it
@@ -282,8 +282,7 @@ class DatagenConfig:
 class NetworkConfig:
     """The hierarchical graph network (paper sec. 3.1, 3.2), or one it is compared with. Lengths in domain units."""
 
-    # or gns; or gns_particles, which sees obstacles as static particles
-    kind: Annotated[str, one_of(*NETWORK_KINDS)] = "hgn"
+    kind: Annotated[str, one_of(*NETWORK_KINDS)] = "hgn"  # or gns: Sanchez-Gonzalez et al. 2020, on backend torch
     cell_size: Positive[float] = 0.035  # R: the finest level; the connectivity radius of GNS
     levels: FewLayers = 4  # L; GNS has one, the particles
     message_passing_steps: FewLayers = 4  # M, in each of the 2 L - 1 blocks
@@ -303,9 +302,6 @@ class NetworkConfig:
     materials: tuple[MaterialName, ...] = PAPER_MATERIALS
     # 2: z is that of a plane; imported data alone have it
     dimensions: Annotated[int, Bound("2 or 3", lambda count: count in (2, 3))] = 3
-    maximum_neighbours: OneOrMore | None = None  # of a particle of GNS, the nearest; null: all within R
-    # of gns_particles: how far apart static particles are, at least, in obstacle cells
-    static_spacing_cells: Positive[float] = 0.25
 
     def __post_init__(self) -> None:
         require_bounds(self)
@@ -319,26 +315,8 @@ class NetworkConfig:
         require(not self.rests or self.dimensions == 3, "rest_threshold", "0 with dimensions=2", self.rest_threshold)
         held, rule = self.obstacle_clearance is not None, "null with dimensions=2"
         require(not held or self.dimensions == 3, "obstacle_clearance", rule, self.obstacle_clearance)
-        if self.kind == "hgn":
-            require(self.maximum_neighbours is None, "maximum_neighbours", "null for an hgn", self.maximum_neighbours)
-        else:
-            require(self.levels == 1, "levels", f"1 for {self.kind}: the particles themselves", self.levels)
-        require(
-            not (self.obstacle_particles and self.obstacle_features),
-            "obstacle_features",
-            "false for gns_particles: its obstacles are particles",
-            True,
-        )
-
-    @property
-    def obstacle_particles(self) -> bool:
-        """Whether obstacles are static particles."""
-        return self.kind == "gns_particles"
-
-    @property
-    def sees_obstacles(self) -> bool:
-        """Whether obstacles are among its input."""
-        return self.obstacle_features or self.obstacle_particles
+        if self.kind == "gns":
+            require(self.levels == 1, "levels", "1 for gns: the particles themselves", self.levels)
 
     @property
     def relative(self) -> bool:
@@ -454,7 +432,7 @@ class TrainConfig:
         rule = "relative where scene.zero_gravity_fraction or scene.tilted_gravity_fraction is above 0"
         require(self.network.relative or upright, "network.inputs", rule, self.network.inputs)
         require(
-            self.network.sees_obstacles or self.scene.obstacle_count == 0,
+            self.network.obstacle_features or self.scene.obstacle_count == 0,
             "network.obstacle_features",
             "true for scenes with obstacles",
             False,

@@ -51,7 +51,7 @@ class EvaluateConfig:
     particles_per_batch: Positive[int] = 32_768  # of one-step errors; more need more memory
     device: str = "auto"  # or cpu, cuda, cuda:1
     backend: BackendName = "auto"  # of the rollouts: torch, triton, cpu; auto: the fastest that runs
-    precision: Precision = "tf32"  # of matrix products: fp32, tf32, fp16 (rollouts of backend triton, and GNS)
+    precision: Precision = "tf32"  # of matrix products: fp32, tf32, fp16 (rollouts of backend triton)
     json: FileName | None = None  # also write the figures to this file
 
     def __post_init__(self) -> None:

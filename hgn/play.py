@@ -44,7 +44,7 @@ class PlayConfig:
     keep_mb: Positive[int] = 1024  # of past frames, to go back to and to save
     device: str = "auto"  # or cpu, cuda, cuda:1, …
     backend: BackendName = "auto"  # torch, triton (kernels in CUDA graphs), cpu (compiled C); auto: the fastest
-    precision: Precision = "tf32"  # of matrix products: fp32, tf32 (on a GPU), fp16 (backend triton, and GNS)
+    precision: Precision = "tf32"  # of matrix products: fp32, tf32 (on a GPU), fp16 (backend triton)
 
     def __post_init__(self) -> None:
         require_bounds(self)

@@ -51,6 +51,7 @@ def _rests_otherwise(network: Mapping[str, Any]) -> bool:
     return _rests(network) and (materials if large is None else set(large)) != materials - {"water"}
 
 
+LAST_COMMIT = "commit a0b88cb, before release 0.2.0, is the last with it"
 TRAIN_ANEW = "leave it out; weights with another value must be trained anew"
 
 
@@ -61,8 +62,10 @@ REMOVED: dict[str, Removed] = {
     "network.contact_gate": Removed("cell", TRAIN_ANEW, _relative),
     "network.contact_reach_cells": Removed(3.0, TRAIN_ANEW, _relative),
     "network.material_embedding": Removed(16, TRAIN_ANEW),
+    "network.maximum_neighbours": Removed(None, f"leave it out; {LAST_COMMIT}"),
     "network.rest_large_materials": Removed("all but water", "leave it out", _rests_otherwise),
     "network.rest_levels": Removed(2, "leave it out", _rests),
+    "network.static_spacing_cells": Removed(remedy=f"leave it out; {LAST_COMMIT}"),
     "network.wall_distance_cells": Removed(8.0, TRAIN_ANEW, lambda network: not _relative(network)),
     "training.gradient_messages": Removed("fp32"),
     "training.huber": Removed(),
@@ -80,7 +83,17 @@ REMOVED: dict[str, Removed] = {
 }
 
 # Values that a setting or a config group no longer takes, by the last part of its key, and what to do instead.
-REMOVED_CHOICES: dict[str, dict[Any, str]] = {}
+_GNS_PARTICLES = {"gns_particles": LAST_COMMIT}
+REMOVED_CHOICES: dict[str, dict[Any, str]] = {
+    "kind": _GNS_PARTICLES,
+    "network": _GNS_PARTICLES,
+    "experiment": _GNS_PARTICLES,
+    "weights": _GNS_PARTICLES
+    | {
+        name: f"{LAST_COMMIT}; its file hgn/weights/{name}.safetensors loads"
+        for name in ("gns", "gns_no_obstacles", "no_obstacles", "obstacles_levels_3", "obstacles_steps_1")
+    },
+}
 
 # Old key to new key, as on a command line; a key stays in its section.
 KEYS = {

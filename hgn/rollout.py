@@ -57,7 +57,7 @@ class RolloutConfig:
     frames: FrameCount = 300  # frame 0 is the initial state
     device: str = "auto"  # or cpu, cuda, cuda:1, …
     backend: BackendName = "auto"  # torch, triton (kernels in CUDA graphs), cpu (compiled C); auto: the fastest
-    precision: Precision = "tf32"  # of matrix products: fp32, tf32 (on a GPU), fp16 (backend triton, and GNS)
+    precision: Precision = "tf32"  # of matrix products: fp32, tf32 (on a GPU), fp16 (backend triton)
 
     def __post_init__(self) -> None:
         require_bounds(self)
@@ -172,7 +172,7 @@ def _scene(config: RolloutConfig, info: WeightsInfo) -> tuple[str, Scene]:
     imported = info.network.dimensions != 3 or bool(own)
     require(not imported, "data", rule, None, "for example data=data/mine episode=validation-000000")
     drawn = SceneConfig(gravity=info.gravity, cell_size=info.obstacle_cell_size, materials=info.network.materials)
-    if not info.network.sees_obstacles:
+    if not info.network.obstacle_features:
         drawn = replace(drawn, obstacle_count=0, group_shapes=("cube",))  # as conf/scene/no_obstacles.yaml says
     return f"random_{config.seed}", generate_scene(drawn, config.seed)
 

@@ -21,11 +21,8 @@ def average_of(count, coefficients=None):
 
 RULES = {
     NetworkConfig: [
-        ({"kind": "gnn"}, "kind must be one of hgn, gns, gns_particles"),
+        ({"kind": "gnn"}, "kind must be one of hgn, gns, got 'gnn'"),
         ({"kind": "gns"}, "levels must be 1 for gns"),
-        ({"maximum_neighbours": 9}, "maximum_neighbours must be null for an hgn"),
-        (GNS | {"maximum_neighbours": 0}, "maximum_neighbours must be at least 1"),
-        (GNS | {"kind": "gns_particles"}, "obstacle_features must be false for gns_particles"),
         ({"inputs": "Relative"}, "inputs must be one of absolute, relative, got 'Relative'"),
         (RELATIVE | {"velocity_history": 1}, "velocity_history must be at least 2 with inputs=relative"),
         (GNS | RELATIVE, "inputs must be absolute for gns, got 'relative'"),

@@ -85,7 +85,7 @@ def test_weights_of_play(monkeypatch, device, expected):
 
     monkeypatch.setattr(play, "choose_device", lambda _: SimpleNamespace(type=device))
     monkeypatch.setattr(play, "Simulator", SimpleNamespace(load=load))
-    for given, taken in ((None, expected), ("no_obstacles", "no_obstacles")):
+    for given, taken in ((None, expected), ("obstacles", "obstacles")):
         with pytest.raises(LookupError, match=f"^{taken}$"):
             play.play_page(play.PlayConfig(weights=given))
     assert expected in field_comments(play.PlayConfig)["weights"]

@@ -14,7 +14,7 @@ from hgn.export import ExportConfig
 from hgn.network.build import build_network
 from hgn.renamed import KEYS, REMOVED, REMOVED_CHOICES, Removed, current_names, removed_remedy, stored_names
 from hgn.rollout import RolloutConfig
-from hgn.runtime.weights import WeightsInfo, load_weights, save_weights
+from hgn.runtime.weights import WeightsInfo, find_weights, load_weights, save_weights
 from hgn.schema import ConfigError, from_mapping, from_stored, section_of, to_mapping
 
 SECTIONS = (SceneConfig, MpmConfig, NetworkConfig)
@@ -48,6 +48,17 @@ def removed(monkeypatch):
         ),
         (TrainConfig, {"network": {"contact_gate": "cell"}}, "it was removed and is always cell now; leave it out"),
         (TrainConfig, {"network": {"rest_levels": 1}}, "it was removed and is always 2 now, not 1; leave it out"),
+        (
+            TrainConfig,
+            {"network": {"maximum_neighbours": 64}},
+            "it was removed and is always None now, not 64; leave it",
+        ),
+        (TrainConfig, {"network": {"static_spacing_cells": 1.0}}, "it was removed; leave it out; commit a0b88cb"),
+        (
+            TrainConfig,
+            {"network": {"kind": "gns_particles"}},
+            "network.kind must be one of hgn, gns, got 'gns_particles'; commit a0b88cb, before release 0.2.0",
+        ),
         (RolloutConfig, {"film": 3}, "film is not a known key; it was removed; render with tools.render"),
         (RolloutConfig, {"backend": "abacus"}, "backend must be one of .*, got 'abacus'; take backend=cpu"),
     ],
@@ -120,6 +131,25 @@ def test_networks_of_before():
             continue
         with pytest.raises(ConfigError, match=rf"network\.{refused} is not a known key; it was removed and is always"):
             from_stored(NetworkConfig, stored, "network")
+
+
+def test_weights_of_gns():
+    """Files of GNS load without the settings of static particles and neighbour limits; files with them are refused."""
+    gns = NetworkConfig(kind="gns", levels=1)
+    stored = to_mapping(gns) | {"maximum_neighbours": None, "static_spacing_cells": 0.25}
+    assert from_stored(NetworkConfig, stored, "network") == gns
+    for changes, message in (
+        ({"maximum_neighbours": 64}, r"network\.maximum_neighbours is not a known key; it was removed"),
+        (
+            {"kind": "gns_particles"},
+            r"network\.kind must be .*; commit a0b88cb, before release 0\.2\.0, is the last with it",
+        ),
+    ):
+        with pytest.raises(ConfigError, match=message):
+            from_stored(NetworkConfig, stored | changes, "network")
+    for name in REMOVED_CHOICES["weights"]:
+        with pytest.raises(ConfigError, match=rf"got '{name}'; commit a0b88cb, before release 0\.2\.0"):
+            find_weights(name)
 
 
 def test_identity_keeps_its_names(monkeypatch, removed):

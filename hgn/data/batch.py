@@ -15,10 +15,9 @@ from hgn.config import NetworkConfig
 from hgn.data.episode_tensors import frame_gravity, shown_symmetries
 from hgn.data.sampler import SamplerState
 from hgn.network.features import ParticleState, material_rows
-from hgn.network.obstacles import ObstacleCells, SurfaceParticles
+from hgn.network.obstacles import ObstacleCells
 from hgn.scene.episode import Episode
 from hgn.scene.history import window
-from hgn.scene.rollout_file import episode_surface
 from hgn.scene.symmetry import Symmetry
 
 
@@ -33,7 +32,6 @@ class Batch:
     domain_S3: torch.Tensor
     gravity_S3: torch.Tensor  # domain units per frame squared
     obstacles: ObstacleCells | None
-    surface: SurfaceParticles | None  # for networks with obstacles as particles
     seeds_S: tuple[int, ...]  # of noise, jitter and symmetry
     sampler_state: SamplerState | None = None  # after this batch
     symmetries_S: tuple[tuple[Symmetry, ...], ...] = ()  # of each scene, that training may apply
@@ -44,8 +42,7 @@ class Batch:
         names = ("window_WN3", "material_N", "scene_N", "domain_S3", "gravity_S3")
         moved = {name: getattr(self, name).to(device, non_blocking=non_blocking) for name in names}
         obstacles = self.obstacles and self.obstacles.to(device, non_blocking)
-        surface = self.surface and self.surface.to(device, non_blocking)
-        return replace(self, obstacles=obstacles, surface=surface, **moved)
+        return replace(self, obstacles=obstacles, **moved)
 
     def state(self, window_WN3: torch.Tensor | None = None) -> ParticleState:
         """Returns the network's input at frame n, from this window or a perturbed copy of it."""
@@ -60,7 +57,6 @@ class Batch:
             domain_S3=self.domain_S3,
             gravity_S3=self.gravity_S3,
             obstacles=self.obstacles,
-            surface=self.surface,
         )
 
     def acceleration(self, window_WN3: torch.Tensor | None = None) -> torch.Tensor:
@@ -113,9 +109,6 @@ def make_batch(
 
 def _joined(samples: Sequence[BatchSample], network: NetworkConfig, sampler_state: SamplerState | None = None) -> Batch:
     episodes = [sample.episode for sample in samples]
-    surface = None
-    if network.obstacle_particles:
-        surface = SurfaceParticles.of([episode_surface(e, network.static_spacing_cells) for e in episodes])
     particles = tuple(len(episode.material_N) for episode in episodes)
     return Batch(
         window_WN3=torch.from_numpy(np.concatenate([sample.window_WN3 for sample in samples], axis=1)),
@@ -125,7 +118,6 @@ def _joined(samples: Sequence[BatchSample], network: NetworkConfig, sampler_stat
         domain_S3=torch.tensor([episode.domain_size for episode in episodes], dtype=torch.float32),
         gravity_S3=torch.tensor([frame_gravity(episode) for episode in episodes], dtype=torch.float32),
         obstacles=ObstacleCells.of([e.obstacle_grid for e in episodes]) if network.obstacle_features else None,
-        surface=surface,
         seeds_S=tuple(sample.seed for sample in samples),
         sampler_state=sampler_state,
         weight_S=tuple(sample.weight for sample in samples),

@@ -20,12 +20,11 @@ from hgn.network.relative import Contacts, relative_features
 class ParticleNetwork(nn.Module, ABC):
     """Predicts the acceleration of every particle, in frame units."""
 
-    def __init__(self, config: NetworkConfig, embeddings: int | None = None, slope: float = LEAKY_SLOPE) -> None:
-        """`embeddings` is the number of kinds of particles, where there are others than the materials."""
+    def __init__(self, config: NetworkConfig, slope: float = LEAKY_SLOPE) -> None:
         super().__init__()
         self.config = config
         self.normaliser = Normaliser()
-        self.embedding = nn.Embedding(embeddings or len(config.materials), MATERIAL_EMBEDDING)
+        self.embedding = nn.Embedding(len(config.materials), MATERIAL_EMBEDDING)
         normal_width = 3 if config.obstacle_features else 0
         parts: tuple[int, ...] = (3 * config.velocity_history, normal_width, 6, MATERIAL_EMBEDDING)
         if config.relative:

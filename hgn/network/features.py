@@ -15,7 +15,7 @@ import torch
 from torch import nn
 
 from hgn.network.barriers import Barriers
-from hgn.network.obstacles import ObstacleCells, SurfaceParticles
+from hgn.network.obstacles import ObstacleCells
 from hgn.scene.material import MATERIALS
 from hgn.schema import ConfigError
 
@@ -35,7 +35,6 @@ class ParticleState:
     domain_S3: torch.Tensor  # domain size of each scene
     gravity_S3: torch.Tensor  # of each scene, domain units per frame squared
     obstacles: ObstacleCells | None
-    surface: SurfaceParticles | None = None  # where the network sees obstacles as particles
     barriers: Barriers | None = None  # where nothing passes them (network.obstacle_clearance)
 
     @property

@@ -35,12 +35,9 @@ class NeighbourList:
         return len(self.sender_E)
 
 
-def neighbour_list(
-    position_N3: torch.Tensor, scene_N: torch.Tensor, radius: float, maximum: int | None = None
-) -> NeighbourList:
-    """All ordered pairs of particles of one scene with a distance below `radius`, and each particle with itself.
+def neighbour_list(position_N3: torch.Tensor, scene_N: torch.Tensor, radius: float) -> NeighbourList:
+    """Returns all ordered pairs of particles of one scene closer than `radius`, each particle with itself included.
 
-    With `maximum` each receiver keeps its nearest ones only, itself counted.
     Raises: GridRangeError when a particle is not finite or too far from the origin.
     """
     key_N = _keys(position_N3, scene_N, 0.5 * SLACK * radius)
@@ -57,10 +54,8 @@ def neighbour_list(
     near_K = _squared_distance(position_N3, sender_K, receiver_K) < radius * radius
     near_E = torch.nonzero(near_K).flatten()
     sender_E, receiver_E = sender_K[near_E], receiver_K[near_E]
-    if maximum is not None:
-        kept = _nearest(_squared_distance(position_N3, sender_E, receiver_E), receiver_E, len(key_N), maximum)
-        sender_E, receiver_E = sender_E[kept], receiver_E[kept]
-    return NeighbourList(order_N, sender_E, Segments(_offsets(receiver_E, len(key_N)), receiver_E))
+    offset_N1 = torch.searchsorted(receiver_E, torch.arange(len(key_N) + 1, device=receiver_E.device))
+    return NeighbourList(order_N, sender_E, Segments(offset_N1, receiver_E))
 
 
 def _keys(position_N3: torch.Tensor, scene_N: torch.Tensor, size: float) -> torch.Tensor:
@@ -87,17 +82,3 @@ def _runs(key_N: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
 def _squared_distance(position_N3: torch.Tensor, sender_E: torch.Tensor, receiver_E: torch.Tensor) -> torch.Tensor:
     offset_E3 = position_N3.index_select(0, sender_E) - position_N3.index_select(0, receiver_E)
     return offset_E3.square().sum(-1)
-
-
-def _offsets(receiver_E: torch.Tensor, count: int) -> torch.Tensor:
-    """Where each receiver's edges begin, and the number of edges, [N + 1]."""
-    return torch.searchsorted(receiver_E, torch.arange(count + 1, device=receiver_E.device))
-
-
-def _nearest(square_E: torch.Tensor, receiver_E: torch.Tensor, count: int, maximum: int) -> torch.Tensor:
-    """The edges of the `maximum` nearest senders of each receiver, in their present order."""
-    by_distance_E = torch.sort(square_E, stable=True).indices
-    by_both_E = by_distance_E[torch.sort(receiver_E[by_distance_E], stable=True).indices]
-    place_E = torch.arange(len(receiver_E), device=receiver_E.device)
-    rank_E = place_E - _offsets(receiver_E, count)[receiver_E]  # receivers keep their rows: the same for both orders
-    return torch.sort(by_both_E[rank_E < maximum]).values

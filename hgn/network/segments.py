@@ -6,7 +6,6 @@ Shape legend: E rows, N segments, W width.
 
 from __future__ import annotations
 
-import itertools
 from dataclasses import dataclass
 
 import torch
@@ -14,34 +13,14 @@ import torch
 
 @dataclass(frozen=True, eq=False)
 class Segments:
-    """Segment i holds the rows offset_N1[i] to offset_N1[i + 1] - 1.
-
-    Rows beyond the last offset belong to none (room of a fixed size that is not full); no gradients then.
-    """
+    """Segment i contains the rows offset_N1[i] to offset_N1[i + 1] - 1."""
 
     offset_N1: torch.Tensor  # int64 [N + 1], ascending from 0
-    segment_E: torch.Tensor  # int64, the segment of each row; any valid index beyond the last offset
+    segment_E: torch.Tensor  # int64, the segment of each row
 
     @property
     def count(self) -> int:
         return len(self.offset_N1) - 1
-
-    def blocks(self, rows: int) -> list[Block]:
-        """Runs of whole segments of about `rows` rows each; waits for the device where there are several."""
-        total = len(self.segment_E)
-        if total <= rows:
-            return [Block(slice(0, self.count), slice(0, total), self)]
-        wanted = torch.arange(rows, total, rows, device=self.offset_N1.device)
-        cut = torch.searchsorted(self.offset_N1, wanted).clamp_(max=self.count)
-        places = [(0, 0), *torch.stack([cut, self.offset_N1[cut]], dim=-1).tolist(), (self.count, total)]
-        blocks = []
-        for (first, first_row), (last, last_row) in itertools.pairwise(places):
-            if last > first:
-                part = Segments(
-                    self.offset_N1[first : last + 1] - first_row, self.segment_E[first_row:last_row] - first
-                )
-                blocks.append(Block(slice(first, last), slice(first_row, last_row), part))
-        return blocks
 
     def sum(self, row_EW: torch.Tensor) -> torch.Tensor:
         """The sum of the rows of each segment, [N, W]; zero where it has none."""
@@ -54,20 +33,9 @@ class Segments:
         return result
 
 
-@dataclass(frozen=True, eq=False)
-class Block:
-    """Some consecutive segments, their rows, and themselves counted from zero."""
-
-    segments: slice
-    rows: slice
-    part: Segments
-
-
 def _sum(row_EW: torch.Tensor, segments: Segments) -> torch.Tensor:
     if row_EW.device.type == "cpu":  # the faster way there, in the same order
-        rows = int(segments.offset_N1[-1])
-        sum_NW = row_EW.new_zeros(segments.count, row_EW.shape[1])
-        return sum_NW.index_add_(0, segments.segment_E[:rows], row_EW[:rows])
+        return row_EW.new_zeros(segments.count, row_EW.shape[1]).index_add_(0, segments.segment_E, row_EW)
     return torch.segment_reduce(row_EW.contiguous(), "sum", offsets=segments.offset_N1, axis=0, unsafe=True)
 
 

@@ -3,7 +3,7 @@
 | backend | what it is | networks | gradients |
 |---|---|---|---|
 | torch | PyTorch, the reference | all | yes |
-| triton | Triton kernels, frames and updates in CUDA graphs | hgn, and gns in fp16 | of its own kernels |
+| triton | Triton kernels, frames and updates in CUDA graphs | hgn | of its own kernels |
 | cpu | compiled C in blocks of rows, a core each | hgn | no |
 
 All have the same signature. `choose` takes the fastest that runs and says why; nobody else asks for a network's class.
@@ -20,9 +20,8 @@ from hgn.cpu import compiled
 from hgn.cpu import network as cpu_network
 from hgn.network.base import ParticleNetwork
 from hgn.network.features import ParticleState
-from hgn.network.gns import GraphNetworkSimulator
 from hgn.network.hgn import HierarchicalGraphNetwork
-from hgn.runtime.torch_backend import Backend, GnsBackend
+from hgn.runtime.torch_backend import Backend
 from hgn.runtime.triton_host import host_unsupported_reason
 from hgn.schema import ConfigError, require
 
@@ -60,7 +59,7 @@ def choose(
     reasons = {
         "triton": triton_unsupported_reason(device, config, precision),
         "cpu": cpu_unsupported_reason(device, config, precision),
-        "torch": torch_unsupported_reason(config, precision),
+        "torch": torch_unsupported_reason(precision),
     }
     name, note = pick(reasons, backend, precision, field)
     if name == "cpu":
@@ -72,17 +71,13 @@ def build(name: str, network: ParticleNetwork, precision: str = "tf32", note: st
     """The backend of that name, whether the machine supports it or not."""
     if name == "triton":
         # Triton, which the others do without, is loaded here.
-        from hgn.runtime.triton_backend import TritonBackend, TritonGnsBackend
+        from hgn.runtime.triton_backend import TritonBackend
 
-        if isinstance(network, GraphNetworkSimulator):
-            return TritonGnsBackend(network, precision, note)
         assert isinstance(network, HierarchicalGraphNetwork)
         return TritonBackend(network, precision, note)
     if name == "cpu":
         assert isinstance(network, HierarchicalGraphNetwork)
         return CpuBackend(network, precision, note)
-    if isinstance(network, GraphNetworkSimulator):
-        return GnsBackend(network, precision, note)
     return Backend(network, precision, note)
 
 
@@ -90,15 +85,7 @@ def fastest_stepped(network: ParticleNetwork, precision: str = "tf32") -> Backen
     """The fastest backend that makes frames one by one, for any network and device."""
     if cpu_unsupported_reason(next(network.parameters()).device, network.config, precision) is None:
         return build("cpu", network, precision)
-    return with_gradients(network, precision)
-
-
-def with_gradients(network: ParticleNetwork, precision: str) -> Backend:
-    """The fastest backend by which PyTorch trains a network: triton for a GNS in fp16, which has gradients there."""
-    device = next(network.parameters()).device
-    fused = isinstance(network, GraphNetworkSimulator)
-    supported = fused and triton_unsupported_reason(device, network.config, precision) is None
-    return build("triton" if supported else "torch", network, precision)
+    return build("torch", network, precision)
 
 
 def pick(reasons: Mapping[str, str | None], backend: str, precision: str, field: str) -> tuple[str, str]:
@@ -119,9 +106,9 @@ def pick(reasons: Mapping[str, str | None], backend: str, precision: str, field:
     return chosen, f"{where} backend: {chosen}{because}, precision {precision}"
 
 
-def torch_unsupported_reason(config: NetworkConfig, precision: str) -> str | None:
+def torch_unsupported_reason(precision: str) -> str | None:
     """What keeps PyTorch from computing a network, in words; none if nothing does."""
-    return "it has no fp16 for hgn networks" if precision == "fp16" and config.kind == "hgn" else None
+    return "it has no fp16" if precision == "fp16" else None
 
 
 def cpu_unsupported_reason(device: torch.device, config: NetworkConfig, precision: str) -> str | None:
@@ -139,8 +126,8 @@ def triton_unsupported_reason(device: torch.device, config: NetworkConfig, preci
         return f"it needs a CUDA device, not {device.type}"
     if reason := host_unsupported_reason() or _too_little_shared_memory(device, config.width):
         return reason
-    if config.kind != "hgn" and precision != "fp16":
-        return f"it computes {config.kind} with precision fp16, not {precision}"
+    if config.kind != "hgn":
+        return f"it computes hgn networks, not {config.kind}"
     if config.width not in TRITON_WIDTHS:
         return f"network.width must be one of {', '.join(map(str, TRITON_WIDTHS))} for it, not {config.width}"
     if precision == "fp32":
@@ -158,24 +145,6 @@ def _too_little_shared_memory(device: torch.device, width: int) -> str | None:
         shared = getattr(torch.cuda.get_device_properties(device), "shared_memory_per_block_optin", needed)
     if shared < needed:
         return f"its kernels need {needed >> 10} KB of shared memory at width {width}, and this GPU has {shared >> 10}"
-    return None
-
-
-def training_unsupported_reason(
-    device: torch.device, config: NetworkConfig, precision: str, pushforward: bool = False
-) -> str | None:
-    """What keeps training from the backend triton, in words; none if nothing does.
-
-    `pushforward`: it is to train on the network's own simulations.
-    """
-    if reason := triton_unsupported_reason(device, config, precision):
-        return reason
-    if config.obstacle_particles:
-        return f"it trains hgn and gns networks, not {config.kind}"
-    if config.maximum_neighbours is not None:
-        return f"network.maximum_neighbours must be null for it, not {config.maximum_neighbours}"
-    if pushforward and config.kind != "hgn":
-        return "it trains gns on true states alone (training.pushforward_fraction=0)"
     return None
 
 

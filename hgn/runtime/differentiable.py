@@ -1,7 +1,7 @@
 """A simulation through which PyTorch takes gradients, by what it starts from and where its obstacles are.
 
 What has exact gradients, what only within a cell, and how long they can be trusted: docs/how_to/gradients.md.
-Shape legend: T frames, N particles, H velocities, P surface particles, F triangles.
+Shape legend: T frames, N particles, H velocities, F triangles.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ from hgn.network.barriers import Barriers, barrier_rows
 from hgn.network.base import ParticleNetwork
 from hgn.network.features import ParticleState
 from hgn.network.grid import GridRangeError
-from hgn.network.obstacles import ObstacleCells, SurfaceParticles
+from hgn.network.obstacles import ObstacleCells
 from hgn.network.posed_obstacles import Placement, PosedObstacleCells
 from hgn.runtime.divergence import DivergedError, describe_diverged, diverged
 from hgn.runtime.stepped_rollout import advanced
 from hgn.scene.barrier import barrier_of_pieces, barrier_pieces
-from hgn.scene.obstacle_grid import ObstacleGrid, build_obstacle_grid, surface_points
+from hgn.scene.obstacle_grid import ObstacleGrid, build_obstacle_grid
 from hgn.scene.scene import Obstacle, Scene
 from hgn.schema import ConfigError, require
 
@@ -114,8 +114,6 @@ def _variables(state: ParticleState) -> list[torch.Tensor]:
     if isinstance(state.obstacles, PosedObstacleCells):
         for _, placement in state.obstacles.placed:
             tensors += [placement.rotation_33, placement.translation_3]
-    if state.surface is not None:
-        tensors.append(state.surface.position_P3)
     return tensors if state.barriers is None else [*tensors, state.barriers.row_F24]
 
 
@@ -136,7 +134,6 @@ def _with_variables(state: ParticleState, variables: Sequence[torch.Tensor]) -> 
         domain_S3=domain_S3,
         gravity_S3=gravity_S3,
         obstacles=obstacles,
-        surface=state.surface and replace(state.surface, position_P3=next(rest)),
         barriers=state.barriers and replace(state.barriers, row_F24=next(rest)),
     )
 
@@ -166,7 +163,7 @@ def _started(
     gravity_3 = given("gravity_3", inputs.gravity_3, np.array(scene.gravity), (3,)) / frame_rate_hz**2
     domain_3 = given("domain_size_3", inputs.domain_size_3, np.array(scene.domain_size), (3,))
     age_H1 = torch.arange(config.velocity_history, device=device, dtype=torch.float64)[:, None] + 0.5
-    obstacles, surface, barriers = _obstacles(network, start, scene, inputs, dtype)
+    obstacles, barriers = _obstacles(network, start, scene, inputs, dtype)
     return replace(
         start,
         position_N3=position_N3.to(dtype),
@@ -174,38 +171,29 @@ def _started(
         domain_S3=domain_3[None].to(dtype),
         gravity_S3=gravity_3[None].to(dtype),
         obstacles=obstacles,
-        surface=surface,
         barriers=barriers,
     )
 
 
 def _obstacles(
     network: ParticleNetwork, start: ParticleState, scene: Scene, inputs: Inputs, dtype: torch.dtype
-) -> tuple[ObstacleCells | None, SurfaceParticles | None, Barriers | None]:
+) -> tuple[ObstacleCells | None, Barriers | None]:
     poses, config, device = inputs.poses or {}, network.config, start.position_N3.device
     for number in poses:
         rule = f"0 to {len(scene.obstacles) - 1}" if scene.obstacles else "left out: the scene has no obstacles"
         require(number in range(len(scene.obstacles)), "poses", rule, number)
     if not poses and inputs.smoothing == 0:
-        return start.obstacles, start.surface, start.barriers
+        return start.obstacles, start.barriers
     staying = [obstacle for i, obstacle in enumerate(scene.obstacles) if i not in poses]
     placements = {i: _placement(scene.obstacles[i], pose, device, dtype) for i, pose in poses.items()}
-    obstacles, surface, barriers = None, None, start.barriers
+    obstacles, barriers = None, start.barriers
     if config.obstacle_features:
         rest = _cells(scene, staying, device)
         placed = tuple((_cells(scene, [scene.obstacles[i]], device), placement) for i, placement in placements.items())
         obstacles = PosedObstacleCells(rest.key_K, rest.normal_K3, rest.cell_size, placed, inputs.smoothing)
-    if config.obstacle_particles:
-        points = [_points(scene, staying, config.static_spacing_cells, device, dtype)]
-        for i, placement in placements.items():
-            own_P3 = _points(scene, [scene.obstacles[i]], config.static_spacing_cells, device, dtype)
-            points.append(placement.place(own_P3))
-        position_P3 = torch.cat(points)
-        scene_P = torch.zeros(len(position_P3), dtype=torch.int64, device=device)
-        surface = SurfaceParticles(position_P3, scene_P) if len(position_P3) else None
     if config.obstacle_clearance is not None and placements:
         barriers = _barriers(scene, placements, config.obstacle_clearance, device, dtype)
-    return obstacles, surface, barriers
+    return obstacles, barriers
 
 
 def _barriers(
@@ -231,13 +219,6 @@ def _cells(scene: Scene, obstacles: list[Obstacle], device: torch.device) -> Obs
     if cells is None:
         cells = ObstacleCells(torch.zeros(0, dtype=torch.int64), torch.zeros(0, 3), scene.cell_size)
     return cells.to(device)
-
-
-def _points(
-    scene: Scene, obstacles: list[Obstacle], spacing_cells: float, device: torch.device, dtype: torch.dtype
-) -> torch.Tensor:
-    point_P3 = surface_points(obstacles, scene.cell_size, 0, spacing_cells=spacing_cells)
-    return torch.from_numpy(point_P3).to(device, dtype)
 
 
 def _placement(obstacle: Obstacle, pose: Pose, device: torch.device, dtype: torch.dtype) -> Placement:

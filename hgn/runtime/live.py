@@ -111,9 +111,9 @@ class LiveSimulation:
         Raises: ConfigError as `Simulator.start`.
         """
         other = InitialState.of(scene)
-        of_obstacles = ("obstacle_grid", "sampled", "corners")
+        of_obstacles = ("obstacle_grid", "corners")
         obstacles: dict[str, Any] = {name: getattr(other, name) for name in of_obstacles}
-        self._change_scene(replace(self.scene, **obstacles), ("obstacles", "surface", "barriers"))
+        self._change_scene(replace(self.scene, **obstacles), ("obstacles", "barriers"))
 
     def set_gravity(self, gravity: tuple[float, float, float]) -> None:
         """Gravity from now on, domain units per second squared.

@@ -20,11 +20,9 @@ import torch
 from hgn.config import NetworkConfig
 from hgn.kernels.grid.op import ObstacleTable, Window
 from hgn.kernels.triton_compat import Launches, build_launcher, noted_launches, preload, use_target
-from hgn.kernels.update.op import UpdateSettings
-from hgn.network.build import build_network
+from hgn.kernels.update.op import Updates, UpdateSettings
 from hgn.network.features import ParticleState
 from hgn.network.hgn import HierarchicalGraphNetwork
-from hgn.runtime.triton_backend import updates_of
 from hgn.runtime.triton_rollout import TritonRollout, first_capacities
 from hgn.schema import from_mapping, to_mapping
 
@@ -41,7 +39,7 @@ class PrecompileJob:
     several_ranks: bool
     averages: bool  # the weights over the updates
     particles: int  # of an update, about
-    cells: tuple[int, ...]  # of each level, about; of a GNS its edges
+    cells: tuple[int, ...]  # of each level, about
     capability: int  # of the GPU: 90 for an H100
     pushforward_scenes: tuple[int, ...] = ()  # that the network simulates at once, to train on them and to measure
 
@@ -68,15 +66,14 @@ def launches_of(job: PrecompileJob | FrameJob, device: str = "meta") -> Launches
 
 def _update_launches(job: PrecompileJob, device: str) -> None:
     with torch.device(device):
-        network = build_network(job.network)
+        network = HierarchicalGraphNetwork(job.network)
     nothing = torch.zeros(5, device=device)
     reduce: Callable[[torch.Tensor], None] | None = (lambda _: None) if job.several_ranks else None
-    updates = updates_of(network)(network, job.settings, job.precision, nothing[:2], nothing, reduce)
+    updates = Updates(network, job.settings, job.precision, nothing[:2], nothing, reduce)
     updates.average = torch.zeros_like(updates.values) if job.averages else None
     updates.allocate(job.particles, job.cells)
     updates.launches()
     for scenes in job.pushforward_scenes:  # of hgn.training.graph_pushforward, or of a monitored rollout
-        assert isinstance(network, HierarchicalGraphNetwork)
         fraction = scenes / job.settings.scenes
         particles = round(fraction * job.particles)
         capacities = first_capacities([round(fraction * cells) for cells in job.cells], particles)

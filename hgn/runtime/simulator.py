@@ -17,7 +17,7 @@ from hgn.config import DEFAULT_WEIGHTS
 from hgn.network.barriers import Barriers
 from hgn.network.base import ParticleNetwork
 from hgn.network.features import ParticleState, material_rows
-from hgn.network.obstacles import ObstacleCells, SurfaceParticles
+from hgn.network.obstacles import ObstacleCells
 from hgn.runtime.backend import build, choose, set_matmul_precision
 from hgn.runtime.differentiable import Inputs, Pose, simulate
 from hgn.runtime.stepped_rollout import stepped
@@ -27,9 +27,9 @@ from hgn.scene.barrier import Barrier, build_barrier
 from hgn.scene.episode import Episode
 from hgn.scene.history import ballistic_velocities, require_past
 from hgn.scene.material import MATERIALS
-from hgn.scene.obstacle_grid import ObstacleGrid, build_obstacle_grid, surface_points
-from hgn.scene.rollout_file import cell_obstacles, episode_surface, known_obstacles
-from hgn.scene.scene import Obstacle, Scene, all_corners
+from hgn.scene.obstacle_grid import ObstacleGrid, build_obstacle_grid
+from hgn.scene.rollout_file import known_obstacles
+from hgn.scene.scene import Scene, all_corners
 from hgn.schema import require
 from hgn.system.device import choose_device
 
@@ -47,9 +47,6 @@ class InitialState:
     obstacle_grid: ObstacleGrid
     domain_size: tuple[float, float, float]
     gravity: tuple[float, float, float]
-    # Points on the obstacles so many cells apart, for networks that see them as particles; none: of the cells alone, a
-    # square each.
-    sampled: Callable[[float], np.ndarray] | None = None
     # Corners of the obstacles' triangles, float64 [F, 3, 3], for networks that pass none; none: nothing is known but
     # cells, and these hold nothing.
     corners: Callable[[], np.ndarray] | None = None
@@ -67,7 +64,6 @@ class InitialState:
             episode.obstacle_grid,
             episode.domain_size,
             episode.gravity,
-            lambda spacing_cells: episode_surface(episode, spacing_cells),
             lambda: all_corners(known_obstacles(episode) or ()),
             episode.materials,
             episode.past_HN3,
@@ -91,7 +87,6 @@ class InitialState:
             build_obstacle_grid(scene.obstacles, scene.cell_size, scene.seed, scene.domain_size),
             scene.domain_size,
             scene.gravity,
-            lambda spacing_cells: _surface(scene.obstacles, scene.cell_size, spacing_cells),
             lambda: all_corners(scene.obstacles),
         )
 
@@ -111,12 +106,6 @@ class InitialState:
         require_past(self.past_HN3, history)
         path_TN3 = np.concatenate([self.past_HN3[len(self.past_HN3) - history :], self.position_N3[None]])
         return np.ascontiguousarray(np.diff(path_TN3, axis=0)[::-1].transpose(1, 0, 2))
-
-    def surface(self, spacing_cells: float) -> np.ndarray:
-        """Points on the obstacles, no closer than `spacing_cells` cells, float32 [P, 3]."""
-        if self.sampled is not None:
-            return self.sampled(spacing_cells)
-        return _surface(cell_obstacles(self.obstacle_grid), self.obstacle_grid.cell_size, spacing_cells)
 
     def barrier(self, clearance: float) -> Barrier:
         """What of the obstacles nothing passes. Raises: ConfigError for a clearance of more than a cell."""
@@ -182,9 +171,6 @@ class Simulator:
         counts = [len(state.position_N3) for state in states]
         position_N3 = np.concatenate([state.position_N3 for state in states]).astype(np.float32)
         obstacles = ObstacleCells.of([state.obstacle_grid for state in states]) if config.obstacle_features else None
-        surface = None
-        if config.obstacle_particles:
-            surface = SurfaceParticles.of([state.surface(config.static_spacing_cells) for state in states])
         barriers = None
         if config.obstacle_clearance is not None:
             barriers = Barriers.of([state.barrier(config.obstacle_clearance) for state in states])
@@ -196,7 +182,6 @@ class Simulator:
             domain_S3=torch.tensor([state.domain_size for state in states], dtype=torch.float32).to(self.device),
             gravity_S3=torch.from_numpy(gravity_S3.astype(np.float32)).to(self.device),
             obstacles=obstacles and obstacles.to(self.device),
-            surface=surface and surface.to(self.device),
             barriers=barriers and barriers.to(self.device),
         )
 
@@ -275,7 +260,7 @@ class Simulator:
             difference = np.linalg.norm(np.subtract(scene.gravity, info.gravity))
             same = bool(difference <= SAME_GRAVITY * np.linalg.norm(info.gravity))
             require(same, "gravity", rule, scene.gravity, remedy)
-        if info.network.sees_obstacles:
+        if info.network.obstacle_features:
             rule = f"the weights' {info.obstacle_cell_size}, the size of the cells that they know obstacles by"
             require(cell_size == info.obstacle_cell_size, "cell_size", rule, cell_size)
 
@@ -284,7 +269,3 @@ def _initial(scenes: Sequence[InitialState | Scene]) -> list[InitialState]:
     alone = isinstance(scenes, (InitialState, Scene))
     require(not alone, "scenes", "a list of them", type(scenes).__name__, "as in rollout([scene], frames)")
     return [InitialState.of(scene) for scene in scenes]
-
-
-def _surface(obstacles: Sequence[Obstacle], cell_size: float, spacing_cells: float) -> np.ndarray:
-    return surface_points(obstacles, cell_size, 0, spacing_cells=spacing_cells)

@@ -9,8 +9,6 @@ import torch
 from hgn.cpu.allocator import keep_freed_memory
 from hgn.network.base import ParticleNetwork
 from hgn.network.features import ParticleState
-from hgn.network.gns import GraphNetworkSimulator
-from hgn.network.gns_edges import Edges, PlainEdges
 from hgn.runtime.stepped_rollout import Rollout, SteppedRollout
 
 
@@ -36,49 +34,9 @@ class Backend:
         result: torch.Tensor = self.network(state)
         return result
 
-    def require_parity(self, state: ParticleState, gradients: bool = False, field: str = "precision") -> None:
-        """Compares a backend of kernels that this machine has compiled with PyTorch. Raises: ConfigError."""
-
     def rollout(self, state: ParticleState, room: int = 0) -> AbstractContextManager[Rollout]:
         """A simulation that begins with a state; backend triton makes `room` for as many particles."""
-        self.require_parity(state)
         return nullcontext(SteppedRollout(self.predict, state, self.network.config))
 
     def release(self) -> None:
         """Gives back the buffers that simulations keep for those that follow."""
-
-
-class GnsBackend(Backend):
-    """The same for a GNS in PyTorch, by what is fastest on the device for its edges."""
-
-    network: GraphNetworkSimulator
-
-    def __init__(self, network: GraphNetworkSimulator, precision: str = "tf32", note: str = "") -> None:
-        super().__init__(network, precision, note)
-        self.edges = self._edges()
-        self._predict = self._prediction()
-
-    def _edges(self) -> Edges | None:
-        """What works on the edges. None: plain autograd, which passes over them less often than blocks that compute
-        their hidden layer twice; on a CPU such blocks are twice as fast, for they stay in its caches.
-        """
-        if self.precision == "fp16":
-            return PlainEdges(torch.float16)
-        return PlainEdges() if self.device.type == "cpu" else None
-
-    def _prediction(self):  # type: ignore[no-untyped-def]
-        if self.device.type != "cuda" or isinstance(self.edges, PlainEdges):  # which take no room to spare
-            return lambda state: self.network.predict(state, self.edges)
-        from hgn.runtime.gns_graph import GnsGraphs
-
-        return GnsGraphs(self.network, self.edges)
-
-    def normalised_acceleration(self, state: ParticleState, origin_S3: torch.Tensor | None = None) -> torch.Tensor:
-        return self.network.normalised_acceleration(state, origin_S3, self.edges)
-
-    def predict(self, state: ParticleState) -> torch.Tensor:
-        result: torch.Tensor = self._predict(state)
-        return result
-
-    def release(self) -> None:
-        self._predict = self._prediction()

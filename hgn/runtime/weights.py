@@ -17,7 +17,7 @@ from safetensors.torch import save
 from hgn.config import NetworkConfig
 from hgn.network.base import ParticleNetwork
 from hgn.network.build import build_network
-from hgn.renamed import current_names
+from hgn.renamed import REMOVED_CHOICES, current_names
 from hgn.schema import ConfigError, from_mapping, require, to_mapping
 from hgn.system.files import make_folder, write_atomically
 from hgn.system.hub import PREFIX, hub_weights
@@ -72,7 +72,9 @@ def find_weights(name: str, field: str = "weights") -> Path:
     if path.suffix or len(path.parts) > 1 or path.exists():
         return path
     names = ", ".join(shipped) or "none in this copy"
-    raise ConfigError(f"{field} must be a file or the name of shipped weights ({names}), got {name!r}")
+    removed = REMOVED_CHOICES["weights"].get(name)
+    remedy = f"; {removed}" if removed else ""
+    raise ConfigError(f"{field} must be a file or the name of shipped weights ({names}), got {name!r}{remedy}")
 
 
 def load_weights(

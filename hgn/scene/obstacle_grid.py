@@ -88,36 +88,17 @@ def grid_of_samples(point_S3: np.ndarray, normal_S3: np.ndarray, cell_size: floa
     return ObstacleGrid(cell_size, cell_K3.astype(np.int32), (sum_K3 / length_K[:, None]).astype(np.float32))
 
 
-def surface_points(
-    obstacles: Sequence[Obstacle],
-    cell_size: float,
-    seed: int,
-    domain_size: Vector | None = None,
-    spacing_cells: float = NORMAL_SPACING_CELLS,
-) -> np.ndarray:
-    """Points on obstacles no closer than `spacing_cells` cells, float32 [S, 3]: GNS's static particles.
-
-    At the default spacing these are the samples that the normals of `build_obstacle_grid` are made from.
-    Raises: ConfigError for a bad cell size, or a surface too large to sample.
-    """
-    return _samples(obstacles, cell_size, seed, domain_size, spacing_cells)[1].astype(np.float32)
-
-
 def _samples(
-    obstacles: Sequence[Obstacle],
-    cell_size: float,
-    seed: int,
-    domain_size: Vector | None,
-    spacing_cells: float = NORMAL_SPACING_CELLS,
+    obstacles: Sequence[Obstacle], cell_size: float, seed: int, domain_size: Vector | None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Returns triangle corners, surface points at least `spacing_cells` cells apart, and the triangle of each."""
+    """Returns triangle corners, surface points no closer than NORMAL_SPACING_CELLS, and the triangle of each point."""
     require(0 < cell_size < np.inf, "cell_size", "a finite number > 0", cell_size, "the paper uses 1/64")
     corner_F33 = all_corners(obstacles)
     if domain_size is not None:
         box = (np.full(3, -cell_size), np.array(domain_size, np.float64) + cell_size)
         corner_F33 = split_long_edges(corner_F33, SPLIT_CELLS * cell_size, box)
     rng = np.random.Generator(np.random.PCG64(seed))
-    point_S3, owner_S = sample_surface(corner_F33, spacing_cells * cell_size, rng)
+    point_S3, owner_S = sample_surface(corner_F33, NORMAL_SPACING_CELLS * cell_size, rng)
     if domain_size is not None:
         near = ((point_S3 >= box[0]) & (point_S3 < box[1])).all(axis=1)
         point_S3, owner_S = point_S3[near], owner_S[near]

@@ -16,7 +16,6 @@ Shape legend: T frames, N particles, R frames of ground truth, V vertices, F tri
 
 from __future__ import annotations
 
-import functools
 import json
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -30,7 +29,7 @@ from hgn.scene.episode import Episode
 from hgn.scene.hdf5 import damage_named, open_hdf5
 from hgn.scene.material import MATERIALS, require_materials
 from hgn.scene.motion import Motion
-from hgn.scene.obstacle_grid import ObstacleGrid, surface_points
+from hgn.scene.obstacle_grid import ObstacleGrid
 from hgn.scene.rotation import quaternion_rotation
 from hgn.scene.scene import Obstacle
 from hgn.scene.shapes import mesh_sha256, shape_obstacle
@@ -161,19 +160,6 @@ def _is_here(record: dict[str, Any]) -> bool:
     if not is_mesh_file(shape):
         return True
     return Path(shape).is_file() and mesh_sha256(shape) == record.get("sha256")
-
-
-@functools.lru_cache(maxsize=1024)
-def episode_surface(episode: Episode, spacing_cells: float) -> np.ndarray:
-    """Points on the surfaces of an episode's obstacles, no closer than `spacing_cells` cells, float32 [P, 3]; of an
-    imported one the particles that its obstacles were given as.
-
-    Kept for the episodes used last; sampling takes some tenths of a second.
-    """
-    grid = episode.obstacle_grid
-    if episode.boundary_P3 is not None:
-        return np.array(episode.boundary_P3)
-    return surface_points(obstacles_of_episode(episode), grid.cell_size, 0, spacing_cells=spacing_cells)
 
 
 def cell_obstacles(grid: ObstacleGrid, plane_z: float | None = None) -> tuple[Obstacle, ...]:

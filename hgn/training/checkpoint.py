@@ -111,7 +111,7 @@ def network_of_weights(config: TrainConfig) -> ParticleNetwork:
     free = ("rest_threshold", "wall_clearance", "obstacle_clearance")
     pairs = [pair for pair in _network_pairs(info.network, config) if pair[0].removeprefix("network.") not in free]
     pairs.append(("dataset.frame_rate_hz", info.frame_rate_hz, config.dataset.frame_rate_hz))
-    if info.network.sees_obstacles:
+    if info.network.obstacle_features:
         pairs.append(("scene.cell_size", info.obstacle_cell_size, config.scene.cell_size))
     _require_equal(pairs, f", as in training.init_weights {path}", remedy)
     network = build_network(config.network)

@@ -59,7 +59,7 @@ def _require_goes_with(config: TrainConfig, store: EpisodeStore, field: str) -> 
     require(scene.cell_size == cell_size, field, f"of solver cells of {cell_size:g}", scene.cell_size)
     known_materials = set(scene.materials) <= set(network.materials)
     require(known_materials, field, f"of the materials {', '.join(network.materials)}", list(scene.materials))
-    seen = network.sees_obstacles or scene.obstacle_count == 0
+    seen = network.obstacle_features or scene.obstacle_count == 0
     require(seen, field, "without obstacles, which the network does not see", folder)
     upright = scene.gravity == config.scene.gravity and not scene.zero_gravity_fraction + scene.tilted_gravity_fraction
     require(network.relative or upright, field, "of dataset's gravity where network.inputs=absolute", folder)

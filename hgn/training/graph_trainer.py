@@ -18,10 +18,9 @@ from hgn.data.episode_tensors import EpisodeTensors, UpdateChunk
 from hgn.kernels.barrier_table import BarrierHash
 from hgn.kernels.grid.op import ObstacleHash
 from hgn.kernels.triton_compat import JitMisses
-from hgn.kernels.update.op import DeviceEpisode, DeviceSample, UpdateSettings
+from hgn.kernels.update.op import DeviceEpisode, DeviceSample, Updates, UpdateSettings
 from hgn.network.base import ParticleNetwork
 from hgn.network.hgn import HierarchicalGraphNetwork
-from hgn.runtime.triton_backend import updates_of
 from hgn.runtime.triton_host import kernel_precision
 from hgn.scene.symmetry import drawn_symmetry
 from hgn.training.graph_pushforward import GraphPushforwardPool
@@ -50,6 +49,7 @@ class GraphTrainer:
         """`averaged` holds the moving average of the weights.
 
         loss_sum [2] and counters [5] are added to, as hgn.kernels.update.kernel.finish_update says."""
+        assert isinstance(network, HierarchicalGraphNetwork)
         self._begun, self._made, self._jit_misses = time.monotonic(), 0, JitMisses()
         self._seconds: dict[str, float] = defaultdict(float)
         self.network, self.optimizer = network, optimizer
@@ -58,7 +58,7 @@ class GraphTrainer:
         settings = UpdateSettings.of(training, obstacle_cell_size)
         precision = kernel_precision(training.precision, self.device)
         self._take_over()
-        self.updates = updates_of(network)(network, settings, precision, loss_sum, counters, reduce, ranks)
+        self.updates = Updates(network, settings, precision, loss_sum, counters, reduce, ranks)
         self._read_moments()
         self._averaged = None
         if averaged is not None:

@@ -33,7 +33,7 @@ def settings_of_imported(mapping: Mapping[str, Any]) -> dict[str, Any]:
         "cell_size": own["radius"],
         "dimensions": own["dimensions"],
         "materials": own["materials"],
-        "obstacle_features": own["obstacles"] and network.get("kind") != "gns_particles",
+        "obstacle_features": own["obstacles"],
         "velocity_history": own["history"],
     }
     network |= {key: value for key, value in left_open.items() if network.get(key) is None}

@@ -14,12 +14,13 @@ import torch
 from lightning.pytorch import LightningModule
 
 from hgn.config import TrainingConfig
+from hgn.cpu.allocator import keep_freed_memory
 from hgn.data.batch import Batch, UpdateSamples
 from hgn.data.episode_tensors import UpdateChunk
 from hgn.data.sampler import SamplerState
 from hgn.data.statistics import Statistics
 from hgn.network.base import ParticleNetwork
-from hgn.runtime.backend import build, fastest_stepped, with_gradients
+from hgn.runtime.backend import build, fastest_stepped
 from hgn.runtime.torch_backend import Backend
 from hgn.schema import to_mapping
 from hgn.training import lightning_compat
@@ -60,8 +61,6 @@ class TrainingModule(LightningModule):
         self.register_buffer("gradient_counters", torch.zeros(5), persistent=False)
         self._graph_trainer: Any = None
         self._pool: PushforwardPool | None = None
-        self.backend: Backend | None = None  # of the updates that PyTorch makes, once the device is known
-        self._unchecked = True  # whether kernels compute on this machine what they should
 
     def set_statistics(self, statistics: Statistics) -> None:
         """Freezes the normaliser; noise enters in quadrature. Done once, when a run begins."""
@@ -116,7 +115,7 @@ class TrainingModule(LightningModule):
         window_WN3 = perturbed_window(batch, config.noise_std, config.noise_correlated_fraction, cell_size, axes)
         origin_S3 = jittered_origin(batch, cell_size, axes) if jitter else None
         target_N3 = self.network.target(batch.acceleration(window_WN3), batch.gravity_S3[batch.scene_N])
-        predicted_N3 = (self.backend or self.network).normalised_acceleration(batch.state(window_WN3), origin_S3)
+        predicted_N3 = self.network.normalised_acceleration(batch.state(window_WN3), origin_S3)
         return batch.mean_over_scenes((predicted_N3 - target_N3).square().mean(-1))
 
     @property
@@ -126,7 +125,8 @@ class TrainingModule(LightningModule):
         return {} if pool is None else dict(pool.figures)
 
     def on_fit_start(self) -> None:
-        self.backend = with_gradients(self.network, self.training_config.precision)
+        if self.device.type == "cpu":
+            keep_freed_memory()
 
     def simulating_backend(self) -> Backend:
         """What simulates with the weights that count: the kernels that train, or else what makes frames one by one."""
@@ -164,11 +164,6 @@ class TrainingModule(LightningModule):
         if isinstance(batch, UpdateChunk):
             self._train_chunk(batch)
             return None
-        if self._unchecked:
-            first = self._batch_of(batch) if isinstance(batch, UpdateSamples) else batch
-            assert self.backend is not None
-            self.backend.require_parity(first.state(), gradients=True, field="training.precision")
-            self._unchecked = False
         if isinstance(batch, UpdateSamples):
             assert self._pool is not None
             if batch.starts:

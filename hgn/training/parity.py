@@ -21,6 +21,8 @@ from hgn.runtime.parity import GRADIENT_BOUND, LEAST_OUTPUT, OUTPUT_BOUND, relat
 from hgn.scene.symmetry import Symmetry
 from hgn.training.symmetry import obstacles_under
 
+CHECKED_PARTICLES = 200_000  # at most: autograd needs memory
+
 
 def require_parity(
     updates: Updates, episodes: Sequence[EpisodeTensors], symmetries: Sequence[Symmetry] | None = None
@@ -30,13 +32,13 @@ def require_parity(
     Too large a batch is not checked: NaN. Raises: ConfigError when one of them exceeds its bound.
     """
     network, fused, count = updates.network, updates.fused, int(updates.particle_count)
-    if count > updates.checked_particles:
+    if count > CHECKED_PARTICLES:
         return math.nan, math.nan
     state, origin_S3 = _state(updates, episodes, symmetries, count)
     generator = torch.Generator().manual_seed(0)
     weight_N3 = torch.randn(count, 3, generator=generator).to(updates.device) * updates.share_N[:count, None]
     parameters = list(network.parameters())
-    output_N3 = updates.reference_output(state, origin_S3)
+    output_N3 = network.normalised_acceleration(state, origin_S3)
     expected = torch.autograd.grad((output_N3 * weight_N3).sum(), parameters, allow_unused=True)
     output_error = relative_error(fused.output[:count, :3], output_N3.detach(), LEAST_OUTPUT)
     fused.output_gradient[:count].zero_()

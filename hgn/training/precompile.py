@@ -7,17 +7,13 @@ from hgn.kernels.update.op import UpdateSettings
 from hgn.runtime.precompile_program import PrecompileJob
 from hgn.training.errors import MONITORED_SCENES
 
-NEIGHBOURS = 100  # of a particle of GNS, about
-
 
 def job_of_training(config: TrainConfig, capability: tuple[int, int], several_ranks: bool) -> PrecompileJob:
     """What a training on such a GPU will compile; sizes follow from the scenes' distribution."""
     training, network = config.training, config.network
     particles, cells = _sizes(config.scene, network.levels)
-    if network.kind == "gns":
-        cells = [NEIGHBOURS * particles]
     own = [training.pushforward_scenes] if training.pushforward_fraction > 0 else []
-    monitored = network.kind == "hgn" and training.monitor_rollout_frames >= 2
+    monitored = training.monitor_rollout_frames >= 2
     return PrecompileJob(
         network,
         UpdateSettings.of(training, config.scene.cell_size),

@@ -17,7 +17,7 @@ from hgn.data.pooled import AnyStore
 from hgn.data.sampler import SamplerState
 from hgn.network.base import ParticleNetwork
 from hgn.network.build import build_network
-from hgn.runtime.backend import pick, set_matmul_precision, torch_unsupported_reason, training_unsupported_reason
+from hgn.runtime.backend import pick, set_matmul_precision, torch_unsupported_reason, triton_unsupported_reason
 from hgn.schema import to_mapping
 from hgn.system.device import keep_to_quota
 from hgn.system.files import make_folder, write_atomically
@@ -127,10 +127,9 @@ def _backend(config: TrainConfig) -> tuple[str, str]:
     training = config.training
     on_gpu = training.accelerator != "cpu" and torch.cuda.is_available()
     device = torch.device("cuda" if on_gpu else "cpu")
-    pushforward = training.pushforward_fraction > 0
     reasons = {
-        "triton": training_unsupported_reason(device, config.network, training.precision, pushforward),
-        "torch": torch_unsupported_reason(config.network, training.precision),
+        "triton": triton_unsupported_reason(device, config.network, training.precision),
+        "torch": torch_unsupported_reason(training.precision),
     }
     return pick(reasons, training.backend, training.precision, "training.backend")
 

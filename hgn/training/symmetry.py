@@ -1,6 +1,6 @@
 """Symmetry augmentation on backend torch: a batch as each scene's symmetry shows it, on the batch's device.
 
-Shape legend: W window frames, N particles, K obstacle cells, P surface particles of all scenes, S scenes.
+Shape legend: W window frames, N particles, K obstacle cells, S scenes.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import torch
 
 from hgn.data.batch import Batch
 from hgn.network.cell_keys import pack, unpack
-from hgn.network.obstacles import ObstacleCells, SurfaceParticles
+from hgn.network.obstacles import ObstacleCells
 from hgn.scene.symmetry import Symmetry, drawn_symmetry
 
 
@@ -23,15 +23,11 @@ def drawn_symmetries(batch: Batch) -> list[Symmetry]:
 
 def under_symmetries(batch: Batch, symmetries: Sequence[Symmetry]) -> Batch:
     """A copy of the batch with the scenes' images in it; domains are their own images."""
-    obstacles, surface = batch.obstacles, batch.surface
-    if surface is not None:
-        surface = SurfaceParticles(_points(surface.position_P3, surface.scene_P, symmetries), surface.scene_P)
     return replace(
         batch,
         window_WN3=_points(batch.window_WN3, batch.scene_N, symmetries),
         gravity_S3=_vectors(batch.gravity_S3, torch.arange(len(symmetries), device=batch.scene_N.device), symmetries),
-        obstacles=obstacles and obstacles_under(obstacles, symmetries),
-        surface=surface,
+        obstacles=batch.obstacles and obstacles_under(batch.obstacles, symmetries),
     )
 
 

@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from hgn.runtime.simulator import InitialState
 from hgn.scene.mesh import load_mesh
 from hgn.scene.motion import Motion
-from hgn.scene.obstacle_grid import grid_of_samples, surface_points, surface_samples
+from hgn.scene.obstacle_grid import grid_of_samples, surface_samples
 from hgn.scene.rotation import euler_rotation, rotate, round_to_float32
 from hgn.scene.scene import Obstacle, all_corners
 from hgn.scene.scene_file import ObstacleEntry
@@ -119,8 +119,5 @@ def with_obstacles(scene: InitialState, obstacles: Sequence[PlacedObstacle]) -> 
     return dataclasses.replace(
         scene,
         obstacle_grid=grid_of_samples(point_S3[near], normal_S3[near], cell_size),
-        sampled=lambda spacing_cells: surface_points(
-            [obstacle.mesh() for obstacle in obstacles], cell_size, 0, scene.domain_size, spacing_cells
-        ),
         corners=lambda: all_corners([obstacle.mesh() for obstacle in obstacles]),
     )

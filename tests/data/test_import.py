@@ -39,7 +39,6 @@ GRAVITY = (0.0, -9.8, 0.0)
 TYPES = np.array([5, 6, 8])  # of water, sand, snow
 NAMES = {"5": "water", "6": "sand", "8": "snow"}
 SPLITS = {"train": "train", "validation": "valid", "test": "test"}
-PARTICLES = {"kind": "gns_particles", "levels": 1, "obstacle_features": False}
 NOTHING = np.zeros((0, 3), np.float32)
 
 
@@ -450,7 +449,7 @@ def test_a_flat_set_is_one_layer(flat):
     assert len(batch.symmetries_S[0]) == 2  # the mirror that keeps gravity
 
 
-@pytest.mark.parametrize("changes", [{}, {"inputs": "relative"}, PARTICLES])
+@pytest.mark.parametrize("changes", [{}, {"inputs": "relative"}, {"kind": "gns", "levels": 1}])
 def test_a_flat_simulation_stays_in_its_plane(changes, flat):
     """Whatever a network says, z is the same in every frame, bit by bit; the start is the set's own six frames."""
     manifest = Manifest.load(flat)

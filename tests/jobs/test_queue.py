@@ -296,16 +296,17 @@ def trained_and_scored(name, mappings, data):
     assert list(mappings) == ["hgn.train", "hgn.export", "hgn.evaluate"]
     mappings["hgn.train"].pop("name")
     config = from_mapping(TrainConfig, mappings["hgn.train"])
-    assert config.run == f"runs/{name}" and config.training.precision == "fp16"
+    precision = "fp16" if config.network.kind == "hgn" else "tf32"
+    assert config.run == f"runs/{name}" and config.training.precision == precision
     made = data[config.dataset.folder]
     assert config.dataset.training_scenes == made.dataset.training_scenes
     assert dataset_identity(config.datagen) == dataset_identity(made)
-    assert made.scene.obstacle_count > 0 or not config.network.sees_obstacles
+    assert made.scene.obstacle_count > 0 or not config.network.obstacle_features
     export = from_mapping(ExportConfig, mappings["hgn.export"])
     assert (export.checkpoint, export.stored_precision) == (f"runs/{name}/checkpoints/last.ckpt", "fp16")
     score = from_mapping(EvaluateConfig, mappings["hgn.evaluate"])
     assert score.weights == export.out
-    assert (score.split, score.scenes, score.frame_stride, score.precision) == ("test", 20, 5, "fp16")
+    assert (score.split, score.scenes, score.frame_stride, score.precision) == ("test", 20, 5, precision)
     return config, score
 
 

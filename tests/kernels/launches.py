@@ -13,7 +13,6 @@ from kernels.interpreter import dropped_bits
 from triton.runtime.jit import KernelInterface
 
 from hgn.config import MATERIAL_EMBEDDING
-from hgn.kernels.gns.op import FusedEdges
 from hgn.kernels.reference import Added, ProgramSums, rows
 
 
@@ -90,23 +89,6 @@ def watched_engine(see, engine):
         engine.encode_weights.data_ptr(): _encoder(engine, values),
     }
     with watched(see, parameters, {tensor.data_ptr(): tensor for tensor in _tensors(engine)}):
-        yield
-
-
-@contextmanager
-def watched_edges(see):
-    """Of GNS, whose products read copies that are made for each launch."""
-    parameters: dict[int, torch.Tensor] = {}
-    operands: list[torch.Tensor] = []  # held, or another tensor would come to lie where one was and be taken for it
-    copy = FusedEdges._operand
-
-    def noting(edges, weight):
-        operand = copy(edges, weight)
-        parameters[operand.data_ptr()] = weight.detach().double()
-        operands.append(operand)
-        return operand
-
-    with mock.patch.object(FusedEdges, "_operand", noting), watched(see, parameters):
         yield
 
 

@@ -15,15 +15,13 @@ from types import FunctionType
 import pytest
 import torch
 from kernels.engines import device, engine_of, inference_of, run_forward
-from kernels.launches import watched_edges, watched_engine
+from kernels.launches import watched_engine
 from kernels.test_network import drawn, float32_state
-from network.states import gns_of, network_of, on_device, random_state
-from network.test_gns_edges import output_and_gradients
+from network.states import network_of
 from triton.runtime.jit import KernelInterface
 
 import hgn.kernels
 from hgn.kernels.backward import FusedTrainingNetwork
-from hgn.kernels.gns.op import FusedEdges
 from hgn.kernels.tuning import Tuning
 from hgn.network.hgn import HierarchicalGraphNetwork
 from hgn.runtime.parity import relative_error
@@ -35,14 +33,12 @@ LOSS_SCALE = {"fp16": 256.0}
 ROOM = 2048 if NATIVE else 64  # for cells on each level
 
 # Without products, in integers, float32 or float64 at every precision: of grids and neighbours, batches, optimisers,
-# frames. Compared in test_network, test_relative, test_neighbours, test_update, test_gns_update, test_training and
-# test_rollout.
+# frames. Compared in test_network, test_relative, test_update, test_training and test_rollout.
 ELSEWHERE = {
     *("mark_cells", "fill_tables", "prepare_particles", "prepare_features"),
     *("sum_motion", "prepare_relative_features"),
     *("sum_coarsest", "balance", "balance_backward", "add_coarsest"),
     *("sum_displacements", "find_deformation", "slow_displacements", "stop_slow"),
-    *("pack_cells", "find_runs", "walk_neighbours", "check_room"),
     *("draw_waves", "assemble_batch", "loss_gradient", "tell_overflow", "square_norm", "average_values"),
     *("finish_update", "adam", "momentum_directions", "step_blocks", "integrate", "advance"),
 }
@@ -213,19 +209,6 @@ def test_a_trained_network(precision, table):
     judge = Judge(table, precision)
     judged(judge, made(network, state, precision, ROOM if NATIVE else 32), network, state)
     assert not judge.wrong
-
-
-@pytest.mark.parametrize("precision", ["tf32", "fp16"] if NATIVE else ["tf32", "fp16", "fp32"])
-def test_gns(precision, table):
-    """The kernels of GNS's edges, forward and backward."""
-    network = gns_of(torch.float32, width=width_for(precision), message_passing_steps=2).to(device())
-    counts = (301, 1, 81) if NATIVE else (13, 1, 6)
-    state = on_device(random_state(counts, dtype=torch.float32, spread=0.1), device())
-    edges = FusedEdges.in_tf32() if precision == "tf32" else FusedEdges(precision)
-    judge = Judge(table, precision)
-    with watched_edges(judge):
-        output_and_gradients(network, edges, state, 1e-3)
-    assert not judge.wrong and judge.kernels == kernels_of("gns.op")
 
 
 def test_no_kernel_is_left_out():

@@ -11,16 +11,13 @@ from kernels.test_network import flat
 from kernels.test_pushforward import placed
 from kernels.test_training import without_jitter
 from kernels.test_update import HISTORY, parameters_of, updates_of
-from network.states import gns_of, network_of
+from network.states import network_of
 from training.test_symmetry import CELL_SIZE, CYCLIC, EIGHT, doubled, scene_with_obstacles, seeds_of
 
 from hgn.config import TrainingConfig
 from hgn.data.batch import make_batch
 from hgn.data.episode_tensors import UpdateChunk, whole_episode
 from hgn.data.sampler import Sample, SamplerState
-from hgn.kernels.gns.update import GnsUpdates
-from hgn.network.gns import GraphNetworkSimulator
-from hgn.network.hgn import HierarchicalGraphNetwork
 from hgn.runtime.parity import relative_error
 from hgn.scene.obstacle_grid import ObstacleGrid
 from hgn.scene.symmetry import scene_symmetries
@@ -36,17 +33,12 @@ def small_network():
     return network_of(width=16, levels=1, message_passing_steps=1, cell_size=0.1)
 
 
-@pytest.mark.parametrize(
-    "kind",
-    ["hgn", "relative", pytest.param("gns", marks=pytest.mark.skipif(device().type == "cuda", reason="float32"))],
-)
+@pytest.mark.parametrize("kind", ["hgn", "relative"])
 def test_an_update_under_symmetries_is_the_plain_one(kind, monkeypatch):
     """An update of eight scenes, each under another symmetry, one without obstacles, one without gravity: positions,
     velocities, targets, normals, loss and gradients are those of backend torch in float64, and the check passes. With
     relative inputs the symmetries are any of the cube's, which turn gravity."""
-    network: HierarchicalGraphNetwork | GraphNetworkSimulator = small_network()
-    if kind == "gns":
-        network = gns_of(message_passing_steps=1, cell_size=0.1)
+    network = small_network()
     if kind == "relative":
         network = network_of(width=16, levels=1, message_passing_steps=1, cell_size=0.1, inputs="relative")
     episodes = [scene_with_obstacles(i, 2 + i) for i in range(8)]
@@ -84,8 +76,7 @@ def test_an_update_under_symmetries_is_the_plain_one(kind, monkeypatch):
     assert state.obstacles is not None
     normal = state.obstacles.normals(state.position_N3, state.scene_N)
     assert normal.abs().sum(-1).gt(0).sum() > 10
-    feature_NF = updates.feature_NF if isinstance(updates, GnsUpdates) else updates.grid.feature_NF
-    assert torch.equal(feature_NF[:count, width : width + 3].cpu().double(), normal)
+    assert torch.equal(updates.grid.feature_NF[:count, width : width + 3].cpu().double(), normal)
     assert float(loss_sum[0]) == pytest.approx(float(loss.detach()), rel=1e-5)
     found = [torch.zeros_like(parameter) for parameter in network.parameters()]
     updates.packed.scatter(updates.fused.totals[: updates.packed.size].cpu(), found)

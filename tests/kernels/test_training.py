@@ -13,7 +13,7 @@ from hgn import train
 from hgn.config import NetworkConfig, TrainingConfig
 from hgn.kernels.update.op import UpdateSettings
 from hgn.network.build import build_network
-from hgn.runtime.backend import choose, pick, training_unsupported_reason, triton_unsupported_reason
+from hgn.runtime.backend import choose, pick, triton_unsupported_reason
 from hgn.schema import ConfigError
 from hgn.training.checkpoint import read_checkpoint
 from hgn.training.data_module import UPDATES_AT_ONCE, EpisodeDataModule, chunk_length
@@ -41,7 +41,7 @@ def without_jitter(monkeypatch):
 def test_fast_training_is_the_plain_one(data, tmp_path, monkeypatch, capsys):
     """Without noise and jitter both backends make the same updates: every count and log line is there, weights,
     their average and moments agree; a training may change backend at any checkpoint, and ends where the others do."""
-    monkeypatch.setattr("hgn.runtime.backend.triton_unsupported_reason", lambda *_: None)  # in float32
+    monkeypatch.setattr("hgn.training.session.triton_unsupported_reason", lambda *_: None)  # in float32
     without_jitter(monkeypatch)
     same = {"noise_std": 0.0, "warmup_updates": 3, "ema_decay": 0.7}
     ends = {}
@@ -87,7 +87,7 @@ def test_a_part_of_the_data_is_enough(make_config, make_dataset, tmp_path, monke
     all, bitwise."""
     config = make_config(training_scenes=14, validation_scenes=1, test_scenes=0, frames=3)
     make_dataset(config)
-    monkeypatch.setattr("hgn.runtime.backend.triton_unsupported_reason", lambda *_: None)  # in float32
+    monkeypatch.setattr("hgn.training.session.triton_unsupported_reason", lambda *_: None)  # in float32
     updates = {"maximum_updates": 9, "batch_scenes": 2, "log_every": 2, "checkpoint_every": 9, "monitor_every": 9}
     ends, most = [], []
     original = GraphTrainer.run
@@ -105,38 +105,6 @@ def test_a_part_of_the_data_is_enough(make_config, make_dataset, tmp_path, monke
         most.append(max(sizes))
     assert most[0] <= 6 < most[1]
     assert all(torch.equal(ends[0][name], ends[1][name]) for name in ends[0])
-
-
-def test_fast_training_of_gns_is_the_plain_one(data, tmp_path, monkeypatch, capsys):
-    """GNS with Muon and a moving average: a training that takes backend triton from its second update on ends where a
-    plain one does, with the same counts and rates."""
-    on_cpu = device().type == "cpu"
-    if on_cpu:  # kernels run in the interpreter
-        monkeypatch.setattr("hgn.training.session.training_unsupported_reason", lambda *_: None)
-    without_jitter(monkeypatch)
-    same = {"noise_std": 0.0, "optimizer": "muon", "ema_decay": 0.7, "maximum_updates": 3}
-    same |= {"log_every": 3, "checkpoint_every": 3, "monitor_every": 3, "precision": "fp32" if on_cpu else "fp16"}
-    ends = {}
-    for name, parts in {"torch": [("torch", 3)], "mixed": [("torch", 1), ("triton", 3)]}.items():
-        for backend, updates in parts:
-            mapping = run_mapping(data, tmp_path / name, backend=backend, **same)
-            with monkeypatch.context() as patch:
-                if updates < 3:
-                    stop_at(patch, updates)
-                assert train.main(mapping | {"network": NETWORK | {"kind": "gns"}}) == 0
-        ends[name] = read_checkpoint(tmp_path / name / "checkpoints" / "last.ckpt")
-        assert ends[name]["hgn"]["updates"] == 3
-    assert "training backend: triton" in (said := capsys.readouterr().err) and "gradients within" in said
-    assert ends["mixed"]["lr_schedulers"] == ends["torch"]["lr_schedulers"]
-    tolerance = {"rtol": 1e-3, "atol": 2e-5} if on_cpu else {"rtol": 5e-2, "atol": 6e-3}
-    for key, value in ends["torch"]["state_dict"].items():
-        torch.testing.assert_close(ends["mixed"]["state_dict"][key], value, **tolerance)
-    states, expected = ends["mixed"]["optimizer_states"][0], ends["torch"]["optimizer_states"][0]
-    assert all(float(states["state"][i]["step"]) == float(state["step"]) == 3 for i, state in expected["state"].items())
-    lines = [[line for line in metrics(tmp_path / name) if "one_step/validation" in line][-1] for name in ends]
-    assert lines[0]["update"] == lines[1]["update"] == 3
-    plain, fast = (line["one_step/validation"] for line in lines)
-    assert fast == pytest.approx(plain, rel=1e-2 if on_cpu else 0.2)
 
 
 def stop_at(monkeypatch, update):
@@ -205,13 +173,14 @@ def test_the_backend_is_chosen_and_said(backend, precision, reasons, expected):
 
 
 def test_what_a_cpu_takes():
-    """An HGN compiled C, unless torch is asked for; a GNS PyTorch, in fp16 too, which an HGN is refused."""
+    """An HGN compiled C, unless torch is asked for; a GNS PyTorch; fp16 is refused for both."""
     cpu = torch.device("cpu")
     hgn, gns = (build_network(NetworkConfig(width=16, kind=kind, levels=1)) for kind in ("hgn", "gns"))
     assert [choose(cpu, hgn, "tf32", name).name for name in ("auto", "torch", "cpu")] == ["cpu", "torch", "cpu"]
-    assert choose(cpu, gns).name == choose(cpu, gns, "fp16").name == "torch"
+    assert choose(cpu, gns).name == "torch"
     for network, precision, backend, message in (
         (hgn, "fp16", "auto", "got fp16; triton: it needs a CUDA device"),
+        (gns, "fp16", "auto", "precision must be tf32 or fp32 on backend torch, got fp16; triton"),
         (hgn, "tf32", "triton", "backend must be cpu or torch or auto here, got triton: it needs a CUDA device"),
         (gns, "tf32", "cpu", "backend must be torch or auto here, got cpu: it computes hgn networks, not gns"),
     ):
@@ -219,26 +188,12 @@ def test_what_a_cpu_takes():
             choose(cpu, network, precision, backend)
 
 
-def test_why_gns_is_not_trained_on_backend_triton():
-    """Another device, precision or width, static particles, a limit of neighbours and own states are each named."""
-    gpu, gns = torch.device("cuda"), NetworkConfig(kind="gns", levels=1)
-    assert training_unsupported_reason(gpu, gns, "fp16") is None
-    assert training_unsupported_reason(gpu, NetworkConfig(), "tf32") is None
-    assert "not cpu" in str(training_unsupported_reason(torch.device("cpu"), gns, "fp16"))
-    assert "not tf32" in str(training_unsupported_reason(gpu, gns, "tf32"))
-    assert "not 48" in str(training_unsupported_reason(gpu, replace(gns, width=48), "fp16"))
-    assert "not 128" in str(training_unsupported_reason(gpu, replace(gns, maximum_neighbours=128), "fp16"))
-    assert "true states" in str(training_unsupported_reason(gpu, gns, "fp16", pushforward=True))
-    static = NetworkConfig(kind="gns_particles", levels=1, obstacle_features=False)
-    assert "not gns_particles" in str(training_unsupported_reason(gpu, static, "fp16"))
-
-
 def test_why_backend_triton_does_not_run():
     """A CPU, GNS, an odd width and too many levels are each named."""
     gpu, hgn = torch.device("cuda"), NetworkConfig()
     assert triton_unsupported_reason(gpu, hgn) is None
     assert "not cpu" in str(triton_unsupported_reason(torch.device("cpu"), hgn))
-    assert "fp16, not tf32" in str(triton_unsupported_reason(gpu, NetworkConfig(kind="gns", levels=1)))
+    assert "hgn networks, not gns" in str(triton_unsupported_reason(gpu, NetworkConfig(kind="gns", levels=1)))
     assert "not 48" in str(triton_unsupported_reason(gpu, NetworkConfig(width=48)))
     assert "in tf32 or fp16, not fp32" in str(triton_unsupported_reason(gpu, hgn, "fp32"))
     assert "at most 8" in str(triton_unsupported_reason(gpu, NetworkConfig(levels=9)))

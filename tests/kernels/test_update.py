@@ -83,9 +83,9 @@ def plain_updates(network, chunk, grids, rates, optimizer=None):
     return losses
 
 
-def updates_of(network, scenes, capacities=(), kind=Updates, precision="fp32", **changes):
+def updates_of(network, scenes, capacities=(), precision="fp32", **changes):
     settings = {"noise_std": 0.0, "grid_jitter": False} | changes
-    return kind(
+    return Updates(
         copy.deepcopy(network).float().to(device()),
         UpdateSettings(scenes=scenes, obstacle_cell_size=CELL_SIZE, **settings),
         precision,

@@ -13,7 +13,7 @@ def naive_edges(position_N3, scene_N, radius):
 
 
 def naive_gns_acceleration(network, state):
-    """The network's raw output, [N, 3]; all static particles take part, however far away."""
+    """The network's raw output, [N, 3]."""
     config, normaliser = network.config, network.normaliser
     positions, latent, scenes = [], [], []
     for i in range(len(state.position_N3)):
@@ -22,13 +22,6 @@ def naive_gns_acceleration(network, state):
         velocity = (state.velocity_NM3[i] - normaliser.velocity_mean) / normaliser.velocity_std
         normal = state.obstacles.normals(positions[-1][None], state.scene_N[i : i + 1])[0] if state.obstacles else None
         latent.append(_encode(network, state, positions[-1], scenes[-1], velocity, int(state.material_N[i]), normal))
-    if state.surface is not None:
-        for position, scene in zip(state.surface.position_P3, state.surface.scene_P.tolist(), strict=True):
-            positions.append(position.to(state.position_N3))
-            scenes.append(scene)
-            velocity = -normaliser.velocity_mean.expand(config.velocity_history, 3) / normaliser.velocity_std
-            kind = len(config.materials)
-            latent.append(_encode(network, state, positions[-1], scene, velocity, kind, None))
 
     pairs = sorted(naive_edges(torch.stack(positions), torch.tensor(scenes), config.cell_size))
     edges = {}

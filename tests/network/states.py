@@ -51,7 +51,7 @@ def scene_of(state, scene, obstacles=None):
     """One scene taken out of a batch."""
     alone, here = chosen(state, state.scene_N == scene), slice(scene, scene + 1)
     scenes = {"scene_N": 0 * alone.scene_N, "domain_S3": state.domain_S3[here], "gravity_S3": state.gravity_S3[here]}
-    return replace(alone, **scenes, obstacles=obstacles, surface=None)
+    return replace(alone, **scenes, obstacles=obstacles)
 
 
 def on_device(state, device):
@@ -75,9 +75,8 @@ def silent(network):
 
 
 def gns_of(dtype=torch.float64, **changes):
-    """The same of GNS; `kind` may be gns_particles."""
+    """The same of GNS."""
     values = {"kind": "gns", "width": 16, "levels": 1, "message_passing_steps": 3} | changes
-    values = {"obstacle_features": values["kind"] == "gns"} | values
     network = _with_random_weights(NetworkConfig(**values), dtype)
     assert isinstance(network, GraphNetworkSimulator)
     return network

@@ -58,19 +58,6 @@ def test_particles_on_cell_borders():
     assert (len(position) - 2, len(position) - 1) not in found
 
 
-@pytest.mark.parametrize("maximum", [1, 5, 1000])
-def test_maximum_keeps_the_nearest(maximum):
-    """A limited list holds the nearest of each particle, the particle itself first."""
-    position, scene = points(120, 0.3), torch.arange(120) % 2
-    everything = naive_edges(position, scene, RADIUS)
-    expected = set()
-    for receiver in range(120):
-        senders = [s for s, r in everything if r == receiver]
-        senders.sort(key=lambda s: float((position[s] - position[receiver]).square().sum()))
-        expected |= {(s, receiver) for s in senders[:maximum]}
-    assert pairs_of(neighbour_list(position, scene, RADIUS, maximum)) == expected
-
-
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), 1e6])
 def test_positions_out_of_range(value):
     """Where a particle is not finite, or too far away for integer cells, lists and grids name the rule."""
@@ -89,13 +76,3 @@ def test_segment_sums():
     expected = torch.stack([part.sum(0) for part in rows.split(LENGTHS.tolist())])
     torch.testing.assert_close(SEGMENTS.sum(rows), expected)
     assert torch.autograd.gradcheck(SEGMENTS.sum, (rows,)) and torch.autograd.gradcheck(SEGMENTS.spread, (value,))
-
-
-@pytest.mark.parametrize("rows", [1, 3, 4, 100])
-def test_blocks_hold_every_row_once(rows):
-    """Blocks cover all segments and rows in order, whatever their size, and sum as the whole does."""
-    value = torch.randn(8, 2)
-    blocks = SEGMENTS.blocks(rows)
-    found = torch.cat([block.part.sum(value[block.rows]) for block in blocks])
-    assert torch.equal(found, SEGMENTS.sum(value))
-    assert [row for block in blocks for row in range(block.rows.start, block.rows.stop)] == list(range(8))

@@ -38,8 +38,8 @@ def network(kind, dtype=torch.float64):
     if kind == "held":  # the cone holds some particles, and walls too
         changes = {"wall_clearance": (0.3, 0.1), "obstacle_clearance": CLEARANCE}
         return network_of(dtype, levels=2, message_passing_steps=1, **changes)
-    if kind.startswith("gns"):
-        return gns_of(dtype, kind=kind, message_passing_steps=2, static_spacing_cells=2.0)
+    if kind == "gns":
+        return gns_of(dtype, message_passing_steps=2, obstacle_features=False)
     return network_of(dtype, inputs=kind)
 
 
@@ -62,7 +62,7 @@ def positions(simulator, inputs, smoothing):
 
 @pytest.mark.parametrize(
     ("kind", "smoothing"),
-    [("absolute", 0.0), ("absolute", 0.5), ("relative", 1.0), ("gns_particles", 0.0), ("walled", 0.0), ("held", 0.0)],
+    [("absolute", 0.0), ("absolute", 0.5), ("relative", 1.0), ("gns", 0.0), ("walled", 0.0), ("held", 0.0)],
 )
 def test_gradients_are_those_of_central_differences(kind, smoothing):
     """Over 30 frames, along a random direction of each input, where no particle changes a cell between both sides."""
@@ -90,7 +90,7 @@ def test_gradients_are_those_of_central_differences(kind, smoothing):
         )
 
 
-@pytest.mark.parametrize("kind", ["absolute", "relative", "gns_particles", "walled", "held"])
+@pytest.mark.parametrize("kind", ["absolute", "relative", "gns", "walled", "held"])
 def test_positions_are_those_of_a_rollout(kind):
     """What nothing replaces moves as in a rollout."""
     simulator = Simulator(network(kind, torch.float32), 60.0, "torch")

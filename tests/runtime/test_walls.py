@@ -20,7 +20,6 @@ NETWORKS = {
     "absolute": lambda **changes: network_of(torch.float32, levels=2, **changes),
     "relative": lambda **changes: network_of(torch.float32, levels=2, inputs="relative", **changes),
     "gns": lambda **changes: gns_of(torch.float32, **changes),
-    "gns_particles": lambda **changes: gns_of(torch.float32, kind="gns_particles", static_spacing_cells=2.0, **changes),
 }
 
 

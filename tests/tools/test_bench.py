@@ -71,8 +71,8 @@ def test_no_time_where_a_check_is_red(tmp_path, monkeypatch, capsys):
         after = step(self, state)
         return replace(after, velocity_NM3=1.001 * after.velocity_NM3)
 
-    def wrong_gradient(self, state, neighbours, edges=None):
-        output = project(self, state, neighbours, edges)
+    def wrong_gradient(self, state, neighbours):
+        output = project(self, state, neighbours)
         return output if output.dtype == torch.float64 else output + 0.1 * (output - output.detach())
 
     monkeypatch.setattr(Simulator, "step", wrong_step)
@@ -95,15 +95,6 @@ def test_checks_see_small_faults(monkeypatch):
     predict = frame.simulator.backend.predict
     frame.simulator.backend.predict = lambda state: 1.0001 * predict(state)
     assert frame.check("fp32").startswith("relative error of acceleration 1.0e-04 exceeds 1e-05")
-
-
-def test_gns_in_half_precision(tmp_path):
-    """Our GNS is checked and timed in fp16 where there is no backend triton either, and nothing else is."""
-    path = tmp_path / "bench.json"
-    assert main(SMALL | {"scenes": [1], "precisions": ["fp16"], "json": str(path)}) == 0
-    rows = json.loads(path.read_text())["rows"]
-    assert [row["case"] for row in rows] == ["gns_frame", "gns_train"]
-    assert all(row["check"] == "pass" and row["precision"] == "fp16" for row in rows)
 
 
 def test_triton_is_checked_like_torch():

@@ -1,12 +1,11 @@
 """precompile_keys.py ORDER…: the keys in Triton's cache on disk of a small update's kernels, one a line.
 
 They are asked for in a process for each order: `launch`, as a training does, `behind`, as a process might that
-compiles a share of them; `gns` are another network's.
+compiles a share of them.
 """
 
 import os
 import sys
-from dataclasses import replace
 
 from no_gpu import use_h100
 from triton.compiler import ASTSource
@@ -31,9 +30,6 @@ def tell(order):
     """Prints a blank line, and then the keys."""
     settings = UpdateSettings(2, 1e-3, True, 1 / 64, True, 0.5)
     network, sizes = NetworkConfig(width=16, levels=2, message_passing_steps=2), (200, 60)
-    if order == "gns":
-        settings = replace(settings, optimizer="muon")
-        network, sizes = NetworkConfig(kind="gns", width=16, levels=1, message_passing_steps=2), (9000,)
     found = list(launches_of(PrecompileJob(network, settings, "fp16", True, True, 300, sizes, 90)).values())
     JITFunction._do_compile = not_compiled
     print()

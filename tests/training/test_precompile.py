@@ -81,9 +81,9 @@ def test_the_launches_are_those_of_an_update(warm_python, tmp_path):
 
 @pytest.fixture(scope="module")
 def keys(warm_python, tmp_path_factory):
-    """Of a small update: as it launches, from behind, and a GNS's."""
+    """Of a small update: as it launches, and from behind."""
     folder = tmp_path_factory.mktemp("triton")
-    text = run_compiled(warm_python, folder, "training/precompile_keys.py", "launch", "behind", "gns")
+    text = run_compiled(warm_python, folder, "training/precompile_keys.py", "launch", "behind")
     return [part.split("\n") for part in text.split("\n\n")]
 
 
@@ -91,15 +91,3 @@ def test_every_process_looks_under_the_same_keys(keys):
     """A kernel's key in the cache on disk does not depend on which kernels the process saw before: those that a share
     compiles are found by a training, which begins with others."""
     assert len(keys[0]) > 30 and keys[0] == keys[1][::-1]
-
-
-def test_an_update_of_gns_never_asks_the_device(keys):
-    """From the samples to new weights it runs on tensors without memory, which have no value to wait for; neighbours,
-    edges, both passes and the optimiser are among its kernels, which can be compiled ahead."""
-    assert {line.split()[0] for line in keys[2]} >= {
-        "walk_neighbours",
-        "gns_step_forward",
-        "gns_norm_backward",
-        "gns_encode_layers_backward",
-        "momentum_directions",
-    }

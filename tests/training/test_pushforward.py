@@ -159,9 +159,8 @@ def test_long_episodes_are_simulated_for_longer():
     [
         network_of(torch.float32, levels=2, message_passing_steps=1),
         gns_of(torch.float32, message_passing_steps=1, cell_size=0.05),
-        gns_of(torch.float32, kind="gns_particles", message_passing_steps=1, cell_size=0.05),
     ],
-    ids=["hgn", "gns", "gns_particles"],
+    ids=["hgn", "gns"],
 )
 def test_the_pool_is_what_the_network_does(network):
     """From frame 0, whose past is ballistic, and from a later one, the pool holds the windows of each scene simulated

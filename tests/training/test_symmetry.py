@@ -11,7 +11,7 @@ from training.test_noise import episode
 
 from hgn.config import TrainingConfig
 from hgn.data.batch import make_batch
-from hgn.network.obstacles import ObstacleCells, SurfaceParticles
+from hgn.network.obstacles import ObstacleCells
 from hgn.scene.obstacle_grid import ObstacleGrid, build_obstacle_grid
 from hgn.scene.scene import Obstacle
 from hgn.scene.symmetry import Symmetry, drawn_symmetry, scene_symmetries
@@ -53,7 +53,7 @@ def doubled(batch):
 
 def by_hand(batch, episodes, symmetries):
     """The batch of the images, each scene multiplied by its matrix about the centre of the solver's nodes."""
-    windows, grids, points = [], [], []
+    windows, grids = [], []
     parts = batch.window_WN3.numpy().astype(np.float64)
     for scene, (made, symmetry) in enumerate(zip(episodes, symmetries, strict=True)):
         matrix = matrix_of(symmetry)
@@ -63,16 +63,12 @@ def by_hand(batch, episodes, symmetries):
         order = np.lexsort(cell.T[::-1])
         normal = (made.obstacle_grid.normal_K3 @ matrix.T).astype(np.float32)
         grids.append(ObstacleGrid(CELL_SIZE, cell[order], normal[order]))
-        if batch.surface is not None:
-            own = batch.surface.position_P3[batch.surface.scene_P == scene].numpy()
-            points.append((own - CENTRE) @ matrix.T + CENTRE)
     pairs = zip(symmetries, batch.gravity_S3, strict=True)
     return replace(
         batch,
         window_WN3=torch.from_numpy(np.concatenate(windows, axis=1)),
         gravity_S3=torch.stack([torch.tensor(matrix_of(symmetry)) @ gravity_3 for symmetry, gravity_3 in pairs]),
         obstacles=ObstacleCells.of(grids) if batch.obstacles is not None else None,
-        surface=SurfaceParticles.of(points) if batch.surface is not None else None,
     )
 
 
@@ -89,21 +85,19 @@ def loss_and_gradients(network, batch, symmetry):
         (network_of(levels=2, message_passing_steps=1), EIGHT),
         (network_of(levels=2, message_passing_steps=1, inputs="relative"), ALL_48[::6]),
         (gns_of(message_passing_steps=1, cell_size=0.05), EIGHT[5:7]),
-        (gns_of(kind="gns_particles", message_passing_steps=1, cell_size=0.05), EIGHT[5:7]),
     ],
-    ids=["hgn", "relative", "gns", "gns_particles"],
+    ids=["hgn", "relative", "gns"],
 )
 def test_training_sees_the_image(network, shown):
     """With noise and grid jitter, loss and gradients of a batch whose samples draw each of the symmetries are those of
     the batch of images made by hand, to 1e-6 (positions of float32) or better; and not those of the batch itself."""
-    cells = 200 if network.config.obstacle_particles else 4_000  # sampling surfaces takes time
-    episodes = [scene_with_obstacles(i, cells=cells) for i in range(len(shown))]
+    episodes = [scene_with_obstacles(i, cells=4_000) for i in range(len(shown))]
     group = ALL_48 if network.config.relative else EIGHT
     batch = doubled(make_batch([(e, 6) for e in episodes], network.config, seeds_of(shown, group)))
     assert drawn_symmetries(batch) == list(shown)
     loss, gradient = loss_and_gradients(network, batch, "gravity")
     expected_loss, expected = loss_and_gradients(network, by_hand(batch, episodes, shown), "none")
-    bound = 1e-6 if network.config.obstacle_particles else 1e-10  # surface points are float32
+    bound = 1e-10
     assert loss == pytest.approx(expected_loss, rel=bound)
     assert float((gradient - expected).norm() / expected.norm()) < bound
     other_loss, other = loss_and_gradients(network, batch, "none")

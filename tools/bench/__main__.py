@@ -14,7 +14,7 @@ from typing import Any
 import torch
 
 from hgn.command import run_command
-from hgn.runtime.backend import training_unsupported_reason, triton_unsupported_reason
+from hgn.runtime.backend import triton_unsupported_reason
 from hgn.schema import from_mapping
 from hgn.system.device import choose_device
 from hgn.system.files import write_json
@@ -138,8 +138,6 @@ def _maker(
         return functools.partial(PublicFrame if frame else PublicTrain, Path(config.public_gns)), None
     if case in ("frame", "train") and triton_unsupported_reason(device, config.network, precision) is None:
         return TritonFrame if frame else TritonTrain, "triton"
-    if case == "gns_train" and training_unsupported_reason(device, config.gns, precision) is None:
-        return TritonTrain, "triton"
     if not frame:
         return Train, None if "gns" in case else "torch"
     fastest = "cpu" if case == "frame" and device.type == "cpu" else "torch"
@@ -148,7 +146,7 @@ def _maker(
 
 
 def _wanted(config: BenchConfig, device: torch.device, precision: str, cases: tuple[str, ...]) -> list[str]:
-    """Those of `cases` that are asked for and mean something; fp16 is backend triton's and our GNS's alone."""
+    """Those of `cases` that are asked for and mean something; fp16 is only computed by backend triton."""
     triton = triton_unsupported_reason(device, config.network, precision) is None
     fastest_differs = {"torch_frame": triton or device.type == "cpu", "torch_train": triton}  # from torch
     wanted = config.cases or tuple(
@@ -157,8 +155,7 @@ def _wanted(config: BenchConfig, device: torch.device, precision: str, cases: tu
         if fastest_differs.get(case, True) and (config.public_gns is not None or case not in PUBLIC_GNS_CASES)
     )
     if precision == "fp16":
-        known = (("frame", "train") if triton else ()) + ("gns_frame", "gns_train")
-        wanted = tuple(case for case in known if case in wanted)
+        wanted = tuple(case for case in ("frame", "train") if triton and case in wanted)
     return [case for case in cases if case in wanted]
 
 

@@ -21,7 +21,7 @@ class BenchConfig:
     particles: tuple[OneOrMore, ...] | None = None  # of one scene; null: 4296, 40000, 400000 on a GPU, 4296 on a CPU
     # side by side, of the smallest number of particles; null: 1, 8, 32 on a GPU, 1 on a CPU
     scenes: tuple[OneOrMore, ...] | None = None
-    # fp32, tf32, fp16 (backend triton and our GNS); null: tf32 and fp16 on a GPU, fp32 on a CPU
+    # fp32, tf32, fp16 (backend triton); null: tf32 and fp16 on a GPU, fp32 on a CPU
     precisions: tuple[str, ...] | None = None
     network: NetworkConfig = field(default_factory=NetworkConfig)
     gns: NetworkConfig = field(default_factory=lambda: NetworkConfig(kind="gns", levels=1, message_passing_steps=10))

@@ -18,7 +18,7 @@ from hgn.network.base import ParticleNetwork
 from hgn.network.build import build_network
 from hgn.network.features import ParticleState
 from hgn.network.gns import GraphNetworkSimulator
-from hgn.runtime.backend import build, fastest_stepped, with_gradients
+from hgn.runtime.backend import build, fastest_stepped
 from hgn.runtime.parity import relative_error
 from hgn.runtime.simulator import Simulator
 from hgn.training.checkpoint import DataInfo
@@ -104,7 +104,6 @@ class Train(Contender):
     def __init__(self, config: NetworkConfig, work: Workload, device: torch.device, precision: str) -> None:
         self.device = device
         self.module = training_module(config, work.scenes, device)
-        self.module.backend = with_gradients(self.module.network, precision)
         self.batch = batch_of(work, config, device)
         self.optimizer = self.module.configure_optimizers()["optimizer"]
 
@@ -116,7 +115,6 @@ class Train(Contender):
     def check(self, precision: str) -> str:
         plain = replace(self.module.training_config, noise_std=0.0)
         module = TrainingModule(self.module.network, plain, DATA)
-        module.backend = self.module.backend
         module.network.zero_grad()
         loss = module.loss(self.batch, jitter=False)
         loss.backward()

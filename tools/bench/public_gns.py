@@ -3,14 +3,13 @@
 The copy is the repository github.com/geoelements/gns, which is no part of this project. What is timed is its own
 simulator class, in its own operations. Two things are ours, so that it computes the same function on the same
 machine: the neighbour search, for its own needs a further compiled library and keeps any 128 neighbours, where ours
-keeps `gns.maximum_neighbours`, the nearest, or all; and training noise, drawn on the device instead of the host.
+keeps all; and training noise, drawn on the device instead of the host.
 Shape legend: N particles, H velocity history, W = H + 2 frames, E directed edges.
 """
 
 from __future__ import annotations
 
 import copy
-import functools
 import importlib
 import sys
 import warnings
@@ -38,8 +37,8 @@ from tools.bench.states import Workload, batch_of
 MODULE = "gns.learned_simulator"
 
 
-def load_public(folder: Path, maximum_neighbours: int | None) -> ModuleType:
-    """The module with the public simulator class, which gets all neighbours or the nearest ones.
+def load_public(folder: Path) -> ModuleType:
+    """The module with the public simulator class, which gets all neighbours.
 
     Raises: ConfigError when the folder is no copy of the repository, or PyTorch Geometric is not installed.
     """
@@ -58,7 +57,7 @@ def load_public(folder: Path, maximum_neighbours: int | None) -> ModuleType:
     assert module.__file__ is not None
     imported = Path(module.__file__).resolve()
     require(imported == file.resolve(), "public_gns", "the only package named gns", str(imported))
-    module.radius_graph = functools.partial(_radius_graph, maximum_neighbours)  # type: ignore[attr-defined]
+    module.radius_graph = _radius_graph  # type: ignore[attr-defined]
     return module
 
 
@@ -127,7 +126,7 @@ class PublicGns(Contender):
         assert isinstance(network, GraphNetworkSimulator)
         self.device, self.network = device, network
         self.batch = batch_of(work, config, device)
-        module = load_public(folder, config.maximum_neighbours)
+        module = load_public(folder)
         self.simulator: Any = public_simulator(module, network, self.batch.domain_S3[0])
         copy_weights(self.simulator, network)
 
@@ -206,9 +205,9 @@ def _copy(theirs: Any, ours: MLP, same_input: bool = True) -> None:
 
 
 def _radius_graph(
-    maximum: int | None, position_N3: torch.Tensor, r: float, batch: torch.Tensor, loop: bool, max_num_neighbors: int
+    position_N3: torch.Tensor, r: float, batch: torch.Tensor, loop: bool, max_num_neighbors: int
 ) -> torch.Tensor:
-    """Sender and receiver of each edge, int64 [2, E]: all particles within r or the nearest, themselves among them."""
-    neighbours = neighbour_list(position_N3.detach(), batch, r, maximum)
+    """Sender and receiver of each edge, int64 [2, E]: all particles within r, themselves among them."""
+    neighbours = neighbour_list(position_N3.detach(), batch, r)
     order_N = neighbours.order_N
     return torch.stack([order_N[neighbours.sender_E], order_N[neighbours.receivers.segment_E]])

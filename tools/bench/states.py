@@ -98,7 +98,6 @@ def batch_of_scenes(
         domain_S3=torch.tensor([[scene.domain_size] * 3 for scene in scenes]),
         gravity_S3=torch.tensor([[0.0, -9.8 / 60**2, 0.0]]).repeat(len(scenes), 1),
         obstacles=None,
-        surface=None,
         seeds_S=tuple(range(first_seed + 1, first_seed + len(scenes) + 1)),
     ).to(device)
 

@@ -83,12 +83,11 @@ def triton_updates(
     network: ParticleNetwork, scenes: int, precision: str, device: torch.device, noise_std: float | None = None
 ) -> Callable[..., Any]:
     """Makes training updates of so many scenes, each of a copy of the network; without jitter if `noise_std` is 0."""
-    from hgn.kernels.update.op import UpdateSettings  # loads Triton
-    from hgn.runtime.triton_backend import updates_of
+    from hgn.kernels.update.op import Updates, UpdateSettings  # loads Triton
 
     noise_std = TrainingConfig.noise_std if noise_std is None else noise_std
     return partial(
-        updates_of(network),
+        Updates,
         copy.deepcopy(network),
         UpdateSettings(scenes, noise_std, noise_std > 0, OBSTACLE_CELL_SIZE),
         kernel_precision(precision, device),

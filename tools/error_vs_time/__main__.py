@@ -55,7 +55,7 @@ if TYPE_CHECKING:
 
 REFERENCE_STEP = 0.25  # of the limit of stability, on the data's own grid
 COMPILING_FRACTION = 0.4  # of the seconds given, until when kernels that are compiled ahead are waited for
-HGN_ORDER, GNS_ORDER = ("tf32", "fp16", "fp32"), ("fp16", "tf32", "fp32")  # what tells most for its time first
+ORDER = ("tf32", "fp16", "fp32")  # what tells most for its time first
 
 
 def main(mapping: dict[str, Any]) -> int:
@@ -160,8 +160,8 @@ def network_contenders(
         hgn = load_weights(file)[1].network.kind == "hgn"
         precisions = config.precisions
         if precisions is None:
-            precisions = ("fp32",) if device.type != "cuda" else PRECISIONS if hgn else ("tf32", "fp16")
-        ranked = sorted(precisions, key=(HGN_ORDER if hgn else GNS_ORDER).index)
+            precisions = ("fp32",) if device.type != "cuda" else PRECISIONS if hgn else ("tf32",)
+        ranked = sorted(precisions, key=ORDER.index)
         for precision in precisions:
             chosen = precision, config.backend, device, episodes[0].frame_rate_hz, ranked.index(precision)
             try:
@@ -195,7 +195,7 @@ def fitting_weights(episodes: Sequence[Episode]) -> list[Path]:
     files = []
     for name, file in shipped_weights().items():
         info = load_weights(file)[1]
-        if info.network.sees_obstacles == seen and _why_unfit(info, episodes) is None:
+        if info.network.obstacle_features == seen and _why_unfit(info, episodes) is None:
             files.append(file)
         else:
             print(f"left out: the shipped weights {name}, which are for other data", file=sys.stderr)
@@ -207,7 +207,7 @@ def _why_unfit(info: WeightsInfo, episodes: Sequence[Episode]) -> str | None:
     network, rate, cell_size = info.network, episodes[0].frame_rate_hz, episodes[0].obstacle_grid.cell_size
     present = {MATERIALS[i] for episode in episodes for i in np.unique(episode.material_N)}
     others = [e.gravity for e in episodes if tuple(e.gravity) != info.gravity and not network.relative]
-    seen = network.sees_obstacles and any(len(episode.obstacle_grid.cell_K3) for episode in episodes)
+    seen = network.obstacle_features and any(len(episode.obstacle_grid.cell_K3) for episode in episodes)
     if info.frame_rate_hz != rate:
         return f"frames at {rate:g} Hz, not {info.frame_rate_hz:g}"
     if not present <= set(network.materials):

@@ -37,7 +37,7 @@ PARTICLES_AT_ONCE = 150_000  # of backend triton's one-step errors
 REST_SPEED = 1e-4  # domain units a frame; what is slower is at rest
 REPEATED_FRAMES = 51  # of rollouts of a network's further precisions on backend torch, which take minutes
 # What is measured first, a point of each kind before the others; what is last may be left out when the time is over.
-HGN_FIRST, SAME_GRID, GNS_FIRST, HGN_NEXT, COARSE_GRIDS, STATIC_PARTICLES_FIRST, HGN_LAST, GNS_LAST = range(8)
+HGN_FIRST, SAME_GRID, GNS_FIRST, HGN_NEXT, COARSE_GRIDS, HGN_LAST, GNS_LAST = range(7)
 
 
 @dataclass
@@ -88,8 +88,7 @@ class NetworkContender(Contender):
             self.simulator = Simulator(self.network, info.frame_rate_hz, chosen)
         self.stepped, hgn = chosen.stepped, config.kind == "hgn"
         if rank == 0:
-            others = STATIC_PARTICLES_FIRST if config.obstacle_particles else GNS_FIRST
-            self.importance = HGN_FIRST if hgn else others
+            self.importance = HGN_FIRST if hgn else GNS_FIRST
         else:
             self.importance = HGN_NEXT if not self.stepped else HGN_LAST if hgn else GNS_LAST
         self.all_at_once = hgn and self.stepped and device.type == "cuda"  # which waits for the host then

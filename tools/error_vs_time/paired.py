@@ -17,6 +17,7 @@ from tools.error_vs_time.score import label
 
 RESAMPLINGS, COVERED = 10_000, 0.95
 NO_DIFFERENCE = "no difference shown"
+NETWORK_SYSTEMS = (*NETWORK_KINDS, "gns_particles")  # the last only in reports before 0.2.0
 Row = Mapping[str, Any]
 
 
@@ -45,11 +46,11 @@ def paired_rows(rows: Sequence[Row]) -> list[dict[str, Any]]:
     told = [row for row in rows if row.get("by_scene")]
     made = []
     for i, one in enumerate(told):
-        if one["system"] not in NETWORK_KINDS:
+        if one["system"] not in NETWORK_SYSTEMS:
             continue
         later = [row for row in told[i + 1 :] if row["system"] == one["system"] == "hgn"]
         alike = [r for r in later if r["weights"] != one["weights"] and r["precision"] == one["precision"]]
-        others = [row for row in told if row["system"] in (*NETWORK_KINDS[1:], "mpm") and row is not one]
+        others = [row for row in told if row["system"] in (*NETWORK_SYSTEMS[1:], "mpm") and row is not one]
         for other in (*alike, *others):
             for error, values in one["by_scene"].items():
                 for frame in values.keys() & other["by_scene"].get(error, {}).keys():

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from hgn.config import NETWORK_KINDS
+from tools.error_vs_time.paired import NETWORK_SYSTEMS
 from tools.error_vs_time.score import label
 from tools.error_vs_time.settings import UNTIMED
 from tools.report import as_png, new_figure
@@ -29,7 +29,7 @@ TEXT, SMALL, TINY = 10.5, 9.5, 7.5  # points
 FIGURE_WIDTH, PANEL_HEIGHT = 16.2, 4.9  # inches
 NEAR_FLOOR, FAR_ABOVE = 30, 8  # what is still shown: times below the least error, above the best that learns nothing
 LEGEND_LINE = 1.5 * SMALL  # points
-TIMED = (*NETWORK_KINDS, "mpm")
+TIMED = (*NETWORK_SYSTEMS, "mpm")
 UPPER_EDGE = 0.965  # where of a panel's height they are marked that diverged in all scenes
 
 Row = Mapping[str, Any]
@@ -66,12 +66,12 @@ def draw_frames(rows: Sequence[Row], meta: Mapping[str, Any]) -> bytes:
     """Position MSE over the frames, of each network at the precision that came farthest; PNG bytes."""
     figure, ((panel,),) = new_figure(1, 1, (11.0, 6.4))
     looks = _looks(rows)
-    networks = [row for row in rows if row["system"] in NETWORK_KINDS]
+    networks = [row for row in rows if row["system"] in NETWORK_SYSTEMS]
     best: dict[str, Row] = {}
     for row in sorted(networks, key=lambda row: sum(value is None for value in row["curve"])):
         best.setdefault(row["weights"], row)
     for row in rows:
-        network = row["system"] in NETWORK_KINDS
+        network = row["system"] in NETWORK_SYSTEMS
         if network and row is not best[row["weights"]]:
             continue
         look, curve_T = looks[label(row, setting=False)], np.array([np.nan if v is None else v for v in row["curve"]])
@@ -175,12 +175,12 @@ def _legend(rows: Sequence[Row], looks: Mapping[str, Any]) -> list[list[Any]]:
     lines: list[Any] = []
     steps: dict[float, str] = {}
     for name, look in looks.items():
-        kind = networks if look["system"] in NETWORK_KINDS else grids if look["system"] == "mpm" else lines
+        kind = networks if look["system"] in NETWORK_SYSTEMS else grids if look["system"] == "mpm" else lines
         style = {"linestyle": look["line"], "linewidth": 1.5} if kind is lines else {"linewidth": 3.5}
         text = f"learns nothing: {name}" if look["system"] == "baseline" else name
         kind.append(Line2D([], [], color=look["color"], label=text, **style))
         steps |= look.get("markers", {})
-    present = {row["precision"] for row in rows if row["system"] in NETWORK_KINDS}
+    present = {row["precision"] for row in rows if row["system"] in NETWORK_SYSTEMS}
     precisions = [_mark(marker, name) for name, marker in PRECISION_MARKERS.items() if name in present]
     marks = [_mark(m, f"solver, {step:g} of the stable step") for step, m in sorted(steps.items(), reverse=True)]
     notes: list[Any] = []

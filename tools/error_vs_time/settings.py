@@ -32,7 +32,7 @@ class ErrorVsTimeConfig:
     scenes: Positive[int] = 20
     frames: FrameCount = 300
     frame_stride: Positive[int] = 10  # every tenth frame for the one-step error
-    # fp32, tf32, fp16 where a network's backend knows it; null: all on a GPU (tf32 and fp16 of GNS), fp32 on a CPU
+    # fp32, tf32, fp16 where a network's backend knows it; null: all on a GPU (tf32 for GNS), fp32 on a CPU
     precisions: tuple[Precision, ...] | None = None
     # of the networks: torch, triton; auto: triton wherever it runs
     backend: Annotated[str, one_of("auto", "torch", "triton")] = "auto"

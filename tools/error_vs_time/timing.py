@@ -44,7 +44,7 @@ class Stopwatch:
                 frame_milliseconds(contender, scenes, min(SOLVER_WARM_FRAMES, most))
         # what looks at its frames 32 at a time tells nothing of fewer
         frames = min(WARM_FRAMES if contender.stepped else TRITON_WARM_FRAMES, most)
-        captures = not contender.stepped or contender.row["system"].startswith("gns")
+        captures = not contender.stepped
         if captures:  # which would be taken for the time of a frame
             frame_milliseconds(contender, largest, frames)
         taken = frame_milliseconds(contender, largest, frames)

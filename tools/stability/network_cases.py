@@ -67,7 +67,7 @@ class StabilityNetworkConfig:
     # the scenes as they are in training; obstacles only where the network sees them
     scene: SceneConfig = field(default_factory=SceneConfig)
     backend: BackendName = "auto"  # torch, triton, cpu; auto: the fastest that runs
-    precision: Precision = "tf32"  # of matrix products: fp32, tf32 (on a GPU), fp16 (backend triton, and GNS)
+    precision: Precision = "tf32"  # of matrix products: fp32, tf32 (on a GPU), fp16 (backend triton)
     device: str = "auto"
     picture: str | None = None  # also draw the first scene of each case, as far as it came, into this PNG
     json: str | None = None  # also write the rows to this file; --json FILE does the same
@@ -102,7 +102,7 @@ def cases(config: StabilityNetworkConfig, network: NetworkConfig) -> Iterator[Ca
     """
     wanted = config.cases or CASES
     base = replace(config.scene, funnel_scene_fraction=0.0)
-    base = base if network.sees_obstacles else replace(base, obstacle_count=0)
+    base = base if network.obstacle_features else replace(base, obstacle_count=0)
     base = replace(base, materials=tuple(name for name in base.materials if name in network.materials))
 
     def case(name: str, **change: Any) -> Case:
@@ -114,7 +114,7 @@ def cases(config: StabilityNetworkConfig, network: NetworkConfig) -> Iterator[Ca
         name = f"falls and spreads, {material}"
         if times:
             yield Case(name, drops, times[-1] + 1, spread_at=times, beside_solver=True)
-    judged = config.solver and network.sees_obstacles and config.frames >= HOLE_FRAMES
+    judged = config.solver and network.obstacle_features and config.frames >= HOLE_FRAMES
     for material in base.materials if "hole" in wanted and judged else ():
         for side, hole_cells in HOLE_CELLS.items():
             name = f"passes holes{'' if side == 1 else ' under load'}, {material}"
@@ -146,7 +146,7 @@ def cases(config: StabilityNetworkConfig, network: NetworkConfig) -> Iterator[Ca
     for material in base.materials if "single" in wanted else ():
         single = body(base, material, 0.5 * np.array([base.domain_size]), np.zeros(3))
         yield Case(f"single particle, {material}", (single,), config.frames, base.gravity, FALL_FRAMES)
-    for material in base.materials if "slope" in wanted and network.sees_obstacles else ():
+    for material in base.materials if "slope" in wanted and network.obstacle_features else ():
         for degrees in SLOPES_DEG:
             yield replace(_slope(base, material, config.frames, degrees), beside_solver=config.solver)
     if "far" in wanted:

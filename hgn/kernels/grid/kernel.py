@@ -426,7 +426,7 @@ def prepare_features(
     """Absolute features of each particle (velocities, normal if NORMALS, walls, one-hot material), [N, FEATURES].
     Without OBSTACLES nothing is looked up and the normals stay zero. SYMMETRY as in obstacle_normals.
 
-    Reference: hgn.network.features; test: tests/kernels/test_network.py, tests/kernels/test_gns_update.py.
+    Reference: hgn.network.features; test: tests/kernels/test_network.py.
     """
     count = tl.load(particle_count)
     if tl.program_id(0) * BLOCK >= count:

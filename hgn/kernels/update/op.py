@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -25,10 +25,8 @@ from hgn.kernels.capture import captured
 from hgn.kernels.forward import feature_columns
 from hgn.kernels.grid.op import OBSTACLE_COLUMNS, OUT_OF_WINDOW, DeviceGrid, ObstacleHash, ObstacleTable, Window
 from hgn.kernels.muon.op import SquareBlocks
-from hgn.kernels.packing import PackedNetwork, pack_network
+from hgn.kernels.packing import pack_network
 from hgn.kernels.update import kernel
-from hgn.network.base import ParticleNetwork
-from hgn.network.features import ParticleState
 from hgn.network.hgn import HierarchicalGraphNetwork
 from hgn.scene.symmetry import Symmetry, Vector, drawn_symmetry
 from hgn.schema import ConfigError
@@ -113,50 +111,6 @@ class UpdateSettings:
         )  # fmt: skip
 
 
-class Layout(Protocol):
-    """Where the parameters are in the flat buffers; `index` maps their elements to the concatenated parameters."""
-
-    @property
-    def size(self) -> int: ...
-
-    @property
-    def index(self) -> torch.Tensor: ...
-
-    def gather(self, tensors: list[torch.Tensor]) -> torch.Tensor: ...
-
-    def scatter(self, packed: torch.Tensor, tensors: list[torch.Tensor]) -> None: ...
-
-
-class Tables(Protocol):
-    """What a network needs of where particles are, in buffers of fixed capacities."""
-
-    status: torch.Tensor
-    needed_L: torch.Tensor
-
-    def build(
-        self, position: torch.Tensor, scene_N: torch.Tensor, origin_S3: torch.Tensor, count: torch.Tensor
-    ) -> None: ...
-
-
-class TrainedNetwork(Protocol):
-    """A network's forward and backward pass; `totals` are gradients laid out as the values, and a tail."""
-
-    output: torch.Tensor
-    output_gradient: torch.Tensor
-    totals: torch.Tensor
-    weights: torch.Tensor  # the copy of the values that products read …
-    copy_precision: str  # … at this precision
-    unscale: float
-
-    def forward(self) -> None: ...
-
-    def backward(self) -> None: ...
-
-    def refresh(self) -> None: ...
-
-    def refresh_encoder(self) -> None: ...
-
-
 class Updates:
     """Parameters and Adam's moments in flat buffers, and the launches that update them.
 
@@ -164,14 +118,12 @@ class Updates:
     all ranks in place, the gradients of `ranks` ranks are averaged; then all make the same updates.
     """
 
-    growth = GROWTH  # of capacities over what was needed
-    checked_particles = 200_000  # at most, of an update that is compared with PyTorch, which needs memory
-    grid: Tables
-    fused: TrainedNetwork
+    grid: DeviceGrid
+    fused: FusedTrainingNetwork
 
     def __init__(
         self,
-        network: ParticleNetwork,
+        network: HierarchicalGraphNetwork,
         settings: UpdateSettings,
         precision: str,
         loss_sum: torch.Tensor,
@@ -188,7 +140,7 @@ class Updates:
         self.loss_sum, self.counters, self.reduce, self.ranks = loss_sum, counters, reduce, ranks
         self.one_graph = one_graph
         self.device = device = next(network.parameters()).device
-        self.packed = self._layout()
+        self.packed = pack_network(network)
         self.values = self.packed.gather(list(network.parameters()))
         self.first_moment, self.second_moment = torch.zeros_like(self.values), torch.zeros_like(self.values)
         self.average: torch.Tensor | None = None  # of the values over the updates; set it before the first one
@@ -406,10 +358,8 @@ class Updates:
 
     def _grid(self) -> None:
         """What follows from where the particles are."""
-        grid = self.grid
-        assert isinstance(grid, DeviceGrid)
-        grid.build(self.position_N3, self.scene_N, self.origin_S3, self.particle_count)
-        grid.prepare(
+        self.grid.build(self.position_N3, self.scene_N, self.origin_S3, self.particle_count)
+        self.grid.prepare(
             self.config, self.position_N3, self.velocity_NV, self.scene_N, self.material_N, self.origin_S3,
             self.domain_S3, self.gravity_S3, self.particle_count, self.velocity_mean, self.velocity_std,
             self.obstacles, self.settings.symmetry,
@@ -445,25 +395,14 @@ class Updates:
         self.grid = self._device_grid(self.capacities)
         self.fused = self._fused_network()
 
-    # what the kind of network decides
-
-    def reference_output(self, state: ParticleState, origin_S3: torch.Tensor) -> torch.Tensor:
-        """What PyTorch computes, with gradients: the normalised accelerations [N, 3]."""
-        return self.network.normalised_acceleration(state, origin_S3)
-
-    def _layout(self) -> Layout:
-        assert isinstance(self.network, HierarchicalGraphNetwork)
-        return pack_network(self.network)
-
-    def _fused_network(self) -> TrainedNetwork:
-        assert isinstance(self.grid, DeviceGrid) and isinstance(self.packed, PackedNetwork)
+    def _fused_network(self) -> FusedTrainingNetwork:
         # gradients of the mean over particles are small: float16 would lose them
         scale = 2.0 ** round(math.log2(max(self.particles, 2))) if self.precision == "fp16" else 1.0
         return FusedTrainingNetwork(
             self.config, self.packed, self.values, self.grid, self.particle_count, self.precision, scale, tail=TAIL
         )
 
-    def _device_grid(self, capacities: tuple[int, ...]) -> Tables:
+    def _device_grid(self, capacities: tuple[int, ...]) -> DeviceGrid:
         config = self.config
         return DeviceGrid(
             self._window(), self.settings.scenes, capacities, self.particles, feature_columns(config),
@@ -500,4 +439,4 @@ class Updates:
         self.capture_seconds += time.monotonic() - begun
 
     def _rounded(self, needed: Sequence[int]) -> tuple[int, ...]:
-        return tuple(16 * math.ceil(max(self.growth * count, 32) / 16) for count in needed)
+        return tuple(16 * math.ceil(max(GROWTH * count, 32) / 16) for count in needed)
