@@ -103,7 +103,6 @@ UNMENTIONED: set[str] = {
     "MpmConfig.wall_contact",
     "MpmConfig.water_equation",
     "MpmConfig.water_minimum_volume_ratio",
-    "NetworkConfig.maximum_neighbours",
     "RenderConfig.fps",
     "ScalingConfig.rounds",
     "SceneConfig.clearance_cells",
@@ -124,15 +123,9 @@ UNMENTIONED: set[str] = {
 
 BYTES_OF_A_FILE = 500_000
 LARGE_FILES = {  # shipped weights, and results that pages show
-    "hgn/weights/gns.safetensors",
-    "hgn/weights/gns_no_obstacles.safetensors",
-    "hgn/weights/gns_particles.safetensors",
     "hgn/weights/mechanics.safetensors",
-    "hgn/weights/no_obstacles.safetensors",
     "hgn/weights/obstacles.safetensors",
-    "hgn/weights/obstacles_levels_3.safetensors",
     "hgn/weights/obstacles_small.safetensors",
-    "hgn/weights/obstacles_steps_1.safetensors",
     "results/recipe/side_by_side.webp",
     "results/stability/network_h100.json",
     "results/stability/obstacles_h100.png",

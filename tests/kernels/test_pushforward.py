@@ -149,7 +149,7 @@ def test_fast_training_is_the_plain_one(data, tmp_path, monkeypatch, capsys):
     """Both paths simulate the same scenes at the same updates and train on the same windows: weights, their average and
     what is logged of the pool agree. The fast one tells where the time of its first updates went."""
     monkeypatch.setattr("hgn.training.graph_trainer.REPORTED_UPDATES", 2)
-    monkeypatch.setattr("hgn.runtime.backend.triton_unsupported_reason", lambda *_: None)  # in float32
+    monkeypatch.setattr("hgn.training.session.triton_unsupported_reason", lambda *_: None)  # in float32
     without_jitter(monkeypatch)
     same = {"noise_std": 0.0, "ema_decay": 0.7, "symmetry": "gravity"}
     own = {"pushforward_fraction": 0.5, "pushforward_every": 1, "pushforward_scenes": 2, "pushforward_frames": 2}

@@ -24,7 +24,7 @@ needs_copy = pytest.mark.skipif(
 
 
 @needs_copy
-@pytest.mark.parametrize("config", [SMALL, replace(SMALL, obstacle_features=False, maximum_neighbours=12)])
+@pytest.mark.parametrize("config", [SMALL, replace(SMALL, obstacle_features=False)])
 def test_our_gns_with_their_weights_is_their_function(config):
     """In float32 both give the same output to 1e-5, several scenes at once, and the same loss."""
     assert COPY is not None
@@ -45,4 +45,4 @@ def test_our_gns_with_their_weights_is_their_function(config):
 def test_a_folder_without_the_code(tmp_path):
     """A wrong folder is named, with where to get the code."""
     with pytest.raises(ConfigError, match=r"public_gns must be a local copy.*geoelements/gns"):
-        load_public(tmp_path, None)
+        load_public(tmp_path)
