@@ -16,10 +16,10 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 29_150,
+    "hgn": 29_200,
     "datagen": 8_900,
-    "tools": 6_450,
-    "tests": 28_100,
+    "tools": 6_400,
+    "tests": 28_050,
 }
 SETTINGS = 305  # fields of the dataclasses behind the commands, *Config
 
@@ -29,8 +29,8 @@ LONG_FILES = {
     "datagen/mpm/mls_mpm.py": 553,
     "datagen/mpm/team_kernel.py": 482,
     "hgn/config.py": 472,
-    "hgn/kernels/coarsest/kernel.py": 588,
-    "hgn/kernels/grid/kernel.py": 552,
+    "hgn/kernels/coarsest/kernel.py": 584,
+    "hgn/kernels/grid/kernel.py": 548,
     "hgn/kernels/update/op.py": 503,
     "tools/stability/network.py": 465,
 }

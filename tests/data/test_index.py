@@ -22,7 +22,7 @@ from hgn.data.reader import EpisodeStore
 from hgn.data.statistics import Moments, Statistics
 from hgn.schema import ConfigError
 
-MANY = 1_250
+MANY = 1_259  # far from the ends of a segment
 
 
 class Count:
