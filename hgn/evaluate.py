@@ -13,8 +13,7 @@ import numpy as np
 from hgn.command import run_command
 from hgn.config import DEFAULT_WEIGHTS, BackendName, Precision, Split
 from hgn.data.fresh import set_record
-from hgn.data.lookup import first_episodes
-from hgn.data.reader import EpisodeStore
+from hgn.data.reader import EpisodeStore, first_episodes
 from hgn.runtime.rollouts import RolloutResult, simulate_scenes
 from hgn.runtime.simulator import InitialState, Simulator
 from hgn.runtime.torch_backend import Backend

@@ -18,7 +18,7 @@ import numpy as np
 
 from hgn.command import run_command
 from hgn.config import DEFAULT_WEIGHTS, BackendName, Precision, SceneConfig, require_rollout_name
-from hgn.data.lookup import find_episode
+from hgn.data.reader import find_episode
 from hgn.render.exchange import PLY_ENDING, USD_ENDINGS, require_exchange, save_rollout
 from hgn.render.pictures import animate, compare_picture, spread, write_picture
 from hgn.runtime.divergence import DivergedError

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from hgn.command import run_command
-from hgn.data.lookup import find_episode
+from hgn.data.reader import find_episode
 from hgn.render import pictures
 from hgn.render.error_curve import error_curve, position_error
 from hgn.render.exchange import PLY_ENDING, USD_ENDINGS, save_rollout

@@ -66,7 +66,6 @@ class PooledStore(Episodes):
 
     @property
     def entries(self) -> Iterator[EpisodeEntry]:
-        """The index entries of all episodes."""
         return chain.from_iterable(store.entries for store in (*self.others, self.own))
 
     def frames(self, count: int | None = None) -> list[int]:

@@ -13,6 +13,8 @@ from abc import ABC, abstractmethod
 from collections import OrderedDict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
+from heapq import nsmallest
+from itertools import islice
 from pathlib import Path
 from typing import Any, overload
 
@@ -39,6 +41,16 @@ class Episodes(Sequence[Episode], ABC):
     @abstractmethod
     def open(self, index: int) -> Episode:
         """Returns the episode at a place from 0 on."""
+
+    @property
+    @abstractmethod
+    def entries(self) -> Iterator[EpisodeEntry]:
+        """The index entries of all episodes (key, particles, frames), read without opening a shard."""
+
+    def first_indices(self, count: int, published: int | None = None) -> list[int]:
+        """Returns the places of the episodes with the lowest indices among the first `published` (None: all)."""
+        places = ((entry.index, place) for place, entry in enumerate(islice(self.entries, published)))
+        return [place for _, place in nsmallest(count, places)]
 
     @overload
     def __getitem__(self, index: int) -> Episode: ...
@@ -169,7 +181,6 @@ class EpisodeStore(Episodes):
 
     @property
     def entries(self) -> Iterator[EpisodeEntry]:
-        """The index entries of all episodes (key, particles, frames), read without opening a shard."""
         return (entry for shard in self.manifest.shards_of(self.split) for entry in shard.episodes)
 
     def frames(self, count: int | None = None) -> list[int]:
@@ -305,3 +316,30 @@ def read_episode(
         data = shard_bytes[offset : offset + size]
         members[member] = data if member == POSITION_MEMBER else data.tobytes()
     return decode_episode(key, members, scan_positions)
+
+
+def first_episodes(store: EpisodeStore, count: int) -> list[Episode]:
+    """Returns the `count` episodes of lowest index.
+
+    Raises: ConfigError when there are none.
+    """
+    if not len(store):
+        others = ", ".join(f"split={split}" for split in SPLITS if len(store.of_split(split)))
+        remedy = f"; it has others: {others}" if others else ""
+        raise ConfigError(f"data must hold episodes of the split {store.split}, got none in {store.folder}{remedy}")
+    return [store.open(i) for i in store.first_indices(count)]
+
+
+def find_episode(folder: Path | str, key: str) -> Episode:
+    """Returns the episode with a key, for example validation-000000.
+
+    Raises: ConfigError when the data set does not hold it.
+    """
+    split = key.rsplit("-", 1)[0]
+    if split not in SPLITS:
+        raise ConfigError(f"episode must begin with one of {', '.join(SPLITS)}, got {key!r}; e.g. validation-000000")
+    store = EpisodeStore(folder, split)
+    for place, entry in enumerate(store.entries):
+        if entry.key == key:
+            return store.open(place)
+    raise ConfigError(f"episode must be one of the {len(store)} {split} episodes in {folder}, got {key!r}")

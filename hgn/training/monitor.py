@@ -12,7 +12,6 @@ import numpy as np
 import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
 
-from hgn.data.lookup import first_indices
 from hgn.data.pooled import AnyStore
 from hgn.data.storage import PATIENCE_S
 from hgn.render.pictures import rollout_of_episode
@@ -72,7 +71,7 @@ class Monitor(Callback):
         started = time.monotonic()
         self.stores["validation"].refresh()
         chosen = {
-            split: first_indices(store, MONITORED_SCENES, agreed_count(store, trainer))
+            split: store.first_indices(MONITORED_SCENES, agreed_count(store, trainer))
             for split, store in self.stores.items()
         }
         here = all(store.within_reach(chosen[split], patience_s) for split, store in self.stores.items())

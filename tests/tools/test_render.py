@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from hgn.data.lookup import find_episode
+from hgn.data.reader import find_episode
 from hgn.render.pictures import rollout_of_episode
 from hgn.scene.rollout_file import Rollout, read_rollout, write_rollout
 from hgn.schema import ConfigError

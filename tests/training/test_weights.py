@@ -8,8 +8,7 @@ from training.runs import NETWORK, TRAINING, metrics, train_mapping
 
 from hgn import train
 from hgn.config import NetworkConfig, TrainConfig, TrainingConfig
-from hgn.data.lookup import first_episodes
-from hgn.data.reader import EpisodeStore
+from hgn.data.reader import EpisodeStore, first_episodes
 from hgn.evaluate import EvaluateConfig, one_step_rows
 from hgn.export import export
 from hgn.export import main as export_main

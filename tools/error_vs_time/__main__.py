@@ -23,8 +23,7 @@ import torch
 from hgn.command import EXIT_MACHINE, run_command
 from hgn.config import PRECISIONS, MpmConfig
 from hgn.data.fresh import set_record
-from hgn.data.lookup import first_episodes
-from hgn.data.reader import EpisodeStore
+from hgn.data.reader import EpisodeStore, first_episodes
 from hgn.runtime.weights import WeightsInfo, find_weights, load_weights, shipped_weights
 from hgn.scene.episode import Episode
 from hgn.scene.material import MATERIALS
