@@ -16,22 +16,20 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 29_200,
+    "hgn": 27_150,
     "datagen": 8_900,
     "tools": 6_400,
-    "tests": 28_050,
+    "tests": 27_450,
 }
-SETTINGS = 305  # fields of the dataclasses behind the commands, *Config
+SETTINGS = 303  # fields of the dataclasses behind the commands, *Config
 
 LINES_OF_A_FILE = 450
 LONG_FILES = {
     "datagen/mpm/launch.py": 494,
     "datagen/mpm/mls_mpm.py": 553,
     "datagen/mpm/team_kernel.py": 482,
-    "hgn/config.py": 472,
     "hgn/kernels/coarsest/kernel.py": 584,
     "hgn/kernels/grid/kernel.py": 548,
-    "hgn/kernels/update/op.py": 503,
     "tools/stability/network.py": 465,
 }
 
@@ -42,11 +40,10 @@ MANY_PARAMETERS: dict[str, int] = {
 }
 # the number of such calls in a file
 MANY_POSITIONAL_ARGUMENTS: dict[str, int] = {
-    "hgn/runtime/differentiable.py": 7,
+    "hgn/runtime/differentiable.py": 5,
     "hgn/runtime/exported_step.py": 1,
     "hgn/runtime/precompile_program.py": 4,
     "hgn/runtime/simulator.py": 10,
-    "hgn/runtime/triton_backend.py": 1,
     "hgn/runtime/triton_rollout.py": 5,
     "hgn/runtime/weights.py": 1,
     "hgn/training/data_module.py": 4,
