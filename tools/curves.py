@@ -1,12 +1,10 @@
 """python -m tools.curves runs=[runs/obstacles] out=results/NAME: learning curves of runs as PNG and JSON.
 
-One run: loss, one-step errors beside the baselines, and rollout errors, over updates. Several: loss and
-one-step validation error over the scenes that were trained on, and the latter over minutes, in one panel each.
+One run: loss, one-step errors with the baselines, and rollout errors, over updates. Several runs: loss and one-step
+validation error over the scenes of all updates, and the latter also over minutes of training.
 
-The JSON holds {"meta": provenance of the figure, "runs": [{"name", "meta": provenance and settings of the run,
-"rows"}, ...]}, a row for each measurement; `minutes` are those of training, without the time between a stop and the
-next start. `scenes` are those of all updates so far: a scene that comes again counts again. Both count on from the
-end of the run that this one began with.
+The JSON contains {"meta": provenance of the figure, "runs": [{"name", "meta": provenance and settings of the run,
+"rows"}, ...]}, with a row for each record. Minutes do not include the time between a stop and the next start.
 """
 
 from __future__ import annotations
@@ -27,7 +25,7 @@ from hgn.system.files import write_atomically, write_json
 from hgn.system.provenance import provenance
 from tools.report import as_png, new_figure
 
-# what of a record is kept
+# prefixes of the figures in the JSON
 BEGINNINGS = (
     *("update", "minutes", "loss", "learning_rate", "updates_per_second", "scenes_per_second", "gpu_memory_gb"),
     *("scenes", "one_step", "baseline", "rollout", "monitor"),
@@ -35,8 +33,8 @@ BEGINNINGS = (
 BASELINE_STYLES = {"constant_velocity": ":", "ballistic_motion": "--", "mean_acceleration": "-."}
 LOSS = "MSE of normalised acceleration"
 ONE_STEP = "one-step MSE (sum over axes, frame units)"
-LINES = 200  # of the loss that are kept
-BREAKS = 10  # times the usual time between two records: there the training was stopped
+LINES = 200  # records of the loss in the JSON
+BREAKS = 10  # a gap of this many usual gaps between two records is a stop of the training
 
 
 @dataclass(frozen=True)
@@ -44,58 +42,31 @@ class CurvesConfig:
     """The options of `python -m tools.curves`."""
 
     runs: tuple[str, ...]  # folders of python -m hgn.train, for example [runs/obstacles,runs/gns]
-    out: str  # without ending: OUT.png and OUT.json
-    names: tuple[str, ...] | None = None  # of the runs in the figure; null: those of the folders
-    # for each run the name of an earlier one that it began with the weights of, or null; null: none did
-    after: tuple[str | None, ...] | None = None
+    out: str  # name of the files without ending: OUT.png and OUT.json
 
     def __post_init__(self) -> None:
         require(len(self.runs) > 0, "runs", "at least one folder of python -m hgn.train", self.runs)
-        if self.names is not None:
-            rule = f"one for each of the {len(self.runs)} runs"
-            require(len(self.names) == len(self.runs), "names", rule, self.names)
-        earlier = [name is None or name in self.labels[:i] for i, name in enumerate(self.begun_with)]
-        rule = f"for each of the {len(self.runs)} runs null or the name of one before it"
-        require(len(earlier) == len(self.runs) and all(earlier), "after", rule, self.after)
-
-    @property
-    def labels(self) -> tuple[str, ...]:
-        """The runs' names in the figure."""
-        return self.names or tuple(Path(run).name for run in self.runs)
-
-    @property
-    def begun_with(self) -> tuple[str | None, ...]:
-        """For each run the name of the one whose weights it began with."""
-        return self.after or (None,) * len(self.runs)
+        names = {Path(run).name for run in self.runs}
+        require(len(names) == len(self.runs), "runs", "folders of different names", self.runs)
 
 
 @dataclass(frozen=True)
 class Run:
-    """What a run of hgn.train has written."""
+    """The records of a run of hgn.train."""
 
     name: str
     settings: Mapping[str, Any]
-    records: list[dict[str, float]]  # of metrics.jsonl, each update's last, with `minutes` and `scenes`
+    records: list[dict[str, float]]  # of metrics.jsonl, the last of each update, with `minutes` and `scenes`
 
 
 def main(mapping: dict[str, Any]) -> int:
     """Writes <out>.png and <out>.json; returns the exit code."""
     config = from_mapping(CurvesConfig, mapping)
-    runs = [read_run(Path(folder), name) for folder, name in zip(config.runs, config.labels, strict=True)]
-    ends = {run.name: run.records[-1] for run in runs if run.records}
-    for run, before in zip(runs, config.begun_with, strict=True):
-        if before in ends:
-            for record in run.records:
-                record["scenes"] += ends[before]["scenes"]
-                record["minutes"] += ends[before]["minutes"]
-    parts = [
-        {
-            "name": run.name,
-            "meta": dict(run.settings.get("provenance", {})) | {"config": run.settings},
-            "rows": measurements(run.records),
-        }
-        for run in runs
-    ]
+    runs = [read_run(Path(folder)) for folder in config.runs]
+    parts = []
+    for run in runs:
+        meta = dict(run.settings.get("provenance", {})) | {"config": run.settings}
+        parts.append({"name": run.name, "meta": meta, "rows": measurements(run.records)})
     picture, report = (Path(config.out).with_suffix(ending) for ending in (".png", ".json"))
     write_json(report, {"meta": provenance(), "runs": parts})
     write_atomically(picture, draw(runs))
@@ -103,11 +74,8 @@ def main(mapping: dict[str, Any]) -> int:
     return 0
 
 
-def read_run(folder: Path, name: str) -> Run:
-    """Reads metrics.jsonl and the resolved configuration.
-
-    Raises: ConfigError when the folder is no run of hgn.train.
-    """
+def read_run(folder: Path) -> Run:
+    """Reads metrics.jsonl and the resolved configuration. Raises: ConfigError if the folder is no run of hgn.train."""
     try:
         lines = (folder / "metrics.jsonl").read_text(encoding="utf-8").splitlines()
         settings = yaml.safe_load((folder / "config.yaml").read_text(encoding="utf-8"))
@@ -117,13 +85,13 @@ def read_run(folder: Path, name: str) -> Run:
     records = [current_metrics(json.loads(line)) for line in lines]
     _add_minutes(records)
     _add_scenes(records, settings["training"]["batch_scenes"])
-    # A run that was stopped and resumed may have repeated some updates: the later record holds.
+    # a resumed run repeats some updates: the later record counts
     latest = {(record["update"], "loss" in record): record for record in records}
-    return Run(name, settings, [latest[key] for key in sorted(latest)])
+    return Run(folder.name, settings, [latest[key] for key in sorted(latest)])
 
 
 def _add_minutes(records: list[dict[str, float]]) -> None:
-    """Adds the minutes since the first record; a stop counts as much as two records are usually apart."""
+    """Adds the minutes since the first record; a stop counts as one usual gap."""
     gaps = [after["time"] - before["time"] for before, after in itertools.pairwise(records)]
     usual = sorted(gaps)[len(gaps) // 2] if gaps else 0.0
     seconds = 0.0
@@ -134,7 +102,7 @@ def _add_minutes(records: list[dict[str, float]]) -> None:
 
 
 def _add_scenes(records: list[dict[str, float]], of_a_device: int) -> None:
-    """Adds the scenes so far; how many an update had, over all devices, its rates say."""
+    """Adds the scenes so far; rates give the scenes of an update over all devices."""
     rated = [record for record in records if record.get("updates_per_second")]
     an_update = round(rated[0]["scenes_per_second"] / rated[0]["updates_per_second"]) if rated else of_a_device
     for record in records:
@@ -142,7 +110,7 @@ def _add_scenes(records: list[dict[str, float]], of_a_device: int) -> None:
 
 
 def measurements(records: list[dict[str, float]]) -> list[dict[str, float]]:
-    """Records with errors in full, and at most LINES of the loss lines."""
+    """Returns all records with errors, and at most LINES of the loss."""
     losses = [i for i, record in enumerate(records) if "loss" in record]
     kept = set(losses[:: max(1, -(-len(losses) // LINES))])
     return [
@@ -153,9 +121,7 @@ def measurements(records: list[dict[str, float]]) -> list[dict[str, float]]:
 
 
 def draw(runs: Sequence[Run]) -> bytes:
-    """Of one run: loss and one-step errors over updates, the baselines as lines, and rollout errors. Of several: loss
-    and validation error over scenes, and the latter over minutes. PNG bytes.
-    """
+    """Draws the curves of one run or of several; returns PNG bytes."""
     figure, (panels,) = new_figure(1, 3, (15, 5 if len(runs) > 1 else 4.5))
     last = {name: value for record in runs[0].records for name, value in record.items()}
     title = "; ".join(sorted({_origin(run) for run in runs}))
@@ -174,7 +140,7 @@ def draw(runs: Sequence[Run]) -> bytes:
             if len(runs) == 1:
                 panel.legend(fontsize=8)
     if len(runs) > 1:
-        # of all panels and below them: within one it would cover lines of several runs
+        # one legend below all panels: within a panel it would cover curves
         named = {line.get_label(): line for panel in panels for line in panel.lines}
         shown = {label: line for label, line in named.items() if label and not label.startswith("_")}
         figure.legend(shown.values(), shown.keys(), fontsize=8, loc="outside lower center", ncols=5)
@@ -218,7 +184,7 @@ def _plot_baselines(panel: Any, last: Mapping[str, float]) -> None:
 
 
 def _means(records: list[dict[str, float]], key: str, lines: int = 60) -> list[dict[str, float]]:
-    """Means over neighbouring records, as many as are drawn."""
+    """Averages neighbouring records."""
     step = max(1, len(records) // lines)
     parts = [records[i : i + step] for i in range(0, len(records), step)]
     return [{"scenes": part[-1]["scenes"], key: sum(r[key] for r in part) / len(part)} for part in parts]

@@ -1,6 +1,6 @@
-"""What is measured of trajectories besides positions: momentum, energy, density, the domain.
+"""Measures of trajectories: momentum, energy, density, and particles outside of the domain.
 
-All in frame units: displacement a frame for velocities, domain units a frame squared for accelerations.
+All are in frame units: domain units a frame for velocities, domain units a frame squared for accelerations.
 Shape legend: T frames, N particles.
 """
 
@@ -15,7 +15,7 @@ FRAMES_AT_ONCE = 50  # in float64
 
 
 def momentum_error(path_TN3: np.ndarray, reference_TN3: np.ndarray) -> float:
-    """Root mean square over frames of the difference of the mean velocities, per mass; 0 for a single frame."""
+    """Returns the root mean square, over frames, of the difference of mean velocities; 0 for a single frame."""
     if len(path_TN3) < 2:
         return 0.0
     reference_TN3 = reference_TN3[: len(path_TN3)]
@@ -24,14 +24,14 @@ def momentum_error(path_TN3: np.ndarray, reference_TN3: np.ndarray) -> float:
 
 
 def _mean_position(path_TN3: np.ndarray) -> np.ndarray:
-    """float64 [T, 3], axis by axis: a seventh of the time of all at once."""
+    """Returns float64 [T, 3]; axis by axis takes a seventh of the time."""
     return np.stack([path_TN3[..., axis].mean(1, dtype=np.float64) for axis in range(path_TN3.shape[2])], axis=-1)
 
 
 def energies(path_TN3: np.ndarray, gravity_3: np.ndarray) -> np.ndarray:
-    """Kinetic and potential energy per mass between each two frames, float64 [T - 1].
+    """Returns kinetic and potential energy per mass, v² / 2 - g · x, at the middle of each frame, float64 [T - 1].
 
-    v² / 2 - g · x at the middle of the frame; gravity in domain units a frame squared. Elastic energy is not in it.
+    Gravity is in domain units a frame squared. Elastic energy is not included.
     """
     parts = [np.zeros(0)]
     for first in range(0, len(path_TN3) - 1, FRAMES_AT_ONCE):
@@ -43,12 +43,12 @@ def energies(path_TN3: np.ndarray, gravity_3: np.ndarray) -> np.ndarray:
 
 
 def energy_scale(gravity_3: np.ndarray, domain_size: Sequence[float]) -> float:
-    """The energy per mass of a fall through the domain; 1 without gravity."""
+    """Returns the energy per mass of a fall through the domain; 1 without gravity."""
     return float(np.abs(gravity_3) @ np.asarray(domain_size)) or 1.0
 
 
 def neighbours(position_N3: np.ndarray, radius: float) -> float:
-    """How many others are within the radius of a particle, on average: how densely they lie."""
+    """Returns the mean number of other particles within the radius of a particle."""
     if len(position_N3) == 0:
         return 0.0
     tree = cKDTree(position_N3)
@@ -56,6 +56,6 @@ def neighbours(position_N3: np.ndarray, radius: float) -> float:
 
 
 def outside_domain(position_N3: np.ndarray, domain_size: Sequence[float]) -> float:
-    """Share of the particles beyond the domain's planes."""
+    """Returns the fraction of particles outside of the domain."""
     outside_N3 = (position_N3 < 0) | (position_N3 > np.asarray(domain_size))
     return float(outside_N3.any(-1).mean()) if len(position_N3) else 0.0

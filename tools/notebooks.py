@@ -1,7 +1,7 @@
-"""python -m tools.notebooks: writes the notebooks of docs/notebooks from the pages whose blocks they hold.
+"""python -m tools.notebooks: writes the notebooks of docs/notebooks from pages of the documentation.
 
-A page's text becomes Markdown cells, its Python blocks code cells, its commands `!` lines and its files `%%writefile`.
-So the pages, whose blocks the tests run, are the only source.
+Text becomes Markdown cells, Python blocks code cells, commands `!` lines and files `%%writefile`. The tests run the
+blocks of the pages, which are the only source.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _BLOCK = re.compile(r"(?:<!-- file: (\S+) -->\n)?```(\w+)\n(.*?)```\n", re.DOTAL
 
 
 def main() -> int:
-    """Writes all; returns the exit code."""
+    """Writes all notebooks; returns the exit code."""
     (DOCS / "notebooks").mkdir(exist_ok=True)
     for name, page in NOTEBOOKS.items():
         write_atomically(DOCS / "notebooks" / f"{name}.ipynb", notebook(DOCS / page).encode())
@@ -31,7 +31,7 @@ def main() -> int:
 
 
 def notebook(page: Path) -> str:
-    """The notebook of a page, as JSON."""
+    """Returns the notebook of a page, as JSON."""
     text, cells, end = page.read_text(encoding="utf-8"), [], 0
     for block in _BLOCK.finditer(text):
         cells.append(_cell("markdown", text[end : block.start()]))

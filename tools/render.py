@@ -1,9 +1,9 @@
 """python -m tools.render rollout=FILE out=FOLDER_OR_FILE: pictures of a rollout, or of an episode of a data set.
 
-Into a folder go NAME.png (frames beside each other), NAME.gif (the animation) and, with ground truth,
-NAME_error.png (error over time); into a file that ends in .png, .gif or .webp (an animation in half the space) goes
-that picture alone; into .usdc, .usda, .usd or .ply the rollout for other programs (`surface=true`: water as a closed
-surface too). Other rollouts of the same scene (`others=[FILE,...]`) are drawn beside it, under `names`.
+A folder gets NAME.png (some frames), NAME.gif (an animation) and, with ground truth, NAME_error.png (error over time).
+A file that ends in .png, .gif or .webp (half the size of GIF) gets this picture only; .usdc, .usda, .usd or .ply get
+the rollout for other programs (`surface=true`: also water as a closed surface). Further rollouts of the same scene
+(`others=[FILE,...]`) are drawn next to it, with the labels `names`.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ from hgn.render import pictures
 from hgn.render.error_curve import error_curve, position_error
 from hgn.render.exchange import PLY_ENDING, USD_ENDINGS, save_rollout
 from hgn.scene.rollout_file import Rollout, read_rollout
-from hgn.schema import ConfigError, OneOrMore, Positive, from_mapping, require, require_bounds
+from hgn.schema import ConfigError, OneOrMore, from_mapping, require, require_bounds
 from hgn.system.progress import bar
 
-PICTURES = 4  # in the PNG, where frames does not say
+PICTURES = 4  # in the PNG by default
 ANIMATIONS = (".gif", ".webp")
 
 
@@ -33,18 +33,17 @@ class RenderConfig:
     """The options of `python -m tools.render`."""
 
     out: str  # a folder, or one file that ends in .png, .gif, .webp (animated, half as large as GIF), .usdc or .ply
-    surface: bool = False  # water also as a closed surface, in USD and PLY
-    rollout: str | None = None  # file that python -m hgn.rollout wrote
-    others: tuple[str, ...] = ()  # more rollouts of the same scene, drawn beside it or beside the episode
-    # of rollout (or the episode) and of each of others; null: prediction (ground truth), and the files' names
+    surface: bool = False  # true: USD and PLY also contain water as a closed surface
+    rollout: str | None = None  # file of python -m hgn.rollout
+    others: tuple[str, ...] = ()  # further rollouts of the same scene, drawn next to it
+    # labels of rollout (or the episode) and of each of others; null: prediction (ground truth), and the files' names
     names: tuple[str, ...] | None = None
-    data: str | None = None  # or: folder of a data set
-    episode: str | None = None  # and the key of an episode in it, as in validation-000000
-    frames: tuple[int, ...] | None = None  # in the PNG, as in [0,50,100]; null: four, evenly spread
-    gif: bool = True
-    every: OneOrMore = 3  # frames of the rollout for one picture of the animation
-    fps: Positive[float] | None = None  # pictures per second of the animation; null: real time
-    size: int = 360  # width of one panel, pixels
+    data: str | None = None  # folder of a data set, instead of rollout
+    episode: str | None = None  # key of an episode of data, for example validation-000000
+    frames: tuple[int, ...] | None = None  # of the PNG, for example [0,50,100]; null: four, evenly spaced
+    gif: bool = True  # false: a folder gets no animation
+    every: OneOrMore = 3  # stride of the frames in the animation, which plays in real time
+    size: int = 360  # width of a panel, pixels
 
     def __post_init__(self) -> None:
         require_bounds(self)
@@ -64,20 +63,17 @@ class RenderConfig:
 
 @dataclass(frozen=True)
 class Versions:
-    """A rollout, or the truth, and others of the same scene by name."""
+    """A rollout or ground truth, and other rollouts of the same scene by label."""
 
     name: str  # of the files
     rollout: Rollout
     label: str
     others: Mapping[str, np.ndarray]
-    truth_TN3: np.ndarray | None  # what all of them are measured against
+    truth_TN3: np.ndarray | None  # reference of the errors
 
 
 def main(mapping: Mapping[str, Any]) -> int:
-    """Draws what the mapping of a RenderConfig asks for and prints the path of each file; returns the exit code.
-
-    Raises: ConfigError.
-    """
+    """Draws or writes the files and prints their paths; returns the exit code."""
     config = from_mapping(RenderConfig, mapping)
     versions = _load(config)
     rollout, out = versions.rollout, Path(config.out)
@@ -104,12 +100,9 @@ def main(mapping: Mapping[str, Any]) -> int:
 
 
 def _load(config: RenderConfig) -> Versions:
-    """Reads what is to be drawn.
-
-    Raises: ConfigError where another rollout shows other particles.
-    """
+    """Reads the rollouts. Raises: ConfigError if one has other particles or another frame rate."""
     if config.rollout is None:
-        assert config.data is not None and config.episode is not None  # RenderConfig saw to it
+        assert config.data is not None and config.episode is not None  # checked by RenderConfig
         rollout = pictures.rollout_of_episode(find_episode(config.data, config.episode))
         name, first, label = config.episode, f"episode {config.episode}", "ground truth" if config.others else ""
         truth_TN3 = rollout.position_TN3 if config.others else None
@@ -145,13 +138,13 @@ def _write_png(config: RenderConfig, versions: Versions, path: Path) -> None:
 def _write_animation(config: RenderConfig, versions: Versions, path: Path) -> None:
     rollout = versions.rollout
     with bar("drawing", total=len(range(0, rollout.frame_count, config.every)), unit="picture") as progress:
-        how = config.fps, config.every, config.size, lambda done, _: progress.update()
+        how = None, config.every, config.size, lambda done, _: progress.update()
         pictures.animate(rollout, path, *how, versions.label, versions.others)
     print(path)
 
 
 def _errors(versions: Versions) -> dict[str, np.ndarray]:
-    """Position error over time: of each material, or of each of several rollouts."""
+    """Returns the position error over time, by material or by rollout."""
     rollout, truth_TN3 = versions.rollout, versions.truth_TN3
     if not versions.others:
         return position_error(rollout)

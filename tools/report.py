@@ -1,9 +1,11 @@
-"""What reports share: where they come from, their tables and figures for people, and what a check says."""
+"""Shared by all reports: provenance, tables and figures."""
 
 from __future__ import annotations
 
 import io
+import itertools
 import math
+import textwrap
 from collections.abc import Iterable, Sequence
 from typing import Any
 
@@ -13,36 +15,45 @@ import torch
 from hgn.schema import to_mapping
 from hgn.system.provenance import provenance, without_folders
 
-PASS = "pass"  # of a check; else it says by how much something differs
+PASS = "pass"  # result of a check; otherwise a sentence with the error and its bound
 EXIT_RED = 1
 
 
 def meta_of(config: Any, device: torch.device | str = "cpu") -> dict[str, Any]:
-    """Provenance, and the options of the command."""
+    """Returns the provenance and the options of the command."""
     return provenance(device) | {"config": without_folders(to_mapping(config))}
 
 
-def table(head: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
-    """Markdown whose columns stand below each other on a terminal too."""
+def table(head: Sequence[str], rows: Iterable[Sequence[Any]], width: int | None = None) -> str:
+    """Returns an aligned Markdown table. If it is wider than `width` columns, the cells of its widest columns wrap."""
     lines = [[str(cell) for cell in line] for line in (head, *rows)]
     widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
-    lines.insert(1, ["-" * width for width in widths])
-    return "\n".join(f"| {' | '.join(map(str.ljust, line, widths))} |" for line in lines)
+    frame = 3 * len(widths) + 1
+    while width is not None and sum(widths) + frame > width:
+        widths[widths.index(max(widths))] -= 1
+    ruled = [*lines[:1], ["-" * width for width in widths], *lines[1:]]
+    return "\n".join(text for line in ruled for text in _wrapped(line, widths))
+
+
+def _wrapped(line: Sequence[str], widths: Sequence[int]) -> list[str]:
+    cells = [textwrap.wrap(text, width) for text, width in zip(line, widths, strict=True)]
+    parts = itertools.zip_longest(*cells, fillvalue="")
+    return [f"| {' | '.join(map(str.ljust, part, widths))} |" for part in parts]
 
 
 def number(value: float | None, form: str) -> str:
-    """A figure for people; a dash where there is none."""
+    """Formats a number, or returns a dash."""
     return "-" if value is None or not math.isfinite(value) else format(value, form)
 
 
 def spread(quartiles: Sequence[float] | None, form: str) -> str:
-    """The least and the most, or the quartiles, for people."""
+    """Formats a range, or returns a dash."""
     return "-" if quartiles is None else " … ".join(format(value, form) for value in quartiles)
 
 
 def new_figure(lines: int, columns: int, size: tuple[float, float], share_y: bool = False) -> tuple[Any, np.ndarray]:
-    """A figure of that size in inches, and its panels [lines, columns]."""
-    from matplotlib.figure import Figure  # takes a second to load, which a command may not need
+    """Returns a figure of that size in inches, and its panels [lines, columns]."""
+    from matplotlib.figure import Figure  # loading takes a second
 
     figure = Figure(figsize=size, layout="constrained")
     return figure, figure.subplots(lines, columns, sharey=share_y, squeeze=False)

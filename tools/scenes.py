@@ -1,4 +1,4 @@
-"""Scenes that reports make: bodies of one material at random places, parts of them, and several together.
+"""Scenes of reports: bodies of one material, parts of scenes, and joined scenes.
 
 Shape legend: N particles.
 """
@@ -18,24 +18,24 @@ OF_PARTICLES = ("position_N3", "velocity_N3", "material_N")
 
 
 def random_places(size_cells: Sequence[float], seed: int = 0) -> np.ndarray:
-    """Uniform in a box with a corner at 0, eight a cell, in cells."""
+    """Draws places in a box with a corner at 0, eight a cell, in cells."""
     count = max(1, round(PARTICLES_PER_CELL * float(np.prod(size_cells))))
     return np.random.default_rng(seed).random((count, 3)) * np.asarray(size_cells)
 
 
 def filled(material: int, position_N3: np.ndarray, velocity_3: Sequence[float] | np.ndarray, **more: Any) -> Scene:
-    """Particles of one material and velocity; `more` are fields of Scene."""
+    """Returns particles of one material and velocity; `more` are fields of Scene."""
     count = len(position_N3)
     velocity_N3 = np.tile(np.asarray(velocity_3, np.float32), (count, 1))
     return Scene(np.asarray(position_N3).astype(np.float32), velocity_N3, np.full(count, material, np.uint8), **more)
 
 
 def some(scene: Scene, chosen_N: np.ndarray) -> Scene:
-    """A scene with those of its particles alone."""
+    """Returns a scene with some of its particles."""
     return replace(scene, **{name: getattr(scene, name)[chosen_N] for name in OF_PARTICLES})
 
 
 def joined(scenes: Sequence[Scene]) -> Scene:
-    """The first scene with the particles of all."""
+    """Returns the first scene with the particles of all."""
     whole: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in scenes]) for name in OF_PARTICLES}
     return replace(scenes[0], **whole)

@@ -1,13 +1,10 @@
-"""Simulating test scenes with the solver, to the end or to its failure."""
+"""Simulates test scenes with the solver, to the end or to its failure."""
 
 from __future__ import annotations
 
-import hashlib
-import pickle
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,16 +14,15 @@ from hgn.runtime.rollouts import RolloutResult
 from hgn.scene.episode import Episode
 from hgn.scene.rollout_file import obstacles_of_episode
 from hgn.scene.scene import Scene
-from hgn.system.files import make_folder, temporary_file
 from hgn.system.machine import available_cpus
 
 OnFrame = Callable[[int], None] | None
 
 
 def solver_scene(episode: Episode, cell_size: float | None = None) -> Scene:
-    """An episode's initial state for the solver, on its own grid or another."""
+    """Returns an episode's initial state for the solver, on its own grid or another."""
     own = episode.obstacle_grid.cell_size
-    density = episode.solver.get("particles_per_cell")  # none in data made before it was kept
+    density = episode.solver.get("particles_per_cell")  # not stored in older data
     return Scene(
         position_N3=np.array(episode.position_TN3[0]),
         velocity_N3=episode.initial_velocity_N3,
@@ -49,7 +45,7 @@ def solver_trials(
     colliders: Sequence[Any] | None = None,
     stability_fractions: Sequence[float] | None = None,
 ) -> list[RolloutResult]:
-    """The solver's trajectories; of a scene that it stops only the initial state is left."""
+    """Returns the solver's trajectories; of a scene that it stops only the initial state."""
     from datagen.mpm.solver import SceneFailure, simulate
 
     results = simulate(
@@ -63,47 +59,23 @@ def solver_trials(
     ]
 
 
-def kept_trials(
-    folder: Path, scenes: Sequence[Scene], config: MpmConfig, frames: int, frame_rate_hz: float
-) -> list[RolloutResult]:
-    """The same; what lies in `folder` is not simulated again, and what was simulated is kept there. A folder is for one
-    version of the solver.
-    """
-    make_folder(folder)
-    physics = replace(config, device="auto", scenes_per_launch=None)
-    keys = [hashlib.sha256(pickle.dumps((scene, physics, frames, frame_rate_hz))).hexdigest() for scene in scenes]
-    files = [folder / f"{key}.npz" for key in keys]
-    missing = [i for i, file in enumerate(files) if not file.exists()]
-    if missing:
-        simulated = solver_trials([scenes[i] for i in missing], config, frames, frame_rate_hz)
-        for i, trial in zip(missing, simulated, strict=True):
-            with temporary_file(files[i]) as temporary:
-                with temporary.open("wb") as file:
-                    np.savez(file, position_TN3=trial.position_TN3, cause=np.array(trial.cause or ""))
-                temporary.replace(files[i])
-    trials = []
-    for path in files:
-        with np.load(path) as stored:
-            trials.append(RolloutResult(stored["position_TN3"], str(stored["cause"]) or None))
-    return trials
-
-
 def other_grid(config: MpmConfig, cell_size: float, own_cell_size: float) -> MpmConfig:
-    """The solver's settings for cells of another size: walls as thick as they were, to the nearest node."""
+    """Returns the solver's settings for another cell size; the thickness of walls is kept to the nearest node."""
     return replace(config, wall_cells=max(2, round(config.wall_cells * own_cell_size / cell_size)))
 
 
 @dataclass(frozen=True)
 class Setting:
-    """What is varied on a grid: the share of the limit of stability, and how far particles start off at most."""
+    """A setting of the solver on a grid."""
 
-    step: float
-    perturbation: float = 0.0  # domain units
+    step: float  # fraction of the limit of stability
+    perturbation: float = 0.0  # largest initial displacement, domain units
 
 
 class SolverLaunches:
-    """Simulates scenes on one grid with every setting that was added, all side by side, as a launch lasts as long as
-    its longest scene, whatever runs beside it; each is simulated once, and scenes get their colliders once.
+    """Simulates scenes on one grid with all settings in one launch, which takes as long as its longest scene.
+
+    Each scene is simulated once with each setting, and its colliders are built once.
     """
 
     def __init__(self, config: MpmConfig, cell_size: float, frame_rate_hz: float, frames: int) -> None:
@@ -116,12 +88,8 @@ class SolverLaunches:
         if setting not in self._settings:
             self._settings.append(setting)
 
-    def knows(self, setting: Setting) -> bool:
-        """Whether scenes were simulated with it."""
-        return any(known == setting for known, _ in self._known)
-
     def collide(self, episodes: Sequence[Episode], threads: Executor) -> None:
-        """Builds the colliders of the scenes on those threads."""
+        """Builds the colliders of the scenes."""
         from datagen.mpm.collider import build_collider
 
         for episode in episodes:
@@ -130,7 +98,7 @@ class SolverLaunches:
                 self._colliders[episode.key] = threads.submit(build_collider, scene, self.config.collider_band_cells)
 
     def trials(self, setting: Setting, episodes: Sequence[Episode], on_frame: OnFrame = None) -> list[RolloutResult]:
-        """Trajectories of `frames` frames from the episodes' first ones."""
+        """Returns trajectories from the episodes' first frames."""
         self.add(setting)
         missing = [episode for episode in episodes if (setting, episode.key) not in self._known]
         if missing:
@@ -140,13 +108,13 @@ class SolverLaunches:
         return [self._known[setting, episode.key] for episode in episodes]
 
     def simulate(self, pairs: Sequence[tuple[Setting, Episode]], frames: int, on_frame: OnFrame) -> list[RolloutResult]:
-        """So many frames of these settings and episodes, whatever is known."""
+        """Simulates these settings and episodes, also if they were simulated before."""
         with ThreadPoolExecutor(available_cpus()) as threads:
             self.collide([episode for _, episode in pairs], threads)
         scenes = [self._scene(setting, episode) for setting, episode in pairs]
         colliders = [self._colliders[episode.key].result() for _, episode in pairs]
         steps = [setting.step for setting, _ in pairs]
-        # a scene's steps are its own; where all are alike the config says so
+        # scenes have their own steps; the step of the config is used if all are equal
         alike = replace(self.config, stability_fraction=steps[0])
         return solver_trials(scenes, alike, frames, self.frame_rate_hz, on_frame, colliders, steps)
 

@@ -2,7 +2,7 @@
 
 A folder of pages has a `tables.yaml`, for its own pages or for those that its `pages` names. A page holds
 `<!-- table: NAME -->` … `<!-- end -->` for a table and `<!--=NAME-->0.302<!--/-->` for a figure within a sentence. What
-stands between is written by this command:
+stands between the markers is written by this command:
 
     files: {bench: bench_h100.json}     # sources by name, relative to the folder: .json, or .safetensors (the header)
     values:
@@ -14,11 +14,11 @@ stands between is written by this command:
           particles: "{row.particles:,}"
           ms: "{row.ms:.3f}"
 
-In braces stands an expression of Python over the sources, the names of the row and the functions of `FUNCTIONS`, then
-a format. `rows(case='frame')` is the one item of a list whose fields are these; `every(rows, case='frame')` are all;
-`held(rows)` says how many hold, as in 35 of 36, and finds nothing where there are none.
-`let: {NAME: EXPRESSION}` in a table gives each row further names. A format that begins with `?` leaves the cell empty
-where there is nothing. Lists are joined by commas, and `%` multiplies by 100.
+Braces contain a Python expression over the sources, the names of the row and the functions of `FUNCTIONS`, then a
+format. `rows(case='frame')` is the only item of a list with these fields, `every(rows, case='frame')` are all such
+items. `held(rows)` counts rows that pass, for example 35 of 36. `let: {NAME: EXPRESSION}` in a table gives each row
+further names. A format that starts with `?` leaves the cell empty if there is no value. Lists are joined by commas, and
+`%` multiplies by 100.
 """
 
 from __future__ import annotations
@@ -57,14 +57,14 @@ WITH_FORMAT = re.compile(r"(.*):([^:'\"()\[\]]*)", re.DOTALL)
 
 @dataclass(frozen=True)
 class TablesConfig:
-    """`python -m tools.tables`: what is done with pages that differ from their JSON."""
+    """The options of `python -m tools.tables`."""
 
-    check: bool = False  # true: change nothing, name each line that differs, exit code 1
+    check: bool = False  # true: changes nothing, prints differences, and exits with 1 if there are any
 
 
 @dataclass(frozen=True)
 class Page:
-    """A page as its sources say it has to be, and what differs from that, a line each."""
+    """A page with the text from its sources, and its differences from the file."""
 
     path: Path
     text: str
@@ -72,7 +72,7 @@ class Page:
 
 
 def main(mapping: dict[str, Any]) -> int:
-    """Writes the pages that differ, or with check=true names what differs; exit code 1 then."""
+    """Writes the pages that differ from their sources, or prints the differences."""
     config = from_mapping(TablesConfig, mapping)
     differing = [page for path in specifications(ROOT) for page in pages(path) if page.differences]
     for page in differing:
@@ -84,7 +84,7 @@ def main(mapping: dict[str, Any]) -> int:
 
 
 def specifications(root: Path) -> list[Path]:
-    """All `tables.yaml` of the repository. Raises ConfigError where there is none."""
+    """Returns all `tables.yaml` of the repository. Raises: ConfigError if there are none."""
     paths = sorted(path for folder in FOLDERS for path in (root / folder).rglob(SPECIFICATION))
     if not paths:
         places = f"{root}/{{{','.join(FOLDERS)}}}"
@@ -93,14 +93,14 @@ def specifications(root: Path) -> list[Path]:
 
 
 def pages(specification: Path) -> list[Page]:
-    """The Markdown pages beside a specification, or those of its `pages`.
+    """Returns the Markdown pages in the folder of a specification, or those of its `pages`.
 
-    Raises: ConfigError for a marker without a definition or an end, a definition without a marker, and an expression
-    that finds nothing; it names file and definition.
+    Raises: ConfigError with file and definition for a marker without a definition or an end, a definition without a
+    marker, and an expression without a value.
     """
     definitions = yaml.safe_load(specification.read_text())
     folder = specification.parent
-    read: set[str] = set()  # sources that the current definition has asked
+    read: set[str] = set()  # sources of the current definition
     sources = {name: Source(folder / file, read) for name, file in (definitions.get("files") or {}).items()}
     kinds = {"table": definitions.get("tables") or {}, "figure": definitions.get("values") or {}}
     used: set[str] = set()
@@ -139,7 +139,7 @@ def pages(specification: Path) -> list[Page]:
 
 
 class Source:
-    """A file of `files`, read when an expression asks for it; its name is then added to `read`."""
+    """A file of `files`, read at first use; its name is then added to `read`."""
 
     def __init__(self, path: Path, read: set[str]) -> None:
         self._path = path
@@ -171,7 +171,7 @@ class Record(dict):
 
 
 class Records(list):
-    """A JSON list. Called with fields it is the one item that has them."""
+    """A JSON list. A call with fields returns the only item that has them."""
 
     def __call__(self, **fields: Any) -> Any:
         chosen = every(self, **fields)
@@ -181,14 +181,14 @@ class Records(list):
 
 
 def every(records: Iterable[Record], **fields: Any) -> Records:
-    """All items of a list that have these fields."""
+    """Returns all items of a list that have these fields."""
     return Records(item for item in records if all(item.get(name) == value for name, value in fields.items()))
 
 
 def held(rows: Sequence[Record]) -> str:
-    """How many of the rows hold, for example 35 of 36. Raises: LookupError where there are none."""
+    """Returns the number of rows that pass, for example 35 of 36. Raises: LookupError if there are no rows."""
     if not rows:
-        raise LookupError("no rows of which some could hold")
+        raise LookupError("no rows that could pass")
     return f"{sum(row.held for row in rows)} of {len(rows)}"
 
 
@@ -259,7 +259,7 @@ def _evaluate(expression: str, names: Mapping[str, Any]) -> Any:
 
 
 def formatted(value: Any, form: str) -> str:
-    """A value as a page shows it: 8.4e-6 for 8.4e-06, 12 % for 0.12, 0 for zero; lists joined by commas."""
+    """Formats a value for a page: 8.4e-6 for 8.4e-06, 12 % for 0.12, 0 for zero; lists are joined by commas."""
     if isinstance(value, (list, tuple)):
         texts = [formatted(item, form) for item in value]
         unit = " %" if form.endswith("%") else ""

@@ -1,4 +1,4 @@
-"""Times and memory of what takes turns in one process: warmed up, by device events, as medians; precisions alike."""
+"""Times and memory of contenders that take turns in one process, after a warm-up, by device events."""
 
 from __future__ import annotations
 
@@ -14,22 +14,22 @@ from hgn.runtime.backend import set_matmul_precision
 
 WARM_UP = 3
 MINIMUM_ROUNDS = 5
-TOGETHER_S = 20e-6  # frames that are reported less than this apart were computed together
+TOGETHER_S = 20e-6  # frames reported closer together than this were computed together
 
 
 class Timed:
-    """What takes turns: `sample` does the work once or more and returns milliseconds."""
+    """A contender: `sample` does the work once or more and returns milliseconds."""
 
-    warm_up = WARM_UP  # samples that are thrown away
-    rounds: int | None = None  # samples in all, for one that is long; none: one a round
-    failure: str | None = None  # why what was timed is worth nothing
+    warm_up = WARM_UP  # samples that do not count
+    rounds: int | None = None  # number of samples of a slow contender; None: one a round
+    failure: str | None = None  # why the times are invalid
 
     def sample(self) -> float:
         raise NotImplementedError
 
 
 def once(run: Callable[[], object], device: torch.device) -> float:
-    """Milliseconds of one run: between device events on a GPU, of the wall clock on a CPU."""
+    """Returns milliseconds of one run, by device events on a GPU and by the wall clock on a CPU."""
     if device.type != "cuda":
         started = time.perf_counter()
         run()
@@ -44,9 +44,9 @@ def once(run: Callable[[], object], device: torch.device) -> float:
 
 
 def alternate(contenders: Sequence[Timed], rounds: int, is_over: Callable[[], bool]) -> list[list[float]]:
-    """The milliseconds of each: every round takes one sample of each contender in turn, once all are warmed up.
+    """Returns the milliseconds of each contender, after warming up; a round takes one sample of each in turn.
 
-    Ends after `rounds` rounds, or where `is_over` says so once MINIMUM_ROUNDS are done.
+    Ends after `rounds` rounds, or if `is_over` returns True after MINIMUM_ROUNDS.
     """
     for timed in contenders:
         for _ in range(timed.warm_up):
@@ -61,14 +61,15 @@ def alternate(contenders: Sequence[Timed], rounds: int, is_over: Callable[[], bo
     return milliseconds
 
 
-def median_and_quartiles(milliseconds: Sequence[float]) -> dict[str, object]:
-    """Of a row: `ms`, `ms_quartiles` and how many samples these are."""
-    low, middle, high = np.percentile(milliseconds, (25, 50, 75)).tolist()
-    return {"ms": middle, "ms_quartiles": [low, high], "samples": len(milliseconds)}
+def statistics(milliseconds: Sequence[float]) -> dict[str, object]:
+    """Returns the columns `ms` (the median), `ms_quartiles`, `ms_range` and `samples` of a row."""
+    least, low, middle, high, most = np.percentile(milliseconds, (0, 25, 50, 75, 100)).tolist()
+    columns = {"ms": middle, "ms_quartiles": [low, high], "ms_range": [least, most]}
+    return columns | {"samples": len(milliseconds)}
 
 
 class FrameClock:
-    """Notes when frames are done; a simulator may report several at once."""
+    """Records when frames end; a simulator may report several frames together."""
 
     def __init__(self) -> None:
         self.ends: list[float] = []
@@ -77,7 +78,7 @@ class FrameClock:
         self.ends.append(time.perf_counter())
 
     def milliseconds(self) -> float | None:
-        """Mean time of a frame behind the first ones, which start things up; none where there are too few."""
+        """Returns the mean time of a frame after the first frames, or None if there are too few."""
         gaps = np.diff(self.ends)
         later = np.flatnonzero(gaps > TOGETHER_S)
         if not len(later):
@@ -87,14 +88,14 @@ class FrameClock:
 
 
 def free(device: torch.device) -> None:
-    """Gives memory of the device back that nobody uses any more."""
+    """Frees unused memory of the device."""
     gc.collect()
     if device.type == "cuda":
         torch.cuda.empty_cache()
 
 
 class GpuMemory:
-    """What a GPU holds of torch's tensors from now on, beyond what it held; what nobody uses is freed before."""
+    """Memory of torch's tensors on a GPU from now on; unused memory is freed before."""
 
     def __init__(self, device: torch.device) -> None:
         self.device = device
@@ -104,7 +105,7 @@ class GpuMemory:
             self.before = torch.cuda.memory_allocated(device)
 
     def peak_gb(self) -> float | None:
-        """The most so far; none on a CPU."""
+        """Returns the peak so far; None on a CPU."""
         if self.device.type != "cuda":
             return None
         return (torch.cuda.max_memory_allocated(self.device) - self.before) / 1e9
@@ -112,7 +113,7 @@ class GpuMemory:
 
 @contextmanager
 def matmul_precision(precision: str) -> Iterator[None]:
-    """While it is entered PyTorch multiplies matrices at that precision."""
+    """Sets the precision of PyTorch's matrix products inside the block."""
     before = torch.get_float32_matmul_precision()
     set_matmul_precision(precision)
     try:

@@ -17,19 +17,18 @@ from hgn.network.grid import build_hierarchy
 from hgn.network.neighbours import neighbour_list
 from hgn.runtime.simulator import Simulator
 from hgn.schema import ConfigError
-from tools.bench import contenders
+from tools.bench import contenders, triton_contenders
 from tools.bench.__main__ import main, workloads
 from tools.bench.config import BenchConfig
 from tools.bench.states import TILE_PARTICLES, Workload, positions, scene_of
 from tools.bench.triton_contenders import TritonFrame, TritonTrain
-from tools.timing import Timed, alternate, median_and_quartiles
+from tools.timing import Timed, alternate, statistics
 
 CPU = torch.device("cpu")
 SMALL = {
     "particles": [60],
     "rounds": 5,
     "network": {"width": 16, "levels": 2, "message_passing_steps": 1},
-    "gns": {"kind": "gns", "width": 16, "levels": 1, "message_passing_steps": 2},
     "device": "cpu",
 }
 
@@ -97,22 +96,21 @@ def test_checks_see_small_faults(monkeypatch):
     assert frame.check("fp32").startswith("relative error of acceleration 1.0e-04 exceeds 1e-05")
 
 
-def test_triton_is_checked_like_torch():
-    """Frames, loss and gradients of backend triton pass in float32 (in the interpreter), and a wrong weight not."""
+def test_triton_is_checked_like_torch(monkeypatch):
+    """Frames, loss and gradients of backend triton pass in float32 (in the interpreter); small errors do not."""
+    found = {}
+    for name in ("check_acceleration", "check_update"):
+        check = getattr(contenders, name)
+        monkeypatch.setattr(triton_contenders, name, lambda *given, check=check: found.update({check: given}) or "")
     config = NetworkConfig(width=16, levels=1, message_passing_steps=1)
-    frame = TritonFrame(config, Workload(2, 1), CPU, "fp32")
-    assert frame.check("fp32") == "pass"
-    frame.rollout.values.mul_(1.001)
-    frame.rollout._build(frame.rollout.grid.capacities)
-    assert frame.check("fp32").startswith("relative error of acceleration")
-    train = TritonTrain(config, Workload(2, 2), CPU, "fp32")
-    assert train.check("fp32") == "pass"
-    with torch.no_grad():
-        train.network.decode.second.bias += 0.1
-    expected = contenders.reference_gradients(train.network, train.batch)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(contenders, "reference_gradients", lambda *_: (1.001 * expected[0], expected[1]))
-        assert train.check("fp32").startswith("relative error of loss 1.0e-03 exceeds")
+    TritonFrame(config, Workload(2, 1), CPU, "fp32").check("fp32")
+    TritonTrain(config, Workload(2, 2), CPU, "fp32").check("fp32")
+    assert all(check(*given) == "pass" for check, given in found.items())
+    (velocity_N3, *others), (loss, gradient, *more) = found.values()
+    faster_N3 = velocity_N3 + 0.001 * (velocity_N3 - others[1].velocity_NM3[:, 0])
+    assert contenders.check_acceleration(faster_N3, *others).startswith("relative error of acceleration 1.0e-03")
+    assert contenders.check_update(1.001 * loss, gradient, *more).startswith("relative error of loss 1.0e-03 exceeds")
+    assert contenders.check_update(loss, 1.01 * gradient, *more).startswith("relative error of gradient 1.0e-02")
 
 
 def test_a_tile_is_like_real_frames():
@@ -153,7 +151,9 @@ def test_contenders_take_turns():
     times = alternate([Named("a"), Named("b"), Named("c", rounds=2)], 6, lambda: False)
     assert "".join(order) == "aaabbbc" + "abc" + "ab" * 2 + "abc" + "ab" * 2
     assert [len(milliseconds) for milliseconds in times] == [6, 6, 2]
-    assert median_and_quartiles([4.0, 1.0, 2.0, 3.0, 5.0]) == {"ms": 3.0, "ms_quartiles": [2.0, 4.0], "samples": 5}
+    assert statistics([4.0, 1.0, 2.0, 3.0, 5.0]) == {
+        "ms": 3.0, "ms_quartiles": [2.0, 4.0], "ms_range": [1.0, 5.0], "samples": 5,
+    }  # fmt: skip
     assert len(alternate([Named("d")], 100, lambda: True)[0]) == 5
 
 

@@ -35,6 +35,7 @@ def make_run(folder, updates=40, pause=0.0, repeated=0, error=1e-6, ranks=1):
 
 
 def test_figure_and_rows_of_one_run(tmp_path):
+    """The picture is drawn, and the JSON has all records."""
     run = make_run(tmp_path / "first")
     assert main({"runs": [str(run)], "out": str(tmp_path / "curves")}) == 0
     width, height = Image.open(io.BytesIO((tmp_path / "curves.png").read_bytes())).size
@@ -47,40 +48,26 @@ def test_figure_and_rows_of_one_run(tmp_path):
     ]
 
 
-def test_several_runs_have_a_colour_and_a_name_each(tmp_path):
-    runs = [str(make_run(tmp_path / "x")), str(make_run(tmp_path / "y", error=1e-7))]
-    assert main({"runs": runs, "names": ["ours", "theirs"], "out": str(tmp_path / "curves")}) == 0
-    assert [run["name"] for run in json.loads((tmp_path / "curves.json").read_text())["runs"]] == ["ours", "theirs"]
+def test_several_runs(tmp_path):
+    """Each run has a curve and a name; the scenes of an update count on all ranks."""
+    runs = [str(make_run(tmp_path / "x", ranks=2)), str(make_run(tmp_path / "y", error=1e-7))]
+    assert main({"runs": runs, "out": str(tmp_path / "curves")}) == 0
+    written = json.loads((tmp_path / "curves.json").read_text())["runs"]
+    assert [run["name"] for run in written] == ["x", "y"]
+    assert [(run["rows"][-1]["update"], run["rows"][-1]["scenes"]) for run in written] == [(39, 39 * 4), (39, 39 * 2)]
     picture = Image.open(io.BytesIO((tmp_path / "curves.png").read_bytes())).convert("RGB")
     colours = {colour for _, colour in picture.getcolors(1 << 24)}
     assert {(31, 119, 180), (255, 127, 14)} <= colours  # both lines are drawn
 
 
-def test_runs_are_compared_over_scenes_and_one_goes_on_where_another_ended(tmp_path):
-    """Two ranks of two scenes: four an update; what began with the weights of `first` begins where it ended."""
-    first = make_run(tmp_path / "first", ranks=2)
-    names = ["first", "more", "alone"]
-    runs = [str(first), str(make_run(tmp_path / "more")), str(make_run(tmp_path / "alone"))]
-    options = {"runs": runs, "names": names, "after": [None, "first", None], "out": str(tmp_path / "curves")}
-    assert main(options) == 0
-    ends = [run["rows"][-1] for run in json.loads((tmp_path / "curves.json").read_text())["runs"]]
-    assert [row["update"] for row in ends] == [39, 39, 39]
-    assert [row["scenes"] for row in ends] == [39 * 4, 39 * 4 + 39 * 2, 39 * 2]
-    assert ends[1]["minutes"] == pytest.approx(2 * ends[0]["minutes"]) and ends[2]["minutes"] == ends[0]["minutes"]
-
-
-@pytest.mark.parametrize("after", [["x"], [None, "z"], ["y", None], [None, "y"]])
-def test_what_a_run_goes_on_from_comes_before_it(tmp_path, after):
-    with pytest.raises(ConfigError, match=r"after must be .* got"):
-        main({"runs": ["x", "y"], "names": ["x", "y"], "after": after, "out": str(tmp_path / "curves")})
-
-
-def test_time_of_a_stop_is_no_training(tmp_path):
-    records = read_run(make_run(tmp_path / "run", pause=5000, repeated=3), "run").records
+def test_time_of_a_stop_does_not_count(tmp_path):
+    """A resumed run has each update once, without the time of the stop."""
+    records = read_run(make_run(tmp_path / "run", pause=5000, repeated=3)).records
     assert [record["update"] for record in records if "loss" in record] == list(range(40))
     assert records[-1]["minutes"] * 60 == pytest.approx(42)  # 43 lines, a second apart; the repeated ones took time too
 
 
-def test_a_folder_that_is_no_run_is_named(tmp_path):
+def test_a_folder_that_is_no_run(tmp_path):
+    """The error names the folder."""
     with pytest.raises(ConfigError, match=r"runs must be folders of python -m hgn.train, got .*empty"):
-        read_run(tmp_path / "empty", "empty")
+        read_run(tmp_path / "empty")

@@ -1,4 +1,4 @@
-"""What tools.error_vs_time measures, pairs and draws: errors of frames and rollouts against closed forms."""
+"""Measures, paired intervals and figures of tools.error_vs_time, against closed forms."""
 
 import io
 import math
@@ -22,7 +22,6 @@ from tools.error_vs_time import score
 from tools.error_vs_time.contenders import BaselineContender, TritonPredictor
 from tools.error_vs_time.paired import paired_difference, paired_lines, paired_rows
 from tools.error_vs_time.plot import draw_frames, draw_pareto
-from tools.error_vs_time.settings import ErrorVsTimeConfig
 from tools.error_vs_time.sinkhorn import sinkhorn_divergences
 from tools.measures import energies, energy_scale, momentum_error, outside_domain
 from tools.solver_rollouts import other_grid
@@ -46,7 +45,7 @@ def test_baseline_errors_are_those_of_training(data):
     assert gravity.one_step(episode, 1).error.mse == pytest.approx(expected["fall"].mse, rel=1e-5)
 
 
-def test_the_fast_path_tells_its_own_errors(data):
+def test_one_step_errors_of_triton(data):
     """One-step errors of backend triton come from its kernels, several frames at once: in float32 they are the plain
     network's, whatever its walls hold; what is captured serves the next frames, and those of fewer particles too."""
     (episode,) = EpisodeStore(data, "test")
@@ -144,7 +143,7 @@ def test_shares_inside_obstacles_and_outside_of_the_domain():
     assert outside_domain(point, (1.0, 1.0, 1.0)) == 0.5 and outside_domain(point[:0], (1.0, 1.0, 1.0)) == 0
 
 
-def test_frames_that_are_told_together_are_timed_together():
+def test_frames_that_end_together():
     """The clock counts from the end of the first bunch of frames; with one bunch only it tells nothing."""
     clock = FrameClock()
     clock.ends = [1.0, 1.000001, 1.000002, 1.3, 1.300001, 1.300002]
@@ -161,13 +160,12 @@ def test_other_grids_keep_their_walls():
     assert cells == [2, 2, 3, 6]
 
 
-def test_scenes_that_failed_leave_the_means(data):
+def test_failed_scenes_are_left_out_of_means(data):
     """Errors at a frame are means over the scenes that reached it, and say over how many."""
     episodes = list(EpisodeStore(data, "validation"))
-    config = ErrorVsTimeConfig(data="d", out="x")
     paths = [np.array(episode.position_TN3) for episode in episodes]
     trials = [RolloutResult(paths[0] + np.float32(0.1)), RolloutResult(paths[1][:3] + np.float32(0.2), "why")]
-    row = score.rollout_figures(trials, episodes, config, CPU)
+    row = score.rollout_figures(trials, episodes, CPU)
     np.testing.assert_allclose(row["curve"], [*[0.075] * 3, *[0.03] * 3], rtol=1e-4)
     assert row["by_scene"]["position MSE"]["5"] == [pytest.approx(0.03, rel=1e-3), None]
     assert row["by_scene"]["Sinkhorn"]["5"][1] is None
@@ -175,7 +173,7 @@ def test_scenes_that_failed_leave_the_means(data):
 
 
 @pytest.mark.parametrize("kind", ["hgn", "gns"])
-def test_scenes_beside_one_that_diverges_go_their_way(data, kind):
+def test_a_diverging_scene_does_not_change_others(data, kind):
     """Off backend triton they are simulated once, as if it had never been there."""
     episodes = EpisodeStore(data, "validation")
     scenes = [InitialState.of_episode(episode) for episode in (*episodes, episodes[0])]
@@ -238,7 +236,7 @@ def test_paired_differences():
     assert paired_difference([1.0], [2.0]) is None
 
 
-def test_paired_rows_are_told():
+def test_paired_rows():
     """A network stands beside GNS, each setting of the solver and other weights at its precision, in the errors and
     frames that both have of scenes.
     """
@@ -264,7 +262,12 @@ def test_the_figures_show_what_diverged(tmp_path):
     meta |= {"scenes": 2, "split": "test", "data": "d", "device": "a GPU", "reference": "the solver"}
     rows = report_rows()
     rows[2] |= {"position_mse": {"50": 1e-6}, "scenes_reached": {"50": 2, "299": 0}, "failed_scenes": 2}
-    for some in (rows, []):
-        for picture in (draw_pareto(some, meta), draw_pareto(some, meta, batched=True), draw_frames(some, meta)):
-            with Image.open(io.BytesIO(picture)) as image:
-                assert image.width > 500
+    pictures = (
+        draw_pareto(rows, meta),
+        draw_pareto([], meta, batched=True),
+        draw_frames(rows, meta),
+        draw_frames([], meta),
+    )
+    for picture in pictures:
+        with Image.open(io.BytesIO(picture)) as image:
+            assert image.width > 500

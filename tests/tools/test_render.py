@@ -52,7 +52,7 @@ def test_single_file(tmp_path, ending):
     """A file name as `out` gets that picture alone, with the frames asked for."""
     path = rollout_file(tmp_path, True)
     out = tmp_path / f"one.{ending}"
-    main({"rollout": str(path), "out": str(out), "size": 80, "frames": [0, 8], "every": 4, "fps": 10})
+    main({"rollout": str(path), "out": str(out), "size": 80, "frames": [0, 8], "every": 4})
     assert sorted(entry.name for entry in tmp_path.iterdir()) == ["fall.vtkhdf", f"one.{ending}"]
     with Image.open(out) as picture:
         assert picture.format == ending.upper()
@@ -135,7 +135,6 @@ def test_other_rollouts_stand_beside_it(tmp_path):
         ({"frames": [0, 9]}, r"frames\[1\] must be in \[0, 9\)"),
         ({"every": 0}, "every must be at least 1"),
         ({"size": 10}, "size must be 64 to 4096 pixels"),
-        ({"fps": float("nan")}, "fps must be a finite number > 0"),
         ({"colour": "red"}, "colour is not a known key"),
         ({"rollout": None, "data": "d", "episode": "holiday-000000"}, "episode must begin with one of train"),
         ({"rollout": None, "data": "missing", "episode": "test-000000"}, "missing"),

@@ -55,7 +55,7 @@ def test_rows_of_every_case(warm_python, tmp_path):
 
 def test_scenes_are_balanced():
     """Ranks have scenes of as many particles at each update, and the same scenes on as many ranks as when measured."""
-    config = from_mapping(ScalingConfig, {"particle_spread": 0.17, "batches": 20})
+    config = from_mapping(ScalingConfig, {"batches": 20})
     counts_BRS = measure._particles(config, 4, 0.17)
     load_BR = counts_BRS.sum(-1)
     assert counts_BRS.shape == (20, 4, 8) and np.ptp(counts_BRS) > 1000

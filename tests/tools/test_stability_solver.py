@@ -1,4 +1,4 @@
-"""python -m tools.stability solver: its rows, and that a step beyond the formula is seen."""
+"""python -m tools.stability solver: its rows and its measures."""
 
 import json
 
@@ -19,6 +19,7 @@ def test_report(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(solver_steps, "STIFFNESS", (1.0,))
     monkeypatch.setattr(solver_steps, "FACTORS", (0.97, 1.1))
     monkeypatch.setattr(solver_steps, "SOLID_FACTORS", (1.0,))
+    monkeypatch.setattr(solver_steps, "_singles", lambda *given, singles=solver_steps._singles: singles(*given)[::4])
     file, picture = tmp_path / "reports" / "solver.json", tmp_path / "steps.png"
     assert main({"cases": ["steps"], "device": "cpu", "json": str(file), "picture": str(picture)}) == 0
     report = json.loads(file.read_text())
@@ -28,7 +29,9 @@ def test_report(tmp_path, monkeypatch, capsys):
     singles = [point["stable"] for point in report["steps"] if point["case"].startswith("single")]
     assert singles == [True, False, True, False]
     assert picture.read_bytes().startswith(b"\x89PNG")
-    assert "single particle, water" in capsys.readouterr().out
+    printed = capsys.readouterr()
+    assert "single particle, water, stiffness x1: " in printed.err
+    assert len(printed.out.splitlines()) > 5 and all(len(line) <= 100 for line in printed.out.splitlines())
 
 
 def test_formula():
@@ -38,14 +41,14 @@ def test_formula():
 
 
 def test_crossing_paths():
-    """Only a way through the triangle counts: not one beside it, not one that turns back before it."""
+    """Only a step through the triangle counts, not one beside it or one that turns back before it."""
     triangle = np.array([[[0.0, 0, 0], [1, 0, 0], [0, 0, 1]]])
     path = np.array([[[0.2, 1, 0.2], [0.9, 1, 0.9], [0.2, 1, 0.2]], [[0.2, -1, 0.2], [0.9, -1, 0.9], [0.2, 0.1, 0.2]]])
     assert crossing_paths(path / 64, triangle / 64) == pytest.approx(1 / 3)
 
 
 def test_crossings_of_a_bent_surface():
-    """A straight way that cuts a ridge twice ends where it began, outside; long and short ways count alike."""
+    """A step that cuts a ridge twice does not cross it; long and short steps are counted alike."""
     ridge = np.array([[[0.0, 0, -9], [0, 0, 9], [3, 3, 0]], [[6.0, 0, -9], [3, 3, 0], [6, 0, 9]]])
     for scale in (1.0, 0.05):
         way = scale * np.array([[[0.0, 1, 0.1], [3, 1, 0.1]], [[6, 1, 0.1], [6, 1, 0.1]]])
@@ -54,43 +57,39 @@ def test_crossings_of_a_bent_surface():
 
 
 def test_leaks(monkeypatch):
-    """Small blocks that hit a sheet, a cone and a bowl: a row for each, with nothing through."""
+    """Small blocks do not leak through a sheet, a cone and a bowl."""
     monkeypatch.setattr(solver_leak, "OFFSETS", solver_leak.OFFSETS[3:4])
     monkeypatch.setattr(solver_leak, "ORIENTATIONS", {"tilted": solver_leak.ORIENTATIONS["tilted"]})
-    rows = leaks(MpmConfig(device="cpu"), 0.03, 2.0, 1)
+    monkeypatch.setattr(solver_leak, "SECONDS", 0.03)
+    monkeypatch.setattr(solver_leak, "BLOCK_CELLS", 2.0)
+    rows = list(leaks(MpmConfig(device="cpu")))
     assert len(rows) == 3 * 3 * 2
     assert [row.measured for row in rows] == [0.0] * len(rows)
     assert all(row.held for row in rows)
 
 
 def test_validation_rows(monkeypatch):
-    """Even four cells of water lead the experiment by less than 18 %; columns have run-out and height by each law."""
+    """Even four cells of water differ from the experiment by less than 18 %; columns have a run-out and a height."""
     monkeypatch.setattr(solver_validation, "DAM_CELLS", (4, 5))
     monkeypatch.setattr(solver_validation, "COLUMN_CELLS", 4)
     monkeypatch.setattr(solver_validation, "COLUMN_ASPECTS", (1.0,))
-    monkeypatch.setattr(solver_validation, "OTHER_ASPECTS", (1.0,))
-    monkeypatch.setattr(solver_validation, "SAND_LAWS", (("compression", 45.0),))
     monkeypatch.setattr(solver_validation, "REST_S", 3.0)
     cpu = MpmConfig(device="cpu")
     rows = [row for part in ("rest", "dam_breaks") for row in getattr(solver_validation, part)(cpu)]
-    rows += solver_validation.columns(cpu) + solver_validation.columns(cpu, (0.0, 50.0))
-    rows += solver_validation.column_laws(cpu)
+    rows += solver_validation.columns(cpu)
     assert [row.case.split(",")[0] for row in rows] == [
-        "level of water at rest", *["dam break"] * 3, *["sand column"] * 8
+        "level of water at rest", *["dam break"] * 3, *["sand column"] * 2
     ]  # fmt: skip
     assert rows[1].held and rows[2].held
     assert [row.more["published"] for row in rows[4:6]] == [pytest.approx([1.013, 1.24], rel=1e-3), [0.74, 0.88]]
     assert [row.predicted for row in rows[4:6]] == pytest.approx([1.013, 0.74], rel=1e-3)  # both are below
     assert rows[4].case.endswith("mohr coulomb, 33 degrees, 4 cells in radius, 200 grains, run-out")  # the default sand
-    assert rows[6].case.endswith("radius, run-out") and rows[8].case.endswith("50 grains, run-out")
-    assert rows[8].predicted == rows[4].predicted
-    assert rows[5].measured < rows[11].measured  # so few cells tell heights apart, not run-outs
 
 
 def test_grids(monkeypatch):
-    """Fronts, run-outs and heights on each grid, with what they lead to."""
+    """Fronts, run-outs and heights on each grid, with their order of convergence."""
 
-    def columns(aspect, law, angle, base, cells):
+    def columns(aspect, base, cells):
         return [Row(f"column, {what}", 3.0, 3 - 2 / cells, True, "") for what in ("run-out", "height")]
 
     monkeypatch.setattr(solver_validation, "column_rows", columns)
@@ -108,16 +107,15 @@ def test_grids(monkeypatch):
     [("mohr_coulomb", 33.0, (18.9, 28.6, 32.7)), ("matsuoka_nakai", 31.0, (21.2, 29.7, 34.8))],
 )
 def test_rows_of_slopes(law, own, shears, monkeypatch):
-    """Slopes rest where sand shears along them, tan = sin by Mohr and Coulomb, 2 sin / sqrt(3 + sin²) by Matsuoka and
-    Nakai, or still move and do not hold; the quartz sand's angle of repose is a row of its own.
-    """
+    """Slopes should rest at the angle of shear: tan = sin by Mohr and Coulomb, 2 sin / sqrt(3 + sin²) by Matsuoka and
+    Nakai. Moving slopes fail. The angle of repose of quartz sand is a row of its own."""
 
     def rests(angle, start, *_):
         return start, start if start < angle else {20.0: 20.5, own: 30.8, 40.0: 32.9}[angle], 0.05 * (angle == 20)
 
     monkeypatch.setattr(solver_validation, "repose", rests)
     base = MpmConfig(device="cpu", sand_friction_law=law, sand_friction_angle_deg=own)
-    rows = solver_validation.reposes(base)
+    rows = list(solver_validation.reposes(base))
     asked = [17, shears[0], own - 3, shears[1], 31, 37, shears[2]]
     assert [row.predicted for row in rows] == pytest.approx(asked, abs=0.05)
     assert [row.held for row in rows] == [True, False, *[True] * 5]
@@ -126,7 +124,7 @@ def test_rows_of_slopes(law, own, shears, monkeypatch):
 
 @pytest.mark.parametrize("order", [0.5, 1.0, 2.0])
 def test_order_of_convergence(order):
-    """Values that approach a limit by a power of the cells' size have both told; from what turns round nothing is."""
+    """Order and limit of a power law are found; values that are not monotonic, or diverge, have neither."""
     cells = (8, 12, 16, 32)
     found, limit = solver_validation.convergence_order(cells, [3 - 2 / count**order for count in cells])
     assert (found, limit) == pytest.approx((order, 3.0), rel=0.02)
@@ -134,8 +132,8 @@ def test_order_of_convergence(order):
     assert solver_validation.convergence_order(cells, [1.0, 1.1, 1.3, 2.3]) == (None, None)
 
 
-def test_height_is_taken_while_there_is_a_block():
-    """Until the centre rises or less than two cells are left, whichever comes first."""
+def test_height_is_measured_while_the_block_sinks():
+    """Frames are measured until the centre rises or the block is thinner than two cells."""
     block = np.random.default_rng(0).uniform(0, 8 / 64, (100, 3))
     sinking = np.stack([block * (1, size, 1) for size in (1.0, 0.8, 0.6, 0.1)])
     assert _sinks_until(sinking) == 3
@@ -144,7 +142,7 @@ def test_height_is_taken_while_there_is_a_block():
 
 
 def test_extents():
-    """Thickness leaves out a twentieth at each end; the front is counted from the wall."""
+    """Thickness is between the 0.05 and 0.95 quantiles; the front is measured from the wall."""
     line = np.linspace(0, 1, 101)
     position = np.stack([line, line, line], axis=1)
     assert thickness_cells(position) == pytest.approx(0.9 * 64)

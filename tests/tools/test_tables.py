@@ -1,4 +1,4 @@
-"""python -m tools.tables: pages say what the JSON beside them says, and a page or a file that was changed is named."""
+"""python -m tools.tables: pages agree with their JSON, and a changed page or file is named."""
 
 import json
 import shutil
@@ -64,7 +64,7 @@ def folder(path, specification=SPECIFICATION, page=PAGE):
 
 @pytest.mark.parametrize("specification", specifications(ROOT), ids=lambda path: str(path.parent.relative_to(ROOT)))
 def test_pages_and_their_json_agree(specification):
-    """Every page of the repository is what `python -m tools.tables` makes of the files beside it."""
+    """Every page of the repository agrees with its sources."""
     assert [page.differences for page in pages(specification) if page.differences] == []
 
 
@@ -87,7 +87,7 @@ def test_an_edited_figure_of_the_repository_is_found(tmp_path):
 
 
 def test_writes_tables_and_figures(tmp_path, monkeypatch, capsys):
-    """What stands between markers is replaced, and nothing else; check=true names it and changes nothing."""
+    """Only text between markers is replaced; check=true prints differences and changes nothing."""
     monkeypatch.setattr(tools.tables, "ROOT", tmp_path)
     page = folder(tmp_path).with_name("README.md")
     assert main({}) == 0 and page.read_text() == PAGE and capsys.readouterr().out == ""
@@ -119,20 +119,20 @@ def test_writes_tables_and_figures(tmp_path, monkeypatch, capsys):
         ),
         (
             ("{bench.rows(case='frame', particles=4296).ms:.3f} ms", "{held(every(bench.rows, case='no'))}"),
-            "figure frame: LookupError: no rows of which some could hold",
+            "figure frame: LookupError: no rows that could pass",
         ),
     ],
 )
 def test_faulty_specifications(tmp_path, change, message):
-    """An expression that finds nothing, or too much, and names without a counterpart are answered by name."""
+    """Expressions without a unique value and names without a counterpart are refused by name."""
     assert change[0] in SPECIFICATION
     with pytest.raises(ConfigError) as error:
         pages(folder(tmp_path, SPECIFICATION.replace(*change)))
     assert message in str(error.value) and "tables.yaml" in str(error.value)
 
 
-def test_how_many_hold():
-    """Of no rows none can hold, which a format with `?` leaves empty."""
+def test_rows_that_pass():
+    """Rows that pass are counted; without rows a format with `?` leaves the cell empty."""
     rows = Records([Record(held=True), Record(held=False), Record(held=True)])
     assert _fill("{held(rows)}", {"rows": rows}) == "2 of 3"
     assert _fill("{held(rows):?}", {"rows": Records()}) == ""
@@ -140,14 +140,14 @@ def test_how_many_hold():
 
 @pytest.mark.parametrize("marker", ["<!--/-->", "<!-- end -->\n<!-- table: chosen"])
 def test_a_marker_without_an_end(tmp_path, marker):
-    """An end that was deleted is not searched for in the next table."""
+    """A missing end is not taken from the next table."""
     broken = PAGE.replace(marker, marker.removeprefix("<!--/-->").removeprefix("<!-- end -->\n"))
     with pytest.raises(ConfigError, match=r"README.md: a marker has no end"):
         pages(folder(tmp_path, page=broken))
 
 
 def test_outside_of_a_checkout(tmp_path):
-    """Without pages there is nothing to write, which is said."""
+    """Without pages the command fails with a message."""
     with pytest.raises(ConfigError, match="run it from a checkout"):
         specifications(tmp_path)
 

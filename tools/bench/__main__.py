@@ -1,6 +1,6 @@
-"""python -m tools.bench [--json FILE]: times of a frame, a training step and the solver, beside each other.
+"""python -m tools.bench [--json FILE]: times of a frame, a training step and the solver.
 
-Prints no time of what fails its check. The JSON holds {"meta": provenance, "rows": [...]}.
+A contender is timed only if it passes its check. The JSON contains {"meta": provenance, "rows": [...]}.
 """
 
 from __future__ import annotations
@@ -20,24 +20,22 @@ from hgn.system.device import choose_device
 from hgn.system.files import write_json
 from hgn.system.progress import bar
 from tools import report
-from tools.bench.config import CASES, PUBLIC_GNS_CASES, BenchConfig
+from tools.bench.config import CASES, FRAME_CASES, TRAIN_CASES, BenchConfig
 from tools.bench.contenders import Contender, Frame, MpmFrame, Train, checked_workload
 from tools.bench.public_gns import PublicFrame, PublicTrain
 from tools.bench.states import TILE_PARTICLES, Workload
 from tools.bench.triton_contenders import TritonFrame, TritonTrain
 from tools.report import EXIT_RED, PASS
-from tools.timing import GpuMemory, Timed, alternate, free, matmul_precision, median_and_quartiles
+from tools.timing import GpuMemory, Timed, alternate, free, matmul_precision, statistics
 
 GPU_PARTICLES, GPU_SCENES = (TILE_PARTICLES, 40_000, 400_000), (1, 8, 32)
 CPU_PARTICLES, CPU_SCENES = (TILE_PARTICLES,), (1,)
 OUT_OF_MEMORY = "out of memory"
-FRAME_CASES = ("frame", "torch_frame", "gns_frame", "public_gns_frame", "mpm_frame")
-TRAIN_CASES = ("train", "torch_train", "gns_train", "public_gns_train")
 Row = dict[str, Any]
 
 
 def main(mapping: dict[str, Any]) -> int:
-    """Prints a table, and writes JSON where asked to; the exit code is 1 where a check is red."""
+    """Prints a table, and writes JSON if asked to; the exit code is 1 if a check fails."""
     config = from_mapping(BenchConfig, mapping)
     device = choose_device(config.device)
     rows: list[Row] = []
@@ -45,7 +43,7 @@ def main(mapping: dict[str, Any]) -> int:
         (precision, wanted, work)
         for precision in config.precisions or (("tf32", "fp16") if device.type == "cuda" else ("fp32",))
         for work in workloads(config, device)
-        # the paper's scenes are trained on; others are simulated only
+        # larger scenes than the paper's are only simulated
         for cases in ((FRAME_CASES, TRAIN_CASES) if work.particles <= TILE_PARTICLES else (FRAME_CASES,))
         if (wanted := _wanted(config, device, precision, cases))
     ]
@@ -54,14 +52,14 @@ def main(mapping: dict[str, Any]) -> int:
         for group in groups:
             rows += group_rows(config, device, *group)
             progress.update()
-            if config.json is not None:  # after each: what a later group does takes nothing away
+            if config.json is not None:
                 write_json(config.json, {"meta": meta, "rows": rows})
     print(table(rows))
     return 0 if all(row["check"] in (PASS, OUT_OF_MEMORY) for row in rows) else EXIT_RED
 
 
 def workloads(config: BenchConfig, device: torch.device) -> list[Workload]:
-    """One scene of each number of particles, then several scenes of the smallest number."""
+    """Returns one scene of each number of particles, then several scenes of the smallest number."""
     gpu = device.type == "cuda"
     particles = config.particles or (GPU_PARTICLES if gpu else CPU_PARTICLES)
     scenes = config.scenes or (GPU_SCENES if gpu else CPU_SCENES)
@@ -72,7 +70,7 @@ def workloads(config: BenchConfig, device: torch.device) -> list[Workload]:
 def group_rows(
     config: BenchConfig, device: torch.device, precision: str, cases: list[str], work: Workload
 ) -> list[Row]:
-    """The rows of contenders that are timed in turns."""
+    """Returns the rows of contenders that take turns."""
     with matmul_precision(precision):
         prepared = [_prepare(config, device, precision, case, work) for case in cases]
         ready = [(row, contender) for row, contender in prepared if contender is not None]
@@ -82,37 +80,37 @@ def group_rows(
         if contender.failure is not None:
             row["check"] = contender.failure
             continue
-        row |= median_and_quartiles(milliseconds)
+        row |= statistics(milliseconds)
         if isinstance(contender, MpmFrame):
             row["substeps"] = contender.substeps
     return [row for row, _ in prepared]
 
 
 def table(rows: list[Row]) -> str:
-    """The figures for people."""
+    """Returns a table of the rows."""
     named = ("case", "particles", "scenes", "precision")
     lines = []
     for row in rows:
-        times = report.number(row["ms"], ".3f"), report.spread(row.get("ms_quartiles"), ".3f")
+        times = report.number(row["ms"], ".3f"), report.spread(row.get("ms_range"), ".3f")
         work = [row[name] for name in named]
         lines.append([*work, *times, report.number(row["memory_gb"], ".3f"), row["check"]])
-    return report.table((*named, "ms", "quartiles", "GB", "check"), lines)
+    return report.table((*named, "ms", "range", "GB", "check"), lines, width=100)
 
 
 def _prepare(
     config: BenchConfig, device: torch.device, precision: str, case: str, work: Workload
 ) -> tuple[Row, Timed | None]:
-    """A row in the making, and what is timed for it, once its check is green."""
+    """Checks a contender; returns its row, and the contender if it passes."""
     row: Row = {"case": case, "particles": work.particles, "scenes": work.scenes}
     row |= {"precision": precision if case != "mpm_frame" else "fp32", "ms": None, "memory_gb": None}
     network = config.gns if "gns" in case else config.network
     try:
         if case == "mpm_frame":
-            mpm = MpmFrame(work, config, device)
+            mpm = MpmFrame(work, config.network.cell_size, device)
             return row | {"particles": mpm.particles, "check": PASS}, mpm
         make, backend = _maker(config, device, precision, case)
         row |= {} if backend is None else {"backend": backend}
-        checked = checked_workload(work, "frame" if case.endswith("frame") else "train")
+        checked = checked_workload(work, "frame" if case in FRAME_CASES else "train")
         row["check"] = make(network, checked, device, precision).check(precision)
         row["checked_particles"] = checked.particles * checked.scenes
         if row["check"] != PASS:
@@ -131,32 +129,26 @@ def _prepare(
 def _maker(
     config: BenchConfig, device: torch.device, precision: str, case: str
 ) -> tuple[Callable[..., Contender], str | None]:
-    """What makes the contender from configuration, workload, device and precision, and the backend of ours."""
-    frame = case.endswith("frame")
-    if case in PUBLIC_GNS_CASES:
-        assert config.public_gns is not None  # BenchConfig saw to it
+    """Returns the class of a contender, and the name of its backend if it is an HGN."""
+    frame = case in FRAME_CASES
+    if case.startswith("public"):
+        assert config.public_gns is not None  # checked by BenchConfig
         return functools.partial(PublicFrame if frame else PublicTrain, Path(config.public_gns)), None
     if case in ("frame", "train") and triton_unsupported_reason(device, config.network, precision) is None:
         return TritonFrame if frame else TritonTrain, "triton"
-    if not frame:
-        return Train, None if "gns" in case else "torch"
-    fastest = "cpu" if case == "frame" and device.type == "cpu" else "torch"
-    backend = None if "gns" in case else fastest
-    return functools.partial(Frame, backend=backend), backend
+    backend = None if "gns" in case else "cpu" if case == "frame" and device.type == "cpu" else "torch"
+    return functools.partial(Frame, backend=backend) if frame else Train, backend
 
 
 def _wanted(config: BenchConfig, device: torch.device, precision: str, cases: tuple[str, ...]) -> list[str]:
-    """Those of `cases` that are asked for and mean something; fp16 is only computed by backend triton."""
+    """Returns the chosen ones of `cases` that are meaningful here; only backend triton computes in fp16."""
     triton = triton_unsupported_reason(device, config.network, precision) is None
-    fastest_differs = {"torch_frame": triton or device.type == "cpu", "torch_train": triton}  # from torch
-    wanted = config.cases or tuple(
-        case
-        for case in CASES
-        if fastest_differs.get(case, True) and (config.public_gns is not None or case not in PUBLIC_GNS_CASES)
-    )
     if precision == "fp16":
-        wanted = tuple(case for case in ("frame", "train") if triton and case in wanted)
-    return [case for case in cases if case in wanted]
+        return [case for case in ("frame", "train") if triton and case in cases and case in (config.cases or CASES)]
+    left_out = set() if config.public_gns else {"public_gns_frame", "public_gns_train"}
+    left_out |= set() if triton or device.type == "cpu" else {"torch_frame"}  # the same as frame
+    left_out |= set() if triton else {"torch_train"}
+    return [case for case in cases if (case in config.cases if config.cases else case not in left_out)]
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
-"""What is timed, and how each is checked before: a frame, a training step, the solver's frame.
+"""Contenders with their checks: a frame, a training step, a frame of the solver.
 
-A check compares with PyTorch in float64 on the same input. Work that is too large for float64 is checked
-on one scene of a tile, by the same code.
+A check compares with PyTorch in float64 on the same input. Workloads that are too large for float64 are checked on one
+tile of particles, by the same code.
 """
 
 from __future__ import annotations
@@ -23,31 +23,30 @@ from hgn.runtime.parity import relative_error
 from hgn.runtime.simulator import Simulator
 from hgn.training.checkpoint import DataInfo
 from hgn.training.module import TrainingModule
-from tools.bench.config import BenchConfig
 from tools.bench.states import SPEED, TILE_PARTICLES, Workload, batch_of, scene_of, state_of
 from tools.report import PASS
 from tools.timing import FrameClock, Timed, once
 
 BOUNDS = {"fp32": 1e-5, "tf32": 2e-3, "fp16": 2e-3}  # relative error of accelerations and loss, of the norm
-# Of all gradients together. Looser, for rounding turns the activations that lie next to their kink: of millions of
-# them a share like the rounding itself, and the gradient's error is like that share's root.
+# Of all gradients together. Looser, because rounding flips activations next to their kink: a fraction of them as large
+# as the rounding, and the error of the gradient is as large as the root of this fraction.
 GRADIENT_BOUNDS = {"fp32": 1e-3, "tf32": 5e-2, "fp16": 5e-2}
 FRAME_RATE_HZ = 60.0
 CHECKED_AT_MOST = {"frame": 50_000, "train": TILE_PARTICLES}  # particles of all scenes
-MPM_ROUNDS = 5
+MPM_ROUNDS, MPM_FRAMES = 5, 20  # samples of the solver, and frames of each
 OBSTACLE_CELL_SIZE = 1 / 64
 DATA = DataInfo("", FRAME_RATE_HZ, OBSTACLE_CELL_SIZE)
 
 
 def checked_workload(work: Workload, what: str) -> Workload:
-    """The workload itself, or one scene of it, where float64 would not fit."""
+    """Returns the workload, or one scene if float64 does not fit."""
     if work.particles * work.scenes <= CHECKED_AT_MOST[what]:
         return work
     return Workload(min(work.particles, TILE_PARTICLES), 1)
 
 
 def bench_network(config: NetworkConfig, device: torch.device) -> ParticleNetwork:
-    """Random weights, and a normaliser with the spread of the bench's states."""
+    """Returns a network with random parameters, and a normaliser with the spread of the bench's states."""
     torch.manual_seed(0)
     network = build_network(config)
     for quantity in ("velocity", "acceleration"):
@@ -56,22 +55,22 @@ def bench_network(config: NetworkConfig, device: torch.device) -> ParticleNetwor
 
 
 def training_module(config: NetworkConfig, scenes: int, device: torch.device) -> TrainingModule:
-    """The training of the bench's network, the same weights in every process."""
+    """Returns the training of the bench's network, with the same parameters in every process."""
     network = bench_network(config, device).train()
     return TrainingModule(network, TrainingConfig(batch_scenes=scenes), DATA).to(device)
 
 
 class Contender(Timed):
-    """What is timed run by run, once it was checked."""
+    """A network that is checked, and then timed run by run."""
 
     device: torch.device
-    at_once = 1  # so many times what is told in one run
+    at_once = 1  # repetitions of the work in one run
 
     def run(self) -> object:
         raise NotImplementedError
 
     def check(self, precision: str) -> str:
-        """`pass`, or by how much what it computes differs."""
+        """Returns `pass`, or the error and its bound."""
         raise NotImplementedError
 
     def sample(self) -> float:
@@ -84,7 +83,7 @@ class Frame(Contender):
     def __init__(
         self, config: NetworkConfig, work: Workload, device: torch.device, precision: str, backend: str | None = None
     ) -> None:
-        """`backend`: none is the fastest that makes frames one by one."""
+        """`backend`: None is the fastest that computes frames one by one."""
         self.device = device
         self.network = bench_network(config, device)
         chosen = build(backend, self.network, precision) if backend else fastest_stepped(self.network, precision)
@@ -124,20 +123,19 @@ class Train(Contender):
 class MpmFrame(Timed):
     """One frame of the solver that generates the data, at its converged step; the same particles start at rest."""
 
-    def __init__(self, work: Workload, config: BenchConfig, device: torch.device) -> None:
-        self.scenes = [scene_of(work, seed, config.network.cell_size) for seed in range(work.scenes)]
+    def __init__(self, work: Workload, cell_size: float, device: torch.device) -> None:
+        self.scenes = [scene_of(work, seed, cell_size) for seed in range(work.scenes)]
         self.config = MpmConfig(device="gpu" if device.type == "cuda" else "cpu", scenes_per_launch=work.scenes)
-        self.frames = config.mpm_frames
         self.particles = sum(scene.particle_count for scene in self.scenes) // work.scenes
         self.rounds, self.warm_up = MPM_ROUNDS, 1
         self.substeps = 0.0  # of a frame, mean over particles
 
     def sample(self) -> float:
-        """Milliseconds a frame of a short simulation: frames may come several at once."""
+        """Returns milliseconds a frame of a short simulation, because several frames may end together."""
         from datagen.mpm.solver import SceneFailure, simulate
 
         clock = FrameClock()
-        results = simulate(self.scenes, self.config, self.frames, FRAME_RATE_HZ, clock)
+        results = simulate(self.scenes, self.config, MPM_FRAMES, FRAME_RATE_HZ, clock)
         steps = 0
         for scene, result in zip(self.scenes, results, strict=True):
             if isinstance(result, SceneFailure):
@@ -147,14 +145,14 @@ class MpmFrame(Timed):
             else:
                 steps += result.counters["substeps"] * scene.particle_count
         particles = sum(scene.particle_count for scene in self.scenes)
-        self.substeps = steps / particles / (self.frames - 1)
-        return (clock.ends[-1] - clock.ends[0]) * 1e3 / (self.frames - 1)
+        self.substeps = steps / particles / (MPM_FRAMES - 1)
+        return (clock.ends[-1] - clock.ends[0]) * 1e3 / (MPM_FRAMES - 1)
 
 
 def check_acceleration(
     velocity_N3: torch.Tensor, network: ParticleNetwork, state: ParticleState, precision: str
 ) -> str:
-    """`pass`, or by how much the velocities after a frame differ from what float64 gives."""
+    """Compares the velocities after a frame with float64; returns `pass` or the error."""
     reference = copy.deepcopy(network).double()
     with torch.no_grad():
         expected_N3 = reference.restored_acceleration(reference_output(reference, state), state)
@@ -165,7 +163,7 @@ def check_acceleration(
 def check_update(
     loss: torch.Tensor, gradient: torch.Tensor, network: ParticleNetwork, batch: Batch, precision: str
 ) -> str:
-    """`pass`, or by how much loss or gradients, without noise and jitter, differ from float64."""
+    """Compares loss and gradients, without noise and jitter, with float64; returns `pass` or the error."""
     expected_loss, expected = reference_gradients(network, batch)
     check = verdict("loss", relative_error(loss.double(), expected_loss), BOUNDS[precision])
     if check == PASS:
@@ -174,7 +172,7 @@ def check_update(
 
 
 def reference_gradients(network: ParticleNetwork, batch: Batch) -> tuple[torch.Tensor, torch.Tensor]:
-    """The float64 network's loss without noise and jitter, and the gradients of all parameters, end to end."""
+    """Returns the float64 network's loss without noise and jitter, and all gradients, concatenated."""
     reference = copy.deepcopy(network).double()
     reference.zero_grad()
     double = replace(batch, window_WN3=batch.window_WN3.double(), domain_S3=batch.domain_S3.double())
@@ -186,7 +184,7 @@ def reference_gradients(network: ParticleNetwork, batch: Batch) -> tuple[torch.T
 
 
 def reference_output(reference: ParticleNetwork, state: ParticleState) -> torch.Tensor:
-    """The float64 network's raw output. Of GNS on the same neighbour list: rounding at the radius is no error."""
+    """Returns the float64 network's output; GNS gets the same neighbours, for rounding at the radius."""
     double = replace(
         state,
         position_N3=state.position_N3.double(),
@@ -199,11 +197,11 @@ def reference_output(reference: ParticleNetwork, state: ParticleState) -> torch.
 
 
 def verdict(what: str, error: float, bound: float) -> str:
-    """`pass`, or the error in words."""
+    """Returns `pass`, or the error and its bound."""
     return PASS if error <= bound else f"relative error of {what} {error:.1e} exceeds {bound:.0e}"  # NaN fails
 
 
 def _gradients(network: torch.nn.Module) -> torch.Tensor:
-    """Of all parameters, end to end; zero where there is none."""
+    """Concatenates the gradients of all parameters."""
     gradients = [torch.zeros_like(p) if p.grad is None else p.grad for p in network.parameters()]
     return torch.cat([gradient.flatten() for gradient in gradients])

@@ -1,9 +1,8 @@
-"""The public PyTorch Geometric implementation of GNS, from a local copy, with our GNS's weights: the same function.
+"""The public PyTorch Geometric implementation of GNS, from a local copy, with the parameters of our GNS.
 
-The copy is the repository github.com/geoelements/gns, which is no part of this project. What is timed is its own
-simulator class, in its own operations. Two things are ours, so that it computes the same function on the same
-machine: the neighbour search, for its own needs a further compiled library and keeps any 128 neighbours, where ours
-keeps all; and training noise, drawn on the device instead of the host.
+The copy is the repository github.com/geoelements/gns, which is not part of this project. Its own simulator class is
+timed. Two parts are replaced so that it computes the same function: the neighbour search, whose original needs another
+compiled library and keeps any 128 neighbours, and training noise, which is drawn on the device instead of the host.
 Shape legend: N particles, H velocity history, W = H + 2 frames, E directed edges.
 """
 
@@ -38,9 +37,9 @@ MODULE = "gns.learned_simulator"
 
 
 def load_public(folder: Path) -> ModuleType:
-    """The module with the public simulator class, which gets all neighbours.
+    """Imports the module with the public simulator class, and replaces its neighbour search.
 
-    Raises: ConfigError when the folder is no copy of the repository, or PyTorch Geometric is not installed.
+    Raises: ConfigError if the folder is no copy of the repository, or PyTorch Geometric is not installed.
     """
     file = folder / "gns" / "learned_simulator.py"
     remedy = "clone github.com/geoelements/gns to a place outside of this repository"
@@ -48,7 +47,7 @@ def load_public(folder: Path) -> ModuleType:
     sys.path.insert(0, str(folder.resolve()))
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of their files, and of libraries that we do not choose
+            warnings.simplefilter("ignore")  # of their files and libraries
             module = importlib.import_module(MODULE)
     except ModuleNotFoundError as error:
         raise ConfigError(f"public_gns must find its libraries, got none named {error.name}; install it") from None
@@ -62,7 +61,7 @@ def load_public(folder: Path) -> ModuleType:
 
 
 def public_simulator(module: ModuleType, network: GraphNetworkSimulator, domain_3: torch.Tensor) -> nn.Module:
-    """Their simulator with our network's structure and normaliser, in a cubic domain, and weights of its own."""
+    """Returns their simulator with our network's structure and normaliser, in a cubic domain."""
     config, normaliser = network.config, network.normaliser
     statistics = {
         name: {"mean": getattr(normaliser, f"{name}_mean"), "std": getattr(normaliser, f"{name}_std")}
@@ -88,10 +87,10 @@ def public_simulator(module: ModuleType, network: GraphNetworkSimulator, domain_
 
 @torch.no_grad()
 def copy_weights(simulator: nn.Module, network: GraphNetworkSimulator) -> None:
-    """Their weights into our network, which then is the same function; its columns for normals become zero.
+    """Copies their parameters into our network, which then computes the same function.
 
-    They list velocities from the oldest, we from the newest; their wall distances are in radii, ours over the largest;
-    their edges read the receiver first, their particles the sum first.
+    Their velocities start with the oldest, ours with the newest; their wall distances are in radii, ours divided by the
+    largest; their edges read the receiver first, their particles the sum. Columns of obstacle normals become zero.
     """
     public: Any = simulator
     config, parts = network.config, network.encode.parts
@@ -117,7 +116,7 @@ def copy_weights(simulator: nn.Module, network: GraphNetworkSimulator) -> None:
 
 
 class PublicGns(Contender):
-    """Their simulator on the bench's states, and ours with the same weights to check it against."""
+    """Their simulator on the bench's states, checked against ours with the same parameters."""
 
     def __init__(
         self, folder: Path, config: NetworkConfig, work: Workload, device: torch.device, precision: str = "fp32"
@@ -131,7 +130,7 @@ class PublicGns(Contender):
         copy_weights(self.simulator, network)
 
     def output(self, window_WN3: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Their normalised acceleration and its target, [N, 3] each; noise is in the window already."""
+        """Returns their normalised acceleration and its target, [N, 3] each; the window contains the noise."""
         sequence_NH3 = window_WN3[:-1].transpose(0, 1).contiguous()
         return self.simulator.predict_accelerations(
             next_positions=window_WN3[-1],
@@ -142,7 +141,7 @@ class PublicGns(Contender):
         )
 
     def expected(self) -> torch.Tensor:
-        """What our network gives in float64 on the same neighbours, normalised, [N, 3]."""
+        """Returns our network's normalised acceleration in float64 with the same neighbours, [N, 3]."""
         with torch.no_grad():
             return reference_output(copy.deepcopy(self.network).double(), self.batch.state())
 
@@ -158,7 +157,7 @@ class PublicFrame(PublicGns):
 
     @torch.no_grad()
     def check(self, precision: str) -> str:
-        """`pass`, or by how much their accelerations differ from ours."""
+        """Compares their accelerations with ours."""
         found_N3, _ = self.output(self.batch.window_WN3)
         return verdict("acceleration", relative_error(found_N3.double(), self.expected()), BOUNDS[precision])
 
@@ -171,7 +170,7 @@ class PublicTrain(PublicGns):
         self.optimizer = torch.optim.Adam(self.simulator.parameters(), lr=TrainingConfig.learning_rate)
 
     def loss(self, batch: Batch) -> torch.Tensor:
-        """Their loss: the squared error summed over axes."""
+        """Returns their loss: the squared error, summed over axes."""
         found_N3, target_N3 = self.output(batch.window_WN3)
         return (found_N3 - target_N3).square().sum(-1).mean()
 
@@ -184,7 +183,7 @@ class PublicTrain(PublicGns):
 
     @torch.no_grad()
     def check(self, precision: str) -> str:
-        """`pass`, or by how much their loss differs from ours."""
+        """Compares their loss with ours."""
         normaliser = copy.deepcopy(self.network.normaliser).double()
         target_N3 = normaliser.normalise_acceleration(self.batch.acceleration(self.batch.window_WN3.double()))
         expected = (self.expected() - target_N3).square().sum(-1).mean()
@@ -192,7 +191,7 @@ class PublicTrain(PublicGns):
 
 
 def _copy(theirs: Any, ours: MLP, same_input: bool = True) -> None:
-    """Layers and norm, but for the first layer's matrix where its columns are in another order."""
+    """Copies layers and norm, except for a first layer's matrix whose columns have another order."""
     layers = theirs[0]
     if same_input:
         ours.first.weight.copy_(layers[0].weight)
@@ -207,7 +206,7 @@ def _copy(theirs: Any, ours: MLP, same_input: bool = True) -> None:
 def _radius_graph(
     position_N3: torch.Tensor, r: float, batch: torch.Tensor, loop: bool, max_num_neighbors: int
 ) -> torch.Tensor:
-    """Sender and receiver of each edge, int64 [2, E]: all particles within r, themselves among them."""
+    """Returns sender and receiver of each edge, int64 [2, E]: all particles within r, and themselves."""
     neighbours = neighbour_list(position_N3.detach(), batch, r)
     order_N = neighbours.order_N
     return torch.stack([order_N[neighbours.sender_E], order_N[neighbours.receivers.segment_E]])

@@ -1,7 +1,7 @@
-"""The frames that are timed: a fixed mixture of clumps and spray, with the neighbours and cells of real frames.
+"""States that are timed: a fixed mixture of clumps and spray, with the neighbours and cells of real frames.
 
-A tile holds what the paper's obstacle-free scene holds in the middle of its 300 frames: 4,296 particles, about 97
-neighbours each within R and 1,200 active cells of R (measured there: 97 and 1,307). More particles are more tiles.
+A tile is similar to the middle of the 300 frames of the paper's obstacle-free scene: 4,296 particles, about 97
+neighbours each within R and 1,200 active cells of R (measured: 97 and 1,307). More particles are more tiles.
 Shape legend: N particles of all scenes, S scenes, W window frames.
 """
 
@@ -21,28 +21,28 @@ from hgn.scene.scene import Scene
 
 TILE_PARTICLES = 4_296
 TILE_SIZE = 0.5  # domain units
-CLUMPED = 2_120 / TILE_PARTICLES  # share of the particles in four cubes, at the solver's 8 a cell; the rest is spray
+CLUMPED = 2_120 / TILE_PARTICLES  # fraction of the particles in four cubes, 8 a cell of the solver; others are spray
 SPRAY_SIZE = 0.31
-MARGIN = 0.04  # of a tile that stays empty: the solver's walls
-BORDER = 1e-3  # of a grid cell, kept free: rounding may not decide which cells a particle touches
+MARGIN = 0.04  # empty margin of a tile, for the solver's walls
+BORDER = 1e-3  # empty margin of a grid cell, so that rounding does not change a particle's cells
 SPEED = 2e-3  # domain units a frame
 
 
 @dataclass(frozen=True)
 class Workload:
-    """How much one launch has to do."""
+    """The size of the work."""
 
     particles: int  # of each scene
     scenes: int
 
     @property
     def domain_size(self) -> float:
-        """Side of the cubic domain, domain units: as many tiles as the particles fill."""
+        """Returns the side of the cubic domain that the tiles fill, domain units."""
         return TILE_SIZE * max(2, math.ceil((self.particles / TILE_PARTICLES) ** (1 / 3) - 1e-9))
 
 
 def positions(workload: Workload, seed: int, cell_size: float) -> np.ndarray:
-    """One scene's particles, float32 [particles, 3]. A last tile that is not full has fewer of each kind."""
+    """Returns a scene's particles, float32 [particles, 3]; a partial last tile has fewer of each kind."""
     generator = np.random.default_rng(seed)
     side = round(workload.domain_size / TILE_SIZE)
     parts = []
@@ -57,7 +57,7 @@ def positions(workload: Workload, seed: int, cell_size: float) -> np.ndarray:
 
 
 def scene_of(workload: Workload, seed: int, cell_size: float) -> Scene:
-    """The same particles at rest, for the solver."""
+    """Returns the same particles at rest, for the solver."""
     position_N3 = positions(workload, seed, cell_size)
     size = workload.domain_size
     return Scene(
@@ -70,21 +70,21 @@ def scene_of(workload: Workload, seed: int, cell_size: float) -> Scene:
 
 
 def batch_of(workload: Workload, network: NetworkConfig, device: torch.device) -> Batch:
-    """A window of such frames, scene s from seed s."""
+    """Returns a window of frames, scene s from seed s."""
     return batch_of_scenes([Workload(workload.particles, 1)] * workload.scenes, network, device)
 
 
 def batch_of_scenes(
     scenes: Sequence[Workload], network: NetworkConfig, device: torch.device, first_seed: int = 0
 ) -> Batch:
-    """Windows of scenes of different sizes, from seeds in a row: particles that move a little, and accelerate."""
+    """Returns windows of scenes of different sizes, from consecutive seeds, with small velocities and accelerations."""
     parts, materials = [], []
     for seed, scene in enumerate(scenes, first_seed):
         last_N3 = positions(scene, seed, network.cell_size)
         generator = np.random.default_rng([seed, 1])
         velocity_N3 = generator.normal(0, SPEED, last_N3.shape)
         change_HN3 = generator.normal(0, 0.3 * SPEED, (network.velocity_history + 1, *last_N3.shape))
-        velocity_HN3 = velocity_N3 + change_HN3  # oldest first, the answer's last
+        velocity_HN3 = velocity_N3 + change_HN3  # oldest first; the last is the target
         after_N3 = last_N3 + velocity_HN3[-1]
         before_HN3 = last_N3 - velocity_HN3[-2::-1].cumsum(0)
         parts.append(np.concatenate([before_HN3[::-1], last_N3[None], after_N3[None]]))
@@ -103,7 +103,7 @@ def batch_of_scenes(
 
 
 def state_of(workload: Workload, network: NetworkConfig, device: torch.device) -> ParticleState:
-    """The state that a simulation is in at such a frame, without the frames before it."""
+    """Returns the state of a simulation at such a frame."""
     state = batch_of(workload, network, device).state()
     return replace(state, position_N3=state.position_N3.clone(), velocity_NM3=state.velocity_NM3.contiguous())
 
@@ -112,8 +112,8 @@ def _tile(count: int, generator: np.random.Generator) -> np.ndarray:
     clump = round(CLUMPED * count / 4)
     side = (clump / 8) ** (1 / 3) / 64
     corners = np.array([[0, 0, 0], [1, 0, 1], [1, 1, 0], [0, 1, 1]])
-    room = TILE_SIZE - 2 * MARGIN - side
-    clumps = [MARGIN + room * corner + side * generator.random((clump, 3)) for corner in corners]
+    free = TILE_SIZE - 2 * MARGIN - side
+    clumps = [MARGIN + free * corner + side * generator.random((clump, 3)) for corner in corners]
     spray = 0.5 * (TILE_SIZE - SPRAY_SIZE) + SPRAY_SIZE * generator.random((count - 4 * clump, 3))
     return np.concatenate([*clumps, spray])
 

@@ -1,4 +1,4 @@
-"""Backend triton on the bench: frames and training updates in CUDA graphs, checked like PyTorch's.
+"""Contenders of backend triton: frames and training updates in CUDA graphs.
 
 Shape legend: N particles of all scenes, S scenes.
 """
@@ -29,7 +29,7 @@ FIRST_MOMENT_FRACTION = 0.1  # of Adam, of the gradient, after the first update
 
 
 class TritonFrame(Contender):
-    """One frame of a simulation; what is timed puts the same state back before each."""
+    """One frame of a simulation; the state is restored before each frame."""
 
     def __init__(self, config: NetworkConfig, work: Workload, device: torch.device, precision: str) -> None:
         from hgn.runtime.triton_rollout import TritonRollout  # loads Triton
@@ -40,7 +40,7 @@ class TritonFrame(Contender):
         self.network, self.state = network, state_of(work, config, device)
         self.velocity_NV = self.state.velocity_NM3.flatten(1)  # a view
         self.rollout = TritonRollout(network, self.state, precision)
-        # as many as the rollout has room to keep the positions of
+        # the rollout stores positions of a limited number of frames
         self.at_once = min(FRAMES_AT_ONCE, len(self.rollout.path_TN3))
 
     def restore(self) -> None:
@@ -60,17 +60,17 @@ class TritonFrame(Contender):
     def sample(self) -> float:
         milliseconds = super().sample()
         if int(self.rollout.frame) != self.at_once:
-            self.failure = "frames were left out for lack of room"
+            self.failure = "frames were skipped for lack of memory"
         return milliseconds
 
     def check(self, precision: str) -> str:
         self.restore()
-        self.rollout.run(1)  # makes room where it needs more
+        self.rollout.run(1)  # allocates memory if necessary
         return check_acceleration(self.rollout.velocity_NV[:, :3], self.network, self.state, precision)
 
 
 def device_samples(batch: Batch) -> list[tuple[DeviceEpisode, int, int]]:
-    """The scenes of a batch as Triton's updates take them: episodes of one window, frame 0 and the seed."""
+    """Converts the scenes of a batch for Triton's updates: episodes of one window, frame 0 and the seed."""
     from hgn.kernels.update.op import DeviceEpisode  # loads Triton
 
     windows = batch.window_WN3.split(batch.particles_S, dim=1)

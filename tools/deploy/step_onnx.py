@@ -1,6 +1,6 @@
 """python step_onnx.py MODEL ARRAYS FRAMES OUT: simulates a scene with an ONNX file of hgn.export.
 
-Needs NumPy and ONNX Runtime alone.
+Needs only NumPy and ONNX Runtime.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
-"""What is compared: networks, the solver at several grids and steps, and predictors that have learned nothing.
+"""Contenders: networks, the solver on several grids and with several steps, and baselines.
 
-Each gives its one-step errors where it has any, its rollouts, and itself for timing, on the same test scenes.
+Each computes one-step errors, if it has any, and rollouts of the same test scenes.
 Shape legend: T frames, N particles of a scene.
 """
 
@@ -34,65 +34,59 @@ if TYPE_CHECKING:
 Row = dict[str, Any]
 PARTICLES_PER_BATCH = 32_768
 PARTICLES_AT_ONCE = 150_000  # of backend triton's one-step errors
-REST_SPEED = 1e-4  # domain units a frame; what is slower is at rest
-REPEATED_FRAMES = 51  # of rollouts of a network's further precisions on backend torch, which take minutes
-# What is measured first, a point of each kind before the others; what is last may be left out when the time is over.
-HGN_FIRST, SAME_GRID, GNS_FIRST, HGN_NEXT, COARSE_GRIDS, HGN_LAST, GNS_LAST = range(7)
+REST_SPEED = 1e-4  # domain units a frame; slower particles are at rest
+# Order of measurements: those that come last may be left out when the time is over.
+HGN_FIRST, SAME_GRID, GNS_FIRST, COARSE_GRIDS, OTHER_PRECISIONS = range(5)
 
 
 @dataclass
 class OneStep:
-    """One-step errors of a scene, and what is predicted for its particles at rest."""
+    """One-step errors of a scene, and accelerations predicted for its particles at rest."""
 
     error: SquaredError = field(default_factory=SquaredError)
-    rest_sum: float = 0.0  # of the predicted accelerations' lengths, domain units a frame squared
+    rest_sum: float = 0.0  # sum of the lengths of these accelerations, domain units a frame squared
     rest_count: int = 0
 
 
 class Contender:
-    """One row of the report."""
+    """A row of the report."""
 
     row: Row  # system and settings
     importance = SAME_GRID  # 0 is scored first
-    all_at_once = False  # all scenes are simulated side by side, and not so many as the command says
-    stepped = True  # frames are made one by one: nothing is captured or compiled for them
+    all_at_once = False  # simulates all scenes side by side, instead of BATCH_SCENES
+    stepped = True  # computes frames one by one, without captured or compiled programs
 
     def one_step(self, episode: Episode, stride: int) -> OneStep | None:
-        """Errors of the accelerations of every stride-th frame; none where the contender has no such thing."""
+        """Returns errors of the accelerations of every stride-th frame; None if the contender has none."""
         return None
 
     def trials(self, episodes: Sequence[Episode], frames: int, on_frame: OnFrame) -> list[RolloutResult]:
-        """Rollouts from the episodes' first frames, side by side."""
+        """Simulates from the episodes' first frames, side by side."""
         raise NotImplementedError
 
     def release(self) -> None:
-        """Gives back what is kept on the device for rollouts to come, if anything is."""
+        """Frees memory of the device that is kept for further rollouts."""
 
 
 class NetworkContender(Contender):
-    """A weights file at one precision of its matrix products, on the backend that a simulation would take."""
+    """A weights file at one precision of its matrix products, on the fastest backend."""
 
     def __init__(
-        self, file: Path, precision: str, backend: str, device: torch.device, frame_rate_hz: float, rank: int = 0
+        self, file: Path, precision: str, device: torch.device, frame_rate_hz: float, first: bool = True
     ) -> None:
-        """`rank` counts the precisions of these weights that tell more.
+        """`first`: this precision of the weights is measured before the others.
 
-        Raises: ConfigError where the backend does not take the network or the precision.
+        Raises: ConfigError if no backend supports the precision.
         """
         self.file, self.device, self.precision = file, device, precision
         self.network, info = load_weights(file, device)
         require_frame_rate(info, frame_rate_hz)
         config = info.network
         with matmul_precision(self.precision):
-            chosen = choose(device, self.network, precision, backend)
+            chosen = choose(device, self.network, precision, "auto")
             self.simulator = Simulator(self.network, info.frame_rate_hz, chosen)
-        self.stepped, hgn = chosen.stepped, config.kind == "hgn"
-        if rank == 0:
-            self.importance = HGN_FIRST if hgn else GNS_FIRST
-        else:
-            self.importance = HGN_NEXT if not self.stepped else HGN_LAST if hgn else GNS_LAST
-        self.all_at_once = hgn and self.stepped and device.type == "cuda"  # which waits for the host then
-        self.short = rank > 0 and self.stepped
+        self.stepped = chosen.stepped
+        self.importance = OTHER_PRECISIONS if not first else HGN_FIRST if config.kind == "hgn" else GNS_FIRST
         self._predictor: TritonPredictor | None = None
         self.row = {
             "system": config.kind,
@@ -115,7 +109,6 @@ class NetworkContender(Contender):
             return one_step(predict, self.network.config, episode, stride, self.device, at_once)
 
     def trials(self, episodes: Sequence[Episode], frames: int, on_frame: OnFrame) -> list[RolloutResult]:
-        frames = min(frames, REPEATED_FRAMES) if self.short and on_frame is None else frames
         with matmul_precision(self.precision):
             return simulate_scenes(self.simulator, [InitialState.of_episode(e) for e in episodes], frames, on_frame)
 
@@ -125,16 +118,17 @@ class NetworkContender(Contender):
 
 
 class SolverContender(Contender):
-    """The solver that made the data, on a grid and with a step of its own. It has no one-step error: a step begins from
-    stresses and volumes, which positions do not tell.
+    """The solver that generated the data, on a grid and with a step.
+
+    It has no one-step error: a step starts from stresses and volumes, which are not in the data.
     """
 
-    all_at_once = True  # a scene takes one of a GPU's many processors
+    all_at_once = True  # a scene uses a few of a GPU's processors
 
     def __init__(
         self, launches: SolverLaunches, setting: Setting, frames: int, importance: int, named: Row | None = None
     ) -> None:
-        """Rollouts end at `frames`, where nobody takes the time. `named`: its row, where that is not the settings'."""
+        """`frames`: length of rollouts that are not timed. `named`: the row, instead of one from the settings."""
         self.launches, self.setting, self.frames, self.importance = launches, setting, frames, importance
         grid = round(1 / launches.cell_size)
         self.row = named or {"system": "mpm", "grid": grid, "step": setting.step, "precision": "fp32"}
@@ -147,7 +141,7 @@ class SolverContender(Contender):
 
 
 class BaselineContender(Contender):
-    """The same acceleration for every particle, whatever happens: nothing is learned."""
+    """The same acceleration for every particle of a scene."""
 
     def __init__(self, name: str, acceleration: Callable[[Episode], np.ndarray], device: torch.device) -> None:
         self.row = {"system": "baseline", "predictor": name}
@@ -163,7 +157,7 @@ class BaselineContender(Contender):
 
         def trial(episode: Episode) -> RolloutResult:
             velocity_N3 = episode.initial_velocity_N3 / episode.frame_rate_hz
-            # As the networks integrate: the velocity first, and the history before frame 0 falls freely.
+            # integrated like the networks: velocity first; the history before frame 0 is free fall
             velocity_N3 = velocity_N3 - 0.5 * np.asarray(episode.gravity) / episode.frame_rate_hz**2
             path_TN3 = velocity_N3 * time_T11 + self.acceleration(episode) * (0.5 * time_T11 * (time_T11 + 1))
             return RolloutResult((episode.position_TN3[0] + path_TN3).astype(np.float32))
@@ -173,7 +167,7 @@ class BaselineContender(Contender):
 
 
 class TritonPredictor:
-    """Accelerations by backend triton's own launches: a frame simulated from each given state."""
+    """Accelerations of backend triton: simulates one frame from each state."""
 
     def __init__(self, network: HierarchicalGraphNetwork, precision: str) -> None:
         self.network, self.precision = network, precision
@@ -202,11 +196,11 @@ def one_step(
     device: torch.device,
     particles_per_batch: int = PARTICLES_PER_BATCH,
 ) -> OneStep:
-    """Errors of a predictor on every stride-th frame of an episode, without noise."""
+    """Measures a predictor on every stride-th frame of an episode, without noise."""
     result = OneStep()
     frames = list(range(0, len(episode.position_TN3) - 1, stride))
     together = max(1, particles_per_batch // max(1, len(episode.material_N)))
-    together = math.ceil(len(frames) / math.ceil(len(frames) / together))  # batches of about as many
+    together = math.ceil(len(frames) / math.ceil(len(frames) / together))  # batches of similar sizes
     with torch.inference_mode():
         for first in range(0, len(frames), together):
             batch = make_batch([(episode, n) for n in frames[first : first + together]], network).to(device)
@@ -220,7 +214,7 @@ def one_step(
 
 
 def frame_milliseconds(contender: Contender, episodes: Sequence[Episode], frames: int) -> float | None:
-    """Mean time of a frame of a rollout, everything included; none where it ends too early to tell."""
+    """Returns the mean time of a frame of a rollout; None if the rollout ends too early."""
     clock = FrameClock()
     contender.trials(episodes, frames, clock)
     return clock.milliseconds()

@@ -1,6 +1,6 @@
-"""Two contenders on the same scenes: by how much one's error is below the other's, with intervals that carry a word.
+"""Paired comparison of two contenders: differences of errors scene by scene, with bootstrap intervals.
 
-Differences are taken scene by scene, their median and mean resampled over scenes (bootstrap, percentile intervals).
+Median and mean of the differences are resampled over scenes; intervals are percentiles.
 Shape legend: S scenes, B resamplings.
 """
 
@@ -22,8 +22,9 @@ Row = Mapping[str, Any]
 
 
 def paired_difference(one_S: Sequence[float | None], other_S: Sequence[float | None]) -> dict[str, Any] | None:
-    """{"scenes", "median": [value, low, high], "mean": …, and what each carries} of `one` less `other`, over the scenes
-    that both have a value of; none for fewer than two of them.
+    """Compares errors of the scenes in which both have one; returns None for fewer than two scenes.
+
+    Returns {"scenes", "median": [difference, low, high], "median_says", "mean", "mean_says"}.
     """
     pairs = [(a, b) for a, b in zip(one_S, other_S, strict=False) if a is not None and b is not None]
     if len(pairs) < 2:
@@ -39,30 +40,29 @@ def paired_difference(one_S: Sequence[float | None], other_S: Sequence[float | N
 
 
 def paired_rows(rows: Sequence[Row]) -> list[dict[str, Any]]:
-    """Every network at every precision beside every GNS, every setting of the solver, and later rows of the same kind
-    with other weights at its precision, for each error that both have of scenes: {"one", "other", "error", "frame", …}
-    and `paired_difference`.
+    """Compares every network with every GNS, every setting of the solver, and later networks of the same kind and
+    precision with other weights. A row is {"one", "other", "error", "frame"} and a `paired_difference`.
     """
-    told = [row for row in rows if row.get("by_scene")]
-    made = []
-    for i, one in enumerate(told):
+    scored = [row for row in rows if row.get("by_scene")]
+    pairs = []
+    for i, one in enumerate(scored):
         if one["system"] not in NETWORK_SYSTEMS:
             continue
-        later = [row for row in told[i + 1 :] if row["system"] == one["system"] == "hgn"]
+        later = [row for row in scored[i + 1 :] if row["system"] == one["system"] == "hgn"]
         alike = [r for r in later if r["weights"] != one["weights"] and r["precision"] == one["precision"]]
-        others = [row for row in told if row["system"] in (*NETWORK_SYSTEMS[1:], "mpm") and row is not one]
+        others = [row for row in scored if row["system"] in (*NETWORK_SYSTEMS[1:], "mpm") and row is not one]
         for other in (*alike, *others):
             for error, values in one["by_scene"].items():
                 for frame in values.keys() & other["by_scene"].get(error, {}).keys():
                     difference = paired_difference(values[frame], other["by_scene"][error][frame])
                     if difference is not None:
                         named = {"one": label(one), "other": label(other), "error": error, "frame": frame}
-                        made.append(named | difference)
-    return sorted(made, key=lambda row: (row["one"], row["other"], row["error"], int(row["frame"])))
+                        pairs.append(named | difference)
+    return sorted(pairs, key=lambda row: (row["one"], row["other"], row["error"], int(row["frame"])))
 
 
 def paired_lines(rows: Sequence[Row]) -> list[str]:
-    """Lines for people, from paired rows."""
+    """Formats paired rows."""
     lines = ["", f"scene by scene: difference, and its {COVERED:.0%} interval over scenes"] if rows else []
     for row in rows:
         at = f" after {row['frame']} frames" if row["frame"] != "0" else ""
@@ -70,7 +70,7 @@ def paired_lines(rows: Sequence[Row]) -> list[str]:
         for name in ("median", "mean"):
             value, low, high = row[name]
             parts.append(f"{row[f'{name}_says']} in the {name} ({value:+.2e}, {low:+.2e} to {high:+.2e})")
-        pair = f"{row['one']} beside {row['other']}"
+        pair = f"{row['one']} against {row['other']}"
         lines.append(f"  {pair}, {row['error']}{at}, {row['scenes']} scenes: {'; '.join(parts)}")
     return lines
 

@@ -1,5 +1,4 @@
-"""The figures: error against run time, and error over the frames with the chaos floor. All are drawn from a report's
-JSON."""
+"""Figures of a report's JSON: error against run time, and error over the frames with the chaos floor."""
 
 from __future__ import annotations
 
@@ -16,7 +15,7 @@ from tools.error_vs_time.settings import UNTIMED
 from tools.report import as_png, new_figure
 
 CONVENTION = "squared errors: sum over axes, mean over particles and scenes, frame units"
-SHOWN_FRAME = 50  # in a panel of its own, beside the last one
+SHOWN_FRAME = 50  # in a panel of its own, next to the last frame
 HGN_COLORS = ("#0b3c8c", "#2f7fd6", "#12a3a8", "#7b5cd6", "#5aa9e6", "#2b2f77")
 GNS_COLORS = ("#d9480f", "#a61e4d", "#f08c00", "#862e9c")
 GRID_COLORS = ("#111111", "#5c5c5c", "#9a9a9a", "#c0c0c0")  # the finest first
@@ -27,33 +26,32 @@ FLOOR_LINES, BASELINE_LINES = ("-", "--"), (":", "--", "-.")
 TICKS = (1, 2, 5)  # of each decade of the run times
 TEXT, SMALL, TINY = 10.5, 9.5, 7.5  # points
 FIGURE_WIDTH, PANEL_HEIGHT = 16.2, 4.9  # inches
-NEAR_FLOOR, FAR_ABOVE = 30, 8  # what is still shown: times below the least error, above the best that learns nothing
+NEAR_FLOOR, FAR_ABOVE = 30, 8  # limits of the axis: factor below the least error, and above the best baseline
 LEGEND_LINE = 1.5 * SMALL  # points
 TIMED = (*NETWORK_SYSTEMS, "mpm")
-UPPER_EDGE = 0.965  # where of a panel's height they are marked that diverged in all scenes
+UPPER_EDGE = 0.965  # of a panel's height, where contenders are marked that diverged in all scenes
 
 Row = Mapping[str, Any]
 
 
 def draw_pareto(rows: Sequence[Row], meta: Mapping[str, Any], batched: bool = False) -> bytes:
-    """Milliseconds a frame of one scene, or of each of several side by side, against one-step MSE and position MSE; PNG
-    bytes.
+    """Draws errors against milliseconds a frame, of one scene or of several side by side; returns PNG bytes.
 
     A line joins the precisions of a network, and the steps of the solver on a grid. Bars are the middle half of the
-    scenes. Crossed out are means over those scenes that came so far, where others failed.
+    scenes. Crosses mark means over fewer scenes, because others failed.
     """
     frames = sorted({int(frame) for row in rows for frame in row["position_mse"]})
     shown: list[int | None] = [None, *sorted({f for f in frames if f == SHOWN_FRAME} | set(frames[-1:]))]
-    looks = _looks(rows)
-    columns = _legend(rows, looks)
+    styles = _styles(rows)
+    columns = _legend(rows, styles)
     most = max(len(column) for column in columns)
     below = most * LEGEND_LINE / 72  # inches
     size = (FIGURE_WIDTH, PANEL_HEIGHT + below + 0.9)
     figure, grid = new_figure(1, len(shown), size)
     scenes = max((row.get("batch_scenes") or 1 for row in rows), default=1)
-    how = f"up to {scenes} scenes side by side, as each has it best" if batched else "one scene"
+    how = f"up to {scenes} scenes side by side, the best number for each" if batched else "one scene"
     for panel, frame in zip(grid[0], shown, strict=True):
-        _pareto(panel, rows, frame, "ms_batched" if batched else "ms", looks)
+        _pareto(panel, rows, frame, "ms_batched" if batched else "ms", styles)
         panel.set_xlabel(f"milliseconds a frame{' and scene' if batched else ''}", fontsize=TEXT)
     footer = _footer(figure, meta)
     filled = [handle for column in columns for handle in column + [_mark("", "", "none")] * (most - len(column))]
@@ -63,9 +61,9 @@ def draw_pareto(rows: Sequence[Row], meta: Mapping[str, Any], batched: bool = Fa
 
 
 def draw_frames(rows: Sequence[Row], meta: Mapping[str, Any]) -> bytes:
-    """Position MSE over the frames, of each network at the precision that came farthest; PNG bytes."""
+    """Draws position MSE over the frames, of each network at the precision that reached most; returns PNG bytes."""
     figure, ((panel,),) = new_figure(1, 1, (11.0, 6.4))
-    looks = _looks(rows)
+    styles = _styles(rows)
     networks = [row for row in rows if row["system"] in NETWORK_SYSTEMS]
     best: dict[str, Row] = {}
     for row in sorted(networks, key=lambda row: sum(value is None for value in row["curve"])):
@@ -74,17 +72,17 @@ def draw_frames(rows: Sequence[Row], meta: Mapping[str, Any]) -> bytes:
         network = row["system"] in NETWORK_SYSTEMS
         if network and row is not best[row["weights"]]:
             continue
-        look, curve_T = looks[label(row, setting=False)], np.array([np.nan if v is None else v for v in row["curve"]])
+        own, curve_T = styles[label(row, setting=False)], np.array([np.nan if v is None else v for v in row["curve"]])
         time_T = np.flatnonzero(curve_T > 0)
-        style = {"color": look["color"], "linestyle": look.get("line", "-"), "linewidth": 2.0 if network else 1.2}
+        style = {"color": own["color"], "linestyle": own.get("line", "-"), "linewidth": 2.0 if network else 1.2}
         if row["system"] == "mpm":
-            style |= {"marker": look["markers"][row["step"]], "markevery": 0.15, "markersize": 5}
+            style |= {"marker": own["markers"][row["step"]], "markevery": 0.15, "markersize": 5}
         panel.plot(time_T, curve_T[time_T], label=label(row), **style)
     panel.set_xlabel("frame", fontsize=TEXT)
     panel.set_ylabel("position MSE (domain lengths²)", fontsize=TEXT)
     panel.set_yscale("log")
     scored = sorted({int(frame) for row in rows for frame in row["position_mse"]})
-    if scored:  # earlier errors of the solver, and those of ballistic motion, would leave the networks' a few pixels
+    if scored:  # without the solver's small first errors and the large ones of ballistic motion
         panel.set_ylim(_limits(rows, scored[0])[0], _limits(rows, scored[-1])[1])
     panel.grid(alpha=0.25)
     panel.tick_params(labelsize=SMALL)
@@ -93,7 +91,7 @@ def draw_frames(rows: Sequence[Row], meta: Mapping[str, Any]) -> bytes:
     return _png(figure, meta, "Error over the frames", _footer(figure, meta))
 
 
-def _pareto(panel: Any, rows: Sequence[Row], frame: int | None, key: str, looks: Mapping[str, Any]) -> None:
+def _pareto(panel: Any, rows: Sequence[Row], frame: int | None, key: str, styles: Mapping[str, Any]) -> None:
     from matplotlib.ticker import LogLocator
 
     times = [row[key] for row in rows if row.get(key) is not None] or [1.0]
@@ -102,15 +100,15 @@ def _pareto(panel: Any, rows: Sequence[Row], frame: int | None, key: str, looks:
     for row in rows:
         groups.setdefault(label(row, setting=False), []).append(row)
     for name, some in groups.items():
-        look, error = looks[name], _error(some[0], frame)
+        own, error = styles[name], _error(some[0], frame)
         if some[0]["system"] not in UNTIMED:
             points = sorted((row for row in some if row.get(key) is not None), key=lambda row: row[key])
             there = [(row[key], y) for row in points if (y := _error(row, frame)) is not None]
-            panel.plot([x for x, _ in there], [y for _, y in there], "-", color=look["color"], linewidth=1.2, alpha=0.6)
+            panel.plot([x for x, _ in there], [y for _, y in there], "-", color=own["color"], linewidth=1.2, alpha=0.6)
             for row in points:
-                _point(panel, row, frame, key, look, high)
+                _point(panel, row, frame, key, own, high)
         elif error is not None:
-            panel.axhline(error, color=look["color"], linestyle=look["line"], linewidth=1.3, zorder=1)
+            panel.axhline(error, color=own["color"], linestyle=own["line"], linewidth=1.3, zorder=1)
     panel.set(xscale="log", yscale="log", xlim=(min(times) / 1.8, max(times) * 1.8), ylim=(low, high))
     panel.xaxis.set_major_locator(LogLocator(subs=TICKS))
     panel.xaxis.set_major_formatter(lambda x, _: f"{x:g}")
@@ -127,7 +125,7 @@ def _pareto(panel: Any, rows: Sequence[Row], frame: int | None, key: str, looks:
 
 
 def _limits(rows: Sequence[Row], frame: int | None) -> tuple[float, float]:
-    """Of the errors' axis: all points but those far above what learns nothing, and floors that are near."""
+    """Returns limits of the axis of errors, without points far above the baselines and floors far below."""
     points, baselines, floors = (_errors(rows, frame, *of) for of in (TIMED, ("baseline",), ("chaos",)))
     everything = points + baselines + floors or [1.0]
     low, high = min(points or everything), max([*points, *baselines[:1]] or everything)
@@ -137,9 +135,9 @@ def _limits(rows: Sequence[Row], frame: int | None) -> tuple[float, float]:
     return low / 2.5, high * (2.5 * high / low) ** 0.12
 
 
-def _point(panel: Any, row: Row, frame: int | None, key: str, look: Mapping[str, Any], highest: float) -> None:
-    marker = look["markers"][row["step"]] if row["system"] == "mpm" else PRECISION_MARKERS[row["precision"]]
-    style = {"color": look["color"], "markeredgecolor": "white", "markeredgewidth": 0.7, "markersize": 8.5, "zorder": 4}
+def _point(panel: Any, row: Row, frame: int | None, key: str, own: Mapping[str, Any], highest: float) -> None:
+    marker = own["markers"][row["step"]] if row["system"] == "mpm" else PRECISION_MARKERS[row["precision"]]
+    style = {"color": own["color"], "markeredgecolor": "white", "markeredgewidth": 0.7, "markersize": 8.5, "zorder": 4}
     x, error, scenes = row[key], _error(row, frame), len(row["seeds"])
     reached = scenes if frame is None else int(row["scenes_reached"].get(str(frame), 0))
     if error is None and (reached or not row["failed_scenes"]):
@@ -149,12 +147,12 @@ def _point(panel: Any, row: Row, frame: int | None, key: str, look: Mapping[str,
     y, at = (error, {}) if inside else (UPPER_EDGE, edge)
     panel.plot(x, y, marker, **at, **style)
     if error is not None and not inside:
-        told = {"textcoords": "offset points", "xytext": (8, -4), "fontsize": SMALL, "color": look["color"]}
-        panel.annotate(f"↑ {error:.0e}", (x, y), xycoords=edge["transform"], **told)
+        style = {"textcoords": "offset points", "xytext": (8, -4), "fontsize": SMALL, "color": own["color"]}
+        panel.annotate(f"↑ {error:.0e}", (x, y), xycoords=edge["transform"], **style)
         return
     bars = row["one_step_quartiles"] if frame is None else row["position_quartiles"].get(str(frame))
     if inside and bars and min(bars) > 0:
-        panel.plot([x] * 2, bars, "-", color=look["color"], linewidth=4, alpha=0.28, zorder=2)
+        panel.plot([x] * 2, bars, "-", color=own["color"], linewidth=4, alpha=0.28, zorder=2)
     if reached < scenes:
         panel.plot(x, y, "x", color="black", markersize=10, zorder=5, **at)
 
@@ -165,8 +163,8 @@ def _mark(marker: str, name: str, color: str = "0.35") -> Any:
     return Line2D([], [], marker=marker, linestyle="", color=color, markersize=7.5, label=name)
 
 
-def _legend(rows: Sequence[Row], looks: Mapping[str, Any]) -> list[list[Any]]:
-    """What the colours, markers and lines are, in columns."""
+def _legend(rows: Sequence[Row], styles: Mapping[str, Any]) -> list[list[Any]]:
+    """Returns the columns of the legend."""
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
@@ -174,12 +172,12 @@ def _legend(rows: Sequence[Row], looks: Mapping[str, Any]) -> list[list[Any]]:
     grids: list[Any] = []
     lines: list[Any] = []
     steps: dict[float, str] = {}
-    for name, look in looks.items():
-        kind = networks if look["system"] in NETWORK_SYSTEMS else grids if look["system"] == "mpm" else lines
-        style = {"linestyle": look["line"], "linewidth": 1.5} if kind is lines else {"linewidth": 3.5}
-        text = f"learns nothing: {name}" if look["system"] == "baseline" else name
-        kind.append(Line2D([], [], color=look["color"], label=text, **style))
-        steps |= look.get("markers", {})
+    for name, own in styles.items():
+        kind = networks if own["system"] in NETWORK_SYSTEMS else grids if own["system"] == "mpm" else lines
+        style = {"linestyle": own["line"], "linewidth": 1.5} if kind is lines else {"linewidth": 3.5}
+        text = f"baseline: {name}" if own["system"] == "baseline" else name
+        kind.append(Line2D([], [], color=own["color"], label=text, **style))
+        steps |= own.get("markers", {})
     present = {row["precision"] for row in rows if row["system"] in NETWORK_SYSTEMS}
     precisions = [_mark(marker, name) for name, marker in PRECISION_MARKERS.items() if name in present]
     marks = [_mark(m, f"solver, {step:g} of the stable step") for step, m in sorted(steps.items(), reverse=True)]
@@ -189,31 +187,31 @@ def _legend(rows: Sequence[Row], looks: Mapping[str, Any]) -> list[list[Any]]:
     if any(row["failed_scenes"] for row in rows):
         notes.append(_mark("x", "some scenes failed (at the upper edge: all)", "black"))
     if any(row["system"] == "chaos" for row in rows):
-        notes.append(Patch(color=FLOOR_COLOR, alpha=0.15, label="below the chaos floor: means nothing"))
+        notes.append(Patch(color=FLOOR_COLOR, alpha=0.15, label="below the chaos floor"))
     columns = [networks, [*grids, *marks], [*precisions, *notes], lines]
     return [column for column in columns if column] or [[_mark("", "nothing was measured")]]
 
 
-def _looks(rows: Sequence[Row]) -> dict[str, dict[str, Any]]:
-    """Colours and markers by name: one of each network, each grid of the solver, and each line across."""
+def _styles(rows: Sequence[Row]) -> dict[str, dict[str, Any]]:
+    """Returns colours, markers and lines by name."""
     grids = sorted({row["grid"] for row in rows if row["system"] == "mpm"}, reverse=True)
     steps = sorted({row["step"] for row in rows if row["system"] == "mpm"}, reverse=True)
     gns = cycle(GNS_COLORS)
     colors = {"hgn": cycle(HGN_COLORS), "chaos": repeat(FLOOR_COLOR), "baseline": repeat(BASELINE_COLOR)}
     lines = {"chaos": cycle(FLOOR_LINES), "baseline": cycle(BASELINE_LINES)}
-    looks: dict[str, dict[str, Any]] = {}
+    styles: dict[str, dict[str, Any]] = {}
     for row in rows:
         name, system = label(row, setting=False), row["system"]
-        if name in looks:
+        if name in styles:
             continue
-        looks[name] = {"system": system}
+        styles[name] = {"system": system}
         if system == "mpm":
             color = GRID_COLORS[min(grids.index(row["grid"]), len(GRID_COLORS) - 1)]
-            looks[name] |= {"color": color, "markers": dict(zip(steps, cycle(STEP_MARKERS), strict=False))}
+            styles[name] |= {"color": color, "markers": dict(zip(steps, cycle(STEP_MARKERS), strict=False))}
         else:
-            looks[name] |= {"color": next(colors.get(system, gns))}
-            looks[name] |= {"line": next(lines[system])} if system in lines else {}
-    return looks
+            styles[name] |= {"color": next(colors.get(system, gns))}
+            styles[name] |= {"line": next(lines[system])} if system in lines else {}
+    return styles
 
 
 def _error(row: Row, frame: int | None) -> float | None:
@@ -226,18 +224,18 @@ def _errors(rows: Sequence[Row], frame: int | None, *systems: str) -> list[float
 
 
 def _footer(figure: Any, meta: Mapping[str, Any]) -> float:
-    """Where the figure comes from, at its lower edge; the inches that it takes."""
+    """Writes the provenance at the lower edge; returns its height in inches."""
     versions = "torch {torch}, taichi {taichi}".format(**meta["versions"])
     when = f"commit {meta['commit']}, {meta['date'][:10]}: {meta['command']}"
-    told = f"{CONVENTION}; scored by {meta['reference']}. {versions}, {when}"
+    text = f"{CONVENTION}; scored by {meta['reference']}. {versions}, {when}"
     width = int(figure.get_figwidth() * 72 / (0.62 * TINY))  # characters
-    lines = textwrap.wrap(told, width, max_lines=4, placeholder=" …")
+    lines = textwrap.wrap(text, width, max_lines=4, placeholder=" …")
     figure.text(0.006, 0.008, "\n".join(lines), fontsize=TINY, color="0.35", va="bottom")
     return (len(lines) * 1.4 * TINY + 8) / 72
 
 
 def _png(figure: Any, meta: Mapping[str, Any], title: str, below: float) -> bytes:
-    """With a title, and so many inches kept free below."""
+    """Adds a title; `below` inches stay free at the lower edge."""
     free = below / figure.get_figheight()
     figure.get_layout_engine().set(rect=(0, free, 1, 1 - free))
     scenes = f"{meta['scenes']} {meta['split']} scenes of {meta['data']}, {meta['device']}"

@@ -1,6 +1,6 @@
-"""The row of a contender: its errors on the test scenes against the reference, and its run times.
+"""The row of a contender: its errors on the test scenes against the reference.
 
-Conventions: squared errors sum over axes and average over particles, in frame units; means over scenes, of those
+Conventions: squared errors sum over axes and average over particles, in frame units; means over scenes are of those
 scenes that reached the frame. Shape legend: T frames, N particles of a scene, S scenes.
 """
 
@@ -22,33 +22,32 @@ from hgn.scene.rollout_file import obstacles_of_episode
 from hgn.training.errors import REPORTED_FRAMES, mean_so_far, position_mse
 from tools import report
 from tools.error_vs_time.contenders import Contender, OneStep
-from tools.error_vs_time.settings import ErrorVsTimeConfig
 from tools.error_vs_time.sinkhorn import sinkhorn_divergences
 from tools.measures import momentum_error, outside_domain
 
-SINKHORN_POINTS, SINKHORN_BLUR = 1024, 0.01  # of each material at most; domain units
+FRAME_STRIDE = 10  # of the one-step errors
+BATCH_SCENES = 8  # of rollouts, side by side
+SINKHORN_SCENES, SINKHORN_POINTS, SINKHORN_BLUR = 20, 1024, 0.01  # points of each material at most; domain units
 OfMaterial = tuple[int, str, str, float]  # a scene's number, material and frame, and a value
 
 
-def score(
-    contender: Contender, references: Sequence[Episode], config: ErrorVsTimeConfig, device: torch.device
-) -> dict[str, Any]:
-    """The row without run times."""
-    steps = [contender.one_step(episode, config.frame_stride) for episode in references]
+def score(contender: Contender, references: Sequence[Episode], device: torch.device) -> dict[str, Any]:
+    """Returns the row without run times."""
+    steps = [contender.one_step(episode, FRAME_STRIDE) for episode in references]
     frames = len(references[0].position_TN3)
-    together = len(references) if contender.all_at_once else config.batch_scenes
+    together = len(references) if contender.all_at_once else BATCH_SCENES
     trials: list[RolloutResult] = []
     for first in range(0, len(references), together):
         trials += contender.trials(references[first : first + together], frames, None)
     row = contender.row | one_step_figures([step for step in steps if step is not None])
-    row |= rollout_figures(trials, references, config, device)
+    row |= rollout_figures(trials, references, device)
     known = [None if step is None else _rounded(step.error.mse) for step in steps]
     row["by_scene"] = ({"one-step MSE": {"0": known}} if any(v is not None for v in known) else {}) | row["by_scene"]
     return row
 
 
 def one_step_figures(steps: Sequence[OneStep]) -> dict[str, Any]:
-    """Errors over all scenes, by material, their quartiles over scenes, and the mean acceleration at rest."""
+    """Returns errors over all scenes and by material, quartiles over scenes, and the mean acceleration at rest."""
     if not steps:
         return {"one_step_mse": None, "one_step_quartiles": None, "one_step_by_material": None, "ghost": None}
     total = {name: sum(step.error.total.get(name, 0.0) for step in steps) for name in MATERIALS}
@@ -64,9 +63,9 @@ def one_step_figures(steps: Sequence[OneStep]) -> dict[str, Any]:
 
 
 def rollout_figures(
-    trials: Sequence[RolloutResult], references: Sequence[Episode], config: ErrorVsTimeConfig, device: torch.device
+    trials: Sequence[RolloutResult], references: Sequence[Episode], device: torch.device
 ) -> dict[str, Any]:
-    """Everything that rollouts tell; `curve` is the position MSE of each frame, none where no scene came so far."""
+    """Returns the figures of rollouts; `curve` is the position MSE of each frame, NaN if no scene reached it."""
     frames = len(references[0].position_TN3)
     mse_ST = np.full((len(trials), frames), np.nan)
 
@@ -85,20 +84,20 @@ def rollout_figures(
     reached_T = np.isfinite(mse_ST).sum(0)
     curve_T = mean_so_far(mse_ST)
     reported = sorted({frame for frame in (*REPORTED_FRAMES, frames - 1) if frame < frames})
-    told = [frame for frame in reported if reached_T[frame]]
+    shown = [frame for frame in reported if reached_T[frame]]
     failures = [trial for trial in trials if trial.cause is not None]
-    few = config.sinkhorn_scenes
-    sinkhorn = _sinkhorn(trials[:few], references[:few], reported, device)
+    few = trials[:SINKHORN_SCENES]
+    sinkhorn = _sinkhorn(few, references[:SINKHORN_SCENES], reported, device)
     row: dict[str, Any] = {
-        "position_mse": {str(frame): float(curve_T[frame]) for frame in told},
-        "position_quartiles": {str(frame): quartiles(mse_ST[:, frame]) for frame in told},
-        "position_by_material": _means(_position_mse(trials, references, told)),
+        "position_mse": {str(frame): float(curve_T[frame]) for frame in shown},
+        "position_quartiles": {str(frame): quartiles(mse_ST[:, frame]) for frame in shown},
+        "position_by_material": _means(_position_mse(trials, references, shown)),
         "curve": [float(f"{value:.4g}") for value in curve_T],
         "scenes_reached": {str(frame): int(reached_T[frame]) for frame in reported},
         "sinkhorn": _means(sinkhorn),
         "by_scene": {
-            "position MSE": {str(frame): [_rounded(value) for value in mse_ST[:, frame]] for frame in told},
-            "Sinkhorn": {str(frame): _by_scene(sinkhorn, str(frame), len(trials[:few])) for frame in told},
+            "position MSE": {str(frame): [_rounded(value) for value in mse_ST[:, frame]] for frame in shown},
+            "Sinkhorn": {str(frame): _by_scene(sinkhorn, str(frame), len(few)) for frame in shown},
         },
         "failed_scenes": len(failures),
         "first_failure_frame": min((trial.frame_count for trial in failures), default=None),
@@ -111,7 +110,7 @@ def rollout_figures(
 
 
 def table(rows: Sequence[Mapping[str, Any]]) -> str:
-    """The figures for people."""
+    """Returns a table of the rows."""
     frames = sorted({int(frame) for row in rows for frame in row.get("scenes_reached", {})})
     head = ["system", "ms", "batched", "one-step MSE", *(f"MSE at {frame}" for frame in frames), "Sinkhorn", "failed"]
     lines = []
@@ -125,7 +124,7 @@ def table(rows: Sequence[Mapping[str, Any]]) -> str:
 
 
 def label(row: Mapping[str, Any], setting: bool = True) -> str:
-    """A contender's name; without its `setting` that of all steps of a grid, or of all precisions of a network."""
+    """Returns a contender's name; without `setting` that of all steps of a grid, or of all precisions of a network."""
     match row["system"]:
         case "mpm":
             return f"MPM {row['grid']}³" + (f", step {row['step']:g}" if setting else "")
@@ -139,7 +138,7 @@ def label(row: Mapping[str, Any], setting: bool = True) -> str:
     return f"{row['system'].upper().replace('_', ' ')} {size} ({row['weights']})"
 
 
-# The same for every contender.
+# cached: the same for every contender
 @functools.lru_cache(maxsize=1024)
 def _reference_penetration(reference: Episode, frame: int) -> float:
     return share_inside(np.asarray(reference.position_TN3[frame]), obstacles_of_episode(reference))
@@ -148,8 +147,9 @@ def _reference_penetration(reference: Episode, frame: int) -> float:
 def _of_materials(
     trials: Sequence[RolloutResult], references: Sequence[Episode], frames: Sequence[int], most: int | None = None
 ) -> Iterator[tuple[int, str, str, np.ndarray, np.ndarray]]:
-    """The particles of each material at those frames that a scene reached: scene, material, frame, and where they are
-    in the rollout and the reference. At most so many, drawn alike: as near to the whole clouds as so few can be.
+    """Yields scene, material, frame, and the positions of its particles in rollout and reference.
+
+    Frames that a scene did not reach are left out. `most` limits the particles, which are drawn at random.
     """
     for scene, (trial, reference) in enumerate(zip(trials, references, strict=True)):
         for index in np.unique(reference.material_N):
@@ -181,7 +181,7 @@ def _sinkhorn(
 
 
 def _means(values: Iterable[OfMaterial]) -> dict[str, dict[str, float]]:
-    """Over the scenes that hold a material and reached a frame."""
+    """Averages over the scenes that contain a material and reached a frame."""
     of_frames: dict[str, dict[str, list[float]]] = {}
     for _, material, frame, value in values:
         of_frames.setdefault(material, {}).setdefault(frame, []).append(value)
@@ -189,7 +189,7 @@ def _means(values: Iterable[OfMaterial]) -> dict[str, dict[str, float]]:
 
 
 def _by_scene(values: Iterable[OfMaterial], frame: str, scenes: int) -> list[float | None]:
-    """The mean over materials of each scene; none for one that did not come so far."""
+    """Returns the mean over materials of each scene, None for a scene that did not reach the frame."""
     of_scenes: list[list[float]] = [[] for _ in range(scenes)]
     for scene, _, other, value in values:
         if other == frame:
@@ -202,7 +202,7 @@ def _rounded(value: float | np.floating[Any]) -> float | None:
 
 
 def quartiles(values: Sequence[float] | np.ndarray) -> list[float] | None:
-    """The first and the third of what is finite."""
+    """Returns the first and third quartile of the finite values."""
     finite = np.asarray(values, np.float64)
     finite = finite[np.isfinite(finite)]
     return [float(q) for q in np.percentile(finite, (25, 75))] if len(finite) else None

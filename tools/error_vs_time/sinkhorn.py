@@ -1,7 +1,7 @@
 """The debiased Sinkhorn divergence between two clouds of particles (Feydy et al. 2019).
 
-An optimal-transport distance that does not care which particle is which: small where a rollout looks right although no
-particle is where the reference has it. S(a, b) = OT(a, b) - OT(a, a) / 2 - OT(b, b) / 2, each with entropy blur².
+An optimal-transport distance that ignores the identity of particles: it is small if a rollout looks right although its
+particles are elsewhere than the reference's. S(a, b) = OT(a, b) - OT(a, a) / 2 - OT(b, b) / 2, each with entropy blur².
 Shape legend: B pairs of clouds, N, M particles.
 """
 
@@ -13,16 +13,16 @@ from collections.abc import Sequence
 import torch
 
 SCALING = 0.8  # the blur's ratio between steps, from the clouds' size down
-LARGEST = 10.0  # blur: float32 would round what larger ones find
+LARGEST = 10.0  # blur, for the precision of float32
 FINAL_STEPS = 20  # at the last blur
 ENTRIES_AT_ONCE = 1 << 26  # of costs
 
 
 def sinkhorn_divergences(pairs: Sequence[tuple[torch.Tensor, torch.Tensor]], blur: float) -> list[float]:
-    """Of each pair the mean squared distance that mass has to move. NaN where positions are not finite.
+    """Returns the mean squared distance that mass has to move, for each pair; NaN if positions are not finite.
 
-    Zero for equal clouds, the square of the shift for a shifted one. `blur` is the length below which matter may be
-    mixed up. Costs memory and time of N x M; pairs of equal numbers of particles are taken at once.
+    Zero for equal clouds, the square of the shift for a shifted one. `blur` is the length below which clouds are not
+    distinguished. Needs memory and time of N x M; pairs of equal numbers of particles are computed together.
     """
     divergences = [math.nan] * len(pairs)
     of_size: dict[tuple[int, int], list[int]] = {}
@@ -50,7 +50,7 @@ def _divergences(first_BN3: torch.Tensor, second_BM3: torch.Tensor, blur: float)
 
 
 def _blurs(size: float, blur: float) -> list[float]:
-    """From the clouds' size down, which finds the optimum sooner, and then at the last."""
+    """Returns decreasing blurs from the size of the clouds, which converge sooner, and FINAL_STEPS of the last."""
     steps = max(0, math.ceil(math.log(blur / size) / math.log(SCALING))) if blur < size else 0
     return [size * SCALING**k for k in range(steps)] + [blur] * FINAL_STEPS
 
@@ -59,7 +59,7 @@ def _potentials(cost_BNM: torch.Tensor, blurs: Sequence[float]) -> tuple[torch.T
     f_BN, g_BM = cost_BNM.new_zeros(cost_BNM.shape[:2]), cost_BNM.new_zeros(cost_BNM.shape[0], cost_BNM.shape[2])
     turned_BMN = cost_BNM.transpose(1, 2)
     for blur in blurs:
-        # Both from the old ones, averaged: symmetric in the clouds, and it does not oscillate.
+        # both from the old potentials, averaged: symmetric in the clouds, without oscillation
         next_f_BN, next_g_BM = _soft_minimum(cost_BNM, g_BM, blur), _soft_minimum(turned_BMN, f_BN, blur)
         f_BN, g_BM = 0.5 * (f_BN + next_f_BN), 0.5 * (g_BM + next_g_BM)
     return _soft_minimum(cost_BNM, g_BM, blurs[-1]), _soft_minimum(turned_BMN, f_BN, blurs[-1])
@@ -79,5 +79,5 @@ def _soft_minimum(cost_BNM: torch.Tensor, g_BM: torch.Tensor, blur: float) -> to
 
 
 def _squared(first_BN3: torch.Tensor, second_BM3: torch.Tensor) -> torch.Tensor:
-    # By differences: as a matrix product it would round in TF32.
+    # by differences: a matrix product would be rounded to TF32
     return torch.cdist(first_BN3, second_BM3, compute_mode="donot_use_mm_for_euclid_dist").square()

@@ -1,4 +1,4 @@
-"""The run times of contenders, all on the same scenes in one process."""
+"""Run times of contenders, all on the same scenes in one process."""
 
 from __future__ import annotations
 
@@ -11,53 +11,45 @@ import torch
 from hgn.scene.episode import Episode
 from tools.error_vs_time.contenders import Contender, frame_milliseconds
 from tools.error_vs_time.score import quartiles
-from tools.error_vs_time.settings import ErrorVsTimeConfig
 from tools.timing import GpuMemory
 
-WARM_FRAMES, TRITON_WARM_FRAMES = 6, 70  # the least that a contender is timed over, too
-SOLVER_WARM_FRAMES = 2  # the initial state and the first, in which the solver compiles
-GAIN = 0.95  # of a scene's time, that a larger batch must come below
+SCENES = 3  # timed one by one
+BATCHES = (8, 64, 256)  # scenes side by side, of which each contender takes its best
+FRAMES, SECONDS = 100, 0.5  # of each timed rollout, at most; slow contenders simulate fewer frames
+SOLVER_FRAMES = 300  # the solver's frames are slowest when material has landed
+WARM_FRAMES, TRITON_WARM_FRAMES = 6, 70  # also the least number of timed frames; Triton reports 32 frames at once
+SOLVER_WARM_FRAMES = 2  # the solver compiles in the first frame
+GAIN = 0.95  # of a scene's time, below which a larger batch is better
 
 
 class Stopwatch:
-    """The run times of a contender over some scenes one by one and over some side by side, which are warmed up once."""
+    """Measures a contender on some scenes one by one, and side by side."""
 
-    def __init__(
-        self, contender: Contender, references: Sequence[Episode], config: ErrorVsTimeConfig, device: torch.device
-    ) -> None:
-        """Simulates one scene and batches for some frames, which say how many take `timed_seconds`, and which batch
-        is done soonest; then all that will be timed, as far as something is captured or compiled for it. Tells the
-        most GPU memory that the first scene took, of what torch knows. The solver is timed over whole rollouts.
-        """
-        # The largest first: what is captured for it has room for the others.
-        some = sorted(references[: config.timed_scenes], key=lambda episode: -len(episode.material_N))
+    def __init__(self, contender: Contender, references: Sequence[Episode], device: torch.device) -> None:
+        """Warms up everything that is timed, and chooses the number of frames and the batch."""
+        some = sorted(references[:SCENES], key=lambda episode: -len(episode.material_N))  # the largest allocates most
         self.contender, self.singles = contender, [[episode] for episode in some]
         self.single_ms: list[float] = []
         self.batched_ms: list[float] = []
         contender.release()
         memory, largest = GpuMemory(device), self.singles[0]
         self.solver = contender.row["system"] == "mpm"
-        most = config.mpm_timed_frames if self.solver else config.timed_frames
-        most = min(most, len(largest[0].position_TN3))
+        most = min(SOLVER_FRAMES if self.solver else FRAMES, len(largest[0].position_TN3))
         if self.solver:
-            for scenes in self.singles:  # kernels are compiled for the materials that a scene holds
+            for scenes in self.singles:  # each set of materials is another kernel
                 frame_milliseconds(contender, scenes, min(SOLVER_WARM_FRAMES, most))
-        # what looks at its frames 32 at a time tells nothing of fewer
         frames = min(WARM_FRAMES if contender.stepped else TRITON_WARM_FRAMES, most)
         captures = not contender.stepped
-        if captures:  # which would be taken for the time of a frame
+        if captures:
             frame_milliseconds(contender, largest, frames)
         taken = frame_milliseconds(contender, largest, frames)
         self.memory_gb = None if self.solver else memory.peak_gb()
-        # the scenes again and again where a batch holds more
-        counts = sorted(config.timed_batches)
-        batches = [[references[i % len(references)] for i in range(count)] for count in counts]
-        self.batch, together = self._best_batch(batches, frames, self.solver or captures)
+        self.batch, together = self._best_batch(references, frames, self.solver or captures)
 
         def affordable(milliseconds: float | None) -> int:
             if milliseconds is None or self.solver:
                 return most
-            return min(most, max(frames, int(1e3 * config.timed_seconds / milliseconds)))
+            return min(most, max(frames, int(1e3 * SECONDS / milliseconds)))
 
         self.single_frames, self.batch_frames = affordable(taken), affordable(together)
         if captures:
@@ -66,13 +58,12 @@ class Stopwatch:
             frame_milliseconds(contender, self.batch, self.batch_frames)
 
     def _best_batch(
-        self, batches: Sequence[list[Episode]], frames: int, compiles: bool
+        self, references: Sequence[Episode], frames: int, compiles: bool
     ) -> tuple[list[Episode], float | None]:
-        """The batch whose scenes are done soonest, and the milliseconds of its frames: larger ones are tried as long as
-        they gain and there is memory.
-        """
-        best, least = batches[0], None
-        for batch in batches:
+        """Returns the batch with the shortest time a scene, and the milliseconds of its frames."""
+        best, least = list(references[:1]), None
+        for count in BATCHES:
+            batch = [references[i % len(references)] for i in range(count)]
             try:
                 if compiles:
                     frame_milliseconds(self.contender, batch, frames)
@@ -86,11 +77,9 @@ class Stopwatch:
         return best, least
 
     def round(self) -> dict[str, Any]:
-        """Simulates each of the scenes once more; what the report tells of all times so far. `ms` is a frame of one
-        scene, `ms_batched` a frame of each of the scenes side by side.
-        """
+        """Simulates each scene once more; returns `ms` of a frame and `ms_batched` of a frame and scene."""
         rollouts = [(scenes, self.single_frames, self.single_ms) for scenes in self.singles]
-        if not (self.solver and self.batched_ms):  # a whole rollout of many scenes, once
+        if not (self.solver and self.batched_ms):  # a whole rollout of many scenes is timed once
             rollouts.append((self.batch, self.batch_frames, self.batched_ms))
         for scenes, frames, milliseconds in rollouts:
             taken = frame_milliseconds(self.contender, scenes, frames)

@@ -1,6 +1,6 @@
 """python -m tools.scaling [--json FILE]: weak scaling of training on this machine's devices.
 
-Prints no time of what fails its check. The JSON holds {"meta": provenance, "rows"}.
+A contender is timed only if it passes its check. The JSON contains {"meta": provenance, "rows"}.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ from tools.bench.contenders import OBSTACLE_CELL_SIZE
 from tools.report import EXIT_RED, PASS
 from tools.scaling.measure import ScalingConfig, measure
 
-CELL_FRACTION = 0.3  # cells of the finest level for each particle of tools.bench.states, about
+CELL_FRACTION = 0.3  # cells of the finest level per particle of tools.bench.states, about
 
 
 def main(mapping: dict[str, Any]) -> int:
-    """Prints tables, and writes JSON where asked to; the exit code is 1 where a check is red."""
+    """Prints a table, and writes JSON if asked to; the exit code is 1 if a check fails."""
     config = from_mapping(ScalingConfig, mapping)
     device_type, count = devices(config)
     _compile_ahead(config, device_type, count)
@@ -42,7 +42,7 @@ def main(mapping: dict[str, Any]) -> int:
 
 
 def devices(config: ScalingConfig) -> tuple[str, int]:
-    """(kind of device, how many processes). Raises: ConfigError when there are not as many GPUs."""
+    """Returns the kind of device and the number of processes. Raises: ConfigError if there are fewer GPUs."""
     gpus = torch.cuda.device_count() if torch.cuda.is_available() else 0
     if config.device == "cpu" or (config.device == "auto" and gpus == 0):
         return "cpu", config.devices or 2
@@ -53,7 +53,7 @@ def devices(config: ScalingConfig) -> tuple[str, int]:
 
 
 def _compile_ahead(config: ScalingConfig, device_type: str, count: int) -> None:
-    """Fills Triton's cache: one process after the other would compile for minutes."""
+    """Fills Triton's cache, because each process would compile for minutes."""
     if device_type == "cpu" or "triton" not in config.backends or torch.version.hip is not None:
         return
     # Triton, which backend torch does without, is loaded here.
@@ -73,7 +73,7 @@ def _compile_ahead(config: ScalingConfig, device_type: str, count: int) -> None:
 
 
 def with_efficiency(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Adds each row's particles per second and device, against one device alone with the same kind of scenes."""
+    """Adds each row's particles per second and device, relative to a single device with the same kind of scenes."""
     rates = [row["particles_per_update"] / row["ms"] if row["ms"] else None for row in rows]
     kinds = [(row["backend"], row["particle_spread"]) for row in rows]
     alone = {kind: rate for row, kind, rate in zip(rows, kinds, rates, strict=True) if row["devices"] == 1}
@@ -84,7 +84,7 @@ def with_efficiency(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def table(rows: list[dict[str, Any]]) -> str:
-    """The figures for people."""
+    """Returns a table of the rows."""
     work = ("backend", "precision", "devices", "scenes", "particle_spread")
     lines = []
     for row in rows:

@@ -1,7 +1,7 @@
-"""The processes that are timed: one for each device, training together in different numbers, in turns.
+"""The timed processes: one for each device; different numbers of them train together in turns.
 
-What is timed is the update of a training on several ranks: noise, jitter, grid, forward, backward, the gradients'
-average, Adam. Not in it: Lightning, log lines and the reading of data.
+An update on several ranks is timed: noise, jitter, grid, forward, backward, the gradients' average, Adam. Lightning,
+logging and reading of data are not included.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from hgn.data.batch import Batch
 from hgn.data.sampler import balanced_parts
 from hgn.runtime.backend import set_matmul_precision, triton_unsupported_reason
 from hgn.runtime.parity import relative_error
-from hgn.schema import NonNegative, OneOrMore, Positive, require, require_bounds
+from hgn.schema import OneOrMore, Positive, require, require_bounds
 from hgn.system.machine import available_cpus
 from hgn.training.distributed import averaging_options
 from hgn.training.gradients import GradientGuard
@@ -37,32 +37,31 @@ from tools.bench.contenders import bench_network, training_module
 from tools.bench.states import Workload, batch_of_scenes
 from tools.bench.triton_contenders import device_samples, triton_updates
 from tools.report import PASS
-from tools.timing import Timed, alternate, median_and_quartiles
+from tools.timing import Timed, alternate, statistics
 
-# Relative error of the averaged gradients, of their norm. Looser than rounding: on a GPU sums are taken in another
-# order each time, which turns the activations that lie next to their kink, and TF32 makes more of it.
+# Relative error of the averaged gradients. Larger than rounding: the order of sums on a GPU varies, which flips
+# activations next to their kink, and TF32 amplifies it.
 GRADIENT_BOUND = 2e-2
 WARM_UPDATES = 3
+SPREAD = 0.17  # standard deviation of a scene's particles, as a fraction of the mean, in the paper's random scenes
 PATIENCE = datetime.timedelta(minutes=2)
 
 
 @dataclass(frozen=True)
 class ScalingConfig:
-    """`python -m tools.scaling`: how training is timed on several devices of this machine."""
+    """The options of `python -m tools.scaling`."""
 
-    devices: OneOrMore | None = None  # at most; none: all GPUs, or two processes on a CPU
+    devices: OneOrMore | None = None  # largest number; null: all GPUs, or two processes on a CPU
     scenes: OneOrMore = 8  # on each device
-    particles: OneOrMore = 4_296  # of a scene
-    # of a scene's particles, standard deviation as a fraction of the mean; the paper's random scenes: 0.17
-    particle_spread: NonNegative[float] = 0.17
-    batches: OneOrMore = 8  # of each device; one sample is an update on each of them
-    backends: tuple[str, ...] = ("torch", "triton")  # of training; triton where there are GPUs
-    precision: Precision = "tf32"  # as for training; or fp32, fp16 (where backend torch takes tf32)
-    network: NetworkConfig = field(default_factory=NetworkConfig)
+    particles: OneOrMore = 4_296  # of a scene, on average
+    batches: OneOrMore = 8  # of each device; a sample is one update on each batch
+    backends: tuple[str, ...] = ("torch", "triton")  # of training; triton is skipped without GPUs
+    precision: Precision = "tf32"  # or fp32, fp16 (backend triton; backend torch then takes tf32)
+    network: NetworkConfig = field(default_factory=NetworkConfig)  # that is trained
     rounds: Positive[int] = 20  # samples of each contender
-    seconds: Positive[float] = 30.0  # at most for all contenders, once five rounds are done
+    seconds: Positive[float] = 30.0  # time limit of all contenders, after five rounds
     device: str = "auto"  # or cpu, cuda
-    json: str | None = None  # also write the rows to this file; --json FILE does the same
+    json: str | None = None  # file for the rows; --json FILE does the same
 
     def __post_init__(self) -> None:
         require_bounds(self)
@@ -74,22 +73,22 @@ class ScalingConfig:
 
 @dataclass
 class Contender(Timed):
-    """Some of the devices training at the same time, together or each for itself."""
+    """Some of the devices, which train at the same time, together or independently."""
 
     backend: str  # torch or triton
     devices: int
     averaged: bool
     spread: float  # of the particles of a scene
     particles: float  # of one update, on each device, in the mean
-    one_graph: bool = False  # with the gradients' average in the CUDA graph of the update
-    update: TorchUpdates | TritonUpdates | None = None  # none in processes that take no part
+    one_graph: bool = False  # the gradients' average is in the CUDA graph of the update
+    update: TorchUpdates | TritonUpdates | None = None  # None in processes that only wait
     check: str = PASS
     messages: list[int] = field(default_factory=list)
     milliseconds: list[float] = field(default_factory=list)  # of one update
     batches: int = 1  # updates of one sample
 
     def sample(self) -> float:
-        """Of the slowest rank; the others wait, and so do those that take no part."""
+        """Returns the milliseconds of the slowest rank; all others wait."""
         taken = torch.zeros(1)
         dist.barrier()
         if self.update is not None:
@@ -103,7 +102,7 @@ class Contender(Timed):
 
 
 class TorchUpdates:
-    """Training updates of one rank on batches that lie on its device, with autograd."""
+    """Training updates of one rank by autograd, on batches on its device."""
 
     def __init__(self, config: ScalingConfig, batches: list[Batch], device: torch.device) -> None:
         self.batches, self.device = batches, device
@@ -114,17 +113,17 @@ class TorchUpdates:
         self.parameters = list(module.network.parameters())
 
     def average(self, group: dist.ProcessGroup, one_graph: bool = False) -> list[int]:
-        """From now on gradients are averaged over the ranks of `group`; the bytes of the messages that this takes."""
+        """Averages gradients over the ranks of `group` from now on; returns the bytes of the messages."""
         messages: list[int] = []
 
-        # torch reads annotations, and takes none for right but not those that are strings
+        # no annotations: torch would read them, and refuse strings
         def hook(state, bucket):  # type: ignore[no-untyped-def]
             messages.append(bucket.buffer().nbytes)
             return allreduce_hook(group, bucket)
 
         probe = _averaged(copy.deepcopy(self.loss), group, self.device)
         probe.register_comm_hook(None, hook)
-        for _ in range(2):  # after the first pass the messages follow the order in which gradients came
+        for _ in range(2):  # after the first pass messages follow the order of gradients
             messages.clear()
             probe.zero_grad()
             probe(self.batches[0]).backward()
@@ -140,7 +139,7 @@ class TorchUpdates:
             self.optimizer.step()
 
     def gradients(self) -> torch.Tensor:
-        """Those of the first batch, averaged if so."""
+        """Returns the gradients of the first batch."""
         self.optimizer.zero_grad()
         self.loss(self.batches[0]).backward()
         return torch.cat([p.grad.flatten() for p in self.parameters if p.grad is not None])
@@ -150,7 +149,7 @@ class TorchUpdates:
 
 
 class TritonUpdates:
-    """The same with hgn.kernels.update, on episodes of one window each."""
+    """Training updates of one rank by hgn.kernels.update, on episodes of one window."""
 
     def __init__(self, config: ScalingConfig, batches: list[Batch], device: torch.device) -> None:
         network = bench_network(config.network, device)
@@ -160,7 +159,7 @@ class TritonUpdates:
         self.rates = [TrainingConfig.learning_rate] * len(self.chunk)
 
     def average(self, group: dist.ProcessGroup, one_graph: bool = False) -> list[int]:
-        """From now on gradients are averaged over the ranks of `group`; the bytes of the messages that this takes."""
+        """Averages gradients over the ranks of `group` from now on; returns the bytes of the messages."""
         messages: list[int] = []
 
         def reduce(tensor: torch.Tensor) -> None:
@@ -176,7 +175,7 @@ class TritonUpdates:
         self.ours.run(self.chunk, self.rates)
 
     def gradients(self) -> torch.Tensor:
-        """Those of the first batch, averaged if so; from Adam's first moment, which it moves by a tenth of them."""
+        """Returns the gradients of the first batch, from Adam's first moment, to which a tenth of them is added."""
         before = self.ours.first_moment.clone()
         self.ours.run(self.chunk[:1], [0.0])
         return (self.ours.first_moment - 0.9 * before) * 10
@@ -186,7 +185,7 @@ class TritonUpdates:
 
 
 class _Loss(nn.Module):
-    """The loss as a forward pass, which is where DistributedDataParallel begins."""
+    """The loss as a forward pass, as DistributedDataParallel requires."""
 
     def __init__(self, module: TrainingModule) -> None:
         super().__init__()
@@ -197,14 +196,14 @@ class _Loss(nn.Module):
 
 
 def measure(rank: int, count: int, config: ScalingConfig, device_type: str, folder: Path) -> None:
-    """One of `count` processes; the first writes FOLDER/rows.json. Raises in all of them when one of them fails."""
+    """Runs one of `count` processes; the first writes FOLDER/rows.json. If one fails, all raise."""
     device = torch.device(device_type, rank) if device_type == "cuda" else torch.device(device_type)
     if device.type == "cuda":
         torch.cuda.set_device(device)
     else:
         torch.set_num_threads(max(1, available_cpus() // count))
     set_matmul_precision(_torch_precision(config, device))
-    # all processes talk through this group when nothing is timed; it leaves the devices alone
+    # processes communicate through this group while nothing is timed, without the devices
     dist.init_process_group(
         "gloo", init_method=f"file://{folder / 'store'}", rank=rank, world_size=count, timeout=PATIENCE
     )
@@ -228,7 +227,7 @@ def measure(rank: int, count: int, config: ScalingConfig, device_type: str, fold
 
 
 def _torch_precision(config: ScalingConfig, device: torch.device) -> str:
-    """Backend torch has no fp16, and a CPU no TF32."""
+    """Returns the precision of backend torch, which has no fp16; a CPU has no TF32."""
     return "tf32" if device.type == "cuda" and config.precision != "fp32" else "fp32"
 
 
@@ -237,7 +236,7 @@ def _contenders(config: ScalingConfig, sizes: list[int], device: torch.device) -
     for backend in config.backends:
         if backend == "triton" and triton_unsupported_reason(device, config.network, config.precision):
             continue
-        for size, averaged, spread in itertools.product(sizes, (False, True), sorted({0.0, config.particle_spread})):
+        for size, averaged, spread in itertools.product(sizes, (False, True), (0.0, SPREAD)):
             if averaged == (size > 1) or (not averaged and spread == 0):
                 particles = float(_particles(config, size, spread).sum(-1).mean())
                 for one_graph in (False, True) if backend == "triton" and averaged else (False,):
@@ -248,7 +247,7 @@ def _contenders(config: ScalingConfig, sizes: list[int], device: torch.device) -
 
 
 def _particles(config: ScalingConfig, ranks: int, spread: float) -> np.ndarray:
-    """Of each scene of the updates of so many ranks, int64 [batches, ranks, scenes]; balanced as in a training."""
+    """Returns the particles of each scene, balanced over ranks as in training, int64 [batches, ranks, scenes]."""
     normal = np.stack(
         [np.random.default_rng([rank, 7]).standard_normal((config.batches, config.scenes)) for rank in range(ranks)], 1
     )
@@ -257,7 +256,7 @@ def _particles(config: ScalingConfig, ranks: int, spread: float) -> np.ndarray:
 
 
 def _batches(config: ScalingConfig, rank: int, ranks: int, spread: float, device: torch.device) -> list[Batch]:
-    """This rank's scenes of each update, which no other rank has."""
+    """Returns this rank's scenes of each update."""
     counts = _particles(config, ranks, spread)[:, rank].tolist()
     return [
         batch_of_scenes(
@@ -285,7 +284,7 @@ def _averaged(loss: nn.Module, group: dist.ProcessGroup, device: torch.device) -
 
 
 def _average(contender: Contender, group: dist.ProcessGroup) -> None:
-    """Lets gradients be averaged, and checks them against the mean of each rank's own."""
+    """Starts averaging gradients, and compares them with the mean of the ranks' own."""
     assert contender.update is not None
     expected = contender.update.gradients().clone()
     dist.all_reduce(expected, group=group)
@@ -297,7 +296,7 @@ def _average(contender: Contender, group: dist.ProcessGroup) -> None:
 
 
 def _check_weights(contender: Contender, groups: dict[int, dist.ProcessGroup], rank: int) -> None:
-    """After the timed updates the weights must be the same, bit for bit, on all ranks."""
+    """Checks that parameters are bitwise equal on all ranks after the timed updates."""
     if contender.update is not None and contender.averaged:
         weights = contender.update.weights()
         first = weights.clone()
@@ -308,18 +307,18 @@ def _check_weights(contender: Contender, groups: dict[int, dist.ProcessGroup], r
 
 
 def _agree(contender: Contender) -> None:
-    """Every process gets the first reason that one of them has."""
+    """Shares the first failed check with all processes."""
     checks: list[Any] = [None] * dist.get_world_size()
     dist.all_gather_object(checks, contender.check)
     contender.check = next((check for check in checks if check != PASS), PASS)
 
 
 def _until(seconds: float) -> Callable[[], bool]:
-    """Whether so many seconds are over, as the first rank has it."""
-    begun, over = time.monotonic(), torch.zeros(1)
+    """Returns a function that says, on all ranks alike, whether the seconds are over."""
+    started, over = time.monotonic(), torch.zeros(1)
 
     def is_over() -> bool:
-        over.fill_(float(time.monotonic() - begun > seconds))
+        over.fill_(float(time.monotonic() - started > seconds))
         dist.broadcast(over, 0)
         return bool(over)
 
@@ -344,5 +343,5 @@ def _row(contender: Contender, config: ScalingConfig, device: torch.device) -> d
         "ms": None,
     }
     if contender.check == PASS:
-        row |= median_and_quartiles(contender.milliseconds)
+        row |= statistics(contender.milliseconds)
     return row

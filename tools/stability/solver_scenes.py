@@ -1,4 +1,4 @@
-"""Blocks and single particles above the floor of a domain of one unit, and what is measured of them.
+"""Blocks above the floor of a domain of one unit, and their measures.
 
 Shape legend: T frames, N particles.
 """
@@ -28,38 +28,38 @@ def block(
     seed: int = 0,
     **more: Any,
 ) -> Scene:
-    """A box of particles at random places, eight a cell; corner and size in cells of the default grid."""
+    """Returns a box of particles at random places, eight a cell; corner and size are in cells of the default grid."""
     return filled(material, (random_places(size_cells, seed) + np.asarray(low_cells)) * CELL, velocity, **more)
 
 
 def positions(outcome: Simulated | SceneFailure) -> np.ndarray:
-    """A scene's trajectory, float32 [T, N, 3]. Raises: RuntimeError where the solver stopped it."""
+    """Returns a scene's trajectory, float32 [T, N, 3]. Raises: RuntimeError if the solver stopped it."""
     if isinstance(outcome, SceneFailure):
         raise RuntimeError(f"a scene was stopped: {outcome.cause}")
     return outcome.position_TN3
 
 
 def rms_speed(path_TN3: np.ndarray, rate_hz: float) -> float:
-    """Root mean square over the particles and frames given, domain units a second."""
+    """Returns the root mean square speed over particles and frames, domain units per second."""
     return float(np.sqrt((np.diff(path_TN3.astype(np.float64), axis=0) ** 2).sum(axis=2).mean())) * rate_hz
 
 
 def thickness_cells(position_N3: np.ndarray) -> float:
-    """From the lowest to the highest particle, twentieths at each end left out."""
+    """Returns the height between the 0.05 and 0.95 quantiles."""
     low, high = np.quantile(position_N3[:, 1], (0.05, 0.95))
     return float(high - low) / CELL
 
 
 def height_cells(position_N3: np.ndarray) -> float:
-    """How high above the last node of the floor's walls the uppermost twentieth begins."""
+    """Returns the 0.95 quantile of heights above the last node of the floor."""
     return float(np.quantile(position_N3[:, 1], 0.95)) / CELL - (FLOOR_CELLS - 1)
 
 
 def centre_cells(position_N3: np.ndarray) -> float:
-    """The centre's height above the last node of the floor's walls."""
+    """Returns the mean height above the last node of the floor."""
     return float(position_N3[:, 1].mean()) / CELL - (FLOOR_CELLS - 1)
 
 
 def front_cells(position_N3: np.ndarray) -> float:
-    """How far from the last wall node the foremost hundredth begins."""
+    """Returns the 0.99 quantile of distances from the last wall node."""
     return float(np.quantile(position_N3[:, 0], 0.99)) / CELL - (FLOOR_CELLS - 1)

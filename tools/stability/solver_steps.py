@@ -1,17 +1,17 @@
 """The largest stable step, measured against the formula dt = dx sqrt(rho / (3 lambda + 2 mu)).
 
-A single particle is the stability limit: its own stress meets no neighbour's resistance. One that bounces off the
-floor keeps a strain afterwards, which oscillates without end at a stable step and grows at an unstable one. Plastic
-flow hides the growth (stretched sand bears no stress, snow yields), so the formula is measured on water and on an
-elastic solid; sand and snow themselves are measured as blocks pressed into a corner, which bear more.
+A single particle has the smallest limit: no neighbour resists its stress. After a bounce off the floor its strain
+oscillates at a stable step and grows at an unstable one. Plastic flow hides the growth, so single particles are water
+or an elastic solid. Sand and snow are blocks pressed into a corner, which remain stable at larger steps.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import math
-from dataclasses import dataclass
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -31,32 +31,24 @@ FACTORS = (0.5, 0.8, 0.9, 0.94, 0.97, 1.0, 1.03, 1.06, 1.1, 1.3, 1.7)  # of the 
 SOLID_FACTORS = (0.5, 0.8, 1.0, 1.3, 1.7, 2.2, 3.0)
 SUBSTEPS, FRAMES = 50, 21  # a frame
 WITHIN = 0.06  # of the formula; the factors lie 3 % apart
-FASTER = 1.5  # times the speed of impact: energy from nowhere
+FASTER = 1.5  # times the speed of impact: a sign of instability
 
 
-@dataclass(frozen=True)
-class Point:
-    """One simulation of the picture."""
-
-    case: str
-    stiffness: float  # times the default
-    step_s: float
-    factor: float  # of the formula
-    stable: bool
+Point = dict[str, Any]  # a simulation of the picture
+POINT = ("case", "stiffness", "step_s", "factor", "stable")  # stiffness times the default, factor of the formula
 
 
 def formula(config: MpmConfig, material: int) -> float:
-    """The single-particle limit of unhardened material, s."""
+    """Returns the largest stable step of a single particle of unhardened material, s."""
     shear, bulk = lame_parameters(config)
     return CELL * math.sqrt(config.density_kg_m3 / (3 * bulk + (2 * shear if material != WATER else 0.0)))
 
 
-def largest_steps(base: MpmConfig, points: list[Point]) -> list[Row]:
-    """A row for each material and stiffness; all simulations behind them are added to `points`."""
-    rows = []
+def largest_steps(base: MpmConfig, points: list[Point]) -> Iterator[Row]:
+    """Yields a row for each material and stiffness, and adds its simulations to `points`."""
     for stiffness in STIFFNESS:
         modulus = base.youngs_modulus_pa * stiffness
-        # speeds like the speed of sound, so that the same strains arise
+        # speeds proportional to the speed of sound, so that strains are the same
         speed = math.sqrt(stiffness)
         config = dataclasses.replace(base, youngs_modulus_pa=modulus, time_step="fixed")
         cases = (
@@ -73,30 +65,29 @@ def largest_steps(base: MpmConfig, points: list[Point]) -> list[Row]:
                 # a frame of whole steps; the margin keeps rounding from adding one
                 outcomes = simulate(scenes, own, FRAMES, (1 + 1e-9) / (SUBSTEPS * step))
                 unstable = list(filter(None, map(_sign, outcomes, scenes)))
-                points.append(Point(name, stiffness, step, factor, not unstable))
+                points.append(dict(zip(POINT, (name, stiffness, step, factor, not unstable), strict=True)))
                 if unstable:
                     where = f"in {len(unstable)} of {len(scenes)} scenes: {max(unstable)}"
                     beyond = f"at {factor:g} times the formula, {where}"
                     break
                 measured = step
             held = abs(measured / limit - 1) <= WITHIN if name.startswith("single") else measured >= limit
-            rows.append(Row(f"largest step, {name}, stiffness x{stiffness:g}", limit, measured, held, beyond))
-    return rows
+            yield Row(f"largest step, {name}, stiffness x{stiffness:g}", limit, measured, held, beyond)
 
 
 def _sign(outcome: Simulated | SceneFailure, scene: Scene) -> str:
-    """What tells that the step was unstable; empty where nothing does."""
+    """Returns the sign of an unstable step, or an empty string."""
     if isinstance(outcome, SceneFailure):
         return f"stopped, {outcome.cause}"
     if outcome.counters["water_volume_floors"] or outcome.counters["singular_value_floors"]:
-        return "the particle's strain grows to its floor"
+        return "the particle's strain grows to its bound"
     if outcome.counters["largest_speed"] > FASTER * float(np.linalg.norm(scene.velocity_N3, axis=1).max()):
-        return "faster than it came"
+        return "faster than at the impact"
     return ""
 
 
 def _singles(material: int, speed: float) -> list[Scene]:
-    """One particle a scene, at 24 places within a cell, about to touch the floor; without gravity."""
+    """Returns scenes of one particle about to touch the floor, at 24 places within a cell, without gravity."""
     places = [(x, y, z) for x in (0, 0.25, 0.5) for y in (0, 0.25, 0.5, 0.75) for z in (0, 0.25)]
     above = [CELL * (np.array([[32, 2.75, 32]]) + place) for place in places]
     return [filled(material, place, (0, -speed, 0), cell_size=CELL, gravity=(0.0, 0.0, 0.0)) for place in above]
@@ -108,19 +99,19 @@ def _corner(material: int, speed: float) -> list[Scene]:
 
 
 def draw(points: list[Point], base: MpmConfig, file: Path) -> None:
-    """Stable and unstable steps over the stiffness, with the formula as a line, as PNG."""
-    cases = list(dict.fromkeys(point.case for point in points))
+    """Plots stable and unstable steps over the stiffness, with the formula as a line."""
+    cases = list(dict.fromkeys(point["case"] for point in points))
     figure, (axes,) = new_figure(1, len(cases), (3.4 * len(cases), 3.6), share_y=True)
     stiffness = np.geomspace(min(STIFFNESS) / 1.6, max(STIFFNESS) * 1.6)
     for axis, case in zip(axes, cases, strict=True):
-        own = [point for point in points if point.case == case]
+        own = [point for point in points if point["case"] == case]
         for stable, marker, color in ((True, "o", "#2a7f62"), (False, "x", "#b3402a")):
-            xy = [(point.stiffness, 1e3 * point.step_s) for point in own if point.stable == stable]
+            xy = [(p["stiffness"], 1e3 * p["step_s"]) for p in own if p["stable"] == stable]
             label = "stable" if stable else "unstable"
             axis.plot([x for x, _ in xy], [y for _, y in xy], marker, color=color, label=label, markersize=5)
-        limit = 1e3 * own[0].step_s / own[0].factor * np.sqrt(own[0].stiffness / stiffness)
+        limit = 1e3 * own[0]["step_s"] / own[0]["factor"] * np.sqrt(own[0]["stiffness"] / stiffness)
         axis.plot(stiffness, limit, "-", color="#39424e", label="formula")
-        axis.plot(stiffness, limit * base.stability_fraction, "--", color="#39424e", label="the solver's own step")
+        axis.plot(stiffness, limit * base.stability_fraction, "--", color="#39424e", label="the solver's step")
         axis.set(xscale="log", yscale="log", title=case, xlabel="Young's modulus, times 1 MPa")
     axes[0].set_ylabel("step, ms")
     axes[0].legend(fontsize=8)

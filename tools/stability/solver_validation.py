@@ -1,18 +1,16 @@
-"""Against published experiments: a dam that breaks, columns of sand that collapse, and the angle at which sand rests.
+"""Published experiments: dam breaks, collapsing columns of sand, and the angle of repose.
 
-Walls stand at the last node that stops motion, number 2 (and three from the other end): material fills its basin to
-there, as what is left open is filled by creeping. Floors of sand are sheets. Those of columns bear by friction what the
-sand itself bears in simple shear, for a rougher floor shears the sand above it: with more the grid's lowest cell,
-which moves as one, would be braked by more than sand can be.
+Walls stand at the last node that stops motion, number 2 (and three from the other end). Material fills its basin up to
+them, because it would creep into a gap. Sand lies on sheets. The friction of a column's floor is what sand bears in
+simple shear: a rougher floor would brake the lowest cells by more than sand can bear.
 Shape legend: T frames, N particles.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -27,7 +25,7 @@ from tools.stability.row import Row, within
 from tools.stability.solver_scenes import positions, rms_speed
 
 GRAVITY = 9.8
-WALL = 2.0  # cells: the last wall node; what lies beyond cannot move
+WALL = 2.0  # cells: the last wall node, beyond which nothing moves
 FAR_WALL = 3.0  # from the end of the domain
 SLAB = 3  # cells, the thinnest that fits between walls
 
@@ -35,14 +33,14 @@ SLAB = 3  # cells, the thinnest that fits between walls
 DAM = np.array(
     [(0.832, 1.217), (1.219, 1.474), (1.997, 2.292), (2.547, 2.995), (3.345, 4.134), (4.034, 4.944), (4.418, 5.881)]
 )
-DAM_WIDTH = 0.2  # m: of a free surface at a speed of sound of 17 m/s
+DAM_WIDTH = 0.2  # m: slow flow at a speed of sound of 17 m/s
 DAM_CELLS = (8, 16)
-DAM_ROOM = 8  # widths
-DAM_DEPTH = 1 / 16  # of the width: where water is as deep, there is the front
+DAM_SPACE = 8  # width of the basin, in widths
+DAM_DEPTH = 1 / 16  # depth of water at the front, in widths
 DAM_LEADS, DAM_RESOLVED = 0.18, 0.05
 DAM_RATE_HZ = 200.0
 
-# water that stands from wall to wall
+# water at rest between walls
 REST_CELLS, REST_DEPTH = 6, 0.375  # m
 REST_S, REST_RATE_HZ, REST_WITHIN = 20.0, 4.0, 0.005
 SETTLED_S = 2.5  # until its first waves are gone
@@ -54,30 +52,25 @@ GRID_WITHIN = 0.05
 ORDERS = (0.1, 4.0, 391)
 IMPACT_SIDE, IMPACT_DROP, IMPACT_SPEED = 0.125, 0.125, 4.5  # m; sides above the floor; m/s
 
-# quarters of round columns on a rough floor beside what Lube et al. 2004 and Lajeunesse et al. 2004 found, which lie up
-# to a third apart: between them a column is as right as experiments can tell
-COLUMN_RADIUS = 0.5  # m, 200 of the default sand's grains; the tallest column's own weight presses it by 2 %
-COLUMN_CELLS = 24  # in radius: a front lacks its last two to two and a half cells
-LOW_COLUMN_CELLS = 72  # in radius of columns that are wider than high, which run out by less than their radius
-COLUMN_DEPTH = 1 / 64  # of the radius: where sand is as deep, there is its edge
+# Quarters of round columns on a rough floor. Lube et al. 2004 and Lajeunesse et al. 2004 differ by up to a third; a
+# column between them agrees with the experiments.
+COLUMN_RADIUS = 0.5  # m, 200 default grains; the tallest column is compressed by 2 % by its weight
+COLUMN_CELLS = 24  # in radius: fronts lack their last 2 to 2.5 cells
+LOW_COLUMN_CELLS = 72  # in radius of columns that are wider than high, which run out less
+COLUMN_DEPTH = 1 / 64  # depth of sand at its edge, in radii
 COLUMN_WITHIN = 0.1
 COLUMN_ASPECTS = (0.5, 1.0, 1.5, 2.5, 4.0)
-COLUMN_ROOM = 1.6  # times the radius expected
+COLUMN_SPACE = 1.6  # width of the basin, times the expected radius
 COLUMN_TOP_CELLS = 2.5  # around the axis, where the height is taken
 LUBE_ANGLE_DEG = 31.0  # at which the quartz sand of Lube et al. 2004 rests
-SAND_LAWS = (  # beside the default; their friction does not grow with the rate of flow
-    ("matsuoka_nakai", LUBE_ANGLE_DEG), ("plane_strain", LUBE_ANGLE_DEG), ("compression", LUBE_ANGLE_DEG),
-    ("compression", 45.0),
-)  # fmt: skip
-OTHER_ASPECTS = (0.5, 1.5, 4.0)  # at which the other laws are shown
 TIMES = 4.0  # of sqrt(height / g) until all stands; the experiments took about 3
-STRAY = 1e-3  # of the particles: fewer may reach the walls of their room
+STRAY = 1e-3  # fraction of the particles that may reach the walls of the basin
 
-# a slope of sand on a rough platform that ends: it stands, or runs off and leaves one that does
-REPOSE_OTHERS_DEG = (20.0, 40.0)  # friction angles beside the default sand's
-REPOSE_WITHIN_DEG = 3.0  # at so much less than the friction angle a slope stands; steeper ones come to rest so near
-REPOSE_STEEPER_DEG = 4.0  # what runs off a much steeper one takes more along than a poured heap would
-STANDS_DEG = 1.0  # of change
+# a slope of sand on a rough platform, from which sand may run off
+REPOSE_OTHERS_DEG = (20.0, 40.0)  # further friction angles
+REPOSE_WITHIN_DEG = 3.0  # a slope stands this far below the friction angle; steeper ones come to rest as close to it
+REPOSE_STEEPER_DEG = 4.0  # sand that runs off a much steeper slope would carry more sand with it
+STANDS_DEG = 1.0  # change of a slope that stands
 REPOSE_LENGTH = 0.5  # m, of the platform
 REPOSE_CELLS = 24  # along it
 REPOSE_TIMES = 24.0  # of sqrt(length / g)
@@ -85,9 +78,9 @@ PIT = 0.4  # of the platform's length, below it
 AT_REST = 1e-2  # m/s, root mean square
 
 
-def dam_breaks(base: MpmConfig) -> list[Row]:
-    """The front of a collapsing column of water beside the experiment, and at one resolution beside the other."""
-    rows, fronts = [], []
+def dam_breaks(base: MpmConfig) -> Iterator[Row]:
+    """Compares the front of a collapsing column of water with the experiment, and at two resolutions."""
+    fronts = []
     for cells in DAM_CELLS:
         path = _path(dam(cells), base, 2 + math.ceil(DAM[-1, 0] * math.sqrt(DAM_WIDTH / (2 * GRAVITY)) * DAM_RATE_HZ))
         time = np.arange(len(path)) / DAM_RATE_HZ * math.sqrt(2 * GRAVITY / DAM_WIDTH)
@@ -96,66 +89,66 @@ def dam_breaks(base: MpmConfig) -> list[Row]:
         beyond = "fronts " + ", ".join(f"{x:.2f} at {t:.2f} ({y:.2f})" for x, (t, y) in zip(front, DAM, strict=True))
         more = {"front": front.tolist(), "experiment": DAM.tolist()}
         worst = float(np.abs(front / DAM[:, 1] - 1).max())
-        touched = _strays(path * (cells / DAM_WIDTH), DAM_ROOM * cells, (0,))
+        touched = _strays(path * (cells / DAM_WIDTH), DAM_SPACE * cells, (0,))
         held = worst <= DAM_LEADS and not touched
-        rows.append(Row(f"dam break, {cells} cells wide", DAM_LEADS, worst, held, beyond + touched, more))
+        yield Row(f"dam break, {cells} cells wide", DAM_LEADS, worst, held, beyond + touched, more)
     change = float(np.abs(fronts[1] / fronts[0] - 1).max())
     name = f"dam break, {DAM_CELLS[0]} against {DAM_CELLS[1]} cells"
-    return [*rows, within(name, DAM_RESOLVED, change, "largest change of the front")]
+    yield within(name, DAM_RESOLVED, change, "largest change of the front")
 
 
 def dam(cells: int) -> Scene:
-    """Water `cells` wide and twice as high, three cells thick, left of an empty basin."""
-    return basin(WATER, (cells, 2 * cells, SLAB), (DAM_ROOM * cells, 3 * cells, SLAB), DAM_WIDTH / cells)
+    """Returns water `cells` wide and twice as high, three cells thick, left of an empty basin."""
+    return basin(WATER, (cells, 2 * cells, SLAB), (DAM_SPACE * cells, 3 * cells, SLAB), DAM_WIDTH / cells)
 
 
 def dam_front(position_N3: np.ndarray, cells: int) -> float:
-    """How far the water is DAM_DEPTH deep, in widths; depth is what the particles of a cell's width would fill."""
+    """Returns the distance up to which the water is DAM_DEPTH deep, in widths; depths are from particle counts."""
     place = position_N3[:, 0] * cells / DAM_WIDTH - WALL
     depth = np.bincount(np.maximum(np.floor(place).astype(int), 0)) / (SLAB * PARTICLES_PER_CELL)
     return edge(depth, DAM_DEPTH * cells) / cells
 
 
-def rest(base: MpmConfig) -> list[Row]:
-    """The level of water that stands in a random filling."""
+def rest(base: MpmConfig) -> Iterator[Row]:
+    """Measures the level of water at rest, filled at random."""
     scene = basin(WATER, (REST_CELLS,) * 3, (REST_CELLS, REST_CELLS + 3, REST_CELLS), REST_DEPTH / REST_CELLS)
     path = _path(scene, base, 1 + round(REST_S * REST_RATE_HZ), REST_RATE_HZ)
     level = 2 * (path[:, :, 1].mean(axis=1) / scene.cell_size - WALL) / REST_CELLS
     change = level[round(SETTLED_S * REST_RATE_HZ) :] / level[0] - 1
     beyond = f"{change[0]:+.2%} after {SETTLED_S:g} s, {change[-1]:+.2%} after {REST_S:g} s"
     worst = float(change[np.abs(change).argmax()])
-    return [within("level of water at rest, random filling", REST_WITHIN, worst, beyond)]
+    yield within("level of water at rest, random filling", REST_WITHIN, worst, beyond)
 
 
-def grids(base: MpmConfig, cells: Sequence[int]) -> list[Row]:
-    """How fronts, run-outs and heights change with the grid, with the order of it: `cells`, three or more, are those of
-    the width of a dam, the radius of a column, and the side of blocks that hit the floor.
+def grids(base: MpmConfig, cells: Sequence[int]) -> Iterator[Row]:
+    """Measures how fronts, run-outs and heights change with the grid, and the order of convergence.
+
+    `cells`, three or more, are the width of a dam, the radius of a column, and the side of blocks that hit the floor.
     """
     measured: dict[str, list[float]] = {}
     for count in cells:
         path = _path(dam(count), base, 2 + math.ceil(GRID_DAM_S * DAM_RATE_HZ))
         measured.setdefault("front of the dam break, in widths", []).append(dam_front(path[-1], count))
-        for row in column_rows(GRID_ASPECT, base.sand_friction_law, base.sand_friction_angle_deg, base, count):
+        for row in column_rows(GRID_ASPECT, base, count):
             what = row.case.rsplit(", ", 1)[1]
             measured.setdefault(f"{what} of a sand column, in radii", []).append(float(row.measured))
         for kind, name in enumerate(PAPER_MATERIALS):
             path = _path(impact(kind, count), base, 2, 1 / GRID_IMPACT_S)
             height = float(np.quantile(path[-1][:, 1], 0.95)) / IMPACT_SIDE - WALL / count
             measured.setdefault(f"height of a block of {name} after its impact, in sides", []).append(height)
-    rows = []
     for name, values in measured.items():
         order, limit = convergence_order(cells, values)
         series = ", ".join(f"{value:.3f} at {count}" for value, count in zip(values, cells, strict=True)) + " cells; "
-        leads = "approaches nothing yet" if order is None else f"order {order:.2g}, towards {limit:.3f}"
+        leads = "no limit yet" if order is None else f"order {order:.2g}, limit {limit:.3f}"
         more: dict[str, Any] = {"cells": list(cells), "series": values, "order": order, "limit": limit}
         case, change = f"grid of {cells[-1]} cells beside {cells[-2]}: {name}", abs(values[-1] / values[-2] - 1)
-        rows.append(within(case, GRID_WITHIN, change, series + leads, more))
-    return rows
+        yield within(case, GRID_WITHIN, change, series + leads, more)
 
 
 def convergence_order(cells: Sequence[int], values: Sequence[float]) -> tuple[float, float] | tuple[None, None]:
-    """p and the limit of limit + c / cells^p, as near to the values as can be; none where these turn round, or change
-    by no less a step than before, or where p is not between 0.1 and 4.
+    """Fits limit + c / cells^p to the values and returns p and the limit.
+
+    Returns None if the values are not monotonic, change no less with finer cells, or p is not between 0.1 and 4.
     """
     steps = np.diff(values)
     slopes = steps / np.diff(np.log(cells))
@@ -171,50 +164,25 @@ def convergence_order(cells: Sequence[int], values: Sequence[float]) -> tuple[fl
 
 
 def impact(kind: int, cells: int) -> Scene:
-    """A block so many cells a side that is about to hit the floor, in a room four times as wide."""
+    """Returns a block of `cells` a side that is about to hit the floor of a basin four times as wide."""
     scene = basin(kind, (cells,) * 3, (4 * cells, 2 * cells, 4 * cells), IMPACT_SIDE / cells)
     position_N3 = (scene.position_N3 + np.array([1.5, IMPACT_DROP, 1.5]) * IMPACT_SIDE).astype(np.float32)
     velocity_N3 = scene.velocity_N3 + np.array([0, -IMPACT_SPEED, 0], np.float32)
     return dataclasses.replace(scene, position_N3=position_N3, velocity_N3=velocity_N3)
 
 
-def columns(base: MpmConfig, grains: Sequence[float] | None = None) -> list[Row]:
-    """Run-out and height of collapsed columns by the config's own law, grains and all, or with so many grains in radius
-    (0: friction does not grow with the rate of flow).
-    """
-    own = base.sand_friction_law, base.sand_friction_angle_deg
-    configs = [base]
-    if grains is not None:
-        diameters = [COLUMN_RADIUS / many if many else 0.0 for many in grains]
-        configs = [dataclasses.replace(base, sand_grain_diameter_m=diameter) for diameter in diameters]
-    return [
-        row
-        for config, aspect in itertools.product(configs, COLUMN_ASPECTS)
-        for row in column_rows(aspect, *own, config, least_cells(aspect))
-    ]
+def columns(base: MpmConfig) -> Iterator[Row]:
+    """Measures run-out and height of collapsed columns of several aspects."""
+    for aspect in COLUMN_ASPECTS:
+        yield from column_rows(aspect, base, LOW_COLUMN_CELLS if aspect < 1 else COLUMN_CELLS)
 
 
-def column_laws(base: MpmConfig) -> list[Row]:
-    """Run-out and height by other laws than the config's own."""
-    base = dataclasses.replace(base, sand_grain_diameter_m=0.0)
-    return [
-        row
-        for law, aspect in itertools.product(SAND_LAWS, OTHER_ASPECTS)
-        for row in column_rows(aspect, *law, base, least_cells(aspect))
-    ]
-
-
-def least_cells(aspect: float) -> int:
-    """In radius, so that the column's front is found."""
-    return LOW_COLUMN_CELLS if aspect < 1 else COLUMN_CELLS
-
-
-def column_rows(aspect: float, law: str, angle_deg: float, base: MpmConfig, cells: int) -> list[Row]:
-    """How far a column of so many cells in radius runs out, and how high it stays at its axis, in initial radii."""
+def column_rows(aspect: float, base: MpmConfig, cells: int) -> Iterator[Row]:
+    """Yields run-out and height at the axis, in initial radii, of a column of `cells` in radius."""
     scene = column(aspect, cells)
     duration = TIMES * math.sqrt(aspect * COLUMN_RADIUS / GRAVITY)
-    config = _sand(base, law, angle_deg)
-    config = dataclasses.replace(config, collider_friction=shear_strength(config))
+    law, angle_deg = base.sand_friction_law, base.sand_friction_angle_deg
+    config = dataclasses.replace(base, collider_friction=shear_strength(base))
     path = _path(scene, config, 41, 40 / duration)
     place = _above_floor(path[-1], scene.cell_size)
     distance = np.hypot(place[:, 0], place[:, 2])
@@ -222,84 +190,84 @@ def column_rows(aspect: float, law: str, angle_deg: float, base: MpmConfig, cell
     depth = many / PARTICLES_PER_CELL / (math.pi / 4 * np.diff(np.arange(len(many) + 1) ** 2))
     run_out = edge(depth, COLUMN_DEPTH * cells) / cells - 1
     height = float(np.quantile(place[distance < COLUMN_TOP_CELLS, 1], 0.95)) / 0.95 / cells
-    room = math.ceil(COLUMN_ROOM * lube(aspect) * cells)
-    touched = _strays(path / scene.cell_size, room, (0, 2))
+    space = math.ceil(COLUMN_SPACE * lube(aspect) * cells)
+    touched = _strays(path / scene.cell_size, space, (0, 2))
     name = f"sand column, aspect {aspect:g}, {law.replace('_', ' ')}, {angle_deg:g} degrees, {cells} cells in radius"
     if base.sand_grain_diameter_m > 0:
         name += f", {COLUMN_RADIUS / base.sand_grain_diameter_m:.3g} grains"
-    rows = []
     for what, value, published in (("run-out", run_out, run_outs(aspect)), ("height", height, heights(aspect))):
         expected = min(max(value, min(published)), max(published))
         change = value / expected - 1
         beyond = f"{change:+.1%}; speed at the end {rms_speed(path[-2:], 40 / duration):.2g} m/s{touched}"
         more = {"cells": cells, "particles": scene.particle_count, "published": sorted(set(published))}
-        rows.append(Row(f"{name}, {what}", expected, value, abs(change) <= COLUMN_WITHIN and not touched, beyond, more))
-    return rows
+        yield Row(f"{name}, {what}", expected, value, abs(change) <= COLUMN_WITHIN and not touched, beyond, more)
 
 
 def column(aspect: float, cells: int) -> Scene:
-    """A quarter of a round column of sand `cells` in radius on a rough floor, between two smooth walls."""
-    room = math.ceil(COLUMN_ROOM * lube(aspect) * cells)
-    scene = basin(SAND, (cells, aspect * cells, cells), (room, aspect * cells + 2, room), COLUMN_RADIUS / cells, 2)
+    """Returns a quarter of a round column of sand, `cells` in radius, on a rough floor between two smooth walls."""
+    space = math.ceil(COLUMN_SPACE * lube(aspect) * cells)
+    scene = basin(SAND, (cells, aspect * cells, cells), (space, aspect * cells + 2, space), COLUMN_RADIUS / cells, 2)
     place_N3 = _above_floor(scene.position_N3, scene.cell_size)
     return some(scene, np.hypot(place_N3[:, 0], place_N3[:, 2]) < cells)
 
 
 def lube(aspect: float) -> float:
-    """The final radius of a column, in initial radii (Lube et al. 2004)."""
+    """Returns the final radius of a column, in initial radii (Lube et al. 2004)."""
     return 1 + (1.24 * aspect if aspect < 1.7 else 1.6 * math.sqrt(aspect))
 
 
 def run_outs(aspect: float) -> tuple[float, ...]:
-    """What a column's radius grows by, in initial radii: by Lube et al. 2004; between aspects of 0.74 and 3 also by
-    Lajeunesse et al. 2004, who found cones 0.74 high there, whose volume tells their radius.
+    """Returns published growths of a column's radius, in initial radii.
+
+    Lube et al. 2004; between aspects of 0.74 and 3 also Lajeunesse et al. 2004, from the volume of cones 0.74 high.
     """
     return (lube(aspect) - 1, *((math.sqrt(3 * aspect / 0.74) - 1,) if 0.74 <= aspect < 3 else ()))
 
 
 def heights(aspect: float) -> tuple[float, float]:
-    """The final height of a column at its axis, in initial radii: of glass beads (Lajeunesse et al. 2004), and of sand,
-    salt and seeds (Lube et al. 2004), a power of the aspect from 1.7 on; below, the least that leads there.
+    """Returns published final heights at the axis, in initial radii.
+
+    Glass beads (Lajeunesse et al. 2004); sand, salt and seeds (Lube et al. 2004), a power of the aspect from 1.7 on.
     """
     return min(aspect, 0.74), min(aspect, 0.88 * aspect ** (1 / 6))
 
 
-def reposes(base: MpmConfig) -> list[Row]:
-    """Slopes of sand below its friction angle, which stand, and above it, which come to rest: near the angle to which
-    sand shears on along the slope, in plane strain without a change of volume; the config's own sand also near the
-    angle of repose that Lube et al. found.
+def reposes(base: MpmConfig) -> Iterator[Row]:
+    """Measures slopes of sand: those below the friction angle stand, steeper ones come to rest.
+
+    The expected angle of repose is that of shear along the slope, in plane strain without a change of volume; for the
+    default sand also that of Lube et al.
     """
-    rows, own = [], base.sand_friction_angle_deg
+    own = base.sand_friction_angle_deg
     for angle in sorted({own, *REPOSE_OTHERS_DEG}):
         for start in (angle - REPOSE_WITHIN_DEG, angle + REPOSE_STEEPER_DEG):
             before, after, speed = repose(angle, start, base, REPOSE_CELLS)
             beyond = f"{after - before:+.1f} degrees; at the end {speed:.2g} m/s rms"
             if start < angle:
                 held = abs(after - before) <= STANDS_DEG
-                rows.append(Row(f"slope that stands, friction {angle:g} degrees", before, after, held, beyond))
+                yield Row(f"slope that stands, friction {angle:g} degrees", before, after, held, beyond)
                 continue
-            shears = math.degrees(math.atan(shear_strength(_sand(base, base.sand_friction_law, angle))))
-            asked = [(f"angle of repose, friction {angle:g} degrees", shears)]
+            shears = math.degrees(math.atan(shear_strength(_sand(base, angle))))
+            angles = [(f"angle of repose, friction {angle:g} degrees", shears)]
             if angle == own:
-                asked.append((f"angle of repose, friction {angle:g} degrees, as quartz sand has it", LUBE_ANGLE_DEG))
-            for name, expected in asked:
+                angles.append((f"angle of repose, friction {angle:g} degrees, as quartz sand has it", LUBE_ANGLE_DEG))
+            for name, expected in angles:
                 held = abs(after - expected) <= REPOSE_WITHIN_DEG and speed < AT_REST
-                rows.append(Row(name, expected, after, held, beyond))
-    return rows
+                yield Row(name, expected, after, held, beyond)
 
 
 def repose(angle_deg: float, start_deg: float, base: MpmConfig, cells: int) -> tuple[float, float, float]:
-    """The slope of sand on a platform before and after, degrees, and its root mean square speed at the end, m/s."""
+    """Returns the slope of sand on a platform before and after, degrees, and its final rms speed, m/s."""
     scene = platform(start_deg, cells)
     rate_hz = 30 / (REPOSE_TIMES * math.sqrt(REPOSE_LENGTH / GRAVITY))
-    path = _path(scene, _sand(base, base.sand_friction_law, angle_deg), 31, rate_hz)
+    path = _path(scene, _sand(base, angle_deg), 31, rate_hz)
     place = path / scene.cell_size - WALL - np.array([0.0, round(PIT * cells), 0.0])
     on = (place[-1, :, 1] > 0) & (place[-1, :, 0] < cells)
     return surface_slope(place[0], cells), surface_slope(place[-1, on], cells), rms_speed(path[-2:, on], rate_hz)
 
 
 def platform(slope_deg: float, cells: int) -> Scene:
-    """A slope of sand from a smooth wall down to the end of a rough platform, so many cells long, above a pit."""
+    """Returns a slope of sand from a smooth wall to the end of a rough platform, `cells` long, above a pit."""
     height = math.ceil(cells * math.tan(math.radians(slope_deg)))
     pit = round(PIT * cells)
     scene = basin(SAND, (cells, height, SLAB), (2 * cells, height + 2, SLAB), REPOSE_LENGTH / cells, pit)
@@ -312,10 +280,9 @@ def platform(slope_deg: float, cells: int) -> Scene:
 
 
 def surface_slope(place_N3: np.ndarray, cells: int) -> float:
-    """The slope of sand over the middle of a platform, degrees; places in cells from its wall.
+    """Returns the slope of sand over the middle of a platform, degrees; places are in cells from its wall.
 
-    The surface of a cell's sand lies where the height below which nine tenths of it lie says: counts are as random as
-    the filling.
+    The surface of a cell is extrapolated from the 0.9 quantile of heights: maxima and counts are too random.
     """
     column = np.floor(place_N3[:, 0]).astype(int)
     own = np.arange(round(0.15 * cells), round(0.85 * cells))
@@ -324,13 +291,12 @@ def surface_slope(place_N3: np.ndarray, cells: int) -> float:
 
 
 def basin(
-    material: int, size_cells: Sequence[float], room_cells: Sequence[float], cell: float, floor: int | None = None
+    material: int, size_cells: Sequence[float], space_cells: Sequence[float], cell: float, floor: int | None = None
 ) -> Scene:
-    """A box of particles at random places in the corner of a basin, wall to wall where the room is as large; above
-    the wall's floor, or with `floor` that many cells higher on a sheet.
-    """
+    """Fills a box in the corner of a basin with particles at random places, on a sheet `floor` cells above its floor
+    if given."""
     place = random_places(size_cells) + WALL
-    nodes = [math.ceil(room + WALL + FAR_WALL) for room in room_cells]
+    nodes = [math.ceil(space + WALL + FAR_WALL) for space in space_cells]
     obstacles: tuple[Obstacle, ...] = ()
     if floor is not None:
         place[:, 1] += floor
@@ -345,15 +311,15 @@ def basin(
 
 
 def edge(depth: np.ndarray, least: float) -> float:
-    """Where depths, each the mean of a cell in turn, fall below `least` for good, in cells from the first.
+    """Returns where mean depths of cells finally fall below `least`, in cells from the first.
 
-    Between centres of cells depth is linear; but what ends in a cliff fills its last cells in part alone, and ends
-    where the slope behind would have filled them.
+    Depths are interpolated between centres of cells. A cliff fills its last cells partly; it ends where the slope
+    behind it would have filled them.
     """
     depth = np.concatenate([depth[:1], depth[:1], depth, [0.0, 0.0]])
     last = int(np.flatnonzero(depth[2:] >= least).max(initial=0)) + 2
     linear = 0.5 + float((depth[last] - least) / max(depth[last] - depth[last + 1], 1e-9))
-    # a cliff is where the depth behind, with its slope, would hold what lies in the last two cells
+    # the cliff is where the extrapolated depth contains the volume of the last two cells
     slope = max(float(depth[last - 2] - depth[last - 1]), 0.0)
     mass, begin = float(depth[last] + depth[last + 1]), max(float(depth[last - 1]) - 0.5 * slope, least)
     square = begin * begin - 2 * slope * mass
@@ -361,24 +327,24 @@ def edge(depth: np.ndarray, least: float) -> float:
     return last - 2 + min(linear, cliff)
 
 
-def _strays(place_TN3: np.ndarray, room_cells: float, axes: Sequence[int]) -> str:
-    """What to say where particles come within a cell of the far walls of their room; empty where hardly any does."""
-    reach = WALL + room_cells - 1
+def _strays(place_TN3: np.ndarray, space_cells: float, axes: Sequence[int]) -> str:
+    """Returns a note if many particles come within a cell of the far walls of the basin, or an empty string."""
+    reach = WALL + space_cells - 1
     share = float(np.mean([(place_TN3[..., axis] > reach).any(axis=0) for axis in axes]))
-    return f"; {share:.1%} of it reached the walls of its room, {room_cells:g} cells wide" if share > STRAY else ""
+    return f"; {share:.1%} of it reached the walls of the basin, {space_cells:g} cells wide" if share > STRAY else ""
 
 
 def _above_floor(position_N3: np.ndarray, cell: float) -> np.ndarray:
-    """From the edge where the walls meet the sheet of a column's floor, in cells."""
+    """Returns places from the corner of a column's floor, in cells."""
     return np.asarray(position_N3, np.float64) / cell - np.array([WALL, WALL + 2.0, WALL])
 
 
-def _sand(base: MpmConfig, law: str, angle_deg: float) -> MpmConfig:
-    return dataclasses.replace(base, sand_friction_law=law, sand_friction_angle_deg=angle_deg, collider_friction=1.0)
+def _sand(base: MpmConfig, angle_deg: float) -> MpmConfig:
+    return dataclasses.replace(base, sand_friction_angle_deg=angle_deg, collider_friction=1.0)
 
 
 def shear_strength(config: MpmConfig) -> float:
-    """The shear that sand bears in simple shear, over the pressure: its yield where the middle stress is the mean."""
+    """Returns the yield stress in simple shear over the pressure."""
     sine = sand_sine(config)
     if sine < 0:  # Mohr and Coulomb
         return -sine

@@ -1,0 +1,79 @@
+"""A case of `tools.stability network` as data: scenes, frames, and limits on named measures.
+
+A measure (measures.py) maps trajectories to figures. A limit bounds one of them from both sides, relative to the
+figure of the solver where the case is simulated by the solver too. A new case needs no code of its own.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from hgn.runtime.rollouts import RolloutResult
+from hgn.runtime.simulator import InitialState, Simulator
+from hgn.scene.scene import Scene
+
+
+@dataclass(frozen=True)
+class Limit:
+    """Passes if low + below * solver <= figure <= high + above * solver, where solver is the solver's figure."""
+
+    measure: str  # a key of measures.MEASURES; a dot and a field follow where the measure returns records
+    low: float = -math.inf
+    high: float = math.inf
+    below: float = 0.0
+    above: float = 0.0
+
+
+STANDARD = (Limit("energy_growth", high=0.02), Limit("outside_domain", high=0.0))
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """Scenes that are simulated side by side, for how long, and the limits of their measures."""
+
+    name: str
+    scenes: tuple[Scene, ...]
+    frames: int
+    limits: tuple[Limit, ...] = STANDARD
+    solver: bool = False  # the solver simulates the scenes too, as the reference of limits
+    reported: str | None = None  # measure in the column "measured"; None: the number of frames reached
+    also: tuple[str, ...] = ()  # measures that are reported without a limit
+    labels: tuple[str, ...] = ()  # of the scenes
+    last_frames: tuple[int, ...] = ()  # last frame of each scene that is measured; empty: the last one
+    known_3: tuple[float, float, float] | None = None  # acceleration of the particles in the first `known_frames`
+    known_frames: int = 0
+    at_frames: tuple[int, ...] = ()  # frames in which `collapse` is measured
+    hole_cells: tuple[float, ...] = ()  # width of each scene's hole, in the network's finest cells
+    hole_height: float = 0.0  # of the holes' edges
+    settled: int = 0  # frame from which on all particles rest
+    upright: tuple[Scene, ...] = ()  # the scenes before they were turned
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """Trajectories of a case, of the network or of the solver, with what measures need."""
+
+    case: Case
+    scenes: Sequence[InitialState]
+    trials: Sequence[RolloutResult]
+    simulator: Simulator
+    solver: Outcome | None = None  # the solver's trajectories of the same scenes
+    upright: tuple[Sequence[RolloutResult], Sequence[RolloutResult]] | None = None  # network and solver
+
+    @property
+    def frame_rate_hz(self) -> float:
+        return self.simulator.frame_rate_hz
+
+    @property
+    def complete(self) -> bool:
+        return all(t.cause is None and t.frame_count >= self.case.frames for t in self.trials)
+
+
+def cut(trials: Sequence[RolloutResult], last_frames: Sequence[int]) -> list[RolloutResult]:
+    """Ends each trajectory at its last measured frame; a divergence after that does not count."""
+    return [
+        RolloutResult(trial.position_TN3[: last + 1], trial.cause if trial.frame_count <= last else None)
+        for trial, last in zip(trials, last_frames, strict=True)
+    ]

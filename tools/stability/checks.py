@@ -1,0 +1,92 @@
+"""Compares the measures of a case with its limits."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from tools.stability.case import Case, Limit, Outcome
+from tools.stability.measures import MEASURES
+from tools.stability.row import Row
+
+
+def row_of(outcome: Outcome, more: dict[str, Any]) -> Row:
+    """Measures an outcome and compares the figures with the case's limits."""
+    case, solver = outcome.case, outcome.solver
+    causes = [trial.cause for trial in outcome.trials if trial.cause is not None]
+    finite = all(bool(np.isfinite(trial.position_TN3).all()) for trial in outcome.trials)
+    names = dict.fromkeys([limit.measure.partition(".")[0] for limit in case.limits] + list(case.also))
+    if case.reported is not None and causes:  # closed forms need complete trajectories
+        names = {}
+    figures = {name: MEASURES[name](outcome) for name in names}
+    references = {name: MEASURES[name](solver) for name in names} if solver is not None else {}
+    failure = causes[0] if causes else None
+    if failure is None and not finite:
+        failure = "positions are not finite, and the runtime did not report it"
+    for limit in case.limits if failure is None else ():
+        failure = failure or violation(limit, figures, references, solver is not None)
+    count = sum(len(scene.position_N3) for scene in outcome.scenes)
+    row: dict[str, Any] = {"particles": count, "scenes": len(outcome.scenes)}
+    row |= {"domain_size": list(outcome.scenes[0].domain_size), "failed_scenes": len(causes)}
+    row["guard"] = "missed" if not finite else "raised" if causes else "not needed"
+    row |= {name: _finite(value) for name, value in figures.items()}
+    row |= {f"solver_{name}": _finite(value) for name, value in references.items()} | more
+    predicted, measured = case.frames, min(trial.frame_count for trial in outcome.trials)
+    if case.reported is None:
+        return Row(case.name, predicted, measured, failure is None, failure or "nothing seen", row)
+    value = "diverged" if causes else _finite(figures[case.reported])
+    value = "not finite" if value is None else value
+    return Row(case.name, _bound(case), value, failure is None, failure or "within all limits", row)
+
+
+def refused(case: Case, cause: str) -> Row:
+    """Returns the row of a case whose scenes the weights do not take."""
+    return Row(case.name, _bound(case), "refused", False, cause)
+
+
+def _bound(case: Case) -> float:
+    return next((limit.high for limit in case.limits if limit.measure == case.reported), case.frames)
+
+
+def violation(limit: Limit, figures: dict[str, Any], references: dict[str, Any], solved: bool) -> str | None:
+    """Returns the figure that is farthest beyond a limit, as a sentence; None if all are within."""
+    name, _, field = limit.measure.partition(".")
+    own, solver = figures[name], references.get(name)
+    if own is None or (solved and solver is None):
+        return f"{name}: the {'network' if own is None else 'solver'} did not come to the end"
+    worst, sentence = 0.0, None
+    reference = dict(_values(solver, field)) if solved else {}
+    for where, value in _values(own, field):
+        base = reference.get(where, 0.0)
+        low = limit.low + (limit.below * base if limit.below else 0.0)
+        high = limit.high + (limit.above * base if limit.above else 0.0)
+        excess = max(low - value, value - high)
+        if not excess <= worst:  # NaN fails
+            worst = excess
+            allowed = f"must be {_interval(low, high)}"
+            sentence = f"{limit.measure.replace('_', ' ')}{where} {value:.3g}, {allowed}"
+            sentence += f" (solver {base:.3g})" if limit.below or limit.above else ""
+    return sentence
+
+
+def _values(figure: Any, field: str) -> Iterator[tuple[str, float]]:
+    """Yields a place and a value of each record."""
+    for record in figure if isinstance(figure, list) else [figure]:
+        if not isinstance(record, dict):
+            yield "", record
+        elif record[field] is not None:
+            places = [f"{key} {record[key]}" for key in ("scene", "frame", "hole_cells") if key in record]
+            yield f" ({', '.join(places)})" if places else "", record[field]
+
+
+def _interval(low: float, high: float) -> str:
+    if low == -math.inf:
+        return f"at most {high:.3g}"
+    return f"at least {low:.3g}" if high == math.inf else f"{low:.3g} to {high:.3g}"
+
+
+def _finite(value: Any) -> Any:
+    return None if isinstance(value, float) and not math.isfinite(value) else value
