@@ -1,17 +1,22 @@
-"""The page of `hgn.play`: a session on screen, with its buttons; any number of viewers share it.
+"""The page of `hgn.play`: one session with its buttons, shared by any number of viewers.
 
-What viewers do is queued and done between two frames, so that nobody waits for a frame on the server's event loop; the
-places that an obstacle is dragged to only the last is worth anything. All state is here: a viewer whose connection is
-lost comes back to it.
+Actions of viewers are queued and run between two frames, so the event loop of the server never waits for a frame. Only
+the last of several moves of one obstacle runs. The state lives here, so a viewer who reconnects finds it again.
+
+Viewers are not trusted: a raw message may contain any value. Values are clamped to their sliders, weights must be
+listed, and every error of an action becomes a message to its viewer.
 """
 
 from __future__ import annotations
 
 import itertools
+import math
 import queue
+import sys
 import tempfile
 import threading
 import time
+import traceback
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -27,14 +32,15 @@ from hgn.scene.material import MATERIALS
 from hgn.scene.rollout_file import write_rollout
 from hgn.scene.scene_file import ObstacleEntry
 from hgn.schema import ConfigError, Vector, require
-from hgn.viewer.placed import PlacedObstacle
+from hgn.viewer.placed import PlacedObstacle, plain
 from hgn.viewer.session import PlaySession, Spout
 from hgn.viewer.stage import StageView, quaternion
 from hgn.viewer.viser_compat import start_server, stop_server
 
 STATUS_S = 0.25  # between two updates of frame and speed
 BACK_S = {"a frame": 0.0, "1 s": 1.0, "5 s": 5.0}
-TURN_DEGREES = 360.0  # by a drag across the whole window
+TURN_DEGREES = 360.0  # rotation for a drag across the whole window
+MAXIMUM_UPLOAD_BYTES = 64 << 20
 HELP = """
 **Shift + drag** on the floor pours, **Shift + click** drops a ball.
 **Drag** an obstacle to move it, **Ctrl/⌘ + drag** to turn it, **click** to choose it.
@@ -80,7 +86,7 @@ class PlayPage:
     # between the viewers and the session
 
     def do(self, action: Callable[[], Any], client: viser.ClientHandle | None = None, key: object = None) -> None:
-        """Queues what is to be done before the next frame; of actions with one key only the last is done."""
+        """Queues an action for the time before the next frame. Of several actions with one key only the last runs."""
         self.actions.put((next(self._numbers) if key is None else key, action, client))
 
     def _do_all(self) -> bool:
@@ -92,8 +98,12 @@ class PlayPage:
         for action, client in latest.values():
             try:
                 action()
-            except (ConfigError, DivergedError, OSError) as error:  # a full disk ends no session
+            except (ConfigError, DivergedError, OSError) as error:
                 self._notify(str(error), client)
+            # a file or a value of one viewer must not end the session of all
+            except Exception as error:  # noqa: BLE001
+                traceback.print_exception(error, file=sys.stderr)
+                self._notify(f"failed: {type(error).__name__}: {error}", client)
         return bool(latest)
 
     def _notify(self, message: str, client: viser.ClientHandle | None = None) -> None:
@@ -101,7 +111,7 @@ class PlayPage:
             one.add_notification("HGN", message, auto_close_seconds=10)
 
     def run(self) -> None:
-        """Simulates from the first viewer's coming until `close`, at most as fast as time passes."""
+        """Simulates from the first viewer's arrival until `close`, at most in real time."""
         due = updated = time.monotonic()
         frames = 0
         while not self.ended.is_set():
@@ -239,7 +249,9 @@ class PlayPage:
 
     def _use(self, name: str) -> None:
         assert self.load is not None
+        listed = tuple(self.weights.options)
         try:
+            require(name in listed, "weights", f"one of {', '.join(listed)}", name)
             self.session.use_weights(self.load(name), name)
         except ConfigError:
             self.weights.value = self.session.weights
@@ -247,7 +259,7 @@ class PlayPage:
         self.material.options = self._materials()
 
     def _materials(self) -> tuple[str, ...]:
-        """What can be poured: what the weights know of the materials that scenes are made of."""
+        """Returns the materials that can be poured: those of the weights that scenes have too."""
         return tuple(name for name in self.session.simulator.network.config.materials if name in MATERIALS)
 
     def _middle(self) -> Vector:
@@ -255,19 +267,23 @@ class PlayPage:
         return 0.5 * x, 0.3 * y, 0.5 * z
 
     def _add_shape(self) -> None:
-        entry = ObstacleEntry(shape=self.shape.value, size=float(self.size.value), position=self._middle())
+        entry = ObstacleEntry(shape=self.shape.value, size=clamped(self.size), position=self._middle())
         self.chosen = self.session.add_obstacle(entry).body.number
 
     def _add_file(self, name: str, content: bytes) -> None:
-        """A mesh as large as the slider says, in the middle."""
+        """Adds a mesh in the middle of the domain, scaled to the size of the slider."""
+        require("\0" not in name, "mesh", "a name without null characters", name)
         file = Path(name).name
         require(Path(file).suffix.lower() in MESH_SUFFIXES, "mesh", f"one of {', '.join(MESH_SUFFIXES)}", file)
+        rule = f"at most {MAXIMUM_UPLOAD_BYTES >> 20} MiB"
+        require(len(content) <= MAXIMUM_UPLOAD_BYTES, f"mesh {file}", rule, f"{len(content) / 2**20:.1f} MiB")
         with tempfile.TemporaryDirectory() as folder:
-            (Path(folder) / file).write_bytes(content)
+            path = Path(folder) / f"{plain(Path(file).stem)}{Path(file).suffix}"
+            path.write_bytes(content)
             try:
-                added = self.session.add_mesh(Path(folder) / file, float(self.size.value), self._middle())
-            except ConfigError as error:  # by the name that it was sent with
-                raise ConfigError(str(error).replace(f"{folder}/", "")) from None
+                added = self.session.add_mesh(path, clamped(self.size), self._middle())
+            except ConfigError as error:  # the viewer knows the file without the folder
+                raise ConfigError(str(error).replace(str(path), file)) from None
         self.chosen = added.body.number
 
     def _remove_chosen(self) -> None:
@@ -291,30 +307,37 @@ class PlayPage:
         @room.on_drag("left", modifier="shift")
         async def _(event: viser.SceneNodeDragEvent) -> None:
             eye_3 = np.array(event.client.camera.position)
-            spout = None if event.phase == "end" else self._spout(eye_3, np.array(event.end_position) - eye_3)
-            self.do(lambda: self._pour(spout), event.client, "pour")
+            ray_3 = None if event.phase == "end" else np.array(event.end_position) - eye_3
+            self.do(lambda: self._pour(eye_3, ray_3), event.client, "pour")
 
         @self.server.scene.on_click(modifier="shift")
         def _(event: viser.SceneClickEvent) -> None:
-            spout = self._spout(np.array(event.ray_origin), np.array(event.ray_direction))
-            self.do(lambda: self._drop(spout), event.client)
+            self.do(lambda: self._drop(np.array(event.ray_origin), np.array(event.ray_direction)), event.client)
 
-    def _pour(self, spout: Spout | None) -> None:
-        self.session.spout = spout
+    def _pour(self, origin_3: np.ndarray, direction_3: np.ndarray | None) -> None:
+        """Opens the spout where the ray points, or closes it if there is no ray."""
+        self.session.spout = None if direction_3 is None else self._spout(origin_3, direction_3)
 
-    def _drop(self, spout: Spout) -> None:
+    def _drop(self, origin_3: np.ndarray, direction_3: np.ndarray) -> None:
+        spout = self._spout(origin_3, direction_3)
         if not self.session.drop(spout.material, spout.position, spout.diameter, spout.speed):
             self._notify("there is no room for a ball here")
 
     def _spout(self, origin_3: np.ndarray, direction_3: np.ndarray) -> Spout:
-        """Above what a ray hits in the room: the floor, or else the wall it leaves through."""
+        """Returns a spout above the point where a ray meets the floor or leaves through a wall.
+
+        Raises: ConfigError for a ray that is not finite or has no direction.
+        """
         high_3 = np.array(self.session.domain_size)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            far_3 = np.where(direction_3 > 0, (high_3 - origin_3) / direction_3, -origin_3 / direction_3)
-        hit_3 = origin_3 + np.nanmin(far_3) * direction_3
+        usable = np.isfinite(origin_3).all() and np.isfinite(direction_3).all() and direction_3.any()
+        require(bool(usable), "ray", "finite, with a direction", [*origin_3.tolist(), *direction_3.tolist()])
+        along_3 = direction_3 != 0
+        plane_3 = np.where(direction_3 > 0, high_3, 0.0)
+        distance = ((plane_3 - origin_3)[along_3] / direction_3[along_3]).min()
+        hit_3 = origin_3 + distance * direction_3
         x, _, z = np.clip(hit_3, 0, high_3).tolist()
-        height = float(self.height.value) * self.session.domain_size[1]
-        return Spout((x, height, z), self.material.value, float(self.diameter.value), float(self.speed.value))
+        height = clamped(self.height) * self.session.domain_size[1]
+        return Spout((x, height, z), self.material.value, clamped(self.diameter), clamped(self.speed))
 
     def _add_mesh(self, obstacle: PlacedObstacle) -> None:
         number = obstacle.body.number
@@ -352,3 +375,9 @@ class PlayPage:
                 return replace(before.turned(degrees), position=self.shown[number].position)
 
             drag(event, turned)
+
+
+def clamped(slider: Any) -> float:
+    """Returns the value of a slider within its range; NaN becomes the least value."""
+    value = float(slider.value)
+    return float(slider.min) if math.isnan(value) else min(max(value, float(slider.min)), float(slider.max))

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -26,6 +27,7 @@ from hgn.scene.scene_file import ObstacleEntry
 from hgn.scene.shapes import shape_obstacle
 from hgn.schema import Vector
 
+LONGEST_STEM = 32  # characters of a file's name that are shown
 _numbers = itertools.count()
 
 
@@ -46,7 +48,9 @@ class Body:
 
     @property
     def name(self) -> str:
-        return f"{Path(self.entry.mesh).stem if self.entry.mesh else self.entry.shape}_{self.number}"
+        """A name for pages, logs and archives: letters, digits and ._- whatever the file is called."""
+        stem = Path(self.entry.mesh).stem if self.entry.mesh else self.entry.shape
+        return f"{plain(str(stem))}_{self.number}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,6 +88,11 @@ class PlacedObstacle:
         point_S3, normal_S3 = self.body.samples
         matrix = self.rotation_33
         return rotate(point_S3, matrix) + np.array(self.position), rotate(normal_S3, matrix)
+
+
+def plain(name: str) -> str:
+    """Returns a name without characters that pages, terminals or file systems interpret, cut to LONGEST_STEM."""
+    return re.sub("[^A-Za-z0-9_.-]+", "_", name)[:LONGEST_STEM]
 
 
 def placed_by(entry: ObstacleEntry, folder: Path, cell_size: float) -> PlacedObstacle:

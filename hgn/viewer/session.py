@@ -30,6 +30,7 @@ from hgn.viewer.placed import PlacedObstacle, placed_at_rest, placed_by, with_ob
 from hgn.viewer.recording import Frame, Recording
 
 CLEARANCE = 1.25  # spacings of particles at rest, within which no drop enters
+MAXIMUM_GRAVITY = 1000.0  # domain units per second squared
 FULL_SHARE = 0.5  # of what leaves a spout in a frame: where there is more, nothing leaves
 
 
@@ -252,7 +253,12 @@ class PlaySession:
     # what moves it all
 
     def set_gravity(self, gravity: Vector) -> None:
-        """Raises: ConfigError for what the weights cannot take."""
+        """Sets gravity, domain units per second squared.
+
+        Raises: ConfigError if it is not finite, above MAXIMUM_GRAVITY, or not supported by the weights.
+        """
+        size = math.hypot(*gravity)
+        require(size <= MAXIMUM_GRAVITY, "gravity", f"finite and at most {MAXIMUM_GRAVITY:g} in size", list(gravity))
         self.live.set_gravity(gravity)
 
     def use_weights(self, simulator: Simulator, weights: str = "") -> None:
@@ -298,7 +304,7 @@ class PlaySession:
             entry = {key: value for key, value in to_mapping(obstacle.entry).items() if value not in (None, [], ())}
             if body.mesh_file is not None:
                 assert body.entry.mesh is not None
-                entry["mesh"] = f"{body.number}_{Path(body.entry.mesh).name}"
+                entry["mesh"] = f"{body.name}{Path(body.entry.mesh).suffix}"
                 files[entry["mesh"]] = body.mesh_file
             obstacles.append(entry)
         mapping = {

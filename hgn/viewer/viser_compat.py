@@ -59,16 +59,21 @@ def stop_server(server: viser.ViserServer) -> None:
 
 
 def guarded(process: Process, token: str) -> Process:
-    """Answers requests that have the token, in the address or a cookie of it, as `process`, and refuses all others."""
+    """Passes on requests that have the token, in the address or in a cookie, and refuses all others.
+
+    Browsers send cookies to every port of a host, so a request whose Origin is another page is refused too.
+    """
 
     def answer(connection: Any, request: Request) -> Response | None:
         port = connection.local_address[1]
-        name = f"{COOKIE}_{port}"  # cookies know no ports
+        name = f"{COOKIE}_{port}"  # a cookie is for all ports of a host
         # other programs' cookies for this host come too, with any names and values, so no parser that refuses some
         cookies = [part.strip() for header in request.headers.get_all("Cookie") for part in header.split(";")]
         tokens = [cookie.removeprefix(f"{name}=") for cookie in cookies if cookie.startswith(f"{name}=")]
         tokens += parse_qs(urlsplit(request.path).query).get("token", [])
-        if not any(hmac.compare_digest(value.encode(), token.encode()) for value in tokens):
+        origins, hosts = request.headers.get_all("Origin"), request.headers.get_all("Host")
+        foreign = any(urlsplit(origin).netloc not in hosts for origin in origins)
+        if foreign or not any(hmac.compare_digest(value.encode(), token.encode()) for value in tokens):
             headers = Headers({"Content-Type": "text/plain", "Content-Length": str(len(REFUSAL))})
             return Response(http.HTTPStatus.FORBIDDEN, "Forbidden", headers, REFUSAL)
         response = process(connection, request)

@@ -1,0 +1,197 @@
+"""What strangers send to the page of hgn.play: names, values, files and requests; no browser is needed."""
+
+import gc
+import http
+import re
+import weakref
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from network.states import network_of, silent
+from websockets import Headers
+from websockets.http11 import Request
+
+from hgn.runtime.simulator import InitialState, Simulator
+from hgn.scene.scene import Scene
+from hgn.scene.shapes import shape_obstacle
+
+pytest.importorskip("viser", reason="viser is not installed: pip install 'hgn[play]'")
+from hgn.viewer.page import MAXIMUM_UPLOAD_BYTES, PlayPage
+from hgn.viewer.session import PlaySession
+from hgn.viewer.viser_compat import COOKIE, guarded
+
+# viser keeps its event loop's threads and sockets until the garbage collector comes
+pytestmark = pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::pytest.PytestUnraisableExceptionWarning")
+TRIANGLES = b"v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
+
+
+@pytest.fixture(scope="module")
+def page():
+    network = silent(network_of(torch.float32, width=16, levels=2, inputs="relative"))
+    block_N3 = 0.4 + 0.2 * np.random.default_rng(0).random((100, 3)).astype(np.float32)
+    cone = shape_obstacle("cone", 0.3, (0.5, 0.5, 0.5))
+    scene = Scene(block_N3, 0 * block_N3, np.zeros(100, np.uint8), (cone,), cell_size=1 / 32, gravity=(0.0, 0.0, 0.0))
+    session = PlaySession(Simulator(network, 60.0, "cpu"), scene, weights="floating")
+    loaded = []
+
+    def load(name):
+        loaded.append(name)
+        return session.simulator
+
+    page = PlayPage(session, ("floating", "other"), load, port=0)
+    page.loaded = loaded
+    yield page
+    page.close()
+
+
+@pytest.fixture
+def messages(page, monkeypatch):
+    """The messages that viewers have seen."""
+    seen = []
+    monkeypatch.setattr(page, "_notify", lambda message, client=None: seen.append(message))
+    return seen
+
+
+def sent(page, action):
+    """Does what a viewer sent, as the page's loop would."""
+    page.do(action)
+    page._do_all()
+    page._show()
+    page._show_status()
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "<img src=x onerror=alert(1)>.obj",
+        "<script>alert(1)<script>.obj",
+        "[x](javascript:alert(1)).obj",
+        "![x](http:example.org).obj",
+        "`a` **b** | c.obj",
+        "\x1b[31mred.obj",
+        "{{constructor}}.obj",
+        "a\nb.obj",
+        "ü" * 200 + ".obj",
+    ],
+)
+def test_names_of_files_are_shown_as_plain_words(page, messages, name):
+    """Whatever a file is called, the page shows letters, digits, dots, hyphens and underscores."""
+    sent(page, lambda: page._add_file(name, TRIANGLES))
+    assert re.fullmatch(r"chosen: [A-Za-z0-9_.-]{1,48}", page.chosen_text.content)
+    assert not messages
+    sent(page, page._remove_chosen)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("x\0y.obj", TRIANGLES, "null"),
+        ("x.obj", b"\xff\xfe\x00", "x.obj"),
+        ("x.glb", b"glTF\x02\0\0\0" + bytes(8), "x.glb"),
+        ("x.stl", b"", "x.stl"),
+        ("x.txt", TRIANGLES, "mesh must be one of"),
+        ("x.obj", bytes(MAXIMUM_UPLOAD_BYTES + 1), "at most 64 MiB"),
+    ],
+)
+def test_bad_files_are_answered(page, messages, name, content, message):
+    """A file that cannot be read is a message to the viewer who sent it; the session goes on."""
+    count = len(page.session.obstacles)
+    sent(page, lambda: page._add_file(name, content))
+    assert len(messages) == 1 and message in messages[0]
+    assert len(page.session.obstacles) == count
+
+
+@pytest.mark.parametrize("error", [KeyError("x"), ZeroDivisionError("x"), RuntimeError("x"), MemoryError("x")])
+def test_any_error_of_one_viewer_is_a_message_to_that_viewer(page, messages, capsys, error):
+    """An unexpected error is told to its viewer and printed with its trace; no other action is lost."""
+
+    def fail():
+        raise error
+
+    done = []
+    page.do(fail)
+    page.do(lambda: done.append(True))
+    page._do_all()
+    assert len(messages) == 1 and type(error).__name__ in messages[0]
+    assert done
+    assert type(error).__name__ in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("value", [100.0, 1e30, float("inf"), float("nan"), -5.0])
+def test_values_beyond_the_sliders_are_clamped(page, messages, monkeypatch, value):
+    """A value that no slider gives is taken as the nearest that one gives; NaN as the least."""
+    for name in ("diameter", "speed", "height"):
+        monkeypatch.setattr(page, name, SimpleNamespace(value=value, min=0.1, max=0.3))
+    spout = page._spout(np.array([0.5, 2.0, 0.5]), np.array([0.0, -1.0, 0.0]))
+    assert 0.1 <= spout.diameter <= 0.3 and 0.1 <= spout.speed <= 0.3
+    assert 0.1 <= spout.position[1] <= 0.3
+
+
+@pytest.mark.parametrize("ray", [(0.0, 0.0, 0.0), (float("nan"), 0.0, 1.0), (float("inf"), 0.0, 0.0)])
+def test_rays_without_a_direction_are_refused(page, messages, ray):
+    count = page.session.live.particle_count
+    sent(page, lambda: page._drop(np.array([0.5, 2.0, 0.5]), np.array(ray)))
+    assert len(messages) == 1 and "ray" in messages[0]
+    assert page.session.live.particle_count == count
+
+
+def test_only_listed_weights_are_loaded(page, messages):
+    """A name that the page does not offer is refused before anything is opened."""
+    for name in ("/etc/passwd", "hf://someone/weights", "../weights", ""):
+        sent(page, lambda name=name: page._use(name))
+    assert not page.loaded
+    assert len(messages) == 4 and all("weights must be one of floating, other" in message for message in messages)
+
+
+@pytest.mark.parametrize("gravity", [(float("nan"), 0.0, 0.0), (0.0, float("inf"), 0.0), (0.0, 1e30, 0.0)])
+def test_gravity_is_finite_and_bounded(page, messages, gravity):
+    before = page.session.gravity
+    sent(page, lambda: page.session.set_gravity(gravity))
+    assert len(messages) == 1 and "gravity" in messages[0]
+    assert page.session.gravity == before
+
+
+def test_a_moved_obstacle_leaves_no_earlier_scene_behind(page, monkeypatch):
+    """Moving an obstacle 30 times keeps no more states alive than moving it once."""
+    session = page.session
+    alive: list[weakref.ref] = []
+    monkeypatch.setattr(InitialState, "__init__", _remembering(InitialState.__init__, alive))
+    for step in range(30):
+        moved = replace(session.obstacles[0], position=(0.3 + 0.01 * step, 0.5, 0.5))
+        session.move_obstacle(moved)
+        session.step()
+    gc.collect()
+    assert len(alive) >= 30
+    assert sum(state() is not None for state in alive) <= 3
+
+
+def _remembering(init, alive):
+    def wrapped(self, *arguments, **options):
+        init(self, *arguments, **options)
+        alive.append(weakref.ref(self))
+
+    return wrapped
+
+
+@pytest.mark.parametrize(
+    ("origin", "refused"),
+    [
+        (None, False),
+        ("http://127.0.0.1:8080", False),
+        ("http://127.0.0.1:9999", True),
+        ("http://evil.example", True),
+        ("null", True),
+        ("", True),
+    ],
+)
+def test_requests_of_other_pages_are_refused(origin, refused):
+    """A page of another origin is refused though the browser sends this page's cookie with its request."""
+    headers = Headers({"Host": "127.0.0.1:8080", "Cookie": f"{COOKIE}_8080=secret"})
+    if origin is not None:
+        headers["Origin"] = origin
+    connection = SimpleNamespace(local_address=("127.0.0.1", 8080))
+    response = guarded(lambda connection, request: None, "secret")(connection, Request("/", headers))
+    assert (response is not None and response.status_code == http.HTTPStatus.FORBIDDEN) == refused
