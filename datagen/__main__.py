@@ -17,7 +17,8 @@ def main(mapping: dict[str, Any], backend: Backend | None = None) -> int:
     require(kind in PROGRESS_KINDS, "progress", f"one of {', '.join(PROGRESS_KINDS)}", kind)
     config = datagen_config(mapping)
     with StopSignal() as stop:
-        finished = generate(config, make_progress(kind), stop.requested, backend)
+        # progress=json is read by a training that waits for the first episodes
+        finished = generate(config, make_progress(kind), stop.requested, backend, early=kind == "json")
     return 0 if finished else 128 + (stop.signal or 0)
 
 

@@ -89,10 +89,15 @@ def require_local_folder(config: DatagenConfig) -> None:
 
 
 def generate(
-    config: DatagenConfig, progress: Progress, should_stop: Callable[[], bool], backend: Backend | None = None
+    config: DatagenConfig,
+    progress: Progress,
+    should_stop: Callable[[], bool],
+    backend: Backend | None = None,
+    early: bool = False,
 ) -> bool:
     """Makes what is missing; False when it was asked to stop before the end, and the folder can be gone on with.
 
+    early: a GPU begins with few scenes, because something waits for the first episodes; all take longer then.
     Raises: ConfigError, OSError, RuntimeError: what is published and staged is kept then too.
     """
     require_local_folder(config)
@@ -100,7 +105,7 @@ def generate(
     with DatasetWriter(config, progress.message) as writer:
         if not writer.complete:
             try:
-                with _workers(config, backend) as factory:
+                with _workers(config, backend, early) as factory:
                     Pool(writer, progress, factory, should_stop).run()
             except Stopped:
                 progress.message(
@@ -112,12 +117,12 @@ def generate(
     return True
 
 
-def _workers(config: DatagenConfig, backend: Backend) -> AbstractContextManager[WorkerFactory]:
+def _workers(config: DatagenConfig, backend: Backend, early: bool) -> AbstractContextManager[WorkerFactory]:
     if config.dataset.pool == "ray":
         from datagen.pool.ray_workers import RayWorkerFactory
 
-        return RayWorkerFactory(config, backend)
-    plan = plan_workers(config, visible_gpus(), available_cpus(), available_memory())
+        return RayWorkerFactory(config, backend, early)
+    plan = plan_workers(config, visible_gpus(), available_cpus(), available_memory(), early=early)
     return nullcontext(LocalWorkerFactory(config, backend, plan))
 
 

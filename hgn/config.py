@@ -7,7 +7,7 @@ Below this file nobody sees a DictConfig. Numbers that follow from others are pr
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
@@ -46,7 +46,7 @@ MaterialName = Annotated[
     str,
     Bound("a name of lower-case letters, digits and _", lambda name: MATERIAL_NAME.fullmatch(name) is not None),
 ]
-Processor = Annotated[str, one_of("auto", "cpu", "gpu")]
+DeviceName = Annotated[str, one_of("auto", "cpu", "cuda")]
 BackendName = Annotated[str, one_of(*BACKENDS)]
 Precision = Annotated[str, one_of(*PRECISIONS)]
 StoredPrecision = Annotated[str, one_of("fp32", "fp16")]
@@ -200,7 +200,7 @@ class MpmConfig:
     collider_band_cells: NonNegative[float] = 0.5  # from a sheet, where nodes stop motion; more keeps it further off
     collider_friction: NonNegative[float] = 0.0  # Coulomb coefficient; 0 separates without friction
     collider_projection: bool = True  # stop particles that would still cross an obstacle's triangle; counted
-    device: Processor = "auto"  # or cpu, gpu
+    device: DeviceName = "auto"  # cpu or cuda; auto: cuda where there is a GPU
     scenes_per_launch: OneOrMore | None = None  # null: 1 on a CPU, 416 on a GPU
     maximum_substeps_per_frame: Positive[int] = 20_000  # beyond it a scene is stopped and reported
 
@@ -230,8 +230,6 @@ class DatasetConfig:
     long_frames: FrameCount = 300  # of a long episode
     frame_rate_hz: Positive[float] = 60.0  # frames per simulated second
     seed: NonNegative[int] = 0  # of all scenes of the data set
-    # true: a GPU begins with few scenes, which takes longer in all; training and the service set it
-    early_episodes: bool = False
     episodes_per_shard: Positive[int] = 8  # the first shards are smaller, so that training can start early
     workers: OneOrMore | None = None  # processes that simulate; null: one per GPU, or per two cores of a CPU
     maximum_attempts: Positive[int] = 3  # per scene before it is quarantined and replaced
@@ -271,11 +269,6 @@ class DatagenConfig:
     scene: SceneConfig = field(default_factory=SceneConfig)
     mpm: MpmConfig = field(default_factory=MpmConfig)
     dataset: DatasetConfig = field(default_factory=DatasetConfig)
-
-    @property
-    def awaited(self) -> DatagenConfig:
-        """The same for a generator whose first episodes somebody waits for."""
-        return replace(self, dataset=replace(self.dataset, early_episodes=True))
 
 
 @dataclass(frozen=True)
@@ -346,60 +339,63 @@ CORRELATED_WAVES, CORRELATED_WAVELENGTHS = 16, (4, 64)
 class TrainingConfig:
     """How a network is trained (paper sec. 3.3)."""
 
-    maximum_updates: Positive[int] = 20_000_000
+    maximum_updates: Positive[int] = 20_000_000  # updates of the optimiser until the training ends
     maximum_minutes: Positive[float] | None = None  # wall time of this start; null: no limit
     batch_scenes: Positive[int] = 1  # frames of random scenes in one update, on each device
-    # or muon (Jordan 2024): hidden matrices step along their orthogonalised momentum, everything else as in Adam
+    # adam, or muon (Jordan 2024): hidden matrices step along their orthogonalised momentum, all else as in Adam
     optimizer: Annotated[str, one_of("adam", "muon")] = "adam"
-    learning_rate: Positive[float] = 1e-4
-    final_learning_rate: Positive[float] = 1e-6  # reached at maximum_updates, exponentially
-    warmup_updates: NonNegative[int] = 0  # first updates, over which the rate grows linearly to what it is without
-    # what a new run begins with: a file of python -m hgn.export, or shipped weights by name; a run that goes on
-    # takes its checkpoint
+    learning_rate: Positive[float] = 1e-4  # at the first update, after the warm-up
+    final_learning_rate: Positive[float] = 1e-6  # reached at maximum_updates by exponential decay
+    warmup_updates: NonNegative[int] = 0  # first updates, over which the rate grows linearly to its usual value
+    # weights that a new run starts from: a file of python -m hgn.export, or shipped weights by name; a run that
+    # resumes takes its checkpoint
     init_weights: str | None = None
-    # of a moving average of the weights, an update, for example 0.9999; monitored and exported; 0: none
+    # decay of a moving average of the parameters per update, for example 0.9999; the average is monitored and
+    # exported; 0: no average
     ema_decay: BelowOne[float] = 0.0
-    noise_std: NonNegative[float] = 0.000848528  # of the last velocity, domain units per frame
-    # fraction of the noise's variance that neighbours have in common, in waves of 4 to 64 cells; the paper's: 0
+    noise_std: NonNegative[float] = 0.000848528  # input noise of the last velocity, domain units per frame
+    # fraction of the noise's variance that neighbours have in common, as waves of 4 to 64 cells; the paper's: 0
     noise_correlated_fraction: Fraction[float] = 0.1
-    # in a frame whose rms acceleration is a below noise_std, the noise's scale is drawn down to max(a /
-    # noise_std, this); 1: the same noise everywhere
+    # smallest scale of the noise in a frame whose rms acceleration a is below noise_std: the scale is drawn down to
+    # max(a / noise_std, this); 1: the same noise in all frames
     noise_min_scale: AtMostOne[Positive[float]] = 1.0
-    # domain units per frame squared; squared errors of a frame of rms acceleration a below it weigh this / a, at most 4
+    # squared errors of a frame whose rms acceleration a, domain units per frame squared, is below this are multiplied
+    # by this / a, at most by 4; 0: all frames weigh the same
     quiet_acceleration: NonNegative[float] = 0.0
-    # fraction of an episode's samples drawn by its frames' accelerations, with weights that keep the loss; 0:
-    # all frames alike
+    # fraction of an episode's samples drawn in proportion to the acceleration in their frames, with weights that keep
+    # the expected loss; 0: all frames are equally likely
     frame_importance: BelowOne[float] = 0.0
-    # folders of data sets that are trained on too, as far as they are published when the run starts: of the same
+    # folders of data sets that are trained on too, with the episodes published when the run starts; they need the same
     # physics, frame rate and solver cells
     more_data: tuple[str, ...] = ()
-    # episodes whose samples are shuffled together, for data larger than the cache or the GPU's memory; 0: all
+    # number of episodes whose samples are shuffled together, for data larger than the cache or the GPU's memory; 0: all
     shuffle_episodes: NonNegative[int] = 0
-    # gravity: samples are turned and mirrored at random, by what keeps gravity and domain
+    # gravity: samples are rotated and mirrored at random by the symmetries of gravity and domain; none: they are not
     symmetry: Annotated[str, one_of("none", "gravity")] = "none"
-    # of the scenes of an update, taken from the network's own simulations, for example 0.25; 0: none are made
+    # fraction of an update's samples taken from the network's own simulations, for example 0.25; 0: no simulations
     pushforward_fraction: BelowOne[float] = 0.0
     pushforward_every: Positive[int] = 500  # updates between such simulations
-    pushforward_scenes: Positive[int] = 64  # simulated at once, on each device, from random frames of the data on …
-    pushforward_frames: Positive[int] = 16  # … for so many frames at most, as the truth goes; each can be trained on
-    # … or for this fraction of an episode's frames, where that is more: slow drifts show in long episodes alone
+    pushforward_scenes: Positive[int] = 64  # simulated side by side on each device, from random frames of the data
+    pushforward_frames: Positive[int] = 16  # simulated from there, at most to the end of the episode
+    # simulated frames as a fraction of the episode's, where that is more than pushforward_frames: slow drifts show only
+    # in long episodes
     pushforward_episode_fraction: BelowOne[float] = 0.0
-    pushforward_pull: Fraction[float] = 0.1  # fraction of the distance from the truth to be taken back in a frame
-    # fraction of these samples drawn by the acceleration that they ask for, with weights that keep the loss; 0: all
-    # alike
+    pushforward_pull: Fraction[float] = 0.1  # fraction of the distance from the data that a target takes back
+    # fraction of these samples drawn in proportion to their target acceleration, with weights that keep the expected
+    # loss; 0: all are equally likely
     pushforward_importance: BelowOne[float] = 0.0
-    seed: NonNegative[int] = 0
-    accelerator: Processor = "auto"  # or cpu, gpu
+    seed: NonNegative[int] = 0  # of initial parameters, order of samples, noise and simulations
+    device: DeviceName = "auto"  # cpu or cuda; auto: cuda where there is a GPU
     devices: OneOrMore | None = None  # on each machine; null: as launched, without a launcher all GPUs, or one CPU
     precision: Precision = "tf32"  # of matrix products: fp32, tf32 (on a GPU), fp16 (backend triton, and GNS)
-    # torch, triton (kernels in CUDA graphs); auto: triton where it runs
+    # torch, or triton (kernels in CUDA graphs); auto: triton where it runs
     backend: Annotated[str, one_of("auto", "torch", "triton")] = "auto"
-    minimum_episodes: Positive[int] = 1  # training starts once that many training episodes are published
+    minimum_episodes: Positive[int] = 1  # training starts once this number of training episodes is published
     generate: bool = True  # start the generator where the data set is missing or incomplete
-    log_every: Positive[int] = 50  # updates
-    checkpoint_every: Positive[int] = 1_000  # updates
+    log_every: Positive[int] = 50  # updates between log lines
+    checkpoint_every: Positive[int] = 1_000  # updates between checkpoints
     monitor_every: Positive[int] = 100_000  # updates between measurements of one-step and rollout errors
-    monitor_rollout_frames: NonNegative[int] = 300  # 0: no rollouts
+    monitor_rollout_frames: NonNegative[int] = 300  # of each rollout that is measured; 0: no rollouts
 
     def __post_init__(self) -> None:
         require_bounds(self)

@@ -112,10 +112,10 @@ def export(checkpoint_path: Path, out: Path, stored_precision: str = "fp32", **n
     """
     # Lightning, which the other exports do without, is loaded here
     from hgn.training.checkpoint import (
+        Progress,
         data_of_checkpoint,
         network_of_checkpoint,
         read_checkpoint,
-        updates_of_checkpoint,
     )
 
     checkpoint = read_checkpoint(checkpoint_path)
@@ -127,7 +127,7 @@ def export(checkpoint_path: Path, out: Path, stored_precision: str = "fp32", **n
         obstacle_cell_size=data.obstacle_cell_size,
         gravity=data.gravity,
         maximum_initial_speed=data.maximum_initial_speed,
-        updates=updates_of_checkpoint(checkpoint),
+        updates=Progress.of(checkpoint).updates,
         provenance=provenance() | {"checkpoint": checkpoint_path.name, "data_config_hash": data.config_hash},
     )
     save_weights(out, network, info, stored_precision)

@@ -67,6 +67,7 @@ REMOVED: dict[str, Removed] = {
     "network.rest_levels": Removed(2, "leave it out", _rests),
     "network.static_spacing_cells": Removed(remedy=f"leave it out; {LAST_COMMIT}"),
     "network.wall_distance_cells": Removed(8.0, TRAIN_ANEW, lambda network: not _relative(network)),
+    "dataset.early_episodes": Removed(remedy="leave it out: trainings and the service generate few scenes first"),
     "training.gradient_messages": Removed("fp32"),
     "training.huber": Removed(),
     "training.weight_decay": Removed(),
@@ -109,6 +110,7 @@ KEYS = {
     "training.rollout_frames": "training.pushforward_frames",
     "training.rollout_pull": "training.pushforward_pull",
     "training.weights": "training.init_weights",
+    "training.accelerator": "training.device",
     "scene.initial_speed_share": "scene.moving_group_fraction",
     "shares": "coefficients",  # of hgn.average
     "cursor": "sampler_state",  # in checkpoints
@@ -123,6 +125,7 @@ VALUES: dict[str, dict[Any, str]] = {
     "precision": _PRECISIONS,
     "precisions": _PRECISIONS,
     "stored_precision": {True: "fp16", False: "fp32"},
+    "device": {"gpu": "cuda"},
     "system": {"trivial": "baseline"},  # in reports of tools.error_vs_time
 }
 

@@ -17,7 +17,6 @@ from hgn.config import TrainConfig
 from hgn.data.identity import dataset_identity, identity_hash, require_same_dataset
 from hgn.data.manifest import Manifest
 from hgn.data.reader import EpisodeStore
-from hgn.data.sampler import SamplerState
 from hgn.data.storage import is_remote
 from hgn.network.base import ParticleNetwork
 from hgn.schema import from_mapping
@@ -27,16 +26,17 @@ from hgn.system.processes import die_with_parent
 from hgn.training.checkpoint import (
     LAST_NAMES,
     DamagedError,
+    Progress,
+    Resume,
     check_checkpoint,
     network_of_weights,
     read_checkpoint,
-    sampler_state_of_checkpoint,
 )
 from hgn.training.dataset import PublishedEpisodes, is_complete, more_data, wait_for_episodes
 from hgn.training.distributed import default_run, first_on_machine, first_rank, layout
 from hgn.training.generator import Generator
 from hgn.training.imported import require_network_fits, settings_of_imported
-from hgn.training.session import precompile_kernels, train_network
+from hgn.training.session import Start, precompile_kernels, train_network
 from hgn.training.stop import StopRequest
 
 
@@ -62,8 +62,8 @@ def main(mapping: dict[str, Any]) -> int:
     with ExitStack() as stack:
         if first_rank():
             stack.enter_context(held(run / ".lock", "run", "another training is in it; wait for its end, or choose"))
-        checkpoint = _checkpoint_to_resume(config, run / "checkpoints")
-        initial = _initial_network(config, checkpoint)
+        resume = _checkpoint_to_resume(config, run / "checkpoints")
+        initial = _initial_network(config, resume)
         generator = None
         # what a URL lacks, its own service makes
         if first_rank() and config.training.generate and not is_remote(folder) and not is_complete(config):
@@ -75,12 +75,12 @@ def main(mapping: dict[str, Any]) -> int:
             print("stopped before the first episode was published; the same command resumes it", file=sys.stderr)
             return stop.exit_code
         stop.restart_clock(config.training.maximum_minutes)
-        published = PublishedEpisodes(config, generator)
-        return train_network(config, store, checkpoint, initial, stop, published, precompilation)
+        start = Start(store, resume, initial, precompilation)
+        return train_network(config, start, stop, PublishedEpisodes(config, generator))
 
 
-def _checkpoint_to_resume(config: TrainConfig, folder: Path) -> tuple[Path, SamplerState] | None:
-    """The run's last whole checkpoint, checked before anything is started, and where in the data it stood.
+def _checkpoint_to_resume(config: TrainConfig, folder: Path) -> Resume | None:
+    """Returns the run's last whole checkpoint, checked before anything is started; None without any.
 
     Raises: DamagedError when there are some and none is whole.
     """
@@ -96,24 +96,22 @@ def _checkpoint_to_resume(config: TrainConfig, folder: Path) -> tuple[Path, Samp
         if damaged is not None:
             raise damaged
         return None
-    imported = config.imported
-    asked = (
-        Manifest.load(config.dataset.folder).config_hash
-        if imported
-        else identity_hash(dataset_identity(config.datagen))
-    )
-    check_checkpoint(checkpoint, config, asked, path)
-    return path, sampler_state_of_checkpoint(checkpoint)
+    if config.imported:
+        config_hash = Manifest.load(config.dataset.folder).config_hash
+    else:
+        config_hash = identity_hash(dataset_identity(config.datagen))
+    check_checkpoint(checkpoint, config, config_hash, path)
+    return Resume(path, Progress.of(checkpoint))
 
 
-def _initial_network(config: TrainConfig, checkpoint: tuple[Path, SamplerState] | None) -> ParticleNetwork | None:
-    """The network of training.init_weights, for a new run alone: a checkpoint wins."""
+def _initial_network(config: TrainConfig, resume: Resume | None) -> ParticleNetwork | None:
+    """Returns the network of training.init_weights for a new run; a run that resumes takes its checkpoint's."""
     weights = config.training.init_weights
     if weights is None:
         return None
-    if checkpoint is not None:
+    if resume is not None:
         if first_rank():
-            print(f"training.init_weights={weights} is not read: the run goes on from {checkpoint[0]}", file=sys.stderr)
+            print(f"training.init_weights={weights} is not read: the run goes on from {resume.path}", file=sys.stderr)
         return None
     network = network_of_weights(config)
     if first_rank():

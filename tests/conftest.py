@@ -2,10 +2,12 @@
 
 import gc
 import importlib.util
+import io
 import os
 import shutil
 import signal
 import sys
+from contextlib import redirect_stderr, redirect_stdout
 from functools import partial
 from pathlib import Path
 
@@ -127,6 +129,27 @@ def data(make_config, small_dataset):
     config = make_config()
     shutil.copytree(small_dataset, config.dataset.folder)
     return config
+
+
+@pytest.fixture(scope="session")
+def finished_once(small_dataset, tmp_path_factory):
+    """A training of 12 updates that ended, with rollouts measured: its data, its folder, and what it printed."""
+    from training.runs import train_mapping
+
+    from hgn import train
+
+    config, run, said = small_config(small_dataset), tmp_path_factory.mktemp("finished") / "run", io.StringIO()
+    with redirect_stdout(said), redirect_stderr(said):
+        assert train.main(train_mapping(config, run, monitor_rollout_frames=4)) == 0
+    return config, run, said.getvalue()
+
+
+@pytest.fixture
+def finished(finished_once, tmp_path):
+    """The data of that training, and a copy of its folder."""
+    config, run, _ = finished_once
+    shutil.copytree(run, tmp_path / "run")
+    return config, tmp_path / "run"
 
 
 @pytest.fixture

@@ -34,9 +34,7 @@ LONG_FILES = {
 
 NARROW_PACKAGES = ("hgn/training/", "hgn/runtime/")
 PARAMETERS, POSITIONAL_ARGUMENTS = 8, 4
-MANY_PARAMETERS: dict[str, int] = {
-    "hgn/training/graph_trainer.py:__init__": 10,
-}
+MANY_PARAMETERS: dict[str, int] = {}
 # the number of such calls in a file
 MANY_POSITIONAL_ARGUMENTS: dict[str, int] = {
     "hgn/runtime/differentiable.py": 5,
@@ -45,16 +43,7 @@ MANY_POSITIONAL_ARGUMENTS: dict[str, int] = {
     "hgn/runtime/simulator.py": 10,
     "hgn/runtime/triton_rollout.py": 5,
     "hgn/runtime/weights.py": 1,
-    "hgn/training/data_module.py": 4,
-    "hgn/training/graph_pushforward.py": 3,
-    "hgn/training/graph_trainer.py": 3,
-    "hgn/training/imported.py": 2,
-    "hgn/training/module.py": 3,
-    "hgn/training/monitor.py": 2,
-    "hgn/training/noise.py": 1,
     "hgn/training/parity.py": 3,
-    "hgn/training/precompile.py": 1,
-    "hgn/training/session.py": 2,
 }
 
 UNCOMMENTED: set[str] = {
@@ -68,13 +57,9 @@ UNCOMMENTED: set[str] = {
     "MpmConfig.youngs_modulus_pa",
     "NetworkConfig.materials",
     "NetworkConfig.obstacle_features",
-    "TrainingConfig.learning_rate",
-    "TrainingConfig.maximum_updates",
-    "TrainingConfig.seed",
 }
 UNMENTIONED: set[str] = {
     "BenchConfig.rounds",
-    "DatasetConfig.early_episodes",
     "DatasetConfig.ray_address",
     "EvaluateConfig.particles_per_batch",
     "MpmConfig.collider_projection",
@@ -86,7 +71,6 @@ UNMENTIONED: set[str] = {
     "ScalingConfig.rounds",
     "SceneConfig.clearance_cells",
     "StabilitySolverConfig.grid_cells",
-    "TrainingConfig.accelerator",
     "TrainingConfig.log_every",
 }
 

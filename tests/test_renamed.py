@@ -36,6 +36,11 @@ def removed(monkeypatch):
         (RolloutConfig, {"path": "fast"}, "path is not a known key; it is called backend now; write backend=triton"),
         (EvaluateConfig, {"weights": "a", "data": "b", "path": "plain"}, "now; write backend=torch"),
         (TrainConfig, {"training": {"path": "auto"}}, "it is called training.backend now; write training.backend=auto"),
+        (
+            TrainConfig,
+            {"training": {"accelerator": "gpu"}},
+            "is called training.device now; write training.device=cuda",
+        ),
         (TrainConfig, {"path": "fast"}, "path is not a known key; known keys: scene, "),  # it never had this one
         (RolloutConfig, {"backend": "fast"}, "backend must be one of .*, got 'fast'; fast is called triton now"),
         (RolloutConfig, {"precision": "half"}, "precision must be one of .*, got 'half'; half is called fp16 now"),

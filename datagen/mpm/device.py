@@ -38,15 +38,15 @@ _started: Device | None = None
 def initialise(device: str = "auto", cpu_threads: int | None = None) -> Device:
     """Starts Taichi, or returns what an earlier call of this process started.
 
-    `device` is auto (CUDA if this machine has it, else the CPU), cpu or gpu. `cpu_threads` is the number of
+    `device` is auto (CUDA if this machine has it, else the CPU), cpu or cuda. `cpu_threads` is the number of
     threads on a CPU; none takes all cores that this process may use. Compiled kernels are kept in Taichi's
     cache on disk, so that the next process starts fast.
 
-    Raises: ConfigError when gpu is asked for and there is none, or when the process already runs on another
+    Raises: ConfigError when cuda is requested and there is none, or when the process already runs on another
     device or number of threads (Taichi has one runtime a process).
     """
     global _started
-    require(device in ("auto", "cpu", "gpu"), "device", "one of auto, cpu, gpu", device)
+    require(device in ("auto", "cpu", "cuda"), "device", "one of auto, cpu, cuda", device)
     if cpu_threads is not None:
         require(cpu_threads >= 1, "cpu_threads", "at least 1", cpu_threads)
     if _started is not None:
@@ -63,8 +63,8 @@ def initialise(device: str = "auto", cpu_threads: int | None = None) -> Device:
     name_lines_alone()
     ti.set_logging_level(ti.ERROR)  # the search for CUDA warns where there is none
     has_gpu = device != "cpu" and ti.lang.misc.is_arch_supported(ti.cuda)
-    if device == "gpu" and not has_gpu:
-        raise ConfigError("device must be cpu or auto where CUDA finds no device, got 'gpu'")
+    if device == "cuda" and not has_gpu:
+        raise ConfigError("device must be cpu or auto where CUDA finds no device, got 'cuda'")
     threads = cpu_threads or available_cpus()
     # where it cannot write to its cache Taichi crashes as the process ends
     kernels = writable_folder(Path(ti.lang.impl.default_cfg().offline_cache_file_path), "taichi")
@@ -82,7 +82,7 @@ def initialise(device: str = "auto", cpu_threads: int | None = None) -> Device:
             opt_level=0,  # expressions that stand twice
             log_level=ti.ERROR,
         )
-    _started = Device("gpu", 1, _processors()) if has_gpu else Device("cpu", threads)
+    _started = Device("cuda", 1, _processors()) if has_gpu else Device("cpu", threads)
     return _started
 
 

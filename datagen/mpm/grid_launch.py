@@ -63,7 +63,7 @@ class GridLaunch(Launch):
         if device.kind == "cpu":
             self.parts = self.copies = min(device.threads, MAXIMUM_PARTS)
         super().__init__(*batch)
-        self.variant += VARIANT.atomic * (device.kind == "gpu")
+        self.variant += VARIANT.atomic * (device.kind == "cuda")
         self.position = device_vectors(np.concatenate([scene.position_N3 for scene in self.scenes]))
         self.velocity = device_vectors(np.concatenate([scene.velocity_N3 for scene in self.scenes]))
         self.affine = ti.Matrix.ndarray(3, 3, ti.f32, self.particles)

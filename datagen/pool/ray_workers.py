@@ -41,7 +41,7 @@ _CONNECT_REMEDY = (
 class RayWorkerFactory:
     """Actors of a cluster; a context manager that holds the connection to it."""
 
-    def __init__(self, config: DatagenConfig, backend: Backend) -> None:
+    def __init__(self, config: DatagenConfig, backend: Backend, early: bool = False) -> None:
         """Raises: ConfigError when Ray is not installed."""
         try:
             import ray
@@ -49,7 +49,7 @@ class RayWorkerFactory:
             raise ConfigError(
                 "pool=ray needs Ray, which is not installed; pip install 'hgn[ray]' on every machine"
             ) from None
-        self._ray, self._config, self._backend = ray, config, backend
+        self._ray, self._config, self._backend, self._early = ray, config, backend, early
 
     def __enter__(self) -> RayWorkerFactory:
         """Raises: ConfigError when no cluster answers."""
@@ -60,7 +60,8 @@ class RayWorkerFactory:
             raise ConfigError(
                 f"pool=ray needs a Ray cluster at {address}, got {type(error).__name__}; {_CONNECT_REMEDY}"
             ) from None
-        self.plan = plan_cluster(self._config, [node["Resources"] for node in self._ray.nodes() if node["Alive"]])
+        nodes = [node["Resources"] for node in self._ray.nodes() if node["Alive"]]
+        self.plan = plan_cluster(self._config, nodes, self._early)
         return self
 
     def __exit__(self, *error: object) -> None:

@@ -29,27 +29,29 @@ class WorkerPlan:
     gpus: tuple[str, ...] = ()  # CUDA devices, dealt out to the solvers in turn
 
 
-def plan_workers(config: DatagenConfig, gpus: tuple[str, ...], cpu_count: int, memory_bytes: float) -> WorkerPlan:
+def plan_workers(
+    config: DatagenConfig, gpus: tuple[str, ...], cpu_count: int, memory_bytes: float, early: bool = False
+) -> WorkerPlan:
     """One solver for two cores on a CPU; one for each GPU, with scene makers on the cores."""
     workers, launch = config.dataset.workers, config.mpm.scenes_per_launch
-    if config.mpm.device == "gpu" or (config.mpm.device == "auto" and gpus):
+    if config.mpm.device == "cuda" or (config.mpm.device == "auto" and gpus):
         solvers = workers or max(1, len(gpus))
         launch = launch or gpu_scenes_per_launch(config, memory_bytes / solvers)
         makers = max(1, min(MAXIMUM_MAKERS, cpu_count - 1))
-        return WorkerPlan(solvers, None, makers, launch, gpu_first_launch(config, launch), gpus)
+        return WorkerPlan(solvers, None, makers, launch, gpu_first_launch(launch, early), gpus)
     solvers = workers or max(1, cpu_count // 2)
     threads = max(1, cpu_count // solvers)
     return WorkerPlan(solvers, threads, 1, launch or 1, launch or 1)
 
 
-def plan_cluster(config: DatagenConfig, nodes: Sequence[Mapping[str, float]]) -> WorkerPlan:
+def plan_cluster(config: DatagenConfig, nodes: Sequence[Mapping[str, float]], early: bool = False) -> WorkerPlan:
     """One solver for each GPU of the cluster; without one, for each two cores of a node."""
     workers, launch = config.dataset.workers, config.mpm.scenes_per_launch
     gpus = int(sum(node.get("GPU", 0) for node in nodes))
-    if config.mpm.device == "gpu" or (config.mpm.device == "auto" and gpus):
+    if config.mpm.device == "cuda" or (config.mpm.device == "auto" and gpus):
         memory = min((node["memory"] for node in nodes if "memory" in node), default=math.inf)
         launch = launch or gpu_scenes_per_launch(config, memory)
-        solvers, threads, first = workers or max(1, gpus), None, gpu_first_launch(config, launch)
+        solvers, threads, first = workers or max(1, gpus), None, gpu_first_launch(launch, early)
     else:
         cores = [int(node["CPU"]) for node in nodes if node.get("CPU", 0) >= 1]
         threads = min(_CLUSTER_THREADS, *cores) if cores else 1
@@ -69,11 +71,11 @@ def gpu_scenes_per_launch(config: DatagenConfig, memory_bytes: float) -> int:
     return max(1, int(min(GPU_SCENES_PER_LAUNCH, GPU_NODES_PER_LAUNCH // nodes, held)))
 
 
-def gpu_first_launch(config: DatagenConfig, launch: int) -> int:
+def gpu_first_launch(launch: int, early: bool) -> int:
     """Few scenes where something waits for the first episodes; else all: a launch of few lasts as long as its longest
     scene, which costs more than it takes to make the others.
     """
-    return min(launch, GPU_EARLY_LAUNCH) if config.dataset.early_episodes else launch
+    return min(launch, GPU_EARLY_LAUNCH) if early else launch
 
 
 def visible_gpus() -> tuple[str, ...]:

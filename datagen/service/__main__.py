@@ -65,7 +65,7 @@ def main(mapping: dict[str, Any], backend: Backend | None = None) -> int:
         from datagen.service.server import make_app, make_server, telling
 
         progress = make_progress(kind)
-        with Supervisor(config.awaited, progress, backend) as supervisor:
+        with Supervisor(config, progress, backend) as supervisor:
             app = make_app(
                 folder, token, lambda: replace(supervisor.state, log_error=log.error or supervisor.state.log_error)
             )

@@ -189,7 +189,7 @@ def _generate(connection: Connection, config: DatagenConfig, backend: Backend | 
                     connection.send(("alive",))
                 return stop.requested()
 
-            finished = generate(config, _PipeProgress(connection), should_stop, backend)
+            finished = generate(config, _PipeProgress(connection), should_stop, backend, early=True)
             connection.send(("complete",) if finished else ("stopped",))
         except (BrokenPipeError, ConnectionResetError):
             return  # the service is gone; what is finished is kept

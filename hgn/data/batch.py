@@ -33,7 +33,6 @@ class Batch:
     gravity_S3: torch.Tensor  # domain units per frame squared
     obstacles: ObstacleCells | None
     seeds_S: tuple[int, ...]  # of noise, jitter and symmetry
-    sampler_state: SamplerState | None = None  # after this batch
     symmetries_S: tuple[tuple[Symmetry, ...], ...] = ()  # of each scene, that training may apply
     weight_S: tuple[float, ...] = ()  # of each scene's loss; empty: 1
     noise_scale_S: tuple[float, ...] = ()  # of each scene, in units of training.noise_std; empty: 1
@@ -86,16 +85,13 @@ class BatchSample:
 
 
 @dataclass(frozen=True, eq=False)
-class UpdateSamples:
-    """The samples of an update, some of which the pushforward pool may replace."""
+class WindowChunk:
+    """The samples of one update on backend torch. hgn.data.episode_tensors.EpisodeChunk is the same for triton."""
 
-    samples: tuple[BatchSample, ...]
+    samples: tuple[tuple[BatchSample, ...], ...]  # of each update: here of one
     sampler_state: SamplerState  # after this update
     starts: tuple[tuple[Episode, int], ...] = ()  # where simulations start before this update
-
-    def batch(self, network: NetworkConfig) -> Batch:
-        """Returns the samples as tensors."""
-        return _joined(self.samples, network, self.sampler_state)
+    batch: Batch | None = None  # the samples as tensors; None where the pushforward pool may replace some of them
 
 
 def make_batch(
@@ -104,10 +100,11 @@ def make_batch(
     """Returns the windows of (episode, frame) pairs, with the obstacle inputs of the network."""
     pairs = zip(frames, seeds or [0] * len(frames), strict=True)
     history = network.velocity_history
-    return _joined([BatchSample(e, frame, window(e, frame, history), seed) for (e, frame), seed in pairs], network)
+    return join([BatchSample(e, frame, window(e, frame, history), seed) for (e, frame), seed in pairs], network)
 
 
-def _joined(samples: Sequence[BatchSample], network: NetworkConfig, sampler_state: SamplerState | None = None) -> Batch:
+def join(samples: Sequence[BatchSample], network: NetworkConfig) -> Batch:
+    """Returns the samples as the tensors of one batch."""
     episodes = [sample.episode for sample in samples]
     particles = tuple(len(episode.material_N) for episode in episodes)
     return Batch(
@@ -119,7 +116,6 @@ def _joined(samples: Sequence[BatchSample], network: NetworkConfig, sampler_stat
         gravity_S3=torch.tensor([frame_gravity(episode) for episode in episodes], dtype=torch.float32),
         obstacles=ObstacleCells.of([e.obstacle_grid for e in episodes]) if network.obstacle_features else None,
         seeds_S=tuple(sample.seed for sample in samples),
-        sampler_state=sampler_state,
         weight_S=tuple(sample.weight for sample in samples),
         noise_scale_S=tuple(sample.noise_scale for sample in samples),
         symmetries_S=tuple(shown_symmetries(e, network) for e in episodes),

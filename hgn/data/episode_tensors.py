@@ -34,7 +34,7 @@ class EpisodeTensors:
 
 
 @dataclass(frozen=True, eq=False)
-class UpdateChunk:
+class EpisodeChunk:
     """The samples of successive updates, and their episodes that are not on the device yet."""
 
     samples: tuple[tuple[Sample, ...], ...]

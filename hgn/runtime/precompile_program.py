@@ -73,7 +73,7 @@ def _update_launches(job: PrecompileJob, device: str) -> None:
     updates.average = torch.zeros_like(updates.values) if job.averages else None
     updates.allocate(job.particles, job.cells)
     updates.launches()
-    for scenes in job.pushforward_scenes:  # of hgn.training.graph_pushforward, or of a monitored rollout
+    for scenes in job.pushforward_scenes:  # of hgn.training.triton_pushforward, or of a monitored rollout
         fraction = scenes / job.settings.scenes
         particles = round(fraction * job.particles)
         capacities = first_capacities([round(fraction * cells) for cells in job.cells], particles)

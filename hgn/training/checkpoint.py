@@ -1,6 +1,6 @@
-"""Checkpoints on disk: reading, checking against a configuration, and taking the network out.
+"""Checkpoints on disk: reading, comparison with a configuration, and the network in them.
 
-Nothing here needs Lightning: export and resume checks read plain containers and tensors.
+Nothing here needs Lightning: checkpoints contain plain containers and tensors.
 """
 
 from __future__ import annotations
@@ -22,33 +22,57 @@ from hgn.renamed import current_names
 from hgn.runtime.weights import find_weights, load_weights
 from hgn.schema import ConfigError, from_stored, to_mapping
 
-SECTION = "hgn"  # the checkpoint's key for what is ours
+SECTION = "hgn"  # key of this project's entries in a checkpoint
 LAST_NAMES = ("last.ckpt", "last-1.ckpt", "last-2.ckpt")  # newest first
-BEST_NAME = "best.ckpt"  # of the lowest one-step validation error; none where no validation scene was measured
+BEST_NAME = "best.ckpt"  # has the lowest one-step validation error; missing where no validation scene was measured
 _ZIP_FAULTS = (zipfile.BadZipFile, zlib.error, NotImplementedError)
-NETWORK, AVERAGED = "network.", "averaged."  # prefixes of the tensors: as trained, and their moving average
+NETWORK, AVERAGED = "network.", "averaged."  # prefixes of the trained tensors, and of their moving average
 
 
 class DamagedError(ConfigError):
-    """A checkpoint's bytes are not those that were written."""
+    """The bytes of a checkpoint changed since it was written."""
 
 
 @dataclass(frozen=True)
 class DataInfo:
-    """What a network must remember of the data it was trained on."""
+    """Facts about the training data that are stored with a network."""
 
     config_hash: str
     frame_rate_hz: float
     obstacle_cell_size: float
     gravity: tuple[float, float, float] = (0.0, -9.8, 0.0)
-    maximum_initial_speed: float | None = None  # of the groups, domain units per second; null: not known
+    maximum_initial_speed: float | None = None  # of the groups, domain units per second; None: unknown
+
+
+@dataclass(frozen=True)
+class Progress:
+    """How far a run had come when a checkpoint was written."""
+
+    updates: int
+    skipped: int  # of the updates, because a gradient was not finite
+    sampler_state: SamplerState  # the place in the order of samples
+
+    @staticmethod
+    def of(checkpoint: dict[str, Any]) -> Progress:
+        section = current_names(checkpoint[SECTION])
+        before = checkpoint["callbacks"].get("GradientGuard", {}).get("skipped", 0)  # in checkpoints of 0.1.0
+        state = from_stored(SamplerState, section["sampler_state"], "sampler_state")
+        return Progress(section["updates"], section.get("skipped", before), state)
+
+
+@dataclass(frozen=True)
+class Resume:
+    """The checkpoint that a run resumes from."""
+
+    path: Path
+    progress: Progress
 
 
 def read_checkpoint(path: Path) -> dict[str, Any]:
-    """A checkpoint's content; only plain containers and tensors are ever loaded.
+    """Returns the content of a checkpoint; only plain containers and tensors are loaded.
 
-    Raises: DamagedError when it is cut or any bit of it changed, which torch would not notice; ConfigError when the
-    file is missing, or no checkpoint of this project.
+    Raises: DamagedError when it is incomplete or any bit of it changed, which torch does not detect; ConfigError when
+    the file is missing, or is no checkpoint of this project.
     """
     try:
         with zipfile.ZipFile(path) as records:
@@ -69,15 +93,15 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
 
 
 def check_checkpoint(checkpoint: dict[str, Any], config: TrainConfig, config_hash: str, path: Path) -> None:
-    """Refuses to resume a checkpoint of another configuration.
+    """Compares a checkpoint with the configuration that is to resume it.
 
     Raises: ConfigError naming the first key that differs.
     """
     remedy = "set it so, or choose another run=FOLDER"
-    # Through the dataclass: a key that is younger than the checkpoint has its default in it.
+    # The dataclass adds the default of a key that the checkpoint lacks.
     stored, section = _network_config(checkpoint, path), checkpoint[SECTION]
     pairs = _network_pairs(stored, config)
-    pairs.append(("training.noise_std", section["noise_std"], config.training.noise_std))  # is in the normaliser
+    pairs.append(("training.noise_std", section["noise_std"], config.training.noise_std))  # part of the normaliser
     _require_equal(pairs, f" to resume {path}", remedy)
     if section["data"]["config_hash"] != config_hash:
         raise ConfigError(
@@ -87,7 +111,7 @@ def check_checkpoint(checkpoint: dict[str, Any], config: TrainConfig, config_has
 
 
 def _network_pairs(network: NetworkConfig, config: TrainConfig) -> list[tuple[str, Any, Any]]:
-    """Each key of the networks' settings: its name, the value there, and the one that is asked for."""
+    """Returns each key of the network settings with the stored and the configured value."""
     stored, wanted = to_mapping(network), to_mapping(config.network)
     return [(f"network.{key}", stored[key], wanted[key]) for key in sorted(stored)]
 
@@ -120,9 +144,9 @@ def network_of_weights(config: TrainConfig) -> ParticleNetwork:
 
 
 def network_of_checkpoint(checkpoint: dict[str, Any], path: Path) -> ParticleNetwork:
-    """The network of a checkpoint, normaliser included, in evaluation mode: the moving average where there is one.
+    """Returns the network of a checkpoint with its normaliser, in evaluation mode; the moving average if there is one.
 
-    Raises: ConfigError where this version builds other networks.
+    Raises: ConfigError for a network that this version does not build.
     """
     network, state = build_network(_network_config(checkpoint, path)), checkpoint["state_dict"]
     prefix = AVERAGED if any(name.startswith(AVERAGED) for name in state) else NETWORK
@@ -145,16 +169,6 @@ def _other_version(path: Path, reason: str) -> str:
     return f"checkpoint must hold a network as this version builds it, got {path}: {reason}; export it with its version"
 
 
-def sampler_state_of_checkpoint(checkpoint: dict[str, Any]) -> SamplerState:
-    """Where in the order of samples the run stood."""
-    return from_stored(SamplerState, current_names(checkpoint[SECTION])["sampler_state"], "sampler_state")
-
-
 def data_of_checkpoint(checkpoint: dict[str, Any]) -> DataInfo:
-    """The data set that the network was trained on."""
+    """Returns the description of the training data."""
     return from_stored(DataInfo, checkpoint[SECTION]["data"], "data")
-
-
-def updates_of_checkpoint(checkpoint: dict[str, Any]) -> int:
-    """Updates made when the checkpoint was written."""
-    return int(checkpoint[SECTION]["updates"])

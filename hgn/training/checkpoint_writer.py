@@ -1,4 +1,4 @@
-"""Checkpoints that are written beside the training: the next updates run while the file is made."""
+"""Writes checkpoints in a thread, while the next updates run."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ from lightning_utilities.core.apply_func import apply_to_collection
 from hgn.system.files import make_folder, temporary_file, write_atomically
 from hgn.training.checkpoint import LAST_NAMES
 
-TURN_S = 1e-4  # for which a checkpoint's writing keeps Python's lock from the training; Python's own are 5e-3
+TURN_S = 1e-4  # Python's switch interval while a checkpoint is pickled; the default is 5e-3
 
 
 class CheckpointWriter(TorchCheckpointIO):
-    """Copies a checkpoint when it is asked to save it, and writes the copy in a thread, whole or not at all.
+    """Copies a checkpoint, and writes the copy in a thread, whole or not at all.
 
-    At most one write is under way: the next one waits for it. What a write failed with is raised by whatever waits for
-    it: the next one, `wait`, or the end of the training, however it ends. Lightning's AsyncCheckpointIO lets any number
-    of copies wait, and raises an error one write later or not before the end.
+    At most one write is in progress: the next one waits for it. An error of a write is raised by the next write, by
+    `wait`, or at the end of the training. (Lightning's AsyncCheckpointIO queues any number of copies, and raises an
+    error one write later or at the end.)
     """
 
     def __init__(self) -> None:
@@ -35,20 +35,20 @@ class CheckpointWriter(TorchCheckpointIO):
         self._writing: futures.Future[None] | None = None
 
     def save_checkpoint(self, checkpoint: dict[str, Any], path: str | Path, storage_options: Any = None) -> None:
-        """Returns once the checkpoint is copied. Raises: OSError where the write before failed."""
+        """Returns when the checkpoint is copied. Raises: OSError if the previous write failed."""
         self.wait()
         self._writing = self._thread.submit(_write, snapshot(checkpoint), Path(path))
 
     def wait(self) -> None:
-        """Returns once the last checkpoint is on disk. Raises: OSError where it could not be written."""
+        """Returns when the last checkpoint is on disk. Raises: OSError if it could not be written."""
         if self._writing is not None:
-            # a second Ctrl-C leaves from here: `teardown` then waits, and tells of errors
+            # a second Ctrl-C interrupts this wait; then `teardown` waits, and raises errors
             futures.wait([self._writing])
             writing, self._writing = self._writing, None
             writing.result()
 
     def teardown(self) -> None:
-        """The end of the training, by an exception too."""
+        """Waits at the end of the training, also after an exception."""
         try:
             self.wait()
         finally:
@@ -56,14 +56,14 @@ class CheckpointWriter(TorchCheckpointIO):
 
 
 def snapshot(checkpoint: dict[str, Any]) -> dict[str, Any]:
-    """A copy in the host's memory that later updates do not reach. Tensors that share memory share it there too."""
+    """Returns a copy in host memory. Tensors that share memory also share it in the copy."""
     copies: dict[tuple[torch.device, int], torch.UntypedStorage] = {}
 
     def copied(tensor: torch.Tensor) -> torch.Tensor:
         storage = tensor.untyped_storage()
         place = storage.device, storage.data_ptr()
         if place not in copies:
-            # a GPU fills pinned memory fastest, and torch keeps it for the next time
+            # copies to pinned memory are fastest, and torch caches it
             pinned = storage.device.type == "cuda"
             copies[place] = torch.empty(storage.nbytes(), dtype=torch.uint8, pin_memory=pinned).untyped_storage()
             copies[place].copy_(storage)
@@ -75,7 +75,7 @@ def snapshot(checkpoint: dict[str, Any]) -> dict[str, Any]:
 
 
 def _keep_earlier(folder: Path) -> None:
-    """The names of earlier checkpoints move on by one; the last keeps its own until it is replaced."""
+    """Renames each earlier checkpoint to the next older name; last.ckpt stays until it is replaced."""
     for earlier, later in pairwise(reversed(LAST_NAMES)):
         if (folder / later).exists():
             with temporary_file(folder / earlier) as temporary:
@@ -98,8 +98,8 @@ def _write(checkpoint: dict[str, Any], path: Path) -> None:
 
 @contextmanager
 def _short_turns() -> Iterator[None]:
-    """Pickling holds Python's lock, which the training asks for again after each operation of torch: with Python's own
-    turns the two are hardly faster beside each other than one after the other.
+    """Shortens Python's switch interval: pickling holds the interpreter lock, and the training needs it after each
+    operation of torch, so with the default interval the two run almost one after the other.
     """
     before = sys.getswitchinterval()
     sys.setswitchinterval(TURN_S)

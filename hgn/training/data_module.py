@@ -1,197 +1,112 @@
-"""Feeds batches to the trainer from a data set that may still grow."""
+"""Feeds chunks of updates to the trainer from a data set that may still grow."""
 
 from __future__ import annotations
 
-import sys
 import time
-from collections import OrderedDict, deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from itertools import islice
-from typing import Any, TypeVar
+from typing import Any
 
 import torch
 from lightning.pytorch import LightningDataModule, Trainer
 from torch.utils.data import DataLoader, IterableDataset
 
-from hgn.config import NetworkConfig, TrainingConfig
-from hgn.data.batch import Batch, BatchSample, UpdateSamples
-from hgn.data.episode_tensors import EpisodeTensors, UpdateChunk, whole_episode
-from hgn.data.importance import FrameImportance
+from hgn.config import TrainingConfig
+from hgn.data.batch import WindowChunk
+from hgn.data.episode_tensors import EpisodeChunk
 from hgn.data.pooled import AnyStore
-from hgn.data.sampler import BLOCK_EPISODES, EpisodeSampler, Sample, SamplerState
-from hgn.scene.episode import Episode
-from hgn.scene.history import window
+from hgn.data.sampler import EpisodeSampler, SamplerState
 from hgn.schema import ConfigError
 from hgn.system.patience import without_patience
-from hgn.training.noise import noise_scale
-from hgn.training.pushforward import Starts, drawn_starts, simulated_barrier
+from hgn.training.pushforward import Starts, drawn_starts
+from hgn.training.readers import ChunkReader, DrawnChunk
 
-T = TypeVar("T")
 SHARED_FOLDER_PATIENCE_S = 300.0
-BATCHES_AHEAD = 2
-READERS = 8  # threads that copy whole episodes
-LOOK_S = 1.0  # between looks for a signal while there is no batch
-UPDATES_AT_ONCE = 64  # in a chunk, at most
+CHUNKS_AHEAD = 2
+LOOK_S = 1.0  # between looks for a signal while there is no chunk
 
 
 class EpisodeDataModule(LightningDataModule):
-    """Endless batches in the deterministic order; each epoch sees what was published when it began."""
+    """Chunks of updates in the deterministic order, until the last update; each epoch sees what was published when it
+    began.
+    """
 
     def __init__(
         self,
         store: AnyStore,
-        network: NetworkConfig,
         training: TrainingConfig,
-        batches_ahead: int = BATCHES_AHEAD,
-        chunks: bool = False,
+        reader: ChunkReader,
+        chunks_ahead: int = CHUNKS_AHEAD,
         interrupted: Callable[[], bool] = lambda: False,
     ) -> None:
-        """With `chunks` it gives an UpdateChunk instead of a Batch. Once `interrupted`, it ends instead of waiting."""
+        """Once `interrupted`, the chunks end instead of waiting for data."""
         super().__init__()
-        assert batches_ahead >= 0
-        self.store = store
-        self.network = network
-        self.training = training
-        self.batches_ahead = batches_ahead  # read while another is trained on; 0: read when asked for
-        self.hands_out_chunks = chunks
+        assert chunks_ahead >= 0
+        self.store, self.training, self.reader = store, training, reader
+        self.chunks_ahead = chunks_ahead  # read while another is trained on; 0: read when it is needed
         self.interrupted = interrupted
-        self.sampler_state = SamplerState()  # where to begin; set from the checkpoint on a resume
-        self._importance: dict[int, FrameImportance] = {}
-        self._fetched_from = (-1, -1)  # epoch and quarter of a window that shards were last asked for at
-        self.waited_s = 0.0  # time that the training has waited for a batch
+        self.sampler_state, self.first_update = SamplerState(), 0  # where to begin; from the checkpoint on a resume
+        self._fetched_from = (-1, -1)  # epoch and quarter of a window of the last request for shards
+        self.waited_s = 0.0  # time that the training has waited for a chunk
 
-    def train_dataloader(self) -> DataLoader[Batch | UpdateSamples | UpdateChunk]:
+    def train_dataloader(self) -> DataLoader[WindowChunk | EpisodeChunk]:
         # The windows are memory-mapped and small: a worker process would cost more than it saves.
         return DataLoader(_Stream(self), batch_size=None, num_workers=0)
 
-    def transfer_batch_to_device(
-        self, batch: Batch | UpdateSamples | UpdateChunk, device: torch.device, dataloader_idx: int
-    ) -> Batch | UpdateSamples | UpdateChunk:
-        return batch.to(device, non_blocking=True) if isinstance(batch, Batch) else batch
+    def transfer_batch_to_device(self, batch: Any, device: torch.device, dataloader_idx: int) -> Any:
+        return batch  # the updates do so
 
-    def batches(self) -> Iterator[Batch | UpdateSamples]:
-        """This rank's batches, without end; samples instead where the pushforward pool may replace some of them."""
-        order = self._order()
-        begun = update = self._update()
+    def chunks(self) -> Iterator[WindowChunk | EpisodeChunk]:
+        """Yields this rank's chunks. A chunk ends wherever something is due between updates."""
+        drawn = self._drawn()
+        # The order may have to ask other ranks, so it stays in this thread; reading runs ahead in another.
+        executor = ThreadPoolExecutor(1)
+        try:
+            waiting: deque[Future[WindowChunk | EpisodeChunk]] = deque()
+            while True:
+                started = time.monotonic()
+                for chunk in islice(drawn, self.chunks_ahead + 1 - len(waiting)):
+                    waiting.append(executor.submit(self.reader.read, chunk))
+                if not waiting:
+                    break
+                item = waiting.popleft()
+                while not wait([item], LOOK_S).done:
+                    if self._ends():
+                        return
+                self.waited_s += time.monotonic() - started
+                yield item.result()
+            if self.trainer is not None:
+                self.trainer.should_stop = True
+        finally:
+            with without_patience():
+                executor.shutdown(cancel_futures=True)
 
-        def draw() -> tuple[tuple[list[Sample], Starts], SamplerState]:
-            nonlocal update
-            starts = self._starts(order, begun, update)
-            update += 1
-            self._fetch_window(order)
-            return (order.next_batch(), starts), order.state
-
-        def read(drawn: tuple[list[Sample], Starts], state: SamplerState) -> Batch | UpdateSamples:
-            samples = tuple(
-                BatchSample(
-                    self.store[sample.episode],
-                    sample.frame,
-                    window(self.store[sample.episode], sample.frame, self.network.velocity_history),
-                    sample.seed,
-                    sample.weight,
-                    sample.noise_scale,
-                )
-                for sample in self._weighted(drawn[0])
-            )
-            update_samples = UpdateSamples(samples, state, tuple((self.store[i], frame) for i, frame in drawn[1]))
-            return update_samples if self.training.pushforward_fraction else update_samples.batch(self.network)
-
-        yield from self._prefetched(draw, read)
-
-    def chunks(self) -> Iterator[UpdateChunk]:
-        """The same samples, those of many updates at once. A chunk ends wherever something is due between updates."""
-        order = self._order()
-        begun = update = self._update()
-        held: OrderedDict[int, None] = OrderedDict()  # episodes that the trainer has, the longest unused first
-        most = self._most_held()
-
-        def draw() -> tuple[tuple[list[tuple[Sample, ...]], Starts], SamplerState]:
-            nonlocal update
-            starts = self._starts(order, begun, update)
-            count = chunk_length(self.training, begun, update)
+    def _drawn(self) -> Iterator[DrawnChunk]:
+        order, update = self._order(), self.first_update
+        while update < self.training.maximum_updates:
+            starts = self._starts(order, update)
+            count = chunk_length(self.training, self.first_update, update, self.reader.updates_at_once)
             update += count
             self._fetch_window(order)
-            return ([tuple(order.next_batch()) for _ in range(count)], starts), order.state
-
-        def read(drawn: tuple[list[tuple[Sample, ...]], Starts], state: SamplerState) -> UpdateChunk:
-            samples, starts = drawn
-            needed = {sample.episode for batch in samples for sample in batch} | {index for index, _ in starts}
-            new = sorted(needed - held.keys())
-            for episode in sorted(needed):
-                held[episode] = None
-                held.move_to_end(episode)
-            dropped = list(islice(held, max(0, len(held) - max(most, len(needed)))))
-            for episode in dropped:
-                del held[episode]
-            episodes = self._whole(new)
-            drawn_frames = tuple(self._weighted(update) for update in samples)
-            return UpdateChunk(drawn_frames, episodes, state, tuple(dropped), starts)
-
-        yield from self._prefetched(draw, read)
+            samples = [order.next_batch() for _ in range(count)]
+            yield DrawnChunk(samples, order.state, starts)
 
     def _fetch_window(self, order: EpisodeSampler) -> None:
-        """Has the shards of as many samples as a window has brought here before they are needed; each quarter of it."""
+        """Has the shards of a window of samples fetched before they are needed; each quarter of it."""
         quarter = order.window_samples // 4
         if quarter and (place := (order.state.epoch, order.state.position // quarter)) != self._fetched_from:
             self._fetched_from = place
             self.store.fetch_ahead(order.upcoming(order.window_samples + quarter))
 
-    def _most_held(self) -> int:
-        """How many episodes stay on the device: two windows of the order, where it has windows."""
-        window = self.training.shuffle_episodes
-        return 2 * max(window, BLOCK_EPISODES) if window else sys.maxsize
-
-    def _update(self) -> int:
-        """The number of the next update."""
-        return self.trainer.global_step if self.trainer is not None else 0
-
-    def _starts(self, order: EpisodeSampler, begun: int, update: int) -> Starts:
-        """Episodes and frames that the network is to simulate from before this update; none where that is not due."""
-        due = update == begun or update % self.training.pushforward_every == 0
+    def _starts(self, order: EpisodeSampler, update: int) -> Starts:
+        """Returns episodes and frames that the network simulates from before this update, none where it is not due."""
+        due = update == self.first_update or update % self.training.pushforward_every == 0
         if self.training.pushforward_fraction == 0 or not due:
             return ()
         frames = self.store.frames(order.state.episodes)
         return drawn_starts(self.training, update, order.rank, frames)
-
-    def _whole(self, indices: Sequence[int]) -> dict[int, EpisodeTensors]:
-        """Reads episodes, several at once: a data set's first pass is gigabytes, and copies release Python's lock."""
-        fraction, measured = self.training.frame_importance, self._measures_frames
-        clearance = self.network.obstacle_clearance if self.training.pushforward_fraction > 0 else None
-
-        def read(episode: Episode) -> tuple[EpisodeTensors, FrameImportance | None]:
-            barrier = None if clearance is None else simulated_barrier(episode, clearance)
-            whole = whole_episode(episode, self.network, barrier)
-            return whole, FrameImportance.of(episode, fraction) if measured else None
-
-        opened = [self.store[index] for index in indices]
-        with ThreadPoolExecutor(READERS) as readers:
-            results = dict(zip(indices, readers.map(read, opened), strict=True))
-        self._importance.update({index: importance for index, (_, importance) in results.items() if importance})
-        return {index: whole for index, (whole, _) in results.items()}
-
-    @property
-    def _measures_frames(self) -> bool:
-        """Whether it matters how much happens in a frame."""
-        training = self.training
-        return training.frame_importance > 0 or training.noise_min_scale < 1 or training.quiet_acceleration > 0
-
-    def _weighted(self, samples: Sequence[Sample]) -> tuple[Sample, ...]:
-        """The same samples with frames drawn as `training.frame_importance` says, the scale of their noise as
-        `noise_min_scale` says, and their weights. For both backends, before windows are read."""
-        fraction = self.training.frame_importance
-        if not self._measures_frames:
-            return tuple(samples)
-        drawn = []
-        for sample in samples:
-            if sample.episode not in self._importance:
-                episode = self.store[sample.episode]
-                self._importance[sample.episode] = FrameImportance.of(episode, fraction)
-            importance = self._importance[sample.episode]
-            frame, weight = importance.draw(sample.frame, sample.seed) if fraction > 0 else (sample.frame, 1.0)
-            scale, scale_weight = noise_scale(self.training, importance.accelerations[frame], sample.seed)
-            drawn.append(Sample(sample.episode, frame, sample.seed, weight * scale_weight, scale))
-        return tuple(drawn)
 
     def _order(self) -> EpisodeSampler:
         rank, world_size = (self.trainer.global_rank, self.trainer.world_size) if self.trainer else (0, 1)
@@ -200,33 +115,12 @@ class EpisodeDataModule(LightningDataModule):
             self.training.batch_scenes,
             self._published,
             self.sampler_state,
-            rank,
-            world_size,
-            self.store.digest,
-            self.training.shuffle_episodes,
-            self.store.particles,
+            rank=rank,
+            world_size=world_size,
+            digest=self.store.digest,
+            window=self.training.shuffle_episodes,
+            particles=self.store.particles,
         )
-
-    def _prefetched(
-        self, draw: Callable[[], tuple[Any, SamplerState]], read: Callable[[Any, SamplerState], T]
-    ) -> Iterator[T]:
-        # The order may have to ask other ranks, so it stays in this thread; reading runs ahead in another.
-        executor = ThreadPoolExecutor(1)
-        try:
-            waiting: deque[Future[T]] = deque()
-            while True:
-                started = time.monotonic()
-                while len(waiting) <= self.batches_ahead:
-                    waiting.append(executor.submit(read, *draw()))
-                item = waiting.popleft()
-                while not wait([item], timeout=LOOK_S).done:
-                    if self._ends():
-                        return
-                self.waited_s += time.monotonic() - started
-                yield item.result()
-        finally:
-            with without_patience():
-                executor.shutdown(cancel_futures=True)
 
     def _ends(self) -> bool:
         """Whether the training ends here for want of data. Alone: other ranks would wait for this one's gradients."""
@@ -250,17 +144,17 @@ class EpisodeDataModule(LightningDataModule):
         return self.store.frames(count)
 
 
-def chunk_length(training: TrainingConfig, begun: int, update: int) -> int:
-    """Updates of the chunk that begins at `update`, in a training that began at `begun`; the same on all ranks.
+def chunk_length(training: TrainingConfig, first_update: int, update: int, most: int) -> int:
+    """Returns the updates of the chunk that begins at `update`, in a training that began at `first_update`; at most
+    `most`, and the same on all ranks.
 
-    The first chunks are short: they bring the most episodes that are not in memory yet.
+    The first chunks are short: they need the most episodes that are not in memory yet.
     """
     due = [training.log_every, training.checkpoint_every, training.monitor_every]
     if training.pushforward_fraction > 0:
         due.append(training.pushforward_every)
     until_due = min([every - update % every for every in due])
-    until_end = max(training.maximum_updates - update, 1)
-    return min(until_due, until_end, UPDATES_AT_ONCE, max(1, update - begun))
+    return min(until_due, training.maximum_updates - update, most, max(1, update - first_update))
 
 
 def agreed_count(store: AnyStore, trainer: Trainer, order: Mapping[str, int] | None = None) -> int:
@@ -299,9 +193,9 @@ def agreed_count(store: AnyStore, trainer: Trainer, order: Mapping[str, int] | N
     return count
 
 
-class _Stream(IterableDataset[Batch | UpdateSamples | UpdateChunk]):
+class _Stream(IterableDataset[WindowChunk | EpisodeChunk]):
     def __init__(self, feed: EpisodeDataModule) -> None:
         self.feed = feed
 
-    def __iter__(self) -> Iterator[Batch | UpdateSamples | UpdateChunk]:
-        return self.feed.chunks() if self.feed.hands_out_chunks else self.feed.batches()
+    def __iter__(self) -> Iterator[WindowChunk | EpisodeChunk]:
+        return self.feed.chunks()

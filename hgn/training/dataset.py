@@ -1,4 +1,4 @@
-"""The data set that a training needs: whether it is there, waiting for its episodes, and how far it has come."""
+"""The data set of a training: whether it is complete, waiting for its episodes, and its progress."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from hgn.training.distributed import first_rank
 from hgn.training.generator import Generator
 from hgn.training.stop import StopRequest
 
-BETWEEN_LOOKS_S = 10.0  # at the data set's manifest, for the progress line
+BETWEEN_LOOKS_S = 10.0  # between reads of the manifest for the progress line
 
 
 def is_complete(config: TrainConfig) -> bool:
-    """Whether every episode that the configuration asks for is published."""
+    """Returns whether every configured episode is published."""
     folder = config.dataset.folder
     if not EpisodeStore.available(folder):
         return False
@@ -33,9 +33,9 @@ def is_complete(config: TrainConfig) -> bool:
 
 
 def more_data(config: TrainConfig) -> list[EpisodeStore]:
-    """The training episodes of `training.more_data`, as far as they are published now.
+    """Returns the training episodes of `training.more_data` that are published now.
 
-    Raises: ConfigError where a data set is not there, is given twice, or does not go with the others.
+    Raises: ConfigError for a data set that is missing, given twice, or incompatible with the others.
     """
     stores: list[EpisodeStore] = []
     for i, folder in enumerate(config.training.more_data):
@@ -70,10 +70,10 @@ def _require_goes_with(config: TrainConfig, store: EpisodeStore, field: str) -> 
 def wait_for_episodes(
     config: TrainConfig, generator: Generator | None, stop: StopRequest, others: Sequence[EpisodeStore] = ()
 ) -> AnyStore | None:
-    """Waits until enough training episodes are published, those of `others` among them, showing what is awaited; none
-    when asked to stop.
+    """Waits until enough training episodes are published, including those of `others`, and shows the progress. Returns
+    None after a stop request.
 
-    Raises: ConfigError when they cannot come: the generator failed, or nobody makes them.
+    Raises: ConfigError when the generator failed, or no process makes the missing episodes.
     """
     folder = config.dataset.folder
     present = sum(map(len, others))
@@ -113,9 +113,10 @@ def wait_for_episodes(
 
 
 class PublishedEpisodes:
-    """What the progress line says of the data set: `5/800 episodes`.
+    """Returns the progress of the data set when called: `5/800 episodes`.
 
-    Hundreds of scenes take a tenth of a second to read: not with every line, and never again once all are there.
+    A manifest of hundreds of scenes takes 0.1 s to read, so it is read at most every BETWEEN_LOOKS_S, and not again
+    once it is complete.
     """
 
     def __init__(self, config: TrainConfig, generator: Generator | None) -> None:

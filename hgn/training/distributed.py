@@ -1,6 +1,6 @@
-"""How many processes train, which of them this is, the run's folder, and how gradients are averaged over them.
+"""The processes that train together, the run's folder, and the averaging of gradients.
 
-Launchers say so in environment variables: torchrun sets RANK, WORLD_SIZE and LOCAL_WORLD_SIZE, srun sets SLURM_PROCID,
+Launchers set environment variables: torchrun sets RANK, WORLD_SIZE and LOCAL_WORLD_SIZE, srun sets SLURM_PROCID,
 SLURM_NTASKS and SLURM_NNODES, Lightning's own launcher, which starts the other processes of a machine itself, sets
 LOCAL_RANK and NODE_RANK in them.
 """
@@ -25,29 +25,29 @@ _RANDOM_ID = re.compile(r"[0-9a-f]{8}(-[0-9a-f]{4}){3}-[0-9a-f]{12}")
 
 
 def first_rank() -> bool:
-    """Whether this process leads: it alone starts the generator and writes the run's files."""
+    """Returns whether this process starts the generator and writes the run's files."""
     if "RANK" in os.environ:
-        # torchrun's word counts: inside Slurm its rank 0 may be on any of the nodes
+        # torchrun's variable comes first: inside Slurm its rank 0 may be on any of the nodes
         return os.environ["RANK"] == "0"
     return all(os.environ.get(name, "0") == "0" for name in ("SLURM_PROCID", "NODE_RANK", "LOCAL_RANK"))
 
 
 def first_on_machine() -> bool:
-    """Whether this process leads those of its machine."""
+    """Returns whether this process is the first on its machine."""
     if "RANK" in os.environ:
         return os.environ.get("LOCAL_RANK", "0") == "0"
     return all(os.environ.get(name, "0") == "0" for name in ("SLURM_LOCALID", "LOCAL_RANK"))
 
 
 def default_run(name: str) -> Path:
-    """The run's folder where the configuration names none; the same in all processes and after every restart.
+    """Returns the run's folder where the configuration names none: the same in all processes and after every restart.
 
-    In runs/, the first of these that there is: HGN_RUN (a path may be given too), torchrun's run id (--rdzv-id),
-    `name` with Slurm's job id (which a requeued job keeps), `name`. So two jobs do not meet in one folder by accident.
+    It is in runs/ and has the first of these names that is set: HGN_RUN (which may be a path), torchrun's run id
+    (--rdzv-id), `name` with Slurm's job id (which a requeued job keeps), `name`. So each job gets its own folder.
     """
     torchrun_id = os.environ.get("TORCHELASTIC_RUN_ID", "none")  # none: no id was given
     if _RANDOM_ID.fullmatch(torchrun_id):
-        torchrun_id = "none"  # torchrun --standalone makes a new one at each start: nothing could go on from there
+        torchrun_id = "none"  # torchrun --standalone draws one at each start: no run could be resumed
     if os.environ.get(RUN_VARIABLE):
         return Path("runs", os.environ[RUN_VARIABLE])
     if torchrun_id != "none":
@@ -64,11 +64,11 @@ def layout(training: TrainingConfig) -> tuple[int, int]:
     """
     _check_restarts()
     launched = _launched(training.devices)
-    devices = _devices(training.accelerator, training.devices or (launched and launched[0]))
+    devices = _devices(training.device, training.devices or (launched and launched[0]))
     if launched is None:
         return devices, 1
     if devices != launched[0]:
-        # each process would train alone and write over the others' checkpoints, or wait for ever
+        # each process would train alone and overwrite the others' checkpoints, or wait forever
         raise ConfigError(
             f"training.devices must be the {launched[0]} processes that the launcher started on each of {launched[1]} "
             f"machines, got {devices}; leave it out, and under Slurm start one task for each device with srun"
@@ -77,10 +77,10 @@ def layout(training: TrainingConfig) -> tuple[int, int]:
 
 
 def averaging_options() -> dict[str, Any]:
-    """How gradients are averaged: arguments of DistributedDataParallel.
+    """Returns arguments of DistributedDataParallel, by which backend torch averages gradients.
 
-    In buckets, while the backward pass still runs; nothing else travels. Buffers are not sent at each update: the
-    normaliser is constant, and the sum of losses is each rank's own.
+    Gradients are sent in buckets while the backward pass still runs. Buffers are not sent: the normaliser is constant,
+    and each rank has its own sum of losses.
     """
     from torch.nn.parallel import DistributedDataParallel
 
@@ -91,19 +91,19 @@ def averaging_options() -> dict[str, Any]:
 
 
 def sum_over_ranks(tensor: torch.Tensor) -> None:
-    """Sums a tensor over all ranks, in place. Backend triton does so with an update's gradients, in one message."""
+    """Sums a tensor over all ranks in place; backend triton sends an update's gradients so, in one message."""
     torch.distributed.all_reduce(tensor)
 
 
 def checksum(tensors: Iterable[torch.Tensor]) -> torch.Tensor:
-    """A number that a change of any one value of these float32 tensors changes: int64 [], on their device."""
+    """Returns a checksum of float32 tensors, int64 [] on their device; a change of any one value changes it."""
     bits = torch.cat([tensor.detach().flatten() for tensor in tensors]).view(torch.int32)
-    # modulo 2^64 no difference vanishes when it is multiplied by an odd number
+    # modulo 2^64 no difference becomes 0 by multiplication with an odd number
     return (bits * torch.arange(1, 2 * len(bits), 2, device=bits.device)).sum()
 
 
 def same_on_all_ranks(number: torch.Tensor) -> bool:
-    """Whether an int64 number is the same on all ranks; all get the same answer. One message of 16 bytes."""
+    """Returns whether an int64 number is the same on all ranks, with one message of 16 bytes."""
     lowest = torch.stack([number, ~number])
     torch.distributed.all_reduce(lowest, torch.distributed.ReduceOp.MIN)
     low, high = lowest.tolist()
@@ -113,7 +113,7 @@ def same_on_all_ranks(number: torch.Tensor) -> bool:
 def _check_restarts() -> None:
     shared = os.environ.get("TORCHELASTIC_USE_AGENT_STORE") == "True"
     if shared and int(os.environ.get("TORCHELASTIC_MAX_RESTARTS", "0")) > 0:
-        # Restarted processes would find the addresses of those that are gone, and wait for half an hour.
+        # Restarted processes would read the addresses of ended ones, and wait for half an hour.
         raise ConfigError(
             "TORCH_DISABLE_SHARE_RDZV_TCP_STORE must be 1 in torchrun's environment where it may restart processes "
             f"(--max-restarts {os.environ['TORCHELASTIC_MAX_RESTARTS']}), got "
@@ -121,10 +121,10 @@ def _check_restarts() -> None:
         )
 
 
-def _devices(accelerator: str, wanted: int | None) -> int:
+def _devices(device: str, wanted: int | None) -> int:
     gpus = torch.cuda.device_count() if torch.cuda.is_available() else 0
-    require(accelerator != "gpu" or gpus > 0, "training.accelerator", "auto or cpu without a GPU", "gpu")
-    if accelerator == "cpu" or gpus == 0:
+    require(device != "cuda" or gpus > 0, "training.device", "auto or cpu without a GPU", "cuda")
+    if device == "cpu" or gpus == 0:
         return wanted or 1
     wanted = wanted or gpus
     require(wanted <= gpus, "training.devices", f"at most the {gpus} GPUs of this machine", wanted)
@@ -136,18 +136,20 @@ def _launched(devices: int | None) -> tuple[int, int] | None:
 
     Where the launcher reports the sum only, `devices` are on each machine if they divide it.
     """
+    here: int | None = None
     if "RANK" in os.environ and "WORLD_SIZE" in os.environ:
-        processes, here, nodes = int(os.environ["WORLD_SIZE"]), os.environ.get("LOCAL_WORLD_SIZE"), None
+        processes = int(os.environ["WORLD_SIZE"])
+        here = int(os.environ["LOCAL_WORLD_SIZE"]) if "LOCAL_WORLD_SIZE" in os.environ else devices
     elif _inside_slurm_step():
-        processes, here, nodes = int(os.environ["SLURM_NTASKS"]), None, os.environ.get("SLURM_NNODES")
+        processes = int(os.environ["SLURM_NTASKS"])
+        here = processes // int(os.environ["SLURM_NNODES"]) if "SLURM_NNODES" in os.environ else devices
     else:
         return None
-    if here is None:
-        known = processes // int(nodes) if nodes else devices
-        here = known if known and processes % known == 0 else processes
-    return int(here), processes // int(here)
+    if here is None or processes % here:
+        here = processes
+    return here, processes // here
 
 
 def _inside_slurm_step() -> bool:
-    interactive = os.environ.get("SLURM_JOB_NAME") in ("bash", "interactive")  # Lightning's rule: a shell, no job
+    interactive = os.environ.get("SLURM_JOB_NAME") in ("bash", "interactive")  # a shell, by Lightning's rule
     return "SLURM_PROCID" in os.environ and "SLURM_NTASKS" in os.environ and not interactive

@@ -1,4 +1,4 @@
-"""One-step and rollout errors, of the network and of predictors that have learned nothing.
+"""One-step and rollout errors of the network, and of baselines without learned parameters.
 
 Conventions: squared errors sum over axes and average over particles, in frame units (domain units per frame
 squared for accelerations, domain units for positions).
@@ -26,7 +26,7 @@ Predictor = Callable[[Batch], torch.Tensor]  # accelerations [N, 3] in frame uni
 
 
 def format_ratio(gain: float) -> str:
-    """How many times an error is below another that is `gain` times as large, for people: above, where it is."""
+    """Returns a text: an error is this many times below another one, which is `gain` times as large, or above it."""
     if not 0 < gain < 1:
         return f"{gain:.2f} times below"
     return f"{1 / gain:.2f} times above"
@@ -34,7 +34,7 @@ def format_ratio(gain: float) -> str:
 
 @dataclass
 class SquaredError:
-    """Sums of squared errors and particle counts, by material; `mse` over all of them."""
+    """Sums of squared errors and particle counts by material; `mse` is over all materials."""
 
     total: dict[str, float] = field(default_factory=dict)
     count: dict[str, int] = field(default_factory=dict)
@@ -58,22 +58,22 @@ class SquaredError:
 
 
 def constant_velocity(batch: Batch) -> torch.Tensor:
-    """Nothing accelerates."""
+    """Predicts no acceleration."""
     return torch.zeros_like(batch.window_WN3[0])
 
 
 def ballistic(batch: Batch) -> torch.Tensor:
-    """Everything falls freely."""
+    """Predicts free fall."""
     return batch.gravity_S3[batch.scene_N]
 
 
 def mean_acceleration(mean_3: torch.Tensor) -> Predictor:
-    """The training data's mean acceleration, for every particle."""
+    """Predicts the mean acceleration of the training data for every particle."""
     return lambda batch: mean_3.to(batch.window_WN3).expand_as(batch.window_WN3[0])
 
 
 def baselines(network: ParticleNetwork) -> dict[str, Predictor]:
-    """What a network must beat to have learned anything."""
+    """Returns the predictors that a trained network must improve on."""
     return {
         "constant velocity": constant_velocity,
         "ballistic motion": ballistic,
@@ -82,7 +82,7 @@ def baselines(network: ParticleNetwork) -> dict[str, Predictor]:
 
 
 def network_predictor(backend: Backend) -> Predictor:
-    """The network without noise and jitter, as a backend computes it."""
+    """Returns the prediction of a backend, without noise and jitter."""
 
     def predict(batch: Batch) -> torch.Tensor:
         state = batch.state()
@@ -99,7 +99,7 @@ def frame_batches(
     rank: int = 0,
     world_size: int = 1,
 ) -> Iterator[Batch]:
-    """Every stride-th frame of every episode, several frames a batch; rank r takes each world_size-th frame."""
+    """Yields batches of every stride-th frame of every episode; rank r takes each world_size-th of them."""
     config = network.config
     pairs = [(e, n) for e in episodes for n in range(0, len(e.position_TN3) - 1, stride)][rank::world_size]
     while pairs:
@@ -118,7 +118,7 @@ def one_step_errors(
     materials: Sequence[str],
     stop: Callable[[], bool] = lambda: False,
 ) -> dict[str, SquaredError]:
-    """Squared errors of accelerations of each predictor over the batches."""
+    """Returns squared errors of accelerations of each predictor over the batches."""
     errors = {name: SquaredError() for name in predictors}
     with torch.inference_mode():
         for batch in batches:
@@ -133,7 +133,7 @@ def one_step_errors(
 
 
 def position_mse(predicted_TN3: np.ndarray, reference_TN3: np.ndarray) -> np.ndarray:
-    """Mean squared distance of the particles at each frame, float64 [T]."""
+    """Returns the mean squared distance of the particles at each frame, float64 [T]."""
     mse_T = np.empty(len(predicted_TN3))
     for first in range(0, len(mse_T), FRAMES_AT_ONCE):
         some = slice(first, first + FRAMES_AT_ONCE)
@@ -143,10 +143,10 @@ def position_mse(predicted_TN3: np.ndarray, reference_TN3: np.ndarray) -> np.nda
 
 
 def rollout_errors(predicted: Sequence[np.ndarray], episodes: Sequence[Episode]) -> dict[str, np.ndarray]:
-    """Position MSE at each frame, mean over the scenes that came so far, float64 [T]: `all`, and each material over the
-    scenes that have it, NaN behind the last of them.
+    """Returns the position MSE at each frame, float64 [T], for `all` particles and for each material.
 
-    predicted: positions [T, N, 3] of each episode; T is that of the longest.
+    Each frame's value is the mean over the scenes that reached it and have the material, NaN without any. `predicted`
+    has positions [T, N, 3] of each episode; the result has the length of the longest.
     """
     frames = max(len(path_TN3) for path_TN3 in predicted)
     curves: dict[str, list[np.ndarray]] = {}
@@ -161,12 +161,12 @@ def rollout_errors(predicted: Sequence[np.ndarray], episodes: Sequence[Episode])
 
 
 def set_convention(one_step_mse: float, predicted: Sequence[np.ndarray], episodes: Sequence[Episode]) -> dict[str, Any]:
-    """Errors as the papers of imported sets tell them: means over axes too, of free particles and of all.
+    """Returns errors as the papers of imported sets report them: means also over axes, of free particles and of all.
 
-    Particles of the boundary are where they were, and so have no error; GNS counts them in its averages. Positions are
-    compared over the frames that were predicted, all or the first 20, scene by scene; as GNS does for its one-step and
-    rollout MSE (Sanchez-Gonzalez et al. 2020), and LagrangeBench for MSE20 (Toshev et al. 2023).
-    Units: squared, of the set's length.
+    Boundary particles do not move and have no error; GNS includes them in its averages. Positions are compared over
+    all predicted frames or the first 20, scene by scene, as GNS does for its one-step and rollout MSE
+    (Sanchez-Gonzalez et al. 2020), and LagrangeBench for MSE20 (Toshev et al. 2023).
+    Units: the set's unit of length, squared.
     """
     dimensions = episodes[0].dimensions
     still = [0 if episode.boundary_P3 is None else len(episode.boundary_P3) for episode in episodes]
@@ -189,7 +189,7 @@ def _free_and_all(free: float, share: float) -> dict[str, float]:
 
 
 def mean_so_far(value_ST: np.ndarray) -> np.ndarray:
-    """The mean at each frame over the scenes that came so far, float64 [T]; NaN in a scene's row behind its end."""
+    """Returns the mean at each frame over the scenes that are not NaN there, float64 [T]."""
     there_ST = np.isfinite(value_ST)
     count_T = there_ST.sum(0)
     return np.where(count_T > 0, np.where(there_ST, value_ST, 0).sum(0) / np.maximum(count_T, 1), np.nan)

@@ -1,4 +1,4 @@
-"""The generator that a training starts itself where its data set is missing or incomplete."""
+"""The generator that a training starts where its data set is missing or incomplete."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ STOP_PATIENCE_S = 60.0
 
 
 class Generator:
-    """`python -m datagen` as a child process with its own log; it ends with its parent."""
+    """Runs `python -m datagen` as a child process with its own log; it ends with its parent."""
 
     def __init__(self, config: DatagenConfig, folder: Path) -> None:
         """Writes the resolved configuration to `folder`/dataset.yaml and starts the process."""
         folder.mkdir(parents=True, exist_ok=True)
-        mapping = to_mapping(config.awaited) | {
+        mapping = to_mapping(config) | {
             "name": folder.name,
             "scenes": config.dataset.training_scenes,
             "out": config.dataset.folder,
@@ -46,7 +46,7 @@ class Generator:
                 "--config-name",
                 "dataset",
             ]
-            # Its own process group: Ctrl-C reaches the trainer, which then ends the generator in order.
+            # A process group of its own: Ctrl-C reaches only the trainer, which then stops the generator.
             self._process = subprocess.Popen(
                 command,
                 stdout=log,
@@ -61,13 +61,13 @@ class Generator:
         return self._process.poll() is None
 
     def check(self) -> None:
-        """Raises: ConfigError when the generator has failed; the message is its own."""
+        """Raises: ConfigError with the generator's message when it has failed."""
         code = self._process.poll()
         if code not in (None, 0):
             raise ConfigError(f"the generator ended with exit code {code}: {self._last_error()} (log: {self.log_path})")
 
     def frames_done(self) -> int:
-        """Frames simulated since it started, those of running episodes included."""
+        """Returns the frames simulated since the start, including those of running episodes."""
         with self.log_path.open("rb") as log:
             log.seek(self._read_to)
             for line in log:
@@ -87,7 +87,7 @@ class Generator:
             self._finished += 1
 
     def stop(self) -> None:
-        """Ends the process as Ctrl-C does: it keeps what it has finished and can go on later."""
+        """Ends the process as Ctrl-C does: finished episodes are kept, and a later start continues."""
         if self.running:
             os.killpg(self._process.pid, signal.SIGINT)
             try:

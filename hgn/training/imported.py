@@ -1,4 +1,4 @@
-"""Training on an imported data set: what the settings leave open, the set says."""
+"""Training on an imported data set, which provides the settings that are null."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ FLAG = "+experiment=imported"
 
 
 def settings_of_imported(mapping: Mapping[str, Any]) -> dict[str, Any]:
-    """The composed settings, with an imported set's own where +experiment=imported leaves them null.
+    """Returns the composed settings, with values of the imported set where +experiment=imported leaves them null.
 
-    `scene` and `dataset` become the set's. Noise and cells are the paper's in proportion to the set's radius.
-    Raises: ConfigError where an imported set is trained on without that experiment, or another with it.
+    `scene` and `dataset` become the set's. Noise and cells are the paper's, scaled by the set's radius.
+    Raises: ConfigError for an imported set without that experiment, or another set with it.
     """
     mapping = {key: dict(value) if isinstance(value, Mapping) else value for key, value in mapping.items()}
     folder, asked = mapping["dataset"]["folder"], bool(mapping.get("imported"))
@@ -26,7 +26,8 @@ def settings_of_imported(mapping: Mapping[str, Any]) -> dict[str, Any]:
     if own is None:
         require(not asked, "dataset.folder", "a data set of python -m hgn.import_trajectories", folder)
         return mapping
-    require(asked, "dataset.folder", f"one of python -m datagen without {FLAG}", folder, f"it is imported; add {FLAG}")
+    rule = f"one of python -m datagen without {FLAG}"
+    require(asked, "dataset.folder", rule, folder, remedy=f"it is imported; add {FLAG}")
     assert manifest is not None
     network, training = mapping["network"], mapping["training"]
     left_open = {
@@ -61,7 +62,7 @@ def settings_of_imported(mapping: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def require_network_fits(config: TrainConfig, manifest: Manifest) -> None:
-    """Raises ConfigError where a network cannot be trained on an imported set."""
+    """Raises: ConfigError for a network that cannot be trained on this imported set."""
     own = manifest.config["imported"]
     require(
         config.network.dimensions == own["dimensions"],
@@ -72,6 +73,12 @@ def require_network_fits(config: TrainConfig, manifest: Manifest) -> None:
     if own["dimensions"] == 2:
         remedy = "import it again with radius=… for other cells"
         rule = f"the data's radius of {own['radius']:g}, from which the plane of its particles follows"
-        require(config.network.cell_size == own["radius"], "network.cell_size", rule, config.network.cell_size, remedy)
+        require(
+            config.network.cell_size == own["radius"],
+            "network.cell_size",
+            rule,
+            config.network.cell_size,
+            remedy=remedy,
+        )
     unknown = [name for name in own["materials"] if name not in config.network.materials]
     require(not unknown, "network.materials", f"all of the data's {own['materials']}", list(config.network.materials))

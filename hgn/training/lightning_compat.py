@@ -1,6 +1,6 @@
-"""All of Lightning's private and fragile parts that this project touches; pyproject.toml bounds its version.
+"""All private and fragile parts of Lightning that this project uses; pyproject.toml bounds its version.
 
-`tests/training/test_lightning_compat.py` fails when a new version has changed one of them.
+`tests/training/test_lightning_compat.py` fails when a new version changes one of them.
 """
 
 from __future__ import annotations
@@ -9,9 +9,7 @@ import logging
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any
 
-import torch
 from lightning.pytorch import Trainer
 from lightning.pytorch.strategies import DDPStrategy
 
@@ -19,11 +17,11 @@ from hgn.training.distributed import averaging_options
 
 
 def quieten() -> None:
-    """No news and no advice from Lightning: the commands say themselves what they do."""
+    """Silences messages and hints of Lightning: the commands print their own."""
     logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
     warnings.filterwarnings("ignore", ".*does not have many workers.*")
     warnings.filterwarnings("ignore", ".*LeafSpec.*")
-    warnings.filterwarnings("ignore", ".*GPU available but not used.*")  # training.accelerator=cpu says so
+    warnings.filterwarnings("ignore", ".*GPU available but not used.*")  # training.device=cpu says so
 
 
 def gradient_averaging(backend: str) -> DDPStrategy:
@@ -32,7 +30,7 @@ def gradient_averaging(backend: str) -> DDPStrategy:
 
 
 class _Unwrapped(DDPStrategy):
-    """For updates that average their gradients themselves: no DistributedDataParallel, which would wait for them."""
+    """Omits DistributedDataParallel, for updates that average their gradients themselves."""
 
     def configure_ddp(self) -> None:
         pass
@@ -40,7 +38,7 @@ class _Unwrapped(DDPStrategy):
 
 @contextmanager
 def interrupts_passed_on() -> Iterator[None]:
-    """Lightning makes an exit of its own of a KeyboardInterrupt, with the code of a fault."""
+    """Restores a KeyboardInterrupt, which Lightning turns into an exit with an error code."""
     try:
         yield
     except SystemExit as end:
@@ -48,43 +46,17 @@ def interrupts_passed_on() -> Iterator[None]:
 
 
 def skip_sigterm_broadcast(trainer: Trainer) -> None:
-    """Before each update Lightning asks rank 0 for a SIGTERM, and has the host wait for the device until it answers
-    (its issue 21487). Ours goes another way: the ranks agree now and then, see hgn.training.callbacks.Stopper.
+    """Removes a broadcast before each training step, by which Lightning shares a SIGTERM of rank 0 and makes the host
+    wait for the device (its issue 21487). hgn.training.callbacks.Stopper shares signals every few updates instead.
     """
     trainer.fit_loop.epoch_loop._broadcast_sigterm_tensor = _nothing  # type: ignore[method-assign]
 
 
 def forget_sigterm(trainer: Trainer) -> None:
-    """Of a SIGTERM that came while Lightning's own handler was in place, which calls ours, too: after an update it
-    would leave the loop by an exception, past the checkpoint and with exit code 0.
+    """Clears a SIGTERM that Lightning's own handler received, which also called ours: Lightning would leave the loop by
+    an exception, without a checkpoint and with exit code 0.
     """
     trainer._signal_connector.received_sigterm = False
-
-
-def count_updates(trainer: Trainer, count: int) -> None:
-    """Leaves behind what `count` steps of an optimiser do, where kernels made them: `trainer.global_step` grows."""
-    progress = trainer.fit_loop.epoch_loop.manual_optimization.optim_step_progress
-    for tracker in (progress.total, progress.current):
-        tracker.ready += count
-        tracker.completed += count
-
-
-def advance_scheduler(scheduler: torch.optim.lr_scheduler.LambdaLR, base: float, update: int) -> None:
-    """Leaves behind what a scheduler of this base rate does in its steps up to this update."""
-    rate = base * scheduler.lr_lambdas[0](update)
-    scheduler.last_epoch, scheduler._step_count = update, update + 1
-    scheduler.base_lrs, scheduler._last_lr = [base], [rate]
-    scheduler.optimizer.param_groups[0]["lr"] = rate
-
-
-def set_stored_updates(checkpoint: dict[str, Any], updates: int) -> None:
-    """Lightning counts updates in one of two places, by the backend that made them; a checkpoint gets both."""
-    loops = checkpoint["loops"]["fit_loop"]
-    for tracker in (
-        loops["epoch_loop.automatic_optimization.optim_progress"]["optimizer"]["step"],
-        loops["epoch_loop.manual_optimization.optim_step_progress"],
-    ):
-        tracker["total"] = {"ready": updates, "completed": updates}
 
 
 def _nothing() -> None:

@@ -1,4 +1,4 @@
-"""What is measured while a training runs: one-step errors and rollouts on fixed scenes."""
+"""Measurements while a training runs: one-step errors and rollouts of fixed scenes."""
 
 from __future__ import annotations
 
@@ -34,13 +34,13 @@ from hgn.training.errors import (
 )
 from hgn.training.module import TrainingModule
 from hgn.training.stop import StopRequest
-from hgn.training.tensorboard import show_rollout
+from hgn.training.tensorboard import show_pictures, write_pictures
 
 FRAME_STRIDE = 4  # neighbouring frames say the same
 
 
 class Monitor(Callback):
-    """Measures one-step errors on fixed scenes of both splits, and rollouts of the validation scenes."""
+    """Measures one-step errors of fixed scenes of both splits, and rollouts of the validation scenes."""
 
     def __init__(self, run: Path, training: AnyStore, stop: StopRequest, checkpoints: Checkpoints):
         self.run, self.stop, self.checkpoints = run, stop, checkpoints
@@ -48,9 +48,13 @@ class Monitor(Callback):
         self.last: dict[str, float] = {}
         self._measured_update = -1
 
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        assert isinstance(pl_module, TrainingModule)
+        self._measured_update = pl_module.update  # nothing is new before the next update
+
     def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
         assert isinstance(pl_module, TrainingModule)
-        if trainer.global_step % pl_module.training_config.monitor_every == 0:
+        if pl_module.update % pl_module.training_config.monitor_every == 0:
             self.measure(trainer, pl_module)
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
@@ -59,13 +63,14 @@ class Monitor(Callback):
             self.measure(trainer, pl_module, PATIENCE_S)
 
     def measure(self, trainer: Trainer, module: TrainingModule, patience_s: float = 0.0) -> None:
-        """The one-step frames are divided among the ranks; rank 0 does the rollouts. Ends early on a stop request.
+        """Measures and logs. One-step frames are divided among the ranks, rank 0 does the rollouts; a stop request ends
+        it early.
 
-        Where a server has scenes that are not here yet and does not answer, measures nothing and says so.
+        If scenes are still on a server that does not answer, nothing is measured, with a message.
         """
-        if self._measured_update == trainer.global_step:
+        if self._measured_update == module.update:
             return
-        self._measured_update = trainer.global_step
+        self._measured_update = module.update
         network = module.result
         network.eval()
         started = time.monotonic()
@@ -79,7 +84,7 @@ class Monitor(Callback):
             network.train()
             if trainer.is_global_zero:
                 text = "the scenes to measure on are not all here, and their server does not send them now"
-                print(f"nothing is measured at update {trainer.global_step}: {text}", file=sys.stderr)
+                print(f"nothing is measured at update {module.update}: {text}", file=sys.stderr)
             return
         scenes = {split: [store[i] for i in chosen[split]] for split, store in self.stores.items()}
         values: dict[str, float] = {}
@@ -95,7 +100,7 @@ class Monitor(Callback):
         values["monitor/seconds"] = time.monotonic() - started
         network.train()
         self.last |= values
-        log(trainer, self.run, values)
+        log(trainer, self.run, module.update, values)
 
     def _one_step(
         self, trainer: Trainer, module: TrainingModule, split: str, episodes: list[Episode]
@@ -106,14 +111,14 @@ class Monitor(Callback):
             network,
             FRAME_STRIDE,
             PARTICLES_PER_BATCH,
-            trainer.global_rank,
-            trainer.world_size,
+            rank=trainer.global_rank,
+            world_size=trainer.world_size,
         )
         backend = fastest_stepped(network, module.training_config.precision)
         predictors = {"network": network_predictor(backend)} | baselines(network)
         materials = network.config.materials
         interrupted: Callable[[], bool] = lambda: trainer.world_size == 1 and self.stop.signal is not None  # noqa: E731
-        errors = one_step_errors(predictors, batches, module.device, materials, interrupted)
+        errors = one_step_errors(predictors, batches, module.device, materials, stop=interrupted)
         if trainer.world_size > 1:
             errors = {name: _reduce(trainer, module.device, error, materials) for name, error in errors.items()}
         values = {f"one_step/{split}": errors["network"].mse}
@@ -130,7 +135,7 @@ class Monitor(Callback):
     def _rollout(
         self, trainer: Trainer, module: TrainingModule, episodes: list[Episode], frames: int
     ) -> dict[str, float]:
-        """Errors are means over the scenes that came so far; told beside them is how many came to the end."""
+        """Returns rollout errors, means over the scenes that reached each frame, and the fraction that finished."""
         simulator = Simulator(module.result, episodes[0].frame_rate_hz, module.simulating_backend())
         frames = min(frames, *(len(episode.position_TN3) for episode in episodes))
         trials = simulate_scenes(simulator, [InitialState.of_episode(episode) for episode in episodes], frames)
@@ -142,7 +147,8 @@ class Monitor(Callback):
         for name, mse_T in error_T.items():
             values["rollout/mse" if name == "all" else f"rollout/mse_{name}"] = float(np.nanmean(mse_T))
         shown = rollout_of_episode(episodes[0], trials[0].position_TN3)
-        show_rollout(trainer, self.run / "pictures", shown, error_T)
+        paths = write_pictures(self.run / "pictures", module.update, shown, error_T)
+        show_pictures(trainer.logger, module.update, paths)
         return values
 
     def _interrupted(self, trainer: Trainer) -> bool:

@@ -14,7 +14,7 @@ from hgn.network.orthogonal import MOMENTUM, normalised, orthogonalised, square_
 class Muon(torch.optim.Adam):
     """torch.optim.Adam whose square blocks (hgn.network.orthogonal) take Muon's step instead, with Nesterov's momentum.
 
-    A block's momentum is kept as its `exp_avg`; its `exp_avg_sq` has no use.
+    A block's momentum is stored as its `exp_avg`; its `exp_avg_sq` is not used.
     """
 
     def __init__(self, network: ParticleNetwork, lr: float) -> None:

@@ -1,8 +1,8 @@
 """Input noise and grid jitter (paper sec. 3.3), each drawn from the sample's own seed.
 
-`noise_scale` decides for both backends how much noise a sample gets, before its batch is made. What is then drawn is
-here for torch (`perturbed_window`, which hgn.training.module calls); for triton it is in hgn.kernels.update
-(`Updates._assemble`, with the kernels `draw_waves` and `assemble_batch`).
+`noise_scale` returns the scale of a sample's noise for both backends. The noise itself is drawn here for backend torch
+(`perturbed_window`, called by hgn.training.torch_updates), and in hgn.kernels.update for triton (`Updates._assemble`,
+with the kernels `draw_waves` and `assemble_batch`).
 Shape legend: W = m + 2 window frames (m velocities), N particles, F windows, S scenes, K waves.
 """
 
@@ -16,24 +16,24 @@ from hgn.config import CORRELATED_WAVELENGTHS, CORRELATED_WAVES, TrainingConfig
 from hgn.data.batch import Batch
 from hgn.system.splitmix import splitmix64
 
-# Of other streams than the particles' own noise: the same seed would tie them to the first particles' noise.
+# Keys of random streams other than the particles' noise: with the same seed they would repeat its first numbers.
 JITTER_STREAM, WAVE_STREAM, SCALE_STREAM = 0x5DEECE66D, 0x2545F4914F, 0x9E6D62D06F6A9A9B
 
-SMALLEST_ACCELERATION = 1e-30  # that anything is divided by
-QUIET_WEIGHT = 4.0  # of a frame below training.quiet_acceleration, at most
+SMALLEST_ACCELERATION = 1e-30  # avoids a division by 0
+QUIET_WEIGHT = 4.0  # largest loss weight of a frame below training.quiet_acceleration
 
 
 def noise_scale(training: TrainingConfig, acceleration: float, seed: int) -> tuple[float, float]:
-    """Scale of a sample's noise in units of `noise_std`, and the weight of its loss.
+    """Returns the scale of a sample's noise in units of `noise_std`, and the loss weight of the sample.
 
-    Noise hides from a network what it errs by less: at rest its bias stays at a twentieth of the noise, and over
-    thousands of frames what should lie still creeps. Where little happens, the noise's scale is drawn from a wide range
-    (as the levels of a denoiser are: Song & Ermon 2019), and squared errors count in units of it, so that each scale
-    weighs the same.
     `acceleration` is the root mean square of the target, domain units per frame squared. Where it is a fraction
     r < 1 of `noise_std`, the scale is log-uniform between max(r, training.noise_min_scale) and 1, drawn from the
-    sample's seed alone, and the weight is 1 / scale^2; elsewhere both are 1. The weight is also that of
+    sample's seed only, and the loss weight is 1 / scale^2; elsewhere both are 1. The loss weight is also multiplied by
     `quiet_weight`.
+
+    A network does not learn errors that are small compared with the noise: at rest its bias stays at a twentieth of the
+    noise, and bodies at rest creep over thousands of frames. So noise is drawn from a wide range of scales in frames
+    with small accelerations, like the noise levels of a denoiser (Song & Ermon 2019), and all scales weigh the same.
     """
     quiet = quiet_weight(training, acceleration)
     if training.noise_min_scale == 1.0 or training.noise_std == 0.0:
@@ -46,10 +46,10 @@ def noise_scale(training: TrainingConfig, acceleration: float, seed: int) -> tup
 
 
 def quiet_weight(training: TrainingConfig, acceleration: float) -> float:
-    """How often a sample's squared error counts whose target has this root mean square.
+    """Returns the loss weight of a sample whose target has this root mean square.
 
-    A network's error at rest is small beside that of impacts, and so it counts for nothing in their mean; but it is the
-    same in every frame, and what should lie still creeps over thousands of them.
+    Errors at rest are small compared with those of impacts and hardly change the mean, but they are the same in every
+    frame: bodies at rest creep over thousands of frames.
     """
     if not acceleration < training.quiet_acceleration:
         return 1.0
@@ -57,13 +57,13 @@ def quiet_weight(training: TrainingConfig, acceleration: float) -> float:
 
 
 def target_acceleration(window_FWN3: torch.Tensor) -> torch.Tensor:
-    """Root mean square of the acceleration in the last three frames of each window, [F]."""
+    """Returns the root mean square of the acceleration in the last three frames of each window, [F]."""
     acceleration_FN3 = window_FWN3[:, -1] - 2 * window_FWN3[:, -2] + window_FWN3[:, -3]
     return acceleration_FN3.square().mean((1, 2)).sqrt()
 
 
 def random_walk(shape_MN3: tuple[int, int, int], std_last: float, generator: torch.Generator) -> torch.Tensor:
-    """Velocity noise [m, N, 3], oldest first: a random walk whose last step has standard deviation `std_last`."""
+    """Returns velocity noise [m, N, 3], oldest first: a random walk that ends with standard deviation `std_last`."""
     steps_MN3 = torch.randn(shape_MN3, generator=generator, device=generator.device)
     return steps_MN3.cumsum(0) * (std_last / math.sqrt(shape_MN3[0]))
 
@@ -71,8 +71,8 @@ def random_walk(shape_MN3: tuple[int, int, int], std_last: float, generator: tor
 def correlated_walk(
     position_N3: torch.Tensor, history: int, std_last: float, cell_size: float, generator: torch.Generator
 ) -> torch.Tensor:
-    """Velocity noise [m, N, 3] that neighbours have in common: a sum of plane waves, random Fourier features (Rahimi,
-    Recht 2007), whose amplitudes walk as `random_walk` does; over waves its standard deviation is the same everywhere.
+    """Returns velocity noise [m, N, 3] that neighbours have in common: a sum of plane waves, random Fourier features
+    (Rahimi, Recht 2007), whose amplitudes are a `random_walk`. Its standard deviation is the same everywhere.
     """
     waves, device = CORRELATED_WAVES, generator.device
     direction_K3 = torch.randn(waves, 3, generator=generator, device=device)
@@ -89,13 +89,13 @@ def correlated_walk(
 def perturbed_window(
     batch: Batch, std_last: float, correlated: float = 0.0, cell_size: float = 1.0, dimensions: int = 3
 ) -> torch.Tensor:
-    """A copy of the batch's window with noise in its question, [W, N, 3]; the batch stays as it is.
+    """Returns a copy of the batch's window with noise in its input frames, [W, N, 3].
 
-    The walk runs through the velocities, positions follow as their sums. The next position moves with the
-    last one, so the target becomes v_true^{n+1} - v_noisy^n: the network learns to undo the velocity error
-    (the rule of GNS, Sanchez-Gonzalez et al. 2020). `correlated` is the fraction of the variance that neighbours have
-    in common: in a rollout a body's particles err together, which independent noise, averaged over them, never shows.
-    Each scene's noise is `batch.noise_scale_S` times that. Axes from `dimensions` on have none.
+    The random walk is added to the velocities, and positions follow as their sums. The next position moves with the
+    last one, so the target becomes v_true^{n+1} - v_noisy^n: the network learns to undo the velocity error (as in GNS,
+    Sanchez-Gonzalez et al. 2020). `correlated` is the fraction of the variance that neighbours have in common: in a
+    rollout the errors of a body's particles are correlated, while independent noise averages out over a body. Each
+    scene's noise is multiplied by `batch.noise_scale_S`. Axes from `dimensions` on have no noise.
     """
     window_WN3 = batch.window_WN3
     if std_last == 0:
@@ -111,7 +111,7 @@ def perturbed_window(
             generator.manual_seed(seed ^ WAVE_STREAM)
             position_N3 = window_WN3[-2, first : first + count]
             std = scale * std_last * math.sqrt(correlated)
-            velocity_MN3 = velocity_MN3 + correlated_walk(position_N3, history, std, cell_size, generator)
+            velocity_MN3 = velocity_MN3 + correlated_walk(position_N3, history, std, cell_size, generator=generator)
         first += count
         velocity_MN3[..., dimensions:] = 0.0
         position_MN3 = velocity_MN3.cumsum(0)
@@ -120,7 +120,7 @@ def perturbed_window(
 
 
 def jittered_origin(batch: Batch, cell_size: float, dimensions: int = 3) -> torch.Tensor:
-    """Grid origins uniform in [-cell_size, 0]^3, one for each scene, [S, 3]; 0 on axes from `dimensions` on."""
+    """Returns grid origins uniform in [-cell_size, 0]^3, [S, 3]; 0 on axes from `dimensions` on."""
     origins = []
     for seed in batch.seeds_S:
         generator = torch.Generator().manual_seed(seed ^ JITTER_STREAM)

@@ -1,4 +1,4 @@
-"""What a training's kernels are compiled for ahead, while the first episodes are made."""
+"""The kernels that a training compiles while the first episodes are generated."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from hgn.training.errors import MONITORED_SCENES
 
 
 def job_of_training(config: TrainConfig, capability: tuple[int, int], several_ranks: bool) -> PrecompileJob:
-    """What a training on such a GPU will compile; sizes follow from the scenes' distribution."""
+    """Returns the kernels that a training on such a GPU needs; sizes follow from the scenes' distribution."""
     training, network = config.training, config.network
     particles, cells = _sizes(config.scene, network.levels)
     own = [training.pushforward_scenes] if training.pushforward_fraction > 0 else []
@@ -19,16 +19,16 @@ def job_of_training(config: TrainConfig, capability: tuple[int, int], several_ra
         UpdateSettings.of(training, config.scene.cell_size),
         training.precision,
         several_ranks,
-        training.ema_decay > 0,
-        training.batch_scenes * particles,
-        tuple(training.batch_scenes * count for count in cells),
-        10 * capability[0] + capability[1],
-        tuple(own + ([MONITORED_SCENES] if monitored else [])),
+        averages=training.ema_decay > 0,
+        particles=training.batch_scenes * particles,
+        cells=tuple(training.batch_scenes * count for count in cells),
+        capability=10 * capability[0] + capability[1],
+        pushforward_scenes=tuple(own + ([MONITORED_SCENES] if monitored else [])),
     )
 
 
 def _sizes(scene: SceneConfig, levels: int) -> tuple[int, list[int]]:
-    """Particles and cells of each level of a scene as it begins, its groups being cubes."""
+    """Returns the initial particles and cells of each level of a scene whose groups are cubes."""
     edge = scene.group_size / scene.cell_size
     particles = scene.group_count * scene.particles_per_cell * edge**3
     cells, length = [], edge + 2  # cells beside a particle's are active too

@@ -1,16 +1,14 @@
-"""Pushforward: the network simulates, and learns to return from where that leads to the truth.
+"""Pushforward: the network simulates, and learns to return from the simulated states to the data.
 
-The idea of Brandstetter et al. 2022, collected like DAgger (Ross et al. 2011). Every `pushforward_every` updates the
-present weights (their moving average where there is one) simulate `pushforward_scenes` scenes, each from a random true
-frame on for `pushforward_frames` (of long episodes for `pushforward_episode_fraction` of their frames) or as long as
-the truth goes, and each simulated frame becomes a window in a pool;
-until the next simulation a fraction of the samples is taken from the pool. Noise shows a network errors that are drawn;
-its own are biased, and common to a body. Everything is drawn from seed, update and rank. The pool is not part of a
-checkpoint: a training that goes on makes a new one, which is the old one where the checkpoint lies at a multiple of
-`pushforward_every`.
+The idea of Brandstetter et al. 2022, collected as in DAgger (Ross et al. 2011). Every `pushforward_every` updates the
+present parameters (their moving average where there is one) simulate `pushforward_scenes` scenes, each from a random
+frame of the data on for `pushforward_frames` (in long episodes for `pushforward_episode_fraction` of their frames), or
+to the end of the episode. Each simulated frame becomes a window in a pool, and until the next simulation a fraction of
+the samples is taken from the pool. Noise shows a network random errors, while its own are biased and common to a body.
+Everything is drawn from seed, update and rank. The pool is not part of a checkpoint: a resumed training simulates anew,
+with the same result where the checkpoint is at a multiple of `pushforward_every`.
 
-The rule is here, and the pool of the torch backend; that of the triton backend is in hgn.training.graph_pushforward.
-Both replace samples before a batch is made of them.
+The rule and the pool are here; scenes of a backend are in hgn.training.torch_pushforward and triton_pushforward.
 Shape legend: H velocity history, F simulated frames, W = H + 2 frames of a window, N particles, S scenes.
 """
 
@@ -19,47 +17,49 @@ from __future__ import annotations
 import functools
 import time
 from collections.abc import Sequence
-from dataclasses import replace
-from typing import TypeVar
+from typing import Generic, Protocol, TypeVar
 
 import numpy as np
 import torch
 
 from hgn.config import SIMULATED_FRAMES, TrainingConfig
-from hgn.data.batch import BatchSample, UpdateSamples, make_batch
 from hgn.data.importance import DrawnBySize
-from hgn.network.barriers import Barriers
-from hgn.network.base import ParticleNetwork
-from hgn.runtime.backend import fastest_stepped
 from hgn.runtime.divergence import diverged
 from hgn.runtime.simulator import InitialState
-from hgn.runtime.stepped_rollout import stepped
 from hgn.scene.barrier import Barrier
 from hgn.scene.episode import Episode
-from hgn.scene.history import window
 from hgn.schema import ConfigError
-from hgn.training.errors import PARTICLES_PER_BATCH
 from hgn.training.noise import noise_scale, target_acceleration
 
-S = TypeVar("S")
+E = TypeVar("E")  # an episode as a backend reads it
+
+
+class Sample(Protocol):
+    """A sample as a backend reads it."""
+
+    @property
+    def seed(self) -> int: ...
+
+
+T = TypeVar("T", bound=Sample)
 Starts = tuple[tuple[int, int], ...]  # episodes and frames that the network simulates from
 START_STREAM, SAMPLE_STREAM = 0x57A7, 0xE217
-# finest cells; farther from the truth (rms over a scene) its motion is no answer any more, and the loss would be made
-# of such frames alone: they are dropped, and with an untrained network most are
+# In finest cells, root mean square over a scene. Frames farther from the data are dropped, because its motion is no
+# target for them, and they would dominate the loss; of an untrained network most frames are.
 DROPPED_BEYOND = 0.5
-PULLED_WITHIN = 1.0  # finest cells on an axis; no particle is pulled as if it were farther away
+PULLED_WITHIN = 1.0  # finest cells on each axis: the distance that a target takes a fraction of is clamped to this
 
 
 def simulated_frames(training: TrainingConfig, frame_count: int) -> int:
-    """How many frames are simulated of an episode of so many, where its truth goes on for as long."""
+    """Returns how many frames are simulated in an episode of `frame_count` frames, if it is long enough."""
     return max(training.pushforward_frames, int(training.pushforward_episode_fraction * frame_count))
 
 
 def drawn_starts(training: TrainingConfig, update: int, rank: int, frame_counts: Sequence[int]) -> Starts:
-    """Episode and frame that each simulation before `update` starts from, of episodes of so many frames.
+    """Draws episode and frame of each simulation before `update`, from episodes with `frame_counts` frames.
 
-    Every episode once before one comes twice, from a frame from which on the truth goes on for as long as is simulated,
-    or for half of what it has, where that is less: it has to be known for one frame longer than is trained on.
+    Every episode is drawn once before one is drawn twice. After the start frame the episode has as many frames as are
+    simulated and one more, for the last target; or half of its frames, if that is less.
     Raises: ConfigError when all episodes are too short.
     """
     last = {
@@ -79,8 +79,7 @@ def drawn_starts(training: TrainingConfig, update: int, rank: int, frame_counts:
 
 
 class PoolDraws:
-    """Which windows of a pool are drawn, and how often: by the accelerations that they ask for where
-    `training.pushforward_importance` says so."""
+    """Draws windows of a pool, by their target accelerations as far as `training.pushforward_importance` says."""
 
     def __init__(self, training: TrainingConfig, rank: int, accelerations: Sequence[float]) -> None:
         self._training, self._rank = training, rank
@@ -88,8 +87,8 @@ class PoolDraws:
         self._by_size = DrawnBySize.of(np.array(accelerations, np.float64), training.pushforward_importance)
 
     def drawn(self, update: int) -> list[tuple[int, float]]:
-        """The windows that replace the first samples of an update, `pushforward_fraction` of them on average, each
-        with the weight of its loss.
+        """Returns the windows that replace the first samples of an update, `pushforward_fraction` of them on average,
+        each with its loss weight.
         """
         if not self._windows:
             return []
@@ -98,27 +97,19 @@ class PoolDraws:
         return [self._by_size.at(place) for place in generator.random(count)]
 
 
-def by_frames(training: TrainingConfig, starts: Sequence[S], frame_counts: Sequence[int]) -> list[tuple[int, list[S]]]:
-    """The starts that are simulated for as many frames, with that number; the most of them first."""
-    groups: dict[int, list[S]] = {}
-    for start, count in zip(starts, frame_counts, strict=True):
-        groups.setdefault(simulated_frames(training, count), []).append(start)
-    return sorted(groups.items(), key=lambda group: -len(group[1]))
-
-
 def known_frames(simulated: int, frame_count: int, frame: int) -> int:
-    """How many of the frames simulated from `frame` on the truth of an episode of `frame_count` frames answers."""
+    """Returns how many of the frames simulated from `frame` on have a target, in an episode of `frame_count` frames."""
     return min(simulated, frame_count - 2 - frame)
 
 
 def pushforward_windows(
     true_TN3: torch.Tensor, simulated_FN3: torch.Tensor, pull: float, cell_size: float
 ) -> torch.Tensor:
-    """The windows of one scene's simulation, [F, W, N, 3].
+    """Returns the windows of one scene's simulation, [F, W, N, 3].
 
-    true_TN3 holds the frames n - H to n + F + 1 of the truth, simulated_FN3 the frames n + 1 to n + F. The answer after
-    frame k is x_k + (true_{k+1} - true_k) + pull (true_k - x_k): the network undoes its velocity error, and a fraction
-    of its position error, which brings back what has crossed a wall.
+    true_TN3 has the frames n - H to n + F + 1 of the data, simulated_FN3 the frames n + 1 to n + F. The last frame of
+    the window of frame k is x_k + (true_{k+1} - true_k) + pull (true_k - x_k): the network undoes its velocity error,
+    and a fraction of its position error, which also brings back particles that crossed a wall.
     """
     frames = len(simulated_FN3)
     history = len(true_TN3) - frames - 2
@@ -133,18 +124,20 @@ def pushforward_windows(
 def usable_frames(
     true_TN3: torch.Tensor, simulated_FN3: torch.Tensor, domain_3: torch.Tensor, cell_size: float
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """How many frames from the first on can be trained on, and the mean squared distance from the truth in the last of
-    them, both [] on the device.
+    """Returns how many frames can be trained on, from the first on, and the mean squared distance from the data in the
+    last of them, both [] on the device.
     """
     now_FN3 = true_TN3[len(true_TN3) - len(simulated_FN3) - 1 : -1]
     square_F = (simulated_FN3 - now_FN3).square().sum(-1).mean(-1)
-    good_F = (square_F <= (DROPPED_BEYOND * cell_size) ** 2) & ~diverged(simulated_FN3, domain_3).any(-1)  # NaN is not
+    good_F = (square_F <= (DROPPED_BEYOND * cell_size) ** 2) & ~diverged(simulated_FN3, domain_3).any(
+        -1
+    )  # NaN diverged
     count = good_F.int().cumprod(0).sum()
     return count, square_F[(count - 1).clamp(min=0)]
 
 
 def diverged_scenes(position_N3: torch.Tensor, scene_N: torch.Tensor, domain_S3: torch.Tensor) -> torch.Tensor:
-    """Whether each particle belongs to a scene that has one that diverged, bool [N]."""
+    """Returns whether each particle belongs to a scene with a particle that diverged, bool [N]."""
     scene_N = scene_N.long()
     diverged_S = torch.zeros(len(domain_S3), device=position_N3.device)
     diverged_S.index_add_(0, scene_N, diverged(position_N3, domain_S3[scene_N]).float())
@@ -153,103 +146,111 @@ def diverged_scenes(position_N3: torch.Tensor, scene_N: torch.Tensor, domain_S3:
 
 @functools.lru_cache(maxsize=256)
 def simulated_barrier(episode: Episode, clearance: float) -> Barrier:
-    """What of an episode's obstacles its simulations hold by: where only their cells are known, nothing.
+    """Returns the barrier of an episode's obstacles, empty where only their cells are known.
 
-    Kept for the episodes used last; that of a large mesh takes some tenths of a second.
+    Barriers of the last episodes are cached; that of a large mesh takes 0.1 s and more.
     Raises: ConfigError for a clearance of more than a cell.
     """
     return InitialState.of_episode(episode).barrier(clearance)
 
 
-class PushforwardPool:
-    """The pool on backend torch, which serves every network; see GraphPushforwardPool for triton's."""
+class SimulatedScenes(Protocol[E, T]):
+    """Scenes of a backend: its episodes, simulations from their frames, and its samples."""
 
-    def __init__(self, network: ParticleNetwork, training: TrainingConfig, rank: int) -> None:
-        """`network` simulates."""
-        self.network, self.training, self.rank = network, training, rank
-        self._backend = fastest_stepped(network)
-        self._samples: list[tuple[BatchSample, float]] = []  # with the rms of the target acceleration
+    @property
+    def cell_size(self) -> float:
+        """The size of the finest cells."""
+
+    def frame_count(self, episode: E) -> int:
+        """Returns the number of frames of an episode, without those before frame 0."""
+
+    def domain_size(self, episode: E) -> torch.Tensor:
+        """Returns the domain size, [3] on the device."""
+
+    def groups(self, starts: Sequence[tuple[E, int]]) -> list[Sequence[tuple[E, int]]]:
+        """Divides scenes into groups that fit into memory."""
+
+    def simulate(self, starts: Sequence[tuple[E, int]], frames: int) -> list[torch.Tensor]:
+        """Returns simulated positions [F, N, 3] of each scene of a group; anything after a divergence."""
+
+    def true_frames(self, episode: E, frame: int, known: int) -> torch.Tensor:
+        """Returns the frames of the data from `frame` - H to `frame` + `known` + 1, [T, N, 3]."""
+
+    def sample(self, episode: E, frame: int, window_WN3: torch.Tensor) -> T:
+        """Returns the sample of a window around a frame."""
+
+    def drawn(self, sample: T, seed: int, weight: float, scale: float) -> T:
+        """Returns the sample with this seed, loss weight and noise scale."""
+
+
+class PushforwardPool(Generic[E, T]):
+    """Windows of the last simulations."""
+
+    def __init__(self, scenes: SimulatedScenes[E, T], training: TrainingConfig, rank: int) -> None:
+        self._scenes, self.training, self._rank = scenes, training, rank
+        self._samples: list[tuple[T, float]] = []  # with the rms of the target acceleration
         self._draws = PoolDraws(training, rank, [])
         self.figures: dict[str, float] = {}
 
-    def refresh(self, starts: Sequence[tuple[Episode, int]]) -> None:
-        """Simulates from these frames, and makes the pool of that."""
-        begin_s = time.monotonic()
-        self._samples = []
-        squares, known = [], 0
-        for frames, alike in by_frames(self.training, starts, [episode.frame_count for episode, _ in starts]):
-            for group in self._groups(alike):
-                for (episode, frame), simulated_FN3 in zip(group, self._simulate(group, frames), strict=True):
-                    answered = known_frames(frames, episode.frame_count, frame)
-                    squares += self._take(episode, frame, simulated_FN3[:answered])
-                    known += answered
-        self._draws = PoolDraws(self.training, self.rank, [acceleration for _, acceleration in self._samples])
-        self.figures = pool_figures(len(self._samples), known, squares, time.monotonic() - begin_s)
+    def refresh(self, starts: Sequence[tuple[E, int]]) -> None:
+        """Simulates from these frames, and fills the pool with the windows.
 
-    def replaced(self, update_samples: UpdateSamples, update: int) -> UpdateSamples:
-        """The samples of an update with a fraction from the pool; seeds stay, and with them noise, jitter, symmetry."""
-        samples = list(update_samples.samples)
+        Raises: ConfigError the first time, when the backend computes wrongly on this machine.
+        """
+        begin_s = time.monotonic()
+        self._samples = []  # frees the memory
+        squares, known = [], 0
+        for frames, alike in self._by_frames(starts):
+            for group in self._scenes.groups(alike):
+                counts = [known_frames(frames, self._scenes.frame_count(episode), frame) for episode, frame in group]
+                simulated = self._scenes.simulate(group, frames)
+                squares += self._add(group, [path_FN3[:n] for path_FN3, n in zip(simulated, counts, strict=True)])
+                known += sum(counts)
+        self._draws = PoolDraws(self.training, self._rank, [acceleration for _, acceleration in self._samples])
+        windows = len(self._samples)
+        values = {"windows": float(windows), "dropped": float(known - windows), "seconds": time.monotonic() - begin_s}
+        if squares:
+            values["mse"] = float(np.mean(squares))
+        self.figures = {f"pushforward/{name}": value for name, value in values.items()}
+
+    def replaced(self, samples: Sequence[T], update: int) -> list[T]:
+        """Returns the samples of an update with a fraction from the pool. Seeds stay, and noise, jitter, symmetry."""
+        samples, scenes = list(samples), self._scenes
         for slot, (number, rarity) in enumerate(self._draws.drawn(update)):
             own, acceleration = self._samples[number]
             seed = samples[slot].seed
             scale, weight = noise_scale(self.training, acceleration, seed)
-            samples[slot] = replace(own, seed=seed, weight=rarity * weight, noise_scale=scale)
-        return replace(update_samples, samples=tuple(samples))
+            samples[slot] = scenes.drawn(own, seed, rarity * weight, scale)
+        return samples
 
-    def _groups(self, starts: Sequence[tuple[Episode, int]]) -> list[list[tuple[Episode, int]]]:
-        """What fits into memory at once."""
-        groups: list[list[tuple[Episode, int]]] = []
-        left = 0  # particles that the last group may still take
-        for start in starts:
-            if left <= 0:
-                groups.append([])
-                left = PARTICLES_PER_BATCH
-            groups[-1].append(start)
-            left -= len(start[0].material_N)
-        return groups
+    def _by_frames(self, starts: Sequence[tuple[E, int]]) -> list[tuple[int, list[tuple[E, int]]]]:
+        """Groups the starts by the number of frames to simulate; the largest group first."""
+        groups: dict[int, list[tuple[E, int]]] = {}
+        for episode, frame in starts:
+            frames = simulated_frames(self.training, self._scenes.frame_count(episode))
+            groups.setdefault(frames, []).append((episode, frame))
+        return sorted(groups.items(), key=lambda group: -len(group[1]))
 
-    def _simulate(self, starts: Sequence[tuple[Episode, int]], frames: int) -> list[torch.Tensor]:
-        """Positions [F, N, 3] of each scene; of a scene that diverged, whatever came after."""
-        config = self.network.config
-        batch = make_batch(starts, config).to(self._backend.device)
-        begin = state = replace(batch.state(), barriers=self._barriers([episode for episode, _ in starts]))
-        path = []
-        for _ in range(frames):
-            state = stepped(self._backend.predict, state, config)
-            path.append(state.position_N3.cpu().clone())
-            again_N = diverged_scenes(state.position_N3, state.scene_N, state.domain_S3)
-            if bool(again_N.any()):
-                position_N3 = torch.where(again_N[:, None], begin.position_N3, state.position_N3)
-                velocity_NM3 = torch.where(again_N[:, None, None], 0.0, state.velocity_NM3)
-                state = replace(state, position_N3=position_N3, velocity_NM3=velocity_NM3)
-        return list(torch.stack(path).split(list(batch.particles_S), dim=1))
-
-    def _barriers(self, episodes: Sequence[Episode]) -> Barriers | None:
-        """What of the obstacles simulations hold by; windows are trained on without."""
-        clearance = self.network.config.obstacle_clearance
-        if clearance is None:
-            return None
-        barriers = Barriers.of([simulated_barrier(episode, clearance) for episode in episodes])
-        return barriers and barriers.to(self._backend.device)
-
-    def _take(self, episode: Episode, frame: int, simulated_FN3: torch.Tensor) -> list[float]:
-        """Adds a scene's windows; its mean squared distance at the end, where it is there until then."""
-        config, frames = self.network.config, len(simulated_FN3)
-        true_TN3 = torch.from_numpy(window(episode, frame, config.velocity_history, frames + 1))
-        count, square = usable_frames(true_TN3, simulated_FN3, torch.tensor(episode.domain_size), config.cell_size)
-        windows = pushforward_windows(true_TN3, simulated_FN3, self.training.pushforward_pull, config.cell_size)
-        accelerations = target_acceleration(windows).tolist()
-        self._samples += [
-            (BatchSample(episode, frame + k + 1, windows[k].numpy()), accelerations[k]) for k in range(int(count))
+    def _add(self, starts: Sequence[tuple[E, int]], simulated: Sequence[torch.Tensor]) -> list[float]:
+        """Adds the windows of simulated scenes; returns the mean squared distance from the data in the last frame of
+        each scene that is usable until then.
+        """
+        scenes, cell_size, squares = self._scenes, self._scenes.cell_size, []
+        pairs = list(zip(starts, simulated, strict=True))
+        truths = [scenes.true_frames(episode, frame, len(path_FN3)) for (episode, frame), path_FN3 in pairs]
+        usable = [
+            torch.stack([x.double() for x in usable_frames(truth, path_FN3, scenes.domain_size(episode), cell_size)])
+            for ((episode, _), path_FN3), truth in zip(pairs, truths, strict=True)
         ]
-        return [float(square)] if count == frames else []
-
-
-def pool_figures(windows: int, known: int, squares: Sequence[float], seconds: float) -> dict[str, float]:
-    """What is logged of a pool of so many windows, where the truth is known of so many frames; `squares` are mean
-    squared distances of whole simulations in their last frame.
-    """
-    values = {"windows": float(windows), "dropped": float(known - windows), "seconds": seconds}
-    if squares:
-        values["mse"] = float(np.mean(squares))
-    return {f"pushforward/{name}": value for name, value in values.items()}
+        for ((episode, frame), path_FN3), truth, (count, square) in zip(
+            pairs, truths, torch.stack(usable).tolist(), strict=True
+        ):
+            windows = pushforward_windows(truth, path_FN3, self.training.pushforward_pull, cell_size)
+            windows = windows[: int(count)].contiguous()
+            accelerations = target_acceleration(windows).tolist()
+            self._samples += [
+                (scenes.sample(episode, frame + k + 1, window_WN3), acceleration)
+                for k, (window_WN3, acceleration) in enumerate(zip(windows, accelerations, strict=True))
+            ]
+            squares += [square] if count == len(path_FN3) else []
+        return squares

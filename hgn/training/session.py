@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable
 from contextlib import ExitStack
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,7 +15,6 @@ import yaml
 from hgn.config import TrainConfig
 from hgn.data.manifest import Manifest
 from hgn.data.pooled import AnyStore
-from hgn.data.sampler import SamplerState
 from hgn.network.base import ParticleNetwork
 from hgn.network.build import build_network
 from hgn.runtime.backend import pick, set_matmul_precision, torch_unsupported_reason, triton_unsupported_reason
@@ -22,28 +22,30 @@ from hgn.schema import to_mapping
 from hgn.system.device import keep_to_quota
 from hgn.system.files import make_folder, write_atomically
 from hgn.system.provenance import provenance
-from hgn.training.checkpoint import BEST_NAME, LAST_NAMES, DataInfo
+from hgn.training.checkpoint import BEST_NAME, LAST_NAMES, DataInfo, Resume
 from hgn.training.distributed import first_on_machine, first_rank, layout
 from hgn.training.errors import format_ratio
 from hgn.training.stop import StopRequest
 
 if TYPE_CHECKING:
     from hgn.runtime.precompile import Precompilation
+    from hgn.training.module import TrainingModule
 
 
-def train_network(
-    config: TrainConfig,
-    store: AnyStore,
-    checkpoint: tuple[Path, SamplerState] | None,
-    initial: ParticleNetwork | None,
-    stop: StopRequest,
-    published: Callable[[], str],
-    precompilation: Precompilation | None,
-) -> int:
+@dataclass(frozen=True)
+class Start:
+    """What a training begins with."""
+
+    store: AnyStore
+    resume: Resume | None  # the checkpoint to go on from
+    initial: ParticleNetwork | None  # parameters and normaliser of a new run; None: drawn, and the data's
+    precompilation: Precompilation | None
+
+
+def train_network(config: TrainConfig, start: Start, stop: StopRequest, published: Callable[[], str]) -> int:
     """Trains until `training.maximum_updates` or a stop request; returns the exit code.
 
-    checkpoint: the file to resume from, and where in the data it stood. `published` tells how much of the data set is
-    there. Every rank calls this.
+    `published` reports how much of the data set is there. Every rank calls this.
     """
     # Lightning loads for seconds: not before the waiting is over, and never for the other commands.
     from lightning.pytorch import Trainer, seed_everything
@@ -53,19 +55,11 @@ def train_network(
     from hgn.training.callbacks import Checkpoints, LogLines, SameWeights, Stopper
     from hgn.training.checkpoint_writer import CheckpointWriter
     from hgn.training.data_module import EpisodeDataModule
-    from hgn.training.gradients import GradientGuard
-    from hgn.training.module import TrainingModule
     from hgn.training.monitor import Monitor
+    from hgn.training.readers import EpisodeReader, WindowReader
     from hgn.training.tensorboard import FinalMetrics
 
-    training, run = config.training, Path(config.run)
-    data = DataInfo(
-        store.manifest.config_hash,
-        config.dataset.frame_rate_hz,
-        config.scene.cell_size,
-        config.scene.gravity,
-        config.scene.maximum_initial_speed,
-    )
+    training, run, store, resume = config.training, Path(config.run), start.store, start.resume
     lightning_compat.quieten()
     devices, nodes = layout(training)
     backend, text = _backend(config)
@@ -78,31 +72,25 @@ def train_network(
     keep_to_quota()
     set_matmul_precision(training.precision)
     seed_everything(training.seed, verbose=False)
-    module = TrainingModule(build_network(config.network), training, data, backend)
-    if initial is None:
-        module.set_statistics(store.statistics())
-    else:
-        module.load_weights(initial)
-    chunks = backend == "triton"
-    feed = EpisodeDataModule(store, config.network, training, chunks=chunks, interrupted=lambda: stop.requested)
-    if checkpoint is not None:
-        feed.sampler_state = checkpoint[1]
+    module = _module(config, start, backend)
+    reader = (EpisodeReader if backend == "triton" else WindowReader)(store, config.network, training)
+    feed = EpisodeDataModule(store, training, reader, interrupted=lambda: stop.requested)
+    if resume is not None:
+        feed.first_update, feed.sampler_state = resume.progress.updates, resume.progress.sampler_state
     _write_run_files(config, run)
 
     writer = CheckpointWriter()
     checkpoints = Checkpoints(run / "checkpoints", training.checkpoint_every, writer)
     monitor = Monitor(run, store, stop, checkpoints)
-    guard = GradientGuard()
-    lines = LogLines(run, monitor.last, guard, feed, published)
+    lines = LogLines(run, monitor.last, feed, published)
     final = FinalMetrics(to_mapping(config), monitor.last, stop)
     trainer = Trainer(
-        accelerator=training.accelerator,
+        accelerator=training.device,
         devices=devices,
         num_nodes=nodes,
         strategy=lightning_compat.gradient_averaging(backend) if devices * nodes > 1 else "auto",
-        max_steps=training.maximum_updates,
-        max_epochs=-1,
-        callbacks=[SameWeights(feed), guard, lines, monitor, checkpoints, Stopper(stop, checkpoints), final],
+        max_epochs=-1,  # the feed ends after the last update
+        callbacks=[SameWeights(feed), lines, monitor, checkpoints, Stopper(stop, checkpoints), final],
         plugins=[writer],
         logger=TensorBoardLogger(run, name="", version="tensorboard"),
         default_root_dir=run,
@@ -110,22 +98,39 @@ def train_network(
         enable_progress_bar=False,
         enable_model_summary=False,
         use_distributed_sampler=False,
-        log_every_n_steps=training.maximum_updates,
     )
-    if precompilation is not None:
-        print(precompilation.wait(lambda: stop.requested), file=sys.stderr)
+    if start.precompilation is not None:
+        print(start.precompilation.wait(lambda: stop.requested), file=sys.stderr)
     with lightning_compat.interrupts_passed_on():
-        trainer.fit(module, feed, ckpt_path=checkpoint[0] if checkpoint else None, weights_only=True)
+        trainer.fit(module, feed, ckpt_path=resume.path if resume else None, weights_only=True)
     if trainer.is_global_zero:
-        _report(config, trainer.global_step, monitor.last, stop)
+        _report(config, module.update, monitor.last, stop)
     # a signal that came after the last update changed nothing
-    return 0 if trainer.global_step >= training.maximum_updates else stop.exit_code
+    return 0 if module.update >= training.maximum_updates else stop.exit_code
+
+
+def _module(config: TrainConfig, start: Start, backend: str) -> TrainingModule:
+    from hgn.training.module import TrainingModule
+
+    data = DataInfo(
+        start.store.manifest.config_hash,
+        config.dataset.frame_rate_hz,
+        config.scene.cell_size,
+        config.scene.gravity,
+        maximum_initial_speed=config.scene.maximum_initial_speed,
+    )
+    module = TrainingModule(build_network(config.network), config.training, data, backend)
+    if start.initial is None:
+        module.set_statistics(start.store.statistics())
+    else:
+        module.load_weights(start.initial)
+    return module
 
 
 def _backend(config: TrainConfig) -> tuple[str, str]:
     """`torch` or `triton`, and a line that says so."""
     training = config.training
-    on_gpu = training.accelerator != "cpu" and torch.cuda.is_available()
+    on_gpu = training.device != "cpu" and torch.cuda.is_available()
     device = torch.device("cuda" if on_gpu else "cpu")
     reasons = {
         "triton": triton_unsupported_reason(device, config.network, training.precision),
@@ -138,7 +143,7 @@ def precompile_kernels(config: TrainConfig, stack: ExitStack) -> Precompilation 
     """Lets the kernels be compiled while others wait for data, where this process leads its machine's on GPUs."""
     training = config.training
     backend, _ = _backend(config)
-    on_gpu = training.accelerator != "cpu" and torch.cuda.is_available() and torch.version.hip is None
+    on_gpu = training.device != "cpu" and torch.cuda.is_available() and torch.version.hip is None
     if backend != "triton" or not on_gpu or not first_on_machine():
         return None
     # Triton, which backend torch does without, is loaded here.

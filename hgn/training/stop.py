@@ -1,7 +1,6 @@
-"""Stopping a training: Ctrl-C, SIGTERM, SIGUSR1 (what schedulers send before the end), or the time a start was given.
+"""Stopping a training: by Ctrl-C, SIGTERM, SIGUSR1 (which schedulers send before the end), or a time limit.
 
-A signal only raises a flag; the loop ends at the next update, after a checkpoint was written, and nothing is
-lost. A second Ctrl-C does not wait.
+A signal only sets a flag: the loop ends at the next update, after a checkpoint. A second Ctrl-C ends it at once.
 """
 
 from __future__ import annotations
@@ -10,13 +9,13 @@ import signal
 import time
 from types import FrameType
 
-# what a process that got several of them ends with: a scheduler that sent SIGUSR1 queues the job again, and sends
-# SIGTERM too when it is in a hurry
+# After several signals the exit code is that of the last in this order: a scheduler that sent SIGUSR1 queues the job
+# again, and may send SIGTERM too.
 BY_WEIGHT = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1)
 
 
 class StopRequest:
-    """Whether, and why, this process should stop training."""
+    """Records whether and why this process should stop training."""
 
     def __init__(self) -> None:
         self.signal: int | None = None
@@ -28,7 +27,7 @@ class StopRequest:
             signal.signal(number, self._on_signal)
 
     def restart_clock(self, maximum_minutes: float | None) -> None:
-        """Counts the time from now: waiting for data is not training."""
+        """Starts the time limit now, after the wait for data."""
         self._deadline = None if maximum_minutes is None else time.monotonic() + 60 * maximum_minutes
 
     @property
@@ -41,7 +40,7 @@ class StopRequest:
 
     @property
     def exit_code(self) -> int:
-        """128 + the signal's number, or 0."""
+        """128 + the signal's number, or 0 without a signal."""
         return 0 if self.signal is None else 128 + self.signal
 
     def _on_signal(self, number: int, frame: FrameType | None) -> None:

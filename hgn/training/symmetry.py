@@ -1,4 +1,4 @@
-"""Symmetry augmentation on backend torch: a batch as each scene's symmetry shows it, on the batch's device.
+"""Symmetry augmentation on backend torch: applies a symmetry to each scene of a batch, on the batch's device.
 
 Shape legend: W window frames, N particles, K obstacle cells, S scenes.
 """
@@ -17,12 +17,12 @@ from hgn.scene.symmetry import Symmetry, drawn_symmetry
 
 
 def drawn_symmetries(batch: Batch) -> list[Symmetry]:
-    """A symmetry of each scene, drawn from its sample's seed."""
+    """Returns a symmetry of each scene, drawn from its sample's seed."""
     return [drawn_symmetry(own, seed) for own, seed in zip(batch.symmetries_S, batch.seeds_S, strict=True)]
 
 
 def under_symmetries(batch: Batch, symmetries: Sequence[Symmetry]) -> Batch:
-    """A copy of the batch with the scenes' images in it; domains are their own images."""
+    """Returns a copy of the batch with the images of its scenes; domains are invariant."""
     return replace(
         batch,
         window_WN3=_points(batch.window_WN3, batch.scene_N, symmetries),
@@ -32,9 +32,9 @@ def under_symmetries(batch: Batch, symmetries: Sequence[Symmetry]) -> Batch:
 
 
 def obstacles_under(obstacles: ObstacleCells, symmetries: Sequence[Symmetry]) -> ObstacleCells:
-    """Cells and normals of the images. Mirrored, cell k becomes n - 2 - k, where the solver has n nodes.
+    """Returns cells and normals of the images. A mirrored cell k becomes n - 2 - k, where the solver has n nodes.
 
-    A particle exactly on a face belongs to the cell above it in the image too, as in any scene.
+    A particle exactly on a face belongs to the cell above it, also in the image.
     """
     scene_K, cell_K3 = unpack(obstacles.key_K)
     source_K3, mirrored_K3 = _axes(symmetries, scene_K)
@@ -47,7 +47,7 @@ def obstacles_under(obstacles: ObstacleCells, symmetries: Sequence[Symmetry]) ->
 
 
 def _points(point_N3: torch.Tensor, scene_N: torch.Tensor, symmetries: Sequence[Symmetry]) -> torch.Tensor:
-    """The images of positions […, N, 3]."""
+    """Returns the images of positions […, N, 3]."""
     source_N3, mirrored_N3 = _axes(symmetries, scene_N)
     sum_S3 = torch.tensor([s.mirror_sum for s in symmetries], dtype=torch.float64).to(point_N3)
     point_N3 = point_N3.gather(-1, source_N3.expand(point_N3.shape))
@@ -55,14 +55,14 @@ def _points(point_N3: torch.Tensor, scene_N: torch.Tensor, symmetries: Sequence[
 
 
 def _vectors(vector_N3: torch.Tensor, scene_N: torch.Tensor, symmetries: Sequence[Symmetry]) -> torch.Tensor:
-    """The images of directions [N, 3]."""
+    """Returns the images of directions [N, 3]."""
     source_N3, mirrored_N3 = _axes(symmetries, scene_N)
     vector_N3 = vector_N3.gather(-1, source_N3)
     return torch.where(mirrored_N3, -vector_N3, vector_N3)
 
 
 def _axes(symmetries: Sequence[Symmetry], scene_N: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Where each coordinate comes from, and whether it is mirrored, [N, 3]."""
+    """Returns the source axis of each coordinate and whether it is mirrored, [N, 3]."""
     source_S3 = torch.tensor([s.source for s in symmetries], device=scene_N.device)
     mirrored_S3 = torch.tensor([s.mirrored for s in symmetries], device=scene_N.device)
     return source_S3[scene_N], mirrored_S3[scene_N]

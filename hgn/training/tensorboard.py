@@ -1,4 +1,4 @@
-"""Pictures, animations and hyper-parameters for TensorBoard; nothing is written where there is no such logger."""
+"""Pictures, animations and hyper-parameters for TensorBoard."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from PIL import Image
 from hgn.render.error_curve import error_curve
 from hgn.render.pictures import animate, compare_picture, write_picture
 from hgn.scene.rollout_file import Rollout
+from hgn.training.module import TrainingModule
 from hgn.training.stop import StopRequest
 
 PICTURES = 4  # frames beside each other
@@ -21,30 +22,35 @@ ANIMATION_SIZE = 200  # pixels of a panel
 FINAL_PREFIXES = ("one_step/", "baseline_ratio/", "rollout/")
 
 
-def show_rollout(trainer: Trainer, folder: Path, rollout: Rollout, error_T: dict[str, np.ndarray]) -> None:
-    """A rollout beside its ground truth, as a picture and as a GIF, and `error_T`, position MSE over time by material.
-
-    They are kept in `folder` as rollout_UPDATE.png, rollout_UPDATE.gif and error_UPDATE.png.
+def write_pictures(folder: Path, update: int, rollout: Rollout, error_T: dict[str, np.ndarray]) -> dict[str, Path]:
+    """Writes a rollout beside its ground truth, as a picture and as a GIF, and `error_T`, position MSE over time by
+    material. Returns their files by TensorBoard's tags.
     """
-    step = trainer.global_step
+    names = {"picture": "rollout_{:09d}.png", "error_over_time": "error_{:09d}.png", "animation": "rollout_{:09d}.gif"}
+    paths = {f"rollout/{name}": folder / file.format(update) for name, file in names.items()}
     frames = np.linspace(0, rollout.frame_count - 1, PICTURES).astype(int).tolist()
-    picture = compare_picture(rollout, frames)
-    curve = error_curve(error_T, rollout.frame_rate_hz)
-    animation = folder / f"rollout_{step:09d}.gif"
-    write_picture(folder / f"rollout_{step:09d}.png", picture)
-    write_picture(folder / f"error_{step:09d}.png", curve)
+    write_picture(paths["rollout/picture"], compare_picture(rollout, frames))
+    write_picture(paths["rollout/error_over_time"], error_curve(error_T, rollout.frame_rate_hz))
     # at most 50 pictures a second, which viewers keep
     every = max(-(-rollout.frame_count // ANIMATION_PICTURES), -(-int(rollout.frame_rate_hz) // 50))
-    animate(rollout, animation, every=every, size=ANIMATION_SIZE)
-    logger = trainer.logger
-    if isinstance(logger, TensorBoardLogger):
-        for tag, image in (("rollout/picture", picture), ("rollout/error_over_time", curve)):
-            logger.experiment.add_image(tag, np.asarray(image.convert("RGB")), step, dataformats="HWC")
-        add_animation(logger, "rollout/animation", animation, step)
+    animate(rollout, paths["rollout/animation"], every=every, size=ANIMATION_SIZE)
+    return paths
+
+
+def show_pictures(logger: Any, update: int, paths: dict[str, Path]) -> None:
+    """Adds pictures and animations to TensorBoard."""
+    if not isinstance(logger, TensorBoardLogger):
+        return
+    for tag, path in paths.items():
+        if path.suffix == ".gif":
+            add_animation(logger, tag, path, update)
+        else:
+            with Image.open(path) as image:
+                logger.experiment.add_image(tag, np.asarray(image.convert("RGB")), update, dataformats="HWC")
 
 
 def add_animation(logger: TensorBoardLogger, tag: str, path: Path, step: int) -> None:
-    """Shows a GIF file as an image summary, which TensorBoard plays; `add_video` would need a film library."""
+    """Adds a GIF file as an image summary, which TensorBoard plays; `add_video` would need a video library."""
     from tensorboard.compat.proto.summary_pb2 import Summary
 
     with Image.open(path) as opened:
@@ -54,14 +60,15 @@ def add_animation(logger: TensorBoardLogger, tag: str, path: Path, step: int) ->
 
 
 class FinalMetrics(Callback):
-    """Hyper-parameters beside the last measured errors, when a training ends by itself: TensorBoard's HPARAMS page."""
+    """Writes hyper-parameters and the last errors for TensorBoard's HPARAMS page, unless a signal ended the run."""
 
     def __init__(self, settings: dict[str, Any], last: dict[str, float], stop: StopRequest) -> None:
-        """settings: the resolved configuration; last: filled by the monitor as it measures."""
+        """`settings` is the resolved configuration; `last` is filled by the monitor."""
         self.settings, self.last, self.stop = settings, last, stop
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         metrics = {f"final/{name}": value for name, value in self.last.items() if name.startswith(FINAL_PREFIXES)}
         logger = trainer.logger
         if self.stop.signal is None and metrics and isinstance(logger, TensorBoardLogger):
-            logger.log_hyperparams(self.settings, metrics, trainer.global_step)
+            assert isinstance(pl_module, TrainingModule)
+            logger.log_hyperparams(self.settings, metrics, pl_module.update)

@@ -24,7 +24,7 @@ def test_teams_agree_with_one_launch_a_substep(threads, blocks, run):
     """
     from datagen.mpm.solver import Team, simulate
 
-    config = MpmConfig(device="gpu")
+    config = MpmConfig(device="cuda")
     expected = simulate([_scene()], config, 11, 60.0, team=Team(0))
     _require_alike(expected * 3, simulate([_scene()] * 3, config, 11, 60.0, team=Team(threads, blocks, run)))
 
@@ -38,7 +38,7 @@ def test_blocks_that_do_not_fit_end_in_one_launch_a_substep(monkeypatch):
     from datagen.mpm import solver
 
     monkeypatch.setattr(solver, "_teams_at_once", lambda device, team: 1)
-    config = MpmConfig(device="gpu")
+    config = MpmConfig(device="cuda")
     expected = solver.simulate([_scene()], config, 11, 60.0, team=solver.Team(0))
     with pytest.warns(RuntimeWarning, match="does not run 4000 blocks"):
         found = solver.simulate([_scene()], config, 11, 60.0, team=solver.Team(512, 4000))

@@ -255,8 +255,7 @@ def test_worker_plans():
     large = DatagenConfig(scene=SceneConfig(domain_size=(4.0, 1.0, 4.0)))
     assert plan_workers(large, ("0",), 8, 2**36).scenes_per_launch == 52
     assert plan_workers(default, ("0",), 8, 2**32).scenes_per_launch == 138  # of frames that fill half of 4 GB
-    early = DatagenConfig(dataset=DatasetConfig(early_episodes=True))
-    assert plan_workers(early, ("0",), 8, 2**36) == WorkerPlan(1, None, 7, 416, 2, ("0",))
+    assert plan_workers(default, ("0",), 8, 2**36, early=True) == WorkerPlan(1, None, 7, 416, 2, ("0",))
     assert plan_workers(many, (), 8, 2**36) == WorkerPlan(3, 2, 1, 2, 2)
     assert plan_workers(many, ("4", "5"), 8, 2**36) == WorkerPlan(3, None, 7, 2, 2, ("4", "5"))
     assert plan_workers(default, ("4", "5"), 8, 2**40) == WorkerPlan(2, None, 7, 416, 416, ("4", "5"))

@@ -38,7 +38,7 @@ TRAINING = [
     "training.checkpoint_every=2",
     "training.monitor_every=2",
     "training.monitor_rollout_frames=0",
-    "training.accelerator=cpu",
+    "training.device=cpu",
 ]
 SETTINGS = {
     "datagen.solve": ["frames=2"],

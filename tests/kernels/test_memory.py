@@ -7,7 +7,7 @@ import pytest
 import torch
 from kernels.engines import device, engine_of, inference_of, run_forward
 from kernels.memory import Alive, checked_memory
-from kernels.test_pushforward import CELL_SIZE, placed, values_of
+from kernels.test_pushforward import placed, pools_of, values_of
 from kernels.test_update import HISTORY, episode, updates_of
 from network.states import network_of, random_state
 from training.test_noise import episode as falling_episode
@@ -17,7 +17,6 @@ from triton.runtime.errors import InterpreterError
 
 from hgn.kernels.grid.op import OUT_OF_WINDOW, OVERFLOW
 from hgn.kernels.update.op import DeviceSample
-from hgn.training.graph_pushforward import GraphPushforwardPool
 
 pytestmark = pytest.mark.usefixtures("large_tiles")
 
@@ -75,19 +74,21 @@ def test_pushforward_stays_within_memory():
     network = network_of(torch.float32, width=16, levels=1, message_passing_steps=1, cell_size=0.1)
     scenes = [scene_with_obstacles(0, 4), falling_episode(3, seed=1), scene_with_obstacles(3, 14)]
     training = training_of(precision="fp32", pushforward_frames=2, pushforward_fraction=0.9)
-    own = GraphPushforwardPool(network, training, CELL_SIZE, 0)
+    own, _ = pools_of(network, training)
+    own._scenes.values = values_of(network)
     episodes = [placed(scene, network) for scene in scenes]
     updates = updates_of(network, 4)
     frames: dict[object, set[tuple]] = {}
     for turn, (starts, mean) in enumerate([((0, 1), 0.0), ((1, 1), float("nan")), ((2, 0), 0.0)]):
         network.normaliser.acceleration_mean.fill_(mean)
         with checked_memory() as checked:
-            own.refresh([(episodes[i], i) for i in starts], values_of(network))
+            own.refresh([(episodes[i], i) for i in starts])
         last = max(i for i, (name, _) in enumerate(checked.launches) if name == "mark_cells")
-        frames.setdefault(own._rollout, set()).add(tuple(checked.launches[last:]))
+        frames.setdefault(own._scenes._rollout, set()).add(tuple(checked.launches[last:]))
         samples = [DeviceSample(episodes[i % 3], i, 7 * i + turn) for i in range(4)]
         mixed = [own.replaced(samples, 5 * turn + i) for i in range(3)]
-        assert any(sample.episode in dict(own._samples) for update in mixed for sample in update) or not own._samples
+        pool = {sample.episode for sample, _ in own._samples}
+        assert any(sample.episode in pool for update in mixed for sample in update) or not pool
         updates._upload(mixed, [0.0] * 3)
         alive = Alive()
         for row in updates._samples[:3].flatten(0, 1).tolist():

@@ -22,10 +22,11 @@ from hgn.kernels.packing import pack_network
 from hgn.kernels.update.op import DeviceEpisode, DeviceSample
 from hgn.schema import ConfigError
 from hgn.training.checkpoint import read_checkpoint
-from hgn.training.graph_pushforward import GraphPushforwardPool
 from hgn.training.module import TrainingModule
 from hgn.training.noise import noise_scale
 from hgn.training.pushforward import PushforwardPool, simulated_barrier
+from hgn.training.torch_pushforward import TorchScenes
+from hgn.training.triton_pushforward import TritonScenes
 
 pytestmark = pytest.mark.usefixtures("large_tiles")
 
@@ -44,8 +45,20 @@ def placed(made, network):
     return DeviceEpisode(position_TN3, material_N, obstacles, *scene, hashed and hashed.to(where))
 
 
+def pools_of(network, training):
+    """The pool of each backend, triton's first."""
+    scenes = TritonScenes(network, training, CELL_SIZE)
+    return PushforwardPool(scenes, training, 0), PushforwardPool(TorchScenes(network), training, 0)
+
+
 def values_of(network):
     return pack_network(network).gather(list(network.parameters())).detach()
+
+
+def refresh(fast, network, starts):
+    """Simulates on backend triton from these episodes and frames."""
+    fast._scenes.values = values_of(network)
+    fast.refresh([(placed(made, network), frame) for made, frame in starts])
 
 
 def assert_same_pools(fast, plain):
@@ -53,8 +66,9 @@ def assert_same_pools(fast, plain):
         if name != "pushforward/seconds":
             assert fast.figures[name] == pytest.approx(value, rel=1e-3), name
     for (found, asked), (sample, acceleration) in zip(fast._samples, plain._samples, strict=True):
-        np.testing.assert_allclose(found.position_TN3.cpu().numpy(), sample.window_WN3, rtol=0, atol=1e-6)
-        assert found.particles == sample.episode.particle_count and found.position_TN3.is_contiguous()
+        position_TN3 = found.episode.position_TN3
+        np.testing.assert_allclose(position_TN3.cpu().numpy(), sample.window_WN3, rtol=0, atol=1e-6)
+        assert found.episode.particles == sample.episode.particle_count and position_TN3.is_contiguous()
         assert asked == pytest.approx(acceleration, abs=1e-6)
 
 
@@ -68,21 +82,21 @@ def test_the_pool_is_that_of_the_plain_path(changes):
     scenes = [scene_with_obstacles(0, 7), episode(5, seed=1), scene_with_obstacles(2, 6), scene_with_obstacles(3, 12)]
     drawn = {"noise_std": 0.5, "noise_min_scale": 0.1, "pushforward_importance": 0.5}
     training = training_of(precision="fp32", pushforward_frames=2, **drawn)
-    fast, plain = GraphPushforwardPool(network, training, CELL_SIZE, 0), PushforwardPool(network, training, 0)
+    fast, plain = pools_of(network, training)
     if "obstacle_clearance" in changes:
         scenes = [with_square(made, (0.25, 0.25, 0.25)) if made is not scenes[1] else made for made in scenes]
         free_network = network_of(torch.float32, width=16, levels=1, message_passing_steps=1).to(device())
         plain.refresh([(scenes[0], 0)])
-        free = PushforwardPool(free_network, training, 0)
+        free = PushforwardPool(TorchScenes(free_network), training, 0)
         free.refresh([(scenes[0], 0)])
         ends = [pool._samples[-1][0].window_WN3[-2] for pool in (plain, free)]
         assert 0 < (abs(ends[0] - ends[1]).max(-1) > 3e-4).sum() < 7  # others feel those that are held
     rollouts = []
     for starts in ([(0, 0), (1, 9)], [(1, 0), (2, 6)], [(0, 5), (3, 2)]):  # from frame 9 on, one has an answer
-        fast.refresh([(placed(scenes[i], network), frame) for i, frame in starts], values_of(network))
+        refresh(fast, network, [(scenes[i], frame) for i, frame in starts])
         plain.refresh([(scenes[i], frame) for i, frame in starts])
         assert_same_pools(fast, plain)
-        rollouts.append(fast._rollout)
+        rollouts.append(fast._scenes._rollout)
         with torch.no_grad():
             for parameter in network.parameters():
                 parameter.mul_(1.05)
@@ -90,7 +104,7 @@ def test_the_pool_is_that_of_the_plain_path(changes):
     samples = [DeviceSample(placed(scenes[0], network), 2, seed, 0.5) for seed in (5, 6, 7, 8)]
     mixed = fast.replaced(samples, 11)
     assert [sample.seed for sample in mixed] == [5, 6, 7, 8] and mixed[2:] == samples[2:]
-    asked = dict(fast._samples)
+    asked = {sample.episode: acceleration for sample, acceleration in fast._samples}
     mean = sum(asked.values()) / len(asked)
     for sample in mixed[:2]:
         scale, weight = noise_scale(training, asked[sample.episode], sample.seed)
@@ -104,11 +118,11 @@ def test_long_episodes_are_simulated_for_longer():
     network = network_of(torch.float32, width=16, levels=1, message_passing_steps=1).to(device())
     scenes = [episode(8, frames=12, seed=1), episode(7, frames=6, seed=2), episode(5, frames=6, seed=3)]
     training = training_of(precision="fp32", pushforward_frames=2, pushforward_episode_fraction=0.4)
-    fast, plain = GraphPushforwardPool(network, training, CELL_SIZE, 0), PushforwardPool(network, training, 0)
-    fast.refresh([(placed(made, network), 1) for made in scenes], values_of(network))
+    fast, plain = pools_of(network, training)
+    refresh(fast, network, [(made, 1) for made in scenes])
     plain.refresh([(made, 1) for made in scenes])
     assert_same_pools(fast, plain)
-    assert [found.particles for found, _ in fast._samples] == [7, 7, 5, 5, 8, 8, 8, 8]
+    assert [found.episode.particles for found, _ in fast._samples] == [7, 7, 5, 5, 8, 8, 8, 8]
 
 
 def test_lost_scenes_are_dropped():
@@ -118,10 +132,10 @@ def test_lost_scenes_are_dropped():
     small, large = falling(episode(4, seed=1), 0.27), episode(4, seed=2)
     starts = [(small, 2), (large, 2)]
     training = training_of(precision="fp32")
-    fast, plain = GraphPushforwardPool(network, training, CELL_SIZE, 0), PushforwardPool(network, training, 0)
+    fast, plain = pools_of(network, training)
     for mean, kept in ((0.02, 4), (float("nan"), 0), (0.01, 5)):
         network.normaliser.acceleration_mean.fill_(mean)
-        fast.refresh([(placed(made, network), frame) for made, frame in starts], values_of(network))
+        refresh(fast, network, starts)
         plain.refresh(starts)
         assert_same_pools(fast, plain)
         assert len(fast._samples) == kept
@@ -130,9 +144,9 @@ def test_lost_scenes_are_dropped():
 def test_wrong_kernels_are_refused():
     """Before anything is trained on them, the simulation's kernels are compared with the reference network."""
     network = network_of(torch.float32, width=16, levels=1, message_passing_steps=1).to(device())
-    fast = GraphPushforwardPool(network, training_of(precision="fp32"), CELL_SIZE, 0)
-    starts = [(placed(scene_with_obstacles(i, 5), network), 2) for i in range(2)]
-    kept = GraphPushforwardPool._first_scenes
+    fast, _ = pools_of(network, training_of(precision="fp32"))
+    starts = [(scene_with_obstacles(i, 5), 2) for i in range(2)]
+    kept = TritonScenes._first_scenes
 
     def another(self, *arguments):
         with torch.no_grad():
@@ -140,15 +154,15 @@ def test_wrong_kernels_are_refused():
         return kept(self, *arguments)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(GraphPushforwardPool, "_first_scenes", another)
+        patch.setattr(TritonScenes, "_first_scenes", another)
         with pytest.raises(ConfigError, match=r"must be torch on this machine.*set training.backend=torch"):
-            fast.refresh(starts, values_of(network))
+            refresh(fast, network, starts)
 
 
 def test_fast_training_is_the_plain_one(data, tmp_path, monkeypatch, capsys):
     """Both paths simulate the same scenes at the same updates and train on the same windows: weights, their average and
     what is logged of the pool agree. The fast one tells where the time of its first updates went."""
-    monkeypatch.setattr("hgn.training.graph_trainer.REPORTED_UPDATES", 2)
+    monkeypatch.setattr("hgn.training.triton_updates.REPORTED_UPDATES", 2)
     monkeypatch.setattr("hgn.training.session.triton_unsupported_reason", lambda *_: None)  # in float32
     without_jitter(monkeypatch)
     same = {"noise_std": 0.0, "ema_decay": 0.7, "symmetry": "gravity"}

@@ -16,13 +16,14 @@ from training.test_symmetry import CELL_SIZE, CYCLIC, EIGHT, doubled, scene_with
 
 from hgn.config import TrainingConfig
 from hgn.data.batch import make_batch
-from hgn.data.episode_tensors import UpdateChunk, whole_episode
+from hgn.data.episode_tensors import EpisodeChunk, whole_episode
 from hgn.data.sampler import Sample, SamplerState
 from hgn.runtime.parity import relative_error
 from hgn.scene.obstacle_grid import ObstacleGrid
 from hgn.scene.symmetry import scene_symmetries
-from hgn.training.graph_trainer import GraphTrainer
 from hgn.training.symmetry import under_symmetries
+from hgn.training.triton_updates import TritonUpdates
+from hgn.training.updates import Ranks, TrainedNetwork
 
 pytestmark = pytest.mark.usefixtures("large_tiles")
 
@@ -60,12 +61,12 @@ def test_an_update_under_symmetries_is_the_plain_one(kind, monkeypatch):
     trained = copy.deepcopy(network).float().to(device())
     training = TrainingConfig(batch_scenes=8, noise_std=0.0, symmetry="gravity", precision="fp32")
     loss_sum, counters = torch.zeros(2, device=device()), torch.zeros(5, device=device())
-    optimizer = torch.optim.Adam(trained.parameters())
     without_jitter(monkeypatch)
-    fast = GraphTrainer(trained, optimizer, training, CELL_SIZE, loss_sum, counters)
+    parts = TrainedNetwork(trained, torch.optim.Adam(trained.parameters()), loss_sum, counters)
+    fast = TritonUpdates(parts, training, CELL_SIZE, Ranks())
     samples = tuple(Sample(i, FRAME, seed) for i, seed in enumerate(seeds))
     wholes = {i: whole_episode(made, network.config) for i, made in enumerate(episodes)}
-    fast.run(UpdateChunk((samples,), wholes, SamplerState()), [0.0])
+    fast.run(EpisodeChunk((samples,), wholes, SamplerState()), 0)
     updates, count = fast.updates, len(state.position_N3)
     width = 3 * HISTORY + (9 if kind == "relative" else 0)
     assert fast.parity is not None and max(fast.parity) < 1e-3

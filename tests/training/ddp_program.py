@@ -17,6 +17,7 @@ import torch
 
 from hgn import train
 from hgn.training.module import TrainingModule
+from hgn.training.torch_updates import TorchUpdates
 
 
 def main(folder):
@@ -40,27 +41,32 @@ def main(folder):
     for name in ("all_gather", "all_reduce", "barrier", "broadcast", "broadcast_object_list"):
         setattr(torch.distributed, name, counted(getattr(torch.distributed, name)))
 
+    step, start = TorchUpdates.step, TrainingModule.on_train_start
+
     def at_update(module, *_):
         nonlocal update
-        update = module.global_step + 1
+        update = module.update + 1
 
     def at_start(module):
         with (folder / f"starts_{rank}").open("a") as file:
-            file.write(f"{module.global_step}\n")
+            file.write(f"{module.update}\n")
+        start(module)
 
-    def before_step(module, optimizer):
-        if module.global_step == 0:
-            gradients = {name: parameter.grad.clone() for name, parameter in module.named_parameters()}
+    def before_step(updates, number):
+        if number == 0:
+            named = updates.trained.network.named_parameters()
+            gradients = {f"network.{name}": parameter.grad.clone() for name, parameter in named}
             torch.save(gradients, folder / f"gradients_{rank}.pt")
-        if module.global_step in signals:
-            os.kill(*signals[module.global_step])
+        if number in signals:
+            os.kill(*signals[number])
+        step(updates, number)
 
     def at_end(module):
-        end.update(weights=module.state_dict(), update=module.global_step)
+        end.update(weights=module.state_dict(), update=module.update)
 
     TrainingModule.on_train_start = at_start
     TrainingModule.on_train_batch_start = at_update
-    TrainingModule.on_before_optimizer_step = before_step
+    TorchUpdates.step = before_step
     TrainingModule.on_train_end = at_end
     end["exit_code"] = train.main(mapping)
     torch.save(end, folder / f"end_{rank}.pt")

@@ -18,7 +18,7 @@ from hgn.training.module import TrainingModule
 
 def main(folder, fault, failing):
     def fail(module, *_):
-        if module.global_step == 3 and os.environ.get("LOCAL_RANK", "0") == failing:
+        if module.update == 3 and os.environ.get("LOCAL_RANK", "0") == failing:
             if fault == "error":
                 raise ConfigError("this rank fails")
             with torch.no_grad():

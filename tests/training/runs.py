@@ -10,7 +10,7 @@ TRAINING = {
     "batch_scenes": 2,
     "learning_rate": 1e-3,
     "final_learning_rate": 1e-4,
-    "accelerator": "cpu",
+    "device": "cpu",
     "log_every": 4,
     "checkpoint_every": 5,
     "monitor_every": 6,

@@ -12,7 +12,7 @@ from hgn.system.files import write_atomically
 from hgn.training import checkpoint_writer
 from hgn.training.checkpoint import read_checkpoint
 from hgn.training.checkpoint_writer import CheckpointWriter
-from hgn.training.module import TrainingModule
+from hgn.training.torch_updates import TorchUpdates
 
 
 @pytest.fixture
@@ -98,10 +98,9 @@ def test_a_failed_write_is_raised(tmp_path):
 
 
 @pytest.mark.parametrize("failing", ["best.ckpt", "last.ckpt"])
-def test_a_training_ends_when_it_cannot_write(data, tmp_path, monkeypatch, failing):
+def test_a_training_ends_when_it_cannot_write(finished, monkeypatch, failing):
     """A full disk ends the training with the file's name, and leaves the last checkpoint that could be written."""
-    run = tmp_path / "run"
-    assert train.main(train_mapping(data, run, maximum_updates=2)) == 0
+    data, run = finished
     kept = (run / "checkpoints" / "last.ckpt").read_bytes()
 
     def write(path, content):
@@ -111,23 +110,23 @@ def test_a_training_ends_when_it_cannot_write(data, tmp_path, monkeypatch, faili
 
     monkeypatch.setattr(checkpoint_writer, "write_atomically", write)
     with pytest.raises(OSError, match=rf"No space left on device.*{failing}"):
-        train.main(train_mapping(data, run))
+        train.main(train_mapping(data, run, maximum_updates=18))
     assert failing == "best.ckpt" or (run / "checkpoints" / "last.ckpt").read_bytes() == kept
 
 
 def test_a_stopped_training_waits_for_its_checkpoint(data, tmp_path, monkeypatch):
     """A signal while a checkpoint is being written: that one and the last one are whole when the command returns."""
     gate = Gate(monkeypatch)
-    original = TrainingModule.on_before_optimizer_step
+    original = TorchUpdates.step
 
-    def signalled(module, optimizer):
-        if module.global_step == 5:
+    def signalled(updates, number):
+        if number == 5:
             assert gate.events in ([], ["begin last.ckpt"])
             signal.raise_signal(signal.SIGTERM)
             threading.Timer(0.5, gate.opened.set).start()
-        original(module, optimizer)
+        original(updates, number)
 
-    monkeypatch.setattr(TrainingModule, "on_before_optimizer_step", signalled)
+    monkeypatch.setattr(TorchUpdates, "step", signalled)
     run = tmp_path / "run"
     assert train.main(train_mapping(data, run, monitor_every=1000)) == 128 + signal.SIGTERM
     assert gate.events == ["begin last.ckpt", "end last.ckpt"] * 2

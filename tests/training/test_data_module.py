@@ -17,13 +17,24 @@ from hgn.data.reader import EpisodeStore
 from hgn.data.shard_cache import CACHE_VARIABLE, LIMIT_VARIABLE
 from hgn.schema import ConfigError
 from hgn.training.data_module import EpisodeDataModule, agreed_count
+from hgn.training.readers import EpisodeReader, WindowReader
 
 UPDATES = 40  # of 2 samples, where an epoch has 25
-SETTINGS = (NetworkConfig(**NETWORK), TrainingConfig(**TRAINING))
+SETTINGS = (NetworkConfig(**NETWORK), TrainingConfig(**TRAINING | {"maximum_updates": 200}))
 
 
 def streamed(folder, training=SETTINGS[1]):
-    return list(islice(EpisodeDataModule(EpisodeStore(folder, "train"), SETTINGS[0], training).batches(), UPDATES))
+    return list(islice(windows_of(folder, training).chunks(), UPDATES))
+
+
+def windows_of(folder, training=SETTINGS[1], **options):
+    store = EpisodeStore(folder, "train")
+    return EpisodeDataModule(store, training, WindowReader(store, SETTINGS[0], training), **options)
+
+
+def episodes_of(folder, training, **options):
+    store = EpisodeStore(folder, "train")
+    return EpisodeDataModule(store, training, EpisodeReader(store, SETTINGS[0], training), **options)
 
 
 @pytest.mark.parametrize(("importance", "at_rest"), [(0.0, 1.0), (0.5, 1.0), (0.5, 0.01), (0.0, 0.01)])
@@ -35,11 +46,11 @@ def test_resident_feeding_equals_streaming(folder, importance, at_rest):
     expected = streamed(folder, training)
     resident: dict[int, EpisodeTensors] = {}
     update = 0
-    for chunk in EpisodeDataModule(EpisodeStore(folder, "train"), network, training, chunks=True).chunks():
+    for chunk in episodes_of(folder, training).chunks():
         assert not resident.keys() & chunk.episodes.keys()
         resident |= chunk.episodes
         for samples in chunk.samples[: UPDATES - update]:
-            batch = expected[update]
+            batch = expected[update].batch
             windows = [
                 resident[sample.episode].position_TN3[sample.frame : sample.frame + network.velocity_history + 2]
                 for sample in samples
@@ -66,21 +77,20 @@ def test_feeding_from_a_url_equals_feeding_from_a_folder(folder, tmp_path, monke
     files = fsspec.filesystem("memory")
     files.put(str(folder), "/feeding", recursive=True)
     for here, there in zip(streamed(folder), streamed("memory://feeding"), strict=True):
-        assert torch.equal(here.window_WN3, there.window_WN3)
-        assert (here.seeds_S, here.sampler_state) == (there.seeds_S, there.sampler_state)
+        assert torch.equal(here.batch.window_WN3, there.batch.window_WN3)
+        assert (here.batch.seeds_S, here.sampler_state) == (there.batch.seeds_S, there.sampler_state)
 
 
 def test_shard_made_again_is_not_mixed_up(make_config, make_dataset, folder):
     """A damaged shard that was deleted and made again is published last: an epoch that began before does not go on,
     for some samples would come twice."""
-    feed = EpisodeDataModule(EpisodeStore(folder, "train"), *SETTINGS)
-    *_, last = islice(feed.batches(), 3)
+    *_, last = islice(windows_of(folder).chunks(), 3)
     (folder / "train-000001-000002.tar").unlink()
     make_dataset(make_config())
-    again = EpisodeDataModule(EpisodeStore(folder, "train"), *SETTINGS)
+    again = windows_of(folder)
     again.sampler_state = last.sampler_state
     with pytest.raises(ConfigError, match="must still hold the shards that epoch 0 began with, in the order"):
-        next(again.batches())
+        next(again.chunks())
 
 
 @pytest.mark.parametrize("here", [True, False])
@@ -134,8 +144,8 @@ def test_data_larger_than_the_cache(make_config, make_dataset, tmp_path, monkeyp
     def batches(place, training):
         nonlocal given
         given = 0
-        feed, found = EpisodeDataModule(EpisodeStore(place, "train"), SETTINGS[0], training, batches_ahead=0), []
-        for batch in islice(feed.batches(), epoch):
+        feed, found = windows_of(place, training, chunks_ahead=0), []
+        for batch in islice(feed.chunks(), epoch):
             found.append(batch)
             given = len(found)
             if (fetcher := feed.store._fetcher) is not None:
@@ -143,7 +153,8 @@ def test_data_larger_than_the_cache(make_config, make_dataset, tmp_path, monkeyp
         return found
 
     for here, there in zip(batches(folder, training), batches("memory://larger", training), strict=True):
-        assert torch.equal(here.window_WN3, there.window_WN3) and here.sampler_state == there.sampler_state
+        assert torch.equal(here.batch.window_WN3, there.batch.window_WN3)
+        assert here.sampler_state == there.sampler_state
     once = sorted(name for name in fetched if name.endswith(".tar"))
     assert len(once) == len(set(once)) == len(sizes) == 7
     assert room < 2 / 3 or max(waited_for, default=0) == 0
@@ -159,7 +170,7 @@ def test_data_larger_than_the_device(make_config, make_dataset):
     folder = make_dataset(make_config(training_scenes=64, validation_scenes=0, test_scenes=0, frames=4))
     store = EpisodeStore(folder, "train")
     training = replace(SETTINGS[1], shuffle_episodes=8, batch_scenes=4, log_every=2)
-    feed = EpisodeDataModule(store, SETTINGS[0], training, batches_ahead=0)
+    feed = episodes_of(folder, training, chunks_ahead=0)
     held: dict[int, EpisodeTensors] = {}
     brought, most, samples = 0, 0, 0
     for chunk in feed.chunks():

@@ -22,7 +22,7 @@ from hgn.data.sampler import EpisodeSampler
 from hgn.schema import ConfigError
 from hgn.training.checkpoint import read_checkpoint
 from hgn.training.distributed import checksum, default_run, first_rank, layout
-from hgn.training.module import TrainingModule
+from hgn.training.torch_updates import TorchUpdates
 
 ROOT = Path(__file__).resolve().parents[2]
 PROGRAM = Path(__file__).with_name("ddp_program.py")
@@ -148,8 +148,8 @@ def test_two_ranks_train_as_one(reference, warm_python, tmp_path):
     alone["training"] |= {"devices": 1, "batch_scenes": 1}
     seen: list[tuple[int, ...]] = []
     with pytest.MonkeyPatch.context() as patch:
-        original = TrainingModule.training_step
-        patch.setattr(TrainingModule, "training_step", lambda m, b, i: (seen.append(b.seeds_S), original(m, b, i))[1])
+        original = TorchUpdates.run
+        patch.setattr(TorchUpdates, "run", lambda u, c, n: (seen.append(c.batch.seeds_S), original(u, c, n))[1])
         assert train.main(alone) == 0
     order = EpisodeSampler(alone["training"].get("seed", 0), 2, lambda _: [6] * 5)
     for _ in range(20):
@@ -256,7 +256,7 @@ def test_one_process_leads(first):
 def test_launcher_and_configuration_agree(started):
     """A launcher that started another number of processes on a machine than devices is refused: each would train
     alone."""
-    training = TrainingConfig(accelerator="cpu", devices=2)
+    training = TrainingConfig(device="cpu", devices=2)
     if started[0] == 2:
         assert layout(training) == started
         return
@@ -279,20 +279,20 @@ def test_launcher_and_configuration_agree(started):
 @pytest.mark.usefixtures("launched")
 def test_layout_follows_the_launcher(expected):
     """Where the configuration leaves them open, devices and nodes are those that the launcher started."""
-    assert layout(TrainingConfig(accelerator="cpu")) == expected
+    assert layout(TrainingConfig(device="cpu")) == expected
 
 
 def test_restarts_that_would_hang_are_refused(no_launcher):
     """Where torchrun may restart processes that share its store, the missing variable is named at the start."""
     no_launcher.setenv("TORCHELASTIC_USE_AGENT_STORE", "True")
     no_launcher.setenv("TORCHELASTIC_MAX_RESTARTS", "0")
-    assert layout(TrainingConfig(accelerator="cpu")) == (1, 1)
+    assert layout(TrainingConfig(device="cpu")) == (1, 1)
     no_launcher.setenv("TORCHELASTIC_MAX_RESTARTS", "3")
     message = r"STORE must be 1 in torchrun's environment .*--max-restarts 3\), got nothing"
     with pytest.raises(ConfigError, match=message):
-        layout(TrainingConfig(accelerator="cpu"))
+        layout(TrainingConfig(device="cpu"))
     no_launcher.setenv("TORCHELASTIC_USE_AGENT_STORE", "False")
-    assert layout(TrainingConfig(accelerator="cpu")) == (1, 1)
+    assert layout(TrainingConfig(device="cpu")) == (1, 1)
 
 
 @pytest.mark.parametrize(
@@ -323,12 +323,12 @@ def test_devices_that_are_not_there(no_launcher):
         no_launcher.setattr(torch.cuda, "device_count", lambda gpus=gpus: gpus)
         assert layout(TrainingConfig()) == (max(gpus, 1), 1)
         assert layout(TrainingConfig(devices=3)) == (3, 1)
-        assert layout(TrainingConfig(accelerator="cpu")) == (1, 1)
+        assert layout(TrainingConfig(device="cpu")) == (1, 1)
     with pytest.raises(ConfigError, match=r"training\.devices must be at most the 4 GPUs of this machine, got 5"):
         layout(TrainingConfig(devices=5))
     no_launcher.setattr(torch.cuda, "is_available", lambda: False)
-    with pytest.raises(ConfigError, match=r"training\.accelerator must be auto or cpu without a GPU, got 'gpu'"):
-        layout(TrainingConfig(accelerator="gpu"))
+    with pytest.raises(ConfigError, match=r"training\.device must be auto or cpu without a GPU, got 'cuda'"):
+        layout(TrainingConfig(device="cuda"))
 
 
 def test_checksum():
@@ -350,18 +350,18 @@ GPUS = (pytest.mark.multigpu, pytest.mark.skipif(torch.cuda.device_count() < 2, 
 
 
 @pytest.mark.parametrize(
-    ("accelerator", "fault", "failing"),
+    ("device", "fault", "failing"),
     [
         ("cpu", "weights", "1"),
-        *(pytest.param("gpu", fault, rank, marks=GPUS) for fault in ("error", "weights") for rank in ("0", "1")),
+        *(pytest.param("cuda", fault, rank, marks=GPUS) for fault in ("error", "weights") for rank in ("0", "1")),
     ],
 )
-def test_no_rank_waits_for_one_that_fails(data, no_launcher, warm_python, tmp_path, accelerator, fault, failing):
+def test_no_rank_waits_for_one_that_fails(data, no_launcher, warm_python, tmp_path, device, fault, failing):
     """Two ranks of Lightning's own launcher end where one of them meets an error of its own, and where one has other
     weights, which the next log line finds."""
-    options: dict[str, Any] = {"accelerator": accelerator, "backend": "torch", "devices": 2, "maximum_updates": 10**6}
+    options: dict[str, Any] = {"device": device, "backend": "torch", "devices": 2, "maximum_updates": 10**6}
     (tmp_path / "mapping.json").write_text(json.dumps(train_mapping(data, tmp_path / "run", **options)))
-    python = str(warm_python) if accelerator == "cpu" else sys.executable
+    python = str(warm_python) if device == "cpu" else sys.executable
     process = subprocess.Popen(
         [python, str(PROGRAM.with_name("failing_rank.py")), str(tmp_path), fault, failing],
         env=os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1", "PYTHON_EXEC": python},

@@ -39,7 +39,7 @@ def test_makes_what_is_missing(tmp_path):
     """
     config = small_config(tmp_path / "data")
     generator = Generator(config, tmp_path / "run")
-    assert yaml.safe_load((tmp_path / "run/dataset.yaml").read_text())["dataset"]["early_episodes"] is True
+    assert yaml.safe_load((tmp_path / "run/dataset.yaml").read_text())["progress"] == "json"  # few scenes first
     while generator.running and generator.frames_done() == 0:
         time.sleep(0.05)
     generator.stop()

@@ -15,9 +15,8 @@ from hgn.network.obstacles import ObstacleCells
 from hgn.scene.obstacle_grid import ObstacleGrid, build_obstacle_grid
 from hgn.scene.scene import Obstacle
 from hgn.scene.symmetry import Symmetry, drawn_symmetry, scene_symmetries
-from hgn.training.checkpoint import DataInfo
-from hgn.training.module import TrainingModule
 from hgn.training.symmetry import drawn_symmetries, obstacles_under, under_symmetries
+from hgn.training.torch_updates import batch_loss
 
 CELL_SIZE = 1 / 64
 EIGHT = scene_symmetries((0.0, -9.8, 0.0), (1.0, 1.0, 1.0), CELL_SIZE)
@@ -73,8 +72,7 @@ def by_hand(batch, episodes, symmetries):
 
 
 def loss_and_gradients(network, batch, symmetry):
-    module = TrainingModule(network, TrainingConfig(symmetry=symmetry), DataInfo("", 60.0, CELL_SIZE))
-    loss = module.loss(batch)
+    loss = batch_loss(network, batch, TrainingConfig(symmetry=symmetry))
     found = torch.autograd.grad(loss, list(network.parameters()), allow_unused=True)
     return float(loss.detach()), torch.cat([g.flatten() for g in found if g is not None])
 

@@ -13,11 +13,12 @@ import torch
 import yaml
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tensorboard.plugins.hparams.plugin_data_pb2 import HParamsPluginData
-from training.runs import metrics, train_mapping
+from training.runs import NETWORK, TRAINING, metrics, train_mapping
 
 from hgn import train
-from hgn.config import TrainConfig
+from hgn.config import NetworkConfig, TrainConfig, TrainingConfig
 from hgn.data.manifest import Manifest
+from hgn.data.pooled import PooledStore
 from hgn.data.reader import EpisodeStore
 from hgn.data.statistics import merge_statistics
 from hgn.export import export
@@ -26,10 +27,12 @@ from hgn.schema import ConfigError, from_mapping
 from hgn.system.files import held
 from hgn.training import gradients, monitor
 from hgn.training.callbacks import LogLines
-from hgn.training.checkpoint import LAST_NAMES, read_checkpoint, sampler_state_of_checkpoint
+from hgn.training.checkpoint import LAST_NAMES, Progress, read_checkpoint
+from hgn.training.data_module import EpisodeDataModule
 from hgn.training.dataset import PublishedEpisodes
-from hgn.training.module import TrainingModule
+from hgn.training.readers import WindowReader
 from hgn.training.stop import StopRequest
+from hgn.training.torch_updates import TorchUpdates
 
 
 @pytest.fixture
@@ -41,11 +44,11 @@ def weights(path):
     return read_checkpoint(path)["state_dict"]
 
 
-def test_a_run_leaves_what_it_promises(data, run, capsys):
+def test_a_run_leaves_what_it_promises(finished_once):
     """Checkpoints, metrics with one-step and rollout errors of both splits, pictures, the resolved config; and in
     TensorBoard loss, errors by material, rate, gradient norm, speed, waiting, shards, pictures, hyper-parameters."""
-    assert train.main(train_mapping(data, run, monitor_rollout_frames=4)) == 0
-    assert "best.ckpt" not in "".join(capsys.readouterr())  # what is there is not told of
+    _, run, output = finished_once
+    assert "best.ckpt" not in output
     checkpoint = read_checkpoint(run / "checkpoints" / "last.ckpt")
     assert checkpoint["hgn"]["updates"] == 12 and (run / "checkpoints" / "best.ckpt").is_file()
     records = metrics(run)
@@ -100,14 +103,14 @@ def test_relative_inputs_train_as_all_others(data, run):
 
 def gradients_with_faults(monkeypatch, faulty):
     """Puts one NaN into the gradient of some updates, before the callbacks see it."""
-    original = TrainingModule.on_after_backward
+    original = TorchUpdates.step
 
-    def on_after_backward(module):
-        original(module)
-        if module.global_step in faulty:
-            next(iter(module.network.parameters())).grad.view(-1)[0] = float("nan")
+    def step(updates, number):
+        if number in faulty:
+            next(iter(updates.trained.network.parameters())).grad.view(-1)[0] = float("nan")
+        original(updates, number)
 
-    monkeypatch.setattr(TrainingModule, "on_after_backward", on_after_backward)
+    monkeypatch.setattr(TorchUpdates, "step", step)
 
 
 def test_a_scene_that_diverges_leaves_the_others_measured(data, run, monkeypatch):
@@ -119,59 +122,53 @@ def test_a_scene_that_diverges_leaves_the_others_measured(data, run, monkeypatch
         return [RolloutResult(first.position_TN3[:2], "diverged"), *others]
 
     monkeypatch.setattr(monitor, "simulate_scenes", cut_short)
-    assert train.main(train_mapping(data, run, monitor_rollout_frames=4)) == 0
-    last = [record for record in metrics(run) if "rollout/finished" in record][-1]
+    assert train.main(train_mapping(data, run, monitor_rollout_frames=4, maximum_updates=1)) == 0
+    (last,) = [record for record in metrics(run) if "rollout/finished" in record]
     assert (last["rollout/finished"], last["rollout/frames"]) == (0.5, 2.0)
     assert all(math.isfinite(value) for name, value in last.items() if name.startswith("rollout/mse"))
-    assert (run / "pictures" / "rollout_000000012.png").is_file()
+    assert (run / "pictures" / "rollout_000000001.png").is_file()
 
 
 def test_updates_without_a_finite_gradient_are_skipped(data, run, monkeypatch):
-    """One NaN in a gradient leaves weights and moments bitwise as they were, is counted, and the training goes on."""
+    """One NaN in a gradient leaves parameters and moments bitwise as they were, is counted, and the training goes on.
+    At the limit of updates skipped in a row it ends with a message, and the stored parameters are finite."""
     before: dict[int, dict[str, torch.Tensor]] = {}
-    original = TrainingModule.on_train_batch_start
+    original = TorchUpdates.run
 
-    def remember(module, batch, index):
-        before[module.global_step] = {name: tensor.clone() for name, tensor in module.network.state_dict().items()}
-        return original(module, batch, index)
+    def remember(updates, chunk, first):
+        before[first] = {name: tensor.clone() for name, tensor in updates.trained.network.state_dict().items()}
+        return original(updates, chunk, first)
 
-    monkeypatch.setattr(TrainingModule, "on_train_batch_start", remember)
-    gradients_with_faults(monkeypatch, {2, 3, 9})
-    monkeypatch.setattr(gradients, "MAXIMUM_SKIPPED", 3)
-    assert train.main(train_mapping(data, run)) == 0
+    monkeypatch.setattr(TorchUpdates, "run", remember)
+    gradients_with_faults(monkeypatch, {2, 3, 9, *range(12, 100)})
+    monkeypatch.setattr(gradients, "MAXIMUM_SKIPPED", 5)
+    with pytest.raises(ConfigError, match="gradients must be finite, got 8 updates in a row without, up to update 20"):
+        train.main(train_mapping(data, run, maximum_updates=30))
     changed = [
         any(not torch.equal(before[n][name], before[n + 1][name]) for name in before[n]) for n in range(len(before) - 1)
     ]
-    assert [n for n, moved in enumerate(changed) if not moved] == [2, 3, 9]
+    assert [n for n, moved in enumerate(changed[:12]) if not moved] == [2, 3, 9] and not any(changed[12:])
     lines = [record for record in metrics(run) if "loss" in record]
-    assert [line["skipped_updates"] for line in lines] == [2, 2, 3]
-    assert all(np.isfinite(line["gradient_norm"]) and np.isfinite(line["loss"]) for line in lines)
-    state = read_checkpoint(run / "checkpoints" / "last.ckpt")["optimizer_states"][0]["state"]
-    assert {int(entry["step"]) for entry in state.values()} == {9}  # twelve updates, three of them skipped
-
-
-def test_training_ends_when_no_gradient_is_finite(data, run, monkeypatch):
-    """At the limit of updates skipped in a row the training ends with a message; the stored weights are finite."""
-    gradients_with_faults(monkeypatch, range(3, 100))
-    monkeypatch.setattr(gradients, "MAXIMUM_SKIPPED", 5)
-    with pytest.raises(ConfigError, match="gradients must be finite, got 5 updates in a row without, up to update 8"):
-        train.main(train_mapping(data, run))
+    assert [line["skipped_updates"] for line in lines] == [2, 2, 3, 7]
+    assert all(np.isfinite(line["gradient_norm"]) for line in lines[:3])
+    assert all(np.isfinite(line["loss"]) for line in lines)
     stored = read_checkpoint(run / "checkpoints" / "last.ckpt")
-    assert stored["hgn"]["updates"] == 5
+    assert (stored["hgn"]["updates"], stored["hgn"]["skipped"]) == (15, 6)
+    assert {int(entry["step"]) for entry in stored["optimizer_states"][0]["state"].values()} == {9}
     assert all(tensor.isfinite().all() for tensor in stored["state_dict"].values())
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGUSR1, signal.SIGINT])
 def test_signals_end_the_run_after_a_checkpoint(data, run, monkeypatch, number):
     """A real signal in the middle of an update ends the run at that update, with a checkpoint and 128 + its number."""
-    original = TrainingModule.on_before_optimizer_step
+    original = TorchUpdates.step
 
-    def signalled(module, optimizer):
-        if module.global_step == 2:
+    def signalled(updates, update):
+        if update == 2:
             os.kill(os.getpid(), number)
-        return original(module, optimizer)
+        original(updates, update)
 
-    monkeypatch.setattr(TrainingModule, "on_before_optimizer_step", signalled)
+    monkeypatch.setattr(TorchUpdates, "step", signalled)
     assert train.main(train_mapping(data, run)) == 128 + number
     assert read_checkpoint(run / "checkpoints" / "last.ckpt")["hgn"]["updates"] == 3
 
@@ -189,19 +186,18 @@ def test_a_signal_before_the_first_update(data, tmp_path, monkeypatch):
     assert read_checkpoint(tmp_path / "run" / "checkpoints" / "last.ckpt")["hgn"]["updates"] == 1
 
 
-def test_a_second_interrupt_does_not_wait(data, tmp_path, monkeypatch):
+def test_a_second_interrupt_does_not_wait(finished, monkeypatch):
     """Ctrl-C twice within an update leaves at once, and as every command does, by an interrupt."""
-    run = tmp_path / "run"
-    assert train.main(train_mapping(data, run, maximum_updates=2)) == 0
+    data, run = finished
 
-    def signalled(module, optimizer):
+    def signalled(updates, update):
         os.kill(os.getpid(), signal.SIGINT)
         os.kill(os.getpid(), signal.SIGINT)
 
-    monkeypatch.setattr(TrainingModule, "on_before_optimizer_step", signalled)
+    monkeypatch.setattr(TorchUpdates, "step", signalled)
     with pytest.raises(KeyboardInterrupt):
-        train.main(train_mapping(data, run))
-    assert read_checkpoint(run / "checkpoints" / "last.ckpt")["hgn"]["updates"] == 2
+        train.main(train_mapping(data, run, maximum_updates=14))
+    assert read_checkpoint(run / "checkpoints" / "last.ckpt")["hgn"]["updates"] == 12
 
 
 def test_progress_reads_the_data_set_seldom(make_config, make_dataset, tmp_path, monkeypatch):
@@ -224,16 +220,18 @@ def test_progress_reads_the_data_set_seldom(make_config, make_dataset, tmp_path,
         assert looks == expected
 
 
-def test_a_finished_run_stays_finished(data, run):
-    """Starting a finished run again makes no update and changes no weight; what a crash left half-written is gone."""
-    train.main(train_mapping(data, run))
-    before = weights(run / "checkpoints" / "last.ckpt")
+def test_a_finished_run_stays_finished(finished):
+    """Starting a finished run again changes no file of its results; incomplete files of a crash are removed. While
+    another training is in the run it is refused."""
+    data, run = finished
+    kept = [run / "metrics.jsonl", *sorted((run / "checkpoints").iterdir())]
+    before = [path.read_bytes() for path in kept]
     (run / "checkpoints" / ".last.ckpt.1.partial").write_bytes(b"half")
+    with held(run / ".lock", "run", ""), pytest.raises(ConfigError, match="run must be a folder of its own, got"):
+        train.main(train_mapping(data, run))
     assert train.main(train_mapping(data, run)) == 0
     assert {path.name for path in (run / "checkpoints").iterdir()} == {*LAST_NAMES, "best.ckpt"}
-    after = read_checkpoint(run / "checkpoints" / "last.ckpt")
-    assert after["hgn"]["updates"] == 12
-    assert all(torch.equal(before[name], tensor) for name, tensor in after["state_dict"].items())
+    assert [path.read_bytes() for path in kept] == before
 
 
 def test_the_best_network_is_remembered(data, tmp_path):
@@ -262,28 +260,40 @@ def test_without_validation_scenes_there_is_no_best(make_config, make_dataset, t
         export(tmp_path / "other.ckpt", tmp_path / "out.safetensors")
 
 
-def test_a_resumed_run_has_the_rate_it_is_given(data, tmp_path):
-    """Settings that need not be the same count as they are given: here the learning rate."""
-    run = tmp_path / "run"
-    assert train.main(train_mapping(data, run, maximum_updates=6)) == 0
-    assert train.main(train_mapping(data, run, learning_rate=5e-4)) == 0
-    rates = {record["update"]: record["learning_rate"] for record in metrics(run) if "loss" in record}
-    assert [rates[n] for n in (8, 12)] == pytest.approx([5e-4 * 0.2 ** (n / 12) for n in (8, 12)])
-
-
-def test_a_cut_line_of_metrics_is_dropped(data, tmp_path):
-    """Where a full disk cut the last record, the next start writes the next one on a line of its own."""
-    run = tmp_path / "run"
-    assert train.main(train_mapping(data, run, maximum_updates=4)) == 0
+def test_a_finished_run_can_go_on(finished):
+    """With more updates, and with settings that need not be the same, here the learning rate. Where a full disk cut the
+    last record of the metrics, the next one is written on a line of its own."""
+    data, run = finished
     whole = metrics(run)
     with (run / "metrics.jsonl").open("a") as file:
         file.write('{"update": 8, "ti')
-    assert train.main(train_mapping(data, run)) == 0
-    assert metrics(run)[: len(whole)] == whole and {8, 12} <= {record["update"] for record in metrics(run)}
+    assert train.main(train_mapping(data, run, learning_rate=5e-4, maximum_updates=20)) == 0
+    records = metrics(run)
+    assert records[: len(whole)] == whole
+    rates = {record["update"]: record["learning_rate"] for record in records if "loss" in record}
+    assert [rates[n] for n in (16, 20)] == pytest.approx([5e-4 * 0.2 ** (n / 20) for n in (16, 20)])
+
+
+def test_a_checkpoint_of_the_first_release(finished):
+    """It counted updates in Lightning's loops and had a scheduler and skipped updates of its own; it resumes."""
+    data, run = finished
+    path = run / "checkpoints" / "last.ckpt"
+    checkpoint = read_checkpoint(path)
+    assert checkpoint["hgn"].pop("skipped") == 0
+    checkpoint["callbacks"]["GradientGuard"] = {"skipped": 3}
+    checkpoint["hgn"]["cursor"] = checkpoint["hgn"].pop("sampler_state")
+    checkpoint["lr_schedulers"] = [{"last_epoch": 12, "base_lrs": [1e-3]}]
+    steps = checkpoint["loops"]["fit_loop"]["epoch_loop.manual_optimization.optim_step_progress"]
+    steps["total"] = {"ready": 12, "completed": 12}
+    torch.save(checkpoint, path)
+    assert train.main(train_mapping(data, run, maximum_updates=16)) == 0
+    stored = read_checkpoint(path)["hgn"]
+    assert (stored["updates"], stored["skipped"], stored["sampler_state"]["epoch"]) == (16, 3, 1)
+    assert [record["skipped_updates"] for record in metrics(run) if "loss" in record] == [0, 0, 0, 3]
 
 
 def test_a_gpu_that_is_left_alone_is_no_warning(data, tmp_path, monkeypatch):
-    """Training on a CPU where there is a GPU: training.accelerator=cpu has said so."""
+    """Training on a CPU where there is a GPU: training.device=cpu says so."""
     monkeypatch.setattr("lightning.pytorch.trainer.setup.CUDAAccelerator.is_available", lambda: True)
     assert train.main(train_mapping(data, tmp_path / "run", maximum_updates=1)) == 0
 
@@ -298,10 +308,10 @@ def test_training_learns(make_config, make_dataset, run):
     assert sum(losses[-4:]) < 0.8 * sum(losses[:4])
 
 
-def test_damaged_checkpoints_are_refused(data, run, capsys):
+def test_damaged_checkpoints_are_refused(finished, capsys):
     """Of the last three checkpoints the newest whole one is gone on with: one that was cut, or of which a bit changed,
     is named and stays. Where none is whole the training ends with a message."""
-    train.main(train_mapping(data, run))
+    data, run = finished
     paths = [run / "checkpoints" / name for name in LAST_NAMES]
     assert [read_checkpoint(path)["hgn"]["updates"] for path in paths] == [12, 10, 5]
     contents = [path.read_bytes() for path in paths]
@@ -314,21 +324,15 @@ def test_damaged_checkpoints_are_refused(data, run, capsys):
     torch.load(paths[0], weights_only=True)  # which does not see it
     mapping = train_mapping(data, run)
     config = from_mapping(TrainConfig, {name: value for name, value in mapping.items() if name != "name"})
-    path, state = train._checkpoint_to_resume(config, paths[0].parent)
+    resume = train._checkpoint_to_resume(config, paths[0].parent)
     errors = capsys.readouterr().err
-    assert path == paths[2] and state.position == 10 and errors.count("must be a whole checkpoint file") == 2
+    assert resume is not None and resume.path == paths[2]
+    assert resume.progress.sampler_state.position == 10 and errors.count("must be a whole checkpoint file") == 2
     assert "has another CRC; trying the one before" in errors
     paths[2].write_bytes(b"")
     with pytest.raises(ConfigError, match=r"last\.ckpt: .* has another CRC"):
         train.main(mapping)
     assert paths[0].read_bytes() == flipped
-
-
-def test_two_trainings_in_one_folder(data, run):
-    """A run that another training is in is refused, and can be gone on with when that has ended."""
-    with held(run / ".lock", "run", ""), pytest.raises(ConfigError, match="run must be a folder of its own, got"):
-        train.main(train_mapping(data, run))
-    assert train.main(train_mapping(data, run, maximum_updates=1)) == 0
 
 
 @pytest.mark.parametrize("order", list(permutations((signal.SIGTERM, signal.SIGUSR1))))
@@ -354,7 +358,7 @@ def other(make_config, make_dataset, tmp_path):
     return config
 
 
-def test_more_data(data, other, run, tmp_path):
+def test_more_data(data, other, run):
     """A run on two data sets has the episodes and the statistics of both, and goes on with both; without the second it
     is not gone on with in the middle of an epoch."""
     more = {"more_data": [other.dataset.folder], "minimum_episodes": 8}
@@ -367,10 +371,11 @@ def test_more_data(data, other, run, tmp_path):
     with pytest.raises(ConfigError, match="data set must still hold the 8 training episodes"):
         train.main(train_mapping(data, run))
     assert train.main(train_mapping(data, run, **more)) == 0
-    whole = tmp_path / "whole"
-    assert train.main(train_mapping(data, whole, **more)) == 0
-    found, expected = (read_checkpoint(folder / "checkpoints" / "last.ckpt") for folder in (run, whole))
-    assert sampler_state_of_checkpoint(found) == sampler_state_of_checkpoint(expected)
+    network, training = NetworkConfig(**NETWORK), TrainingConfig(**TRAINING)
+    pooled = PooledStore(stores[1], stores[:1])
+    *_, last = EpisodeDataModule(pooled, training, WindowReader(pooled, network, training)).chunks()
+    progress = Progress.of(read_checkpoint(run / "checkpoints" / "last.ckpt"))
+    assert progress == Progress(12, 0, last.sampler_state)
 
 
 @pytest.mark.parametrize(

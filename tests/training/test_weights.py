@@ -16,8 +16,9 @@ from hgn.network.build import build_network
 from hgn.runtime.torch_backend import Backend
 from hgn.runtime.weights import WeightsInfo, load_weights, save_weights
 from hgn.schema import ConfigError
-from hgn.training.checkpoint import DataInfo, network_of_checkpoint, network_of_weights, read_checkpoint
-from hgn.training.module import TrainingModule
+from hgn.training.checkpoint import network_of_checkpoint, network_of_weights, read_checkpoint
+from hgn.training.schedule import learning_rate
+from hgn.training.torch_updates import TorchUpdates
 
 
 @pytest.fixture
@@ -38,7 +39,13 @@ def weights_file(path, stored_precision="fp16", rate=60.0, cell_size=1 / 64, **n
 
 
 def evaluate(data, weights):
-    mapping = {"weights": str(weights), "data": data.dataset.folder, "rollout_frames": 0, "device": "cpu"}
+    mapping = {
+        "weights": str(weights),
+        "data": data.dataset.folder,
+        "rollout_frames": 0,
+        "device": "cpu",
+        "frame_stride": 4,
+    }
     config = EvaluateConfig(**mapping)
     episodes = first_episodes(EpisodeStore(config.data, config.split), 5)
     rows = one_step_rows(Backend(load_weights(weights)[0]), episodes, config)
@@ -49,11 +56,10 @@ def last(run):
     return read_checkpoint(run / "checkpoints" / "last.ckpt")
 
 
-@pytest.mark.parametrize("stored_precision", ["fp16", "fp32"])
-def test_a_run_begins_with_weights(data, tmp_path, stored_precision, capsys):
-    """A new run has the file's weights and its normaliser, whether rounded or not; one that goes on takes its
+def test_a_run_begins_with_weights(data, tmp_path, capsys):
+    """A new run has the file's weights and its normaliser; one that goes on takes its
     checkpoint's, even where the file is gone, and says so."""
-    file = weights_file(tmp_path / "begin.safetensors", stored_precision)
+    file = weights_file(tmp_path / "begin.safetensors")
     tiny = {"learning_rate": 1e-12, "final_learning_rate": 1e-12, "maximum_updates": 1}
     mapping = train_mapping(data, tmp_path / "run", init_weights=str(file), **tiny)
     assert train.main(mapping) == 0
@@ -105,26 +111,19 @@ def test_other_constraints_are_taken(tmp_path):
 def test_warm_up():
     """The rate grows linearly over the first updates to what it is without warm-up, and is the same from there."""
     values = {"learning_rate": 1e-3, "final_learning_rate": 1e-5, "maximum_updates": 100}
-    warm, cold = (
-        TrainingModule(
-            build_network(NetworkConfig(**NETWORK)),
-            TrainingConfig(**values, warmup_updates=n),
-            DataInfo("", 60.0, 1 / 64),
-        )
-        for n in (10, 0)
-    )
+    warm, cold = (TrainingConfig(**values, warmup_updates=n) for n in (10, 0))
     for update in range(30):
-        share = min(1.0, (update + 1) / 10)
-        assert warm._rate(update) == pytest.approx(share * cold._rate(update), rel=1e-12)
-    assert cold._rate(0) == 1e-3 and warm._rate(100) == pytest.approx(1e-5)
+        factor = min(1.0, (update + 1) / 10)
+        assert learning_rate(warm, update) == pytest.approx(factor * learning_rate(cold, update), rel=1e-12)
+    assert learning_rate(cold, 0) == 1e-3 and learning_rate(warm, 100) == pytest.approx(1e-5)
 
 
-def test_an_export_sets_rest_walls_and_obstacles(data, tmp_path):
+def test_an_export_sets_rest_walls_and_obstacles(data, finished, tmp_path):
     """The tensors stay; networks that have no contacts to rest on are refused, and so is each for what exists."""
     relative = {"network": {**NETWORK, "inputs": "relative"}}
-    for name, changes in (("relative", relative), ("absolute", {})):
-        assert train.main(train_mapping(data, tmp_path / name, maximum_updates=2) | changes) == 0
-    kept, absolute = (str(tmp_path / name / "checkpoints" / "last.ckpt") for name in ("relative", "absolute"))
+    assert train.main(train_mapping(data, tmp_path / "relative", maximum_updates=2) | relative) == 0
+    kept = str(tmp_path / "relative" / "checkpoints" / "last.ckpt")
+    absolute = str(finished[1] / "checkpoints" / "last.ckpt")
     chosen = [
         {},
         {"rest_threshold": 0.1},
@@ -184,15 +183,16 @@ def test_weights_are_changed_without_a_checkpoint(tmp_path):
 def test_the_average_is_what_is_measured_and_exported(data, tmp_path, monkeypatch):
     """The average follows its definition over every update; the export holds it, and monitoring measures it."""
     seen: list[dict[str, torch.Tensor]] = []
-    original = TrainingModule.optimizer_step
+    original = TorchUpdates.step
 
-    def optimizer_step(self, *arguments, **named):
+    def step(updates, update):
+        network = updates.trained.network
         if not seen:
-            seen.append({name: p.detach().clone() for name, p in self.network.named_parameters()})
-        original(self, *arguments, **named)
-        seen.append({name: p.detach().clone() for name, p in self.network.named_parameters()})
+            seen.append({name: p.detach().clone() for name, p in network.named_parameters()})
+        original(updates, update)
+        seen.append({name: p.detach().clone() for name, p in network.named_parameters()})
 
-    monkeypatch.setattr(TrainingModule, "optimizer_step", optimizer_step)
+    monkeypatch.setattr(TorchUpdates, "step", step)
     mapping = train_mapping(data, tmp_path / "run", ema_decay=0.6, learning_rate=1e-2)
     assert train.main(mapping) == 0
     assert len(seen) == TRAINING["maximum_updates"] + 1

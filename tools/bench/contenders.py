@@ -21,8 +21,8 @@ from hgn.network.gns import GraphNetworkSimulator
 from hgn.runtime.backend import build, fastest_stepped
 from hgn.runtime.parity import relative_error
 from hgn.runtime.simulator import Simulator
-from hgn.training.checkpoint import DataInfo
-from hgn.training.module import TrainingModule
+from hgn.training.torch_updates import batch_loss
+from hgn.training.updates import build_optimizer
 from tools.bench.states import SPEED, TILE_PARTICLES, Workload, batch_of, scene_of, state_of
 from tools.report import PASS
 from tools.timing import FrameClock, Timed, once
@@ -35,7 +35,6 @@ FRAME_RATE_HZ = 60.0
 CHECKED_AT_MOST = {"frame": 50_000, "train": TILE_PARTICLES}  # particles of all scenes
 MPM_ROUNDS, MPM_FRAMES = 5, 20  # samples of the solver, and frames of each
 OBSTACLE_CELL_SIZE = 1 / 64
-DATA = DataInfo("", FRAME_RATE_HZ, OBSTACLE_CELL_SIZE)
 
 
 def checked_workload(work: Workload, what: str) -> Workload:
@@ -52,12 +51,6 @@ def bench_network(config: NetworkConfig, device: torch.device) -> ParticleNetwor
     for quantity in ("velocity", "acceleration"):
         network.normaliser.set(quantity, torch.zeros(3), torch.full((3,), SPEED), 0.0)
     return network.to(device).eval()
-
-
-def training_module(config: NetworkConfig, scenes: int, device: torch.device) -> TrainingModule:
-    """Returns the training of the bench's network, with the same parameters in every process."""
-    network = bench_network(config, device).train()
-    return TrainingModule(network, TrainingConfig(batch_scenes=scenes), DATA).to(device)
 
 
 class Contender(Timed):
@@ -102,22 +95,22 @@ class Train(Contender):
 
     def __init__(self, config: NetworkConfig, work: Workload, device: torch.device, precision: str) -> None:
         self.device = device
-        self.module = training_module(config, work.scenes, device)
+        self.network = bench_network(config, device).train()
+        self.training = TrainingConfig(batch_scenes=work.scenes)
         self.batch = batch_of(work, config, device)
-        self.optimizer = self.module.configure_optimizers()["optimizer"]
+        self.optimizer = build_optimizer(self.network, self.training)
 
     def run(self) -> None:
         self.optimizer.zero_grad()
-        self.module.loss(self.batch).backward()
+        batch_loss(self.network, self.batch, self.training).backward()
         self.optimizer.step()
 
     def check(self, precision: str) -> str:
-        plain = replace(self.module.training_config, noise_std=0.0)
-        module = TrainingModule(self.module.network, plain, DATA)
-        module.network.zero_grad()
-        loss = module.loss(self.batch, jitter=False)
+        network = self.network
+        network.zero_grad()
+        loss = batch_loss(network, self.batch, replace(self.training, noise_std=0.0), jitter=False)
         loss.backward()
-        return check_update(loss.detach(), _gradients(module.network), module.network, self.batch, precision)
+        return check_update(loss.detach(), _gradients(network), network, self.batch, precision)
 
 
 class MpmFrame(Timed):
@@ -125,7 +118,7 @@ class MpmFrame(Timed):
 
     def __init__(self, work: Workload, cell_size: float, device: torch.device) -> None:
         self.scenes = [scene_of(work, seed, cell_size) for seed in range(work.scenes)]
-        self.config = MpmConfig(device="gpu" if device.type == "cuda" else "cpu", scenes_per_launch=work.scenes)
+        self.config = MpmConfig(device=device.type, scenes_per_launch=work.scenes)
         self.particles = sum(scene.particle_count for scene in self.scenes) // work.scenes
         self.rounds, self.warm_up = MPM_ROUNDS, 1
         self.substeps = 0.0  # of a frame, mean over particles

@@ -71,8 +71,7 @@ def main(mapping: dict[str, Any]) -> int:
     for i, (meta, _) in enumerate(earlier):
         require_same(meta, f"earlier[{i}]", same)
     known = [row for _, rows in earlier for row in rows]
-    processor = "gpu" if device.type == "cuda" else "cpu"
-    mpm = replace(from_stored(MpmConfig, store.manifest.config["mpm"], "mpm"), device=processor)
+    mpm = replace(from_stored(MpmConfig, store.manifest.config["mpm"], "mpm"), device=device.type)
     own_cell, rate = episodes[0].obstacle_grid.cell_size, episodes[0].frame_rate_hz
     own_grid = round(1 / own_cell)
 

@@ -26,14 +26,16 @@ from torch.nn.parallel import DistributedDataParallel
 from hgn.config import NetworkConfig, Precision, TrainingConfig
 from hgn.data.batch import Batch
 from hgn.data.sampler import balanced_parts
+from hgn.network.base import ParticleNetwork
 from hgn.runtime.backend import set_matmul_precision, triton_unsupported_reason
 from hgn.runtime.parity import relative_error
 from hgn.schema import OneOrMore, Positive, require, require_bounds
 from hgn.system.machine import available_cpus
 from hgn.training.distributed import averaging_options
 from hgn.training.gradients import GradientGuard
-from hgn.training.module import TrainingModule
-from tools.bench.contenders import bench_network, training_module
+from hgn.training.torch_updates import batch_loss
+from hgn.training.updates import build_optimizer
+from tools.bench.contenders import bench_network
 from tools.bench.states import Workload, batch_of_scenes
 from tools.bench.triton_contenders import device_samples, triton_updates
 from tools.report import PASS
@@ -106,11 +108,11 @@ class TorchUpdates:
 
     def __init__(self, config: ScalingConfig, batches: list[Batch], device: torch.device) -> None:
         self.batches, self.device = batches, device
-        module = training_module(config.network, config.scenes, device)
-        self.optimizer: torch.optim.Optimizer = module.configure_optimizers()["optimizer"]
-        self.guard = GradientGuard()
-        self.loss: nn.Module = _Loss(module)
-        self.parameters = list(module.network.parameters())
+        training, network = TrainingConfig(batch_scenes=config.scenes), bench_network(config.network, device).train()
+        self.optimizer: torch.optim.Optimizer = build_optimizer(network, training)
+        self.guard = GradientGuard(torch.zeros(5, device=device))
+        self.loss: nn.Module = _Loss(network, training)
+        self.parameters = list(network.parameters())
 
     def average(self, group: dist.ProcessGroup, one_graph: bool = False) -> list[int]:
         """Averages gradients over the ranks of `group` from now on; returns the bytes of the messages."""
@@ -187,12 +189,12 @@ class TritonUpdates:
 class _Loss(nn.Module):
     """The loss as a forward pass, as DistributedDataParallel requires."""
 
-    def __init__(self, module: TrainingModule) -> None:
+    def __init__(self, network: ParticleNetwork, training: TrainingConfig) -> None:
         super().__init__()
-        self.module = module
+        self.network, self.training_config = network, training
 
     def forward(self, batch: Batch) -> torch.Tensor:
-        return self.module.loss(batch)
+        return batch_loss(self.network, batch, self.training_config)
 
 
 def measure(rank: int, count: int, config: ScalingConfig, device_type: str, folder: Path) -> None:

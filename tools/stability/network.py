@@ -76,7 +76,7 @@ def main(mapping: dict[str, Any]) -> int:
     report = Report("network", _meta(config, simulator), config.json)
     wanted = config.cases or CASES
     cases = cases_of(config, simulator)
-    mpm = replace(config.mpm, device="gpu" if simulator.device.type == "cuda" else "cpu") if config.solver else None
+    mpm = replace(config.mpm, device=simulator.device.type) if config.solver else None
     runner = Runner(simulator, cases, mpm)
     gallery = Gallery(config.picture, simulator, report.meta["weights"])
     if cases:

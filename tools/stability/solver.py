@@ -13,7 +13,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any
 
-from hgn.config import MpmConfig, Processor
+from hgn.config import DeviceName, MpmConfig
 from hgn.schema import from_mapping, one_of, require, require_bounds, to_mapping
 from tools.report import meta_of
 from tools.stability.row import Report, Row, table
@@ -36,7 +36,7 @@ class StabilitySolverConfig:
 
     # steps, stiffness, impact, convergence, contact, leak, long, rest, dam, column, repose, grid; null: all
     cases: tuple[Annotated[str, one_of(*NAMES)], ...] | None = None
-    device: Processor = "auto"  # or cpu, gpu
+    device: DeviceName = "auto"  # cpu or cuda; auto: cuda where there is a GPU
     # resolutions of the case grid: cells in the width of dams, the radius of columns and the side of blocks. A domain
     # is about four times as wide; 32 cells need a GPU
     grid_cells: tuple[int, ...] = (8, 12, 16)
@@ -58,7 +58,7 @@ def main(mapping: dict[str, Any]) -> int:
 
     config = from_mapping(StabilitySolverConfig, mapping)
     mpm = MpmConfig(device=config.device)
-    meta = meta_of(config, "cuda" if initialise(config.device).kind == "gpu" else "cpu") | {"solver": to_mapping(mpm)}
+    meta = meta_of(config, initialise(config.device).kind) | {"solver": to_mapping(mpm)}
     points: list[Point] = []
     report = Report("solver", meta, config.json, steps=points)
     wanted = config.cases or NAMES

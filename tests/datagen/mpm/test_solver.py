@@ -320,7 +320,7 @@ def test_one_runtime_a_process():
     with pytest.raises(ConfigError, match="cpu_threads"):
         initialise("cpu", 1)
     with pytest.raises(ConfigError, match="device"):
-        initialise("gpu")
+        initialise("cuda")
 
 
 def test_one_thread_repeats_itself_in_silence():

@@ -89,15 +89,15 @@ def test_a_hundred_thousand_substeps():
 @pytest.mark.parametrize("most", [1, 50, 4_000, 40_000, 1_000_000])
 def test_blocks_that_wait_for_each_other_all_run_at_once(scenes, most):
     """The blocks of a scene, where there are several, find room on a GPU's processors."""
-    team = _team(Device("gpu", 1, 132), [most] * scenes)
+    team = _team(Device("cuda", 1, 132), [most] * scenes)
     assert team.threads % 32 == 0
-    assert team.blocks * _teams_at_once(Device("gpu", 1, 132), team) <= 132 * 2
-    assert _team(Device("cpu", 2), [most] * scenes) == _team(Device("gpu", 1, 132), [50_000_000]) == Team(0)
+    assert team.blocks * _teams_at_once(Device("cuda", 1, 132), team) <= 132 * 2
+    assert _team(Device("cpu", 2), [most] * scenes) == _team(Device("cuda", 1, 132), [50_000_000]) == Team(0)
 
 
 def test_who_runs_many_scenes():
     """One block a scene where all are done at once, else teams that take scenes one after another."""
-    gpu = Device("gpu", 1, 132)
+    gpu = Device("cuda", 1, 132)
     assert _team(gpu, [4_000] * 256) == Team(256)
     for counts in ([4_000, *[3_000] * 255], [4_000] * 100, [4_000] * 412):
         assert _team(gpu, counts) == Team(256, 3, 4)

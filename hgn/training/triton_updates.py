@@ -1,20 +1,22 @@
-"""Training by captured updates: what Lightning sees stays true, what runs is hgn.kernels.update.
+"""Training updates in Triton kernels (hgn.kernels.update), captured as CUDA graphs.
 
-Parameters and Adam's moments live in the kernels' layout while a chunk of updates runs, and are copied back after it,
-so that checkpoints, monitoring and backend torch find them where they belong.
+Parameters and Adam's moments are in the kernels' layout while a chunk of updates runs, and are copied back after it,
+so that a checkpoint has one content, whatever the backend.
 """
 
 from __future__ import annotations
 
+import math
+import sys
 import time
 from collections import defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 
 import torch
 
 from hgn.config import TrainingConfig
-from hgn.data.episode_tensors import EpisodeTensors, UpdateChunk
+from hgn.data.episode_tensors import EpisodeChunk, EpisodeTensors
 from hgn.kernels.barrier_table import BarrierHash
 from hgn.kernels.grid.op import ObstacleHash
 from hgn.kernels.triton_compat import JitMisses
@@ -23,68 +25,60 @@ from hgn.network.base import ParticleNetwork
 from hgn.network.hgn import HierarchicalGraphNetwork
 from hgn.runtime.triton_host import kernel_precision
 from hgn.scene.symmetry import drawn_symmetry
-from hgn.training.graph_pushforward import GraphPushforwardPool
+from hgn.training.distributed import sum_over_ranks
 from hgn.training.parity import require_parity
+from hgn.training.pushforward import PushforwardPool
+from hgn.training.schedule import average_weight, learning_rate
+from hgn.training.triton_pushforward import TritonScenes
+from hgn.training.updates import Ranks, TrainedNetwork
 
 REPORTED_UPDATES = 256  # the first ones, which take longest
 DATA_FRACTION = 0.6  # of a GPU's memory at most, for episodes; the others stay in the host's
 
 
-class GraphTrainer:
-    """Makes the updates of chunks on a network and its optimiser, a torch.optim.Adam."""
+class TritonUpdates:
+    """Makes the updates of chunks with CUDA graphs; hgn.training.updates.Updates describes the methods."""
 
     def __init__(
-        self,
-        network: ParticleNetwork,
-        optimizer: torch.optim.Optimizer,
-        training: TrainingConfig,
-        obstacle_cell_size: float,
-        loss_sum: torch.Tensor,
-        counters: torch.Tensor,
-        reduce: Callable[[torch.Tensor], None] | None = None,
-        ranks: int = 1,
-        averaged: ParticleNetwork | None = None,
-        rank: int = 0,
+        self, trained: TrainedNetwork, training: TrainingConfig, obstacle_cell_size: float, ranks: Ranks
     ) -> None:
-        """`averaged` holds the moving average of the weights.
-
-        loss_sum [2] and counters [5] are added to, as hgn.kernels.update.kernel.finish_update says."""
-        assert isinstance(network, HierarchicalGraphNetwork)
         self._begun, self._made, self._jit_misses = time.monotonic(), 0, JitMisses()
         self._seconds: dict[str, float] = defaultdict(float)
-        self.network, self.optimizer = network, optimizer
-        self.device = next(network.parameters()).device
-        self.symmetric = training.symmetry != "none"
-        settings = UpdateSettings.of(training, obstacle_cell_size)
-        precision = kernel_precision(training.precision, self.device)
+        self.training, self._ranks = training, ranks
+        self.network, self.optimizer = trained.network, trained.optimizer
+        self.device = next(self.network.parameters()).device
+        assert isinstance(self.network, HierarchicalGraphNetwork)
         self._take_over()
-        self.updates = Updates(network, settings, precision, loss_sum, counters, reduce, ranks)
+        self.updates = Updates(
+            self.network,
+            UpdateSettings.of(training, obstacle_cell_size),
+            kernel_precision(training.precision, self.device),
+            trained.loss_sum,
+            counters=trained.counters,
+            reduce=sum_over_ranks if ranks.count > 1 else None,
+            ranks=ranks.count,
+        )
         self._read_moments()
         self._averaged = None
-        if averaged is not None:
-            self._averaged = _flattened(averaged)
+        if trained.averaged is not None:
+            self._averaged = _flattened(trained.averaged)
             self.updates.average = self._packed(self._averaged)
         self._episodes: dict[int, DeviceEpisode] = {}
-        self.pool: GraphPushforwardPool | None = None
+        self._pool: PushforwardPool[DeviceEpisode, DeviceSample] | None = None
         if training.pushforward_fraction > 0:
-            simulated = averaged or network
+            simulated = trained.result
             assert isinstance(simulated, HierarchicalGraphNetwork)
-            self.pool = GraphPushforwardPool(simulated, training, obstacle_cell_size, rank)
+            self._scenes = TritonScenes(simulated, training, obstacle_cell_size)
+            self._pool = PushforwardPool(self._scenes, training, ranks.rank)
         self.parity: tuple[float, float] | None = None  # with PyTorch, see hgn.training.parity
 
-    def run(
-        self,
-        chunk: UpdateChunk,
-        rates: list[float],
-        average_weights: list[float] | None = None,
-        first_update: int = 0,
-    ) -> None:
-        """Makes an update for each entry of the chunk, at these learning rates.
+    @property
+    def pool_figures(self) -> dict[str, float]:
+        return {} if self._pool is None else self._pool.figures
 
-        `average_weights` are those of the new values in their moving average, where there is one. `first_update` is the
-        number of the first update.
-
-        Raises: ConfigError when positions are not finite, or before the first update when the kernels are wrong here.
+    def run(self, chunk: EpisodeChunk, first_update: int) -> None:
+        """Raises: ConfigError when positions are not finite, or before the first update when the kernels are wrong
+        here.
         """
         for index in chunk.dropped:
             del self._episodes[index]
@@ -94,29 +88,37 @@ class GraphTrainer:
         if self.parity is None:
             with self._timed("checking the kernels"):
                 self._check(chunk)
-        if self.pool is not None and chunk.starts:
+        if self._pool is not None and chunk.starts:
             average = self.updates.average
-            values = self.updates.values if average is None else average
+            self._scenes.values = self.updates.values if average is None else average
             with self._timed("pushforward"):
-                self.pool.refresh([(self._episodes[i], frame) for i, frame in chunk.starts], values)
-        samples = [
-            [DeviceSample(self._episodes[s.episode], s.frame, s.seed, s.weight, s.noise_scale) for s in u]
-            for u in chunk.samples
-        ]
-        if self.pool is not None:
-            samples = [self.pool.replaced(update, first_update + i) for i, update in enumerate(samples)]
-        self.updates.run(samples, rates, average_weights)
+                self._pool.refresh([(self._episodes[i], frame) for i, frame in chunk.starts])
+        samples = [[DeviceSample(self._episodes[s.episode], *s[1:]) for s in update] for update in chunk.samples]
+        if self._pool is not None:
+            samples = [self._pool.replaced(update, first_update + i) for i, update in enumerate(samples)]
+        numbers = range(first_update, first_update + len(samples))
+        rates = [learning_rate(self.training, update) for update in numbers]
+        average_weights = [average_weight(self.training, update) for update in numbers]
+        self.updates.run(samples, rates, None if self._averaged is None else average_weights)
+        self.optimizer.param_groups[0]["lr"] = rates[-1]
         self._write_back()
-        self._made += len(chunk.samples)
+        self._made += len(samples)
+        self._report()
 
-    def _check(self, chunk: UpdateChunk) -> None:
+    def _check(self, chunk: EpisodeChunk) -> None:
         first = chunk.samples[0]
         self.updates.predict([(self._episodes[s.episode], s.frame, s.seed) for s in first])
         episodes = [chunk.episodes[s.episode] for s in first]
         shown = None
-        if self.symmetric:
+        if self.training.symmetry != "none":
             shown = [drawn_symmetry(e.symmetries, s.seed) for e, s in zip(episodes, first, strict=True)]
-        self.parity = require_parity(self.updates, episodes, shown)
+        outputs, gradients = self.parity = require_parity(self.updates, episodes, shown)
+        text = f"outputs within {outputs:.0e}, gradients within {gradients:.0e} of PyTorch's"
+        self._say(text if math.isfinite(outputs) else "batch too large to check")
+
+    def _say(self, text: str) -> None:
+        if self._ranks.rank == 0:
+            print(f"backend triton: {text}", file=sys.stderr)
 
     @contextmanager
     def _timed(self, what: str) -> Iterator[None]:
@@ -124,16 +126,16 @@ class GraphTrainer:
         yield
         self._seconds[what] += time.monotonic() - begun
 
-    def report(self) -> str | None:
-        """Where the time of the first updates went: once, when REPORTED_UPDATES are made."""
+    def _report(self) -> None:
+        """Prints where the time of the first updates went, once, when REPORTED_UPDATES are made."""
         if not self._begun or self._made < REPORTED_UPDATES:
-            return None
+            return
         total, updates, misses = time.monotonic() - self._begun, self.updates, self._jit_misses
         self._begun = 0.0
         parts = [f"{seconds:.1f} s {what}" for what, seconds in self._seconds.items()]
         parts.append(f"{updates.capture_seconds:.1f} s capturing {updates.captures} times")
-        return (
-            f"backend triton: the first {self._made} updates took {total:.1f} s, {', '.join(parts)}; "
+        self._say(
+            f"the first {self._made} updates took {total:.1f} s, {', '.join(parts)}; "
             f"in that {misses.seconds:.1f} s for {misses.count} kernels that were not compiled ahead"
         )
 
@@ -152,9 +154,9 @@ class GraphTrainer:
             episode.material_N.to(self.device),
             obstacles,
             episode.domain_size,
-            episode.gravity,
-            episode.symmetries,
-            barrier and barrier.to(self.device),
+            gravity=episode.gravity,
+            symmetries=episode.symmetries,
+            barrier=barrier and barrier.to(self.device),
         )
 
     def _take_over(self) -> None:

@@ -1,0 +1,141 @@
+"""Reads the samples of a chunk from the data set: windows for backend torch, whole episodes for triton."""
+
+from __future__ import annotations
+
+import sys
+from collections import OrderedDict
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from itertools import islice
+from typing import NamedTuple, Protocol
+
+from hgn.config import NetworkConfig, TrainingConfig
+from hgn.data.batch import BatchSample, WindowChunk, join
+from hgn.data.episode_tensors import EpisodeChunk, EpisodeTensors, whole_episode
+from hgn.data.importance import FrameImportance
+from hgn.data.pooled import AnyStore
+from hgn.data.sampler import BLOCK_EPISODES, Sample, SamplerState
+from hgn.scene.episode import Episode
+from hgn.scene.history import window
+from hgn.training.noise import noise_scale
+from hgn.training.pushforward import Starts, simulated_barrier
+
+READERS = 8  # threads that copy whole episodes
+
+
+class DrawnChunk(NamedTuple):
+    """A chunk in the deterministic order, before anything is read."""
+
+    samples: list[list[Sample]]  # of each update
+    sampler_state: SamplerState  # the order's state once these are trained on
+    starts: Starts
+
+
+class ChunkReader(Protocol):
+    updates_at_once: int  # in a chunk, at most
+
+    def read(self, drawn: DrawnChunk) -> WindowChunk | EpisodeChunk:
+        """Reads a chunk; called for one chunk after the other, in their order."""
+
+
+class FrameDraws:
+    """Draws a sample's frame by importance, and its noise scale and loss weight by the frame's acceleration."""
+
+    def __init__(self, store: AnyStore, training: TrainingConfig) -> None:
+        self._store, self._training = store, training
+        self._importance: dict[int, FrameImportance] = {}
+        low_noise = training.noise_min_scale < 1 or training.quiet_acceleration > 0
+        self.measures_frames = training.frame_importance > 0 or low_noise
+
+    def measured(self, episode: Episode) -> FrameImportance | None:
+        """Returns an episode's accelerations, None where nothing depends on them."""
+        return FrameImportance.of(episode, self._training.frame_importance) if self.measures_frames else None
+
+    def add(self, index: int, importance: FrameImportance | None) -> None:
+        """Keeps what `measured` returned of the episode with this index."""
+        if importance is not None:
+            self._importance[index] = importance
+
+    def drawn(self, samples: Sequence[Sample]) -> tuple[Sample, ...]:
+        """Returns the samples as they are trained on."""
+        fraction = self._training.frame_importance
+        if not self.measures_frames:
+            return tuple(samples)
+        drawn = []
+        for sample in samples:
+            if sample.episode not in self._importance:
+                self.add(sample.episode, self.measured(self._store[sample.episode]))
+            importance = self._importance[sample.episode]
+            frame, weight = importance.draw(sample.frame, sample.seed) if fraction > 0 else (sample.frame, 1.0)
+            scale, scale_weight = noise_scale(self._training, importance.accelerations[frame], sample.seed)
+            drawn.append(sample._replace(frame=frame, weight=weight * scale_weight, noise_scale=scale))
+        return tuple(drawn)
+
+
+class WindowReader:
+    """Reads the position windows of one update's samples."""
+
+    updates_at_once = 1
+
+    def __init__(self, store: AnyStore, network: NetworkConfig, training: TrainingConfig) -> None:
+        self._store, self._network = store, network
+        self._simulates = training.pushforward_fraction > 0
+        self._draws = FrameDraws(store, training)
+
+    def read(self, drawn: DrawnChunk) -> WindowChunk:
+        (update,) = drawn.samples
+        samples = tuple(self._sample(sample) for sample in self._draws.drawn(update))
+        starts = tuple((self._store[index], frame) for index, frame in drawn.starts)
+        batch = None if self._simulates else join(samples, self._network)
+        return WindowChunk((samples,), drawn.sampler_state, starts, batch)
+
+    def _sample(self, sample: Sample) -> BatchSample:
+        episode = self._store[sample.episode]
+        window_WN3 = window(episode, sample.frame, self._network.velocity_history)
+        return BatchSample(
+            episode, sample.frame, window_WN3, seed=sample.seed, weight=sample.weight, noise_scale=sample.noise_scale
+        )
+
+
+class EpisodeReader:
+    """Reads the episodes that the device does not hold yet, and names those that it may free."""
+
+    updates_at_once = 64
+
+    def __init__(self, store: AnyStore, network: NetworkConfig, training: TrainingConfig) -> None:
+        self._store, self._network = store, network
+        self._draws = FrameDraws(store, training)
+        self._clearance = network.obstacle_clearance if training.pushforward_fraction > 0 else None
+        shuffled = training.shuffle_episodes
+        # two windows of the order, where it has windows
+        self.capacity = 2 * max(shuffled, BLOCK_EPISODES) if shuffled else sys.maxsize
+        self._on_device: OrderedDict[int, None] = OrderedDict()  # the longest unused first
+
+    def read(self, drawn: DrawnChunk) -> EpisodeChunk:
+        needed = {sample.episode for update in drawn.samples for sample in update}
+        needed |= {index for index, _ in drawn.starts}
+        new = sorted(needed - self._on_device.keys())
+        for episode in sorted(needed):
+            self._on_device[episode] = None
+            self._on_device.move_to_end(episode)
+        excess = max(0, len(self._on_device) - max(self.capacity, len(needed)))
+        dropped = tuple(islice(self._on_device, excess))
+        for episode in dropped:
+            del self._on_device[episode]
+        episodes = self._whole(new)
+        samples = tuple(self._draws.drawn(update) for update in drawn.samples)
+        return EpisodeChunk(samples, episodes, drawn.sampler_state, dropped=dropped, starts=drawn.starts)
+
+    def _whole(self, indices: Sequence[int]) -> dict[int, EpisodeTensors]:
+        """Reads several episodes together: a data set's first pass is gigabytes, and copies release Python's lock."""
+
+        def read(episode: Episode) -> tuple[EpisodeTensors, FrameImportance | None]:
+            barrier = None if self._clearance is None else simulated_barrier(episode, self._clearance)
+            return whole_episode(episode, self._network, barrier), self._draws.measured(episode)
+
+        opened = [self._store[index] for index in indices]
+        with ThreadPoolExecutor(READERS) as readers:
+            results = dict(zip(indices, readers.map(read, opened), strict=True))
+        for index, (_, importance) in results.items():
+            self._draws.add(index, importance)
+        return {index: whole for index, (whole, _) in results.items()}

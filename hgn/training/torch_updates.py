@@ -1,0 +1,90 @@
+"""Training updates in PyTorch, the reference: one batch, its loss, one step of the optimiser."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+
+from hgn.config import TrainingConfig
+from hgn.cpu.allocator import keep_freed_memory
+from hgn.data.batch import Batch, BatchSample, WindowChunk, join
+from hgn.network.base import ParticleNetwork
+from hgn.scene.episode import Episode
+from hgn.training.gradients import GradientGuard
+from hgn.training.noise import jittered_origin, perturbed_window
+from hgn.training.pushforward import PushforwardPool
+from hgn.training.schedule import average_weight, learning_rate
+from hgn.training.symmetry import drawn_symmetries, under_symmetries
+from hgn.training.torch_pushforward import TorchScenes
+from hgn.training.updates import TrainedNetwork
+
+
+class TorchUpdates:
+    """Makes the updates of chunks with PyTorch; hgn.training.updates.Updates describes the methods."""
+
+    def __init__(
+        self,
+        trained: TrainedNetwork,
+        training: TrainingConfig,
+        rank: int = 0,
+        backward: Callable[[torch.Tensor], None] = torch.Tensor.backward,
+    ) -> None:
+        """`backward` computes the gradients of a loss, averaged over the ranks."""
+        self.trained, self.training, self._backward = trained, training, backward
+        self._device = next(trained.network.parameters()).device
+        if self._device.type == "cpu":
+            keep_freed_memory()
+        self._guard = GradientGuard(trained.counters)
+        self._pool: PushforwardPool[Episode, BatchSample] | None = None
+        if training.pushforward_fraction > 0:
+            self._pool = PushforwardPool(TorchScenes(trained.result), training, rank)
+
+    @property
+    def pool_figures(self) -> dict[str, float]:
+        return {} if self._pool is None else self._pool.figures
+
+    def run(self, chunk: WindowChunk, first_update: int) -> None:
+        if self._pool is not None and chunk.starts:
+            self._pool.refresh(chunk.starts)
+        for update, samples in enumerate(chunk.samples, first_update):
+            batch = chunk.batch
+            if self._pool is not None or batch is None:
+                own = samples if self._pool is None else self._pool.replaced(samples, update)
+                batch = join(own, self.trained.network.config)
+            self._update(batch.to(self._device), update)
+
+    def _update(self, batch: Batch, update: int) -> None:
+        loss = batch_loss(self.trained.network, batch, self.training)
+        value = loss.detach()
+        self.trained.loss_sum.add_(torch.where(value.isfinite(), torch.stack([value, torch.ones_like(value)]), 0))
+        self.trained.optimizer.zero_grad()
+        self._backward(loss)
+        self.step(update)
+
+    def step(self, update: int) -> None:
+        """Moves the parameters along their gradients, unless one is not finite, and their average after them."""
+        network, averaged, optimizer = self.trained.network, self.trained.averaged, self.trained.optimizer
+        optimizer.param_groups[0]["lr"] = learning_rate(self.training, update)
+        self._guard.check(network.parameters(), optimizer)
+        optimizer.step()
+        if averaged is not None:
+            means = [parameter.detach() for parameter in averaged.parameters()]
+            values = [parameter.detach() for parameter in network.parameters()]
+            torch._foreach_lerp_(means, values, average_weight(self.training, update))
+
+
+def batch_loss(network: ParticleNetwork, batch: Batch, training: TrainingConfig, jitter: bool = True) -> torch.Tensor:
+    """Returns the mean squared error of the normalised acceleration: over axes, over particles, over scenes.
+
+    Noise, jitter and symmetry are drawn here for backend torch; hgn.kernels.update does so for triton.
+    """
+    if training.symmetry != "none":
+        batch = under_symmetries(batch, drawn_symmetries(batch))
+    cell_size, axes = network.config.cell_size, network.config.dimensions
+    correlated = training.noise_correlated_fraction
+    window_WN3 = perturbed_window(batch, training.noise_std, correlated, cell_size=cell_size, dimensions=axes)
+    origin_S3 = jittered_origin(batch, cell_size, axes) if jitter else None
+    target_N3 = network.target(batch.acceleration(window_WN3), batch.gravity_S3[batch.scene_N])
+    predicted_N3 = network.normalised_acceleration(batch.state(window_WN3), origin_S3)
+    return batch.mean_over_scenes((predicted_N3 - target_N3).square().mean(-1))

@@ -1,0 +1,182 @@
+"""Pushforward on backend triton: scenes simulated, cut into windows and read on the device.
+
+A window is an episode of W frames with its scene's material and obstacles, so that the kernels of an update read it
+like any other episode. Buffers and the captured graph are kept from one simulation to the next.
+Shape legend: as in hgn.training.pushforward.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import torch
+
+from hgn.config import TrainingConfig
+from hgn.kernels.barrier_table import BarrierTable
+from hgn.kernels.grid.op import ObstacleTable
+from hgn.kernels.rollout.kernel import DIVERGED
+from hgn.kernels.update.op import DeviceEpisode, DeviceSample
+from hgn.network.cell_keys import COORDINATE_BITS
+from hgn.network.features import ParticleState
+from hgn.network.hgn import HierarchicalGraphNetwork
+from hgn.network.obstacles import ObstacleCells
+from hgn.runtime.triton_rollout import CHECKED_PARTICLES, TritonRollout
+from hgn.training.pushforward import diverged_scenes
+
+SPARE = 1.1  # capacity for particles, as a multiple of those of the first simulation
+
+
+class TritonScenes:
+    """Implements hgn.training.pushforward.SimulatedScenes."""
+
+    def __init__(self, network: HierarchicalGraphNetwork, training: TrainingConfig, obstacle_cell_size: float) -> None:
+        """`network` simulates with the parameters in `values`; it also checks the kernels, the first time."""
+        self._network, self._training = network, training
+        self._obstacle_cell_size = obstacle_cell_size
+        self._history = network.config.velocity_history
+        self._rollout: TritonRollout | None = None
+        self.values = torch.empty(0)  # parameters in the packed layout, set before each simulation
+
+    @property
+    def cell_size(self) -> float:
+        return self._network.config.cell_size
+
+    def frame_count(self, episode: DeviceEpisode) -> int:
+        return episode.frames - self._history
+
+    def domain_size(self, episode: DeviceEpisode) -> torch.Tensor:
+        return torch.tensor(episode.domain_size, device=self.values.device)
+
+    def groups(self, starts: Sequence[tuple[DeviceEpisode, int]]) -> list[Sequence[tuple[DeviceEpisode, int]]]:
+        return [starts]
+
+    def true_frames(self, episode: DeviceEpisode, frame: int, known: int) -> torch.Tensor:
+        return episode.position_TN3[frame : frame + self._history + known + 2].to(self.values.device)
+
+    def sample(self, episode: DeviceEpisode, frame: int, window_WN3: torch.Tensor) -> DeviceSample:
+        return DeviceSample(replace(episode, position_TN3=window_WN3), 0, 0)
+
+    def drawn(self, sample: DeviceSample, seed: int, weight: float, scale: float) -> DeviceSample:
+        return sample._replace(seed=seed, weight=weight, noise_scale=scale)
+
+    def simulate(self, starts: Sequence[tuple[DeviceEpisode, int]], frames: int) -> list[torch.Tensor]:
+        """Raises: ConfigError the first time, when the kernels are wrong on this machine."""
+        episodes, state = [episode for episode, _ in starts], self._state(starts)
+        rollout = self._begun(episodes, state)
+        pieces, done = [], 0
+        while done < frames:
+            path_TN3, status = rollout.look(frames - done)
+            pieces.append(path_TN3.clone())
+            done += len(path_TN3)
+            if status & DIVERGED.value:
+                self._set_back(rollout, state)
+            else:
+                rollout.make_room(status)
+        return list(torch.cat(pieces).split([episode.particles for episode in episodes], dim=1))
+
+    def _state(self, starts: Sequence[tuple[DeviceEpisode, int]]) -> ParticleState:
+        """Returns the true state that the simulation starts from; obstacles have tables of their own.
+
+        Scenes up to `pushforward_scenes` are empty, so that simulations of fewer scenes fit the same buffers.
+        """
+        device, episodes = self.values.device, [episode for episode, _ in starts]
+        last = self._history + 1
+        pasts = [episode.position_TN3[frame : frame + last].to(device) for episode, frame in starts]
+        past_TN3 = torch.cat(pasts, dim=1)
+        counts = torch.tensor([episode.particles for episode in episodes], device=device)
+        empty = max(0, self._training.pushforward_scenes - len(episodes))
+        placed = [*episodes, *[episodes[0]] * empty]  # empty scenes have the domain of any
+        return ParticleState(
+            position_N3=past_TN3[-1],
+            velocity_NM3=past_TN3.diff(dim=0).flip(0).transpose(0, 1),
+            material_N=torch.cat([episode.material_N for episode in episodes]),
+            scene_N=torch.arange(len(episodes), device=device).repeat_interleave(counts),
+            domain_S3=torch.tensor([episode.domain_size for episode in placed], device=device),
+            gravity_S3=torch.tensor([episode.gravity for episode in placed], device=device),
+            obstacles=None,
+        )
+
+    def _begun(self, episodes: Sequence[DeviceEpisode], state: ParticleState) -> TritonRollout:
+        """Returns a simulation at its start: the previous one if its buffers are large enough."""
+        config, values = self._network.config, self.values
+        device = values.device
+        table, empty = None, state.scene_count - len(episodes)
+        if config.obstacle_features:
+            table = ObstacleTable(
+                [*(episode.obstacles for episode in episodes), *[None] * empty], self._obstacle_cell_size, device
+            )
+        barriers = None
+        if config.obstacle_clearance is not None:
+            barriers = BarrierTable([*(episode.barrier for episode in episodes), *[None] * empty], device)
+        rollout = self._rollout
+        if rollout is not None and len(state.position_N3) <= rollout.particles:
+            if table is not None:
+                assert rollout.obstacles is not None
+                rollout.obstacles.take(table)
+            if barriers is not None:
+                assert rollout.barriers is not None
+                rollout.barriers.take(barriers)
+            rollout.use_values(values)
+            rollout.begin(state)
+            return rollout
+        capacities = None
+        if rollout is not None:
+            capacities = rollout.grid.capacities
+            self._rollout = rollout = None  # before the new one is allocated
+        particles = 16 * math.ceil(SPARE * len(state.position_N3) / 16)
+        rollout = TritonRollout(
+            self._network,
+            state,
+            self._training.precision,
+            capacities,
+            room=particles,
+            obstacles=table,
+            barriers=barriers,
+        )
+        if capacities is None:
+            first = self._first_scenes(episodes, state)
+            if first is not None:
+                rollout.require_parity(self._network, first, "training.backend")
+                if device.type == "cuda":
+                    torch.cuda.empty_cache()  # what is free decides where episodes are kept
+        rollout.use_values(values)
+        self._rollout = rollout
+        return rollout
+
+    def _first_scenes(self, episodes: Sequence[DeviceEpisode], state: ParticleState) -> ParticleState | None:
+        """Returns as many of the first scenes as PyTorch can check, with obstacles; None if the first is too large."""
+        scenes, count = 0, 0
+        while scenes < len(episodes) and count + episodes[scenes].particles <= CHECKED_PARTICLES:
+            count += episodes[scenes].particles
+            scenes += 1
+        if count == 0:
+            return None
+        seen = [(scene, e.obstacles) for scene, e in enumerate(episodes[:scenes]) if e.obstacles is not None]
+        obstacles = None
+        if seen:
+            # a hash has the keys of scene 0
+            key_K = torch.cat([cells.key_K + (scene << 3 * COORDINATE_BITS) for scene, cells in seen])
+            order_K = torch.argsort(key_K)
+            normal_K3 = torch.cat([cells.normal_K3 for _, cells in seen])[order_K]
+            obstacles = ObstacleCells(key_K[order_K], normal_K3, self._obstacle_cell_size)
+        return replace(
+            state,
+            position_N3=state.position_N3[:count],
+            velocity_NM3=state.velocity_NM3[:count],
+            material_N=state.material_N[:count].long(),
+            scene_N=state.scene_N[:count],
+            domain_S3=state.domain_S3[:scenes],
+            gravity_S3=state.gravity_S3[:scenes],
+            obstacles=obstacles,
+        )
+
+    def _set_back(self, rollout: TritonRollout, state: ParticleState) -> None:
+        """Resets scenes that diverged to their start, at rest, so that the others continue."""
+        count = rollout.live
+        again_N1 = diverged_scenes(rollout.position_N3[:count], rollout.scene_N[:count], rollout.domain_S3)[:, None]
+        rollout.position_N3[:count] = torch.where(again_N1, state.position_N3, rollout.position_N3[:count])
+        rollout.velocity_NV[:count] = torch.where(again_N1, 0.0, rollout.velocity_NV[:count])
+        rollout.lost.zero_()
+        rollout.grid.status.zero_()

@@ -1,0 +1,65 @@
+"""The interface of training updates, which both backends implement, and what they update.
+
+| backend | class | updates of a chunk |
+|---|---|---|
+| torch | hgn.training.torch_updates.TorchUpdates | 1 |
+| triton | hgn.training.triton_updates.TritonUpdates | up to 64, in CUDA graphs |
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import torch
+
+from hgn.config import TrainingConfig
+from hgn.network.base import ParticleNetwork
+from hgn.training.muon import Muon
+
+
+@dataclass(frozen=True, eq=False)
+class TrainedNetwork:
+    """A network, and what its updates change beside its parameters."""
+
+    network: ParticleNetwork
+    optimizer: torch.optim.Adam
+    loss_sum: torch.Tensor  # [2]: sum of the finite losses since the last log line, and their number
+    counters: torch.Tensor  # [5]: see hgn.training.gradients
+    averaged: ParticleNetwork | None = None  # holds the moving average of the parameters
+
+    @property
+    def result(self) -> ParticleNetwork:
+        """The network that is measured, simulated and exported: the moving average where there is one."""
+        return self.network if self.averaged is None else self.averaged
+
+
+@dataclass(frozen=True)
+class Ranks:
+    """This process among those that train together."""
+
+    rank: int = 0
+    count: int = 1
+
+
+class Updates(Protocol):
+    """Makes the updates of chunks of samples."""
+
+    @property
+    def pool_figures(self) -> dict[str, float]:
+        """Metrics of the pushforward pool, empty without one."""
+
+    def run(self, chunk: Any, first_update: int) -> None:
+        """Makes an update for each entry of `chunk.samples`; `first_update` is the number of the first, from 0.
+
+        Losses and gradient norms are added to the TrainedNetwork's tensors: nothing waits for the device.
+        Raises: ConfigError when the backend computes wrongly on this machine.
+        """
+
+
+def build_optimizer(network: ParticleNetwork, training: TrainingConfig) -> torch.optim.Adam:
+    """Returns the optimiser of a training."""
+    if training.optimizer == "muon":
+        return Muon(network, training.learning_rate)
+    # One launch instead of several for each group of tensors; only the fused kind can skip a step by itself.
+    return torch.optim.Adam(network.parameters(), lr=training.learning_rate, fused=True)
