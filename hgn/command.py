@@ -94,7 +94,7 @@ def _exit_code(main: Callable[[dict[str, Any]], int | None], config_name: str) -
 
 
 def _unread() -> bool:
-    """Whether standard output or error is a pipe without a reader."""
+    """Returns whether standard output or error is a pipe without a reader."""
     poll = select.poll()
     for stream in (sys.stdout, sys.stderr):
         poll.register(stream.fileno(), 0)

@@ -65,7 +65,7 @@ def config_directory() -> Path:
 
 
 def is_mesh_file(name: str | Path) -> bool:
-    """Whether a name is that of a mesh file, and not of a built-in shape."""
+    """Returns whether a name is that of a mesh file, and not of a built-in shape."""
     return Path(name).suffix.lower() in MESH_SUFFIXES
 
 
@@ -213,7 +213,7 @@ class MpmConfig:
 
 
 def _spread(number: int, fraction: float) -> bool:
-    """Whether item `number`, from 1, belongs to an evenly spread fraction of all."""
+    """Returns whether item `number`, from 1, belongs to an evenly spread fraction of all."""
     return math.floor(number * fraction + 1e-9) > math.floor((number - 1) * fraction + 1e-9)
 
 
@@ -313,12 +313,12 @@ class NetworkConfig:
 
     @property
     def relative(self) -> bool:
-        """Whether inputs are relative: nothing depends on a motion that all particles have in common."""
+        """Returns whether inputs are relative: nothing depends on a motion that all particles have in common."""
         return self.inputs == "relative"
 
     @property
     def rests(self) -> bool:
-        """Whether slow deformations of what touches stop."""
+        """Returns whether slow deformations of what touches stop."""
         return self.rest_threshold > 0
 
     @property

@@ -32,7 +32,7 @@ class Removed:
     has_effect: Callable[[Mapping[str, Any]], bool] = lambda section: True
 
     def allows(self, value: Any, section: Mapping[str, Any]) -> bool:
-        """Whether a stored section with this value computes what is computed now."""
+        """Returns whether a stored section with this value computes what is computed now."""
         return self.value is ANY or value == self.value or not self.has_effect(section)
 
 
@@ -45,7 +45,7 @@ def _rests(network: Mapping[str, Any]) -> bool:
 
 
 def _rests_otherwise(network: Mapping[str, Any]) -> bool:
-    """Whether other materials than those with friction rest between larger cells."""
+    """Returns whether other materials than those with friction rest between larger cells."""
     materials = set(network.get("materials", ()))
     large = network.get("rest_large_materials")
     return _rests(network) and (materials if large is None else set(large)) != materials - {"water"}

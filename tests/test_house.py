@@ -46,6 +46,9 @@ MANY_POSITIONAL_ARGUMENTS: dict[str, int] = {
     "hgn/training/parity.py": 3,
 }
 
+HEADLESS = re.compile(r"(What|Of|Whether|That|Those|These|How|Which|Whose|Where)\b")
+HEADLESS_DOCSTRINGS = {"hgn": 156, "datagen": 59, "tools": 59}
+
 UNCOMMENTED: set[str] = {
     "MpmConfig.density_kg_m3",
     "MpmConfig.fixed_time_step_s",
@@ -202,6 +205,17 @@ def test_named_arguments():
         calls = (node for node in ast.walk(tree(name)) if isinstance(node, ast.Call))
         counts[name] = sum(len(call.args) > POSITIONAL_ARGUMENTS for call in calls)
     assert over(counts, 0, MANY_POSITIONAL_ARGUMENTS) == {}
+
+
+def test_docstrings_start_with_a_verb():
+    """Docstrings of functions and classes say what is returned, done or contained, as in "Returns the time step"."""
+    counts = dict.fromkeys(PACKAGES, 0)
+    for package in PACKAGES:
+        for name in in_packages(f"{package}/"):
+            nodes = (node for node in ast.walk(tree(name)) if isinstance(node, (ast.FunctionDef, ast.ClassDef)))
+            texts = (ast.get_docstring(node, clean=False) or "" for node in nodes)
+            counts[package] += sum(HEADLESS.match(text) is not None for text in texts)
+    assert over(counts, 0, HEADLESS_DOCSTRINGS) == {}
 
 
 def test_large_files():

@@ -193,7 +193,7 @@ class Index(Sequence[ShardEntry]):
         return totals.digest if totals.episodes == episodes else None
 
     def continues(self, earlier: Index, split: str) -> bool:
-        """Whether the shards of a split begin with those of `earlier`."""
+        """Returns whether the shards of a split begin with those of `earlier`."""
         before = earlier.totals[split]
         return self.digest(split, before.episodes) == before.digest
 

@@ -166,5 +166,5 @@ class Manifest(_Identity):
 
     @property
     def complete(self) -> bool:
-        """Whether every requested episode is published."""
+        """Returns whether every requested episode is published."""
         return all(self.published(split) >= count for split, count in self.requested.items())

@@ -45,11 +45,11 @@ class PooledStore(Episodes):
         return self.own.refresh()
 
     def within_reach(self, indices: Sequence[int], patience_s: float) -> bool:
-        """As EpisodeStore.within_reach."""
+        """Fetches the shards of these episodes; see EpisodeStore.within_reach."""
         return all(store.within_reach(places, patience_s) for store, places in self._by_store(indices))
 
     def fetch_ahead(self, episodes: Sequence[int] | None = None) -> None:
-        """As EpisodeStore.fetch_ahead."""
+        """Starts to fetch shards in the background; see EpisodeStore.fetch_ahead."""
         if episodes is None:
             for store in (*self.others, self.own):
                 store.fetch_ahead()

@@ -85,7 +85,7 @@ class EpisodeStore(Episodes):
 
     @staticmethod
     def available(folder: Path | str) -> bool:
-        """Whether a data set exists there, complete or not, with shards or not.
+        """Returns whether a data set exists there, complete or not, with shards or not.
 
         Raises: ConfigError where access is refused; UnreachableError.
         """

@@ -61,7 +61,7 @@ class Storage(ABC):
 
 
 def is_remote(folder: Path | str) -> bool:
-    """Whether a data set lies at a URL."""
+    """Returns whether a data set lies at a URL."""
     return "://" in str(folder) and not str(folder).startswith("file://")
 
 

@@ -138,7 +138,7 @@ def _alike(extent_F3: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
 def _near(
     row_F24: np.ndarray, low_F3: np.ndarray, cell_3C: np.ndarray, cell_size: float, reach: float, clearance: float
 ) -> np.ndarray:
-    """Whether the volume covered by a triangle may come within `reach` of a cell, by its planes, bool [F, C]."""
+    """Returns whether a triangle's covered volume may come within `reach` of a cell, by its planes, bool [F, C]."""
     centre_F3, half = (low_F3 + 0.5) * cell_size, 0.5 * cell_size + reach
     near_FC = np.ones((len(row_F24), cell_3C.shape[1]), bool)
     for plane in range(4):

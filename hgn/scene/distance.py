@@ -63,7 +63,7 @@ def winding_numbers(point_P3: np.ndarray, triangle_F33: np.ndarray) -> np.ndarra
 
 
 def contains(point_P3: np.ndarray, obstacle: Obstacle) -> np.ndarray:
-    """Whether each point lies inside the obstacle, bool [P]; no point is inside a sheet.
+    """Returns whether each point lies inside the obstacle, bool [P]; no point is inside a sheet.
 
     Triangle orientation does not matter: inside is |winding number| > 0.5.
     """

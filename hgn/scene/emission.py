@@ -118,7 +118,7 @@ def require_free_entries(scene: Scene, entered: Scene) -> None:
 
 
 def _crosses(start_3: np.ndarray, way_3: np.ndarray, corner_F33: np.ndarray) -> bool:
-    """Whether a path meets a triangle (Möller and Trumbore 1997)."""
+    """Returns whether a path meets a triangle (Möller and Trumbore 1997)."""
     edge_1, edge_2 = corner_F33[:, 1] - corner_F33[:, 0], corner_F33[:, 2] - corner_F33[:, 0]
     across = np.cross(way_3, edge_2)
     determinant = (edge_1 * across).sum(axis=1)

@@ -99,7 +99,7 @@ class Episode:
 
     @property
     def imported(self) -> bool:
-        """Whether the episode was imported (hgn.import_trajectories)."""
+        """Returns whether the episode was imported (hgn.import_trajectories)."""
         return self.specification.get("kind") == "imported"
 
     @property

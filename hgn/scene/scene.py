@@ -93,12 +93,12 @@ class Scene:
 
     @property
     def moves(self) -> bool:
-        """Whether any obstacle moves."""
+        """Returns whether any obstacle moves."""
         return any(obstacle.motion is not None for obstacle in self.obstacles)
 
     @property
     def emits(self) -> bool:
-        """Whether particles enter after the start."""
+        """Returns whether particles enter after the start."""
         return self.entry_s_N is not None and bool((self.entry_s_N > 0).any())
 
     @property

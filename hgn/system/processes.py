@@ -9,6 +9,6 @@ PR_SET_PDEATHSIG = 1  # linux/prctl.h
 
 
 def die_with_parent(number: int) -> None:
-    """To be called in the child: Linux sends it the signal `number` when its parent ends for any reason."""
+    """Asks Linux, in a child process, to send it the signal `number` when its parent ends for any reason."""
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, number)
