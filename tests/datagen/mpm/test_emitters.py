@@ -65,7 +65,7 @@ def test_emitters_leave_their_batch_alone():
 
 def test_an_obstacle_in_the_way_is_refused():
     """A sheet between the face and where particles are first seen would let them through."""
-    with pytest.raises(ConfigError, match=r"emitters must be clear of obstacles for the first frame .* through sheet"):
+    with pytest.raises(ConfigError, match=r"emitters must be clear of obstacles for the first frame .* pass sheet"):
         simulate([jet(WATER, UP, obstacles=(sheet(0.36),))], CONFIG, 3, RATE_HZ)
 
 
