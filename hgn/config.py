@@ -31,6 +31,7 @@ from hgn.schema import (
     require,
     require_bounds,
 )
+from hgn.solver_method import METHODS, SolverMethod
 
 OBSTACLE_SHAPES = ("half_box", "square", "half_sphere", "cone", "pyramid")
 MESH_SUFFIXES = (".stl", ".obj", ".ply", ".glb")
@@ -99,7 +100,6 @@ class SceneConfig:
     group_size: Positive[float] = 0.08  # side or diameter
     materials: tuple[Material, ...] = PAPER_MATERIALS  # drawn for each group
     particles_per_cell: Positive[float] = 8.0  # of the solver, at the start
-    clearance_cells: NonNegative[float] = 2.0  # between obstacles, groups and walls, in solver cells
     maximum_initial_speed: NonNegative[float] = 0.0  # domain units per second; each moving group draws a velocity
     # fraction of groups with an initial velocity, where maximum_initial_speed is above 0
     moving_group_fraction: Fraction[float] = 1.0
@@ -108,8 +108,8 @@ class SceneConfig:
     pure_direction_fraction: Fraction[float] = 0.0
     colliding_scene_fraction: Fraction[float] = 0.0  # fraction of scenes with colliding groups and no obstacles
     zero_gravity_fraction: Fraction[float] = 0.0  # fraction of scenes without gravity
-    tilted_gravity_fraction: Fraction[float] = 0.0  # of the scenes, with gravity of any direction and …
-    maximum_tilted_gravity: NonNegative[float] = 19.6  # … any size up to this, domain units per second squared
+    # fraction of scenes with gravity of any direction and any size up to 19.6 domain units per second squared
+    tilted_gravity_fraction: Fraction[float] = 0.0
     # fraction of scenes (with gravity, without collisions) in which four square obstacles, of 0.5 to 0.8 times the
     # largest obstacle_size, form a funnel below the groups
     funnel_scene_fraction: Fraction[float] = 0.0
@@ -150,66 +150,42 @@ class SceneConfig:
 
 @dataclass(frozen=True)
 class MpmConfig:
-    """The MLS-MPM solver. The defaults correct Taichi Elements; conf/mpm/taichi_elements.yaml restores it."""
+    """The MLS-MPM solver. The defaults correct Taichi Elements; conf/mpm/taichi_elements.yaml computes as it does."""
 
     youngs_modulus_pa: Positive[float] = 1e6
     poisson_ratio: Annotated[float, Bound("in [0, 0.5)", lambda ratio: 0 <= ratio < 0.5)] = 0.2
     density_kg_m3: Positive[float] = 1000.0
-    # of quartz sand at its critical state (Bolton 1986)
+    # Friction angle of quartz sand at its critical state (Bolton 1986).
     sand_friction_angle_deg: Annotated[NonNegative[float], Bound("< 90", lambda angle: angle < 90)] = 33.0
-    # mohr_coulomb: the angle on every path; matsuoka_nakai: in triaxial compression and extension, more in plane strain
-    # (34.8 for 31); or a cone (Drucker-Prager) that has it in triaxial compression alone (Taichi Elements, with 45) or
-    # in plane_strain
-    sand_friction_law: Annotated[str, one_of("matsuoka_nakai", "mohr_coulomb", "compression", "plane_strain")] = (
-        "mohr_coulomb"
-    )
-    sand_volume_correction: Annotated[str, one_of("tampubolon", "taichi_elements")] = "tampubolon"
-    # of grains that make friction grow with the rate of flow, mu(I) (Jop, Forterre and Pouliquen 2006), which tall
-    # columns show: those judged are 200 of these in radius; 0: the same friction at any rate
+    # Diameter of grains, which make friction grow with the rate of flow: mu(I) of Jop, Forterre and Pouliquen (2006).
+    # With the default, the columns that the solver is checked against are 200 grains in radius. 0: friction does not
+    # depend on the rate.
     sand_grain_diameter_m: NonNegative[float] = 0.0025
-    snow_hardening: NonNegative[float] = 10.0
-    snow_critical_compression: BelowOne[float] = 0.025
+    snow_hardening: NonNegative[float] = 10.0  # exponent of the stiffness of compressed snow
+    snow_critical_compression: BelowOne[float] = 0.025  # elastic limits of snow's singular values
     snow_critical_stretch: NonNegative[float] = 0.0045
-    snow_maximum_hardening: Positive[float] = 20.0  # bound on exp(hardening * (1 - Jp)), counted; beyond 5 m/s raise it
-    # pressure lambda (1 - J); or stiffening, beyond 15 m/s: lambda / 7 (J^-7 - 1)
-    water_equation: Annotated[str, one_of("linear", "stiffening")] = "linear"
-    # J *= 1 + dt tr C; or taichi_elements: det(1 + dt C)
-    water_volume_update: Annotated[str, one_of("trace", "taichi_elements")] = "trace"
-    # fraction of its tension that stretched water bears; 1: Taichi Elements'
+    # Fraction of its tension that stretched water bears. 1 as in Taichi Elements.
     water_tension: AtMostOne[NonNegative[float]] = 1.0
-    water_viscosity_pa_s: NonNegative[float] = 0.0  # beside that of the grid, which is larger than real water's
-    # to be as its particles lie, below a free surface: else water at rest sinks in a random filling; null: never
-    water_density_relaxation_s: Positive[float] | None = 1.0
-    water_minimum_volume_ratio: Positive[float] = 0.1  # floor on J; hits are counted
-    minimum_singular_value: Positive[float] = 0.05  # floor on the singular values of F; hits are counted
-    # free fall is exact; or symplectic_euler, which is ahead by g t dt / 2
-    time_integration: Annotated[str, one_of("leapfrog", "symplectic_euler")] = "leapfrog"
-    time_step: Annotated[str, one_of("adaptive", "fixed")] = "adaptive"  # or fixed
-    fixed_time_step_s: Positive[float] = 0.02 / 64
-    # of the single-particle limit dx sqrt(rho / (3 lambda + 2 mu))
+    # Added to the viscosity of the grid, which is larger than that of real water.
+    water_viscosity_pa_s: NonNegative[float] = 0.0
+    collider_friction: NonNegative[float] = 0.0  # Coulomb coefficient of obstacles; 0: frictionless
+    # corrected, or taichi_elements: numerical choices as in the paper's simulator (hgn/solver_method.py lists them).
+    method: Annotated[str, one_of(*METHODS)] = "corrected"
+    fixed_time_step_s: Positive[float] | None = None  # null: each scene takes steps as long as its materials allow
+    # Fraction of the stability limit dx sqrt(rho / (3 lambda + 2 mu)) of a single particle that adaptive steps use.
     stability_fraction: AtMostOne[Positive[float]] = 0.875
-    # of a cell that the fastest particle may cross between two transfers
-    speed_fraction: AtMostOne[Positive[float]] = 0.3
-    # particles and grid exchange velocities every cell_size / this: 32 times a frame of 1/60 s at 64 cells,
-    # whatever the materials, with as many steps of stress between as they need; null: at every step. Fewer
-    # transfers smooth less.
-    transfer_speed_m_s: Positive[float] | None = 30.0
-    # grid nodes at each face of the domain that stop outgoing motion
+    # Grid nodes at each face of the domain that stop outgoing motion.
     wall_cells: Annotated[int, Bound("at least 2, the reach of a particle", lambda count: count >= 2)] = 3
-    wall_contact: Annotated[str, one_of("slip", "stick")] = "slip"  # or stick
-    collider_band_cells: NonNegative[float] = 0.5  # from a sheet, where nodes stop motion; more keeps it further off
-    collider_friction: NonNegative[float] = 0.0  # Coulomb coefficient; 0 separates without friction
-    collider_projection: bool = True  # stop particles that would still cross an obstacle's triangle; counted
-    device: DeviceName = "auto"  # cpu or cuda; auto: cuda where there is a GPU
+    device: DeviceName = "auto"  # cpu, cuda, or auto: cuda where there is a GPU
     scenes_per_launch: OneOrMore | None = None  # null: 1 on a CPU, 416 on a GPU
-    maximum_substeps_per_frame: Positive[int] = 20_000  # beyond it a scene is stopped and reported
 
     def __post_init__(self) -> None:
         require_bounds(self)
-        if self.sand_volume_correction == "taichi_elements":  # whose strains have no deviator to speak of
-            rule = "compression or plane_strain with sand_volume_correction=taichi_elements"
-            cone = self.sand_friction_law in ("compression", "plane_strain")
-            require(cone, "sand_friction_law", rule, self.sand_friction_law)
+
+    @property
+    def choices(self) -> SolverMethod:
+        """What the method decides."""
+        return METHODS[self.method]
 
 
 def _spread(number: int, fraction: float) -> bool:
@@ -232,18 +208,14 @@ class DatasetConfig:
     seed: NonNegative[int] = 0  # of all scenes of the data set
     episodes_per_shard: Positive[int] = 8  # the first shards are smaller, so that training can start early
     workers: OneOrMore | None = None  # processes that simulate; null: one per GPU, or per two cores of a CPU
-    maximum_attempts: Positive[int] = 3  # per scene before it is quarantined and replaced
     worker_silence_s: Positive[float] = 600.0  # seconds without progress after which a worker is replaced
     pool: Annotated[str, one_of("local", "ray")] = "local"  # local: processes of this machine; ray: of a Ray cluster
-    # of the cluster, as in 10.0.0.1:6379; null: $RAY_ADDRESS, else the cluster that this machine is in
-    ray_address: str | None = None
     # number of this generator, 0 to array_tasks - 1, as in a Slurm array; each generates its own shards of one folder
     array_task: int | None = None
     array_tasks: OneOrMore | None = None  # number of generators on one folder
 
     def __post_init__(self) -> None:
         require_bounds(self)
-        require(self.ray_address is None or self.pool == "ray", "ray_address", "left out without pool=ray", self.pool)
         task, tasks = self.array_task, self.array_tasks
         require((task is None) == (tasks is None), "array_task", "given together with array_tasks", [task, tasks])
         if task is not None and tasks is not None:

@@ -7,6 +7,7 @@
 | a setting was removed | REMOVED | refused with the reason | loads with the fixed value, else refused |
 | a choice of a config group was renamed | CHOICES | refused with the new choice | |
 | a value or a choice was removed | REMOVED_CHOICES | refused with the reason | refused |
+| a setting of the solver became a part of its method | METHODS | refused with the method | loads as the method |
 | a setting of the solver was added | BEFORE | | gets what the solver did before |
 """
 
@@ -15,6 +16,8 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
+
+from hgn.solver_method import CONSTANTS, METHODS, TAICHI_ELEMENTS_STEP_S
 
 ANY = object()
 
@@ -58,6 +61,11 @@ TRAIN_ANEW = "leave it out; weights with another value must be trained anew"
 # `section.key`; the section is the name of the dataclass without Config: network, mpm, scene, dataset, training,
 # train, evaluate, rollout, error_vs_time. Fixed values of `scene` and `mpm` stay in the identity of data sets.
 REMOVED: dict[str, Removed] = {
+    "dataset.maximum_attempts": Removed(3),
+    "dataset.ray_address": Removed(None, "set $RAY_ADDRESS"),
+    "scene.clearance_cells": Removed(2.0),
+    "scene.maximum_tilted_gravity": Removed(19.6),
+    **{f"mpm.{key}": Removed(value) for key, value in CONSTANTS.items()},
     "network.contact_forces": Removed("normal", TRAIN_ANEW, _relative),
     "network.contact_gate": Removed("cell", TRAIN_ANEW, _relative),
     "network.contact_reach_cells": Removed(3.0, TRAIN_ANEW, _relative),
@@ -121,6 +129,8 @@ _BACKENDS = {"plain": "torch", "fast": "triton"}
 _PRECISIONS = {"highest": "fp32", "high": "tf32", "half": "fp16"}
 VALUES: dict[str, dict[Any, str]] = {
     "backend": _BACKENDS,
+    "device": {"gpu": "cuda"},
+    "solver_device": {"gpu": "cuda"},
     "backends": _BACKENDS,
     "precision": _PRECISIONS,
     "precisions": _PRECISIONS,
@@ -180,6 +190,19 @@ def current_names(mapping: Mapping[str, Any], section: str = "") -> dict[str, An
         if removed is None or not removed.allows(value, mapping):
             inner = current_names(value, key) if isinstance(value, Mapping) else current_value(key, value)
             result[key.rpartition(".")[2]] = inner
+    return _current_solver(result) if section == "mpm" else result
+
+
+def _current_solver(stored: dict[str, Any]) -> dict[str, Any]:
+    """Returns settings of the solver with `method` in place of the values that it decides. Values that belong to no
+    method stay, for `from_mapping` to refuse.
+    """
+    result = dict(stored)
+    for method, choices in METHODS.items():
+        if choices._asdict().items() <= stored.items():
+            result = {key: value for key, value in stored.items() if key not in choices._fields} | {"method": method}
+    if result.pop("time_step", None) == "adaptive":
+        result["fixed_time_step_s"] = None
     return result
 
 
@@ -190,7 +213,12 @@ def stored_names(mapping: Mapping[str, Any], section: str) -> dict[str, Any]:
     old_keys = {new: old.rpartition(".")[2] for old, new in KEYS.items()}
     owners = {key.rpartition("."): removed.value for key, removed in REMOVED.items()}
     fixed = {name: value for (owner, _, name), value in owners.items() if owner == section and value is not ANY}
-    return fixed | {old_keys.get(_join(section, key), key): value for key, value in mapping.items()}
+    result = fixed | {old_keys.get(_join(section, key), key): value for key, value in mapping.items()}
+    if section == "mpm":
+        step_s = result["fixed_time_step_s"]
+        result |= METHODS[result.pop("method")]._asdict() | {"time_step": "adaptive" if step_s is None else "fixed"}
+        result |= {"fixed_time_step_s": TAICHI_ELEMENTS_STEP_S if step_s is None else step_s}
+    return result
 
 
 def renamed_remedy(key: str, value: Any) -> str | None:
@@ -205,6 +233,11 @@ def renamed_remedy(key: str, value: Any) -> str | None:
 def removed_remedy(section: str, key: str, value: Any) -> str | None:
     """Returns what to do about a removed setting that was given this value, or None for any other setting."""
     removed = REMOVED.get(_join(section, key))
+    if section == "mpm" and key == "time_step":
+        return "it was removed; mpm.fixed_time_step_s is null for adaptive steps"
+    if section == "mpm" and key in METHODS["corrected"]._fields:
+        values = ", ".join(f"{getattr(choices, key)} with {method}" for method, choices in METHODS.items())
+        return f"it was removed and follows from mpm.method: {values}; other data need the release that made them"
     if removed is None:
         return None
     if removed.value is ANY:

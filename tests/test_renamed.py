@@ -7,6 +7,7 @@ from importlib import import_module
 import pytest
 
 import hgn.config
+from datagen.solve import SolveConfig
 from hgn.config import DatagenConfig, MpmConfig, NetworkConfig, SceneConfig, TrainConfig
 from hgn.data.identity import dataset_identity
 from hgn.evaluate import EvaluateConfig
@@ -64,6 +65,21 @@ def removed(monkeypatch):
             {"network": {"kind": "gns_particles"}},
             "network.kind must be one of hgn, gns, got 'gns_particles'; commit a0b88cb, before release 0.2.0",
         ),
+        (
+            SolveConfig,
+            {"scene": "a", "mpm": {"wall_contact": "stick"}},
+            "it was removed and is always slip now, not stick; leave it",
+        ),
+        (
+            TrainConfig,
+            {"mpm": {"time_step": "fixed"}},
+            "it was removed; mpm.fixed_time_step_s is null for adaptive steps",
+        ),
+        (
+            TrainConfig,
+            {"mpm": {"sand_friction_law": "mohr_coulomb"}},
+            "follows from mpm.method: mohr_coulomb with corrected, compression with taichi_elements",
+        ),
         (RolloutConfig, {"film": 3}, "film is not a known key; it was removed; render with tools.render"),
         (RolloutConfig, {"backend": "abacus"}, "backend must be one of .*, got 'abacus'; take backend=cpu"),
     ],
@@ -75,16 +91,23 @@ def test_old_names_are_answered(config, mapping, message, removed):
     assert "\n" not in str(caught.value)
 
 
-def test_data_of_before_settings():
-    """A data set from before a setting of the solver was made without what it sets, whatever new data have."""
-    stored = to_mapping(MpmConfig(sand_friction_angle_deg=45.0))
-    for key in ("time_integration", "water_density_relaxation_s", "sand_grain_diameter_m"):
-        del stored[key]
-    config = from_stored(MpmConfig, stored, "mpm")
-    assert config.time_integration == "symplectic_euler"
-    assert (config.water_density_relaxation_s, config.sand_grain_diameter_m) == (None, 0.0)
-    assert config.sand_friction_angle_deg == 45.0
-    assert from_stored(MpmConfig, to_mapping(MpmConfig()), "mpm") == MpmConfig()
+def test_settings_of_the_solver_in_data_sets():
+    """A data set's settings of the solver are read as those of a method. Those of no method are refused by name, and so
+    is a data set that is older than a setting."""
+    for config in (
+        MpmConfig(sand_friction_angle_deg=45.0),
+        MpmConfig(method="taichi_elements", fixed_time_step_s=1e-3),
+    ):
+        stored = stored_names(to_mapping(config), "mpm")
+        assert stored["time_step"] == ("adaptive" if config.fixed_time_step_s is None else "fixed")
+        assert from_stored(MpmConfig, stored, "mpm") == config
+    stored = stored_names(to_mapping(MpmConfig()), "mpm")
+    for change in ({"sand_friction_law": "matsuoka_nakai"}, {"speed_fraction": 0.1}):
+        with pytest.raises(ConfigError, match=r"mpm\.\w+ is not a known key; it was removed"):
+            from_stored(MpmConfig, stored | change, "mpm")
+    del stored["time_integration"]
+    with pytest.raises(ConfigError, match="it was removed and follows from"):
+        from_stored(MpmConfig, stored, "mpm")
 
 
 def test_files_of_before(tmp_path, monkeypatch, removed):
@@ -170,9 +193,8 @@ def test_identity_keeps_its_names(monkeypatch, removed):
     assert current_names(scene, "scene") == current_names(before["scene"], "scene")
     assert from_stored(SceneConfig, scene, "scene") == config.scene
     stored = stored_names(to_mapping(config.mpm), "mpm")
-    assert stored == to_mapping(config.mpm) | {"swirl": 0.5} | {
-        key.removeprefix("mpm."): row.value for key, row in REMOVED.items() if key.startswith("mpm.")
-    }
+    removed = {key.removeprefix("mpm."): row.value for key, row in REMOVED.items() if key.startswith("mpm.")}
+    assert stored.items() >= removed.items() and stored["swirl"] == 0.5
     assert from_stored(MpmConfig, stored, "mpm") == config.mpm
 
 

@@ -95,7 +95,9 @@ class SolverLaunches:
         for episode in episodes:
             if episode.key not in self._colliders:
                 scene = solver_scene(episode, self.cell_size)
-                self._colliders[episode.key] = threads.submit(build_collider, scene, self.config.collider_band_cells)
+                self._colliders[episode.key] = threads.submit(
+                    build_collider, scene, self.config.choices.collider_band_cells
+                )
 
     def trials(self, setting: Setting, episodes: Sequence[Episode], on_frame: OnFrame = None) -> list[RolloutResult]:
         """Returns trajectories from the episodes' first frames."""

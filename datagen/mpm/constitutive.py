@@ -12,6 +12,7 @@ import taichi as ti
 from datagen.mpm.layout import CONSTANT, COUNT, VARIANT, is_only_solid
 from datagen.mpm.svd import svd3
 from hgn.scene.material import ELASTIC, SAND, SNOW, WATER
+from hgn.solver_method import MINIMUM_SINGULAR_VALUE, WATER_MINIMUM_VOLUME_RATIO
 
 # Jp beyond these is rounding: hardening is capped, or nothing is left of it
 SMALLEST_PLASTIC_VOLUME, LARGEST_PLASTIC_VOLUME = 1e-3, 1e3
@@ -19,8 +20,6 @@ LARGEST_VOLUME = 1e12  # of an elastic solid, whose stress goes with its square
 # of an elastic solid's stiffness, for the step: a single particle that hits the floor at 10 m/s gains energy with steps
 # of 0.8 of the limit, and none with 0.65
 ELASTIC_MARGIN = 1.6
-# the same of pressed water whose pressure grows with J^-7: without it a block of it at 30 m/s needs ever more steps
-STIFFENING_MARGIN = 1.6
 # mu(I) = mu_s (1 + RATE_FRICTION / (1 + RATE_NUMBER / I)), as Jop, Forterre and Pouliquen 2006 have it of glass beads:
 # mu_s = tan 20.9, mu_2 = tan 32.76 degrees
 RATE_FRICTION, RATE_NUMBER = 0.685, 0.279
@@ -48,29 +47,22 @@ def water(
     row: ti.i32,
     counter: ti.template(),
     scene: ti.i32,
-    stiffening: ti.template(),
 ):
-    """J (1 + expansion), floored; Kirchhoff pressure term; present stiffness, Pa.
+    """Returns J (1 + expansion) with its floor, the Kirchhoff pressure term lambda J (J - 1), and the present
+    stiffness, Pa.
 
-    The expansion of a step is dt tr C; Taichi Elements' det(1 + dt C) - 1 swells what turns and shrinks what is purely
-    sheared, in second order of the step. The term is lambda J (J - 1), as in Taichi Elements, or with `stiffening`
-    that of the pressure lambda / 7 (J^-7 - 1) (Cole 1948), which withstands any compression. Stretched water bears as
-    much of the tension as the law says; with none it has no pressure until it is pressed together again.
+    The expansion of a step is dt tr C. Taichi Elements' det(1 + dt C) - 1 expands rotating water and compresses sheared
+    water, to second order in the step. Stretched water bears the fraction of its tension that the law contains; with 0
+    it has no pressure until it is compressed again.
     """
     bulk = law[row + CONSTANT.bulk]
-    smallest = law[row + CONSTANT.water_smallest_volume]
     J = volume * (1.0 + expansion)
-    if J < smallest:
-        J = smallest
+    if J < WATER_MINIMUM_VOLUME_RATIO:
+        J = WATER_MINIMUM_VOLUME_RATIO
         count_event(counter, scene, COUNT.water_volume_floors, 1)
     # d(tau) / d(log J) is lambda J (2 J - 1): stretched water is stiffer than water at rest
     stress = bulk * J * (J - 1.0)
     stiffness = J * (2.0 * J - 1.0)
-    if ti.static(stiffening):
-        power = 1.0 / (J * J * J)
-        power *= power
-        stress = bulk * (J - power) / 7.0
-        stiffness = (J + 6.0 * power) / 7.0
     if J > 1.0:
         stress *= law[row + CONSTANT.water_tension]
     return J, stress, 3.0 * bulk * ti.max(1.0, stiffness)
@@ -92,18 +84,17 @@ def settled(volume: ti.f32, density: ti.f32, share: ti.f32) -> ti.f32:
 def _project_sand(log_strain, volume: ti.f32, law: ti.template(), row: ti.i32, step: ti.f32, variant: ti.template()):
     """Return mapping of the principal log strains: new ones, and the new volume correction.
 
-    Stress yields where |s| > alpha (-tr tau), s its deviator: alpha is constant (Drucker and Prager), or such that
-    I1 I2 = (9 - sin² phi) / (1 - sin² phi) I3 for the invariants of tau (Matsuoka and Nakai 1974), or that the largest
-    and the least principal stress differ by sin phi of their sum (Mohr and Coulomb). The deviator shrinks
-    and keeps its direction: no plastic flow changes the volume. With grains alpha grows with the inertial number
-    I = rate d sqrt(rho_grain / p) of the plastic shear of this step (Jop, Forterre and Pouliquen 2006).
+    Stress yields where |s| > alpha (-tr tau), s its deviator: alpha is such that the largest and the smallest principal
+    stress differ by sin phi of their sum (Mohr-Coulomb), or constant in Taichi Elements (Drucker-Prager). The deviator
+    shrinks and keeps its direction, so plastic flow does not change the volume. With grains alpha grows with the
+    inertial number I = rate d sqrt(rho_grain / p) of the plastic shear of this step (Jop, Forterre, Pouliquen 2006).
 
-    Tampubolon et al. 2017: v_c / 3 joins each log strain first, and v_c += log det F_trial - log det F_new.
-    In Taichi Elements' form v_c enters the trace but not the strains.
+    Volume correction (Tampubolon et al. 2017): v_c / 3 joins each log strain first, and
+    v_c += log det F_trial - log det F_new. In Taichi Elements v_c enters the trace but not the strains.
     """
     strain = log_strain
     trace = log_strain.sum() + volume
-    if ti.static(not variant & VARIANT.taichi_elements_sand):
+    if ti.static(not variant & VARIANT.taichi_elements):
         strain = log_strain + volume / 3.0
     deviator = strain - trace / 3.0
     new_volume = 0.0
@@ -115,22 +106,13 @@ def _project_sand(log_strain, volume: ti.f32, law: ti.template(), row: ti.i32, s
         bulk = law[row + CONSTANT.bulk]
         size = deviator.norm() + 1e-20
         alpha = law[row + CONSTANT.sand_alpha]
-        sine = law[row + CONSTANT.sand_sine]
-        if sine > 0.0:
-            # with z = p / |s| the criterion is z³ - a z + b = 0, and stress meets it first at the largest root
-            a = (3.0 + sine * sine) / (8.0 * sine * sine)
-            direction = deviator / size
-            third = -direction[0] * direction[1] * direction[2]
-            half_b = (9.0 - sine * sine) / (16.0 * sine * sine) * third
-            root = ti.sqrt(a / 3.0)
-            cosine = ti.min(ti.max(-half_b / (root * root * root), -1.0), 1.0)
-            alpha = 1.0 / (6.0 * root * ti.cos(ti.acos(cosine) / 3.0))
-        elif sine < 0.0:
-            # with principal stresses |s| n - p: |s| (n1 - n3) = (2 p + |s| n2) sin phi, n1 the largest, n3 the least
+        if ti.static(not variant & VARIANT.taichi_elements):
+            sine = law[row + CONSTANT.sand_sine]
+            # principal stresses are |s| n - p: |s| (n1 - n3) = (2 p + |s| n2) sin phi, n1 the largest, n3 the smallest
             direction = deviator / size
             largest, least = direction.max(), direction.min()
-            # what is less than 0.8 has a deviator of rounding alone
-            alpha = -2.0 / 3.0 * sine / ti.max(largest - least - sine * (largest + least), 0.5)
+            # a denominator below 0.8 is that of a deviator of rounding errors
+            alpha = 2.0 / 3.0 * sine / ti.max(largest - least + sine * (largest + least), 0.5)
         bearing = -(3.0 * bulk + 2.0 * shear) / (2.0 * shear) * trace * alpha
         excess = ti.max(size - bearing, 0.0)
         if ti.static(bool(variant & VARIANT.rate_of_sand)):
@@ -159,9 +141,8 @@ def foreseen_stiffness(
     row: ti.i32,
     variant: ti.template(),
 ) -> ti.f32:
-    """(3 lambda + 2 mu) / density of a particle that goes on for a time with the gradient C of its velocity. Elastic
-    solids, whose stretch it would take a decomposition to tell, and water whose pressure grows with J^-7 go for stiffer
-    than any other: they take no steps of their own.
+    """Returns (3 lambda + 2 mu) / density of a particle after `time` with the velocity gradient C. Elastic solids,
+    whose stretch only a decomposition would give, count as stiffer than any other: they take no steps of their own.
     """
     density = law[row + CONSTANT.density]
     bulk = 3.0 * law[row + CONSTANT.bulk]
@@ -173,8 +154,6 @@ def foreseen_stiffness(
             rough = ti.sqrt(bulk * ti.max(1.0, J * (2.0 * J - 1.0)))
             rough += 4.0 * law[row + CONSTANT.viscosity] * inverse_dx / ti.sqrt(density)
             stiffness = rough * rough
-            if ti.static(bool(variant & VARIANT.stiffening_water)):
-                stiffness = 1e30
     if ti.static(bool(variant & VARIANT.snow)):
         if material == SNOW:
             stiffness *= hardening(volume * (1.0 - change), law, row)
@@ -207,12 +186,11 @@ def solid(
     elastic = ti.static(bool(variant & VARIANT.elastic))
     shear = law[row + CONSTANT.shear]
     bulk = law[row + CONSTANT.bulk]
-    smallest = law[row + CONSTANT.smallest_singular_value]
     U, sigma, V = svd3(F)
     floors = 0
     for i in ti.static(range(3)):
-        if sigma[i] < smallest:
-            sigma[i] = smallest
+        if sigma[i] < MINIMUM_SINGULAR_VALUE:
+            sigma[i] = MINIMUM_SINGULAR_VALUE
             floors += 1
     count_event(counter, scene, COUNT.singular_value_floors, floors)
     new_sigma = sigma

@@ -27,7 +27,7 @@ from datagen.mpm.taichi_compat import name_lines_alone
 class Device:
     """What this process simulates on."""
 
-    kind: str  # cpu or gpu
+    kind: str  # cpu or cuda
     threads: int  # of the CPU; 1 on a GPU
     processors: int = 1  # of the GPU: thread blocks at work at once
 
@@ -42,7 +42,7 @@ def initialise(device: str = "auto", cpu_threads: int | None = None) -> Device:
     threads on a CPU; none takes all cores that this process may use. Compiled kernels are kept in Taichi's
     cache on disk, so that the next process starts fast.
 
-    Raises: ConfigError when cuda is requested and there is none, or when the process already runs on another
+    Raises: ConfigError when cuda is requested and there is no GPU, or when the process already runs on another
     device or number of threads (Taichi has one runtime a process).
     """
     global _started

@@ -5,6 +5,8 @@ the grid, one after another, and the copies are summed in order: no atomics, and
 of threads at work. On a GPU all particles scatter at once into one copy with atomics.
 """
 
+from collections import namedtuple
+
 import taichi as ti
 
 from datagen.mpm.layout import BLOCK_NODES, CONSTANT, COUNT, SETTING, SHAPE, STATUS, VALUE, VARIANT, has_solid
@@ -15,128 +17,105 @@ from datagen.mpm.mls_mpm import (
     Scalars,
     Vectors,
     find_hidden,
-    ghost_place,
     initial_stiffness,
-    interpolate,
-    interpolate_hidden,
     is_fluid,
-    mark,
     move,
-    node_places,
     node_velocity,
     respond,
     settle,
     settles,
-    weights,
 )
 from datagen.mpm.multiple_time_stepping import acts, change_of, mark_changed, own_step
+from datagen.mpm.nodes import ghost_place, interpolate, interpolate_hidden, mark, node_places, weights
 from datagen.mpm.time_step import choose_time_step, falls, raise_maximum
 from hgn.scene.material import MATERIAL_BITS, MATERIAL_MASK, SAND, WATER
 
+# The arguments of `substep`, which its functions take as one. Taichi resolves the names as it compiles.
+GridArrays = namedtuple(
+    "GridArrays",
+    [
+        "position", "velocity", "affine", "deformation", "volume", "strained", "covered", "spread",
+        "response", "label", "law_row", "hidden", "scene_value", "counter", "setting", "law", "shape", "node",
+        "gain", "fallen", "block", "contact", "contact_normal", "variant",
+    ],
+)  # fmt: skip
+
 
 @ti.func
-def _particle_to_grid(
-    p: ti.i32,
-    copy: ti.i32,
-    scene: ti.i32,
-    step: ti.f32,
-    position: ti.template(),
-    velocity: ti.template(),
-    affine: ti.template(),
-    deformation: ti.template(),
-    volume: ti.template(),
-    strained: ti.template(),
-    covered: ti.template(),
-    spread: ti.template(),
-    response: ti.template(),
-    label: ti.template(),
-    law_row: ti.template(),
-    hidden: ti.template(),
-    node: ti.template(),
-    gain: ti.template(),
-    block: ti.template(),
-    scene_value: ti.template(),
-    counter: ti.template(),
-    setting: ti.template(),
-    law: ti.template(),
-    shape: ti.template(),
-    contact: ti.template(),
-    contact_normal: ti.template(),
-    variant: ti.template(),
-):
+def _particle_to_grid(p: ti.i32, copy: ti.i32, scene: ti.i32, step: ti.f32, arrays: ti.template()):
     """Updates the particle's deformation where it acts, and adds what it gives to its nodes to one copy of the grid:
     momentum and mass in the first substep of an interval, later what its stress changes alone.
     """
-    dx = setting[SETTING.cell_size]
-    inverse_dx = setting[SETTING.inverse_cell_size]
-    material = label[p] & MATERIAL_MASK
+    dx = arrays.setting[SETTING.cell_size]
+    inverse_dx = arrays.setting[SETTING.inverse_cell_size]
+    material = arrays.label[p] & MATERIAL_MASK
     row = 0
-    if ti.static(bool(variant & VARIANT.several_laws)):
-        row = law_row[p]
-    begins = scene_value[scene, VALUE.begins]
+    if ti.static(bool(arrays.variant & VARIANT.several_laws)):
+        row = arrays.law_row[p]
+    begins = arrays.scene_value[scene, VALUE.begins]
     hidden_here = 0
-    if ti.static(bool(variant & VARIANT.sheets)):
+    if ti.static(bool(arrays.variant & VARIANT.sheets)):
         if begins == 1.0:
-            elapsed = scene_value[scene, VALUE.part] - scene_value[scene, VALUE.remaining] - step
-            hidden[p] = find_hidden(position[p], scene, elapsed, contact, contact_normal, setting, shape, variant)
-        hidden_here = hidden[p]
-    marks = 3 * shape[SHAPE.all_blocks] + 2
+            elapsed = arrays.scene_value[scene, VALUE.part] - arrays.scene_value[scene, VALUE.remaining] - step
+            arrays.hidden[p] = find_hidden(arrays.position[p], scene, elapsed, arrays)
+        hidden_here = arrays.hidden[p]
+    marks = 3 * arrays.shape[SHAPE.all_blocks] + 2
     A = ti.Matrix.zero(ti.f32, 3, 3)
-    if acts(covered[p], begins, step, scene, scene_value):
+    if acts(arrays.covered[p], begins, step, scene, arrays.scene_value):
         F = ti.Matrix.identity(ti.f32, 3)
-        if ti.static(has_solid(variant)):
-            if ti.static(not variant & VARIANT.water) or not is_fluid(material):
-                F = deformation[p]
-        C = affine[p]
+        if ti.static(has_solid(arrays.variant)):
+            if ti.static(not arrays.variant & VARIANT.water) or not is_fluid(material):
+                F = arrays.deformation[p]
+        C = arrays.affine[p]
         stretch = ti.Matrix.zero(ti.f32, 3, 3)
         if begins == 0.0:
-            stretch = affine[p]  # which holds it until the interval ends
+            stretch = arrays.affine[p]  # which holds it until the interval ends
             v_now, C_now = interpolate(
-                position[p], scene * shape[SHAPE.scene_blocks] * BLOCK_NODES, node, inverse_dx, shape
+                arrays.position[p], scene * arrays.shape[SHAPE.scene_blocks] * BLOCK_NODES, arrays, inverse_dx
             )
-            if ti.static(bool(variant & VARIANT.sheets)):
+            if ti.static(bool(arrays.variant & VARIANT.sheets)):
                 v_now, C_now = interpolate_hidden(
-                    position[p], v_now, C_now, hidden_here, scene, node, inverse_dx, shape, contact
+                    arrays.position[p], v_now, C_now, hidden_here, scene, arrays, inverse_dx
                 )
             C = C_now
-            raise_maximum(counter, scene, COUNT.speed_square_bits, v_now.dot(v_now))
+            raise_maximum(arrays.counter, scene, COUNT.speed_square_bits, v_now.dot(v_now))
         length, until, acts_until, many, spreads, acting = own_step(
-            strained[p], covered[p], spread[p], position[p], C, volume[p], material, row, begins, step, scene, counter,
-            shape, block, marks, scene_value, setting, law, variant,
+            arrays.strained[p], arrays.covered[p], arrays.spread[p], arrays.position[p], C, arrays.volume[p], material,
+            row, begins, step, scene, arrays, marks,
         )  # fmt: skip
-        strained[p] = until
-        covered[p] = acts_until
-        spread[p] = spreads
+        arrays.strained[p] = until
+        arrays.covered[p] = acts_until
+        arrays.spread[p] = spreads
         answer, new_stretch, new_F, new_volume, stiffness = respond(
-            C, stretch, F, volume[p], material, row, length, scene, counter, setting, law, variant
+            C, stretch, F, arrays.volume[p], material, row, length, scene, arrays
         )
         if spreads:
-            response[p] = answer
+            arrays.response[p] = answer
         A = begins * C + acting * answer
         if many > 1.0:
-            raise_maximum(counter, scene, COUNT.held_stiffness_bits, stiffness)
-        if scene_value[scene, VALUE.interval_remaining] > 0.0:
-            affine[p] = new_stretch
-        volume[p] = new_volume
-        if ti.static(has_solid(variant)):
-            if ti.static(not variant & VARIANT.water) or not is_fluid(material):
-                deformation[p] = new_F
-        raise_maximum(counter, scene, COUNT.stiffness_bits, stiffness)
+            raise_maximum(arrays.counter, scene, COUNT.held_stiffness_bits, stiffness)
+        if arrays.scene_value[scene, VALUE.interval_remaining] > 0.0:
+            arrays.affine[p] = new_stretch
+        arrays.volume[p] = new_volume
+        if ti.static(has_solid(arrays.variant)):
+            if ti.static(not arrays.variant & VARIANT.water) or not is_fluid(material):
+                arrays.deformation[p] = new_F
+        raise_maximum(arrays.counter, scene, COUNT.stiffness_bits, stiffness)
     else:
-        A = step * response[p]
-        if scene_value[scene, VALUE.interval_remaining] > 0.0:
-            now = ti.cast(counter[scene, COUNT.substeps], ti.i32)
-            mark_changed(position[p], scene, now, 1.0, inverse_dx, shape, block, marks)
+        A = step * arrays.response[p]
+        if arrays.scene_value[scene, VALUE.interval_remaining] > 0.0:
+            now = ti.cast(arrays.counter[scene, COUNT.substeps], ti.i32)
+            mark_changed(arrays.position[p], scene, now, 1.0, inverse_dx, arrays, marks)
 
-    x = position[p] * inverse_dx
+    x = arrays.position[p] * inverse_dx
     base = ti.floor(x - 0.5, ti.i32)
     fx = x - ti.cast(base, ti.f32)
     w0, w1, w2 = weights(fx)
-    first_node = (copy + scene * shape[SHAPE.scene_blocks]) * BLOCK_NODES
-    index_x, index_y, index_z = node_places(base, first_node, shape, 1)
+    first_node = (copy + scene * arrays.shape[SHAPE.scene_blocks]) * BLOCK_NODES
+    index_x, index_y, index_z = node_places(base, first_node, arrays.shape, 1)
     w = ti.static((w0, w1, w2))
     A *= dx
-    v = begins * velocity[p] - A @ fx
+    v = begins * arrays.velocity[p] - A @ fx
     for i, j in ti.static(ti.ndrange(3, 3)):
         wxy = w[i][0] * w[j][1]
         vxy = ti.Vector([v[a] + A[a, 0] * i + A[a, 1] * j for a in range(3)])
@@ -144,72 +123,53 @@ def _particle_to_grid(
             weight = wxy * w[k][2]
             vxyz = ti.Vector([vxy[a] + A[a, 2] * k for a in range(3)])
             share = ti.Vector([weight * vxyz[0], weight * vxyz[1], weight * vxyz[2], weight * begins])
-            if ti.static(bool(variant & VARIANT.several_laws)):
-                share *= law[row + CONSTANT.mass]
+            if ti.static(bool(arrays.variant & VARIANT.several_laws)):
+                share *= arrays.law[row + CONSTANT.mass]
             target = index_x[i] + index_y[j] + index_z[k]
-            if ti.static(bool(variant & VARIANT.sheets)):
+            if ti.static(bool(arrays.variant & VARIANT.sheets)):
                 if (hidden_here >> (9 * i + 3 * j + k)) & 1:
-                    target = copy * BLOCK_NODES + ghost_place(base + ti.Vector([i, j, k]), scene, contact, shape)
-            if ti.static(bool(variant & VARIANT.atomic)):
+                    target = copy * BLOCK_NODES + ghost_place(base + ti.Vector([i, j, k]), scene, arrays)
+            if ti.static(bool(arrays.variant & VARIANT.atomic)):
                 for a in ti.static(range(3)):
-                    ti.atomic_add(gain[target][a], share[a])
+                    ti.atomic_add(arrays.gain[target][a], share[a])
                 if begins == 1.0:
-                    ti.atomic_add(gain[target][3], share[3])
+                    ti.atomic_add(arrays.gain[target][3], share[3])
             else:
-                old = gain[target]
-                gain[target] = old + share
+                old = arrays.gain[target]
+                arrays.gain[target] = old + share
 
 
 @ti.func
-def _mass_around(x, first_node: ti.i32, node: ti.template(), inverse_dx: ti.f32, shape: ti.template()) -> ti.f32:
+def _mass_around(x, first_node: ti.i32, arrays: ti.template(), inverse_dx: ti.f32) -> ti.f32:
     """The masses of the nodes around x, interpolated."""
     scaled = x * inverse_dx
     base = ti.floor(scaled - 0.5, ti.i32)
     w0, w1, w2 = weights(scaled - ti.cast(base, ti.f32))
     w = ti.static((w0, w1, w2))
-    index_x, index_y, index_z = node_places(base, first_node, shape, 1)
+    index_x, index_y, index_z = node_places(base, first_node, arrays.shape, 1)
     mass = 0.0
     for i, j, k in ti.static(ti.ndrange(3, 3, 3)):
-        mass += w[i][0] * w[j][1] * w[k][2] * node[index_x[i] + index_y[j] + index_z[k]][3]
+        mass += w[i][0] * w[j][1] * w[k][2] * arrays.node[index_x[i] + index_y[j] + index_z[k]][3]
     return mass
 
 
 @ti.func
-def _grid_to_particle(
-    p: ti.i32,
-    scene: ti.i32,
-    position: ti.template(),
-    velocity: ti.template(),
-    affine: ti.template(),
-    volume: ti.template(),
-    is_water: ti.i32,
-    hidden: ti.template(),
-    node: ti.template(),
-    scene_value: ti.template(),
-    counter: ti.template(),
-    setting: ti.template(),
-    shape: ti.template(),
-    contact: ti.template(),
-    contact_normal: ti.template(),
-    variant: ti.template(),
-):
+def _grid_to_particle(p: ti.i32, scene: ti.i32, arrays: ti.template(), is_water: ti.i32):
     """New velocity and its gradient, then advection."""
-    x = position[p]
-    first_node = scene * shape[SHAPE.scene_blocks] * BLOCK_NODES
-    v, C = interpolate(x, first_node, node, setting[SETTING.inverse_cell_size], shape)
-    if ti.static(bool(variant & VARIANT.sheets)):
-        v, C = interpolate_hidden(x, v, C, hidden[p], scene, node, setting[SETTING.inverse_cell_size], shape, contact)
-    moved, speed, speed_square = move(
-        x, v, C, scene, scene_value, counter, setting, shape, contact, contact_normal, variant
-    )
-    raise_maximum(counter, scene, COUNT.speed_square_bits, speed_square)
-    if ti.static(bool(variant & VARIANT.water)):
-        if is_water and settles(scene, scene_value, setting):
-            mass = _mass_around(x, first_node, node, setting[SETTING.inverse_cell_size], shape)
-            volume[p] = settle(x, volume[p], mass, scene, scene_value, setting, shape)
-    position[p] = moved
-    velocity[p] = speed
-    affine[p] = C
+    x = arrays.position[p]
+    first_node = scene * arrays.shape[SHAPE.scene_blocks] * BLOCK_NODES
+    v, C = interpolate(x, first_node, arrays, arrays.setting[SETTING.inverse_cell_size])
+    if ti.static(bool(arrays.variant & VARIANT.sheets)):
+        v, C = interpolate_hidden(x, v, C, arrays.hidden[p], scene, arrays, arrays.setting[SETTING.inverse_cell_size])
+    moved, speed, speed_square = move(x, v, C, scene, arrays)
+    raise_maximum(arrays.counter, scene, COUNT.speed_square_bits, speed_square)
+    if ti.static(bool(arrays.variant & VARIANT.water)):
+        if is_water and settles(scene, arrays):
+            mass = _mass_around(x, first_node, arrays, arrays.setting[SETTING.inverse_cell_size])
+            arrays.volume[p] = settle(x, arrays.volume[p], mass, scene, arrays)
+    arrays.position[p] = moved
+    arrays.velocity[p] = speed
+    arrays.affine[p] = C
 
 
 @ti.kernel
@@ -255,6 +215,11 @@ def substep(
     for each base node, where its list of triangles begins in `contact` itself, or -1; then those lists, with their
     heads (see surface_kernel.LIST_HEAD). An entry is the place in `contact_normal` of the triangle's vectors.
     """
+    arrays = ti.static(GridArrays(
+        position, velocity, affine, deformation, volume, strained, covered, spread, response, label, law_row,
+        hidden, scene_value, counter, setting, law, shape, node, gain, fallen, block, contact, contact_normal,
+        variant,
+    ))  # fmt: skip
     for scene in range(scene_value.shape[0]):
         choose_time_step(scene, scene_value, counter, setting, shape[SHAPE.maximum_substeps])
         if scene_value[scene, VALUE.time_step] > 0.0 and scene_value[scene, VALUE.begins] == 1.0:
@@ -265,7 +230,7 @@ def substep(
         scene = label[p] >> MATERIAL_BITS
         if block[3 * shape[SHAPE.all_blocks] + 1] == 1 and scene_value[scene, VALUE.time_step] > 0.0:
             blocks = shape[SHAPE.all_blocks]
-            mark(position[p], scene, setting[SETTING.inverse_cell_size], shape, block, blocks, block, 3 * blocks)
+            mark(position[p], scene, setting[SETTING.inverse_cell_size], arrays, blocks, block, 3 * blocks)
 
     if ti.static(bool(variant & VARIANT.atomic)):
         for p in range(position.shape[0]):
@@ -274,11 +239,7 @@ def substep(
             if step > 0.0 and (
                 spread[p] == 1 or acts(covered[p], scene_value[scene, VALUE.begins], step, scene, scene_value)
             ):
-                _particle_to_grid(
-                    p, 0, scene, step, position, velocity, affine, deformation, volume, strained, covered, spread,
-                    response, label, law_row, hidden, node, gain, block, scene_value, counter, setting, law, shape,
-                    contact, contact_normal, variant,
-                )  # fmt: skip
+                _particle_to_grid(p, 0, scene, step, arrays)
     else:
         for task in range(scene_value.shape[0] * ti.static(variant // VARIANT.parts)):
             parts = ti.static(variant // VARIANT.parts)
@@ -290,11 +251,7 @@ def substep(
                     if label[p] >> MATERIAL_BITS == scene and (
                         spread[p] == 1 or acts(covered[p], scene_value[scene, VALUE.begins], step, scene, scene_value)
                     ):
-                        _particle_to_grid(
-                            p, copy, scene, step, position, velocity, affine, deformation, volume, strained,
-                            covered, spread, response, label, law_row, hidden, node, gain, block, scene_value, counter,
-                            setting, law, shape, contact, contact_normal, variant,
-                        )  # fmt: skip
+                        _particle_to_grid(p, copy, scene, step, arrays)
 
     for n in range(block[3 * shape[SHAPE.all_blocks]] * BLOCK_NODES):
         global_block = block[shape[SHAPE.all_blocks] + (n >> 6)]
@@ -339,18 +296,14 @@ def substep(
                 v = node_velocity(
                     ti.Vector([before[0], before[1], before[2]]), ti.Vector([total[0], total[1], total[2]]), mass,
                     n & 63, 2 * entry + field, block[2 * shape[SHAPE.all_blocks] + (n >> 6)],
-                    falls(gravity_time + lead - ahead, scene, scene_value), scene, scene_value,
-                    shape, contact_normal, variant,
+                    falls(gravity_time + lead - ahead, scene, scene_value), scene, arrays,
                 )  # fmt: skip
                 node[own] = ti.Vector([v[0], v[1], v[2], mass])
 
     for p in range(position.shape[0]):
         scene = label[p] >> MATERIAL_BITS
         if scene_value[scene, VALUE.time_step] > 0.0 and scene_value[scene, VALUE.interval_remaining] == 0.0:
-            _grid_to_particle(
-                p, scene, position, velocity, affine, volume, label[p] & MATERIAL_MASK == WATER, hidden, node,
-                scene_value, counter, setting, shape, contact, contact_normal, variant,
-            )  # fmt: skip
+            _grid_to_particle(p, scene, arrays, label[p] & MATERIAL_MASK == WATER)
 
 
 @ti.kernel

@@ -75,9 +75,8 @@ class GridLaunch(Launch):
         self.response = ti.Matrix.ndarray(3, 3, ti.f32, self.particles)
         self.block = device_array(np.zeros(8 * self.all_blocks + 2, np.int32))
         grid_kernel.start(
-            self.velocity, self.affine, self.deformation, self.volume, self.label, self.law_row, self.counter,
-            self.law,
-        )  # fmt: skip
+            self.velocity, self.affine, self.deformation, self.volume, self.label, self.law_row, self.counter, self.law
+        )
 
     def _node_array(self, nodes: int) -> ti.VectorNdarray:
         self.gain = ti.Vector.ndarray(4, ti.f32, nodes)
@@ -117,7 +116,7 @@ class GridLaunch(Launch):
     def _move(self, begin: float, end: float) -> None:
         """Makes the contacts of scenes in which obstacles move anew, as they lie at `begin`."""
         self.colliders = [
-            build_collider(scene, self.config.collider_band_cells, begin) if scene.moves else collider
+            build_collider(scene, self.config.choices.collider_band_cells, begin) if scene.moves else collider
             for scene, collider in zip(self.scenes, self.colliders, strict=True)
         ]
         self.ghosts = sum(int(collider.doubled_K.sum()) for collider in self.colliders)

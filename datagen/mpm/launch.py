@@ -1,11 +1,10 @@
-"""What all ways to run a batch of scenes share: its device arrays, the loop over frames, failures and counters.
+"""Device arrays of a batch of scenes, the loop over frames, failures and counters, for all ways to run a batch.
 
 Shape legend: T frames, N particles of a scene, P particles of all scenes, B scenes, K constants.
 """
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
@@ -27,13 +26,14 @@ from datagen.mpm.layout import (
     STATUS,
     VALUE,
     VARIANT,
-    constants,
+    material_laws,
 )
 from hgn.config import MpmConfig
 from hgn.scene.emission import entry_frames
-from hgn.scene.material import MATERIAL_BITS, MATERIAL_MASK, MATERIAL_PARAMETERS, MATERIALS, SAND
+from hgn.scene.material import MATERIAL_BITS, MATERIAL_MASK, MATERIALS, SAND
 from hgn.scene.scene import Scene
 from hgn.schema import ConfigError
+from hgn.solver_method import MAXIMUM_SUBSTEPS
 
 import datagen.mpm.device  # noqa: F401  # isort: skip  # keeps Taichi's banner off stdout
 import taichi as ti  # isort: skip
@@ -61,18 +61,13 @@ class Simulated:
 
 @dataclass(frozen=True)
 class SceneFailure:
-    """A scene that was stopped; the others of its batch went on, unaffected."""
-
-    cause: str
+    cause: str  # why the scene was stopped; others of its batch are unaffected
 
 
 def no_counters() -> dict[str, Any]:
-    counters: dict[str, Any] = dict.fromkeys(REPORTED, 0)
-    counters["smallest_time_step_s"] = None
-    counters["largest_speed"] = 0.0
-    counters["particles_inside_obstacles_at_start"] = 0
-    counters["particles_inside_obstacles_at_end"] = 0
-    return counters
+    others = {"smallest_time_step_s": None, "largest_speed": 0.0}
+    inside = {"particles_inside_obstacles_at_start": 0, "particles_inside_obstacles_at_end": 0}
+    return dict.fromkeys(REPORTED, 0) | others | inside
 
 
 def particle_bounds(scene: Scene, config: MpmConfig) -> tuple[np.ndarray, np.ndarray]:
@@ -97,48 +92,15 @@ def cell_mass(scene: Scene) -> float:
 
 
 def fixed_substeps(config: MpmConfig, frame_rate_hz: float) -> int:
-    """Substeps a frame of a fixed time step: as many as it takes to reach the frame's end."""
+    """Returns the number of fixed time steps that it takes to reach the end of a frame."""
+    assert config.fixed_time_step_s is not None
     return max(1, math.ceil(1 / (frame_rate_hz * config.fixed_time_step_s) - 1e-6))
-
-
-def material_laws(scenes: Sequence[Scene], config: MpmConfig) -> tuple[np.ndarray, np.ndarray]:
-    """The different rows of constants, float32 [rows, K], and the row of each particle, int32 [N of all scenes].
-
-    What a scene's material_parameters leave open (a name, or NaN for a particle) is the config's. The first row is
-    the config's own.
-    Raises: ConfigError for a value that MpmConfig refuses.
-    """
-    if not any(scene.material_parameters for scene in scenes):  # to sort a million rows takes seconds
-        return constants(config, config.density_kg_m3)[None], np.zeros(sum(s.particle_count for s in scenes), np.int32)
-    own = {name: np.float32(getattr(config, name)) for name in MATERIAL_PARAMETERS}
-    columns = [
-        np.concatenate(
-            [
-                np.asarray(scene.material_parameters.get(name, np.full(scene.particle_count, own[name])), np.float32)
-                for scene in scenes
-            ]
-        )
-        for name in MATERIAL_PARAMETERS
-    ]
-    values = np.stack(columns, axis=1)
-    values = np.where(np.isnan(values), np.array([own[name] for name in MATERIAL_PARAMETERS], np.float32), values)
-    given, row = np.unique(values, axis=0, return_inverse=True)
-    laws = [constants(config, config.density_kg_m3)]
-    rows = np.zeros(len(given), np.int32)
-    for index, values in enumerate(given):
-        changed: dict[str, Any] = {
-            name: float(value) for name, value in zip(MATERIAL_PARAMETERS, values, strict=True) if value != own[name]
-        }
-        if changed:
-            rows[index] = len(laws)
-            laws.append(constants(dataclasses.replace(config, **changed), config.density_kg_m3))
-    return np.stack(laws), rows[row.reshape(-1)]
 
 
 class Launch(ABC):
     """The device arrays of one batch of scenes, each with at least one particle, and the loop over frames.
 
-    A subclass holds the particles and says in `_advance` how frames are run.
+    A subclass has the particles, and runs frames in `_advance`.
     """
 
     parts = 1  # bounds that each scene's particles are cut at
@@ -156,7 +118,7 @@ class Launch(ABC):
     ) -> None:
         self.scenes, self.colliders, self.config, self.node_counts = scenes, colliders, config, node_counts
         self.frame_s = 1 / frame_rate_hz
-        if config.time_step == "fixed":
+        if config.fixed_time_step_s is not None:
             self.frame_s = fixed_substeps(config, frame_rate_hz) * config.fixed_time_step_s
         self.particle_begin = np.concatenate([[0], np.cumsum([scene.particle_count for scene in scenes])])
         self.particles = int(self.particle_begin[-1])
@@ -188,20 +150,16 @@ class Launch(ABC):
         label = np.where(self.entry_frame > 0, (len(scenes) << MATERIAL_BITS) + (label & MATERIAL_MASK), label)
         laws, row = material_laws(scenes, config)
         has_contact = self.moving or any(len(collider.node_K3) for collider in colliders)
-        has_sweep = config.collider_projection and (
-            self.moving or any(len(collider.sweep.base_K3) for collider in colliders)
-        )
+        has_sweep = self.moving or any(len(collider.sweep.base_K3) for collider in colliders)
         self.variant = (
             sum(MATERIAL_VARIANTS[material] for material in np.unique(label & MATERIAL_MASK))
             + VARIANT.contact * has_contact
             + VARIANT.sweep * has_sweep
             + VARIANT.sheets * (ghost_room > 0)
             + VARIANT.moving * self.moving
-            + VARIANT.taichi_elements_sand * (config.sand_volume_correction == "taichi_elements")
+            + VARIANT.taichi_elements * (config.method == "taichi_elements")
             + VARIANT.rate_of_sand * bool(config.sand_grain_diameter_m > 0 and SAND in label & MATERIAL_MASK)
-            + VARIANT.taichi_elements_water * (config.water_volume_update == "taichi_elements")
-            + VARIANT.stiffening_water * (config.water_equation == "stiffening")
-            + VARIANT.each_step * (config.time_step == "fixed" or config.transfer_speed_m_s is None)
+            + VARIANT.each_step * (config.fixed_time_step_s is not None or config.choices.transfer_speed_m_s is None)
             + VARIANT.several_laws * (len(laws) > 1)
             + VARIANT.parts * self.copies
         )
@@ -296,24 +254,23 @@ class Launch(ABC):
         shape[SHAPE.ghosts] = self.ghosts
         shape[SHAPE.ghost_begin] = len(self.scenes) * self.scene_nodes
         shape[SHAPE.wall_cells] = self.config.wall_cells
-        shape[SHAPE.sticky_walls] = self.config.wall_contact == "stick"
-        shape[SHAPE.maximum_substeps] = self.config.maximum_substeps_per_frame
+        shape[SHAPE.maximum_substeps] = MAXIMUM_SUBSTEPS
         return np.concatenate([shape, np.array([*begin, self.particles], np.int32)])
 
     def _settings(self, frame_rate_hz: float) -> np.ndarray:
-        config, cell_size = self.config, self.scenes[0].cell_size
+        config, choices, cell_size = self.config, self.config.choices, self.scenes[0].cell_size
         low, high = particle_bounds(self.scenes[0], config)
         setting = np.zeros(SETTING.length, np.float32)
         setting[SETTING.cell_size] = cell_size
         setting[SETTING.inverse_cell_size] = 1 / cell_size
-        if config.time_step == "fixed":
+        if config.fixed_time_step_s is not None:
             setting[SETTING.fixed_time_step] = config.fixed_time_step_s
             setting[SETTING.fixed_substeps] = fixed_substeps(config, frame_rate_hz)
-        setting[SETTING.speed_fraction] = config.speed_fraction
-        setting[SETTING.transfer_interval] = cell_size / config.transfer_speed_m_s if config.transfer_speed_m_s else 0
-        setting[SETTING.leapfrog] = config.time_integration == "leapfrog"
-        if config.water_density_relaxation_s is not None:
-            setting[SETTING.density_relaxation] = 1 / config.water_density_relaxation_s
+        if choices.transfer_speed_m_s is not None:
+            setting[SETTING.transfer_interval] = cell_size / choices.transfer_speed_m_s
+        setting[SETTING.leapfrog] = choices.time_integration == "leapfrog"
+        if choices.water_density_relaxation_s is not None:
+            setting[SETTING.density_relaxation] = 1 / choices.water_density_relaxation_s
         setting[SETTING.low : SETTING.low + 3] = low
         setting[SETTING.high : SETTING.high + 3] = high
         setting[SETTING.size : SETTING.size + 3] = self.scenes[0].domain_size
@@ -457,14 +414,12 @@ class Launch(ABC):
         ]
 
     def _cause(self, status: int, frame: int) -> str:
-        if status == STATUS.not_finite:
-            rule = "a particle's position, velocity or velocity gradient is no longer finite"
-        elif status == STATUS.left_domain:
-            rule = "a particle left the domain"
-        else:
-            limit = self.config.maximum_substeps_per_frame
-            rule = f"the frame needs more than maximum_substeps_per_frame = {limit} substeps"
-        return f"frame {frame}: {rule}"
+        rules = {
+            STATUS.not_finite: "a particle's position, velocity or velocity gradient is no longer finite",
+            STATUS.left_domain: "a particle left the domain",
+            STATUS.too_many_substeps: f"the frame needs more than {MAXIMUM_SUBSTEPS} substeps",
+        }
+        return f"frame {frame}: {rules[status]}"
 
     def _counters(self) -> list[dict[str, Any]]:
         counter, value = self.counter.to_numpy(), self.scene_value.to_numpy()

@@ -5,12 +5,15 @@ Kernels take few arrays rather than many scalars, since each argument of a launc
 
 from __future__ import annotations
 
-from typing import NamedTuple
+import dataclasses
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from hgn.config import MpmConfig
-from hgn.scene.material import FLUIDS, MATERIALS
+from hgn.scene.material import FLUIDS, MATERIAL_PARAMETERS, MATERIALS
+from hgn.scene.scene import Scene
 
 BLOCK = 4  # nodes along the side of a block of the grid
 BLOCK_NODES = BLOCK**3
@@ -28,15 +31,12 @@ class Constant(NamedTuple):
     snow_smallest: int = 5  # singular values that snow bears elastically
     snow_largest: int = 6
     maximum_hardening: int = 7
-    water_smallest_volume: int = 8
-    smallest_singular_value: int = 9
-    mass: int = 10  # of a particle, in units of the config's
-    # of the friction angle: > 0 where sand yields as Matsuoka and Nakai have it, < 0 as Mohr and Coulomb; 0: a cone
-    sand_sine: int = 11
-    water_tension: int = 12  # share of the tension that stretched water bears
-    viscosity: int = 13  # of water, Pa s
-    grain: int = 14  # of sand, d sqrt(2 rho_grain), sqrt(kg / m): see constitutive
-    length: int = 15
+    mass: int = 8  # of a particle, in units of the config's
+    sand_sine: int = 9  # sine of the friction angle
+    water_tension: int = 10  # fraction of the tension that stretched water bears
+    viscosity: int = 11  # of water, Pa s
+    grain: int = 12  # of sand, d sqrt(2 rho_grain), sqrt(kg / m): see constitutive
+    length: int = 13
 
 
 class Count(NamedTuple):
@@ -106,14 +106,13 @@ class Setting(NamedTuple):
     inverse_cell_size: int = 1
     fixed_time_step: int = 2  # s; 0 for the adaptive rule
     fixed_substeps: int = 3  # a frame, where the time step is fixed
-    speed_fraction: int = 4
-    density_relaxation: int = 5  # in a second, of water's J to its density
-    low: int = 6  # 6, 7, 8: smallest coordinates of a particle
-    high: int = 9  # 9, 10, 11: largest
-    size: int = 12  # 12, 13, 14: of the domain
-    transfer_interval: int = 15  # s; 0 where every substep is a transfer
-    leapfrog: int = 16  # 1 where velocities belong to the middle of an interval, 0 to its end
-    length: int = 17
+    density_relaxation: int = 4  # of water's J to its density, 1/s
+    low: int = 5  # 5, 6, 7: smallest coordinates of a particle
+    high: int = 8  # 8, 9, 10: largest
+    size: int = 11  # 11, 12, 13: of the domain
+    transfer_interval: int = 14  # s; 0 where every substep is a transfer
+    leapfrog: int = 15  # 1 where velocities belong to the middle of an interval, 0 to its end
+    length: int = 16
 
 
 class Shape(NamedTuple):
@@ -124,11 +123,10 @@ class Shape(NamedTuple):
     scene_blocks: int = 6
     all_blocks: int = 7  # of all scenes
     wall_cells: int = 8
-    sticky_walls: int = 9
-    maximum_substeps: int = 10
-    ghosts: int = 11  # nodes that sheets hide from particles near them, of all scenes: see mls_mpm
-    ghost_begin: int = 12  # the first of their second fields in the array of nodes
-    part_begin: int = 13  # from here on: first particle of each (scene, part), and the end
+    maximum_substeps: int = 9
+    ghosts: int = 10  # nodes that sheets hide from particles near them, of all scenes: see mls_mpm
+    ghost_begin: int = 11  # the first of their second fields in the array of nodes
+    part_begin: int = 12  # from here on: first particle of each (scene, part), and the end
 
 
 class Variant(NamedTuple):
@@ -138,18 +136,16 @@ class Variant(NamedTuple):
     sand: int = 2
     snow: int = 4
     contact: int = 8
-    taichi_elements_sand: int = 16
-    atomic: int = 32  # a GPU's way to add up; else in parts, one after another
+    taichi_elements: int = 16  # laws of sand and water as in Taichi Elements
+    atomic: int = 32  # sums with atomics, on a GPU; else in parts, one after another
     several_laws: int = 64  # particles of one kind differ in their constants
     sweep: int = 128  # particles are stopped at triangles
-    stiffening_water: int = 256
-    taichi_elements_water: int = 512
-    sheets: int = 1024  # some nodes have two fields
-    moving: int = 2048  # obstacles move
-    elastic: int = 4096
-    rate_of_sand: int = 8192  # friction grows with the rate of flow
-    each_step: int = 16384  # is an interval of its own
-    parts: int = 32768  # times the number of parts: the last, so it moves up where a flag is added
+    sheets: int = 256  # some nodes have two fields
+    moving: int = 512  # obstacles move
+    elastic: int = 1024
+    rate_of_sand: int = 2048  # friction grows with the rate of flow
+    each_step: int = 4096  # is an interval of its own
+    parts: int = 8192  # times the number of parts; must be the last
 
 
 class Field(NamedTuple):
@@ -208,16 +204,13 @@ def lame_parameters(config: MpmConfig) -> tuple[float, float]:
 
 
 def sand_sine(config: MpmConfig) -> float:
-    """Sine of the friction angle of Matsuoka and Nakai's law, minus that of Mohr and Coulomb's; 0 for a cone."""
-    sine = float(np.sin(np.deg2rad(config.sand_friction_angle_deg)))
-    return {"matsuoka_nakai": sine, "mohr_coulomb": -sine}.get(config.sand_friction_law, 0.0)
+    """Returns the sine of the friction angle."""
+    return float(np.sin(np.deg2rad(config.sand_friction_angle_deg)))
 
 
 def sand_alpha(config: MpmConfig) -> float:
-    """The Drucker-Prager slope, matched to Mohr-Coulomb in compression (Taichi Elements) or in plane strain."""
+    """Returns the slope of the Drucker-Prager cone that matches Mohr-Coulomb in triaxial compression."""
     sine = np.sin(np.deg2rad(config.sand_friction_angle_deg))
-    if config.sand_friction_law == "plane_strain":
-        return float(np.sqrt(2.0) * sine / 3)
     return float(np.sqrt(2 / 3) * 2 * sine / (3 - sine))
 
 
@@ -234,10 +227,42 @@ def constants(config: MpmConfig, unit_density: float | None = None) -> np.ndarra
     out[CONSTANT.hardening] = config.snow_hardening
     out[CONSTANT.snow_smallest] = 1 - config.snow_critical_compression
     out[CONSTANT.snow_largest] = 1 + config.snow_critical_stretch
-    out[CONSTANT.maximum_hardening] = config.snow_maximum_hardening
-    out[CONSTANT.water_smallest_volume] = config.water_minimum_volume_ratio
-    out[CONSTANT.smallest_singular_value] = config.minimum_singular_value
+    out[CONSTANT.maximum_hardening] = config.choices.snow_maximum_hardening
     out[CONSTANT.water_tension] = config.water_tension
     out[CONSTANT.viscosity] = config.water_viscosity_pa_s
     out[CONSTANT.grain] = config.sand_grain_diameter_m * np.sqrt(2 * config.density_kg_m3 / SOLID_FRACTION)
     return out
+
+
+def material_laws(scenes: Sequence[Scene], config: MpmConfig) -> tuple[np.ndarray, np.ndarray]:
+    """The different rows of constants, float32 [rows, K], and the row of each particle, int32 [N of all scenes].
+
+    What a scene's material_parameters leave open (a name, or NaN for a particle) is the config's. The first row is
+    the config's own.
+    Raises: ConfigError for a value that MpmConfig refuses.
+    """
+    if not any(scene.material_parameters for scene in scenes):  # to sort a million rows takes seconds
+        return constants(config, config.density_kg_m3)[None], np.zeros(sum(s.particle_count for s in scenes), np.int32)
+    own = {name: np.float32(getattr(config, name)) for name in MATERIAL_PARAMETERS}
+    columns = [
+        np.concatenate(
+            [
+                np.asarray(scene.material_parameters.get(name, np.full(scene.particle_count, own[name])), np.float32)
+                for scene in scenes
+            ]
+        )
+        for name in MATERIAL_PARAMETERS
+    ]
+    values = np.stack(columns, axis=1)
+    values = np.where(np.isnan(values), np.array([own[name] for name in MATERIAL_PARAMETERS], np.float32), values)
+    given, row = np.unique(values, axis=0, return_inverse=True)
+    laws = [constants(config, config.density_kg_m3)]
+    rows = np.zeros(len(given), np.int32)
+    for index, values in enumerate(given):
+        changed: dict[str, Any] = {
+            name: float(value) for name, value in zip(MATERIAL_PARAMETERS, values, strict=True) if value != own[name]
+        }
+        if changed:
+            rows[index] = len(laws)
+            laws.append(constants(dataclasses.replace(config, **changed), config.density_kg_m3))
+    return np.stack(laws), rows[row.reshape(-1)]

@@ -33,14 +33,7 @@ Everything is per scene: time step, interval, remaining time, state, counters. A
 
 import taichi as ti
 
-from datagen.mpm.constitutive import (
-    STIFFENING_MARGIN,
-    count_event,
-    hardening,
-    settled,
-    solid,
-    water,
-)
+from datagen.mpm.constitutive import count_event, hardening, settled, solid, water
 from datagen.mpm.layout import (
     BLOCK,
     BLOCK_NODES,
@@ -53,6 +46,7 @@ from datagen.mpm.layout import (
     VARIANT,
     has_solid,
 )
+from datagen.mpm.nodes import base_node, node_place, weights
 from datagen.mpm.surface_kernel import MOVING_NODE_VECTORS, NODE_VECTORS, hidden_nodes, meet, stop_at_surface
 from hgn.scene.material import FLUIDS, SNOW
 
@@ -66,111 +60,13 @@ Nodes = ti.types.ndarray(dtype=ti.types.vector(4, ti.f32), ndim=1)
 
 
 @ti.func
-def weights(fx):
-    """Quadratic B-spline weights of nodes 0, 1, 2 for an offset fx in [0.5, 1.5) cells, per axis."""
-    return (
-        0.5 * (1.5 - fx) ** 2,
-        0.75 - (fx - 1.0) ** 2,
-        0.5 * (fx - 0.5) ** 2,
-    )
-
-
-@ti.func
-def spline(distance: ti.f32) -> ti.f32:
-    """The weight of a node from the distance to it along one axis, in (-1.5, 1.5) cells."""
-    away = ti.abs(distance)
-    outer = 1.5 - away
-    return 0.75 - away * away if away < 0.5 else 0.5 * outer * outer
-
-
-@ti.func
-def _node_of_axis(index, stride: ti.i32, local_stride: ti.i32):
-    """What a node's index along one axis adds to its place in an array; those of the three axes add up."""
-    return (index >> 2) * stride + (index & 3) * local_stride
-
-
-@ti.func
-def base_node(x, inverse_dx: ti.f32):
-    return ti.floor(x * inverse_dx - 0.5, ti.i32)
-
-
-@ti.func
 def _not_finite(value) -> ti.i32:
     return (ti.bit_cast(value, ti.i32) & 0x7F800000) == 0x7F800000
 
 
 @ti.func
-def mark(
-    x,
-    scene: ti.i32,
-    inverse_dx: ti.f32,
-    shape: ti.template(),
-    block: ti.template(),
-    list_begin: ti.i32,
-    length: ti.template(),
-    length_at: ti.i32,
-):
-    """Adds the blocks that the particle's nodes lie in, up to eight, to a list.
-
-    `block` begins with a flag for each of the all_blocks blocks of all scenes. From `list_begin` on it lists the
-    indices of touched ones, length[length_at] of them; all_blocks after each entry lies its block's place along x, y,
-    z, in ten bits each.
-    """
-    base = base_node(x, inverse_dx)
-    first = base >> 2
-    last = (base + 2) >> 2
-    corner = ti.Matrix([[last[axis] if n >> (2 - axis) & 1 else first[axis] for axis in range(3)] for n in range(8)])
-    index = ti.Vector(
-        [
-            scene * shape[SHAPE.scene_blocks]
-            + (corner[n, 0] * shape[SHAPE.blocks + 1] + corner[n, 1]) * shape[SHAPE.blocks + 2]
-            + corner[n, 2]
-            for n in range(8)
-        ]
-    )
-    flag = ti.Vector([block[index[n]] for n in range(8)])  # all at once: each is a way to memory
-    for n in ti.static(range(8)):
-        fresh = flag[n] == 0
-        for axis in ti.static(range(3)):
-            if ti.static(bool(n >> (2 - axis) & 1)):
-                fresh = fresh and first[axis] != last[axis]
-        if fresh:
-            if ti.atomic_max(block[index[n]], 1) == 0:
-                entry = list_begin + ti.atomic_add(length[length_at], 1)
-                block[entry] = index[n]
-                block[entry + shape[SHAPE.all_blocks]] = (corner[n, 0] << 20) | (corner[n, 1] << 10) | corner[n, 2]
-
-
-@ti.func
-def node_places(base, first_entry: ti.i32, shape: ti.template(), entries: ti.template()):
-    """Where nodes base .. base + 2 lie in an array of `entries` numbers a node, by axis: node base + (i, j, k) begins
-    at the sum of the first result's i, the second's j and the third's k. The scene's nodes begin at `first_entry`.
-    """
-    stride_z = BLOCK_NODES * entries
-    stride_y = shape[SHAPE.blocks + 2] * stride_z
-    stride_x = shape[SHAPE.blocks + 1] * stride_y
-    offset = ti.Vector([0, 1, 2])
-    return (
-        first_entry + _node_of_axis(base[0] + offset, stride_x, BLOCK * BLOCK * entries),
-        _node_of_axis(base[1] + offset, stride_y, BLOCK * entries),
-        _node_of_axis(base[2] + offset, stride_z, entries),
-    )
-
-
-@ti.func
 def respond(
-    C,
-    stretch,
-    F,
-    volume: ti.f32,
-    material: ti.i32,
-    row: ti.i32,
-    step: ti.f32,
-    scene: ti.i32,
-    counter: ti.template(),
-    setting: ti.template(),
-    law: ti.template(),
-    variant: ti.template(),
+    C, stretch, F, volume: ti.f32, material: ti.i32, row: ti.i32, step: ti.f32, scene: ti.i32, arrays: ti.template()
 ):
     """The material's answer to a step of `step` seconds with the velocity gradient C, 1/s.
 
@@ -182,10 +78,10 @@ def respond(
     and F, both as they were for water; the new volume (see constitutive); and the present (3 lambda + 2 mu) / density,
     m²/s².
     """
-    has_water = ti.static(bool(variant & VARIANT.water))
-    solids = ti.static(has_solid(variant))
-    inverse_dx = setting[SETTING.inverse_cell_size]
-    density = law[row + CONSTANT.density]
+    has_water = ti.static(bool(arrays.variant & VARIANT.water))
+    solids = ti.static(has_solid(arrays.variant))
+    inverse_dx = arrays.setting[SETTING.inverse_cell_size]
+    density = arrays.law[row + CONSTANT.density]
     scale = -4.0 * inverse_dx * inverse_dx / density  # V0 / mass = 1 / density
     response = ti.Matrix.zero(ti.f32, 3, 3)
     new_stretch = stretch
@@ -195,16 +91,12 @@ def respond(
     if ti.static(has_water):
         if ti.static(not solids) or is_fluid(material):
             expansion = step * C.trace()
-            if ti.static(bool(variant & VARIANT.taichi_elements_water)):
+            if ti.static(bool(arrays.variant & VARIANT.taichi_elements)):
                 expansion = (ti.Matrix.identity(ti.f32, 3) + step * C).determinant() - 1.0
-            J, pressure, water_stiffness = water(
-                volume, expansion, law, row, counter, scene, ti.static(bool(variant & VARIANT.stiffening_water))
-            )
+            J, pressure, water_stiffness = water(volume, expansion, arrays.law, row, arrays.counter, scene)
             new_volume = J
-            if ti.static(bool(variant & VARIANT.stiffening_water)):
-                water_stiffness *= STIFFENING_MARGIN if J < 1.0 else 1.0
             stiffness = water_stiffness
-            viscosity = law[row + CONSTANT.viscosity]
+            viscosity = arrays.law[row + CONSTANT.viscosity]
             if viscosity > 0.0:
                 rate = 0.5 * (C + C.transpose())
                 response += scale * 2.0 * viscosity * J * (rate - C.trace() / 3.0 * ti.Matrix.identity(ti.f32, 3))
@@ -223,11 +115,11 @@ def respond(
                 trial_F,
                 volume,
                 material,
-                law,
+                arrays.law,
                 row,
-                counter,
+                arrays.counter,
                 scene,
-                variant,
+                arrays.variant,
                 step,
             )
             new_F = solid_F
@@ -247,10 +139,7 @@ def node_velocity(
     corner: ti.i32,
     fall,
     scene: ti.i32,
-    scene_value: ti.template(),
-    shape: ti.template(),
-    contact_normal: ti.template(),
-    variant: ti.template(),
+    arrays: ti.template(),
 ):
     """The new velocity of a node's field: what colliders, then walls, leave of `before` + `momentum` / `mass` + `fall`;
     the momentum is what came to it, `fall` is gravity's. 0 where the mass is at the rounding of the weights.
@@ -261,23 +150,23 @@ def node_velocity(
     v = ti.Vector([0.0, 0.0, 0.0])
     if mass > SMALLEST_MASS:
         v = before + momentum / mass + fall
-        if ti.static(bool(variant & VARIANT.contact)):
+        if ti.static(bool(arrays.variant & VARIANT.contact)):
             if facing >= 0:
                 entry = facing // 2
                 field = facing - 2 * entry
-                moving = ti.static(bool(variant & VARIANT.moving))
+                moving = ti.static(bool(arrays.variant & VARIANT.moving))
                 at = ti.static(MOVING_NODE_VECTORS if moving else NODE_VECTORS) * entry
-                friction = contact_normal[at + 2][0]
-                least = contact_normal[at + 3][0]
+                friction = arrays.contact_normal[at + 2][0]
+                least = arrays.contact_normal[at + 3][0]
                 if field == 1:
-                    friction = contact_normal[at + 2][1]
-                    least = contact_normal[at + 3][1]
+                    friction = arrays.contact_normal[at + 2][1]
+                    least = arrays.contact_normal[at + 3][1]
                 if mass >= least:
                     if ti.static(moving):
-                        surface = contact_normal[at + 4 + field]
-                        v = meet(v - surface, contact_normal[at + field], friction) + surface
+                        surface = arrays.contact_normal[at + 4 + field]
+                        v = meet(v - surface, arrays.contact_normal[at + field], friction) + surface
                     else:
-                        v = meet(v, contact_normal[at + field], friction)
+                        v = meet(v, arrays.contact_normal[at + field], friction)
         # walls last: whatever a collider leaves, nothing leaves the domain
         index = ti.Vector(
             [
@@ -286,57 +175,18 @@ def node_velocity(
                 (corner & 1023) * BLOCK + (local & 3),
             ]
         )
-        wall_cells = shape[SHAPE.wall_cells]
-        stuck = 0
+        wall_cells = arrays.shape[SHAPE.wall_cells]
         for axis in ti.static(range(3)):
             outward = 0.0
             if index[axis] < wall_cells:
                 outward = -1.0
-            if index[axis] >= shape[SHAPE.nodes + axis] - wall_cells:
+            if index[axis] >= arrays.shape[SHAPE.nodes + axis] - wall_cells:
                 outward = 1.0
             if outward != 0.0:
-                stuck = 1
                 normal = ti.Vector([0.0, 0.0, 0.0])
                 normal[axis] = -outward
-                v = meet(v, normal, scene_value[scene, VALUE.wall_friction + axis])
-        if stuck and shape[SHAPE.sticky_walls]:
-            v = ti.Vector([0.0, 0.0, 0.0])
+                v = meet(v, normal, arrays.scene_value[scene, VALUE.wall_friction + axis])
     return v
-
-
-@ti.func
-def interpolate(x, first_node: ti.i32, node: ti.template(), inverse_dx: ti.f32, shape: ti.template()):
-    """The velocity at x from the nodes around, and its gradient, APIC's C, 1/s. The scene's begin at `first_node`."""
-    scaled = x * inverse_dx
-    base = ti.floor(scaled - 0.5, ti.i32)
-    fx = scaled - ti.cast(base, ti.f32)
-    w0, w1, w2 = weights(fx)
-    w = ti.static((w0, w1, w2))
-    index_x, index_y, index_z = node_places(base, first_node, shape, 1)
-    v = ti.Vector([0.0, 0.0, 0.0])
-    gradient_x = ti.Vector([0.0, 0.0, 0.0])
-    gradient_y = ti.Vector([0.0, 0.0, 0.0])
-    gradient_z = ti.Vector([0.0, 0.0, 0.0])
-    for i in ti.static(range(3)):
-        plane = ti.Vector([0.0, 0.0, 0.0])
-        plane_y = ti.Vector([0.0, 0.0, 0.0])
-        plane_z = ti.Vector([0.0, 0.0, 0.0])
-        for j in ti.static(range(3)):
-            line = ti.Vector([0.0, 0.0, 0.0])
-            line_z = ti.Vector([0.0, 0.0, 0.0])
-            for k in ti.static(range(3)):
-                whole = node[index_x[i] + index_y[j] + index_z[k]]
-                share = w[k][2] * ti.Vector([whole[0], whole[1], whole[2]])
-                line += share
-                line_z += (k - fx[2]) * share
-            plane += w[j][1] * line
-            plane_y += w[j][1] * (j - fx[1]) * line
-            plane_z += w[j][1] * line_z
-        v += w[i][0] * plane
-        gradient_x += w[i][0] * (i - fx[0]) * plane
-        gradient_y += w[i][0] * plane_y
-        gradient_z += w[i][0] * plane_z
-    return v, ti.Matrix.cols([gradient_x, gradient_y, gradient_z]) * (4.0 * inverse_dx)
 
 
 @ti.func
@@ -364,152 +214,75 @@ def _room(fx, base: ti.i32, axis: ti.template(), shape: ti.template()) -> ti.f32
 
 
 @ti.func
-def settles(scene: ti.i32, scene_value: ti.template(), setting: ti.template()) -> ti.i32:
+def settles(scene: ti.i32, arrays: ti.template()) -> ti.i32:
     """Whether the water of a scene follows its density."""
-    return scene_value[scene, VALUE.water_density] > 0.0 and setting[SETTING.density_relaxation] > 0.0
+    return arrays.scene_value[scene, VALUE.water_density] > 0.0 and arrays.setting[SETTING.density_relaxation] > 0.0
 
 
 @ti.func
-def settle(
-    x,
-    volume: ti.f32,
-    mass: ti.f32,
-    scene: ti.i32,
-    scene_value: ti.template(),
-    setting: ti.template(),
-    shape: ti.template(),
-) -> ti.f32:
+def settle(x, volume: ti.f32, mass: ti.f32, scene: ti.i32, arrays: ti.template()) -> ti.f32:
     """J of a particle of water after an interval, nearer to what its density tells: that of the nodes around, whose
     masses are interpolated to `mass`.
     """
-    scaled = x * setting[SETTING.inverse_cell_size]
+    scaled = x * arrays.setting[SETTING.inverse_cell_size]
     base = ti.floor(scaled - 0.5, ti.i32)
     fx = scaled - ti.cast(base, ti.f32)
-    room = _room(fx[0], base[0], 0, shape) * _room(fx[1], base[1], 1, shape) * _room(fx[2], base[2], 2, shape)
-    share = scene_value[scene, VALUE.interval_elapsed] * setting[SETTING.density_relaxation]
-    density = mass / (scene_value[scene, VALUE.water_density] * ti.max(room, 0.1))
+    room = (
+        _room(fx[0], base[0], 0, arrays.shape)
+        * _room(fx[1], base[1], 1, arrays.shape)
+        * _room(fx[2], base[2], 2, arrays.shape)
+    )
+    share = arrays.scene_value[scene, VALUE.interval_elapsed] * arrays.setting[SETTING.density_relaxation]
+    density = mass / (arrays.scene_value[scene, VALUE.water_density] * ti.max(room, 0.1))
     return settled(volume, density, ti.min(share, 1.0))
 
 
 @ti.func
-def node_place(index, scene: ti.i32, shape: ti.template()) -> ti.i32:
-    """Where a node's entry lies in arrays that hold one for each node."""
-    block = index >> 2
-    local = index & 3
-    place = (block[0] * shape[SHAPE.blocks + 1] + block[1]) * shape[SHAPE.blocks + 2] + block[2]
-    place = (scene * shape[SHAPE.scene_blocks] + place) * BLOCK_NODES
-    return place + (local[0] * BLOCK + local[1]) * BLOCK + local[2]
-
-
-@ti.func
-def _triangle_list(x, scene: ti.i32, contact: ti.template(), setting: ti.template(), shape: ti.template()) -> ti.i32:
+def _triangle_list(x, scene: ti.i32, arrays: ti.template()) -> ti.i32:
     """Where the list of triangles near a particle begins in `contact`, or -1."""
-    base = base_node(x, setting[SETTING.inverse_cell_size])
-    return contact[shape[SHAPE.all_blocks] * BLOCK_NODES + node_place(base, scene, shape)]
+    base = base_node(x, arrays.setting[SETTING.inverse_cell_size])
+    return arrays.contact[arrays.shape[SHAPE.all_blocks] * BLOCK_NODES + node_place(base, scene, arrays.shape)]
 
 
 @ti.func
-def find_hidden(
-    x,
-    scene: ti.i32,
-    elapsed: ti.f32,
-    contact: ti.template(),
-    contact_normal: ti.template(),
-    setting: ti.template(),
-    shape: ti.template(),
-    variant: ti.template(),
-) -> ti.i32:
+def find_hidden(x, scene: ti.i32, elapsed: ti.f32, arrays: ti.template()) -> ti.i32:
     """Which of a particle's nodes sheets hide from it, in bits (see surface_kernel.hidden_nodes). A node's second field
     is shared by all particles that it is hidden from. Contacts that move were placed `elapsed` seconds ago.
     """
     bits = 0
-    list_at = _triangle_list(x, scene, contact, setting, shape)
+    list_at = _triangle_list(x, scene, arrays)
     if list_at >= 0:
-        moving = ti.static(bool(variant & VARIANT.moving))
-        scaled = x * setting[SETTING.inverse_cell_size]
-        bits = hidden_nodes(scaled, list_at, elapsed, contact, contact_normal, moving)
+        moving = ti.static(bool(arrays.variant & VARIANT.moving))
+        scaled = x * arrays.setting[SETTING.inverse_cell_size]
+        bits = hidden_nodes(scaled, list_at, elapsed, arrays, moving)
     return bits
 
 
 @ti.func
-def ghost_place(index, scene: ti.i32, contact: ti.template(), shape: ti.template()) -> ti.i32:
-    """Where a node's second field lies, in numbers of nodes."""
-    return shape[SHAPE.ghost_begin] + contact[node_place(index, scene, shape)]
-
-
-@ti.func
-def interpolate_hidden(
-    x,
-    v,
-    C,
-    hidden: ti.i32,
-    scene: ti.i32,
-    node: ti.template(),
-    inverse_dx: ti.f32,
-    shape: ti.template(),
-    contact: ti.template(),
-):
-    """The v and C that `interpolate` gave, with the second fields of hidden nodes in place of their first."""
-    scaled = x * inverse_dx
-    base = ti.floor(scaled - 0.5, ti.i32)
-    new_v = v
-    new_C = C
-    bits = hidden
-    n = 0
-    while bits != 0:
-        if bits & 1:
-            index = base + ti.Vector([n // 9, n // 3 % 3, n % 3])
-            offset = ti.cast(index, ti.f32) - scaled
-            place = node_place(index, scene, shape)
-            difference = node[shape[SHAPE.ghost_begin] + contact[place]] - node[place]
-            change = ti.Vector([difference[0], difference[1], difference[2]])
-            change *= spline(offset[0]) * spline(offset[1]) * spline(offset[2])
-            new_v += change
-            new_C += (4.0 * inverse_dx) * change.outer_product(offset)
-        bits >>= 1
-        n += 1
-    return new_v, new_C
-
-
-@ti.func
-def move(
-    x,
-    v,
-    C,
-    scene: ti.i32,
-    scene_value: ti.template(),
-    counter: ti.template(),
-    setting: ti.template(),
-    shape: ti.template(),
-    contact: ti.template(),
-    contact_normal: ti.template(),
-    variant: ti.template(),
-):
+def move(x, v, C, scene: ti.i32, arrays: ti.template()):
     """The particle's position and velocity at the end of an interval, as triangles and bounds leave them, and v².
 
     What is not finite, or leaves the domain, stops its scene; v² is 0 then.
     """
-    out = x + scene_value[scene, VALUE.interval_elapsed] * v
+    out = x + arrays.scene_value[scene, VALUE.interval_elapsed] * v
     speed = v
-    if ti.static(bool(variant & VARIANT.sweep)):
-        list_at = _triangle_list(x, scene, contact, setting, shape)
+    if ti.static(bool(arrays.variant & VARIANT.sweep)):
+        list_at = _triangle_list(x, scene, arrays)
         if list_at >= 0:
-            moving = ti.static(bool(variant & VARIANT.moving))
-            interval = scene_value[scene, VALUE.interval_elapsed]
+            moving = ti.static(bool(arrays.variant & VARIANT.moving))
+            interval = arrays.scene_value[scene, VALUE.interval_elapsed]
             elapsed = 0.0
             if ti.static(moving):
-                elapsed = scene_value[scene, VALUE.part] - scene_value[scene, VALUE.remaining] - interval
-            out, speed = stop_at_surface(
-                x, out, v, list_at, elapsed, interval, scene, contact, contact_normal, counter, setting, moving
-            )
+                elapsed = arrays.scene_value[scene, VALUE.part] - arrays.scene_value[scene, VALUE.remaining] - interval
+            out, speed = stop_at_surface(x, out, v, list_at, elapsed, interval, scene, arrays, moving)
     speed_square = speed.dot(speed)
     bad = _not_finite(speed_square) | _not_finite(out.sum()) | _not_finite(C.sum())
     outside = 0
     clamps = 0
     for axis in ti.static(range(3)):
-        low = setting[SETTING.low + axis]
-        high = setting[SETTING.high + axis]
-        if not (out[axis] >= 0.0 and out[axis] <= setting[SETTING.size + axis]):
+        low = arrays.setting[SETTING.low + axis]
+        high = arrays.setting[SETTING.high + axis]
+        if not (out[axis] >= 0.0 and out[axis] <= arrays.setting[SETTING.size + axis]):
             outside = 1
         if not out[axis] >= low:
             out[axis] = low
@@ -518,17 +291,17 @@ def move(
             out[axis] = high
             clamps = 1
     if bad:
-        counter[scene, COUNT.status] = ti.cast(STATUS.not_finite, ti.i64)
-        scene_value[scene, VALUE.remaining] = 0.0
+        arrays.counter[scene, COUNT.status] = ti.cast(STATUS.not_finite, ti.i64)
+        arrays.scene_value[scene, VALUE.remaining] = 0.0
         speed_square = 0.0
     elif outside:
         # a value that is not finite is the better cause to report
-        if counter[scene, COUNT.status] != STATUS.not_finite:
-            counter[scene, COUNT.status] = ti.cast(STATUS.left_domain, ti.i64)
-        scene_value[scene, VALUE.remaining] = 0.0
+        if arrays.counter[scene, COUNT.status] != STATUS.not_finite:
+            arrays.counter[scene, COUNT.status] = ti.cast(STATUS.left_domain, ti.i64)
+        arrays.scene_value[scene, VALUE.remaining] = 0.0
         speed_square = 0.0
     else:
-        count_event(counter, scene, COUNT.position_clamps, clamps)
+        count_event(arrays.counter, scene, COUNT.position_clamps, clamps)
     return out, speed, speed_square
 
 

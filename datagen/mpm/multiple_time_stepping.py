@@ -17,7 +17,7 @@ import taichi as ti
 
 from datagen.mpm.constitutive import foreseen_stiffness
 from datagen.mpm.layout import COUNT, SETTING, SHAPE, VALUE
-from datagen.mpm.mls_mpm import base_node
+from datagen.mpm.nodes import base_node
 
 MANY = 32  # substeps of a step of a particle's own at most, and as far as marks count
 SLACK = 1e-3  # of a substep, within which times are the same
@@ -32,31 +32,22 @@ def _corner_block(first, last, n: ti.template(), scene: ti.i32, shape: ti.templa
 
 
 @ti.func
-def _raise_marks(base, least: ti.i32, scene: ti.i32, shape: ti.template(), block: ti.template(), begin: ti.i32):
+def _raise_marks(base, least: ti.i32, scene: ti.i32, arrays: ti.template(), begin: ti.i32):
     """Marks of all blocks that the nodes from `base` on lie in, from block[begin] on, become `least` at least."""
     first, last = base >> 2, (base + 2) >> 2
-    index = ti.Vector([begin + _corner_block(first, last, n, scene, shape) for n in range(8)])
-    found = ti.Vector([block[index[n]] for n in range(8)])  # all at once: each is a way to memory
+    index = ti.Vector([begin + _corner_block(first, last, n, scene, arrays.shape) for n in range(8)])
+    found = ti.Vector([arrays.block[index[n]] for n in range(8)])  # all at once: each is a way to memory
     for n in ti.static(range(8)):
         own = found[n] < least
         for axis in ti.static(range(3)):
             if ti.static(bool(n >> (2 - axis) & 1)):
                 own = own and first[axis] != last[axis]
         if own:
-            ti.atomic_max(block[index[n]], least)
+            ti.atomic_max(arrays.block[index[n]], least)
 
 
 @ti.func
-def mark_changed(
-    x,
-    scene: ti.i32,
-    now: ti.i32,
-    many: ti.f32,
-    inverse_dx: ti.f32,
-    shape: ti.template(),
-    block: ti.template(),
-    begin: ti.i32,
-):
+def mark_changed(x, scene: ti.i32, now: ti.i32, many: ti.f32, inverse_dx: ti.f32, arrays: ti.template(), begin: ti.i32):
     """Marks the blocks of the particle's nodes: in the substep `now` it gives them the impulse of `many` substeps.
 
     A block's mark is block[begin + its index], the largest now MANY + MANY - many of all that change the block: of the
@@ -64,19 +55,12 @@ def mark_changed(
     """
     base = base_node(x, inverse_dx)
     change = now * MANY + MANY - ti.cast(many, ti.i32)
-    _raise_marks(base, change, scene, shape, block, begin)
+    _raise_marks(base, change, scene, arrays, begin)
 
 
 @ti.func
 def _alike_around(
-    x,
-    scene: ti.i32,
-    interval: ti.i32,
-    own: ti.f32,
-    inverse_dx: ti.f32,
-    shape: ti.template(),
-    block: ti.template(),
-    begin: ti.i32,
+    x, scene: ti.i32, interval: ti.i32, own: ti.f32, inverse_dx: ti.f32, arrays: ti.template(), begin: ti.i32
 ) -> ti.i32:
     """Whether all particles in the blocks of a particle's nodes began the interval before with steps of `own` substeps;
     what this one takes is marked for the next.
@@ -86,18 +70,18 @@ def _alike_around(
     earlier is no match.
     """
     base = base_node(x, inverse_dx)
-    blocks = shape[SHAPE.all_blocks]
+    blocks = arrays.shape[SHAPE.all_blocks]
     present = begin + 2 * (interval & 1) * blocks
     former = begin + 2 * ((interval - 1) & 1) * blocks
     many = ti.cast(own, ti.i32)
     fewest, most = interval * MANY + MANY - many, interval * MANY + many - 1
     alike = 1
     for n in ti.static(range(8)):
-        index = former + _corner_block(base >> 2, (base + 2) >> 2, n, scene, shape)
-        if (block[index] != fewest - MANY) | (block[index + blocks] != most - MANY):
+        index = former + _corner_block(base >> 2, (base + 2) >> 2, n, scene, arrays.shape)
+        if (arrays.block[index] != fewest - MANY) | (arrays.block[index + blocks] != most - MANY):
             alike = 0
-    _raise_marks(base, fewest, scene, shape, block, present)
-    _raise_marks(base, most, scene, shape, block, present + blocks)
+    _raise_marks(base, fewest, scene, arrays, present)
+    _raise_marks(base, most, scene, arrays, present + blocks)
     return alike
 
 
@@ -133,14 +117,8 @@ def own_step(
     begins: ti.f32,
     step: ti.f32,
     scene: ti.i32,
-    counter: ti.template(),
-    shape: ti.template(),
-    block: ti.template(),
+    arrays: ti.template(),
     marks: ti.i32,
-    scene_value: ti.template(),
-    setting: ti.template(),
-    law: ti.template(),
-    variant: ti.template(),
 ):
     """The step of its own that a particle begins in this substep (see acts). Times are in s, within the interval.
 
@@ -158,14 +136,14 @@ def own_step(
     a step has; particles that keep the same `alike` have the same steps. In an interval that is not synchronised, and
     in the last substep of each, a step is a substep.
     """
-    elapsed = scene_value[scene, VALUE.interval_elapsed]
-    left = scene_value[scene, VALUE.interval_remaining]
+    elapsed = arrays.scene_value[scene, VALUE.interval_elapsed]
+    left = arrays.scene_value[scene, VALUE.interval_remaining]
     begin = elapsed - step
     before = strained
     ahead = covered - begin
     if begins == 1.0:
-        before -= scene_value[scene, VALUE.last_interval]
-        ahead -= scene_value[scene, VALUE.last_interval]
+        before -= arrays.scene_value[scene, VALUE.last_interval]
+        ahead -= arrays.scene_value[scene, VALUE.last_interval]
     if strained < 0.0:
         before, ahead = begin, 0.0
     if spread:
@@ -176,11 +154,11 @@ def own_step(
     many = 1.0
     acting = step
     until = elapsed
-    if scene_value[scene, VALUE.synchronised] == 1.0 and left > 0.0:
-        whole = scene_value[scene, VALUE.whole_step]
-        inverse_dx = setting[SETTING.inverse_cell_size]
-        stiffness = foreseen_stiffness(C, volume, material, left + step, inverse_dx, law, row, variant)
-        longest = scene_value[scene, VALUE.stability_fraction] * setting[SETTING.cell_size]
+    if arrays.scene_value[scene, VALUE.synchronised] == 1.0 and left > 0.0:
+        whole = arrays.scene_value[scene, VALUE.whole_step]
+        inverse_dx = arrays.setting[SETTING.inverse_cell_size]
+        stiffness = foreseen_stiffness(C, volume, material, left + step, inverse_dx, arrays.law, row, arrays.variant)
+        longest = arrays.scene_value[scene, VALUE.stability_fraction] * arrays.setting[SETTING.cell_size]
         longest /= ti.sqrt(ti.max(stiffness, 1e-3)) * whole
         longest = ti.min(ti.max(ti.floor(longest + 1e-4), 1.0), ti.cast(MANY, ti.f32))
         total = (elapsed + left) / whole
@@ -189,9 +167,9 @@ def own_step(
         if begins == 1.0:
             many = ti.floor(0.5 * total / ti.ceil(total / alike - 1e-3) + 0.501)
             until = begin
-            interval = ti.cast(counter[scene, COUNT.transfers], ti.i32)
-            others = marks + shape[SHAPE.all_blocks]
-            if not _alike_around(x, scene, interval, alike, inverse_dx, shape, block, others):
+            interval = ti.cast(arrays.counter[scene, COUNT.transfers], ti.i32)
+            others = marks + arrays.shape[SHAPE.all_blocks]
+            if not _alike_around(x, scene, interval, alike, inverse_dx, arrays, others):
                 spreads = 1
         elif steps <= 1.0:
             many = 1.0 + ti.round(left / whole + 0.5)
@@ -200,8 +178,8 @@ def own_step(
             many = ti.floor(2.0 * (before + (elapsed + left - before) / steps - begin) / whole + 1e-3)
             many = ti.min(ti.max(many, 1.0), ti.round(left / whole + 0.5))
             until = begin + 0.5 * many * whole
-        now = ti.cast(counter[scene, COUNT.substeps], ti.i32)
-        mark_changed(x, scene, now, 1.0 if spreads else ti.min(many, MANY), inverse_dx, shape, block, marks)
+        now = ti.cast(arrays.counter[scene, COUNT.substeps], ti.i32)
+        mark_changed(x, scene, now, 1.0 if spreads else ti.min(many, MANY), inverse_dx, arrays, marks)
         acting = step + ti.min((many - 1.0) * whole, left)
     acts_until = begin + acting
     length = until - before
@@ -214,7 +192,7 @@ def own_step(
     length = ti.max(length, SLACK * step)
     strained_until = before + length
     if begins == 1.0:
-        catch_up = scene_value[scene, VALUE.catch_up]
+        catch_up = arrays.scene_value[scene, VALUE.catch_up]
         length = ti.max(length + catch_up, SLACK * step)
         acting += 0.5 * catch_up
     return length, strained_until, acts_until, many, spreads, acting

@@ -64,8 +64,8 @@ def simulate(
     """Simulates `scenes` side by side and returns `frames` frames of each, the initial state among them.
 
     The scenes may differ in particles, materials, obstacles and gravity, but share domain and cell size. With
-    an adaptive time step particles and grid exchange velocities every dx / transfer_speed_m_s, or every step of stress
-    where that is longer, at most every speed_fraction dx / |v|max, spread evenly over what is left of the frame. Each
+    adaptive time steps particles and grid exchange velocities every dx / transfer_speed_m_s, or every step of stress
+    where that is longer, at most every SPEED_FRACTION dx / |v|max, spread evenly over what is left of the frame. Each
     scene takes its own steps of stress between: at most stability_fraction dx sqrt(rho / (3 lambda_h + 2 mu_h)). A
     fixed time step, each with its transfer, is taken ceil(frame / step) times a frame in full, as Taichi Elements does:
     54 times at 60 Hz and 3.125e-4 s, which is 1.25 % more than the frame.
@@ -81,7 +81,7 @@ def simulate(
 
     Particles with an entry time are NaN in the frames before; they enter in free flight from the place given.
 
-    A scene that turns non-finite, leaves the domain or needs more than `maximum_substeps_per_frame` ends as a
+    A scene that turns non-finite, leaves the domain or needs more than MAXIMUM_SUBSTEPS a frame ends as a
     SceneFailure with cause and frame. A scene without particles gives [frames, 0, 3].
 
     Raises: ConfigError for scenes that do not share a grid, particles outside the walls, obstacles that are
@@ -98,7 +98,7 @@ def simulate(
         require_free_entries(scene, entered)
         _require_sound(entered, index, low, high)
     if colliders is None:
-        colliders = [build_collider(scene, config.collider_band_cells) for scene in scenes]
+        colliders = [build_collider(scene, config.choices.collider_band_cells) for scene in scenes]
     require(len(colliders) == len(scenes), "colliders", f"one for each of {len(scenes)} scenes", len(colliders))
     fractions = [config.stability_fraction] * len(scenes) if stability_fractions is None else list(stability_fractions)
     require(len(fractions) == len(scenes), "stability_fractions", f"one for each of {len(scenes)} scenes", fractions)
@@ -117,7 +117,8 @@ def simulate(
             own_fractions,
         )  # fmt: skip
         moving = any(scene.moves for scene in batch[0])
-        require(not moving or config.time_step == "adaptive", "time_step", "adaptive where obstacles move", "fixed")
+        step_s = config.fixed_time_step_s
+        require(not moving or step_s is None, "fixed_time_step_s", "null where obstacles move", step_s)
         if moving or any(scene.emits for scene in batch[0]):
             team = Team(0)  # contacts that move are placed between launches, and particles enter there
         elif team is None:

@@ -39,30 +39,23 @@ def _drift(scaled, triangle: ti.i32, contact_normal: ti.template()):
 
 
 @ti.func
-def hidden_nodes(
-    scaled,
-    list_at: ti.i32,
-    elapsed: ti.f32,
-    contact: ti.template(),
-    contact_normal: ti.template(),
-    moving: ti.template(),
-) -> ti.i32:
+def hidden_nodes(scaled, list_at: ti.i32, elapsed: ti.f32, arrays: ti.template(), moving: ti.template()) -> ti.i32:
     """Which of a particle's nodes sheets hide from it: bit 9 i + 3 j + k says that the way to node base + (i, j, k)
     crosses a triangle of a sheet. The particle is at `scaled`, in cells; its base node's list begins at list_at.
     Triangles have moved for `elapsed` seconds since they were listed; which side nodes lie on was settled then.
     """
     bits = 0
     to_base = ti.floor(scaled - 0.5) - scaled
-    for s in range(list_at + LIST_HEAD, list_at + LIST_HEAD + contact[list_at + 1]):
-        triangle = contact[s]
-        normal = contact_normal[triangle + 1]
-        across_1 = contact_normal[triangle + 2]
-        across_2 = contact_normal[triangle + 3]
-        offset = scaled - contact_normal[triangle]
+    for s in range(list_at + LIST_HEAD, list_at + LIST_HEAD + arrays.contact[list_at + 1]):
+        triangle = arrays.contact[s]
+        normal = arrays.contact_normal[triangle + 1]
+        across_1 = arrays.contact_normal[triangle + 2]
+        across_2 = arrays.contact_normal[triangle + 3]
+        offset = scaled - arrays.contact_normal[triangle]
         height = normal.dot(offset)
         height_base = height + normal.dot(to_base)
         if ti.static(moving):
-            height -= elapsed * normal.dot(_drift(scaled, triangle, contact_normal))
+            height -= elapsed * normal.dot(_drift(scaled, triangle, arrays.contact_normal))
         lowest = height_base + 2.0 * ti.min(normal, 0.0).sum()
         highest = height_base + 2.0 * ti.max(normal, 0.0).sum()
         if (height >= 0.0 and lowest < 0.0) or (height < 0.0 and highest >= -ON_TRIANGLE):
@@ -82,14 +75,7 @@ def hidden_nodes(
 
 @ti.func
 def _first_crossing(
-    start,
-    end,
-    list_at: ti.i32,
-    elapsed: ti.f32,
-    interval: ti.f32,
-    contact: ti.template(),
-    contact_normal: ti.template(),
-    moving: ti.template(),
+    start, end, list_at: ti.i32, elapsed: ti.f32, interval: ti.f32, arrays: ti.template(), moving: ti.template()
 ):
     """The triangle that the way from start to end (in cells) meets first, of the list that begins at list_at.
 
@@ -102,15 +88,15 @@ def _first_crossing(
     free = ti.Vector([0.0, 0.0, 0.0])
     friction = 0.0
     velocity = ti.Vector([0.0, 0.0, 0.0])
-    for s in range(list_at + LIST_HEAD, list_at + LIST_HEAD + contact[list_at]):
-        triangle = contact[s]
-        corner = contact_normal[triangle]
-        normal = contact_normal[triangle + 1]
+    for s in range(list_at + LIST_HEAD, list_at + LIST_HEAD + arrays.contact[list_at]):
+        triangle = arrays.contact[s]
+        corner = arrays.contact_normal[triangle]
+        normal = arrays.contact_normal[triangle + 1]
         begin = start - corner
         finish = end - corner
         drift = ti.Vector([0.0, 0.0, 0.0])
         if ti.static(moving):  # in the frame in which the triangle lies where it was listed
-            drift = _drift(start, triangle, contact_normal)
+            drift = _drift(start, triangle, arrays.contact_normal)
             begin -= elapsed * drift
             finish -= (elapsed + interval) * drift
         before = normal.dot(begin)
@@ -123,13 +109,13 @@ def _first_crossing(
             if after < 0.0:
                 fraction = before / (before - after)
             place = begin + fraction * (finish - begin)
-            along_1 = contact_normal[triangle + 2].dot(place)
-            along_2 = contact_normal[triangle + 3].dot(place)
+            along_1 = arrays.contact_normal[triangle + 2].dot(place)
+            along_2 = arrays.contact_normal[triangle + 3].dot(place)
             if along_1 >= -EDGE and along_2 >= -EDGE and along_1 + along_2 <= 1.0 + EDGE and fraction < first:
                 first = fraction
                 stop = end + normal * (STOP - after)
                 free = normal
-                friction = contact_normal[triangle + 4][0]
+                friction = arrays.contact_normal[triangle + 4][0]
                 velocity = drift
     return first, stop, free, friction, velocity
 
@@ -143,10 +129,7 @@ def stop_at_surface(
     elapsed: ti.f32,
     interval: ti.f32,
     scene: ti.i32,
-    contact: ti.template(),
-    contact_normal: ti.template(),
-    counter: ti.template(),
-    setting: ti.template(),
+    arrays: ti.template(),
     moving: ti.template(),
 ):
     """The place that a particle from x reaches on its way to out, and its velocity there.
@@ -154,15 +137,15 @@ def stop_at_surface(
     A triangle in the way takes what leads through it, and the particle slides on along it with what its friction leaves
     of the velocity. What then leads through a third triangle (in a corner) stays at x.
     """
-    dx = setting[SETTING.cell_size]
-    start = x * setting[SETTING.inverse_cell_size]
-    end = out * setting[SETTING.inverse_cell_size]
+    dx = arrays.setting[SETTING.cell_size]
+    start = x * arrays.setting[SETTING.inverse_cell_size]
+    end = out * arrays.setting[SETTING.inverse_cell_size]
     moved = out
     speed = v
     attempt = 0
     while attempt < ATTEMPTS:
         fraction, stop, free, friction, velocity = _first_crossing(
-            start, end, list_at, elapsed, interval, contact, contact_normal, moving
+            start, end, list_at, elapsed, interval, arrays, moving
         )
         if fraction <= 1.0:
             if ti.static(moving):
@@ -172,7 +155,7 @@ def stop_at_surface(
             end = stop
             moved = stop * dx
             if attempt == 0:
-                ti.atomic_add(counter[scene, COUNT.surface_projections], ti.cast(1, ti.i64))
+                ti.atomic_add(arrays.counter[scene, COUNT.surface_projections], ti.cast(1, ti.i64))
             attempt += 1
             if attempt == ATTEMPTS:
                 moved = x

@@ -14,6 +14,8 @@ space are neighbours in memory.
 With one thread a block it runs on a CPU too; the tests check it there against the other kernel.
 """
 
+from collections import namedtuple
+
 import taichi as ti
 
 from datagen.mpm.device_memory import load, store
@@ -24,13 +26,13 @@ from datagen.mpm.mls_mpm import (
     Vectors,
     find_hidden,
     initial_stiffness,
-    mark,
     move,
     respond,
     settle,
     settles,
 )
 from datagen.mpm.multiple_time_stepping import own_step
+from datagen.mpm.nodes import mark
 from datagen.mpm.team_lists import gives_now, list_acting, mark_going_on, start_lists
 from datagen.mpm.team_meeting import (
     ACTING,
@@ -48,6 +50,8 @@ from datagen.mpm.team_meeting import (
     wait,
 )
 from datagen.mpm.team_particles import (
+    Share,
+    Thread,
     dealt,
     get_matrix,
     get_symmetric,
@@ -65,182 +69,136 @@ CPU_ITEMS = 512  # of a loop, that Taichi gives to a thread of a CPU at once: a 
 CHUNK = 32  # particles that follow each other, of one block of a team
 
 
+# The arguments of `advance`, which its functions take as one. Taichi resolves the names as it compiles.
+TeamArrays = namedtuple(
+    "TeamArrays",
+    [
+        "state", "node", "tag", "rank", "strained", "covered", "spread", "response", "hidden", "cell_count",
+        "column_count", "column_list", "block", "live", "columns", "meeting", "turn", "scene_value",
+        "counter", "setting", "law", "shape", "contact", "contact_normal", "output", "variant", "threads",
+        "several", "run", "giving",
+    ],
+)  # fmt: skip
+
+
 @ti.func
 def _strain(
-    owned: ti.i32,
-    part: ti.i32,
-    chunk: ti.i32,
-    blocks: ti.i32,
-    lane: ti.i32,
-    scene: ti.i32,
-    first: ti.i32,
+    share: ti.template(),
+    thread: ti.template(),
     particles: ti.i32,
     tags: ti.i32,
-    stride: ti.i32,
-    segment: ti.i32,
-    velocities: ti.i32,
     step: ti.f32,
     begins: ti.f32,
     own_steps: ti.i32,
     some_wait: ti.i32,
-    state: ti.template(),
-    tag: ti.template(),
-    column_list: ti.template(),
-    giving: ti.template(),
-    columns: ti.template(),
-    strained: ti.template(),
-    covered: ti.template(),
-    spread: ti.template(),
-    response: ti.template(),
-    hidden: ti.template(),
-    node: ti.template(),
-    block: ti.template(),
-    live: ti.template(),
-    scene_value: ti.template(),
-    counter: ti.template(),
-    setting: ti.template(),
-    law: ti.template(),
-    shape: ti.template(),
-    contact: ti.template(),
-    contact_normal: ti.template(),
-    variant: ti.template(),
-    threads: ti.template(),
-    run: ti.template(),
+    arrays: ti.template(),
 ):
     """The materials' answer of each particle that acts to the gradient of the nodes' velocities, left in place of C; in
     the first step of an interval to C, and also which nodes it touches. Where particles take steps of their own, those
     act that list_acting found, else all.
     """
-    solid = ti.static(has_solid(variant))
-    intervals = ti.static(not variant & VARIANT.each_step)
+    solid = ti.static(has_solid(arrays.variant))
+    intervals = ti.static(not arrays.variant & VARIANT.each_step)
     largest = 0.0
     held = 0.0
     fastest = 0.0
-    acting_count = owned
-    if ti.static(intervals and run > 1):  # noqa: SIM102 (this one is the compiler's)
+    acting_count = share.owned
+    if ti.static(intervals and arrays.run > 1):  # noqa: SIM102 (this one is the compiler's)
         if own_steps:
-            acting_count = columns[segment + ACTING]
-    own = lane
+            acting_count = arrays.columns[thread.segment + ACTING]
+    own = thread.lane
     while own < acting_count:
-        p = dealt(own, part, chunk, blocks)
-        own += threads
+        p = dealt(own, thread, share.chunk)
+        own += arrays.threads
         if ti.static(intervals):  # noqa: SIM102 (this one is the compiler's)
             if own_steps:
-                if ti.static(run > 1):
-                    p = column_list[first + p]
-                elif not gives_now(
-                    p, first, step, scene, particles, stride, some_wait, state, covered, spread, giving, block,
-                    counter, scene_value, setting, shape,
-                ):  # fmt: skip
+                if ti.static(arrays.run > 1):
+                    p = arrays.column_list[share.first + p]
+                elif not gives_now(p, share, step, particles, thread.stride, some_wait, arrays):
                     continue
         place = particles + p
-        x = get_vector(state, place, stride, FIELD.position)
+        x = get_vector(arrays.state, place, thread.stride, FIELD.position)
         C = ti.Matrix.zero(ti.f32, 3, 3)
         stretch = ti.Matrix.zero(ti.f32, 3, 3)
         if begins == 1.0:
-            C = get_matrix(state, place, stride, FIELD.affine)
-            if ti.static(bool(variant & VARIANT.sheets)):
-                hidden[first + p] = find_hidden(x, scene, 0.0, contact, contact_normal, setting, shape, variant)
+            C = get_matrix(arrays.state, place, thread.stride, FIELD.affine)
+            if ti.static(bool(arrays.variant & VARIANT.sheets)):
+                arrays.hidden[share.first + p] = find_hidden(x, share.scene, 0.0, arrays)
             mark(
-                x, scene, setting[SETTING.inverse_cell_size], shape, block,
-                shape[SHAPE.all_blocks] + scene * shape[SHAPE.scene_blocks], live, scene * LIVE.length + LIVE.blocks,
+                x, share.scene, arrays.setting[SETTING.inverse_cell_size], arrays,
+                arrays.shape[SHAPE.all_blocks] + share.scene * arrays.shape[SHAPE.scene_blocks], arrays.live,
+                share.scene * LIVE.length + LIVE.blocks,
             )  # fmt: skip
         else:
             bits = 0
-            if ti.static(bool(variant & VARIANT.sheets)):
-                bits = hidden[first + p]
-            v, found_C, _ = gather(x, bits, scene, velocities, node, setting, shape, contact, variant)
+            if ti.static(bool(arrays.variant & VARIANT.sheets)):
+                bits = arrays.hidden[share.first + p]
+            v, found_C, _ = gather(x, bits, share.scene, thread.velocities, arrays)
             C = found_C
             fastest = ti.max(fastest, v.dot(v))
             if ti.static(solid):
-                stretch = get_symmetric(state, place, stride, FIELD.stretch)
+                stretch = get_symmetric(arrays.state, place, thread.stride, FIELD.stretch)
         F = ti.Matrix.identity(ti.f32, 3)
         if ti.static(solid):
-            F = get_matrix(state, place, stride, FIELD.deformation)
+            F = get_matrix(arrays.state, place, thread.stride, FIELD.deformation)
         row = 0
-        if ti.static(bool(variant & VARIANT.several_laws)):
-            row = tag[tags + TAG.law_row * stride + p]
-        material = tag[tags + TAG.material * stride + p]
-        old_volume = load(state, place + FIELD.volume * stride)
+        if ti.static(bool(arrays.variant & VARIANT.several_laws)):
+            row = arrays.tag[tags + TAG.law_row * thread.stride + p]
+        material = arrays.tag[tags + TAG.material * thread.stride + p]
+        old_volume = load(arrays.state, place + FIELD.volume * thread.stride)
         length, acting, many, spreads = step, step, 1.0, 0
         if ti.static(intervals):
             length, until, acts_until, many, spreads, acting = own_step(
-                strained[first + p], covered[first + p], spread[first + p], x, C, old_volume, material, row, begins,
-                step, scene, counter, shape, block, 3 * shape[SHAPE.all_blocks], scene_value, setting, law, variant,
+                arrays.strained[share.first + p], arrays.covered[share.first + p], arrays.spread[share.first + p], x,
+                C, old_volume, material, row, begins, step, share.scene, arrays, 3 * arrays.shape[SHAPE.all_blocks],
             )  # fmt: skip
-            strained[first + p] = until
-            covered[first + p] = acts_until
-            spread[first + p] = spreads
+            arrays.strained[share.first + p] = until
+            arrays.covered[share.first + p] = acts_until
+            arrays.spread[share.first + p] = spreads
         answer, new_stretch, new_F, volume, stiffness = respond(
-            C, stretch, F, old_volume, material, row, length, scene, counter, setting, law, variant
+            C, stretch, F, old_volume, material, row, length, share.scene, arrays
         )
         if ti.static(intervals) and spreads:
             for i, j, k in ti.static(((0, 0, 0), (1, 1, 1), (2, 2, 2), (3, 0, 1), (4, 0, 2), (5, 1, 2))):
-                response[first + p + i * stride] = answer[j, k]
-        put_matrix(state, place, stride, FIELD.affine, begins * C + acting * answer)
+                arrays.response[share.first + p + i * thread.stride] = answer[j, k]
+        put_matrix(arrays.state, place, thread.stride, FIELD.affine, begins * C + acting * answer)
         if ti.static(solid):
-            put_matrix(state, place, stride, FIELD.deformation, new_F)
+            put_matrix(arrays.state, place, thread.stride, FIELD.deformation, new_F)
             if ti.static(intervals):
-                put_symmetric(state, place, stride, FIELD.stretch, new_stretch)
-        store(state, place + FIELD.volume * stride, volume)
+                put_symmetric(arrays.state, place, thread.stride, FIELD.stretch, new_stretch)
+        store(arrays.state, place + FIELD.volume * thread.stride, volume)
         largest = ti.max(largest, stiffness)
         if many > 1.0:
             held = ti.max(held, stiffness)
-    raise_by_warps(lane, counter, scene, COUNT.stiffness_bits, largest, threads)
-    raise_by_warps(lane, counter, scene, COUNT.held_stiffness_bits, held, threads)
-    raise_by_warps(lane, counter, scene, COUNT.speed_square_bits, fastest, threads)
+    raise_by_warps(thread.lane, arrays, share.scene, COUNT.stiffness_bits, largest)
+    raise_by_warps(thread.lane, arrays, share.scene, COUNT.held_stiffness_bits, held)
+    raise_by_warps(thread.lane, arrays, share.scene, COUNT.speed_square_bits, fastest)
 
 
 @ti.func
-def _move(
-    owned: ti.i32,
-    part: ti.i32,
-    chunk: ti.i32,
-    blocks: ti.i32,
-    lane: ti.i32,
-    scene: ti.i32,
-    first: ti.i32,
-    particles: ti.i32,
-    tags: ti.i32,
-    stride: ti.i32,
-    velocities: ti.i32,
-    state: ti.template(),
-    tag: ti.template(),
-    hidden: ti.template(),
-    node: ti.template(),
-    scene_value: ti.template(),
-    counter: ti.template(),
-    setting: ti.template(),
-    shape: ti.template(),
-    contact: ti.template(),
-    contact_normal: ti.template(),
-    variant: ti.template(),
-    threads: ti.template(),
-):
+def _move(share: ti.template(), thread: ti.template(), particles: ti.i32, tags: ti.i32, arrays: ti.template()):
     """New velocities and their gradients, as obstacles leave them, and new positions."""
     largest = 0.0
-    own = lane
-    while own < owned:
-        p = dealt(own, part, chunk, blocks)
+    own = thread.lane
+    while own < share.owned:
+        p = dealt(own, thread, share.chunk)
         place = particles + p
-        x = get_vector(state, place, stride, FIELD.position)
+        x = get_vector(arrays.state, place, thread.stride, FIELD.position)
         bits = 0
-        if ti.static(bool(variant & VARIANT.sheets)):
-            bits = hidden[first + p]
-        v, C, mass = gather(x, bits, scene, velocities, node, setting, shape, contact, variant)
-        moved, speed, speed_square = move(
-            x, v, C, scene, scene_value, counter, setting, shape, contact, contact_normal, variant
-        )
-        if ti.static(bool(variant & VARIANT.water)):  # noqa: SIM102 (this one is the compiler's)
-            if tag[tags + TAG.material * stride + p] == WATER and settles(scene, scene_value, setting):
-                volume = place + FIELD.volume * stride
-                store(state, volume, settle(x, load(state, volume), mass, scene, scene_value, setting, shape))
-        put_vector(state, place, stride, FIELD.position, moved)
-        put_vector(state, place, stride, FIELD.velocity, speed)
-        put_matrix(state, place, stride, FIELD.affine, C)
+        if ti.static(bool(arrays.variant & VARIANT.sheets)):
+            bits = arrays.hidden[share.first + p]
+        v, C, mass = gather(x, bits, share.scene, thread.velocities, arrays)
+        moved, speed, speed_square = move(x, v, C, share.scene, arrays)
+        if ti.static(bool(arrays.variant & VARIANT.water)):  # noqa: SIM102 (this one is the compiler's)
+            if arrays.tag[tags + TAG.material * thread.stride + p] == WATER and settles(share.scene, arrays):
+                volume = place + FIELD.volume * thread.stride
+                store(arrays.state, volume, settle(x, load(arrays.state, volume), mass, share.scene, arrays))
+        put_vector(arrays.state, place, thread.stride, FIELD.position, moved)
+        put_vector(arrays.state, place, thread.stride, FIELD.velocity, speed)
+        put_matrix(arrays.state, place, thread.stride, FIELD.affine, C)
         largest = ti.max(largest, speed_square)
-        own += threads
-    raise_by_warps(lane, counter, scene, COUNT.speed_square_bits, largest, threads)
+        own += arrays.threads
+    raise_by_warps(thread.lane, arrays, share.scene, COUNT.speed_square_bits, largest)
 
 
 @ti.kernel
@@ -307,10 +265,16 @@ def advance(
         velocities = node_entries // 2
         state = state_address
         node = node_address
+        arrays = ti.static(TeamArrays(
+            state, node, tag, rank, strained, covered, spread, response, hidden, cell_count, column_count,
+            column_list, block, live, columns, meeting, turn, scene_value, counter, setting, law, shape, contact,
+            contact_normal, output, variant, threads, several, run, rank,
+        ))  # fmt: skip
         meetings = 0
         choices = 0
         at = (team + 1) * MEETING
         segment = SEGMENT * (team * blocks + part)
+        thread = ti.static(Thread(lane, part, blocks, member, members, stride, velocities, at, segment, patience))
         scenes = turn.shape[0]
         turns = 0
         place_in_turn = 0
@@ -318,7 +282,7 @@ def advance(
             if member == 0:
                 take_turn(at, meeting)
             # whether all blocks are at work at once shows before anything is simulated
-            meet_team(at, lane, meetings, meeting, columns, segment, patience, threads, several, blocks)
+            meet_team(thread, meetings, arrays)
             if frames > 0 and columns[segment + LEAVES] == 0:
                 turns = scenes * ((frames + stretch - 1) // stretch)
                 place_in_turn = meeting[at + TURN]
@@ -331,6 +295,7 @@ def advance(
                 chunk = CHUNK
             round_of_all = chunk * blocks
             owned = count // round_of_all * chunk + ti.min(ti.max(count % round_of_all - part * chunk, 0), chunk)
+            share = ti.static(Share(scene, first, chunk, owned))
             live_at = scene * LIVE.length
             copy = live[live_at + LIVE.copy]
             frame = place_in_turn // scenes * stretch
@@ -342,10 +307,7 @@ def advance(
                     if member == 0:
                         counter[scene, COUNT.frame_substeps] = ti.cast(0, ti.i64)
                         scene_value[scene, VALUE.remaining] = frame_s
-                    meet_and_choose(
-                        at, lane, scene, meetings, choices, meeting, columns, segment, patience, scene_value, counter,
-                        setting, shape, live, threads, several, blocks,
-                    )  # fmt: skip
+                    meet_and_choose(thread, scene, meetings, choices, arrays)
                 particles = copy * fields * stride + first
                 tags = copy * TAG.length * stride + first
                 while going:
@@ -365,11 +327,7 @@ def advance(
                     going = step > 0.0 and columns[segment + LEAVES] == 0
                     if going:
                         if begins == 1.0 and not sorted_already:
-                            sort(
-                                owned, part, chunk, blocks, scene, first, copy, segment, at, lane, meetings, stride,
-                                state, tag, rank, cell_count, column_count, column_list, columns, live, meeting,
-                                patience, setting, shape, fields, threads, several,
-                            )  # fmt: skip
+                            sort(share, thread, copy, meetings, arrays, fields)
                             copy = 1 - copy
                             particles = copy * fields * stride + first
                             tags = copy * TAG.length * stride + first
@@ -377,52 +335,29 @@ def advance(
                         listed = ti.static(not variant & VARIANT.each_step and run > 1)
                         if ti.static(listed):  # noqa: SIM102 (this one is the compiler's)
                             if own_steps:
-                                list_acting(
-                                    owned, part, chunk, blocks, lane, scene, first, segment, step, covered,
-                                    spread, column_list, rank, columns, scene_value, threads,
-                                )  # fmt: skip
+                                list_acting(share, thread, step, arrays)
                                 wait(threads)
                                 if some_wait:
-                                    mark_going_on(
-                                        owned, part, chunk, blocks, lane, scene, first, segment, particles, stride,
-                                        state, column_list, columns, block, counter, setting, shape, threads,
-                                    )  # fmt: skip
-                        _strain(
-                            owned, part, chunk, blocks, lane, scene, first, particles, tags, stride, segment,
-                            velocities, step, begins, own_steps, some_wait, state, tag, column_list, rank, columns,
-                            strained, covered, spread, response, hidden, node, block, live, scene_value, counter,
-                            setting, law, shape, contact, contact_normal, variant, threads, run,
-                        )  # fmt: skip
+                                    mark_going_on(share, thread, particles, arrays)
+                        _strain(share, thread, particles, tags, step, begins, own_steps, some_wait, arrays)
                         wait(threads)
-                        scatter(
-                            owned, part, chunk, blocks, lane, scene, first, particles, tags, stride, segment, begins,
-                            own_steps, step, state, tag, rank, columns, response, hidden, node, setting, law, shape,
-                            contact, variant, threads, run,
-                        )  # fmt: skip
-                        meet_team(at, lane, meetings, meeting, columns, segment, patience, threads, several, blocks)
+                        scatter(share, thread, particles, tags, begins, own_steps, step, arrays)
+                        meet_team(thread, meetings, arrays)
                         if ti.static(listed):
-                            start_lists(lane, segment, columns)
+                            start_lists(thread, columns)
                         # a thread that hardly has nodes of its own, while the others are at theirs
                         if not ends and member == members - 1:
-                            choose(scene, scene_value, counter, setting, shape, live)
+                            choose(scene, arrays)
                         update_nodes(
-                            member, scene, velocities, begins, ends, some_wait, now, whole, left, gravity_time, fallen,
-                            block, live, node, scene_value, shape, contact, contact_normal, variant, members,
-                        )  # fmt: skip
-                        meet_team(at, lane, meetings, meeting, columns, segment, patience, threads, several, blocks)
+                            thread, scene, begins, ends, some_wait, now, whole, left, gravity_time, fallen, arrays
+                        )
+                        meet_team(thread, meetings, arrays)
                         if ends:
-                            _move(
-                                owned, part, chunk, blocks, lane, scene, first, particles, tags, stride, velocities,
-                                state, tag, hidden, node, scene_value, counter, setting, shape, contact,
-                                contact_normal, variant, threads,
-                            )  # fmt: skip
-                            meet_and_choose(
-                                at, lane, scene, meetings, choices, meeting, columns, segment, patience, scene_value,
-                                counter, setting, shape, live, threads, several, blocks,
-                            )  # fmt: skip
+                            _move(share, thread, particles, tags, arrays)
+                            meet_and_choose(thread, scene, meetings, choices, arrays)
                 own = lane
                 while own < owned:
-                    p = dealt(own, part, chunk, blocks)
+                    p = dealt(own, thread, chunk)
                     target = frame * stride + first + tag[tags + TAG.origin * stride + p]
                     for axis in ti.static(range(3)):
                         output[3 * target + axis] = load(state, particles + p + (FIELD.position + axis) * stride)
@@ -436,15 +371,13 @@ def advance(
             if member == 0:
                 live[live_at + LIVE.copy] = copy
                 take_turn(at, meeting)
-            leave_scene((teams + 1) * MEETING + scene, lane, meeting, threads)
-            meet_team(at, lane, meetings, meeting, columns, segment, patience, threads, several, blocks)
+            leave_scene((teams + 1) * MEETING + scene, lane, arrays)
+            meet_team(thread, meetings, arrays)
             place_in_turn = meeting[at + TURN]
             if place_in_turn >= scenes and place_in_turn < turns:
-                await_scene(
-                    (teams + 1) * MEETING + turn[place_in_turn % scenes], place_in_turn // scenes * blocks, lane,
-                    meeting, columns, segment, threads,
-                )  # fmt: skip
-            meet_team(at, lane, meetings, meeting, columns, segment, patience, threads, several, blocks)
+                entry = (teams + 1) * MEETING + turn[place_in_turn % scenes]
+                await_scene(entry, place_in_turn // scenes * blocks, thread, arrays)
+            meet_team(thread, meetings, arrays)
 
 
 @ti.kernel

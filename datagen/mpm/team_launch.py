@@ -73,8 +73,14 @@ class TeamLaunch(Launch):
         self.columns = ti.ndarray(ti.i32, SEGMENT * self.teams * team.blocks)
         self.host_copy = HostCopy()
         for array in (
-            self.cell_count, self.column_count, self.covered, self.spread, self.block, self.columns, self.node,
-        ):  # fmt: skip
+            self.cell_count,
+            self.column_count,
+            self.covered,
+            self.spread,
+            self.block,
+            self.columns,
+            self.node,
+        ):
             array.fill(0)
         self.live = device_array(np.zeros(len(self.scenes) * LIVE.length, np.int32))
         team_kernel.start_team(

@@ -23,160 +23,107 @@ IDLE = -(2**31)
 
 
 @ti.func
-def _places(entry, columns: ti.template(), segment: ti.i32, lane: ti.i32, threads: ti.template()):
+def _places(entry, arrays: ti.template(), thread: ti.template()):
     """Of each of three lists, whose new entries are 1 in `entry`, the place of this thread's: places are given to all
     threads of a warp at once, in their order.
     """
     before = ti.Vector([0, 0, 0])
-    if ti.static(threads > 1):
+    if ti.static(arrays.threads > 1):
         # three counts of at most 32 in one number
         own = entry[0] | entry[1] << 8 | entry[2] << 16
         total = own
         for step in ti.static((1, 2, 4, 8, 16)):
             below = ti.simt.warp.shfl_up_i32(ti.u32(FULL), total, step)
-            if lane % WARP >= step:
+            if thread.lane % WARP >= step:
                 total += below
         begin = ti.Vector([0, 0, 0])
-        if lane % WARP == WARP - 1:
+        if thread.lane % WARP == WARP - 1:
             for i in ti.static(range(3)):
                 count = total >> (8 * i) & 255
                 if count > 0:
-                    begin[i] = ti.atomic_add(columns[segment + ACTING + i], count)
+                    begin[i] = ti.atomic_add(arrays.columns[thread.segment + ACTING + i], count)
         for i in ti.static(range(3)):
             begin[i] = ti.simt.warp.shfl_sync_i32(ti.u32(FULL), begin[i], WARP - 1)
             before[i] = begin[i] + ((total - own) >> (8 * i) & 255)
     else:
         for i in ti.static(range(3)):
             if entry[i] == 1:
-                before[i] = ti.atomic_add(columns[segment + ACTING + i], 1)
+                before[i] = ti.atomic_add(arrays.columns[thread.segment + ACTING + i], 1)
     return before
 
 
 @ti.func
-def list_acting(
-    owned: ti.i32,
-    part: ti.i32,
-    chunk: ti.i32,
-    blocks: ti.i32,
-    lane: ti.i32,
-    scene: ti.i32,
-    first: ti.i32,
-    segment: ti.i32,
-    step: ti.f32,
-    covered: ti.template(),
-    spread: ti.template(),
-    column_list: ti.template(),
-    giving: ti.template(),
-    columns: ti.template(),
-    scene_value: ti.template(),
-    threads: ti.template(),
-):
+def list_acting(share: ti.template(), thread: ti.template(), step: ti.f32, arrays: ti.template()):
     """Makes the block's lists for a substep within an interval; their counts are 0 before."""
-    rounds = (owned + threads - 1) // threads
+    rounds = (share.owned + arrays.threads - 1) // arrays.threads
     for around in range(rounds):
-        own = around * threads + lane
+        own = around * arrays.threads + thread.lane
         entry = ti.Vector([0, 0, 0])
         p = -1
-        if own < owned:
-            p = dealt(own, part, chunk, blocks)
-            spreads = spread[first + p]
-            if acts(covered[first + p], 0.0, step, scene, scene_value):
+        if own < share.owned:
+            p = dealt(own, thread, share.chunk)
+            spreads = arrays.spread[share.first + p]
+            if acts(arrays.covered[share.first + p], 0.0, step, share.scene, arrays.scene_value):
                 entry = ti.Vector([1, 0, 1])
             elif spreads == 1:
                 entry = ti.Vector([0, 1, 1])
-        place = _places(entry, columns, segment, lane, threads)
+        place = _places(entry, arrays, thread)
         if entry[0] == 1:
-            column_list[first + dealt(place[0], part, chunk, blocks)] = p
+            arrays.column_list[share.first + dealt(place[0], thread, share.chunk)] = p
         if entry[1] == 1:
-            column_list[first + dealt(owned - 1 - place[1], part, chunk, blocks)] = p
+            arrays.column_list[share.first + dealt(share.owned - 1 - place[1], thread, share.chunk)] = p
         if entry[2] == 1:
-            giving[first + dealt(place[2], part, chunk, blocks)] = p if entry[0] == 1 else -1 - p
+            arrays.giving[share.first + dealt(place[2], thread, share.chunk)] = p if entry[0] == 1 else -1 - p
 
 
 @ti.func
-def mark_going_on(
-    owned: ti.i32,
-    part: ti.i32,
-    chunk: ti.i32,
-    blocks: ti.i32,
-    lane: ti.i32,
-    scene: ti.i32,
-    first: ti.i32,
-    segment: ti.i32,
-    particles: ti.i32,
-    stride: ti.i32,
-    state: ti.template(),
-    column_list: ti.template(),
-    columns: ti.template(),
-    block: ti.template(),
-    counter: ti.template(),
-    setting: ti.template(),
-    shape: ti.template(),
-    threads: ti.template(),
-):
+def mark_going_on(share: ti.template(), thread: ti.template(), particles: ti.i32, arrays: ti.template()):
     """Marks the blocks of nodes of what goes on with a step whose stress acts evenly (see mark_changed)."""
-    count = columns[segment + GOING_ON]
-    own = lane
+    count = arrays.columns[thread.segment + GOING_ON]
+    own = thread.lane
     while own < count:
-        p = column_list[first + dealt(owned - 1 - own, part, chunk, blocks)]
-        own += threads
-        _mark(p, scene, particles, stride, state, block, counter, setting, shape)
+        p = arrays.column_list[share.first + dealt(share.owned - 1 - own, thread, share.chunk)]
+        own += arrays.threads
+        _mark(p, share.scene, particles, thread.stride, arrays)
 
 
 @ti.func
-def start_lists(lane: ti.i32, segment: ti.i32, columns: ti.template()):
+def start_lists(thread: ti.template(), columns: ti.template()):
     """Counts of 0, which the block sees after its next meeting."""
-    if lane == 0:
+    if thread.lane == 0:
         for i in ti.static(range(3)):
-            columns[segment + ACTING + i] = 0
+            columns[thread.segment + ACTING + i] = 0
 
 
 @ti.func
 def gives_now(
     p: ti.i32,
-    first: ti.i32,
+    share: ti.template(),
     step: ti.f32,
-    scene: ti.i32,
     particles: ti.i32,
     stride: ti.i32,
     some_wait: ti.i32,
-    state: ti.template(),
-    covered: ti.template(),
-    spread: ti.template(),
-    giving: ti.template(),
-    block: ti.template(),
-    counter: ti.template(),
-    scene_value: ti.template(),
-    setting: ti.template(),
-    shape: ti.template(),
+    arrays: ti.template(),
 ) -> ti.i32:
     """Whether a particle begins a step of its own, where none is put before another: its entry in `giving`, and the
     marks of one that goes on.
     """
-    begins_own = acts(covered[first + p], 0.0, step, scene, scene_value)
+    begins_own = acts(arrays.covered[share.first + p], 0.0, step, share.scene, arrays.scene_value)
     if begins_own:
-        giving[first + p] = p
-    elif spread[first + p] == 1:
-        giving[first + p] = -1 - p
+        arrays.giving[share.first + p] = p
+    elif arrays.spread[share.first + p] == 1:
+        arrays.giving[share.first + p] = -1 - p
         if some_wait:
-            _mark(p, scene, particles, stride, state, block, counter, setting, shape)
+            _mark(p, share.scene, particles, stride, arrays)
     else:
-        giving[first + p] = IDLE
+        arrays.giving[share.first + p] = IDLE
     return begins_own
 
 
 @ti.func
-def _mark(
-    p: ti.i32,
-    scene: ti.i32,
-    particles: ti.i32,
-    stride: ti.i32,
-    state: ti.template(),
-    block: ti.template(),
-    counter: ti.template(),
-    setting: ti.template(),
-    shape: ti.template(),
-):
-    x = get_vector(state, particles + p, stride, FIELD.position)
-    now = ti.cast(counter[scene, COUNT.substeps], ti.i32)
-    mark_changed(x, scene, now, 1.0, setting[SETTING.inverse_cell_size], shape, block, 3 * shape[SHAPE.all_blocks])
+def _mark(p: ti.i32, scene: ti.i32, particles: ti.i32, stride: ti.i32, arrays: ti.template()):
+    x = get_vector(arrays.state, particles + p, stride, FIELD.position)
+    now = ti.cast(arrays.counter[scene, COUNT.substeps], ti.i32)
+    mark_changed(
+        x, scene, now, 1.0, arrays.setting[SETTING.inverse_cell_size], arrays, 3 * arrays.shape[SHAPE.all_blocks]
+    )

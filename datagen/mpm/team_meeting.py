@@ -36,52 +36,33 @@ def fence(threads: ti.template()):
 
 
 @ti.func
-def await_count(
-    meeting: ti.template(),
-    entry: ti.i32,
-    target: ti.i32,
-    columns: ti.template(),
-    segment: ti.i32,
-    patience: ti.i32,
-    threads: ti.template(),
-):
+def await_count(arrays: ti.template(), entry: ti.i32, target: ti.i32, segment: ti.i32, patience: ti.i32):
     looks = 0
     while looks >= 0:
-        if ti.atomic_max(meeting[entry], 0) >= target:  # Taichi has no load that passes by the caches
+        if ti.atomic_max(arrays.meeting[entry], 0) >= target:  # Taichi has no load that passes by the caches
             looks = -1
         else:
             looks += 1
             if looks % LOOKS == 0:
-                apart = ti.atomic_max(meeting[APART], 0)
+                apart = ti.atomic_max(arrays.meeting[APART], 0)
                 if apart > 0 or looks >= patience:
-                    ti.atomic_max(meeting[APART], 1)
-                    columns[segment + LEAVES] = 1
+                    ti.atomic_max(arrays.meeting[APART], 1)
+                    arrays.columns[segment + LEAVES] = 1
                     looks = -1
-    fence(threads)
+    fence(arrays.threads)
 
 
 @ti.func
-def meet_team(
-    at: ti.i32,
-    lane: ti.i32,
-    meetings: ti.template(),
-    meeting: ti.template(),
-    columns: ti.template(),
-    segment: ti.i32,
-    patience: ti.i32,
-    threads: ti.template(),
-    several: ti.template(),
-    blocks: ti.i32,
-):
+def meet_team(thread: ti.template(), meetings: ti.template(), arrays: ti.template()):
     """Until the whole team is here, and sees what each has written; `meetings` counts a block's own."""
-    wait(threads)
-    if ti.static(several):
-        if lane == 0:
+    wait(arrays.threads)
+    if ti.static(arrays.several):
+        if thread.lane == 0:
             meetings += 1
-            fence(threads)
-            ti.atomic_add(meeting[at], 1)
-            await_count(meeting, at, meetings * blocks, columns, segment, patience, threads)
-        wait(threads)
+            fence(arrays.threads)
+            ti.atomic_add(arrays.meeting[thread.at], 1)
+            await_count(arrays, thread.at, meetings * thread.blocks, thread.segment, thread.patience)
+        wait(arrays.threads)
 
 
 @ti.func
@@ -93,102 +74,66 @@ def take_turn(at: ti.i32, meeting: ti.template()):
 
 
 @ti.func
-def leave_scene(entry: ti.i32, lane: ti.i32, meeting: ti.template(), threads: ti.template()):
+def leave_scene(entry: ti.i32, lane: ti.i32, arrays: ti.template()):
     """Counts at `entry`, which is the scene's, that this block has had a turn with it."""
-    wait(threads)
+    wait(arrays.threads)
     if lane == 0:
-        fence(threads)
-        ti.atomic_add(meeting[entry], 1)
+        fence(arrays.threads)
+        ti.atomic_add(arrays.meeting[entry], 1)
 
 
 @ti.func
-def await_scene(
-    entry: ti.i32,
-    count: ti.i32,
-    lane: ti.i32,
-    meeting: ti.template(),
-    columns: ti.template(),
-    segment: ti.i32,
-    threads: ti.template(),
-):
+def await_scene(entry: ti.i32, count: ti.i32, thread: ti.template(), arrays: ti.template()):
     """Until so many have left the scene, however long the team takes that has it: its turn came before, so it is at
     work.
     """
-    if lane == 0:
-        await_count(meeting, entry, count, columns, segment, EVER, threads)
+    if thread.lane == 0:
+        await_count(arrays, entry, count, thread.segment, EVER)
 
 
 @ti.func
-def choose(
-    scene: ti.i32,
-    scene_value: ti.template(),
-    counter: ti.template(),
-    setting: ti.template(),
-    shape: ti.template(),
-    live: ti.template(),
-):
-    choose_time_step(scene, scene_value, counter, setting, shape[SHAPE.maximum_substeps])
-    if scene_value[scene, VALUE.begins] == 1.0:
-        live[scene * LIVE.length + LIVE.blocks] = 0
+def choose(scene: ti.i32, arrays: ti.template()):
+    choose_time_step(scene, arrays.scene_value, arrays.counter, arrays.setting, arrays.shape[SHAPE.maximum_substeps])
+    if arrays.scene_value[scene, VALUE.begins] == 1.0:
+        arrays.live[scene * LIVE.length + LIVE.blocks] = 0
 
 
 @ti.func
 def meet_and_choose(
-    at: ti.i32,
-    lane: ti.i32,
-    scene: ti.i32,
-    meetings: ti.template(),
-    choices: ti.template(),
-    meeting: ti.template(),
-    columns: ti.template(),
-    segment: ti.i32,
-    patience: ti.i32,
-    scene_value: ti.template(),
-    counter: ti.template(),
-    setting: ti.template(),
-    shape: ti.template(),
-    live: ti.template(),
-    threads: ti.template(),
-    several: ti.template(),
-    blocks: ti.i32,
+    thread: ti.template(), scene: ti.i32, meetings: ti.template(), choices: ti.template(), arrays: ti.template()
 ):
     """A meeting where the last block to come chooses the next step; `choices` counts them."""
-    wait(threads)
-    if lane == 0:
+    wait(arrays.threads)
+    if thread.lane == 0:
         last = 1
-        if ti.static(several):
+        if ti.static(arrays.several):
             meetings += 1
             choices += 1
-            fence(threads)
-            if ti.atomic_add(meeting[at], 1) != meetings * blocks - 1:
+            fence(arrays.threads)
+            if ti.atomic_add(arrays.meeting[thread.at], 1) != meetings * thread.blocks - 1:
                 last = 0
         if last == 1:
-            if ti.static(several):
-                fence(threads)
-            choose(scene, scene_value, counter, setting, shape, live)
-            if ti.static(several):
-                fence(threads)
-                ti.atomic_add(meeting[at + MEETING // 3], 1)
-        if ti.static(several):
-            await_count(meeting, at + MEETING // 3, choices, columns, segment, patience, threads)
-    wait(threads)
+            if ti.static(arrays.several):
+                fence(arrays.threads)
+            choose(scene, arrays)
+            if ti.static(arrays.several):
+                fence(arrays.threads)
+                ti.atomic_add(arrays.meeting[thread.at + MEETING // 3], 1)
+        if ti.static(arrays.several):
+            await_count(arrays, thread.at + MEETING // 3, choices, thread.segment, thread.patience)
+    wait(arrays.threads)
 
 
 @ti.func
-def raise_by_warps(
-    lane: ti.i32,
-    counter: ti.template(),
-    scene: ti.i32,
-    entry: ti.template(),
-    value: ti.f32,
-    threads: ti.template(),
-):
+def raise_by_warps(lane: ti.i32, arrays: ti.template(), scene: ti.i32, entry: ti.template(), value: ti.f32):
     """raise_maximum for all threads of a block, one for a warp."""
-    if ti.static(threads > 1):
+    if ti.static(arrays.threads > 1):
         bits = ti.bit_cast(ti.max(value, 0.0), ti.i32)
         for step in ti.static((16, 8, 4, 2, 1)):
             bits = ti.max(bits, ti.simt.warp.shfl_down_i32(ti.u32(0xFFFFFFFF), bits, step))
         if lane % WARP == 0 and bits > 0:
-            ti.atomic_max(counter[scene, entry], ti.cast(bits, ti.i64))  # without a look, which would be waited for
+            ti.atomic_max(
+                arrays.counter[scene, entry], ti.cast(bits, ti.i64)
+            )  # without a look, which would be waited for
     else:
-        raise_maximum(counter, scene, entry, value)
+        raise_maximum(arrays.counter, scene, entry, value)

@@ -3,22 +3,35 @@
 State is stored by field, `state[copy, field, particle]`, in two copies; sorting goes from one to the other.
 """
 
+from collections import namedtuple
+
 import taichi as ti
 
 from datagen.mpm.device_memory import load, store
 from datagen.mpm.layout import BLOCK, BLOCK_NODES, FIELD, LIVE, SETTING, TAG
-from datagen.mpm.mls_mpm import base_node, node_place
+from datagen.mpm.nodes import base_node, node_place
 from datagen.mpm.team_meeting import meet_team, wait
 
 COPIED = 16  # fields at once
 
+# Variables of a kernel that its functions take as one.
+# Of a thread: its number in its block, the block's in the team, the number of blocks; its number in the team, and that
+# of its threads; the number of all particles; where velocities begin in `node`, the team's integers in `meeting`, the
+# block's in `columns`; and how often it reads a counter.
+Thread = namedtuple(
+    "Thread", ["lane", "part", "blocks", "member", "members", "stride", "velocities", "at", "segment", "patience"]
+)
+# Of a block's particles: their scene, its first particle, how many that follow each other are dealt out together, and
+# the number of the block's own.
+Share = namedtuple("Share", ["scene", "first", "chunk", "owned"])
+
 
 @ti.func
-def dealt(own: ti.i32, part: ti.i32, chunk: ti.i32, blocks: ti.i32) -> ti.i32:
+def dealt(own: ti.i32, thread: ti.template(), chunk: ti.i32) -> ti.i32:
     """Which of a scene's particles a block's own one is: they are dealt out in chunks, so that no block has all of
     what takes long.
     """
-    return (own // chunk * blocks + part) * chunk + own % chunk
+    return (own // chunk * thread.blocks + thread.part) * chunk + own % chunk
 
 
 @ti.func
@@ -57,105 +70,96 @@ def put_symmetric(state: ti.template(), place: ti.i32, stride: ti.i32, field: ti
 
 
 @ti.func
-def _cell(x, scene: ti.i32, setting: ti.template(), shape: ti.template()) -> ti.i32:
+def _cell(x, scene: ti.i32, arrays: ti.template()) -> ti.i32:
     """The number of a particle's cell in the order: BLOCK of them above each other are a column. Material falls, so
     what follows in a column stays beside each other for longest.
     """
-    base = base_node(x, setting[SETTING.inverse_cell_size])
-    place = node_place(base, scene, shape)
+    base = base_node(x, arrays.setting[SETTING.inverse_cell_size])
+    place = node_place(base, scene, arrays.shape)
     column = (place // BLOCK_NODES * BLOCK + (base[0] & 3)) * BLOCK + (base[2] & 3)
     return column * BLOCK + (base[1] & 3)
 
 
 @ti.func
 def sort(
-    owned: ti.i32,
-    part: ti.i32,
-    chunk: ti.i32,
-    blocks: ti.i32,
-    scene: ti.i32,
-    first: ti.i32,
+    share: ti.template(),
+    thread: ti.template(),
     copy: ti.i32,
-    segment: ti.i32,
-    at: ti.i32,
-    lane: ti.i32,
     meetings: ti.template(),
-    stride: ti.i32,
-    state: ti.template(),
-    tag: ti.template(),
-    rank: ti.template(),
-    cell_count: ti.template(),
-    column_count: ti.template(),
-    column_list: ti.template(),
-    columns: ti.template(),
-    live: ti.template(),
-    meeting: ti.template(),
-    patience: ti.i32,
-    setting: ti.template(),
-    shape: ti.template(),
+    arrays: ti.template(),
     fields: ti.template(),
-    threads: ti.template(),
-    several: ti.template(),
 ):
     """Copies all particles to the other copy, in the order of their columns; a meeting at its end."""
-    own = lane
-    while own < owned:
-        p = dealt(own, part, chunk, blocks)
+    own = thread.lane
+    while own < share.owned:
+        p = dealt(own, thread, share.chunk)
         cell = _cell(
-            get_vector(state, copy * fields * stride + first + p, stride, FIELD.position), scene, setting, shape
+            get_vector(arrays.state, copy * fields * thread.stride + share.first + p, thread.stride, FIELD.position),
+            share.scene,
+            arrays,
         )
-        rank[first + p] = ti.atomic_add(cell_count[cell], 1)
-        if ti.atomic_add(column_count[cell // BLOCK], 1) == 0:
-            listed = ti.atomic_add(columns[segment], 1)
-            column_list[first + dealt(listed, part, chunk, blocks)] = cell // BLOCK
-        own += threads
-    meet_team(at, lane, meetings, meeting, columns, segment, patience, threads, several, blocks)
+        arrays.rank[share.first + p] = ti.atomic_add(arrays.cell_count[cell], 1)
+        if ti.atomic_add(arrays.column_count[cell // BLOCK], 1) == 0:
+            listed = ti.atomic_add(arrays.columns[thread.segment], 1)
+            arrays.column_list[share.first + dealt(listed, thread, share.chunk)] = cell // BLOCK
+        own += arrays.threads
+    meet_team(thread, meetings, arrays)
     # the columns that a block came upon first stay together
-    c = lane
-    while c < columns[segment]:
-        ti.atomic_add(columns[segment + 1], column_count[column_list[first + dealt(c, part, chunk, blocks)]])
-        c += threads
-    wait(threads)
-    if lane == 0:
-        columns[segment + 1] = ti.atomic_add(live[scene * LIVE.length + LIVE.cursor], columns[segment + 1])
-    wait(threads)
-    c = lane
-    while c < columns[segment]:
-        column = column_list[first + dealt(c, part, chunk, blocks)]
-        begin = ti.atomic_add(columns[segment + 1], column_count[column])
+    c = thread.lane
+    while c < arrays.columns[thread.segment]:
+        ti.atomic_add(
+            arrays.columns[thread.segment + 1],
+            arrays.column_count[arrays.column_list[share.first + dealt(c, thread, share.chunk)]],
+        )
+        c += arrays.threads
+    wait(arrays.threads)
+    if thread.lane == 0:
+        arrays.columns[thread.segment + 1] = ti.atomic_add(
+            arrays.live[share.scene * LIVE.length + LIVE.cursor], arrays.columns[thread.segment + 1]
+        )
+    wait(arrays.threads)
+    c = thread.lane
+    while c < arrays.columns[thread.segment]:
+        column = arrays.column_list[share.first + dealt(c, thread, share.chunk)]
+        begin = ti.atomic_add(arrays.columns[thread.segment + 1], arrays.column_count[column])
         for n in range(BLOCK):
-            count = cell_count[column * BLOCK + n]
-            cell_count[column * BLOCK + n] = begin
+            count = arrays.cell_count[column * BLOCK + n]
+            arrays.cell_count[column * BLOCK + n] = begin
             begin += count
-        c += threads
-    meet_team(at, lane, meetings, meeting, columns, segment, patience, threads, several, blocks)
-    own = lane
-    while own < owned:
-        p = dealt(own, part, chunk, blocks)
-        source = copy * fields * stride + first + p
-        cell = _cell(get_vector(state, source, stride, FIELD.position), scene, setting, shape)
+        c += arrays.threads
+    meet_team(thread, meetings, arrays)
+    own = thread.lane
+    while own < share.owned:
+        p = dealt(own, thread, share.chunk)
+        source = copy * fields * thread.stride + share.first + p
+        cell = _cell(get_vector(arrays.state, source, thread.stride, FIELD.position), share.scene, arrays)
         # within memory also where blocks leave, and counts are not whole
-        place = ti.min(first + cell_count[cell] + rank[first + p], stride - 1)
-        target = (1 - copy) * fields * stride + place
+        place = ti.min(share.first + arrays.cell_count[cell] + arrays.rank[share.first + p], thread.stride - 1)
+        target = (1 - copy) * fields * thread.stride + place
         for group in ti.static(range(0, fields, COPIED)):
             values = ti.Vector(
-                [load(state, source + field * stride) for field in range(group, min(group + COPIED, fields))]
+                [
+                    load(arrays.state, source + field * thread.stride)
+                    for field in range(group, min(group + COPIED, fields))
+                ]
             )
             for i in ti.static(range(values.n)):
-                store(state, target + (group + i) * stride, values[i])
+                store(arrays.state, target + (group + i) * thread.stride, values[i])
         for i in ti.static(range(TAG.length)):
-            tag[((1 - copy) * TAG.length + i) * stride + place] = tag[(copy * TAG.length + i) * stride + first + p]
-        own += threads
-    meet_team(at, lane, meetings, meeting, columns, segment, patience, threads, several, blocks)
-    c = lane
-    while c < columns[segment]:
-        column = column_list[first + dealt(c, part, chunk, blocks)]
-        column_count[column] = 0
+            arrays.tag[((1 - copy) * TAG.length + i) * thread.stride + place] = arrays.tag[
+                (copy * TAG.length + i) * thread.stride + share.first + p
+            ]
+        own += arrays.threads
+    meet_team(thread, meetings, arrays)
+    c = thread.lane
+    while c < arrays.columns[thread.segment]:
+        column = arrays.column_list[share.first + dealt(c, thread, share.chunk)]
+        arrays.column_count[column] = 0
         for n in range(BLOCK):
-            cell_count[column * BLOCK + n] = 0
-        c += threads
-    wait(threads)
-    if lane == 0:
-        columns[segment] = 0
-        columns[segment + 1] = 0
-        live[scene * LIVE.length + LIVE.cursor] = 0
+            arrays.cell_count[column * BLOCK + n] = 0
+        c += arrays.threads
+    wait(arrays.threads)
+    if thread.lane == 0:
+        arrays.columns[thread.segment] = 0
+        arrays.columns[thread.segment + 1] = 0
+        arrays.live[share.scene * LIVE.length + LIVE.cursor] = 0

@@ -8,16 +8,9 @@ import taichi as ti
 
 from datagen.mpm.device_memory import add, load, load4, store4
 from datagen.mpm.layout import BLOCK_NODES, CONSTANT, FIELD, LIVE, SETTING, SHAPE, TAG, VARIANT
-from datagen.mpm.mls_mpm import (
-    base_node,
-    ghost_place,
-    node_place,
-    node_places,
-    node_velocity,
-    spline,
-    weights,
-)
+from datagen.mpm.mls_mpm import node_velocity
 from datagen.mpm.multiple_time_stepping import change_of
+from datagen.mpm.nodes import base_node, ghost_place, node_place, node_places, spline, weights
 from datagen.mpm.team_lists import IDLE
 from datagen.mpm.team_meeting import GIVING
 from datagen.mpm.team_particles import dealt, get_vector
@@ -33,26 +26,16 @@ def _vector(entries):
 
 
 @ti.func
-def gather(
-    x,
-    bits: ti.i32,
-    scene: ti.i32,
-    velocities: ti.i32,
-    node: ti.template(),
-    setting: ti.template(),
-    shape: ti.template(),
-    contact: ti.template(),
-    variant: ti.template(),
-):
+def gather(x, bits: ti.i32, scene: ti.i32, velocities: ti.i32, arrays: ti.template()):
     """Velocity, its gradient and the mass at x from the nodes around, of which sheets hide `bits`."""
-    inverse_dx = setting[SETTING.inverse_cell_size]
+    inverse_dx = arrays.setting[SETTING.inverse_cell_size]
     scaled = x * inverse_dx
     base = ti.floor(scaled - 0.5, ti.i32)
     fx = scaled - ti.cast(base, ti.f32)
     w0, w1, w2 = weights(fx)
     w = ti.static((w0, w1, w2))
-    first_entry = velocities + LANES * scene * shape[SHAPE.scene_blocks] * BLOCK_NODES
-    index_x, index_y, index_z = node_places(base, first_entry, shape, LANES)
+    first_entry = velocities + LANES * scene * arrays.shape[SHAPE.scene_blocks] * BLOCK_NODES
+    index_x, index_y, index_z = node_places(base, first_entry, arrays.shape, LANES)
     total = ti.Vector([0.0, 0.0, 0.0, 0.0])
     gradient_x = ti.Vector([0.0, 0.0, 0.0])
     gradient_y = ti.Vector([0.0, 0.0, 0.0])
@@ -65,7 +48,7 @@ def gather(
             line = ti.Vector([0.0, 0.0, 0.0, 0.0])
             line_z = ti.Vector([0.0, 0.0, 0.0])
             for k in ti.static(range(3)):
-                share = w[k][2] * load4(node, index_x[i] + index_y[j] + index_z[k])
+                share = w[k][2] * load4(arrays.node, index_x[i] + index_y[j] + index_z[k])
                 line += share
                 line_z += (k - fx[2]) * _vector(share)
             plane += w[j][1] * line
@@ -77,15 +60,15 @@ def gather(
         gradient_z += w[i][0] * plane_z
     v = _vector(total)
     gradient = ti.Matrix.cols([gradient_x, gradient_y, gradient_z])
-    if ti.static(bool(variant & VARIANT.sheets)):
+    if ti.static(bool(arrays.variant & VARIANT.sheets)):
         left = bits
         n = 0
         while left != 0:
             if left & 1:
                 index = base + ti.Vector([n // 9, n // 3 % 3, n % 3])
                 offset = ti.cast(index, ti.f32) - scaled
-                seen = load4(node, velocities + LANES * node_place(index, scene, shape))
-                change = _vector(load4(node, velocities + LANES * ghost_place(index, scene, contact, shape)) - seen)
+                seen = load4(arrays.node, velocities + LANES * node_place(index, scene, arrays.shape))
+                change = _vector(load4(arrays.node, velocities + LANES * ghost_place(index, scene, arrays)) - seen)
                 change *= spline(offset[0]) * spline(offset[1]) * spline(offset[2])
                 v += change
                 gradient += change.outer_product(offset)
@@ -95,12 +78,12 @@ def gather(
 
 
 @ti.func
-def _entry(at: ti.i32, first: ti.i32, own_steps: ti.i32, giving: ti.template(), variant: ti.template()) -> ti.i32:
+def _entry(at: ti.i32, first: ti.i32, own_steps: ti.i32, arrays: ti.template()) -> ti.i32:
     """A particle that gives in this substep: as team_lists has it where some take steps of their own, else all do."""
     entry = at
-    if ti.static(not variant & VARIANT.each_step):  # noqa: SIM102 (this one is the compiler's)
+    if ti.static(not arrays.variant & VARIANT.each_step):  # noqa: SIM102 (this one is the compiler's)
         if own_steps:
-            entry = giving[first + at]
+            entry = arrays.giving[first + at]
     return entry
 
 
@@ -111,63 +94,43 @@ def _particle(entry: ti.i32) -> ti.i32:
 
 @ti.func
 def scatter(
-    owned: ti.i32,
-    part: ti.i32,
-    chunk: ti.i32,
-    blocks: ti.i32,
-    lane: ti.i32,
-    scene: ti.i32,
-    first: ti.i32,
+    share: ti.template(),
+    thread: ti.template(),
     particles: ti.i32,
     tags: ti.i32,
-    stride: ti.i32,
-    segment: ti.i32,
     begins: ti.f32,
     own_steps: ti.i32,
     step: ti.f32,
-    state: ti.template(),
-    tag: ti.template(),
-    giving: ti.template(),
-    columns: ti.template(),
-    response: ti.template(),
-    hidden: ti.template(),
-    node: ti.template(),
-    setting: ti.template(),
-    law: ti.template(),
-    shape: ti.template(),
-    contact: ti.template(),
-    variant: ti.template(),
-    threads: ti.template(),
-    run: ti.template(),
+    arrays: ti.template(),
 ):
     """Adds what particles give to their 27 nodes: momentum and mass; in later steps of an interval, of those alone that
     team_lists has, what forces change in momentum. A thread adds up what `run` particles in their order give, in a
     window of nodes that goes up a column with them; what it leaves goes to the nodes.
     """
-    dx = setting[SETTING.cell_size]
-    inverse_dx = setting[SETTING.inverse_cell_size]
-    first_entry = LANES * scene * shape[SHAPE.scene_blocks] * BLOCK_NODES
-    lanes, count = LANES, owned
-    if ti.static(not variant & VARIANT.each_step):
+    dx = arrays.setting[SETTING.cell_size]
+    inverse_dx = arrays.setting[SETTING.inverse_cell_size]
+    first_entry = LANES * share.scene * arrays.shape[SHAPE.scene_blocks] * BLOCK_NODES
+    lanes, count = LANES, share.owned
+    if ti.static(not arrays.variant & VARIANT.each_step):
         if begins == 0.0:
             lanes = MASS
-        if ti.static(run > 1):  # noqa: SIM102 (this one is the compiler's)
+        if ti.static(arrays.run > 1):  # noqa: SIM102 (this one is the compiler's)
             if own_steps:
-                count = columns[segment + GIVING]
-    task = lane
-    tasks = (count + run - 1) // run * lanes
+                count = arrays.columns[thread.segment + GIVING]
+    task = thread.lane
+    tasks = (count + arrays.run - 1) // arrays.run * lanes
     while task < tasks:
         component = task % lanes
-        own = task // lanes * run
-        at = dealt(own, part, chunk, blocks)
-        end = at + ti.min(run, count - own)
-        entry = _entry(at, first, own_steps, giving, variant)
-        task += threads
+        own = task // lanes * arrays.run
+        at = dealt(own, thread, share.chunk)
+        end = at + ti.min(arrays.run, count - own)
+        entry = _entry(at, share.first, own_steps, arrays)
+        task += arrays.threads
         if entry == IDLE:
             continue
         p = _particle(entry)
         gain = ti.Vector([0.0 for _ in range(27)])
-        x = get_vector(state, particles + p, stride, FIELD.position)
+        x = get_vector(arrays.state, particles + p, thread.stride, FIELD.position)
         base = base_node(x, inverse_dx)
         while at < end:
             place = particles + p
@@ -178,59 +141,64 @@ def scatter(
             v = 1.0
             if component < MASS:
                 if entry >= 0:
-                    A = ti.Vector([load(state, place + (FIELD.affine + 3 * component + j) * stride) for j in range(3)])
+                    A = ti.Vector(
+                        [
+                            load(arrays.state, place + (FIELD.affine + 3 * component + j) * thread.stride)
+                            for j in range(3)
+                        ]
+                    )
                 else:  # what acts evenly, of xx, yy, zz, xy, xz, yz
                     for j in ti.static(range(3)):
                         which = j if component == j else 2 + component + j
-                        A[j] = step * response[first + p + which * stride]
+                        A[j] = step * arrays.response[share.first + p + which * thread.stride]
                 A *= dx
                 v = -A.dot(fx)
                 if begins == 1.0:
-                    v += load(state, place + (FIELD.velocity + component) * stride)
-            if ti.static(bool(variant & VARIANT.several_laws)):
-                scale = law[tag[tags + TAG.law_row * stride + p] + CONSTANT.mass]
+                    v += load(arrays.state, place + (FIELD.velocity + component) * thread.stride)
+            if ti.static(bool(arrays.variant & VARIANT.several_laws)):
+                scale = arrays.law[arrays.tag[tags + TAG.law_row * thread.stride + p] + CONSTANT.mass]
                 v *= scale
                 A *= scale
             bits = 0
-            if ti.static(bool(variant & VARIANT.sheets)):
-                bits = hidden[first + p]
+            if ti.static(bool(arrays.variant & VARIANT.sheets)):
+                bits = arrays.hidden[share.first + p]
             for i, j in ti.static(ti.ndrange(3, 3)):
                 weight_xy = w[i][0] * w[j][1]
                 v_xy = v + A[0] * i + A[1] * j
                 for k in ti.static(range(3)):
                     given = weight_xy * w[k][2] * (v_xy + A[2] * k)
-                    if ti.static(bool(variant & VARIANT.sheets)):
+                    if ti.static(bool(arrays.variant & VARIANT.sheets)):
                         given = 0.0 if (bits >> (9 * i + 3 * j + k)) & 1 else given
                     gain[9 * i + 3 * j + k] += given
-            if ti.static(bool(variant & VARIANT.sheets)):
+            if ti.static(bool(arrays.variant & VARIANT.sheets)):
                 n = 0
                 while bits != 0:
                     if bits & 1:
                         corner = ti.Vector([n // 9, n // 3 % 3, n % 3])
                         away = ti.cast(corner, ti.f32)
                         weight = spline(away[0] - fx[0]) * spline(away[1] - fx[1]) * spline(away[2] - fx[2])
-                        ghost = ghost_place(base + corner, scene, contact, shape)
-                        add(node, LANES * ghost + component, weight * (v + A.dot(away)))
+                        ghost = ghost_place(base + corner, share.scene, arrays)
+                        add(arrays.node, LANES * ghost + component, weight * (v + A.dot(away)))
                     bits >>= 1
                     n += 1
             at += 1
             following = base
             if at < end:
-                entry = _entry(at, first, own_steps, giving, variant)
+                entry = _entry(at, share.first, own_steps, arrays)
                 p = _particle(entry)
-                x = get_vector(state, particles + p, stride, FIELD.position)
+                x = get_vector(arrays.state, particles + p, thread.stride, FIELD.position)
                 following = base_node(x, inverse_dx)
             if at == end or (following != base).any():
                 climbs = at < end and (following == base + ti.Vector([0, 1, 0])).all()
-                index_x, index_y, index_z = node_places(base, first_entry + component, shape, LANES)
+                index_x, index_y, index_z = node_places(base, first_entry + component, arrays.shape, LANES)
                 for i, k in ti.static(ti.ndrange(3, 3)):
-                    add(node, index_x[i] + index_y[0] + index_z[k], gain[9 * i + k])
+                    add(arrays.node, index_x[i] + index_y[0] + index_z[k], gain[9 * i + k])
                     gain[9 * i + k] = gain[9 * i + 3 + k]
                     gain[9 * i + 3 + k] = gain[9 * i + 6 + k]
                     gain[9 * i + 6 + k] = 0.0
                 if not climbs:
                     for i, j, k in ti.static(ti.ndrange(3, 2, 3)):
-                        add(node, index_x[i] + index_y[j + 1] + index_z[k], gain[9 * i + 3 * j + k])
+                        add(arrays.node, index_x[i] + index_y[j + 1] + index_z[k], gain[9 * i + 3 * j + k])
                         gain[9 * i + 3 * j + k] = 0.0
                 base = following
 
@@ -269,25 +237,18 @@ def _update(
     gravity_time: ti.f32,
     lead: ti.f32,
     fallen: ti.f32,
-    node: ti.template(),
-    scene_value: ti.template(),
-    shape: ti.template(),
-    contact_normal: ti.template(),
-    variant: ti.template(),
+    arrays: ti.template(),
 ):
     ahead = before[MASS] - fallen if begins == 0.0 else 0.0
-    fall = falls(gravity_time + lead - ahead, scene, scene_value)
-    v = node_velocity(
-        _vector(before), gain, mass, local, facing, corner, fall, scene, scene_value, shape, contact_normal, variant
-    )
-    _write_node(place, velocities, v, mass, ends, fallen + gravity_time + lead, node)
+    fall = falls(gravity_time + lead - ahead, scene, arrays.scene_value)
+    v = node_velocity(_vector(before), gain, mass, local, facing, corner, fall, scene, arrays)
+    _write_node(place, velocities, v, mass, ends, fallen + gravity_time + lead, arrays.node)
 
 
 @ti.func
 def update_nodes(
-    member: ti.i32,
+    thread: ti.template(),
     scene: ti.i32,
-    velocities: ti.i32,
     begins: ti.f32,
     ends: ti.i32,
     some_wait: ti.i32,
@@ -296,51 +257,43 @@ def update_nodes(
     left: ti.f32,
     gravity_time: ti.f32,
     fallen: ti.f32,
-    block: ti.template(),
-    live: ti.template(),
-    node: ti.template(),
-    scene_value: ti.template(),
-    shape: ti.template(),
-    contact: ti.template(),
-    contact_normal: ti.template(),
-    variant: ti.template(),
-    members: ti.i32,
+    arrays: ti.template(),
 ):
     """New velocities of the nodes of all blocks that particles touch; within an interval of those alone whose particles
     act.
     """
-    block_list = shape[SHAPE.all_blocks] + scene * shape[SHAPE.scene_blocks]
-    count = live[scene * LIVE.length + LIVE.blocks] * BLOCK_NODES
-    n = member
+    block_list = arrays.shape[SHAPE.all_blocks] + scene * arrays.shape[SHAPE.scene_blocks]
+    count = arrays.live[scene * LIVE.length + LIVE.blocks] * BLOCK_NODES
+    n = thread.member
     while n < count:
-        touched = block[block_list + n // BLOCK_NODES]
-        corner = block[block_list + shape[SHAPE.all_blocks] + n // BLOCK_NODES]
+        touched = arrays.block[block_list + n // BLOCK_NODES]
+        corner = arrays.block[block_list + arrays.shape[SHAPE.all_blocks] + n // BLOCK_NODES]
         local = n % BLOCK_NODES
-        n += members
+        n += thread.members
         many = 1.0
         if some_wait:
-            many = change_of(block[3 * shape[SHAPE.all_blocks] + touched], now)
+            many = change_of(arrays.block[3 * arrays.shape[SHAPE.all_blocks] + touched], now)
             if many == 0.0:
                 continue
         lead = ti.min((many - 1.0) * whole_step, left)
         # all that is read, before anything is written: Taichi looks up where an array lies anew after each store
         place = LANES * (touched * BLOCK_NODES + local)
         entry = -1
-        if ti.static(bool(variant & VARIANT.contact)):
-            entry = contact[touched * BLOCK_NODES + local]
-        gain, mass, before = _read_node(place, velocities, begins, node)
+        if ti.static(bool(arrays.variant & VARIANT.contact)):
+            entry = arrays.contact[touched * BLOCK_NODES + local]
+        gain, mass, before = _read_node(place, thread.velocities, begins, arrays.node)
         if local == 0:
-            block[touched] = 0
+            arrays.block[touched] = 0
         if mass > 0.0:  # others keep a velocity of before, in which no particle has a share
             _update(
-                place, 2 * entry, gain, mass, before, velocities, local, corner, scene, begins, ends, gravity_time,
-                lead, fallen, node, scene_value, shape, contact_normal, variant,
+                place, 2 * entry, gain, mass, before, thread.velocities, local, corner, scene, begins, ends,
+                gravity_time, lead, fallen, arrays,
             )  # fmt: skip
-        if ti.static(bool(variant & VARIANT.sheets)):  # noqa: SIM102 (this one is the compiler's)
-            if entry >= 0 and entry < shape[SHAPE.ghosts]:
-                ghost = LANES * (shape[SHAPE.ghost_begin] + entry)
-                gain_there, mass_there, before_there = _read_node(ghost, velocities, begins, node)
+        if ti.static(bool(arrays.variant & VARIANT.sheets)):  # noqa: SIM102 (this one is the compiler's)
+            if entry >= 0 and entry < arrays.shape[SHAPE.ghosts]:
+                ghost = LANES * (arrays.shape[SHAPE.ghost_begin] + entry)
+                gain_there, mass_there, before_there = _read_node(ghost, thread.velocities, begins, arrays.node)
                 _update(
-                    ghost, 2 * entry + 1, gain_there, mass_there, before_there, velocities, local, corner, scene,
-                    begins, ends, gravity_time, lead, fallen, node, scene_value, shape, contact_normal, variant,
+                    ghost, 2 * entry + 1, gain_there, mass_there, before_there, thread.velocities, local, corner, scene,
+                    begins, ends, gravity_time, lead, fallen, arrays,
                 )  # fmt: skip

@@ -3,6 +3,7 @@
 import taichi as ti
 
 from datagen.mpm.layout import COUNT, SETTING, STATUS, VALUE
+from hgn.solver_method import SPEED_FRACTION
 
 # steps of stress of an interval, from which on it is synchronised (see mls_mpm). Of fewer, no material at rest was seen
 # to gain energy, but what hits the ground at 10 m/s ended 6 % from where half the step takes it: fast ones are, too.
@@ -60,7 +61,7 @@ def choose_time_step(
     fixed = setting[SETTING.fixed_time_step]
     fixed_substeps = setting[SETTING.fixed_substeps]
     transfer_interval = setting[SETTING.transfer_interval]
-    speed_fraction = setting[SETTING.speed_fraction]
+    speed_fraction = SPEED_FRACTION
     leapfrog = setting[SETTING.leapfrog]
     last_interval = scene_value[scene, VALUE.last_interval]
     last_step = scene_value[scene, VALUE.whole_step]

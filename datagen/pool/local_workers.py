@@ -1,17 +1,14 @@
 """Workers that are processes of this machine.
 
-Started with `spawn` (a forked Taichi hangs). A worker ends when its parent does, and leaves signals from the
-terminal to it. Whatever goes wrong inside is sent to the parent; a worker that dies without a word is its affair too.
+A worker ends with its parent, and leaves signals from the terminal to it. Errors inside are sent to the parent.
 """
 
 from __future__ import annotations
 
 import contextlib
-import multiprocessing
 import os
 import pkgutil
 import signal
-import sys
 import threading
 import time
 from collections import defaultdict
@@ -43,7 +40,7 @@ from datagen.pool.worker_plan import WorkerPlan
 from hgn.config import DatagenConfig
 from hgn.data.identity import dataset_identity, identity_hash
 from hgn.scene.obstacle_grid import ObstacleGrid
-from hgn.system.processes import die_with_parent
+from hgn.system.processes import cause_of_exit, start_child
 
 _FRAME_REPORT_SECONDS = 1.0  # between reports of a worker; each is a line of a log with progress=json
 _STAGING_THREADS = 8
@@ -57,12 +54,8 @@ class LocalWorker(Worker):
 
     def __init__(self, target: Callable[..., None], *arguments: Any) -> None:
         super().__init__()
-        context = multiprocessing.get_context("spawn")
-        self.connection, child = context.Pipe()
-        self.process = context.Process(target=_run, args=(target, child, *arguments), daemon=True)
         with _terminal_signals_blocked():
-            self.process.start()
-        child.close()
+            self.process, self.connection = start_child(_run, target, *arguments)
         self.idle, self._patience_s = True, 0.0
 
     def give(self, message: object) -> None:
@@ -91,10 +84,7 @@ class LocalWorker(Worker):
 
     def cause_of_death(self) -> str:
         self.process.join(timeout=10)
-        code = self.process.exitcode
-        if code is not None and code < 0:
-            return f"its process was ended by {signal.Signals(-code).name}"
-        return f"its process ended with exit code {code}"
+        return cause_of_exit(self.process)
 
 
 class LocalWorkerFactory:
@@ -128,8 +118,7 @@ class LocalWorkerFactory:
             yield worker, message
 
 
-def _run(target: Callable[..., None], connection: Connection, *arguments: Any) -> None:
-    _end_with_parent()
+def _run(connection: Connection, target: Callable[..., None], *arguments: Any) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     send = _Sender(connection)
     with _errors_sent(send):
@@ -281,15 +270,6 @@ def _received(connection: Connection) -> Iterator[Any]:
             yield connection.recv()
         except (EOFError, ConnectionResetError):
             return
-
-
-def _end_with_parent() -> None:
-    # on Linux the kernel does it; elsewhere a worker ends when it next touches its closed pipe
-    die_with_parent(signal.SIGKILL)
-    if sys.platform == "linux":
-        parent = multiprocessing.parent_process()
-        if parent is None or os.getppid() != parent.pid:
-            os._exit(0)
 
 
 @contextlib.contextmanager

@@ -1,7 +1,7 @@
 """Workers that make the missing episodes of a data set: scene makers in front, solvers behind.
 
 The pool hands out work, publishes shards and replaces workers that die. A scene whose worker dies is tried again,
-alone; after `maximum_attempts` it is quarantined and the next seed takes its place. Workers are processes of this
+alone; after MAXIMUM_ATTEMPTS it is quarantined and the next seed takes its place. Workers are processes of this
 machine (datagen/pool/local_workers.py) or of a Ray cluster (datagen/pool/ray_workers.py).
 """
 
@@ -19,6 +19,7 @@ from datagen.pool.worker import BuiltGrid, GridTask, MadeScene, Worker, WorkerFa
 from datagen.pool.writer import DatasetWriter
 from hgn.schema import ConfigError
 
+MAXIMUM_ATTEMPTS = 3  # of a scene whose worker dies, before it is quarantined
 _WAIT_SECONDS = 0.2  # at most until a stop request is seen
 _PACKING_SECONDS = 0.02  # at most until a packed shard is published
 _LOOK_SECONDS = 1.0  # between looks at what other generators have published or left behind
@@ -261,9 +262,8 @@ class Pool:
     def _replace(self, worker: Worker, cause: str) -> None:
         blamable = worker.blamable()
         self._deaths_in_a_row += blamable
-        attempts = self._settings.maximum_attempts
         halvings = self._plan.scenes_per_launch.bit_length()
-        if self._deaths_in_a_row > 3 * attempts + self._plan.solvers + halvings:
+        if self._deaths_in_a_row > 3 * MAXIMUM_ATTEMPTS + self._plan.solvers + halvings:
             raise RuntimeError(f"workers keep dying before they finish any scene, the last because {cause}")
         self._progress.message(f"a worker died ({cause}); it is replaced and its scenes are tried again")
         lost = list(worker.tasks.values())
@@ -288,7 +288,7 @@ class Pool:
             if blamable:
                 self._alone[task.key] = self._alone.get(task.key, 0) + (len(lost) == 1)
                 self._group[task.key] = groups + (2 * place >= len(lost))
-            if self._alone.get(task.key, 0) >= attempts:
+            if self._alone.get(task.key, 0) >= MAXIMUM_ATTEMPTS:
                 self._quarantine(task, cause)
             elif isinstance(item, MadeScene):
                 self._ready.append(item)
@@ -297,7 +297,7 @@ class Pool:
 
     def _grid_lost(self, item: GridTask, cause: str, blamable: bool) -> None:
         deaths = self._grid_deaths[item.task] = self._grid_deaths.get(item.task, 0) + blamable
-        if deaths >= self._settings.maximum_attempts:
+        if deaths >= MAXIMUM_ATTEMPTS:
             self._grid_built(BuiltGrid(item.task, cause))
         else:
             self._gridless.insert(0, MadeScene(item.task, item.scene, None))

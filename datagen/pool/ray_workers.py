@@ -33,8 +33,8 @@ from hgn.data.identity import dataset_identity, identity_hash
 from hgn.schema import ConfigError
 
 _CONNECT_REMEDY = (
-    "start one with `ray start --head` on one machine and `ray start --address=...` on the others, and name it with "
-    "dataset.ray_address=... or RAY_ADDRESS"
+    "start one with `ray start --head` on one machine and `ray start --address=...` on the others, and set RAY_ADDRESS "
+    "to its address, as in 10.0.0.1:6379"
 )
 
 
@@ -53,7 +53,7 @@ class RayWorkerFactory:
 
     def __enter__(self) -> RayWorkerFactory:
         """Raises: ConfigError when no cluster answers."""
-        address = self._config.dataset.ray_address or os.environ.get("RAY_ADDRESS") or "auto"
+        address = os.environ.get("RAY_ADDRESS") or "auto"
         try:
             self._ray.init(address=address, log_to_driver=False, logging_level=logging.WARNING)
         except (ConnectionError, ValueError, RuntimeError) as error:

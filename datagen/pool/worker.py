@@ -146,7 +146,7 @@ def make_scene(task: SceneTask, config: DatagenConfig, backend: Backend, with_gr
     try:
         scene = generate_scene(config.scene, task.seed)
         # here rather than in the solver, which would do it for one scene after another while its device waits
-        collider = build_collider(scene, config.mpm.collider_band_cells)
+        collider = build_collider(scene, config.mpm.choices.collider_band_cells)
     except ConfigError as error:  # no room for the obstacles, say: another seed may do
         return "failed", task.key, str(error)
     made = MadeScene(task, Parcel(scene), None, Parcel(collider))

@@ -7,8 +7,6 @@ cannot be written ends nothing; a fault of the supervisor itself ends the servic
 
 from __future__ import annotations
 
-import multiprocessing
-import os
 import signal
 import threading
 import time
@@ -22,7 +20,7 @@ from datagen.pool.progress import Progress
 from datagen.pool.worker import Backend, error_message
 from hgn.config import DatagenConfig
 from hgn.schema import ConfigError
-from hgn.system.processes import die_with_parent
+from hgn.system.processes import cause_of_exit, start_child
 
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 1.0, 60.0
 _STOP_PATIENCE_S = 60.0
@@ -53,7 +51,6 @@ class Supervisor:
         self.unusable: str | None = None  # why the service has to end
         self.on_unusable = lambda: None
         self._stopping = threading.Event()
-        self._process: multiprocessing.process.BaseProcess | None = None
         self._thread = threading.Thread(target=self._run, name="pool supervisor")
 
     def __enter__(self) -> Supervisor:
@@ -102,11 +99,10 @@ class Supervisor:
 
     def _run_once(self) -> tuple[str, str]:
         """Runs a pool to its end: complete, stopped, config_error, os_error, error or died, and in words why."""
-        context = multiprocessing.get_context("spawn")
-        connection, child = context.Pipe(duplex=False)
-        process = context.Process(target=_generate, args=(child, self._config, self._backend), name="pool")
-        process.start()
-        child.close()
+        # should the service be killed, the pool ends as it would at Ctrl-C
+        process, connection = start_child(
+            _generate, self._config, self._backend, number=signal.SIGTERM, duplex=False, daemon=False
+        )
         self._set(status="running", starts=self.state.starts + 1)
         outcome, text = "died", ""
         asked, patience, silent_s, silence = False, _STOP_PATIENCE_S, 0.0, self._config.dataset.worker_silence_s
@@ -132,10 +128,7 @@ class Supervisor:
         finally:
             connection.close()
         if outcome == "died":
-            code = process.exitcode or 0
-            text = f"ended by {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
-            if silent_s > silence:
-                text = f"it said nothing for {silence:.0f} s"
+            text = f"it said nothing for {silence:.0f} s" if silent_s > silence else cause_of_exit(process)
         return outcome, text
 
     def _note(self, kind: str, *values: Any) -> None:
@@ -175,10 +168,6 @@ class _PipeProgress(Progress):
 
 def _generate(connection: Connection, config: DatagenConfig, backend: Backend | None) -> None:
     with StopSignal() as stop:
-        die_with_parent(signal.SIGTERM)  # should the service be killed, the pool ends as it would at Ctrl-C
-        parent = multiprocessing.parent_process()
-        if parent is None or os.getppid() != parent.pid:
-            return
         try:
             spoke_at = -_BEAT_S
 

@@ -38,6 +38,8 @@ if TYPE_CHECKING:
 
 
 REPORT_SEED = 1_000_000  # the first of scenes that reports draw for themselves: a data set's seeds are hashes
+CLEARANCE_CELLS = 2.0  # between obstacles, groups and walls, in solver cells
+MAXIMUM_TILTED_GRAVITY = 19.6  # domain units per second squared
 LAYOUTS = 5  # whole scenes begun afresh before giving up
 SHAPES_PER_ITEM = 20  # sizes, shapes and orientations drawn for one obstacle or group
 PLACES_PER_SHAPE = 50
@@ -69,7 +71,7 @@ def generate_scene(config: SceneConfig, seed: int) -> Scene:
     """A random scene with particles at rest, or with one velocity per group; a lone particle is a group of size 0.
     Its gravity is the config's, none, or a drawn one.
 
-    Obstacles lie completely inside the domain, `clearance_cells` solver cells from each other and none inside
+    Obstacles lie completely inside the domain, CLEARANCE_CELLS solver cells from each other and none inside
     another, but for the four squares of a funnel, which cross; groups keep the same distance to obstacles, to
     each other and to the solver's walls. Items are placed by rejection: a new place, then a new size, shape and
     orientation, then a new layout.
@@ -155,7 +157,7 @@ def _place_obstacles(config: SceneConfig, sheets: list[_Placed], rng: np.random.
 
 
 def _place_obstacle(config: SceneConfig, placed: list[_Placed], index: int, rng: np.random.Generator) -> _Placed:
-    clearance = config.clearance_cells * config.cell_size
+    clearance = CLEARANCE_CELLS * config.cell_size
     domain = np.array(config.domain_size)
     smallest, largest = config.obstacle_size
     for _ in range(SHAPES_PER_ITEM):
@@ -185,7 +187,7 @@ def _place_obstacle(config: SceneConfig, placed: list[_Placed], index: int, rng:
             return _Placed(obstacle, point, gap, point_tree(point), low + centre, high + centre, record)
     raise _NoRoomError(
         f"obstacle_count must leave room for each obstacle, got no place for number {index + 1} of "
-        f"{config.obstacle_count}; lower obstacle_count, obstacle_size or clearance_cells, or raise domain_size"
+        f"{config.obstacle_count}; lower obstacle_count or obstacle_size, or raise domain_size"
     )
 
 
@@ -220,7 +222,7 @@ def _place_group(
     index: int,
     rng: np.random.Generator,
 ) -> tuple[str, Region]:
-    clearance = config.clearance_cells * config.cell_size + ROUNDING
+    clearance = CLEARANCE_CELLS * config.cell_size + ROUNDING
     margin = WALL_CELLS * config.cell_size + clearance + 0.5 * config.group_size
     span = np.array(config.domain_size) - 2 * margin
     size = (config.group_size,) * 3
@@ -238,8 +240,8 @@ def _place_group(
             return shape, region
     raise _NoRoomError(
         f"group_count must leave room for each group, got no place for number {index + 1} of "
-        f"{config.group_count} with group_size {config.group_size:g}; lower group_count, group_size, "
-        "clearance_cells or obstacle_count, or raise domain_size"
+        f"{config.group_count} with group_size {config.group_size:g}; lower group_count, group_size "
+        "or obstacle_count, or raise domain_size"
     )
 
 
@@ -247,7 +249,7 @@ def _place_lone_particles(
     config: SceneConfig, obstacles: list[_Placed], groups: list[Region], rng: np.random.Generator
 ) -> list[Region]:
     near = LONE_CELLS * config.cell_size
-    clearance = config.clearance_cells * config.cell_size + ROUNDING
+    clearance = CLEARANCE_CELLS * config.cell_size + ROUNDING
     margin = WALL_CELLS * config.cell_size + clearance
     span = np.array(config.domain_size) - 2 * margin
     placed: list[Region] = []
@@ -313,7 +315,7 @@ def _draw_gravity(config: SceneConfig, rng: np.random.Generator) -> Vector:
     if kind < config.zero_gravity_fraction:
         return 0.0, 0.0, 0.0
     if kind < config.zero_gravity_fraction + config.tilted_gravity_fraction:
-        return _triple(size * config.maximum_tilted_gravity * direction_3)
+        return _triple(size * MAXIMUM_TILTED_GRAVITY * direction_3)
     return config.gravity
 
 

@@ -5,6 +5,7 @@ Run as `python ray_program.py FOLDER`, with this folder on the path and BALLISTI
 """
 
 import json
+import os
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -45,6 +46,7 @@ def main(folder):
     )
     second = cluster.add_node(num_cpus=2, object_store_memory=STORE_BYTES)
     try:
+        os.environ["RAY_ADDRESS"] = cluster.address
         dataset = DatasetConfig(
             folder=f"{folder}/shared",
             training_scenes=10,
@@ -52,14 +54,13 @@ def main(folder):
             test_scenes=0,
             frames=6,
             pool="ray",
-            ray_address=cluster.address,
         )
         killer = Killer(cluster, second)
         finished = generate(DatagenConfig(dataset=dataset), killer, lambda: False, BALLISTIC)
     finally:
         cluster.shutdown()
     peaceful, shared = Path(folder) / "peaceful", Path(folder) / "shared"
-    make_dataset(DatagenConfig(dataset=replace(dataset, folder=str(peaceful), pool="local", ray_address=None)))
+    make_dataset(DatagenConfig(dataset=replace(dataset, folder=str(peaceful), pool="local")))
     report = {
         "meta": provenance(),
         "finished": finished,

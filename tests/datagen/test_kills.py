@@ -15,7 +15,7 @@ def command(control, tmp_path, monkeypatch):
     monkeypatch.setenv("PYTHONPATH", BALLISTIC_PATH)
 
     def make(config):
-        keys = ("training_scenes", "validation_scenes", "test_scenes", "frames", "workers", "maximum_attempts")
+        keys = ("training_scenes", "validation_scenes", "test_scenes", "frames", "workers")
         overrides = [f"dataset.{key}={getattr(config.dataset, key)}" for key in keys]
         folder = f"out={tmp_path / 'killed'}"
         return [sys.executable, "-m", "ballistic_service", *overrides, folder, "port=0", "progress=off"]
@@ -27,7 +27,7 @@ def command(control, tmp_path, monkeypatch):
 def test_nothing_is_lost(make_config, make_dataset, command, control, tmp_path):
     """A generation whose worker, pool, service and all processes are killed writes the data set of an undisturbed one,
     bitwise, and leaves no temporary file."""
-    config = make_config(training_scenes=6, maximum_attempts=100)
+    config = make_config(training_scenes=6)
     peaceful, killed = make_dataset(config), tmp_path / "killed"
     (control / "slow").touch()
     kills = generate_with_kills(command(config), killed, 4, 0.5, tmp_path / "log")

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from written_files import Recorder, hashes, simulated
 
+from datagen.pool import pool
 from datagen.pool.local_workers import LocalWorker, LocalWorkerFactory
 from datagen.pool.plan import SceneTask, scene_seed
 from datagen.pool.pool import Pool, Stopped
@@ -148,24 +149,23 @@ def test_killed_worker_is_replaced(make_config, backend, control):
     seed = scene_seed(0, "train", 1, 0)
     (control / f"kill-{seed}").write_text("1")
     recorder = generate(config, backend)
-    assert recorder.messages == [
-        "a worker died (its process was ended by SIGKILL); it is replaced and its scenes are tried again"
-    ]
+    assert recorder.messages == ["a worker died (ended by SIGKILL); it is replaced and its scenes are tried again"]
     manifest = Manifest.load(config.dataset.folder)
     assert manifest.complete and not manifest.quarantined
     assert simulated(control).count(seed) == 2
 
 
-def test_scene_that_kills_its_worker_is_quarantined(make_config, backend, control):
-    """In a batch only the guilty scene, found by halves, is quarantined after maximum_attempts alone; the next seed
+def test_scene_that_kills_its_worker_is_quarantined(make_config, backend, control, monkeypatch):
+    """In a batch only the guilty scene, found by halves, is quarantined after MAXIMUM_ATTEMPTS alone; the next seed
     replaces it."""
-    config = make_config(training_scenes=4, validation_scenes=0, test_scenes=0, maximum_attempts=2)
+    config = make_config(training_scenes=4, validation_scenes=0, test_scenes=0)
+    monkeypatch.setattr(pool, "MAXIMUM_ATTEMPTS", 2)
     seed = scene_seed(0, "train", 2, 0)
     (control / f"kill-{seed}").write_text("99")
     generate(config, backend, WorkerPlan(1, None, 1, 4, 4))
     manifest = Manifest.load(config.dataset.folder)
     (failure,) = manifest.quarantined
-    assert (failure.key, failure.seed, failure.cause) == ("train-000002", seed, "its process was ended by SIGKILL")
+    assert (failure.key, failure.seed, failure.cause) == ("train-000002", seed, "ended by SIGKILL")
     assert manifest.complete
     assert list(EpisodeStore(config.dataset.folder, "train").entries)[2].attempt == 1
     assert simulated(control).count(seed) == 4  # with the others, with a half of them, twice alone

@@ -117,7 +117,7 @@ def test_other_settings_are_refused(make_config, folder, changes, message):
 
 def test_where_and_how_fast_is_no_identity(data):
     """Device, launch size, workers, attempts and shard size may change between runs of one data set."""
-    dataset = dataclasses.replace(data.dataset, workers=3, maximum_attempts=1, episodes_per_shard=2)
+    dataset = dataclasses.replace(data.dataset, workers=3, episodes_per_shard=2)
     mpm = MpmConfig(device="cuda", scenes_per_launch=64)
     with DatasetWriter(DatagenConfig(dataset=dataset, mpm=mpm)) as writer:
         assert writer.complete

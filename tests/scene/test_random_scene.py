@@ -13,7 +13,7 @@ from hgn.scene.distance import closest_points, contains
 from hgn.scene.group import WALL_CELLS, fill, particle_count, points_in_ball, region_of
 from hgn.scene.material import MATERIALS, PAPER_MATERIALS
 from hgn.scene.obstacle_grid import build_obstacle_grid
-from hgn.scene.random_scene import generate_scene
+from hgn.scene.random_scene import CLEARANCE_CELLS, generate_scene
 from hgn.scene.rollout_file import obstacles_of_episode
 from hgn.scene.surface import split_long_edges
 from hgn.schema import ConfigError
@@ -80,11 +80,9 @@ def test_obstacles_are_inside_the_domain_and_disjoint(seed):
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-@pytest.mark.parametrize("clearance", [0.0, 2.0])
-def test_particles_are_clear_of_obstacles_walls_and_other_groups(seed, clearance):
+def test_particles_are_clear_of_obstacles_walls_and_other_groups(seed):
     """Every particle keeps the clearance to surfaces, walls and other groups, and is inside no closed body."""
-    config = SceneConfig(clearance_cells=clearance)
-    scene = generate_scene(config, seed)
+    scene, clearance = generate_scene(SceneConfig(), seed), CLEARANCE_CELLS
     point = scene.position_N3.astype(np.float64)
     inner = (WALL_CELLS + clearance) * CELL
     assert point.min() > inner
@@ -269,7 +267,7 @@ def test_funnels():
         assert ((corner_S43 @ up_3) >= (hole_S3 @ up_3).min() - 1e-6).all()  # they rise outwards
         for group in scene.specification["groups"]:
             assert np.array(group["position"]) @ up_3 > (hole_S3 @ up_3).mean()
-        clearance = config.clearance_cells * config.cell_size
+        clearance = CLEARANCE_CELLS * config.cell_size
         for square in scene.obstacles[:4]:
             for points_P3 in (scene.position_N3, scene.obstacles[4].vertex_V3):
                 assert surface_distances(points_P3.astype(np.float64), square).min() > clearance - 1e-6
@@ -416,7 +414,7 @@ def test_motion_is_identity_only_where_there_is_some():
     assert "long_frames" not in before
     for config in (
         DatagenConfig(scene=SceneConfig(zero_gravity_fraction=0.1)),
-        DatagenConfig(scene=SceneConfig(tilted_gravity_fraction=0.1, maximum_tilted_gravity=5.0)),
+        DatagenConfig(scene=SceneConfig(tilted_gravity_fraction=0.1)),
         DatagenConfig(scene=SceneConfig(funnel_scene_fraction=0.1)),
         DatagenConfig(scene=SceneConfig(funnel_scene_fraction=0.1, funnel_hole=(0.05, 0.1))),
         DatagenConfig(dataset=DatasetConfig(long_fraction=0.1)),

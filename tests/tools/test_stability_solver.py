@@ -102,19 +102,16 @@ def test_grids(monkeypatch):
     assert all(0.1 < value < 0.3 for value in block.more["series"])  # of a side: it has spread by then
 
 
-@pytest.mark.parametrize(
-    ("law", "own", "shears"),
-    [("mohr_coulomb", 33.0, (18.9, 28.6, 32.7)), ("matsuoka_nakai", 31.0, (21.2, 29.7, 34.8))],
-)
-def test_rows_of_slopes(law, own, shears, monkeypatch):
-    """Slopes should rest at the angle of shear: tan = sin by Mohr and Coulomb, 2 sin / sqrt(3 + sin²) by Matsuoka and
-    Nakai. Moving slopes fail. The angle of repose of quartz sand is a row of its own."""
+def test_rows_of_slopes(monkeypatch):
+    """Slopes should rest at the angle of shear: tan = sin of the friction angle. Moving slopes fail. The angle of
+    repose of quartz sand is a row of its own."""
+    own, shears = 33.0, (18.9, 28.6, 32.7)
 
     def rests(angle, start, *_):
         return start, start if start < angle else {20.0: 20.5, own: 30.8, 40.0: 32.9}[angle], 0.05 * (angle == 20)
 
     monkeypatch.setattr(solver_validation, "repose", rests)
-    base = MpmConfig(device="cpu", sand_friction_law=law, sand_friction_angle_deg=own)
+    base = MpmConfig(device="cpu", sand_friction_angle_deg=own)
     rows = list(solver_validation.reposes(base))
     asked = [17, shears[0], own - 3, shears[1], 31, 37, shears[2]]
     assert [row.predicted for row in rows] == pytest.approx(asked, abs=0.05)
@@ -147,3 +144,36 @@ def test_extents():
     position = np.stack([line, line, line], axis=1)
     assert thickness_cells(position) == pytest.approx(0.9 * 64)
     assert front_cells(position) == pytest.approx(0.99 * 64 - 2)
+
+
+def test_what_is_published_of_columns():
+    """Low columns keep their top, glass beads no more than 0.74; from where it meets a column's own height on, sand's
+    is a power of the aspect, a third higher at aspect 4. A cone of glass beads holds what the column held.
+    """
+    assert solver_validation.run_outs(0.5) == pytest.approx((0.62,)) and solver_validation.run_outs(
+        4.0
+    ) == pytest.approx((3.2,))
+    sand, beads = solver_validation.run_outs(1.5)
+    assert sand == pytest.approx(1.86) and np.pi * (1 + beads) ** 2 * 0.74 / 3 == pytest.approx(1.5 * np.pi)
+    assert solver_validation.heights(0.5) == (0.5, 0.5) and solver_validation.heights(0.8) == (0.74, 0.8)
+    assert solver_validation.heights(1.5) == pytest.approx((0.74, 0.9415), abs=1e-3)
+    assert solver_validation.heights(4.0) == pytest.approx((0.74, 1.109), abs=1e-3)
+
+
+def test_a_room_that_is_too_small_is_said(monkeypatch):
+    """A column whose sand reaches the walls of its room is no measurement: the rows say so, and do not hold."""
+    monkeypatch.setattr(solver_validation, "COLUMN_ROOM", 0.7)
+    monkeypatch.setattr(solver_validation, "COLUMN_WITHIN", 10.0)
+    rows = list(solver_validation.column_rows(1.0, MpmConfig(device="cpu"), 6))
+    assert [row.held for row in rows] == [False, False]
+    assert all("reached the walls of its room, 10 cells wide" in row.beyond for row in rows)
+
+
+def test_edges():
+    """The edge of a cliff, wherever it ends in its cell, is found within 0.1 cells, that of a slope within 0.2."""
+    for end in np.arange(6.0, 7.0, 0.1):
+        cliff = np.clip(end - np.arange(12), 0, 1) * 5.0
+        assert solver_validation.edge(cliff, 0.25) == pytest.approx(end, abs=0.1)
+        for steepness in (0.1, 0.3, 0.6):
+            depth = np.clip(steepness * (end - np.arange(0, 12, 0.01) - 0.005), 0, None).reshape(12, 100).mean(axis=1)
+            assert solver_validation.edge(depth, 0.25) == pytest.approx(end - 0.25 / steepness, abs=0.2)

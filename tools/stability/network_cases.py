@@ -15,7 +15,7 @@ import numpy as np
 from hgn.config import NetworkConfig, SceneConfig
 from hgn.scene.funnel import funnel_squares
 from hgn.scene.material import MATERIALS
-from hgn.scene.random_scene import REPORT_SEED, generate_scene
+from hgn.scene.random_scene import CLEARANCE_CELLS, REPORT_SEED, generate_scene
 from hgn.scene.rotation import euler_rotation, quaternion_rotation
 from hgn.scene.scene import Scene
 from hgn.scene.shapes import shape_obstacle
@@ -303,7 +303,7 @@ def _funnels(name: str, config: SceneConfig, material: str, hole_cells: tuple[fl
     side, middle_3 = FUNNEL_SIDE * min(config.domain_size), 0.5 * np.array(config.domain_size)
     tilt = math.radians(FUNNEL_TILT_DEG)
     edge, half = float(middle_3[1]) - 0.5 * side * math.sin(tilt), 0.5 * config.group_size
-    clear = (half * math.sin(tilt) + config.clearance_cells * config.cell_size) / math.cos(tilt)
+    clear = (half * math.sin(tilt) + CLEARANCE_CELLS * config.cell_size) / math.cos(tilt)
     above = cube(config, material, np.array([middle_3[0], edge + clear + half, middle_3[2]]), np.zeros(3))
     hole_3 = np.array([middle_3[0], edge, middle_3[2]])
     scenes = []

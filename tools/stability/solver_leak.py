@@ -54,7 +54,7 @@ def leaks(base: MpmConfig) -> Iterator[Row]:
     workers = max(1, available_cpus() - 1)
     with ProcessPoolExecutor(workers, multiprocessing.get_context("spawn")) if many else ThreadPoolExecutor() as pool:
         scenes = [scene(*key, offset, BLOCK_CELLS) for key in keys for offset in OFFSETS]
-        colliders = list(pool.map(build_collider, scenes, [base.collider_band_cells] * len(scenes)))
+        colliders = list(pool.map(build_collider, scenes, [base.choices.collider_band_cells] * len(scenes)))
         outcomes = simulate(scenes, base, frames, FRAME_RATE_HZ, colliders=colliders)
         measured = list(pool.map(_measure, scenes, map(_thinned, outcomes)))
     gaps: dict[str, float] = {}

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from datagen.mpm.layout import sand_alpha, sand_sine
+from datagen.mpm.layout import sand_sine
 from datagen.mpm.solver import simulate
 from hgn.config import MpmConfig
 from hgn.scene.material import PAPER_MATERIALS, SAND, WATER
@@ -181,8 +181,8 @@ def column_rows(aspect: float, base: MpmConfig, cells: int) -> Iterator[Row]:
     """Yields run-out and height at the axis, in initial radii, of a column of `cells` in radius."""
     scene = column(aspect, cells)
     duration = TIMES * math.sqrt(aspect * COLUMN_RADIUS / GRAVITY)
-    law, angle_deg = base.sand_friction_law, base.sand_friction_angle_deg
-    config = dataclasses.replace(base, collider_friction=shear_strength(base))
+    angle_deg = base.sand_friction_angle_deg
+    config = dataclasses.replace(base, collider_friction=sand_sine(base))
     path = _path(scene, config, 41, 40 / duration)
     place = _above_floor(path[-1], scene.cell_size)
     distance = np.hypot(place[:, 0], place[:, 2])
@@ -192,7 +192,7 @@ def column_rows(aspect: float, base: MpmConfig, cells: int) -> Iterator[Row]:
     height = float(np.quantile(place[distance < COLUMN_TOP_CELLS, 1], 0.95)) / 0.95 / cells
     space = math.ceil(COLUMN_SPACE * lube(aspect) * cells)
     touched = _strays(path / scene.cell_size, space, (0, 2))
-    name = f"sand column, aspect {aspect:g}, {law.replace('_', ' ')}, {angle_deg:g} degrees, {cells} cells in radius"
+    name = f"sand column, aspect {aspect:g}, mohr coulomb, {angle_deg:g} degrees, {cells} cells in radius"
     if base.sand_grain_diameter_m > 0:
         name += f", {COLUMN_RADIUS / base.sand_grain_diameter_m:.3g} grains"
     for what, value, published in (("run-out", run_out, run_outs(aspect)), ("height", height, heights(aspect))):
@@ -247,7 +247,7 @@ def reposes(base: MpmConfig) -> Iterator[Row]:
                 held = abs(after - before) <= STANDS_DEG
                 yield Row(f"slope that stands, friction {angle:g} degrees", before, after, held, beyond)
                 continue
-            shears = math.degrees(math.atan(shear_strength(_sand(base, angle))))
+            shears = math.degrees(math.atan(sand_sine(_sand(base, angle))))
             angles = [(f"angle of repose, friction {angle:g} degrees", shears)]
             if angle == own:
                 angles.append((f"angle of repose, friction {angle:g} degrees, as quartz sand has it", LUBE_ANGLE_DEG))
@@ -341,14 +341,6 @@ def _above_floor(position_N3: np.ndarray, cell: float) -> np.ndarray:
 
 def _sand(base: MpmConfig, angle_deg: float) -> MpmConfig:
     return dataclasses.replace(base, sand_friction_angle_deg=angle_deg, collider_friction=1.0)
-
-
-def shear_strength(config: MpmConfig) -> float:
-    """Returns the yield stress in simple shear over the pressure."""
-    sine = sand_sine(config)
-    if sine < 0:  # Mohr and Coulomb
-        return -sine
-    return 2 * sine / math.sqrt(3 + sine**2) if sine else 3 * sand_alpha(config) / math.sqrt(2)
 
 
 def _path(scene: Scene, config: MpmConfig, frames: int, rate_hz: float = DAM_RATE_HZ) -> np.ndarray:

@@ -4,8 +4,9 @@ import dataclasses
 
 import numpy as np
 import pytest
-from mpm_scenes import BOX, CELL, QUAD, box_corners, particles, sheet, simulated
+from mpm_scenes import BOX, CELL, CONFIG, QUAD, box_corners, particles, sheet, simulated
 
+from datagen.mpm import launch
 from datagen.mpm.grid_launch import motion_parts
 from datagen.mpm.solver import SceneFailure, simulate
 from hgn.config import MpmConfig
@@ -139,17 +140,19 @@ def test_poses_between_keyframes():
         assert np.allclose(turning(turned(np.array(turn))), turn, atol=1e-8)
 
 
-def test_parts_of_a_frame_share_its_maximum_of_substeps():
-    """Where motion cuts a frame into parts, `maximum_substeps_per_frame` counts the substeps of all of them."""
+def test_parts_of_a_frame_share_its_maximum_of_substeps(monkeypatch):
+    """Where motion cuts a frame into parts, MAXIMUM_SUBSTEPS counts the substeps of all of them."""
     lift = moving(wide_sheet(2.5), [0.0, 1.0], [np.zeros(3), np.array([0.0, 3.0, 0.0])])
     place = CELL * np.array([[4.5, height, 4.5] for height in (5, 6, 7, 8)])
     scene = particles(place, range(4), obstacles=(lift,), domain_size=(CELLS * CELL,) * 3)
     assert motion_parts([scene], 0.0, 1 / RATE_HZ) == 8
     (whole,) = simulated([scene])
     needed = whole.counters["substeps"]
-    simulated([scene], MpmConfig(device="cpu", maximum_substeps_per_frame=needed))
-    (failed,) = simulate([scene], MpmConfig(device="cpu", maximum_substeps_per_frame=needed - 1), 2, RATE_HZ)
-    assert isinstance(failed, SceneFailure) and failed.cause.startswith("frame 1: the frame needs more than maximum")
+    monkeypatch.setattr(launch, "MAXIMUM_SUBSTEPS", needed)
+    simulated([scene])
+    monkeypatch.setattr(launch, "MAXIMUM_SUBSTEPS", needed - 1)
+    (failed,) = simulate([scene], CONFIG, 2, RATE_HZ)
+    assert isinstance(failed, SceneFailure) and failed.cause.startswith("frame 1: the frame needs more than")
 
 
 def test_bad_motion_is_refused():
@@ -164,5 +167,5 @@ def test_bad_motion_is_refused():
         motion_parts([scene], 0.0, 1 / RATE_HZ)
     slow = moving(still, [0.0, 0.1], [(0, 0, 0), (0, 0.01, 0)])
     scene = dataclasses.replace(scene, obstacles=(slow,))
-    with pytest.raises(ConfigError, match="time_step must be adaptive where obstacles move"):
-        simulate([scene], MpmConfig(device="cpu", time_step="fixed"), 2, RATE_HZ)
+    with pytest.raises(ConfigError, match="fixed_time_step_s must be null where obstacles move"):
+        simulate([scene], MpmConfig(device="cpu", fixed_time_step_s=1e-3), 2, RATE_HZ)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from datagen.mpm import launch
 from datagen.solve import main
 from hgn.scene.rollout_file import read_rollout, write_rollout
 from hgn.scene.scene_file import load_scene
@@ -49,6 +50,7 @@ def test_a_scene_file_is_solved(tmp_path, monkeypatch):
 def test_bad_input(tmp_path, monkeypatch):
     """What cannot be solved is said, and nothing is written."""
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(launch, "MAXIMUM_SUBSTEPS", 1)
     Path("mine.yaml").write_text(SCENE.split("\n")[3])
     for change, message in (
         ({"scene": "none.yaml"}, "scene must be an existing YAML file, got none.yaml"),
@@ -56,10 +58,7 @@ def test_bad_input(tmp_path, monkeypatch):
         ({"out": "a.png"}, "out must be a name that ends in .vtkhdf, .hdf, .hdf5 or .h5, got 'a.png'; tools.render"),
         ({"out": "a.usdc"}, "got 'a.usdc'; tools.render makes pictures, USD and PLY of a rollout file"),
         ({"mpm": {"snow_hardning": 5.0}}, "mpm.snow_hardning is not a known key; did you mean snow_hardening?"),
-        (
-            {"mpm": {"device": "cpu", "maximum_substeps_per_frame": 1}},
-            "mine.yaml must be a scene that the solver keeps",
-        ),
+        ({"mpm": {"device": "cpu"}}, "mine.yaml must be a scene that the solver keeps together, got frame 1"),
     ):
         with pytest.raises(ConfigError, match=message):
             main({"scene": "mine.yaml", "frames": 3} | change)

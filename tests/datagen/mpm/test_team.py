@@ -47,8 +47,8 @@ def test_teams_agree_with_the_other_launch():
 
 def test_teams_agree_where_each_step_is_an_interval():
     """Kernels then have no steps of particles' own: a frame agrees to 1e-6."""
-    config = MpmConfig(device="cpu", time_step="fixed", fixed_time_step_s=1e-3)
-    one, other = (simulate([HEAVY], config, 6, 60.0, team=team)[0] for team in (Team(0), Team(1, 1, 4)))
+    config = MpmConfig(device="cpu", fixed_time_step_s=1e-3)
+    one, other = (simulate([HEAVY], config, 6, 60.0, team=team)[0] for team in (Team(0), Team(1)))
     assert isinstance(one, Simulated) and isinstance(other, Simulated)
     assert np.abs(one.position_TN3[1] - other.position_TN3[1]).max() < 1e-6
     assert np.abs(one.position_TN3 - other.position_TN3).max() < 1e-3
@@ -73,7 +73,7 @@ def test_a_hundred_thousand_substeps():
     density = {"density_kg_m3": np.float32([1000, 1200, 1000, 1000])}
     room = {"obstacles": (sheet(0.3),), "domain_size": (8 * CELL,) * 3}
     scene = particles(place, range(4), material_parameters=density, **room)
-    config = MpmConfig(device="cpu", time_step="fixed", fixed_time_step_s=5e-4)
+    config = MpmConfig(device="cpu", fixed_time_step_s=5e-4)
     (outcome,) = simulated([scene], config, 12, 1 / 4.55, team=Team(1))
     assert outcome.counters["substeps"] == 11 * 9100 > 100_000
     assert_inside(outcome.position_TN3, scene, config)

@@ -7,12 +7,15 @@ import pytest
 from mpm_scenes import CELL, CONFIG, joined, particles, simulated
 
 from datagen.mpm import grid_kernel
-from hgn.config import MpmConfig
 from hgn.scene.material import ELASTIC, SAND, SNOW, WATER
-from hgn.schema import ConfigError
+from hgn.solver_method import METHODS
 from tools.stability.solver_scenes import block, centre_cells, height_cells
 
-EVERY_STEP = dataclasses.replace(CONFIG, transfer_speed_m_s=None)
+
+@pytest.fixture
+def every_step(monkeypatch):
+    """A transfer at every step."""
+    monkeypatch.setitem(METHODS, "corrected", METHODS["corrected"]._replace(transfer_speed_m_s=None))
 
 
 def cube(velocity, stiffness=1.0, cell=CELL):
@@ -39,18 +42,6 @@ def test_stiffness_changes_steps_and_not_transfers():
     assert fast.counters["transfers"] > 1.5 * 16
 
 
-def test_a_transfer_at_every_step():
-    """With intervals no longer than steps each step is a transfer: the same bits as with transfer_speed_m_s none."""
-    scene = cube((1, -3, 0))
-    none = run(scene, EVERY_STEP, 7)
-    often = run(scene, dataclasses.replace(CONFIG, transfer_speed_m_s=1e4), 7)
-    assert none.counters == often.counters
-    assert none.counters["transfers"] == none.counters["substeps"]
-    assert np.array_equal(none.position_TN3, often.position_TN3)
-    with pytest.raises(ConfigError, match="transfer_speed_m_s"):
-        MpmConfig(transfer_speed_m_s=0.0)
-
-
 def test_momentum_is_kept_over_intervals():
     """Without gravity blocks that collide keep their momentum to 1e-5 over intervals of many steps of stress."""
     scene = dataclasses.replace(cube((0, 0, 0), 30.0), gravity=(0.0, 0.0, 0.0))
@@ -61,21 +52,29 @@ def test_momentum_is_kept_over_intervals():
     assert np.abs(moved - moved[0]).max() < 1e-5 * np.abs(towards).sum() / 60
 
 
-def test_what_is_stiff_leaves_water_as_it_is():
-    """Water splashes as it does alone where something far away asks for several times as many steps; with a transfer
-    at each step it would be smoothed several times as much.
-    """
+def apart(frames=9):
+    """How much the height of a splash of water changes where something far away needs several times as many steps."""
     water = block(WATER, (30, 4, 30), (5, 5, 5), (0, -4.5, 0))
     far = [block(kind, (6, 30, 6 + 4 * kind), (1, 1, 1)) for kind in (SAND, SNOW, ELASTIC)]
     moduli = [np.repeat(np.float32([1e6, modulus]), [water.particle_count, 24]) for modulus in (1e6, 1e8)]
     both = [joined(water, *far, material_parameters={"youngs_modulus_pa": modulus_N}) for modulus_N in moduli]
-    changes = []
-    for config in (CONFIG, EVERY_STEP):
-        alone, beside = (run(scene, config, 9, 240.0) for scene in both)
-        assert beside.counters["substeps"] > 4 * alone.counters["substeps"]
-        heights = [height_cells(o.position_TN3[-1][: water.particle_count]) for o in (alone, beside)]
-        changes.append(abs(heights[1] / heights[0] - 1))
-    assert changes[0] < 0.03 < changes[1], changes
+    alone, beside = (run(scene, CONFIG, frames, 240.0) for scene in both)
+    assert beside.counters["substeps"] > 4 * alone.counters["substeps"]
+    heights = [height_cells(o.position_TN3[-1][: water.particle_count]) for o in (alone, beside)]
+    return abs(heights[1] / heights[0] - 1)
+
+
+def test_what_is_stiff_leaves_water_as_it_is():
+    """Water splashes the same, to 3 %, whatever its neighbours' stiffness."""
+    assert apart() < 0.03
+
+
+def test_a_transfer_at_every_step_smooths(every_step):
+    """With a transfer at every step of stress the same water is smoothed by the neighbour's steps."""
+    scene = cube((1, -3, 0))
+    none = run(scene, CONFIG, 3)
+    assert none.counters["transfers"] == none.counters["substeps"]
+    assert apart() > 0.03
 
 
 def with_stiff(soft, stiff, times):
@@ -124,7 +123,7 @@ def shaken(scene, frames):
     return np.sqrt((speed_N3**2).sum(1).mean()), np.abs(place_TN3[-1].mean(0) - place_TN3[0].mean(0)).max()
 
 
-@pytest.mark.parametrize(("material", "stiffness"), [(ELASTIC, 16), (ELASTIC, 4), (SNOW, 16), (SNOW, 3.6)])
+@pytest.mark.parametrize(("material", "stiffness"), [(ELASTIC, 16), (SNOW, 3.6)])
 def test_what_is_stiff_rests(material, stiffness):
     """A block that takes several steps of stress an interval lies still on the floor: after 0.3 s it moves by less than
     0.01 cells a second, and has not left its place (it danced, since transfers found velocities half a step ahead).
@@ -150,24 +149,23 @@ def test_sand_rests_around_what_is_stiff():
 
 
 def test_bodies_of_different_steps_that_meet():
-    """Sand and water that a stiff body falls upon end as with half the step, to 2 % of a cell in the mean (0.37 where
-    what is beside the body takes longer steps); without gravity and floor the momentum of all stays what it was.
+    """Sand that a stiff body falls upon ends as with half the step, to 2 % of a cell in the mean (0.37 where particles
+    near the body take longer steps); without gravity and floor the momentum of all is constant.
     """
-    for material in (SAND, WATER):
-        scene = with_stiff(
-            block(material, (30, 3, 30), (6, 4, 6), (0, 0, 0)), block(ELASTIC, (31, 8, 31), (4, 4, 4), (0, -3, 0)), 16
-        )
-        whole, fine = (
-            run(scene, dataclasses.replace(CONFIG, stability_fraction=CONFIG.stability_fraction / parts), 7, 240.0)
-            for parts in (1, 2)
-        )
-        assert 64 * np.abs(fine.position_TN3[-1].mean(0) - whole.position_TN3[-1].mean(0)).max() < 0.02
-        assert 64 * np.abs(fine.position_TN3[-1].std(0) - whole.position_TN3[-1].std(0)).max() < 0.02
-        lifted_N3 = scene.position_N3 + np.float32([0, 0.3, 0])
-        free = dataclasses.replace(scene, gravity=(0.0, 0.0, 0.0), position_N3=lifted_N3)
-        path_TN3 = run(free, CONFIG, 7, 240.0).position_TN3.astype(np.float64)
-        velocity_T3 = 240 * np.diff(path_TN3.mean(1), axis=0)
-        assert np.abs(velocity_T3 - scene.velocity_N3.mean(0)).max() < 1e-4, velocity_T3
+    scene = with_stiff(
+        block(SAND, (30, 3, 30), (6, 4, 6), (0, 0, 0)), block(ELASTIC, (31, 8, 31), (4, 4, 4), (0, -3, 0)), 16
+    )
+    whole, fine = (
+        run(scene, dataclasses.replace(CONFIG, stability_fraction=CONFIG.stability_fraction / parts), 7, 240.0)
+        for parts in (1, 2)
+    )
+    assert 64 * np.abs(fine.position_TN3[-1].mean(0) - whole.position_TN3[-1].mean(0)).max() < 0.02
+    assert 64 * np.abs(fine.position_TN3[-1].std(0) - whole.position_TN3[-1].std(0)).max() < 0.02
+    lifted_N3 = scene.position_N3 + np.float32([0, 0.3, 0])
+    free = dataclasses.replace(scene, gravity=(0.0, 0.0, 0.0), position_N3=lifted_N3)
+    path_TN3 = run(free, CONFIG, 7, 240.0).position_TN3.astype(np.float64)
+    velocity_T3 = 240 * np.diff(path_TN3.mean(1), axis=0)
+    assert np.abs(velocity_T3 - scene.velocity_N3.mean(0)).max() < 1e-4, velocity_T3
 
 
 def test_half_the_step_in_fast_impacts():
@@ -183,7 +181,7 @@ def test_half_the_step_in_fast_impacts():
 def test_half_the_step():
     """Half the step changes the height of a block on the floor by less than 3 %, as its transfers stay as many."""
     half = dataclasses.replace(CONFIG, stability_fraction=CONFIG.stability_fraction / 2)
-    blocks = [(SAND, 4.5), (SAND, 10.0), (WATER, 4.5)]
+    blocks = [(SAND, 4.5), (SNOW, 4.5), (WATER, 4.5)]
     scenes = [block(material, (30, 4, 30), (6, 6, 6), (0, -speed, 0)) for material, speed in blocks]
     outcomes = [simulated([*scenes, cube((0, 0, 0), cell=1 / 64)], config, 6, 240.0) for config in (CONFIG, half)]
     for whole, fine in zip(*(outcome[:3] for outcome in outcomes), strict=True):

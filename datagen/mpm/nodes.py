@@ -1,0 +1,172 @@
+"""Nodes of the grid for Taichi kernels: where they lie in arrays, and quadratic B-splines between them and particles.
+
+A particle at x reaches the nodes base .. base + 2 with base = floor(x / dx - 1/2); node I lies at I dx. Nodes are
+stored by blocks of 4 x 4 x 4, [scene, block, node in block].
+"""
+
+import taichi as ti
+
+from datagen.mpm.layout import BLOCK, BLOCK_NODES, SHAPE
+
+
+@ti.func
+def weights(fx):
+    """Quadratic B-spline weights of nodes 0, 1, 2 for an offset fx in [0.5, 1.5) cells, per axis."""
+    return (
+        0.5 * (1.5 - fx) ** 2,
+        0.75 - (fx - 1.0) ** 2,
+        0.5 * (fx - 0.5) ** 2,
+    )
+
+
+@ti.func
+def spline(distance: ti.f32) -> ti.f32:
+    """The weight of a node from the distance to it along one axis, in (-1.5, 1.5) cells."""
+    away = ti.abs(distance)
+    outer = 1.5 - away
+    return 0.75 - away * away if away < 0.5 else 0.5 * outer * outer
+
+
+@ti.func
+def _node_of_axis(index, stride: ti.i32, local_stride: ti.i32):
+    """What a node's index along one axis adds to its place in an array; those of the three axes add up."""
+    return (index >> 2) * stride + (index & 3) * local_stride
+
+
+@ti.func
+def base_node(x, inverse_dx: ti.f32):
+    return ti.floor(x * inverse_dx - 0.5, ti.i32)
+
+
+@ti.func
+def mark(
+    x,
+    scene: ti.i32,
+    inverse_dx: ti.f32,
+    arrays: ti.template(),
+    list_begin: ti.i32,
+    length: ti.template(),
+    length_at: ti.i32,
+):
+    """Adds the blocks that the particle's nodes lie in, up to eight, to a list.
+
+    `block` begins with a flag for each of the all_blocks blocks of all scenes. From `list_begin` on it lists the
+    indices of touched ones, length[length_at] of them; all_blocks after each entry lies its block's place along x, y,
+    z, in ten bits each.
+    """
+    base = base_node(x, inverse_dx)
+    first = base >> 2
+    last = (base + 2) >> 2
+    corner = ti.Matrix([[last[axis] if n >> (2 - axis) & 1 else first[axis] for axis in range(3)] for n in range(8)])
+    index = ti.Vector(
+        [
+            scene * arrays.shape[SHAPE.scene_blocks]
+            + (corner[n, 0] * arrays.shape[SHAPE.blocks + 1] + corner[n, 1]) * arrays.shape[SHAPE.blocks + 2]
+            + corner[n, 2]
+            for n in range(8)
+        ]
+    )
+    flag = ti.Vector([arrays.block[index[n]] for n in range(8)])  # all at once: each is a way to memory
+    for n in ti.static(range(8)):
+        fresh = flag[n] == 0
+        for axis in ti.static(range(3)):
+            if ti.static(bool(n >> (2 - axis) & 1)):
+                fresh = fresh and first[axis] != last[axis]
+        if fresh:
+            if ti.atomic_max(arrays.block[index[n]], 1) == 0:
+                entry = list_begin + ti.atomic_add(length[length_at], 1)
+                arrays.block[entry] = index[n]
+                arrays.block[entry + arrays.shape[SHAPE.all_blocks]] = (
+                    (corner[n, 0] << 20) | (corner[n, 1] << 10) | corner[n, 2]
+                )
+
+
+@ti.func
+def node_places(base, first_entry: ti.i32, shape: ti.template(), entries: ti.template()):
+    """Where nodes base .. base + 2 lie in an array of `entries` numbers a node, by axis: node base + (i, j, k) begins
+    at the sum of the first result's i, the second's j and the third's k. The scene's nodes begin at `first_entry`.
+    """
+    stride_z = BLOCK_NODES * entries
+    stride_y = shape[SHAPE.blocks + 2] * stride_z
+    stride_x = shape[SHAPE.blocks + 1] * stride_y
+    offset = ti.Vector([0, 1, 2])
+    return (
+        first_entry + _node_of_axis(base[0] + offset, stride_x, BLOCK * BLOCK * entries),
+        _node_of_axis(base[1] + offset, stride_y, BLOCK * entries),
+        _node_of_axis(base[2] + offset, stride_z, entries),
+    )
+
+
+@ti.func
+def node_place(index, scene: ti.i32, shape: ti.template()) -> ti.i32:
+    """Where a node's entry lies in arrays that hold one for each node."""
+    block = index >> 2
+    local = index & 3
+    place = (block[0] * shape[SHAPE.blocks + 1] + block[1]) * shape[SHAPE.blocks + 2] + block[2]
+    place = (scene * shape[SHAPE.scene_blocks] + place) * BLOCK_NODES
+    return place + (local[0] * BLOCK + local[1]) * BLOCK + local[2]
+
+
+@ti.func
+def ghost_place(index, scene: ti.i32, arrays: ti.template()) -> ti.i32:
+    """Where a node's second field lies, in numbers of nodes."""
+    return arrays.shape[SHAPE.ghost_begin] + arrays.contact[node_place(index, scene, arrays.shape)]
+
+
+@ti.func
+def interpolate(x, first_node: ti.i32, arrays: ti.template(), inverse_dx: ti.f32):
+    """The velocity at x from the nodes around, and its gradient, APIC's C, 1/s. The scene's begin at `first_node`."""
+    scaled = x * inverse_dx
+    base = ti.floor(scaled - 0.5, ti.i32)
+    fx = scaled - ti.cast(base, ti.f32)
+    w0, w1, w2 = weights(fx)
+    w = ti.static((w0, w1, w2))
+    index_x, index_y, index_z = node_places(base, first_node, arrays.shape, 1)
+    v = ti.Vector([0.0, 0.0, 0.0])
+    gradient_x = ti.Vector([0.0, 0.0, 0.0])
+    gradient_y = ti.Vector([0.0, 0.0, 0.0])
+    gradient_z = ti.Vector([0.0, 0.0, 0.0])
+    for i in ti.static(range(3)):
+        plane = ti.Vector([0.0, 0.0, 0.0])
+        plane_y = ti.Vector([0.0, 0.0, 0.0])
+        plane_z = ti.Vector([0.0, 0.0, 0.0])
+        for j in ti.static(range(3)):
+            line = ti.Vector([0.0, 0.0, 0.0])
+            line_z = ti.Vector([0.0, 0.0, 0.0])
+            for k in ti.static(range(3)):
+                whole = arrays.node[index_x[i] + index_y[j] + index_z[k]]
+                share = w[k][2] * ti.Vector([whole[0], whole[1], whole[2]])
+                line += share
+                line_z += (k - fx[2]) * share
+            plane += w[j][1] * line
+            plane_y += w[j][1] * (j - fx[1]) * line
+            plane_z += w[j][1] * line_z
+        v += w[i][0] * plane
+        gradient_x += w[i][0] * (i - fx[0]) * plane
+        gradient_y += w[i][0] * plane_y
+        gradient_z += w[i][0] * plane_z
+    return v, ti.Matrix.cols([gradient_x, gradient_y, gradient_z]) * (4.0 * inverse_dx)
+
+
+@ti.func
+def interpolate_hidden(x, v, C, hidden: ti.i32, scene: ti.i32, arrays: ti.template(), inverse_dx: ti.f32):
+    """The v and C that `interpolate` gave, with the second fields of hidden nodes in place of their first."""
+    scaled = x * inverse_dx
+    base = ti.floor(scaled - 0.5, ti.i32)
+    new_v = v
+    new_C = C
+    bits = hidden
+    n = 0
+    while bits != 0:
+        if bits & 1:
+            index = base + ti.Vector([n // 9, n // 3 % 3, n % 3])
+            offset = ti.cast(index, ti.f32) - scaled
+            place = node_place(index, scene, arrays.shape)
+            difference = arrays.node[arrays.shape[SHAPE.ghost_begin] + arrays.contact[place]] - arrays.node[place]
+            change = ti.Vector([difference[0], difference[1], difference[2]])
+            change *= spline(offset[0]) * spline(offset[1]) * spline(offset[2])
+            new_v += change
+            new_C += (4.0 * inverse_dx) * change.outer_product(offset)
+        bits >>= 1
+        n += 1
+    return new_v, new_C
