@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+from functools import partial
 
 import pytest
 import yaml
@@ -117,35 +118,47 @@ def test_help_and_config_print(tmp_path, monkeypatch, capfd):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_makes_completes_and_leaves_alone(backend, tmp_path):
+@pytest.fixture
+def command(backend, threads, tmp_path, monkeypatch, capfd):
+    """Runs the command here, with workers that are threads: its exit code, output and errors."""
+    monkeypatch.chdir(tmp_path)
+
+    def call(*arguments):
+        code = exit_code(partial(main, backend=backend), "datagen", list(arguments), monkeypatch)
+        return code, *capfd.readouterr()
+
+    return call
+
+
+def test_makes_completes_and_leaves_alone(command, tmp_path):
     """The command makes a data set from any working folder, says when it is complete, and then changes nothing."""
-    code, output, errors = run(*SMALL, "out=made", cwd=tmp_path)
+    code, output, errors = command(*SMALL, "out=made")
     assert code == 0 and output == "", errors
     assert errors.splitlines()[-1] == "made is complete: 3 train, 1 validation, 0 test episodes"
     assert "published train-000000-000001.tar (1 episode)" in errors and "\r" not in errors
     manifest = (tmp_path / "made" / "manifest.json").read_bytes()
-    code, _, errors = run(*SMALL, "out=made", cwd=tmp_path)
+    code, _, errors = command(*SMALL, "out=made")
     assert (code, errors) == (0, "made is complete: 3 train, 1 validation, 0 test episodes\n")
     assert (tmp_path / "made" / "manifest.json").read_bytes() == manifest
     assert [path.name for path in tmp_path.iterdir() if path.name != "control"] == ["made"]
-    code, _, errors = run(*SMALL, "out=made", "scene=no_obstacles", cwd=tmp_path)
+    code, _, errors = command(*SMALL, "out=made", "scene=no_obstacles")
     assert code == 2 and errors.startswith("error: made holds another data set: scene.group_shapes is")
 
 
-def test_resolved_config_file(backend, make_config, tmp_path):
+def test_resolved_config_file(command, make_config, tmp_path):
     """A resolved config in any folder, as the trainer writes one, serves instead of conf/."""
     dataset = make_config(training_scenes=1, validation_scenes=0, test_scenes=0, frames=4).dataset
     config = DatagenConfig(scene=SceneConfig(obstacle_count=1), dataset=dataset)
     (tmp_path / "dataset.yaml").write_text(yaml.safe_dump(to_mapping(config)))
-    code, _, errors = run("--config-path", str(tmp_path), "--config-name", "dataset", cwd=tmp_path)
+    code, _, errors = command("--config-path", str(tmp_path), "--config-name", "dataset")
     assert code == 0, errors
     assert Manifest.load(dataset.folder).complete
     assert not (tmp_path / "outputs").exists()
 
 
-def test_json_progress(backend, tmp_path):
+def test_json_progress(command):
     """With progress=json standard output is one JSON object a line, and standard error is empty."""
-    code, output, errors = run(*SMALL, "out=made", "progress=json", cwd=tmp_path)
+    code, output, errors = command(*SMALL, "out=made", "progress=json")
     assert (code, errors) == (0, "")
     events = [json.loads(line) for line in output.splitlines()]
     assert events[0]["event"] == "start" and (events[0]["done"], events[0]["total"]) == (0, 4)
@@ -154,9 +167,9 @@ def test_json_progress(backend, tmp_path):
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="looks for orphans in /proc")
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGKILL, -9)])
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGKILL, -9)])
 def test_stopping_leaves_a_resumable_folder(backend, control, tmp_path, number, code):
-    """Ctrl-C, SIGTERM and even SIGKILL keep every staged episode and leave no process; the same command resumes."""
+    """Ctrl-C and even SIGKILL keep every staged episode and leave no process; the same command resumes."""
     (control / "slow").touch()
     process = start(*SMALL, "out=made", cwd=tmp_path)
     manifest = tmp_path / "made" / "manifest.json"

@@ -48,6 +48,9 @@ def test_whole_dataset(make_config, small_dataset, backend, tmp_path):
     assert 1 <= ended <= 2  # one may have had no scene
     assert hashes(Path(config.dataset.folder)) == hashes(small_dataset)
     assert len(recorder.episodes) == 8 and len(recorder.shards) == 7
+    episode = next(iter(EpisodeStore(config.dataset.folder, "train")))
+    assert episode.solver["counters"] == {"substeps": 6}
+    assert episode.solver["settings"]["youngs_modulus_pa"] == 1e6 and "device" not in episode.solver["settings"]
     assert {path.suffix for path in Path(config.dataset.folder).iterdir()} == {".tar", ".json", ""}
 
 
@@ -79,7 +82,7 @@ def test_scenes_that_cannot_be_read(make_config, backend):
         generate(make_config(), unreadable, WorkerPlan(1, 1, 2, 4, 4))
 
 
-def test_long_episodes(make_config, backend):
+def test_long_episodes(make_config, backend, threads):
     """A third of each split's episodes, evenly spread, have long_frames; a launch of both kinds becomes two."""
     config = make_config(training_scenes=9, validation_scenes=3, test_scenes=0, long_fraction=0.34, long_frames=11)
     generate(config, backend, WorkerPlan(1, None, 2, 4, 4))
@@ -94,7 +97,7 @@ def test_long_episodes(make_config, backend):
         np.testing.assert_allclose(moved_N3, np.tile(0.5 * time_s**2 * down, (len(moved_N3), 1)), atol=1e-6)
 
 
-def test_batches(make_config, backend, control):
+def test_batches(make_config, backend, control, threads):
     """A solver that takes several scenes a launch starts with a small launch and fills the later ones."""
     config = make_config(training_scenes=9, validation_scenes=0, test_scenes=0)
     recorder = generate(config, backend, WorkerPlan(1, None, 2, 4, 2))
@@ -105,7 +108,7 @@ def test_batches(make_config, backend, control):
         assert generate(config, backend, WorkerPlan(1, None, 2, largest, largest)).launches == launches
 
 
-def test_scenes_are_spread_over_solvers(make_config, backend, control):
+def test_scenes_are_spread_over_solvers(make_config, backend, control, threads):
     """Each of three solvers gets a launch of the same size, though those on a GPU ask for more as soon as they have
     one, and some take long to start.
     """
@@ -134,7 +137,7 @@ def test_scenes_are_spread_over_solvers(make_config, backend, control):
         assert batches == expected
 
 
-def test_first_launch_waits_for_the_first_scenes(make_config, backend, control):
+def test_first_launch_waits_for_the_first_scenes(make_config, backend, control, threads):
     """A scene that is quick to make does not overtake the first ones: training waits for the first shard."""
     config = make_config(training_scenes=7, validation_scenes=0, test_scenes=0)
     first, second = (scene_seed(0, "train", i, 0) for i in range(2))
@@ -172,7 +175,7 @@ def test_scene_that_kills_its_worker_is_quarantined(make_config, backend, contro
 
 
 @pytest.mark.parametrize(("sign", "cause"), [("fail", "diverged in frame 3"), ("refuse", "no room for the obstacles")])
-def test_scene_that_fails_is_quarantined(make_config, backend, control, sign, cause):
+def test_scene_that_fails_is_quarantined(make_config, backend, control, sign, cause, threads):
     """A scene that cannot be made or simulated is replaced at once: trying the same seed again would not help."""
     config = make_config(training_scenes=2, validation_scenes=0, test_scenes=0)
     seed = scene_seed(0, "train", 0, 0)
@@ -186,7 +189,7 @@ def test_scene_that_fails_is_quarantined(make_config, backend, control, sign, ca
     assert recorder.messages == [f"train-000000 (seed {seed}) could not be simulated: {cause}; trying another seed"]
 
 
-def test_stop_keeps_what_is_staged(make_config, backend, control):
+def test_stop_keeps_what_is_staged(make_config, backend, control, threads):
     """A run that is asked to stop ends, and the next one simulates only what is left."""
     config = make_config()
     recorder = Recorder()
@@ -223,7 +226,7 @@ def test_fault_in_the_solver_ends_the_run(make_config, backend, control):
         generate(make_config(), Backend(backend.generate_scene, backend.build_obstacle_grid, "no_such_module:simulate"))
 
 
-def test_full_disk_in_a_worker_reaches_the_parent(make_config, backend, tmp_path):
+def test_full_disk_in_a_worker_reaches_the_parent(make_config, backend, tmp_path, threads):
     """An OSError while staging ends the run as that OSError."""
     config = make_config(training_scenes=1, validation_scenes=0, test_scenes=0)
     with DatasetWriter(config) as writer:
@@ -236,7 +239,7 @@ def test_full_disk_in_a_worker_reaches_the_parent(make_config, backend, tmp_path
         staging.mkdir()
 
 
-def test_every_scene_fails(make_config, backend, control):
+def test_every_scene_fails(make_config, backend, control, threads):
     """When no seed works the run ends with the cause and what to change."""
     for attempt in range(20):
         (control / f"refuse-{scene_seed(0, 'train', 0, attempt)}").touch()
@@ -271,16 +274,6 @@ def test_hidden_gpus_are_not_used(monkeypatch):
         assert visible_gpus() == ()
 
 
-def test_positions_start_at_the_scene(make_config, backend):
-    """Episodes hold what the solver returned, with seed, counters and physics beside."""
-    config = make_config(training_scenes=1, validation_scenes=0, test_scenes=0)
-    generate(config, backend)
-    (episode,) = EpisodeStore(config.dataset.folder, "train")
-    assert episode.solver["counters"] == {"substeps": 6}
-    assert episode.solver["settings"]["youngs_modulus_pa"] == 1e6 and "device" not in episode.solver["settings"]
-    assert np.isfinite(episode.position_TN3).all() and episode.frame_count == 6
-
-
 def test_grids_follow(make_config, backend, control):
     """A scene whose grid cannot be built is replaced, also when it was simulated meanwhile; a maker that dies of one
     grid is replaced and builds it.
@@ -296,12 +289,10 @@ def test_grids_follow(make_config, backend, control):
     assert len(recorder.messages) == 2
 
 
-def test_tars_are_those_of_tarfile(make_config, backend, tmp_path):
+def test_tars_are_those_of_tarfile(folder, tmp_path):
     """Shards are bitwise what Python's own module makes of their members."""
-    config = make_config(training_scenes=4, validation_scenes=0, test_scenes=0)
-    generate(config, backend)
-    for shard in Manifest.load(config.dataset.folder).shards:
-        path = Path(config.dataset.folder) / shard.name
+    for shard in Manifest.load(folder).shards:
+        path = folder / shard.name
         with tarfile.open(path) as given, tarfile.open(tmp_path / "own.tar", "w", format=tarfile.GNU_FORMAT) as own:
             for info in given:
                 plain = tarfile.TarInfo(info.name)
