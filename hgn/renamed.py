@@ -135,7 +135,6 @@ VALUES: dict[str, dict[Any, str]] = {
     "precision": _PRECISIONS,
     "precisions": _PRECISIONS,
     "stored_precision": {True: "fp16", False: "fp32"},
-    "device": {"gpu": "cuda"},
     "system": {"trivial": "baseline"},  # in reports of tools.error_vs_time
 }
 

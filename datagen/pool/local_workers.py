@@ -1,4 +1,4 @@
-"""Workers that are processes of this machine.
+"""Workers in processes of this machine.
 
 A worker ends with its parent, and leaves signals from the terminal to it. Errors inside are sent to the parent.
 """
@@ -61,7 +61,7 @@ class LocalWorker(Worker):
     def give(self, message: object) -> None:
         self.idle, self.heard_at = False, time.monotonic()
         if isinstance(message, list):
-            for made in message:  # those of a launch are a gigabyte, which in one piece would be copied several times
+            for made in message:  # a launch is a gigabyte, which would be copied several times in one piece
                 self.tell(made)
             message = None
         self.tell(message)
@@ -94,14 +94,12 @@ class LocalWorkerFactory:
         self.plan, self._config, self._backend = plan, config, backend
 
     def start_maker(self) -> Worker:
-        """A process that answers each SceneTask with a MadeScene, or a cause, and each GridTask with a BuiltGrid."""
+        """Starts a process that answers a SceneTask with a MadeScene or a cause, and a GridTask with a BuiltGrid."""
         return LocalWorker(_make_scenes, self._config, self._backend)
 
     def start_solver(self, number: int) -> Worker:
-        """A process that simulates lists of MadeScene, told one by one with None behind the last, and takes the
-        BuiltGrid of those that lack one at any time.
-
-        Of several it sees one CUDA device alone.
+        """Starts a process that simulates batches of MadeScene, sent one by one and ended by None; it accepts their
+        BuiltGrid at any time. With several solvers each sees one CUDA device.
         """
         plan = self.plan
         gpu = plan.gpus[number % len(plan.gpus)] if plan.solvers > 1 and plan.gpus else None
@@ -126,7 +124,7 @@ def _run(connection: Connection, target: Callable[..., None], *arguments: Any) -
 
 
 class _Sender:
-    """Sends from the main thread and from the staging thread."""
+    """Sends messages from several threads."""
 
     def __init__(self, connection: Connection) -> None:
         self._connection, self._lock = connection, threading.Lock()
@@ -157,7 +155,7 @@ def _make_scenes(connection: Connection, send: _Sender, config: DatagenConfig, b
 
 
 class _Inbox:
-    """What the pool sends to a solver, read while it simulates: scenes, None behind those of a launch, and grids."""
+    """Receives scenes, None at the end of a launch, and grids in a thread, while the solver simulates."""
 
     def __init__(self, connection: Connection, send: _Sender) -> None:
         self._batches: SimpleQueue[list[MadeScene] | None] = SimpleQueue()
@@ -166,12 +164,12 @@ class _Inbox:
         threading.Thread(target=self._read, args=(connection, send), name="inbox", daemon=True).start()
 
     def batches(self) -> Iterator[list[MadeScene]]:
-        """Until the pool has gone."""
+        """Yields batches until the pool is gone."""
         while (batch := self._batches.get()) is not None:
             yield batch
 
     def grid(self, made: MadeScene) -> ObstacleGrid | str:
-        """The grid of a scene, or why there is none; waits for it."""
+        """Waits for the grid of a scene and returns it, or why there is none."""
         if made.obstacle_grid is not None:
             return made.obstacle_grid
         grid = self._coming(made.task).result()
@@ -201,7 +199,7 @@ class _Inbox:
                 for grid in self._grids.values():
                     grid.cancel()
             return
-        os._exit(1)  # the parent may be sending, and would wait for ever for somebody who reads
+        os._exit(1)  # else the parent could wait for ever for its message to be read
 
 
 def _solve(
@@ -218,9 +216,9 @@ def _solve(
     config_hash = identity_hash(dataset_identity(config))
     inbox = _Inbox(connection, send)
     on_gpu = threads is None
-    if on_gpu:  # it compiles while the first scenes are made
+    if on_gpu:  # compiles while the first scenes are built
         pkgutil.resolve_name(backend.warm_up)(config.scene, config.mpm, first_launch)
-    # one batch is staged while the next is simulated, so that a GPU does not wait for the disk
+    # a batch is staged while the next is simulated, so that a GPU does not wait for the disk
     with ThreadPoolExecutor(max_workers=_STAGING_THREADS) as stager:
         staging: list[Future[None]] = []
         for batch in inbox.batches():
@@ -274,8 +272,8 @@ def _received(connection: Connection) -> Iterator[Any]:
 
 @contextlib.contextmanager
 def _terminal_signals_blocked() -> Iterator[None]:
-    # a child inherits the mask: Ctrl-C reaches the whole process group, and only the parent may act on it.
-    # Starting the resource tracker unblocks the signal, so it is started before.
+    # A child inherits the mask: only the parent acts on Ctrl-C, which reaches the whole process group.
+    # Starting the resource tracker unblocks the signal, so it is started first.
     resource_tracker.ensure_running()
     previous = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:

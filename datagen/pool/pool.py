@@ -1,8 +1,8 @@
-"""Workers that make the missing episodes of a data set: scene makers in front, solvers behind.
+"""The pool of workers that generate the missing episodes of a data set: makers build scenes, solvers simulate them.
 
-The pool hands out work, publishes shards and replaces workers that die. A scene whose worker dies is tried again,
-alone; after MAXIMUM_ATTEMPTS it is quarantined and the next seed takes its place. Workers are processes of this
-machine (datagen/pool/local_workers.py) or of a Ray cluster (datagen/pool/ray_workers.py).
+The pool distributes work, publishes shards and replaces dead workers. A scene whose worker died is simulated again
+alone; after MAXIMUM_ATTEMPTS it is quarantined and replaced by the next seed. Workers run on this machine
+(datagen/pool/local_workers.py) or on a Ray cluster (datagen/pool/ray_workers.py).
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ from datagen.pool.writer import DatasetWriter
 from hgn.schema import ConfigError
 
 MAXIMUM_ATTEMPTS = 3  # of a scene whose worker dies, before it is quarantined
-_WAIT_SECONDS = 0.2  # at most until a stop request is seen
-_PACKING_SECONDS = 0.02  # at most until a packed shard is published
-_LOOK_SECONDS = 1.0  # between looks at what other generators have published or left behind
-_LAUNCH_GROWTH = 32  # from one launch to the next, up to the full size
+_WAIT_SECONDS = 0.2  # maximum delay of a stop request
+_PACKING_SECONDS = 0.02  # maximum delay between packing and publishing a shard
+_LOOK_SECONDS = 1.0  # interval of checks for shards of other generators
+_LAUNCH_GROWTH = 32  # factor between the sizes of two launches, up to the full size
 
 
 class Stopped(Exception):  # noqa: N818 - a request, not an error
@@ -31,7 +31,7 @@ class Stopped(Exception):  # noqa: N818 - a request, not an error
 
 
 class Pool:
-    """Makes every episode of `writer`'s share that no other generator makes, and publishes the shards."""
+    """Generates the episodes of a writer's share that no other generator has claimed, and publishes the shards."""
 
     def __init__(
         self,
@@ -45,18 +45,19 @@ class Pool:
         self._launch_size = self._largest_launch = self._plan.first_launch
         self._launches = 0
         self._deaths_in_a_row = 0
-        self._alone: dict[str, int] = {}  # keys whose worker died: how often while they ran alone
-        self._group: dict[str, int] = {}  # keys whose worker died: which others they are tried again with
+        # of keys whose worker died: deaths while they ran alone, and the group that they are tried again with
+        self._alone: dict[str, int] = {}
+        self._group: dict[str, int] = {}
         self._grid_deaths: dict[SceneTask, int] = {}
 
     def run(self) -> None:
-        """Returns when the share is published.
+        """Runs until the share is published, and ends all workers.
 
-        Raises: Stopped; ConfigError, OSError or RuntimeError from a worker. Workers are gone in any case.
+        Raises: Stopped; ConfigError, OSError or RuntimeError from a worker.
         """
         self._todo: list[SceneTask] = []
         self._ready: list[MadeScene] = []
-        self._gridless: list[MadeScene] = []  # what lacks its obstacle grid, and nobody builds it
+        self._gridless: list[MadeScene] = []  # scenes whose obstacle grid no maker builds yet
         self._makers: list[Worker] = []
         self._solvers: list[Worker] = []
         self._counted, self._next_look, self._said_waiting = self._writer.done, 0.0, False
@@ -83,19 +84,19 @@ class Pool:
 
     def _start_workers(self) -> None:
         missing = self._writer.total - self._writer.done
-        # a solver needs seconds to start, so all start before the first scene is asked for
+        # a solver takes seconds to start, so all start before the first scene is requested
         self._solvers = [self._factory.start_solver(i) for i in range(min(self._plan.solvers, missing))]
         self._makers = [self._factory.start_maker() for _ in range(min(self._plan.makers, missing))]
         self._launch_size = min(self._largest_launch, self._even_launch(0))
 
     def _even_launch(self, taken: int) -> int:
-        """Scenes of a launch, so that those that no solver has make even ones; `taken` are about to be given to one."""
+        """Returns the launch size that divides the remaining scenes evenly; `taken` scenes are about to be given."""
         left = self._writer.total - self._writer.done - sum(len(solver.tasks) for solver in self._solvers) - taken
         share = max(1, math.ceil(left / len(self._solvers)))
         return math.ceil(share / math.ceil(share / self._plan.scenes_per_launch))
 
     def _claim(self) -> None:
-        """Claims shards as the makers need them, so that other generators on the folder find work too."""
+        """Claims shards as the makers need them, and leaves others to other generators on the folder."""
         if len(self._todo) >= self._plan.makers or time.monotonic() < self._next_look:
             return
         self._writer.refresh()
@@ -122,7 +123,7 @@ class Pool:
         return shard is not None
 
     def _hand_out(self) -> None:
-        # a GPU's solver asks for more as soon as it has some: first those that have none, also while they start
+        # a GPU's solver is idle as soon as it has scenes: solvers without scenes come first, even while they start
         for solver in sorted(self._solvers, key=lambda solver: (bool(solver.tasks), solver.given)):
             others_first = solver.tasks and any(other.idle and not other.tasks for other in self._solvers)
             if solver.idle and not others_first and (batch := self._next_batch(solver)):
@@ -135,7 +136,7 @@ class Pool:
                 maker.give(task)
 
     def _next_task(self) -> SceneTask | GridTask | None:
-        """For a maker: a scene while the next launch lacks some, then what a launch must have at its end."""
+        """Returns a maker's next task: scenes until the next launch is full, then grids, needed at a launch's end."""
         coming = len(self._ready) + len(self._being_made())
         short = coming < self._launch_size
         if self._todo and short:
@@ -153,12 +154,12 @@ class Pool:
         return [task for maker in self._makers for task in maker.tasks.values() if isinstance(task, SceneTask)]
 
     def _next_batch(self, solver: Worker) -> list[MadeScene]:
-        """The next scenes to simulate; empty when it is better to wait for more of them."""
+        """Returns the next scenes to simulate, or none where waiting for more is better."""
         self._ready.sort(key=lambda made: made.task.place)
         for made in self._ready:
             group = self._group.get(made.task.key)
             if group is not None:
-                if solver.tasks:  # still being staged: no other can be to blame
+                if solver.tasks:  # still being staged; with others the cause of a death would be unclear
                     return []
                 batch = [other for other in self._ready if self._group.get(other.task.key) == group]
                 self._ready = [other for other in self._ready if self._group.get(other.task.key) != group]
@@ -167,13 +168,13 @@ class Pool:
         unmade = [*self._todo, *self._being_made()]
         if not self._ready or (unmade and len(self._ready) < size):
             return []
-        # training waits for the first shards in order, so small launches must not overtake a scene still being made
+        # training waits for the first shards in order, so small launches must not overtake unfinished scenes
         growing = self._largest_launch < self._plan.scenes_per_launch
         if growing and any(task.place < self._ready[size - 1].task.place for task in unmade):
             return []
         batch, self._ready = self._ready[:size], self._ready[size:]
         self._launches += 1
-        if self._launches % len(self._solvers) == 0:  # each has had one of this size
+        if self._launches % len(self._solvers) == 0:  # each solver has had a launch of this size
             self._largest_launch = min(_LAUNCH_GROWTH * self._largest_launch, self._plan.scenes_per_launch)
             self._launch_size = min(self._largest_launch, self._even_launch(len(batch)))
         return batch
@@ -183,15 +184,15 @@ class Pool:
             worker.heard_at = time.monotonic()
             if message is not None:
                 self._handle(worker, *message)
-            elif self._should_stop():  # a signal to the whole process group ends workers too
+            elif self._should_stop():  # the signal reached the whole process group
                 raise Stopped
             else:
                 self._replace(worker, worker.cause_of_death())
-        # a process that is stopped, or waits for a device for ever
+        # a stopped process, or one that waits for a device for ever, sends nothing
         silence, now = self._settings.worker_silence_s, time.monotonic()
         slept, self._awake_at = now - self._awake_at > silence / 2, now
         for worker in (*self._makers, *self._solvers):
-            if slept:  # this process was stopped itself (Ctrl-Z, a frozen container), and they with it
+            if slept:  # this process was stopped too (Ctrl-Z, a frozen container)
                 worker.heard_at = now
             elif worker.speaks and worker.tasks and now - worker.heard_at > silence:
                 self._replace(worker, f"it said nothing for {silence:.0f} s")
@@ -226,7 +227,7 @@ class Pool:
             raise RuntimeError(f"a worker failed:\n{values[0]}")
 
     def _grid_built(self, built: BuiltGrid) -> None:
-        """Gives a scene its grid, wherever it is by now: among those to be simulated, or with a solver."""
+        """Adds a grid to its scene, which is ready to be simulated, or in a solver."""
         key, grid = built.task.key, built.grid
         for place, made in enumerate(self._ready):
             if made.task == built.task:
@@ -283,8 +284,7 @@ class Pool:
             if isinstance(item, MadeScene) and self._writer.is_staged(task.split, task.index):
                 self._accept(task)
                 continue
-            # of several scenes any may be to blame: each half is tried without the other, down to a scene alone, and
-            # only then is it counted against it
+            # any scene of a launch may be the cause: halves are tried alone, down to one scene, whose deaths count
             if blamable:
                 self._alone[task.key] = self._alone.get(task.key, 0) + (len(lost) == 1)
                 self._group[task.key] = groups + (2 * place >= len(lost))

@@ -1,9 +1,8 @@
 """Workers on a Ray cluster: `ray start --head` on one machine, `ray start --address=...` on others, then `pool=ray`.
 
-Makers and solvers are Ray actors; the pool schedules, retries and publishes as it does with processes of its own.
-Finished episodes travel through Ray's object store, so only the machine of the pool needs the data set's folder, and
-all need this project installed in the same Python. An actor that finds no place waits for a machine with room for
-it: machines may leave while the pool runs, and others may take their place.
+Makers and solvers are Ray actors; the pool schedules, retries and publishes as with local processes. Episodes travel
+through Ray's object store: only the pool's machine needs the data set's folder, and all machines need this project in
+the same Python. An actor waits until a machine has room for it, so machines may leave and join at any time.
 """
 
 from __future__ import annotations
@@ -39,7 +38,7 @@ _CONNECT_REMEDY = (
 
 
 class RayWorkerFactory:
-    """Actors of a cluster; a context manager that holds the connection to it."""
+    """Starts actors on a cluster; a context manager for the connection."""
 
     def __init__(self, config: DatagenConfig, backend: Backend, early: bool = False) -> None:
         """Raises: ConfigError when Ray is not installed."""
@@ -88,7 +87,7 @@ class RayWorkerFactory:
                 kind, *values = self._ray.get(ref)
             except self._ray.exceptions.RayError as error:
                 worker.cause = f"{type(error).__name__} on node {worker.node or 'not yet known'}"
-                # a node that falls silent is at first only unavailable; an actor that its scene killed is known dead
+                # a silent node is first reported as unavailable; an actor killed by its scene as dead
                 worker.silent = isinstance(error, self._ray.exceptions.ActorUnavailableError)
                 yield worker, None
                 continue
@@ -104,13 +103,13 @@ class RayWorkerFactory:
                 yield worker, ("idle",)
 
     def _start(self, kind: type, *arguments: object, **options: Any) -> RayWorker:
-        # neither restarted nor retried by Ray: the pool counts a scene's deaths, and replaces workers itself
+        # Ray neither restarts nor retries: the pool counts a scene's deaths and replaces workers
         actor: Any = self._ray.remote(kind).options(max_restarts=0, max_task_retries=0, **options).remote(*arguments)
         return RayWorker(self._ray, actor)
 
 
 class RayWorker(Worker):
-    """The pool's end of an actor. It is idle once the cluster has found a place for it."""
+    """The pool's view of an actor, which is idle once the cluster has placed it."""
 
     def __init__(self, ray: Any, actor: Any) -> None:
         super().__init__()
@@ -138,7 +137,7 @@ class RayWorker(Worker):
 
 
 class _Maker:
-    """The actor that builds scenes."""
+    """An actor that builds scenes."""
 
     def __init__(self, config: DatagenConfig, backend: Backend) -> None:
         self._config, self._backend = config, backend
@@ -154,7 +153,7 @@ class _Maker:
 
 
 class _Solver:
-    """The actor that simulates scenes: one answer for each."""
+    """An actor that simulates scenes, with one answer for each."""
 
     def __init__(self, config: DatagenConfig, backend: Backend, threads: int | None) -> None:
         self._config, self._backend, self._threads = config, backend, threads

@@ -1,7 +1,4 @@
-"""What workers of the pool do, wherever they run (makers build scenes, solvers simulate them), and its end of them.
-
-datagen.pool.local_workers and datagen.pool.ray_workers say where workers run.
-"""
+"""The work of the pool's makers and solvers, wherever they run, and the pool's view of a worker."""
 
 from __future__ import annotations
 
@@ -29,9 +26,7 @@ from hgn.system.extras import missing_extra
 
 @dataclass(frozen=True)
 class Backend:
-    """Where the functions that do the work are found, as `module:function`; resolved inside the workers alone, so
-    that the parent imports no solver.
-    """
+    """The functions that do the work, as `module:function`. Only workers resolve them: the pool imports no solver."""
 
     generate_scene: str = "hgn.scene.random_scene:generate_scene"
     build_obstacle_grid: str = "hgn.scene.obstacle_grid:build_obstacle_grid"
@@ -44,7 +39,7 @@ _Value = TypeVar("_Value")
 
 
 class Parcel(Generic[_Value]):
-    """A value that processes may pass on as the bytes that came: it is pickled once, and read where it is opened."""
+    """A value that is pickled once, passed on as bytes, and unpickled where it is opened."""
 
     def __init__(self, value: _Value) -> None:
         self._value: _Value | None = value
@@ -71,13 +66,13 @@ class MadeScene:
 
     task: SceneTask
     scene: Parcel[Scene]
-    obstacle_grid: ObstacleGrid | None  # none: it follows, for the solver does not need it
-    collider: Parcel[Any] = field(default_factory=lambda: Parcel(None))  # what the solver makes of the obstacles
+    obstacle_grid: ObstacleGrid | None  # None: sent later, as the solver does not need it
+    collider: Parcel[Any] = field(default_factory=lambda: Parcel(None))  # the solver's form of the obstacles
 
 
 @dataclass(frozen=True)
 class GridTask:
-    """The obstacle grid of a made scene, to be built."""
+    """A scene whose obstacle grid is to be built."""
 
     task: SceneTask
     scene: Parcel[Scene]
@@ -85,7 +80,7 @@ class GridTask:
 
 @dataclass(frozen=True)
 class BuiltGrid:
-    """What became of it: the grid, or why there is none."""
+    """The result of a GridTask: the grid, or why there is none."""
 
     task: SceneTask
     grid: ObstacleGrid | str
@@ -94,24 +89,24 @@ class BuiltGrid:
 class Worker(ABC):
     """The pool's end of a worker, wherever it runs."""
 
-    speaks = False  # more often than dataset.worker_silence_s while it works; others speak at the end alone
+    speaks = False  # whether it reports more often than dataset.worker_silence_s while it works
 
     def __init__(self) -> None:
         self.idle = False
-        self.tasks: dict[str, SceneTask | MadeScene | GridTask] = {}  # what it has and has not answered for, by key
-        self.given = 0  # scenes to simulate, in all
-        self.heard_at = time.monotonic()  # when it was last given or said something
+        self.tasks: dict[str, SceneTask | MadeScene | GridTask] = {}  # unanswered, by key
+        self.given = 0  # scenes to simulate, in total
+        self.heard_at = time.monotonic()  # of the last message in either direction
 
     @abstractmethod
     def give(self, message: object) -> None:
-        """Sends work. A worker that has died meanwhile is noticed at the next receive."""
+        """Sends work. A dead worker is noticed at the next receive."""
 
     def tell(self, message: object) -> None:
-        """Sends what belongs to work that it has. Only workers that leave something to be sent later are told."""
+        """Sends a part of work that it already has."""
         raise NotImplementedError
 
     def dismiss(self) -> None:  # noqa: B027 - Ray ends its actors itself
-        """Tells an idle one that nothing comes any more; `kill` waits a little for its end then."""
+        """Tells an idle worker to end; `kill` then waits a little."""
 
     @abstractmethod
     def kill(self) -> None:
@@ -119,15 +114,15 @@ class Worker(ABC):
 
     @abstractmethod
     def cause_of_death(self) -> str:
-        """Why a worker that no longer answers has ended."""
+        """Returns why a worker that no longer answers has ended."""
 
     def blamable(self) -> bool:
-        """Whether what it was working on may have been its end; not where its whole machine went away."""
+        """Whether its task may have caused its death; False where its whole machine is gone."""
         return True
 
 
 class WorkerFactory(Protocol):
-    """Where workers come from."""
+    """Starts workers."""
 
     plan: WorkerPlan
 
@@ -136,18 +131,18 @@ class WorkerFactory(Protocol):
     def start_solver(self, number: int) -> Worker: ...
 
     def receive(self, workers: Sequence[Worker], timeout: float) -> Iterator[tuple[Worker, tuple[Any, ...] | None]]:
-        """What the workers have said, waiting `timeout` seconds at most for the first word; None from one that died."""
+        """Yields messages of workers, None from a dead one; waits `timeout` seconds at most for the first."""
 
 
 def make_scene(task: SceneTask, config: DatagenConfig, backend: Backend, with_grid: bool = True) -> tuple[Any, ...]:
-    """What a maker answers: ("made", MadeScene), or ("failed", key, cause)."""
+    """Returns a maker's answer: ("made", MadeScene), or ("failed", key, cause)."""
     generate_scene = pkgutil.resolve_name(backend.generate_scene)
     build_collider = pkgutil.resolve_name(backend.build_collider)
     try:
         scene = generate_scene(config.scene, task.seed)
-        # here rather than in the solver, which would do it for one scene after another while its device waits
+        # built here, because in the solver the device would wait for one scene after another
         collider = build_collider(scene, config.mpm.choices.collider_band_cells)
-    except ConfigError as error:  # no room for the obstacles, say: another seed may do
+    except ConfigError as error:  # for example no room for the obstacles; another seed may fit
         return "failed", task.key, str(error)
     made = MadeScene(task, Parcel(scene), None, Parcel(collider))
     if with_grid:
@@ -175,8 +170,9 @@ def simulate_batch(
     threads: int | None,
     reporter: Callable[[int], Callable[[int], None]] | None = None,
 ) -> list[Any]:
-    """What the solver returns for each scene, by one launch for each length of episodes; `reporter` makes of a launch's
-    scene count what is called with each of its frames.
+    """Simulates a batch, in one launch for each episode length, and returns the solver's results.
+
+    `reporter` maps the scene count of a launch to a function that is called with each of its frames.
     """
     simulate, lengths = pkgutil.resolve_name(backend.simulate), [config.dataset.frames_of(m.task.index) for m in batch]
     results: dict[SceneTask, Any] = {}
@@ -196,7 +192,7 @@ def simulate_batch(
 
 
 def failure_of(result: Any) -> str | None:
-    """Why what the solver returned is no episode; none where it is one."""
+    """Returns why a result of the solver is no episode, or None."""
     cause = getattr(result, "cause", None)
     if cause is not None:
         return str(cause)
@@ -204,7 +200,7 @@ def failure_of(result: Any) -> str | None:
 
 
 def make_episode(made: MadeScene, result: Any, config: DatagenConfig, config_hash: str) -> Episode:
-    """The episode of a scene with its grid and what the solver returned for it (`position_TN3`, `counters`)."""
+    """Returns the episode of a scene with its grid and the solver's result (`position_TN3`, `counters`)."""
     assert made.obstacle_grid is not None
     scene = made.scene.open()
     return Episode(
@@ -232,7 +228,7 @@ def make_episode(made: MadeScene, result: Any, config: DatagenConfig, config_has
 
 
 def error_message(error: Exception) -> tuple[Any, ...]:
-    """What a worker tells the pool of a fault that no scene is to blame for."""
+    """Returns a worker's message about an error that no scene caused."""
     if isinstance(error, ConfigError):
         return "config_error", str(error)
     if isinstance(error, ModuleNotFoundError) and (missing := missing_extra(error)):

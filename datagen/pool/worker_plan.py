@@ -1,4 +1,4 @@
-"""How many workers make a data set, and how much each takes at once: of a machine, or of a Ray cluster."""
+"""The number of workers and their batch sizes, for one machine or a Ray cluster."""
 
 from __future__ import annotations
 
@@ -10,29 +10,29 @@ from pathlib import Path
 
 from hgn.config import DatagenConfig
 
-GPU_SCENES_PER_LAUNCH = 416  # several for each team; while they are simulated others are made, and staged
-GPU_NODES_PER_LAUNCH = 832 * 64**3  # of the grids of all scenes, about 50 bytes each
-GPU_EARLY_LAUNCH = 2  # where episodes are wanted early: such a launch has the whole GPU for each substep
+GPU_SCENES_PER_LAUNCH = 416  # several for each thread-block team
+GPU_NODES_PER_LAUNCH = 832 * 64**3  # grid nodes of all scenes, about 50 bytes each
+GPU_EARLY_LAUNCH = 2  # scenes of the first launch where episodes are needed early
 MAXIMUM_MAKERS = 32
 _CLUSTER_THREADS = 2  # of a solver without a GPU
 
 
 @dataclass(frozen=True)
 class WorkerPlan:
-    """How many processes of each kind, and how much each takes at once."""
+    """Numbers of workers and batch sizes."""
 
     solvers: int
-    threads: int | None  # of each solver; none on a GPU
+    threads: int | None  # of each solver; None on a GPU
     makers: int
     scenes_per_launch: int
     first_launch: int
-    gpus: tuple[str, ...] = ()  # CUDA devices, dealt out to the solvers in turn
+    gpus: tuple[str, ...] = ()  # CUDA devices, assigned to the solvers in turn
 
 
 def plan_workers(
     config: DatagenConfig, gpus: tuple[str, ...], cpu_count: int, memory_bytes: float, early: bool = False
 ) -> WorkerPlan:
-    """One solver for two cores on a CPU; one for each GPU, with scene makers on the cores."""
+    """Plans one solver for two cores of a CPU, or one for each GPU with makers on the cores."""
     workers, launch = config.dataset.workers, config.mpm.scenes_per_launch
     if config.mpm.device == "cuda" or (config.mpm.device == "auto" and gpus):
         solvers = workers or max(1, len(gpus))
@@ -45,7 +45,7 @@ def plan_workers(
 
 
 def plan_cluster(config: DatagenConfig, nodes: Sequence[Mapping[str, float]], early: bool = False) -> WorkerPlan:
-    """One solver for each GPU of the cluster; without one, for each two cores of a node."""
+    """Plans one solver for each GPU of the cluster, or without GPUs for two cores of a node."""
     workers, launch = config.dataset.workers, config.mpm.scenes_per_launch
     gpus = int(sum(node.get("GPU", 0) for node in nodes))
     if config.mpm.device == "cuda" or (config.mpm.device == "auto" and gpus):
@@ -61,8 +61,8 @@ def plan_cluster(config: DatagenConfig, nodes: Sequence[Mapping[str, float]], ea
 
 
 def gpu_scenes_per_launch(config: DatagenConfig, memory_bytes: float) -> int:
-    """As many as give every part of a GPU work; fewer where their grids are large, or their frames, which the host
-    holds until they are published, would take more than half of its memory.
+    """Returns a launch size that fills a GPU; less where grids are large, or where frames, which stay in host memory
+    until they are published, would need more than half of it.
     """
     scene = config.scene
     nodes = math.prod(math.ceil(length / scene.cell_size) for length in scene.domain_size)
@@ -72,14 +72,14 @@ def gpu_scenes_per_launch(config: DatagenConfig, memory_bytes: float) -> int:
 
 
 def gpu_first_launch(launch: int, early: bool) -> int:
-    """Few scenes where something waits for the first episodes; else all: a launch of few lasts as long as its longest
-    scene, which costs more than it takes to make the others.
+    """Returns the size of the first launch: small only where training or the service waits for episodes, because a
+    launch takes as long as its longest scene.
     """
     return min(launch, GPU_EARLY_LAUNCH) if early else launch
 
 
 def visible_gpus() -> tuple[str, ...]:
-    """The CUDA devices of this machine that CUDA_VISIBLE_DEVICES leaves, without starting CUDA."""
+    """Returns the CUDA devices that CUDA_VISIBLE_DEVICES allows, without starting CUDA."""
     visible = os.environ.get("CUDA_VISIBLE_DEVICES")
     count = len(list(Path("/dev").glob("nvidia[0-9]*"))) or int(Path("/dev/dxg").exists())
     if visible is None:
