@@ -37,7 +37,7 @@ class ServiceConfig:
 
     host: str = "127.0.0.1"  # address to listen on; 0.0.0.0: all
     port: Port = 8000  # 0: any free port
-    health_port: Port | None = None  # of a second process that answers /healthz; null: none
+    health_port: Port | None = None  # also answers /healthz there, for the probes of a busy service; null: none
     connections: Positive[int] = 1024  # simultaneous connections; others are answered with 503
 
     def __post_init__(self) -> None:
