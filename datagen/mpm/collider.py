@@ -1,24 +1,22 @@
-"""Mesh obstacles as the grid sees them: nodes near or inside a mesh, each with the direction that is free.
+"""Contact nodes of mesh obstacles: grid nodes near or inside a mesh, each with the free direction of motion.
 
 The paper's cell normals leak when used as a collider, so the solver builds its own from the triangles.
 Shape legend: K contact nodes, P points, F triangles, V vertices.
 
-Nodes inside a closed body and up to a quarter of a cell above its surface stop what moves inward; where the body is
-thinner than a cell, so that no node may lie there, those nearer to the surface and outside too, in a band of one cell
-at least.
+Closed bodies: nodes inside and up to a quarter of a cell above the surface stop inward motion. Where a body is thinner
+than a cell, so do nodes outside, in a band of one cell at least.
 
-Sheets (open meshes): particles on both sides reach the same nodes, and would hold each other through them. So a node
-near a sheet has two fields of mass and velocity (Bardenhagen et al. 2000): one for the particles that see it, one for
-those that the sheet hides it from (the "colours" of Hu et al. 2018, by line of sight). For the latter the node lies
-beyond the surface, as the inside of a body does: there the same rule holds, with the normal toward the sheet.
+Sheets (open meshes): particles on both sides reach the same nodes, which would couple them. So a node near a sheet has
+two fields of mass and velocity (Bardenhagen et al. 2000): one for particles that see it, and one for particles from
+which the sheet hides it (the "colours" of Hu et al. 2018, by line of sight). For the latter the node lies beyond the
+surface, like the inside of a body, with the normal toward the sheet.
 
-A particle's spline reaches 1.5 cells, so a node stops material that is still far off. That is a gap, and therefore
-nodes near the surface stop none until they have the mass that they have where material lies within 0.75 cells of the
-surface. Without nodes at the surface itself nothing bears the three quarters of the load that come to them: the lowest
-cell of sand falls into a single layer, whose particles the swept test stops one by one, and the sand is braked as if
-it were thinner than it is.
+A particle's spline reaches 1.5 cells, so a node would stop material at a distance and leave a gap. Therefore nodes near
+the surface stop motion only from the mass on that they have where material lies within 0.75 cells of the surface.
+Without nodes at the surface three quarters of the load would have no support: the lowest cell of sand would collapse
+into a layer, stopped only by the swept test, and be braked too strongly.
 
-Where two obstacles claim a node, the closest surface wins. What nodes leave open the swept test stops, with the same
+Where two obstacles claim a node, the nearer surface counts. The swept test stops remaining crossings, with the same
 friction.
 """
 

@@ -1,8 +1,8 @@
 """One substep of explicit MLS-MPM for a batch of scenes, as a single Taichi kernel.
 
 The method is that of datagen.mpm.mls_mpm. On a CPU each (scene, part) of the particles scatters into its own copy of
-the grid, one after another, and the copies are summed in order: no atomics, and the same result whatever the number
-of threads at work. On a GPU all particles scatter at once into one copy with atomics.
+the grid, and the copies are summed in order: the result does not depend on the number of threads. On a GPU all
+particles scatter into one copy with atomics.
 """
 
 from collections import namedtuple

@@ -1,34 +1,31 @@
-"""The parts of a substep of explicit MLS-MPM, for Taichi kernels: grid_kernel and team_kernel are made of them.
+"""The parts of a substep of explicit MLS-MPM, for the Taichi kernels grid_kernel and team_kernel.
 
-APIC transfers with quadratic B-splines (Jiang et al. 2015; Hu et al. 2018): a particle at x touches the nodes
-base .. base + 2 with base = floor(x / dx - 1/2); node I lies at I dx. Nodes are stored by blocks of 4 x 4 x 4,
-[scene, block, node in block]. Only blocks that a particle touches are updated; what particles give to nodes is added
-up apart from the nodes' velocities. Masses are in units of a particle of the config's density.
+APIC transfers with quadratic B-splines (Jiang et al. 2015; Hu et al. 2018). Only blocks of nodes with particles nearby
+are updated. Contributions of particles are summed separately from the nodes' velocities. Masses are in units of a
+particle of the config's density.
 
-Transfers come at a rate of their own, since each smooths velocities: an interval between two holds as many substeps
-as the stiffest particle needs. Where that is three or more, or something so fast that the interval is shorter for it,
-and the time step adaptive, the interval is synchronised: it has one substep more, and its first and last are half as
-long as the others. Stress then acts from half a step before to half a step after the time that it is of, so that
-transfers find velocities of the same time as stresses (velocity Verlet). Were velocities half a step ahead, their
-smoothing would feed oscillations of half a period an interval, whose energy could double in each.
+Each transfer smooths velocities, so transfers have their own rate: the interval between two contains as many substeps
+as the stiffest particle needs. With adaptive steps an interval is synchronised if it needs three or more substeps, or
+if a fast particle shortens it. It then has one substep more, and its first and last are half as long as the others:
+stress acts from half a step before to half a step after its time (velocity Verlet). Velocities half a step ahead of the
+stresses would feed oscillations of two periods an interval, whose energy could double in each.
 
-Where an interval that is not synchronised ends, strain is a step behind and velocity half a step. The first substep of
-a synchronised one that follows makes up for both (VALUE.catch_up); where it is the other way round, the first substep
-of the one that follows strains nothing, and its stress acts for half of it.
+At the end of an interval that is not synchronised strain is one step behind, and velocity half a step. The first
+substep of a following synchronised interval compensates both (VALUE.catch_up). In the opposite case the first substep
+does not strain, and its stress acts for half of it.
 
-In an interval's first substep particles give mass and momentum to the nodes and force; in the others they stay where
-they are on the grid, take the gradient of the nodes' velocities for strain and stress, and give force alone, as in the
-Lagrangian phase of the classical method (Sulsky et al. 1994). After the last they take velocity and gradient, and move
-by the interval times that velocity: momentum and angular momentum are kept, as stresses are symmetric and each particle
-moves along its velocity. Within an interval no velocity is smoothed. Which particles find a new stress in a substep is
-the subject of multiple_time_stepping.
+In the first substep of an interval particles transfer mass, momentum and force to the nodes. In the others they keep
+their place on the grid, compute strain and stress from the gradient of the nodes' velocities, and transfer force only,
+as in the Lagrangian phase of the classical method (Sulsky et al. 1994). After the last they take velocity and gradient
+from the grid and move by the interval times the velocity. Momentum and angular momentum are conserved, because stresses
+are symmetric and each particle moves along its velocity. multiple_time_stepping chooses which particles compute a new
+stress in a substep.
 
-Positions belong to the ends of intervals, velocities to their middles (leapfrog): gravity acts for half the last and
-half the present interval, at first for half of the first, so that free fall is v t + g t² / 2 at the end of each,
-whatever their lengths. Only gravity is known that far ahead; stresses and contacts act as in the symplectic Euler
-scheme, which Taichi Elements has for gravity too.
+Positions belong to the ends of intervals, velocities to their middles (leapfrog): gravity acts for half of the last and
+half of the present interval, so that free fall is exactly v t + g t² / 2 at the end of each interval. Stresses and
+contacts act as in the symplectic Euler scheme, which Taichi Elements uses for gravity too.
 
-Everything is per scene: time step, interval, remaining time, state, counters. A scene that is done, or failed, idles.
+Time step, interval, remaining time, state and counters are per scene. Scenes that are done or failed idle.
 """
 
 import taichi as ti

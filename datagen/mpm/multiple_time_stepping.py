@@ -1,16 +1,14 @@
-"""Which particle takes steps of its own, and when, for Taichi kernels: multiple time stepping (Streett et al. 1978).
+"""Multiple time stepping (Streett et al. 1978) for Taichi kernels: soft particles take longer steps.
 
 The substeps of an interval between two transfers are as short as the stiffest particle of the scene needs. In a
-synchronised interval (see mls_mpm) particles that bear longer steps take steps of their own of several substeps, as
-long as their own wave speed allows. Strain and stress are found once a step.
+synchronised interval (see mls_mpm) softer particles take steps of several substeps, as long as their own wave speed
+allows, and compute strain and stress once a step.
 
-The stress acts evenly over the step's substeps: particles of shorter steps read the velocities of the same nodes in
-each of them. Were the impulse of the step given at once, they would read velocities that nothing has, even where all is
-at rest.
+The stress acts evenly over the substeps of a step, because particles with shorter steps read the velocities of the same
+nodes in each of them. The whole impulse at once would give them wrong velocities, even at rest.
 
-Where all particles in a block of nodes take the same steps nobody reads its nodes within a step. There the impulse of
-the whole step goes to the nodes in its first substep, with that of gravity, and the block is left as it is until the
-next step.
+Where all particles in a block of nodes take the same steps, its nodes are not read within a step. There the impulse of
+the whole step and of gravity is applied in the first substep, and the block is not updated until the next step.
 """
 
 import taichi as ti

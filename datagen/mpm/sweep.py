@@ -1,9 +1,8 @@
-"""The triangles near a particle, listed by its base node: those that it may not cross as it moves, and those of sheets
-that may hide nodes from it.
+"""Lists of triangles near particles, by base node: those that a particle may not cross, and those of sheets that may
+hide nodes from it.
 
 A particle with base node I lies half to one and a half cells above it along each axis, and its nodes from I to I + 2:
-all that it can meet on the way to a node, or on a way of half a cell, lies between I and I + 2. All lengths are in
-cells.
+everything on the way to a node, or within half a cell, lies between I and I + 2. All lengths are in cells.
 Shape legend: F triangles, K base nodes near triangles, L entries of all lists.
 """
 

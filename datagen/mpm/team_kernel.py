@@ -1,17 +1,14 @@
-"""Frames of explicit MLS-MPM in one launch, a team of threads for each scene: the fast way on a GPU.
+"""Frames of explicit MLS-MPM in one launch, with a team of threads for each scene: the fast way on a GPU.
 
-The method is that of datagen.mpm.mls_mpm, of whose parts it is made. What differs is who works: a scene of a few
-thousand particles needs hundreds of steps a frame, each of a few microseconds' work, so a team runs a scene by itself,
-step after step, without a launch or a look at other scenes in between. Scenes share nothing, so each takes its own
-steps. A team is one thread block or several, which share a scene's particles and wait for each other
-(datagen.mpm.team_meeting), so that all blocks of such a launch have to be at work at once; it takes one scene after
-another.
+The method and its parts are those of datagen.mpm.mls_mpm. A scene of a few thousand particles needs hundreds of steps a
+frame, each of a few microseconds, so a team runs a scene step after step within one launch, independently of other
+scenes. A team is one or several thread blocks that share a scene's particles and wait for each other
+(datagen.mpm.team_meeting), so all blocks of a launch must run at the same time. A team takes one scene after another.
 
-What each particle alone decides (strain, stress, contact with triangles) is done by a thread for each. At each frame
-the particles are copied from one copy of the state to the other in the order of their cells, so that neighbours in
-space are neighbours in memory.
+Strain, stress and contact with triangles are computed by one thread for each particle. At each frame the particles are
+sorted by their cells into the other copy of the state, so that neighbours in space are neighbours in memory.
 
-With one thread a block it runs on a CPU too; the tests check it there against the other kernel.
+With one thread a block it runs on a CPU too, where tests compare it with the other kernel.
 """
 
 from collections import namedtuple

@@ -1,13 +1,12 @@
-"""Which particles of a team's block act within an interval, as lists.
+"""Lists of the particles of a thread block that act in a substep within an interval.
 
-Of a scene whose particles take steps of their own a third act in a substep. Were each looked at by a thread of its own,
-half of a warp's threads would wait for the others, so threads take what is listed, one entry after the other. Where a
-thread has one particle at most (`run` 1) none is put before another, and `giving` has IDLE for what gives nothing.
-In an interval that is not synchronised all act in each substep, and nothing is listed.
+Where particles take steps of their own about a third acts in a substep. With one thread for each particle half of a
+warp would wait, so threads process lists. Where a thread has at most one particle (`run` 1) there are no lists, and
+`giving` contains IDLE for inactive particles. In an interval that is not synchronised all particles act.
 
-A block lists its own particles, counted from the scene's first: in `column_list` those that begin a step of their own,
-and from its end backwards those that go on with a step whose stress acts evenly; in `giving` both, in their order, the
-latter as -1 - p. Entries lie where the block's own particles do (see team_particles.dealt). How many there are is in
+A block lists its own particles, counted from the scene's first: `column_list` those that begin a step and, backwards
+from its end, those that continue a step whose stress acts evenly; `giving` both, in order, the latter as -1 - p.
+Entries lie at the places of the block's own particles (see team_particles.dealt). Their numbers are in
 columns[segment + ACTING], + GOING_ON and + GIVING.
 """
 

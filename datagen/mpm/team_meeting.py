@@ -1,9 +1,8 @@
-"""How the thread blocks of a team wait for each other: at a counter in global memory, where several share a scene.
+"""Barriers between the thread blocks of a team: counters in global memory.
 
-`threads` of a block are 1 on a CPU, where nothing has to be waited for within it. A block looks at the counter so often
-at most, the `patience`: where blocks that it waits for are not at work at the same time, it would wait for ever. Then
-it says so in meeting[APART] and in columns[segment + LEAVES], and all leave the launch, whose results are worth
-nothing.
+On a CPU a block has one thread. A block reads the counter `patience` times at most: blocks that do not run at the same
+time would wait for each other for ever. Then it sets meeting[APART] and columns[segment + LEAVES], all blocks leave the
+launch, and its results are discarded.
 """
 
 import taichi as ti

@@ -1,4 +1,4 @@
-"""The particles of a team's scene: which block has which, their state in memory, and their order.
+"""The particles of a team's scene: their distribution over blocks, state in memory, and order.
 
 State is stored by field, `state[copy, field, particle]`, in two copies; sorting goes from one to the other.
 """

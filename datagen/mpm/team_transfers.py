@@ -1,7 +1,7 @@
-"""What passes between the particles of a team's scene and its nodes.
+"""Transfers between the particles of a team's scene and its nodes.
 
-Nodes are read whole. Where particles give to them four threads share a particle, one for each component of a node (x, y
-and z of momentum, and mass): together they add up whole sectors of memory.
+Nodes are read whole. In the transfer to nodes four threads share a particle, one for each component of a node (momentum
+along x, y, z, and mass), so that they write whole sectors of memory.
 """
 
 import taichi as ti
