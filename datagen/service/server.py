@@ -4,7 +4,6 @@
 |---|---|---|
 | /manifest.json | the manifest: what the data set is, and how much of it is published | ETag: sha256 of its bytes |
 | /index/... | the index's files, see `hgn.data.index` | Range |
-| /index?since=N | the next shards after the first N, a line of JSON each; at most 128 | |
 | /<shard>.tar | a published shard | ETag: its sha256; Range, If-Range |
 | /progress | counts and the pool's state, JSON | |
 | /metrics | the same for Prometheus | |
@@ -19,11 +18,9 @@ from __future__ import annotations
 import asyncio
 import hashlib
 import hmac
-import json
 from collections import Counter, defaultdict
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, replace
-from itertools import islice
 from pathlib import Path
 
 import uvicorn
@@ -39,10 +36,10 @@ from datagen.service.health import HealthPage
 from datagen.service.sendfile import FileRange
 from datagen.service.supervisor import PoolState
 from datagen.service.uvicorn_compat import SendfileProtocol
-from hgn.data.index import INDEX_NAME, SEGMENT_SHARDS, Index
+from hgn.data.index import INDEX_NAME, Index
 from hgn.data.manifest import MANIFEST_NAME, Manifest
 from hgn.data.verification import verify_file
-from hgn.schema import ConfigError, to_mapping
+from hgn.schema import ConfigError
 from hgn.system.files import read_replaced
 
 _OPEN_PATHS = ("/healthz",)
@@ -50,7 +47,6 @@ _GRACE_S = 5  # for answers that are being sent when the service is stopped; rea
 _FRESH_S = 0.05  # for which a look at the manifest counts: a thousand readers may ask in a second
 _BACKLOG = 256  # connections that are accepted before any of them is looked at
 _OTHER_FILES = 64
-_ANSWERS = 64  # that are kept, of 128 lines at most
 OPEN_FILES = 1024  # of a process, where nothing else is said
 _REMEDY = "delete it and run the generator again"
 
@@ -167,8 +163,6 @@ def make_app(folder: Path, token: str | None, pool: Callable[[], PoolState]) -> 
     """The service as an ASGI application."""
     published, counters = Published(folder), Counter[str]()
     hashing: defaultdict[str, asyncio.Lock] = defaultdict(asyncio.Lock)
-    answers: dict[tuple[int, int, int], str] = {}  # what came after so many shards, of so many
-    answering = asyncio.Lock()
 
     async def manifest(request: Request) -> Response:
         snapshot = await published.snapshot()
@@ -186,28 +180,6 @@ def make_app(folder: Path, token: str | None, pool: Callable[[], PoolState]) -> 
         # what was sent of it never changes: it may only be longer another time
         headers = {"etag": f'"{request.path_params["name"]}"', "cache-control": "private, no-cache"}
         return FileRange(folder / name, size, headers, "application/jsonl")
-
-    async def since(request: Request) -> Response:
-        asked = request.query_params.get("since", "0")
-        if not (asked.isascii() and asked.isdecimal() and len(asked) < 10):
-            return PlainTextResponse(f"since must be a number of shards, got {asked!r}\n", 400)
-        index = (await published.snapshot()).manifest.shards
-
-        def lines() -> str:
-            return "".join(
-                json.dumps(to_mapping(shard)) + "\n" for shard in islice(index.since(int(asked)), SEGMENT_SHARDS)
-            )
-
-        # after a publication a thousand ask for the same
-        key = index.state.generation, len(index), int(asked)
-        if key not in answers:
-            async with answering:
-                if key not in answers:
-                    answers[key] = await to_thread.run_sync(lines)
-        text = answers[key]
-        while len(answers) > _ANSWERS:
-            del answers[next(iter(answers))]
-        return Response(text, headers={"cache-control": "no-cache"}, media_type="application/jsonl")
 
     async def shard(request: Request) -> Response:
         name = request.path_params["name"]
@@ -252,7 +224,6 @@ def make_app(folder: Path, token: str | None, pool: Callable[[], PoolState]) -> 
     app = Starlette(
         routes=[
             Route(f"/{MANIFEST_NAME}", manifest),
-            Route(f"/{INDEX_NAME}", since),
             Route(f"/{INDEX_NAME}/{{name}}", index_file),
             Route("/progress", progress),
             Route("/metrics", metrics),

@@ -32,7 +32,6 @@ from datagen.service.supervisor import PoolState, Supervisor
 from hgn.data.manifest import Manifest, ShardEntry
 from hgn.data.storage import TOKEN_VARIABLE
 from hgn.data.verification import file_sha256
-from hgn.schema import to_mapping
 
 TOKEN = "correct-horse-battery"
 SHARD = "/train-000002-000004.tar"
@@ -89,8 +88,8 @@ def test_manifest_and_its_etag(ask, folder):
     assert ask("/manifest.json", method="HEAD")[1] == headers
 
 
-def test_index_and_what_is_new(ask, folder):
-    """The index's files come as far as the manifest says, whole or in part; and its shards from any number on."""
+def test_index(ask, folder):
+    """The index's files come as far as the manifest says, whole or in part."""
     path = folder / "index" / "1-000000.jsonl"
     content = path.read_bytes()
     path.write_bytes(content + b"not yet published")
@@ -98,14 +97,10 @@ def test_index_and_what_is_new(ask, folder):
     assert ask("/index/1-000000.jsonl", range="bytes=100-")[::2] == (206, content[100:])
     for name in ("1-000001.jsonl", "2-000000.jsonl", "1-segments.jsonl", "..%2fmanifest.json", "1-x.jsonl"):
         assert ask(f"/index/{name}")[0] == 404
-    lines = [json.loads(line) for line in content.splitlines()]
-    for since in (0, 3, 7, 99):
-        assert [json.loads(line) for line in ask(f"/index?since={since}")[2].splitlines()] == lines[since:]
-    assert ask("/index?since=-1")[::2] == (400, b"since must be a number of shards, got '-1'\n")
 
 
 def test_many_ask_at_once(folder, monkeypatch):
-    """After a publication the manifest is read once, each line of the index once, and what is new is written once; a
+    """After a publication the manifest is read once, and each line of the index once; a
     shard that many want is hashed once; and who asks whether the service lives waits for none of these."""
     work: Counter[str] = Counter()
     hash_may_end = threading.Event()
@@ -124,11 +119,10 @@ def test_many_ask_at_once(folder, monkeypatch):
     monkeypatch.setattr(Manifest, "parse", staticmethod(counted("parse", slowly)))
     monkeypatch.setattr(ShardEntry, "__post_init__", counted("line", ShardEntry.__post_init__))
     monkeypatch.setattr(hgn.data.verification, "file_sha256", counted("hash", slow))
-    monkeypatch.setattr(datagen.service.server, "to_mapping", counted("told", to_mapping))
 
     async def crowd():
         app = make_app(folder, None, PoolState)
-        await asyncio.gather(*(request(app, path) for path in 16 * ["/manifest.json", "/progress", "/index?since=4"]))
+        await asyncio.gather(*(request(app, path) for path in 16 * ["/manifest.json", "/progress"]))
         readers = [asyncio.create_task(request(app, SHARD)) for _ in range(60)]
         while not work["hash"]:
             await asyncio.sleep(0)
@@ -138,7 +132,7 @@ def test_many_ask_at_once(folder, monkeypatch):
         return await asyncio.gather(*readers)
 
     assert {answer[::2] for answer in asyncio.run(crowd())} == {(200, (folder / SHARD[1:]).read_bytes())}
-    assert work == {"parse": 1, "line": 7, "told": 3, "hash": 1}
+    assert work == {"parse": 1, "line": 7, "hash": 1}
 
 
 def test_shards_with_ranges(ask, folder):
