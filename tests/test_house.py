@@ -17,7 +17,7 @@ PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
     "hgn": 27_600,
-    "datagen": 8_330,
+    "datagen": 8_340,
     "tools": 6_400,
     "tests": 27_800,
 }
