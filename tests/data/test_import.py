@@ -2,14 +2,13 @@
 
 import dataclasses
 import json
-import os
 from typing import Any
 
 import h5py
 import numpy as np
 import pytest
 import torch
-from data.foreign_writers import Hostile, metadata, pickled_npz, sequence_example, write
+from data.foreign_writers import metadata, pickled_npz, write
 from PIL import Image
 from training.runs import metrics, train_mapping
 
@@ -98,182 +97,6 @@ def test_training_losses_are_the_same(name, data, tmp_path):
     assert losses[0] == losses[1] and len(losses[0]) == 3
 
 
-def flip(place):
-    """Changes a byte of train.tfrecord."""
-
-    def change(folder):
-        data = bytearray((folder / "train.tfrecord").read_bytes())
-        data[place] ^= 1
-        (folder / "train.tfrecord").write_bytes(data)
-
-    return change
-
-
-def cut(name, size):
-    return lambda folder: os.truncate(folder / name, size)
-
-
-def meta(**changes):
-    def change(folder):
-        path = folder / "metadata.json"
-        kept = json.loads(path.read_text()) | changes
-        path.write_text(json.dumps({key: value for key, value in kept.items() if value is not None}))
-
-    return change
-
-
-def hdf5(name, key, value=None):
-    """Puts another array in the place of one, or takes it away."""
-
-    def change(folder):
-        with h5py.File(folder / name, "a") as file:
-            old = file[key][()]
-            del file[key]
-            if value is not None:
-                file[key] = value(old)
-
-    return change
-
-
-def rewrite(folder, **changes):
-    """Puts other arrays into train.npz: functions of those that are there, or new ones."""
-    with np.load(folder / "train.npz") as archive:
-        members = dict(archive)
-    for key, value in changes.items():
-        members[key] = value(members[key]) if callable(value) else value
-    np.savez(folder / "train.npz", **members)
-
-
-def npz(key, value):
-    return lambda folder: rewrite(folder, **{key: value})
-
-
-def with_nan(array):
-    array = array.copy()
-    array[3, 1, 1] = np.nan
-    return array
-
-
-def moving(array):
-    return array + 0.01 * np.arange(len(array), dtype=np.float32)[:, None, None]
-
-
-def claimed(folder):
-    """A file of few bytes that says of itself that it holds 7 TiB."""
-    with h5py.File(folder / "train.h5", "a") as file:
-        del file["00000/position"]
-        file.create_dataset("00000/position", (10**6, 10**6, 2), "f4", chunks=(1, 1000, 2))
-
-
-def cells(cell, length=1.0):
-    """Obstacle cells of the plain layout."""
-
-    def change(folder):
-        meta(obstacle_cell_size=1 / 64)(folder)
-        normal = np.tile(np.array([[0, length, 0]], np.float32), (len(cell), 1))
-        rewrite(folder, **{"00001/obstacle_cell": np.array(cell), "00001/obstacle_normal": normal})
-
-    return change
-
-
-def at_the_side(folder):
-    meta(periodic_boundary_conditions=[True] * 3)(folder)
-    hdf5("train.h5", "00000/position", lambda a: a - np.array([0.48, 0, 0], np.float32))(folder)
-
-
-WALK = np.zeros((9, 2, 3))
-
-
-def pickled(content):
-    return lambda folder: pickled_npz(folder / "train.npz", content(folder))
-
-
-@pytest.mark.parametrize(
-    ("name", "change", "message"),
-    [
-        ("deepmind", flip(0), r"train.tfrecord: record 0: length must have CRC .*: it was altered"),
-        ("deepmind", flip(200), r"train.tfrecord: record 0: data must have CRC .*: it was altered"),
-        ("deepmind", cut("train.tfrecord", 300), r"record 0: data must have \d+ bytes, .*: the file is cut"),
-        ("deepmind", cut("train.tfrecord", 5), r"record 0: length must have 12 bytes, got 5: the file is cut"),
-        ("deepmind", meta(sequence_length=3), r"record 0: position must have \d+ numbers for sequence_length \+ 1"),
-        ("deepmind", meta(sequence_length=None), r"metadata.json: sequence_length must be a whole number, got None"),
-        ("deepmind", meta(bounds=None), r"bounds must be given where .*metadata.json does not say it"),
-        ("deepmind", meta(bounds=[[0, 0.2]] * 3), r"bounds must hold the particles, got .* of record|bounds must hold"),
-        ("deepmind", meta(dt="soon"), r"metadata.json: dt must be a finite number, got 'soon'"),
-        ("deepmind", meta(dim=2.5), r"metadata.json: dim must be 2 or 3, got 2.5"),
-        ("deepmind", meta(bounds=[[0, 1], [0, 1], [0, float("inf")]]), r"bounds must be finite numbers in pairs"),
-        ("deepmind", meta(default_connectivity_radius=1e-12), r"radius must be 6.1e-05 or more, the box being 1 wide"),
-        ("deepmind", lambda folder: (folder / "metadata.json").write_text("[" * 9**6), r"metadata.json must be JSON"),
-        ("lagrangebench", meta(periodic_boundary_conditions="no"), r"conditions must be finite numbers in a list"),
-        ("lagrangebench", meta(write_every=0), r"metadata.json: write_every must be > 0, got 0.0"),
-        ("lagrangebench", hdf5("train.h5", "00000/particle_type", lambda a: 0 * a - 1), r"position must be of part"),
-        ("lagrangebench", claimed, r"train.h5: 00000: position must be there, and whole, got Unable to allocate"),
-        ("plain", meta(obstacle_cell_size=0), r"metadata.json: obstacle_cell_size must be > 0, got 0.0"),
-        ("plain", meta(materials=["water"]), r"metadata.json: materials must be names by number, got \['water'\]"),
-        ("plain", meta(materials={"1": "Wa ter"}), r"materials must be names of lower-case letters.*got 'Wa ter'"),
-        ("plain", meta(boundary_types="none"), r"metadata.json: boundary_types must be finite numbers in a list"),
-        ("plain", cells([[2, 2, 2]] * 2), r"00001: obstacle_cell must be each there once, got '1 again'"),
-        ("plain", cells([[1 << 40, 2, 2]]), r"00001: obstacle_cell must be cells of the box"),
-        ("plain", cells([[2, 2, 2]], 5.0), r"00001: obstacle_normal must be of length 1, got 5"),
-        ("deepmind", meta(dt=-1), r"metadata.json: dt must be a finite number > 0, got -1"),
-        ("deepmind", meta(context_mean=[0.0]), r"context_mean must be absent, got a set with step_context"),
-        ("deepmind", meta(dim=2), r"metadata.json: bounds must be \[low, high\] for each of 2 axes"),
-        ("geoelements", cut("train.npz", 400), r"train.npz must be a whole NumPy archive"),
-        ("geoelements", pickled(lambda folder: Hostile(folder / "ran")), r"gns_data must be .*no part of an array"),
-        ("geoelements", pickled(lambda _: (np.zeros((9, 2, 3)),)), r"gns_data\[0\] must be \(position, particle_type"),
-        ("geoelements", pickled(lambda _: (np.zeros((9, 2, 3), int), 5)), r"\[0\]: position must be float32"),
-        ("geoelements", pickled(lambda _: ([[1.0], [1.0, 2.0]], 5)), r"gns_data\[0\]: position must be an array, got"),
-        ("geoelements", pickled(lambda _: (WALK, [5, np.inf])), r"gns_data\[0\]: particle_type must be whole numbers"),
-        ("geoelements", pickled(lambda _: (WALK, 5, np.ones(7))), r"material_property must be numbers of one or 2"),
-        ("geoelements", pickled(lambda _: (WALK, 5, [[1.0], [1.0, 2.0]])), r"material_property must be an array, got"),
-        ("geoelements", pickled(lambda _: (np.zeros((9, 2, 3)), [5, 6, 5])), r"\[0\]: particle_type must be one"),
-        ("geoelements", pickled(lambda _: (np.zeros((9, 2, 2)), 5)), r"position must have shape \[any, any, 3\], got"),
-        ("lagrangebench", cut("train.h5", 2000), r"train.h5 must be a whole HDF5 file"),
-        ("lagrangebench", hdf5("train.h5", "00001/position"), r"train.h5: 00001: position is missing"),
-        ("lagrangebench", hdf5("train.h5", "00000/particle_type"), r"train.h5: 00000: particle_type must be there"),
-        ("lagrangebench", hdf5("train.h5", "00000/position", with_nan), r"position must be finite, got nan at \[3"),
-        ("lagrangebench", hdf5("train.h5", "00000/particle_type", lambda a: a + 40), r"particle_type must have a"),
-        ("lagrangebench", at_the_side, r"conditions must be false on axis x, where particles of .*00000 come within"),
-        ("lagrangebench", hdf5("train.h5", "00000/position", lambda a: a[:5]), r"must be 5 \+ 2 frames or more"),
-        ("neuralmpm", hdf5("train/sim_0.h5", "boundary"), r"sim_0.h5: boundary must be there, and whole"),
-        ("neuralmpm", hdf5("train/sim_0.h5", "boundary", moving), r"sim_0.h5: boundary must be at rest, got 'a motion"),
-        ("neuralmpm", hdf5("train/sim_0.h5", "particles", lambda a: a.astype(np.int32)), r"particles must be float32"),
-        ("neuralmpm", hdf5("train/sim_0.h5", "types", lambda a: a[1:]), r"particle_type must be one number for each"),
-        ("plain", npz("00000/position", with_nan), r"train.npz: 00000: position must be finite, got nan at"),
-        ("plain", npz("00000/particle_type", lambda a: a + 0.5), r"00000: particle_type must be whole"),
-        ("plain", npz("lonely", lambda a: a), r"lonely"),
-        ("plain", npz("00000/position", moving), r"types \[3\] must be at rest, got a motion by .*obstacles at rest"),
-    ],
-)  # fmt: skip
-def test_malformed_files_are_refused(name, change, message, tmp_path):
-    """By the name of file and field; nothing is run or written, and no manifest appears."""
-    generator = np.random.default_rng(0)
-    walk_TN3 = (0.5 + 0.001 * generator.normal(size=(9, 4, 3))).astype(np.float32)
-    wall_P3 = generator.uniform(0.1, 0.9, (6, 3)).astype(np.float32)
-    simulations = {"train": [(walk_TN3, TYPES[[0, 1, 2, 0]], wall_P3)] * 2}
-    extra = {"write_every": 1} if name == "lagrangebench" else {}
-    source = write(tmp_path / "foreign", name, simulations, metadata(**extra))
-    if message == "lonely":
-        np.savez(source / "train.npz", lonely=walk_TN3)
-        message = r"train.npz: lonely must be named TRAJECTORY/FIELD"
-    else:
-        change(source)
-    with pytest.raises(ConfigError, match=message):
-        import_trajectories.main(options(tmp_path / "mine", source))
-    assert not (source / "ran").exists() and not (tmp_path / "mine" / "manifest.json").exists()
-
-
-def test_a_record_without_a_feature_is_refused(tmp_path):
-    """A SequenceExample lacks particle_type; and bytes that are none are no message."""
-    from hgn.data.foreign.tfrecord import parse_sequence_example
-
-    context, lists = parse_sequence_example(sequence_example(np.zeros((3, 2, 3)), np.array([5, 5]), 7), "here")
-    assert set(context) == {"key", "particle_type"} and len(lists["position"]) == 3 and context["key"] == []
-    for data in (b"\x0a\xff", b"\x0f", b"\xff" * 11, b"\x09\x00"):
-        with pytest.raises(ConfigError, match=r"here must be a tf.SequenceExample, got"):
-            parse_sequence_example(data, "here")
-
-
 @pytest.mark.parametrize("gravity", [(0.0, -9.8), (0.0, -9.8, 0.0), (1.5, 0.0, -3.0)])
 def test_gravity_is_estimated_from_what_flies(gravity):
     """Among particles at rest, in even motion and in collisions, from float32 positions, to half a percent."""
@@ -330,12 +153,6 @@ def test_what_leaves_the_bounds_later_is_told(tmp_path, capsys):
     assert line.startswith("bounds: particles of 2 of 3 trajectories go farther out of them than a radius (0.035)")
     assert "train.npz: 00002 to y = -0.25 in frame 6, where bounds are [0.0, 1.0]" in line
     assert line.endswith("give bounds=… around all particles, or leave these trajectories out")
-
-
-def test_materials_that_are_no_mapping(tmp_path):
-    """Names without their types are refused by name."""
-    with pytest.raises(ConfigError, match="materials must be a mapping, got 3"):
-        import_trajectories.main({"from": str(tmp_path), "out": "x", "materials": 3})
 
 
 def flights(*gravities):
@@ -396,13 +213,6 @@ def flat_simulations(count=24):
     types = np.where(np.arange(count) % 2, 5, 7)
     one = path.astype(np.float32), types, floor.astype(np.float32)
     return {"train": [one] * 2, "valid": [one]}
-
-
-def test_options_are_refused_by_their_own_names(tmp_path):
-    """What the command line says wrong is not told of metadata.json."""
-    for name in ("radius", "dt"):
-        with pytest.raises(ConfigError, match=f"^{name} must be a finite number > 0, got -1.0"):
-            import_trajectories.main({"from": str(tmp_path), "out": str(tmp_path / "new"), name: -1.0})
 
 
 @pytest.fixture
