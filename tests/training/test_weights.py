@@ -17,8 +17,10 @@ from hgn.runtime.torch_backend import Backend
 from hgn.runtime.weights import WeightsInfo, load_weights, save_weights
 from hgn.schema import ConfigError
 from hgn.training.checkpoint import network_of_checkpoint, network_of_weights, read_checkpoint
+from hgn.training.muon import Muon
 from hgn.training.schedule import learning_rate
 from hgn.training.torch_updates import TorchUpdates
+from hgn.training.updates import build_optimizer
 
 
 @pytest.fixture
@@ -116,6 +118,13 @@ def test_warm_up():
         factor = min(1.0, (update + 1) / 10)
         assert learning_rate(warm, update) == pytest.approx(factor * learning_rate(cold, update), rel=1e-12)
     assert learning_rate(cold, 0) == 1e-3 and learning_rate(warm, 100) == pytest.approx(1e-5)
+
+
+@pytest.mark.parametrize(("name", "kind"), [("adam", torch.optim.Adam), ("muon", Muon)])
+def test_the_optimiser_is_the_configured_one(name, kind):
+    """Both are fused, which alone can skip a step by themselves."""
+    optimizer = build_optimizer(build_network(NetworkConfig(**NETWORK)), TrainingConfig(optimizer=name))
+    assert type(optimizer) is kind and optimizer.param_groups[0]["fused"]
 
 
 def test_an_export_sets_rest_walls_and_obstacles(data, finished, tmp_path):
