@@ -1,4 +1,4 @@
-"""python -m hgn.train +experiment=obstacles: trains a network, and makes the data it needs.
+"""python -m hgn.train +experiment=obstacles: trains a network, and generates the data it needs.
 
 A run is a folder; the same command again resumes it. Ctrl-C, SIGTERM and SIGUSR1 end the run at the
 next update, after a checkpoint.
@@ -41,14 +41,14 @@ from hgn.training.stop import StopRequest
 
 
 def main(mapping: dict[str, Any]) -> int:
-    """Trains as the resolved configuration says; returns the exit code."""
+    """Trains with the resolved configuration; returns the exit code."""
     require_installed("lightning")
     name = mapping.pop("name", "unnamed")
     if mapping.get("run") is None:
         mapping["run"] = str(default_run(name))
     config = from_mapping(TrainConfig, settings_of_imported(mapping))
     if not first_on_machine():
-        # whoever started this rank has ended, by an error of its own say: no time-out is waited for
+        # ends this rank when the process that started it ends, without waiting for a time-out
         die_with_parent(signal.SIGKILL)
     layout(config.training)
     folder, run = config.dataset.folder, Path(config.run)
@@ -65,7 +65,7 @@ def main(mapping: dict[str, Any]) -> int:
         resume = _checkpoint_to_resume(config, run / "checkpoints")
         initial = _initial_network(config, resume)
         generator = None
-        # what a URL lacks, its own service makes
+        # the service of a URL generates missing episodes itself
         if first_rank() and config.training.generate and not is_remote(folder) and not is_complete(config):
             generator = Generator(config.datagen, run / "datagen")
             stack.callback(generator.stop)

@@ -46,7 +46,7 @@ class DataInfo:
 
 @dataclass(frozen=True)
 class Progress:
-    """How far a run had come when a checkpoint was written."""
+    """The progress of a run when a checkpoint was written."""
 
     updates: int
     skipped: int  # of the updates, because a gradient was not finite
@@ -123,10 +123,10 @@ def _require_equal(pairs: list[tuple[str, Any, Any]], why: str, remedy: str) -> 
 
 
 def network_of_weights(config: TrainConfig) -> ParticleNetwork:
-    """The network of training.init_weights, normaliser included, for a new run to begin with. Rest, walls and
-    obstacles' clearance may differ from those of the weights: they change no tensor.
+    """Returns the network of training.init_weights with its normaliser, as the initial state of a new run.
 
-    Raises: ConfigError for a file that is none, and where the run wants another network or has other data.
+    Rest, walls and the clearance of obstacles may differ from those of the weights, because they change no tensor.
+    Raises: ConfigError for a file without weights, and for another network or other data.
     """
     assert config.training.init_weights is not None
     path = find_weights(config.training.init_weights, "training.init_weights")

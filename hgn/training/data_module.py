@@ -123,7 +123,7 @@ class EpisodeDataModule(LightningDataModule):
         )
 
     def _ends(self) -> bool:
-        """Whether the training ends here for want of data. Alone: other ranks would wait for this one's gradients."""
+        """Ends a training that waits for data after a stop request, unless other ranks need its gradients."""
         trainer = self.trainer
         if trainer is None:
             return self.interrupted()
@@ -133,7 +133,7 @@ class EpisodeDataModule(LightningDataModule):
         return True
 
     def _published(self, epoch: int) -> list[int]:
-        """Frames of each published episode, the same on all ranks: rank 0 looks, the others follow."""
+        """Returns the frames of each published episode, as rank 0 sees them."""
         self.store.refresh()
         if not 0 < self.training.shuffle_episodes < len(self.store):
             self.store.fetch_ahead()
@@ -158,13 +158,12 @@ def chunk_length(training: TrainingConfig, first_update: int, update: int, most:
 
 
 def agreed_count(store: AnyStore, trainer: Trainer, order: Mapping[str, int] | None = None) -> int:
-    """How many episodes rank 0 knows; the other ranks wait until they see as many. All ranks call this.
+    """Returns the number of episodes that rank 0 sees; the other ranks wait for them. All ranks call this.
 
-    `order` is what the order of samples stands on beside the data: settings of `training`.
-
-    Episodes come in publication order, so that the first `count` are then the same everywhere.
-    Raises: ConfigError when a node does not see them for SHARED_FOLDER_PATIENCE_S; on every rank when one sees others,
-    or was given another order.
+    Episodes are in the order of their publication, so the first ones are the same on all ranks. `order` has the
+    settings of `training` that decide the order of samples.
+    Raises: ConfigError when a node does not see them within SHARED_FOLDER_PATIENCE_S; on every rank when one of them
+    sees other episodes or has other settings.
     """
     if trainer.world_size == 1:
         return len(store)

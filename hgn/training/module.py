@@ -73,7 +73,7 @@ class TrainingModule(LightningModule):
 
     @property
     def result(self) -> ParticleNetwork:
-        """The network that is measured and exported: the moving average where there is one."""
+        """The measured and exported network: the moving average where there is one."""
         return self.network if self.averaged is None else self.averaged
 
     @property
@@ -131,6 +131,6 @@ class TrainingModule(LightningModule):
         if self.averaged is None:
             for name in [name for name in state if name.startswith(AVERAGED)]:
                 del state[name]
-        elif not any(name.startswith(AVERAGED) for name in state):  # the average begins here
-            begun = {AVERAGED + k.removeprefix(NETWORK): v.clone() for k, v in state.items() if k.startswith(NETWORK)}
-            state.update(begun)
+        elif not any(name.startswith(AVERAGED) for name in state):  # the average starts from these parameters
+            average = {AVERAGED + k.removeprefix(NETWORK): v.clone() for k, v in state.items() if k.startswith(NETWORK)}
+            state.update(average)

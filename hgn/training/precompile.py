@@ -31,7 +31,7 @@ def _sizes(scene: SceneConfig, levels: int) -> tuple[int, list[int]]:
     """Returns the initial particles and cells of each level of a scene whose groups are cubes."""
     edge = scene.group_size / scene.cell_size
     particles = scene.group_count * scene.particles_per_cell * edge**3
-    cells, length = [], edge + 2  # cells beside a particle's are active too
+    cells, length = [], edge + 2  # neighbours of a particle's cell are active too
     for _ in range(levels):
         cells.append(max(1, round(scene.group_count * length**3)))
         length = (length + 1) / 2

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Start:
-    """What a training begins with."""
+    """Data and network at the start of a training."""
 
     store: AnyStore
     resume: Resume | None  # the checkpoint to go on from
@@ -128,7 +128,7 @@ def _module(config: TrainConfig, start: Start, backend: str) -> TrainingModule:
 
 
 def _backend(config: TrainConfig) -> tuple[str, str]:
-    """`torch` or `triton`, and a line that says so."""
+    """Returns `torch` or `triton`, and a line that reports it."""
     training = config.training
     on_gpu = training.device != "cpu" and torch.cuda.is_available()
     device = torch.device("cuda" if on_gpu else "cpu")
@@ -140,7 +140,7 @@ def _backend(config: TrainConfig) -> tuple[str, str]:
 
 
 def precompile_kernels(config: TrainConfig, stack: ExitStack) -> Precompilation | None:
-    """Lets the kernels be compiled while others wait for data, where this process leads its machine's on GPUs."""
+    """Starts compiling the kernels during the wait for data, in the first process of a machine with GPUs."""
     training = config.training
     backend, _ = _backend(config)
     on_gpu = training.device != "cpu" and torch.cuda.is_available() and torch.version.hip is None
@@ -157,7 +157,7 @@ def precompile_kernels(config: TrainConfig, stack: ExitStack) -> Precompilation 
 
 
 def _write_run_files(config: TrainConfig, run: Path) -> None:
-    """The resolved configuration, with the commit and the machine that it ran on."""
+    """Writes the resolved configuration, with the commit and the machine."""
     make_folder(run)
     if not first_rank():
         return

@@ -16,14 +16,14 @@ from hgn.scene.rollout_file import Rollout
 from hgn.training.module import TrainingModule
 from hgn.training.stop import StopRequest
 
-PICTURES = 4  # frames beside each other
+PICTURES = 4  # frames in a picture
 ANIMATION_PICTURES = 24
 ANIMATION_SIZE = 200  # pixels of a panel
 FINAL_PREFIXES = ("one_step/", "baseline_ratio/", "rollout/")
 
 
 def write_pictures(folder: Path, update: int, rollout: Rollout, error_T: dict[str, np.ndarray]) -> dict[str, Path]:
-    """Writes a rollout beside its ground truth, as a picture and as a GIF, and `error_T`, position MSE over time by
+    """Writes a rollout and its ground truth, as a picture and as a GIF, and `error_T`, position MSE over time by
     material. Returns their files by TensorBoard's tags.
     """
     names = {"picture": "rollout_{:09d}.png", "error_over_time": "error_{:09d}.png", "animation": "rollout_{:09d}.gif"}

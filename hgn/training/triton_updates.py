@@ -32,8 +32,8 @@ from hgn.training.schedule import average_weight, learning_rate
 from hgn.training.triton_pushforward import TritonScenes
 from hgn.training.updates import Ranks, TrainedNetwork
 
-REPORTED_UPDATES = 256  # the first ones, which take longest
-DATA_FRACTION = 0.6  # of a GPU's memory at most, for episodes; the others stay in the host's
+REPORTED_UPDATES = 256  # number of first updates, the slowest ones, whose times are printed
+DATA_FRACTION = 0.6  # largest fraction of a GPU's memory for episodes; the others stay in host memory
 
 
 class TritonUpdates:
@@ -42,7 +42,7 @@ class TritonUpdates:
     def __init__(
         self, trained: TrainedNetwork, training: TrainingConfig, obstacle_cell_size: float, ranks: Ranks
     ) -> None:
-        self._begun, self._made, self._jit_misses = time.monotonic(), 0, JitMisses()
+        self._start_s, self._made, self._jit_misses = time.monotonic(), 0, JitMisses()
         self._seconds: dict[str, float] = defaultdict(float)
         self.training, self._ranks = training, ranks
         self.network, self.optimizer = trained.network, trained.optimizer
@@ -122,16 +122,16 @@ class TritonUpdates:
 
     @contextmanager
     def _timed(self, what: str) -> Iterator[None]:
-        begun = time.monotonic()
+        start_s = time.monotonic()
         yield
-        self._seconds[what] += time.monotonic() - begun
+        self._seconds[what] += time.monotonic() - start_s
 
     def _report(self) -> None:
         """Prints where the time of the first updates went, once, when REPORTED_UPDATES are made."""
-        if not self._begun or self._made < REPORTED_UPDATES:
+        if not self._start_s or self._made < REPORTED_UPDATES:
             return
-        total, updates, misses = time.monotonic() - self._begun, self.updates, self._jit_misses
-        self._begun = 0.0
+        total, updates, misses = time.monotonic() - self._start_s, self.updates, self._jit_misses
+        self._start_s = 0.0
         parts = [f"{seconds:.1f} s {what}" for what, seconds in self._seconds.items()]
         parts.append(f"{updates.capture_seconds:.1f} s capturing {updates.captures} times")
         self._say(
@@ -140,7 +140,7 @@ class TritonUpdates:
         )
 
     def _placed(self, episode: EpisodeTensors) -> DeviceEpisode:
-        """On the device while there is room, else in pinned memory, which the kernels read through the bus."""
+        """Copies an episode to the device if it fits, else to pinned memory, which the kernels read through the bus."""
         position_TN3 = episode.position_TN3
         if self.device.type == "cuda":
             free, total = torch.cuda.mem_get_info(self.device)

@@ -20,7 +20,7 @@ from hgn.training.muon import Muon
 
 @dataclass(frozen=True, eq=False)
 class TrainedNetwork:
-    """A network, and what its updates change beside its parameters."""
+    """A network with the other state that its updates change."""
 
     network: ParticleNetwork
     optimizer: torch.optim.Adam
@@ -30,7 +30,7 @@ class TrainedNetwork:
 
     @property
     def result(self) -> ParticleNetwork:
-        """The network that is measured, simulated and exported: the moving average where there is one."""
+        """The measured, simulated and exported network: the moving average where there is one."""
         return self.network if self.averaged is None else self.averaged
 
 
