@@ -18,7 +18,7 @@ from hgn.runtime.rollouts import RolloutResult, simulate_scenes
 from hgn.runtime.simulator import InitialState, Simulator
 from hgn.runtime.torch_backend import Backend
 from hgn.runtime.weights import find_weights, require_frame_rate
-from hgn.scene.distance import share_inside
+from hgn.scene.distance import fraction_inside
 from hgn.scene.episode import Episode
 from hgn.scene.rollout_file import obstacles_of_episode
 from hgn.schema import FileName, NonNegative, Positive, from_mapping, require_bounds
@@ -161,8 +161,8 @@ def end_of_rollout(trial: RolloutResult, episode: Episode) -> dict[str, Any]:
         "episode": episode.key,
         "frames": trial.frame_count,
         "cause": trial.cause,
-        "penetration": share_inside(position_N3, obstacles),
-        "reference_penetration": share_inside(np.asarray(episode.position_TN3[last]), obstacles),
+        "penetration": fraction_inside(position_N3, obstacles),
+        "reference_penetration": fraction_inside(np.asarray(episode.position_TN3[last]), obstacles),
         "outside_domain": float(beyond_N3.any(-1).mean()),
     }
 

@@ -21,7 +21,7 @@ from hgn.data.storage import is_remote
 from hgn.network.base import ParticleNetwork
 from hgn.schema import from_mapping
 from hgn.system.extras import require_installed
-from hgn.system.files import held
+from hgn.system.files import locked
 from hgn.system.processes import die_with_parent
 from hgn.training.checkpoint import (
     LAST_NAMES,
@@ -61,7 +61,7 @@ def main(mapping: dict[str, Any]) -> int:
     stop.listen()
     with ExitStack() as stack:
         if first_rank():
-            stack.enter_context(held(run / ".lock", "run", "another training is in it; wait for its end, or choose"))
+            stack.enter_context(locked(run / ".lock", "run", "another training is in it; wait for its end, or choose"))
         resume = _checkpoint_to_resume(config, run / "checkpoints")
         initial = _initial_network(config, resume)
         generator = None

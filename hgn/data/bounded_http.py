@@ -1,6 +1,6 @@
-"""HTTP answers that cannot fill the memory: of a range no more than was asked for, else a data set's largest file.
+"""HTTP answers of bounded size: the requested range, or else the size of a data set's largest file.
 
-Loaded only where a data set is read from a URL of HTTP.
+Imported only for data sets at HTTP URLs.
 """
 
 from __future__ import annotations
@@ -11,19 +11,19 @@ import aiohttp
 
 from hgn.schema import ConfigError
 
-LARGEST_BYTES = 2**29  # of what is sent whole: manifests of the first release, shards of servers without ranges
+LARGEST_BYTES = 2**29  # of whole files: manifests of the first release, and shards of servers without ranges
 _RANGE = re.compile(r"bytes=(\d+)-(\d+)")
 
 
 class BoundedResponse(aiohttp.ClientResponse):
-    """An answer whose body is read piece by piece, up to its limit."""
+    """An answer whose body is read in pieces, up to its limit."""
 
     async def read(self) -> bytes:
-        """Raises: ConfigError where more comes."""
+        """Returns the body. Raises: ConfigError for a longer one."""
         if self._body is None:
-            asked = _RANGE.fullmatch(self.request_info.headers.get("Range", ""))
-            partial = asked is not None and self.status == 206
-            limit = int(asked[2]) - int(asked[1]) + 1 if asked is not None and partial else LARGEST_BYTES
+            requested = _RANGE.fullmatch(self.request_info.headers.get("Range", ""))
+            partial = requested is not None and self.status == 206
+            limit = int(requested[2]) - int(requested[1]) + 1 if requested is not None and partial else LARGEST_BYTES
             pieces, size = [], 0
             async for piece in self.content.iter_any():
                 size += len(piece)

@@ -65,12 +65,12 @@ def identity_hash(identity: Mapping[str, Any]) -> str:
     return hashlib.sha256(text.encode()).hexdigest()
 
 
-def identity_differences(stored: Mapping[str, Any], asked: Mapping[str, Any], path: str = "") -> list[str]:
+def identity_differences(stored: Mapping[str, Any], requested: Mapping[str, Any], path: str = "") -> list[str]:
     """Returns a line for each key that differs: `scene.obstacle_count is 5 there, 3 is asked for`."""
     lines = []
-    for key in sorted(stored.keys() | asked.keys()):
+    for key in sorted(stored.keys() | requested.keys()):
         name = f"{path}.{key}" if path else key
-        left, right = stored.get(key, "nothing"), asked.get(key, "nothing")
+        left, right = stored.get(key, "nothing"), requested.get(key, "nothing")
         if isinstance(left, Mapping) and isinstance(right, Mapping):
             lines += identity_differences(left, right, name)
         elif left != right:

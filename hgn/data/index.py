@@ -43,7 +43,7 @@ from hgn.system.files import errors_name, make_folder, sync_file, sync_folder
 INDEX_NAME = "index"
 SEGMENT_SHARDS = 128
 _IN_MEMORY = 0  # the generation of an index without files
-_SEGMENTS_HELD = 64  # segments that stay in memory: 8,192 shards
+_SEGMENTS_CACHED = 64  # segments that stay in memory: 8,192 shards
 
 T = TypeVar("T")
 
@@ -277,7 +277,7 @@ class Index(Sequence[ShardEntry]):
                 read.see(number, segment.shards)
                 read.segments[number] = segment
             read.segments.move_to_end(number)
-            if len(read.segments) > _SEGMENTS_HELD:
+            if len(read.segments) > _SEGMENTS_CACHED:
                 read.segments.popitem(last=False)
             return segment.shards
 

@@ -95,7 +95,7 @@ def _fetch(path: Path, shard: CachedShard, patience_s: float, spared: Collection
     with _locked_partial(path, shard.url, patience_s) as file:
         if file is None:
             return
-        while True:  # only the process that has the lock makes room: two that need one shard would do it twice
+        while True:  # only the process that has the lock frees space: two that need one shard would do it twice
             over = _bytes_over(path.parent, shard.size)
             try:
                 if over > 0:
@@ -105,7 +105,7 @@ def _fetch(path: Path, shard: CachedShard, patience_s: float, spared: Collection
             except OSError as error:
                 if error.errno not in _FULL or spared is None:
                     raise
-                if not _make_room(path.parent, max(over, shard.size), spared):
+                if not _free_space(path.parent, max(over, shard.size), spared):
                     raise
         os.fsync(file.fileno())
         # the newest shard must have the latest time, wherever this machine's clock stood before
@@ -153,7 +153,7 @@ def _bytes_over(folder: Path, size: int) -> float:
     return sum(cached for _, cached, _ in _cached(folder)) + size - allowed
 
 
-def _make_room(folder: Path, size: float, spared: Collection[str]) -> bool:
+def _free_space(folder: Path, size: float, spared: Collection[str]) -> bool:
     """Removes the oldest shards that are not spared; returns whether there was any."""
     freed = 0
     for _, cached, path in _cached(folder):

@@ -42,9 +42,9 @@ class Moments:
         if self.count == 0 or other.count == 0:
             return other if self.count == 0 else self
         count = self.count + other.count
-        share, weight = other.count / count, self.count * other.count / count
+        fraction, weight = other.count / count, self.count * other.count / count
         axes = list(zip(self.mean, other.mean, self.squared_deviation, other.squared_deviation, strict=True))
-        x, y, z = (mean + (their_mean - mean) * share for mean, their_mean, _, _ in axes)
+        x, y, z = (mean + (their_mean - mean) * fraction for mean, their_mean, _, _ in axes)
         u, v, w = (
             (squares + their_squares) + (their_mean - mean) * (their_mean - mean) * weight
             for mean, their_mean, squares, their_squares in axes

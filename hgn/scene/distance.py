@@ -78,7 +78,7 @@ def contains(point_P3: np.ndarray, obstacle: Obstacle) -> np.ndarray:
     return inside
 
 
-def share_inside(position_N3: np.ndarray, obstacles: Sequence[Obstacle]) -> float:
+def fraction_inside(position_N3: np.ndarray, obstacles: Sequence[Obstacle]) -> float:
     """Returns the fraction of particles inside closed obstacles."""
     inside_N = np.zeros(len(position_N3), bool)
     for obstacle in obstacles:

@@ -113,8 +113,8 @@ def require_free_entries(scene: Scene, entered: Scene) -> None:
         corner_F33 = obstacle.corners
         hits = sum(_crosses(point, step.astype(np.float64), corner_F33) for point, step in zip(start, way, strict=True))
         rule = "clear of obstacles for the first frame of entering particles"
-        share = f"{hits / max(len(late), 1):.0%} of them pass {obstacle.name}"
-        require(not hits, "emitters", rule, share, "move one of them")
+        blocked = f"{hits / max(len(late), 1):.0%} of them pass {obstacle.name}"
+        require(not hits, "emitters", rule, blocked, "move one of them")
 
 
 def _crosses(start_3: np.ndarray, way_3: np.ndarray, corner_F33: np.ndarray) -> bool:
@@ -124,9 +124,9 @@ def _crosses(start_3: np.ndarray, way_3: np.ndarray, corner_F33: np.ndarray) -> 
     determinant = (edge_1 * across).sum(axis=1)
     determinant = np.where(determinant == 0, np.nan, determinant)
     offset = start_3 - corner_F33[:, 0]
-    share_1 = (offset * across).sum(axis=1) / determinant
+    u = (offset * across).sum(axis=1) / determinant
     normal = np.cross(offset, edge_1)
-    share_2 = (normal @ way_3) / determinant
+    v = (normal @ way_3) / determinant
     fraction = (edge_2 * normal).sum(axis=1) / determinant
-    inside = (share_1 >= 0) & (share_2 >= 0) & (share_1 + share_2 <= 1) & (fraction >= 0) & (fraction <= 1)
+    inside = (u >= 0) & (v >= 0) & (u + v <= 1) & (fraction >= 0) & (fraction <= 1)
     return bool(inside.any())

@@ -43,10 +43,10 @@ class Motion:
         if after == 0 or after > last:
             at = min(after, last)
             return self.rotation_T33[at], self.translation_T3[at]
-        share = (time - self.time_T[after - 1]) / (self.time_T[after] - self.time_T[after - 1])
+        fraction = (time - self.time_T[after - 1]) / (self.time_T[after] - self.time_T[after - 1])
         turn = turning(self.rotation_T33[after] @ self.rotation_T33[after - 1].T)
         begin, end = self.translation_T3[after - 1], self.translation_T3[after]
-        return turned(share * turn) @ self.rotation_T33[after - 1], begin + share * (end - begin)
+        return turned(fraction * turn) @ self.rotation_T33[after - 1], begin + fraction * (end - begin)
 
     def place(self, point_P3: np.ndarray, time: float) -> np.ndarray:
         """Returns the places of the obstacle's points at a time, float64 [P, 3]."""

@@ -128,10 +128,10 @@ def rollout_velocity(rollout: Rollout) -> np.ndarray:
 
 def obstacles_of_episode(episode: Episode) -> tuple[Obstacle, ...]:
     """Returns the meshes of an episode's obstacles; where only its cells are known, a square for each cell."""
-    known = known_obstacles(episode)
-    if known is None:
+    meshes = known_obstacles(episode)
+    if meshes is None:
         return cell_obstacles(episode.obstacle_grid, episode.domain_size[2] / 2 if episode.dimensions == 2 else None)
-    return known
+    return meshes
 
 
 def known_obstacles(episode: Episode) -> tuple[Obstacle, ...] | None:

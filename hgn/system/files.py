@@ -84,7 +84,7 @@ def write_json(path: Path | str, value: Any, allow_nan: bool = True) -> None:
 
 
 @contextlib.contextmanager
-def held(path: Path, field: str, refusal: str) -> Iterator[None]:
+def locked(path: Path, field: str, refusal: str) -> Iterator[None]:
     """Locks a file for this process; the kernel releases the lock when the process ends.
 
     Raises: ConfigError `<field> must be ...`, with `refusal`, when another process has the lock. On a file system

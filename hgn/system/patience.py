@@ -42,7 +42,7 @@ def patiently(
 
     Raises: UnreachableError naming `url`; a permanent error.
     """
-    begin, pause, told = time.monotonic(), FIRST_PAUSE_S, False
+    start, pause, warned = time.monotonic(), FIRST_PAUSE_S, False
     while True:
         try:
             return ask()
@@ -50,10 +50,10 @@ def patiently(
             cause = passing(error)
             if cause is None:
                 raise
-            if time.monotonic() - begin + pause > patience_s or without.is_set():
+            if time.monotonic() - start + pause > patience_s or without.is_set():
                 raise UnreachableError(url, patience_s, cause) from error
-            if not told and pause > 1:
-                told = True
+            if not warned and pause > 1:
+                warned = True
                 print(f"{server} does not answer ({cause}); retrying for {patience_s:.0f} s", file=sys.stderr)
             without.wait(pause * random.uniform(0.5, 1.0))  # readers must not return all at the same moment
             pause = min(2 * pause, LONGEST_PAUSE_S)

@@ -100,7 +100,7 @@ def test_costs_do_not_grow(make_config, stage, tmp_path, monkeypatch):
 @pytest.fixture
 def small_segments(monkeypatch):
     monkeypatch.setattr(hgn.data.index, "SEGMENT_SHARDS", 3)
-    monkeypatch.setattr(hgn.data.index, "_SEGMENTS_HELD", 2)
+    monkeypatch.setattr(hgn.data.index, "_SEGMENTS_CACHED", 2)
 
 
 def test_every_way_to_read(tmp_path, small_segments):

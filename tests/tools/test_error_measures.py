@@ -15,7 +15,7 @@ from hgn.data.batch import make_batch
 from hgn.data.reader import EpisodeStore
 from hgn.runtime.rollouts import RolloutResult, simulate_scenes
 from hgn.runtime.simulator import InitialState, Simulator
-from hgn.scene.distance import share_inside
+from hgn.scene.distance import fraction_inside
 from hgn.scene.shapes import shape_obstacle
 from hgn.training.errors import ballistic, frame_batches, one_step_errors
 from tools.error_vs_time import score
@@ -139,7 +139,7 @@ def test_shares_inside_obstacles_and_outside_of_the_domain():
     cone = shape_obstacle("cone", 0.4, (0.5, 0.5, 0.5), np.eye(3), "cone")
     square = shape_obstacle("square", 0.4, (0.5, 0.5, 0.5), np.eye(3), "square")
     point = np.array([[0.5, 0.5, 0.5], [0.9, 0.9, 0.9], [1.1, 0.5, 0.5], [0.5, -0.1, 0.5]])
-    assert share_inside(point, [cone]) == 0.25 and share_inside(point, [square]) == 0
+    assert fraction_inside(point, [cone]) == 0.25 and fraction_inside(point, [square]) == 0
     assert outside_domain(point, (1.0, 1.0, 1.0)) == 0.5 and outside_domain(point[:0], (1.0, 1.0, 1.0)) == 0
 
 

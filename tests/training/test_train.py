@@ -24,7 +24,7 @@ from hgn.data.statistics import merge_statistics
 from hgn.export import export
 from hgn.runtime.rollouts import RolloutResult
 from hgn.schema import ConfigError, from_mapping
-from hgn.system.files import held
+from hgn.system.files import locked
 from hgn.training import gradients, monitor
 from hgn.training.callbacks import LogLines
 from hgn.training.checkpoint import LAST_NAMES, Progress, read_checkpoint
@@ -227,7 +227,7 @@ def test_a_finished_run_stays_finished(finished):
     kept = [run / "metrics.jsonl", *sorted((run / "checkpoints").iterdir())]
     before = [path.read_bytes() for path in kept]
     (run / "checkpoints" / ".last.ckpt.1.partial").write_bytes(b"half")
-    with held(run / ".lock", "run", ""), pytest.raises(ConfigError, match="run must be a folder of its own, got"):
+    with locked(run / ".lock", "run", ""), pytest.raises(ConfigError, match="run must be a folder of its own, got"):
         train.main(train_mapping(data, run))
     assert train.main(train_mapping(data, run)) == 0
     assert {path.name for path in (run / "checkpoints").iterdir()} == {*LAST_NAMES, "best.ckpt"}

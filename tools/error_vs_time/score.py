@@ -15,7 +15,7 @@ import numpy as np
 import torch
 
 from hgn.runtime.rollouts import RolloutResult
-from hgn.scene.distance import share_inside
+from hgn.scene.distance import fraction_inside
 from hgn.scene.episode import Episode
 from hgn.scene.material import MATERIALS
 from hgn.scene.rollout_file import obstacles_of_episode
@@ -74,7 +74,7 @@ def rollout_figures(
         mse_T[:end] = position_mse(trial.position_TN3, reference.position_TN3[:end])
         return {
             "momentum_error": momentum_error(trial.position_TN3, reference.position_TN3),
-            "penetration": share_inside(trial.position_TN3[-1], obstacles_of_episode(reference)),
+            "penetration": fraction_inside(trial.position_TN3[-1], obstacles_of_episode(reference)),
             "reference_penetration": _reference_penetration(reference, end - 1),
             "outside_domain": outside_domain(trial.position_TN3[-1], reference.domain_size),
         }
@@ -141,7 +141,7 @@ def label(row: Mapping[str, Any], setting: bool = True) -> str:
 # cached: the same for every contender
 @functools.lru_cache(maxsize=1024)
 def _reference_penetration(reference: Episode, frame: int) -> float:
-    return share_inside(np.asarray(reference.position_TN3[frame]), obstacles_of_episode(reference))
+    return fraction_inside(np.asarray(reference.position_TN3[frame]), obstacles_of_episode(reference))
 
 
 def _of_materials(

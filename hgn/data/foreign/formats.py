@@ -33,7 +33,7 @@ _DEEPMIND = {0: "rigid", FLUID: "fluid", 5: "water", 6: "sand", 7: "goop"}
 _LAGRANGEBENCH = {0: "fluid", 3: "rigid", 5: "water", 6: "sand", 7: "goop"}  # 5 to 7: its copies of DeepMind's sets
 
 
-def find_format(folder: Path, asked: str) -> str:
+def find_format(folder: Path, required: str) -> str:
     """Returns the format of a folder's files. Raises: ConfigError where there are none, or of another format."""
     require(folder.is_dir(), "from", "a folder with trajectories", str(folder))
     formats = []
@@ -50,13 +50,13 @@ def find_format(folder: Path, asked: str) -> str:
         formats.append("lagrangebench" if bench else "plain")
     names = "train.tfrecord, train.npz, train.h5 or train/sim_0.h5"
     require(bool(formats), "from", f"a folder with {names}", str(folder), "see docs/how_to/import.md")
-    if asked == "auto":
-        require(len(formats) == 1, "format", f"one of {', '.join(formats)}, which {folder} has", asked)
+    if required == "auto":
+        require(len(formats) == 1, "format", f"one of {', '.join(formats)}, which {folder} has", required)
         return formats[0]
     alike = {"lagrangebench", "plain"}  # the same files
-    fits = asked in formats or (asked in alike and bool(alike & set(formats)))
-    require(fits, "format", " or ".join(formats), asked)
-    return asked
+    fits = required in formats or (required in alike and bool(alike & set(formats)))
+    require(fits, "format", " or ".join(formats), required)
+    return required
 
 
 def set_info(folder: Path, name: str, config: ImportConfig) -> SetInfo:
