@@ -115,3 +115,22 @@ def test_manifest_that_is_replaced_while_it_is_read(make_config, folder, monkeyp
         assert writer.complete
     asyncio.run(Published(folder).snapshot())
     assert lost >= 9
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "message"),
+    [
+        ("name", "../../etc/passwd", r"shards\[0\]\.name must be a plain file name"),
+        ("name", ".lock", r"shards\[0\]\.name must be a plain file name"),
+        ("sha256", "../" * 10 + "evil", r"shards\[0\]\.sha256 must be 64 hexadecimal digits"),
+        ("bytes", -1, r"shards\[0\]\.bytes must be a finite number >= 0"),
+        ("split", "../train", r"shards\[0\]\.split must be one of"),
+    ],
+)
+def test_manifest_cannot_name_other_files(folder, key, value, message):
+    """Names and hashes of a manifest become paths: what could lead elsewhere is refused."""
+    mapping = first_release(folder)
+    mapping["shards"][0][key] = value
+    (folder / "manifest.json").write_text(json.dumps(mapping))
+    with pytest.raises(ConfigError, match=message):
+        Manifest.load(folder)

@@ -19,6 +19,7 @@ from hgn.data.index import ListedIndex
 from hgn.data.manifest import Manifest
 from hgn.data.reader import EpisodeStore
 from hgn.data.shard import locate_members
+from hgn.data.verification import file_sha256, verify_file
 from hgn.schema import ConfigError
 
 
@@ -151,3 +152,16 @@ def test_refresh_refuses_another_dataset(folder, make_config, make_dataset, tmp_
     Manifest.load(made).save(folder)
     with pytest.raises(ConfigError, match="must keep holding the same data set"):
         store.refresh()
+
+
+def test_times_that_were_set_back(folder):
+    """A file whose bytes changed while its size and modification time stayed is hashed again."""
+    path = folder / "train-000000-000001.tar"
+    status, sha256 = path.stat(), file_sha256(path)
+    verify_file(path, sha256, status.st_size, "")
+    content = bytearray(path.read_bytes())
+    content[700] ^= 1
+    path.write_bytes(content)
+    os.utime(path, ns=(status.st_atime_ns, status.st_mtime_ns))
+    with pytest.raises(ConfigError, match="it was altered"):
+        verify_file(path, sha256, status.st_size, "")

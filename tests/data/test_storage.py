@@ -4,10 +4,6 @@ import contextlib
 import dataclasses
 import errno
 import fcntl
-import functools
-import gzip
-import http.server
-import json
 import os
 import threading
 import urllib.request
@@ -18,7 +14,6 @@ import numpy as np
 import pytest
 from processes import PATIENCE_S, exit_code, free_port
 from serving import serving
-from written_files import first_release
 
 import hgn.data.storage
 from datagen.service.server import make_app
@@ -27,7 +22,6 @@ from hgn.data.manifest import Manifest
 from hgn.data.reader import EpisodeStore
 from hgn.data.shard_cache import CACHE_VARIABLE, LIMIT_VARIABLE, cache_folder
 from hgn.data.storage import TOKEN_VARIABLE, is_remote, open_storage
-from hgn.data.verification import file_sha256, verify_file
 from hgn.schema import ConfigError
 from hgn.system.patience import UnreachableError, without_patience
 
@@ -67,24 +61,6 @@ def serve(folder):
 
         start.stop = running.close
         yield start
-
-
-class Quiet:
-    """Of a server's handler: without a log."""
-
-    def log_message(self, *arguments):
-        pass
-
-
-@contextlib.contextmanager
-def answering(handler):
-    """The URL of a server of its own."""
-    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
-        threading.Thread(target=server.serve_forever).start()
-        try:
-            yield f"http://127.0.0.1:{server.server_port}"
-        finally:
-            server.shutdown()
 
 
 def same_episodes(one, other):
@@ -220,64 +196,6 @@ def test_altered_or_cut_shards_are_refused(folder, cache):
     assert list(cache.iterdir()) == []
 
 
-def test_times_that_were_set_back(folder):
-    """A file whose bytes changed while its size and modification time stayed is hashed again."""
-    path = folder / "train-000000-000001.tar"
-    status, sha256 = path.stat(), file_sha256(path)
-    verify_file(path, sha256, status.st_size, "")
-    content = bytearray(path.read_bytes())
-    content[700] ^= 1
-    path.write_bytes(content)
-    os.utime(path, ns=(status.st_atime_ns, status.st_mtime_ns))
-    with pytest.raises(ConfigError, match="it was altered"):
-        verify_file(path, sha256, status.st_size, "")
-
-
-@pytest.mark.parametrize("attack", ["gzip bomb", "endless", "long range"])
-def test_answers_are_bounded(monkeypatch, attack):
-    """A server cannot fill the memory: a packed answer stays packed, and one that is longer than was asked for, or
-    than any, is cut."""
-    monkeypatch.setattr("hgn.data.bounded_http.LARGEST_BYTES", 100_000)
-
-    class Attack(Quiet, http.server.BaseHTTPRequestHandler):
-        def do_GET(self):
-            self.send_response(206 if attack == "long range" else 200)
-            if attack == "gzip bomb":
-                self.send_header("Content-Encoding", "gzip")
-            self.end_headers()
-            with contextlib.suppress(ConnectionError):
-                if attack == "gzip bomb":
-                    self.wfile.write(gzip.compress(bytes(10**7)))
-                for _ in range(0 if attack == "gzip bomb" else 1000):
-                    self.wfile.write(bytes(10_000))
-
-    with answering(Attack) as url:
-        storage = open_storage(url)
-        if attack == "gzip bomb":
-            assert len(storage.manifest("manifest.json")) < 20_000
-        else:
-            limit = 50 if attack == "long range" else 100_000
-            with pytest.raises(ConfigError, match=f"must answer with at most {limit} bytes, got more"):
-                storage.read("s", 0, 50) if attack == "long range" else storage.manifest("manifest.json")
-
-
-def test_proxy_that_remembers():
-    """A proxy that has an older, shorter file of the index is asked again until it has the one that the manifest is
-    about."""
-    answers = iter([(416, b""), (206, b"56"), (206, b"5678")])
-
-    class Proxy(Quiet, http.server.BaseHTTPRequestHandler):
-        def do_GET(self):
-            status, content = next(answers)
-            self.send_response(status)
-            self.send_header("Content-Length", str(len(content)))
-            self.end_headers()
-            self.wfile.write(content)
-
-    with answering(Proxy) as url:
-        assert open_storage(url).read("index", 5, 9) == b"5678"
-
-
 @pytest.mark.parametrize("full", ["limit", "disk"])
 def test_full_cache(folder, cache, monkeypatch, full):
     """A data set that is larger than the cache's limit, or its disk, is read all the same, again and again: shards that
@@ -349,36 +267,6 @@ def test_link_in_the_cache(folder, cache, tmp_path):
     with pytest.raises(ConfigError, match="must be a file, got a symbolic link"):
         brought(url)
     assert (tmp_path / "precious").read_text() == "mine"
-
-
-@pytest.mark.parametrize(
-    ("key", "value", "message"),
-    [
-        ("name", "../../etc/passwd", r"shards\[0\]\.name must be a plain file name"),
-        ("name", ".lock", r"shards\[0\]\.name must be a plain file name"),
-        ("sha256", "../" * 10 + "evil", r"shards\[0\]\.sha256 must be 64 hexadecimal digits"),
-        ("bytes", -1, r"shards\[0\]\.bytes must be a finite number >= 0"),
-        ("split", "../train", r"shards\[0\]\.split must be one of"),
-    ],
-)
-def test_manifest_cannot_name_other_files(folder, key, value, message):
-    """Names and hashes of a manifest become paths: what could lead elsewhere is refused."""
-    mapping = first_release(folder)
-    mapping["shards"][0][key] = value
-    (folder / "manifest.json").write_text(json.dumps(mapping))
-    with pytest.raises(ConfigError, match=message):
-        Manifest.load(in_memory(folder, "evil"))
-
-
-def test_server_without_ranges(folder, monkeypatch):
-    """A plain file server that knows no ranges will do."""
-    monkeypatch.setattr(hgn.data.storage, "_CHUNK_BYTES", 4000)
-
-    class Plain(Quiet, http.server.SimpleHTTPRequestHandler):
-        pass
-
-    with answering(functools.partial(Plain, directory=str(folder))) as url:
-        assert same_episodes(EpisodeStore(url, "train"), EpisodeStore(folder, "train"))
 
 
 def test_no_data_set_there(serve):

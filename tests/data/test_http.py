@@ -1,0 +1,97 @@
+"""Data sets on web servers that do not behave: unbounded answers, old copies, no ranges."""
+
+import contextlib
+import functools
+import gzip
+import http.server
+import threading
+
+import numpy as np
+import pytest
+
+import hgn.data.storage
+from hgn.data.reader import EpisodeStore
+from hgn.data.shard_cache import CACHE_VARIABLE
+from hgn.data.storage import open_storage
+from hgn.schema import ConfigError
+
+
+@pytest.fixture(autouse=True)
+def _cache(tmp_path, monkeypatch):
+    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "cache"))
+    monkeypatch.setattr("hgn.system.patience.FIRST_PAUSE_S", 0.01)
+
+
+class Quiet:
+    """Of a server's handler: without a log."""
+
+    def log_message(self, *arguments):
+        pass
+
+
+@contextlib.contextmanager
+def answering(handler):
+    """The URL of a server of its own."""
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
+        threading.Thread(target=server.serve_forever).start()
+        try:
+            yield f"http://127.0.0.1:{server.server_port}"
+        finally:
+            server.shutdown()
+
+
+@pytest.mark.parametrize("attack", ["gzip bomb", "endless", "long range"])
+def test_answers_are_bounded(monkeypatch, attack):
+    """A server cannot fill the memory: a packed answer stays packed, and one that is longer than was asked for, or
+    than any, is cut."""
+    monkeypatch.setattr("hgn.data.bounded_http.LARGEST_BYTES", 100_000)
+
+    class Attack(Quiet, http.server.BaseHTTPRequestHandler):
+        def do_GET(self):
+            self.send_response(206 if attack == "long range" else 200)
+            if attack == "gzip bomb":
+                self.send_header("Content-Encoding", "gzip")
+            self.end_headers()
+            with contextlib.suppress(ConnectionError):
+                if attack == "gzip bomb":
+                    self.wfile.write(gzip.compress(bytes(10**7)))
+                for _ in range(0 if attack == "gzip bomb" else 1000):
+                    self.wfile.write(bytes(10_000))
+
+    with answering(Attack) as url:
+        storage = open_storage(url)
+        if attack == "gzip bomb":
+            assert len(storage.manifest("manifest.json")) < 20_000
+        else:
+            limit = 50 if attack == "long range" else 100_000
+            with pytest.raises(ConfigError, match=f"must answer with at most {limit} bytes, got more"):
+                storage.read("s", 0, 50) if attack == "long range" else storage.manifest("manifest.json")
+
+
+def test_proxy_that_remembers():
+    """A proxy that has an older, shorter file of the index is asked again until it has the one that the manifest is
+    about."""
+    answers = iter([(416, b""), (206, b"56"), (206, b"5678")])
+
+    class Proxy(Quiet, http.server.BaseHTTPRequestHandler):
+        def do_GET(self):
+            status, content = next(answers)
+            self.send_response(status)
+            self.send_header("Content-Length", str(len(content)))
+            self.end_headers()
+            self.wfile.write(content)
+
+    with answering(Proxy) as url:
+        assert open_storage(url).read("index", 5, 9) == b"5678"
+
+
+def test_server_without_ranges(folder, monkeypatch):
+    """A plain file server that knows no ranges will do."""
+    monkeypatch.setattr(hgn.data.storage, "_CHUNK_BYTES", 4000)
+
+    class Plain(Quiet, http.server.SimpleHTTPRequestHandler):
+        pass
+
+    with answering(functools.partial(Plain, directory=str(folder))) as url:
+        pairs = list(zip(EpisodeStore(url, "train"), EpisodeStore(folder, "train"), strict=True))
+        assert len(pairs) == 5 and all(np.array_equal(a.position_TN3, b.position_TN3) for a, b in pairs)
