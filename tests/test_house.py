@@ -27,6 +27,10 @@ LINES_OF_A_FILE = 450
 LONG_FILES = {
     "hgn/kernels/coarsest/kernel.py": 584,
     "hgn/kernels/grid/kernel.py": 548,
+    "tests/datagen/mpm/test_constitutive.py": 483,
+    "tests/jobs/test_queue.py": 457,
+    "tests/network/test_relative.py": 474,
+    "tests/tools/test_stability_network.py": 489,
 }
 
 NARROW_PACKAGES = ("hgn/training/", "hgn/runtime/")
@@ -153,8 +157,8 @@ def test_lines_of_packages():
 
 
 def test_lines_of_files():
-    """No file of the packages has more than 450 lines."""
-    counts = {name: line_counts()[name] for name in in_packages(*(f"{package}/" for package in PACKAGES))}
+    """No file has more than 450 lines."""
+    counts = {name: line_counts()[name] for name in in_packages(*(f"{package}/" for package in LINES))}
     assert over(counts, LINES_OF_A_FILE, LONG_FILES) == {}
 
 
