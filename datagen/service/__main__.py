@@ -35,7 +35,7 @@ _SERVICE_KEYS = ("host", "port", "health_port", "connections")
 class ServiceConfig:
     """`python -m datagen.service`: the server, in addition to the settings of `python -m datagen`."""
 
-    host: str = "127.0.0.1"  # address to listen on; 0.0.0.0: all
+    host: str = "127.0.0.1"  # address to listen on; any other needs a token in $HGN_DATASET_TOKEN
     port: Port = 8000  # 0: any free port
     health_port: Port | None = None  # also answers /healthz there, for the probes of a busy service; null: none
     connections: Positive[int] = 1024  # simultaneous connections; others are answered with 503
