@@ -75,9 +75,7 @@ LARGE_FILES = {  # shipped weights, and results that pages show
     "hgn/weights/mechanics.safetensors",
     "hgn/weights/obstacles.safetensors",
     "hgn/weights/obstacles_small.safetensors",
-    "results/recipe/side_by_side.webp",
     "results/stability/network_h100.json",
-    "results/stability/obstacles_h100.png",
     "results/stability/thrown.webp",
 }
 
