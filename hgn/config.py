@@ -1,7 +1,7 @@
-"""The dataclasses behind the commands: Hydra composes YAML, these validate it, once per command. A command's own
-options are at the top of its file.
+"""Settings shared by the commands, as dataclasses: Hydra composes YAML, the dataclasses validate it once per command.
+Settings of one command are at the top of its file.
 
-Below this file nobody sees a DictConfig. Numbers that follow from others are properties, never keys.
+Only plain dataclasses are passed on, no DictConfig. Numbers that follow from others are properties, not settings.
 """
 
 from __future__ import annotations
@@ -40,8 +40,8 @@ GROUP_SHAPES = ("cube", "sphere")
 NETWORK_KINDS = ("hgn", "gns")
 BACKENDS = ("auto", "torch", "triton", "cpu")
 PRECISIONS = ("fp32", "tf32", "fp16")
-SIMULATED_FRAMES = 3  # of an episode at least for pushforward: one to start from, one simulated, one that answers it
-DEFAULT_WEIGHTS = "mechanics"  # of the commands and of `Simulator.load`; shipped, by name
+SIMULATED_FRAMES = 3  # an episode needs for pushforward: the start, a simulated frame and its target
+DEFAULT_WEIGHTS = "mechanics"  # shipped weights that commands and `Simulator.load` use
 Material = Annotated[str, one_of(*MATERIALS)]
 MaterialName = Annotated[
     str,
@@ -57,7 +57,7 @@ WallClearance = tuple[NonNegative[float], NonNegative[float]]
 
 
 def config_directory() -> Path:
-    """The folder with the Hydra configs: inside the installed package, or beside it in a checkout."""
+    """Returns the folder with the Hydra configs: inside the installed package, or beside it in a checkout."""
     package = Path(__file__).resolve().parent
     for candidate in (package / "conf", package.parent / "conf"):
         if (candidate / "datagen.yaml").is_file():

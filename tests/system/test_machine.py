@@ -122,18 +122,27 @@ def test_folders_that_can_be_written_to(tmp_path, monkeypatch):
     assert other.parent == own.parent and other != own and other.stat().st_mode & 0o777 == 0o700
 
 
-@pytest.mark.parametrize("named", [None, "TRITON_HOME", "TRITON_CACHE_DIR"])
-def test_where_triton_keeps_what_it_compiles(tmp_path, named):
-    """A home that cannot be written to is in nobody's way, unless somebody named a folder; how sums and products are
-    rounded is said, which Triton's next version would do otherwise."""
+PROGRAM = """
+import importlib, os, sys
+names = ("TRITON_HOME", "TRITON_CACHE_DIR")
+for named in (None, *names):
+    for name in (*names, "TRITON_DEFAULT_FP_FUSION"):
+        os.environ.pop(name, None)
+    if named:
+        os.environ[named] = "/mine"
+    sys.modules.pop("hgn.kernels", None)
+    importlib.import_module("hgn.kernels")
+    print(os.environ.get("TRITON_CACHE_DIR"), os.environ["TRITON_DEFAULT_FP_FUSION"])
+"""
+
+
+def test_where_triton_keeps_what_it_compiles(tmp_path):
+    """A home that cannot be written to is replaced by a temporary folder, unless one is named; the rounding of sums
+    and products is fixed, which Triton's next version would change."""
     (tmp_path / "file").touch()
-    program = (
-        "import os, hgn.kernels; print(os.environ.get('TRITON_CACHE_DIR'), os.environ['TRITON_DEFAULT_FP_FUSION'])"
-    )
-    names = {"TRITON_HOME", "TRITON_CACHE_DIR", "TRITON_DEFAULT_FP_FUSION"}
-    environment = {name: value for name, value in os.environ.items() if name not in names}
-    environment |= {"HOME": str(tmp_path / "file"), "TMPDIR": str(tmp_path)}
-    environment |= {"PYTHONPATH": str(Path(__file__).parents[2])} | ({named: "/mine"} if named else {})
-    ended = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True, check=True)
-    folder = {None: str(tmp_path / f"triton-{os.getuid()}"), "TRITON_HOME": "None", "TRITON_CACHE_DIR": "/mine"}[named]
-    assert ended.stdout == f"{folder} 1\n"
+    environment = os.environ | {"HOME": str(tmp_path / "file"), "TMPDIR": str(tmp_path)}
+    environment |= {"PYTHONPATH": str(Path(__file__).parents[2])}
+    command = [sys.executable, "-c", PROGRAM]
+    ended = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+    folders = (tmp_path / f"triton-{os.getuid()}", None, "/mine")
+    assert ended.stdout.splitlines() == [f"{folder} 1" for folder in folders]
