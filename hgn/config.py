@@ -257,13 +257,6 @@ class NetworkConfig:
     # absolute: velocities and wall distances, the paper's; relative: hgn.network.relative, where free motion and
     # gravity are exact
     inputs: Annotated[str, one_of("absolute", "relative")] = "absolute"
-    # particles in contact that deform by less than this many |g| a frame stop (hgn.network.rest); 0: none do
-    rest_threshold: NonNegative[float] = 0.0
-    # at the end of a frame particles are no nearer to the domain's planes than that, at the near sides (0) and at the
-    # far ones, or than they were before it; null: nothing holds them but what was learned
-    wall_clearance: WallClearance | None = None
-    # and on its way in a frame none comes nearer to an obstacle's triangles than that, or passes them; null: as above
-    obstacle_clearance: Positive[float] | None = None
     materials: tuple[MaterialName, ...] = PAPER_MATERIALS
     # 2: z is that of a plane; imported data alone have it
     dimensions: Annotated[int, Bound("2 or 3", lambda count: count in (2, 3))] = 3
@@ -275,11 +268,6 @@ class NetworkConfig:
             require(self.kind == "hgn", "inputs", f"absolute for {self.kind}", self.inputs)
             rule = "at least 2 with inputs=relative, which are of differences"
             require(self.velocity_history >= 2, "velocity_history", rule, self.velocity_history)
-        else:
-            require(not self.rests, "rest_threshold", "0 with inputs=absolute", self.rest_threshold)
-        require(not self.rests or self.dimensions == 3, "rest_threshold", "0 with dimensions=2", self.rest_threshold)
-        held, rule = self.obstacle_clearance is not None, "null with dimensions=2"
-        require(not held or self.dimensions == 3, "obstacle_clearance", rule, self.obstacle_clearance)
         if self.kind == "gns":
             require(self.levels == 1, "levels", "1 for gns: the particles themselves", self.levels)
 
@@ -289,11 +277,6 @@ class NetworkConfig:
         return self.inputs == "relative"
 
     @property
-    def rests(self) -> bool:
-        """Returns whether slow deformations of what touches stop."""
-        return self.rest_threshold > 0
-
-    @property
     def feature_width(self) -> int:
         """Numbers per particle, the embedding last: paper sec. 3.1, or hgn.network.relative."""
         if self.relative:
@@ -301,6 +284,41 @@ class NetworkConfig:
             return motion + 6 + 6 * self.obstacle_features + MATERIAL_EMBEDDING
         return 3 * self.velocity_history + 3 * self.obstacle_features + 6 + MATERIAL_EMBEDDING
 
+
+@dataclass(frozen=True)
+class StepConfig:
+    """The constraints of simulated frames, which need no training (hgn.step). Lengths in domain units."""
+
+    # particles in contact that deform by less than this many |g| a frame stop; 0: none do
+    rest_threshold: NonNegative[float] = 0.0
+    # least distances from the domain's planes at the near sides (0) and at the far sides; null: no walls
+    wall_clearance: WallClearance | None = None
+    # least distance from an obstacle's triangles, which no particle passes; null: particles may pass
+    obstacle_clearance: Positive[float] | None = None
+
+    def __post_init__(self) -> None:
+        require_bounds(self)
+
+    @property
+    def rests(self) -> bool:
+        """Whether slow deformations stop."""
+        return self.rest_threshold > 0
+
+    @property
+    def in_training(self) -> StepConfig:
+        """The constraints of pushforward simulations: obstacles only, so that errors at rest and at walls show."""
+        return StepConfig(obstacle_clearance=self.obstacle_clearance)
+
+    def require_fits(self, network: NetworkConfig) -> None:
+        """Raises ConfigError where a network cannot have these constraints."""
+        name, value = "step.rest_threshold", self.rest_threshold
+        require(not self.rests or network.relative, name, "0 with inputs=absolute", value)
+        require(not self.rests or network.dimensions == 3, name, "0 with dimensions=2", value)
+        fits = self.obstacle_clearance is None or network.dimensions == 3
+        require(fits, "step.obstacle_clearance", "null with dimensions=2", self.obstacle_clearance)
+
+
+UNCONSTRAINED = StepConfig()
 
 # Plane waves of the correlated noise, and the lengths that they are drawn from, in finest cells: short ones stir a
 # body, long ones shift it.
@@ -387,6 +405,7 @@ class TrainConfig:
     mpm: MpmConfig = field(default_factory=MpmConfig)
     dataset: DatasetConfig = field(default_factory=DatasetConfig)
     network: NetworkConfig = field(default_factory=NetworkConfig)
+    step: StepConfig = field(default_factory=StepConfig)
     training: TrainingConfig = field(default_factory=TrainingConfig)
     run: FolderName = "runs/obstacles"  # folder of checkpoints, logs and pictures
     # the data set was imported (hgn.import_trajectories) and determines `scene` and `dataset`: +experiment=imported
@@ -394,6 +413,7 @@ class TrainConfig:
 
     def __post_init__(self) -> None:
         require_bounds(self)
+        self.step.require_fits(self.network)
         rule, dimensions = "3 for data that are not imported", self.network.dimensions
         require(self.imported or dimensions == 3, "network.dimensions", rule, dimensions)
         upright = self.scene.zero_gravity_fraction == 0 and self.scene.tilted_gravity_fraction == 0

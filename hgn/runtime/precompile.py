@@ -20,7 +20,7 @@ from typing import Self
 
 import torch
 
-from hgn.config import NetworkConfig
+from hgn.config import NetworkConfig, StepConfig
 from hgn.runtime.backend import triton_unsupported_reason
 from hgn.runtime.precompile_program import FrameJob, PrecompileJob, job_text
 from hgn.system.machine import available_cpus
@@ -104,14 +104,17 @@ class Precompilation:
 
 
 def precompile_frames(
-    networks: Sequence[NetworkConfig], precisions: Sequence[str], device: torch.device, particles: Sequence[int]
+    networks: Sequence[tuple[NetworkConfig, StepConfig]],
+    precisions: Sequence[str],
+    device: torch.device,
+    particles: Sequence[int],
 ) -> Precompilation | None:
     """Compiles what simulations of so many particles launch, however far they spread; none where nothing is."""
     if device.type != "cuda" or torch.version.hip is not None:
         return None
     pairs = [
-        (network, precision)
-        for network in dict.fromkeys(networks)
+        (network, step, precision)
+        for network, step in dict.fromkeys(networks)
         for precision in dict.fromkeys(precisions)
         if network.kind == "hgn" and triton_unsupported_reason(device, network, precision) is None
     ]

@@ -86,7 +86,7 @@ def network_predictor(backend: Backend) -> Predictor:
 
     def predict(batch: Batch) -> torch.Tensor:
         state = batch.state()
-        return backend.network.restored_acceleration(backend.normalised_acceleration(state), state)
+        return backend.predict(state)
 
     return predict
 

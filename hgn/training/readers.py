@@ -9,7 +9,7 @@ from concurrent.futures import ThreadPoolExecutor
 from itertools import islice
 from typing import NamedTuple, Protocol
 
-from hgn.config import NetworkConfig, TrainingConfig
+from hgn.config import UNCONSTRAINED, NetworkConfig, StepConfig, TrainingConfig
 from hgn.data.batch import BatchSample, WindowChunk, join
 from hgn.data.episode_tensors import EpisodeChunk, EpisodeTensors, whole_episode
 from hgn.data.importance import FrameImportance
@@ -102,10 +102,12 @@ class EpisodeReader:
 
     updates_at_once = 64
 
-    def __init__(self, store: AnyStore, network: NetworkConfig, training: TrainingConfig) -> None:
+    def __init__(
+        self, store: AnyStore, network: NetworkConfig, training: TrainingConfig, step: StepConfig = UNCONSTRAINED
+    ) -> None:
         self._store, self._network = store, network
         self._draws = FrameDraws(store, training)
-        self._clearance = network.obstacle_clearance if training.pushforward_fraction > 0 else None
+        self._clearance = step.obstacle_clearance if training.pushforward_fraction > 0 else None
         shuffled = training.shuffle_episodes
         # two windows of the order, where it has windows
         self.capacity = 2 * max(shuffled, BLOCK_EPISODES) if shuffled else sys.maxsize
