@@ -4,34 +4,17 @@ Each stage takes what the stage before returns:
 
     Prediction --rested--> accelerations --moved--> FreeMotion --constrained--> Motion --next_state--> ParticleState
 
-**Rest** (`rest_threshold`, relative inputs only; not the paper's). `balanced` makes the motion of coarsest cells exact,
-but how bodies deform is learned and never exactly 0, so that piles creep and swell. Here slow deformation stops, as
-below a yield stress. The motion that a body has in common and faster deformation are not changed.
+docs/concepts/constraints.md derives them. P of **rest** is sum_K w_pK min(1, 2 q_K) (value_p - mean_K - Omega_K x y_p):
+K are the middles of coarsest cells, w_pK trilinear weights times the particle's gate sum_C w_pC t_C; mean, rate of
+rotation Omega_K and centre of mass are those with these weights, and q_K says how well rotation is known (`rotation`).
+With the next displacement u = v + a and d = P u accelerations become a - P (phi d), where phi = 2 - |d|^2 /
+(threshold |g|)^2 within 0 and 1. The same follows between cells of four times that size, with what the first has left;
+FRICTIONLESS materials are not part of it.
 
-P value = sum_K w_pK min(1, 2 q_K) (value_p - mean_K - Omega_K x y_p) is the deforming part of a field. K are the
-middles of coarsest cells, w_pK the trilinear weights between them times the particle's gate sum_C w_pC t_C, t_C
-`touched`. Mean and rate of rotation Omega_K are those of the field with these weights, y_p is seen from their centre of
-mass, and q_K says how well rotation is known (`rotation`). Weights overlap, so that P does not depend on where a body
-lies in the grid. With the next displacement u = v + a and d = P u accelerations become a - P (phi d), where
-phi = 2 - |d|^2 / (threshold |g|)^2 within 0 and 1.
-
-The same follows between cells of four times that size, with what the first has left: sand that covers a floor, which is
-larger than a coarsest cell, rests too. Particles in contact within two of these larger cells share their slow motion,
-in one body or in several. FRICTIONLESS materials are not part of it: water spreads on.
-
-Momentum and angular momentum stay, whatever the weights. P is symmetric and within 0 and 1, so that no motion gains
-energy, in any frame, and a boost changes nothing. Nothing changes without contact, without gravity, and beyond sqrt(2)
-of the threshold.
-
-**Walls** (`wall_clearance`). Positions come no nearer to the planes at 0 and at the domain's size than the clearances,
-or than they were: particles between two walls that are too close stay. Axes from `dimensions` on have no walls.
-
-**Obstacles** (`obstacle_clearance`). On its way from x to y a particle keeps to the side of each triangle that it
-begins on; exactly on a plane, to that of the normal. A triangle stops the way where it comes nearer to the triangle's
-plane than the clearance, over the area that the triangle covers (hgn.scene.barrier), or crosses the plane there; of
-several triangles, the first. The way ends as far from the plane as the clearance, or as x where that is nearer: y is
-shifted along the triangle's normal, and the motion along the triangle is kept, as on a surface without friction. Ways
-are stopped SLACK of the clearance nearer than they end, so that for rounding no triangle stops a way twice.
+**Obstacles** stop the way from x to y at the first triangle whose plane it crosses, or comes nearer to than the
+clearance, over the area that the triangle covers (hgn.scene.barrier). A particle keeps to the side that it begins on;
+exactly on a plane, to that of the normal. The way ends as far from the plane as the clearance, or as x where that is
+nearer. Ways are stopped SLACK of the clearance nearer than they end, so that for rounding no triangle stops one twice.
 Shape legend: N particles, C coarsest cells, K middles of cells, F triangles, P pairs of particles and triangles.
 """
 
