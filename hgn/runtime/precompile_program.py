@@ -61,7 +61,7 @@ def launches_of(job: PrecompileJob | FrameJob, device: str = "meta") -> Launches
             _update_launches(job, device)
         else:
             for config, step, precision in job.networks:
-                _frame_launches(config, step, precision, job.sizes, device)
+                _frame_launches(config, step, precision, job.sizes, device=device)
     return launches
 
 

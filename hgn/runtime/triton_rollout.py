@@ -122,14 +122,9 @@ class TritonRollout:
         self.origin_S3 = torch.zeros_like(self.domain_S3)
         self.gravity_S3 = torch.zeros_like(self.domain_S3)  # zero with absolute inputs, which have learned it
         self.device_particles = DeviceParticles(
-            self.position_N3,
-            self.velocity_NV,
-            self.scene_N,
-            self.material_N,
-            self.domain_S3,
-            self.gravity_S3,
-            self.count,
-        )
+            position_N3=self.position_N3, velocity_NV=self.velocity_NV, scene_N=self.scene_N,
+            material_N=self.material_N, domain_S3=self.domain_S3, gravity_S3=self.gravity_S3, count=self.count,
+        )  # fmt: skip
         self.obstacles = obstacles
         if obstacles is None and state.obstacles is not None:
             self.obstacles = ObstacleTable.of(state.obstacles, state.scene_count)
