@@ -32,6 +32,7 @@ from hgn.schema import (
     require_bounds,
 )
 from hgn.solver_method import METHODS, SolverMethod
+from hgn.step_config import StepConfig
 
 OBSTACLE_SHAPES = ("half_box", "square", "half_sphere", "cone", "pyramid")
 MESH_SUFFIXES = (".stl", ".obj", ".ply", ".glb")
@@ -53,7 +54,6 @@ Precision = Annotated[str, one_of(*PRECISIONS)]
 StoredPrecision = Annotated[str, one_of("fp32", "fp16")]
 Split = Annotated[str, one_of("train", "validation", "test")]
 MATERIAL_EMBEDDING = 16  # numbers that a network learns for each material (paper: E)
-WallClearance = tuple[NonNegative[float], NonNegative[float]]
 
 
 def config_directory() -> Path:
@@ -285,41 +285,6 @@ class NetworkConfig:
         return 3 * self.velocity_history + 3 * self.obstacle_features + 6 + MATERIAL_EMBEDDING
 
 
-@dataclass(frozen=True)
-class StepConfig:
-    """The constraints of simulated frames, which need no training (hgn.step). Lengths in domain units."""
-
-    # particles in contact that deform by less than this many |g| a frame stop; 0: none do
-    rest_threshold: NonNegative[float] = 0.0
-    # least distances from the domain's planes at the near sides (0) and at the far sides; null: no walls
-    wall_clearance: WallClearance | None = None
-    # least distance from an obstacle's triangles, which no particle passes; null: particles may pass
-    obstacle_clearance: Positive[float] | None = None
-
-    def __post_init__(self) -> None:
-        require_bounds(self)
-
-    @property
-    def rests(self) -> bool:
-        """Whether slow deformations stop."""
-        return self.rest_threshold > 0
-
-    @property
-    def in_training(self) -> StepConfig:
-        """The constraints of pushforward simulations: obstacles only, so that errors at rest and at walls show."""
-        return StepConfig(obstacle_clearance=self.obstacle_clearance)
-
-    def require_fits(self, network: NetworkConfig) -> None:
-        """Raises ConfigError where a network cannot have these constraints."""
-        name, value = "step.rest_threshold", self.rest_threshold
-        require(not self.rests or network.relative, name, "0 with inputs=absolute", value)
-        require(not self.rests or network.dimensions == 3, name, "0 with dimensions=2", value)
-        fits = self.obstacle_clearance is None or network.dimensions == 3
-        require(fits, "step.obstacle_clearance", "null with dimensions=2", self.obstacle_clearance)
-
-
-UNCONSTRAINED = StepConfig()
-
 # Plane waves of the correlated noise, and the lengths that they are drawn from, in finest cells: short ones stir a
 # body, long ones shift it.
 CORRELATED_WAVES, CORRELATED_WAVELENGTHS = 16, (4, 64)
@@ -413,7 +378,7 @@ class TrainConfig:
 
     def __post_init__(self) -> None:
         require_bounds(self)
-        self.step.require_fits(self.network)
+        self.step.require_fits(self.network.relative, self.network.dimensions)
         rule, dimensions = "3 for data that are not imported", self.network.dimensions
         require(self.imported or dimensions == 3, "network.dimensions", rule, dimensions)
         upright = self.scene.zero_gravity_fraction == 0 and self.scene.tilted_gravity_fraction == 0

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from hgn.command import run_command
-from hgn.config import StepConfig, StoredPrecision, WallClearance
+from hgn.config import StoredPrecision
 from hgn.network.base import ParticleNetwork
 from hgn.network.features import ParticleState
 from hgn.runtime.exported_step import initial_arrays, traced_step, write_onnx, write_package
@@ -19,6 +19,7 @@ from hgn.scene.barrier import barrier_pieces
 from hgn.scene.scene import all_corners
 from hgn.scene.scene_file import find_scene, load_scene
 from hgn.schema import FileName, NonNegative, Positive, from_mapping, require, require_bounds
+from hgn.step_config import StepConfig, WallClearance
 from hgn.system.device import choose_device
 from hgn.system.extras import require_installed
 from hgn.system.files import require_place
@@ -147,7 +148,7 @@ def change(file: Path, out: Path, stored_precision: str = "fp32", **step_changes
 def changed_step(network: ParticleNetwork, changes: dict[str, Any]) -> StepConfig:
     """Returns the network's constraints with changes. Raises: ConfigError where the network cannot have them."""
     step = replace(network.step, **changes)
-    step.require_fits(network.config)
+    step.require_fits(network.config.relative, network.config.dimensions)
     return step
 
 

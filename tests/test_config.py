@@ -3,8 +3,9 @@
 import pytest
 
 from hgn.average import AverageConfig
-from hgn.config import DatasetConfig, NetworkConfig, SceneConfig, StepConfig, TrainConfig, TrainingConfig
+from hgn.config import DatasetConfig, NetworkConfig, SceneConfig, TrainConfig, TrainingConfig
 from hgn.schema import ConfigError
+from hgn.step_config import StepConfig
 
 GNS = {"kind": "gns", "levels": 1}
 RELATIVE = {"inputs": "relative"}

@@ -11,11 +11,12 @@ from dataclasses import dataclass
 import torch
 from torch import nn
 
-from hgn.config import MATERIAL_EMBEDDING, UNCONSTRAINED, NetworkConfig, StepConfig
+from hgn.config import MATERIAL_EMBEDDING, NetworkConfig
 from hgn.network.features import WALL_DISTANCE_CELLS, Normaliser, ParticleState, wall_distances
 from hgn.network.grid import GridHierarchy
 from hgn.network.mlp import LEAKY_SLOPE, MLP
 from hgn.network.relative import Contacts, relative_features
+from hgn.step_config import UNCONSTRAINED, StepConfig
 
 
 @dataclass(frozen=True, eq=False)

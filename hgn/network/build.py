@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from hgn.config import UNCONSTRAINED, NetworkConfig, StepConfig
+from hgn.config import NetworkConfig
 from hgn.network.base import ParticleNetwork
 from hgn.network.gns import GraphNetworkSimulator
 from hgn.network.hgn import HierarchicalGraphNetwork
+from hgn.step_config import UNCONSTRAINED, StepConfig
 
 
 def build_network(config: NetworkConfig, step: StepConfig = UNCONSTRAINED) -> ParticleNetwork:
@@ -13,7 +14,7 @@ def build_network(config: NetworkConfig, step: StepConfig = UNCONSTRAINED) -> Pa
 
     Raises: ConfigError where the network cannot have these constraints.
     """
-    step.require_fits(config)
+    step.require_fits(config.relative, config.dimensions)
     network: ParticleNetwork = (HierarchicalGraphNetwork if config.kind == "hgn" else GraphNetworkSimulator)(config)
     network.step = step
     return network

@@ -20,9 +20,10 @@ from typing import Self
 
 import torch
 
-from hgn.config import NetworkConfig, StepConfig
+from hgn.config import NetworkConfig
 from hgn.runtime.backend import triton_unsupported_reason
 from hgn.runtime.precompile_program import FrameJob, PrecompileJob, job_text
+from hgn.step_config import StepConfig
 from hgn.system.machine import available_cpus
 from hgn.system.processes import die_with_parent
 

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 
 import torch
 
-from hgn.config import UNCONSTRAINED, NetworkConfig, StepConfig
+from hgn.config import NetworkConfig
 from hgn.kernels.grid.op import ObstacleTable, Window
 from hgn.kernels.triton_compat import Launches, build_launcher, noted_launches, preload, use_target
 from hgn.kernels.update.op import Updates, UpdateSettings
@@ -25,6 +25,7 @@ from hgn.network.features import ParticleState
 from hgn.network.hgn import HierarchicalGraphNetwork
 from hgn.runtime.triton_rollout import TritonRollout, first_capacities
 from hgn.schema import from_mapping, to_mapping
+from hgn.step_config import UNCONSTRAINED, StepConfig
 
 NICENESS = 10
 

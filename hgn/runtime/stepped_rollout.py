@@ -12,11 +12,11 @@ from typing import Protocol
 import numpy as np
 import torch
 
-from hgn.config import StepConfig
 from hgn.network.features import ParticleState
 from hgn.network.grid import GridRangeError
 from hgn.runtime.divergence import DivergedError, describe_diverged, diverged
 from hgn.step.reference import advanced
+from hgn.step_config import StepConfig
 
 
 class Rollout(Protocol):

@@ -16,7 +16,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from hgn.config import StepConfig
 from hgn.kernels.capture import captured
 from hgn.kernels.forward import FusedNetwork, feature_columns
 from hgn.kernels.grid.op import OUT_OF_WINDOW, OVERFLOW, DeviceGrid, ObstacleTable, Window
@@ -31,6 +30,7 @@ from hgn.runtime.divergence import DivergedError, describe_diverged, diverged
 from hgn.runtime.parity import LEAST_OUTPUT, OUTPUT_BOUND, relative_error, require_bound
 from hgn.runtime.triton_host import kernel_precision
 from hgn.step.reference import rested
+from hgn.step_config import StepConfig
 
 LOOK_FRAMES, FEWEST_FRAMES = 32, 4
 CROWDED = 140  # particles in a cell of the finest level, half again as many as in the data's bodies

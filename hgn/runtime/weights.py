@@ -14,11 +14,12 @@ import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 
-from hgn.config import NetworkConfig, StepConfig
+from hgn.config import NetworkConfig
 from hgn.network.base import ParticleNetwork
 from hgn.network.build import build_network
 from hgn.renamed import REMOVED_CHOICES, current_names, with_step
 from hgn.schema import ConfigError, from_mapping, require, to_mapping
+from hgn.step_config import StepConfig
 from hgn.system.files import make_folder, write_atomically
 from hgn.system.hub import PREFIX, hub_weights
 

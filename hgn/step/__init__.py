@@ -6,8 +6,8 @@
 | `wall_clearance` | after the integration | no particle comes nearer to the domain's planes |
 | `obstacle_clearance` | after the walls | no particle passes an obstacle's triangle |
 
-`hgn.config.StepConfig` holds the settings, `ParticleNetwork.step` those of a network, and a weights file its section
-`step`. They act in this order, in one file of each backend:
+`hgn.step_config.StepConfig` holds the settings: `ParticleNetwork.step` of a network, section `step` of a weights file.
+They act in this order, in one file of each backend:
 
 | backend | file |
 |---|---|

@@ -26,13 +26,13 @@ import torch
 from torch import nn
 from torch.compiler import is_exporting
 
-from hgn.config import StepConfig
 from hgn.network.barriers import Barriers
 from hgn.network.base import ParticleNetwork, Prediction
 from hgn.network.cell_keys import COORDINATE_LIMIT, LARGEST_EXPORTED, find, pack, unique, unpack
 from hgn.network.features import ParticleState
 from hgn.network.grid import CORNER_83, GridHierarchy
 from hgn.network.relative import SMALLEST_MASS, coarsest_cells, coarsest_places, inertia, rotation
+from hgn.step_config import StepConfig
 
 SURE = 0.5  # q from which on rotation counts as known
 LEAST = 1e-30  # of a limit squared

@@ -14,13 +14,14 @@ from typing import Any
 
 import torch
 
-from hgn.config import NetworkConfig, StepConfig, TrainConfig
+from hgn.config import NetworkConfig, TrainConfig
 from hgn.data.sampler import SamplerState
 from hgn.network.base import ParticleNetwork
 from hgn.network.build import build_network
 from hgn.renamed import current_names, with_step
 from hgn.runtime.weights import find_weights, load_weights
 from hgn.schema import ConfigError, from_stored, to_mapping
+from hgn.step_config import StepConfig
 
 SECTION = "hgn"  # key of this project's entries in a checkpoint
 LAST_NAMES = ("last.ckpt", "last-1.ckpt", "last-2.ckpt")  # newest first

@@ -9,7 +9,7 @@ from concurrent.futures import ThreadPoolExecutor
 from itertools import islice
 from typing import NamedTuple, Protocol
 
-from hgn.config import UNCONSTRAINED, NetworkConfig, StepConfig, TrainingConfig
+from hgn.config import NetworkConfig, TrainingConfig
 from hgn.data.batch import BatchSample, WindowChunk, join
 from hgn.data.episode_tensors import EpisodeChunk, EpisodeTensors, whole_episode
 from hgn.data.importance import FrameImportance
@@ -17,6 +17,7 @@ from hgn.data.pooled import AnyStore
 from hgn.data.sampler import BLOCK_EPISODES, Sample, SamplerState
 from hgn.scene.episode import Episode
 from hgn.scene.history import window
+from hgn.step_config import UNCONSTRAINED, StepConfig
 from hgn.training.noise import noise_scale
 from hgn.training.pushforward import Starts, simulated_barrier
 

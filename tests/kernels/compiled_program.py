@@ -17,10 +17,11 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "training"))
 from no_gpu import use_h100
 from ptx import hazards, overwritten_tiles
 
-from hgn.config import NetworkConfig, StepConfig
+from hgn.config import NetworkConfig
 from hgn.kernels import triton_compat
 from hgn.kernels.update.op import UpdateSettings
 from hgn.runtime.precompile_program import FrameJob, PrecompileJob, launches_of
+from hgn.step_config import StepConfig
 
 
 @triton.jit

@@ -6,13 +6,14 @@ import torch
 from kernels.engines import device
 from network.barrier_scenes import CELL, CLEARANCE, DOMAIN, ball, barriers_of, crossings, gutter, scattered, square
 
-from hgn.config import NetworkConfig, StepConfig
+from hgn.config import NetworkConfig
 from hgn.kernels.buffers import OUT
 from hgn.kernels.grid.op import DeviceGrid, Window
 from hgn.kernels.step.op import BarrierHash, BarrierTable, DeviceParticles, DeviceStep
 from hgn.network.features import ParticleState
 from hgn.scene.barrier import build_barrier
 from hgn.step.reference import advanced, first_stop
+from hgn.step_config import StepConfig
 
 NO_CORNERS = np.zeros((0, 3, 3))
 

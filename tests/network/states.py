@@ -5,13 +5,14 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from hgn.config import NetworkConfig, StepConfig
+from hgn.config import NetworkConfig
 from hgn.network.build import build_network
 from hgn.network.features import ParticleState
 from hgn.network.gns import GraphNetworkSimulator
 from hgn.network.hgn import HierarchicalGraphNetwork
 from hgn.network.obstacles import ObstacleCells
 from hgn.scene.obstacle_grid import ObstacleGrid
+from hgn.step_config import StepConfig
 
 GRAVITY = (0.0, -9.8 / 3600, 0.0)  # domain units per frame squared
 

@@ -7,7 +7,6 @@ import pytest
 import torch
 from network.barrier_scenes import CELL, CLEARANCE, DOMAIN, ball, barriers_of, crossings, gutter, scattered, square
 
-from hgn.config import StepConfig
 from hgn.network.barriers import Barriers, barrier_rows
 from hgn.network.features import ParticleState
 from hgn.scene.barrier import CELLS, MARGIN, barrier_of_pieces, barrier_pieces, build_barrier
@@ -15,6 +14,7 @@ from hgn.scene.rotation import euler_rotation
 from hgn.scene.scene import Obstacle
 from hgn.schema import ConfigError
 from hgn.step.reference import SLACK, FreeMotion, constrained, first_stop
+from hgn.step_config import StepConfig
 
 MORE, RIM = SLACK * CLEARANCE, MARGIN * CLEARANCE
 

@@ -8,12 +8,12 @@ import torch
 from network.states import gns_of, network_of, random_state, silent
 from runtime.scenes import random_scene
 
-from hgn.config import StepConfig
 from hgn.network.features import ParticleState
 from hgn.runtime.divergence import DivergedError
 from hgn.runtime.rollouts import simulate_scenes
 from hgn.runtime.simulator import Simulator
 from hgn.step.reference import advanced
+from hgn.step_config import StepConfig
 
 WALLS = (0.03, 0.05)  # near sides, far sides
 DOMAIN = (1.0, 0.8, 0.6)

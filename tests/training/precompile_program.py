@@ -4,9 +4,10 @@ from dataclasses import replace
 
 from no_gpu import use_h100
 
-from hgn.config import NetworkConfig, StepConfig
+from hgn.config import NetworkConfig
 from hgn.kernels.update.op import UpdateSettings
 from hgn.runtime.precompile_program import FrameJob, PrecompileJob, compile_part, launches_of
+from hgn.step_config import StepConfig
 
 use_h100()
 settings = UpdateSettings(2, 1e-3, True, 1 / 64)

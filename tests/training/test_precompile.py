@@ -6,9 +6,10 @@ import time
 import pytest
 from processes import run_compiled
 
-from hgn.config import NetworkConfig, SceneConfig, StepConfig, TrainConfig, TrainingConfig
+from hgn.config import NetworkConfig, SceneConfig, TrainConfig, TrainingConfig
 from hgn.runtime.precompile import Precompilation, frame_sizes
 from hgn.runtime.precompile_program import FrameJob, job_of, job_text
+from hgn.step_config import StepConfig
 from hgn.training.precompile import job_of_training
 
 

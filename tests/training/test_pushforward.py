@@ -15,7 +15,7 @@ from training.test_resume import stop_at as stop_at
 from training.test_symmetry import scene_with_obstacles
 
 from hgn import train
-from hgn.config import StepConfig, TrainingConfig
+from hgn.config import TrainingConfig
 from hgn.data.batch import BatchSample, join, make_batch
 from hgn.runtime import simulator
 from hgn.runtime.simulator import Simulator
@@ -23,6 +23,7 @@ from hgn.scene.history import window
 from hgn.scene.rollout_file import known_obstacles
 from hgn.scene.scene import all_corners
 from hgn.schema import ConfigError
+from hgn.step_config import StepConfig
 from hgn.training.checkpoint import read_checkpoint
 from hgn.training.pushforward import PoolDraws, PushforwardPool, drawn_starts, pushforward_windows
 from hgn.training.torch_pushforward import TorchScenes

@@ -7,7 +7,7 @@ import torch
 from training.runs import NETWORK, TRAINING, metrics, train_mapping
 
 from hgn import train
-from hgn.config import NetworkConfig, StepConfig, TrainConfig, TrainingConfig
+from hgn.config import NetworkConfig, TrainConfig, TrainingConfig
 from hgn.data.reader import EpisodeStore, first_episodes
 from hgn.evaluate import EvaluateConfig, one_step_rows
 from hgn.export import export
@@ -16,6 +16,7 @@ from hgn.network.build import build_network
 from hgn.runtime.torch_backend import Backend
 from hgn.runtime.weights import WeightsInfo, load_weights, save_weights
 from hgn.schema import ConfigError
+from hgn.step_config import StepConfig
 from hgn.training.checkpoint import network_of_checkpoint, network_of_weights, read_checkpoint
 from hgn.training.muon import Muon
 from hgn.training.schedule import learning_rate

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 import triton
 
-from hgn.config import NetworkConfig, StepConfig
+from hgn.config import NetworkConfig
 from hgn.kernels.buffers import OUT
 from hgn.kernels.grid.op import PARTICLE_BLOCK, SUMS, DeviceGrid, Window
 from hgn.kernels.step import kernel
@@ -24,6 +24,7 @@ from hgn.network.barriers import Barriers
 from hgn.network.cell_keys import in_buckets, unpack
 from hgn.scene.barrier import Barrier
 from hgn.step.reference import LEAST_CREASE, LEVEL_SHIFT, REST_SIZES, SLACK, SURFACES, rests_widely
+from hgn.step_config import StepConfig
 
 BARRIER_COLUMNS, RATES = kernel.BARRIER_COLUMNS.value, kernel.RATES.value
 DIVERGED = kernel.DIVERGED.value
