@@ -314,7 +314,7 @@ def _pairs(
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Particles and triangles int64 [P] among which are all that meet."""
     if is_exporting():
-        return _pairs_of_boxes(barriers, before_N3, after_N3)
+        return pairs_of_boxes(barriers, before_N3, after_N3)
     before_N3, after_N3 = before_N3.detach(), after_N3.detach()
     way_N3 = after_N3 - before_N3
     pieces_N = torch.ceil(torch.linalg.vector_norm(way_N3, dim=-1) / barriers.cell_size).clamp(min=1)
@@ -334,7 +334,7 @@ def _pairs(
     return torch.cat(particles), torch.cat(triangles)
 
 
-def _pairs_of_boxes(
+def pairs_of_boxes(
     barriers: Barriers, before_N3: torch.Tensor, after_N3: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Those whose boxes meet: as a graph without loops has it, of one scene."""

@@ -13,7 +13,7 @@ from hgn.scene.barrier import CELLS, MARGIN, barrier_of_pieces, barrier_pieces, 
 from hgn.scene.rotation import euler_rotation
 from hgn.scene.scene import Obstacle
 from hgn.schema import ConfigError
-from hgn.step.reference import SLACK, FreeMotion, constrained, first_stop
+from hgn.step.reference import SLACK, FreeMotion, constrained, first_stop, pairs_of_boxes
 from hgn.step_config import StepConfig
 
 MORE, RIM = SLACK * CLEARANCE, MARGIN * CLEARANCE
@@ -252,7 +252,7 @@ def test_rows_of_an_exported_graph(dtype):
     np.testing.assert_allclose(row_F24.numpy(), barrier.row_F24, rtol=0, atol=6e-8)  # a rounding to float32
     flat_F33 = torch.tensor([[[0.5] * 3] * 3, [[0.3] * 3, [0.5] * 3, [0.7] * 3]], dtype=dtype)
     flat = replace(Barriers.of([barrier]), row_F24=barrier_rows(flat_F33, CLEARANCE))
-    assert not len(flat._pairs_of_boxes(torch.zeros(1, 3), torch.ones(1, 3))[0])
+    assert not len(pairs_of_boxes(flat, torch.zeros(1, 3), torch.ones(1, 3))[0])
 
 
 def test_scenes_side_by_side():
