@@ -50,11 +50,7 @@ class SteppedRollout:
     """`predict` gives accelerations [N, 3] of a state, in frame units; `step` constrains the frames."""
 
     def __init__(
-        self,
-        predict: Callable[[ParticleState], torch.Tensor],
-        state: ParticleState,
-        step: StepConfig,
-        dimensions: int,
+        self, predict: Callable[[ParticleState], torch.Tensor], state: ParticleState, step: StepConfig, dimensions: int
     ) -> None:
         self.predict, self.state, self.frame = predict, state, 0
         self._step, self._dimensions = step, dimensions

@@ -279,15 +279,10 @@ class TritonRollout:
         self.step.rest(self.fused.output, self.device_particles, self.velocity_std)
 
     def _integrate(self) -> None:
-        normaliser = (self.mean, self.std)
         self.step.integrate(
-            self.fused.output,
-            self.device_particles,
-            normaliser,
-            lost=self.lost,
-            frame=self.frame,
+            self.fused.output, self.device_particles, (self.mean, self.std), lost=self.lost, frame=self.frame,
             path_TN3=self.path_TN3,
-        )
+        )  # fmt: skip
 
     def run(self, frames: int, on_frame: Callable[[int], None] | None = None) -> np.ndarray:
         """Simulates `frames` more frames; their positions, float32 [frames, N, 3].

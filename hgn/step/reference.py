@@ -11,10 +11,8 @@ With the next displacement u = v + a and d = P u accelerations become a - P (phi
 (threshold |g|)^2 within 0 and 1. The same follows between cells of four times that size, with what the first has left;
 FRICTIONLESS materials are not part of it.
 
-**Obstacles** stop the way from x to y at the first triangle whose plane it crosses, or comes nearer to than the
-clearance, over the area that the triangle covers (hgn.scene.barrier). A particle keeps to the side that it begins on;
-exactly on a plane, to that of the normal. The way ends as far from the plane as the clearance, or as x where that is
-nearer. Ways are stopped SLACK of the clearance nearer than they end, so that for rounding no triangle stops one twice.
+**Obstacles**: exactly on a plane a particle keeps to the side of the normal. Ways are stopped SLACK of the clearance
+nearer than they end, so that for rounding no triangle stops one twice.
 Shape legend: N particles, C coarsest cells, K middles of cells, F triangles, P pairs of particles and triangles.
 """
 

@@ -72,8 +72,7 @@ class RestLevel:
 
 
 def rest_numbers(step: StepConfig, window: Window, scenes: int, levels: int) -> tuple[int, ...]:
-    """Returns the sizes of the sums that rest needs cleared with a grid: none without rest."""
-    # slots of the coarsest cells, and as many for larger ones, which need fewer
+    """Returns the sizes of the sums that rest needs cleared: with rest, one slot a coarsest cell for each size."""
     middles = scenes * math.prod((n >> levels - 1) + 2 for n in window.cells)
     return tuple(columns * middles for columns in REST_SUMS * REST_SIZES * step.rests)
 
@@ -163,27 +162,19 @@ class BarrierHash:
         """Of a scene's barrier; none where nothing is in it."""
         if not len(barrier.row_F24):
             return None
-        parts = (barrier.cell_Q3, barrier.start_Q, barrier.triangle_E, barrier.row_F24)
-        cell_Q3, start_Q, triangle_E, row_F24 = map(torch.from_numpy, parts)
-        return BarrierHash._of(cell_Q3, start_Q, triangle_E, row_F24, barrier.cell_size)
+        lists = (barrier.cell_Q3, barrier.start_Q, barrier.triangle_E, barrier.row_F24)
+        return BarrierHash._of([torch.from_numpy(part) for part in lists], barrier.cell_size)
 
     @staticmethod
-    def _of(
-        cell_Q3: torch.Tensor,
-        start_Q: torch.Tensor,
-        triangle_E: torch.Tensor,
-        row_F24: torch.Tensor,
-        cell_size: float,
-    ) -> BarrierHash:
+    def _of(lists: Sequence[torch.Tensor], cell_size: float) -> BarrierHash:
+        cell_Q3, start_Q, triangle_E, row_F24 = lists
         bucket_B, key_Q, order_Q = in_buckets(cell_Q3)
         span_Q2 = torch.stack([start_Q[:-1], start_Q[1:]], dim=1)[order_Q].int().contiguous()
         return BarrierHash(bucket_B, key_Q, span_Q2, triangle_E.int(), row_F24.float().contiguous(), cell_size)
 
     def to(self, device: torch.device) -> BarrierHash:
-        bucket_B, key_Q, span_Q2 = self.bucket_B.to(device), self.key_Q.to(device), self.span_Q2.to(device)
-        return BarrierHash(
-            bucket_B, key_Q, span_Q2, self.triangle_E.to(device), self.row_F24.to(device), self.cell_size
-        )
+        parts = (self.bucket_B, self.key_Q, self.span_Q2, self.triangle_E, self.row_F24)
+        return BarrierHash(*(part.to(device) for part in parts), cell_size=self.cell_size)
 
     def row(self) -> list[int]:
         """This scene's row of a barrier table; valid as long as this object lives."""
@@ -226,8 +217,8 @@ class BarrierTable:
                 first[scene : scene + 2] for first in (first_cell, first_entry, first_triangle)
             )
             start_Q, triangle_E = barriers.start_Q[q : q_end + 1] - e, barriers.triangle_E[e:e_end] - f
-            parts = cell_Q3[q:q_end], start_Q, triangle_E, barriers.row_F24[f:f_end], barriers.cell_size
-            hashes.append(BarrierHash._of(*parts) if triangles[scene] else None)
+            lists = cell_Q3[q:q_end], start_Q, triangle_E, barriers.row_F24[f:f_end]
+            hashes.append(BarrierHash._of(lists, barriers.cell_size) if triangles[scene] else None)
         table = BarrierTable(hashes, barriers.key_Q.device)
         table._barriers = barriers
         return table
