@@ -30,7 +30,7 @@ _OF_DATASET = {
     "array_tasks": "array_tasks",
 }
 # an experiment file serves all commands: what only hgn.train needs is left out
-_OTHERS = ("frozen", "name", "network", "training", "progress")
+_OTHERS = ("frozen", "name", "network", "step", "training", "progress")
 
 
 class StopSignal:

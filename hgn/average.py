@@ -20,7 +20,7 @@ from hgn.schema import ConfigError, FileName, from_mapping, require, require_bou
 from hgn.system.provenance import provenance
 
 Loaded = tuple[ParticleNetwork, WeightsInfo]
-SHARED = ("network", "frame_rate_hz", "obstacle_cell_size", "gravity")  # of weights that can be averaged
+SHARED = ("network", "step", "frame_rate_hz", "obstacle_cell_size", "gravity")  # of weights that can be averaged
 
 
 @dataclass(frozen=True)

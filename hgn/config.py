@@ -32,6 +32,7 @@ from hgn.schema import (
     require_bounds,
 )
 from hgn.solver_method import METHODS, SolverMethod
+from hgn.step_config import StepConfig
 
 OBSTACLE_SHAPES = ("half_box", "square", "half_sphere", "cone", "pyramid")
 MESH_SUFFIXES = (".stl", ".obj", ".ply", ".glb")
@@ -53,7 +54,6 @@ Precision = Annotated[str, one_of(*PRECISIONS)]
 StoredPrecision = Annotated[str, one_of("fp32", "fp16")]
 Split = Annotated[str, one_of("train", "validation", "test")]
 MATERIAL_EMBEDDING = 16  # numbers that a network learns for each material (paper: E)
-WallClearance = tuple[NonNegative[float], NonNegative[float]]
 
 
 def config_directory() -> Path:
@@ -257,13 +257,6 @@ class NetworkConfig:
     # absolute: velocities and wall distances, the paper's; relative: hgn.network.relative, where free motion and
     # gravity are exact
     inputs: Annotated[str, one_of("absolute", "relative")] = "absolute"
-    # particles in contact that deform by less than this many |g| a frame stop (hgn.network.rest); 0: none do
-    rest_threshold: NonNegative[float] = 0.0
-    # at the end of a frame particles are no nearer to the domain's planes than that, at the near sides (0) and at the
-    # far ones, or than they were before it; null: nothing holds them but what was learned
-    wall_clearance: WallClearance | None = None
-    # and on its way in a frame none comes nearer to an obstacle's triangles than that, or passes them; null: as above
-    obstacle_clearance: Positive[float] | None = None
     materials: tuple[MaterialName, ...] = PAPER_MATERIALS
     # 2: z is that of a plane; imported data alone have it
     dimensions: Annotated[int, Bound("2 or 3", lambda count: count in (2, 3))] = 3
@@ -275,11 +268,6 @@ class NetworkConfig:
             require(self.kind == "hgn", "inputs", f"absolute for {self.kind}", self.inputs)
             rule = "at least 2 with inputs=relative, which are of differences"
             require(self.velocity_history >= 2, "velocity_history", rule, self.velocity_history)
-        else:
-            require(not self.rests, "rest_threshold", "0 with inputs=absolute", self.rest_threshold)
-        require(not self.rests or self.dimensions == 3, "rest_threshold", "0 with dimensions=2", self.rest_threshold)
-        held, rule = self.obstacle_clearance is not None, "null with dimensions=2"
-        require(not held or self.dimensions == 3, "obstacle_clearance", rule, self.obstacle_clearance)
         if self.kind == "gns":
             require(self.levels == 1, "levels", "1 for gns: the particles themselves", self.levels)
 
@@ -287,11 +275,6 @@ class NetworkConfig:
     def relative(self) -> bool:
         """Returns whether inputs are relative: nothing depends on a motion that all particles have in common."""
         return self.inputs == "relative"
-
-    @property
-    def rests(self) -> bool:
-        """Returns whether slow deformations of what touches stop."""
-        return self.rest_threshold > 0
 
     @property
     def feature_width(self) -> int:
@@ -387,6 +370,7 @@ class TrainConfig:
     mpm: MpmConfig = field(default_factory=MpmConfig)
     dataset: DatasetConfig = field(default_factory=DatasetConfig)
     network: NetworkConfig = field(default_factory=NetworkConfig)
+    step: StepConfig = field(default_factory=StepConfig)
     training: TrainingConfig = field(default_factory=TrainingConfig)
     run: FolderName = "runs/obstacles"  # folder of checkpoints, logs and pictures
     # the data set was imported (hgn.import_trajectories) and determines `scene` and `dataset`: +experiment=imported
@@ -394,6 +378,7 @@ class TrainConfig:
 
     def __post_init__(self) -> None:
         require_bounds(self)
+        self.step.require_fits(self.network.relative, self.network.dimensions)
         rule, dimensions = "3 for data that are not imported", self.network.dimensions
         require(self.imported or dimensions == 3, "network.dimensions", rule, dimensions)
         upright = self.scene.zero_gravity_fraction == 0 and self.scene.tilted_gravity_fraction == 0

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from hgn.command import run_command
-from hgn.config import StoredPrecision, WallClearance
+from hgn.config import StoredPrecision
+from hgn.network.base import ParticleNetwork
 from hgn.network.features import ParticleState
 from hgn.runtime.exported_step import initial_arrays, traced_step, write_onnx, write_package
 from hgn.runtime.simulator import Simulator
@@ -18,12 +19,11 @@ from hgn.scene.barrier import barrier_pieces
 from hgn.scene.scene import all_corners
 from hgn.scene.scene_file import find_scene, load_scene
 from hgn.schema import FileName, NonNegative, Positive, from_mapping, require, require_bounds
+from hgn.step_config import StepConfig, WallClearance
 from hgn.system.device import choose_device
 from hgn.system.extras import require_installed
 from hgn.system.files import require_place
 from hgn.system.provenance import provenance
-
-CHANGES = ("rest_threshold", "wall_clearance", "obstacle_clearance")
 
 
 @dataclass(frozen=True)
@@ -34,9 +34,9 @@ class ExportConfig:
     weights: str | None = None  # a file or the name of shipped weights; only without checkpoint
     out: FileName | None = None  # the weights file to write
     stored_precision: StoredPrecision = "fp32"  # of the learned tensors; fp16: files half as large
-    rest_threshold: NonNegative[float] | None = None  # network.rest_threshold of `out`; null: as it was
-    wall_clearance: WallClearance | None = None  # network.wall_clearance of `out`; null: as it was
-    obstacle_clearance: Positive[float] | None = None  # network.obstacle_clearance of `out`; null: as it was
+    rest_threshold: NonNegative[float] | None = None  # step.rest_threshold of `out`; null: as it was
+    wall_clearance: WallClearance | None = None  # step.wall_clearance of `out`; null: as it was
+    obstacle_clearance: Positive[float] | None = None  # step.obstacle_clearance of `out`; null: as it was
     # of `out`, or else of `weights`: file of a step's graph, for ONNX Runtime
     onnx: FileName | None = None
     package: str | None = None  # file of a step compiled for `device`, for PyTorch's C++ (.pt2)
@@ -51,7 +51,7 @@ class ExportConfig:
         require(self.checkpoint is None or self.weights is None, "weights", "null with checkpoint", self.weights)
         require(self.checkpoint is None or self.out is not None, "out", "given with checkpoint", self.out)
         require((self.arrays is None) == (self.scene is None), "scene", "given with arrays, and only then", self.scene)
-        for name, value in self.network_changes.items():
+        for name, value in self.step_changes.items():
             require(self.out is not None, name, "null without out, the file that it is for", value)
         some = any(name is not None for name in (self.out, self.onnx, self.package, self.arrays))
         require(some, "out", "given with weights, or onnx, package or arrays", self.out)
@@ -59,9 +59,9 @@ class ExportConfig:
             require(self.package.endswith(".pt2"), "package", "a name that ends in .pt2", self.package)
 
     @property
-    def network_changes(self) -> dict[str, Any]:
-        """What the network of `out` is to have otherwise than it was trained, by the names of NetworkConfig."""
-        chosen = {name: getattr(self, name) for name in CHANGES}
+    def step_changes(self) -> dict[str, Any]:
+        """The constraints of a frame that `out` has other than before, by the names of StepConfig."""
+        chosen = {field.name: getattr(self, field.name) for field in fields(StepConfig)}
         return {name: value for name, value in chosen.items() if value is not None}
 
 
@@ -75,10 +75,10 @@ def main(mapping: dict[str, Any]) -> int:
             require_place(Path(file))
     if config.out is not None:
         if config.checkpoint is not None:
-            export(Path(config.checkpoint), Path(config.out), config.stored_precision, **config.network_changes)
+            export(Path(config.checkpoint), Path(config.out), config.stored_precision, **config.step_changes)
         else:
             assert config.weights is not None
-            change(find_weights(config.weights), Path(config.out), config.stored_precision, **config.network_changes)
+            change(find_weights(config.weights), Path(config.out), config.stored_precision, **config.step_changes)
         print(config.out)
     if config.onnx is None and config.package is None and config.arrays is None:
         return 0
@@ -104,9 +104,8 @@ def main(mapping: dict[str, Any]) -> int:
     return 0
 
 
-def export(checkpoint_path: Path, out: Path, stored_precision: str = "fp32", **network_changes: Any) -> None:
-    """Checkpoint to weights, of the network as it was trained but for `network_changes`, fields of NetworkConfig that
-    change no tensor.
+def export(checkpoint_path: Path, out: Path, stored_precision: str = "fp32", **step_changes: Any) -> None:
+    """Writes a checkpoint's network as weights, with `step_changes`, fields of StepConfig, in place of its own.
 
     Raises: ConfigError when the checkpoint is missing or not ours, or holds a network that does not take the changes.
     """
@@ -122,7 +121,8 @@ def export(checkpoint_path: Path, out: Path, stored_precision: str = "fp32", **n
     network = network_of_checkpoint(checkpoint, checkpoint_path)
     data = data_of_checkpoint(checkpoint)
     info = WeightsInfo(
-        network=replace(network.config, **network_changes),
+        network=network.config,
+        step=changed_step(network, step_changes),
         frame_rate_hz=data.frame_rate_hz,
         obstacle_cell_size=data.obstacle_cell_size,
         gravity=data.gravity,
@@ -133,17 +133,23 @@ def export(checkpoint_path: Path, out: Path, stored_precision: str = "fp32", **n
     save_weights(out, network, info, stored_precision)
 
 
-def change(file: Path, out: Path, stored_precision: str = "fp32", **network_changes: Any) -> None:
-    """Weights to weights, with `network_changes` as in `export`. The provenance of `out` holds that of `file`.
+def change(file: Path, out: Path, stored_precision: str = "fp32", **step_changes: Any) -> None:
+    """Writes weights to weights, with `step_changes` as in `export`. The provenance of `out` holds that of `file`.
 
     Raises: ConfigError when the file is missing or not ours, or holds a network that does not take the changes.
     """
     network, info = load_weights(file)
-    changed = {"file": file.name, "network": network_changes, "provenance": info.provenance}
-    changed_info = replace(
-        info, network=replace(info.network, **network_changes), provenance=provenance() | {"changed": changed}
-    )
+    changed = {"file": file.name, "step": step_changes, "provenance": info.provenance}
+    step = changed_step(network, step_changes)
+    changed_info = replace(info, step=step, provenance=provenance() | {"changed": changed})
     save_weights(out, network, changed_info, stored_precision)
+
+
+def changed_step(network: ParticleNetwork, changes: dict[str, Any]) -> StepConfig:
+    """Returns the network's constraints with changes. Raises: ConfigError where the network cannot have them."""
+    step = replace(network.step, **changes)
+    step.require_fits(network.config.relative, network.config.dimensions)
+    return step
 
 
 def write_arrays(folder: Path, state: ParticleState, corner_F33: np.ndarray) -> None:

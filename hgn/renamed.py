@@ -91,6 +91,10 @@ REMOVED: dict[str, Removed] = {
     "upload.poll_s": Removed(remedy="run the command again, as with watch -n 60: it copies what is new"),
 }
 
+# Settings of `network` in 0.1.0 that are in `step` now.
+STEP = ("rest_threshold", "wall_clearance", "obstacle_clearance")
+REMOVED |= {f"network.{key}": Removed(remedy=f"write step.{key}") for key in STEP}
+
 # Values that a setting or a config group no longer takes, by the last part of its key, and what to do instead.
 _GNS_PARTICLES = {"gns_particles": LAST_COMMIT}
 REMOVED_CHOICES: dict[str, dict[Any, str]] = {
@@ -203,6 +207,16 @@ def _current_solver(stored: dict[str, Any]) -> dict[str, Any]:
     if result.pop("time_step", None) == "adaptive":
         result["fixed_time_step_s"] = None
     return result
+
+
+def with_step(mapping: Mapping[str, Any]) -> dict[str, Any]:
+    """Returns the mapping of a weights file or checkpoint with a section `step`; 0.1.0 wrote the constraints of a frame
+    among the network's settings.
+    """
+    network = mapping.get("network")
+    if "step" in mapping or not isinstance(network, Mapping):
+        return dict(mapping)
+    return {**mapping, "step": {key: network[key] for key in STEP if key in network}}
 
 
 def stored_names(mapping: Mapping[str, Any], section: str) -> dict[str, Any]:

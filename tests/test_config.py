@@ -5,6 +5,7 @@ import pytest
 from hgn.average import AverageConfig
 from hgn.config import DatasetConfig, NetworkConfig, SceneConfig, TrainConfig, TrainingConfig
 from hgn.schema import ConfigError
+from hgn.step_config import StepConfig
 
 GNS = {"kind": "gns", "levels": 1}
 RELATIVE = {"inputs": "relative"}
@@ -13,6 +14,12 @@ RELATIVE = {"inputs": "relative"}
 def train_on_six_frames(frames=6, **training):
     dataset = DatasetConfig(frames=frames)
     return TrainConfig(dataset=dataset, network=NetworkConfig(), training=TrainingConfig(**training))
+
+
+def step_of(inputs="absolute", dimensions=3, **step):
+    return TrainConfig(
+        network=NetworkConfig(inputs=inputs, dimensions=dimensions), step=StepConfig(**step), imported=True
+    )
 
 
 def average_of(count, coefficients=None):
@@ -26,19 +33,20 @@ RULES = {
         ({"inputs": "Relative"}, "inputs must be one of absolute, relative, got 'Relative'"),
         (RELATIVE | {"velocity_history": 1}, "velocity_history must be at least 2 with inputs=relative"),
         (GNS | RELATIVE, "inputs must be absolute for gns, got 'relative'"),
-        ({"rest_threshold": 0.3}, "rest_threshold must be 0 with inputs=absolute, got 0.3"),
-        (RELATIVE | {"rest_threshold": 0.3, "dimensions": 2}, "rest_threshold must be 0 with dimensions=2"),
-        (RELATIVE | {"rest_threshold": float("nan")}, "rest_threshold must be a finite number >= 0"),
-        (RELATIVE | {"rest_threshold": -0.1}, "rest_threshold must be a finite number >= 0, got -0.1"),
+    ],
+    StepConfig: [
+        ({"rest_threshold": float("nan")}, "rest_threshold must be a finite number >= 0"),
+        ({"rest_threshold": -0.1}, "rest_threshold must be a finite number >= 0, got -0.1"),
         ({"wall_clearance": (-0.1, 0.1)}, r"wall_clearance\[0\] must be a finite number >= 0, got -0.1"),
-        (GNS | {"wall_clearance": (0.1, float("inf"))}, r"wall_clearance\[1\] must be a finite number >= 0, got inf"),
-        (
-            RELATIVE | {"wall_clearance": (float("nan"), 0)},
-            r"wall_clearance\[0\] must be a finite number >= 0, got nan",
-        ),
+        ({"wall_clearance": (0.1, float("inf"))}, r"wall_clearance\[1\] must be a finite number >= 0, got inf"),
+        ({"wall_clearance": (float("nan"), 0)}, r"wall_clearance\[0\] must be a finite number >= 0, got nan"),
         ({"obstacle_clearance": 0.0}, "obstacle_clearance must be a finite number > 0, got 0.0"),
-        (GNS | {"obstacle_clearance": float("nan")}, "obstacle_clearance must be a finite number > 0, got nan"),
-        ({"obstacle_clearance": 1e-3, "dimensions": 2}, "obstacle_clearance must be null with dimensions=2, got 0.001"),
+        ({"obstacle_clearance": float("nan")}, "obstacle_clearance must be a finite number > 0, got nan"),
+    ],
+    step_of: [
+        ({"rest_threshold": 0.3}, "step.rest_threshold must be 0 with inputs=absolute, got 0.3"),
+        (RELATIVE | {"rest_threshold": 0.3, "dimensions": 2}, "step.rest_threshold must be 0 with dimensions=2"),
+        ({"obstacle_clearance": 1e-3, "dimensions": 2}, "step.obstacle_clearance must be null with dimensions=2"),
     ],
     SceneConfig: [
         ({"obstacle_shapes": ("torus",)}, r"obstacle_shapes\[0\] must be one of half_box, .*, or a mesh file"),

@@ -136,7 +136,7 @@ def test_networks_of_before():
     contacts = {"contact_gate": "cell", "contact_forces": "normal", "contact_reach_cells": 3.0}
     older = {"material_embedding": 16, "wall_distance_cells": 8.0}  # keys of 0.1.0
     rests = {"rest_levels": 2, "rest_large_materials": ["sand", "snow"]}
-    relative, resting = NetworkConfig(inputs="relative"), NetworkConfig(inputs="relative", rest_threshold=0.1)
+    relative, resting = NetworkConfig(inputs="relative"), {"rest_threshold": 0.1}
     for config, told, refused in (
         (NetworkConfig(), {}, None),
         (NetworkConfig(), older, None),
@@ -148,10 +148,10 @@ def test_networks_of_before():
         (relative, older | contacts | {"contact_forces": "any"}, "contact_forces"),
         (relative, older | contacts | {"contact_reach_cells": 2.0}, "contact_reach_cells"),
         (relative, older | {"contact_forces": "normal", "contact_reach_cells": 3.0}, "contact_gate"),  # younger
-        (resting, older | contacts | rests, None),
-        (resting, older | contacts | rests | {"rest_levels": 1}, "rest_levels"),
-        (resting, older | contacts | rests | {"rest_large_materials": None}, "rest_large_materials"),
-        (resting, older | contacts | {"rest_large_materials": ["sand", "snow"]}, "rest_levels"),
+        (relative, older | contacts | rests | resting, None),
+        (relative, older | contacts | rests | resting | {"rest_levels": 1}, "rest_levels"),
+        (relative, older | contacts | rests | resting | {"rest_large_materials": None}, "rest_large_materials"),
+        (relative, older | contacts | resting | {"rest_large_materials": ["sand", "snow"]}, "rest_levels"),
     ):
         stored = to_mapping(config) | told
         if refused is None:

@@ -20,6 +20,7 @@ from torch import nn
 from hgn.cpu.block_threads import for_each, single_threaded
 from hgn.cpu.compiled import rows_class
 from hgn.cpu.rows import Hidden, Rows, Segments
+from hgn.network.base import Prediction
 from hgn.network.features import ParticleState
 from hgn.network.grid import CORNER_83, DIRECTION_63, GridHierarchy, Level
 from hgn.network.hgn import HierarchicalGraphNetwork
@@ -31,12 +32,12 @@ ROWS_AT_ONCE = 4096
 FEWEST_ROWS = 256  # worth a thread's waking
 
 
-def normalised_acceleration(
+def prediction(
     network: HierarchicalGraphNetwork, state: ParticleState, origin_S3: torch.Tensor | None = None
-) -> torch.Tensor:
-    """What the network's own function of that name gives, without gradients."""
+) -> Prediction:
+    """Returns what the network's own `prediction` does, without gradients."""
     with torch.no_grad():
-        return network.accelerate(state, network.grid(state, origin_S3), partial(propagate, network))
+        return network.predicted(state, network.grid(state, origin_S3), partial(propagate, network))
 
 
 def propagate(network: HierarchicalGraphNetwork, particle_NW: torch.Tensor, grid: GridHierarchy) -> torch.Tensor:

@@ -31,4 +31,32 @@ def most_around(disturbed, felt, part: tl.constexpr, neighbour, cell, there, cap
     tl.store(felt + cell * 2 + part, most.to(tl.float32) / FULLY, mask=there)
 
 
+@triton.jit
+def lowest_middle(k, axis: tl.constexpr, low, place_of, row, live, LEVELS: tl.constexpr, SHIFT: tl.constexpr):
+    """Along an axis, from the number in the window of a particle's own coarsest cell: the number of the lowest middle
+    around it, of cells 2^SHIFT times as large, from 0 on, and its place from there, in their edges."""
+    first = tl.load(low + axis) >> LEVELS - 1
+    place = tl.load(place_of + row * 3 + axis, mask=live, other=0.0)
+    lowest = tl.floor(place)
+    k += first + lowest.to(tl.int32)
+    wide = k >> SHIFT
+    return wide - (first - 1 >> SHIFT), ((k - (wide << SHIFT)).to(tl.float32) + place - lowest) * (1.0 / (1 << SHIFT))
+
+
+@triton.jit
+def middles_around(base, gate, spot, geometry, LEVELS: tl.constexpr):
+    """From the lowest slots, the gates and the spots of particles, the slots [N, 8] of all middles around them, their
+    places from there, and their weights."""
+    line = geometry + (LEVELS - 1) * GEOMETRY_COLUMNS
+    corner = tl.arange(0, 8)[None, :]
+    axes, weight = (), gate[:, None]
+    for i in tl.static_range(3):
+        place = spot[i][:, None] - (corner >> 2 - i & 1).to(tl.float32)
+        weight = weight * (1 - tl.abs(place))
+        axes = axes + (place,)  # noqa: RUF005 - Triton knows no unpacking here
+    across = (corner >> 2 & 1) * tl.load(line + 2) + (corner >> 1 & 1)
+    slot = base[:, None] + across * tl.load(line + 3) + (corner & 1)
+    return slot, axes, weight
+
+
 settle_keys(globals())

@@ -1,12 +1,6 @@
-"""Rigid surfaces of obstacles, on the device: what stops a particle's straight way at the end of a frame.
+"""The triangles of obstacles on the device, and the cells that they are looked up by (hgn.step.reference).
 
-The rule, for a way from x to y. A particle keeps to the side of each triangle that it begins on; exactly on a plane,
-to that of the normal. Where its way comes nearer to the triangle's plane than the clearance, over what the triangle
-covers (hgn.scene.barrier), or crosses the plane there, the triangle stops it; of several triangles, the first. What
-stops it is SLACK of the clearance nearer than where it is to end, so that for rounding no triangle stops a way twice.
-It is to end as far from the plane as the clearance, or as x where that is nearer: y is to be shifted along the
-triangle's normal (hgn.runtime.holding), and keeps what is along the triangle, as on a surface without friction.
-Shape legend: N particles, Q cells of all scenes, E entries of their lists, F triangles, P pairs of both.
+Shape legend: Q cells of all scenes, E entries of their lists, F triangles.
 """
 
 from __future__ import annotations
@@ -16,13 +10,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from torch.compiler import is_exporting
 
-from hgn.network.cell_keys import COORDINATE_LIMIT, LARGEST_EXPORTED, find, pack
+from hgn.network.cell_keys import pack
 from hgn.scene.barrier import CELLS, LEAST_HEIGHT, MARGIN, Barrier
 from hgn.schema import require
 
-SLACK = 0.02  # of the clearance; what begins nearer leaves by that in a frame that would bring it nearer
 NOWHERE = 1e30  # domain units: lowest corner of a box that nothing meets, its highest is at minus that
 
 
@@ -75,84 +67,6 @@ class Barriers:
         moved = {name: getattr(self, name).to(device, non_blocking=non_blocking) for name in names}
         return replace(self, **moved)
 
-    def stopped(
-        self, before_N3: torch.Tensor, after_N3: torch.Tensor, scene_N: torch.Tensor
-    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Which ways a triangle stops, bool [N]; by how much their ends are to be shifted, [N, 1], and along which unit
-        normals, [N, 3]; and the share of a way on which nothing is met, [N, 1].
-
-        Shifts and normals are zero where nothing stops a way. Positions are finite. The way to a shifted end may be
-        stopped by another triangle.
-        """
-        particle_P, triangle_P = self._pairs(before_N3, after_N3, scene_N)
-        row_P24 = self.row_F24.to(before_N3.dtype)[triangle_P]
-        before_P3, way_P3 = before_N3[particle_P], (after_N3 - before_N3)[particle_P]
-        normal_P3 = row_P24[:, :3]
-        distance_P = (normal_P3 * before_P3).sum(-1) - row_P24[:, 3]
-        side_P = torch.where(distance_P >= 0, 1.0, -1.0).to(distance_P.dtype)
-        distance_P = side_P * distance_P
-        approach_P = -side_P * (normal_P3 * way_P3).sum(-1)
-        end_P, closing_P = distance_P - approach_P, approach_P.clamp(min=1e-30)
-        within, slack = (1 - SLACK) * self.clearance, SLACK * self.clearance
-        contact_P = ((distance_P - within) / closing_P).clamp(0, 1)
-        crossing_P = (distance_P / closing_P).clamp(0, 1)
-        meets_P = _covers(row_P24, before_P3 + contact_P[:, None] * way_P3)
-        crosses_P = _covers(row_P24, before_P3 + crossing_P[:, None] * way_P3) & (end_P < 0)
-        stops_P = (approach_P > 0) & (end_P < within) & (meets_P | crosses_P)
-        time_P = torch.where(stops_P, torch.where(meets_P, contact_P, crossing_P), 2.0)
-        least_N = torch.full_like(before_N3[:, 0], 2.0).scatter_reduce(0, particle_P, time_P.detach(), "amin")
-        first_P = stops_P & (time_P == least_N[particle_P])
-        # of several at one time that of the least number
-        count, pairs = self.row_F24.shape[0], particle_P.shape[0]
-        number_P = torch.where(first_P, triangle_P, count)
-        number_N = torch.full_like(scene_N, count).scatter_reduce(0, particle_P, number_P, "amin")
-        first_P = first_P & (triangle_P == number_N[particle_P])
-        # the pair of each particle, a last one that moves nothing for the others
-        place_P = torch.where(first_P, torch.arange(pairs, device=scene_N.device), pairs)
-        pair_N = torch.full_like(scene_N, pairs).scatter_reduce(0, particle_P, place_P, "amin")
-        push_P4 = torch.cat([(distance_P.clamp(max=within) + slack - end_P)[:, None], side_P[:, None] * normal_P3], 1)
-        push_N4 = torch.cat([push_P4, before_N3.new_zeros(1, 4)])[pair_N]
-        free_P = torch.where(stops_P, contact_P, 1.0)
-        free_N = torch.ones_like(before_N3[:, 0]).scatter_reduce(0, particle_P, free_P, "amin")
-        return pair_N < pairs, push_N4[:, :1], push_N4[:, 1:], free_N[:, None]
-
-    def _pairs(
-        self, before_N3: torch.Tensor, after_N3: torch.Tensor, scene_N: torch.Tensor
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Particles and triangles int64 [P] among which are all that meet."""
-        if is_exporting():
-            return self._pairs_of_boxes(before_N3, after_N3)
-        before_N3, after_N3 = before_N3.detach(), after_N3.detach()
-        way_N3 = after_N3 - before_N3
-        pieces_N = torch.ceil(torch.linalg.vector_norm(way_N3, dim=-1) / self.cell_size).clamp(min=1)
-        particles, triangles = [scene_N[:0]], [scene_N[:0]]
-        for piece in range(int(pieces_N.max()) if len(pieces_N) else 0):
-            here_N = torch.nonzero(pieces_N > piece).flatten() if piece else torch.arange(len(way_N3)).to(scene_N)
-            share_N1 = ((piece + 0.5) / pieces_N[here_N])[:, None]
-            cell_N3 = torch.floor((before_N3[here_N] + share_N1 * way_N3[here_N]) / self.cell_size)
-            cell_N3 = cell_N3.clamp(-COORDINATE_LIMIT, COORDINATE_LIMIT - 1).long()
-            index_N, found_N = find(self.key_Q, pack(scene_N[here_N], cell_N3))
-            index_N, here_N = index_N[found_N], here_N[found_N]
-            count_N = self.start_Q[index_N + 1] - self.start_Q[index_N]
-            before = torch.repeat_interleave(count_N.cumsum(0) - count_N, count_N)
-            entry = torch.arange(len(before), device=before.device) - before
-            triangles.append(self.triangle_E[torch.repeat_interleave(self.start_Q[index_N], count_N) + entry])
-            particles.append(torch.repeat_interleave(here_N, count_N))
-        return torch.cat(particles), torch.cat(triangles)
-
-    def _pairs_of_boxes(self, before_N3: torch.Tensor, after_N3: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Those whose boxes meet: as a graph without loops has it, of one scene."""
-        low_N3, high_N3 = torch.minimum(before_N3, after_N3), torch.maximum(before_N3, after_N3)
-        low_F3, high_F3 = self.row_F24[:, 16:19], self.row_F24[:, 20:23]
-        meets_NF = (low_N3[:, None, 0] <= high_F3[None, :, 0]) & (high_N3[:, None, 0] >= low_F3[None, :, 0])
-        for axis in (1, 2):
-            meets_NF = meets_NF & (low_N3[:, None, axis] <= high_F3[None, :, axis])
-            meets_NF = meets_NF & (high_N3[:, None, axis] >= low_F3[None, :, axis])
-        particle_P, triangle_P = torch.nonzero(meets_NF, as_tuple=True)
-        if is_exporting():
-            torch._check(particle_P.shape[0] <= LARGEST_EXPORTED)
-        return particle_P, triangle_P
-
 
 def barrier_rows(corner_F33: torch.Tensor, clearance: float) -> torch.Tensor:
     """The rows of triangles as hgn.scene.barrier computes them, float64 [F, 24], with gradients by the corners.
@@ -178,11 +92,3 @@ def barrier_rows(corner_F33: torch.Tensor, clearance: float) -> torch.Tensor:
 
 def _unit(direction_F3: torch.Tensor) -> torch.Tensor:
     return direction_F3 / torch.linalg.vector_norm(direction_F3, dim=-1, keepdim=True).clamp(min=1e-300)
-
-
-def _covers(row_P24: torch.Tensor, place_P3: torch.Tensor) -> torch.Tensor:
-    """Whether a triangle covers a place in its plane, bool [P]."""
-    inside_P = ((place_P3 >= row_P24[:, 16:19]) & (place_P3 <= row_P24[:, 20:23])).all(-1)
-    for plane in (4, 8, 12):
-        inside_P = inside_P & ((row_P24[:, plane : plane + 3] * place_P3).sum(-1) <= row_P24[:, plane + 3])
-    return inside_P

@@ -6,6 +6,7 @@ Shape legend: N particles, W width, S scenes.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from dataclasses import dataclass
 
 import torch
 from torch import nn
@@ -15,14 +16,29 @@ from hgn.network.features import WALL_DISTANCE_CELLS, Normaliser, ParticleState,
 from hgn.network.grid import GridHierarchy
 from hgn.network.mlp import LEAKY_SLOPE, MLP
 from hgn.network.relative import Contacts, relative_features
+from hgn.step_config import UNCONSTRAINED, StepConfig
+
+
+@dataclass(frozen=True, eq=False)
+class Prediction:
+    """A network's raw output: normalised accelerations [N, 3], with relative inputs less gravity; and with these the
+    contacts and the grid that they come from.
+    """
+
+    acceleration_N3: torch.Tensor
+    contacts: Contacts | None = None
+    grid: GridHierarchy | None = None
 
 
 class ParticleNetwork(nn.Module, ABC):
-    """Predicts the acceleration of every particle, in frame units."""
+    """Predicts the acceleration of every particle, in frame units. `step` holds the constraints of its frames, which
+    simulations apply (hgn.step), not the network.
+    """
 
     def __init__(self, config: NetworkConfig, slope: float = LEAKY_SLOPE) -> None:
         super().__init__()
         self.config = config
+        self.step: StepConfig = UNCONSTRAINED
         self.normaliser = Normaliser()
         self.embedding = nn.Embedding(len(config.materials), MATERIAL_EMBEDDING)
         normal_width = 3 if config.obstacle_features else 0
@@ -56,6 +72,10 @@ class ParticleNetwork(nn.Module, ABC):
 
         `origin_S3` moves the grid, where the network has one.
         """
+
+    def prediction(self, state: ParticleState, origin_S3: torch.Tensor | None = None) -> Prediction:
+        """Returns the raw output with the contacts that rest needs."""
+        return Prediction(self.normalised_acceleration(state, origin_S3))
 
     def relative_features(self, state: ParticleState, grid: GridHierarchy) -> tuple[torch.Tensor, Contacts]:
         """All columns but the material's, [N, F], and what the coarsest cells know of disturbances and surfaces."""

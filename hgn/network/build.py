@@ -6,8 +6,15 @@ from hgn.config import NetworkConfig
 from hgn.network.base import ParticleNetwork
 from hgn.network.gns import GraphNetworkSimulator
 from hgn.network.hgn import HierarchicalGraphNetwork
+from hgn.step_config import UNCONSTRAINED, StepConfig
 
 
-def build_network(config: NetworkConfig) -> ParticleNetwork:
-    """A new network with random weights."""
-    return HierarchicalGraphNetwork(config) if config.kind == "hgn" else GraphNetworkSimulator(config)
+def build_network(config: NetworkConfig, step: StepConfig = UNCONSTRAINED) -> ParticleNetwork:
+    """Returns a new network with random weights, and the constraints of its frames.
+
+    Raises: ConfigError where the network cannot have these constraints.
+    """
+    step.require_fits(config.relative, config.dimensions)
+    network: ParticleNetwork = (HierarchicalGraphNetwork if config.kind == "hgn" else GraphNetworkSimulator)(config)
+    network.step = step
+    return network

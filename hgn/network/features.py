@@ -35,7 +35,7 @@ class ParticleState:
     domain_S3: torch.Tensor  # domain size of each scene
     gravity_S3: torch.Tensor  # of each scene, domain units per frame squared
     obstacles: ObstacleCells | None
-    barriers: Barriers | None = None  # where nothing passes them (network.obstacle_clearance)
+    barriers: Barriers | None = None  # with step.obstacle_clearance
 
     @property
     def scene_count(self) -> int:

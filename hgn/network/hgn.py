@@ -14,12 +14,11 @@ import torch
 from torch import nn
 
 from hgn.config import NetworkConfig
-from hgn.network.base import ParticleNetwork
+from hgn.network.base import ParticleNetwork, Prediction
 from hgn.network.features import ParticleState
 from hgn.network.grid import CORNER_83, DIRECTION_63, GridHierarchy, Level, build_hierarchy
 from hgn.network.mlp import MLP
 from hgn.network.relative import OUTPUTS, balanced
-from hgn.network.rest import rested, rests_widely
 
 
 class MessagePassing(nn.Module):
@@ -80,25 +79,23 @@ class HierarchicalGraphNetwork(ParticleNetwork):
 
         The finest grid's origin in each scene is 0 unless given.
         """
-        return self.accelerate(state, self.grid(state, origin_S3), self.propagate)
+        return self.prediction(state, origin_S3).acceleration_N3
 
-    def accelerate(
+    def prediction(self, state: ParticleState, origin_S3: torch.Tensor | None = None) -> Prediction:
+        return self.predicted(state, self.grid(state, origin_S3), self.propagate)
+
+    def predicted(
         self,
         state: ParticleState,
         grid: GridHierarchy,
         propagate: Callable[[torch.Tensor, GridHierarchy], torch.Tensor],
-    ) -> torch.Tensor:
-        """The same on a grid, with `propagate` for steps 1 to 12."""
+    ) -> Prediction:
+        """Returns the prediction on a grid, with `propagate` for steps 1 to 12."""
         if not self.config.relative:
-            return propagate(self.encode_particles(state, grid), grid)
+            return Prediction(propagate(self.encode_particles(state, grid), grid))
         feature_NF, contacts = self.relative_features(state, grid)
         output_N9 = propagate(self.encode_features(feature_NF, state.material_N), grid)
-        acceleration_N3 = balanced(output_N9, contacts, grid)
-        if not self.config.rests:
-            return acceleration_N3
-        scale = self.normaliser.acceleration_std[0]
-        widely_M = torch.tensor(rests_widely(self.config), dtype=scale.dtype, device=scale.device)
-        return rested(acceleration_N3, state, contacts.touched_C, grid, self.config.rest_threshold, scale, widely_M)
+        return Prediction(balanced(output_N9, contacts, grid), contacts, grid)
 
     def grid(self, state: ParticleState, origin_S3: torch.Tensor | None = None) -> GridHierarchy:
         """The cells of all levels around a state's particles."""

@@ -18,7 +18,7 @@ import torch
 from hgn.config import BACKENDS, PRECISIONS, NetworkConfig
 from hgn.cpu import compiled
 from hgn.cpu import network as cpu_network
-from hgn.network.base import ParticleNetwork
+from hgn.network.base import ParticleNetwork, Prediction
 from hgn.network.features import ParticleState
 from hgn.network.hgn import HierarchicalGraphNetwork
 from hgn.runtime.torch_backend import Backend
@@ -35,11 +35,8 @@ class CpuBackend(Backend):
     name = "cpu"
     network: HierarchicalGraphNetwork
 
-    def normalised_acceleration(self, state: ParticleState, origin_S3: torch.Tensor | None = None) -> torch.Tensor:
-        return cpu_network.normalised_acceleration(self.network, state, origin_S3)
-
-    def predict(self, state: ParticleState) -> torch.Tensor:
-        return self.network.restored_acceleration(self.normalised_acceleration(state), state)
+    def prediction(self, state: ParticleState, origin_S3: torch.Tensor | None = None) -> Prediction:
+        return cpu_network.prediction(self.network, state, origin_S3)
 
 
 def choose(

@@ -20,11 +20,11 @@ from hgn.network.grid import GridRangeError
 from hgn.network.obstacles import ObstacleCells
 from hgn.network.posed_obstacles import Placement, PosedObstacleCells
 from hgn.runtime.divergence import DivergedError, describe_diverged, diverged
-from hgn.runtime.stepped_rollout import advanced
 from hgn.scene.barrier import barrier_of_pieces, barrier_pieces
 from hgn.scene.obstacle_grid import ObstacleGrid, build_obstacle_grid
 from hgn.scene.scene import Obstacle, Scene
 from hgn.schema import ConfigError, require
+from hgn.step.reference import Accelerations, advanced
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,11 +59,13 @@ def simulate(
     require(frames >= 1, "frames", "at least 1", frames)
     require(0 <= inputs.smoothing <= 1, "smoothing", "0 to 1 cells", inputs.smoothing)
     state = _started(network, start, scene, frame_rate_hz, inputs)
-    weights = {name: tensor.detach() for name, tensor in network.state_dict(keep_vars=True).items()}
+    predicted = Accelerations(network)
+    weights = {name: tensor.detach() for name, tensor in predicted.state_dict(keep_vars=True).items()}
 
     def step(*variables: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         before = _with_variables(state, variables)
-        after = advanced(before, functional_call(network, weights, (before,)), network.config)
+        acceleration_N3 = functional_call(predicted, weights, (before,))
+        after = advanced(before, acceleration_N3, network.step, network.config.dimensions)
         return after.position_N3, after.velocity_NM3
 
     variables = _variables(state)
@@ -191,8 +193,9 @@ def _obstacles(
         rest = _cells(scene, staying, device)
         placed = tuple((_cells(scene, [scene.obstacles[i]], device), placement) for i, placement in placements.items())
         obstacles = PosedObstacleCells(rest.key_K, rest.normal_K3, rest.cell_size, placed, inputs.smoothing)
-    if config.obstacle_clearance is not None and placements:
-        barriers = _barriers(scene, placements, config.obstacle_clearance, device, dtype)
+    clearance = network.step.obstacle_clearance
+    if clearance is not None and placements:
+        barriers = _barriers(scene, placements, clearance, device, dtype)
     return obstacles, barriers
 
 

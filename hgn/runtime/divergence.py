@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import torch
 
+from hgn.step.reference import within_range
+
 
 class DivergedError(RuntimeError):
     """Particles are no longer finite, or have left the domain by more than its own size."""
@@ -16,11 +18,6 @@ class DivergedError(RuntimeError):
 def diverged(position_N3: torch.Tensor, domain_N3: torch.Tensor) -> torch.Tensor:
     """Which particles are not finite or farther from the domain than its own size, bool [..., N]."""
     return ~within_range(position_N3, domain_N3).all(-1)
-
-
-def within_range(position_N3: torch.Tensor, domain_N3: torch.Tensor) -> torch.Tensor:
-    """Which coordinates are finite, and no farther from the domain than its own size, bool [..., N, 3]."""
-    return (position_N3 > -domain_N3) & (position_N3 < 2 * domain_N3)  # NaN is not
 
 
 def describe_diverged(diverged_count: int, particle_count: int) -> str:

@@ -24,9 +24,9 @@ from hgn.network.cell_keys import COORDINATE_LIMIT, LARGEST_EXPORTED, pack, unpa
 from hgn.network.features import ParticleState
 from hgn.network.hgn import HierarchicalGraphNetwork
 from hgn.network.obstacles import ObstacleCells
-from hgn.runtime.stepped_rollout import advanced
 from hgn.runtime.weights import WeightsInfo
 from hgn.schema import require, to_mapping
+from hgn.step.reference import accelerations, advanced
 from hgn.system.files import make_folder, sync_folder, sync_written, write_atomically
 
 INPUTS = (
@@ -76,12 +76,13 @@ class Step(nn.Module):
             obstacles=ObstacleCells(key_K, normal_K3, self.obstacle_cell_size),
             barriers=self._barriers(obstacle_triangle),
         )
-        after = advanced(state, self.network(state), self.network.config)
+        acceleration_N3 = accelerations(self.network, state, self.network.prediction(state))
+        after = advanced(state, acceleration_N3, self.network.step, self.network.config.dimensions)
         return after.position_N3, after.velocity_NM3
 
     def _barriers(self, corner_F33: torch.Tensor) -> Barriers | None:
         """Without lists of cells: the graph looks for pairs by boxes."""
-        clearance = self.network.config.obstacle_clearance
+        clearance = self.network.step.obstacle_clearance
         if clearance is None:
             return None
         # one without area, which nothing meets, so that there always is one

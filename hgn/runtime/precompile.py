@@ -23,6 +23,7 @@ import torch
 from hgn.config import NetworkConfig
 from hgn.runtime.backend import triton_unsupported_reason
 from hgn.runtime.precompile_program import FrameJob, PrecompileJob, job_text
+from hgn.step_config import StepConfig
 from hgn.system.machine import available_cpus
 from hgn.system.processes import die_with_parent
 
@@ -104,14 +105,17 @@ class Precompilation:
 
 
 def precompile_frames(
-    networks: Sequence[NetworkConfig], precisions: Sequence[str], device: torch.device, particles: Sequence[int]
+    networks: Sequence[tuple[NetworkConfig, StepConfig]],
+    precisions: Sequence[str],
+    device: torch.device,
+    particles: Sequence[int],
 ) -> Precompilation | None:
     """Compiles what simulations of so many particles launch, however far they spread; none where nothing is."""
     if device.type != "cuda" or torch.version.hip is not None:
         return None
     pairs = [
-        (network, precision)
-        for network in dict.fromkeys(networks)
+        (network, step, precision)
+        for network, step in dict.fromkeys(networks)
         for precision in dict.fromkeys(precisions)
         if network.kind == "hgn" and triton_unsupported_reason(device, network, precision) is None
     ]

@@ -25,6 +25,7 @@ from hgn.network.features import ParticleState
 from hgn.network.hgn import HierarchicalGraphNetwork
 from hgn.runtime.triton_rollout import TritonRollout, first_capacities
 from hgn.schema import from_mapping, to_mapping
+from hgn.step_config import UNCONSTRAINED, StepConfig
 
 NICENESS = 10
 
@@ -42,13 +43,14 @@ class PrecompileJob:
     cells: tuple[int, ...]  # of each level, about
     capability: int  # of the GPU: 90 for an H100
     pushforward_scenes: tuple[int, ...] = ()  # that the network simulates at once, to train on them and to measure
+    step: StepConfig = UNCONSTRAINED  # of what it simulates
 
 
 @dataclass(frozen=True)
 class FrameJob:
     """What simulates, how precisely, and at which sizes: particles, and cells of the finest level."""
 
-    networks: tuple[tuple[NetworkConfig, str], ...]  # with their precisions
+    networks: tuple[tuple[NetworkConfig, StepConfig, str], ...]  # with their precisions
     sizes: tuple[tuple[int, int], ...]
     capability: int  # of the GPU: 90 for an H100
 
@@ -59,8 +61,8 @@ def launches_of(job: PrecompileJob | FrameJob, device: str = "meta") -> Launches
         if isinstance(job, PrecompileJob):
             _update_launches(job, device)
         else:
-            for config, precision in job.networks:
-                _frame_launches(config, precision, job.sizes, device)
+            for config, step, precision in job.networks:
+                _frame_launches(config, step, precision, job.sizes, device=device)
     return launches
 
 
@@ -78,16 +80,19 @@ def _update_launches(job: PrecompileJob, device: str) -> None:
         particles = round(fraction * job.particles)
         capacities = first_capacities([round(fraction * cells) for cells in job.cells], particles)
         cell_size = job.settings.obstacle_cell_size
-        _simulation_launches(network, job.precision, scenes, particles, capacities, cell_size, device)
+        for step in dict.fromkeys((job.step.in_training, job.step)):
+            _simulation_launches(network, step, job.precision, scenes, particles, capacities, cell_size, device)
 
 
-def _frame_launches(config: NetworkConfig, precision: str, sizes: tuple[tuple[int, int], ...], device: str) -> None:
+def _frame_launches(
+    config: NetworkConfig, step: StepConfig, precision: str, sizes: tuple[tuple[int, int], ...], device: str
+) -> None:
     """Those of hgn.runtime.simulator; a level has a quarter of the cells of the one below."""
     with torch.device(device):
         network = HierarchicalGraphNetwork(config)
     for particles, cells in sizes:
         capacities = tuple(max(1, cells >> 2 * level) for level in range(config.levels))
-        _simulation_launches(network, precision, 1, particles, capacities, 1.0, device)
+        _simulation_launches(network, step, precision, 1, particles, capacities, 1.0, device)
 
 
 class _Unplaced(TritonRollout):
@@ -99,6 +104,7 @@ class _Unplaced(TritonRollout):
 
 def _simulation_launches(
     network: HierarchicalGraphNetwork,
+    step: StepConfig,
     precision: str,
     scenes: int,
     particles: int,
@@ -119,7 +125,7 @@ def _simulation_launches(
         torch.zeros(scenes, 3, device=device),
         None,
     )
-    _Unplaced(network, state, precision, capacities, obstacles=obstacles).frame_launches()
+    _Unplaced(network, state, precision, capacities, obstacles=obstacles, step=step).frame_launches()
 
 
 def compile_part(job: PrecompileJob | FrameJob, part: int, parts: int) -> int:

@@ -172,8 +172,9 @@ class Simulator:
         position_N3 = np.concatenate([state.position_N3 for state in states]).astype(np.float32)
         obstacles = ObstacleCells.of([state.obstacle_grid for state in states]) if config.obstacle_features else None
         barriers = None
-        if config.obstacle_clearance is not None:
-            barriers = Barriers.of([state.barrier(config.obstacle_clearance) for state in states])
+        clearance = self.network.step.obstacle_clearance
+        if clearance is not None:
+            barriers = Barriers.of([state.barrier(clearance) for state in states])
         return ParticleState(
             position_N3=torch.from_numpy(position_N3).to(self.device),
             velocity_NM3=torch.from_numpy(np.concatenate(velocities)).to(self.device),
@@ -187,7 +188,7 @@ class Simulator:
 
     def step(self, state: ParticleState) -> ParticleState:
         """The state one frame later."""
-        return stepped(self.backend.predict, state, self.network.config)
+        return stepped(self.backend.predict, state, self.backend.step, self.network.config.dimensions)
 
     def rollout(
         self,

@@ -7,17 +7,16 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from typing import Protocol
 
 import numpy as np
 import torch
 
-from hgn.config import NetworkConfig
 from hgn.network.features import ParticleState
 from hgn.network.grid import GridRangeError
 from hgn.runtime.divergence import DivergedError, describe_diverged, diverged
-from hgn.runtime.holding import held
+from hgn.step.reference import advanced
+from hgn.step_config import StepConfig
 
 
 class Rollout(Protocol):
@@ -41,37 +40,26 @@ class Rollout(Protocol):
 
 @torch.inference_mode()
 def stepped(
-    predict: Callable[[ParticleState], torch.Tensor], state: ParticleState, config: NetworkConfig
+    predict: Callable[[ParticleState], torch.Tensor], state: ParticleState, step: StepConfig, dimensions: int
 ) -> ParticleState:
-    """One frame later, without gradients."""
-    return advanced(state, predict(state), config)
-
-
-def advanced(state: ParticleState, acceleration_N3: torch.Tensor, config: NetworkConfig) -> ParticleState:
-    """One frame later: v += a, x += v, and what walls and obstacles hold. Velocity is kept as state, not as a
-    difference of positions.
-    """
-    velocity_N3 = state.velocity_NM3[:, 0] + acceleration_N3
-    position_N3 = state.position_N3 + velocity_N3
-    if config.wall_clearance is not None or config.obstacle_clearance is not None:
-        position_N3, velocity_N3 = held(state, position_N3, velocity_N3, config)
-    history_NM3 = torch.cat([velocity_N3[:, None], state.velocity_NM3[:, :-1]], dim=1)
-    return replace(state, position_N3=position_N3, velocity_NM3=history_NM3)
+    """Returns the state a frame later, without gradients."""
+    return advanced(state, predict(state), step, dimensions)
 
 
 class SteppedRollout:
-    """`predict` gives accelerations [N, 3] of a state, in frame units."""
+    """`predict` gives accelerations [N, 3] of a state, in frame units; `step` constrains the frames."""
 
     def __init__(
-        self, predict: Callable[[ParticleState], torch.Tensor], state: ParticleState, config: NetworkConfig
+        self, predict: Callable[[ParticleState], torch.Tensor], state: ParticleState, step: StepConfig, dimensions: int
     ) -> None:
-        self.predict, self.state, self.config, self.frame = predict, state, config, 0
+        self.predict, self.state, self.frame = predict, state, 0
+        self._step, self._dimensions = step, dimensions
 
     def step(self) -> None:
         """One frame. Raises: DivergedError where positions are beyond what a grid can hold."""
         self.frame += 1
         try:
-            self.state = stepped(self.predict, self.state, self.config)
+            self.state = stepped(self.predict, self.state, self._step, self._dimensions)
         except GridRangeError as error:
             raise DivergedError(self.frame, str(error)) from None
 

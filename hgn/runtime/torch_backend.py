@@ -7,9 +7,10 @@ from contextlib import AbstractContextManager, nullcontext
 import torch
 
 from hgn.cpu.allocator import keep_freed_memory
-from hgn.network.base import ParticleNetwork
+from hgn.network.base import ParticleNetwork, Prediction
 from hgn.network.features import ParticleState
 from hgn.runtime.stepped_rollout import Rollout, SteppedRollout
+from hgn.step.reference import accelerations
 
 
 class Backend:
@@ -20,23 +21,27 @@ class Backend:
 
     def __init__(self, network: ParticleNetwork, precision: str = "tf32", note: str = "") -> None:
         self.network, self.precision, self.note = network, precision, note
+        self.step = network.step  # the constraints of its simulations
         self.device = next(network.parameters()).device
         self.growths = 0  # of buffers, in all rollouts
         if self.device.type == "cpu":
             keep_freed_memory()
 
     def normalised_acceleration(self, state: ParticleState, origin_S3: torch.Tensor | None = None) -> torch.Tensor:
-        """The network's raw output [N, 3], with gradients if they are enabled."""
-        return self.network.normalised_acceleration(state, origin_S3)
+        """Returns the network's raw output [N, 3], with gradients if they are enabled."""
+        return self.prediction(state, origin_S3).acceleration_N3
+
+    def prediction(self, state: ParticleState, origin_S3: torch.Tensor | None = None) -> Prediction:
+        """Returns the raw output with the contacts that rest needs."""
+        return self.network.prediction(state, origin_S3)
 
     def predict(self, state: ParticleState) -> torch.Tensor:
-        """Accelerations [N, 3] in frame units."""
-        result: torch.Tensor = self.network(state)
-        return result
+        """Returns the accelerations of a simulation [N, 3] in frame units, with rest."""
+        return accelerations(self.network, state, self.prediction(state), self.step)
 
     def rollout(self, state: ParticleState, room: int = 0) -> AbstractContextManager[Rollout]:
         """A simulation that begins with a state; backend triton makes `room` for as many particles."""
-        return nullcontext(SteppedRollout(self.predict, state, self.network.config))
+        return nullcontext(SteppedRollout(self.predict, state, self.step, self.network.config.dimensions))
 
     def release(self) -> None:
         """Gives back the buffers that simulations keep for those that follow."""

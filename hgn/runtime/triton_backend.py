@@ -30,7 +30,7 @@ class TritonBackend(Backend):
         """A simulation that begins with a state, and is kept for others once it is over."""
         rollout = self._reused(state, room)
         if rollout is None:
-            rollout = TritonRollout(self.network, state, self.precision, room=room)
+            rollout = TritonRollout(self.network, state, self.precision, room=room, step=self.step)
             if len(state.position_N3) <= CHECKED_PARTICLES:
                 rollout.require_parity(self.network, state)
         before = rollout.growths

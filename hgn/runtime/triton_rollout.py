@@ -16,24 +16,21 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from hgn.kernels.barrier_table import BarrierTable
-from hgn.kernels.buffers import OUT
 from hgn.kernels.capture import captured
 from hgn.kernels.forward import FusedNetwork, feature_columns
 from hgn.kernels.grid.op import OUT_OF_WINDOW, OVERFLOW, DeviceGrid, ObstacleTable, Window
 from hgn.kernels.packing import pack_network
-from hgn.kernels.rollout.kernel import DIVERGED, advance, integrate
-from hgn.kernels.triton_compat import overlaps
+from hgn.kernels.step.op import DIVERGED, BarrierTable, DeviceParticles, DeviceStep, rest_numbers
 from hgn.kernels.tuning import Tuning
-from hgn.network.barriers import SLACK
 from hgn.network.cell_keys import COORDINATE_LIMIT, pack
 from hgn.network.features import ParticleState
 from hgn.network.grid import build_hierarchy
 from hgn.network.hgn import HierarchicalGraphNetwork
 from hgn.runtime.divergence import DivergedError, describe_diverged, diverged
-from hgn.runtime.holding import LEAST_CREASE, SURFACES
 from hgn.runtime.parity import LEAST_OUTPUT, OUTPUT_BOUND, relative_error, require_bound
 from hgn.runtime.triton_host import kernel_precision
+from hgn.step.reference import rested
+from hgn.step_config import StepConfig
 
 LOOK_FRAMES, FEWEST_FRAMES = 32, 4
 CROWDED = 140  # particles in a cell of the finest level, half again as many as in the data's bodies
@@ -45,7 +42,6 @@ HEADROOM = 8.0  # times the cells of a scene's start: groups that fall and lie s
 SPREAD_CELLS = (0.6, 0.1, 0.035, 0.02)  # so many a particle at most, on each level; coarser ones as the last
 ROOMY_CELLS = 65_536  # of the finest level, up to which there is such headroom: beyond, memory counts
 CHECKED_PARTICLES = 50_000  # at most; PyTorch needs memory
-INTEGRATE_BLOCK = 64  # particles
 
 
 def first_capacities(cells: Sequence[int], particles: int) -> tuple[int, ...]:
@@ -99,13 +95,15 @@ class TritonRollout:
         room: int = 0,
         obstacles: ObstacleTable | None = None,
         barriers: BarrierTable | None = None,
+        step: StepConfig | None = None,
     ) -> None:
         """`capacities` are cells of each level to begin with.
 
         `room` is for particles of states that `begin` brings later. `obstacles` and `barriers` replace those of the
-        state.
+        state; `step` replaces the network's.
         """
         self.config, self.device = network.config, state.position_N3.device
+        self.step_config = network.step if step is None else step
         self.precision = kernel_precision(precision, self.device)
         self.packed = pack_network(network)
         self.values = self.packed.gather(list(network.parameters()))
@@ -123,11 +121,15 @@ class TritonRollout:
         self.domain_S3 = torch.zeros(self.scenes, 3, device=self.device)
         self.origin_S3 = torch.zeros_like(self.domain_S3)
         self.gravity_S3 = torch.zeros_like(self.domain_S3)  # zero with absolute inputs, which have learned it
+        self.device_particles = DeviceParticles(
+            position_N3=self.position_N3, velocity_NV=self.velocity_NV, scene_N=self.scene_N,
+            material_N=self.material_N, domain_S3=self.domain_S3, gravity_S3=self.gravity_S3, count=self.count,
+        )  # fmt: skip
         self.obstacles = obstacles
         if obstacles is None and state.obstacles is not None:
             self.obstacles = ObstacleTable.of(state.obstacles, state.scene_count)
         self.barriers = None
-        if self.config.obstacle_clearance is not None:
+        if self.step_config.obstacle_clearance is not None:
             self.barriers = barriers or BarrierTable.of(state.barriers, self.scenes, self.device)
         affordable = PATH_BYTES // (2 * 3 * 4 * max(1, self.particles))
         self.look_frames = max(FEWEST_FRAMES, min(LOOK_FRAMES, affordable))
@@ -223,10 +225,12 @@ class TritonRollout:
         limits = [self.scenes * math.prod(n >> i for n in window.cells) for i in range(config.levels)]
         limits = [min(limit, 8 * self.particles) for limit in limits]
         rounded = tuple(16 * math.ceil(max(1, min(c, m)) / 16) for c, m in zip(capacities, limits, strict=True))
+        more = rest_numbers(self.step_config, window, self.scenes, config.levels)
         self.grid = DeviceGrid(
             window, self.scenes, rounded, self.particles, feature_columns(config), config.cell_size,
-            self.device, config.relative, config.rests,
+            self.device, config.relative, more,
         )  # fmt: skip
+        self.step = DeviceStep(self.step_config, config, self.grid, self.barriers)
         tuning = Tuning.of(self.precision)
         tuning = replace(tuning, half_sums=tuning.half_sums and not self._careful)
         self.fused = FusedNetwork(
@@ -255,7 +259,8 @@ class TritonRollout:
             self._network_pass()
         output_N3 = self.fused.output[: len(state.position_N3), :3]
         with torch.no_grad():
-            error = relative_error(output_N3, network.normalised_acceleration(state), LEAST_OUTPUT)
+            expected_N3 = rested(network, state, network.prediction(state), self.step_config)
+            error = relative_error(output_N3, expected_N3, LEAST_OUTPUT)
         require_bound(error, OUTPUT_BOUND, "outputs", field, "torch", "triton")
 
     def frame_launches(self) -> None:
@@ -271,26 +276,13 @@ class TritonRollout:
             self.domain_S3, self.gravity_S3, self.count, self.velocity_mean, self.velocity_std, self.obstacles,
         )  # fmt: skip
         self.fused.forward()
+        self.step.rest(self.fused.output, self.device_particles, self.velocity_std)
 
     def _integrate(self) -> None:
-        config, overlap = self.config, overlaps()
-        near, far = config.wall_clearance or (0.0, 0.0)
-        clearance = config.obstacle_clearance or 0.0
-        integrate[(-(-self.particles // INTEGRATE_BLOCK),)](
-            output=self.fused.output, position=self.position_N3, velocity=self.velocity_NV,
-            scene_of=self.scene_N, domain=self.domain_S3, gravity=self.gravity_S3, mean=self.mean, std=self.std,
-            particle_count=self.count, status=self.grid.status, lost=self.lost, frame=self.frame,
-            path=self.path_TN3, near=near, far=far,
-            barrier_table=self.count if self.barriers is None else self.barriers.row_S7,
-            within=(1 - SLACK) * clearance, slack=SLACK * clearance, least_crease=LEAST_CREASE, OUT=OUT,
-            HISTORY=config.velocity_history, COLUMNS=1 << (3 * config.velocity_history - 1).bit_length(),
-            WALLED_AXES=0 if config.wall_clearance is None else config.dimensions,
-            SURFACES=0 if self.barriers is None else SURFACES, OVERLAP=overlap, BLOCK=INTEGRATE_BLOCK,
-            launch_pdl=overlap,
+        self.step.integrate(
+            self.fused.output, self.device_particles, (self.mean, self.std), lost=self.lost, frame=self.frame,
+            path_TN3=self.path_TN3,
         )  # fmt: skip
-        advance[(1,)](
-            status=self.grid.status, lost=self.lost, frame=self.frame, OVERLAP=overlap, num_warps=1, launch_pdl=overlap
-        )
 
     def run(self, frames: int, on_frame: Callable[[int], None] | None = None) -> np.ndarray:
         """Simulates `frames` more frames; their positions, float32 [frames, N, 3].
@@ -315,7 +307,7 @@ class TritonRollout:
             if status and ahead is not None:
                 self._settle(ahead)  # in vain, and over before its buffers go
                 ahead = None
-            if status & DIVERGED.value:
+            if status & DIVERGED:
                 raise self._diverged()
             self.make_room(status)
         return position_TN3
@@ -327,7 +319,7 @@ class TritonRollout:
         """
         while True:
             path_TN3, status = self.look(self.look_frames)
-            last_diverged = bool(status & DIVERGED.value)
+            last_diverged = bool(status & DIVERGED)
             yield from path_TN3[: len(path_TN3) - last_diverged].to("cpu", copy=True).numpy()
             if last_diverged:
                 raise self._diverged()
@@ -394,7 +386,7 @@ class TritonRollout:
         self.growths += 1
         # Particles are kept elsewhere: what there is goes first, so that there is never room for both.
         self.graph = None
-        del self.fused, self.grid
+        del self.fused, self.grid, self.step
         try:
             self._build(capacities)
             return

@@ -17,8 +17,9 @@ from safetensors.torch import save
 from hgn.config import NetworkConfig
 from hgn.network.base import ParticleNetwork
 from hgn.network.build import build_network
-from hgn.renamed import REMOVED_CHOICES, current_names
+from hgn.renamed import REMOVED_CHOICES, current_names, with_step
 from hgn.schema import ConfigError, from_mapping, require, to_mapping
+from hgn.step_config import StepConfig
 from hgn.system.files import make_folder, write_atomically
 from hgn.system.hub import PREFIX, hub_weights
 
@@ -38,6 +39,7 @@ class WeightsInfo:
     # of the data's groups, domain units per second; null: not known
     maximum_initial_speed: float | None = None
     format_version: int = FORMAT_VERSION
+    step: StepConfig = field(default_factory=StepConfig)  # constraints of its frames
     updates: int = 0
     provenance: dict[str, Any] = field(default_factory=dict)  # commit, data set, date, versions
 
@@ -103,8 +105,8 @@ def load_weights(
     version = mapping.get("format_version") if isinstance(mapping, dict) else None
     if version != FORMAT_VERSION:
         raise ConfigError(f"{field} format_version must be {FORMAT_VERSION}, got {version!r} in {path}; export again")
-    info = from_mapping(WeightsInfo, current_names(mapping), "weights")
-    network = build_network(info.network)
+    info = from_mapping(WeightsInfo, current_names(with_step(mapping)), "weights")
+    network = build_network(info.network, info.step)
     expected = {name: tensor.shape for name, tensor in network.state_dict().items()}
     shapes = {name: tensor.shape for name, tensor in tensors.items()}
     for name in sorted(expected.keys() | shapes.keys()):

@@ -18,9 +18,10 @@ from hgn.config import NetworkConfig, TrainConfig
 from hgn.data.sampler import SamplerState
 from hgn.network.base import ParticleNetwork
 from hgn.network.build import build_network
-from hgn.renamed import current_names
+from hgn.renamed import current_names, with_step
 from hgn.runtime.weights import find_weights, load_weights
 from hgn.schema import ConfigError, from_stored, to_mapping
+from hgn.step_config import StepConfig
 
 SECTION = "hgn"  # key of this project's entries in a checkpoint
 LAST_NAMES = ("last.ckpt", "last-1.ckpt", "last-2.ckpt")  # newest first
@@ -100,7 +101,7 @@ def check_checkpoint(checkpoint: dict[str, Any], config: TrainConfig, config_has
     remedy = "set it so, or choose another run=FOLDER"
     # The dataclass adds the default of a key that the checkpoint lacks.
     stored, section = _network_config(checkpoint, path), checkpoint[SECTION]
-    pairs = _network_pairs(stored, config)
+    pairs = _network_pairs(stored, config) + _step_pairs(checkpoint, config)
     pairs.append(("training.noise_std", section["noise_std"], config.training.noise_std))  # part of the normaliser
     _require_equal(pairs, f" to resume {path}", remedy)
     if section["data"]["config_hash"] != config_hash:
@@ -114,6 +115,12 @@ def _network_pairs(network: NetworkConfig, config: TrainConfig) -> list[tuple[st
     """Returns each key of the network settings with the stored and the configured value."""
     stored, wanted = to_mapping(network), to_mapping(config.network)
     return [(f"network.{key}", stored[key], wanted[key]) for key in sorted(stored)]
+
+
+def _step_pairs(checkpoint: dict[str, Any], config: TrainConfig) -> list[tuple[str, Any, Any]]:
+    """Returns the same of the constraints of a frame."""
+    stored, wanted = to_mapping(_step_config(checkpoint)), to_mapping(config.step)
+    return [(f"step.{key}", stored[key], wanted[key]) for key in sorted(stored)]
 
 
 def _require_equal(pairs: list[tuple[str, Any, Any]], why: str, remedy: str) -> None:
@@ -132,13 +139,12 @@ def network_of_weights(config: TrainConfig) -> ParticleNetwork:
     path = find_weights(config.training.init_weights, "training.init_weights")
     weights, info = load_weights(path, field="training.init_weights")
     remedy = "set it so, or take other training.init_weights"
-    free = ("rest_threshold", "wall_clearance", "obstacle_clearance")
-    pairs = [pair for pair in _network_pairs(info.network, config) if pair[0].removeprefix("network.") not in free]
+    pairs = _network_pairs(info.network, config)
     pairs.append(("dataset.frame_rate_hz", info.frame_rate_hz, config.dataset.frame_rate_hz))
     if info.network.obstacle_features:
         pairs.append(("scene.cell_size", info.obstacle_cell_size, config.scene.cell_size))
     _require_equal(pairs, f", as in training.init_weights {path}", remedy)
-    network = build_network(config.network)
+    network = build_network(config.network, config.step)
     network.load_state_dict(weights.state_dict())
     return network
 
@@ -148,7 +154,8 @@ def network_of_checkpoint(checkpoint: dict[str, Any], path: Path) -> ParticleNet
 
     Raises: ConfigError for a network that this version does not build.
     """
-    network, state = build_network(_network_config(checkpoint, path)), checkpoint["state_dict"]
+    network = build_network(_network_config(checkpoint, path), _step_config(checkpoint))
+    state = checkpoint["state_dict"]
     prefix = AVERAGED if any(name.startswith(AVERAGED) for name in state) else NETWORK
     try:
         network.load_state_dict({k.removeprefix(prefix): v for k, v in state.items() if k.startswith(prefix)})
@@ -160,9 +167,13 @@ def network_of_checkpoint(checkpoint: dict[str, Any], path: Path) -> ParticleNet
 
 def _network_config(checkpoint: dict[str, Any], path: Path) -> NetworkConfig:
     try:
-        return from_stored(NetworkConfig, checkpoint[SECTION]["network"], "network")
+        return from_stored(NetworkConfig, with_step(checkpoint[SECTION])["network"], "network")
     except ConfigError as error:
         raise ConfigError(_other_version(path, str(error))) from None
+
+
+def _step_config(checkpoint: dict[str, Any]) -> StepConfig:
+    return from_stored(StepConfig, with_step(checkpoint[SECTION])["step"], "step")
 
 
 def _other_version(path: Path, reason: str) -> str:

@@ -17,6 +17,7 @@ from hgn.data.batch import Batch, make_batch
 from hgn.network.base import ParticleNetwork
 from hgn.runtime.torch_backend import Backend
 from hgn.scene.episode import Episode
+from hgn.step.reference import accelerations
 
 REPORTED_FRAMES = (10, 50, 150, 299)  # of rollouts
 FRAMES_AT_ONCE = 16  # in float64
@@ -86,7 +87,7 @@ def network_predictor(backend: Backend) -> Predictor:
 
     def predict(batch: Batch) -> torch.Tensor:
         state = batch.state()
-        return backend.network.restored_acceleration(backend.normalised_acceleration(state), state)
+        return accelerations(backend.network, state, backend.prediction(state), backend.step)
 
     return predict
 

@@ -115,6 +115,7 @@ class TrainingModule(LightningModule):
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         checkpoint[SECTION] = {
             "network": to_mapping(self.network.config),
+            "step": to_mapping(self.network.step),
             "noise_std": self.training_config.noise_std,
             "data": to_mapping(self.data),
             "sampler_state": to_mapping(self.sampler_state),

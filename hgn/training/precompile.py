@@ -24,6 +24,7 @@ def job_of_training(config: TrainConfig, capability: tuple[int, int], several_ra
         cells=tuple(training.batch_scenes * count for count in cells),
         capability=10 * capability[0] + capability[1],
         pushforward_scenes=tuple(own + ([MONITORED_SCENES] if monitored else [])),
+        step=config.step,
     )
 
 

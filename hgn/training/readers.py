@@ -17,6 +17,7 @@ from hgn.data.pooled import AnyStore
 from hgn.data.sampler import BLOCK_EPISODES, Sample, SamplerState
 from hgn.scene.episode import Episode
 from hgn.scene.history import window
+from hgn.step_config import UNCONSTRAINED, StepConfig
 from hgn.training.noise import noise_scale
 from hgn.training.pushforward import Starts, simulated_barrier
 
@@ -102,10 +103,12 @@ class EpisodeReader:
 
     updates_at_once = 64
 
-    def __init__(self, store: AnyStore, network: NetworkConfig, training: TrainingConfig) -> None:
+    def __init__(
+        self, store: AnyStore, network: NetworkConfig, training: TrainingConfig, step: StepConfig = UNCONSTRAINED
+    ) -> None:
         self._store, self._network = store, network
         self._draws = FrameDraws(store, training)
-        self._clearance = network.obstacle_clearance if training.pushforward_fraction > 0 else None
+        self._clearance = step.obstacle_clearance if training.pushforward_fraction > 0 else None
         shuffled = training.shuffle_episodes
         # two windows of the order, where it has windows
         self.capacity = 2 * max(shuffled, BLOCK_EPISODES) if shuffled else sys.maxsize

@@ -56,7 +56,7 @@ def train_network(config: TrainConfig, start: Start, stop: StopRequest, publishe
     from hgn.training.checkpoint_writer import CheckpointWriter
     from hgn.training.data_module import EpisodeDataModule
     from hgn.training.monitor import Monitor
-    from hgn.training.readers import EpisodeReader, WindowReader
+    from hgn.training.readers import ChunkReader, EpisodeReader, WindowReader
     from hgn.training.tensorboard import FinalMetrics
 
     training, run, store, resume = config.training, Path(config.run), start.store, start.resume
@@ -73,7 +73,10 @@ def train_network(config: TrainConfig, start: Start, stop: StopRequest, publishe
     set_matmul_precision(training.precision)
     seed_everything(training.seed, verbose=False)
     module = _module(config, start, backend)
-    reader = (EpisodeReader if backend == "triton" else WindowReader)(store, config.network, training)
+    if backend == "triton":
+        reader: ChunkReader = EpisodeReader(store, config.network, training, config.step)
+    else:
+        reader = WindowReader(store, config.network, training)
     feed = EpisodeDataModule(store, training, reader, interrupted=lambda: stop.requested)
     if resume is not None:
         feed.first_update, feed.sampler_state = resume.progress.updates, resume.progress.sampler_state
@@ -119,7 +122,7 @@ def _module(config: TrainConfig, start: Start, backend: str) -> TrainingModule:
         config.scene.gravity,
         maximum_initial_speed=config.scene.maximum_initial_speed,
     )
-    module = TrainingModule(build_network(config.network), config.training, data, backend)
+    module = TrainingModule(build_network(config.network, config.step), config.training, data, backend)
     if start.initial is None:
         module.set_statistics(start.store.statistics())
     else:

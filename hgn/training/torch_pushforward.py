@@ -27,6 +27,7 @@ class TorchScenes:
     def __init__(self, network: ParticleNetwork) -> None:
         """`network` simulates."""
         self._network, self._backend = network, fastest_stepped(network)
+        self._backend.step = network.step.in_training
 
     @property
     def cell_size(self) -> float:
@@ -55,7 +56,7 @@ class TorchScenes:
         begin = state = replace(batch.state(), barriers=self._barriers([episode for episode, _ in starts]))
         path = []
         for _ in range(frames):
-            state = stepped(self._backend.predict, state, config)
+            state = stepped(self._backend.predict, state, self._backend.step, config.dimensions)
             path.append(state.position_N3.cpu().clone())
             again_N = diverged_scenes(state.position_N3, state.scene_N, state.domain_S3)
             if bool(again_N.any()):
@@ -75,7 +76,7 @@ class TorchScenes:
 
     def _barriers(self, episodes: Sequence[Episode]) -> Barriers | None:
         """Returns the obstacles that constrain simulations; windows are trained on without."""
-        clearance = self._network.config.obstacle_clearance
+        clearance = self._backend.step.obstacle_clearance
         if clearance is None:
             return None
         barriers = Barriers.of([simulated_barrier(episode, clearance) for episode in episodes])

@@ -14,9 +14,8 @@ from dataclasses import replace
 import torch
 
 from hgn.config import TrainingConfig
-from hgn.kernels.barrier_table import BarrierTable
 from hgn.kernels.grid.op import ObstacleTable
-from hgn.kernels.rollout.kernel import DIVERGED
+from hgn.kernels.step.op import DIVERGED, BarrierTable
 from hgn.kernels.update.op import DeviceEpisode, DeviceSample
 from hgn.network.cell_keys import COORDINATE_BITS
 from hgn.network.features import ParticleState
@@ -70,7 +69,7 @@ class TritonScenes:
             path_TN3, status = rollout.look(frames - done)
             pieces.append(path_TN3.clone())
             done += len(path_TN3)
-            if status & DIVERGED.value:
+            if status & DIVERGED:
                 self._set_back(rollout, state)
             else:
                 rollout.make_room(status)
@@ -108,7 +107,8 @@ class TritonScenes:
                 [*(episode.obstacles for episode in episodes), *[None] * empty], self._obstacle_cell_size, device
             )
         barriers = None
-        if config.obstacle_clearance is not None:
+        step = self._network.step.in_training
+        if step.obstacle_clearance is not None:
             barriers = BarrierTable([*(episode.barrier for episode in episodes), *[None] * empty], device)
         rollout = self._rollout
         if rollout is not None and len(state.position_N3) <= rollout.particles:
@@ -134,6 +134,7 @@ class TritonScenes:
             room=particles,
             obstacles=table,
             barriers=barriers,
+            step=step,
         )
         if capacities is None:
             first = self._first_scenes(episodes, state)

@@ -17,8 +17,8 @@ import torch
 
 from hgn.config import TrainingConfig
 from hgn.data.episode_tensors import EpisodeChunk, EpisodeTensors
-from hgn.kernels.barrier_table import BarrierHash
 from hgn.kernels.grid.op import ObstacleHash
+from hgn.kernels.step.op import BarrierHash
 from hgn.kernels.triton_compat import JitMisses
 from hgn.kernels.update.op import DeviceEpisode, DeviceSample, Updates, UpdateSettings
 from hgn.network.base import ParticleNetwork

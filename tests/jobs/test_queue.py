@@ -362,14 +362,16 @@ def test_mechanics(tmp_path, monkeypatch):
             score = from_mapping(EvaluateConfig, commands["hgn.evaluate"])
             assert (score.weights, score.data) == (export.out, config.dataset.folder)
             assert score.scenes == config.dataset.validation_scenes
-    last, export = trained["mechanics"], exported["mechanics"]
+    last = trained["mechanics"]
     used = [{each.dataset.folder, *each.training.more_data} for each in trained.values()]
     assert set().union(*used) == set(folders)
     shipped = load_weights(shipped_weights()["mechanics"])[1]
-    assert shipped.network == replace(last.network, **export.network_changes)
+    assert (shipped.network, shipped.step) == (last.network, last.step)
     assert shipped.updates == last.training.maximum_updates
-    assert set(export.network_changes) == {"rest_threshold", "wall_clearance"}
-    assert not any(exported[name].network_changes for name in exported if name != "mechanics")
+    assert not any(each.step_changes for each in exported.values())
+    in_pushforward = {name: each.step.in_training.obstacle_clearance for name, each in trained.items()}
+    free = ("first", "second", "third")
+    assert in_pushforward == {name: None if name in free else 0.0005 for name in trained}
     repeats, one = [trained[name] for name in repeated], trained["fourth"]
     assert len({each.training.seed for each in repeats}) == 3
     for each in repeats:

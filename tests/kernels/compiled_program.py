@@ -5,7 +5,6 @@ meanwhile, HAZARDS, kernel, precision and their number, SHARED, kernel and its b
 
 import json
 import sys
-from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -22,6 +21,7 @@ from hgn.config import NetworkConfig
 from hgn.kernels import triton_compat
 from hgn.kernels.update.op import UpdateSettings
 from hgn.runtime.precompile_program import FrameJob, PrecompileJob, launches_of
+from hgn.step_config import StepConfig
 
 
 @triton.jit
@@ -45,10 +45,8 @@ CUDABackend.make_cubin = lambda *_: b""  # ptxas takes a fifth of the time, and 
 settings = UpdateSettings(2, 1e-3, True, 1 / 64)
 relative = NetworkConfig(inputs="relative", width=16, levels=2, message_passing_steps=1)
 of_relative = {}  # before any is compiled: what is would be launched
-contacts = {"rest_threshold": 0.3}
-contacts |= {"wall_clearance": (0.02, 0.04), "obstacle_clearance": 1e-3}
-for network in (relative, replace(relative, **contacts)):
-    job = PrecompileJob(network, settings, "fp16", False, False, 9000, (9000, 3000), 90, (2,))
+for step in (StepConfig(), StepConfig(0.3, (0.02, 0.04), 1e-3)):
+    job = PrecompileJob(relative, settings, "fp16", False, False, 9000, (9000, 3000), 90, (2,), step)
     of_relative |= launches_of(job)
 
 network = NetworkConfig(levels=1, message_passing_steps=1)
@@ -70,7 +68,7 @@ for precision in ("fp16", "tf32"):
 # where a block has 99 KB of shared memory
 triton_compat.use_target(89)
 narrow = NetworkConfig(width=64, levels=2, message_passing_steps=1)
-for function, data in launches_of(FrameJob(((narrow, "fp16"),), ((40_000, 10_000),), 89)).values():
+for function, data in launches_of(FrameJob(((narrow, StepConfig(), "fp16"),), ((40_000, 10_000),), 89)).values():
     if function.fn.__module__ == "hgn.kernels.grid.kernel":
         continue  # knows no width
     print("SHARED", function.__name__, triton_compat.preload(function, data).metadata.shared, flush=True)
@@ -79,7 +77,7 @@ triton_compat.use_target(90)
 seen = set()
 for function, data in of_relative.values():
     name, early = function.__name__, json.loads(data)["options"]["launch_pdl"]
-    varied = function.fn.__module__.split(".")[2] in ("grid", "coarsest", "rollout")  # by what those two differ in
+    varied = function.fn.__module__.split(".")[2] in ("grid", "coarsest", "step")  # by what those two differ in
     if not varied and (not early or name in seen):
         continue
     seen.add(name)

@@ -8,6 +8,7 @@ from hgn.kernels.backward import FusedTrainingNetwork
 from hgn.kernels.forward import FusedNetwork, feature_columns
 from hgn.kernels.grid.op import DeviceGrid, ObstacleTable, Window
 from hgn.kernels.packing import pack_network
+from hgn.kernels.step.op import DeviceParticles, rest_numbers
 from hgn.kernels.tuning import Tuning
 
 
@@ -32,7 +33,7 @@ def engine_of(network, state, precision="fp32", capacities=(), spare_particles=3
         config.cell_size,
         where,
         config.relative,
-        config.rests,
+        rest_numbers(network.step, window, state.scene_count, config.levels),
     )
     packed = pack_network(network)
     values = packed.gather(list(network.parameters())).to(where)
@@ -55,7 +56,7 @@ def run_forward(engine, network, state, origin_S3):
 
 
 def prepare(engine, network, state, origin_S3):
-    """The state's cells and features in the engine's grid."""
+    """Prepares the state's cells and features in the engine's grid; returns its particles there."""
     where, grid, config = engine.device, engine.grid, network.config
 
     def padded(value):
@@ -67,7 +68,7 @@ def prepare(engine, network, state, origin_S3):
     velocity = padded(state.velocity_NM3.float().flatten(1))
     scene = padded(state.scene_N.int())
     material = padded(state.material_N.int())
-    origin, domain = origin_S3.float().to(where), state.domain_S3.float().to(where)
+    origin, domain, gravity = (x.float().to(where) for x in (origin_S3, state.domain_S3, state.gravity_S3))
     obstacles = ObstacleTable.of(state.obstacles.to(where), state.scene_count) if state.obstacles is not None else None
     grid.build(position, scene, origin, engine.particle_count)
     normaliser = network.normaliser
@@ -79,11 +80,12 @@ def prepare(engine, network, state, origin_S3):
         material,
         origin,
         domain,
-        state.gravity_S3.float().to(where),
+        gravity,
         engine.particle_count,
         *(x.float().to(where) for x in normaliser.feature_scale(config.relative)),
         obstacles,
     )
+    return DeviceParticles(position, velocity, scene, material, domain, gravity, engine.particle_count)
 
 
 def gradients(engine, network):

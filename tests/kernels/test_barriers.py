@@ -1,45 +1,21 @@
-"""Obstacles that nothing passes, on the device against hgn.runtime.holding."""
+"""Obstacles that nothing passes, on the device against hgn.step.reference."""
 
 import numpy as np
 import pytest
 import torch
-import triton
-import triton.language as tl
 from kernels.engines import device
 from network.barrier_scenes import CELL, CLEARANCE, DOMAIN, ball, barriers_of, crossings, gutter, scattered, square
-from network.states import network_of
 
-from hgn.kernels.barrier_table import BarrierHash, BarrierTable
-from hgn.kernels.barriers import BARRIER_COLUMNS, kept_apart
-from hgn.network.barriers import SLACK
+from hgn.config import NetworkConfig
+from hgn.kernels.buffers import OUT
+from hgn.kernels.grid.op import DeviceGrid, Window
+from hgn.kernels.step.op import BarrierHash, BarrierTable, DeviceParticles, DeviceStep
 from hgn.network.features import ParticleState
-from hgn.runtime.holding import LEAST_CREASE, SURFACES, held
 from hgn.scene.barrier import build_barrier
+from hgn.step.reference import advanced, first_stop
+from hgn.step_config import StepConfig
 
-BLOCK = 1024 if device().type == "cpu" else 64  # the interpreter's time goes by programs
 NO_CORNERS = np.zeros((0, 3, 3))
-
-
-@triton.jit
-def hold(
-    before, after, scene_of, table, out, count, within, slack, least_crease, near, far, SURFACES: tl.constexpr,
-    WALLED: tl.constexpr, BLOCK: tl.constexpr,
-):  # fmt: skip
-    row = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    live = row < count
-    line = table + tl.load(scene_of + row, mask=live, other=0) * BARRIER_COLUMNS
-    bx = tl.load(before + 3 * row, mask=live, other=0.0)
-    by = tl.load(before + 3 * row + 1, mask=live, other=0.0)
-    bz = tl.load(before + 3 * row + 2, mask=live, other=0.0)
-    x = tl.load(after + 3 * row, mask=live, other=0.0)
-    y = tl.load(after + 3 * row + 1, mask=live, other=0.0)
-    z = tl.load(after + 3 * row + 2, mask=live, other=0.0)
-    size = tl.zeros_like(x) + 1.0
-    ends = kept_apart(
-        bx, by, bz, x, y, z, size, size, size, line, live, within, slack, least_crease, near, far, SURFACES, WALLED
-    )  # fmt: skip
-    for axis in tl.static_range(3):
-        tl.store(out + 3 * row + axis, ends[axis], mask=live)
 
 
 def both(before_N3, after_N3, scene_N, barriers, table, walls=None):
@@ -52,19 +28,30 @@ def both(before_N3, after_N3, scene_N, barriers, table, walls=None):
     state = ParticleState(
         before_N3, velocity_NM3, scene_N, scene_N, domain_S3, torch.zeros_like(domain_S3), None, barriers=barriers
     )
-    config = network_of(obstacle_clearance=CLEARANCE, wall_clearance=walls).config
-    expected_N3, _ = held(state, after_N3, after_N3 - before_N3, config)
-    if walls is not None:
-        config = network_of(wall_clearance=walls).config
-        after_N3, _ = held(state, after_N3, after_N3 - before_N3, config)
-    found_N3 = torch.full_like(after_N3, torch.nan)
-    near, far = walls or (0.0, 0.0)
-    hold[(triton.cdiv(count, BLOCK),)](
-        before=before_N3, after=after_N3, scene_of=scene_N, table=table.row_S7, out=found_N3, count=count,
-        within=(1 - SLACK) * CLEARANCE, slack=SLACK * CLEARANCE, least_crease=LEAST_CREASE, near=near, far=far,
-        SURFACES=SURFACES, WALLED=walls is not None, BLOCK=BLOCK,
+    step = StepConfig(wall_clearance=walls, obstacle_clearance=CLEARANCE)
+    expected_N3 = advanced(state, after_N3 - before_N3, step, 3).position_N3
+    return expected_N3.cpu().numpy(), integrated(state, after_N3 - before_N3, step, table).cpu().numpy()
+
+
+def integrated(state, way_N3, step, table):
+    """Positions after a frame on the device, from rest by these ways."""
+    count, where = len(way_N3), device()
+    config = NetworkConfig(levels=1, velocity_history=1)
+    window = Window.around((0.0,) * 3, (1.0,) * 3, config.cell_size, 1)
+    grid = DeviceGrid(window, state.scene_count, (16,), count, 16, config.cell_size, where)
+    one, zero_3 = torch.ones(1, dtype=torch.int32, device=where), way_N3.new_zeros(3)
+    output = way_N3.new_zeros(count, OUT)
+    output[:, :3] = way_N3
+    particles = DeviceParticles(
+        state.position_N3.clone(), way_N3.new_zeros(count, 3), state.scene_N.int(), state.scene_N.int(),
+        state.domain_S3, state.gravity_S3, count * one,
     )  # fmt: skip
-    return expected_N3.cpu().numpy(), found_N3.cpu().numpy()
+    path_TN3 = way_N3.new_zeros(1, count, 3)
+    DeviceStep(step, config, grid, table).integrate(
+        output, particles, (zero_3, zero_3 + 1), lost=0 * one, frame=0 * one, path_TN3=path_TN3
+    )
+    torch.testing.assert_close(path_TN3[0], particles.position_N3, rtol=0, atol=0, equal_nan=True)
+    return particles.position_N3
 
 
 def table_of(*scenes):
@@ -81,7 +68,7 @@ def met(seed):
     """Of ways among scattered obstacles those that are stopped, and the first hundred others; float32."""
     corner_F33, *ways = scattered(seed)
     before_N3, after_N3 = (torch.as_tensor(x, dtype=torch.float32) for x in ways)
-    hit_N, *_ = barriers_of(corner_F33).stopped(before_N3, after_N3, torch.zeros(len(before_N3), dtype=torch.int64))
+    hit_N, *_ = first_stop(barriers_of(corner_F33), before_N3, after_N3, torch.zeros(len(before_N3), dtype=torch.int64))
     chosen_N = hit_N | (torch.cumsum(~hit_N, 0) <= 100)
     return corner_F33, before_N3[chosen_N].numpy(), after_N3[chosen_N].numpy()
 
@@ -128,6 +115,7 @@ def test_where_nothing_stops_nothing_changes():
     """Bitwise: ways between the obstacles, and whatever has come apart."""
     corner_F33, before_N3, after_N3 = met(4)
     after_N3[::7], after_N3[3::7] = np.nan, 2.5
+    after_N3 = before_N3 + (after_N3 - before_N3)  # as the integration rounds it
     barriers, scene_N = on_device(barriers_of(corner_F33)), np.zeros(len(after_N3), np.int64)
     expected_N3, found_N3 = both(before_N3, after_N3, scene_N, barriers, table_of(corner_F33))
     free_N = ~(expected_N3 != after_N3).any(-1) | np.isnan(after_N3[:, 0])

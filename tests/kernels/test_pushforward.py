@@ -16,9 +16,9 @@ from training.test_symmetry import scene_with_obstacles
 
 from hgn import train
 from hgn.data.episode_tensors import whole_episode
-from hgn.kernels.barrier_table import BarrierHash
 from hgn.kernels.grid.op import ObstacleHash
 from hgn.kernels.packing import pack_network
+from hgn.kernels.step.op import BarrierHash
 from hgn.kernels.update.op import DeviceEpisode, DeviceSample
 from hgn.schema import ConfigError
 from hgn.training.checkpoint import read_checkpoint
@@ -34,7 +34,7 @@ CELL_SIZE = 1 / 64
 
 
 def placed(made, network):
-    clearance = network.config.obstacle_clearance
+    clearance = network.step.obstacle_clearance
     barrier = None if clearance is None else simulated_barrier(made, clearance)
     whole, where = whole_episode(made, network.config, barrier), device()
     cells, normals = whole.obstacle_cell_K3, whole.obstacle_normal_K3

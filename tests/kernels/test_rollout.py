@@ -16,8 +16,8 @@ from network.states import network_of, on_device, random_state
 from runtime.scenes import random_scene
 
 from hgn.config import NetworkConfig
-from hgn.kernels.barrier_table import BarrierTable
 from hgn.kernels.grid.op import DeviceGrid, Window
+from hgn.kernels.step.op import BarrierTable
 from hgn.network.features import ParticleState
 from hgn.network.hgn import HierarchicalGraphNetwork
 from hgn.runtime import triton_rollout

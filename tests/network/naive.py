@@ -96,12 +96,12 @@ def _one_scene(network, state, members, scene, origin_S3):
         return output
     output = _balanced(config, *felt, pairs, output)
     scale = network.normaliser.acceleration_std[0]
-    for level in range(2 * config.rests):
+    for level in range(2 * network.step.rests):
         moving = [value + state.velocity_NM3[i, 0] / scale for i, value in zip(members, output, strict=True)]
         slow = []
         large = [config.materials[int(state.material_N[i])] != "water" or not level for i in members]
         for rate in _deforming(config, felt[0], pairs, moving, level, large):
-            ratio = rate.norm() * scale / (config.rest_threshold * state.gravity_S3[scene].norm() + 1e-300)
+            ratio = rate.norm() * scale / (network.step.rest_threshold * state.gravity_S3[scene].norm() + 1e-300)
             slow.append((2 - ratio**2).clamp(0, 1) * rate)
         stopped = _deforming(config, felt[0], pairs, slow, level, large)
         output = [value - part for value, part in zip(output, stopped, strict=True)]

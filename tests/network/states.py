@@ -12,6 +12,7 @@ from hgn.network.gns import GraphNetworkSimulator
 from hgn.network.hgn import HierarchicalGraphNetwork
 from hgn.network.obstacles import ObstacleCells
 from hgn.scene.obstacle_grid import ObstacleGrid
+from hgn.step_config import StepConfig
 
 GRAVITY = (0.0, -9.8 / 3600, 0.0)  # domain units per frame squared
 
@@ -61,7 +62,7 @@ def on_device(state, device):
 def network_of(dtype=torch.float64, **changes):
     """A small network with random weights, norms included, and a normaliser that is not the identity."""
     values = {"width": 16, "levels": 3, "message_passing_steps": 2} | changes
-    network = _with_random_weights(NetworkConfig(**values), dtype)
+    network = _with_random_weights(values, dtype)
     assert isinstance(network, HierarchicalGraphNetwork)
     return network
 
@@ -77,14 +78,21 @@ def silent(network):
 def gns_of(dtype=torch.float64, **changes):
     """The same of GNS."""
     values = {"kind": "gns", "width": 16, "levels": 1, "message_passing_steps": 3} | changes
-    network = _with_random_weights(NetworkConfig(**values), dtype)
+    network = _with_random_weights(values, dtype)
     assert isinstance(network, GraphNetworkSimulator)
     return network
 
 
-def _with_random_weights(config, dtype):
+def structure(values):
+    """The network and the constraints of its frames that settings of both describe."""
+    step = {name: values[name] for name in vars(StepConfig()) if name in values}
+    return NetworkConfig(**{name: value for name, value in values.items() if name not in step}), StepConfig(**step)
+
+
+def _with_random_weights(values, dtype):
     torch.manual_seed(5)
-    network = build_network(config)
+    config, step = structure(values)
+    network = build_network(config, step)
     with torch.no_grad():
         for parameter in network.parameters():
             parameter.add_(0.1 * torch.randn_like(parameter))

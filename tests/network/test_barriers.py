@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 import torch
 from network.barrier_scenes import CELL, CLEARANCE, DOMAIN, ball, barriers_of, crossings, gutter, scattered, square
-from network.states import network_of
 
-from hgn.network.barriers import SLACK, Barriers, barrier_rows
+from hgn.network.barriers import Barriers, barrier_rows
 from hgn.network.features import ParticleState
-from hgn.runtime.holding import held
 from hgn.scene.barrier import CELLS, MARGIN, barrier_of_pieces, barrier_pieces, build_barrier
 from hgn.scene.rotation import euler_rotation
 from hgn.scene.scene import Obstacle
 from hgn.schema import ConfigError
+from hgn.step.reference import SLACK, FreeMotion, constrained, first_stop, pairs_of_boxes
+from hgn.step_config import StepConfig
 
 MORE, RIM = SLACK * CLEARANCE, MARGIN * CLEARANCE
 
@@ -29,9 +29,9 @@ def ended(before, after, barriers, dtype=torch.float64, scene=None, **changes):
     state = ParticleState(
         before_N3, velocity_NM3, scene_N, scene_N, domain_S3, torch.zeros_like(domain_S3), None, barriers=barriers
     )
-    config = network_of(**({"obstacle_clearance": CLEARANCE} | changes)).config
-    position_N3, velocity_N3 = held(state, after_N3, after_N3 - before_N3, config)
-    return position_N3.numpy(), velocity_N3.numpy()
+    step = StepConfig(**({"obstacle_clearance": CLEARANCE} | changes))
+    motion = constrained(state, FreeMotion(after_N3, after_N3 - before_N3), step, 3)
+    return motion.position_N3.numpy(), motion.velocity_N3.numpy()
 
 
 @pytest.mark.parametrize("sign", [1, -1])
@@ -252,7 +252,7 @@ def test_rows_of_an_exported_graph(dtype):
     np.testing.assert_allclose(row_F24.numpy(), barrier.row_F24, rtol=0, atol=6e-8)  # a rounding to float32
     flat_F33 = torch.tensor([[[0.5] * 3] * 3, [[0.3] * 3, [0.5] * 3, [0.7] * 3]], dtype=dtype)
     flat = replace(Barriers.of([barrier]), row_F24=barrier_rows(flat_F33, CLEARANCE))
-    assert not len(flat._pairs_of_boxes(torch.zeros(1, 3), torch.ones(1, 3))[0])
+    assert not len(pairs_of_boxes(flat, torch.zeros(1, 3), torch.ones(1, 3))[0])
 
 
 def test_scenes_side_by_side():
@@ -287,7 +287,7 @@ def test_gradients_are_those_of_what_is_left():
     barriers = barriers_of(square((0.5,) * 3, 1))
     after_N3 = torch.tensor([[0.52, 0.45, 0.5]], dtype=torch.float64, requires_grad=True)
     before_N3 = torch.tensor([[0.5, 0.55, 0.5]], dtype=torch.float64)
-    hit_N, shift_N1, normal_N3, _ = barriers.stopped(before_N3, after_N3, torch.zeros(1, dtype=torch.int64))
+    hit_N, shift_N1, normal_N3, _ = first_stop(barriers, before_N3, after_N3, torch.zeros(1, dtype=torch.int64))
     end_N3 = after_N3 + shift_N1 * normal_N3
     assert bool(hit_N[0])
     for axis, expected in ((0, (1.0, 0.0, 0.0)), (1, (0.0, 0.0, 0.0))):

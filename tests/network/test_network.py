@@ -18,6 +18,7 @@ from hgn.network.grid import build_hierarchy
 from hgn.network.hgn import HierarchicalGraphNetwork
 from hgn.network.mlp import MLP
 from hgn.network.obstacles import ObstacleCells
+from hgn.step.reference import rested
 
 
 @pytest.mark.parametrize(
@@ -60,7 +61,7 @@ def test_network_equals_the_literal_definition(counts, changes):
     state = random_state(counts, obstacles=changes.get("obstacle_features", True))
     origin = -network.config.cell_size * torch.rand(len(counts), 3, dtype=torch.float64)
     expected = naive_normalised_acceleration(network, state, origin)
-    assert_same_function(network, network.normalised_acceleration(state, origin), expected)
+    assert_same_function(network, rested(network, state, network.prediction(state, origin)), expected)
 
 
 def test_particles_on_centres_and_faces():

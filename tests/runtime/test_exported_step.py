@@ -23,6 +23,7 @@ from hgn.network.hgn import HierarchicalGraphNetwork
 from hgn.runtime.exported_step import INPUTS, initial_arrays, write_package
 from hgn.runtime.simulator import Simulator
 from hgn.runtime.stepped_rollout import stepped
+from hgn.runtime.torch_backend import Backend
 from hgn.runtime.weights import WeightsInfo, save_weights
 from hgn.scene.barrier import barrier_of_pieces, barrier_pieces
 from hgn.scene.scene_file import load_scene
@@ -171,18 +172,18 @@ def exported(folder, name, kind):
 def compare(network, step):
     corner_F33, _, _ = scattered(0)
     corner_F33 = barrier_pieces(0.2 + 0.5 * (corner_F33 - 0.5), CELL)  # where the particles are
-    clearance = network.config.obstacle_clearance
+    clearance, predict = network.step.obstacle_clearance, Backend(network).predict
     for particles, obstacles in SIZES:
         state = random_state((particles,), dtype=torch.float32, obstacles=obstacles)
         state = replace(state, velocity_NM3=10 * state.velocity_NM3)
         if obstacles and clearance is not None:
             state = replace(state, barriers=Barriers.of([barrier_of_pieces(corner_F33, CELL, clearance)]))
         position_N3, velocity_NM3 = step(initial_arrays(state, corner_F33 if obstacles else None))
-        after = stepped(network, state, network.config)
+        after = stepped(predict, state, network.step, network.config.dimensions)
         np.testing.assert_allclose(position_N3, after.position_N3.numpy(), rtol=0, atol=TOLERANCE)
         np.testing.assert_allclose(velocity_NM3, after.velocity_NM3.numpy(), rtol=0, atol=TOLERANCE)
         if state.barriers is not None and particles > 1:
-            free = stepped(network, replace(state, barriers=None), network.config)
+            free = stepped(predict, replace(state, barriers=None), network.step, network.config.dimensions)
             assert (free.position_N3 != after.position_N3).any(-1).float().mean() > 0.01
 
 
@@ -191,7 +192,7 @@ def assert_rollout(written, found_TN3):
     simulator = Simulator(written.network, 60.0, "torch")
     (expected_TN3,) = simulator.rollout([written.scene], FRAMES)
     np.testing.assert_allclose(found_TN3, expected_TN3, rtol=0, atol=FRAMES * TOLERANCE)
-    if written.network.config.obstacle_clearance is not None:
+    if written.network.step.obstacle_clearance is not None:
         state = replace(simulator.start([written.scene]), barriers=None)
         for _ in range(FRAMES - 1):
             state = simulator.step(state)

@@ -12,7 +12,8 @@ from hgn.network.features import ParticleState
 from hgn.runtime.divergence import DivergedError
 from hgn.runtime.rollouts import simulate_scenes
 from hgn.runtime.simulator import Simulator
-from hgn.runtime.stepped_rollout import advanced
+from hgn.step.reference import advanced
+from hgn.step_config import StepConfig
 
 WALLS = (0.03, 0.05)  # near sides, far sides
 DOMAIN = (1.0, 0.8, 0.6)
@@ -31,7 +32,8 @@ def moved(x, velocity, size=1.0, acceleration=0.0, axis=0, dtype=torch.float64, 
     acceleration_N3[0, axis] = acceleration
     nothing = torch.zeros(1, dtype=torch.int64)
     state = ParticleState(position_N3, velocity_NM3, nothing, nothing, domain_S3, torch.zeros_like(domain_S3), None)
-    after = advanced(state, acceleration_N3, network_of(**changes).config)
+    dimensions = changes.pop("dimensions", 3)
+    after = advanced(state, acceleration_N3, StepConfig(**changes), dimensions)
     others = [i for i in range(3) if i != axis]
     assert (
         torch.equal(after.position_N3[:, others], position_N3[:, others]) and not after.velocity_NM3[:, 0, others].any()
@@ -98,7 +100,7 @@ def test_free_of_walls_nothing_changes(dtype):
     state = random_state((200, 50), dtype=dtype)
     acceleration_N3 = 1e-3 * torch.randn(250, 3, dtype=dtype)
     free, walled = (
-        advanced(state, acceleration_N3, network_of(**c).config) for c in ({}, {"wall_clearance": (0.0, 0.1)})
+        advanced(state, acceleration_N3, step, 3) for step in (StepConfig(), StepConfig(wall_clearance=(0.0, 0.1)))
     )
     assert torch.equal(free.position_N3, walled.position_N3) and torch.equal(free.velocity_NM3, walled.velocity_NM3)
     assert walled.position_N3.dtype == dtype

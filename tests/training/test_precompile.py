@@ -9,6 +9,7 @@ from processes import run_compiled
 from hgn.config import NetworkConfig, SceneConfig, TrainConfig, TrainingConfig
 from hgn.runtime.precompile import Precompilation, frame_sizes
 from hgn.runtime.precompile_program import FrameJob, job_of, job_text
+from hgn.step_config import StepConfig
 from hgn.training.precompile import job_of_training
 
 
@@ -43,7 +44,8 @@ def test_the_job_follows_from_the_configuration():
 def test_jobs_of_simulations():
     """Networks keep their precisions through the job's text; few and many particles, dense and spread, are among the
     sizes, and as many as there are cases change little."""
-    networks = ((NetworkConfig(width=16), "fp16"), (NetworkConfig(width=16, levels=2), "tf32"))
+    small = NetworkConfig(width=16)
+    networks = ((small, StepConfig(), "fp16"), (small, StepConfig(0.1), "tf32"))
     made = FrameJob(networks, frame_sizes([2_763, 30_000, 1, 30_000]), 90)
     assert job_of(job_text(made)) == made
     assert {particles for particles, _ in made.sizes} == {1, 2_763, 30_000} and len(made.sizes) == 9

@@ -23,6 +23,7 @@ from hgn.scene.history import window
 from hgn.scene.rollout_file import known_obstacles
 from hgn.scene.scene import all_corners
 from hgn.schema import ConfigError
+from hgn.step_config import StepConfig
 from hgn.training.checkpoint import read_checkpoint
 from hgn.training.pushforward import PoolDraws, PushforwardPool, drawn_starts, pushforward_windows
 from hgn.training.torch_pushforward import TorchScenes
@@ -219,7 +220,7 @@ def test_obstacles_hold():
     scenes = [with_square(episode(6, seed=1), (0.5, 0.53, 0.5)), episode(6, seed=2)]
     corner_F33 = all_corners(known_obstacles(scenes[0]) or ())
     for clearance, expected in ((None, [6, 6]), (2e-3, [0, 6])):
-        network.config = replace(network.config, obstacle_clearance=clearance)
+        network.step = StepConfig(obstacle_clearance=clearance)
         own = pool_of(network)
         own.refresh([(scene, 2) for scene in scenes])
         passed = []
@@ -240,7 +241,7 @@ def test_barriers_are_remembered(monkeypatch):
     scenes = [with_square(episode(8, seed=seed), (0.5, 0.53, 0.5)) for seed in (1, 2)]
     network = wild_network()
     for clearance in (2e-3, 1e-3):
-        network.config = replace(network.config, obstacle_clearance=clearance)
+        network.step = StepConfig(obstacle_clearance=clearance)
         own = pool_of(network)
         for frame in (2, 3, 4):
             own.refresh([(scene, frame) for scene in scenes])

@@ -16,6 +16,7 @@ from hgn.network.build import build_network
 from hgn.runtime.torch_backend import Backend
 from hgn.runtime.weights import WeightsInfo, load_weights, save_weights
 from hgn.schema import ConfigError
+from hgn.step_config import StepConfig
 from hgn.training.checkpoint import network_of_checkpoint, network_of_weights, read_checkpoint
 from hgn.training.muon import Muon
 from hgn.training.schedule import learning_rate
@@ -99,11 +100,10 @@ def test_other_weights_are_refused(data, tmp_path, file, message):
 def test_other_constraints_are_taken(tmp_path):
     """Weights without rest, walls and obstacles' clearance begin a network with these: the same tensors."""
     path = weights_file(tmp_path / "own.safetensors", "fp32", inputs="relative")
-    constraints = {"rest_threshold": 0.1, "wall_clearance": (0.02, 0.04), "obstacle_clearance": 1e-3}
-    wanted = NetworkConfig(**NETWORK | {"inputs": "relative"} | constraints)
-    config = TrainConfig(network=wanted, training=TrainingConfig(init_weights=str(path)))
+    wanted, step = NetworkConfig(**NETWORK | {"inputs": "relative"}), StepConfig(0.1, (0.02, 0.04), 1e-3)
+    config = TrainConfig(network=wanted, step=step, training=TrainingConfig(init_weights=str(path)))
     network, (own, info) = network_of_weights(config), load_weights(path)
-    assert network.config == wanted and info.network.rest_threshold == 0
+    assert (network.config, network.step, info.step) == (wanted, step, StepConfig())
     theirs = own.state_dict()
     assert all(torch.equal(tensor, theirs[name]) for name, tensor in network.state_dict().items())
     with pytest.raises(ConfigError, match=r"network.cell_size must be .*, as in"):
@@ -143,15 +143,14 @@ def test_an_export_sets_rest_walls_and_obstacles(data, finished, tmp_path):
     for out, options in zip(outs, chosen, strict=True):
         assert export_main({"checkpoint": kept, "out": str(out)} | options) == 0
     (one, trained), *others = (load_weights(out) for out in outs)
-    assert trained.network.rest_threshold == 0
-    assert trained.network.wall_clearance is None and trained.network.obstacle_clearance is None
+    assert trained.step == StepConfig()
     expected = (
         {"rest_threshold": 0.1},
         {"wall_clearance": (0.02, 0.04)},
         {"obstacle_clearance": 1e-3},
     )
     for (other, after), changes in zip(others, expected, strict=True):
-        assert after.network == replace(trained.network, **changes) == other.config
+        assert after.step == StepConfig(**changes) == other.step and after.network == trained.network
         for name, tensor in one.state_dict().items():
             assert torch.equal(tensor, other.state_dict()[name])
     with pytest.raises(ConfigError, match=r"rest_threshold must be 0 with inputs=absolute, got 0\.1"):
@@ -174,10 +173,10 @@ def test_weights_are_changed_without_a_checkpoint(tmp_path):
         options = {"obstacle_clearance": 1e-3, "stored_precision": "fp16"}
         assert export_main({"weights": str(file), "out": str(out)} | options) == 0
         changed, after = load_weights(out)
-        assert after.network == replace(info.network, obstacle_clearance=1e-3) == changed.config
+        assert after.step == StepConfig(obstacle_clearance=1e-3) == changed.step and after.network == info.network
         assert (after.updates, after.frame_rate_hz, after.gravity) == (7, info.frame_rate_hz, info.gravity)
         told = after.provenance["changed"]
-        assert told == {"file": file.name, "network": {"obstacle_clearance": 1e-3}, "provenance": {"commit": "abc"}}
+        assert told == {"file": file.name, "step": {"obstacle_clearance": 1e-3}, "provenance": {"commit": "abc"}}
         for name, tensor in network.state_dict().items():
             assert torch.equal(tensor, changed.state_dict()[name])
     before = file.read_bytes()
@@ -186,7 +185,7 @@ def test_weights_are_changed_without_a_checkpoint(tmp_path):
     assert file.read_bytes() == before
     small = tmp_path / "small.safetensors"
     assert export_main({"weights": "obstacles_small", "out": str(small), "obstacle_clearance": 5e-4}) == 0
-    assert load_weights(small)[1].network.obstacle_clearance == 5e-4
+    assert load_weights(small)[1].step.obstacle_clearance == 5e-4
 
 
 def test_the_average_is_what_is_measured_and_exported(data, tmp_path, monkeypatch):

@@ -203,7 +203,7 @@ def _precompilation(
         from hgn.runtime.precompile import precompile_frames  # loads Triton
 
         particles = max(len(episode.material_N) for episode in episodes)
-        configs, precisions = [c.network.config for c in whole], [c.precision for c in whole]
+        configs, precisions = [(c.network.config, c.network.step) for c in whole], [c.precision for c in whole]
         ahead = precompile_frames(configs, precisions, device, [particles, 8 * particles, PARTICLES_AT_ONCE])
     with ahead if ahead is not None else nullcontext():
         yield

@@ -119,7 +119,8 @@ def compile_kernels(simulator: Simulator, cases: Sequence[Case], precision: Prec
     from hgn.runtime.precompile import precompile_frames  # loads Triton
 
     particles = [sum(scene.particle_count for scene in case.scenes) for case in cases]
-    ahead = precompile_frames([simulator.network.config], [precision], simulator.device, particles)
+    network = simulator.network
+    ahead = precompile_frames([(network.config, network.step)], [precision], simulator.device, particles)
     if ahead is not None:
         with ahead:
             print(ahead.wait(), file=sys.stderr)

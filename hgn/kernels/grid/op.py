@@ -22,14 +22,11 @@ from hgn.network.cell_keys import SCENE_LIMIT, in_buckets, unpack
 from hgn.network.features import WALL_DISTANCE_CELLS
 from hgn.network.obstacles import ObstacleCells
 from hgn.network.relative import CONTACT_REACH_CELLS, FEW, OUTPUTS, QUIET, RARE
-from hgn.network.rest import LEVEL_SHIFT, REST_SIZES, rests_widely
 
 MARK_BLOCK = 128
 PARTICLE_BLOCK = 32
 FILL_BLOCK = 4096 if interpreting() else 512  # slots; the interpreter's time goes by programs
-RATES = coarsest_kernel.RATES.value
 SUMS = 16  # columns of what goes through the coarsest cells, as many as the decoder's padded output has
-REST_SUMS = (SUMS, RATES, RATES, RATES)  # columns of the sums of a `RestLevel`
 MARGIN_CELLS = 4  # of a window, around what it must hold
 OBSTACLE_COLUMNS = obstacle_lookup.OBSTACLE_COLUMNS.value
 OVERFLOW, OUT_OF_WINDOW = kernel.OVERFLOW.value, kernel.OUT_OF_WINDOW.value
@@ -111,30 +108,6 @@ class ObstacleTable:
         return ObstacleTable(hashes, cells.cell_size, cells.key_K.device)
 
 
-@dataclass(frozen=True, eq=False)
-class RestLevel:
-    """What rests between cells of one size: the sums of bodies and displacements, of slow ones, and of both gradients,
-    each [K, columns]; what is subtracted at each middle; of each particle the lowest of its middles, the place from
-    there, the gate, and the deformation, all of it and what of it is slow.
-    """
-
-    sums: tuple[torch.Tensor, ...]
-    table: torch.Tensor  # [K, RATES]
-    base_N: torch.Tensor  # int32
-    spot_N3: torch.Tensor
-    gate_N: torch.Tensor
-    rate_N3: torch.Tensor
-    slow_N3: torch.Tensor
-
-    @staticmethod
-    def of(particles: int, middles: int, sums: Sequence[torch.Tensor], device: torch.device) -> RestLevel:
-        """With sums that are cleared elsewhere."""
-        spot_N3, rate_N3, slow_N3 = (torch.zeros(particles, 3, device=device) for _ in range(3))
-        base_N, gate_N = torch.zeros(particles, dtype=torch.int32, device=device), torch.zeros(particles, device=device)
-        table = torch.zeros(middles, RATES, device=device)
-        return RestLevel(tuple(sums), table, base_N, spot_N3, gate_N, rate_N3, slow_N3)
-
-
 class DeviceGrid:
     """Tables of all levels at fixed capacities; counts stay on the device.
 
@@ -158,8 +131,9 @@ class DeviceGrid:
         cell_size: float,
         device: torch.device,
         relative: bool = False,
-        rests: bool = False,
+        more: tuple[int, ...] = (),
     ) -> None:
+        """`more_cleared` are int32 tensors of `more` numbers for others, which `build` clears too."""
         assert scenes < SCENE_LIMIT
         self.window, self.scenes, self.capacities, self.particles = window, scenes, tuple(capacities), particles
         self.cell_size, self.levels, self.features = cell_size, len(capacities), features
@@ -178,19 +152,15 @@ class DeviceGrid:
         self.geometry = torch.tensor(rows, dtype=torch.int32, device=device)
         self.low = torch.tensor(window.low, dtype=torch.int32, device=device)
         coarsest = self.capacities[-1] if relative else 0
-        middles = rows[-1][1]  # slots of the coarsest cells, and as many for larger ones, which need fewer
-        each, rest_sizes = len(REST_SUMS), REST_SIZES * rests
-        parts = [4 * at if relative else 4, *[columns * middles for columns in REST_SUMS * rest_sizes]]
-        parts += [*[SUMS * coarsest] * 3, 2 * coarsest, start]
+        parts = [4 * at if relative else 4, *[SUMS * coarsest] * 3, 2 * coarsest, start, *more]
         self._cleared = integers(sum(parts))  # one piece, cleared at once
-        motion, *sums, moments, disturbed, self.occupied = self._cleared.split(parts)
-        rest_sums, sums = [x.view(torch.float32) for x in sums[: each * rest_sizes]], sums[each * rest_sizes :]
+        motion, *sums, moments, disturbed, self.occupied = self._cleared.split(parts)[:6]
+        self.more_cleared = self._cleared.split(parts)[6:]
         self.prefix_sum = integers(start)
         self.slot_of_cell, self._parent, self._octant = integers(at), integers(at), integers(at)
         self._neighbour, self._children = integers(6 * at), integers(8 * at)
         self.counts_L, self.needed_L = integers(self.levels), integers(self.levels)
         self.status = integers(1)
-        self._rest: dict[str, Any] | None = None  # what its deformations rest by, of the network last prepared for
         self.cell_N8 = integers(particles, 8)
         self.weight_N8 = torch.zeros(particles, 8, device=device)
         self.fraction_N3 = torch.zeros(particles, 3, device=device)
@@ -204,9 +174,6 @@ class DeviceGrid:
         self.disturbed_C2 = disturbed.view(-1, 2)
         self.felt_C2 = torch.zeros(coarsest, 2, device=device)
         self.table_C = torch.zeros(coarsest, SUMS, device=device)
-        self._rest_levels = [
-            RestLevel.of(particles, middles, rest_sums[each * level :][:each], device) for level in range(rest_sizes)
-        ]
         self._at = [row[6] for row in rows]
 
     def neighbour(self, level: int) -> torch.Tensor:
@@ -269,13 +236,6 @@ class DeviceGrid:
         `symmetry` the obstacles are seen under the symmetries in their rows.
         """
         blocks, overlap = (triton.cdiv(self.particles, PARTICLE_BLOCK),), overlaps()
-        self._rest = None
-        if config.rests:
-            self._rest = {"velocity": velocity, "scale": std_3, "scene_of": scene_N, "gravity": gravity_S3}
-            self._rest |= {"threshold": config.rest_threshold, "HISTORY": config.velocity_history}
-            widely = rests_widely(config)
-            bits = sum(resting << material for material, resting in enumerate(widely))
-            self._rest |= {"material_of": material_N, "widely": -1 if all(widely) else bits}
         arguments = feature_arguments(
             config, position, velocity, scene_N, material_N, domain_S3, count, obstacles, symmetry, self.feature_NF
         )
@@ -312,15 +272,9 @@ class DeviceGrid:
     def balance(self, output: torch.Tensor, count: torch.Tensor) -> None:
         """From what the decoder puts out [N, OUT] to accelerations less gravity in columns 0 to 2, in place."""
         self._through_coarsest(output, count, self.sum_C, coarsest_kernel.balance, OUTPUTS, 3)
-        if self._rest:
-            for level in range(len(self._rest_levels)):
-                self._take_rest(output, count, self._rest, level, True)
 
     def balance_backward(self, gradient: torch.Tensor, count: torch.Tensor) -> None:
         """From the gradient of what `balance` leaves to that of what it was given, in place."""
-        if self._rest:
-            for level in reversed(range(len(self._rest_levels))):
-                self._take_rest(gradient, count, self._rest, level, False)
         self._through_coarsest(gradient, count, self.gradient_sum_C, coarsest_kernel.balance_backward, 3, OUTPUTS)
 
     def _through_coarsest(
@@ -346,42 +300,6 @@ class DeviceGrid:
         coarsest_kernel.add_coarsest[(triton.cdiv(particles, PARTICLE_BLOCK),)](
             x=x, table=self.table_C, **pairs, USED=left, COLUMNS=triton.next_power_of_2(left + 1), **sizes,
             launch_pdl=overlap,
-        )  # fmt: skip
-
-    def _take_rest(self, x: torch.Tensor, count: torch.Tensor, rest: dict[str, Any], level: int, forward: bool) -> None:
-        """Slow deformations between cells of a size out of columns 0 to 2, or the same of their gradients, in place."""
-        overlap, blocks, own = overlaps(), (triton.cdiv(self.particles, PARTICLE_BLOCK),), self._rest_levels[level]
-        whole, *halves = own.sums
-        first, second = (whole, halves[0]) if forward else halves[1:]
-        pairs: dict[str, Any] = {"base_of": own.base_N, "gate_of": own.gate_N, "spot_of": own.spot_N3}
-        pairs |= {"x": x, "geometry": self.geometry, "particle_count": count, "OUT": x.shape[1], "LEVELS": self.levels}
-        sizes: dict[str, Any] = {"OVERLAP": overlap, "BLOCK": PARTICLE_BLOCK}
-        moving = {name: rest[name] for name in ("velocity", "scale", "HISTORY")} | {"FORWARD": forward}
-        middles = len(own.table)
-
-        def find(sums: torch.Tensor) -> None:
-            columns = SUMS if sums is whole else RATES
-            coarsest_kernel.find_deformation[(triton.cdiv(middles, PARTICLE_BLOCK),)](
-                bodies=whole, sums=sums, table=own.table, count=middles, AT=10 if sums is whole else 0,
-                COLUMNS=columns, BODIES=SUMS, **sizes, launch_pdl=overlap,
-            )  # fmt: skip
-
-        # behind what is not a kernel in a backward pass
-        coarsest_kernel.sum_displacements[blocks](
-            **pairs, **moving, **sizes, coarsest_of=self.coarsest_N8, share_of=self.share_N8, place_of=self.place_N3,
-            felt=self.felt_C2, slot_of_cell=self.slot_of_cell, low=self.low, sums=first, SHIFT=level * LEVEL_SHIFT,
-            material_of=rest["material_of"], RESTING=rest["widely"] if level else -1,
-            COLUMNS=SUMS if forward else RATES, launch_pdl=overlap and forward,
-        )  # fmt: skip
-        find(first)
-        coarsest_kernel.slow_displacements[blocks](
-            **pairs, **moving, **sizes, scene_of=rest["scene_of"], gravity=rest["gravity"],
-            threshold=rest["threshold"], rate=own.rate_N3, slow=own.slow_N3, table=own.table, sums=second,
-            launch_pdl=overlap,
-        )  # fmt: skip
-        find(second)
-        coarsest_kernel.stop_slow[blocks](
-            **pairs, **sizes, slow=own.slow_N3, table=own.table, launch_pdl=overlap
         )  # fmt: skip
 
 

@@ -20,12 +20,12 @@ import triton
 
 from hgn.config import CORRELATED_WAVELENGTHS, CORRELATED_WAVES, TrainingConfig
 from hgn.kernels.backward import FusedTrainingNetwork
-from hgn.kernels.barrier_table import BarrierHash
 from hgn.kernels.capture import captured
 from hgn.kernels.forward import feature_columns
 from hgn.kernels.grid.op import OBSTACLE_COLUMNS, OUT_OF_WINDOW, DeviceGrid, ObstacleHash, ObstacleTable, Window
 from hgn.kernels.muon.op import SquareBlocks
 from hgn.kernels.packing import pack_network
+from hgn.kernels.step.op import BarrierHash
 from hgn.kernels.update import kernel
 from hgn.network.hgn import HierarchicalGraphNetwork
 from hgn.scene.symmetry import Symmetry, Vector, drawn_symmetry
@@ -406,7 +406,7 @@ class Updates:
         config = self.config
         return DeviceGrid(
             self._window(), self.settings.scenes, capacities, self.particles, feature_columns(config),
-            config.cell_size, self.device, config.relative, config.rests,
+            config.cell_size, self.device, config.relative,
         )  # fmt: skip
 
     def _make_room(self, status: int, needed: list[int]) -> None:

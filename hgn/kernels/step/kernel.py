@@ -1,0 +1,435 @@
+"""A frame behind the network's output on the device: rest, integration, walls and obstacles.
+
+The rules are those of hgn.step.reference. A frame is taken only if nothing went wrong before it.
+Row of the barrier table of a scene, int64: addresses of the hash buckets of its cells (0: no obstacle), of their keys
+and of where their lists begin and end, the mask of the buckets, addresses of the lists and of the triangles' rows, and
+the bits of the cells' size in float32.
+Shape legend: N particles, K middles of coarsest or larger cells, T frames kept between two looks of the host.
+"""
+
+from __future__ import annotations
+
+import triton
+import triton.language as tl
+
+from hgn.kernels.bodies import body_of, coarsest_cells, cross, one_over, rotation, three_columns
+from hgn.kernels.cell_hash import find_cell
+from hgn.kernels.geometry import GEOMETRY_COLUMNS, lowest_middle, middles_around, split_slot
+from hgn.kernels.triton_compat import gdc_launch_dependents, gdc_wait, settle_keys
+from hgn.scene import barrier
+from hgn.step.reference import LEAST, SURE
+
+RATES = tl.constexpr(8)  # columns of what rest sums up and spreads
+SURELY, TINY = tl.constexpr(SURE), tl.constexpr(LEAST)
+BARRIER_COLUMNS = tl.constexpr(7)
+ROW = tl.constexpr(barrier.ROW)
+ONE = tl.constexpr(0x3F800000)  # its bits in float32
+NO_TRIANGLE = tl.constexpr(0x7FFFFFFF)
+DIVERGED = tl.constexpr(4)
+
+
+@triton.jit
+def _lowest(base_of, gate_of, spot_of, row, live):
+    """The slots of the lowest middles around particles, their gates, and their places from there, in edges."""
+    spot = three_columns(spot_of, row, 0, live, 1.0, 3)
+    return tl.load(base_of + row, mask=live, other=0), tl.load(gate_of + row, mask=live, other=0.0), spot
+
+
+@triton.jit
+def _add_bodies(sums, slot, place, weight, value, BODIES: tl.constexpr, COLUMNS: tl.constexpr):
+    """Adds values of particles and their moments to middles' sums [K, COLUMNS]: behind mass, places and their products
+    xx, yy, zz, yz, xz, xy with BODIES."""
+    at: tl.constexpr = 10 * BODIES
+    moment = cross(place, (value[0][:, None], value[1][:, None], value[2][:, None]))
+    column = tl.arange(0, COLUMNS)[None, None, :]
+    added = tl.zeros((slot.shape[0], 8, COLUMNS), tl.float32)
+    if BODIES:
+        added = tl.where(column == 0, weight[:, :, None], added)
+        for i in tl.static_range(3):
+            one, other = place[(i + 1) % 3], place[(i + 2) % 3]
+            added = tl.where(column == 1 + i, (weight * place[i])[:, :, None], added)
+            added = tl.where(column == 4 + i, (weight * place[i] * place[i])[:, :, None], added)
+            added = tl.where(column == 7 + i, (weight * one * other)[:, :, None], added)
+    for i in tl.static_range(3):
+        added = tl.where(column == at + i, (weight * value[i][:, None])[:, :, None], added)
+        added = tl.where(column == at + 3 + i, (weight * moment[i])[:, :, None], added)
+    # columns of zeros are added too, four at once
+    there = (weight > 0)[:, :, None] & (column < COLUMNS)
+    tl.atomic_add(sums + slot[:, :, None] * COLUMNS + column, added, mask=there, sem="relaxed")
+
+
+@triton.jit
+def _deforming(table, slot, place, weight, value):
+    """The part of values of particles that deforms what touches, by the middles' table [K, RATES]."""
+    there = weight > 0
+    base = three_columns(table, slot, 0, there, weight, RATES)
+    swing = cross(three_columns(table, slot, 4, there, weight, RATES), place)
+    factor = tl.sum(tl.load(table + slot * RATES + 3, mask=there, other=0.0) * weight, 1)
+    result = ()
+    for i in tl.static_range(3):
+        part = factor * value[i] - tl.sum(base[i] + swing[i], 1)
+        result = result + (part,)  # noqa: RUF005 - Triton knows no unpacking here
+    return result
+
+
+@triton.jit
+def _displaced(x, velocity, scale, row, live, OUT: tl.constexpr, HISTORY: tl.constexpr):
+    """The next displacements in units of `scale`: columns 0 to 2 of x [N, OUT] and the newest velocities."""
+    ax, ay, az = three_columns(x, row, 0, live, 1.0, OUT)
+    vx, vy, vz = three_columns(velocity, row, 0, live, 1 / tl.load(scale), 3 * HISTORY)
+    return ax + vx, ay + vy, az + vz
+
+
+@triton.jit
+def sum_displacements(
+    x, velocity, scale, material_of, coarsest_of, share_of, place_of, felt, slot_of_cell, geometry, low, base_of,
+    gate_of, spot_of, sums, particle_count,
+    OUT: tl.constexpr, HISTORY: tl.constexpr, LEVELS: tl.constexpr, SHIFT: tl.constexpr, RESTING: tl.constexpr,
+    COLUMNS: tl.constexpr, OVERLAP: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
+    """Adds the particles' bodies and next displacements, with their moments, to the sums [K, COLUMNS] of the middles
+    around them, between cells 2^SHIFT times as large as coarsest ones. The lowest of these slots goes into `base_of`
+    [N], the place from there into `spot_of` [N, 3], and the gate into `gate_of` [N]: 0 for materials whose bit is not
+    in RESTING; with -1 all are.
+
+    Reference: hgn.step.reference.Deformation; test: tests/kernels/test_relative.py.
+    """
+    row = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    live = row < tl.load(particle_count)
+    line = geometry + (LEVELS - 1) * GEOMETRY_COLUMNS
+    cell, share = coarsest_cells(coarsest_of, share_of, row, live)
+    gate = tl.sum(share * tl.load(felt + cell * 2 + 1, mask=cell >= 0, other=0.0), 1)
+    if RESTING != -1:
+        gate *= (RESTING >> tl.load(material_of + row, mask=live, other=0) & 1).to(tl.float32)
+    own = tl.load(coarsest_of + row * 8, mask=live, other=-1)
+    local = tl.load(slot_of_cell + tl.load(line + 6) + own, mask=own >= 0, other=0)
+    ny, nz, stride = tl.load(line + 2), tl.load(line + 3), tl.load(line + 4)
+    scene, kx, ky, kz = split_slot(local, ny, nz, stride)
+    bx, x_spot = lowest_middle(kx, 0, low, place_of, row, live, LEVELS, SHIFT)
+    by, y_spot = lowest_middle(ky, 1, low, place_of, row, live, LEVELS, SHIFT)
+    bz, z_spot = lowest_middle(kz, 2, low, place_of, row, live, LEVELS, SHIFT)
+    base, spot = scene * stride + (bx * ny + by) * nz + bz, (x_spot, y_spot, z_spot)
+    base, gate = tl.where(own >= 0, base, 0), tl.where(own >= 0, gate, 0.0)
+    slot, place, weight = middles_around(base, gate, spot, geometry, LEVELS)
+    if OVERLAP:
+        gdc_wait()
+        gdc_launch_dependents()
+    tl.store(base_of + row, base, mask=live)
+    tl.store(gate_of + row, gate, mask=live)
+    for i in tl.static_range(3):
+        tl.store(spot_of + row * 3 + i, spot[i], mask=live)
+    value = _displaced(x, velocity, scale, row, live, OUT, HISTORY)
+    _add_bodies(sums, slot, place, weight, value, True, COLUMNS)
+
+
+@triton.jit
+def find_deformation(
+    bodies, sums, table, count,
+    AT: tl.constexpr, COLUMNS: tl.constexpr, BODIES: tl.constexpr, OVERLAP: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
+    """From a field's sums [K, COLUMNS] at the middles of cells, from column AT on, and `bodies` [K, BODIES] to
+    their table [K, RATES]: what is subtracted there, the factor of a particle's own in column 3, and the rate of
+    rotation that is subtracted in columns 4 to 6.
+
+    Reference: hgn.step.reference.Deformation; test: tests/kernels/test_relative.py.
+    """
+    middle = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    there = middle < count
+    if OVERLAP:
+        gdc_wait()
+        gdc_launch_dependents()
+    inverse = one_over(tl.load(bodies + middle * BODIES, mask=there, other=0.0))
+    x, y, z, inertia = body_of(bodies + 1, middle, there, inverse, BODIES)
+    centre = (x, y, z)
+    mean = three_columns(sums, middle, AT, there, inverse, COLUMNS)
+    moment = three_columns(sums, middle, AT + 3, there, inverse, COLUMNS)
+    lever = cross(centre, mean)
+    known, wx, wy, wz = rotation(inertia, moment[0] - lever[0], moment[1] - lever[1], moment[2] - lever[2])
+    share = 1 / tl.maximum(known, SURELY)
+    turn = (share * wx, share * wy, share * wz)
+    lever = cross(turn, centre)
+    line = table + middle * RATES
+    for i in tl.static_range(3):
+        tl.store(line + i, share * known * mean[i] - lever[i], mask=there)
+        tl.store(line + 4 + i, turn[i], mask=there)
+    tl.store(line + 3, share * known, mask=there)
+
+
+@triton.jit
+def slow_displacements(
+    x, velocity, scale, scene_of, gravity, threshold, slow, table, base_of, gate_of, spot_of, geometry, sums,
+    particle_count,
+    OUT: tl.constexpr, HISTORY: tl.constexpr, LEVELS: tl.constexpr, OVERLAP: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
+    """Writes the slow part of the deformation by the middles' table into `slow` [N, 3], and adds it with its moments to
+    the sums [K, RATES].
+
+    Reference: hgn.step.reference.rest; test: tests/kernels/test_relative.py.
+    """
+    row = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    live = row < tl.load(particle_count)
+    value = _displaced(x, velocity, scale, row, live, OUT, HISTORY)
+    scene = tl.load(scene_of + row, mask=live, other=0)
+    gx, gy, gz = three_columns(gravity, scene, 0, live, threshold / tl.load(scale), 3)
+    limit = gx * gx + gy * gy + gz * gz
+    if OVERLAP:
+        gdc_wait()
+        gdc_launch_dependents()
+    base, gate, spot = _lowest(base_of, gate_of, spot_of, row, live)
+    slot, place, weight = middles_around(base, gate, spot, geometry, LEVELS)
+    d = _deforming(table, slot, place, weight, value)
+    ratio = (d[0] * d[0] + d[1] * d[1] + d[2] * d[2]) / tl.maximum(limit, TINY)
+    phi = tl.where(limit > 0, tl.minimum(tl.maximum(2 - ratio, 0.0), 1.0), 0.0)
+    stopped = ()
+    for i in tl.static_range(3):
+        stopped = stopped + (phi * d[i],)  # noqa: RUF005 - Triton knows no unpacking here
+        tl.store(slow + row * 3 + i, stopped[i], mask=live)
+    _add_bodies(sums, slot, place, weight, stopped, False, RATES)
+
+
+@triton.jit
+def stop_slow(
+    x, slow, table, base_of, gate_of, spot_of, geometry, particle_count,
+    OUT: tl.constexpr, LEVELS: tl.constexpr, OVERLAP: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
+    """Takes what of `slow` [N, 3] deforms, by the middles' table, off columns 0 to 2 of x [N, OUT].
+
+    Reference: hgn.step.reference.Deformation; test: tests/kernels/test_relative.py.
+    """
+    row = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    live = row < tl.load(particle_count)
+    base, gate, spot = _lowest(base_of, gate_of, spot_of, row, live)
+    slot, place, weight = middles_around(base, gate, spot, geometry, LEVELS)
+    own = three_columns(x, row, 0, live, 1.0, OUT)
+    value = three_columns(slow, row, 0, live, 1.0, 3)
+    if OVERLAP:
+        gdc_wait()
+        gdc_launch_dependents()
+    part = _deforming(table, slot, place, weight, value)
+    for i in tl.static_range(3):
+        tl.store(x + row * OUT + i, own[i] - part[i], mask=live)
+
+
+# walls and obstacles
+
+
+@triton.jit
+def _wall_limit(x, before, size, near, far):
+    """Whether a wall is in the way from `before` to x on an axis, and where it holds it."""
+    low, high = tl.where(before < near, before, near), tl.where(before > size - far, before, size - far)
+    inside = (x > -size) & (x < 2 * size)  # NaN is outside
+    return inside & ((x < low) | (x > high)), tl.where(x < low, low, high)
+
+
+@triton.jit
+def _between_walls(x, before, size, near, far, WALLED: tl.constexpr):
+    if WALLED:
+        stopped, limit = _wall_limit(x, before, size, near, far)
+        x = tl.where(stopped, limit, x)
+    return x
+
+
+@triton.jit
+def _distance(row, x, y, z, live):
+    """Before the plane that lies at `row`, and above 0 in front of it."""
+    across = tl.load(row, mask=live, other=0.0) * x + tl.load(row + 1, mask=live, other=0.0) * y
+    across += tl.load(row + 2, mask=live, other=0.0) * z
+    return across - tl.load(row + 3, mask=live, other=0.0)
+
+
+@triton.jit
+def _covers(row, x, y, z, live):
+    """Whether a triangle covers a place in its plane."""
+    inside = live & (x >= tl.load(row + 16, mask=live, other=0.0)) & (x <= tl.load(row + 20, mask=live, other=0.0))
+    inside = inside & (y >= tl.load(row + 17, mask=live, other=0.0)) & (y <= tl.load(row + 21, mask=live, other=0.0))
+    inside = inside & (z >= tl.load(row + 18, mask=live, other=0.0)) & (z <= tl.load(row + 22, mask=live, other=0.0))
+    for plane in tl.static_range(4, 16, 4):
+        inside = inside & (_distance(row + plane, x, y, z, inside) <= 0)
+    return inside
+
+
+@triton.jit
+def _first_stop(bx, by, bz, x, y, z, line, live, within, slack):
+    """Which ways from (bx, by, bz) to (x, y, z) a triangle stops; by how much their ends are to be shifted along which
+    unit normals; and the share of a way on which nothing is met."""
+    bits = tl.load(line + 6, mask=live, other=ONE)
+    cell_size = bits.to(tl.int32).to(tl.float32, bitcast=True)
+    span = tl.load(line + 2, mask=live, other=0).to(tl.pointer_type(tl.int32))
+    lists = tl.load(line + 4, mask=live, other=0).to(tl.pointer_type(tl.int32))
+    rows = tl.load(line + 5, mask=live, other=0).to(tl.pointer_type(tl.float32))
+    wx, wy, wz = x - bx, y - by, z - bz
+    length = tl.sqrt_rn(wx * wx + wy * wy + wz * wz)
+    pieces = tl.maximum(tl.ceil(tl.div_rn(length, cell_size)), 1.0)
+    piece, least, free = tl.zeros_like(x), tl.zeros_like(x) + 2.0, tl.zeros_like(x) + 1.0
+    first = tl.zeros_like(x).to(tl.int32) + NO_TRIANGLE
+    shift, sx, sy, sz = tl.zeros_like(x), tl.zeros_like(x), tl.zeros_like(x), tl.zeros_like(x)
+    while tl.max(live.to(tl.int32)) > 0:
+        share = tl.div_rn(piece + 0.5, pieces)  # at the piece's middle
+        cx = tl.floor(tl.div_rn(bx + share * wx, cell_size))
+        cy = tl.floor(tl.div_rn(by + share * wy, cell_size))
+        cz = tl.floor(tl.div_rn(bz + share * wz, cell_size))
+        cell = find_cell(cx, cy, cz, line, live)
+        entry = tl.load(span + 2 * cell, mask=cell >= 0, other=0)
+        end = tl.load(span + 2 * cell + 1, mask=cell >= 0, other=0)
+        ask = entry < end
+        while tl.max(ask.to(tl.int32)) > 0:
+            triangle = tl.load(lists + entry, mask=ask, other=0)
+            row = rows + triangle * ROW
+            nx, ny, nz = three_columns(rows, triangle, 0, ask, 1.0, ROW)
+            distance = nx * bx + ny * by + nz * bz - tl.load(row + 3, mask=ask, other=0.0)
+            side = tl.where(distance >= 0, 1.0, -1.0)
+            distance = side * distance
+            approach = -side * (nx * wx + ny * wy + nz * wz)
+            left = distance - approach
+            comes_near = ask & (approach > 0) & (left < within)
+            closing = tl.maximum(approach, 1e-30)
+            contact = tl.minimum(tl.maximum(tl.div_rn(distance - within, closing), 0.0), 1.0)
+            crossing = tl.minimum(tl.maximum(tl.div_rn(distance, closing), 0.0), 1.0)
+            meets = _covers(row, bx + contact * wx, by + contact * wy, bz + contact * wz, comes_near)
+            passing = comes_near & (left < 0) & (meets == 0)
+            crosses = _covers(row, bx + crossing * wx, by + crossing * wy, bz + crossing * wz, passing)
+            time = tl.where(meets, contact, crossing)
+            sooner = (time < least) | ((time == least) & (triangle < first))
+            sooner = sooner & (meets | crosses)
+            shift = tl.where(sooner, tl.minimum(distance, within) + slack - left, shift)
+            sx = tl.where(sooner, side * nx, sx)
+            sy = tl.where(sooner, side * ny, sy)
+            sz = tl.where(sooner, side * nz, sz)
+            free = tl.where(meets | crosses, tl.minimum(free, contact), free)
+            least, first = tl.where(sooner, time, least), tl.where(sooner, triangle, first)
+            entry += 1
+            ask = ask & (entry < end)
+        piece += 1.0
+        live = live & (piece < pieces)
+    return first < NO_TRIANGLE, shift, sx, sy, sz, free
+
+
+@triton.jit
+def _stopped_by_obstacles(
+    bx, by, bz, x, y, z, width, height, depth, line, live, within, slack, least_crease, near, far,
+    SURFACES: tl.constexpr, WALLED: tl.constexpr,
+):  # fmt: skip
+    """Where ways from (bx, by, bz) to (x, y, z) end, which are between the walls, in domains of so much width, height
+    and depth: up to SURFACES triangles stop one after the other, and walls, where WALLED, again; what a further one
+    stops ends where it meets one. `line` is the scenes' row of the barrier table; all are vectors of particles. What is
+    out of range is not held.
+
+    Triangles stop what comes within `within` of them, and put it farther by `slack`. Planes whose squared sine is at
+    most `least_crease` are one.
+    """
+    live = live & (x > -width) & (x < 2 * width) & (y > -height) & (y < 2 * height)
+    live = live & (z > -depth) & (z < 2 * depth)  # NaN is not
+    live = live & (tl.load(line, mask=live, other=0) != 0)
+    bx, by, bz = tl.where(live, bx, 0.0), tl.where(live, by, 0.0), tl.where(live, bz, 0.0)
+    ex, ey, ez = tl.where(live, x, 0.0), tl.where(live, y, 0.0), tl.where(live, z, 0.0)
+    ask, surface = live, tl.zeros_like(ex)
+    lx, ly, lz = tl.zeros_like(ex), tl.zeros_like(ex), tl.zeros_like(ex)  # the normals of the shifts before
+    while tl.max(ask.to(tl.int32)) > 0:
+        hit, shift, nx, ny, nz, free = _first_stop(bx, by, bz, ex, ey, ez, line, ask, within, slack)
+        ask = ask & hit
+        cosine = nx * lx + ny * ly + nz * lz
+        ax, ay, az = nx - cosine * lx, ny - cosine * ly, nz - cosine * lz  # along the last planes
+        square = ax * ax + ay * ay + az * az
+        crease = (cosine < 0) & (square > least_crease)
+        farther = tl.div_rn(shift, tl.maximum(square, least_crease))
+        mx = _between_walls(tl.where(crease, ex + farther * ax, ex + shift * nx), bx, width, near, far, WALLED)
+        my = _between_walls(tl.where(crease, ey + farther * ay, ey + shift * ny), by, height, near, far, WALLED)
+        mz = _between_walls(tl.where(crease, ez + farther * az, ez + shift * nz), bz, depth, near, far, WALLED)
+        slides = surface < SURFACES
+        ex = tl.where(ask, tl.where(slides, mx, bx + free * (ex - bx)), ex)
+        ey = tl.where(ask, tl.where(slides, my, by + free * (ey - by)), ey)
+        ez = tl.where(ask, tl.where(slides, mz, bz + free * (ez - bz)), ez)
+        lx, ly, lz = nx, ny, nz
+        ask = ask & slides
+        surface += 1.0
+    return tl.where(live, ex, x), tl.where(live, ey, y), tl.where(live, ez, z)
+
+
+@triton.jit
+def integrate(
+    output, position, velocity, scene_of, domain, gravity, mean, std, particle_count, status, lost, frame, path,
+    near, far, barrier_table, within, slack, least_crease, OUT: tl.constexpr, HISTORY: tl.constexpr,
+    COLUMNS: tl.constexpr, WALLED_AXES: tl.constexpr, SURFACES: tl.constexpr, OVERLAP: tl.constexpr,
+    BLOCK: tl.constexpr,
+):  # fmt: skip
+    """v += a, x += v, and the new positions into path [T, N, 3] at `frame`; a is gravity and the restored output.
+
+    Where the status is not zero, nothing changes. Particles that are not finite or farther from the domain than its
+    own size are counted in `lost`, once an axis; `advance` then ends the simulation. All others stay between the
+    walls of the first WALLED_AXES axes, `near` and `far` from the planes, and, with SURFACES, outside the obstacles of
+    `barrier_table`, see `_stopped_by_obstacles`.
+
+    Reference: hgn.step.reference.advanced; test: tests/kernels/test_rollout.py, tests/kernels/test_barriers.py.
+    """
+    if OVERLAP:
+        gdc_wait()
+        gdc_launch_dependents()
+    count = tl.load(particle_count)
+    if tl.program_id(0) * BLOCK >= count:
+        return
+    if tl.load(status) != 0:
+        return
+    row = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    column = tl.arange(0, COLUMNS)[None, :]  # of the velocities, newest first: a particle's lie side by side
+    axis, newest = column % 3, column < 3
+    live = (row < count)[:, None] & (column < 3 * HISTORY)
+    live_axis = live & newest
+    entry = row[:, None] * 3 + axis
+    at = velocity + row[:, None] * (3 * HISTORY) + column
+    v = tl.load(at - tl.where(newest, 0, 3), mask=live, other=0.0)
+    a = tl.load(output + row[:, None] * OUT + axis, mask=live_axis, other=0.0)
+    a = a * tl.load(std + axis) + tl.load(mean + axis)
+    scene = tl.load(scene_of + row, mask=row < count, other=0)
+    a += tl.load(gravity + scene[:, None] * 3 + axis, mask=live_axis, other=0.0)
+    v = tl.where(newest, v + a, v)
+    before = tl.load(position + entry, mask=live_axis, other=0.0)
+    x = before + v
+    size = tl.load(domain + scene[:, None] * 3 + axis, mask=live_axis, other=1.0)
+    inside = (x > -size) & (x < 2 * size)  # NaN is outside
+    if WALLED_AXES > 0:
+        stopped, limit = _wall_limit(x, before, size, near, far)
+        stopped = stopped & live_axis & (axis < WALLED_AXES)
+        v = tl.where(stopped, limit - before, v)
+        x = tl.where(stopped, limit, x)
+    if SURFACES > 0:
+        bx, by, bz = three_columns(position, row, 0, row < count, 1.0, 3)
+    now = tl.load(frame).to(tl.int64)
+    tl.debug_barrier()  # all have read before one writes
+    tl.store(at, v, mask=live)
+    tl.store(position + entry, x, mask=live_axis)
+    tl.store(path + now * count * 3 + entry, x, mask=live_axis)
+    outside = tl.sum(tl.sum((live_axis & (inside == 0)).to(tl.int32), 1), 0)
+    if outside > 0:
+        tl.atomic_add(lost, outside)
+    if SURFACES > 0:
+        tl.debug_barrier()  # what other threads wrote is read: as columns of the above, each number would be in 16
+        x, y, z = three_columns(position, row, 0, row < count, 1.0, 3)
+        width, height, depth = three_columns(domain, scene, 0, row < count, 1.0, 3)
+        line = barrier_table + scene * BARRIER_COLUMNS
+        ends = _stopped_by_obstacles(
+            bx, by, bz, x, y, z, width, height, depth, line, row < count, within, slack, least_crease, near, far,
+            SURFACES, WALLED_AXES > 0,
+        )  # fmt: skip
+        begins, free = (bx, by, bz), (x, y, z)
+        for k in tl.static_range(3):
+            moved = (row < count) & (ends[k] != free[k])
+            tl.store(position + row * 3 + k, ends[k], mask=moved)
+            tl.store(path + now * count * 3 + row * 3 + k, ends[k], mask=moved)
+            tl.store(velocity + row * (3 * HISTORY) + k, ends[k] - begins[k], mask=moved)
+
+
+@triton.jit
+def advance(status, lost, frame, OVERLAP: tl.constexpr):
+    """Counts the frame, unless it was not taken.
+
+    Reference: hgn.runtime.stepped_rollout; test: tests/kernels/test_rollout.py.
+    """
+    if OVERLAP:
+        gdc_wait()
+    if tl.load(status) == 0:
+        tl.store(frame, tl.load(frame) + 1)
+        if tl.load(lost) > 0:
+            tl.store(status, DIVERGED)
+
+
+settle_keys(globals())

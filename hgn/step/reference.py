@@ -1,0 +1,356 @@
+"""The constraints of a frame in PyTorch: rest, walls and obstacles; the reference of the backend triton.
+
+Each stage takes what the stage before returns:
+
+    Prediction --rested--> accelerations --moved--> FreeMotion --constrained--> Motion --next_state--> ParticleState
+
+docs/concepts/constraints.md derives them. P of **rest** is sum_K w_pK min(1, 2 q_K) (value_p - mean_K - Omega_K x y_p):
+K are the middles of coarsest cells, w_pK trilinear weights times the particle's gate sum_C w_pC t_C; mean, rate of
+rotation Omega_K and centre of mass are those with these weights, and q_K says how well rotation is known (`rotation`).
+With the next displacement u = v + a and d = P u accelerations become a - P (phi d), where phi = 2 - |d|^2 /
+(threshold |g|)^2 within 0 and 1. The same follows between cells of four times that size, with what the first has left;
+FRICTIONLESS materials are not part of it.
+
+**Obstacles**: exactly on a plane a particle keeps to the side of the normal. Ways are stopped SLACK of the clearance
+nearer than they end, so that for rounding no triangle stops one twice.
+Shape legend: N particles, C coarsest cells, K middles of cells, F triangles, P pairs of particles and triangles.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import nn
+from torch.compiler import is_exporting
+
+from hgn.network.barriers import Barriers
+from hgn.network.base import ParticleNetwork, Prediction
+from hgn.network.cell_keys import COORDINATE_LIMIT, LARGEST_EXPORTED, find, pack, unique, unpack
+from hgn.network.features import ParticleState
+from hgn.network.grid import CORNER_83, GridHierarchy
+from hgn.network.relative import SMALLEST_MASS, coarsest_cells, coarsest_places, inertia, rotation
+from hgn.step_config import StepConfig
+
+SURE = 0.5  # q from which on rotation counts as known
+LEAST = 1e-30  # of a limit squared
+REST_SIZES, LEVEL_SHIFT = 2, 2  # sizes of cells, and the shift from one to the next: 2^LEVEL_SHIFT times as large
+FRICTIONLESS = ("water",)  # materials that do not rest between the larger cells
+SLACK = 0.02  # of the clearance; a particle that begins nearer is moved away by that when a frame brings it nearer
+SURFACES = 3  # triangles that move the end of one way; where a further one stops it, it ends there
+LEAST_CREASE = 1e-4  # squared sine of the angle between two planes, below which they are one
+
+
+@dataclass(frozen=True, eq=False)
+class FreeMotion:
+    """Positions and velocities [N, 3] after a frame without walls and obstacles."""
+
+    position_N3: torch.Tensor
+    velocity_N3: torch.Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """Positions and velocities [N, 3] after a frame."""
+
+    position_N3: torch.Tensor
+    velocity_N3: torch.Tensor
+
+
+def accelerations(
+    network: ParticleNetwork, state: ParticleState, prediction: Prediction, step: StepConfig | None = None
+) -> torch.Tensor:
+    """Returns accelerations [N, 3] in frame units with the rest of `step`, by default `network.step`."""
+    return network.restored_acceleration(rested(network, state, prediction, step), state)
+
+
+class Accelerations(nn.Module):
+    """`accelerations` as a module of a state, for graphs and gradients."""
+
+    def __init__(self, network: ParticleNetwork) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(self, state: ParticleState) -> torch.Tensor:
+        return accelerations(self.network, state, self.network.prediction(state))
+
+
+def rested(
+    network: ParticleNetwork, state: ParticleState, prediction: Prediction, step: StepConfig | None = None
+) -> torch.Tensor:
+    """Returns the network's normalised accelerations [N, 3] with the rest of `step`, by default `network.step`."""
+    step = network.step if step is None else step
+    if not step.rests:
+        return prediction.acceleration_N3
+    assert prediction.contacts is not None and prediction.grid is not None
+    scale = network.normaliser.acceleration_std[0]
+    widely_M = torch.tensor(rests_widely(network.config.materials), dtype=scale.dtype, device=scale.device)
+    touched_C = prediction.contacts.touched_C
+    return rest(prediction.acceleration_N3, state, touched_C, prediction.grid, step.rest_threshold, scale, widely_M)
+
+
+def advanced(state: ParticleState, acceleration_N3: torch.Tensor, step: StepConfig, dimensions: int) -> ParticleState:
+    """Returns the state after a frame with these accelerations in frame units."""
+    return next_state(state, constrained(state, moved(state, acceleration_N3), step, dimensions))
+
+
+def moved(state: ParticleState, acceleration_N3: torch.Tensor) -> FreeMotion:
+    """Integrates a frame: v += a, x += v."""
+    velocity_N3 = state.velocity_NM3[:, 0] + acceleration_N3
+    return FreeMotion(state.position_N3 + velocity_N3, velocity_N3)
+
+
+def constrained(state: ParticleState, motion: FreeMotion, step: StepConfig, dimensions: int) -> Motion:
+    """Applies walls, then obstacles. `state` is the one before the frame. A changed position changes the velocity.
+
+    Particles that are not `within_range` stay as they are, so that divergence shows in their positions.
+    """
+    position_N3 = motion.position_N3
+    if step.wall_clearance is None and step.obstacle_clearance is None:
+        return Motion(position_N3, motion.velocity_N3)
+    if step.wall_clearance is not None:
+        position_N3 = _walled(state, position_N3, step.wall_clearance, dimensions)
+    if step.obstacle_clearance is not None and state.barriers is not None:
+        position_N3 = _outside_obstacles(state, position_N3, step, dimensions, state.barriers)
+    changed_N3 = position_N3 != motion.position_N3
+    return Motion(position_N3, torch.where(changed_N3, position_N3 - state.position_N3, motion.velocity_N3))
+
+
+def next_state(state: ParticleState, motion: Motion) -> ParticleState:
+    """Returns the state after a motion. Velocity is kept as state, not as a difference of positions."""
+    history_NM3 = torch.cat([motion.velocity_N3[:, None], state.velocity_NM3[:, :-1]], dim=1)
+    return replace(state, position_N3=motion.position_N3, velocity_NM3=history_NM3)
+
+
+def within_range(position_N3: torch.Tensor, domain_N3: torch.Tensor) -> torch.Tensor:
+    """Whether coordinates are finite and no farther from the domain than its own size, bool [N, 3]."""
+    return (position_N3 > -domain_N3) & (position_N3 < 2 * domain_N3)
+
+
+# rest
+
+
+class Deformation:
+    """P of a grid whose coarsest cells are `touched_C`, between cells 2^shift times as large as these, of the particles
+    that `share_N` is 1 for: called with a field [N, 3], it gives the part that deforms.
+    """
+
+    def __init__(
+        self, touched_C: torch.Tensor, grid: GridHierarchy, shift: int = 0, share_N: torch.Tensor | None = None
+    ) -> None:
+        cell_N8, corner_83 = coarsest_cells(grid), CORNER_83.to(grid.cell_N8)
+        gate_N = (grid.weight_N8 * touched_C[cell_N8]).sum(1)
+        if share_N is not None:
+            gate_N = share_N * gate_N
+        scene_N, coordinate_N3 = unpack(grid.levels[-1].key_C[cell_N8[:, 0]])
+        place_N3 = coarsest_places(grid)[:, 0]
+        low_N3 = torch.floor(place_N3)
+        low_N3, place_N3 = coordinate_N3 + low_N3.long(), place_N3 - low_N3
+        wide_N3 = low_N3 >> shift
+        key_N8 = pack(scene_N[:, None], wide_N3[:, None] + corner_83)
+        key_K, self.middle_N8 = unique(key_N8)
+        self.count = key_K.shape[0]
+        self.place_N83 = ((low_N3 - (wide_N3 << shift) + place_N3) / 2**shift)[:, None] - corner_83
+        self.weight_N8 = gate_N[:, None] * (1 - self.place_N83.abs()).prod(-1)
+        square_N89 = (self.place_N83[..., :, None] * self.place_N83[..., None, :]).flatten(2)
+        sum_KX = self._sums(torch.cat([torch.ones_like(square_N89[..., :1]), self.place_N83, square_N89], -1))
+        self.mass_K1 = sum_KX[:, :1].clamp(min=SMALLEST_MASS)
+        self.centre_K3, square_K9 = (sum_KX[:, 1:] / self.mass_K1).split([3, 9], 1)
+        spread_K33 = square_K9.unflatten(1, (3, 3)) - self.centre_K3[:, :, None] * self.centre_K3[:, None, :]
+        self.inertia_K33 = inertia(spread_K33)
+
+    def __call__(self, value_N3: torch.Tensor) -> torch.Tensor:
+        value_N83 = value_N3[:, None].expand_as(self.place_N83)
+        sum_K6 = self._sums(torch.cat([value_N83, torch.linalg.cross(self.place_N83, value_N83)], -1))
+        mean_K3, moment_K3 = (sum_K6 / self.mass_K1).split(3, 1)
+        known_K, turn_K3 = rotation(self.inertia_K33, moment_K3 - torch.linalg.cross(self.centre_K3, mean_K3))
+        share_K = 1 / known_K.clamp(min=SURE)
+        factor_N81 = (share_K * known_K)[self.middle_N8][..., None]
+        turn_N83 = (share_K[:, None] * turn_K3)[self.middle_N8]
+        place_N83 = self.place_N83 - self.centre_K3[self.middle_N8]
+        part_N83 = factor_N81 * (value_N83 - mean_K3[self.middle_N8]) - torch.linalg.cross(turn_N83, place_N83)
+        return (self.weight_N8[..., None] * part_N83).sum(1)
+
+    def _sums(self, value_N8X: torch.Tensor) -> torch.Tensor:
+        """With the weights, [K, X]."""
+        value_N8X = self.weight_N8[..., None] * value_N8X
+        sum_KX = value_N8X.new_zeros(self.count, value_N8X.shape[-1])
+        return sum_KX.index_add(0, self.middle_N8.flatten(), value_N8X.flatten(0, 1))
+
+
+def rest(
+    acceleration_N3: torch.Tensor,
+    state: ParticleState,
+    touched_C: torch.Tensor,
+    grid: GridHierarchy,
+    threshold: float,
+    scale: torch.Tensor,
+    widely_M: torch.Tensor,
+) -> torch.Tensor:
+    """Returns accelerations less gravity, as `balanced` gives them, without slow deformations, [N, 3], in units of the
+    normaliser's `scale`. `widely_M` is 1 for the materials that rest between larger cells, too.
+    """
+    widely_N = widely_M[state.material_N]
+    limit_N = ((threshold / scale) ** 2 * state.gravity_S3.square().sum(-1))[state.scene_N]
+    for level in range(REST_SIZES):
+        deformation = Deformation(touched_C, grid, level * LEVEL_SHIFT, widely_N if level else None)
+        # gravity, which is the same for all of a scene, is no part of a deformation
+        rate_N3 = deformation(acceleration_N3 + state.velocity_NM3[:, 0] / scale)
+        acceleration_N3 = acceleration_N3 - deformation(slow(rate_N3, limit_N))
+    return acceleration_N3
+
+
+def rests_widely(materials: tuple[str, ...]) -> list[bool]:
+    """Returns whether each material rests between cells larger than the coarsest, too."""
+    return [name not in FRICTIONLESS for name in materials]
+
+
+def slow(rate_N3: torch.Tensor, limit_N: torch.Tensor) -> torch.Tensor:
+    """phi d of d and of the threshold's square, which may be 0."""
+    ratio_N = rate_N3.square().sum(-1) / limit_N.clamp(min=LEAST)
+    return torch.where(limit_N > 0, (2 - ratio_N).clamp(0, 1), 0)[:, None] * rate_N3
+
+
+# walls and obstacles
+
+
+def _walled(
+    state: ParticleState, position_N3: torch.Tensor, clearance: tuple[float, float], dimensions: int
+) -> torch.Tensor:
+    near, far = clearance
+    before_N3, domain_N3 = state.position_N3, state.domain_S3[state.scene_N]
+    low_N3 = torch.where(before_N3 < near, before_N3, near)
+    high_N3 = torch.where(before_N3 > domain_N3 - far, before_N3, domain_N3 - far)
+    walled_3 = torch.arange(3, device=position_N3.device) < dimensions
+    stopped_N3 = ((position_N3 < low_N3) | (position_N3 > high_N3)) & within_range(position_N3, domain_N3) & walled_3
+    limit_N3 = torch.where(position_N3 < low_N3, low_N3, high_N3)
+    return torch.where(stopped_N3, limit_N3, position_N3)
+
+
+def _outside_obstacles(
+    state: ParticleState, position_N3: torch.Tensor, step: StepConfig, dimensions: int, barriers: Barriers
+) -> torch.Tensor:
+    """Up to SURFACES triangles stop the straight way of a frame one after the other, and walls again.
+
+    Each shifts its end. Where that shift would bring the end nearer to the plane of the shift before, the end moves
+    along the crease of both planes instead, for from plane to plane a narrow gutter would take more shifts than these.
+    """
+    before_N3, domain_N3 = state.position_N3, state.domain_S3[state.scene_N]
+    lost_N1 = ~within_range(position_N3, domain_N3).all(-1, keepdim=True)
+    end_N3 = torch.where(lost_N1, before_N3, position_N3)
+    last_N3 = torch.zeros_like(end_N3)
+    for surface in range(SURFACES + 1):
+        hit_N, shift_N1, normal_N3, free_N1 = first_stop(barriers, before_N3, end_N3, state.scene_N)
+        if not is_exporting() and not bool(hit_N.any()):
+            break
+        if surface == SURFACES:
+            moved_N3 = before_N3 + free_N1 * (end_N3 - before_N3)
+        else:
+            moved_N3 = end_N3 + shift_N1 * _direction(normal_N3, last_N3)
+            if step.wall_clearance is not None:
+                moved_N3 = _walled(state, moved_N3, step.wall_clearance, dimensions)
+        end_N3 = torch.where(hit_N[:, None], moved_N3, end_N3)
+        last_N3 = torch.where(hit_N[:, None], normal_N3, last_N3)
+    return torch.where(lost_N1, position_N3, end_N3)
+
+
+def _direction(normal_N3: torch.Tensor, last_N3: torch.Tensor) -> torch.Tensor:
+    """Along the normals, or where that leads back across the last ones, along the last planes and by so much farther
+    that the distance from the new ones is the same.
+    """
+    cosine_N1 = (normal_N3 * last_N3).sum(-1, keepdim=True)
+    along_N3 = normal_N3 - cosine_N1 * last_N3
+    square_N1 = (along_N3 * along_N3).sum(-1, keepdim=True)
+    crease_N1 = (cosine_N1 < 0) & (square_N1 > LEAST_CREASE)
+    return torch.where(crease_N1, along_N3 / square_N1.clamp(min=LEAST_CREASE), normal_N3)
+
+
+def first_stop(
+    barriers: Barriers, before_N3: torch.Tensor, after_N3: torch.Tensor, scene_N: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Which ways a triangle stops, bool [N]; by how much their ends are to be shifted, [N, 1], and along which unit
+    normals, [N, 3]; and the share of a way on which nothing is met, [N, 1].
+
+    Shifts and normals are zero where nothing stops a way. Positions are finite. The way to a shifted end may be
+    stopped by another triangle.
+    """
+    particle_P, triangle_P = _pairs(barriers, before_N3, after_N3, scene_N)
+    row_P24 = barriers.row_F24.to(before_N3.dtype)[triangle_P]
+    before_P3, way_P3 = before_N3[particle_P], (after_N3 - before_N3)[particle_P]
+    normal_P3 = row_P24[:, :3]
+    distance_P = (normal_P3 * before_P3).sum(-1) - row_P24[:, 3]
+    side_P = torch.where(distance_P >= 0, 1.0, -1.0).to(distance_P.dtype)
+    distance_P = side_P * distance_P
+    approach_P = -side_P * (normal_P3 * way_P3).sum(-1)
+    end_P, closing_P = distance_P - approach_P, approach_P.clamp(min=1e-30)
+    within, slack = (1 - SLACK) * barriers.clearance, SLACK * barriers.clearance
+    contact_P = ((distance_P - within) / closing_P).clamp(0, 1)
+    crossing_P = (distance_P / closing_P).clamp(0, 1)
+    meets_P = _covers(row_P24, before_P3 + contact_P[:, None] * way_P3)
+    crosses_P = _covers(row_P24, before_P3 + crossing_P[:, None] * way_P3) & (end_P < 0)
+    stops_P = (approach_P > 0) & (end_P < within) & (meets_P | crosses_P)
+    time_P = torch.where(stops_P, torch.where(meets_P, contact_P, crossing_P), 2.0)
+    least_N = torch.full_like(before_N3[:, 0], 2.0).scatter_reduce(0, particle_P, time_P.detach(), "amin")
+    first_P = stops_P & (time_P == least_N[particle_P])
+    # of several at one time that of the least number
+    count, pairs = barriers.row_F24.shape[0], particle_P.shape[0]
+    number_P = torch.where(first_P, triangle_P, count)
+    number_N = torch.full_like(scene_N, count).scatter_reduce(0, particle_P, number_P, "amin")
+    first_P = first_P & (triangle_P == number_N[particle_P])
+    # the pair of each particle, a last one that moves nothing for the others
+    place_P = torch.where(first_P, torch.arange(pairs, device=scene_N.device), pairs)
+    pair_N = torch.full_like(scene_N, pairs).scatter_reduce(0, particle_P, place_P, "amin")
+    push_P4 = torch.cat([(distance_P.clamp(max=within) + slack - end_P)[:, None], side_P[:, None] * normal_P3], 1)
+    push_N4 = torch.cat([push_P4, before_N3.new_zeros(1, 4)])[pair_N]
+    free_P = torch.where(stops_P, contact_P, 1.0)
+    free_N = torch.ones_like(before_N3[:, 0]).scatter_reduce(0, particle_P, free_P, "amin")
+    return pair_N < pairs, push_N4[:, :1], push_N4[:, 1:], free_N[:, None]
+
+
+def _pairs(
+    barriers: Barriers, before_N3: torch.Tensor, after_N3: torch.Tensor, scene_N: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Particles and triangles int64 [P] among which are all that meet."""
+    if is_exporting():
+        return pairs_of_boxes(barriers, before_N3, after_N3)
+    before_N3, after_N3 = before_N3.detach(), after_N3.detach()
+    way_N3 = after_N3 - before_N3
+    pieces_N = torch.ceil(torch.linalg.vector_norm(way_N3, dim=-1) / barriers.cell_size).clamp(min=1)
+    particles, triangles = [scene_N[:0]], [scene_N[:0]]
+    for piece in range(int(pieces_N.max()) if len(pieces_N) else 0):
+        here_N = torch.nonzero(pieces_N > piece).flatten() if piece else torch.arange(len(way_N3)).to(scene_N)
+        share_N1 = ((piece + 0.5) / pieces_N[here_N])[:, None]
+        cell_N3 = torch.floor((before_N3[here_N] + share_N1 * way_N3[here_N]) / barriers.cell_size)
+        cell_N3 = cell_N3.clamp(-COORDINATE_LIMIT, COORDINATE_LIMIT - 1).long()
+        index_N, found_N = find(barriers.key_Q, pack(scene_N[here_N], cell_N3))
+        index_N, here_N = index_N[found_N], here_N[found_N]
+        count_N = barriers.start_Q[index_N + 1] - barriers.start_Q[index_N]
+        before = torch.repeat_interleave(count_N.cumsum(0) - count_N, count_N)
+        entry = torch.arange(len(before), device=before.device) - before
+        triangles.append(barriers.triangle_E[torch.repeat_interleave(barriers.start_Q[index_N], count_N) + entry])
+        particles.append(torch.repeat_interleave(here_N, count_N))
+    return torch.cat(particles), torch.cat(triangles)
+
+
+def pairs_of_boxes(
+    barriers: Barriers, before_N3: torch.Tensor, after_N3: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Those whose boxes meet: as a graph without loops has it, of one scene."""
+    low_N3, high_N3 = torch.minimum(before_N3, after_N3), torch.maximum(before_N3, after_N3)
+    low_F3, high_F3 = barriers.row_F24[:, 16:19], barriers.row_F24[:, 20:23]
+    meets_NF = (low_N3[:, None, 0] <= high_F3[None, :, 0]) & (high_N3[:, None, 0] >= low_F3[None, :, 0])
+    for axis in (1, 2):
+        meets_NF = meets_NF & (low_N3[:, None, axis] <= high_F3[None, :, axis])
+        meets_NF = meets_NF & (high_N3[:, None, axis] >= low_F3[None, :, axis])
+    particle_P, triangle_P = torch.nonzero(meets_NF, as_tuple=True)
+    if is_exporting():
+        torch._check(particle_P.shape[0] <= LARGEST_EXPORTED)
+    return particle_P, triangle_P
+
+
+def _covers(row_P24: torch.Tensor, place_P3: torch.Tensor) -> torch.Tensor:
+    """Whether a triangle covers a place in its plane, bool [P]."""
+    inside_P = ((place_P3 >= row_P24[:, 16:19]) & (place_P3 <= row_P24[:, 20:23])).all(-1)
+    for plane in (4, 8, 12):
+        inside_P = inside_P & ((row_P24[:, plane : plane + 3] * place_P3).sum(-1) <= row_P24[:, plane + 3])
+    return inside_P

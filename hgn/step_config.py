@@ -1,0 +1,45 @@
+"""The settings of the constraints of a frame; hgn.step implements them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from hgn.schema import NonNegative, Positive, require, require_bounds
+
+WallClearance = tuple[NonNegative[float], NonNegative[float]]
+
+
+@dataclass(frozen=True)
+class StepConfig:
+    """The constraints of simulated frames, which need no training (hgn.step). Lengths in domain units."""
+
+    # particles in contact that deform by less than this many |g| a frame stop; 0: none do
+    rest_threshold: NonNegative[float] = 0.0
+    # least distances from the domain's planes at the near sides (0) and at the far sides; null: no walls
+    wall_clearance: WallClearance | None = None
+    # least distance from an obstacle's triangles, which no particle passes; null: particles may pass
+    obstacle_clearance: Positive[float] | None = None
+
+    def __post_init__(self) -> None:
+        require_bounds(self)
+
+    @property
+    def rests(self) -> bool:
+        """Whether slow deformations stop."""
+        return self.rest_threshold > 0
+
+    @property
+    def in_training(self) -> StepConfig:
+        """The constraints of pushforward simulations: obstacles only, so that errors at rest and at walls show."""
+        return StepConfig(obstacle_clearance=self.obstacle_clearance)
+
+    def require_fits(self, relative: bool, dimensions: int) -> None:
+        """Raises ConfigError where a network with relative inputs or not cannot have these constraints."""
+        name, value = "step.rest_threshold", self.rest_threshold
+        require(not self.rests or relative, name, "0 with inputs=absolute", value)
+        require(not self.rests or dimensions == 3, name, "0 with dimensions=2", value)
+        fits = self.obstacle_clearance is None or dimensions == 3
+        require(fits, "step.obstacle_clearance", "null with dimensions=2", self.obstacle_clearance)
+
+
+UNCONSTRAINED = StepConfig()
