@@ -160,7 +160,9 @@ def test_flight_against_its_closed_form():
     assert not any(row.held for name, row in weak.items() if name != "gravity none, sand")
     drag = rows_of(Repeats(1.0, 0.005), ("throw",))
     thrown = drag["thrown at 3 a second, sand"]
-    assert not any(row.held for row in drag.values()) and thrown.more["kept"] < 0.995
+    frames = thrown.more["throws"]["+x"]["frames"]
+    assert not any(row.held for row in drag.values()) and frames > 5
+    assert thrown.more["throws"]["+x"]["kept"] == pytest.approx(0.995**frames, abs=2e-3)
 
 
 def test_relative_inputs_move_exactly():
@@ -218,6 +220,9 @@ def test_collapse_beside_the_solver():
     row = row_of(outcome_of(case, films, solver=films), {})
     truth = row.more["collapse"]
     assert row.held and truth == row.more["solver_collapse"] and len(truth) == 4
+    x_N, y_N, z_N = 64 * films[0].position_TN3[30].T.astype(np.float64)
+    expected = {"spread": np.sqrt(0.5 * (x_N.var() + z_N.var())), "height": y_N.mean()}
+    assert truth[0] == pytest.approx({"scene": 0, "frame": 30} | expected)
     assert truth[1]["spread"] > 1.5 * truth[0]["spread"] > 6  # it falls apart
     for field, factor in (("spread", 0.8), ("height", 1.6)):
         other = [record | {field: factor * record[field]} for record in truth]
@@ -281,8 +286,10 @@ def test_holes_beside_the_solver(through, leaked, beyond):
         ways = [[(0.52, 0.3), (0.9, 0.1), (0.9, 0.1)], [(0.6, 0.3), (0.5, 0.1), (0.5, 0.1)]]
         ways.append([(0.5, 0.3), (0.5, 0.6), (0.5, 0.6)])
         first, second = round(20 * through), round(20 * (through + leaked))
-        for some, way in zip((slice(first), slice(first, second), slice(second, None)), ways, strict=True):
-            path_TN3[1:, some, :2] = np.array(way)[:, None]
+        for axes, some, way in zip(
+            ((0, 1), (2, 1), (0, 1)), np.split(np.arange(20), (first, second)), ways, strict=True
+        ):
+            path_TN3[np.ix_((1, 2, 3), some, axes)] = np.array(way)[:, None]
         return RolloutResult(path_TN3)
 
     limits = PASSES[1:3]  # these particles fall faster than gravity says
@@ -420,7 +427,7 @@ def test_energy_growth_against_a_closed_form():
         (1.05, 0.05, 0.02, None),
         (1.0, 3.2, 0.0, "rest.drift"),
         (1.3, 0.0, 0.0, "rest.density"),
-        (0.4, 0.0, 0.0, "rest.density"),
+        (0.7, 0.0, 0.0, "rest.density"),
         (1.0, 0.12, 0.0, "rest.height"),
         (1.0, 0.0, 0.05, "rest.squared speed 0.0025, must be at most 0.0013 (solver 0.0004)"),
     ],
