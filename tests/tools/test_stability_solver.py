@@ -177,3 +177,12 @@ def test_edges():
         for steepness in (0.1, 0.3, 0.6):
             depth = np.clip(steepness * (end - np.arange(0, 12, 0.01) - 0.005), 0, None).reshape(12, 100).mean(axis=1)
             assert solver_validation.edge(depth, 0.25) == pytest.approx(end - 0.25 / steepness, abs=0.2)
+
+
+def test_slope_of_a_filled_wedge():
+    """The slope of randomly filled sand is that of its surface."""
+    for degrees in (17.0, 30.0):
+        scene = solver_validation.platform(degrees, 48)
+        place_N3 = scene.position_N3.astype(np.float64) / scene.cell_size - solver_validation.WALL
+        place_N3[:, 1] -= round(solver_validation.PIT * 48)
+        assert solver_validation.surface_slope(place_N3, 48) == pytest.approx(degrees, abs=0.7)
