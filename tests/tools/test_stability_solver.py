@@ -147,8 +147,8 @@ def test_extents():
 
 
 def test_published_columns():
-    """Low columns keep their height, of glass beads at most 0.74; that of sand is a power of the aspect. A cone of glass
-    beads has the volume of the column."""
+    """Low columns keep their height, of glass beads at most 0.74; that of sand is a power of the aspect. A cone
+    of glass beads has the volume of the column."""
     assert solver_validation.run_outs(0.5) == pytest.approx((0.62,)) and solver_validation.run_outs(
         4.0
     ) == pytest.approx((3.2,))
