@@ -18,7 +18,7 @@ PACKAGES = ("hgn", "datagen", "tools")
 LINES = {  # of Python, in tracked files
     "hgn": 27_600,
     "datagen": 8_340,
-    "tools": 6_400,
+    "tools": 6_250,
     "tests": 27_800,
 }
 SETTINGS = 275  # fields of the dataclasses behind the commands, *Config
@@ -48,7 +48,7 @@ MANY_POSITIONAL_ARGUMENTS: dict[str, int] = {
 }
 
 HEADLESS = re.compile(r"(What|Of|Whether|That|Those|These|How|Which|Whose|Where)\b")
-HEADLESS_DOCSTRINGS = {"hgn": 156, "datagen": 59, "tools": 59}
+HEADLESS_DOCSTRINGS = {"hgn": 156, "datagen": 59, "tools": 0}
 
 UNCOMMENTED: set[str] = {
     "MpmConfig.density_kg_m3",

@@ -9,27 +9,20 @@ import torch
 from docs.pages import run_module
 from network.states import network_of
 from PIL import Image
+from runtime.stability import family, one_particle, outcome_of
 
-from hgn.config import MpmConfig, NetworkConfig, SceneConfig
+from hgn.config import MpmConfig, SceneConfig
 from hgn.runtime.rollouts import RolloutResult
-from hgn.runtime.simulator import InitialState, Simulator
+from hgn.runtime.simulator import Simulator
 from hgn.runtime.weights import WeightsInfo, save_weights
-from hgn.scene.obstacle_grid import ObstacleGrid
-from tools.measures import neighbours
 from tools.stability import network, network_cases
-from tools.stability.case import Case, Limit, Outcome
-from tools.stability.checks import row_of, violation
-from tools.stability.measures import STIR_FRAMES, conserved, energy_growth, passed, pull, share_of_way
+from tools.stability.case import Case
+from tools.stability.measures import conserved, share_of_way
 from tools.stability.network import Runner, guard_row, main
 from tools.stability.network_cases import (
     DIRECTIONS,
-    FAMILIES,
     GRAVITIES,
-    PASSES,
-    RESTS,
-    SPREADS,
     WAY,
-    Context,
     cube,
     flight_frames,
     meeting,
@@ -59,18 +52,6 @@ def silence(some_network):
         some_network.decode.second.weight.zero_()
         some_network.decode.second.bias.zero_()
     return some_network
-
-
-def family(name, config, frames=300, solver=True, **scene):
-    """The cases of a family."""
-    return list(FAMILIES[name](Context(SceneConfig(**scene), config, 60.0, frames, 3000, solver)))
-
-
-def outcome_of(case, trials, simulator=None, solver=None):
-    scenes = [InitialState.of_scene(scene) for scene in case.scenes]
-    simulator = simulator or Simulator(network_of(), 60.0)
-    reference = None if solver is None else Outcome(case, scenes, solver, simulator)
-    return Outcome(case, scenes, trials, simulator, reference)
 
 
 def test_every_case_has_a_row(weights, tmp_path, monkeypatch, capsys):
@@ -160,7 +141,13 @@ def test_flight_against_its_closed_form():
     assert not any(row.held for name, row in weak.items() if name != "gravity none, sand")
     drag = rows_of(Repeats(1.0, 0.005), ("throw",))
     thrown = drag["thrown at 3 a second, sand"]
-    assert not any(row.held for row in drag.values()) and thrown.more["kept"] < 0.995
+    frames = thrown.more["throws"]["+x"]["frames"]
+    assert not any(row.held for row in drag.values()) and frames > 5
+    speed, change = 1.0, 0.0
+    for _ in range(frames):
+        change -= 0.005 * speed
+        speed += change
+    assert thrown.more["throws"]["+x"]["kept"] == pytest.approx(speed, abs=2e-3)
 
 
 def test_relative_inputs_move_exactly():
@@ -188,42 +175,6 @@ def test_flight_ends_before_the_walls():
                 assert ((place_N3 > 0.07) & (place_N3 < 0.93)).all() == clear or last == 60
 
 
-def failure(limits, own, solver):
-    """The first violation of limits, by figures of the network and of the solver."""
-    return next(filter(None, (violation(limit, own, solver, True) for limit in limits)), None)
-
-
-def test_limits():
-    """A limit bounds from both sides, absolutely or relative to the solver; NaN and missing figures violate it."""
-    limit = Limit("rest.height", -0.1, 0.2, below=1.0, above=2.0)
-    for value, passes in ((0.89, False), (0.91, True), (2.19, True), (2.21, False), (float("nan"), False)):
-        found = violation(limit, {"rest": {"height": value}}, {"rest": {"height": 1.0}}, True)
-        assert (found is None) == passes
-    assert found == "rest.height nan, must be 0.9 to 2.2 (solver 1)"
-    both = {"spread": [{"scene": 0, "frame": 3, "width": 1.0}, {"scene": 1, "frame": 3, "width": 4.0}]}
-    assert violation(Limit("spread.width", high=3.0), both, {}, False) == (
-        "spread.width (scene 1, frame 3) 4, must be at most 3"
-    )
-    assert violation(Limit("spread.width", low=0.5), both, {}, False) is None
-    assert "the solver did not come to the end" in str(violation(limit, both | {"rest": {}}, {"rest": None}, True))
-    assert "the network did not come to the end" in str(violation(limit, {"rest": None}, {}, False))
-
-
-def test_collapse_beside_the_solver():
-    """A cube of sand that spreads as the solver's passes; spread a fifth less, or a cell higher, it does not."""
-    (case,) = family("collapse", NetworkConfig(materials=("sand",)), frames=61, **SCENE)
-    assert case.frames == 61 and case.at_frames == (30, 60)
-    assert [scene.position_N3[:, 1].min() for scene in case.scenes] == pytest.approx([5 / 64, 20 / 64])
-    films = Runner(Simulator(network_of(), 60.0), [case], CPU)._solver(case.scenes, case.frames)
-    row = row_of(outcome_of(case, films, solver=films), {})
-    truth = row.more["collapse"]
-    assert row.held and truth == row.more["solver_collapse"] and len(truth) == 4
-    assert truth[1]["spread"] > 1.5 * truth[0]["spread"] > 6  # it falls apart
-    for field, factor in (("spread", 0.8), ("height", 1.6)):
-        other = [record | {field: factor * record[field]} for record in truth]
-        assert f"collapse.{field} (scene" in str(failure(SPREADS[1:3], {"collapse": other}, {"collapse": truth}))
-
-
 def test_funnels_have_holes_of_the_given_width():
     """Sheets leave a square hole at the height where particles are counted, with a cube above it that keeps the
     clearance. Without the solver, obstacles in the input, or enough frames there is no such case."""
@@ -249,73 +200,6 @@ def test_funnels_have_holes_of_the_given_width():
         assert scene.position_N3.mean(axis=0)[[0, 2]] == pytest.approx(middle_3[[0, 2]], abs=5e-3)
     assert not family("hole", network_of(obstacle_features=False).config)
     assert not family("hole", config, frames=149) and not family("hole", config, solver=False)
-
-
-def one_particle(**change):
-    (case, *_) = family("single", network_of().config)
-    return replace(case.scenes[0], **change)
-
-
-@pytest.mark.parametrize(
-    ("through", "leaked", "beyond"),
-    [
-        (0.7, 0.0, None),
-        (0.55, 0.15, None),
-        (0.55, 0.4, "passed.leaked (hole_cells 2.0) 0.4, must be at most 0.15 (solver 0.1)"),
-        (0.1, 0.0, "passed.through (hole_cells 2.0) 0.1, must be 0.5 to 0.9 (solver 0.7)"),
-        (1.0, 0.0, "passed.through (hole_cells 2.0) 1, must be 0.5 to 0.9 (solver 0.7)"),
-        (0.1, 0.6, "passed.through (hole_cells 2.0) 0.1, must be 0.5 to 0.9 (solver 0.7)"),
-    ],
-)
-def test_holes_beside_the_solver(through, leaked, beyond):
-    """Particles that cross the edge's height within the hole pass, others leak, and those that come back do neither.
-    At most a fifth of all may pass more or less than with the solver, and a twentieth more leak."""
-    still_N3 = np.zeros((20, 3), np.float32)
-    scene = one_particle(
-        position_N3=still_N3 + np.float32(0.5), velocity_N3=still_N3, material_N=np.zeros(20, np.uint8)
-    )
-
-    def falls(through, leaked):
-        """Through the hole at 0.4 and then far aside; or past it and then to the middle; or in and out again."""
-        path_TN3 = np.stack([scene.position_N3] * 4)
-        ways = [[(0.52, 0.3), (0.9, 0.1), (0.9, 0.1)], [(0.6, 0.3), (0.5, 0.1), (0.5, 0.1)]]
-        ways.append([(0.5, 0.3), (0.5, 0.6), (0.5, 0.6)])
-        first, second = round(20 * through), round(20 * (through + leaked))
-        for some, way in zip((slice(first), slice(first, second), slice(second, None)), ways, strict=True):
-            path_TN3[1:, some, :2] = np.array(way)[:, None]
-        return RolloutResult(path_TN3)
-
-    limits = PASSES[1:3]  # these particles fall faster than gravity says
-    case = Case("holes", (scene,) * 2, 4, limits, also=("pull",), hole_cells=(1.0, 2.0), hole_height=0.4)
-    own, solvers = [falls(0.0, 0.0), falls(through, leaked)], [falls(0.1, 0.0), falls(0.7, 0.1)]
-    row = row_of(outcome_of(case, own, solver=solvers), {})
-    hole = row.more["passed"][1]
-    assert hole == {"hole_cells": 2.0, "through": pytest.approx(through), "leaked": pytest.approx(leaked)}
-    assert row.held == (beyond is None) and (row.held or row.beyond == beyond)
-    assert row.more["pull"] == row.more["solver_pull"] == [None, None]  # four frames are fewer than a history
-    early = [own[0], RolloutResult(own[1].position_TN3[:3], "diverged at frame 3")]
-    row = row_of(outcome_of(case, early, solver=solvers), {})
-    assert not row.held and row.beyond == "diverged at frame 3" and row.more["passed"] is None
-    row = row_of(outcome_of(case, own, solver=early), {})
-    assert not row.held and row.beyond == "passed: the solver did not come to the end"
-    assert passed(outcome_of(case, early)) is None
-
-
-def test_pull_in_a_hole():
-    """Only particles in the hole of the solver's trajectory count: without contacts the network's fall with gravity,
-    whatever its parameters; the solver's hung there, or fell at half the acceleration."""
-    free = network_of(torch.float32, inputs="relative", obstacle_features=False)
-    place_N3 = np.array([[0.5, 0.4, 0.49], [0.51, 0.405, 0.5], [0.5, 0.6, 0.5], [0.8, 0.4, 0.5]], np.float32)
-    scene = one_particle(position_N3=place_N3, velocity_N3=0 * place_N3, material_N=np.zeros(4, np.uint8))
-    case = Case("passes holes", (scene,) * 2, 20, hole_cells=(2.0, 2.0), hole_height=0.4)
-    fall_T = 0.5 * scene.gravity[1] / 60**2 * np.arange(20.0) ** 2
-    paths = [np.stack([place_N3] * 20), np.stack([place_N3] * 20)]
-    paths[1][:, :2, 1] += (0.5 * (fall_T - fall_T[10]))[:, None]
-    films = [RolloutResult(path) for path in paths]
-    outcome = outcome_of(case, films, Simulator(free, 60.0), films)
-    assert pull(outcome) == [pytest.approx(1, abs=1e-3)] * 2
-    assert outcome.solver is not None
-    assert pull(outcome.solver) == [pytest.approx(0, abs=1e-3), pytest.approx(0.5, abs=1e-3)]
 
 
 @pytest.mark.parametrize(("wind", "held"), [(0.0, True), (-1e-3, False)])
@@ -401,67 +285,6 @@ def test_a_slope_against_a_closed_form():
         assert share_of_way(outcome_of(case, [RolloutResult(slid)])) == pytest.approx(share, rel=1e-3)
     low, high = slope.vertex_V3.min(0), slope.vertex_V3.max(0)
     assert ((slid.mean(1) >= low - 0.08) & (slid.mean(1) <= high + 0.08)).all()
-
-
-def test_energy_growth_against_a_closed_form():
-    """Free fall from rest adds no energy; a sudden throw upwards adds that of its speed."""
-    scene = one_particle()
-    case, time = Case("single", (scene,), 12), np.arange(12)[:, None, None] / 60
-    fall = scene.position_N3 + 0.5 * np.array(scene.gravity) * time**2
-    thrown = fall + np.array([0, 1.4, 0]) * time
-    found = [energy_growth(outcome_of(case, [RolloutResult(p.astype(np.float32))])) for p in (fall, thrown, thrown[:1])]
-    assert found == [pytest.approx(0, abs=1e-4), pytest.approx(0.5 * 1.4**2 / 9.8, rel=5e-3), 0]
-
-
-@pytest.mark.parametrize(
-    ("stretch", "shift", "stir", "beyond"),
-    [
-        (1.0, 0.0, 0.0, None),
-        (1.05, 0.05, 0.02, None),
-        (1.0, 3.2, 0.0, "rest.drift"),
-        (1.3, 0.0, 0.0, "rest.density"),
-        (0.4, 0.0, 0.0, "rest.density"),
-        (1.0, 0.12, 0.0, "rest.height"),
-        (1.0, 0.0, 0.05, "rest.squared speed 0.0025, must be at most 0.0013 (solver 0.0004)"),
-    ],
-)  # fmt: skip
-def test_rest_beside_the_solver(stretch, shift, stir, beyond):
-    """A lattice counts its neighbours by a closed form. Its drift may be twice the solver's plus a cell, its density
-    half to twice, its height 0.1 cells off, its squared speed about the mean twice the solver's plus a small floor."""
-    side, cell = 6, 1 / 64
-    lattice_N3 = 0.6 * cell * np.stack(np.meshgrid(*3 * [np.arange(side)]), -1).reshape(-1, 3)
-    lattice_N3 += 0.4 - lattice_N3.mean(axis=0)
-    assert neighbours(lattice_N3, 0.7 * cell) == pytest.approx(6 * (side - 1) / side)
-    assert neighbours(lattice_N3, 0.3 * cell) == neighbours(lattice_N3[:0], cell) == 0
-    empty = ObstacleGrid(cell, np.zeros((0, 3), np.int32), np.zeros((0, 3), np.float32))
-    still = 0 * lattice_N3
-    scene = InitialState(lattice_N3, still, np.full(len(still), 2), empty, (1.0, 1.0, 1.0), (0.0, 0.0, 0.0))
-    # at the end every other particle oscillates against the others, and all slide slowly together
-    every_other_N = np.where(np.arange(len(lattice_N3)) % 2, 1.0, -1.0)
-    back_T = np.arange(STIR_FRAMES + 1)[:, None] % 2
-
-    def path(stretch, shift_cells, stir, sideways_cells=0.0):
-        moved_3 = np.array([sideways_cells, shift_cells, 0.0]) * cell
-        last_TN3 = np.stack([0.4 + stretch * (lattice_N3 - 0.4) + moved_3] * len(back_T))
-        last_TN3[..., 0] += stir / 60 * back_T * every_other_N
-        last_TN3[..., 0] += 1e-4 * cell * np.arange(len(back_T))[:, None]
-        return RolloutResult(np.concatenate([[lattice_N3] * 3, last_TN3]).astype(np.float32))
-
-    own, solver = (
-        path(stretch, 0.0, stir, shift) if shift > 1 else path(stretch, shift, stir),
-        path(1.0, 0.0, 0.02, 1.0),
-    )
-    case, simulator = Case("64 frames", (), len(back_T) + 3, RESTS, settled=2), Simulator(network_of(), 60.0)
-
-    def row(own, solver):
-        return row_of(Outcome(case, [scene], [own], simulator, Outcome(case, [scene], [solver], simulator)), {})
-
-    found = row(own, solver)
-    assert found.held is (beyond is None) and (beyond is None or beyond in found.beyond), found
-    assert found.more["solver_rest"]["drift"] == pytest.approx(1.0, rel=2e-2)
-    assert found.more["rest"]["squared_speed"] == pytest.approx(stir**2, abs=1e-8)
-    assert found.more["solver_rest"]["squared_speed"] == pytest.approx(0.02**2, rel=1e-3)
-    assert not row(own, RolloutResult(own.position_TN3[:3], "diverged")).held
 
 
 def test_scenes_follow_the_network():

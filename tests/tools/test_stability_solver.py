@@ -146,10 +146,9 @@ def test_extents():
     assert front_cells(position) == pytest.approx(0.99 * 64 - 2)
 
 
-def test_what_is_published_of_columns():
-    """Low columns keep their top, glass beads no more than 0.74; from where it meets a column's own height on, sand's
-    is a power of the aspect, a third higher at aspect 4. A cone of glass beads holds what the column held.
-    """
+def test_published_columns():
+    """Low columns keep their height, of glass beads at most 0.74; that of sand is a power of the aspect. A cone
+    of glass beads has the volume of the column."""
     assert solver_validation.run_outs(0.5) == pytest.approx((0.62,)) and solver_validation.run_outs(
         4.0
     ) == pytest.approx((3.2,))
@@ -160,13 +159,13 @@ def test_what_is_published_of_columns():
     assert solver_validation.heights(4.0) == pytest.approx((0.74, 1.109), abs=1e-3)
 
 
-def test_a_room_that_is_too_small_is_said(monkeypatch):
-    """A column whose sand reaches the walls of its room is no measurement: the rows say so, and do not hold."""
-    monkeypatch.setattr(solver_validation, "COLUMN_ROOM", 0.7)
+def test_a_basin_that_is_too_small(monkeypatch):
+    """Rows of a column whose sand reaches the walls of the basin fail, with a note."""
+    monkeypatch.setattr(solver_validation, "COLUMN_SPACE", 0.7)
     monkeypatch.setattr(solver_validation, "COLUMN_WITHIN", 10.0)
     rows = list(solver_validation.column_rows(1.0, MpmConfig(device="cpu"), 6))
     assert [row.held for row in rows] == [False, False]
-    assert all("reached the walls of its room, 10 cells wide" in row.beyond for row in rows)
+    assert all("reached the walls of the basin, 10 cells wide" in row.beyond for row in rows)
 
 
 def test_edges():
@@ -177,3 +176,12 @@ def test_edges():
         for steepness in (0.1, 0.3, 0.6):
             depth = np.clip(steepness * (end - np.arange(0, 12, 0.01) - 0.005), 0, None).reshape(12, 100).mean(axis=1)
             assert solver_validation.edge(depth, 0.25) == pytest.approx(end - 0.25 / steepness, abs=0.2)
+
+
+def test_slope_of_a_filled_wedge():
+    """The slope of randomly filled sand is that of its surface."""
+    for degrees in (17.0, 30.0):
+        scene = solver_validation.platform(degrees, 48)
+        place_N3 = scene.position_N3.astype(np.float64) / scene.cell_size - solver_validation.WALL
+        place_N3[:, 1] -= round(solver_validation.PIT * 48)
+        assert solver_validation.surface_slope(place_N3, 48) == pytest.approx(degrees, abs=0.7)

@@ -110,6 +110,7 @@ def test_writes_tables_and_figures(tmp_path, monkeypatch, capsys):
         (("row.particles:,", "row.particle:,"), "table frames: LookupError: no 'particle' among case, particles"),
         (("row.mse['10']:?", "row.mse['10']:"), "table frames: LookupError: no '10' among"),
         (("row.ms:.2g", "row.mse:.2g"), "table frames: TypeError"),
+        (("row.check:?", "row.check:"), "table frames: ValueError: there is no value"),
         (("  chosen:", "  other:"), "has no table chosen; define it there or take the marker away"),
         (("bench.json", "none.json"), "FileNotFoundError: [Errno 2] No such file or directory: "),
         (("values:", "values:\n  more: '1'"), "no page has a marker for more"),
