@@ -67,7 +67,6 @@ UNMENTIONED: set[str] = {
     "MpmConfig.wall_cells",
     "ScalingConfig.rounds",
     "StabilitySolverConfig.grid_cells",
-    "TrainingConfig.log_every",
 }
 
 BYTES_OF_A_FILE = 500_000
