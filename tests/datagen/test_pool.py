@@ -189,7 +189,7 @@ def test_scene_that_fails_is_quarantined(make_config, backend, control, sign, ca
     assert recorder.messages == [f"train-000000 (seed {seed}) could not be simulated: {cause}; trying another seed"]
 
 
-def test_stop_keeps_what_is_staged(make_config, backend, control, threads):
+def test_stop_keeps_what_is_staged(make_config, backend, control):
     """A run that is asked to stop ends, and the next one simulates only what is left."""
     config = make_config()
     recorder = Recorder()
