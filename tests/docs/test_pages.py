@@ -120,12 +120,13 @@ def test_settings_exist():
         "mpm": config.MpmConfig,
         "dataset": config.DatasetConfig,
         "network": config.NetworkConfig,
+        "step": config.StepConfig,
         "training": config.TrainingConfig,
     }
     checked = 0
     for page in OWN_PAGES:
         for code in CODE.findall("\n".join(line for _, line in prose_lines(page))):
-            for group, name in re.findall(r"(?<![\w./])(scene|mpm|dataset|network|training)\.([a-z]\w*)", code):
+            for group, name in re.findall(r"(?<![\w./])(scene|mpm|dataset|network|step|training)\.([a-z]\w*)", code):
                 if name not in ("py", "md", "yaml"):
                     fields = [field.name for field in dataclasses.fields(groups[group])]
                     assert name in fields, f"{page.relative_to(ROOT)}: {group}.{name}"
