@@ -85,6 +85,7 @@ def triton_updates(
     """Makes training updates of so many scenes, each of a copy of the network; without jitter if `noise_std` is 0."""
     from hgn.kernels.update.op import Updates, UpdateSettings  # loads Triton
 
+    assert isinstance(network, HierarchicalGraphNetwork)
     noise_std = TrainingConfig.noise_std if noise_std is None else noise_std
     return partial(
         Updates,

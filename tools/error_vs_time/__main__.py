@@ -92,7 +92,8 @@ def main(mapping: dict[str, Any]) -> int:
         solver.launches.add(solver.setting)
     limit = None if config.seconds is None else started + COMPILING_FRACTION * config.seconds
     with _precompilation(networks, episodes, device, limit):
-        references, left_out = episodes, {}
+        references: Sequence[Episode] = episodes
+        left_out: dict[str, str] = {}
         if config.resimulate:
             references, left_out = resimulated(episodes, launches(own_grid), REFERENCE_STEP)
         references = [replace(e, position_TN3=np.asarray(e.position_TN3[:frames])) for e in references]

@@ -155,7 +155,7 @@ class Runner:
             solver = Outcome(case, initial, self._solver(case.scenes, case.frames), self.simulator)
         if case.upright:
             upright = self._straight(case), self._solver(case.upright, case.frames)
-        more = {"growths": backend.growths - growths, "kernels_compiled": self.compiled() - compiled}
+        more: dict[str, Any] = {"growths": backend.growths - growths, "kernels_compiled": self.compiled() - compiled}
         more |= {"ms": clock.milliseconds()} if case.reported is None else {}
         more["seconds"] = time.monotonic() - started
         return row_of(Outcome(case, initial, trials, self.simulator, solver, upright), more), trials

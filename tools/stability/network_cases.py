@@ -185,7 +185,7 @@ def fast_groups(context: Context) -> Iterator[Case]:
 def single_particles(context: Context) -> Iterator[Case]:
     for material in context.scene.materials:
         scene = body(context.scene, material, 0.5 * np.array([context.scene.domain_size]), np.zeros(3))
-        known = {"known_3": context.scene.gravity, "known_frames": FALL_FRAMES}
+        known: dict[str, Any] = {"known_3": context.scene.gravity, "known_frames": FALL_FRAMES}
         yield Case(f"single particle, {material}", (scene,), context.frames, WAY, **known)
 
 

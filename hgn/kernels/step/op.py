@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -173,8 +173,9 @@ class BarrierHash:
         return BarrierHash(bucket_B, key_Q, span_Q2, triangle_E.int(), row_F24.float().contiguous(), cell_size)
 
     def to(self, device: torch.device) -> BarrierHash:
-        parts = (self.bucket_B, self.key_Q, self.span_Q2, self.triangle_E, self.row_F24)
-        return BarrierHash(*(part.to(device) for part in parts), cell_size=self.cell_size)
+        names = ("bucket_B", "key_Q", "span_Q2", "triangle_E", "row_F24")
+        moved: dict[str, Any] = {name: getattr(self, name).to(device) for name in names}
+        return replace(self, **moved)
 
     def row(self) -> list[int]:
         """This scene's row of a barrier table; valid as long as this object lives."""
