@@ -87,6 +87,7 @@ REMOVED: dict[str, Removed] = {
     "training.nodes": Removed(remedy="leave it out: the launcher starts processes on every machine"),
     "training.noise_weight_power": Removed(2.0),
     "training.quiet_weight": Removed(4.0),
+    "render.fps": Removed(remedy="leave it out: animations play in real time"),
     "upload.follow": Removed(remedy="run the command again, as with watch -n 60: it copies what is new"),
     "upload.poll_s": Removed(remedy="run the command again, as with watch -n 60: it copies what is new"),
 }

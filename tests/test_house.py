@@ -18,19 +18,17 @@ PACKAGES = ("hgn", "datagen", "tools")
 LINES = {  # of Python, in tracked files
     "hgn": 27_600,
     "datagen": 8_340,
-    "tools": 6_250,
-    "tests": 27_800,
+    "tools": 6_200,
+    "tests": 27_500,
 }
-SETTINGS = 275  # fields of the dataclasses behind the commands, *Config
+SETTINGS = 257  # fields of the dataclasses behind the commands, *Config
 
 LINES_OF_A_FILE = 450
 LONG_FILES = {
-    "hgn/kernels/coarsest/kernel.py": 584,
     "hgn/kernels/grid/kernel.py": 548,
     "tests/datagen/mpm/test_constitutive.py": 483,
-    "tests/jobs/test_queue.py": 457,
+    "tests/jobs/test_queue.py": 459,
     "tests/network/test_relative.py": 474,
-    "tests/tools/test_stability_network.py": 489,
 }
 
 NARROW_PACKAGES = ("hgn/training/", "hgn/runtime/")
@@ -52,11 +50,8 @@ HEADLESS_DOCSTRINGS = {"hgn": 156, "datagen": 59, "tools": 0}
 
 UNCOMMENTED: set[str] = {
     "MpmConfig.density_kg_m3",
-    "MpmConfig.fixed_time_step_s",
     "MpmConfig.poisson_ratio",
-    "MpmConfig.snow_critical_compression",
     "MpmConfig.snow_critical_stretch",
-    "MpmConfig.snow_hardening",
     "MpmConfig.youngs_modulus_pa",
     "NetworkConfig.materials",
     "NetworkConfig.obstacle_features",
