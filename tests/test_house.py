@@ -16,7 +16,7 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 27_600,
+    "hgn": 27_700,
     "datagen": 8_340,
     "tools": 6_200,
     "tests": 27_500,
