@@ -22,7 +22,7 @@ from hgn.export import ExportConfig
 from hgn.runtime.weights import load_weights, shipped_weights
 from hgn.schema import from_mapping
 from tools.error_vs_time.settings import ErrorVsTimeConfig
-from tools.stability.network_cases import StabilityNetworkConfig
+from tools.stability.network import StabilityNetworkConfig
 
 JOBS = Path(__file__).resolve().parents[2] / "jobs"
 # the arguments of each call, as a line of JSON; succeeds
