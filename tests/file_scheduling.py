@@ -8,7 +8,7 @@ from xdist.scheduler import LoadScopeScheduling
 LONGEST_FILES = (  # five seconds and more of one core; begun last, one of them would run alone
     *("solver", "datagen/mpm/test_team", "generator", "viewer/test_page", "training/test_ddp", "jobs/test_jobs"),
     *("kernels/test_triton_compat", "network/test_network", "datagen/test_command", "datagen/test_pool"),
-    *("runtime/test_exported_step", "runtime/test_differentiable", "kernels/test_rollout", "kernels/test_relative"),
+    *("runtime/test_exported_step", "runtime/test_differentiable", "kernels/test_rollout"),
     *("tools/test_bench", "end_to_end/test_bad_input", "kernels/test_training", "kernels/test_kernels_alone"),
     *("datagen/test_kills", "training/test_train", "scene/test_random_scene", "end_to_end/test_wheel"),
     *("tools/test_error_vs_time", "network/test_relative", "kernels/test_update", "jobs/test_queue"),

@@ -25,7 +25,6 @@ SETTINGS = 257  # fields of the dataclasses behind the commands, *Config
 
 LINES_OF_A_FILE = 450
 LONG_FILES = {
-    "hgn/kernels/grid/kernel.py": 548,
     "tests/datagen/mpm/test_constitutive.py": 483,
     "tests/jobs/test_queue.py": 459,
     "tests/network/test_relative.py": 474,

@@ -209,6 +209,13 @@ def normalise_once(z, WIDTH: tl.constexpr, PRECISION: tl.constexpr):
 
 
 @triton.jit
+def with_column(value, number, x):
+    """`value` [N, F] with the column x [N] in place of one of its own."""
+    column = tl.arange(0, value.shape[1])
+    return tl.where((column == number)[None, :], x[:, None], value)
+
+
+@triton.jit
 def chosen_rows(ROWS: tl.constexpr, EACH: tl.constexpr, CHOICES: tl.constexpr):
     """[ROWS, CHOICES]: one where a choice is a row's, EACH rows after one another having the same, else zero.
 

@@ -59,4 +59,13 @@ def middles_around(base, gate, spot, geometry, LEVELS: tl.constexpr):
     return slot, axes, weight
 
 
+@triton.jit
+def raise_disturbed(disturbed, cell, own):
+    """Raises every second of `disturbed` to what the particles [N] in its cells [N, 8] have, where that is more."""
+    own = (own * FULLY).to(tl.int32)[:, None]
+    # most are told by another already
+    mask = (cell >= 0) & (tl.load(disturbed + cell * 2, mask=cell >= 0, other=FULLY) < own)
+    tl.atomic_max(disturbed + cell * 2, own + 0 * cell, mask=mask, sem="relaxed")
+
+
 settle_keys(globals())

@@ -69,7 +69,7 @@ for precision in ("fp16", "tf32"):
 triton_compat.use_target(89)
 narrow = NetworkConfig(width=64, levels=2, message_passing_steps=1)
 for function, data in launches_of(FrameJob(((narrow, StepConfig(), "fp16"),), ((40_000, 10_000),), 89)).values():
-    if function.fn.__module__ == "hgn.kernels.grid.kernel":
+    if function.fn.__module__ in ("hgn.kernels.grid.kernel", "hgn.kernels.features.kernel"):
         continue  # knows no width
     print("SHARED", function.__name__, triton_compat.preload(function, data).metadata.shared, flush=True)
 
@@ -77,7 +77,12 @@ triton_compat.use_target(90)
 seen = set()
 for function, data in of_relative.values():
     name, early = function.__name__, json.loads(data)["options"]["launch_pdl"]
-    varied = function.fn.__module__.split(".")[2] in ("grid", "coarsest", "step")  # by what those two differ in
+    varied = function.fn.__module__.split(".")[2] in (
+        "grid",
+        "features",
+        "coarsest",
+        "step",
+    )  # by what those two differ in
     if not varied and (not early or name in seen):
         continue
     seen.add(name)

@@ -10,10 +10,10 @@ from unittest import mock
 
 import torch
 from kernels.interpreter import dropped_bits
+from kernels.references import Added, ProgramSums, rows
 from triton.runtime.jit import KernelInterface
 
 from hgn.config import MATERIAL_EMBEDDING
-from hgn.kernels.reference import Added, ProgramSums, rows
 
 
 @dataclass(frozen=True)

@@ -4,82 +4,92 @@ from dataclasses import replace
 
 import pytest
 import torch
+from kernels.cases import CASES, compare, drawn, flat, float32_state, moving_state, reference
+from kernels.conftest import in_large_tiles
 from kernels.engines import device, engine_of, gradients, inference_of, run_forward
 from kernels.rounded import rounded, rounding
-from network.states import network_of, random_state
+from network.states import network_of
 
 from hgn.kernels.packing import rounded_to_tf32
+from hgn.kernels.tuning import Tuning
+from hgn.network.cell_keys import unpack
 from hgn.runtime.parity import OUTPUT_BOUND, relative_error
 
-SEVERAL = (5, 1, 3)  # particles of three scenes
 gpu = pytest.mark.skipif(device().type != "cuda", reason="needs a CUDA device")
 
 
-def reference(network, state, origin_S3, weight_N3):
-    """Output and gradients of the sum of outputs times `weight_N3`."""
-    output = network.normalised_acceleration(state, origin_S3)
-    found = torch.autograd.grad((output * weight_N3).sum(), list(network.parameters()), allow_unused=True)
-    pairs = zip(network.parameters(), found, strict=True)
-    return output.detach(), [torch.zeros_like(p) if gradient is None else gradient for p, gradient in pairs]
-
-
-def flat(tensors):
-    return torch.cat([tensor.double().cpu().flatten() for tensor in tensors])
-
-
-def float32_state(counts, obstacles=True, spread=0.3, seed=3):
-    """A state whose numbers float32 holds exactly, in float64."""
-    state = random_state(counts, seed, torch.float32, obstacles, spread)
-    doubled = {name: getattr(state, name).double() for name in ("position_N3", "velocity_NM3", "domain_S3")}
-    return replace(state, **doubled)
-
-
-def drawn(network, state):
-    """Origins of the scenes' grids, and weights of the outputs."""
-    generator = torch.Generator().manual_seed(1)
-    origin_S3 = (-network.config.cell_size * torch.rand(state.scene_count, 3, generator=generator)).double()
-    return origin_S3, torch.randn(state.position_N3.shape, generator=generator, dtype=torch.float64)
-
-
-def compare(network, state, precision, loss_scale, room):
-    """Relative errors of the output, of all gradients together, of each gradient."""
-    origin_S3, weight_N3 = drawn(network, state)
-    output, expected = reference(network, state, origin_S3, weight_N3)
-    engine = engine_of(network, state, precision, (room,) * network.config.levels, loss_scale=loss_scale)
-    found = run_forward(engine, network, state, origin_S3)
-    assert int(engine.grid.status) == 0
-    engine.output_gradient[: len(weight_N3), :3] = (loss_scale * weight_N3).float()
-    engine.backward()
-    each = gradients(engine, network)
-    pairs = zip(each, expected, strict=True)
-    return (
-        relative_error(found, output),
-        relative_error(flat(each), flat(expected)),
-        [relative_error(a, b) for a, b in pairs],
-    )
-
-
-@pytest.mark.parametrize(
-    ("counts", "spread", "changes"),
-    [
-        (SEVERAL, 0.2, {"levels": 2, "message_passing_steps": 2}),
-        ((1,), 0.3, {"levels": 3, "message_passing_steps": 1, "obstacle_features": False}),
-        ((5,), 0.1, {"levels": 1, "message_passing_steps": 1, "materials": ("water", "snow", "sand")}),
-    ],
-)
-def test_outputs_and_gradients(counts, spread, changes, monkeypatch):
-    """In float32 several scenes in one batch, a single particle, and a single level, with odd numbers of particles and
-    cells, give the outputs and every gradient of the reference to 1e-5. So few programs run that each takes several
-    tiles, and the last has one fewer."""
+@pytest.mark.parametrize("name", CASES)
+def test_outputs_and_gradients(name, monkeypatch):
+    """In float32 outputs, every gradient and every feature are those of the reference network in float64: absolute and
+    relative inputs, several scenes of odd numbers of particles, one particle, particles on borders."""
+    case = CASES[name]
     monkeypatch.setattr("hgn.kernels.tuning.RESIDENT_PROGRAMS", 2)
-    if len(counts) > 1:
+    if case.many_rows:
         monkeypatch.setattr("hgn.kernels.tuning.PROCESSORS", 2)
-        monkeypatch.setattr("hgn.kernels.tuning.FEW_ROWS", 0)  # every level is one of many rows
-    network = network_of(width=16, **changes)
-    state = float32_state(counts, network.config.obstacle_features, spread)
-    precision = "fp32"
-    output, together, each = compare(network, state, precision, 1.0, 128)
-    assert output < 1e-5 and together < 1e-5 and max(each) < 2e-5
+        monkeypatch.setattr("hgn.kernels.tuning.FEW_ROWS", 0)
+    elif device().type != "cuda":
+        of = Tuning.of
+        monkeypatch.setattr(Tuning, "of", staticmethod(lambda precision: in_large_tiles(of(precision))))
+    network, state = case.network(), case.state()
+    state = replace(state, velocity_NM3=state.velocity_NM3[:, : network.config.velocity_history])
+    found = compare(network, state, "fp32", 1.0, 512 if network.config.relative else 128)
+    assert max(found.output, found.together, *found.each) < case.bound, (found.output, found.together, found.each)
+    if network.config.relative:
+        assert_features(network, state, found)
+
+
+def assert_features(network, state, found):
+    """Each column is that of hgn.network.relative, the material one-hot behind them, zeros behind that; and coarsest
+    cells are disturbed and in contact as there."""
+    grid = network.grid(state, found.origin_S3)
+    expected, contacts = network.relative_features(state, grid)
+    feature_NF = found.engine.grid.feature_NF[: len(state.position_N3)].cpu().double()
+    width, materials = expected.shape[1], len(network.config.materials)
+    assert float((feature_NF[:, :width] - expected.double()).abs().max()) < 2e-5
+    assert torch.equal(feature_NF[:, width : width + materials].argmax(-1), state.material_N)
+    assert torch.equal(feature_NF[:, width:].sum(-1), torch.ones(len(feature_NF)).double())
+    assert feature_NF.shape[1] == (32 if width + materials <= 32 else 64)
+    expected_C2 = torch.stack([contacts.disturbed_C, contacts.touched_C], 1)
+    felt_C2 = found.engine.grid.felt_C2[: len(expected_C2)].cpu().double()
+    torch.testing.assert_close(felt_C2, expected_C2, rtol=0, atol=1e-3)
+
+
+def test_cases_are_what_they_say():
+    """Among the cases some particles are within a surface's reach and some beyond; of the three scenes in free flight
+    one is not disturbed, one in part and one wholly."""
+    network, state = CASES["relative"].network(), CASES["relative"].state()
+    columns = network.relative_features(state, network.grid(state, drawn(network, state)[0]))[0]
+    contact = columns[:, 3 * (network.config.velocity_history - 1) + 3 * network.config.levels]
+    assert contact.eq(0).any() and contact.ne(0).any()
+    network, state = CASES["relative, free flight"].network(), CASES["relative, free flight"].state()
+    grid = network.grid(state, drawn(network, state)[0])
+    contacts = network.relative_features(state, grid)[1]
+    scene_C = unpack(grid.levels[-1].key_C)[0]
+    most = [float(contacts.disturbed_C[scene_C == scene].max()) for scene in range(3)]
+    assert most[0] < 1e-3 < most[1] < 0.5 < most[2] and not contacts.touched_C.any()
+
+
+@pytest.mark.parametrize("precision", ["fp32", "tf32", "fp16"])
+@pytest.mark.usefixtures("large_tiles")
+def test_free_motion_is_exact(precision):
+    """Away from surfaces what inference adds to gravity keeps momentum and angular momentum in each scene to float32's
+    rounding; 3 m/s more for all, in any direction, leave it as it was to the rounding of velocities."""
+    network = CASES["relative"].network()
+    state = moving_state((23, 5), obstacles=False, spread=0.1)
+    state = replace(state, position_N3=state.position_N3 + 0.4, velocity_NM3=state.velocity_NM3.clamp(-5e-3, 5e-3))
+    origin_S3, _ = drawn(network, state)
+    engine = inference_of(engine_of(network, state, precision), network)
+    outputs = []
+    for boost in ((0.0, 0.0, 0.0), (5e-2, 0.0, 0.0), (-1e-2, 3e-2, 2e-2)):
+        faster = replace(state, velocity_NM3=state.velocity_NM3 + torch.tensor(boost, dtype=torch.float64))
+        outputs.append(run_forward(engine, network, faster, origin_S3).double())
+    assert float(outputs[0].abs().max()) > 1e-2
+    for output in outputs[1:]:
+        assert relative_error(output, outputs[0]) < {"fp32": 1e-4, "tf32": 2e-3, "fp16": 2e-3}[precision]
+    for scene in range(2):
+        here_N = state.scene_N == scene
+        for kept_N3 in (outputs[0], torch.linalg.cross(state.position_N3 - 0.55, outputs[0])):
+            assert float(kept_N3[here_N].sum(0).abs().max()) < 1e-5 * float(outputs[0][here_N].abs().sum()) + 1e-7
 
 
 def test_half_precision_keeps_small_gradients():
@@ -87,8 +97,7 @@ def test_half_precision_keeps_small_gradients():
     network = network_of(width=16, levels=1, message_passing_steps=1)
     state = float32_state((5,), spread=0.1)
     weight = 2.0**-14
-    output, _, _ = compare(network, state, "fp16", 1.0, 64)
-    assert output < 5e-3
+    assert compare(network, state, "fp16", 1.0, 64).output < 5e-3
     origin_S3 = torch.zeros(1, 3, dtype=torch.float64)
     engine = engine_of(network, state, "fp16", (64,), loss_scale=1 / weight)
     run_forward(engine, network, state, origin_S3)
@@ -100,7 +109,7 @@ def test_half_precision_keeps_small_gradients():
 
 @pytest.mark.parametrize(
     ("precision", "half_cells", "half_sums", "few_rows"),
-    [("tf32", False, False, None), ("fp16", False, False, None), ("fp16", True, False, 0), ("fp16", True, True, 0)],
+    [("tf32", False, False, None), ("fp16", True, False, None), ("fp16", True, True, 0)],
 )
 def test_inference_alone(precision, half_cells, half_sums, few_rows, monkeypatch):
     """Where nothing is kept for gradients, operands of TF32 and float16 change the output by less than 5e-3, also with
@@ -113,18 +122,6 @@ def test_inference_alone(precision, half_cells, half_sums, few_rows, monkeypatch
     engine = inference_of(engine_of(network, state, precision, (64,)), network, half_cells, half_sums)
     found = run_forward(engine, network, state, origin_S3)
     assert relative_error(found, network.normalised_acceleration(state, origin_S3).detach()) < 5e-3
-
-
-def test_cells_on_the_border_of_the_grid():
-    """Particles exactly at cell centres and cell faces activate the cells that the plain grid activates."""
-    network = network_of(width=16, levels=2, message_passing_steps=1, cell_size=0.0625)
-    state = float32_state((4,), spread=0.2)
-    position = torch.tensor([[0.0, 0.0, 0.0], [0.03125, 0.09375, 0.0625], [0.125, 0.125, 0.125], [0.28125, 0.25, 0.0]])
-    state = replace(state, position_N3=position.double())
-    origin_S3 = torch.zeros(1, 3, dtype=torch.float64)
-    engine = engine_of(network, state, "fp32", (64, 32))
-    found = run_forward(engine, network, state, origin_S3)
-    assert relative_error(found, network.normalised_acceleration(state, origin_S3).detach()) < 1e-5
 
 
 def test_without_obstacles_nothing_is_looked_up():
@@ -168,12 +165,12 @@ def test_whole_networks_on_a_gpu(precision, counts, draws):
     found, explained = [], []
     for seed in range(3, 3 + draws):
         state = float32_state(counts, seed=seed)
-        output, together, _ = compare(network, state, precision, 256.0 if precision == "fp16" else 1.0, 8192)
+        compared = compare(network, state, precision, 256.0 if precision == "fp16" else 1.0, 8192)
         origin_S3, _ = drawn(network, state)
         engine = inference_of(engine_of(network, state, precision, (8192,) * 4), network)
         alone = run_forward(engine, network, state, origin_S3)
         expected = network.normalised_acceleration(state, origin_S3).detach()
-        found.append((output, relative_error(alone, expected), together))
+        found.append((compared.output, relative_error(alone, expected), compared.together))
         rounded_output, rounded_together = rounding_errors(network, state, precision == "fp16")
         explained.append((rounded_output, rounded_output, rounded_together))
     assert all(output < OUTPUT_BOUND and alone < OUTPUT_BOUND for output, alone, _ in found)

@@ -6,8 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from kernels.cases import flat
 from kernels.engines import device
-from kernels.test_network import flat
 from kernels.test_pushforward import placed
 from kernels.test_training import without_jitter
 from kernels.test_update import HISTORY, parameters_of, updates_of

@@ -43,7 +43,7 @@ def cell_mlp_forward(
 
     RESIDENT: all weights are read before the first tile, and kept. LOOP: a program has more than one tile.
 
-    Reference: hgn.kernels.cell_mlp.reference; test: tests/kernels/test_kernels_alone.py.
+    Reference: tests/kernels/references.py; test: tests/kernels/test_kernels_alone.py.
     """
     if OVERLAP:
         gdc_launch_dependents()
@@ -138,7 +138,7 @@ def cell_mlp_backward(
     sum_gradient [C, W] is that of the edges' sums. Without GATHER send_gradient is there already. RESIDENT as in
     cell_mlp_forward.
 
-    Reference: hgn.kernels.cell_mlp.reference; test: tests/kernels/test_kernels_alone.py.
+    Reference: tests/kernels/references.py; test: tests/kernels/test_kernels_alone.py.
     """
     if OVERLAP:
         gdc_launch_dependents()

@@ -96,7 +96,7 @@ def edge_forward(
     what edge_backward reads: the hidden layer and the normalised output [C, 6, W], and `rstd` [C, 6], one over its
     standard deviation.
 
-    Reference: hgn.kernels.edges.reference; test: tests/kernels/test_kernels_alone.py.
+    Reference: tests/kernels/references.py; test: tests/kernels/test_kernels_alone.py.
     """
     if OVERLAP:
         gdc_launch_dependents()
@@ -225,7 +225,7 @@ def edge_backward(
 
     `rstd` is zero where there is no edge. It is read a tile ahead, for it says what else is read.
 
-    Reference: hgn.kernels.edges.reference; test: tests/kernels/test_kernels_alone.py.
+    Reference: tests/kernels/references.py; test: tests/kernels/test_kernels_alone.py.
     """
     if OVERLAP:
         gdc_launch_dependents()

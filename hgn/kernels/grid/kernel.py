@@ -9,7 +9,8 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
-from hgn.kernels.geometry import FULLY, GEOMETRY_COLUMNS, most_around, split_slot
+from hgn.kernels.blocks import with_column
+from hgn.kernels.geometry import GEOMETRY_COLUMNS, raise_disturbed, split_slot
 from hgn.kernels.obstacles import OBSTACLE_COLUMNS, obstacle_normals
 from hgn.kernels.triton_compat import gdc_launch_dependents, gdc_wait, settle_keys
 from hgn.network.relative import STEPS_AHEAD, WALL_LIMIT
@@ -206,13 +207,6 @@ def fill_tables(
 
 
 @triton.jit
-def _with_column(value, number, x):
-    """`value` [N, F] with the column x [N] in place of one of its own."""
-    column = tl.arange(0, value.shape[1])
-    return tl.where((column == number)[None, :], x[:, None], value)
-
-
-@triton.jit
 def _surfaces(
     position, velocity, domain, row, live, scene, obstacle_table, obstacle_cell_size, reach,
     HISTORY: tl.constexpr, OBSTACLES: tl.constexpr, SYMMETRY: tl.constexpr,
@@ -242,9 +236,9 @@ def _surfaces(
         found = (normal[0] != 0) | (normal[1] != 0) | (normal[2] != 0)
         ahead = tl.min(tl.where(found & (quarters > 0), quarters, 8), 1)
         for i in tl.static_range(3):
-            value = _with_column(value, 6 + i, tl.sum(tl.where(quarters == 0, normal[i], 0.0), 1))
+            value = with_column(value, 6 + i, tl.sum(tl.where(quarters == 0, normal[i], 0.0), 1))
             there = tl.sum(tl.where(quarters == ahead[:, None], normal[i], 0.0), 1)
-            value = _with_column(value, 9 + i, there)
+            value = with_column(value, 9 + i, there)
         touch = tl.where(tl.max(found.to(tl.int32), 1) > 0, 1.0, touch)
     return value, touch
 
@@ -263,15 +257,6 @@ def _surface_normals(surfaces):
         first = first + (tl.sum(tl.where(column == at, surfaces, 0.0), 1),)  # noqa: RUF005
     x, y, z = first
     return near[0] + x * x, near[1] + y * y, near[2] + z * z, y * z, x * z, x * y
-
-
-@triton.jit
-def _raise(disturbed, cell, own):
-    """Raises every second of `disturbed` to what the particles [N] in its cells [N, 8] have, where that is more."""
-    own = (own * FULLY).to(tl.int32)[:, None]
-    # most are told by another already
-    mask = (cell >= 0) & (tl.load(disturbed + cell * 2, mask=cell >= 0, other=FULLY) < own)
-    tl.atomic_max(disturbed + cell * 2, own + 0 * cell, mask=mask, sem="relaxed")
 
 
 @triton.jit
@@ -303,8 +288,7 @@ def prepare_particles(
     their products xx, yy, zz, yz, xz, xy are added to the coarsest cells' `moments` [C, COLUMNS], and those of the
     normals of touched surfaces behind them. OBSTACLES and SYMMETRY as in prepare_features.
 
-    Reference: hgn.network.grid.build_hierarchy and hgn.network.relative; test: tests/kernels/test_network.py,
-    tests/kernels/test_relative.py.
+    Reference: hgn.network.grid.build_hierarchy and hgn.network.relative; test: tests/kernels/test_network.py.
     """
     count = tl.load(particle_count)
     if tl.program_id(0) * BLOCK >= count:
@@ -376,173 +360,12 @@ def prepare_particles(
         # up to a multiple of four, which are added at once
         adds = (coarsest >= 0)[:, :, None] & ((part < 12) | (touch > 0)[:, None, None])
         tl.atomic_add(moments + coarsest[:, :, None] * COLUMNS + part, added, mask=adds, sem="relaxed")
-        _raise(disturbed + 1, coarsest, touch)
+        raise_disturbed(disturbed + 1, coarsest, touch)
     if OVERLAP:
         gdc_wait()  # reads nothing of the tables that are being filled; who comes next does
     # cells past the capacity: the frame is void, but nothing may be read or written out of bounds
     tl.store(cell_of + row[:, None] * 8 + corner, tl.maximum(cell, 0), mask=here)
     tl.store(weight_of + row[:, None] * 8 + corner, weight, mask=here)
-
-
-@triton.jit
-def sum_motion(
-    motion, parent, geometry, counts, disturbed, felt, neighbour, coarsest_capacity,
-    LEVELS: tl.constexpr, OVERLAP: tl.constexpr, BLOCK: tl.constexpr,
-):  # fmt: skip
-    """Adds mass and momentum of the finest cells to all cells above them, in `motion` [.., 4] of all levels, and tells
-    the coarsest in `felt` [C, 2] how touched they are (`most_around`): two programs for as many finest cells.
-
-    Reference: hgn.network.relative; test: tests/kernels/test_relative.py.
-    """
-    if OVERLAP:
-        gdc_wait()
-        gdc_launch_dependents()
-    count = tl.load(counts)
-    if tl.program_id(0) * BLOCK >= count:
-        return
-    cell = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    if tl.program_id(1) == 1:  # beside the sums
-        most_around(disturbed, felt, 1, neighbour, cell, cell < tl.load(counts + LEVELS - 1), coarsest_capacity)
-        return
-    there = cell < count
-    part = tl.arange(0, 4)[None, :]
-    value = tl.load(motion + cell[:, None] * 4 + part, mask=there[:, None], other=0.0)
-    for level in tl.static_range(1, LEVELS):
-        line = geometry + level * GEOMETRY_COLUMNS
-        # a parent past the capacity is none (-1)
-        cell = tl.load(parent + tl.load(line - GEOMETRY_COLUMNS + 6) + cell, mask=there, other=-1)
-        there = there & (cell >= 0)
-        at = motion + (tl.load(line + 6) + cell)[:, None] * 4 + part
-        tl.atomic_add(at, value, mask=there[:, None], sem="relaxed")
-
-
-@triton.jit
-def prepare_features(
-    position, velocity, scene_of, material_of, domain, particle_count, mean, std, obstacle_table,
-    obstacle_cell_size, features, wall_maximum,
-    HISTORY: tl.constexpr, NORMALS: tl.constexpr, OBSTACLES: tl.constexpr, SYMMETRY: tl.constexpr,
-    FEATURES: tl.constexpr, BLOCK: tl.constexpr,
-):  # fmt: skip
-    """Absolute features of each particle (velocities, normal if NORMALS, walls, one-hot material), [N, FEATURES].
-    Without OBSTACLES nothing is looked up and the normals stay zero. SYMMETRY as in obstacle_normals.
-
-    Reference: hgn.network.features; test: tests/kernels/test_network.py.
-    """
-    count = tl.load(particle_count)
-    if tl.program_id(0) * BLOCK >= count:
-        return
-    row = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    live = row < count
-    scene = tl.load(scene_of + row, mask=live, other=0)
-    column = tl.arange(0, FEATURES)
-    axis = column % 3
-    here = live[:, None]
-    # 3 * HISTORY velocities: column 3 k + axis
-    is_velocity = column < 3 * HISTORY
-    v = tl.load(velocity + row[:, None] * (3 * HISTORY) + column[None, :], mask=here & is_velocity[None, :], other=0.0)
-    centred = v - tl.load(mean + axis)[None, :]
-    value = tl.where(
-        is_velocity[None, :], tl.div_rn(centred, tl.load(std + axis)[None, :] + tl.zeros_like(centred)), 0.0
-    )
-    WALLS: tl.constexpr = 3 * HISTORY + 3 * NORMALS
-    if OBSTACLES:
-        x = tl.load(position + row * 3, mask=live, other=0.0)
-        y = tl.load(position + row * 3 + 1, mask=live, other=0.0)
-        z = tl.load(position + row * 3 + 2, mask=live, other=0.0)
-        line = obstacle_table + scene * OBSTACLE_COLUMNS
-        normal = obstacle_normals(x, y, z, line, live, obstacle_cell_size, SYMMETRY)
-        for i in tl.static_range(3):
-            value = _with_column(value, 3 * HISTORY + i, normal[i])
-    is_wall = (column >= WALLS) & (column < WALLS + 6)
-    place = tl.load(position + row[:, None] * 3 + axis[None, :], mask=here & is_wall[None, :], other=0.0)
-    size = tl.load(domain + scene[:, None] * 3 + axis[None, :], mask=here & is_wall[None, :], other=0.0)
-    distance = tl.where((column >= WALLS + 3)[None, :], size - place, place)
-    distance = tl.minimum(tl.maximum(distance, -wall_maximum), wall_maximum) / wall_maximum
-    value = tl.where(is_wall[None, :], distance, value)
-    material = tl.load(material_of + row, mask=live, other=0)
-    value = tl.where((column[None, :] - (WALLS + 6)) == material[:, None], 1.0, value)
-    tl.store(features + row[:, None] * FEATURES + column[None, :], value, mask=here)
-
-
-@triton.jit
-def _asinh(x):
-    """Exactly odd, and within float32's rounding next to zero too: log(1 + y) as Kahan has it."""
-    size = tl.abs(x)
-    y = size + size * size / (1 + tl.sqrt(1 + size * size))
-    one = 1 + y
-    rounded = one - 1
-    result = tl.where(rounded == 0, y, tl.log(one) * (y / tl.where(rounded == 0, 1.0, rounded)))
-    return tl.where(x < 0, -result, result)
-
-
-@triton.jit
-def prepare_relative_features(
-    velocity, scene_of, material_of, gravity, particle_count, scale, cell_of, weight_of, coarsest_of, share_of, motion,
-    parent, geometry, features, touch_of, disturbed, felt, quiet,
-    HISTORY: tl.constexpr, LEVELS: tl.constexpr, NORMALS: tl.constexpr,
-    FEATURES: tl.constexpr, OVERLAP: tl.constexpr, BLOCK: tl.constexpr,
-):  # fmt: skip
-    """Features of each particle that no boost and no shift changes, [N, FEATURES]: changes of velocity less gravity,
-    velocity relative to the cells around on each level (`motion`: mass and momentum of the cells of all levels), and
-    near a surface velocity, by what its coarsest cells feel; behind the columns
-    of surfaces, which are there already, the one-hot material. Differences of velocity are in units of `scale`, and
-    their asinh. `disturbed` [C, 2] of the coarsest cells, whose first numbers are raised to how disturbed their
-    particles are, over FULLY.
-
-    Reference: hgn.network.relative; test: tests/kernels/test_relative.py.
-    """
-    HISTORIES: tl.constexpr = 3 * (HISTORY - 1)
-    CONTACT: tl.constexpr = HISTORIES + 3 * LEVELS
-    WALLS: tl.constexpr = CONTACT + 3
-    MATERIAL: tl.constexpr = WALLS + 6 + 6 * NORMALS
-    count = tl.load(particle_count)
-    if tl.program_id(0) * BLOCK >= count:
-        if OVERLAP:
-            gdc_wait()
-        return
-    row = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    live = row < count
-    here = live[:, None]
-    scene = tl.load(scene_of + row, mask=live, other=0)
-    column = tl.arange(0, FEATURES)
-    axis = column % 3
-    is_history = here & (column < HISTORIES)[None, :]
-    at = velocity + row[:, None] * (3 * HISTORY) + column[None, :]
-    value = tl.load(at, mask=is_history, other=0.0) - tl.load(at + 3, mask=is_history, other=0.0)
-    value -= tl.load(gravity + scene[:, None] * 3 + axis[None, :], mask=is_history, other=0.0)
-    corner = tl.arange(0, 8)[None, :]
-    corners = here & (corner >= 0)
-    if OVERLAP:
-        gdc_wait()
-    cell = tl.load(cell_of + row[:, None] * 8 + corner, mask=corners, other=0)
-    weight = tl.load(weight_of + row[:, None] * 8 + corner, mask=corners, other=0.0)
-    for level in tl.static_range(LEVELS):
-        first = tl.load(geometry + level * GEOMETRY_COLUMNS + 6)
-        at = motion + (first + cell) * 4
-        mass = tl.load(at, mask=corners, other=0.0)
-        share = tl.where(mass > 0, weight / tl.where(mass > 0, mass, 1.0), 0.0)
-        for i in tl.static_range(3):
-            around = tl.sum(share * tl.load(at + 1 + i, mask=corners, other=0.0), 1)
-            own = tl.load(velocity + row * (3 * HISTORY) + i, mask=live, other=0.0)
-            value = _with_column(value, HISTORIES + 3 * level + i, own - around)
-        if level < LEVELS - 1:
-            # a parent past the capacity: the frame is void, but nothing may be read out of bounds
-            cell = tl.maximum(tl.load(parent + first + cell, mask=corners, other=0), 0)
-    is_contact = here & ((column >= CONTACT) & (column < WALLS))[None, :]
-    v = tl.load(velocity + row[:, None] * (3 * HISTORY) + axis[None, :], mask=is_contact, other=0.0)
-    value = tl.where(is_contact, v, value)
-    value = _asinh(tl.div_rn(value, tl.load(scale) + tl.zeros_like(value)))
-    touch = tl.load(touch_of + row, mask=live, other=0.0)
-    coarsest = tl.load(coarsest_of + row[:, None] * 8 + corner, mask=corners, other=-1)
-    share = tl.load(share_of + row[:, None] * 8 + corner, mask=coarsest >= 0, other=0.0)
-    gate = tl.sum(share * tl.load(felt + coarsest * 2 + 1, mask=coarsest >= 0, other=0.0), 1)
-    value = tl.where(is_contact, value * gate[:, None], value)
-    moved = tl.where((column < CONTACT)[None, :], value / quiet, 0.0)
-    _raise(disturbed, coarsest, tl.minimum(touch + tl.sum(moved * moved, 1), 1.0))
-    material = tl.load(material_of + row, mask=live, other=0)
-    value = tl.where((column[None, :] - MATERIAL) == material[:, None], 1.0, value)
-    own = (column < WALLS) | (column >= MATERIAL)
-    tl.store(features + row[:, None] * FEATURES + column[None, :], value, mask=here & own[None, :])
 
 
 settle_keys(globals())

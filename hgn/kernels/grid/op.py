@@ -16,6 +16,7 @@ import triton
 from hgn.config import NetworkConfig
 from hgn.kernels import obstacles as obstacle_lookup
 from hgn.kernels.coarsest import kernel as coarsest_kernel
+from hgn.kernels.features import kernel as feature_kernel
 from hgn.kernels.grid import kernel
 from hgn.kernels.triton_compat import interpreting, overlaps
 from hgn.network.cell_keys import SCENE_LIMIT, in_buckets, unpack
@@ -236,10 +237,14 @@ class DeviceGrid:
         `symmetry` the obstacles are seen under the symmetries in their rows.
         """
         blocks, overlap = (triton.cdiv(self.particles, PARTICLE_BLOCK),), overlaps()
-        arguments = feature_arguments(
-            config, position, velocity, scene_N, material_N, domain_S3, count, obstacles, symmetry, self.feature_NF
-        )
-        surfaces = {name: value for name, value in arguments.items() if name != "material_of"}
+        surfaces: dict[str, Any] = {
+            "position": position, "velocity": velocity, "scene_of": scene_N, "domain": domain_S3,
+            "particle_count": count, "obstacle_table": obstacles.row_S5 if obstacles else count,
+            "obstacle_cell_size": obstacles.cell_size if obstacles else 1.0, "features": self.feature_NF,
+            "HISTORY": config.velocity_history, "NORMALS": int(config.obstacle_features),
+            "OBSTACLES": config.obstacle_features and obstacles is not None, "SYMMETRY": symmetry,
+            "FEATURES": self.features, "BLOCK": PARTICLE_BLOCK,
+        }  # fmt: skip
         kernel.prepare_particles[blocks](
             **surfaces, origin=origin_S3, low=self.low, geometry=self.geometry, occupied=self.occupied,
             prefix_sum=self.prefix_sum, cell_of=self.cell_N8, weight_of=self.weight_N8,
@@ -250,16 +255,18 @@ class DeviceGrid:
             MOTION=config.relative, COLUMNS=SUMS, OVERLAP=overlap, launch_pdl=overlap,
         )  # fmt: skip
         if not config.relative:
-            wall_maximum = WALL_DISTANCE_CELLS * config.cell_size
-            kernel.prepare_features[blocks](**arguments, mean=mean_3, std=std_3, wall_maximum=wall_maximum)
+            feature_kernel.prepare_features[blocks](
+                **surfaces, material_of=material_N, mean=mean_3, std=std_3,
+                wall_maximum=WALL_DISTANCE_CELLS * config.cell_size,
+            )  # fmt: skip
             return
-        kernel.sum_motion[(triton.cdiv(self.capacities[0], MARK_BLOCK), 2)](
+        feature_kernel.sum_motion[(triton.cdiv(self.capacities[0], MARK_BLOCK), 2)](
             motion=self.motion_C4, parent=self._parent, geometry=self.geometry, counts=self.counts_L,
             disturbed=self.disturbed_C2, felt=self.felt_C2, neighbour=self.neighbour(self.levels - 1),
             coarsest_capacity=self.capacities[-1], LEVELS=self.levels, OVERLAP=overlap, BLOCK=MARK_BLOCK,
             launch_pdl=overlap,
         )  # fmt: skip
-        kernel.prepare_relative_features[blocks](
+        feature_kernel.prepare_relative_features[blocks](
             velocity=velocity, scene_of=scene_N, material_of=material_N, gravity=gravity_S3, particle_count=count,
             scale=std_3, cell_of=self.cell_N8, weight_of=self.weight_N8, coarsest_of=self.coarsest_N8,
             share_of=self.share_N8, motion=self.motion_C4, parent=self._parent, geometry=self.geometry,
@@ -301,35 +308,3 @@ class DeviceGrid:
             x=x, table=self.table_C, **pairs, USED=left, COLUMNS=triton.next_power_of_2(left + 1), **sizes,
             launch_pdl=overlap,
         )  # fmt: skip
-
-
-def feature_arguments(
-    config: NetworkConfig,
-    position: torch.Tensor,
-    velocity: torch.Tensor,
-    scene_N: torch.Tensor,
-    material_N: torch.Tensor,
-    domain_S3: torch.Tensor,
-    count: torch.Tensor,
-    obstacles: ObstacleTable | None,
-    symmetry: bool,
-    feature_NF: torch.Tensor,
-) -> dict[str, Any]:
-    """What the kernels of features of both kinds take, in programs of PARTICLE_BLOCK particles."""
-    return {
-        "position": position,
-        "velocity": velocity,
-        "scene_of": scene_N,
-        "material_of": material_N,
-        "domain": domain_S3,
-        "particle_count": count,
-        "obstacle_table": obstacles.row_S5 if obstacles else count,
-        "obstacle_cell_size": obstacles.cell_size if obstacles else 1.0,
-        "features": feature_NF,
-        "HISTORY": config.velocity_history,
-        "NORMALS": int(config.obstacle_features),
-        "OBSTACLES": config.obstacle_features and obstacles is not None,
-        "SYMMETRY": symmetry,
-        "FEATURES": feature_NF.shape[1],
-        "BLOCK": PARTICLE_BLOCK,
-    }

@@ -1,0 +1,178 @@
+"""Features of particles on the device: the paper's absolute ones, or relative ones and the motion of cells.
+
+hgn.kernels.grid writes what particles read of the grid. Shape legend: N particles, C cells of a level, L levels.
+"""
+
+from __future__ import annotations
+
+import triton
+import triton.language as tl
+
+from hgn.kernels.blocks import with_column
+from hgn.kernels.geometry import GEOMETRY_COLUMNS, most_around, raise_disturbed
+from hgn.kernels.obstacles import OBSTACLE_COLUMNS, obstacle_normals
+from hgn.kernels.triton_compat import gdc_launch_dependents, gdc_wait, settle_keys
+
+
+@triton.jit
+def sum_motion(
+    motion, parent, geometry, counts, disturbed, felt, neighbour, coarsest_capacity,
+    LEVELS: tl.constexpr, OVERLAP: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
+    """Adds mass and momentum of the finest cells to all cells above them, in `motion` [.., 4] of all levels, and tells
+    the coarsest in `felt` [C, 2] how touched they are (`most_around`): two programs for as many finest cells.
+
+    Reference: hgn.network.relative; test: tests/kernels/test_network.py.
+    """
+    if OVERLAP:
+        gdc_wait()
+        gdc_launch_dependents()
+    count = tl.load(counts)
+    if tl.program_id(0) * BLOCK >= count:
+        return
+    cell = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    if tl.program_id(1) == 1:  # beside the sums
+        most_around(disturbed, felt, 1, neighbour, cell, cell < tl.load(counts + LEVELS - 1), coarsest_capacity)
+        return
+    there = cell < count
+    part = tl.arange(0, 4)[None, :]
+    value = tl.load(motion + cell[:, None] * 4 + part, mask=there[:, None], other=0.0)
+    for level in tl.static_range(1, LEVELS):
+        line = geometry + level * GEOMETRY_COLUMNS
+        # a parent past the capacity is none (-1)
+        cell = tl.load(parent + tl.load(line - GEOMETRY_COLUMNS + 6) + cell, mask=there, other=-1)
+        there = there & (cell >= 0)
+        at = motion + (tl.load(line + 6) + cell)[:, None] * 4 + part
+        tl.atomic_add(at, value, mask=there[:, None], sem="relaxed")
+
+
+@triton.jit
+def prepare_features(
+    position, velocity, scene_of, material_of, domain, particle_count, mean, std, obstacle_table,
+    obstacle_cell_size, features, wall_maximum,
+    HISTORY: tl.constexpr, NORMALS: tl.constexpr, OBSTACLES: tl.constexpr, SYMMETRY: tl.constexpr,
+    FEATURES: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
+    """Absolute features of each particle (velocities, normal if NORMALS, walls, one-hot material), [N, FEATURES].
+    Without OBSTACLES nothing is looked up and the normals stay zero. SYMMETRY as in obstacle_normals.
+
+    Reference: hgn.network.features; test: tests/kernels/test_network.py.
+    """
+    count = tl.load(particle_count)
+    if tl.program_id(0) * BLOCK >= count:
+        return
+    row = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    live = row < count
+    scene = tl.load(scene_of + row, mask=live, other=0)
+    column = tl.arange(0, FEATURES)
+    axis = column % 3
+    here = live[:, None]
+    # 3 * HISTORY velocities: column 3 k + axis
+    is_velocity = column < 3 * HISTORY
+    v = tl.load(velocity + row[:, None] * (3 * HISTORY) + column[None, :], mask=here & is_velocity[None, :], other=0.0)
+    centred = v - tl.load(mean + axis)[None, :]
+    value = tl.where(
+        is_velocity[None, :], tl.div_rn(centred, tl.load(std + axis)[None, :] + tl.zeros_like(centred)), 0.0
+    )
+    WALLS: tl.constexpr = 3 * HISTORY + 3 * NORMALS
+    if OBSTACLES:
+        x = tl.load(position + row * 3, mask=live, other=0.0)
+        y = tl.load(position + row * 3 + 1, mask=live, other=0.0)
+        z = tl.load(position + row * 3 + 2, mask=live, other=0.0)
+        line = obstacle_table + scene * OBSTACLE_COLUMNS
+        normal = obstacle_normals(x, y, z, line, live, obstacle_cell_size, SYMMETRY)
+        for i in tl.static_range(3):
+            value = with_column(value, 3 * HISTORY + i, normal[i])
+    is_wall = (column >= WALLS) & (column < WALLS + 6)
+    place = tl.load(position + row[:, None] * 3 + axis[None, :], mask=here & is_wall[None, :], other=0.0)
+    size = tl.load(domain + scene[:, None] * 3 + axis[None, :], mask=here & is_wall[None, :], other=0.0)
+    distance = tl.where((column >= WALLS + 3)[None, :], size - place, place)
+    distance = tl.minimum(tl.maximum(distance, -wall_maximum), wall_maximum) / wall_maximum
+    value = tl.where(is_wall[None, :], distance, value)
+    material = tl.load(material_of + row, mask=live, other=0)
+    value = tl.where((column[None, :] - (WALLS + 6)) == material[:, None], 1.0, value)
+    tl.store(features + row[:, None] * FEATURES + column[None, :], value, mask=here)
+
+
+@triton.jit
+def _asinh(x):
+    """Exactly odd, and within float32's rounding next to zero too: log(1 + y) as Kahan has it."""
+    size = tl.abs(x)
+    y = size + size * size / (1 + tl.sqrt(1 + size * size))
+    one = 1 + y
+    rounded = one - 1
+    result = tl.where(rounded == 0, y, tl.log(one) * (y / tl.where(rounded == 0, 1.0, rounded)))
+    return tl.where(x < 0, -result, result)
+
+
+@triton.jit
+def prepare_relative_features(
+    velocity, scene_of, material_of, gravity, particle_count, scale, cell_of, weight_of, coarsest_of, share_of, motion,
+    parent, geometry, features, touch_of, disturbed, felt, quiet,
+    HISTORY: tl.constexpr, LEVELS: tl.constexpr, NORMALS: tl.constexpr,
+    FEATURES: tl.constexpr, OVERLAP: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
+    """Features of each particle that no boost and no shift changes, [N, FEATURES]: changes of velocity less gravity,
+    velocity relative to the cells around on each level (`motion`: mass and momentum of the cells of all levels), and
+    near a surface velocity, by what its coarsest cells feel; behind the columns
+    of surfaces, which are there already, the one-hot material. Differences of velocity are in units of `scale`, and
+    their asinh. `disturbed` [C, 2] of the coarsest cells, whose first numbers are raised to how disturbed their
+    particles are, over FULLY.
+
+    Reference: hgn.network.relative; test: tests/kernels/test_network.py.
+    """
+    HISTORIES: tl.constexpr = 3 * (HISTORY - 1)
+    CONTACT: tl.constexpr = HISTORIES + 3 * LEVELS
+    WALLS: tl.constexpr = CONTACT + 3
+    MATERIAL: tl.constexpr = WALLS + 6 + 6 * NORMALS
+    count = tl.load(particle_count)
+    if tl.program_id(0) * BLOCK >= count:
+        if OVERLAP:
+            gdc_wait()
+        return
+    row = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    live = row < count
+    here = live[:, None]
+    scene = tl.load(scene_of + row, mask=live, other=0)
+    column = tl.arange(0, FEATURES)
+    axis = column % 3
+    is_history = here & (column < HISTORIES)[None, :]
+    at = velocity + row[:, None] * (3 * HISTORY) + column[None, :]
+    value = tl.load(at, mask=is_history, other=0.0) - tl.load(at + 3, mask=is_history, other=0.0)
+    value -= tl.load(gravity + scene[:, None] * 3 + axis[None, :], mask=is_history, other=0.0)
+    corner = tl.arange(0, 8)[None, :]
+    corners = here & (corner >= 0)
+    if OVERLAP:
+        gdc_wait()
+    cell = tl.load(cell_of + row[:, None] * 8 + corner, mask=corners, other=0)
+    weight = tl.load(weight_of + row[:, None] * 8 + corner, mask=corners, other=0.0)
+    for level in tl.static_range(LEVELS):
+        first = tl.load(geometry + level * GEOMETRY_COLUMNS + 6)
+        at = motion + (first + cell) * 4
+        mass = tl.load(at, mask=corners, other=0.0)
+        share = tl.where(mass > 0, weight / tl.where(mass > 0, mass, 1.0), 0.0)
+        for i in tl.static_range(3):
+            around = tl.sum(share * tl.load(at + 1 + i, mask=corners, other=0.0), 1)
+            own = tl.load(velocity + row * (3 * HISTORY) + i, mask=live, other=0.0)
+            value = with_column(value, HISTORIES + 3 * level + i, own - around)
+        if level < LEVELS - 1:
+            # a parent past the capacity: the frame is void, but nothing may be read out of bounds
+            cell = tl.maximum(tl.load(parent + first + cell, mask=corners, other=0), 0)
+    is_contact = here & ((column >= CONTACT) & (column < WALLS))[None, :]
+    v = tl.load(velocity + row[:, None] * (3 * HISTORY) + axis[None, :], mask=is_contact, other=0.0)
+    value = tl.where(is_contact, v, value)
+    value = _asinh(tl.div_rn(value, tl.load(scale) + tl.zeros_like(value)))
+    touch = tl.load(touch_of + row, mask=live, other=0.0)
+    coarsest = tl.load(coarsest_of + row[:, None] * 8 + corner, mask=corners, other=-1)
+    share = tl.load(share_of + row[:, None] * 8 + corner, mask=coarsest >= 0, other=0.0)
+    gate = tl.sum(share * tl.load(felt + coarsest * 2 + 1, mask=coarsest >= 0, other=0.0), 1)
+    value = tl.where(is_contact, value * gate[:, None], value)
+    moved = tl.where((column < CONTACT)[None, :], value / quiet, 0.0)
+    raise_disturbed(disturbed, coarsest, tl.minimum(touch + tl.sum(moved * moved, 1), 1.0))
+    material = tl.load(material_of + row, mask=live, other=0)
+    value = tl.where((column[None, :] - MATERIAL) == material[:, None], 1.0, value)
+    own = (column < WALLS) | (column >= MATERIAL)
+    tl.store(features + row[:, None] * FEATURES + column[None, :], value, mask=here & own[None, :])
+
+
+settle_keys(globals())

@@ -1,0 +1,139 @@
+"""Networks and states on which kernels are compared with the reference network in float64."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import torch
+from kernels.engines import engine_of, gradients, run_forward
+from network.states import network_of, random_state
+
+from hgn.runtime.parity import relative_error
+
+SEVERAL, CROWD = (5, 1, 3), (17, 1, 6)  # particles of three scenes
+
+
+def float32_state(counts, obstacles=True, spread=0.3, seed=3):
+    """A state whose numbers float32 holds exactly, in float64."""
+    state = random_state(counts, seed, torch.float32, obstacles, spread)
+    doubled = {name: getattr(state, name).double() for name in ("position_N3", "velocity_NM3", "domain_S3")}
+    return replace(state, **doubled)
+
+
+def moving_state(counts, obstacles=True, spread=0.3):
+    """Scenes of different gravity, some of whose particles fly through several cells in a frame, out of the domain or
+    lie on a cell's corner."""
+    state = float32_state(counts, obstacles, spread)
+    generator = torch.Generator().manual_seed(2)
+    gravity_S3 = torch.randn(len(counts), 3, generator=generator) * 3e-3
+    fast_N = torch.rand(len(state.position_N3), generator=generator) < 0.5
+    state.velocity_NM3[fast_N] *= 32.0
+    state.position_N3[0] = torch.tensor([0.0625, 0.125, -0.0009765625])
+    return replace(state, gravity_S3=gravity_S3.double())
+
+
+def border_state():
+    """Particles exactly at cell centres and cell faces of cells of 1/16."""
+    state = float32_state((4,), spread=0.2)
+    position = torch.tensor([[0.0, 0.0, 0.0], [0.03125, 0.09375, 0.0625], [0.125, 0.125, 0.125], [0.28125, 0.25, 0.0]])
+    return replace(state, position_N3=position.double())
+
+
+def flying_state():
+    """Two scenes in free flight, of which one particle of the second is hardly accelerated, and one in motion."""
+    state = moving_state((30, 30, 30), obstacles=False, spread=0.15)
+    velocity_NH3, gravity_N3 = state.velocity_NM3.clone(), state.gravity_S3[state.scene_N]
+    age_1H1 = torch.arange(velocity_NH3.shape[1], dtype=torch.float64)[None, :, None]
+    quiet_N = state.scene_N < 2
+    velocity_NH3[quiet_N] = (torch.tensor([1e-2, 2e-2, 0.0]) - age_1H1 * gravity_N3[:, None])[quiet_N]
+    velocity_NH3[35, 0] += 2e-3 * 1.5e-3
+    return replace(state, position_N3=state.position_N3 + 0.4, velocity_NM3=velocity_NH3)
+
+
+@dataclass(frozen=True)
+class Case:
+    """A network, a state, and the largest relative error of outputs, of all gradients, and of each gradient."""
+
+    state: Callable[[], Any]
+    bound: float
+    changes: dict[str, Any] = field(default_factory=dict)  # of the network
+    many_rows: bool = False  # every level is one of many rows, and programs take several tiles
+
+    def network(self):
+        network = network_of(**{"width": 16, "levels": 2, "message_passing_steps": 1, **self.changes})
+        if network.config.relative:
+            network.normaliser.velocity_std.fill_(7.0)  # which nothing depends on
+        return network
+
+
+RELATIVE = {"inputs": "relative"}
+SHUFFLED = ("water", "snow", "sand")
+# Relative inputs: in the weights of normals the rounding of distances counts tenfold (FEW).
+CASES = {
+    "several scenes": Case(lambda: float32_state(SEVERAL, True, 0.2), 2e-5, {"message_passing_steps": 2}, True),
+    "one particle": Case(lambda: float32_state((1,), False), 2e-5, {"levels": 3, "obstacle_features": False}),
+    "one level": Case(lambda: float32_state((5,), True, 0.1), 2e-5, {"levels": 1, "materials": SHUFFLED}),
+    "borders of cells": Case(border_state, 2e-5, {"cell_size": 0.0625}),
+    "relative": Case(lambda: moving_state(CROWD), 4e-5, RELATIVE),
+    "relative, one level": Case(
+        lambda: moving_state((9, 33), False), 4e-5, RELATIVE | {"levels": 1, "velocity_history": 2}
+    ),
+    "relative, one particle": Case(lambda: moving_state((1,), False), 4e-5, RELATIVE),
+    "relative, four levels": Case(
+        lambda: moving_state((7, 2), False, 0.6),
+        4e-5,
+        RELATIVE | {"obstacle_features": False, "levels": 4, "materials": SHUFFLED},
+    ),
+    "relative, free flight": Case(flying_state, 2e-4, RELATIVE),
+}
+
+
+def flat(tensors):
+    return torch.cat([tensor.double().cpu().flatten() for tensor in tensors])
+
+
+def drawn(network, state):
+    """Origins of the scenes' grids, and weights of the outputs."""
+    generator = torch.Generator().manual_seed(1)
+    origin_S3 = (-network.config.cell_size * torch.rand(state.scene_count, 3, generator=generator)).double()
+    return origin_S3, torch.randn(state.position_N3.shape, generator=generator, dtype=torch.float64)
+
+
+def reference(network, state, origin_S3, weight_N3):
+    """Output and gradients of the sum of outputs times `weight_N3`."""
+    output = network.normalised_acceleration(state, origin_S3)
+    found = torch.autograd.grad((output * weight_N3).sum(), list(network.parameters()), allow_unused=True)
+    pairs = zip(network.parameters(), found, strict=True)
+    return output.detach(), [torch.zeros_like(p) if gradient is None else gradient for p, gradient in pairs]
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Relative errors of the output, of all gradients together and of each, and the engine that made them."""
+
+    output: float
+    together: float
+    each: list[float]
+    engine: Any
+    origin_S3: torch.Tensor
+    output_N3: torch.Tensor
+
+
+def compare(network, state, precision, loss_scale, room):
+    origin_S3, weight_N3 = drawn(network, state)
+    output, expected = reference(network, state, origin_S3, weight_N3)
+    engine = engine_of(network, state, precision, (room,) * network.config.levels, loss_scale=loss_scale)
+    found = run_forward(engine, network, state, origin_S3).clone()
+    assert int(engine.grid.status) == 0
+    engine.output_gradient[: len(weight_N3), :3] = (loss_scale * weight_N3).float()
+    engine.backward()
+    each = gradients(engine, network)
+    pairs = zip(each, expected, strict=True)
+    return Comparison(
+        relative_error(found, output),
+        relative_error(flat(each), flat(expected)),
+        [relative_error(a, b) for a, b in pairs],
+        engine,
+        origin_S3,
+        found,
+    )
