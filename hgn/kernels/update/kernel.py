@@ -254,7 +254,7 @@ def average_values(value, average, shares, update, status, size, BLOCK: tl.const
 
     Not while the update has to be made again; after one that was skipped, with the values that stayed.
 
-    Reference: hgn.training.module's average; test: tests/kernels/test_training.py.
+    Reference: hgn.training.torch_updates.TorchUpdates; test: tests/kernels/test_training.py.
     """
     if (tl.load(status) & AGAIN) != 0:
         return
