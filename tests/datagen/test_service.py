@@ -12,9 +12,7 @@ import sys
 import threading
 import time
 from collections import Counter
-from multiprocessing.connection import Connection
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 from urllib.parse import unquote
 
@@ -227,14 +225,8 @@ def test_pool_that_says_nothing_is_started_again(make_config, monkeypatch):
     class Process:
         exitcode = None
 
-        def __init__(self, args, **options):
-            self.connection = Connection(os.dup(args[0].fileno()))
-            started.append(self)
-
-        def start(self):
-            if len(started) > 1:
-                self.connection.send(("complete",))
-                self.connection.close()
+        def __init__(self, connection):
+            self.connection = connection
 
         def kill(self):
             self.exitcode = -signal.SIGKILL
@@ -243,8 +235,15 @@ def test_pool_that_says_nothing_is_started_again(make_config, monkeypatch):
         def join(self):
             pass
 
-    context = SimpleNamespace(Pipe=multiprocessing.Pipe, Process=Process)
-    monkeypatch.setattr(multiprocessing, "get_context", lambda kind: context)
+    def start_child(target, *arguments, **options):
+        here, there = multiprocessing.Pipe(duplex=False)
+        started.append(Process(there))
+        if len(started) > 1:
+            there.send(("complete",))
+            there.close()
+        return started[-1], here
+
+    monkeypatch.setattr(datagen.service.supervisor, "start_child", start_child)
     recorder = Recorder()
     with Supervisor(make_config(worker_silence_s=0.05), recorder) as supervisor:
         wait_until(lambda: supervisor.state.status == "complete")
