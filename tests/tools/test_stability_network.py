@@ -102,25 +102,33 @@ def test_every_case_has_a_row(weights, tmp_path, monkeypatch, capsys):
     assert sum(line.startswith(("passes ", "FAILS ")) for line in printed.err.splitlines()) == len(rows)
 
 
-class Repeats(torch.nn.Module):
+class Repeats:
     """Accelerates as in the frame before, times a factor, with a drag and a wind along y."""
 
     def __init__(self, factor, drag, wind=0.0):
-        super().__init__()
-        self.config, self.weight = network_of().config, torch.nn.Parameter(torch.zeros(1))
         self.factor, self.drag, self.wind = factor, drag, wind
 
-    def forward(self, state):
+    def __call__(self, state):
         velocity_NM3 = state.velocity_NM3
         gain_N3 = self.factor * (velocity_NM3[:, 0] - velocity_NM3[:, 1])
         return gain_N3 - self.drag * velocity_NM3[:, 0] + self.wind * torch.eye(3)[1]
 
 
-def rows_of(some_network, names, **scene):
+def simulator_of(model):
+    """Simulates with a network or with other accelerations."""
+    if not isinstance(model, Repeats):
+        return Simulator(model, 60.0, "torch")
+    simulator = Simulator(network_of(torch.float32), 60.0, "torch")
+    simulator.backend.predict = model
+    return simulator
+
+
+def rows_of(model, names, **scene):
     """The rows of families for sand, without the solver."""
-    config = replace(some_network.config, materials=("sand",))
+    simulator = simulator_of(model)
+    config = replace(simulator.network.config, materials=("sand",))
     cases = [case for name in names for case in family(name, config, solver=False, **({"group_size": 0.04} | scene))]
-    runner = Runner(Simulator(some_network, 60.0, "torch"), cases, None)
+    runner = Runner(simulator, cases, None)
     return {case.name: runner.row(case)[0] for case in cases}
 
 
@@ -216,7 +224,7 @@ def test_turned_gravity(wind, held, monkeypatch):
     monkeypatch.setattr(network_cases, "TURNED_FRAMES", 20)
     config = replace(network_of().config, materials=("snow",))
     turned = [case for case in family("gravity", config, group_size=0.03) if case.upright]
-    runner = Runner(Simulator(Repeats(0.0, 0.0, wind), 60.0, "torch"), turned, CPU)
+    runner = Runner(simulator_of(Repeats(0.0, 0.0, wind)), turned, CPU)
     rows = [runner.row(case)[0] for case in turned]
     assert [row.held for row in rows] == [held] * 2 and calls == [8]  # both share the upright scenes
     assert not held or rows[0].measured == pytest.approx(1.0, rel=1e-3)
