@@ -22,10 +22,9 @@ from hgn.data.reader import find_episode
 from hgn.render.exchange import PLY_ENDING, USD_ENDINGS, require_exchange, save_rollout
 from hgn.render.pictures import animate, compare_picture, spread, write_picture
 from hgn.runtime.divergence import DivergedError
-from hgn.runtime.live import run_scene
 from hgn.runtime.simulator import InitialState, Simulator
 from hgn.runtime.weights import WeightsInfo, find_weights, require_frame_rate
-from hgn.scene.emission import at_start, entry_frames
+from hgn.scene.emission import entry_frames
 from hgn.scene.material import MATERIALS
 from hgn.scene.random_scene import generate_scene
 from hgn.scene.rollout_file import Rollout, obstacles_of_episode
@@ -101,7 +100,7 @@ def rollout(config: RolloutConfig) -> tuple[Path, Rollout]:
     reference_TN3 = scene = None
     if config.data is None:
         name, scene = _scene(config, simulator.info)
-        initial = InitialState.of_scene(at_start(scene))
+        initial = InitialState.of_scene(scene)
         obstacles = scene.obstacles
         for note in (*notes_on_meshes(scene), *_not_used(scene, weights.stem)):
             print(note, file=sys.stderr)
@@ -126,10 +125,7 @@ def rollout(config: RolloutConfig) -> tuple[Path, Rollout]:
     print(simulator.backend.note, file=sys.stderr)
     with bar("simulating", total=frames - 1, unit="frame") as progress:
         try:
-            if scene is not None and scene.emits:
-                position_TN3 = run_scene(simulator, scene, frames, lambda _: progress.update())
-            else:
-                (position_TN3,) = simulator.rollout([initial], frames, lambda _: progress.update())
+            (position_TN3,) = simulator.rollout([initial], frames, lambda _: progress.update())
         except DivergedError as error:
             raise ConfigError(f"weights must keep the simulation together, got {weights}: {error}") from error
     result = Rollout(

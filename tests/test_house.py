@@ -39,7 +39,7 @@ MANY_POSITIONAL_ARGUMENTS: dict[str, int] = {
     "hgn/runtime/exported_step.py": 1,
     "hgn/runtime/precompile_program.py": 4,
     "hgn/runtime/simulator.py": 10,
-    "hgn/runtime/triton_rollout.py": 5,
+    "hgn/runtime/triton_stepper.py": 5,
     "hgn/runtime/weights.py": 1,
     "hgn/training/parity.py": 3,
 }

@@ -2,7 +2,7 @@
 
 What it compiles goes into Triton's cache on disk.
 
-The launches are those of Updates and TritonRollout on tensors without memory, so that no kernel and no specialisation
+The launches are those of Updates and TritonStepper on tensors without memory, so that no kernel and no specialisation
 is named twice; only sizes are guessed (they choose between few variants), and what is guessed wrong is compiled when it
 is first used.
 """
@@ -23,7 +23,7 @@ from hgn.kernels.triton_compat import Launches, build_launcher, noted_launches, 
 from hgn.kernels.update.op import Updates, UpdateSettings
 from hgn.network.features import ParticleState
 from hgn.network.hgn import HierarchicalGraphNetwork
-from hgn.runtime.triton_rollout import TritonRollout, first_capacities
+from hgn.runtime.triton_stepper import TritonStepper, first_capacities
 from hgn.schema import from_mapping, to_mapping
 from hgn.step_config import UNCONSTRAINED, StepConfig
 
@@ -95,7 +95,7 @@ def _frame_launches(
         _simulation_launches(network, step, precision, 1, particles, capacities, 1.0, device)
 
 
-class _Unplaced(TritonRollout):
+class _Unplaced(TritonStepper):
     """A simulation of particles that are nowhere."""
 
     def _window(self) -> Window:

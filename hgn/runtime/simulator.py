@@ -6,8 +6,10 @@ Shape legend: T frames, N particles of all scenes, S scenes.
 
 from __future__ import annotations
 
+import functools
+import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -20,10 +22,13 @@ from hgn.network.features import ParticleState, material_rows
 from hgn.network.obstacles import ObstacleCells
 from hgn.runtime.backend import build, choose, set_matmul_precision
 from hgn.runtime.differentiable import Inputs, Pose, simulate
-from hgn.runtime.stepped_rollout import stepped
+from hgn.runtime.divergence import DivergedError
+from hgn.runtime.simulation import Simulation, on_host
 from hgn.runtime.torch_backend import Backend
+from hgn.runtime.torch_stepper import stepped
 from hgn.runtime.weights import WeightsInfo, find_weights, load_weights
 from hgn.scene.barrier import Barrier, build_barrier
+from hgn.scene.emission import at_entry, at_start, entry_frames, require_free_entries
 from hgn.scene.episode import Episode
 from hgn.scene.history import ballistic_velocities, require_past
 from hgn.scene.material import MATERIALS
@@ -53,6 +58,7 @@ class InitialState:
     materials: tuple[str, ...] = MATERIALS
     past_HN3: np.ndarray | None = None  # frames before this one, oldest first; none: free flight
     dimensions: int = 3
+    emitting: Scene | None = None  # the scene with the particles that enter later, which come behind those above
 
     @staticmethod
     def of_episode(episode: Episode) -> InitialState:
@@ -74,20 +80,20 @@ class InitialState:
     def of_scene(scene: Scene) -> InitialState:
         """A scene's initial particles, its obstacles sampled into cells.
 
-        Raises: ConfigError where obstacles move, for networks know them at rest, or where particles enter later.
+        Raises: ConfigError where obstacles move: a network knows obstacles at rest.
         """
         remedy = "leave keyframes out, or run datagen.solve"
         require(not scene.moves, "obstacles", "at rest for a network", "keyframes", remedy)
-        remedy = "run hgn.rollout, or hgn.runtime.live.run_scene"
-        require(not scene.emits, "emitters", "left out here, where all particles begin at once", "some", remedy)
+        first = at_start(scene)
         return InitialState(
-            scene.position_N3,
-            scene.velocity_N3,
-            scene.material_N,
+            first.position_N3,
+            first.velocity_N3,
+            first.material_N,
             build_obstacle_grid(scene.obstacles, scene.cell_size, scene.seed, scene.domain_size),
             scene.domain_size,
             scene.gravity,
             lambda: all_corners(scene.obstacles),
+            emitting=scene if scene.emits else None,
         )
 
     @staticmethod
@@ -111,6 +117,14 @@ class InitialState:
         """What of the obstacles nothing passes. Raises: ConfigError for a clearance of more than a cell."""
         corner_F33 = np.zeros((0, 3, 3)) if self.corners is None else self.corners()
         return build_barrier(corner_F33, self.obstacle_grid.cell_size, clearance, self.domain_size)
+
+
+@dataclass(frozen=True, eq=False)
+class _Entry:
+    """Particles that enter a scene in one frame."""
+
+    frame: int
+    state: ParticleState
 
 
 class Simulator:
@@ -198,27 +212,87 @@ class Simulator:
     ) -> list[np.ndarray]:
         """Simulates `frames` frames, frame 0 included; float32 [frames, N, 3] for each scene.
 
+        A particle that enters later is NaN until then. `on_frame(t)` is called when frame t is complete.
         Raises: ConfigError as `start`; DivergedError, which says at which frame; the network must be trained further
         then.
         """
+        return self.paths(scenes, frames, on_frame)[0]
+
+    def paths(
+        self,
+        scenes: Sequence[InitialState | Scene],
+        frames: int,
+        on_frame: Callable[[int], None] | None = None,
+        isolate: bool = False,
+    ) -> tuple[list[np.ndarray], dict[int, DivergedError]]:
+        """As `rollout`. With `isolate` a scene that diverges is NaN from that frame on, and the others continue; the
+        causes are returned by the number of the scene.
+        """
         require(frames >= 1, "frames", "at least 1", frames)
         states = _initial(scenes)
+        entries = [entry for entry in self._entries(states) if entry.frame < frames]
         state = self.start(states)
-        with self.backend.rollout(state) as rollout:
-            positions = [state.position_N3[None].cpu().numpy(), rollout.run(frames - 1, on_frame)]
-        counts = [len(initial.position_N3) for initial in states]
-        return np.split(np.concatenate(positions), np.cumsum(counts)[:-1], axis=1)
+        scene_N = torch.cat([state.scene_N, *(entry.state.scene_N for entry in entries)]).cpu().numpy()
+        position_TN3 = np.full((frames, len(scene_N), 3), np.nan, np.float32)
+        with self.simulation(state, len(scene_N), isolate) as simulation:
+            end = len(state.position_N3)
+            position_TN3[0, :end] = state.position_N3.cpu().numpy()
+            for entry in [*entries, None]:
+                last = frames - 1 if entry is None else entry.frame
+                first = simulation.frame + 1
+                position_TN3[first : last + 1, :end] = simulation.run(last + 1 - first, on_frame)
+                if entry is not None:
+                    begin, end = end, end + len(entry.state.position_N3)
+                    position_TN3[last, begin:end] = entry.state.position_N3.cpu().numpy()
+                    simulation.add(entry.state)
+            if not entries:
+                return np.split(
+                    position_TN3, np.cumsum(np.bincount(scene_N, minlength=len(states)))[:-1], axis=1
+                ), simulation.ended
+            return [position_TN3[:, scene_N == scene] for scene in range(len(states))], simulation.ended
 
     def frames(self, scene: InitialState | Scene) -> Iterator[np.ndarray]:
-        """Positions float32 [N, 3] of frame after frame, the initial ones first, for as long as they are asked for.
+        """Yields positions float32 [N, 3] of frame after frame without end, the initial ones first.
 
-        Backend triton is some frames ahead. Several scenes may be simulated side by side, each by a call of its own.
-        Raises: what `rollout` does, ConfigError with the first frame and DivergedError behind the last good one.
+        Backend triton computes some frames ahead. Several scenes may be simulated side by side, each by a call of its
+        own. Raises: what `rollout` does, ConfigError with the first frame and DivergedError after the last good one.
         """
-        state = self.start([scene])
+        states = _initial([scene])
+        entries = self._entries(states)
+        state = self.start(states)
         yield state.position_N3.cpu().numpy()
-        with self.backend.rollout(state) as rollout:
-            yield from rollout.frames()
+        capacity = len(state.position_N3) + sum(len(entry.state.position_N3) for entry in entries)
+        with self.simulation(state, capacity) as simulation:
+            for entry in entries:
+                for _ in range(simulation.frame + 1, entry.frame):
+                    yield simulation.run(1)[0]
+                (before_N3,) = simulation.run(1)
+                yield np.concatenate([before_N3, entry.state.position_N3.cpu().numpy()])
+                simulation.add(entry.state)
+            for block_TN3 in simulation.blocks(sys.maxsize):
+                yield from on_host(block_TN3)
+
+    def simulation(self, state: ParticleState, capacity: int = 0, isolate: bool = False) -> Simulation:
+        """Begins a simulation of a state; backend triton allocates buffers for `capacity` particles."""
+        return Simulation(functools.partial(self.backend.stepper, capacity=capacity), state, isolate)
+
+    def _entries(self, states: Sequence[InitialState]) -> list[_Entry]:
+        """The particles that enter the scenes, by frame. Raises: ConfigError where an obstacle is in their way."""
+        entries = []
+        for number, state in enumerate(states):
+            if state.emitting is None:
+                continue
+            entered = at_entry(state.emitting, self.frame_rate_hz)
+            entry_N = entry_frames(state.emitting, self.frame_rate_hz)
+            require_free_entries(state.emitting, entered)
+            for frame in sorted({*entry_N[len(state.position_N3) :].tolist()}):
+                new_N = entry_N == frame
+                particles = {
+                    name: getattr(entered, name)[new_N] for name in ("position_N3", "velocity_N3", "material_N")
+                }
+                new = self.start([replace(state, corners=None, **particles)])  # without barriers, which take long
+                entries.append(_Entry(frame, replace(new, scene_N=new.scene_N + number)))
+        return sorted(entries, key=lambda entry: entry.frame)
 
     def differentiable(
         self,

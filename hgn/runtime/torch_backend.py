@@ -9,7 +9,8 @@ import torch
 from hgn.cpu.allocator import keep_freed_memory
 from hgn.network.base import ParticleNetwork, Prediction
 from hgn.network.features import ParticleState
-from hgn.runtime.stepped_rollout import Rollout, SteppedRollout
+from hgn.runtime.simulation import Stepper
+from hgn.runtime.torch_stepper import TorchStepper
 from hgn.step.reference import accelerations
 
 
@@ -39,9 +40,9 @@ class Backend:
         """Returns the accelerations of a simulation [N, 3] in frame units, with rest."""
         return accelerations(self.network, state, self.prediction(state), self.step)
 
-    def rollout(self, state: ParticleState, room: int = 0) -> AbstractContextManager[Rollout]:
-        """A simulation that begins with a state; backend triton makes `room` for as many particles."""
-        return nullcontext(SteppedRollout(self.predict, state, self.step, self.network.config.dimensions))
+    def stepper(self, state: ParticleState, capacity: int = 0) -> AbstractContextManager[Stepper]:
+        """Computes the frames that follow a state; backend triton allocates buffers for `capacity` particles."""
+        return nullcontext(TorchStepper(self.predict, state, self.step, self.network.config.dimensions))
 
     def release(self) -> None:
         """Gives back the buffers that simulations keep for those that follow."""

@@ -8,10 +8,10 @@ from contextlib import contextmanager
 from hgn.network.features import ParticleState
 from hgn.network.hgn import HierarchicalGraphNetwork
 from hgn.runtime.torch_backend import Backend
-from hgn.runtime.triton_rollout import CHECKED_PARTICLES, TritonRollout
+from hgn.runtime.triton_stepper import CHECKED_PARTICLES, TritonStepper
 
-IDLE_ROLLOUTS = 2  # kept for the next simulations, of different numbers of scenes
-LEAST_FILLING = 0.5  # of the particles that one has room for: launches are as large as the room
+IDLE_STEPPERS = 2  # kept for the next simulations, of different numbers of scenes
+LEAST_FILLING = 0.5  # fraction of a stepper's capacity that is used at least: launches have the size of the capacity
 
 
 class TritonBackend(Backend):
@@ -23,37 +23,37 @@ class TritonBackend(Backend):
 
     def __init__(self, network: HierarchicalGraphNetwork, precision: str = "tf32", note: str = "") -> None:
         super().__init__(network, precision, note)
-        self.idle: dict[int, TritonRollout] = {}  # by number of scenes
+        self.idle: dict[int, TritonStepper] = {}  # by number of scenes
 
     @contextmanager
-    def rollout(self, state: ParticleState, room: int = 0) -> Iterator[TritonRollout]:
-        """A simulation that begins with a state, and is kept for others once it is over."""
-        rollout = self._reused(state, room)
-        if rollout is None:
-            rollout = TritonRollout(self.network, state, self.precision, room=room, step=self.step)
+    def stepper(self, state: ParticleState, capacity: int = 0) -> Iterator[TritonStepper]:
+        """Yields a stepper, new or idle; it is idle again on exit."""
+        stepper = self._idle_stepper(state, capacity)
+        if stepper is None:
+            stepper = TritonStepper(self.network, state, self.precision, capacity=capacity, step=self.step)
             if len(state.position_N3) <= CHECKED_PARTICLES:
-                rollout.require_parity(self.network, state)
-        before = rollout.growths
+                stepper.require_parity(self.network, state)
+        before = stepper.growths
         try:
-            yield rollout
+            yield stepper
         finally:
-            self.growths += rollout.growths - before
+            self.growths += stepper.growths - before
             self.idle.pop(state.scene_count, None)
-            if len(self.idle) == IDLE_ROLLOUTS:
+            if len(self.idle) == IDLE_STEPPERS:
                 del self.idle[next(iter(self.idle))]
-            self.idle[state.scene_count] = rollout
+            self.idle[state.scene_count] = stepper
 
-    def _reused(self, state: ParticleState, room: int) -> TritonRollout | None:
-        """An idle simulation of the same network begun anew, its launches captured already; none that fits.
+    def _idle_stepper(self, state: ParticleState, capacity: int) -> TritonStepper | None:
+        """Takes an idle stepper that fits the state and starts it from there; its launches are captured already.
 
-        Nobody else has it while it runs, and one that does not fit goes before another is allocated.
+        An idle stepper that does not fit is freed before another one is allocated.
         """
-        rollout, wanted = self.idle.pop(state.scene_count, None), max(room, len(state.position_N3))
-        if rollout is None or not rollout.fits(state) or not wanted <= rollout.particles <= wanted / LEAST_FILLING:
+        stepper, wanted = self.idle.pop(state.scene_count, None), max(capacity, len(state.position_N3))
+        if stepper is None or not stepper.fits(state) or not wanted <= stepper.particles <= wanted / LEAST_FILLING:
             return None
-        rollout.use_values(rollout.packed.gather(list(self.network.parameters())))
-        rollout.begin(state, new_obstacles=True)
-        return rollout
+        stepper.use_values(stepper.packed.gather(list(self.network.parameters())))
+        stepper.begin(state, new_obstacles=True)
+        return stepper
 
     def release(self) -> None:
         self.idle.clear()

@@ -136,14 +136,6 @@ def usable_frames(
     return count, square_F[(count - 1).clamp(min=0)]
 
 
-def diverged_scenes(position_N3: torch.Tensor, scene_N: torch.Tensor, domain_S3: torch.Tensor) -> torch.Tensor:
-    """Returns whether each particle belongs to a scene with a particle that diverged, bool [N]."""
-    scene_N = scene_N.long()
-    diverged_S = torch.zeros(len(domain_S3), device=position_N3.device)
-    diverged_S.index_add_(0, scene_N, diverged(position_N3, domain_S3[scene_N]).float())
-    return diverged_S[scene_N] > 0
-
-
 @functools.lru_cache(maxsize=256)
 def simulated_barrier(episode: Episode, clearance: float) -> Barrier:
     """Returns the barrier of an episode's obstacles, empty where only their cells are known.

@@ -14,11 +14,11 @@ from hgn.data.batch import BatchSample, make_batch
 from hgn.network.barriers import Barriers
 from hgn.network.base import ParticleNetwork
 from hgn.runtime.backend import fastest_stepped
-from hgn.runtime.stepped_rollout import stepped
+from hgn.runtime.simulation import Simulation
 from hgn.scene.episode import Episode
 from hgn.scene.history import window
 from hgn.training.errors import PARTICLES_PER_BATCH
-from hgn.training.pushforward import diverged_scenes, simulated_barrier
+from hgn.training.pushforward import simulated_barrier
 
 
 class TorchScenes:
@@ -51,19 +51,11 @@ class TorchScenes:
         return [*groups]
 
     def simulate(self, starts: Sequence[tuple[Episode, int]], frames: int) -> list[torch.Tensor]:
-        config = self._network.config
-        batch = make_batch(starts, config).to(self._backend.device)
-        begin = state = replace(batch.state(), barriers=self._barriers([episode for episode, _ in starts]))
-        path = []
-        for _ in range(frames):
-            state = stepped(self._backend.predict, state, self._backend.step, config.dimensions)
-            path.append(state.position_N3.cpu().clone())
-            again_N = diverged_scenes(state.position_N3, state.scene_N, state.domain_S3)
-            if bool(again_N.any()):
-                position_N3 = torch.where(again_N[:, None], begin.position_N3, state.position_N3)
-                velocity_NM3 = torch.where(again_N[:, None, None], 0.0, state.velocity_NM3)
-                state = replace(state, position_N3=position_N3, velocity_NM3=velocity_NM3)
-        return list(torch.stack(path).split(list(batch.particles_S), dim=1))
+        batch = make_batch(starts, self._network.config).to(self._backend.device)
+        begin = replace(batch.state(), barriers=self._barriers([episode for episode, _ in starts]))
+        with Simulation(self._backend.stepper, begin, isolate=True) as simulation:
+            path_FN3 = torch.from_numpy(simulation.run(frames))
+        return list(path_FN3.split(list(batch.particles_S), dim=1))
 
     def true_frames(self, episode: Episode, frame: int, known: int) -> torch.Tensor:
         return torch.from_numpy(window(episode, frame, self._network.config.velocity_history, known + 1))

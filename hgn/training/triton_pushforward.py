@@ -9,20 +9,21 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from contextlib import nullcontext
 from dataclasses import replace
 
 import torch
 
 from hgn.config import TrainingConfig
 from hgn.kernels.grid.op import ObstacleTable
-from hgn.kernels.step.op import DIVERGED, BarrierTable
+from hgn.kernels.step.op import BarrierTable
 from hgn.kernels.update.op import DeviceEpisode, DeviceSample
 from hgn.network.cell_keys import COORDINATE_BITS
 from hgn.network.features import ParticleState
 from hgn.network.hgn import HierarchicalGraphNetwork
 from hgn.network.obstacles import ObstacleCells
-from hgn.runtime.triton_rollout import CHECKED_PARTICLES, TritonRollout
-from hgn.training.pushforward import diverged_scenes
+from hgn.runtime.simulation import Simulation
+from hgn.runtime.triton_stepper import CHECKED_PARTICLES, TritonStepper
 
 SPARE = 1.1  # capacity for particles, as a multiple of those of the first simulation
 
@@ -35,7 +36,7 @@ class TritonScenes:
         self._network, self._training = network, training
         self._obstacle_cell_size = obstacle_cell_size
         self._history = network.config.velocity_history
-        self._rollout: TritonRollout | None = None
+        self._stepper: TritonStepper | None = None
         self.values = torch.empty(0)  # parameters in the packed layout, set before each simulation
 
     @property
@@ -63,17 +64,9 @@ class TritonScenes:
     def simulate(self, starts: Sequence[tuple[DeviceEpisode, int]], frames: int) -> list[torch.Tensor]:
         """Raises: ConfigError the first time, when the kernels are wrong on this machine."""
         episodes, state = [episode for episode, _ in starts], self._state(starts)
-        rollout = self._begun(episodes, state)
-        pieces, done = [], 0
-        while done < frames:
-            path_TN3, status = rollout.look(frames - done)
-            pieces.append(path_TN3.clone())
-            done += len(path_TN3)
-            if status & DIVERGED:
-                self._set_back(rollout, state)
-            else:
-                rollout.make_room(status)
-        return list(torch.cat(pieces).split([episode.particles for episode in episodes], dim=1))
+        with Simulation(lambda _: nullcontext(self._begun(episodes, state)), state, isolate=True) as simulation:
+            path_FN3 = torch.cat([block_TN3.clone() for block_TN3 in simulation.blocks(frames)])
+        return list(path_FN3.split([episode.particles for episode in episodes], dim=1))
 
     def _state(self, starts: Sequence[tuple[DeviceEpisode, int]]) -> ParticleState:
         """Returns the true state that the simulation starts from; obstacles have tables of their own.
@@ -97,8 +90,8 @@ class TritonScenes:
             obstacles=None,
         )
 
-    def _begun(self, episodes: Sequence[DeviceEpisode], state: ParticleState) -> TritonRollout:
-        """Returns a simulation at its start: the previous one if its buffers are large enough."""
+    def _begun(self, episodes: Sequence[DeviceEpisode], state: ParticleState) -> TritonStepper:
+        """Returns a stepper at its start: the previous one if its buffers are large enough."""
         config, values = self._network.config, self.values
         device = values.device
         table, empty = None, state.scene_count - len(episodes)
@@ -110,28 +103,28 @@ class TritonScenes:
         step = self._network.step.in_training
         if step.obstacle_clearance is not None:
             barriers = BarrierTable([*(episode.barrier for episode in episodes), *[None] * empty], device)
-        rollout = self._rollout
-        if rollout is not None and len(state.position_N3) <= rollout.particles:
+        stepper = self._stepper
+        if stepper is not None and len(state.position_N3) <= stepper.particles:
             if table is not None:
-                assert rollout.obstacles is not None
-                rollout.obstacles.take(table)
+                assert stepper.obstacles is not None
+                stepper.obstacles.take(table)
             if barriers is not None:
-                assert rollout.barriers is not None
-                rollout.barriers.take(barriers)
-            rollout.use_values(values)
-            rollout.begin(state)
-            return rollout
+                assert stepper.barriers is not None
+                stepper.barriers.take(barriers)
+            stepper.use_values(values)
+            stepper.begin(state)
+            return stepper
         capacities = None
-        if rollout is not None:
-            capacities = rollout.grid.capacities
-            self._rollout = rollout = None  # before the new one is allocated
+        if stepper is not None:
+            capacities = stepper.grid.capacities
+            self._stepper = stepper = None  # before the new one is allocated
         particles = 16 * math.ceil(SPARE * len(state.position_N3) / 16)
-        rollout = TritonRollout(
+        stepper = TritonStepper(
             self._network,
             state,
             self._training.precision,
             capacities,
-            room=particles,
+            capacity=particles,
             obstacles=table,
             barriers=barriers,
             step=step,
@@ -139,12 +132,12 @@ class TritonScenes:
         if capacities is None:
             first = self._first_scenes(episodes, state)
             if first is not None:
-                rollout.require_parity(self._network, first, "training.backend")
+                stepper.require_parity(self._network, first, "training.backend")
                 if device.type == "cuda":
                     torch.cuda.empty_cache()  # what is free decides where episodes are kept
-        rollout.use_values(values)
-        self._rollout = rollout
-        return rollout
+        stepper.use_values(values)
+        self._stepper = stepper
+        return stepper
 
     def _first_scenes(self, episodes: Sequence[DeviceEpisode], state: ParticleState) -> ParticleState | None:
         """Returns as many of the first scenes as PyTorch can check, with obstacles; None if the first is too large."""
@@ -172,12 +165,3 @@ class TritonScenes:
             gravity_S3=state.gravity_S3[:scenes],
             obstacles=obstacles,
         )
-
-    def _set_back(self, rollout: TritonRollout, state: ParticleState) -> None:
-        """Resets scenes that diverged to their start, at rest, so that the others continue."""
-        count = rollout.live
-        again_N1 = diverged_scenes(rollout.position_N3[:count], rollout.scene_N[:count], rollout.domain_S3)[:, None]
-        rollout.position_N3[:count] = torch.where(again_N1, state.position_N3, rollout.position_N3[:count])
-        rollout.velocity_NV[:count] = torch.where(again_N1, 0.0, rollout.velocity_NV[:count])
-        rollout.lost.zero_()
-        rollout.grid.status.zero_()

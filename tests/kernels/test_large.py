@@ -13,7 +13,7 @@ from hgn.kernels import forward
 from hgn.kernels.blocks import elements
 from hgn.network.features import ParticleState
 from hgn.runtime.parity import relative_error
-from hgn.runtime.triton_rollout import TritonRollout
+from hgn.runtime.triton_stepper import TritonStepper
 from hgn.schema import ConfigError
 from tools.bench.contenders import BOUNDS, bench_network
 from tools.bench.states import Workload, state_of
@@ -50,7 +50,7 @@ def test_blocks_are_alike(monkeypatch):
     """Each block gets the accelerations of a single one, with the 64-bit addresses that 10 million particles need."""
     monkeypatch.setattr(forward, "ADDRESSED", 4000)
     network, (block, scene) = bench_network(NETWORK, CPU), states()
-    rollout = TritonRollout(network, scene, "fp32")
+    rollout = TritonStepper(network, scene, "fp32")
     rollout._network_pass()
     with torch.no_grad():
         expected_N3 = network.normalised_acceleration(block)
@@ -63,7 +63,7 @@ def test_too_many_are_refused(scene, message, monkeypatch):
     """A scene with more cells or particles than int32 can address is refused before anything is computed."""
     monkeypatch.setattr(forward, "ADDRESSED", 16 * 24)
     with pytest.raises(ConfigError, match=message + "; take fewer at once"):
-        TritonRollout(bench_network(NETWORK, CPU), states()[scene], "fp32")
+        TritonStepper(bench_network(NETWORK, CPU), states()[scene], "fp32")
 
 
 @triton.jit

@@ -3,6 +3,7 @@
 import gc
 import itertools
 import weakref
+from contextlib import nullcontext
 from dataclasses import replace
 from functools import partial
 
@@ -20,12 +21,14 @@ from hgn.kernels.grid.op import DeviceGrid, Window
 from hgn.kernels.step.op import BarrierTable
 from hgn.network.features import ParticleState
 from hgn.network.hgn import HierarchicalGraphNetwork
-from hgn.runtime import triton_rollout
+from hgn.runtime import triton_stepper
 from hgn.runtime.divergence import DivergedError
 from hgn.runtime.live import LiveSimulation
 from hgn.runtime.parity import relative_error
+from hgn.runtime.rollouts import simulate_scenes
+from hgn.runtime.simulation import Simulation, on_host
 from hgn.runtime.simulator import Simulator
-from hgn.runtime.triton_rollout import TritonRollout, first_capacities
+from hgn.runtime.triton_stepper import TritonStepper, first_capacities
 from hgn.runtime.weights import find_weights, load_weights
 from hgn.schema import ConfigError
 
@@ -38,6 +41,11 @@ def scene(particles, seed=0, **changes):
 
 def network(levels=1, **changes):
     return network_of(torch.float32, width=16, levels=levels, message_passing_steps=1, **changes).to(device())
+
+
+def path_of(stepper, frames):
+    """Positions [T, N, 3] of the next frames."""
+    return np.concatenate([on_host(block_TN3) for block_TN3, _ in stepper.blocks(frames)])
 
 
 def spreading():
@@ -74,9 +82,9 @@ def test_walls_hold(changes):
         walled.normaliser.acceleration_std.fill_(0.02)
         simulator = Simulator(walled, 60.0, backend, "fp32")
         state = simulator.start(scenes)
-        with simulator.backend.rollout(state) as rollout:
-            path_TN3 = rollout.run(3)
-            motions.append((path_TN3, *(x.numpy(force=True) for x in rollout.motion())))
+        with simulator.simulation(state) as simulation:
+            path_TN3, last = simulation.run(3), simulation.state
+            motions.append((path_TN3, *(x.numpy(force=True) for x in (last.position_N3, last.velocity_NM3))))
         begin_N3 = state.position_N3.numpy(force=True)
         walls = slice(changes.get("dimensions", 3))
         assert (path_TN3[..., walls] >= np.minimum(begin_N3, near)[..., walls] - 1e-7).all()
@@ -111,9 +119,9 @@ def test_obstacles_hold(walls):
     for backend, clearance in (("torch", None), ("torch", 2e-3), ("triton", 2e-3)):
         simulator = thrown(backend, wall_clearance=walls, obstacle_clearance=clearance)
         state = simulator.start(held_scenes)
-        with simulator.backend.rollout(state) as rollout:
-            path_TN3 = rollout.run(3)
-            motions.append((path_TN3, *(x.numpy(force=True) for x in rollout.motion())))
+        with simulator.simulation(state) as simulation:
+            path_TN3, last = simulation.run(3), simulation.state
+            motions.append((path_TN3, *(x.numpy(force=True) for x in (last.position_N3, last.velocity_NM3))))
         whole_TN3 = np.concatenate([state.position_N3.numpy(force=True)[None], path_TN3]).astype(np.float64)
         passed_S = [
             sum(crossings(*ways, corner_F33) for ways in itertools.pairwise(whole_TN3[:, 12 * i : 12 * i + 12]))
@@ -138,15 +146,15 @@ def test_obstacles_that_hold_change():
     paths = [thrown("triton", **changes).rollout([each], 3)[0][1:] for each in scenes]
     assert all(abs(paths[i] - paths[i + 1]).max() > 1e-3 for i in (0, 1))
     same = partial(np.testing.assert_allclose, rtol=0, atol=1e-7)
-    rollout = TritonRollout(simulator.network, states[0], "fp32")
+    rollout = TritonStepper(simulator.network, states[0], "fp32")
     for index in (0, 1, 2, 0):
         assert rollout.take(states[index])
-        same(rollout.run(2), paths[index])
+        same(path_of(rollout, 2), paths[index])
     given = BarrierTable.of(states[2].barriers, 1, device())
-    rollout = TritonRollout(simulator.network, states[1], "fp32", barriers=given)
-    same(rollout.run(2), paths[2])
+    rollout = TritonStepper(simulator.network, states[1], "fp32", barriers=given)
+    same(path_of(rollout, 2), paths[2])
     rollout.begin(states[1])
-    same(rollout.run(2), paths[2])
+    same(path_of(rollout, 2), paths[2])
 
 
 def test_obstacles_that_hold_stay(monkeypatch):
@@ -158,7 +166,7 @@ def test_obstacles_that_hold_stay(monkeypatch):
     )
     hashed, real = [], BarrierTable.of
     monkeypatch.setattr(BarrierTable, "of", lambda barriers, *rest: hashed.append(barriers) or real(barriers, *rest))
-    rollout = TritonRollout(simulator.network, state, "fp32")
+    rollout = TritonStepper(simulator.network, state, "fp32")
     for next_state in (state, replace(state, gravity_S3=2 * state.gravity_S3), other, other, state):
         assert rollout.take(next_state)
     assert [barriers is state.barriers for barriers in hashed] == [True, False, True]
@@ -192,7 +200,7 @@ def test_free_flight_is_not_refused():
         falls_T3 = np.diff(path_TN3, 2, axis=0).mean(axis=1) * 3600
         np.testing.assert_allclose(falls_T3, np.broadcast_to(thrown.gravity, falls_T3.shape), rtol=0, atol=5e-3)
     stirred = Simulator(network(2, inputs="relative"), 60.0, "torch").start([scene(40)])
-    rollout = TritonRollout(network(2, inputs="relative"), stirred, "fp16", (512, 64))
+    rollout = TritonStepper(network(2, inputs="relative"), stirred, "fp16", (512, 64))
     rollout.require_parity(network(2, inputs="relative"), stirred)
     other = network(2, inputs="relative")
     with torch.no_grad():
@@ -203,9 +211,9 @@ def test_free_flight_is_not_refused():
 
 def test_overflow_loses_nothing():
     """A rollout whose cells outgrow its buffers grows them, and its frames equal those of one that had room."""
-    roomy, tight = (TritonRollout(*spreading(), "fp32", (room,)) for room in (64, 16))
-    expected = roomy.run(3)
-    found = np.concatenate([tight.run(1), tight.run(2)])
+    roomy, tight = (TritonStepper(*spreading(), "fp32", (room,)) for room in (64, 16))
+    expected = path_of(roomy, 3)
+    found = np.concatenate([path_of(tight, 1), path_of(tight, 2)])
     assert tight.growths > 0 and roomy.growths == 0
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-6)
 
@@ -238,8 +246,8 @@ def test_scenes_that_change():
     paths, growing = [], []
     for backend, precision in (("torch", "fp32"), ("triton", "fp32")):
         simulator = Simulator(network(2, inputs="relative"), 60.0, backend, precision)
-        live = LiveSimulation(simulator, scene(4), room=6)
-        first = live._rollout
+        live = LiveSimulation(simulator, scene(4), capacity=6)
+        first = live.simulation.stepper
         path = [live.step()]
         state = live.state
         for count, seed in ((2, 1), (3, 2)):
@@ -248,7 +256,7 @@ def test_scenes_that_change():
             live.replace_obstacles(new)
             live.set_gravity((0.0, float(seed), 1.0))
             path += [live.step() for _ in range(2)]
-            growing.append(live._rollout is not first)
+            growing.append(live.simulation.stepper is not first)
         live.restore(state.position_N3.cpu().numpy(), state.velocity_NM3.cpu().numpy(), 1)
         paths.append([*path, live.step()])
         live.close()
@@ -260,7 +268,7 @@ def test_scenes_that_change():
 def test_frame_by_frame(monkeypatch):
     """Frames that are asked for one by one are bitwise those of a rollout, beside another simulation of the same
     simulator; the one that ends last is kept. What diverges gives its good frames first."""
-    monkeypatch.setattr(triton_rollout, "LOOK_FRAMES", 2)
+    monkeypatch.setattr(triton_stepper, "LOOK_FRAMES", 2)
     first, second = scene(3), scene(2, 1)
     simulator = Simulator(network(), 60.0, "triton", "fp32")
     (expected,) = simulator.rollout([first], 4)
@@ -293,7 +301,7 @@ def test_memory_of_a_simulation(particles, side, most, monkeypatch):
     """In fp16 the network of the paper's size simulates a million particles, of which a cell has three as on
     the bench, within 2.35 KB each, and 4,296 within 0.055 GB; what is asked are 3 KB and 0.1 GB. Counted over all
     tensors of a simulation without memory: weights, state and positions on their way to the host too."""
-    monkeypatch.setattr(TritonRollout, "_window", lambda _: Window((0, 0, 0), (side, side, side)))
+    monkeypatch.setattr(TritonStepper, "_window", lambda _: Window((0, 0, 0), (side, side, side)))
     cells = tuple(round(share * particles) for share in (0.32, 0.0569, 0.0107, 0.0015))
     before = set(on_meta())
     with torch.device("meta"):
@@ -301,7 +309,7 @@ def test_memory_of_a_simulation(particles, side, most, monkeypatch):
         position_N3, velocity_NM3 = torch.zeros(particles, 3), torch.zeros(particles, 5, 3)
         index_N = torch.zeros(particles, dtype=torch.int64)
         state = ParticleState(position_N3, velocity_NM3, index_N, index_N, torch.zeros(1, 3), torch.zeros(1, 3), None)
-    rollout = TritonRollout(whole, state, "fp16", first_capacities(cells, particles))
+    rollout = TritonStepper(whole, state, "fp16", first_capacities(cells, particles))
     gc.collect()
     held = sum(size for storage, size in on_meta().items() if storage not in before)
     assert 0.8 * most < held <= most
@@ -317,8 +325,8 @@ def on_meta():
 def test_growing_gives_back_first(monkeypatch):
     """While buffers grow the old ones are gone; where there is no memory for larger ones, the simulation has its old
     ones again and stands where it stood: with memory it goes on as if nothing had been."""
-    expected = TritonRollout(*spreading(), "fp32", (64,)).run(3)
-    tight = TritonRollout(*spreading(), "fp32", (16,))
+    expected = path_of(TritonStepper(*spreading(), "fp32", (64,)), 3)
+    tight = TritonStepper(*spreading(), "fp32", (16,))
     old = [weakref.ref(tight.grid), weakref.ref(tight.fused)]
     build, asked = DeviceGrid.__init__, []
 
@@ -330,30 +338,33 @@ def test_growing_gives_back_first(monkeypatch):
         build(grid, window, scenes, capacities, *rest)
 
     monkeypatch.setattr(DeviceGrid, "__init__", refuse)
+    done = []
     with pytest.raises(torch.OutOfMemoryError, match="no room"):
-        tight.run(3)
+        for block_TN3, _ in tight.blocks(3):
+            done.append(on_host(block_TN3))
     assert asked[0][0] > asked[1][0] == (16,) and all(one is None for _, alive in asked for one in alive)
-    done = tight.frames_done
-    np.testing.assert_allclose(tight.run(3 - done), expected[done:], rtol=0, atol=1e-6)
+    rest = path_of(tight, 3 - sum(map(len, done)))
+    np.testing.assert_allclose(np.concatenate([*done, rest]), expected, rtol=0, atol=1e-6)
 
 
 def test_frames_taken_away_beside_the_next(monkeypatch):
     """Frames that are started before those before them are looked at are the same bitwise, where buffers grow too: what
     was started in vain moves nothing; and the frame of a divergence is the same."""
-    monkeypatch.setattr(triton_rollout, "LOOK_FRAMES", 1)
+    monkeypatch.setattr(triton_stepper, "LOOK_FRAMES", 1)
     paths, growths, lost = [], [], []
     for overlap in (False, True):
         fast, state = spreading()
-        tight = TritonRollout(fast, state, "fp32", (16,))
+        tight = TritonStepper(fast, state, "fp32", (16,))
         tight.overlap = overlap
         seen: list[int] = []
-        paths.append(tight.run(3, seen.append))
+        simulation = Simulation(lambda _, stepper=tight: nullcontext(stepper), state)
+        paths.append(simulation.run(3, seen.append))
         growths.append(tight.growths)
         assert seen == [1, 2, 3]
-        tight.begin(state)
+        simulation.continue_from(state)
         tight.velocity_NV[0] = 1.0
         with pytest.raises(DivergedError) as caught:
-            tight.run(2)
+            simulation.run(2)
         lost.append(str(caught.value))
     np.testing.assert_array_equal(paths[0], paths[1])
     assert growths[0] == growths[1] > 0 and lost[0] == lost[1]
@@ -372,11 +383,29 @@ def test_divergence_names_the_frame():
     assert messages[0] == messages[1] and "4 of 4 particles" in messages[0]
 
 
+def test_a_scene_that_diverges_ends_alone():
+    """The scene between two others ends at the frame of backend torch with its message; the others go on in the same
+    buffers, and each frame is computed once."""
+    scenes = [scene(3), scene(2, 1), scene(4, 2)]
+    scenes[1] = replace(scenes[1], velocity_N3=np.full_like(scenes[1].velocity_N3, 12.0))
+    steppers, results = [], []
+    for backend in ("torch", "triton"):
+        simulator = Simulator(network(2), 60.0, backend, "fp32")
+        results.append(simulate_scenes(simulator, scenes, 6))
+        steppers.append(getattr(simulator.backend, "idle", None))
+    for found, expected in zip(*results, strict=True):
+        assert found.cause == expected.cause
+        np.testing.assert_allclose(found.position_TN3, expected.position_TN3, rtol=0, atol=1e-6)
+    assert [result.cause is None for result in results[1]] == [True, False, True]
+    assert 1 < results[1][1].frame_count < 6 and "2 of 2 particles" in results[1][1].cause
+    assert steppers[1][3].live == 7
+
+
 def test_wrong_kernels_are_refused():
     """A rollout whose first output is not the reference network's is refused before it moves anything."""
     plain = network()
     state = Simulator(plain, 60.0, "torch").start([scene(5)])
-    rollout = TritonRollout(plain, state, "fp32")
+    rollout = TritonStepper(plain, state, "fp32")
     rollout.require_parity(plain, state)
     other = network()
     with torch.no_grad():
@@ -404,7 +433,7 @@ def test_crowds_are_added_in_float32(monkeypatch):
 
     def error(density, careful):
         state = block(density, 0.0625, 1)
-        rollout = TritonRollout(network, state, "fp16", (64,))
+        rollout = TritonStepper(network, state, "fp16", (64,))
         assert rollout._careful is careful
         rollout._network_pass()
         expected = network.normalised_acceleration(state).detach()
@@ -412,9 +441,9 @@ def test_crowds_are_added_in_float32(monkeypatch):
 
     assert error(1, False) < 1e-2
     crowded = error(2, True)
-    roomy = TritonRollout(network, block(1, 0.0625, 1), "fp16", (64,), room=200)
+    roomy = TritonStepper(network, block(1, 0.0625, 1), "fp16", (64,), capacity=200)
     assert roomy.fits(block(1, 0.0625, 1)) and not roomy.fits(block(2, 0.0625, 1))
-    monkeypatch.setattr(triton_rollout, "CROWDED", 10**9)
+    monkeypatch.setattr(triton_stepper, "CROWDED", 10**9)
     assert crowded < 1e-2 and crowded < 0.8 * error(2, False)
 
 
@@ -430,7 +459,7 @@ def test_density(density):
     state = on_device(block(density, network.config.cell_size, 4), device())
     output = []
     for precision in ("fp16", "tf32"):
-        rollout = TritonRollout(network, state, precision)
+        rollout = TritonStepper(network, state, precision)
         rollout._network_pass()
         output.append(rollout.fused.output[: len(state.position_N3), :3].clone())
     error = relative_error(*output)

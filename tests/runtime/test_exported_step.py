@@ -22,8 +22,8 @@ from hgn.network.barriers import Barriers
 from hgn.network.hgn import HierarchicalGraphNetwork
 from hgn.runtime.exported_step import INPUTS, initial_arrays, write_package
 from hgn.runtime.simulator import Simulator
-from hgn.runtime.stepped_rollout import stepped
 from hgn.runtime.torch_backend import Backend
+from hgn.runtime.torch_stepper import stepped
 from hgn.runtime.weights import WeightsInfo, save_weights
 from hgn.scene.barrier import barrier_of_pieces, barrier_pieces
 from hgn.scene.scene_file import load_scene

@@ -12,8 +12,8 @@ from runtime.scenes import random_scene as scene
 
 from hgn.runtime import simulator as simulator_module
 from hgn.runtime.divergence import DivergedError
-from hgn.runtime.live import LiveSimulation, run_scene
-from hgn.runtime.simulator import InitialState, Simulator
+from hgn.runtime.live import LiveSimulation
+from hgn.runtime.simulator import Simulator
 from hgn.runtime.weights import WeightsInfo
 from hgn.scene.scene import Scene
 from hgn.schema import ConfigError
@@ -232,7 +232,7 @@ def test_a_scene_that_particles_enter(backend):
     time = np.repeat([0.0, 0.04, 0.05], [20, 2, 4])
     emitting = Scene(**joined(first, new), entry_s_N=time, gravity=first.gravity)
     simulator = Simulator(small(), 60.0, backend)
-    path_TN3 = run_scene(simulator, emitting, 6)
+    (path_TN3,) = simulator.rollout([emitting], 6)
     entry_N = np.repeat([0, 3, 3], [20, 2, 4])
     assert (np.isfinite(path_TN3).all(axis=2) == (entry_N <= np.arange(6)[:, None])).all()
     flight = (3 / 60 - time[20:])[:, None]
@@ -243,5 +243,11 @@ def test_a_scene_that_particles_enter(backend):
         entered = new.velocity_N3 + flight * np.array(first.gravity)
         live.add_particles(path_TN3[3, 20:], entered.astype(np.float32), new.material_N)
         np.testing.assert_array_equal(frames(live, 2), path_TN3[4:])
-    with pytest.raises(ConfigError, match="emitters must be left out here, where all particles begin at once"):
-        simulator.rollout([InitialState.of_scene(emitting)], 2)
+    # beside a scene of its own, and frame by frame, particles enter in the same way
+    other, _ = simulator.rollout([emitting, first], 6)
+    np.testing.assert_allclose(other, path_TN3, rtol=0, atol=1e-6)
+    for position_N3, expected_N3 in zip(simulator.frames(emitting), path_TN3, strict=False):
+        np.testing.assert_array_equal(position_N3, expected_N3[: len(position_N3)])
+        assert np.isnan(expected_N3[len(position_N3) :]).all()
+    with pytest.raises(ConfigError, match="emitters must be left out here"):
+        LiveSimulation(simulator, emitting)

@@ -13,6 +13,7 @@ from PIL import Image
 from hgn.config import MpmConfig
 from hgn.data.batch import make_batch
 from hgn.data.reader import EpisodeStore
+from hgn.runtime.backend import build
 from hgn.runtime.rollouts import RolloutResult, simulate_scenes
 from hgn.runtime.simulator import InitialState, Simulator
 from hgn.scene.distance import fraction_inside
@@ -57,12 +58,13 @@ def test_one_step_errors_of_triton(data):
         material_N=episode.material_N[1:],
     )
     network = network_of(torch.float32, width=16, levels=1, message_passing_steps=1, wall_clearance=(0.5, 0.5))
-    predict, made = TritonPredictor(network, "fp32"), []
+    backend, made = build("triton", network, "fp32"), []
     with torch.inference_mode():
         for samples in ([(episode, 0), (episode, 2)], [(fewer, 1), (fewer, 3)], [(episode, 3)]):
             batch = make_batch(samples, network.config)
-            torch.testing.assert_close(predict(batch), network(batch.state()), rtol=1e-4, atol=1e-8)
-            made.append(predict._rollout)
+            found_N3 = TritonPredictor(backend)(batch)
+            torch.testing.assert_close(found_N3, network(batch.state()), rtol=1e-4, atol=1e-8)
+            made.append(backend.idle[len(samples)])
     assert made[0] is made[1] is not made[2]
 
 

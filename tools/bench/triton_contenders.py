@@ -32,41 +32,42 @@ class TritonFrame(Contender):
     """One frame of a simulation; the state is restored before each frame."""
 
     def __init__(self, config: NetworkConfig, work: Workload, device: torch.device, precision: str) -> None:
-        from hgn.runtime.triton_rollout import TritonRollout  # loads Triton
+        from hgn.runtime.triton_stepper import TritonStepper  # loads Triton
 
         self.device = device
         network = bench_network(config, device)
         assert isinstance(network, HierarchicalGraphNetwork)
         self.network, self.state = network, state_of(work, config, device)
         self.velocity_NV = self.state.velocity_NM3.flatten(1)  # a view
-        self.rollout = TritonRollout(network, self.state, precision)
+        self.stepper = TritonStepper(network, self.state, precision)
         # the rollout stores positions of a limited number of frames
-        self.at_once = min(FRAMES_AT_ONCE, len(self.rollout.path_TN3))
+        self.at_once = min(FRAMES_AT_ONCE, len(self.stepper.path_TN3))
 
     def restore(self) -> None:
-        self.rollout.position_N3.copy_(self.state.position_N3)
-        self.rollout.velocity_NV.copy_(self.velocity_NV)
+        self.stepper.position_N3.copy_(self.state.position_N3)
+        self.stepper.velocity_NV.copy_(self.velocity_NV)
 
     def run(self) -> None:
         """Frames of the same state, each in a graph where there is a GPU."""
-        self.rollout.frame.zero_()
+        self.stepper.frame.zero_()
         for _ in range(self.at_once):
             self.restore()
-            if self.rollout.graph is None:
-                self.rollout.frame_launches()
+            if self.stepper.graph is None:
+                self.stepper.frame_launches()
             else:
-                self.rollout.graph.replay()
+                self.stepper.graph.replay()
 
     def sample(self) -> float:
         milliseconds = super().sample()
-        if int(self.rollout.frame) != self.at_once:
+        if int(self.stepper.frame) != self.at_once:
             self.failure = "frames were skipped for lack of memory"
         return milliseconds
 
     def check(self, precision: str) -> str:
         self.restore()
-        self.rollout.run(1)  # allocates memory if necessary
-        return check_acceleration(self.rollout.velocity_NV[:, :3], self.network, self.state, precision)
+        for _ in self.stepper.blocks(1):  # allocates memory if necessary
+            pass
+        return check_acceleration(self.stepper.velocity_NV[:, :3], self.network, self.state, precision)
 
 
 def device_samples(batch: Batch) -> list[tuple[DeviceEpisode, int, int]]:

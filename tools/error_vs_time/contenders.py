@@ -18,7 +18,6 @@ import torch
 
 from hgn.config import NetworkConfig
 from hgn.data.batch import Batch, make_batch
-from hgn.network.hgn import HierarchicalGraphNetwork
 from hgn.runtime.backend import choose
 from hgn.runtime.rollouts import RolloutResult, simulate_scenes
 from hgn.runtime.simulator import InitialState, Simulator
@@ -29,7 +28,7 @@ from tools.solver_rollouts import OnFrame, Setting, SolverLaunches
 from tools.timing import FrameClock, matmul_precision
 
 if TYPE_CHECKING:
-    from hgn.runtime.triton_rollout import TritonRollout
+    from hgn.runtime.triton_backend import TritonBackend
 
 Row = dict[str, Any]
 PARTICLES_PER_BATCH = 32_768
@@ -87,7 +86,6 @@ class NetworkContender(Contender):
             self.simulator = Simulator(self.network, info.frame_rate_hz, chosen)
         self.stepped = chosen.stepped
         self.importance = OTHER_PRECISIONS if not first else HGN_FIRST if config.kind == "hgn" else GNS_FIRST
-        self._predictor: TritonPredictor | None = None
         self.row = {
             "system": config.kind,
             "weights": file.name,
@@ -102,9 +100,10 @@ class NetworkContender(Contender):
     def one_step(self, episode: Episode, stride: int) -> OneStep:
         predict, at_once = network_predictor(self.simulator.backend), PARTICLES_PER_BATCH
         if not self.stepped:
-            assert isinstance(self.network, HierarchicalGraphNetwork)
-            self._predictor = self._predictor or TritonPredictor(self.network, self.precision)
-            predict, at_once = self._predictor, PARTICLES_AT_ONCE
+            from hgn.runtime.triton_backend import TritonBackend  # loads Triton
+
+            assert isinstance(self.simulator.backend, TritonBackend)
+            predict, at_once = TritonPredictor(self.simulator.backend), PARTICLES_AT_ONCE
         with matmul_precision(self.precision):
             return one_step(predict, self.network.config, episode, stride, self.device, at_once)
 
@@ -113,7 +112,6 @@ class NetworkContender(Contender):
             return simulate_scenes(self.simulator, [InitialState.of_episode(e) for e in episodes], frames, on_frame)
 
     def release(self) -> None:
-        self._predictor = None
         self.simulator.backend.release()
 
 
@@ -169,23 +167,16 @@ class BaselineContender(Contender):
 class TritonPredictor:
     """Accelerations of backend triton: simulates one frame from each state."""
 
-    def __init__(self, network: HierarchicalGraphNetwork, precision: str) -> None:
-        self.network, self.precision = network, precision
-        self._rollout: TritonRollout | None = None
+    def __init__(self, backend: TritonBackend) -> None:
+        self.backend = backend
 
     def __call__(self, batch: Batch) -> torch.Tensor:
-        from hgn.runtime.triton_rollout import TritonRollout  # loads Triton
-
-        state, rollout = batch.state(), self._rollout
-        if rollout is not None and rollout.fits(state):
-            rollout.begin(state, new_obstacles=True)
-        else:
-            room = 0 if rollout is None else rollout.particles
-            self._rollout = rollout = None  # before the new one is allocated
-            rollout = self._rollout = TritonRollout(self.network, state, self.precision, room=room)
-        rollout.run(1)
-        output_N3 = rollout.fused.output[: len(state.position_N3), :3]  # before the walls hold what comes to them
-        return self.network.restored_acceleration(output_N3, state)
+        state = batch.state()
+        with self.backend.stepper(state) as stepper:
+            for _ in stepper.blocks(1):
+                pass
+            output_N3 = stepper.fused.output[: len(state.position_N3), :3]  # before walls act on positions
+            return self.backend.network.restored_acceleration(output_N3, state)
 
 
 def one_step(

@@ -422,7 +422,7 @@ def integrate(
 def advance(status, lost, frame, OVERLAP: tl.constexpr):
     """Counts the frame, unless it was not taken.
 
-    Reference: hgn.runtime.stepped_rollout; test: tests/kernels/test_rollout.py.
+    Reference: hgn.runtime.torch_stepper; test: tests/kernels/test_rollout.py.
     """
     if OVERLAP:
         gdc_wait()

@@ -8,12 +8,10 @@ Shape legend: N particles of all scenes, S scenes, T frames.
 
 from __future__ import annotations
 
-import functools
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
-import numpy as np
 import torch
 
 from hgn.kernels.capture import captured
@@ -26,7 +24,6 @@ from hgn.network.cell_keys import COORDINATE_LIMIT, pack
 from hgn.network.features import ParticleState
 from hgn.network.grid import build_hierarchy
 from hgn.network.hgn import HierarchicalGraphNetwork
-from hgn.runtime.divergence import DivergedError, describe_diverged, diverged
 from hgn.runtime.parity import LEAST_OUTPUT, OUTPUT_BOUND, relative_error, require_bound
 from hgn.runtime.triton_host import kernel_precision
 from hgn.step.reference import rested
@@ -78,12 +75,7 @@ class _Look:
     end: torch.cuda.Event | None
 
 
-@functools.cache
-def _copy_stream(device: int) -> torch.cuda.Stream:
-    return torch.cuda.Stream(device)
-
-
-class TritonRollout:
+class TritonStepper:
     """A simulation in progress on one device. Without CUDA the same launches run one by one (for tests)."""
 
     def __init__(
@@ -92,22 +84,22 @@ class TritonRollout:
         state: ParticleState,
         precision: str,
         capacities: tuple[int, ...] | None = None,
-        room: int = 0,
+        capacity: int = 0,
         obstacles: ObstacleTable | None = None,
         barriers: BarrierTable | None = None,
         step: StepConfig | None = None,
     ) -> None:
         """`capacities` are cells of each level to begin with.
 
-        `room` is for particles of states that `begin` brings later. `obstacles` and `barriers` replace those of the
-        state; `step` replaces the network's.
+        `capacity` is the least number of particles that buffers are allocated for. `obstacles` and `barriers` replace
+        those of the state; `step` replaces the network's.
         """
         self.config, self.device = network.config, state.position_N3.device
         self.step_config = network.step if step is None else step
         self.precision = kernel_precision(precision, self.device)
         self.packed = pack_network(network)
         self.values = self.packed.gather(list(network.parameters()))
-        self.particles = max(room, len(state.position_N3))
+        self.particles = max(capacity, len(state.position_N3))
         self.scenes = state.scene_count
 
         def integers(value: int) -> torch.Tensor:
@@ -138,7 +130,6 @@ class TritonRollout:
         normaliser = network.normaliser
         self.velocity_mean, self.velocity_std = (x.float() for x in normaliser.feature_scale(self.config.relative))
         self.mean, self.std = normaliser.acceleration_mean.float(), normaliser.acceleration_std.float()
-        self.frames_done = 0
         self.growths = 0
         self._careful = self._crowded(state)
         self._fill(state)
@@ -168,7 +159,6 @@ class TritonRollout:
             assert self.obstacles is not None
             self.obstacles.take(ObstacleTable.of(state.obstacles, state.scene_count))
         self._fill(state)
-        self.frames_done = 0
         self.lost.zero_()
         self.grid.status.zero_()
 
@@ -179,8 +169,19 @@ class TritonRollout:
         self.begin(state, new_obstacles=True)
         return True
 
+    def keep(self, kept_N: torch.Tensor) -> None:
+        """Removes particles after a divergence; cells, obstacles and launches stay."""
+        buffers = (self.position_N3, self.velocity_NV, self.scene_N, self.material_N)
+        remaining = [buffer[: self.live][kept_N] for buffer in buffers]
+        self.live = len(remaining[0])
+        for buffer, value in zip(buffers, remaining, strict=True):
+            buffer[: self.live].copy_(value)
+        self.count.fill_(self.live)
+        self.lost.zero_()
+        self.grid.status.zero_()
+
     def motion(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """Copies of positions [N, 3] and velocity histories [N, M, 3] behind the last frame of `run`."""
+        """Copies of positions [N, 3] and velocity histories [N, M, 3] after the last block."""
         position_N3, velocity_NV = self.position_N3[: self.live], self.velocity_NV[: self.live]
         return position_N3.clone(), velocity_NV.clone().view(self.live, -1, 3)
 
@@ -284,53 +285,29 @@ class TritonRollout:
             path_TN3=self.path_TN3,
         )  # fmt: skip
 
-    def run(self, frames: int, on_frame: Callable[[int], None] | None = None) -> np.ndarray:
-        """Simulates `frames` more frames; their positions, float32 [frames, N, 3].
+    def blocks(self, frames: int) -> Iterator[tuple[torch.Tensor, bool]]:
+        """Yields up to `look_frames` frames a block; while a block is processed, the device computes the next one.
 
-        Raises: DivergedError, with the number of the frame.
+        Raises: torch.OutOfMemoryError where buffers cannot grow; the stepper continues from there when there is memory.
         """
-        position_TN3 = np.empty((frames, self.live, 3), np.float32)
         done, half = 0, 0
         ahead: _Look | None = None
         while done < frames:
             look = ahead or self._launch(min(self.look_frames, frames - done), half)
-            rest, half = frames - done - look.frames, 1 - half
-            # The device goes on while the host takes frames away; where something is amiss it stands still instead.
-            ahead = self._launch(min(self.look_frames, rest), half) if self.overlap and rest else None
+            remaining, half = frames - done - look.frames, 1 - half
+            # With a status that is not zero these launches change nothing.
+            ahead = self._launch(min(self.look_frames, remaining), half) if self.overlap and remaining else None
             path_TN3, status = self._settle(look)
-            taken = len(path_TN3)
-            position_TN3[done : done + taken] = self._taken_away(path_TN3)
-            if on_frame is not None:
-                for frame in range(done, done + taken):
-                    on_frame(self.frames_done - taken + frame - done + 1)
-            done += taken
+            done += len(path_TN3)
             if status and ahead is not None:
-                self._settle(ahead)  # in vain, and over before its buffers go
+                self._settle(ahead)  # its launches use the buffers that may grow now
                 ahead = None
-            if status & DIVERGED:
-                raise self._diverged()
-            self.make_room(status)
-        return position_TN3
-
-    def frames(self) -> Iterator[np.ndarray]:
-        """Positions float32 [N, 3] of frame after frame, without an end, computed `look_frames` at a time.
-
-        Raises: DivergedError, behind the last frame before it.
-        """
-        while True:
-            path_TN3, status = self.look(self.look_frames)
-            last_diverged = bool(status & DIVERGED)
-            yield from path_TN3[: len(path_TN3) - last_diverged].to("cpu", copy=True).numpy()
-            if last_diverged:
-                raise self._diverged()
-            self.make_room(status)
-
-    def look(self, frames: int) -> tuple[torch.Tensor, int]:
-        """Simulates up to `frames` more frames: those taken, at most `look_frames` of them, and the status after them.
-
-        They are a view of what the next call writes to. Where the status is not zero, it must be dealt with first.
-        """
-        return self._settle(self._launch(min(self.look_frames, frames), 0))
+            lost = bool(status & DIVERGED)
+            yield path_TN3, lost
+            if lost:
+                return
+            if status & (OVERFLOW | OUT_OF_WINDOW):
+                self._grow()
 
     def _launch(self, frames: int, half: int) -> _Look:
         """Starts some frames, whose positions go into one half of the path."""
@@ -355,28 +332,8 @@ class TritonRollout:
             look.end.synchronize()
         last, status = look.seen.tolist()
         taken = last - look.first
-        self.frames_done += taken
         start = 3 * look.first * self.live
         return self.path_TN3.view(-1)[start : start + 3 * taken * self.live].view(taken, self.live, 3), status
-
-    def _taken_away(self, path_TN3: torch.Tensor) -> np.ndarray:
-        """Frames that are settled, on the host: copied beside whatever the device is at."""
-        if self.device.type != "cuda":
-            return path_TN3.numpy()
-        with torch.cuda.stream(_copy_stream(torch.cuda.current_device())):
-            host_TN3 = torch.empty(path_TN3.shape, pin_memory=True).copy_(path_TN3, non_blocking=True)
-            torch.cuda.current_stream().synchronize()
-        return host_TN3.numpy()
-
-    def make_room(self, status: int) -> None:
-        """Grows the buffers where the status says that they were too small."""
-        if status & (OVERFLOW | OUT_OF_WINDOW):
-            self._grow()
-
-    def _diverged(self) -> DivergedError:
-        position_N3, domain_N3 = self.position_N3[: self.live], self.domain_S3[self.scene_N[: self.live].long()]
-        cause = describe_diverged(int(diverged(position_N3, domain_N3).sum()), self.live)
-        return DivergedError(self.frames_done, cause)
 
     def _grow(self) -> None:
         # all levels: those that still had room are as full, and would have the same captured again soon

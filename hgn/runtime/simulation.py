@@ -1,0 +1,232 @@
+"""A simulation in progress: the one loop of frames, for every backend and every caller.
+
+A backend contributes a `Stepper`, which computes frames. Divergence, particles that enter and other changes between
+frames are handled here.
+Shape legend: T frames, N particles of all scenes, A particles that enter, M velocities of a history, S scenes.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, ExitStack
+from dataclasses import replace
+from types import TracebackType
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+
+from hgn.network.features import ParticleState
+from hgn.network.grid import GridRangeError
+from hgn.runtime.divergence import DivergedError, describe_diverged, diverged
+
+OF_PARTICLES = ("position_N3", "velocity_NM3", "material_N", "scene_N")
+
+
+class Stepper(Protocol):
+    """Computes the frames that follow a state, on the device of the state."""
+
+    def blocks(self, frames: int) -> Iterator[tuple[torch.Tensor, bool]]:
+        """Yields positions [T, N, 3] of the next `frames` frames in blocks, each with whether its last frame has
+        particles that diverged; such a block is the last one.
+
+        A block is valid until the next one is requested.
+        """
+
+    def motion(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """Returns positions [N, 3] and velocity histories [N, M, 3] after the last block."""
+
+    def keep(self, kept_N: torch.Tensor) -> None:
+        """Removes the particles for which `kept_N`, bool [N], is false."""
+
+    def take(self, state: ParticleState) -> bool:
+        """Continues from another state. Returns False, and changes nothing, if the buffers do not fit it."""
+
+
+class Simulation:
+    """Scenes that are simulated side by side. Use it as a context manager, or close it."""
+
+    def __init__(
+        self,
+        stepper_of: Callable[[ParticleState], AbstractContextManager[Stepper]],
+        state: ParticleState,
+        isolate: bool = False,
+    ) -> None:
+        """`stepper_of` allocates buffers and frees them on exit: Backend.stepper.
+
+        isolate: a scene that diverges ends, is entered in `ended`, and the others continue; otherwise the first
+        divergence raises DivergedError.
+        """
+        self.isolate, self.frame = isolate, 0
+        self.ended: dict[int, DivergedError] = {}
+        self._stepper_of, self._buffers = stepper_of, ExitStack()
+        self.stepper: Stepper | None = None
+        self.continue_from(state)
+
+    def __enter__(self) -> Simulation:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Returns the buffers to the backend."""
+        self.stepper = None
+        self._buffers.close()
+
+    @property
+    def state(self) -> ParticleState:
+        """The state after the last frame, without scenes that ended; read-only."""
+        if self.stepper is None:
+            return self._state
+        position_N3, velocity_NM3 = self.stepper.motion()
+        return replace(self._state, position_N3=position_N3, velocity_NM3=velocity_NM3)
+
+    @property
+    def static_state(self) -> ParticleState:
+        """`state`, but with positions and velocities of when it last changed; needs no copy from the device."""
+        return self._state
+
+    @property
+    def particle_count(self) -> int:
+        return len(self._state.material_N)
+
+    def continue_from(self, state: ParticleState) -> None:
+        """Replaces the state; no scene of it has ended."""
+        self.ended.clear()
+        self._row_count = len(state.position_N3)
+        self._row_N: torch.Tensor | None = None  # rows of the particles in blocks; None: all, in order
+        self._begin(state)
+
+    def add(self, new: ParticleState) -> None:
+        """Adds particles behind the others; those of scenes that ended have rows without a number."""
+        old, rows_N = self.state, self._rows()
+        going_A = torch.tensor([i not in self.ended for i in range(old.scene_count)], device=old.scene_N.device)
+        going_A = going_A[new.scene_N]
+        entering = selected(new, going_A)
+        if self.ended:
+            self._row_N = torch.cat([rows_N, self._row_count + torch.nonzero(going_A).flatten()])
+        self._row_count += len(new.position_N3)
+        self._begin(joined(old, entering))
+
+    def run(self, frames: int, on_frame: Callable[[int], Any] | None = None) -> np.ndarray:
+        """Returns positions of the next `frames` frames, float32 [T, N, 3]; calls `on_frame(number)` after each.
+
+        Positions of a scene that ended are NaN. Raises: DivergedError without `isolate`.
+        """
+        position_TN3 = np.empty((frames, self._row_count, 3), np.float32)
+        first, done = self.frame, 0
+        for block_TN3 in self.blocks(frames):
+            position_TN3[done : done + len(block_TN3)] = on_host(block_TN3)
+            for _ in range(len(block_TN3)):
+                done += 1
+                if on_frame is not None:
+                    on_frame(first + done)
+        return position_TN3
+
+    def blocks(self, frames: int) -> Iterator[torch.Tensor]:
+        """Yields positions [T, N, 3] of the next `frames` frames on the device; otherwise as `run`.
+
+        A block is valid until the next one is requested.
+        """
+        end = self.frame + frames
+        while self.frame < end:
+            if len(self.ended) == self._state.scene_count:
+                rest, self.frame = end - self.frame, end
+                yield self._whole(self._state.position_N3[None].expand(rest, -1, -1))
+            elif self.stepper is None:  # no particles yet
+                self.frame += 1
+                yield self._whole(self._state.position_N3[None])
+            else:
+                yield from self._stepped(self.stepper, end - self.frame)
+
+    def _stepped(self, stepper: Stepper, frames: int) -> Iterator[torch.Tensor]:
+        try:
+            for block_TN3, lost in stepper.blocks(frames):
+                self.frame += len(block_TN3)
+                if not lost:
+                    yield self._whole(block_TN3)
+                elif self.isolate:
+                    yield self._without_diverged(block_TN3, stepper)
+                else:
+                    yield block_TN3[:-1]
+                    count = int(self._diverged(block_TN3[-1]).sum())
+                    raise DivergedError(self.frame, describe_diverged(count, block_TN3.shape[1]))
+        except GridRangeError as error:
+            self.frame += 1
+            raise DivergedError(self.frame, str(error)) from None
+
+    def _begin(self, state: ParticleState) -> None:
+        self._state = state
+        if not len(state.position_N3):
+            self.close()
+        elif self.stepper is None or not self.stepper.take(state):
+            self.close()
+            self.stepper = self._buffers.enter_context(self._stepper_of(state))
+
+    def _diverged(self, position_N3: torch.Tensor) -> torch.Tensor:
+        return diverged(position_N3, self._state.domain_S3[self._state.scene_N.long()])
+
+    def _without_diverged(self, block_TN3: torch.Tensor, stepper: Stepper) -> torch.Tensor:
+        """Ends the scenes with particles that diverged; returns the block without them in its last frame."""
+        state, scenes = self._state, self._state.scene_count
+        lost_N = self._diverged(block_TN3[-1])
+        lost_S = torch.bincount(state.scene_N[lost_N], minlength=scenes)
+        for scene, (lost, count) in enumerate(
+            zip(lost_S.tolist(), torch.bincount(state.scene_N).tolist(), strict=False)
+        ):
+            if lost:
+                self.ended[scene] = DivergedError(self.frame, describe_diverged(lost, count))
+        kept_N = (lost_S == 0)[state.scene_N.long()]
+        block_TN3 = block_TN3.clone()
+        block_TN3[-1, ~kept_N] = torch.nan
+        whole_TN3 = self._whole(block_TN3)
+        self._row_N = self._rows()[kept_N]
+        self._state = selected(state, kept_N)
+        if bool(kept_N.any()):
+            stepper.keep(kept_N)
+        else:
+            self.close()
+        return whole_TN3
+
+    def _rows(self) -> torch.Tensor:
+        return torch.arange(self._row_count, device=self._state.scene_N.device) if self._row_N is None else self._row_N
+
+    def _whole(self, block_TN3: torch.Tensor) -> torch.Tensor:
+        """A block with a row for each particle, NaN for those of scenes that ended."""
+        if self._row_N is None:
+            return block_TN3
+        whole_TN3 = block_TN3.new_full((len(block_TN3), self._row_count, 3), torch.nan)
+        whole_TN3[:, self._row_N] = block_TN3
+        if whole_TN3.device.type == "cuda":
+            torch.cuda.current_stream().synchronize()  # `on_host` copies on another stream
+        return whole_TN3
+
+
+def joined(first: ParticleState, second: ParticleState) -> ParticleState:
+    """Returns a state with the particles of both, and everything else from the first."""
+    both: dict[str, Any] = {name: torch.cat([getattr(first, name), getattr(second, name)]) for name in OF_PARTICLES}
+    return replace(first, **both)
+
+
+@torch.inference_mode()
+def selected(state: ParticleState, selected_N: torch.Tensor) -> ParticleState:
+    """Returns a state with some of the particles; scenes keep their numbers."""
+    some: dict[str, Any] = {name: getattr(state, name)[selected_N] for name in OF_PARTICLES}
+    return replace(state, **some)
+
+
+def on_host(block_TN3: torch.Tensor) -> np.ndarray:
+    """Copies a finished block to the host while the device continues."""
+    if block_TN3.device.type != "cuda":
+        return block_TN3.numpy(force=True).copy()
+    with torch.cuda.stream(_copy_stream(block_TN3.device.index)):
+        host_TN3 = torch.empty(block_TN3.shape, pin_memory=True).copy_(block_TN3, non_blocking=True)
+        torch.cuda.current_stream().synchronize()
+    return host_TN3.numpy()
+
+
+@functools.cache
+def _copy_stream(device: int) -> torch.cuda.Stream:
+    return torch.cuda.Stream(device)
