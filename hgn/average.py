@@ -1,7 +1,7 @@
 """python -m hgn.average weights=[a,b] coefficients=[0.7,0.3] out=…: the mean of several networks' weights.
 
-Networks that were trained from the same weights on, each in another way, lie in one valley: between them the error is
-no larger, and what each has learned is there in part (model soups, Wortsman et al. 2022). One network as large as each.
+Networks that were trained from the same weights can be averaged: the mean network has the size of one, no larger
+error, and part of what each has learned (model soups, Wortsman et al. 2022).
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from hgn.schema import ConfigError, FileName, from_mapping, require, require_bou
 from hgn.system.provenance import provenance
 
 Loaded = tuple[ParticleNetwork, WeightsInfo]
-SHARED = ("network", "step", "frame_rate_hz", "obstacle_cell_size", "gravity")  # of weights that can be averaged
+SHARED = ("network", "step", "frame_rate_hz", "obstacle_cell_size", "gravity")  # must be equal in all files
 
 
 @dataclass(frozen=True)
@@ -51,9 +51,9 @@ def main(mapping: dict[str, Any]) -> int:
 
 
 def average(config: AverageConfig) -> None:
-    """Writes the mean. Its number of updates is the most that one of them has; `provenance` lists all.
+    """Writes the mean. `updates` is the largest of the files; `provenance` lists all of them.
 
-    Raises: ConfigError when a file is missing, or they are of different networks, data or normalisers.
+    Raises: ConfigError when a file is missing, or networks, data or normalisers differ.
     """
     coefficients = config.coefficients or (1 / len(config.weights),) * len(config.weights)
     files = [find_weights(name, f"weights[{i}]") for i, name in enumerate(config.weights)]

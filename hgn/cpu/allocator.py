@@ -1,7 +1,7 @@
-"""Memory that PyTorch frees on a CPU stays with the process, for the next frame to take.
+"""Keeps memory that PyTorch frees on a CPU in the process, for the next frame.
 
-The GNU C library gives large blocks back to the system at once, which then hands out zeroed pages one by one, 18,000 a
-frame of 4,296 particles: up to a quarter of its time.
+The GNU C library returns large blocks to the system, which then zeroes 18,000 pages in a frame of 4,296 particles: up
+to a quarter of the frame's time.
 """
 
 from __future__ import annotations
@@ -11,12 +11,12 @@ import functools
 import platform
 
 TRIM_THRESHOLD, MMAP_THRESHOLD = -1, -3  # parameters of mallopt in malloc.h
-LARGEST = 32 << 20  # bytes of a block that is kept: more mallopt refuses
+LARGEST = 32 << 20  # bytes of a block; mallopt refuses more
 
 
 @functools.cache
 def keep_freed_memory() -> bool:
-    """Tells the C library to keep freed blocks; False where there is another library, which is left as it is."""
+    """Makes the GNU C library keep freed blocks. Returns False for another C library."""
     if platform.libc_ver()[0] != "glibc":
         return False
     mallopt = ctypes.CDLL(None).mallopt

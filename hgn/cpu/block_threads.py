@@ -1,7 +1,7 @@
-"""Work in blocks on the cores of a CPU: each thread computes whole blocks by itself.
+"""Distributes blocks of work over the cores of a CPU; each thread computes whole blocks.
 
-PyTorch shares every single operation among its threads instead. Many of a frame are so short that waking a thread for
-each costs more than they do, for idle threads sleep (hgn.system.threads).
+PyTorch would split every operation among its threads. Many operations of a frame are shorter than the waking of a
+sleeping thread (hgn.system.threads).
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ from typing import TypeVar
 import torch
 
 Block = TypeVar("Block")
-MAXIMUM_THREADS = 8  # operations begin one at a time, whatever the number of threads: Python has one lock
+MAXIMUM_THREADS = 8  # more threads wait for Python's lock, which each operation takes
 
 
 @contextmanager
 def single_threaded() -> Iterator[int]:
-    """Within it, this thread's operations are computed by itself alone; gives how many threads they had before."""
+    """Limits PyTorch to one thread in operations of this thread; yields the number of threads before."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
@@ -31,10 +31,9 @@ def single_threaded() -> Iterator[int]:
 
 
 def for_each(work: Callable[[Block], None], blocks: Sequence[Block], threads: int) -> None:
-    """`work` on each of the blocks, without gradients, by so many threads, this one among them.
+    """Calls `work` for each block, without gradients, on a number of threads that includes this one.
 
-    Whichever thread is free takes the next block: none waits for one whose core does something else. Blocks must write
-    to different places. Raises: what `work` raises.
+    A free thread takes the next block. Blocks must write to disjoint memory. Raises: what `work` raises.
     """
     remaining, inference = iter(blocks), torch.is_inference_mode_enabled()
 
@@ -54,5 +53,5 @@ def for_each(work: Callable[[Block], None], blocks: Sequence[Block], threads: in
 
 @functools.lru_cache(1)
 def _pool(threads: int, process: int) -> ThreadPoolExecutor:
-    """A forked process needs threads of its own."""
+    """Returns the threads of a process; a forked process needs its own."""
     return ThreadPoolExecutor(threads, "core", lambda: torch.set_num_threads(1))

@@ -1,8 +1,8 @@
-"""Rows through an MLP on a CPU in one pass: the same function as hgn.cpu.rows, by rows.c.
+"""Rows of an MLP on a CPU in one pass, by rows.c; hgn.cpu.rows is the reference.
 
-PyTorch writes and reads every intermediate result of a block of rows; here a few rows at a time stay in the fastest
+PyTorch writes and reads every intermediate result of a block of rows; rows.c keeps a few rows at a time in the fastest
 cache from the gather to the sums. The machine's C compiler compiles rows.c for its CPU, once for each width, into
-`$XDG_CACHE_HOME/hgn/rows` (by default `~/.cache/hgn/rows`). Where that cannot be, PyTorch does the work.
+`$XDG_CACHE_HOME/hgn/rows` (by default `~/.cache/hgn/rows`). Without a compiler PyTorch computes the rows.
 """
 
 from __future__ import annotations
@@ -23,15 +23,15 @@ from hgn.cpu.rows import Hidden, Rows, Segments
 from hgn.system.files import sync_written, temporary_file
 
 SOURCE = Path(__file__).with_name("rows.c")
-# None that changes the order of sums: each row is computed alike, whatever rows are beside it.
+# No flag changes the order of sums: the result of a row does not depend on the rows around it.
 FLAGS = ("-std=gnu11", "-O3", "-march=native", "-fno-math-errno", "-ffp-contract=fast", "-shared", "-fPIC")
-LANES = 16  # float32 numbers in the widest vectors
-WIDEST = 512  # two matrices of it lie on a thread's stack
+LANES = 16  # float32 numbers in a vector of AVX-512
+WIDEST = 512  # largest width: two matrices lie on a thread's stack
 COMPILERS = ("cc", "gcc", "clang")
 
 
 def unsupported_reason(width: int, dtype: torch.dtype) -> str | None:
-    """What keeps rows on a CPU from being computed in one pass, in words; none if nothing does."""
+    """Returns why rows cannot be computed by rows.c, or None."""
     if dtype != torch.float32:
         return f"it computes float32, not {dtype}"
     if width % LANES or width > WIDEST:
@@ -40,18 +40,18 @@ def unsupported_reason(width: int, dtype: torch.dtype) -> str | None:
 
 
 def rows_class(width: int, dtype: torch.dtype) -> type[Rows]:
-    """What computes an MLP's rows on a CPU."""
+    """Returns the class that computes rows of an MLP."""
     return Rows if unsupported_reason(width, dtype) else CompiledRows
 
 
 def describe(width: int) -> str:
-    """What computes float32 rows on a CPU, and why, for people."""
+    """Returns how float32 rows are computed, and why, for messages."""
     reason = unsupported_reason(width, torch.float32)
     return "rows compiled for this CPU" if reason is None else f"rows in PyTorch ({reason})"
 
 
 class CompiledRows(Rows):
-    """Of MLPs whose layers are as wide as each other, or only projections of others."""
+    """Computes rows of an MLP whose layers have equal widths; of other MLPs only projections."""
 
     def __init__(self, network: torch.nn.Module) -> None:
         super().__init__(network)
@@ -105,14 +105,14 @@ class CompiledRows(Rows):
         )
 
     def _part(self, part: int) -> tuple[int, int]:
-        """Where a part of the first layer's weight [W, in] lies, and from one of its rows to the next."""
+        """Returns the address of a part of the first layer's matrix [W, in], and its row stride."""
         one, columns = self.parts[part].stride()
         assert one == 1
         return self.parts[part].data_ptr(), columns
 
 
 def _place(tensor: torch.Tensor | None) -> int | None:
-    """Where its numbers lie, one beside the other."""
+    """Returns the address of a contiguous tensor."""
     if tensor is None:
         return None
     assert tensor.is_contiguous()
@@ -121,7 +121,7 @@ def _place(tensor: torch.Tensor | None) -> int | None:
 
 @functools.cache
 def _library(width: int) -> tuple[ctypes.CDLL | None, str | None]:
-    """The functions of rows.c for rows so wide, or why there are none."""
+    """Returns the functions of rows.c for a width, or the reason why there are none."""
     options = (*FLAGS, f"-DWIDTH={width}")
     try:
         key = hashlib.sha256(repr((SOURCE.read_bytes(), options, _cpu())).encode()).hexdigest()
@@ -131,7 +131,7 @@ def _library(width: int) -> tuple[ctypes.CDLL | None, str | None]:
             if not compiler:
                 return None, f"it needs a C compiler: {', '.join(COMPILERS)} or CC=…"
             path.parent.mkdir(parents=True, exist_ok=True)
-            with temporary_file(path) as temporary:  # other processes may be at it too
+            with temporary_file(path) as temporary:  # other processes may compile it at the same time
                 command = [*compiler, *options, str(SOURCE), "-o", str(temporary)]
                 subprocess.run(command, check=True, capture_output=True, text=True)
                 sync_written(temporary)
@@ -139,12 +139,12 @@ def _library(width: int) -> tuple[ctypes.CDLL | None, str | None]:
         return _load(path), None
     except subprocess.CalledProcessError as error:
         return None, f"{compiler[0]} does not compile {SOURCE.name}: {error.stderr.strip()[:200]}"
-    except (OSError, RuntimeError) as error:  # no compiler of that name, no home, a folder that forbids it
+    except (OSError, RuntimeError) as error:  # no such compiler, no home folder, no permission
         return None, str(error)
 
 
 def _load(path: Path) -> ctypes.CDLL:
-    """The functions of a compiled rows.c, which run without the interpreter's lock."""
+    """Loads a compiled rows.c; its functions release the interpreter's lock."""
     library = ctypes.CDLL(str(path))
     pointer, count, number = ctypes.c_void_p, ctypes.c_int64, ctypes.c_float
     library.project.argtypes = [count, pointer, count, pointer, count, pointer, pointer]
@@ -158,7 +158,7 @@ def _load(path: Path) -> ctypes.CDLL:
 
 
 def _cpu() -> list[str]:
-    """What the compiler's `native` depends on: folders are shared by machines."""
+    """Returns what `-march=native` depends on, because machines may share the cache folder."""
     lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").split("\n\n")[0].splitlines()
     fields = ("vendor_id", "cpu family", "model", "stepping", "flags", "CPU ", "Features")
     return [platform.machine(), *(line for line in lines if line.startswith(fields))]

@@ -1,11 +1,9 @@
-"""A frame of the hierarchical graph network on a CPU: the same function in blocks of rows, each on one core.
+"""The forward pass of the hierarchical graph network on a CPU, in blocks of rows, each on one core; without gradients.
 
-What belongs to the same cells is done block by block of cells, from one exchange with other cells to the next: a step
-of message passing takes the edges that end there, their sums, the cells' network and the products with the cells that
-the next step needs. Pairs of particles and cells are taken in the order of their cells on the way to cells. So blocks
-write to different places, and sums have one order whatever the threads.
-Where rows can be computed in one pass (hgn.cpu.compiled), they are.
-There are no gradients: nothing is kept for them. hgn.network.hgn says what is computed, step by step.
+hgn.network.hgn is the reference. A block of a level is a run of cells with the edges that end in them: a message
+passing step computes its edges, their sums, the cell network and the products that the next step needs. Pairs of
+particles and cells are sorted by cell. So blocks write to disjoint rows, and the order of sums does not depend on the
+number of threads. Rows are computed in one pass by compiled C where there is a compiler (hgn.cpu.compiled).
 Shape legend: N particles, P pairs of particles and cells, C cells, E directed edges, W width.
 """
 
@@ -25,11 +23,11 @@ from hgn.network.features import ParticleState
 from hgn.network.grid import CORNER_83, DIRECTION_63, GridHierarchy, Level
 from hgn.network.hgn import HierarchicalGraphNetwork
 
-# Rows of edges or pairs of a block: at width 128 an intermediate result takes two megabytes. Smaller blocks stay in
-# faster caches, but each operation costs some microseconds of Python, in which all other threads wait, and where rows
-# are compiled, matrices are transposed for each block.
+# Rows of edges or pairs in a block: at width 128 an intermediate result takes 2 MB. Smaller blocks fit into faster
+# caches, but each operation costs some microseconds of Python, during which all other threads wait, and compiled rows
+# transpose their matrices for each block.
 ROWS_AT_ONCE = 4096
-FEWEST_ROWS = 256  # worth a thread's waking
+FEWEST_ROWS = 256  # of a block; for fewer, waking a thread takes longer than the work
 
 
 def prediction(
@@ -41,8 +39,8 @@ def prediction(
 
 
 def propagate(network: HierarchicalGraphNetwork, particle_NW: torch.Tensor, grid: GridHierarchy) -> torch.Tensor:
-    """Latent particles and their grids to the decoder's output [N, 3 or 9]: steps 1 to 12, without gradients."""
-    # Towards the parent's centre, in fine cells, as in hgn.network.hgn.
+    """Returns the decoder's output [N, 3 or 9] for latent particles: steps 1 to 12 of the paper."""
+    # From a cell to its parent's centre, in fine cells, as in hgn.network.hgn.
     parent_offset_83 = 0.5 - CORNER_83.to(particle_NW)
     rows_of = rows_class(network.config.width, particle_NW.dtype)
     with torch.no_grad(), single_threaded() as threads:
@@ -68,13 +66,13 @@ def propagate(network: HierarchicalGraphNetwork, particle_NW: torch.Tensor, grid
 
 
 class _Cells:
-    """A level in blocks of cells with the edges that end in them."""
+    """A level in blocks of cells, each with the edges that end in them."""
 
     def __init__(self, level: Level, threads: int) -> None:
         count = level.cell_count
         self.blocks = _Blocks(level.receiver_E, count, threads)
-        # Rows of a table of all cells as senders, all as receivers, and the directions: what an edge sums of it. Only
-        # the first step sees directions.
+        # An edge sums rows of a table: all cells as senders, all cells as receivers, and the directions, which only the
+        # first step reads.
         ends_E3 = torch.stack([level.sender_E, level.receiver_E + count, level.direction_E + 2 * count], -1)
         self.ends_of_first, self.ends_of_others = self.blocks.indices(ends_E3), self.blocks.indices(ends_E3[:, :2])
         self.segments = self.blocks.segments()
@@ -84,14 +82,14 @@ class _Cells:
 def _passed(
     rows_of: type[Rows], passing: nn.Module, cell_CW: torch.Tensor, cells: _Cells, threads: int
 ) -> torch.Tensor:
-    """Message passing on one level, as MessagePassing.forward."""
+    """Returns the cells after the message passing of one level; the reference is MessagePassing.forward."""
     assert isinstance(passing.edge, nn.ModuleList) and isinstance(passing.cell, nn.ModuleList)
     networks = list(zip(map(rows_of, passing.edge), map(rows_of, passing.cell), strict=True))
     blocks, count = cells.blocks, len(cell_CW)
     result_CW, hidden_CW, sum_CW = cell_CW.clone(), torch.empty_like(cell_CW), torch.zeros_like(cell_CW)
     own, hidden, sums = map(blocks.split, (result_CW, hidden_CW, sum_CW))
     edges: list[torch.Tensor | None] = [None] * len(blocks)
-    # A step reads what the cells of other blocks were before it, and writes what its own are after: tables in turns.
+    # A step reads the cells of other blocks as they were before it, so steps alternate between two tables.
     tables = cell_CW.new_empty(2, 2 * count + len(DIRECTION_63), cell_CW.shape[1])
     tables[1, 2 * count :] = networks[0][0].project(2, -DIRECTION_63.to(cell_CW))
     ends = [(blocks.split(table[:count]), blocks.split(table[count : 2 * count])) for table in tables]
@@ -107,7 +105,7 @@ def _passed(
         edge, cell = networks[step]
         ends_E, each = (cells.ends_of_others, 2) if step else (cells.ends_of_first, 3)
         seen = Hidden(tables[(step + 1) % 2], ends_E[block], each, 2, edges[block])
-        # Sums grow by the messages of each step, as the edges do; of the last step's edges nothing else is wanted.
+        # Each step adds its messages to the sums and to the edges; the edges of the last step are not needed.
         if step + 1 == len(networks):
             edge.add_sums(sums[block], seen, cells.segments[block])
         else:
@@ -125,7 +123,7 @@ def _passed(
 def _to_parents(
     rows: Rows, cell_CW: torch.Tensor, cells: _Cells, offset_83: torch.Tensor, threads: int
 ) -> torch.Tensor:
-    """What each cell sends to its parent [C, W]."""
+    """Returns the message of each cell to its parent [C, W]."""
     assert cells.level.octant_C is not None
     offset_8W = rows.project(1, offset_83, rows.first_bias)
     message_CW = torch.empty_like(cell_CW)
@@ -146,7 +144,7 @@ def _to_children(
     offset_83: torch.Tensor,
     threads: int,
 ) -> torch.Tensor:
-    """The cells on the way up, from their parents and what they were on the way down."""
+    """Returns the cells on the way up, from their parents and their values on the way down."""
     assert cells.level.parent_C is not None and cells.level.octant_C is not None
     count = len(coarse_CW)
     table_CW = coarse_CW.new_empty(count + len(offset_83), coarse_CW.shape[1])
@@ -165,12 +163,12 @@ def _to_children(
 
 
 def _to_cells(rows: Rows, particle_NW: torch.Tensor, grid: GridHierarchy, threads: int) -> torch.Tensor:
-    """Step 1: the finest cells [C, W]."""
+    """Returns the finest cells [C, W]: step 1."""
     particles, count = len(particle_NW), grid.levels[0].cell_count
-    cell_P, pair_P = torch.sort(grid.cell_N8.flatten().int(), stable=True)  # half the time of int64
+    cell_P, pair_P = torch.sort(grid.cell_N8.flatten().int(), stable=True)  # takes half as long as int64
     blocks = _Blocks(cell_P, count, threads)
     ends = blocks.indices(torch.stack([pair_P >> 3, (pair_P & 7) + particles], -1))
-    # The particles' share of the hidden layer, and the corners'.
+    # The products of the hidden layer with particles and with corners.
     table_NW = particle_NW.new_empty(particles + len(CORNER_83), particle_NW.shape[1])
     table_NW[particles:] = rows.project(1, CORNER_83.to(particle_NW), rows.first_bias)
     _project(rows, table_NW[:particles], threads, (0, particle_NW), (1, -grid.fraction_N3))
@@ -193,9 +191,9 @@ def _to_particles(
     grid: GridHierarchy,
     threads: int,
 ) -> torch.Tensor:
-    """Steps 11 and 12: the decoder's output [N, 3 or 9]."""
+    """Returns the decoder's output [N, 3 or 9]: steps 11 and 12."""
     count, others, particles = len(cell_CW), len(cell_CW) + len(CORNER_83), len(particle_NW)
-    # The shares of the hidden layer of cells, of corners, and of particles.
+    # The products of the hidden layer with cells, corners and particles.
     table_KW = particle_NW.new_empty(others + particles, particle_NW.shape[1])
     _project(rows, table_KW[:count], threads, (0, cell_CW))
     table_KW[count:others] = rows.first_bias - rows.project(2, CORNER_83.to(particle_NW))
@@ -218,7 +216,7 @@ def _to_particles(
 
 
 def _project(rows: Rows, out_RW: torch.Tensor, threads: int, *values: tuple[int, torch.Tensor]) -> None:
-    """The sum of products of the first layer's parts with values, without the bias."""
+    """Writes the sum of products of parts of the first layer with values, without the bias."""
     runs = _runs(len(out_RW), ROWS_AT_ONCE, threads)
     out, *split = (x.split_with_sizes(runs) for x in (out_RW, *(value for _, value in values)))
     (first, *others) = (part for part, _ in values)
@@ -232,7 +230,7 @@ def _project(rows: Rows, out_RW: torch.Tensor, threads: int, *values: tuple[int,
 
 
 class _Blocks:
-    """Runs of cells with about as many rows each; rows are in ascending order of their cells."""
+    """Splits cells into runs with about equal numbers of rows; rows are sorted by cell."""
 
     def __init__(self, cell_R: torch.Tensor, count: int, threads: int) -> None:
         rows = len(cell_R)
@@ -252,17 +250,17 @@ class _Blocks:
         return value_C.split_with_sizes(self.cells)
 
     def indices(self, index_RK: torch.Tensor) -> list[torch.Tensor]:
-        """Of each block's rows, one after the other."""
+        """Returns the indices of each block's rows, flattened."""
         return [index.flatten() for index in index_RK.split_with_sizes(self.rows)]
 
     def segments(self, weight_R: torch.Tensor | None = None) -> list[Segments]:
-        """The rows of each block by cells, with their weights."""
+        """Returns the rows of each block grouped by cell, with their weights."""
         weights = [None] * len(self) if weight_R is None else weight_R.split_with_sizes(self.rows)
         return [Segments(*x) for x in zip(self.rows, self.offset, weights, strict=True)]
 
 
 def _runs(rows: int, at_once: int, threads: int) -> list[int]:
-    """Lengths of nearly equal runs: of about `at_once` rows, as many for each thread, but none of a few rows only."""
+    """Returns the lengths of nearly equal runs of about `at_once` rows, equally many for each thread."""
     count = -(-rows // (at_once * threads)) * threads
     count = max(1, min(count, rows // min(at_once, FEWEST_ROWS)))
     return [(i + 1) * rows // count - i * rows // count for i in range(count)]

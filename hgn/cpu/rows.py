@@ -1,8 +1,7 @@
-"""Rows through an MLP whose parts lie elsewhere: gathered, multiplied, normed and summed by segments, in PyTorch.
+"""Rows of an MLP in PyTorch, without gradients: gathered from a table, multiplied, normalised and summed by segment.
 
-The reference of hgn.cpu.compiled. There are no gradients.
-Norms of rows commute with sums of them as far as gain and shift go, so those are left to the sums where nothing else
-is wanted. Shape legend: R rows, K rows of a table, S segments, W width.
+The reference for hgn.cpu.compiled. Where only sums are needed, the gain and shift of the norm are applied to the sums.
+Shape legend: R rows, K rows of a table, S segments, W width.
 """
 
 from __future__ import annotations
@@ -17,25 +16,25 @@ from hgn.network.mlp import MINIMUM_ROWS, MLP, linear
 
 
 class Hidden(NamedTuple):
-    """A hidden layer before its activation: the sum of `each` rows of a table, plus the product with a part's value."""
+    """A hidden layer before its activation: the sum of `each` rows of a table, plus a part's product with a value."""
 
     table_KW: torch.Tensor
-    chosen: torch.Tensor | None  # [R * each], int64; none: the table's rows in their order, which may be overwritten
+    chosen: torch.Tensor | None  # [R * each], int64; None: all rows of the table, which may be overwritten
     each: int
     part: int = 0
-    value_RW: torch.Tensor | None = None  # none: no product
+    value_RW: torch.Tensor | None = None  # None: no product
 
 
 class Segments(NamedTuple):
     """Runs of rows that are summed, each row times its weight."""
 
     rows: int
-    offset: torch.Tensor  # [S + 1], int64: where they begin, and the number of rows
-    weight_R: torch.Tensor | None  # none: ones
+    offset: torch.Tensor  # [S + 1], int64: first row of each run, then the number of rows
+    weight_R: torch.Tensor | None  # None: ones
 
 
 class Rows:
-    """An MLP of rows [R, W], its matrices taken once a frame: attributes of modules cost as much as a small product."""
+    """An MLP of rows [R, W]. Its matrices are read once a frame: attributes of a module are slow."""
 
     def __init__(self, network: nn.Module) -> None:
         assert isinstance(network, MLP)
@@ -63,7 +62,7 @@ class Rows:
         return hidden.addmm_(value, self.parts[part])
 
     def finish(self, hidden: torch.Tensor) -> torch.Tensor:
-        """Overwrites `hidden`."""
+        """Returns the output for a hidden layer, which is overwritten."""
         out = _product(nn.functional.leaky_relu_(hidden, self.slope), self.second, self.second_bias)
         if self.norm is None:
             return out
@@ -71,7 +70,7 @@ class Rows:
         return torch.layer_norm(out, gain.shape, gain, shift, epsilon)
 
     def output(self, out_RW: torch.Tensor, hidden: Hidden, residual_RW: torch.Tensor | None = None) -> None:
-        """Into `out_RW`, which may be the residual."""
+        """Writes the output, plus the residual, into `out_RW`, which may be the residual."""
         rows_RW = self.finish(self._hidden(hidden))
         if residual_RW is None:
             out_RW.copy_(rows_RW)
@@ -79,7 +78,7 @@ class Rows:
             torch.add(rows_RW, residual_RW, out=out_RW)
 
     def add_sums(self, sum_SW: torch.Tensor, hidden: Hidden, segments: Segments) -> None:
-        """Adds those of the outputs."""
+        """Adds the sums of the outputs to `sum_SW`."""
         assert self.norm is not None
         gain, shift, epsilon = self.norm
         matrix, bias = self._centred
@@ -96,7 +95,7 @@ class Rows:
     def output_and_add_sums(
         self, sum_SW: torch.Tensor, hidden: Hidden, segments: Segments, residual_RW: torch.Tensor | None
     ) -> torch.Tensor:
-        """The outputs plus the residual, which may be overwritten; adds sums of the outputs."""
+        """Returns the outputs plus the residual, which may be overwritten; adds the sums of the outputs to `sum_SW`."""
         assert segments.weight_R is None
         rows_RW = self.finish(self._hidden(hidden))
         sum_SW.add_(_summed(rows_RW, segments.offset))
@@ -114,12 +113,12 @@ class Rows:
 
     @cached_property
     def _centred(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """The second layer less its mean over the outputs: what the norm divides."""
+        """The second layer minus its mean over the outputs: the numerator of the norm."""
         return self.second - self.second.mean(1, keepdim=True), self.second_bias - self.second_bias.mean()
 
 
 def _product(value: torch.Tensor, matrix: torch.Tensor, bias: torch.Tensor | None = None) -> torch.Tensor:
-    """Rows times a matrix plus bias, each row computed alike however few there are, as hgn.network.mlp.linear."""
+    """Returns rows times a matrix plus bias; as in hgn.network.mlp.linear, the number of rows does not matter."""
     if len(value) < MINIMUM_ROWS:
         return linear(value, matrix.T, bias)
     return torch.mm(value, matrix) if bias is None else torch.addmm(bias, value, matrix)
@@ -131,7 +130,7 @@ def _summed(
     weight_R: torch.Tensor | None = None,
     chosen: torch.Tensor | None = None,
 ) -> torch.Tensor:
-    """Sums of runs of rows, or of those that are chosen, in one pass [S, W]."""
+    """Returns sums of runs of rows, or of chosen rows, in one pass [S, W]."""
     chosen = _steps(len(table_KW)) if chosen is None else chosen
     result: torch.Tensor = torch.embedding_bag(
         table_KW, chosen, offset, per_sample_weights=weight_R, include_last_offset=True
@@ -141,6 +140,6 @@ def _summed(
 
 @lru_cache(64)
 def _steps(end: int, step: int = 1) -> torch.Tensor:
-    """0 to `end`, excluded; the same blocks come again and again."""
+    """Returns 0 to `end`, exclusive; blocks of the same size recur."""
     with torch.inference_mode(False):
         return torch.arange(0, end, step)

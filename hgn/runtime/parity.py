@@ -1,35 +1,62 @@
-"""How far apart two computations of the same thing are, and how far backend triton may be from PyTorch."""
+"""The check of kernels, as compiled for this machine, against PyTorch.
+
+Both round, and rounding moves activations across their kinks, so the bounds are wide; wrong kernels exceed them by far.
+"""
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import torch
 
 from hgn.schema import ConfigError
 
-GRADIENT_BOUND = 0.3  # relative error of all gradients, of the norm
-OUTPUT_BOUND = 0.05  # relative error of the network's outputs; both round, and wrong kernels miss it by far
-# Of normalised accelerations, root mean square: smaller outputs are compared with this. Latents are of size 1, whatever
-# comes of them, so rounding to 11 bits (fp16, tf32) changes outputs by about 5e-4: 6e-4 was measured on an H100, of a
-# start in which almost nothing is accelerated. The bound is 2.5 times that here.
-LEAST_OUTPUT = 0.03
+
+@dataclass(frozen=True)
+class Quantity:
+    """A result that is compared: the largest relative error of its norm, and the root mean square that smaller results
+    are treated as.
+    """
+
+    name: str
+    bound: float
+    least: float = 0.0
+
+
+# Normalised accelerations. Latents have size 1 whatever the output, so rounding to 11 bits (fp16, tf32) changes small
+# outputs as much as large ones: by 6e-4 on an H100, where almost nothing is accelerated. The bound is 2.5 times that.
+OUTPUTS = Quantity("outputs", 0.05, least=0.03)
+GRADIENTS = Quantity("gradients", 0.3)
 
 
 def relative_error(computed: torch.Tensor, expected: torch.Tensor, least: float = 0.0) -> float:
-    """Of the norm, or of that of values of size `least` where it is larger. Where nothing is expected: 0 if nothing is
-    computed, else infinite."""
+    """Returns the error's norm over that of `expected`, or over that of values of size `least` if it is larger; where
+    both are zero, 0 for no error and infinity for any.
+    """
     difference, size = float((computed - expected).norm()), max(float(expected.norm()), least * expected.numel() ** 0.5)
     if size > 0:
         return difference / size
     return 0.0 if difference == 0 else math.inf
 
 
-def require_bound(error: float, bound: float, what: str, field: str, right: str, wrong: str) -> None:
-    """Raises ConfigError where kernels, as compiled for this machine, are farther from PyTorch than rounding brings
-    them: `field` must be `right` then and not `wrong`."""
-    if not error <= bound:  # NaN fails
+def require_parity(
+    computed: torch.Tensor,
+    expected: torch.Tensor,
+    quantity: Quantity,
+    field: str = "backend",
+    *,
+    right: str = "torch",
+    wrong: str = "triton",
+) -> float:
+    """Returns the relative error of kernels against PyTorch.
+
+    Raises: ConfigError where it exceeds its bound: the setting `field` must be `right` on this machine, not `wrong`.
+    """
+    error = relative_error(computed, expected, quantity.least)
+    if not error <= quantity.bound:  # NaN fails
         raise ConfigError(
-            f"{field} must be {right} on this machine, got {wrong}: its {what} differ by {error:.1e} from PyTorch's "
-            f"(at most {bound}); set {field}={right}, and report device and versions"
+            f"{field} must be {right} on this machine, got {wrong}: its {quantity.name} differ by {error:.1e} from "
+            f"PyTorch's (at most {quantity.bound}); set {field}={right}, and report device and versions"
         )
+    return error

@@ -24,7 +24,7 @@ from hgn.network.cell_keys import COORDINATE_LIMIT, pack
 from hgn.network.features import ParticleState
 from hgn.network.grid import build_hierarchy
 from hgn.network.hgn import HierarchicalGraphNetwork
-from hgn.runtime.parity import LEAST_OUTPUT, OUTPUT_BOUND, relative_error, require_bound
+from hgn.runtime.parity import OUTPUTS, require_parity
 from hgn.runtime.triton_host import kernel_precision
 from hgn.step.reference import rested
 from hgn.step_config import StepConfig
@@ -251,18 +251,15 @@ class TritonStepper:
         self.grid.status.zero_()
 
     def require_parity(self, network: HierarchicalGraphNetwork, state: ParticleState, field: str = "backend") -> None:
-        """Compares the first output with PyTorch's, as all kernels still stand at the start: `state` is that
-        of the start, or its first scenes.
-
-        Both round; kernels that are wrong differ by far more. Raises: ConfigError.
+        """Compares the first output with PyTorch's. Call it before the first frame; `state` is that of the start, or
+        its first scenes. Raises: ConfigError.
         """
         if self.graph is None:
             self._network_pass()
         output_N3 = self.fused.output[: len(state.position_N3), :3]
         with torch.no_grad():
             expected_N3 = rested(network, state, network.prediction(state), self.step_config)
-            error = relative_error(output_N3, expected_N3, LEAST_OUTPUT)
-        require_bound(error, OUTPUT_BOUND, "outputs", field, "torch", "triton")
+            require_parity(output_N3, expected_N3, OUTPUTS, field)
 
     def frame_launches(self) -> None:
         """All launches of one frame: what the graph holds."""

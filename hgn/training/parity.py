@@ -17,7 +17,8 @@ from hgn.kernels.update.op import Updates
 from hgn.network.cell_keys import pack
 from hgn.network.features import ParticleState
 from hgn.network.obstacles import ObstacleCells
-from hgn.runtime.parity import GRADIENT_BOUND, LEAST_OUTPUT, OUTPUT_BOUND, relative_error, require_bound
+from hgn.runtime.parity import GRADIENTS, OUTPUTS
+from hgn.runtime.parity import require_parity as require
 from hgn.scene.symmetry import Symmetry
 from hgn.training.symmetry import obstacles_under
 
@@ -40,20 +41,15 @@ def require_parity(
     parameters = list(network.parameters())
     output_N3 = network.normalised_acceleration(state, origin_S3)
     expected = torch.autograd.grad((output_N3 * weight_N3).sum(), parameters, allow_unused=True)
-    output_error = relative_error(fused.output[:count, :3], output_N3.detach(), LEAST_OUTPUT)
+    output_error = require(fused.output[:count, :3], output_N3.detach(), OUTPUTS, "training.backend")
     fused.output_gradient[:count].zero_()
     fused.output_gradient[:count, :3] = weight_N3 / fused.unscale
     fused.backward()
     gradients = [torch.zeros_like(parameter) for parameter in parameters]
     updates.packed.scatter(fused.totals[: updates.packed.size], gradients)
-    gradient_error = relative_error(
-        torch.cat([tensor.flatten() for tensor in gradients]),
-        torch.cat(
-            [(torch.zeros_like(p) if g is None else g).flatten() for p, g in zip(parameters, expected, strict=True)]
-        ),
-    )
-    require_bound(output_error, OUTPUT_BOUND, "outputs", "training.backend", "torch", "triton")
-    require_bound(gradient_error, GRADIENT_BOUND, "gradients", "training.backend", "torch", "triton")
+    expected = [torch.zeros_like(p) if g is None else g for p, g in zip(parameters, expected, strict=True)]
+    flat, expected_flat = (torch.cat([tensor.flatten() for tensor in each]) for each in (gradients, expected))
+    gradient_error = require(flat, expected_flat, GRADIENTS, "training.backend")
     if updates.device.type == "cuda":
         del output_N3, expected
         torch.cuda.empty_cache()  # what is free decides where episodes are kept

@@ -13,7 +13,7 @@ from network.states import network_of
 from hgn.kernels.packing import rounded_to_tf32
 from hgn.kernels.tuning import Tuning
 from hgn.network.cell_keys import unpack
-from hgn.runtime.parity import OUTPUT_BOUND, relative_error
+from hgn.runtime.parity import OUTPUTS, relative_error
 
 gpu = pytest.mark.skipif(device().type != "cuda", reason="needs a CUDA device")
 
@@ -173,7 +173,7 @@ def test_whole_networks_on_a_gpu(precision, counts, draws):
         found.append((compared.output, relative_error(alone, expected), compared.together))
         rounded_output, rounded_together = rounding_errors(network, state, precision == "fp16")
         explained.append((rounded_output, rounded_output, rounded_together))
-    assert all(output < OUTPUT_BOUND and alone < OUTPUT_BOUND for output, alone, _ in found)
+    assert all(output < OUTPUTS.bound and alone < OUTPUTS.bound for output, alone, _ in found)
     middle = torch.tensor(found).median(0).values
     bounds = 1.5 * torch.tensor(explained).median(0).values
     assert (middle < bounds).all(), (middle, bounds)

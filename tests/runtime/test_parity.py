@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from hgn.runtime.parity import LEAST_OUTPUT, OUTPUT_BOUND, relative_error, require_bound
+from hgn.runtime.parity import OUTPUTS, require_parity
 from hgn.schema import ConfigError
 
 
@@ -15,11 +15,7 @@ def test_rounding_passes_and_what_is_wrong_does_not(size):
     direction_N3, noise_N3 = torch.randn(2, 5000, 3, generator=generator)
     expected_N3 = size * direction_N3
 
-    def require(computed_N3: torch.Tensor) -> None:
-        error = relative_error(computed_N3, expected_N3, LEAST_OUTPUT)
-        require_bound(error, OUTPUT_BOUND, "outputs", "backend", "torch", "triton")
-
-    require(expected_N3 + 6e-4 * noise_N3)
+    require_parity(expected_N3 + 6e-4 * noise_N3, expected_N3, OUTPUTS)
     for wrong_N3 in (0.8 * expected_N3 if size else 2e-3 * noise_N3, expected_N3 + 0.1 * max(size, 0.1) * noise_N3):
         with pytest.raises(ConfigError, match="backend must be torch on this machine, got triton: its outputs differ"):
-            require(wrong_N3)
+            require_parity(wrong_N3, expected_N3, OUTPUTS)
