@@ -1,4 +1,4 @@
-"""python -m hgn.evaluate weights=… data=…: one-step and rollout errors beside the baselines'."""
+"""python -m hgn.evaluate weights=… data=…: one-step and rollout errors, compared with baselines."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class EvaluateConfig:
 
 
 def main(mapping: dict[str, Any]) -> int:
-    """Prints a table, and writes JSON where asked to; returns the exit code."""
+    """Prints a table, and writes JSON if `json` is set; returns the exit code."""
     config = from_mapping(EvaluateConfig, mapping)
     if config.json is not None:
         require_place(Path(config.json))
@@ -95,7 +95,7 @@ def main(mapping: dict[str, Any]) -> int:
 
 
 def one_step_rows(backend: Backend, episodes: list[Episode], config: EvaluateConfig) -> list[dict[str, Any]]:
-    """One row a predictor: {"system", "one_step_mse", "by_material"}."""
+    """Returns a row for each predictor: {"system", "one_step_mse", "by_material"}."""
     network, device = backend.network, backend.device
     predictors = {"network": network_predictor(backend)} | baselines(network)
     total = sum(-(-(len(episode.position_TN3) - 1) // config.frame_stride) for episode in episodes)
@@ -114,7 +114,7 @@ def one_step_rows(backend: Backend, episodes: list[Episode], config: EvaluateCon
 
 
 def rollouts(simulator: Simulator, episodes: list[Episode], frames: int) -> list[RolloutResult]:
-    """Simulates the episodes from their first frame, as far as the shortest of them goes."""
+    """Simulates the episodes from their first frame to the last frame of the shortest."""
     frames = min(frames, *(len(episode.position_TN3) for episode in episodes))
     with bar("rollouts", total=frames - 1, unit="frame") as progress:
         initial = [InitialState.of_episode(episode) for episode in episodes]
@@ -122,15 +122,15 @@ def rollouts(simulator: Simulator, episodes: list[Episode], frames: int) -> list
 
 
 def convention_lines(errors: dict[str, dict[str, float]]) -> str:
-    """What `set_convention` found, for people."""
+    """Formats the errors of `set_convention`."""
     lines = ["in the set's own convention: mean over axes and frames; free particles, all particles"]
     lines += [f"{name.replace('_', ' '):<20} {error['free']:.3e}, {error['all']:.3e}" for name, error in errors.items()]
     return "\n".join(lines)
 
 
 def rollout_row(trials: Sequence[RolloutResult], episodes: list[Episode], frames: int) -> dict[str, Any]:
-    """{"system", "position_mse": {frame: value}, "scenes_reached": {frame: count}, "mean_position_mse", "by_material",
-    "ends"}; errors are means over the scenes that came so far.
+    """Returns {"system", "position_mse": {frame: value}, "scenes_reached": {frame: count}, "mean_position_mse",
+    "by_material", "ends"}; an error is the mean over the scenes that reached its frame.
     """
     mse_T = rollout_errors([trial.position_TN3 for trial in trials], episodes)
     frames = min(frames, *(len(episode.position_TN3) for episode in episodes))
@@ -151,8 +151,8 @@ def _at_frames(mse_T: np.ndarray, frames: list[int]) -> dict[str, float]:
 
 
 def end_of_rollout(trial: RolloutResult, episode: Episode) -> dict[str, Any]:
-    """Shares of the particles within closed obstacles, beside the data's, and beyond the domain, in the last frame that
-    a scene came to, and why it came no farther.
+    """Returns fractions of the particles within closed obstacles, also of the data's, and outside the domain, in the
+    last frame of a rollout, and the cause of an early end.
     """
     obstacles, last = obstacles_of_episode(episode), trial.frame_count - 1
     position_N3 = trial.position_TN3[last]
@@ -168,7 +168,7 @@ def end_of_rollout(trial: RolloutResult, episode: Episode) -> dict[str, Any]:
 
 
 def table(rows: list[dict[str, Any]], config: EvaluateConfig, scenes: int) -> str:
-    """The figures for people. Errors sum over axes and average over particles, in frame units."""
+    """Formats the figures. Errors sum over axes and average over particles, in frame units."""
     every = "every frame" if config.frame_stride == 1 else f"every {config.frame_stride}th frame"
     lines = [f"{config.split}, {scenes} scenes, {every}; sum over axes, mean over particles, frame units"]
     lines.append(f"{'predictor':<20} {'one-step MSE':>12}  by material")

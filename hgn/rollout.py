@@ -72,7 +72,7 @@ class RolloutConfig:
 
 
 def main(mapping: dict[str, Any]) -> int:
-    """Simulates, writes the rollout file and what is drawn of it; returns the exit code."""
+    """Simulates, writes the rollout file and its pictures; returns the exit code."""
     config = from_mapping(RolloutConfig, mapping)
     path, result = rollout(config)
     print(path)
@@ -87,9 +87,9 @@ def main(mapping: dict[str, Any]) -> int:
 
 
 def rollout(config: RolloutConfig) -> tuple[Path, Rollout]:
-    """Simulates a scene, or an episode beside its truth, and writes HDF5; returns its path, and what is in it.
+    """Simulates a scene, or an episode that is stored with its truth, and writes the file; returns path and content.
 
-    Raises: ConfigError for bad input, weights that let the simulation diverge among them; nothing is written then.
+    Raises: ConfigError for bad input or a simulation that diverges; nothing is written then.
     """
     require_exchange(Path(config.out or "rollout.vtkhdf"), config.surface)
     require_place(Path(config.out or "rollout/rollout.vtkhdf"))
@@ -146,7 +146,7 @@ def rollout(config: RolloutConfig) -> tuple[Path, Rollout]:
 
 
 def _not_used(scene: Scene, weights: str) -> Iterator[str]:
-    """What a scene says to the solver alone, a line each."""
+    """Yields a line for each setting of the scene that only the solver uses."""
     if scene.material_parameters:
         names = ", ".join(scene.material_parameters)
         yield f"not used: {names} of groups, which are the solver's; {weights} knows one of each material"
@@ -159,7 +159,7 @@ def _fastest(initial: InitialState) -> float:
 
 
 def _scene(config: RolloutConfig, info: WeightsInfo) -> tuple[str, Scene]:
-    """A scene file or an example, or a scene like those that the network was trained on; and a name for it."""
+    """Returns a scene and its name: a scene file, an example, or a random scene like the training's."""
     if config.scene is not None:
         path = find_scene(config.scene)
         return path.stem, load_scene(path)

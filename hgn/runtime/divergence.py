@@ -1,4 +1,4 @@
-"""When a simulation has come apart: one rule for all backends, and for pushforward."""
+"""The rule by which a simulation has diverged, for all backends and for pushforward."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from hgn.step.reference import within_range
 
 
 class DivergedError(RuntimeError):
-    """Particles are no longer finite, or have left the domain by more than its own size."""
+    """Particles are not finite, or farther from the domain than its own size."""
 
     def __init__(self, frame: int, cause: str) -> None:
         super().__init__(f"the simulation diverged at frame {frame}: {cause}; train further, or take other weights")
@@ -16,10 +16,10 @@ class DivergedError(RuntimeError):
 
 
 def diverged(position_N3: torch.Tensor, domain_N3: torch.Tensor) -> torch.Tensor:
-    """Which particles are not finite or farther from the domain than its own size, bool [..., N]."""
+    """Returns which particles are not finite or farther from the domain than its own size, bool [..., N]."""
     return ~within_range(position_N3, domain_N3).all(-1)
 
 
 def describe_diverged(diverged_count: int, particle_count: int) -> str:
-    """How a simulation came apart."""
+    """Describes a divergence."""
     return f"{diverged_count} of {particle_count} particles are not finite or farther from the domain than its own size"

@@ -1,9 +1,9 @@
 """One frame of a network as a graph that runs without this package: ONNX, or a compiled package (AOTInductor).
 
-The graph is traced from the reference, hgn.network, and holds all of it: features, grid, network, integration, and what
-walls and obstacles hold. Numbers of particles, obstacle cells and triangles are free, up to LARGEST_EXPORTED. It raises
-nothing: who runs it checks that positions are finite. INPUTS and OUTPUTS name its tensors; `initial_arrays` gives those
-of a scene.
+The graph is traced from the reference, hgn.network, and contains features, grid, network, integration, and the
+constraints of walls and obstacles. The numbers of particles, obstacle cells and triangles may change from frame to
+frame, up to LARGEST_EXPORTED. The graph raises no errors: its caller checks that positions are finite. INPUTS and
+OUTPUTS name its tensors; `initial_arrays` returns those of a scene.
 Shape legend: N particles, H velocities, K obstacle cells, F triangles of obstacles.
 """
 
@@ -34,7 +34,7 @@ INPUTS = (
     "obstacle_triangle",
 )  # fmt: skip
 OUTPUTS = ("next_position", "next_velocity")
-EXAMPLE_PARTICLES, EXAMPLE_CELLS, EXAMPLE_TRIANGLES = 64, 32, 16  # of the trace; any others would do
+EXAMPLE_PARTICLES, EXAMPLE_CELLS, EXAMPLE_TRIANGLES = 64, 32, 16  # of the trace; the numbers do not matter
 
 
 class Step(nn.Module):
@@ -55,13 +55,13 @@ class Step(nn.Module):
         obstacle_normal: torch.Tensor,
         obstacle_triangle: torch.Tensor,
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Positions [N, 3] and velocities [N, H, 3], newest first, a frame later; units: domain units, frames.
+        """Returns positions [N, 3] and velocities [N, H, 3], newest first, a frame later; units: domain units, frames.
 
         material int64 [N] indexes the network's materials; domain_size and gravity [3]; obstacle_cell int64 [K, 3],
-        each once, and obstacle_normal [K, 3]; obstacle_triangle [F, 3, 3], corners. Absolute inputs take no heed of
-        gravity, and networks without `obstacle_clearance` none of triangles.
+        each once, and obstacle_normal [K, 3]; obstacle_triangle [F, 3, 3], corners. Networks of absolute inputs ignore
+        gravity, and networks without `obstacle_clearance` ignore triangles.
         """
-        # a cell that no particle reaches, so that there always is one
+        # At least one cell, which no particle reaches.
         far_13 = torch.full_like(domain_size[None], COORDINATE_LIMIT - 1).to(torch.int64)
         cell_K3 = torch.cat([obstacle_cell, far_13])
         normal_K3 = torch.cat([obstacle_normal, torch.zeros_like(domain_size[None])])
@@ -81,11 +81,11 @@ class Step(nn.Module):
         return after.position_N3, after.velocity_NM3
 
     def _barriers(self, corner_F33: torch.Tensor) -> Barriers | None:
-        """Without lists of cells: the graph looks for pairs by boxes."""
+        """Returns barriers without lists of cells; the graph finds pairs by bounding boxes."""
         clearance = self.network.step.obstacle_clearance
         if clearance is None:
             return None
-        # one without area, which nothing meets, so that there always is one
+        # At least one triangle, which has no area.
         corner_F33 = torch.cat([corner_F33, corner_F33.new_zeros(1, 3, 3)])
         row_F24 = barrier_rows(corner_F33, clearance).to(corner_F33.dtype)
         none = torch.zeros(0, dtype=torch.int64, device=corner_F33.device)
@@ -93,10 +93,10 @@ class Step(nn.Module):
 
 
 def initial_arrays(state: ParticleState, corner_F33: np.ndarray | None = None) -> dict[str, np.ndarray]:
-    """What the graph of a step is first given, by the names of INPUTS: a simulator's state of one scene.
+    """Returns the first inputs of the graph, by the names of INPUTS, for a simulator's state of one scene.
 
-    corner_F33: the corners of its obstacles' triangles in domain units, as `hgn.scene.barrier.barrier_pieces` has them
-    for the simulator; none: no triangles.
+    corner_F33: corners of the obstacles' triangles in domain units, of `hgn.scene.barrier.barrier_pieces`; None: no
+    triangles.
     """
     require(state.scene_count == 1, "scenes", "one", state.scene_count)
     cells, normals = np.zeros((0, 3), np.int64), np.zeros((0, 3), np.float32)
@@ -110,7 +110,7 @@ def initial_arrays(state: ParticleState, corner_F33: np.ndarray | None = None) -
 
 
 def traced_step(network: ParticleNetwork, info: WeightsInfo) -> torch.export.ExportedProgram:
-    """The graph. Raises: ConfigError for a GNS, whose neighbour list has no such graph yet."""
+    """Returns the graph. Raises: ConfigError for a GNS: neighbour lists are not exported."""
     require(isinstance(network, HierarchicalGraphNetwork), "weights", "an hgn network", network.config.kind)
     assert isinstance(network, HierarchicalGraphNetwork)
     device, config = next(network.parameters()).device, network.config
@@ -129,7 +129,7 @@ def traced_step(network: ParticleNetwork, info: WeightsInfo) -> torch.export.Exp
     cells = {0: torch.export.Dim("obstacle_cells", min=0, max=LARGEST_EXPORTED)}
     triangles = {0: torch.export.Dim("obstacle_triangles", min=0, max=LARGEST_EXPORTED)}
     step = Step(network, info.obstacle_cell_size).eval()
-    # one graph for 0, 1 and more of each
+    # One graph for 0, 1 and more of each.
     with (
         torch.no_grad(),
         torch.fx.experimental._config.patch(  # type: ignore[attr-defined]
@@ -145,11 +145,11 @@ def traced_step(network: ParticleNetwork, info: WeightsInfo) -> torch.export.Exp
 
 
 def write_onnx(path: Path, program: torch.export.ExportedProgram, info: WeightsInfo) -> None:
-    """The graph as ONNX, weights inside; what the weights say of themselves is its metadata `hgn`."""
-    import onnxscript  # noqa: F401 - torch says no more than that something is missing
+    """Writes the graph as ONNX with its parameters; the metadata `hgn` holds the weights' info."""
+    import onnxscript  # noqa: F401 - torch's own error does not name it
 
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # torch's own, of its dependencies
+        warnings.simplefilter("ignore")  # torch warns about its dependencies
         program = program.run_decompositions({torch.ops.aten.index_add.default: _added_in_order})
         exported = torch.onnx.export(program, (), dynamo=True, input_names=INPUTS, output_names=OUTPUTS, verbose=False)
     assert exported is not None
@@ -161,14 +161,14 @@ def write_onnx(path: Path, program: torch.export.ExportedProgram, info: WeightsI
 def _added_in_order(
     sums: torch.Tensor, dim: int, index: torch.Tensor, source: torch.Tensor, alpha: float = 1
 ) -> torch.Tensor:
-    """`index_add` as ScatterElements. As ScatterND, which it would be, threads of ONNX Runtime 1.32 overwrite each
-    other's sums: frames of 4,096 particles differed from each other by 1e-4 domain units."""
+    """Writes `index_add` as ScatterElements. In ScatterND, the default, threads of ONNX Runtime 1.32 overwrite each
+    other's sums: repeated frames of 4,096 particles differed by 1e-4 domain units."""
     shape = [-1 if axis == dim else 1 for axis in range(source.dim())]
     return sums.scatter_add(dim, index.reshape(shape).expand(source.shape), alpha * source)
 
 
 def write_package(path: Path, program: torch.export.ExportedProgram, info: WeightsInfo) -> None:
-    """The graph compiled for the device it was traced on, as PyTorch's C++ loads it; minutes, with a C++ compiler."""
+    """Writes the graph compiled for its device, for PyTorch's C++ library; needs a C++ compiler and takes minutes."""
     make_folder(path.parent)
     with TemporaryDirectory(prefix=f".{path.stem}.", dir=path.parent) as folder, warnings.catch_warnings():
         temporary = Path(folder) / path.name
@@ -176,7 +176,7 @@ def write_package(path: Path, program: torch.export.ExportedProgram, info: Weigh
         torch._inductor.aoti_compile_and_package(
             program,
             package_path=str(temporary.resolve()),
-            # threads as the program that runs it has them, not as this one
+            # The program that runs the package sets the number of threads.
             inductor_configs={"aot_inductor.metadata": {"hgn": _description(info)}, "cpp.dynamic_threads": True},
         )
         sync_written(temporary)

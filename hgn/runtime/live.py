@@ -72,9 +72,9 @@ class LiveSimulation:
         return np.asarray(self.simulation.run(1)[0])
 
     def add_particles(self, position_A3: np.ndarray, velocity_A3: np.ndarray, material_A: np.ndarray) -> np.ndarray:
-        """Particles enter, in free flight until now: domain units, domain units per second, indices into MATERIALS.
+        """Adds particles that were in free flight: domain units, domain units per second, indices into MATERIALS.
 
-        Returns: their velocity histories, float32 [A, M, 3] in domain units per frame, newest first.
+        Returns their velocity histories, float32 [A, M, 3] in domain units per frame, newest first.
         Raises: ConfigError for a material that the network does not know, or arrays that do not fit each other.
         """
         count = len(position_A3)
@@ -89,13 +89,13 @@ class LiveSimulation:
             require(not len(unusable), name, "finite", float(unusable[0]) if len(unusable) else 0.0)
         require(material_A.dtype.kind in "iu", "material_A", "whole numbers", str(material_A.dtype))
         entering = replace(self.scene, position_N3=position_A3, velocity_N3=velocity_A3, material_N=material_A)
-        new = self.simulator.start([replace(entering, corners=None)])  # barriers stay, and would take time
+        new = self.simulator.start([replace(entering, corners=None)])  # barriers stay; building them takes time
         if count:
             self.simulation.add(new)
         return new.velocity_NM3.cpu().numpy()
 
     def replace_obstacles(self, scene: InitialState | Scene) -> None:
-        """The obstacles are those of another scene from now on, at rest; its particles do not matter.
+        """Replaces the obstacles by those of another scene, at rest; the particles of that scene are ignored.
 
         Raises: ConfigError as `Simulator.start`.
         """
@@ -105,15 +105,15 @@ class LiveSimulation:
         self._change_scene(replace(self.scene, **obstacles), ("obstacles", "barriers"))
 
     def set_gravity(self, gravity: tuple[float, float, float]) -> None:
-        """Gravity from now on, domain units per second squared.
+        """Replaces gravity, domain units per second squared.
 
-        Raises: ConfigError for what the weights cannot take: absolute inputs know that of their data alone.
+        Raises: ConfigError for weights of absolute inputs, which only have the gravity of their data.
         """
         self._change_scene(replace(self.scene, gravity=gravity), ("gravity_S3",))
 
     def restore(self, position_N3: np.ndarray, velocity_NM3: np.ndarray, frame: int) -> None:
-        """Goes back to what the first particles of the simulation did at an earlier frame: those that entered later
-        leave. Obstacles and gravity stay.
+        """Restores an earlier frame of the first particles; particles that entered later are removed. Obstacles and
+        gravity stay.
 
         position_N3: float32, domain units. velocity_NM3: float32, domain units per frame, newest first.
         """
@@ -134,11 +134,11 @@ class LiveSimulation:
         )
 
     def _change_scene(self, scene: InitialState, names: tuple[str, ...]) -> None:
-        """Another scene's are those parts of the state that have these names; the others stay."""
+        """Replaces the named parts of the state by those of another scene."""
         of_particles = ("position_N3", "velocity_N3", "material_N")
         started: dict[str, Any] = {name: getattr(scene, name)[:0] for name in of_particles}
         if "barriers" not in names:
-            started["corners"] = None  # barriers stay, and would take time
+            started["corners"] = None  # barriers stay; building them takes time
         new = self.simulator.start([replace(scene, **started)])
         self.scene = scene
         changed: dict[str, Any] = {name: getattr(new, name) for name in names}

@@ -1,4 +1,4 @@
-"""What Triton needs of a machine with a GPU: besides its package a C compiler, which builds what launches kernels."""
+"""Requirements of Triton: its package and, with a GPU, a C compiler, which builds the launchers of kernels."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ import torch
 
 
 def host_unsupported_reason() -> str | None:
-    """What keeps this machine from launching Triton's kernels, in words; none if nothing does.
+    """Returns why this machine cannot launch Triton's kernels, or None.
 
-    Without a GPU they are interpreted, which needs the package alone.
+    Without a GPU kernels are interpreted, which needs only the package.
     """
     if importlib.util.find_spec("triton") is None:
         return "it needs the package triton"
@@ -23,7 +23,7 @@ def host_unsupported_reason() -> str | None:
 
         if reason := unsupported_reason():
             return reason
-    if not torch.cuda.is_available() or any(_cache().glob("*/cuda_utils*")):  # built already, perhaps elsewhere
+    if not torch.cuda.is_available() or any(_cache().glob("*/cuda_utils*")):  # built before, perhaps on another machine
         return None
     if not (os.environ.get("CC") or shutil.which("gcc") or shutil.which("clang")):
         return "Triton needs a C compiler: gcc, clang or CC=…"
@@ -34,7 +34,7 @@ def host_unsupported_reason() -> str | None:
 
 
 def kernel_precision(precision: str, device: torch.device) -> str:
-    """What the kernels are given: without a GPU there is no TF32."""
+    """Returns the precision for the kernels: a CPU has no TF32."""
     return "fp32" if device.type == "cpu" and precision == "tf32" else precision
 
 
@@ -45,6 +45,6 @@ def _cache() -> Path:
 
 
 def _headers() -> str:
-    """Where Triton tells the compiler to look for them."""
+    """Returns the folder where Triton's compiler looks for Python's headers."""
     scheme = sysconfig.get_default_scheme()
     return sysconfig.get_paths("posix_prefix" if scheme == "posix_local" else scheme)["include"]

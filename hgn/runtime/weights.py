@@ -30,7 +30,7 @@ SHIPPED = Path(__file__).resolve().parents[1] / "weights"  # beside each file a 
 
 @dataclass(frozen=True)
 class WeightsInfo:
-    """What a weights file says of itself, beside the tensors."""
+    """The metadata of a weights file."""
 
     network: NetworkConfig
     frame_rate_hz: float  # of the data: one step of the network is one frame
@@ -45,7 +45,7 @@ class WeightsInfo:
 
 
 def save_weights(path: Path, network: ParticleNetwork, info: WeightsInfo, stored_precision: str = "fp32") -> None:
-    """Writes the file whole or not at all. With fp16 the learned tensors are rounded, for shipping."""
+    """Writes the file atomically. With fp16 the parameters are rounded; the normaliser is not."""
     tensors = {}
     for name, tensor in network.state_dict().items():
         rounded = stored_precision == "fp16" and not name.startswith("normaliser.")
@@ -56,14 +56,14 @@ def save_weights(path: Path, network: ParticleNetwork, info: WeightsInfo, stored
 
 
 def shipped_weights() -> dict[str, Path]:
-    """The files that come with this package, by name."""
+    """Returns the files of this package by name."""
     return {path.stem: path for path in sorted(SHIPPED.glob(f"*{SUFFIX}"))}
 
 
 def find_weights(name: str, field: str = "weights") -> Path:
-    """The file that `name` means: shipped weights by their name, as in `obstacles`, a repository's at hf://, or a path.
+    """Returns the file of shipped weights by name, of a repository at hf://, or at a path.
 
-    Raises: ConfigError for what is neither a name that is shipped nor looks like a path.
+    Raises: ConfigError for a name that is neither shipped nor looks like a path.
     """
     shipped = shipped_weights()
     if name in shipped:
@@ -82,10 +82,10 @@ def find_weights(name: str, field: str = "weights") -> Path:
 def load_weights(
     path: Path, device: torch.device | str = "cpu", field: str = "weights"
 ) -> tuple[ParticleNetwork, WeightsInfo]:
-    """The network in evaluation mode, float32, on `device`. `field` names the setting in messages.
+    """Returns the network in evaluation mode, float32, on `device`. `field` names the setting in messages.
 
-    Raises: ConfigError when the file is missing, is no weights file of ours, has another format version, or
-    holds tensors that do not fit the structure it declares.
+    Raises: ConfigError when the file is missing, is not a weights file, has another format version, or holds tensors
+    that do not fit the structure it declares.
     """
     if not path.is_file():
         raise ConfigError(f"{field} must be an existing file, got {path}; write one with python -m hgn.export")
@@ -120,10 +120,7 @@ def load_weights(
 
 
 def require_frame_rate(info: WeightsInfo, frame_rate_hz: float) -> None:
-    """One step of a network is one frame of the data it was trained on.
-
-    Raises: ConfigError when the data has another frame rate than the weights.
-    """
+    """Raises ConfigError where data and weights differ in frame rate: a step of a network is a frame of its data."""
     require(
         frame_rate_hz == info.frame_rate_hz,
         "data frame_rate_hz",
