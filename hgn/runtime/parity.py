@@ -40,23 +40,15 @@ def relative_error(computed: torch.Tensor, expected: torch.Tensor, least: float 
     return 0.0 if difference == 0 else math.inf
 
 
-def require_parity(
-    computed: torch.Tensor,
-    expected: torch.Tensor,
-    quantity: Quantity,
-    field: str = "backend",
-    *,
-    right: str = "torch",
-    wrong: str = "triton",
-) -> float:
+def require_parity(computed: torch.Tensor, expected: torch.Tensor, quantity: Quantity, field: str = "backend") -> float:
     """Returns the relative error of kernels against PyTorch.
 
-    Raises: ConfigError where it exceeds its bound: the setting `field` must be `right` on this machine, not `wrong`.
+    Raises: ConfigError where it exceeds its bound; `field` names the setting that must be torch then.
     """
     error = relative_error(computed, expected, quantity.least)
     if not error <= quantity.bound:  # NaN fails
         raise ConfigError(
-            f"{field} must be {right} on this machine, got {wrong}: its {quantity.name} differ by {error:.1e} from "
-            f"PyTorch's (at most {quantity.bound}); set {field}={right}, and report device and versions"
+            f"{field} must be torch on this machine, got triton: its {quantity.name} differ by {error:.1e} from "
+            f"PyTorch's (at most {quantity.bound}); set {field}=torch, and report device and versions"
         )
     return error
