@@ -40,18 +40,18 @@ def require_parity(
     weight_N3 = torch.randn(count, 3, generator=generator).to(updates.device) * updates.share_N[:count, None]
     parameters = list(network.parameters())
     output_N3 = network.normalised_acceleration(state, origin_S3)
-    expected = torch.autograd.grad((output_N3 * weight_N3).sum(), parameters, allow_unused=True)
+    slopes = torch.autograd.grad((output_N3 * weight_N3).sum(), parameters, allow_unused=True)
     output_error = require(fused.output[:count, :3], output_N3.detach(), OUTPUTS, "training.backend")
     fused.output_gradient[:count].zero_()
     fused.output_gradient[:count, :3] = weight_N3 / fused.unscale
     fused.backward()
     gradients = [torch.zeros_like(parameter) for parameter in parameters]
     updates.packed.scatter(fused.totals[: updates.packed.size], gradients)
-    expected = [torch.zeros_like(p) if g is None else g for p, g in zip(parameters, expected, strict=True)]
+    expected = [torch.zeros_like(p) if g is None else g for p, g in zip(parameters, slopes, strict=True)]
     flat, expected_flat = (torch.cat([tensor.flatten() for tensor in each]) for each in (gradients, expected))
     gradient_error = require(flat, expected_flat, GRADIENTS, "training.backend")
     if updates.device.type == "cuda":
-        del output_N3, expected
+        del output_N3, slopes, expected, expected_flat
         torch.cuda.empty_cache()  # what is free decides where episodes are kept
     return output_error, gradient_error
 
