@@ -66,7 +66,7 @@ class ExportConfig:
 
 
 def main(mapping: dict[str, Any]) -> int:
-    """Writes what is asked for; returns the exit code."""
+    """Writes the files that the settings name; returns the exit code."""
     config = from_mapping(ExportConfig, mapping)
     if config.onnx is not None:
         require_installed("onnxscript")
@@ -153,7 +153,7 @@ def changed_step(network: ParticleNetwork, changes: dict[str, Any]) -> StepConfi
 
 
 def write_arrays(folder: Path, state: ParticleState, corner_F33: np.ndarray) -> None:
-    """What a step is first given, an .npy file each; corners as `initial_arrays` takes them."""
+    """Writes the first inputs of a step, an .npy file each; corners as in `initial_arrays`."""
     folder.mkdir(parents=True, exist_ok=True)
     for name, array in initial_arrays(state, corner_F33).items():
         np.save(folder / f"{name}.npy", array)

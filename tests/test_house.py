@@ -35,13 +35,8 @@ PARAMETERS, POSITIONAL_ARGUMENTS = 8, 4
 MANY_PARAMETERS: dict[str, int] = {}
 # the number of such calls in a file
 MANY_POSITIONAL_ARGUMENTS: dict[str, int] = {
-    "hgn/runtime/differentiable.py": 5,
-    "hgn/runtime/exported_step.py": 1,
     "hgn/runtime/precompile_program.py": 4,
-    "hgn/runtime/simulator.py": 10,
-    "hgn/runtime/triton_stepper.py": 5,
-    "hgn/runtime/weights.py": 1,
-    "hgn/training/parity.py": 3,
+    "hgn/runtime/triton_stepper.py": 3,
 }
 
 HEADLESS = re.compile(r"(What|Of|Whether|That|Those|These|How|Which|Whose|Where)\b")

@@ -1,4 +1,4 @@
-"""The one place that knows which backend computes a network: torch, triton or cpu.
+"""Chooses the backend that computes a network: torch, triton or cpu.
 
 | backend | what it is | networks | gradients |
 |---|---|---|---|
@@ -104,12 +104,12 @@ def pick(reasons: Mapping[str, str | None], backend: str, precision: str, field:
 
 
 def torch_unsupported_reason(precision: str) -> str | None:
-    """What keeps PyTorch from computing a network, in words; none if nothing does."""
+    """Returns why PyTorch cannot compute a network, or None."""
     return "it has no fp16" if precision == "fp16" else None
 
 
 def cpu_unsupported_reason(device: torch.device, config: NetworkConfig, precision: str) -> str | None:
-    """What keeps a network from the backend cpu, in words; none if nothing does."""
+    """Returns why backend cpu cannot compute a network, or None."""
     if device.type != "cpu":
         return f"it needs the CPU, not {device.type}"
     if config.kind != "hgn":
@@ -118,7 +118,7 @@ def cpu_unsupported_reason(device: torch.device, config: NetworkConfig, precisio
 
 
 def triton_unsupported_reason(device: torch.device, config: NetworkConfig, precision: str = "tf32") -> str | None:
-    """What keeps simulations from the backend triton, in words; none if nothing does."""
+    """Returns why backend triton cannot simulate a network, or None."""
     if device.type != "cuda":
         return f"it needs a CUDA device, not {device.type}"
     if reason := host_unsupported_reason() or _too_little_shared_memory(device, config.width):

@@ -29,7 +29,7 @@ from hgn.step.reference import Accelerations, advanced
 
 @dataclass(frozen=True, eq=False)
 class Pose:
-    """How an obstacle lies against its scene's: turned about a pivot, then shifted. What is None stays."""
+    """A change of an obstacle's place: rotation about a pivot, then translation. None leaves it as it is."""
 
     rotation_3: torch.Tensor | None = None  # axis times angle, radians
     translation_3: torch.Tensor | None = None  # domain units
@@ -38,7 +38,7 @@ class Pose:
 
 @dataclass(frozen=True, eq=False)
 class Inputs:
-    """What replaces a scene's own: tensors, with gradients where they are asked for. Units: domain units, seconds."""
+    """Tensors that replace a scene's own, with gradients if they require them. Units: domain units, seconds."""
 
     position_N3: torch.Tensor | None = None
     velocity_N3: torch.Tensor | None = None
@@ -58,7 +58,7 @@ def simulate(
     """
     require(frames >= 1, "frames", "at least 1", frames)
     require(0 <= inputs.smoothing <= 1, "smoothing", "0 to 1 cells", inputs.smoothing)
-    state = _started(network, start, scene, frame_rate_hz, inputs)
+    state = _started(network, start, scene, frame_rate_hz, inputs=inputs)
     predicted = Accelerations(network)
     weights = {name: tensor.detach() for name, tensor in predicted.state_dict(keep_vars=True).items()}
 
@@ -157,7 +157,7 @@ def _started(
         "gravity_3",
         "left out for a network of absolute inputs, which knows no gravity but its data's",
         "a tensor",
-        "take weights of relative inputs, as mechanics",
+        remedy="take weights of relative inputs, as mechanics",
     )
     count = len(scene.position_N3)
     position_N3 = given("position_N3", inputs.position_N3, scene.position_N3, (count, 3))
@@ -165,7 +165,7 @@ def _started(
     gravity_3 = given("gravity_3", inputs.gravity_3, np.array(scene.gravity), (3,)) / frame_rate_hz**2
     domain_3 = given("domain_size_3", inputs.domain_size_3, np.array(scene.domain_size), (3,))
     age_H1 = torch.arange(config.velocity_history, device=device, dtype=torch.float64)[:, None] + 0.5
-    obstacles, barriers = _obstacles(network, start, scene, inputs, dtype)
+    obstacles, barriers = _obstacles(network, start, scene, inputs)
     return replace(
         start,
         position_N3=position_N3.to(dtype),
@@ -178,9 +178,10 @@ def _started(
 
 
 def _obstacles(
-    network: ParticleNetwork, start: ParticleState, scene: Scene, inputs: Inputs, dtype: torch.dtype
+    network: ParticleNetwork, start: ParticleState, scene: Scene, inputs: Inputs
 ) -> tuple[ObstacleCells | None, Barriers | None]:
     poses, config, device = inputs.poses or {}, network.config, start.position_N3.device
+    dtype = next(network.parameters()).dtype
     for number in poses:
         rule = f"0 to {len(scene.obstacles) - 1}" if scene.obstacles else "left out: the scene has no obstacles"
         require(number in range(len(scene.obstacles)), "poses", rule, number)
@@ -192,17 +193,17 @@ def _obstacles(
     if config.obstacle_features:
         rest = _cells(scene, staying, device)
         placed = tuple((_cells(scene, [scene.obstacles[i]], device), placement) for i, placement in placements.items())
-        obstacles = PosedObstacleCells(rest.key_K, rest.normal_K3, rest.cell_size, placed, inputs.smoothing)
+        obstacles = PosedObstacleCells(rest.key_K, rest.normal_K3, rest.cell_size, placed, smoothing=inputs.smoothing)
     clearance = network.step.obstacle_clearance
     if clearance is not None and placements:
-        barriers = _barriers(scene, placements, clearance, device, dtype)
+        barriers = _barriers(scene, placements, clearance, device, dtype=dtype)
     return obstacles, barriers
 
 
 def _barriers(
     scene: Scene, placements: Mapping[int, Placement], clearance: float, device: torch.device, dtype: torch.dtype
 ) -> Barriers | None:
-    """Those of the obstacles where they are: rows with gradients by their poses, lists of where these have them now."""
+    """Returns barriers of the placed obstacles: rows with gradients by the poses, lists of cells without."""
     cell_size, parts = scene.cell_size, []
     for i, obstacle in enumerate(scene.obstacles):
         staying = i not in placements

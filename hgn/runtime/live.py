@@ -33,7 +33,7 @@ class LiveSimulation:
         """
         self.simulator, self.scene = simulator, InitialState.of(scene)
         emits = self.scene.emitting is not None
-        require(not emits, "emitters", "left out here", "some", "take Simulator.frames, or add_particles")
+        require(not emits, "emitters", "left out here", "some", remedy="take Simulator.frames, or add_particles")
         self.simulation = simulator.simulation(simulator.start([self.scene]), capacity)
 
     def __enter__(self) -> LiveSimulation:

@@ -1,6 +1,6 @@
-"""The simulation loop (paper algorithm 1): features, grid, network, integration, all on one device.
+"""Simulates scenes with a trained network (paper algorithm 1) on one device.
 
-Imports torch and the network, nothing of the training stack.
+Imports torch and the network, but nothing of the training stack.
 Shape legend: T frames, N particles of all scenes, S scenes.
 """
 
@@ -44,7 +44,7 @@ SAME_GRAVITY = 1e-3  # of its size: what is estimated from trajectories differs 
 
 @dataclass(frozen=True, eq=False)
 class InitialState:
-    """Where a simulation starts. Units: domain units, seconds."""
+    """The start of a simulation. Units: domain units, seconds."""
 
     position_N3: np.ndarray
     velocity_N3: np.ndarray
@@ -62,47 +62,47 @@ class InitialState:
 
     @staticmethod
     def of_episode(episode: Episode) -> InitialState:
-        """Frame 0 of an episode."""
+        """Returns frame 0 of an episode."""
         return InitialState(
-            np.array(episode.position_TN3[0]),
-            episode.initial_velocity_N3,
-            episode.material_N,
-            episode.obstacle_grid,
-            episode.domain_size,
-            episode.gravity,
-            lambda: all_corners(known_obstacles(episode) or ()),
-            episode.materials,
-            episode.past_HN3,
-            episode.dimensions,
+            position_N3=np.array(episode.position_TN3[0]),
+            velocity_N3=episode.initial_velocity_N3,
+            material_N=episode.material_N,
+            obstacle_grid=episode.obstacle_grid,
+            domain_size=episode.domain_size,
+            gravity=episode.gravity,
+            corners=lambda: all_corners(known_obstacles(episode) or ()),
+            materials=episode.materials,
+            past_HN3=episode.past_HN3,
+            dimensions=episode.dimensions,
         )
 
     @staticmethod
     def of_scene(scene: Scene) -> InitialState:
-        """A scene's initial particles, its obstacles sampled into cells.
+        """Returns a scene's initial particles; obstacles are sampled into cells.
 
         Raises: ConfigError where obstacles move: a network knows obstacles at rest.
         """
         remedy = "leave keyframes out, or run datagen.solve"
-        require(not scene.moves, "obstacles", "at rest for a network", "keyframes", remedy)
+        require(not scene.moves, "obstacles", "at rest for a network", "keyframes", remedy=remedy)
         first = at_start(scene)
         return InitialState(
-            first.position_N3,
-            first.velocity_N3,
-            first.material_N,
-            build_obstacle_grid(scene.obstacles, scene.cell_size, scene.seed, scene.domain_size),
-            scene.domain_size,
-            scene.gravity,
-            lambda: all_corners(scene.obstacles),
+            position_N3=first.position_N3,
+            velocity_N3=first.velocity_N3,
+            material_N=first.material_N,
+            obstacle_grid=build_obstacle_grid(scene.obstacles, scene.cell_size, scene.seed, scene.domain_size),
+            domain_size=scene.domain_size,
+            gravity=scene.gravity,
+            corners=lambda: all_corners(scene.obstacles),
             emitting=scene if scene.emits else None,
         )
 
     @staticmethod
     def of(scene: InitialState | Scene) -> InitialState:
-        """A scene's, where it is not given itself."""
+        """Returns the initial state of a scene, or the given one."""
         return InitialState.of_scene(scene) if isinstance(scene, Scene) else scene
 
     def velocities(self, history: int, frame_rate_hz: float) -> np.ndarray:
-        """Displacements in the frames up to now, newest first, float32 [N, history, 3], domain units per frame.
+        """Returns displacements in the frames up to now, newest first, float32 [N, history, 3], domain units per frame.
 
         Raises: ConfigError where fewer frames before this one are known.
         """
@@ -114,7 +114,7 @@ class InitialState:
         return np.ascontiguousarray(np.diff(path_TN3, axis=0)[::-1].transpose(1, 0, 2))
 
     def barrier(self, clearance: float) -> Barrier:
-        """What of the obstacles nothing passes. Raises: ConfigError for a clearance of more than a cell."""
+        """Returns the barrier of the obstacles. Raises: ConfigError for a clearance of more than a cell."""
         corner_F33 = np.zeros((0, 3, 3)) if self.corners is None else self.corners()
         return build_barrier(corner_F33, self.obstacle_grid.cell_size, clearance, self.domain_size)
 
@@ -161,16 +161,16 @@ class Simulator:
         network, info = load_weights(find_weights(str(weights)), place)
         chosen = choose(place, network, precision, backend)
         set_matmul_precision(precision)
-        return Simulator(network, info.frame_rate_hz, chosen, precision, info)
+        return Simulator(network, info.frame_rate_hz, chosen, precision, info=info)
 
     @property
     def info(self) -> WeightsInfo:
-        """What the weights file says of itself, for a simulator that `load` made."""
+        """The metadata of the weights file, for a simulator of `load`."""
         assert self._info is not None
         return self._info
 
     def start(self, scenes: Sequence[InitialState | Scene]) -> ParticleState:
-        """The state at frame 0, with a ballistic history.
+        """Returns the state at frame 0, with a ballistic history.
 
         Raises: ConfigError when a scene holds a material that the network does not know, or, for weights that were
         loaded, a gravity that they cannot take (absolute inputs: another, relative: a huge one) or obstacle cells of
@@ -201,7 +201,7 @@ class Simulator:
         )
 
     def step(self, state: ParticleState) -> ParticleState:
-        """The state one frame later."""
+        """Returns the state one frame later."""
         return stepped(self.backend.predict, state, self.backend.step, self.network.config.dimensions)
 
     def rollout(
@@ -314,16 +314,16 @@ class Simulator:
         by PyTorch, one frame's work in memory at a time. docs/how_to/gradients.md says what is differentiable.
         Raises: ConfigError and DivergedError as `rollout`.
         """
-        inputs = Inputs(position_N3, velocity_N3, gravity_3, domain_size_3, poses, smoothing)
-        return simulate(self.network, self.start([scene]), scene, self.frame_rate_hz, frames, inputs)
+        inputs = Inputs(position_N3, velocity_N3, gravity_3, domain_size_3, poses=poses, smoothing=smoothing)
+        return simulate(self.network, self.start([scene]), scene, self.frame_rate_hz, frames=frames, inputs=inputs)
 
     def require_fits(self, scene: InitialState) -> None:
-        """Raises ConfigError where weights that were loaded cannot take a scene; of its materials `start` says so."""
+        """Raises ConfigError where loaded weights do not fit a scene; `start` checks its materials."""
         info, cell_size = self._info, scene.obstacle_grid.cell_size
         dimensions = self.network.config.dimensions
         rule = f"the network's {dimensions}"
         remedy = f"take weights of {scene.dimensions}D data, or an episode of {dimensions}D data"
-        require(scene.dimensions == dimensions, "dimensions", rule, scene.dimensions, remedy)
+        require(scene.dimensions == dimensions, "dimensions", rule, scene.dimensions, remedy=remedy)
         if info is None:
             return
         if info.network.relative:
@@ -334,7 +334,7 @@ class Simulator:
             remedy = "take weights of relative inputs, as mechanics, or train some on scenes with this gravity"
             difference = np.linalg.norm(np.subtract(scene.gravity, info.gravity))
             same = bool(difference <= SAME_GRAVITY * np.linalg.norm(info.gravity))
-            require(same, "gravity", rule, scene.gravity, remedy)
+            require(same, "gravity", rule, scene.gravity, remedy=remedy)
         if info.network.obstacle_features:
             rule = f"the weights' {info.obstacle_cell_size}, the size of the cells that they know obstacles by"
             require(cell_size == info.obstacle_cell_size, "cell_size", rule, cell_size)
@@ -342,5 +342,6 @@ class Simulator:
 
 def _initial(scenes: Sequence[InitialState | Scene]) -> list[InitialState]:
     alone = isinstance(scenes, (InitialState, Scene))
-    require(not alone, "scenes", "a list of them", type(scenes).__name__, "as in rollout([scene], frames)")
+    example = "as in rollout([scene], frames)"
+    require(not alone, "scenes", "a list of them", type(scenes).__name__, remedy=example)
     return [InitialState.of(scene) for scene in scenes]

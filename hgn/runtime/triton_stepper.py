@@ -1,8 +1,8 @@
-"""The simulation loop as one CUDA graph a frame (paper algorithm 1): no host synchronisation between looks.
+"""Frames of a simulation as CUDA graphs (paper algorithm 1), without synchronisation within a block of frames.
 
-The host looks every `look_frames` frames, while the device is at the next ones. Where the grid needed more room than it
-had, the frames before are kept, the buffers grow, and the simulation goes on from the last good frame: nothing is lost,
-and nothing is done twice.
+The host reads the status after each block of `look_frames` frames, while the device computes the next block. If the
+grid needed more memory than it had, the frames before are kept, the buffers grow, and the simulation continues from the
+last good frame; no frame is computed twice.
 Shape legend: N particles of all scenes, S scenes, T frames.
 """
 
@@ -52,7 +52,7 @@ def first_capacities(cells: Sequence[int], particles: int) -> tuple[int, ...]:
 
 
 def crowded(position_N3: torch.Tensor, scene_N: torch.Tensor, cell_size: float) -> bool:
-    """Whether more than a twentieth of the particles lie where sums of them in float16 would lose small summands."""
+    """Returns whether more than a twentieth of the particles are in cells whose float16 sums would lose small terms."""
     cell_N3 = torch.floor(position_N3 / cell_size).long()
     inside_N = (cell_N3.abs() < COORDINATE_LIMIT).all(-1)
     key_N = pack(scene_N[inside_N].long(), cell_N3[inside_N])
@@ -76,7 +76,7 @@ class _Look:
 
 
 class TritonStepper:
-    """A simulation in progress on one device. Without CUDA the same launches run one by one (for tests)."""
+    """Computes frames on one device. Without CUDA the same launches run one by one, in Triton's interpreter."""
 
     def __init__(
         self,
@@ -136,8 +136,8 @@ class TritonStepper:
         self._build(capacities or self._first_capacities())
 
     def fits(self, state: ParticleState) -> bool:
-        """Whether `begin` can go on with a state: as many scenes, in such domains, and not too many particles, nor too
-        many in one place.
+        """Returns whether `begin` can continue from a state: the same scenes' domains and obstacle cells, no more
+        particles than the capacity, and no crowds that need float32 sums.
         """
         if state.scene_count != self.scenes or len(state.position_N3) > self.particles:
             return False
@@ -148,10 +148,10 @@ class TritonStepper:
         return same and torch.equal(state.domain_S3, self.domain_S3)
 
     def begin(self, state: ParticleState, new_obstacles: bool = False) -> None:
-        """Goes on with another state that `fits`.
+        """Continues from another state that `fits`.
 
-        Obstacles are those of the rows of `self.obstacles` and `self.barriers`, which the caller may write, or those of
-        the state.
+        Obstacles are those of the tables `self.obstacles` and `self.barriers`, which the caller may write, or with
+        `new_obstacles` those of the state.
         """
         if new_obstacles and self.barriers is not None and not self.barriers.is_of(state.barriers):
             self.barriers.take(BarrierTable.of(state.barriers, self.scenes, self.device))
@@ -163,7 +163,7 @@ class TritonStepper:
         self.grid.status.zero_()
 
     def take(self, state: ParticleState) -> bool:
-        """Goes on with another state, its obstacles too, if it `fits`."""
+        """Continues from another state and its obstacles, if it `fits`."""
         if not self.fits(state):
             return False
         self.begin(state, new_obstacles=True)
@@ -202,7 +202,7 @@ class TritonStepper:
         return not nowhere and crowded(state.position_N3, state.scene_N, self.config.cell_size)
 
     def use_values(self, values: torch.Tensor) -> None:
-        """Takes over parameters in the packed layout."""
+        """Replaces the parameters, in the packed layout."""
         self.values.copy_(values)
         self.fused.refresh()
 
@@ -235,7 +235,13 @@ class TritonStepper:
         tuning = Tuning.of(self.precision)
         tuning = replace(tuning, half_sums=tuning.half_sums and not self._careful)
         self.fused = FusedNetwork(
-            config, self.packed, self.values, self.grid, self.count, self.precision, tuning=tuning
+            config,
+            self.packed,
+            self.values,
+            self.grid,
+            particle_count=self.count,
+            precision=self.precision,
+            tuning=tuning,
         )
         if self.device.type == "cuda":
             self.graph = self._capture()
@@ -262,7 +268,7 @@ class TritonStepper:
             require_parity(output_N3, expected_N3, OUTPUTS, field)
 
     def frame_launches(self) -> None:
-        """All launches of one frame: what the graph holds."""
+        """Makes all launches of one frame, which the graph contains."""
         self._network_pass()
         self._integrate()
 
@@ -307,7 +313,7 @@ class TritonStepper:
                 self._grow()
 
     def _launch(self, frames: int, half: int) -> _Look:
-        """Starts some frames, whose positions go into one half of the path."""
+        """Starts some frames, whose positions are written to one half of the path."""
         first = half * self.look_frames
         self.frame.fill_(first)
         for _ in range(frames):
@@ -324,7 +330,7 @@ class TritonStepper:
         return _Look(frames, first, seen, end)
 
     def _settle(self, look: _Look) -> tuple[torch.Tensor, int]:
-        """Waits for frames that were started: those taken, and the status after them."""
+        """Waits for started frames; returns positions of the completed ones, and the status after them."""
         if look.end is not None:
             look.end.synchronize()
         last, status = look.seen.tolist()

@@ -126,7 +126,7 @@ def require_frame_rate(info: WeightsInfo, frame_rate_hz: float) -> None:
         "data frame_rate_hz",
         f"the weights' {info.frame_rate_hz}",
         frame_rate_hz,
-        "take a data set or weights of the same frame rate",
+        remedy="take a data set or weights of the same frame rate",
     )
 
 

@@ -74,12 +74,12 @@ def _state(
             obstacles = obstacles_under(obstacles, symmetries)
         obstacles = obstacles.to(updates.device)
     state = ParticleState(
-        updates.position_N3[:count],
-        updates.velocity_NV[:count].view(count, config.velocity_history, 3),
-        updates.material_N[:count].long(),
-        updates.scene_N[:count].long(),
-        updates.domain_S3,
-        updates.gravity_S3,
-        obstacles,
+        position_N3=updates.position_N3[:count],
+        velocity_NM3=updates.velocity_NV[:count].view(count, config.velocity_history, 3),
+        material_N=updates.material_N[:count].long(),
+        scene_N=updates.scene_N[:count].long(),
+        domain_S3=updates.domain_S3,
+        gravity_S3=updates.gravity_S3,
+        obstacles=obstacles,
     )
     return state, updates.origin_S3
