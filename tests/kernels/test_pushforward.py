@@ -96,7 +96,7 @@ def test_the_pool_is_that_of_the_plain_path(changes):
         refresh(fast, network, [(scenes[i], frame) for i, frame in starts])
         plain.refresh([(scenes[i], frame) for i, frame in starts])
         assert_same_pools(fast, plain)
-        rollouts.append(fast._scenes._rollout)
+        rollouts.append(fast._scenes._stepper)
         with torch.no_grad():
             for parameter in network.parameters():
                 parameter.mul_(1.05)
