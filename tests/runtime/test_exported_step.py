@@ -13,7 +13,7 @@ import numpy as np
 import onnxruntime
 import pytest
 import torch
-from network.states import network_of, random_state
+from network.states import gns_of, network_of, random_state
 from network.test_barriers import scattered
 
 from hgn import export
@@ -132,7 +132,6 @@ def test_package_is_the_step(tmp_path, name):
         ({"checkpoint": "a"}, "out must be given with checkpoint, got None"),
         ({"checkpoint": "a", "weights": "gns"}, "weights must be null with checkpoint, got 'gns'"),
         ({"weights": "gns"}, "out must be given with weights, or onnx, package or arrays, got None"),
-        ({"weights": "gns", "onnx": "a.onnx"}, "weights must be an hgn network, got 'gns'"),
         ({"weights": "obstacles", "package": "a.so"}, "package must be a name that ends in .pt2, got 'a.so'"),
         ({"weights": "obstacles", "arrays": "a"}, "scene must be given with arrays, and only then, got None"),
     ],
@@ -141,6 +140,15 @@ def test_what_is_refused(options, message):
     """By name, with the rule, before anything is written."""
     with pytest.raises(ConfigError, match=message):
         export.main(options)
+
+
+def test_a_gns_is_refused(tmp_path):
+    """Neighbour lists are not exported."""
+    network, path = gns_of(torch.float32), tmp_path / "gns.safetensors"
+    save_weights(path, network, WeightsInfo(network.config, 60.0, 1 / 64))
+    with pytest.raises(ConfigError, match="weights must be an hgn network, got 'gns'"):
+        export.main({"weights": str(path), "onnx": str(tmp_path / "a.onnx")})
+    assert not (tmp_path / "a.onnx").exists()
 
 
 def test_a_package_that_is_cut_off_leaves_nothing(tmp_path, monkeypatch):
