@@ -89,15 +89,8 @@ class Step(nn.Module):
         corner_F33 = torch.cat([corner_F33, corner_F33.new_zeros(1, 3, 3)])
         row_F24 = barrier_rows(corner_F33, clearance).to(corner_F33.dtype)
         none = torch.zeros(0, dtype=torch.int64, device=corner_F33.device)
-        return Barriers(
-            key_Q=none,
-            start_Q=none,
-            triangle_E=none,
-            row_F24=row_F24,
-            scene_F=none,
-            cell_size=self.obstacle_cell_size,
-            clearance=clearance,
-        )
+        cell_size = self.obstacle_cell_size
+        return Barriers(none, none, none, row_F24, scene_F=none, cell_size=cell_size, clearance=clearance)
 
 
 def initial_arrays(state: ParticleState, corner_F33: np.ndarray | None = None) -> dict[str, np.ndarray]:

@@ -108,7 +108,8 @@ class Simulation:
         if self.ended:
             self._row_N = torch.cat([rows_N, self._row_count + torch.nonzero(going_A).flatten()])
         self._row_count += len(new.position_N3)
-        self._begin(joined(old, entering))
+        both: dict[str, Any] = {name: torch.cat([getattr(old, name), getattr(entering, name)]) for name in OF_PARTICLES}
+        self._begin(replace(old, **both))
 
     def run(self, frames: int, on_frame: Callable[[int], Any] | None = None) -> np.ndarray:
         """Returns positions of the next `frames` frames, float32 [T, N, 3]; calls `on_frame(number)` after each.
@@ -202,12 +203,6 @@ class Simulation:
         if whole_TN3.device.type == "cuda":
             torch.cuda.current_stream().synchronize()  # `on_host` copies on another stream
         return whole_TN3
-
-
-def joined(first: ParticleState, second: ParticleState) -> ParticleState:
-    """Returns a state with the particles of both, and everything else from the first."""
-    both: dict[str, Any] = {name: torch.cat([getattr(first, name), getattr(second, name)]) for name in OF_PARTICLES}
-    return replace(first, **both)
 
 
 @torch.inference_mode()
