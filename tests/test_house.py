@@ -16,10 +16,10 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 27_700,
+    "hgn": 27_150,
     "datagen": 8_340,
     "tools": 6_200,
-    "tests": 27_500,
+    "tests": 27_900,
 }
 SETTINGS = 257  # fields of the dataclasses behind the commands, *Config
 
