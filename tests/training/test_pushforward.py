@@ -285,4 +285,6 @@ def test_a_resume_where_the_pool_is_made_anew_changes_nothing(data, tmp_path, st
     assert elsewhere["hgn"] == whole["hgn"]
     assert any(not torch.equal(elsewhere["state_dict"][name], value) for name, value in whole["state_dict"].items())
     lines = [line for line in metrics(tmp_path / "whole") if "loss" in line]
+    resumed = [line for line in metrics(tmp_path / "elsewhere") if "loss" in line]
+    assert all(line["pushforward/windows"] > 0 for line in resumed)  # also between updates 6 and 8
     assert all(line["pushforward/windows"] == 6 and line["pushforward/dropped"] == 0 for line in lines)
