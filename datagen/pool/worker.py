@@ -39,7 +39,7 @@ _Value = TypeVar("_Value")
 
 
 class Parcel(Generic[_Value]):
-    """A value that is pickled once, passed on as bytes, and unpickled where it is opened."""
+    """A value that is passed on as pickled bytes and unpickled only where it is opened."""
 
     def __init__(self, value: _Value) -> None:
         self._value: _Value | None = value
@@ -102,7 +102,7 @@ class Worker(ABC):
         """Sends work. A dead worker is noticed at the next receive."""
 
     def tell(self, message: object) -> None:
-        """Sends a part of work that it already has."""
+        """Sends the missing part of a task that the worker already has."""
         raise NotImplementedError
 
     def dismiss(self) -> None:  # noqa: B027 - Ray ends its actors itself

@@ -1,6 +1,6 @@
 """Published episodes of a data set. Positions are memory-mapped, so a window of frames reads only its own pages.
 
-Each shard is checked against the manifest (size, then sha256) before it is used: a tar cut at a member boundary would
+Each shard is checked against the index (size, then sha256) before it is used: a tar cut at a member boundary would
 otherwise read as fewer samples without an error. Remote shards are read from a cache (`hgn.data.shard_cache`).
 """
 
@@ -141,7 +141,7 @@ class EpisodeStore(Episodes):
 
     def fetch_ahead(self, episodes: Sequence[int] | None = None) -> None:
         """Starts to fetch shards in the background, one after the other: all that are published, or those of `episodes`
-        in their order. Only the latter remove older shards from a full cache. Does nothing for a folder.
+        in their order. Only with `episodes` are older shards removed from a full cache. Does nothing for a folder.
         """
         if not is_remote(self.folder):
             return
@@ -156,7 +156,7 @@ class EpisodeStore(Episodes):
                 self._fetcher = threading.Thread(target=target, name="shards", daemon=True)
                 self._fetcher.start()
 
-    # a reader that needs a shard which cannot be fetched gets the same error, and reports it
+    # errors are ignored here: the reader that needs the shard meets and reports them
 
     def _fetch_all(self) -> None:
         with contextlib.suppress(ConfigError, OSError):
@@ -184,7 +184,7 @@ class EpisodeStore(Episodes):
         return (entry for shard in self.manifest.shards_of(self.split) for entry in shard.episodes)
 
     def frames(self, count: int | None = None) -> list[int]:
-        """Returns the frames of the first `count` episodes (None: all), from the index only where they differ."""
+        """Returns the frame counts of the first `count` episodes (None: all), from the index only where they differ."""
         count, config = len(self) if count is None else count, self.manifest.config
         if "frames" in config and "long_fraction" not in config:
             return [config["frames"]] * count

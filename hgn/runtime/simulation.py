@@ -56,7 +56,7 @@ class Simulation:
         """`stepper_of` allocates buffers and frees them on exit: Backend.stepper.
 
         isolate: a scene that diverges ends, is entered in `ended`, and the others continue; otherwise the first
-        divergence raises DivergedError.
+        divergence raises DivergedError. A scene beyond the range of the grid ends all.
         """
         self.isolate, self.frame = isolate, 0
         self.ended: dict[int, DivergedError] = {}
@@ -85,7 +85,7 @@ class Simulation:
 
     @property
     def static_state(self) -> ParticleState:
-        """`state`, but with positions and velocities of when it last changed; needs no copy from the device."""
+        """`state`, but with the positions and velocities of the last edit; needs no copy from the device."""
         return self._state
 
     @property
@@ -100,7 +100,7 @@ class Simulation:
         self._begin(state)
 
     def add(self, new: ParticleState) -> None:
-        """Adds particles behind the others; those of scenes that ended have rows without a number."""
+        """Adds particles behind the others; those of scenes that ended get an output row of NaN."""
         old, rows_N = self.state, self._rows()
         going_A = torch.tensor([i not in self.ended for i in range(old.scene_count)], device=old.scene_N.device)
         going_A = going_A[new.scene_N]

@@ -11,8 +11,8 @@ With the next displacement u = v + a and d = P u accelerations become a - P (phi
 (threshold |g|)^2 within 0 and 1. The same follows between cells of four times that size, with what the first has left;
 FRICTIONLESS materials are not part of it.
 
-**Obstacles**: exactly on a plane a particle keeps to the side of the normal. Ways are stopped SLACK of the clearance
-nearer than they end, so that for rounding no triangle stops one twice.
+**Obstacles**: a particle exactly on a plane stays on the side of the normal. Contact is tested nearer, by SLACK of the
+clearance, than ends are placed, so that rounding never triggers a contact again.
 Shape legend: N particles, C coarsest cells, K middles of cells, F triangles, P pairs of particles and triangles.
 """
 
@@ -36,7 +36,7 @@ SURE = 0.5  # q from which on rotation counts as known
 LEAST = 1e-30  # of a limit squared
 REST_SIZES, LEVEL_SHIFT = 2, 2  # sizes of cells, and the shift from one to the next: 2^LEVEL_SHIFT times as large
 FRICTIONLESS = ("water",)  # materials that do not rest between the larger cells
-SLACK = 0.02  # of the clearance; a particle that begins nearer is moved away by that when a frame brings it nearer
+SLACK = 0.02  # of the clearance; a particle that starts nearer and approaches ends farther out by this
 SURFACES = 3  # triangles that move the end of one way; where a further one stops it, it ends there
 LEAST_CREASE = 1e-4  # squared sine of the angle between two planes, below which they are one
 
@@ -131,8 +131,10 @@ def within_range(position_N3: torch.Tensor, domain_N3: torch.Tensor) -> torch.Te
 
 
 class Deformation:
-    """P of a grid whose coarsest cells are `touched_C`, between cells 2^shift times as large as these, of the particles
-    that `share_N` is 1 for: called with a field [N, 3], it gives the part that deforms.
+    """The operator P between cells 2^shift times as large as the coarsest cells of a grid.
+
+    It acts in cells with `touched_C` and on particles with `share_N` = 1. Called with a field [N, 3], it returns the
+    part that deforms.
     """
 
     def __init__(
@@ -230,10 +232,10 @@ def _walled(
 def _outside_obstacles(
     state: ParticleState, position_N3: torch.Tensor, step: StepConfig, dimensions: int, barriers: Barriers
 ) -> torch.Tensor:
-    """Up to SURFACES triangles stop the straight way of a frame one after the other, and walls again.
+    """Stops the straight path of a frame at up to SURFACES triangles, one after the other, and at walls after each.
 
-    Each shifts its end. Where that shift would bring the end nearer to the plane of the shift before, the end moves
-    along the crease of both planes instead, for from plane to plane a narrow gutter would take more shifts than these.
+    Each triangle shifts the end. If the shift would bring the end nearer to the plane of the previous shift, the end
+    moves along the crease of both planes instead: alternating between the planes of a gutter needs more shifts.
     """
     before_N3, domain_N3 = state.position_N3, state.domain_S3[state.scene_N]
     lost_N1 = ~within_range(position_N3, domain_N3).all(-1, keepdim=True)
@@ -292,7 +294,7 @@ def first_stop(
     time_P = torch.where(stops_P, torch.where(meets_P, contact_P, crossing_P), 2.0)
     least_N = torch.full_like(before_N3[:, 0], 2.0).scatter_reduce(0, particle_P, time_P.detach(), "amin")
     first_P = stops_P & (time_P == least_N[particle_P])
-    # of several at one time that of the least number
+    # of several triangles at one time the one with the lowest number
     count, pairs = barriers.row_F24.shape[0], particle_P.shape[0]
     number_P = torch.where(first_P, triangle_P, count)
     number_N = torch.full_like(scene_N, count).scatter_reduce(0, particle_P, number_P, "amin")
@@ -335,7 +337,7 @@ def _pairs(
 def pairs_of_boxes(
     barriers: Barriers, before_N3: torch.Tensor, after_N3: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Those whose boxes meet: as a graph without loops has it, of one scene."""
+    """Returns pairs of particles and triangles whose boxes meet, without loops, for the export of one scene."""
     low_N3, high_N3 = torch.minimum(before_N3, after_N3), torch.maximum(before_N3, after_N3)
     low_F3, high_F3 = barriers.row_F24[:, 16:19], barriers.row_F24[:, 20:23]
     meets_NF = (low_N3[:, None, 0] <= high_F3[None, :, 0]) & (high_N3[:, None, 0] >= low_F3[None, :, 0])
