@@ -84,7 +84,7 @@ def test_pushforward_stays_within_memory():
         with checked_memory() as checked:
             own.refresh([(episodes[i], i) for i in starts])
         last = max(i for i, (name, _) in enumerate(checked.launches) if name == "mark_cells")
-        frames.setdefault(own._scenes._rollout, set()).add(tuple(checked.launches[last:]))
+        frames.setdefault(own._scenes._stepper, set()).add(tuple(checked.launches[last:]))
         samples = [DeviceSample(episodes[i % 3], i, 7 * i + turn) for i in range(4)]
         mixed = [own.replaced(samples, 5 * turn + i) for i in range(3)]
         pool = {sample.episode for sample, _ in own._samples}

@@ -55,9 +55,9 @@ def assert_features(network, state, found):
 
 
 def test_cases_are_what_they_say():
-    """Among the cases some particles are within a surface's reach and some beyond; of the three scenes in free flight
-    one is not disturbed, one in part and one wholly."""
-    network, state = CASES["relative"].network(), CASES["relative"].state()
+    """Some particles are in contact with a wall and some are not; of the three scenes in free flight one is not
+    disturbed, one in part and one wholly."""
+    network, state = CASES["relative, four levels"].network(), CASES["relative, four levels"].state()
     columns = network.relative_features(state, network.grid(state, drawn(network, state)[0]))[0]
     contact = columns[:, 3 * (network.config.velocity_history - 1) + 3 * network.config.levels]
     assert contact.eq(0).any() and contact.ne(0).any()

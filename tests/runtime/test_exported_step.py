@@ -168,7 +168,7 @@ def test_a_package_that_is_cut_off_leaves_nothing(tmp_path, monkeypatch):
 def exported(folder, name, kind):
     """What the command writes of a small network, and beside it a scene and its arrays."""
     network = network_of(torch.float32, levels=2, message_passing_steps=1, **NETWORKS[name])
-    save_weights(folder / "w.safetensors", network, WeightsInfo(network.config, 60.0, CELL))
+    save_weights(folder / "w.safetensors", network, WeightsInfo(network.config, 60.0, CELL, step=network.step))
     shutil.copy(config_directory() / "example/ramp.obj", folder)
     (folder / "scene.yaml").write_text(SCENE)
     path = folder / "new" / ("step.onnx" if kind == "onnx" else "step.pt2")
