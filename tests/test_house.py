@@ -16,7 +16,7 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 27213,
+    "hgn": 27_215,
     "datagen": 8_340,
     "tools": 6_200,
     "tests": 27_900,
@@ -40,7 +40,7 @@ MANY_POSITIONAL_ARGUMENTS: dict[str, int] = {
 }
 
 HEADLESS = re.compile(r"(What|Of|Whether|That|Those|These|How|Which|Whose|Where)\b")
-HEADLESS_DOCSTRINGS = {"hgn": 27213, "datagen": 59, "tools": 0}
+HEADLESS_DOCSTRINGS = {"hgn": 27_215, "datagen": 59, "tools": 0}
 
 UNCOMMENTED: set[str] = {
     "MpmConfig.density_kg_m3",

@@ -78,6 +78,8 @@ class _Look:
 class TritonStepper:
     """Computes frames on one device. Without CUDA the same launches run one by one, in Triton's interpreter."""
 
+    live: int  # particles of the state; the buffers have more rows
+
     def __init__(
         self,
         network: HierarchicalGraphNetwork,
