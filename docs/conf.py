@@ -36,7 +36,12 @@ _INTERNAL = (
     "network.base.ParticleNetwork",
     "network.features.ParticleState",
 )
-_INTERNAL += ("runtime.torch_backend.Backend", "runtime.simulator.InitialState", "scene.episode.Episode")
+_INTERNAL += (
+    "step_config.StepConfig",
+    "runtime.torch_backend.Backend",
+    "runtime.simulator.InitialState",
+    "scene.episode.Episode",
+)
 nitpick_ignore = [("py:class", f"hgn.{name}") for name in _INTERNAL]
 autodoc_member_order = "bysource"
 autodoc_typehints = "signature"
