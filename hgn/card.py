@@ -107,11 +107,19 @@ def data_card(manifest: Manifest, name: str, licence: str) -> str:
         "materials": ", ".join(scene["materials"]),
         "gravity": _vector(scene["gravity"]),
         "made by": f"an import of {own['format']} files" if own else "HGN's solver",
+        **_reference_row(manifest.config.get("reference")),
         "configuration": manifest.config_hash[:12],
     }
     kind = "imported" if own else "EXPERIMENT"
     use = f"python -m hgn.train +experiment={kind} dataset.folder=hf://datasets/USER/NAME"
     return _page(metadata, name, "Trajectories of particles: WebDataset shards, a manifest and an index.", rows, use)
+
+
+def _reference_row(reference: dict[str, Any] | None) -> dict[str, str]:
+    if reference is None:
+        return {}
+    children = f"{reference['visible']} of {reference['particles_per_visible']} particles"
+    return {"simulated on": f"{reference['cells']} cells per unit; each particle is the {children}"}
 
 
 def _vector(value: Sequence[float]) -> str:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from hgn.scene.material import MATERIAL_NAME, MATERIALS, PAPER_MATERIALS
 from hgn.schema import (
@@ -205,6 +205,9 @@ class DatasetConfig:
     long_fraction: Fraction[float] = 0.0  # fraction of each split's episodes, evenly spread, that have long_frames
     long_frames: FrameCount = 300  # of a long episode
     frame_rate_hz: Positive[float] = 60.0  # frames per simulated second
+    # cells per unit of a finer grid that scenes are simulated on, with more particles; their episodes contain those of
+    # scene.cell_size only. null: the grid of scene.cell_size, which has 64 by default
+    reference_cells: OneOrMore | None = None
     seed: NonNegative[int] = 0  # of all scenes of the data set
     episodes_per_shard: Positive[int] = 8  # the first shards are smaller, so that training can start early
     workers: OneOrMore | None = None  # processes that simulate; null: one per GPU, or per two cores of a CPU
@@ -241,6 +244,39 @@ class DatagenConfig:
     scene: SceneConfig = field(default_factory=SceneConfig)
     mpm: MpmConfig = field(default_factory=MpmConfig)
     dataset: DatasetConfig = field(default_factory=DatasetConfig)
+
+    def __post_init__(self) -> None:
+        if self.reference_ratio == 1:
+            return
+        cells, visible, name = self.dataset.reference_cells, 1 / self.scene.cell_size, "dataset.reference_cells"
+        halves = 2 * self.reference_ratio
+        rule = f"a multiple of {visible / 2:g}, half of the visible grid's cells per unit, and at least {visible:g}"
+        require(halves > 2 and abs(halves - round(halves)) < 1e-6, name, rule, cells)
+        edges = [length / self.reference_cell_size for length in self.scene.domain_size]
+        whole = all(abs(edge - round(edge)) < 1e-3 for edge in edges)
+        require(whole, name, "such that domain_size is a whole number of its cells", cells)
+        step_s = self.mpm.fixed_time_step_s
+        require(step_s is None, "mpm.fixed_time_step_s", f"null with {name}, which chooses its own", step_s)
+
+    @property
+    def reference_cell_size(self) -> float:
+        """The cell size of the grid that scenes are simulated on."""
+        cells = self.dataset.reference_cells
+        return self.scene.cell_size if cells is None else 1 / cells
+
+    @property
+    def reference_ratio(self) -> float:
+        """The cell size of scenes, divided by that of the grid that they are simulated on."""
+        ratio = self.scene.cell_size / self.reference_cell_size
+        return 1.0 if abs(ratio - 1) < 1e-6 else ratio
+
+    @property
+    def reference(self) -> dict[str, Any] | None:
+        """What a data set records of a finer grid; None on the visible grid."""
+        if self.reference_ratio == 1:
+            return None
+        children = round(self.reference_ratio**3)
+        return {"cells": self.dataset.reference_cells, "particles_per_visible": children, "visible": "mean"}
 
 
 @dataclass(frozen=True)

@@ -16,12 +16,12 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 27_215,
-    "datagen": 8_340,
+    "hgn": 27_265,
+    "datagen": 8_515,
     "tools": 6_200,
-    "tests": 27_900,
+    "tests": 28_110,
 }
-SETTINGS = 257  # fields of the dataclasses behind the commands, *Config
+SETTINGS = 258  # fields of the dataclasses behind the commands, *Config
 
 LINES_OF_A_FILE = 450
 LONG_FILES = {

@@ -227,15 +227,17 @@ def _rasterise(triangle_F33: np.ndarray, box: _Box) -> tuple[np.ndarray, ...]:
     owner = np.full(box.count, -1, np.int64)
     centre = triangle_F33.mean(axis=1)
     radius = np.linalg.norm(triangle_F33 - centre[:, None], axis=2).max(axis=1)
+    normal = _face_normals(triangle_F33)
     centre_3F, corner_3F, normal_3F = (
-        np.ascontiguousarray(of_triangle.T) for of_triangle in (centre, triangle_F33[:, 0], _face_normals(triangle_F33))
+        np.ascontiguousarray(of_triangle.T) for of_triangle in (centre, triangle_F33[:, 0], normal)
     )
+    slab = np.full(len(triangle_F33), box.reach)
     # a triangle counts at a node only if its sphere comes nearer than the nearest centre of all
     bound = np.full(box.count, box.reach)
-    for node_3P, triangle in near_pairs(triangle_F33, box.reach, box.grid):
+    for node_3P, triangle in near_pairs(triangle_F33, normal, box.reach, slab, box.grid):
         np.minimum.at(bound, box.flat(node_3P), np.sqrt(square(node_3P - centre_3F.take(triangle, axis=1))))
     bound += 1e-9
-    for node_3P, triangle in near_pairs(triangle_F33, box.reach, box.grid):
+    for node_3P, triangle in near_pairs(triangle_F33, normal, box.reach, slab, box.grid):
         flat = box.flat(node_3P)
         height = dot(node_3P - corner_3F.take(triangle, axis=1), normal_3F.take(triangle, axis=1))
         reach = np.sqrt(square(node_3P - centre_3F.take(triangle, axis=1))) - radius[triangle]

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from hgn.schema import ConfigError, require
-from hgn.system.machine import available_cpus, writable_folder
+from hgn.system.machine import available_cpus, available_memory, writable_folder
 
 # Taichi aborts the process where HOME is not set, as in a system's service; a user without a name has none
 os.environ.setdefault("HOME", os.path.expanduser("~").replace("~", "/nonexistent"))  # noqa: PTH111
@@ -94,6 +94,17 @@ def _processors() -> int:
     if status != 0:
         raise ConfigError(f"device must be one that CUDA tells about, got error {status}; choose cpu")
     return count.value
+
+
+def memory_bytes(device: Device) -> int:
+    """Returns the size of the memory that the device simulates in."""
+    if device.kind == "cpu":
+        return available_memory()
+    size = ctypes.c_size_t()
+    status = cuda_driver().cuDeviceTotalMem_v2(ctypes.byref(size), 0)
+    if status != 0:
+        raise ConfigError(f"device must be one whose memory CUDA reports, got error {status}; choose cpu")
+    return size.value
 
 
 @functools.cache

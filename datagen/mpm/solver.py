@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator, Sequence
 import numpy as np
 
 from datagen.mpm.collider import Collider, build_collider
-from datagen.mpm.device import Device, initialise
+from datagen.mpm.device import Device, initialise, memory_bytes
 from datagen.mpm.grid_launch import GridLaunch
 from datagen.mpm.launch import Launch, SceneFailure, Simulated, fixed_substeps, no_counters, particle_bounds
 from datagen.mpm.team_launch import MAXIMUM_PARTICLES, BlocksApartError, Team, TeamLaunch
@@ -36,6 +36,7 @@ SHARED_PARTICLES = 8  # at least, of each of several
 LARGE_PARTICLES = 4096  # for each processor, from which on a scene's blocks are as large as those of many scenes
 WARM_SCENES = 16
 USUAL_PARTICLES = 4_000  # of a random scene
+PARTICLE_BYTES, NODE_BYTES = 340, 50  # of a launch's arrays
 CELL_TOLERANCE = 1e-3  # of a cell that a domain may be longer or shorter than whole cells
 
 __all__ = [
@@ -119,6 +120,7 @@ def simulate(
         moving = any(scene.moves for scene in batch[0])
         step_s = config.fixed_time_step_s
         require(not moving or step_s is None, "fixed_time_step_s", "null where obstacles move", step_s)
+        _require_memory(device, batch[0], node_counts)
         if moving or any(scene.emits for scene in batch[0]):
             team = Team(0)  # contacts that move are placed between launches, and particles enter there
         elif team is None:
@@ -254,6 +256,18 @@ def _shared_grid(scenes: Sequence[Scene], config: MpmConfig) -> tuple[int, int, 
         )
         counts.append(round(cells))
     return counts[0], counts[1], counts[2]
+
+
+def _require_memory(device: Device, scenes: Sequence[Scene], node_counts: tuple[int, int, int]) -> None:
+    particles, nodes = sum(scene.particle_count for scene in scenes), len(scenes) * math.prod(node_counts)
+    needed, memory = PARTICLE_BYTES * particles + NODE_BYTES * nodes, memory_bytes(device)
+    require(
+        needed <= memory,
+        "a batch",
+        f"such that its particles and nodes fit in the {device.kind}'s memory of {memory / 1e9:.3g} GB",
+        f"{needed / 1e9:.3g} GB for {particles} particles and {nodes} nodes of {len(scenes)} scenes",
+        "lower mpm.scenes_per_launch or dataset.reference_cells, or simulate fewer particles",
+    )
 
 
 def _require_sound(scene: Scene, index: int, low: np.ndarray, high: np.ndarray) -> None:

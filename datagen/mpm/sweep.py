@@ -17,6 +17,8 @@ from hgn.scene.distance import dot
 
 # cells: a node so near to a triangle is on the side that its normal points to, whatever the rounding
 ON_TRIANGLE = 1e-4
+SMALLEST_SLOPE = 1e-6  # of a normal along z; a plane that is steeper counts as this steep
+SLAB_MARGIN = 1e-2  # cells; more than that and rounding change
 COLUMNS_PER_CHUNK = 1 << 11  # of nodes along z, held at once: some 20,000 pairs, which stay in a core's cache
 
 
@@ -66,32 +68,43 @@ def build_sweep(triangle_F33: np.ndarray, obstacle_F: np.ndarray, sheets: int, s
 
 
 def near_slabs(triangle_F33: np.ndarray, reach: float, shape: tuple[int, ...]) -> Iterator[tuple[np.ndarray, ...]]:
-    """Chunks of (node, triangle index): the nodes whose cube of half side `reach` the triangle's box and plane meet."""
+    """Yields chunks of (node, triangle): nodes whose cube of half side `reach` meets a triangle's box and plane."""
     normal = np.cross(triangle_F33[:, 1] - triangle_F33[:, 0], triangle_F33[:, 2] - triangle_F33[:, 0])
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     slab = reach * np.abs(normal).sum(axis=1) + 1e-9
     normal_3F, corner_3F = np.ascontiguousarray(normal.T), np.ascontiguousarray(triangle_F33[:, 0].T)
-    for node_3P, owner in near_pairs(triangle_F33, reach, shape):
+    for node_3P, owner in near_pairs(triangle_F33, normal, reach, slab, shape):
         height = dot(node_3P - corner_3F.take(owner, axis=1), normal_3F.take(owner, axis=1))
         keep = np.flatnonzero(np.abs(height) <= slab[owner])
         yield node_3P.take(keep, axis=1), owner[keep]
 
 
-def near_pairs(triangle_F33: np.ndarray, band: float, shape: tuple[int, ...]) -> Iterator[tuple[np.ndarray, ...]]:
-    """Chunks of (node, triangle index), int64 [3, P] and [P]: the nodes in each triangle's box widened by `band` cells,
-    one triangle after another.
+def near_pairs(
+    triangle_F33: np.ndarray, normal_F3: np.ndarray, band: float, slab_F: np.ndarray, shape: tuple[int, ...]
+) -> Iterator[tuple[np.ndarray, ...]]:
+    """Yields chunks of (node, triangle index), int64 [3, P] and [P], one triangle after another.
+
+    The nodes lie in each triangle's box widened by `band` cells. Most that are more than `slab_F` cells from its plane
+    are left out: a large triangle's box has many more nodes than its surroundings.
     """
     low = np.clip(np.ceil(triangle_F33.min(axis=1) - band), 0, np.array(shape)).astype(np.int64)
     high = np.clip(np.floor(triangle_F33.max(axis=1) + band) + 1, 0, np.array(shape)).astype(np.int64)
     size = np.maximum(high - low, 0)
-    columns = size[:, 0] * size[:, 1]  # of nodes along z
+    columns = size[:, 0] * size[:, 1] * (size[:, 2] > 0)  # of nodes along z
     end = np.cumsum(columns)
+    # the slab meets a column at the plane's height there, and so far above and below
+    steep = np.where(np.abs(normal_F3[:, 2]) > SMALLEST_SLOPE, normal_F3[:, 2], SMALLEST_SLOPE)
+    half = (slab_F + SLAB_MARGIN) / np.abs(steep)
+    offset = (triangle_F33[:, 0] * normal_F3).sum(axis=1)
     total = int(end[-1]) if len(end) else 0
     for start in range(0, total, COLUMNS_PER_CHUNK):
         column = np.arange(start, min(start + COLUMNS_PER_CHUNK, total))
         owner = np.searchsorted(end, column, side="right")
-        place, size_y, height = column - (end - columns)[owner], size[owner, 1], size[owner, 2]
-        below = low[owner, 2] - (np.cumsum(height) - height)
-        of_column = np.stack([low[owner, 0] + place // size_y, low[owner, 1] + place % size_y, below, owner])
-        x, y, z, triangle = np.repeat(of_column, height, axis=1)
+        place, size_y = column - (end - columns)[owner], size[owner, 1]
+        x, y = low[owner, 0] + place // size_y, low[owner, 1] + place % size_y
+        middle = (offset[owner] - normal_F3[owner, 0] * x - normal_F3[owner, 1] * y) / steep[owner]
+        first = np.clip(np.ceil(middle - half[owner]), low[owner, 2], high[owner, 2]).astype(np.int64)
+        height = np.clip(np.floor(middle + half[owner]) + 1, first, high[owner, 2]).astype(np.int64) - first
+        below = first - (np.cumsum(height) - height)
+        x, y, z, triangle = np.repeat(np.stack([x, y, below, owner]), height, axis=1)
         yield np.stack([x, y, z + np.arange(len(z))]), triangle

@@ -13,6 +13,7 @@ from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
 
+from datagen.fine import scene_to_simulate, solver_to_use, visible_positions
 from datagen.pool.plan import SceneTask
 from datagen.pool.worker_plan import WorkerPlan
 from hgn.config import DatagenConfig
@@ -141,7 +142,7 @@ def make_scene(task: SceneTask, config: DatagenConfig, backend: Backend, with_gr
     try:
         scene = generate_scene(config.scene, task.seed)
         # built here, because in the solver the device would wait for one scene after another
-        collider = build_collider(scene, config.mpm.choices.collider_band_cells)
+        collider = build_collider(scene_to_simulate(scene, config), config.mpm.choices.collider_band_cells)
     except ConfigError as error:  # for example no room for the obstacles; another seed may fit
         return "failed", task.key, str(error)
     made = MadeScene(task, Parcel(scene), None, Parcel(collider))
@@ -179,8 +180,8 @@ def simulate_batch(
     for frames in sorted(set(lengths)):
         launch = [made for made, length in zip(batch, lengths, strict=True) if length == frames]
         of_launch = simulate(
-            [made.scene.open() for made in launch],
-            config.mpm,
+            [scene_to_simulate(made.scene.open(), config) for made in launch],
+            solver_to_use(config),
             frames,
             config.dataset.frame_rate_hz,
             on_frame=reporter and reporter(len(launch)),
@@ -200,12 +201,13 @@ def failure_of(result: Any) -> str | None:
 
 
 def make_episode(made: MadeScene, result: Any, config: DatagenConfig, config_hash: str) -> Episode:
-    """Returns the episode of a scene with its grid and the solver's result (`position_TN3`, `counters`)."""
+    """Returns the episode of a scene's particles with its grid and the solver's result (`position_TN3`, `counters`)."""
     assert made.obstacle_grid is not None
-    scene = made.scene.open()
+    scene, reference = made.scene.open(), config.reference
+    position_TN3 = visible_positions(result.position_TN3, scene.particle_count)
     return Episode(
         key=made.task.key,
-        position_TN3=np.ascontiguousarray(result.position_TN3, np.float32),
+        position_TN3=np.ascontiguousarray(position_TN3, np.float32),
         initial_velocity_N3=scene.velocity_N3,
         material_N=scene.material_N,
         obstacle_grid=made.obstacle_grid,
@@ -223,7 +225,8 @@ def make_episode(made: MadeScene, result: Any, config: DatagenConfig, config_has
             "particles_per_cell": scene.particles_per_cell,
             "counters": dict(result.counters),
             "dataset": {"config_hash": config_hash, "attempt": made.task.attempt},
-        },
+        }
+        | ({} if reference is None else {"reference": reference}),
     )
 
 

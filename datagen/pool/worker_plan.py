@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from hgn.config import DatagenConfig
+from hgn.schema import require
 
 GPU_SCENES_PER_LAUNCH = 416  # several for each thread-block team
 GPU_NODES_PER_LAUNCH = 832 * 64**3  # grid nodes of all scenes, about 50 bytes each
@@ -65,9 +66,13 @@ def gpu_scenes_per_launch(config: DatagenConfig, memory_bytes: float) -> int:
     until they are published, would need more than half of it.
     """
     scene = config.scene
-    nodes = math.prod(math.ceil(length / scene.cell_size) for length in scene.domain_size)
+    nodes = math.prod(math.ceil(length / config.reference_cell_size) for length in scene.domain_size)
     particles = scene.group_count * scene.particles_per_cell * (scene.group_size / scene.cell_size) ** 3
+    particles *= config.reference["particles_per_visible"] if config.reference else 1
     held = memory_bytes / 2 / (12 * config.dataset.most_frames * max(particles, 1))
+    gigabytes = f"{memory_bytes / 2e9 / max(held, 1e-9):.3g} GB of {memory_bytes / 2e9:.3g}"
+    rule = "such that the frames of a scene's particles fit in half of a worker's memory"
+    require(held >= 1 or not config.reference, "dataset.reference_cells", rule, gigabytes)
     return max(1, int(min(GPU_SCENES_PER_LAUNCH, GPU_NODES_PER_LAUNCH // nodes, held)))
 
 

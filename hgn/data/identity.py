@@ -28,7 +28,7 @@ _LATER_OPTIONS = (
 
 
 def dataset_identity(config: DatagenConfig) -> dict[str, Any]:
-    """Returns the mapping that defines the episodes: scene distribution, physics, frames, rate, seed, schema.
+    """Returns the mapping that defines the episodes: scenes, physics, frames, rate, seed, schema, a finer grid.
 
     Keys are those of the first release, so that the identity does not change. Mesh files count by their content.
     Raises: ConfigError for one that cannot be read.
@@ -43,7 +43,9 @@ def dataset_identity(config: DatagenConfig) -> dict[str, Any]:
     lengths: dict[str, float] = {"frames": config.dataset.frames}
     if config.dataset.long_fraction > 0:
         lengths |= {"long_fraction": config.dataset.long_fraction, "long_frames": config.dataset.long_frames}
+    reference = config.reference
     return {
+        **({} if reference is None else {"reference": reference}),
         "schema_version": SCHEMA_VERSION,
         "scene": scene | {"obstacle_shapes": named},
         "mpm": physics_settings(config),

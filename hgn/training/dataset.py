@@ -65,6 +65,8 @@ def _require_goes_with(config: TrainConfig, store: EpisodeStore, field: str) -> 
     require(network.relative or upright, field, "of dataset's gravity where network.inputs=absolute", folder)
     differences = identity_differences(stored["mpm"], physics_settings(config.datagen), "mpm")
     require(not differences, field, "of the same physics", f"{folder}, where {'; '.join(differences[:3])}")
+    reference, own = stored.get("reference"), config.datagen.reference
+    require(reference == own, field, f"of the same reference grid ({own or 'the visible one'})", reference)
 
 
 def wait_for_episodes(

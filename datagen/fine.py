@@ -1,0 +1,131 @@
+"""Simulates the scenes of a data set on a finer grid than the networks see, with more particles.
+
+Each particle of a scene, called visible, stands for the same number of fine particles, its children: one begins at its
+place, the others around it, with their mean there. So all fine particles have the same mass, and a scene's first frame,
+total mass, momentum and centre of mass do not depend on the grid. An episode contains the visible particles only: each
+is at the mean of its children.
+Shape legend: T frames, N visible particles, C children of each, M = N C fine particles, F triangles.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from hgn.config import DatagenConfig, MpmConfig
+from hgn.scene.distance import closest_points
+from hgn.scene.scene import Scene
+
+STREAM = 4  # of random numbers; hgn.scene.random_scene uses those before it
+SURFACE_FRACTION = 0.9  # of the distance to an obstacle's surface, at which children may begin
+RULES = ("mean", "child")
+
+
+def fine_scene(scene: Scene, cell_size: float, wall: float) -> Scene:
+    """Returns the scene with its particles' children, for a grid of `cell_size`; the scene itself on its own grid.
+
+    The number of children is the ratio of the cells' volumes, rounded. They fill the volume that a particle has at the
+    start, but cross neither the domain's walls, whose thickness is `wall`, nor the surface of an obstacle.
+    """
+    volume = (scene.cell_size / cell_size) ** 3
+    children = max(1, round(volume))
+    if abs(volume - 1) < 1e-6:
+        return scene
+    offset_NC3 = _offsets(scene, children, wall)
+    density = scene.particles_per_cell
+    return dataclasses.replace(
+        scene,
+        position_N3=(scene.position_N3[:, None] + offset_NC3).astype(np.float32).reshape(-1, 3),
+        velocity_N3=np.repeat(scene.velocity_N3, children, axis=0),
+        material_N=np.repeat(scene.material_N, children),
+        material_parameters={k: np.repeat(value_N, children) for k, value_N in scene.material_parameters.items()},
+        entry_s_N=None if scene.entry_s_N is None else np.repeat(scene.entry_s_N, children),
+        cell_size=cell_size,
+        particles_per_cell=None if density is None else density * children / volume,
+    )
+
+
+def wall_thickness(config: MpmConfig, cell_size: float) -> float:
+    """Returns where walls end: at the last of their nodes."""
+    return (config.wall_cells - 1) * cell_size
+
+
+def solver_on_grid(config: MpmConfig, cell_size: float, own_cell_size: float) -> MpmConfig:
+    """Returns the solver's settings for another cell size.
+
+    Walls end at the same place on a finer grid, at most a cell further out on a coarser one.
+    """
+    ratio = own_cell_size / cell_size
+    return dataclasses.replace(config, wall_cells=max(2, 1 + int((config.wall_cells - 1) * ratio + 1e-6)))
+
+
+def visible_positions(position_TM3: np.ndarray, visible: int, rule: str = RULES[0]) -> np.ndarray:
+    """Returns the positions of `visible` particles from those of all their children, float32 [T, N, 3].
+
+    Frame 0 is the visible particles' own, bitwise. With `rule` child the first child is followed instead of the mean.
+    """
+    children = position_TM3.shape[1] // max(visible, 1)
+    if children <= 1:
+        return position_TM3
+    child_TNC3 = position_TM3.reshape(len(position_TM3), visible, children, 3)
+    first_TN3 = child_TNC3[:, :, 0]
+    if rule == "child":
+        return np.ascontiguousarray(first_TN3)
+    total_TN3 = first_TN3.astype(np.float64)
+    for index in range(1, children):
+        total_TN3 += child_TNC3[:, :, index]
+    position_TN3 = (total_TN3 / children).astype(np.float32)
+    position_TN3[0] = first_TN3[0]
+    return position_TN3
+
+
+def scene_to_simulate(scene: Scene, config: DatagenConfig) -> Scene:
+    """Returns a scene of a data set as the solver simulates it."""
+    return fine_scene(scene, config.reference_cell_size, wall_thickness(config.mpm, scene.cell_size))
+
+
+def solver_to_use(config: DatagenConfig) -> MpmConfig:
+    """Returns the settings of the solver on the reference grid of a data set."""
+    return solver_on_grid(config.mpm, config.reference_cell_size, config.scene.cell_size)
+
+
+def _offsets(scene: Scene, children: int, wall: float) -> np.ndarray:
+    """Returns the children's offsets, float64 [N, C, 3]; the first is zero, and so is the mean."""
+    generator = np.random.Generator(np.random.PCG64([scene.seed, STREAM]))
+    # the cube that a particle fills; in single precision, because cubic roots differ between machines
+    edge = scene.cell_size / float(np.float32((scene.particles_per_cell or 8.0) ** (1 / 3)))
+    offset_NC3 = np.zeros((scene.particle_count, children, 3))
+    others_NC3 = offset_NC3[:, 1:]
+    if others_NC3.size == 0:
+        return offset_NC3
+    others_NC3[:] = edge * (generator.random(others_NC3.shape) - 0.5)
+    others_NC3 -= others_NC3.mean(axis=1, keepdims=True)
+    room_N3 = np.minimum(scene.position_N3 - wall, np.array(scene.domain_size) - wall - scene.position_N3)
+    reach_N3 = np.abs(others_NC3).max(axis=1)
+    offset_NC3 *= np.clip(room_N3 / np.maximum(reach_N3, 1e-12), 0.0, 1.0)[:, None]
+    reach_N = np.sqrt((offset_NC3**2).sum(axis=2).max(axis=1))
+    room_N = SURFACE_FRACTION * _surface_distances(scene, edge)
+    offset_NC3 *= np.clip(room_N / np.maximum(reach_N, 1e-12), 0.0, 1.0)[:, None, None]
+    return offset_NC3
+
+
+def _surface_distances(scene: Scene, reach: float) -> np.ndarray:
+    """Returns the particles' distances to obstacles in their first pose, float64 [N]; inf where beyond `reach`."""
+    distance_N = np.full(scene.particle_count, np.inf)
+    tree = cKDTree(scene.position_N3)
+    for obstacle in scene.obstacles:
+        vertex_V3 = np.asarray(obstacle.vertex_V3, np.float64)
+        if obstacle.motion is not None:
+            vertex_V3 = obstacle.motion.place(vertex_V3, 0.0)
+        corner_F33 = vertex_V3[obstacle.triangle_F3].reshape(-1, 3, 3)
+        centre_F3 = corner_F33.mean(axis=1)
+        radius_F = np.sqrt(((corner_F33 - centre_F3[:, None]) ** 2).sum(axis=2).max(axis=1, initial=0.0))
+        for corner_33, near in zip(corner_F33, tree.query_ball_point(centre_F3, radius_F + reach), strict=True):
+            if near:
+                point_P3 = scene.position_N3[near].astype(np.float64)
+                away_P3 = point_P3 - closest_points(point_P3, np.broadcast_to(corner_33, (len(near), 3, 3)))
+                distance_P = np.sqrt((away_P3**2).sum(axis=1))
+                distance_N[near] = np.minimum(distance_N[near], np.where(distance_P <= reach, distance_P, np.inf))
+    return distance_N

@@ -1,0 +1,209 @@
+"""Scenes simulated on a finer grid than their episodes show (dataset.reference_cells)."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import written_files
+from mpm_scenes import CELL, CONFIG, block, joined, particles, sheet, simulated
+from written_files import Recorder, hashes
+
+from datagen.fine import RULES, fine_scene, solver_on_grid, visible_positions
+from datagen.pool.local_workers import LocalWorkerFactory
+from datagen.pool.plan import scene_seed
+from datagen.pool.pool import Pool, Stopped
+from datagen.pool.worker_plan import WorkerPlan, gpu_scenes_per_launch
+from datagen.pool.writer import DatasetWriter
+from hgn.card import data_card
+from hgn.config import DatagenConfig, DatasetConfig, MpmConfig, SceneConfig
+from hgn.data.identity import dataset_identity
+from hgn.data.manifest import Manifest
+from hgn.data.reader import EpisodeStore
+from hgn.schema import ConfigError
+
+WALL = (CONFIG.wall_cells - 1) * CELL  # where walls end
+
+
+def drop():
+    """Water falling beside a snow cube."""
+    water = block(0, (0.25, 0.4, 0.3), (0.45, 0.6, 0.5), (0.5, 0, 0), particles_per_cell=8.0)
+    return joined(water, block(2, (0.6, 0.3, 0.4), (0.75, 0.45, 0.55), seed=1))
+
+
+def test_ratio_one_is_the_scene_itself():
+    """On its own grid nothing changes: scene, settings and positions are the same objects."""
+    scene = drop()
+    assert fine_scene(scene, CELL, WALL) is scene
+    assert solver_on_grid(CONFIG, CELL, CELL) == CONFIG
+    position = scene.position_N3[None]
+    assert visible_positions(position, scene.particle_count) is position
+
+
+@pytest.mark.parametrize(("ratio", "children"), [(1.5, 3), (2, 8), (3, 27)])
+def test_children_of_a_particle(ratio, children):
+    """Mass, momentum, centre of mass and density of a scene do not depend on the grid."""
+    scene = drop()
+    fine = fine_scene(scene, CELL / ratio, WALL)
+    assert fine.particle_count == children * scene.particle_count
+    assert fine.particles_per_cell == pytest.approx(8 * children / ratio**3)
+    child = fine.position_N3.reshape(-1, children, 3)
+    assert np.array_equal(child[:, 0], scene.position_N3)
+    assert np.abs(child.mean(axis=1, dtype=np.float64) - scene.position_N3).max() < 1e-7
+    assert 0.1 * CELL < np.abs(child - child[:, :1]).max() < 0.5 * CELL
+    assert np.array_equal(fine.velocity_N3.reshape(-1, children, 3)[:, -1], scene.velocity_N3)
+    assert np.array_equal(fine.material_N.reshape(-1, children)[:, -1], scene.material_N)
+
+
+def test_children_stay_clear_of_obstacles_and_walls():
+    """A child begins on its particle's side of a sheet and of the walls, with the same mean."""
+    height = 0.4
+    place = np.random.default_rng(0).uniform((WALL, 0.38, WALL), (WALL + 0.05, 0.42, WALL + 0.05), (400, 3))
+    place = place[np.abs(place[:, 1] - height) > 1e-4]
+    scene = particles(place, obstacles=(sheet(height),), particles_per_cell=8.0)
+    child = fine_scene(scene, CELL / 2, WALL).position_N3.reshape(-1, 8, 3)
+    assert (np.sign(child[:, :, 1] - height) == np.sign(scene.position_N3[:, None, 1] - height)).all()
+    assert child[:, :, [0, 2]].min() >= WALL - 1e-7
+    assert np.abs(child.mean(axis=1, dtype=np.float64) - scene.position_N3).max() < 1e-7
+
+
+def test_walls_are_at_the_same_place():
+    """The last node of a wall keeps its place on every finer grid that is allowed."""
+    for ratio in (1, 1.5, 2, 2.5, 3):
+        assert (solver_on_grid(MpmConfig(), 1 / (64 * ratio), 1 / 64).wall_cells - 1) / ratio == 2
+    assert [solver_on_grid(MpmConfig(), 1 / grid, 1 / 64).wall_cells for grid in (32, 48)] == [2, 2]
+
+
+def test_visible_particles_are_means_of_children():
+    """Positions of all frames are the children's means; with the rule child they are the first child's."""
+    generator = np.random.default_rng(0)
+    child = generator.random((4, 5, 3, 3)).astype(np.float32)
+    fine = child.reshape(4, 15, 3)
+    mean, first = (visible_positions(fine, 5, rule) for rule in RULES)
+    assert np.array_equal(mean[1:], child[1:].mean(axis=2, dtype=np.float64).astype(np.float32))
+    assert np.array_equal(mean[0], child[0, :, 0]) and np.array_equal(first, child[:, :, 0])
+    assert mean.dtype == first.dtype == np.float32
+    assert visible_positions(np.zeros((4, 0, 3), np.float32), 0).shape == (4, 0, 3)
+
+
+def refined(scene, ratio, frames=8):
+    """The fine trajectory and the visible one."""
+    fine = fine_scene(scene, CELL / ratio, WALL)
+    config = solver_on_grid(CONFIG, CELL / ratio, CELL)
+    (outcome,) = simulated([fine], config, frames)
+    return outcome.position_TN3, visible_positions(outcome.position_TN3, scene.particle_count)
+
+
+def test_a_simulation_keeps_momentum_and_centre_of_mass():
+    """Centre of mass and momentum of the visible particles are those of the fine ones in every frame."""
+    fine, visible = refined(drop(), 1.5)
+    one, other = (position.astype(np.float64).mean(axis=1) for position in (fine, visible))
+    assert np.abs(one[1:] - other[1:]).max() < 1e-7
+    assert np.abs(np.diff(one[1:], axis=0) - np.diff(other[1:], axis=0)).max() < 1e-7
+
+
+def test_free_fall_is_exact():
+    """Visible particles in free flight move by v t + g t² / 2."""
+    scene = block(2, (0.4, 0.4, 0.4), (0.55, 0.55, 0.55), (0.5, 0.5, 0.0), particles_per_cell=8.0)
+    time = np.arange(6)[:, None, None] / 60
+    path = scene.position_N3 + time * scene.velocity_N3 + 0.5 * time**2 * np.array(scene.gravity)
+    assert np.abs(refined(scene, 2, 6)[1] - path).max() < 2e-6
+
+
+def test_a_dam_break_converges():
+    """Two finer grids differ less from each other than the coarse grid from the finer of them."""
+    scene = block(0, (WALL,) * 3, (WALL + 0.25, WALL + 0.3, WALL + 0.2), particles_per_cell=8.0)
+    coarse, fine, finer = (refined(scene, ratio, 20)[1][-1] for ratio in (1, 1.5, 2))
+    assert np.square(fine - finer).sum(axis=1).mean() < np.square(coarse - finer).sum(axis=1).mean()
+
+
+def data_set(**dataset):
+    return DatagenConfig(dataset=DatasetConfig(**dataset))
+
+
+def test_identity_names_the_grid():
+    """The data set's identity has the grid and the rule; on the visible grid it is as without the setting."""
+    assert dataset_identity(data_set(reference_cells=64)) == dataset_identity(data_set())
+    named = dataset_identity(data_set(reference_cells=128))["reference"]
+    assert named == {"cells": 128, "particles_per_visible": 8, "visible": "mean"}
+    assert data_set(reference_cells=96).reference["particles_per_visible"] == 3
+    json.dumps(named)
+
+
+@pytest.mark.parametrize(
+    ("cells", "other", "cause"),
+    [
+        (100, {}, "multiple of 32"),
+        (32, {}, "at least 64"),
+        (96, {"scene": SceneConfig(domain_size=(1 + 1 / 64, 1, 1))}, "whole number of its cells"),
+        (128, {"mpm": MpmConfig(fixed_time_step_s=1e-4)}, "fixed_time_step_s must be null"),
+    ],
+)
+def test_grids_that_are_refused(cells, other, cause):
+    """A grid that is no multiple, coarser, cuts a cell, or has a fixed time step is refused in one line."""
+    with pytest.raises(ConfigError, match=cause) as error:
+        DatagenConfig(dataset=DatasetConfig(reference_cells=cells), **other)
+    assert "\n" not in str(error.value)
+
+
+def generated(config, backend, should_stop=lambda recorder: False):
+    recorder = Recorder()
+    with DatasetWriter(config, recorder.message) as writer:
+        factory = LocalWorkerFactory(config, backend, WorkerPlan(1, 1, 1, 1, 1))
+        Pool(writer, recorder, factory, lambda: should_stop(recorder)).run()
+    return Path(config.dataset.folder)
+
+
+def test_the_visible_grid_named_changes_no_byte(make_config, small_dataset, backend, threads):
+    """A data set with the visible grid as its reference has the same files as one without."""
+    config = make_config(reference_cells=64)
+    assert hashes(generated(config, backend)) == hashes(small_dataset)
+    assert Manifest.load(config.dataset.folder).config_hash == Manifest.load(small_dataset).config_hash
+
+
+def test_a_data_set_of_a_finer_grid(make_config, small_dataset, backend, threads):
+    """Episodes contain the visible particles, and name the grid like manifest and card. Another grid is refused."""
+    config = make_config(reference_cells=128)
+    folder = generated(config, backend)
+    for fine, coarse in zip(EpisodeStore(folder, "train"), EpisodeStore(small_dataset, "train"), strict=True):
+        assert np.array_equal(fine.position_TN3[0], coarse.position_TN3[0])
+        assert np.abs(fine.position_TN3 - coarse.position_TN3).max() < 1e-6  # free flight is the same on any grid
+        assert fine.solver["reference"] == config.reference and "reference" not in coarse.solver
+    manifest = Manifest.load(folder)
+    assert manifest.config["reference"] == config.reference
+    assert "128 cells per unit" in data_card(manifest, "name", "mit")
+    with pytest.raises(ConfigError, match="reference is"):
+        generated(make_config(), backend)
+
+
+def test_a_killed_generator_resumes(make_config, backend, control, tmp_path):
+    """A solver that is killed and a run that is stopped leave the same files as an undisturbed run."""
+    config = make_config(reference_cells=128, training_scenes=3)
+    (control / f"kill-{scene_seed(0, 'train', 1, 0)}").write_text("1")
+    with pytest.raises(Stopped):
+        generated(config, backend, lambda recorder: len(recorder.episodes) >= 4)
+    disturbed = hashes(generated(config, backend))
+    assert (
+        len(written_files.simulated(control)) <= 8
+    )  # six episodes, the one of the kill again, and the one in flight when it stopped
+    whole = make_config(folder=str(tmp_path / "whole"), reference_cells=128, training_scenes=3)
+    assert disturbed == hashes(generated(whole, backend))
+
+
+def test_launches_fit_in_memory():
+    """A finer grid makes launches smaller; where the frames of one scene need too much memory it is refused."""
+    sizes = [gpu_scenes_per_launch(data_set(reference_cells=cells), 1e13) for cells in (64, 128, 192)]
+    assert sizes == [416, 104, 30]
+    with pytest.raises(ConfigError, match="fit in half") as error:
+        gpu_scenes_per_launch(data_set(reference_cells=128), 1e8)
+    assert "\n" not in str(error.value)
+
+
+def test_more_particles_than_memory(monkeypatch):
+    """A batch that does not fit in the device's memory is refused before anything is allocated, in one line."""
+    from datagen.mpm import solver
+
+    monkeypatch.setattr(solver, "memory_bytes", lambda device: 200_000)
+    with pytest.raises(ConfigError, match=r"fit in the cpu's memory of 0\.0002 GB, got") as error:
+        simulated([drop()])
+    assert "\n" not in str(error.value) and "reference_cells" in str(error.value)
