@@ -152,9 +152,10 @@ class SceneConfig:
 class MpmConfig:
     """The MLS-MPM solver. The defaults correct Taichi Elements; conf/mpm/taichi_elements.yaml computes as it does."""
 
-    youngs_modulus_pa: Positive[float] = 1e6
+    youngs_modulus_pa: Positive[float] = 1e6  # stiffness of all materials; stiffer ones need shorter steps
+    # of all materials; water has the pressure of its Lame parameter lambda
     poisson_ratio: Annotated[float, Bound("in [0, 0.5)", lambda ratio: 0 <= ratio < 0.5)] = 0.2
-    density_kg_m3: Positive[float] = 1000.0
+    density_kg_m3: Positive[float] = 1000.0  # of all materials at the start
     # Friction angle of quartz sand at its critical state (Bolton 1986).
     sand_friction_angle_deg: Annotated[NonNegative[float], Bound("< 90", lambda angle: angle < 90)] = 33.0
     # Diameter of grains, which make friction grow with the rate of flow: mu(I) of Jop, Forterre and Pouliquen (2006).
@@ -162,8 +163,8 @@ class MpmConfig:
     # depend on the rate.
     sand_grain_diameter_m: NonNegative[float] = 0.0025
     snow_hardening: NonNegative[float] = 10.0  # exponent of the stiffness of compressed snow
-    snow_critical_compression: BelowOne[float] = 0.025  # elastic limits of snow's singular values
-    snow_critical_stretch: NonNegative[float] = 0.0045
+    snow_critical_compression: BelowOne[float] = 0.025  # snow is elastic down to singular values of 1 minus this
+    snow_critical_stretch: NonNegative[float] = 0.0045  # snow is elastic up to singular values of 1 plus this
     # Fraction of its tension that stretched water bears. 1 as in Taichi Elements.
     water_tension: AtMostOne[NonNegative[float]] = 1.0
     # Added to the viscosity of the grid, which is larger than that of real water.
@@ -174,7 +175,8 @@ class MpmConfig:
     fixed_time_step_s: Positive[float] | None = None  # null: each scene takes steps as long as its materials allow
     # Fraction of the stability limit dx sqrt(rho / (3 lambda + 2 mu)) of a single particle that adaptive steps use.
     stability_fraction: AtMostOne[Positive[float]] = 0.875
-    # Grid nodes at each face of the domain that stop outgoing motion.
+    # Grid nodes at each face of the domain that stop outgoing motion; a grid of other cells needs another number for
+    # walls in the same place.
     wall_cells: Annotated[int, Bound("at least 2, the reach of a particle", lambda count: count >= 2)] = 3
     device: DeviceName = "auto"  # cpu, cuda, or auto: cuda where there is a GPU
     scenes_per_launch: OneOrMore | None = None  # null: 1 on a CPU, 416 on a GPU
@@ -237,6 +239,16 @@ class DatasetConfig:
         return {"train": self.training_scenes, "validation": self.validation_scenes, "test": self.test_scenes}[split]
 
 
+@dataclass(frozen=True, kw_only=True)
+class SimulatorConfig:
+    """What the commands that simulate with a network compute on, and how."""
+
+    device: str = "auto"  # or cpu, cuda, cuda:1
+    # torch, triton (kernels in CUDA graphs), cpu (compiled C); auto: the fastest that runs
+    backend: BackendName = "auto"
+    precision: Precision = "tf32"  # of matrix products: fp32, tf32 (on a GPU), fp16 (backend triton)
+
+
 @dataclass(frozen=True)
 class DatagenConfig:
     """`python -m datagen`: everything that defines a data set."""
@@ -289,11 +301,11 @@ class NetworkConfig:
     message_passing_steps: FewLayers = 4  # M, in each of the 2 L - 1 blocks
     width: LayerSize = 128  # latent and hidden
     velocity_history: FewLayers = 5  # m
-    obstacle_features: bool = True
+    obstacle_features: bool = True  # inputs from the nearest obstacle; false: only for scenes without obstacles
     # absolute: velocities and wall distances, the paper's; relative: hgn.network.relative, where free motion and
     # gravity are exact
     inputs: Annotated[str, one_of("absolute", "relative")] = "absolute"
-    materials: tuple[MaterialName, ...] = PAPER_MATERIALS
+    materials: tuple[MaterialName, ...] = PAPER_MATERIALS  # each has an embedding of its own
     # 2: z is that of a plane; imported data alone have it
     dimensions: Annotated[int, Bound("2 or 3", lambda count: count in (2, 3))] = 3
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from hgn.command import run_command
-from hgn.config import DEFAULT_WEIGHTS, BackendName, Precision, Split
+from hgn.config import DEFAULT_WEIGHTS, SimulatorConfig, Split
 from hgn.data.fresh import set_record
 from hgn.data.reader import EpisodeStore, first_episodes
 from hgn.runtime.rollouts import RolloutResult, simulate_scenes
@@ -38,7 +38,7 @@ from hgn.training.errors import (
 
 
 @dataclass(frozen=True)
-class EvaluateConfig:
+class EvaluateConfig(SimulatorConfig):
     """`python -m hgn.evaluate`: one-step and rollout errors on a split of a data set."""
 
     data: str  # folder or URL of a data set
@@ -47,10 +47,6 @@ class EvaluateConfig:
     scenes: Positive[int] = 5  # the first of the split, by index
     frame_stride: Positive[int] = 1  # distance of the frames whose one-step errors are measured
     rollout_frames: NonNegative[int] = 300  # of each rollout; 0: no rollouts
-    particles_per_batch: Positive[int] = 32_768  # of one-step errors; more need more memory
-    device: str = "auto"  # or cpu, cuda, cuda:1
-    backend: BackendName = "auto"  # of the rollouts: torch, triton, cpu; auto: the fastest that runs
-    precision: Precision = "tf32"  # of matrix products: fp32, tf32, fp16 (rollouts of backend triton)
     json: FileName | None = None  # also write the figures to this file
 
     def __post_init__(self) -> None:
@@ -102,7 +98,7 @@ def one_step_rows(backend: Backend, episodes: list[Episode], config: EvaluateCon
     with bar("one-step errors", total=total, unit="frame") as progress:
 
         def counted() -> Any:
-            for batch in frame_batches(episodes, network, config.frame_stride, config.particles_per_batch):
+            for batch in frame_batches(episodes, network, config.frame_stride):
                 yield batch
                 progress.update(len(batch.particles_S))
 

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from hgn.command import run_command
-from hgn.config import DEFAULT_WEIGHTS, BackendName, Precision
+from hgn.config import DEFAULT_WEIGHTS, SimulatorConfig
 from hgn.runtime.simulator import Simulator
 from hgn.runtime.weights import shipped_weights
 from hgn.scene.rollout_file import read_rollout
@@ -29,7 +29,7 @@ CPU_WEIGHTS = "obstacles_small"  # M = 2: a viewer waits for each frame
 
 
 @dataclass(frozen=True)
-class PlayConfig:
+class PlayConfig(SimulatorConfig):
     """`python -m hgn.play`: a scene in the browser, live, or a rollout file."""
 
     weights: str | None = None  # a file or the name of shipped ones; null: mechanics on a GPU, else obstacles_small
@@ -42,9 +42,6 @@ class PlayConfig:
     browser: bool = True  # open the page in this machine's browser
     particles: Positive[int] = 40_000  # at most
     keep_mb: Positive[int] = 1024  # of past frames, to go back to and to save
-    device: str = "auto"  # or cpu, cuda, cuda:1, …
-    backend: BackendName = "auto"  # torch, triton (kernels in CUDA graphs), cpu (compiled C); auto: the fastest
-    precision: Precision = "tf32"  # of matrix products: fp32, tf32 (on a GPU), fp16 (backend triton)
 
     def __post_init__(self) -> None:
         require_bounds(self)

@@ -59,7 +59,7 @@ TRAIN_ANEW = "leave it out; weights with another value must be trained anew"
 
 
 # `section.key`; the section is the name of the dataclass without Config: network, mpm, scene, dataset, training,
-# train, evaluate, rollout, error_vs_time. Fixed values of `scene` and `mpm` stay in the identity of data sets.
+# train, evaluate, render, bench, scaling. Fixed values of `scene` and `mpm` stay in the identity of data sets.
 REMOVED: dict[str, Removed] = {
     "dataset.maximum_attempts": Removed(3),
     "dataset.ray_address": Removed(None, "set $RAY_ADDRESS"),
@@ -87,6 +87,10 @@ REMOVED: dict[str, Removed] = {
     "training.nodes": Removed(remedy="leave it out: the launcher starts processes on every machine"),
     "training.noise_weight_power": Removed(2.0),
     "training.quiet_weight": Removed(4.0),
+    "evaluate.particles_per_batch": Removed(32_768),
+    "bench.rounds": Removed(50, "set seconds for a shorter measurement"),
+    "scaling.rounds": Removed(20, "set seconds for a shorter measurement"),
+    "render.gif": Removed(True, "give a file that ends in .png as out for a picture without animation"),
     "render.fps": Removed(remedy="leave it out: animations play in real time"),
     "upload.follow": Removed(remedy="run the command again, as with watch -n 60: it copies what is new"),
     "upload.poll_s": Removed(remedy="run the command again, as with watch -n 60: it copies what is new"),

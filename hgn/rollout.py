@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from hgn.command import run_command
-from hgn.config import DEFAULT_WEIGHTS, BackendName, Precision, SceneConfig, require_rollout_name
+from hgn.config import DEFAULT_WEIGHTS, SceneConfig, SimulatorConfig, require_rollout_name
 from hgn.data.reader import find_episode
 from hgn.render.exchange import PLY_ENDING, USD_ENDINGS, require_exchange, save_rollout
 from hgn.render.pictures import animate, compare_picture, spread, write_picture
@@ -40,7 +40,7 @@ SAME_SPEED = 1e-5  # of it: velocities are stored in float32
 
 
 @dataclass(frozen=True)
-class RolloutConfig:
+class RolloutConfig(SimulatorConfig):
     """`python -m hgn.rollout`: simulates a random scene, a scene file, or an episode of a data set beside its truth."""
 
     weights: str = DEFAULT_WEIGHTS  # a file of python -m hgn.export, or the name of shipped weights
@@ -54,9 +54,6 @@ class RolloutConfig:
     data: str | None = None  # folder or URL of a data set, for episode
     episode: str | None = None  # an episode of data to simulate, for example validation-000000
     frames: FrameCount = 300  # frame 0 is the initial state
-    device: str = "auto"  # or cpu, cuda, cuda:1, …
-    backend: BackendName = "auto"  # torch, triton (kernels in CUDA graphs), cpu (compiled C); auto: the fastest
-    precision: Precision = "tf32"  # of matrix products: fp32, tf32 (on a GPU), fp16 (backend triton)
 
     def __post_init__(self) -> None:
         require_bounds(self)

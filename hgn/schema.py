@@ -144,9 +144,9 @@ def to_mapping(value: Any) -> Any:
 
 
 def default_mapping(cls: type) -> dict[str, Any]:
-    """Returns a dataclass's defaults as plain containers, with Hydra's `???` for required fields."""
+    """Returns a dataclass's defaults, inherited ones last, as plain containers, with Hydra's `???` where required."""
     result: dict[str, Any] = {}
-    for field in dataclasses.fields(cls):
+    for field in sorted(dataclasses.fields(cls), key=lambda field: field.name not in cls.__annotations__):
         if field.default is not dataclasses.MISSING:
             result[field.name] = to_mapping(field.default)
         elif field.default_factory is not dataclasses.MISSING:
@@ -159,6 +159,8 @@ def default_mapping(cls: type) -> dict[str, Any]:
 def field_comments(cls: type) -> dict[str, str]:
     """Returns the comment of each field of a dataclass: the lines above it, and the one beside it."""
     comments: dict[str, str] = {}
+    for base in filter(dataclasses.is_dataclass, cls.__bases__):
+        comments |= field_comments(base)
     above: list[str] = []
     for line in inspect.getsource(cls).splitlines():
         text = line.strip()

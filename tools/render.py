@@ -41,7 +41,6 @@ class RenderConfig:
     data: str | None = None  # folder of a data set, instead of rollout
     episode: str | None = None  # key of an episode of data, for example validation-000000
     frames: tuple[int, ...] | None = None  # of the PNG, for example [0,50,100]; null: four, evenly spaced
-    gif: bool = True  # false: a folder gets no animation
     every: OneOrMore = 3  # stride of the frames in the animation, which plays in real time
     size: int = 360  # width of a panel, pixels
 
@@ -89,8 +88,7 @@ def main(mapping: Mapping[str, Any]) -> int:
         raise ConfigError(f"out must be a folder or end in one of {endings}, got {config.out!r}")
     else:
         _write_png(config, versions, out / f"{versions.name}.png")
-        if config.gif:
-            _write_animation(config, versions, out / f"{versions.name}.gif")
+        _write_animation(config, versions, out / f"{versions.name}.gif")
         if versions.truth_TN3 is not None:
             path = out / f"{versions.name}_error.png"
             curve = error_curve(_errors(versions), rollout.frame_rate_hz)

@@ -7,6 +7,7 @@ import itertools
 import math
 import textwrap
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,14 @@ from hgn.system.provenance import provenance, without_folders
 
 PASS = "pass"  # result of a check; otherwise a sentence with the error and its bound
 EXIT_RED = 1
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReportConfig:
+    """The options that reports have in common."""
+
+    device: str = "auto"  # or cpu, cuda, cuda:1
+    json: str | None = None  # file for the rows; --json FILE does the same
 
 
 def meta_of(config: Any, device: torch.device | str = "cpu") -> dict[str, Any]:

@@ -34,14 +34,19 @@ def configuration_page() -> str:
 
 def fields_table(path: Path, name: str) -> str:
     """The fields of a dataclass in a file, in order: types, defaults, and the comments beside them."""
+    return "\n".join(["| field | type | default | what |", "|---|---|---|---|", *_rows(path, name)]) + "\n"
+
+
+def _rows(path: Path, name: str) -> list[str]:
+    """The rows of a dataclass: its own fields, then those that it inherits."""
     source = path.read_text(encoding="utf-8")
     lines, comments = source.splitlines(), _comments(source)
     (node,) = [n for n in ast.parse(source).body if isinstance(n, ast.ClassDef) and n.name == name]
-    rows = ["| field | type | default | what |", "|---|---|---|---|"]
-    for item in node.body:
-        if isinstance(item, ast.AnnAssign) and isinstance(item.target, ast.Name):
-            rows.append(_row(item, _comment_of(item, lines, comments)))
-    return "\n".join(rows) + "\n"
+    fields = [item for item in node.body if isinstance(item, ast.AnnAssign) and isinstance(item.target, ast.Name)]
+    rows = [_row(item, _comment_of(item, lines, comments)) for item in fields]
+    for base in map(ast.unparse, node.bases):
+        rows += _rows(CONFIG if base == "SimulatorConfig" else ROOT / "tools" / "report.py", base)
+    return rows
 
 
 def _row(item: ast.AnnAssign, comment: str) -> str:

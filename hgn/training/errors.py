@@ -96,7 +96,7 @@ def frame_batches(
     episodes: Sequence[Episode],
     network: ParticleNetwork,
     stride: int,
-    particles_per_batch: int,
+    particles_per_batch: int = PARTICLES_PER_BATCH,
     rank: int = 0,
     world_size: int = 1,
 ) -> Iterator[Batch]:

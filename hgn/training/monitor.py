@@ -23,7 +23,6 @@ from hgn.training.callbacks import Checkpoints, log
 from hgn.training.data_module import agreed_count
 from hgn.training.errors import (
     MONITORED_SCENES,
-    PARTICLES_PER_BATCH,
     REPORTED_FRAMES,
     SquaredError,
     baselines,
@@ -106,14 +105,8 @@ class Monitor(Callback):
         self, trainer: Trainer, module: TrainingModule, split: str, episodes: list[Episode]
     ) -> dict[str, float]:
         network = module.result
-        batches = frame_batches(
-            episodes,
-            network,
-            FRAME_STRIDE,
-            PARTICLES_PER_BATCH,
-            rank=trainer.global_rank,
-            world_size=trainer.world_size,
-        )
+        ranks = {"rank": trainer.global_rank, "world_size": trainer.world_size}
+        batches = frame_batches(episodes, network, FRAME_STRIDE, **ranks)
         backend = fastest_stepped(network, module.training_config.precision)
         predictors = {"network": network_predictor(backend)} | baselines(network)
         materials = network.config.materials

@@ -45,7 +45,7 @@ SETTINGS = {
     "hgn.rollout": ["frames=2", "device=cpu", "render=false"],
     "hgn.evaluate": ["rollout_frames=0", "device=cpu"],
     "hgn.train": [*SCENES, *TRAINING],
-    "tools.render": ["size=64", "gif=false"],
+    "tools.render": ["size=64"],
 }
 INSTALLS = {
     ". .venv/bin/activate": "tests/end_to_end/test_wheel.py",

@@ -27,7 +27,7 @@ from tools.timing import Timed, alternate, statistics
 CPU = torch.device("cpu")
 SMALL = {
     "particles": [60],
-    "rounds": 5,
+    "seconds": 1e-9,
     "network": {"width": 16, "levels": 2, "message_passing_steps": 1},
     "device": "cpu",
 }
@@ -167,7 +167,7 @@ def test_workloads():
 def test_json_option(tmp_path):
     """The command takes --json FILE as other tools do, beside overrides; without a name it says so."""
     path = tmp_path / "bench.json"
-    small = ["cases=[frame]", "particles=[30]", "rounds=5", "network.width=8", "network.levels=1", "device=cpu"]
+    small = ["cases=[frame]", "particles=[30]", "seconds=1e-9", "network.width=8", "network.levels=1", "device=cpu"]
     assert run_module("tools.bench", ["--json", str(path), *small]) == 0
     assert json.loads(path.read_text())["rows"][0]["case"] == "frame"
     assert _with_json_as_override(["a=1", "--json=b.json", "c=2"]) == ["a=1", "json=b.json", "c=2"]

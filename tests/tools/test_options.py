@@ -28,7 +28,7 @@ GIVEN = {  # what each must be given
         (BenchConfig, {"cases": ["frames"]}, "cases[0] must be one of frame, torch_frame"),
         (BenchConfig, {"particles": [0]}, "particles[0] must be at least 1"),
         (BenchConfig, {"precisions": ["fp8"]}, "precisions[0] must be one of fp32, tf32, fp16"),
-        (BenchConfig, {"rounds": 0}, "rounds must be a finite number > 0"),
+        (BenchConfig, {"seconds": 0}, "seconds must be a finite number > 0"),
         (
             BenchConfig,
             {"cases": ["public_gns_train"]},

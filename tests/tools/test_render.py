@@ -58,12 +58,6 @@ def test_single_file(tmp_path, ending):
         assert picture.format == ending.upper()
 
 
-def test_no_gif(tmp_path):
-    """gif=false leaves the animation out."""
-    main({"rollout": str(rollout_file(tmp_path, False)), "out": str(tmp_path / "p"), "size": 80, "gif": False})
-    assert [entry.name for entry in (tmp_path / "p").iterdir()] == ["fall.png"]
-
-
 def test_episode_of_a_data_set(tmp_path, make_dataset, make_config):
     """An episode is drawn without a rollout; a key that is not there is answered with those that are."""
     folder = make_dataset(make_config(training_scenes=1, validation_scenes=2, test_scenes=1))

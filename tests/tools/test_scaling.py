@@ -21,7 +21,7 @@ SMALL: dict[str, Any] = {
     "particles": 40,
     "scenes": 2,
     "batches": 2,
-    "rounds": 3,
+    "seconds": 1e-9,
     "network": {"width": 16, "levels": 2, "message_passing_steps": 1},
     "device": "cpu",
 }

@@ -31,6 +31,7 @@ from tools.timing import GpuMemory, Timed, alternate, free, matmul_precision, st
 GPU_PARTICLES, GPU_SCENES = (TILE_PARTICLES, 40_000, 400_000), (1, 8, 32)
 CPU_PARTICLES, CPU_SCENES = (TILE_PARTICLES,), (1,)
 OUT_OF_MEMORY = "out of memory"
+ROUNDS = 50  # samples of a contender
 Row = dict[str, Any]
 
 
@@ -75,7 +76,7 @@ def group_rows(
         prepared = [_prepare(config, device, precision, case, work) for case in cases]
         ready = [(row, contender) for row, contender in prepared if contender is not None]
         end = time.monotonic() + config.seconds
-        times = alternate([contender for _, contender in ready], config.rounds, lambda: time.monotonic() > end)
+        times = alternate([contender for _, contender in ready], ROUNDS, lambda: time.monotonic() > end)
     for (row, contender), milliseconds in zip(ready, times, strict=True):
         if contender.failure is not None:
             row["check"] = contender.failure

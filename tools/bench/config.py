@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, replace
 
 from hgn.config import PRECISIONS, NetworkConfig
 from hgn.schema import OneOrMore, Positive, require, require_bounds
+from tools.report import ReportConfig
 
 FRAME_CASES = ("frame", "torch_frame", "gns_frame", "public_gns_frame", "mpm_frame")
 TRAIN_CASES = ("train", "torch_train", "gns_train", "public_gns_train")
@@ -13,7 +14,7 @@ CASES = (*FRAME_CASES, *TRAIN_CASES)
 
 
 @dataclass(frozen=True)
-class BenchConfig:
+class BenchConfig(ReportConfig):
     """The options of `python -m tools.bench`."""
 
     # frame, train (the fastest backend), torch_frame, torch_train, gns_frame, gns_train, public_gns_frame,
@@ -26,10 +27,8 @@ class BenchConfig:
     precisions: tuple[str, ...] | None = None
     network: NetworkConfig = field(default_factory=NetworkConfig)  # GNS has its width, and 10 steps
     public_gns: str | None = None  # a folder with a copy of github.com/geoelements/gns, which needs PyTorch Geometric
-    rounds: Positive[int] = 50  # samples of each contender
-    seconds: Positive[float] = 20.0  # time limit of contenders that take turns, after five rounds
-    device: str = "auto"  # or cpu, cuda, cuda:1
-    json: str | None = None  # file for the rows; --json FILE does the same
+    # after which contenders that take turns are sampled no more, but five times at least and 50 times at most
+    seconds: Positive[float] = 20.0
 
     def __post_init__(self) -> None:
         require_bounds(self)

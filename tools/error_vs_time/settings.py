@@ -8,15 +8,17 @@ from typing import Annotated
 
 from hgn.config import Precision, Split
 from hgn.schema import Bound, FrameCount, NonNegative, Positive, require, require_bounds
+from tools.report import ReportConfig
 
 UNTIMED = ("baseline", "chaos")  # systems without run times
 
 
 @dataclass(frozen=True)
-class ErrorVsTimeConfig:
+class ErrorVsTimeConfig(ReportConfig):
     """The options of `python -m tools.error_vs_time`."""
 
-    # writes OUT.json, OUT.png (error against run time), OUT_batched.png (side by side), OUT_frames.png (over frames)
+    # writes OUT.json (or the file `json`), OUT.png (error against run time), OUT_batched.png (side by side) and
+    # OUT_frames.png (over frames)
     out: str
     # data set whose scenes the solver simulates again with a finer step, as the reference; null: draws `earlier` again
     data: str | None = None
@@ -36,8 +38,6 @@ class ErrorVsTimeConfig:
     perturbation: NonNegative[float] = 1e-6
     times_last: bool = False  # true: measures all errors before all run times, on a device that is shared until then
     seconds: Positive[float] | None = None  # time limit, after which no measurement starts; null: none
-    device: str = "auto"  # or cpu, cuda, cuda:1
-    json: str | None = None  # another name for OUT.json; --json FILE does the same
 
     def __post_init__(self) -> None:
         require_bounds(self)

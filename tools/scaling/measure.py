@@ -38,19 +38,20 @@ from hgn.training.updates import build_optimizer
 from tools.bench.contenders import bench_network
 from tools.bench.states import Workload, batch_of_scenes
 from tools.bench.triton_contenders import device_samples, triton_updates
-from tools.report import PASS
+from tools.report import PASS, ReportConfig
 from tools.timing import Timed, alternate, statistics
 
 # Relative error of the averaged gradients. Larger than rounding: the order of sums on a GPU varies, which flips
 # activations next to their kink, and TF32 amplifies it.
 GRADIENT_BOUND = 2e-2
 WARM_UPDATES = 3
+ROUNDS = 20  # samples of a contender
 SPREAD = 0.17  # standard deviation of a scene's particles, as a fraction of the mean, in the paper's random scenes
 PATIENCE = datetime.timedelta(minutes=2)
 
 
 @dataclass(frozen=True)
-class ScalingConfig:
+class ScalingConfig(ReportConfig):
     """The options of `python -m tools.scaling`."""
 
     devices: OneOrMore | None = None  # largest number; null: all GPUs, or two processes on a CPU
@@ -60,10 +61,8 @@ class ScalingConfig:
     backends: tuple[str, ...] = ("torch", "triton")  # of training; triton is skipped without GPUs
     precision: Precision = "tf32"  # or fp32, fp16 (backend triton; backend torch then takes tf32)
     network: NetworkConfig = field(default_factory=NetworkConfig)  # that is trained
-    rounds: Positive[int] = 20  # samples of each contender
-    seconds: Positive[float] = 30.0  # time limit of all contenders, after five rounds
-    device: str = "auto"  # or cpu, cuda
-    json: str | None = None  # file for the rows; --json FILE does the same
+    # after which contenders are sampled no more, but five times at least and 20 times at most
+    seconds: Positive[float] = 30.0
 
     def __post_init__(self) -> None:
         require_bounds(self)
@@ -217,7 +216,7 @@ def measure(rank: int, count: int, config: ScalingConfig, device_type: str, fold
         for contender in contenders:
             _prepare(contender, config, rank, groups, device)
         ready = [contender for contender in contenders if contender.check == PASS]
-        for contender, times in zip(ready, alternate(ready, config.rounds, _until(config.seconds)), strict=True):
+        for contender, times in zip(ready, alternate(ready, ROUNDS, _until(config.seconds)), strict=True):
             contender.milliseconds = times
         for contender in contenders:
             _check_weights(contender, groups, rank)

@@ -19,7 +19,7 @@ import torch
 from PIL import Image
 
 from hgn.command import run_command
-from hgn.config import DEFAULT_WEIGHTS, BackendName, MpmConfig, Precision, SceneConfig
+from hgn.config import DEFAULT_WEIGHTS, MpmConfig, Precision, SceneConfig, SimulatorConfig
 from hgn.render.pictures import compare_picture, spread, stacked, write_picture
 from hgn.runtime.rollouts import RolloutResult, simulate_scenes
 from hgn.runtime.simulator import InitialState, Simulator
@@ -44,7 +44,7 @@ ON_THE_FLOOR = 0.04  # times the height of a particle in the middle: 0.02 domain
 
 
 @dataclass(frozen=True)
-class StabilityNetworkConfig:
+class StabilityNetworkConfig(SimulatorConfig):
     """The options of `python -m tools.stability network`."""
 
     weights: str = DEFAULT_WEIGHTS  # a file of python -m hgn.export, or the name of shipped weights
@@ -57,9 +57,6 @@ class StabilityNetworkConfig:
     solver: bool = True
     mpm: MpmConfig = field(default_factory=MpmConfig)  # the solver; its sand must be that of the network's data
     scene: SceneConfig = field(default_factory=SceneConfig)  # the scenes of the training
-    backend: BackendName = "auto"  # torch, triton, cpu; auto: the fastest that runs
-    precision: Precision = "tf32"  # of matrix products: fp32, tf32 (on a GPU), fp16 (backend triton)
-    device: str = "auto"  # or cpu, cuda, cuda:1
     picture: str | None = None  # a PNG that shows the first scene of each case
     json: str | None = None  # file for the rows; --json FILE does the same
 

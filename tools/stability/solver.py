@@ -13,9 +13,9 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any
 
-from hgn.config import DeviceName, MpmConfig
+from hgn.config import MpmConfig
 from hgn.schema import from_mapping, one_of, require, require_bounds, to_mapping
-from tools.report import meta_of
+from tools.report import ReportConfig, meta_of
 from tools.stability.row import Report, Row, table
 from tools.stability.solver_contact import contacts
 from tools.stability.solver_leak import leaks
@@ -31,17 +31,15 @@ NAMES = ("steps", *CASES, "grid")
 
 
 @dataclass(frozen=True)
-class StabilitySolverConfig:
+class StabilitySolverConfig(ReportConfig):
     """The options of `python -m tools.stability solver`."""
 
     # steps, stiffness, impact, convergence, contact, leak, long, rest, dam, column, repose, grid; null: all
     cases: tuple[Annotated[str, one_of(*NAMES)], ...] | None = None
-    device: DeviceName = "auto"  # cpu or cuda; auto: cuda where there is a GPU
     # resolutions of the case grid: cells in the width of dams, the radius of columns and the side of blocks. A domain
     # is about four times as wide; 32 cells need a GPU
     grid_cells: tuple[int, ...] = (8, 12, 16)
     picture: str | None = None  # a PNG with stable and unstable steps and the formula
-    json: str | None = None  # file for the rows; --json FILE does the same
 
     def __post_init__(self) -> None:
         require_bounds(self)
