@@ -119,10 +119,10 @@ def export(checkpoint_path: Path, out: Path, stored_precision: str = "fp32", **s
 
     checkpoint = read_checkpoint(checkpoint_path)
     network = network_of_checkpoint(checkpoint, checkpoint_path)
+    change_step(network, step_changes)
     data = data_of_checkpoint(checkpoint)
     info = WeightsInfo(
         network=network.config,
-        step=changed_step(network, step_changes),
         frame_rate_hz=data.frame_rate_hz,
         obstacle_cell_size=data.obstacle_cell_size,
         gravity=data.gravity,
@@ -140,16 +140,15 @@ def change(file: Path, out: Path, stored_precision: str = "fp32", **step_changes
     """
     network, info = load_weights(file)
     changed = {"file": file.name, "step": step_changes, "provenance": info.provenance}
-    step = changed_step(network, step_changes)
-    changed_info = replace(info, step=step, provenance=provenance() | {"changed": changed})
-    save_weights(out, network, changed_info, stored_precision)
+    change_step(network, step_changes)
+    save_weights(out, network, replace(info, provenance=provenance() | {"changed": changed}), stored_precision)
 
 
-def changed_step(network: ParticleNetwork, changes: dict[str, Any]) -> StepConfig:
-    """Returns the network's constraints with changes. Raises: ConfigError where the network cannot have them."""
+def change_step(network: ParticleNetwork, changes: dict[str, Any]) -> None:
+    """Changes the constraints of a network's frames. Raises: ConfigError where the network cannot have them."""
     step = replace(network.step, **changes)
     step.require_fits(network.config.relative, network.config.dimensions)
-    return step
+    network.step = step
 
 
 def write_arrays(folder: Path, state: ParticleState, corner_F33: np.ndarray) -> None:

@@ -6,7 +6,7 @@ Nothing in it is ever unpickled or executed. The structure travels as JSON in th
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -45,7 +45,11 @@ class WeightsInfo:
 
 
 def save_weights(path: Path, network: ParticleNetwork, info: WeightsInfo, stored_precision: str = "fp32") -> None:
-    """Writes the file atomically. With fp16 the parameters are rounded; the normaliser is not."""
+    """Writes the file atomically, with the network's own structure and constraints in place of those in `info`.
+
+    With fp16 the parameters are rounded; the normaliser is not.
+    """
+    info = replace(info, network=network.config, step=network.step)
     tensors = {}
     for name, tensor in network.state_dict().items():
         rounded = stored_precision == "fp16" and not name.startswith("normaliser.")

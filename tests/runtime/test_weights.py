@@ -1,6 +1,7 @@
 """Inference weights: what comes out is what went in, and every file that is not ours is refused."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -11,9 +12,11 @@ from safetensors.torch import save_file
 from training.runs import train_mapping
 
 from hgn import train
+from hgn.config import NetworkConfig
 from hgn.export import export
 from hgn.runtime.weights import WeightsInfo, load_weights, save_weights
 from hgn.schema import ConfigError
+from hgn.step_config import StepConfig
 from hgn.training.checkpoint import network_of_checkpoint, read_checkpoint
 
 STATE = random_state((70, 30), dtype=torch.float32)
@@ -72,10 +75,11 @@ def test_roundtrip_keeps_every_bit(weights):
 
 
 def test_same_network_same_bytes(weights, tmp_path):
-    """A file depends on nothing but the network and what is said of it."""
+    """A file depends on nothing but the network and its other metadata; structure and constraints are the network's."""
     network, info = load_weights(weights)
-    save_weights(tmp_path / "again.safetensors", network, info)
-    assert (tmp_path / "again.safetensors").read_bytes() == weights.read_bytes()
+    for given in (info, replace(info, step=StepConfig(obstacle_clearance=1e-3), network=NetworkConfig())):
+        save_weights(tmp_path / "again.safetensors", network, given)
+        assert (tmp_path / "again.safetensors").read_bytes() == weights.read_bytes()
 
 
 def test_half_precision(weights, tmp_path):
