@@ -18,7 +18,8 @@ from dataclasses import dataclass
 import torch
 
 from hgn.config import NetworkConfig
-from hgn.kernels.grid.op import ObstacleTable, Window
+from hgn.kernels.grid.op import Window
+from hgn.kernels.scene_tables import OBSTACLE_COLUMNS, SceneTable
 from hgn.kernels.triton_compat import Launches, build_launcher, noted_launches, preload, use_target
 from hgn.kernels.update.op import Updates, UpdateSettings
 from hgn.network.features import ParticleState
@@ -115,7 +116,7 @@ def _simulation_launches(
     """Those of a frame."""
     config, obstacles = network.config, None
     if config.obstacle_features:
-        obstacles = ObstacleTable([None] * scenes, obstacle_cell_size, torch.device(device))
+        obstacles = SceneTable([None] * scenes, OBSTACLE_COLUMNS, torch.device(device), obstacle_cell_size)
     state = ParticleState(
         config.cell_size * torch.arange(particles, device=device)[:, None].expand(-1, 3),  # apart: none is crowded
         torch.zeros(particles, config.velocity_history, 3, device=device),

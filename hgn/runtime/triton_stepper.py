@@ -16,9 +16,10 @@ import torch
 
 from hgn.kernels.capture import captured
 from hgn.kernels.forward import FusedNetwork, feature_columns
-from hgn.kernels.grid.op import OUT_OF_WINDOW, OVERFLOW, DeviceGrid, ObstacleTable, Window
+from hgn.kernels.grid.op import OUT_OF_WINDOW, OVERFLOW, DeviceGrid, Window
 from hgn.kernels.packing import pack_network
-from hgn.kernels.step.op import DIVERGED, BarrierTable, DeviceParticles, DeviceStep, rest_numbers
+from hgn.kernels.scene_tables import SceneTable
+from hgn.kernels.step.op import DIVERGED, DeviceParticles, DeviceStep, rest_numbers
 from hgn.kernels.tuning import Tuning
 from hgn.network.cell_keys import COORDINATE_LIMIT, pack
 from hgn.network.features import ParticleState
@@ -87,8 +88,8 @@ class TritonStepper:
         precision: str,
         capacities: tuple[int, ...] | None = None,
         capacity: int = 0,
-        obstacles: ObstacleTable | None = None,
-        barriers: BarrierTable | None = None,
+        obstacles: SceneTable | None = None,
+        barriers: SceneTable | None = None,
         step: StepConfig | None = None,
     ) -> None:
         """`capacities` are cells of each level to begin with.
@@ -121,10 +122,10 @@ class TritonStepper:
         )  # fmt: skip
         self.obstacles = obstacles
         if obstacles is None and state.obstacles is not None:
-            self.obstacles = ObstacleTable.of(state.obstacles, state.scene_count)
+            self.obstacles = SceneTable.of_obstacles(state.obstacles, state.scene_count)
         self.barriers = None
         if self.step_config.obstacle_clearance is not None:
-            self.barriers = barriers or BarrierTable.of(state.barriers, self.scenes, self.device)
+            self.barriers = barriers or SceneTable.of_barriers(state.barriers, self.scenes, self.device)
         affordable = PATH_BYTES // (2 * 3 * 4 * max(1, self.particles))
         self.look_frames = max(FEWEST_FRAMES, min(LOOK_FRAMES, affordable))
         self.path_TN3 = torch.zeros(2 * self.look_frames, self.particles, 3, device=self.device)
@@ -156,10 +157,10 @@ class TritonStepper:
         `new_obstacles` those of the state.
         """
         if new_obstacles and self.barriers is not None and not self.barriers.is_of(state.barriers):
-            self.barriers.take(BarrierTable.of(state.barriers, self.scenes, self.device))
+            self.barriers.take(SceneTable.of_barriers(state.barriers, self.scenes, self.device))
         if new_obstacles and state.obstacles is not None:
             assert self.obstacles is not None
-            self.obstacles.take(ObstacleTable.of(state.obstacles, state.scene_count))
+            self.obstacles.take(SceneTable.of_obstacles(state.obstacles, state.scene_count))
         self._fill(state)
         self.lost.zero_()
         self.grid.status.zero_()

@@ -15,8 +15,7 @@ from dataclasses import replace
 import torch
 
 from hgn.config import TrainingConfig
-from hgn.kernels.grid.op import ObstacleTable
-from hgn.kernels.step.op import BarrierTable
+from hgn.kernels.scene_tables import BARRIER_COLUMNS, OBSTACLE_COLUMNS, SceneTable
 from hgn.kernels.update.op import DeviceEpisode, DeviceSample
 from hgn.network.cell_keys import COORDINATE_BITS
 from hgn.network.features import ParticleState
@@ -94,15 +93,13 @@ class TritonScenes:
         """Returns a stepper at its start: the previous one if its buffers are large enough."""
         config, values = self._network.config, self.values
         device = values.device
-        table, empty = None, state.scene_count - len(episodes)
+        table, barriers, empty = None, None, [None] * (state.scene_count - len(episodes))
         if config.obstacle_features:
-            table = ObstacleTable(
-                [*(episode.obstacles for episode in episodes), *[None] * empty], self._obstacle_cell_size, device
-            )
-        barriers = None
+            hashes = [*(episode.obstacles for episode in episodes), *empty]
+            table = SceneTable(hashes, OBSTACLE_COLUMNS, device, self._obstacle_cell_size)
         step = self._network.step.in_training
         if step.obstacle_clearance is not None:
-            barriers = BarrierTable([*(episode.barrier for episode in episodes), *[None] * empty], device)
+            barriers = SceneTable([*(e.barrier for e in episodes), *empty], BARRIER_COLUMNS, device)
         stepper = self._stepper
         if stepper is not None and len(state.position_N3) <= stepper.particles:
             if table is not None:
@@ -153,7 +150,7 @@ class TritonScenes:
             # a hash has the keys of scene 0
             key_K = torch.cat([cells.key_K + (scene << 3 * COORDINATE_BITS) for scene, cells in seen])
             order_K = torch.argsort(key_K)
-            normal_K3 = torch.cat([cells.normal_K3 for _, cells in seen])[order_K]
+            normal_K3 = torch.cat([cells.value_K for _, cells in seen])[order_K]
             obstacles = ObstacleCells(key_K[order_K], normal_K3, self._obstacle_cell_size)
         return replace(
             state,

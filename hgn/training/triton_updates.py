@@ -17,8 +17,7 @@ import torch
 
 from hgn.config import TrainingConfig
 from hgn.data.episode_tensors import EpisodeChunk, EpisodeTensors
-from hgn.kernels.grid.op import ObstacleHash
-from hgn.kernels.step.op import BarrierHash
+from hgn.kernels.scene_tables import SceneHash
 from hgn.kernels.triton_compat import JitMisses
 from hgn.kernels.update.op import DeviceEpisode, DeviceSample, Updates, UpdateSettings
 from hgn.network.base import ParticleNetwork
@@ -147,8 +146,8 @@ class TritonUpdates:
             fits = free - position_TN3.nbytes > (1 - DATA_FRACTION) * total
             position_TN3 = position_TN3.to(self.device) if fits else position_TN3.pin_memory()
         cells, normals = episode.obstacle_cell_K3, episode.obstacle_normal_K3
-        obstacles = ObstacleHash.of(cells, normals).to(self.device) if len(cells) else None
-        barrier = BarrierHash.of(episode.barrier) if episode.barrier is not None else None
+        obstacles = SceneHash.of_obstacles(cells, normals).to(self.device) if len(cells) else None
+        barrier = SceneHash.of_barrier(episode.barrier) if episode.barrier is not None else None
         return DeviceEpisode(
             position_TN3,
             episode.material_N.to(self.device),

@@ -6,8 +6,9 @@ import torch
 
 from hgn.kernels.backward import FusedTrainingNetwork
 from hgn.kernels.forward import FusedNetwork, feature_columns
-from hgn.kernels.grid.op import DeviceGrid, ObstacleTable, Window
+from hgn.kernels.grid.op import DeviceGrid, Window
 from hgn.kernels.packing import pack_network
+from hgn.kernels.scene_tables import SceneTable
 from hgn.kernels.step.op import DeviceParticles, rest_numbers
 from hgn.kernels.tuning import Tuning
 
@@ -69,7 +70,9 @@ def prepare(engine, network, state, origin_S3):
     scene = padded(state.scene_N.int())
     material = padded(state.material_N.int())
     origin, domain, gravity = (x.float().to(where) for x in (origin_S3, state.domain_S3, state.gravity_S3))
-    obstacles = ObstacleTable.of(state.obstacles.to(where), state.scene_count) if state.obstacles is not None else None
+    obstacles = (
+        SceneTable.of_obstacles(state.obstacles.to(where), state.scene_count) if state.obstacles is not None else None
+    )
     grid.build(position, scene, origin, engine.particle_count)
     normaliser = network.normaliser
     grid.prepare(

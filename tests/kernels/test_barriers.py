@@ -9,7 +9,8 @@ from network.barrier_scenes import CELL, CLEARANCE, DOMAIN, ball, barriers_of, c
 from hgn.config import NetworkConfig
 from hgn.kernels.buffers import OUT
 from hgn.kernels.grid.op import DeviceGrid, Window
-from hgn.kernels.step.op import BarrierHash, BarrierTable, DeviceParticles, DeviceStep
+from hgn.kernels.scene_tables import BARRIER_COLUMNS, SceneHash, SceneTable
+from hgn.kernels.step.op import DeviceParticles, DeviceStep
 from hgn.network.features import ParticleState
 from hgn.scene.barrier import build_barrier
 from hgn.step.reference import advanced, first_stop
@@ -56,8 +57,8 @@ def integrated(state, way_N3, step, table):
 
 def table_of(*scenes):
     """Of the scenes' corners, each scene by itself."""
-    hashes = [BarrierHash.of(build_barrier(corner_F33, CELL, CLEARANCE, DOMAIN)) for corner_F33 in scenes]
-    return BarrierTable(hashes, device())
+    hashes = [SceneHash.of_barrier(build_barrier(corner_F33, CELL, CLEARANCE, DOMAIN)) for corner_F33 in scenes]
+    return SceneTable(hashes, BARRIER_COLUMNS, device())
 
 
 def on_device(barriers):
@@ -81,7 +82,7 @@ def test_ways_end_where_the_reference_ends_them(walls):
     corners[1] = NO_CORNERS
     scene_N = np.repeat(np.arange(3), [len(before_N3) for before_N3 in befores])
     before_N3, after_N3, barriers = np.concatenate(befores), np.concatenate(afters), on_device(barriers_of(*corners))
-    table = table_of(*corners) if walls is None else BarrierTable.of(barriers, 3, device())
+    table = table_of(*corners) if walls is None else SceneTable.of_barriers(barriers, 3, device())
     expected_N3, found_N3 = both(before_N3, after_N3, scene_N, barriers, table, walls)
     np.testing.assert_allclose(found_N3, expected_N3, rtol=0, atol=1e-6)
     for scene, corner_F33 in enumerate(corners):
@@ -127,11 +128,11 @@ def test_a_table_takes_the_rows_of_another():
     """In place: obstacles come where none were, others take their place, and go."""
     first, second = square((0.5,) * 3, 1), square((0.5, 0.4, 0.5), 1)
     before_N3, after_N3 = np.full((1, 3), (0.5, 0.6, 0.52)), np.full((1, 3), (0.5, 0.3, 0.52))
-    table = BarrierTable.of(None, 1, device())
-    address = table.row_S7.data_ptr()
+    table = SceneTable.of_barriers(None, 1, device())
+    address = table.row_SC.data_ptr()
     for corners, height in ((None, 0.3), ((first,), 0.501), ((second,), 0.401), (None, 0.3)):
         barriers = None if corners is None else on_device(barriers_of(*corners))
-        table.take(BarrierTable.of(barriers, 1, device()))
+        table.take(SceneTable.of_barriers(barriers, 1, device()))
         expected_N3, found_N3 = both(before_N3, after_N3, np.zeros(1, np.int64), barriers, table)
         assert found_N3[0] == pytest.approx((0.5, height, 0.52), abs=1e-6)
-        assert found_N3 == pytest.approx(expected_N3, abs=1e-6) and table.row_S7.data_ptr() == address
+        assert found_N3 == pytest.approx(expected_N3, abs=1e-6) and table.row_SC.data_ptr() == address

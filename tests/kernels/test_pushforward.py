@@ -16,9 +16,8 @@ from training.test_symmetry import scene_with_obstacles
 
 from hgn import train
 from hgn.data.episode_tensors import whole_episode
-from hgn.kernels.grid.op import ObstacleHash
 from hgn.kernels.packing import pack_network
-from hgn.kernels.step.op import BarrierHash
+from hgn.kernels.scene_tables import SceneHash
 from hgn.kernels.update.op import DeviceEpisode, DeviceSample
 from hgn.schema import ConfigError
 from hgn.training.checkpoint import read_checkpoint
@@ -38,8 +37,8 @@ def placed(made, network):
     barrier = None if clearance is None else simulated_barrier(made, clearance)
     whole, where = whole_episode(made, network.config, barrier), device()
     cells, normals = whole.obstacle_cell_K3, whole.obstacle_normal_K3
-    obstacles = ObstacleHash.of(cells, normals).to(where) if len(cells) else None
-    hashed = BarrierHash.of(whole.barrier) if whole.barrier is not None else None
+    obstacles = SceneHash.of_obstacles(cells, normals).to(where) if len(cells) else None
+    hashed = SceneHash.of_barrier(whole.barrier) if whole.barrier is not None else None
     position_TN3, material_N = whole.position_TN3.to(where), whole.material_N.to(where)
     scene = whole.domain_size, whole.gravity, whole.symmetries
     return DeviceEpisode(position_TN3, material_N, obstacles, *scene, hashed and hashed.to(where))

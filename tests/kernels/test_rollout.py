@@ -18,7 +18,7 @@ from runtime.scenes import random_scene
 
 from hgn.config import NetworkConfig
 from hgn.kernels.grid.op import DeviceGrid, Window
-from hgn.kernels.step.op import BarrierTable
+from hgn.kernels.scene_tables import SceneTable
 from hgn.network.features import ParticleState
 from hgn.network.hgn import HierarchicalGraphNetwork
 from hgn.runtime import triton_stepper
@@ -150,7 +150,7 @@ def test_obstacles_that_hold_change():
     for index in (0, 1, 2, 0):
         assert rollout.take(states[index])
         same(path_of(rollout, 2), paths[index])
-    given = BarrierTable.of(states[2].barriers, 1, device())
+    given = SceneTable.of_barriers(states[2].barriers, 1, device())
     rollout = TritonStepper(simulator.network, states[1], "fp32", barriers=given)
     same(path_of(rollout, 2), paths[2])
     rollout.begin(states[1])
@@ -164,8 +164,10 @@ def test_obstacles_that_hold_stay(monkeypatch):
         simulator.start([replace(scene(12), corners=partial(crossed, at))])
         for at in ((0.1, 0.1, 0.1), (0.08, 0.12, 0.1))
     )
-    hashed, real = [], BarrierTable.of
-    monkeypatch.setattr(BarrierTable, "of", lambda barriers, *rest: hashed.append(barriers) or real(barriers, *rest))
+    hashed, real = [], SceneTable.of_barriers
+    monkeypatch.setattr(
+        SceneTable, "of_barriers", lambda barriers, *rest: hashed.append(barriers) or real(barriers, *rest)
+    )
     rollout = TritonStepper(simulator.network, state, "fp32")
     for next_state in (state, replace(state, gravity_S3=2 * state.gravity_S3), other, other, state):
         assert rollout.take(next_state)

@@ -1,6 +1,6 @@
 """The device grid: capacities, buffers and launches of the grid kernels.
 
-Shape legend: N particles, C cells of a level, S scenes, L levels, K obstacle cells of all scenes.
+Shape legend: N particles, C cells of a level, S scenes, L levels.
 """
 
 from __future__ import annotations
@@ -14,14 +14,13 @@ import torch
 import triton
 
 from hgn.config import NetworkConfig
-from hgn.kernels import obstacles as obstacle_lookup
 from hgn.kernels.coarsest import kernel as coarsest_kernel
 from hgn.kernels.features import kernel as feature_kernel
 from hgn.kernels.grid import kernel
+from hgn.kernels.scene_tables import SceneTable
 from hgn.kernels.triton_compat import interpreting, overlaps
-from hgn.network.cell_keys import SCENE_LIMIT, in_buckets, unpack
+from hgn.network.cell_keys import SCENE_LIMIT
 from hgn.network.features import WALL_DISTANCE_CELLS
-from hgn.network.obstacles import ObstacleCells
 from hgn.network.relative import CONTACT_REACH_CELLS, FEW, OUTPUTS, QUIET, RARE
 
 MARK_BLOCK = 128
@@ -29,7 +28,6 @@ PARTICLE_BLOCK = 32
 FILL_BLOCK = 4096 if interpreting() else 512  # slots; the interpreter's time goes by programs
 SUMS = 16  # columns of what goes through the coarsest cells, as many as the decoder's padded output has
 MARGIN_CELLS = 4  # of a window, around what it must hold
-OBSTACLE_COLUMNS = obstacle_lookup.OBSTACLE_COLUMNS.value
 OVERFLOW, OUT_OF_WINDOW = kernel.OVERFLOW.value, kernel.OUT_OF_WINDOW.value
 
 
@@ -60,53 +58,6 @@ class Window:
     @property
     def slots(self) -> int:
         return math.prod(n + 2 for n in self.cells)
-
-
-@dataclass(frozen=True, eq=False)
-class ObstacleHash:
-    """One scene's obstacle cells in hash buckets: entries of bucket b are rows bucket_B[b] to bucket_B[b + 1]."""
-
-    bucket_B: torch.Tensor  # int32
-    key_K: torch.Tensor  # int64
-    normal_K3: torch.Tensor  # float32
-
-    @staticmethod
-    def of(cell_K3: torch.Tensor, normal_K3: torch.Tensor) -> ObstacleHash:
-        """Of cells int [K, 3] with normals [K, 3], on their device."""
-        bucket_B, key_K, order_K = in_buckets(cell_K3)
-        return ObstacleHash(bucket_B, key_K, normal_K3[order_K].float().contiguous())
-
-    def to(self, device: torch.device) -> ObstacleHash:
-        return ObstacleHash(self.bucket_B.to(device), self.key_K.to(device), self.normal_K3.to(device))
-
-    def row(self) -> list[int]:
-        """This scene's row of an obstacle table, the symmetry not set; valid as long as this object lives."""
-        pointers = [self.bucket_B.data_ptr(), self.key_K.data_ptr(), self.normal_K3.data_ptr()]
-        return [*pointers, len(self.bucket_B) - 2, 0]
-
-
-class ObstacleTable:
-    """The obstacles of the scenes of a batch, for the kernels; its rows may be rewritten on the device."""
-
-    def __init__(self, hashes: Sequence[ObstacleHash | None], cell_size: float, device: torch.device) -> None:
-        self._hashes = [entry.to(device) if entry is not None else None for entry in hashes]
-        rows = [entry.row() if entry is not None else [0] * OBSTACLE_COLUMNS for entry in self._hashes]
-        self.row_S5 = torch.tensor(rows, dtype=torch.int64, device=device)
-        self.cell_size = cell_size
-
-    def take(self, other: ObstacleTable) -> None:
-        """Makes its rows those of another table, in place."""
-        self.row_S5.copy_(other.row_S5)
-        self._hashes = other._hashes
-
-    @staticmethod
-    def of(cells: ObstacleCells, scenes: int) -> ObstacleTable:
-        """Of a batch's obstacle cells, on their device."""
-        scene_K, cell_K3 = unpack(cells.key_K)
-        counts = torch.bincount(scene_K, minlength=scenes).tolist()
-        parts = zip(cell_K3.split(counts), cells.normal_K3.split(counts), strict=True)
-        hashes = [ObstacleHash.of(cell, normal) if len(cell) else None for cell, normal in parts]
-        return ObstacleTable(hashes, cells.cell_size, cells.key_K.device)
 
 
 class DeviceGrid:
@@ -228,7 +179,7 @@ class DeviceGrid:
         count: torch.Tensor,
         mean_3: torch.Tensor,
         std_3: torch.Tensor,
-        obstacles: ObstacleTable | None,
+        obstacles: SceneTable | None,
         symmetry: bool = False,
     ) -> None:
         """Cells and features of every particle; without `obstacles` normals are zero, and nothing is looked up.
@@ -239,7 +190,7 @@ class DeviceGrid:
         blocks, overlap = (triton.cdiv(self.particles, PARTICLE_BLOCK),), overlaps()
         surfaces: dict[str, Any] = {
             "position": position, "velocity": velocity, "scene_of": scene_N, "domain": domain_S3,
-            "particle_count": count, "obstacle_table": obstacles.row_S5 if obstacles else count,
+            "particle_count": count, "obstacle_table": obstacles.row_SC if obstacles else count,
             "obstacle_cell_size": obstacles.cell_size if obstacles else 1.0, "features": self.feature_NF,
             "HISTORY": config.velocity_history, "NORMALS": int(config.obstacle_features),
             "OBSTACLES": config.obstacle_features and obstacles is not None, "SYMMETRY": symmetry,

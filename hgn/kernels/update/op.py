@@ -22,10 +22,10 @@ from hgn.config import CORRELATED_WAVELENGTHS, CORRELATED_WAVES, TrainingConfig
 from hgn.kernels.backward import FusedTrainingNetwork
 from hgn.kernels.capture import captured
 from hgn.kernels.forward import feature_columns
-from hgn.kernels.grid.op import OBSTACLE_COLUMNS, OUT_OF_WINDOW, DeviceGrid, ObstacleHash, ObstacleTable, Window
+from hgn.kernels.grid.op import OUT_OF_WINDOW, DeviceGrid, Window
 from hgn.kernels.muon.op import SquareBlocks
 from hgn.kernels.packing import pack_network
-from hgn.kernels.step.op import BarrierHash
+from hgn.kernels.scene_tables import OBSTACLE_COLUMNS, SceneHash, SceneTable
 from hgn.kernels.update import kernel
 from hgn.network.hgn import HierarchicalGraphNetwork
 from hgn.scene.symmetry import Symmetry, Vector, drawn_symmetry
@@ -48,11 +48,11 @@ class DeviceEpisode:
 
     position_TN3: torch.Tensor
     material_N: torch.Tensor  # int32, index into the network's materials
-    obstacles: ObstacleHash | None
+    obstacles: SceneHash | None
     domain_size: Vector
     gravity: Vector = (0.0, 0.0, 0.0)  # domain units per frame squared; for relative inputs alone
     symmetries: tuple[Symmetry, ...] = ()  # of which one is drawn for each sample, where that is asked
-    barrier: BarrierHash | None = None  # that its simulations hold by
+    barrier: SceneHash | None = None  # that its simulations hold by
 
     def __post_init__(self) -> None:
         position_TN3, material_N = self.position_TN3, self.material_N
@@ -156,9 +156,8 @@ class Updates:
         columns = 4 + 3 * self.config.velocity_history  # a wave's number and phase, its amplitude in each velocity
         self.waves_SKC = torch.zeros(scenes, CORRELATED_WAVES, columns, device=device)
         sees = self.config.obstacle_features
-        self.obstacles = ObstacleTable([None] * scenes, settings.obstacle_cell_size, device) if sees else None
-        none_S5 = torch.zeros(scenes, OBSTACLE_COLUMNS, dtype=torch.int64, device=device)
-        self._obstacle_row = self.obstacles.row_S5 if self.obstacles else none_S5
+        table = SceneTable([None] * scenes, OBSTACLE_COLUMNS, device, settings.obstacle_cell_size)
+        self.obstacles, self._obstacle_row = table if sees else None, table.row_SC
         self.velocity_mean, self.velocity_std = (x.float() for x in normaliser.feature_scale(self.config.relative))
         self.mean, self.std = normaliser.acceleration_mean.float(), normaliser.acceleration_std.float()
         self.capacities = capacities
