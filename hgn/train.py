@@ -21,7 +21,7 @@ from hgn.data.storage import is_remote
 from hgn.network.base import ParticleNetwork
 from hgn.schema import from_mapping
 from hgn.system.extras import require_installed
-from hgn.system.files import locked
+from hgn.system.locks import locked
 from hgn.system.processes import die_with_parent
 from hgn.training.checkpoint import (
     LAST_NAMES,

@@ -8,17 +8,15 @@ the locks of a process that ends, however it ends: no claim goes stale, and no c
 from __future__ import annotations
 
 import contextlib
-import errno
 import fcntl
 import os
-import struct
 from collections.abc import Iterator
 from pathlib import Path
 
 from datagen.pool.plan import ShardRange
 from hgn.data.manifest import SPLITS
 from hgn.schema import ConfigError
-from hgn.system.files import NO_LOCKS
+from hgn.system.locks import NO_LOCKS, lock_bytes
 
 LOCK_NAME = ".lock"
 _MANIFEST_BYTE, _GENERATORS_BYTE, _FIRST_EPISODE_BYTE = 0, 1, 2
@@ -86,24 +84,14 @@ class ShardLocks:
                 self._lock(fcntl.F_RDLCK, _GENERATORS_BYTE)
 
     def _lock(self, kind: int, start: int, length: int = 1, wait: bool = False, file: int | None = None) -> bool:
-        file = self._file if file is None else file
         try:
-            if hasattr(fcntl, "F_OFD_SETLK"):
-                # a lock of the open file, not of the process: two generators in one process exclude each other too
-                request = struct.pack("hhqqi4x", kind, os.SEEK_SET, start, length, 0)
-                fcntl.fcntl(file, fcntl.F_OFD_SETLKW if wait else fcntl.F_OFD_SETLK, request)
-            else:
-                flags = {fcntl.F_RDLCK: fcntl.LOCK_SH, fcntl.F_WRLCK: fcntl.LOCK_EX, fcntl.F_UNLCK: fcntl.LOCK_UN}
-                fcntl.lockf(file, flags[kind] | (0 if wait else fcntl.LOCK_NB), length, start)
+            return lock_bytes(self._file if file is None else file, kind, start, length, wait)
         except OSError as error:
-            if error.errno in (errno.EAGAIN, errno.EACCES) and not wait:
-                return False
-            if error.errno in NO_LOCKS:
-                raise ConfigError(
-                    f"{self._path} must lie on a file system with file locks, got {error.strerror}; {_REMEDY}"
-                ) from None
-            raise
-        return True
+            if error.errno not in NO_LOCKS:
+                raise
+            raise ConfigError(
+                f"{self._path} must lie on a file system with file locks, got {error.strerror}; {_REMEDY}"
+            ) from None
 
 
 def _bytes_of(shard: ShardRange) -> tuple[int, int]:

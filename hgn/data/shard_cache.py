@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import fcntl
 import math
 import os
 import sys
@@ -23,7 +22,8 @@ from typing import Protocol
 from hgn.data.verification import note_verified, verify_file
 from hgn.schema import ConfigError, require
 from hgn.system import patience
-from hgn.system.files import NO_LOCKS, TEMPORARY_SUFFIX, sync_folder
+from hgn.system.files import TEMPORARY_SUFFIX, sync_folder
+from hgn.system.locks import NO_LOCKS, lock_file
 from hgn.system.patience import UnreachableError
 
 CACHE_VARIABLE = "HGN_CACHE"
@@ -206,24 +206,21 @@ def _locked_partial(path: Path, url: str, patience_s: float) -> Iterator[Buffere
 def _lock(file: BufferedRandom, folder: Path, url: str, patience_s: float) -> None:
     """Locks a file; waits for another process as long as the file grows, since that process may have been stopped."""
     size, start = -1, time.monotonic()
-    while True:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            return
-        except BlockingIOError:
+    try:
+        while not lock_file(file):
             before, size = size, os.fstat(file.fileno()).st_size
             if before != size:
                 start = time.monotonic()
             if time.monotonic() - start >= patience_s or patience.without.is_set():
-                raise UnreachableError(url, patience_s, "another process is fetching it") from None
+                raise UnreachableError(url, patience_s, "another process is fetching it")
             patience.without.wait(_LOCK_PAUSE_S)
-        except OSError as error:
-            if error.errno not in NO_LOCKS:
-                raise
-            raise ConfigError(
-                f"{CACHE_VARIABLE} must name a folder on a file system with file locks, got {folder} "
-                f"({error.strerror}); take one of this machine's own disks"
-            ) from None
+    except OSError as error:
+        if error.errno not in NO_LOCKS:
+            raise
+        raise ConfigError(
+            f"{CACHE_VARIABLE} must name a folder on a file system with file locks, got {folder} "
+            f"({error.strerror}); take one of this machine's own disks"
+        ) from None
 
 
 def _open_file(name: str, flags: int) -> int:

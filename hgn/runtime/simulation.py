@@ -8,9 +8,9 @@ Shape legend: T frames, N particles of all scenes, A particles that enter, M vel
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from types import TracebackType
 from typing import Any, Protocol
 
@@ -44,6 +44,14 @@ class Stepper(Protocol):
         """Continues from another state. Returns False, and changes nothing, if the buffers do not fit it."""
 
 
+@dataclass(frozen=True, eq=False)
+class Entry:
+    """Particles that enter in a frame, behind all others."""
+
+    frame: int
+    state: ParticleState
+
+
 class Simulation:
     """Scenes that are simulated side by side. Use it as a context manager, or close it."""
 
@@ -52,13 +60,14 @@ class Simulation:
         stepper_of: Callable[[ParticleState], AbstractContextManager[Stepper]],
         state: ParticleState,
         isolate: bool = False,
+        entries: Sequence[Entry] = (),
     ) -> None:
-        """`stepper_of` allocates buffers and frees them on exit: Backend.stepper.
+        """`stepper_of` allocates buffers and frees them on exit: Backend.stepper. `entries` are sorted by frame.
 
         isolate: a scene that diverges ends, is entered in `ended`, and the others continue; otherwise the first
         divergence raises DivergedError. A scene beyond the range of the grid ends all.
         """
-        self.isolate, self.frame = isolate, 0
+        self.isolate, self.frame, self.entries = isolate, 0, list(entries)
         self.ended: dict[int, DivergedError] = {}
         self._stepper_of, self._buffers = stepper_of, ExitStack()
         self.stepper: Stepper | None = None
@@ -114,12 +123,14 @@ class Simulation:
     def run(self, frames: int, on_frame: Callable[[int], Any] | None = None) -> np.ndarray:
         """Returns positions of the next `frames` frames, float32 [T, N, 3]; calls `on_frame(number)` after each.
 
-        Positions of a scene that ended are NaN. Raises: DivergedError without `isolate`.
+        Positions are NaN in a scene that ended, and of particles before they enter. Raises: DivergedError without
+        `isolate`.
         """
-        position_TN3 = np.empty((frames, self._row_count, 3), np.float32)
         first, done = self.frame, 0
+        entering = [len(entry.state.position_N3) for entry in self.entries if entry.frame <= first + frames]
+        position_TN3 = np.full((frames, self._row_count + sum(entering), 3), np.nan, np.float32)
         for block_TN3 in self.blocks(frames):
-            position_TN3[done : done + len(block_TN3)] = on_host(block_TN3)
+            position_TN3[done : done + len(block_TN3), : block_TN3.shape[1]] = on_host(block_TN3)
             for _ in range(len(block_TN3)):
                 done += 1
                 if on_frame is not None:
@@ -127,11 +138,25 @@ class Simulation:
         return position_TN3
 
     def blocks(self, frames: int) -> Iterator[torch.Tensor]:
-        """Yields positions [T, N, 3] of the next `frames` frames on the device; otherwise as `run`.
+        """Yields positions [T, N, 3] of the next `frames` frames on the device, without particles that enter later;
+        otherwise as `run`.
 
         A block is valid until the next one is requested.
         """
         end = self.frame + frames
+        while self.entries and self.entries[0].frame <= end:
+            frame = self.entries[0].frame
+            yield from self._blocks(frame - 1)
+            entering = [entry.state for entry in self.entries if entry.frame == frame]
+            for block_TN3 in self._blocks(frame):
+                new = [state.position_N3.expand(len(block_TN3), -1, -1) for state in entering]
+                yield _finished(torch.cat([block_TN3, *new], dim=1))
+            del self.entries[: len(entering)]
+            for state in entering:
+                self.add(state)
+        yield from self._blocks(end)
+
+    def _blocks(self, end: int) -> Iterator[torch.Tensor]:
         while self.frame < end:
             if len(self.ended) == self._state.scene_count:
                 rest, self.frame = end - self.frame, end
@@ -200,9 +225,7 @@ class Simulation:
             return block_TN3
         whole_TN3 = block_TN3.new_full((len(block_TN3), self._row_count, 3), torch.nan)
         whole_TN3[:, self._row_N] = block_TN3
-        if whole_TN3.device.type == "cuda":
-            torch.cuda.current_stream().synchronize()  # `on_host` copies on another stream
-        return whole_TN3
+        return _finished(whole_TN3)
 
 
 @torch.inference_mode()
@@ -210,6 +233,13 @@ def selected(state: ParticleState, selected_N: torch.Tensor) -> ParticleState:
     """Returns a state with some of the particles; scenes keep their numbers."""
     some: dict[str, Any] = {name: getattr(state, name)[selected_N] for name in OF_PARTICLES}
     return replace(state, **some)
+
+
+def _finished(block_TN3: torch.Tensor) -> torch.Tensor:
+    """Waits until a block is computed, because `on_host` copies on another stream."""
+    if block_TN3.device.type == "cuda":
+        torch.cuda.current_stream().synchronize()
+    return block_TN3
 
 
 def on_host(block_TN3: torch.Tensor) -> np.ndarray:

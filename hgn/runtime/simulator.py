@@ -23,7 +23,7 @@ from hgn.network.obstacles import ObstacleCells
 from hgn.runtime.backend import build, choose, set_matmul_precision
 from hgn.runtime.differentiable import Inputs, Pose, simulate
 from hgn.runtime.divergence import DivergedError
-from hgn.runtime.simulation import Simulation, on_host
+from hgn.runtime.simulation import Entry, Simulation, on_host
 from hgn.runtime.torch_backend import Backend
 from hgn.runtime.torch_stepper import stepped
 from hgn.runtime.weights import WeightsInfo, find_weights, load_weights
@@ -117,14 +117,6 @@ class InitialState:
         """Returns the barrier of the obstacles. Raises: ConfigError for a clearance of more than a cell."""
         corner_F33 = np.zeros((0, 3, 3)) if self.corners is None else self.corners()
         return build_barrier(corner_F33, self.obstacle_grid.cell_size, clearance, self.domain_size)
-
-
-@dataclass(frozen=True, eq=False)
-class _Entry:
-    """Particles that enter a scene in one frame."""
-
-    frame: int
-    state: ParticleState
 
 
 class Simulator:
@@ -233,23 +225,14 @@ class Simulator:
         entries = [entry for entry in self._entries(states) if entry.frame < frames]
         state = self.start(states)
         scene_N = torch.cat([state.scene_N, *(entry.state.scene_N for entry in entries)]).cpu().numpy()
-        position_TN3 = np.full((frames, len(scene_N), 3), np.nan, np.float32)
-        with self.simulation(state, len(scene_N), isolate) as simulation:
-            end = len(state.position_N3)
-            position_TN3[0, :end] = state.position_N3.cpu().numpy()
-            for entry in [*entries, None]:
-                last = frames - 1 if entry is None else entry.frame
-                first = simulation.frame + 1
-                position_TN3[first : last + 1, :end] = simulation.run(last + 1 - first, on_frame)
-                if entry is not None:
-                    begin, end = end, end + len(entry.state.position_N3)
-                    position_TN3[last, begin:end] = entry.state.position_N3.cpu().numpy()
-                    simulation.add(entry.state)
-            if not entries:
-                return np.split(
-                    position_TN3, np.cumsum(np.bincount(scene_N, minlength=len(states)))[:-1], axis=1
-                ), simulation.ended
+        first_N3 = np.full((len(scene_N), 3), np.nan, np.float32)
+        first_N3[: len(state.position_N3)] = state.position_N3.cpu().numpy()
+        with self.simulation(state, len(scene_N), isolate, entries) as simulation:
+            position_TN3 = np.concatenate([first_N3[None], simulation.run(frames - 1, on_frame)])
+        if entries:
             return [position_TN3[:, scene_N == scene] for scene in range(len(states))], simulation.ended
+        ends = np.cumsum(np.bincount(scene_N, minlength=len(states)))[:-1]
+        return np.split(position_TN3, ends, axis=1), simulation.ended
 
     def frames(self, scene: InitialState | Scene) -> Iterator[np.ndarray]:
         """Yields positions float32 [N, 3] of frame after frame without end, the initial ones first.
@@ -262,22 +245,18 @@ class Simulator:
         state = self.start(states)
         yield state.position_N3.cpu().numpy()
         capacity = len(state.position_N3) + sum(len(entry.state.position_N3) for entry in entries)
-        with self.simulation(state, capacity) as simulation:
-            for entry in entries:
-                for _ in range(simulation.frame + 1, entry.frame):
-                    yield simulation.run(1)[0]
-                (before_N3,) = simulation.run(1)
-                yield np.concatenate([before_N3, entry.state.position_N3.cpu().numpy()])
-                simulation.add(entry.state)
+        with self.simulation(state, capacity, entries=entries) as simulation:
             for block_TN3 in simulation.blocks(sys.maxsize):
                 yield from on_host(block_TN3)
 
-    def simulation(self, state: ParticleState, capacity: int = 0, isolate: bool = False) -> Simulation:
+    def simulation(
+        self, state: ParticleState, capacity: int = 0, isolate: bool = False, entries: Sequence[Entry] = ()
+    ) -> Simulation:
         """Begins a simulation of a state; backend triton allocates buffers for `capacity` particles."""
-        return Simulation(functools.partial(self.backend.stepper, capacity=capacity), state, isolate)
+        return Simulation(functools.partial(self.backend.stepper, capacity=capacity), state, isolate, entries)
 
-    def _entries(self, states: Sequence[InitialState]) -> list[_Entry]:
-        """The particles that enter the scenes, by frame. Raises: ConfigError where an obstacle is in their way."""
+    def _entries(self, states: Sequence[InitialState]) -> list[Entry]:
+        """Returns the particles that enter the scenes, by frame. Raises: ConfigError for an obstacle in their way."""
         entries = []
         for number, state in enumerate(states):
             if state.emitting is None:
@@ -291,7 +270,7 @@ class Simulator:
                     name: getattr(entered, name)[new_N] for name in ("position_N3", "velocity_N3", "material_N")
                 }
                 new = self.start([replace(state, corners=None, **particles)])  # without barriers, which take long
-                entries.append(_Entry(frame, replace(new, scene_N=new.scene_N + number)))
+                entries.append(Entry(frame, replace(new, scene_N=new.scene_N + number)))
         return sorted(entries, key=lambda entry: entry.frame)
 
     def differentiable(

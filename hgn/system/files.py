@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import fcntl
 import json
 import os
 import secrets
@@ -12,11 +11,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from hgn.schema import ConfigError
-
 TEMPORARY_SUFFIX = ".partial"
 _LOST_AT_MOST = 10  # retries
-NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP, errno.EINVAL)  # of file systems without locks
 
 
 def temporary_path(path: Path) -> Path:
@@ -81,27 +77,6 @@ def write_json(path: Path | str, value: Any, allow_nan: bool = True) -> None:
     path = Path(path)
     make_folder(path.parent)
     write_atomically(path, json.dumps(value, indent=1, allow_nan=allow_nan).encode() + b"\n")
-
-
-@contextlib.contextmanager
-def locked(path: Path, field: str, refusal: str) -> Iterator[None]:
-    """Locks a file for this process; the kernel releases the lock when the process ends.
-
-    Raises: ConfigError `<field> must be ...`, with `refusal`, when another process has the lock. On a file system
-    without locks every process succeeds.
-    """
-    make_folder(path.parent)
-    with path.open("ab") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise ConfigError(
-                f"{field} must be a folder of its own, got {path.parent}: {refusal} another {field}=..."
-            ) from None
-        except OSError as error:
-            if error.errno not in NO_LOCKS:
-                raise
-        yield
 
 
 def require_place(path: Path) -> None:

@@ -24,7 +24,7 @@ from hgn.data.statistics import merge_statistics
 from hgn.export import export
 from hgn.runtime.rollouts import RolloutResult
 from hgn.schema import ConfigError, from_mapping
-from hgn.system.files import locked
+from hgn.system.locks import locked
 from hgn.training import gradients, monitor
 from hgn.training.callbacks import LogLines
 from hgn.training.checkpoint import LAST_NAMES, Progress, read_checkpoint

@@ -1,0 +1,66 @@
+"""File locks, of whole files and of bytes. The kernel releases the locks of a process that ends, however it ends."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import fcntl
+import os
+import struct
+from collections.abc import Iterator
+from pathlib import Path
+from typing import IO, Any
+
+from hgn.schema import ConfigError
+from hgn.system.files import make_folder
+
+NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP, errno.EINVAL)  # of file systems without locks
+
+
+def lock_file(file: IO[Any]) -> bool:
+    """Locks a file; returns False if another process has the lock. Raises: OSError with one of NO_LOCKS."""
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    return True
+
+
+def lock_bytes(file: int, kind: int, start: int, length: int = 1, wait: bool = False) -> bool:
+    """Locks bytes of an open file, which need not exist; returns False if others have them and it may not wait.
+
+    kind: fcntl.F_RDLCK (shared), F_WRLCK (alone) or F_UNLCK. Raises: OSError with one of NO_LOCKS.
+    """
+    try:
+        if hasattr(fcntl, "F_OFD_SETLK"):
+            # a lock of the open file, not of the process: two generators in one process exclude each other too
+            request = struct.pack("hhqqi4x", kind, os.SEEK_SET, start, length, 0)
+            fcntl.fcntl(file, fcntl.F_OFD_SETLKW if wait else fcntl.F_OFD_SETLK, request)
+        else:
+            flags = {fcntl.F_RDLCK: fcntl.LOCK_SH, fcntl.F_WRLCK: fcntl.LOCK_EX, fcntl.F_UNLCK: fcntl.LOCK_UN}
+            fcntl.lockf(file, flags[kind] | (0 if wait else fcntl.LOCK_NB), length, start)
+    except OSError as error:
+        if error.errno in (errno.EAGAIN, errno.EACCES) and not wait:
+            return False
+        raise
+    return True
+
+
+@contextlib.contextmanager
+def locked(path: Path, field: str, refusal: str) -> Iterator[None]:
+    """Locks a file for this process.
+
+    Raises: ConfigError `<field> must be ...`, with `refusal`, when another process has the lock. On a file system
+    without locks every process succeeds.
+    """
+    make_folder(path.parent)
+    with path.open("ab") as file:
+        try:
+            free = lock_file(file)
+        except OSError as error:
+            if error.errno not in NO_LOCKS:
+                raise
+            free = True
+        if not free:
+            raise ConfigError(f"{field} must be a folder of its own, got {path.parent}: {refusal} another {field}=...")
+        yield
