@@ -30,12 +30,6 @@ REMEDY = "take fewer at once, or backend torch"
 NONE = -1  # where a product has no bias
 
 
-def feature_columns(config: NetworkConfig) -> int:
-    """Columns of the encoder's input: features, one-hot material, padding to a power of two that matrix units take."""
-    used = config.feature_width - MATERIAL_EMBEDDING + len(config.materials)
-    return max(16, triton.next_power_of_2(used))
-
-
 def _require_room(grid: DeviceGrid, width: int, training: bool) -> None:
     """Raises: ConfigError where a tensor has more elements than int32 can count, but for edges without gradients."""
     pairs, edges = (8, 6) if training else (1, 1)

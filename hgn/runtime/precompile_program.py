@@ -72,7 +72,7 @@ def _update_launches(job: PrecompileJob, device: str) -> None:
         network = HierarchicalGraphNetwork(job.network)
     nothing = torch.zeros(5, device=device)
     reduce: Callable[[torch.Tensor], None] | None = (lambda _: None) if job.several_ranks else None
-    updates = Updates(network, job.settings, job.precision, nothing[:2], nothing, reduce)
+    updates = Updates(network, job.settings, job.precision, nothing[:2], counters=nothing, reduce=reduce)
     updates.average = torch.zeros_like(updates.values) if job.averages else None
     updates.allocate(job.particles, job.cells)
     updates.launches()
@@ -80,9 +80,8 @@ def _update_launches(job: PrecompileJob, device: str) -> None:
         fraction = scenes / job.settings.scenes
         particles = round(fraction * job.particles)
         capacities = first_capacities([round(fraction * cells) for cells in job.cells], particles)
-        cell_size = job.settings.obstacle_cell_size
         for step in dict.fromkeys((job.step.in_training, job.step)):
-            _simulation_launches(network, step, job.precision, scenes, particles, capacities, cell_size, device)
+            _simulation_launches(network, step, job.precision, capacities, scenes=scenes, particles=particles)
 
 
 def _frame_launches(
@@ -93,7 +92,7 @@ def _frame_launches(
         network = HierarchicalGraphNetwork(config)
     for particles, cells in sizes:
         capacities = tuple(max(1, cells >> 2 * level) for level in range(config.levels))
-        _simulation_launches(network, step, precision, 1, particles, capacities, 1.0, device)
+        _simulation_launches(network, step, precision, capacities, scenes=1, particles=particles)
 
 
 class _Unplaced(TritonStepper):
@@ -107,24 +106,24 @@ def _simulation_launches(
     network: HierarchicalGraphNetwork,
     step: StepConfig,
     precision: str,
+    capacities: tuple[int, ...],
+    *,
     scenes: int,
     particles: int,
-    capacities: tuple[int, ...],
-    obstacle_cell_size: float,
-    device: str,
 ) -> None:
-    """Those of a frame."""
-    config, obstacles = network.config, None
+    """Makes the launches of a frame."""
+    config, obstacles, device = network.config, None, network.normaliser.acceleration_std.device
     if config.obstacle_features:
-        obstacles = SceneTable([None] * scenes, OBSTACLE_COLUMNS, torch.device(device), obstacle_cell_size)
+        obstacles = SceneTable([None] * scenes, OBSTACLE_COLUMNS, device, cell_size=1.0)
     state = ParticleState(
-        config.cell_size * torch.arange(particles, device=device)[:, None].expand(-1, 3),  # apart: none is crowded
-        torch.zeros(particles, config.velocity_history, 3, device=device),
-        torch.zeros(particles, dtype=torch.int32, device=device),
-        torch.zeros(particles, dtype=torch.int64, device=device),
-        torch.zeros(scenes, 3, device=device),
-        torch.zeros(scenes, 3, device=device),
-        None,
+        # one particle a cell: they are not crowded
+        position_N3=config.cell_size * torch.arange(particles, device=device)[:, None].expand(-1, 3),
+        velocity_NM3=torch.zeros(particles, config.velocity_history, 3, device=device),
+        material_N=torch.zeros(particles, dtype=torch.int32, device=device),
+        scene_N=torch.zeros(particles, dtype=torch.int64, device=device),
+        domain_S3=torch.zeros(scenes, 3, device=device),
+        gravity_S3=torch.zeros(scenes, 3, device=device),
+        obstacles=None,
     )
     _Unplaced(network, state, precision, capacities, obstacles=obstacles, step=step).frame_launches()
 

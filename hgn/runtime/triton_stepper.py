@@ -15,11 +15,11 @@ from dataclasses import dataclass, replace
 import torch
 
 from hgn.kernels.capture import captured
-from hgn.kernels.forward import FusedNetwork, feature_columns
-from hgn.kernels.grid.op import OUT_OF_WINDOW, OVERFLOW, DeviceGrid, Window
+from hgn.kernels.forward import FusedNetwork
+from hgn.kernels.grid.op import OUT_OF_WINDOW, OVERFLOW, DeviceGrid, DeviceParticles, Window
 from hgn.kernels.packing import pack_network
 from hgn.kernels.scene_tables import SceneTable
-from hgn.kernels.step.op import DIVERGED, DeviceParticles, DeviceStep, rest_numbers
+from hgn.kernels.step.op import DIVERGED, DeviceStep, rest_numbers
 from hgn.kernels.tuning import Tuning
 from hgn.network.cell_keys import COORDINATE_LIMIT, pack
 from hgn.network.features import ParticleState
@@ -105,21 +105,8 @@ class TritonStepper:
         self.particles = max(capacity, len(state.position_N3))
         self.scenes = state.scene_count
 
-        def integers(value: int) -> torch.Tensor:
-            return torch.full((1,), value, dtype=torch.int32, device=self.device)
-
-        self.count, self.lost, self.frame = integers(0), integers(0), integers(0)
-        self.position_N3 = torch.zeros(self.particles, 3, device=self.device)
-        self.velocity_NV = torch.zeros(self.particles, 3 * self.config.velocity_history, device=self.device)
-        self.scene_N = torch.zeros(self.particles, dtype=torch.int32, device=self.device)
-        self.material_N = torch.zeros(self.particles, dtype=torch.int32, device=self.device)
-        self.domain_S3 = torch.zeros(self.scenes, 3, device=self.device)
-        self.origin_S3 = torch.zeros_like(self.domain_S3)
-        self.gravity_S3 = torch.zeros_like(self.domain_S3)  # zero with absolute inputs, which have learned it
-        self.device_particles = DeviceParticles(
-            position_N3=self.position_N3, velocity_NV=self.velocity_NV, scene_N=self.scene_N,
-            material_N=self.material_N, domain_S3=self.domain_S3, gravity_S3=self.gravity_S3, count=self.count,
-        )  # fmt: skip
+        self.buffers = DeviceParticles.empty(self.particles, self.scenes, self.config.velocity_history, self.device)
+        self.lost, self.frame = (torch.zeros(1, dtype=torch.int32, device=self.device) for _ in range(2))
         self.obstacles = obstacles
         if obstacles is None and state.obstacles is not None:
             self.obstacles = SceneTable.of_obstacles(state.obstacles, state.scene_count)
@@ -131,7 +118,8 @@ class TritonStepper:
         self.path_TN3 = torch.zeros(2 * self.look_frames, self.particles, 3, device=self.device)
         self.overlap = self.device.type == "cuda"  # frames are started before those before them are taken away
         normaliser = network.normaliser
-        self.velocity_mean, self.velocity_std = (x.float() for x in normaliser.feature_scale(self.config.relative))
+        mean_3, std_3 = normaliser.feature_scale(self.config.relative)
+        self.scale = (mean_3.float(), std_3.float())
         self.mean, self.std = normaliser.acceleration_mean.float(), normaliser.acceleration_std.float()
         self.growths = 0
         self._careful = self._crowded(state)
@@ -148,7 +136,7 @@ class TritonStepper:
             return False
         new, old = state.obstacles, self.obstacles
         same = new is old is None or (new is not None and old is not None and new.cell_size == old.cell_size)
-        return same and torch.equal(state.domain_S3, self.domain_S3)
+        return same and torch.equal(state.domain_S3, self.buffers.domain_S3)
 
     def begin(self, state: ParticleState, new_obstacles: bool = False) -> None:
         """Continues from another state that `fits`.
@@ -174,31 +162,32 @@ class TritonStepper:
 
     def keep(self, kept_N: torch.Tensor) -> None:
         """Removes particles after a divergence; cells, obstacles and launches stay."""
-        buffers = (self.position_N3, self.velocity_NV, self.scene_N, self.material_N)
+        buffers = (self.buffers.position_N3, self.buffers.velocity_NV, self.buffers.scene_N, self.buffers.material_N)
         remaining = [buffer[: self.live][kept_N] for buffer in buffers]
         self.live = len(remaining[0])
         for buffer, value in zip(buffers, remaining, strict=True):
             buffer[: self.live].copy_(value)
-        self.count.fill_(self.live)
+        self.buffers.count.fill_(self.live)
         self.lost.zero_()
         self.grid.status.zero_()
 
     def motion(self) -> tuple[torch.Tensor, torch.Tensor]:
         """Copies of positions [N, 3] and velocity histories [N, M, 3] after the last block."""
-        position_N3, velocity_NV = self.position_N3[: self.live], self.velocity_NV[: self.live]
+        position_N3, velocity_NV = self.buffers.position_N3[: self.live], self.buffers.velocity_NV[: self.live]
         return position_N3.clone(), velocity_NV.clone().view(self.live, -1, 3)
 
     def _fill(self, state: ParticleState) -> None:
         count = self.live = len(state.position_N3)
         assert count <= self.particles and state.scene_count == self.scenes
-        self.count.fill_(count)
-        self.position_N3[:count].copy_(state.position_N3)
-        self.velocity_NV[:count].copy_(state.velocity_NM3.flatten(1))
-        self.scene_N[:count].copy_(state.scene_N)
-        self.material_N[:count].copy_(state.material_N)
-        self.domain_S3.copy_(state.domain_S3)
+        buffers = self.buffers
+        buffers.count.fill_(count)
+        buffers.position_N3[:count].copy_(state.position_N3)
+        buffers.velocity_NV[:count].copy_(state.velocity_NM3.flatten(1))
+        buffers.scene_N[:count].copy_(state.scene_N)
+        buffers.material_N[:count].copy_(state.material_N)
+        buffers.domain_S3.copy_(state.domain_S3)
         if self.config.relative:
-            self.gravity_S3.copy_(state.gravity_S3)
+            buffers.gravity_S3.copy_(state.gravity_S3)
 
     def _crowded(self, state: ParticleState) -> bool:
         nowhere = state.position_N3.device.type == "meta"  # kernels are compiled ahead, for no particles
@@ -210,14 +199,15 @@ class TritonStepper:
         self.fused.refresh()
 
     def _first_capacities(self) -> tuple[int, ...]:
-        position_N3, scene_N = self.position_N3[: self.live], self.scene_N[: self.live].long()
-        grid = build_hierarchy(position_N3, scene_N, self.origin_S3, self.config.cell_size, self.config.levels)
+        position_N3, scene_N = self.buffers.position_N3[: self.live], self.buffers.scene_N[: self.live].long()
+        cell_size, levels = self.config.cell_size, self.config.levels
+        grid = build_hierarchy(position_N3, scene_N, self.buffers.origin_S3, cell_size=cell_size, levels=levels)
         return first_capacities([level.cell_count for level in grid.levels], self.live)
 
     def _window(self) -> Window:
-        position_N3 = self.position_N3[: self.live]
+        position_N3 = self.buffers.position_N3[: self.live]
         box = torch.stack([position_N3.amin(0), position_N3.amax(0)]).cpu()
-        size = self.domain_S3.amax(0).cpu()
+        size = self.buffers.domain_S3.amax(0).cpu()
         lower, upper = torch.minimum(box[0], torch.zeros(3)), torch.maximum(box[1], size)
         config = self.config
         return Window.around(lower.tolist(), upper.tolist(), config.cell_size, config.levels)
@@ -231,9 +221,8 @@ class TritonStepper:
         rounded = tuple(16 * math.ceil(max(1, min(c, m)) / 16) for c, m in zip(capacities, limits, strict=True))
         more = rest_numbers(self.step_config, window, self.scenes, config.levels)
         self.grid = DeviceGrid(
-            window, self.scenes, rounded, self.particles, feature_columns(config), config.cell_size,
-            self.device, config.relative, more,
-        )  # fmt: skip
+            config, window, rounded, scenes=self.scenes, particles=self.particles, device=self.device, more=more
+        )
         self.step = DeviceStep(self.step_config, config, self.grid, self.barriers)
         tuning = Tuning.of(self.precision)
         tuning = replace(tuning, half_sums=tuning.half_sums and not self._careful)
@@ -242,7 +231,7 @@ class TritonStepper:
             self.packed,
             self.values,
             self.grid,
-            particle_count=self.count,
+            particle_count=self.buffers.count,
             precision=self.precision,
             tuning=tuning,
         )
@@ -276,18 +265,14 @@ class TritonStepper:
         self._integrate()
 
     def _network_pass(self) -> None:
-        config, grid = self.config, self.grid
-        grid.build(self.position_N3, self.scene_N, self.origin_S3, self.count)
-        grid.prepare(
-            config, self.position_N3, self.velocity_NV, self.scene_N, self.material_N, self.origin_S3,
-            self.domain_S3, self.gravity_S3, self.count, self.velocity_mean, self.velocity_std, self.obstacles,
-        )  # fmt: skip
+        self.grid.build(self.buffers)
+        self.grid.prepare(self.buffers, self.scale, self.obstacles)
         self.fused.forward()
-        self.step.rest(self.fused.output, self.device_particles, self.velocity_std)
+        self.step.rest(self.fused.output, self.buffers, self.scale[1])
 
     def _integrate(self) -> None:
         self.step.integrate(
-            self.fused.output, self.device_particles, (self.mean, self.std), lost=self.lost, frame=self.frame,
+            self.fused.output, self.buffers, (self.mean, self.std), lost=self.lost, frame=self.frame,
             path_TN3=self.path_TN3,
         )  # fmt: skip
 

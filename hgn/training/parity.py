@@ -32,7 +32,7 @@ def require_parity(
 
     Too large a batch is not checked: NaN. Raises: ConfigError when one of them exceeds its bound.
     """
-    network, fused, count = updates.network, updates.fused, int(updates.particle_count)
+    network, fused, count = updates.network, updates.fused, int(updates.buffers.count)
     if count > CHECKED_PARTICLES:
         return math.nan, math.nan
     state, origin_S3 = _state(updates, episodes, symmetries, count)
@@ -73,13 +73,14 @@ def _state(
         if symmetries is not None:
             obstacles = obstacles_under(obstacles, symmetries)
         obstacles = obstacles.to(updates.device)
+    particles = updates.buffers
     state = ParticleState(
-        position_N3=updates.position_N3[:count],
-        velocity_NM3=updates.velocity_NV[:count].view(count, config.velocity_history, 3),
-        material_N=updates.material_N[:count].long(),
-        scene_N=updates.scene_N[:count].long(),
-        domain_S3=updates.domain_S3,
-        gravity_S3=updates.gravity_S3,
+        position_N3=particles.position_N3[:count],
+        velocity_NM3=particles.velocity_NV[:count].view(count, config.velocity_history, 3),
+        material_N=particles.material_N[:count].long(),
+        scene_N=particles.scene_N[:count].long(),
+        domain_S3=particles.domain_S3,
+        gravity_S3=particles.gravity_S3,
         obstacles=obstacles,
     )
-    return state, updates.origin_S3
+    return state, particles.origin_S3

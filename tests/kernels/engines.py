@@ -5,11 +5,11 @@ from dataclasses import replace
 import torch
 
 from hgn.kernels.backward import FusedTrainingNetwork
-from hgn.kernels.forward import FusedNetwork, feature_columns
-from hgn.kernels.grid.op import DeviceGrid, Window
+from hgn.kernels.forward import FusedNetwork
+from hgn.kernels.grid.op import DeviceGrid, DeviceParticles, Window
 from hgn.kernels.packing import pack_network
 from hgn.kernels.scene_tables import SceneTable
-from hgn.kernels.step.op import DeviceParticles, rest_numbers
+from hgn.kernels.step.op import rest_numbers
 from hgn.kernels.tuning import Tuning
 
 
@@ -25,17 +25,8 @@ def engine_of(network, state, precision="fp32", capacities=(), spare_particles=3
     box = state.position_N3.float()
     lower, upper = box.min(0).values.tolist(), box.max(0).values.tolist()
     window = Window.around(lower, upper, config.cell_size, config.levels, 2)
-    grid = DeviceGrid(
-        window,
-        state.scene_count,
-        capacities,
-        particles + spare_particles,
-        feature_columns(config),
-        config.cell_size,
-        where,
-        config.relative,
-        rest_numbers(network.step, window, state.scene_count, config.levels),
-    )
+    more = rest_numbers(network.step, window, state.scene_count, config.levels)
+    grid = DeviceGrid(config, window, capacities, state.scene_count, particles + spare_particles, where, more)
     packed = pack_network(network)
     values = packed.gather(list(network.parameters())).to(where)
     count = torch.tensor([particles], dtype=torch.int32, device=where)
@@ -58,37 +49,30 @@ def run_forward(engine, network, state, origin_S3):
 
 def prepare(engine, network, state, origin_S3):
     """Prepares the state's cells and features in the engine's grid; returns its particles there."""
-    where, grid, config = engine.device, engine.grid, network.config
+    where, grid = engine.device, engine.grid
 
     def padded(value):
         full = torch.full((grid.particles, *value.shape[1:]), 7, dtype=value.dtype)
         full[: len(value)] = value
         return full.to(where)
 
-    position = padded(state.position_N3.float())
-    velocity = padded(state.velocity_NM3.float().flatten(1))
-    scene = padded(state.scene_N.int())
-    material = padded(state.material_N.int())
-    origin, domain, gravity = (x.float().to(where) for x in (origin_S3, state.domain_S3, state.gravity_S3))
+    scale = tuple(x.float().to(where) for x in network.normaliser.feature_scale(network.config.relative))
     obstacles = (
         SceneTable.of_obstacles(state.obstacles.to(where), state.scene_count) if state.obstacles is not None else None
     )
-    grid.build(position, scene, origin, engine.particle_count)
-    normaliser = network.normaliser
-    grid.prepare(
-        config,
-        position,
-        velocity,
-        scene,
-        material,
-        origin,
-        domain,
-        gravity,
-        engine.particle_count,
-        *(x.float().to(where) for x in normaliser.feature_scale(config.relative)),
-        obstacles,
+    particles = DeviceParticles(
+        position_N3=padded(state.position_N3.float()),
+        velocity_NV=padded(state.velocity_NM3.float().flatten(1)),
+        scene_N=padded(state.scene_N.int()),
+        material_N=padded(state.material_N.int()),
+        origin_S3=origin_S3.float().to(where),
+        domain_S3=state.domain_S3.float().to(where),
+        gravity_S3=state.gravity_S3.float().to(where),
+        count=engine.particle_count,
     )
-    return DeviceParticles(position, velocity, scene, material, domain, gravity, engine.particle_count)
+    grid.build(particles)
+    grid.prepare(particles, scale, obstacles)
+    return particles
 
 
 def gradients(engine, network):

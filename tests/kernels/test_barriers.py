@@ -8,9 +8,9 @@ from network.barrier_scenes import CELL, CLEARANCE, DOMAIN, ball, barriers_of, c
 
 from hgn.config import NetworkConfig
 from hgn.kernels.buffers import OUT
-from hgn.kernels.grid.op import DeviceGrid, Window
+from hgn.kernels.grid.op import DeviceGrid, DeviceParticles, Window
 from hgn.kernels.scene_tables import BARRIER_COLUMNS, SceneHash, SceneTable
-from hgn.kernels.step.op import DeviceParticles, DeviceStep
+from hgn.kernels.step.op import DeviceStep
 from hgn.network.features import ParticleState
 from hgn.scene.barrier import build_barrier
 from hgn.step.reference import advanced, first_stop
@@ -39,13 +39,13 @@ def integrated(state, way_N3, step, table):
     count, where = len(way_N3), device()
     config = NetworkConfig(levels=1, velocity_history=1)
     window = Window.around((0.0,) * 3, (1.0,) * 3, config.cell_size, 1)
-    grid = DeviceGrid(window, state.scene_count, (16,), count, 16, config.cell_size, where)
+    grid = DeviceGrid(config, window, (16,), state.scene_count, count, where)
     one, zero_3 = torch.ones(1, dtype=torch.int32, device=where), way_N3.new_zeros(3)
     output = way_N3.new_zeros(count, OUT)
     output[:, :3] = way_N3
     particles = DeviceParticles(
         state.position_N3.clone(), way_N3.new_zeros(count, 3), state.scene_N.int(), state.scene_N.int(),
-        state.domain_S3, state.gravity_S3, count * one,
+        torch.zeros_like(state.domain_S3), state.domain_S3, state.gravity_S3, count * one,
     )  # fmt: skip
     path_TN3 = way_N3.new_zeros(1, count, 3)
     DeviceStep(step, config, grid, table).integrate(

@@ -71,8 +71,10 @@ def test_an_update_under_symmetries_is_the_plain_one(kind, monkeypatch):
     width = 3 * HISTORY + (9 if kind == "relative" else 0)
     assert fast.parity is not None and max(fast.parity) < 1e-3
     near = {"rtol": 0, "atol": 1e-7}
-    torch.testing.assert_close(updates.position_N3[:count].cpu().double(), state.position_N3, **near)
-    torch.testing.assert_close(updates.velocity_NV[:count].cpu().double(), state.velocity_NM3.flatten(1), **near)
+    torch.testing.assert_close(updates.buffers.position_N3[:count].cpu().double(), state.position_N3, **near)
+    torch.testing.assert_close(
+        updates.buffers.velocity_NV[:count].cpu().double(), state.velocity_NM3.flatten(1), **near
+    )
     torch.testing.assert_close(updates.target_N3[:count].cpu().double(), target, rtol=0, atol=1e-4)
     assert state.obstacles is not None
     normal = state.obstacles.normals(state.position_N3, state.scene_N)
@@ -96,7 +98,12 @@ def test_without_symmetry_nothing_changes():
         updates = updates_of(network, 1, (256,), noise_std=1e-3, grid_jitter=True, symmetry=symmetry)
         updates.run([[(made, FRAME, 3)]], [1e-3])
         count = made.position_TN3.shape[1]
-        seen.append([rows[:count].cpu() for rows in (updates.position_N3, updates.velocity_NV, updates.target_N3)])
+        seen.append(
+            [
+                rows[:count].cpu()
+                for rows in (updates.buffers.position_N3, updates.buffers.velocity_NV, updates.target_N3)
+            ]
+        )
         ends.append((parameters_of(updates), updates.loss_sum.cpu(), updates.first_moment.cpu()))
     for found, expected in zip(*seen, strict=True):
         assert torch.equal(found, expected)
@@ -116,7 +123,7 @@ def test_noise_and_jitter_are_those_without():
         for noise_std in (1e-3, 0.0):
             updates = updates_of(network, 1, (256,), noise_std=noise_std, grid_jitter=True, symmetry=True)
             updates.predict([(replace(made, symmetries=known), FRAME, 3)])
-            noise.append((updates.velocity_NV[:5].cpu().clone(), updates.origin_S3.cpu().clone()))
+            noise.append((updates.buffers.velocity_NV[:5].cpu().clone(), updates.buffers.origin_S3.cpu().clone()))
         drawn.append((noise[0][0] - noise[1][0], noise[0][1]))
     torch.testing.assert_close(drawn[0][0], drawn[1][0], rtol=0, atol=1e-9)
     assert torch.equal(drawn[0][1], drawn[1][1]) and drawn[0][0].std() > 1e-4

@@ -175,7 +175,7 @@ def test_noise_and_jitter():
     torch.testing.assert_close(first["target_N3"][:400], expected, rtol=0, atol=1e-3)
     updates._upload([[DeviceSample(made, 1, 5, 4.0, 0.25), DeviceSample(still, 0, 6)]], [1e-3])
     updates._assemble()
-    calm = updates.velocity_NV[:400].cpu().view(400, HISTORY, 3) - clean
+    calm = updates.buffers.velocity_NV[:400].cpu().view(400, HISTORY, 3) - clean
     torch.testing.assert_close(calm, walk / 4, rtol=0, atol=1e-7)
     torch.testing.assert_close(updates.share_N[:700].cpu(), torch.tensor([4 / 800] * 400 + [1 / 600] * 300))
 
@@ -190,10 +190,10 @@ def test_a_flat_network_is_shown_no_noise_across():
     updates._build()
     updates._assemble()
     window = made.position_TN3[1 : 1 + HISTORY + 1]
-    step_N3 = updates.velocity_NV[:64].view(64, HISTORY, 3)[:, 0] - (window[-1] - window[-2])
+    step_N3 = updates.buffers.velocity_NV[:64].view(64, HISTORY, 3)[:, 0] - (window[-1] - window[-2])
     assert not step_N3[:, 2].any() and step_N3[:, :2].all()
-    assert torch.equal(updates.position_N3[:64, 2], window[-1, :, 2])
-    assert updates.origin_S3[0, 2] == 0 and (updates.origin_S3[0, :2] < 0).all()
+    assert torch.equal(updates.buffers.position_N3[:64, 2], window[-1, :, 2])
+    assert updates.buffers.origin_S3[0, 2] == 0 and (updates.buffers.origin_S3[0, :2] < 0).all()
 
 
 def test_correlated_noise():
@@ -212,7 +212,7 @@ def test_correlated_noise():
         updates._reach = (torch.zeros(3), torch.ones(3))
         updates._build()
         updates._assemble()
-        walks[smooth] = updates.velocity_NV[:700].cpu().view(700, HISTORY, 3) - clean
+        walks[smooth] = updates.buffers.velocity_NV[:700].cpu().view(700, HISTORY, 3) - clean
         waves = updates.waves_SKC.cpu()
     length = 2 * math.pi / waves[..., :3].norm(dim=-1) / 0.01
     assert 4 <= float(length.min()) < 8 and 32 < float(length.max()) <= 64.01
@@ -226,7 +226,7 @@ def test_correlated_noise():
     torch.testing.assert_close(walks[0.5], (walks[0.0] + walks[1.0]) / 2**0.5, rtol=0, atol=2e-6)
     updates._upload([[DeviceSample(made, 1, 5), DeviceSample(still, 0, 6, noise_scale=0.5)]], [1e-3])
     updates._assemble()
-    walk = updates.velocity_NV[:700].cpu().view(700, HISTORY, 3) - clean
+    walk = updates.buffers.velocity_NV[:700].cpu().view(700, HISTORY, 3) - clean
     torch.testing.assert_close(walk[:400], walks[1.0][:400], rtol=0, atol=0)
     torch.testing.assert_close(walk[400:], walks[1.0][400:] / 2, rtol=0, atol=1e-6)
 

@@ -44,8 +44,8 @@ class TritonFrame(Contender):
         self.at_once = min(FRAMES_AT_ONCE, len(self.stepper.path_TN3))
 
     def restore(self) -> None:
-        self.stepper.position_N3.copy_(self.state.position_N3)
-        self.stepper.velocity_NV.copy_(self.velocity_NV)
+        self.stepper.buffers.position_N3.copy_(self.state.position_N3)
+        self.stepper.buffers.velocity_NV.copy_(self.velocity_NV)
 
     def run(self) -> None:
         """Frames of the same state, each in a graph where there is a GPU."""
@@ -67,7 +67,7 @@ class TritonFrame(Contender):
         self.restore()
         for _ in self.stepper.blocks(1):  # allocates memory if necessary
             pass
-        return check_acceleration(self.stepper.velocity_NV[:, :3], self.network, self.state, precision)
+        return check_acceleration(self.stepper.buffers.velocity_NV[:, :3], self.network, self.state, precision)
 
 
 def device_samples(batch: Batch) -> list[tuple[DeviceEpisode, int, int]]:

@@ -13,7 +13,7 @@ from typing import Any
 import torch
 import triton
 
-from hgn.config import NetworkConfig
+from hgn.config import MATERIAL_EMBEDDING, NetworkConfig
 from hgn.kernels.coarsest import kernel as coarsest_kernel
 from hgn.kernels.features import kernel as feature_kernel
 from hgn.kernels.grid import kernel
@@ -60,6 +60,36 @@ class Window:
         return math.prod(n + 2 for n in self.cells)
 
 
+def feature_columns(config: NetworkConfig) -> int:
+    """Columns of the encoder's input: features, one-hot material, padding to a power of two that matrix units take."""
+    used = config.feature_width - MATERIAL_EMBEDDING + len(config.materials)
+    return max(16, triton.next_power_of_2(used))
+
+
+@dataclass(frozen=True, eq=False)
+class DeviceParticles:
+    """The particles of all scenes, padded to the size of the buffers, and their scenes."""
+
+    position_N3: torch.Tensor
+    velocity_NV: torch.Tensor  # histories, newest first
+    scene_N: torch.Tensor  # int32
+    material_N: torch.Tensor  # int32
+    origin_S3: torch.Tensor  # of the grid
+    domain_S3: torch.Tensor
+    gravity_S3: torch.Tensor  # zero with absolute inputs, which have learned it
+    count: torch.Tensor  # int32 [1]
+
+    @staticmethod
+    def empty(particles: int, scenes: int, history: int, device: torch.device) -> DeviceParticles:
+        """Returns buffers of zeros."""
+        position_N3, velocity_NV = (torch.zeros(particles, columns, device=device) for columns in (3, 3 * history))
+        scene_N, material_N, count = (
+            torch.zeros(size, dtype=torch.int32, device=device) for size in (particles, particles, 1)
+        )
+        of_scenes = [torch.zeros(scenes, 3, device=device) for _ in range(3)]
+        return DeviceParticles(position_N3, velocity_NV, scene_N, material_N, *of_scenes, count)
+
+
 class DeviceGrid:
     """Tables of all levels at fixed capacities; counts stay on the device.
 
@@ -75,20 +105,19 @@ class DeviceGrid:
 
     def __init__(
         self,
+        config: NetworkConfig,
         window: Window,
-        scenes: int,
         capacities: Sequence[int],
+        scenes: int,
         particles: int,
-        features: int,
-        cell_size: float,
         device: torch.device,
-        relative: bool = False,
         more: tuple[int, ...] = (),
     ) -> None:
         """`more_cleared` are int32 tensors of `more` numbers for others, which `build` clears too."""
         assert scenes < SCENE_LIMIT
+        relative, features = config.relative, feature_columns(config)
         self.window, self.scenes, self.capacities, self.particles = window, scenes, tuple(capacities), particles
-        self.cell_size, self.levels, self.features = cell_size, len(capacities), features
+        self.config, self.cell_size, self.levels, self.features = config, config.cell_size, len(capacities), features
         rows, start, at = [], 0, 0
         for level, capacity in enumerate(capacities):
             nx, ny, nz = ((n >> level) + 2 for n in window.cells)
@@ -148,15 +177,13 @@ class DeviceGrid:
         """How many cells are active, [1], on the device."""
         return self.counts_L[level : level + 1]
 
-    def build(
-        self, position: torch.Tensor, scene_N: torch.Tensor, origin_S3: torch.Tensor, count: torch.Tensor
-    ) -> None:
+    def build(self, particles: DeviceParticles) -> None:
         """Marks, numbers and tabulates the cells of all levels."""
         self._cleared.zero_()
         kernel.mark_cells[(triton.cdiv(self.particles, MARK_BLOCK),)](
-            position=position, scene_of=scene_N, origin=origin_S3, particle_count=count, low=self.low,
-            geometry=self.geometry, occupied=self.occupied, status=self.status, cell_size=self.cell_size,
-            LEVELS=self.levels, BLOCK=MARK_BLOCK,
+            position=particles.position_N3, scene_of=particles.scene_N, origin=particles.origin_S3,
+            particle_count=particles.count, low=self.low, geometry=self.geometry, occupied=self.occupied,
+            status=self.status, cell_size=self.cell_size, LEVELS=self.levels, BLOCK=MARK_BLOCK,
         )  # fmt: skip
         torch.cumsum(self.occupied, 0, dtype=torch.int32, out=self.prefix_sum)
         kernel.fill_tables[(triton.cdiv(self.largest, FILL_BLOCK), self.levels)](
@@ -168,36 +195,27 @@ class DeviceGrid:
 
     def prepare(
         self,
-        config: NetworkConfig,
-        position: torch.Tensor,
-        velocity: torch.Tensor,
-        scene_N: torch.Tensor,
-        material_N: torch.Tensor,
-        origin_S3: torch.Tensor,
-        domain_S3: torch.Tensor,
-        gravity_S3: torch.Tensor,
-        count: torch.Tensor,
-        mean_3: torch.Tensor,
-        std_3: torch.Tensor,
+        particles: DeviceParticles,
+        scale: tuple[torch.Tensor, torch.Tensor],
         obstacles: SceneTable | None,
         symmetry: bool = False,
     ) -> None:
-        """Cells and features of every particle; without `obstacles` normals are zero, and nothing is looked up.
+        """Computes cells and features of every particle; without `obstacles` normals are zero.
 
-        `mean_3` and `std_3` are those of Normaliser.feature_scale; gravity counts for relative inputs alone. With
-        `symmetry` the obstacles are seen under the symmetries in their rows.
+        `scale` is Normaliser.feature_scale. With `symmetry` the obstacles are seen under the symmetries in their rows.
         """
-        blocks, overlap = (triton.cdiv(self.particles, PARTICLE_BLOCK),), overlaps()
+        config, blocks, overlap = self.config, (triton.cdiv(self.particles, PARTICLE_BLOCK),), overlaps()
         surfaces: dict[str, Any] = {
-            "position": position, "velocity": velocity, "scene_of": scene_N, "domain": domain_S3,
-            "particle_count": count, "obstacle_table": obstacles.row_SC if obstacles else count,
+            "position": particles.position_N3, "velocity": particles.velocity_NV, "scene_of": particles.scene_N,
+            "domain": particles.domain_S3, "particle_count": particles.count,
+            "obstacle_table": obstacles.row_SC if obstacles else particles.count,
             "obstacle_cell_size": obstacles.cell_size if obstacles else 1.0, "features": self.feature_NF,
             "HISTORY": config.velocity_history, "NORMALS": int(config.obstacle_features),
             "OBSTACLES": config.obstacle_features and obstacles is not None, "SYMMETRY": symmetry,
             "FEATURES": self.features, "BLOCK": PARTICLE_BLOCK,
         }  # fmt: skip
         kernel.prepare_particles[blocks](
-            **surfaces, origin=origin_S3, low=self.low, geometry=self.geometry, occupied=self.occupied,
+            **surfaces, origin=particles.origin_S3, low=self.low, geometry=self.geometry, occupied=self.occupied,
             prefix_sum=self.prefix_sum, cell_of=self.cell_N8, weight_of=self.weight_N8,
             fraction_of=self.fraction_N3, motion=self.motion_C4, coarsest_of=self.coarsest_N8,
             share_of=self.share_N8, place_of=self.place_N3, moments=self.moment_C, touch_of=self.touch_N,
@@ -207,7 +225,7 @@ class DeviceGrid:
         )  # fmt: skip
         if not config.relative:
             feature_kernel.prepare_features[blocks](
-                **surfaces, material_of=material_N, mean=mean_3, std=std_3,
+                **surfaces, material_of=particles.material_N, mean=scale[0], std=scale[1],
                 wall_maximum=WALL_DISTANCE_CELLS * config.cell_size,
             )  # fmt: skip
             return
@@ -218,13 +236,13 @@ class DeviceGrid:
             launch_pdl=overlap,
         )  # fmt: skip
         feature_kernel.prepare_relative_features[blocks](
-            velocity=velocity, scene_of=scene_N, material_of=material_N, gravity=gravity_S3, particle_count=count,
-            scale=std_3, cell_of=self.cell_N8, weight_of=self.weight_N8, coarsest_of=self.coarsest_N8,
-            share_of=self.share_N8, motion=self.motion_C4, parent=self._parent, geometry=self.geometry,
-            features=self.feature_NF, touch_of=self.touch_N, disturbed=self.disturbed_C2, felt=self.felt_C2,
-            quiet=QUIET, HISTORY=config.velocity_history, LEVELS=self.levels, NORMALS=int(config.obstacle_features),
-            FEATURES=self.features, OVERLAP=overlap, BLOCK=PARTICLE_BLOCK,
-            launch_pdl=overlap,
+            velocity=particles.velocity_NV, scene_of=particles.scene_N, material_of=particles.material_N,
+            gravity=particles.gravity_S3, particle_count=particles.count, scale=scale[1], cell_of=self.cell_N8,
+            weight_of=self.weight_N8, coarsest_of=self.coarsest_N8, share_of=self.share_N8, motion=self.motion_C4,
+            parent=self._parent, geometry=self.geometry, features=self.feature_NF, touch_of=self.touch_N,
+            disturbed=self.disturbed_C2, felt=self.felt_C2, quiet=QUIET, HISTORY=config.velocity_history,
+            LEVELS=self.levels, NORMALS=int(config.obstacle_features), FEATURES=self.features, OVERLAP=overlap,
+            BLOCK=PARTICLE_BLOCK, launch_pdl=overlap,
         )  # fmt: skip
 
     def balance(self, output: torch.Tensor, count: torch.Tensor) -> None:

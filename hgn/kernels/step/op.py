@@ -15,7 +15,7 @@ import triton
 
 from hgn.config import NetworkConfig
 from hgn.kernels.buffers import OUT
-from hgn.kernels.grid.op import PARTICLE_BLOCK, SUMS, DeviceGrid, Window
+from hgn.kernels.grid.op import PARTICLE_BLOCK, SUMS, DeviceGrid, DeviceParticles, Window
 from hgn.kernels.scene_tables import SceneTable
 from hgn.kernels.step import kernel
 from hgn.kernels.triton_compat import overlaps
@@ -26,19 +26,6 @@ RATES = kernel.RATES.value
 DIVERGED = kernel.DIVERGED.value
 REST_SUMS = (SUMS, RATES)  # columns of the sums of a `RestLevel`
 INTEGRATE_BLOCK = 64  # particles
-
-
-@dataclass(frozen=True, eq=False)
-class DeviceParticles:
-    """The particles of all scenes, padded to the size of the buffers, and their scenes."""
-
-    position_N3: torch.Tensor
-    velocity_NV: torch.Tensor
-    scene_N: torch.Tensor  # int32
-    material_N: torch.Tensor  # int32
-    domain_S3: torch.Tensor
-    gravity_S3: torch.Tensor
-    count: torch.Tensor  # int32 [1]
 
 
 @dataclass(frozen=True, eq=False)

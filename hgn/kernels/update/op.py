@@ -21,8 +21,7 @@ import triton
 from hgn.config import CORRELATED_WAVELENGTHS, CORRELATED_WAVES, TrainingConfig
 from hgn.kernels.backward import FusedTrainingNetwork
 from hgn.kernels.capture import captured
-from hgn.kernels.forward import feature_columns
-from hgn.kernels.grid.op import OUT_OF_WINDOW, DeviceGrid, Window
+from hgn.kernels.grid.op import OUT_OF_WINDOW, DeviceGrid, DeviceParticles, Window
 from hgn.kernels.muon.op import SquareBlocks
 from hgn.kernels.packing import pack_network
 from hgn.kernels.scene_tables import OBSTACLE_COLUMNS, SceneHash, SceneTable
@@ -148,17 +147,15 @@ class Updates:
         self.blocks = SquareBlocks(network, self.packed.index, device) if muon else None
         self.step = torch.zeros(1, dtype=torch.float64, device=device)
         self.update = torch.zeros(1, dtype=torch.int32, device=device)
-        self.particle_count = torch.zeros(1, dtype=torch.int32, device=device)
         self.loss, self.norm = torch.zeros(1, device=device), torch.zeros(1, device=device)
         scenes, normaliser = settings.scenes, network.normaliser
-        self.origin_S3, self.domain_S3 = torch.zeros(scenes, 3, device=device), torch.ones(scenes, 3, device=device)
-        self.gravity_S3 = torch.zeros(scenes, 3, device=device)  # zero with absolute inputs
         columns = 4 + 3 * self.config.velocity_history  # a wave's number and phase, its amplitude in each velocity
         self.waves_SKC = torch.zeros(scenes, CORRELATED_WAVES, columns, device=device)
         sees = self.config.obstacle_features
         table = SceneTable([None] * scenes, OBSTACLE_COLUMNS, device, settings.obstacle_cell_size)
         self.obstacles, self._obstacle_row = table if sees else None, table.row_SC
-        self.velocity_mean, self.velocity_std = (x.float() for x in normaliser.feature_scale(self.config.relative))
+        mean_3, std_3 = normaliser.feature_scale(self.config.relative)
+        self.scale = (mean_3.float(), std_3.float())
         self.mean, self.std = normaliser.acceleration_mean.float(), normaliser.acceleration_std.float()
         self.capacities = capacities
         self.particles = 0
@@ -292,7 +289,7 @@ class Updates:
         fused.forward()
         kernel.loss_gradient[(triton.cdiv(self.particles, BLOCK),)](
             output=fused.output, target=self.target_N3, share_of=self.share_N,
-            particle_count=self.particle_count, gradient=fused.output_gradient, loss=self.loss,
+            particle_count=self.buffers.count, gradient=fused.output_gradient, loss=self.loss,
             scale=1.0 / fused.unscale, OUT=fused.output.shape[1], BLOCK=BLOCK,
         )  # fmt: skip
         fused.backward()
@@ -344,10 +341,10 @@ class Updates:
                 scenes=settings.scenes, HISTORY=config.velocity_history, WAVES=CORRELATED_WAVES,
             )  # fmt: skip
         kernel.assemble_batch[(triton.cdiv(self.particles, BLOCK),)](
-            samples=self._samples, sample_vectors=self._vectors, update=self.update, position=self.position_N3,
-            velocity=self.velocity_NV, scene_of=self.scene_N, material_of=self.material_N,
-            target=self.target_N3, share_of=self.share_N, origin=self.origin_S3, domain=self.domain_S3,
-            gravity=self.gravity_S3, obstacle_table=self._obstacle_row, particle_count=self.particle_count,
+            samples=self._samples, sample_vectors=self._vectors, update=self.update, position=self.buffers.position_N3,
+            velocity=self.buffers.velocity_NV, scene_of=self.buffers.scene_N, material_of=self.buffers.material_N,
+            target=self.target_N3, share_of=self.share_N, origin=self.buffers.origin_S3, domain=self.buffers.domain_S3,
+            gravity=self.buffers.gravity_S3, obstacle_table=self._obstacle_row, particle_count=self.buffers.count,
             mean=self.mean, std=self.std, noise_step=own_step, waves=self.waves_SKC,
             jitter=config.cell_size if settings.grid_jitter else 0.0, scenes=settings.scenes,
             obstacle_cell_size=settings.obstacle_cell_size, HISTORY=config.velocity_history,
@@ -357,12 +354,8 @@ class Updates:
 
     def _grid(self) -> None:
         """What follows from where the particles are."""
-        self.grid.build(self.position_N3, self.scene_N, self.origin_S3, self.particle_count)
-        self.grid.prepare(
-            self.config, self.position_N3, self.velocity_NV, self.scene_N, self.material_N, self.origin_S3,
-            self.domain_S3, self.gravity_S3, self.particle_count, self.velocity_mean, self.velocity_std,
-            self.obstacles, self.settings.symmetry,
-        )  # fmt: skip
+        self.grid.build(self.buffers)
+        self.grid.prepare(self.buffers, self.scale, self.obstacles, self.settings.symmetry)
 
     # room
 
@@ -380,16 +373,13 @@ class Updates:
         if hasattr(self, "fused"):
             del self.fused, self.grid  # before the new ones are allocated
         self._built_reach = self._reach
-        self.position_N3 = torch.zeros(particles, 3, device=device)
-        self.velocity_NV = torch.zeros(particles, 3 * config.velocity_history, device=device)
-        self.scene_N = torch.zeros(particles, dtype=torch.int32, device=device)
-        self.material_N = torch.zeros(particles, dtype=torch.int32, device=device)
+        self.buffers = DeviceParticles.empty(particles, self.settings.scenes, config.velocity_history, device)
         self.target_N3 = torch.zeros(particles, 3, device=device)
         self.share_N = torch.zeros(particles, device=device)
         if not self.capacities:
             self.grid = self._device_grid((16,) * config.levels)
             self._assemble()
-            self.grid.build(self.position_N3, self.scene_N, self.origin_S3, self.particle_count)
+            self.grid.build(self.buffers)
             self.capacities = self._rounded(self.grid.needed_L.tolist())
         self.grid = self._device_grid(self.capacities)
         self.fused = self._fused_network()
@@ -398,19 +388,15 @@ class Updates:
         # gradients of the mean over particles are small: float16 would lose them
         scale = 2.0 ** round(math.log2(max(self.particles, 2))) if self.precision == "fp16" else 1.0
         return FusedTrainingNetwork(
-            self.config, self.packed, self.values, self.grid, self.particle_count, self.precision, scale, tail=TAIL
+            self.config, self.packed, self.values, self.grid, self.buffers.count, self.precision, scale, tail=TAIL
         )
 
     def _device_grid(self, capacities: tuple[int, ...]) -> DeviceGrid:
-        config = self.config
-        return DeviceGrid(
-            self._window(), self.settings.scenes, capacities, self.particles, feature_columns(config),
-            config.cell_size, self.device, config.relative,
-        )  # fmt: skip
+        return DeviceGrid(self.config, self._window(), capacities, self.settings.scenes, self.particles, self.device)
 
     def _make_room(self, status: int, needed: list[int]) -> None:
         if status & OUT_OF_WINDOW:
-            position = self.position_N3[: int(self.particle_count)]
+            position = self.buffers.position_N3[: int(self.buffers.count)]
             if not bool(position.isfinite().all()):
                 raise ConfigError("positions of the training episodes must be finite, got some that are not")
             low, high = position.amin(0).cpu(), position.amax(0).cpu()
