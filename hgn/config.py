@@ -186,7 +186,7 @@ class MpmConfig:
 
     @property
     def choices(self) -> SolverMethod:
-        """What the method decides."""
+        """Returns the choices of the method."""
         return METHODS[self.method]
 
 
@@ -241,7 +241,7 @@ class DatasetConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class SimulatorConfig:
-    """What the commands that simulate with a network compute on, and how."""
+    """The settings that commands which simulate with a network have in common."""
 
     device: str = "auto"  # or cpu, cuda, cuda:1
     # torch, triton (kernels in CUDA graphs), cpu (compiled C); auto: the fastest that runs
@@ -340,7 +340,7 @@ CORRELATED_WAVES, CORRELATED_WAVELENGTHS = 16, (4, 64)
 
 @dataclass(frozen=True)
 class TrainingConfig:
-    """How a network is trained (paper sec. 3.3)."""
+    """The training of a network (paper sec. 3.3)."""
 
     maximum_updates: Positive[int] = 20_000_000  # updates of the optimiser until the training ends
     maximum_minutes: Positive[float] | None = None  # wall time of this start; null: no limit

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 
 class SolverMethod(NamedTuple):
-    """What differs between the solver's own method and that of Taichi Elements."""
+    """The choices by which the solver's own method and that of Taichi Elements differ."""
 
     # mohr_coulomb: the friction angle on every stress path; compression: the Drucker-Prager cone with that angle in
     # triaxial compression.

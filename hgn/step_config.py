@@ -13,7 +13,7 @@ WallClearance = tuple[NonNegative[float], NonNegative[float]]
 class StepConfig:
     """The constraints of simulated frames, which need no training (hgn.step). Lengths in domain units."""
 
-    # particles in contact that deform by less than this many |g| a frame stop; 0: none do
+    # deformations of particles in contact by less than this many |g| a frame stop; 0: none do
     rest_threshold: NonNegative[float] = 0.0
     # least distances from the domain's planes at the near sides (0) and at the far sides; null: no walls
     wall_clearance: WallClearance | None = None
@@ -25,7 +25,7 @@ class StepConfig:
 
     @property
     def rests(self) -> bool:
-        """Whether slow deformations stop."""
+        """Returns whether slow deformations stop."""
         return self.rest_threshold > 0
 
     @property

@@ -16,7 +16,7 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 27_216,
+    "hgn": 27_227,
     "datagen": 8_320,
     "tools": 6_187,
     "tests": 27_874,
@@ -36,7 +36,7 @@ MANY_PARAMETERS: dict[str, int] = {}
 MANY_POSITIONAL_ARGUMENTS: dict[str, int] = {}
 
 HEADLESS = re.compile(r"(What|Of|Whether|That|Those|These|How|Which|Whose|Where)\b")
-HEADLESS_DOCSTRINGS = {"hgn": 79, "datagen": 47, "tools": 0}
+HEADLESS_DOCSTRINGS = {"hgn": 10, "datagen": 47, "tools": 0}
 
 UNCOMMENTED: set[str] = set()
 UNMENTIONED: set[str] = set()

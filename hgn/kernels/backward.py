@@ -32,7 +32,7 @@ MANY_ROWS = 16384
 
 @dataclass(frozen=True)
 class MLPGradients:
-    """Of an MLP's hidden layer before its activation, and of its second layer's output."""
+    """Gradients of an MLP's hidden layer before its activation, and of its second layer's output."""
 
     hidden: torch.Tensor
     output: torch.Tensor
@@ -40,7 +40,7 @@ class MLPGradients:
 
 @dataclass(frozen=True)
 class PairGradients:
-    """Of the pairs' second layer's output [8 N, W], and of what the particles give to the first [N, W]."""
+    """Gradients of the pairs' second layer [8 N, W], and of the particles' part of the first layer [N, W]."""
 
     output: torch.Tensor
     by_particle: torch.Tensor
@@ -48,7 +48,7 @@ class PairGradients:
 
 @dataclass(frozen=True)
 class StepGradients:
-    """Of a message-passing iteration: its edges' MLP [C, 6, W], its cells', and their products for the edges [C, W]."""
+    """Gradients of a message-passing iteration: edge MLP [C, 6, W], cell MLP, cell products for edges [C, W]."""
 
     edge: MLPGradients
     cell: MLPGradients
@@ -58,7 +58,7 @@ class StepGradients:
 
 @dataclass(frozen=True)
 class Gradients:
-    """What the weights' products read of the backward pass; lists are over levels, finest first, and iterations."""
+    """Gradients of activations, which those of weights follow from; lists are over levels, finest first."""
 
     encode: MLPGradients
     decode: MLPGradients
@@ -285,13 +285,13 @@ class FusedTrainingNetwork(FusedNetwork):
         return self._operands() | {"totals": self.totals, "unscale": self.unscale}
 
     def _rows_at_once(self) -> int:
-        """Of a weight's product; in the interpreter, whose time goes by operations, more."""
+        """Returns the rows of one step of a weight gradient; more in the interpreter, whose time goes by operations."""
         if interpreting():
             return 128
         return 64 if self.precision == "fp16" else 32
 
     def _gradient_of(self, block: Block) -> torch.Tensor:
-        """Where the gradient of a block's output is collected, and left as that of its input."""
+        """Returns the buffer that receives the gradient of a block's output, and is left with that of its input."""
         down = any(block is other for other in self.down)
         return (self.cell_gradient_down if down else self.cell_gradient_up)[block.level]
 

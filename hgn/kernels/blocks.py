@@ -21,7 +21,7 @@ EPSILON = tl.constexpr(1e-5)  # torch.nn.LayerNorm's
 
 @triton.jit
 def elements(row, WIDTH: tl.constexpr, WIDE: tl.constexpr):
-    """Where the rows' elements [R, W] lie in a tensor; WIDE where it has more than int32 can count."""
+    """Returns the places of the rows' elements [R, W] in a tensor; WIDE: it has more than int32 can count."""
     at = row[:, None] * WIDTH
     if WIDE:
         at = row.to(tl.int64)[:, None] * WIDTH
@@ -142,7 +142,7 @@ def once_both(x, y, never):
 
 @triton.jit
 def nothing_to_do(count, BLOCK: tl.constexpr):
-    """Whether a program has no rows. The first one stays: it waits for the kernel before where all others are idle."""
+    """Returns whether a program has no rows. The first one stays, and waits for the previous kernel if all are idle."""
     return (tl.program_id(0) * BLOCK >= count) & (tl.program_id(0) > 0)
 
 

@@ -34,8 +34,10 @@ def adjugate(matrix, x, y, z):
 
 @triton.jit
 def rotation(inertia, x, y, z):
-    """How well a rotation is known, and the rate at which it turns, of moments about a centre: as
-    hgn.network.relative.rotation. The inertia is xx, yy, zz, yz, xz, xy."""
+    """Returns how well a rotation is determined by moments about a centre, and its rate: hgn.network.relative.rotation.
+
+    The inertia is xx, yy, zz, yz, xz, xy.
+    """
     xx, yy, zz = inertia[0], inertia[1], inertia[2]
     determinant, turn = adjugate(inertia, x, y, z)
     determinant = tl.maximum(determinant, 0.0)
@@ -46,7 +48,7 @@ def rotation(inertia, x, y, z):
 
 @triton.jit
 def inertia_of(xx, yy, zz, yz, xz, xy):
-    """Of second moments about a centre."""
+    """Returns the inertia, as in `rotation`, of second moments about a centre."""
     return yy + zz, xx + zz, xx + yy, -yz, -xz, -xy
 
 

@@ -19,7 +19,7 @@ OUT = SUMS  # the decoder's three outputs, nine with relative inputs, padded
 
 
 class Stored(NamedTuple):
-    """What a kernel stores for the backward pass, by its names; one row where it stores nothing."""
+    """The buffers of a kernel for the backward pass, by its names; one row where it stores nothing."""
 
     hidden: torch.Tensor  # [R, W]: R are pairs [8 N], edges [C, 6] or cells [C]
     normalised: torch.Tensor  # [R, W]
@@ -88,7 +88,7 @@ class Buffers:
         return self._operand(*shape) if self.tuning.half_cells else self._float(*shape)
 
     def _first_cell(self, *shape: int) -> torch.Tensor:
-        """Of the first block, which particles are added to by atomics: rounded sums cost the gradients precision."""
+        """Returns the first block's input, which atomics add particles to: rounded sums cost gradients precision."""
         return self._cell(*shape) if self.tuning.half_sums and not self.training else self._float(*shape)
 
     def _allocate(self, stores_pair_hidden: bool) -> None:

@@ -156,7 +156,7 @@ class FusedNetwork(Buffers):
             grid.balance(self.output, self.particle_count)
 
     def _operands(self) -> dict[str, Any]:
-        """What every kernel with products takes."""
+        """Returns the arguments of every kernel with products."""
         return {"weights": self.weights, "values": self.values, "WIDTH": self.width, "PRECISION": self.precision}
 
     def _clear(self, x: torch.Tensor, overlap: bool = False) -> None:
@@ -170,11 +170,11 @@ class FusedNetwork(Buffers):
         return (triton.cdiv(rows, block),)
 
     def overlaps(self) -> bool:
-        """Whether the kernels of a message step start before the one before has ended."""
+        """Returns whether a kernel of a message step starts before the previous one has ended."""
         return self.tuning.overlap and overlaps()
 
     def stores_pair_hidden(self) -> bool:
-        """Whether the hidden layer of the pairs is stored for the backward pass (see particle_cell_forward)."""
+        """Returns whether the hidden layer of pairs is stored for the backward pass (see particle_cell_forward)."""
         return self.precision == "tf32"
 
     def _mlp(

@@ -15,15 +15,15 @@ FULLY = tl.constexpr(1 << 24)  # how disturbed a coarsest cell is, where it is s
 
 @triton.jit
 def split_slot(local, ny, nz, stride):
-    """Of a slot of a level, counted from its first: the scene, and the cell in its window, which borders are -1 of."""
+    """Returns scene and cell of a slot of a level, counted from its first; a window's borders begin at cell -1."""
     inside = local % stride
     return local // stride, inside // (ny * nz) - 1, inside // nz % ny - 1, inside % nz - 1
 
 
 @triton.jit
 def most_around(disturbed, felt, part: tl.constexpr, neighbour, cell, there, capacity):
-    """What a coarsest cell and those across its faces have at most in one column of `disturbed` [C, 2], in units of
-    FULLY, goes into that of `felt` [C, 2], from 0 to 1."""
+    """Writes the maximum over a coarsest cell and those across its faces of a column of `disturbed` [C, 2], in units of
+    FULLY, to the same column of `felt` [C, 2], from 0 to 1."""
     most = tl.load(disturbed + cell * 2 + part, mask=there, other=0)
     for slot in tl.static_range(6):
         other = tl.load(neighbour + slot * capacity + cell, mask=there, other=-1)

@@ -26,7 +26,7 @@ def _before_mirror(cell, symmetry, axis: tl.constexpr):
 
 @triton.jit
 def _from_axis(x, y, z, symmetry, axis: tl.constexpr):
-    """That of the image's coordinates x, y, z which comes from this axis of the scene."""
+    """Returns the one of the image's coordinates x, y, z that comes from this axis of the scene."""
     z_or_y = tl.where((symmetry >> CODE_BITS & 3) == axis, y, z)
     return tl.where((symmetry & 3) == axis, x, z_or_y)
 

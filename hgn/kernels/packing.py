@@ -31,7 +31,7 @@ class PackedMLP:
     out: int
 
     def layers(self, second_bias: bool = True) -> dict[str, int]:
-        """Where the second layer and the norm are, by the kernels' names of it."""
+        """Returns the places of the second layer and the norm, by the kernels' names."""
         bias = {"second_bias_at": self.second_bias} if second_bias else {}
         norm = {"norm_weight_at": self.norm_weight, "norm_bias_at": self.norm_bias}
         return {"second_at": self.second, **bias, **norm}
@@ -45,8 +45,7 @@ class PackedMessagePassing:
 
 @dataclass(frozen=True)
 class PackedNetwork:
-    """Where everything is. `index` (int32, on the host) maps packed elements to the concatenated parameters, -1 for
-    padding."""
+    """The layout of the buffer. `index` (int32, on the host) maps packed elements to parameters, -1 for padding."""
 
     encode: PackedMLP
     particle_to_cell: PackedMLP

@@ -24,9 +24,9 @@ Launches = dict[str, tuple[Any, str]]  # kernels with what they are specialised 
 
 
 def unsupported_reason(version: str = triton.__version__, hip: str | None = torch.version.hip) -> str | None:
-    """Why kernels are not to be compiled by this Triton, in words; none if nothing speaks against it.
+    """Returns why this version of Triton cannot be used, or None.
 
-    A compiler's fault shows as wrong numbers. What it makes of these kernels was read for the versions named here.
+    Faults of a compiler show as wrong numbers; the code that these versions generate was inspected.
     """
     if hip is not None:
         return "its kernels have instructions of NVIDIA's GPUs alone"
@@ -36,18 +36,18 @@ def unsupported_reason(version: str = triton.__version__, hip: str | None = torc
 
 
 def interpreting() -> bool:
-    """Whether kernels run in Triton's interpreter."""
+    """Returns whether kernels run in Triton's interpreter."""
     return bool(triton.knobs.runtime.interpret)
 
 
 def capability() -> int:
-    """Of the GPU that kernels are compiled for, 90 for an H100; 0 for another than NVIDIA's."""
+    """Returns the compute capability that kernels are compiled for, 90 for an H100; 0 without an NVIDIA GPU."""
     target = triton.runtime.driver.active.get_current_target()
     return target.arch if target.backend == "cuda" else 0
 
 
 def overlaps() -> bool:
-    """Whether kernels may start before the one before them has ended (programmatic dependent launch)."""
+    """Returns whether a kernel may start before the previous one has ended (programmatic dependent launch)."""
     return not interpreting() and capability() >= 90
 
 
@@ -64,7 +64,7 @@ def settle_keys(names: dict[str, Any]) -> None:
 
 @contextmanager
 def noted_launches() -> Iterator[Launches]:
-    """Launches are noted, and neither compiled nor made."""
+    """Notes launches, which are neither compiled nor made."""
     launches: Launches = {}
 
     def note(*, fn: Any, compile: dict[str, Any], **_: Any) -> bool:

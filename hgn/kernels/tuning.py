@@ -1,6 +1,6 @@
-"""How many rows and warps the programs of HGN's kernels have, and how many programs run at once on an H100.
+"""The rows and warps of the kernels' programs, and how many programs an H100 runs at the same time.
 
-They change how fast, never what.
+They change speed, never results.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ LIGHT_BLOCK = (64, 4)  # rows and warps of a program that keeps two weights, of 
 
 
 def many(rows: int) -> bool:
-    """Whether so many rows keep all processors busy with large tiles."""
+    """Returns whether this number of rows keeps all processors busy with large tiles."""
     return rows >= FEW_ROWS
 
 
@@ -51,7 +51,7 @@ class Tuning:
 
     @staticmethod
     def of(precision: str) -> Tuning:
-        """What was fastest on an H100 at width 128."""
+        """Returns the fastest choices on an H100 at width 128."""
         if precision == "fp32":
             return Tuning(8, 4, 8, 4, 16, 4, 4, 2, 4, 1056, dense=True, loops=True, gather_block=16)
         if precision == "tf32":  # operands of twice the size
@@ -85,15 +85,15 @@ class Tuning:
         return 8 * block // 6 if self.dense else block
 
     def gathers(self, rows: int) -> bool:
-        """Whether sums of so many rows' neighbours have a kernel of their own."""
+        """Returns whether sums over the neighbours of this number of rows have a kernel of their own."""
         return self.gather_block > 0 and many(rows)
 
     def loops_over(self, rows: int, block: int, least: int = 1) -> bool:
-        """Whether a program keeps all its weights and takes one block after the other, where each has `least`."""
+        """Returns whether a program keeps all its weights and takes several blocks, at least `least`."""
         return self.loops and many(rows) and rows >= (least - 1) * PROCESSORS * block
 
     def row_programs(self, rows: int, block: int, loops: bool, at_once: int = 1) -> tuple[int]:
-        """Those that keep their weights fill a processor's shared memory each, or an `at_once`-th of it."""
+        """Returns the number of programs; `at_once` programs that keep their weights fill a processor."""
         programs = triton.cdiv(rows, block)
         return (min(programs, PROCESSORS * at_once) if loops else programs,)
 

@@ -32,9 +32,9 @@ class Barriers:
 
     @staticmethod
     def of(barriers: Sequence[Barrier]) -> Barriers | None:
-        """Of a batch, scene s from barriers[s]; none where no scene has an obstacle.
+        """Returns the barriers of a batch, scene s from barriers[s]; None if no scene has an obstacle.
 
-        Raises: ConfigError where those that have some have cells of more than one size.
+        Raises: ConfigError where scenes with obstacles have cells of more than one size.
         """
         if not any(len(barrier.row_F24) for barrier in barriers):
             return None

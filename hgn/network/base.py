@@ -1,4 +1,4 @@
-"""What every network of particles shares: the features, their normalisation, and the encoder (paper sec. 3.1).
+"""The parts that all networks of particles share: features, their normalisation, and the encoder (paper sec. 3.1).
 
 Shape legend: N particles, W width, S scenes.
 """
@@ -61,7 +61,7 @@ class ParticleNetwork(nn.Module, ABC):
         return acceleration_N3 + state.gravity_S3[state.scene_N] if self.config.relative else acceleration_N3
 
     def target(self, acceleration_N3: torch.Tensor, gravity_N3: torch.Tensor) -> torch.Tensor:
-        """What the raw output should be for these accelerations and gravity, all in frame units: the inverse."""
+        """Returns the raw output for these accelerations and gravity, all in frame units: the inverse."""
         return self.normaliser.normalise_acceleration(
             acceleration_N3 - gravity_N3 if self.config.relative else acceleration_N3
         )

@@ -26,7 +26,7 @@ STILL = 1e-30
 
 @dataclass(frozen=True, eq=False)
 class ParticleState:
-    """What the network is told of the particles of a batch of scenes."""
+    """The particles of a batch of scenes: the input of a network."""
 
     position_N3: torch.Tensor  # domain units
     velocity_NM3: torch.Tensor  # displacement per frame, newest first

@@ -30,7 +30,7 @@ def linear(value: torch.Tensor, weight: torch.Tensor, bias: torch.Tensor | None 
 
 
 def _few(value: torch.Tensor) -> bool:
-    """Whether its rows are padded. An exported graph is one for all sizes, and pads none."""
+    """Returns whether the rows are padded. An exported graph, which serves all sizes, does not pad."""
     return value.device.type == "cpu" and not is_exporting() and value.shape[:-1].numel() < MINIMUM_ROWS
 
 

@@ -29,7 +29,7 @@ class ObstacleCells:
 
     @staticmethod
     def of(grids: Sequence[ObstacleGrid]) -> ObstacleCells | None:
-        """The cells of a batch, scene s from grids[s]; none where no scene has an obstacle."""
+        """Returns the cells of a batch, scene s from grids[s]; None if no scene has an obstacle."""
         if not any(len(grid.cell_K3) for grid in grids):
             return None
         cell_size = grids[0].cell_size
@@ -46,7 +46,7 @@ class ObstacleCells:
         )
 
     def normals(self, position_N3: torch.Tensor, scene_N: torch.Tensor) -> torch.Tensor:
-        """n_o of each particle, [N, 3] in the positions' dtype; zero where its cell holds no obstacle."""
+        """Returns n_o of each particle, [N, 3] in the positions' dtype; zero in cells without obstacles."""
         cell_N3 = torch.floor(position_N3 / self.cell_size).long()
         index_N, found_N = find(self.key_K, pack(scene_N, cell_N3))
         return (self.normal_K3[index_N] * found_N[:, None]).to(position_N3.dtype)
@@ -54,7 +54,7 @@ class ObstacleCells:
 
 @lru_cache(REMEMBERED_SCENES)
 def _keys(grid: ObstacleGrid) -> torch.Tensor:
-    """Of scene 0, int64 [K]."""
+    """Returns the keys of the cells in scene 0, int64 [K]."""
     cell_K3 = torch.from_numpy(grid.cell_K3.astype(np.int64))
     key_K = pack(torch.zeros(len(cell_K3), dtype=torch.int64), cell_K3)
     assert bool((key_K[1:] > key_K[:-1]).all()), "obstacle cells come sorted and unique"

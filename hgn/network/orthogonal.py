@@ -43,7 +43,7 @@ def square_blocks(network: ParticleNetwork) -> torch.Tensor:
 
 
 def step_size(width: int) -> float:
-    """Of a step along an orthogonal matrix, in learning rates: the matrix's own elements have an rms of width^-1/2."""
+    """Returns the size of a step along an orthogonal matrix (elements of rms width^-1/2), in learning rates."""
     return RELATIVE_STEP * math.sqrt(width)
 
 

@@ -21,7 +21,7 @@ from hgn.network.obstacles import ObstacleCells
 
 @dataclass(frozen=True, eq=False)
 class Placement:
-    """Where an obstacle is, against where its scene has it: x -> R (x - c) + c + t."""
+    """The pose of an obstacle relative to that in its scene: x -> R (x - c) + c + t."""
 
     rotation_33: torch.Tensor
     pivot_3: torch.Tensor  # c, domain units

@@ -117,9 +117,8 @@ def surroundings(velocity_N3: torch.Tensor, grid: GridHierarchy) -> torch.Tensor
 def wall_nearness(
     position_N3: torch.Tensor, velocity_N3: torch.Tensor, domain_N3: torch.Tensor, reach: float
 ) -> torch.Tensor:
-    """How near the domain's six planes are, lower ones first, [N, 6]: 0 from `reach` on, 1 at the plane, at most 2.
-
-    A particle that flies towards a plane is as near as it would be one frame later.
+    """Returns the nearness of the domain's six planes, lower ones first, [N, 6]: 0 from `reach` on, 1 at the plane, at
+    most 2. For a particle that approaches a plane it is that of the next frame.
     """
     distance_N6 = torch.cat([position_N3, domain_N3 - position_N3], dim=-1)
     away_N6 = torch.cat([velocity_N3, -velocity_N3], dim=-1)
@@ -186,7 +185,8 @@ def adjugate(matrix_K33: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
 def disturbance(
     motion_NK: torch.Tensor, touch_N: torch.Tensor, grid: GridHierarchy
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """How far what is around each coarsest cell is from free flight in one piece, and from flight, 0 to 1, [C] each.
+    """Returns how far the particles around each coarsest cell are from free flight as one rigid body, and how much
+    surfaces disturb them, from 0 to 1, [C] each.
 
     A particle is disturbed by a surface within reach (`surface_gate`), or if a column of history or surroundings is
     not small against QUIET (rounding leaves 0). A coarsest cell is as disturbed as the most disturbed particle in it
@@ -271,7 +271,7 @@ def balanced(output_N9: torch.Tensor, contacts: Contacts, grid: GridHierarchy) -
 
 
 def coarsest_places(grid: GridHierarchy) -> torch.Tensor:
-    """Where particles are in the coarsest cells above their eight, [N, 8, 3]: from a cell's middle, of its edge."""
+    """Returns the particles' places in the coarsest cells above their eight, [N, 8, 3]: from the middle, in edges."""
     corner_83 = CORNER_83.to(grid.fraction_N3)
     place_N83, cell_N8 = grid.fraction_N3[:, None] - corner_83, grid.cell_N8
     for level in grid.levels[:-1]:
@@ -288,7 +288,7 @@ def inertia(spread_K33: torch.Tensor) -> torch.Tensor:
 
 
 def rotation(inertia_K33: torch.Tensor, moment_K3: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """How well a rotation is known, q [K] from 0 of a line or a point to 1, and W [K, 3] with I W = q L.
+    """Returns how well a rotation is determined, q [K] from 0 (a line or a point) to 1, and W [K, 3] with I W = q L.
 
     q = det I / (det I + m), W = adj(I) L / (det I + m), where m = (THIN (tr I / 3 + POINT))^3: both polynomials over
     what is never 0, so that nothing jumps, and what is q times a field less W is without any angular momentum.

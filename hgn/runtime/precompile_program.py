@@ -33,7 +33,7 @@ NICENESS = 10
 
 @dataclass(frozen=True)
 class PrecompileJob:
-    """What is trained, and on what."""
+    """A training whose kernels are compiled."""
 
     network: NetworkConfig
     settings: UpdateSettings
@@ -49,7 +49,7 @@ class PrecompileJob:
 
 @dataclass(frozen=True)
 class FrameJob:
-    """What simulates, how precisely, and at which sizes: particles, and cells of the finest level."""
+    """Simulations whose kernels are compiled."""
 
     networks: tuple[tuple[NetworkConfig, StepConfig, str], ...]  # with their precisions
     sizes: tuple[tuple[int, int], ...]
@@ -57,7 +57,7 @@ class FrameJob:
 
 
 def launches_of(job: PrecompileJob | FrameJob, device: str = "meta") -> Launches:
-    """Every kernel of a job with what it is specialised for, by a key of both; Triton's driver needs a target."""
+    """Returns every kernel of a job with its specialisation, by a key of both; Triton's driver needs a target."""
     with noted_launches() as launches:
         if isinstance(job, PrecompileJob):
             _update_launches(job, device)
@@ -87,7 +87,7 @@ def _update_launches(job: PrecompileJob, device: str) -> None:
 def _frame_launches(
     config: NetworkConfig, step: StepConfig, precision: str, sizes: tuple[tuple[int, int], ...], device: str
 ) -> None:
-    """Those of hgn.runtime.simulator; a level has a quarter of the cells of the one below."""
+    """Makes the launches of hgn.runtime.simulator; a level has a quarter of the cells of the one below."""
     with torch.device(device):
         network = HierarchicalGraphNetwork(config)
     for particles, cells in sizes:
@@ -129,7 +129,7 @@ def _simulation_launches(
 
 
 def compile_part(job: PrecompileJob | FrameJob, part: int, parts: int) -> int:
-    """Compiles every `parts`-th kernel from number `part` on; how many those are."""
+    """Compiles every `parts`-th kernel from number `part` on; returns how many those are."""
     mine = list(launches_of(job).values())[part::parts]
     for function, data in mine:
         build_launcher(preload(function, data))

@@ -23,7 +23,7 @@ CAUGHT = 0.5  # of a square's width over the ground: groups are placed above tha
 
 @dataclass(frozen=True)
 class Funnel:
-    """Where its parts are, from the middle of its hole. Domain units."""
+    """The places of a funnel's parts, from the middle of its hole. Domain units."""
 
     size: float  # side of the four squares
     quaternion: tuple[Quaternion, ...]  # of each square

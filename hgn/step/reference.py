@@ -123,7 +123,7 @@ def next_state(state: ParticleState, motion: Motion) -> ParticleState:
 
 
 def within_range(position_N3: torch.Tensor, domain_N3: torch.Tensor) -> torch.Tensor:
-    """Whether coordinates are finite and no farther from the domain than its own size, bool [N, 3]."""
+    """Returns whether coordinates are finite and no farther from the domain than its own size, bool [N, 3]."""
     return (position_N3 > -domain_N3) & (position_N3 < 2 * domain_N3)
 
 
@@ -270,11 +270,11 @@ def _direction(normal_N3: torch.Tensor, last_N3: torch.Tensor) -> torch.Tensor:
 def first_stop(
     barriers: Barriers, before_N3: torch.Tensor, after_N3: torch.Tensor, scene_N: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Which ways a triangle stops, bool [N]; by how much their ends are to be shifted, [N, 1], and along which unit
-    normals, [N, 3]; and the share of a way on which nothing is met, [N, 1].
+    """Returns which paths a triangle stops, bool [N]; the shifts of their ends [N, 1] along unit normals [N, 3]; and
+    the fraction of each path before the first triangle, [N, 1].
 
-    Shifts and normals are zero where nothing stops a way. Positions are finite. The way to a shifted end may be
-    stopped by another triangle.
+    Shifts and normals are zero for paths that nothing stops. Positions are finite. Another triangle may stop the path
+    to a shifted end.
     """
     particle_P, triangle_P = _pairs(barriers, before_N3, after_N3, scene_N)
     row_P24 = barriers.row_F24.to(before_N3.dtype)[triangle_P]
@@ -351,7 +351,7 @@ def pairs_of_boxes(
 
 
 def _covers(row_P24: torch.Tensor, place_P3: torch.Tensor) -> torch.Tensor:
-    """Whether a triangle covers a place in its plane, bool [P]."""
+    """Returns whether a triangle covers a place in its plane, bool [P]."""
     inside_P = ((place_P3 >= row_P24[:, 16:19]) & (place_P3 <= row_P24[:, 20:23])).all(-1)
     for plane in (4, 8, 12):
         inside_P = inside_P & ((row_P24[:, plane : plane + 3] * place_P3).sum(-1) <= row_P24[:, plane + 3])

@@ -43,7 +43,7 @@ def cell_mlp_forward(
 
     RESIDENT: all weights are read before the first tile, and kept. LOOP: a program has more than one tile.
 
-    Reference: tests/kernels/references.py; test: tests/kernels/test_kernels_alone.py.
+    Rule: hgn.network.hgn.MessagePassing; reference and test: tests/kernels/references.py, test_kernels_alone.py.
     """
     if OVERLAP:
         gdc_launch_dependents()
@@ -138,7 +138,7 @@ def cell_mlp_backward(
     sum_gradient [C, W] is that of the edges' sums. Without GATHER send_gradient is there already. RESIDENT as in
     cell_mlp_forward.
 
-    Reference: tests/kernels/references.py; test: tests/kernels/test_kernels_alone.py.
+    Rule: hgn.network.hgn.MessagePassing; reference and test: tests/kernels/references.py, test_kernels_alone.py.
     """
     if OVERLAP:
         gdc_launch_dependents()

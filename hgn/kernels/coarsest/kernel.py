@@ -18,7 +18,7 @@ DECODED = tl.constexpr(OUTPUTS)
 
 @triton.jit
 def _coarsest_places(place_of, row, live):
-    """Where particles are in these cells, three [N, 8]: from the cells' middles, in edges."""
+    """Returns the particles' places in these cells, three [N, 8]: from the cells' middles, in edges."""
     corner = tl.arange(0, 8)[None, :]
     at = place_of + row * 3
     x = tl.load(at, mask=live, other=0.0)[:, None] - (corner >> 2 & 1).to(tl.float32)
@@ -37,7 +37,7 @@ def sum_coarsest(
     felt [C, 2] is told how disturbed coarsest cells are (`most_around`; how touched was told before).
     Programs for as many particles as for coarsest cells.
 
-    Reference: hgn.network.relative.balanced and disturbance; test: tests/kernels/test_relative.py.
+    Rule: hgn.network.relative.balanced and disturbance; test: tests/kernels/test_relative.py.
     """
     row = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     if FEEL:
@@ -64,8 +64,8 @@ def sum_coarsest(
 
 @triton.jit
 def _slip(moments, cell, there, few, rare, mean, OUT: tl.constexpr):
-    """What surfaces leave free of the cells' means, as hgn.network.relative.slip, of the
-    products of normals behind the second moments."""
+    """Returns the cells' means without the part that surfaces forbid: hgn.network.relative.slip, from the products of
+    normals behind the second moments."""
     xx, yy, zz = three_columns(moments, cell, 9, there, 1.0, OUT)
     yz, xz, xy = three_columns(moments, cell, 12, there, 1.0, OUT)
     ratio = 1 / (few + rare * (xx + yy + zz))
@@ -80,9 +80,9 @@ def _pairs(
     moments, neighbour, motion, geometry, cell, there, mass, centre, inertia, capacity,
     LEVELS: tl.constexpr, OUT: tl.constexpr,
 ):  # fmt: skip
-    """Of the cells across the faces [C, 8], the last two of which are none: their numbers, one over their masses, the
-    axis and the sign of the direction to them, this cell's share of both masses, the product of both shares, their
-    centres of mass from their middles, how far these are apart, and the inertia of both about the centre of all."""
+    """Returns of the cells across the faces [C, 8], of which the last two do not exist: numbers, one over the masses,
+    axis and sign of the direction to them, this cell's share of both masses, the product of both shares, centres of
+    mass from the cells' middles, the distance of these, and the inertia of both about the centre of all."""
     slot = tl.arange(0, 8)[None, :]
     other = tl.load(neighbour + slot * capacity + cell[:, None], mask=there[:, None] & (slot < 6), other=-1)
     found = other >= 0
@@ -109,11 +109,11 @@ def balance(
     sums, moments, felt, motion, neighbour, geometry, counts, table, capacity, few, rare,
     LEVELS: tl.constexpr, OUT: tl.constexpr, OVERLAP: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """What the coarsest cells add to their particles' accelerations at their middles, of the sums of what these put
-    out, in columns 0 to 2 of table [C, OUT], the factor of these particles' own in column 3, and the rate of rotation
-    that cells add in columns 4 to 6.
+    """From sums of particles' outputs to the table [C, OUT] of the coarsest cells: the acceleration that a cell adds to
+    its particles at its middle (columns 0 to 2), the factor of the particles' own output (3), and the rate of rotation
+    that the cell adds (4 to 6).
 
-    Reference: hgn.network.relative.balanced; test: tests/kernels/test_relative.py.
+    Rule: hgn.network.relative.balanced; test: tests/kernels/test_relative.py.
     """
     count = tl.load(counts + LEVELS - 1)
     if tl.program_id(0) * BLOCK >= count:
@@ -170,7 +170,7 @@ def balance_backward(
     table [C, OUT] what coarsest cells add to the gradients of their particles' outputs at their middles, in column 9
     the factor of the accelerations' own, and in columns 10 to 12 the rate of rotation.
 
-    Reference: hgn.network.relative.balanced; test: tests/kernels/test_relative.py.
+    Rule: hgn.network.relative.balanced; test: tests/kernels/test_relative.py.
     """
     count = tl.load(counts + LEVELS - 1)
     if tl.program_id(0) * BLOCK >= count:
@@ -238,7 +238,7 @@ def _coarsest_of(motion, geometry, count, LEVELS: tl.constexpr, BLOCK: tl.conste
 
 @triton.jit
 def _felt(felt, cell, there):
-    """How disturbed and how touched cells are."""
+    """Returns how disturbed cells are, and how much surfaces disturb them."""
     return tl.load(felt + cell * 2, mask=there, other=0.0), tl.load(felt + cell * 2 + 1, mask=there, other=0.0)
 
 
@@ -257,7 +257,7 @@ def add_coarsest(
     [C, OUT], and adds its columns before that, each with the particles' shares, and the rotation in columns USED + 1 to
     USED + 3 about the cells' middles. COLUMNS: a power of two above USED.
 
-    Reference: hgn.network.relative.balanced; test: tests/kernels/test_relative.py.
+    Rule: hgn.network.relative.balanced; test: tests/kernels/test_relative.py.
     """
     row = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     live = row < tl.load(particle_count)

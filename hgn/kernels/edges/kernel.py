@@ -96,7 +96,7 @@ def edge_forward(
     what edge_backward reads: the hidden layer and the normalised output [C, 6, W], and `rstd` [C, 6], one over its
     standard deviation.
 
-    Reference: tests/kernels/references.py; test: tests/kernels/test_kernels_alone.py.
+    Rule: hgn.network.hgn.MessagePassing; reference and test: tests/kernels/references.py, test_kernels_alone.py.
     """
     if OVERLAP:
         gdc_launch_dependents()
@@ -225,7 +225,7 @@ def edge_backward(
 
     `rstd` is zero where there is no edge. It is read a tile ahead, for it says what else is read.
 
-    Reference: tests/kernels/references.py; test: tests/kernels/test_kernels_alone.py.
+    Rule: hgn.network.hgn.MessagePassing; reference and test: tests/kernels/references.py, test_kernels_alone.py.
     """
     if OVERLAP:
         gdc_launch_dependents()

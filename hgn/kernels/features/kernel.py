@@ -22,7 +22,7 @@ def sum_motion(
     """Adds mass and momentum of the finest cells to all cells above them, in `motion` [.., 4] of all levels, and tells
     the coarsest in `felt` [C, 2] how touched they are (`most_around`): two programs for as many finest cells.
 
-    Reference: hgn.network.relative; test: tests/kernels/test_network.py.
+    Rule: hgn.network.relative; test: tests/kernels/test_network.py.
     """
     if OVERLAP:
         gdc_wait()
@@ -56,7 +56,7 @@ def prepare_features(
     """Absolute features of each particle (velocities, normal if NORMALS, walls, one-hot material), [N, FEATURES].
     Without OBSTACLES nothing is looked up and the normals stay zero. SYMMETRY as in obstacle_normals.
 
-    Reference: hgn.network.features; test: tests/kernels/test_network.py.
+    Rule: hgn.network.features; test: tests/kernels/test_network.py.
     """
     count = tl.load(particle_count)
     if tl.program_id(0) * BLOCK >= count:
@@ -119,7 +119,7 @@ def prepare_relative_features(
     their asinh. `disturbed` [C, 2] of the coarsest cells, whose first numbers are raised to how disturbed their
     particles are, over FULLY.
 
-    Reference: hgn.network.relative; test: tests/kernels/test_network.py.
+    Rule: hgn.network.relative; test: tests/kernels/test_network.py.
     """
     HISTORIES: tl.constexpr = 3 * (HISTORY - 1)
     CONTACT: tl.constexpr = HISTORIES + 3 * LEVELS

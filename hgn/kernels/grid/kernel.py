@@ -30,8 +30,8 @@ def _base(position, origin, scene, row, live, axis: tl.constexpr, cell_size):
 
 @triton.jit
 def _base_cell(position, origin, scene, row, live, low, geometry, cell_size):
-    """Of each particle the lowest of its 8 cells, counted from the window's first, its fractions, and whether the
-    window holds all 8; else cell 0."""
+    """Returns the lowest of each particle's 8 cells, counted from the window's first, its fractions, and whether the
+    window contains all 8; cell 0 if it does not."""
     x, fx = _base(position, origin, scene, row, live, 0, cell_size)
     y, fy = _base(position, origin, scene, row, live, 1, cell_size)
     z, fz = _base(position, origin, scene, row, live, 2, cell_size)
@@ -47,7 +47,7 @@ def _base_cell(position, origin, scene, row, live, low, geometry, cell_size):
 
 @triton.jit
 def _slots_of(geometry, level: tl.constexpr):
-    """Of a level what `_slot` needs: the compiler would read it again for each slot."""
+    """Returns the numbers of a level that `_slot` needs: the compiler would read them again for each slot."""
     line = geometry + level * GEOMETRY_COLUMNS
     return tl.load(line), tl.load(line + 2), tl.load(line + 3), tl.load(line + 4)
 
@@ -65,7 +65,7 @@ def mark_cells(
 ):  # fmt: skip
     """Sets the slots of the cells that particles reach, and of their ancestors; one pass for all levels.
 
-    Reference: hgn.network.grid.build_hierarchy; test: tests/kernels/test_network.py.
+    Rule: hgn.network.grid.build_hierarchy; test: tests/kernels/test_network.py.
     """
     count = tl.load(particle_count)
     if tl.program_id(0) * BLOCK >= count:
@@ -101,7 +101,7 @@ def mark_cells(
 
 @triton.jit
 def _marked(occupied, slot, ask):
-    """Whether the cell in a slot is active."""
+    """Returns whether the cell in a slot is active."""
     return ask & (tl.load(occupied + slot, mask=ask, other=0) > 0)
 
 
@@ -141,7 +141,7 @@ def fill_tables(
 ):  # fmt: skip
     """Each active slot writes its cell's neighbours, parent and children, int32, -1 where there is none.
 
-    Reference: hgn.network.grid.build_hierarchy; test: tests/kernels/test_network.py.
+    Rule: hgn.network.grid.build_hierarchy; test: tests/kernels/test_network.py.
     """
     if OVERLAP:
         gdc_launch_dependents()  # who needs the cells' numbers alone
@@ -211,8 +211,8 @@ def _surfaces(
     position, velocity, domain, row, live, scene, obstacle_table, obstacle_cell_size, reach,
     HISTORY: tl.constexpr, OBSTACLES: tl.constexpr, SYMMETRY: tl.constexpr,
 ):  # fmt: skip
-    """How near the walls are, and the normals here and ahead, columns 0 to 11 of [N, 16]; and how near any surface is,
-    from 0 beyond its reach to 1, [N]."""
+    """Returns the nearness of walls and the normals here and ahead, columns 0 to 11 of [N, 16]; and the nearness of the
+    nearest surface, from 0 beyond its reach to 1, [N]."""
     column = tl.arange(0, 16)
     axis, upper, walls = column % 3, (column >= 3)[None, :], live[:, None] & (column < 6)[None, :]
     v = tl.load(velocity + row[:, None] * (3 * HISTORY) + axis[None, :], mask=walls, other=0.0)
@@ -261,8 +261,9 @@ def _surface_normals(surfaces):
 
 @triton.jit
 def _coarsest_part(x, fraction, high, LEVELS: tl.constexpr):
-    """Of one axis: whether a corner's coarsest cell is not that of the corner below [N, 8], a particle's share of it,
-    and its place [N] in that of the lower corners, from the middle, in edges. x is the lower corners' coordinate."""
+    """Returns along one axis whether a corner's coarsest cell differs from that of the corner below [N, 8], the weight
+    of a particle in it, and its place [N] in that of the lower corners, from the middle, in edges. x is the lower
+    corners' coordinate."""
     ABOVE: tl.constexpr = LEVELS - 1
     EDGE: tl.constexpr = 1 << ABOVE
     split = ((x + (fraction > 0).to(tl.int32)) >> ABOVE) != x >> ABOVE
@@ -288,7 +289,7 @@ def prepare_particles(
     their products xx, yy, zz, yz, xz, xy are added to the coarsest cells' `moments` [C, COLUMNS], and those of the
     normals of touched surfaces behind them. OBSTACLES and SYMMETRY as in prepare_features.
 
-    Reference: hgn.network.grid.build_hierarchy and hgn.network.relative; test: tests/kernels/test_network.py.
+    Rule: hgn.network.grid.build_hierarchy and hgn.network.relative; test: tests/kernels/test_network.py.
     """
     count = tl.load(particle_count)
     if tl.program_id(0) * BLOCK >= count:

@@ -174,7 +174,7 @@ class DeviceGrid:
         return self._octant[self._at[level] : self._at[level] + self.capacities[level]]
 
     def count(self, level: int) -> torch.Tensor:
-        """How many cells are active, [1], on the device."""
+        """Returns the number of active cells, [1], on the device."""
         return self.counts_L[level : level + 1]
 
     def build(self, particles: DeviceParticles) -> None:

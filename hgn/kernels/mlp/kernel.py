@@ -78,7 +78,7 @@ def mlp_forward(
     LOOP: a program takes one tile after the other, and reads its weights once. OVERLAP: it starts before the launch
     before it has ended, and what it reads of weights ahead it reads meanwhile.
 
-    Reference: tests/kernels/references.py; test: tests/kernels/test_kernels_alone.py.
+    Rule: hgn.network.mlp.MLP; reference and test: tests/kernels/references.py, test_kernels_alone.py.
     """
     count = tl.load(count_ptr)
     if tl.program_id(0) * BLOCK >= count:
@@ -197,7 +197,7 @@ def mlp_backward(
     (NEXT). INTO: 0 no gradient of x, 1 write it, 2 add it to what is there. Gains, shifts and offset weights are summed
     into `totals`, divided by the loss rstd (`unscale`); hidden_gradient and second_gradient are left for the others.
 
-    Reference: tests/kernels/references.py; test: tests/kernels/test_kernels_alone.py.
+    Rule: hgn.network.mlp.MLP; reference and test: tests/kernels/references.py, test_kernels_alone.py.
     """
     count = tl.load(count_ptr)
     if tl.program_id(0) * BLOCK >= count:
@@ -257,7 +257,7 @@ def mlp_backward(
 def clear_rows(x, count_ptr, WIDTH: tl.constexpr, OVERLAP: tl.constexpr, BLOCK: tl.constexpr):
     """Zeros into the rows of x [.., W] that are in use: capacities have room for twice as many.
 
-    Reference: tests/kernels/references.py; test: tests/kernels/test_kernels_alone.py.
+    Rule: hgn.network.mlp.MLP; reference and test: tests/kernels/references.py, test_kernels_alone.py.
     """
     count = tl.load(count_ptr)
     row = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
@@ -277,7 +277,7 @@ def gather_sums(
     In a kernel of its own where there are many rows: its programs are small enough that many wait at once, while a
     kernel with products has registers for two rows at a time.
 
-    Reference: tests/kernels/references.py; test: tests/kernels/test_kernels_alone.py.
+    Rule: hgn.network.mlp.MLP; reference and test: tests/kernels/references.py, test_kernels_alone.py.
     """
     count = tl.load(count_ptr)
     if tl.program_id(0) * BLOCK >= count:
@@ -298,7 +298,7 @@ def gather_project(
     """y = x, or with SUM > 0 the sum of x's rows listed in table [SUM, capacity] (-1: none); and two products of y, the
     second with a bias. LOOP and OVERLAP as in mlp_forward.
 
-    Reference: tests/kernels/references.py; test: tests/kernels/test_kernels_alone.py.
+    Rule: hgn.network.mlp.MLP; reference and test: tests/kernels/references.py, test_kernels_alone.py.
     """
     count = tl.load(count_ptr)
     if tl.program_id(0) * BLOCK >= count:
@@ -346,7 +346,7 @@ def gather_project_backward(
     With EDGES, x is [capacity, SUM, W], of the row listed for a direction the opposite direction's part is taken, and
     the product of `other` [capacity, W] with its own weights is added to the gradient.
 
-    Reference: tests/kernels/references.py; test: tests/kernels/test_kernels_alone.py.
+    Rule: hgn.network.mlp.MLP; reference and test: tests/kernels/references.py, test_kernels_alone.py.
     """
     count = tl.load(count_ptr)
     if tl.program_id(0) * BLOCK >= count:

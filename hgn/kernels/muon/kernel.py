@@ -18,7 +18,7 @@ def momentum_directions(
     Nesterov's, normalised, goes to direction [blocks, WIDTH, WIDTH]. A program a block; nothing where `adam` does
     nothing.
 
-    Reference: hgn.training.muon.Muon; test: tests/kernels/test_update.py.
+    Rule: hgn.training.muon.Muon; test: tests/kernels/test_update.py.
     """
     if tl.load(status) != 0:
         return
@@ -45,7 +45,7 @@ def step_blocks(
     """Moves square blocks against their directions by rate times `step_size`; values and weights are written as `adam`
     does.
 
-    Reference: hgn.training.muon.Muon; test: tests/kernels/test_update.py.
+    Rule: hgn.training.muon.Muon; test: tests/kernels/test_update.py.
     """
     if tl.load(status) != 0:
         return

@@ -12,8 +12,8 @@ WARPS = 8
 
 
 def direction_dtype(device: torch.device) -> torch.dtype:
-    """Of the directions. On a GPU they are orthogonal to a hundredth, as the iterations are: products in bfloat16,
-    summed in float32."""
+    """Returns the type of the directions. On a GPU products are in bfloat16, summed in float32: the directions are
+    orthogonal to a hundredth, like the iterations."""
     return torch.float32 if device.type == "cpu" else torch.bfloat16
 
 

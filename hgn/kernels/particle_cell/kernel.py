@@ -94,7 +94,7 @@ def particle_cell_forward(
     SAVE keeps what particle_cell_backward reads: the normalised output [8 N, W], `rstd` [8 N], one over its standard
     deviation, and the hidden layer unless BY_PRODUCT: then it is cheaper to compute again.
 
-    Reference: tests/kernels/references.py; test: tests/kernels/test_kernels_alone.py.
+    Rule: hgn.network.hgn; reference and test: tests/kernels/references.py, test_kernels_alone.py.
     """
     ROWS: tl.constexpr = PARTICLES * 8
     SUMS: tl.constexpr = 16  # the least that the matrix units take; room for PARTICLES sums and three more
@@ -203,7 +203,7 @@ def particle_cell_backward(
     second_gradient [8 N, W] is left for the weight product. Where the hidden layer was not kept it is computed again,
     to the same bits.
 
-    Reference: tests/kernels/references.py; test: tests/kernels/test_kernels_alone.py.
+    Rule: hgn.network.hgn; reference and test: tests/kernels/references.py, test_kernels_alone.py.
     """
     ROWS: tl.constexpr = PARTICLES * 8
     SUMS: tl.constexpr = 16  # the least that the matrix units take; room for PARTICLES sums and three more
@@ -317,7 +317,7 @@ def particle_cell_weight_gradient(
     PIPELINED: the compiler has a counted loop's tiles copied to shared memory two ahead. The interpreter of Triton 3.6
     counts to no number that was loaded.
 
-    Reference: tests/kernels/references.py; test: tests/kernels/test_kernels_alone.py.
+    Rule: hgn.network.hgn; reference and test: tests/kernels/references.py, test_kernels_alone.py.
     """
     SUMS: tl.constexpr = 16
     count = tl.load(count_ptr)

@@ -92,7 +92,7 @@ def sum_displacements(
     [N], the place from there into `spot_of` [N, 3], and the gate into `gate_of` [N]: 0 for materials whose bit is not
     in RESTING; with -1 all are.
 
-    Reference: hgn.step.reference.Deformation; test: tests/kernels/test_relative.py.
+    Rule: hgn.step.reference.Deformation; test: tests/kernels/test_relative.py.
     """
     row = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     live = row < tl.load(particle_count)
@@ -131,7 +131,7 @@ def find_deformation(
     their table [K, RATES]: what is subtracted there, the factor of a particle's own in column 3, and the rate of
     rotation that is subtracted in columns 4 to 6.
 
-    Reference: hgn.step.reference.Deformation; test: tests/kernels/test_relative.py.
+    Rule: hgn.step.reference.Deformation; test: tests/kernels/test_relative.py.
     """
     middle = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     there = middle < count
@@ -164,7 +164,7 @@ def slow_displacements(
     """Writes the slow part of the deformation by the middles' table into `slow` [N, 3], and adds it with its moments to
     the sums [K, RATES].
 
-    Reference: hgn.step.reference.rest; test: tests/kernels/test_relative.py.
+    Rule: hgn.step.reference.rest; test: tests/kernels/test_relative.py.
     """
     row = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     live = row < tl.load(particle_count)
@@ -194,7 +194,7 @@ def stop_slow(
 ):  # fmt: skip
     """Takes what of `slow` [N, 3] deforms, by the middles' table, off columns 0 to 2 of x [N, OUT].
 
-    Reference: hgn.step.reference.Deformation; test: tests/kernels/test_relative.py.
+    Rule: hgn.step.reference.Deformation; test: tests/kernels/test_relative.py.
     """
     row = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     live = row < tl.load(particle_count)
@@ -215,7 +215,7 @@ def stop_slow(
 
 @triton.jit
 def _wall_limit(x, before, size, near, far):
-    """Whether a wall is in the way from `before` to x on an axis, and where it holds it."""
+    """Returns whether a wall stops the path from `before` to x on an axis, and the coordinate where it ends."""
     low, high = tl.where(before < near, before, near), tl.where(before > size - far, before, size - far)
     inside = (x > -size) & (x < 2 * size)  # NaN is outside
     return inside & ((x < low) | (x > high)), tl.where(x < low, low, high)
@@ -239,7 +239,7 @@ def _distance(row, x, y, z, live):
 
 @triton.jit
 def _covers(row, x, y, z, live):
-    """Whether a triangle covers a place in its plane."""
+    """Returns whether a triangle covers a place in its plane."""
     inside = live & (x >= tl.load(row + 16, mask=live, other=0.0)) & (x <= tl.load(row + 20, mask=live, other=0.0))
     inside = inside & (y >= tl.load(row + 17, mask=live, other=0.0)) & (y <= tl.load(row + 21, mask=live, other=0.0))
     inside = inside & (z >= tl.load(row + 18, mask=live, other=0.0)) & (z <= tl.load(row + 22, mask=live, other=0.0))
@@ -250,8 +250,8 @@ def _covers(row, x, y, z, live):
 
 @triton.jit
 def _first_stop(bx, by, bz, x, y, z, line, live, within, slack):
-    """Which ways from (bx, by, bz) to (x, y, z) a triangle stops; by how much their ends are to be shifted along which
-    unit normals; and the share of a way on which nothing is met."""
+    """Returns which paths from (bx, by, bz) to (x, y, z) a triangle stops, the shifts of their ends along unit normals,
+    and the fraction of each path before the first triangle: hgn.step.reference.first_stop."""
     bits = tl.load(line + 6, mask=live, other=ONE)
     cell_size = bits.to(tl.int32).to(tl.float32, bitcast=True)
     span = tl.load(line + 2, mask=live, other=0).to(tl.pointer_type(tl.int32))
@@ -309,13 +309,13 @@ def _stopped_by_obstacles(
     bx, by, bz, x, y, z, width, height, depth, line, live, within, slack, least_crease, near, far,
     SURFACES: tl.constexpr, WALLED: tl.constexpr,
 ):  # fmt: skip
-    """Where ways from (bx, by, bz) to (x, y, z) end, which are between the walls, in domains of so much width, height
-    and depth: up to SURFACES triangles stop one after the other, and walls, where WALLED, again; what a further one
-    stops ends where it meets one. `line` is the scenes' row of the barrier table; all are vectors of particles. What is
-    out of range is not held.
+    """Returns the ends of paths from (bx, by, bz) to (x, y, z) between the walls of domains of this width, height and
+    depth, outside obstacles. Up to SURFACES triangles stop a path one after the other, and with WALLED the walls after
+    each; where a further one would, the path ends at the triangle that it meets first. `line` is the scenes' row of
+    the barrier table; all are vectors of particles. Particles out of range are not constrained.
 
-    Triangles stop what comes within `within` of them, and put it farther by `slack`. Planes whose squared sine is at
-    most `least_crease` are one.
+    Triangles stop particles that come within `within` of them, and move them away by `slack`. Planes whose squared sine
+    is at most `least_crease` count as one.
     """
     live = live & (x > -width) & (x < 2 * width) & (y > -height) & (y < 2 * height)
     live = live & (z > -depth) & (z < 2 * depth)  # NaN is not
@@ -359,7 +359,7 @@ def integrate(
     walls of the first WALLED_AXES axes, `near` and `far` from the planes, and, with SURFACES, outside the obstacles of
     `barrier_table`, see `_stopped_by_obstacles`.
 
-    Reference: hgn.step.reference.advanced; test: tests/kernels/test_rollout.py, tests/kernels/test_barriers.py.
+    Rule: hgn.step.reference.advanced; test: tests/kernels/test_rollout.py, tests/kernels/test_barriers.py.
     """
     if OVERLAP:
         gdc_wait()
@@ -422,7 +422,7 @@ def integrate(
 def advance(status, lost, frame, OVERLAP: tl.constexpr):
     """Counts the frame, unless it was not taken.
 
-    Reference: hgn.runtime.torch_stepper; test: tests/kernels/test_rollout.py.
+    Rule: hgn.runtime.torch_stepper; test: tests/kernels/test_rollout.py.
     """
     if OVERLAP:
         gdc_wait()

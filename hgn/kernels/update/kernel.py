@@ -36,7 +36,7 @@ def draw_waves(
     waves [S, WAVES, 4 + 3 HISTORY]: wave vector (direction uniform, length log-uniform), phase, and what the amplitude
     gains with each velocity, the oldest first.
 
-    Reference: hgn.training.noise; test: tests/kernels/test_update.py.
+    Rule: hgn.training.noise; test: tests/kernels/test_update.py.
     """
     scene = tl.program_id(0)
     sample = samples + (tl.load(update).to(tl.int64) * scenes + scene) * SAMPLE_COLUMNS
@@ -74,7 +74,7 @@ def assemble_batch(
     the window is the image of the stored one; velocities come from the stored positions, for mirrored ones are rounded.
     SCENES: a power of two, at least `scenes`. Axes from DIMENSIONS on have neither noise nor jitter.
 
-    Reference: hgn.training.noise; test: tests/kernels/test_update.py.
+    Rule: hgn.training.noise; test: tests/kernels/test_update.py.
     """
     table = samples + tl.load(update).to(tl.int64) * scenes * SAMPLE_COLUMNS
     vectors = sample_vectors + tl.load(update) * scenes * 6
@@ -169,7 +169,7 @@ def loss_gradient(
 ):
     """Mean squared error of the normalised acceleration over axes, particles, scenes; its gradient times `scale`.
 
-    Reference: torch's autograd; test: tests/kernels/test_update.py.
+    Rule: torch's autograd; test: tests/kernels/test_update.py.
     """
     count = tl.load(particle_count)
     if tl.program_id(0) * BLOCK >= count:
@@ -218,7 +218,7 @@ def adam(
     rates [updates]; step, float64 [1], counts the steps made. `weight` is the copy that products at
     this precision read. `others`, int8 [size] or none, tells which elements another optimiser steps.
 
-    Reference: torch.optim.Adam; test: tests/kernels/test_update.py.
+    Rule: torch.optim.Adam; test: tests/kernels/test_update.py.
     """
     if tl.load(status) != 0:
         return
@@ -254,7 +254,7 @@ def average_values(value, average, shares, update, status, size, BLOCK: tl.const
 
     Not while the update has to be made again; after one that was skipped, with the values that stayed.
 
-    Reference: hgn.training.torch_updates.TorchUpdates; test: tests/kernels/test_training.py.
+    Rule: hgn.training.torch_updates.TorchUpdates; test: tests/kernels/test_training.py.
     """
     if (tl.load(status) & AGAIN) != 0:
         return

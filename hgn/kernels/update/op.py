@@ -92,7 +92,7 @@ AnySample = DeviceSample | tuple[DeviceEpisode, int, int]
 
 @dataclass(frozen=True)
 class UpdateSettings:
-    """What an update does, as hgn.config.TrainingConfig says it."""
+    """The settings of hgn.config.TrainingConfig that an update depends on."""
 
     scenes: int
     noise_std: float
@@ -353,7 +353,7 @@ class Updates:
         )  # fmt: skip
 
     def _grid(self) -> None:
-        """What follows from where the particles are."""
+        """Builds the grid, and cells and features of the particles."""
         self.grid.build(self.buffers)
         self.grid.prepare(self.buffers, self.scale, self.obstacles, self.settings.symmetry)
 

@@ -25,7 +25,7 @@ def weight_gradient(
 
     PIPELINED: the compiler has tiles copied to shared memory two ahead, as it has not in the interpreter.
 
-    Reference: tests/kernels/references.py; test: tests/kernels/test_kernels_alone.py.
+    Rule: torch.nn.Linear; reference and test: tests/kernels/references.py, test_kernels_alone.py.
     """
     job = jobs + tl.load(chunk_job + tl.program_id(0)) * 8
     first = tl.load(chunk_first + tl.program_id(0))
