@@ -7,13 +7,14 @@ Shape legend: N particles, C cells, W width.
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import torch
 
-from hgn.config import MATERIAL_EMBEDDING, NetworkConfig
+from hgn.config import MATERIAL_EMBEDDING
 from hgn.kernels.buffers import OUT, Block, Stored
 from hgn.kernels.cell_mlp.kernel import cell_mlp_backward
 from hgn.kernels.edges.kernel import edge_backward
@@ -76,7 +77,6 @@ class FusedTrainingNetwork(FusedNetwork):
 
     def __init__(
         self,
-        config: NetworkConfig,
         packed: PackedNetwork,
         values: torch.Tensor,
         grid: DeviceGrid,
@@ -90,7 +90,7 @@ class FusedTrainingNetwork(FusedNetwork):
 
         Behind the gradients `totals` has the encoder's combined first layer, and `tail` elements for other use.
         """
-        super().__init__(config, packed, values, grid, particle_count, precision, True, tuning)
+        super().__init__(packed, values, grid, particle_count, precision, True, tuning)
         self.unscale, self.copy_precision = 1.0 / loss_scale, precision
         self._allocate_gradients(tail)
 
@@ -108,16 +108,16 @@ class FusedTrainingNetwork(FusedNetwork):
         self.sum_gradient = self._operand(capacities[0], width)
         # what the weights' products read lies in one arena, so that one launch can reach it all
         sizes: list[int] = []
-        self._gradients(lambda *shape: self._sized(sizes, shape))
+
+        def noted(*shape: int) -> torch.Tensor:
+            sizes.append(math.prod(shape))
+            return torch.empty(0)
+
+        self._gradients(noted)
         self.left = self._operand(sum(sizes))
         views = iter(self.left.split(sizes))
         self.g = self._gradients(lambda *shape: next(views).view(shape))
         self._plan_weight_gradients()
-
-    @staticmethod
-    def _sized(sizes: list[int], shape: tuple[int, ...]) -> torch.Tensor:
-        sizes.append(torch.Size(shape).numel())
-        return torch.empty(0)
 
     def _gradients(self, take: Callable[..., torch.Tensor]) -> Gradients:
         """All gradients that the weights' products read, each a piece that `take` makes of a shape."""
@@ -146,9 +146,6 @@ class FusedTrainingNetwork(FusedNetwork):
             coarse_to_fine=[mlp(count) for count in capacities[:-1]],
         )
 
-    def _blocks_of_steps(self) -> list[tuple[Block, list[StepGradients]]]:
-        return [*zip(self.down, self.g.down, strict=True), *zip(self.up, self.g.up, strict=True)]
-
     def _plan_weight_gradients(self) -> None:
         packed, grid = self.packed, self.grid
         particles = grid.levels  # row of the counts table
@@ -171,7 +168,8 @@ class FusedTrainingNetwork(FusedNetwork):
         if self.stores_pair_hidden():
             job(g.particle_to_cell.output, self.pairs_down.hidden, pair.second, particles, pair.second_bias, 8)
             job(g.cell_to_particle.output, self.pairs_up.hidden, back.second, particles, back.second_bias, 8)
-        for block, gradients in self._blocks_of_steps():
+        blocks = [*zip(self.down, self.g.down, strict=True), *zip(self.up, self.g.up, strict=True)]
+        for block, gradients in blocks:
             for m, step in enumerate(gradients):
                 edge, cell = block.packed.edge[m], block.packed.cell[m]
                 job(step.edge.output, block.edge_stored[m].hidden, edge.second, block.level, edge.second_bias)
@@ -193,7 +191,8 @@ class FusedTrainingNetwork(FusedNetwork):
             job(g.coarse_to_fine[i].output, self.transfer_hidden_up[i], up.second, i, up.second_bias)
         self._weight_jobs = []
         for dtype, chunk in itertools.product(dict.fromkeys((torch.float32, self.operand)), CHUNK_ROWS):
-            mine = [entry for entry in jobs if entry[1].dtype == dtype and chunk == _chunk_rows(entry[0])]
+            alike = [entry for entry in jobs if chunk == CHUNK_ROWS[_rows(entry[0]) >= MANY_ROWS]]
+            mine = [entry for entry in alike if entry[1].dtype == dtype]
             if not mine:
                 continue
             # offsets from the lowest address: allocations are aligned far beyond an element
@@ -202,7 +201,7 @@ class FusedTrainingNetwork(FusedNetwork):
             chunk_job: list[int] = []
             chunk_first: list[int] = []
             for left, right, at, count, bias, multiple in mine:
-                rows_held = _mlp(left)
+                rows_held = _rows(left)
                 multiple = 6 if left.dim() == 3 else multiple
                 left_at = (left.data_ptr() - self.left.data_ptr()) // left.element_size()
                 right_at = (right.data_ptr() - base.data_ptr()) // right.element_size()
@@ -439,9 +438,5 @@ class FusedTrainingNetwork(FusedNetwork):
         self._gather_backward(level, gradients[0].edge.hidden, table, 6, first.parts[0], into, gradient, True, received)
 
 
-def _mlp(table: torch.Tensor) -> int:
+def _rows(table: torch.Tensor) -> int:
     return table.numel() // table.shape[-1]
-
-
-def _chunk_rows(table: torch.Tensor) -> int:
-    return CHUNK_ROWS[_mlp(table) >= MANY_ROWS]

@@ -11,7 +11,7 @@ from typing import Any
 import torch
 import triton
 
-from hgn.config import MATERIAL_EMBEDDING, NetworkConfig
+from hgn.config import MATERIAL_EMBEDDING
 from hgn.kernels.buffers import Block, Buffers, Stored
 from hgn.kernels.cell_mlp.kernel import cell_mlp_forward
 from hgn.kernels.edges.kernel import edge_forward
@@ -49,7 +49,6 @@ class FusedNetwork(Buffers):
 
     def __init__(
         self,
-        config: NetworkConfig,
         packed: PackedNetwork,
         values: torch.Tensor,
         grid: DeviceGrid,
@@ -59,6 +58,7 @@ class FusedNetwork(Buffers):
         tuning: Tuning | None = None,
     ) -> None:
         assert precision in PRECISIONS
+        config = grid.config
         _require_room(grid, config.width, training)
         self.config, self.packed, self.grid, self.precision = config, packed, grid, precision
         self.values, self.training, self.width = values, training, config.width

@@ -223,17 +223,12 @@ class TritonStepper:
         self.grid = DeviceGrid(
             config, window, rounded, scenes=self.scenes, particles=self.particles, device=self.device, more=more
         )
-        self.step = DeviceStep(self.step_config, config, self.grid, self.barriers)
+        self.step = DeviceStep(self.step_config, self.grid, self.barriers)
         tuning = Tuning.of(self.precision)
         tuning = replace(tuning, half_sums=tuning.half_sums and not self._careful)
+        count, precision = self.buffers.count, self.precision
         self.fused = FusedNetwork(
-            config,
-            self.packed,
-            self.values,
-            self.grid,
-            particle_count=self.buffers.count,
-            precision=self.precision,
-            tuning=tuning,
+            self.packed, self.values, self.grid, particle_count=count, precision=precision, tuning=tuning
         )
         if self.device.type == "cuda":
             self.graph = self._capture()

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import multiprocessing
 import os
 import signal
+import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from functools import partial
 from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnProcess
-from typing import Any
+from typing import Any, BinaryIO
 
 PR_SET_PDEATHSIG = 1  # linux/prctl.h
 
@@ -19,6 +22,46 @@ def die_with_parent(number: int) -> None:
     """Asks Linux, in a child process, to send it the signal `number` when its parent ends for any reason."""
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, number)
+
+
+class Program:
+    """A command in a process group of its own: Ctrl-C reaches only this process. It gets SIGINT when this one ends."""
+
+    def __init__(self, command: Sequence[str], output: BinaryIO, text: str = "") -> None:
+        """Starts it with `text` as its input; `output` is the file of its messages."""
+        self.output = output
+        self._process = subprocess.Popen(
+            command,
+            stdin=subprocess.PIPE,
+            stdout=output,
+            stderr=output,
+            preexec_fn=partial(die_with_parent, signal.SIGINT),
+            process_group=0,
+        )
+        assert self._process.stdin is not None
+        with contextlib.suppress(BrokenPipeError), self._process.stdin:  # where it has ended already
+            self._process.stdin.write(text.encode())
+
+    @property
+    def exit_code(self) -> int | None:
+        """None while it runs."""
+        return self._process.poll()
+
+    def stop(self, patience_s: float = 0.0) -> None:
+        """Ends its group: as Ctrl-C does if there is patience, and then by SIGKILL."""
+        for number in (signal.SIGINT, signal.SIGKILL)[patience_s == 0 :]:
+            if self.exit_code is None:
+                os.killpg(self._process.pid, number)
+                with contextlib.suppress(subprocess.TimeoutExpired):
+                    self._process.wait(patience_s if number == signal.SIGINT else None)
+
+
+def last_message(file: BinaryIO) -> str:
+    """Returns the last line of a program's output that is no JSON."""
+    file.seek(0, os.SEEK_END)
+    file.seek(max(file.tell() - 8192, 0))
+    lines = map(str.strip, file.read().decode("utf-8", "replace").splitlines())
+    return next((line for line in reversed(list(lines)) if line and not line.startswith("{")), "no message")
 
 
 def start_child(

@@ -101,7 +101,7 @@ def check_checkpoint(checkpoint: dict[str, Any], config: TrainConfig, config_has
     remedy = "set it so, or choose another run=FOLDER"
     # The dataclass adds the default of a key that the checkpoint lacks.
     stored, section = _network_config(checkpoint, path), checkpoint[SECTION]
-    pairs = _network_pairs(stored, config) + _step_pairs(checkpoint, config)
+    pairs = _pairs("network", stored, config.network) + _pairs("step", _step_config(checkpoint), config.step)
     pairs.append(("training.noise_std", section["noise_std"], config.training.noise_std))  # part of the normaliser
     _require_equal(pairs, f" to resume {path}", remedy)
     if section["data"]["config_hash"] != config_hash:
@@ -111,16 +111,10 @@ def check_checkpoint(checkpoint: dict[str, Any], config: TrainConfig, config_has
         )
 
 
-def _network_pairs(network: NetworkConfig, config: TrainConfig) -> list[tuple[str, Any, Any]]:
-    """Returns each key of the network settings with the stored and the configured value."""
-    stored, wanted = to_mapping(network), to_mapping(config.network)
-    return [(f"network.{key}", stored[key], wanted[key]) for key in sorted(stored)]
-
-
-def _step_pairs(checkpoint: dict[str, Any], config: TrainConfig) -> list[tuple[str, Any, Any]]:
-    """Returns the same of the constraints of a frame."""
-    stored, wanted = to_mapping(_step_config(checkpoint)), to_mapping(config.step)
-    return [(f"step.{key}", stored[key], wanted[key]) for key in sorted(stored)]
+def _pairs(section: str, stored: NetworkConfig | StepConfig, wanted: Any) -> list[tuple[str, Any, Any]]:
+    """Returns each key of a section with the stored and the configured value."""
+    theirs, ours = to_mapping(stored), to_mapping(wanted)
+    return [(f"{section}.{key}", theirs[key], ours[key]) for key in sorted(theirs)]
 
 
 def _require_equal(pairs: list[tuple[str, Any, Any]], why: str, remedy: str) -> None:
@@ -139,7 +133,7 @@ def network_of_weights(config: TrainConfig) -> ParticleNetwork:
     path = find_weights(config.training.init_weights, "training.init_weights")
     weights, info = load_weights(path, field="training.init_weights")
     remedy = "set it so, or take other training.init_weights"
-    pairs = _network_pairs(info.network, config)
+    pairs = _pairs("network", info.network, config.network)
     pairs.append(("dataset.frame_rate_hz", info.frame_rate_hz, config.dataset.frame_rate_hz))
     if info.network.obstacle_features:
         pairs.append(("scene.cell_size", info.obstacle_cell_size, config.scene.cell_size))

@@ -173,7 +173,8 @@ def set_convention(one_step_mse: float, predicted: Sequence[np.ndarray], episode
     still = [0 if episode.boundary_P3 is None else len(episode.boundary_P3) for episode in episodes]
     share_S = np.array([e.particle_count / (e.particle_count + more) for e, more in zip(episodes, still, strict=True)])
     steps_S = np.array([e.particle_count * (e.frame_count - 1) for e in episodes], np.float64)
-    result = {"one_step": _free_and_all(one_step_mse / dimensions, steps_S.sum() / (steps_S / share_S).sum())}
+    free = one_step_mse / dimensions
+    result = {"one_step": {"free": float(free), "all": float(free * (steps_S.sum() / (steps_S / share_S).sum()))}}
     curves = [
         position_mse(path_TN3[1:], episode.position_TN3[1 : len(path_TN3)]) / dimensions
         for path_TN3, episode in zip(predicted, episodes, strict=True)
@@ -183,10 +184,6 @@ def set_convention(one_step_mse: float, predicted: Sequence[np.ndarray], episode
         if len(free_S):
             result[name] = {"free": float(free_S.mean()), "all": float((free_S * share_S).mean())}
     return result
-
-
-def _free_and_all(free: float, share: float) -> dict[str, float]:
-    return {"free": float(free), "all": float(free * share)}
 
 
 def mean_so_far(value_ST: np.ndarray) -> np.ndarray:

@@ -3,11 +3,7 @@
 from __future__ import annotations
 
 import json
-import os
-import signal
-import subprocess
 import sys
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +11,7 @@ import yaml
 
 from hgn.config import DatagenConfig
 from hgn.schema import ConfigError, to_mapping
-from hgn.system.processes import die_with_parent
+from hgn.system.processes import Program, last_message
 
 STOP_PATIENCE_S = 60.0
 
@@ -36,35 +32,21 @@ class Generator:
         self.log_path = folder / "datagen.log"
         self._read_to = self._finished = self._frames_per_episode = 0
         self._running: dict[int, int] = {}  # frames of the launch that each worker is in
+        command = (sys.executable, "-m", "datagen", "--config-path", str(folder.resolve()), "--config-name", "dataset")
         with self.log_path.open("wb") as log:
-            command = [
-                sys.executable,
-                "-m",
-                "datagen",
-                "--config-path",
-                str(folder.resolve()),
-                "--config-name",
-                "dataset",
-            ]
-            # A process group of its own: Ctrl-C reaches only the trainer, which then stops the generator.
-            self._process = subprocess.Popen(
-                command,
-                stdout=log,
-                stderr=log,
-                stdin=subprocess.DEVNULL,
-                preexec_fn=partial(die_with_parent, signal.SIGINT),
-                process_group=0,
-            )
+            self._program = Program(command, log)
 
     @property
     def running(self) -> bool:
-        return self._process.poll() is None
+        return self._program.exit_code is None
 
     def check(self) -> None:
         """Raises: ConfigError with the generator's message when it has failed."""
-        code = self._process.poll()
+        code = self._program.exit_code
         if code not in (None, 0):
-            raise ConfigError(f"the generator ended with exit code {code}: {self._last_error()} (log: {self.log_path})")
+            with self.log_path.open("rb") as log:
+                message = last_message(log)
+            raise ConfigError(f"the generator ended with exit code {code}: {message} (log: {self.log_path})")
 
     def frames_done(self) -> int:
         """Returns the frames simulated since the start, including those of running episodes."""
@@ -88,18 +70,4 @@ class Generator:
 
     def stop(self) -> None:
         """Ends the process as Ctrl-C does: finished episodes are kept, and a later start continues."""
-        if self.running:
-            os.killpg(self._process.pid, signal.SIGINT)
-            try:
-                self._process.wait(STOP_PATIENCE_S)
-            except subprocess.TimeoutExpired:
-                os.killpg(self._process.pid, signal.SIGKILL)
-                self._process.wait()
-
-    def _last_error(self) -> str:
-        with self.log_path.open("rb") as log:
-            log.seek(0, os.SEEK_END)
-            log.seek(max(log.tell() - 8192, 0))
-            tail = log.read().decode("utf-8", "replace").splitlines()
-        lines = [line for line in tail if line.strip() and not line.startswith("{")]
-        return lines[-1] if lines else "no message"
+        self._program.stop(STOP_PATIENCE_S)

@@ -32,11 +32,7 @@ class StopRequest:
 
     @property
     def requested(self) -> bool:
-        return self.signal is not None or self.out_of_time
-
-    @property
-    def out_of_time(self) -> bool:
-        return self._deadline is not None and time.monotonic() > self._deadline
+        return self.signal is not None or (self._deadline is not None and time.monotonic() > self._deadline)
 
     @property
     def exit_code(self) -> int:

@@ -30,13 +30,13 @@ def engine_of(network, state, precision="fp32", capacities=(), spare_particles=3
     packed = pack_network(network)
     values = packed.gather(list(network.parameters())).to(where)
     count = torch.tensor([particles], dtype=torch.int32, device=where)
-    return FusedTrainingNetwork(config, packed, values, grid, count, precision, loss_scale, tuning)
+    return FusedTrainingNetwork(packed, values, grid, count, precision, loss_scale, tuning)
 
 
 def inference_of(engine, network, half_cells=False, half_sums=False):
     """An engine that keeps nothing, on the same grid: other kernels than those of training."""
     tuning = replace(Tuning.of(engine.precision), half_cells=half_cells, half_sums=half_sums)
-    given = (network.config, engine.packed, engine.values, engine.grid, engine.particle_count, engine.precision)
+    given = (engine.packed, engine.values, engine.grid, engine.particle_count, engine.precision)
     return FusedNetwork(*given, tuning=tuning)
 
 

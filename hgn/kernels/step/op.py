@@ -13,7 +13,6 @@ from typing import Any
 import torch
 import triton
 
-from hgn.config import NetworkConfig
 from hgn.kernels.buffers import OUT
 from hgn.kernels.grid.op import PARTICLE_BLOCK, SUMS, DeviceGrid, DeviceParticles, Window
 from hgn.kernels.scene_tables import SceneTable
@@ -61,15 +60,15 @@ def rest_numbers(step: StepConfig, window: Window, scenes: int, levels: int) -> 
 
 
 class DeviceStep:
-    """The launches of one network's frames behind its output."""
+    """Launches the part of a frame that follows the network's output."""
 
-    def __init__(self, step: StepConfig, config: NetworkConfig, grid: DeviceGrid, barriers: SceneTable | None) -> None:
+    def __init__(self, step: StepConfig, grid: DeviceGrid, barriers: SceneTable | None) -> None:
         """`barriers` are given with `step.obstacle_clearance`."""
-        self.step, self.config, self.grid, self.barriers = step, config, grid, barriers
+        self.step, self.config, self.grid, self.barriers = step, grid.config, grid, barriers
         each = len(REST_SUMS)
         parts = [grid.more_cleared[each * level :][:each] for level in range(REST_SIZES * step.rests)]
         self._levels = [RestLevel.of(grid, cleared) for cleared in parts]
-        widely = rests_widely(config.materials)
+        widely = rests_widely(grid.config.materials)
         # bits of the materials that rest between larger cells; -1: all do
         self._widely = -1 if all(widely) else sum(rests << material for material, rests in enumerate(widely))
 

@@ -388,7 +388,7 @@ class Updates:
         # gradients of the mean over particles are small: float16 would lose them
         scale = 2.0 ** round(math.log2(max(self.particles, 2))) if self.precision == "fp16" else 1.0
         return FusedTrainingNetwork(
-            self.config, self.packed, self.values, self.grid, self.buffers.count, self.precision, scale, tail=TAIL
+            self.packed, self.values, self.grid, self.buffers.count, self.precision, scale, tail=TAIL
         )
 
     def _device_grid(self, capacities: tuple[int, ...]) -> DeviceGrid:
