@@ -62,7 +62,7 @@ def save_rollout(
 
 
 def require_exchange(path: Path, surface: bool) -> None:
-    """Whether `save_rollout` can write this, asked before a simulation. Raises: as it does."""
+    """Raises what `save_rollout` would raise; call it before a simulation."""
     if path.suffix in USD_ENDINGS:
         require_installed("pxr")
     if surface:
@@ -93,7 +93,7 @@ def fluid_surface(position_N3: np.ndarray, spacing: float) -> tuple[np.ndarray, 
 
 
 def _surfaces(rollout: Rollout) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Of each frame."""
+    """Yields the surface of each frame."""
     fluid_N = np.isin(rollout.material_N, FLUIDS)
     spacing = rollout_spacing(rollout, fluid_N)
     for frame, position_N3 in enumerate(rollout.position_TN3):

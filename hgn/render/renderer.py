@@ -113,7 +113,7 @@ class Stage:
         self.place(obstacles)
 
     def place(self, obstacles: Sequence[Obstacle]) -> None:
-        """These obstacles, as they lie, are there from now on."""
+        """Places obstacles where they are."""
         self._prepare_obstacles(obstacles)
         self._prepare_background()
         self._prepare_box(self.domain_size)
@@ -144,7 +144,7 @@ class Stage:
         self.map_shape = tuple(math.ceil(domain_size[axis] / self.map_cell) for axis in (2, 0))
 
     def _to_map(self, point_N3: np.ndarray) -> np.ndarray:
-        """Where the shadow of a point falls on the floor, in map cells: [N, 2] as (x, z)."""
+        """Returns where the shadow of a point falls on the floor, in map cells: [N, 2] as (x, z)."""
         fall_N1 = point_N3[:, 1:2] / LIGHT[1]
         return (point_N3[:, ::2] - fall_N1 * LIGHT[::2]) / self.map_cell
 

@@ -19,7 +19,7 @@ from hgn.viewer.placed import PlacedObstacle
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """What a frame showed. Particles keep their order; those that enter later come behind."""
+    """The content of a frame. Particles keep their order; those that enter later come behind."""
 
     position_N3: np.ndarray  # float32, domain units
     velocity_N3: np.ndarray  # float32, domain units per frame

@@ -36,7 +36,7 @@ FULL_SHARE = 0.5  # of what leaves a spout in a frame: where there is more, noth
 
 @dataclass(frozen=True)
 class Spout:
-    """Where a material runs from, straight down: domain units, and domain units per second."""
+    """A source of a material that runs straight down: domain units, and domain units per second."""
 
     position: Vector  # of the disc's centre
     material: str = "water"
@@ -103,7 +103,7 @@ class PlaySession:
         return self.recording.frames[-1]
 
     def materials(self) -> np.ndarray:
-        """Of the newest frame's particles, indices into MATERIALS, uint8 [N]."""
+        """Returns the materials of the newest frame's particles, indices into MATERIALS, uint8 [N]."""
         return self.recording.material_N[: len(self.newest.position_N3)]
 
     @property
@@ -164,7 +164,7 @@ class PlaySession:
         return self._enter(position_C3[self._free(position_C3)], spout)
 
     def _pour(self, spout: Spout) -> None:
-        """What leaves a spout in one frame: as dense as the material at rest."""
+        """Adds the particles that leave a spout in one frame, as dense as the material at rest."""
         length = spout.speed / self.simulator.frame_rate_hz
         radius = 0.5 * spout.diameter
         centre = self._inside(spout.position, radius, 0.5 * length)
@@ -190,7 +190,7 @@ class PlaySession:
         return float(x), float(y), float(z)
 
     def _enter(self, position_C3: np.ndarray, spout: Spout) -> int:
-        """Those of the candidates enter that are not in a closed obstacle, and not too many."""
+        """Adds candidates that are not in a closed obstacle, up to the maximum."""
         position_C3 = position_C3[: max(0, self.maximum_particles - self.live.particle_count)]
         for obstacle in self.obstacles:
             if obstacle.body.mesh.closed:
@@ -203,7 +203,7 @@ class PlaySession:
         return count
 
     def _free(self, position_C3: np.ndarray) -> np.ndarray:
-        """Where no other particle is near, bool [C]."""
+        """Returns which candidates have no other particle near, bool [C]."""
         near = CLEARANCE * self.cell_size / self.particles_per_cell ** (1 / 3)
         low, high = position_C3.min(axis=0) - near, position_C3.max(axis=0) + near
         others_A3 = self._between(low, high)
