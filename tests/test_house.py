@@ -16,7 +16,7 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 27_189,
+    "hgn": 27_183,
     "datagen": 8_320,
     "tools": 6_187,
     "tests": 27_874,

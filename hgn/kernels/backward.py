@@ -100,13 +100,13 @@ class FusedTrainingNetwork(FusedNetwork):
         self.totals = self._float(self.packed.size + width * grid.features + tail)
         self.output_gradient = self._float(particles, OUT)
         self.latent_gradient = self._float(particles, width)
-        # of what the pairs read of the cells, which add to it
+        # gradients of the cells' products, to which pairs add
         self.product_gradient = (self._operand if self.tuning.half_sums else self._float)(capacities[0], width)
         self.cell_gradient_up = [self._float(c, width) for c in capacities]
         self.cell_gradient_down = [self._float(c, width) for c in capacities]
         self.edge_gradient = self._operand(capacities[0], 6, width)
         self.sum_gradient = self._operand(capacities[0], width)
-        # what the weights' products read lies in one arena, so that one launch can reach it all
+        # one arena for all operands of weight gradients, so that one launch reaches them
         sizes: list[int] = []
 
         def noted(*shape: int) -> torch.Tensor:
@@ -382,7 +382,7 @@ class FusedTrainingNetwork(FusedNetwork):
         add: bool = False,
         received: tuple[torch.Tensor, int] | None = None,
     ) -> None:
-        """With `received`, x are gradients of edges, and what came with it through other weights is added too."""
+        """With `received`, x are gradients of edges, and the part through the receivers' weights is added too."""
         rows = self.grid.capacities[level]
         size, warps = self.tuning.row_tile(rows)
         other, other_at = received or (summed, at)

@@ -1,7 +1,7 @@
 """The network on fixed-capacity buffers: its forward pass as a fixed list of launches, fit for one CUDA graph.
 
-Nothing here reads a value back to the host. What each launch computes is in its kernel's file; the order is the
-paper's (sec. 3.2). Shape legend: N particles, C cells, W width.
+Nothing here reads a value back to the host. Each kernel's file describes its launch; the order is the paper's (sec.
+3.2). Shape legend: N particles, C cells, W width.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ class FusedNetwork(Buffers):
         self.device = values.device
         rounded = precision in ("fp16", "tf32")
         self.weights = torch.empty_like(values, dtype=self.operand) if rounded else values
-        # Falling particles show the encoder the same features frame by frame: its rounding pulls all of them one way.
+        # Falling particles have the same features frame after frame: the encoder's rounding would push all one way.
         self.fine = rounded and not training
         self.encode_weights = torch.zeros(self.width, grid.features, device=self.device)
         self.tuning = tuning or Tuning.of(precision)
@@ -77,13 +77,13 @@ class FusedNetwork(Buffers):
     # parameters
 
     def refresh(self) -> None:
-        """Copies what the kernels read in another form: all weights rounded, and the encoder's first layer."""
+        """Updates the kernels' copies of the weights: all of them rounded, and the encoder's first layer."""
         if self.weights is not self.values:
             self.weights.copy_(self._rounded(self.values))
         self.refresh_encoder()
 
     def refresh_encoder(self) -> None:
-        """The encoder's first layer on features and one-hot materials: embedding and bias are multiplied out."""
+        """Computes the encoder's first layer on features and one-hot materials, from embedding and bias."""
         first, embedding, bias = self._encode_views(self.values)
         used = self.config.feature_width - MATERIAL_EMBEDDING
         materials = len(self.config.materials)
@@ -93,7 +93,7 @@ class FusedNetwork(Buffers):
             self.encode_weights.copy_(self._rounded(self.encode_weights))
 
     def _rounded(self, weights: torch.Tensor) -> torch.Tensor:
-        """To the nearest that TF32 can hold, as hgn.kernels.blocks.nearest_tf32; as they are at other precisions."""
+        """Returns the nearest TF32 numbers (hgn.kernels.blocks.nearest_tf32); other precisions: the weights."""
         if self.precision != "tf32":
             return weights
         return rounded_to_tf32(weights)
@@ -160,7 +160,7 @@ class FusedNetwork(Buffers):
         return {"weights": self.weights, "values": self.values, "WIDTH": self.width, "PRECISION": self.precision}
 
     def _clear(self, x: torch.Tensor, overlap: bool = False) -> None:
-        """Zeros into the finest cells' rows of x."""
+        """Clears the finest cells' rows of x."""
         clear_rows[self._blocks(len(x), CLEAR_ROWS)](
             x=x, count_ptr=self.grid.count(0), WIDTH=self.width, OVERLAP=overlap, BLOCK=CLEAR_ROWS,
             num_warps=4, launch_pdl=overlap,
@@ -236,7 +236,7 @@ class FusedNetwork(Buffers):
         )  # fmt: skip
 
     def _gather(self, level: int, x: torch.Tensor, table: torch.Tensor, y: torch.Tensor, edges: bool = False) -> None:
-        """y = the sums of x's rows that the table lists."""
+        """Writes the sums of x's rows that the table lists to y."""
         rows, size = self.grid.capacities[level], self.tuning.gather_block
         gather_sums[self._blocks(rows, size)](
             x=x, table=table, count_ptr=self.grid.count(level), y=y, capacity=rows, SUM=len(table), EDGES=edges,

@@ -67,7 +67,7 @@ class PackedNetwork:
         return flat.index_select(0, self.index.remainder(len(flat)).to(flat.device))
 
     def scatter(self, packed: torch.Tensor, tensors: list[torch.Tensor]) -> None:
-        """The inverse of `gather`, into the tensors."""
+        """Copies packed elements into tensors: the inverse of `gather`."""
         index = self.index.to(packed.device)
         flat = packed.new_empty(sum(tensor.numel() for tensor in tensors))
         flat[index[index >= 0]] = packed[index >= 0]
@@ -122,7 +122,7 @@ class _Packer:
 
 
 def pack_network(network: HierarchicalGraphNetwork) -> PackedNetwork:
-    """The layout of a network; a pure function of its configuration."""
+    """Returns the layout of a network, which depends on its configuration only."""
     packer = _Packer(network)
     encode = packer.mlp(network.encode, whole_first=True)
     particle_to_cell = packer.mlp(network.particle_to_cell)
@@ -140,5 +140,5 @@ def pack_network(network: HierarchicalGraphNetwork) -> PackedNetwork:
 
 
 def rounded_to_tf32(weights: torch.Tensor) -> torch.Tensor:
-    """To the nearest that TF32 can hold, as hgn.kernels.blocks.nearest_tf32; contiguous float32."""
+    """Returns the nearest TF32 numbers (hgn.kernels.blocks.nearest_tf32), contiguous float32."""
     return ((weights.contiguous().view(torch.int32) + 0x1000) & -0x2000).view(torch.float32)

@@ -39,14 +39,16 @@ class Tuning:
     dense: bool = False  # six rows a cell in the tiles of edges, not eight
     overlap: bool = False  # kernels of a message step read their weights before their turn
     loops: bool = False  # where there are many rows, a program keeps all weights and takes one block after the other
-    gather_block: int = 0  # of a kernel for the sums of many rows' neighbours; 0: whoever needs them makes them
+    gather_block: int = (
+        0  # of a kernel for the sums of many rows' neighbours; 0: the kernel that reads them computes them
+    )
     cell_backward_block: int = 0  # where there are many rows; 0: as of other rows
     cell_backward_warps: int = 8
     half_cells: bool = False  # cells too are rounded between kernels, as edges are
     # And particles are added to them rounded, half the traffic of the L2 cache: in training only the pairs' gradients.
     half_sums: bool = False
     light_programs: int = 2  # on a processor, of kernels with one weight: pairs forward, edges of a first iteration
-    light_registers: int | None = None  # of a thread, so that as many fit
+    light_registers: int | None = None  # of a thread, so that these programs fit
     weight_registers: int | None = None  # of a thread of the weights' products: 128 for two programs on a processor
 
     @staticmethod
@@ -70,18 +72,18 @@ class Tuning:
         )
 
     def row_tile(self, rows: int, backward: bool = False) -> tuple[int, int]:
-        """Rows and warps of a program over so many rows."""
+        """Returns rows and warps of a program, for this number of rows in all."""
         if not many(rows):
             return self.small_block, self.small_warps
         return self.row_block, self.row_backward_warps if backward else self.row_warps
 
     def edge_tile(self, cells: int) -> tuple[int, int]:
-        """Cells and warps of a tile of edges: small tiles where there would be few."""
+        """Returns cells and warps of a tile of edges; tiles are small where there are few."""
         few = cells <= self.few_cells
         return (self.few_cell_block, self.few_cell_warps) if few else (self.cell_block, self.cell_warps)
 
     def edge_cells(self, block: int) -> int:
-        """Cells that a tile of edges takes where it has rows for `block` of eight each."""
+        """Returns the cells of a tile of edges that has rows for `block` cells of eight rows each."""
         return 8 * block // 6 if self.dense else block
 
     def gathers(self, rows: int) -> bool:
@@ -98,5 +100,5 @@ class Tuning:
         return (min(programs, PROCESSORS * at_once) if loops else programs,)
 
     def programs(self, rows: int, block: int, at_once: int = 2) -> tuple[int]:
-        """Programs that take one block after the other: as many as run at once, `at_once` on a processor."""
+        """Returns the number of programs that take one block after the other; `at_once` run on a processor."""
         return (min(triton.cdiv(rows, block), RESIDENT_PROGRAMS * at_once // 2),)

@@ -15,7 +15,7 @@ from hgn.network.cell_keys import pack
 from hgn.scene.barrier import CELLS, LEAST_HEIGHT, MARGIN, Barrier
 from hgn.schema import require
 
-NOWHERE = 1e30  # domain units: lowest corner of a box that nothing meets, its highest is at minus that
+NOWHERE = 1e30  # domain units: lowest corner of an empty box, whose highest corner is at minus that
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,9 +69,9 @@ class Barriers:
 
 
 def barrier_rows(corner_F33: torch.Tensor, clearance: float) -> torch.Tensor:
-    """The rows of triangles as hgn.scene.barrier computes them, float64 [F, 24], with gradients by the corners.
+    """Returns the rows of triangles of hgn.scene.barrier, float64 [F, 24], with gradients by the corners.
 
-    Nothing meets the row of a triangle without area.
+    The row of a triangle without area covers nothing.
     """
     corner_F33 = corner_F33.double()
     a_F3, b_F3, c_F3 = corner_F33.unbind(1)

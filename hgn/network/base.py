@@ -52,11 +52,11 @@ class ParticleNetwork(nn.Module, ABC):
         return sum(parameter.numel() for parameter in self.parameters())
 
     def forward(self, state: ParticleState, origin_S3: torch.Tensor | None = None) -> torch.Tensor:
-        """Accelerations in frame units [N, 3]."""
+        """Returns accelerations in frame units [N, 3]."""
         return self.restored_acceleration(self.normalised_acceleration(state, origin_S3), state)
 
     def restored_acceleration(self, normalised_N3: torch.Tensor, state: ParticleState) -> torch.Tensor:
-        """The raw output in frame units; with relative inputs it is what is added to gravity."""
+        """Returns the raw output in frame units, with relative inputs without gravity."""
         acceleration_N3 = self.normaliser.restore_acceleration(normalised_N3)
         return acceleration_N3 + state.gravity_S3[state.scene_N] if self.config.relative else acceleration_N3
 
@@ -68,7 +68,7 @@ class ParticleNetwork(nn.Module, ABC):
 
     @abstractmethod
     def normalised_acceleration(self, state: ParticleState, origin_S3: torch.Tensor | None = None) -> torch.Tensor:
-        """The network's raw output [N, 3], which the loss compares with the normalised target.
+        """Returns the network's raw output [N, 3], which the loss compares with the normalised target.
 
         `origin_S3` moves the grid, where the network has one.
         """
@@ -78,18 +78,18 @@ class ParticleNetwork(nn.Module, ABC):
         return Prediction(self.normalised_acceleration(state, origin_S3))
 
     def relative_features(self, state: ParticleState, grid: GridHierarchy) -> tuple[torch.Tensor, Contacts]:
-        """All columns but the material's, [N, F], and what the coarsest cells know of disturbances and surfaces."""
+        """Returns all columns but the material's, [N, F], and the disturbances and surfaces of the coarsest cells."""
         return relative_features(state, grid, self.config, self.normaliser.acceleration_std[0])
 
     def encode_features(self, feature_NF: torch.Tensor, material_N: torch.Tensor) -> torch.Tensor:
-        """Relative features to latent vectors [N, W]."""
+        """Returns latent vectors [N, W] of relative features."""
         material_MH = self.encode.project(1, self.embedding.weight) + self.encode.first.bias
         return self.encode.finish(self.encode.add_projection(material_MH.index_select(0, material_N), 0, feature_NF))
 
     def encode_particles(self, state: ParticleState, grid: GridHierarchy | None = None) -> torch.Tensor:
-        """Particle features to latent vectors [N, W] (sec. 3.2, step 0). Zero normals are not multiplied.
+        """Returns latent vectors [N, W] of the particles (sec. 3.2, step 0). Zero normals are not multiplied.
 
-        Relative inputs are taken from the grid's cells, too.
+        Relative inputs depend on the grid's cells, too.
         """
         if self.config.relative:
             assert grid is not None

@@ -20,7 +20,7 @@ AXIS_STRIDE = (1 << (2 * COORDINATE_BITS), 1 << COORDINATE_BITS, 1)  # key diffe
 
 
 def pack(scene: torch.Tensor, cell_3: torch.Tensor) -> torch.Tensor:
-    """Keys int64 […] of scene indices int64 […] and cell coordinates int64 […, 3].
+    """Returns keys int64 […] of scene indices int64 […] and cell coordinates int64 […, 3].
 
     Coordinates must lie within ±COORDINATE_LIMIT; callers keep particles in range.
     """
@@ -32,12 +32,12 @@ def pack(scene: torch.Tensor, cell_3: torch.Tensor) -> torch.Tensor:
 
 
 def of_scene(key: torch.Tensor, scene: int) -> torch.Tensor:
-    """Keys of scene 0 as those of another."""
+    """Returns keys of scene 0 as keys of another scene."""
     return key + (scene << (3 * COORDINATE_BITS))
 
 
 def unpack(key: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """The inverse of `pack`: scene indices int64 […] and coordinates int64 […, 3]."""
+    """Returns scene indices int64 […] and coordinates int64 […, 3]: the inverse of `pack`."""
     mask = (1 << COORDINATE_BITS) - 1
     shifts = (2 * COORDINATE_BITS, COORDINATE_BITS, 0)
     cell_3 = torch.stack([(key >> shift) & mask for shift in shifts], dim=-1) - COORDINATE_LIMIT
@@ -45,8 +45,8 @@ def unpack(key: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
 
 
 def in_buckets(cell_K3: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """A scene's cells int [K, 3] in hash buckets: where each begins and ends in their order, int32 [B + 1], and in that
-    order the keys of the cells, as of scene 0, and which they were, both int64 [K].
+    """Sorts a scene's cells int [K, 3] into hash buckets. Returns the limits of the buckets, int32 [B + 1], and in
+    their order the keys of the cells in scene 0 and the numbers of the cells, both int64 [K].
     """
     count = len(cell_K3)
     mask = (1 << max(4, math.ceil(math.log2(2 * max(count, 1))))) - 1
@@ -62,7 +62,7 @@ def in_buckets(cell_K3: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch
 
 
 def unique(key: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """The keys that occur, sorted, int64 [K], and where each of `key` is among them."""
+    """Returns the different keys, sorted, int64 [K], and the place of each of `key` among them."""
     key_K, index = torch.unique(key, return_inverse=True)
     if is_exporting():
         torch._check(key_K.shape[0] <= LARGEST_EXPORTED)
@@ -70,7 +70,7 @@ def unique(key: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
 
 
 def find(sorted_key_K: torch.Tensor, key: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Looks keys up in a sorted list: index int64 […] (0 where absent) and whether each is there, bool […]."""
+    """Looks keys up in a sorted list; returns indices int64 […] (0 where absent) and which keys exist, bool […]."""
     if is_exporting():
         return _find_by_unique(sorted_key_K, key)
     if len(sorted_key_K) == 0:
@@ -81,7 +81,7 @@ def find(sorted_key_K: torch.Tensor, key: torch.Tensor) -> tuple[torch.Tensor, t
 
 
 def _find_by_unique(sorted_key_K: torch.Tensor, key: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """The same without a search, which ONNX lacks."""
+    """Does the same without a search, which ONNX lacks."""
     count = sorted_key_K.shape[0]
     key_U, place = unique(torch.cat([sorted_key_K, key.flatten()]))
     absent_U = torch.full_like(key_U, -1)

@@ -58,7 +58,7 @@ def build_hierarchy(
     cell_size: float,
     levels: int,
 ) -> GridHierarchy:
-    """Builds the grids of all scenes at once; cells of different scenes never meet.
+    """Builds the grids of all scenes; cells of different scenes are never neighbours.
 
     position_N3 in domain units, scene_N int64 indices into origin_S3 (the finest grid's origin in each scene).
     Raises: GridRangeError when a particle is not finite or lies beyond ±65,536 cells.

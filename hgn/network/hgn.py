@@ -75,7 +75,7 @@ class HierarchicalGraphNetwork(ParticleNetwork):
         self.decode = MLP((width,), width, OUTPUTS if config.relative else 3, layer_norm=False)
 
     def normalised_acceleration(self, state: ParticleState, origin_S3: torch.Tensor | None = None) -> torch.Tensor:
-        """The network's raw output [N, 3], which the loss compares with the normalised target.
+        """Returns the network's raw output [N, 3], which the loss compares with the normalised target.
 
         The finest grid's origin in each scene is 0 unless given.
         """
@@ -98,14 +98,14 @@ class HierarchicalGraphNetwork(ParticleNetwork):
         return Prediction(balanced(output_N9, contacts, grid), contacts, grid)
 
     def grid(self, state: ParticleState, origin_S3: torch.Tensor | None = None) -> GridHierarchy:
-        """The cells of all levels around a state's particles."""
+        """Returns the cells of all levels around a state's particles."""
         if origin_S3 is None:
             origin_S3 = torch.zeros_like(state.domain_S3)
         return build_hierarchy(state.position_N3, state.scene_N, origin_S3, self.config.cell_size, self.config.levels)
 
     def propagate(self, particle_NW: torch.Tensor, grid: GridHierarchy) -> torch.Tensor:
-        """Steps 1 to 12: latent particles and their grids to the decoder's output, normalised accelerations [N, 3], or
-        with relative inputs [N, 9], for hgn.network.relative.balanced."""
+        """Returns the decoder's output for latent particles (steps 1 to 12): normalised accelerations [N, 3], or with
+        relative inputs [N, 9], for hgn.network.relative.balanced."""
         corner_83 = CORNER_83.to(particle_NW)
         # Towards the parent's centre, in fine cells: from octant o the parent's centre lies at 1/2 - o.
         parent_offset_83 = 0.5 - corner_83

@@ -28,14 +28,14 @@ class Placement:
     translation_3: torch.Tensor  # t, domain units
 
     def place(self, position_3: torch.Tensor) -> torch.Tensor:
-        """Points […, 3] of the obstacle where it was, to where it is."""
+        """Moves points […, 3] of the obstacle to its pose."""
         return (position_3 - self.pivot_3) @ self.rotation_33.T + self.pivot_3 + self.translation_3
 
     def to(self, dtype: torch.dtype) -> Placement:
         return Placement(*(tensor.to(dtype) for tensor in (self.rotation_33, self.pivot_3, self.translation_3)))
 
     def undo(self, position_N3: torch.Tensor) -> torch.Tensor:
-        """The inverse: points into the frame in which the obstacle's cells were made."""
+        """Moves points into the frame of the obstacle's cells: the inverse."""
         return (position_N3 - self.translation_3 - self.pivot_3) @ self.rotation_33 + self.pivot_3
 
 
@@ -47,7 +47,7 @@ class PosedObstacleCells(ObstacleCells):
     smoothing: float = 0.0  # side of the cube that normals are the mean over, in cells, 0 to 1
 
     def normals(self, position_N3: torch.Tensor, scene_N: torch.Tensor) -> torch.Tensor:
-        """n_o of each particle, [N, 3]: the sum over obstacles, of length 1 at most."""
+        """Returns n_o of each particle, [N, 3]: the sum over obstacles, of length 1 at most."""
         normal_N3 = smoothed_normals(self, position_N3, scene_N, self.smoothing)
         for cells, placement in self.placed:
             own_N3 = smoothed_normals(cells, placement.undo(position_N3), scene_N, self.smoothing)
@@ -59,7 +59,7 @@ class PosedObstacleCells(ObstacleCells):
 def smoothed_normals(
     cells: ObstacleCells, position_N3: torch.Tensor, scene_N: torch.Tensor, smoothing: float
 ) -> torch.Tensor:
-    """The mean of the cells' normals over a cube of `smoothing` cells around each particle, [N, 3]."""
+    """Returns the mean of the cells' normals over a cube of `smoothing` cells around each particle, [N, 3]."""
     if len(cells.key_K) == 0:
         return torch.zeros_like(position_N3)
     if smoothing == 0:

@@ -46,9 +46,9 @@ def choose(
     backend: str = "auto",
     field: str = "backend",
 ) -> Backend:
-    """The backend that is asked for, or with `auto` the fastest that runs; `note` says which and why.
+    """Returns the named backend, or with `auto` the fastest that runs; its `note` reports which and why.
 
-    Raises: ConfigError naming `field` when it is none, or what keeps it from running here.
+    Raises: ConfigError naming `field` for an unknown backend, or with the reason why it cannot run here.
     """
     for name, value, known in ((field, backend, BACKENDS), ("precision", precision, PRECISIONS)):
         require(value in known, name, f"one of {', '.join(known)}", value)
@@ -65,7 +65,7 @@ def choose(
 
 
 def build(name: str, network: ParticleNetwork, precision: str = "tf32", note: str = "") -> Backend:
-    """The backend of that name, whether the machine supports it or not."""
+    """Returns the named backend, whether the machine supports it or not."""
     if name == "triton":
         # Triton, which the others do without, is loaded here.
         from hgn.runtime.triton_backend import TritonBackend
@@ -79,16 +79,16 @@ def build(name: str, network: ParticleNetwork, precision: str = "tf32", note: st
 
 
 def fastest_stepped(network: ParticleNetwork, precision: str = "tf32") -> Backend:
-    """The fastest backend that makes frames one by one, for any network and device."""
+    """Returns the fastest backend that computes frames one by one, for any network and device."""
     if cpu_unsupported_reason(next(network.parameters()).device, network.config, precision) is None:
         return build("cpu", network, precision)
     return build("torch", network, precision)
 
 
 def pick(reasons: Mapping[str, str | None], backend: str, precision: str, field: str) -> tuple[str, str]:
-    """A backend's name, and a line that says so; `reasons` is what keeps each from running, the fastest first.
+    """Returns a backend's name, and a line that reports it; `reasons` has why each cannot run, or None, fastest first.
 
-    Raises: ConfigError when the one that is asked for cannot run, or none with such a precision.
+    Raises: ConfigError when the wanted backend cannot run, or none has this precision.
     """
     running = [name for name, reason in reasons.items() if reason is None]
     if backend not in (*running, "auto", "torch"):
@@ -135,7 +135,7 @@ def triton_unsupported_reason(device: torch.device, config: NetworkConfig, preci
 
 
 def _too_little_shared_memory(device: torch.device, width: int) -> str | None:
-    """Kernels keep their weights there: five of the cells' MLP in float16, or as much of others in TF32."""
+    """Returns why weights do not fit: kernels keep five matrices of the cells' MLP in shared memory, in float16."""
     needed = shared = 10 * width**2
     if torch.cuda.is_available():
         # a name that torch's own annotations leave out
@@ -146,5 +146,5 @@ def _too_little_shared_memory(device: torch.device, width: int) -> str | None:
 
 
 def set_matmul_precision(precision: str) -> None:
-    """PyTorch's own float32 products: full with fp32, one TF32 product on a GPU with tf32 and fp16."""
+    """Sets the precision of PyTorch's float32 products: full with fp32, else TF32 on a GPU."""
     torch.set_float32_matmul_precision("highest" if precision == "fp32" else "high")

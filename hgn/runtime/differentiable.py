@@ -1,6 +1,6 @@
-"""A simulation through which PyTorch takes gradients, by what it starts from and where its obstacles are.
+"""Simulation with gradients by its initial state and the poses of its obstacles.
 
-What has exact gradients, what only within a cell, and how long they can be trusted: docs/how_to/gradients.md.
+docs/how_to/gradients.md lists which gradients are exact, which hold only within a cell, and for how long.
 Shape legend: T frames, N particles, H velocities, F triangles.
 """
 
@@ -51,10 +51,10 @@ class Inputs:
 def simulate(
     network: ParticleNetwork, start: ParticleState, scene: Scene, frame_rate_hz: float, frames: int, inputs: Inputs
 ) -> torch.Tensor:
-    """Positions [T, N, 3]; `start` is the scene's state at frame 0, as the simulator has it.
+    """Returns positions [T, N, 3]; `start` is the scene's state at frame 0, of `Simulator.start`.
 
-    The backward pass computes each frame again, so that it holds what one frame needs and the
-    states between. The network's own weights have no gradients. Raises: ConfigError, DivergedError.
+    The backward pass computes each frame again: memory holds one frame and the states between frames.
+    The network's own weights have no gradients. Raises: ConfigError, DivergedError.
     """
     require(frames >= 1, "frames", "at least 1", frames)
     require(0 <= inputs.smoothing <= 1, "smoothing", "0 to 1 cells", inputs.smoothing)
@@ -85,7 +85,7 @@ def simulate(
 class _Frame(torch.autograd.Function):
     """A frame without its intermediate results, which the backward pass computes again.
 
-    torch.utils.checkpoint does it too, with a call into Python for each of them: on a GPU that costs as much as they.
+    torch.utils.checkpoint calls Python for each result, which takes as long as the results on a GPU.
     """
 
     @staticmethod
@@ -103,7 +103,7 @@ class _Frame(torch.autograd.Function):
         with torch.enable_grad():
             outputs = context.step(*variables)
         wanted = [tensor for tensor in variables if tensor.requires_grad]
-        # a frame in which no obstacle holds does not depend on where they are
+        # where no obstacle stops a particle, the frame does not depend on their poses
         reached = [pair for pair in zip(outputs, gradients, strict=True) if pair[0].requires_grad]
         ends, slopes = [output for output, _ in reached], [gradient for _, gradient in reached]
         computed = iter(torch.autograd.grad(ends, wanted, slopes, allow_unused=True))
@@ -111,7 +111,7 @@ class _Frame(torch.autograd.Function):
 
 
 def _variables(state: ParticleState) -> list[torch.Tensor]:
-    """All of a state that may have gradients, positions and velocities first."""
+    """Returns the tensors of a state that may have gradients, positions and velocities first."""
     tensors = [state.position_N3, state.velocity_NM3, state.domain_S3, state.gravity_S3]
     if isinstance(state.obstacles, PosedObstacleCells):
         for _, placement in state.obstacles.placed:
@@ -120,7 +120,7 @@ def _variables(state: ParticleState) -> list[torch.Tensor]:
 
 
 def _with_variables(state: ParticleState, variables: Sequence[torch.Tensor]) -> ParticleState:
-    """The inverse: the state with those tensors."""
+    """Returns the state with these tensors: the inverse."""
     position_N3, velocity_NM3, domain_S3, gravity_S3, *others = variables
     rest, obstacles = iter(others), state.obstacles
     if isinstance(obstacles, PosedObstacleCells):
@@ -143,7 +143,7 @@ def _with_variables(state: ParticleState, variables: Sequence[torch.Tensor]) -> 
 def _started(
     network: ParticleNetwork, start: ParticleState, scene: Scene, frame_rate_hz: float, inputs: Inputs
 ) -> ParticleState:
-    """The state at frame 0 with what replaces the scene's, in the network's precision."""
+    """Returns the state at frame 0 with the given inputs, in the network's precision."""
     config, device = network.config, start.position_N3.device
     dtype = next(network.parameters()).dtype
 

@@ -1,10 +1,7 @@
-"""python -m hgn.runtime.precompile_program: compiles some kernels of a training or of simulations, launching none.
-
-What it compiles goes into Triton's cache on disk.
+"""python -m hgn.runtime.precompile_program: compiles kernels into Triton's cache on disk.
 
 The launches are those of Updates and TritonStepper on tensors without memory, so that no kernel and no specialisation
-is named twice; only sizes are guessed (they choose between few variants), and what is guessed wrong is compiled when it
-is first used.
+is listed twice. Only sizes are guesses (they choose between few variants); other variants are compiled at first use.
 """
 
 from __future__ import annotations

@@ -1,6 +1,5 @@
 """Simulates scenes with a trained network (paper algorithm 1) on one device.
 
-Imports torch and the network, but nothing of the training stack.
 Shape legend: T frames, N particles of all scenes, S scenes.
 """
 
@@ -39,7 +38,7 @@ from hgn.schema import require
 from hgn.system.device import choose_device
 
 LARGEST_GRAVITY = 98.0  # domain units per second squared
-SAME_GRAVITY = 1e-3  # of its size: what is estimated from trajectories differs by a few 1e-5 between two sets
+SAME_GRAVITY = 1e-3  # relative difference; estimates from the trajectories of two sets differ by a few 1e-5
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,13 +51,13 @@ class InitialState:
     obstacle_grid: ObstacleGrid
     domain_size: tuple[float, float, float]
     gravity: tuple[float, float, float]
-    # Corners of the obstacles' triangles, float64 [F, 3, 3], for networks that pass none; none: nothing is known but
-    # cells, and these hold nothing.
+    # corners of the obstacles' triangles, float64 [F, 3, 3], for networks with obstacle_clearance; None: only the cells
+    # of obstacles are known, and none is passed by a triangle
     corners: Callable[[], np.ndarray] | None = None
     materials: tuple[str, ...] = MATERIALS
-    past_HN3: np.ndarray | None = None  # frames before this one, oldest first; none: free flight
+    past_HN3: np.ndarray | None = None  # frames before this one, oldest first; None: free flight
     dimensions: int = 3
-    emitting: Scene | None = None  # the scene with the particles that enter later, which come behind those above
+    emitting: Scene | None = None  # the scene with the particles that enter later, behind the others
 
     @staticmethod
     def of_episode(episode: Episode) -> InitialState:
@@ -120,7 +119,7 @@ class InitialState:
 
 
 class Simulator:
-    """Runs a trained network on one or several scenes at once."""
+    """Simulates scenes with a trained network, one or several side by side."""
 
     def __init__(
         self,
@@ -131,7 +130,7 @@ class Simulator:
         info: WeightsInfo | None = None,
     ) -> None:
         """`backend` is one of hgn.runtime.backend, or the name of one: torch, triton or cpu, whether this machine
-        supports it or not; auto: the fastest that it does. `info` is what the weights file says of itself.
+        supports it or not; auto: the fastest supported one. `info` is the metadata of the weights file.
         """
         self.network, self.frame_rate_hz, self._info = network, frame_rate_hz, info
         self.device = next(network.parameters()).device
@@ -144,7 +143,7 @@ class Simulator:
     def load(
         weights: str | Path = DEFAULT_WEIGHTS, device: str = "auto", backend: str = "auto", precision: str = "tf32"
     ) -> Simulator:
-        """A simulator of exported weights: a file, or the name of shipped ones. The options are those of hgn.rollout.
+        """Loads exported weights: a file, or the name of shipped ones. The options are those of hgn.rollout.
 
         Sets the precision of PyTorch's own float32 products, too.
         Raises: ConfigError when the weights, the device or the backend do not exist or do not fit each other.
@@ -164,9 +163,8 @@ class Simulator:
     def start(self, scenes: Sequence[InitialState | Scene]) -> ParticleState:
         """Returns the state at frame 0, with a ballistic history.
 
-        Raises: ConfigError when a scene holds a material that the network does not know, or, for weights that were
-        loaded, a gravity that they cannot take (absolute inputs: another, relative: a huge one) or obstacle cells of
-        another size.
+        Raises: ConfigError when a scene has a material that the network was not trained with, or, for loaded weights,
+        an unsupported gravity (absolute inputs: another, relative: a huge one) or obstacle cells of another size.
         """
         config, states = self.network.config, _initial(scenes)
         for state in states:
@@ -205,8 +203,7 @@ class Simulator:
         """Simulates `frames` frames, frame 0 included; float32 [frames, N, 3] for each scene.
 
         A particle that enters later is NaN until then. `on_frame(t)` is called when frame t is complete.
-        Raises: ConfigError as `start`; DivergedError, which says at which frame; the network must be trained further
-        then.
+        Raises: ConfigError as `start`; DivergedError with the frame; the network must be trained further then.
         """
         return self.paths(scenes, frames, on_frame)[0]
 

@@ -31,19 +31,19 @@ from hgn.step.reference import rested
 from hgn.step_config import StepConfig
 
 LOOK_FRAMES, FEWEST_FRAMES = 32, 4
-CROWDED = 140  # particles in a cell of the finest level, half again as many as in the data's bodies
+CROWDED = 140  # particles in a cell of the finest level, 1.5 times those in bodies of the data
 PATH_BYTES = 1 << 27  # of positions on their way to the host: fewer frames where there are many particles
-GROWTH = 2.0  # room for so many times the cells
+GROWTH = 2.0  # capacity when buffers grow, in cells
 # The same where there are more than ROOMY_CELLS of them: at first, and for what was needed when there was too little.
 TIGHT_START, TIGHT_GROWTH = 1.25, 1.5
 HEADROOM = 8.0  # times the cells of a scene's start: groups that fall and lie spread need up to six times as many,
-SPREAD_CELLS = (0.6, 0.1, 0.035, 0.02)  # so many a particle at most, on each level; coarser ones as the last
+SPREAD_CELLS = (0.6, 0.1, 0.035, 0.02)  # most cells per particle on each level; coarser levels as the last
 ROOMY_CELLS = 65_536  # of the finest level, up to which there is such headroom: beyond, memory counts
 CHECKED_PARTICLES = 50_000  # at most; PyTorch needs memory
 
 
 def first_capacities(cells: Sequence[int], particles: int) -> tuple[int, ...]:
-    """Room on each level for a scene that begins with so many cells: few simulations need more later."""
+    """Returns capacities for a scene that starts with `cells` on each level; few simulations need more later."""
     capacities = []
     for level, count in enumerate(cells):
         spread = SPREAD_CELLS[min(level, len(SPREAD_CELLS) - 1)] * particles
@@ -62,17 +62,17 @@ def crowded(position_N3: torch.Tensor, scene_N: torch.Tensor, cell_size: float) 
 
 
 def _room(count: int, level: int, tight: float) -> int:
-    """GROWTH times the count, and less where that is more than for ROOMY_CELLS: at least `tight` times."""
+    """Returns GROWTH times the count, but for more than ROOMY_CELLS less, and at least `tight` times the count."""
     return max(int(tight * count), int(GROWTH * min(count, ROOMY_CELLS >> 2 * level)))
 
 
 @dataclass(frozen=True, eq=False)
 class _Look:
-    """Frames on their way: how many, where the first goes, and frame and status behind the last."""
+    """Frames that were launched: their number, the place of the first, and frame and status after the last."""
 
     frames: int
     first: int
-    seen: torch.Tensor  # int32 [2], on the host once `end` has come
+    seen: torch.Tensor  # int32 [2], on the host after `end`
     end: torch.cuda.Event | None
 
 
@@ -92,7 +92,7 @@ class TritonStepper:
         barriers: SceneTable | None = None,
         step: StepConfig | None = None,
     ) -> None:
-        """`capacities` are cells of each level to begin with.
+        """`capacities` are cells of each level at the start.
 
         `capacity` is the least number of particles that buffers are allocated for. `obstacles` and `barriers` replace
         those of the state; `step` replaces the network's.
@@ -172,7 +172,7 @@ class TritonStepper:
         self.grid.status.zero_()
 
     def motion(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """Copies of positions [N, 3] and velocity histories [N, M, 3] after the last block."""
+        """Returns copies of positions [N, 3] and velocity histories [N, M, 3] after the last block."""
         position_N3, velocity_NV = self.buffers.position_N3[: self.live], self.buffers.velocity_NV[: self.live]
         return position_N3.clone(), velocity_NV.clone().view(self.live, -1, 3)
 
@@ -322,12 +322,12 @@ class TritonStepper:
         return self.path_TN3.view(-1)[start : start + 3 * taken * self.live].view(taken, self.live, 3), status
 
     def _grow(self) -> None:
-        # all levels: those that still had room are as full, and would have the same captured again soon
+        # all levels: the others are nearly full too, and would soon require another capture
         before, needed = self.grid.capacities, self.grid.needed_L.tolist()
         pairs = zip(before, needed, strict=True)
         capacities = tuple(max(c, _room(n, i, TIGHT_GROWTH)) for i, (c, n) in enumerate(pairs))
         self.growths += 1
-        # Particles are kept elsewhere: what there is goes first, so that there is never room for both.
+        # Free the old buffers first, so that memory never has to hold both; particles are stored elsewhere.
         self.graph = None
         del self.fused, self.grid, self.step
         try:

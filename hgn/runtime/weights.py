@@ -1,6 +1,5 @@
-"""Inference weights: one safetensors file with the network's structure and normaliser inside.
-
-Nothing in it is ever unpickled or executed. The structure travels as JSON in the file's metadata.
+"""Inference weights: one safetensors file with the network's parameters and normaliser, and its structure as JSON in
+the metadata. Nothing in it is unpickled or executed.
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ from hgn.system.hub import PREFIX, hub_weights
 
 FORMAT_VERSION = 1
 SUFFIX = ".safetensors"
-SHIPPED = Path(__file__).resolve().parents[1] / "weights"  # beside each file a card, NAME.md
+SHIPPED = Path(__file__).resolve().parents[1] / "weights"  # with a card NAME.md for each file
 
 
 @dataclass(frozen=True)

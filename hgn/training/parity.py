@@ -1,8 +1,7 @@
-"""Whether the Triton kernels, as compiled for this machine, compute what PyTorch computes.
+"""The check of training kernels against PyTorch, before the first update and on its batch: outputs, and gradients of a
+random weighted sum of them. hgn.runtime.parity has the bounds.
 
-Compared on the first update's own batch, before anything is trained: outputs, and the gradients of a random weighting
-of them. Both paths round, and rounding turns the activations next to their kink, so the bounds are wide; kernels that
-are wrong miss them by far. Shape legend: N particles of all scenes, S scenes.
+Shape legend: N particles of all scenes, S scenes.
 """
 
 from __future__ import annotations
@@ -28,9 +27,10 @@ CHECKED_PARTICLES = 200_000  # at most: autograd needs memory
 def require_parity(
     updates: Updates, episodes: Sequence[EpisodeTensors], symmetries: Sequence[Symmetry] | None = None
 ) -> tuple[float, float]:
-    """Relative errors of outputs and of all gradients on the batch that `updates` holds, of these episodes' images.
+    """Returns the relative errors of outputs and of all gradients on the batch of `updates`, of these episodes' images;
+    NaN for a batch of more than CHECKED_PARTICLES.
 
-    Too large a batch is not checked: NaN. Raises: ConfigError when one of them exceeds its bound.
+    Raises: ConfigError when one of them exceeds its bound.
     """
     network, fused, count = updates.network, updates.fused, int(updates.buffers.count)
     if count > CHECKED_PARTICLES:
@@ -52,14 +52,14 @@ def require_parity(
     gradient_error = require(flat, expected_flat, GRADIENTS, "training.backend")
     if updates.device.type == "cuda":
         del output_N3, slopes, expected, expected_flat
-        torch.cuda.empty_cache()  # what is free decides where episodes are kept
+        torch.cuda.empty_cache()  # free memory decides where episodes are stored
     return output_error, gradient_error
 
 
 def _state(
     updates: Updates, episodes: Sequence[EpisodeTensors], symmetries: Sequence[Symmetry] | None, count: int
 ) -> tuple[ParticleState, torch.Tensor]:
-    """The batch as PyTorch reads it, noise and jitter included."""
+    """Returns the batch as PyTorch reads it, noise and jitter included."""
     config = updates.config
     keys, normals = [], []
     for scene, episode in enumerate(episodes):

@@ -131,7 +131,7 @@ class TritonScenes:
             if first is not None:
                 stepper.require_parity(self._network, first, "training.backend")
                 if device.type == "cuda":
-                    torch.cuda.empty_cache()  # what is free decides where episodes are kept
+                    torch.cuda.empty_cache()  # free memory decides where episodes are stored
         stepper.use_values(values)
         self._stepper = stepper
         return stepper

@@ -26,8 +26,8 @@ from hgn.network.relative import CONTACT_REACH_CELLS, FEW, OUTPUTS, QUIET, RARE
 MARK_BLOCK = 128
 PARTICLE_BLOCK = 32
 FILL_BLOCK = 4096 if interpreting() else 512  # slots; the interpreter's time goes by programs
-SUMS = 16  # columns of what goes through the coarsest cells, as many as the decoder's padded output has
-MARGIN_CELLS = 4  # of a window, around what it must hold
+SUMS = 16  # columns of the sums of coarsest cells: those of the decoder's padded output
+MARGIN_CELLS = 4  # of a window, around the box that it must contain
 OVERFLOW, OUT_OF_WINDOW = kernel.OVERFLOW.value, kernel.OUT_OF_WINDOW.value
 
 
@@ -45,7 +45,7 @@ class Window:
     def around(
         lower_3: Sequence[float], upper_3: Sequence[float], cell_size: float, levels: int, margin: int = MARGIN_CELLS
     ) -> Window:
-        """Holds every cell within `margin` cells of a box given in domain units."""
+        """Returns the window of every cell within `margin` cells of a box, in domain units."""
         unit = 1 << (levels - 1)
         low, cells = [], []
         for lower, upper in zip(lower_3, upper_3, strict=True):
@@ -61,7 +61,7 @@ class Window:
 
 
 def feature_columns(config: NetworkConfig) -> int:
-    """Columns of the encoder's input: features, one-hot material, padding to a power of two that matrix units take."""
+    """Returns the columns of the encoder's input: features, one-hot material, padding to a power of two."""
     used = config.feature_width - MATERIAL_EMBEDDING + len(config.materials)
     return max(16, triton.next_power_of_2(used))
 
@@ -113,7 +113,7 @@ class DeviceGrid:
         device: torch.device,
         more: tuple[int, ...] = (),
     ) -> None:
-        """`more_cleared` are int32 tensors of `more` numbers for others, which `build` clears too."""
+        """`more_cleared` are int32 tensors of `more` numbers for other users; `build` clears them too."""
         assert scenes < SCENE_LIMIT
         relative, features = config.relative, feature_columns(config)
         self.window, self.scenes, self.capacities, self.particles = window, scenes, tuple(capacities), particles
@@ -134,7 +134,7 @@ class DeviceGrid:
         self.low = torch.tensor(window.low, dtype=torch.int32, device=device)
         coarsest = self.capacities[-1] if relative else 0
         parts = [4 * at if relative else 4, *[SUMS * coarsest] * 3, 2 * coarsest, start, *more]
-        self._cleared = integers(sum(parts))  # one piece, cleared at once
+        self._cleared = integers(sum(parts))  # in one piece, cleared by one launch
         motion, *sums, moments, disturbed, self.occupied = self._cleared.split(parts)[:6]
         self.more_cleared = self._cleared.split(parts)[6:]
         self.prefix_sum = integers(start)
@@ -246,17 +246,17 @@ class DeviceGrid:
         )  # fmt: skip
 
     def balance(self, output: torch.Tensor, count: torch.Tensor) -> None:
-        """From what the decoder puts out [N, OUT] to accelerations less gravity in columns 0 to 2, in place."""
+        """Turns the decoder's output [N, OUT] into accelerations less gravity in columns 0 to 2: relative.balanced."""
         self._through_coarsest(output, count, self.sum_C, coarsest_kernel.balance, OUTPUTS, 3)
 
     def balance_backward(self, gradient: torch.Tensor, count: torch.Tensor) -> None:
-        """From the gradient of what `balance` leaves to that of what it was given, in place."""
+        """Turns the gradient of the result of `balance` into that of its input, in place."""
         self._through_coarsest(gradient, count, self.gradient_sum_C, coarsest_kernel.balance_backward, 3, OUTPUTS)
 
     def _through_coarsest(
         self, x: torch.Tensor, count: torch.Tensor, sums: torch.Tensor, between: Any, taken: int, left: int
     ) -> None:
-        """Sums of the first columns on the coarsest cells, what these make of them, and that back to particles."""
+        """Sums the first columns over coarsest cells, applies `between`, and adds the result to particles."""
         particles, capacity, coarsest = self.particles, self.capacities[-1], self.neighbour(self.levels - 1)
         forward, overlap = taken == OUTPUTS, overlaps()
         pairs: dict[str, Any] = {"coarsest_of": self.coarsest_N8, "share_of": self.share_N8, "place_of": self.place_N3}
@@ -264,7 +264,7 @@ class DeviceGrid:
         cells = {"neighbour": coarsest, "counts": self.counts_L, "capacity": capacity, "LEVELS": self.levels}
         sizes = {"OUT": x.shape[1], "OVERLAP": overlap, "BLOCK": PARTICLE_BLOCK}
         cells_too = max(particles, capacity) if forward else particles
-        # behind what is not a kernel in a backward pass
+        # in a backward pass, the operation before is no kernel of ours
         coarsest_kernel.sum_coarsest[(triton.cdiv(cells_too, PARTICLE_BLOCK),)](
             x=x, **pairs, **cells, disturbed=self.disturbed_C2, felt=self.felt_C2, sums=sums, USED=taken,
             FEEL=forward, **sizes, launch_pdl=overlap and forward,

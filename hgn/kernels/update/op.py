@@ -32,10 +32,10 @@ from hgn.schema import ConfigError
 
 SAMPLE_COLUMNS = kernel.SAMPLE_COLUMNS.value
 GROWTH = 1.25
-TABLE_UPDATES = 64  # that the tables hold at least: with tables that grow the graph would be captured anew
+TABLE_UPDATES = 64  # least capacity of the tables: when they grow, the graph is captured again
 BLOCK = 128
 FLAT_BLOCK = 1024
-TAIL = 16  # elements behind the gradient, of which the first tells the other ranks of an overflow
+TAIL = 16  # elements behind the gradient; the first reports an overflow to the other ranks
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,9 +49,9 @@ class DeviceEpisode:
     material_N: torch.Tensor  # int32, index into the network's materials
     obstacles: SceneHash | None
     domain_size: Vector
-    gravity: Vector = (0.0, 0.0, 0.0)  # domain units per frame squared; for relative inputs alone
-    symmetries: tuple[Symmetry, ...] = ()  # of which one is drawn for each sample, where that is asked
-    barrier: SceneHash | None = None  # that its simulations hold by
+    gravity: Vector = (0.0, 0.0, 0.0)  # domain units per frame squared; only for relative inputs
+    symmetries: tuple[Symmetry, ...] = ()  # one is drawn for each sample, if settings.symmetry
+    barrier: SceneHash | None = None  # of its simulations
 
     def __post_init__(self) -> None:
         position_TN3, material_N = self.position_TN3, self.material_N
@@ -65,12 +65,12 @@ class DeviceEpisode:
 
     @cached_property
     def frames(self) -> int:
-        """All of them, those before frame 0 too."""
+        """Returns the number of frames, including those before frame 0."""
         return len(self.position_TN3)
 
     @cached_property
     def row(self) -> np.ndarray:
-        """A sample of frame 0 in the kernels' table, int64 [SAMPLE_COLUMNS], without seed, weight, noise, symmetry."""
+        """Returns frame 0 as a row of the sample table, int64 [SAMPLE_COLUMNS], without seed, weight and noise."""
         obstacles = self.obstacles.row() if self.obstacles is not None else [0] * OBSTACLE_COLUMNS
         return np.array(
             [self.position_TN3.data_ptr(), self.particles, 0, 0, self.material_N.data_ptr(), 0, 0, *obstacles], np.int64
@@ -84,7 +84,7 @@ class DeviceSample(NamedTuple):
     frame: int
     seed: int  # of noise, jitter and symmetry
     weight: float = 1.0  # of the loss
-    noise_scale: float = 1.0  # of the noise, in units of what the settings say
+    noise_scale: float = 1.0  # of the noise, in units of the settings' noise_std
 
 
 AnySample = DeviceSample | tuple[DeviceEpisode, int, int]
@@ -132,8 +132,8 @@ class Updates:
         capacities: tuple[int, ...] = (),
         one_graph: bool = False,
     ) -> None:
-        """`capacities` are cells of each level to begin with; without, they follow from the first update. With
-        `one_graph` a CUDA graph holds `reduce` too, which must then be captured without a word to the other ranks.
+        """`capacities` are the cells of each level at the start; without them they follow from the first update. With
+        `one_graph` a CUDA graph contains `reduce` too, which must not communicate while it is captured.
         """
         self.network, self.config, self.settings, self.precision = network, network.config, settings, precision
         self.loss_sum, self.counters, self.reduce, self.ranks = loss_sum, counters, reduce, ranks
@@ -161,7 +161,7 @@ class Updates:
         self.particles = 0
         self.growths = 0  # how often the buffers had to grow
         self.captures, self.capture_seconds = 0, 0.0
-        self._reach = (torch.zeros(3), torch.zeros(3))  # what the window must hold
+        self._reach = (torch.zeros(3), torch.zeros(3))  # the box that the window must contain
         self._graphs: list[torch.cuda.CUDAGraph] = []
         self._samples = self._vectors = self._rates = self._shares = torch.empty(0)
 
@@ -173,9 +173,9 @@ class Updates:
         rates: Sequence[float],
         shares: Sequence[float] | None = None,
     ) -> None:
-        """One update for each entry of `chunk`, which lists the sample of every scene.
+        """Makes one update for each entry of `chunk`, which lists the sample of every scene.
 
-        `shares` are those of the new values in `average`. Raises: ConfigError when positions are not finite.
+        `shares` are the weights of the new values in `average`. Raises: ConfigError when positions are not finite.
         """
         assert (shares is None) == (self.average is None)
         self._prepare(chunk, rates)
@@ -203,7 +203,7 @@ class Updates:
             self._make_room(status, needed)
 
     def _prepare(self, chunk: Sequence[Sequence[AnySample]], rates: Sequence[float]) -> None:
-        """Uploads what is to be computed, and makes room."""
+        """Uploads the tables of a chunk, and grows buffers if necessary."""
         assert len(chunk) == len(rates)
         particles = self._upload(chunk, rates)
         if particles > self.particles or not self._inside(self._reach):
@@ -211,11 +211,11 @@ class Updates:
             self._build()
 
     def _upload(self, chunk: Sequence[Sequence[AnySample]], rates: Sequence[float]) -> int:
-        """Writes the chunk's tables; the most particles of an update."""
+        """Writes the chunk's tables; returns the most particles of an update."""
         scenes, history = self.settings.scenes, self.config.velocity_history
         assert all(len(samples) == scenes for samples in chunk)
         flat = [DeviceSample(*sample) for samples in chunk for sample in samples]
-        # kernels read raw addresses: what is not there would be read all the same
+        # kernels read raw addresses, without a check of bounds
         for episode, frame, *_ in flat:
             assert 0 <= frame <= episode.frames - history - 2, "a window reaches beyond its episode"
         table = np.array([sample.episode.row for sample in flat]).reshape(len(chunk), scenes, SAMPLE_COLUMNS)
@@ -265,13 +265,13 @@ class Updates:
     # launches
 
     def allocate(self, particles: int, cells: Sequence[int]) -> None:
-        """Buffers for about so many particles and cells of each level, without samples: for precompilation."""
+        """Allocates buffers for about this number of particles and cells of each level, for precompilation."""
         self._allocate_tables(1)
         self.particles, self.capacities = 16 * math.ceil(particles / 16), self._rounded(cells)
         self._build()
 
     def launches(self) -> None:
-        """All launches of one update, without the other ranks."""
+        """Makes all launches of one update, without the other ranks."""
         self.launches_before_reduction()
         self.launches_after_reduction()
 
@@ -282,7 +282,7 @@ class Updates:
         self.launches_after_reduction()
 
     def launches_before_reduction(self) -> None:
-        """From the sample table to this rank's gradients."""
+        """Makes the launches from the sample table to this rank's gradients."""
         self._assemble()
         self._grid()
         fused = self.fused
@@ -297,7 +297,7 @@ class Updates:
             kernel.tell_overflow[(1,)](status=self.grid.status, flag=fused.totals[-TAIL:])
 
     def launches_after_reduction(self) -> None:
-        """From the gradients to new parameters."""
+        """Makes the launches from the gradients to new parameters."""
         fused, size, share = self.fused, self.packed.size, 1.0 / self.ranks
         blocks = (triton.cdiv(size, FLAT_BLOCK),)
         kernel.square_norm[blocks](
@@ -328,7 +328,7 @@ class Updates:
         )  # fmt: skip
 
     def _assemble(self) -> None:
-        """Windows, symmetry, noise and jitter of the update's samples; see hgn.training.noise for the torch backend."""
+        """Launches the assembly of the samples: windows, symmetry, noise, jitter. The rule is hgn.training.noise."""
         settings, config = self.settings, self.config
         correlated, steps = settings.noise_correlated_fraction, config.velocity_history
         wave_step = settings.noise_std * math.sqrt(2 / CORRELATED_WAVES * correlated / steps)
@@ -367,7 +367,7 @@ class Updates:
         return bool((self._built_reach[0] <= reach[0]).all() and (self._built_reach[1] >= reach[1]).all())
 
     def _build(self) -> None:
-        """Buffers for `particles` particles and `capacities` cells, which are measured first where unknown."""
+        """Allocates buffers for `particles` and `capacities`, which are measured first where unknown."""
         config, device, particles = self.config, self.device, self.particles
         self._graphs = []
         if hasattr(self, "fused"):
