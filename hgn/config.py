@@ -284,7 +284,7 @@ class DatagenConfig:
 
     @property
     def reference(self) -> dict[str, Any] | None:
-        """What a data set records of a finer grid; None on the visible grid."""
+        """Returns the record of the finer grid in a data set, or None on the visible grid."""
         if self.reference_ratio == 1:
             return None
         children = round(self.reference_ratio**3)

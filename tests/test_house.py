@@ -16,12 +16,12 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 27_183,
-    "datagen": 8_320,
+    "hgn": 27_232,
+    "datagen": 8_499,
     "tools": 6_187,
-    "tests": 27_874,
+    "tests": 28_083,
 }
-SETTINGS = 238  # fields of the dataclasses behind the commands, *Config
+SETTINGS = 239  # fields of the dataclasses behind the commands, *Config
 
 LINES_OF_A_FILE = 450
 LONG_FILES = {
