@@ -332,12 +332,12 @@ def test_growing_gives_back_first(monkeypatch):
     old = [weakref.ref(tight.grid), weakref.ref(tight.fused)]
     build, asked = DeviceGrid.__init__, []
 
-    def refuse(grid, window, scenes, capacities, *rest):
+    def refuse(grid, config, window, capacities, **rest):
         gc.collect()
         asked.append((capacities, [one() for one in old]))
         if len(asked) == 1:
             raise torch.OutOfMemoryError("no room")
-        build(grid, window, scenes, capacities, *rest)
+        build(grid, config, window, capacities, **rest)
 
     monkeypatch.setattr(DeviceGrid, "__init__", refuse)
     done = []

@@ -86,8 +86,8 @@ class DeviceParticles:
         scene_N, material_N, count = (
             torch.zeros(size, dtype=torch.int32, device=device) for size in (particles, particles, 1)
         )
-        of_scenes = [torch.zeros(scenes, 3, device=device) for _ in range(3)]
-        return DeviceParticles(position_N3, velocity_NV, scene_N, material_N, *of_scenes, count)
+        origin_S3, domain_S3, gravity_S3 = (torch.zeros(scenes, 3, device=device) for _ in range(3))
+        return DeviceParticles(position_N3, velocity_NV, scene_N, material_N, origin_S3, domain_S3, gravity_S3, count)
 
 
 class DeviceGrid:
