@@ -363,7 +363,7 @@ def test_frames_taken_away_beside_the_next(monkeypatch):
         growths.append(tight.growths)
         assert seen == [1, 2, 3]
         simulation.continue_from(state)
-        tight.velocity_NV[0] = 1.0
+        tight.buffers.velocity_NV[0] = 1.0
         with pytest.raises(DivergedError) as caught:
             simulation.run(2)
         lost.append(str(caught.value))
