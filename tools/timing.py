@@ -1,4 +1,4 @@
-"""Times and memory of contenders that take turns in one process, after a warm-up, by device events."""
+"""Times and memory of contenders in one process, after a warm-up: runs by device events, rollouts by their frames."""
 
 from __future__ import annotations
 
@@ -6,15 +6,25 @@ import gc
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from typing import Any, Protocol
 
 import numpy as np
 import torch
 
 from hgn.runtime.backend import set_matmul_precision
+from hgn.scene.episode import Episode
 
 WARM_UP = 3
 MINIMUM_ROUNDS = 5
 TOGETHER_S = 20e-6  # frames reported closer together than this were computed together
+# rollouts
+SCENES = 3  # timed one by one
+BATCHES = (8, 64, 256)  # scenes side by side, of which each contender takes its best
+FRAMES, SECONDS = 100, 0.5  # of each timed rollout, at most; slow contenders simulate fewer frames
+SOLVER_FRAMES = 300  # the solver's frames are slowest when material has landed
+WARM_FRAMES, TRITON_WARM_FRAMES = 6, 70  # also the least number of timed frames; Triton reports 32 frames at once
+SOLVER_WARM_FRAMES = 2  # the solver compiles in the first frame
+GAIN = 0.95  # of a scene's time, below which a larger batch is better
 
 
 class Timed:
@@ -61,11 +71,12 @@ def alternate(contenders: Sequence[Timed], rounds: int, is_over: Callable[[], bo
     return milliseconds
 
 
-def statistics(milliseconds: Sequence[float]) -> dict[str, object]:
-    """Returns the columns `ms` (the median), `ms_quartiles`, `ms_range` and `samples` of a row."""
+def statistics(milliseconds: Sequence[float]) -> dict[str, Any]:
+    """Returns the columns `ms` (the median), `ms_quartiles`, `ms_range` and `samples` of a row; `ms` of no samples."""
+    if not len(milliseconds):
+        return {"ms": None}
     least, low, middle, high, most = np.percentile(milliseconds, (0, 25, 50, 75, 100)).tolist()
-    columns = {"ms": middle, "ms_quartiles": [low, high], "ms_range": [least, most]}
-    return columns | {"samples": len(milliseconds)}
+    return {"ms": middle, "ms_quartiles": [low, high], "ms_range": [least, most], "samples": len(milliseconds)}
 
 
 class FrameClock:
@@ -85,6 +96,86 @@ class FrameClock:
             return None
         first = int(later[0])
         return 1e3 * float(gaps[first:].sum()) / (len(self.ends) - 1 - first)
+
+
+class Simulates(Protocol):
+    """A contender that simulates scenes side by side and reports its frames."""
+
+    row: dict[str, Any]
+    stepped: bool
+
+    def trials(self, episodes: Sequence[Episode], frames: int, on_frame: FrameClock, /) -> object: ...
+    def release(self) -> None: ...
+
+
+class Stopwatch:
+    """Times rollouts of some scenes one by one, and of a batch side by side."""
+
+    def __init__(self, contender: Simulates, references: Sequence[Episode], device: torch.device) -> None:
+        """Warms up everything that is timed, and chooses the number of frames and the batch."""
+        some = sorted(references[:SCENES], key=lambda episode: -len(episode.material_N))  # the largest allocates most
+        self.contender, self.singles = contender, [[episode] for episode in some]
+        self.single_ms: list[float] = []
+        self.batched_ms: list[float] = []
+        contender.release()
+        memory, captures = GpuMemory(device), not contender.stepped
+        self.solver = contender.row["system"] == "mpm"
+        most = min(SOLVER_FRAMES if self.solver else FRAMES, len(some[0].position_TN3))
+        frames = min(TRITON_WARM_FRAMES if captures else WARM_FRAMES, most)
+        if self.solver:
+            for scenes in self.singles:  # each set of materials is another kernel
+                self._frame_ms(scenes, min(SOLVER_WARM_FRAMES, most))
+        elif captures:
+            self._frame_ms(self.singles[0], frames)
+        taken = self._frame_ms(self.singles[0], frames)
+        self.memory_gb = None if self.solver else memory.peak_gb()
+        self.batch, together = self._best_batch(references, frames, self.solver or captures)
+        self.single_frames, self.batch_frames = (
+            most if ms is None or self.solver else min(most, max(frames, int(1e3 * SECONDS / ms)))
+            for ms in (taken, together)
+        )
+        if captures:
+            for single in self.singles:
+                self._frame_ms(single, self.single_frames)
+            self._frame_ms(self.batch, self.batch_frames)
+
+    def _frame_ms(self, scenes: Sequence[Episode], frames: int) -> float | None:
+        """Returns the mean time of a frame of a rollout; None if the rollout ends too early."""
+        clock = FrameClock()
+        self.contender.trials(scenes, frames, clock)
+        return clock.milliseconds()
+
+    def _best_batch(
+        self, references: Sequence[Episode], frames: int, compiles: bool
+    ) -> tuple[list[Episode], float | None]:
+        """Returns the batch with the shortest time a scene, and the milliseconds of its frames."""
+        best, least = list(references[:1]), None
+        for count in BATCHES:
+            batch = [references[i % len(references)] for i in range(count)]
+            try:
+                if compiles:
+                    self._frame_ms(batch, frames)
+                taken = self._frame_ms(batch, frames)
+            except torch.OutOfMemoryError:
+                self.contender.release()
+                break
+            if taken is None or (least is not None and taken / len(batch) > GAIN * least / len(best)):
+                break
+            best, least = batch, taken
+        return best, least
+
+    def round(self) -> dict[str, Any]:
+        """Simulates each scene once more; returns `ms` of a frame and `ms_batched` of a frame and scene."""
+        rollouts = [(scenes, self.single_frames, self.single_ms) for scenes in self.singles]
+        if not (self.solver and self.batched_ms):  # a whole rollout of many scenes is timed once
+            rollouts.append((self.batch, self.batch_frames, self.batched_ms))
+        for scenes, frames, milliseconds in rollouts:
+            taken = self._frame_ms(scenes, frames)
+            if taken is not None:
+                milliseconds.append(taken / len(scenes))
+        batch = {"ms_batched": statistics(self.batched_ms)["ms"], "batch_scenes": len(self.batch)}
+        timed = {"timed_frames": self.single_frames, "memory_gb": self.memory_gb}
+        return statistics(self.single_ms) | batch | timed
 
 
 def free(device: torch.device) -> None:

@@ -21,7 +21,7 @@ from hgn.scene.shapes import shape_obstacle
 from hgn.training.errors import ballistic, frame_batches, one_step_errors
 from tools.error_vs_time import score
 from tools.error_vs_time.contenders import BaselineContender, TritonPredictor
-from tools.error_vs_time.paired import paired_difference, paired_lines, paired_rows
+from tools.error_vs_time.paired import paired_difference, paired_rows, paired_table
 from tools.error_vs_time.plot import draw_frames, draw_pareto
 from tools.error_vs_time.sinkhorn import sinkhorn_divergences
 from tools.measures import energies, energy_scale, momentum_error, outside_domain
@@ -32,13 +32,25 @@ CPU = torch.device("cpu")
 
 
 @pytest.fixture
-def data(small_dataset):
-    return str(small_dataset)
+def episode(small_dataset):
+    (episode,) = EpisodeStore(small_dataset, "test")
+    return episode
 
 
-def test_baseline_errors_are_those_of_training(data):
+@pytest.fixture
+def episodes(small_dataset):
+    return list(EpisodeStore(small_dataset, "validation"))
+
+
+def some_of(episode, particles):
+    """The episode with some of its particles."""
+    changed = {name: getattr(episode, name)[particles] for name in ("initial_velocity_N3", "material_N")}
+    key = f"some-{particles.start}"
+    return replace(episode, key=key, position_TN3=np.array(episode.position_TN3[:, particles]), **changed)
+
+
+def test_baseline_errors_are_those_of_training(episode):
     """One-step errors agree with what training measures, at every frame."""
-    (episode,) = EpisodeStore(data, "test")
     gravity = BaselineContender("fall", lambda e: 0.9 * np.asarray(e.gravity) / e.frame_rate_hz**2, CPU)
     network = network_of(torch.float32, obstacle_features=False)
     batches = frame_batches([episode], network, 1, 100)
@@ -46,21 +58,14 @@ def test_baseline_errors_are_those_of_training(data):
     assert gravity.one_step(episode, 1).error.mse == pytest.approx(expected["fall"].mse, rel=1e-5)
 
 
-def test_one_step_errors_of_triton(data):
+def test_one_step_errors_of_triton(episode):
     """One-step errors of backend triton come from its kernels, several frames at once: in float32 they are the plain
     network's, whatever its walls hold; what is captured serves the next frames, and those of fewer particles too."""
-    (episode,) = EpisodeStore(data, "test")
-    fewer = replace(
-        episode,
-        key="fewer",
-        position_TN3=episode.position_TN3[:, 1:],
-        initial_velocity_N3=episode.initial_velocity_N3[1:],
-        material_N=episode.material_N[1:],
-    )
+    more, fewer = some_of(episode, slice(0, 12)), some_of(episode, slice(1, 12))
     network = network_of(torch.float32, width=16, levels=1, message_passing_steps=1, wall_clearance=(0.5, 0.5))
     backend, made = build("triton", network, "fp32"), []
     with torch.inference_mode():
-        for samples in ([(episode, 0), (episode, 2)], [(fewer, 1), (fewer, 3)], [(episode, 3)]):
+        for samples in ([(more, 0), (more, 2)], [(fewer, 1), (fewer, 3)], [(more, 3)]):
             batch = make_batch(samples, network.config)
             found_N3 = TritonPredictor(backend)(batch)
             torch.testing.assert_close(found_N3, network(batch.state()), rtol=1e-4, atol=1e-8)
@@ -68,59 +73,38 @@ def test_one_step_errors_of_triton(data):
     assert made[0] is made[1] is not made[2]
 
 
-def test_ghost_acceleration_counts_particles_at_rest(data):
+def test_ghost_acceleration_counts_particles_at_rest(episode):
     """Only particles that have not moved count, each with the length of what is predicted for it."""
-    (episode,) = EpisodeStore(data, "test")
     position_TN3 = np.repeat(np.array(episode.position_TN3[:1]), 9, axis=0)
     position_TN3[:, 0] += np.arange(9, dtype=np.float32)[:, None] * 0.01
-    still = replace(
-        episode,
-        position_TN3=position_TN3,
-        initial_velocity_N3=np.zeros_like(episode.initial_velocity_N3),
-        gravity=(0.0, 0.0, 0.0),
-    )
+    still_N3 = np.zeros_like(episode.initial_velocity_N3)
+    still = replace(episode, position_TN3=position_TN3, initial_velocity_N3=still_N3, gravity=(0.0, 0.0, 0.0))
     step = BaselineContender("push", lambda e: np.array([3e-3, 0.0, 4e-3]), CPU).one_step(still, 1)
     assert step.rest_count == 8 * (position_TN3.shape[1] - 1)
     assert score.one_step_figures([step])["ghost"] == pytest.approx(5e-3, rel=1e-5)
 
 
-def test_a_diverging_scene_ends_alone(data):
-    """Beside one that diverges a scene goes on to the end; the other is kept as far as it came, with the cause."""
-    episodes = EpisodeStore(data, "validation")
-    scenes = [InitialState.of_episode(episode) for episode in episodes]
-    scenes = [replace(s, material_N=np.full_like(s.material_N, i)) for i, s in enumerate(scenes)]
-    simulator = Simulator(network_of(torch.float32), 60.0)
-    simulator.backend.predict = lambda state: (state.material_N == 1)[:, None].float().expand(-1, 3)
-    through, failed = simulate_scenes(simulator, scenes, 5)
-    assert through.cause is None and through.frame_count == 5
-    assert failed.cause is not None and "diverged at frame 2" in failed.cause and failed.frame_count == 2
-    assert np.isfinite(failed.position_TN3).all()
-    assert simulate_scenes(simulator, [], 5) == []
-
-
 def test_sinkhorn_against_closed_forms():
     """Zero for a permuted cloud, the square of the shift for a shifted one, NaN where a position is not finite."""
 
-    def sinkhorn_divergence(first, second, blur):
+    def sinkhorn_divergence(first, second, blur=0.01):
         return sinkhorn_divergences([(first, second)], blur)[0]
 
     generator = torch.Generator().manual_seed(0)
     cloud = torch.rand(120, 3, generator=generator)
     shift = torch.tensor([0.1, -0.05, 0.2])
-    assert abs(sinkhorn_divergence(cloud, cloud.flip(0), 0.01)) < 1e-9
-    assert sinkhorn_divergence(cloud, cloud + shift, 0.01) == pytest.approx(float(shift.square().sum()), rel=1e-4)
-    assert sinkhorn_divergence(cloud, cloud + 0.01 * shift, 0.01) == pytest.approx(5.25e-6, rel=1e-3)
-    assert sinkhorn_divergence(cloud[:1], cloud[1:2], 0.01) == pytest.approx(
-        float((cloud[0] - cloud[1]).square().sum()), rel=1e-5
-    )
+    assert abs(sinkhorn_divergence(cloud, cloud.flip(0))) < 1e-9
+    assert sinkhorn_divergence(cloud, cloud + shift) == pytest.approx(float(shift.square().sum()), rel=1e-4)
+    assert sinkhorn_divergence(cloud, cloud + 0.01 * shift) == pytest.approx(5.25e-6, rel=1e-3)
+    apart = float((cloud[0] - cloud[1]).square().sum())
+    assert sinkhorn_divergence(cloud[:1], cloud[1:2]) == pytest.approx(apart, rel=1e-5)
     others = [(cloud[:50], cloud[50:100] + shift), (cloud[:50], cloud[:50]), (cloud[:3], cloud[3:6])]
-    together = sinkhorn_divergences(
-        [*others, (cloud[:50] * 0.1, cloud[50:100]), (cloud[:50] * math.nan, cloud[:50])], 0.05
-    )
+    more = [(cloud[:50] * 0.1, cloud[50:100]), (cloud[:50] * math.nan, cloud[:50])]
+    together = sinkhorn_divergences([*others, *more], 0.05)
     assert together[:3] == pytest.approx([sinkhorn_divergence(*pair, 0.05) for pair in others], rel=1e-4, abs=1e-9)
     assert together[3] > 0 and math.isnan(together[4])
     cloud[3, 0] = math.nan
-    assert math.isnan(sinkhorn_divergence(cloud, cloud, 0.01))
+    assert math.isnan(sinkhorn_divergence(cloud, cloud))
 
 
 def test_momentum_and_energy_against_closed_forms():
@@ -162,9 +146,8 @@ def test_other_grids_keep_their_walls():
     assert cells == [2, 2, 3, 6]
 
 
-def test_failed_scenes_are_left_out_of_means(data):
+def test_failed_scenes_are_left_out_of_means(episodes):
     """Errors at a frame are means over the scenes that reached it, and say over how many."""
-    episodes = list(EpisodeStore(data, "validation"))
     paths = [np.array(episode.position_TN3) for episode in episodes]
     trials = [RolloutResult(paths[0] + np.float32(0.1)), RolloutResult(paths[1][:3] + np.float32(0.2), "why")]
     row = score.rollout_figures(trials, episodes, CPU)
@@ -174,22 +157,23 @@ def test_failed_scenes_are_left_out_of_means(data):
     assert row["scenes_reached"] == {"5": 1} and row["first_failure_frame"] == 3 and row["first_failure"] == "why"
 
 
-@pytest.mark.parametrize("kind", ["hgn", "gns"])
-def test_a_diverging_scene_does_not_change_others(data, kind):
-    """Off backend triton they are simulated once, as if it had never been there."""
-    episodes = EpisodeStore(data, "validation")
+@pytest.mark.parametrize("network_of_kind", [network_of, gns_of])
+def test_a_diverging_scene_does_not_change_others(episodes, network_of_kind):
+    """Off backend triton scenes are simulated once, and one that diverges ends alone: it is kept as far as it came,
+    with the cause, and the others are as if it had never been there."""
     scenes = [InitialState.of_episode(episode) for episode in (*episodes, episodes[0])]
     scenes[1] = replace(scenes[1], velocity_N3=scenes[1].velocity_N3 + np.float32(60.0))
-    simulator, calls = Simulator((network_of if kind == "hgn" else gns_of)(torch.float32), 60.0), []
+    simulator, calls = Simulator(network_of_kind(torch.float32), 60.0), []
     predict = simulator.backend.predict
     simulator.backend.predict = lambda state: calls.append(len(state.position_N3)) or predict(state)
     first, lost, last = simulate_scenes(simulator, scenes, 5)
     assert lost.cause is not None and f"diverged at frame {lost.frame_count}" in lost.cause and len(calls) == 4
-    assert calls[0] > calls[-1]
+    assert calls[0] > calls[-1] and np.isfinite(lost.position_TN3).all()
     for trial, scene in ((first, scenes[0]), (last, scenes[2])):
         (alone,) = simulate_scenes(simulator, [scene], 5)
-        assert trial.cause is None
+        assert trial.cause is None and trial.frame_count == 5
         np.testing.assert_allclose(trial.position_TN3, alone.position_TN3, atol=1e-6)
+    assert simulate_scenes(simulator, [], 5) == []
 
 
 def report_row(system, error, ms, **more):
@@ -198,10 +182,8 @@ def report_row(system, error, ms, **more):
     row |= {"one_step_by_material": one_step and {"water": 2 * error}, "position_mse": {"50": error, "299": 2 * error}}
     row |= {"position_quartiles": {"50": [0.5 * error, 2 * error]}, "scenes_reached": {"50": 2, "299": 1}}
     row |= {"seeds": [1, 2], "failed_scenes": 1, "curve": [0.0, error, None], "penetration": 0.01, "sinkhorn": {}}
-    row |= {"reference_penetration": 0.005, "ms": ms, "ms_batched": ms, "batch_scenes": 2}
-    return (
-        row | {"weights": f"{system}.safetensors", "levels": 3, "message_passing_steps": 4, "backend": "triton"} | more
-    )
+    row |= {"reference_penetration": 0.005, "ms": ms, "ms_batched": ms, "batch_scenes": 2, "backend": "triton"}
+    return row | {"weights": f"{system}.safetensors", "levels": 3, "message_passing_steps": 4} | more
 
 
 def report_rows():
@@ -254,10 +236,10 @@ def test_paired_rows():
     assert of_hgn == [("GNS M = 4", "one-step MSE"), ("GNS M = 4", "position MSE"), ("MPM 64³", "position MSE")]
     beside = paired_rows([*rows, other, other | {"precision": "another"}])
     assert [(row["error"], row["mean"][0]) for row in beside if "(other" in row["other"]] == [("position MSE", -0.5)]
-    told = "\n".join(paired_lines(made))
-    assert "position MSE after 50 frames, 3 scenes: nearer in the median (-1.00e+00, -1.00e+00 to -1.00e+00)" in told
-    assert "MPM 64³, step 0.5, position MSE after 50 frames, 3 scenes: no difference shown in the median" in told
-    assert paired_lines([]) == []
+    _, _, *told = paired_table(made).splitlines()
+    assert len(told) == len(made)
+    assert any("-1.00e+00 (-1.00e+00 to -1.00e+00): nearer" in line and "GNS" in line for line in told)
+    assert any("MPM 64³, step 0.5" in line and "no difference shown" in line for line in told)
 
 
 def test_the_figures_show_what_diverged(tmp_path):
@@ -266,12 +248,9 @@ def test_the_figures_show_what_diverged(tmp_path):
     meta |= {"scenes": 2, "split": "test", "data": "d", "device": "a GPU", "reference": "the solver"}
     rows = report_rows()
     rows[2] |= {"position_mse": {"50": 1e-6}, "scenes_reached": {"50": 2, "299": 0}, "failed_scenes": 2}
-    pictures = (
-        draw_pareto(rows, meta),
-        draw_pareto([], meta, batched=True),
-        draw_frames(rows, meta),
-        draw_frames([], meta),
-    )
-    for picture in pictures:
+    for picture in (
+        *(draw_pareto(rows, meta), draw_pareto([], meta, batched=True)),
+        *(draw_frames(rows, meta), draw_frames([], meta)),
+    ):
         with Image.open(io.BytesIO(picture)) as image:
             assert image.width > 500

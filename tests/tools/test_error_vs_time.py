@@ -15,12 +15,13 @@ from PIL import Image
 import datagen.mpm.solver
 from datagen.mpm.solver import SceneFailure, Simulated
 from hgn.data.reader import EpisodeStore
-from hgn.runtime.weights import WeightsInfo, save_weights, shipped_weights
-from hgn.schema import ConfigError, from_mapping
-from tools.error_vs_time import plot, run, score, timing
+from hgn.runtime.weights import WeightsInfo, save_weights
+from hgn.schema import ConfigError
+from tools import timing
+from tools.error_vs_time import plot, run, score
 from tools.error_vs_time.__main__ import fitting_weights, main, network_contenders
 from tools.error_vs_time.settings import ErrorVsTimeConfig
-from tools.error_vs_time.timing import Stopwatch
+from tools.timing import Stopwatch
 
 SHORT = {"split": "validation", "device": "cpu", "perturbation": 0.0}
 CPU = torch.device("cpu")
@@ -74,50 +75,70 @@ def data(small_dataset):
 
 
 @pytest.fixture
+def compare(data, both, tmp_path):
+    """Runs the command and returns its report; `code` is the expected exit code."""
+
+    def compare(name="report", code=0, **options):
+        out = tmp_path / name
+        assert main(SHORT | {"data": data, "out": str(out), "weights": both, "mpm_grids": []} | options) == code
+        return json.loads(Path(f"{out}.json").read_text())
+
+    return compare
+
+
+@pytest.fixture
 def undrawn(monkeypatch):
     """Skips figures, which take most of the time."""
     monkeypatch.setattr("tools.error_vs_time.run.draw", lambda *_: [])
 
 
-def test_the_report(data, both, tmp_path, monkeypatch, capsys):
+@pytest.fixture
+def on_score(monkeypatch):
+    """Calls a function with the row of each contender that is about to be scored."""
+
+    def on_score(action):
+        monkeypatch.setattr("tools.error_vs_time.run.score", lambda c, *more: action(c.row) or score.score(c, *more))
+
+    return on_score
+
+
+def systems(report):
+    return [row["system"] for row in report["rows"]]
+
+
+def test_the_report(compare, tmp_path, monkeypatch, capsys):
     """Every contender gets a row with the report's keys on the same scenes; failed scenes are counted."""
     monkeypatch.setattr(datagen.mpm.solver, "simulate", fake_simulate)
-    out = tmp_path / "results" / "report"
-    options = {"data": data, "out": str(out), "weights": both, "mpm_grids": [32, 64], "perturbation": 1e-6}
     monkeypatch.setattr(timing, "SOLVER_FRAMES", 300)
-    assert main(SHORT | options) == 0
-    report = json.loads(Path(f"{out}.json").read_text())
+    report = compare("results/report", mpm_grids=[32, 64], perturbation=1e-6)
     assert {"device", "versions", "commit", "date", "command", "convention", "reference"} <= report["meta"].keys()
     rows = report["rows"]
-    systems = [row["system"] for row in rows]
-    assert systems == ["hgn", "gns", *["baseline"] * 3, *["mpm"] * 4, *["chaos"] * 2]
+    assert systems(report) == ["hgn", "gns", *["baseline"] * 3, *["mpm"] * 4, *["chaos"] * 2]
     keys = {"one_step_mse", "position_mse", "sinkhorn", "penetration", "ghost", "momentum_error", "seeds"}
     for row in rows:
-        assert keys <= row.keys() and len(row["seeds"]) == 2
+        assert keys <= row.keys() and len(row["seeds"]) == 2 and row["scoring_s"] >= 0
         assert (row["one_step_mse"] is None) == (row["system"] in ("mpm", "chaos"))
         assert ("ms" in row) == (row["system"] in ("hgn", "gns", "mpm"))
+        for error, mean in (("position MSE", row["position_mse"]["5"]), ("one-step MSE", row["one_step_mse"])):
+            for values in row["by_scene"].get(error, {}).values():
+                assert np.mean([value for value in values if value is not None]) == pytest.approx(mean, rel=0.1)
     mpm = {(row["grid"], row["step"]): row for row in rows if row["system"] == "mpm"}
     assert mpm[64, 1.0]["failed_scenes"] == 1 and mpm[64, 1.0]["first_failure"] == "too fast"
     assert mpm[64, 1.0]["scenes_reached"] == {"5": 1} and mpm[64, 0.5]["scenes_reached"] == {"5": 2}
     assert 0 < mpm[64, 0.5]["position_mse"]["5"] < mpm[32, 0.5]["position_mse"]["5"]
-    assert report["meta"]["not_run"] == [] and all(row["scoring_s"] >= 0 for row in rows)
     floor = {row["floor"]: row["position_mse"]["5"] for row in rows if row["system"] == "chaos"}
     assert 1e-13 < floor["perturbed by 1e-06"] < 3e-12
     assert floor["twice the step"] == pytest.approx(mpm[64, 0.5]["position_mse"]["5"])
     assert report["meta"]["set"]["drawn"] is None and len(report["meta"]["set"]["not_frozen_before"]) == 2
+    assert report["meta"]["not_run"] == []
     assert rows[0]["by_scene"].keys() == {"one-step MSE", "position MSE", "Sinkhorn"} != rows[-1]["by_scene"].keys()
-    for row in rows:
-        for error, mean in (("position MSE", row["position_mse"]["5"]), ("one-step MSE", row["one_step_mse"])):
-            for values in row["by_scene"].get(error, {}).values():
-                assert np.mean([value for value in values if value is not None]) == pytest.approx(mean, rel=0.1)
     assert {row["other"].split(",")[0] for row in report["paired"]} == {"GNS M = 3", "MPM 32³", "MPM 64³"}
     for end in ("", "_batched", "_frames"):
-        with Image.open(f"{out}{end}.png") as picture:
+        with Image.open(tmp_path / f"results/report{end}.png") as picture:
             assert picture.width > 500
     printed = capsys.readouterr().out
-    assert all(
-        name in printed for name in ("HGN L = 3, M = 2", "GNS M = 3, torch fp32", "MPM 32³, step 1", "chaos floor")
-    )
+    names = ("HGN L = 3, M = 2", "GNS M = 3, torch fp32", "MPM 32³, step 1", "chaos floor", "95% interval")
+    assert all(name in printed for name in names)
 
 
 def test_labels_of_the_figures_lie_side_by_side(monkeypatch):
@@ -134,7 +155,7 @@ def test_labels_of_the_figures_lie_side_by_side(monkeypatch):
 
 
 @pytest.mark.usefixtures("undrawn")
-def test_when_time_is_over(data, tmp_path, monkeypatch):
+def test_when_time_is_over(compare, monkeypatch):
     """Contenders that have not started by then are named, and left out; a shorter rollout of the solver is scored up
     to its end, and each setting is simulated once."""
     calls: list[tuple[float, list[float], int]] = []
@@ -145,62 +166,38 @@ def test_when_time_is_over(data, tmp_path, monkeypatch):
 
     monkeypatch.setattr(datagen.mpm.solver, "simulate", counted)
     monkeypatch.setattr("tools.error_vs_time.__main__.shipped_weights", dict)
-    out = tmp_path / "report"
-    options = SHORT | {"data": data, "out": str(out), "resimulate": False, "mpm_grids": [64], "mpm_frames": 3}
-    assert main(options) == 0
+    options = {"weights": None, "resimulate": False, "mpm_grids": [64], "mpm_frames": 3}
+    report = compare(**options)
     assert [call for call in calls if call[2] == 3] == [(1 / 64, [0.5, 1.0], 3)]  # of one grid side by side
     assert {call[2] for call in calls} == {2, 3, 4} and all(len(call[1]) == 1 for call in calls if call[2] != 3)
-    rows = json.loads(Path(f"{out}.json").read_text())["rows"]
-    assert [row["system"] for row in rows] == ["baseline"] * 3 + ["mpm", "mpm"]
-    assert rows[4]["scenes_reached"] == {"5": 0} and rows[4]["failed_scenes"] == 0
-    assert main(options | {"seconds": 1e-9}) == 0
-    report = json.loads(Path(f"{out}.json").read_text())
-    assert [row["system"] for row in report["rows"]] == ["baseline"] * 3 and len(report["meta"]["not_run"]) == 2
-    assert all(left["cause"] == "the time was over" for left in report["meta"]["not_run"])
+    assert systems(report) == ["baseline"] * 3 + ["mpm", "mpm"]
+    assert report["rows"][4]["scenes_reached"] == {"5": 0} and report["rows"][4]["failed_scenes"] == 0
+    report = compare(seconds=1e-9, **options)
+    assert systems(report) == ["baseline"] * 3
+    assert [left["cause"] for left in report["meta"]["not_run"]] == ["the time was over"] * 2
 
 
 @pytest.mark.usefixtures("undrawn")
-def test_the_data_can_be_the_reference(data, tmp_path):
-    """Without a solver the data is the reference; ballistic motion has no error on ballistic data."""
-    out = tmp_path / "report"
-    options = {"data": data, "out": str(out), "split": "validation", "resimulate": False, "device": "cpu"}
-    assert main(options | {"weights": [], "mpm_grids": [], "perturbation": 0.0}) == 0
-    rows = {row["predictor"]: row for row in json.loads(Path(f"{out}.json").read_text())["rows"]}
-    assert rows["ballistic motion"]["position_mse"]["5"] < 1e-13 < rows["constant velocity"]["position_mse"]["5"]
-    assert rows["ballistic motion"]["one_step_mse"] < 1e-13 < rows["constant velocity"]["one_step_mse"]
-
-
-def test_unsupported_precisions(data, both, tmp_path, capsys):
-    """A precision that no backend supports here is left out, with a message."""
-    options = {"data": data, "out": str(tmp_path / "report"), "split": "test", "weights": both}
-    config = from_mapping(ErrorVsTimeConfig, options | {"precisions": ["fp32", "fp16"]})
-    (episode,) = EpisodeStore(data, "test")
-    found = [(c.row["system"], c.row["precision"]) for c in network_contenders(config, CPU, [episode])]
-    assert found == [("hgn", "fp32"), ("gns", "fp32")]
-    printed = capsys.readouterr().err
-    assert all(f"left out: {name}.safetensors at fp16" in printed for name in ("hgn", "gns"))
-
-
-@pytest.mark.usefixtures("undrawn")
-def test_order_of_measurements(data, both, tmp_path, monkeypatch, capsys):
+def test_order_of_measurements(compare, both, monkeypatch, on_score, capsys):
     """Networks at their first precision, the solver on the data's grid, baselines, GNS, coarse grids, then other
-    precisions; the report keeps its own order. A contender that fails is named with the cause, and the others go on."""
+    precisions; the report keeps its own order. A contender that fails is named with the cause, and the others go on;
+    an unexpected error is printed, and the exit code is 1."""
     monkeypatch.setattr(datagen.mpm.solver, "simulate", fake_simulate)
     monkeypatch.setattr("tools.error_vs_time.__main__.STEPS", (0.5,))
     monkeypatch.setattr(score, "SINKHORN_SCENES", 0)
     order: list[str] = []
 
-    def noted(contender, *more):
-        order.append(score.label(contender.row))
+    def noted(row):
+        order.append(score.label(row).split(" (")[0])
         if "48" in order[-1]:
             raise ConfigError("grids of 48 are not liked")
-        return score.score(contender, *more)
+        if order[-1] == "mean acceleration":
+            raise RuntimeError("an illegal memory access")
 
-    monkeypatch.setattr("tools.error_vs_time.run.score", noted)
-    options = {"data": data, "out": str(tmp_path / "report"), "weights": both[::-1], "perturbation": 1e-6}
-    options |= {"mpm_grids": [48, 64], "precisions": ["tf32", "fp32"]}
-    assert main(SHORT | options) == 0
-    assert [name.split(" (")[0] for name in order] == [
+    on_score(noted)
+    options = {"weights": both[::-1], "perturbation": 1e-6, "mpm_grids": [48, 64]}
+    report = compare(code=1, precisions=["tf32", "fp32", "fp16"], **options)
+    assert order == [
         "HGN L = 3, M = 2, cpu tf32",
         *["constant velocity", "ballistic motion", "mean acceleration"],
         *["MPM 64³, step 0.5", "chaos floor: perturbed by 1e-06", "chaos floor: twice the step"],
@@ -209,11 +206,13 @@ def test_order_of_measurements(data, both, tmp_path, monkeypatch, capsys):
         "GNS M = 3, torch fp32",
         "HGN L = 3, M = 2, cpu fp32",
     ]
-    report = json.loads((tmp_path / "report.json").read_text())
-    (left,) = report["meta"]["not_run"]
-    assert left["grid"] == 48 and left["cause"] == "grids of 48 are not liked"
+    causes = [left["cause"] for left in report["meta"]["not_run"]]
+    assert causes == ["RuntimeError: an illegal memory access", "grids of 48 are not liked"]
     assert report["meta"]["not_timed"] == ["MPM 64³, step 0.5"]  # its frames end together here
-    assert "left out: MPM 48³, step 0.5: grids of 48 are not liked" in capsys.readouterr().err
+    printed = capsys.readouterr().err
+    assert "left out: MPM 48³, step 0.5: grids of 48 are not liked" in printed
+    assert "Traceback" in printed and "1 of the measurements failed" in printed
+    assert all(f"left out: {name}.safetensors at fp16" in printed for name in ("hgn", "gns"))  # no backend here has it
     rows = report["rows"]
     assert [(row["system"], row["precision"]) for row in rows[:4]] == [
         (kind, precision) for kind in ("gns", "hgn") for precision in ("tf32", "fp32")
@@ -232,7 +231,6 @@ def test_the_solver_is_timed_over_whole_rollouts(system, frames, monkeypatch):
             self.asked.append(frames)
             for frame in range(frames):
                 on_frame(frame)
-            return []
 
         def release(self):
             pass
@@ -240,7 +238,7 @@ def test_the_solver_is_timed_over_whole_rollouts(system, frames, monkeypatch):
     monkeypatch.setattr(timing, "FRAMES", 8)
     monkeypatch.setattr(timing, "SOLVER_FRAMES", 300)
     episode: Any = SimpleNamespace(material_N=np.zeros(3), position_TN3=np.zeros((12, 3, 3)))
-    contender: Any = Recorder()
+    contender = Recorder()
     Stopwatch(contender, [episode], CPU).round()
     assert max(contender.asked) == frames
 
@@ -248,32 +246,24 @@ def test_the_solver_is_timed_over_whole_rollouts(system, frames, monkeypatch):
 def test_shipped_weights_that_fit(data, tmp_path, monkeypatch, capsys):
     """By default all shipped weights that fit the data are compared; others are named."""
     (episode,) = EpisodeStore(data, "test")
-    networks = {
-        "a": network_of(levels=3),
-        "b": gns_of(),
-        "blind": network_of(obstacle_features=False),
-        "slow": network_of(),
-        "coarse": network_of(),
-        "dry": network_of(materials=("snow",)),
-    }
-    paths = {}
+    networks = {"a": network_of(levels=3), "b": gns_of(), "blind": network_of(obstacle_features=False)}
+    networks |= {"slow": network_of(), "coarse": network_of(), "dry": network_of(materials=("snow",))}
+    paths, grid = {name: tmp_path / f"{name}.safetensors" for name in networks}, random_grid(0, 10)
     for name, network in networks.items():
-        paths[name] = tmp_path / f"{name}.safetensors"
-        cell_size = 1 / 32 if name == "coarse" else random_grid(0, 10).cell_size
+        cell_size = 1 / 32 if name == "coarse" else grid.cell_size
         save_weights(paths[name], network, WeightsInfo(network.config, 30.0 if name == "slow" else 60.0, cell_size))
     monkeypatch.setattr("tools.error_vs_time.__main__.shipped_weights", lambda: paths)
-    config = ErrorVsTimeConfig(data=data, out="x")
-    grid = random_grid(0, 10)
     water = replace(episode, material_N=np.zeros_like(episode.material_N), obstacle_grid=grid)
     assert [file.stem for file in fitting_weights([water])] == ["a", "b"]
     printed = capsys.readouterr().err
     assert all(f"shipped weights {name}:" in printed for name in ("blind", "slow", "coarse", "dry"))
+    config = ErrorVsTimeConfig(data=data, out="x")
     found = {c.row["weights"]: c.row["levels"] for c in network_contenders(config, CPU, [water])}
     assert found == {"a.safetensors": 3, "b.safetensors": 1}
-    assert set(shipped_weights()) == {"mechanics", "obstacles", "obstacles_small"}
 
 
-def test_an_interrupted_report_continues(data, both, tmp_path, monkeypatch):
+@pytest.mark.usefixtures("undrawn")
+def test_an_interrupted_report_continues(compare, data, tmp_path, monkeypatch, on_score):
     """Rows of an earlier report are neither simulated nor scored again; rows without run times are timed, with device,
     commit and date. Without data they are only drawn again."""
     simulated: list[set[float]] = []
@@ -284,83 +274,58 @@ def test_an_interrupted_report_continues(data, both, tmp_path, monkeypatch):
 
     monkeypatch.setattr(datagen.mpm.solver, "simulate", noted)
     drawn: list[str] = []
-    monkeypatch.setattr("tools.error_vs_time.run.draw", lambda *_: [])
     monkeypatch.setattr("tools.error_vs_time.__main__.draw", lambda out, *_: drawn.append(out) or [])
     monkeypatch.setattr("tools.error_vs_time.__main__.STEPS", (0.5,))
-    first, second = tmp_path / "first", tmp_path / "second"
-    options = {"data": data, "weights": both, "mpm_grids": [64], **SHORT}
-    assert main(options | {"out": str(first)}) == 0
-    report = json.loads(Path(f"{first}.json").read_text())
+    report = compare("first", mpm_grids=[64])
     rows = {row["system"]: row for row in report["rows"]}
     rows["gns"]["ms"], rows["mpm"]["ms"] = None, 9.0  # frames of fake_simulate end together
-    Path(f"{first}.json").write_text(json.dumps(report))
+    first, second = tmp_path / "first.json", tmp_path / "second.json"
+    first.write_text(json.dumps(report))
     simulated.clear()
     scored: list[str] = []
-
-    def counted(contender, *more):
-        scored.append(contender.row["system"])
-        return score.score(contender, *more)
-
-    monkeypatch.setattr("tools.error_vs_time.run.score", counted)
-    assert main(options | {"out": str(second), "earlier": [f"{first}.json"]}) == 0
+    on_score(lambda row: scored.append(row["system"]))
+    again = compare("second", mpm_grids=[64], earlier=[str(first)])
     assert scored == [] and simulated == [{0.25}]
-    again = json.loads(Path(f"{second}.json").read_text())["rows"]
-    (timed,) = (row for row in again if "timed" in row)
+    (timed,) = (row for row in again["rows"] if "timed" in row)
     assert timed["system"] == "gns" and timed["ms"] > 0 and timed["timed"].keys() == {"device", "commit", "date"}
     assert timed["by_scene"] == rows["gns"]["by_scene"]
-    assert sorted(row["system"] for row in again) == sorted(row["system"] for row in report["rows"])
-    assert main({"out": str(tmp_path / "drawn"), "earlier": [f"{second}.json"]}) == 0
-    assert json.loads((tmp_path / "drawn.json").read_text())["rows"] == again
+    assert sorted(systems(again)) == sorted(systems(report))
+    assert main({"out": str(tmp_path / "drawn"), "earlier": [str(second)]}) == 0
+    assert json.loads((tmp_path / "drawn.json").read_text())["rows"] == again["rows"]
     assert drawn == [str(tmp_path / "drawn")]
     with pytest.raises(ConfigError, match=r"earlier\[0\] frames must be 4 as in this report, got 6; take the data"):
-        main(options | {"out": str(second), "earlier": [f"{first}.json"], "frames": 4})
-    for text, cause in (("{}", "must be JSON that python -m tools.error_vs_time wrote"), (None, "an existing file")):
-        other = tmp_path / f"{text is None}.json"
-        if text is not None:
-            other.write_text(text)
-        with pytest.raises(ConfigError, match=rf"earlier\[0\] must be .*{cause}|{cause}"):
-            main({"out": "x", "earlier": [str(other)]})
-
-
-@pytest.mark.usefixtures("undrawn")
-def test_an_unexpected_error_stops_one_contender(data, both, tmp_path, monkeypatch, capsys):
-    """The others are scored and timed, the error is printed and in the report, and the exit code is 1."""
-
-    def failing(contender, *more):
-        if contender.row["system"] == "hgn":
-            raise RuntimeError("an illegal memory access")
-        return score.score(contender, *more)
-
-    monkeypatch.setattr("tools.error_vs_time.run.score", failing)
-    options = {"data": data, "weights": both, "out": str(tmp_path / "report"), "resimulate": False, "mpm_grids": []}
-    assert main(options | SHORT) == 1
-    report = json.loads((tmp_path / "report.json").read_text())
-    assert [row["system"] for row in report["rows"]] == ["gns", *["baseline"] * 3]
-    (left,) = report["meta"]["not_run"]
-    assert left["cause"] == "RuntimeError: an illegal memory access" and report["rows"][0]["ms"] > 0
-    assert "Traceback" in (printed := capsys.readouterr().err) and "1 of the measurements failed" in printed
+        compare("second", earlier=[str(first)], frames=4)
+    (tmp_path / "other.json").write_text("{}")
+    for name, cause in (("other", "JSON that python -m tools.error_vs_time wrote"), ("none", "an existing file")):
+        with pytest.raises(ConfigError, match=rf"earlier\[0\] must be {cause}"):
+            main({"out": "x", "earlier": [str(tmp_path / f"{name}.json")]})
 
 
 @pytest.mark.usefixtures("undrawn")
 @pytest.mark.parametrize("times_last", [False, True])
-def test_a_killed_run_leaves_complete_rows(data, both, tmp_path, monkeypatch, times_last):
-    """After each contender the file contains its errors and, unless times come last, its run times."""
+def test_a_killed_run_leaves_complete_rows(compare, tmp_path, monkeypatch, on_score, times_last):
+    """After each contender the file contains its errors and, unless times come last, its run times. Without a solver
+    the data is the reference; ballistic motion has no error on ballistic data."""
+    monkeypatch.delattr(datagen.mpm.solver, "simulate")
 
-    def killed(contender, *more):
-        if contender.row["system"] == "gns":
+    def killed(row):
+        if row["system"] == "gns":
             raise KeyboardInterrupt
-        return score.score(contender, *more)
 
-    monkeypatch.setattr("tools.error_vs_time.run.score", killed)
-    options = {"data": data, "weights": both, "out": str(tmp_path / "report"), "resimulate": False, "mpm_grids": []}
+    on_score(killed)
     with pytest.raises(KeyboardInterrupt):
-        main(options | SHORT | {"times_last": times_last})
-    rows = {row["system"]: row for row in json.loads((tmp_path / "report.json").read_text())["rows"]}
+        compare(resimulate=False, times_last=times_last)
+    rows = {
+        row.get("predictor", row["system"]): row for row in json.loads((tmp_path / "report.json").read_text())["rows"]
+    }
     assert rows["hgn"]["one_step_mse"] > 0 and rows["hgn"]["position_mse"]["5"] > 0
     assert "ms" not in rows["hgn"] if times_last else rows["hgn"]["ms"] > 0
+    falls, flies = rows["ballistic motion"], rows["constant velocity"]
+    assert falls["position_mse"]["5"] < 1e-13 < flies["position_mse"]["5"]
+    assert falls["one_step_mse"] < 1e-13 < flies["one_step_mse"]
 
 
-def test_weights_that_do_not_fit(data, tmp_path, monkeypatch):
+def test_weights_that_do_not_fit(compare, tmp_path, monkeypatch):
     """An unknown name, a missing file and weights for other data are refused before anything is simulated."""
     monkeypatch.delattr(datagen.mpm.solver, "simulate")
     dry = network_of(torch.float32, materials=("snow",))
@@ -376,4 +341,4 @@ def test_weights_that_do_not_fit(data, tmp_path, monkeypatch):
         (str(tmp_path / "moon.safetensors"), "gravity must be the weights'"),
     ):
         with pytest.raises(ConfigError, match=message):
-            main({"data": data, "out": str(tmp_path / "report"), "weights": [name]} | SHORT)
+            compare(weights=[name])

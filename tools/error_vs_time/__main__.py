@@ -41,7 +41,7 @@ from tools.error_vs_time.contenders import (
     NetworkContender,
     SolverContender,
 )
-from tools.error_vs_time.paired import paired_lines, paired_rows
+from tools.error_vs_time.paired import paired_rows, paired_table
 from tools.error_vs_time.plot import CONVENTION
 from tools.error_vs_time.run import Row, Run, draw, is_untimed, read_report, require_same, same_row
 from tools.error_vs_time.score import table
@@ -108,7 +108,7 @@ def main(mapping: dict[str, Any]) -> int:
     run = Run(config, contenders, references, device, meta, started, known)
     run.measure()
     run.write(drawn=True)
-    print(table(run.rows), *paired_lines(paired_rows(run.rows)), f"{run.out}.png {run.file}", sep="\n")
+    print(table(run.rows), paired_table(paired_rows(run.rows)), f"{run.out}.png {run.file}", sep="\n\n")
     if run.failed:
         print(f"error: {run.failed} of the measurements failed; see above, and not_run in {run.file}", file=sys.stderr)
     return EXIT_MACHINE if run.failed else 0
@@ -122,7 +122,7 @@ def _draw_again(config: ErrorVsTimeConfig, earlier: Sequence[tuple[dict[str, Any
     rows = [row for _, report_rows in earlier for row in report_rows]
     files, paired = draw(config.out, rows, first), paired_rows(rows)
     write_json(config.json or f"{config.out}.json", {"meta": first, "rows": rows, "paired": paired}, allow_nan=False)
-    print(table(rows), *paired_lines(paired), " ".join(files), sep="\n")
+    print(table(rows), paired_table(paired), " ".join(files), sep="\n\n")
     return 0
 
 
@@ -140,14 +140,12 @@ def network_contenders(
     contenders: list[NetworkContender] = []
     for file in files:
         hgn = load_weights(file)[1].network.kind == "hgn"
-        precisions = config.precisions
-        if precisions is None:
-            precisions = ("fp32",) if device.type != "cuda" else PRECISIONS if hgn else ("tf32",)
-        ranked = sorted(precisions, key=ORDER.index)
+        precisions = config.precisions or (("fp32",) if device.type != "cuda" else PRECISIONS if hgn else ("tf32",))
+        first = min(precisions, key=ORDER.index)
         for precision in precisions:
-            first, rate = precision == ranked[0], episodes[0].frame_rate_hz
             try:
-                contenders.append(NetworkContender(file, precision, device, rate, first))
+                named = file, precision, device, episodes[0].frame_rate_hz
+                contenders.append(NetworkContender(*named, first=precision == first))
             except ConfigError as error:
                 if precision != "fp16":
                     raise
@@ -157,11 +155,10 @@ def network_contenders(
 
 def named_weights(names: Sequence[str], episodes: Sequence[Episode]) -> list[Path]:
     """Returns the files. Raises: ConfigError for a name or file that does not exist or does not fit the data."""
-    files = []
-    for i, name in enumerate(names):
-        files.append(find_weights(name, f"weights[{i}]"))
+    files = [find_weights(name, f"weights[{i}]") for i, name in enumerate(names)]
+    for i, (name, file) in enumerate(zip(names, files, strict=True)):
         try:
-            require_fits(files[-1], episodes, f"weights[{i}]")
+            require_fits(file, episodes, f"weights[{i}]")
         except ConfigError as error:
             remedy = "take other weights, or the data set that these were trained on"
             raise ConfigError(f"weights[{i}] must fit the data, got {name}: {error}; {remedy}") from None

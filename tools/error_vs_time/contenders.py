@@ -25,7 +25,7 @@ from hgn.runtime.weights import load_weights, require_frame_rate
 from hgn.scene.episode import Episode
 from hgn.training.errors import Predictor, SquaredError, network_predictor
 from tools.solver_rollouts import OnFrame, Setting, SolverLaunches
-from tools.timing import FrameClock, matmul_precision
+from tools.timing import matmul_precision
 
 if TYPE_CHECKING:
     from hgn.runtime.triton_backend import TritonBackend
@@ -202,10 +202,3 @@ def one_step(
             result.rest_sum += float(predicted_N3.norm(dim=-1)[resting_N].double().sum())
             result.rest_count += int(resting_N.sum())
     return result
-
-
-def frame_milliseconds(contender: Contender, episodes: Sequence[Episode], frames: int) -> float | None:
-    """Returns the mean time of a frame of a rollout; None if the rollout ends too early."""
-    clock = FrameClock()
-    contender.trials(episodes, frames, clock)
-    return clock.milliseconds()

@@ -7,16 +7,17 @@ Shape legend: S scenes, B resamplings.
 from __future__ import annotations
 
 import functools
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from hgn.config import NETWORK_KINDS
+from tools import report
 from tools.error_vs_time.score import label
 
 RESAMPLINGS, COVERED = 10_000, 0.95
-NO_DIFFERENCE = "no difference shown"
+STATISTICS: dict[str, Callable[..., Any]] = {"median": np.median, "mean": np.mean}
 NETWORK_SYSTEMS = (*NETWORK_KINDS, "gns_particles")  # the last only in reports before 0.2.0
 Row = Mapping[str, Any]
 
@@ -32,10 +33,10 @@ def paired_difference(one_S: Sequence[float | None], other_S: Sequence[float | N
     difference_S = np.array([a - b for a, b in pairs])
     drawn_BS = difference_S[_draws(len(pairs))]
     result: dict[str, Any] = {"scenes": len(pairs)}
-    for name, statistic in (("median", np.median), ("mean", np.mean)):
+    for name, statistic in STATISTICS.items():
         low, high = np.percentile(statistic(drawn_BS, axis=1), (50 * (1 - COVERED), 50 * (1 + COVERED))).tolist()
         result[name] = [float(statistic(difference_S)), low, high]
-        result[f"{name}_says"] = "nearer" if high < 0 else "farther" if low > 0 else NO_DIFFERENCE
+        result[f"{name}_says"] = "nearer" if high < 0 else "farther" if low > 0 else "no difference shown"
     return result
 
 
@@ -61,18 +62,14 @@ def paired_rows(rows: Sequence[Row]) -> list[dict[str, Any]]:
     return sorted(pairs, key=lambda row: (row["one"], row["other"], row["error"], int(row["frame"])))
 
 
-def paired_lines(rows: Sequence[Row]) -> list[str]:
-    """Formats paired rows."""
-    lines = ["", f"scene by scene: difference, and its {COVERED:.0%} interval over scenes"] if rows else []
+def paired_table(rows: Sequence[Row]) -> str:
+    """Returns paired rows as a table: differences, their intervals over scenes, and what these say."""
+    head = ("one", "other", "error", "frame", "scenes", *(f"{name} ({COVERED:.0%} interval)" for name in STATISTICS))
+    lines = []
     for row in rows:
-        at = f" after {row['frame']} frames" if row["frame"] != "0" else ""
-        parts = []
-        for name in ("median", "mean"):
-            value, low, high = row[name]
-            parts.append(f"{row[f'{name}_says']} in the {name} ({value:+.2e}, {low:+.2e} to {high:+.2e})")
-        pair = f"{row['one']} against {row['other']}"
-        lines.append(f"  {pair}, {row['error']}{at}, {row['scenes']} scenes: {'; '.join(parts)}")
-    return lines
+        cells = ["{:+.2e} ({:+.2e} to {:+.2e}): ".format(*row[name]) + row[f"{name}_says"] for name in STATISTICS]
+        lines.append((*(row[name] for name in head[:5]), *cells))
+    return report.table(head, lines)
 
 
 @functools.cache

@@ -26,7 +26,7 @@ from tools.error_vs_time.paired import paired_rows
 from tools.error_vs_time.plot import draw_frames, draw_pareto
 from tools.error_vs_time.score import label, score
 from tools.error_vs_time.settings import UNTIMED, ErrorVsTimeConfig
-from tools.error_vs_time.timing import Stopwatch
+from tools.timing import Stopwatch
 
 START_FRACTION, ROUND_FRACTION = 0.85, 0.95  # of the seconds given, until which contenders and rounds may start
 ROUNDS = 2  # of each timed scene
