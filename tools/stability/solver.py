@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any
@@ -23,11 +24,10 @@ from tools.stability.solver_loads import convergence, impacts, long_run, stiffne
 from tools.stability.solver_steps import Point, draw, largest_steps
 from tools.stability.solver_validation import columns, dam_breaks, grids, reposes, rest
 
-CASES: dict[str, Callable[[MpmConfig], Iterable[Row]]] = {
-    "stiffness": stiffnesses, "impact": impacts, "convergence": convergence, "contact": contacts, "leak": leaks,
-    "long": long_run, "rest": rest, "dam": dam_breaks, "column": columns, "repose": reposes,
-}  # fmt: skip
-NAMES = ("steps", *CASES, "grid")
+NAMES = (
+    *("steps", "stiffness", "impact", "convergence", "contact", "leak"),
+    *("long", "rest", "dam", "column", "repose", "grid"),
+)
 
 
 @dataclass(frozen=True)
@@ -58,15 +58,15 @@ def main(mapping: dict[str, Any]) -> int:
     mpm = MpmConfig(device=config.device)
     meta = meta_of(config, initialise(config.device).kind) | {"solver": to_mapping(mpm)}
     points: list[Point] = []
+    cases: dict[str, Callable[[MpmConfig], Iterable[Row]]] = {
+        "steps": partial(largest_steps, points=points), "stiffness": stiffnesses, "impact": impacts,
+        "convergence": convergence, "contact": contacts, "leak": leaks, "long": long_run, "rest": rest,
+        "dam": dam_breaks, "column": columns, "repose": reposes, "grid": partial(grids, cells=config.grid_cells),
+    }  # fmt: skip
     report = Report("solver", meta, config.json, steps=points)
-    wanted = config.cases or NAMES
-    if "steps" in wanted:
-        report.add(largest_steps(mpm, points))
-    for name, rows in CASES.items():
-        if name in wanted:
-            report.add(rows(mpm))
-    if "grid" in wanted:
-        report.add(grids(mpm, config.grid_cells))
+    for name in NAMES:
+        if config.cases is None or name in config.cases:
+            report.add(cases[name](mpm))
     print(table(report.rows))
     if config.picture is not None:
         draw(points, mpm, Path(config.picture))

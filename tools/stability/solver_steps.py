@@ -8,8 +8,9 @@ or an elastic solid. Sand and snow are blocks pressed into a corner, which remai
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -44,35 +45,47 @@ def formula(config: MpmConfig, material: int) -> float:
     return CELL * math.sqrt(config.density_kg_m3 / (3 * bulk + (2 * shear if material != WATER else 0.0)))
 
 
+def singles(material: int, speed: float) -> list[Scene]:
+    """Returns scenes of one particle about to touch the floor, at 24 places within a cell, without gravity."""
+    places = [(x, y, z) for x in (0, 0.25, 0.5) for y in (0, 0.25, 0.5, 0.75) for z in (0, 0.25)]
+    above = [CELL * (np.array([[32, 2.75, 32]]) + place) for place in places]
+    return [filled(material, place, (0, -speed, 0), cell_size=CELL, gravity=(0.0, 0.0, 0.0)) for place in above]
+
+
+def corners(material: int, speed: float) -> list[Scene]:
+    """Returns blocks that are pressed into a corner."""
+    velocity = (-speed, -speed, -speed)
+    return [block(material, (2.8, 2.8, 2.8), (2, 2, 2), velocity, seed) for seed in range(6)]
+
+
+CASES: dict[str, tuple[int, Callable[[int, float], list[Scene]], tuple[float, ...]]] = {
+    "single particle, water": (WATER, singles, FACTORS),
+    "single particle, elastic solid": (ELASTIC, singles, FACTORS),
+    "block in a corner, sand": (SAND, corners, SOLID_FACTORS),
+    "block in a corner, snow": (SNOW, corners, SOLID_FACTORS),
+}
+
+
 def largest_steps(base: MpmConfig, points: list[Point]) -> Iterator[Row]:
-    """Yields a row for each material and stiffness, and adds its simulations to `points`."""
-    for stiffness in STIFFNESS:
-        modulus = base.youngs_modulus_pa * stiffness
-        # speeds proportional to the speed of sound, so that strains are the same
-        speed = math.sqrt(stiffness)
-        config = dataclasses.replace(base, youngs_modulus_pa=modulus)
-        cases = (
-            ("single particle, water", WATER, _singles(WATER, speed), FACTORS),
-            ("single particle, elastic solid", ELASTIC, _singles(ELASTIC, speed), FACTORS),
-            ("block in a corner, sand", SAND, _corner(SAND, speed), SOLID_FACTORS),
-            ("block in a corner, snow", SNOW, _corner(SNOW, speed), SOLID_FACTORS),
-        )  # fmt: skip
-        for name, material, scenes, factors in cases:
-            limit, beyond, measured = formula(config, material), "stable at all steps tried", 0.0
-            for factor in factors:
-                step = factor * limit
-                own = dataclasses.replace(config, fixed_time_step_s=step)
-                # a frame of whole steps; the margin keeps rounding from adding one
-                outcomes = simulate(scenes, own, FRAMES, (1 + 1e-9) / (SUBSTEPS * step))
-                unstable = list(filter(None, map(_sign, outcomes, scenes)))
-                points.append(dict(zip(POINT, (name, stiffness, step, factor, not unstable), strict=True)))
-                if unstable:
-                    where = f"in {len(unstable)} of {len(scenes)} scenes: {max(unstable)}"
-                    beyond = f"at {factor:g} times the formula, {where}"
-                    break
-                measured = step
-            held = abs(measured / limit - 1) <= WITHIN if name.startswith("single") else measured >= limit
-            yield Row(f"largest step, {name}, stiffness x{stiffness:g}", limit, measured, held, beyond)
+    """Yields a row for each stiffness and case, and adds its simulations to `points`."""
+    for stiffness, (name, (material, make, factors)) in itertools.product(STIFFNESS, CASES.items()):
+        config = dataclasses.replace(base, youngs_modulus_pa=base.youngs_modulus_pa * stiffness)
+        scenes = make(material, math.sqrt(stiffness))  # speeds proportional to that of sound: the same strains
+        limit, beyond, measured = formula(config, material), "stable at all steps tried", 0.0
+        for factor in factors:
+            step = factor * limit
+            own = dataclasses.replace(config, fixed_time_step_s=step)
+            # a frame of whole steps; the margin keeps rounding from adding one
+            outcomes = simulate(scenes, own, FRAMES, (1 + 1e-9) / (SUBSTEPS * step))
+            unstable = list(filter(None, map(_sign, outcomes, scenes)))
+            points.append(dict(zip(POINT, (name, stiffness, step, factor, not unstable), strict=True)))
+            if unstable:
+                where = f"in {len(unstable)} of {len(scenes)} scenes: {max(unstable)}"
+                beyond = f"at {factor:g} times the formula, {where}"
+                break
+            measured = step
+        held = abs(measured / limit - 1) <= WITHIN if name.startswith("single") else measured >= limit
+        yield Row(f"largest step, {name}, stiffness x{stiffness:g}", limit, measured, held, beyond)
 
 
 def _sign(outcome: Simulated | SceneFailure, scene: Scene) -> str:
@@ -84,18 +97,6 @@ def _sign(outcome: Simulated | SceneFailure, scene: Scene) -> str:
     if outcome.counters["largest_speed"] > FASTER * float(np.linalg.norm(scene.velocity_N3, axis=1).max()):
         return "faster than at the impact"
     return ""
-
-
-def _singles(material: int, speed: float) -> list[Scene]:
-    """Returns scenes of one particle about to touch the floor, at 24 places within a cell, without gravity."""
-    places = [(x, y, z) for x in (0, 0.25, 0.5) for y in (0, 0.25, 0.5, 0.75) for z in (0, 0.25)]
-    above = [CELL * (np.array([[32, 2.75, 32]]) + place) for place in places]
-    return [filled(material, place, (0, -speed, 0), cell_size=CELL, gravity=(0.0, 0.0, 0.0)) for place in above]
-
-
-def _corner(material: int, speed: float) -> list[Scene]:
-    velocity = (-speed, -speed, -speed)
-    return [block(material, (2.8, 2.8, 2.8), (2, 2, 2), velocity, seed) for seed in range(6)]
 
 
 def draw(points: list[Point], base: MpmConfig, file: Path) -> None:
