@@ -1,11 +1,18 @@
-"""The rules of settings: what breaks one is refused in a line that says field, rule and value."""
+"""Rules of settings: what breaks one is refused in a line that says field, rule and value."""
 
 import pytest
 
 from hgn.average import AverageConfig
 from hgn.config import DatasetConfig, NetworkConfig, SceneConfig, TrainConfig, TrainingConfig
-from hgn.schema import ConfigError
+from hgn.schema import ConfigError, from_mapping
 from hgn.step_config import StepConfig
+from tools.bench.config import BenchConfig
+from tools.curves import CurvesConfig
+from tools.error_vs_time.settings import ErrorVsTimeConfig
+from tools.render import RenderConfig
+from tools.scaling.measure import ScalingConfig
+from tools.stability.network import StabilityNetworkConfig
+from tools.stability.solver import StabilitySolverConfig
 
 GNS = {"kind": "gns", "levels": 1}
 RELATIVE = {"inputs": "relative"}
@@ -24,6 +31,11 @@ def step_of(inputs="absolute", dimensions=3, **step):
 
 def average_of(count, coefficients=None):
     return AverageConfig(("a.safetensors",) * count, "out.safetensors", coefficients)
+
+
+def command(cls, **given):
+    """A command's options from a mapping, beside those that must be given."""
+    return lambda **options: from_mapping(cls, given | options)
 
 
 RULES = {
@@ -82,6 +94,48 @@ RULES = {
         ({"count": 2, "coefficients": (0.5, 0.3, 0.2)}, "coefficients must be one for each of the 2 files, got 3"),
         ({"count": 2, "coefficients": (0.7, 0.4)}, "coefficients must be 1 together, got 1.1"),
     ],
+    command(BenchConfig): [
+        ({"cases": ["frames"]}, r"cases\[0\] must be one of frame, torch_frame"),
+        ({"particles": [0]}, r"particles\[0\] must be at least 1"),
+        ({"precisions": ["fp8"]}, r"precisions\[0\] must be one of fp32, tf32, fp16"),
+        ({"seconds": 0}, "seconds must be a finite number > 0"),
+        ({"cases": ["public_gns_train"]}, "public_gns must be a folder with the public code for public_gns_train"),
+    ],
+    command(CurvesConfig, out="curves"): [({"runs": ["a/x", "b/x"]}, "runs must be folders of different names")],
+    command(ErrorVsTimeConfig, data="d", out="o"): [
+        ({"data": None}, "data must be a data set, got None; make one with python -m datagen, or"),
+        ({"mpm_grids": [4]}, r"mpm_grids\[0\] must be at least 8"),
+        ({"weights": ["a/x.safetensors", "b/x.safetensors"]}, "weights must be files of different names"),
+        ({"frames": 1}, "frames must be at least 2"),
+        ({"precisions": ["fp8"]}, r"precisions\[0\] must be one of fp32, tf32, fp16"),
+        ({"split": "all"}, "split must be one of train"),
+    ],
+    command(RenderConfig, rollout="r", out="o"): [
+        ({"rollout": None}, "rollout must be a file, or else data and episode given"),
+        ({"data": "folder"}, "rollout must be left out where data and episode are given"),
+        ({"names": ["a", "b"]}, "names must be 1 different ones"),
+        ({"every": 0}, "every must be at least 1"),
+        ({"size": 10}, "size must be 64 to 4096 pixels"),
+        ({"colour": "red"}, "colour is not a known key"),
+    ],
+    command(ScalingConfig): [
+        ({"devices": 0}, "devices must be at least 1"),
+        ({"device": "cuda:1"}, "device must be auto, cpu or cuda"),
+        ({"batches": 0}, "batches must be at least 1"),
+        ({"backends": ["slow"]}, r"backends\[0\] must be torch or triton"),
+        ({"network": {"kind": "gns", "levels": 1}}, "network.kind must be hgn"),
+    ],
+    command(StabilityNetworkConfig, weights="w"): [
+        ({"cases": ["wide"]}, r"cases\[0\] must be one of throw"),
+        ({"frames": 1}, "frames must be at least 2"),
+        ({"precision": "fp8"}, "precision must be one of fp32, tf32, fp16"),
+        ({"backend": "quick"}, "backend must be one of auto, torch, triton, cpu"),
+    ],
+    command(StabilitySolverConfig): [
+        ({"cases": ["stesp"]}, r"cases\[0\] must be one of steps"),
+        ({"cases": ["leak"], "picture": "steps.png"}, "picture must be left out without the case"),
+        ({"cases": ["grid"], "grid_cells": [16, 8, 12]}, "grid_cells must be three or more rising numbers"),
+    ],
 }
 
 
@@ -89,6 +143,6 @@ RULES = {
     ("settings", "options", "message"), [(settings, *rule) for settings, rules in RULES.items() for rule in rules]
 )
 def test_what_breaks_a_rule_is_named(settings, options, message):
-    """Of networks, random scenes, trainings and averages: values alone, and values that contradict each other."""
+    """In settings and in options of commands: values alone, and values that contradict each other."""
     with pytest.raises(ConfigError, match=message):
         settings(**options)

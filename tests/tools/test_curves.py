@@ -1,6 +1,5 @@
 """tools.curves: one run, several runs, a run that was stopped, and folders that are none."""
 
-import io
 import json
 
 import pytest
@@ -38,14 +37,13 @@ def test_figure_and_rows_of_one_run(tmp_path):
     """The picture is drawn, and the JSON has all records."""
     run = make_run(tmp_path / "first")
     assert main({"runs": [str(run)], "out": str(tmp_path / "curves")}) == 0
-    width, height = Image.open(io.BytesIO((tmp_path / "curves.png").read_bytes())).size
-    assert width > 1000 and height > 300
+    with Image.open(tmp_path / "curves.png") as picture:
+        assert picture.width > 1000 and picture.height > 300
     (written,) = json.loads((tmp_path / "curves.json").read_text())["runs"]
     assert written["name"] == "first" and written["meta"]["device"] == "a device"
     assert [row["update"] for row in written["rows"] if "loss" in row] == list(range(40))
-    assert [row["one_step/validation"] for row in written["rows"] if "one_step/validation" in row] == [
-        1e-6 / update for update in (9, 19, 29, 39)
-    ]
+    errors = [row["one_step/validation"] for row in written["rows"] if "one_step/validation" in row]
+    assert errors == [1e-6 / update for update in (9, 19, 29, 39)]
 
 
 def test_several_runs(tmp_path):
@@ -55,8 +53,8 @@ def test_several_runs(tmp_path):
     written = json.loads((tmp_path / "curves.json").read_text())["runs"]
     assert [run["name"] for run in written] == ["x", "y"]
     assert [(run["rows"][-1]["update"], run["rows"][-1]["scenes"]) for run in written] == [(39, 39 * 4), (39, 39 * 2)]
-    picture = Image.open(io.BytesIO((tmp_path / "curves.png").read_bytes())).convert("RGB")
-    colours = {colour for _, colour in picture.getcolors(1 << 24)}
+    with Image.open(tmp_path / "curves.png") as picture:
+        colours = {colour for _, colour in picture.convert("RGB").getcolors(1 << 24)}
     assert {(31, 119, 180), (255, 127, 14)} <= colours  # both lines are drawn
 
 

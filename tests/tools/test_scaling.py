@@ -18,7 +18,7 @@ from tools.scaling.measure import ScalingConfig
 
 ENVIRONMENT = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])}
 SMALL: dict[str, Any] = {
-    "particles": 40,
+    "particles": 20,
     "scenes": 2,
     "batches": 2,
     "seconds": 1e-9,

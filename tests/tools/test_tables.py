@@ -102,41 +102,28 @@ def test_writes_tables_and_figures(tmp_path, monkeypatch, capsys):
     assert capsys.readouterr().out == "results/bench/README.md\n"
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (("particles=4296).ms", "particles=1).ms"), "figure frame: LookupError: 0 items of 3 have"),
-        (("rows(case='frame', particles=4296)", "rows(case='frame')"), "figure frame: LookupError: 2 items of 3 have"),
-        (("row.particles:,", "row.particle:,"), "table frames: LookupError: no 'particle' among case, particles"),
-        (("row.mse['10']:?", "row.mse['10']:"), "table frames: LookupError: no '10' among"),
-        (("row.ms:.2g", "row.mse:.2g"), "table frames: TypeError"),
-        (("row.check:?", "row.check:"), "table frames: ValueError: there is no value"),
-        (("  chosen:", "  other:"), "has no table chosen; define it there or take the marker away"),
-        (("bench.json", "none.json"), "FileNotFoundError: [Errno 2] No such file or directory: "),
-        (("values:", "values:\n  more: '1'"), "no page has a marker for more"),
-        (
-            ("every(bench.rows, case='frame')", "every(bench.rows, case='no')"),
-            "table frames: LookupError: no rows: every(",
-        ),
-        (
-            ("{bench.rows(case='frame', particles=4296).ms:.3f} ms", "{held(every(bench.rows, case='no'))}"),
-            "figure frame: LookupError: no rows that could pass",
-        ),
-    ],
-)
+FAULTS = [
+    (("particles=4296).ms", "particles=1).ms"), "figure frame: LookupError: 0 items of 3 have"),
+    (("rows(case='frame', particles=4296)", "rows(case='frame')"), "figure frame: LookupError: 2 items of 3 have"),
+    (("row.particles:,", "row.particle:,"), "table frames: LookupError: no 'particle' among case, particles"),
+    (("row.mse['10']:?", "row.mse['10']:"), "table frames: LookupError: no '10' among"),
+    (("row.ms:.2g", "row.mse:.2g"), "table frames: TypeError"),
+    (("row.check:?", "row.check:"), "table frames: ValueError: there is no value"),
+    (("  chosen:", "  other:"), "has no table chosen; define it there or take the marker away"),
+    (("bench.json", "none.json"), "FileNotFoundError: [Errno 2] No such file or directory: "),
+    (("values:", "values:\n  more: '1'"), "no page has a marker for more"),
+    (("every(bench.rows, case='frame')", "every(bench.rows, case='no')"), "table frames: LookupError: no rows: every("),
+    (("bench.rows(case='frame', particles=4296).ms:.3f", "held([])"), "figure frame: LookupError: no rows that could"),
+]
+
+
+@pytest.mark.parametrize(("change", "message"), FAULTS)
 def test_faulty_specifications(tmp_path, change, message):
     """Expressions without a unique value and names without a counterpart are refused by name."""
     assert change[0] in SPECIFICATION
     with pytest.raises(ConfigError) as error:
         pages(folder(tmp_path, SPECIFICATION.replace(*change)))
     assert message in str(error.value) and "tables.yaml" in str(error.value)
-
-
-def test_rows_that_pass():
-    """Rows that pass are counted; without rows a format with `?` leaves the cell empty."""
-    rows = Records([Record(held=True), Record(held=False), Record(held=True)])
-    assert _fill("{held(rows)}", {"rows": rows}) == "2 of 3"
-    assert _fill("{held(rows):?}", {"rows": Records()}) == ""
 
 
 @pytest.mark.parametrize("marker", ["<!--/-->", "<!-- end -->\n<!-- table: chosen"])
@@ -147,34 +134,28 @@ def test_a_marker_without_an_end(tmp_path, marker):
         pages(folder(tmp_path, page=broken))
 
 
+def test_rows_that_pass():
+    """Rows that pass are counted; without rows a format with `?` leaves the cell empty."""
+    rows = Records([Record(held=True), Record(held=False), Record(held=True)])
+    assert _fill("{held(rows)}", {"rows": rows}) == "2 of 3"
+    assert _fill("{held(rows):?}", {"rows": Records()}) == ""
+
+
 def test_outside_of_a_checkout(tmp_path):
     """Without pages the command fails with a message."""
     with pytest.raises(ConfigError, match="run it from a checkout"):
         specifications(tmp_path)
 
 
-@pytest.mark.parametrize(
-    ("value", "form", "text"),
-    [
-        (0.00064, ".2g", "6.4e-4"),
-        (0.0489, ".2g", "0.049"),
-        (0.1, ".2g", "0.10"),
-        (38.7, ".2g", "39"),
-        (1.65e-7, ".3g", "1.65e-7"),
-        (-3e-5, ".1g", "-3e-5"),
-        (4296, ",", "4,296"),
-        (0.8882, ".0%", "89 %"),
-        ([0.8882, 0.968], ".0%", "89, 97 %"),
-        ((0.0270, 0.0597), ".3f", "0.027, 0.060"),
-        (0.0, ".3f", "0"),
-        (1.5e-3, ".1e", "1.5e-3"),
-        (True, "", "yes"),
-        ("pass", "", "pass"),
-    ],
-)
-def test_formats(value, form, text):
+def test_formats():
     """Figures are shown as pages write them."""
-    assert formatted(value, form) == text
+    for value, form, text in (
+        *((0.00064, ".2g", "6.4e-4"), (0.0489, ".2g", "0.049"), (0.1, ".2g", "0.10"), (38.7, ".2g", "39")),
+        *((1.65e-7, ".3g", "1.65e-7"), (-3e-5, ".1g", "-3e-5"), (4296, ",", "4,296"), (0.8882, ".0%", "89 %")),
+        *(([0.8882, 0.968], ".0%", "89, 97 %"), ((0.0270, 0.0597), ".3f", "0.027, 0.060"), (0.0, ".3f", "0")),
+        *((1.5e-3, ".1e", "1.5e-3"), (True, "", "yes"), ("pass", "", "pass")),
+    ):
+        assert formatted(value, form) == text
 
 
 def test_safetensors_header(tmp_path):
