@@ -1,3 +1,5 @@
+"""Mesh files: formats, closed bodies and sheets, placement, and what is refused."""
+
 import numpy as np
 import pytest
 import trimesh
@@ -21,24 +23,26 @@ def test_a_box_is_closed_in_every_format(tmp_path, suffix):
     path = tmp_path / f"box.{suffix}"
     trimesh.creation.box((1, 2, 3)).export(path, file_type=suffix.lower())
     obstacle = load_mesh(path)
-    assert (len(obstacle.vertex_V3), len(obstacle.triangle_F3)) == (8, 12)
-    assert obstacle.closed
-    assert obstacle.name == "box"
-    assert obstacle.triangle_F3.dtype == np.int32
-    assert obstacle.vertex_V3.dtype == np.float64
+    assert obstacle.closed and obstacle.name == "box"
+    assert (obstacle.vertex_V3.shape, obstacle.triangle_F3.shape) == ((8, 3), (12, 3))
+    assert (obstacle.vertex_V3.dtype, obstacle.triangle_F3.dtype) == (np.float64, np.int32)
     np.testing.assert_allclose(np.ptp(obstacle.vertex_V3, axis=0), [1, 2, 3])
 
 
-def test_parts_of_a_scene_become_one_obstacle(tmp_path):
-    """A GLB of two placed bodies is one closed obstacle with both."""
+def test_bodies_of_several_parts(tmp_path):
+    """A GLB of two placed bodies is one closed obstacle with both. Of a shell with an inward inner surface the space
+    between counts as inside, the cavity does not."""
     scene = trimesh.Scene()
     scene.add_geometry(trimesh.creation.box((1, 1, 1)))
     scene.add_geometry(trimesh.creation.box((1, 1, 1)), transform=trimesh.transformations.translation_matrix([3, 0, 0]))
     scene.export(tmp_path / "two.glb")
-    obstacle = load_mesh(tmp_path / "two.glb")
-    assert len(obstacle.triangle_F3) == 24
-    assert obstacle.closed
-    assert contains(np.array([[0.1, 0.2, 0.3], [1.5, 0, 0], [3.1, 0.2, 0.3]]), obstacle).tolist() == [True, False, True]
+    outer, inner = trimesh.creation.icosphere(2, 1.0), trimesh.creation.icosphere(2, 0.5)
+    inner.invert()
+    trimesh.util.concatenate([outer, inner]).export(tmp_path / "shell.stl")
+    two, shell = load_mesh(tmp_path / "two.glb"), load_mesh(tmp_path / "shell.stl")
+    assert len(two.triangle_F3) == 24 and two.closed
+    assert contains(np.array([[0.1, 0.2, 0.3], [1.5, 0, 0], [3.1, 0.2, 0.3]]), two).tolist() == [True, False, True]
+    assert contains(np.array([[0.7, 0.1, 0.1], [0.1, 0.1, 0.1]]), shell).tolist() == [True, False]
 
 
 def test_scale_then_rotation_then_translation(tmp_path):
@@ -57,24 +61,12 @@ def test_flipped_triangles_are_turned_to_agree(tmp_path):
     mesh.faces[flipped] = mesh.faces[flipped][:, ::-1]
     trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).export(tmp_path / "torus.ply")
     obstacle = load_mesh(tmp_path / "torus.ply")
-    assert obstacle.closed
     fixed = trimesh.Trimesh(obstacle.vertex_V3, obstacle.triangle_F3, process=False)
-    assert fixed.is_winding_consistent
-    assert fixed.volume > 0
+    assert obstacle.closed and fixed.is_winding_consistent and fixed.volume > 0
     point = rng.random((500, 3)) * 3 - 1.5
     tube = np.hypot(np.hypot(point[:, 0], point[:, 1]) - 1.0, point[:, 2])
     inside = contains(point, obstacle)
-    assert inside[tube < 0.36].all()
-    assert not inside[tube > 0.4].any()
-
-
-def test_hollow_bodies_keep_their_hollow(tmp_path):
-    """Of a shell with an inward inner surface the space between counts as inside, the cavity does not."""
-    outer, inner = trimesh.creation.icosphere(2, 1.0), trimesh.creation.icosphere(2, 0.5)
-    inner.invert()
-    trimesh.util.concatenate([outer, inner]).export(tmp_path / "shell.stl")
-    obstacle = load_mesh(tmp_path / "shell.stl")
-    assert contains(np.array([[0.7, 0.1, 0.1], [0.1, 0.1, 0.1]]), obstacle).tolist() == [True, False]
+    assert inside[tube < 0.36].all() and not inside[tube > 0.4].any()
 
 
 @pytest.mark.parametrize(
@@ -97,56 +89,52 @@ def test_meshes_with_a_boundary_are_sheets(tmp_path, text, triangles):
 def test_one_sided_and_branching_surfaces_are_sheets(tmp_path):
     """A Klein bottle has two triangles at every edge but no inside; two boxes sharing an edge have four there."""
     n = 12
-    cells = [(i, j) for i in range(n) for j in range(n)]
 
     def vertex(i, j):
         return (i % n) * n + ((j if i < n else -j) % n)
 
     faces = []
-    for i, j in cells:
+    for i, j in np.ndindex(n, n):
         a, b, c, d = vertex(i, j), vertex(i + 1, j), vertex(i + 1, j + 1), vertex(i, j + 1)
         faces += [(a, b, c), (a, c, d)]
-    points = np.random.default_rng(0).random((n * n, 3))
-    trimesh.Trimesh(points, faces, process=False).export(tmp_path / "klein.ply")
-    assert not load_mesh(tmp_path / "klein.ply").closed
+    klein = trimesh.Trimesh(np.random.default_rng(0).random((n * n, 3)), faces, process=False)
     boxes = [trimesh.creation.box((1, 1, 1)), trimesh.creation.box((1, 1, 1))]
     boxes[1].apply_translation([1, 1, 0])
-    trimesh.util.concatenate(boxes).export(tmp_path / "boxes.stl")
-    assert not load_mesh(tmp_path / "boxes.stl").closed
+    for name, mesh in (("klein.ply", klein), ("boxes.stl", trimesh.util.concatenate(boxes))):
+        mesh.export(tmp_path / name)
+        assert not load_mesh(tmp_path / name).closed
 
 
-@pytest.mark.parametrize(
-    ("name", "content", "message"),
-    [
-        ("a.fbx", b"", r"obstacle must end in one of \.stl, \.obj, \.ply, \.glb, got .*a\.fbx; convert"),
-        ("a.obj", b"", "obstacle must contain triangles, got none"),
-        ("a.obj", b"v 0 0 0\nv 1 0 0\n", "obstacle must contain triangles"),
-        ("a.stl", b"solid\nendsolid\n", "obstacle must contain triangles"),
-        ("a.ply", b"bad", "obstacle must be a readable PLY file"),
-        ("a.glb", b"", "obstacle must be a readable GLB file"),
-        ("a.glb", b"glTFxxxxxx", "obstacle must be a readable GLB file"),
-        ("a.obj", TRIANGLE.encode() + b"f 1 2 9\n", "obstacle must be a readable OBJ file"),
-        ("a.obj", b"v 0 0 nan\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "obstacle must have finite vertices, got .*nan"),
-        ("a.obj", b"v 0 0 inf\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "obstacle must have finite vertices, got .*inf"),
-        ("a.obj", b"v 0 0 1e39\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "obstacle must stay within .*lower scale"),
-        ("a.obj", b"v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n", "obstacle must have a triangle with an area"),
-    ],
-)
-def test_bad_files_are_refused_by_name(tmp_path, name, content, message):
+FACE = b"f 1 2 3\n"
+GOOD = TRIANGLE.encode() + FACE
+READABLE = "ramp must be a readable {} file"
+REFUSED = [
+    ("a.fbx", b"", {}, r"ramp must end in one of \.stl, \.obj, \.ply, \.glb, got .*a\.fbx; convert"),
+    ("a.obj", b"", {}, "ramp must contain triangles, got none"),
+    ("a.obj", b"v 0 0 0\nv 1 0 0\n", {}, "ramp must contain triangles"),
+    ("a.stl", b"solid\nendsolid\n", {}, "ramp must contain triangles"),
+    ("a.ply", b"bad", {}, READABLE.format("PLY")),
+    ("a.glb", b"", {}, READABLE.format("GLB")),
+    ("a.glb", b"glTFxxxxxx", {}, READABLE.format("GLB")),
+    ("a.obj", TRIANGLE.encode() + b"f 1 2 9\n", {}, READABLE.format("OBJ")),
+    ("a.obj", b"v 0 0 nan\nv 1 0 0\nv 0 1 0\n" + FACE, {}, "ramp must have finite vertices, got .*nan"),
+    ("a.obj", b"v 0 0 inf\nv 1 0 0\nv 0 1 0\n" + FACE, {}, "ramp must have finite vertices, got .*inf"),
+    ("a.obj", b"v 0 0 1e39\nv 1 0 0\nv 0 1 0\n" + FACE, {}, "ramp must stay within .*lower scale"),
+    ("a.obj", b"v 0 0 0\nv 1 0 0\nv 2 0 0\n" + FACE, {}, "ramp must have a triangle with an area"),
+    ("none.obj", None, {}, r"ramp must be an existing file, got .*none\.obj"),
+    *(
+        ("a.obj", GOOD, {"scale": scale}, "ramp: scale must be a finite number > 0")
+        for scale in (0.0, -1.0, np.nan, np.inf)
+    ),
+    ("a.obj", GOOD, {"translation": (0.0, np.nan, 0.0)}, "ramp: translation must be three finite numbers"),
+    ("a.obj", GOOD, {"rotation": (np.inf, 0.0, 0.0)}, "ramp: rotation must be three finite numbers"),
+]
+
+
+@pytest.mark.parametrize(("name", "content", "options", "message"), REFUSED)
+def test_bad_files_and_numbers_are_refused_by_name(tmp_path, name, content, options, message):
     """Unknown suffix, nothing inside, damage, non-finite numbers, no area: an error with field, file and cause."""
-    (tmp_path / name).write_bytes(content)
+    if content is not None:
+        (tmp_path / name).write_bytes(content)
     with pytest.raises(ConfigError, match=message):
-        load_mesh(tmp_path / name, "obstacle")
-
-
-def test_missing_files_and_bad_numbers_are_refused(tmp_path):
-    """A missing file and a bad scale, translation or rotation name the field."""
-    path = write(tmp_path, TRIANGLE + "f 1 2 3\n")
-    for file, options, message in (
-        (tmp_path / "none.obj", {}, r"ramp must be an existing file, got .*none\.obj"),
-        *((path, {"scale": s}, "ramp: scale must be a finite number > 0") for s in (0.0, -1.0, np.nan, np.inf)),
-        (path, {"translation": (0.0, np.nan, 0.0)}, "ramp: translation must be three finite numbers"),
-        (path, {"rotation": (np.inf, 0.0, 0.0)}, "ramp: rotation must be three finite numbers"),
-    ):
-        with pytest.raises(ConfigError, match=message):
-            load_mesh(file, "ramp", **options)
+        load_mesh(tmp_path / name, "ramp", **options)

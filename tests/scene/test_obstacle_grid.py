@@ -1,3 +1,5 @@
+"""Obstacle cells: samples of surfaces, normals, and grids of any mesh."""
+
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
@@ -45,31 +47,25 @@ def test_samples_cover_the_surface(shape):
     assert tree.query(pieces.mean(axis=1))[0].max() < 2 * CELL / 4
 
 
-def test_samples_cover_a_needle():
-    """A strip far narrower than the spacing is sampled along its whole length."""
+def test_samples_and_pieces():
+    """A strip far narrower than the spacing is sampled along its whole length. Pieces are short, their areas add up,
+    and a box keeps only what touches it."""
     vertex = np.array([[0, 0, 0], [1, 0, 0], [1, 1e-7, 0], [0, 1e-7, 0]])
     point, _ = sample_surface(vertex[[[0, 1, 2], [0, 2, 3]]], CELL / 4, rng())
     assert np.diff(np.sort(point[:, 0])).max() < 3 * CELL / 4
-
-
-def test_split_keeps_area_and_drops_what_misses_the_box():
-    """Pieces are short, their areas add up, and a box keeps only what touches it."""
     corner = np.array([[[0, 0, 0], [1, 0, 0], [0, 1, 0]]], float)
     pieces = split_long_edges(corner, 0.1)
-    edge = np.roll(pieces, -1, axis=1) - pieces
-    assert np.linalg.norm(edge, axis=2).max() <= 0.1
+    assert np.linalg.norm(np.roll(pieces, -1, axis=1) - pieces, axis=2).max() <= 0.1
     area = np.linalg.norm(np.cross(pieces[:, 1] - pieces[:, 0], pieces[:, 2] - pieces[:, 0]), axis=1) / 2
     assert area.sum() == pytest.approx(0.5)
-    boxed = split_long_edges(1e6 * corner, 0.1, (np.zeros(3), np.ones(3)))
-    assert 200 < len(boxed) < 2000
+    assert 200 < len(split_long_edges(1e6 * corner, 0.1, (np.zeros(3), np.ones(3)))) < 2000
 
 
 def test_grid_is_sorted_unique_unit_and_near_the_surface():
     """Cells are unique and sorted, normals have unit length, and the surface passes through each cell."""
     shapes = [shape_obstacle(name, 0.2, (i, 0.0, -1.0), TILT) for i, name in enumerate(OBSTACLE_SHAPES)]
     grid = build_obstacle_grid(shapes, CELL, 0)
-    assert grid.cell_K3.dtype == np.int32
-    assert grid.normal_K3.dtype == np.float32
+    assert (grid.cell_K3.dtype, grid.normal_K3.dtype) == (np.int32, np.float32)
     np.testing.assert_array_equal(np.unique(grid.cell_K3, axis=0), grid.cell_K3)
     np.testing.assert_allclose(np.linalg.norm(grid.normal_K3.astype(float), axis=1), 1, atol=1e-6)
     centre = (grid.cell_K3 + 0.5) * CELL
@@ -113,10 +109,8 @@ def test_cancelled_cell_takes_the_normal_of_the_nearest_sample():
 def test_surfaces_without_area():
     """No obstacles, and zero-area triangles, give empty arrays of the right types; among others they are skipped."""
     flat = Obstacle("flat", np.zeros((3, 3)), np.array([[0, 1, 2], [0, 0, 0]], np.int32), closed=False)
-    for grid in (
-        *(build_obstacle_grid(o, CELL, 0) for o in ([], [flat])),
-        build_obstacle_grid([], CELL, 0, 3 * (1.0,)),
-    ):
+    grids = [build_obstacle_grid(obstacles, CELL, 0) for obstacles in ([], [flat])]
+    for grid in (*grids, build_obstacle_grid([], CELL, 0, (1.0, 1.0, 1.0))):
         assert (grid.cell_K3.shape, grid.cell_K3.dtype) == ((0, 3), np.int32)
         assert (grid.normal_K3.shape, grid.normal_K3.dtype) == ((0, 3), np.float32)
     mixed = build_obstacle_grid([flat, shape_obstacle("cone", 0.1)], CELL, 0)
@@ -137,10 +131,8 @@ def test_a_mesh_far_larger_than_the_domain_is_cut_to_it():
     floor = sheet(0.5)
     huge = Obstacle("floor", (floor.vertex_V3 - 0.5) * 1e6 + [0.5, 0.3, 0.5], floor.triangle_F3, closed=False)
     grid = build_obstacle_grid([huge], CELL, 0, (1.0, 1.0, 1.0))
-    assert grid.cell_K3.min() >= -1
-    assert grid.cell_K3.max() <= 64
-    inside = ((grid.cell_K3 >= 0) & (grid.cell_K3 < 64)).all(axis=1)
-    assert inside.sum() == 64 * 64
+    assert grid.cell_K3.min() >= -1 and grid.cell_K3.max() <= 64
+    assert ((grid.cell_K3 >= 0) & (grid.cell_K3 < 64)).all(axis=1).sum() == 64 * 64
 
 
 def test_errors():

@@ -52,10 +52,14 @@ def make_rollout(reference_frames=3):
     )
 
 
-def stored(folder, rollout):
-    """What is read of a rollout's file."""
-    write_rollout(folder / "new" / "rollout.vtkhdf", rollout)
-    return read_rollout(folder / "new" / "rollout.vtkhdf")
+def stored(folder, rollout, change=None):
+    """What is read of a rollout's file; `change` edits the file before."""
+    path = folder / "new" / "rollout.vtkhdf"
+    write_rollout(path, rollout)
+    if change is not None:
+        with h5py.File(path, "a") as file:
+            change(file)
+    return read_rollout(path)
 
 
 @pytest.mark.parametrize("reference_frames", [None, 3, 6])
@@ -68,32 +72,34 @@ def test_roundtrip(tmp_path, reference_frames):
     np.testing.assert_array_equal(stored(tmp_path, written).position_TN3, written.position_TN3)
 
 
-def test_files_of_other_materials(tmp_path):
-    """A file is read with the names that it brings, fewer or others than the solver's, and refused with too few."""
-    path = tmp_path / "rollout.h5"
-    write_rollout(path, make_rollout())
-    for names in (["water", "sand", "snow"], ["water", "sand", "snow", "goop"], ["water"], ["A B"] * 4):
-        with h5py.File(path, "a") as file:
-            file["hgn"].attrs["materials"] = json.dumps(names)
-        if len(set(names)) < 3:
-            with pytest.raises(ConfigError, match=r"material_N must be 0 to 0|materials must be names of lower-case"):
-                read_rollout(path)
-        else:
-            assert read_rollout(path).materials == tuple(names)
+def attribute(name, value):
+    return lambda file: file["hgn"].attrs.__setitem__(name, value)
 
 
-def test_files_of_flat_rollouts(tmp_path):
-    """A file keeps that all lies in a plane; older ones, which do not tell, have three dimensions."""
-    path, flat = tmp_path / "rollout.h5", dataclasses.replace(make_rollout(), dimensions=2)
-    write_rollout(path, flat)
-    assert read_rollout(path).dimensions == 2
-    with h5py.File(path, "a") as file:
-        file["hgn"].attrs["dimensions"] = 4
-    with pytest.raises(ConfigError, match=r"dimensions must be 2 or 3, got 4; write it again"):
-        read_rollout(path)
-    with h5py.File(path, "a") as file:
-        del file["hgn"].attrs["dimensions"]
-    assert read_rollout(path).dimensions == 3
+def array(name, value):
+    def change(file):
+        del file[name]
+        file[name] = value
+
+    return change
+
+
+def test_files_of_other_programs_and_versions(tmp_path):
+    """A file is read with the names of materials that it brings, more or others than the solver's, and keeps that all
+    lies in a plane; older ones do not tell, and have three dimensions. Files of format 1 had no obstacles in /VTKHDF.
+    """
+    for names in (["water", "sand", "snow"], ["water", "sand", "snow", "goop"]):
+        assert stored(tmp_path, make_rollout(), attribute("materials", json.dumps(names))).materials == tuple(names)
+    flat = dataclasses.replace(make_rollout(), dimensions=2)
+    assert stored(tmp_path, flat).dimensions == 2
+    assert stored(tmp_path, flat, lambda file: file["hgn"].attrs.pop("dimensions")).dimensions == 3
+
+    def first_format(file):
+        del file["VTKHDF/CellData"], file["VTKHDF/Steps/CellDataOffsets"]
+        file["hgn"].attrs["format_version"] = 1
+
+    read = stored(tmp_path, dataclasses.replace(flat, obstacles=()), first_format)
+    np.testing.assert_array_equal(read.position_TN3, flat.position_TN3)
 
 
 def test_particles_that_enter(tmp_path):
@@ -185,16 +191,6 @@ def test_what_enters_and_what_moves(tmp_path):
         np.testing.assert_array_equal(place_V3, expected_V3)
 
 
-def test_files_of_format_1_are_read(tmp_path):
-    """They had no obstacles in /VTKHDF."""
-    written = make_rollout()
-    write_rollout(tmp_path / "a.vtkhdf", dataclasses.replace(written, obstacles=()))
-    with h5py.File(tmp_path / "a.vtkhdf", "a") as file:
-        del file["VTKHDF/CellData"], file["VTKHDF/Steps/CellDataOffsets"]
-        file["hgn"].attrs["format_version"] = 1
-    np.testing.assert_array_equal(read_rollout(tmp_path / "a.vtkhdf").position_TN3, written.position_TN3)
-
-
 def test_vtk_reads_it(tmp_path):
     """VTK's own reader has, at each time, the particles that are there and the obstacles where they then are, with
     material, velocity and the obstacle's number."""
@@ -216,16 +212,13 @@ def test_vtk_reads_it(tmp_path):
         point_P3 = vtk_to_numpy(data.GetPoints().GetData())
         particle_N = [data.GetVerts().GetConnectivityArray().GetValue(i) for i in range(data.GetNumberOfVerts())]
         np.testing.assert_array_equal(point_P3[particle_N], rollout.position_TN3[frame, :count])
-        material_P, velocity_P3 = (
-            vtk_to_numpy(data.GetPointData().GetArray(name)) for name in ("material", "velocity")
-        )
+        arrays = (data.GetPointData().GetArray(name) for name in ("material", "velocity"))
+        material_P, velocity_P3 = map(vtk_to_numpy, arrays)
         assert material_P.tolist() == [255] * 7 + rollout.material_N[:count].tolist()
         np.testing.assert_array_equal(velocity_P3[particle_N], velocity_TN3[frame, :count])
         assert np.isfinite(velocity_P3).all()
-        places = [
-            o.vertex_V3 if o.motion is None else o.motion.place(o.vertex_V3, frame / 60) for o in rollout.obstacles
-        ]
-        vertex_V3 = np.concatenate(places)
+        still, moving = rollout.obstacles
+        vertex_V3 = np.concatenate([still.vertex_V3, moving.motion.place(moving.vertex_V3, frame / 60)])
         np.testing.assert_allclose(point_P3[:7], vertex_V3, atol=1e-6)
         if before_V3 is not None:
             np.testing.assert_allclose(velocity_P3[:7], 60 * (vertex_V3 - before_V3), atol=1e-4)
@@ -264,38 +257,28 @@ def test_a_failed_write_leaves_the_old_file(tmp_path):
     assert [entry.name for entry in tmp_path.iterdir()] == ["rollout.h5"]
 
 
-def edited(change):
-    def edit(path):
-        with h5py.File(path, "a") as file:
-            change(file)
-
-    return edit
-
-
-def attribute(name, value):
-    return edited(lambda file: file["hgn"].attrs.__setitem__(name, value))
-
-
-def array(name, value):
-    def change(file):
-        del file[name]
-        file[name] = value
-
-    return edited(change)
-
-
 SHEET = "hgn/obstacles/0000"
+
+
+def external_points(file):
+    """HDF5 can take data from any file that its reader may read."""
+    points = file["VTKHDF/Points"]
+    shape, dtype, foreign = points.shape, points.dtype, file.filename + ".raw"
+    Path(foreign).write_bytes(bytes(10_000))
+    del file["VTKHDF/Points"]
+    file["VTKHDF"].create_dataset("Points", shape, dtype, external=[(foreign, 0, h5py.h5f.UNLIMITED)])
 
 
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (Path.unlink, r"existing file, got .*a\.vtkhdf.*hgn\.rollout"),
-        (lambda path: path.write_text("not a rollout"), "complete HDF5 file"),
-        (edited(lambda file: file["hgn"].attrs.pop("format")), "format None"),
+        (lambda file: file["hgn"].attrs.pop("format"), "format None"),
         (attribute("format_version", 99), "format_version must be 1 or 2, got 99"),
+        (attribute("dimensions", 4), r"dimensions must be 2 or 3, got 4; write it again"),
+        (attribute("materials", '["water"]'), r"material_N must be 0 to 0"),
+        (attribute("materials", '["A B", "A B"]'), "materials must be names of lower-case"),
         (array("VTKHDF/Points", np.zeros((5, 3), np.float32)), "4 frames of 7 particles"),
-        (edited(lambda file: file.pop("VTKHDF/Points")), r"must be a complete HDF5 file, got .*Points"),
+        (lambda file: file.pop("VTKHDF/Points"), r"must be a complete HDF5 file, got .*Points"),
         (attribute("format", np.array([1, 2])), "with format array"),
         (attribute("format_version", "x"), "format_version must be 1 or 2, got x"),
         (attribute("domain_size", np.array([np.nan, 1, 1])), r"domain_size\[0\] must be a finite number > 0, got nan"),
@@ -310,16 +293,19 @@ SHEET = "hgn/obstacles/0000"
         (array(f"{SHEET}/triangles", np.array([0, 1, 2])), r"triangles must be numbers \[any, 3\]"),
         (array(f"{SHEET}/vertices", np.zeros((3, 2))), r"vertices must be numbers \[any, 3\]"),
         (array(f"{SHEET}/vertices", np.full((3, 3), np.nan)), "vertices must be finite"),
+        (external_points, "must lie in the file itself"),
+        (lambda file: file.__setitem__("VTKHDF/other", h5py.ExternalLink("/", "/")), "got a link in other"),
     ],
 )
 def test_other_files_are_refused(tmp_path, change, message):
-    """Missing files, files of other programs and versions, damaged ones, and values that cannot be drawn are told apart
-    in the message."""
-    path = tmp_path / "a.vtkhdf"
-    write_rollout(path, make_rollout())
-    change(path)
+    """Missing files, files of other programs and versions, damaged ones, those with data of other files, and values
+    that cannot be drawn are told apart in the message."""
     with pytest.raises(ConfigError, match=message):
-        read_rollout(path)
+        stored(tmp_path, make_rollout(), change)
+    (tmp_path / "text.vtkhdf").write_text("not a rollout")
+    for name, told in (("none", r"existing file, got .*none\.vtkhdf.*hgn\.rollout"), ("text", "complete HDF5 file")):
+        with pytest.raises(ConfigError, match=told):
+            read_rollout(tmp_path / f"{name}.vtkhdf")
 
 
 @pytest.mark.parametrize(

@@ -1,3 +1,5 @@
+"""Scene files: what is read, and one table of what is refused."""
+
 import json
 import shutil
 from pathlib import Path
@@ -15,10 +17,16 @@ CUBE = {"shape": "cube", "size": 0.08, "position": [0.5, 0.5, 0.5], "material": 
 CONE = {"shape": "cone", "size": 0.2, "position": [0.5, 0.2, 0.5]}
 
 
-def write(folder, mapping):
+def write(folder, content):
+    """A scene file of a mapping, a text or bytes."""
     path = folder / "scene.yaml"
-    path.write_text(yaml.safe_dump(mapping), encoding="utf-8")
+    text = content if isinstance(content, str | bytes) else yaml.safe_dump(content)
+    path.write_bytes(text if isinstance(text, bytes) else text.encode())
     return path
+
+
+def load(folder, **mapping):
+    return load_scene(write(folder, {"groups": [CUBE]} | mapping))
 
 
 @pytest.mark.parametrize("name", ["funnel.yaml", "own_mesh.yaml"])
@@ -56,7 +64,7 @@ def test_groups_become_particles(tmp_path):
             {"shape": "box", "size": [0.5, 0.125, 0.25], "position": [1.0, 0.8, 0.5], "material": "snow"},
         ],
     }
-    scene = load_scene(write(tmp_path, mapping))
+    scene = load(tmp_path, **mapping)
     assert (scene.domain_size, scene.cell_size, scene.gravity) == ((2.0, 1.0, 1.0), 0.03125, (0.0, -1.5, 0.0))
     assert scene.seed == 9
     counts = [4 * 512 + 1, int(np.ceil(4 * np.pi / 6 * 0.2**3 * 32**3)), 4 * 512 + 1]
@@ -72,10 +80,7 @@ def test_groups_become_particles(tmp_path):
 
 def test_friction_of_each_surface(tmp_path):
     """Walls, floor and each obstacle have their own friction, kept in the specification; none is the solver's."""
-    mapping = {
-        "groups": [CUBE], "floor_friction": 0.5, "wall_friction": 0.1, "obstacles": [CONE, {**CONE, "friction": 0.3}],
-    }  # fmt: skip
-    scene = load_scene(write(tmp_path, mapping))
+    scene = load(tmp_path, floor_friction=0.5, wall_friction=0.1, obstacles=[CONE, {**CONE, "friction": 0.3}])
     assert scene.wall_friction == (0.1, 0.5, 0.1)
     assert [obstacle.friction for obstacle in scene.obstacles] == [None, 0.3]
     assert scene.specification["floor_friction"] == 0.5
@@ -85,7 +90,7 @@ def test_friction_of_each_surface(tmp_path):
 def test_keyframes_are_poses_about_the_position(tmp_path):
     """An obstacle with keyframes moves from where its entry places it, turned about its position."""
     keyframes = [{"time": 0}, {"time": 2, "translation": [0.1, 0, 0], "rotation": [0, 90, 0]}]
-    scene = load_scene(write(tmp_path, {"groups": [CUBE], "obstacles": [{**CONE, "keyframes": keyframes}]}))
+    scene = load(tmp_path, obstacles=[{**CONE, "keyframes": keyframes}])
     (cone,) = scene.obstacles
     assert scene.moves and cone.motion is not None
     assert np.allclose(cone.motion.place(cone.vertex_V3, 0.0), cone.vertex_V3)
@@ -97,8 +102,7 @@ def test_keyframes_are_poses_about_the_position(tmp_path):
 def test_editing_one_group_leaves_the_others(tmp_path):
     """Each group has a random stream of its own."""
     other = {**CUBE, "position": [0.2, 0.5, 0.5]}
-    before = load_scene(write(tmp_path, {"groups": [CUBE, other]}))
-    after = load_scene(write(tmp_path, {"groups": [{**CUBE, "size": 0.1}, other]}))
+    before, after = load(tmp_path, groups=[CUBE, other]), load(tmp_path, groups=[{**CUBE, "size": 0.1}, other])
     assert before.position_N3[-1074:].tobytes() == after.position_N3[-1074:].tobytes()
     assert before.position_N3[:1074].tobytes() != before.position_N3[1074:].tobytes()
 
@@ -106,29 +110,19 @@ def test_editing_one_group_leaves_the_others(tmp_path):
 def test_shapes_are_placed_and_turned(tmp_path):
     """A square turned by 90 degrees about x stands upright at its position."""
     square = {"shape": "square", "size": 0.2, "position": [0.5, 0.3, 0.6], "rotation": [90, 0, 0]}
-    (obstacle,) = load_scene(write(tmp_path, {"groups": [CUBE], "obstacles": [square]})).obstacles
+    (obstacle,) = load(tmp_path, obstacles=[square]).obstacles
     np.testing.assert_allclose(obstacle.vertex_V3.min(axis=0), [0.4, 0.2, 0.6], atol=1e-6)
     np.testing.assert_allclose(obstacle.vertex_V3.max(axis=0), [0.6, 0.4, 0.6], atol=1e-6)
 
 
-def test_groups_may_touch_the_walls_but_not_enter_them(tmp_path):
-    """The solver's walls are 3 cells thick: a cube on the inner face is accepted, a cell further it is not."""
-    wall, half = 3 / 64, 0.04
-    load_scene(write(tmp_path, {"groups": [{**CUBE, "position": [wall + half, 1 - wall - half, 0.5]}]}))
-    with pytest.raises(ConfigError, match=r"groups\[0\] \(cube of water\) must lie between the walls"):
-        load_scene(write(tmp_path, {"groups": [{**CUBE, "position": [wall + half - 1 / 64, 0.5, 0.5]}]}))
+WALL, HALF = 3 / 64, 0.04  # the solver's walls are 3 cells thick
 
 
-def test_particles_inside_a_closed_obstacle_are_refused_with_their_count(tmp_path):
-    """The message names group, obstacle and count; inside a bowl or above a sheet is no offence."""
-    path = write(tmp_path, {"groups": [CUBE, {**CUBE, "position": [0.5, 0.25, 0.5]}], "obstacles": [CONE]})
-    message = r"groups\[1\] \(cube of water\) must be clear of closed .*obstacle_0_cone"
-    with pytest.raises(ConfigError, match=message) as seen:
-        load_scene(path)
-    assert "1074 of 1074" not in str(seen.value)
-    assert " of 1074 particles inside" in str(seen.value)
+def test_where_groups_may_be(tmp_path):
+    """A cube on the inner face of the walls is accepted, and one inside a bowl, which is a sheet."""
+    load(tmp_path, groups=[{**CUBE, "position": [WALL + HALF, 1 - WALL - HALF, 0.5]}])
     bowl = {"shape": "half_sphere", "size": 0.4, "position": [0.5, 0.5, 0.5]}
-    assert load_scene(write(tmp_path, {"groups": [CUBE], "obstacles": [bowl]})).particle_count == 1074
+    assert load(tmp_path, obstacles=[bowl]).particle_count == 1074
 
 
 def scene_with(**changes):
@@ -152,72 +146,95 @@ def obstacle_with(**changes):
     return {"groups": [CUBE], "obstacles": [entry]}
 
 
-@pytest.mark.parametrize(
-    ("mapping", "message"),
-    [
-        (None, "the file must be a mapping"),
-        ({}, "groups must be a list with at least one group, or emitters"),
-        (emitter_with(velocity=[0, 0, 0]), r"emitters\[0\]\.velocity must be other than zero"),
-        (emitter_with(stop=0), r"emitters\[0\]\.stop must be later than start \(0\), got 0"),
-        (emitter_with(start=-1), r"emitters\[0\]\.start must be a finite number >= 0"),
-        (emitter_with(shape="cube"), r"emitters\[0\]\.shape must be one of disc, rectangle, got 'cube'"),
-        (emitter_with(shape="rectangle"), r"emitters\[0\]\.size must be a list of two edges for a rectangle"),
-        (emitter_with(size=-1), r"emitters\[0\]\.size must be finite and > 0, got -1"),
-        (emitter_with(material="lava"), r"emitters\[0\]\.material must be one of water, .*, got 'lava'"),
-        (emitter_with(water_tension=2.0), r"emitters\[0\].*water_tension must be at most 1, got 2"),
-        (emitter_with(position=[0.5, 0.99, 0.5]), r"emitters\[0\] \(disc of water\) must lie between the walls"),
-        (
-            emitter_with(position=[0.5, 0.22, 0.5]) | {"obstacles": [CONE]},
-            r"emitters\[0\] \(disc of water\) must be clear of closed obstacles, got it inside obstacle_0_cone",
-        ),
-        (scene_with(gruops=1), "gruops is not a known key; did you mean groups"),
-        (scene_with(cell_size=0), "cell_size must be a finite number > 0"),
-        (scene_with(cell_size=float("nan")), "cell_size must be a finite number > 0, got nan"),
-        (scene_with(particles_per_cell=-1), "particles_per_cell must be a finite number > 0"),
-        (scene_with(particles_per_cell=1e9), "groups must be at most 50000000 particles"),
-        (scene_with(cell_size=1e-200), "groups must be at most 50000000 particles together, .* got inf"),
-        (group_with(size=1e300), "groups must be at most 50000000 particles together, .* got inf"),
-        (obstacle_with(size=1e300), r"obstacles\[0\].size must be in the range of float32, got 1e\+300"),
-        (scene_with(domain_size=[1, -1, 1]), r"domain_size\[1\] must be a finite number > 0, got -1"),
-        (scene_with(domain_size=[1, 1]), "domain_size must be a list of 3 values"),
-        (scene_with(domain_size=[0.05, 1, 1]), r"groups\[0\] \(cube of water\) must lie between the walls"),
-        (scene_with(gravity=[0, float("inf"), 0]), r"gravity\[1\] must be finite, got inf"),
-        (scene_with(floor_friction=-0.1), "floor_friction must be a finite number >= 0, got -0.1"),
-        (scene_with(wall_friction=float("nan")), "wall_friction must be a finite number >= 0, got nan"),
-        (obstacle_with(keyframes=[{"time": 1}, {"time": 1}]), r"obstacles\[0\]\.keyframes must be in order of time"),
-        (obstacle_with(keyframes=[{"time": -1}]), r"obstacles\[0\]\.keyframes\[0\]\.time must be .* >= 0"),
-        (obstacle_with(keyframes=[{"time": 0, "rotation": [0, float("inf"), 0]}]), r"\.rotation\[1\] must be finite"),
-        (obstacle_with(friction=-1), r"obstacles\[0\]\.friction must be a finite number >= 0, got -1"),
-        (scene_with(seed=-1), "seed must be a whole number >= 0"),
-        (scene_with(seed=0.5), "seed must be a whole number"),
-        (group_with(material="lava"), r"groups\[0\]\.material must be one of water, sand, snow, elastic, got 'lava'"),
-        (group_with(shape="torus"), r"groups\[0\]\.shape must be one of cube, sphere, box"),
-        (group_with(size=0), r"groups\[0\]\.size must be finite and > 0"),
-        (group_with(size=float("nan")), r"groups\[0\]\.size must be finite and > 0"),
-        (group_with(size=[0.1, 0.1, 0.1]), r"groups\[0\]\.size must be one number for a cube"),
-        (group_with(shape="box"), r"groups\[0\]\.size must be a list of three edges for a box"),
-        (group_with(shape="box", size=[0.1, -0.1, 0.1]), r"groups\[0\]\.size must be finite and > 0"),
-        (group_with(position=[0.5, float("nan"), 0.5]), r"groups\[0\]\.position\[1\] must be finite, got nan"),
-        (group_with(velocity=[0, float("inf"), 0]), r"groups\[0\]\.velocity\[1\] must be finite"),
-        (group_with(position=[5, 0.5, 0.5]), "got 1074 of 1074 particles outside; move or shrink it"),
-        (obstacle_with(shape="sphere"), r"obstacles\[0\]\.shape must be one of half_box"),
-        (obstacle_with(shape=None), r"obstacles\[0\]\.mesh or shape must be given, .* got neither"),
-        (obstacle_with(mesh="a.obj"), r"obstacles\[0\]\.mesh or shape must be given, .* got both"),
-        (obstacle_with(size=None), r"obstacles\[0\]\.size must be given beside shape"),
-        (obstacle_with(size=-1), r"obstacles\[0\]\.size must be a finite number > 0"),
-        (obstacle_with(position=None), r"obstacles\[0\]\.position must be given beside shape"),
-        (obstacle_with(position=[0, 0, float("nan")]), r"obstacles\[0\]\.position\[2\] must be finite"),
-        (obstacle_with(rotation=[0, 0, float("nan")]), r"obstacles\[0\]\.rotation\[2\] must be finite"),
-        (obstacle_with(scale=2), r"obstacles\[0\]\.scale must be left out beside shape"),
-        (obstacle_with(shape=None, mesh="a.obj"), r"obstacles\[0\]\.size must be left out beside mesh"),
-        (obstacle_with(shape=None, size=None, mesh="a.obj", scale=0), r"obstacles\[0\]\.scale must be a finite"),
-        (obstacle_with(shape=None, size=None, mesh="a.obj"), r"obstacles\[0\]\.mesh must be an existing file"),
-    ],
+BOMB = "a: &a [x, x, x, x, x, x, x, x, x]\n" + "".join(
+    f"{name}: &{name} [{', '.join(9 * [f'*{before}'])}]\n"
+    for before, name in zip("abcdefghi", "bcdefghij", strict=True)
 )
-def test_every_mistake_is_named(tmp_path, mapping, message):
-    """Each mistake in a scene file ends in one error: the file, the field, the rule and the value."""
-    with pytest.raises(ConfigError, match=rf"scene\.yaml: {message}|scene\.yaml: .*{message}"):
-        load_scene(write(tmp_path, mapping))
+GROUP, EMITTER, OBSTACLE = r"groups\[0\]", r"emitters\[0\]", r"obstacles\[0\]"
+BETWEEN_WALLS = r" \((cube|disc) of water\) must lie between the walls"
+MESH = {"shape": None, "size": None, "mesh": "a.obj"}
+INSIDE = {"groups": [CUBE, {**CUBE, "position": [0.5, 0.25, 0.5]}], "obstacles": [CONE]}
+YAML, ALIASES = "must be a YAML file", "its aliases expand to more than 100000 values"
+MISTAKES = [
+    ("groups: [", YAML),
+    (b"\xff\xfe\xfa", YAML),
+    ("groups: " + 1000 * "[", YAML),
+    ("cell_size: " + 5000 * "9", YAML + ": Exceeds the limit"),
+    ("cell_size: " + 400 * "9", "cell_size must be a number of at most 63 bits, got one of 1329"),
+    (BOMB, ALIASES),
+    ("groups: &a [*a]", ALIASES),
+    (None, "the file must be a mapping"),
+    ({}, "groups must be a list with at least one group, or emitters"),
+    (emitter_with(velocity=[0, 0, 0]), EMITTER + r"\.velocity must be other than zero"),
+    (emitter_with(stop=0), EMITTER + r"\.stop must be later than start \(0\), got 0"),
+    (emitter_with(start=-1), EMITTER + r"\.start must be a finite number >= 0"),
+    (emitter_with(shape="cube"), EMITTER + r"\.shape must be one of disc, rectangle, got 'cube'"),
+    (emitter_with(shape="rectangle"), EMITTER + r"\.size must be a list of two edges for a rectangle"),
+    (emitter_with(size=-1), EMITTER + r"\.size must be finite and > 0, got -1"),
+    (emitter_with(material="lava"), EMITTER + r"\.material must be one of water, .*, got 'lava'"),
+    (emitter_with(water_tension=2.0), EMITTER + ".*water_tension must be at most 1, got 2"),
+    (emitter_with(position=[0.5, 0.99, 0.5]), EMITTER + BETWEEN_WALLS),
+    (
+        emitter_with(position=[0.5, 0.22, 0.5]) | {"obstacles": [CONE]},
+        EMITTER + r" \(disc of water\) must be clear of closed obstacles, got it inside obstacle_0_cone",
+    ),
+    (scene_with(gruops=1), "gruops is not a known key; did you mean groups"),
+    (scene_with(cell_size=0), "cell_size must be a finite number > 0"),
+    (scene_with(cell_size=float("nan")), "cell_size must be a finite number > 0, got nan"),
+    (scene_with(particles_per_cell=-1), "particles_per_cell must be a finite number > 0"),
+    (scene_with(particles_per_cell=1e9), "groups must be at most 50000000 particles"),
+    (scene_with(cell_size=1e-200), "groups must be at most 50000000 particles together, .* got inf"),
+    (group_with(size=1e300), "groups must be at most 50000000 particles together, .* got inf"),
+    (obstacle_with(size=1e300), OBSTACLE + r".size must be in the range of float32, got 1e\+300"),
+    (scene_with(domain_size=[1, -1, 1]), r"domain_size\[1\] must be a finite number > 0, got -1"),
+    (scene_with(domain_size=[1, 1]), "domain_size must be a list of 3 values"),
+    (scene_with(domain_size=[0.05, 1, 1]), GROUP + BETWEEN_WALLS),
+    (scene_with(gravity=[0, float("inf"), 0]), r"gravity\[1\] must be finite, got inf"),
+    (scene_with(floor_friction=-0.1), "floor_friction must be a finite number >= 0, got -0.1"),
+    (scene_with(wall_friction=float("nan")), "wall_friction must be a finite number >= 0, got nan"),
+    (obstacle_with(keyframes=[{"time": 1}, {"time": 1}]), OBSTACLE + r"\.keyframes must be in order of time"),
+    (obstacle_with(keyframes=[{"time": -1}]), OBSTACLE + r"\.keyframes\[0\]\.time must be .* >= 0"),
+    (obstacle_with(keyframes=[{"time": 0, "rotation": [0, float("inf"), 0]}]), r"\.rotation\[1\] must be finite"),
+    (obstacle_with(friction=-1), OBSTACLE + r"\.friction must be a finite number >= 0, got -1"),
+    (scene_with(seed=-1), "seed must be a whole number >= 0"),
+    (scene_with(seed=0.5), "seed must be a whole number"),
+    (group_with(material="lava"), GROUP + r"\.material must be one of water, sand, snow, elastic, got 'lava'"),
+    (group_with(shape="torus"), GROUP + r"\.shape must be one of cube, sphere, box"),
+    (group_with(size=0), GROUP + r"\.size must be finite and > 0"),
+    (group_with(size=float("nan")), GROUP + r"\.size must be finite and > 0"),
+    (group_with(size=[0.1, 0.1, 0.1]), GROUP + r"\.size must be one number for a cube"),
+    (group_with(shape="box"), GROUP + r"\.size must be a list of three edges for a box"),
+    (group_with(shape="box", size=[0.1, -0.1, 0.1]), GROUP + r"\.size must be finite and > 0"),
+    (group_with(position=[0.5, float("nan"), 0.5]), GROUP + r"\.position\[1\] must be finite, got nan"),
+    (group_with(velocity=[0, float("inf"), 0]), GROUP + r"\.velocity\[1\] must be finite"),
+    (group_with(position=[5, 0.5, 0.5]), "got 1074 of 1074 particles outside; move or shrink it"),
+    (group_with(position=[WALL + HALF - 1 / 64, 0.5, 0.5]), GROUP + BETWEEN_WALLS),
+    (group_with(density_kg_m3=-1.0), GROUP + ".*density_kg_m3 must be"),
+    (INSIDE, r"groups\[1\] \(cube of water\) must be clear of closed .* of 1074 particles inside obstacle_0_cone"),
+    (obstacle_with(shape="sphere"), OBSTACLE + r"\.shape must be one of half_box"),
+    (obstacle_with(shape=None), OBSTACLE + r"\.mesh or shape must be given, .* got neither"),
+    (obstacle_with(mesh="a.obj"), OBSTACLE + r"\.mesh or shape must be given, .* got both"),
+    (obstacle_with(size=None), OBSTACLE + r"\.size must be given beside shape"),
+    (obstacle_with(size=-1), OBSTACLE + r"\.size must be a finite number > 0"),
+    (obstacle_with(position=None), OBSTACLE + r"\.position must be given beside shape"),
+    (obstacle_with(position=[0, 0, float("nan")]), OBSTACLE + r"\.position\[2\] must be finite"),
+    (obstacle_with(rotation=[0, 0, float("nan")]), OBSTACLE + r"\.rotation\[2\] must be finite"),
+    (obstacle_with(scale=2), OBSTACLE + r"\.scale must be left out beside shape"),
+    (obstacle_with(shape=None, mesh="a.obj"), OBSTACLE + r"\.size must be left out beside mesh"),
+    (obstacle_with(scale=0, **MESH), OBSTACLE + r"\.scale must be a finite"),
+    (obstacle_with(**MESH), OBSTACLE + r"\.mesh must be an existing file"),
+]
+
+
+@pytest.mark.parametrize(("content", "message"), MISTAKES, ids=range(len(MISTAKES)))
+def test_every_mistake_is_named(tmp_path, content, message):
+    """Each mistake in a scene file ends in one short error: the file, the field, the rule and the value. So do aliases
+    that stand for billions of values, deep nesting and endless numbers."""
+    with pytest.raises(ConfigError, match=rf"scene\.yaml:? .*{message}") as caught:
+        load_scene(write(tmp_path, content))
+    assert len(str(caught.value)) < 1000 and "1074 of 1074 particles inside" not in str(caught.value)
+    with pytest.raises(ConfigError, match=r"scene must be an existing YAML file, got .*nothing\.yaml"):
+        load_scene(tmp_path / "nothing.yaml")
 
 
 def test_emitters(tmp_path):
@@ -243,38 +260,22 @@ def test_emitters(tmp_path):
     assert (tension[water] == 0.5).all() and np.isnan(tension[~water]).all()
 
 
-def test_missing_and_broken_files(tmp_path):
-    """A missing file and broken YAML are named."""
-    with pytest.raises(ConfigError, match=r"scene must be an existing YAML file, got .*nothing\.yaml"):
-        load_scene(tmp_path / "nothing.yaml")
-    path = tmp_path / "scene.yaml"
-    path.write_text("groups: [", encoding="utf-8")
-    with pytest.raises(ConfigError, match=r"scene\.yaml must be a YAML file"):
-        load_scene(path)
-    path.write_bytes(b"\xff\xfe\xfa")
-    with pytest.raises(ConfigError, match=r"scene\.yaml must be a YAML file"):
-        load_scene(path)
-
-
 def test_material_parameters_of_groups(tmp_path):
     """A group may differ in its material's constants; particles of other groups hold NaN, the solver's own setting."""
     stiff = CUBE | {"material": "sand", "position": [0.3, 0.5, 0.5], "youngs_modulus_pa": 5e6, "density_kg_m3": 1600.0}
-    scene = load_scene(write(tmp_path, {"groups": [CUBE, stiff]}))
+    scene = load(tmp_path, groups=[CUBE, stiff])
     assert sorted(scene.material_parameters) == ["density_kg_m3", "youngs_modulus_pa"]
     modulus = scene.material_parameters["youngs_modulus_pa"]
     assert np.isnan(modulus[scene.material_N == WATER]).all()
     assert (modulus[scene.material_N == SAND] == 5e6).all()
-    assert load_scene(write(tmp_path, {"groups": [CUBE]})).material_parameters == {}
-    with pytest.raises(ConfigError, match=r"groups\[0\].*density_kg_m3 must be"):
-        load_scene(write(tmp_path, {"groups": [CUBE | {"density_kg_m3": -1.0}]}))
+    assert load(tmp_path).material_parameters == {}
 
 
 @pytest.mark.parametrize(("text", "value"), [("1e5", 1e5), ("1.0e5", 1e5), ("+2E-1", 0.2), (".5e1", 5.0), ("3", 3.0)])
 def test_numbers_as_people_write_them(tmp_path, text, value):
     """A power of ten needs neither a point nor a sign."""
     group = f"{{shape: cube, size: 0.08, position: [0.5, 0.5, 0.5], material: water, density_kg_m3: {text}}}"
-    (tmp_path / "scene.yaml").write_text(f"groups: [{group}]\n")
-    scene = load_scene(tmp_path / "scene.yaml")
+    scene = load_scene(write(tmp_path, f"groups: [{group}]"))
     np.testing.assert_array_equal(np.unique(scene.material_parameters["density_kg_m3"]), np.float32(value))
 
 
@@ -283,13 +284,8 @@ def test_particles_of_a_file(tmp_path):
     position_N3 = np.random.default_rng(0).random((9, 3)).astype(np.float32)
     np.savez(tmp_path / "own.npz", position=position_N3, velocity=2 * position_N3)
     np.savez(tmp_path / "still.npz", position=position_N3[:4])
-    (tmp_path / "scene.yaml").write_text("""
-groups:
-  - {particles: own.npz, material: sand, velocity: [0, 1, 0]}
-  - {shape: cube, size: 0.1, position: [0.5, 0.5, 0.5], material: water}
-  - {particles: still.npz, material: snow}
-""")
-    scene = load_scene(tmp_path / "scene.yaml")
+    moving = {"particles": "own.npz", "material": "sand", "velocity": [0, 1, 0]}
+    scene = load(tmp_path, groups=[moving, CUBE, {"particles": "still.npz", "material": "snow"}])
     cube = scene.particle_count - 13
     np.testing.assert_array_equal(scene.position_N3[:9], position_N3)
     np.testing.assert_array_equal(scene.position_N3[-4:], position_N3[:4])
@@ -319,6 +315,5 @@ def test_particles_that_cannot_be_taken(tmp_path, arrays, message):
         np.savez(path, **arrays)
     elif arrays is not None:
         path.write_bytes(arrays)
-    (tmp_path / "scene.yaml").write_text("groups: [{particles: own.npz, material: sand}]")
     with pytest.raises(ConfigError, match=rf"groups\[0\].particles.*{message}"):
-        load_scene(tmp_path / "scene.yaml")
+        load(tmp_path, groups=[{"particles": "own.npz", "material": "sand"}])

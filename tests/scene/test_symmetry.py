@@ -57,13 +57,6 @@ def test_any_gravity():
         assert products == matrices(group)
 
 
-def test_mirrors_keep_the_solvers_walls():
-    """Nodes go to nodes: of 64, the three at the lower wall to the three at the upper one, and the other way round."""
-    nodes = np.arange(64) * CELL_SIZE
-    for symmetry in scene_symmetries(DOWN, CUBE, CELL_SIZE):
-        np.testing.assert_array_equal(symmetry.mirror_sum[0] - nodes, nodes[::-1])
-
-
 def test_draws_are_uniform_and_belong_to_the_seed():
     """Over 16,000 seeds of an order, or in a row, each of the eight is drawn within five standard deviations as often
     as the others; the same seed draws the same."""
@@ -80,8 +73,11 @@ def test_draws_are_uniform_and_belong_to_the_seed():
 
 
 def test_codes_tell_all():
-    """A code holds source, mirror and cells of each axis, in 20 bits each."""
+    """A code holds source, mirror and cells of each axis, in 20 bits each; mirrors take nodes to nodes: of 64, the
+    three at the lower wall to the three at the upper one, and the other way round."""
+    nodes = np.arange(64) * CELL_SIZE
     for symmetry in scene_symmetries((0.0, 0.0, 0.0), CUBE, CELL_SIZE):
+        np.testing.assert_array_equal(symmetry.mirror_sum[0] - nodes, nodes[::-1])
         assert symmetry.code < 2**60
         parts = [symmetry.code >> 20 * i for i in range(3)]
         assert tuple(part & 3 for part in parts) == symmetry.source
