@@ -5,13 +5,12 @@ import os
 import nbclient
 import nbformat
 import pytest
-from docs.pages import ROOT
+from docs.pages import FEWER, ROOT
 from processes import PATIENCE_S
 
 from tools.notebooks import DOCS, NOTEBOOKS, notebook
 
-SMALLER = {"frames=300": "frames=2", "frame == 300": "frame == 1", "!pip install PATH_OF_THE_CHECKOUT": ""}
-SMALLER |= {"range(120)": "range(2)", "frame == 60": "frame == 0"}
+SMALLER = FEWER | {"!pip install PATH_OF_THE_CHECKOUT": ""}
 
 
 @pytest.mark.parametrize("name", list(NOTEBOOKS))

@@ -1,6 +1,7 @@
 """What holds of every Markdown page: width, links, paths; and of README and CHANGELOG, whose form is fixed."""
 
 import dataclasses
+import functools
 import importlib.util
 import re
 import shlex
@@ -29,6 +30,7 @@ TESTS_IN = re.compile(r"`(tests/[\w/]+\.py)`\s+\(((?:`\w+`(?:,\s+)?)+)\)")
 PATH = re.compile(r"`((?:hgn|datagen|tools|tests|conf|jobs|docs|results)/[\w./-]*\w/?)`")
 
 
+@functools.cache
 def anchors(page):
     """The anchors of a page's headings, as GitHub and MyST make them."""
     found: set[str] = set()
@@ -46,33 +48,24 @@ def counted(line):
     return ADDRESS.sub("", re.sub(r"\]\([^)]*\)", "]", line))
 
 
-@pytest.mark.parametrize("page", PAGES)
-def test_no_line_is_wide(page):
-    """No line of prose is wider than 100 columns; tables, addresses and blocks of code are left out."""
-    wide = [number for number, line in prose_lines(page) if not line.startswith("|") and len(counted(line)) > COLUMNS]
-    assert not wide, f"{page.relative_to(ROOT)}: lines {wide}"
+def leads_somewhere(page, target):
+    """Whether a link's file and anchor are there; addresses of other hosts are."""
+    name, _, anchor = target.partition("#")
+    file = (page.parent / name).resolve() if name else page
+    return re.match(r"[a-z0-9+]+:", target) or (file.exists() and (not anchor or anchor in anchors(file)))
 
 
-@pytest.mark.parametrize("page", PAGES)
-def test_links_lead_somewhere(page):
-    """Each link to a file of the project, and each anchor in it, is there."""
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_prose(page):
+    """No line is wider than 100 columns (tables, addresses and blocks of code are left out), each link to a file of the
+    project and to an anchor in it leads there, and each path of the checkout that README and docs/ name exists."""
+    faults = []
     for number, line in prose_lines(page):
-        for target in LINK.findall(CODE.sub("", line)):
-            if re.match(r"[a-z0-9+]+:", target):
-                continue
-            name, _, anchor = target.partition("#")
-            file = page if not name else (page.parent / name).resolve()
-            assert file.exists(), f"{page.relative_to(ROOT)}:{number}: {target}"
-            if anchor:
-                assert anchor in anchors(file), f"{page.relative_to(ROOT)}:{number}: {target}, of {anchors(file)}"
-
-
-@pytest.mark.parametrize("page", OWN_PAGES)
-def test_paths_exist(page):
-    """Each path of the checkout that a page names in code is there."""
-    for number, line in prose_lines(page):
-        for path in PATH.findall(line):
-            assert (ROOT / path).exists(), f"{page.relative_to(ROOT)}:{number}: {path}"
+        wide = not line.startswith("|") and len(counted(line)) > COLUMNS
+        links = [link for link in LINK.findall(CODE.sub("", line)) if not leads_somewhere(page, link)]
+        paths = [path for path in PATH.findall(line) if page in OWN_PAGES and not (ROOT / path).exists()]
+        faults += [f"line {number}: {fault}" for fault in ("wide",) * wide + (*links, *paths)]
+    assert not faults
 
 
 def test_figures_are_drawn():
@@ -115,15 +108,8 @@ def test_names_exist():
 
 def test_settings_exist():
     """Each setting that README and docs/ name by its group is a field of it."""
-    groups = {
-        "scene": config.SceneConfig,
-        "mpm": config.MpmConfig,
-        "dataset": config.DatasetConfig,
-        "network": config.NetworkConfig,
-        "step": config.StepConfig,
-        "training": config.TrainingConfig,
-    }
-    checked = 0
+    names = ("scene", "mpm", "dataset", "network", "step", "training")
+    groups, checked = {name: getattr(config, f"{name.title()}Config") for name in names}, 0
     for page in OWN_PAGES:
         for code in CODE.findall("\n".join(line for _, line in prose_lines(page))):
             for group, name in re.findall(r"(?<![\w./])(scene|mpm|dataset|network|step|training)\.([a-z]\w*)", code):
@@ -135,25 +121,21 @@ def test_settings_exist():
 
 
 def commands():
-    """Each `python -m` line of README and docs/, in blocks and in code within lines, with its place."""
-    found = []
+    """Each `python -m` line of README and docs/, in blocks and in code within lines, with the last place of it."""
+    found = {}
     for page in OWN_PAGES:
         for block in blocks_of(page):
-            found += [(str(block), line) for line in _commands_of(block)]
+            lines = shell_lines(block) if block.language == "bash" else ()
+            found |= {line: str(block) for line in lines if line.startswith("python -m ")}
         for number, line in prose_lines(page):
-            place = f"{page.relative_to(ROOT)}:{number}"
-            found += [(place, text) for text in re.findall(r"`(python -m [^`]+)`", line)]
+            found |= {text: f"{page.relative_to(ROOT)}:{number}" for text in re.findall(r"`(python -m [^`]+)`", line)}
     return found
-
-
-def _commands_of(block):
-    return [line for line in shell_lines(block) if line.startswith("python -m ")] if block.language == "bash" else []
 
 
 def test_commands_compose():
     """Each command that a page shows is there, and each setting that it is given exists."""
     assert len(commands()) > 20
-    for place, line in commands():
+    for line, place in commands().items():
         _, _, module, *arguments = shlex.split(line.removesuffix("&").replace("…", "a"))
         assert importlib.util.find_spec(module) is not None, f"{place}: {line}"
         if module.split(".")[0] not in ("hgn", "datagen", "tools"):

@@ -6,40 +6,21 @@ import signal
 from pathlib import Path
 
 import pytest
-from docs.pages import ROOT, Runner, blocks_of, run_module, shell_lines
+from docs.pages import FEWER, ROOT, Runner, blocks_of, run_module, shell_lines
 from processes import PATIENCE_S, free_port
 
 from hgn.scene.scene_file import load_scene
 
 TUTORIALS = ROOT / "docs" / "tutorials"
 # a data set, made by the solver once for all pages, of which every training here is told
-SCENES = [
-    "scene.obstacle_count=1",
-    "scene.obstacle_shapes=[rock.obj]",
-    "scene.obstacle_size=[0.2,0.2]",
-    "scene.group_count=1",
-    "scene.group_size=0.04",
-    "scene.materials=[water]",
-    "scene.lone_particles=0",
-    "dataset.training_scenes=2",
-    "dataset.validation_scenes=1",
-    "dataset.test_scenes=0",
-    "dataset.frames=6",
-    "dataset.folder=data/mine",
-]
-TRAINING = [
-    "network.width=8",
-    "network.levels=2",
-    "network.message_passing_steps=1",
-    "training.maximum_updates=4",
-    "training.batch_scenes=1",
-    "training.precision=tf32",
-    "training.log_every=1",
-    "training.checkpoint_every=2",
-    "training.monitor_every=2",
-    "training.monitor_rollout_frames=0",
-    "training.device=cpu",
-]
+SCENE = ("obstacle_count=1", "obstacle_shapes=[rock.obj]", "obstacle_size=[0.2,0.2]", "group_count=1")
+SCENE += ("group_size=0.04", "materials=[water]", "lone_particles=0")
+DATASET = ("training_scenes=2", "validation_scenes=1", "test_scenes=0", "frames=6", "folder=data/mine")
+SCENES = [*(f"scene.{value}" for value in SCENE), *(f"dataset.{value}" for value in DATASET)]
+TRAINING = ["network.width=8", "network.levels=2", "network.message_passing_steps=1"]
+UPDATES = ("maximum_updates=4", "batch_scenes=1", "precision=tf32", "log_every=1", "checkpoint_every=2")
+UPDATES += ("monitor_every=2", "monitor_rollout_frames=0", "device=cpu")
+TRAINING += [f"training.{value}" for value in UPDATES]
 SETTINGS = {
     "datagen.solve": ["frames=2"],
     "hgn.rollout": ["frames=2", "device=cpu", "render=false"],
@@ -47,11 +28,11 @@ SETTINGS = {
     "hgn.train": [*SCENES, *TRAINING],
     "tools.render": ["size=64"],
 }
-INSTALLS = {
-    ". .venv/bin/activate": "tests/end_to_end/test_wheel.py",
-    "pip install PATH_OF_THE_CHECKOUT": "tests/end_to_end/test_wheel.py",
-    "pip install PATH_OF_THIS_FOLDER": "tests/end_to_end/test_wheel.py",
-}
+ONE_UPDATE = ["training.maximum_updates=1", "training.monitor_every=2"]
+INSTALLS = dict.fromkeys(
+    (". .venv/bin/activate", "pip install PATH_OF_THE_CHECKOUT", "pip install PATH_OF_THIS_FOLDER"),
+    "tests/end_to_end/test_wheel.py",
+)
 
 
 def lines_of(page):
@@ -114,29 +95,27 @@ def test_train(here):
 
 def test_program(here):
     """Weights in a program: a scene file as a whole, frame by frame from particles and a mesh, one that changes."""
-    fewer = {"frames=300": "frames=2", "frame == 300": "frame == 1"}
-    fewer |= {"range(120)": "range(2)", "frame == 60": "frame == 0"}
-    runner = Runner(SETTINGS, fewer, INSTALLS)
+    runner = Runner(SETTINGS, FEWER, INSTALLS)
     runner.run(TUTORIALS / "program.md")
     assert runner.names["frame"] == 1 and (here / "my_scene.vtkhdf").is_file()
     assert len(runner.names["position_N3"]) == 2 * len(runner.names["block"])
 
 
-@pytest.fixture
-def port(monkeypatch):
-    """A free one, at which the tutorial's program looks too."""
-    number = free_port()
-    monkeypatch.setenv("DATASET", f"http://127.0.0.1:{number}")
-    monkeypatch.setenv("HGN_DATASET_TOKEN", "")
-    return number
-
-
-def test_serve(here, port, monkeypatch):
+def test_serve(here, monkeypatch):
     """A data set served over HTTP with a token, and two trainings that read it."""
-    monkeypatch.setenv("HGN_CACHE", str(here / "cache"))
+    port = free_port()
+    address = f"http://127.0.0.1:{port}"
+    variables = {"DATASET": address, "HGN_DATASET_TOKEN": "", "HGN_CACHE": str(here / "cache")}
+    for name, value in variables.items():
+        monkeypatch.setenv(name, value)
     settings = SETTINGS | {
         "datagen.service": [*SCENES[:-1], "out=data/mine", "host=127.0.0.1", f"port={port}", "progress=json"],
-        "hgn.train": [*SETTINGS["hgn.train"], f"dataset.folder=http://127.0.0.1:{port}", "run=runs/served"],
+        "hgn.train": [
+            *SETTINGS["hgn.train"],
+            *ONE_UPDATE,
+            f"dataset.folder=http://127.0.0.1:{port}",
+            "run=runs/served",
+        ],
     }
     proxy = "tests/jobs/test_nginx.py runs nginx with jobs/nginx.conf"
     lines = (TUTORIALS / "serve.md").read_text().splitlines()
@@ -181,9 +160,9 @@ def test_gradients():
     """Gradients: of velocities and of a turned obstacle; the launch that hits a target is the closed form's; the
     bucket is filled to 90 % of what a tilt by 16 degrees reaches, near the best of the search."""
     shorter = {
-        "(scene, 21, velocity": "(scene, 7, velocity",
-        "20 / 60": "6 / 60",
-        "1.5e-4": "5e-6",
+        "(scene, 21, velocity": "(scene, 4, velocity",
+        "20 / 60": "3 / 60",
+        "1.5e-4": "2e-6",
     }  # a flight, minutes
     runner = Runner(SETTINGS, shorter | {"range(-60, 61, 4)": "(-16,)", "(100, 101, 102)": "(100,)"})
     runner.run(ROOT / "docs/how_to/gradients.md")

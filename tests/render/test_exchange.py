@@ -42,6 +42,10 @@ def rollout():
     return Rollout(start_N3 + motion_T13, material_N, obstacles, (1.0, 1.0, 1.0), 60.0)
 
 
+def meshes_of(stage):
+    return [UsdGeom.Mesh(prim) for prim in stage.GetPrimAtPath("/World/obstacles").GetChildren()]
+
+
 def test_usd_is_read_back(tmp_path, rollout):
     """Every position, velocity, index and triangle; seconds by the frame rate; nothing else is left in the folder."""
     path = save_rollout(tmp_path / "a" / "scene.usdc", rollout, surface=True)
@@ -60,9 +64,7 @@ def test_usd_is_read_back(tmp_path, rollout):
             np.testing.assert_array_equal(points.GetPointsAttr().Get(frame), rollout.position_TN3[frame, mine_N])
             np.testing.assert_array_equal(points.GetVelocitiesAttr().Get(frame), velocity_TN3[frame, mine_N])
     assert not stage.GetPrimAtPath("/World/particles/snow")
-    obstacles = stage.GetPrimAtPath("/World/obstacles").GetChildren()
-    for prim, obstacle in zip(obstacles, rollout.obstacles, strict=True):
-        mesh = UsdGeom.Mesh(prim)
+    for mesh, obstacle in zip(meshes_of(stage), rollout.obstacles, strict=True):
         np.testing.assert_allclose(mesh.GetPointsAttr().Get(), obstacle.vertex_V3, rtol=1e-6)
         indices = np.array(mesh.GetFaceVertexIndicesAttr().Get()).reshape(-1, 3)
         np.testing.assert_array_equal(indices, obstacle.triangle_F3)
@@ -72,16 +74,13 @@ def test_usd_is_read_back(tmp_path, rollout):
 
 
 def test_obstacles_of_one_name_stay_apart(tmp_path, rollout):
-    """A mesh placed twice, and names that USD writes alike, are a prim each."""
-    names = ("ramp", "ramp", "a b", "a-b", "a_b")
-    shapes = [
-        replace(rollout.obstacles[0], name=name, vertex_V3=rollout.obstacles[0].vertex_V3 + i)
-        for i, name in enumerate(names)
-    ]
-    stage = Usd.Stage.Open(str(save_rollout(tmp_path / "a.usda", replace(rollout, obstacles=tuple(shapes)))))
-    prims = stage.GetPrimAtPath("/World/obstacles").GetChildren()
-    for prim, obstacle in zip(prims, shapes, strict=True):
-        np.testing.assert_allclose(UsdGeom.Mesh(prim).GetPointsAttr().Get(), obstacle.vertex_V3, rtol=1e-6)
+    """A mesh placed twice, also at one place, and names that USD writes alike, are a prim each."""
+    names = {"ramp": 0.0, "ramp ": 0.25, "a b": 2, "a-b": 3, "a_b": 4, "a_b ": 0.0}
+    box, _ = rollout.obstacles
+    shapes = tuple(replace(box, name=name.strip(), vertex_V3=box.vertex_V3 + shift) for name, shift in names.items())
+    stage = Usd.Stage.Open(str(save_rollout(tmp_path / "a.usda", replace(rollout, obstacles=shapes))))
+    for mesh, obstacle in zip(meshes_of(stage), shapes, strict=True):
+        np.testing.assert_allclose(mesh.GetPointsAttr().Get(), obstacle.vertex_V3, rtol=1e-6)
 
 
 def test_what_enters_and_what_moves(tmp_path, rollout):
@@ -115,16 +114,6 @@ def test_what_enters_and_what_moves(tmp_path, rollout):
         np.testing.assert_allclose(ply.vertices, expected_V3, atol=1e-6)
 
 
-def test_one_mesh_twice(tmp_path, rollout):
-    """Obstacles of one mesh file have one name: each is there, at its place."""
-    box, _ = rollout.obstacles
-    twin = replace(box, vertex_V3=box.vertex_V3 + 0.25)
-    stage = Usd.Stage.Open(str(save_rollout(tmp_path / "a.usdc", replace(rollout, obstacles=(box, twin, box)))))
-    meshes = [UsdGeom.Mesh(prim) for prim in stage.GetPrimAtPath("/World/obstacles").GetChildren()]
-    for mesh, obstacle in zip(meshes, (box, twin, box), strict=True):
-        np.testing.assert_allclose(mesh.GetPointsAttr().Get(), obstacle.vertex_V3, rtol=1e-6)
-
-
 def test_ply_is_read_back(tmp_path, rollout):
     """A file a frame with places, velocities and materials; the obstacles once; the water's surface a frame."""
     first = save_rollout(tmp_path / "scene.ply", rollout, surface=True)
@@ -144,17 +133,12 @@ def test_ply_is_read_back(tmp_path, rollout):
 
 @pytest.mark.parametrize("random", [False, True])
 def test_the_surface_encloses_the_water(random):
-    """Closed, and of the particles' volume within 5 %, for a lattice and a random filling."""
+    """Closed, and of the particles' volume within 5 %, for a lattice and a random filling; empty without any."""
     position_N3 = block(random)
     mesh = trimesh.Trimesh(*fluid_surface(position_N3, particle_spacing(position_N3)), process=False)
     assert mesh.is_watertight
     assert mesh.volume == pytest.approx(len(position_N3) * SPACING**3, rel=0.05)
-
-
-def test_no_fluid_no_surface():
-    """Sand alone has an empty surface."""
-    vertex_V3, triangle_F3 = fluid_surface(np.zeros((0, 3)), SPACING)
-    assert vertex_V3.shape == triangle_F3.shape == (0, 3)
+    assert [array.shape for array in fluid_surface(np.zeros((0, 3)), SPACING)] == [(0, 3), (0, 3)]
 
 
 def test_what_cannot_be_written_is_said_before_the_simulation(monkeypatch):

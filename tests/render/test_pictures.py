@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 import trimesh
 from PIL import Image, ImageSequence
+from scene.test_episode import make_episode
 from scipy.ndimage import center_of_mass, label
 
 from hgn.render.error_curve import error_curve, position_error
 from hgn.render.pictures import animate, compare_picture, particle_spacing, rollout_of_episode, write_picture
 from hgn.render.renderer import OBSTACLE_COLOR, Stage, to_bytes
-from hgn.scene.episode import Episode
 from hgn.scene.motion import Motion
 from hgn.scene.obstacle_grid import ObstacleGrid
 from hgn.scene.rollout_file import Rollout, read_rollout, write_rollout
@@ -61,18 +61,14 @@ def has_hue(picture, material):
     return int(found.sum()) >= 20
 
 
-@pytest.mark.parametrize("material", [0, 1, 2])
-def test_each_material_is_seen_in_its_colour(material):
+def test_each_material_is_seen_in_its_colour():
     """A frame shows a material's hue when that material is there, and not when it is not."""
     rollout = falling_blobs()
-
     stage = Stage(rollout.domain_size, (), 0.01, 300)
-
-    def frame(kept):
-        return stage.draw(rollout.position_TN3[0, kept], rollout.material_N[kept])
-
-    assert has_hue(frame(rollout.material_N == material), material)
-    assert not has_hue(frame(np.zeros(len(rollout.material_N), bool)), material)
+    for kept in range(-1, 3):
+        chosen_N = rollout.material_N == kept
+        picture = stage.draw(rollout.position_TN3[0, chosen_N], rollout.material_N[chosen_N])
+        assert has_hue(picture, kept) if kept >= 0 else not any(has_hue(picture, material) for material in range(3))
 
 
 def test_grid_of_frames():
@@ -111,20 +107,9 @@ def flat_rollout():
     """Three particles of water in the plane of a box twice as wide as high, and two obstacle cells on its floor."""
     position_N3 = np.array([[0.1, 0.1, 0.25], [0.7, 0.1, 0.25], [0.1, 0.3, 0.25]], np.float32)
     grid = ObstacleGrid(0.05, np.array([[8, 0, 3], [9, 0, 3]], np.int32), np.array([[0, 1, 0]] * 2, np.float32))
-    episode = Episode(
-        key="train-000000",
-        position_TN3=np.stack([position_N3, position_N3]),
-        initial_velocity_N3=np.zeros((3, 3), np.float32),
-        material_N=np.zeros(3, np.uint8),
-        obstacle_grid=grid,
-        domain_size=(0.8, 0.4, 0.5),
-        gravity=(0.0, -9.8, 0.0),
-        frame_rate_hz=60.0,
-        seed=0,
-        specification={"kind": "imported", "dimensions": 2},
-        solver={},
-    )
-    return rollout_of_episode(episode)
+    values = {"position_TN3": np.stack([position_N3] * 2), "material_N": np.zeros(3, np.uint8), "obstacle_grid": grid}
+    kind = {"kind": "imported", "dimensions": 2}
+    return rollout_of_episode(make_episode(2, 3, domain_size=(0.8, 0.4, 0.5), specification=kind, **values))
 
 
 def test_flat_rollouts_are_drawn_in_their_plane(tmp_path):
@@ -154,29 +139,36 @@ def test_flat_rollouts_are_drawn_in_their_plane(tmp_path):
         assert film.size == (200, 104 + 2 * 18)
 
 
-def test_pictures_are_reproducible():
-    """The same rollout gives the same pixels."""
-    rollout = falling_blobs(12, 12)
-    first, second = (np.asarray(compare_picture(rollout, [5, 11], size=100)) for _ in range(2))
-    np.testing.assert_array_equal(first, second)
-
-
 def test_ended_ground_truth_and_lost_particles_are_said():
-    """A panel past the end of the ground truth says so, as does one with particles that are not finite."""
-    rollout = falling_blobs(20, 10)
-    whole = np.asarray(compare_picture(falling_blobs(20, 20), [15], size=150))
-    assert (np.asarray(compare_picture(rollout, [15], size=150)) != whole).any()
+    """A panel past the end of the ground truth says so, as does one with particles that are not finite; else the same
+    rollout gives the same pixels."""
+
+    def picture(rollout, frame=15):
+        return np.asarray(compare_picture(rollout, [frame], size=150))
+
+    rollout, whole = falling_blobs(20, 10), falling_blobs(20, 20)
+    assert (picture(rollout) != picture(whole)).any()
+    np.testing.assert_array_equal(picture(whole), picture(whole))
     rollout.position_TN3[15, :5] = np.nan
-    compare_picture(rollout, [15], size=150)
     rollout.position_TN3[0] = np.nan
-    compare_picture(rollout, [0], size=150)
+    picture(rollout)
+    picture(rollout, 0)
 
 
-@pytest.mark.parametrize("frames", [[], [0, 30], [-1]])
-def test_frames_outside_the_rollout(frames):
-    """Frames that are not there are refused by name and number."""
-    with pytest.raises(ConfigError, match="frames"):
-        compare_picture(falling_blobs(), frames)
+def test_frames_and_rates_that_are_refused(tmp_path):
+    """Frames that are not there, every=0, and rates above 50 per second (WebP 60), which viewers slow down."""
+    for frames in ([], [0, 30], [-1]):
+        with pytest.raises(ConfigError, match="frames"):
+            compare_picture(falling_blobs(), frames)
+    for ending, options, message in (
+        ("gif", {"every": 1}, "every >= 2"),
+        ("gif", {"fps": 100}, "another fps"),
+        ("webp", {"fps": 61}, r"fps must be in \(0, 60\], which WebP viewers keep, got 61"),
+        ("gif", {"every": 0}, "every must be"),
+    ):
+        with pytest.raises(ConfigError, match=message):
+            animate(falling_blobs(), tmp_path / f"a.{ending}", **options)
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize(("every", "fps", "pictures", "milliseconds"), [(3, None, 10, 50), (7, 12.5, 5, 80)])
@@ -194,8 +186,7 @@ def test_animation(tmp_path, every, fps, pictures, milliseconds):
     assert tuple(shown[-1][1][1, 1]) == (255, 255, 255)
     assert seen == [(i + 1, pictures) for i in range(pictures)]
     assert [entry.name for entry in path.parent.iterdir()] == ["rollout.gif"]
-    for material in range(3):
-        assert has_hue(Image.fromarray(shown[0][1]), material)
+    assert all(has_hue(Image.fromarray(shown[0][1]), material) for material in range(3))
 
 
 def test_webp_animation(tmp_path):
@@ -214,25 +205,12 @@ def test_webp_animation(tmp_path):
     assert (tmp_path / "a.webp").stat().st_size < 0.8 * (tmp_path / "a.gif").stat().st_size
 
 
-@pytest.mark.parametrize("ending", ["gif", "webp"])
-def test_single_frame_animation(tmp_path, ending):
+def test_single_frame_animation(tmp_path):
     """A rollout of one frame gives a still picture."""
-    animate(falling_blobs(1), tmp_path / f"still.{ending}", size=80)
-    with Image.open(tmp_path / f"still.{ending}") as picture:
-        assert picture.n_frames == 1
-
-
-def test_animation_rates_that_viewers_change(tmp_path):
-    """Rates above 50 per second (WebP 60), which viewers slow down, are refused with the remedy; so is every=0."""
-    with pytest.raises(ConfigError, match="every >= 2"):
-        animate(falling_blobs(), tmp_path / "a.gif", every=1)
-    with pytest.raises(ConfigError, match="another fps"):
-        animate(falling_blobs(), tmp_path / "a.gif", fps=100)
-    with pytest.raises(ConfigError, match=r"fps must be in \(0, 60\], which WebP viewers keep, got 61"):
-        animate(falling_blobs(), tmp_path / "a.webp", fps=61)
-    with pytest.raises(ConfigError, match="every must be"):
-        animate(falling_blobs(), tmp_path / "a.gif", every=0)
-    assert not list(tmp_path.iterdir())
+    for ending in ("gif", "webp"):
+        animate(falling_blobs(1), tmp_path / f"still.{ending}", size=80)
+        with Image.open(tmp_path / f"still.{ending}") as picture:
+            assert picture.n_frames == 1
 
 
 def test_position_error():
@@ -269,19 +247,10 @@ def test_episode_as_rollout(tmp_path):
     """An episode alone is no prediction and is not labelled as one; beside a prediction it is the ground truth."""
     blobs = falling_blobs(4, 6)
     assert blobs.reference_TN3 is not None
-    episode = Episode(
-        key="validation-000000",
-        position_TN3=blobs.reference_TN3,
-        initial_velocity_N3=np.zeros((blobs.particle_count, 3), np.float32),
-        material_N=blobs.material_N,
-        obstacle_grid=ObstacleGrid(1 / 64, np.full((1, 3), 30, np.int32), np.array([[0, 1, 0]], np.float32)),
-        domain_size=(1.0, 1.0, 1.0),
-        gravity=(0.0, -9.8, 0.0),
-        frame_rate_hz=60.0,
-        seed=5,
-        specification={"kind": "user"},
-        solver={},
-    )
+    episode = make_episode(
+        particles=blobs.particle_count, key="validation-000000", position_TN3=blobs.reference_TN3,
+        material_N=blobs.material_N, domain_size=(1.0, 1.0, 1.0), specification={"kind": "user"},
+    )  # fmt: skip
     alone = rollout_of_episode(episode)
     assert alone.reference_TN3 is None and alone.source["episode"] == "validation-000000"
     np.testing.assert_array_equal(alone.position_TN3, episode.position_TN3)

@@ -26,39 +26,32 @@ def middle_color(stage, position_N3, material_N):
     return picture[int(y), int(x)]
 
 
-def test_fragments_of_a_right_triangle():
-    """The pixels under a right triangle are those whose centres it contains, and its weights give them back."""
+def test_fragments():
+    """The pixels under a right triangle are those whose centres it contains, and its weights give them back. A triangle
+    beyond the picture fills it whole, with either winding; a degenerate one gives nothing."""
     corner = np.array([[[0.0, 0.0], [4.0, 0.0], [0.0, 4.0]]])
     triangle, pixel, weight = fragments(corner, 5, 6)
+    place = np.stack((pixel % 5, pixel // 5), axis=1)
     assert set(triangle) == {0}
-    assert sorted(zip(pixel % 5, pixel // 5, strict=True)) == [
-        (x, y) for x in range(4) for y in range(4) if x + y + 1 <= 4
-    ]
+    assert sorted(map(tuple, place.tolist())) == [(x, y) for x in range(4) for y in range(4) if x + y + 1 <= 4]
     np.testing.assert_allclose(weight.sum(axis=1), 1)
-    np.testing.assert_allclose(weight @ corner[0], np.stack((pixel % 5, pixel // 5), axis=1) + 0.5)
-
-
-def test_fragments_are_clipped_and_either_winding_counts():
-    """A triangle beyond the picture fills it whole; a degenerate one gives nothing."""
+    np.testing.assert_allclose(weight @ corner[0], place + 0.5)
     large = np.array([[-50.0, -50.0], [200.0, -50.0], [-50.0, 200.0]])
     flat = np.array([[0.0, 0.0], [2.0, 2.0], [4.0, 4.0]])
     for corners in (large, large[::-1]):
         triangle, pixel, _ = fragments(np.stack((corners, flat)), 7, 3)
-        assert set(triangle) == {0}
-        assert sorted(pixel) == list(range(21))
+        assert set(triangle) == {0} and sorted(pixel) == list(range(21))
 
 
 def test_smooth_normals():
     """A sphere's normals point outwards from its centre; a cube keeps the normals of its faces."""
-    sphere = trimesh.creation.icosphere(subdivisions=3)
-    corner = sphere.vertices[sphere.faces]
-    _, normal = smooth_normals(corner)
-    normal /= np.linalg.norm(normal, axis=2, keepdims=True)
-    assert (normal * corner).sum(axis=2).min() > 0.999
-    box = trimesh.creation.box()
-    _, normal = smooth_normals(box.vertices[box.faces])
-    normal /= np.linalg.norm(normal, axis=2, keepdims=True)
-    np.testing.assert_allclose(normal, np.repeat(box.face_normals[:, None], 3, axis=1), atol=1e-9)
+    sphere, box = trimesh.creation.icosphere(subdivisions=3), trimesh.creation.box()
+    corners = [mesh.vertices[mesh.faces] for mesh in (sphere, box)]
+    round_F33, flat_F33 = (
+        normal / np.linalg.norm(normal, axis=2, keepdims=True) for _, normal in map(smooth_normals, corners)
+    )
+    assert (round_F33 * corners[0]).sum(axis=2).min() > 0.999
+    np.testing.assert_allclose(flat_F33, np.repeat(box.face_normals[:, None], 3, axis=1), atol=1e-9)
 
 
 @pytest.mark.parametrize("domain_size", [UNIT, (4.0, 1.0, 2.0), (0.1, 0.3, 0.1)])
@@ -105,26 +98,19 @@ def test_particles_cast_a_shadow_along_the_light():
     assert (empty - picture)[int(y), int(x)].min() > 10
 
 
-def test_lost_particles_are_left_out():
-    """NaN, infinite, far and too near particles change nothing, without a warning."""
-    stage = Stage(UNIT, (), 0.01, 80)
-    lost = np.array([[np.nan, 0, 0], [np.inf, 0, 0], [1e30, -1e30, 0.5], stage.camera.eye], np.float32)
-    empty = np.asarray(stage.draw(np.empty((0, 3)), np.empty(0, np.uint8)))
-    np.testing.assert_array_equal(np.asarray(stage.draw(lost, np.zeros(4, np.uint8))), empty)
-
-
-def test_particles_outside_the_domain_are_drawn():
-    """A particle that left the box is seen as long as it is in the picture."""
+def test_particles_outside_the_domain():
+    """Near the box a particle is seen as long as it is in the picture; NaN, infinite, far and too near ones change
+    nothing, without a warning."""
     stage = Stage(UNIT, (), 0.02, 120)
-    outside = np.array([[1.02, 0.5, 0.5], [0.5, -0.02, 0.99]])
     empty = np.asarray(stage.draw(np.empty((0, 3)), np.empty(0, np.uint8)))
-    for position in outside:
-        assert (np.asarray(stage.draw(position[None], WATER)) != empty).any()
+    for outside in ([1.02, 0.5, 0.5], [0.5, -0.02, 0.99]):
+        assert (np.asarray(stage.draw(np.array([outside]), WATER)) != empty).any()
+    lost = np.array([[np.nan, 0, 0], [np.inf, 0, 0], [1e30, -1e30, 0.5], stage.camera.eye], np.float32)
+    np.testing.assert_array_equal(np.asarray(stage.draw(lost, np.zeros(4, np.uint8))), empty)
 
 
 def test_materials_can_be_told_apart():
     """The hues of the materials are far from each other and from the background."""
     colors = np.concatenate((MATERIAL_COLORS, [(1.0, 1.0, 1.0)]))
-    for i in range(len(colors)):
-        for j in range(i):
-            assert np.abs(colors[i] - colors[j]).max() > 0.25
+    difference = np.abs(colors[:, None] - colors[None]).max(axis=-1) + np.eye(len(colors))
+    assert difference.min() > 0.25

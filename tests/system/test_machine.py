@@ -25,61 +25,42 @@ def root(tmp_path, monkeypatch):
     return tmp_path
 
 
-def write(root, files):
+CGROUP, CPU, MEMORY = "proc/self/cgroup", "sys/fs/cgroup/cpu.max", "sys/fs/cgroup/memory.max"
+OLD_CPU, OLD_MEMORY = "sys/fs/cgroup/cpu,cpuacct", "sys/fs/cgroup/memory"
+OLD = {CGROUP: "9:name=systemd:/x\n4:memory:/pod/one\n2:cpu,cpuacct:/pod/one\n1:cpuset:/\n0::/"}
+OLD |= {f"{OLD_CPU}/cpu.cfs_quota_us": "-1", f"{OLD_CPU}/cpu.cfs_period_us": "100000"}
+OLD |= {f"{OLD_MEMORY}/memory.limit_in_bytes": "9223372036854771712"}
+POD = {f"{OLD_CPU}/pod/one/cpu.cfs_quota_us": "250000", f"{OLD_CPU}/pod/one/cpu.cfs_period_us": "50000"}
+POD |= {f"{OLD_MEMORY}/pod/one/memory.limit_in_bytes": str(4 * GIB)}
+A, C, OWN = "sys/fs/cgroup/a", "sys/fs/cgroup/a/b/c", {CGROUP: "0::/"}
+NESTED = {CGROUP: "0::/a/b/c", f"{A}/cpu.max": "400000 100000", f"{A}/memory.max": str(32 * GIB)}
+NESTED |= {f"{A}/b/cpu.max": "300000 100000", f"{A}/b/memory.max": "max"}
+NESTED |= {f"{C}/cpu.max": "max 100000", f"{C}/memory.max": str(48 * GIB)}
+UNSEEN = {CPU: "400000 100000", "sys/machine.slice/cpu.max": "100000 100000"}
+LIMITS = [  # files, cores, GiB
+    ({}, 16, 64),  # another system, a machine without control groups, and groups without limits
+    (OWN | {"sys/fs/cgroup/cgroup.procs": "1"}, 16, 64),
+    (OWN | {CPU: "max 100000", MEMORY: "max"}, 16, 64),
+    (OWN | {CPU: "max 100000", f"{MEMORY}/a": ""}, 16, 64),  # cannot be read
+    # version 2: its own group is the outermost that a container sees; parts of a core count as one
+    *((OWN | {CPU: f"{q} 100000", MEMORY: str(8 * GIB)}, n, 8) for q, n in ((150000, 2), (200000, 2), (10000, 1))),
+    (OWN | {CPU: "9900000 100000"}, 16, 64),
+    (NESTED, 3, 32),  # a limit of any group holds for what is within
+    # version 1: a tree for each controller, or for several; -1 and a number that no memory has are no limits
+    (OLD, 16, 64),
+    (OLD | POD, 5, 4),
+    # a container is told of groups outside of it, and sees its own as the outermost
+    *(({CGROUP: f"0::{own}"} | UNSEEN, 4, 64) for own in ("/docker/0a1b", "/../../machine.slice")),
+]
+
+
+@pytest.mark.parametrize(("files", "cpus", "gib"), LIMITS, ids=range(len(LIMITS)))
+def test_limits(root, files, cpus, gib):
+    """The least of the machine's cores and memory and of the limits of all groups around a process."""
     for name, text in files.items():
         (root / name).parent.mkdir(parents=True, exist_ok=True)
         (root / name).write_text(f"{text}\n")
-
-
-def test_where_nothing_limits(root):
-    """Another system, a machine without control groups, and groups without limits: all cores and all memory."""
-    assert (available_cpus(), available_memory()) == (16, 64 * GIB)
-    write(root, {"proc/self/cgroup": "0::/", "sys/fs/cgroup/cgroup.procs": "1"})
-    assert (available_cpus(), available_memory()) == (16, 64 * GIB)
-    write(root, {"sys/fs/cgroup/cpu.max": "max 100000", "sys/fs/cgroup/memory.max": "max"})
-    assert (available_cpus(), available_memory()) == (16, 64 * GIB)
-    (root / "sys/fs/cgroup/memory.max").unlink()
-    (root / "sys/fs/cgroup/memory.max").mkdir()  # cannot be read
-    assert (available_cpus(), available_memory()) == (16, 64 * GIB)
-
-
-@pytest.mark.parametrize(("quota", "cpus"), [("150000", 2), ("200000", 2), ("10000", 1), ("9900000", 16)])
-def test_a_container(root, quota, cpus):
-    """Version 2: its own group is the outermost that it sees. Parts of a core count as one."""
-    write(root, {"proc/self/cgroup": "0::/", "sys/fs/cgroup/cpu.max": f"{quota} 100000"})
-    write(root, {"sys/fs/cgroup/memory.max": str(8 * GIB)})
-    assert (available_cpus(), available_memory()) == (cpus, 8 * GIB)
-
-
-def test_the_least_of_all_groups_around(root):
-    """A limit of any of them holds for what is within."""
-    write(root, {"proc/self/cgroup": "0::/a/b/c"})
-    folder = "sys/fs/cgroup/a"
-    write(root, {f"{folder}/cpu.max": "400000 100000", f"{folder}/memory.max": str(32 * GIB)})
-    write(root, {f"{folder}/b/cpu.max": "300000 100000", f"{folder}/b/memory.max": "max"})
-    write(root, {f"{folder}/b/c/cpu.max": "max 100000", f"{folder}/b/c/memory.max": str(48 * GIB)})
-    assert (available_cpus(), available_memory()) == (3, 32 * GIB)
-
-
-def test_version_1(root):
-    """A tree for each controller, or for several; -1 and a number that no memory has are no limits."""
-    groups = "9:name=systemd:/x\n4:memory:/pod/one\n2:cpu,cpuacct:/pod/one\n1:cpuset:/\n0::/"
-    write(root, {"proc/self/cgroup": groups})
-    cpu, memory = "sys/fs/cgroup/cpu,cpuacct", "sys/fs/cgroup/memory"
-    write(root, {f"{cpu}/cpu.cfs_quota_us": "-1", f"{cpu}/cpu.cfs_period_us": "100000"})
-    write(root, {f"{memory}/memory.limit_in_bytes": "9223372036854771712"})
-    assert (available_cpus(), available_memory()) == (16, 64 * GIB)
-    write(root, {f"{cpu}/pod/one/cpu.cfs_quota_us": "250000", f"{cpu}/pod/one/cpu.cfs_period_us": "50000"})
-    write(root, {f"{memory}/pod/one/memory.limit_in_bytes": str(4 * GIB)})
-    assert (available_cpus(), available_memory()) == (5, 4 * GIB)
-
-
-@pytest.mark.parametrize("own", ["/docker/0a1b", "/../../machine.slice"])
-def test_groups_that_cannot_be_seen(root, own):
-    """A container is told of groups outside of it, and sees its own as the outermost."""
-    write(root, {"proc/self/cgroup": f"0::{own}", "sys/fs/cgroup/cpu.max": "400000 100000"})
-    write(root, {"sys/machine.slice/cpu.max": "100000 100000"})
-    assert available_cpus() == 4
+    assert (available_cpus(), available_memory()) == (cpus, gib * GIB)
 
 
 def test_this_machine():

@@ -19,6 +19,8 @@ import torch
 import yaml
 from network.states import network_of, silent
 from PIL import Image
+from websockets.exceptions import InvalidStatus
+from websockets.sync.client import connect
 
 from hgn.render.renderer import PARTICLE_COLORS, to_bytes
 from hgn.runtime.simulator import Simulator
@@ -84,7 +86,8 @@ def viewer(browser, play):
 
 def opened(browser, address):
     """A viewer's page, once its canvas shows more than one colour."""
-    page = browser.new_context(viewport={"width": SIZE[0], "height": SIZE[1]}).new_page()
+    size = {"width": SIZE[0], "height": SIZE[1]}
+    page = browser.new_context(viewport=size, device_scale_factor=0.5).new_page()  # it draws without a GPU
     page.set_default_timeout(300_000)
     page.goto(address)
     page.wait_for_selector("canvas")
@@ -93,7 +96,7 @@ def opened(browser, address):
 
 
 def pixels(page):
-    return np.asarray(Image.open(io.BytesIO(page.screenshot())).convert("RGB")).astype(int)
+    return np.asarray(Image.open(io.BytesIO(page.screenshot(scale="css"))).convert("RGB")).astype(int)
 
 
 def until(condition, seconds=300.0):
@@ -255,50 +258,34 @@ def test_two_viewers_and_a_lost_connection(browser, viewer, play):
     second.context.close()
 
 
-def test_without_the_token_there_is_nothing(browser, play):
-    """Neither the page nor the websocket answers without it, nor with another; the host is loopback's."""
-    bare = play.address.split("?")[0]
+def test_who_may_read_the_page(play):
+    """Neither the page nor the websocket answers without the token, nor with another; the host is loopback's. What
+    other programs on this machine have left in the browser, in any form, does not close the page."""
+    bare, (token,) = play.address.split("?")[0], parse_qs(urlsplit(play.address).query)["token"]
     assert bare.startswith("http://127.0.0.1:")
     for address in (bare, f"{bare}?token=wrong"):
         with pytest.raises(urllib.error.HTTPError, match="403"):
             urllib.request.urlopen(address)
-    from websockets.exceptions import InvalidStatus
-    from websockets.sync.client import connect
-
     with pytest.raises(InvalidStatus, match="403"):
         connect(bare.replace("http", "ws"))
     with pytest.raises(ConfigError, match=r"host must be an address of this machine, got '192.0.2.1'"):
         start_server("192.0.2.1", 0, "HGN")
-
-
-def test_cookies_of_other_programs(play):
-    """What other programs on this machine have left in the browser, in any form, does not close the page."""
-    (token,) = parse_qs(urlsplit(play.address).query)["token"]
-    bare = play.address.split("?")[0]
     own = f"{COOKIE}_{urlsplit(bare).port}={token}"
     for others in ("user@host=1", "a/b=1", 'x={"a":1,"b":2}', "path=1", "flag"):
         for cookies in (f"{others}; {own}", f"{own}; {others}"):
-            request = urllib.request.Request(bare, headers={"Cookie": cookies})
-            with urllib.request.urlopen(request) as answer:
+            with urllib.request.urlopen(urllib.request.Request(bare, headers={"Cookie": cookies})) as answer:
                 assert answer.status == 200
 
 
-def test_materials_of_imported_sets_are_shown():
-    """Particles of a name that the set brought are drawn in the colour that pictures have for it."""
+def test_stage():
+    """Particles of a name that an imported set brought are drawn in the colour that pictures have for it. Before a flat
+    rollout the camera stands before the middle of the plane, whose box is as deep as a particle."""
     server, _ = start_server("127.0.0.1", 0, "stage")
     try:
         stage = StageView(server, (1.0, 1.0, 1.0), 0.01, materials=(*MATERIALS, "goop"))
         stage.show(np.full((3, 3), 0.5, np.float32), np.array([0, 4, 4]))
         assert [len(cloud.points) for cloud in stage.clouds] == [1, 0, 0, 0, 2]
         np.testing.assert_array_equal(stage.clouds[4].colors.reshape(-1, 3)[0], to_bytes(PARTICLE_COLORS[4]))
-    finally:
-        stop_server(server)
-
-
-def test_flat_rollouts_are_looked_at_straight():
-    """The camera stands before the middle of the plane, whose box is as deep as a particle."""
-    server, _ = start_server("127.0.0.1", 0, "stage")
-    try:
         StageView(server, (0.8, 0.4, 0.5), 0.01, dimensions=2)
         camera = server.initial_camera
         np.testing.assert_allclose(camera.look_at, (0.4, 0.2, 0.25))

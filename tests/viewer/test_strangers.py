@@ -66,14 +66,8 @@ def sent(page, action):
 @pytest.mark.parametrize(
     "name",
     [
-        "<img src=x onerror=alert(1)>.obj",
-        "<script>alert(1)<script>.obj",
-        "[x](javascript:alert(1)).obj",
-        "![x](http:example.org).obj",
-        "`a` **b** | c.obj",
-        "\x1b[31mred.obj",
-        "{{constructor}}.obj",
-        "a\nb.obj",
+        *("<img src=x onerror=alert(1)>.obj", "<script>alert(1)<script>.obj", "[x](javascript:alert(1)).obj"),
+        *("![x](http:example.org).obj", "`a` **b** | c.obj", "\x1b[31mred.obj", "{{constructor}}.obj", "a\nb.obj"),
         "ü" * 200 + ".obj",
     ],
 )
@@ -85,23 +79,48 @@ def test_names_of_files_are_shown_as_plain_words(page, messages, name):
     sent(page, page._remove_chosen)
 
 
-@pytest.mark.parametrize(
-    ("name", "content", "message"),
-    [
-        ("x\0y.obj", TRIANGLES, "null"),
-        ("x.obj", b"\xff\xfe\x00", "x.obj"),
-        ("x.glb", b"glTF\x02\0\0\0" + bytes(8), "x.glb"),
-        ("x.stl", b"", "x.stl"),
-        ("x.txt", TRIANGLES, "mesh must be one of"),
-        ("x.obj", bytes(MAXIMUM_UPLOAD_BYTES + 1), "at most 64 MiB"),
-    ],
-)
-def test_bad_files_are_answered(page, messages, name, content, message):
-    """A file that cannot be read is a message to the viewer who sent it; the session goes on."""
-    count = len(page.session.obstacles)
-    sent(page, lambda: page._add_file(name, content))
-    assert len(messages) == 1 and message in messages[0]
-    assert len(page.session.obstacles) == count
+def file(name, content):
+    return lambda page: page._add_file(name, content)
+
+
+def click(*ray):
+    return lambda page: page._drop(np.array([0.5, 2.0, 0.5]), np.array(ray))
+
+
+def gravity(*value):
+    return lambda page: page.session.set_gravity(value)
+
+
+def weights(name):
+    return lambda page: page._use(name)
+
+
+INFINITE, NAN, LISTED = float("inf"), float("nan"), "weights must be one of floating, other"
+REFUSED = [
+    (file("x\0y.obj", TRIANGLES), "null"),
+    (file("x.obj", b"\xff\xfe\x00"), "x.obj"),
+    (file("x.glb", b"glTF\x02\0\0\0" + bytes(8)), "x.glb"),
+    (file("x.stl", b""), "x.stl"),
+    (file("x.txt", TRIANGLES), "mesh must be one of"),
+    (file("x.obj", bytes(MAXIMUM_UPLOAD_BYTES + 1)), "at most 64 MiB"),
+    *((click(*ray), "ray") for ray in ((0.0, 0.0, 0.0), (NAN, 0.0, 1.0), (INFINITE, 0.0, 0.0))),
+    *((gravity(*value), "gravity") for value in ((NAN, 0.0, 0.0), (0.0, INFINITE, 0.0), (0.0, 1e30, 0.0))),
+    *((weights(name), LISTED) for name in ("/etc/passwd", "hf://someone/weights", "../weights", "")),
+]
+
+
+@pytest.mark.parametrize(("action", "message"), REFUSED, ids=range(len(REFUSED)))
+def test_bad_input_is_answered(page, messages, action, message):
+    """Files that cannot be read, rays without a direction, gravity without bounds and weights that the page does not
+    offer are a message to the viewer who sent them; nothing is opened, and the session goes on as it was."""
+
+    def state():
+        session = page.session
+        return len(session.obstacles), session.live.particle_count, session.gravity, list(page.loaded)
+
+    before = state()
+    sent(page, lambda: action(page))
+    assert len(messages) == 1 and message in messages[0] and state() == before and not page.loaded
 
 
 @pytest.mark.parametrize("error", [KeyError("x"), ZeroDivisionError("x"), RuntimeError("x"), MemoryError("x")])
@@ -116,82 +135,45 @@ def test_any_error_of_one_viewer_is_a_message_to_that_viewer(page, messages, cap
     page.do(lambda: done.append(True))
     page._do_all()
     assert len(messages) == 1 and type(error).__name__ in messages[0]
-    assert done
-    assert type(error).__name__ in capsys.readouterr().err
+    assert done and type(error).__name__ in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("value", [100.0, 1e30, float("inf"), float("nan"), -5.0])
-def test_values_beyond_the_sliders_are_clamped(page, messages, monkeypatch, value):
+def test_values_beyond_the_sliders_are_clamped(page, monkeypatch):
     """A value that no slider gives is taken as the nearest that one gives; NaN as the least."""
-    for name in ("diameter", "speed", "height"):
-        monkeypatch.setattr(page, name, SimpleNamespace(value=value, min=0.1, max=0.3))
-    spout = page._spout(np.array([0.5, 2.0, 0.5]), np.array([0.0, -1.0, 0.0]))
-    assert 0.1 <= spout.diameter <= 0.3 and 0.1 <= spout.speed <= 0.3
-    assert 0.1 <= spout.position[1] <= 0.3
-
-
-@pytest.mark.parametrize("ray", [(0.0, 0.0, 0.0), (float("nan"), 0.0, 1.0), (float("inf"), 0.0, 0.0)])
-def test_rays_without_a_direction_are_refused(page, messages, ray):
-    count = page.session.live.particle_count
-    sent(page, lambda: page._drop(np.array([0.5, 2.0, 0.5]), np.array(ray)))
-    assert len(messages) == 1 and "ray" in messages[0]
-    assert page.session.live.particle_count == count
-
-
-def test_only_listed_weights_are_loaded(page, messages):
-    """A name that the page does not offer is refused before anything is opened."""
-    for name in ("/etc/passwd", "hf://someone/weights", "../weights", ""):
-        sent(page, lambda name=name: page._use(name))
-    assert not page.loaded
-    assert len(messages) == 4 and all("weights must be one of floating, other" in message for message in messages)
-
-
-@pytest.mark.parametrize("gravity", [(float("nan"), 0.0, 0.0), (0.0, float("inf"), 0.0), (0.0, 1e30, 0.0)])
-def test_gravity_is_finite_and_bounded(page, messages, gravity):
-    before = page.session.gravity
-    sent(page, lambda: page.session.set_gravity(gravity))
-    assert len(messages) == 1 and "gravity" in messages[0]
-    assert page.session.gravity == before
+    for value in (100.0, 1e30, INFINITE, NAN, -5.0):
+        for name in ("diameter", "speed", "height"):
+            monkeypatch.setattr(page, name, SimpleNamespace(value=value, min=0.1, max=0.3))
+        spout = page._spout(np.array([0.5, 2.0, 0.5]), np.array([0.0, -1.0, 0.0]))
+        assert all(0.1 <= number <= 0.3 for number in (spout.diameter, spout.speed, spout.position[1]))
 
 
 def test_a_moved_obstacle_leaves_no_earlier_scene_behind(page, monkeypatch):
     """Moving an obstacle 30 times keeps no more states alive than moving it once."""
     session = page.session
     alive: list[weakref.ref] = []
-    monkeypatch.setattr(InitialState, "__init__", _remembering(InitialState.__init__, alive))
+    begin = InitialState.__init__
+
+    def remembering(self, *arguments, **options):
+        begin(self, *arguments, **options)
+        alive.append(weakref.ref(self))
+
+    monkeypatch.setattr(InitialState, "__init__", remembering)
     for step in range(30):
-        moved = replace(session.obstacles[0], position=(0.3 + 0.01 * step, 0.5, 0.5))
-        session.move_obstacle(moved)
+        session.move_obstacle(replace(session.obstacles[0], position=(0.3 + 0.01 * step, 0.5, 0.5)))
         session.step()
     gc.collect()
     assert len(alive) >= 30
     assert sum(state() is not None for state in alive) <= 3
 
 
-def _remembering(init, alive):
-    def wrapped(self, *arguments, **options):
-        init(self, *arguments, **options)
-        alive.append(weakref.ref(self))
-
-    return wrapped
-
-
-@pytest.mark.parametrize(
-    ("origin", "refused"),
-    [
-        (None, False),
-        ("http://127.0.0.1:8080", False),
-        ("http://127.0.0.1:9999", True),
-        ("http://evil.example", True),
-        ("null", True),
-        ("", True),
-    ],
-)
-def test_requests_of_other_pages_are_refused(origin, refused):
+def test_requests_of_other_pages_are_refused():
     """A page of another origin is refused though the browser sends this page's cookie with its request."""
-    headers = Headers({"Host": "127.0.0.1:8080", "Cookie": f"{COOKIE}_8080=secret"})
-    if origin is not None:
-        headers["Origin"] = origin
-    connection = SimpleNamespace(local_address=("127.0.0.1", 8080))
-    response = guarded(lambda connection, request: None, "secret")(connection, Request("/", headers))
-    assert (response is not None and response.status_code == http.HTTPStatus.FORBIDDEN) == refused
+    for origin, refused in (
+        *((None, False), ("http://127.0.0.1:8080", False), ("http://127.0.0.1:9999", True)),
+        *(("http://evil.example", True), ("null", True), ("", True)),
+    ):
+        given = {} if origin is None else {"Origin": origin}
+        headers = Headers({"Host": "127.0.0.1:8080", "Cookie": f"{COOKIE}_8080=secret"} | given)
+        connection = SimpleNamespace(local_address=("127.0.0.1", 8080))
+        response = guarded(lambda connection, request: None, "secret")(connection, Request("/", headers))
+        assert (response is not None and response.status_code == http.HTTPStatus.FORBIDDEN) == refused
