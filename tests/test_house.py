@@ -18,8 +18,8 @@ PACKAGES = ("hgn", "datagen", "tools")
 LINES = {  # of Python, in tracked files
     "hgn": 27_232,
     "datagen": 8_499,
-    "tools": 6_187,
-    "tests": 28_083,
+    "tools": 6_171,
+    "tests": 27_635,
 }
 SETTINGS = 239  # fields of the dataclasses behind the commands, *Config
 
