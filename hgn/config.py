@@ -260,13 +260,12 @@ class DatagenConfig:
     def __post_init__(self) -> None:
         if self.reference_ratio == 1:
             return
-        cells, visible, name = self.dataset.reference_cells, 1 / self.scene.cell_size, "dataset.reference_cells"
+        cells, visible, name = 1 / self.reference_cell_size, 1 / self.scene.cell_size, "dataset.reference_cells"
         halves = 2 * self.reference_ratio
         rule = f"a multiple of {visible / 2:g}, half of the visible grid's cells per unit, and at least {visible:g}"
-        require(halves > 2 and abs(halves - round(halves)) < 1e-6, name, rule, cells)
-        edges = [length / self.reference_cell_size for length in self.scene.domain_size]
-        whole = all(abs(edge - round(edge)) < 1e-3 for edge in edges)
-        require(whole, name, "such that domain_size is a whole number of its cells", cells)
+        require(halves > 2 and abs(halves - round(halves)) < 1e-6, name, rule, self.dataset.reference_cells)
+        whole = all(abs(edge * cells - round(edge * cells)) < 1e-3 for edge in self.scene.domain_size)
+        require(whole, name, "such that domain_size is a whole number of its cells", round(cells))
         step_s = self.mpm.fixed_time_step_s
         require(step_s is None, "mpm.fixed_time_step_s", f"null with {name}, which chooses its own", step_s)
 

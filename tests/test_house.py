@@ -16,10 +16,10 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 27_232,
-    "datagen": 8_499,
-    "tools": 6_171,
-    "tests": 27_635,
+    "hgn": 27_231,
+    "datagen": 8_495,
+    "tools": 6_220,
+    "tests": 27_664,
 }
 SETTINGS = 239  # fields of the dataclasses behind the commands, *Config
 

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from datagen.fine import fine_scene, visible_positions, wall_thickness
 from hgn.config import MpmConfig
 from hgn.runtime.rollouts import RolloutResult
 from hgn.scene.episode import Episode
@@ -19,20 +20,32 @@ from hgn.system.machine import available_cpus
 OnFrame = Callable[[int], None] | None
 
 
-def solver_scene(episode: Episode, cell_size: float | None = None) -> Scene:
-    """Returns an episode's initial state for the solver, on its own grid or another."""
+def solver_scene(episode: Episode, cell_size: float | None = None, wall: float = 0.0) -> Scene:
+    """Returns an episode's initial state for the solver, on its own grid or another.
+
+    A finer grid has more particles, which begin inside walls of thickness `wall`.
+    """
     own = episode.obstacle_grid.cell_size
     density = episode.solver.get("particles_per_cell")  # not stored in older data
-    return Scene(
+    scene = Scene(
         position_N3=np.array(episode.position_TN3[0]),
         velocity_N3=episode.initial_velocity_N3,
         material_N=episode.material_N,
         obstacles=obstacles_of_episode(episode),
         domain_size=episode.domain_size,
-        cell_size=own if cell_size is None else cell_size,
-        particles_per_cell=density if density is None or cell_size is None else density * (cell_size / own) ** 3,
+        cell_size=own,
+        particles_per_cell=density,
         gravity=episode.gravity,
         seed=episode.seed,
+    )
+    if cell_size is None or cell_size == own:
+        return scene
+    if cell_size < own:
+        return fine_scene(scene, cell_size, wall)
+    return replace(
+        scene,
+        cell_size=cell_size,
+        particles_per_cell=None if density is None else density * (cell_size / own) ** 3,
     )
 
 
@@ -57,11 +70,6 @@ def solver_trials(
         else RolloutResult(result.position_TN3)
         for scene, result in zip(scenes, results, strict=True)
     ]
-
-
-def other_grid(config: MpmConfig, cell_size: float, own_cell_size: float) -> MpmConfig:
-    """Returns the solver's settings for another cell size; the thickness of walls is kept to the nearest node."""
-    return replace(config, wall_cells=max(2, round(config.wall_cells * own_cell_size / cell_size)))
 
 
 @dataclass(frozen=True)
@@ -94,7 +102,7 @@ class SolverLaunches:
 
         for episode in episodes:
             if episode.key not in self._colliders:
-                scene = solver_scene(episode, self.cell_size)
+                scene = self._scene(episode)
                 self._colliders[episode.key] = threads.submit(
                     build_collider, scene, self.config.choices.collider_band_cells
                 )
@@ -113,16 +121,20 @@ class SolverLaunches:
         """Simulates these settings and episodes, also if they were simulated before."""
         with ThreadPoolExecutor(available_cpus()) as threads:
             self.collide([episode for _, episode in pairs], threads)
-        scenes = [self._scene(setting, episode) for setting, episode in pairs]
+        scenes = [self._scene(episode, setting.perturbation) for setting, episode in pairs]
         colliders = [self._colliders[episode.key].result() for _, episode in pairs]
         steps = [setting.step for setting, _ in pairs]
         # scenes have their own steps; the step of the config is used if all are equal
         alike = replace(self.config, stability_fraction=steps[0])
-        return solver_trials(scenes, alike, frames, self.frame_rate_hz, on_frame, colliders, steps)
+        trials = solver_trials(scenes, alike, frames, self.frame_rate_hz, on_frame, colliders, steps)
+        return [
+            replace(trial, position_TN3=visible_positions(trial.position_TN3, len(episode.material_N)))
+            for trial, (_, episode) in zip(trials, pairs, strict=True)
+        ]
 
-    def _scene(self, setting: Setting, episode: Episode) -> Scene:
-        scene = solver_scene(episode, self.cell_size)
-        if setting.perturbation:
+    def _scene(self, episode: Episode, perturbation: float = 0.0) -> Scene:
+        scene = solver_scene(episode, self.cell_size, wall_thickness(self.config, self.cell_size))
+        if perturbation:
             draw = np.random.default_rng(scene.seed).uniform
-            scene.position_N3[:] += draw(-setting.perturbation, setting.perturbation, scene.position_N3.shape)
+            scene.position_N3[:] += draw(-perturbation, perturbation, scene.position_N3.shape)
         return scene

@@ -4,17 +4,17 @@ The paper's cell normals leak when used as a collider, so the solver builds its 
 Shape legend: K contact nodes, P points, F triangles, V vertices.
 
 Closed bodies: nodes inside and up to a quarter of a cell above the surface stop inward motion. Where a body is thinner
-than a cell, so do nodes outside, in a band of one cell at least.
+than a cell, nodes outside stop it too, in a band of at least one cell.
 
 Sheets (open meshes): particles on both sides reach the same nodes, which would couple them. So a node near a sheet has
 two fields of mass and velocity (Bardenhagen et al. 2000): one for particles that see it, and one for particles from
 which the sheet hides it (the "colours" of Hu et al. 2018, by line of sight). For the latter the node lies beyond the
 surface, like the inside of a body, with the normal toward the sheet.
 
-A particle's spline reaches 1.5 cells, so a node would stop material at a distance and leave a gap. Therefore nodes near
-the surface stop motion only from the mass on that they have where material lies within 0.75 cells of the surface.
+A particle's spline reaches 1.5 cells, so a node would stop material at a distance and leave a gap. Therefore a node
+near the surface stops motion only if its mass is at least what it has when material is 0.75 cells from the surface.
 Without nodes at the surface three quarters of the load would have no support: the lowest cell of sand would collapse
-into a layer, stopped only by the swept test, and be braked too strongly.
+into a layer, which only the swept test stops, with too much friction.
 
 Where two obstacles claim a node, the nearer surface counts. The swept test stops remaining crossings, with the same
 friction.
@@ -35,36 +35,34 @@ from hgn.scene.scene import Obstacle, Scene
 from hgn.schema import ConfigError
 
 SEEN, HIDDEN = 0, 1  # the two fields of a node
-ON_SURFACE_CELLS = 0.05  # nearer than this, the direction to the surface is rounding
-MOVE_CELLS = 0.1  # that an obstacle moves at most until its contacts are made anew
-BEARING_CELLS = 0.25  # above a surface, up to where nodes stop motion
-GAP_CELLS = 0.75  # from a surface, where material is that nodes begin to stop
+ON_SURFACE_CELLS = 0.05  # at smaller distances the direction to the surface is rounding
+MOVE_CELLS = 0.1  # largest motion of an obstacle until its contacts are built again
+BEARING_CELLS = 0.25  # height above a surface up to which nodes stop motion
+GAP_CELLS = 0.75  # distance of material from a surface at which nodes begin to stop it
 STENCIL_CELLS = 1.501  # from a particle to its nodes, along each axis, with rounding
-ON_EDGE = 1e-6  # of a triangle's edge: as near to it a place lies on it
-WIDENED = 1 + 1e-3  # triangles, since kernels look a ten-thousandth beyond their edges
+ON_EDGE = 1e-6  # barycentric coordinate below which a point lies on a triangle's edge
+WIDENED = 1 + 1e-3  # factor for triangles, since kernels look a ten-thousandth beyond their edges
 REACH_CELLS = WIDENED * STENCIL_CELLS * np.sqrt(3.0)  # of a particle, in any direction
 # squared area over fourth power of the longest edge, below which a triangle has no direction
 FLAT_TRIANGLE = 1e-20
-# of nodes: flat index in a box [P], signed distance from the surface in cells [P], free direction [P, 3] and least
-# mass [P]
+# nodes: flat index in a box [P], signed distance from the surface in cells [P], free direction [P, 3], least mass [P]
 Contacts = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 
 
 @dataclass(frozen=True, eq=False)
 class Collider:
-    """A scene's contact nodes, the triangles that none may cross, and which of its bodies are closed."""
+    """A scene's contact nodes, the triangles that particles may not cross, and its closed bodies."""
 
     node_K3: np.ndarray  # int32, unique
-    normal_K23: np.ndarray  # float32, of both fields: what is free, unit length; zero where all motion is
-    obstacle_K2: np.ndarray  # int32, whose contact it is in either field
-    # float32: the share of a full cell's mass from which on the node stops that field's motion
-    least_K2: np.ndarray
+    normal_K23: np.ndarray  # float32, free direction in each field, unit length; zero where all motion is free
+    obstacle_K2: np.ndarray  # int32, the obstacle in contact in each field
+    least_K2: np.ndarray  # float32: fraction of a full cell's mass from which the node stops that field's motion
     doubled_K: np.ndarray  # bool: sheets hide the node from some particles
     closed: tuple[Obstacle, ...]
     sweep: Sweep
 
     def count_inside(self, position_N3: np.ndarray) -> int:
-        """How many of the particles lie inside a closed obstacle."""
+        """Returns the number of particles inside closed obstacles."""
         inside = np.zeros(len(position_N3), bool)
         for obstacle in self.closed:
             inside |= contains(position_N3, obstacle)
@@ -72,12 +70,11 @@ class Collider:
 
 
 def build_collider(scene: Scene, band_cells: float, time: float = 0.0) -> Collider:
-    """The contact nodes of all obstacles of a scene, as they lie at a time in seconds; nodes lie at multiples of
-    scene.cell_size. What moves may go on by MOVE_CELLS.
+    """Returns the contact nodes of all obstacles of a scene in their pose at `time`, in seconds.
 
-    Any number and size of triangles takes bounded memory. Triangles without area and parts outside the domain
-    are left out. Raises: ConfigError when an obstacle has vertices that are not finite, or triangles whose
-    indices are out of range.
+    Nodes lie at multiples of scene.cell_size. They are valid until an obstacle has moved by MOVE_CELLS. Any number and
+    size of triangles takes bounded memory. Triangles without area and parts outside the domain are left out.
+    Raises: ConfigError when vertices of an obstacle are not finite, or indices of its triangles are out of range.
     """
     shape = tuple(round(length / scene.cell_size) for length in scene.domain_size)
     count = int(np.prod(shape))
@@ -92,7 +89,7 @@ def build_collider(scene: Scene, band_cells: float, time: float = 0.0) -> Collid
         owners[obstacle.closed].append(np.full(len(triangle_F33), index, np.int32))
         if not len(triangle_F33):
             continue
-        # of all nodes that a particle outside may reach the way out is exact
+        # the way out is exact at all nodes that a particle outside may reach
         box = _Box(triangle_F33, max(band_cells, REACH_CELLS) if obstacle.closed else REACH_CELLS, shape)
         if obstacle.closed:
             contacts = _closed_contacts(obstacle, triangle_F33, band_cells, box, scene.cell_size)
@@ -122,14 +119,14 @@ def build_collider(scene: Scene, band_cells: float, time: float = 0.0) -> Collid
 
 
 def placed(obstacle: Obstacle, time: float) -> Obstacle:
-    """The obstacle where it lies at a time."""
+    """Returns the obstacle in its pose at a time."""
     if obstacle.motion is None:
         return obstacle
     return dataclasses.replace(obstacle, vertex_V3=obstacle.motion.place(obstacle.vertex_V3, time))
 
 
 class _Box:
-    """The part of a grid of `grid` nodes around triangles that nodes up to `reach` cells away from them lie in."""
+    """The part of a grid of `grid` nodes that contains all nodes up to `reach` cells from triangles."""
 
     def __init__(self, triangle_F33: np.ndarray, reach: float, grid: tuple[int, ...]) -> None:
         self.grid, self.reach = grid, reach
@@ -140,21 +137,21 @@ class _Box:
         self.count = math.prod(self.shape)
 
     def flat(self, node_3P: np.ndarray) -> np.ndarray:
-        """Places [P] in a flat array of the box, of nodes of the grid in it."""
+        """Returns flat indices [P] in the box of nodes of the grid."""
         (x, y, z), (_, size_y, size_z) = self._low, self.shape
         return np.asarray(((node_3P[0] - x) * size_y + node_3P[1] - y) * size_z + node_3P[2] - z)
 
     def node(self, flat_P: np.ndarray) -> np.ndarray:
-        """The nodes of the grid at such places, int64 [P, 3]."""
+        """Returns the nodes of the grid at flat indices, int64 [P, 3]."""
         return np.stack(np.unravel_index(flat_P, self.shape), axis=1) + self._low
 
     def flat_in_grid(self, flat_P: np.ndarray) -> np.ndarray:
-        """The same places in a flat array of the whole grid."""
+        """Returns the flat indices in the whole grid."""
         return np.ravel_multi_index(tuple(self.node(flat_P).T), self.grid)
 
 
 class _Surface:
-    """Per node the closest surface: distance in cells (infinity where there is none), free direction, obstacle."""
+    """The closest surface of each node: distance in cells (infinity without one), free direction, obstacle."""
 
     def __init__(self, count: int) -> None:
         self.distance = np.full(count, np.inf)
@@ -173,8 +170,8 @@ class _Surface:
 
 
 def reached(height: np.ndarray) -> np.ndarray:
-    """The share of a full cell's mass that nodes at such heights above a surface, in cells, have where material fills
-    the half-space from GAP_CELLS above it on: the spline's integral.
+    """Returns the fraction of a full cell's mass of nodes at heights above a surface, in cells, if material fills the
+    half-space that begins GAP_CELLS above it: the spline's integral.
     """
     below = GAP_CELLS - height
     far = np.clip(1.5 - np.abs(below), 0, 1) ** 3 / 6
@@ -184,8 +181,8 @@ def reached(height: np.ndarray) -> np.ndarray:
 
 
 def _triangles(obstacle: Obstacle, index: int, cell_size: float) -> tuple[np.ndarray, np.ndarray]:
-    """Corners of the triangles that have an area, in cells, float64 [F, 3, 3]; and what of each lies on the rim, bool
-    [F, 6]: the edges opposite to its corners, then the corners. A rim is where no other triangle goes on.
+    """Returns the corners of the triangles that have an area, in cells, float64 [F, 3, 3], and which of their parts lie
+    on the rim, bool [F, 6]: the edges opposite to the corners, then the corners. Edges of one triangle form the rim.
     """
     vertex = np.asarray(obstacle.vertex_V3, np.float64)
     triangle = np.asarray(obstacle.triangle_F3)
@@ -218,9 +215,9 @@ def _triangles(obstacle: Obstacle, index: int, cell_size: float) -> tuple[np.nda
 
 
 def _rasterise(triangle_F33: np.ndarray, box: _Box) -> tuple[np.ndarray, ...]:
-    """Nodes within the box's reach of its triangles: flat index [P], distance [P], closest point [P, 3], triangle [P].
+    """Returns the nodes within the box's reach: flat index [P], distance [P], closest point [P, 3], triangle [P].
 
-    All in cells. Of triangles equally close the first counts.
+    Lengths are in cells. The first of several equally close triangles counts.
     """
     best = np.full(box.count, np.inf)
     closest = np.zeros((box.count, 3))
@@ -247,7 +244,7 @@ def _rasterise(triangle_F33: np.ndarray, box: _Box) -> tuple[np.ndarray, ...]:
         distance = np.sqrt(square((node - foot).T))
         nearer = np.flatnonzero((distance <= box.reach) & (distance < best[flat]))
         np.minimum.at(best, flat[nearer], distance[nearer])
-        # of several at a node the first is written last
+        # the first of several at a node is written last
         nearest = nearer[distance[nearer] == best[flat[nearer]]][::-1]
         closest[flat[nearest]], owner[flat[nearest]] = foot[nearest], triangle[nearest]
     near = np.flatnonzero(owner >= 0)
@@ -260,7 +257,7 @@ def _face_normals(triangle_F33: np.ndarray) -> np.ndarray:
 
 
 def _sheet_contacts(triangle_F33: np.ndarray, rim_F6: np.ndarray, box: _Box) -> tuple[Contacts, Contacts]:
-    """Nodes near a sheet: what is free for particles on their own side of it, and on the other."""
+    """Returns the contacts of nodes near a sheet for particles on their side of it, and on the other side."""
     node, distance, foot, owner = _rasterise(triangle_F33, box)
     face = _face_normals(triangle_F33)[owner]
     offset = box.node(node) - foot
@@ -276,14 +273,14 @@ def _sheet_contacts(triangle_F33: np.ndarray, rim_F6: np.ndarray, box: _Box) -> 
 
 
 def _on_rim(foot_P3: np.ndarray, triangle_P33: np.ndarray, rim_P6: np.ndarray) -> np.ndarray:
-    """Whether places of triangles lie on what of them `rim_P6` names (see _triangles), bool [P]."""
+    """Returns whether points of triangles lie on their parts `rim_P6` (see _triangles), bool [P]."""
     edge_1, edge_2 = triangle_P33[:, 1] - triangle_P33[:, 0], triangle_P33[:, 2] - triangle_P33[:, 0]
     normal = np.cross(edge_1, edge_2)
     square = (normal**2).sum(axis=1)
     from_corner = foot_P3 - triangle_P33[:, 0]
     share_1 = (np.cross(from_corner, edge_2) * normal).sum(axis=1) / square
     share_2 = (np.cross(edge_1, from_corner) * normal).sum(axis=1) / square
-    # a place lies on the edge opposite to a corner that it has no share of, and at a corner where it has no other
+    # a point lies on the edge opposite to a corner of weight 0, and at a corner of weight 1
     share_P3 = np.stack([1 - share_1 - share_2, share_1, share_2], axis=1)
     on_edge, at_corner = share_P3 < ON_EDGE, share_P3 > 1 - ON_EDGE
     return np.asarray((np.concatenate([on_edge, at_corner], axis=1) & rim_P6).any(axis=1))
@@ -313,7 +310,7 @@ def _closed_contacts(
     face[on[inward]] *= -1
     normal = np.where(on_surface[:, None], face, away)
 
-    # thin: a cell further on, past the surface, lies outside again
+    # a body is thin where the point one cell further on, past the surface, lies outside again
     height = sign * distance
     thin = np.zeros(len(node), bool)
     # one cell at least: a line of nodes that crosses the surface then meets a node of the band

@@ -1,8 +1,7 @@
-"""Lists of triangles near particles, by base node: those that a particle may not cross, and those of sheets that may
-hide nodes from it.
+"""Lists of the triangles near particles, by base node: a particle may not cross them, and sheets may hide nodes.
 
-A particle with base node I lies half to one and a half cells above it along each axis, and its nodes from I to I + 2:
-everything on the way to a node, or within half a cell, lies between I and I + 2. All lengths are in cells.
+A particle with base node I lies half to one and a half cells above it along each axis, and its nodes are I to I + 2.
+So all points on the way to a node, or within half a cell, lie between I and I + 2. All lengths are in cells.
 Shape legend: F triangles, K base nodes near triangles, L entries of all lists.
 """
 
@@ -15,7 +14,7 @@ import numpy as np
 
 from hgn.scene.distance import dot
 
-# cells: a node so near to a triangle is on the side that its normal points to, whatever the rounding
+# cells: a node nearer to a triangle counts as on the side of the normal, whatever the rounding
 ON_TRIANGLE = 1e-4
 SMALLEST_SLOPE = 1e-6  # of a normal along z; a plane that is steeper counts as this steep
 SLAB_MARGIN = 1e-2  # cells; more than that and rounding change
@@ -24,22 +23,22 @@ COLUMNS_PER_CHUNK = 1 << 11  # of nodes along z, held at once: some 20,000 pairs
 
 @dataclass(frozen=True, eq=False)
 class Sweep:
-    """Triangles, and for each base node near any which ones its particles may meet, those of sheets first."""
+    """Triangles, and for each base node near them a list of those that its particles may meet, sheets first."""
 
-    # float32: a corner, the unit normal, and two vectors whose products with an offset from the corner are its
-    # coordinates along the two edges from there
+    # float32: a corner, the unit normal, and two vectors; the products of these with an offset from the corner are its
+    # coordinates along the two edges that begin there
     triangle_F43: np.ndarray
-    obstacle_F: np.ndarray  # int32, whose triangle it is
+    obstacle_F: np.ndarray  # int32, index of the triangle's obstacle
     base_K3: np.ndarray  # int32
     begin_K: np.ndarray  # int64, into triangle_L; a list ends where the next begins
-    sheets_K: np.ndarray  # int32, how many of a list are sheets'
+    sheets_K: np.ndarray  # int32, number of triangles of sheets in each list
     triangle_L: np.ndarray  # int32
 
 
 def build_sweep(triangle_F33: np.ndarray, obstacle_F: np.ndarray, sheets: int, shape: tuple[int, ...]) -> Sweep:
-    """From triangles with an area, corners in cells, in a grid of `shape` nodes, the first `sheets` those of sheets.
+    """Returns the lists for triangles with an area, corners in cells, in a grid of `shape` nodes.
 
-    Outside the grid there are none.
+    The first `sheets` triangles are those of sheets.
     """
     edge_1, edge_2 = triangle_F33[:, 1] - triangle_F33[:, 0], triangle_F33[:, 2] - triangle_F33[:, 0]
     normal = np.cross(edge_1, edge_2)

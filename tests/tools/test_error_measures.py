@@ -10,7 +10,6 @@ import torch
 from network.states import gns_of, network_of
 from PIL import Image
 
-from hgn.config import MpmConfig
 from hgn.data.batch import make_batch
 from hgn.data.reader import EpisodeStore
 from hgn.runtime.backend import build
@@ -25,7 +24,6 @@ from tools.error_vs_time.paired import paired_difference, paired_rows, paired_ta
 from tools.error_vs_time.plot import draw_frames, draw_pareto
 from tools.error_vs_time.sinkhorn import sinkhorn_divergences
 from tools.measures import energies, energy_scale, momentum_error, outside_domain
-from tools.solver_rollouts import other_grid
 from tools.timing import FrameClock
 
 CPU = torch.device("cpu")
@@ -138,12 +136,6 @@ def test_frames_that_end_together():
     assert clock.milliseconds() == pytest.approx(100)
     clock.ends = [1.0, 1.000001]
     assert clock.milliseconds() is None
-
-
-def test_other_grids_keep_their_walls():
-    """Three nodes of 1/64 are two of 1/32 at the least, and six of 1/128."""
-    cells = [other_grid(MpmConfig(), 1 / n, 1 / 64).wall_cells for n in (32, 48, 64, 128)]
-    assert cells == [2, 2, 3, 6]
 
 
 def test_failed_scenes_are_left_out_of_means(episodes):

@@ -20,6 +20,7 @@ from hgn.schema import ConfigError
 from tools import timing
 from tools.error_vs_time import plot, run, score
 from tools.error_vs_time.__main__ import fitting_weights, main, network_contenders
+from tools.error_vs_time.contenders import FallingContender
 from tools.error_vs_time.settings import ErrorVsTimeConfig
 from tools.timing import Stopwatch
 
@@ -113,11 +114,12 @@ def test_the_report(compare, tmp_path, monkeypatch, capsys):
     report = compare("results/report", mpm_grids=[32, 64], perturbation=1e-6)
     assert {"device", "versions", "commit", "date", "command", "convention", "reference"} <= report["meta"].keys()
     rows = report["rows"]
-    assert systems(report) == ["hgn", "gns", *["baseline"] * 3, *["mpm"] * 4, *["chaos"] * 2]
+    assert systems(report) == ["hgn", "gns", *["baseline"] * 4, *["mpm"] * 4, *["chaos"] * 2]
     keys = {"one_step_mse", "position_mse", "sinkhorn", "penetration", "ghost", "momentum_error", "seeds"}
     for row in rows:
         assert keys <= row.keys() and len(row["seeds"]) == 2 and row["scoring_s"] >= 0
-        assert (row["one_step_mse"] is None) == (row["system"] in ("mpm", "chaos"))
+        falling = row.get("predictor") == "fall and stop at the floor"
+        assert (row["one_step_mse"] is None) == (falling or row["system"] in ("mpm", "chaos"))
         assert ("ms" in row) == (row["system"] in ("hgn", "gns", "mpm"))
         for error, mean in (("position MSE", row["position_mse"]["5"]), ("one-step MSE", row["one_step_mse"])):
             for values in row["by_scene"].get(error, {}).values():
@@ -170,11 +172,46 @@ def test_when_time_is_over(compare, monkeypatch):
     report = compare(**options)
     assert [call for call in calls if call[2] == 3] == [(1 / 64, [0.5, 1.0], 3)]  # of one grid side by side
     assert {call[2] for call in calls} == {2, 3, 4} and all(len(call[1]) == 1 for call in calls if call[2] != 3)
-    assert systems(report) == ["baseline"] * 3 + ["mpm", "mpm"]
-    assert report["rows"][4]["scenes_reached"] == {"5": 0} and report["rows"][4]["failed_scenes"] == 0
+    assert systems(report) == ["baseline"] * 4 + ["mpm", "mpm"]
+    assert report["rows"][-1]["scenes_reached"] == {"5": 0} and report["rows"][-1]["failed_scenes"] == 0
     report = compare(seconds=1e-9, **options)
-    assert systems(report) == ["baseline"] * 3
+    assert systems(report) == ["baseline"] * 4
     assert [left["cause"] for left in report["meta"]["not_run"]] == ["the time was over"] * 2
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_a_reference_of_a_finer_grid(make_config, make_dataset, compare, monkeypatch):
+    """Data of a finer grid is the reference, and is not simulated again on its own. Solvers on finer grids get the
+    children of the visible particles, and are scored by their means; the chaos floor is that of the reference's grid.
+    """
+    folder = make_dataset(make_config(reference_cells=128))
+    calls = []
+
+    def counted(scenes, *more, **others):
+        calls.append((round(1 / scenes[0].cell_size), [scene.particle_count for scene in scenes]))
+        return fake_simulate(scenes, *more, **others)
+
+    monkeypatch.setattr(datagen.mpm.solver, "simulate", counted)
+    monkeypatch.setattr("tools.error_vs_time.__main__.STEPS", (0.5,))
+    report = compare(data=str(folder), weights=[], mpm_grids=[48, 96], perturbation=1e-6)
+    assert report["meta"]["reference"] == "the data: 128 cells a unit, 8 particles for each visible one"
+    visible = [len(episode.material_N) for episode in EpisodeStore(folder, "validation")]
+    particles = {grid: counts for grid, counts in calls if len(counts) == len(visible)}
+    assert particles == {48: visible, 96: [3 * count for count in visible], 128: [8 * count for count in visible]}
+    assert systems(report) == [*["baseline"] * 4, "mpm", "mpm", "chaos"]
+    assert all(row["failed_scenes"] == 0 and row["position_mse"]["5"] < 1e-3 for row in report["rows"][4:])
+
+
+def test_fall_and_stop(data):
+    """The baseline is exact in free flight, and stays where it meets a wall."""
+    (episode,) = EpisodeStore(data, "test")
+    contender = FallingContender(1 / 32)
+    (free,) = contender.trials([episode], 6, None)
+    assert np.abs(free.position_TN3 - episode.position_TN3).max() < 1e-6
+    (long,) = contender.trials([episode], 200, None)
+    assert (long.position_TN3[-1] == long.position_TN3[-2]).all()
+    assert long.position_TN3.min() >= 1 / 32 - 1e-7 and long.position_TN3.max() <= 31 / 32 + 1e-7
+    assert ((long.position_TN3[-1] < 1 / 32 + 1e-6) | (long.position_TN3[-1] > 31 / 32 - 1e-6)).any(axis=1).all()
 
 
 @pytest.mark.usefixtures("undrawn")
@@ -199,7 +236,7 @@ def test_order_of_measurements(compare, both, monkeypatch, on_score, capsys):
     report = compare(code=1, precisions=["tf32", "fp32", "fp16"], **options)
     assert order == [
         "HGN L = 3, M = 2, cpu tf32",
-        *["constant velocity", "ballistic motion", "mean acceleration"],
+        *["constant velocity", "ballistic motion", "mean acceleration", "fall and stop at the floor"],
         *["MPM 64³, step 0.5", "chaos floor: perturbed by 1e-06", "chaos floor: twice the step"],
         "GNS M = 3, torch tf32",
         "MPM 48³, step 0.5",

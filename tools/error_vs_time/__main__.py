@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from datagen.fine import solver_on_grid, wall_thickness
 from hgn.command import EXIT_MACHINE, run_command
 from hgn.config import PRECISIONS, MpmConfig
 from hgn.data.fresh import set_record
@@ -38,6 +39,7 @@ from tools.error_vs_time.contenders import (
     SAME_GRID,
     BaselineContender,
     Contender,
+    FallingContender,
     NetworkContender,
     SolverContender,
 )
@@ -47,7 +49,7 @@ from tools.error_vs_time.run import Row, Run, draw, is_untimed, read_report, req
 from tools.error_vs_time.score import table
 from tools.error_vs_time.settings import ErrorVsTimeConfig
 from tools.report import meta_of
-from tools.solver_rollouts import Setting, SolverLaunches, other_grid
+from tools.solver_rollouts import Setting, SolverLaunches
 
 REFERENCE_STEP = 0.25  # of the limit of stability, on the data's own grid
 STEPS = (1.0, 0.5)  # of the solver, fractions of the limit of stability
@@ -67,23 +69,27 @@ def main(mapping: dict[str, Any]) -> int:
     store = EpisodeStore(config.data, config.split)
     episodes = first_episodes(store, config.scenes)
     frames = min(config.frames, *(len(episode.position_TN3) for episode in episodes))
-    same = {"episodes": [e.key for e in episodes], "frames": frames, "reference": _reference_name(config)}
+    finer = store.manifest.config.get("reference")
+    resimulate = config.resimulate and finer is None  # a finer grid is nearer to the truth than the data's own
+    same = {"episodes": [e.key for e in episodes], "frames": frames, "reference": _reference_name(resimulate, finer)}
     for i, (meta, _) in enumerate(earlier):
         require_same(meta, f"earlier[{i}]", same)
     known = [row for _, rows in earlier for row in rows]
     mpm = replace(from_stored(MpmConfig, store.manifest.config["mpm"], "mpm"), device=device.type)
     own_cell, rate = episodes[0].obstacle_grid.cell_size, episodes[0].frame_rate_hz
     own_grid = round(1 / own_cell)
+    reference_grid = own_grid if finer is None else int(finer["cells"])
 
     @functools.cache
     def launches(grid: int) -> SolverLaunches:
-        reference = config.resimulate and grid == own_grid
+        reference = resimulate and grid == reference_grid
         most = frames if reference else min(frames, config.mpm_frames)
         cell_size = own_cell if grid == own_grid else 1 / grid
-        return SolverLaunches(other_grid(mpm, cell_size, own_cell), cell_size, rate, most)
+        return SolverLaunches(solver_on_grid(mpm, cell_size, own_cell), cell_size, rate, most)
 
-    every: list[Contender] = [*network_contenders(config, device, episodes), *baseline_contenders(store, device)]
-    every += solver_contenders(config, mpm, launches, own_grid)
+    every: list[Contender] = list(network_contenders(config, device, episodes))
+    every += baseline_contenders(store, device, wall_thickness(mpm, own_cell))
+    every += solver_contenders(config, mpm, launches, own_grid, reference_grid, resimulate)
     measured = [row for row in known if not is_untimed(row)]
     contenders = [contender for contender in every if same_row(contender.row, measured) is None]
     networks = [contender for contender in contenders if isinstance(contender, NetworkContender)]
@@ -94,7 +100,7 @@ def main(mapping: dict[str, Any]) -> int:
     with _precompilation(networks, episodes, device, limit):
         references: Sequence[Episode] = episodes
         left_out: dict[str, str] = {}
-        if config.resimulate:
+        if resimulate:
             references, left_out = resimulated(episodes, launches(own_grid), REFERENCE_STEP)
         references = [replace(e, position_TN3=np.asarray(e.position_TN3[:frames])) for e in references]
         require(bool(references), "data", "scenes that the solver simulates to the end", left_out)
@@ -126,8 +132,12 @@ def _draw_again(config: ErrorVsTimeConfig, earlier: Sequence[tuple[dict[str, Any
     return 0
 
 
-def _reference_name(config: ErrorVsTimeConfig) -> str:
-    if not config.resimulate:
+def _reference_name(resimulate: bool, finer: dict[str, Any] | None) -> str:
+    if finer is not None:
+        return (
+            f"the data: {finer['cells']} cells a unit, {finer['particles_per_visible']} particles for each visible one"
+        )
+    if not resimulate:
         return "the data"
     return f"the solver on the data's grid at {REFERENCE_STEP:g} of the limit of stability"
 
@@ -209,8 +219,8 @@ def _precompilation(
             print(ahead.wait(lambda: limit is not None and time.monotonic() > limit), file=sys.stderr)
 
 
-def baseline_contenders(store: EpisodeStore, device: torch.device) -> list[Contender]:
-    """Returns predictors that have learned nothing."""
+def baseline_contenders(store: EpisodeStore, device: torch.device, wall: float) -> list[Contender]:
+    """Returns predictors that have learned nothing; `wall` is the thickness of the domain's walls."""
     split = "train" if store.manifest.published("train") else store.split  # fresh test sets have no other split
     mean_3 = np.asarray(store.manifest.statistics(split).acceleration.mean)
     predictors: dict[str, Callable[[Episode], np.ndarray]] = {
@@ -218,14 +228,20 @@ def baseline_contenders(store: EpisodeStore, device: torch.device) -> list[Conte
         "ballistic motion": lambda episode: np.asarray(episode.gravity) / episode.frame_rate_hz**2,
         "mean acceleration": lambda episode: mean_3,
     }
-    return [BaselineContender(name, acceleration, device) for name, acceleration in predictors.items()]
+    constant = [BaselineContender(name, acceleration, device) for name, acceleration in predictors.items()]
+    return [*constant, FallingContender(wall)]
 
 
 def solver_contenders(
-    config: ErrorVsTimeConfig, mpm: MpmConfig, launches: Callable[[int], SolverLaunches], own_grid: int
+    config: ErrorVsTimeConfig,
+    mpm: MpmConfig,
+    launches: Callable[[int], SolverLaunches],
+    own_grid: int,
+    reference_grid: int,
+    resimulate: bool,
 ) -> list[Contender]:
     """Returns the solver with each setting, and the chaos floor: the reference compared with itself, displaced."""
-    step = REFERENCE_STEP if config.resimulate else mpm.stability_fraction
+    step = REFERENCE_STEP if resimulate else mpm.stability_fraction
 
     def solver(grid: int, step: float, perturbation: float = 0.0, **named: Any) -> SolverContender:
         importance = SAME_GRID if grid == own_grid else COARSE_GRIDS
@@ -234,7 +250,7 @@ def solver_contenders(
     contenders: list[Contender] = [solver(grid, step) for grid in config.mpm_grids for step in STEPS]
     if config.perturbation:
         floor = f"perturbed by {config.perturbation:g}"
-        contenders.append(solver(own_grid, step, config.perturbation, system="chaos", floor=floor))
+        contenders.append(solver(reference_grid, step, config.perturbation, system="chaos", floor=floor))
     if config.mpm_grids and 2 * step <= 1:
         contenders.append(solver(own_grid, 2 * step, system="chaos", floor="twice the step"))
     return contenders

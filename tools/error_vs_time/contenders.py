@@ -164,6 +164,27 @@ class BaselineContender(Contender):
             return list(threads.map(trial, episodes))
 
 
+class FallingContender(Contender):
+    """Free flight from the first frame until a particle meets a wall of the domain, where it stays."""
+
+    def __init__(self, wall: float) -> None:
+        """`wall`: thickness of the domain's walls."""
+        self.row, self.wall = {"system": "baseline", "predictor": "fall and stop at the floor"}, wall
+
+    def trials(self, episodes: Sequence[Episode], frames: int, on_frame: OnFrame) -> list[RolloutResult]:
+        return [RolloutResult(self._path(episode, frames)) for episode in episodes]
+
+    def _path(self, episode: Episode, frames: int) -> np.ndarray:
+        time_T11 = np.arange(frames)[:, None, None] / episode.frame_rate_hz
+        fall_TN3 = time_T11 * episode.initial_velocity_N3 + 0.5 * time_T11**2 * np.asarray(episode.gravity)
+        path_TN3 = episode.position_TN3[0] + fall_TN3
+        low, high = self.wall, np.asarray(episode.domain_size) - self.wall
+        outside_TN = ((path_TN3 < low) | (path_TN3 > high)).any(axis=2)
+        stop_N = np.where(outside_TN.any(axis=0), outside_TN.argmax(axis=0), frames)
+        frame_TN1 = np.minimum(np.arange(frames)[:, None], stop_N)[:, :, None]
+        return np.take_along_axis(path_TN3, frame_TN1, axis=0).clip(low, high).astype(np.float32)
+
+
 class TritonPredictor:
     """Accelerations of backend triton: simulates one frame from each state."""
 
