@@ -52,12 +52,12 @@ class Target:
 
     @property
     def shards(self) -> int:
-        """How many shards can be read there."""
+        """Returns the number of shards at the URL."""
         return 0 if self._manifest is None else len(self._manifest.shards)
 
     @property
     def complete(self) -> bool:
-        """Whether that is the whole data set."""
+        """Returns whether the URL has the whole data set."""
         return self._manifest is not None and self._manifest.complete
 
     def copy(self, folder: Path, stop: StopSignal) -> None:

@@ -17,9 +17,9 @@ PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
     "hgn": 27_231,
-    "datagen": 8_495,
+    "datagen": 8_494,
     "tools": 6_220,
-    "tests": 27_664,
+    "tests": 27_667,
 }
 SETTINGS = 239  # fields of the dataclasses behind the commands, *Config
 
@@ -36,7 +36,7 @@ MANY_PARAMETERS: dict[str, int] = {}
 MANY_POSITIONAL_ARGUMENTS: dict[str, int] = {}
 
 HEADLESS = re.compile(r"(What|Of|Whether|That|Those|These|How|Which|Whose|Where)\b")
-HEADLESS_DOCSTRINGS = {"hgn": 0, "datagen": 47, "tools": 0}
+HEADLESS_DOCSTRINGS = {"hgn": 0, "datagen": 0, "tools": 0}
 
 UNCOMMENTED: set[str] = set()
 UNMENTIONED: set[str] = set()

@@ -25,7 +25,7 @@ from datagen.mpm.taichi_compat import name_lines_alone
 
 @dataclass(frozen=True)
 class Device:
-    """What this process simulates on."""
+    """The device that this process simulates on."""
 
     kind: str  # cpu or cuda
     threads: int  # of the CPU; 1 on a GPU
@@ -87,7 +87,7 @@ def initialise(device: str = "auto", cpu_threads: int | None = None) -> Device:
 
 
 def _processors() -> int:
-    """How many multiprocessors the GPU has that Taichi started."""
+    """Returns the number of multiprocessors of the GPU that Taichi started."""
     count = ctypes.c_int()
     multiprocessors, device = 16, 0
     status = cuda_driver().cuDeviceGetAttribute(ctypes.byref(count), multiprocessors, device)

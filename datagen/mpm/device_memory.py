@@ -17,7 +17,7 @@ _functions.bc, _functions.mode = str(Path(__file__).with_suffix(".bc")), "bc"
 
 
 def address(array: ti.ScalarNdarray) -> int:
-    """Where an array of floats begins."""
+    """Returns the address of an array of floats."""
     begin: int = ti.lang.impl.get_runtime().prog.get_ndarray_data_ptr_as_int(array.arr)
     assert begin % ALIGNMENT == 0
     return begin

@@ -27,7 +27,7 @@ class HostCopy:
         self._locked = False
 
     def read(self, array: ti.ScalarNdarray) -> np.ndarray:
-        """What the array holds once all kernels are done, float32 [its length]; the next read writes over it.
+        """Returns the array's values after all kernels, float32 [its length]; the next read overwrites them.
 
         Raises: RuntimeError where the GPU cannot be read, as after an error of a kernel.
         """
@@ -57,7 +57,7 @@ class HostCopy:
         self._memory, self._locked = np.empty(0, np.float32), False
 
     def _lock(self) -> bool:
-        """Whether the system lets so much memory be locked; what is not locked is read as well, but slower."""
+        """Locks the memory, and returns whether the system allows it; memory that is not locked is read more slowly."""
         memory, size = ctypes.c_void_p(self._memory.ctypes.data), ctypes.c_size_t(self._memory.nbytes)
         return bool(cuda_driver().cuMemHostRegister_v2(memory, size, ctypes.c_uint(0)) == SUCCESS)
 

@@ -277,8 +277,8 @@ class Launch(ABC):
         return setting
 
     def _rates(self, begin: float, end: float) -> list[np.ndarray]:
-        """Of each scene its obstacles' motion from one time to another, float64 [obstacles, 3, 3]: angular velocity,
-        velocity of a point, and that point.
+        """Returns for each scene the motion of its obstacles between two times, float64 [obstacles, 3, 3]: angular
+        velocity, velocity of a point, and the point.
         """
         rates = [np.zeros((max(len(scene.obstacles), 1), 3, 3)) for scene in self.scenes]
         for own, scene in zip(rates, self.scenes, strict=True):
@@ -313,7 +313,7 @@ class Launch(ABC):
         return places, entries
 
     def _frictions(self) -> list[np.ndarray]:
-        """Of each scene the Coulomb coefficients of its obstacles, one entry at least."""
+        """Returns the Coulomb coefficients of each scene's obstacles, at least one entry each."""
         own = self.config.collider_friction
         return [
             np.array([own if o.friction is None else o.friction for o in scene.obstacles] or [own], np.float32)
@@ -321,7 +321,7 @@ class Launch(ABC):
         ]
 
     def _places(self, node_K3: np.ndarray) -> np.ndarray:
-        """Where nodes lie within a scene's arrays of nodes, int32 [K]."""
+        """Returns the indices of nodes in a scene's arrays of nodes, int32 [K]."""
         x, y, z = node_K3.T
         place = ((x // BLOCK) * np.int32(self.blocks[1]) + y // BLOCK) * np.int32(self.blocks[2]) + z // BLOCK
         return place * np.int32(BLOCK_NODES) + ((x % BLOCK) * BLOCK + y % BLOCK) * BLOCK + z % BLOCK

@@ -188,12 +188,12 @@ SOLID_VARIANTS = sum(bit for material, bit in enumerate(MATERIAL_VARIANTS) if ma
 
 
 def has_solid(variant: int) -> bool:
-    """Whether a kernel of this variant, of `Variant`'s bits, has particles with a deformation gradient."""
+    """Returns whether a kernel of this variant (bits of `Variant`) has particles with a deformation gradient."""
     return variant & SOLID_VARIANTS != 0
 
 
 def is_only_solid(variant: int, kind: int) -> bool:
-    """Whether of all solids a kernel of this variant has the one of bit `kind` alone, so that none needs to be told."""
+    """Returns whether the only solid of a kernel of this variant is that of bit `kind`."""
     return variant & SOLID_VARIANTS == kind
 
 

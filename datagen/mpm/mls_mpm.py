@@ -212,7 +212,7 @@ def _room(fx, base: ti.i32, axis: ti.template(), shape: ti.template()) -> ti.f32
 
 @ti.func
 def settles(scene: ti.i32, arrays: ti.template()) -> ti.i32:
-    """Whether the water of a scene follows its density."""
+    """Returns whether the water of a scene relaxes to its density."""
     return arrays.scene_value[scene, VALUE.water_density] > 0.0 and arrays.setting[SETTING.density_relaxation] > 0.0
 
 
@@ -236,15 +236,16 @@ def settle(x, volume: ti.f32, mass: ti.f32, scene: ti.i32, arrays: ti.template()
 
 @ti.func
 def _triangle_list(x, scene: ti.i32, arrays: ti.template()) -> ti.i32:
-    """Where the list of triangles near a particle begins in `contact`, or -1."""
+    """Returns the index in `contact` of the list of triangles near a particle, or -1."""
     base = base_node(x, arrays.setting[SETTING.inverse_cell_size])
     return arrays.contact[arrays.shape[SHAPE.all_blocks] * BLOCK_NODES + node_place(base, scene, arrays.shape)]
 
 
 @ti.func
 def find_hidden(x, scene: ti.i32, elapsed: ti.f32, arrays: ti.template()) -> ti.i32:
-    """Which of a particle's nodes sheets hide from it, in bits (see surface_kernel.hidden_nodes). A node's second field
-    is shared by all particles that it is hidden from. Contacts that move were placed `elapsed` seconds ago.
+    """Returns in bits which of a particle's nodes sheets hide from it (see surface_kernel.hidden_nodes).
+
+    All particles that a node is hidden from share its second field. Moving contacts were placed `elapsed` seconds ago.
     """
     bits = 0
     list_at = _triangle_list(x, scene, arrays)
@@ -304,7 +305,7 @@ def move(x, v, C, scene: ti.i32, arrays: ti.template()):
 
 @ti.func
 def is_fluid(material: ti.i32) -> ti.i32:
-    """Whether a material has no deformation gradient."""
+    """Returns whether a material has no deformation gradient."""
     result = 0
     for fluid in ti.static(FLUIDS):
         if material == fluid:

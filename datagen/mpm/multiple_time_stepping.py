@@ -23,7 +23,7 @@ SLACK = 1e-3  # of a substep, within which times are the same
 
 @ti.func
 def _corner_block(first, last, n: ti.template(), scene: ti.i32, shape: ti.template()) -> ti.i32:
-    """Of the blocks from `first` to `last` that a particle's nodes lie in, the one at corner n of eight."""
+    """Returns the block at corner n of eight of the blocks `first` to `last` that contain a particle's nodes."""
     corner = ti.Vector([last[axis] if n >> (2 - axis) & 1 else first[axis] for axis in range(3)])
     index = (corner[0] * shape[SHAPE.blocks + 1] + corner[1]) * shape[SHAPE.blocks + 2] + corner[2]
     return index + scene * shape[SHAPE.scene_blocks]
@@ -60,8 +60,8 @@ def mark_changed(x, scene: ti.i32, now: ti.i32, many: ti.f32, inverse_dx: ti.f32
 def _alike_around(
     x, scene: ti.i32, interval: ti.i32, own: ti.f32, inverse_dx: ti.f32, arrays: ti.template(), begin: ti.i32
 ) -> ti.i32:
-    """Whether all particles in the blocks of a particle's nodes began the interval before with steps of `own` substeps;
-    what this one takes is marked for the next.
+    """Returns whether all particles in the blocks of a particle's nodes began the previous interval with steps of `own`
+    substeps, and marks this particle's step for the next interval.
 
     A block has four marks, each in an array of all blocks, the first from block[begin] on: the fewest substeps in even
     intervals, the most in them, and both in odd ones. A mark holds the number of its interval too, so that one from
@@ -85,8 +85,8 @@ def _alike_around(
 
 @ti.func
 def change_of(mark: ti.i32, now: ti.i32) -> ti.f32:
-    """Of how many substeps a block takes impulses in the substep `now`, by its mark (see mark_changed); 0 where nothing
-    changes it.
+    """Returns the number of substeps whose impulses a block takes in the substep `now`, from its mark (see
+    mark_changed); 0 for a block without changes.
     """
     many = 0.0
     if mark // MANY == now:
@@ -96,8 +96,8 @@ def change_of(mark: ti.i32, now: ti.i32) -> ti.f32:
 
 @ti.func
 def acts(covered: ti.f32, begins: ti.f32, step: ti.f32, scene: ti.i32, scene_value: ti.template()) -> ti.i32:
-    """Whether a particle begins a step of its own in this substep: all do in an interval's first, and later those whose
-    last stress acts until `covered` (s, within the interval), before the substep ends.
+    """Returns whether a particle begins its own step in this substep: always in an interval's first one, later if its
+    last stress acts only until `covered` (s, within the interval), before the substep ends.
     """
     return begins == 1.0 or covered < scene_value[scene, VALUE.interval_elapsed] - SLACK * step
 

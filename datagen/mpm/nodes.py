@@ -29,7 +29,7 @@ def spline(distance: ti.f32) -> ti.f32:
 
 @ti.func
 def _node_of_axis(index, stride: ti.i32, local_stride: ti.i32):
-    """What a node's index along one axis adds to its place in an array; those of the three axes add up."""
+    """Returns the part of a node's array index that depends on one axis; the index is the sum over the axes."""
     return (index >> 2) * stride + (index & 3) * local_stride
 
 
@@ -83,8 +83,9 @@ def mark(
 
 @ti.func
 def node_places(base, first_entry: ti.i32, shape: ti.template(), entries: ti.template()):
-    """Where nodes base .. base + 2 lie in an array of `entries` numbers a node, by axis: node base + (i, j, k) begins
-    at the sum of the first result's i, the second's j and the third's k. The scene's nodes begin at `first_entry`.
+    """Returns the array indices of nodes base .. base + 2 by axis, for `entries` numbers per node.
+
+    Node base + (i, j, k) begins at the sum of entries i, j and k of the three results, the scene at `first_entry`.
     """
     stride_z = BLOCK_NODES * entries
     stride_y = shape[SHAPE.blocks + 2] * stride_z
@@ -99,7 +100,7 @@ def node_places(base, first_entry: ti.i32, shape: ti.template(), entries: ti.tem
 
 @ti.func
 def node_place(index, scene: ti.i32, shape: ti.template()) -> ti.i32:
-    """Where a node's entry lies in arrays that hold one for each node."""
+    """Returns a node's index in arrays of one entry per node."""
     block = index >> 2
     local = index & 3
     place = (block[0] * shape[SHAPE.blocks + 1] + block[1]) * shape[SHAPE.blocks + 2] + block[2]
@@ -109,7 +110,7 @@ def node_place(index, scene: ti.i32, shape: ti.template()) -> ti.i32:
 
 @ti.func
 def ghost_place(index, scene: ti.i32, arrays: ti.template()) -> ti.i32:
-    """Where a node's second field lies, in numbers of nodes."""
+    """Returns the index of a node's second field, counted in nodes."""
     return arrays.shape[SHAPE.ghost_begin] + arrays.contact[node_place(index, scene, arrays.shape)]
 
 

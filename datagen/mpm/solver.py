@@ -222,7 +222,7 @@ def _blocks_at_once(device: Device) -> int:
 
 
 def _teams_at_once(device: Device, team: Team) -> int:
-    """How many teams are at work at once: the blocks of one wait for each other, and teams for who has their scene."""
+    """Returns the number of teams that run at once; blocks of a team wait for each other."""
     room = _blocks_at_once(device)
     require(team.blocks <= room, "team.blocks", f"at most {room}, which run at once", team.blocks)
     return room // team.blocks

@@ -40,9 +40,9 @@ def _drift(scaled, triangle: ti.i32, contact_normal: ti.template()):
 
 @ti.func
 def hidden_nodes(scaled, list_at: ti.i32, elapsed: ti.f32, arrays: ti.template(), moving: ti.template()) -> ti.i32:
-    """Which of a particle's nodes sheets hide from it: bit 9 i + 3 j + k says that the way to node base + (i, j, k)
-    crosses a triangle of a sheet. The particle is at `scaled`, in cells; its base node's list begins at list_at.
-    Triangles have moved for `elapsed` seconds since they were listed; which side nodes lie on was settled then.
+    """Returns which of a particle's nodes sheets hide from it: bit 9 i + 3 j + k is 1 if the line to node base +
+    (i, j, k) crosses a triangle of a sheet. The particle is at `scaled`, in cells; its base node's list begins at
+    list_at. Triangles have moved for `elapsed` seconds since they were listed; the sides of nodes date from then.
     """
     bits = 0
     to_base = ti.floor(scaled - 0.5) - scaled

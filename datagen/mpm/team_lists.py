@@ -23,8 +23,9 @@ IDLE = -(2**31)
 
 @ti.func
 def _places(entry, arrays: ti.template(), thread: ti.template()):
-    """Of each of three lists, whose new entries are 1 in `entry`, the place of this thread's: places are given to all
-    threads of a warp at once, in their order.
+    """Returns the positions of this thread's new entries in three lists; an entry is new where `entry` is 1.
+
+    All threads of a warp get their positions together, in their order.
     """
     before = ti.Vector([0, 0, 0])
     if ti.static(arrays.threads > 1):
@@ -104,8 +105,8 @@ def gives_now(
     some_wait: ti.i32,
     arrays: ti.template(),
 ) -> ti.i32:
-    """Whether a particle begins a step of its own, where none is put before another: its entry in `giving`, and the
-    marks of one that goes on.
+    """Returns whether a particle begins its own step, in a block whose particles keep their order; fills its entry in
+    `giving`, and marks a particle that continues its step.
     """
     begins_own = acts(arrays.covered[share.first + p], 0.0, step, share.scene, arrays.scene_value)
     if begins_own:

@@ -29,7 +29,7 @@ def wait(threads: ti.template()):
 
 @ti.func
 def fence(threads: ti.template()):
-    """What the block wrote is seen by whoever sees what this thread writes next, and the other way round."""
+    """Orders memory: other blocks that see this thread's next writes also see its earlier ones, and vice versa."""
     if ti.static(threads > 1):
         ti.simt.grid.memfence()
 

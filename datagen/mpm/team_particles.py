@@ -28,9 +28,7 @@ Share = namedtuple("Share", ["scene", "first", "chunk", "owned"])
 
 @ti.func
 def dealt(own: ti.i32, thread: ti.template(), chunk: ti.i32) -> ti.i32:
-    """Which of a scene's particles a block's own one is: they are dealt out in chunks, so that no block has all of
-    what takes long.
-    """
+    """Returns the scene's index of a block's particle `own`; blocks get chunks in turn, to share slow particles."""
     return (own // chunk * thread.blocks + thread.part) * chunk + own % chunk
 
 

@@ -205,8 +205,8 @@ def scatter(
 
 @ti.func
 def _read_node(place: ti.i32, velocities: ti.i32, begins: ti.f32, node: ti.template()):
-    """What came to its momentum, its mass, and its velocity before (none where an interval begins), with the time that
-    it has fallen in this interval.
+    """Returns a node's gain of momentum, its mass, and its velocity before (zero at the begin of an interval) with its
+    time of fall in this interval.
     """
     before = ti.Vector([0.0, 0.0, 0.0, 0.0])
     if begins == 0.0:

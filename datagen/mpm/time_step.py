@@ -162,6 +162,6 @@ def choose_time_step(
 
 @ti.func
 def falls(time: ti.f32, scene: ti.i32, scene_value: ti.template()):
-    """What gravity adds to velocities in a time."""
+    """Returns the change of velocity by gravity in a time."""
     gravity = ti.Vector([scene_value[scene, VALUE.gravity + i] for i in range(3)])
     return time * gravity

@@ -75,7 +75,7 @@ class ShardLocks:
 
     @contextlib.contextmanager
     def alone(self) -> Iterator[bool]:
-        """Whether this is the only generator; while it is, another one waits before it begins."""
+        """Yields whether this is the only generator; if so, others wait before they begin."""
         alone = self._lock(fcntl.F_WRLCK, _GENERATORS_BYTE)
         try:
             yield alone

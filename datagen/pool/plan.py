@@ -124,7 +124,5 @@ def missing_ranges(planned: Iterable[ShardRange], published: Mapping[str, Sequen
 
 
 def generation_place(split: str, index: int) -> tuple[bool, int, bool]:
-    """What episodes are sorted by to be simulated: training and validation in turn until validation is done, the rest
-    of training, then test.
-    """
+    """Returns an episode's sort key: training and validation in turn, the rest of training, then test."""
     return split == "test", index, split == "validation"

@@ -29,7 +29,7 @@ _COPY_BYTES = 1 << 22
 
 
 def staged_path(folder: Path, split: str, index: int) -> Path:
-    """Where the tar file of a finished episode waits for the rest of its shard."""
+    """Returns the path of the tar file of a finished episode until its shard is complete."""
     return folder / STAGING_NAME / f"{episode_key(split, index)}.tar"
 
 

@@ -118,7 +118,7 @@ class Worker(ABC):
         """Returns why a worker that no longer answers has ended."""
 
     def blamable(self) -> bool:
-        """Whether its task may have caused its death; False where its whole machine is gone."""
+        """Returns whether its task may have caused its death; False if its machine is gone."""
         return True
 
 

@@ -152,17 +152,17 @@ class DatasetWriter:
 
     @property
     def holds(self) -> bool:
-        """Whether there are claimed shards that are not published yet."""
+        """Returns whether claimed shards are not yet published."""
         return bool(self._claimed)
 
     @property
     def done(self) -> int:
-        """How many of them are published, or staged in claimed shards."""
+        """Returns the number of the share's episodes that are published, or staged in claimed shards."""
         return self._published_of_share + len(self._staged)
 
     @property
     def complete(self) -> bool:
-        """Whether the share is published, by whomever."""
+        """Returns whether the share is published, by any generator."""
         return self._published_of_share == self.total
 
     def task(self, split: str, index: int) -> SceneTask:
@@ -195,12 +195,12 @@ class DatasetWriter:
         self._staged[split, index] = time.monotonic()
 
     def is_staged(self, split: str, index: int) -> bool:
-        """Whether a staged file is there, told or not: a worker may die between the two."""
+        """Returns whether a staged file exists, reported or not: a worker may die between the two."""
         return staged_path(self.folder, split, index).is_file()
 
     @property
     def packing(self) -> bool:
-        """Whether shards are being packed, for `publish_next` to publish."""
+        """Returns whether shards are being packed."""
         return bool(self._packing)
 
     def publish_next(self, wait: bool = True) -> ShardEntry | None:
@@ -266,7 +266,7 @@ class DatasetWriter:
         return entry
 
     def _winner(self, shard: ShardRange) -> ShardEntry | None:
-        """What another generator has published of a claimed shard: only where a file system's locks do not hold."""
+        """Returns the shard of another generator that has a claimed one's episodes, or None: locks may not work."""
         self.refresh()
         if missing_ranges([shard], self._published) == [shard]:
             return None
@@ -355,7 +355,7 @@ class DatasetWriter:
                         self._locks.free(shard)
 
     def _pending(self) -> Iterator[ShardRange]:
-        """What of the share is not published."""
+        """Yields the ranges of the share that are not published."""
         for place in range(self._begun, len(self._share)):
             missing = missing_ranges(self._share[place : place + 1], self._published)
             if not missing and place == self._begun:

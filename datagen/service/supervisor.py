@@ -30,7 +30,7 @@ _EVENTS = ("start", "frame", "episode", "found", "shard", "message", "close")
 
 @dataclass(frozen=True)
 class PoolState:
-    """What is known of the pool. `status` is starting, running, complete, waiting (to start again), failed, stopped."""
+    """The pool as last seen; `status` is starting, running, complete, waiting (to start again), failed or stopped."""
 
     status: str = "starting"
     starts: int = 0

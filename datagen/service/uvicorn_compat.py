@@ -56,7 +56,7 @@ class SendfileProtocol(H11Protocol):
 
     @property
     def busy(self) -> bool:
-        """Whether a request is being answered."""
+        """Returns whether a request is being answered."""
         return self.cycle is not None and not self.cycle.response_complete
 
     def _look(self) -> None:
