@@ -16,10 +16,10 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 27_231,
+    "hgn": 27_269,
     "datagen": 8_494,
-    "tools": 6_220,
-    "tests": 27_667,
+    "tools": 7_115,
+    "tests": 27_998,
 }
 SETTINGS = 239  # fields of the dataclasses behind the commands, *Config
 

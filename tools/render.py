@@ -4,6 +4,9 @@ A folder gets NAME.png (some frames), NAME.gif (an animation) and, with ground t
 A file that ends in .png, .gif or .webp (half the size of GIF) gets this picture only; .usdc, .usda, .usd or .ply get
 the rollout for other programs (`surface=true`: also water as a closed surface). Further rollouts of the same scene
 (`others=[FILE,...]`) are drawn next to it, with the labels `names`.
+
+With the name of a scene in conf/gallery the solver simulates it first, and each of `others` is weights that do so too:
+`python -m tools.render rollout=pool_deep 'others=[mechanics]'`.
 """
 
 from __future__ import annotations
@@ -16,16 +19,20 @@ from typing import Any
 import numpy as np
 
 from hgn.command import run_command
+from hgn.config import MpmConfig
 from hgn.data.reader import find_episode
 from hgn.render import pictures
 from hgn.render.error_curve import error_curve, position_error
 from hgn.render.exchange import PLY_ENDING, USD_ENDINGS, save_rollout
+from hgn.scene.emission import entry_frames
 from hgn.scene.rollout_file import Rollout, read_rollout
-from hgn.schema import ConfigError, OneOrMore, from_mapping, require, require_bounds
+from hgn.scene.scene_file import load_scene, scene_files
+from hgn.schema import ConfigError, OneOrMore, from_mapping, require, require_bounds, to_mapping
 from hgn.system.progress import bar
 
 PICTURES = 4  # in the PNG by default
 ANIMATIONS = (".gif", ".webp")
+FRAME_RATE_HZ = 60.0  # of simulated gallery scenes
 
 
 @dataclass(frozen=True)
@@ -34,8 +41,10 @@ class RenderConfig:
 
     out: str  # a folder, or one file that ends in .png, .gif, .webp (animated, half as large as GIF), .usdc or .ply
     surface: bool = False  # true: USD and PLY also contain water as a closed surface
-    rollout: str | None = None  # file of python -m hgn.rollout
-    others: tuple[str, ...] = ()  # further rollouts of the same scene, drawn next to it
+    # file of python -m hgn.rollout; or the name of a scene in conf/gallery, which the solver simulates
+    rollout: str | None = None
+    # further rollouts of the same scene, drawn next to it; of a scene in conf/gallery: weights
+    others: tuple[str, ...] = ()
     # labels of rollout (or the episode) and of each of others; null: prediction (ground truth), and the files' names
     names: tuple[str, ...] | None = None
     data: str | None = None  # folder of a data set, instead of rollout
@@ -99,13 +108,15 @@ def main(mapping: Mapping[str, Any]) -> int:
 
 def _load(config: RenderConfig) -> Versions:
     """Reads the rollouts. Raises: ConfigError if one has other particles or another frame rate."""
+    scene = None
     if config.rollout is None:
         assert config.data is not None and config.episode is not None  # checked by RenderConfig
         rollout = pictures.rollout_of_episode(find_episode(config.data, config.episode))
         name, first, label = config.episode, f"episode {config.episode}", "ground truth" if config.others else ""
         truth_TN3 = rollout.position_TN3 if config.others else None
     else:
-        rollout = read_rollout(config.rollout)
+        scene = scene_files("gallery").get(config.rollout)
+        rollout = read_rollout(config.rollout) if scene is None else solver_rollout(scene)
         name, first, label = Path(config.rollout).stem, config.rollout, "prediction"
         truth_TN3 = rollout.reference_TN3
         if "solver" in rollout.source:
@@ -115,7 +126,7 @@ def _load(config: RenderConfig) -> Versions:
     label, *rest = names
     others = {}
     for i, (other_name, file) in enumerate(zip(rest, config.others, strict=True)):
-        other = read_rollout(file)
+        other = read_rollout(file) if scene is None else weights_rollout(rollout, scene, file)
         if not np.array_equal(other.position_TN3[0], rollout.position_TN3[0], equal_nan=True):
             raise ConfigError(f"others[{i}] must begin with the same particles as {first}, got {file}")
         rule = f"{rollout.frame_rate_hz:g} frames a second"
@@ -123,6 +134,36 @@ def _load(config: RenderConfig) -> Versions:
             raise ConfigError(f"others[{i}] must have {rule}, got {other.frame_rate_hz:g}")
         others[other_name] = other.position_TN3
     return Versions(name, rollout, label, others, truth_TN3)
+
+
+def solver_rollout(file: Path) -> Rollout:
+    """Simulates a gallery scene with the solver. Raises: ConfigError where the solver stops."""
+    from tools.solver_rollouts import solver_trials
+    from tools.stability.gallery import load_case  # loads torch
+
+    case = load_case(file.stem, file)
+    scene = case.scenes[0]
+    (trial,) = solver_trials([scene], MpmConfig(), case.measure.frames, FRAME_RATE_HZ)
+    if trial.cause is not None:
+        raise ConfigError(f"{file} must be a scene that the solver keeps together, got {trial.cause}")
+    return Rollout(
+        trial.position_TN3, scene.material_N, scene.obstacles, scene.domain_size, FRAME_RATE_HZ,
+        gravity=scene.gravity, cell_size=scene.cell_size,
+        source={"scene": file.stem, "solver": to_mapping(MpmConfig())},
+        entry_frame_N=entry_frames(scene, FRAME_RATE_HZ) if scene.emits else None,
+    )  # fmt: skip
+
+
+def weights_rollout(solver: Rollout, file: Path, weights: str) -> Rollout:
+    """Simulates a gallery scene with weights. Raises: ConfigError where they refuse it or diverge."""
+    from hgn.runtime.divergence import DivergedError
+    from hgn.runtime.simulator import Simulator
+
+    try:
+        (position_TN3,) = Simulator.load(weights).rollout([load_scene(file)], solver.frame_count)
+    except DivergedError as error:
+        raise ConfigError(f"others must keep {file} together, got {weights}: {error}") from error
+    return replace(solver, position_TN3=position_TN3, source={"scene": file.stem, "weights": weights})
 
 
 def _write_png(config: RenderConfig, versions: Versions, path: Path) -> None:

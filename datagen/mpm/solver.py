@@ -22,7 +22,7 @@ from datagen.mpm.team_launch import MAXIMUM_PARTICLES, BlocksApartError, Team, T
 from hgn.config import MpmConfig, SceneConfig
 from hgn.scene.emission import at_entry, require_free_entries
 from hgn.scene.material import material_index
-from hgn.scene.scene import Scene
+from hgn.scene.scene import Scene, whole_cells
 from hgn.scene.shapes import shape_obstacle
 from hgn.schema import ConfigError, require
 
@@ -37,7 +37,6 @@ LARGE_PARTICLES = 4096  # for each processor, from which on a scene's blocks are
 WARM_SCENES = 16
 USUAL_PARTICLES = 4_000  # of a random scene
 PARTICLE_BYTES, NODE_BYTES = 340, 50  # of a launch's arrays
-CELL_TOLERANCE = 1e-3  # of a cell that a domain may be longer or shorter than whole cells
 
 __all__ = [
     "SceneFailure",
@@ -230,7 +229,6 @@ def _teams_at_once(device: Device, team: Team) -> int:
 
 def _shared_grid(scenes: Sequence[Scene], config: MpmConfig) -> tuple[int, int, int]:
     first = scenes[0]
-    require(first.cell_size > 0 and math.isfinite(first.cell_size), "cell_size", "a finite number > 0", first.cell_size)
     for index, scene in enumerate(scenes):
         for name in ("domain_size", "cell_size"):
             if getattr(scene, name) != getattr(first, name):
@@ -238,24 +236,12 @@ def _shared_grid(scenes: Sequence[Scene], config: MpmConfig) -> tuple[int, int, 
                     f"{name} must be the same in all scenes of a batch, got {getattr(scene, name)} in scene {index} "
                     f"and {getattr(first, name)} in scene 0; simulate them apart"
                 )
-    counts = []
-    for axis, length in zip("xyz", first.domain_size, strict=True):
-        cells = length / first.cell_size
-        require(
-            math.isfinite(cells) and abs(cells - round(cells)) <= CELL_TOLERANCE,
-            f"domain_size ({axis})",
-            f"a whole number of cells of {first.cell_size}",
-            length,
-        )
-        smallest = 2 * config.wall_cells + 2
-        require(
-            cells >= smallest - 0.5,
-            f"domain_size ({axis})",
-            f"at least {smallest} cells: the walls, and two between them",
-            length,
-        )
-        counts.append(round(cells))
-    return counts[0], counts[1], counts[2]
+    counts = whole_cells(first.domain_size, first.cell_size)
+    smallest = 2 * config.wall_cells + 2
+    for axis, length, cells in zip("xyz", first.domain_size, counts, strict=True):
+        rule = f"at least {smallest} cells: the walls, and two between them"
+        require(cells >= smallest, f"domain_size ({axis})", rule, length)
+    return counts
 
 
 def _require_memory(device: Device, scenes: Sequence[Scene], node_counts: tuple[int, int, int]) -> None:

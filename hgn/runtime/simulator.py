@@ -33,7 +33,7 @@ from hgn.scene.history import ballistic_velocities, require_past
 from hgn.scene.material import MATERIALS
 from hgn.scene.obstacle_grid import ObstacleGrid, build_obstacle_grid
 from hgn.scene.rollout_file import known_obstacles
-from hgn.scene.scene import Scene, all_corners
+from hgn.scene.scene import Scene, all_corners, whole_cells
 from hgn.schema import require
 from hgn.system.device import choose_device
 
@@ -79,8 +79,10 @@ class InitialState:
     def of_scene(scene: Scene) -> InitialState:
         """Returns a scene's initial particles; obstacles are sampled into cells.
 
-        Raises: ConfigError where obstacles move: a network knows obstacles at rest.
+        Raises: ConfigError where obstacles move, because a network knows obstacles at rest, and for a domain that is
+        not whole solver cells, which the solver refuses too.
         """
+        whole_cells(scene.domain_size, scene.cell_size)
         remedy = "leave keyframes out, or run datagen.solve"
         require(not scene.moves, "obstacles", "at rest for a network", "keyframes", remedy=remedy)
         first = at_start(scene)

@@ -17,6 +17,24 @@ from hgn.scene.material import MATERIAL_PARAMETERS, MATERIALS, require_materials
 from hgn.scene.motion import Motion
 from hgn.schema import ConfigError, Vector, require
 
+CELL_TOLERANCE = 1e-3  # of a cell that a domain may be longer or shorter than whole cells
+
+
+def whole_cells(domain_size: Vector, cell_size: float) -> tuple[int, int, int]:
+    """Returns the number of solver cells along each side of a domain.
+
+    Raises: ConfigError for a side that is not a whole number of cells.
+    """
+    require(0 < cell_size < math.inf, "cell_size", "a finite number > 0", cell_size)
+    counts = [length / cell_size for length in domain_size]
+    for axis, length, cells in zip("xyz", domain_size, counts, strict=True):
+        whole = math.isfinite(cells) and abs(cells - round(cells)) <= CELL_TOLERANCE
+        near = round(cells) * cell_size if math.isfinite(cells) else 1.0
+        remedy = f"for example {near:.6g}"
+        require(whole, f"domain_size ({axis})", f"a whole number of cells of {cell_size:.6g}", length, remedy)
+    x, y, z = (round(cells) for cells in counts)
+    return x, y, z
+
 
 @dataclass(frozen=True, eq=False)
 class Obstacle:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,7 +24,7 @@ from hgn.scene.material import MATERIAL_PARAMETERS, MATERIALS, material_index
 from hgn.scene.motion import Motion
 from hgn.scene.npz import read_npz
 from hgn.scene.rotation import euler_rotation
-from hgn.scene.scene import Obstacle, Scene
+from hgn.scene.scene import Obstacle, Scene, whole_cells
 from hgn.scene.shapes import shape_obstacle
 from hgn.schema import (
     BoxSize,
@@ -42,6 +42,7 @@ GROUP_SHAPES = ("cube", "sphere", "box")
 EMITTER_SHAPES = ("disc", "rectangle")
 MAXIMUM_PARTICLES = 50_000_000
 MAXIMUM_NODES = 100_000  # of a scene file
+MEASURE = "measure"  # section of the files in conf/gallery that tools.stability reads
 EMITTER_STREAM = 2**31  # of random numbers, separate from those of groups
 
 
@@ -240,15 +241,20 @@ _Loader.add_implicit_resolver(
 
 
 def find_scene(name: str) -> Path:
-    """Returns the file of a path, or of an example by its name, as in `funnel`.
+    """Returns the file of a path, or of a scene in conf/example or conf/gallery by its name, as in `funnel`.
 
     Raises: ConfigError for a name without an ending that is neither a file nor an example.
     """
     if Path(name).is_file() or not re.fullmatch(r"\w+", name):
         return Path(name)
-    examples = {path.stem: path for path in sorted((config_directory() / "example").glob("*.yaml"))}
-    require(name in examples, "scene", f"a YAML file or the name of an example ({', '.join(examples)})", name)
-    return examples[name]
+    files = scene_files("example") | scene_files("gallery")
+    require(name in files, "scene", f"a YAML file or the name of an example ({', '.join(files)})", name)
+    return files[name]
+
+
+def scene_files(folder: str) -> dict[str, Path]:
+    """Returns the scene files in a folder of conf by name."""
+    return {path.stem: path for path in sorted((config_directory() / folder).glob("*.yaml"))}
 
 
 def load_scene(path: str | Path) -> Scene:
@@ -259,6 +265,11 @@ def load_scene(path: str | Path) -> Scene:
     Raises: ConfigError, starting with the path, for unknown keys, invalid values, unreadable meshes, and groups that
     reach into the solver's walls (3 cells) or into closed obstacles.
     """
+    return scene_of(read_mapping(path), path)
+
+
+def read_mapping(path: str | Path) -> dict[str, Any]:
+    """Reads the YAML of a scene file. Raises: ConfigError, starting with the path."""
     path = Path(path)
     if not path.is_file():
         raise ConfigError(f"scene must be an existing YAML file, got {path}")
@@ -266,9 +277,15 @@ def load_scene(path: str | Path) -> Scene:
         mapping = yaml.load(path.read_text(encoding="utf-8"), _Loader)
     except (yaml.YAMLError, ValueError, RecursionError) as error:  # a number of thousands of digits, nesting
         raise ConfigError(f"{path} must be a YAML file: {error}") from error
+    require(isinstance(mapping, dict), f"{path}: the file", "a mapping of keys to values, such as groups", mapping)
+    return dict(mapping)
+
+
+def scene_of(mapping: Mapping[str, Any], path: str | Path) -> Scene:
+    """Returns the scene of a file's content; meshes are found beside `path`. Raises: ConfigError as load_scene."""
+    content = {key: value for key, value in mapping.items() if key != MEASURE}
     try:
-        require(isinstance(mapping, dict), "the file", "a mapping of keys to values, such as groups", mapping)
-        return _build(from_mapping(SceneFile, mapping), path.parent)
+        return _build(from_mapping(SceneFile, content), Path(path).parent)
     except ConfigError as error:
         raise ConfigError(f"{path}: {error}") from error
 
@@ -296,6 +313,7 @@ def notes_on_meshes(scene: Scene) -> list[str]:
 
 
 def _build(file: SceneFile, folder: Path) -> Scene:
+    whole_cells(file.domain_size, file.cell_size)
     obstacles = tuple(_obstacle(entry, index, folder) for index, entry in enumerate(file.obstacles))
     stored = {i: _read_particles(entry, i, folder, file) for i, entry in enumerate(file.groups) if entry.particles}
     filling = file.particles_per_cell, file.cell_size

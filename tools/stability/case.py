@@ -9,10 +9,14 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from hgn.runtime.rollouts import RolloutResult
 from hgn.runtime.simulator import InitialState, Simulator
 from hgn.scene.scene import Scene
+
+if TYPE_CHECKING:
+    from tools.stability.gallery import GalleryCase
 
 
 @dataclass(frozen=True)
@@ -49,6 +53,8 @@ class Case:
     hole_height: float = 0.0  # of the holes' edges
     settled: int = 0  # frame from which on all particles rest
     upright: tuple[Scene, ...] = ()  # the scenes before they were turned
+    gallery: GalleryCase | None = None  # the file of a gallery scene, which has bounds instead of limits
+    references: tuple[float, ...] = ()  # the solver's figures, one for each bound of the gallery scene
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,6 +10,7 @@ import numpy as np
 
 from tools.stability.case import Case, Limit, Outcome
 from tools.stability.measures import MEASURES
+from tools.stability.observables import series
 from tools.stability.row import Row
 
 
@@ -42,9 +43,37 @@ def row_of(outcome: Outcome, more: dict[str, Any]) -> Row:
     return Row(case.name, _bound(case), value, failure is None, failure or "within all limits", row)
 
 
-def refused(case: Case, cause: str) -> Row:
-    """Returns the row of a case whose scenes the weights do not take."""
-    return Row(case.name, _bound(case), "refused", False, cause)
+def refused(case: Case, cause: str) -> list[Row]:
+    """Returns the rows of a case whose scenes the weights do not take."""
+    if case.gallery is None:
+        return [Row(case.name, _bound(case), "refused", False, cause)]
+    bounds = case.gallery.measure.bounds
+    return [Row(f"{case.name}: {bound.label}", "simulated", "refused", False, cause) for bound in bounds]
+
+
+def gallery_rows(outcome: Outcome, more: dict[str, Any]) -> list[Row]:
+    """Measures the trajectory of a gallery scene, and compares each figure with its bounds."""
+    case, gallery, trials = outcome.case, outcome.case.gallery, outcome.trials
+    assert gallery is not None
+    cause = next((trial.cause for trial in trials if trial.cause is not None), None)
+    film = gallery.film(case.scenes[0], [trial.position_TN3 for trial in trials], outcome.frame_rate_hz)
+    measured: dict[str, list[float]] = {}
+    rows = []
+    for bound, solver in zip(gallery.measure.bounds, case.references, strict=True):
+        low, high = bound.interval(solver)
+        about: dict[str, Any] = {"scene": case.name, "kind": gallery.measure.kind, "observable": bound.of}
+        about |= {"low": _finite(low), "high": _finite(high), "solver": _finite(solver)} | more
+        name, predicted = f"{case.name}: {bound.label}", interval_text(low, high)
+        if cause is not None:
+            rows.append(Row(name, predicted, "diverged", False, cause, about))
+            continue
+        if bound.key not in measured:
+            measured[bound.key] = series(film, bound)
+        figure = bound.reduced(measured[bound.key])
+        held = low <= figure <= high
+        beyond = f"{'within' if held else 'outside of'} its bounds; solver {solver:.3g}"
+        rows.append(Row(name, predicted, figure if math.isfinite(figure) else "none", held, beyond, about))
+    return rows
 
 
 def _bound(case: Case) -> float:
@@ -66,7 +95,7 @@ def violation(limit: Limit, figures: dict[str, Any], references: dict[str, Any],
         excess = max(low - value, value - high)
         if not excess <= worst:  # NaN fails
             worst = excess
-            allowed = f"must be {_interval(low, high)}"
+            allowed = f"must be {interval_text(low, high)}"
             sentence = f"{limit.measure.replace('_', ' ')}{where} {value:.3g}, {allowed}"
             sentence += f" (solver {base:.3g})" if limit.below or limit.above else ""
     return sentence
@@ -82,7 +111,8 @@ def _values(figure: Any, field: str) -> Iterator[tuple[str, float]]:
             yield f" ({', '.join(places)})" if places else "", record[field]
 
 
-def _interval(low: float, high: float) -> str:
+def interval_text(low: float, high: float) -> str:
+    """Returns two bounds in words."""
     if low == -math.inf:
         return f"at most {high:.3g}"
     return f"at least {low:.3g}" if high == math.inf else f"{low:.3g} to {high:.3g}"

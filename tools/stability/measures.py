@@ -40,6 +40,44 @@ def energy_growth(outcome: Outcome) -> float:
     return max(growths)
 
 
+def energy_rise(outcome: Outcome) -> float:
+    """Returns the largest increase of kinetic and potential energy from any earlier frame, scaled as `energy_growth`.
+
+    Elastic energy is not included, so that a body that bounces has a rise of its own; limits add the solver's.
+    """
+    rises = [0.0]
+    for trial, scene in zip(outcome.trials, outcome.scenes, strict=True):
+        gravity_3 = np.asarray(scene.gravity, np.float64) / outcome.frame_rate_hz**2
+        energy_T = energies(trial.position_TN3, gravity_3)
+        if len(energy_T):
+            rise = float((energy_T - np.minimum.accumulate(energy_T)).max())
+            rises.append(rise / energy_scale(gravity_3, scene.domain_size))
+    return max(rises)
+
+
+def kinetic_change(outcome: Outcome) -> float:
+    """Returns the largest change of the kinetic energy, free of gravity and contact, as a fraction of the first."""
+    changes = []
+    for trial, scene in zip(outcome.trials, outcome.scenes, strict=True):
+        started = float((scene.velocity_N3.astype(np.float64) ** 2).sum(axis=1).mean())
+        energy_T = 2 * outcome.frame_rate_hz**2 * energies(trial.position_TN3, np.zeros(3))
+        changes.append(energy_T[np.abs(energy_T - started).argmax()] / started - 1)
+    return float(max(changes, key=abs))
+
+
+def far_effect(outcome: Outcome) -> float | None:
+    """Returns the largest root mean square distance, in obstacle cells, between a body alone and with another far away.
+
+    The first scene contains the body, the second one also the other.
+    """
+    if not outcome.complete:
+        return None
+    (alone, together), scene = outcome.trials, outcome.scenes[0]
+    own = slice(len(scene.position_N3))
+    way_TN3 = together.position_TN3[:, own].astype(np.float64) - alone.position_TN3
+    return float(np.sqrt(np.square(way_TN3).sum(axis=2).mean(axis=1)).max()) / scene.obstacle_grid.cell_size
+
+
 def outside(outcome: Outcome) -> float:
     """Returns the largest fraction of a scene's particles that end outside of the domain."""
     pairs = zip(outcome.trials, outcome.scenes, strict=True)
@@ -158,7 +196,7 @@ def turned_ratio(outcome: Outcome) -> float | None:
 
 
 def collapse(outcome: Outcome) -> list[dict[str, float]] | None:
-    """Returns spread and mean height, in obstacle cells, of each scene in `at_frames`.
+    """Returns spread and mean height, in obstacle cells, and neighbours within a cell, of each scene in `at_frames`.
 
     The spread is the root mean square distance from the mean along x and z.
     """
@@ -169,7 +207,8 @@ def collapse(outcome: Outcome) -> list[dict[str, float]] | None:
         for frame in outcome.case.at_frames:
             place_N3 = trial.position_TN3[frame].astype(np.float64) / scene.obstacle_grid.cell_size
             spread = float(np.sqrt(0.5 * place_N3[:, [0, 2]].var(axis=0).sum()))
-            rows.append({"scene": number, "frame": frame, "spread": spread, "height": float(place_N3[:, 1].mean())})
+            own = {"spread": spread, "height": float(place_N3[:, 1].mean()), "neighbours": neighbours(place_N3, 1.0)}
+            rows.append({"scene": number, "frame": frame} | own)
     return rows
 
 
@@ -227,12 +266,13 @@ def pull(outcome: Outcome) -> list[float | None]:
 def rest(outcome: Outcome) -> dict[str, float] | None:
     """Measures the particles of all scenes from frame `settled` to the end, lengths in obstacle cells.
 
-    Returns the root mean square displacement, the mean heights at both frames, the ratio of neighbours within a cell,
-    and the mean squared speed about each scene's mean in the last STIR_FRAMES, (domain units per second)².
+    Returns the root mean square displacement, the mean heights at both frames, the neighbours within a cell at the end
+    and their ratio to those before, the spread at the end along x and z, and the mean squared speed about each scene's
+    mean in the last STIR_FRAMES, (domain units per second)².
     """
     if not outcome.complete:
         return None
-    moved, heights, counts, speeds = [], [], [], []
+    moved, heights, counts, speeds, spreads = [], [], [], [], []
     for trial, scene in zip(outcome.trials, outcome.scenes, strict=True):
         cell = scene.obstacle_grid.cell_size
         last_TN3 = trial.position_TN3[-STIR_FRAMES - 1 :].astype(np.float64)
@@ -241,6 +281,7 @@ def rest(outcome: Outcome) -> dict[str, float] | None:
         pair_2N3 = trial.position_TN3[[outcome.case.settled, -1]].astype(np.float64) / cell
         moved.append(np.square(pair_2N3[1] - pair_2N3[0]).sum(axis=1))
         heights.append(pair_2N3[..., 1])
+        spreads.append(0.5 * pair_2N3[1][:, [0, 2]].var(axis=0).sum())
         counts.append([neighbours(place_N3, 1.0) * len(place_N3) for place_N3 in pair_2N3])
     before, after = np.concatenate(heights, axis=1).mean(axis=1)
     first, last = np.sum(counts, axis=0)
@@ -249,12 +290,17 @@ def rest(outcome: Outcome) -> dict[str, float] | None:
         "height_before": float(before),
         "height": float(after),
         "density": float(last / max(first, 1.0)),
+        "neighbours": float(last / np.concatenate(heights, axis=1).shape[1]),
+        "spread": float(np.sqrt(np.mean(spreads))),
         "squared_speed": float(np.concatenate(speeds).mean()),
     }
 
 
 MEASURES: dict[str, Callable[[Outcome], Any]] = {
     "energy_growth": energy_growth,
+    "energy_rise": energy_rise,
+    "kinetic_change": kinetic_change,
+    "far_effect": far_effect,
     "outside_domain": outside,
     "share_of_way": share_of_way,
     "throws": throws,

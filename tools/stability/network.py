@@ -25,17 +25,21 @@ from hgn.runtime.rollouts import RolloutResult, simulate_scenes
 from hgn.runtime.simulator import InitialState, Simulator
 from hgn.scene.rollout_file import Rollout
 from hgn.scene.scene import Scene
-from hgn.schema import ConfigError, FrameCount, from_mapping, one_of, require_bounds, to_mapping
+from hgn.schema import Bound, ConfigError, FrameCount, from_mapping, require_bounds, to_mapping
 from tools.report import meta_of
 from tools.solver_rollouts import solver_trials
 from tools.stability.case import Case, Outcome, cut
-from tools.stability.checks import refused, row_of
+from tools.stability.checks import gallery_rows, refused, row_of
+from tools.stability.gallery import gallery_cases, is_gallery
 from tools.stability.network_cases import FAMILIES, Context, body
 from tools.stability.row import Report, Row, table
 from tools.timing import FrameClock
 
 GUARD = "guard"
 CASES = (*FAMILIES, GUARD)
+CaseName = Annotated[
+    str, Bound(f"one of {', '.join(CASES)}, gallery, gallery_NUMBER", lambda n: n in CASES or is_gallery(n))
+]
 PICTURES, PICTURE_SIZE = 4, 300  # frames of each case; width of a frame in pixels
 LONGEST = 100.0  # domain that is drawn whole, in heights
 DRAWN_EVERY_S = 5.0  # the picture of all cases so far takes longer with each
@@ -48,8 +52,10 @@ class StabilityNetworkConfig(SimulatorConfig):
     """The options of `python -m tools.stability network`."""
 
     weights: str = DEFAULT_WEIGHTS  # a file of python -m hgn.export, or the name of shipped weights
-    # throw, gravity, collision, collapse, hole, rest, particles, domain, speed, single, slope, far, guard; null: all
-    cases: tuple[Annotated[str, one_of(*CASES)], ...] | None = None
+    # throw, gravity, collision, apart, collapse, hole, rest, particles, domain, speed, single, slope, far, guard;
+    # null: all of these. gallery: the scenes of conf/gallery beside the solver's figures; gallery_1: the draw for
+    # choices; gallery_2: the draw for reports; gallery_NUMBER: another draw
+    cases: tuple[CaseName, ...] | None = None
     frames: FrameCount = 300  # of each rollout
     long_frames: FrameCount = 3000  # of the case rest
     # false: without the solver, which needs Taichi; collapse, hole and rest are left out, slope and collision have
@@ -75,20 +81,20 @@ def main(mapping: dict[str, Any]) -> int:
     cases = cases_of(config, simulator)
     mpm = replace(config.mpm, device=simulator.device.type) if config.solver else None
     runner = Runner(simulator, cases, mpm)
-    gallery = Gallery(config.picture, simulator, report.meta["weights"])
+    pictures = Pictures(config.picture, simulator, report.meta["weights"])
     if cases:
         compile_kernels(simulator, cases, config.precision)
     report.meta["seconds_before_cases"] = time.monotonic() - started
     for case in cases:
-        row, trials = runner.row(case)
-        report.add([row])
+        rows, trials = runner.rows(case)
+        report.add(rows)
         if case.reported is None and trials:
-            gallery.add(case, trials[0])
+            pictures.add(case, trials[0])
     if GUARD in wanted:
         report.add([guard_row(simulator, config.scene)])
     report.meta["seconds"] = time.monotonic() - started
     report.write()
-    gallery.write()
+    pictures.write()
     print(table(report.rows))
     return 0
 
@@ -100,7 +106,8 @@ def cases_of(config: StabilityNetworkConfig, simulator: Simulator) -> list[Case]
         config.solver,
     )  # fmt: skip
     wanted = config.cases or CASES
-    return [case for name, family in FAMILIES.items() if name in wanted for case in family(context)]
+    cases = [case for name, family in FAMILIES.items() if name in wanted for case in family(context)]
+    return cases + [case for name in wanted if is_gallery(name) for case in gallery_cases(name)]
 
 
 def _meta(config: StabilityNetworkConfig, simulator: Simulator) -> dict[str, Any]:
@@ -136,12 +143,12 @@ class Runner:
             for scene in (*(case.scenes if case.solver else ()), *case.upright):
                 self._to_solve.setdefault(case.frames, {})[id(scene)] = scene
 
-    def row(self, case: Case) -> tuple[Row, Sequence[RolloutResult]]:
-        """Returns a case's row and the network's trajectories."""
+    def rows(self, case: Case) -> tuple[list[Row], Sequence[RolloutResult]]:
+        """Returns a case's rows, one but for gallery scenes, and the network's trajectories."""
         backend, clock = self.simulator.backend, FrameClock()
         started, growths, compiled = time.monotonic(), backend.growths, self.compiled()
-        initial = [InitialState.of_scene(scene) for scene in case.scenes]
         try:
+            initial = [InitialState.of_scene(scene) for scene in case.scenes]
             trials = simulate_scenes(self.simulator, initial, case.frames, clock)
         except ConfigError as refusal:
             return refused(case, str(refusal)), []
@@ -155,7 +162,8 @@ class Runner:
         more: dict[str, Any] = {"growths": backend.growths - growths, "kernels_compiled": self.compiled() - compiled}
         more |= {"ms": clock.milliseconds()} if case.reported is None else {}
         more["seconds"] = time.monotonic() - started
-        return row_of(Outcome(case, initial, trials, self.simulator, solver, upright), more), trials
+        outcome = Outcome(case, initial, trials, self.simulator, solver, upright)
+        return (gallery_rows(outcome, more) if case.gallery else [row_of(outcome, more)]), trials
 
     def _straight(self, case: Case) -> list[RolloutResult]:
         if id(case.upright) not in self._upright:
@@ -182,7 +190,7 @@ def _compiled_kernels(backend: str) -> Callable[[], int]:
     return lambda: misses.count
 
 
-class Gallery:
+class Pictures:
     """Draws frames of each case's first scene into one picture."""
 
     def __init__(self, file: str | None, simulator: Simulator, weights: str) -> None:

@@ -15,10 +15,12 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from hgn.config import MpmConfig
-from hgn.schema import from_mapping, one_of, require, require_bounds, to_mapping
+from hgn.schema import Bound, from_mapping, require, require_bounds, to_mapping
 from tools.report import ReportConfig, meta_of
+from tools.stability.gallery import is_gallery
 from tools.stability.row import Report, Row, table
 from tools.stability.solver_contact import contacts
+from tools.stability.solver_gallery import broken_table, gallery_rows
 from tools.stability.solver_leak import leaks
 from tools.stability.solver_loads import convergence, impacts, long_run, stiffnesses
 from tools.stability.solver_steps import Point, draw, largest_steps
@@ -28,14 +30,18 @@ NAMES = (
     *("steps", "stiffness", "impact", "convergence", "contact", "leak"),
     *("long", "rest", "dam", "column", "repose", "grid"),
 )
+CaseName = Annotated[
+    str, Bound(f"one of {', '.join(NAMES)}, gallery, gallery_NUMBER", lambda n: n in NAMES or is_gallery(n))
+]
 
 
 @dataclass(frozen=True)
 class StabilitySolverConfig(ReportConfig):
     """The options of `python -m tools.stability solver`."""
 
-    # steps, stiffness, impact, convergence, contact, leak, long, rest, dam, column, repose, grid; null: all
-    cases: tuple[Annotated[str, one_of(*NAMES)], ...] | None = None
+    # steps, stiffness, impact, convergence, contact, leak, long, rest, dam, column, repose, grid; null: all of these.
+    # gallery: the scenes of conf/gallery, which networks are compared with; gallery_NUMBER: a draw of them
+    cases: tuple[CaseName, ...] | None = None
     # resolutions of the case grid: cells in the width of dams, the radius of columns and the side of blocks. A domain
     # is about four times as wide; 32 cells need a GPU
     grid_cells: tuple[int, ...] = (8, 12, 16)
@@ -63,11 +69,16 @@ def main(mapping: dict[str, Any]) -> int:
         "convergence": convergence, "contact": contacts, "leak": leaks, "long": long_run, "rest": rest,
         "dam": dam_breaks, "column": columns, "repose": reposes, "grid": partial(grids, cells=config.grid_cells),
     }  # fmt: skip
-    report = Report("solver", meta, config.json, steps=points)
+    scenes: dict[str, Any] = {}
+    report = Report("solver", meta, config.json, steps=points, scenes=scenes)
     for name in NAMES:
         if config.cases is None or name in config.cases:
             report.add(cases[name](mpm))
+    for name in filter(is_gallery, config.cases or ()):
+        report.add(gallery_rows(name, mpm, scenes))
     print(table(report.rows))
+    if scenes:
+        print(broken_table(report.rows))
     if config.picture is not None:
         draw(points, mpm, Path(config.picture))
     return 0

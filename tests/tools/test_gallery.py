@@ -1,0 +1,273 @@
+"""The gallery: observables against closed forms, broken trajectories, files, and both commands."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import yaml
+from docs.pages import run_module
+from network.states import network_of
+
+from hgn.runtime.rollouts import RolloutResult
+from hgn.runtime.weights import WeightsInfo, save_weights
+from hgn.scene.scene_file import scene_files
+from hgn.schema import ConfigError
+from tools import render
+from tools.scenes import filled
+from tools.stability import gallery, network, solver
+from tools.stability.broken import BROKEN
+from tools.stability.gallery import load_case, load_gallery
+from tools.stability.observables import OBSERVABLES, BoundEntry, Film, period, series
+
+TINY = """
+domain_size: [0.25, 0.25, 0.25]
+particles_per_cell: 1
+groups:
+  - {shape: cube, size: 0.04, position: [0.125, 0.12, 0.125], material: water}
+  - {shape: cube, size: 0.03, position: [0.075, 0.12, 0.075], material: water}
+measure:
+  kind: drop
+  frames: 11
+  vary:
+    - {range: [-0.01, 0.01], add: {groups.0.position.1: 1, groups.1.size: 0.5}}
+  far: {shape: cube, size: 0.03, position: [0.185, 0.12, 0.185], material: water}
+  bounds:
+    - {of: height, frames: [5, 10], times: [0.95, 1.05]}
+    - {of: centre, group: 1, frames: [5, 10], within: 0.003}
+    - {of: far_effect, frames: [10, 10], between: [0, 0.5]}
+"""
+
+
+def tiny_file(folder, **changes):
+    """The tiny scene with other fields of `measure`."""
+    content = yaml.safe_load(TINY)
+    content["measure"] |= changes
+    path = folder / "tiny.yaml"
+    path.write_text(yaml.safe_dump({k: v for k, v in content.items() if v is not None}))
+    return path
+
+
+def still_weights(folder):
+    """A file of a network that never accelerates particles."""
+    still = network_of(torch.float32, width=8, message_passing_steps=1, levels=2)
+    with torch.no_grad():
+        still.decode.second.weight.zero_()
+        still.decode.second.bias.zero_()
+    still.normaliser.acceleration_mean.zero_()
+    save_weights(folder / "still.safetensors", still, WeightsInfo(still.config, 60.0, 1 / 64, updates=3))
+    return str(folder / "still.safetensors")
+
+
+def film_of(path_TN3, **more):
+    """A film of three particles of the tiny scene's kind."""
+    scene = filled(0, path_TN3[0], (0.0, 0.0, 0.0), domain_size=(0.25,) * 3, particles_per_cell=1.0)
+    return Film(scene, path_TN3.astype(np.float32), 60.0, 1 / 64, 1.0, **more)
+
+
+def bound_of(of, **more):
+    return BoundEntry(**({"of": of, "frames": (5, 5), "between": (0.0, 1.0)} | more))
+
+
+def test_observables():
+    """Figures of three particles that fall freely and move along x, from formulas."""
+    start_N3 = np.array([[0.10, 0.20, 0.10], [0.11, 0.20, 0.10], [0.15, 0.20, 0.10]])
+    time_T11 = np.arange(11)[:, None, None] / 60
+    fall_TN3 = start_N3 + time_T11 * np.array([0.3, 0.0, 0.0]) + 0.5 * time_T11**2 * np.array([0.0, -9.8, 0.0])
+    film, x = film_of(fall_TN3, beside_far_TN3=fall_TN3 + np.array([0.0, 0.0, 1 / 64])), 0.12 + 5 / 60 * 0.3
+    height, speed = 0.2 - 0.5 * 9.8 * (5 / 60) ** 2, 9.8 * 4.5 / 60
+    expected = {
+        "height": 64 * height, "top": 64 * height, "crowding": 2 / 3, "centre": x, "front": x + 0.0292,
+        "spread": np.sqrt(0.5 * np.var([0.1, 0.11, 0.15])), "squared_speed": 0.3**2 + speed**2, "far_effect": 1.0,
+        "momentum": 0.3, "displacement": 64 * np.hypot(5 / 60 * 0.3, 0.2 - height),
+        "energy_gain": 0.5 * 0.3**2 - 0.5 * (9.8 / 120) ** 2,
+    }  # fmt: skip
+    for name, value in expected.items():
+        assert series(film, bound_of(name))[0] == pytest.approx(value, rel=1e-3), name
+    assert series(film, bound_of("moved", along=(2.0, 0, 0)))[0] == pytest.approx(5 / 60 * 0.3, rel=1e-3)
+    assert series(film, bound_of("moved", along=(2.0, 0, 0), since=5))[1] == pytest.approx(5 / 60 * 0.3, rel=1e-3)
+    assert series(film, bound_of("below", at=0.19)) == [1.0, 1.0]
+    assert series(film, bound_of("beyond", at=0.14))[0] == pytest.approx(1 / 3)
+    assert {*expected, "moved", "below", "beyond"} == OBSERVABLES.keys()
+
+
+def test_figures_of_series():
+    """Means, extremes, swing and period of a wave; a creeping series has no period."""
+    wave = np.sin(2 * np.pi * 5 * np.arange(1, 41) / 60)
+    bound = bound_of("centre", take="period", frames=(5, 200))
+    assert bound.reduced(wave) == pytest.approx(60, rel=0.02)
+    assert np.isnan(period(np.linspace(0.0, 1.0, 20)))
+    bound = bound_of("centre", take="swing", frames=(10, 20))
+    assert bound.reduced([0.0, 3.0, 5.0, 4.0, 9.0]) == 2.0
+    relative = bound_of("centre", between=None, times=(0.9, 1.2), within=0.5)
+    assert relative.interval(10.0) == (8.5, 12.5) and relative.interval(-10.0) == (-12.5, -8.5)
+    assert bound_of("centre", between=(-1.0, 2.0)).interval(7.0) == (-1.0, 2.0)
+
+
+def test_broken_trajectories():
+    """Each changes a falling, moving body in its own way and leaves the first frame where it is, but for its shape."""
+    path_TN3 = np.random.default_rng(0).random((1, 50, 3)) * 0.1 + 0.08
+    path_TN3 = (path_TN3 + np.arange(31)[:, None, None] * np.array([0.001, -0.001, 0.0])).astype(np.float32)
+    scene = film_of(path_TN3).scene
+    wrong = {name: change(path_TN3, scene, 60.0) for name, change in BROKEN.items()}
+    assert (wrong["frozen"] == path_TN3[0]).all()
+    np.testing.assert_allclose(wrong["delayed"][20], path_TN3[10], atol=1e-6)
+    np.testing.assert_allclose(wrong["hurried"][[10, 30]], path_TN3[[20, 30]], atol=1e-6)
+    assert wrong["compressed"][5, 0, 1] - 0.03125 == pytest.approx(0.6 * (path_TN3[5, 0, 1] - 0.03125), rel=1e-3)
+    assert wrong["squeezed"][5].std() < path_TN3[5].std()
+    np.testing.assert_allclose(wrong["drifting"][30] - path_TN3[30], np.tile([0.025, 0, 0.01], (50, 1)), atol=1e-6)
+    assert 0.1 < 64 * (wrong["stirred"][5] - path_TN3[5]).std() < 0.2
+    path_TN3[:5, 3] = np.nan  # enters in frame 5
+    assert np.isnan(BROKEN["frozen"](path_TN3, scene, 60.0)[:5, 3]).all()
+
+
+@pytest.mark.parametrize("draw", [0, 1, 2])
+def test_gallery_files(draw):
+    """The gallery has 28 scenes and more in 12 kinds and more; all rows have two bounds; draws differ."""
+    cases = load_gallery(f"gallery_{draw}" if draw else "gallery")
+    assert len(cases) >= 28 and len({case.measure.kind for case in cases}) >= 12
+    for case in cases:
+        lines = case.file.read_text().splitlines()
+        assert lines[0].startswith("# ") and max(map(len, lines)) <= 140, case.name
+        assert all(-np.inf < low <= high < np.inf for low, high in (b.interval(1.0) for b in case.measure.bounds))
+        sides = [length * cells for length in case.scenes[0].domain_size for cells in gallery.GRID_CELLS]
+        assert all(side == round(side) for side in sides), f"{case.name}: whole cells on both grids"
+    if draw:
+        same = [case.name for case in cases if case.digest == load_case(case.name, case.file).digest]
+        assert not same and all(case.content["seed"] == draw for case in cases)
+
+
+@pytest.mark.parametrize(
+    ("bounds", "message"),
+    [
+        ([], "measure.bounds must be at least one, got []"),
+        ([{"of": "hight"}], "measure.bounds[0].of must be one of height, "),
+        ([{"of": "energy_gain", "group": 2}], "measure.bounds[0].group must be one of the 2 groups"),
+        ([{"of": "far_effect"}], "measure.bounds[0].of must be measured in scenes with a body in measure.far"),
+        ([{"of": "height", "frames": [5, 15]}], "measure.bounds[0].frames must be below frames (11), got 15"),
+        ([{"of": "height", "frames": [4, 10]}], "measure.bounds[0].frames must be two multiples of 5 in order"),
+        ([{"of": "height", "between": None}], "measure.bounds[0].between must be given, or else times or within"),
+        ([{"of": "height", "within": 1.0}], "measure.bounds[0].between must be given, or else times or within"),
+        ([{"of": "height", "between": [2, 1]}], "measure.bounds[0].between must be finite and in order"),
+        ([{"of": "height", "at": 0.5}], "measure.bounds[0].at must be left out, got 0.5"),
+        ([{"of": "below"}], "measure.bounds[0].at must be given with below, got None"),
+        ([{"of": "height", "since": 5}], "measure.bounds[0].since must be left out except with moved"),
+        ([{"of": "height", "take": "median"}], "measure.bounds[0].take must be one of mean, max"),
+        ([{"of": "height", "upper": 1}], "measure.bounds[0].upper is not a known key"),
+    ],
+)
+def test_bad_files(tmp_path, bounds, message):
+    """A mistake in a gallery file is one line that starts with the file."""
+    whole = [{"frames": [5, 10], "between": [0, 1]} | bound for bound in bounds]
+    whole = [{k: v for k, v in bound.items() if v is not None} for bound in whole]
+    path = tiny_file(tmp_path, bounds=whole, far=None)
+    with pytest.raises(ConfigError) as error:
+        load_case("tiny", path)
+    assert str(error.value).startswith(f"{path}: {message}") and "\n" not in str(error.value)
+
+
+def test_files_without_measure_and_wrong_places(tmp_path):
+    """A scene file without `measure`, and a variation of a value that is not there, are refused by file and place."""
+    path = tmp_path / "plain.yaml"
+    path.write_text(TINY[: TINY.index("measure:")])
+    with pytest.raises(ConfigError, match=r"plain.yaml: measure must be a section with frames and bounds"):
+        load_case("plain", path)
+    outside = {"shape": "cube", "size": 0.03, "position": [0.2, 0.12, 0.2], "material": "water"}
+    path = tiny_file(tmp_path, far=outside)
+    with pytest.raises(ConfigError, match=r"tiny.yaml: measure.far: groups\[0\] \(cube of water\) must lie between"):
+        load_case("tiny", path)
+    path = tiny_file(tmp_path, vary=[{"range": [0, 1], "add": {"groups.7.size": 1}}])
+    with pytest.raises(ConfigError, match=r"tiny.yaml: measure.vary\[0\].add must be places .*, got groups.7.size"):
+        load_case("tiny", path)
+
+
+def test_draws(tmp_path):
+    """A draw changes coupled values by factors of one number, is the same each time, and has its own seed."""
+    path = tiny_file(tmp_path)
+    first, again, other = (load_case("tiny", path, draw).content for draw in (1, 1, 2))
+    assert first == again and first["seed"] == 1
+    change = first["groups"][0]["position"][1] - 0.12
+    assert 0 < abs(change) <= 0.01 and first["groups"][1]["size"] - 0.03 == pytest.approx(0.5 * change)
+    assert other["groups"][0]["position"][1] != first["groups"][0]["position"][1]
+
+
+def test_both_commands(tmp_path, monkeypatch, capsys):
+    """The solver writes figures on both grids and the table of broken trajectories; a network is compared with them.
+
+    A network that holds particles still fails, a changed scene is refused, a changed bound is not.
+    """
+    path = tiny_file(tmp_path)
+    monkeypatch.setattr(gallery, "scene_files", lambda folder: {"tiny": path})
+    monkeypatch.setattr(gallery, "REFERENCE", tmp_path)
+    json_file = tmp_path / "gallery_solver.json"
+    options = {"weights": still_weights(tmp_path), "device": "cpu", "cases": ["gallery"]}
+    with pytest.raises(
+        ConfigError, match=r"gallery only where .*gallery_solver.json .*; run python -m tools.stability"
+    ):
+        network.main(options)
+    assert solver.main({"cases": ["gallery"], "device": "cpu", "json": str(json_file)}) == 0
+    report = json.loads(json_file.read_text())
+    rows = report["rows"]
+    assert [row["case"] for row in rows] == [
+        "tiny: height, frames 5 to 10", "tiny: centre, group 1, frames 5 to 10", "tiny: far_effect, frame 10"
+    ]  # fmt: skip
+    assert all(set(row["solver"]) == {"64", "96"} and set(row["broken"]) == set(BROKEN) for row in rows)
+    assert rows[0]["held"] and {"frozen", "compressed"} <= set(rows[0]["caught"])
+    assert rows[1]["held"] and "drifting" in rows[1]["caught"]
+    printed = capsys.readouterr().out
+    assert "| frozen" in printed and "fails, as it should" in printed
+    own = report["scenes"]["tiny"]
+    assert own["kind"] == "drop" and len(own["series"]["64"]["height"].split()) == 2
+    shown = tmp_path / "network.json"
+    assert network.main(options | {"json": str(shown)}) == 0
+    judged = {row["case"]: row for row in json.loads(shown.read_text())["rows"]}
+    assert list(judged) == [row["case"] for row in rows]
+    assert not judged["tiny: height, frames 5 to 10"]["held"]
+    assert judged["tiny: far_effect, frame 10"]["measured"] == 0.0
+    assert judged["tiny: height, frames 5 to 10"]["solver"] == pytest.approx(rows[0]["solver"]["64"], rel=1e-3)
+    tiny_file(tmp_path, bounds=[{"of": "height", "frames": [10, 10], "within": 90.0}])
+    assert network.main(options | {"json": str(shown)}) == 0
+    assert [row["held"] for row in json.loads(shown.read_text())["rows"]] == [True]
+    tiny_file(tmp_path, far=None, bounds=[{"of": "height", "frames": [10, 10], "within": 90.0}])
+    with pytest.raises(ConfigError, match=r"tiny.yaml must be as it was when gallery_solver.json was measured"):
+        network.main(options)
+
+
+def test_a_scene_is_drawn_beside_the_solver(tmp_path, monkeypatch, capsys):
+    """One command simulates a gallery scene with the solver and with weights, and draws both."""
+    path, weights = tiny_file(tmp_path), still_weights(tmp_path)
+    monkeypatch.setattr(render, "scene_files", lambda folder: {"tiny": path})
+
+    def falls(scenes, config, frames, rate_hz):
+        time_T11 = np.arange(frames)[:, None, None] / rate_hz
+        falls_T3 = 0.5 * time_T11**2 * np.array(scenes[0].gravity)
+        return [RolloutResult((scenes[0].position_N3 + falls_T3).astype(np.float32))]
+
+    monkeypatch.setattr("tools.solver_rollouts.solver_trials", falls)
+    options = {"rollout": "tiny", "others": [weights], "out": str(tmp_path / "pictures"), "every": 5, "size": 64}
+    assert render.main(options) == 0
+    drawn = [Path(line).name for line in capsys.readouterr().out.splitlines()]
+    assert drawn == ["tiny.png", "tiny.gif", "tiny_error.png"]
+    assert render.main(options | {"others": [], "out": str(tmp_path / "solver.png")}) == 0
+    monkeypatch.setattr("tools.solver_rollouts.solver_trials", lambda *_: [RolloutResult(np.zeros((1, 1, 3)), "burst")])
+    with pytest.raises(ConfigError, match=r"tiny.yaml must be a scene that the solver keeps together, got burst"):
+        render.main(options)
+
+
+def test_a_mistake_ends_with_code_2(capsys):
+    """Cases are gallery or gallery_NUMBER; anything else is one line and exit code 2."""
+    assert run_module("tools.stability", ["solver", "cases=[galery]"]) == 2
+    refused = capsys.readouterr().err
+    assert refused.startswith("error: cases[0] must be one of steps, ") and refused.count("\n") == 1
+
+
+def test_scenes_load_as_scene_files():
+    """Commands that take scene files find the gallery's by name and ignore `measure`."""
+    from hgn.scene.scene_file import find_scene, load_scene
+
+    names = scene_files("gallery")
+    assert not names.keys() & scene_files("example").keys()
+    assert find_scene("pool_medium") == names["pool_medium"]
+    assert load_scene(find_scene("pool_medium")).particle_count == 6022
+    assert Path(names["torus"]).with_suffix(".obj").is_file()
