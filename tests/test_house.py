@@ -16,8 +16,8 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 27_269,
-    "datagen": 8_494,
+    "hgn": 27_260,
+    "datagen": 8_480,
     "tools": 7_115,
     "tests": 27_998,
 }
@@ -36,7 +36,7 @@ MANY_PARAMETERS: dict[str, int] = {}
 MANY_POSITIONAL_ARGUMENTS: dict[str, int] = {}
 
 HEADLESS = re.compile(r"(What|Of|Whether|That|Those|These|How|Which|Whose|Where)\b")
-HEADLESS_DOCSTRINGS = {"hgn": 0, "datagen": 0, "tools": 0}
+HEADLESS_DOCSTRINGS = {"hgn": 0, "datagen": 0, "tools": 1}
 
 UNCOMMENTED: set[str] = set()
 UNMENTIONED: set[str] = set()

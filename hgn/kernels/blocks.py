@@ -1,8 +1,8 @@
-"""What the kernels share: matrix products at a chosen precision, layer normalisation and its gradient.
+"""Functions that kernels share: matrix products at a chosen precision, layer normalisation and its gradient.
 
-Precision is a compile-time name: "tf32" rounds operands to 10 bits of mantissa with float32's range (weights come
-rounded, see nearest_tf32), "fp16" to 10 bits with float16's range, "fp32" not at all, for tests.
-Sums are float32 always.
+Precision is a compile-time name: "tf32" rounds operands to 10 bits of mantissa with float32's range (weights are
+rounded before, see nearest_tf32), "fp16" to 10 bits with float16's range, "fp32" (for tests) does not round.
+Sums are always float32.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ def elements(row, WIDTH: tl.constexpr, WIDE: tl.constexpr):
 
 @triton.jit
 def nearest_tf32(x):
-    """float32 rounded to 10 bits of mantissa, ties away from zero, as cvt.rna does.
+    """Returns float32 rounded to 10 bits of mantissa, ties away from zero, like cvt.rna.
 
-    The matrix units drop the other bits, which alone would make every operand too small by 2^-12 on average.
+    The matrix units only drop the other bits, which would make every operand too small by 2^-12 on average.
     """
     bits = x.to(tl.int32, bitcast=True)
     rounded = ((bits + 0x1000) & -0x2000).to(tl.float32, bitcast=True)
@@ -41,7 +41,7 @@ def nearest_tf32(x):
 
 @triton.jit
 def product(x, w, PRECISION: tl.constexpr, total=None):
-    """x [R, K] @ w [K, N] in float32 accumulation, added to the float32 `total` if there is one."""
+    """Returns x [R, K] @ w [K, N] in float32 accumulation, added to the float32 `total` if it is given."""
     if PRECISION == "fp16":
         result = tl.dot(x.to(tl.float16), w.to(tl.float16), total)
     elif PRECISION == "tf32":
@@ -53,9 +53,9 @@ def product(x, w, PRECISION: tl.constexpr, total=None):
 
 @triton.jit
 def finer_product(x, w, PRECISION: tl.constexpr):
-    """The same for float32 operands of moderate size, to 20 bits where `product` keeps 10: three products in float16.
+    """Does the same for float32 operands of moderate size, to 20 bits instead of 10, by three products in float16.
 
-    An operand is a float16 and the float16 of what that leaves.
+    An operand is the sum of a float16 and the float16 of the rest.
     """
     if PRECISION == "fp16" or PRECISION == "tf32":
         x_high, w_high = x.to(tl.float16), w.to(tl.float16)
@@ -71,9 +71,9 @@ def finer_product(x, w, PRECISION: tl.constexpr):
 
 @triton.jit
 def weighted_sums(w, x, PRECISION: tl.constexpr):
-    """w [S, R] @ x [R, W]: S sums of x's rows, in float32 of operands rounded as those of `product`.
+    """Returns w [S, R] @ x [R, W]: S sums of x's rows, in float32 of operands rounded as those of `product`.
 
-    Sums inside a tile run on the matrix units: as reductions they pass the rows from thread to thread.
+    Sums inside a tile run on the matrix units; reductions would pass the rows from thread to thread.
     """
     if PRECISION == "fp16":
         result = tl.dot(w.to(tl.float16), x.to(tl.float16))
@@ -86,13 +86,13 @@ def weighted_sums(w, x, PRECISION: tl.constexpr):
 
 @triton.jit
 def members(SUMS: tl.constexpr, ROWS: tl.constexpr, EACH: tl.constexpr):
-    """[SUMS, ROWS]: one where a row is among the EACH of a sum, else zero."""
+    """Returns [SUMS, ROWS]: one for the EACH rows of a sum, else zero."""
     return tl.where(tl.arange(0, ROWS)[None, :] // EACH == tl.arange(0, SUMS)[:, None], 1.0, 0.0)
 
 
 @triton.jit
 def matrix(pointer, ROWS: tl.constexpr, COLUMNS: tl.constexpr):
-    """The row-major matrix [ROWS, COLUMNS] at `pointer`."""
+    """Loads the row-major matrix [ROWS, COLUMNS] at `pointer`."""
     row = tl.arange(0, ROWS)
     column = tl.arange(0, COLUMNS)
     return tl.load(pointer + row[:, None] * COLUMNS + column[None, :])
@@ -100,7 +100,7 @@ def matrix(pointer, ROWS: tl.constexpr, COLUMNS: tl.constexpr):
 
 @triton.jit
 def transposed(pointer, ROWS: tl.constexpr, COLUMNS: tl.constexpr):
-    """The transpose [COLUMNS, ROWS] of the row-major matrix [ROWS, COLUMNS] at `pointer`."""
+    """Loads the transpose [COLUMNS, ROWS] of the row-major matrix [ROWS, COLUMNS] at `pointer`."""
     row = tl.arange(0, ROWS)
     column = tl.arange(0, COLUMNS)
     return tl.load(pointer + row[None, :] * COLUMNS + column[:, None])
@@ -108,11 +108,11 @@ def transposed(pointer, ROWS: tl.constexpr, COLUMNS: tl.constexpr):
 
 @triton.jit
 def vectors(pointer, at_0, at_1, at_2, at_3, at_4, WIDTH: tl.constexpr):
-    """Up to five vectors [WIDTH], as rows of a matrix [8, WIDTH] from which `vector` takes them, for a loop over tiles;
-    zeros where the place is below zero.
+    """Loads up to five vectors [WIDTH], as rows of a matrix [8, WIDTH] for `vector`, in a loop over tiles; zeros where
+    the place is below zero.
 
-    A plain load with fewer elements than threads the compiler repeats in each layout that it is used in, and each stays
-    in registers, of which there are too few. It does not repeat one of this size.
+    The compiler repeats a plain load with fewer elements than threads in each layout that uses it, and keeps each copy
+    in registers, of which there are too few. It does not repeat a load of this size.
     """
     row = tl.arange(0, 8)
     at = tl.where(row == 0, at_0, tl.where(row == 1, at_1, tl.where(row == 2, at_2, tl.where(row == 3, at_3, at_4))))
@@ -121,7 +121,7 @@ def vectors(pointer, at_0, at_1, at_2, at_3, at_4, WIDTH: tl.constexpr):
 
 @triton.jit
 def optional_vector(pointer, at, WIDTH: tl.constexpr):
-    """The vector [WIDTH] at place `at`, zeros where that is below zero."""
+    """Loads the vector [WIDTH] at place `at`, zeros where that is below zero."""
     place = at + tl.zeros((WIDTH,), tl.int32)  # a mask of one number Triton 3.9's interpreter does not take
     return tl.load(pointer + place + tl.arange(0, WIDTH), mask=place >= 0, other=0.0)
 
@@ -133,9 +133,9 @@ def vector(matrix, number: tl.constexpr):
 
 @triton.jit
 def once_both(x, y, never):
-    """x, in the place where both x and y are loaded; `never` is false, but not known to be.
+    """Returns x after the loads of both x and y; `never` is false, which the compiler does not know.
 
-    The compiler takes what it loaded to shared memory at once, and waits for it, before it begins the next load.
+    The compiler moves loaded values to shared memory and waits for them before it begins the next load.
     """
     return added(x, tl.where(never, y.to(x.dtype), 0.0))
 
@@ -148,15 +148,15 @@ def nothing_to_do(count, BLOCK: tl.constexpr):
 
 @triton.jit
 def inside(vector, tile):
-    """`vector`, as a value of the loop over tiles: else it is laid out for the matrix units before the loop, where each
-    thread holds a quarter of it, and registers spill. Tiles are numbered from 0."""
+    """Returns `vector` as a value inside the loop over tiles. Otherwise it is laid out for the matrix units before the
+    loop, where each thread has a quarter of it, and registers spill. Tiles are numbered from 0."""
     return tl.where(tile >= 0, vector, 0.0)
 
 
 @triton.jit
 def next_tile(tile, ONCE: tl.constexpr):
-    """The program's tile after this one. ONCE: there is none, and the compiler sees it: it drops the loop, before which
-    it would work out addresses that take up registers."""
+    """Returns the program's next tile. ONCE: there is none; the compiler sees that and drops the loop, before which it
+    would compute addresses that take up registers."""
     if ONCE:
         tile = tile * 0 + LAST_TILE
     else:
@@ -171,7 +171,7 @@ def leaky(h):
 
 @triton.jit
 def leaky_operand(h, PRECISION: tl.constexpr):
-    """leaky(h) for a product: in fp16 of float16 numbers, two in an instruction."""
+    """Returns leaky(h) for a product: in fp16 of float16 numbers, two in an instruction."""
     if PRECISION == "fp16":
         h = h.to(tl.float16)
         a = leaky(h)
@@ -182,13 +182,13 @@ def leaky_operand(h, PRECISION: tl.constexpr):
 
 @triton.jit
 def leaky_backward(gradient, a):
-    """The gradient before the activation; `a` is its output, which has the sign of its input."""
+    """Returns the gradient before the activation; `a` is its output, which has the sign of its input."""
     return tl.where(a > 0, gradient, gradient * LEAKY)
 
 
 @triton.jit
 def normalise(z, WIDTH: tl.constexpr):
-    """Rows of zero mean and unit variance, and one over the standard deviation."""
+    """Returns rows of zero mean and unit variance, and one over the standard deviation."""
     centred = z - (tl.sum(z, 1) / WIDTH)[:, None]
     rstd = 1.0 / tl.sqrt(tl.sum(centred * centred, 1) / WIDTH + EPSILON)
     return centred * rstd[:, None], rstd
@@ -196,8 +196,8 @@ def normalise(z, WIDTH: tl.constexpr):
 
 @triton.jit
 def normalise_once(z, WIDTH: tl.constexpr, PRECISION: tl.constexpr):
-    """The same, at the lower precisions with both sums at once: cancellation costs less than their operands' rounding
-    as long as a row's mean is within some ten standard deviations."""
+    """Does the same, at lower precisions with both sums in one pass: cancellation costs less than rounding operands, as
+    long as a row's mean is within about ten standard deviations."""
     if PRECISION == "fp16":
         mean = tl.sum(z, 1) / WIDTH
         variance = tl.maximum(tl.sum(z * z, 1) / WIDTH - mean * mean, 0.0)
@@ -210,24 +210,24 @@ def normalise_once(z, WIDTH: tl.constexpr, PRECISION: tl.constexpr):
 
 @triton.jit
 def with_column(value, number, x):
-    """`value` [N, F] with the column x [N] in place of one of its own."""
+    """Returns `value` [N, F] with x [N] as column `number`."""
     column = tl.arange(0, value.shape[1])
     return tl.where((column == number)[None, :], x[:, None], value)
 
 
 @triton.jit
 def chosen_rows(ROWS: tl.constexpr, EACH: tl.constexpr, CHOICES: tl.constexpr):
-    """[ROWS, CHOICES]: one where a choice is a row's, EACH rows after one another having the same, else zero.
+    """Returns [ROWS, CHOICES]: one for the choice of a row, which EACH successive rows share, else zero.
 
-    A product with it is exact, and spares reading a row as often as it is used.
+    A product with it is exact, and reads each row only once.
     """
     return tl.where(tl.arange(0, ROWS)[:, None] // EACH == tl.arange(0, CHOICES)[None, :], 1.0, 0.0)
 
 
 @triton.jit
 def high_and_low(pointer, FIRST: tl.constexpr, SUMS: tl.constexpr, WIDTH: tl.constexpr, PRECISION: tl.constexpr):
-    """[SUMS, W]: from row FIRST on the rows of the matrix [3, W] at `pointer` as operands of a product, and after them
-    what that rounds away of them; zeros elsewhere."""
+    """Returns [SUMS, W]: from row FIRST on, the rows of the matrix [3, W] at `pointer` as operands of a product, then
+    the parts that rounding removes from them; zeros elsewhere."""
     row = tl.arange(0, SUMS)
     place = row - FIRST
     inside = (place >= 0) & (place < 6)
@@ -244,7 +244,7 @@ def high_and_low(pointer, FIRST: tl.constexpr, SUMS: tl.constexpr, WIDTH: tl.con
 
 @triton.jit
 def normalise_backward(gradient, normalised, rstd, gamma, WIDTH: tl.constexpr):
-    """The gradient before the normalisation, from the gradient after its weight `gamma` [W]."""
+    """Returns the gradient before the normalisation, from the gradient after its weight `gamma` [W]."""
     inner = gradient * gamma[None, :]
     mean = tl.sum(inner, 1) / WIDTH
     slope = tl.sum(inner * normalised, 1) / WIDTH
@@ -253,19 +253,19 @@ def normalise_backward(gradient, normalised, rstd, gamma, WIDTH: tl.constexpr):
 
 @triton.jit
 def column_sums(x, ROWS: tl.constexpr, WIDTH: tl.constexpr, APART: tl.constexpr):
-    """Sums [APART, W] over the rows of x [ROWS, W], each of every APART-th row, for whoever adds up many tiles first.
+    """Returns sums [APART, W] over the rows of x [ROWS, W], each of every APART-th row, to be added up over many tiles.
 
-    With two rows a warp (as many as 16-byte loads of 128 float16 take) a thread adds its own rows only; a whole sum
-    passes them from thread to thread, with barriers, in each tile.
+    With two rows a warp (which 16-byte loads of 128 float16 fill) a thread adds only its own rows; a whole sum passes
+    them from thread to thread, with barriers, in each tile.
     """
     return tl.sum(tl.reshape(x, (ROWS // APART, APART, WIDTH)), 0)
 
 
 @triton.jit
 def listed(table, row, count, capacity, SUM: tl.constexpr, EDGES: tl.constexpr):
-    """For each of `row` the rows that the table [SUM, capacity] lists, as a tuple; below zero: none.
+    """Returns for each of `row` the rows that the table [SUM, capacity] lists, as a tuple; below zero: none.
 
-    With EDGES they are rows of [capacity, SUM, W]: of the row listed for a direction the opposite direction's part.
+    With EDGES they are rows of [capacity, SUM, W]: the part of the opposite direction of the row that is listed.
     """
     summands = ()
     for i in tl.static_range(SUM):
@@ -278,7 +278,7 @@ def listed(table, row, count, capacity, SUM: tl.constexpr, EDGES: tl.constexpr):
 
 @triton.jit
 def gathered_sum(x, summands, SUM: tl.constexpr, WIDTH: tl.constexpr, BLOCK: tl.constexpr):
-    """The sums [BLOCK, W] of x's rows `summands` by `listed`."""
+    """Returns the sums [BLOCK, W] of x's rows `summands` of `listed`."""
     column = tl.arange(0, WIDTH)
     # so many reads begin before the first is waited for
     TOGETHER: tl.constexpr = SUM if BLOCK <= 16 else 2
@@ -299,20 +299,21 @@ def gathered_sum(x, summands, SUM: tl.constexpr, WIDTH: tl.constexpr, BLOCK: tl.
 
 @triton.jit
 def settled(total):
-    """A product as it is, in a loop whose next tiles are copied to shared memory meanwhile; no instruction.
+    """Returns a product unchanged, without an instruction, in a loop whose next tiles are copied to shared memory.
 
-    For a product that nothing in the loop reads the compiler waits one round later. Of a tile that is read twice, by
-    the product and by others, it keeps one buffer too few for that (Triton 3.6 and 3.9): the tile after the next would
-    be copied over the one that is being multiplied. The interpreter knows no such thing.
+    If nothing in the loop reads the product, the compiler waits for it one round later. For a tile that the product and
+    others read, it then has one buffer too few (Triton 3.6 and 3.9): the tile after the next would be copied over the
+    one that is being multiplied. The interpreter does not need it.
     """
     return tl.inline_asm_elementwise("", "=f,0", [total], dtype=tl.float32, is_pure=True, pack=1)
 
 
 @triton.jit
 def added(x, y):
-    """x + y in their type, as a reduction: so they are added where they were loaded, after both loads began.
+    """Returns x + y in their type, as a reduction, so that they are added where they were loaded, after both loads
+    began.
 
-    Of a plain sum the compiler takes each part to the matrix units' layout by itself, one after the other.
+    For a plain sum the compiler converts each part to the matrix units' layout, one after the other.
     """
     return tl.sum(tl.join(x, y), 2)
 

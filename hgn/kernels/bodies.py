@@ -16,7 +16,7 @@ THINNEST, SMALLEST = tl.constexpr(THIN), tl.constexpr(POINT)  # of a cell's cont
 
 @triton.jit
 def coarsest_cells(coarsest_of, share_of, row, live):
-    """The particles' coarsest cells, each once and -1 elsewhere, and their shares of these, [N, 8] each."""
+    """Returns the particles' coarsest cells, each once and -1 elsewhere, and their weights, [N, 8] each."""
     at = row[:, None] * 8 + tl.arange(0, 8)[None, :]
     cell = tl.load(coarsest_of + at, mask=live[:, None], other=-1)
     return cell, tl.load(share_of + at, mask=cell >= 0, other=0.0)
@@ -24,7 +24,7 @@ def coarsest_cells(coarsest_of, share_of, row, live):
 
 @triton.jit
 def adjugate(matrix, x, y, z):
-    """The determinant of a symmetric matrix xx, yy, zz, yz, xz, xy, and its adjugate times a vector."""
+    """Returns the determinant of a symmetric matrix xx, yy, zz, yz, xz, xy, and its adjugate times a vector."""
     xx, yy, zz, yz, xz, xy = matrix
     axx, ayy, azz = yy * zz - yz * yz, xx * zz - xz * xz, xx * yy - xy * xy
     ayz, axz, axy = xy * xz - xx * yz, xy * yz - yy * xz, xz * yz - zz * xy
@@ -54,7 +54,7 @@ def inertia_of(xx, yy, zz, yz, xz, xy):
 
 @triton.jit
 def body_of(moments, cell, mask, inverse, OUT: tl.constexpr):
-    """Centres of mass in coarsest cells, from their middles, and the inertia over the mass, in their edges."""
+    """Returns centres of mass in coarsest cells, from their middles, and the inertia over the mass, in their edges."""
     at = moments + cell * OUT
     x = tl.load(at, mask=mask, other=0.0) * inverse
     y = tl.load(at + 1, mask=mask, other=0.0) * inverse
@@ -70,7 +70,7 @@ def body_of(moments, cell, mask, inverse, OUT: tl.constexpr):
 
 @triton.jit
 def three_columns(table, cell, column, mask, factor, OUT: tl.constexpr):
-    """Three neighbouring columns of the cells' rows, times a factor."""
+    """Returns three neighbouring columns of the cells' rows, times a factor."""
     at = table + cell * OUT + column
     x = tl.load(at, mask=mask, other=0.0) * factor
     y = tl.load(at + 1, mask=mask, other=0.0) * factor
@@ -84,7 +84,7 @@ def cross(a, b):
 
 @triton.jit
 def one_over(mass):
-    """One over it, 0 of 0."""
+    """Returns 1 / x, and 0 for 0."""
     return tl.where(mass > 0, 1 / tl.where(mass > 0, mass, 1.0), 0.0)
 
 

@@ -1,4 +1,4 @@
-"""What the network's launches write: in training a buffer each, in inference shared by what lives at different times.
+"""Outputs of the network's launches: in training a buffer each, in inference shared by results of different times.
 
 Shape legend: N particles, C cells, W width.
 """
@@ -44,11 +44,11 @@ class Block:
 
 
 class Buffers:
-    """`down` and `up` are the blocks; messages to parents and hidden layers of the steps between levels are lists over
-    the finer level.
+    """The buffers of a network. `down` and `up` are the blocks; messages to parents and hidden layers of the steps
+    between levels are lists over the finer level.
 
-    Inference may share what it shares because each kernel that is launched without a wait inside runs when all before
-    it have ended, and those that begin early wait for all before them ahead of what they read and write here.
+    Inference may share buffers because a kernel that is launched without a wait inside runs when all before it have
+    ended, and kernels that begin early wait for all before them, before they read or write these buffers.
     """
 
     config: NetworkConfig
@@ -112,7 +112,7 @@ class Buffers:
             self._allocate_inference()
 
     def _last(self, level: int) -> Block:
-        """The last block on a level."""
+        """Returns the last block on a level."""
         return self.down[level] if level == self.config.levels - 1 else self.up[level]
 
     def _allocate_training(self) -> None:
@@ -137,11 +137,11 @@ class Buffers:
             self._last(level).product = self._operand(capacity, width)
 
     def _allocate_inference(self) -> None:
-        """Edges of a block have one buffer, whatever the block. In it lie, at times when there are no edges: particles'
-        products until the first pairs have read them; a block's message to the parents, or product for who follows,
-        until it is read, which is before the next block's edges; and beside the last of these the decoder's input.
+        """All edges share one buffer. When there are no edges it contains: the particles' products, until the first
+        pairs have read them; a block's message to the parents, or its product for the next block, until it is read,
+        before the next block's edges; and next to the last of these the decoder's input.
 
-        `output` lies where the features were, which only the encoder reads. Hidden rows are not kept.
+        `output` is where the features were, which only the encoder reads. Hidden rows are not stored.
         """
         width, steps = self.width, self.config.message_passing_steps
         particles, capacities = self.grid.particles, self.grid.capacities

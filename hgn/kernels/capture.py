@@ -12,11 +12,11 @@ _streams: dict[int, tuple[torch.cuda.Stream, torch.cuda.Stream]] = {}
 
 
 def captured(parts: Sequence[Launches], warm_up: Launches) -> list[torch.cuda.CUDAGraph]:
-    """A graph of each of `parts`. `warm_up` runs before: it launches the same without changing anything that counts.
+    """Returns a graph of each of `parts`. `warm_up` runs first: it makes the same launches without lasting changes.
 
-    cuBLAS keeps 32 MiB for each stream that it has run in; torch frees those of a capture's stream whenever a graph
-    captured there ends, though another may read them. So the warm-up has a stream of its own: then what cuBLAS has in
-    the capture's stream is part of the graph's memory, which lives as long as the graph.
+    cuBLAS keeps 32 MiB for each stream that it has run in; torch frees those of a capture's stream when any graph
+    captured there ends, though another graph may read them. The warm-up has a stream of its own, so that cuBLAS's
+    memory in the capture's stream belongs to the graph and lives as long.
     """
     device = torch.cuda.current_device()
     if device not in _streams:

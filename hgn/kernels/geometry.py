@@ -1,4 +1,4 @@
-"""What the kernels of cells know of the grid's levels.
+"""Levels, slots and middles of the grid, for the kernels of cells.
 
 Row of the geometry table of a level: first slot, slots, cells of the window in y and z with borders, slots of a
 scene, capacity, first cell in tables, window cells in x with borders.
@@ -33,8 +33,9 @@ def most_around(disturbed, felt, part: tl.constexpr, neighbour, cell, there, cap
 
 @triton.jit
 def lowest_middle(k, axis: tl.constexpr, low, place_of, row, live, LEVELS: tl.constexpr, SHIFT: tl.constexpr):
-    """Along an axis, from the number in the window of a particle's own coarsest cell: the number of the lowest middle
-    around it, of cells 2^SHIFT times as large, from 0 on, and its place from there, in their edges."""
+    """Returns along one axis the number, from 0, of the lowest middle around a particle, between cells 2^SHIFT times as
+    large as coarsest ones, and the particle's place from there, in their edges. `k` is the number of its own coarsest
+    cell in the window."""
     first = tl.load(low + axis) >> LEVELS - 1
     place = tl.load(place_of + row * 3 + axis, mask=live, other=0.0)
     lowest = tl.floor(place)
@@ -45,8 +46,8 @@ def lowest_middle(k, axis: tl.constexpr, low, place_of, row, live, LEVELS: tl.co
 
 @triton.jit
 def middles_around(base, gate, spot, geometry, LEVELS: tl.constexpr):
-    """From the lowest slots, the gates and the spots of particles, the slots [N, 8] of all middles around them, their
-    places from there, and their weights."""
+    """Returns the slots [N, 8] of all middles around particles, the places from there, and the weights, from the lowest
+    slots, the gates and the spots."""
     line = geometry + (LEVELS - 1) * GEOMETRY_COLUMNS
     corner = tl.arange(0, 8)[None, :]
     axes, weight = (), gate[:, None]
@@ -61,7 +62,7 @@ def middles_around(base, gate, spot, geometry, LEVELS: tl.constexpr):
 
 @triton.jit
 def raise_disturbed(disturbed, cell, own):
-    """Raises every second of `disturbed` to what the particles [N] in its cells [N, 8] have, where that is more."""
+    """Raises every second number of `disturbed` to the maximum over the particles [N] in its cells [N, 8]."""
     own = (own * FULLY).to(tl.int32)[:, None]
     # most are told by another already
     mask = (cell >= 0) & (tl.load(disturbed + cell * 2, mask=cell >= 0, other=FULLY) < own)

@@ -18,7 +18,7 @@ CODE_MASK = tl.constexpr((1 << codes.CELL_BITS) - 1)  # of the cells in a symmet
 
 @triton.jit
 def _before_mirror(cell, symmetry, axis: tl.constexpr):
-    """A cell's coordinate, in floats, from before the symmetry mirrored this axis."""
+    """Returns a cell's coordinate, in floats, before the symmetry mirrored this axis."""
     part = symmetry >> CODE_BITS * axis
     last = (part >> 3 & CODE_MASK).to(tl.float32) - 1
     return tl.where((part >> 2 & 1) == 1, last - cell, cell)
@@ -33,9 +33,9 @@ def _from_axis(x, y, z, symmetry, axis: tl.constexpr):
 
 @triton.jit
 def obstacle_normals(x, y, z, line, live, obstacle_cell_size, SYMMETRY: tl.constexpr):
-    """The obstacle normals' three parts at positions of any shape, zeros where there is none; `line` is their scenes'
-    row of the obstacle table. With SYMMETRY the positions are an image of the scene that the table is of: looked up
-    there, normals brought back."""
+    """Returns the three parts of obstacle normals at positions of any shape, zeros without an obstacle; `line` is their
+    scenes' row of the obstacle table. With SYMMETRY the positions are in an image of the table's scene: they are looked
+    up in the scene, and normals are those of the image."""
     x = tl.floor(tl.div_rn(x, obstacle_cell_size))
     y = tl.floor(tl.div_rn(y, obstacle_cell_size))
     z = tl.floor(tl.div_rn(z, obstacle_cell_size))

@@ -65,8 +65,7 @@ class Normaliser(nn.Module):
     ) -> None:
         """Sets `velocity` or `acceleration` from the data's statistics. An axis without spread keeps a tiny one.
 
-        Axes from `dimensions` on get STILL: whatever a network says of them, nothing moves along them by as much as
-        rounding.
+        Axes from `dimensions` on get STILL: the network's output along them moves particles by less than rounding.
         """
         getattr(self, f"{quantity}_mean").copy_(mean_3)
         total_3 = torch.sqrt(std_3.double() ** 2 + noise_std**2).clamp(min=1e-9)
@@ -75,13 +74,13 @@ class Normaliser(nn.Module):
         getattr(self, f"{quantity}_std")[dimensions:] = 1.0 if quantity == "velocity" else STILL
 
     def set_isotropic(self, acceleration_std_3: torch.Tensor, noise_std: float, dimensions: int = 3) -> None:
-        """For relative inputs: no means, and one scale everywhere, the root mean square of the axes' with the noise."""
+        """Sets the normaliser for relative inputs: no means, and one scale, the rms over the axes, with the noise."""
         for quantity in ("velocity", "acceleration"):
             scale = acceleration_std_3[:dimensions].double().square().mean().sqrt().expand(3)
             self.set(quantity, torch.zeros(3), scale, noise_std, dimensions)
 
     def feature_scale(self, relative: bool) -> tuple[torch.Tensor, torch.Tensor]:
-        """Mean and standard deviation [3] of what features show of velocities: relative ones are of accelerations."""
+        """Returns mean and standard deviation [3] of velocity features; relative ones are of accelerations."""
         quantity = "acceleration" if relative else "velocity"
         return getattr(self, f"{quantity}_mean"), getattr(self, f"{quantity}_std")
 
@@ -96,15 +95,15 @@ class Normaliser(nn.Module):
 
 
 def wall_distances(position_N3: torch.Tensor, domain_N3: torch.Tensor, maximum: float) -> torch.Tensor:
-    """Signed distances to the lower and upper planes of the domain, clamped to ±maximum, over it, [N, 6]."""
+    """Returns signed distances to the lower and upper planes of the domain, clamped to ±maximum, over it, [N, 6]."""
     distance_N6 = torch.cat([position_N3, domain_N3 - position_N3], dim=-1)
     return distance_N6.clamp(-maximum, maximum) / maximum
 
 
 def material_rows(material_N: np.ndarray, materials: Sequence[str], names: Sequence[str] = MATERIALS) -> torch.Tensor:
-    """Indices into a network's material list, int64 [N], from indices into `names`.
+    """Returns indices into a network's material list, int64 [N], from indices into `names`.
 
-    Raises: ConfigError when the network does not know a material.
+    Raises: ConfigError for a material that the network was not trained with.
     """
     row = [materials.index(name) if name in materials else -1 for name in names]
     rows_N = np.asarray(row, np.int64)[material_N]

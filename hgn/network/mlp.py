@@ -21,7 +21,8 @@ MINIMUM_ROWS = 16
 
 
 def linear(value: torch.Tensor, weight: torch.Tensor, bias: torch.Tensor | None = None) -> torch.Tensor:
-    """The affine map of rows [R, in] (or [..., in]) to [R, out], each row computed alike however few there are."""
+    """Returns the affine map of rows [R, in] (or [..., in]) to [R, out]; a row does not depend on the number of
+    rows."""
     if not _few(value):
         return functional.linear(value, weight, bias)
     rows = value.shape[:-1].numel()
@@ -48,7 +49,7 @@ class MLP(nn.Module):
         self.norm = nn.LayerNorm(out) if layer_norm else None
 
     def project(self, part: int, value: torch.Tensor) -> torch.Tensor:
-        """The first layer's product with one part, [..., parts[part]] -> [..., hidden], without the bias."""
+        """Returns the first layer's product with one part, [..., parts[part]] -> [..., hidden], without the bias."""
         return linear(value, self.columns(part))
 
     def add_projection(self, hidden: torch.Tensor, part: int, value: torch.Tensor) -> torch.Tensor:
@@ -58,12 +59,12 @@ class MLP(nn.Module):
         return hidden.add_(self.project(part, value))
 
     def finish(self, hidden: torch.Tensor) -> torch.Tensor:
-        """From the sum of all projections, bias included, to the output [..., out]. Overwrites `hidden`."""
+        """Returns the output [..., out] from the sum of all projections, bias included. Overwrites `hidden`."""
         out = linear(functional.leaky_relu_(hidden, self.slope), self.second.weight, self.second.bias)
         return out if self.norm is None else self.norm(out)
 
     def forward(self, *values: torch.Tensor) -> torch.Tensor:
-        """The definition: concatenate, two layers, norm."""
+        """Computes the definition: concatenation, two layers, norm."""
         return self.finish(linear(torch.cat(values, dim=-1), self.first.weight, self.first.bias))
 
     def columns(self, part: int) -> torch.Tensor:

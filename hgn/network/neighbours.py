@@ -70,7 +70,7 @@ def _keys(position_N3: torch.Tensor, scene_N: torch.Tensor, size: float) -> torc
 
 
 def _runs(key_N: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """First place and length of the 25 runs of each particle, [N, 25]."""
+    """Returns first place and length of the 25 runs of each particle, [N, 25]."""
     side = torch.arange(-REACH, REACH + 1, device=key_N.device)
     column_R = (side[:, None] * AXIS_STRIDE[0] + side[None] * AXIS_STRIDE[1]).flatten()
     low_NR = key_N[:, None] + (column_R - REACH * AXIS_STRIDE[2])

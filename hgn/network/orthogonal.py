@@ -1,4 +1,4 @@
-"""Square blocks of the weights, and the orthogonal matrix nearest to one: what the Muon optimiser steps along.
+"""Square blocks of the weights and their orthogonalisation, for the steps of the Muon optimiser.
 
 Shape legend: K blocks, W width.
 """
@@ -21,9 +21,9 @@ RELATIVE_STEP = 0.2  # rms of a step in learning rates, as Adam's is in practice
 
 
 def square_blocks(network: ParticleNetwork) -> torch.Tensor:
-    """Places of all blocks from latent to latent in the concatenated parameters, int64 [K, W, W].
+    """Returns the places of all blocks from latent to latent in the concatenated parameters, int64 [K, W, W].
 
-    A first layer on several parts is several matrices side by side, each a map of its own; the encoder's is none.
+    A first layer on several parts is several matrices side by side, each a block; the encoder's is not one.
     """
     width = network.config.width
     start, total = {}, 0
@@ -48,12 +48,12 @@ def step_size(width: int) -> float:
 
 
 def normalised(matrix_KWW: torch.Tensor) -> torch.Tensor:
-    """With Frobenius norm 1, so that no singular value is above 1."""
+    """Scales matrices to Frobenius norm 1, so that no singular value is above 1."""
     return matrix_KWW / (matrix_KWW.norm(dim=(1, 2), keepdim=True) + EPSILON)
 
 
 def orthogonalised(matrix_KWW: torch.Tensor) -> torch.Tensor:
-    """Singular values of matrices of norm 1 brought near 1, singular vectors kept: U V^T of their SVD, roughly.
+    """Returns approximately U V^T of the SVD of matrices of norm 1: singular values near 1, the same singular vectors.
 
     Newton-Schulz iterations of odd degree five: three products each.
     """

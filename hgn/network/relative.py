@@ -1,26 +1,26 @@
-"""Relative inputs: what a particle is told where a motion common to all changes nothing (`network.inputs: relative`).
+"""Relative inputs: features that do not change with a motion common to all particles (`network.inputs: relative`).
 
-Not the paper's (sec. 3.1 has absolute velocities and wall distances). Away from surfaces the features stay the same
-under any common velocity, and in free flight under any gravity, which the output is added to: g + s_a * decoder.
-Columns, in this order, with f(x) = asinh(x / s_a), s_a the normaliser's scale, which is odd, as the cube's symmetries
-ask:
+Not the paper's (sec. 3.1 has absolute velocities and wall distances). Away from surfaces the features do not depend on
+a common velocity, and in free flight not on gravity, to which the output is added: g + s_a * decoder. Columns, in this
+order, with f(x) = asinh(x / s_a), s_a the normaliser's scale; f is odd, so that features transform with the symmetries
+of the cube:
 
-| columns | what |
+| columns | value |
 |---|---|
 | 3 (H - 1) | f(v^{n-k} - v^{n-k-1} - g), k = 0 … H - 2: zero in free flight |
 | 3 L | f(v_p - U_l(x_p)) on each level, finest first, U_l the momentum over the mass of the cells around |
-| 3 | G f(v^n): the velocity against what stands still, near a surface |
+| 3 | G f(v^n): the velocity relative to surfaces, near one |
 | 6 | walls within CONTACT_REACH_CELLS R, lower x, y, z, then upper |
-| 3 + 3 | obstacle normals, at the particle and where it is flying to; only with obstacle_features |
+| 3 + 3 | obstacle normals, at the particle and ahead of it; only with obstacle_features |
 
-G = sum_C w_pC t_C, with t_C of `disturbance`: at least the particle's own `surface_gate`, and above 0 inside a pile
-whose foot alone is within reach of a surface. Surfaces push along their normals only (`balanced`).
+G = sum_C w_pC t_C, with t_C of `disturbance`: at least the particle's own `surface_gate`, and above 0 inside a pile of
+which only the foot is within reach of a surface. Surfaces push along their normals only (`balanced`).
 
-The decoder's nine numbers are an acceleration r and a stress sigma of each particle; `balanced` makes of them what is
-added to gravity. It is 0 where nothing moves against anything: what flies freely in one piece has exactly the
-acceleration g, whatever the weights. And where no surface is within reach it keeps momentum, whatever the weights: a
-coarsest cell's mean is taken out of r, and cells push each other across their faces by antisymmetric impulses alone;
-and angular momentum, for a cell's rotation is taken out too, and the one of two cells that push each other.
+The decoder's nine numbers are an acceleration r and a stress sigma of each particle; `balanced` turns them into the
+acceleration without gravity. It is 0 without relative motion: a body that flies freely without deforming has exactly
+the acceleration g, for any parameters. Where no surface is within reach it conserves momentum, for any parameters: the
+mean of r over a coarsest cell is subtracted, and cells push each other across their faces only by antisymmetric
+impulses; and angular momentum: the rotation of a cell is subtracted too, and that of two cells that push each other.
 Shape legend: N particles, H velocities, L levels, C cells of a level, E directed edges, S scenes.
 """
 
@@ -89,15 +89,15 @@ def relative_features(
 
 
 def history(velocity_NH3: torch.Tensor, gravity_N3: torch.Tensor) -> torch.Tensor:
-    """Accelerations of the frames past less gravity, newest first, [N, 3 (H - 1)]."""
+    """Returns the accelerations of the past frames less gravity, newest first, [N, 3 (H - 1)]."""
     return (velocity_NH3[:, :-1] - velocity_NH3[:, 1:] - gravity_N3[:, None]).flatten(1)
 
 
 def surroundings(velocity_N3: torch.Tensor, grid: GridHierarchy) -> torch.Tensor:
-    """Velocities less that of the cells around on each level, [N, 3 L].
+    """Returns velocities less those of the cells around on each level, [N, 3 L].
 
     A cell's velocity is sum(m v) / sum(m), on the finest level over its particles with their trilinear weights, above
-    over its children; a particle takes those of its 8 cells' ancestors with its own weights.
+    over its children; a particle interpolates those of its 8 cells' ancestors with its own weights.
     """
     weight_N8 = grid.weight_N8
     value_N84 = weight_N8[..., None] * torch.cat([velocity_N3, torch.ones_like(velocity_N3[:, :1])], -1)[:, None]
@@ -128,7 +128,8 @@ def wall_nearness(
 def obstacle_normals(
     position_N3: torch.Tensor, velocity_N3: torch.Tensor, scene_N: torch.Tensor, obstacles: ObstacleCells | None
 ) -> torch.Tensor:
-    """The normal at the particle, and the first one at a quarter, a half … of the next frame's way, [N, 6]; else 0."""
+    """Returns the normal at the particle, and the first one at a quarter, a half … of the path to the next frame, or 0,
+    [N, 6]."""
     here_N3, ahead_N3 = torch.zeros_like(position_N3), torch.zeros_like(position_N3)
     if obstacles is not None:
         here_N3 = obstacles.normals(position_N3, scene_N)
@@ -145,8 +146,9 @@ def surface_gate(wall_N6: torch.Tensor, normal_N6: torch.Tensor | None) -> torch
 
 
 def surface_normals(wall_N6: torch.Tensor, normal_N6: torch.Tensor | None) -> torch.Tensor:
-    """sum n n^T of the walls within reach, gated as in `surface_gate`, and of the obstacle's normal, at the particle or
-    else where it is flying to, [N, 3, 3]: no sign, so that nothing jumps where surfaces face each other."""
+    """Returns sum n n^T of the walls within reach, gated as in `surface_gate`, and of the obstacle's normal, at the
+    particle or else ahead of it, [N, 3, 3]. It has no sign, so that nothing jumps between surfaces that face each
+    other."""
     near_N6 = (2 * wall_N6).clamp(max=1)
     normal_N33 = torch.diag_embed(near_N6[:, :3] + near_N6[:, 3:])
     if normal_N6 is None:
@@ -157,15 +159,16 @@ def surface_normals(wall_N6: torch.Tensor, normal_N6: torch.Tensor | None) -> to
 
 
 def touched_normals(normal_N33: torch.Tensor, grid: GridHierarchy) -> torch.Tensor:
-    """S [C, 3, 3]: sums of w_pC times `surface_normals` in a coarsest cell."""
+    """Returns S [C, 3, 3]: sums of w_pC times `surface_normals` in a coarsest cell."""
     normal_N89 = grid.weight_N8[..., None] * normal_N33.flatten(1)[:, None]
     sum_C9 = normal_N89.new_zeros(grid.levels[-1].cell_count, 9)
     return sum_C9.index_add(0, coarsest_cells(grid).flatten(), normal_N89.flatten(0, 1)).unflatten(1, (3, 3))
 
 
 def slip(normal_C33: torch.Tensor) -> torch.Tensor:
-    """Q [C, 3, 3], what surfaces leave free: (1 + S / (FEW + RARE tr S))^-1 of the `touched_normals` S. On a plane it
-    is 1 along it and next to 0 along its normal, in a corner 1 along that alone, and 1 where nothing is touched."""
+    """Returns Q [C, 3, 3], the projection on directions that surfaces leave free: (1 + S / (FEW + RARE tr S))^-1 of the
+    `touched_normals` S. Near a plane it is 1 along the plane and almost 0 along its normal, in a corner 1 only along
+    the corner, and 1 away from surfaces."""
     ratio_C33 = normal_C33 / (FEW + RARE * trace(normal_C33))[:, None, None]
     determinant_C, adjugate_C33 = adjugate(ratio_C33 + torch.eye(3, dtype=ratio_C33.dtype, device=ratio_C33.device))
     return adjugate_C33 / determinant_C[:, None, None]
@@ -176,7 +179,7 @@ def trace(matrix_K33: torch.Tensor) -> torch.Tensor:
 
 
 def adjugate(matrix_K33: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Determinants [K] and adjugates [K, 3, 3] of symmetric matrices."""
+    """Returns determinants [K] and adjugates [K, 3, 3] of symmetric matrices."""
     row = matrix_K33.unbind(1)
     adjugate_K33 = torch.stack([torch.linalg.cross(row[i - 2], row[i - 1]) for i in range(3)], 1)
     return (row[0] * adjugate_K33[:, 0]).sum(-1), adjugate_K33
@@ -204,7 +207,7 @@ def disturbance(
 
 
 def coarsest_cells(grid: GridHierarchy) -> torch.Tensor:
-    """The coarsest cells above each particle's eight, [N, 8]; several may be the same."""
+    """Returns the coarsest cells above each particle's eight, [N, 8]; several may be the same."""
     cell_N8 = grid.cell_N8
     for level in grid.levels[:-1]:
         assert level.parent_C is not None
@@ -213,22 +216,22 @@ def coarsest_cells(grid: GridHierarchy) -> torch.Tensor:
 
 
 def balanced(output_N9: torch.Tensor, contacts: Contacts, grid: GridHierarchy) -> torch.Tensor:
-    """Accelerations less gravity, normalised, [N, 3], of the decoder's output and what `disturbance` gives.
+    """Returns normalised accelerations less gravity, [N, 3], of the decoder's output and the contacts of `disturbance`.
 
-    With a particle's shares w_pC of the coarsest cells, their mass M, mean acceleration R and mean stress S, e from a
+    With a particle's weights w_pC in the coarsest cells, their mass M, mean acceleration R and mean stress S, e from a
     cell to its neighbour C', d disturbed and t touched: a_p = sum_C w_pC d_C (r_p - (1 - t_C) R_C + A_C), where
     A_C = sum_C' d_C' f' T, T = (S_C + S_C') e / 2, f = M_C / (M_C + M_C') and f' = 1 - f. Times M_C d_C this is
-    antisymmetric, and no small mass is divided by: sum_p a_p = sum_C d_C t_C M_C R_C, which is 0 where no surface is
-    within reach. (Cells exchange momentum across faces as in finite volumes; a symmetric stress makes no spin.)
+    antisymmetric, without a division by a small mass: sum_p a_p = sum_C d_C t_C M_C R_C, which is 0 where no surface is
+    within reach. (Cells exchange momentum across faces as in finite volumes; a symmetric stress causes no rotation.)
 
-    From this rotation is taken out, so that sum_p x_p x a_p is 0 there, too. y_p is a particle's place seen from the
-    cell's centre of mass X, I and L sums of w over M of its inertia and of y x r, and (q, W) = `rotation`(I, L):
-    r_p - R counts as q (r_p - R) - W x y_p. And of T on one cell and -T on another, D = X' - X apart, the rotation that
-    both have about their common centre is taken out: with (q, W) of I f + I' f' + f f' (D^2 - D D^T) and of -f f' D x T
-    a cell gets f' (q T + W x D) - W x y_p. That is a projection: nothing grows, however small or thin contents are.
+    Rotation is subtracted, so that sum_p x_p x a_p is 0 there, too. y_p is a particle's place relative to the cell's
+    centre of mass X, I and L are sums of w over M of its inertia and of y x r, and (q, W) = `rotation`(I, L): r_p - R
+    is replaced by q (r_p - R) - W x y_p. For T on one cell and -T on another, at the distance D = X' - X, the rotation
+    of both about their common centre is subtracted: with (q, W) of I f + I' f' + f f' (D^2 - D D^T) and of -f f' D x T
+    a cell gets f' (q T + W x D) - W x y_p. That is a projection: nothing grows, however small or thin bodies are.
 
-    t_C Q_C R_C, Q = `slip` of the `touched_normals`, is taken out, too: what surfaces give a cell on the mean lies
-    along their normals, and bodies slide on a plane without friction, or any drive, whatever the weights.
+    t_C Q_C R_C, with Q = `slip` of the `touched_normals`, is subtracted, too: the mean force of surfaces on a cell is
+    along their normals, and bodies slide on a plane without friction or propulsion, for any parameters.
     """
     disturbed_C, touched_C = contacts.disturbed_C, contacts.touched_C
     level, cell_N8, weight_N8 = grid.levels[-1], coarsest_cells(grid), grid.weight_N8
@@ -282,7 +285,7 @@ def coarsest_places(grid: GridHierarchy) -> torch.Tensor:
 
 
 def inertia(spread_K33: torch.Tensor) -> torch.Tensor:
-    """tr(G) - G of the second moments G of masses about their centre."""
+    """Returns tr(G) - G of the second moments G of masses about their centre."""
     one_33 = torch.eye(3, dtype=spread_K33.dtype, device=spread_K33.device)
     return trace(spread_K33)[:, None, None] * one_33 - spread_K33
 

@@ -1,6 +1,6 @@
-"""Sums over the rows of each segment, and the spreading of one row to its whole segment: each the other's gradient.
+"""Sums over the rows of each segment, and the spreading of one row to its segment: each is the other's gradient.
 
-The rows of a segment lie together, so that a sum needs no atomic additions and has a fixed order.
+The rows of a segment are contiguous, so that a sum needs no atomic additions and has a fixed order.
 Shape legend: E rows, N segments, W width.
 """
 
@@ -23,12 +23,12 @@ class Segments:
         return len(self.offset_N1) - 1
 
     def sum(self, row_EW: torch.Tensor) -> torch.Tensor:
-        """The sum of the rows of each segment, [N, W]; zero where it has none."""
+        """Returns the sum of the rows of each segment, [N, W]; zero for an empty one."""
         result: torch.Tensor = _Sum.apply(row_EW, self)
         return result
 
     def spread(self, value_NW: torch.Tensor) -> torch.Tensor:
-        """Each segment's value at its rows, [E, W]."""
+        """Returns each segment's value at its rows, [E, W]."""
         result: torch.Tensor = _Spread.apply(value_NW, self)
         return result
 

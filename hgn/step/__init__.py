@@ -1,4 +1,4 @@
-"""The constraints of a simulated frame: they need no training, and hold whatever the parameters of the network are.
+"""The constraints of a simulated frame. They need no training, and hold for any parameters of the network.
 
 | setting of `step:`, in the order of the stages | effect |
 |---|---|
@@ -7,5 +7,5 @@
 | `obstacle_clearance`, after the walls | no particle passes an obstacle's triangle |
 
 Losses compare the network's output before any of them. Pushforward simulations are constrained by obstacles only.
-docs/concepts/constraints.md says how each works and which file of each backend implements them.
+docs/concepts/constraints.md describes each one and lists the files that implement it on each backend.
 """

@@ -174,7 +174,7 @@ class Deformation:
         return (self.weight_N8[..., None] * part_N83).sum(1)
 
     def _sums(self, value_N8X: torch.Tensor) -> torch.Tensor:
-        """With the weights, [K, X]."""
+        """Returns weighted sums, [K, X]."""
         value_N8X = self.weight_N8[..., None] * value_N8X
         sum_KX = value_N8X.new_zeros(self.count, value_N8X.shape[-1])
         return sum_KX.index_add(0, self.middle_N8.flatten(), value_N8X.flatten(0, 1))
@@ -208,7 +208,7 @@ def rests_widely(materials: tuple[str, ...]) -> list[bool]:
 
 
 def slow(rate_N3: torch.Tensor, limit_N: torch.Tensor) -> torch.Tensor:
-    """phi d of d and of the threshold's square, which may be 0."""
+    """Returns phi d of d and of the threshold's square, which may be 0."""
     ratio_N = rate_N3.square().sum(-1) / limit_N.clamp(min=LEAST)
     return torch.where(limit_N > 0, (2 - ratio_N).clamp(0, 1), 0)[:, None] * rate_N3
 
@@ -257,9 +257,8 @@ def _outside_obstacles(
 
 
 def _direction(normal_N3: torch.Tensor, last_N3: torch.Tensor) -> torch.Tensor:
-    """Along the normals, or where that leads back across the last ones, along the last planes and by so much farther
-    that the distance from the new ones is the same.
-    """
+    """Returns shifts along the normals, or where these lead back across the previous planes, along those planes and
+    longer, so that the distance from the new ones is the same."""
     cosine_N1 = (normal_N3 * last_N3).sum(-1, keepdim=True)
     along_N3 = normal_N3 - cosine_N1 * last_N3
     square_N1 = (along_N3 * along_N3).sum(-1, keepdim=True)
@@ -312,7 +311,7 @@ def first_stop(
 def _pairs(
     barriers: Barriers, before_N3: torch.Tensor, after_N3: torch.Tensor, scene_N: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Particles and triangles int64 [P] among which are all that meet."""
+    """Returns particles and triangles int64 [P] that include all that meet."""
     if is_exporting():
         return pairs_of_boxes(barriers, before_N3, after_N3)
     before_N3, after_N3 = before_N3.detach(), after_N3.detach()

@@ -17,7 +17,6 @@ from hgn.data.batch import Batch, make_batch
 from hgn.network.base import ParticleNetwork
 from hgn.runtime.torch_backend import Backend
 from hgn.scene.episode import Episode
-from hgn.step.reference import accelerations
 
 REPORTED_FRAMES = (10, 50, 150, 299)  # of rollouts
 FRAMES_AT_ONCE = 16  # in float64
@@ -58,38 +57,24 @@ class SquaredError:
         return {name: self.total[name] / self.count[name] for name in self.total if self.count[name]}
 
 
-def constant_velocity(batch: Batch) -> torch.Tensor:
-    """Predicts no acceleration."""
-    return torch.zeros_like(batch.window_WN3[0])
-
-
 def ballistic(batch: Batch) -> torch.Tensor:
     """Predicts free fall."""
     return batch.gravity_S3[batch.scene_N]
 
 
-def mean_acceleration(mean_3: torch.Tensor) -> Predictor:
-    """Predicts the mean acceleration of the training data for every particle."""
-    return lambda batch: mean_3.to(batch.window_WN3).expand_as(batch.window_WN3[0])
-
-
 def baselines(network: ParticleNetwork) -> dict[str, Predictor]:
     """Returns the predictors that a trained network must improve on."""
+    mean_3 = network.normaliser.acceleration_mean  # of the training data
     return {
-        "constant velocity": constant_velocity,
+        "constant velocity": lambda batch: torch.zeros_like(batch.window_WN3[0]),
         "ballistic motion": ballistic,
-        "mean acceleration": mean_acceleration(network.normaliser.acceleration_mean),
+        "mean acceleration": lambda batch: mean_3.to(batch.window_WN3).expand_as(batch.window_WN3[0]),
     }
 
 
 def network_predictor(backend: Backend) -> Predictor:
     """Returns the prediction of a backend, without noise and jitter."""
-
-    def predict(batch: Batch) -> torch.Tensor:
-        state = batch.state()
-        return accelerations(backend.network, state, backend.prediction(state), backend.step)
-
-    return predict
+    return lambda batch: backend.predict(batch.state())
 
 
 def frame_batches(

@@ -1,4 +1,4 @@
-"""The cells of one message-passing iteration on a level (paper fig. 5), forward and backward, once its edges are done.
+"""The cells of one message-passing iteration on a level (paper fig. 5), forward and backward, after its edges.
 
 OVERLAP as in hgn.kernels.edges.kernel. Shape legend: C cells, W width.
 """
@@ -38,8 +38,8 @@ def cell_mlp_forward(
     NEXT: tl.constexpr, SAVE: tl.constexpr, WIDTH: tl.constexpr, BLOCK: tl.constexpr, PRECISION: tl.constexpr,
     RESIDENT: tl.constexpr, LOOP: tl.constexpr, OVERLAP: tl.constexpr,
 ):  # fmt: skip
-    """Paper steps 2, 4, … (fig. 5): the cells' new features from theirs and their edges' sums, all [C, W], and up to
-    two products of them, of which the second with a bias.
+    """Computes paper steps 2, 4, … (fig. 5): the cells' new features from their old ones and their edges' sums, all [C,
+    W], and up to two products of them, the second with a bias.
 
     RESIDENT: all weights are read before the first tile, and kept. LOOP: a program has more than one tile.
 
@@ -131,11 +131,11 @@ def cell_mlp_backward(
     LAST: tl.constexpr, GATHER: tl.constexpr, WIDTH: tl.constexpr, BLOCK: tl.constexpr, PRECISION: tl.constexpr,
     RESIDENT: tl.constexpr, OVERLAP: tl.constexpr,
 ):  # fmt: skip
-    """In place: `gradient` [C, W] comes in as the gradient of cell_out, less what reaches it through `send` and
-    `receive` of the following iteration (added here unless LAST; what comes from the edges that start in a cell is left
-    in send_gradient), and leaves as that of `cell`, again less what goes through its own.
+    """Turns `gradient` [C, W], in place, from the gradient of cell_out, without the parts through `send` and `receive`
+    of the following iteration, into that of `cell`, again without the parts through its own. The following iteration's
+    parts are added here unless LAST; the gradient through edges that start in a cell is stored in send_gradient.
 
-    sum_gradient [C, W] is that of the edges' sums. Without GATHER send_gradient is there already. RESIDENT as in
+    sum_gradient [C, W] is that of the edges' sums. Without GATHER send_gradient was computed before. RESIDENT as in
     cell_mlp_forward.
 
     Rule: hgn.network.hgn.MessagePassing; reference and test: tests/kernels/references.py, test_kernels_alone.py.

@@ -1,4 +1,4 @@
-"""What the coarsest cells add to the accelerations of relative inputs, so that momentum holds, and its gradient.
+"""The part of the coarsest cells in the accelerations of relative inputs, which conserves momentum, and its gradient.
 
 Shape legend: N particles, C coarsest cells; geometry as in hgn.kernels.geometry.
 """
@@ -33,9 +33,8 @@ def sum_coarsest(
     OVERLAP: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Adds the first USED columns of the particles' rows of x [N, OUT] to their coarsest cells' sums [C, OUT], with
-    their shares. The next three columns are the moments of columns 0 to 2 about the cells' middles. With FEEL
-    felt [C, 2] is told how disturbed coarsest cells are (`most_around`; how touched was told before).
-    Programs for as many particles as for coarsest cells.
+    their weights. The next three columns are the moments of columns 0 to 2 about the cells' middles. With FEEL writes
+    the disturbance of coarsest cells to felt [C, 2] (`most_around`). Programs cover particles and coarsest cells.
 
     Rule: hgn.network.relative.balanced and disturbance; test: tests/kernels/test_relative.py.
     """
@@ -166,9 +165,9 @@ def balance_backward(
     sums, moments, felt, motion, neighbour, geometry, counts, table, capacity, few, rare,
     LEVELS: tl.constexpr, OUT: tl.constexpr, OVERLAP: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """The same of the sums of the gradients of what `balance` leads to, and of their moments: in columns 0 to 8 of
-    table [C, OUT] what coarsest cells add to the gradients of their particles' outputs at their middles, in column 9
-    the factor of the accelerations' own, and in columns 10 to 12 the rate of rotation.
+    """From sums of gradients of the result of `balance`, and of their moments, to the table [C, OUT]: gradients that
+    cells add to their particles' outputs at their middles (columns 0 to 8), the factor of the accelerations' own
+    gradient (9), and the rate of rotation (10 to 12).
 
     Rule: hgn.network.relative.balanced; test: tests/kernels/test_relative.py.
     """
@@ -229,7 +228,7 @@ def balance_backward(
 
 @triton.jit
 def _coarsest_of(motion, geometry, count, LEVELS: tl.constexpr, BLOCK: tl.constexpr):
-    """This program's coarsest cells: their masses, and one over these, [BLOCK] each."""
+    """Returns this program's coarsest cells, which of them exist, their masses, and one over these, [BLOCK] each."""
     cell = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     there = cell < count
     mass = _mass(motion, geometry, cell, there, LEVELS)

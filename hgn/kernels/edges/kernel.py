@@ -1,17 +1,15 @@
-"""The edges of one message-passing iteration on a level (paper fig. 5), forward and backward; its cells follow them.
+"""The edges of one message-passing iteration on a level (paper fig. 5), forward and backward, before its cells.
 
-A tile has ROWS rows, eight for each cell of which six can hold an edge that ends in it, or six if
-DENSE (64 rows: ten cells instead of eight). A program takes one tile after the other and reads its weights once.
-Edge arrays are [capacity, 6, W], [c, d] for the edge to cell c from its neighbour in direction d. Sums over edges are
-made inside the tile and by gathers in fixed order, the same every time. Atomics add gradients of parameters alone.
-OVERLAP: a program starts while the kernel before still runs, reads its weights and what the grid's kernels left (count,
-neighbours; at least one kernel without OVERLAP lies between), and waits for that kernel's end before it reads or writes
-anything else; a program that has rows, and the first one always, waits, so that a kernel has ended only when all before
-it have. The wait is inside the loop over tiles, where it costs nothing once it is over: the compiler then lays out the
-weights for the matrix units before it.
-AHEAD: the next tile's rows are asked for as soon as this one's have left their registers, so that
-they are there when it begins; the kernel before is waited for, and the first tile's rows are read, ahead of the loop.
-Shape legend: C cells, W width.
+A tile has ROWS rows: eight for each cell, six of which may be an edge that ends in it, or with DENSE six (64 rows: ten
+cells instead of eight). A program takes one tile after the other and reads its weights once. Edge arrays are [capacity,
+6, W], [c, d] for the edge to cell c from its neighbour in direction d. Sums over edges are computed inside the tile and
+by gathers in a fixed order. Only gradients of parameters are added by atomics. OVERLAP: a program starts while the
+previous kernel still runs, reads its weights and the results of the grid's kernels (count, neighbours; at least one
+kernel without OVERLAP is between), and waits for the end of the previous kernel before it reads or writes anything
+else. Every program that has rows waits, and the first one always, so that a kernel has ended only after all before it.
+The wait is inside the loop over tiles, where it costs nothing after the first: the compiler then lays out the weights
+for the matrix units before it. AHEAD: the next tile's rows are loaded as soon as this one's have left their registers;
+the previous kernel is waited for, and the first tile's rows are read, before the loop. Shape legend: C cells, W width.
 """
 
 from __future__ import annotations
@@ -42,7 +40,7 @@ from hgn.kernels.triton_compat import gdc_launch_dependents, gdc_wait, settle_ke
 
 @triton.jit
 def _edges_of(tile, count, ROWS: tl.constexpr, SLOTS: tl.constexpr):
-    """For each row of a tile its place among the edges, and whether it has one."""
+    """Returns for each row of a tile its place among the edges, and whether it has one."""
     row = tl.arange(0, ROWS)
     BLOCK: tl.constexpr = ROWS // SLOTS
     holds = (tile * BLOCK + row // SLOTS < count) & (row % SLOTS < 6) & (row < SLOTS * BLOCK)
@@ -52,7 +50,7 @@ def _edges_of(tile, count, ROWS: tl.constexpr, SLOTS: tl.constexpr):
 
 @triton.jit
 def _senders(neighbour, slot, owner, used, count, capacity):
-    """The cells that edges come from, -1: none."""
+    """Returns the cells that edges come from, -1: none."""
     return tl.load(neighbour + slot * capacity + owner, mask=used & (owner < count), other=-1)
 
 
@@ -62,7 +60,8 @@ def _edge_rows(
     FIRST: tl.constexpr, BY_PRODUCT: tl.constexpr, WIDTH: tl.constexpr, SUMS: tl.constexpr, BLOCK: tl.constexpr,
     WIDE: tl.constexpr,
 ):  # fmt: skip
-    """A tile's rows: of `receive` (by cell if BY_PRODUCT, else by edge), of `send`, and of the edges unless FIRST."""
+    """Loads a tile's rows: of `receive` (by cell if BY_PRODUCT, else by edge), of `send`, and of the edges unless
+    FIRST."""
     column = tl.arange(0, WIDTH)
     there = (other >= 0)[:, None]
     # all loads before the first use: the compiler keeps their order, and waits at the first
@@ -89,11 +88,11 @@ def edge_forward(
     FIRST: tl.constexpr, STORE_EDGE: tl.constexpr, SAVE: tl.constexpr, WIDTH: tl.constexpr, ROWS: tl.constexpr,
     DENSE: tl.constexpr, PRECISION: tl.constexpr, OVERLAP: tl.constexpr, AHEAD: tl.constexpr, WIDE: tl.constexpr,
 ):  # fmt: skip
-    """Paper steps 2, 4, … (fig. 5): the edges' new features [C, 6, W] and their sums by receiver [C, W]; send and
-    receive [C, W] are the cells' products with the edge MLP's first two parts, receive with the bias.
+    """Computes paper steps 2, 4, … (fig. 5): the edges' new features [C, 6, W] and their sums by receiver [C, W]. send
+    and receive [C, W] are the cells' products with the edge MLP's first two parts, receive with the bias.
 
-    FIRST: edges have no features yet, their unit offset takes the place. The last iteration stores no edges. SAVE keeps
-    what edge_backward reads: the hidden layer and the normalised output [C, 6, W], and `rstd` [C, 6], one over its
+    FIRST: edges have no features yet; their unit offset replaces them. The last iteration stores no edges. SAVE stores
+    the inputs of edge_backward: the hidden layer and the normalised output [C, 6, W], and `rstd` [C, 6], one over its
     standard deviation.
 
     Rule: hgn.network.hgn.MessagePassing; reference and test: tests/kernels/references.py, test_kernels_alone.py.
@@ -220,10 +219,10 @@ def edge_backward(
     FIRST: tl.constexpr, LAST: tl.constexpr, WIDTH: tl.constexpr, ROWS: tl.constexpr, DENSE: tl.constexpr,
     PRECISION: tl.constexpr, OVERLAP: tl.constexpr,
 ):  # fmt: skip
-    """In place: edge_gradient [C, 6, W] comes in as that of edge_out, less the sums' part (there is none if LAST), and
-    leaves as that of edge_in (if there is one: not FIRST). receive_gradient [C, W] is that of `receive`.
+    """Turns edge_gradient [C, 6, W], in place, from the gradient of edge_out without the sums' part (there is none if
+    LAST) into that of edge_in (unless FIRST). receive_gradient [C, W] is that of `receive`.
 
-    `rstd` is zero where there is no edge. It is read a tile ahead, for it says what else is read.
+    `rstd` is zero where there is no edge. It is read a tile ahead, because it decides what else is read.
 
     Rule: hgn.network.hgn.MessagePassing; reference and test: tests/kernels/references.py, test_kernels_alone.py.
     """

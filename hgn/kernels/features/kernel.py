@@ -19,8 +19,8 @@ def sum_motion(
     motion, parent, geometry, counts, disturbed, felt, neighbour, coarsest_capacity,
     LEVELS: tl.constexpr, OVERLAP: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Adds mass and momentum of the finest cells to all cells above them, in `motion` [.., 4] of all levels, and tells
-    the coarsest in `felt` [C, 2] how touched they are (`most_around`): two programs for as many finest cells.
+    """Adds mass and momentum of the finest cells to all cells above them, in `motion` [.., 4] of all levels, and writes
+    the nearness of surfaces to the coarsest cells' `felt` [C, 2] (`most_around`), by a second set of programs.
 
     Rule: hgn.network.relative; test: tests/kernels/test_network.py.
     """
@@ -53,8 +53,8 @@ def prepare_features(
     HISTORY: tl.constexpr, NORMALS: tl.constexpr, OBSTACLES: tl.constexpr, SYMMETRY: tl.constexpr,
     FEATURES: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Absolute features of each particle (velocities, normal if NORMALS, walls, one-hot material), [N, FEATURES].
-    Without OBSTACLES nothing is looked up and the normals stay zero. SYMMETRY as in obstacle_normals.
+    """Writes the absolute features of each particle (velocities, normal if NORMALS, walls, one-hot material),
+    [N, FEATURES]. Without OBSTACLES the normals are zero. SYMMETRY as in obstacle_normals.
 
     Rule: hgn.network.features; test: tests/kernels/test_network.py.
     """
@@ -96,7 +96,7 @@ def prepare_features(
 
 @triton.jit
 def _asinh(x):
-    """Exactly odd, and within float32's rounding next to zero too: log(1 + y) as Kahan has it."""
+    """Returns asinh(x), exactly odd, and within float32's rounding next to zero too: log(1 + y) by Kahan's method."""
     size = tl.abs(x)
     y = size + size * size / (1 + tl.sqrt(1 + size * size))
     one = 1 + y
@@ -112,12 +112,12 @@ def prepare_relative_features(
     HISTORY: tl.constexpr, LEVELS: tl.constexpr, NORMALS: tl.constexpr,
     FEATURES: tl.constexpr, OVERLAP: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Features of each particle that no boost and no shift changes, [N, FEATURES]: changes of velocity less gravity,
-    velocity relative to the cells around on each level (`motion`: mass and momentum of the cells of all levels), and
-    near a surface velocity, by what its coarsest cells feel; behind the columns
-    of surfaces, which are there already, the one-hot material. Differences of velocity are in units of `scale`, and
-    their asinh. `disturbed` [C, 2] of the coarsest cells, whose first numbers are raised to how disturbed their
-    particles are, over FULLY.
+    """Writes the features of each particle that no boost and no shift changes, [N, FEATURES]: changes of velocity less
+    gravity, velocity relative to the cells around on each level (`motion`: mass and momentum of the cells of all
+    levels), near a surface the velocity, weighted by `felt` of its coarsest cells, and after the columns of surfaces,
+    which prepare_particles wrote, the one-hot material. Differences of velocity are in units of `scale`, as asinh.
+    Raises the first numbers of the coarsest cells' `disturbed` [C, 2] to the disturbance of their particles, over
+    FULLY.
 
     Rule: hgn.network.relative; test: tests/kernels/test_network.py.
     """

@@ -63,7 +63,7 @@ def mark_cells(
     position, scene_of, origin, particle_count, low, geometry, occupied, status, cell_size,
     LEVELS: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Sets the slots of the cells that particles reach, and of their ancestors; one pass for all levels.
+    """Marks the slots of the cells that particles reach, and of their ancestors, in one pass for all levels.
 
     Rule: hgn.network.grid.build_hierarchy; test: tests/kernels/test_network.py.
     """
@@ -107,20 +107,20 @@ def _marked(occupied, slot, ask):
 
 @triton.jit
 def _number(prefix_sum, slot, first, capacity, there):
-    """The number of the cell in a slot, -1 where it is not active."""
+    """Returns the number of the cell in a slot, -1 if it is not active."""
     cell = tl.load(prefix_sum + slot, mask=there, other=0) - 1 - first
     return tl.where(there & (cell < capacity), cell, -1)
 
 
 @triton.jit
 def _cell(occupied, prefix_sum, slot, first, capacity, ask):
-    """The same, of slots that may be asked for."""
+    """Does the same for the slots where `ask` is true."""
     return _number(prefix_sum, slot, first, capacity, _marked(occupied, slot, ask))
 
 
 @triton.jit
 def _write_cells(table, cell, live, occupied, prefix_sum, slots, first, capacity, own_capacity, COUNT: tl.constexpr):
-    """Line i of the table [COUNT, own_capacity] gets the numbers of the cells in slots i of the tuple `slots`.
+    """Writes the numbers of the cells in slots i of the tuple `slots` to line i of the table [COUNT, own_capacity].
 
     All are read before the first is written: the compiler keeps that order, and would wait for each in turn.
     """
@@ -139,7 +139,7 @@ def fill_tables(
     occupied, prefix_sum, geometry, slot_of_cell, neighbour, parent, octant, children, counts, needed, status,
     LEVELS: tl.constexpr, OVERLAP: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Each active slot writes its cell's neighbours, parent and children, int32, -1 where there is none.
+    """Writes the neighbours, parent and children of each active slot's cell, int32, -1 for none.
 
     Rule: hgn.network.grid.build_hierarchy; test: tests/kernels/test_network.py.
     """
@@ -245,7 +245,7 @@ def _surfaces(
 
 @triton.jit
 def _surface_normals(surfaces):
-    """Products xx, yy, zz, yz, xz, xy of the normals that `_surfaces` tells of, summed over a particle's surfaces."""
+    """Returns the products xx, yy, zz, yz, xz, xy of the normals of `_surfaces`, summed over a particle's surfaces."""
     column = tl.arange(0, 16)[None, :]
     near, first = (), ()
     for i in tl.static_range(3):
@@ -281,13 +281,13 @@ def prepare_particles(
     NORMALS: tl.constexpr, OBSTACLES: tl.constexpr, SYMMETRY: tl.constexpr, FEATURES: tl.constexpr,
     OVERLAP: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Each particle's 8 cells, their weights, and its fraction; with MOTION its parts of the finest cells' mass and
-    momentum are added to `motion` [.., 4], and its coarsest cells are told: `coarsest_of` [N, 8], each once and -1
-    elsewhere, its shares of them, and its place [N, 3] in the lowest, from the middle, in edges. Surfaces need no sums:
-    their columns of the features are written here, with `touch_of` [N], how near a particle is to any, to which the
-    second numbers of its coarsest cells in `disturbed` [C, 2] are raised, over FULLY. Sums of places and of
-    their products xx, yy, zz, yz, xz, xy are added to the coarsest cells' `moments` [C, COLUMNS], and those of the
-    normals of touched surfaces behind them. OBSTACLES and SYMMETRY as in prepare_features.
+    """Writes each particle's 8 cells, their weights, and its fraction. With MOTION adds its parts of the finest cells'
+    mass and momentum to `motion` [.., 4], and writes its coarsest cells `coarsest_of` [N, 8], each once and -1
+    elsewhere, its weights in them, and its place [N, 3] in the lowest, from the middle, in edges. Writes the columns of
+    the features for surfaces and `touch_of` [N], the nearness of the nearest surface, and raises the second number of
+    its coarsest cells in `disturbed` [C, 2] to it, over FULLY. Adds places, their products xx, yy, zz, yz, xz, xy, and
+    after them those of the normals of near surfaces to the coarsest cells' `moments` [C, COLUMNS]. OBSTACLES and
+    SYMMETRY as in prepare_features.
 
     Rule: hgn.network.grid.build_hierarchy and hgn.network.relative; test: tests/kernels/test_network.py.
     """

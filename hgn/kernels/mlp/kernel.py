@@ -1,7 +1,7 @@
 """An MLP on rows, forward and backward: encoder, decoder, and the steps between levels.
 
 Forward of row r: h = x W + gathered[index_r] + offset_octant + b; a = leaky(h); y = norm(a W2 + b2) (+ x).
-Up to two products of y follow, with biases or without, for whoever reads it next. Shape legend: R rows, W width.
+Up to two products of y follow, with or without biases, for the next kernels. Shape legend: R rows, W width.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from hgn.kernels.triton_compat import gdc_launch_dependents, gdc_wait, settle_ke
 
 @triton.jit
 def _shift(values, offset_at, octant, SIGN: tl.constexpr, WIDTH: tl.constexpr):
-    """Sum over axes of (1/2 - bit) times the offset weights [3, W]: towards the parent's centre for SIGN = 1."""
+    """Returns the sum over axes of (1/2 - bit) times the offset weights [3, W]: towards the parent for SIGN = 1."""
     column = tl.arange(0, WIDTH)
     result = tl.zeros((octant.shape[0], WIDTH), tl.float32)
     for axis in tl.static_range(3):
@@ -45,14 +45,14 @@ def _shift(values, offset_at, octant, SIGN: tl.constexpr, WIDTH: tl.constexpr):
 
 @triton.jit
 def _rows_of(x, tile, count, INPUT: tl.constexpr, BLOCK: tl.constexpr):
-    """A tile's rows of x [R, INPUT]."""
+    """Loads a tile's rows of x [R, INPUT]."""
     row = tile * BLOCK + tl.arange(0, BLOCK)
     return tl.load(x + row[:, None] * INPUT + tl.arange(0, INPUT)[None, :], mask=(row < count)[:, None], other=0.0)
 
 
 @triton.jit
 def _three_rows(pointer, WIDTH: tl.constexpr):
-    """The matrix [3, W] at `pointer`, filled up to the 16 rows that a product takes."""
+    """Loads the matrix [3, W] at `pointer`, filled up to the 16 rows of a product."""
     row = tl.arange(0, 16)
     return tl.load(pointer + row[:, None] * WIDTH + tl.arange(0, WIDTH)[None, :], mask=(row < 3)[:, None], other=0.0)
 
@@ -67,16 +67,16 @@ def mlp_forward(
     SAVE: tl.constexpr, FINE: tl.constexpr, BLOCK: tl.constexpr, PRECISION: tl.constexpr, LOOP: tl.constexpr,
     OVERLAP: tl.constexpr,
 ):  # fmt: skip
-    """y [R, OUT] of x [R, INPUT] as above: the encoder (paper step 0, with the products that steps 1 and 11 take),
+    """Computes y [R, OUT] of x [R, INPUT] as above: the encoder (paper step 0, with the products for steps 1 and 11),
     messages to parents (3, 5, …) and from them (7, 9, …; GATHER), the decoder (12).
 
-    With FINE the MLP's own products are finer than PRECISION, and read the weights themselves.
+    With FINE the MLP's own products are finer than PRECISION, and read the unrounded weights.
 
-    FRACTION: the products that follow are a particle's part of its pairs: the first less what its fraction [R, 3] makes
-    of the offsets' weights [3, W], the second with it.
+    FRACTION: the following products are a particle's part of its pairs: of the first, the product of its fraction [R,
+    3] with the offsets' weights [3, W] is subtracted; to the second it is added.
 
-    LOOP: a program takes one tile after the other, and reads its weights once. OVERLAP: it starts before the launch
-    before it has ended, and what it reads of weights ahead it reads meanwhile.
+    LOOP: a program takes one tile after the other, and reads its weights once. OVERLAP: it starts before the previous
+    launch has ended, and reads weights meanwhile.
 
     Rule: hgn.network.mlp.MLP; reference and test: tests/kernels/references.py, test_kernels_alone.py.
     """
@@ -191,11 +191,11 @@ def mlp_backward(
     RESIDUAL: tl.constexpr, NEXT: tl.constexpr, INTO: tl.constexpr, BLOCK: tl.constexpr,
     PRECISION: tl.constexpr,
 ):  # fmt: skip
-    """Gradients of all inputs of mlp_forward.
+    """Computes the gradients of all inputs of mlp_forward.
 
     The gradient of y is `gradient` (row gradient_index_r if GATHER) plus from_0, from_1 times their products' weights
-    (NEXT). INTO: 0 no gradient of x, 1 write it, 2 add it to what is there. Gains, shifts and offset weights are summed
-    into `totals`, divided by the loss rstd (`unscale`); hidden_gradient and second_gradient are left for the others.
+    (NEXT). INTO: 0 no gradient of x, 1 write it, 2 add it. Gradients of norm and offset weights are added to `totals`,
+    divided by the loss scale (`unscale`); hidden_gradient and second_gradient are stored for the weights' gradients.
 
     Rule: hgn.network.mlp.MLP; reference and test: tests/kernels/references.py, test_kernels_alone.py.
     """
@@ -255,7 +255,7 @@ def mlp_backward(
 
 @triton.jit(do_not_specialize_on_alignment=["count_ptr"])
 def clear_rows(x, count_ptr, WIDTH: tl.constexpr, OVERLAP: tl.constexpr, BLOCK: tl.constexpr):
-    """Zeros into the rows of x [.., W] that are in use: capacities have room for twice as many.
+    """Clears the rows of x [.., W] that are in use; capacities may be twice as large.
 
     Rule: hgn.network.mlp.MLP; reference and test: tests/kernels/references.py, test_kernels_alone.py.
     """
@@ -272,10 +272,10 @@ def gather_sums(
     x, table, count_ptr, y, capacity,
     SUM: tl.constexpr, EDGES: tl.constexpr, WIDTH: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """y = the sum of x's rows listed in the table [SUM, capacity] (-1: none), as gathered_sum takes them.
+    """Computes y = the sum of x's rows listed in the table [SUM, capacity] (-1: none), as gathered_sum.
 
-    In a kernel of its own where there are many rows: its programs are small enough that many wait at once, while a
-    kernel with products has registers for two rows at a time.
+    A kernel of its own where there are many rows: its programs are so small that many wait at the same time, while a
+    kernel with products has registers for two rows.
 
     Rule: hgn.network.mlp.MLP; reference and test: tests/kernels/references.py, test_kernels_alone.py.
     """
@@ -295,8 +295,8 @@ def gather_project(
     SUM: tl.constexpr, WIDTH: tl.constexpr, BLOCK: tl.constexpr, PRECISION: tl.constexpr, LOOP: tl.constexpr,
     OVERLAP: tl.constexpr,
 ):  # fmt: skip
-    """y = x, or with SUM > 0 the sum of x's rows listed in table [SUM, capacity] (-1: none); and two products of y, the
-    second with a bias. LOOP and OVERLAP as in mlp_forward.
+    """Computes y = x, or with SUM > 0 the sum of x's rows listed in table [SUM, capacity] (-1: none); and two products
+    of y, the second with a bias. LOOP and OVERLAP as in mlp_forward.
 
     Rule: hgn.network.mlp.MLP; reference and test: tests/kernels/references.py, test_kernels_alone.py.
     """
@@ -341,10 +341,10 @@ def gather_project_backward(
     SUM: tl.constexpr, EDGES: tl.constexpr, ADD: tl.constexpr, WIDTH: tl.constexpr, BLOCK: tl.constexpr,
     PRECISION: tl.constexpr,
 ):  # fmt: skip
-    """summed = x, or the sum of x's rows listed in the table [SUM, capacity]; gradient (+)= summed W.
+    """Computes summed = x, or the sum of x's rows listed in the table [SUM, capacity], and gradient (+)= summed W.
 
-    With EDGES, x is [capacity, SUM, W], of the row listed for a direction the opposite direction's part is taken, and
-    the product of `other` [capacity, W] with its own weights is added to the gradient.
+    With EDGES, x is [capacity, SUM, W], of which the part of the opposite direction of the listed row is taken, and the
+    product of `other` [capacity, W] with its own weights is added to the gradient.
 
     Rule: hgn.network.mlp.MLP; reference and test: tests/kernels/references.py, test_kernels_alone.py.
     """

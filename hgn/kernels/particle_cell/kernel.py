@@ -30,21 +30,21 @@ from hgn.kernels.triton_compat import gdc_launch_dependents, gdc_wait, settle_ke
 
 @triton.jit
 def _offset(fraction, particle, corner, live, axis: tl.constexpr):
-    """Cell centre minus particle, in cells."""
+    """Returns cell centre minus particle, in cells."""
     bit = (corner >> (2 - axis)) & 1
     return bit.to(tl.float32) - tl.load(fraction + particle * 3 + axis, mask=live, other=0.0)
 
 
 @triton.jit
 def _cell_of(tile, count, cell_of, ROWS: tl.constexpr):
-    """For each row of a tile its cell; there may be no such tile."""
+    """Returns the cell of each row of a tile; the tile may not exist."""
     pair = tile * ROWS + tl.arange(0, ROWS)
     return tl.load(cell_of + pair, mask=(pair >= 0) & (pair < count * 8), other=0)
 
 
 @triton.jit
 def _cells_of(tile, count, cell_of, weight_of, ROWS: tl.constexpr):
-    """For each row of a tile its cell and its weight."""
+    """Returns cell and weight of each row of a tile."""
     pair = tile * ROWS + tl.arange(0, ROWS)
     live = pair < count * 8
     return tl.load(cell_of + pair, mask=live, other=0), tl.load(weight_of + pair, mask=live, other=0.0)
@@ -52,7 +52,7 @@ def _cells_of(tile, count, cell_of, weight_of, ROWS: tl.constexpr):
 
 @triton.jit
 def _particles(by_particle, tile, count, PARTICLES: tl.constexpr, SUMS: tl.constexpr, WIDTH: tl.constexpr):
-    """A tile's particles' rows [SUMS, W]."""
+    """Loads a tile's particles' rows [SUMS, W]."""
     mine = tile * PARTICLES + tl.arange(0, SUMS)
     there = ((tl.arange(0, SUMS) < PARTICLES) & (mine < count))[:, None]
     return tl.load(by_particle + mine[:, None] * WIDTH + tl.arange(0, WIDTH)[None, :], mask=there, other=0.0)
@@ -60,8 +60,8 @@ def _particles(by_particle, tile, count, PARTICLES: tl.constexpr, SUMS: tl.const
 
 @triton.jit
 def _choice(PARTICLES: tl.constexpr, SUMS: tl.constexpr, SIGN: tl.constexpr):
-    """[8 PARTICLES, SUMS]: a pair's particle, and in the spare places the bits of its corner, for the high parts of the
-    offsets' weights and for the low ones (high_and_low)."""
+    """Returns [8 PARTICLES, SUMS]: a pair's particle, and in the spare places the bits of its corner, for the high and
+    the low parts of the offsets' weights (high_and_low)."""
     ROWS: tl.constexpr = PARTICLES * 8
     spare = tl.arange(0, SUMS) - PARTICLES
     bit = ((tl.arange(0, ROWS) % 8)[:, None] >> (2 - spare % 3)[None, :]) & 1
@@ -71,8 +71,8 @@ def _choice(PARTICLES: tl.constexpr, SUMS: tl.constexpr, SIGN: tl.constexpr):
 
 @triton.jit
 def _first_layer(choice, rows, of_cells, TO_CELL: tl.constexpr, PRECISION: tl.constexpr):
-    """The first layer of a tile's pairs [ROWS, W] before its activation: of its particles' rows and the offsets', and
-    unless TO_CELL of its cells' [ROWS, W]."""
+    """Returns the first layer of a tile's pairs [ROWS, W] before its activation: of its particles' rows and the
+    offsets', and unless TO_CELL of its cells' [ROWS, W]."""
     if TO_CELL:
         h = product(choice, rows, PRECISION)
     else:
@@ -87,12 +87,13 @@ def particle_cell_forward(
     TO_CELL: tl.constexpr, SAVE: tl.constexpr, WIDTH: tl.constexpr, PARTICLES: tl.constexpr,
     PRECISION: tl.constexpr, OVERLAP: tl.constexpr,
 ):  # fmt: skip
-    """Paper step 1 (TO_CELL): out [C, W] += weight * MLP(by_particle_n + offset). Paper step 11: out [N, W] =
-    particle + sum over the corners of weight * MLP(by_cell_c + by_particle_n - offset). The by_… are products with
-    first-layer weights, by_particle with the particle's part of the offset: what is left of it are the corner's bits.
+    """Computes paper step 1 (TO_CELL): out [C, W] += weight * MLP(by_particle_n + offset), or step 11: out [N, W] =
+    particle + sum over the corners of weight * MLP(by_cell_c + by_particle_n - offset). by_particle and by_cell are
+    products with first-layer weights; by_particle includes the particle's part of the offset, so that only the corner's
+    bits are left.
 
-    SAVE keeps what particle_cell_backward reads: the normalised output [8 N, W], `rstd` [8 N], one over its standard
-    deviation, and the hidden layer unless BY_PRODUCT: then it is cheaper to compute again.
+    SAVE stores the inputs of particle_cell_backward: the normalised output [8 N, W], `rstd` [8 N], one over its
+    standard deviation, and the hidden layer unless BY_PRODUCT: then it is cheaper to compute again.
 
     Rule: hgn.network.hgn; reference and test: tests/kernels/references.py, test_kernels_alone.py.
     """
@@ -179,7 +180,7 @@ def particle_cell_forward(
 
 @triton.jit
 def _pairs_of(tile, count, cell_of, weight_of, fraction, ROWS: tl.constexpr):
-    """For each row of a tile its cell, its weight, and its offset's three parts."""
+    """Returns for each row of a tile its cell, its weight, and its offset's three parts."""
     row = tl.arange(0, ROWS)
     owner = tile * (ROWS // 8) + row // 8
     corner = row % 8
@@ -198,9 +199,10 @@ def particle_cell_backward(
     by_cell_gradient, unscale,
     TO_CELL: tl.constexpr, WIDTH: tl.constexpr, PARTICLES: tl.constexpr, PRECISION: tl.constexpr,
 ):  # fmt: skip
-    """From the gradient of `out` ([C, W] if TO_CELL, else [N, W]) to those of by_particle, and of by_cell by atomics.
+    """Computes the gradients of by_particle, and by atomics of by_cell, from that of `out` ([C, W] if TO_CELL, else [N,
+    W]).
 
-    second_gradient [8 N, W] is left for the weight product. Where the hidden layer was not kept it is computed again,
+    second_gradient [8 N, W] is stored for the weights' gradients. A hidden layer that was not stored is computed again,
     to the same bits.
 
     Rule: hgn.network.hgn; reference and test: tests/kernels/references.py, test_kernels_alone.py.
@@ -286,7 +288,8 @@ def _weight_tile(
     TO_CELL: tl.constexpr, WIDTH: tl.constexpr, PARTICLES: tl.constexpr, SUMS: tl.constexpr,
     PRECISION: tl.constexpr,
 ):  # fmt: skip
-    """`total` and `lines` with a tile's part of the gradients added, and the cells of the program's next tile."""
+    """Returns `total` and `lines` with a tile's part of the gradients added, and the cells of the program's next
+    tile."""
     ROWS: tl.constexpr = PARTICLES * 8
     column = tl.arange(0, WIDTH)
     pair = tile * ROWS + tl.arange(0, ROWS)
@@ -310,12 +313,12 @@ def particle_cell_weight_gradient(
     TO_CELL: tl.constexpr, WIDTH: tl.constexpr, PARTICLES: tl.constexpr, PRECISION: tl.constexpr,
     PIPELINED: tl.constexpr,
 ):  # fmt: skip
-    """Gradients of the second layer and its bias, as weight_gradient makes them, where the hidden layer was not kept:
-    it is computed again, to the same bits, from an eighth of the bytes. Tiles come from behind: what
-    particle_cell_backward wrote last is still in the L2 cache.
+    """Computes the gradients of the second layer and its bias, like weight_gradient, where the hidden layer was not
+    stored: it is computed again, to the same bits, from an eighth of the bytes. The last tile is first, because the
+    last writes of particle_cell_backward are still in the L2 cache.
 
-    PIPELINED: the compiler has a counted loop's tiles copied to shared memory two ahead. The interpreter of Triton 3.6
-    counts to no number that was loaded.
+    PIPELINED: in a counted loop, the compiler copies tiles to shared memory two ahead. The interpreter of Triton 3.6
+    cannot count to a loaded number.
 
     Rule: hgn.network.hgn; reference and test: tests/kernels/references.py, test_kernels_alone.py.
     """

@@ -1,10 +1,10 @@
-"""A frame behind the network's output on the device: rest, integration, walls and obstacles.
+"""The part of a frame after the network's output, on the device: rest, integration, walls and obstacles.
 
-The rules are those of hgn.step.reference. A frame is taken only if nothing went wrong before it.
+The rules are those of hgn.step.reference. A frame is integrated only if nothing went wrong before it.
 Row of the barrier table of a scene, int64: addresses of the hash buckets of its cells (0: no obstacle), of their keys
-and of where their lists begin and end, the mask of the buckets, addresses of the lists and of the triangles' rows, and
-the bits of the cells' size in float32.
-Shape legend: N particles, K middles of coarsest or larger cells, T frames kept between two looks of the host.
+and of the ranges of their lists, the mask of the buckets, addresses of the lists and of the triangles' rows, and the
+bits of the cells' size in float32.
+Shape legend: N particles, K middles of coarsest or larger cells, T frames between two synchronisations with the host.
 """
 
 from __future__ import annotations
@@ -30,15 +30,15 @@ DIVERGED = tl.constexpr(4)
 
 @triton.jit
 def _lowest(base_of, gate_of, spot_of, row, live):
-    """The slots of the lowest middles around particles, their gates, and their places from there, in edges."""
+    """Returns the slots of the lowest middles around particles, their gates, and their places from there, in edges."""
     spot = three_columns(spot_of, row, 0, live, 1.0, 3)
     return tl.load(base_of + row, mask=live, other=0), tl.load(gate_of + row, mask=live, other=0.0), spot
 
 
 @triton.jit
 def _add_bodies(sums, slot, place, weight, value, BODIES: tl.constexpr, COLUMNS: tl.constexpr):
-    """Adds values of particles and their moments to middles' sums [K, COLUMNS]: behind mass, places and their products
-    xx, yy, zz, yz, xz, xy with BODIES."""
+    """Adds values of particles and their moments to the sums of middles [K, COLUMNS]; with BODIES after mass, places
+    and their products xx, yy, zz, yz, xz, xy."""
     at: tl.constexpr = 10 * BODIES
     moment = cross(place, (value[0][:, None], value[1][:, None], value[2][:, None]))
     column = tl.arange(0, COLUMNS)[None, None, :]
@@ -60,7 +60,7 @@ def _add_bodies(sums, slot, place, weight, value, BODIES: tl.constexpr, COLUMNS:
 
 @triton.jit
 def _deforming(table, slot, place, weight, value):
-    """The part of values of particles that deforms what touches, by the middles' table [K, RATES]."""
+    """Returns the part of particles' values that deforms the bodies around them, by the middles' table [K, RATES]."""
     there = weight > 0
     base = three_columns(table, slot, 0, there, weight, RATES)
     swing = cross(three_columns(table, slot, 4, there, weight, RATES), place)
@@ -74,7 +74,7 @@ def _deforming(table, slot, place, weight, value):
 
 @triton.jit
 def _displaced(x, velocity, scale, row, live, OUT: tl.constexpr, HISTORY: tl.constexpr):
-    """The next displacements in units of `scale`: columns 0 to 2 of x [N, OUT] and the newest velocities."""
+    """Returns the next displacements in units of `scale`: columns 0 to 2 of x [N, OUT] plus the newest velocities."""
     ax, ay, az = three_columns(x, row, 0, live, 1.0, OUT)
     vx, vy, vz = three_columns(velocity, row, 0, live, 1 / tl.load(scale), 3 * HISTORY)
     return ax + vx, ay + vy, az + vz
@@ -88,9 +88,9 @@ def sum_displacements(
     COLUMNS: tl.constexpr, OVERLAP: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Adds the particles' bodies and next displacements, with their moments, to the sums [K, COLUMNS] of the middles
-    around them, between cells 2^SHIFT times as large as coarsest ones. The lowest of these slots goes into `base_of`
-    [N], the place from there into `spot_of` [N, 3], and the gate into `gate_of` [N]: 0 for materials whose bit is not
-    in RESTING; with -1 all are.
+    around them, between cells 2^SHIFT times as large as coarsest ones. Writes the lowest of these slots to `base_of`
+    [N], the place from there to `spot_of` [N, 3], and the gate to `gate_of` [N]: 0 for materials whose bit is not in
+    RESTING; -1 has all bits.
 
     Rule: hgn.step.reference.Deformation; test: tests/kernels/test_relative.py.
     """
@@ -128,8 +128,8 @@ def find_deformation(
     AT: tl.constexpr, COLUMNS: tl.constexpr, BODIES: tl.constexpr, OVERLAP: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """From a field's sums [K, COLUMNS] at the middles of cells, from column AT on, and `bodies` [K, BODIES] to
-    their table [K, RATES]: what is subtracted there, the factor of a particle's own in column 3, and the rate of
-    rotation that is subtracted in columns 4 to 6.
+    their table [K, RATES]: the subtracted motion (columns 0 to 2), the factor of a particle's own (3), and the
+    subtracted rate of rotation (4 to 6).
 
     Rule: hgn.step.reference.Deformation; test: tests/kernels/test_relative.py.
     """
@@ -161,7 +161,7 @@ def slow_displacements(
     particle_count,
     OUT: tl.constexpr, HISTORY: tl.constexpr, LEVELS: tl.constexpr, OVERLAP: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Writes the slow part of the deformation by the middles' table into `slow` [N, 3], and adds it with its moments to
+    """Writes the slow part of the deformation by the middles' table to `slow` [N, 3], and adds it with its moments to
     the sums [K, RATES].
 
     Rule: hgn.step.reference.rest; test: tests/kernels/test_relative.py.
@@ -192,7 +192,7 @@ def stop_slow(
     x, slow, table, base_of, gate_of, spot_of, geometry, particle_count,
     OUT: tl.constexpr, LEVELS: tl.constexpr, OVERLAP: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Takes what of `slow` [N, 3] deforms, by the middles' table, off columns 0 to 2 of x [N, OUT].
+    """Subtracts the part of `slow` [N, 3] that deforms, by the middles' table, from columns 0 to 2 of x [N, OUT].
 
     Rule: hgn.step.reference.Deformation; test: tests/kernels/test_relative.py.
     """
@@ -231,7 +231,7 @@ def _between_walls(x, before, size, near, far, WALLED: tl.constexpr):
 
 @triton.jit
 def _distance(row, x, y, z, live):
-    """Before the plane that lies at `row`, and above 0 in front of it."""
+    """Returns the distance from the plane at `row`, above 0 in front of it."""
     across = tl.load(row, mask=live, other=0.0) * x + tl.load(row + 1, mask=live, other=0.0) * y
     across += tl.load(row + 2, mask=live, other=0.0) * z
     return across - tl.load(row + 3, mask=live, other=0.0)
@@ -352,11 +352,12 @@ def integrate(
     COLUMNS: tl.constexpr, WALLED_AXES: tl.constexpr, SURFACES: tl.constexpr, OVERLAP: tl.constexpr,
     BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """v += a, x += v, and the new positions into path [T, N, 3] at `frame`; a is gravity and the restored output.
+    """Computes v += a, x += v, where a is gravity and the restored output, and writes the new positions into path
+    [T, N, 3] at `frame`.
 
-    Where the status is not zero, nothing changes. Particles that are not finite or farther from the domain than its
-    own size are counted in `lost`, once an axis; `advance` then ends the simulation. All others stay between the
-    walls of the first WALLED_AXES axes, `near` and `far` from the planes, and, with SURFACES, outside the obstacles of
+    If the status is not zero, nothing changes. Particles that are not finite or farther from the domain than its own
+    size are counted in `lost`, once an axis; `advance` then ends the simulation. All others stay between the walls of
+    the first WALLED_AXES axes, `near` and `far` from the planes, and, with SURFACES, outside the obstacles of
     `barrier_table`, see `_stopped_by_obstacles`.
 
     Rule: hgn.step.reference.advanced; test: tests/kernels/test_rollout.py, tests/kernels/test_barriers.py.
@@ -420,7 +421,7 @@ def integrate(
 
 @triton.jit
 def advance(status, lost, frame, OVERLAP: tl.constexpr):
-    """Counts the frame, unless it was not taken.
+    """Counts the frame, if it was integrated.
 
     Rule: hgn.runtime.torch_stepper; test: tests/kernels/test_rollout.py.
     """

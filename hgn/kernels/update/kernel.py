@@ -1,9 +1,8 @@
-"""What a training step needs around the network: assembling a batch, loss, Adam, bookkeeping; all on the device.
+"""The parts of a training step around the network, on the device: batch, loss, Adam, counters.
 
 Row of the sample table, int64, one for each scene of each update: address of the window's first frame of positions,
 particles, first row in the batch, seed, address of the materials (int32), weight of the loss, scale of the noise (the
-bits of a float64 each), and the scene's row of the obstacle table, whose last column is the symmetry that the scene is
-shown under.
+bits of a float64 each), and the scene's row of the obstacle table, whose last column is the symmetry of the sample.
 Shape legend: N particles of all scenes, S scenes, H velocity history.
 """
 
@@ -31,10 +30,10 @@ def draw_waves(
     samples, update, waves, amplitude_step, largest_number, log_range, scenes,
     HISTORY: tl.constexpr, WAVES: tl.constexpr,
 ):  # fmt: skip
-    """The plane waves of a scene's smooth velocity noise, from its sample's seed; a program a scene.
+    """Draws the plane waves of a scene's smooth velocity noise from its sample's seed; a program for each scene.
 
-    waves [S, WAVES, 4 + 3 HISTORY]: wave vector (direction uniform, length log-uniform), phase, and what the amplitude
-    gains with each velocity, the oldest first.
+    waves [S, WAVES, 4 + 3 HISTORY]: wave vector (direction uniform, length log-uniform), phase, and the change of the
+    amplitude with each velocity, the oldest first.
 
     Rule: hgn.training.noise; test: tests/kernels/test_update.py.
     """
@@ -65,13 +64,13 @@ def assemble_batch(
     HISTORY: tl.constexpr, SYMMETRY: tl.constexpr, NOISE: tl.constexpr, WAVES: tl.constexpr,
     DIMENSIONS: tl.constexpr, SCENES: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Windows with noise in the question (paper sec. 3.3): a random walk of velocity noise, positions follow;
-    with NOISE each particle has its own, with WAVES a part comes from the waves of its scene, see draw_waves.
+    """Writes windows with noise in the inputs (paper sec. 3.3): a random walk of velocity noise that positions follow.
+    With NOISE each particle has its own; with WAVES a part comes from the waves of its scene, see draw_waves.
 
     The target is v_true^{n+1} - v_noisy^n less gravity, normalised. sample_vectors [updates, S, 2, 3] are the domain's
-    size and gravity as the sample shows them; gravity is zero with absolute inputs. Grid origins are uniform in
-    [-jitter, 0]. Noise and jitter are Philox numbers of the sample's seed: they depend on nothing else. With SYMMETRY
-    the window is the image of the stored one; velocities come from the stored positions, for mirrored ones are rounded.
+    size and gravity under the sample's symmetry; gravity is zero with absolute inputs. Grid origins are uniform in
+    [-jitter, 0]. Noise and jitter are Philox numbers of the sample's seed, and depend on nothing else. With SYMMETRY
+    the window is the image of the stored one; velocities come from stored positions, because mirrored ones are rounded.
     SCENES: a power of two, at least `scenes`. Axes from DIMENSIONS on have neither noise nor jitter.
 
     Rule: hgn.training.noise; test: tests/kernels/test_update.py.
@@ -167,7 +166,8 @@ def assemble_batch(
 def loss_gradient(
     output, target, share_of, particle_count, gradient, loss, scale, OUT: tl.constexpr, BLOCK: tl.constexpr
 ):
-    """Mean squared error of the normalised acceleration over axes, particles, scenes; its gradient times `scale`.
+    """Adds up the mean squared error of the normalised acceleration over axes, particles and scenes; writes its
+    gradient times `scale`.
 
     Rule: torch's autograd; test: tests/kernels/test_update.py.
     """
@@ -187,7 +187,7 @@ def loss_gradient(
 
 @triton.jit
 def tell_overflow(status, flag):
-    """Puts into the gradient's last element whether this rank must repeat the update: it travels with the gradient.
+    """Writes to the element after the gradient whether this rank must repeat the update: it is sent with the gradient.
 
     Test: tests/kernels/test_ranks.py.
     """
@@ -213,10 +213,10 @@ def adam(
     others,
     PRECISION: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Adam (Kingma & Ba 2015) on flat buffers, unless the status is not zero or the gradient not finite.
+    """Makes a step of Adam (Kingma & Ba 2015) on flat buffers, if the status is zero and the gradient finite.
 
-    rates [updates]; step, float64 [1], counts the steps made. `weight` is the copy that products at
-    this precision read. `others`, int8 [size] or none, tells which elements another optimiser steps.
+    rates [updates]; step, float64 [1], counts the steps. `weight` is the copy for products at this precision. `others`,
+    int8 [size] or None, marks the elements that another optimiser steps.
 
     Rule: torch.optim.Adam; test: tests/kernels/test_update.py.
     """
@@ -250,9 +250,9 @@ def adam(
 
 @triton.jit
 def average_values(value, average, shares, update, status, size, BLOCK: tl.constexpr):
-    """Moving average of the values, with the update's share, shares [updates], of the new ones.
+    """Updates the moving average of the values, with the weights shares [updates] of the new ones.
 
-    Not while the update has to be made again; after one that was skipped, with the values that stayed.
+    Does nothing for an update that is repeated; after a skipped one the values are the old ones.
 
     Rule: hgn.training.torch_updates.TorchUpdates; test: tests/kernels/test_training.py.
     """
@@ -267,10 +267,10 @@ def average_values(value, average, shares, update, status, size, BLOCK: tl.const
 
 @triton.jit
 def finish_update(status, update, step, loss, norm, loss_sum, counters):
-    """Counts the update, unless it has to be done again with more room.
+    """Counts the update, unless it is repeated with larger buffers.
 
-    loss_sum: sum and number of finite losses. counters: sum of finite norms, how many those are, skipped updates,
-    skipped in a row, most in a row.
+    loss_sum: sum and number of finite losses. counters: sum and number of finite norms, skipped updates, skipped in a
+    row, most in a row.
 
     Test: tests/kernels/test_update.py.
     """
