@@ -64,7 +64,7 @@ class BoundEntry:
 
     @property
     def key(self) -> str:
-        """What is measured, without the frames: rows with the same key share a series."""
+        """Returns the measured quantity without the frames: rows with the same key share a series."""
         parts = [
             self.of,
             *(f"{name} {getattr(self, name)}" for name in ("group", "at") if getattr(self, name) is not None),
