@@ -91,6 +91,7 @@ REMOVED: dict[str, Removed] = {
     "bench.rounds": Removed(50, "set seconds for a shorter measurement"),
     "scaling.rounds": Removed(20, "set seconds for a shorter measurement"),
     "render.gif": Removed(True, "give a file that ends in .png as out for a picture without animation"),
+    "stability_solver.picture": Removed(remedy="leave it out: make docs draws it from the JSON"),
     "render.fps": Removed(remedy="leave it out: animations play in real time"),
     "upload.follow": Removed(remedy="run the command again, as with watch -n 60: it copies what is new"),
     "upload.poll_s": Removed(remedy="run the command again, as with watch -n 60: it copies what is new"),

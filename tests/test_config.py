@@ -65,29 +65,20 @@ RULES = {
         ({"pure_direction_fraction": 1.5}, "pure_direction_fraction must be .*, got 1.5"),
         ({"colliding_scene_fraction": -0.1}, "colliding_scene_fraction must be .*, got -0.1"),
         ({"funnel_hole": (0.1, 0.05)}, r"funnel_hole must be 0 < smallest <= largest, got \[0.1, 0.05\]"),
-        (
-            {"funnel_scene_fraction": 0.5, "obstacle_count": 3},
-            "obstacle_count must be at least 4 where funnel_scene_fraction is above 0, got 3",
-        ),
+        ({"funnel_scene_fraction": 0.5, "obstacle_count": 3}, "obstacle_count must be at least 4 where .*, got 3"),
         ({"zero_gravity_fraction": float("nan")}, "zero_gravity_fraction must be .*, got nan"),
         (
             {"zero_gravity_fraction": 0.6, "tilted_gravity_fraction": 0.5},
-            r"tilted_gravity_fraction must be at most 1 - zero_gravity_fraction \(0.6\), got 0.5",
+            r"must be at most 1 - .* \(0.6\), got 0.5",
         ),
-        (
-            {"colliding_scene_fraction": 0.1},
-            "maximum_initial_speed must be above 0 where colliding_scene_fraction is, got 0.0",
-        ),
+        ({"colliding_scene_fraction": 0.1}, "maximum_initial_speed must be above 0 where colliding_.* is, got 0.0"),
     ],
     train_on_six_frames: [
         ({"symmetry": "square"}, "symmetry must be one of none, gravity, got 'square'"),
         ({"pushforward_fraction": 1.0}, "pushforward_fraction must be 0 or more and below 1, got 1.0"),
         ({"pushforward_pull": 1.5}, "pushforward_pull must be from 0 to 1, got 1.5"),
         ({"pushforward_every": 0}, "pushforward_every must be .*got 0"),
-        (
-            {"pushforward_fraction": 0.5, "frames": 2},
-            "dataset.frames must be at least 3 where training.pushforward_fraction > 0, got 2",
-        ),
+        ({"pushforward_fraction": 0.5, "frames": 2}, "dataset.frames must be at least 3 where .*_fraction > 0, got 2"),
     ],
     average_of: [
         ({"count": 1}, "weights must be at least two files, got 1"),
@@ -133,7 +124,6 @@ RULES = {
     ],
     command(StabilitySolverConfig): [
         ({"cases": ["stesp"]}, r"cases\[0\] must be one of steps"),
-        ({"cases": ["leak"], "picture": "steps.png"}, "picture must be left out without the case"),
         ({"cases": ["grid"], "grid_cells": [16, 8, 12]}, "grid_cells must be three or more rising numbers"),
     ],
 }

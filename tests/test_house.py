@@ -16,12 +16,12 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 27_260,
+    "hgn": 27_261,
     "datagen": 8_480,
-    "tools": 7_115,
-    "tests": 27_998,
+    "tools": 7_106,
+    "tests": 27_906,
 }
-SETTINGS = 239  # fields of the dataclasses behind the commands, *Config
+SETTINGS = 238  # fields of the dataclasses behind the commands, *Config
 
 LINES_OF_A_FILE = 450
 LONG_FILES = {

@@ -18,6 +18,7 @@ from hgn.rollout import RolloutConfig
 from hgn.runtime.weights import WeightsInfo, find_weights, load_weights, save_weights
 from hgn.schema import ConfigError, from_mapping, from_stored, section_of, to_mapping
 
+LAST = "commit a0b88cb, before release 0.2.0"
 SECTIONS = (SceneConfig, MpmConfig, NetworkConfig)
 
 
@@ -31,63 +32,45 @@ def removed(monkeypatch):
     monkeypatch.setitem(REMOVED_CHOICES, "backend", {"abacus": "take backend=cpu"})
 
 
-@pytest.mark.parametrize(
-    ("config", "mapping", "message"),
-    [
-        (RolloutConfig, {"path": "fast"}, "path is not a known key; it is called backend now; write backend=triton"),
-        (EvaluateConfig, {"weights": "a", "data": "b", "path": "plain"}, "now; write backend=torch"),
-        (TrainConfig, {"training": {"path": "auto"}}, "it is called training.backend now; write training.backend=auto"),
-        (
-            TrainConfig,
-            {"training": {"accelerator": "gpu"}},
-            "is called training.device now; write training.device=cuda",
-        ),
-        (TrainConfig, {"path": "fast"}, "path is not a known key; known keys: scene, "),  # it never had this one
-        (RolloutConfig, {"backend": "fast"}, "backend must be one of .*, got 'fast'; fast is called triton now"),
-        (RolloutConfig, {"precision": "half"}, "precision must be one of .*, got 'half'; half is called fp16 now"),
-        (TrainConfig, {"training": {"precision": "highest"}}, "training.precision must .*; highest is called fp32 now"),
-        (ExportConfig, {"checkpoint": "a", "out": "b", "half": True}, "write stored_precision=fp16"),
-        (
-            TrainConfig,
-            {"network": {"depth": 4}},
-            "network.depth is not a known key; it was removed and is always 3 now, not 4; train other weights",
-        ),
-        (TrainConfig, {"network": {"contact_gate": "cell"}}, "it was removed and is always cell now; leave it out"),
-        (TrainConfig, {"network": {"rest_levels": 1}}, "it was removed and is always 2 now, not 1; leave it out"),
-        (
-            TrainConfig,
-            {"network": {"maximum_neighbours": 64}},
-            "it was removed and is always None now, not 64; leave it",
-        ),
-        (TrainConfig, {"network": {"static_spacing_cells": 1.0}}, "it was removed; leave it out; commit a0b88cb"),
-        (
-            TrainConfig,
-            {"network": {"kind": "gns_particles"}},
-            "network.kind must be one of hgn, gns, got 'gns_particles'; commit a0b88cb, before release 0.2.0",
-        ),
-        (
-            SolveConfig,
-            {"scene": "a", "mpm": {"wall_contact": "stick"}},
-            "it was removed and is always slip now, not stick; leave it",
-        ),
-        (
-            TrainConfig,
-            {"mpm": {"time_step": "fixed"}},
-            "it was removed; mpm.fixed_time_step_s is null for adaptive steps",
-        ),
-        (
-            TrainConfig,
-            {"mpm": {"sand_friction_law": "mohr_coulomb"}},
-            "follows from mpm.method: mohr_coulomb with corrected, compression with taichi_elements",
-        ),
-        (RolloutConfig, {"film": 3}, "film is not a known key; it was removed; render with tools.render"),
-        (RolloutConfig, {"backend": "abacus"}, "backend must be one of .*, got 'abacus'; take backend=cpu"),
-    ],
-)
-def test_old_names_are_answered(config, mapping, message, removed):
+ALWAYS, NETWORK = "it was removed and is always {} now", "network.{} is not a known key; "
+GIVEN = {EvaluateConfig: {"weights": "a", "data": "b"}, ExportConfig: {"checkpoint": "a", "out": "b"}}
+GIVEN |= {SolveConfig: {"scene": "a"}}
+ANSWERS = [
+    (RolloutConfig, "path", "fast", "path is not a known key; it is called backend now; write backend=triton"),
+    (EvaluateConfig, "path", "plain", "now; write backend=torch"),
+    (TrainConfig, "training.path", "auto", "it is called training.backend now; write training.backend=auto"),
+    (TrainConfig, "training.accelerator", "gpu", "is called training.device now; write training.device=cuda"),
+    (TrainConfig, "path", "fast", "path is not a known key; known keys: scene, "),  # it never had this one
+    (RolloutConfig, "backend", "fast", "backend must be one of .*, got 'fast'; fast is called triton now"),
+    (RolloutConfig, "precision", "half", "precision must be one of .*, got 'half'; half is called fp16 now"),
+    (TrainConfig, "training.precision", "highest", "training.precision must .*; highest is called fp32 now"),
+    (ExportConfig, "half", True, "write stored_precision=fp16"),
+    (TrainConfig, "network.depth", 4, f"{NETWORK.format('depth')}{ALWAYS.format(3)}, not 4; train other weights"),
+    (TrainConfig, "network.contact_gate", "cell", f"{ALWAYS.format('cell')}; leave it out"),
+    (TrainConfig, "network.rest_levels", 1, f"{ALWAYS.format(2)}, not 1; leave it out"),
+    (TrainConfig, "network.maximum_neighbours", 64, f"{ALWAYS.format(None)}, not 64; leave it"),
+    (TrainConfig, "network.static_spacing_cells", 1.0, "it was removed; leave it out; commit a0b88cb"),
+    (TrainConfig, "network.kind", "gns_particles", f"network.kind must be .*, got 'gns_particles'; {LAST}"),
+    (SolveConfig, "mpm.wall_contact", "stick", f"{ALWAYS.format('slip')}, not stick; leave it"),
+    (TrainConfig, "mpm.time_step", "fixed", "it was removed; mpm.fixed_time_step_s is null for adaptive steps"),
+    (
+        TrainConfig,
+        "mpm.sand_friction_law",
+        "mohr_coulomb",
+        "follows from mpm.method: mohr_coulomb with corrected, comp",
+    ),
+    (RolloutConfig, "film", 3, "film is not a known key; it was removed; render with tools.render"),
+    (RolloutConfig, "backend", "abacus", "backend must be one of .*, got 'abacus'; take backend=cpu"),
+]
+
+
+@pytest.mark.parametrize(("config", "key", "value", "message"), ANSWERS)
+def test_old_names_are_answered(config, key, value, message, removed):
     """An old key, value or setting is refused in one line that says what replaces it."""
+    for part in reversed(key.split(".")):
+        value = {part: value}
     with pytest.raises(ConfigError, match=message) as caught:
-        from_mapping(config, mapping)
+        from_mapping(config, GIVEN.get(config, {}) | value)
     assert "\n" not in str(caught.value)
 
 
@@ -168,15 +151,12 @@ def test_weights_of_gns():
     assert from_stored(NetworkConfig, stored, "network") == gns
     for changes, message in (
         ({"maximum_neighbours": 64}, r"network\.maximum_neighbours is not a known key; it was removed"),
-        (
-            {"kind": "gns_particles"},
-            r"network\.kind must be .*; commit a0b88cb, before release 0\.2\.0, is the last with it",
-        ),
+        ({"kind": "gns_particles"}, rf"network\.kind must be .*; {LAST}, is the last with it"),
     ):
         with pytest.raises(ConfigError, match=message):
             from_stored(NetworkConfig, stored | changes, "network")
     for name in REMOVED_CHOICES["weights"]:
-        with pytest.raises(ConfigError, match=rf"got '{name}'; commit a0b88cb, before release 0\.2\.0"):
+        with pytest.raises(ConfigError, match=f"got '{name}'; {LAST}"):
             find_weights(name)
 
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 import re
 import sys
-import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -66,9 +65,7 @@ def _steps(report: Report) -> bytes:
     from tools.stability.solver_steps import Point, draw
 
     config = MpmConfig(stability_fraction=report["meta"]["solver"]["stability_fraction"])
-    with tempfile.TemporaryDirectory() as folder:
-        draw([Point(**point) for point in report["steps"]], config, Path(folder) / "steps.png")
-        return (Path(folder) / "steps.png").read_bytes()
+    return draw([Point(**point) for point in report["steps"]], config)
 
 
 def _drift(report: Report) -> bytes:

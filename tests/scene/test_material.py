@@ -14,12 +14,10 @@ def test_labels_keep_scene_and_material():
             assert (label >> MATERIAL_BITS, label & MATERIAL_MASK) == (scene, material) and label < 2**31
 
 
-def test_each_material_has_its_look():
+def test_each_material_is_complete():
+    """Each has its look; what is no fluid is a solid: a kernel keeps deformation gradients if it is compiled for a
+    material outside of FLUIDS, whatever else it has."""
     assert len(MATERIAL_COLORS) == len(MATERIALS) and set(FLUIDS) <= set(range(len(MATERIALS)))
-
-
-def test_what_is_no_fluid_is_a_solid():
-    """A kernel keeps deformation gradients if it is compiled for a material outside of FLUIDS, whatever else it has."""
     other = VARIANT.contact | VARIANT.sweep | VARIANT.several_laws
     for material, bit in enumerate(MATERIAL_VARIANTS):
         assert bit.bit_count() == 1 and has_solid(bit | other) == (material not in FLUIDS)

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import math
 from pathlib import Path
 
 import h5py
@@ -132,36 +133,29 @@ def test_vtkhdf_layout(tmp_path):
     write_rollout(tmp_path / "rollout.h5", rollout)
     with h5py.File(tmp_path / "rollout.h5") as file:
         vtk = file["VTKHDF"]
-        assert vtk.attrs["Version"].tolist() == [2, 0]
-        assert vtk.attrs["Type"] == b"PolyData"
-        kind = h5py.h5a.open(vtk.id, b"Type").get_type()
-        assert not kind.is_variable_str()
-        assert vtk["NumberOfPoints"][()].tolist() == [whole] * FRAMES
-        assert vtk["Points"].shape == (FRAMES * whole, 3)
-        assert vtk["Vertices/Connectivity"][()].tolist() == list(range(vertices, whole))
-        assert vtk["Vertices/Offsets"][()].tolist() == list(range(PARTICLES + 1))
-        assert vtk["Polygons/Connectivity"][:6].tolist() == [0, 1, 2, 3, 4, 5]
+        assert vtk.attrs["Version"].tolist() == [2, 0] and vtk.attrs["Type"] == b"PolyData"
+        assert not h5py.h5a.open(vtk.id, b"Type").get_type().is_variable_str()
         sizes = {"Vertices": (PARTICLES, 1), "Lines": (0, 1), "Polygons": (triangles, 3), "Strips": (0, 1)}
-        for name, (cells, corners) in sizes.items():
-            assert vtk[name]["NumberOfCells"][()].tolist() == [cells] * FRAMES
-            assert vtk[name]["NumberOfConnectivityIds"][()].tolist() == [cells * corners] * FRAMES
-            assert vtk[name]["Offsets"].shape == (cells + 1,)
+        expected = {f"{name}/NumberOfCells": [cells] * FRAMES for name, (cells, _) in sizes.items()}
+        expected |= {f"{name}/NumberOfConnectivityIds": [math.prod(size)] * FRAMES for name, size in sizes.items()}
+        expected |= {"NumberOfPoints": [whole] * FRAMES, "Vertices/Connectivity": list(range(vertices, whole))}
+        expected |= {"Vertices/Offsets": list(range(PARTICLES + 1)), "Steps/PartOffsets": list(range(FRAMES))}
+        expected |= {"Steps/NumberOfParts": [1] * FRAMES, "Steps/CellOffsets": [[0] * 4] * FRAMES}
+        expected |= {"CellData/obstacle": [-1] * PARTICLES + [0, 1, 1, 1, 1]}
+        assert {name: vtk[name][()].tolist() for name in expected} == expected
+        assert all(vtk[name]["Offsets"].shape == (cells + 1,) for name, (cells, _) in sizes.items())
+        assert vtk["Points"].shape == (FRAMES * whole, 3)
+        assert vtk["Polygons/Connectivity"][:6].tolist() == [0, 1, 2, 3, 4, 5]
         steps = vtk["Steps"]
-        assert steps.attrs["NSteps"] == FRAMES
+        assert steps.attrs["NSteps"] == FRAMES and steps["ConnectivityIdOffsets"].shape == (FRAMES, 4)
         np.testing.assert_allclose(steps["Values"], np.arange(FRAMES) / 60)
-        assert steps["PartOffsets"][()].tolist() == list(range(FRAMES))
-        assert steps["NumberOfParts"][()].tolist() == [1] * FRAMES
-        assert steps["CellOffsets"].shape == steps["ConnectivityIdOffsets"].shape == (FRAMES, 4)
-        assert not steps["CellOffsets"][()].any()
-        assert vtk["CellData/obstacle"][()].tolist() == [-1] * PARTICLES + [0, 1, 1, 1, 1]
-        for step in range(FRAMES):
-            start = steps["PointOffsets"][step] + vertices
-            np.testing.assert_array_equal(vtk["Points"][start : start + PARTICLES], rollout.position_TN3[step])
-            start = steps["PointDataOffsets/material"][step] + vertices
-            np.testing.assert_array_equal(vtk["PointData/material"][start : start + PARTICLES], rollout.material_N)
-            start = steps["PointDataOffsets/velocity"][step] + vertices
-            expected = frame_velocity(rollout.position_TN3, 60.0)[step]
-            np.testing.assert_array_equal(vtk["PointData/velocity"][start : start + PARTICLES], expected)
+        for data, offsets, values_TN in (
+            ("Points", "PointOffsets", rollout.position_TN3),
+            ("PointData/material", "PointDataOffsets/material", [rollout.material_N] * FRAMES),
+            ("PointData/velocity", "PointDataOffsets/velocity", frame_velocity(rollout.position_TN3, 60.0)),
+        ):
+            for start, values_N in zip(steps[offsets][()] + vertices, values_TN, strict=True):
+                np.testing.assert_array_equal(vtk[data][start : start + PARTICLES], values_N)
 
 
 def moving_rollout():

@@ -17,6 +17,7 @@ from hgn.network.grid import build_hierarchy
 from hgn.network.neighbours import neighbour_list
 from hgn.runtime.simulator import Simulator
 from hgn.schema import ConfigError
+from tools import timing
 from tools.bench import contenders, triton_contenders
 from tools.bench.__main__ import main, workloads
 from tools.bench.config import BenchConfig
@@ -47,6 +48,7 @@ def fake_simulate(fails):
 def test_rows_of_every_case(tmp_path, monkeypatch, capsys):
     """Each case gets a row with the report's keys, checked and timed; the table names them all."""
     monkeypatch.setattr(datagen.mpm.solver, "simulate", fake_simulate(False))
+    monkeypatch.setattr(timing, "MINIMUM_ROUNDS", 1)
     path = tmp_path / "reports" / "bench.json"
     assert main(SMALL | {"scenes": [2], "json": str(path)}) == 0
     report = json.loads(path.read_text())

@@ -24,14 +24,14 @@ def test_report(tmp_path, monkeypatch, capsys):
     kinds = {"single particle, water": WATER, "single particle, elastic solid": ELASTIC}
     some = {name: (kind, lambda *of: solver_steps.singles(*of)[::4], (0.97, 1.1)) for name, kind in kinds.items()}
     monkeypatch.setattr(solver_steps, "CASES", some)
-    file, picture = tmp_path / "reports" / "solver.json", tmp_path / "steps.png"
-    assert main({"cases": ["steps"], "device": "cpu", "json": str(file), "picture": str(picture)}) == 0
+    file = tmp_path / "reports" / "solver.json"
+    assert main({"cases": ["steps"], "device": "cpu", "json": str(file)}) == 0
     report = json.loads(file.read_text())
     assert {"device", "versions", "commit", "date", "command", "config", "solver"} <= report["meta"].keys()
     assert [row["held"] for row in report["rows"]] == [True, True]
     assert all({"part", "case", "predicted", "measured", "beyond"} <= row.keys() for row in report["rows"])
     assert [point["stable"] for point in report["steps"]] == [True, False] * 2
-    assert picture.read_bytes().startswith(b"\x89PNG")
+    assert solver_steps.draw(report["steps"], CPU).startswith(b"\x89PNG")
     printed = capsys.readouterr()
     assert "passes largest step, single particle, water, stiffness x1: " in printed.err
     assert len(printed.out.splitlines()) > 2 and all(len(line) <= 100 for line in printed.out.splitlines())

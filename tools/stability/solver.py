@@ -1,4 +1,4 @@
-"""python -m tools.stability solver [--json FILE] [picture=FILE]: checks the solver against formulas and experiments.
+"""python -m tools.stability solver [--json FILE]: checks the solver against formulas and experiments.
 
 Rows: the largest stable step, stiffness, speed of impact, convergence of the default step, free flight from obstacles
 and friction on them, leaks, a long run, published experiments (water at rest, dams, columns and slopes of sand), and
@@ -11,7 +11,6 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
-from pathlib import Path
 from typing import Annotated, Any
 
 from hgn.config import MpmConfig
@@ -23,7 +22,7 @@ from tools.stability.solver_contact import contacts
 from tools.stability.solver_gallery import broken_table, gallery_rows
 from tools.stability.solver_leak import leaks
 from tools.stability.solver_loads import convergence, impacts, long_run, stiffnesses
-from tools.stability.solver_steps import Point, draw, largest_steps
+from tools.stability.solver_steps import Point, largest_steps
 from tools.stability.solver_validation import columns, dam_breaks, grids, reposes, rest
 
 NAMES = (
@@ -45,19 +44,16 @@ class StabilitySolverConfig(ReportConfig):
     # resolutions of the case grid: cells in the width of dams, the radius of columns and the side of blocks. A domain
     # is about four times as wide; 32 cells need a GPU
     grid_cells: tuple[int, ...] = (8, 12, 16)
-    picture: str | None = None  # a PNG with stable and unstable steps and the formula
 
     def __post_init__(self) -> None:
         require_bounds(self)
         cells = self.grid_cells
         rising = len(cells) > 2 and cells[0] > 3 and all(a < b for a, b in pairwise(cells))
         require(rising, "grid_cells", "three or more rising numbers from 4 on", list(cells))
-        drawn = self.picture is None or self.cases is None or "steps" in self.cases
-        require(drawn, "picture", "left out without the case steps", self.picture)
 
 
 def main(mapping: dict[str, Any]) -> int:
-    """Prints a table, and writes JSON and the picture if asked to. A case that fails is a finding: exit code 0."""
+    """Prints a table, and writes JSON if asked to. A case that fails is a finding: exit code 0."""
     from datagen.mpm.device import initialise
 
     config = from_mapping(StabilitySolverConfig, mapping)
@@ -79,6 +75,4 @@ def main(mapping: dict[str, Any]) -> int:
     print(table(report.rows))
     if scenes:
         print(broken_table(report.rows))
-    if config.picture is not None:
-        draw(points, mpm, Path(config.picture))
     return 0

@@ -11,7 +11,6 @@ import dataclasses
 import itertools
 import math
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -21,7 +20,6 @@ from datagen.mpm.solver import SceneFailure, Simulated, simulate
 from hgn.config import MpmConfig
 from hgn.scene.material import ELASTIC, SAND, SNOW, WATER
 from hgn.scene.scene import Scene
-from hgn.system.files import write_atomically
 from tools.report import as_png, new_figure
 from tools.scenes import filled
 from tools.stability.row import Row
@@ -35,7 +33,7 @@ WITHIN = 0.06  # of the formula; the factors lie 3 % apart
 FASTER = 1.5  # times the speed of impact: a sign of instability
 
 
-Point = dict[str, Any]  # a simulation of the picture
+Point = dict[str, Any]  # a simulation of the figure
 POINT = ("case", "stiffness", "step_s", "factor", "stable")  # stiffness times the default, factor of the formula
 
 
@@ -99,8 +97,8 @@ def _sign(outcome: Simulated | SceneFailure, scene: Scene) -> str:
     return ""
 
 
-def draw(points: list[Point], base: MpmConfig, file: Path) -> None:
-    """Plots stable and unstable steps over the stiffness, with the formula as a line."""
+def draw(points: list[Point], base: MpmConfig) -> bytes:
+    """Plots stable and unstable steps over the stiffness, with the formula as a line; returns PNG bytes."""
     cases = list(dict.fromkeys(point["case"] for point in points))
     figure, (axes,) = new_figure(1, len(cases), (3.4 * len(cases), 3.6), share_y=True)
     stiffness = np.geomspace(min(STIFFNESS) / 1.6, max(STIFFNESS) * 1.6)
@@ -116,5 +114,4 @@ def draw(points: list[Point], base: MpmConfig, file: Path) -> None:
         axis.set(xscale="log", yscale="log", title=case, xlabel="Young's modulus, times 1 MPa")
     axes[0].set_ylabel("step, ms")
     axes[0].legend(fontsize=8)
-    file.parent.mkdir(parents=True, exist_ok=True)
-    write_atomically(file, as_png(figure))
+    return as_png(figure)
