@@ -1,5 +1,6 @@
 """Rows through an MLP in PyTorch and compiled, against the MLP itself in float64."""
 
+import itertools
 import subprocess
 
 import pytest
@@ -12,8 +13,11 @@ from hgn.network.mlp import MLP
 
 NO_COMPILER = compiled.unsupported_reason(16, torch.float32)
 KINDS = [Rows, pytest.param(CompiledRows, marks=pytest.mark.skipif(NO_COMPILER is not None, reason=str(NO_COMPILER)))]
-TOLERANCE = {"rtol": 1e-5, "atol": 2e-5}
 TABLE = 50
+
+
+def assert_close(found, expected):
+    torch.testing.assert_close(found.double(), expected, rtol=1e-5, atol=2e-5)
 
 
 def fcn_of(width):
@@ -50,46 +54,40 @@ def segments_of(rows, weighted):
     return Segments(rows, offset, torch.rand(rows) if weighted else None), segment_R
 
 
-@pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("width", [16, 48, 128])
-@pytest.mark.parametrize("rows", [0, 1, 6, 47, 48, 301])
-def test_projections(kind, width, rows):
-    """Each part's product with and without the bias, and added to what is there."""
-    network = fcn_of(width)
-    computed = kind(network)
-    for part, depth in enumerate(network.parts):
-        value, out = torch.randn(rows, depth), torch.full((rows, width), torch.nan)
-        expected = value.double() @ network.columns(part).double().T
-        computed.project_into(out, part, value)
-        torch.testing.assert_close(out.double(), expected, **TOLERANCE)
-        torch.testing.assert_close(computed.add_projection(out, part, value).double(), 2 * expected, **TOLERANCE)
-        with_bias = computed.project(part, value, computed.first_bias)
-        torch.testing.assert_close(with_bias.double(), expected + network.first.bias.double(), **TOLERANCE)
+# width, rows, addends of each row: every pair of rows and addends, half of them beside a value
+CASES = [
+    ((16, 48, 128)[i % 3], rows, each, (i + i // 4) % 2 == 0)
+    for i, (rows, each) in enumerate(itertools.product((0, 1, 6, 47, 48, 301), range(4)))
+]
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("width", [16, 48, 128])
-@pytest.mark.parametrize("rows", [0, 1, 6, 47, 48, 301])
-@pytest.mark.parametrize("each", [0, 1, 2, 3])
-@pytest.mark.parametrize("value", [False, True])
-def test_outputs_and_sums(kind, width, rows, each, value):
-    """Outputs alone, onto a residual in place, sums of weighted outputs, and both, equal those of the MLP."""
+@pytest.mark.parametrize(("width", "rows", "each", "value"), CASES)
+def test_rows_are_those_of_the_mlp(kind, width, rows, each, value):
+    """Each part's product with and without the bias, and added to what is there; outputs alone, onto a residual in
+    place, sums of weighted outputs, and both, also where the value itself is the residual."""
     network = fcn_of(width)
     computed, hidden = kind(network), hidden_of(rows, width, each, value)
+    for part, depth in enumerate(network.parts):
+        value_RW, out_RW = torch.randn(rows, depth), torch.full((rows, width), torch.nan)
+        expected_RW = value_RW.double() @ network.columns(part).double().T
+        computed.project_into(out_RW, part, value_RW)
+        assert_close(out_RW, expected_RW)
+        assert_close(computed.add_projection(out_RW, part, value_RW), 2 * expected_RW)
+        with_bias_RW = computed.project(part, value_RW, computed.first_bias)
+        assert_close(with_bias_RW, expected_RW + network.first.bias.double())
     expected_RW = expected_outputs(network, hidden)
 
     def again():
         """The table may be overwritten."""
         return hidden._replace(table_KW=hidden.table_KW.clone())
 
-    out_RW = torch.full((rows, width), torch.nan)
-    computed.output(out_RW, again())
-    torch.testing.assert_close(out_RW.double(), expected_RW, **TOLERANCE)
-
-    residual_RW = torch.randn(rows, width)
+    out_RW, residual_RW = torch.full((rows, width), torch.nan), torch.randn(rows, width)
     total_RW = expected_RW + residual_RW
+    computed.output(out_RW, again())
     computed.output(residual_RW, again(), residual_RW)
-    torch.testing.assert_close(residual_RW.double(), total_RW, **TOLERANCE)
+    assert_close(out_RW, expected_RW)
+    assert_close(residual_RW, total_RW)
 
     for weighted in (False, True):
         segments, segment_R = segments_of(rows, weighted)
@@ -98,25 +96,15 @@ def test_outputs_and_sums(kind, width, rows, each, value):
         after_SW = before_SW.double().index_add_(0, segment_R, expected_RW * weight_R[:, None])
         sum_SW = before_SW.clone()
         computed.add_sums(sum_SW, again(), segments)
-        torch.testing.assert_close(sum_SW.double(), after_SW, **TOLERANCE)
-        if not weighted:
-            for edges_RW in (None, torch.randn(rows, width)):
-                total_RW = expected_RW if edges_RW is None else expected_RW + edges_RW
-                sum_SW = before_SW.clone()
-                edges_RW = computed.output_and_add_sums(sum_SW, again(), segments, edges_RW)
-                torch.testing.assert_close(edges_RW.double(), total_RW, **TOLERANCE)
-                torch.testing.assert_close(sum_SW.double(), after_SW, **TOLERANCE)
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_a_value_may_be_the_residual(kind):
-    """Edges are read by the product, and added to, where they lie."""
-    network, hidden = fcn_of(128), hidden_of(100, 128, 2, value=True)
-    segments, _ = segments_of(100, weighted=False)
-    sum_SW = torch.zeros(len(segments.offset) - 1, 128)
-    expected_RW = expected_outputs(network, hidden) + hidden.value_RW
-    found_RW = kind(network).output_and_add_sums(sum_SW, hidden, segments, hidden.value_RW)
-    torch.testing.assert_close(found_RW.double(), expected_RW, **TOLERANCE)
+        assert_close(sum_SW, after_SW)
+        for edges_RW in () if weighted else (None, torch.randn(rows, width), hidden.value_RW):
+            total_RW = expected_RW if edges_RW is None else expected_RW + edges_RW
+            sum_SW = before_SW.clone()
+            edges_RW = computed.output_and_add_sums(sum_SW, again(), segments, edges_RW)
+            assert_close(edges_RW, total_RW)
+            assert_close(sum_SW, after_SW)
+        hidden = hidden_of(rows, width, each, value)
+        expected_RW = expected_outputs(network, hidden)
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -135,18 +123,18 @@ def test_rows_do_not_depend_on_those_beside_them(kind):
 
 
 @pytest.mark.skipif(NO_COMPILER is not None, reason=str(NO_COMPILER))
-@pytest.mark.parametrize("narrower", [("-mno-avx512f",), ("-mno-avx",), ()])
+@pytest.mark.parametrize("narrower", ["-mno-avx512f", "-mno-avx"])
 def test_vectors_of_other_cpus(monkeypatch, tmp_path, narrower):
     """What is compiled for shorter vectors computes the same."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    monkeypatch.setattr(compiled, "FLAGS", (*compiled.FLAGS, *narrower))
+    monkeypatch.setattr(compiled, "FLAGS", (*compiled.FLAGS, narrower))
     monkeypatch.setattr(compiled, "_library", compiled._library.__wrapped__)
     if (reason := unsupported_reason(128, torch.float32)) is not None:
         pytest.skip(reason)  # a CPU of another kind
     network, hidden = fcn_of(128), hidden_of(100, 128, 3, value=True)
     expected_RW, out_RW = expected_outputs(network, hidden), torch.empty(100, 128)
     CompiledRows(network).output(out_RW, hidden)
-    torch.testing.assert_close(out_RW.double(), expected_RW, **TOLERANCE)
+    assert_close(out_RW, expected_RW)
     assert len(list((tmp_path / "hgn" / "rows").iterdir())) == 1
 
 
