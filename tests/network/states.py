@@ -55,6 +55,45 @@ def scene_of(state, scene, obstacles=None):
     return replace(alone, **scenes, obstacles=obstacles)
 
 
+def airborne(counts=(40, 17, 1)):
+    """Scenes far from walls and without obstacles, each with a gravity of its own; particles move as they please."""
+    state = random_state(counts, obstacles=False, spread=0.2)
+    gravity_S3 = 3e-3 * torch.randn(len(counts), 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    return replace(state, position_N3=state.position_N3 + 0.38, gravity_S3=gravity_S3)
+
+
+def in_flight(state, velocity, gravity_3):
+    """All particles with one velocity, and the free fall that leads there behind them."""
+    age_H1 = torch.arange(5, dtype=torch.float64)[:, None]
+    velocity_H3 = torch.tensor(velocity, dtype=torch.float64) - age_H1 * gravity_3
+    return replace(
+        state,
+        velocity_NM3=velocity_H3.expand(len(state.position_N3), 5, 3),
+        gravity_S3=gravity_3.expand(state.scene_count, 3),
+    )
+
+
+def few(place_N3):
+    """Places of a few particles about the middle of a domain, in finest cells, float64."""
+    return 0.45 + 0.035 * torch.tensor(place_N3, dtype=torch.float64)
+
+
+# on a line, in one place, on a line but for a hair, in one place but for one, two apart, on a plane
+ODD_BODIES = [
+    few([[0.3, 0.7, -0.2], [0.8, 1.7, -0.1], [-0.2, -0.3, -0.3], [1.8, 3.7, 0.1]]),
+    few([[0.4, 0.2, 0.1]] * 3),
+    few([[0.3, 0.7, -0.2], [0.8, 1.7, -0.1], [-0.2, -0.3, -0.3 + 1e-7]]),
+    few([[0.4, 0.2, 0.1], [0.4, 0.2, 0.1], [-3.4, 0.3, 0.2]]),
+    few([[0.0, 0.0, 0.0], [2.4, 3.1, 0.7]]),
+    few([[0.3, 0.2, 0.0], [4.1, -2.2, 0.0], [-1.7, 0.4, 0.0], [2.2, 2.1, 0.0]]),
+]
+
+
+def drawn_outputs(count):
+    """Accelerations and stresses [N, 9]."""
+    return torch.randn(count, 9, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+
+
 def on_device(state, device):
     return replace(state, **{name: value.to(device) for name, value in vars(state).items() if value is not None})
 

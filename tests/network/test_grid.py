@@ -3,7 +3,7 @@
 import itertools
 
 import torch
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from hgn.network.cell_keys import COORDINATE_LIMIT, SCENE_LIMIT, find, pack, unpack
@@ -25,53 +25,16 @@ def cells(level):
     return [(s, *c) for s, c in zip(scene.tolist(), coordinate.tolist(), strict=True)]
 
 
-def test_known_particle_in_a_corner_of_cells():
-    """A particle at the corner where eight cells meet activates them with weight 1/8 each, joined by 24 edges."""
-    grid = build([[0.5, 0.5, 0.5]])
-    assert cells(grid.levels[0]) == [(0, *k) for k in itertools.product((1, 2), repeat=3)]
-    assert torch.equal(grid.weight_N8, torch.full((1, 8), 0.125, dtype=torch.float64))
-    assert len(grid.levels[0].sender_E) == 24
-    assert cells(grid.levels[1]) == [(0, *k) for k in itertools.product((0, 1), repeat=3)]
-
-
-def test_known_particle_on_a_centre():
-    """A particle on a cell's centre activates that cell alone: the others' weights are exactly zero."""
-    grid = build([[0.375, 0.125, 0.625]])
-    assert cells(grid.levels[0]) == [(0, 1, 0, 2)]
-    assert grid.weight_N8.sum() == 1 and grid.weight_N8.max() == 1
-    assert len(grid.levels[0].sender_E) == 0
-    assert cells(grid.levels[1]) == [(0, 0, 0, 1)]
-
-
-def test_known_particle_between_two_centres():
-    """A particle on a line of centres activates the two cells it lies between, joined in both directions."""
-    grid = build([[0.25, 0.125, 0.125]])
-    level = grid.levels[0]
-    assert cells(level) == [(0, 0, 0, 0), (0, 1, 0, 0)]
-    edges = set(zip(level.sender_E.tolist(), level.receiver_E.tolist(), strict=True))
-    assert edges == {(0, 1), (1, 0)}
-    for sender, receiver, direction in zip(
-        level.sender_E.tolist(), level.receiver_E.tolist(), level.direction_E.tolist(), strict=True
-    ):
-        difference = torch.tensor(cells(level)[sender][1:]) - torch.tensor(cells(level)[receiver][1:])
-        assert torch.equal(difference, DIRECTION_63[direction])
-
-
-def test_negative_cells_have_floored_parents():
-    """The parent of k is floor(k / 2), below zero too: cells -1 and -2 share parent -1."""
-    grid = build([[-0.25, 0.125, 0.125]], levels=2)
-    assert [c[1] for c in cells(grid.levels[0])] == [-2, -1]
-    assert cells(grid.levels[1]) == [(0, -1, 0, 0)]
-
-
 positions = st.lists(st.tuples(*[st.floats(-1, 1, allow_nan=False)] * 3), min_size=1, max_size=20)
 
 
 @settings(max_examples=60, deadline=None)
 @given(positions, st.lists(st.integers(0, 2), min_size=20, max_size=20))
+@example([(0.5, 0.5, 0.5), (0.375, 0.125, 0.625), (0.25, 0.125, 0.125)], [0, 1, 2])  # corner, centre, between centres
+@example([(-0.25, 0.125, 0.125)], [0])  # cells -2 and -1, of one parent
 def test_hierarchy_is_what_the_definition_says(particles, scenes):
-    """On random particles: weights sum to 1, active cells are those of non-zero weight, edges join face neighbours of
-    one scene, a coarse cell is active iff a child is."""
+    """Weights sum to 1, active cells are those of non-zero weight, edges join face neighbours of one scene and know
+    their direction, a coarse cell is active iff a child is."""
     scene = torch.tensor(scenes[: len(particles)])
     origin = torch.tensor([[0.0, 0, 0], [-0.1, -0.2, -0.05], [-0.25, 0, -0.125]], dtype=torch.float64)
     grid = build(particles, scene, origin, levels=3)
@@ -106,6 +69,9 @@ def test_hierarchy_is_what_the_definition_says(particles, scenes):
             if listed[a][0] == listed[b][0] and sum(abs(x - y) for x, y in zip(listed[a], listed[b], strict=True)) == 1
         }
         assert set(zip(level.sender_E.tolist(), level.receiver_E.tolist(), strict=True)) == neighbours
+        coordinate_C3 = unpack(level.key_C)[1]
+        away_E3 = coordinate_C3[level.sender_E] - coordinate_C3[level.receiver_E]
+        assert torch.equal(away_E3, DIRECTION_63[level.direction_E].to(away_E3))
 
 
 @given(st.integers(0, SCENE_LIMIT - 1), st.tuples(*[st.integers(-COORDINATE_LIMIT, COORDINATE_LIMIT - 1)] * 3))
@@ -117,13 +83,8 @@ def test_keys_round_trip(scene, cell):
     assert int(found_scene[0]) == scene and tuple(found_cell[0].tolist()) == cell
 
 
-def test_find_in_an_empty_list():
-    """Nothing is found where nothing is."""
+def test_nothing():
+    """An empty scene has empty levels, and nothing is found where nothing is."""
+    assert [level.cell_count for level in build(torch.zeros(0, 3)).levels] == [0, 0]
     index, found = find(torch.zeros(0, dtype=torch.long), torch.tensor([3, 4]))
     assert index.tolist() == [0, 0] and found.tolist() == [False, False]
-
-
-def test_no_particles():
-    """An empty scene has empty levels."""
-    grid = build(torch.zeros(0, 3))
-    assert [level.cell_count for level in grid.levels] == [0, 0]

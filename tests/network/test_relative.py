@@ -7,18 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from network.states import chosen, gns_of, network_of, random_grid, random_state, scene_of
-from scene.test_symmetry import CUBE, matrix_of
+from network.states import ODD_BODIES, airborne, drawn_outputs, gns_of, in_flight, network_of, random_state
 
 from hgn.config import NetworkConfig
-from hgn.network.cell_keys import unpack
 from hgn.network.features import Normaliser, ParticleState
 from hgn.network.grid import build_hierarchy
-from hgn.network.hgn import HierarchicalGraphNetwork
 from hgn.network.obstacles import ObstacleCells
 from hgn.network.relative import (
     QUIET,
-    STRESS_33,
     Contacts,
     balanced,
     coarsest_cells,
@@ -28,80 +24,15 @@ from hgn.network.relative import (
     wall_nearness,
 )
 from hgn.scene.obstacle_grid import ObstacleGrid
-from hgn.scene.symmetry import Symmetry, scene_symmetries
 
-HISTORY, SURROUNDINGS, CONTACT = slice(0, 12), slice(12, 21), slice(21, 24)  # with five velocities and three levels
-WALLS, NORMALS = slice(24, 30), slice(30, 36)
-ALL_48 = scene_symmetries((0.0, 0.0, 0.0), CUBE, 1 / 64)
+CONTACT, WALLS, NORMALS = slice(21, 24), slice(24, 30), slice(30, 36)  # with five velocities and three levels
 
 
-def airborne(counts: tuple[int, ...] = (40, 17, 1)) -> ParticleState:
-    """Scenes far from walls and without obstacles, each with a gravity of its own; particles move as they please."""
-    state = random_state(counts, obstacles=False, spread=0.2)
-    gravity_S3 = 3e-3 * torch.randn(len(counts), 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
-    return replace(state, position_N3=state.position_N3 + 0.38, gravity_S3=gravity_S3)
-
-
-def in_flight(state: ParticleState, velocity: tuple[float, float, float], gravity_3: torch.Tensor) -> ParticleState:
-    """All particles with one velocity, and the free fall that leads there behind them."""
-    age_H1 = torch.arange(5, dtype=torch.float64)[:, None]
-    velocity_H3 = torch.tensor(velocity, dtype=torch.float64) - age_H1 * gravity_3
-    return replace(
-        state,
-        velocity_NM3=velocity_H3.expand(len(state.position_N3), 5, 3),
-        gravity_S3=gravity_3.expand(state.scene_count, 3),
-    )
-
-
-def columns(network: HierarchicalGraphNetwork, state: ParticleState) -> torch.Tensor:
+def columns(network, state):
     return network.relative_features(state, network.grid(state))[0]
 
 
-@pytest.mark.parametrize("velocity", [(5e-2, 0.0, 0.0), (0.0, 1.7e-2, 0.0), (-1e-3, 5e-3, 2e-2)])
-@pytest.mark.parametrize("counts", [(40, 17, 1), (1,)])
-def test_a_common_velocity_changes_nothing(counts: tuple[int, ...], velocity: tuple[float, float, float]) -> None:
-    """Away from surfaces accelerations are the same to rounding with up to 3 m/s more in any direction, whatever the
-    particles do among themselves; and they depend on that, but for a particle alone, which has none to push."""
-    network, state = network_of(inputs="relative"), airborne(counts)
-    boosted = replace(state, velocity_NM3=state.velocity_NM3 + torch.tensor(velocity, dtype=torch.float64))
-    torch.testing.assert_close(network(boosted), network(state), rtol=0, atol=1e-14)
-    stirred = replace(state, velocity_NM3=state.velocity_NM3 * 2)
-    assert (float((network(stirred) - network(state)).detach().abs().max()) > 1e-6) == (len(state.position_N3) > 1)
-
-
-def test_another_place_changes_nothing() -> None:
-    """Particles and the grid's origin beside each other elsewhere, away from surfaces, accelerate alike."""
-    network, state = network_of(inputs="relative"), airborne()
-    shift_3 = torch.tensor([0.07, -0.05, 0.11], dtype=torch.float64)
-    moved = replace(state, position_N3=state.position_N3 + shift_3)
-    torch.testing.assert_close(network(moved, shift_3.expand(3, 3)), network(state), rtol=0, atol=1e-13)
-
-
-@pytest.mark.parametrize("gravity", [(0.0, -(2.0**-8), 0.0), (2.0**-9, 2.0**-10, -(2.0**-7)), (0.0, 0.0, 0.0)])
-def test_free_flight_knows_no_gravity(gravity: tuple[float, float, float]) -> None:
-    """In free flight all columns of motion are exactly zero (numbers with short binary fractions), so that what is
-    added to gravity is the same under any, and at rest without one."""
-    network, state = network_of(inputs="relative"), airborne()
-    gravity_3 = torch.tensor(gravity, dtype=torch.float64)
-    flying = in_flight(state, (2.0**-5, -(2.0**-6), 2.0**-7), gravity_3)
-    found = columns(network, flying)
-    assert not found[:, HISTORY].any() and not found[:, CONTACT.start :].any()
-    assert float(found[:, SURROUNDINGS].abs().max()) < 1e-12
-    resting = in_flight(state, (0.0, 0.0, 0.0), torch.zeros(3, dtype=torch.float64))
-    torch.testing.assert_close(network(flying) - gravity_3, network(resting), rtol=0, atol=1e-14)
-
-
-@pytest.mark.parametrize("velocity", [(0.0, 0.0, 0.0), (1.7e-1, 0.0, 0.0), (-1e-3, 5e-2, 2e-2)])
-def test_free_flight_in_one_piece_is_exact(velocity: tuple[float, float, float]) -> None:
-    """With any weights, velocity up to 10 m/s and gravity, what flies freely as one has the acceleration g to rounding;
-    and so has a single particle, however it got there."""
-    network = network_of(inputs="relative")
-    gravity_3 = torch.tensor([2e-3, -5e-3, 1e-3], dtype=torch.float64)
-    state = in_flight(airborne(), velocity, gravity_3)
-    torch.testing.assert_close(network(state), gravity_3.expand_as(state.position_N3), rtol=0, atol=1e-15)
-
-
-def test_what_is_disturbed_disturbs_its_body() -> None:
+def test_what_is_disturbed_disturbs_its_body():
     """One particle that is slower than its neighbours frees the output of all within a coarsest cell, and of nothing
     in another scene."""
     network, zero_3 = network_of(inputs="relative"), torch.zeros(3, dtype=torch.float64)
@@ -110,7 +41,7 @@ def test_what_is_disturbed_disturbs_its_body() -> None:
     reach = config.cell_size * 2 ** (config.levels - 1)
     near_N = (state.position_N3 - state.position_N3[3]).abs().amax(-1) < reach
 
-    def gates(velocity_NH3: torch.Tensor) -> torch.Tensor:
+    def gates(velocity_NH3):
         changed = replace(state, velocity_NM3=velocity_NH3)
         grid = network.grid(changed)
         contacts = network.relative_features(changed, grid)[1]
@@ -128,24 +59,8 @@ def test_what_is_disturbed_disturbs_its_body() -> None:
     assert gates(state.velocity_NM3).abs().max() < 1e-15
 
 
-def few(place_N3: list[list[float]]) -> torch.Tensor:
-    """Places of a few particles about the middle of a domain, in finest cells, float64."""
-    return 0.45 + 0.035 * torch.tensor(place_N3, dtype=torch.float64)
-
-
-# on a line, in one place, on a line but for a hair, in one place but for one, two apart, on a plane
-ODD_BODIES = [
-    few([[0.3, 0.7, -0.2], [0.8, 1.7, -0.1], [-0.2, -0.3, -0.3], [1.8, 3.7, 0.1]]),
-    few([[0.4, 0.2, 0.1]] * 3),
-    few([[0.3, 0.7, -0.2], [0.8, 1.7, -0.1], [-0.2, -0.3, -0.3 + 1e-7]]),
-    few([[0.4, 0.2, 0.1], [0.4, 0.2, 0.1], [-3.4, 0.3, 0.2]]),
-    few([[0.0, 0.0, 0.0], [2.4, 3.1, 0.7]]),
-    few([[0.3, 0.2, 0.0], [4.1, -2.2, 0.0], [-1.7, 0.4, 0.0], [2.2, 2.1, 0.0]]),
-]
-
-
 @pytest.mark.parametrize("levels", [1, 2, 3])
-def test_momentum_is_kept_where_nothing_touches(levels: int) -> None:
+def test_momentum_is_kept_where_nothing_touches(levels):
     """With any weights, the accelerations of particles that move as they please, over many coarsest cells and alone in
     theirs, on lines, planes and in one place, sum to gravity's, and their moments to 0. Near a wall they do not, nor do
     those of a part; and the means of cells differ."""
@@ -174,7 +89,7 @@ def test_momentum_is_kept_where_nothing_touches(levels: int) -> None:
     assert float(extra_N3[state.scene_N == 0].sum(0).abs().max()) > 1e-2 * float(extra_N3.abs().max())
 
 
-def pushed(place_N3: torch.Tensor, output_N9: torch.Tensor, levels: int = 3, touched: float = 0.0) -> torch.Tensor:
+def pushed(place_N3, output_N9, levels=3, touched=0.0):
     """What `balanced` makes of outputs at such places, all disturbed: accelerations [N, 3]; places are normals, too."""
     scene_N, origin_13 = torch.zeros(len(place_N3), dtype=torch.long), place_N3.new_zeros(1, 3)
     grid = build_hierarchy(place_N3, scene_N, origin_13, 0.035, levels)
@@ -183,13 +98,9 @@ def pushed(place_N3: torch.Tensor, output_N9: torch.Tensor, levels: int = 3, tou
     return balanced(output_N9, Contacts(one_C, touched * one_C, normal_C33), grid)
 
 
-def drawn_outputs(count: int) -> torch.Tensor:
-    return torch.randn(count, 9, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
-
-
 @pytest.mark.parametrize("levels", [1, 3])
 @pytest.mark.parametrize("way", ["through a line", "through one place", "into another cell"])
-def test_accelerations_are_continuous(way: str, levels: int) -> None:
+def test_accelerations_are_continuous(way, levels):
     """Where three particles pass through a line, meet in one place, or a body enters another coarsest cell, smaller
     steps change accelerations less, in proportion: nothing jumps where a cell's inertia is that of a line or a point,
     or where a cell begins."""
@@ -197,7 +108,7 @@ def test_accelerations_are_continuous(way: str, levels: int) -> None:
     across_33 = torch.tensor([[0.1, 0.0, 0.0], [0.0, 0.9, -0.3], [0.0, 0.2, 0.4]], dtype=torch.float64)
     body_N3 = torch.rand(12, 3, generator=torch.Generator().manual_seed(6), dtype=torch.float64)
 
-    def place(s: float) -> torch.Tensor:
+    def place(s):
         if way == "through a line":
             return 0.42 + 0.035 * (line_33 + (s - 0.5) * across_33)
         if way == "through one place":
@@ -213,18 +124,18 @@ def test_accelerations_are_continuous(way: str, levels: int) -> None:
 
 
 @pytest.mark.parametrize("touched", [0.0, 0.3, 1.0])
-def test_gradients_of_the_balance(touched: float) -> None:
+def test_gradients_of_the_balance(touched):
     """Those with respect to outputs, and to places, are finite differences."""
     place_N3 = 0.42 + 0.2 * torch.rand(9, 3, generator=torch.Generator().manual_seed(6), dtype=torch.float64)
 
-    def of(place: torch.Tensor, output: torch.Tensor) -> torch.Tensor:
+    def of(place, output):
         return pushed(place, output, 2, touched)
 
     inputs = (place_N3.requires_grad_(), drawn_outputs(9).requires_grad_())
     assert torch.autograd.gradcheck(of, inputs, eps=1e-7, atol=1e-4)
 
 
-def test_a_body_may_still_turn() -> None:
+def test_a_body_may_still_turn():
     """Two cells push each other so that both turn, against the way that they go around each other; and a pair of
     particles in one cell is left alone, for no turn of a line is known."""
     corner_83 = torch.tensor([[i >> 2 & 1, i >> 1 & 1, i & 1] for i in range(8)], dtype=torch.float64)
@@ -242,79 +153,7 @@ def test_a_body_may_still_turn() -> None:
     assert pushed(ODD_BODIES[4], drawn_outputs(2), levels=4).abs().max() < 1e-12
 
 
-def test_each_scene_has_its_gravity() -> None:
-    """A scene's accelerations in a batch of other gravities are those that it has alone with its own."""
-    network, state = network_of(inputs="relative"), airborne()
-    together = network(state)
-    for scene in range(3):
-        found_N3 = network(scene_of(state, scene))
-        torch.testing.assert_close(found_N3, together[state.scene_N == scene], rtol=0, atol=1e-14)
-    other = replace(state, gravity_S3=state.gravity_S3.flip(0))
-    assert float((network(other) - together).detach().abs().max()) > 1e-4
-
-
-def test_no_particles() -> None:
-    """An empty scene has no accelerations."""
-    assert network_of(inputs="relative")(chosen(airborne(), slice(0))).shape == (0, 3)
-
-
-def turned_outputs(output_N9: torch.Tensor, turn_33: torch.Tensor) -> torch.Tensor:
-    """An acceleration turns as a vector, a stress as a tensor."""
-    stress_N33 = turn_33 @ output_N9[:, torch.tensor(STRESS_33)] @ turn_33.T
-    rows, columns = [0, 1, 2, 1, 0, 0], [0, 1, 2, 2, 2, 1]
-    return torch.cat([output_N9[:, :3] @ turn_33.T, stress_N33[:, rows, columns]], 1)
-
-
-@pytest.mark.parametrize("symmetry", ALL_48, ids=lambda s: f"{s.source}{s.mirrored}")
-def test_impulses_turn_with_the_scene(symmetry: Symmetry) -> None:
-    """What `balanced` makes of outputs turned and mirrored with the scene is turned and mirrored with it."""
-    network, state = network_of(inputs="relative", cell_size=1 / 8), random_state((60,), spread=0.95)
-    turn_33 = torch.tensor(matrix_of(symmetry), dtype=torch.float64)
-    image = replace(state, position_N3=(state.position_N3 - 0.5) @ turn_33.T + 0.5)
-    output_N9 = drawn_outputs(60)
-    # of the coarsest cells: functions of their centres' distance from the domain's
-    results = []
-    for outputs, scene in ((output_N9, state), (turned_outputs(output_N9, turn_33), image)):
-        grid = network.grid(scene)
-        coordinate_C3 = unpack(grid.levels[-1].key_C)[1]
-        place_C3 = (coordinate_C3.double() + 0.5) * 4 / 8 - 0.5
-        normal_C33, distance_C = place_C3[:, :, None] * place_C3[:, None, :], place_C3.square().sum(1)
-        results.append(balanced(outputs, Contacts(torch.exp(-distance_C), distance_C / 4, normal_C33), grid))
-    assert float(results[0].norm()) > 1
-    torch.testing.assert_close(results[1], results[0] @ turn_33.T, rtol=0, atol=1e-12)
-
-
-@pytest.mark.parametrize("symmetry", ALL_48, ids=lambda s: f"{s.source}{s.mirrored}")
-def test_columns_turn_with_the_scene(symmetry: Symmetry) -> None:
-    """Scene and gravity turned and mirrored together by what keeps a cube: columns of vectors do as they, walls change
-    places; with obstacles and walls within reach. The grid's cells are their own images here."""
-    network = network_of(inputs="relative", cell_size=1 / 8)
-    grid = random_grid(3, 40_000, extent=64)
-    state = replace(random_state((60,), spread=0.95), obstacles=ObstacleCells.of([grid]))
-    state = replace(state, velocity_NM3=10 * state.velocity_NM3)
-    turn_33 = torch.tensor(matrix_of(symmetry), dtype=torch.float64)
-    centre_K3 = (grid.cell_K3 + 0.5) / 64 - 0.5
-    cell_K3 = np.floor((centre_K3 @ turn_33.numpy().T + 0.5) * 64).astype(np.int32)
-    order = np.lexsort(cell_K3.T[::-1])
-    normal_K3 = (grid.normal_K3 @ turn_33.numpy().T.astype(np.float32))[order]
-    image = replace(
-        state,
-        position_N3=(state.position_N3 - 0.5) @ turn_33.T + 0.5,
-        velocity_NM3=state.velocity_NM3 @ turn_33.T,
-        gravity_S3=state.gravity_S3 @ turn_33.T,
-        obstacles=ObstacleCells.of([ObstacleGrid(1 / 64, cell_K3[order], normal_K3)]),
-    )
-    before, after = columns(network, state), columns(network, image)
-    assert before.abs().amax(0).min() > 0, "every column shows something"
-    vectors = [*range(0, CONTACT.stop), *range(NORMALS.start, NORMALS.stop)]
-    expected = (before[:, vectors].unflatten(1, (-1, 3)) @ turn_33.T).flatten(1)
-    torch.testing.assert_close(after[:, vectors], expected, rtol=0, atol=1e-10)
-    outward_63 = torch.cat([-torch.eye(3), torch.eye(3)]).double()
-    place_6 = (outward_63 @ turn_33.T @ outward_63.T).argmax(1)  # of each wall's image
-    torch.testing.assert_close(after[:, WALLS][:, place_6], before[:, WALLS], rtol=0, atol=1e-12)
-
-
-def test_surfaces_beyond_reach_are_not_seen() -> None:
+def test_surfaces_beyond_reach_are_not_seen():
     """A hair beyond the reach of all walls the columns of contact are exactly zero, at any speed along them; a hair
     within it they are not, and the gate is 1 half way."""
     network = network_of(inputs="relative")
@@ -329,7 +168,7 @@ def test_surfaces_beyond_reach_are_not_seen() -> None:
     assert float(found[2, CONTACT][2]) == pytest.approx(along) and int(found[2, WALLS].argmax()) == 4
 
 
-def pile(*heights: list[float]) -> ParticleState:
+def pile(*heights):
     """A scene for each list, in which particles lie one above the other, that many R = 0.035 above a floor; all slide
     at 0.3 m/s, and nothing else moves."""
     place_N3 = 0.035 * torch.tensor([[14.3, height, 14.2] for scene in heights for height in scene]).double()
@@ -340,19 +179,19 @@ def pile(*heights: list[float]) -> ParticleState:
     return in_flight(state, (5e-3, 0.0, 0.0), zero_3)
 
 
-def gates(network: HierarchicalGraphNetwork, state: ParticleState) -> torch.Tensor:
+def gates(network, state):
     """G of each particle: its column of contact over what that is of."""
     along_N = torch.asinh(state.velocity_NM3[:, 0, 0] / network.normaliser.acceleration_std[0])
     return columns(network, state)[:, CONTACT.start] / along_N
 
 
-def own_gates(network: HierarchicalGraphNetwork, state: ParticleState) -> torch.Tensor:
+def own_gates(network, state):
     """How near each particle itself is to a surface."""
     found = columns(network, state)
     return surface_gate(found[:, WALLS], found[:, NORMALS])
 
 
-def test_a_pile_knows_how_it_moves() -> None:
+def test_a_pile_knows_how_it_moves():
     """Only the foot of a pile is within reach of the floor; all particles in its coarsest cells and in those above see
     the velocity. Further up and without the foot none do."""
     network = network_of(inputs="relative")  # coarsest cells of 4 R
@@ -363,7 +202,7 @@ def test_a_pile_knows_how_it_moves() -> None:
 
 
 @pytest.mark.parametrize("height", [0.4, 2.2, 2.98])  # R above the floor: the gate is 1, below 1, and next to 0
-def test_bodies_slip_on_a_plane(height: float) -> None:
+def test_bodies_slip_on_a_plane(height):
     """A floor pushes a body up or down only, whatever the weights, motions and materials: along it what is added to
     gravity sums to 0."""
     network, state = network_of(inputs="relative"), airborne((40,))
@@ -375,7 +214,7 @@ def test_bodies_slip_on_a_plane(height: float) -> None:
     assert height > 2.9 or float(extra_3[1].abs()) > 1e-3
 
 
-def test_no_gate_is_less_than_the_own_one() -> None:
+def test_no_gate_is_less_than_the_own_one():
     """Among walls and obstacles the cells' gate is at most 1, and nowhere below a particle's own."""
     state = random_state((60, 9, 1), spread=0.5)
     state.velocity_NM3[:, :, 0] = 5e-3
@@ -385,7 +224,7 @@ def test_no_gate_is_less_than_the_own_one() -> None:
     assert (own_N == 0).any() and (found_N > own_N + 0.1).any()
 
 
-def test_the_gate_is_continuous() -> None:
+def test_the_gate_is_continuous():
     """On a particle's way up a pile, from cell to cell and out of reach, smaller steps change its gate less, in
     proportion, and no other's."""
     network, jumps = network_of(inputs="relative"), []
@@ -398,12 +237,12 @@ def test_the_gate_is_continuous() -> None:
     assert jumps[0] < 0.1 and jumps[1] < jumps[0] / 6
 
 
-def test_gradients_of_the_columns() -> None:
+def test_gradients_of_the_columns():
     """Those by places and velocities are finite differences, near a floor."""
     network, state = network_of(inputs="relative"), airborne((5,))
     place_N3 = state.position_N3 * torch.tensor([1.0, 0.15, 1.0])
 
-    def of(place_N3: torch.Tensor, velocity_NH3: torch.Tensor) -> torch.Tensor:
+    def of(place_N3, velocity_NH3):
         moved = replace(state, position_N3=place_N3, velocity_NM3=velocity_NH3)
         return columns(network, moved)
 
@@ -412,27 +251,23 @@ def test_gradients_of_the_columns() -> None:
     assert torch.autograd.gradcheck(of, inputs, eps=1e-7, atol=1e-4)
 
 
-@pytest.mark.parametrize("wall", range(6))
-def test_a_wall_is_seen_a_frame_before_it_is_hit(wall: int) -> None:
+def test_walls_are_seen_a_frame_before_they_are_hit():
     """At 10 m/s towards a wall, one frame before the particle is there: so is its gate, while at rest, or at that speed
     away from the wall, nothing shows at that place."""
-    axis, upper = wall % 3, wall >= 3
-    towards = torch.zeros(1, 3, dtype=torch.float64)
-    towards[0, axis] = 10 / 60 if upper else -10 / 60
-    place = torch.full((1, 3), 0.5, dtype=torch.float64)
-    place[0, axis] = 1 - 10 / 60 if upper else 10 / 60
-    domain = torch.ones(1, 3, dtype=torch.float64)
-    seen = wall_nearness(place, towards, domain, 0.0525)
-    assert float(seen[0, wall]) == pytest.approx(1.0) and int((seen > 0).sum()) == 1
-    assert surface_gate(seen, None).tolist() == [1.0]
-    for velocity in (torch.zeros_like(towards), -towards):
-        unseen = wall_nearness(place, velocity, domain, 0.0525)
-        assert not unseen.any() and surface_gate(unseen, None).tolist() == [0.0]
-    behind = place + 2 * towards  # beyond the plane by as much
-    assert float(wall_nearness(behind, towards, domain, 0.0525)[0, wall]) == 2.0
+    sign_63 = torch.cat([-torch.eye(3), torch.eye(3)]).double()  # of the way to each wall
+    place_63, domain_63 = 0.5 + sign_63 * (0.5 - 10 / 60), torch.ones(6, 3, dtype=torch.float64)
+    towards_63, wall_6 = sign_63 * 10 / 60, torch.arange(6)
+    seen_66 = wall_nearness(place_63, towards_63, domain_63, 0.0525)
+    torch.testing.assert_close(seen_66, torch.eye(6).double())
+    assert surface_gate(seen_66, None).tolist() == pytest.approx([1.0] * 6)
+    for velocity_63 in (0 * towards_63, -towards_63):
+        unseen_66 = wall_nearness(place_63, velocity_63, domain_63, 0.0525)
+        assert not unseen_66.any() and not surface_gate(unseen_66, None).any()
+    behind_66 = wall_nearness(place_63 + 2 * towards_63, towards_63, domain_63, 0.0525)  # beyond the plane by as much
+    assert (behind_66[wall_6, wall_6] == 2.0).all()
 
 
-def test_a_sheet_ahead_is_seen() -> None:
+def test_a_sheet_ahead_is_seen():
     """A particle that flies over a sheet of one cell within a frame sees the first normal on its way, in its own scene
     alone; one that flies away sees none, and the one in the sheet sees it twice where it stays."""
     cell_K3 = np.array([[i, 20, k] for i in range(10, 54) for k in range(10, 54)], np.int32)
@@ -449,7 +284,7 @@ def test_a_sheet_ahead_is_seen() -> None:
     assert surface_gate(no_wall, found).tolist() == [1, 0, 1, 0]
 
 
-def test_one_scale_for_all_axes() -> None:
+def test_one_scale_for_all_axes():
     """The scale is the root mean square of the axes' spreads with the noise, there are no means; the target is the
     inverse of what the output means."""
     normaliser = Normaliser()
@@ -464,7 +299,7 @@ def test_one_scale_for_all_axes() -> None:
     torch.testing.assert_close(back, raw, rtol=1e-9, atol=1e-9)
 
 
-def test_width_of_the_encoder() -> None:
+def test_width_of_the_encoder():
     """55 numbers with five velocities and four levels, and others as the configuration says; weights of absolute inputs
     keep their shapes."""
     assert NetworkConfig(inputs="relative").feature_width == 12 + 12 + 3 + 6 + 6 + 16

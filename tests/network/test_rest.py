@@ -5,8 +5,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from network.states import network_of
-from network.test_relative import ODD_BODIES, airborne, drawn_outputs
+from network.states import ODD_BODIES, airborne, drawn_outputs, network_of
 
 from hgn.network.features import ParticleState
 from hgn.network.grid import build_hierarchy
@@ -73,7 +72,7 @@ def test_nothing_changes_in_flight(threshold):
         assert torch.equal(network(state), found) == same and torch.equal(network(state), resting(state))
 
 
-@pytest.mark.parametrize("shift", [0.0, 0.02, 0.05, 0.07, 0.12])  # over a face of cells of 0.14, too
+@pytest.mark.parametrize("shift", [0.0, 0.05, 0.12])  # over a face of cells of 0.14, too
 def test_a_pile_comes_to_rest(shift):
     """Under random pushes below the threshold a body of half a coarsest cell, wherever it lies, never deforms faster
     than by two of them, and without any it comes to rest; without rest deformation grows and stays. What moves as one
@@ -101,7 +100,7 @@ def test_a_pile_comes_to_rest(shift):
     torch.testing.assert_close(rest(swift_N3, moving, touched_C, grid, 0.3, ONE, NONE_1), swift_N3, rtol=0, atol=0)
 
 
-@pytest.mark.parametrize("shift", [0.0, 0.05, 0.31])
+@pytest.mark.parametrize("shift", [0.0, 0.31])
 def test_what_is_larger_than_coarsest_cells_rests(shift):
     """A sheet of three by six coarsest cells whose middle slowly moves against both its ends: between coarsest cells
     little of that is a deformation, and it goes on; between larger ones it comes to rest, and a rigid motion
