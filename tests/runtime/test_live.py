@@ -40,64 +40,42 @@ def small(**changes):
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_changes_that_change_nothing(backend):
-    """Frames with nothing added, the same obstacles and the same gravity set between them are bitwise a rollout's."""
-    simulator, first = Simulator(small(), 60.0, backend), scene(40)
-    (expected_TN3,) = simulator.rollout([first], 6)
+def test_a_scene_that_changes_is_one_that_began_so(backend):
+    """To the bit: frames with nothing added, the same obstacles and the same gravity set between them are a rollout's;
+    particles added before the first frame move as if the scene had begun with them, histories too; and what is restored
+    with positions and histories of an earlier frame repeats that frame's future, without those that entered later."""
+    simulator, first, second = Simulator(small(), 60.0, backend), scene(30), scene(20, 1)
+    (expected_TN3,) = simulator.rollout([replace(first, **joined(first, second))], 7)
     live = LiveSimulation(simulator, first)
-    for frame in range(1, 6):
+    history_AM3 = entering(live, second)
+    np.testing.assert_array_equal(history_AM3, simulator.start([second]).velocity_NM3)
+    for frame in range(1, 4):
         entering(live, scene(0))
         live.replace_obstacles(first)
         live.set_gravity(first.gravity)
         np.testing.assert_array_equal(live.step(), expected_TN3[frame])
+    state = live.state
+    position_N3, velocity_NM3 = state.position_N3.numpy().copy(), state.velocity_NM3.numpy().copy()
+    entering(live, scene(10, 2))
+    frames(live, 2)
     assert live.frame == 5
+    live.restore(position_N3, velocity_NM3, 3)
+    assert (live.frame, live.particle_count) == (3, 50)
+    np.testing.assert_array_equal(frames(live, 3), expected_TN3[4:])
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_particles_that_enter_are_those_of_a_scene(backend):
-    """Particles added before the first frame move, to the bit, as if the scene had begun with them: histories too."""
-    simulator, first, second = Simulator(small(), 60.0, backend), scene(30), scene(20, 1)
-    (expected_TN3,) = simulator.rollout([replace(first, **joined(first, second))], 5)
-    live = LiveSimulation(simulator, first)
-    history_AM3 = entering(live, second)
-    np.testing.assert_array_equal(history_AM3, simulator.start([second]).velocity_NM3)
-    np.testing.assert_array_equal(frames(live, 4), expected_TN3[1:])
-
-
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_particles_far_away_do_not_matter(backend):
-    """What enters beyond the grid's reach leaves the others' frames as they are, to rounding; what enters among them
-    does not."""
-    simulator, first = Simulator(small(), 60.0, backend), scene(40, domain_size=(20.0, 20.0, 20.0))
-    (alone_TN3,) = simulator.rollout([first], 8)
-    reach = {}
-    for low in (0.05, 18.0):
-        live = LiveSimulation(simulator, first)
-        begin_TN3 = frames(live, 3)
-        np.testing.assert_array_equal(begin_TN3, alone_TN3[1:4])
-        entering(live, scene(25, 1, low))
-        reach[low] = np.abs(frames(live, 4)[:, :40] - alone_TN3[4:]).max()
-    assert reach[18.0] < 1e-6 < 1e-5 < reach[0.05]
-
-
-def test_empty_until_particles_enter():
-    """A scene without particles waits; those that enter move as a scene of their own."""
+def test_empty_scenes_and_other_obstacles():
+    """A scene without particles waits; those that enter move as a scene of their own. From the next frame on particles
+    feel other obstacles, and without any they move as if there were none."""
     simulator, first = Simulator(small(), 60.0), scene(20)
-    live = LiveSimulation(simulator, scene(0))
+    live, bare = LiveSimulation(simulator, scene(0)), replace(first, obstacle_grid=EMPTY_GRID)
     assert frames(live, 2).shape == (2, 0, 3)
-    entering(live, first)
-    np.testing.assert_array_equal(frames(live, 3), simulator.rollout([first], 4)[0][1:])
-
-
-def test_obstacles_are_replaced():
-    """From the next frame on particles feel other obstacles, and without any they move as if there were none."""
-    simulator, first = Simulator(small(), 60.0), scene(40)
-    bare = replace(first, obstacle_grid=EMPTY_GRID)
-    live = LiveSimulation(simulator, first)
     live.replace_obstacles(bare)
-    np.testing.assert_array_equal(frames(live, 3), simulator.rollout([bare], 4)[0][1:])
+    entering(live, first)
+    (expected_TN3,) = simulator.rollout([bare], 5)
+    np.testing.assert_array_equal(frames(live, 3), expected_TN3[1:4])
     live.replace_obstacles(scene(0, 5))
-    assert np.abs(live.step() - simulator.rollout([bare], 5)[0][-1]).max() > 1e-6
+    assert np.abs(live.step() - expected_TN3[-1]).max() > 1e-6
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
@@ -145,7 +123,7 @@ def test_barriers_stay_where_obstacles_do(monkeypatch):
 def test_gravity_changes_between_frames():
     """Relative inputs: a lone particle falls on under the new gravity from the velocity that it had, by the closed
     form of the frame's integration: v += g dt^2, x += v."""
-    simulator = Simulator(constant_relative(), 60.0)
+    simulator = Simulator(silent(small(inputs="relative")), 60.0)
     one = replace(scene(1), velocity_N3=np.zeros((1, 3), np.float32))
     live = LiveSimulation(simulator, one)
     before_T13 = frames(live, 2)
@@ -157,28 +135,6 @@ def test_gravity_changes_between_frames():
     np.testing.assert_allclose(after_T13[:, 0], before_T13[1, 0] + rise_T3, rtol=0, atol=2e-6)
 
 
-def constant_relative():
-    """Relative inputs and an output of zero: free flight."""
-    return silent(small(inputs="relative"))
-
-
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_back_in_time(backend):
-    """What is restored with positions and histories of an earlier frame repeats that frame's future to the bit, without
-    those that entered later."""
-    simulator, first = Simulator(small(), 60.0, backend), scene(30)
-    live = LiveSimulation(simulator, first)
-    frames(live, 3)
-    state = live.state
-    position_N3, velocity_NM3 = state.position_N3.numpy().copy(), state.velocity_NM3.numpy().copy()
-    expected_TN3 = frames(live, 3)
-    entering(live, scene(10, 1))
-    frames(live, 2)
-    live.restore(position_N3, velocity_NM3, 3)
-    assert (live.frame, live.particle_count) == (3, 30)
-    np.testing.assert_array_equal(frames(live, 3), expected_TN3)
-
-
 def test_what_is_refused_changes_nothing():
     """Materials and gravity that the weights do not know, and arrays that do not fit, are refused by name; the
     simulation goes on as if nothing had been asked."""
@@ -187,25 +143,23 @@ def test_what_is_refused_changes_nothing():
     simulator, first = Simulator(network, 60.0, info=info), scene(20)
     first.material_N[:] = 0
     (expected_TN3,) = simulator.rollout([first], 3)
-    live, position_13 = LiveSimulation(simulator, first), np.full((1, 3), 0.5, np.float32)
-    with pytest.raises(ConfigError, match=r"material must be one of the network's \(water, sand\), got snow"):
-        live.add_particles(position_13, 0 * position_13, np.array([2]))
-    with pytest.raises(ConfigError, match=r"velocity_A3 must be of shape \(1, 3\), got \(1, 2\)"):
-        live.add_particles(position_13, position_13[:, :2], np.array([0]))
-    with pytest.raises(ConfigError, match=r"position_A3 must be a NumPy array, got 'list'"):
-        live.add_particles([[0.5, 0.5, 0.5]], 0 * position_13, np.array([0]))
-    with pytest.raises(ConfigError, match=r"material_A must be whole numbers, got 'float64'"):
-        live.add_particles(position_13, 0 * position_13, np.zeros(1))
-    with pytest.raises(
-        ConfigError, match=r"scenes must be a list of them, got 'InitialState'; as in rollout\(\[scene\], fr"
-    ):
-        simulator.rollout(first, 3)
-    with pytest.raises(ConfigError, match=r"position_A3 must be finite, got nan"):
-        live.add_particles(position_13 * np.nan, 0 * position_13, np.array([0]))
-    with pytest.raises(ConfigError, match="gravity must be the weights'"):
-        live.set_gravity((0.0, 0.0, 0.0))
-    with pytest.raises(ConfigError, match="position_N3 must be at most 20 particles, got 21"):
-        live.restore(np.zeros((21, 3), np.float32), np.zeros((21, 5, 3), np.float32), 0)
+    live, one_13, which_1 = LiveSimulation(simulator, first), np.full((1, 3), 0.5, np.float32), np.array([0])
+    for call, message in (
+        (lambda: live.add_particles(one_13, one_13, np.array([2])),
+         r"material must be one of the network's \(water, sand\), got snow"),
+        (lambda: live.add_particles(one_13, one_13[:, :2], which_1),
+         r"velocity_A3 must be of shape \(1, 3\), got \(1, 2\)"),
+        (lambda: live.add_particles([[0.5] * 3], one_13, which_1), "position_A3 must be a NumPy array, got 'list'"),
+        (lambda: live.add_particles(one_13, one_13, np.zeros(1)), "material_A must be whole numbers, got 'float64'"),
+        (lambda: live.add_particles(one_13 * np.nan, one_13, which_1), "position_A3 must be finite, got nan"),
+        (lambda: simulator.rollout(first, 3),
+         r"scenes must be a list of them, got 'InitialState'; as in rollout\(\[scene\], fr"),
+        (lambda: live.set_gravity((0.0, 0.0, 0.0)), "gravity must be the weights'"),
+        (lambda: live.restore(np.zeros((21, 3), np.float32), np.zeros((21, 5, 3), np.float32), 0),
+         "position_N3 must be at most 20 particles, got 21"),
+    ):  # fmt: skip
+        with pytest.raises(ConfigError, match=message):
+            call()
     np.testing.assert_array_equal(frames(live, 2), expected_TN3[1:])
 
 

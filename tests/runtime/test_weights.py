@@ -48,10 +48,8 @@ def rewrite(path, change, structure=None):
 def test_exported_checkpoint_is_the_trained_network(data, tmp_path):
     """A checkpoint of the trainer, exported and loaded, predicts what the checkpoint's network does (to 1e-6) and
     remembers what it was trained on."""
-    changes = {"maximum_updates": 3, "monitor_every": 3, "monitor_rollout_frames": 0}
-    assert train.main(train_mapping(data, tmp_path / "run", **changes)) == 0
-    checkpoint = tmp_path / "run" / "checkpoints" / "last.ckpt"
-    path = tmp_path / "shipped" / "weights.safetensors"
+    assert train.main(train_mapping(data, tmp_path / "run", maximum_updates=3)) == 0
+    checkpoint, path = tmp_path / "run" / "checkpoints" / "last.ckpt", tmp_path / "shipped" / "weights.safetensors"
     export(checkpoint, path)
     loaded, info = load_weights(path)
     expected = network_of_checkpoint(read_checkpoint(checkpoint), checkpoint)
@@ -63,22 +61,17 @@ def test_exported_checkpoint_is_the_trained_network(data, tmp_path):
     assert [file.name for file in path.parent.iterdir()] == ["weights.safetensors"]
 
 
-def test_roundtrip_keeps_every_bit(weights):
-    """Saved and loaded, every tensor is bitwise the same, normaliser included; the network is ready to predict."""
+def test_roundtrip_keeps_every_bit(weights, tmp_path):
+    """Saved and loaded, every tensor is bitwise the same, normaliser included; the network is ready to predict. A file
+    depends on nothing but the network and its other metadata; structure and constraints are the network's."""
     expected = network_of(torch.float32)
     loaded, info = load_weights(weights)
     assert not loaded.training and info == WeightsInfo(expected.config, 60.0, 1 / 64, updates=7)
     found = loaded.state_dict()
     assert found.keys() == expected.state_dict().keys()
-    for name, tensor in expected.state_dict().items():
-        assert torch.equal(found[name], tensor), name
-
-
-def test_same_network_same_bytes(weights, tmp_path):
-    """A file depends on nothing but the network and its other metadata; structure and constraints are the network's."""
-    network, info = load_weights(weights)
+    assert all(torch.equal(found[name], tensor) for name, tensor in expected.state_dict().items())
     for given in (info, replace(info, step=StepConfig(obstacle_clearance=1e-3), network=NetworkConfig())):
-        save_weights(tmp_path / "again.safetensors", network, given)
+        save_weights(tmp_path / "again.safetensors", loaded, given)
         assert (tmp_path / "again.safetensors").read_bytes() == weights.read_bytes()
 
 
