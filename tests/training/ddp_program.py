@@ -1,10 +1,11 @@
-"""One rank of a distributed training, started by torchrun: python ddp_program.py FOLDER.
+"""One rank of a distributed training: python ddp_program.py FOLDER, started by torchrun or Lightning's own launcher.
 
-Trains as FOLDER/mapping.json says and keeps what this rank saw: FOLDER/gradients_RANK.pt of the first update,
-FOLDER/end_RANK.pt with the weights, the update and the exit code, FOLDER/starts_RANK with the update of each start,
-FOLDER/talk_RANK.json with the updates at which ranks talked of anything but gradients.
-FOLDER/signals.json holds [restart, rank, update, signal, target] rows: in that start, that rank sends the signal at
-that update, to itself (target self) or to torchrun (launcher).
+Trains as FOLDER/mapping.json says. FOLDER/faults.json holds [restart, rank, update, fault, target] rows: in that start,
+that rank sends a signal (its number) at that update to itself (target self) or to torchrun (launcher), meets an error
+of its own ("error"), or gets other weights ("weights").
+Keeps what this rank saw: FOLDER/gradients_RANK.pt of the first update, FOLDER/end_RANK.pt with the weights, the update
+and the exit code, FOLDER/starts_RANK with the update of each start, FOLDER/talk_RANK.json with the updates at which
+ranks talked of anything but gradients.
 """
 
 import json
@@ -16,18 +17,17 @@ from typing import Any
 import torch
 
 from hgn import train
+from hgn.schema import ConfigError
 from hgn.training.module import TrainingModule
 from hgn.training.torch_updates import TorchUpdates
 
 
 def main(folder):
     mapping: dict[str, Any] = json.loads((folder / "mapping.json").read_text())
-    rank, restart = int(os.environ["RANK"]), int(os.environ["TORCHELASTIC_RESTART_COUNT"])
-    signals = {
-        update: (int(os.environ.get("WARM_PARENT", os.getppid())) if target == "launcher" else os.getpid(), number)
-        for in_start, of_rank, update, number, target in json.loads((folder / "signals.json").read_text())
-        if (in_start, of_rank) == (restart, rank)
-    }
+    rank = int(os.environ.get("RANK", os.environ.get("LOCAL_RANK", "0")))
+    restart = int(os.environ.get("TORCHELASTIC_RESTART_COUNT", "0"))
+    rows = json.loads((folder / "faults.json").read_text())
+    faults = {update: rest for in_start, of_rank, update, *rest in rows if (in_start, of_rank) == (restart, rank)}
     end: dict[str, Any] = {}
     update, talked = 0, set()
 
@@ -53,12 +53,19 @@ def main(folder):
         start(module)
 
     def before_step(updates, number):
+        parameters = dict(updates.trained.network.named_parameters())
         if number == 0:
-            named = updates.trained.network.named_parameters()
-            gradients = {f"network.{name}": parameter.grad.clone() for name, parameter in named}
+            gradients = {f"network.{name}": parameter.grad.clone() for name, parameter in parameters.items()}
             torch.save(gradients, folder / f"gradients_{rank}.pt")
-        if number in signals:
-            os.kill(*signals[number])
+        fault, target = faults.get(number, (None, None))
+        if fault == "error":
+            raise ConfigError("this rank fails")
+        if fault == "weights":
+            with torch.no_grad():
+                next(iter(parameters.values())).view(-1)[0] += 1e-3
+        elif fault is not None:
+            launcher = int(os.environ.get("WARM_PARENT", os.getppid()))
+            os.kill(launcher if target == "launcher" else os.getpid(), fault)
         step(updates, number)
 
     def at_end(module):
@@ -68,11 +75,17 @@ def main(folder):
     TrainingModule.on_train_batch_start = at_update
     TorchUpdates.step = before_step
     TrainingModule.on_train_end = at_end
-    end["exit_code"] = train.main(mapping)
+    try:
+        end["exit_code"] = train.main(mapping)
+    except ConfigError as error:
+        print(error, file=sys.stderr)
+        return 2
     torch.save(end, folder / f"end_{rank}.pt")
     (folder / f"talk_{rank}.json").write_text(json.dumps(sorted(talked)))
     return end["exit_code"]
 
 
 if __name__ == "__main__":
+    if os.environ.get("PYTHON_EXEC"):
+        sys.executable = os.environ["PYTHON_EXEC"]  # which starts the other ranks
     sys.exit(main(Path(sys.argv[1])))

@@ -69,11 +69,11 @@ class Reference:
     mapping: Callable[[Path], dict[str, Any]]
     gradients: dict[str, torch.Tensor]
 
-    def folder(self, path, signals):
-        """A folder for ddp_program.py: 40 updates of two ranks with a scene each, and the signals it sends itself."""
+    def folder(self, path, faults):
+        """A folder for ddp_program.py: 40 updates of two ranks with a scene each, and what befalls them."""
         path.mkdir()
         (path / "mapping.json").write_text(json.dumps(self.mapping(path)))
-        (path / "signals.json").write_text(json.dumps(signals))
+        (path / "faults.json").write_text(json.dumps(faults))
         return path
 
     def check(self, folder, exit_code):
@@ -135,8 +135,8 @@ def test_two_ranks_train_as_one(reference, warm_python, tmp_path):
     updates = [record["update"] for record in metrics(cut / "run") if "loss" in record]
     assert updates == [4, 8, 12, 16, 20]  # one line each: rank 0 alone writes
 
-    signals = [(0, 1, 13, signal.SIGKILL, "self"), (1, 0, 16, signal.SIGTERM, "launcher")]
-    killed = reference.folder(tmp_path / "killed", signals)
+    faults = [(0, 1, 13, signal.SIGKILL, "self"), (1, 0, 16, signal.SIGTERM, "launcher")]
+    killed = reference.folder(tmp_path / "killed", faults)
     process = torchrun(killed, *one_machine, "--max-restarts", "1", python=warm_python)
     text = output(process)
     assert process.returncode != 0 and "signal" in text.lower()
@@ -213,30 +213,45 @@ def no_launcher(monkeypatch):
     return monkeypatch
 
 
-@pytest.fixture
-def launched(no_launcher, variables):
-    """By what sets these variables alone."""
-    for name, value in variables.items():
-        no_launcher.setenv(name, value)
+SLURM = {"SLURM_PROCID": "0", "SLURM_NTASKS": "8", "SLURM_NNODES": "2"}
+JOB = {"SLURM_JOB_ID": "4711"}
+BOTH = {"SLURM_PROCID": "1", "SLURM_NTASKS": "2", "RANK": "3", "WORLD_SIZE": "4"}
+RANDOM_ID = "5bd6a8f0-93a5-4c5b-9b8c-0a52b6cf3d11"
 
 
 @pytest.mark.parametrize(
-    ("variables", "first"),
-    [
-        ({}, True),
-        ({"RANK": "0", "LOCAL_RANK": "0"}, True),
-        ({"RANK": "2", "LOCAL_RANK": "0"}, False),
-        ({"RANK": "0", "LOCAL_RANK": "0", "SLURM_PROCID": "1"}, True),  # torchrun inside srun, rank 0 elsewhere
-        ({"SLURM_PROCID": "0"}, True),
-        ({"SLURM_PROCID": "3"}, False),
-        ({"LOCAL_RANK": "1"}, False),
-        ({"LOCAL_RANK": "0", "NODE_RANK": "1"}, False),
+    ("variables", "first", "started", "folder"),
+    [  # whether it leads, devices and nodes that the launcher started, the folder's name
+        ({}, True, (1, 1), "runs/small"),
+        ({"RANK": "0", "LOCAL_RANK": "0", "WORLD_SIZE": "4"}, True, (4, 1), "runs/small"),
+        ({"RANK": "0", "WORLD_SIZE": "3"}, True, (3, 1), "runs/small"),
+        ({"RANK": "5", "LOCAL_RANK": "0", "WORLD_SIZE": "6", "LOCAL_WORLD_SIZE": "2"}, False, (2, 3), "runs/small"),
+        ({"RANK": "0", "WORLD_SIZE": "4", "LOCAL_WORLD_SIZE": "4"}, True, (4, 1), "runs/small"),
+        ({"SLURM_PROCID": "0", "SLURM_NTASKS": "4"}, True, (4, 1), "runs/small"),
+        (SLURM | JOB, True, (4, 2), "runs/small-4711"),
+        (SLURM | JOB | {"SLURM_PROCID": "7"}, False, (4, 2), "runs/small-4711"),
+        (SLURM | {"SLURM_JOB_NAME": "bash"}, True, (1, 1), "runs/small"),
+        (SLURM | {"SLURM_JOB_NAME": "interactive"}, True, (1, 1), "runs/small"),
+        (JOB, True, (1, 1), "runs/small"),  # a shell or a script inside a job, without srun
+        (BOTH | JOB | {"LOCAL_WORLD_SIZE": "2"}, False, (2, 2), "runs/small"),  # torchrun inside srun
+        (BOTH | {"RANK": "0", "TORCHELASTIC_RUN_ID": "a", "SLURM_JOB_ID": "1"}, True, (4, 1), "runs/a"),
+        ({"LOCAL_RANK": "1"}, False, (1, 1), "runs/small"),
+        ({"LOCAL_RANK": "0", "NODE_RANK": "1"}, False, (1, 1), "runs/small"),
+        ({"TORCHELASTIC_RUN_ID": "none", "RANK": "1", "WORLD_SIZE": "2"}, False, (2, 1), "runs/small"),
+        ({"TORCHELASTIC_RUN_ID": "night/one two"}, True, (1, 1), "runs/night-one-two"),
+        ({"TORCHELASTIC_RUN_ID": RANDOM_ID}, True, (1, 1), "runs/small"),
+        (SLURM | JOB | {"HGN_RUN": "mine", "TORCHELASTIC_RUN_ID": "a"}, True, (4, 2), "runs/mine"),
+        ({"HGN_RUN": "/shared/mine"}, True, (1, 1), "/shared/mine"),
     ],
 )
-@pytest.mark.usefixtures("launched")
-def test_one_process_leads(first):
-    """Whatever launched the processes, exactly the one of global rank 0 leads."""
-    assert first_rank() is first
+def test_what_a_launcher_says(no_launcher, variables, first, started, folder):
+    """Exactly the process of global rank 0 leads. Devices and nodes that the configuration leaves open are those that
+    the launcher started, and others than it started are refused: each would train alone. All processes of a job, and
+    its restarts, agree on the folder, and two jobs get two: our own variable comes first, then torchrun's id (unless it
+    is random, as --standalone makes it), then Slurm's."""
+    for name, value in variables.items():
+        no_launcher.setenv(name, value)
+    assert (first_rank(), layout(TrainingConfig(device="cpu")), str(default_run("small"))) == (first, started, folder)
 
 
 @pytest.mark.parametrize(
@@ -247,15 +262,15 @@ def test_one_process_leads(first):
         ({"RANK": "0", "WORLD_SIZE": "3"}, (3, 1)),
         ({"RANK": "0", "WORLD_SIZE": "4", "LOCAL_WORLD_SIZE": "4"}, (4, 1)),
         ({"SLURM_PROCID": "0", "SLURM_NTASKS": "4"}, (2, 2)),
-        ({"SLURM_PROCID": "0", "SLURM_NTASKS": "8", "SLURM_NNODES": "2"}, (4, 2)),
-        ({"SLURM_PROCID": "0", "SLURM_NTASKS": "8", "SLURM_JOB_NAME": "bash"}, (2, 1)),
-        ({"SLURM_PROCID": "1", "SLURM_NTASKS": "2", "RANK": "3", "WORLD_SIZE": "4"}, (2, 2)),
+        (SLURM, (4, 2)),
+        (SLURM | {"SLURM_JOB_NAME": "bash"}, (2, 1)),
+        (BOTH, (2, 2)),
     ],
 )
-@pytest.mark.usefixtures("launched")
-def test_launcher_and_configuration_agree(started):
-    """A launcher that started another number of processes on a machine than devices is refused: each would train
-    alone."""
+def test_launcher_and_configuration_agree(no_launcher, variables, started):
+    """A launcher that started another number of processes on a machine than devices is refused."""
+    for name, value in variables.items():
+        no_launcher.setenv(name, value)
     training = TrainingConfig(device="cpu", devices=2)
     if started[0] == 2:
         assert layout(training) == started
@@ -263,23 +278,6 @@ def test_launcher_and_configuration_agree(started):
     message = rf"devices must be the {started[0]} processes that the launcher started on each of {started[1]} machines"
     with pytest.raises(ConfigError, match=message):
         layout(training)
-
-
-@pytest.mark.parametrize(
-    ("variables", "expected"),
-    [
-        ({}, (1, 1)),
-        ({"RANK": "5", "WORLD_SIZE": "6", "LOCAL_WORLD_SIZE": "2"}, (2, 3)),
-        ({"RANK": "0", "WORLD_SIZE": "4"}, (4, 1)),
-        ({"SLURM_PROCID": "7", "SLURM_NTASKS": "8", "SLURM_NNODES": "2"}, (4, 2)),
-        ({"SLURM_PROCID": "0", "SLURM_NTASKS": "8", "SLURM_NNODES": "2", "SLURM_JOB_NAME": "interactive"}, (1, 1)),
-        ({"SLURM_PROCID": "1", "SLURM_NTASKS": "2", "RANK": "3", "WORLD_SIZE": "4", "LOCAL_WORLD_SIZE": "2"}, (2, 2)),
-    ],
-)
-@pytest.mark.usefixtures("launched")
-def test_layout_follows_the_launcher(expected):
-    """Where the configuration leaves them open, devices and nodes are those that the launcher started."""
-    assert layout(TrainingConfig(device="cpu")) == expected
 
 
 def test_restarts_that_would_hang_are_refused(no_launcher):
@@ -293,27 +291,6 @@ def test_restarts_that_would_hang_are_refused(no_launcher):
         layout(TrainingConfig(device="cpu"))
     no_launcher.setenv("TORCHELASTIC_USE_AGENT_STORE", "False")
     assert layout(TrainingConfig(device="cpu")) == (1, 1)
-
-
-@pytest.mark.parametrize(
-    ("variables", "folder"),
-    [
-        ({}, "runs/small"),
-        ({"SLURM_JOB_ID": "4711"}, "runs/small"),  # a shell or a script inside a job, without srun
-        ({"SLURM_JOB_ID": "4711", "SLURM_PROCID": "3", "SLURM_NTASKS": "8"}, "runs/small-4711"),
-        ({"RANK": "1", "WORLD_SIZE": "2", "TORCHELASTIC_RUN_ID": "none"}, "runs/small"),
-        ({"RANK": "1", "WORLD_SIZE": "2", "TORCHELASTIC_RUN_ID": "night/one two"}, "runs/night-one-two"),
-        ({"RANK": "1", "TORCHELASTIC_RUN_ID": "5bd6a8f0-93a5-4c5b-9b8c-0a52b6cf3d11"}, "runs/small"),
-        ({"RANK": "0", "TORCHELASTIC_RUN_ID": "a", "SLURM_JOB_ID": "1", "SLURM_PROCID": "0"}, "runs/a"),
-        ({"HGN_RUN": "mine", "TORCHELASTIC_RUN_ID": "a", "SLURM_JOB_ID": "1", "SLURM_PROCID": "0"}, "runs/mine"),
-        ({"HGN_RUN": "/shared/mine"}, "/shared/mine"),
-    ],
-)
-@pytest.mark.usefixtures("launched")
-def test_one_folder_a_run(folder):
-    """All processes of a job, and its restarts, agree on the folder; two jobs get two. Our own variable comes first,
-    then torchrun's id (unless it is random, as --standalone makes it), then Slurm's."""
-    assert str(default_run("small")) == folder
 
 
 def test_devices_that_are_not_there(no_launcher):
@@ -352,8 +329,8 @@ GPUS = (pytest.mark.multigpu, pytest.mark.skipif(torch.cuda.device_count() < 2, 
 @pytest.mark.parametrize(
     ("device", "fault", "failing"),
     [
-        ("cpu", "weights", "1"),
-        *(pytest.param("cuda", fault, rank, marks=GPUS) for fault in ("error", "weights") for rank in ("0", "1")),
+        ("cpu", "weights", 1),
+        *(pytest.param("cuda", fault, rank, marks=GPUS) for fault in ("error", "weights") for rank in (0, 1)),
     ],
 )
 def test_no_rank_waits_for_one_that_fails(data, no_launcher, warm_python, tmp_path, device, fault, failing):
@@ -361,9 +338,10 @@ def test_no_rank_waits_for_one_that_fails(data, no_launcher, warm_python, tmp_pa
     weights, which the next log line finds."""
     options: dict[str, Any] = {"device": device, "backend": "torch", "devices": 2, "maximum_updates": 10**6}
     (tmp_path / "mapping.json").write_text(json.dumps(train_mapping(data, tmp_path / "run", **options)))
+    (tmp_path / "faults.json").write_text(json.dumps([(0, failing, 3, fault, "self")]))
     python = str(warm_python) if device == "cpu" else sys.executable
     process = subprocess.Popen(
-        [python, str(PROGRAM.with_name("failing_rank.py")), str(tmp_path), fault, failing],
+        [python, str(PROGRAM), str(tmp_path)],
         env=os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1", "PYTHON_EXEC": python},
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,

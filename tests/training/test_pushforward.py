@@ -121,31 +121,25 @@ def pool_of(network, training=None):
     return PushforwardPool(TorchScenes(network), training or training_of(), 0)
 
 
-def test_short_episodes_are_simulated_as_far_as_the_truth_goes():
-    """Of frames that no truth answers there is no window; what is dropped is counted of the others."""
-    network = network_of(torch.float32, levels=1, message_passing_steps=1)
-    long, short = episode(7, frames=9, seed=1), episode(7, frames=4, seed=2)
-    alone = pool_of(network)
-    alone.refresh([(long, 1)])
-    for frame, answered in ((0, 2), (1, 1)):
-        own = pool_of(network)
-        own.refresh([(long, 1), (short, frame)])
-        assert [sample.episode is short for sample, _ in own._samples] == [False] * 3 + [True] * answered
-        assert own.figures["pushforward/windows"] == 3 + answered and own.figures["pushforward/dropped"] == 0
-        for (found, _), (expected, _) in zip(own._samples[:3], alone._samples, strict=True):
-            np.testing.assert_allclose(found.window_WN3, expected.window_WN3, rtol=0, atol=1e-7)
+LONG, SHORT, OTHER = episode(7, frames=12, seed=1), episode(7, frames=6, seed=2), episode(5, frames=6, seed=3)
 
 
-def test_long_episodes_are_simulated_for_longer():
-    """Of each episode its fraction, where that is more than what all have: as they are by themselves, in whatever order
-    they come."""
+@pytest.mark.parametrize(
+    ("share", "starts"),
+    [  # episodes, first frames, windows
+        (0.0, ((LONG, 1, 3), (SHORT, 2, 2))),  # of frames that no truth answers there is no window
+        (0.0, ((LONG, 1, 3), (SHORT, 3, 1))),
+        (0.35, ((LONG, 1, 4), (SHORT, 1, 3), (OTHER, 0, 3))),  # a fraction that is more than what all have
+    ],
+)
+def test_episodes_are_simulated_as_far_as_the_truth_and_their_fraction_go(share, starts):
+    """As they are by themselves, in whatever order they come; what is dropped is counted of the others."""
     network = network_of(torch.float32, levels=1, message_passing_steps=1)
-    training = training_of(pushforward_episode_fraction=0.35)
-    long, short, other = episode(7, frames=12, seed=1), episode(7, frames=6, seed=2), episode(5, frames=6, seed=3)
-    own = pool_of(network, training)
-    own.refresh([(long, 1), (short, 1), (other, 0)])
-    assert own.figures["pushforward/windows"] == 3 + 3 + 4 and own.figures["pushforward/dropped"] == 0
-    for made, frame, count in ((long, 1, 4), (short, 1, 3), (other, 0, 3)):
+    own = pool_of(network, training_of(pushforward_episode_fraction=share))
+    own.refresh([(made, frame) for made, frame, _ in starts])
+    windows = sum(count for *_, count in starts)
+    assert own.figures["pushforward/windows"] == windows and own.figures["pushforward/dropped"] == 0
+    for made, frame, count in starts:
         alone = pool_of(network, training_of(pushforward_frames=count))
         alone.refresh([(made, frame)])
         mine = [sample for sample, _ in own._samples if sample.episode is made]

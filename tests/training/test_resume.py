@@ -4,8 +4,8 @@ import dataclasses
 from itertools import islice
 from typing import Any
 
+import numpy as np
 import pytest
-import torch
 from equality import assert_same
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -15,6 +15,7 @@ from hgn import train
 from hgn.config import NetworkConfig, TrainingConfig
 from hgn.data.reader import EpisodeStore
 from hgn.data.sampler import EpisodeSampler, SamplerState
+from hgn.scene.history import window
 from hgn.training.checkpoint import read_checkpoint
 from hgn.training.data_module import EpisodeDataModule
 from hgn.training.module import TrainingModule
@@ -85,29 +86,6 @@ def test_an_epoch_keeps_the_revision_it_began_with(growth, world_size, starts):
     seen.require_each_once(sampler_state, lambda epoch: published[: begun[epoch]])
 
 
-def test_reading_ahead_changes_nothing(data):
-    """With 0 to 3 batches read ahead the batches are the same, bit by bit, and each carries the sampler's state after
-    it, from which a feed goes on with the next one."""
-    network, training = NetworkConfig(**NETWORK), TrainingConfig(**TRAINING | {"maximum_updates": 40})
-    store = EpisodeStore(data.dataset.folder, "train")
-
-    def batches(ahead, count, sampler_state=None):
-        feed = EpisodeDataModule(store, training, WindowReader(store, network, training), chunks_ahead=ahead)
-        feed.sampler_state = sampler_state or SamplerState()
-        return list(islice(feed.chunks(), count))
-
-    expected = batches(0, 30)
-    for ahead in (1, 2, 3):
-        for chunk, other in zip(expected, batches(ahead, 30), strict=True):
-            assert torch.equal(chunk.batch.window_WN3, other.batch.window_WN3)
-            assert (chunk.batch.seeds_S, chunk.sampler_state) == (other.batch.seeds_S, other.sampler_state)
-    for ahead in range(4):
-        again = batches(ahead, 5, expected[16].sampler_state)
-        for chunk, other in zip(expected[17:22], again, strict=True):
-            assert torch.equal(chunk.batch.window_WN3, other.batch.window_WN3)
-            assert chunk.batch.seeds_S == other.batch.seeds_S
-
-
 class Shared:
     """What a feed asks of the trainer of one rank of several, when all see the same data set."""
 
@@ -123,11 +101,14 @@ class Shared:
 
 def test_feeds_of_all_ranks_resume_anywhere(data):
     """Interrupted after any batches, on 1 to 8 ranks that may be others at each start, with 0 to 3 batches read ahead
-    at that moment, the ranks together get the samples of one uninterrupted process, update by update."""
+    at that moment, the ranks together get the samples of one uninterrupted process, update by update, and each sample's
+    window bit by bit."""
     network = NetworkConfig(**NETWORK)
     store = EpisodeStore(data.dataset.folder, "train")
     whole = EpisodeSampler(TrainingConfig(**TRAINING).seed, 1, lambda _: [6] * 5)
-    expected = [whole.next_batch()[0].seed for _ in range(8 * 2 * 3 * 4)]
+    expected = [whole.next_batch()[0] for _ in range(8 * 2 * 3 * 4)]
+    seeds = [sample.seed for sample in expected]
+    windows = {s.seed: window(store[s.episode], s.frame, network.velocity_history) for s in expected}
 
     @settings(max_examples=25, deadline=None, derandomize=True)
     @given(st.lists(st.tuples(*(st.integers(*ends) for ends in STARTS)), min_size=1, max_size=3))
@@ -143,9 +124,12 @@ def test_feeds_of_all_ranks_resume_anywhere(data):
                 ranks.append(list(islice(feed.chunks(), count)))
             for chunks in zip(*ranks, strict=True):
                 update = [seed for chunk in chunks for seed in chunk.batch.seeds_S]
-                assert sorted(update) == sorted(expected[len(seen) :][: len(update)])
+                assert sorted(update) == sorted(seeds[len(seen) :][: len(update)])
                 seen += update
                 assert len({chunk.sampler_state for chunk in chunks}) == 1
+                for batch in (chunk.batch for chunk in chunks):
+                    found = np.concatenate([windows[seed] for seed in batch.seeds_S], axis=1)
+                    assert np.array_equal(found, batch.window_WN3.numpy())
             sampler_state = ranks[0][-1].sampler_state
 
     interrupted()

@@ -158,32 +158,26 @@ def test_updates_without_a_finite_gradient_are_skipped(data, run, monkeypatch):
     assert all(tensor.isfinite().all() for tensor in stored["state_dict"].values())
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGUSR1, signal.SIGINT])
-def test_signals_end_the_run_after_a_checkpoint(data, run, monkeypatch, number):
-    """A real signal in the middle of an update ends the run at that update, with a checkpoint and 128 + its number."""
-    original = TorchUpdates.step
-
-    def signalled(updates, update):
-        if update == 2:
-            os.kill(os.getpid(), number)
-        original(updates, update)
-
-    monkeypatch.setattr(TorchUpdates, "step", signalled)
-    assert train.main(train_mapping(data, run)) == 128 + number
-    assert read_checkpoint(run / "checkpoints" / "last.ckpt")["hgn"]["updates"] == 3
-
-
-def test_a_signal_before_the_first_update(data, tmp_path, monkeypatch):
-    """SIGTERM while Lightning's own handler is in place ends the run after a checkpoint, with 128 + its number."""
-    original = LogLines.on_train_start
+@pytest.mark.parametrize(
+    ("number", "place", "updates"),
+    [
+        *((number, (TorchUpdates, "step"), 3) for number in (signal.SIGTERM, signal.SIGUSR1, signal.SIGINT)),
+        (signal.SIGTERM, (LogLines, "on_train_start"), 1),  # while Lightning's own handler is in place
+    ],
+)
+def test_signals_end_the_run_after_a_checkpoint(data, run, monkeypatch, number, place, updates):
+    """A real signal in the middle of an update, or before the first, ends the run at that update, with a checkpoint and
+    128 + its number."""
+    original = getattr(*place)
 
     def signalled(*arguments):
-        os.kill(os.getpid(), signal.SIGTERM)
+        if updates == 1 or arguments[1] == 2:
+            os.kill(os.getpid(), number)
         original(*arguments)
 
-    monkeypatch.setattr(LogLines, "on_train_start", signalled)
-    assert train.main(train_mapping(data, tmp_path / "run")) == 128 + signal.SIGTERM
-    assert read_checkpoint(tmp_path / "run" / "checkpoints" / "last.ckpt")["hgn"]["updates"] == 1
+    monkeypatch.setattr(*place, signalled)
+    assert train.main(train_mapping(data, run)) == 128 + number
+    assert read_checkpoint(run / "checkpoints" / "last.ckpt")["hgn"]["updates"] == updates
 
 
 def test_a_second_interrupt_does_not_wait(finished, monkeypatch):
@@ -234,10 +228,10 @@ def test_a_finished_run_stays_finished(finished):
     assert [path.read_bytes() for path in kept] == before
 
 
-def test_the_best_network_is_remembered(data, tmp_path):
+def test_the_best_network_is_remembered(data, run, monkeypatch):
     """What is measured at the very end, after a checkpoint of the same update, is the bound that a later start has to
-    beat; so `best.ckpt` is never replaced by a worse one."""
-    run = tmp_path / "run"
+    beat; so `best.ckpt` is never replaced by a worse one. A GPU that training.device=cpu leaves alone is no warning."""
+    monkeypatch.setattr("lightning.pytorch.trainer.setup.CUDAAccelerator.is_available", lambda: True)
     assert train.main(train_mapping(data, run, maximum_updates=5, monitor_every=1000)) == 0
     (error,) = (record["one_step/validation"] for record in metrics(run) if "one_step/validation" in record)
     assert read_checkpoint(run / "checkpoints" / "last.ckpt")["callbacks"]["Checkpoints"] == {"best_error": error}
@@ -292,12 +286,6 @@ def test_a_checkpoint_of_the_first_release(finished):
     assert [record["skipped_updates"] for record in metrics(run) if "loss" in record] == [0, 0, 0, 3]
 
 
-def test_a_gpu_that_is_left_alone_is_no_warning(data, tmp_path, monkeypatch):
-    """Training on a CPU where there is a GPU: training.device=cpu says so."""
-    monkeypatch.setattr("lightning.pytorch.trainer.setup.CUDAAccelerator.is_available", lambda: True)
-    assert train.main(train_mapping(data, tmp_path / "run", maximum_updates=1)) == 0
-
-
 def test_training_learns(make_config, make_dataset, run):
     """On free fall with strong velocity noise, 240 updates learn to undo a good part of the noise."""
     config = make_config(training_scenes=6, frames=30)
@@ -344,10 +332,10 @@ def test_signals_of_a_scheduler(order):
     assert stop.exit_code == 138
 
 
-def test_missing_data_without_generator(make_config, tmp_path):
+def test_missing_data_without_generator(make_config, run):
     """Without data and with generate=false the message says how to make some."""
     with pytest.raises(ConfigError, match="generate it with python -m datagen"):
-        train.main(train_mapping(make_config(), tmp_path / "run"))
+        train.main(train_mapping(make_config(), run))
 
 
 @pytest.fixture

@@ -1,6 +1,7 @@
 """What a run begins with, how it warms up, and the moving average it ends with."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
@@ -14,7 +15,7 @@ from hgn.export import export
 from hgn.export import main as export_main
 from hgn.network.build import build_network
 from hgn.runtime.torch_backend import Backend
-from hgn.runtime.weights import WeightsInfo, load_weights, save_weights
+from hgn.runtime.weights import WeightsInfo, find_weights, load_weights, save_weights
 from hgn.schema import ConfigError
 from hgn.step_config import StepConfig
 from hgn.training.checkpoint import network_of_checkpoint, network_of_weights, read_checkpoint
@@ -127,65 +128,47 @@ def test_the_optimiser_is_the_configured_one(name, kind):
     assert type(optimizer) is kind and optimizer.param_groups[0]["fused"]
 
 
-def test_an_export_sets_rest_walls_and_obstacles(data, finished, tmp_path):
-    """The tensors stay; networks that have no contacts to rest on are refused, and so is each for what exists."""
-    relative = {"network": {**NETWORK, "inputs": "relative"}}
-    assert train.main(train_mapping(data, tmp_path / "relative", maximum_updates=2) | relative) == 0
-    kept = str(tmp_path / "relative" / "checkpoints" / "last.ckpt")
-    absolute = str(finished[1] / "checkpoints" / "last.ckpt")
-    chosen = [
-        {},
-        {"rest_threshold": 0.1},
-        {"wall_clearance": [0.02, 0.04]},
-        {"obstacle_clearance": 1e-3},
-    ]
-    outs = [tmp_path / f"{index}.safetensors" for index in range(4)]
-    for out, options in zip(outs, chosen, strict=True):
-        assert export_main({"checkpoint": kept, "out": str(out)} | options) == 0
-    (one, trained), *others = (load_weights(out) for out in outs)
-    assert trained.step == StepConfig()
-    expected = (
-        {"rest_threshold": 0.1},
-        {"wall_clearance": (0.02, 0.04)},
-        {"obstacle_clearance": 1e-3},
-    )
-    for (other, after), changes in zip(others, expected, strict=True):
-        assert after.step == StepConfig(**changes) == other.step and after.network == trained.network
-        for name, tensor in one.state_dict().items():
-            assert torch.equal(tensor, other.state_dict()[name])
-    with pytest.raises(ConfigError, match=r"rest_threshold must be 0 with inputs=absolute, got 0\.1"):
-        export_main({"checkpoint": absolute, "out": str(outs[0]), "rest_threshold": 0.1})
-    for options in chosen[1:]:
-        name, value = next(iter(options.items()))
-        with pytest.raises(ConfigError, match=f"{name} must be null without out, the file that it is for, got "):
-            export_main({"weights": str(outs[0]), "onnx": str(tmp_path / "step.onnx"), name: value})
-    with pytest.raises(ConfigError, match=r"wall_clearance\[1\] must be a finite number >= 0, got -0\.1"):
-        export_main({"checkpoint": absolute, "out": str(outs[0]), "wall_clearance": [0.1, -0.1]})
-
-
-def test_weights_are_changed_without_a_checkpoint(tmp_path):
-    """Tensors, updates and what else is known of them stay, also in a file that is its own origin; the provenance says
-    what was changed, of which file, and holds that file's own. Shipped weights go by their name."""
-    file = weights_file(tmp_path / "trained.safetensors")
+def test_an_export_sets_rest_walls_and_obstacles(finished, tmp_path):
+    """Of a checkpoint, of a weights file, also in its own place, and of shipped weights by their name. Tensors, updates
+    and what else is known of them stay; the provenance says what was changed, of which file, and holds that file's own.
+    Networks that have no contacts to rest on are refused, and so is each for what exists."""
+    checkpoint, out = str(finished[1] / "checkpoints" / "last.ckpt"), str(tmp_path / "out.safetensors")
+    file = weights_file(tmp_path / "trained.safetensors", inputs="relative")
     network, info = load_weights(file)
     save_weights(file, network, replace(info, updates=7, provenance={"commit": "abc"}), "fp16")
-    for out in (tmp_path / "out.safetensors", file):
-        options = {"obstacle_clearance": 1e-3, "stored_precision": "fp16"}
-        assert export_main({"weights": str(file), "out": str(out)} | options) == 0
-        changed, after = load_weights(out)
-        assert after.step == StepConfig(obstacle_clearance=1e-3) == changed.step and after.network == info.network
-        assert (after.updates, after.frame_rate_hz, after.gravity) == (7, info.frame_rate_hz, info.gravity)
-        told = after.provenance["changed"]
-        assert told == {"file": file.name, "step": {"obstacle_clearance": 1e-3}, "provenance": {"commit": "abc"}}
-        for name, tensor in network.state_dict().items():
-            assert torch.equal(tensor, changed.state_dict()[name])
-    before = file.read_bytes()
-    with pytest.raises(ConfigError, match=r"rest_threshold must be 0 with inputs=absolute, got 0\.1"):
-        export_main({"weights": str(file), "out": str(file), "rest_threshold": 0.1})
-    assert file.read_bytes() == before
-    small = tmp_path / "small.safetensors"
-    assert export_main({"weights": "obstacles_small", "out": str(small), "obstacle_clearance": 5e-4}) == 0
-    assert load_weights(small)[1].step.obstacle_clearance == 5e-4
+    kept = str(tmp_path / "kept.safetensors")
+    assert export_main({"checkpoint": checkpoint, "out": kept}) == 0
+    for origin, before, options in (
+        ({"checkpoint": checkpoint}, kept, {"wall_clearance": (0.02, 0.04)}),
+        ({"weights": str(file)}, file, {"rest_threshold": 0.1}),
+        ({"weights": str(file)}, file, {"obstacle_clearance": 1e-3}),
+        ({"weights": "obstacles_small"}, "obstacles_small", {"obstacle_clearance": 5e-4}),
+    ):
+        (first, was), place = load_weights(find_weights(str(before))), out
+        if origin == {"weights": str(file)}:
+            place = str(file) if "obstacle_clearance" in options else out
+            origin = origin | {"stored_precision": "fp16"}
+        assert export_main(origin | options | {"out": place}) == 0
+        changed, after = load_weights(Path(place))
+        assert after.step == StepConfig(**options) == changed.step and after.network == was.network
+        assert (after.updates, after.frame_rate_hz, after.gravity) == (was.updates, was.frame_rate_hz, was.gravity)
+        if origin.get("weights") == str(file):
+            told = {"file": file.name, "step": options, "provenance": {"commit": "abc"}}
+            assert after.provenance["changed"] == told and after.updates == 7
+        assert all(torch.equal(tensor, changed.state_dict()[name]) for name, tensor in first.state_dict().items())
+    bytes_before, step = file.read_bytes(), str(tmp_path / "step.onnx")
+    absolute = r"rest_threshold must be 0 with inputs=absolute, got 0\.1"
+    given = (("rest_threshold", 0.1), ("wall_clearance", [0.02, 0.04]), ("obstacle_clearance", 1e-3))
+    for options, message in (
+        ({"checkpoint": checkpoint, "out": out, "rest_threshold": 0.1}, absolute),
+        ({"weights": kept, "out": kept, "rest_threshold": 0.1}, absolute),
+        ({"checkpoint": checkpoint, "out": out, "wall_clearance": [0.1, -0.1]}, r"wall_clearance\[1\] must be a fin"),
+        *(({"weights": str(file), "onnx": step, name: value}, f"{name} must be null without out, the file that it is")
+          for name, value in given),
+    ):  # fmt: skip
+        with pytest.raises(ConfigError, match=message):
+            export_main(options)
+    assert file.read_bytes() == bytes_before
 
 
 def test_the_average_is_what_is_measured_and_exported(data, tmp_path, monkeypatch):
