@@ -2,8 +2,8 @@
 
 Each particle of a scene, called visible, stands for the same number of fine particles, its children: one begins at its
 place, the others around it, with their mean there. So all fine particles have the same mass, and a scene's first frame,
-total mass, momentum and centre of mass do not depend on the grid. An episode contains the visible particles only: each
-is at the mean of its children.
+total mass, momentum and centre of mass do not depend on the grid. An episode contains the first child of each visible
+particle: the mean of all is no point of the material once they part (results/solver/README.md).
 Shape legend: T frames, N visible particles, C children of each, M = N C fine particles, F triangles.
 """
 
@@ -20,7 +20,6 @@ from hgn.scene.scene import Scene
 
 STREAM = 4  # of random numbers; hgn.scene.random_scene uses those before it
 SURFACE_FRACTION = 0.9  # of the distance to an obstacle's surface, at which children may begin
-RULES = ("mean", "child")
 
 
 def fine_scene(scene: Scene, cell_size: float, wall: float) -> Scene:
@@ -61,24 +60,10 @@ def solver_on_grid(config: MpmConfig, cell_size: float, own_cell_size: float) ->
     return dataclasses.replace(config, wall_cells=max(2, 1 + int((config.wall_cells - 1) * ratio + 1e-6)))
 
 
-def visible_positions(position_TM3: np.ndarray, visible: int, rule: str = RULES[0]) -> np.ndarray:
-    """Returns the positions of `visible` particles from those of all their children, float32 [T, N, 3].
-
-    Frame 0 is the visible particles' own, bitwise. With `rule` child the first child is followed instead of the mean.
-    """
+def visible_positions(position_TM3: np.ndarray, visible: int) -> np.ndarray:
+    """Returns the positions of `visible` particles from those of all their children, float32 [T, N, 3]."""
     children = position_TM3.shape[1] // max(visible, 1)
-    if children <= 1:
-        return position_TM3
-    child_TNC3 = position_TM3.reshape(len(position_TM3), visible, children, 3)
-    first_TN3 = child_TNC3[:, :, 0]
-    if rule == "child":
-        return np.ascontiguousarray(first_TN3)
-    total_TN3 = first_TN3.astype(np.float64)
-    for index in range(1, children):
-        total_TN3 += child_TNC3[:, :, index]
-    position_TN3 = (total_TN3 / children).astype(np.float32)
-    position_TN3[0] = first_TN3[0]
-    return position_TN3
+    return position_TM3 if children <= 1 else np.ascontiguousarray(position_TM3[:, ::children])
 
 
 def scene_to_simulate(scene: Scene, config: DatagenConfig) -> Scene:

@@ -118,8 +118,8 @@ def data_card(manifest: Manifest, name: str, licence: str) -> str:
 def _reference_row(reference: dict[str, Any] | None) -> dict[str, str]:
     if reference is None:
         return {}
-    children = f"{reference['visible']} of {reference['particles_per_visible']} particles"
-    return {"simulated on": f"{reference['cells']} cells per unit; each particle is the {children}"}
+    children = f"{reference['particles_per_visible']} there, {reference['visible']}"
+    return {"simulated on": f"{reference['cells']} cells per unit; each particle stands for {children}"}
 
 
 def _vector(value: Sequence[float]) -> str:

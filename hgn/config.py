@@ -287,7 +287,7 @@ class DatagenConfig:
         if self.reference_ratio == 1:
             return None
         children = round(self.reference_ratio**3)
-        return {"cells": self.dataset.reference_cells, "particles_per_visible": children, "visible": "mean"}
+        return {"cells": self.dataset.reference_cells, "particles_per_visible": children, "visible": "first child"}
 
 
 @dataclass(frozen=True)

@@ -17,9 +17,9 @@ PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
     "hgn": 27_261,
-    "datagen": 8_480,
-    "tools": 7_106,
-    "tests": 27_572,
+    "datagen": 8_471,
+    "tools": 7_110,
+    "tests": 27_581,
 }
 SETTINGS = 238  # fields of the dataclasses behind the commands, *Config
 

@@ -77,7 +77,8 @@ class Setting:
     """A setting of the solver on a grid."""
 
     step: float  # fraction of the limit of stability
-    perturbation: float = 0.0  # largest initial displacement, domain units
+    # largest initial displacement, domain units; on a finer grid all but the visible particles are drawn anew instead
+    perturbation: float = 0.0
 
 
 class SolverLaunches:
@@ -133,8 +134,11 @@ class SolverLaunches:
         ]
 
     def _scene(self, episode: Episode, perturbation: float = 0.0) -> Scene:
+        finer = self.cell_size < episode.obstacle_grid.cell_size
+        if perturbation and finer:  # other children of the same particles
+            episode = replace(episode, seed=episode.seed + 1)
         scene = solver_scene(episode, self.cell_size, wall_thickness(self.config, self.cell_size))
-        if perturbation:
+        if perturbation and not finer:
             draw = np.random.default_rng(scene.seed).uniform
             scene.position_N3[:] += draw(-perturbation, perturbation, scene.position_N3.shape)
         return scene

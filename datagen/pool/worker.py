@@ -188,8 +188,15 @@ def simulate_batch(
             cpu_threads=threads,
             colliders=[made.collider.open() for made in launch],
         )
-        results |= zip((made.task for made in launch), of_launch, strict=True)
+        results |= {m.task: _visible(m.scene.open(), result) for m, result in zip(launch, of_launch, strict=True)}
     return [results[made.task] for made in batch]
+
+
+def _visible(scene: Scene, result: Any) -> Any:
+    """Returns a result of the solver with the positions of a scene's own particles."""
+    if not hasattr(result, "position_TN3"):
+        return result
+    return replace(result, position_TN3=visible_positions(result.position_TN3, scene.particle_count))
 
 
 def failure_of(result: Any) -> str | None:
@@ -201,13 +208,12 @@ def failure_of(result: Any) -> str | None:
 
 
 def make_episode(made: MadeScene, result: Any, config: DatagenConfig, config_hash: str) -> Episode:
-    """Returns the episode of a scene's particles with its grid and the solver's result (`position_TN3`, `counters`)."""
+    """Returns the episode of a scene with its grid and the solver's result (`position_TN3`, `counters`)."""
     assert made.obstacle_grid is not None
     scene, reference = made.scene.open(), config.reference
-    position_TN3 = visible_positions(result.position_TN3, scene.particle_count)
     return Episode(
         key=made.task.key,
-        position_TN3=np.ascontiguousarray(position_TN3, np.float32),
+        position_TN3=np.ascontiguousarray(result.position_TN3, np.float32),
         initial_velocity_N3=scene.velocity_N3,
         material_N=scene.material_N,
         obstacle_grid=made.obstacle_grid,

@@ -182,7 +182,7 @@ def test_when_time_is_over(compare, monkeypatch):
 @pytest.mark.usefixtures("undrawn")
 def test_a_reference_of_a_finer_grid(make_config, make_dataset, compare, monkeypatch):
     """Data of a finer grid is the reference, and is not simulated again on its own. Solvers on finer grids get the
-    children of the visible particles, and are scored by their means; the chaos floor is that of the reference's grid.
+    children of the visible particles, and are scored by the first ones; the floor is another draw of the reference.
     """
     folder = make_dataset(make_config(reference_cells=128))
     calls = []

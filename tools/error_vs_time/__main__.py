@@ -249,7 +249,7 @@ def solver_contenders(
 
     contenders: list[Contender] = [solver(grid, step) for grid in config.mpm_grids for step in STEPS]
     if config.perturbation:
-        floor = f"perturbed by {config.perturbation:g}"
+        floor = f"perturbed by {config.perturbation:g}" if reference_grid == own_grid else "other children"
         contenders.append(solver(reference_grid, step, config.perturbation, system="chaos", floor=floor))
     if config.mpm_grids and 2 * step <= 1:
         contenders.append(solver(own_grid, 2 * step, system="chaos", floor="twice the step"))
