@@ -19,7 +19,6 @@ from datagen.generate import datagen_config
 from datagen.service.__main__ import ServiceConfig
 from datagen.service.server import _GRACE_S
 from datagen.service.supervisor import _STOP_PATIENCE_S
-from hgn.command import _compose
 from hgn.config import TrainConfig
 from hgn.data.storage import TOKEN_VARIABLE
 from hgn.schema import from_mapping
@@ -27,21 +26,18 @@ from hgn.schema import from_mapping
 K8S = Path(__file__).resolve().parents[2] / "jobs" / "k8s"
 OLDEST, NEWEST = "1.31", "1.37"
 SERVICE_KEYS = ("host", "port", "health_port", "connections")
-RAY_JOB = {
-    *("activeDeadlineSeconds", "backoffLimit", "clusterSelector", "deletionStrategy", "entrypoint", "jobId"),
-    *("entrypointNumCpus", "entrypointNumGpus", "entrypointResources", "managedBy", "metadata", "rayClusterSpec"),
-    *("preRunningDeadlineSeconds", "runtimeEnvYAML", "shutdownAfterJobFinishes", "submissionMode", "submitterConfig"),
-    *("submitterPodTemplate", "suspend", "ttlSecondsAfterFinished"),
-}
-RAY_CLUSTER = {
-    *("authOptions", "autoscalerOptions", "enableInTreeAutoscaling", "gcsFaultToleranceOptions", "headGroupSpec"),
-    *("headServiceAnnotations", "managedBy", "networkPolicy", "rayVersion", "suspend", "tlsOptions"),
-    *("upgradeStrategy", "workerGroupSpecs"),
-}
-RAY_HEAD = {"enableIngress", "headService", "labels", "rayStartParams", "resources", "serviceType", "template"}
-RAY_WORKER = {
-    *("groupName", "idleTimeoutSeconds", "labels", "maxReplicas", "minReplicas", "numOfHosts", "rayStartParams"),
-    *("replicas", "resources", "scaleStrategy", "suspend", "template"),
+# keys of each part of a RayJob; + stands before those that must be there
+RAY = {
+    "": "+apiVersion +kind +metadata +spec",
+    "spec": """activeDeadlineSeconds backoffLimit clusterSelector deletionStrategy entrypoint jobId entrypointNumCpus
+        entrypointNumGpus entrypointResources managedBy metadata rayClusterSpec preRunningDeadlineSeconds runtimeEnvYAML
+        shutdownAfterJobFinishes submissionMode submitterConfig submitterPodTemplate suspend ttlSecondsAfterFinished""",
+    "cluster": """authOptions autoscalerOptions enableInTreeAutoscaling gcsFaultToleranceOptions +headGroupSpec
+        headServiceAnnotations managedBy networkPolicy rayVersion suspend tlsOptions upgradeStrategy
+        workerGroupSpecs""",
+    "head": "enableIngress headService labels rayStartParams resources serviceType +template",
+    "worker": """+groupName idleTimeoutSeconds labels +maxReplicas +minReplicas numOfHosts rayStartParams replicas
+        resources scaleStrategy suspend +template""",
 }
 
 
@@ -97,41 +93,32 @@ def test_ray_job():
     """The RayJob has only keys of its definition, those that must be there, and valid pods."""
     (job,) = documents("generate.yaml")
     assert (job["apiVersion"], job["kind"]) == ("ray.io/v1", "RayJob")
-    assert set(job) == {"apiVersion", "kind", "metadata", "spec"}
-    assert set(job["spec"]) <= RAY_JOB
     cluster = job["spec"]["rayClusterSpec"]
-    assert set(cluster) <= RAY_CLUSTER
-    assert {"template"} <= set(cluster["headGroupSpec"]) <= RAY_HEAD
-    validate_pod(cluster["headGroupSpec"]["template"])
-    for group in cluster["workerGroupSpecs"]:
-        assert {"groupName", "minReplicas", "maxReplicas", "template"} <= set(group) <= RAY_WORKER
-        assert group["minReplicas"] <= group["replicas"] <= group["maxReplicas"]
+    groups = [("head", cluster["headGroupSpec"]), *(("worker", group) for group in cluster["workerGroupSpecs"])]
+    for part, keys in (("", job), ("spec", job["spec"]), ("cluster", cluster), *groups):
+        words = RAY[part].split()
+        assert {word[1:] for word in words if word[0] == "+"} <= set(keys) <= {word.lstrip("+") for word in words}
+    for part, group in groups:
         validate_pod(group["template"])
-    for group in (cluster["headGroupSpec"], *cluster["workerGroupSpecs"]):
         assert all(isinstance(value, str) for value in group.get("rayStartParams", {}).values())
+        assert part == "head" or group["minReplicas"] <= group["replicas"] <= group["maxReplicas"]
 
 
-def composed(monkeypatch, config, arguments):
-    monkeypatch.setattr("sys.argv", [config, *arguments])
-    (mapping,) = _compose(config)
-    return mapping
-
-
-def test_commands_take_what_the_files_give_them(monkeypatch):
+def test_commands_take_what_the_files_give_them(composed):
     """Each file's arguments compose to a valid configuration of the command that it starts."""
     arguments = documents("train.yaml")[0]["spec"]["trainer"]["args"]
-    mapping = composed(monkeypatch, "train", arguments[arguments.index("hgn.train") + 1 :])
+    mapping = composed("train", arguments[arguments.index("hgn.train") + 1 :])
     mapping.pop("name")
     assert from_mapping(TrainConfig, mapping | {"run": "runs/any"}).dataset.folder == "/shared/data/obstacles"
 
     entrypoint = shlex.split(documents("generate.yaml")[0]["spec"]["entrypoint"])
     assert entrypoint[:3] == ["python", "-m", "datagen"]
-    config = datagen_config(composed(monkeypatch, "datagen", entrypoint[3:]))
+    config = datagen_config(composed("datagen", entrypoint[3:]))
     assert (config.dataset.pool, config.dataset.folder) == ("ray", "/shared/data/obstacles")
 
     (container,) = documents("service.yaml")[0]["spec"]["template"]["spec"]["containers"]
     assert container["command"] == ["python", "-m", "datagen.service"]
-    mapping = composed(monkeypatch, "service", container["args"])
+    mapping = composed("service", container["args"])
     assert datagen_config(mapping, SERVICE_KEYS).dataset.folder == "/shared/data/obstacles"
     service = from_mapping(ServiceConfig, {key: mapping[key] for key in SERVICE_KEYS})
     assert [port["containerPort"] for port in container["ports"]] == [service.port, service.health_port]
