@@ -52,7 +52,7 @@ def test_what_reports_say_of_a_set(weights, tmp_path):
 
 
 def test_what_is_no_fresh_set_is_refused(weights, tmp_path, folder):
-    """A data set that is there, weights that changed since, files that are not there, a seed that is given, a URL."""
+    """A data set that is there, weights that changed since, files that are not there."""
     assert Manifest.load(folder).complete
     with pytest.raises(ConfigError, match=r"frozen must be left out: .* holds a data set whose seed was chosen before"):
         draw_fresh(folder, [str(weights)])
@@ -62,10 +62,3 @@ def test_what_is_no_fresh_set_is_refused(weights, tmp_path, folder):
         draw_fresh(tmp_path / "fresh", [str(weights)])
     with pytest.raises(ConfigError, match=r"frozen\[0\] must be an existing file of weights, got 'none'"):
         draw_fresh(tmp_path / "fresh", ["none"])
-    for change, message in (
-        ({"frozen": "all"}, "frozen must be a list of weights files"),
-        ({"dataset": {"seed": 4}}, "dataset.seed must be left out with frozen"),
-        ({"out": "http://host/set"}, "out must be a folder to write to"),
-    ):
-        with pytest.raises(ConfigError, match=message):
-            datagen_config({"out": str(tmp_path / "new"), "frozen": [str(weights)]} | change)

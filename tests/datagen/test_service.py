@@ -12,7 +12,6 @@ import sys
 import threading
 import time
 from collections import Counter
-from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
 
@@ -93,8 +92,6 @@ def test_index(ask, folder):
     path.write_bytes(content + b"not yet published")
     assert ask("/index/1-000000.jsonl")[::2] == (200, content)
     assert ask("/index/1-000000.jsonl", range="bytes=100-")[::2] == (206, content[100:])
-    for name in ("1-000001.jsonl", "2-000000.jsonl", "1-segments.jsonl", "..%2fmanifest.json", "1-x.jsonl"):
-        assert ask(f"/index/{name}")[0] == 404
 
 
 def test_many_ask_at_once(folder, monkeypatch):
@@ -151,32 +148,33 @@ def test_shards_with_ranges(ask, folder):
     assert ask(SHARD, if_none_match=f'W/"x", "{entry.sha256}"')[::2] == (304, b"")
 
 
-def test_nothing_else_is_served(ask, folder):
-    """Whatever is not in the manifest does not exist: locks, staged and half-written files, paths that lead out."""
-    unlisted, partial = "train-000090-000091.tar", ".train-000002-000004.tar.1.partial"
+OUTSIDE = ("/../outside.txt", "/%2e%2e/outside.txt", "/%2e%2e%2foutside.txt", "//etc/passwd", f"{SHARD}/", "/")
+OTHERS = ("/.lock", "/.staging/train-000000.tar", "/train-000090-000091.tar", "/.train-000002-000004.tar.1.partial")
+NO_INDEX = ("1-000001.jsonl", "2-000000.jsonl", "1-segments.jsonl", "..%2fmanifest.json", "1-x.jsonl")
+WRONG = (None, TOKEN, f"Bearer {TOKEN[:-1]}", "Bearer ")
+REFUSALS = [  # the path, the method, the service's token, what is given as one; the answer
+    # what is not in the manifest does not exist: locks, staged and half-written files, paths that lead out
+    *((path, "GET", None, None, 404) for path in (*OUTSIDE, *OTHERS, *(f"/index/{name}" for name in NO_INDEX))),
+    *((SHARD, method, None, None, 405) for method in ("POST", "PUT", "DELETE", "PATCH")),
+    # every path but /healthz asks for the token
+    *((path, "GET", TOKEN, given, 401) for given in WRONG for path in ("/manifest.json", SHARD, "/metrics", "/no")),
+    *((path, "GET", TOKEN, f"Bearer {TOKEN}", 200) for path in (SHARD, "/progress")),
+    ("/healthz", "GET", TOKEN, None, 200),
+]
+
+
+def test_refusals(ask, folder):
+    """Nothing but published files is served, to nobody without the token, and no method but GET and HEAD does
+    anything."""
     (folder.parent / "outside.txt").write_text("secret")
-    (folder / unlisted).write_bytes(b"not listed")
-    (folder / partial).write_bytes(b"half")
-    outside = ("/../outside.txt", "/%2e%2e/outside.txt", "/%2e%2e%2foutside.txt", "//etc/passwd")
-    for path in ("/.lock", "/.staging/train-000000.tar", f"/{unlisted}", f"/{partial}", *outside, f"{SHARD}/", "/"):
-        assert ask(path)[0] == 404, path
-
-
-def test_read_only(ask):
-    """No method but GET and HEAD does anything."""
-    for method in ("POST", "PUT", "DELETE", "PATCH"):
-        assert ask(SHARD, method=method)[0] == 405
-
-
-def test_token(ask):
-    """With a token every path but /healthz asks for it; a wrong one, or a part of it, is refused."""
-    wrong = [{"authorization": value} for value in (TOKEN, f"Bearer {TOKEN[:-1]}", "Bearer ")]
-    for headers in ({}, *wrong):
-        for path in ("/manifest.json", SHARD, "/progress", "/metrics", "/nothing"):
-            status, answer, body = ask(path, token=TOKEN, **headers)
-            assert status == 401 and answer["www-authenticate"] == "Bearer" and TOKEN.encode() not in body
-    assert ask(SHARD, token=TOKEN, authorization=f"Bearer {TOKEN}")[0] == 200
-    assert ask("/healthz", token=TOKEN)[0] == 200
+    for name in OTHERS[2:]:
+        (folder / name[1:]).write_bytes(b"not listed")
+    for path, method, token, given, expected in REFUSALS:
+        headers = {"authorization": given} if given else {}
+        status, answer, body = ask(path, method=method, token=token, **headers)
+        assert status == expected, (path, method, given)
+        if status == 401:
+            assert answer["www-authenticate"] == "Bearer" and TOKEN.encode() not in body
 
 
 def test_damage_is_not_served(ask, folder):
@@ -264,17 +262,6 @@ def test_full_disk_is_waited_for(make_config, backend, tmp_path):
     assert Manifest.load(blocked / "data").complete and supervisor.state.error == ""
 
 
-def test_stopping_ends_the_pool_in_order(make_config, backend, control):
-    """Leaving the supervisor ends the pool as Ctrl-C would: what is staged is kept and nothing is half-written."""
-    (control / "slow").touch()
-    recorder = Recorder()
-    config = make_config()
-    with Supervisor(config, recorder, backend) as supervisor:
-        wait_until(lambda: len(recorder.episodes) >= 2)
-    assert supervisor.state.status == "stopped" and not list(Path(config.dataset.folder).rglob("*.partial"))
-    assert "run the same command to resume" in recorder.messages[-1]
-
-
 @pytest.mark.parametrize("error", [BrokenPipeError(32, "Broken pipe"), OSError(28, "No space left"), KeyError("fault")])
 def test_log_that_nobody_reads(make_config, monkeypatch, error):
     """Whoever reads the log may leave, and its disk may be full: generation goes on. A fault of ours ends the service,
@@ -301,50 +288,26 @@ def run_service(arguments, monkeypatch):
     return exit_code(main, "service", arguments, monkeypatch)
 
 
-@pytest.fixture
-def taken():
-    """A port that is in use."""
-    with socket.create_server(("127.0.0.1", 0)) as listener:
-        yield listener.getsockname()[1]
-
-
-def test_bad_input_is_one_line(taken, monkeypatch, capsys, tmp_path):
-    """A port in use, an open door and a folder that is none end the service before it makes anything."""
+def test_what_cannot_be_served(monkeypatch, capsys, tmp_path, folder):
+    """A port in use, a token that is too short, a data set of another version and a file that is no shard end the
+    service with one line before it makes anything."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.delenv(TOKEN_VARIABLE, raising=False)
-    for arguments, message in (
-        ([f"port={taken}"], f"host and port must be free to serve on, got 127.0.0.1:{taken} (Address already"),
-        (["port=70000"], "port must be 0 to 65535, got 70000"),
-        (["host=0.0.0.0", "port=0"], "host must be a loopback address without a token, got '0.0.0.0'; set HGN_DATASET"),
-        (["host=no.such.host.invalid"], "host and port must be free to serve on, got no.such.host.invalid:8000 ("),
-        (["host=no..host"], "host and port must be free to serve on, got no..host:8000 ("),
-        (["out=http://localhost:1"], "out must be a folder to write to, got 'http://localhost:1'"),
-        (["hots=1"], "hots is not a known key; did you mean host?"),
-    ):
-        assert run_service(arguments, monkeypatch) == 2
-        output, errors = capsys.readouterr()
-        assert errors.startswith(f"error: {message}") and errors.count("\n") == 1 and output == "", errors
-    monkeypatch.setenv(TOKEN_VARIABLE, "short")
-    assert run_service(["port=0"], monkeypatch) == 2
-    assert "HGN_DATASET_TOKEN must be 16 or more" in capsys.readouterr().err
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_another_data_set_is_not_served(folder, monkeypatch, capsys, tmp_path):
-    """A folder with another data set, or one of another version, ends the service with exit code 2."""
-    assert run_service([f"out={folder}", "port=0", "dataset.seed=7"], monkeypatch) == 2
-    assert "holds another data set: frames is 6 there" in capsys.readouterr().err
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        taken = listener.getsockname()[1]
+        assert run_service([f"port={taken}"], monkeypatch) == 2
+    errors = capsys.readouterr().err
+    assert errors.startswith(f"error: host and port must be free to serve on, got 127.0.0.1:{taken} (Address already")
     mapping = json.loads((folder / "manifest.json").read_text()) | {"schema_version": 99}
     (folder / "manifest.json").write_text(json.dumps(mapping))
     assert run_service([f"out={folder}", "port=0"], monkeypatch) == 2
     assert "schema_version must be 1, got 99" in capsys.readouterr().err
-
-
-def test_generator_that_cannot_begin_ends_the_service(monkeypatch, capsys, tmp_path):
-    """What only the pool finds out, a file that is no shard say, ends the service too."""
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "made").mkdir()
+    monkeypatch.setenv(TOKEN_VARIABLE, "short")
+    assert run_service(["port=0"], monkeypatch) == 2
+    assert "HGN_DATASET_TOKEN must be 16 or more" in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["data"]
+    (tmp_path / "made").mkdir()  # what only the pool finds out ends the service too
     (tmp_path / "made" / "train-000000-000001.tar").write_bytes(b"no tar")
+    monkeypatch.delenv(TOKEN_VARIABLE)
     assert run_service(["out=made", "port=0", "progress=off"], monkeypatch) == 2
     assert "train-000000-000001.tar must be a whole tar" in capsys.readouterr().err
 

@@ -4,6 +4,7 @@ import json
 import os
 import shutil
 import subprocess
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,12 +14,15 @@ import pytest
 import torch
 from network.states import network_of
 from processes import PATIENCE_S, exit_code
-from training.runs import train_arguments, train_mapping
+from training.runs import train_arguments
 
 import datagen.__main__
+import datagen.service.__main__
+from datagen import solve, upload
 from hgn import evaluate, export, rollout, train
 from hgn.command import EXIT_INPUT, EXIT_MACHINE
 from hgn.config import DatagenConfig
+from hgn.data.storage import TOKEN_VARIABLE
 from hgn.runtime.simulator import Simulator
 from hgn.runtime.weights import WeightsInfo, load_weights, save_weights
 from tools import render
@@ -26,6 +30,9 @@ from tools import render
 ROOT = Path(__file__).resolve().parents[2]
 COMMANDS: dict[str, Callable[[dict[str, Any]], int]] = {
     "datagen": datagen.__main__.main,
+    "service": datagen.service.__main__.main,
+    "solve": solve.main,
+    "upload": upload.main,
     "train": train.main,
     "export": export.main,
     "rollout": rollout.main,
@@ -57,6 +64,10 @@ class Place:
         for shard in self.path("data").glob(f"{split}-*.tar"):
             how(shard)
 
+    def damage_run(self, how):
+        for path in self.path("run/checkpoints").iterdir():
+            how(path)
+
     def weights(self, materials=None, **changes):
         """Weights of another kind in the place of the run's."""
         path = self.path("weights.safetensors")
@@ -71,6 +82,9 @@ class Place:
         change(checkpoint["hgn"])
         torch.save(checkpoint if checkpoint["hgn"] else {"state_dict": {}}, self.path("foreign.ckpt"))
 
+    def network(self, **changes):
+        self.checkpoint(lambda ours: ours["network"].update(changes))
+
     def accelerate(self, by):
         """Puts weights in the place of those that throw all particles out of the domain."""
         network = network_of(torch.float32)
@@ -81,31 +95,35 @@ class Place:
         return ["+experiment=obstacles", *train_arguments(self.config, self.path(run)), *arguments]
 
 
-@pytest.fixture(scope="module")
-def original(tmp_path_factory):
-    """Where the first test keeps what all begin with."""
-    return tmp_path_factory.mktemp("original") / "place"
+@pytest.fixture(scope="session")
+def original(small_dataset, finished_once, tmp_path_factory):
+    """What all tests begin with."""
+    folder = tmp_path_factory.mktemp("original")
+    shutil.copytree(small_dataset, folder / "data")
+    shutil.copytree(finished_once[1], folder / "run")
+    export.export(folder / "run" / "checkpoints" / "last.ckpt", folder / "weights.safetensors")
+    (folder / "scene.yaml").write_text(SCENE)
+    return folder
 
 
 @pytest.fixture
-def place(original, make_config, make_dataset, tmp_path, monkeypatch):
-    config = make_config()
-    made = Place(tmp_path, config)
-    if original.exists():
-        shutil.copytree(original, tmp_path, dirs_exist_ok=True)
-    else:
-        make_dataset(config)
-        assert train.main(train_mapping(config, tmp_path / "run", maximum_updates=2, monitor_rollout_frames=0)) == 0
-        export.export(tmp_path / "run" / "checkpoints" / "last.ckpt", tmp_path / "weights.safetensors")
-        shutil.copytree(tmp_path, original)
-    made.edit_scene("", "")
+def untouched(original, make_config, monkeypatch):
+    """The original itself, for commands that leave it as it is."""
+    monkeypatch.chdir(original)
+    return Place(original, make_config(folder=str(original / "data")))
+
+
+@pytest.fixture
+def place(original, make_config, tmp_path, monkeypatch):
+    shutil.copytree(original, tmp_path, dirs_exist_ok=True)
     monkeypatch.chdir(tmp_path)
-    yield made
+    return Place(tmp_path, make_config())
 
 
 def content(folder):
-    """Every file below a folder."""
-    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    """Every file below a folder, by size and time."""
+    files = ((path, path.stat()) for path in folder.rglob("*") if path.is_file())
+    return {str(path.relative_to(folder)): (status.st_size, status.st_mtime_ns) for path, status in files}
 
 
 def truncate(path):
@@ -126,6 +144,7 @@ def refused(command, arguments, capsys, monkeypatch):
     errors = [line for line in lines if line.startswith("error: ")]
     # a progress bar may have begun; after the error there is nothing
     assert errors == lines[-1:] and "Traceback" not in "".join(lines), lines
+    assert sys.argv == [command, *arguments] and "HYDRA_FULL_ERROR" not in os.environ
     return code, errors[0]
 
 
@@ -143,10 +162,39 @@ ROLLOUT = ["weights=weights.safetensors", "scene=scene.yaml", "out=made/rollout.
 EPISODE = [*ROLLOUT, "scene=null", "data=data", "episode=validation-000000"]
 EVALUATE = ["weights=weights.safetensors", "data=data", "rollout_frames=3", "json=made/errors.json"]
 EXPORT = ["checkpoint=foreign.ckpt", "out=weights.safetensors"]
+FRESH = ["out=made", "frozen=[weights.safetensors]"]
 OF_THE_RUN = "checkpoint=run/checkpoints/last.ckpt"
 
 # command, arguments, message
 VALUES = [
+    ("datagen", ["scenes=abc"], "dataset.training_scenes must be a whole number, got 'abc' (str)"),
+    ("datagen", ["dataset.frames=1"], "dataset.frames must be at least 2, got 1"),
+    ("datagen", ["colour=1"], "colour is not a known key; known keys: "),
+    ("datagen", ["+colour=1"], "colour is not a known key; known keys: scene, mpm, dataset, scenes, out,"),
+    ("datagen", ["+dataset.colour=1"], "dataset.colour is not a known key; known keys: folder,"),
+    ("datagen", ["scene=moon"], "In 'datagen': Could not find 'scene/moon' Available options in 'scene':"),
+    ("datagen", ["scene=3"], "Config group override must be a string or a list. Got int"),
+    ("datagen", ["progress=loud"], "progress must be one of bar, json, off, got 'loud'"),
+    ("datagen", ["out=${nowhere}"], "Interpolation key 'nowhere' not found"),
+    ("datagen", [*FRESH, "frozen=all"], "frozen must be a list of weights files"),
+    ("datagen", [*FRESH, "dataset.seed=4"], "dataset.seed must be left out with frozen"),
+    ("datagen", [*FRESH, "out=http://host/set"], "out must be a folder to write to"),
+    ("service", ["port=70000"], "port must be 0 to 65535, got 70000"),
+    ("service", ["host=0.0.0.0", "port=0"], "host must be a loopback address without a token, got '0.0.0.0'; set HGN_"),
+    ("service", ["host=no.such.host.invalid"], "host and port must be free to serve on, got no.such.host.invalid:8000"),
+    ("service", ["host=no..host"], "host and port must be free to serve on, got no..host:8000 ("),
+    ("service", ["out=http://localhost:1"], "out must be a folder to write to, got 'http://localhost:1'"),
+    ("service", ["hots=1"], "hots is not a known key; did you mean host?"),
+    ("service", ["out=data", "port=0", "dataset.seed=7"], "holds another data set: frames is 6 there"),
+    ("solve", ["scene=none.yaml"], "scene must be an existing YAML file, got none.yaml"),
+    ("solve", ["scene=scene.yaml", "frames=1"], "frames must be at least 2, got 1"),
+    ("solve", ["scene=scene.yaml", "out=a.png"], "out must be a name that ends in .vtkhdf, .hdf, .hdf5 or .h5, got 'a"),
+    ("solve", ["scene=scene.yaml", "out=a.usdc"], "got 'a.usdc'; tools.render makes pictures, USD and PLY of a rollou"),
+    ("solve", ["scene=scene.yaml", "mpm.snow_hardning=5"], "mpm.snow_hardning is not a known key; did you mean snow_h"),
+    ("upload", ["data=data", "to=data"], "to must be a URL, got"),
+    ("upload", ["data=memory://there", "to=memory://here"], "data must be a folder of this machine, got 'memory:"),
+    ("upload", ["data=run", "to=memory://here"], "without manifest.json"),
+    ("upload", ["data=data"], "to is missing"),
     ("datagen", ["dataset.frames=-3"], "dataset.frames must be at least 2, got -3"),
     ("datagen", ["scene.group_size=nan"], "scene.group_size must be a finite number > 0, got nan"),
     ("datagen", ["scene.materials=[water,lava]"], "scene.materials[1] must be one of water, sand, snow, elastic, got"),
@@ -169,6 +217,11 @@ VALUES = [
     ("rollout", ["frame=3"], "frame is not a known key; did you mean frames?"),
     ("rollout", [*ROLLOUT, "scene=none.yaml"], "scene must be an existing YAML file, got none.yaml"),
     ("rollout", [*ROLLOUT, "data=data"], "data must be given together with episode, got 'data'; for example"),
+    ("rollout", ["scene=funnel", "data=d", "episode=e"], "scene must be left out where data is given, got 'funnel'"),
+    ("rollout", ["out=a.png"], "must be a name that ends in .vtkhdf, .hdf, .hdf5, .h5, .usdc, .usda, .usd or .ply, go"),
+    ("rollout", ["out=pictures"], ".usd or .ply, got 'pictures'"),
+    ("rollout", ["scene=funnle"], "scene must be a YAML file or the name of an example (funnel, "),
+    ("rollout", ["seed=-1"], "seed must be a finite number >= 0, got -1"),
     ("rollout", [*ROLLOUT, "device=abacus"], "device must be auto, cpu or cuda[:index], got 'abacus'"),
     ("rollout", [*ROLLOUT, "device=cuda:77"], "device must exist, got 'cuda:77' with"),
     ("rollout", [*ROLLOUT, "weights=none.safetensors"], "weights must be an existing file, got none.safetensors; wri"),
@@ -188,93 +241,71 @@ VALUES = [
 
 
 @pytest.mark.parametrize(("command", "arguments", "message"), VALUES)
-def test_values(place, command, arguments, message, capsys, monkeypatch):
+def test_values(untouched, command, arguments, message, capsys, monkeypatch):
     """Unknown keys, wrong types, negative and NaN numbers, unknown materials, missing files and settings of another run
     are named."""
-    resumed = "to resume" in message or "another data set" in message
-    check(place, command, place.train(*arguments) if resumed else arguments, message, capsys, monkeypatch)
+    monkeypatch.delenv(TOKEN_VARIABLE, raising=False)
+    if "to resume" in message or (message.startswith("holds another") and command == "train"):
+        arguments = untouched.train(*arguments)
+    check(untouched, command, arguments, message, capsys, monkeypatch)
 
 
-# command, arguments, how the files are damaged, message
-FILES = {
-    "particles in a cone": (
-        *("rollout", ROLLOUT, lambda place: place.edit_scene("[0.5, 0.8, 0.5]", "[0.5, 0.45, 0.5]")),
-        "particles inside obstacle_0_cone; move or shrink the",
+def of(method, *arguments, **options):
+    """A fault: what a place does to its files."""
+    return lambda place: getattr(place, method)(*arguments, **options)
+
+
+MESH = of("edit_scene", "shape: cone, size: 0.3", "mesh: points.obj")
+EVALUATE_STEPS = [*EVALUATE, "rollout_frames=0"]
+CUT_RUN, OF_RUN = of("damage_run", truncate), [OF_THE_RUN, EXPORT[1]]
+RATE, SNOW = of("weights", frame_rate_hz=30.0), of("weights", materials=("snow",))
+RATES = "data frame_rate_hz must be the weights' 30.0, got 60.0; take a data set or weights of the same"
+# command, arguments, fault, message
+FILES = [
+    (
+        "rollout",
+        ROLLOUT,
+        of("edit_scene", "0.8, 0.5]", "0.45, 0.5]"),
+        "particles inside obstacle_0_cone; move or shrink",
     ),
-    "mesh without triangles": (
-        *("rollout", ROLLOUT, lambda place: place.edit_scene("shape: cone, size: 0.3", "mesh: points.obj")),
-        "obstacles[0].mesh must",
-    ),
-    "cut shard": (
-        *("evaluate", EVALUATE, lambda place: place.damage("validation", truncate)),
-        " bytes, got ",
-    ),
-    "altered shard": (
-        *("evaluate", EVALUATE, lambda place: place.damage("validation", alter)),
+    ("rollout", ROLLOUT, MESH, "obstacles[0].mesh must"),
+    ("evaluate", EVALUATE, of("damage", "validation", truncate), " bytes, got "),
+    (
+        "evaluate",
+        EVALUATE,
+        of("damage", "validation", alter),
         ": it was altered; delete it and run the generator again",
     ),
-    "missing shard": (
-        *("evaluate", EVALUATE, lambda place: place.damage("validation", Path.unlink)),
-        " is listed in the index but missing; run the generator again",
+    ("evaluate", EVALUATE, of("damage", "validation", Path.unlink), " is listed in the index but missing; run the gen"),
+    ("train", "other", of("damage", "train", truncate), " bytes, got "),
+    ("train", "run", CUT_RUN, "checkpoint must be a whole checkpoint file, got"),
+    ("export", OF_RUN, CUT_RUN, "checkpoint must be a whole checkpoint file, got"),
+    ("export", EXPORT, of("checkpoint", dict.clear), "checkpoint must be one of python -m hgn.train, got foreign.ckpt"),
+    ("export", EXPORT, of("network", wings=2), "got foreign.ckpt: network.wings is not a known key; "),
+    ("export", EXPORT, of("network", width=16), "got foreign.ckpt: size mismatch for "),
+    *((*call, RATE, RATES) for call in (("rollout", EPISODE), ("evaluate", EVALUATE))),
+    *(
+        (*call, SNOW, "must be one of the network's (snow), got ")
+        for call in (("rollout", EPISODE), ("evaluate", EVALUATE))
     ),
-    "cut training shard": ("train", None, lambda place: place.damage("train", truncate), " bytes, got "),
-    "cut checkpoint of a run": (
-        *("train", "run", lambda place: truncate(place.path("run/checkpoints/last.ckpt"))),
-        "checkpoint must be a whole checkpoint file, got",
-    ),
-    "cut checkpoint": (
-        *("export", [OF_THE_RUN, EXPORT[1]], lambda place: truncate(place.path("run/checkpoints/last.ckpt"))),
-        "checkpoint must be a whole checkpoint file, got",
-    ),
-    "another project's checkpoint": (
-        *("export", EXPORT, lambda place: place.checkpoint(lambda ours: ours.clear())),
-        "checkpoint must be one of python -m hgn.train, got foreign.ckpt",
-    ),
-    "checkpoint of another network": (
-        *("export", EXPORT, lambda place: place.checkpoint(lambda ours: ours["network"].update(wings=2))),
-        "got foreign.ckpt: network.wings is not a known key; ",
-    ),
-    "checkpoint of another width": (
-        *("export", EXPORT, lambda place: place.checkpoint(lambda ours: ours["network"].update(width=16))),
-        "got foreign.ckpt: size mismatch for ",
-    ),
-    **{
-        f"{what}, {command}": (command, arguments, change, message)
-        for what, change, message in (
-            (
-                "frame rate",
-                lambda place: place.weights(frame_rate_hz=30.0),
-                "data frame_rate_hz must be the weights' 30.0, got 60.0; take a data set or weights of the same",
-            ),
-            (
-                "material",
-                lambda place: place.weights(materials=("snow",)),
-                "material must be one of the network's (snow), got ",
-            ),
-        )
-        for command, arguments in (("rollout", EPISODE), ("evaluate", EVALUATE))
-    },
-    "gravity": (
-        *("evaluate", [*EVALUATE, "rollout_frames=0"], lambda place: place.weights(gravity=(0.0, -1.6, 0.0))),
+    (
+        *("evaluate", EVALUATE_STEPS, of("weights", gravity=(0.0, -1.6, 0.0))),
         "gravity must be the weights' (0.0, -1.6, 0.0), which a network of absolute",
     ),
-    "obstacle cells": (
-        *("evaluate", [*EVALUATE, "rollout_frames=0"], lambda place: place.weights(obstacle_cell_size=1 / 32)),
+    (
+        *("evaluate", EVALUATE_STEPS, of("weights", obstacle_cell_size=1 / 32)),
         "cell_size must be the weights' 0.03125, the size of the cells",
     ),
-}
+]
 
 
-@pytest.mark.parametrize("case", FILES)
-def test_files(place, case, capsys, monkeypatch):
+@pytest.mark.parametrize(("command", "arguments", "fault", "message"), FILES)
+def test_files(place, command, arguments, fault, message, capsys, monkeypatch):
     """Scenes that cannot be simulated, damaged shards and checkpoints, and weights of other data are refused; earlier
     outputs stay."""
-    command, arguments, damage, message = FILES[case]
     place.path("points.obj").write_text("v 0 0 0\nv 1 0 0\n")
-    damage(place)
-    if command == "train":
-        arguments = place.train(run=arguments or "other")
-    check(place, command, arguments, message, capsys, monkeypatch)
+    fault(place)
+    check(place, command, place.train(run=arguments) if command == "train" else arguments, message, capsys, monkeypatch)
 
 
 def test_diverging_weights(place, capsys, monkeypatch):

@@ -116,23 +116,3 @@ def test_what_is_faster_than_the_data_is_said(tmp_path, capsys):
         assert rollout.main(given) == 0
         line = "velocity: groups begin with up to 5 domain units per second, those of the data of still with up to 3;"
         assert (line in capsys.readouterr().err) == wanted
-
-
-@pytest.mark.parametrize(
-    ("given", "message"),
-    [
-        ({"data": "data"}, "data must be given together with episode, got 'data'"),
-        ({"scene": "funnel", "data": "d", "episode": "e"}, "scene must be left out where data is given, got 'funnel'"),
-        (
-            {"out": "a.png"},
-            r"out must be a name that ends in .vtkhdf, .hdf, .hdf5, .h5, .usdc, .usda, .usd or .ply, got .a.png.",
-        ),
-        ({"out": "pictures"}, r"out must be a name that ends in .vtkhdf, .* or .ply, got 'pictures'"),
-        ({"scene": "funnle"}, r"scene must be a YAML file or the name of an example \(funnel, .*\), got 'funnle'"),
-        ({"seed": -1}, "seed must be a finite number >= 0, got -1"),
-    ],
-)
-def test_refused(given, message):
-    """What contradicts itself is refused by name."""
-    with pytest.raises(ConfigError, match=message):
-        rollout.main(given)

@@ -1,5 +1,6 @@
 """The wheel: installed without the checkout, every command runs from any folder."""
 
+import json
 import os
 import subprocess
 import sys
@@ -15,6 +16,17 @@ from processes import PATIENCE_S
 from hgn.config import DEFAULT_WEIGHTS
 
 ROOT = Path(__file__).resolve().parents[2]
+PROGRAM = """
+import json, runpy, sys, hgn.config
+print(hgn.config.config_directory(), end="")
+for module, *arguments in json.loads(sys.argv[1]):
+    print(end="\\0")
+    sys.argv = [module, *arguments]
+    try:
+        runpy.run_module(module, run_name="__main__", alter_sys=True)
+    except SystemExit as end:
+        assert not end.code
+"""
 
 
 @pytest.fixture(scope="module")
@@ -70,18 +82,17 @@ def test_configs_travel_inside(wheel):
     assert not [name for name in names if "__pycache__" in name or "test" in name]
 
 
-def test_package_is_the_installed_one(python, tmp_path):
-    """The configs are found inside the installed package."""
-    code = "import hgn.config; print(hgn.config.config_directory())"
-    directory = Path(run(python, tmp_path, "-c", code).strip())
+def test_commands_compose_their_config(python, tmp_path):
+    """The configs are found inside the installed package, from an empty folder: `--cfg job` with an experiment prints
+    the composed configuration, `--help` what a command does and its keys with their comments."""
+    small = ("+experiment=small", "--cfg", "job")
+    calls = [("hgn.train", *small), ("datagen", *small), ("hgn.rollout", "--help")]
+    place, train, datagen, text = run(python, tmp_path, "-c", PROGRAM, json.dumps(calls)).split("\0")
+    directory = Path(place)
     assert directory.is_relative_to(python.parents[1]) and directory.parts[-2:] == ("hgn", "conf")
-
-
-@pytest.mark.parametrize(("module", "key"), [("hgn.train", "training"), ("datagen", "mpm")])
-def test_commands_compose_their_config(python, tmp_path, module, key):
-    """`--cfg job` with an experiment prints the composed configuration, from an empty folder."""
-    composed = yaml.safe_load(run(python, tmp_path, "-m", module, "+experiment=small", "--cfg", "job"))
-    assert composed["name"] == "small" and key in composed
+    for key, composed in (("training", yaml.safe_load(train)), ("mpm", yaml.safe_load(datagen))):
+        assert composed["name"] == "small" and key in composed
+    assert f"weights: {DEFAULT_WEIGHTS} # a f" in text and text.strip("`\n").startswith("python -m hgn.rollout")
 
 
 def test_shipped_weights_simulate(python, tmp_path):
@@ -90,9 +101,3 @@ def test_shipped_weights_simulate(python, tmp_path):
     out = tmp_path / "rollout.vtkhdf"
     run(python, here, "-m", "hgn.rollout", "frames=2", "device=cpu", "render=false", f"out={out}")
     assert out.stat().st_size > 10_000
-
-
-def test_command_helps(python, tmp_path):
-    """`--help` says what a command does and shows its keys with their comments, from an empty folder."""
-    text = run(python, tmp_path, "-m", "hgn.rollout", "--help")
-    assert f"weights: {DEFAULT_WEIGHTS} # a f" in text and text.strip("`\n").startswith("python -m hgn.rollout")
