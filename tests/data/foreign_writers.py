@@ -126,40 +126,35 @@ def pickled_npz(path, content):
     np.savez(path, gns_data=data)
 
 
+_MESSAGES = {  # label, name, number and type of each field; * repeats, and an entry is that of a map
+    "BytesList": "*value 1 BYTES",
+    "Int64List": "*value 1 INT64",
+    "Feature": "bytes_list 1 BytesList, int64_list 3 Int64List",
+    "Features": "*feature 1 Features.FeatureEntry",
+    "Features.FeatureEntry": "key 1 STRING, value 2 Feature",
+    "FeatureList": "*feature 1 Feature",
+    "FeatureLists": "*feature_list 1 FeatureLists.FeatureListEntry",
+    "FeatureLists.FeatureListEntry": "key 1 STRING, value 2 FeatureList",
+    "SequenceExample": "context 1 Features, feature_lists 2 FeatureLists",
+}
+
+
 def _message_class():
     """tf.SequenceExample from its published definition (tensorflow/core/example/{example,feature}.proto)."""
     field = descriptor_pb2.FieldDescriptorProto
     file = descriptor_pb2.FileDescriptorProto(name="example.proto", package="tensorflow", syntax="proto3")
-
-    def message(name, *fields, entry=""):
-        proto = file.message_type.add(name=name)
-        if entry:
-            pair = proto.nested_type.add(name=f"{entry.title().replace('_', '')}Entry")
-            pair.options.map_entry = True
-            kind = {"feature": "Feature", "feature_list": "FeatureList"}[entry]
-            pair.field.add(name="key", number=1, type=field.TYPE_STRING, label=field.LABEL_OPTIONAL)
-            pair.field.add(name="value", number=2, label=field.LABEL_OPTIONAL, type=field.TYPE_MESSAGE)
-            pair.field[1].type_name = f".tensorflow.{kind}"
-        for label, number, kind, of in fields:
-            many = field.LABEL_REPEATED if label.startswith("*") else field.LABEL_OPTIONAL
-            proto.field.add(name=label.lstrip("*"), number=number, type=kind, type_name=of or None, label=many)
-
-    message("BytesList", ("*value", 1, field.TYPE_BYTES, ""))
-    message("Int64List", ("*value", 1, field.TYPE_INT64, ""))
-    message(
-        "Feature",
-        ("bytes_list", 1, field.TYPE_MESSAGE, ".tensorflow.BytesList"),
-        ("int64_list", 3, field.TYPE_MESSAGE, ".tensorflow.Int64List"),
-    )
-    message("Features", ("*feature", 1, field.TYPE_MESSAGE, ".tensorflow.Features.FeatureEntry"), entry="feature")
-    message("FeatureList", ("*feature", 1, field.TYPE_MESSAGE, ".tensorflow.Feature"))
-    entry = ".tensorflow.FeatureLists.FeatureListEntry"
-    message("FeatureLists", ("*feature_list", 1, field.TYPE_MESSAGE, entry), entry="feature_list")
-    message(
-        "SequenceExample",
-        ("context", 1, field.TYPE_MESSAGE, ".tensorflow.Features"),
-        ("feature_lists", 2, field.TYPE_MESSAGE, ".tensorflow.FeatureLists"),
-    )
+    made = {}
+    for name, fields in _MESSAGES.items():
+        owner, _, entry = name.rpartition(".")
+        made[name] = made[owner].nested_type.add(name=entry) if owner else file.message_type.add(name=name)
+        made[name].options.map_entry = bool(owner)
+        for label, number, kind in (words.split() for words in fields.split(", ")):
+            many = field.LABEL_REPEATED if label[0] == "*" else field.LABEL_OPTIONAL
+            options = {"name": label.lstrip("*"), "number": int(number), "label": many}
+            if kind.isupper():
+                made[name].field.add(type=field.Type.Value(f"TYPE_{kind}"), **options)
+            else:
+                made[name].field.add(type=field.TYPE_MESSAGE, type_name=f".tensorflow.{kind}", **options)
     pool = descriptor_pool.DescriptorPool()
     pool.Add(file)
     return message_factory.GetMessageClass(pool.FindMessageTypeByName("tensorflow.SequenceExample"))

@@ -3,7 +3,10 @@
 import asyncio
 import dataclasses
 import errno
+import functools
 import json
+import math
+import operator
 from pathlib import Path
 
 import pytest
@@ -34,21 +37,14 @@ def make_manifest():
 
 
 def test_roundtrip(tmp_path):
-    """Saving and loading returns every field, floats bitwise."""
-    make_manifest().save(tmp_path)
-    assert Manifest.load(tmp_path) == make_manifest()
-    assert Manifest.load(tmp_path).quarantined == make_manifest().quarantined
-    assert {path.name for path in tmp_path.iterdir()} == {"manifest.json", "index"}
-
-
-def test_counts():
-    """A manifest knows what is published of what is requested."""
+    """Saving and loading returns every field, floats bitwise; what is published is counted."""
     manifest = make_manifest()
-    assert (manifest.published("train"), manifest.published("validation")) == (1, 0)
-    assert not manifest.complete
+    manifest.save(tmp_path)
+    assert Manifest.load(tmp_path) == manifest and Manifest.load(tmp_path).quarantined == manifest.quarantined
+    assert {path.name for path in tmp_path.iterdir()} == {"manifest.json", "index"}
+    assert (manifest.published("train"), manifest.published("validation")) == (1, 0) and not manifest.complete
     assert dataclasses.replace(manifest, requested={"train": 1}).complete
-    assert manifest.statistics("train").velocity.count == 7
-    assert manifest.statistics("test") == Statistics()
+    assert manifest.statistics("train").velocity.count == 7 and manifest.statistics("test") == Statistics()
 
 
 def test_missing_manifest(tmp_path):
@@ -59,40 +55,11 @@ def test_missing_manifest(tmp_path):
             Manifest.load(folder)
 
 
-@pytest.mark.parametrize("content", [b"", b"{", b"\xff\xfe"])
-def test_garbled_manifest(tmp_path, content):
-    """A manifest that is no JSON is refused with the remedy."""
-    (tmp_path / "manifest.json").write_bytes(content)
-    message = r"manifest\.json must be JSON .* delete manifest.json and run the generator again"
-    with pytest.raises(ConfigError, match=message):
-        Manifest.load(tmp_path)
-
-
-def test_wrong_manifest(tmp_path):
-    """Another schema, an unknown key or a wrong type is refused by name, the first with the remedy."""
-    make_manifest().save(tmp_path)
-    path, good = tmp_path / "manifest.json", first_release(tmp_path)
-    for changes, message in (
-        ({"schema_version": 2}, "schema_version must be 1, got 2; .* or use the version that made it"),
-        ({"colour": 1}, "colour is not a known key"),
-        ({"revision": "3"}, "revision must be a whole number, got '3'"),
-        ({"shards": [good["shards"][0] | {"bytes": None}]}, r"shards\[0\]\.bytes must be a whole number"),
-    ):
-        path.write_text(json.dumps(good | changes))
-        with pytest.raises(ConfigError, match=message):
-            Manifest.load(tmp_path)
-
-
-def test_identity_survives_json(make_config):
-    """The identity in a manifest hashes to the manifest's hash, in any key order."""
+def test_identity(make_config):
+    """The identity in a manifest hashes to the manifest's hash, in any key order; keys on one side are differences."""
     identity = dataset_identity(make_config())
     reread = json.loads(json.dumps(dict(reversed(identity.items()))))
-    assert identity_hash(reread) == identity_hash(identity)
-    assert identity_differences(reread, identity) == []
-
-
-def test_differences_are_named():
-    """Keys on one side only count as differences too."""
+    assert identity_hash(reread) == identity_hash(identity) and identity_differences(reread, identity) == []
     lines = identity_differences({"a": {"b": 1, "c": 2}, "d": 3}, {"a": {"b": 1, "c": 4}, "e": 5})
     differences = ["a.c is 2 there, 4", "d is 3 there, nothing", "e is nothing there, 5"]
     assert lines == [f"{difference} is asked for" for difference in differences]
@@ -117,20 +84,42 @@ def test_manifest_that_is_replaced_while_it_is_read(make_config, folder, monkeyp
     assert lost >= 9
 
 
-@pytest.mark.parametrize(
-    ("key", "value", "message"),
-    [
-        ("name", "../../etc/passwd", r"shards\[0\]\.name must be a plain file name"),
-        ("name", ".lock", r"shards\[0\]\.name must be a plain file name"),
-        ("sha256", "../" * 10 + "evil", r"shards\[0\]\.sha256 must be 64 hexadecimal digits"),
-        ("bytes", -1, r"shards\[0\]\.bytes must be a finite number >= 0"),
-        ("split", "../train", r"shards\[0\]\.split must be one of"),
-    ],
-)
-def test_manifest_cannot_name_other_files(folder, key, value, message):
-    """Names and hashes of a manifest become paths: what could lead elsewhere is refused."""
-    mapping = first_release(folder)
-    mapping["shards"][0][key] = value
-    (folder / "manifest.json").write_text(json.dumps(mapping))
+CUT = r"manifest\.json must be JSON .* delete manifest.json and run the generator again"
+FAULTS = [  # the place in a manifest of the first release, its value or what is done to it, the message
+    *(("", content, CUT) for content in (b"", b"{", b"\xff\xfe")),
+    ("schema_version", 2, "schema_version must be 1, got 2; .* or use the version that made it"),
+    ("colour", 1, "colour is not a known key"),
+    ("revision", "3", "revision must be a whole number, got '3'"),
+    ("config_hash", "0" * 64, "config_hash must be"),
+    ("requested.dev", 1, "requested must be of train, validation, test"),
+    ("shards", lambda shards: shards.append(shards[0]), "must be listed once, got its episodes twice"),
+    ("shards.0.bytes", None, r"shards\[0\]\.bytes must be a whole number"),
+    ("shards.0.bytes", -1, r"shards\[0\]\.bytes must be a finite number >= 0"),
+    ("shards.0.statistics.velocity.mean", [math.nan, 0, 0], "must be JSON .* got NaN"),
+    ("shards.0.statistics.velocity.count", -1, "must be finite, with count"),
+    # names and hashes become paths: what could lead elsewhere is refused
+    ("shards.0.name", "../../etc/passwd", r"shards\[0\]\.name must be a plain file name"),
+    ("shards.0.name", ".lock", r"shards\[0\]\.name must be a plain file name"),
+    ("shards.0.sha256", "../" * 10 + "evil", r"shards\[0\]\.sha256 must be 64 hexadecimal digits"),
+    ("shards.0.split", "../train", r"shards\[0\]\.split must be one of"),
+    ("shards.4.episodes", lambda episodes: episodes.pop(), r"episodes must be numbers 2 to 3, got \[2\]"),
+    # what the shard contradicts is never read out of range
+    ("shards.0.episodes.0.seed", 1, "must have seed, particles, frames"),
+    ("shards.0.episodes.0.members", {"position.npy": [10**9, 4]}, "must lie within"),
+    ("shards.0.episodes.0.members", {"position.npy": [0, 2000]}, "json is missing"),
+]
+
+
+@pytest.mark.parametrize(("place", "value", "message"), FAULTS)
+def test_faulty_manifests_are_refused(folder, place, value, message):
+    """What is no JSON, of another schema or type, contradicts itself or its shards, or leads out of the folder, is
+    refused by name."""
+    content = first_release(folder)
+    path = folder / "manifest.json"
+    if place:
+        *parents, key = (int(word) if word.isdigit() else word for word in place.split("."))
+        owner = functools.reduce(operator.getitem, parents, content)
+        value(owner[key]) if callable(value) else owner.update({key: value})
+    path.write_bytes(json.dumps(content).encode() if place else value)
     with pytest.raises(ConfigError, match=message):
-        Manifest.load(folder)
+        _ = EpisodeStore(folder, "train")[0]

@@ -2,14 +2,12 @@
 
 import dataclasses
 import hashlib
-import json
 import os
 import pickle
 
 import numpy as np
 import pytest
 from data.test_index import shard
-from written_files import first_release
 
 import hgn.data.verification
 from datagen.pool.writer import DatasetWriter
@@ -47,56 +45,32 @@ def test_a_shard_of_no_bytes(tmp_path):
         EpisodeStore(tmp_path, "train")[0]
 
 
-def test_one_map_a_shard(folder):
-    """A thousand episodes do not need a thousand open files: a shard is mapped once."""
-    store = EpisodeStore(folder, "train")
-    _ = list(store)
-    assert len(store._open_shards) == store.manifest.totals["train"].shards == 4
-    assert store[2] is store[2]
-
-
 def test_store_travels_to_workers(folder):
-    """A pickled store holds no episode data and opens the same episodes on the other side."""
+    """A shard is mapped once: a thousand episodes do not need a thousand open files. A pickled store holds no episode
+    data and opens the same episodes on the other side."""
     store = EpisodeStore(folder, "train")
     _ = list(store)
+    assert len(store._open_shards) == store.manifest.totals["train"].shards == 4 and store[2] is store[2]
     data = pickle.dumps(store)
     assert len(data) < 20_000
-    there = pickle.loads(data)
-    assert np.array_equal(there[3].position_TN3, store[3].position_TN3)
+    assert np.array_equal(pickle.loads(data)[3].position_TN3, store[3].position_TN3)
 
 
 def test_store_grows_with_the_dataset(make_config, make_dataset):
-    """Refreshing appends new episodes and keeps the places of those that were there."""
-    folder = make_dataset(make_config(training_scenes=3))
+    """Refreshing appends new episodes, of their own lengths, and keeps the places of those that were there; a data set
+    that holds nothing yet can be opened. Only the three splits exist."""
+    with DatasetWriter(make_config(training_scenes=3, long_fraction=0.4, long_frames=9)) as writer:
+        assert EpisodeStore.available(writer.folder) and len(EpisodeStore(writer.folder, "train")) == 0
+    folder = make_dataset(make_config(training_scenes=3, long_fraction=0.4, long_frames=9))
     train, test = EpisodeStore(folder, "train"), EpisodeStore(folder, "test")
     first = train[0]
-    assert not train.refresh()
-    make_dataset(make_config(training_scenes=9))
-    assert train.refresh() and not test.refresh()
+    assert not train.refresh() and train.frames() == [6, 6, 9]
+    make_dataset(make_config(training_scenes=9, long_fraction=0.4, long_frames=9))
+    assert train.refresh() and not test.refresh() and train.frames(4) == [6, 6, 9, 6]
     assert len(train) == 9 and train[0] is first
+    assert train.frames() == [episode.frame_count for episode in train] and 9 in train.frames()[3:]
     assert train.manifest.revision == Manifest.load(folder).revision
     assert train.statistics() == Manifest.load(folder).statistics("train")
-
-
-def test_store_opens_before_the_first_episode(make_config):
-    """A data set that is being made can be opened while it holds nothing yet."""
-    with DatasetWriter(make_config()) as writer:
-        assert EpisodeStore.available(writer.folder)
-        assert len(EpisodeStore(writer.folder, "train")) == 0
-
-
-def test_frames_of_episodes(make_config, make_dataset):
-    """The number of frames is known of each episode, also where some are longer and the data set grows."""
-    make_dataset(make_config(training_scenes=3, long_fraction=0.4, long_frames=9))
-    store = EpisodeStore(make_config().dataset.folder, "train")
-    assert store.frames() == [6, 6, 9]
-    make_dataset(make_config(long_fraction=0.4, long_frames=9))
-    assert store.refresh() and store.frames(4) == [6, 6, 9, 6]
-    assert store.frames() == [episode.frame_count for episode in store] == [6, 6, 9, 6, 9]
-
-
-def test_unknown_split(folder):
-    """Only the three splits exist."""
     with pytest.raises(ConfigError, match="split must be one of train, validation, test, got 'dev'"):
         EpisodeStore(folder, "dev")
 
@@ -121,23 +95,6 @@ def test_shards_are_hashed_once(folder, monkeypatch):
     for _ in range(2):
         _ = list(EpisodeStore(folder, "train"))
     assert len(hashed) == len(set(hashed)) == 4
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"seed": 1}, "must have seed, particles, frames"),
-        ({"members": {"position.npy": [10**9, 4]}}, "must lie within"),
-        ({"members": {"position.npy": [0, 2000]}}, "json is missing"),
-    ],
-)
-def test_manifest_that_does_not_fit_its_shard(folder, changes, message):
-    """Offsets or facts that the shard contradicts are refused, never read out of range."""
-    path, mapping = folder / "manifest.json", first_release(folder)
-    mapping["shards"][0]["episodes"][0] |= changes
-    path.write_text(json.dumps(mapping))
-    with pytest.raises(ConfigError, match=message):
-        EpisodeStore(folder, "train")[0]
 
 
 def test_refresh_refuses_another_dataset(folder, make_config, make_dataset, tmp_path):

@@ -1,6 +1,7 @@
 """The deterministic order of samples, and its exact resume."""
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -89,25 +90,6 @@ def test_epochs_and_seeds_differ():
     assert len({s[2] for s in samples}) == 200
 
 
-def test_lost_or_missing_episodes_are_refused():
-    """A data set that has shrunk, or is empty, ends in a message with the remedy."""
-    with pytest.raises(ConfigError, match="must still hold the 3 training episodes"):
-        EpisodeSampler(0, 1, lambda _: [5, 5], SamplerState(0, 2, 3))
-    with pytest.raises(ConfigError, match="at least one training episode"):
-        EpisodeSampler(0, 1, lambda _: [])
-
-
-def test_other_shards_are_refused():
-    """An epoch goes on only with the shards that it began with, in their order; later ones may be there."""
-    order = EpisodeSampler(0, 1, lambda _: [5, 5], digest=lambda count: f"digest {count}")
-    assert order.state.digest == "digest 2"
-    EpisodeSampler(0, 1, lambda _: [5, 5, 5], order.state, digest=lambda count: f"digest {count}")
-    EpisodeSampler(0, 1, lambda _: [5, 5], replace(order.state, digest=""), digest=lambda count: f"digest {count}")
-    for found in ("other", None):
-        with pytest.raises(ConfigError, match="must still hold the shards that epoch 0 began with"):
-            EpisodeSampler(0, 1, lambda _: [5, 5], order.state, digest=lambda count, found=found: found)
-
-
 @settings(max_examples=60, deadline=None)
 @given(st.lists(st.integers(2, 5), min_size=1, max_size=60), st.integers(1, 40), st.integers(1, 4), st.integers(0, 99))
 def test_windows(frames, window, world_size, cut):
@@ -136,23 +118,36 @@ def test_windows(frames, window, world_size, cut):
         assert all(place[-1] - place[0] < most for place in places)
 
 
-def test_window_cannot_change_within_an_epoch():
-    """Another window is another order: an epoch goes on with its own, and its end with any."""
-    order = EpisodeSampler(0, 1, lambda _: [5] * 20, window=8)
+def test_what_cannot_be_resumed():
+    """An epoch goes on with its own seed, window and shards, later ones may be there; another epoch, and old
+    checkpoints, go on with any. A data set that has shrunk, or is empty, is refused."""
+
+    def digest(count):
+        return f"digest {count}"
+
+    order = EpisodeSampler(7, 1, lambda _: [5] * 20, window=8, digest=digest)
     take(order, 1)
-    with pytest.raises(ConfigError, match=r"training\.shuffle_episodes must be 8 to resume in the middle of epoch 0"):
-        EpisodeSampler(0, 1, lambda _: [5] * 20, order.state)
-    assert EpisodeSampler(0, 1, lambda _: [5] * 20, SamplerState(1, 0, 20, "", 8)).state.window == 0
-
-
-def test_seed_cannot_change_within_an_epoch():
-    """Another seed is another order: an epoch goes on with its own; the next one, and old checkpoints, with any."""
-    order = EpisodeSampler(7, 1, lambda _: [5] * 3)
-    take(order, 2)
-    with pytest.raises(ConfigError, match=r"training\.seed must be 7 to resume in the middle of epoch 0, got 8"):
-        EpisodeSampler(8, 1, lambda _: [5] * 3, order.state)
-    EpisodeSampler(8, 1, lambda _: [5] * 3, replace(order.state, seed=None))
-    assert EpisodeSampler(8, 1, lambda _: [5] * 3, SamplerState(1, 0, 3)).state.seed == 8
+    own = order.state
+    assert own.digest == "digest 20"
+    for seed, scenes, window, state, found, message in (
+        (7, 20, 8, own, digest, None),
+        (7, 21, 8, own, digest, None),
+        (7, 20, 8, replace(own, digest=""), digest, None),
+        (8, 20, 8, replace(own, seed=None), digest, None),
+        (8, 20, 0, SamplerState(1, 0, 20, "", 8), digest, None),
+        (8, 20, 8, own, digest, r"training\.seed must be 7 to resume in the middle of epoch 0, got 8"),
+        (7, 20, 0, own, digest, r"training\.shuffle_episodes must be 8 to resume in the middle of epoch 0"),
+        (7, 20, 8, own, lambda _: "other", "must still hold the shards that epoch 0 began with"),
+        (7, 20, 8, own, lambda _: None, "must still hold the shards that epoch 0 began with"),
+        (7, 2, 0, SamplerState(0, 2, 3), digest, "must still hold the 3 training episodes"),
+        (7, 0, 0, None, digest, "at least one training episode"),
+    ):
+        begin = partial(EpisodeSampler, seed, 1, lambda _, n=scenes: [5] * n, state, window=window, digest=found)
+        if message is None:
+            assert begin().state.window == window and begin().state.seed == seed
+        else:
+            with pytest.raises(ConfigError, match=message):
+                begin()
 
 
 def test_order_is_the_same_everywhere():

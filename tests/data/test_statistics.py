@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hgn.data.statistics import Moments, Statistics, episode_statistics, merge_statistics
+from hgn.data.statistics import Moments, Statistics, episode_statistics
 
 
 @settings(max_examples=50, deadline=None)
@@ -23,19 +23,6 @@ def test_merged_moments_equal_direct_ones(sizes, offset):
         np.testing.assert_allclose(merged.std, values.std(axis=0), rtol=1e-8, atol=1e-12)
     else:
         assert merged == Moments() and merged.std == (0.0, 0.0, 0.0)
-
-
-def test_episode_statistics_equal_direct_ones():
-    """Velocity and acceleration are first and second differences in frame units, over all episodes."""
-    generator = np.random.default_rng(0)
-    episodes = [generator.random((frames, n, 3)).astype(np.float32) for frames, n in ((5, 7), (2, 3), (9, 1))]
-    merged = merge_statistics(episode_statistics(position) for position in episodes)
-    doubles = [position.astype(np.float64) for position in episodes]
-    for moments, order in ((merged.velocity, 1), (merged.acceleration, 2)):
-        values = np.concatenate([np.diff(position, n=order, axis=0).reshape(-1, 3) for position in doubles])
-        assert moments.count == len(values)
-        np.testing.assert_allclose(moments.mean, values.mean(axis=0), rtol=1e-12, atol=1e-14)
-        np.testing.assert_allclose(moments.std, values.std(axis=0), rtol=1e-12, atol=1e-14)
 
 
 def test_too_short_or_empty_episodes_count_nothing():

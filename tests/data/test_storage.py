@@ -259,16 +259,6 @@ def test_who_fetches_was_stopped(folder, cache, patience_s):
             brought(url, patience_s=patience_s)
 
 
-def test_link_in_the_cache(folder, cache, tmp_path):
-    """A partial file that is a link to another file is refused; that file stays as it is."""
-    url = in_memory(folder, "linked")
-    (tmp_path / "precious").write_text("mine")
-    partial_of(Manifest.load(url).shards[0], cache).symlink_to(tmp_path / "precious")
-    with pytest.raises(ConfigError, match="must be a file, got a symbolic link"):
-        brought(url)
-    assert (tmp_path / "precious").read_text() == "mine"
-
-
 def test_no_data_set_there(serve):
     """A URL without a manifest is told apart from one that does not answer."""
     fsspec.filesystem("memory").pipe("/empty/readme", b"")
@@ -339,33 +329,38 @@ def test_what_is_within_reach(folder, serve, cache):
     assert EpisodeStore(folder, "train").within_reach(range(5), patience_s=0)
 
 
-@pytest.mark.parametrize(
-    ("module", "function", "number", "error", "message"),
-    [
-        (os, "fsync", errno.ENOSPC, OSError, "No space left on device: .*cache/shards"),
-        (
-            fcntl,
-            "flock",
-            errno.ENOSYS,
-            ConfigError,
-            rf"{CACHE_VARIABLE} must name a folder on a file system with file locks, got .*shards \(Function not",
-        ),
-    ],
-    ids=["full", "no locks"],
-)
-def test_a_cache_that_fails(folder, cache, monkeypatch, module, function, number, error, message):
-    """Where it is full the error names it, and what was fetched does not stay in the way. Where it has no locks, as on
-    Lustre without -o flock, another folder is asked for, and what stands in the way is named."""
+FILE_SYSTEM = rf"{CACHE_VARIABLE} must name a folder on a file system with file locks, got .*shards \(Function not"
+FAULTS = [  # of the cache: a call that fails and its error, or what lies in the way; the message
+    ((os, "fsync", errno.ENOSPC), OSError, "No space left on device: .*cache/shards"),
+    ((fcntl, "flock", errno.ENOSYS), ConfigError, FILE_SYSTEM),  # as on Lustre without -o flock
+    ("a link", ConfigError, "must be a file, got a symbolic link"),
+    ("a file", ConfigError, rf"{CACHE_VARIABLE} must name a folder .* got .*shards \(Not a directory\)"),
+]
+
+
+@pytest.mark.parametrize(("fault", "error", "message"), FAULTS)
+def test_a_cache_that_fails(folder, cache, monkeypatch, tmp_path, fault, error, message):
+    """What stands in the way is named and stays as it is, and what was fetched does not stay there; where it has no
+    locks, or cannot be made, another folder is asked for. Without the fault the shard comes."""
+    url, precious = in_memory(folder, "failing"), tmp_path / "precious"
+    precious.write_text("mine")
+    store = EpisodeStore(url, "train")
 
     def failing(*arguments):
-        raise OSError(number, os.strerror(number))
+        raise OSError(fault[2], os.strerror(fault[2]))
 
-    store = EpisodeStore(in_memory(folder, function), "train")
     with monkeypatch.context() as patch:
-        patch.setattr(module, function, failing)
+        if fault == "a link":
+            partial_of(store.manifest.shards[0], cache).symlink_to(precious)
+        elif fault == "a file":
+            patch.setenv(CACHE_VARIABLE, str(precious))
+        else:
+            patch.setattr(*fault[:2], failing)
         with pytest.raises(error, match=message):
             store[0]
-    assert function == "flock" or list(cache.iterdir()) == []
+    assert precious.read_text() == "mine" and not [path for path in cache.glob("*") if path.suffix == ".tar"]
+    if fault == "a link":
+        partial_of(store.manifest.shards[0], cache).unlink()
     assert store[0].key == "train-000000"
 
 
@@ -393,11 +388,3 @@ def test_cache_folder(monkeypatch, tmp_path):
     monkeypatch.setattr(Path, "home", homeless)
     with pytest.raises(ConfigError, match=f"{CACHE_VARIABLE} must name a folder"):
         cache_folder()
-
-
-def test_a_cache_that_cannot_be(folder, tmp_path, monkeypatch):
-    """It is said what to name, as in a container whose user has no home of its own."""
-    (tmp_path / "file").touch()
-    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "file"))
-    with pytest.raises(ConfigError, match=rf"{CACHE_VARIABLE} must name a folder .* got .*shards \(Not a directory\)"):
-        EpisodeStore(in_memory(folder, "uncached"), "train")[0]
