@@ -14,13 +14,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from processes import processes_of_session, wait_until
 
 from datagen.pool.locks import LOCK_NAME
 from hgn.data.index import INDEX_NAME
-from hgn.data.manifest import MANIFEST_NAME, SPLITS, Manifest
-from hgn.data.reader import EpisodeStore
+from hgn.data.manifest import MANIFEST_NAME, Manifest
 from hgn.data.verification import verify_file
-from hgn.scene.episode import Episode
 
 TARGETS = ("worker", "pool", "service", "all of them")
 POLL_S = 0.02
@@ -30,13 +29,14 @@ PATIENCE_S = 600.0  # without a new shard
 def generate_with_kills(command: Sequence[str], folder: Path, count: int, interval_s: float, log: Path) -> list[str]:
     """Runs a service's command until `folder` is complete and kills `count` processes meanwhile; returns their kinds.
 
-    After each kill every published shard is verified, and none published before may be missing. Kills are `interval_s`
+    After each kill every published shard is verified, and none published before may be missing; of a service that was
+    killed no process stays behind. Kills are `interval_s`
     apart on average. Raises: AssertionError if the generation was complete before the last kill; RuntimeError if the
     service ended by itself, or publishes nothing more.
     """
     log.parent.mkdir(parents=True, exist_ok=True)
     generator = np.random.default_rng(0)
-    published: list[str] = []
+    published, sessions = list[str](), list[int]()
     order = [TARGETS[i] for _ in range(count) for i in generator.permutation(len(TARGETS))][:count]
     with log.open("ab") as stream:
         service = _Service(command, folder, stream, log)
@@ -46,10 +46,12 @@ def generate_with_kills(command: Sequence[str], folder: Path, count: int, interv
                 assert service.kill(target, generator), f"complete after {number} of {count} kills"
                 published = verified_shards(folder, published)
                 if service.process.poll() is not None:
+                    sessions.append(service.process.pid)
                     service = _Service(command, folder, stream, log)
             service.wait_until_complete()
         finally:
             service.stop()
+    wait_until(lambda: not any(processes_of_session(session) for session in sessions))
     return order
 
 
@@ -67,46 +69,14 @@ def verified_shards(folder: Path, before: Sequence[str]) -> list[str]:
 
 
 def differences(peaceful: Path, killed: Path) -> list[str]:
-    """Returns what a data set lacks, or has too much of, compared with an undisturbed one."""
-    faults = []
-    one, other = Manifest.load(peaceful), Manifest.load(killed)
-    verified_shards(killed, ())
-    if not other.complete:
-        faults.append("it is not complete")
-    if other.quarantined:
-        cause = other.quarantined[0].cause
-        faults.append(f"{len(other.quarantined)} scenes are quarantined, the first because {cause}")
-    if sorted(shard.name for shard in one.shards) != sorted(shard.name for shard in other.shards):
-        faults.append("its shards have other names")
-    for split in SPLITS:
-        first, second = ({e.key: e for e in EpisodeStore(folder, split)} for folder in (peaceful, killed))
-        if first.keys() != second.keys():
-            faults.append(f"{split}: other episodes")
-        both = first.keys() & second.keys()
-        faults += [f"{key}: another scene" for key in both if not _same(first[key], second[key])]
-    index = {Path(name).name for name, _ in other.shards.files()}
-    expected = {MANIFEST_NAME, INDEX_NAME, LOCK_NAME, *index, *(shard.name for shard in other.shards)}
-    left = sorted(path.name for path in killed.rglob("*") if path.name not in expected)
-    return faults + [f"{name} was left behind" for name in left]
-
-
-def equal_shards(one: Path, other: Path) -> int:
-    """Returns the number of bitwise equal shards; the solver on several threads rounds differently each time."""
-    first, second = ({(s.name, s.sha256) for s in Manifest.load(folder).shards} for folder in (one, other))
-    return len(first & second)
-
-
-def _same(one: Episode, other: Episode) -> bool:
-    """Compares seed, specification and initial state of two episodes, bitwise."""
-    arrays = [
-        (e.position_TN3[0], e.initial_velocity_N3, e.material_N, e.obstacle_grid.cell_K3, e.obstacle_grid.normal_K3)
-        for e in (one, other)
-    ]
-    return (
-        (one.seed, one.specification, one.frame_count) == (other.seed, other.specification, other.frame_count)
-        and (one.domain_size, one.gravity) == (other.domain_size, other.gravity)
-        and all(a.shape == b.shape and a.tobytes() == b.tobytes() for a, b in zip(*arrays, strict=True))
-    )
+    """Returns the names of files that one data set has and the other has not, or not the same; indexes may differ."""
+    pairs = [{p.name: p.read_bytes() for p in folder.rglob("*") if p.is_file()} for folder in (peaceful, killed)]
+    own = {MANIFEST_NAME, INDEX_NAME, LOCK_NAME}
+    own |= {Path(name).name for folder in (peaceful, killed) for name, _ in Manifest.load(folder).shards.files()}
+    found = Manifest.load(killed)
+    assert found.complete and not found.quarantined
+    names = pairs[0].keys() | pairs[1].keys()
+    return sorted(name for name in names - own if pairs[0].get(name) != pairs[1].get(name))
 
 
 class _Service:

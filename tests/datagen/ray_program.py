@@ -12,14 +12,12 @@ from pathlib import Path
 
 from ballistic_dataset import make_dataset
 from ballistic_solver import BALLISTIC
-from kills import differences, equal_shards
+from kills import differences
 from ray.cluster_utils import Cluster
 
 from datagen.generate import generate
 from datagen.pool.progress import Progress
 from hgn.config import DatagenConfig, DatasetConfig
-from hgn.data.manifest import Manifest
-from hgn.system.provenance import provenance
 
 STORE_BYTES = 80 * 2**20
 
@@ -62,13 +60,10 @@ def main(folder):
     peaceful, shared = Path(folder) / "peaceful", Path(folder) / "shared"
     make_dataset(DatagenConfig(dataset=replace(dataset, folder=str(peaceful), pool="local")))
     report = {
-        "meta": provenance(),
         "finished": finished,
         "episodes": killer.episodes,
         "messages": killer.messages,
         "differences": differences(peaceful, shared),
-        "shards": len(Manifest.load(shared).shards),
-        "shards_bitwise_equal": equal_shards(peaceful, shared),
     }
     print(json.dumps(report))
 

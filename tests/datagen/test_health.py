@@ -4,9 +4,7 @@ import asyncio
 import http.client
 import json
 import socket
-from contextlib import ExitStack
-
-import pytest
+from contextlib import ExitStack, closing
 
 from datagen.service import health
 from datagen.service.health import HealthPage
@@ -14,33 +12,25 @@ from datagen.service.server import make_app, telling
 from datagen.service.supervisor import PoolState
 
 
-@pytest.fixture
-def page():
-    listener = socket.create_server(("127.0.0.1", 0))
-    with HealthPage(listener) as page:
-        yield page, listener.getsockname()[1]
-
-
 def ask(port):
-    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=60)
-    connection.request("GET", "/healthz")
-    answer = connection.getresponse()
-    content = json.loads(answer.read())
-    connection.close()
-    return answer.status, content
+    with closing(http.client.HTTPConnection("127.0.0.1", port, timeout=60)) as connection:
+        connection.request("GET", "/healthz")
+        answer = connection.getresponse()
+        return answer.status, json.loads(answer.read())
 
 
-def test_the_last_report_is_answered(page, monkeypatch):
+def test_the_last_report_is_answered(monkeypatch):
     """Beside 100 connections that send nothing, too; a service that reports nothing for long is not well."""
-    told, port = page
-    assert ask(port) == (503, {"status": "the service has not begun"})
-    told.tell(200, {"status": "ok"})
-    with ExitStack() as stack:
+    listener = socket.create_server(("127.0.0.1", 0))
+    port = listener.getsockname()[1]
+    with HealthPage(listener) as page, ExitStack() as stack:
+        assert ask(port) == (503, {"status": "the service has not begun"})
+        page.tell(200, {"status": "ok"})
         for _ in range(100):
             stack.enter_context(socket.create_connection(("127.0.0.1", port)))
         assert ask(port) == (200, {"status": "ok"})
-    monkeypatch.setattr(health, "SILENCE_S", -1.0)
-    assert ask(port) == (503, {"status": "the service has not reported for 0 s"})
+        monkeypatch.setattr(health, "SILENCE_S", -1.0)
+        assert ask(port) == (503, {"status": "the service has not reported for 0 s"})
 
 
 def test_what_is_told(tmp_path, folder):

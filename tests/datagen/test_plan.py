@@ -5,36 +5,23 @@ from itertools import product
 from hypothesis import given
 from hypothesis import strategies as st
 
-from datagen.pool.plan import (
-    ShardRange,
-    episode_key,
-    generation_place,
-    missing_ranges,
-    parse_shard_name,
-    scene_seed,
-    shard_ranges,
-)
+from datagen.pool.plan import ShardRange, generation_place, missing_ranges, parse_shard_name, scene_seed, shard_ranges
 
 COUNTS = st.integers(0, 60)
 SPLITS = st.sampled_from(["train", "validation", "test"])
 
 
-def boundaries(split, count, size):
-    return [shard.stop for shard in shard_ranges(split, count, size)]
-
-
-def test_training_shards_double_up_to_their_size():
-    """Training can start after one episode; later shards are of full size, the last is cut to the count."""
-    assert boundaries("train", 30, 8) == [1, 2, 4, 8, 16, 24, 30]
-    assert boundaries("train", 12, 3) == [1, 2, 4, 7, 10, 12]
-    assert boundaries("train", 3, 1) == [1, 2, 3]
-
-
-def test_first_validation_and_test_shards_are_single_episodes():
-    """Five single episodes, then full shards."""
-    for split in ("validation", "test"):
-        assert boundaries(split, 20, 8) == [1, 2, 3, 4, 5, 13, 20]
-        assert boundaries(split, 3, 8) == [1, 2, 3]
+def test_shards_grow_up_to_their_size():
+    """Training can start after one episode: its shards double up to their size. Five validation and test episodes are
+    shards of their own. The last shard is cut to the count."""
+    for split, count, size, stops in (
+        ("train", 30, 8, [1, 2, 4, 8, 16, 24, 30]),
+        ("train", 12, 3, [1, 2, 4, 7, 10, 12]),
+        ("train", 3, 1, [1, 2, 3]),
+        ("validation", 20, 8, [1, 2, 3, 4, 5, 13, 20]),
+        ("test", 3, 8, [1, 2, 3]),
+    ):
+        assert [shard.stop for shard in shard_ranges(split, count, size)] == stops
 
 
 @given(split=SPLITS, count=COUNTS, size=st.integers(1, 9))
@@ -60,25 +47,15 @@ def test_missing_ranges_split_around_holes():
     assert gaps == [(0, 2), (3, 5), (6, 8)]
 
 
-def generation_order(requested):
-    items = [(split, index) for split, count in requested.items() for index in range(count)]
-    return sorted(items, key=lambda item: generation_place(*item))
-
-
 @given(train=COUNTS, validation=COUNTS, test=COUNTS)
 def test_generation_order_holds_each_episode_once(train, validation, test):
     """Every episode of every split is made once; within a split in order; test comes last."""
-    order = generation_order({"train": train, "validation": validation, "test": test})
-    for split, count in (("train", train), ("validation", validation), ("test", test)):
+    requested = {"train": train, "validation": validation, "test": test}
+    items = [(split, index) for split, count in requested.items() for index in range(count)]
+    order = sorted(items, key=lambda item: generation_place(*item))
+    for split, count in requested.items():
         assert [index for name, index in order if name == split] == list(range(count))
     assert [name for name, _ in order[train + validation :]] == ["test"] * test
-
-
-def test_generation_starts_with_training_then_validation():
-    """A trainer can train after one episode and validate after two."""
-    order = generation_order({"train": 4, "validation": 2, "test": 1})
-    expected = "train 0, validation 0, train 1, validation 1, train 2, train 3, test 0"
-    assert ", ".join(f"{split} {index}" for split, index in order) == expected
 
 
 def test_seeds_are_stable_and_distinct():
@@ -92,17 +69,8 @@ def test_seeds_are_stable_and_distinct():
 
 @given(split=SPLITS, first=st.integers(0, 2_000_000), size=st.integers(1, 9))
 def test_shard_names_parse_back(split, first, size):
-    """A name tells split and range, also past six digits."""
+    """A name tells split and range, also past six digits; files of other people in the folder are left alone."""
     shard = ShardRange(split, first, first + size)
     assert parse_shard_name(shard.name) == shard
-
-
-def test_foreign_names_are_no_shards():
-    """Files of other people in the folder are left alone."""
     for name in ("train-0-1.tar", "train-000001-000001.tar", "extra-000000-000001.tar", "train-000000-000001.tar.gz"):
         assert parse_shard_name(name) is None
-
-
-def test_keys_have_no_dot():
-    """WebDataset cuts sample names at the first dot."""
-    assert episode_key("train", 12) == "train-000012"

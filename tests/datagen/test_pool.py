@@ -146,63 +146,42 @@ def test_first_launch_waits_for_the_first_scenes(make_config, backend, control, 
     assert simulated(control)[:2] == [first, second]
 
 
-def test_killed_worker_is_replaced(make_config, backend, control):
-    """A worker that is killed once costs a retry of the same seed, nothing else."""
-    config = make_config(training_scenes=3, validation_scenes=0, test_scenes=0)
-    seed = scene_seed(0, "train", 1, 0)
-    (control / f"kill-{seed}").write_text("1")
-    recorder = generate(config, backend)
-    assert recorder.messages == ["a worker died (ended by SIGKILL); it is replaced and its scenes are tried again"]
-    manifest = Manifest.load(config.dataset.folder)
-    assert manifest.complete and not manifest.quarantined
-    assert simulated(control).count(seed) == 2
+SECOND = scene_seed(0, "train", 1, 0)
+DIVERGED, NO_ROOM, NO_GRID = "diverged in frame 3", "no room for the obstacles", "a surface too large"
+FAULTS = [  # a file that steers the stand-in and its content, scenes a launch, the cause, how often it was simulated
+    (f"kill-{SECOND}", "1", 1, None, 2),
+    (f"kill-{SECOND}", "99", 4, "ended by SIGKILL", 4),  # with the others, with a half of them, twice alone
+    (f"fail-{SECOND}", "", 1, DIVERGED, 1),
+    (f"refuse-{SECOND}", "", 1, NO_ROOM, 0),
+    (f"gridless-{SECOND}", "", 1, NO_GRID, None),  # may be simulated meanwhile
+    (f"kill-grid-{SECOND}", "", 1, None, 1),
+]
 
 
-def test_scene_that_kills_its_worker_is_quarantined(make_config, backend, control, monkeypatch):
-    """In a batch only the guilty scene, found by halves, is quarantined after MAXIMUM_ATTEMPTS alone; the next seed
-    replaces it."""
-    config = make_config(training_scenes=4, validation_scenes=0, test_scenes=0)
+@pytest.mark.parametrize(("sign", "content", "scenes", "cause", "count"), FAULTS)
+def test_a_scene_at_fault(make_config, backend, control, monkeypatch, request, sign, content, scenes, cause, count):
+    """A worker that is killed once costs a retry of the same seed. A scene that kills its worker MAXIMUM_ATTEMPTS times
+    alone, found by halves of its batch, is quarantined; one that cannot be made or simulated, or whose grid cannot be
+    built, is at once, for trying the same seed again would not help. The next seed replaces it."""
     monkeypatch.setattr(pool, "MAXIMUM_ATTEMPTS", 2)
-    seed = scene_seed(0, "train", 2, 0)
-    (control / f"kill-{seed}").write_text("99")
-    generate(config, backend, WorkerPlan(1, None, 1, 4, 4))
+    if not sign.startswith("kill"):
+        request.getfixturevalue("threads")
+    config = make_config(training_scenes=4, validation_scenes=0, test_scenes=0)
+    (control / sign).write_text(content)
+    recorder = generate(config, backend, WorkerPlan(1, None, 1, scenes, scenes))
     manifest = Manifest.load(config.dataset.folder)
-    (failure,) = manifest.quarantined
-    assert (failure.key, failure.seed, failure.cause) == ("train-000002", seed, "ended by SIGKILL")
-    assert manifest.complete
-    assert list(EpisodeStore(config.dataset.folder, "train").entries)[2].attempt == 1
-    assert simulated(control).count(seed) == 4  # with the others, with a half of them, twice alone
-
-
-@pytest.mark.parametrize(("sign", "cause"), [("fail", "diverged in frame 3"), ("refuse", "no room for the obstacles")])
-def test_scene_that_fails_is_quarantined(make_config, backend, control, sign, cause, threads):
-    """A scene that cannot be made or simulated is replaced at once: trying the same seed again would not help."""
-    config = make_config(training_scenes=2, validation_scenes=0, test_scenes=0)
-    seed = scene_seed(0, "train", 0, 0)
-    (control / f"{sign}-{seed}").touch()
-    recorder = generate(config, backend)
-    manifest = Manifest.load(config.dataset.folder)
-    (failure,) = manifest.quarantined
-    assert (failure.seed, failure.attempt, failure.cause) == (seed, 0, cause)
-    seeds = {entry.index: entry.seed for shard in manifest.shards for entry in shard.episodes}
-    assert seeds == {0: scene_seed(0, "train", 0, 1), 1: scene_seed(0, "train", 1, 0)}
-    assert recorder.messages == [f"train-000000 (seed {seed}) could not be simulated: {cause}; trying another seed"]
-
-
-def test_stop_keeps_what_is_staged(make_config, backend, control):
-    """A run that is asked to stop ends, and the next one simulates only what is left."""
-    config = make_config()
-    recorder = Recorder()
-    with pytest.raises(Stopped), DatasetWriter(config) as writer:
-        factory = LocalWorkerFactory(config, backend, ONE)
-        Pool(writer, recorder, factory, lambda: len(recorder.episodes) >= 3).run()
-    assert not multiprocessing.active_children()
-    # the episode in flight may or may not have been staged when its worker ended
-    done = len(recorder.episodes)
-    again = generate(config, backend)
-    assert Manifest.load(config.dataset.folder).complete
-    assert 8 - done - 1 <= len(again.episodes) <= 8 - done
-    assert len(simulated(control)) <= 9
+    assert manifest.complete and count in (None, simulated(control).count(SECOND))
+    failures = [(failure.key, failure.seed, failure.attempt, failure.cause) for failure in manifest.quarantined]
+    assert failures == ([("train-000001", SECOND, 0, cause)] if cause else [])
+    seeds = {entry.index: (entry.seed, entry.attempt) for entry in EpisodeStore(config.dataset.folder, "train").entries}
+    last = int(cause is not None)
+    assert seeds == {i: (scene_seed(0, "train", i, last * (i == 1)), last * (i == 1)) for i in range(4)}
+    if cause is None:
+        message = "a worker died (ended by SIGKILL); it is replaced and its scenes are tried again"
+        assert recorder.messages == [message]
+    elif scenes == 1:
+        message = f"train-000001 (seed {SECOND}) could not be simulated: {cause}; trying another seed"
+        assert recorder.messages == [message]
 
 
 def test_workers_that_die_while_stopping(make_config, backend, control):
@@ -247,46 +226,31 @@ def test_every_scene_fails(make_config, backend, control, threads):
         generate(make_config(training_scenes=1, validation_scenes=0, test_scenes=0), backend)
 
 
-def test_worker_plans():
-    """One solver for two cores; one for each GPU, with full launches and makers in front; settings win."""
-    default = DatagenConfig()
-    assert plan_workers(default, (), 8, 2**36) == WorkerPlan(4, 2, 1, 1, 1)
-    assert plan_workers(default, (), 1, 2**36) == WorkerPlan(1, 1, 1, 1, 1)
-    assert plan_workers(default, ("0",), 8, 2**36) == WorkerPlan(1, None, 7, 416, 416, ("0",))
-    assert plan_workers(DatagenConfig(mpm=MpmConfig(device="cpu")), ("0",), 4, 2**36).threads == 2
-    many = DatagenConfig(dataset=DatasetConfig(workers=3), mpm=MpmConfig(scenes_per_launch=2))
-    large = DatagenConfig(scene=SceneConfig(domain_size=(4.0, 1.0, 4.0)))
-    assert plan_workers(large, ("0",), 8, 2**36).scenes_per_launch == 52
-    assert plan_workers(default, ("0",), 8, 2**32).scenes_per_launch == 138  # of frames that fill half of 4 GB
-    assert plan_workers(default, ("0",), 8, 2**36, early=True) == WorkerPlan(1, None, 7, 416, 2, ("0",))
-    assert plan_workers(many, (), 8, 2**36) == WorkerPlan(3, 2, 1, 2, 2)
-    assert plan_workers(many, ("4", "5"), 8, 2**36) == WorkerPlan(3, None, 7, 2, 2, ("4", "5"))
-    assert plan_workers(default, ("4", "5"), 8, 2**40) == WorkerPlan(2, None, 7, 416, 416, ("4", "5"))
-    assert plan_workers(default, ("4", "5"), 8, 2**33).scenes_per_launch == 138  # each holds its own frames
-    alone = DatagenConfig(dataset=DatasetConfig(workers=1))
-    assert plan_workers(alone, ("4", "5"), 8, 2**40).solvers == 1
-
-
-def test_hidden_gpus_are_not_used(monkeypatch):
-    """CUDA_VISIBLE_DEVICES takes GPUs away, as everywhere else."""
+@pytest.mark.parametrize(
+    ("sections", "gpus", "memory", "plan"),
+    [
+        ({}, (), 2**36, WorkerPlan(4, 2, 1, 1, 1)),
+        ({}, ("0",), 2**36, WorkerPlan(1, None, 7, 416, 416, ("0",))),
+        ({"mpm": MpmConfig(device="cpu")}, ("0",), 2**36, WorkerPlan(4, 2, 1, 1, 1)),
+        ({"scene": SceneConfig(domain_size=(4.0, 1.0, 4.0))}, ("0",), 2**36, WorkerPlan(1, None, 7, 52, 52, ("0",))),
+        ({}, ("0",), 2**32, WorkerPlan(1, None, 7, 138, 138, ("0",))),  # frames that fill half of 4 GB
+        ({"mpm": MpmConfig(scenes_per_launch=2)}, (), 2**36, WorkerPlan(4, 2, 1, 2, 2)),
+        ({"dataset": DatasetConfig(workers=3)}, ("4", "5"), 2**40, WorkerPlan(3, None, 7, 416, 416, ("4", "5"))),
+        ({}, ("4", "5"), 2**40, WorkerPlan(2, None, 7, 416, 416, ("4", "5"))),
+        ({}, ("4", "5"), 2**33, WorkerPlan(2, None, 7, 138, 138, ("4", "5"))),  # each holds its own frames
+        ({"dataset": DatasetConfig(workers=1)}, ("4", "5"), 2**40, WorkerPlan(1, None, 7, 416, 416, ("4", "5"))),
+    ],
+)
+def test_worker_plans(sections, gpus, memory, plan, monkeypatch):
+    """One solver for two cores; one for each GPU that is not hidden, with full launches and makers in front; settings
+    win. Where a training waits, first launches are small."""
+    assert plan_workers(DatagenConfig(**sections), gpus, 8, memory) == plan
+    early = plan_workers(DatagenConfig(**sections), gpus, 8, memory, early=True)
+    assert early == dataclasses.replace(plan, first_launch=min(2, plan.first_launch) if gpus else plan.first_launch)
+    assert plan_workers(DatagenConfig(), (), 1, 2**36) == WorkerPlan(1, 1, 1, 1, 1)
     for value in ("", "-1"):
         monkeypatch.setenv("CUDA_VISIBLE_DEVICES", value)
         assert visible_gpus() == ()
-
-
-def test_grids_follow(make_config, backend, control):
-    """A scene whose grid cannot be built is replaced, also when it was simulated meanwhile; a maker that dies of one
-    grid is replaced and builds it.
-    """
-    config = make_config(training_scenes=3, validation_scenes=0, test_scenes=0)
-    (control / f"gridless-{scene_seed(0, 'train', 0, 0)}").touch()
-    (control / f"kill-grid-{scene_seed(0, 'train', 1, 0)}").touch()
-    recorder = generate(config, backend)
-    manifest = Manifest.load(config.dataset.folder)
-    assert manifest.complete
-    (failure,) = manifest.quarantined
-    assert (failure.key, failure.cause) == ("train-000000", "a surface too large")
-    assert len(recorder.messages) == 2
 
 
 def test_tars_are_those_of_tarfile(folder, tmp_path):

@@ -34,7 +34,7 @@ def test_lost_node(control, tmp_path):
     report = json.loads(program.stdout.splitlines()[-1])
     assert report["finished"] and report["episodes"] == 12
     assert "a worker died" in report["messages"][0] and "on node" in report["messages"][0]
-    assert report["differences"] == [] and report["shards_bitwise_equal"] == report["shards"] == 7
+    assert report["differences"] == []
 
 
 def test_no_cluster(make_config, monkeypatch):

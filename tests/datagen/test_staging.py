@@ -13,8 +13,8 @@ from written_files import claim_all, hashes, simulated_once, snapshot
 import datagen.pool.shard
 import datagen.pool.writer
 from datagen.pool.plan import scene_seed
-from datagen.pool.writer import MAXIMUM_REPLACEMENTS, STAGED_SECONDS, DatasetWriter
-from hgn.config import DatagenConfig, MpmConfig, SceneConfig
+from datagen.pool.writer import STAGED_SECONDS, DatasetWriter
+from hgn.config import MpmConfig, SceneConfig
 from hgn.data.manifest import Manifest
 from hgn.data.reader import EpisodeStore
 from hgn.data.shard import locate_members
@@ -25,7 +25,7 @@ class InterruptionError(Exception):
     """A stand-in for a crash."""
 
 
-@pytest.mark.parametrize("call", [1, 2, 3, 4, 5, 8, 13, 18, 23])
+@pytest.mark.parametrize("call", [1, 2, 3, 5, 13, 23])
 def test_resume_after_a_crash_makes_the_same_shards(
     make_config, make_dataset, small_dataset, stage, monkeypatch, control, call
 ):
@@ -76,21 +76,23 @@ def test_growth_keeps_what_is_there(make_config, make_dataset, tmp_path, control
         assert np.array_equal(grown.position_TN3, made.position_TN3) and grown.seed == made.seed
 
 
-@pytest.mark.parametrize("count", [5, 3])
-def test_complete_folder_stays_untouched(make_config, folder, count):
-    """Asking again for what is there, or for less of it, changes no file."""
+def test_what_is_complete(make_config, make_dataset, folder, stage, tmp_path):
+    """Asking again for what is there, or for less of it, changes no file, on whatever device, with whatever launches,
+    workers and shard size; a folder begun for five episodes and asked for one is complete when that one is there."""
     before = snapshot(folder)
-    with DatasetWriter(make_config(training_scenes=count)) as writer:
-        assert writer.complete and writer.claim_next() is None
+    mpm = MpmConfig(device="cuda", scenes_per_launch=64)
+    for config in (
+        *(make_config(training_scenes=count) for count in (5, 3)),
+        dataclasses.replace(make_config(workers=3, episodes_per_shard=2), mpm=mpm),
+    ):
+        with DatasetWriter(config) as writer:
+            assert writer.complete and writer.claim_next() is None
     assert snapshot(folder) == before
-
-
-def test_asking_for_less_ends_an_unfinished_dataset(make_config, stage):
-    """A folder begun for five episodes and asked for one is complete when that one is there."""
-    with DatasetWriter(make_config()) as writer:
+    begun = {"folder": str(tmp_path / "begun")}
+    with DatasetWriter(make_config(**begun)) as writer:
         stage(writer, "train", 0)
         writer.publish_next()
-    with DatasetWriter(make_config(training_scenes=1, validation_scenes=0, test_scenes=0)) as writer:
+    with DatasetWriter(make_config(training_scenes=1, validation_scenes=0, test_scenes=0, **begun)) as writer:
         assert writer.complete
     assert Manifest.load(writer.folder).complete
 
@@ -113,14 +115,6 @@ def test_other_settings_are_refused(make_config, folder, changes, message):
     with pytest.raises(ConfigError, match=f"holds another data set: {message}; choose another folder"):
         DatasetWriter(config).__enter__()
     assert snapshot(folder) == before
-
-
-def test_where_and_how_fast_is_no_identity(data):
-    """Device, launch size, workers, attempts and shard size may change between runs of one data set."""
-    dataset = dataclasses.replace(data.dataset, workers=3, episodes_per_shard=2)
-    mpm = MpmConfig(device="cuda", scenes_per_launch=64)
-    with DatasetWriter(DatagenConfig(dataset=dataset, mpm=mpm)) as writer:
-        assert writer.complete
 
 
 def test_generators_share_a_folder(make_config, small_dataset, stage, control):
@@ -203,34 +197,25 @@ def test_no_clock_is_asked(make_config, make_dataset, small_dataset, stage, seco
 @pytest.mark.parametrize("damage", ["cut", "zeroed", "a bit", "no seal"])
 def test_broken_staged_file_is_made_again(make_config, make_dataset, small_dataset, stage, damage):
     """A staged file that is not what was written (positions that are zeros read like any others) is dropped and its
-    episode made again; so the shards are those of a run in peace."""
+    episode made again; so the shards are those of a run in peace. One that changes after it was checked is not packed.
+    """
     with DatasetWriter(make_config()) as writer:
         stage(writer, "train", 1)
-    staged = writer.folder / ".staging" / "train-000001.tar"
-    content = bytearray(staged.read_bytes())
-    place, size = locate_members(staged)["train-000001"]["position.npy"]
-    if damage == "zeroed":
-        content[place + 128 : place + size] = bytes(size - 128)
-    content[place + 200] ^= damage == "a bit"
-    staged.write_bytes({"cut": content[:2000], "no seal": content[:-72]}.get(damage, content))
+        staged = writer.folder / ".staging" / "train-000001.tar"
+        content = bytearray(staged.read_bytes())
+        place, size = locate_members(staged)["train-000001"]["position.npy"]
+        if damage == "zeroed":
+            content[place + 128 : place + size] = bytes(size - 128)
+        content[place + 200] ^= damage == "a bit"
+        staged.write_bytes({"cut": content[:2000], "no seal": content[:-72]}.get(damage, content))
+        with pytest.raises(ConfigError, match=r"train-000001\.tar must end with the sha256"):
+            while writer.publish_next():
+                pass
     messages: list[str] = []
     with DatasetWriter(make_config(), messages.append) as writer:
         assert ("train", 1) in claim_all(writer)
     assert "must end with the sha256 of what it holds" in messages[0] and "is made again" in messages[0]
     assert hashes(make_dataset(make_config())) == hashes(small_dataset)
-
-
-def test_staged_file_that_changes_later_is_not_published(make_config, stage):
-    """What was checked when it was claimed is checked again as it is packed."""
-    with DatasetWriter(make_config()) as writer:
-        stage(writer, "train", 0)
-        staged = writer.folder / ".staging" / "train-000000.tar"
-        content = bytearray(staged.read_bytes())
-        content[1000] ^= 1
-        staged.write_bytes(content)
-        with pytest.raises(ConfigError, match=r"train-000000\.tar must end with the sha256"):
-            writer.publish_next()
-    assert not list(writer.folder.glob("*.tar"))
 
 
 def test_what_is_published_is_on_the_disk(make_config, stage, monkeypatch):
@@ -295,12 +280,3 @@ def test_quarantined_seed_is_replaced(make_config, stage):
     assert (failure.key, failure.seed, failure.cause) == ("train-000000", first_seed, "diverged")
     (entry,) = manifest.shards[0].episodes
     assert (entry.attempt, entry.seed) == (1, replacement.seed)
-
-
-def test_scenes_that_never_work_end_in_an_error(make_config):
-    """A distribution none of whose scenes can be simulated ends with the cause, not in an endless loop."""
-    with DatasetWriter(make_config()) as writer:
-        task = writer.task("train", 0)
-        with pytest.raises(ConfigError, match=r"train-000000 could not be simulated with 20 seeds, .*: too stiff;"):
-            for _ in range(MAXIMUM_REPLACEMENTS):
-                task = writer.quarantine(task, "too stiff")
