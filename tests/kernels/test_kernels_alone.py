@@ -205,9 +205,9 @@ def test_a_trained_network(precision, table):
     network, _ = load_weights(find_weights("obstacles"))
     assert isinstance(network, HierarchicalGraphNetwork)
     network.double()
-    state = float32_state((300, 131), spread=0.2) if NATIVE else float32_state((7,), spread=0.04)
+    state = float32_state((300, 131), spread=0.2) if NATIVE else float32_state((2,), spread=0.04)
     judge = Judge(table, precision)
-    judged(judge, made(network, state, precision, ROOM if NATIVE else 32), network, state)
+    judged(judge, made(network, state, precision, ROOM if NATIVE else 16), network, state)
     assert not judge.wrong
 
 

@@ -69,13 +69,13 @@ def test_cases_are_what_they_say():
     assert most[0] < 1e-3 < most[1] < 0.5 < most[2] and not contacts.touched_C.any()
 
 
-@pytest.mark.parametrize("precision", ["fp32", "tf32", "fp16"])
+@pytest.mark.parametrize("precision", ["fp32", "fp16"] if device().type == "cpu" else ["fp32", "tf32", "fp16"])
 @pytest.mark.usefixtures("large_tiles")
 def test_free_motion_is_exact(precision):
     """Away from surfaces what inference adds to gravity keeps momentum and angular momentum in each scene to float32's
     rounding; 3 m/s more for all, in any direction, leave it as it was to the rounding of velocities."""
     network = CASES["relative"].network()
-    state = moving_state((23, 5), obstacles=False, spread=0.1)
+    state = moving_state((9, 3), obstacles=False, spread=0.06)
     state = replace(state, position_N3=state.position_N3 + 0.4, velocity_NM3=state.velocity_NM3.clamp(-5e-3, 5e-3))
     origin_S3, _ = drawn(network, state)
     engine = inference_of(engine_of(network, state, precision), network)
@@ -105,23 +105,6 @@ def test_half_precision_keeps_small_gradients():
     engine.backward()
     _, expected = reference(network, state, origin_S3, torch.full((5, 3), weight, dtype=torch.float64))
     assert relative_error(flat(gradients(engine, network)), flat(expected)) < 5e-2
-
-
-@pytest.mark.parametrize(
-    ("precision", "half_cells", "half_sums", "few_rows"),
-    [("tf32", False, False, None), ("fp16", True, False, None), ("fp16", True, True, 0)],
-)
-def test_inference_alone(precision, half_cells, half_sums, few_rows, monkeypatch):
-    """Where nothing is kept for gradients, operands of TF32 and float16 change the output by less than 5e-3, also with
-    the cells in float16 between kernels and so summed, and with the kernels for many rows."""
-    if few_rows is not None:
-        monkeypatch.setattr("hgn.kernels.tuning.FEW_ROWS", few_rows)
-    network = network_of(width=16, levels=1, message_passing_steps=2)
-    state = float32_state((5, 2), spread=0.1)
-    origin_S3 = torch.zeros(2, 3, dtype=torch.float64)
-    engine = inference_of(engine_of(network, state, precision, (64,)), network, half_cells, half_sums)
-    found = run_forward(engine, network, state, origin_S3)
-    assert relative_error(found, network.normalised_acceleration(state, origin_S3).detach()) < 5e-3
 
 
 def test_without_obstacles_nothing_is_looked_up():

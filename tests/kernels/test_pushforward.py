@@ -1,27 +1,20 @@
 """The pushforward pool on backend triton against that on torch."""
 
-import re
-
 import numpy as np
 import pytest
 import torch
 from kernels.engines import device
 from kernels.test_training import data as data
-from kernels.test_training import run_mapping, without_jitter
 from network.states import network_of
-from training.runs import metrics
 from training.test_noise import episode
 from training.test_pushforward import falling, training_of, wild_network, with_square
 from training.test_symmetry import scene_with_obstacles
 
-from hgn import train
 from hgn.data.episode_tensors import whole_episode
 from hgn.kernels.packing import pack_network
 from hgn.kernels.scene_tables import SceneHash
 from hgn.kernels.update.op import DeviceEpisode, DeviceSample
 from hgn.schema import ConfigError
-from hgn.training.checkpoint import read_checkpoint
-from hgn.training.module import TrainingModule
 from hgn.training.noise import noise_scale
 from hgn.training.pushforward import PushforwardPool, simulated_barrier
 from hgn.training.torch_pushforward import TorchScenes
@@ -156,40 +149,3 @@ def test_wrong_kernels_are_refused():
         patch.setattr(TritonScenes, "_first_scenes", another)
         with pytest.raises(ConfigError, match=r"must be torch on this machine.*set training.backend=torch"):
             refresh(fast, network, starts)
-
-
-def test_fast_training_is_the_plain_one(data, tmp_path, monkeypatch, capsys):
-    """Both paths simulate the same scenes at the same updates and train on the same windows: weights, their average and
-    what is logged of the pool agree. The fast one tells where the time of its first updates went."""
-    monkeypatch.setattr("hgn.training.triton_updates.REPORTED_UPDATES", 2)
-    monkeypatch.setattr("hgn.training.session.triton_unsupported_reason", lambda *_: None)  # in float32
-    without_jitter(monkeypatch)
-    same = {"noise_std": 0.0, "ema_decay": 0.7, "symmetry": "gravity"}
-    own = {"pushforward_fraction": 0.5, "pushforward_every": 1, "pushforward_scenes": 2, "pushforward_frames": 2}
-    counts = {"maximum_updates": 2, "log_every": 2, "checkpoint_every": 2, "monitor_every": 2}
-    original = TrainingModule.set_statistics
-
-    def set_statistics(self, statistics):
-        original(self, statistics)
-        self.network.normaliser.acceleration_std.fill_(1e-3)  # free fall has none, and rounding would be all there is
-        self._begin_average()
-
-    monkeypatch.setattr(TrainingModule, "set_statistics", set_statistics)
-    ends, lines = {}, {}
-    for backend in ("torch", "triton"):
-        assert train.main(run_mapping(data, tmp_path / backend, backend=backend, **same, **own, **counts)) == 0
-        ends[backend] = read_checkpoint(tmp_path / backend / "checkpoints" / "last.ckpt")
-        lines[backend] = next(line for line in metrics(tmp_path / backend) if "loss" in line)
-    assert re.findall(r"the first 2 updates took .* s pushforward, .* capturing \d+ times", capsys.readouterr().err)
-    # Adam's first steps are signs of gradients: where those are next to nothing, rounding decides
-    for key, value in ends["torch"]["state_dict"].items():
-        assert float((ends["triton"]["state_dict"][key] - value).double().abs().mean()) < 1e-5, key
-    moments = [
-        torch.cat([s["exp_avg"].flatten() for s in end["optimizer_states"][0]["state"].values()])
-        for end in (ends["triton"], ends["torch"])
-    ]
-    assert float((moments[0] - moments[1]).norm() / moments[1].norm()) < 1e-4
-    assert ends["triton"]["hgn"] == ends["torch"]["hgn"]
-    assert lines["triton"]["pushforward/windows"] == lines["torch"]["pushforward/windows"] == 4
-    for name in ("loss", "pushforward/mse"):
-        assert lines["triton"][name] == pytest.approx(lines["torch"][name], rel=1e-3)

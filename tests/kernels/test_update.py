@@ -138,61 +138,65 @@ def test_updates_are_those_of_torch(optimizer, directions, monkeypatch):
     assert int(updates.step) == 2 and updates.counters[1] == 2 and updates.counters[2] == 0
 
 
+def assembled(updates, *samples, room=512):
+    """Draws these samples' noise and origins, without an update: velocities [N, HISTORY, 3], newest first."""
+    updates._upload([samples], [1e-3])
+    count = sum(sample[0].particles for sample in samples)
+    if updates.particles == 0:
+        updates.particles, updates.capacities = 16 * math.ceil(count / 16), (room,)
+        updates._reach = (torch.zeros(3), torch.ones(3))
+        updates._build()
+    updates._assemble()
+    return updates.buffers.velocity_NV[:count].cpu().view(count, HISTORY, 3)
+
+
+def clean(made, frame):
+    """An episode's positions up to a frame's window and behind, and its velocities, newest first, without noise."""
+    window_WN3 = made.position_TN3[frame : frame + HISTORY + 2].cpu()
+    return window_WN3, (window_WN3[1:-1] - window_WN3[:-2]).flip(0).transpose(0, 1)
+
+
 def test_noise_and_jitter():
     """Noise is a random walk whose last step has the asked standard deviation, positions follow the velocities, the
     target undoes the velocity error; origins lie in [-cell, 0]; the same seed draws the same, another seed another."""
     network = network_of(width=16, levels=1, message_passing_steps=1, cell_size=0.1)
-    made, _ = episode(1, 400, False, spread=0.3)
-    still, _ = episode(2, 300, False, spread=0.3)
+    made, still = (episode(seed, count, False, spread=0.3)[0] for seed, count in ((1, 160), (2, 120)))
     updates = updates_of(network, 2, noise_std=1e-3, grid_jitter=True)
+    names = ("position_N3", "velocity_NV", "target_N3", "origin_S3", "share_N", "scene_N")
     drawn = []
     for seeds in ((5, 6), (5, 6), (7, 6)):
-        updates._upload([[(made, 1, seeds[0]), (still, 0, seeds[1])]], [1e-3])
-        updates.particles = 704
-        if not drawn:
-            updates._reach = (torch.zeros(3), torch.ones(3))
-            updates.capacities = (512,)
-            updates._build()
-        updates._assemble()
-        names = ("position_N3", "velocity_NV", "target_N3", "origin_S3", "share_N", "scene_N")
-        drawn.append({name: getattr(updates, name).cpu().clone() for name in names})
+        assembled(updates, (made, 1, seeds[0]), (still, 0, seeds[1]))
+        found = vars(updates) | vars(updates.buffers)
+        drawn.append({name: found[name].cpu().clone() for name in names})
     first, again, other = drawn
     assert all(torch.equal(first[name], again[name]) for name in first)
-    assert torch.equal(first["position_N3"][400:700], other["position_N3"][400:700])
-    assert not torch.equal(first["position_N3"][:400], other["position_N3"][:400])
-    torch.testing.assert_close(first["share_N"][:700], torch.tensor([1 / 800] * 400 + [1 / 600] * 300))
-    assert first["scene_N"][:700].tolist() == [0] * 400 + [1] * 300
+    assert torch.equal(first["position_N3"][160:280], other["position_N3"][160:280])
+    assert not torch.equal(first["position_N3"][:160], other["position_N3"][:160])
+    torch.testing.assert_close(first["share_N"][:280], torch.tensor([1 / 320] * 160 + [1 / 240] * 120))
+    assert first["scene_N"][:280].tolist() == [0] * 160 + [1] * 120
     assert ((first["origin_S3"] <= 0) & (first["origin_S3"] >= -0.1)).all() and first["origin_S3"].unique().numel() == 6
-    window = made.position_TN3[1 : 1 + HISTORY + 2].cpu()
-    clean = (window[1:-1] - window[:-2]).flip(0).transpose(0, 1)
-    walk = first["velocity_NV"][:400].view(400, HISTORY, 3) - clean  # newest first
+    window, velocity = clean(made, 1)
+    walk = first["velocity_NV"][:160].view(160, HISTORY, 3) - velocity
     assert walk[:, 0].std() == pytest.approx(1e-3, rel=0.1)
     assert walk[:, -1].std() == pytest.approx(1e-3 / HISTORY**0.5, rel=0.1)
-    moved = first["position_N3"][:400] - window[-2]
+    moved = first["position_N3"][:160] - window[-2]
     torch.testing.assert_close(moved, walk.sum(1), rtol=0, atol=1e-6)
-    wanted = (window[-1] - window[-2]) - first["velocity_NV"][:400, :3]
+    wanted = (window[-1] - window[-2]) - first["velocity_NV"][:160, :3]
     expected = network.float().normaliser.normalise_acceleration(wanted)
-    torch.testing.assert_close(first["target_N3"][:400], expected, rtol=0, atol=1e-3)
-    updates._upload([[DeviceSample(made, 1, 5, 4.0, 0.25), DeviceSample(still, 0, 6)]], [1e-3])
-    updates._assemble()
-    calm = updates.buffers.velocity_NV[:400].cpu().view(400, HISTORY, 3) - clean
+    torch.testing.assert_close(first["target_N3"][:160], expected, rtol=0, atol=1e-3)
+    calm = assembled(updates, DeviceSample(made, 1, 5, 4.0, 0.25), DeviceSample(still, 0, 6))[:160] - velocity
     torch.testing.assert_close(calm, walk / 4, rtol=0, atol=1e-7)
-    torch.testing.assert_close(updates.share_N[:700].cpu(), torch.tensor([4 / 800] * 400 + [1 / 600] * 300))
+    torch.testing.assert_close(updates.share_N[:280].cpu(), torch.tensor([4 / 320] * 160 + [1 / 240] * 120))
 
 
 def test_a_flat_network_is_shown_no_noise_across():
     """With two dimensions z and its velocities are the data's bit by bit, and the grid does not move along it."""
     network = network_of(width=16, levels=1, message_passing_steps=1, cell_size=0.1, dimensions=2)
     made, _ = episode(1, 64, False, spread=0.3)
-    updates = updates_of(network, 1, (512,), noise_std=1e-3, grid_jitter=True, noise_correlated_fraction=0.3)
-    updates._upload([[(made, 1, 5)]], [1e-3])
-    updates.particles, updates._reach = 64, (torch.zeros(3), torch.ones(3))
-    updates._build()
-    updates._assemble()
-    window = made.position_TN3[1 : 1 + HISTORY + 1]
-    step_N3 = updates.buffers.velocity_NV[:64].view(64, HISTORY, 3)[:, 0] - (window[-1] - window[-2])
+    updates = updates_of(network, 1, noise_std=1e-3, grid_jitter=True, noise_correlated_fraction=0.3)
+    step_N3 = (assembled(updates, (made, 1, 5)) - clean(made, 1)[1])[:, 0]
     assert not step_N3[:, 2].any() and step_N3[:, :2].all()
-    assert torch.equal(updates.buffers.position_N3[:64, 2], window[-1, :, 2])
+    assert torch.equal(updates.buffers.position_N3[:64, 2].cpu(), clean(made, 1)[0][-2, :, 2])
     assert updates.buffers.origin_S3[0, 2] == 0 and (updates.buffers.origin_S3[0, :2] < 0).all()
 
 
@@ -200,35 +204,26 @@ def test_correlated_noise():
     """With noise_correlated_fraction=1 a scene gets the sum of its waves for noise, as in backend torch, of the asked
     spread; other scenes have other waves; half of the variance leaves the other half to each particle."""
     network = network_of(width=16, levels=1, message_passing_steps=1, cell_size=0.01)
-    made, _ = episode(1, 400, False, spread=0.3)
-    still, _ = episode(2, 300, False, spread=0.3)
-    walks, waves = {}, torch.empty(0)
-    windows = [e.position_TN3[f : f + HISTORY + 1].cpu() for e, f in ((made, 1), (still, 0))]
-    clean = torch.cat([(w[1:] - w[:-1]).flip(0).transpose(0, 1) for w in windows])
+    made, still = (episode(seed, count, False, spread=0.3)[0] for seed, count in ((1, 160), (2, 120)))
+    samples, windows = ((made, 1, 5), (still, 0, 6)), (clean(made, 1), clean(still, 0))
+    velocity, walks = torch.cat([velocity for _, velocity in windows]), {}
     for smooth in (0.0, 0.5, 1.0):
         updates = updates_of(network, 2, noise_std=1e-3, grid_jitter=False, noise_correlated_fraction=smooth)
-        updates._upload([[(made, 1, 5), (still, 0, 6)]], [1e-3])
-        updates.particles, updates.capacities = 704, (4096,)
-        updates._reach = (torch.zeros(3), torch.ones(3))
-        updates._build()
-        updates._assemble()
-        walks[smooth] = updates.buffers.velocity_NV[:700].cpu().view(700, HISTORY, 3) - clean
-        waves = updates.waves_SKC.cpu()
+        walks[smooth] = assembled(updates, *samples, room=4096) - velocity
+    waves = updates.waves_SKC.cpu()
     length = 2 * math.pi / waves[..., :3].norm(dim=-1) / 0.01
     assert 4 <= float(length.min()) < 8 and 32 < float(length.max()) <= 64.01
     assert not torch.isclose(waves[0], waves[1]).any()
     expected = []
-    for window, wave in zip(windows, waves, strict=True):
-        height_NK = torch.cos(window[-1] @ wave[:, :3].T + wave[:, 3])
+    for (window, _), wave in zip(windows, waves, strict=True):
+        height_NK = torch.cos(window[-2] @ wave[:, :3].T + wave[:, 3])
         expected.append((height_NK @ wave[:, 4:]).view(-1, HISTORY, 3).cumsum(1).flip(1))
     torch.testing.assert_close(walks[1.0], torch.cat(expected), rtol=0, atol=2e-6)
     assert 3e-4 < float(walks[1.0][:, 0].std()) < 3e-3
     torch.testing.assert_close(walks[0.5], (walks[0.0] + walks[1.0]) / 2**0.5, rtol=0, atol=2e-6)
-    updates._upload([[DeviceSample(made, 1, 5), DeviceSample(still, 0, 6, noise_scale=0.5)]], [1e-3])
-    updates._assemble()
-    walk = updates.buffers.velocity_NV[:700].cpu().view(700, HISTORY, 3) - clean
-    torch.testing.assert_close(walk[:400], walks[1.0][:400], rtol=0, atol=0)
-    torch.testing.assert_close(walk[400:], walks[1.0][400:] / 2, rtol=0, atol=1e-6)
+    walk = assembled(updates, DeviceSample(*samples[0]), DeviceSample(*samples[1], noise_scale=0.5)) - velocity
+    torch.testing.assert_close(walk[:160], walks[1.0][:160], rtol=0, atol=0)
+    torch.testing.assert_close(walk[160:], walks[1.0][160:] / 2, rtol=0, atol=1e-6)
 
 
 def test_wrong_kernels_are_refused():
