@@ -19,7 +19,7 @@ LINES = {  # of Python, in tracked files
     "hgn": 27_261,
     "datagen": 8_471,
     "tools": 7_110,
-    "tests": 27_097,
+    "tests": 26_971,
 }
 SETTINGS = 238  # fields of the dataclasses behind the commands, *Config
 
