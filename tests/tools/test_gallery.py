@@ -16,7 +16,7 @@ from hgn.scene.scene_file import scene_files
 from hgn.schema import ConfigError
 from tools import render
 from tools.scenes import filled
-from tools.stability import gallery, network, solver
+from tools.stability import gallery, network, solver, solver_gallery
 from tools.stability.broken import BROKEN
 from tools.stability.gallery import load_case, load_gallery
 from tools.stability.observables import OBSERVABLES, BoundEntry, Film, period, series
@@ -200,6 +200,7 @@ def test_both_commands(tmp_path, monkeypatch, capsys):
     path = tiny_file(tmp_path)
     monkeypatch.setattr(gallery, "scene_files", lambda folder: {"tiny": path})
     monkeypatch.setattr(gallery, "REFERENCE", tmp_path)
+    monkeypatch.setattr(solver_gallery, "REFERENCE", tmp_path)
     json_file = tmp_path / "gallery_solver.json"
     options = {"weights": still_weights(tmp_path), "device": "cpu", "cases": ["gallery"]}
     with pytest.raises(
@@ -219,6 +220,7 @@ def test_both_commands(tmp_path, monkeypatch, capsys):
     assert "| frozen" in printed and "fails, as it should" in printed
     own = report["scenes"]["tiny"]
     assert own["kind"] == "drop" and len(own["series"]["64"]["height"].split()) == 2
+    assert own["simulated"]["date"] == report["meta"]["date"]
     shown = tmp_path / "network.json"
     assert network.main(options | {"json": str(shown)}) == 0
     judged = {row["case"]: row for row in json.loads(shown.read_text())["rows"]}
@@ -229,6 +231,15 @@ def test_both_commands(tmp_path, monkeypatch, capsys):
     tiny_file(tmp_path, bounds=[{"of": "height", "frames": [10, 10], "within": 90.0}])
     assert network.main(options | {"json": str(shown)}) == 0
     assert [row["held"] for row in json.loads(shown.read_text())["rows"]] == [True]
+    # the solver's rows, too, are compared with other bounds without a new simulation
+    never = {"of": "height", "frames": [5, 10], "between": [0, 90]}
+    tiny_file(tmp_path, bounds=[never, {"of": "centre", "group": 1, "frames": [5, 10], "within": 0.002}])
+    monkeypatch.setattr(solver_gallery, "solver_trials", lambda *_: pytest.fail("simulated again"))
+    assert solver.main({"cases": ["gallery"], "device": "cpu", "json": str(tmp_path / "again.json")}) == 0
+    again = json.loads((tmp_path / "again.json").read_text())
+    assert again["scenes"]["tiny"] == own and [row["held"] for row in again["rows"]] == [False, True]
+    assert again["rows"][0]["beyond"].endswith("fails: no broken trajectory")
+    assert again["rows"][1]["broken"] == rows[1]["broken"]
     tiny_file(tmp_path, far=None, bounds=[{"of": "height", "frames": [10, 10], "within": 90.0}])
     with pytest.raises(ConfigError, match=r"tiny.yaml must be as it was when gallery_solver.json was measured"):
         network.main(options)

@@ -71,7 +71,7 @@ def main(mapping: dict[str, Any]) -> int:
         if config.cases is None or name in config.cases:
             report.add(cases[name](mpm))
     for name in filter(is_gallery, config.cases or ()):
-        report.add(gallery_rows(name, mpm, scenes))
+        report.add(gallery_rows(name, mpm, meta, scenes))
     print(table(report.rows))
     if scenes:
         print(broken_table(report.rows))

@@ -1,13 +1,15 @@
 """The solver's side of the gallery: figures on two grids, and of broken trajectories.
 
 Rows pass if the solver passes on both grids and at least one broken trajectory fails. The series of all observables
-are returned for the JSON, which networks are compared with (gallery.py).
+are returned for the JSON, which networks are compared with (gallery.py). Scenes that did not change since the JSON in
+results/stability are not simulated again: their rows are compared with today's bounds.
 """
 
 from __future__ import annotations
 
+import json
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from itertools import groupby
@@ -16,24 +18,56 @@ from typing import Any
 from hgn.config import MpmConfig
 from hgn.runtime.rollouts import RolloutResult
 from hgn.scene.scene import Scene
+from hgn.schema import to_mapping
 from hgn.system.machine import available_cpus
 from tools.report import table
 from tools.solver_rollouts import other_grid, solver_trials
 from tools.stability.broken import BROKEN, FRICTIONLESS
 from tools.stability.checks import interval_text
-from tools.stability.gallery import GRID_CELLS, GalleryCase, load_gallery
-from tools.stability.observables import Film, series
+from tools.stability.gallery import GRID_CELLS, REFERENCE, GalleryCase, load_gallery
+from tools.stability.observables import BoundEntry, Film, series
 from tools.stability.row import Row
 
 RATE_HZ = 60.0  # of the shipped weights
 DIGITS = 5  # of figures in the JSON
+SIMULATED = ("device", "commit", "date")  # of the report's meta, in the entry of each scene
 
 
-def gallery_rows(case: str, mpm: MpmConfig, scenes: dict[str, Any]) -> Iterator[Row]:
-    """Simulates a draw of the gallery, adds the series of each scene to `scenes`, and yields a row for each bound."""
-    for measured in _simulated(load_gallery(case), mpm):
-        scenes[measured[0].name], rows = measure(*measured)
+def gallery_rows(case: str, mpm: MpmConfig, meta: dict[str, Any], scenes: dict[str, Any]) -> Iterator[Row]:
+    """Adds the series of each scene of a draw to `scenes`, and yields a row for each bound; `meta` is the report's."""
+    loaded, earlier = load_gallery(case), _earlier(case, mpm)
+    again = []
+    for each in loaded:
+        entry = earlier["scenes"].get(each.name, {"digest": None})
+        figures = [earlier["figures"].get(_name(each, bound)) for bound in each.measure.bounds]
+        if entry["digest"] != each.digest or None in figures:
+            again.append(each)
+            continue
+        scenes[each.name] = {"simulated": earlier["simulated"]} | entry
+        own = {cells: [_numbers(one[b.key]) for b in each.measure.bounds] for cells, one in entry["series"].items()}
+        for index, bound in enumerate(each.measure.bounds):
+            solver = {cells: bound.reduced(series[index]) for cells, series in own.items()}
+            yield _row(each, bound, solver, {k: math.nan if v is None else v for k, v in figures[index].items()})
+    for measured in _simulated(again, mpm):
+        entry, rows = measure(*measured)
+        scenes[measured[0].name] = {"simulated": {name: meta[name] for name in SIMULATED}} | entry
         yield from rows
+
+
+def _earlier(case: str, mpm: MpmConfig) -> dict[str, Any]:
+    """Reads the scenes of an earlier report, and the figures of broken trajectories by row; none of another solver."""
+    file = REFERENCE / f"{case}_solver.json"
+    report = json.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}
+    meta = report.get("meta", {})
+    if without_device(meta.get("solver", {})) != without_device(to_mapping(mpm)):
+        return {"scenes": {}, "figures": {}}
+    figures = {row["case"]: row["broken"] for row in report["rows"] if "broken" in row}
+    return {"scenes": report["scenes"], "figures": figures, "simulated": {name: meta[name] for name in SIMULATED}}
+
+
+def without_device(solver: Mapping[str, Any]) -> dict[str, Any]:
+    """Returns the solver's settings without where it runs."""
+    return {name: value for name, value in solver.items() if name not in ("device", "scenes_per_launch")}
 
 
 def measure(
@@ -43,9 +77,7 @@ def measure(
     entry: dict[str, Any] = {"kind": case.measure.kind, "digest": case.digest, "series": {}}
     entry["particles"] = case.scenes[0].particle_count
     if causes:
-        return entry, [
-            Row(f"{case.name}: {b.label}", "simulated", "stopped", False, causes[0]) for b in case.measure.bounds
-        ]
+        return entry, [Row(_name(case, b), "simulated", "stopped", False, causes[0]) for b in case.measure.bounds]
     bounds = {bound.key: bound for bound in case.measure.bounds}
     coarse = films[GRID_CELLS[0]]
     every = {str(cells): film for cells, film in films.items()}
@@ -64,19 +96,31 @@ def measure(
     for bound in case.measure.bounds:
         figures = {name: bound.reduced(measured[name, bound.key]) for name in every}
         own, wrong = ({k: v for k, v in figures.items() if (k in grids) == of_grid} for of_grid in (True, False))
-        low, high = bound.interval(own[str(GRID_CELLS[0])])
-        passed = {cells: low <= figure <= high for cells, figure in own.items()}
-        failed = [name for name, figure in wrong.items() if not low <= figure <= high]
-        beyond = ", ".join(f"{figure:.4g} at {cells}" for cells, figure in own.items()) + "; fails: "
-        beyond += ", ".join(failed) or "no broken trajectory"
-        more: dict[str, Any] = {"scene": case.name, "kind": case.measure.kind, "observable": bound.of}
-        more |= _finite({"low": low, "high": high})
-        more |= {"solver": _finite(own), "broken": _finite(wrong), "caught": failed}
-        value = own[str(GRID_CELLS[-1])]
-        held = all(passed.values()) and bool(failed)
-        shown: float | str = value if math.isfinite(value) else "none"
-        rows.append(Row(f"{case.name}: {bound.label}", interval_text(low, high), shown, held, beyond, more))
+        rows.append(_row(case, bound, own, wrong))
     return entry, rows
+
+
+def _row(case: GalleryCase, bound: BoundEntry, solver: dict[str, float], broken: dict[str, float]) -> Row:
+    """Compares the figures of both grids, by cells per unit, and of broken trajectories with a bound."""
+    low, high = bound.interval(solver[str(GRID_CELLS[0])])
+    failed = [name for name, figure in broken.items() if not low <= figure <= high]
+    beyond = ", ".join(f"{figure:.4g} at {cells}" for cells, figure in solver.items()) + "; fails: "
+    beyond += ", ".join(failed) or "no broken trajectory"
+    more: dict[str, Any] = {"scene": case.name, "kind": case.measure.kind, "observable": bound.of}
+    more |= _finite({"low": low, "high": high})
+    more |= {"solver": _finite(solver), "broken": _finite(broken), "caught": failed}
+    value = solver[str(GRID_CELLS[-1])]
+    held = all(low <= figure <= high for figure in solver.values()) and bool(failed)
+    shown: float | str = value if math.isfinite(value) else "none"
+    return Row(_name(case, bound), interval_text(low, high), shown, held, beyond, more)
+
+
+def _name(case: GalleryCase, bound: BoundEntry) -> str:
+    return f"{case.name}: {bound.label}"
+
+
+def _numbers(line: str) -> list[float]:
+    return [float(number) for number in line.split()]
 
 
 def broken_table(rows: Sequence[Row]) -> str:
