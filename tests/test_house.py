@@ -18,8 +18,8 @@ PACKAGES = ("hgn", "datagen", "tools")
 LINES = {  # of Python, in tracked files
     "hgn": 27_261,
     "datagen": 8_471,
-    "tools": 7_110,
-    "tests": 26_971,
+    "tools": 7_154,
+    "tests": 26_982,
 }
 SETTINGS = 238  # fields of the dataclasses behind the commands, *Config
 
