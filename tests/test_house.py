@@ -18,7 +18,7 @@ PACKAGES = ("hgn", "datagen", "tools")
 LINES = {  # of Python, in tracked files
     "hgn": 27_261,
     "datagen": 8_471,
-    "tools": 7_154,
+    "tools": 7_155,
     "tests": 26_982,
 }
 SETTINGS = 238  # fields of the dataclasses behind the commands, *Config

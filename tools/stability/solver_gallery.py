@@ -15,13 +15,14 @@ from dataclasses import replace
 from itertools import groupby
 from typing import Any
 
+from datagen.fine import solver_on_grid
 from hgn.config import MpmConfig
 from hgn.runtime.rollouts import RolloutResult
 from hgn.scene.scene import Scene
 from hgn.schema import to_mapping
 from hgn.system.machine import available_cpus
 from tools.report import table
-from tools.solver_rollouts import other_grid, solver_trials
+from tools.solver_rollouts import solver_trials
 from tools.stability.broken import BROKEN, FRICTIONLESS
 from tools.stability.checks import interval_text
 from tools.stability.gallery import GRID_CELLS, REFERENCE, GalleryCase, load_gallery
@@ -172,7 +173,7 @@ def _launched(
                 jobs.append((index, "far", case.scene(cells, far=True)))
             if cells == GRID_CELLS[0] and _has_friction(scene):
                 jobs.append((index, FRICTIONLESS, _smooth(scene)))
-        config = other_grid(mpm, 1 / cells, 1 / GRID_CELLS[0])
+        config = solver_on_grid(mpm, 1 / cells, 1 / GRID_CELLS[0])
         frames = max(case.measure.frames for case in cases)
         trials = solver_trials([scene for *_, scene in jobs], config, frames, RATE_HZ)
         by_job = {(index, what): (scene, trial) for (index, what, scene), trial in zip(jobs, trials, strict=True)}
