@@ -6,7 +6,7 @@ Writes README.md with the Hub's metadata and a table of the content of the weigh
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,6 +17,7 @@ from hgn.command import run_command
 from hgn.data.manifest import SPLITS, Manifest
 from hgn.data.storage import is_remote
 from hgn.runtime.weights import WeightsInfo, find_weights, load_weights
+from hgn.scene.world import RANGES
 from hgn.schema import from_mapping, require
 from hgn.system.files import write_atomically
 
@@ -105,11 +106,12 @@ def data_card(manifest: Manifest, name: str, licence: str) -> str:
     rows |= {
         "frames a second": f"{manifest.config['frame_rate_hz']:g}",
         "materials": ", ".join(scene["materials"]),
-        "gravity": _vector(scene["gravity"]),
+        "gravity": "of each scene" if scene.get("kinds") else _vector(scene["gravity"]),
         "made by": f"an import of {own['format']} files" if own else "HGN's solver",
         **_reference_row(manifest.config.get("reference")),
         "configuration": manifest.config_hash[:12],
     }
+    rows |= _kind_rows(scene.get("kinds") or {})
     kind = "imported" if own else "EXPERIMENT"
     use = f"python -m hgn.train +experiment={kind} dataset.folder=hf://datasets/USER/NAME"
     return _page(metadata, name, "Trajectories of particles: WebDataset shards, a manifest and an index.", rows, use)
@@ -120,6 +122,17 @@ def _reference_row(reference: dict[str, Any] | None) -> dict[str, str]:
         return {}
     children = f"{reference['particles_per_visible']} there, {reference['visible']}"
     return {"simulated on": f"{reference['cells']} cells per unit; each particle stands for {children}"}
+
+
+def _kind_rows(kinds: Mapping[str, float]) -> dict[str, str]:
+    """Returns a row for each kind of scenes: its share, and the range of each number that it draws."""
+    total = sum(kinds.values())
+    return {
+        f"kind {kind}": f"{share / total:.1%}; "
+        + ", ".join(f"{name} {low:g} to {high:g}" for name, (low, high) in RANGES[kind].items())
+        for kind, share in kinds.items()
+        if share > 0
+    }
 
 
 def _vector(value: Sequence[float]) -> str:

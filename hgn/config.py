@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from hgn.scene.material import MATERIAL_NAME, MATERIALS, PAPER_MATERIALS
+from hgn.scene.kinds import require_kinds
 from hgn.schema import (
     AtMostOne,
     BelowOne,
@@ -114,6 +115,9 @@ class SceneConfig:
     # largest obstacle_size, form a funnel below the groups
     funnel_scene_fraction: Fraction[float] = 0.0
     funnel_hole: tuple[float, float] = (0.035, 0.14)  # smallest and largest side of a funnel's square hole
+    # kinds of hgn.scene.world and their shares, as in conf/scene/world.yaml, which draw all but domain_size (the
+    # largest), cell_size, materials and particles_per_cell; empty: all scenes are as the settings above say
+    kinds: dict[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         require_bounds(self)
@@ -138,14 +142,16 @@ class SceneConfig:
         for i, name in enumerate(self.obstacle_shapes):
             rule = f"one of {', '.join(OBSTACLE_SHAPES)}, or a mesh file ({', '.join(MESH_SUFFIXES)})"
             require(name in OBSTACLE_SHAPES or is_mesh_file(name), f"obstacle_shapes[{i}]", rule, name)
+        require_kinds(self)
         require(len(self.materials) > 0, "materials", "a list with at least one material", list(self.materials))
         require(len(self.group_shapes) > 0, "group_shapes", "a list with at least one shape", [])
-        require(
-            self.obstacle_count == 0 or len(self.obstacle_shapes) > 0,
-            "obstacle_shapes",
-            "a list with at least one shape where obstacle_count > 0",
-            [],
-        )
+        rule = "a list with at least one shape where obstacle_count > 0"
+        require(self.obstacle_count == 0 or len(self.obstacle_shapes) > 0, "obstacle_shapes", rule, [])
+
+    @property
+    def upright(self) -> bool:
+        """Returns whether all scenes have the gravity of the settings."""
+        return not self.kinds and self.zero_gravity_fraction == 0 and self.tilted_gravity_fraction == 0
 
 
 @dataclass(frozen=True)
@@ -401,12 +407,8 @@ class TrainingConfig:
 
     def __post_init__(self) -> None:
         require_bounds(self)
-        require(
-            self.final_learning_rate <= self.learning_rate,
-            "final_learning_rate",
-            f"at most learning_rate ({self.learning_rate})",
-            self.final_learning_rate,
-        )
+        rule, last = f"at most learning_rate ({self.learning_rate})", self.final_learning_rate
+        require(last <= self.learning_rate, "final_learning_rate", rule, last)
 
 
 @dataclass(frozen=True)
@@ -428,16 +430,11 @@ class TrainConfig:
         self.step.require_fits(self.network.relative, self.network.dimensions)
         rule, dimensions = "3 for data that are not imported", self.network.dimensions
         require(self.imported or dimensions == 3, "network.dimensions", rule, dimensions)
-        upright = self.scene.zero_gravity_fraction == 0 and self.scene.tilted_gravity_fraction == 0
-        rule = "relative where scene.zero_gravity_fraction or scene.tilted_gravity_fraction is above 0"
-        require(self.network.relative or upright, "network.inputs", rule, self.network.inputs)
-        require(
-            self.network.obstacle_features or self.scene.obstacle_count == 0,
-            "network.obstacle_features",
-            "true for scenes with obstacles",
-            False,
-            "or set scene.obstacle_count=0 scene.funnel_scene_fraction=0",
-        )
+        rule = "relative where scene.kinds are given, or zero_gravity_fraction or tilted_gravity_fraction is above 0"
+        require(self.network.relative or self.scene.upright, "network.inputs", rule, self.network.inputs)
+        sees, remedy = self.network.obstacle_features, "or set scene.obstacle_count=0 scene.funnel_scene_fraction=0"
+        rule = "true for scenes with obstacles"
+        require(sees or self.scene.obstacle_count == 0, "network.obstacle_features", rule, False, remedy)
         simulates, frames = self.training.pushforward_fraction > 0, self.dataset.frames
         rule = f"at least {SIMULATED_FRAMES} where training.pushforward_fraction > 0"
         require(not simulates or frames >= SIMULATED_FRAMES, "dataset.frames", rule, frames)

@@ -16,10 +16,10 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 27_261,
-    "datagen": 8_471,
+    "hgn": 27_740,
+    "datagen": 8_477,
     "tools": 7_155,
-    "tests": 26_982,
+    "tests": 27_194,
 }
 SETTINGS = 238  # fields of the dataclasses behind the commands, *Config
 

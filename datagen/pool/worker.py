@@ -21,7 +21,7 @@ from hgn.data.identity import physics_settings
 from hgn.scene.episode import Episode
 from hgn.scene.obstacle_grid import ObstacleGrid
 from hgn.scene.scene import Scene
-from hgn.schema import ConfigError
+from hgn.schema import ConfigError, Vector
 from hgn.system.extras import missing_extra
 
 
@@ -171,14 +171,17 @@ def simulate_batch(
     threads: int | None,
     reporter: Callable[[int], Callable[[int], None]] | None = None,
 ) -> list[Any]:
-    """Simulates a batch, in one launch for each episode length, and returns the solver's results.
+    """Simulates a batch, in one launch for each episode length and domain, and returns the solver's results.
 
     `reporter` maps the scene count of a launch to a function that is called with each of its frames.
     """
-    simulate, lengths = pkgutil.resolve_name(backend.simulate), [config.dataset.frames_of(m.task.index) for m in batch]
+    simulate = pkgutil.resolve_name(backend.simulate)
+    launches: dict[tuple[int, Vector], list[MadeScene]] = {}
+    for made in batch:
+        key = config.dataset.frames_of(made.task.index), made.scene.open().domain_size
+        launches.setdefault(key, []).append(made)
     results: dict[SceneTask, Any] = {}
-    for frames in sorted(set(lengths)):
-        launch = [made for made, length in zip(batch, lengths, strict=True) if length == frames]
+    for (frames, _), launch in sorted(launches.items(), key=lambda item: item[0]):
         of_launch = simulate(
             [scene_to_simulate(made.scene.open(), config) for made in launch],
             solver_to_use(config),

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from hgn.config import DatagenConfig
+from hgn.scene.world import MAXIMUM_PARTICLES
 from hgn.schema import require
 
 GPU_SCENES_PER_LAUNCH = 416  # several for each thread-block team
@@ -68,6 +69,8 @@ def gpu_scenes_per_launch(config: DatagenConfig, memory_bytes: float) -> int:
     scene = config.scene
     nodes = math.prod(math.ceil(length / config.reference_cell_size) for length in scene.domain_size)
     particles = scene.group_count * scene.particles_per_cell * (scene.group_size / scene.cell_size) ** 3
+    if scene.kinds:
+        particles = MAXIMUM_PARTICLES
     particles *= config.reference["particles_per_visible"] if config.reference else 1
     held = memory_bytes / 2 / (12 * config.dataset.most_frames * max(particles, 1))
     gigabytes = f"{memory_bytes / 2e9 / max(held, 1e-9):.3g} GB of {memory_bytes / 2e9:.3g}"

@@ -23,7 +23,7 @@ _NOT_PHYSICS = ("device", "scenes_per_launch")
 # settings of scenes that older data sets lack, and which are left out at their defaults
 _LATER_OPTIONS = (
     "pure_direction_fraction", "colliding_scene_fraction", "zero_gravity_fraction", "tilted_gravity_fraction",
-    "maximum_tilted_gravity", "funnel_scene_fraction", "funnel_hole",
+    "maximum_tilted_gravity", "funnel_scene_fraction", "funnel_hole", "kinds",
 )  # fmt: skip
 
 

@@ -7,15 +7,13 @@ sines and cosines (in the unit shapes) are rounded to float32.
 
 from __future__ import annotations
 
-import functools
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from hgn.config import SceneConfig, is_mesh_file
-from hgn.scene.distance import contains
 from hgn.scene.funnel import Funnel, draw_funnel
 from hgn.scene.group import (
     WALL_CELLS,
@@ -26,41 +24,33 @@ from hgn.scene.group import (
     random_direction,
     region_of,
 )
-from hgn.scene.material import material_index
+from hgn.scene.placement import (
+    CLEARANCE_CELLS,
+    ROUNDING,
+    Body,
+    Placed,
+    assemble,
+    blocked,
+    place_shape,
+    thrown,
+    too_near,
+    triple,
+    unit_surface_points,
+)
 from hgn.scene.rotation import quaternion_rotation, rotate
-from hgn.scene.scene import Obstacle, Scene
-from hgn.scene.shapes import mesh_sha256, shape_obstacle, unit_shape
-from hgn.scene.surface import point_tree, split_long_edges
+from hgn.scene.scene import Scene
+from hgn.scene.shapes import mesh_sha256, shape_obstacle
+from hgn.scene.surface import point_tree
+from hgn.scene.world import Layout, draw_layout
 from hgn.schema import ConfigError, Vector, require
 
-if TYPE_CHECKING:
-    from scipy.spatial import cKDTree
-
-
 REPORT_SEED = 1_000_000  # the first of scenes that reports draw for themselves: a data set's seeds are hashes
-CLEARANCE_CELLS = 2.0  # between obstacles, groups and walls, in solver cells
 MAXIMUM_TILTED_GRAVITY = 19.6  # domain units per second squared
 LAYOUTS = 5  # whole scenes begun afresh before giving up
 SHAPES_PER_ITEM = 20  # sizes, shapes and orientations drawn for one obstacle or group
 PLACES_PER_SHAPE = 50
 FUNNELS = 300  # drawn for one that fits
-SURFACE_DETAIL = 0.045  # longest edge, relative to the size, of the pieces that distances are taken between
-FEW = 32
 LONE_CELLS = 6  # solver cells from a lone particle to any other: beyond what a network looks at for neighbours
-ROUNDING = 1e-6  # of a length; keeps float32 rounding on the right side of every bound
-
-
-@dataclass(frozen=True)
-class _Placed:
-    """An obstacle with points of its surface; no surface point is farther than `gap` from one of them."""
-
-    obstacle: Obstacle
-    point_P3: np.ndarray
-    gap: float
-    tree: cKDTree
-    low: np.ndarray
-    high: np.ndarray
-    record: dict[str, Any]
 
 
 class _NoRoomError(Exception):
@@ -69,7 +59,7 @@ class _NoRoomError(Exception):
 
 def generate_scene(config: SceneConfig, seed: int) -> Scene:
     """A random scene with particles at rest, or with one velocity per group; a lone particle is a group of size 0.
-    Its gravity is the config's, none, or a drawn one.
+    Its gravity is the config's, none, or a drawn one. With `kinds`, the scene is of one of them (hgn.scene.world).
 
     Obstacles lie completely inside the domain, CLEARANCE_CELLS solver cells from each other and none inside
     another, but for the four squares of a funnel, which cross; groups keep the same distance to obstacles, to
@@ -80,6 +70,12 @@ def generate_scene(config: SceneConfig, seed: int) -> Scene:
     Raises: ConfigError when an item finds no room, with what to change.
     """
     require(isinstance(seed, int) and seed >= 0, "seed", "a whole number >= 0", seed)
+    kind = None
+    if config.kinds:
+        kind, drawn = draw_layout(config, seed)
+        if isinstance(drawn, Layout):
+            return assemble(drawn.config, seed, drawn.gravity, drawn.obstacles, drawn.bodies, kind)
+        config = drawn
     rng = np.random.Generator(np.random.PCG64(seed))
     # the rest of a scene is the same without them
     lone_rng, motion_rng, funnel_rng = (np.random.Generator(np.random.PCG64([seed, stream])) for stream in (1, 2, 3))
@@ -101,7 +97,7 @@ def generate_scene(config: SceneConfig, seed: int) -> Scene:
         bodies = [_fill_group(config, shape, region, rng) for shape, region in groups]
         bodies = _collide(config, bodies, motion_rng) if colliding else _purify(config, bodies, gravity, motion_rng)
         bodies += [_fill_group(config, "cube", region, lone_rng) for region in lone]
-        return _assemble(config, seed, gravity, obstacles, bodies)
+        return assemble(config, seed, gravity, obstacles, bodies, kind)
     raise ConfigError(f"{failure} ({LAYOUTS} layouts, seed {seed})")
 
 
@@ -119,9 +115,7 @@ class _PlacedFunnel:
         return self.hole_3 + rotate(local_3[None], self.funnel.rotation_33)[0]
 
 
-def _place_funnel(
-    config: SceneConfig, gravity: Vector, rng: np.random.Generator
-) -> tuple[_PlacedFunnel, list[_Placed]]:
+def _place_funnel(config: SceneConfig, gravity: Vector, rng: np.random.Generator) -> tuple[_PlacedFunnel, list[Placed]]:
     domain = np.array(config.domain_size)
     for _ in range(FUNNELS):
         funnel = draw_funnel(config, gravity, rng)
@@ -129,26 +123,20 @@ def _place_funnel(
         span_3 = domain - ROUNDING * domain - funnel.extent_P3.max(axis=0) - first_3
         if (span_3 >= 0).all():
             hole_3 = first_3 + span_3 * rng.random(3)
-            return _PlacedFunnel(funnel, hole_3), [_place_square(funnel, hole_3, index) for index in range(4)]
+            return _PlacedFunnel(funnel, hole_3), _squares(funnel, hole_3)
     raise _NoRoomError(
         f"funnel_scene_fraction must be 0 where no funnel of {FUNNELS} fits, got {config.funnel_scene_fraction:g}; "
         "lower it, obstacle_size or group_size, or raise domain_size"
     )
 
 
-def _place_square(funnel: Funnel, hole_3: np.ndarray, index: int) -> _Placed:
-    rotation_33, centre_3 = quaternion_rotation(funnel.quaternion[index]), hole_3 + funnel.centre_43[index]
-    position = _triple(centre_3)
-    square = shape_obstacle("square", funnel.size, position, rotation_33, f"obstacle_{index}_square")
-    unit_surface_P3, unit_gap = _unit_surface_points("square")
-    point_P3 = rotate(funnel.size * unit_surface_P3, rotation_33) + centre_3
-    low_3, high_3 = square.vertex_V3.min(axis=0), square.vertex_V3.max(axis=0)
-    record: dict[str, Any] = {"shape": "square", "size": funnel.size}
-    record |= {"position": list(position), "quaternion": list(funnel.quaternion[index])}
-    return _Placed(square, point_P3, funnel.size * unit_gap, point_tree(point_P3), low_3, high_3, record)
+def _squares(funnel: Funnel, hole_3: np.ndarray) -> list[Placed]:
+    centre_43 = hole_3 + funnel.centre_43
+    parts = enumerate(zip(centre_43, funnel.quaternion, strict=True))
+    return [place_shape("square", funnel.size, triple(centre_3), turn, index) for index, (centre_3, turn) in parts]
 
 
-def _place_obstacles(config: SceneConfig, sheets: list[_Placed], rng: np.random.Generator) -> list[_Placed]:
+def _place_obstacles(config: SceneConfig, sheets: list[Placed], rng: np.random.Generator) -> list[Placed]:
     """`sheets` are placed, and count."""
     placed = list(sheets)
     for index in range(len(sheets), config.obstacle_count):
@@ -156,7 +144,7 @@ def _place_obstacles(config: SceneConfig, sheets: list[_Placed], rng: np.random.
     return placed
 
 
-def _place_obstacle(config: SceneConfig, placed: list[_Placed], index: int, rng: np.random.Generator) -> _Placed:
+def _place_obstacle(config: SceneConfig, placed: list[Placed], index: int, rng: np.random.Generator) -> Placed:
     clearance = CLEARANCE_CELLS * config.cell_size
     domain = np.array(config.domain_size)
     smallest, largest = config.obstacle_size
@@ -171,42 +159,28 @@ def _place_obstacle(config: SceneConfig, placed: list[_Placed], index: int, rng:
         span = domain - ROUNDING * domain - high - first
         if (span < 0).any():
             continue
-        unit_surface, unit_gap = _unit_surface_points(shape)
+        unit_surface, unit_gap = unit_surface_points(shape)
         surface, gap = rotate(size * unit_surface, rotation), size * unit_gap
         for _ in range(PLACES_PER_SHAPE):
             centre = first + span * rng.random(3)
-            position = _triple(centre)
+            position = triple(centre)
             obstacle = shape_obstacle(shape, size, position, rotation, f"obstacle_{index}_{Path(shape).stem}")
             point = surface + centre
-            if any(_too_near(obstacle, point, gap, other, clearance) for other in placed):
+            if any(too_near(obstacle, point, gap, other, clearance) for other in placed):
                 continue
             record: dict[str, Any] = {"shape": shape, "size": size}
             record |= {"position": list(position), "quaternion": quaternion}
             if is_mesh_file(shape):
                 record["sha256"] = mesh_sha256(shape)
-            return _Placed(obstacle, point, gap, point_tree(point), low + centre, high + centre, record)
+            return Placed(obstacle, point, gap, point_tree(point), low + centre, high + centre, record)
     raise _NoRoomError(
         f"obstacle_count must leave room for each obstacle, got no place for number {index + 1} of "
         f"{config.obstacle_count}; lower obstacle_count or obstacle_size, or raise domain_size"
     )
 
 
-def _too_near(obstacle: Obstacle, point: np.ndarray, gap: float, other: _Placed, clearance: float) -> bool:
-    low, high = obstacle.vertex_V3.min(axis=0), obstacle.vertex_V3.max(axis=0)
-    bound = clearance + gap + other.gap  # apart by this, the points prove the surfaces apart by the clearance
-    if (low > other.high + bound).any() or (high < other.low - bound).any():
-        return False
-    point = point[((point >= other.low - bound) & (point <= other.high + bound)).all(axis=1)]
-    for subset in (point[::FEW], point):  # most overlaps show at a few points already
-        if np.isfinite(other.tree.query(subset, distance_upper_bound=bound)[0]).any():
-            return True
-    # the surfaces do not meet, so one vertex tells whether one body holds the other
-    holds = contains(obstacle.vertex_V3[:1], other.obstacle) | contains(other.obstacle.vertex_V3[:1], obstacle)
-    return bool(holds.any())
-
-
 def _place_groups(
-    config: SceneConfig, obstacles: list[_Placed], funnel: _PlacedFunnel | None, rng: np.random.Generator
+    config: SceneConfig, obstacles: list[Placed], funnel: _PlacedFunnel | None, rng: np.random.Generator
 ) -> list[tuple[str, Region]]:
     placed: list[tuple[str, Region]] = []
     for index in range(config.group_count):
@@ -216,7 +190,7 @@ def _place_groups(
 
 def _place_group(
     config: SceneConfig,
-    obstacles: list[_Placed],
+    obstacles: list[Placed],
     groups: list[Region],
     funnel: _PlacedFunnel | None,
     index: int,
@@ -232,10 +206,10 @@ def _place_group(
             centre_3 = margin + span * rng.random(3) if funnel is None else funnel.place(rng)
             if (centre_3 < margin).any() or (centre_3 > margin + span).any():
                 continue
-            region = region_of(shape, size, _triple(centre_3))
+            region = region_of(shape, size, triple(centre_3))
             if any(region.distance(other) < clearance for other in groups):
                 continue
-            if any(_blocked(region, item, clearance) for item in obstacles):
+            if any(blocked(region, item, clearance) for item in obstacles):
                 continue
             return shape, region
     raise _NoRoomError(
@@ -246,7 +220,7 @@ def _place_group(
 
 
 def _place_lone_particles(
-    config: SceneConfig, obstacles: list[_Placed], groups: list[Region], rng: np.random.Generator
+    config: SceneConfig, obstacles: list[Placed], groups: list[Region], rng: np.random.Generator
 ) -> list[Region]:
     near = LONE_CELLS * config.cell_size
     clearance = CLEARANCE_CELLS * config.cell_size + ROUNDING
@@ -255,10 +229,10 @@ def _place_lone_particles(
     placed: list[Region] = []
     for index in range(config.lone_particles):
         for _ in range(SHAPES_PER_ITEM * PLACES_PER_SHAPE if (span >= 0).all() else 0):
-            region = Region(_triple(margin + span * rng.random(3)))
+            region = Region(triple(margin + span * rng.random(3)))
             if any(region.distance(other) < near for other in (*groups, *placed)):
                 continue
-            if not any(_blocked(region, item, clearance) for item in obstacles):
+            if not any(blocked(region, item, clearance) for item in obstacles):
                 placed.append(region)
                 break
         else:
@@ -269,27 +243,7 @@ def _place_lone_particles(
     return placed
 
 
-def _blocked(region: Region, item: _Placed, clearance: float) -> bool:
-    bound = clearance + item.gap
-    centre = np.array(region.centre)
-    if (centre - region.reach > item.high + bound).any() or (centre + region.reach < item.low - bound).any():
-        return False
-    if (region.distances(item.point_P3) < bound).any():
-        return True
-    return bool(contains(centre[None], item.obstacle)[0])
-
-
-@dataclass(frozen=True, eq=False)
-class _Body:
-    """The particles of a group."""
-
-    position_N3: np.ndarray
-    velocity_3: np.ndarray
-    material: str
-    record: dict[str, Any]
-
-
-def _fill_group(config: SceneConfig, shape: str, region: Region, rng: np.random.Generator) -> _Body:
+def _fill_group(config: SceneConfig, shape: str, region: Region, rng: np.random.Generator) -> Body:
     material = _choice(config.materials, rng)
     velocity = np.zeros(3)
     if config.maximum_initial_speed > 0:
@@ -305,7 +259,7 @@ def _fill_group(config: SceneConfig, shape: str, region: Region, rng: np.random.
         "velocity": velocity.tolist(),
         "particle_count": count,
     }
-    return _Body(fill(region, count, rng), velocity, material, record)
+    return Body(fill(region, count, rng), velocity, material, record)
 
 
 def _draw_gravity(config: SceneConfig, rng: np.random.Generator) -> Vector:
@@ -315,11 +269,11 @@ def _draw_gravity(config: SceneConfig, rng: np.random.Generator) -> Vector:
     if kind < config.zero_gravity_fraction:
         return 0.0, 0.0, 0.0
     if kind < config.zero_gravity_fraction + config.tilted_gravity_fraction:
-        return _triple(size * MAXIMUM_TILTED_GRAVITY * direction_3)
+        return triple(size * MAXIMUM_TILTED_GRAVITY * direction_3)
     return config.gravity
 
 
-def _purify(config: SceneConfig, bodies: list[_Body], gravity: Vector, rng: np.random.Generator) -> list[_Body]:
+def _purify(config: SceneConfig, bodies: list[Body], gravity: Vector, rng: np.random.Generator) -> list[Body]:
     """Gives some of the moving groups a velocity exactly along gravity, against it or across it, uniform in size;
     y is up where there is no gravity.
     """
@@ -335,15 +289,15 @@ def _purify(config: SceneConfig, bodies: list[_Body], gravity: Vector, rng: np.r
         across_3 /= np.sqrt((across_3 * across_3).sum())
         direction_3 = up_3 if kind < 0.25 else -up_3 if kind < 0.5 else across_3
         pure = chosen < config.pure_direction_fraction and body.velocity_3.any()
-        changed.append(_thrown(body, size * config.maximum_initial_speed * direction_3) if pure else body)
+        changed.append(thrown(body, size * config.maximum_initial_speed * direction_3) if pure else body)
     return changed
 
 
-def _collide(config: SceneConfig, bodies: list[_Body], rng: np.random.Generator) -> list[_Body]:
+def _collide(config: SceneConfig, bodies: list[Body], rng: np.random.Generator) -> list[Body]:
     """Throws groups, two by two or all, so that they meet in the middle, off centre by up to half a group's size: the
     fastest at half the maximum speed or more. A group without a partner rests.
     """
-    pairs, changed = rng.random() < 0.5, [_thrown(body, np.zeros(3)) for body in bodies]
+    pairs, changed = rng.random() < 0.5, [thrown(body, np.zeros(3)) for body in bodies]
     size = 2 if pairs else max(len(bodies), 1)
     for first in range(0, len(bodies) - 1, size):
         centre_B3 = np.array([body.record["position"] for body in bodies[first : first + size]])
@@ -354,53 +308,9 @@ def _collide(config: SceneConfig, bodies: list[_Body], rng: np.random.Generator)
         way_B3 = aim_B3 - centre_B3
         way_B3 *= speed / np.sqrt((way_B3 * way_B3).sum(axis=1)).max()
         for place, velocity_3 in enumerate(way_B3, first):
-            changed[place] = _thrown(bodies[place], velocity_3)
+            changed[place] = thrown(bodies[place], velocity_3)
     return changed
-
-
-def _thrown(body: _Body, velocity_3: np.ndarray) -> _Body:
-    velocity_3 = velocity_3 + 0.0  # no -0.0
-    return replace(body, velocity_3=velocity_3, record=body.record | {"velocity": velocity_3.tolist()})
-
-
-def _assemble(config: SceneConfig, seed: int, gravity: Vector, obstacles: list[_Placed], bodies: list[_Body]) -> Scene:
-    none = np.zeros((0, 3), np.float32)
-    counts = [len(body.position_N3) for body in bodies]
-    materials = np.array([material_index(body.material) for body in bodies], np.uint8)
-    velocities = np.array([body.velocity_3 for body in bodies], np.float32).reshape(-1, 3)
-    return Scene(
-        position_N3=np.concatenate([none, *(body.position_N3 for body in bodies)]),
-        velocity_N3=np.repeat(velocities, counts, axis=0),
-        material_N=np.repeat(materials, counts),
-        obstacles=tuple(item.obstacle for item in obstacles),
-        domain_size=config.domain_size,
-        cell_size=config.cell_size,
-        gravity=gravity,
-        seed=seed,
-        particles_per_cell=config.particles_per_cell,
-        specification={
-            "kind": "random",
-            "seed": seed,
-            "obstacles": [item.record for item in obstacles],
-            "groups": [body.record for body in bodies],
-        },
-    )
-
-
-@functools.cache
-def _unit_surface_points(shape: str) -> tuple[np.ndarray, float]:
-    """Points on the shape of size 1, and how far the rest of its surface is from them at most."""
-    vertex, triangle, _ = unit_shape(shape)
-    pieces = split_long_edges(vertex[triangle], SURFACE_DETAIL)
-    centroid = (pieces[:, 0] + pieces[:, 1] + pieces[:, 2]) / 3
-    offset = pieces - centroid[:, None]  # the farthest point of a triangle from its centroid is a corner
-    return centroid, float(np.sqrt((offset * offset).sum(axis=2).max())) + ROUNDING
 
 
 def _choice(options: tuple[str, ...], rng: np.random.Generator) -> str:
     return options[int(rng.random() * len(options))]
-
-
-def _triple(point: np.ndarray) -> Vector:
-    x, y, z = point.tolist()
-    return x, y, z

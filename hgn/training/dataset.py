@@ -61,7 +61,7 @@ def _require_goes_with(config: TrainConfig, store: EpisodeStore, field: str) -> 
     require(known_materials, field, f"of the materials {', '.join(network.materials)}", list(scene.materials))
     seen = network.obstacle_features or scene.obstacle_count == 0
     require(seen, field, "without obstacles, which the network does not see", folder)
-    upright = scene.gravity == config.scene.gravity and not scene.zero_gravity_fraction + scene.tilted_gravity_fraction
+    upright = scene.gravity == config.scene.gravity and scene.upright
     require(network.relative or upright, field, "of dataset's gravity where network.inputs=absolute", folder)
     differences = identity_differences(stored["mpm"], physics_settings(config.datagen), "mpm")
     require(not differences, field, "of the same physics", f"{folder}, where {'; '.join(differences[:3])}")

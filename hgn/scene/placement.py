@@ -1,0 +1,144 @@
+"""Items of random scenes: placed obstacles and filled groups, and whether they keep their distance.
+
+Shape legend: N particles, P points, V vertices.
+"""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from hgn.config import SceneConfig
+from hgn.scene.distance import contains
+from hgn.scene.group import Region
+from hgn.scene.material import material_index
+from hgn.scene.rotation import quaternion_rotation, rotate
+from hgn.scene.scene import Obstacle, Scene
+from hgn.scene.shapes import shape_obstacle, unit_shape
+from hgn.scene.surface import point_tree, split_long_edges
+from hgn.schema import Vector
+
+if TYPE_CHECKING:
+    from scipy.spatial import cKDTree
+
+CLEARANCE_CELLS = 2.0  # between obstacles, groups and walls, in solver cells
+SURFACE_DETAIL = 0.045  # longest edge, relative to the size, of the pieces that distances are taken between
+FEW = 32
+ROUNDING = 1e-6  # of a length; keeps float32 rounding on the right side of every bound
+
+
+@dataclass(frozen=True)
+class Placed:
+    """An obstacle with points of its surface; no surface point is farther than `gap` from one of them."""
+
+    obstacle: Obstacle
+    point_P3: np.ndarray
+    gap: float
+    tree: cKDTree
+    low: np.ndarray
+    high: np.ndarray
+    record: dict[str, Any]
+
+
+def place_shape(
+    shape: str, size: float, position: Vector, quaternion: tuple[float, float, float, float], index: int
+) -> Placed:
+    """Returns obstacle number `index` of a scene: a built-in shape of a size, about a position."""
+    rotation_33 = quaternion_rotation(quaternion)
+    obstacle = shape_obstacle(shape, size, position, rotation_33, f"obstacle_{index}_{shape}")
+    unit_surface_P3, unit_gap = unit_surface_points(shape)
+    point_P3 = rotate(size * unit_surface_P3, rotation_33) + np.array(position)
+    low_3, high_3 = obstacle.vertex_V3.min(axis=0), obstacle.vertex_V3.max(axis=0)
+    record: dict[str, Any] = {"shape": shape, "size": size}
+    record |= {"position": list(position), "quaternion": list(quaternion)}
+    return Placed(obstacle, point_P3, size * unit_gap, point_tree(point_P3), low_3, high_3, record)
+
+
+def too_near(obstacle: Obstacle, point: np.ndarray, gap: float, other: Placed, clearance: float) -> bool:
+    low, high = obstacle.vertex_V3.min(axis=0), obstacle.vertex_V3.max(axis=0)
+    bound = clearance + gap + other.gap  # apart by this, the points prove the surfaces apart by the clearance
+    if (low > other.high + bound).any() or (high < other.low - bound).any():
+        return False
+    point = point[((point >= other.low - bound) & (point <= other.high + bound)).all(axis=1)]
+    for subset in (point[::FEW], point):  # most overlaps show at a few points already
+        if np.isfinite(other.tree.query(subset, distance_upper_bound=bound)[0]).any():
+            return True
+    # the surfaces do not meet, so one vertex tells whether one body holds the other
+    holds = contains(obstacle.vertex_V3[:1], other.obstacle) | contains(other.obstacle.vertex_V3[:1], obstacle)
+    return bool(holds.any())
+
+
+def blocked(region: Region, item: Placed, clearance: float) -> bool:
+    bound = clearance + item.gap
+    centre = np.array(region.centre)
+    if (centre - region.reach > item.high + bound).any() or (centre + region.reach < item.low - bound).any():
+        return False
+    if (region.distances(item.point_P3) < bound).any():
+        return True
+    return bool(contains(centre[None], item.obstacle)[0])
+
+
+@dataclass(frozen=True, eq=False)
+class Body:
+    """The particles of a group."""
+
+    position_N3: np.ndarray
+    velocity_3: np.ndarray
+    material: str
+    record: dict[str, Any]
+
+
+def thrown(body: Body, velocity_3: np.ndarray) -> Body:
+    velocity_3 = velocity_3 + 0.0  # no -0.0
+    return replace(body, velocity_3=velocity_3, record=body.record | {"velocity": velocity_3.tolist()})
+
+
+def assemble(
+    config: SceneConfig,
+    seed: int,
+    gravity: Vector,
+    obstacles: list[Placed],
+    bodies: list[Body],
+    layout: str | None = None,
+) -> Scene:
+    """Returns the scene of placed items; `layout` is its kind, where the config has several."""
+    none = np.zeros((0, 3), np.float32)
+    counts = [len(body.position_N3) for body in bodies]
+    materials = np.array([material_index(body.material) for body in bodies], np.uint8)
+    velocities = np.array([body.velocity_3 for body in bodies], np.float32).reshape(-1, 3)
+    return Scene(
+        position_N3=np.concatenate([none, *(body.position_N3 for body in bodies)]),
+        velocity_N3=np.repeat(velocities, counts, axis=0),
+        material_N=np.repeat(materials, counts),
+        obstacles=tuple(item.obstacle for item in obstacles),
+        domain_size=config.domain_size,
+        cell_size=config.cell_size,
+        gravity=gravity,
+        seed=seed,
+        particles_per_cell=config.particles_per_cell,
+        specification={
+            "kind": "random",
+            "seed": seed,
+            "obstacles": [item.record for item in obstacles],
+            "groups": [body.record for body in bodies],
+            **({} if layout is None else {"layout": layout}),
+        },
+    )
+
+
+@functools.cache
+def unit_surface_points(shape: str) -> tuple[np.ndarray, float]:
+    """Points on the shape of size 1, and how far the rest of its surface is from them at most."""
+    vertex, triangle, _ = unit_shape(shape)
+    pieces = split_long_edges(vertex[triangle], SURFACE_DETAIL)
+    centroid = (pieces[:, 0] + pieces[:, 1] + pieces[:, 2]) / 3
+    offset = pieces - centroid[:, None]  # the farthest point of a triangle from its centroid is a corner
+    return centroid, float(np.sqrt((offset * offset).sum(axis=2).max())) + ROUNDING
+
+
+def triple(point: np.ndarray) -> Vector:
+    x, y, z = point.tolist()
+    return x, y, z

@@ -1,0 +1,386 @@
+"""Scenes as users make them, by kind: pools, dam breaks, columns, slopes, edges, bowls, stairs and others.
+
+A kind draws a domain from DOMAINS, numbers uniformly from its RANGES, and places obstacles and bodies. Like the scenes
+of `hgn.scene.random_scene`, one follows from (config, seed) alone, bitwise on every machine: no sines or logarithms.
+Lengths in domain units, speeds in domain units per second. Bodies are boxes or balls; "tilt" is the tangent of half an
+angle, so that rotations are sums, products and quotients.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from hgn.config import SceneConfig
+from hgn.scene.group import WALL_CELLS, Region, fill, particle_count, points_in_ball, random_direction, region_of
+from hgn.scene.placement import CLEARANCE_CELLS, ROUNDING, Body, Placed, blocked, place_shape, triple
+from hgn.schema import ConfigError, Vector
+
+MAXIMUM_PARTICLES = 16_000  # of a scene; larger ones are drawn again
+DRAWS = 500  # of a scene of a kind, before giving up
+FALLING = (0.0, -9.8, 0.0)
+UNTURNED = (1.0, 0.0, 0.0, 0.0)
+
+Quaternion = tuple[float, float, float, float]
+
+# Edges in solver cells of 1/64. There are few, because scenes of one domain are simulated in one launch.
+DOMAINS: dict[str, tuple[int, int, int]] = {
+    "small": (24, 40, 24),
+    "box": (20, 32, 20),
+    "tray": (36, 32, 28),
+    "flume": (64, 40, 16),
+    "long": (128, 40, 24),
+    "tall": (40, 96, 40),
+    "room": (64, 64, 64),
+    "hall": (96, 64, 96),
+}
+
+# Smallest and largest value of each number that a kind draws.
+RANGES: dict[str, dict[str, tuple[float, float]]] = {
+    "obstacles": {"obstacles": (0, 8), "groups": (1, 6), "size": (0.04, 0.16)},
+    "motion": {"obstacles": (0, 6), "groups": (1, 6), "size": (0.04, 0.14), "speed": (0.5, 4.0)},
+    "collision": {"groups": (2, 6), "size": (0.05, 0.14), "speed": (0.5, 5.0)},
+    "funnel": {"groups": (2, 5), "size": (0.06, 0.1), "hole": (0.035, 0.2)},
+    "pool": {"depth": (0.03, 0.16), "tilt": (0.0, 0.13), "size": (0.04, 0.09), "height": (0.02, 0.2)},
+    "dam": {"length": (0.06, 0.3), "height": (0.08, 0.35)},
+    "column": {"width": (0.06, 0.18), "depth": (0.06, 0.18), "height": (0.05, 0.4)},
+    "drop": {"size": (0.04, 0.25), "height": (0.0, 0.8), "speed": (0.0, 5.0)},
+    "slope": {"plate": (0.45, 0.75), "tilt": (0.03, 0.36), "size": (0.05, 0.12)},
+    "edge": {
+        "plate": (0.2, 0.45), "height": (0.1, 0.35), "beyond": (-0.06, 0.06), "size": (0.05, 0.12), "drop": (0.03, 0.2),
+    },
+    "stack": {"bodies": (2, 4), "size": (0.06, 0.12), "shift": (-0.05, 0.05)},
+    "apart": {"bodies": (2, 4), "size": (0.05, 0.12), "speed": (0.01, 0.4), "tilt": (0.0, 0.1)},
+    "bowl": {"bowl": (0.25, 0.5), "size": (0.06, 0.14), "height": (0.05, 0.4)},
+    "channel": {"width": (0.16, 0.36), "plate": (0.3, 0.5), "length": (0.08, 0.2), "height": (0.1, 0.3)},
+    "stairs": {"steps": (3, 4), "plate": (0.2, 0.3), "rise": (0.06, 0.11), "size": (0.08, 0.14)},
+    "jet": {"length": (0.08, 0.3), "width": (0.05, 0.12), "speed": (1.5, 6.0)},
+}  # fmt: skip
+
+
+class _DrawAgainError(Exception):
+    """The drawn numbers do not fit."""
+
+
+@dataclass
+class Layout:
+    """A scene of a kind while it is drawn: call it with the name of one of the kind's RANGES for a number."""
+
+    config: SceneConfig
+    kind: str
+    rng: np.random.Generator
+    domain: Vector = (1.0, 1.0, 1.0)
+    gravity: Vector = FALLING
+    obstacles: list[Placed] = field(default_factory=list)
+    regions: list[Region] = field(default_factory=list)
+    bodies: list[Body] = field(default_factory=list)
+    particles: int = 0
+
+    def __call__(self, name: str, small: bool = False) -> float:
+        """Returns a number of the range; `small` ones are frequent, as with a uniform square root."""
+        low, high = RANGES[self.kind][name]
+        part = self.rng.random()
+        return low + (high - low) * (part * part if small else part)
+
+    def count(self, name: str) -> int:
+        """Returns a whole number of the range, ends included."""
+        low, high = RANGES[self.kind][name]
+        return int(low + int(self.rng.random() * (high - low + 1)))
+
+    def chance(self, probability: float) -> bool:
+        return self.rng.random() < probability
+
+    def one_of(self, *names: str) -> str:
+        return names[int(self.rng.random() * len(names))]
+
+    def take_domain(self, *names: str) -> None:
+        """Draws the domain. Raises: _DrawAgainError where it is larger than the configured one."""
+        x, y, z = DOMAINS[self.one_of(*names)]
+        self.domain = (x / 64, y / 64, z / 64)
+        if any(own > largest for own, largest in zip(self.domain, self.config.domain_size, strict=True)):
+            raise _DrawAgainError
+
+    @property
+    def low(self) -> float:
+        """The smallest coordinate of particles: the inner face of the solver's walls."""
+        return WALL_CELLS * self.config.cell_size + ROUNDING
+
+    def high(self, axis: int) -> float:
+        """The largest coordinate of particles along an axis."""
+        return self.domain[axis] - self.low
+
+    def along(self, axis: int, half: float) -> float:
+        """Returns a coordinate at which a body of a half width is clear of the walls."""
+        first = self.low + half + ROUNDING
+        span = self.high(axis) - half - ROUNDING - first
+        if span < 0:
+            raise _DrawAgainError
+        return first + span * self.rng.random()
+
+    def place(self, shape: str, size: float, position: Vector, quaternion: Quaternion = UNTURNED) -> None:
+        """Adds an obstacle. Raises: _DrawAgainError where it reaches out of the domain."""
+        item = place_shape(shape, size, position, quaternion, len(self.obstacles))
+        if (item.low < 0).any() or (item.high > np.array(self.domain)).any():
+            raise _DrawAgainError
+        self.obstacles.append(item)
+
+    def add(
+        self, shape: str, size: Vector, centre: Vector, velocity: Vector = (0.0, 0.0, 0.0), material: str = ""
+    ) -> None:
+        """Adds a body of a drawn material, or of the named one where the config has it.
+
+        Raises: _DrawAgainError where it is not clear of walls, obstacles and other bodies, or too large.
+        """
+        region, clearance = region_of(shape, size, centre), CLEARANCE_CELLS * self.config.cell_size
+        inside = (region.reach > 0).all() and (np.array(centre) - region.reach >= self.low - ROUNDING).all()
+        inside = inside and all(centre[i] + region.reach[i] <= self.high(i) + ROUNDING for i in range(3))
+        if not inside or any(region.distance(other) < clearance for other in self.regions):
+            raise _DrawAgainError
+        if any(blocked(region, item, clearance) for item in self.obstacles):
+            raise _DrawAgainError
+        count = particle_count(region, self.config.particles_per_cell, self.config.cell_size)
+        self.particles += count
+        if self.particles > MAXIMUM_PARTICLES:
+            raise _DrawAgainError
+        drawn = self.one_of(*self.config.materials)
+        chosen = material if material in self.config.materials else drawn
+        record = {"shape": shape, "size": list(size) if shape == "box" else size[0], "position": list(centre)}
+        record |= {"material": chosen, "velocity": list(velocity), "particle_count": count}
+        self.regions.append(region)
+        self.bodies.append(Body(fill(region, count, self.rng), np.array(velocity), chosen, record))
+
+    def body(self, size: float, centre: Vector, velocity: Vector = (0.0, 0.0, 0.0)) -> None:
+        """Adds a cube or a ball."""
+        self.add(self.one_of("cube", "sphere"), (size, size, size), centre, velocity)
+
+    def box(self, low: Vector, high: Vector, velocity: Vector = (0.0, 0.0, 0.0), material: str = "") -> None:
+        """Adds a box between two corners."""
+        size = triple(np.array(high) - np.array(low))
+        self.add("box", size, triple(0.5 * (np.array(low) + np.array(high))), velocity, material)
+
+    def tilt_gravity(self, tangent: float) -> None:
+        """Turns gravity about a horizontal axis by twice the arc tangent of a number."""
+        across_x, across_z = random_direction(self.rng, 2).tolist()
+        cosine, sine = _turn(tangent)
+        size = -FALLING[1]
+        self.gravity = (size * sine * across_x, -size * cosine, size * sine * across_z)
+
+
+def _turn(tangent: float) -> tuple[float, float]:
+    """Returns cosine and sine of an angle from the tangent of its half."""
+    square = tangent * tangent
+    return (1 - square) / (1 + square), 2 * tangent / (1 + square)
+
+
+def _about_z(tangent: float) -> Quaternion:
+    """Returns the quaternion of a turn about z from the tangent of half its angle."""
+    length = float(np.sqrt(1 + tangent * tangent))
+    return (1 / length, 0.0, 0.0, tangent / length)
+
+
+def _pool(new: Layout) -> None:
+    """Material lies from wall to wall, often at rest; gravity may be tilted, or a body falls in."""
+    new.take_domain("small", "box", "tray", "flume")
+    top = new.low + new("depth")
+    material = "water" if new.chance(0.6) else ""
+    new.box((new.low,) * 3, (new.high(0), top, new.high(2)), material=material)
+    if new.chance(0.35):
+        new.tilt_gravity(new("tilt"))
+    if new.chance(0.35):
+        size = new("size")
+        height = top + CLEARANCE_CELLS * new.config.cell_size + 0.5 * size + new("height")
+        new.body(size, (new.along(0, 0.5 * size), height, new.along(2, 0.5 * size)))
+
+
+def _dam(new: Layout) -> None:
+    """A block of water, at times of another material, stands at one end of a channel as wide as itself."""
+    new.take_domain("flume", "long", "tray", "small")
+    far = (new.low + new("length"), new.low + new("height"), new.high(2))
+    new.box((new.low,) * 3, far, material="water" if new.chance(0.75) else "")
+
+
+def _column(new: Layout) -> None:
+    """A column stands on the floor and collapses on all sides."""
+    new.take_domain("room", "hall", "tall")
+    width, height, depth = new("width"), new("height", small=True), new("depth")
+    x, z = new.along(0, 0.5 * width), new.along(2, 0.5 * depth)
+    low = (x - 0.5 * width, new.low, z - 0.5 * depth)
+    new.box(low, (x + 0.5 * width, new.low + height, z + 0.5 * depth), material="sand" if new.chance(0.5) else "")
+
+
+def _drop(new: Layout) -> None:
+    """One body falls, or is thrown."""
+    new.take_domain("room", "hall", "tall")
+    size = new("size")
+    height = new.low + 0.5 * size + new("height", small=True) + ROUNDING
+    velocity = (0.0, 0.0, 0.0)
+    if new.chance(0.5):
+        velocity = triple(new("speed") * points_in_ball(1, 3, new.rng)[0])
+    new.body(size, (new.along(0, 0.5 * size), height, new.along(2, 0.5 * size)), velocity)
+
+
+def _slope(new: Layout) -> None:
+    """One or two bodies lie on a tilted plate, and slide off its lower end."""
+    new.take_domain("room", "hall")
+    plate, tangent = new("plate"), new("tilt")
+    cosine, sine = _turn(tangent)
+    y = new.low + 0.5 * plate * sine + 0.1 * new.rng.random()
+    middle = np.array((new.along(0, 0.5 * plate * cosine), y, new.along(2, 0.5 * plate)))
+    new.place("square", plate, triple(middle), _about_z(tangent))
+    for _ in range(1 + new.chance(0.5)):
+        size, along, across = new("size"), new.rng.random() - 0.3, new.rng.random() - 0.5
+        room = 0.5 * (plate - size)
+        gap = 0.5 * size * (cosine + sine) + (CLEARANCE_CELLS + 1) * new.config.cell_size
+        up = np.array((cosine, sine, 0.0)) * along * room + np.array((-sine, cosine, 0.0)) * gap
+        new.body(size, triple(middle + up + np.array((0.0, 0.0, 2 * across * room))))
+
+
+def _edge(new: Layout) -> None:
+    """A body falls onto the edge of a plate, or past it."""
+    new.take_domain("room", "tall")
+    plate, size = new("plate"), new("size")
+    x, y, z = new.along(0, 0.5 * plate), new.low + new("height"), new.along(2, 0.5 * plate)
+    new.place("square", plate, (x, y, z))
+    side = 1.0 if new.chance(0.5) else -1.0
+    edge = x + side * (0.5 * plate + new("beyond"))
+    offset = (new.rng.random() - 0.5) * (plate - size)
+    new.body(size, (edge, y + 0.5 * size + new("drop") + ROUNDING, z + offset))
+
+
+def _stack(new: Layout) -> None:
+    """Bodies stand above one another."""
+    new.take_domain("room", "tall")
+    size = new("size")
+    x, z, y = new.along(0, size), new.along(2, size), new.low + ROUNDING
+    for _ in range(new.count("bodies")):
+        new.body(size, (x + new("shift"), y + 0.5 * size, z + new("shift")))
+        y += size + (CLEARANCE_CELLS + 0.5) * new.config.cell_size
+
+
+def _apart(new: Layout) -> None:
+    """Bodies lie on the floor without contact; some slide slowly. A tilted gravity moves all."""
+    new.take_domain("room", "hall", "long")
+    for _ in range(new.count("bodies")):
+        size, velocity = new("size"), (0.0, 0.0, 0.0)
+        if new.chance(0.5):
+            across_x, across_z = random_direction(new.rng, 2).tolist()
+            speed = new("speed", small=True)
+            velocity = (speed * across_x, 0.0, speed * across_z)
+        centre = (new.along(0, 0.5 * size), new.low + 0.5 * size + ROUNDING, new.along(2, 0.5 * size))
+        new.body(size, centre, velocity)
+    if new.chance(0.3):
+        new.tilt_gravity(new("tilt"))
+
+
+def _bowl(new: Layout) -> None:
+    """Bodies fall into a bowl that stands on the floor."""
+    new.take_domain("room", "tall")
+    width, size = new("bowl"), new("size")
+    x, z = new.along(0, 0.5 * width), new.along(2, 0.5 * width)
+    base = new.low + 0.25 * width
+    new.place(new.one_of("half_sphere", "half_box"), width, (x, base, z))
+    y = base + 0.25 * width + 0.5 * size + new("height")
+    for _ in range(1 + new.chance(0.4)):
+        shift_x, shift_z = (0.3 * width * (new.rng.random() - 0.5) for _ in range(2))
+        new.body(size, (x + shift_x, y, z + shift_z))
+        y += size + (CLEARANCE_CELLS + 0.5) * new.config.cell_size
+
+
+def _channel(new: Layout) -> None:
+    """A block is released between two upright plates."""
+    new.take_domain("room", "hall")
+    plate, width, length = new("plate"), new("width"), new("length")
+    x, z, y = new.along(0, 0.5 * plate), new.along(2, 0.5 * width), 0.5 * plate
+    quarter = (float(np.sqrt(0.5)), float(np.sqrt(0.5)), 0.0, 0.0)
+    for side in (-0.5, 0.5):
+        new.place("square", plate, (x, y + ROUNDING, z + side * width), quarter)
+    half = 0.5 * width - (CLEARANCE_CELLS + 1.5) * new.config.cell_size
+    begin = x - 0.5 * plate + 0.3 * plate * new.rng.random()
+    low = (begin, new.low, z - half)
+    new.box(low, (begin + length, new.low + new("height"), z + half), material="water" if new.chance(0.6) else "")
+
+
+def _stairs(new: Layout) -> None:
+    """A body is poured down steps."""
+    new.take_domain("hall", "room")
+    plate, rise, size, steps = new("plate"), new("rise"), new("size"), new.count("steps")
+    tread = 0.7 * plate
+    x, z = new.along(0, 0.5 * plate), new.along(2, 0.5 * plate)
+    for step in range(steps):
+        new.place("square", plate, (x + step * tread, new.low + (steps - step) * rise, z))
+    height = new.low + steps * rise + 0.5 * size + (CLEARANCE_CELLS + 1) * new.config.cell_size
+    new.add(new.one_of("cube", "sphere"), (size,) * 3, (x, height, z), material="water" if new.chance(0.5) else "")
+
+
+def _jet(new: Layout) -> None:
+    """A bar flies along itself, often against a wall; half of the jets know no gravity."""
+    new.take_domain("hall", "room", "long")
+    length, width = new("length"), new("width")
+    centre = (new.along(0, 0.5 * length), new.along(1, 0.5 * width), new.along(2, 0.5 * width))
+    speed = new("speed") * (1.0 if new.chance(0.5) else -1.0)
+    new.gravity = FALLING if new.chance(0.5) else (0.0, 0.0, 0.0)
+    new.add("box", (length, width, width), centre, (speed, 0.0, 0.0), "water" if new.chance(0.6) else "")
+
+
+_PLACED: dict[str, Callable[[Layout], None]] = {
+    "pool": _pool, "dam": _dam, "column": _column, "drop": _drop, "slope": _slope, "edge": _edge, "stack": _stack,
+    "apart": _apart, "bowl": _bowl, "channel": _channel, "stairs": _stairs, "jet": _jet,
+}  # fmt: skip
+
+
+def _paper(new: Layout) -> SceneConfig:
+    """Returns the settings of a kind whose items are placed at random, as in the paper."""
+    new.take_domain("room", "hall")
+    config = replace(new.config, kinds={}, domain_size=new.domain, group_size=new("size"))
+    volume = (config.group_size / config.cell_size) * (config.group_size / config.cell_size)
+    each = config.particles_per_cell * volume * (config.group_size / config.cell_size) + 1
+    groups = min(new.count("groups"), int(MAXIMUM_PARTICLES / each))
+    config = replace(config, group_count=groups, obstacle_count=0)
+    if new.kind == "funnel":
+        low, high = RANGES["funnel"]["hole"]
+        return replace(config, obstacle_count=4, funnel_scene_fraction=1.0, funnel_hole=(low, high))
+    if new.kind in ("obstacles", "motion"):
+        config = replace(config, obstacle_count=new.count("obstacles"))
+    if new.kind == "obstacles":
+        return config
+    config = replace(config, maximum_initial_speed=new("speed"), lone_particles=2)
+    if new.kind == "collision":
+        return replace(config, colliding_scene_fraction=1.0, zero_gravity_fraction=0.3, tilted_gravity_fraction=0.3)
+    moving = replace(config, moving_group_fraction=0.6, pure_direction_fraction=0.3)
+    return replace(moving, zero_gravity_fraction=0.1, tilted_gravity_fraction=0.3)
+
+
+def draw_kind(kinds: Mapping[str, float], rng: np.random.Generator) -> str:
+    """Returns one of the kinds, with the probability of its share."""
+    rest = rng.random() * sum(kinds.values())
+    for kind, share in kinds.items():
+        rest -= share
+        if rest < 0:
+            return kind
+    return next(kind for kind in reversed(kinds) if kinds[kind] > 0)
+
+
+def draw_layout(config: SceneConfig, seed: int) -> tuple[str, Layout | SceneConfig]:
+    """Draws a scene of a kind in `config.kinds`.
+
+    Returns the kind, with its layout, or with the settings of the scenes of `hgn.scene.random_scene` that it is one of.
+    Raises: ConfigError where a kind does not fit, which no settings of the shipped experiments do.
+    """
+    rng = np.random.Generator(np.random.PCG64([seed, 4]))
+    kind = draw_kind(config.kinds, rng)
+    for _ in range(DRAWS):
+        new = Layout(config, kind, rng)
+        try:
+            if kind not in _PLACED:
+                return kind, _paper(new)
+            _PLACED[kind](new)
+        except _DrawAgainError:
+            continue
+        new.config = replace(config, kinds={}, domain_size=new.domain)
+        return kind, new
+    raise ConfigError(
+        f"kinds must be of scenes that fit into domain_size {list(config.domain_size)}, got {kind}; raise domain_size "
+        f"or leave {kind} out"
+    )

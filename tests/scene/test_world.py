@@ -1,0 +1,160 @@
+import hashlib
+import json
+from collections import Counter
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scene.test_random_scene import digest, surface_distances
+
+from hgn.config import DatagenConfig, SceneConfig
+from hgn.data.identity import dataset_identity
+from hgn.scene.distance import contains
+from hgn.scene.group import WALL_CELLS
+from hgn.scene.kinds import SCENE_KINDS
+from hgn.scene.placement import CLEARANCE_CELLS
+from hgn.scene.random_scene import generate_scene
+from hgn.scene.rotation import quaternion_rotation
+from hgn.scene.world import DOMAINS, MAXIMUM_PARTICLES, RANGES, draw_kind
+from hgn.schema import ConfigError
+
+LARGEST = (2.0, 1.5, 1.5)
+CELL = 1 / 64
+
+
+def test_every_kind_has_its_ranges():
+    assert tuple(RANGES) == SCENE_KINDS
+
+
+def scene_of(kind, seed):
+    return generate_scene(SceneConfig(domain_size=LARGEST, kinds={kind: 1.0}), seed)
+
+
+def bodies(scene):
+    """Record and particles of each body."""
+    records = scene.specification["groups"]
+    ends = np.cumsum([record["particle_count"] for record in records])
+    return list(zip(records, np.split(scene.position_N3.astype(np.float64), ends[:-1]), strict=True))
+
+
+@pytest.mark.parametrize("kind", SCENE_KINDS)
+def test_scenes_of_a_kind_are_sound(kind):
+    """Whole cells, particles between the walls and clear of obstacles and of other bodies, meshes rebuilt from the
+    record, never too many particles, the same bits again, and not the same scene for another seed."""
+    digests = set()
+    for seed in range(4):
+        scene = scene_of(kind, seed)
+        position_N3, size_3 = scene.position_N3.astype(np.float64), np.array(scene.domain_size)
+        assert tuple((size_3 / CELL).tolist()) in DOMAINS.values() and scene.specification["layout"] == kind
+        assert 100 < scene.particle_count <= MAXIMUM_PARTICLES
+        assert (position_N3 > WALL_CELLS * CELL).all() and (position_N3 < size_3 - WALL_CELLS * CELL).all()
+        for obstacle in scene.obstacles:
+            assert (obstacle.vertex_V3 >= 0).all() and (obstacle.vertex_V3 <= size_3).all()
+            assert surface_distances(position_N3[::5], obstacle).min() > CLEARANCE_CELLS * CELL
+            assert not contains(position_N3, obstacle).any()
+        parts = [part for _, part in bodies(scene)]
+        for i, one in enumerate(parts):
+            for other in parts[:i]:
+                assert np.sqrt(((one[::3, None] - other[None, ::5]) ** 2).sum(axis=2)).min() > CLEARANCE_CELLS * CELL
+        digests.add(digest(scene))
+        assert digest(scene) == digest(scene_of(kind, seed))
+    assert len(digests) == 4
+
+
+GOLDEN = "8a5b93f2"  # of one scene of each kind
+
+
+def test_a_kind_is_bitwise_the_same_everywhere():
+    together = " ".join(digest(scene_of(kind, 3)) for kind in SCENE_KINDS)
+    assert hashlib.sha256(together.encode()).hexdigest()[:8] == GOLDEN
+
+
+def tilt_of(record):
+    """The tangent of half the angle between an obstacle's own y axis and the world's."""
+    cosine = quaternion_rotation(tuple(record["quaternion"]))[1, 1]
+    return np.sqrt((1 - cosine) / (1 + cosine))
+
+
+# what makes a scene one of its kind: of (specification, scene)
+def is_pool(scene):
+    record, position_N3 = bodies(scene)[0]
+    inner_3 = np.array(scene.domain_size) - 2 * WALL_CELLS * CELL
+    low, high = RANGES["pool"]["depth"]
+    return (
+        np.allclose(np.array(record["size"])[[0, 2]], inner_3[[0, 2]], atol=1e-5)
+        and low <= record["size"][1] <= high
+        and position_N3[:, 1].min() < WALL_CELLS * CELL + 0.01
+    )
+
+
+def is_edge(scene):
+    (plate,), (body,) = scene.specification["obstacles"], scene.specification["groups"]
+    beyond = abs(body["position"][0] - plate["position"][0]) - plate["size"] / 2
+    low, high = RANGES["edge"]["beyond"]
+    return low - 1e-9 <= beyond <= high + 1e-9 and body["position"][1] > plate["position"][1]
+
+
+def is_slope(scene):
+    (plate,) = scene.specification["obstacles"]
+    low, high = RANGES["slope"]["tilt"]
+    return low - 1e-6 <= tilt_of(plate) <= high + 1e-6
+
+
+def is_dam(scene):
+    ((_, position_N3),) = bodies(scene)
+    width = scene.domain_size[2] - 2 * WALL_CELLS * CELL
+    return np.ptp(position_N3[:, 2]) > 0.9 * width and np.ptp(position_N3[:, 0]) < 0.31
+
+
+def is_apart(scene):
+    lowest = [part[:, 1].min() for _, part in bodies(scene)]
+    speeds = [np.linalg.norm(record["velocity"]) for record, _ in bodies(scene)]
+    return max(lowest) < WALL_CELLS * CELL + 0.02 and max(speeds) <= RANGES["apart"]["speed"][1] and len(speeds) > 1
+
+
+@pytest.mark.parametrize("holds", [is_pool, is_edge, is_slope, is_dam, is_apart])
+def test_a_scene_is_of_its_kind(holds):
+    kind = holds.__name__.removeprefix("is_")
+    assert all(holds(scene_of(kind, seed)) for seed in range(8))
+
+
+def test_gravity_is_as_large_however_it_is_tilted():
+    sizes = [np.linalg.norm(scene_of("pool", seed).gravity) for seed in range(20)]
+    across = [np.linalg.norm(np.array(scene_of("pool", seed).gravity)[[0, 2]]) for seed in range(20)]
+    assert np.allclose(sizes, 9.8) and 2 <= np.count_nonzero(across) <= 14 and max(across) < 9.8 * 0.26
+
+
+def test_kinds_are_drawn_by_their_shares():
+    """Within four standard deviations; a share of 0 is never drawn, and only relative sizes matter."""
+    rng, shares = np.random.Generator(np.random.PCG64(1)), {"pool": 1.0, "dam": 3.0, "jet": 0.0, "edge": 4.0}
+    count = Counter(draw_kind(shares, rng) for _ in range(4000))
+    for kind, share in shares.items():
+        expected = share / 8
+        assert abs(count[kind] / 4000 - expected) <= 4 * np.sqrt(expected * (1 - expected) / 4000)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"kinds": {"lake": 1.0}}, "kinds must be of obstacles, motion"),
+        ({"kinds": {"pool": -1.0}}, "kinds.pool must be a finite share >= 0, got -1.0"),
+        ({"kinds": {"pool": 0.0}}, "kinds must be shares of which one is above 0"),
+        ({"kinds": {"pool": 1.0}, "group_count": 2}, "group_count must be its default (4) where kinds"),
+    ],
+)  # fmt: skip
+def test_shares_that_make_no_sense_are_refused(settings, message):
+    with pytest.raises(ConfigError) as error:
+        SceneConfig(**settings)
+    assert message in str(error.value)
+
+
+def test_a_kind_that_fits_into_no_domain_is_refused():
+    with pytest.raises(ConfigError, match=r"kinds must be of scenes that fit .* got jet; raise domain_size or leave"):
+        generate_scene(SceneConfig(domain_size=(0.4, 1.0, 0.4), kinds={"jet": 1.0}), 0)
+
+
+def test_kinds_belong_to_the_identity_of_a_data_set():
+    plain, world = DatagenConfig(), DatagenConfig(scene=SceneConfig(kinds={"pool": 1.0}))
+    assert "kinds" not in dataset_identity(plain)["scene"]
+    assert dataset_identity(world)["scene"]["kinds"] == {"pool": 1.0}
+    json.dumps(dataset_identity(replace(world)))
