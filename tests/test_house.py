@@ -19,7 +19,7 @@ LINES = {  # of Python, in tracked files
     "hgn": 27_740,
     "datagen": 8_477,
     "tools": 7_155,
-    "tests": 27_194,
+    "tests": 27_185,
 }
 SETTINGS = 238  # fields of the dataclasses behind the commands, *Config
 
