@@ -16,7 +16,7 @@ FREE = ("domain_size", "cell_size", "materials", "particles_per_cell", "kinds") 
 
 
 def require_kinds(scene: Any) -> None:
-    """Checks the kinds of a SceneConfig, and that settings which kinds draw have their defaults. Raises: ConfigError."""
+    """Checks the kinds of a SceneConfig, and that settings which they draw have defaults. Raises: ConfigError."""
     for kind, share in scene.kinds.items():
         require(kind in SCENE_KINDS, "kinds", f"of {', '.join(SCENE_KINDS)}", kind)
         require(0 <= share < math.inf, f"kinds.{kind}", "a finite share >= 0", share)
