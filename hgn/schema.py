@@ -12,6 +12,7 @@ import functools
 import inspect
 import math
 import re
+import reprlib
 import types
 import typing
 from collections.abc import Callable, Iterable, Mapping
@@ -58,11 +59,22 @@ FrameCount = Annotated[
     Bound("at most 1,000,000", lambda value: value <= 1_000_000),
 ]
 LayerSize = Annotated[Positive[int], Bound("at most 65,536", lambda value: value <= 65_536)]
+OrdinarySize = Annotated[float, Bound("from 1e-9 to 1e9", lambda value: 1e-9 <= value <= 1e9)]
 FewLayers = Annotated[Positive[int], Bound("at most 1,000", lambda value: value <= 1_000)]
+
+
+_shown = reprlib.Repr()  # a file's value may have millions of items, and by references 10^12
+_shown.maxlevel, _shown.maxstring, _shown.maxlong, _shown.maxother = 4, 300, 60, 300
+_shown.maxlist = _shown.maxtuple = _shown.maxdict = _shown.maxset = 12
 
 
 class ConfigError(ValueError):
     """An invalid value: the message names field, rule, value and remedy."""
+
+
+def without_passwords(text: str) -> str:
+    """Returns a text whose URLs name no user and password."""
+    return re.sub(r"(\w://)[^/\s@]*@", r"\1", text)
 
 
 def from_mapping(cls: type[T], mapping: object, path: _Path = "") -> T:
@@ -73,7 +85,9 @@ def from_mapping(cls: type[T], mapping: object, path: _Path = "") -> T:
     Raises: ConfigError.
     """
     if not isinstance(mapping, Mapping):
-        raise ConfigError(f"{_text(path) or cls.__name__} must be a mapping of keys to values, got {mapping!r}")
+        raise ConfigError(
+            f"{_text(path) or cls.__name__} must be a mapping of keys to values, got {_shown.repr(mapping)}"
+        )
     hints, fields = _fields(cls)  # type: ignore[arg-type]
     values: dict[str, Any] = {}
     for key, value in mapping.items():
@@ -118,9 +132,9 @@ def _shape(hint: Any) -> tuple[Any, tuple[Any, ...], bool]:
     return typing.get_origin(hint), typing.get_args(hint), dataclasses.is_dataclass(hint)
 
 
-def from_stored(cls: type[T], mapping: Mapping[str, Any], section: str) -> T:
+def from_stored(cls: type[T], mapping: object, section: str) -> T:
     """Builds a dataclass from a section of a stored file, perhaps of an earlier release."""
-    return from_mapping(cls, current_names(mapping, section), section)
+    return from_mapping(cls, current_names(mapping, section) if isinstance(mapping, Mapping) else mapping, section)
 
 
 def known_keys(key: str, names: Iterable[str]) -> str:
@@ -177,7 +191,7 @@ def require(rule_holds: bool, field: str, rule: str, value: object, remedy: str 
     """Raises ConfigError `<field> must be <rule>, got <value>; <remedy>` unless the rule holds."""
     if not rule_holds:
         remedy = remedy or value_remedy(field, value)
-        raise ConfigError(f"{field} must be {rule}, got {value!r}" + (f"; {remedy}" if remedy else ""))
+        raise ConfigError(f"{field} must be {rule}, got {_shown.repr(value)}" + (f"; {remedy}" if remedy else ""))
 
 
 def require_bounds(owner: object) -> None:
@@ -234,21 +248,23 @@ def _convert(hint: Any, value: Any, path: _Path) -> Any:
                 return _convert(option, value, path)
             except ConfigError:
                 continue
-        raise ConfigError(f"{_text(path)} must be {_name(hint)}, got {value!r}")
+        raise ConfigError(f"{_text(path)} must be {_name(hint)}, got {_shown.repr(value)}")
     if is_dataclass:
         return from_mapping(hint, value, path)
     if origin is tuple:
         if not isinstance(value, (list, tuple)):
-            raise ConfigError(f"{_text(path)} must be a list, got {value!r}")
+            raise ConfigError(f"{_text(path)} must be a list, got {_shown.repr(value)}")
         if len(arguments) == 2 and arguments[1] is Ellipsis:
             return tuple([_convert(arguments[0], item, (path, i)) for i, item in enumerate(value)])
         if len(value) != len(arguments):
-            raise ConfigError(f"{_text(path)} must be a list of {len(arguments)} values, got {len(value)}: {value!r}")
+            raise ConfigError(
+                f"{_text(path)} must be a list of {len(arguments)} values, got {len(value)}: {_shown.repr(value)}"
+            )
         pairs = zip(arguments, value, strict=True)
         return tuple([_convert(item_hint, item, (path, i)) for i, (item_hint, item) in enumerate(pairs)])
     if origin is dict:
         if not isinstance(value, Mapping):
-            raise ConfigError(f"{_text(path)} must be a mapping, got {value!r}")
+            raise ConfigError(f"{_text(path)} must be a mapping, got {_shown.repr(value)}")
         return {
             _convert(arguments[0], key, path): _convert(arguments[1], item, (path, str(key)))
             for key, item in value.items()
@@ -259,7 +275,7 @@ def _convert(hint: Any, value: Any, path: _Path) -> Any:
         return float(value)
     if hint in (bool, int, str) and isinstance(value, hint) and isinstance(value, bool) == (hint is bool):
         return value
-    raise ConfigError(f"{_text(path)} must be {_name(hint)}, got {value!r} ({type(value).__name__})")
+    raise ConfigError(f"{_text(path)} must be {_name(hint)}, got {_shown.repr(value)} ({type(value).__name__})")
 
 
 def _name(hint: Any) -> str:

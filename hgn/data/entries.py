@@ -7,13 +7,16 @@ import math
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Annotated
 
 from hgn.config import Split
 from hgn.data.statistics import Moments, Statistics
-from hgn.schema import ConfigError, NonNegative, require, require_bounds
+from hgn.schema import Bound, ConfigError, NonNegative, require, require_bounds
 
 SPLITS = ("train", "validation", "test")
-REMEDY = "delete manifest.json and run the generator again: published shards are found and kept"
+REMEDY = "if it stays so, run the generator again without manifest.json: published shards are found and kept"
+MOST = 10_000_000  # shards, and episodes of a split, in a data set
+Count = Annotated[int, Bound(f"from 0 to {MOST}", lambda value: 0 <= value <= MOST)]
 _FILE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,200}")
 _SHA256 = re.compile(r"[0-9a-f]{64}")
 
@@ -37,8 +40,8 @@ class ShardEntry:
 
     name: str
     split: Split
-    first: int
-    stop: int
+    first: Count
+    stop: Count
     sha256: str
     bytes: NonNegative[int]
     episodes: tuple[EpisodeEntry, ...]
@@ -50,7 +53,7 @@ class ShardEntry:
         require(_FILE_NAME.fullmatch(self.name) is not None, "name", "a plain file name", self.name)
         require(_SHA256.fullmatch(self.sha256) is not None, "sha256", "64 hexadecimal digits", self.sha256)
         numbers = [episode.index for episode in self.episodes]
-        if numbers != list(range(self.first, self.stop)):
+        if self.stop - self.first != len(numbers) or numbers != list(range(self.first, self.stop)):
             raise ConfigError(f"episodes must be numbers {self.first} to {self.stop - 1}, got {numbers}; {REMEDY}")
         require_sound(self.statistics)
 
@@ -69,11 +72,14 @@ class QuarantinedScene:
 class SplitTotals:
     """The published part of a split."""
 
-    shards: int = 0
-    episodes: int = 0
-    bytes: int = 0
+    shards: Count = 0
+    episodes: Count = 0
+    bytes: NonNegative[int] = 0
     digest: str = ""  # over the shards' sha256 in publication order; identifies the order of samples
     statistics: Statistics | None = None  # only in the head
+
+    def __post_init__(self) -> None:
+        require_bounds(self)
 
     def plus(self, shard: ShardEntry) -> SplitTotals:
         """Returns the totals with one more shard."""

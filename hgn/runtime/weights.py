@@ -5,6 +5,7 @@ the metadata. Nothing in it is unpickled or executed.
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -17,8 +18,9 @@ from hgn.config import NetworkConfig
 from hgn.network.base import ParticleNetwork
 from hgn.network.build import build_network
 from hgn.renamed import REMOVED_CHOICES, current_names, with_step
-from hgn.schema import ConfigError, from_mapping, require, to_mapping
+from hgn.schema import ConfigError, OrdinarySize, from_mapping, require, require_bounds, to_mapping
 from hgn.step_config import StepConfig
+from hgn.system.claims import Claims
 from hgn.system.files import make_folder, write_atomically
 from hgn.system.hub import PREFIX, hub_weights
 
@@ -32,8 +34,8 @@ class WeightsInfo:
     """The metadata of a weights file."""
 
     network: NetworkConfig
-    frame_rate_hz: float  # of the data: one step of the network is one frame
-    obstacle_cell_size: float
+    frame_rate_hz: OrdinarySize  # of the data: one step of the network is one frame
+    obstacle_cell_size: OrdinarySize
     gravity: tuple[float, float, float] = (0.0, -9.8, 0.0)  # of the data; absolute inputs cannot take another
     # of the data's groups, domain units per second; null: not known
     maximum_initial_speed: float | None = None
@@ -41,6 +43,9 @@ class WeightsInfo:
     step: StepConfig = field(default_factory=StepConfig)  # constraints of its frames
     updates: int = 0
     provenance: dict[str, Any] = field(default_factory=dict)  # commit, data set, date, versions
+
+    def __post_init__(self) -> None:
+        require_bounds(self)
 
 
 def save_weights(path: Path, network: ParticleNetwork, info: WeightsInfo, stored_precision: str = "fp32") -> None:
@@ -103,23 +108,45 @@ def load_weights(
         raise ConfigError(f"{field} must be a file of python -m hgn.export, got {path} without its structure")
     try:
         mapping = json.loads(metadata["hgn"])
-    except json.JSONDecodeError as error:
+    except (ValueError, RecursionError) as error:
         raise ConfigError(f"{field} must declare their structure as JSON, got {path}: {error}") from None
     version = mapping.get("format_version") if isinstance(mapping, dict) else None
     if version != FORMAT_VERSION:
         raise ConfigError(f"{field} format_version must be {FORMAT_VERSION}, got {version!r} in {path}; export again")
     info = from_mapping(WeightsInfo, current_names(with_step(mapping)), "weights")
-    network = build_network(info.network, info.step)
+    return network_with(info.network, info.step, tensors, path=path, field=field).to(device).eval(), info
+
+
+def network_with(
+    config: NetworkConfig, step: StepConfig, tensors: Mapping[str, torch.Tensor], *, path: Path, field: str
+) -> ParticleNetwork:
+    """Returns the declared network with the tensors of a file, float32; nothing is allocated before they fit.
+
+    Raises: ConfigError naming the tensor that does not fit.
+    """
+    claims, numbers = Claims(path), 0
+    for name, tensor in tensors.items():
+        claims.add(f"{field} tensor {name}", tensor.numel(), 4)
+        numbers += tensor.numel()
+    # of each step of message passing two square matrices: the network is not much larger than these
+    count = 2 * config.message_passing_steps * (2 * config.levels - 1)
+    rule = (
+        f"at least {count} with {count * config.width**2} numbers for network.levels, message_passing_steps and width"
+    )
+    enough = len(tensors) >= count and numbers >= count * config.width**2
+    remedy = f"{path} has those of another network"
+    require(enough, f"{field} tensors", rule, f"{len(tensors)} with {numbers}", remedy=remedy)
+    network = build_network(config, step)
     expected = {name: tensor.shape for name, tensor in network.state_dict().items()}
-    shapes = {name: tensor.shape for name, tensor in tensors.items()}
-    for name in sorted(expected.keys() | shapes.keys()):
-        if expected.get(name) != shapes.get(name):
+    for name in sorted(expected.keys() | tensors.keys()):
+        shape = tensors[name].shape if name in tensors else None
+        if expected.get(name) != shape:
             raise ConfigError(
                 f"{field} tensor {name} must have shape {_shape(expected.get(name))} for the declared network, "
-                f"got {_shape(shapes.get(name))} in {path}; these are the weights of another network"
+                f"got {_shape(shape)} in {path}; these are the weights of another network"
             )
     network.load_state_dict({name: tensor.float() for name, tensor in tensors.items()})
-    return network.to(device).eval(), info
+    return network
 
 
 def require_frame_rate(info: WeightsInfo, frame_rate_hz: float) -> None:

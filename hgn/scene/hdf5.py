@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import contextlib
+import math
 from collections.abc import Iterator
 from pathlib import Path
 
 import h5py
 
 from hgn.schema import ConfigError
+from hgn.system.claims import Claims
 
 _DEPTH = 8  # of groups
 # exceptions of h5py for damage, and of NumPy for a size in a damaged file
@@ -30,21 +32,33 @@ def damage_named(rule: str, remedy: str) -> Iterator[None]:
 
 
 def open_hdf5(path: Path, rule: str, remedy: str) -> h5py.File:
-    """Opens a file that contains all its data itself. Raises: ConfigError, as `damage_named` does."""
+    """Opens a file that contains all its data itself, each object once, and has the size for it.
+
+    Raises: ConfigError, as `damage_named` does.
+    """
     with damage_named(rule, remedy), contextlib.ExitStack() as stack:
         file = stack.enter_context(h5py.File(path, "r"))
-        _require_own_data(file, path)
+        _require_own_data(file, path, Claims(path), {h5py.h5o.get_info(file.id).addr})
         stack.pop_all()
     return file
 
 
-def _require_own_data(group: h5py.Group, path: Path, depth: int = 0) -> None:
-    """Raises ConfigError where a file refers to others, which HDF5 would read with this reader's rights."""
+def _require_own_data(group: h5py.Group, path: Path, claims: Claims, visited: set[int], depth: int = 0) -> None:
+    """Raises ConfigError where a file refers to others, which HDF5 would read with this reader's rights, and where an
+    object has two names or is larger than the file.
+    """
     for name in group:
         if not isinstance(group.get(name, getlink=True), h5py.HardLink) or depth > _DEPTH:
             raise ConfigError(f"{path}: {group.name} must contain its data itself, got a link in {name}")
         item = group[name]
+        if (address := h5py.h5o.get_info(item.id).addr) in visited:
+            raise ConfigError(f"{path}: {group.name} must contain its data itself, got another name, {name}, for it")
+        visited.add(address)
         if isinstance(item, h5py.Group):
-            _require_own_data(item, path, depth + 1)
-        elif isinstance(item, h5py.Dataset) and (item.external or item.is_virtual):
-            raise ConfigError(f"{path}: {item.name} must lie in the file itself, got data of another file")
+            _require_own_data(item, path, claims, visited, depth + 1)
+        elif isinstance(item, h5py.Dataset):
+            if item.external or item.is_virtual:
+                raise ConfigError(f"{path}: {item.name} must lie in the file itself, got data of another file")
+            if item.dtype.hasobject and item.size != 1:
+                raise ConfigError(f"{path}: {item.name} must be numbers, got texts of variable length")
+            claims.add(item.name, max(item.size or 0, math.prod(item.chunks or ())), item.dtype.itemsize)

@@ -20,6 +20,7 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from hgn.schema import ConfigError
+from hgn.system.claims import Claims, require_plain_pickle
 
 _MULTIARRAY = ("numpy.core.multiarray", "numpy._core.multiarray")
 _PLAIN_TYPE = re.compile(r"b1|[iu][1248]|f[248]|O8?")
@@ -85,7 +86,12 @@ def read_npz(path: Path | BinaryIO, objects: bool = False) -> Iterator[tuple[str
     """
     try:
         with zipfile.ZipFile(path) as archive:
+            claims, folders = Claims(str(path), _size(archive)), dict[str, int]()
             for info in archive.infolist():
+                claims.add(info.filename, info.file_size)
+                folders.setdefault(info.filename.rpartition("/")[0] or info.filename, len(folders))
+            # the members of a folder follow one another
+            for info in sorted(archive.infolist(), key=lambda i: folders[i.filename.rpartition("/")[0] or i.filename]):
                 member = info.filename.removesuffix(".npy")
                 kinds = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
                 if member == info.filename or info.compress_type not in kinds:
@@ -115,6 +121,11 @@ def read_header(
     return shape, fortran_order, dtype
 
 
+def _size(archive: zipfile.ZipFile) -> int:
+    assert archive.fp is not None
+    return archive.fp.seek(0, io.SEEK_END)
+
+
 def _read_array(data: bytes, name: str, objects: bool) -> np.ndarray:
     file = io.BytesIO(data)
     shape, fortran_order, dtype = read_header(file, name)
@@ -124,6 +135,7 @@ def _read_array(data: bytes, name: str, objects: bool) -> np.ndarray:
             return flat.reshape(shape, order="F" if fortran_order else "C")
         if not objects:
             raise pickle.UnpicklingError("a pickle")
+        require_plain_pickle(data[file.tell() :])
         array = _ArraysAlone(file).load()
     except _ERRORS as error:
         raise ConfigError(f"{name} must be an array, or a pickle of arrays alone, got {error}") from None

@@ -34,6 +34,7 @@ from hgn.scene.rotation import quaternion_rotation
 from hgn.scene.scene import Obstacle
 from hgn.scene.shapes import mesh_sha256, shape_obstacle
 from hgn.schema import Bound, BoxSize, ConfigError, Positive, Vector, require, require_bounds
+from hgn.system.claims import Claims
 from hgn.system.files import make_folder, sync_file, sync_folder, temporary_file
 
 FORMAT_NAME = "hgn rollout"
@@ -218,7 +219,7 @@ def read_rollout(path: str | Path) -> Rollout:
     with open_hdf5(path, rule, remedy) as file, damage_named(rule, remedy):
         _check_format(file, path)
         try:
-            return _read(file)
+            return _read(file, Claims(path))
         except ConfigError as error:
             raise ConfigError(f"{path}: rollout must be consistent, got {error}; {remedy}") from error
 
@@ -335,7 +336,7 @@ def _check_format(file: h5py.File, path: Path) -> None:
         )
 
 
-def _read(file: h5py.File) -> Rollout:
+def _read(file: h5py.File, claims: Claims) -> Rollout:
     own, vtk = file["hgn"], file["VTKHDF"]
     count_T = vtk["NumberOfPoints"][()]
     points, material_P = vtk["Points"], vtk["PointData/material"][()]
@@ -343,6 +344,7 @@ def _read(file: h5py.File) -> Rollout:
     material_N = material_P[vertices:]
     shape = (len(count_T), len(material_N), 3)
     entry_N = own["entry_frame"][()] if "entry_frame" in own else np.zeros(shape[1], np.int64)
+    claims.add("frames x particles", *shape[:2], 13)
     shown_TP = np.concatenate([np.zeros(vertices, np.int64), entry_N]) <= np.arange(shape[0])[:, None]
     if points.shape != (shown_TP.sum(), 3) or (count_T != shown_TP.sum(axis=1)).any():
         raise ConfigError(f"Points must hold {shape[0]} frames of {shape[1]} particles, got shape {points.shape}")

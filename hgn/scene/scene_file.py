@@ -6,6 +6,7 @@ See conf/example/ for examples. Lengths are in domain units, angles in degrees, 
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 import re
 from collections.abc import Mapping, Sequence
@@ -37,11 +38,11 @@ from hgn.schema import (
     require_bounds,
     to_mapping,
 )
+from hgn.system.claims import count_items
 
-GROUP_SHAPES = ("cube", "sphere", "box")
-EMITTER_SHAPES = ("disc", "rectangle")
-MAXIMUM_PARTICLES = 50_000_000
-MAXIMUM_NODES = 100_000  # of a scene file
+GROUP_SHAPES, EMITTER_SHAPES = ("cube", "sphere", "box"), ("disc", "rectangle")
+MAXIMUM_BYTES, MAXIMUM_NODES = 250_000, 100_000  # of a scene file
+MAXIMUM_PARTICLES, MAXIMUM_ENTRIES = 50_000_000, 256  # entries: obstacles, or groups and emitters
 MEASURE = "measure"  # section of the files in conf/gallery that tools.stability reads
 EMITTER_STREAM = 2**31  # of random numbers, separate from those of groups
 
@@ -208,6 +209,8 @@ class SceneFile:
     def __post_init__(self) -> None:
         require_bounds(self)
         require(len(self.groups + self.emitters) > 0, "groups", "a list with at least one group, or emitters", [])
+        for name, entries in (("groups and emitters", self.groups + self.emitters), ("obstacles", self.obstacles)):
+            require(len(entries) <= MAXIMUM_ENTRIES, name, f"at most {MAXIMUM_ENTRIES}", len(entries), "join some")
         require(self.seed >= 0, "seed", "a whole number >= 0", self.seed)
 
 
@@ -219,20 +222,15 @@ class _Loader(yaml.SafeLoader):
 
     def get_single_node(self) -> yaml.Node | None:
         node = super().get_single_node()
-        if _node_count(node, {}) > MAXIMUM_NODES:
+        if count_items(node, _parts) > MAXIMUM_NODES:
             raise yaml.YAMLError(f"its aliases expand to more than {MAXIMUM_NODES} values")
         return node
 
 
-def _node_count(node: Any, counts: dict[int, float]) -> float:
-    """Returns the number of values of a node with its aliases resolved; infinity for one that contains itself."""
-    if not isinstance(node, yaml.CollectionNode):
-        return 1
-    if id(node) not in counts:
-        counts[id(node)] = math.inf
-        items = node.value if isinstance(node, yaml.SequenceNode) else [part for pair in node.value for part in pair]
-        counts[id(node)] = 1 + sum(_node_count(item, counts) for item in items)
-    return counts[id(node)]
+def _parts(node: Any) -> Any:
+    if isinstance(node, yaml.MappingNode):
+        return itertools.chain.from_iterable(node.value)
+    return node.value if isinstance(node, yaml.SequenceNode) else None
 
 
 _Loader.add_implicit_resolver(
@@ -273,6 +271,8 @@ def read_mapping(path: str | Path) -> dict[str, Any]:
     path = Path(path)
     if not path.is_file():
         raise ConfigError(f"scene must be an existing YAML file, got {path}")
+    rule, size = f"a file of at most {MAXIMUM_BYTES} bytes", path.stat().st_size
+    require(size <= MAXIMUM_BYTES, f"scene {path}", rule, size, "store particles in .npz files")
     try:
         mapping = yaml.load(path.read_text(encoding="utf-8"), _Loader)
     except (yaml.YAMLError, ValueError, RecursionError) as error:  # a number of thousands of digits, nesting

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hgn.schema import ConfigError
+from hgn.schema import ConfigError, require
 
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree
@@ -18,7 +18,7 @@ CANDIDATES = 1.0  # per spacing^2 and round; a dense Poisson-disk set has about 
 MINIMUM_ROUNDS, MAXIMUM_ROUNDS = 4, 12
 SETTLED = 0.02  # rounds end when one adds less than this fraction
 MINIMUM_CANDIDATES = 64
-MAXIMUM_SAMPLES = 5_000_000
+MAXIMUM_SAMPLES, MAXIMUM_PIECES = 5_000_000, 2_000_000
 
 
 def sample_surface(corner_F33: np.ndarray, spacing: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
@@ -65,6 +65,7 @@ def split_long_edges(
     """Bisects triangles at their longest edge until no edge exceeds `longest`: corners, float64 [F', 3, 3].
 
     Pieces whose bounding box misses `box` (lowest and highest corner) are dropped.
+    Raises: ConfigError for more than MAXIMUM_PIECES.
     """
     corner = np.asarray(corner_F33, np.float64)
     pieces = [corner[:0]]
@@ -78,6 +79,8 @@ def split_long_edges(
         corner = corner[~short]
         start = length_square[~short].argmax(axis=1)
         rows = np.arange(len(corner))
+        rule = f"fewer than {MAXIMUM_PIECES} pieces with edges of {longest:.3g}"
+        require(len(corner) < MAXIMUM_PIECES // 2, "obstacle surface", rule, 2 * len(corner), "raise cell_size")
         a, b, c = (corner[rows, (start + i) % 3] for i in range(3))
         middle = 0.5 * (a + b)
         corner = np.concatenate([np.stack([a, middle, c], axis=1), np.stack([middle, b, c], axis=1)])

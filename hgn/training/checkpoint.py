@@ -5,7 +5,7 @@ Nothing here needs Lightning: checkpoints contain plain containers and tensors.
 
 from __future__ import annotations
 
-import pickle
+import re
 import zipfile
 import zlib
 from dataclasses import dataclass
@@ -19,14 +19,15 @@ from hgn.data.sampler import SamplerState
 from hgn.network.base import ParticleNetwork
 from hgn.network.build import build_network
 from hgn.renamed import current_names, with_step
-from hgn.runtime.weights import find_weights, load_weights
-from hgn.schema import ConfigError, from_stored, to_mapping
+from hgn.runtime.weights import find_weights, load_weights, network_with
+from hgn.schema import ConfigError, OrdinarySize, from_stored, require, require_bounds, to_mapping
 from hgn.step_config import StepConfig
+from hgn.system.claims import Claims, require_few_items, require_plain_pickle
 
 SECTION = "hgn"  # key of this project's entries in a checkpoint
 LAST_NAMES = ("last.ckpt", "last-1.ckpt", "last-2.ckpt")  # newest first
 BEST_NAME = "best.ckpt"  # has the lowest one-step validation error; missing where no validation scene was measured
-_ZIP_FAULTS = (zipfile.BadZipFile, zlib.error, NotImplementedError)
+_CALLED = re.compile(r"collections OrderedDict|torch \w+|torch\._utils _rebuild_(tensor_v2|parameter)")
 NETWORK, AVERAGED = "network.", "averaged."  # prefixes of the trained tensors, and of their moving average
 
 
@@ -39,10 +40,13 @@ class DataInfo:
     """Facts about the training data that are stored with a network."""
 
     config_hash: str
-    frame_rate_hz: float
-    obstacle_cell_size: float
+    frame_rate_hz: OrdinarySize
+    obstacle_cell_size: OrdinarySize
     gravity: tuple[float, float, float] = (0.0, -9.8, 0.0)
     maximum_initial_speed: float | None = None  # of the groups, domain units per second; None: unknown
+
+    def __post_init__(self) -> None:
+        require_bounds(self)
 
 
 @dataclass(frozen=True)
@@ -56,9 +60,11 @@ class Progress:
     @staticmethod
     def of(checkpoint: dict[str, Any]) -> Progress:
         section = current_names(checkpoint[SECTION])
-        before = checkpoint["callbacks"].get("GradientGuard", {}).get("skipped", 0)  # in checkpoints of 0.1.0
-        state = from_stored(SamplerState, section["sampler_state"], "sampler_state")
-        return Progress(section["updates"], section.get("skipped", before), state)
+        guard = (checkpoint.get("callbacks") or {}).get("GradientGuard", {})  # in checkpoints of 0.1.0
+        state = from_stored(SamplerState, section.get("sampler_state"), "sampler_state")
+        counts = section.get("updates"), section.get("skipped", guard.get("skipped", 0))
+        require(all(type(count) is int for count in counts), "checkpoint updates, skipped", "whole numbers", counts)
+        return Progress(*counts, state)  # type: ignore[arg-type]
 
 
 @dataclass(frozen=True)
@@ -77,18 +83,26 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
     """
     try:
         with zipfile.ZipFile(path) as records:
+            claims = Claims(path)
+            for record in records.infolist():
+                claims.add(record.filename, record.file_size)
+                if record.filename.endswith("/data.pkl"):
+                    require_plain_pickle(records.read(record), _CALLED)
             if (damaged := records.testzip()) is not None:
                 raise zlib.error(f"{damaged} has another CRC")
         checkpoint = torch.load(path, map_location="cpu", weights_only=True)
+        require_few_items(checkpoint)
     except FileNotFoundError:
         last, remedy = path.with_name(LAST_NAMES[0]), "hgn.train writes one"
         if path.name == BEST_NAME and last.is_file():
             remedy = f"no validation scene was measured, so take {last}"
         raise ConfigError(f"checkpoint must be an existing file, got {path}; {remedy}") from None
-    except (RuntimeError, EOFError, ValueError, KeyError, OSError, pickle.UnpicklingError, *_ZIP_FAULTS) as error:
+    except Exception as error:  # of any kind: torch reads damaged files too
         reason = str(error).strip().split("\n")[0]
-        raise DamagedError(f"checkpoint must be a whole checkpoint file, got {path}: {reason}") from None
-    if not isinstance(checkpoint, dict) or SECTION not in checkpoint:
+        raise DamagedError(f"checkpoint must be a whole checkpoint file, got {path}: {reason}") from error
+    state = checkpoint.get("state_dict") if isinstance(checkpoint, dict) else None
+    plain = isinstance(state, dict) and all(isinstance(tensor, torch.Tensor) for tensor in state.values())
+    if not plain or not isinstance(checkpoint.get(SECTION), dict):
         raise ConfigError(f"checkpoint must be one of python -m hgn.train, got {path}")
     return checkpoint
 
@@ -102,12 +116,13 @@ def check_checkpoint(checkpoint: dict[str, Any], config: TrainConfig, config_has
     # The dataclass adds the default of a key that the checkpoint lacks.
     stored, section = _network_config(checkpoint, path), checkpoint[SECTION]
     pairs = _pairs("network", stored, config.network) + _pairs("step", _step_config(checkpoint), config.step)
-    pairs.append(("training.noise_std", section["noise_std"], config.training.noise_std))  # part of the normaliser
+    noise_std, data = section.get("noise_std"), data_of_checkpoint(checkpoint)
+    pairs.append(("training.noise_std", noise_std, config.training.noise_std))  # part of the normaliser
     _require_equal(pairs, f" to resume {path}", remedy)
-    if section["data"]["config_hash"] != config_hash:
+    if data.config_hash != config_hash:
         raise ConfigError(
             f"dataset.folder must hold the data set that {path} was trained on, got another one (config hash "
-            f"{config_hash[:12]} instead of {section['data']['config_hash'][:12]}); {remedy}"
+            f"{config_hash[:12]} instead of {data.config_hash[:12]}); {remedy}"
         )
 
 
@@ -148,26 +163,25 @@ def network_of_checkpoint(checkpoint: dict[str, Any], path: Path) -> ParticleNet
 
     Raises: ConfigError for a network that this version does not build.
     """
-    network = build_network(_network_config(checkpoint, path), _step_config(checkpoint))
     state = checkpoint["state_dict"]
     prefix = AVERAGED if any(name.startswith(AVERAGED) for name in state) else NETWORK
+    tensors = {name.removeprefix(prefix): tensor for name, tensor in state.items() if name.startswith(prefix)}
+    config = _network_config(checkpoint, path)
     try:
-        network.load_state_dict({k.removeprefix(prefix): v for k, v in state.items() if k.startswith(prefix)})
-    except RuntimeError as error:
-        raise ConfigError(_other_version(path, str(error).split("\n")[1].strip())) from None
-    network.eval()
-    return network
+        return network_with(config, _step_config(checkpoint), tensors, path=path, field="checkpoint").eval()
+    except ConfigError as error:
+        raise ConfigError(_other_version(path, str(error))) from None
 
 
 def _network_config(checkpoint: dict[str, Any], path: Path) -> NetworkConfig:
     try:
-        return from_stored(NetworkConfig, with_step(checkpoint[SECTION])["network"], "network")
+        return from_stored(NetworkConfig, with_step(checkpoint[SECTION]).get("network"), "network")
     except ConfigError as error:
         raise ConfigError(_other_version(path, str(error))) from None
 
 
 def _step_config(checkpoint: dict[str, Any]) -> StepConfig:
-    return from_stored(StepConfig, with_step(checkpoint[SECTION])["step"], "step")
+    return from_stored(StepConfig, with_step(checkpoint[SECTION]).get("step"), "step")
 
 
 def _other_version(path: Path, reason: str) -> str:
@@ -176,4 +190,4 @@ def _other_version(path: Path, reason: str) -> str:
 
 def data_of_checkpoint(checkpoint: dict[str, Any]) -> DataInfo:
     """Returns the description of the training data."""
-    return from_stored(DataInfo, checkpoint[SECTION]["data"], "data")
+    return from_stored(DataInfo, checkpoint[SECTION].get("data"), "data")

@@ -1,5 +1,6 @@
 """Files from anywhere: what is wrong with them ends in one line, never in a traceback, a hang or foreign data."""
 
+import contextlib
 import io
 import json
 import os
@@ -14,7 +15,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from data.foreign_writers import metadata, write
+from data.foreign_writers import metadata, sequence_example, write
 from data.test_index import shard
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -25,10 +26,13 @@ from hgn.config import NetworkConfig
 from hgn.data.entries import SPLITS, QuarantinedScene
 from hgn.data.foreign.formats import read_split, set_info
 from hgn.data.foreign.settings import ImportConfig
+from hgn.data.foreign.tfrecord import parse_sequence_example, read_records
 from hgn.data.identity import identity_hash
 from hgn.data.index import ListedIndex, parse_json
 from hgn.data.manifest import Manifest
 from hgn.data.shard import locate_members
+from hgn.network.build import build_network
+from hgn.runtime.weights import WeightsInfo, load_weights, save_weights
 from hgn.scene.mesh import load_mesh
 from hgn.scene.npz import read_npz
 from hgn.scene.rollout_file import read_rollout, write_rollout
@@ -164,6 +168,30 @@ def foreign(name):
     return path.name, path.read_bytes(), decode
 
 
+def weights():
+    """Weights of the smallest network."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "w.safetensors"
+        network = build_network(NetworkConfig(width=2, levels=1, message_passing_steps=1))
+        save_weights(path, network, WeightsInfo(network.config, 60.0, 1 / 64))
+        return path.name, path.read_bytes(), load_weights
+
+
+def records():
+    """DeepMind's trajectories: the messages of records whose checksums hold, and records as they are."""
+    walk = np.full((9, 2, 3), 0.5, np.float32)
+    message = sequence_example(walk, np.array([5, 5]), 7)
+
+    def decode(path):
+        data = path.read_bytes()
+        with contextlib.suppress(ConfigError):
+            list(read_records(path))
+        context, lists = parse_sequence_example(data, "here")
+        assert context is not None and lists is not None
+
+    return "train.tfrecord", message, decode
+
+
 LISTED = tempfile.TemporaryDirectory()  # data sets without their shards
 
 
@@ -200,23 +228,27 @@ FILES = {
     "npz": archive(),
     "pickles": pickles(),
     "checkpoint": checkpoint(),
+    "weights": weights(),
+    "tfrecord": records(),
     "tar": tar(),
     "yaml": ("s.yaml", b"groups:\n- {shape: cube, size: 0.1, position: [0.5, 0.5, 0.5], material: sand}\n", load_scene),
     "json": ("i.jsonl", b'{"bytes": 12, "totals": {"train": 7}}', lambda path: parse_json(path.read_bytes(), "i")),
 }
 
 
-EXAMPLES = int(os.environ.get("HGN_FUZZ_EXAMPLES", "25"))  # of each; more are other ones each time
+EXAMPLES = 200  # of each
 
 
+@pytest.mark.parametrize("examples", [EXAMPLES, pytest.param(5000, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("kind", FILES)
-def test_decoders_bear_any_bytes(kind):
+def test_decoders_bear_any_bytes(kind, examples):
     """A file with some bytes changed, cut or repeated is read, or refused with a message: nothing else comes out, and
     that in no more than 0.5 GB of memory."""
     name, content, decode = FILES[kind]
     places = st.lists(st.tuples(st.integers(0, len(content) - 1), st.integers(0, 255)), max_size=4)
 
-    @settings(max_examples=EXAMPLES, deadline=None, derandomize=EXAMPLES == 25, database=None)
+    # the slow ones are other ones each time
+    @settings(max_examples=examples, deadline=None, derandomize=examples == EXAMPLES, database=None)
     @given(places, st.integers(0, len(content)), st.integers(0, 3))
     def damaged(changes, cut, kind_of_cut):
         data = bytearray(content)

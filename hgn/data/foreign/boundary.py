@@ -9,9 +9,11 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from hgn.scene.obstacle_grid import ObstacleGrid, grid_of_samples
+from hgn.schema import require
 
 NEAR = 1.9  # spacings: the neighbourhood that normals are computed from, two layers and not three
 THIN = 0.1  # ratio of the spreads across and along a surface, below which it is one layer
+CROWD = 1000  # mean number of neighbours; a body has about 30
 ONE_SIDED = 0.25  # spacings: a mean neighbour offset above it points into a body
 
 
@@ -30,8 +32,11 @@ def boundary_grid(point_P3: np.ndarray, dimensions: int, cell_size: float) -> Ob
     """
     point_PD = point_P3[:, :dimensions].astype(np.float64)
     normal_P3 = np.zeros((len(point_PD), 3))
-    apart = spacing(point_PD)
-    for own, near in enumerate(KDTree(point_PD).query_ball_point(point_PD, NEAR * apart)):
+    apart, tree = spacing(point_PD), KDTree(point_PD)
+    pairs = int(tree.count_neighbors(tree, NEAR * apart))
+    rule = f"at most {CROWD} within {NEAR:g} spacings of each"
+    require(pairs <= CROWD * len(point_PD), "boundary particles", rule, pairs / max(1, len(point_PD)))
+    for own, near in enumerate(tree.query_ball_point(point_PD, NEAR * apart)):
         offset_ND = point_PD[near] - point_PD[own]
         mean_D = offset_ND.mean(axis=0)
         spread_D, axes_DD = np.linalg.eigh(offset_ND.T @ offset_ND)

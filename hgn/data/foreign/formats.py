@@ -12,6 +12,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -155,8 +156,8 @@ def _read_deepmind(folder: Path, split: str, info: SetInfo) -> Iterator[Trajecto
         frames: Any = info.raw.get("sequence_length")
         require(isinstance(frames, int), f"{folder}/metadata.json: sequence_length", "a whole number", frames)
         shape = (int(frames) + 1, len(types), info.dimensions)  # with the frame before the first velocity
-        if flat.size != np.prod(shape):
-            rule = f"{np.prod(shape)} numbers for sequence_length + 1, particles and dim {shape}"
+        if flat.size != math.prod(shape):
+            rule = f"{math.prod(shape)} numbers for sequence_length + 1, particles and dim {shape}"
             raise ConfigError(f"{name}: position must have {rule}, got {flat.size}")
         position_TND, type_N = checked(name, flat.reshape(shape), types, info.dimensions)
         yield Trajectory(name, position_TND, type_N)

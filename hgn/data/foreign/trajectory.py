@@ -5,7 +5,6 @@ Shape legend: T frames, N particles of all kinds, P particles of the boundary, D
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -13,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from hgn.schema import ConfigError, require
+from hgn.system.claims import require_few_items
 
 MOST_RADII = 1 << 14  # across the box, because cells are indexed by integers
 FLUID = 1  # the type of particles in files without types
@@ -54,11 +54,12 @@ class SetInfo:
         require(self.dimensions in (2, 3), "metadata.json: dim", "2 or 3", self.dimensions)
         positive = {"dt": self.frame_dt_s, "default_connectivity_radius": self.radius}
         for name, value in positive.items():
-            require(0 < value < math.inf, f"metadata.json: {name}", "a finite number > 0", value)
+            require(1e-15 <= value <= 1e15, f"metadata.json: {name}", "a finite number > 0", value)
         shape = np.shape(self.bounds)
         rule = f"[low, high] for each of {self.dimensions} axes"
         require(shape == (self.dimensions, 2), "metadata.json: bounds", rule, self.bounds)
-        require(all(low < high for low, high in self.bounds), "metadata.json: bounds", "low < high", self.bounds)
+        ordered = all(-1e9 <= low < high <= 1e9 for low, high in self.bounds)
+        require(ordered, "metadata.json: bounds", "low < high, from -1e9 to 1e9", self.bounds)
         longest = max(high - low for low, high in self.bounds)
         rule = f"{longest / MOST_RADII:.3g} or more, the box being {longest:g} wide"
         require(self.radius * MOST_RADII >= longest, "metadata.json: default_connectivity_radius", rule, self.radius)
@@ -93,6 +94,7 @@ def checked(name: str, position: Any, types: Any, dimensions: int) -> tuple[np.n
 def as_array(name: str, value: Any) -> np.ndarray:
     """Returns a file's value as an array. Raises: ConfigError naming `name` for lists of different lengths."""
     try:
+        require_few_items(value)
         return np.asarray(value)
     except ValueError as error:  # lists of different lengths
         raise ConfigError(f"{name} must be an array, got {error}") from None

@@ -1,0 +1,73 @@
+"""Comparison of what a file claims to contain with its size, before memory is allocated for it."""
+
+from __future__ import annotations
+
+import math
+import pickletools
+import re
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any
+
+from hgn.schema import ConfigError
+
+SMALL_BYTES = 64 << 20  # that any file may claim
+EXPANSION = 100  # bytes that a byte of a larger file may claim: arrays of zeros compress well
+MOST_ITEMS = 10_000_000  # of nested lists, with references resolved
+
+
+class Claims:
+    """Adds up the bytes that the content of a file claims; one object a reading of the file."""
+
+    def __init__(self, file: Path | str, file_bytes: int | None = None) -> None:
+        self._file = file
+        self._file_bytes = Path(file).stat().st_size if file_bytes is None else file_bytes
+        self._most = max(SMALL_BYTES, EXPANSION * self._file_bytes)
+        self._sum = 0
+
+    def add(self, name: object, *counts: int) -> None:
+        """Adds the product of `counts`, the last of which is the size of an item.
+
+        Raises: ConfigError naming the file and `name`, once the sum is more than the file can contain.
+        """
+        self._sum += math.prod(map(int, counts)) if min(counts, default=0) >= 0 else self._most + 1
+        if self._sum > self._most:
+            raise ConfigError(
+                f"{self._file}: {name} must bring its content to at most {self._most} bytes, as the file has "
+                f"{self._file_bytes}, got {' x '.join(map(str, counts))[:200]} more; write or fetch the file again"
+            )
+
+
+def require_plain_pickle(data: bytes, names: re.Pattern[str] = re.compile(".*")) -> None:
+    """Checks the sizes in a pickle, which Python allocates before it reads on, and what it calls (`module name`).
+
+    Raises: ValueError for a pickle that is cut, has a memo larger than itself, or calls other than `names`.
+    """
+    for operation, argument, _ in pickletools.genops(data):
+        if "PUT" in operation.name and int(argument or 0) > len(data):
+            raise ValueError(f"a memo of {argument} objects in a pickle of {len(data)} bytes")
+        if operation.name == "GLOBAL" and names.fullmatch(str(argument)) is None:
+            raise ValueError(f"{argument}, which is no part of it")
+
+
+def require_few_items(value: Any) -> None:
+    """Checks the number of items of nested lists. Raises: ValueError for more than MOST_ITEMS, references resolved."""
+    if (count := count_items(value)) > MOST_ITEMS:
+        raise ValueError(f"references that stand for {count:.3g} items")
+
+
+def _parts(value: Any) -> Iterable[Any] | None:
+    return value.values() if isinstance(value, dict) else value if isinstance(value, (list, tuple)) else None
+
+
+def count_items(
+    value: Any, parts: Callable[[Any], Iterable[Any] | None] = _parts, counts: dict[int, float] | None = None
+) -> float:
+    """Returns the number of values in one, references resolved; infinity for one that contains itself."""
+    counts = {} if counts is None else counts
+    if (inner := parts(value)) is None:
+        return 1
+    if id(value) not in counts:
+        counts[id(value)] = math.inf
+        counts[id(value)] = 1 + sum(count_items(part, parts, counts) for part in inner)
+    return counts[id(value)]

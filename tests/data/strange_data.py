@@ -1,0 +1,290 @@
+"""Files that claim far more than they hold: rollouts, particles, imports and manifests."""
+
+import io
+import json
+import struct
+import zipfile
+
+import h5py
+import numpy as np
+from data.foreign_writers import metadata, write
+from data.strange_files import cases, laughing, saved
+from data.test_index import shard
+from scene.test_rollout_file import make_rollout
+
+from hgn.data.foreign.dataset import import_set
+from hgn.data.foreign.settings import ImportConfig
+from hgn.data.identity import identity_hash
+from hgn.data.index import ListedIndex
+from hgn.data.manifest import Manifest
+from hgn.scene.rollout_file import read_rollout, write_rollout
+from hgn.scene.scene_file import load_scene
+
+# HDF5 and NumPy archives
+
+
+def rollout(change):
+    def make(folder):
+        path = folder / "r.vtkhdf"
+        write_rollout(path, make_rollout())
+        with h5py.File(path, "r+") as file:
+            change(file)
+        return path
+
+    return make
+
+
+def claimed(name, shape, dtype):
+    """A dataset of this shape, none of whose chunks was ever written."""
+
+    def change(file):
+        del file[name]
+        file.create_dataset(name, shape, dtype, chunks=tuple(min(length, 64) for length in shape))
+
+    return change
+
+
+def links(file):
+    """Groups that contain the next one a dozen times: 12^8 paths."""
+    group = file
+    for level in range(8):
+        following = file.create_group(f"level{level}")
+        for number in range(12):
+            group[f"n{number}"] = following
+        group = following
+
+
+def chunked(file):
+    """One number in a chunk of 2 GB."""
+    del file["00000/position"]
+    options = {"maxshape": (None,), "chunks": (500_000_000,), "compression": "gzip"}
+    file.create_dataset("00000/position", (1,), "f4", **options)
+
+
+def loop(file):
+    file["hgn/self"] = file["hgn"]
+
+
+def linked_obstacles(file):
+    group = file["hgn/obstacles"]
+    one = group["0000"]
+    del one["vertices"]
+    one.create_dataset("vertices", data=np.zeros((60_000, 3)), compression="gzip")
+    for number in range(2000):
+        group[f"n{number}"] = one
+
+
+def frames_of_nobody(file):
+    """10^10 places of particles that never enter."""
+    for name, value in {
+        "VTKHDF/NumberOfPoints": np.full(100_000, 7),
+        "VTKHDF/PointData/material": np.zeros(100_000, np.uint8),
+        "VTKHDF/Vertices/Connectivity": np.zeros(100_000, np.int64),
+    }.items():
+        del file[name]
+        file.create_dataset(name, data=value, compression="gzip")
+    file.create_dataset("hgn/entry_frame", data=np.full(100_000, 10**6), compression="gzip")
+
+
+def long_source(file):
+    del file["hgn/source"]
+    file.create_dataset("hgn/source", data=np.frombuffer(b"[" + 20_000_000 * b"[]," + b"0]", "V1"), compression="gzip")
+
+
+cases(
+    "rollout",
+    {
+        "points": rollout(claimed("VTKHDF/Points", (10**10, 3), "f4")),
+        "materials": rollout(claimed("VTKHDF/PointData/material", (10**11,), "u1")),
+        "vertices": rollout(claimed("hgn/obstacles/0000/vertices", (10**10, 3), "f8")),
+        "counts": rollout(claimed("VTKHDF/NumberOfPoints", (10**10,), "i8")),
+        "reference": rollout(claimed("hgn/reference", (10**4, 10**6, 3), "f4")),
+        "text": rollout(claimed("hgn/source", (10**10,), "S64")),
+        "hard links": rollout(links),
+        "loop": rollout(loop),
+        "linked obstacles": rollout(linked_obstacles),
+        "frames of nobody": rollout(frames_of_nobody),
+    },
+    read_rollout,
+)
+
+
+def zipped(members, name="train.npz"):
+    """An archive of arrays of zeros, from their shapes."""
+
+    def make(folder):
+        with zipfile.ZipFile(folder / name, "w", zipfile.ZIP_DEFLATED) as archive:
+            for member, (shape, dtype, held) in members.items():
+                head = io.BytesIO()
+                np.lib.format.write_array_header_1_0(head, {"descr": dtype, "fortran_order": False, "shape": shape})
+                with archive.open(f"{member}.npy", "w", force_zip64=True) as file:
+                    file.write(head.getvalue())
+                    for _ in range(held // 2**20):
+                        file.write(bytes(2**20))
+        return folder / name
+
+    return make
+
+
+def scene_with(particles):
+    def make(folder):
+        particles(folder)
+        path = folder / "s.yaml"
+        path.write_text("groups:\n- {particles: train.npz, material: sand}\n")
+        return path
+
+    return make
+
+
+BOMB = 200 * 2**20
+cases(
+    "particles",
+    {
+        "bomb": scene_with(zipped({"position": ((BOMB // 12, 3), "<f4", BOMB)})),
+        "bomb beside": scene_with(zipped({"other": ((BOMB // 12, 3), "<f4", BOMB)})),
+        "claim": scene_with(zipped({"position": ((10**10, 3), "<f4", 2**20)})),
+        "no axis": scene_with(zipped({"position": ((10**18, 0, 3), "<f4", 0)})),
+        "wide text": scene_with(zipped({"position": ((1,), "<U1000000000", 2**20)})),
+        "many": scene_with(zipped({f"a{number}": ((2**18,), "<f4", 2**20) for number in range(200)})),
+    },
+    load_scene,
+)
+
+
+def imported(name, change=lambda folder: None, **changes):
+    def make(folder):
+        walk = 0.5 + 0.001 * np.random.default_rng(0).random((9, 4, 3)).astype(np.float32)
+        walls = np.random.default_rng(1).uniform(0.1, 0.9, (6, 3)).astype(np.float32)
+        source = write(folder / "foreign", name, {"train": [(walk, np.full(4, 5), walls)] * 2}, metadata(write_every=1))
+        (source / "metadata.json").write_text(json.dumps(json.loads((source / "metadata.json").read_text()) | changes))
+        change(source)
+        return source
+
+    return make
+
+
+def h5(name, change):
+    def on(folder):
+        with h5py.File(folder / name, "r+") as file:
+            change(file)
+
+    return on
+
+
+def objects(value):
+    """A pickled array that refers to a value."""
+
+    def on(folder):
+        entry = np.empty(1, object)
+        entry[0] = value
+        np.savez(folder / "train.npz", gns_data=entry)
+
+    return on
+
+
+def raw_pickle(data):
+    def on(folder):
+        head = io.BytesIO()
+        np.lib.format.write_array_header_1_0(head, {"descr": "|O", "fortran_order": False, "shape": (1,)})
+        with zipfile.ZipFile(folder / "train.npz", "w") as archive:
+            archive.writestr("gns_data.npy", head.getvalue() + data)
+
+    return on
+
+
+def crowded(file):
+    """A wall of 80,000 particles at one place."""
+    del file["boundary"]
+    file["boundary"] = np.full((9, 80_000 // 9, 3), 0.25, np.float32)
+
+
+cases(
+    "import",
+    {
+        "position": imported("lagrangebench", h5("train.h5", claimed("00000/position", (10**4, 10**6, 3), "f4"))),
+        "large chunks": imported("lagrangebench", h5("train.h5", chunked)),
+        "types": imported("lagrangebench", h5("train.h5", claimed("00001/particle_type", (10**11,), "i4"))),
+        "links": imported("lagrangebench", h5("train.h5", links)),
+        "particles": imported("neuralmpm", h5("train/sim_0.h5", claimed("particles", (10**4, 10**6, 6), "f4"))),
+        "crowd": imported("neuralmpm", h5("train/sim_0.h5", crowded)),
+        "npz": imported("plain", zipped({"a/position": ((9, BOMB // 108, 3), "<f4", BOMB)})),
+        "object claim": imported("geoelements", zipped({"gns_data": ((10**10,), "|O", 0)})),
+        "references": imported("geoelements", objects((laughing(), np.full(4, 5)))),
+        "memo": imported("geoelements", raw_pickle(b"\x80\x02}r\xff\xff\xff\x7f.")),
+        "long bytes": imported("geoelements", raw_pickle(b"\x80\x04\x8e" + struct.pack("<Q", 10**11) + b"x.")),
+        "sequence length": imported("deepmind", sequence_length=10**30),
+        "nested metadata": imported(
+            "plain", lambda folder: (folder / "metadata.json").write_text(300_000 * "[" + 300_000 * "]")
+        ),
+        "bounds": imported("plain", bounds=[[0, 1e300]] * 3, default_connectivity_radius=1e296),
+    },
+    lambda source: import_set(source, ImportConfig(out=str(source.parent / "out"), gravity=(0.0, -9.8, 0.0))),
+)
+
+# manifests
+
+
+def manifest(head=None, **changes):
+    def make(folder):
+        Manifest(identity_hash({}), {}, {"train": 1}, 1, ListedIndex([shard(0)])).save(folder)
+        path = folder / "manifest.json"
+        stored = json.loads(path.read_text())
+        if head is not None:
+            head(stored)
+        path.write_text(json.dumps(stored | changes))
+        return folder
+
+    return make
+
+
+def totals(**values):
+    def change(stored):
+        stored["totals"]["train"] |= values
+        if "shards" in values:
+            stored["index"]["shards"] = values["shards"]
+
+    return change
+
+
+def state(**values):
+    return lambda stored: stored["index"].update(values)
+
+
+def listing(**values):
+    def make(folder):
+        moments = {"count": 0, "mean": [0.0] * 3, "squared_deviation": [0.0] * 3}
+        entry = {
+            "name": "a.tar", "split": "train", "first": 0, "stop": 1, "sha256": 64 * "0", "bytes": 1, "episodes": [],
+            "statistics": {"velocity": moments, "acceleration": moments},
+        }  # fmt: skip
+        head = {"config_hash": identity_hash({}), "config": {}, "requested": {}, "schema_version": 1}
+        (folder / "manifest.json").write_text(json.dumps(head | {"shards": [entry | values]}))
+        return folder
+
+    return make
+
+
+def used(folder):
+    """What a training does first."""
+    from hgn.data.reader import EpisodeStore
+
+    store = EpisodeStore(folder, "train")
+    store.frames()
+    store.particles([0])
+    return list(store.entries), store.manifest.quarantined
+
+
+cases(
+    "manifest",
+    {
+        "episodes": manifest(totals(episodes=10**12), config={"frames": 6}, config_hash=identity_hash({"frames": 6})),
+        "shards": manifest(totals(episodes=10**12, shards=10**12)),
+        "bytes of a segment": manifest(state(segment_bytes=10**12)),
+        "bytes of the table": manifest(lambda head: (totals(shards=1000)(head), state(table_bytes=10**12)(head))),
+        "bytes of the quarantine": manifest(state(quarantine_bytes=10**12, quarantined=10**12)),
+        "range": listing(stop=10**11),
+        "nesting": saved("manifest.json", 400_000 * b"["),
+        "config": manifest(config={"a": [[]] * 100_000}),
+    },
+    lambda folder: used(folder if folder.is_dir() else folder.parent),
+)  # fmt: skip

@@ -1,0 +1,36 @@
+"""Files that claim more than they hold are refused before memory is allocated for the claim."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from data import strange_data
+from data.strange_files import CASES
+
+TESTS = Path(__file__).parents[1]
+assert strange_data  # which adds its files to CASES
+READ = {  # files that hold what they claim
+    "mesh: primitives", "mesh: obj of polygons", "mesh: obj of one polygon", "mesh: obj of groups",
+    "mesh: obj of materials", "scene: sheet of 9000", "scene: larger obstacle", "scene: keyframes",
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def outcomes():
+    """What became of each file, in processes with 2 GB of memory and 20 s of a core."""
+    paths = os.pathsep.join(map(str, (TESTS.parent, TESTS, TESTS / "datagen")))
+    command = [sys.executable, str(TESTS / "data" / "strange_program.py")]
+    run = subprocess.run(command, env=os.environ | {"PYTHONPATH": paths}, capture_output=True, text=True, check=True)
+    return {(line := json.loads(text))["name"]: line for text in run.stdout.splitlines()}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_claims_are_compared_first(outcomes, name):
+    """The file is refused in one short line, or read within the limits; it is not memory that runs out."""
+    text = outcomes[name]["text"]
+    assert text == "read" if name in READ else text.startswith("refused: ")
+    assert "allocate" not in text and "\n" not in text and len(text) < 1500
+    assert outcomes[name]["kB"] < 1_000_000
