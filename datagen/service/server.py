@@ -18,6 +18,7 @@ from __future__ import annotations
 import asyncio
 import hashlib
 import hmac
+import re
 from collections import Counter, defaultdict
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, replace
@@ -142,6 +143,11 @@ class Guard:
             for name, value in scope["headers"]
         ):
             await PlainTextResponse("nothing can be sent here\n", 413, {"connection": "close"})(scope, receive, counted)
+            return
+        if self._expected is None and not _is_own_name(scope):  # a page elsewhere that named this machine its own
+            await PlainTextResponse("ask by the address of this machine, or set a token\n", 421)(
+                scope, receive, counted
+            )
             return
         if not self._allowed(scope):
             refusal = PlainTextResponse(
@@ -283,6 +289,14 @@ def make_server(
             timeout_notify=0,  # s; it is looked at every second
         )
     )
+
+
+def _is_own_name(scope: Scope) -> bool:
+    """Returns whether a request names this machine: by localhost, or the address that it was sent to."""
+    hosts = [value.decode("latin-1") for name, value in scope["headers"] if name == b"host"]
+    names = [re.sub(r":\d+$", "", host).strip("[]") for host in hosts]
+    own = ("localhost", "127.0.0.1", "::1", str((scope.get("server") or ("",))[0]))
+    return all(name in own for name in names)
 
 
 def _unchanged(request: Request, etag: str) -> bool:

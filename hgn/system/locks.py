@@ -17,7 +17,7 @@ from hgn.system.files import make_folder
 NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP, errno.EINVAL)  # of file systems without locks
 
 
-def lock_file(file: IO[Any]) -> bool:
+def lock_file(file: IO[Any] | int) -> bool:
     """Locks a file; returns False if another process has the lock. Raises: OSError with one of NO_LOCKS."""
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -48,19 +48,24 @@ def lock_bytes(file: int, kind: int, start: int, length: int = 1, wait: bool = F
 
 @contextlib.contextmanager
 def locked(path: Path, field: str, refusal: str) -> Iterator[None]:
-    """Locks a file for this process.
+    """Locks a file for this process, and its folder, in case somebody deletes the file.
 
     Raises: ConfigError `<field> must be ...`, with `refusal`, when another process has the lock. On a file system
     without locks every process succeeds.
     """
     make_folder(path.parent)
-    with path.open("ab") as file:
-        try:
-            free = lock_file(file)
-        except OSError as error:
-            if error.errno not in NO_LOCKS:
-                raise
-            free = True
-        if not free:
-            raise ConfigError(f"{field} must be a folder of its own, got {path.parent}: {refusal} another {field}=...")
+    with path.open("ab") as file, contextlib.ExitStack() as stack:
+        folder = os.open(path.parent, os.O_RDONLY)
+        stack.callback(os.close, folder)
+        for opened in (file.fileno(), folder):
+            try:
+                free = lock_file(opened)
+            except OSError as error:
+                if error.errno not in (*NO_LOCKS, errno.EBADF):  # the last of folders on NFS
+                    raise
+                free = True
+            if not free:
+                raise ConfigError(
+                    f"{field} must be a folder of its own, got {path.parent}: {refusal} another {field}=..."
+                )
         yield

@@ -13,6 +13,7 @@ import http
 import io
 import secrets
 import socket
+from collections import Counter
 from collections.abc import Callable
 from typing import Any
 from unittest import mock
@@ -20,12 +21,14 @@ from urllib.parse import parse_qs, urlsplit
 
 import viser
 import websockets.asyncio.server
+from viser._gui_api import GuiApi
 from websockets import Headers
 from websockets.http11 import Request, Response
 
 from hgn.schema import require
 
 COOKIE = "hgn_play"
+MAXIMUM_UNFINISHED_BYTES = 128 << 20  # of uploads that are not whole yet, of all viewers
 REFUSAL = b"open the address that hgn.play printed, with its token\n"
 Process = Callable[[Any, Request], Response | None]
 
@@ -45,11 +48,26 @@ def start_server(host: str, port: int, label: str) -> tuple[viser.ViserServer, s
     def guarded_serve(*args: Any, process_request: Process, **options: Any) -> Any:
         return serve(*args, process_request=guarded(process_request, token), **options)
 
+    limit = mock.patch.object(GuiApi, "_handle_file_transfer_part", bounded(GuiApi._handle_file_transfer_part))
     unsaid = contextlib.redirect_stdout(io.StringIO())  # Viser's own lines have an address without the token
-    with unsaid, mock.patch.object(websockets.asyncio.server, "serve", guarded_serve):
+    with unsaid, limit, mock.patch.object(websockets.asyncio.server, "serve", guarded_serve):
         server = viser.ViserServer(host, port, label, verbose=False)
     shown = "127.0.0.1" if host in ("0.0.0.0", "localhost") else host
     return server, f"http://{shown}:{server.get_port()}/?token={token}"
+
+
+def bounded(handle: Callable[..., None]) -> Callable[..., None]:
+    """Drops the uploads of the viewer with the most bytes where unfinished ones are too large together."""
+
+    def answer(gui: GuiApi, client: int, message: Any) -> None:
+        sizes: Counter[int] = Counter({client: len(message.content)})
+        for state in list(gui._current_file_upload_states.values()):
+            sizes[state["client_id"]] += state["transferred_bytes"]
+        if sizes.total() > MAXIMUM_UNFINISHED_BYTES:
+            gui._drop_uploads_from_client(sizes.most_common(1)[0][0])  # type: ignore[arg-type]
+        handle(gui, client, message)  # ignores parts of uploads that were dropped
+
+    return answer
 
 
 def stop_server(server: viser.ViserServer) -> None:

@@ -19,6 +19,7 @@ from hgn.scene.scene import Scene
 from hgn.scene.shapes import shape_obstacle
 
 pytest.importorskip("viser", reason="viser is not installed: pip install 'hgn[play]'")
+from hgn.viewer import viser_compat
 from hgn.viewer.page import MAXIMUM_UPLOAD_BYTES, PlayPage
 from hgn.viewer.session import PlaySession
 from hgn.viewer.viser_compat import COOKIE, guarded
@@ -177,3 +178,27 @@ def test_requests_of_other_pages_are_refused():
         connection = SimpleNamespace(local_address=("127.0.0.1", 8080))
         response = guarded(lambda connection, request: None, "secret")(connection, Request("/", headers))
         assert (response is not None and response.status_code == http.HTTPStatus.FORBIDDEN) == refused
+
+
+def test_unfinished_uploads_are_bounded(monkeypatch):
+    """Parts of uploads that never become whole are dropped, those of the viewer with the most first."""
+    monkeypatch.setattr(viser_compat, "MAXIMUM_UNFINISHED_BYTES", 1000)
+    states = {}
+
+    def drop(client):
+        for key in [key for key, state in states.items() if state["client_id"] == client]:
+            del states[key]
+
+    def take(gui, client, message):
+        if message.transfer_uuid in states:
+            states[message.transfer_uuid]["transferred_bytes"] += len(message.content)
+
+    gui = SimpleNamespace(_current_file_upload_states=states, _drop_uploads_from_client=drop)
+    states["small"] = {"client_id": 1, "transferred_bytes": 0}
+    part = viser_compat.bounded(take)
+    part(gui, 1, SimpleNamespace(transfer_uuid="small", content=bytes(100)))
+    for number in range(40):
+        states[str(number)] = {"client_id": 2, "transferred_bytes": 0}
+        part(gui, 2, SimpleNamespace(transfer_uuid=str(number), content=bytes(300)))
+        assert sum(state["transferred_bytes"] for state in states.values()) <= 1000
+    assert states["small"]["transferred_bytes"] == 100
