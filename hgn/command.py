@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from hgn.config import config_directory
-from hgn.schema import ConfigError, require
+from hgn.schema import ConfigError, require, without_passwords
 from hgn.system.extras import missing_extra
 
 EXIT_MACHINE, EXIT_INPUT, EXIT_INTERRUPTED, EXIT_UNREAD = 1, 2, 130, 141
@@ -32,7 +32,9 @@ _MACHINE_ERRORS = {
     errno.ENOTDIR: "choose another path",
     errno.EISDIR: "choose another path",
     errno.ENAMETOOLONG: "choose another path",
-    errno.ETIMEDOUT: "check that its server runs",
+    errno.ETIMEDOUT: "check its server or disk",
+    errno.EMFILE: "raise the limit of open files (ulimit -n)",
+    errno.ENFILE: "close other programs",
 }
 
 
@@ -83,11 +85,13 @@ def _exit_code(main: Callable[[dict[str, Any]], int | None], config_name: str) -
             raise
         code = _fail(missing, EXIT_MACHINE)
     except OSError as error:
-        if error.errno not in _MACHINE_ERRORS:
+        if isinstance(error, BrokenPipeError):
             raise
         place = f": {error.filename}" if error.filename else ""
-        remedy = _MACHINE_ERRORS[error.errno]
-        code = _fail(f"{error.strerror}{place}; {remedy} and run the same command again", EXIT_MACHINE)
+        remedy = _MACHINE_ERRORS.get(error.errno or 0, "check the disk and its network")
+        code = _fail(f"{error.strerror or error}{place}; {remedy} and run the same command again", EXIT_MACHINE)
+    except MemoryError as error:
+        code = _fail(f"memory is full ({error}); take smaller input or another machine", EXIT_MACHINE)
     except KeyboardInterrupt:
         code = _fail("interrupted", EXIT_INTERRUPTED)
     return code
@@ -151,5 +155,5 @@ def _with_json_as_override(arguments: list[str]) -> list[str]:
 
 
 def _fail(message: str, code: int) -> int:
-    print(f"error: {' '.join(message.split())}", file=sys.stderr, flush=True)
+    print(f"error: {' '.join(without_passwords(message).split())}", file=sys.stderr, flush=True)
     return code

@@ -28,6 +28,7 @@ from typing import Any, TypeVar, overload
 from hgn.data.entries import (
     REMEDY,
     SPLITS,
+    Count,
     EpisodeEntry,
     QuarantinedScene,
     ShardEntry,
@@ -36,7 +37,7 @@ from hgn.data.entries import (
     no_totals,
     totals_of,
 )
-from hgn.data.storage import open_storage
+from hgn.data.storage import Storage, StorageError, ask
 from hgn.schema import ConfigError, NonNegative, from_mapping, require_bounds, to_mapping
 from hgn.system.files import errors_name, make_folder, sync_file, sync_folder
 
@@ -53,7 +54,7 @@ class IndexState:
     """The valid sizes of the index's files."""
 
     generation: NonNegative[int] = 1
-    shards: NonNegative[int] = 0
+    shards: Count = 0
     segment_bytes: NonNegative[int] = 0  # of the last segment
     table_bytes: NonNegative[int] = 0
     quarantined: NonNegative[int] = 0
@@ -229,16 +230,20 @@ class Index(Sequence[ShardEntry]):
 
     def _rows(self, cls: type[T], kind: int | str, start: int, stop: int, count: int) -> list[T]:
         name = self.state.path(kind)
-        try:
-            content = open_storage(self.folder).read(name, start, stop) if stop > start else b""
-        except FileNotFoundError:
-            raise ConfigError(f"{self.folder}/{name} must be there, got no such file; {REMEDY}") from None
-        rows = [from_mapping(cls, parse_json(line, name), name) for line in content.splitlines()]
-        if len(rows) != count:
-            raise ConfigError(
-                f"{self.folder}/{name} must have {count} lines from byte {start}, got {len(rows)}; {REMEDY}"
-            )
-        return rows
+
+        def read(storage: Storage) -> list[T]:
+            try:
+                content = storage.read(name, start, stop) if stop > start else b""
+            except FileNotFoundError:
+                raise StorageError(f"{self.folder}/{name} must be there, got no such file; {REMEDY}") from None
+            rows = [from_mapping(cls, parse_json(line, name), name) for line in content.splitlines()]
+            if len(rows) != count:
+                raise StorageError(
+                    f"{self.folder}/{name} must have {count} lines from byte {start}, got {len(rows)}; {REMEDY}"
+                )
+            return rows
+
+        return ask(self.folder, read)
 
     def _ends(self) -> list[_SegmentEnd]:
         """Returns the ends of the full segments, and of later ones that were read."""
@@ -349,7 +354,7 @@ def parse_json(content: bytes, path: str) -> Any:
     try:
         return json.loads(content, parse_constant=_refuse)
     except (ValueError, RecursionError) as error:
-        raise ConfigError(f"{path} must be JSON written by python -m datagen, got {error}; {REMEDY}") from None
+        raise StorageError(f"{path} must be JSON written by python -m datagen, got {error}; {REMEDY}") from None
 
 
 def _refuse(constant: str) -> None:

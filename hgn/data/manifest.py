@@ -26,13 +26,14 @@ from hgn.data.entries import (
 from hgn.data.identity import identity_hash
 from hgn.data.index import Index, IndexState, ListedIndex, begin, extend, parse_json
 from hgn.data.statistics import Statistics
-from hgn.data.storage import PATIENCE_S, open_storage
+from hgn.data.storage import ask, open_storage
 from hgn.scene.episode import SCHEMA_VERSION, require_schema_version
 from hgn.schema import ConfigError, from_mapping, require, to_mapping
 from hgn.system.files import write_atomically
 
 __all__ = ["MANIFEST_NAME", "SPLITS", "EpisodeEntry", "Manifest", "QuarantinedScene", "ShardEntry"]
 MANIFEST_NAME = "manifest.json"
+MOST_BYTES = 32 << 20  # of it; one of the first release lists 8,000 shards in so many
 
 
 @dataclass(frozen=True)
@@ -69,7 +70,7 @@ class Manifest(_Identity):
     shards: Index = field(default_factory=lambda: ListedIndex(()))  # in publication order
 
     @staticmethod
-    def load(folder: Path | str, patience_s: float = PATIENCE_S) -> Manifest:
+    def load(folder: Path | str, patience_s: float | None = None) -> Manifest:
         """Reads `<folder>/manifest.json`; a server may be away for `patience_s`.
 
         Raises: ConfigError when it is missing, no JSON, of another schema version, or wrong in any field;
@@ -77,13 +78,14 @@ class Manifest(_Identity):
         """
         path = f"{folder}/{MANIFEST_NAME}"
         try:
-            content = open_storage(folder).manifest(MANIFEST_NAME, patience_s)
+            if patience_s != 0:
+                return ask(folder, lambda files: Manifest.parse(files.manifest(MANIFEST_NAME, patience_s), folder))
+            return Manifest.parse(open_storage(folder).manifest(MANIFEST_NAME, 0.0), folder)
         except (FileNotFoundError, NotADirectoryError):
             raise ConfigError(
                 f"{path} must be the manifest of a data set, got no such file; generate one with "
                 f"python -m datagen +experiment=... out={folder}"
             ) from None
-        return Manifest.parse(content, folder)
 
     @staticmethod
     def parse(content: bytes, folder: Path | str) -> Manifest:
@@ -92,6 +94,7 @@ class Manifest(_Identity):
         Raises: ConfigError when they are no JSON, of another schema version, or wrong in any field.
         """
         path = f"{folder}/{MANIFEST_NAME}"
+        require(len(content) <= MOST_BYTES, path, f"at most {MOST_BYTES} bytes", len(content))
         mapping = parse_json(content, path)
         require_schema_version(mapping, path)
         if "index" not in mapping:

@@ -44,6 +44,10 @@ class PooledStore(Episodes):
         """Refreshes the data set that may grow."""
         return self.own.refresh()
 
+    def ask_again(self) -> None:
+        """Refreshes after a fault; see EpisodeStore.ask_again."""
+        self.own.ask_again()
+
     def within_reach(self, indices: Sequence[int], patience_s: float) -> bool:
         """Fetches the shards of these episodes; see EpisodeStore.within_reach."""
         return all(store.within_reach(places, patience_s) for store, places in self._by_store(indices))
@@ -87,6 +91,10 @@ class PooledStore(Episodes):
     def open(self, index: int) -> Episode:
         store, place = self._place(index)
         return store.open(place)
+
+    def read(self, index: int) -> Episode:
+        store, place = self._place(index)
+        return store.read(place)
 
     def _place(self, index: int) -> tuple[EpisodeStore, int]:
         """Returns the store of an episode, and its place there."""

@@ -7,8 +7,10 @@ otherwise read as fewer samples without an error. Remote shards are read from a 
 from __future__ import annotations
 
 import contextlib
+import resource
 import sys
 import threading
+import time
 from abc import ABC, abstractmethod
 from collections import OrderedDict
 from collections.abc import Iterator, Mapping, Sequence
@@ -20,26 +22,33 @@ from typing import Any, overload
 
 import numpy as np
 
+from hgn.data.entries import REMEDY
 from hgn.data.manifest import MANIFEST_NAME, SPLITS, EpisodeEntry, Manifest, ShardEntry
 from hgn.data.shard_cache import holders
 from hgn.data.statistics import Statistics
-from hgn.data.storage import is_remote, open_storage
+from hgn.data.storage import ask, is_remote, open_storage, outliving
 from hgn.scene.episode import POSITION_MEMBER, Episode, decode_episode
-from hgn.schema import ConfigError, require
-from hgn.system.patience import UnreachableError
+from hgn.schema import ConfigError, require, without_passwords
+from hgn.system.patience import UnreachableError, standard_patience_s
 
-MAPPED_SHARDS = 256  # mapped at once; the default limit of open files is 1,024
+AGAIN_S, FORGOTTEN_S = 1.0, 60.0  # between looks at a manifest that could not be read
+MAPPED_SHARDS = 256  # mapped at once, and at most a quarter of the files that a process may open
 
 
 class Episodes(Sequence[Episode], ABC):
     """A sequence of episodes.
 
-    An episode is opened, and its shard verified, on first use; `position_TN3` is a read-only `np.memmap`.
+    An episode is opened, and its shard verified, on first use. In a folder of others the positions are a copy, because
+    a file that is cut would end the process; in this machine's cache, and with `open`, a read-only `np.memmap`.
     Raises on access: ConfigError when a shard is missing or altered.
     """
 
     @abstractmethod
     def open(self, index: int) -> Episode:
+        """Returns the episode at a place from 0 on, to be read at once: the positions are mapped."""
+
+    @abstractmethod
+    def read(self, index: int) -> Episode:
         """Returns the episode at a place from 0 on."""
 
     @property
@@ -60,8 +69,8 @@ class Episodes(Sequence[Episode], ABC):
 
     def __getitem__(self, index: int | slice) -> Episode | list[Episode]:
         if isinstance(index, slice):
-            return [self.open(i) for i in range(len(self))[index]]
-        return self.open(range(len(self))[index])
+            return [self.read(i) for i in range(len(self))[index]]
+        return self.read(range(len(self))[index])
 
 
 class EpisodeStore(Episodes):
@@ -71,6 +80,8 @@ class EpisodeStore(Episodes):
     """
 
     _fetcher: threading.Thread | None = None
+    _faulty_since: float | None = None  # of the manifest
+    _looked_s = 0.0
     _lock: threading.Lock
     _wanted: list[ShardEntry]  # to be fetched next
     _spared: frozenset[str]  # sha256 of shards that stay in a full cache
@@ -105,14 +116,40 @@ class EpisodeStore(Episodes):
     def refresh(self) -> bool:
         """Reads the manifest again; returns whether this split has more episodes than before.
 
-        When a server does not answer, the known episodes stay.
+        When a server does not answer, the known episodes stay; where faults are outlived, they stay after any fault
+        that lasts no longer than the patience, and `ask_again` looks once a second whether it is over.
         Raises: ConfigError when the folder contains another data set, or published shards were removed.
         """
+        previous_s, self._looked_s = self._looked_s, time.monotonic()
         try:
-            manifest = Manifest.load(self.folder, patience_s=0.0)
+            before, self.manifest = len(self), self._later_manifest()
         except UnreachableError as error:
-            print(f"{error.filename}: {error.strerror}; going on with {len(self)} episodes", file=sys.stderr)
+            self._tell(f"{error.filename}: {error.strerror}; going on with {len(self)} episodes")
             return False
+        except (ConfigError, OSError) as error:
+            patience_s = standard_patience_s()
+            if self._looked_s - previous_s > patience_s + FORGOTTEN_S:  # it may have been over in between
+                self._faulty_since = None
+            since = self._looked_s if self._faulty_since is None else self._faulty_since
+            if not outliving() or self._looked_s - since > patience_s:
+                raise
+            if self._faulty_since is None:
+                self._tell(f"{error}; going on with {len(self)} episodes for {patience_s:.0f} s")
+            self._faulty_since = since
+            return False
+        self._faulty_since = None
+        return len(self) > before
+
+    def _tell(self, text: str) -> None:
+        print(without_passwords(text), file=sys.stderr)
+
+    def ask_again(self) -> None:
+        """Refreshes after a fault, at most once a second. Raises: as `refresh`."""
+        if self._faulty_since is not None and time.monotonic() - self._looked_s > AGAIN_S:
+            self.refresh()
+
+    def _later_manifest(self) -> Manifest:
+        manifest = Manifest.load(self.folder, patience_s=0.0)
         if manifest.config_hash != self.manifest.config_hash:
             raise ConfigError(
                 f"{self.folder} must keep holding the same data set, got config hash {manifest.config_hash[:12]} "
@@ -124,8 +161,7 @@ class EpisodeStore(Episodes):
                 f"{self.folder} must keep the {self.split} shards already published, got a manifest (revision "
                 f"{manifest.revision}) without some of them; start again"
             )
-        before, self.manifest = len(self), manifest
-        return len(self) > before
+        return manifest
 
     def within_reach(self, indices: Sequence[int], patience_s: float) -> bool:
         """Fetches the shards of these episodes; returns False if a server does not answer within the patience.
@@ -213,7 +249,9 @@ class EpisodeStore(Episodes):
 
     def _reset(self) -> None:
         self._open_shards: OrderedDict[str, _OpenShard] = OrderedDict()
+        self._scanned: set[str] = set()  # keys of episodes whose positions are finite
         self._fetcher = None
+        self._faulty_since = None
         self._frames: list[int] = []  # of the episodes in the first shards, where lengths differ
         self._measured = 0  # number of these shards
         self._fetched = 0  # number of shards that were fetched ahead
@@ -223,7 +261,7 @@ class EpisodeStore(Episodes):
 
     def _bring(self, shard: ShardEntry, **options: Any) -> Path:
         """Returns a shard's verified file on this machine; options and errors as for `Storage.shard`."""
-        return open_storage(self.folder).shard(shard.name, shard.sha256, shard.bytes, **options)
+        return ask(self.folder, lambda files: files.shard(shard.name, shard.sha256, shard.bytes, **options))
 
     def _locate(self, index: int) -> tuple[ShardEntry, EpisodeEntry]:
         return self.manifest.shards.locate(self.split, index)
@@ -242,7 +280,7 @@ class EpisodeStore(Episodes):
                 opened = self._open_shards.setdefault(shard.name, opened)
                 self._open_shards.move_to_end(shard.name)
                 # each map uses a file descriptor; episodes in use keep theirs
-                if len(self._open_shards) > MAPPED_SHARDS:
+                if len(self._open_shards) > min(MAPPED_SHARDS, resource.getrlimit(resource.RLIMIT_NOFILE)[0] // 4):
                     self._open_shards.popitem(last=False)
                 size = opened.size()
                 if size is None and is_remote(self.folder):  # it was removed from a full cache, and is fetched again
@@ -256,6 +294,14 @@ class EpisodeStore(Episodes):
                     opened.episodes[entry.key] = self._read(opened.content, shard, entry)
                 return opened.episodes[entry.key]
 
+    def read(self, index: int) -> Episode:
+        episode = self.open(index)
+        if is_remote(self.folder):
+            return episode
+        position_TN3 = np.array(episode.position_TN3)
+        position_TN3.flags.writeable = False
+        return replace(episode, position_TN3=position_TN3)
+
     def release(self, path: Path) -> None:
         """Closes a shard; its episodes that are in use stay readable."""
         with self._lock:
@@ -263,7 +309,13 @@ class EpisodeStore(Episodes):
                 del self._open_shards[name]
 
     def _read(self, content: np.ndarray, shard: ShardEntry, entry: EpisodeEntry) -> Episode:
-        episode = read_episode(content, shard.name, entry.key, entry.members)
+        scan = entry.key not in self._scanned  # verified bytes may be those of positions that are not finite
+        try:
+            episode = read_episode(content, shard.name, entry.key, entry.members, scan_positions=scan)
+        except ConfigError as error:
+            text = f"{self.folder}/{shard.name} must be a sound shard, got {error}; delete it, and {REMEDY}"
+            raise ConfigError(text) from None
+        self._scanned.add(entry.key)
         actual = (episode.seed, episode.particle_count, episode.frame_count)
         expected = (entry.seed, entry.particles, entry.frames)
         config = self.manifest.config
@@ -273,7 +325,7 @@ class EpisodeStore(Episodes):
         if actual != expected or entry.frames not in lengths:
             raise ConfigError(
                 f"{self.folder}/{shard.name}: {entry.key} must have seed, particles, frames {expected}, and as many "
-                f"frames as the data set's ({lengths}), got {actual}; delete manifest.json and run the generator again"
+                f"frames as the data set's ({lengths}), got {actual}; {REMEDY}"
             )
         return episode
 
@@ -311,7 +363,7 @@ def read_episode(
         if offset < 0 or size < 0 or offset + size > len(shard_bytes):
             raise ConfigError(
                 f"{shard_name}: {key}.{member} must lie within {len(shard_bytes)} bytes, got offset {offset} and "
-                f"{size} bytes; delete manifest.json and run the generator again"
+                f"{size} bytes; {REMEDY}"
             )
         data = shard_bytes[offset : offset + size]
         members[member] = data if member == POSITION_MEMBER else data.tobytes()

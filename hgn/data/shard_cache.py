@@ -10,6 +10,7 @@ import contextlib
 import errno
 import math
 import os
+import shutil
 import sys
 import time
 import weakref
@@ -96,7 +97,8 @@ def _fetch(path: Path, shard: CachedShard, patience_s: float, spared: Collection
         if file is None:
             return
         while True:  # only the process that has the lock frees space: two that need one shard would do it twice
-            over = _bytes_over(path.parent, shard.size)
+            lacking = shard.size - os.fstat(file.fileno()).st_size - shutil.disk_usage(path.parent).free
+            over = max(_bytes_over(path.parent, shard.size), lacking)
             try:
                 if over > 0:
                     raise OSError(errno.ENOSPC, f"the cache is full ({LIMIT_VARIABLE})", str(path))
@@ -105,7 +107,7 @@ def _fetch(path: Path, shard: CachedShard, patience_s: float, spared: Collection
             except OSError as error:
                 if error.errno not in _FULL or spared is None:
                     raise
-                if not _free_space(path.parent, max(over, shard.size), spared):
+                if not _free_space(path.parent, over, max(over, shard.size), spared):
                     raise
         os.fsync(file.fileno())
         # the newest shard must have the latest time, wherever this machine's clock stood before
@@ -153,14 +155,18 @@ def _bytes_over(folder: Path, size: int) -> float:
     return sum(cached for _, cached, _ in _cached(folder)) + size - allowed
 
 
-def _free_space(folder: Path, size: float, spared: Collection[str]) -> bool:
-    """Removes the oldest shards that are not spared; returns whether there was any."""
+def _free_space(folder: Path, least: float, size: float, spared: Collection[str]) -> bool:
+    """Removes the oldest shards that are not spared, up to `size` bytes; returns whether there was any.
+
+    Removes none where all of them together are less than `least`: a size that an index claims may be wrong.
+    """
+    removable = [(cached, path) for _, cached, path in _cached(folder) if path.stem not in spared]
+    if sum(cached for cached, _ in removable) < least:
+        return False
     freed = 0
-    for _, cached, path in _cached(folder):
+    for cached, path in removable:
         if freed >= size:
             break
-        if path.stem in spared:
-            continue
         for holder in list(holders):
             holder.release(path)
         path.unlink(missing_ok=True)

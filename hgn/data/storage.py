@@ -6,6 +6,7 @@ service; with `HGN_DATASET_HOST` only that host (or host:port) receives it.
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import functools
 import hashlib
@@ -13,7 +14,7 @@ import os
 import threading
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterator
 from io import BufferedRandom
 from pathlib import Path
 from typing import Any, TypeVar
@@ -25,24 +26,56 @@ from hgn.schema import ConfigError, require
 from hgn.system.extras import missing_extra
 from hgn.system.files import read_replaced
 from hgn.system.hub import PREFIX, HubPlace, hub_token
-from hgn.system.patience import UnreachableError, patiently
+from hgn.system.patience import UnreachableError, patiently, standard_patience_s
 
 TOKEN_VARIABLE = "HGN_DATASET_TOKEN"
 TOKEN_HOST_VARIABLE = "HGN_DATASET_HOST"
-PATIENCE_S = 300.0  # for a server that does not answer: time enough to restart a service
 _CHUNK_BYTES = 16 * 2**20  # of a shard in one request; a lost connection costs at most one
-_CONNECT_S, _SILENCE_S = 10.0, 60.0
+_CONNECT_S, _SILENCE_S, _ANSWER_S = 10.0, 60.0, 1800.0  # the last of them for a whole file at most
 _AWAY_S = 10.0  # after a server did not answer, callers without patience do not ask it
 _NETWORK_PACKAGES = {"aiohttp", "botocore", "aiobotocore", "gcsfs", "google", "azure"}
 
 T = TypeVar("T")
+_outliving = threading.Event()
+
+
+class StorageError(ConfigError):
+    """A file of a data set that is missing, refused, cut or no JSON, perhaps for a moment."""
+
+
+@contextlib.contextmanager
+def faults_outlived() -> Iterator[None]:
+    """Inside it `ask` repeats what fails, for the standard patience: a training knows that its data were there."""
+    _outliving.set()
+    try:
+        yield
+    finally:
+        _outliving.clear()
+
+
+def outliving() -> bool:
+    """Returns whether faults are outlived, see `faults_outlived`."""
+    return _outliving.is_set()
+
+
+def ask(folder: Path | str, read: Callable[[Storage], T]) -> T:
+    """Returns `read` of the storage of a data set. Raises: as `read`; UnreachableError where faults are outlived."""
+    storage, place = open_storage(folder), str(folder)
+    if not outliving():
+        return read(storage)
+    return patiently(lambda: read(storage), _may_pass, place, place, standard_patience_s())
+
+
+def _may_pass(error: Exception) -> str | None:
+    lasting = isinstance(error, UnreachableError) or getattr(error, "errno", None) in (errno.ENOSPC, errno.EDQUOT)
+    return " ".join(str(error).split()) if isinstance(error, (StorageError, OSError)) and not lasting else None
 
 
 class Storage(ABC):
     """The files of a data set, wherever they are."""
 
     @abstractmethod
-    def manifest(self, name: str, patience_s: float = PATIENCE_S) -> bytes:
+    def manifest(self, name: str, patience_s: float | None = None) -> bytes:
         """Returns the manifest's bytes. Raises: FileNotFoundError; UnreachableError; ConfigError (no access)."""
 
     @abstractmethod
@@ -51,7 +84,7 @@ class Storage(ABC):
 
     @abstractmethod
     def shard(
-        self, name: str, sha256: str, size: int, patience_s: float = PATIENCE_S, spared: Collection[str] | None = ()
+        self, name: str, sha256: str, size: int, patience_s: float | None = None, spared: Collection[str] | None = ()
     ) -> Path:
         """Returns the path of a verified shard on this machine.
 
@@ -108,16 +141,18 @@ class _Folder(Storage):
     def __init__(self, folder: Path) -> None:
         self._folder = folder
 
-    def manifest(self, name: str, patience_s: float = PATIENCE_S) -> bytes:
+    def manifest(self, name: str, patience_s: float | None = None) -> bytes:
         return read_replaced(self._folder / name)
 
     def read(self, name: str, start: int, stop: int) -> bytes:
         with (self._folder / name).open("rb") as file:
+            if (size := os.fstat(file.fileno()).st_size) < stop:
+                raise _cut(f"{self._folder}/{name}", stop, size)
             file.seek(start)
             return _whole(file.read(stop - start), f"{self._folder}/{name}", start, stop)
 
     def shard(
-        self, name: str, sha256: str, size: int, patience_s: float = PATIENCE_S, spared: Collection[str] | None = ()
+        self, name: str, sha256: str, size: int, patience_s: float | None = None, spared: Collection[str] | None = ()
     ) -> Path:
         path = self._folder / name
         try:
@@ -148,7 +183,7 @@ class _Remote(Storage):
             from hgn.data.bounded_http import BoundedResponse
 
             token = hub_token() if hub else dataset_token() if _token_is_for(url) else None
-            timeout = aiohttp.ClientTimeout(total=None, connect=_CONNECT_S, sock_read=_SILENCE_S)
+            timeout = aiohttp.ClientTimeout(total=_ANSWER_S, connect=_CONNECT_S, sock_read=_SILENCE_S)
             # a small compressed answer could expand without limit
             headers = {"Accept-Encoding": "identity"}
             if token is not None:
@@ -172,7 +207,7 @@ class _Remote(Storage):
         self._lock = threading.Lock()
         self._away = (0.0, "")  # when callers without patience may ask again, and the cause
 
-    def manifest(self, name: str, patience_s: float = PATIENCE_S) -> bytes:
+    def manifest(self, name: str, patience_s: float | None = None) -> bytes:
         with self._lock:
             self._require_not_away(name, patience_s)
             options: dict[str, Any] = {}
@@ -191,13 +226,13 @@ class _Remote(Storage):
                 raise ConnectionError(f"{len(data)} bytes instead of {stop - start}: a proxy may have an older file")
             return data
 
-        data = self._patiently(name, PATIENCE_S, whole)
+        data = self._patiently(name, None, whole)
         if len(data) > stop - start:  # from a server without ranges
             data = data[start:stop]
         return _whole(data, f"{self._url}/{name}", start, stop)
 
     def shard(
-        self, name: str, sha256: str, size: int, patience_s: float = PATIENCE_S, spared: Collection[str] | None = ()
+        self, name: str, sha256: str, size: int, patience_s: float | None = None, spared: Collection[str] | None = ()
     ) -> Path:
         def fill(file: BufferedRandom) -> None:
             self._require_not_away(name, patience_s)
@@ -214,7 +249,8 @@ class _Remote(Storage):
                 f"{self._url}/{name} must have sha256 {sha256}, got other bytes: it was altered; generate it again"
             )
 
-        return cached_shard(CachedShard(f"{self._url}/{name}", sha256, size), patience_s, spared, fill)
+        wait_s = standard_patience_s() if patience_s is None else patience_s
+        return cached_shard(CachedShard(f"{self._url}/{name}", sha256, size), wait_s, spared, fill)
 
     def write(self, name: str, source: Path | bytes) -> None:
         def put(path: str) -> None:
@@ -225,7 +261,7 @@ class _Remote(Storage):
 
         expected = len(source) if isinstance(source, bytes) else source.stat().st_size
         try:
-            self._patiently(name, PATIENCE_S, put)
+            self._patiently(name, None, put)
             self._files.invalidate_cache()
             written = self._files.info(f"{self._root}/{name}")["size"]
         except (NotImplementedError, FileNotFoundError) as error:
@@ -236,7 +272,7 @@ class _Remote(Storage):
         if written != expected:
             raise ConfigError(f"{self._url}/{name} must have {expected} bytes, got {written}; copy it again")
 
-    def _fill(self, file: BufferedRandom, name: str, size: int, patience_s: float) -> str:
+    def _fill(self, file: BufferedRandom, name: str, size: int, patience_s: float | None) -> str:
         """Appends the missing bytes and returns the sha256 of the whole file."""
         if os.fstat(file.fileno()).st_size > size:
             file.truncate(0)
@@ -257,13 +293,14 @@ class _Remote(Storage):
         file.flush()
         return digest.hexdigest()
 
-    def _require_not_away(self, name: str, patience_s: float) -> None:
-        if not patience_s and time.monotonic() < self._away[0]:
-            raise UnreachableError(f"{self._url}/{name}", patience_s, self._away[1])
+    def _require_not_away(self, name: str, patience_s: float | None) -> None:
+        if patience_s == 0 and time.monotonic() < self._away[0]:
+            raise UnreachableError(f"{self._url}/{name}", 0.0, self._away[1])
 
-    def _patiently(self, name: str, patience_s: float, read: Callable[[str], T]) -> T:
+    def _patiently(self, name: str, patience_s: float | None, read: Callable[[str], T]) -> T:
         """Reads, and retries while the server is away. Raises: as `Storage.manifest`."""
         url, path = f"{self._url}/{name}", f"{self._root}/{name}"
+        patience_s = standard_patience_s() if patience_s is None else patience_s
         try:
             result = patiently(lambda: read(path), lambda error: _transient(error, url), url, self._url, patience_s)
         except UnreachableError as error:
@@ -280,12 +317,12 @@ def _whole(data: bytes, path: str, start: int, stop: int) -> bytes:
     return data
 
 
-def _cut(path: str, size: int, got: int) -> ConfigError:
-    return ConfigError(f"{path} must have {size} bytes, got {got}; it was cut: generate it again")
+def _cut(path: str, size: int, got: int) -> StorageError:
+    return StorageError(f"{path} must have {size} bytes, got {got}; it was cut: generate it again")
 
 
-def _missing(path: Path | str) -> ConfigError:
-    return ConfigError(f"{path} is listed in the index but missing; run the generator again")
+def _missing(path: Path | str) -> StorageError:
+    return StorageError(f"{path} is listed in the index but missing; run the generator again")
 
 
 def _transient(error: Exception, url: str) -> str | None:
@@ -294,7 +331,7 @@ def _transient(error: Exception, url: str) -> str | None:
         return None
     status = getattr(error, "status", None)
     if status in (401, 403) or isinstance(error, PermissionError):
-        raise ConfigError(
+        raise StorageError(
             f"{url} must be open to this program, got refused; set {TOKEN_VARIABLE} to the service's token, which "
             f"only {TOKEN_HOST_VARIABLE} receives where that is set (object stores need their own credentials, the "
             "Hugging Face Hub HF_TOKEN)"
@@ -303,7 +340,7 @@ def _transient(error: Exception, url: str) -> str | None:
         raise ConfigError(f"{url} is damaged at its service; delete it there and run the generator again") from None
     # 416: a proxy has an older, shorter index file
     if isinstance(status, int) and 400 <= status < 500 and status not in (408, 416, 425, 429):
-        raise ConfigError(
+        raise StorageError(
             f"{url} must be a file of a data set, got the answer {status}; check dataset.folder"
         ) from None
     packages = {kind.__module__.partition(".")[0] for kind in type(error).__mro__}

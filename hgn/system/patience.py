@@ -1,9 +1,14 @@
-"""Retries for servers that do not answer, with growing pauses, until patience ends."""
+"""Retries for storage that does not answer, with growing pauses, until patience ends.
+
+`HGN_PATIENCE_S` is the patience in seconds; default: two minutes.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import errno
+import math
+import os
 import random
 import sys
 import threading
@@ -11,6 +16,9 @@ import time
 from collections.abc import Callable, Iterator
 from typing import TypeVar
 
+from hgn.schema import require, without_passwords
+
+VARIABLE = "HGN_PATIENCE_S"
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.25, 10.0
 
 T = TypeVar("T")
@@ -23,6 +31,14 @@ class UnreachableError(OSError):
     def __init__(self, url: str, patience_s: float, cause: str) -> None:
         self.cause = cause
         super().__init__(errno.ETIMEDOUT, f"no answer for {patience_s:.0f} s (at last: {cause})", url)
+
+
+def standard_patience_s() -> float:
+    """Returns the seconds for which storage may be away. Raises: ConfigError for a variable that is no number."""
+    given = os.environ.get(VARIABLE, "120")
+    number = float(given) if given.replace(".", "", 1).isdecimal() else math.nan
+    require(0 <= number <= 1e6, VARIABLE, "a number of seconds from 0 to 1000000", given)
+    return number
 
 
 @contextlib.contextmanager
@@ -54,6 +70,7 @@ def patiently(
                 raise UnreachableError(url, patience_s, cause) from error
             if not warned and pause > 1:
                 warned = True
-                print(f"{server} does not answer ({cause}); retrying for {patience_s:.0f} s", file=sys.stderr)
+                text = f"{server} does not answer ({cause}); retrying for {patience_s:.0f} s"
+                print(without_passwords(text), file=sys.stderr)
             without.wait(pause * random.uniform(0.5, 1.0))  # readers must not return all at the same moment
             pause = min(2 * pause, LONGEST_PAUSE_S)

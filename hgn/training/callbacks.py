@@ -98,6 +98,11 @@ class Checkpoints(Callback):
         if _update(pl_module) % self.every == 0:
             self.save_last(trainer, _update(pl_module))
 
+    def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
+        """Saves before a training ends because its data stay away; several ranks cannot agree on it any more."""
+        if isinstance(exception, (ConfigError, OSError)) and trainer.world_size == 1 and _update(pl_module):
+            self.save_last(trainer, _update(pl_module))
+
     def save_last(self, trainer: Trainer, update: int) -> None:
         """All ranks call this; rank 0 writes, see CheckpointWriter."""
         if self._saved_update != update:

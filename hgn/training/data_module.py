@@ -19,11 +19,10 @@ from hgn.data.episode_tensors import EpisodeChunk
 from hgn.data.pooled import AnyStore
 from hgn.data.sampler import EpisodeSampler, SamplerState
 from hgn.schema import ConfigError
-from hgn.system.patience import without_patience
+from hgn.system.patience import standard_patience_s, without_patience
 from hgn.training.pushforward import Starts, drawn_starts
 from hgn.training.readers import ChunkReader, DrawnChunk
 
-SHARED_FOLDER_PATIENCE_S = 300.0
 CHUNKS_AHEAD = 2
 LOOK_S = 1.0  # between looks for a signal while there is no chunk
 
@@ -67,6 +66,7 @@ class EpisodeDataModule(LightningDataModule):
             waiting: deque[Future[WindowChunk | EpisodeChunk]] = deque()
             while True:
                 started = time.monotonic()
+                self.store.ask_again()
                 for chunk in islice(drawn, self.chunks_ahead + 1 - len(waiting)):
                     waiting.append(executor.submit(self.reader.read, chunk))
                 if not waiting:
@@ -162,7 +162,7 @@ def agreed_count(store: AnyStore, trainer: Trainer, order: Mapping[str, int] | N
 
     Episodes are in the order of their publication, so the first ones are the same on all ranks. `order` has the
     settings of `training` that decide the order of samples.
-    Raises: ConfigError when a node does not see them within SHARED_FOLDER_PATIENCE_S; on every rank when one of them
+    Raises: ConfigError when a node does not see them within the standard patience; on every rank when one of them
     sees other episodes or has other settings.
     """
     if trainer.world_size == 1:
@@ -173,12 +173,13 @@ def agreed_count(store: AnyStore, trainer: Trainer, order: Mapping[str, int] | N
             f"training.{', '.join(order or {})} must be the same on all ranks, got {order} on rank "
             f"{trainer.global_rank} and {others} on rank 0: samples would come twice; start all with the same command"
         )
-    deadline = time.monotonic() + SHARED_FOLDER_PATIENCE_S
+    patience_s = standard_patience_s()
+    deadline = time.monotonic() + patience_s
     while len(store) < count:
         if time.monotonic() > deadline:
             raise ConfigError(
                 f"{store.folder} must show the same {count} episodes on every node, got {len(store)} for "
-                f"{SHARED_FOLDER_PATIENCE_S:.0f} s; is it a shared folder?"
+                f"{patience_s:.0f} s; is it a shared folder?"
             )
         time.sleep(1)
         store.refresh()

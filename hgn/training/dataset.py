@@ -131,8 +131,9 @@ class PublishedEpisodes:
             return self._text
         try:
             count = Manifest.load(self.folder, patience_s=0.0).published("train")
-        except UnreachableError:
-            count, self._text = 0, "the service does not answer"
+        except (ConfigError, OSError) as error:  # the data module ends a training whose data stay away
+            away = isinstance(error, UnreachableError)
+            count, self._text = 0, "the service does not answer" if away else "the manifest cannot be read"
         else:
             ended = self.generator is not None and not self.generator.running and count < self.total
             self._text = f"{count}/{self.total} episodes{', generator stopped' if ended else ''}"

@@ -13,12 +13,12 @@ import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
 
 from hgn.data.pooled import AnyStore
-from hgn.data.storage import PATIENCE_S
 from hgn.render.pictures import rollout_of_episode
 from hgn.runtime.backend import fastest_stepped
 from hgn.runtime.rollouts import simulate_scenes
 from hgn.runtime.simulator import InitialState, Simulator
 from hgn.scene.episode import Episode
+from hgn.system.patience import standard_patience_s
 from hgn.training.callbacks import Checkpoints, log
 from hgn.training.data_module import agreed_count
 from hgn.training.errors import (
@@ -59,7 +59,7 @@ class Monitor(Callback):
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         assert isinstance(pl_module, TrainingModule)
         if not self._interrupted(trainer):
-            self.measure(trainer, pl_module, PATIENCE_S)
+            self.measure(trainer, pl_module, standard_patience_s())
 
     def measure(self, trainer: Trainer, module: TrainingModule, patience_s: float = 0.0) -> None:
         """Measures and logs. One-step frames are divided among the ranks, rank 0 does the rollouts; a stop request ends

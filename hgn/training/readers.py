@@ -65,7 +65,7 @@ class FrameDraws:
         drawn = []
         for sample in samples:
             if sample.episode not in self._importance:
-                self.add(sample.episode, self.measured(self._store[sample.episode]))
+                self.add(sample.episode, self.measured(self._store.open(sample.episode)))
             importance = self._importance[sample.episode]
             frame, weight = importance.draw(sample.frame, sample.seed) if fraction > 0 else (sample.frame, 1.0)
             scale, scale_weight = noise_scale(self._training, importance.accelerations[frame], sample.seed)
@@ -91,7 +91,7 @@ class WindowReader:
         return WindowChunk((samples,), drawn.sampler_state, starts, batch)
 
     def _sample(self, sample: Sample) -> BatchSample:
-        episode = self._store[sample.episode]
+        episode = self._store.open(sample.episode)
         window_WN3 = window(episode, sample.frame, self._network.velocity_history)
         return BatchSample(
             episode, sample.frame, window_WN3, seed=sample.seed, weight=sample.weight, noise_scale=sample.noise_scale
@@ -136,7 +136,7 @@ class EpisodeReader:
             barrier = None if self._clearance is None else simulated_barrier(episode, self._clearance)
             return whole_episode(episode, self._network, barrier), self._draws.measured(episode)
 
-        opened = [self._store[index] for index in indices]
+        opened = [self._store.open(index) for index in indices]
         with ThreadPoolExecutor(READERS) as readers:
             results = dict(zip(indices, readers.map(read, opened), strict=True))
         for index, (_, importance) in results.items():

@@ -22,10 +22,10 @@ from hgn.schema import ConfigError
 
 
 def test_positions_are_read_only_memory_maps(folder):
-    """Positions stay on disk until used; everything else is loaded."""
+    """Positions of opened episodes stay on disk until used; everything else is loaded."""
     store = EpisodeStore(folder, "train")
     assert len(store) == 5 and [entry.key for entry in store.entries] == [f"train-{i:06d}" for i in range(5)]
-    for episode, entry in zip(store, store.entries, strict=True):
+    for episode, entry in zip(map(store.open, range(5)), store.entries, strict=True):
         assert isinstance(episode.position_TN3, np.memmap) and not episode.position_TN3.flags.writeable
         assert not isinstance(episode.material_N, np.memmap)
         assert episode.position_TN3.shape == (entry.frames, entry.particles, 3) and episode.seed == entry.seed
@@ -50,7 +50,7 @@ def test_store_travels_to_workers(folder):
     data and opens the same episodes on the other side."""
     store = EpisodeStore(folder, "train")
     _ = list(store)
-    assert len(store._open_shards) == store.manifest.totals["train"].shards == 4 and store[2] is store[2]
+    assert len(store._open_shards) == store.manifest.totals["train"].shards == 4 and store.open(2) is store.open(2)
     data = pickle.dumps(store)
     assert len(data) < 20_000
     assert np.array_equal(pickle.loads(data)[3].position_TN3, store[3].position_TN3)
@@ -63,11 +63,11 @@ def test_store_grows_with_the_dataset(make_config, make_dataset):
         assert EpisodeStore.available(writer.folder) and len(EpisodeStore(writer.folder, "train")) == 0
     folder = make_dataset(make_config(training_scenes=3, long_fraction=0.4, long_frames=9))
     train, test = EpisodeStore(folder, "train"), EpisodeStore(folder, "test")
-    first = train[0]
+    first = train.open(0)
     assert not train.refresh() and train.frames() == [6, 6, 9]
     make_dataset(make_config(training_scenes=9, long_fraction=0.4, long_frames=9))
     assert train.refresh() and not test.refresh() and train.frames(4) == [6, 6, 9, 6]
-    assert len(train) == 9 and train[0] is first
+    assert len(train) == 9 and train.open(0) is first
     assert train.frames() == [episode.frame_count for episode in train] and 9 in train.frames()[3:]
     assert train.manifest.revision == Manifest.load(folder).revision
     assert train.statistics() == Manifest.load(folder).statistics("train")

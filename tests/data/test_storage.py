@@ -299,7 +299,7 @@ def test_command_without_its_server(monkeypatch, capsys):
     assert exit_code(lambda _: Manifest.load(url, patience_s=0.01), "datagen", [], monkeypatch) == 1
     error = capsys.readouterr().err
     assert error.startswith("error: no answer for 0 s (at last: ") and error.count("\n") == 1
-    assert error.endswith(f"{url}/manifest.json; check that its server runs and run the same command again\n")
+    assert error.endswith(f"{url}/manifest.json; check its server or disk and run the same command again\n")
 
 
 def test_server_that_is_away_is_not_asked_at_once_again(folder, serve, monkeypatch):

@@ -1,0 +1,251 @@
+"""Storage that lies, drips or fails: caches, servers, passwords, and errors of the machine."""
+
+import asyncio
+import contextlib
+import errno
+import functools
+import hashlib
+import http.server
+import os
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from data.test_http import Quiet, answering
+from processes import exit_code
+from training.runs import train_mapping
+
+from datagen.service.server import make_app
+from datagen.service.supervisor import PoolState
+from hgn import train
+from hgn.data import shard_cache
+from hgn.data.index import ListedIndex
+from hgn.data.manifest import Manifest
+from hgn.data.reader import EpisodeStore
+from hgn.data.shard_cache import CACHE_VARIABLE, LIMIT_VARIABLE, CachedShard, cached_shard
+from hgn.scene.npz import read_npz
+from hgn.schema import ConfigError, without_passwords
+from hgn.system.locks import locked
+from hgn.system.patience import VARIABLE, UnreachableError, standard_patience_s
+
+
+@pytest.fixture(autouse=True)
+def _cache(tmp_path, monkeypatch):
+    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "cache"))
+
+
+@pytest.mark.parametrize("limit", ["", "0.001", "1000000"])
+@pytest.mark.parametrize("size", [10**13, 2**62, 10**30])
+def test_a_claimed_size_empties_no_cache(tmp_path, monkeypatch, limit, size):
+    """A shard that no cache can contain is refused before anything is fetched or removed for it."""
+    monkeypatch.setenv(LIMIT_VARIABLE, limit)
+    folder = tmp_path / "cache" / "shards"
+    folder.mkdir(parents=True)
+    others = [folder / f"{number:064x}.tar" for number in range(7)]
+    for path in others:
+        path.write_bytes(bytes(1000))
+    fetched: list[object] = []
+    with pytest.raises(OSError) as error:
+        cached_shard(CachedShard("http://x/a.tar", "f" * 64, size), 0.0, (), fetched.append)
+    assert error.value.errno == errno.ENOSPC
+    assert all(path.exists() for path in others) and not fetched
+
+
+def test_a_full_cache_makes_room(tmp_path, monkeypatch):
+    """One that fits after the removal of older shards still is fetched."""
+    monkeypatch.setenv(LIMIT_VARIABLE, "0.000005")
+    monkeypatch.setattr(shard_cache, "verify_file", lambda *_: None)
+    folder = tmp_path / "cache" / "shards"
+    folder.mkdir(parents=True)
+    others = [folder / f"{number:064x}.tar" for number in range(5)]
+    for path in others:
+        path.write_bytes(bytes(1000))
+    path = cached_shard(CachedShard("u", "f" * 64, 2000), 0.0, (), lambda file: file.write(bytes(2000)))
+    assert path.stat().st_size == 2000 and sum(other.exists() for other in others) == 3
+
+
+@pytest.mark.parametrize("dripping", ["manifest.json", ".tar"])
+def test_a_server_that_drips_does_not_answer(data, monkeypatch, dripping):
+    """A body that comes more slowly than the least speed ends like one that does not come."""
+    monkeypatch.setattr("hgn.data.bounded_http.SLOW_S", 0.0)
+    monkeypatch.setattr("hgn.data.bounded_http.LEAST_BYTES_S", 10**12)
+    monkeypatch.setenv(VARIABLE, "0")
+    whole = EpisodeStore(data.dataset.folder, "train")
+
+    class Drip(Quiet, http.server.SimpleHTTPRequestHandler):
+        def copyfile(self, source, outputfile):
+            content = source.read()
+            if self.path.endswith(dripping):
+                with contextlib.suppress(ConnectionError):
+                    for byte in content[:50]:
+                        outputfile.write(bytes([byte]))
+                        time.sleep(0.001)
+            outputfile.write(content[50:])
+
+    server = answering(functools.partial(Drip, directory=data.dataset.folder))
+    with server as url, pytest.raises(UnreachableError, match="bytes a second"):
+        store = EpisodeStore(url, "train")
+        store.manifest = whole.manifest
+        assert store[0]
+
+
+@pytest.mark.parametrize(
+    ("text", "shown"),
+    [
+        ("http://user:secret@host:80/a b", "http://host:80/a b"),
+        ("got s3://key:se%40cret@bucket, ftp://u@h", "got s3://bucket, ftp://h"),
+        ("hf://datasets/a@main/b", "hf://datasets/a@main/b"),
+        ("a@b.c file:///x@y http://h/p@q", "a@b.c file:///x@y http://h/p@q"),
+    ],
+)
+def test_passwords_in_urls(text, shown):
+    assert without_passwords(text) == shown
+
+
+def test_no_file_of_a_run_has_the_password(data, tmp_path, capsys):
+    """A training from a URL with a password writes and prints the URL without it."""
+    run = tmp_path / "run"
+    with answering(functools.partial(Files, directory=data.dataset.folder)) as url:
+        mapping = train_mapping(data, run, monitor_every=100)
+        mapping["dataset"]["folder"] = url.replace("://", "://user:secret-word@")
+        assert train.main(mapping) == 0
+    shown = capsys.readouterr()
+    assert "secret-word" not in shown.out + shown.err
+    assert not [path for path in run.rglob("*") if path.is_file() and b"secret-word" in path.read_bytes()]
+
+
+class Files(Quiet, http.server.SimpleHTTPRequestHandler):
+    pass
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "message"),
+    [
+        (OSError(errno.EIO, "Input/output error", "/data/a.tar"), 1, "/data/a.tar; check the disk"),
+        (OSError(errno.EMFILE, "Too many open files"), 1, "raise the limit of open files"),
+        (OSError(errno.ENFILE, "Too many open files in system"), 1, "close other programs"),
+        (OSError(errno.ESTALE, "Stale file handle"), 1, "Stale file handle; check the disk"),
+        (OSError("no number"), 1, "no number; check the disk"),
+        (MemoryError("Unable to allocate 5 TiB"), 1, "memory is full (Unable to allocate 5 TiB)"),
+        (ConfigError("http://user:secret@host must be"), 2, "http://host must be"),
+    ],
+)
+def test_errors_of_the_machine_are_one_line(error, code, message, monkeypatch, capsys):
+    """Whatever a system call answers, a command prints what failed and what to do."""
+
+    def command(_):
+        raise error
+
+    assert exit_code(command, "card", ["weights=x", "out=y"], monkeypatch) == code
+    said = capsys.readouterr().err
+    assert said.startswith("error: ") and message in said and said.count("\n") == 1
+
+
+@pytest.mark.parametrize("text", ["-1", "x", "nan", "1e9", "10000000", ""])
+def test_a_patience_that_is_none(monkeypatch, text):
+    monkeypatch.setenv(VARIABLE, text)
+    with pytest.raises(ConfigError, match="HGN_PATIENCE_S must be a number of seconds"):
+        standard_patience_s()
+
+
+def test_few_open_files(data, monkeypatch):
+    """Where a process may open few files, few shards stay mapped."""
+    monkeypatch.setattr("resource.getrlimit", lambda _: (8, 8))
+    store = EpisodeStore(data.dataset.folder, "train")
+    before = len([*Path("/proc/self/fd").iterdir()]) if Path("/proc/self/fd").exists() else 0
+    assert [store[place].frame_count for place in range(len(store))] == 5 * [6]
+    after = len([*Path("/proc/self/fd").iterdir()]) if before else 0
+    assert after - before <= 2
+
+
+def with_nan(folder, split="train"):
+    """The name of a shard whose last position is NaN, and whose checksum in the index is right."""
+    manifest = Manifest.load(folder)
+    shards = list(manifest.shards)
+    place = next(place for place, shard in enumerate(shards) if shard.split == split)
+    path = Path(folder) / shards[place].name
+    content = bytearray(path.read_bytes())
+    offset, size = shards[place].episodes[0].members["position.npy"]
+    content[offset + size - 4 : offset + size] = np.float32("nan").tobytes()
+    path.write_bytes(content)
+    shards[place] = replace(shards[place], sha256=hashlib.sha256(content).hexdigest())
+    replace(manifest, shards=ListedIndex(shards)).save(folder)
+    return path.name
+
+
+@pytest.mark.parametrize("split", ["train", "validation"])
+def test_a_shard_that_is_not_finite_is_named(data, tmp_path, split):
+    """A training on it ends with an error that names the shard and the frame, instead of skipping updates."""
+    name = with_nan(data.dataset.folder, split)
+    with pytest.raises(ConfigError, match=rf"{name} must be a sound shard, got {split}-.*: position must be finite"):
+        list(EpisodeStore(data.dataset.folder, split))
+    with pytest.raises(ConfigError, match=name):
+        train.main(train_mapping(data, tmp_path / "run"))
+
+
+def test_a_deleted_lock_file_locks(tmp_path):
+    """A run's folder stays locked where somebody deletes the lock's file."""
+    path = tmp_path / "run" / ".lock"
+    with locked(path, "run", "another training is in it; wait, or choose"):
+        path.unlink()
+        with pytest.raises(ConfigError, match="run must be a folder of its own"), locked(path, "run", "no;"):
+            pass
+    with locked(path, "run", "no;"):
+        pass
+
+
+@pytest.mark.parametrize(
+    ("host", "token", "status"),
+    [
+        (b"127.0.0.1:80", None, 200),
+        (b"localhost", None, 200),
+        (b"[::1]:8000", None, 200),
+        (b"evil.example", None, 421),
+        (b"127.0.0.1.evil.example:80", None, 421),
+        (b"localhost@evil.example", None, 421),
+        (b"10.0.0.1", None, 421),
+        (b"", None, 421),
+        (b"data.example", "correct-horse-battery", 200),
+    ],
+)
+def test_a_page_elsewhere_cannot_ask(folder, host, token, status):
+    """Without a token only requests that name this machine are answered: a browser's page may have given it a name."""
+    headers = [(b"host", host)] + ([] if token is None else [(b"authorization", f"Bearer {token}".encode())])
+    scope = {
+        "type": "http", "method": "GET", "path": "/manifest.json", "raw_path": b"/manifest.json", "query_string": b"",
+        "headers": headers, "server": ("127.0.0.1", 80), "client": ("127.0.0.1", 1), "http_version": "1.1",
+        "scheme": "http", "root_path": "",
+    }  # fmt: skip
+    sent: list[dict[str, object]] = []
+
+    async def send(message):
+        sent.append(message)
+
+    async def receive():
+        return {"type": "http.request", "body": b""}
+
+    asyncio.run(make_app(folder, token, PoolState)(scope, receive, send))
+    assert sent[0]["status"] == status
+
+
+def test_interleaved_members_of_an_archive(tmp_path):
+    """The members of a trajectory need not follow one another in the file."""
+    names = ("b/position", "a/position", "b/particle_type", "c", "a/particle_type")
+    np.savez(tmp_path / "train.npz", **{name: np.full(3, number) for number, name in enumerate(names)})
+    read = [name for name, _ in read_npz(tmp_path / "train.npz")]
+    assert read == ["b/position", "b/particle_type", "a/position", "a/particle_type", "c"]
+
+
+@pytest.mark.parametrize("size", [0, 1000, 100_000])
+def test_a_shard_that_is_cut_under_an_episode(data, size):
+    """An episode that was handed out stays readable; the next one is refused."""
+    store = EpisodeStore(data.dataset.folder, "train")
+    episode = store[0]
+    before = episode.position_TN3.tobytes()
+    for path in Path(data.dataset.folder).glob("train*.tar"):
+        os.truncate(path, min(size, path.stat().st_size - 1))
+    assert episode.position_TN3.tobytes() == before
+    with pytest.raises(ConfigError, match=r"it was cut while it was open|must have"):
+        store[0]

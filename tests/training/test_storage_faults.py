@@ -1,0 +1,204 @@
+"""Momentary faults of the storage of a data set: readers of a training keep what they know, and ask again."""
+
+import contextlib
+import functools
+import http.server
+import json
+import threading
+from pathlib import Path
+
+import pytest
+from data.test_http import Quiet, answering
+from training.runs import metrics, train_mapping
+
+import hgn.train
+from hgn import train
+from hgn.data.reader import EpisodeStore
+from hgn.data.shard_cache import CACHE_VARIABLE
+from hgn.data.storage import faults_outlived
+from hgn.schema import ConfigError
+from hgn.system.patience import VARIABLE
+from hgn.training.checkpoint import read_checkpoint
+
+HTML = b"<html><body>502 Bad Gateway</body></html>"
+
+
+@pytest.fixture(autouse=True)
+def _quick(tmp_path, monkeypatch):
+    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "cache"))
+    monkeypatch.setattr("hgn.system.patience.FIRST_PAUSE_S", 0.01)
+    monkeypatch.setattr("hgn.system.patience.LONGEST_PAUSE_S", 0.05)
+    monkeypatch.setattr("hgn.data.reader.AGAIN_S", 0.0)
+    monkeypatch.setattr("hgn.data.storage._AWAY_S", 0.0)
+
+
+def written(content):
+    """The manifest has another content for a while."""
+
+    @contextlib.contextmanager
+    def fault(folder):
+        path = Path(folder) / "manifest.json"
+        before = path.read_bytes()
+        path.write_bytes(content(before) if callable(content) else content)
+        try:
+            yield
+        finally:
+            path.write_bytes(before)
+
+    return fault
+
+
+def renamed(name):
+    """The folder, or a file in it, has another name for a while."""
+
+    @contextlib.contextmanager
+    def fault(folder):
+        path = Path(folder) / name
+        other = path.rename(path.with_name(f"{path.name}.away"))
+        try:
+            yield
+        finally:
+            other.rename(path)
+
+    return fault
+
+
+def older(before):
+    """A manifest with none of the shards."""
+    head = json.loads(before)
+    empty = {"shards": 0, "episodes": 0, "bytes": 0, "digest": "", "statistics": None}
+    index = {"generation": head["index"]["generation"]}
+    return json.dumps(head | {"revision": 0, "index": index, "totals": {"train": empty}}).encode()
+
+
+def other_set(before):
+    return json.dumps(json.loads(before) | {"config": {}, "config_hash": "0" * 64}).encode()
+
+
+FAULTS = {
+    "missing": renamed("manifest.json"),
+    "folder renamed": renamed("."),
+    "brace": written(b"{"),
+    "empty": written(b""),
+    "html": written(HTML),
+    "no text": written(bytes(range(256))),
+    "older": written(older),
+    "other set": written(other_set),
+}
+
+
+def faulty(folder, name):
+    return FAULTS[name](Path(folder).resolve())
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_a_manifest_that_is_away_for_a_moment(data, name, capsys, monkeypatch):
+    """The episodes stay, a line says so once, and the next look finds the manifest; after the patience it is an error,
+    whose remedy is not to delete the manifest."""
+    store = EpisodeStore(data.dataset.folder, "train")
+    with faults_outlived():
+        with faulty(data.dataset.folder, name):
+            assert not store.refresh() and len(store) == 5
+            store.ask_again()
+            assert capsys.readouterr().err.count("going on with") == 1
+        store.ask_again()
+        with faulty(data.dataset.folder, name):
+            assert not store.refresh()
+            assert "going on with 5 episodes for 120 s" in capsys.readouterr().err
+            monkeypatch.setenv(VARIABLE, "0")
+            with pytest.raises((ConfigError, OSError)) as error:
+                store.ask_again()
+            assert "delete manifest" not in str(error.value)
+    assert not store.refresh()
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_a_command_does_not_wait(data, name):
+    """Outside a training the same faults are errors at once."""
+    store = EpisodeStore(data.dataset.folder, "train")
+    with faulty(data.dataset.folder, name), pytest.raises((ConfigError, OSError)):
+        store.refresh()
+
+
+@pytest.mark.parametrize("away", ["shard", "index", "."])
+def test_files_that_are_away_for_a_moment(data, away):
+    """Reading an episode, or lines of the index, waits for what is renamed."""
+    folder = Path(data.dataset.folder).resolve()
+    name = {"shard": next(folder.glob("train*.tar")).name}.get(away, away)
+    store = EpisodeStore(folder, "train")
+    fault = renamed(name)(folder)
+    fault.__enter__()
+    timer = threading.Timer(0.3, fault.__exit__, (None, None, None))
+    with faults_outlived():
+        timer.start()
+        assert [store[place].frame_count for place in range(5)] == 5 * [6]
+    timer.join()
+
+
+class Server(Quiet, http.server.SimpleHTTPRequestHandler):
+    """A file server that answers each request with the next of `answers` first."""
+
+    answers: list[tuple[int, bytes]] = []  # noqa: RUF012 - one list for all requests
+
+    def do_GET(self):
+        if not self.answers:
+            super().do_GET()
+            return
+        status, body = self.answers.pop(0)
+        self.send_response(status)
+        self.send_header("Content-Length", str(len(body)))
+        self.end_headers()
+        self.wfile.write(body)
+
+
+@pytest.mark.parametrize("status", [404, 401, 403, 400, 451, 500, 503])
+def test_answers_that_pass(data, status, capsys):
+    """Any refusal of a server is outlived, of the manifest and of a shard."""
+    with answering(functools.partial(Server, directory=data.dataset.folder)) as url, faults_outlived():
+        store = EpisodeStore(url, "train")
+        Server.answers += [(status, HTML)]
+        assert not store.refresh()
+        store.ask_again()
+        Server.answers += 3 * [(status, HTML)]
+        assert store[0].frame_count == 6
+    assert not Server.answers
+
+
+@pytest.mark.parametrize("body", [HTML, b"{", b"[]", b"null", b'{"schema_version": 1}'])
+def test_contents_that_pass(data, body):
+    """So is a page instead of the manifest."""
+    with answering(functools.partial(Server, directory=data.dataset.folder)) as url, faults_outlived():
+        store = EpisodeStore(url, "train")
+        Server.answers += [(200, body)]
+        assert not store.refresh() and len(store) == 5
+        store.ask_again()
+        assert store[0].frame_count == 6
+
+
+@pytest.mark.parametrize("name", ["missing", "brace", "other set"])
+def test_a_training_outlives_a_fault(data, tmp_path, monkeypatch, name):
+    """A manifest that breaks as the training starts does not end it. Without patience the training ends with an error,
+    and with a checkpoint of its last update, from which it goes on."""
+    started, run, again, calls = hgn.train.train_network, tmp_path / "run", EpisodeStore.ask_again, []
+
+    def later(store):
+        calls.append(store)
+        if len(calls) > 8:
+            again(store)
+
+    def broken(*arguments):
+        with faulty(data.dataset.folder, name):
+            return started(*arguments)
+
+    monkeypatch.setattr(hgn.train, "train_network", broken)
+    assert train.main(train_mapping(data, tmp_path / "whole", monitor_every=100)) == 0
+    monkeypatch.setenv(VARIABLE, "0")
+    monkeypatch.setattr(EpisodeStore, "ask_again", later)
+    options = {"monitor_every": 100, "checkpoint_every": 100, "maximum_updates": 20}
+    with pytest.raises((ConfigError, OSError)):
+        train.main(train_mapping(data, run, **options))
+    updates = read_checkpoint(run / "checkpoints" / "last.ckpt")["hgn"]["updates"]
+    assert 0 < updates < 20
+    monkeypatch.setattr(hgn.train, "train_network", started)
+    assert train.main(train_mapping(data, run, **options)) == 0
+    assert metrics(run)[-1]["update"] == 20
