@@ -16,10 +16,10 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 27_740,
-    "datagen": 8_477,
+    "hgn": 28_231,
+    "datagen": 8_531,
     "tools": 7_155,
-    "tests": 27_185,
+    "tests": 28_458,
 }
 SETTINGS = 238  # fields of the dataclasses behind the commands, *Config
 

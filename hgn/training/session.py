@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 import yaml
@@ -15,10 +16,11 @@ import yaml
 from hgn.config import TrainConfig
 from hgn.data.manifest import Manifest
 from hgn.data.pooled import AnyStore
+from hgn.data.storage import faults_outlived
 from hgn.network.base import ParticleNetwork
 from hgn.network.build import build_network
 from hgn.runtime.backend import pick, set_matmul_precision, torch_unsupported_reason, triton_unsupported_reason
-from hgn.schema import to_mapping
+from hgn.schema import to_mapping, without_passwords
 from hgn.system.device import keep_to_quota
 from hgn.system.files import make_folder, write_atomically
 from hgn.system.provenance import provenance
@@ -58,6 +60,7 @@ def train_network(config: TrainConfig, start: Start, stop: StopRequest, publishe
     from hgn.training.monitor import Monitor
     from hgn.training.readers import ChunkReader, EpisodeReader, WindowReader
     from hgn.training.tensorboard import FinalMetrics
+    from hgn.training.watch import RankWatch
 
     training, run, store, resume = config.training, Path(config.run), start.store, start.resume
     lightning_compat.quieten()
@@ -80,20 +83,20 @@ def train_network(config: TrainConfig, start: Start, stop: StopRequest, publishe
     feed = EpisodeDataModule(store, training, reader, interrupted=lambda: stop.requested)
     if resume is not None:
         feed.first_update, feed.sampler_state = resume.progress.updates, resume.progress.sampler_state
-    _write_run_files(config, run)
+    _write_run_files(config, start.store.manifest)
 
     writer = CheckpointWriter()
     checkpoints = Checkpoints(run / "checkpoints", training.checkpoint_every, writer)
     monitor = Monitor(run, store, stop, checkpoints)
     lines = LogLines(run, monitor.last, feed, published)
-    final = FinalMetrics(to_mapping(config), monitor.last, stop)
+    final = FinalMetrics(_public(config), monitor.last, stop)
     trainer = Trainer(
         accelerator=training.device,
         devices=devices,
         num_nodes=nodes,
         strategy=lightning_compat.gradient_averaging(backend) if devices * nodes > 1 else "auto",
         max_epochs=-1,  # the feed ends after the last update
-        callbacks=[SameWeights(feed), lines, monitor, checkpoints, Stopper(stop, checkpoints), final],
+        callbacks=[RankWatch(run), SameWeights(feed), lines, monitor, checkpoints, Stopper(stop, checkpoints), final],
         plugins=[writer],
         logger=TensorBoardLogger(run, name="", version="tensorboard"),
         default_root_dir=run,
@@ -104,7 +107,7 @@ def train_network(config: TrainConfig, start: Start, stop: StopRequest, publishe
     )
     if start.precompilation is not None:
         print(start.precompilation.wait(lambda: stop.requested), file=sys.stderr)
-    with lightning_compat.interrupts_passed_on():
+    with lightning_compat.interrupts_passed_on(), faults_outlived():
         trainer.fit(module, feed, ckpt_path=resume.path if resume else None, weights_only=True)
     if trainer.is_global_zero:
         _report(config, module.update, monitor.last, stop)
@@ -159,13 +162,21 @@ def precompile_kernels(config: TrainConfig, stack: ExitStack) -> Precompilation 
     return precompilation
 
 
-def _write_run_files(config: TrainConfig, run: Path) -> None:
+def _public(config: TrainConfig) -> dict[str, Any]:
+    """Returns the settings without the passwords in URLs."""
+    mapping: dict[str, Any] = to_mapping(config)
+    mapping["dataset"]["folder"] = without_passwords(config.dataset.folder)
+    mapping["training"]["more_data"] = [without_passwords(folder) for folder in config.training.more_data]
+    return mapping
+
+
+def _write_run_files(config: TrainConfig, manifest: Manifest) -> None:
     """Writes the resolved configuration, with the commit and the machine."""
+    run = Path(config.run)
     make_folder(run)
     if not first_rank():
         return
-    manifest = Manifest.load(config.dataset.folder)
-    record = to_mapping(config)
+    record = _public(config)
     record["provenance"] = provenance("cuda" if torch.cuda.is_available() else "cpu") | {
         "data_schema_version": manifest.schema_version,
         "data_config_hash": manifest.config_hash,
@@ -178,7 +189,7 @@ def _report(config: TrainConfig, updates: int, last: dict[str, float], stop: Sto
     if "one_step/validation" in last:
         print(
             f"one-step validation MSE {last['one_step/validation']:.3e}, "
-            f"{format_ratio(last['baseline_ratio/validation'])} the best baseline's"
+            f"{format_ratio(last.get('baseline_ratio/validation', math.nan))} the best baseline's"
         )
     folder = Path(config.run) / "checkpoints"
     if not (folder / BEST_NAME).exists():

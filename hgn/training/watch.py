@@ -1,0 +1,101 @@
+"""Ends a rank that waits for another one that was stopped: neither time-outs nor signals reach it inside a collective.
+
+Each rank writes a count to the run's folder every BEAT_S and reads those of the others.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import select
+import signal
+import sys
+import threading
+import time
+from pathlib import Path
+from typing import NoReturn
+
+from lightning.pytorch import Callback, LightningModule, Trainer
+
+from hgn.command import EXIT_MACHINE
+from hgn.training.module import TrainingModule
+from hgn.training.stop import BY_WEIGHT
+
+BEAT_S = 5.0
+SILENCE_S = 300.0  # without a count of another rank; network file systems show files up to a minute late
+GRACE_S = 45.0  # after a signal, without an update, less than what schedulers give
+
+
+class RankWatch(Callback):
+    """Watches the other ranks in a thread, from the start to the end of a training on several ranks."""
+
+    def __init__(self, run: Path) -> None:
+        self._folder = run / ".ranks"
+        self._ended = threading.Event()
+        self._counts: dict[int, tuple[str, float]] = {}  # of each other rank, and when it changed
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        if trainer.world_size == 1:
+            return
+        assert isinstance(pl_module, TrainingModule)
+        self._folder.mkdir(exist_ok=True)
+        self._own = self._folder / str(trainer.global_rank)
+        now = time.monotonic()
+        self._counts = {rank: ("", now) for rank in range(trainer.world_size) if rank != trainer.global_rank}
+        self._woken, wake = os.pipe()
+        os.set_blocking(wake, False)
+        signal.set_wakeup_fd(wake, warn_on_full_buffer=False)  # written to even while the main thread waits
+        threading.Thread(target=self._watch, args=(pl_module,), name="ranks", daemon=True).start()
+
+    def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        if self._counts and not self._ended.is_set():
+            self._ended.set()
+            signal.set_wakeup_fd(-1)
+            with contextlib.suppress(OSError):
+                self._own.unlink()
+                self._folder.rmdir()
+
+    def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
+        self.on_train_end(trainer, pl_module)
+
+    def _watch(self, module: TrainingModule) -> None:
+        number, deadline, update, beats = 0, 0.0, 0, 0
+        while not self._ended.is_set():
+            if select.select([self._woken], [], [], BEAT_S)[0]:
+                for sent in os.read(self._woken, 64):
+                    if sent in BY_WEIGHT:
+                        number, deadline, update = sent, time.monotonic() + GRACE_S, module.update
+            beats += 1
+            silent = self._silent_ranks(str(beats))
+            if silent and not self._ended.is_set():
+                self._end(
+                    f"ranks {silent} must answer within {SILENCE_S:.0f} s, got nothing; run the same command again",
+                    EXIT_MACHINE,
+                )
+            if number and time.monotonic() > deadline and not self._ended.is_set():
+                if module.update == update:
+                    self._end(f"the other ranks must answer after {signal.Signals(number).name}", 128 + number)
+                deadline, update = time.monotonic() + GRACE_S, module.update
+
+    def _silent_ranks(self, count: str) -> list[int]:
+        """Writes this rank's count; returns the ranks whose count has not changed for SILENCE_S."""
+        now = time.monotonic()
+        try:
+            self._own.write_text(count)
+            for rank, (before, _) in self._counts.items():
+                if (text := self._read(rank)) != before:
+                    self._counts[rank] = text, now
+        except OSError:  # the folder is away, and says nothing about ranks
+            self._counts = {rank: (before, now) for rank, (before, _) in self._counts.items()}
+        return [rank for rank, (_, changed) in self._counts.items() if now - changed > SILENCE_S]
+
+    def _read(self, rank: int) -> str:
+        try:
+            return (self._folder / str(rank)).read_text()
+        except FileNotFoundError:
+            return ""
+
+    @staticmethod
+    def _end(text: str, code: int) -> NoReturn:
+        print(f"error: {text}", file=sys.stderr, flush=True)
+        os._exit(code)
