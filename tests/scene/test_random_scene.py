@@ -24,7 +24,7 @@ from hgn.schema import ConfigError
 
 PAPER = SceneConfig()
 CELL = 1 / 64
-SEEDS = [0, 12345]
+SEEDS = [0, 1, 2, 12345]
 
 
 @functools.cache

@@ -40,7 +40,6 @@ from hgn.viewer.viser_compat import COOKIE, start_server, stop_server
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 SIZE = (900, 600)
-VIEW = {"width": SIZE[0], "height": SIZE[1]}
 CONF = Path(__file__).parents[2] / "conf"
 # viser keeps its event loop's threads and sockets until the garbage collector comes
 pytestmark = pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::pytest.PytestUnraisableExceptionWarning")
@@ -86,14 +85,10 @@ def viewer(browser, play):
 
 
 def opened(browser, address):
-    """A viewer's page in a browser that draws without a GPU."""
-    page = browser.new_context(viewport=VIEW, device_scale_factor=0.5).new_page()
+    """A viewer's page, once its canvas shows more than one colour."""
+    size = {"width": SIZE[0], "height": SIZE[1]}
+    page = browser.new_context(viewport=size, device_scale_factor=0.5).new_page()  # it draws without a GPU
     page.set_default_timeout(300_000)
-    return shown(page, address)
-
-
-def shown(page, address):
-    """The page at an address, once its canvas shows more than one colour."""
     page.goto(address)
     page.wait_for_selector("canvas")
     until(lambda: len(np.unique(pixels(page) @ (65536, 256, 1))) > 50)
@@ -250,9 +245,7 @@ def test_own_meshes(viewer, play):
 
 def test_two_viewers_and_a_lost_connection(browser, viewer, play):
     """A second viewer sees the same scene; when all connections break the scene goes on, and both come back to it."""
-    viewer.set_viewport_size({"width": 90, "height": 60})  # it leaves the core to the second
     second = opened(browser, play.address)
-    viewer.set_viewport_size(VIEW)
     until(lambda: len(play.server.get_clients()) == 2 and blue(second) > 300)
     frame, lost = play.session.frame, set(play.server.get_clients())
     play.server._websock_server.disconnect_all_clients()
@@ -302,14 +295,15 @@ def test_stage():
         stop_server(server)
 
 
-def test_a_film_plays_by_itself(viewer, play, tmp_path):
+def test_a_film_plays_by_itself(browser, play, tmp_path):
     """The static page draws the rollout's particles without any server."""
     play.do(lambda: setattr(play, "playing", False))
     until(lambda: not play.playing)
     path = tmp_path / "film.html"
     path.write_text(film_html(play.session.rollout(), every=10))
-    shown(viewer, path.as_uri())
-    until(lambda: blue(viewer) > 300)
+    page = opened(browser, path.as_uri())
+    until(lambda: blue(page) > 300)
+    page.context.close()
 
 
 def test_it_begins_when_somebody_looks_and_restarts_as_it_was():
