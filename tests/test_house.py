@@ -21,7 +21,7 @@ LINES = {  # of Python, in tracked files
     "tools": 7_155,
     "tests": 28_458,
 }
-SETTINGS = 238  # fields of the dataclasses behind the commands, *Config
+SETTINGS = 239  # fields of the dataclasses behind the commands, *Config
 
 LINES_OF_A_FILE = 450
 LONG_FILES = {
