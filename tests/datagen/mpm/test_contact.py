@@ -44,8 +44,7 @@ def test_sheets_release():
 
 def test_nothing_is_glued_below_a_sheet():
     """Of all materials that fall onto a small sheet and around it, nothing stays just below it."""
-    cases = [(Setting(offset, "aligned", CELL), material) for offset in (0.3, 0.5) for material in (WATER, SAND)]
-    cases += [(Setting(0.3, "aligned", CELL), material) for material in (SNOW, ELASTIC)]
+    cases = [(Setting(0.5 if kind == SAND else 0.3, "aligned", CELL), kind) for kind in (WATER, SAND, SNOW, ELASTIC)]
     assert glued_below(cases, CONFIG) == [0.0] * len(cases)
 
 
@@ -71,9 +70,7 @@ def test_friction_acts_as_set(friction):
     cases = [(Setting(offset, "aligned", CELL), "sheet", kind) for offset in (0.0, 0.3, 0.5) for kind in (SAND, SNOW)]
     cases += [(Setting(0.0, "aligned", CELL), "floor", kind) for kind in (SAND, SNOW)]
     if friction == FRICTIONS[-1]:
-        cases += [
-            (Setting(offset, "aligned", CELL), "body", SAND) for offset in (0, 0.2, 0.34, 0.36, 0.41, 0.5, 0.7, 0.9)
-        ]
+        cases += [(Setting(offset, "aligned", CELL), "body", SAND) for offset in (0, 0.34, 0.36, 0.5, 0.7)]
     for case, acting in zip(cases, acting_frictions([*cases, *BESIDE], friction, CONFIG), strict=False):
         assert acting == pytest.approx(friction, rel=FRICTION_ERRORS[case[2]]), case
 

@@ -47,19 +47,11 @@ def test_a_scene_file_is_solved(tmp_path, monkeypatch):
         assert moving.width > 160
 
 
-def test_bad_input(tmp_path, monkeypatch):
-    """What cannot be solved is said, and nothing is written."""
+def test_a_scene_that_bursts(tmp_path, monkeypatch):
+    """What the solver cannot keep together is said, and nothing is written."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(launch, "MAXIMUM_SUBSTEPS", 1)
     Path("mine.yaml").write_text(SCENE.split("\n")[3])
-    for change, message in (
-        ({"scene": "none.yaml"}, "scene must be an existing YAML file, got none.yaml"),
-        ({"frames": 1}, "frames must be at least 2, got 1"),
-        ({"out": "a.png"}, "out must be a name that ends in .vtkhdf, .hdf, .hdf5 or .h5, got 'a.png'; tools.render"),
-        ({"out": "a.usdc"}, "got 'a.usdc'; tools.render makes pictures, USD and PLY of a rollout file"),
-        ({"mpm": {"snow_hardning": 5.0}}, "mpm.snow_hardning is not a known key; did you mean snow_hardening?"),
-        ({"mpm": {"device": "cpu"}}, "mine.yaml must be a scene that the solver keeps together, got frame 1"),
-    ):
-        with pytest.raises(ConfigError, match=message):
-            main({"scene": "mine.yaml", "frames": 3} | change)
+    with pytest.raises(ConfigError, match=r"mine\.yaml must be a scene that the solver keeps together, got frame 1"):
+        main({"scene": "mine.yaml", "frames": 3, "mpm": {"device": "cpu"}})
     assert [path.name for path in tmp_path.iterdir()] == ["mine.yaml"]

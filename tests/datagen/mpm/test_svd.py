@@ -56,10 +56,10 @@ def cases():
     }
 
 
-@pytest.mark.parametrize("name", cases())
-def test_decomposition(name):
+@pytest.mark.parametrize("matrix", cases().values(), ids=cases())
+def test_decomposition(matrix):
     """A = U diag(sigma) Vᵀ and numpy's singular values to 2e-6 of the largest; U, V are rotations to 2e-6."""
-    matrix = cases()[name].astype(np.float32).astype(float)
+    matrix = matrix.astype(np.float32).astype(float)
     U, sigma, V = run(matrix)
     size = np.maximum(np.abs(matrix).max(axis=(1, 2)), 1e-30)
     for rotation in (U, V):

@@ -45,26 +45,27 @@ def test_teams_agree_with_the_other_launch():
     assert np.abs(alone.position_TN3 - found[1].position_TN3).max() < 1e-3
 
 
-def test_teams_agree_where_each_step_is_an_interval():
-    """Kernels then have no steps of particles' own: a frame agrees to 1e-6."""
-    config = MpmConfig(device="cpu", fixed_time_step_s=1e-3)
-    one, other = (simulate([HEAVY], config, 6, 60.0, team=team)[0] for team in (Team(0), Team(1)))
-    assert isinstance(one, Simulated) and isinstance(other, Simulated)
-    assert np.abs(one.position_TN3[1] - other.position_TN3[1]).max() < 1e-6
-    assert np.abs(one.position_TN3 - other.position_TN3).max() < 1e-3
-    assert one.counters["substeps"] == other.counters["substeps"]
+FAILING = mixed(40, 3, (0, 1e6, 0))
 
 
-def test_blocks_that_wait_for_each_other_agree_with_the_other_launch():
-    """A scene of two blocks ends where one launch a substep does, particles added up one by one, beside one that
-    fails.
-    """
-    scenes = [mixed(120, 0, (0, -3, 0)), mixed(40, 3, (0, 1e6, 0)), HEAVY]
-    one, other = (simulate(scenes, CONFIG, 4, 60.0, team=team) for team in (Team(0), Team(1, 2, 1)))
-    assert isinstance(one[0], Simulated) and isinstance(other[0], Simulated)
-    assert isinstance(one[1], SceneFailure) and one[1] == other[1]
-    assert np.abs(one[0].position_TN3 - other[0].position_TN3).max() < 1e-5
-    assert one[0].counters["substeps"] == other[0].counters["substeps"]
+@pytest.mark.parametrize(
+    ("config", "scenes", "team", "tolerance"),
+    [
+        (MpmConfig(device="cpu", fixed_time_step_s=1e-3), [HEAVY], Team(1), 1e-3),
+        (CONFIG, [mixed(120, 0, (0, -3, 0)), HEAVY, FAILING], Team(1, 2, 1), 1e-5),
+    ],
+    ids=["each step is an interval", "two blocks"],
+)
+def test_other_kernels_agree(config, scenes, team, tolerance):
+    """Kernels without steps of particles' own, and scenes of two blocks that wait for each other, beside one that
+    fails, end where one launch a substep does: a frame agrees to 1e-6, as many substeps are taken."""
+    for one, other in zip(*(simulate(scenes, config, 4, 60.0, team=each) for each in (Team(0), team)), strict=True):
+        if isinstance(one, SceneFailure):
+            assert one == other and scenes[2:] == [FAILING]
+            continue
+        assert isinstance(other, Simulated) and one.counters["substeps"] == other.counters["substeps"]
+        assert np.abs(one.position_TN3[1] - other.position_TN3[1]).max() < 1e-6
+        assert np.abs(one.position_TN3 - other.position_TN3).max() < tolerance
 
 
 def test_a_hundred_thousand_substeps():
@@ -95,17 +96,6 @@ def test_blocks_that_wait_for_each_other_all_run_at_once(scenes, most):
     assert _team(Device("cpu", 2), [most] * scenes) == _team(Device("cuda", 1, 132), [50_000_000]) == Team(0)
 
 
-def test_who_runs_many_scenes():
-    """One block a scene where all are done at once, else teams that take scenes one after another."""
-    gpu = Device("cuda", 1, 132)
-    assert _team(gpu, [4_000] * 256) == Team(256)
-    for counts in ([4_000, *[3_000] * 255], [4_000] * 100, [4_000] * 412):
-        assert _team(gpu, counts) == Team(256, 3, 4)
-    assert _team(gpu, [4_000] * 50) == Team(256, 5, 4)
-    assert _team(gpu, [4_000]) == Team(128, 264, 1)
-    assert _team(gpu, [1_000_000]) == Team(256, 264) and _team(gpu, [1_000_000] * 4) == Team(256, 66)
-
-
 def test_blocks_that_are_not_at_work_at_once(monkeypatch):
     """Three blocks on two threads, that would wait for ever: all leave, a warning says so, and each substep is a launch
     of its own, with the same result.
@@ -119,14 +109,10 @@ def test_blocks_that_are_not_at_work_at_once(monkeypatch):
     assert np.array_equal(found.position_TN3, expected.position_TN3)
 
 
-def test_more_blocks_than_run_at_once():
-    """Blocks that would wait for ever are refused."""
+def test_more_than_runs(monkeypatch):
+    """Blocks that would wait for ever, and a batch beyond what int32 counts, are refused with the remedy."""
     with pytest.raises(ConfigError, match=r"team.blocks must be at most 2, .*, got 3"):
         simulate([mixed(1, 0, (0, 0, 0))], CONFIG, 2, 60.0, team=Team(1, 3))
-
-
-def test_more_particles_than_kernels_count(monkeypatch):
-    """A batch beyond what int32 counts is refused with the remedy."""
     monkeypatch.setattr(team_launch, "MAXIMUM_PARTICLES", 10)
     with pytest.raises(ConfigError, match=r"at most 10 particles, got 11 of 1 scenes; lower scenes_per_launch"):
         simulate([mixed(11, 0, (0, 0, 0))], CONFIG, 2, 60.0, team=Team(1))

@@ -42,16 +42,6 @@ def test_stiffness_changes_steps_and_not_transfers():
     assert fast.counters["transfers"] > 1.5 * 16
 
 
-def test_momentum_is_kept_over_intervals():
-    """Without gravity blocks that collide keep their momentum to 1e-5 over intervals of many steps of stress."""
-    scene = dataclasses.replace(cube((0, 0, 0), 30.0), gravity=(0.0, 0.0, 0.0))
-    towards = np.where(scene.position_N3[:, :1] > 0.475, np.float32([[-2, 0.3, 0]]), np.float32([[2, 0, 0.1]]))
-    outcome = run(dataclasses.replace(scene, velocity_N3=towards.astype(np.float32)), CONFIG, 7)
-    moved = np.diff(outcome.position_TN3.astype(float), axis=0).sum(axis=1)
-    assert outcome.counters["substeps"] > 4 * outcome.counters["transfers"]
-    assert np.abs(moved - moved[0]).max() < 1e-5 * np.abs(towards).sum() / 60
-
-
 def apart(frames=9):
     """How much the height of a splash of water changes where something far away needs several times as many steps."""
     water = block(WATER, (30, 4, 30), (5, 5, 5), (0, -4.5, 0))
@@ -125,18 +115,19 @@ def shaken(scene, frames):
 
 @pytest.mark.parametrize(("material", "stiffness"), [(ELASTIC, 16), (SNOW, 3.6)])
 def test_what_is_stiff_rests(material, stiffness):
-    """A block that takes several steps of stress an interval lies still on the floor: after 0.3 s it moves by less than
-    0.01 cells a second, and has not left its place (it danced, since transfers found velocities half a step ahead).
+    """A block that takes several steps of stress an interval lies still on the floor: after 0.15 s it moves by less
+    than 0.01 cells a second, and has not left its place (it danced, since transfers found velocities half a step
+    ahead).
     """
-    scene = block(material, (30, 2, 30), (4, 4, 4))
+    scene = block(material, (30, 2, 30), (3, 3, 3))
     modulus = np.full(scene.particle_count, 1e6 * stiffness, np.float32)
-    speed, way = shaken(dataclasses.replace(scene, material_parameters={"youngs_modulus_pa": modulus}), 73)
+    speed, way = shaken(dataclasses.replace(scene, material_parameters={"youngs_modulus_pa": modulus}), 37)
     assert speed < 0.01 and way < 0.01
 
 
 def test_sand_rests_around_what_is_stiff():
     """Sand in a bin with a stiff body in its middle lies still, though its steps are longer than the body's: its centre
-    sinks by less than 0.02 cells in 0.4 s (it rose by 0.2, for what acts at once is seen before the rest balances it).
+    sinks by less than 0.02 cells in 0.2 s (it rose by 0.2, for what acts at once is seen before the rest balances it).
     """
     sand = block(SAND, (2, 2, 2), (6, 9, 6))
     inside = ((64 * sand.position_N3 > (4, 5, 4)) & (64 * sand.position_N3 < (6, 7, 6))).all(1)
@@ -144,7 +135,7 @@ def test_sand_rests_around_what_is_stiff():
         sand, domain_size=(11 / 64, 16 / 64, 11 / 64),
         **{name: getattr(sand, name)[~inside] for name in ("position_N3", "velocity_N3", "material_N")},
     )  # fmt: skip
-    _, way = shaken(with_stiff(sand, block(ELASTIC, (4, 5, 4), (2, 2, 2), seed=1), 16), 97)
+    _, way = shaken(with_stiff(sand, block(ELASTIC, (4, 5, 4), (2, 2, 2), seed=1), 16), 49)
     assert way < 0.02
 
 
@@ -168,21 +159,16 @@ def test_bodies_of_different_steps_that_meet():
     assert np.abs(velocity_T3 - scene.velocity_N3.mean(0)).max() < 1e-4, velocity_T3
 
 
-def test_half_the_step_in_fast_impacts():
-    """Half the step moves the centre of sand that hits the floor at 10 m/s by less than 3 %: intervals are synchronised
-    while something is fast, and those that follow take up strain and stress where these have left them.
+def test_half_the_step():
+    """Half the step moves the centre of sand that hits the floor at 10 m/s, and the height of a block of each material
+    at 4.5 m/s, by less than 3 %, as transfers stay as many: intervals are synchronised while something is fast, and
+    those that follow take up strain and stress where these have left them.
     """
     half = dataclasses.replace(CONFIG, stability_fraction=CONFIG.stability_fraction / 2)
-    scenes = [block(SAND, (28, 4, 28), (8, 8, 8), (0, -10.0, 0)), cube((0, 0, 0), cell=1 / 64)]
-    whole, fine = (simulated(scenes, config, 9, 240.0)[0].position_TN3 for config in (CONFIG, half))
-    assert np.abs(centre_cells(fine[-1]) / centre_cells(whole[-1]) - 1) < 0.03
-
-
-def test_half_the_step():
-    """Half the step changes the height of a block on the floor by less than 3 %, as its transfers stay as many."""
-    half = dataclasses.replace(CONFIG, stability_fraction=CONFIG.stability_fraction / 2)
-    blocks = [(SAND, 4.5), (SNOW, 4.5), (WATER, 4.5)]
-    scenes = [block(material, (30, 4, 30), (6, 6, 6), (0, -speed, 0)) for material, speed in blocks]
-    outcomes = [simulated([*scenes, cube((0, 0, 0), cell=1 / 64)], config, 6, 240.0) for config in (CONFIG, half)]
-    for whole, fine in zip(*(outcome[:3] for outcome in outcomes), strict=True):
-        assert abs(height_cells(fine.position_TN3[-1]) / height_cells(whole.position_TN3[-1]) - 1) < 0.03
+    blocks = [block(kind, (30, 4, 30), (6, 6, 6), (0, -4.5, 0)) for kind in (SAND, SNOW, WATER)]
+    fast = block(SAND, (28, 4, 28), (8, 8, 8), (0, -10.0, 0))
+    other = cube((0, 0, 0), cell=1 / 64)
+    for scenes, frames, measure in (([fast], 9, centre_cells), (blocks, 6, height_cells)):
+        outcomes = [simulated([*scenes, other], config, frames, 240.0)[:-1] for config in (CONFIG, half)]
+        for whole, fine in zip(*outcomes, strict=True):
+            assert np.abs(measure(fine.position_TN3[-1]) / measure(whole.position_TN3[-1]) - 1) < 0.03
