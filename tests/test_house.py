@@ -19,7 +19,7 @@ LINES = {  # of Python, in tracked files
     "hgn": 28_231,
     "datagen": 8_531,
     "tools": 7_155,
-    "tests": 28_458,
+    "tests": 28_269,
 }
 SETTINGS = 239  # fields of the dataclasses behind the commands, *Config
 
