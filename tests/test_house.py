@@ -19,13 +19,12 @@ LINES = {  # of Python, in tracked files
     "hgn": 28_231,
     "datagen": 8_531,
     "tools": 7_155,
-    "tests": 28_269,
+    "tests": 28_268,
 }
 SETTINGS = 239  # fields of the dataclasses behind the commands, *Config
 
 LINES_OF_A_FILE = 450
-LONG_FILES = {
-}
+LONG_FILES: dict[str, int] = {}
 
 NARROW_PACKAGES = ("hgn/training/", "hgn/runtime/")
 PARAMETERS, POSITIONAL_ARGUMENTS = 8, 4
