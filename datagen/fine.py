@@ -67,13 +67,8 @@ def visible_positions(position_TM3: np.ndarray, visible: int) -> np.ndarray:
 
 
 def scene_to_simulate(scene: Scene, config: DatagenConfig) -> Scene:
-    """Returns a scene of a data set as the solver simulates it."""
+    """Returns a scene of a data set as the solver simulates it, with the settings of `solver_on_grid`."""
     return fine_scene(scene, config.reference_cell_size, wall_thickness(config.mpm, scene.cell_size))
-
-
-def solver_to_use(config: DatagenConfig) -> MpmConfig:
-    """Returns the settings of the solver on the reference grid of a data set."""
-    return solver_on_grid(config.mpm, config.reference_cell_size, config.scene.cell_size)
 
 
 def _offsets(scene: Scene, children: int, wall: float) -> np.ndarray:

@@ -17,7 +17,7 @@ PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
     "hgn": 28_231,
-    "datagen": 8_531,
+    "datagen": 8_530,
     "tools": 7_155,
     "tests": 28_268,
 }

@@ -13,7 +13,7 @@ from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
 
-from datagen.fine import scene_to_simulate, solver_to_use, visible_positions
+from datagen.fine import scene_to_simulate, solver_on_grid, visible_positions
 from datagen.pool.plan import SceneTask
 from datagen.pool.worker_plan import WorkerPlan
 from hgn.config import DatagenConfig
@@ -184,7 +184,7 @@ def simulate_batch(
     for (frames, _), launch in sorted(launches.items(), key=lambda item: item[0]):
         of_launch = simulate(
             [scene_to_simulate(made.scene.open(), config) for made in launch],
-            solver_to_use(config),
+            solver_on_grid(config.mpm, config.reference_cell_size, config.scene.cell_size),
             frames,
             config.dataset.frame_rate_hz,
             on_frame=reporter and reporter(len(launch)),
