@@ -245,6 +245,21 @@ def test_both_commands(tmp_path, monkeypatch, capsys):
         network.main(options)
 
 
+def test_the_stored_figures_pass():
+    """The solver's stored figures are those of today's scenes and within today's bounds on both grids; of each row a
+    broken trajectory fails."""
+    report = json.loads((gallery.REFERENCE / "gallery_solver.json").read_text())
+    rows = {row["case"]: row for row in report["rows"]}
+    for case in gallery.gallery_cases("gallery"):
+        series = report["scenes"][case.name]["series"]
+        for bound in case.gallery.measure.bounds:
+            own = {cells: bound.reduced([float(x) for x in one[bound.key].split()]) for cells, one in series.items()}
+            low, high = bound.interval(own["64"])
+            name, wrong = f"{case.name}: {bound.label}", rows[f"{case.name}: {bound.label}"]["broken"].values()
+            assert set(own) == {"64", "96"} and all(low <= figure <= high for figure in own.values()), name
+            assert any(figure is None or not low <= figure <= high for figure in wrong), name
+
+
 def test_a_scene_is_drawn_beside_the_solver(tmp_path, monkeypatch, capsys):
     """One command simulates a gallery scene with the solver and with weights, and draws both."""
     path, weights = tiny_file(tmp_path), still_weights(tmp_path)
