@@ -19,7 +19,7 @@ LINES = {  # of Python, in tracked files
     "hgn": 28_231,
     "datagen": 8_530,
     "tools": 7_155,
-    "tests": 28_268,
+    "tests": 28_283,
 }
 SETTINGS = 239  # fields of the dataclasses behind the commands, *Config
 
