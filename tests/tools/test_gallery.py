@@ -233,7 +233,7 @@ def test_both_commands(tmp_path, monkeypatch, capsys):
     assert [row["held"] for row in json.loads(shown.read_text())["rows"]] == [True]
     # the solver's rows, too, are compared with other bounds without a new simulation
     never = {"of": "height", "frames": [5, 10], "between": [0, 90]}
-    tiny_file(tmp_path, bounds=[never, {"of": "centre", "group": 1, "frames": [5, 10], "within": 0.002}])
+    tiny_file(tmp_path, bounds=[never, {"of": "centre", "group": 1, "frames": [5, 10], "within": 0.0025}])
     monkeypatch.setattr(solver_gallery, "solver_trials", lambda *_: pytest.fail("simulated again"))
     assert solver.main({"cases": ["gallery"], "device": "cpu", "json": str(tmp_path / "again.json")}) == 0
     again = json.loads((tmp_path / "again.json").read_text())
