@@ -12,7 +12,6 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from hgn.config import DatagenConfig, MpmConfig
 from hgn.scene.distance import closest_points
@@ -93,6 +92,8 @@ def _offsets(scene: Scene, children: int, wall: float) -> np.ndarray:
 
 def _surface_distances(scene: Scene, reach: float) -> np.ndarray:
     """Returns the particles' distances to obstacles in their first pose, float64 [N]; inf where beyond `reach`."""
+    from scipy.spatial import cKDTree
+
     distance_N = np.full(scene.particle_count, np.inf)
     tree = cKDTree(scene.position_N3)
     for obstacle in scene.obstacles:

@@ -15,7 +15,7 @@ from hgn.command import run_command
 from hgn.config import MpmConfig, require_rollout_name
 from hgn.scene.emission import entry_frames
 from hgn.scene.rollout_file import Rollout, write_rollout
-from hgn.scene.scene_file import find_scene, load_scene, notes_on_meshes
+from hgn.scene.scene_file import find_scene, load_scene, notes_on_files
 from hgn.schema import ConfigError, FrameCount, Positive, from_mapping, require_bounds, to_mapping
 from hgn.system.files import require_place
 from hgn.system.progress import bar
@@ -46,7 +46,7 @@ def main(mapping: dict[str, Any]) -> int:
     out = Path(config.out if config.out is not None else f"rollout/{file.stem}_solver.vtkhdf")
     require_place(out)
     scene = load_scene(file)
-    for note in notes_on_meshes(scene):
+    for note in notes_on_files(scene):
         print(note, file=sys.stderr)
     # Taichi takes seconds to load, and bad input is answered before.
     from datagen.mpm.solver import SceneFailure, simulate

@@ -6,6 +6,7 @@ loads neither torch nor NumPy.
 
 from __future__ import annotations
 
+import os
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
@@ -21,6 +22,10 @@ if TYPE_CHECKING:
     from hgn.scene.scene import Scene as Scene
     from hgn.scene.scene_file import load_scene as load_scene
     from hgn.schema import ConfigError as ConfigError
+
+# OpenMP reads this as torch loads it. Its idle threads spin otherwise, and take cores from the thread that the others
+# wait for: a training beside another program makes a sixth of the updates, or less.
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 _MODULES = {
     "ConfigError": "hgn.schema",

@@ -8,18 +8,18 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
-
-import torch
+from typing import TYPE_CHECKING, Any
 
 from hgn.command import run_command
 from hgn.config import StoredPrecision
-from hgn.network.base import ParticleNetwork
-from hgn.runtime.weights import WeightsInfo, find_weights, load_weights, save_weights
 from hgn.schema import ConfigError, FileName, from_mapping, require, require_bounds
-from hgn.system.provenance import provenance
 
-Loaded = tuple[ParticleNetwork, WeightsInfo]
+if TYPE_CHECKING:
+    from hgn.network.base import ParticleNetwork
+    from hgn.runtime.weights import WeightsInfo
+
+    Loaded = tuple[ParticleNetwork, WeightsInfo]
+
 SHARED = ("network", "step", "frame_rate_hz", "obstacle_cell_size", "gravity")  # must be equal in all files
 
 
@@ -55,6 +55,11 @@ def average(config: AverageConfig) -> None:
 
     Raises: ConfigError when a file is missing, or networks, data or normalisers differ.
     """
+    import torch
+
+    from hgn.runtime.weights import find_weights, load_weights, save_weights
+    from hgn.system.provenance import provenance
+
     coefficients = config.coefficients or (1 / len(config.weights),) * len(config.weights)
     files = [find_weights(name, f"weights[{i}]") for i, name in enumerate(config.weights)]
     loaded = [load_weights(file, field=f"weights[{i}]") for i, file in enumerate(files)]
@@ -76,6 +81,8 @@ def average(config: AverageConfig) -> None:
 
 
 def _require_same(first: Loaded, other: Loaded, names: tuple[str, ...], i: int) -> None:
+    import torch
+
     for field in SHARED:
         expected, other_value = getattr(first[1], field), getattr(other[1], field)
         if expected != other_value:

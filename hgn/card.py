@@ -9,17 +9,19 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import yaml
 
 from hgn.command import run_command
 from hgn.data.manifest import SPLITS, Manifest
 from hgn.data.storage import is_remote
-from hgn.runtime.weights import WeightsInfo, find_weights, load_weights
 from hgn.scene.world import RANGES
 from hgn.schema import from_mapping, require
 from hgn.system.files import write_atomically
+
+if TYPE_CHECKING:
+    from hgn.runtime.weights import WeightsInfo
 
 CARD = "README.md"
 _SIZES = ((1_000, "n<1K"), (10_000, "1K<n<10K"), (100_000, "10K<n<100K"))  # the Hub's size categories, by episodes
@@ -46,6 +48,8 @@ class CardConfig:
 
 def main(mapping: dict[str, Any]) -> int:
     """Writes the card, and a copy of the weights; never replaces a card. Returns the exit code."""
+    from hgn.runtime.weights import find_weights, load_weights
+
     config = from_mapping(CardConfig, mapping)
     if config.weights is not None:
         assert config.out is not None  # checked by CardConfig

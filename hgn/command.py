@@ -7,13 +7,15 @@ Exit codes: 0 success, 1 machine error (full disk, no permission, existing path)
 from __future__ import annotations
 
 import errno
+import importlib
+import io
 import itertools
 import os
 import select
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, NoReturn, cast
 
 from hgn.config import config_directory
 from hgn.schema import ConfigError, require, without_passwords
@@ -38,8 +40,13 @@ _MACHINE_ERRORS = {
 }
 
 
-def run_command(main: Callable[[dict[str, Any]], int | None], config_name: str) -> NoReturn:
+Main = Callable[[dict[str, Any]], int | None]
+
+
+def run_command(main: Main | str, config_name: str) -> NoReturn:
     """Composes `conf/<config_name>.yaml` with the command line, calls `main` with the plain mapping, and exits.
+
+    `main` may be the name of the module that has it, which is then loaded after the configuration.
 
     The file of a command without config groups lies in `conf/command/`, because Hydra would take its keys
     (`scene=my_scene.yaml`) for choices of a group.
@@ -50,6 +57,8 @@ def run_command(main: Callable[[dict[str, Any]], int | None], config_name: str) 
     for name in ("stdout", "stderr"):
         if getattr(sys, name) is None:  # the process was started without it
             setattr(sys, name, Path(os.devnull).open("w"))  # noqa: SIM115 - open as long as the process runs
+        elif isinstance(stream := getattr(sys, name), io.TextIOWrapper) and stream.encoding.lower() != "utf-8":
+            stream.reconfigure(errors="replace")  # latin-1 or ASCII, perhaps
     code: int | str | None
     try:
         try:
@@ -67,13 +76,15 @@ def run_command(main: Callable[[dict[str, Any]], int | None], config_name: str) 
     sys.exit(code)
 
 
-def _exit_code(main: Callable[[dict[str, Any]], int | None], config_name: str) -> int:
+def _exit_code(main: Main | str, config_name: str) -> int:
     try:
         code = 0
         if {"--help", "-h"} & set(sys.argv[1:]):
             _print_help(config_name)
             return 0
         for mapping in _compose(config_name):
+            if isinstance(main, str):
+                main = cast("Main", importlib.import_module(main).main)
             code = main(mapping) or 0
             if code:
                 break

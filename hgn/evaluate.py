@@ -6,7 +6,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -14,27 +14,16 @@ from hgn.command import run_command
 from hgn.config import DEFAULT_WEIGHTS, SimulatorConfig, Split
 from hgn.data.fresh import set_record
 from hgn.data.reader import EpisodeStore, first_episodes
-from hgn.runtime.rollouts import RolloutResult, simulate_scenes
-from hgn.runtime.simulator import InitialState, Simulator
-from hgn.runtime.torch_backend import Backend
-from hgn.runtime.weights import find_weights, require_frame_rate
 from hgn.scene.distance import fraction_inside
 from hgn.scene.episode import Episode
-from hgn.scene.rollout_file import obstacles_of_episode
 from hgn.schema import FileName, NonNegative, Positive, from_mapping, require_bounds
 from hgn.system.files import require_place, write_json
 from hgn.system.progress import bar
-from hgn.system.provenance import provenance
-from hgn.training.errors import (
-    REPORTED_FRAMES,
-    baselines,
-    format_ratio,
-    frame_batches,
-    network_predictor,
-    one_step_errors,
-    rollout_errors,
-    set_convention,
-)
+
+if TYPE_CHECKING:
+    from hgn.runtime.rollouts import RolloutResult
+    from hgn.runtime.simulator import Simulator
+    from hgn.runtime.torch_backend import Backend
 
 
 @dataclass(frozen=True)
@@ -55,6 +44,11 @@ class EvaluateConfig(SimulatorConfig):
 
 def main(mapping: dict[str, Any]) -> int:
     """Prints a table, and writes JSON if `json` is set; returns the exit code."""
+    from hgn.runtime.simulator import InitialState, Simulator
+    from hgn.runtime.weights import find_weights, require_frame_rate
+    from hgn.system.provenance import provenance
+    from hgn.training.errors import set_convention
+
     config = from_mapping(EvaluateConfig, mapping)
     if config.json is not None:
         require_place(Path(config.json))
@@ -92,6 +86,8 @@ def main(mapping: dict[str, Any]) -> int:
 
 def one_step_rows(backend: Backend, episodes: list[Episode], config: EvaluateConfig) -> list[dict[str, Any]]:
     """Returns a row for each predictor: {"system", "one_step_mse", "by_material"}."""
+    from hgn.training.errors import baselines, frame_batches, network_predictor, one_step_errors
+
     network, device = backend.network, backend.device
     predictors = {"network": network_predictor(backend)} | baselines(network)
     total = sum(-(-(len(episode.position_TN3) - 1) // config.frame_stride) for episode in episodes)
@@ -111,6 +107,9 @@ def one_step_rows(backend: Backend, episodes: list[Episode], config: EvaluateCon
 
 def rollouts(simulator: Simulator, episodes: list[Episode], frames: int) -> list[RolloutResult]:
     """Simulates the episodes from their first frame to the last frame of the shortest."""
+    from hgn.runtime.rollouts import simulate_scenes
+    from hgn.runtime.simulator import InitialState
+
     frames = min(frames, *(len(episode.position_TN3) for episode in episodes))
     with bar("rollouts", total=frames - 1, unit="frame") as progress:
         initial = [InitialState.of_episode(episode) for episode in episodes]
@@ -128,6 +127,8 @@ def rollout_row(trials: Sequence[RolloutResult], episodes: list[Episode], frames
     """Returns {"system", "position_mse": {frame: value}, "scenes_reached": {frame: count}, "mean_position_mse",
     "by_material", "ends"}; an error is the mean over the scenes that reached its frame.
     """
+    from hgn.training.errors import REPORTED_FRAMES, rollout_errors
+
     mse_T = rollout_errors([trial.position_TN3 for trial in trials], episodes)
     frames = min(frames, *(len(episode.position_TN3) for episode in episodes))
     reported = sorted({n for n in (*REPORTED_FRAMES, frames - 1) if n < frames})
@@ -150,6 +151,8 @@ def end_of_rollout(trial: RolloutResult, episode: Episode) -> dict[str, Any]:
     """Returns fractions of the particles within closed obstacles, also of the data's, and outside the domain, in the
     last frame of a rollout, and the cause of an early end.
     """
+    from hgn.scene.rollout_file import obstacles_of_episode
+
     obstacles, last = obstacles_of_episode(episode), trial.frame_count - 1
     position_N3 = trial.position_TN3[last]
     beyond_N3 = (position_N3 < 0) | (position_N3 > np.asarray(episode.domain_size))
@@ -165,6 +168,8 @@ def end_of_rollout(trial: RolloutResult, episode: Episode) -> dict[str, Any]:
 
 def table(rows: list[dict[str, Any]], config: EvaluateConfig, scenes: int) -> str:
     """Formats the figures. Errors sum over axes and average over particles, in frame units."""
+    from hgn.training.errors import format_ratio
+
     every = "every frame" if config.frame_stride == 1 else f"every {config.frame_stride}th frame"
     lines = [f"{config.split}, {scenes} scenes, {every}; sum over axes, mean over particles, frame units"]
     lines.append(f"{'predictor':<20} {'one-step MSE':>12}  by material")

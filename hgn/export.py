@@ -4,26 +4,23 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from hgn.command import run_command
 from hgn.config import StoredPrecision
-from hgn.network.base import ParticleNetwork
-from hgn.network.features import ParticleState
-from hgn.runtime.exported_step import initial_arrays, traced_step, write_onnx, write_package
-from hgn.runtime.simulator import Simulator
-from hgn.runtime.weights import WeightsInfo, find_weights, load_weights, save_weights
 from hgn.scene.barrier import barrier_pieces
 from hgn.scene.scene import all_corners
 from hgn.scene.scene_file import find_scene, load_scene
 from hgn.schema import FileName, NonNegative, Positive, from_mapping, require, require_bounds
 from hgn.step_config import StepConfig, WallClearance
-from hgn.system.device import choose_device
 from hgn.system.extras import require_installed
 from hgn.system.files import require_place
-from hgn.system.provenance import provenance
+
+if TYPE_CHECKING:
+    from hgn.network.base import ParticleNetwork
+    from hgn.network.features import ParticleState
 
 
 @dataclass(frozen=True)
@@ -67,6 +64,11 @@ class ExportConfig:
 
 def main(mapping: dict[str, Any]) -> int:
     """Writes the files that the settings name; returns the exit code."""
+    from hgn.runtime.exported_step import traced_step, write_onnx, write_package
+    from hgn.runtime.simulator import Simulator
+    from hgn.runtime.weights import find_weights, load_weights
+    from hgn.system.device import choose_device
+
     config = from_mapping(ExportConfig, mapping)
     if config.onnx is not None:
         require_installed("onnxscript")
@@ -109,6 +111,9 @@ def export(checkpoint_path: Path, out: Path, stored_precision: str = "fp32", **s
 
     Raises: ConfigError when the checkpoint is missing or not ours, or holds a network that does not take the changes.
     """
+    from hgn.runtime.weights import WeightsInfo, save_weights
+    from hgn.system.provenance import provenance
+
     # Lightning, which the other exports do without, is loaded here
     from hgn.training.checkpoint import (
         Progress,
@@ -138,6 +143,9 @@ def change(file: Path, out: Path, stored_precision: str = "fp32", **step_changes
 
     Raises: ConfigError when the file is missing or not ours, or holds a network that does not take the changes.
     """
+    from hgn.runtime.weights import load_weights, save_weights
+    from hgn.system.provenance import provenance
+
     network, info = load_weights(file)
     changed = {"file": file.name, "step": step_changes, "provenance": info.provenance}
     change_step(network, step_changes)
@@ -153,6 +161,8 @@ def change_step(network: ParticleNetwork, changes: dict[str, Any]) -> None:
 
 def write_arrays(folder: Path, state: ParticleState, corner_F33: np.ndarray) -> None:
     """Writes the first inputs of a step, an .npy file each; corners as in `initial_arrays`."""
+    from hgn.runtime.exported_step import initial_arrays
+
     folder.mkdir(parents=True, exist_ok=True)
     for name, array in initial_arrays(state, corner_F33).items():
         np.save(folder / f"{name}.npy", array)

@@ -5,7 +5,9 @@
 
 from __future__ import annotations
 
+import codecs
 import importlib
+import itertools
 import os
 import re
 import sys
@@ -14,14 +16,19 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import yaml
+
 from hgn.renamed import CHOICES, REMOVED_CHOICES
 from hgn.schema import ConfigError, default_mapping
+from hgn.system.yaml_files import read_yaml
 
 OPTIONS = (
     *("--help", "-h", "--hydra-help", "--version", "--cfg", "-c", "--resolve", "--package", "-p", "--run", "-r"),
     *("--multirun", "-m", "--shell-completion", "-sc", "--config-path", "-cp", "--config-name", "-cn", "--config-dir"),
     *("-cd", "--experimental-rerun", "--info", "-i"),
 )
+
+_FOLDERS = ("--config-dir", "-cd", "--config-path", "-cp")  # options with a folder of configs
 
 # Hydra creates no folder and no log file; commands choose where they write
 _QUIET = (
@@ -47,6 +54,7 @@ def compose(folder: Path, config_name: str, arguments: list[str], complete: bool
     from omegaconf import OmegaConf
     from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
+    _check_chosen_files(folder, arguments[1:])
     arguments = [arguments[0], *(_override(argument, folder) for argument in arguments[1:])]
     given, full_error = sys.argv, os.environ.get("HYDRA_FULL_ERROR")
     composed: list[Any] = []
@@ -62,7 +70,7 @@ def compose(folder: Path, config_name: str, arguments: list[str], complete: bool
         plain = [OmegaConf.to_container(config, resolve=True, throw_on_missing=complete) for config in composed]
     except MissingMandatoryValue as error:
         raise ConfigError(f"{error.full_key} is missing; it must be given, as in {error.full_key}=…") from error
-    except (HydraException, OmegaConfBaseException, ValueError) as error:  # Hydra raises plain ValueErrors too
+    except (HydraException, OmegaConfBaseException, ValueError, yaml.YAMLError) as error:  # Hydra raises ValueErrors
         raise ConfigError(" ".join(str(error).split("Config search path:")[0].split())) from error
     finally:
         sys.argv = given
@@ -70,6 +78,27 @@ def compose(folder: Path, config_name: str, arguments: list[str], complete: bool
         if full_error is not None:
             os.environ["HYDRA_FULL_ERROR"] = full_error
     return [{str(key): value for key, value in dict(mapping).items()} for mapping in plain]  # type: ignore[arg-type]
+
+
+def _check_chosen_files(folder: Path, arguments: list[str]) -> None:
+    """Reads the files that arguments as experiment=NAME choose, strictly: Hydra would print pages about bad YAML, or
+    ignore keys and take numbers for others.
+
+    Raises: ConfigError.
+    """
+    folders = [folder]
+    for option, (name, _, value) in itertools.pairwise([("", "", ""), *(a.partition("=") for a in arguments)]):
+        if name in _FOLDERS and value:
+            folders.append(Path(value))
+        elif option[0] in _FOLDERS and not option[2]:
+            folders.append(Path(name))
+    for argument in arguments:
+        group, _, choice = argument.lstrip("+").partition("=")
+        for file in (each / group / f"{choice}.yaml" for each in folders if re.fullmatch(r"\w+", group)):
+            if file.is_file():
+                if file.read_bytes().startswith(codecs.BOM_UTF8):
+                    raise ConfigError(f"{file} must be UTF-8 without a byte order mark; save it so")
+                read_yaml(file)
 
 
 def dataclass_of(file: Path) -> type | None:
@@ -121,7 +150,9 @@ def _override(argument: str, folder: Path) -> str:
         raise ConfigError(f"{argument} is called {new} now")
     if remedy := REMOVED_CHOICES.get(key.lstrip("+"), {}).get(value):
         raise ConfigError(f"{argument} was removed; {remedy}")
-    if value and not _understood(value):
+    if re.search(r"[\[{$]", value) and Path(value).is_file():  # Hydra would take its name for a list or a reference
+        value = "'" + value.replace("'", "\\'").replace("$", "\\$") + "'"
+    elif value and not _understood(value):
         value = _in_quotes(value)
     if re.fullmatch(r"[A-Za-z][\w.]*", key) and not key.startswith("hydra"):
         if key == "experiment":
@@ -155,7 +186,8 @@ def _understood(value: str) -> list[Any]:
 
 def _with_quiet(arguments: list[str]) -> list[str]:
     # just before the user's overrides: these win, and argparse accepts overrides only in one sequence
-    for place, argument in enumerate(arguments):
-        if place and "=" in argument and not argument.startswith("-") and not arguments[place - 1].startswith("--conf"):
+    for place, (before, argument) in enumerate(itertools.pairwise(arguments), 1):
+        override = argument.startswith("~") or ("=" in argument and not argument.startswith("-"))
+        if override and not before.startswith("--conf"):
             return [*arguments[:place], *_QUIET, *arguments[place:]]
     return [*arguments, *_QUIET]

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 from hgn.command import run_command
-from hgn.data.foreign.dataset import import_set
 from hgn.data.foreign.settings import ImportConfig
 from hgn.schema import from_mapping, require
 from hgn.system.progress import bar
@@ -19,6 +18,8 @@ from hgn.system.progress import bar
 
 def main(mapping: dict[str, Any]) -> int:
     """Imports a set, prints its content and how to train on it; returns the exit code."""
+    from hgn.data.foreign.dataset import import_set
+
     mapping = dict(mapping)
     source = mapping.pop("from", None)
     require(isinstance(source, str) and source != "", "from", "the folder with the trajectories", source)

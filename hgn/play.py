@@ -5,25 +5,22 @@ Prints the page's address, which has a token; Ctrl-C ends it.
 
 from __future__ import annotations
 
-import hgn.system.threads  # noqa: F401  # isort: skip  # before torch is loaded
-
 import contextlib
 import sys
 import webbrowser
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from hgn.command import run_command
 from hgn.config import DEFAULT_WEIGHTS, SimulatorConfig
-from hgn.runtime.simulator import Simulator
-from hgn.runtime.weights import shipped_weights
-from hgn.scene.rollout_file import read_rollout
-from hgn.scene.scene_file import find_scene, load_scene, notes_on_meshes
+from hgn.scene.scene_file import find_scene, load_scene, notes_on_files
 from hgn.schema import FileName, Port, Positive, from_mapping, require, require_bounds
-from hgn.system.device import choose_device
 from hgn.system.extras import require_installed
 from hgn.system.files import write_atomically
+
+if TYPE_CHECKING:
+    from hgn.runtime.simulator import Simulator
 
 CPU_WEIGHTS = "obstacles_small"  # M = 2: a viewer waits for each frame
 
@@ -68,6 +65,9 @@ def main(mapping: dict[str, Any]) -> int:
 
 def play_page(config: PlayConfig) -> Any:
     """A `hgn.viewer.page.PlayPage` of a scene. Raises: ConfigError, as loading and simulating the scene do."""
+    from hgn.runtime.simulator import Simulator
+    from hgn.runtime.weights import shipped_weights
+    from hgn.system.device import choose_device
     from hgn.viewer.page import PlayPage
     from hgn.viewer.session import PlaySession
 
@@ -80,7 +80,7 @@ def play_page(config: PlayConfig) -> Any:
     simulator, path = load(name), find_scene(config.scene)
     print(simulator.backend.note, file=sys.stderr)
     scene = load_scene(path)
-    for note in notes_on_meshes(scene):
+    for note in notes_on_files(scene):
         print(note, file=sys.stderr)
     session = PlaySession(simulator, scene, path.parent, config.particles, config.keep_mb << 20, name)
     names = [name, *(shipped for shipped in shipped_weights() if shipped != name)]
@@ -89,6 +89,7 @@ def play_page(config: PlayConfig) -> Any:
 
 def film_page(config: PlayConfig) -> Any:
     """A `hgn.viewer.film.FilmPage` of a rollout file. Raises: ConfigError for what is no such file."""
+    from hgn.scene.rollout_file import read_rollout
     from hgn.viewer.film import FilmPage
 
     assert config.rollout is not None
@@ -96,6 +97,7 @@ def film_page(config: PlayConfig) -> Any:
 
 
 def _write_page(config: PlayConfig) -> int:
+    from hgn.scene.rollout_file import read_rollout
     from hgn.viewer.film import film_html
 
     assert config.rollout is not None and config.html is not None

@@ -5,34 +5,32 @@ Writes a VTKHDF file, and pictures beside it.
 
 from __future__ import annotations
 
-import hgn.system.threads  # noqa: F401  # isort: skip  # before torch is loaded
-
 import hashlib
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from hgn.command import run_command
 from hgn.config import DEFAULT_WEIGHTS, SceneConfig, SimulatorConfig, require_rollout_name
 from hgn.data.reader import find_episode
-from hgn.render.exchange import PLY_ENDING, USD_ENDINGS, require_exchange, save_rollout
-from hgn.render.pictures import animate, compare_picture, spread, write_picture
-from hgn.runtime.divergence import DivergedError
-from hgn.runtime.simulator import InitialState, Simulator
-from hgn.runtime.weights import WeightsInfo, find_weights, require_frame_rate
+from hgn.render import PLY_ENDING, USD_ENDINGS
 from hgn.scene.emission import entry_frames
 from hgn.scene.material import MATERIALS
 from hgn.scene.random_scene import generate_scene
-from hgn.scene.rollout_file import Rollout, obstacles_of_episode
 from hgn.scene.scene import Scene
-from hgn.scene.scene_file import find_scene, load_scene, notes_on_meshes
+from hgn.scene.scene_file import find_scene, load_scene, notes_on_files
 from hgn.schema import ConfigError, FrameCount, NonNegative, from_mapping, require, require_bounds
 from hgn.system.files import require_place
 from hgn.system.progress import bar
+
+if TYPE_CHECKING:
+    from hgn.runtime.simulator import InitialState
+    from hgn.runtime.weights import WeightsInfo
+    from hgn.scene.rollout_file import Rollout
 
 PICTURES = 4  # in the PNG
 EVERY = 3  # frames of the rollout for one picture of the GIF
@@ -70,6 +68,8 @@ class RolloutConfig(SimulatorConfig):
 
 def main(mapping: dict[str, Any]) -> int:
     """Simulates, writes the rollout file and its pictures; returns the exit code."""
+    from hgn.render.pictures import animate, compare_picture, spread, write_picture
+
     config = from_mapping(RolloutConfig, mapping)
     path, result = rollout(config)
     print(path)
@@ -88,6 +88,12 @@ def rollout(config: RolloutConfig) -> tuple[Path, Rollout]:
 
     Raises: ConfigError for bad input or a simulation that diverges; nothing is written then.
     """
+    from hgn.render.exchange import require_exchange, save_rollout
+    from hgn.runtime.divergence import DivergedError
+    from hgn.runtime.simulator import InitialState, Simulator
+    from hgn.runtime.weights import find_weights, require_frame_rate
+    from hgn.scene.rollout_file import Rollout, obstacles_of_episode
+
     require_exchange(Path(config.out or "rollout.vtkhdf"), config.surface)
     require_place(Path(config.out or "rollout/rollout.vtkhdf"))
     simulator = Simulator.load(config.weights, config.device, config.backend, config.precision)
@@ -99,7 +105,7 @@ def rollout(config: RolloutConfig) -> tuple[Path, Rollout]:
         name, scene = _scene(config, simulator.info)
         initial = InitialState.of_scene(scene)
         obstacles = scene.obstacles
-        for note in (*notes_on_meshes(scene), *_not_used(scene, weights.stem)):
+        for note in (*notes_on_files(scene), *_not_used(scene, weights.stem)):
             print(note, file=sys.stderr)
         source["scene"] = config.scene or f"random, seed {config.seed}"
     else:

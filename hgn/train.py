@@ -10,7 +10,7 @@ import signal
 import sys
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from hgn.command import run_command
 from hgn.config import TrainConfig
@@ -18,30 +18,25 @@ from hgn.data.identity import dataset_identity, identity_hash, require_same_data
 from hgn.data.manifest import Manifest
 from hgn.data.reader import EpisodeStore
 from hgn.data.storage import is_remote
-from hgn.network.base import ParticleNetwork
 from hgn.schema import from_mapping
 from hgn.system.extras import require_installed
 from hgn.system.locks import locked
 from hgn.system.processes import die_with_parent
-from hgn.training.checkpoint import (
-    LAST_NAMES,
-    DamagedError,
-    Progress,
-    Resume,
-    check_checkpoint,
-    network_of_weights,
-    read_checkpoint,
-)
-from hgn.training.dataset import PublishedEpisodes, is_complete, more_data, wait_for_episodes
-from hgn.training.distributed import default_run, first_on_machine, first_rank, layout
-from hgn.training.generator import Generator
-from hgn.training.imported import require_network_fits, settings_of_imported
-from hgn.training.session import Start, precompile_kernels, train_network
 from hgn.training.stop import StopRequest
+
+if TYPE_CHECKING:
+    from hgn.network.base import ParticleNetwork
+    from hgn.training.checkpoint import DamagedError, Resume
 
 
 def main(mapping: dict[str, Any]) -> int:
     """Trains with the resolved configuration; returns the exit code."""
+    from hgn.training.dataset import PublishedEpisodes, is_complete, more_data, wait_for_episodes
+    from hgn.training.distributed import default_run, first_on_machine, first_rank, layout
+    from hgn.training.generator import Generator
+    from hgn.training.imported import require_network_fits, settings_of_imported
+    from hgn.training.session import Start, precompile_kernels, train_network
+
     require_installed("lightning")
     name = mapping.pop("name", "unnamed")
     if mapping.get("run") is None:
@@ -84,6 +79,8 @@ def _checkpoint_to_resume(config: TrainConfig, folder: Path) -> Resume | None:
 
     Raises: DamagedError when there are some and none is whole.
     """
+    from hgn.training.checkpoint import LAST_NAMES, DamagedError, Progress, Resume, check_checkpoint, read_checkpoint
+
     damaged: DamagedError | None = None
     for path in (folder / name for name in LAST_NAMES if (folder / name).exists()):
         try:
@@ -106,6 +103,9 @@ def _checkpoint_to_resume(config: TrainConfig, folder: Path) -> Resume | None:
 
 def _initial_network(config: TrainConfig, resume: Resume | None) -> ParticleNetwork | None:
     """Returns the network of training.init_weights for a new run; a run that resumes takes its checkpoint's."""
+    from hgn.training.checkpoint import network_of_weights
+    from hgn.training.distributed import first_rank
+
     weights = config.training.init_weights
     if weights is None:
         return None

@@ -13,6 +13,8 @@ from pathlib import Path
 
 import pytest
 
+import hgn  # noqa: F401 - before torch
+
 # the networks of the tests are tiny: threads would wait for one another for most of the time, above all on busy cores
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 

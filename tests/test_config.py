@@ -10,7 +10,7 @@ from tools.bench.config import BenchConfig
 from tools.curves import CurvesConfig
 from tools.error_vs_time.settings import ErrorVsTimeConfig
 from tools.render import RenderConfig
-from tools.scaling.measure import ScalingConfig
+from tools.scaling.config import ScalingConfig
 from tools.stability.network import StabilityNetworkConfig
 from tools.stability.solver import StabilitySolverConfig
 

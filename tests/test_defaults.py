@@ -83,8 +83,8 @@ def test_weights_of_play(monkeypatch, device, expected):
     def load(weights, *_):
         raise LookupError(weights)
 
-    monkeypatch.setattr(play, "choose_device", lambda _: SimpleNamespace(type=device))
-    monkeypatch.setattr(play, "Simulator", SimpleNamespace(load=load))
+    monkeypatch.setattr("hgn.system.device.choose_device", lambda _: SimpleNamespace(type=device))
+    monkeypatch.setattr("hgn.runtime.simulator.Simulator", SimpleNamespace(load=load))
     for given, taken in ((None, expected), ("obstacles", "obstacles")):
         with pytest.raises(LookupError, match=f"^{taken}$"):
             play.play_page(play.PlayConfig(weights=given))

@@ -22,8 +22,6 @@ from hgn.command import run_command
 from hgn.renamed import current_metrics
 from hgn.schema import ConfigError, from_mapping, require
 from hgn.system.files import write_atomically, write_json
-from hgn.system.provenance import provenance
-from tools.report import as_png, new_figure
 
 # prefixes of the figures in the JSON
 BEGINNINGS = (
@@ -61,6 +59,8 @@ class Run:
 
 def main(mapping: dict[str, Any]) -> int:
     """Writes <out>.png and <out>.json; returns the exit code."""
+    from hgn.system.provenance import provenance
+
     config = from_mapping(CurvesConfig, mapping)
     runs = [read_run(Path(folder)) for folder in config.runs]
     parts = []
@@ -122,6 +122,8 @@ def measurements(records: list[dict[str, float]]) -> list[dict[str, float]]:
 
 def draw(runs: Sequence[Run]) -> bytes:
     """Draws the curves of one run or of several; returns PNG bytes."""
+    from tools.report import as_png, new_figure
+
     figure, (panels,) = new_figure(1, 3, (15, 5 if len(runs) > 1 else 4.5))
     last = {name: value for record in runs[0].records for name, value in record.items()}
     title = "; ".join(sorted({_origin(run) for run in runs}))

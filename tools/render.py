@@ -21,9 +21,9 @@ import numpy as np
 from hgn.command import run_command
 from hgn.config import MpmConfig
 from hgn.data.reader import find_episode
-from hgn.render import pictures
+from hgn.render import PLY_ENDING, USD_ENDINGS, pictures
 from hgn.render.error_curve import error_curve, position_error
-from hgn.render.exchange import PLY_ENDING, USD_ENDINGS, save_rollout
+from hgn.render.exchange import save_rollout
 from hgn.scene.emission import entry_frames
 from hgn.scene.rollout_file import Rollout, read_rollout
 from hgn.scene.scene_file import load_scene, scene_files

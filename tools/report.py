@@ -8,13 +8,15 @@ import math
 import textwrap
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
 
 from hgn.schema import to_mapping
 from hgn.system.provenance import provenance, without_folders
+
+if TYPE_CHECKING:
+    import torch
 
 PASS = "pass"  # result of a check; otherwise a sentence with the error and its bound
 EXIT_RED = 1

@@ -1,7 +1,7 @@
 """Distributes blocks of work over the cores of a CPU; each thread computes whole blocks.
 
 PyTorch would split every operation among its threads. Many operations of a frame are shorter than the waking of a
-sleeping thread (hgn.system.threads).
+sleeping thread.
 """
 
 from __future__ import annotations

@@ -10,6 +10,7 @@ import contextlib
 import errno
 import functools
 import hashlib
+import ipaddress
 import os
 import threading
 import time
@@ -135,6 +136,14 @@ def _token_is_for(url: str) -> bool:
     return not named or named in (address.hostname, f"{address.hostname}:{address.port}")
 
 
+def _is_loopback(url: str) -> bool:
+    host = urlsplit(url).hostname or ""
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
+
+
 class _Folder(Storage):
     """A folder of this machine."""
 
@@ -193,6 +202,7 @@ class _Remote(Storage):
                 "timeout": timeout,
                 "auto_decompress": False,
                 "response_class": BoundedResponse,
+                "trust_env": not _is_loopback(address),  # http_proxy, https_proxy, no_proxy
             }
             options = {"client_kwargs": client, "use_listings_cache": False}
         try:

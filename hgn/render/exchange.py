@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import trimesh
 
+from hgn.render import PLY_ENDING, USD_ENDINGS
 from hgn.render.pictures import rollout_spacing
 from hgn.render.renderer import MATERIAL_COLORS, OBSTACLE_COLOR, PARTICLE_COLORS
 from hgn.scene.material import FLUIDS
@@ -25,8 +25,6 @@ from hgn.schema import ConfigError
 from hgn.system.extras import require_installed
 from hgn.system.files import sync_folder, sync_written
 
-USD_ENDINGS = (".usdc", ".usda", ".usd")
-PLY_ENDING = ".ply"
 # Of the surface, in particle radii (half the spacing): with these it encloses the volume of a block of 8 particles a
 # cell within 4 %, as a lattice and as a random filling.
 SMOOTHING_LENGTH, CUBE_SIZE, THRESHOLD = 3.0, 1.0, 0.6
@@ -228,4 +226,6 @@ def _write_ply(path: Path, rollout: Rollout, surface: bool, progress: Callable[[
 
 
 def _export(path: Path, vertex_V3: np.ndarray, triangle_F3: np.ndarray) -> None:
+    import trimesh
+
     path.write_bytes(trimesh.exchange.ply.export_ply(trimesh.Trimesh(vertex_V3, triangle_F3, process=False)))

@@ -16,7 +16,6 @@ from types import MappingProxyType
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont, PngImagePlugin
-from scipy.spatial import KDTree
 
 from hgn.render.flat import FlatStage
 from hgn.render.renderer import BACKGROUND_COLOR, MATERIAL_COLORS, OBSTACLE_COLOR, PARTICLE_COLORS, Stage, to_bytes
@@ -175,6 +174,8 @@ def particle_spacing(position_N3: np.ndarray) -> float:
     random points.
     """
     position_N3 = position_N3[np.isfinite(position_N3).all(axis=1)]
+    from scipy.spatial import KDTree
+
     if len(position_N3) < 4:
         return 1 / 128  # the usual eight particles in a cell of 1/64
     sample_N3 = position_N3[:: max(1, len(position_N3) // 2000)]
@@ -308,6 +309,8 @@ class _Palette:
         self.colors = np.concatenate((exact, np.reshape(chosen, (-1, 3))[:free_colors].astype(np.uint8)))
         # the nearest colour for the upper six bits of each channel; the search of Pillow is coarser
         center = np.stack(np.meshgrid(*[np.arange(64) * 4 + 1.5] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+        from scipy.spatial import KDTree
+
         self.nearest = KDTree(self.colors.astype(np.float64)).query(center)[1].astype(np.uint8)
         self.nearest[_upper_bits(exact)] = np.arange(len(exact))
 

@@ -15,7 +15,6 @@ from collections.abc import Sequence
 
 import numpy as np
 from PIL import Image, ImageDraw
-from scipy.ndimage import gaussian_filter
 
 from hgn.scene.scene import Obstacle, all_corners
 from hgn.scene.surface import area_vectors
@@ -190,7 +189,7 @@ class Stage:
         triangle_S, cell_S, weight_S3 = fragments(xy, columns, rows)
         height_S = np.einsum("sk,sk->s", weight_S3, corner_F33[triangle_S, :, 1])
         np.maximum.at(self.map_top, cell_S, height_S)
-        self.map_obstacle = gaussian_filter(np.isfinite(self.map_top).astype(np.float32).reshape(self.map_shape), 1.6)
+        self.map_obstacle = _blurred(np.isfinite(self.map_top).astype(np.float32).reshape(self.map_shape), 1.6)
 
     def _obstacle_shade(self, normal_S3: np.ndarray) -> np.ndarray:
         facing_S3 = normal_S3 / np.maximum(np.linalg.norm(normal_S3, axis=1, keepdims=True), 1e-12)
@@ -291,7 +290,7 @@ class Stage:
         count = np.bincount(cell_N[inside_N], minlength=len(self.map_top)).reshape(self.map_shape)
         area = (self.map_cell / (2 * self.radius)) ** 2  # particles that fill one map cell
         sigma = max(1.5, 1.5 * self.radius / self.map_cell)
-        cover = gaussian_filter(np.minimum(count / max(area, 1.0), 2.0).astype(np.float32), sigma)
+        cover = _blurred(np.minimum(count / max(area, 1.0), 2.0).astype(np.float32), sigma)
         if area < 1:
             cover /= area
         cover = 0.38 * (1 - np.exp(-1.6 * cover)).ravel()
@@ -303,7 +302,7 @@ class Stage:
         top = self.map_top.copy()
         np.maximum.at(top, cell_N[inside_N], position_N3[inside_N, 1])
         top = np.where(np.isfinite(top), top, 0.0).reshape(self.map_shape)
-        top = gaussian_filter(top, sigma).ravel()
+        top = _blurred(top, sigma).ravel()
         above_N = np.where(inside_N, top[cell_N] - position_N3[:, 1], 0.0)
         shadow_N = np.clip((above_N - self.radius) / (10 * self.radius), 0.0, 1.0)
         return 1 - 0.17 * shadow_N
@@ -443,3 +442,9 @@ def _edge(point: np.ndarray, start: np.ndarray, end: np.ndarray) -> np.ndarray:
     return (end[:, 0] - start[:, 0]) * (point[:, 1] - start[:, 1]) - (end[:, 1] - start[:, 1]) * (
         point[:, 0] - start[:, 0]
     )
+
+
+def _blurred(image: np.ndarray, sigma: float) -> np.ndarray:
+    from scipy.ndimage import gaussian_filter  # SciPy takes half a second to import
+
+    return np.asarray(gaussian_filter(image, sigma))

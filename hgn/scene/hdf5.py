@@ -6,11 +6,13 @@ import contextlib
 import math
 from collections.abc import Iterator
 from pathlib import Path
-
-import h5py
+from typing import TYPE_CHECKING
 
 from hgn.schema import ConfigError
 from hgn.system.claims import Claims
+
+if TYPE_CHECKING:
+    import h5py
 
 _DEPTH = 8  # of groups
 # exceptions of h5py for damage, and of NumPy for a size in a damaged file
@@ -36,6 +38,8 @@ def open_hdf5(path: Path, rule: str, remedy: str) -> h5py.File:
 
     Raises: ConfigError, as `damage_named` does.
     """
+    import h5py
+
     with damage_named(rule, remedy), contextlib.ExitStack() as stack:
         file = stack.enter_context(h5py.File(path, "r"))
         _require_own_data(file, path, Claims(path), {h5py.h5o.get_info(file.id).addr})
@@ -47,6 +51,8 @@ def _require_own_data(group: h5py.Group, path: Path, claims: Claims, visited: se
     """Raises ConfigError where a file refers to others, which HDF5 would read with this reader's rights, and where an
     object has two names or is larger than the file.
     """
+    import h5py
+
     for name in group:
         if not isinstance(group.get(name, getlink=True), h5py.HardLink) or depth > _DEPTH:
             raise ConfigError(f"{path}: {group.name} must contain its data itself, got a link in {name}")

@@ -1,14 +1,13 @@
-"""Mesh files as obstacles: STL, OBJ, PLY and GLB through trimesh.
+"""Mesh files as obstacles: STL, OBJ, PLY and GLB.
 
 Shape legend: V vertices, F triangles, E directed triangle edges (3 F).
 """
 
 from __future__ import annotations
 
-import json
-import struct
+import io
+import re
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import trimesh
@@ -16,24 +15,14 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from hgn.config import MESH_SUFFIXES, is_mesh_file
+from hgn.scene.glb import read_glb
+from hgn.scene.polygons import concave_cut, plain_obj, polygons_of_obj, polygons_of_ply
 from hgn.scene.rotation import euler_rotation, rotate, round_to_float32
 from hgn.scene.scene import Obstacle
 from hgn.scene.surface import area_vectors
 from hgn.schema import ConfigError, Vector, require
-from hgn.system.claims import Claims
 
-_COMPONENTS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}  # of a GLB's accessors
-_NODES = 10_000  # that a GLB may have, and primitives: trimesh takes 0.3 ms for each
-
-
-class _Beside(trimesh.resolvers.FilePathResolver):
-    """Resolves references of a mesh file, only to plain files in its own folder or below."""
-
-    def get(self, name: str) -> bytes:
-        path = (Path(self.parent) / name).resolve()
-        if not (path.is_file() and path.is_relative_to(Path(self.parent).resolve())):
-            raise FileNotFoundError(f"it names {name!r}, which is no file in its folder")
-        return path.read_bytes()
+_ASCII_STL = re.compile(rb"\s*solid.*\n\s*(facet|endsolid)", re.IGNORECASE)
 
 
 def load_mesh(
@@ -46,9 +35,32 @@ def load_mesh(
 ) -> Obstacle:
     """Reads a mesh file: scaled, then turned about the fixed x, y and z axes (degrees, in this order), then moved.
 
-    All parts of a file become one obstacle. Corners with equal float32 coordinates are merged, zero-area and repeated
-    triangles dropped. A watertight mesh (two triangles at every edge, orientable) becomes a solid with consistent
-    orientation; every other mesh is a sheet. It may reach outside the domain.
+    All parts of a file become one obstacle, a solid if all of them are watertight; see `load_bodies`.
+
+    Raises: ConfigError, as load_bodies does.
+    """
+    placing = {"scale": scale, "translation": translation, "rotation": rotation}
+    first, *others = load_bodies(path, field, **placing)  # type: ignore[arg-type]
+    for other in others:
+        vertex_V3 = np.concatenate([first.vertex_V3, other.vertex_V3])
+        triangle_F3 = np.concatenate([first.triangle_F3, other.triangle_F3 + np.int32(len(first.vertex_V3))])
+        first = Obstacle(first.name, vertex_V3, triangle_F3, closed=False)
+    return first
+
+
+def load_bodies(
+    path: str | Path,
+    field: str = "mesh",
+    *,
+    scale: float = 1.0,
+    translation: Vector = (0.0, 0.0, 0.0),
+    rotation: Vector = (0.0, 0.0, 0.0),
+) -> tuple[Obstacle, ...]:
+    """Reads a mesh file as a solid of its watertight bodies, a sheet of its other triangles, or both.
+
+    A body is watertight if two triangles meet at each of its edges, and orientable; it gets a consistent orientation.
+    Corners with equal float32 coordinates are merged, zero-area and repeated triangles dropped, both after that check.
+    A mesh may reach outside the domain.
 
     Raises: ConfigError naming `field` for a missing or unreadable file, an unknown suffix, no triangles,
     non-finite coordinates, only zero-area triangles, or a bad scale, translation or rotation.
@@ -68,16 +80,23 @@ def load_mesh(
     limit = float(np.finfo(np.float32).max)
     if not np.abs(placed).max() < limit:
         raise ConfigError(f"{field} must stay within {limit:.1e} after scaling, got more for {path}; lower scale")
-    vertex_V3, triangle_F3 = _weld(round_to_float32(placed), triangle_F3)
-    if len(triangle_F3) == 0:
+    closed_F, flip_F = _bodies(vertex_V3, triangle_F3)
+    rounded_V3 = round_to_float32(placed)
+    if not closed_F.all():  # corners that differ in their last digits, perhaps
+        also_F, other_F = _bodies(rounded_V3, triangle_F3)
+        closed_F, flip_F = closed_F | also_F, np.where(closed_F, flip_F, other_F)
+    triangle_F3[flip_F] = triangle_F3[flip_F][:, ::-1]
+    parts = []
+    for closed, name in ((True, path.stem), (False, f"{path.stem}_sheets" if closed_F.any() else path.stem)):
+        own_V3, own_F3 = _weld(rounded_V3, triangle_F3[closed_F == closed])
+        if len(own_F3):
+            parts.append(Obstacle(name, own_V3, own_F3, closed))
+    if not parts:
         raise ConfigError(
             f"{field} must have a triangle with an area, got only zero-area triangles in {path}; "
             "raise scale or mend the mesh"
         )
-    flip_F = _orientation(triangle_F3)
-    if flip_F is not None:
-        triangle_F3[flip_F] = triangle_F3[flip_F][:, ::-1]
-    return Obstacle(path.stem, vertex_V3, triangle_F3, closed=flip_F is not None)
+    return tuple(parts)
 
 
 def _read(path: Path, field: str) -> tuple[np.ndarray, np.ndarray]:
@@ -86,16 +105,10 @@ def _read(path: Path, field: str) -> tuple[np.ndarray, np.ndarray]:
     if not path.is_file():
         raise ConfigError(f"{field} must be an existing file, got {path}; in a scene file paths are relative to it")
     try:
-        # else trimesh would silently remove non-finite vertices
-        if path.suffix.lower() == ".glb":
-            _require_small_glb(path)
-        beside = _Beside(str(path))
-        mesh = trimesh.load_scene(path, process=False, skip_materials=True, resolver=beside).to_mesh()
-        vertex = np.array(mesh.vertices, np.float64).reshape(-1, 3)
-        triangle = np.array(mesh.faces, np.int64).reshape(-1, 3)
+        vertex, triangle = read_glb(path) if path.suffix.lower() == ".glb" else _read_polygons(path)
     except ConfigError:
         raise
-    except Exception as error:  # of any kind: trimesh reads damaged files too
+    except Exception as error:  # of any kind: damaged files are read too
         raise ConfigError(
             f"{field} must be a readable {path.suffix[1:].upper()} file, got {path} ({error}); export the mesh again"
         ) from error
@@ -109,37 +122,39 @@ def _read(path: Path, field: str) -> tuple[np.ndarray, np.ndarray]:
     return vertex, triangle
 
 
-def _require_small_glb(path: Path) -> None:
-    """Raises: ConfigError where the vertices and triangles that a GLB's nodes claim cannot be in the file; any other
-    exception for a file that is no GLB.
+def _read_polygons(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Reads STL, OBJ and PLY: STL and OBJ through trimesh, but concave polygons, which it would cut into fans."""
+    data, kind = path.read_bytes(), path.suffix[1:].lower()
+    if kind == "ply":
+        vertex_V3, faces = polygons_of_ply(data)
+        cut_F3 = concave_cut(vertex_V3, faces)
+        return vertex_V3, trimesh.geometry.triangulate_quads(faces).reshape(-1, 3) if cut_F3 is None else cut_F3
+    if kind == "stl" and not _ASCII_STL.match(data):
+        data = data[: 84 + 50 * int.from_bytes(data[80:84], "little")]  # some programs write more behind the triangles
+    if kind == "obj":
+        data = plain_obj(data)
+        vertex_V3, faces = polygons_of_obj(data)
+        if (cut_F3 := concave_cut(vertex_V3, faces)) is not None:
+            return vertex_V3, cut_F3
+    # processing would silently remove non-finite vertices
+    mesh = trimesh.load_scene(io.BytesIO(data), file_type=kind, process=False, skip_materials=True).to_mesh()
+    return np.array(mesh.vertices, np.float64).reshape(-1, 3), np.array(mesh.faces, np.int64).reshape(-1, 3)
+
+
+def _bodies(vertex_V3: np.ndarray, triangle_F3: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Returns whether each triangle belongs to a watertight body, and whether it is to be flipped, both bool [F].
+
+    Vertices at equal positions are one. Triangles without three vertices, and repeated ones, are not counted.
     """
-    with path.open("rb") as file:
-        length, kind = struct.unpack("<12xI4s", file.read(20))
-        if kind != b"JSON" or length > path.stat().st_size:
-            raise ValueError("no JSON at its beginning")
-        header: dict[str, Any] = json.loads(file.read(length))
-    parts = [primitive for mesh in header.get("meshes", ()) for primitive in mesh["primitives"]]
-    nodes = header.get("nodes", ())
-    children = [child for node in nodes for child in node.get("children", ())]
-    require(len(set(children)) == len(children), "mesh", "of nodes with one parent each", str(path))
-    require(max(len(nodes), len(parts)) <= _NODES, "mesh", f"of at most {_NODES} nodes and primitives", str(path))
-    claims, sizes = Claims(path), []
-    for number, accessor in enumerate(header.get("accessors", ())):
-        require(
-            type(accessor["count"]) is int, f"{path}: accessors[{number}].count", "a whole number", accessor["count"]
-        )
-        sizes.append(8 * _COMPONENTS[accessor["type"]] * accessor["count"])  # bytes in float64
-        claims.add(f"accessors[{number}]", sizes[-1])
-    of_meshes = [
-        sum(
-            sizes[place]
-            for part in mesh["primitives"]
-            for place in (*part["attributes"].values(), part.get("indices", 0))
-        )
-        for mesh in header.get("meshes", ())
-    ]
-    for number, node in enumerate(nodes):
-        claims.add(f"nodes[{number}]", of_meshes[node["mesh"]] if "mesh" in node else 0)
+    _, index = np.unique(vertex_V3 + 0.0, axis=0, return_inverse=True)
+    triangle = index.reshape(-1)[triangle_F3]
+    different_F = (triangle != np.roll(triangle, 1, axis=1)).all(axis=1)
+    _, first = np.unique(np.sort(triangle, axis=1), axis=0, return_index=True)
+    counted = np.sort(first[different_F[first]])
+    closed_F, flip_F = np.zeros((2, len(triangle)), bool)
+    if len(counted):
+        closed_F[counted], flip_F[counted] = _orientation(triangle[counted])
+    return closed_F, flip_F
 
 
 def _weld(vertex_V3: np.ndarray, triangle_F3: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -153,34 +168,40 @@ def _weld(vertex_V3: np.ndarray, triangle_F3: np.ndarray) -> tuple[np.ndarray, n
     return unique[used], compact.reshape(-1, 3).astype(np.int32)
 
 
-def _orientation(triangle_F3: np.ndarray) -> np.ndarray | None:
-    """Returns the triangles to flip, bool [F], so that neighbours agree; None for a mesh that is not watertight.
+def _orientation(triangle_F3: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Returns which triangles belong to watertight bodies, and which of these to flip so that all agree, bool [F].
 
-    Each part keeps the orientation of most of its triangles. Two copies of every triangle, one per orientation, are
-    connected to the copies of the neighbours that agree with them: an orientable part has two components, a one-sided
-    part has one.
+    A body keeps the orientation of most of its triangles. Two copies of every triangle, one per orientation, are
+    connected to the copies of the neighbours that agree with them: an orientable body has two components, a one-sided
+    body has one.
     """
     count = len(triangle_F3)
     start_E, end_E = triangle_F3.T.reshape(-1), np.roll(triangle_F3, -1, axis=1).T.reshape(-1)
     low_E, high_E = np.minimum(start_E, end_E).astype(np.int64), np.maximum(start_E, end_E)
-    order = np.argsort(low_E * (int(triangle_F3.max()) + 1) + high_E, kind="stable")
-    if len(order) % 2:
-        return None
-    one, two = order[0::2], order[1::2]
-    if ((low_E[one] != low_E[two]) | (high_E[one] != high_E[two])).any():
-        return None
-    if ((low_E[one[1:]] == low_E[one[:-1]]) & (high_E[one[1:]] == high_E[one[:-1]])).any():
-        return None  # four or more triangles at one edge
+    _, edge_E, uses = np.unique(low_E * (int(triangle_F3.max()) + 1) + high_E, return_inverse=True, return_counts=True)
+    order = np.argsort(edge_E, kind="stable")
+    first = (np.cumsum(uses) - uses)[uses == 2]
+    one, two = order[first], order[first + 1]
     disagree = start_E[one] == start_E[two]
     face_one, face_two = one % count, two % count
     row = np.concatenate([face_one, face_one + count])
     column = np.concatenate([face_two + np.where(disagree, count, 0), face_two + np.where(disagree, 0, count)])
-    graph = coo_matrix((np.ones(len(row), np.int8), (row, column)), shape=(2 * count, 2 * count))
-    parts, label = connected_components(graph, directed=False)
+    parts, label = _components(row, column, 2 * count)
     upright, flipped = label[:count], label[count:]
-    if (upright == flipped).any():
-        return None
+    # bodies are connected by all shared edges
+    same = edge_E[order[1:]] == edge_E[order[:-1]]
+    bodies, body_F = _components(order[1:][same] % count, order[:-1][same] % count, count)
+    open_B = np.zeros(bodies, bool)
+    open_B[body_F[upright == flipped]] = True
+    open_B[body_F[np.flatnonzero(uses[edge_E] != 2) % count]] = True
     # a component and its mirror image hold the same triangles; the one with more unflipped ones wins
     votes = np.bincount(upright, minlength=parts)
     kept_wins = (votes[upright] > votes[flipped]) | ((votes[upright] == votes[flipped]) & (upright < flipped))
-    return ~kept_wins
+    closed_F = ~open_B[body_F]
+    return closed_F, closed_F & ~kept_wins
+
+
+def _components(row: np.ndarray, column: np.ndarray, count: int) -> tuple[int, np.ndarray]:
+    graph = coo_matrix((np.ones(len(row), np.int8), (row, column)), shape=(count, count))
+    number, label = connected_components(graph, directed=False)
+    return int(number), label

@@ -79,8 +79,8 @@ def _scalar(kind: _Type, content: bytes) -> Any:
 
 
 def read_npz(path: Path | BinaryIO, objects: bool = False) -> Iterator[tuple[str, np.ndarray]]:
-    """Yields names and read-only arrays of an archive. With `objects` arrays may contain arrays, numbers, tuples and
-    lists.
+    """Yields names and read-only arrays of an archive, those of a folder in succession. With `objects` arrays may
+    contain arrays, numbers, tuples, lists and dicts.
 
     Raises: ConfigError naming the file and the array that is cut, altered, or contains other objects.
     """

@@ -19,9 +19,8 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
-import h5py
 import numpy as np
 
 from hgn.config import is_mesh_file
@@ -36,6 +35,9 @@ from hgn.scene.shapes import mesh_sha256, shape_obstacle
 from hgn.schema import Bound, BoxSize, ConfigError, Positive, Vector, require, require_bounds
 from hgn.system.claims import Claims
 from hgn.system.files import make_folder, sync_file, sync_folder, temporary_file
+
+if TYPE_CHECKING:
+    import h5py
 
 FORMAT_NAME = "hgn rollout"
 FORMAT_VERSION = 2  # 1 had no obstacles in /VTKHDF
@@ -195,6 +197,8 @@ def write_rollout(path: str | Path, rollout: Rollout) -> None:
 
     Folders are made as needed.
     """
+    import h5py
+
     path = Path(path)
     make_folder(path.parent)
     with temporary_file(path) as temporary:
@@ -321,6 +325,8 @@ def _write_own(group: h5py.Group, rollout: Rollout) -> None:
 
 
 def _check_format(file: h5py.File, path: Path) -> None:
+    import h5py
+
     own = file.get("hgn")
     attributes = own.attrs if isinstance(own, h5py.Group) else {}
     name, version = attributes.get("format"), attributes.get("format_version")

@@ -6,7 +6,6 @@ See conf/example/ for examples. Lengths are in domain units, angles in degrees, 
 from __future__ import annotations
 
 import dataclasses
-import itertools
 import math
 import re
 from collections.abc import Mapping, Sequence
@@ -15,9 +14,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
 from hgn.config import OBSTACLE_SHAPES, MpmConfig, config_directory
+from hgn.scene.barrier import barrier_pieces
 from hgn.scene.distance import contains
 from hgn.scene.emission import Face
 from hgn.scene.group import WALL_CELLS, Region, fill, particle_count, region_of
@@ -38,12 +37,13 @@ from hgn.schema import (
     require_bounds,
     to_mapping,
 )
-from hgn.system.claims import count_items
+from hgn.system.yaml_files import read_yaml
 
 GROUP_SHAPES, EMITTER_SHAPES = ("cube", "sphere", "box"), ("disc", "rectangle")
-MAXIMUM_BYTES, MAXIMUM_NODES = 250_000, 100_000  # of a scene file
+MAXIMUM_BYTES = 250_000  # of a scene file
 MAXIMUM_PARTICLES, MAXIMUM_ENTRIES = 50_000_000, 256  # entries: obstacles, or groups and emitters
 MEASURE = "measure"  # section of the files in conf/gallery that tools.stability reads
+MILLIMETRES = "a file in millimetres needs scale: 0.001"
 EMITTER_STREAM = 2**31  # of random numbers, separate from those of groups
 
 
@@ -214,30 +214,6 @@ class SceneFile:
         require(self.seed >= 0, "seed", "a whole number >= 0", self.seed)
 
 
-class _Loader(yaml.SafeLoader):
-    """Reads 1e5 as a number, as YAML 1.2 does; PyYAML requires 1.0e+5.
-
-    Raises: yaml.YAMLError, also where aliases expand to more than MAXIMUM_NODES values.
-    """
-
-    def get_single_node(self) -> yaml.Node | None:
-        node = super().get_single_node()
-        if count_items(node, _parts) > MAXIMUM_NODES:
-            raise yaml.YAMLError(f"its aliases expand to more than {MAXIMUM_NODES} values")
-        return node
-
-
-def _parts(node: Any) -> Any:
-    if isinstance(node, yaml.MappingNode):
-        return itertools.chain.from_iterable(node.value)
-    return node.value if isinstance(node, yaml.SequenceNode) else None
-
-
-_Loader.add_implicit_resolver(
-    "tag:yaml.org,2002:float", re.compile(r"[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+$"), list("-+.0123456789")
-)
-
-
 def find_scene(name: str) -> Path:
     """Returns the file of a path, or of a scene in conf/example or conf/gallery by its name, as in `funnel`.
 
@@ -273,10 +249,7 @@ def read_mapping(path: str | Path) -> dict[str, Any]:
         raise ConfigError(f"scene must be an existing YAML file, got {path}")
     rule, size = f"a file of at most {MAXIMUM_BYTES} bytes", path.stat().st_size
     require(size <= MAXIMUM_BYTES, f"scene {path}", rule, size, "store particles in .npz files")
-    try:
-        mapping = yaml.load(path.read_text(encoding="utf-8"), _Loader)
-    except (yaml.YAMLError, ValueError, RecursionError) as error:  # a number of thousands of digits, nesting
-        raise ConfigError(f"{path} must be a YAML file: {error}") from error
+    mapping = read_yaml(path)
     require(isinstance(mapping, dict), f"{path}: the file", "a mapping of keys to values, such as groups", mapping)
     return dict(mapping)
 
@@ -290,12 +263,23 @@ def scene_of(mapping: Mapping[str, Any], path: str | Path) -> Scene:
         raise ConfigError(f"{path}: {error}") from error
 
 
-def notes_on_meshes(scene: Scene) -> list[str]:
-    """Returns warnings about a scene's mesh files: sheets, and meshes (in another unit, perhaps) that lie outside the
-    domain or are smaller than a cell.
+def notes_on_files(scene: Scene) -> list[str]:
+    """Returns warnings about the files of a scene: meshes that are sheets, or (in another unit, perhaps) smaller than a
+    cell or without a surface in the domain; and stored particles inside obstacles.
     """
+    if scene.specification.get("kind") != "file":
+        return []
     notes = []
-    entries = scene.specification.get("obstacles", ())
+    entries = scene.specification["obstacles"]
+    for sheet in scene.obstacles[len(entries) :]:
+        notes.append(f"{len(sheet.triangle_F3)} triangles are a sheet, because they enclose nothing: {sheet.name}")
+    first = 0
+    for group, count in zip(scene.specification["groups"], scene.specification["particle_counts"], strict=False):
+        position_N3, first = scene.position_N3[first : first + count], first + count
+        if group.get("particles") is not None:
+            for obstacle in scene.obstacles:
+                if inside := int(contains(position_N3, obstacle).sum()):
+                    notes.append(f"{inside} of {count} particles of {group['particles']} lie inside {obstacle.name}")
     for entry, obstacle in zip(entries, scene.obstacles, strict=False):
         name = entry.get("mesh")
         if name is None:
@@ -307,14 +291,23 @@ def notes_on_meshes(scene: Scene) -> list[str]:
         place += f"z {low_3[2]:.3g} to {high_3[2]:.3g}"
         if obstacle.motion is None and ((low_3 > scene.domain_size) | (high_3 < 0)).any():
             notes.append(f"outside the domain, out of reach of particles: {name} ({place}); see scale and position")
+        elif obstacle.motion is None and not _reaches(obstacle, scene.domain_size, scene.cell_size):
+            notes.append(f"no surface in the domain: {name} ({place}); see scale and position ({MILLIMETRES})")
         elif (high_3 - low_3).max() < scene.cell_size:
             notes.append(f"smaller than a cell of {scene.cell_size:.3g}: {name} ({place}); see scale")
     return notes
 
 
+def _reaches(obstacle: Obstacle, domain_size: Vector, cell_size: float) -> bool:
+    """Returns whether a part of an obstacle's surface lies in the domain."""
+    return len(barrier_pieces(obstacle.corners, cell_size, domain_size)) > 0
+
+
 def _build(file: SceneFile, folder: Path) -> Scene:
     whole_cells(file.domain_size, file.cell_size)
-    obstacles = tuple(_obstacle(entry, index, folder) for index, entry in enumerate(file.obstacles))
+    bodies = [_obstacle(entry, index, folder) for index, entry in enumerate(file.obstacles)]
+    # the sheets of meshes that are partly watertight are last, so that obstacle i is that of entry i
+    obstacles = (*(first for first, *_ in bodies), *(sheet for _, *others in bodies for sheet in others))
     stored = {i: _read_particles(entry, i, folder, file) for i, entry in enumerate(file.groups) if entry.particles}
     filling = file.particles_per_cell, file.cell_size
     total: float
@@ -340,9 +333,10 @@ def _build(file: SceneFile, folder: Path) -> Scene:
         for obstacle in obstacles:
             inside = int(contains(position_N3, obstacle).sum())
             if inside:
+                unit = "" if _reaches(obstacle, file.domain_size, file.cell_size) else f", or its scale ({MILLIMETRES})"
                 raise ConfigError(
                     f"{name} must be clear of closed obstacles, got {inside} of {count} particles inside "
-                    f"{obstacle.name}; move or shrink the group or the obstacle"
+                    f"{obstacle.name}; move or shrink the group or the obstacle{unit}"
                 )
         positions.append(position_N3)
     for index, (emitter, count) in enumerate(zip(file.emitters, entering, strict=True)):
@@ -401,6 +395,7 @@ def _read_particles(entry: GroupEntry, index: int, folder: Path, file: SceneFile
         require(bool(np.isfinite(value).all()), f"{field}: {name}", "finite", float("nan"))
     position_N3 = arrays["position"]
     outside = int(((position_N3 < 0) | (position_N3 > np.array(file.domain_size))).any(axis=1).sum())
+    require(len(position_N3) > 0, f"{field}: position", "of one particle or more", "none")
     require(outside == 0, f"{field}: position", "inside the domain", f"{outside} outside")
     return position_N3, arrays.get("velocity", np.zeros_like(position_N3))
 
@@ -414,26 +409,27 @@ def _material_parameters(groups: Sequence[MaterialEntry], counts: list[int]) -> 
     }
 
 
-def _obstacle(entry: ObstacleEntry, index: int, folder: Path) -> Obstacle:
+def _obstacle(entry: ObstacleEntry, index: int, folder: Path) -> tuple[Obstacle, ...]:
     if entry.mesh is None:
         assert entry.shape is not None and entry.size is not None and entry.position is not None
         name = f"obstacle_{index}_{entry.shape}"
         with np.errstate(over="ignore"):
-            obstacle = shape_obstacle(entry.shape, entry.size, entry.position, euler_rotation(entry.rotation), name)
-        finite = bool(np.isfinite(obstacle.vertex_V3).all())
+            bodies = (shape_obstacle(entry.shape, entry.size, entry.position, euler_rotation(entry.rotation), name),)
+        finite = bool(np.isfinite(bodies[0].vertex_V3).all())
         require(finite, f"obstacles[{index}].size", "in the range of float32", entry.size)
     else:
         # trimesh takes a second to import
-        from hgn.scene.mesh import load_mesh
+        from hgn.scene.mesh import load_bodies
 
-        obstacle = load_mesh(
+        bodies = load_bodies(
             folder / entry.mesh,
             f"obstacles[{index}].mesh",
             scale=1.0 if entry.scale is None else entry.scale,
             translation=entry.position or (0.0, 0.0, 0.0),
             rotation=entry.rotation,
         )
-    return dataclasses.replace(obstacle, friction=entry.friction, motion=entry.motion())
+    motion = entry.motion()
+    return tuple(dataclasses.replace(body, friction=entry.friction, motion=motion) for body in bodies)
 
 
 def _require_inside_walls(

@@ -11,9 +11,10 @@ import shlex
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import torch
+if TYPE_CHECKING:
+    import torch
 
 PACKAGES = ("torch", "triton", "lightning", "taichi", "numpy")
 # matches /a/b/c, but not the path of a URL
@@ -41,6 +42,8 @@ def commit_of(folder: Path) -> str:
 
 def device_name(device: torch.device | str) -> str:
     """Returns the GPU's name, or the processor's type and the number of threads."""
+    import torch
+
     if torch.device(device).type == "cuda":
         return torch.cuda.get_device_name(device)
     return f"CPU {platform.machine()}, {torch.get_num_threads()} threads"

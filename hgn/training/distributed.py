@@ -63,6 +63,7 @@ def layout(training: TrainingConfig) -> tuple[int, int]:
     Raises: ConfigError when there are not as many GPUs, or the launcher started another number of processes.
     """
     _check_restarts()
+    _check_launcher()
     launched = _launched(training.devices)
     devices = _devices(training.device, training.devices or (launched and launched[0]))
     if launched is None:
@@ -140,7 +141,7 @@ def _launched(devices: int | None) -> tuple[int, int] | None:
     if "RANK" in os.environ and "WORLD_SIZE" in os.environ:
         processes = int(os.environ["WORLD_SIZE"])
         here = int(os.environ["LOCAL_WORLD_SIZE"]) if "LOCAL_WORLD_SIZE" in os.environ else devices
-    elif _inside_slurm_step():
+    elif started_by_srun():
         processes = int(os.environ["SLURM_NTASKS"])
         here = processes // int(os.environ["SLURM_NNODES"]) if "SLURM_NNODES" in os.environ else devices
     else:
@@ -148,6 +149,28 @@ def _launched(devices: int | None) -> tuple[int, int] | None:
     if here is None or processes % here:
         here = processes
     return here, processes // here
+
+
+def _check_launcher() -> None:
+    """Refuses variables of a launcher that did not start this process: it would wait for the others forever."""
+    if "RANK" in os.environ:
+        missing = [name for name in ("WORLD_SIZE", "LOCAL_RANK") if name not in os.environ]
+        if missing and os.environ.get("WORLD_SIZE") != "1":
+            raise ConfigError(
+                f"{' and '.join(missing)} must be set where RANK is, got RANK={os.environ['RANK']} without; "
+                "start with torchrun, or unset RANK for one process"
+            )
+    elif _inside_slurm_step() and not started_by_srun() and os.environ["SLURM_NTASKS"] != "1":
+        raise ConfigError(
+            f"training must be started with srun in a job of {os.environ['SLURM_NTASKS']} tasks, got one "
+            "process without; as in srun python -m hgn.train, or sbatch --ntasks=1"
+        )
+
+
+def started_by_srun() -> bool:
+    """Returns whether srun started this process, with SLURM_NTASKS in all: no batch script or shell of Slurm."""
+    own = os.environ.get("SLURM_STEP_NUM_TASKS", os.environ.get("SLURM_NTASKS"))
+    return _inside_slurm_step() and "SLURM_STEP_ID" in os.environ and own == os.environ["SLURM_NTASKS"]
 
 
 def _inside_slurm_step() -> bool:

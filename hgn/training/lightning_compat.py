@@ -6,14 +6,16 @@
 from __future__ import annotations
 
 import logging
+import os
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 
 from lightning.pytorch import Trainer
+from lightning.pytorch.plugins.environments import LightningEnvironment
 from lightning.pytorch.strategies import DDPStrategy
 
-from hgn.training.distributed import averaging_options
+from hgn.training.distributed import averaging_options, started_by_srun
 
 
 def quieten() -> None:
@@ -22,6 +24,12 @@ def quieten() -> None:
     warnings.filterwarnings("ignore", ".*does not have many workers.*")
     warnings.filterwarnings("ignore", ".*LeafSpec.*")
     warnings.filterwarnings("ignore", ".*GPU available but not used.*")  # training.device=cpu says so
+
+
+def own_launcher() -> list[LightningEnvironment]:
+    """Returns the environment of processes without a launcher, where Slurm's variables would mislead Lightning."""
+    mislead = "SLURM_NTASKS" in os.environ and "RANK" not in os.environ and not started_by_srun()
+    return [LightningEnvironment()] if mislead else []
 
 
 def gradient_averaging(backend: str) -> DDPStrategy:

@@ -97,7 +97,7 @@ def train_network(config: TrainConfig, start: Start, stop: StopRequest, publishe
         strategy=lightning_compat.gradient_averaging(backend) if devices * nodes > 1 else "auto",
         max_epochs=-1,  # the feed ends after the last update
         callbacks=[RankWatch(run), SameWeights(feed), lines, monitor, checkpoints, Stopper(stop, checkpoints), final],
-        plugins=[writer],
+        plugins=[writer, *lightning_compat.own_launcher()],
         logger=TensorBoardLogger(run, name="", version="tensorboard"),
         default_root_dir=run,
         enable_checkpointing=False,
@@ -107,6 +107,10 @@ def train_network(config: TrainConfig, start: Start, stop: StopRequest, publishe
     )
     if start.precompilation is not None:
         print(start.precompilation.wait(lambda: stop.requested), file=sys.stderr)
+    if devices * nodes > 1:
+        if stop.requested:
+            return stop.exit_code
+        stop.end_at_once()
     with lightning_compat.interrupts_passed_on(), faults_outlived():
         trainer.fit(module, feed, ckpt_path=resume.path if resume else None, weights_only=True)
     if trainer.is_global_zero:

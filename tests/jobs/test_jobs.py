@@ -31,7 +31,7 @@ while [[ $1 == --* ]]; do shift; done
 [[ $SRUN_CPUS_PER_TASK == "$SLURM_CPUS_PER_TASK" ]] || exit 99 # srun does not take it from sbatch
 pids=()
 for ((task = 0; task < SLURM_NTASKS; task++)); do
-    SLURM_PROCID=$task SLURM_LOCALID=$task SLURM_NODEID=0 "$@" &
+    SLURM_STEP_ID=0 SLURM_PROCID=$task SLURM_LOCALID=$task SLURM_NODEID=0 "$@" &
     pids+=($!)
     echo $! >> "$SLURM_FAKE/pids"
 done

@@ -7,7 +7,7 @@ from functools import partial
 import torch.multiprocessing
 
 from tools import timing
-from tools.scaling.__main__ import main
+from tools.scaling.command import main
 
 timing.MINIMUM_ROUNDS = 1
 torch.multiprocessing.spawn = partial(torch.multiprocessing.start_processes, start_method="fork")

@@ -19,7 +19,7 @@ from hgn.runtime.simulator import Simulator
 from hgn.schema import ConfigError
 from tools import timing
 from tools.bench import contenders, triton_contenders
-from tools.bench.__main__ import main, workloads
+from tools.bench.command import main, workloads
 from tools.bench.config import BenchConfig
 from tools.bench.states import TILE_PARTICLES, Workload, positions, scene_of
 from tools.bench.triton_contenders import TritonFrame, TritonTrain

@@ -19,7 +19,7 @@ from hgn.runtime.weights import WeightsInfo, save_weights
 from hgn.schema import ConfigError
 from tools import timing
 from tools.error_vs_time import plot, run, score
-from tools.error_vs_time.__main__ import fitting_weights, main, network_contenders
+from tools.error_vs_time.command import fitting_weights, main, network_contenders
 from tools.error_vs_time.contenders import FallingContender
 from tools.error_vs_time.settings import ErrorVsTimeConfig
 from tools.timing import Stopwatch
@@ -167,7 +167,7 @@ def test_when_time_is_over(compare, monkeypatch):
         return fake_simulate(scenes, config, frames, *more, stability_fractions=stability_fractions, **others)
 
     monkeypatch.setattr(datagen.mpm.solver, "simulate", counted)
-    monkeypatch.setattr("tools.error_vs_time.__main__.shipped_weights", dict)
+    monkeypatch.setattr("tools.error_vs_time.command.shipped_weights", dict)
     options = {"weights": None, "resimulate": False, "mpm_grids": [64], "mpm_frames": 3}
     report = compare(**options)
     assert [call for call in calls if call[2] == 3] == [(1 / 64, [0.5, 1.0], 3)]  # of one grid side by side
@@ -192,7 +192,7 @@ def test_a_reference_of_a_finer_grid(make_config, make_dataset, compare, monkeyp
         return fake_simulate(scenes, *more, **others)
 
     monkeypatch.setattr(datagen.mpm.solver, "simulate", counted)
-    monkeypatch.setattr("tools.error_vs_time.__main__.STEPS", (0.5,))
+    monkeypatch.setattr("tools.error_vs_time.command.STEPS", (0.5,))
     report = compare(data=str(folder), weights=[], mpm_grids=[48, 96], perturbation=1e-6)
     assert report["meta"]["reference"] == "the data: 128 cells a unit, 8 particles for each visible one"
     visible = [len(episode.material_N) for episode in EpisodeStore(folder, "validation")]
@@ -220,7 +220,7 @@ def test_order_of_measurements(compare, both, monkeypatch, on_score, capsys):
     precisions; the report keeps its own order. A contender that fails is named with the cause, and the others go on;
     an unexpected error is printed, and the exit code is 1."""
     monkeypatch.setattr(datagen.mpm.solver, "simulate", fake_simulate)
-    monkeypatch.setattr("tools.error_vs_time.__main__.STEPS", (0.5,))
+    monkeypatch.setattr("tools.error_vs_time.command.STEPS", (0.5,))
     monkeypatch.setattr(score, "SINKHORN_SCENES", 0)
     order: list[str] = []
 
@@ -289,7 +289,7 @@ def test_shipped_weights_that_fit(data, tmp_path, monkeypatch, capsys):
     for name, network in networks.items():
         cell_size = 1 / 32 if name == "coarse" else grid.cell_size
         save_weights(paths[name], network, WeightsInfo(network.config, 30.0 if name == "slow" else 60.0, cell_size))
-    monkeypatch.setattr("tools.error_vs_time.__main__.shipped_weights", lambda: paths)
+    monkeypatch.setattr("tools.error_vs_time.command.shipped_weights", lambda: paths)
     water = replace(episode, material_N=np.zeros_like(episode.material_N), obstacle_grid=grid)
     assert [file.stem for file in fitting_weights([water])] == ["a", "b"]
     printed = capsys.readouterr().err
@@ -311,8 +311,8 @@ def test_an_interrupted_report_continues(compare, data, tmp_path, monkeypatch, o
 
     monkeypatch.setattr(datagen.mpm.solver, "simulate", noted)
     drawn: list[str] = []
-    monkeypatch.setattr("tools.error_vs_time.__main__.draw", lambda out, *_: drawn.append(out) or [])
-    monkeypatch.setattr("tools.error_vs_time.__main__.STEPS", (0.5,))
+    monkeypatch.setattr("tools.error_vs_time.command.draw", lambda out, *_: drawn.append(out) or [])
+    monkeypatch.setattr("tools.error_vs_time.command.STEPS", (0.5,))
     report = compare("first", mpm_grids=[64])
     rows = {row["system"]: row for row in report["rows"]}
     rows["gns"]["ms"], rows["mpm"]["ms"] = None, 9.0  # frames of fake_simulate end together

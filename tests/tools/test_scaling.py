@@ -13,8 +13,8 @@ import torch.distributed as dist
 
 from hgn.schema import ConfigError, from_mapping
 from tools.scaling import measure
-from tools.scaling.__main__ import main
-from tools.scaling.measure import ScalingConfig
+from tools.scaling.command import main
+from tools.scaling.config import ScalingConfig
 
 ENVIRONMENT = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])}
 SMALL: dict[str, Any] = {

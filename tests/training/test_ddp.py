@@ -31,6 +31,7 @@ LAUNCHER_VARIABLES = (
     *("HGN_RUN", "RANK", "WORLD_SIZE", "LOCAL_RANK", "LOCAL_WORLD_SIZE", "NODE_RANK", "TORCHELASTIC_RUN_ID"),
     *("TORCHELASTIC_USE_AGENT_STORE", "TORCHELASTIC_MAX_RESTARTS", "TORCH_DISABLE_SHARE_RDZV_TCP_STORE"),
     *("SLURM_PROCID", "SLURM_NTASKS", "SLURM_NNODES", "SLURM_JOB_NAME", "SLURM_JOB_ID"),
+    *("SLURM_STEP_ID", "SLURM_STEP_NUM_TASKS"),
 )
 
 
@@ -213,9 +214,9 @@ def no_launcher(monkeypatch):
     return monkeypatch
 
 
-SLURM = {"SLURM_PROCID": "0", "SLURM_NTASKS": "8", "SLURM_NNODES": "2"}
+SLURM = {"SLURM_STEP_ID": "0", "SLURM_PROCID": "0", "SLURM_NTASKS": "8", "SLURM_NNODES": "2"}
 JOB = {"SLURM_JOB_ID": "4711"}
-BOTH = {"SLURM_PROCID": "1", "SLURM_NTASKS": "2", "RANK": "3", "WORLD_SIZE": "4"}
+BOTH = {"SLURM_PROCID": "1", "SLURM_NTASKS": "2", "RANK": "3", "LOCAL_RANK": "1", "WORLD_SIZE": "4"}
 RANDOM_ID = "5bd6a8f0-93a5-4c5b-9b8c-0a52b6cf3d11"
 
 
@@ -224,10 +225,10 @@ RANDOM_ID = "5bd6a8f0-93a5-4c5b-9b8c-0a52b6cf3d11"
     [  # whether it leads, devices and nodes that the launcher started, the folder's name
         ({}, True, (1, 1), "runs/small"),
         ({"RANK": "0", "LOCAL_RANK": "0", "WORLD_SIZE": "4"}, True, (4, 1), "runs/small"),
-        ({"RANK": "0", "WORLD_SIZE": "3"}, True, (3, 1), "runs/small"),
+        ({"RANK": "0", "LOCAL_RANK": "0", "WORLD_SIZE": "3"}, True, (3, 1), "runs/small"),
         ({"RANK": "5", "LOCAL_RANK": "0", "WORLD_SIZE": "6", "LOCAL_WORLD_SIZE": "2"}, False, (2, 3), "runs/small"),
-        ({"RANK": "0", "WORLD_SIZE": "4", "LOCAL_WORLD_SIZE": "4"}, True, (4, 1), "runs/small"),
-        ({"SLURM_PROCID": "0", "SLURM_NTASKS": "4"}, True, (4, 1), "runs/small"),
+        ({"RANK": "0", "LOCAL_RANK": "0", "WORLD_SIZE": "4", "LOCAL_WORLD_SIZE": "4"}, True, (4, 1), "runs/small"),
+        ({"SLURM_STEP_ID": "0", "SLURM_PROCID": "0", "SLURM_NTASKS": "4"}, True, (4, 1), "runs/small"),
         (SLURM | JOB, True, (4, 2), "runs/small-4711"),
         (SLURM | JOB | {"SLURM_PROCID": "7"}, False, (4, 2), "runs/small-4711"),
         (SLURM | {"SLURM_JOB_NAME": "bash"}, True, (1, 1), "runs/small"),
@@ -237,7 +238,12 @@ RANDOM_ID = "5bd6a8f0-93a5-4c5b-9b8c-0a52b6cf3d11"
         (BOTH | {"RANK": "0", "TORCHELASTIC_RUN_ID": "a", "SLURM_JOB_ID": "1"}, True, (4, 1), "runs/a"),
         ({"LOCAL_RANK": "1"}, False, (1, 1), "runs/small"),
         ({"LOCAL_RANK": "0", "NODE_RANK": "1"}, False, (1, 1), "runs/small"),
-        ({"TORCHELASTIC_RUN_ID": "none", "RANK": "1", "WORLD_SIZE": "2"}, False, (2, 1), "runs/small"),
+        (
+            {"TORCHELASTIC_RUN_ID": "none", "RANK": "1", "LOCAL_RANK": "1", "WORLD_SIZE": "2"},
+            False,
+            (2, 1),
+            "runs/small",
+        ),
         ({"TORCHELASTIC_RUN_ID": "night/one two"}, True, (1, 1), "runs/night-one-two"),
         ({"TORCHELASTIC_RUN_ID": RANDOM_ID}, True, (1, 1), "runs/small"),
         (SLURM | JOB | {"HGN_RUN": "mine", "TORCHELASTIC_RUN_ID": "a"}, True, (4, 2), "runs/mine"),
@@ -258,10 +264,10 @@ def test_what_a_launcher_says(no_launcher, variables, first, started, folder):
     ("variables", "started"),
     [
         ({}, (2, 1)),
-        ({"RANK": "0", "WORLD_SIZE": "4"}, (2, 2)),
-        ({"RANK": "0", "WORLD_SIZE": "3"}, (3, 1)),
-        ({"RANK": "0", "WORLD_SIZE": "4", "LOCAL_WORLD_SIZE": "4"}, (4, 1)),
-        ({"SLURM_PROCID": "0", "SLURM_NTASKS": "4"}, (2, 2)),
+        ({"RANK": "0", "LOCAL_RANK": "0", "WORLD_SIZE": "4"}, (2, 2)),
+        ({"RANK": "0", "LOCAL_RANK": "0", "WORLD_SIZE": "3"}, (3, 1)),
+        ({"RANK": "0", "LOCAL_RANK": "0", "WORLD_SIZE": "4", "LOCAL_WORLD_SIZE": "4"}, (4, 1)),
+        ({"SLURM_STEP_ID": "0", "SLURM_PROCID": "0", "SLURM_NTASKS": "4"}, (2, 2)),
         (SLURM, (4, 2)),
         (SLURM | {"SLURM_JOB_NAME": "bash"}, (2, 1)),
         (BOTH, (2, 2)),
@@ -278,6 +284,36 @@ def test_launcher_and_configuration_agree(no_launcher, variables, started):
     message = rf"devices must be the {started[0]} processes that the launcher started on each of {started[1]} machines"
     with pytest.raises(ConfigError, match=message):
         layout(training)
+
+
+@pytest.mark.parametrize(
+    ("variables", "message"),
+    [
+        ({"RANK": "0", "WORLD_SIZE": "2"}, "LOCAL_RANK must be set where RANK is, got RANK=0 without"),
+        ({"RANK": "3", "WORLD_SIZE": "4", "LOCAL_WORLD_SIZE": "2"}, "LOCAL_RANK must be set where RANK is"),
+        ({"RANK": "1"}, "WORLD_SIZE and LOCAL_RANK must be set where RANK is"),
+        ({"RANK": "1", "LOCAL_RANK": "1"}, "WORLD_SIZE must be set where RANK is"),
+        ({"SLURM_PROCID": "0", "SLURM_NTASKS": "4"}, "must be started with srun in a job of 4 tasks"),
+        ({**SLURM, "SLURM_STEP_NUM_TASKS": "1"}, "must be started with srun in a job of 8 tasks"),
+    ],
+)
+def test_variables_without_their_launcher(no_launcher, variables, message):
+    """A process that would wait for others, which nothing has started, is refused with the launcher's name."""
+    for name, value in variables.items():
+        no_launcher.setenv(name, value)
+    with pytest.raises(ConfigError, match=message):
+        layout(TrainingConfig(device="cpu"))
+
+
+@pytest.mark.parametrize(
+    "variables",
+    [{"SLURM_NTASKS": "4"}, {"SLURM_PROCID": "0", "SLURM_NTASKS": "1"}, {"RANK": "0", "WORLD_SIZE": "1"}],
+)
+def test_one_process_among_variables(no_launcher, variables):
+    """A shell of Slurm, a batch job of one task and a container's RANK of one process train with one."""
+    for name, value in variables.items():
+        no_launcher.setenv(name, value)
+    assert layout(TrainingConfig(device="cpu")) == (1, 1)
 
 
 def test_restarts_that_would_hang_are_refused(no_launcher):
@@ -363,7 +399,7 @@ def test_ranks_end_with_the_one_that_started_them(no_launcher, make_config, tmp_
     def far_enough(training):
         raise ConfigError("far enough")
 
-    no_launcher.setattr(train, "layout", far_enough)
+    no_launcher.setattr("hgn.training.distributed.layout", far_enough)
     with pytest.raises(ConfigError, match="far enough"):
         train.main(train_mapping(make_config(), tmp_path / "run"))
     assert asked == expected

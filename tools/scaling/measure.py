@@ -23,13 +23,12 @@ from torch import nn
 from torch.distributed.algorithms.ddp_comm_hooks.default_hooks import allreduce_hook
 from torch.nn.parallel import DistributedDataParallel
 
-from hgn.config import NetworkConfig, Precision, TrainingConfig
+from hgn.config import TrainingConfig
 from hgn.data.batch import Batch
 from hgn.data.sampler import balanced_parts
 from hgn.network.base import ParticleNetwork
 from hgn.runtime.backend import set_matmul_precision, triton_unsupported_reason
 from hgn.runtime.parity import relative_error
-from hgn.schema import OneOrMore, Positive, require, require_bounds
 from hgn.system.machine import available_cpus
 from hgn.training.distributed import averaging_options
 from hgn.training.gradients import GradientGuard
@@ -38,7 +37,8 @@ from hgn.training.updates import build_optimizer
 from tools.bench.contenders import bench_network
 from tools.bench.states import Workload, batch_of_scenes
 from tools.bench.triton_contenders import device_samples, triton_updates
-from tools.report import PASS, ReportConfig
+from tools.report import PASS
+from tools.scaling.config import ScalingConfig
 from tools.timing import Timed, alternate, statistics
 
 # Relative error of the averaged gradients. Larger than rounding: the order of sums on a GPU varies, which flips
@@ -48,28 +48,6 @@ WARM_UPDATES = 3
 ROUNDS = 20  # samples of a contender
 SPREAD = 0.17  # standard deviation of a scene's particles, as a fraction of the mean, in the paper's random scenes
 PATIENCE = datetime.timedelta(minutes=2)
-
-
-@dataclass(frozen=True)
-class ScalingConfig(ReportConfig):
-    """The options of `python -m tools.scaling`."""
-
-    devices: OneOrMore | None = None  # largest number; null: all GPUs, or two processes on a CPU
-    scenes: OneOrMore = 8  # on each device
-    particles: OneOrMore = 4_296  # of a scene, on average
-    batches: OneOrMore = 8  # of each device; a sample is one update on each batch
-    backends: tuple[str, ...] = ("torch", "triton")  # of training; triton is skipped without GPUs
-    precision: Precision = "tf32"  # or fp32, fp16 (backend triton; backend torch then takes tf32)
-    network: NetworkConfig = field(default_factory=NetworkConfig)  # that is trained
-    # after which contenders are sampled no more, but five times at least and 20 times at most
-    seconds: Positive[float] = 30.0
-
-    def __post_init__(self) -> None:
-        require_bounds(self)
-        for i, backend in enumerate(self.backends):
-            require(backend in ("torch", "triton"), f"backends[{i}]", "torch or triton", backend)
-        require(self.device in ("auto", "cpu", "cuda"), "device", "auto, cpu or cuda", self.device)
-        require(self.network.kind == "hgn", "network.kind", "hgn", self.network.kind)
 
 
 @dataclass

@@ -14,7 +14,7 @@ import numpy as np
 
 from hgn.config import NetworkConfig
 from hgn.data.foreign.boundary import boundary_grid, spacing
-from hgn.data.foreign.trajectory import SetInfo, Trajectory
+from hgn.data.foreign.trajectory import SetInfo, Trajectory, require_fine
 from hgn.scene.episode import Episode
 from hgn.scene.material import MATERIALS
 from hgn.scene.obstacle_grid import ObstacleGrid
@@ -75,6 +75,7 @@ class Converter:
         require(
             not fixed_N.all(), f"{name}: position", "of particles that are no obstacles, too", "none", "leave it out"
         )
+        require_fine(name, trajectory.position_TND, info.radius)
         position_TN3 = self._placed(trajectory.position_TND)
         still_TP3, free_TN3 = position_TN3[:, fixed_N], position_TN3[:, ~fixed_N]
         moved = float(np.abs(still_TP3 - still_TP3[:1]).max(initial=0))

@@ -11,7 +11,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
@@ -27,6 +26,7 @@ from hgn.scene.hdf5 import damage_named, open_hdf5
 from hgn.scene.material import MATERIAL_NAME
 from hgn.scene.npz import read_npz
 from hgn.schema import ConfigError, require
+from hgn.system.yaml_files import read_json
 
 SPLIT_NAMES = {"train": ("train",), "validation": ("valid", "validation"), "test": ("test",)}
 # particle types of DeepMind's sets, which geoelements and NeuralMPM share, and of LagrangeBench's
@@ -175,10 +175,11 @@ def _joined(name: str, parts: list[bytes] | None, dtype: str) -> np.ndarray:
 def _read_geoelements(folder: Path, split: str, info: SetInfo) -> Iterator[Trajectory]:
     path = _file(folder, split, ".npz")
     for member, array in read_npz(path, objects=True) if path else ():
-        several = member == "gns_data"
-        for number, entry in enumerate(array if several else [array]):
-            name = f"{path}: {member}" + (f"[{number}]" if several else "")
-            parts = list(entry) if isinstance(entry, (tuple, list, np.ndarray)) else []
+        for key, entry in _entries(member, array):
+            name, parts = f"{path}: {key}", entry
+            if isinstance(entry, Mapping):
+                parts = [entry[field] for field in ("position", "particle_type", "material_property") if field in entry]
+            parts = list(parts) if isinstance(parts, (tuple, list, np.ndarray)) else []
             if len(parts) not in (2, 3):
                 raise ConfigError(
                     f"{name} must be (position, particle_type) or these and material_property, got {entry!r:.60}"
@@ -186,6 +187,17 @@ def _read_geoelements(folder: Path, split: str, info: SetInfo) -> Iterator[Traje
             position_TND, type_N = checked(name, parts[0], parts[1], info.dimensions)
             own = parts[2] if len(parts) == 3 else None
             yield Trajectory(name, position_TND, type_N, property_NK=_properties(name, own, len(type_N)))
+
+
+def _entries(member: str, array: np.ndarray) -> Iterator[tuple[str, Any]]:
+    """Yields names and contents of the trajectories in an array of an archive: one, a dict or a list of them."""
+    content = array.item() if array.shape == () else array
+    if isinstance(content, Mapping) and "position" not in content:
+        yield from ((f"{member}[{key!r}]", entry) for key, entry in content.items())
+    elif array.ndim == 1 and (member == "gns_data" or all(isinstance(entry, (Mapping, tuple)) for entry in content)):
+        yield from ((f"{member}[{number}]", entry) for number, entry in enumerate(content))
+    else:
+        yield member, content
 
 
 def _read_hdf5(folder: Path, split: str, info: SetInfo) -> Iterator[Trajectory]:
@@ -334,8 +346,8 @@ def _metadata(folder: Path) -> dict[str, Any]:
     if not path.is_file():
         return {}
     try:
-        metadata = json.loads(path.read_text("utf-8"))
-    except (ValueError, RecursionError) as error:
+        metadata = read_json(path)
+    except ValueError as error:
         raise ConfigError(f"{path} must be JSON, got {error}") from None
     require(isinstance(metadata, dict), str(path), "a JSON object", type(metadata).__name__)
     return dict(metadata)

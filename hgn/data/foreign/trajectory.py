@@ -14,6 +14,7 @@ import numpy as np
 from hgn.schema import ConfigError, require
 from hgn.system.claims import require_few_items
 
+COARSEST = 1e-3  # spacing of stored numbers, in radii: gravity moves a particle by a few of these in a frame
 MOST_RADII = 1 << 14  # across the box, because cells are indexed by integers
 FLUID = 1  # the type of particles in files without types
 
@@ -118,3 +119,16 @@ def floats(name: str, array: Any, shape: tuple[int | None, ...]) -> np.ndarray:
     if len(bad):
         raise ConfigError(f"{name} must be finite, got {array[tuple(bad[0])]} at {bad[0].tolist()}")
     return array.astype(array.dtype.newbyteorder("="), copy=False)
+
+
+def require_fine(name: str, position_TND: np.ndarray, radius: float) -> None:
+    """Refuses positions that their type stores too coarsely, perhaps before they were stored as float64."""
+    single = position_TND.astype(np.float32)
+    stored = single if np.array_equal(single, position_TND) else position_TND
+    largest = np.abs(stored).max(initial=0)
+    spacing = float(np.spacing(largest))
+    if not spacing <= COARSEST * radius:
+        raise ConfigError(
+            f"{name}: position must have numbers at most {COARSEST * radius:.2g} apart, 0.001 radii, got "
+            f"{spacing:.2g} of {stored.dtype} at coordinates up to {largest:.3g}; subtract an offset before rounding"
+        )

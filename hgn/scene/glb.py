@@ -1,0 +1,189 @@
+"""Triangles of GLB files (glTF 2.0), with all core features that shape them, and instances.
+
+Materials, textures, cameras, lights and animations are not read. Skins are refused.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+import re
+import struct
+from functools import cache
+from pathlib import Path
+from typing import Any
+from urllib.parse import unquote
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from hgn.system.claims import Claims
+
+INSTANCES = "EXT_mesh_gpu_instancing"
+READ = (INSTANCES, "KHR_mesh_quantization")  # extensions that change geometry
+NEUTRAL = re.compile(r"[A-Z]+_(materials|texture|lights|xmp|animation|audio)\w*")  # extensions that do not
+MAXIMUM_SPARSE = 1_000_000  # values of an accessor without data of its own
+TRIANGLES, STRIP, FAN = 4, 5, 6  # modes of primitives; the others are points and lines
+_TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+_WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
+
+
+def read_glb(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Returns vertices, float64 [V, 3], and triangles, int64 [F, 3], of the file's scene.
+
+    Raises: ValueError, LookupError, TypeError, struct.error or OSError for a damaged file, missing data, and features
+    that are not read.
+    """
+    tree, binary = _chunks(path.read_bytes())
+    unknown = [n for n in tree.get("extensionsRequired", ()) if n not in READ and not NEUTRAL.fullmatch(n)]
+    if unknown:
+        raise ValueError(f"it requires {', '.join(unknown)}, which is not read; export it without")
+    file, claims = _File(tree, binary, path.parent), Claims(path)
+    vertices, triangles, vertex_count = [np.zeros((0, 3))], [np.zeros((0, 3), np.int64)], 0
+    for mesh, weights, place_M44 in file.placed():
+        for position_V3, triangle_F3 in file.surfaces(mesh, weights):
+            claims.add("its nodes", len(place_M44), position_V3.nbytes + triangle_F3.nbytes)
+            for place_44 in place_M44:
+                vertices.append(position_V3 @ place_44[:3, :3].T + place_44[:3, 3])
+                triangles.append(triangle_F3 + vertex_count)
+                vertex_count += len(position_V3)
+    return np.concatenate(vertices), np.concatenate(triangles)
+
+
+def _chunks(data: bytes) -> tuple[dict[str, Any], bytes]:
+    magic, version, length = struct.unpack_from("<4sII", data)
+    if magic != b"glTF" or version != 2 or length > len(data):
+        raise ValueError(f"it begins with {magic!r}, version {version}, and has {len(data)} of {length} bytes")
+    chunks: dict[bytes, bytes] = {}
+    place = 12
+    while place < length:
+        size, kind = struct.unpack_from("<I4s", data, place)
+        chunks.setdefault(kind, data[place + 8 : place + 8 + size])
+        place += 8 + size
+    return json.loads(chunks[b"JSON"]), chunks.get(b"BIN\0", b"")
+
+
+class _File:
+    """The tree of a file and its buffers."""
+
+    def __init__(self, tree: dict[str, Any], binary: bytes, folder: Path) -> None:
+        self.tree, self.binary, self.folder = tree, binary, folder.resolve()
+        self.buffer = cache(self._buffer)
+
+    def placed(self) -> list[tuple[dict[str, Any], list[float], np.ndarray]]:
+        """Returns the meshes of the scene, their weights of morph targets, and their places [M, 4, 4]."""
+        nodes = self.tree.get("nodes", [])
+        if "scenes" in self.tree:
+            roots = self.tree["scenes"][self.tree.get("scene", 0)].get("nodes", [])
+        else:
+            roots = set(range(len(nodes))) - {child for node in nodes for child in node.get("children", ())}
+        result, waiting, visited = [], [(index, np.eye(4)) for index in roots], set()
+        while waiting:
+            index, parent_44 = waiting.pop()
+            node = nodes[index]
+            if index in visited:
+                raise ValueError(f"node {index} has two parents")
+            visited.add(index)
+            if "matrix" in node:
+                own_44 = np.reshape(np.array(node["matrix"], np.float64), (4, 4)).T
+            else:
+                own_44 = _places(*(node.get(name) for name in ("translation", "rotation", "scale")))[0]
+            place_44 = parent_44 @ own_44
+            waiting += [(child, place_44) for child in node.get("children", ())]
+            if "mesh" not in node:
+                continue
+            if "skin" in node:
+                raise ValueError(f"node {index} has a skin; apply the armature")
+            instances = node.get("extensions", {}).get(INSTANCES, {}).get("attributes", {})
+            given = [instances.get(name) for name in ("TRANSLATION", "ROTATION", "SCALE")]
+            place_M44 = place_44 @ _places(*(None if i is None else self.accessor(i) for i in given))
+            mesh = self.tree["meshes"][node["mesh"]]
+            result.append((mesh, node.get("weights", mesh.get("weights", [])), place_M44))
+        return result
+
+    def surfaces(self, mesh: dict[str, Any], weights: list[float]) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Returns positions [V, 3] and triangles [F, 3] of the primitives that have triangles."""
+        result = []
+        for primitive in mesh["primitives"]:
+            mode = primitive.get("mode", TRIANGLES)
+            if mode not in (TRIANGLES, STRIP, FAN):
+                continue
+            position_V3 = self.accessor(primitive["attributes"]["POSITION"]).astype(np.float64)
+            for target, weight in zip(primitive.get("targets", ()), weights, strict=False):
+                if weight and "POSITION" in target:
+                    position_V3 = position_V3 + weight * self.accessor(target["POSITION"])
+            if "indices" in primitive:
+                index = self.accessor(primitive["indices"])[:, 0].astype(np.int64)
+            else:
+                index = np.arange(len(position_V3))
+            if index.max(initial=-1) >= len(position_V3):
+                raise ValueError(f"vertex {index.max()} of a primitive with {len(position_V3)}")
+            if mode == TRIANGLES:
+                triangle_F3 = index.reshape(-1, 3)
+            elif mode == STRIP:
+                triangle_F3 = np.stack([index[:-2], index[1:-1], index[2:]], axis=1)
+                triangle_F3[1::2] = triangle_F3[1::2, ::-1]
+            else:
+                triangle_F3 = np.stack([np.full_like(index[2:], index[0]), index[1:-1], index[2:]], axis=1)
+            result.append((position_V3, triangle_F3))
+        return result
+
+    def accessor(self, index: int) -> np.ndarray:
+        """Returns the values of an accessor, [count, width]; integers that stand for fractions as these."""
+        entry = self.tree["accessors"][index]
+        dtype, shape = np.dtype(_TYPES[entry["componentType"]]), (entry["count"], _WIDTHS[entry["type"]])
+        sparse = entry.get("sparse")
+        if "bufferView" in entry:
+            value = self._values(entry, dtype, shape)
+        elif sparse and 0 <= entry["count"] <= MAXIMUM_SPARSE:
+            value = np.zeros(shape, dtype)
+        else:
+            used = ", ".join(self.tree.get("extensionsUsed", ())) or "no extension"
+            raise ValueError(f"accessor {index} has no data; the file uses {used}")
+        if sparse:
+            value = value.copy()
+            place, count = sparse["indices"], sparse["count"]
+            at = self._values(place, np.dtype(_TYPES[place["componentType"]]), (count, 1))[:, 0]
+            value[at] = self._values(sparse["values"], dtype, (count, shape[1]))
+        if entry.get("normalized"):
+            value = np.maximum(value / np.float64(np.iinfo(dtype).max), -1.0)
+        return value
+
+    def _values(self, entry: dict[str, Any], dtype: np.dtype[Any], shape: tuple[int, int]) -> np.ndarray:
+        view = self.tree["bufferViews"][entry["bufferView"]]
+        start, offset = view.get("byteOffset", 0), entry.get("byteOffset", 0)
+        stride = view.get("byteStride", shape[1] * dtype.itemsize)
+        data = self.buffer(view["buffer"])[start : start + view["byteLength"]]
+        last = offset + (shape[0] - 1) * stride + shape[1] * dtype.itemsize
+        if min(start, offset, stride, *shape) < 0 or (shape[0] and last > len(data)):
+            raise ValueError(f"bufferView {entry['bufferView']} has fewer bytes than its values need")
+        return np.ndarray(shape, dtype, data if shape[0] else None, offset, (stride, dtype.itemsize))
+
+    def _buffer(self, index: int) -> bytes:
+        uri = self.tree["buffers"][index].get("uri")
+        if uri is None:
+            if index or not self.binary:
+                used = ", ".join(self.tree.get("extensionsUsed", ())) or "no extension"
+                raise ValueError(f"buffer {index} has no data; the file uses {used}")
+            return self.binary
+        if uri.startswith("data:"):
+            return base64.b64decode(uri.partition(",")[2], validate=True)
+        path = (self.folder / unquote(uri)).resolve()
+        if not (path.is_file() and path.is_relative_to(self.folder)):
+            raise FileNotFoundError(f"it names {uri!r}, which is no file in its folder")
+        return path.read_bytes()
+
+
+def _places(translation: Any, rotation: Any, scale: Any) -> np.ndarray:
+    """Returns matrices [M, 4, 4] of translations [M, 3], quaternions x y z w [M, 4] and scales [M, 3], or of one."""
+    given = [
+        np.atleast_2d(np.array(value, np.float64)) for value in (translation, rotation, scale) if value is not None
+    ]
+    place_M44 = np.tile(np.eye(4), (max(map(len, given), default=1), 1, 1))
+    if rotation is not None:
+        place_M44[:, :3, :3] = Rotation.from_quat(np.atleast_2d(np.array(rotation, np.float64))).as_matrix()
+    if scale is not None:
+        place_M44[:, :3, :3] *= np.reshape(np.array(scale, np.float64), (-1, 1, 3))
+    if translation is not None:
+        place_M44[:, :3, 3] = translation
+    return place_M44

@@ -1,0 +1,107 @@
+"""Reads YAML and JSON files that people write: strictly, because much of YAML 1.1 is a surprise.
+
+A key given twice would replace the first, 010 would be eight, and 1:30 ninety; all are refused with key and line.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from hgn.schema import ConfigError
+from hgn.system.claims import count_items
+
+MAXIMUM_NODES = 100_000  # of a file
+_OCTAL = re.compile(r"[-+]?0[0-7_]*[1-7][0-7_]*")
+_SEXAGESIMAL = re.compile(r"[-+]?[0-9][0-9_]*(:[0-5]?[0-9])+(\.[0-9_]*)?")
+
+
+def read_yaml(path: Path) -> Any:
+    """Returns the content of a YAML file as plain containers.
+
+    Raises: ConfigError, one line that starts with the path, for a file that cannot be read, a repeated key, octal and
+    sexagesimal numbers, and aliases that expand to more than MAXIMUM_NODES values.
+    """
+    try:
+        return _load(path.read_text(encoding="utf-8"))
+    except (yaml.YAMLError, ValueError, RecursionError) as error:  # a number of thousands of digits, nesting
+        mark = getattr(error, "problem_mark", None)
+        place = f"line {mark.line + 1}, column {mark.column + 1}: " if mark else ""
+        cause = str(getattr(error, "problem", None) or error).splitlines()
+        raise ConfigError(f"{path} must be a YAML file: {place}{' '.join(cause)}") from error
+
+
+def read_json(path: Path) -> Any:
+    """Returns the content of a JSON file. Raises: ValueError for another file, or a key given twice."""
+    text = path.read_text("utf-8")
+
+    def unique(pairs: Sequence[tuple[str, Any]]) -> dict[str, Any]:
+        if len(dict(pairs)) < len(pairs):
+            _load(text.replace("\t", " "))  # finds key and line
+        return dict(pairs)
+
+    try:
+        return json.loads(text, object_pairs_hook=unique)
+    except RecursionError as error:
+        raise ValueError("it is nested too deeply") from error
+
+
+def _load(text: str) -> Any:
+    return yaml.load(text, _Loader)
+
+
+class _Loader(yaml.SafeLoader):
+    """Reads 1e5 as a number, as YAML 1.2 does; PyYAML requires 1.0e+5."""
+
+    def get_single_node(self) -> yaml.Node | None:
+        node = super().get_single_node()
+        if count_items(node, _parts) > MAXIMUM_NODES:
+            raise ValueError(f"its aliases expand to more than {MAXIMUM_NODES} values")
+        if node is not None:
+            _check(node, "", set())
+        return node
+
+
+def _parts(node: Any) -> Any:
+    if isinstance(node, yaml.MappingNode):
+        return itertools.chain.from_iterable(node.value)
+    return node.value if isinstance(node, yaml.SequenceNode) else None
+
+
+def _check(node: yaml.Node, name: str, visited: set[int]) -> None:
+    """Refuses repeated keys and numbers that YAML 1.1 reads in other bases. Raises: ValueError."""
+    if id(node) in visited:
+        return
+    visited.add(id(node))
+    line = node.start_mark.line + 1
+    if isinstance(node, yaml.MappingNode):
+        lines: dict[str, int] = {}
+        for key, value in node.value:
+            word = str(key.value)
+            if word in lines:
+                raise ValueError(
+                    f"line {key.start_mark.line + 1}: the key {word} is given twice, first in line {lines[word]}"
+                )
+            lines[word] = key.start_mark.line + 1
+            _check(value, word, visited)
+    elif isinstance(node, yaml.SequenceNode):
+        for item in node.value:
+            _check(item, name, visited)
+    elif node.tag.endswith((":int", ":float")):
+        if _OCTAL.fullmatch(node.value):
+            remedy = f"write {node.value.replace('0', '', 1)}, or {int(node.value.replace('_', ''), 8)}"
+            raise ValueError(f"line {line}: {name}: {node.value} is an octal number in YAML; {remedy}")
+        if _SEXAGESIMAL.fullmatch(node.value):
+            remedy = "write it in decimals, or in quotes"
+            raise ValueError(f"line {line}: {name}: {node.value} is a number of base 60 in YAML; {remedy}")
+
+
+_Loader.add_implicit_resolver(
+    "tag:yaml.org,2002:float", re.compile(r"[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+$"), list("-+.0123456789")
+)

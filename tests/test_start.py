@@ -1,0 +1,65 @@
+"""The start of commands: what `--help` loads, and how the threads of PyTorch wait."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from hgn.config import config_directory
+
+ROOT = Path(__file__).parents[1]
+SLOW = (
+    *("torch", "triton", "lightning", "trimesh", "h5py", "scipy", "matplotlib", "taichi", "viser", "fsspec"),
+    *("ray", "starlette", "uvicorn"),
+)
+PROGRAM = """
+import contextlib, io, json, runpy, sys
+loaded, before = {}, set()
+for module in sys.argv[1:]:
+    sys.argv[:] = [module, "--help"]
+    with contextlib.suppress(SystemExit), contextlib.redirect_stdout(io.StringIO()):
+        runpy.run_module(module, run_name="__main__", alter_sys=True)
+    loaded[module] = sorted(sys.modules.keys() - before)
+    before |= sys.modules.keys()
+print(json.dumps(loaded))
+"""
+
+
+def modules_of_commands():
+    """Yields the modules of all commands, but of the two whose cases are their settings."""
+    names = {path.stem for path in (config_directory() / "command").glob("*.yaml")}
+    for name in sorted(names - {"stability_network", "stability_solver"}):
+        files = [f"{root}/{name}.py" for root in ("hgn", "datagen", "tools")] + [f"tools/{name}/__main__.py"]
+        (file,) = [file for file in files if (ROOT / file).is_file()]
+        yield file.removesuffix(".py").removesuffix("/__main__").replace("/", ".")
+    yield from ("hgn.train", "datagen", "datagen.service")
+
+
+def test_help_loads_little():
+    """No command's --help loads PyTorch, the solver, or packages that take a tenth of a second and more; all of them
+    together load few modules."""
+    names = list(modules_of_commands())
+    assert len(names) >= 18
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    ended = subprocess.run(
+        [sys.executable, "-c", PROGRAM, *names], env=environment, capture_output=True, text=True, check=True
+    )
+    loaded = json.loads(ended.stdout)
+    assert {name: slow for name, modules in loaded.items() if (slow := sorted(set(modules) & set(SLOW)))} == {}
+    assert sum(map(len, loaded.values())) < 900
+
+
+@pytest.mark.parametrize("given", [None, "ACTIVE"])
+def test_idle_threads_sleep(given):
+    """Whatever a program of the project imports first, OpenMP is told to wait passively before PyTorch loads it; a
+    value that the user has set stays."""
+    environment = {name: value for name, value in os.environ.items() if name != "OMP_WAIT_POLICY"}
+    environment |= {"PYTHONPATH": str(ROOT), "OMP_DISPLAY_ENV": "TRUE"} | ({"OMP_WAIT_POLICY": given} if given else {})
+    first = "tools.timing" if given is None else "hgn, torch"
+    ended = subprocess.run(
+        [sys.executable, "-c", f"import {first}"], env=environment, capture_output=True, text=True, check=True
+    )
+    assert f"OMP_WAIT_POLICY = '{given or 'PASSIVE'}'" in ended.stderr

@@ -1,0 +1,270 @@
+"""python -m tools.error_vs_time data=… weights=[…] out=results/error_vs_time: error against run time.
+
+Compares networks (by default the shipped ones), the solver on coarser grids and with larger steps, and baselines on
+the same test scenes; a converged simulation is the reference. Writes a table, OUT.json, OUT.png, OUT_batched.png and
+OUT_frames.png.
+"""
+
+from __future__ import annotations
+
+import functools
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager, nullcontext
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from datagen.fine import solver_on_grid, wall_thickness
+from hgn.command import EXIT_MACHINE
+from hgn.config import PRECISIONS, MpmConfig
+from hgn.data.fresh import set_record
+from hgn.data.reader import EpisodeStore, first_episodes
+from hgn.runtime.simulator import InitialState, Simulator
+from hgn.runtime.weights import find_weights, load_weights, require_frame_rate, shipped_weights
+from hgn.scene.episode import Episode
+from hgn.schema import ConfigError, from_mapping, from_stored, require
+from hgn.system.device import choose_device
+from hgn.system.files import write_json
+from hgn.system.machine import available_cpus
+from hgn.system.progress import bar
+from tools.error_vs_time.contenders import (
+    COARSE_GRIDS,
+    PARTICLES_AT_ONCE,
+    SAME_GRID,
+    BaselineContender,
+    Contender,
+    FallingContender,
+    NetworkContender,
+    SolverContender,
+)
+from tools.error_vs_time.paired import paired_rows, paired_table
+from tools.error_vs_time.plot import CONVENTION
+from tools.error_vs_time.run import Row, Run, draw, is_untimed, read_report, require_same, same_row
+from tools.error_vs_time.score import table
+from tools.error_vs_time.settings import ErrorVsTimeConfig
+from tools.report import meta_of
+from tools.solver_rollouts import Setting, SolverLaunches
+
+REFERENCE_STEP = 0.25  # of the limit of stability, on the data's own grid
+STEPS = (1.0, 0.5)  # of the solver, fractions of the limit of stability
+COMPILING_FRACTION = 0.4  # of the seconds given, until when compilation is waited for
+ORDER = ("tf32", "fp16", "fp32")  # the most informative precision first
+
+
+def main(mapping: dict[str, Any]) -> int:
+    """Prints a table and writes the report; returns the exit code."""
+    started = time.monotonic()
+    config = from_mapping(ErrorVsTimeConfig, mapping)
+    earlier = [read_report(file, f"earlier[{i}]") for i, file in enumerate(config.earlier)]
+    Path(config.out).parent.mkdir(parents=True, exist_ok=True)
+    if config.data is None:
+        return _draw_again(config, earlier)
+    device = choose_device(config.device)
+    store = EpisodeStore(config.data, config.split)
+    episodes = first_episodes(store, config.scenes)
+    frames = min(config.frames, *(len(episode.position_TN3) for episode in episodes))
+    finer = store.manifest.config.get("reference")
+    resimulate = config.resimulate and finer is None  # a finer grid is nearer to the truth than the data's own
+    same = {"episodes": [e.key for e in episodes], "frames": frames, "reference": _reference_name(resimulate, finer)}
+    for i, (meta, _) in enumerate(earlier):
+        require_same(meta, f"earlier[{i}]", same)
+    known = [row for _, rows in earlier for row in rows]
+    mpm = replace(from_stored(MpmConfig, store.manifest.config["mpm"], "mpm"), device=device.type)
+    own_cell, rate = episodes[0].obstacle_grid.cell_size, episodes[0].frame_rate_hz
+    own_grid = round(1 / own_cell)
+    reference_grid = own_grid if finer is None else int(finer["cells"])
+
+    @functools.cache
+    def launches(grid: int) -> SolverLaunches:
+        reference = resimulate and grid == reference_grid
+        most = frames if reference else min(frames, config.mpm_frames)
+        cell_size = own_cell if grid == own_grid else 1 / grid
+        return SolverLaunches(solver_on_grid(mpm, cell_size, own_cell), cell_size, rate, most)
+
+    every: list[Contender] = list(network_contenders(config, device, episodes))
+    every += baseline_contenders(store, device, wall_thickness(mpm, own_cell))
+    every += solver_contenders(config, mpm, launches, own_grid, reference_grid, resimulate)
+    measured = [row for row in known if not is_untimed(row)]
+    contenders = [contender for contender in every if same_row(contender.row, measured) is None]
+    networks = [contender for contender in contenders if isinstance(contender, NetworkContender)]
+    solvers = [contender for contender in contenders if isinstance(contender, SolverContender)]
+    for solver in solvers:
+        solver.launches.add(solver.setting)
+    limit = None if config.seconds is None else started + COMPILING_FRACTION * config.seconds
+    with _precompilation(networks, episodes, device, limit):
+        references: Sequence[Episode] = episodes
+        left_out: dict[str, str] = {}
+        if resimulate:
+            references, left_out = resimulated(episodes, launches(own_grid), REFERENCE_STEP)
+        references = [replace(e, position_TN3=np.asarray(e.position_TN3[:frames])) for e in references]
+        require(bool(references), "data", "scenes that the solver simulates to the end", left_out)
+        with ThreadPoolExecutor(available_cpus()) as threads:
+            for solver in solvers:
+                solver.launches.collide(references, threads)
+    meta = meta_of(config, device) | same
+    meta |= {"data": Path(config.data).name, "split": config.split, "scenes": len(references), "left_out": left_out}
+    meta["set"] = set_record(config.data, store.manifest.config["seed"], {c.file for c in networks})
+    meta |= {"convention": CONVENTION, "seconds_before_scoring": time.monotonic() - started}
+    run = Run(config, contenders, references, device, meta, started, known)
+    run.measure()
+    run.write(drawn=True)
+    print(table(run.rows), paired_table(paired_rows(run.rows)), f"{run.out}.png {run.file}", sep="\n\n")
+    if run.failed:
+        print(f"error: {run.failed} of the measurements failed; see above, and not_run in {run.file}", file=sys.stderr)
+    return EXIT_MACHINE if run.failed else 0
+
+
+def _draw_again(config: ErrorVsTimeConfig, earlier: Sequence[tuple[dict[str, Any], list[Row]]]) -> int:
+    """Draws and prints the rows of earlier reports."""
+    first = earlier[0][0]
+    for i, (meta, _) in enumerate(earlier):
+        require_same(meta, f"earlier[{i}]", {name: first[name] for name in ("episodes", "frames", "reference")})
+    rows = [row for _, report_rows in earlier for row in report_rows]
+    files, paired = draw(config.out, rows, first), paired_rows(rows)
+    write_json(config.json or f"{config.out}.json", {"meta": first, "rows": rows, "paired": paired}, allow_nan=False)
+    print(table(rows), paired_table(paired), " ".join(files), sep="\n\n")
+    return 0
+
+
+def _reference_name(resimulate: bool, finer: dict[str, Any] | None) -> str:
+    if finer is not None:
+        return (
+            f"the data: {finer['cells']} cells a unit, {finer['particles_per_visible']} particles for each visible one"
+        )
+    if not resimulate:
+        return "the data"
+    return f"the solver on the data's grid at {REFERENCE_STEP:g} of the limit of stability"
+
+
+def network_contenders(
+    config: ErrorVsTimeConfig, device: torch.device, episodes: Sequence[Episode]
+) -> list[NetworkContender]:
+    """Returns every weights file at every supported precision, and prints those that are left out."""
+    files = fitting_weights(episodes) if config.weights is None else named_weights(config.weights, episodes)
+    contenders: list[NetworkContender] = []
+    for file in files:
+        hgn = load_weights(file)[1].network.kind == "hgn"
+        precisions = config.precisions or (("fp32",) if device.type != "cuda" else PRECISIONS if hgn else ("tf32",))
+        first = min(precisions, key=ORDER.index)
+        for precision in precisions:
+            try:
+                named = file, precision, device, episodes[0].frame_rate_hz
+                contenders.append(NetworkContender(*named, first=precision == first))
+            except ConfigError as error:
+                if precision != "fp16":
+                    raise
+                print(f"left out: {file.name} at fp16: {error}", file=sys.stderr)
+    return contenders
+
+
+def named_weights(names: Sequence[str], episodes: Sequence[Episode]) -> list[Path]:
+    """Returns the files. Raises: ConfigError for a name or file that does not exist or does not fit the data."""
+    files = [find_weights(name, f"weights[{i}]") for i, name in enumerate(names)]
+    for i, (name, file) in enumerate(zip(names, files, strict=True)):
+        try:
+            require_fits(file, episodes, f"weights[{i}]")
+        except ConfigError as error:
+            remedy = "take other weights, or the data set that these were trained on"
+            raise ConfigError(f"weights[{i}] must fit the data, got {name}: {error}; {remedy}") from None
+    return files
+
+
+def fitting_weights(episodes: Sequence[Episode]) -> list[Path]:
+    """Returns all shipped weights that fit the data and have obstacle features if the data has obstacles.
+
+    Prints the others.
+    """
+    seen = any(len(episode.obstacle_grid.cell_K3) for episode in episodes)
+    files = []
+    for name, file in shipped_weights().items():
+        try:
+            sees = load_weights(file)[1].network.obstacle_features
+            require(sees == seen, "obstacles", f"{'in' if sees else 'not in'} the data of these weights", seen)
+            require_fits(file, episodes, "weights")
+            files.append(file)
+        except ConfigError as error:
+            print(f"left out: the shipped weights {name}: {error}", file=sys.stderr)
+    return files
+
+
+def require_fits(file: Path, episodes: Sequence[Episode], field: str) -> None:
+    """Raises: ConfigError if frame rate, materials, gravity or obstacle cells of the data are not those of weights."""
+    network, info = load_weights(file, field=field)
+    require_frame_rate(info, episodes[0].frame_rate_hz)
+    Simulator(network, info.frame_rate_hz, "torch", info=info).start([InitialState.of_episode(e) for e in episodes])
+
+
+@contextmanager
+def _precompilation(
+    networks: Sequence[NetworkContender], episodes: Sequence[Episode], device: torch.device, limit: float | None
+) -> Iterator[None]:
+    """Compiles kernels of whole frames in other processes meanwhile, and waits for them until a time at most."""
+    whole = [contender for contender in networks if not contender.stepped]
+    ahead = None
+    if whole:
+        from hgn.runtime.precompile import precompile_frames  # loads Triton
+
+        particles = max(len(episode.material_N) for episode in episodes)
+        configs, precisions = [(c.network.config, c.network.step) for c in whole], [c.precision for c in whole]
+        ahead = precompile_frames(configs, precisions, device, [particles, 8 * particles, PARTICLES_AT_ONCE])
+    with ahead if ahead is not None else nullcontext():
+        yield
+        if ahead is not None:
+            print(ahead.wait(lambda: limit is not None and time.monotonic() > limit), file=sys.stderr)
+
+
+def baseline_contenders(store: EpisodeStore, device: torch.device, wall: float) -> list[Contender]:
+    """Returns predictors that have learned nothing; `wall` is the thickness of the domain's walls."""
+    split = "train" if store.manifest.published("train") else store.split  # fresh test sets have no other split
+    mean_3 = np.asarray(store.manifest.statistics(split).acceleration.mean)
+    predictors: dict[str, Callable[[Episode], np.ndarray]] = {
+        "constant velocity": lambda episode: np.zeros(3),
+        "ballistic motion": lambda episode: np.asarray(episode.gravity) / episode.frame_rate_hz**2,
+        "mean acceleration": lambda episode: mean_3,
+    }
+    constant = [BaselineContender(name, acceleration, device) for name, acceleration in predictors.items()]
+    return [*constant, FallingContender(wall)]
+
+
+def solver_contenders(
+    config: ErrorVsTimeConfig,
+    mpm: MpmConfig,
+    launches: Callable[[int], SolverLaunches],
+    own_grid: int,
+    reference_grid: int,
+    resimulate: bool,
+) -> list[Contender]:
+    """Returns the solver with each setting, and the chaos floor: the reference compared with itself, displaced."""
+    step = REFERENCE_STEP if resimulate else mpm.stability_fraction
+
+    def solver(grid: int, step: float, perturbation: float = 0.0, **named: Any) -> SolverContender:
+        importance = SAME_GRID if grid == own_grid else COARSE_GRIDS
+        return SolverContender(launches(grid), Setting(step, perturbation), config.mpm_frames, importance, named)
+
+    contenders: list[Contender] = [solver(grid, step) for grid in config.mpm_grids for step in STEPS]
+    if config.perturbation:
+        floor = f"perturbed by {config.perturbation:g}" if reference_grid == own_grid else "other children"
+        contenders.append(solver(reference_grid, step, config.perturbation, system="chaos", floor=floor))
+    if config.mpm_grids and 2 * step <= 1:
+        contenders.append(solver(own_grid, 2 * step, system="chaos", floor="twice the step"))
+    return contenders
+
+
+def resimulated(
+    episodes: Sequence[Episode], launches: SolverLaunches, step: float
+) -> tuple[list[Episode], dict[str, str]]:
+    """Simulates episodes with another step; returns those that reach the end, and the causes of the others.
+
+    Further settings of the same grid are simulated in the same launch.
+    """
+    with bar("reference", total=launches.frames, unit="frame") as progress:
+        trials = launches.trials(Setting(step), episodes, lambda _: progress.update())
+    pairs = list(zip(episodes, trials, strict=True))
+    left_out = {episode.key: trial.cause for episode, trial in pairs if trial.cause is not None}
+    return [replace(e, position_TN3=trial.position_TN3) for e, trial in pairs if trial.cause is None], left_out

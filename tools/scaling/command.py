@@ -1,0 +1,96 @@
+"""python -m tools.scaling [--json FILE]: weak scaling of training on this machine's devices.
+
+A contender is timed only if it passes its check. The JSON contains {"meta": provenance, "rows"}.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import torch
+import torch.multiprocessing
+
+from hgn.config import TrainingConfig
+from hgn.schema import ConfigError, from_mapping
+from hgn.system.files import write_json
+from hgn.system.machine import available_cpus
+from tools import report
+from tools.bench.contenders import OBSTACLE_CELL_SIZE
+from tools.report import EXIT_RED, PASS
+from tools.scaling.config import ScalingConfig
+from tools.scaling.measure import measure
+
+CELL_FRACTION = 0.3  # cells of the finest level per particle of tools.bench.states, about
+
+
+def main(mapping: dict[str, Any]) -> int:
+    """Prints a table, and writes JSON if asked to; the exit code is 1 if a check fails."""
+    config = from_mapping(ScalingConfig, mapping)
+    device_type, count = devices(config)
+    _compile_ahead(config, device_type, count)
+    with tempfile.TemporaryDirectory() as folder:
+        torch.multiprocessing.spawn(measure, (count, config, device_type, Path(folder)), nprocs=count)
+        rows = with_efficiency(json.loads((Path(folder) / "rows.json").read_text()))
+    print(table(rows))
+    if config.json is not None:
+        write_json(config.json, {"meta": report.meta_of(config, device_type), "rows": rows})
+    return 0 if all(row["check"] == PASS for row in rows) else EXIT_RED
+
+
+def devices(config: ScalingConfig) -> tuple[str, int]:
+    """Returns the kind of device and the number of processes. Raises: ConfigError if there are fewer GPUs."""
+    gpus = torch.cuda.device_count() if torch.cuda.is_available() else 0
+    if config.device == "cpu" or (config.device == "auto" and gpus == 0):
+        return "cpu", config.devices or 2
+    wanted = config.devices or max(gpus, 1)
+    if wanted > gpus:
+        raise ConfigError(f"devices must be at most the {gpus} GPUs of this machine, got {wanted}; take device=cpu")
+    return "cuda", wanted
+
+
+def _compile_ahead(config: ScalingConfig, device_type: str, count: int) -> None:
+    """Fills Triton's cache, because each process would compile for minutes."""
+    if device_type == "cpu" or "triton" not in config.backends or torch.version.hip is not None:
+        return
+    # Triton, which backend torch does without, is loaded here.
+    from hgn.kernels.update.op import UpdateSettings
+    from hgn.runtime.precompile import Precompilation
+    from hgn.runtime.precompile_program import PrecompileJob
+
+    training = TrainingConfig(batch_scenes=config.scenes)
+    settings = UpdateSettings(config.scenes, training.noise_std, True, OBSTACLE_CELL_SIZE)
+    particles = config.scenes * config.particles
+    cells = tuple(max(1, int(CELL_FRACTION * particles) >> 2 * level) for level in range(config.network.levels))
+    major, minor = torch.cuda.get_device_capability()
+    capability = 10 * major + minor
+    job = PrecompileJob(config.network, settings, config.precision, count > 1, False, particles, cells, capability)
+    with Precompilation(job, max(1, available_cpus() - 2)) as precompilation:
+        print(precompilation.wait(), file=sys.stderr)
+
+
+def with_efficiency(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Adds each row's particles per second and device, relative to a single device with the same kind of scenes."""
+    rates = [row["particles_per_update"] / row["ms"] if row["ms"] else None for row in rows]
+    kinds = [(row["backend"], row["particle_spread"]) for row in rows]
+    alone = {kind: rate for row, kind, rate in zip(rows, kinds, rates, strict=True) if row["devices"] == 1}
+    for row, kind, rate in zip(rows, kinds, rates, strict=True):
+        base = alone.get(kind)
+        row["efficiency"] = rate / base if base and rate else None
+    return rows
+
+
+def table(rows: list[dict[str, Any]]) -> str:
+    """Returns a table of the rows."""
+    work = ("backend", "precision", "devices", "scenes", "particle_spread")
+    lines = []
+    for row in rows:
+        sent = f"{len(row['messages'])}, up to {max(row['messages']) / 1e6:.1f} MB" if row["averaged"] else "none"
+        sent += ", in the graph" if row["one_graph"] else ""
+        times = report.number(row["ms"], ".2f"), report.spread(row.get("ms_quartiles"), ".2f")
+        lines.append((*(row[key] for key in work), sent, *times, report.number(row["efficiency"], ".3f"), row["check"]))
+    head = ("backend", "precision", "devices", "scenes", "spread", "messages", "update, ms", "quartiles", "efficiency")
+    return report.table((*head, "check"), lines)
