@@ -19,7 +19,7 @@ LINES = {  # of Python, in tracked files
     "hgn": 28_941,
     "datagen": 8_531,
     "tools": 7_191,
-    "tests": 29_105,
+    "tests": 29_107,
 }
 SETTINGS = 239  # fields of the dataclasses behind the commands, *Config
 

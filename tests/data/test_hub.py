@@ -61,6 +61,7 @@ def test_weights_come_from_a_repository(url, hub):
     ],
 )
 def test_what_cannot_be_had_is_told(url, message, hub):
+    """The address, the repository or the file at fault is named."""
     with pytest.raises(ConfigError, match=message):
         find_weights(url)
 

@@ -245,6 +245,7 @@ def test_faulty_lists_are_refused(machine, text, message):
 
 
 def test_usage():
+    """Called without a list, the queue says how it is called."""
     done = subprocess.run([str(JOBS / "queue.sh")], capture_output=True, text=True)
     assert done.returncode == 2 and done.stderr.startswith("usage: jobs/queue.sh LIST [FOLDER]")
 
