@@ -16,10 +16,10 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 28_941,
+    "hgn": 28_936,
     "datagen": 8_531,
     "tools": 7_191,
-    "tests": 29_107,
+    "tests": 29_105,
 }
 SETTINGS = 239  # fields of the dataclasses behind the commands, *Config
 

@@ -1,6 +1,6 @@
 """Inputs of training with backend triton: the samples of many updates, and whole episodes instead of windows.
 
-Shape legend: H velocity history, T frames, N particles, K obstacle cells.
+Shape legend: H velocity history, T frames, N particles.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from hgn.network.features import material_rows
 from hgn.scene.barrier import Barrier
 from hgn.scene.episode import Episode
 from hgn.scene.history import frames_before
+from hgn.scene.obstacle_grid import ObstacleGrid
 from hgn.scene.symmetry import Symmetry, Vector, scene_symmetries
 
 
@@ -25,8 +26,7 @@ class EpisodeTensors:
 
     position_TN3: torch.Tensor  # float32, domain units
     material_N: torch.Tensor  # int32, index into the network's materials
-    obstacle_cell_K3: torch.Tensor  # int32; empty where the network sees none
-    obstacle_normal_K3: torch.Tensor
+    obstacle_grid: ObstacleGrid  # without cells for networks without obstacle features
     domain_size: Vector
     gravity: Vector  # domain units per frame squared
     symmetries: tuple[Symmetry, ...] = ()  # that training may apply to the scene
@@ -48,11 +48,11 @@ def whole_episode(episode: Episode, network: NetworkConfig, barrier: Barrier | N
     """Reads an episode; its windows are those of `hgn.scene.history.window`. `barrier` is that of its obstacles."""
     past = frames_before(episode, -network.velocity_history)
     grid, seen = episode.obstacle_grid, len(episode.obstacle_grid.cell_K3) if network.obstacle_features else 0
+    cell_K3, normal_K3 = grid.cell_K3[:seen], grid.normal_K3[:seen]
     return EpisodeTensors(
         torch.from_numpy(np.concatenate([past, episode.position_TN3], dtype=np.float32)),
         material_rows(episode.material_N, network.materials, episode.materials).int(),
-        torch.from_numpy(np.array(grid.cell_K3[:seen], np.int32)),
-        torch.from_numpy(np.array(grid.normal_K3[:seen], np.float32)),
+        ObstacleGrid(grid.cell_size, cell_K3.astype(np.int32), normal_K3.astype(np.float32)),
         episode.domain_size,
         frame_gravity(episode),
         shown_symmetries(episode, network),

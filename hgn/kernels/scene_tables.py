@@ -17,6 +17,7 @@ from hgn.network.barriers import Barriers
 from hgn.network.cell_keys import in_buckets, unpack
 from hgn.network.obstacles import ObstacleCells
 from hgn.scene.barrier import Barrier
+from hgn.scene.obstacle_grid import ObstacleGrid
 
 OBSTACLE_COLUMNS, BARRIER_COLUMNS = obstacles.OBSTACLE_COLUMNS.value, kernel.BARRIER_COLUMNS.value
 
@@ -37,6 +38,12 @@ class SceneHash:
         """Returns the hash of cells int [K, 3] with normals [K, 3], on their device."""
         bucket_B, key_K, order_K = in_buckets(cell_K3)
         return SceneHash(bucket_B, key_K, normal_K3[order_K].float().contiguous())
+
+    @staticmethod
+    def of_grid(grid: ObstacleGrid) -> SceneHash | None:
+        """Returns the hash of a scene's obstacle cells, or None without cells."""
+        tensors = torch.from_numpy(grid.cell_K3), torch.from_numpy(grid.normal_K3)
+        return SceneHash.of_obstacles(*tensors) if len(grid.cell_K3) else None
 
     @staticmethod
     def of_barrier(barrier: Barrier) -> SceneHash | None:

@@ -13,18 +13,16 @@ import torch
 
 from hgn.data.episode_tensors import EpisodeTensors
 from hgn.kernels.update.op import Updates
-from hgn.network.cell_keys import pack
 from hgn.network.features import ParticleState
 from hgn.network.obstacles import ObstacleCells
-from hgn.runtime.parity import GRADIENTS, OUTPUTS
-from hgn.runtime.parity import require_parity as require
+from hgn.runtime.parity import GRADIENTS, OUTPUTS, require_parity
 from hgn.scene.symmetry import Symmetry
 from hgn.training.symmetry import obstacles_under
 
 CHECKED_PARTICLES = 200_000  # at most: autograd needs memory
 
 
-def require_parity(
+def require_update_parity(
     updates: Updates, episodes: Sequence[EpisodeTensors], symmetries: Sequence[Symmetry] | None = None
 ) -> tuple[float, float]:
     """Returns the relative errors of outputs and of all gradients on the batch of `updates`, of these episodes' images;
@@ -41,7 +39,7 @@ def require_parity(
     parameters = list(network.parameters())
     output_N3 = network.normalised_acceleration(state, origin_S3)
     slopes = torch.autograd.grad((output_N3 * weight_N3).sum(), parameters, allow_unused=True)
-    output_error = require(fused.output[:count, :3], output_N3.detach(), OUTPUTS, "training.backend")
+    output_error = require_parity(fused.output[:count, :3], output_N3.detach(), OUTPUTS, "training.backend")
     fused.output_gradient[:count].zero_()
     fused.output_gradient[:count, :3] = weight_N3 / fused.unscale
     fused.backward()
@@ -49,7 +47,7 @@ def require_parity(
     updates.packed.scatter(fused.totals[: updates.packed.size], gradients)
     expected = [torch.zeros_like(p) if g is None else g for p, g in zip(parameters, slopes, strict=True)]
     flat, expected_flat = (torch.cat([tensor.flatten() for tensor in each]) for each in (gradients, expected))
-    gradient_error = require(flat, expected_flat, GRADIENTS, "training.backend")
+    gradient_error = require_parity(flat, expected_flat, GRADIENTS, "training.backend")
     if updates.device.type == "cuda":
         del output_N3, slopes, expected, expected_flat
         torch.cuda.empty_cache()  # free memory decides where episodes are stored
@@ -61,18 +59,9 @@ def _state(
 ) -> tuple[ParticleState, torch.Tensor]:
     """Returns the batch as PyTorch reads it, noise and jitter included."""
     config = updates.config
-    keys, normals = [], []
-    for scene, episode in enumerate(episodes):
-        cells = episode.obstacle_cell_K3.long()
-        keys.append(pack(torch.full((len(cells),), scene), cells))
-        normals.append(episode.obstacle_normal_K3)
-    obstacles = None
-    if config.obstacle_features and any(len(key) for key in keys):
-        cell_size = updates.settings.obstacle_cell_size
-        obstacles = ObstacleCells(torch.cat(keys), torch.cat(normals), cell_size)
-        if symmetries is not None:
-            obstacles = obstacles_under(obstacles, symmetries)
-        obstacles = obstacles.to(updates.device)
+    obstacles = ObstacleCells.of([episode.obstacle_grid for episode in episodes])
+    if obstacles is not None and symmetries is not None:
+        obstacles = obstacles_under(obstacles, symmetries)
     particles = updates.buffers
     state = ParticleState(
         position_N3=particles.position_N3[:count],
@@ -81,6 +70,6 @@ def _state(
         scene_N=particles.scene_N[:count].long(),
         domain_S3=particles.domain_S3,
         gravity_S3=particles.gravity_S3,
-        obstacles=obstacles,
+        obstacles=obstacles and obstacles.to(updates.device),
     )
     return state, particles.origin_S3

@@ -25,7 +25,7 @@ from hgn.network.hgn import HierarchicalGraphNetwork
 from hgn.runtime.triton_host import kernel_precision
 from hgn.scene.symmetry import drawn_symmetry
 from hgn.training.distributed import sum_over_ranks
-from hgn.training.parity import require_parity
+from hgn.training.parity import require_update_parity
 from hgn.training.pushforward import PushforwardPool
 from hgn.training.schedule import average_weight, learning_rate
 from hgn.training.triton_pushforward import TritonScenes
@@ -111,7 +111,7 @@ class TritonUpdates:
         shown = None
         if self.training.symmetry != "none":
             shown = [drawn_symmetry(e.symmetries, s.seed) for e, s in zip(episodes, first, strict=True)]
-        outputs, gradients = self.parity = require_parity(self.updates, episodes, shown)
+        outputs, gradients = self.parity = require_update_parity(self.updates, episodes, shown)
         text = f"outputs within {outputs:.0e}, gradients within {gradients:.0e} of PyTorch's"
         self._say(text if math.isfinite(outputs) else "batch too large to check")
 
@@ -145,13 +145,12 @@ class TritonUpdates:
             free, total = torch.cuda.mem_get_info(self.device)
             fits = free - position_TN3.nbytes > (1 - DATA_FRACTION) * total
             position_TN3 = position_TN3.to(self.device) if fits else position_TN3.pin_memory()
-        cells, normals = episode.obstacle_cell_K3, episode.obstacle_normal_K3
-        obstacles = SceneHash.of_obstacles(cells, normals).to(self.device) if len(cells) else None
+        obstacles = SceneHash.of_grid(episode.obstacle_grid)
         barrier = SceneHash.of_barrier(episode.barrier) if episode.barrier is not None else None
         return DeviceEpisode(
             position_TN3,
             episode.material_N.to(self.device),
-            obstacles,
+            obstacles and obstacles.to(self.device),
             episode.domain_size,
             gravity=episode.gravity,
             symmetries=episode.symmetries,

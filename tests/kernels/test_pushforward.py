@@ -29,12 +29,11 @@ def placed(made, network):
     clearance = network.step.obstacle_clearance
     barrier = None if clearance is None else simulated_barrier(made, clearance)
     whole, where = whole_episode(made, network.config, barrier), device()
-    cells, normals = whole.obstacle_cell_K3, whole.obstacle_normal_K3
-    obstacles = SceneHash.of_obstacles(cells, normals).to(where) if len(cells) else None
+    cells = SceneHash.of_grid(whole.obstacle_grid)
     hashed = SceneHash.of_barrier(whole.barrier) if whole.barrier is not None else None
     position_TN3, material_N = whole.position_TN3.to(where), whole.material_N.to(where)
     scene = whole.domain_size, whole.gravity, whole.symmetries
-    return DeviceEpisode(position_TN3, material_N, obstacles, *scene, hashed and hashed.to(where))
+    return DeviceEpisode(position_TN3, material_N, cells and cells.to(where), *scene, hashed and hashed.to(where))
 
 
 def pools_of(network, training):

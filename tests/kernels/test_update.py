@@ -2,6 +2,7 @@
 
 import copy
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -16,7 +17,7 @@ from hgn.network.obstacles import ObstacleCells
 from hgn.network.orthogonal import orthogonalised
 from hgn.schema import ConfigError
 from hgn.training.muon import Muon
-from hgn.training.parity import require_parity
+from hgn.training.parity import require_update_parity
 
 pytestmark = pytest.mark.usefixtures("large_tiles")
 
@@ -30,11 +31,10 @@ def episode(seed, particles, obstacles, spread=0.12):
     start = torch.rand(1, particles, 3, generator=generator) * spread + 0.2
     position = start + (torch.randn(HISTORY + 4, particles, 3, generator=generator) * 1e-3).cumsum(0)
     grid = random_grid(seed, 4_000)
-    cell, normal = torch.from_numpy(grid.cell_K3), torch.from_numpy(grid.normal_K3)
     made = DeviceEpisode(
         position.to(device()),
         torch.randint(0, 3, (particles,), generator=generator, dtype=torch.int32).to(device()),
-        SceneHash.of_obstacles(cell, normal).to(device()) if obstacles else None,
+        SceneHash.of_grid(grid).to(device()) if obstacles else None,
         (1.0, 1.0, 1.0),
     )
     return made, [grid] if obstacles else []
@@ -44,11 +44,10 @@ def one_with_obstacles():
     """A sample of each of two episodes, one among obstacles, and the same episodes as the parity check takes them."""
     made, grids = episode(1, 5, True)
     still, _ = episode(2, 3, False)
-    none = torch.zeros(0, 3)
-    cells = torch.from_numpy(grids[0].cell_K3), torch.from_numpy(grids[0].normal_K3)
+    none = replace(grids[0], cell_K3=grids[0].cell_K3[:0], normal_K3=grids[0].normal_K3[:0])
     episodes = [
-        EpisodeTensors(each.position_TN3, each.material_N, *obstacles, each.domain_size, (0.0, 0.0, 0.0))
-        for each, obstacles in ((made, cells), (still, (none.int(), none)))
+        EpisodeTensors(each.position_TN3, each.material_N, grid, each.domain_size, (0.0, 0.0, 0.0))
+        for each, grid in ((made, grids[0]), (still, none))
     ]
     return [(made, 1, 3), (still, 0, 4)], episodes
 
@@ -233,9 +232,9 @@ def test_wrong_kernels_are_refused():
     samples, episodes = one_with_obstacles()
     updates = updates_of(network, 2, (64,), noise_std=1e-3, grid_jitter=True)
     updates.predict(samples)
-    assert max(require_parity(updates, episodes)) < 1e-3
+    assert max(require_update_parity(updates, episodes)) < 1e-3
     updates.values.mul_(1.3)
     updates.fused.refresh()
     updates.predict(samples)
     with pytest.raises(ConfigError, match=r"must be torch on this machine.*set training.backend=torch"):
-        require_parity(updates, episodes)
+        require_update_parity(updates, episodes)
