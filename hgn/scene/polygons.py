@@ -93,7 +93,7 @@ class _Numbers:
         """Reads rows whose lists are as long as those of the first row. Raises: ValueError for others."""
         start = self.place
         lengths = [np.size(value) for value in self._row(properties)] if count else [1] * len(properties)
-        self.place, kinds, firsts = start, [], []
+        self.place, kinds, firsts = start, list[str](), list[int]()
         for (*kind, _), length in zip(properties, lengths, strict=True):
             firsts.append(len(kinds))
             kinds += [kind[0]] if len(kind) == 1 else [kind[1], *[kind[2]] * length]
