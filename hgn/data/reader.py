@@ -26,7 +26,7 @@ from hgn.data.entries import REMEDY
 from hgn.data.manifest import MANIFEST_NAME, SPLITS, EpisodeEntry, Manifest, ShardEntry
 from hgn.data.shard_cache import holders
 from hgn.data.statistics import Statistics
-from hgn.data.storage import ask, is_remote, open_storage, outliving
+from hgn.data.storage import StorageError, ask, is_remote, open_storage, outliving
 from hgn.scene.episode import POSITION_MEMBER, Episode, decode_episode
 from hgn.schema import ConfigError, require, without_passwords
 from hgn.system.patience import UnreachableError, standard_patience_s
@@ -131,8 +131,10 @@ class EpisodeStore(Episodes):
             if self._looked_s - previous_s > patience_s + FORGOTTEN_S:  # it may have been over in between
                 self._faulty_since = None
             since = self._looked_s if self._faulty_since is None else self._faulty_since
-            if not outliving() or self._looked_s - since > patience_s:
+            if not outliving():
                 raise
+            if self._looked_s - since > patience_s:
+                raise StorageError(str(error)) from error
             if self._faulty_since is None:
                 self._tell(f"{error}; going on with {len(self)} episodes for {patience_s:.0f} s")
             self._faulty_since = since
@@ -314,7 +316,7 @@ class EpisodeStore(Episodes):
             episode = read_episode(content, shard.name, entry.key, entry.members, scan_positions=scan)
         except ConfigError as error:
             text = f"{self.folder}/{shard.name} must be a sound shard, got {error}; delete it, and {REMEDY}"
-            raise ConfigError(text) from None
+            raise StorageError(text) from None
         self._scanned.add(entry.key)
         actual = (episode.seed, episode.particle_count, episode.frame_count)
         expected = (entry.seed, entry.particles, entry.frames)

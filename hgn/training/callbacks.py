@@ -18,6 +18,7 @@ import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
 from tqdm import tqdm
 
+from hgn.data.storage import StorageError
 from hgn.schema import ConfigError, to_mapping
 from hgn.system.files import TEMPORARY_SUFFIX
 from hgn.system.progress import bar
@@ -100,7 +101,7 @@ class Checkpoints(Callback):
 
     def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
         """Saves before a training ends because its data stay away; several ranks cannot agree on it any more."""
-        if isinstance(exception, (ConfigError, OSError)) and trainer.world_size == 1 and _update(pl_module):
+        if isinstance(exception, (StorageError, OSError)) and trainer.world_size == 1 and _update(pl_module):
             self.save_last(trainer, _update(pl_module))
 
     def save_last(self, trainer: Trainer, update: int) -> None:
