@@ -11,7 +11,7 @@ import pytest
 from data.test_http import Quiet, answering
 from training.runs import metrics, train_mapping
 
-import hgn.train
+import hgn.training.session
 from hgn import train
 from hgn.data.reader import EpisodeStore
 from hgn.data.shard_cache import CACHE_VARIABLE
@@ -179,7 +179,7 @@ def test_contents_that_pass(data, body):
 def test_a_training_outlives_a_fault(data, tmp_path, monkeypatch, name):
     """A manifest that breaks as the training starts does not end it. Without patience the training ends with an error,
     and with a checkpoint of its last update, from which it goes on."""
-    started, run, again, calls = hgn.train.train_network, tmp_path / "run", EpisodeStore.ask_again, []
+    started, run, again, calls = hgn.training.session.train_network, tmp_path / "run", EpisodeStore.ask_again, []
 
     def later(store):
         calls.append(store)
@@ -190,7 +190,7 @@ def test_a_training_outlives_a_fault(data, tmp_path, monkeypatch, name):
         with faulty(data.dataset.folder, name):
             return started(*arguments)
 
-    monkeypatch.setattr(hgn.train, "train_network", broken)
+    monkeypatch.setattr(hgn.training.session, "train_network", broken)
     assert train.main(train_mapping(data, tmp_path / "whole", monitor_every=100)) == 0
     monkeypatch.setenv(VARIABLE, "0")
     monkeypatch.setattr(EpisodeStore, "ask_again", later)
@@ -199,6 +199,6 @@ def test_a_training_outlives_a_fault(data, tmp_path, monkeypatch, name):
         train.main(train_mapping(data, run, **options))
     updates = read_checkpoint(run / "checkpoints" / "last.ckpt")["hgn"]["updates"]
     assert 0 < updates < 20
-    monkeypatch.setattr(hgn.train, "train_network", started)
+    monkeypatch.setattr(hgn.training.session, "train_network", started)
     assert train.main(train_mapping(data, run, **options)) == 0
     assert metrics(run)[-1]["update"] == 20
