@@ -16,7 +16,7 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 28_936,
+    "hgn": 28_939,
     "datagen": 8_531,
     "tools": 7_191,
     "tests": 29_105,
