@@ -18,7 +18,7 @@ PACKAGES = ("hgn", "datagen", "tools")
 LINES = {  # of Python, in tracked files
     "hgn": 28_939,
     "datagen": 8_531,
-    "tools": 7_191,
+    "tools": 7_192,
     "tests": 29_105,
 }
 SETTINGS = 239  # fields of the dataclasses behind the commands, *Config

@@ -187,12 +187,10 @@ def test_flight_ends_before_the_walls():
 
 
 def test_bodies_apart_keep_their_energy():
-    """Exact motion keeps the energy of passing bodies and feels no far one; a drag or a push does not pass."""
-    exact = rows_of(Repeats(1.0, 0.0), ("apart",))
-    assert [row.held for row in exact.values()] == [True, True], exact
-    for factor, drag in ((1.0, 0.005), (1.2, -0.005)):
+    """Exact motion keeps the energy of passing bodies; a drag or a push does not pass."""
+    for factor, drag in ((1.0, 0.0), (1.0, 0.005), (1.2, -0.005)):
         row = rows_of(Repeats(factor, drag), ("apart",))["two bodies pass without contact, sand"]
-        assert not row.held and np.sign(row.measured) == -np.sign(drag)
+        assert row.held is (drag == 0.0) and (row.held or np.sign(row.measured) == -np.sign(drag)), row
 
 
 def test_funnels_have_holes_of_the_given_width():

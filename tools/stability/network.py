@@ -25,7 +25,7 @@ from hgn.runtime.rollouts import RolloutResult, simulate_scenes
 from hgn.runtime.simulator import InitialState, Simulator
 from hgn.scene.rollout_file import Rollout
 from hgn.scene.scene import Scene
-from hgn.schema import Bound, ConfigError, FrameCount, from_mapping, require_bounds, to_mapping
+from hgn.schema import Bound, ConfigError, FrameCount, Vector, from_mapping, require_bounds, to_mapping
 from tools.report import meta_of
 from tools.solver_rollouts import solver_trials
 from tools.stability.case import Case, Outcome, cut
@@ -138,10 +138,10 @@ class Runner:
         self.compiled = _compiled_kernels(simulator.backend.name)
         self._upright: dict[int, list[RolloutResult]] = {}
         self._solved: dict[int, RolloutResult] = {}  # by the scene's id
-        self._to_solve: dict[int, dict[int, Scene]] = {}  # by frames and id
+        self._to_solve: dict[tuple[int, Vector], dict[int, Scene]] = {}  # by frames and domain, then id
         for case in cases:
             for scene in (*(case.scenes if case.solver else ()), *case.upright):
-                self._to_solve.setdefault(case.frames, {})[id(scene)] = scene
+                self._to_solve.setdefault((case.frames, scene.domain_size), {})[id(scene)] = scene
 
     def rows(self, case: Case) -> tuple[list[Row], Sequence[RolloutResult]]:
         """Returns a case's rows, one but for gallery scenes, and the network's trajectories."""
@@ -172,11 +172,12 @@ class Runner:
         return self._upright[id(case.upright)]
 
     def _solver(self, scenes: Sequence[Scene], frames: int) -> list[RolloutResult]:
-        """Returns the solver's trajectories; scenes of all cases with as many frames are simulated in one launch."""
-        if pending := self._to_solve.pop(frames, {}):
-            assert self.mpm is not None
-            trials = solver_trials(list(pending.values()), self.mpm, frames, self.simulator.frame_rate_hz)
-            self._solved |= dict(zip(pending, trials, strict=True))
+        """Returns the solver's trajectories; a launch has the scenes of all cases with these frames and a domain."""
+        for domain_size in dict.fromkeys(scene.domain_size for scene in scenes):
+            if pending := self._to_solve.pop((frames, domain_size), {}):
+                assert self.mpm is not None
+                trials = solver_trials(list(pending.values()), self.mpm, frames, self.simulator.frame_rate_hz)
+                self._solved |= dict(zip(pending, trials, strict=True))
         return [self._solved[id(scene)] for scene in scenes]
 
 
