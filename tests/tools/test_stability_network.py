@@ -188,7 +188,7 @@ def test_flight_ends_before_the_walls():
 
 def test_bodies_apart_keep_their_energy():
     """Exact motion keeps the energy of passing bodies; a drag or a push does not pass."""
-    for factor, drag in ((1.0, 0.0), (1.0, 0.005), (1.2, -0.005)):
+    for factor, drag in ((1.0, 0.0), (1.0, 0.005), (1.0, -0.001)):
         row = rows_of(Repeats(factor, drag), ("apart",))["two bodies pass without contact, sand"]
         assert row.held is (drag == 0.0) and (row.held or np.sign(row.measured) == -np.sign(drag)), row
 
