@@ -16,10 +16,10 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 28_939,
+    "hgn": 28_941,
     "datagen": 8_531,
-    "tools": 7_192,
-    "tests": 29_105,
+    "tools": 7_190,
+    "tests": 29_104,
 }
 SETTINGS = 239  # fields of the dataclasses behind the commands, *Config
 

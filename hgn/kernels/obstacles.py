@@ -12,6 +12,7 @@ from hgn.kernels.triton_compat import settle_keys
 from hgn.scene import symmetry as codes
 
 OBSTACLE_COLUMNS = tl.constexpr(5)
+BARRIER_COLUMNS = tl.constexpr(7)  # of the step's table
 CODE_BITS = tl.constexpr(codes.CODE_BITS)
 CODE_MASK = tl.constexpr((1 << codes.CELL_BITS) - 1)  # of the cells in a symmetry's code
 

@@ -12,14 +12,13 @@ import numpy as np
 import torch
 
 from hgn.kernels import obstacles
-from hgn.kernels.step import kernel
 from hgn.network.barriers import Barriers
 from hgn.network.cell_keys import in_buckets, unpack
 from hgn.network.obstacles import ObstacleCells
 from hgn.scene.barrier import Barrier
 from hgn.scene.obstacle_grid import ObstacleGrid
 
-OBSTACLE_COLUMNS, BARRIER_COLUMNS = obstacles.OBSTACLE_COLUMNS.value, kernel.BARRIER_COLUMNS.value
+OBSTACLE_COLUMNS, BARRIER_COLUMNS = obstacles.OBSTACLE_COLUMNS.value, obstacles.BARRIER_COLUMNS.value
 
 
 @dataclass(frozen=True, eq=False)

@@ -359,7 +359,7 @@ def draw_kind(kinds: Mapping[str, float], rng: np.random.Generator) -> str:
         rest -= share
         if rest < 0:
             return kind
-    return next(kind for kind in reversed(kinds) if kinds[kind] > 0)
+    return [kind for kind, share in kinds.items() if share > 0][-1]
 
 
 def draw_layout(config: SceneConfig, seed: int) -> tuple[str, Layout | SceneConfig]:

@@ -18,6 +18,7 @@ from tools import render
 from tools.scenes import filled
 from tools.stability import gallery, network, solver, solver_gallery
 from tools.stability.broken import BROKEN
+from tools.stability.case import gallery_cases
 from tools.stability.gallery import load_case, load_gallery
 from tools.stability.observables import OBSERVABLES, BoundEntry, Film, period, series
 
@@ -199,7 +200,7 @@ def test_both_commands(tmp_path, monkeypatch, capsys):
     """
     path = tiny_file(tmp_path)
     monkeypatch.setattr(gallery, "scene_files", lambda folder: {"tiny": path})
-    monkeypatch.setattr(gallery, "REFERENCE", tmp_path)
+    monkeypatch.setattr("tools.stability.case.REFERENCE", tmp_path)
     monkeypatch.setattr(solver_gallery, "REFERENCE", tmp_path)
     json_file = tmp_path / "gallery_solver.json"
     options = {"weights": still_weights(tmp_path), "device": "cpu", "cases": ["gallery"]}
@@ -250,7 +251,7 @@ def test_the_stored_figures_pass():
     broken trajectory fails."""
     report = json.loads((gallery.REFERENCE / "gallery_solver.json").read_text())
     rows = {row["case"]: row for row in report["rows"]}
-    for case in gallery.gallery_cases("gallery"):
+    for case in gallery_cases("gallery"):
         series = report["scenes"][case.name]["series"]
         for bound in case.gallery.measure.bounds:
             own = {cells: bound.reduced([float(x) for x in one[bound.key].split()]) for cells, one in series.items()}

@@ -6,17 +6,16 @@ figure of the solver where the case is simulated by the solver too. A new case n
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 from hgn.runtime.rollouts import RolloutResult
 from hgn.runtime.simulator import InitialState, Simulator
 from hgn.scene.scene import Scene
-
-if TYPE_CHECKING:
-    from tools.stability.gallery import GalleryCase
+from hgn.schema import require
+from tools.stability.gallery import GRID_CELLS, REFERENCE, GalleryCase, load_gallery
 
 
 @dataclass(frozen=True)
@@ -83,3 +82,25 @@ def cut(trials: Sequence[RolloutResult], last_frames: Sequence[int]) -> list[Rol
         RolloutResult(trial.position_TN3[: last + 1], trial.cause if trial.frame_count <= last else None)
         for trial, last in zip(trials, last_frames, strict=True)
     ]
+
+
+def gallery_cases(case: str) -> list[Case]:
+    """Returns the scenes as cases, with the solver's figures from the JSON of `tools.stability solver`."""
+    loaded = load_gallery(case)
+    file = REFERENCE / f"{case}_solver.json"
+    command = f"run python -m tools.stability solver 'cases=[{case}]' --json {file}"
+    require(file.is_file(), "cases", f"{case} only where {file} has the solver's figures", case, command)
+    stored = json.loads(file.read_text(encoding="utf-8"))["scenes"]
+    cases = []
+    for each in loaded:
+        own = stored.get(each.name, {})
+        rule = f"as it was when {file.name} was measured"
+        require(own.get("digest") == each.digest, str(each.file), rule, "a change of scene", command)
+        grid = own["series"][str(GRID_CELLS[0])]
+        lacking = [bound.key for bound in each.measure.bounds if bound.key not in grid]
+        require(not lacking, str(each.file), rule, f"a new row: {', '.join(lacking)}", command)
+        figures = tuple(
+            bound.reduced([float(value) for value in grid[bound.key].split()]) for bound in each.measure.bounds
+        )
+        cases.append(Case(each.name, each.scenes, each.measure.frames, (), gallery=each, references=figures))
+    return cases

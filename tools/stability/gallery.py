@@ -23,7 +23,6 @@ from hgn.scene.scene import Scene
 from hgn.scene.scene_file import MEASURE, GroupEntry, SceneFile, read_mapping, scene_files, scene_of
 from hgn.schema import ConfigError, FrameCount, from_mapping, require, require_bounds, to_mapping
 from tools.scenes import joined
-from tools.stability.case import Case
 from tools.stability.observables import LACKS, BoundEntry, Film
 
 GALLERY = "gallery"
@@ -180,25 +179,3 @@ def _add(content: Any, place: str, change: float, field: str) -> None:
         raise ConfigError(
             f"{field} must be places of numbers in the file, as in groups.0.position.1, got {place}"
         ) from None
-
-
-def gallery_cases(case: str) -> list[Case]:
-    """Returns the scenes as cases, with the solver's figures from the JSON of `tools.stability solver`."""
-    loaded = load_gallery(case)
-    file = REFERENCE / f"{case}_solver.json"
-    command = f"run python -m tools.stability solver 'cases=[{case}]' --json {file}"
-    require(file.is_file(), "cases", f"{case} only where {file} has the solver's figures", case, command)
-    stored = json.loads(file.read_text(encoding="utf-8"))["scenes"]
-    cases = []
-    for each in loaded:
-        own = stored.get(each.name, {})
-        rule = f"as it was when {file.name} was measured"
-        require(own.get("digest") == each.digest, str(each.file), rule, "a change of scene", command)
-        grid = own["series"][str(GRID_CELLS[0])]
-        lacking = [bound.key for bound in each.measure.bounds if bound.key not in grid]
-        require(not lacking, str(each.file), rule, f"a new row: {', '.join(lacking)}", command)
-        figures = tuple(
-            bound.reduced([float(value) for value in grid[bound.key].split()]) for bound in each.measure.bounds
-        )
-        cases.append(Case(each.name, each.scenes, each.measure.frames, (), gallery=each, references=figures))
-    return cases

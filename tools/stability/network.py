@@ -28,9 +28,9 @@ from hgn.scene.scene import Scene
 from hgn.schema import Bound, ConfigError, FrameCount, Vector, from_mapping, require_bounds, to_mapping
 from tools.report import meta_of
 from tools.solver_rollouts import solver_trials
-from tools.stability.case import Case, Outcome, cut
+from tools.stability.case import Case, Outcome, cut, gallery_cases
 from tools.stability.checks import gallery_rows, refused, row_of
-from tools.stability.gallery import gallery_cases, is_gallery
+from tools.stability.gallery import is_gallery
 from tools.stability.network_cases import FAMILIES, Context, body
 from tools.stability.row import Report, Row, table
 from tools.timing import FrameClock

@@ -15,13 +15,13 @@ import triton.language as tl
 from hgn.kernels.bodies import body_of, coarsest_cells, cross, one_over, rotation, three_columns
 from hgn.kernels.cell_hash import find_cell
 from hgn.kernels.geometry import GEOMETRY_COLUMNS, lowest_middle, middles_around, split_slot
+from hgn.kernels.obstacles import BARRIER_COLUMNS
 from hgn.kernels.triton_compat import gdc_launch_dependents, gdc_wait, settle_keys
 from hgn.scene import barrier
 from hgn.step.reference import LEAST, SURE
 
 RATES = tl.constexpr(8)  # columns of what rest sums up and spreads
 SURELY, TINY = tl.constexpr(SURE), tl.constexpr(LEAST)
-BARRIER_COLUMNS = tl.constexpr(7)
 ROW = tl.constexpr(barrier.ROW)
 ONE = tl.constexpr(0x3F800000)  # its bits in float32
 NO_TRIANGLE = tl.constexpr(0x7FFFFFFF)
