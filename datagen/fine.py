@@ -53,7 +53,7 @@ def wall_thickness(config: MpmConfig, cell_size: float) -> float:
 def solver_on_grid(config: MpmConfig, cell_size: float, own_cell_size: float) -> MpmConfig:
     """Returns the solver's settings for another cell size.
 
-    Walls end at the same place on a finer grid, at most a cell further out on a coarser one.
+    Near walls end at the same place on a finer grid, far ones less than a cell further out; coarser: within a cell.
     """
     ratio = own_cell_size / cell_size
     return dataclasses.replace(config, wall_cells=max(2, 1 + int((config.wall_cells - 1) * ratio + 1e-6)))

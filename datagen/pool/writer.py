@@ -1,11 +1,10 @@
 """Episodes to shards: each finished episode is staged at once, a shard is published when its range is complete.
 
-Every file appears whole or not at all, in this order: `.staging/<key>.tar`, the shard, the manifest; staged files
-go last. So after a crash at any point the state of the folder alone says what is left to do, and no finished
-episode is simulated again. What is published is on the disk. What is staged is brought there when its shard lacks
-others for a while, so that most episodes are written once: a loss of power may take others that wait to be packed.
-Several generators may write to one folder: each claims the shards that it makes, the first to publish an episode wins,
-and the manifest is only changed under its lock, on top of what the others wrote.
+Files are created atomically in the order `.staging/<key>.tar`, shard, manifest; staged files are deleted last. So
+after a crash the folder shows what is left to do, and no finished episode is simulated again. Published shards are
+synced. A staged episode is synced on its own only if its shard is still incomplete after 2 s, so most episodes are
+written once; a power loss may lose others that are not yet packed. Several generators may write to one folder: each
+claims the shards that it makes, the first to publish an episode wins, and the manifest changes only under its lock.
 """
 
 from __future__ import annotations
@@ -50,23 +49,23 @@ from hgn.system.files import (
 )
 from hgn.system.machine import available_cpus
 
-# seeds tried for one episode before the scene distribution itself is held to be at fault
+# seeds tried for one episode before the settings of scenes are blamed
 MAXIMUM_REPLACEMENTS = 20
-STAGED_SECONDS = 2.0  # that a staged episode waits for the rest of its shard before it goes to the disk itself
-PACKED_AT_ONCE = max(4, min(12, available_cpus() - 1))  # shards, where so many are ready; 0.1 GB each
+STAGED_SECONDS = 2.0  # after which a staged episode is synced on its own if its shard is still incomplete
+PACKED_AT_ONCE = max(4, min(12, available_cpus() - 1))  # shards packed in parallel; 0.1 GB each
 
 
 _Packed = tuple[ExitStack, Path, ShardEntry]
 
 
 class DatasetWriter:
-    """One generator's hold on a data set folder; a context manager.
+    """Writes one generator's shards to a data set folder; a context manager.
 
     Entering recovers what earlier runs left: shards that are not yet in the index are checked and listed, and
-    partial files that nobody is writing are removed. Raises: ConfigError when the folder holds another data set, or
+    partial files that nobody is writing are removed. Raises: ConfigError when the folder contains another data set, or
     a file that was altered.
 
-    Of `dataset.array_tasks` writers each makes its own shards alone: its share. Without it the share is everything.
+    With `dataset.array_tasks` each writer makes only its share of the shards; without it the share is everything.
     """
 
     def __init__(self, config: DatagenConfig, report: Callable[[str], None] = lambda message: None) -> None:
@@ -83,14 +82,14 @@ class DatasetWriter:
         self._in_share = {split: bytearray(count) for split, count in self.requested.items()}  # a byte an episode
         for shard in self._share:
             self._in_share[shard.split][shard.first : shard.stop] = b"\1" * len(shard.indices)
-        self._begun = 0  # so many shards at the share's beginning are published
-        self._claimed: list[ShardRange] = []  # what of that this writer makes
-        # and what of these waits in .staging, and not on the disk yet: since when; inf: it is brought there
+        self._begun = 0  # number of shards at the share's beginning that are all published
+        self._claimed: list[ShardRange] = []  # shards that this writer makes
+        # staged episodes of these shards: the time of staging, or inf once its sync has been requested
         self._staged: dict[tuple[str, int], float] = {}
         self._syncing: list[Future[None]] = []
         self._packers = ThreadPoolExecutor(PACKED_AT_ONCE, "packer")
-        self._packing: dict[ShardRange, Future[_Packed]] = {}  # of the shards to be published next
-        self._content = b""  # of the manifest file that `manifest` was read from
+        self._packing: dict[ShardRange, Future[_Packed]] = {}  # shards that are published next
+        self._content = b""  # bytes of the manifest file that `manifest` was read from
         self._failures: list[QuarantinedScene] = []
         self._forget_published()
 
@@ -127,13 +126,13 @@ class DatasetWriter:
     def claim_next(self) -> ShardRange | None:
         """Takes the next shard of the share that is neither published nor being made by another generator.
 
-        Its staged episodes are checked and kept. None when there is no such shard, or not yet: another generator may
-        end without publishing what it has claimed.
+        Its staged episodes are checked and kept. None if there is none now; call again later, because another
+        generator may end without publishing its shards.
         """
         for shard in self._pending():
             if shard in self._claimed or not self._locks.take(shard):
                 continue
-            # whoever had it may have published it, or ended before it could list it
+            # its former owner may have published it, or ended before it could list it
             with self._locks.manifest():
                 self.refresh()
                 self._list_unlisted(self._packed_names(shard))
@@ -146,7 +145,7 @@ class DatasetWriter:
         return None
 
     def remaining(self) -> list[tuple[str, int]]:
-        """The episodes (split, index) of the claimed shards that are not staged, in the order to simulate them."""
+        """Returns the episodes (split, index) of claimed shards that are not staged, in the order to simulate them."""
         wanted = {(shard.split, index) for shard in self._claimed for index in shard.indices} - self._staged.keys()
         return sorted(wanted, key=lambda item: generation_place(*item))
 
@@ -166,7 +165,7 @@ class DatasetWriter:
         return self._published_of_share == self.total
 
     def task(self, split: str, index: int) -> SceneTask:
-        """The scene to simulate for an episode: the first seed that is not quarantined.
+        """Returns the scene to simulate for an episode: the first seed that is not quarantined.
 
         Raises: ConfigError when too many seeds in a row could not be simulated.
         """
@@ -191,7 +190,7 @@ class DatasetWriter:
         return self.task(task.split, task.index)
 
     def add_staged(self, split: str, index: int) -> None:
-        """Tells the writer that an episode was staged."""
+        """Records that an episode was staged."""
         self._staged[split, index] = time.monotonic()
 
     def is_staged(self, split: str, index: int) -> bool:
@@ -204,10 +203,10 @@ class DatasetWriter:
         return bool(self._packing)
 
     def publish_next(self, wait: bool = True) -> ShardEntry | None:
-        """Publishes one claimed shard whose episodes are all staged; None when there is no such shard, or, unless it
-        is to `wait`, while they are being packed.
+        """Publishes one claimed shard whose episodes are all staged, and returns its entry.
 
-        Raises: OSError (a full disk): nothing half-written is left and what was published stays untouched.
+        None if no shard is complete, or with wait=False if none is packed yet. Raises: OSError (a full disk); no
+        partial file is left then, and published shards are unchanged.
         """
         ready = [
             shard for shard in self._claimed if all((shard.split, index) in self._staged for index in shard.indices)
@@ -215,7 +214,7 @@ class DatasetWriter:
         self._sync_staged(ready, time.monotonic() - STAGED_SECONDS)
         if not ready:
             return None
-        # two rounds, so that no packer waits while this thread lists what is packed
+        # two shards per packer, so that none is idle while this thread lists packed shards
         for shard in ready[: 2 * PACKED_AT_ONCE] if len(ready) > 1 or not wait else []:
             if shard not in self._packing:
                 self._packing[shard] = self._packers.submit(self._pack, shard)
@@ -228,7 +227,7 @@ class DatasetWriter:
         return entry
 
     def _sync_staged(self, ready: Sequence[ShardRange], before: float) -> None:
-        """Has what was staged before that time brought to the disk, unless its shard is among the `ready` ones."""
+        """Syncs episodes staged before `before`, unless their shard is among the `ready` ones."""
         packed = {(shard.split, index) for shard in ready for index in shard.indices}
         for episode, since in self._staged.items():
             if since <= before and episode not in packed:
@@ -239,7 +238,7 @@ class DatasetWriter:
             done.result()
 
     def _pack(self, shard: ShardRange) -> _Packed:
-        """A shard's file under a temporary name, which is gone when the stack is closed, and its checked entry."""
+        """Writes a shard to a temporary file that closing the stack deletes; returns both and the checked entry."""
         with ExitStack() as stack:
             temporary = stack.enter_context(temporary_file(self.folder / STAGING_NAME / shard.name))
             with temporary.open("wb") as file:
@@ -266,7 +265,7 @@ class DatasetWriter:
         return entry
 
     def _winner(self, shard: ShardRange) -> ShardEntry | None:
-        """Returns the shard of another generator that has a claimed one's episodes, or None: locks may not work."""
+        """Returns another generator's shard with these episodes, or None. Guards against locks that do not work."""
         self.refresh()
         if missing_ranges([shard], self._published) == [shard]:
             return None
@@ -305,13 +304,13 @@ class DatasetWriter:
         return True
 
     def _packed_names(self, shard: ShardRange) -> set[str]:
-        """Shards with episodes of this range that somebody was publishing."""
+        """Returns the names of shards that overlap this range, with a leftover temporary file."""
         names = {temporary_target(path) for path in (self.folder / STAGING_NAME).glob(f".*{TEMPORARY_SUFFIX}")}
         ranges = {name: parse_shard_name(name) for name in names}
         return {name for name, other in ranges.items() if other is not None and _overlap(shard, other)}
 
     def _list_unlisted(self, names: set[str]) -> None:
-        """Lists those shards that were published by a generator that ended before it could say so."""
+        """Lists those shards that were published by a generator that ended before it could list them."""
         for name in sorted(names):
             shard, path = parse_shard_name(name), self.folder / name
             if shard is None or not path.exists():
@@ -325,7 +324,7 @@ class DatasetWriter:
             self._report(f"{name} was published but not yet listed; checked and listed")
 
     def _find_staged(self, shard: ShardRange) -> None:
-        """Checks what earlier runs left of a shard that was just claimed, and removes what they were writing."""
+        """Checks the staged episodes of a shard that was just claimed, and removes partial files of earlier runs."""
         for index in shard.indices:
             path = staged_path(self.folder, shard.split, index)
             for partial in path.parent.glob(f".{path.name}.*{TEMPORARY_SUFFIX}"):
@@ -342,7 +341,7 @@ class DatasetWriter:
                 self.add_staged(shard.split, index)
 
     def _sweep(self) -> None:
-        """Removes partial files of writers that are gone: nobody else has claimed what they were to be."""
+        """Removes partial files of ended writers: those whose shard or episode no one has locked."""
         for folder in (self.folder, self.folder / STAGING_NAME):
             for path in folder.glob(f".*{TEMPORARY_SUFFIX}"):
                 name = temporary_target(path)
@@ -368,7 +367,7 @@ class DatasetWriter:
         self._failures = []
 
     def _note_published(self) -> None:
-        """Takes notice of the shards that `manifest` has in addition."""
+        """Reads the shards that `manifest` has in addition."""
         for shard in self.manifest.shards.since(self._listed):
             published, in_share = self._published[shard.split], self._in_share[shard.split]
             published.extend(bytes(max(shard.stop - len(published), 0)))
@@ -377,7 +376,7 @@ class DatasetWriter:
         self._listed = len(self.manifest.shards)
 
     def refresh(self) -> None:
-        """Takes notice of what other generators have published."""
+        """Reads the shards that other generators have published."""
         try:
             content = read_replaced(self.folder / MANIFEST_NAME)
         except FileNotFoundError:  # removed by hand: it is written anew with the next shard
@@ -420,7 +419,7 @@ def _overlap(one: ShardRange | ShardEntry, other: ShardRange | ShardEntry) -> bo
 
 
 def _link(temporary: Path, target: Path) -> bool:
-    """Gives a finished file its name; False when the name is taken: a file that is there is never replaced."""
+    """Gives a finished file its name. Returns False if the name is taken: an existing file is never replaced."""
     try:
         target.hardlink_to(temporary)
     except FileExistsError:

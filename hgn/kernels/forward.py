@@ -1,4 +1,4 @@
-"""The network on fixed-capacity buffers: its forward pass as a fixed list of launches, fit for one CUDA graph.
+"""The network on fixed-capacity buffers: a fixed list of launches, suitable for capture in one CUDA graph.
 
 Nothing here reads a value back to the host. Each kernel's file describes its launch; the order is the paper's (sec.
 3.2). Shape legend: N particles, C cells, W width.
@@ -25,13 +25,13 @@ from hgn.schema import require
 
 PRECISIONS = ("fp32", "tf32", "fp16")
 CLEAR_ROWS = 64
-ADDRESSED = 2**31  # elements of a tensor, in int32; edges of more are addressed in 64 bits
+ADDRESSED = 2**31  # int32 index limit; larger edge tensors use 64-bit indices
 REMEDY = "take fewer at once, or backend torch"
-NONE = -1  # where a product has no bias
+NONE = -1  # bias offset that means: no bias
 
 
 def _require_room(grid: DeviceGrid, width: int, training: bool) -> None:
-    """Raises: ConfigError where a tensor has more elements than int32 can count, but for edges without gradients."""
+    """Raises: ConfigError if a tensor exceeds the int32 index limit, except edge tensors in simulations."""
     pairs, edges = (8, 6) if training else (1, 1)
     for what, count, each in (("particles", grid.particles, pairs), ("cells", grid.capacities[0], edges)):
         most = (ADDRESSED - 1) // (each * width)
@@ -42,9 +42,9 @@ def _require_room(grid: DeviceGrid, width: int, training: bool) -> None:
 class FusedNetwork(Buffers):
     """Runs a packed network on a DeviceGrid.
 
-    `values` float32 [packed.size] are the parameters. In fp16 and TF32 the products read `weights`, their
-    rounded copy; call `refresh` after every change of `values`. With `training` everything that a backward pass reads
-    is kept.
+    `values` float32 [packed.size] are the parameters. In fp16 and TF32 matrix products use `weights`, a rounded copy of
+    `values`; call `refresh` after every change of `values`. With `training` everything that a backward pass reads is
+    kept.
     """
 
     def __init__(
@@ -67,7 +67,7 @@ class FusedNetwork(Buffers):
         self.device = values.device
         rounded = precision in ("fp16", "tf32")
         self.weights = torch.empty_like(values, dtype=self.operand) if rounded else values
-        # Falling particles have the same features frame after frame: the encoder's rounding would push all one way.
+        # Finer encoder in simulations: falling particles repeat their features, so its rounding would push all one way.
         self.fine = rounded and not training
         self.encode_weights = torch.zeros(self.width, grid.features, device=self.device)
         self.tuning = tuning or Tuning.of(precision)
@@ -83,7 +83,7 @@ class FusedNetwork(Buffers):
         self.refresh_encoder()
 
     def refresh_encoder(self) -> None:
-        """Computes the encoder's first layer on features and one-hot materials, from embedding and bias."""
+        """Folds embedding and bias into the encoder's first layer, so that it takes one-hot materials."""
         first, embedding, bias = self._encode_views(self.values)
         used = self.config.feature_width - MATERIAL_EMBEDDING
         materials = len(self.config.materials)
@@ -109,7 +109,7 @@ class FusedNetwork(Buffers):
     # forward
 
     def forward(self) -> None:
-        """From the grid's features and tables to `output` [N, OUT]: normalised accelerations in columns 0 to 2."""
+        """Computes `output` [N, OUT] from the grid's features and tables; columns 0 to 2: normalised accelerations."""
         packed, grid, levels = self.packed, self.grid, self.config.levels
         self._mlp(
             packed.encode, grid.feature_NF, self.particle_count, self.latent, self.encode_hidden,
@@ -174,7 +174,7 @@ class FusedNetwork(Buffers):
         return self.tuning.overlap and overlaps()
 
     def stores_pair_hidden(self) -> bool:
-        """Returns whether the hidden layer of pairs is stored for the backward pass (see particle_cell_forward)."""
+        """Returns whether the hidden layer of particle-cell pairs is stored for the backward pass."""
         return self.precision == "tf32"
 
     def _mlp(
@@ -244,7 +244,7 @@ class FusedNetwork(Buffers):
         )  # fmt: skip
 
     def _begin(self, block: Block, from_children: bool) -> None:
-        """The block's input and its products for the first iteration."""
+        """Computes the block's input and its products for the first iteration."""
         grid, level, edge = self.grid, block.level, block.packed.edge[0]
         rows = grid.capacities[level]
         size, warps = self.tuning.row_tile(rows)

@@ -28,10 +28,9 @@ class Stepper(Protocol):
     """Computes the frames that follow a state, on the device of the state."""
 
     def blocks(self, frames: int) -> Iterator[tuple[torch.Tensor, bool]]:
-        """Yields positions [T, N, 3] of the next `frames` frames in blocks, each with whether its last frame has
-        particles that diverged; such a block is the last one.
+        """Yields (block, diverged) for the next `frames` frames; a block has positions [T, N, 3].
 
-        A block is valid until the next one is requested.
+        If particles diverged in a block's last frame, no block follows. A block is valid until the next is requested.
         """
 
     def motion(self) -> tuple[torch.Tensor, torch.Tensor]:
@@ -46,7 +45,7 @@ class Stepper(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Entry:
-    """Particles that enter in a frame, behind all others."""
+    """Particles that enter in a frame; they are appended to the existing ones."""
 
     frame: int
     state: ParticleState
@@ -64,8 +63,8 @@ class Simulation:
     ) -> None:
         """`stepper_of` allocates buffers and frees them on exit: Backend.stepper. `entries` are sorted by frame.
 
-        isolate: a scene that diverges ends, is entered in `ended`, and the others continue; otherwise the first
-        divergence raises DivergedError. A scene beyond the range of the grid ends all.
+        isolate: a scene that diverges ends and is recorded in `ended`, and the others continue; otherwise the first
+        divergence raises DivergedError. A scene beyond the range of the grid ends all scenes.
         """
         self.isolate, self.frame, self.entries = isolate, 0, list(entries)
         self.ended: dict[int, DivergedError] = {}
@@ -102,14 +101,14 @@ class Simulation:
         return len(self._state.material_N)
 
     def continue_from(self, state: ParticleState) -> None:
-        """Replaces the state; no scene of it has ended."""
+        """Replaces the state and clears `ended`."""
         self.ended.clear()
         self._row_count = len(state.position_N3)
-        self._row_N: torch.Tensor | None = None  # rows of the particles in blocks; None: all, in order
+        self._row_N: torch.Tensor | None = None  # output row of each remaining particle; None: all, in order
         self._begin(state)
 
     def add(self, new: ParticleState) -> None:
-        """Adds particles behind the others; those of scenes that ended get an output row of NaN."""
+        """Appends particles to the existing ones; those of scenes that ended get an output row of NaN."""
         old, rows_N = self.state, self._rows()
         going_A = torch.tensor([i not in self.ended for i in range(old.scene_count)], device=old.scene_N.device)
         going_A = going_A[new.scene_N]
@@ -138,10 +137,10 @@ class Simulation:
         return position_TN3
 
     def blocks(self, frames: int) -> Iterator[torch.Tensor]:
-        """Yields positions [T, N, 3] of the next `frames` frames on the device, without particles that enter later;
-        otherwise as `run`.
+        """Yields positions [T, N, 3] of the next `frames` frames in blocks on the device.
 
-        A block is valid until the next one is requested.
+        As in `run`, positions are NaN in a scene that ended; blocks lack the particles that enter later. Raises as
+        `run`. A block is valid until the next one is requested.
         """
         end = self.frame + frames
         while self.entries and self.entries[0].frame <= end:

@@ -1,9 +1,9 @@
 """Scenes as users make them, by kind: pools, dam breaks, columns, slopes, edges, bowls, stairs and others.
 
-A kind draws a domain from DOMAINS, numbers uniformly from its RANGES, and places obstacles and bodies. Like the scenes
-of `hgn.scene.random_scene`, one follows from (config, seed) alone, bitwise on every machine: no sines or logarithms.
-Lengths in domain units, speeds in domain units per second. Bodies are boxes or balls; "tilt" is the tangent of half an
-angle, so that rotations are sums, products and quotients.
+A kind draws a domain from DOMAINS, numbers uniformly from its RANGES, and places obstacles and bodies. As in
+`hgn.scene.random_scene`, a scene is determined by (config, seed), bitwise on every machine. Lengths are in domain
+units, speeds in domain units per second. Bodies are boxes or balls; "tilt" is the tangent of half an angle, so
+rotations need no sine or cosine.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from hgn.scene.placement import CLEARANCE_CELLS, ROUNDING, Body, Placed, blocked
 from hgn.schema import ConfigError, Vector
 
 MAXIMUM_PARTICLES = 16_000  # of a scene; larger ones are drawn again
-DRAWS = 500  # of a scene of a kind, before giving up
+DRAWS = 500  # attempts to place one scene
 FALLING = (0.0, -9.8, 0.0)
 UNTURNED = (1.0, 0.0, 0.0, 0.0)
 
 Quaternion = tuple[float, float, float, float]
 
-# Edges in solver cells of 1/64. There are few, because scenes of one domain are simulated in one launch.
+# Edges in solver cells of 1/64. Few, because only scenes with equal domains share a launch.
 DOMAINS: dict[str, tuple[int, int, int]] = {
     "small": (24, 40, 24),
     "box": (20, 32, 20),
@@ -66,7 +66,7 @@ class _DrawAgainError(Exception):
 
 @dataclass
 class Layout:
-    """A scene of a kind while it is drawn: call it with the name of one of the kind's RANGES for a number."""
+    """An unfinished scene. layout('size') draws a number from RANGES[kind]['size']."""
 
     config: SceneConfig
     kind: str
@@ -79,7 +79,7 @@ class Layout:
     particles: int = 0
 
     def __call__(self, name: str, small: bool = False) -> float:
-        """Returns a number of the range; `small` ones are frequent, as with a uniform square root."""
+        """Returns a number of the range; with `small` the square of a uniform number is used."""
         low, high = RANGES[self.kind][name]
         part = self.rng.random()
         return low + (high - low) * (part * part if small else part)
@@ -112,7 +112,7 @@ class Layout:
         return self.domain[axis] - self.low
 
     def along(self, axis: int, half: float) -> float:
-        """Returns a coordinate at which a body of a half width is clear of the walls."""
+        """Returns a coordinate at which a body with this half width is clear of the walls."""
         first = self.low + half + ROUNDING
         span = self.high(axis) - half - ROUNDING - first
         if span < 0:
@@ -129,7 +129,7 @@ class Layout:
     def add(
         self, shape: str, size: Vector, centre: Vector, velocity: Vector = (0.0, 0.0, 0.0), material: str = ""
     ) -> None:
-        """Adds a body of a drawn material, or of the named one where the config has it.
+        """Adds a body of a drawn material, or of the named one if config.materials contains it.
 
         Raises: _DrawAgainError where it is not clear of walls, obstacles and other bodies, or too large.
         """
@@ -195,7 +195,7 @@ def _pool(new: Layout) -> None:
 
 
 def _dam(new: Layout) -> None:
-    """A block of water, at times of another material, stands at one end of a channel as wide as itself."""
+    """A block of water, at times of another material, stands at one end of a channel and fills the width."""
     new.take_domain("flume", "long", "tray", "small")
     far = (new.low + new("length"), new.low + new("height"), new.high(2))
     new.box((new.low,) * 3, far, material="water" if new.chance(0.75) else "")
@@ -315,7 +315,7 @@ def _stairs(new: Layout) -> None:
 
 
 def _jet(new: Layout) -> None:
-    """A bar flies along itself, often against a wall; half of the jets know no gravity."""
+    """A bar flies along itself, often against a wall; half of the jets have no gravity."""
     new.take_domain("hall", "room", "long")
     length, width = new("length"), new("width")
     centre = (new.along(0, 0.5 * length), new.along(1, 0.5 * width), new.along(2, 0.5 * width))
@@ -331,7 +331,7 @@ _PLACED: dict[str, Callable[[Layout], None]] = {
 
 
 def _paper(new: Layout) -> SceneConfig:
-    """Returns the settings of a kind whose items are placed at random, as in the paper."""
+    """Returns settings for random_scene, for a kind that places its items at random, as in the paper."""
     new.take_domain("room", "hall")
     config = replace(new.config, kinds={}, domain_size=new.domain, group_size=new("size"))
     volume = (config.group_size / config.cell_size) * (config.group_size / config.cell_size)
@@ -365,8 +365,8 @@ def draw_kind(kinds: Mapping[str, float], rng: np.random.Generator) -> str:
 def draw_layout(config: SceneConfig, seed: int) -> tuple[str, Layout | SceneConfig]:
     """Draws a scene of a kind in `config.kinds`.
 
-    Returns the kind, with its layout, or with the settings of the scenes of `hgn.scene.random_scene` that it is one of.
-    Raises: ConfigError where a kind does not fit, which no settings of the shipped experiments do.
+    Returns the kind, with a Layout, or for the kinds of `_paper` with settings for `hgn.scene.random_scene`.
+    Raises: ConfigError if a kind does not fit into `config.domain_size`; those of the shipped experiments fit.
     """
     rng = np.random.Generator(np.random.PCG64([seed, 4]))
     kind = draw_kind(config.kinds, rng)

@@ -43,14 +43,14 @@ class Ranks:
 
 
 class Updates(Protocol):
-    """Makes the updates of chunks of samples."""
+    """Trains on chunks of samples."""
 
     @property
     def pool_figures(self) -> dict[str, float]:
         """Metrics of the pushforward pool, empty without one."""
 
     def run(self, chunk: Any, first_update: int) -> None:
-        """Makes an update for each entry of `chunk.samples`; `first_update` is the number of the first, from 0.
+        """Makes an update for each entry of `chunk.samples`; `first_update` is the number of the first one, from 0.
 
         Losses and gradient norms are added to the TrainedNetwork's tensors: nothing waits for the device.
         Raises: ConfigError when the backend computes wrongly on this machine.
@@ -61,5 +61,5 @@ def build_optimizer(network: ParticleNetwork, training: TrainingConfig) -> torch
     """Returns the optimiser of a training."""
     if training.optimizer == "muon":
         return Muon(network, training.learning_rate)
-    # One launch instead of several for each group of tensors; only the fused kind can skip a step by itself.
+    # One launch; and only fused Adam skips a step whose gradients are not finite, without the host.
     return torch.optim.Adam(network.parameters(), lr=training.learning_rate, fused=True)
