@@ -1,6 +1,6 @@
 """Simulates the scenes of a data set on a finer grid than the networks see, with more particles.
 
-Each particle of a scene, called visible, stands for the same number of fine particles, its children: one begins at its
+Each visible particle of a scene is represented by the same number of fine particles, its children: one begins at its
 place, the others around it, with their mean there. So all fine particles have the same mass, and a scene's first frame,
 total mass, momentum and centre of mass do not depend on the grid. An episode contains the first child of each visible
 particle: the mean of all is no point of the material once they part (results/solver/README.md).

@@ -21,7 +21,7 @@ from hgn.training.updates import TrainedNetwork
 
 
 class TorchUpdates:
-    """Makes the updates of chunks with PyTorch; hgn.training.updates.Updates describes the methods."""
+    """Trains on chunks of samples with PyTorch; hgn.training.updates.Updates describes the methods."""
 
     def __init__(
         self,

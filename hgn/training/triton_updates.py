@@ -36,7 +36,7 @@ DATA_FRACTION = 0.6  # largest fraction of a GPU's memory for episodes; the othe
 
 
 class TritonUpdates:
-    """Makes the updates of chunks with CUDA graphs; hgn.training.updates.Updates describes the methods."""
+    """Trains on chunks of samples with CUDA graphs; hgn.training.updates.Updates describes the methods."""
 
     def __init__(
         self, trained: TrainedNetwork, training: TrainingConfig, obstacle_cell_size: float, ranks: Ranks

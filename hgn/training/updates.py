@@ -1,4 +1,4 @@
-"""The interface of training updates, which both backends implement, and what they update.
+"""The interface for training on chunks of samples, which both backends implement, and the state that it changes.
 
 | backend | class | updates of a chunk |
 |---|---|---|
