@@ -96,7 +96,7 @@ def _exit_code(main: Main | str, config_name: str) -> int:
             raise
         code = _fail(missing, EXIT_MACHINE)
     except OSError as error:
-        if isinstance(error, BrokenPipeError):
+        if isinstance(error, (BrokenPipeError, FileNotFoundError)):  # of a file that we should have looked for
             raise
         place = f": {error.filename}" if error.filename else ""
         remedy = _MACHINE_ERRORS.get(error.errno or 0, "check the disk and its network")

@@ -16,8 +16,8 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 28_941,
-    "datagen": 8_531,
+    "hgn": 28_940,
+    "datagen": 8_530,
     "tools": 7_190,
     "tests": 29_104,
 }

@@ -113,7 +113,7 @@ def test_reader_that_leaves(port, file, caplog):
     caplog.set_level(logging.WARNING)
     for _ in range(3):
         with socket.create_connection(("127.0.0.1", port)) as leaving:
-            leaving.sendall(b"GET /file HTTP/1.1\r\nHost: x\r\n\r\n")
+            leaving.sendall(b"GET /file HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")
             assert leaving.recv(1000).startswith(b"HTTP/1.1 200 OK")
     assert get(port) == file.read_bytes() and not caplog.records
 

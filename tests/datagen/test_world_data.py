@@ -23,7 +23,7 @@ def test_one_batch_has_scenes_of_several_domains():
     )
     tasks = [SceneTask("train", index, 0, seed) for index, seed in enumerate((5, 1, 9, 2, 7))]
     made = [make_scene(task, config, Backend())[1] for task in tasks]
-    results = simulate_batch(made, config, Backend(), 1)
+    results = simulate_batch(made, config, Backend(), 2)
     episodes = [make_episode(one, result, config, "0") for one, result in zip(made, results, strict=True)]
     assert len({episode.domain_size for episode in episodes}) > 1
     for one, episode in zip(made, episodes, strict=True):

@@ -205,7 +205,7 @@ VALUES = [
     ("train", ["training.noise_std=nan"], "training.noise_std must be a finite number >= 0, got nan"),
     ("train", ["network.obstacle_features=false"], "network.obstacle_features must be true for scenes with obst"),
     ("train", ["network.materials=[lava]"], "network.materials must be all of scene.materials, got ['lava']"),
-    ("train", ["scene.tilted_gravity_fraction=0.1"], "network.inputs must be relative where scene.zero_gravity_fracti"),
+    ("train", ["scene.tilted_gravity_fraction=0.1"], "network.inputs must be relative where scene.kinds are given, or"),
     ("train", ["+experiment=moon"], "Could not find 'experiment/moon'"),
     ("export", ["checkpoint=none.ckpt", "out=x"], "checkpoint must be an existing file, got none.ckpt; hgn.train"),
     ("export", ["checkpoint=none.ckpt", "out="], "out must be a file name, got ''"),
@@ -282,7 +282,7 @@ FILES = [
     ("export", OF_RUN, CUT_RUN, "checkpoint must be a whole checkpoint file, got"),
     ("export", EXPORT, of("checkpoint", dict.clear), "checkpoint must be one of python -m hgn.train, got foreign.ckpt"),
     ("export", EXPORT, of("network", wings=2), "got foreign.ckpt: network.wings is not a known key; "),
-    ("export", EXPORT, of("network", width=16), "got foreign.ckpt: size mismatch for "),
+    ("export", EXPORT, of("network", width=16), "got foreign.ckpt: checkpoint tensor "),
     *((*call, RATE, RATES) for call in (("rollout", EPISODE), ("evaluate", EVALUATE))),
     *(
         (*call, SNOW, "must be one of the network's (snow), got ")

@@ -188,7 +188,7 @@ MISTAKES = [
     (obstacle_with(size=1e300), OBSTACLE + r".size must be in the range of float32, got 1e\+300"),
     (scene_with(domain_size=[1, -1, 1]), r"domain_size\[1\] must be a finite number > 0, got -1"),
     (scene_with(domain_size=[1, 1]), "domain_size must be a list of 3 values"),
-    (scene_with(domain_size=[0.05, 1, 1]), GROUP + BETWEEN_WALLS),
+    (scene_with(domain_size=[0.125, 1, 1]), GROUP + BETWEEN_WALLS),
     (scene_with(gravity=[0, float("inf"), 0]), r"gravity\[1\] must be finite, got inf"),
     (scene_with(floor_friction=-0.1), "floor_friction must be a finite number >= 0, got -0.1"),
     (scene_with(wall_friction=float("nan")), "wall_friction must be a finite number >= 0, got nan"),
