@@ -53,7 +53,7 @@ demo: $(VENV)/.demo
 test: setup
 	$(RUN) -m pytest -n $(TEST_PROCESSES)
 
-# exported packages of each kind of network, which PyTorch compiles; CI runs them behind the other tests
+# exported packages and all kernels for an H100 are compiled; CI runs these tests after the others
 slow: setup
 	$(RUN) -m pytest -n $(TEST_PROCESSES) -m slow
 

@@ -29,11 +29,13 @@ def test_versions_that_were_not_read_are_refused():
     assert [f"3.{minor}" for minor in range(int(ceiling[0]), int(ceiling[1]))] == list(TESTED_VERSIONS)
 
 
+@pytest.mark.slow
 def test_the_interface_is_as_it_was(lines):
     """Launches can be noted without being made, compiled by what was noted, and the compilation is told of."""
     assert ["CANARY", "_copy"] in lines
 
 
+@pytest.mark.slow
 def test_what_the_interpreter_forgives(lines):
     """All kernels of grids and relative inputs compile, of an update and of a frame, held by walls and obstacles or by
     nothing: the interpreter takes what Triton does not, a constant that is defined twice say."""
@@ -43,6 +45,7 @@ def test_what_the_interpreter_forgives(lines):
     assert compiled.count("integrate") == 3  # free, between obstacles, and between walls too
 
 
+@pytest.mark.slow
 def test_who_starts_early_waits(lines):
     """Every kernel that may start before the one before it has ended waits for that, and those of a forward pass before
     they write; but for three whose writes nobody before them looks at: beside the tables, the encoder, the decoder."""
@@ -53,6 +56,7 @@ def test_who_starts_early_waits(lines):
     assert writers == {"prepare_particles", "clear_rows", "sum_coarsest"}, early
 
 
+@pytest.mark.slow
 def test_no_tile_is_copied_over_one_that_is_being_multiplied(lines):
     """Of the weights' products tiles are copied to shared memory ahead, and each product is over before the next copy:
     the compiler keeps too few buffers for one that is under way meanwhile."""
@@ -61,6 +65,7 @@ def test_no_tile_is_copied_over_one_that_is_being_multiplied(lines):
     assert all(int(ahead) >= 2 and int(pending) == 0 for _, ahead, pending in products), products
 
 
+@pytest.mark.slow
 def test_no_group_overwrites_what_another_still_multiplies(lines):
     """Kernels of eight warps have a barrier between a product and the next write to what a product reads, for the wait
     for products of Triton 3.6 to 3.8 holds four warps alone."""
@@ -75,6 +80,7 @@ def test_no_group_overwrites_what_another_still_multiplies(lines):
     assert not [line for line in scanned if int(line[-1])], scanned
 
 
+@pytest.mark.slow
 def test_narrow_networks_fit_into_less_shared_memory(lines):
     """Compiled for a GPU with 99 KB of it, as those for graphics have, the kernels of width 64 take no more."""
     shared = {kernel: int(size) for what, kernel, size in (line[:3] for line in lines if line[0] == "SHARED")}
