@@ -16,10 +16,10 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 28_940,
+    "hgn": 28_952,
     "datagen": 8_530,
     "tools": 7_190,
-    "tests": 29_104,
+    "tests": 29_128,
 }
 SETTINGS = 239  # fields of the dataclasses behind the commands, *Config
 

@@ -113,9 +113,9 @@ class PlayPage:
     def run(self) -> None:
         """Simulates from the first viewer's arrival until `close`, at most in real time."""
         due = updated = time.monotonic()
-        frames = 0
+        frames, shown = 0, True
         while not self.ended.is_set():
-            changed = self._do_all()
+            changed = self._do_all() or not shown
             if (self.playing and self.viewed.is_set()) or self.steps:
                 self.steps = max(0, self.steps - 1)
                 try:
@@ -125,14 +125,26 @@ class PlayPage:
                     self._notify(f"{error}; paused a frame before. Back by or Restart")
                 frames, changed = frames + 1, True
             if changed:
-                self._show()
+                shown = self._updates(self._show)
             now = time.monotonic()
             if now - updated >= STATUS_S:
                 self.frames_a_second = frames / (now - updated)
                 updated, frames = now, 0
-                self._show_status()
+                self._updates(self._show_status)
             due = max(due + 1 / self.rate, now)
             self.ended.wait(max(0.0, due - now) if due > now else 0)
+
+    def _updates(self, show: Callable[[], None]) -> bool:
+        """Changes what viewers see; returns False where that failed, to be tried again.
+
+        viser wakes its event loop from this thread without a lock, which fails at times while a viewer comes or goes.
+        """
+        try:
+            show()
+        except Exception as error:  # noqa: BLE001 - one viewer's connection must not end the session of all
+            traceback.print_exception(error, file=sys.stderr)
+            return False
+        return True
 
     def close(self) -> None:
         """Ends the server, once `run` is over: `ended.set()` ends it from another thread."""

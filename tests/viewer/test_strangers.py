@@ -1,5 +1,6 @@
 """What strangers send to the page of hgn.play: names, values, files and requests; no browser is needed."""
 
+import asyncio
 import gc
 import http
 import re
@@ -137,6 +138,23 @@ def test_any_error_of_one_viewer_is_a_message_to_that_viewer(page, messages, cap
     page._do_all()
     assert len(messages) == 1 and type(error).__name__ in messages[0]
     assert done and type(error).__name__ in capsys.readouterr().err
+
+
+def test_an_update_that_fails_is_tried_again(page, monkeypatch, capsys):
+    """viser may fail where a viewer comes or goes: the session goes on, and the next round shows what is missing."""
+    shown, failures = [], [RuntimeError("deque mutated during iteration"), asyncio.InvalidStateError("done")]
+
+    def show():
+        if failures:
+            raise failures.pop()
+        shown.append(page.session.frame)
+        page.ended.set()
+
+    monkeypatch.setattr(page, "_show", show)
+    page.playing = False
+    page.do(lambda: None)
+    page.run()
+    assert len(shown) == 1 and "deque mutated" in capsys.readouterr().err
 
 
 def test_values_beyond_the_sliders_are_clamped(page, monkeypatch):
