@@ -16,7 +16,7 @@ import yaml
 from hgn.command import run_command
 from hgn.data.manifest import SPLITS, Manifest
 from hgn.data.storage import is_remote
-from hgn.scene.world import RANGES
+from hgn.scene.kinds import RANGES
 from hgn.schema import from_mapping, require
 from hgn.system.files import write_atomically
 

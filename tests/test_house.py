@@ -16,8 +16,8 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 28_952,
-    "datagen": 8_530,
+    "hgn": 28_946,
+    "datagen": 8_531,
     "tools": 7_190,
     "tests": 29_128,
 }

@@ -142,7 +142,8 @@ def make_scene(task: SceneTask, config: DatagenConfig, backend: Backend, with_gr
     try:
         scene = generate_scene(config.scene, task.seed)
         # built here, because in the solver the device would wait for one scene after another
-        collider = build_collider(scene_to_simulate(scene, config), config.mpm.choices.collider_band_cells)
+        finer = replace(scene, cell_size=config.reference_cell_size)
+        collider = build_collider(finer, config.mpm.choices.collider_band_cells)
     except ConfigError as error:  # for example no room for the obstacles; another seed may fit
         return "failed", task.key, str(error)
     made = MadeScene(task, Parcel(scene), None, Parcel(collider))

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from hgn.config import DatagenConfig
-from hgn.scene.world import MAXIMUM_PARTICLES
+from hgn.scene.kinds import MAXIMUM_PARTICLES
 from hgn.schema import require
 
 GPU_SCENES_PER_LAUNCH = 416  # several for each thread-block team

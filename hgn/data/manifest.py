@@ -26,14 +26,14 @@ from hgn.data.entries import (
 from hgn.data.identity import identity_hash
 from hgn.data.index import Index, IndexState, ListedIndex, begin, extend, parse_json
 from hgn.data.statistics import Statistics
-from hgn.data.storage import ask, open_storage
+from hgn.data.storage import Storage, ask, open_storage
 from hgn.scene.episode import SCHEMA_VERSION, require_schema_version
 from hgn.schema import ConfigError, from_mapping, require, to_mapping
 from hgn.system.files import write_atomically
 
 __all__ = ["MANIFEST_NAME", "SPLITS", "EpisodeEntry", "Manifest", "QuarantinedScene", "ShardEntry"]
 MANIFEST_NAME = "manifest.json"
-MOST_BYTES = 32 << 20  # of it; one of the first release lists 8,000 shards in so many
+MOST_BYTES = 32 << 20  # enough for 8,000 shards in a manifest of the first release
 
 
 @dataclass(frozen=True)
@@ -76,11 +76,13 @@ class Manifest(_Identity):
         Raises: ConfigError when it is missing, no JSON, of another schema version, or wrong in any field;
         UnreachableError when the server stays away.
         """
+
+        def read(files: Storage) -> Manifest:
+            return Manifest.parse(files.manifest(MANIFEST_NAME, patience_s), folder)
+
         path = f"{folder}/{MANIFEST_NAME}"
         try:
-            if patience_s != 0:
-                return ask(folder, lambda files: Manifest.parse(files.manifest(MANIFEST_NAME, patience_s), folder))
-            return Manifest.parse(open_storage(folder).manifest(MANIFEST_NAME, 0.0), folder)
+            return read(open_storage(folder)) if patience_s == 0 else ask(folder, read)
         except (FileNotFoundError, NotADirectoryError):
             raise ConfigError(
                 f"{path} must be the manifest of a data set, got no such file; generate one with "

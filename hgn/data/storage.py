@@ -15,7 +15,7 @@ import os
 import threading
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection
 from io import BufferedRandom
 from pathlib import Path
 from typing import Any, TypeVar
@@ -27,7 +27,7 @@ from hgn.schema import ConfigError, require
 from hgn.system.extras import missing_extra
 from hgn.system.files import read_replaced
 from hgn.system.hub import PREFIX, HubPlace, hub_token
-from hgn.system.patience import UnreachableError, patiently, standard_patience_s
+from hgn.system.patience import UnreachableError, inside, patiently, standard_patience_s
 
 TOKEN_VARIABLE = "HGN_DATASET_TOKEN"
 TOKEN_HOST_VARIABLE = "HGN_DATASET_HOST"
@@ -44,14 +44,9 @@ class StorageError(ConfigError):
     """A file of a data set that is missing, refused, cut or no JSON, perhaps for a moment."""
 
 
-@contextlib.contextmanager
-def faults_outlived() -> Iterator[None]:
+def faults_outlived() -> contextlib.AbstractContextManager[None]:
     """Inside it `ask` repeats what fails, for the standard patience: a training knows that its data were there."""
-    _outliving.set()
-    try:
-        yield
-    finally:
-        _outliving.clear()
+    return inside(_outliving)
 
 
 def outliving() -> bool:

@@ -8,10 +8,30 @@ from typing import Any
 
 from hgn.schema import require
 
-SCENE_KINDS = (
-    "obstacles", "motion", "collision", "funnel", "pool", "dam", "column", "drop", "slope", "edge", "stack", "apart",
-    "bowl", "channel", "stairs", "jet",
-)  # fmt: skip
+MAXIMUM_PARTICLES = 16_000  # of a scene; larger ones are drawn again
+
+# Smallest and largest value of each number that a kind draws.
+RANGES: dict[str, dict[str, tuple[float, float]]] = {
+    "obstacles": {"obstacles": (0, 8), "groups": (1, 6), "size": (0.04, 0.16)},
+    "motion": {"obstacles": (0, 6), "groups": (1, 6), "size": (0.04, 0.14), "speed": (0.5, 4.0)},
+    "collision": {"groups": (2, 6), "size": (0.05, 0.14), "speed": (0.5, 5.0)},
+    "funnel": {"groups": (2, 5), "size": (0.06, 0.1), "hole": (0.035, 0.2)},
+    "pool": {"depth": (0.03, 0.16), "tilt": (0.0, 0.13), "size": (0.04, 0.09), "height": (0.02, 0.2)},
+    "dam": {"length": (0.06, 0.3), "height": (0.08, 0.35)},
+    "column": {"width": (0.06, 0.18), "depth": (0.06, 0.18), "height": (0.05, 0.4)},
+    "drop": {"size": (0.04, 0.25), "height": (0.0, 0.8), "speed": (0.0, 5.0)},
+    "slope": {"plate": (0.45, 0.75), "tilt": (0.03, 0.36), "size": (0.05, 0.12)},
+    "edge": {
+        "plate": (0.2, 0.45), "height": (0.1, 0.35), "beyond": (-0.06, 0.06), "size": (0.05, 0.12), "drop": (0.03, 0.2),
+    },
+    "stack": {"bodies": (2, 4), "size": (0.06, 0.12), "shift": (-0.05, 0.05)},
+    "apart": {"bodies": (2, 4), "size": (0.05, 0.12), "speed": (0.01, 0.4), "tilt": (0.0, 0.1)},
+    "bowl": {"bowl": (0.25, 0.5), "size": (0.06, 0.14), "height": (0.05, 0.4)},
+    "channel": {"width": (0.16, 0.36), "plate": (0.3, 0.5), "length": (0.08, 0.2), "height": (0.1, 0.3)},
+    "stairs": {"steps": (3, 4), "plate": (0.2, 0.3), "rise": (0.06, 0.11), "size": (0.08, 0.14)},
+    "jet": {"length": (0.08, 0.3), "width": (0.05, 0.12), "speed": (1.5, 6.0)},
+}  # fmt: skip
+SCENE_KINDS = tuple(RANGES)
 FREE = ("domain_size", "cell_size", "materials", "particles_per_cell", "kinds")  # settings that no kind draws
 
 

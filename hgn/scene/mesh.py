@@ -8,6 +8,7 @@ from __future__ import annotations
 import io
 import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import trimesh
@@ -25,22 +26,9 @@ from hgn.schema import ConfigError, Vector, require
 _ASCII_STL = re.compile(rb"\s*solid.*\n\s*(facet|endsolid)", re.IGNORECASE)
 
 
-def load_mesh(
-    path: str | Path,
-    field: str = "mesh",
-    *,
-    scale: float = 1.0,
-    translation: Vector = (0.0, 0.0, 0.0),
-    rotation: Vector = (0.0, 0.0, 0.0),
-) -> Obstacle:
-    """Reads a mesh file: scaled, then turned about the fixed x, y and z axes (degrees, in this order), then moved.
-
-    All parts of a file become one obstacle, a solid if all of them are watertight; see `load_bodies`.
-
-    Raises: ConfigError, as load_bodies does.
-    """
-    placing = {"scale": scale, "translation": translation, "rotation": rotation}
-    first, *others = load_bodies(path, field, **placing)  # type: ignore[arg-type]
+def load_mesh(path: str | Path, field: str = "mesh", **placing: Any) -> Obstacle:
+    """Reads a mesh file as one obstacle, a solid if all parts are watertight; options and errors of `load_bodies`."""
+    first, *others = load_bodies(path, field, **placing)
     for other in others:
         vertex_V3 = np.concatenate([first.vertex_V3, other.vertex_V3])
         triangle_F3 = np.concatenate([first.triangle_F3, other.triangle_F3 + np.int32(len(first.vertex_V3))])
@@ -58,6 +46,7 @@ def load_bodies(
 ) -> tuple[Obstacle, ...]:
     """Reads a mesh file as a solid of its watertight bodies, a sheet of its other triangles, or both.
 
+    It is scaled, then turned about the fixed x, y and z axes (degrees, in this order), then moved.
     A body is watertight if two triangles meet at each of its edges, and orientable; it gets a consistent orientation.
     Corners with equal float32 coordinates are merged, zero-area and repeated triangles dropped, both after that check.
     A mesh may reach outside the domain.

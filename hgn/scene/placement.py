@@ -6,6 +6,7 @@ Shape legend: N particles, P points, V vertices.
 from __future__ import annotations
 
 import functools
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -13,7 +14,8 @@ import numpy as np
 
 from hgn.config import SceneConfig
 from hgn.scene.distance import contains
-from hgn.scene.group import Region
+from hgn.scene.funnel import Quaternion
+from hgn.scene.group import Region, fill, particle_count
 from hgn.scene.material import material_index
 from hgn.scene.rotation import quaternion_rotation, rotate
 from hgn.scene.scene import Obstacle, Scene
@@ -43,9 +45,7 @@ class Placed:
     record: dict[str, Any]
 
 
-def place_shape(
-    shape: str, size: float, position: Vector, quaternion: tuple[float, float, float, float], index: int
-) -> Placed:
+def place_shape(shape: str, size: float, position: Vector, quaternion: Quaternion, index: int) -> Placed:
     """Returns obstacle number `index` of a scene: a built-in shape of a size, about a position."""
     rotation_33 = quaternion_rotation(quaternion)
     obstacle = shape_obstacle(shape, size, position, rotation_33, f"obstacle_{index}_{shape}")
@@ -89,6 +89,23 @@ class Body:
     velocity_3: np.ndarray
     material: str
     record: dict[str, Any]
+
+
+def filled(
+    config: SceneConfig, shape: str, region: Region, material: str, velocity_3: np.ndarray, *, rng: np.random.Generator
+) -> Body:
+    """Returns a group of a shape, filled with random particles."""
+    count = particle_count(region, config.particles_per_cell, config.cell_size)
+    size = (2 * region.reach).tolist()
+    record = {
+        "shape": shape,
+        "size": size if shape == "box" else size[0],
+        "position": list(region.centre),
+        "material": material,
+        "velocity": velocity_3.tolist(),
+        "particle_count": count,
+    }
+    return Body(fill(region, count, rng), velocity_3, material, record)
 
 
 def thrown(body: Body, velocity_3: np.ndarray) -> Body:
@@ -137,6 +154,11 @@ def unit_surface_points(shape: str) -> tuple[np.ndarray, float]:
     centroid = (pieces[:, 0] + pieces[:, 1] + pieces[:, 2]) / 3
     offset = pieces - centroid[:, None]  # the farthest point of a triangle from its centroid is a corner
     return centroid, float(np.sqrt((offset * offset).sum(axis=2).max())) + ROUNDING
+
+
+def choice(options: Sequence[str], rng: np.random.Generator) -> str:
+    """Returns one of the options, all equally likely."""
+    return options[int(rng.random() * len(options))]
 
 
 def triple(point: np.ndarray) -> Vector:

@@ -18,8 +18,6 @@ from hgn.scene.funnel import Funnel, draw_funnel
 from hgn.scene.group import (
     WALL_CELLS,
     Region,
-    fill,
-    particle_count,
     points_in_ball,
     random_direction,
     region_of,
@@ -31,6 +29,8 @@ from hgn.scene.placement import (
     Placed,
     assemble,
     blocked,
+    choice,
+    filled,
     place_shape,
     thrown,
     too_near,
@@ -149,7 +149,7 @@ def _place_obstacle(config: SceneConfig, placed: list[Placed], index: int, rng: 
     domain = np.array(config.domain_size)
     smallest, largest = config.obstacle_size
     for _ in range(SHAPES_PER_ITEM):
-        shape = _choice(config.obstacle_shapes, rng)
+        shape = choice(config.obstacle_shapes, rng)
         size = smallest + (largest - smallest) * rng.random()
         quaternion = random_direction(rng, 4).tolist()
         rotation = quaternion_rotation(quaternion)
@@ -201,7 +201,7 @@ def _place_group(
     span = np.array(config.domain_size) - 2 * margin
     size = (config.group_size,) * 3
     for _ in range(SHAPES_PER_ITEM if (span >= 0).all() else 0):
-        shape = _choice(config.group_shapes, rng)
+        shape = choice(config.group_shapes, rng)
         for _ in range(PLACES_PER_SHAPE):
             centre_3 = margin + span * rng.random(3) if funnel is None else funnel.place(rng)
             if (centre_3 < margin).any() or (centre_3 > margin + span).any():
@@ -244,22 +244,13 @@ def _place_lone_particles(
 
 
 def _fill_group(config: SceneConfig, shape: str, region: Region, rng: np.random.Generator) -> Body:
-    material = _choice(config.materials, rng)
+    material = choice(config.materials, rng)
     velocity = np.zeros(3)
     if config.maximum_initial_speed > 0:
         velocity = config.maximum_initial_speed * points_in_ball(1, 3, rng)[0]
         if config.moving_group_fraction < 1 and rng.random() >= config.moving_group_fraction:
             velocity = np.zeros(3)
-    count = particle_count(region, config.particles_per_cell, config.cell_size)
-    record = {
-        "shape": shape,
-        "size": 2 * float(region.reach[0]),
-        "position": list(region.centre),
-        "material": material,
-        "velocity": velocity.tolist(),
-        "particle_count": count,
-    }
-    return Body(fill(region, count, rng), velocity, material, record)
+    return filled(config, shape, region, material, velocity, rng=rng)
 
 
 def _draw_gravity(config: SceneConfig, rng: np.random.Generator) -> Vector:
@@ -310,7 +301,3 @@ def _collide(config: SceneConfig, bodies: list[Body], rng: np.random.Generator) 
         for place, velocity_3 in enumerate(way_B3, first):
             changed[place] = thrown(bodies[place], velocity_3)
     return changed
-
-
-def _choice(options: tuple[str, ...], rng: np.random.Generator) -> str:
-    return options[int(rng.random() * len(options))]

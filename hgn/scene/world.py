@@ -14,16 +14,15 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from hgn.config import SceneConfig
-from hgn.scene.group import WALL_CELLS, Region, fill, particle_count, points_in_ball, random_direction, region_of
-from hgn.scene.placement import CLEARANCE_CELLS, ROUNDING, Body, Placed, blocked, place_shape, triple
+from hgn.scene.funnel import Quaternion
+from hgn.scene.group import WALL_CELLS, Region, particle_count, points_in_ball, random_direction, region_of
+from hgn.scene.kinds import MAXIMUM_PARTICLES, RANGES
+from hgn.scene.placement import CLEARANCE_CELLS, ROUNDING, Body, Placed, blocked, choice, filled, place_shape, triple
 from hgn.schema import ConfigError, Vector
 
-MAXIMUM_PARTICLES = 16_000  # of a scene; larger ones are drawn again
 DRAWS = 500  # attempts to place one scene
 FALLING = (0.0, -9.8, 0.0)
 UNTURNED = (1.0, 0.0, 0.0, 0.0)
-
-Quaternion = tuple[float, float, float, float]
 
 # Edges in solver cells of 1/64. Few, because only scenes with equal domains share a launch.
 DOMAINS: dict[str, tuple[int, int, int]] = {
@@ -36,28 +35,6 @@ DOMAINS: dict[str, tuple[int, int, int]] = {
     "room": (64, 64, 64),
     "hall": (96, 64, 96),
 }
-
-# Smallest and largest value of each number that a kind draws.
-RANGES: dict[str, dict[str, tuple[float, float]]] = {
-    "obstacles": {"obstacles": (0, 8), "groups": (1, 6), "size": (0.04, 0.16)},
-    "motion": {"obstacles": (0, 6), "groups": (1, 6), "size": (0.04, 0.14), "speed": (0.5, 4.0)},
-    "collision": {"groups": (2, 6), "size": (0.05, 0.14), "speed": (0.5, 5.0)},
-    "funnel": {"groups": (2, 5), "size": (0.06, 0.1), "hole": (0.035, 0.2)},
-    "pool": {"depth": (0.03, 0.16), "tilt": (0.0, 0.13), "size": (0.04, 0.09), "height": (0.02, 0.2)},
-    "dam": {"length": (0.06, 0.3), "height": (0.08, 0.35)},
-    "column": {"width": (0.06, 0.18), "depth": (0.06, 0.18), "height": (0.05, 0.4)},
-    "drop": {"size": (0.04, 0.25), "height": (0.0, 0.8), "speed": (0.0, 5.0)},
-    "slope": {"plate": (0.45, 0.75), "tilt": (0.03, 0.36), "size": (0.05, 0.12)},
-    "edge": {
-        "plate": (0.2, 0.45), "height": (0.1, 0.35), "beyond": (-0.06, 0.06), "size": (0.05, 0.12), "drop": (0.03, 0.2),
-    },
-    "stack": {"bodies": (2, 4), "size": (0.06, 0.12), "shift": (-0.05, 0.05)},
-    "apart": {"bodies": (2, 4), "size": (0.05, 0.12), "speed": (0.01, 0.4), "tilt": (0.0, 0.1)},
-    "bowl": {"bowl": (0.25, 0.5), "size": (0.06, 0.14), "height": (0.05, 0.4)},
-    "channel": {"width": (0.16, 0.36), "plate": (0.3, 0.5), "length": (0.08, 0.2), "height": (0.1, 0.3)},
-    "stairs": {"steps": (3, 4), "plate": (0.2, 0.3), "rise": (0.06, 0.11), "size": (0.08, 0.14)},
-    "jet": {"length": (0.08, 0.3), "width": (0.05, 0.12), "speed": (1.5, 6.0)},
-}  # fmt: skip
 
 
 class _DrawAgainError(Exception):
@@ -93,7 +70,7 @@ class Layout:
         return self.rng.random() < probability
 
     def one_of(self, *names: str) -> str:
-        return names[int(self.rng.random() * len(names))]
+        return choice(names, self.rng)
 
     def take_domain(self, *names: str) -> None:
         """Draws the domain. Raises: _DrawAgainError where it is larger than the configured one."""
@@ -140,16 +117,13 @@ class Layout:
             raise _DrawAgainError
         if any(blocked(region, item, clearance) for item in self.obstacles):
             raise _DrawAgainError
-        count = particle_count(region, self.config.particles_per_cell, self.config.cell_size)
-        self.particles += count
+        self.particles += particle_count(region, self.config.particles_per_cell, self.config.cell_size)
         if self.particles > MAXIMUM_PARTICLES:
             raise _DrawAgainError
         drawn = self.one_of(*self.config.materials)
         chosen = material if material in self.config.materials else drawn
-        record = {"shape": shape, "size": list(size) if shape == "box" else size[0], "position": list(centre)}
-        record |= {"material": chosen, "velocity": list(velocity), "particle_count": count}
         self.regions.append(region)
-        self.bodies.append(Body(fill(region, count, self.rng), np.array(velocity), chosen, record))
+        self.bodies.append(filled(self.config, shape, region, chosen, np.array(velocity), rng=self.rng))
 
     def body(self, size: float, centre: Vector, velocity: Vector = (0.0, 0.0, 0.0)) -> None:
         """Adds a cube or a ball."""

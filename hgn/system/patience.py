@@ -42,13 +42,18 @@ def standard_patience_s() -> float:
 
 
 @contextlib.contextmanager
-def without_patience() -> Iterator[None]:
-    """Inside it no thread of this process waits for a server that does not answer."""
-    without.set()
+def inside(event: threading.Event) -> Iterator[None]:
+    """Sets an event until the block ends."""
+    event.set()
     try:
         yield
     finally:
-        without.clear()
+        event.clear()
+
+
+def without_patience() -> contextlib.AbstractContextManager[None]:
+    """Inside it no thread of this process waits for a server that does not answer."""
+    return inside(without)
 
 
 def patiently(
