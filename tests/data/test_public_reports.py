@@ -147,7 +147,7 @@ def proxy():
 
 
 def test_proxies_are_honoured(monkeypatch, proxy):
-    """http_proxy is asked for another machine's data, not for this machine's, nor for hosts of no_proxy."""
+    """http_proxy serves data of other machines, but not of this one or of hosts in no_proxy."""
     address, asked = proxy
     for name in ("http_proxy", "HTTP_PROXY"):
         monkeypatch.setenv(name, address)

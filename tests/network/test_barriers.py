@@ -214,7 +214,7 @@ def reaching(count=150):
 
 
 def test_lists_hold_all_that_is_met(monkeypatch):
-    """Particles end where they do when each is asked against all triangles, and with the pairs of an exported graph."""
+    """Particles end in the same place with all triangles tested, and with the pairs of an exported graph."""
     for corner_F33, before_N3, after_N3 in (scattered(0), scattered(7), reaching()):
         barriers = barriers_of(corner_F33)
         listed_N3 = ended(before_N3, after_N3, barriers)[0]

@@ -140,7 +140,7 @@ def test_flat_rollouts_are_drawn_in_their_plane(tmp_path):
 
 
 def test_ended_ground_truth_and_lost_particles_are_said():
-    """A panel past the end of the ground truth says so, as does one with particles that are not finite; else the same
+    """A panel past the end of the ground truth is labelled, as is one with particles that are not finite; else the same
     rollout gives the same pixels."""
 
     def picture(rollout, frame=15):

@@ -30,7 +30,7 @@ CPU, GPU = torch.device("cpu"), torch.device("cuda")
     ],
 )
 def test_the_backend_is_chosen_and_said(backend, precision, reasons, expected):
-    """auto takes backend triton where it runs and says so; what cannot be had is refused, never replaced silently."""
+    """auto takes backend triton where it runs, and reports it; another one is refused, never replaced silently."""
     given = dict(zip(("triton", "torch"), reasons, strict=True)), backend, precision, "training.backend"
     if isinstance(expected, tuple):
         assert pick(*given) == expected
@@ -41,7 +41,7 @@ def test_the_backend_is_chosen_and_said(backend, precision, reasons, expected):
 
 @pytest.mark.parametrize(
     ("kind", "precision", "backend", "expected"),
-    [  # an HGN compiled C, unless torch is asked for; a GNS PyTorch; fp16 neither
+    [  # an HGN compiled C, unless torch is set; a GNS PyTorch; fp16 neither
         ("hgn", "tf32", "auto", "cpu"),
         ("hgn", "tf32", "torch", "torch"),
         ("hgn", "tf32", "cpu", "cpu"),

@@ -196,7 +196,7 @@ def test_required_extensions_that_are_not_read(tmp_path, names):
 
 @pytest.mark.parametrize("name", ["KHR_draco_mesh_compression", "EXT_meshopt_compression"])
 def test_compressed_data_without_the_requirement(tmp_path, name):
-    """A cube, and beside it a part whose data is only in an extension: refused by name."""
+    """A cube, and a part whose data is only in an extension: refused by name."""
     file = Glb()
     file.cube()
     file.tree["accessors"].append({"componentType": 5126, "count": 8, "type": "VEC3"})

@@ -59,7 +59,7 @@ def test_sizes_that_no_machine_has(cls, mapping, message):
 
 @pytest.mark.parametrize("uri", ["pipe", "../outside.bin", "/etc/hostname", None])
 def test_meshes_that_are_not_read(tmp_path, uri):
-    """A GLB's buffers are plain files beside it: no pipe, on which reading would wait for ever, and none elsewhere. A
+    """A GLB's buffers are plain files in its folder: no pipe, where reading would wait for ever, no others. A
     version of the format that is not read is refused too."""
     folder = tmp_path / "meshes"
     folder.mkdir()

@@ -122,7 +122,7 @@ def needle_cube(split):
 @pytest.mark.parametrize("form", ["obj", "ascii.ply", "binary.ply"])
 @pytest.mark.parametrize("split", [0, 5, 11])
 def test_needles_do_not_open_a_body(tmp_path, form, split):
-    """Whether a body is closed is asked before its triangles without area are dropped."""
+    """Closedness is tested before triangles without area are dropped."""
     vertices, faces = needle_cube(split)
     path = tmp_path / f"a.{form}"
     write_obj(path, vertices, faces) if form == "obj" else write_ply(path, vertices, faces, "binary" in form)

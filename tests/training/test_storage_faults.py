@@ -93,7 +93,7 @@ def faulty(folder, name):
 
 @pytest.mark.parametrize("name", FAULTS)
 def test_a_manifest_that_is_away_for_a_moment(data, name, capsys, monkeypatch):
-    """The episodes stay, a line says so once, and the next look finds the manifest; after the patience it is an error,
+    """The episodes stay, one line reports it, and the next look finds the manifest; after the patience it is an error,
     whose remedy is not to delete the manifest."""
     store = EpisodeStore(data.dataset.folder, "train")
     with faults_outlived():

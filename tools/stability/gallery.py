@@ -72,7 +72,7 @@ class GalleryCase:
     measure: MeasureEntry
 
     def scene(self, cells: int = GRID_CELLS[0], far: bool = False) -> Scene:
-        """Returns the scene on a grid of so many cells per unit of length, with the far body if wanted."""
+        """Returns the scene on a grid of `cells` cells per unit of length, with the far body if wanted."""
         content: dict[str, Any] = {**self.content, "cell_size": 1 / cells}
         scene = scene_of(content, self.file)
         if not far:

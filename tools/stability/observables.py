@@ -1,6 +1,6 @@
 """Observables of gallery scenes (gallery.py): figures of a trajectory by name, with units.
 
-A length is in domain units, or in cells where the table says so: the cells of the scene file, 1/64 by default, also on
+A length is in domain units, or in cells where the table lists cells: those of the scene file, 1/64 by default, also on
 a finer grid. Shape legend: T frames, N particles, S sampled frames.
 """
 
