@@ -11,7 +11,7 @@ from written_files import Recorder, hashes
 
 from datagen.fine import fine_scene, solver_on_grid, visible_positions
 from datagen.pool.local_workers import LocalWorkerFactory
-from datagen.pool.plan import scene_seed
+from datagen.pool.plan import parse_episode_key, scene_seed
 from datagen.pool.pool import Pool, Stopped
 from datagen.pool.worker_plan import WorkerPlan, gpu_scenes_per_launch
 from datagen.pool.writer import DatasetWriter
@@ -192,12 +192,20 @@ def test_a_killed_generator_resumes(make_config, backend, control, tmp_path):
     """A solver that is killed and a run that is stopped leave the same files as an undisturbed run."""
     config = make_config(reference_cells=128, training_scenes=3)
     (control / f"kill-{scene_seed(0, 'train', 1, 0)}").write_text("1")
+    published = []
+
+    def four_are_published(recorder):
+        published[:] = recorder.episodes
+        return len(published) >= 4
+
     with pytest.raises(Stopped):
-        generated(config, backend, lambda recorder: len(recorder.episodes) >= 4)
+        generated(config, backend, four_are_published)
+    first = written_files.simulated(control)
     disturbed = hashes(generated(config, backend))
-    assert (
-        len(written_files.simulated(control)) <= 8
-    )  # six episodes, the one of the kill again, and the one in flight when it stopped
+    again = written_files.simulated(control)[len(first) :]
+    ranges = [parse_episode_key(key) for key in published]
+    assert len(ranges) >= 4
+    assert not {scene_seed(0, scenes.split, scenes.first, 0) for scenes in ranges} & set(again)
     whole = make_config(folder=str(tmp_path / "whole"), reference_cells=128, training_scenes=3)
     assert disturbed == hashes(generated(whole, backend))
 
