@@ -11,7 +11,7 @@ TEST_PROCESSES ?= 3
 # the tests start a hundred processes, each of which would compile the package anew
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: setup demo test slow check format lint types layers docs film clean
+.PHONY: setup demo test slow soak check format lint types layers docs film clean
 
 setup: $(VENV)/.installed
 
@@ -56,6 +56,10 @@ test: setup
 # exported packages and all kernels for an H100 are compiled; CI runs these tests after the others
 slow: setup
 	$(RUN) -m pytest -n $(TEST_PROCESSES) -m slow
+
+# each decoder reads 5,000 damaged files, other ones each time; for a maintainer to start, not in CI
+soak: setup
+	$(RUN) -m pytest tests/scene/test_hostile_files.py -k any_bytes --soak 5000
 
 check: setup format lint types layers docs test slow
 

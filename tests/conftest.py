@@ -45,6 +45,10 @@ import ballistic_solver
 from hgn.config import DatagenConfig, DatasetConfig
 
 
+def pytest_addoption(parser):
+    parser.addoption("--soak", type=int, metavar="N", help="damage each kind of file in N other ways at each run")
+
+
 def pytest_configure(config):
     """All processes of these tests share a warm interpreter; the first that asks for it has it started."""
     if not hasattr(config, "workerinput"):

@@ -236,19 +236,15 @@ FILES = {
 }
 
 
-EXAMPLES = 200  # of each
-
-
-@pytest.mark.parametrize("examples", [EXAMPLES, pytest.param(5000, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("kind", FILES)
-def test_decoders_bear_any_bytes(kind, examples):
+def test_decoders_bear_any_bytes(kind, request):
     """A file with some bytes changed, cut or repeated is read, or refused with a message: nothing else comes out, and
     that in no more than 0.5 GB of memory."""
     name, content, decode = FILES[kind]
     places = st.lists(st.tuples(st.integers(0, len(content) - 1), st.integers(0, 255)), max_size=4)
+    soak = request.config.getoption("soak")
 
-    # the slow ones are other ones each time
-    @settings(max_examples=examples, deadline=None, derandomize=examples == EXAMPLES, database=None)
+    @settings(max_examples=soak or 200, deadline=None, derandomize=not soak, database=None)
     @given(places, st.integers(0, len(content)), st.integers(0, 3))
     def damaged(changes, cut, kind_of_cut):
         data = bytearray(content)
