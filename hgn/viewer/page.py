@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import itertools
 import math
-import queue
 import sys
 import tempfile
 import threading
@@ -19,6 +18,7 @@ import time
 import traceback
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -41,6 +41,7 @@ STATUS_S = 0.25  # between two updates of frame and speed
 BACK_S = {"a frame": 0.0, "1 s": 1.0, "5 s": 5.0}
 TURN_DEGREES = 360.0  # rotation for a drag across the whole window
 MAXIMUM_UPLOAD_BYTES = 64 << 20
+MAXIMUM_ACTIONS = 64  # that wait for the next frame; more are dropped
 HELP = """
 **Shift + drag** on the floor pours, **Shift + click** drops a ball.
 **Drag** an obstacle to move it, **Ctrl/⌘ + drag** to turn it, **click** to choose it.
@@ -65,19 +66,21 @@ class PlayPage:
         """
         self.server, self.address = start_server(host, port, "HGN")
         self.session, self.load = session, load
+        self.names = tuple(weights) or (session.weights or "own",)
         self.rate = session.simulator.frame_rate_hz
         spacing = session.cell_size / session.particles_per_cell ** (1 / 3)
         self.stage = StageView(self.server, session.domain_size, spacing)
         self.ended, self.playing, self.steps = threading.Event(), True, 0
         self.diverged = False  # it pauses for that, not because somebody asked for it
         self.viewed = threading.Event()  # until somebody looks nothing happens
-        self.actions: queue.SimpleQueue[tuple[object, Callable[[], Any], Any]] = queue.SimpleQueue()
+        self.actions: dict[object, tuple[Callable[[], Any], Any]] = {}
+        self._queueing = threading.Lock()
         self.meshes: dict[int, viser.MeshHandle] = {}
         self.shown: dict[int, PlacedObstacle] = {}
         self.chosen: int | None = None
         self._numbers = itertools.count()
         self.frames_a_second = 0.0
-        self._add_buttons(list(weights))
+        self._add_buttons()
         self._add_mouse()
         self.server.on_client_connect(lambda _: self.viewed.set())
         self._show()
@@ -87,14 +90,15 @@ class PlayPage:
 
     def do(self, action: Callable[[], Any], client: viser.ClientHandle | None = None, key: object = None) -> None:
         """Queues an action for the time before the next frame. Of several actions with one key only the last runs."""
-        self.actions.put((next(self._numbers) if key is None else key, action, client))
+        with self._queueing:
+            key = next(self._numbers) if key is None else key
+            self.actions.pop(key, None)
+            if len(self.actions) < MAXIMUM_ACTIONS:
+                self.actions[key] = action, client
 
     def _do_all(self) -> bool:
-        latest: dict[object, tuple[Callable[[], Any], Any]] = {}
-        while not self.actions.empty():
-            key, action, client = self.actions.get()
-            latest.pop(key, None)
-            latest[key] = action, client
+        with self._queueing:
+            latest, self.actions = self.actions, {}
         for action, client in latest.values():
             try:
                 action()
@@ -108,7 +112,7 @@ class PlayPage:
 
     def _notify(self, message: str, client: viser.ClientHandle | None = None) -> None:
         for one in [client] if client is not None else list(self.server.get_clients().values()):
-            one.add_notification("HGN", message, auto_close_seconds=10)
+            self._updates(partial(one.add_notification, "HGN", message, auto_close_seconds=10))
 
     def run(self) -> None:
         """Simulates from the first viewer's arrival until `close`, at most in real time."""
@@ -120,7 +124,9 @@ class PlayPage:
                 self.steps = max(0, self.steps - 1)
                 try:
                     self.session.step()
-                except DivergedError as error:
+                except Exception as error:  # noqa: BLE001 - nor must what one viewer poured
+                    if not isinstance(error, DivergedError):
+                        traceback.print_exception(error, file=sys.stderr)
                     self.playing, self.diverged = False, True
                     self._notify(f"{error}; paused a frame before. Back by or Restart")
                 frames, changed = frames + 1, True
@@ -134,7 +140,7 @@ class PlayPage:
             due = max(due + 1 / self.rate, now)
             self.ended.wait(max(0.0, due - now) if due > now else 0)
 
-    def _updates(self, show: Callable[[], None]) -> bool:
+    def _updates(self, show: Callable[[], Any]) -> bool:
         """Changes what viewers see; returns False where that failed, to be tried again.
 
         viser wakes its event loop from this thread without a lock, which fails at times while a viewer comes or goes.
@@ -182,7 +188,7 @@ class PlayPage:
 
     # what the viewers do
 
-    def _add_buttons(self, weights: list[str]) -> None:
+    def _add_buttons(self) -> None:
         gui, session = self.server.gui, self.session
         gui.configure_theme(show_share_button=False, show_logo=False)
         gui.set_panel_label("HGN")
@@ -206,7 +212,7 @@ class PlayPage:
             remove = gui.add_button("Remove the chosen")
         with gui.add_folder("World"):
             self.gravity: Any = gui.add_vector3("Gravity", session.gravity, step=0.1)
-            self.weights: Any = gui.add_dropdown("Weights", tuple(weights) or (session.weights or "own",))
+            self.weights: Any = gui.add_dropdown("Weights", self.names)
         with gui.add_folder("Save"):
             save_scene = gui.add_button("Scene (YAML, zip)")
             save_rollout = gui.add_button("Rollout (VTKHDF)")
@@ -248,7 +254,10 @@ class PlayPage:
         @upload.on_upload
         def _(event: Any) -> None:
             file = event.target.value
-            self.do(lambda: self._add_file(file.name, file.content), event.client)
+            if "upload" in self.actions:
+                self._notify("another mesh waits to be read; upload it again", event.client)
+            else:
+                self.do(lambda: self._add_file(file.name, file.content), event.client, "upload")
 
     def play(self, playing: bool) -> None:
         """Goes on or pauses, as a viewer wants it."""
@@ -261,9 +270,8 @@ class PlayPage:
 
     def _use(self, name: str) -> None:
         assert self.load is not None
-        listed = tuple(self.weights.options)
         try:
-            require(name in listed, "weights", f"one of {', '.join(listed)}", name)
+            require(name in self.names, "weights", f"one of {', '.join(self.names)}", name)
             self.session.use_weights(self.load(name), name)
         except ConfigError:
             self.weights.value = self.session.weights

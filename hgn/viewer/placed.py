@@ -82,9 +82,9 @@ class PlacedObstacle:
         vertex_V3 = round_to_float32(rotate(mesh.vertex_V3, self.rotation_33) + np.array(self.position))
         return dataclasses.replace(mesh, name=self.body.name, vertex_V3=vertex_V3, motion=motion)
 
-    @cached_property
+    @property
     def samples(self) -> tuple[np.ndarray, np.ndarray]:
-        """The body's, where they are."""
+        """The body's, where they are; not kept, for past frames have a place each."""
         point_S3, normal_S3 = self.body.samples
         matrix = self.rotation_33
         return rotate(point_S3, matrix) + np.array(self.position), rotate(normal_S3, matrix)

@@ -10,6 +10,7 @@ import math
 import zipfile
 from dataclasses import dataclass, replace
 from pathlib import Path
+from weakref import WeakSet
 
 import numpy as np
 import yaml
@@ -26,11 +27,12 @@ from hgn.scene.rollout_file import Rollout
 from hgn.scene.scene import Scene
 from hgn.scene.scene_file import ObstacleEntry
 from hgn.schema import Vector, from_mapping, require, to_mapping
-from hgn.viewer.placed import PlacedObstacle, placed_at_rest, placed_by, with_obstacles
+from hgn.viewer.placed import Body, PlacedObstacle, placed_at_rest, placed_by, with_obstacles
 from hgn.viewer.recording import Frame, Recording
 
 CLEARANCE = 1.25  # spacings of particles at rest, within which no drop enters
 MAXIMUM_GRAVITY = 1000.0  # domain units per second squared
+MAXIMUM_OBSTACLES, MAXIMUM_MESH_BYTES = 64, 128 << 20  # the latter of files, also of obstacles in past frames
 FULL_SHARE = 0.5  # of what leaves a spout in a frame: where there is more, nothing leaves
 
 
@@ -73,6 +75,7 @@ class PlaySession:
         self.random = np.random.default_rng(scene.seed)
         self.spout: Spout | None = None
         self._owed = 0.0  # particles, of a spout
+        self._bodies: WeakSet[Body] = WeakSet()  # that were added
         initial = InitialState.of_scene(replace(scene, obstacles=()))
         require(not scene.moves, "obstacles", "at rest for a network", "keyframes", "leave keyframes out")
         self.obstacles: tuple[PlacedObstacle, ...] = tuple(self._placed_by(scene, folder))
@@ -227,7 +230,12 @@ class PlaySession:
 
     def add_obstacle(self, entry: ObstacleEntry, folder: Path = Path()) -> PlacedObstacle:
         """An obstacle of a shape, or of a mesh file in a folder. Raises: ConfigError as a scene file."""
+        count = len(self.obstacles) + 1
+        require(count <= MAXIMUM_OBSTACLES, "obstacles", f"at most {MAXIMUM_OBSTACLES}", count, "remove one")
         placed = placed_by(entry, folder, self.cell_size)
+        size = sum(len(body.mesh_file or b"") for body in {*self._bodies, placed.body})
+        require(size <= MAXIMUM_MESH_BYTES, "mesh files", f"at most {MAXIMUM_MESH_BYTES} bytes", size, "restart")
+        self._bodies.add(placed.body)
         self._set_obstacles((*self.obstacles, placed))
         return placed
 

@@ -13,6 +13,7 @@ import http
 import io
 import secrets
 import socket
+import zlib
 from collections import Counter
 from collections.abc import Callable
 from typing import Any
@@ -21,6 +22,7 @@ from urllib.parse import parse_qs, urlsplit
 
 import viser
 import websockets.asyncio.server
+from viser import _messages as messages
 from viser._gui_api import GuiApi
 from websockets import Headers
 from websockets.http11 import Request, Response
@@ -29,8 +31,19 @@ from hgn.schema import require
 
 COOKIE = "hgn_play"
 MAXIMUM_UNFINISHED_BYTES = 128 << 20  # of uploads that are not whole yet, of all viewers
+UPLOAD_BYTES, PART_BYTES = 1 << 20, 200  # that an upload and each of its parts count at least
+MAXIMUM_MESSAGE_BYTES = 4 << 20  # from a viewer; parts of uploads have 512 KiB
+LONGEST_VALUE = 1000  # characters of a control's value
 REFUSAL = b"open the address that hgn.play printed, with its token\n"
+SENT = (
+    *(messages.SceneNodeClickMessage, messages.SceneNodeDragMessage, messages.ScenePointerMessage),
+    *(messages.FileTransferStartUpload, messages.FileTransferPart),
+)  # by viewers, besides the values of controls
 Process = Callable[[Any, Request], Response | None]
+# Viser keeps what it broadcasts under its key, and had one for each part of each upload
+messages.FileTransferPartAck.redundancy_key = (  # type: ignore[method-assign]
+    lambda ack: f"{type(ack).__name__}-{zlib.crc32(ack.transfer_uuid.encode()) % 64}"
+)
 
 
 def start_server(host: str, port: int, label: str) -> tuple[viser.ViserServer, str]:
@@ -46,23 +59,42 @@ def start_server(host: str, port: int, label: str) -> tuple[viser.ViserServer, s
     serve = websockets.asyncio.server.serve
 
     def guarded_serve(*args: Any, process_request: Process, **options: Any) -> Any:
+        options["max_size"] = MAXIMUM_MESSAGE_BYTES
         return serve(*args, process_request=guarded(process_request, token), **options)
 
-    limit = mock.patch.object(GuiApi, "_handle_file_transfer_part", bounded(GuiApi._handle_file_transfer_part))
+    names = ("_handle_file_transfer_start", "_handle_file_transfer_part")
+    limits = mock.patch.multiple(GuiApi, **{name: bounded(getattr(GuiApi, name)) for name in names})
     unsaid = contextlib.redirect_stdout(io.StringIO())  # Viser's own lines have an address without the token
-    with unsaid, limit, mock.patch.object(websockets.asyncio.server, "serve", guarded_serve):
+    with unsaid, limits, mock.patch.object(websockets.asyncio.server, "serve", guarded_serve):
         server = viser.ViserServer(host, port, label, verbose=False)
+    server._websock_server._handle_incoming_message = admitting(  # type: ignore[method-assign]
+        server._websock_server._handle_incoming_message
+    )
     shown = "127.0.0.1" if host in ("0.0.0.0", "localhost") else host
     return server, f"http://{shown}:{server.get_port()}/?token={token}"
+
+
+def admitting(handle: Callable[..., Any]) -> Callable[..., Any]:
+    """Drops messages that the page's controls do not send: Viser would set any attribute of a control, for all."""
+
+    async def answer(client: int, message: Any) -> None:
+        if isinstance(message, messages.GuiUpdateMessage):
+            passes = message.updates.keys() == {"value"} and len(repr(message.updates)) <= LONGEST_VALUE
+        else:
+            passes = isinstance(message, SENT)
+        if passes:
+            await handle(client, message)
+
+    return answer
 
 
 def bounded(handle: Callable[..., None]) -> Callable[..., None]:
     """Drops the uploads of the viewer with the most bytes where unfinished ones are too large together."""
 
     def answer(gui: GuiApi, client: int, message: Any) -> None:
-        sizes: Counter[int] = Counter({client: len(message.content)})
+        sizes: Counter[int] = Counter({client: len(getattr(message, "content", b""))})
         for state in list(gui._current_file_upload_states.values()):
-            sizes[state["client_id"]] += state["transferred_bytes"]
+            sizes[state["client_id"]] += state["transferred_bytes"] + PART_BYTES * len(state["parts"]) + UPLOAD_BYTES
         if sizes.total() > MAXIMUM_UNFINISHED_BYTES:
             gui._drop_uploads_from_client(sizes.most_common(1)[0][0])  # type: ignore[arg-type]
         handle(gui, client, message)  # ignores parts of uploads that were dropped

@@ -3,6 +3,7 @@
 import asyncio
 import gc
 import http
+import pickle
 import re
 import weakref
 from dataclasses import replace
@@ -167,7 +168,7 @@ def test_values_beyond_the_sliders_are_clamped(page, monkeypatch):
 
 
 def test_a_moved_obstacle_leaves_no_earlier_scene_behind(page, monkeypatch):
-    """Moving an obstacle 30 times keeps no more states alive than moving it once."""
+    """Moving an obstacle 30 times keeps no more states alive than moving it once, and no samples of past places."""
     session = page.session
     alive: list[weakref.ref] = []
     begin = InitialState.__init__
@@ -183,6 +184,8 @@ def test_a_moved_obstacle_leaves_no_earlier_scene_behind(page, monkeypatch):
     gc.collect()
     assert len(alive) >= 30
     assert sum(state() is not None for state in alive) <= 3
+    places = {id(placed): vars(placed) for frame in session.recording.frames for placed in frame.obstacles}
+    assert len(places) >= 30 and all(len(pickle.dumps({**place, "body": None})) < 1000 for place in places.values())
 
 
 def test_requests_of_other_pages_are_refused():
@@ -198,25 +201,128 @@ def test_requests_of_other_pages_are_refused():
         assert (response is not None and response.status_code == http.HTTPStatus.FORBIDDEN) == refused
 
 
-def test_unfinished_uploads_are_bounded(monkeypatch):
-    """Parts of uploads that never become whole are dropped, those of the viewer with the most first."""
-    monkeypatch.setattr(viser_compat, "MAXIMUM_UNFINISHED_BYTES", 1000)
-    states = {}
+def updated(label, **values):
+    """A control's message."""
+    return lambda page: viser_compat.messages.GuiUpdateMessage(controls(page)[label].uuid, values)
 
-    def drop(client):
-        for key in [key for key, state in states.items() if state["client_id"] == client]:
-            del states[key]
 
-    def take(gui, client, message):
-        if message.transfer_uuid in states:
-            states[message.transfer_uuid]["transferred_bytes"] += len(message.content)
+def controls(page):
+    return {handle.label: handle._impl for handle in page.server.gui._gui_input_handle_from_uuid.values()}
 
-    gui = SimpleNamespace(_current_file_upload_states=states, _drop_uploads_from_client=drop)
-    states["small"] = {"client_id": 1, "transferred_bytes": 0}
-    part = viser_compat.bounded(take)
-    part(gui, 1, SimpleNamespace(transfer_uuid="small", content=bytes(100)))
-    for number in range(40):
-        states[str(number)] = {"client_id": 2, "transferred_bytes": 0}
-        part(gui, 2, SimpleNamespace(transfer_uuid=str(number), content=bytes(300)))
-        assert sum(state["transferred_bytes"] for state in states.values()) <= 1000
+
+def received(page, client, messages):
+    """Gives messages to the server, as a viewer's connection would."""
+
+    async def give():
+        for message in messages:
+            await page.server._websock_server._handle_incoming_message(client, message)
+
+    asyncio.run(give())
+
+
+def parts(page, name, count, size):
+    """The beginning of an upload of 10^9 bytes, and parts of it."""
+    button = controls(page)["Own mesh"].uuid
+    yield viser_compat.messages.FileTransferStartUpload(button, name, "a.obj", "", 10**9, 10**9)
+    for number in range(count):
+        yield viser_compat.messages.FileTransferPart(button, name, number, bytes(size))
+
+
+@pytest.mark.parametrize(
+    ("message", "passes"),
+    [
+        (updated("Diameter", value=0.2), True),
+        (updated("Weights", value="other"), True),
+        (updated("Weights", props={"options": ("/etc/passwd",)}), False),
+        (updated("Weights", value="other", props={}), False),
+        *((updated("Step", **{name: value}), False) for name, value in (("removed", True), ("update_cb", []))),
+        (updated("Size", sync_cb=None), False),
+        (updated("Weights", value=10**6 * "x"), False),
+        (updated("Gravity", value=10**5 * (0.0,)), False),
+        (lambda page: viser_compat.messages.ShareUrlRequest(), False),
+        (lambda page: viser_compat.messages.ResetGuiMessage(), False),
+    ],
+)
+def test_messages_that_are_not_of_the_page(page, monkeypatch, message, passes):
+    """A viewer sets the values of controls, and nothing else of them; the server asks nobody for an address."""
+    asked, handled = [], page.server._websock_server._incoming_handlers
+    monkeypatch.setitem(handled, viser_compat.messages.ShareUrlRequest, [lambda *_: asked.append("address")])
+    before = {name: dict(vars(state)) for name, state in controls(page).items()}
+    received(page, 0, [message(page)])
+    after = {name: dict(vars(state)) for name, state in controls(page).items()}
+    for name, state in controls(page).items():
+        vars(state).update(before[name])
+    assert (after != before) == passes and not asked
+
+
+def test_acknowledgements_of_parts_are_not_kept(page):
+    """A mesh that comes in a thousand parts leaves few messages for the viewers who come later."""
+    kept = page.server._websock_server._broadcast_buffer.message_from_id
+    before = len(kept)
+    for number in range(20):
+        received(page, 1, parts(page, str(number), 1000, 1))
+    assert len(kept) - before <= 64
+    page.server.gui._drop_uploads_from_client(1)
+
+
+def test_actions_that_wait_are_bounded(page, messages):
+    """Of a flood of actions before one frame the first are done; one mesh waits to be read at a time."""
+    done = []
+    for number in range(10_000):
+        page.do(lambda number=number: done.append(number))
+    page._do_all()
+    assert done == list(range(64))
+
+
+def test_a_frame_that_fails_pauses(page, messages, monkeypatch, capsys):
+    """An unexpected error of the simulation pauses for everybody, and is told; Restart goes on."""
+    failed = []
+
+    def step():
+        failed.append(page.ended.set())
+        raise RuntimeError("no frame")
+
+    monkeypatch.setattr(page.session, "step", step)
+    monkeypatch.setattr(page, "steps", 1)
+    page.ended.clear()
+    page.run()
+    assert failed and not page.playing and "no frame; paused" in messages[0]
+    assert "RuntimeError" in capsys.readouterr().err
+    page.restart()
+    assert page.playing
+    page.playing = False
+
+
+def test_meshes_are_bounded(page, messages, monkeypatch):
+    """Files of all obstacles count together, also of those that only past frames show; so does their number."""
+    monkeypatch.setattr("hgn.viewer.session.MAXIMUM_MESH_BYTES", 4 * len(TRIANGLES))
+    for _ in range(6):
+        sent(page, lambda: page._add_file("a.obj", TRIANGLES))
+        page.session.step()
+        sent(page, page._remove_chosen)
+    assert len(messages) == 2 and "mesh files must be at most" in messages[0]
+    page.restart()
+    gc.collect()
+    sent(page, lambda: page._add_file("a.obj", TRIANGLES))
+    assert len(messages) == 2
+    monkeypatch.setattr("hgn.viewer.session.MAXIMUM_OBSTACLES", 3)
+    for _ in range(3):
+        sent(page, page._add_shape)
+    assert len(messages) == 4 and "obstacles must be at most 3" in messages[3]
+    page.restart()
+
+
+@pytest.mark.parametrize(("uploads", "count", "size"), [(40, 2, 1 << 20), (3, 30_000, 1), (300, 0, 0)])
+def test_unfinished_uploads_are_bounded(page, monkeypatch, uploads, count, size):
+    """Uploads that never become whole are dropped, those of the viewer with the most first: large parts, many parts,
+    none at all."""
+    monkeypatch.setattr(viser_compat, "MAXIMUM_UNFINISHED_BYTES", 10 << 20)
+    states = page.server.gui._current_file_upload_states
+    received(page, 1, parts(page, "small", 1, 100))
+    for number in range(uploads):
+        received(page, 2, parts(page, str(number), count, size))
+        assert sum(state["transferred_bytes"] for state in states.values()) <= 10 << 20
+        assert len(states) <= 11 and sum(len(state["parts"]) for state in states.values()) <= 53_000
     assert states["small"]["transferred_bytes"] == 100
+    for client in (1, 2):
+        page.server.gui._drop_uploads_from_client(client)
