@@ -1,5 +1,6 @@
-"""What all commands share: their configuration is what Hydra's own entry point hands over, and a reader may leave."""
+"""What all commands share: how settings and files of settings are read, and what becomes of their output."""
 
+import io
 import os
 import subprocess
 import sys
@@ -10,20 +11,29 @@ import pytest
 from hgn.command import EXIT_UNREAD, _compose, run_command
 from hgn.schema import ConfigError
 
+HEAD = "# @package _global_\n"
+
+
+@pytest.fixture
+def command(monkeypatch, capsys):
+    """Runs a command that only returns; its exit code, its configuration and its errors."""
+
+    def run(name, *arguments, main=None):
+        given = []
+        monkeypatch.setattr("sys.argv", [name, *arguments])
+        with pytest.raises(SystemExit) as ended:
+            run_command(main or given.append, name)
+        return ended.value.code, given, capsys.readouterr().err
+
+    return run
+
 
 @pytest.mark.parametrize(
     ("given", "meant"),
     [
-        ("../my data/dé mo", "../my data/dé mo"),
-        ("weights (1).safetensors", "weights (1).safetensors"),
-        ("a&b#1!;x=y", "a&b#1!;x=y"),
-        ("it's", "it's"),
-        ("data(1)", "data(1)"),  # to Hydra a function
-        ("ends in \\", "ends in \\"),
-        ("ü\\", "ü\\"),
-        ("ü\\'", "ü\\'"),
+        *((name, name) for name in ("../my data/dé mo", "weights (1).safetensors", "a&b#1!;x=y", "it's", "plain")),
+        *((name, name) for name in ("data(1)", "ends in \\", "ü\\", "ü\\'")),  # the first is a function to Hydra
         ("~/runs/ü", f"{Path.home()}/runs/ü"),
-        ("plain", "plain"),
         ("'ü'", "ü"),
     ],
 )
@@ -42,6 +52,63 @@ def test_names_in_lists(monkeypatch):
     monkeypatch.setattr("sys.argv", ["average", "weights=[a,{ü]", "out=x"])
     with pytest.raises(ConfigError, match="weights="):
         _compose("average")
+
+
+@pytest.mark.parametrize("name", ["[x].yaml", "a${b}.yaml", "{y}.yaml", "it's [1].yaml", "plain.yaml"])
+def test_names_that_are_syntax(tmp_path, command, monkeypatch, name):
+    """Files are found under names that Hydra takes for lists and references."""
+    (tmp_path / name).touch()
+    monkeypatch.chdir(tmp_path)
+    code, given, error = command("rollout", f"scene={name}")
+    assert (code, error) == (0, "") and given[0]["scene"] == name
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (HEAD + "name: x\nseed: [1\n", "must be a YAML file: line 4"),
+        (HEAD + "training:\n\tseed: 1\n", "must be a YAML file: line 3"),
+        (HEAD + "name: 'x\n", "must be a YAML file: line"),
+        (HEAD + "training: {seed: 1}\nname: x\ntraining: {seed: 2}\n", "line 4: the key training is given twice"),
+        (HEAD + "training:\n  batch_scenes: 010\n", "line 3: batch_scenes: 010 is an octal number"),
+        (HEAD + "scene:\n  group_size: 1:30\n", "line 3: group_size: 1:30 is a number of base 60"),
+        ("\ufeff" + HEAD + "name: x\n", "must be UTF-8 without a byte order mark"),
+    ],
+)
+def test_experiments_with_bad_yaml(tmp_path, command, content, message):
+    """One line with the file, the key and the line, and exit code 2; with Hydra's options too."""
+    (tmp_path / "experiment").mkdir()
+    (tmp_path / "experiment" / "mine.yaml").write_text(content, encoding="utf-8")
+    for more in ((), ("--cfg", "job")):
+        code, _, error = command("train", f"--config-dir={tmp_path}", "experiment=mine", *more)
+        assert code == 2 and error.count("\n") == 1 and "mine.yaml" in error and message in error
+    code, _, error = command("train", "--config-dir", str(tmp_path), "+experiment=mine")
+    assert code == 2 and message in error
+
+
+def test_groups_and_included_files(tmp_path, command):
+    """A file of a group is read as strictly; one that an experiment includes ends in one line too. `~training` is an
+    override, wherever options stand."""
+    for folder in ("experiment", "scene"):
+        (tmp_path / folder).mkdir()
+    (tmp_path / "scene" / "own.yaml").write_text("group_size: 0.1\ngroup_size: 0.2\n")
+    (tmp_path / "experiment" / "outer.yaml").write_text(HEAD + "defaults:\n  - inner\n")
+    (tmp_path / "experiment" / "inner.yaml").write_text(HEAD + "name: [x\n")
+    for choice in ("scene=own", "experiment=outer"):
+        code, _, error = command("train", f"--config-dir={tmp_path}", choice)
+        assert code == 2 and error.count("\n") == 1 and ("own.yaml" in error or "inner.yaml" in error)
+    for arguments in (("~training", "--cfg", "job"), ("--cfg", "job", "~training")):
+        code, _, error = command("train", *arguments)
+        assert code == 0 and error == ""
+
+
+@pytest.mark.parametrize(("encoding", "shown"), [("ascii", b"64? ?"), ("latin-1", b"64\xb3 ?"), ("utf-8", None)])
+def test_outputs_without_unicode(command, monkeypatch, encoding, shown):
+    """What an output cannot show is replaced."""
+    raw = io.BytesIO()
+    monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(raw, encoding=encoding))
+    assert command("bench", main=lambda mapping: print("64³ …"))[0] == 0
+    assert raw.getvalue().strip() == (shown or "64³ …".encode())
 
 
 @pytest.mark.parametrize(
@@ -76,8 +143,8 @@ def test_other_broken_pipes_are_faults(monkeypatch):
     def talks(mapping):
         raise BrokenPipeError("the server")
 
+    monkeypatch.setattr("sys.argv", ["bench"])
     with Path(os.devnull).open("w") as out:
-        monkeypatch.setattr("sys.argv", ["bench"])
         monkeypatch.setattr("sys.stdout", out)
         monkeypatch.setattr("sys.stderr", out)
         with pytest.raises(BrokenPipeError, match="the server"):

@@ -33,6 +33,10 @@ def average_of(count, coefficients=None):
     return AverageConfig(("a.safetensors",) * count, "out.safetensors", coefficients)
 
 
+def kinds_of(group_count=4, **kinds):
+    return SceneConfig(kinds=kinds, group_count=group_count)
+
+
 def command(cls, **given):
     """A command's options from a mapping, beside those that must be given."""
     return lambda **options: from_mapping(cls, given | options)
@@ -67,11 +71,14 @@ RULES = {
         ({"funnel_hole": (0.1, 0.05)}, r"funnel_hole must be 0 < smallest <= largest, got \[0.1, 0.05\]"),
         ({"funnel_scene_fraction": 0.5, "obstacle_count": 3}, "obstacle_count must be at least 4 where .*, got 3"),
         ({"zero_gravity_fraction": float("nan")}, "zero_gravity_fraction must be .*, got nan"),
-        (
-            {"zero_gravity_fraction": 0.6, "tilted_gravity_fraction": 0.5},
-            r"must be at most 1 - .* \(0.6\), got 0.5",
-        ),
+        ({"zero_gravity_fraction": 0.6, "tilted_gravity_fraction": 0.5}, r"must be at most 1 - .* \(0.6\), got 0.5"),
         ({"colliding_scene_fraction": 0.1}, "maximum_initial_speed must be above 0 where colliding_.* is, got 0.0"),
+    ],
+    kinds_of: [
+        ({"lake": 1.0}, "kinds must be of obstacles, motion"),
+        ({"pool": -1.0}, "kinds.pool must be a finite share >= 0, got -1.0"),
+        ({"pool": 0.0}, "kinds must be shares of which one is above 0"),
+        ({"pool": 1.0, "group_count": 2}, r"group_count must be its default \(4\) where kinds"),
     ],
     train_on_six_frames: [
         ({"symmetry": "square"}, "symmetry must be one of none, gravity, got 'square'"),

@@ -53,12 +53,7 @@ ANSWERS = [
     (TrainConfig, "network.kind", "gns_particles", f"network.kind must be .*, got 'gns_particles'; {LAST}"),
     (SolveConfig, "mpm.wall_contact", "stick", f"{ALWAYS.format('slip')}, not stick; leave it"),
     (TrainConfig, "mpm.time_step", "fixed", "it was removed; mpm.fixed_time_step_s is null for adaptive steps"),
-    (
-        TrainConfig,
-        "mpm.sand_friction_law",
-        "mohr_coulomb",
-        "follows from mpm.method: mohr_coulomb with corrected, comp",
-    ),
+    (TrainConfig, "mpm.sand_friction_law", "mohr_coulomb", "from mpm.method: mohr_coulomb with corrected, comp"),
     (RolloutConfig, "film", 3, "film is not a known key; it was removed; render with tools.render"),
     (RolloutConfig, "backend", "abacus", "backend must be one of .*, got 'abacus'; take backend=cpu"),
 ]
@@ -115,11 +110,12 @@ def test_files_of_before(tmp_path, monkeypatch, removed):
 
 def test_networks_of_before():
     """They load where removed settings say what is always so now, or where these have no effect; others are refused by
-    the setting's name."""
+    the setting's name. So is a kind of network, and weights that shipped once."""
     contacts = {"contact_gate": "cell", "contact_forces": "normal", "contact_reach_cells": 3.0}
     older = {"material_embedding": 16, "wall_distance_cells": 8.0}  # keys of 0.1.0
     rests = {"rest_levels": 2, "rest_large_materials": ["sand", "snow"]}
     relative, resting = NetworkConfig(inputs="relative"), {"rest_threshold": 0.1}
+    gns = NetworkConfig(kind="gns", levels=1)
     for config, told, refused in (
         (NetworkConfig(), {}, None),
         (NetworkConfig(), older, None),
@@ -135,6 +131,8 @@ def test_networks_of_before():
         (relative, older | contacts | rests | resting | {"rest_levels": 1}, "rest_levels"),
         (relative, older | contacts | rests | resting | {"rest_large_materials": None}, "rest_large_materials"),
         (relative, older | contacts | resting | {"rest_large_materials": ["sand", "snow"]}, "rest_levels"),
+        (gns, {"maximum_neighbours": None, "static_spacing_cells": 0.25}, None),
+        (gns, {"maximum_neighbours": 64}, "maximum_neighbours"),
     ):
         stored = to_mapping(config) | told
         if refused is None:
@@ -142,19 +140,8 @@ def test_networks_of_before():
             continue
         with pytest.raises(ConfigError, match=rf"network\.{refused} is not a known key; it was removed and is always"):
             from_stored(NetworkConfig, stored, "network")
-
-
-def test_weights_of_gns():
-    """Files of GNS load without the settings of static particles and neighbour limits; files with them are refused."""
-    gns = NetworkConfig(kind="gns", levels=1)
-    stored = to_mapping(gns) | {"maximum_neighbours": None, "static_spacing_cells": 0.25}
-    assert from_stored(NetworkConfig, stored, "network") == gns
-    for changes, message in (
-        ({"maximum_neighbours": 64}, r"network\.maximum_neighbours is not a known key; it was removed"),
-        ({"kind": "gns_particles"}, rf"network\.kind must be .*; {LAST}, is the last with it"),
-    ):
-        with pytest.raises(ConfigError, match=message):
-            from_stored(NetworkConfig, stored | changes, "network")
+    with pytest.raises(ConfigError, match=rf"network\.kind must be .*; {LAST}, is the last with it"):
+        from_stored(NetworkConfig, to_mapping(gns) | {"kind": "gns_particles"}, "network")
     for name in REMOVED_CHOICES["weights"]:
         with pytest.raises(ConfigError, match=f"got '{name}'; {LAST}"):
             find_weights(name)

@@ -190,7 +190,8 @@ def test_animation(tmp_path, every, fps, pictures, milliseconds):
 
 
 def test_webp_animation(tmp_path):
-    """A WebP holds the same pictures as the GIF in real time, loops, and is the smaller file."""
+    """A WebP holds the same pictures as the GIF in real time, loops, and is the smaller file. A rollout of one frame
+    gives a still picture."""
     rollout, progress = falling_blobs(24, 24), []
     animate(rollout, tmp_path / "a.webp", every=2, size=160, progress=lambda *step: progress.append(step))
     animate(rollout, tmp_path / "a.gif", every=2, size=160)
@@ -203,10 +204,6 @@ def test_webp_animation(tmp_path):
             assert webp.info["duration"] == 33 and np.abs(one - other).mean() < 4
     assert progress == [(i + 1, 12) for i in range(12)]
     assert (tmp_path / "a.webp").stat().st_size < 0.8 * (tmp_path / "a.gif").stat().st_size
-
-
-def test_single_frame_animation(tmp_path):
-    """A rollout of one frame gives a still picture."""
     for ending in ("gif", "webp"):
         animate(falling_blobs(1), tmp_path / f"still.{ending}", size=80)
         with Image.open(tmp_path / f"still.{ending}") as picture:

@@ -2,12 +2,22 @@
 
 from dataclasses import replace
 
-from network.states import network_of
+import torch
+from network.states import network_of, silent
 
 from hgn.config import SceneConfig
 from hgn.runtime.simulator import InitialState, Simulator
+from hgn.runtime.weights import WeightsInfo, save_weights
 from tools.stability.case import Outcome
 from tools.stability.network_cases import FAMILIES, Context
+
+
+def still_weights(folder, **changes):
+    """A file of a network that never accelerates particles."""
+    still = silent(network_of(torch.float32, width=8, message_passing_steps=1, levels=2, **changes))
+    still.normaliser.acceleration_mean.zero_()
+    save_weights(folder / "still.safetensors", still, WeightsInfo(still.config, 60.0, 1 / 64, updates=3))
+    return str(folder / "still.safetensors")
 
 
 def family(name, config, frames=300, solver=True, **scene):

@@ -67,26 +67,19 @@ def volume_of(bodies):
 
 
 @pytest.mark.parametrize(
-    ("mode", "indices"),
-    [(5, None), (5, [0, 1, 3, 2]), (6, None), (6, [0, 1, 2, 3]), (4, [0, 1, 2, 2, 3, 0])],
+    ("mode", "indices"), [(5, None), (5, [0, 1, 3, 2]), (6, None), (6, [0, 1, 2, 3]), (4, [0, 1, 2, 2, 3, 0])]
 )
 def test_strips_and_fans(tmp_path, mode, indices):
-    """A square beside a cube, as triangles, a strip and a fan, with indices and without."""
+    """A square beside a cube, as triangles, a strip and a fan, with indices and without; points and lines are no
+    surface, and are left out."""
     file = Glb()
+    file.add(*(file.primitive(QUAD, mode=none) for none in (0, 1, 2, 3)))
     file.cube()
     file.add(file.primitive(QUAD if mode != 5 or indices else QUAD[[0, 1, 3, 2]], indices, mode=mode))
     solid, sheet = load_bodies(file.save(tmp_path / "a.glb"))
     assert (solid.closed, len(solid.triangle_F3)) == (True, 12)
     flat = trimesh.Trimesh(sheet.vertex_V3, sheet.triangle_F3, process=False)
     assert not sheet.closed and flat.area == pytest.approx(1) and len(flat.faces) == 2
-
-
-def test_points_and_lines_are_no_surface(tmp_path):
-    """They are left out, whatever is beside them."""
-    file = Glb()
-    file.add(*(file.primitive(QUAD, mode=mode) for mode in (0, 1, 2, 3)))
-    file.cube()
-    assert [len(body.triangle_F3) for body in load_bodies(file.save(tmp_path / "a.glb"))] == [12]
 
 
 def test_instances(tmp_path):

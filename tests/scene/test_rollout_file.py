@@ -34,12 +34,9 @@ FRAMES, PARTICLES = 4, 7
 def make_rollout(reference_frames=3):
     generator = np.random.default_rng(0)
     triangle = Obstacle("sheet", generator.random((3, 3)), np.array([[0, 1, 2]], np.int32), closed=False)
-    tetrahedron = Obstacle(
-        "tetrahedron", np.eye(4, 3), np.array([[0, 1, 2], [0, 3, 1], [0, 2, 3], [1, 3, 2]], np.int32), closed=True
-    )
-    reference = None
-    if reference_frames is not None:
-        reference = generator.random((reference_frames, PARTICLES, 3), np.float32)
+    faces = np.array([[0, 1, 2], [0, 3, 1], [0, 2, 3], [1, 3, 2]], np.int32)
+    tetrahedron = Obstacle("tetrahedron", np.eye(4, 3), faces, closed=True)
+    reference = reference_frames and generator.random((reference_frames, PARTICLES, 3), np.float32)
     return Rollout(
         position_TN3=generator.random((FRAMES, PARTICLES, 3), np.float32),
         material_N=np.arange(PARTICLES, dtype=np.uint8) % 3,
@@ -222,16 +219,13 @@ def test_vtk_reads_it(tmp_path):
         assert vtk_to_numpy(data.GetCellData().GetArray("obstacle")).tolist() == [-1] * count + [0, 1, 1, 1, 1]
 
 
-def test_frame_velocity():
-    """Uniform motion has the same velocity in every frame; a single frame has none."""
+def test_velocities():
+    """Uniform motion has the same velocity in every frame; a single frame has none. A particle that is seen in the last
+    frame alone has none yet; others that enter have that of their second frame."""
     speed = np.array([1.0, -2.0, 0.5], np.float32)
     position_TN3 = (np.arange(5, dtype=np.float32)[:, None, None] / 50) * speed
     np.testing.assert_allclose(frame_velocity(position_TN3, 50.0), np.broadcast_to(speed, (5, 1, 3)), rtol=1e-5)
     assert not frame_velocity(position_TN3[:1], 50.0).any()
-
-
-def test_velocity_of_what_enters_last():
-    """A particle that is seen in the last frame alone has no velocity yet; others have that of their second frame."""
     rollout = make_rollout(None)
     position_TN3, entry_N = rollout.position_TN3.copy(), np.array([0] * 5 + [2, 3])
     position_TN3[:2, 5] = position_TN3[:3, 6] = np.nan

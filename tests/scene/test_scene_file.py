@@ -6,10 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 import yaml
 
 from hgn.scene.material import SAND, SNOW, WATER
-from hgn.scene.scene_file import load_scene
+from hgn.scene.scene_file import load_scene, notes_on_files
 from hgn.schema import ConfigError
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "conf" / "example"
@@ -155,6 +156,7 @@ BETWEEN_WALLS = r" \((cube|disc) of water\) must lie between the walls"
 MESH = {"shape": None, "size": None, "mesh": "a.obj"}
 INSIDE = {"groups": [CUBE, {**CUBE, "position": [0.5, 0.25, 0.5]}], "obstacles": [CONE]}
 YAML, ALIASES = "must be a YAML file", "its aliases expand to more than 100000 values"
+ONE_CUBE = "groups:\n  - {shape: cube, size: 0.05, position: [0.5, 0.8, 0.5], material: water}\n"
 MISTAKES = [
     ("groups: [", YAML),
     (b"\xff\xfe\xfa", YAML),
@@ -163,6 +165,15 @@ MISTAKES = [
     ("cell_size: " + 400 * "9", "cell_size must be a number of at most 63 bits, got one of 1329"),
     (BOMB, ALIASES),
     ("groups: &a [*a]", ALIASES),
+    (ONE_CUBE + "seed: 1\n" + ONE_CUBE, r"line 4: the key groups is given twice, first in line 1"),
+    (ONE_CUBE.replace("size: 0.05", "size: 0.05, size: 0.1"), "line 2: the key size is given twice, first in line 2"),
+    ("\ufeff" + ONE_CUBE.replace("\n", "\r\n") + "seed: 1\r\nseed: 2\r\n", "line 4: the key seed is given twice"),
+    ("gravity: [0, 0, 0]\n'gravity': [0, -9.8, 0]\n" + ONE_CUBE, "line 2: the key gravity is given twice"),
+    (ONE_CUBE + "seed: 010\n", "line 3: seed: 010 is an octal number in YAML; write 10, or 8"),
+    (ONE_CUBE + "cell_size: 00_17\n", "line 3: cell_size: 00_17 is an octal number"),
+    (ONE_CUBE + "gravity:\n- 0\n- -9:30\n- 0\n", "line 5: gravity: -9:30 is a number of base 60 in YAML"),
+    (ONE_CUBE + "cell_size: 1:0.5\n", "line 3: cell_size: 1:0.5 is a number of base 60"),
+    (ONE_CUBE.replace("0.8", "1:48"), "line 2: position: 1:48 is a number of base 60"),
     (None, "the file must be a mapping"),
     ({}, "groups must be a list with at least one group, or emitters"),
     (emitter_with(velocity=[0, 0, 0]), EMITTER + r"\.velocity must be other than zero"),
@@ -229,7 +240,7 @@ MISTAKES = [
 @pytest.mark.parametrize(("content", "message"), MISTAKES, ids=range(len(MISTAKES)))
 def test_every_mistake_is_named(tmp_path, content, message):
     """Each mistake in a scene file ends in one short error: the file, the field, the rule and the value. So do aliases
-    that stand for billions of values, deep nesting and endless numbers."""
+    that stand for billions of values, deep nesting and endless numbers, keys given twice and numbers of other bases."""
     with pytest.raises(ConfigError, match=rf"scene\.yaml:? .*{message}") as caught:
         load_scene(write(tmp_path, content))
     assert len(str(caught.value)) < 1000 and "1074 of 1074 particles inside" not in str(caught.value)
@@ -317,3 +328,41 @@ def test_particles_that_cannot_be_taken(tmp_path, arrays, message):
         path.write_bytes(arrays)
     with pytest.raises(ConfigError, match=rf"groups\[0\].particles.*{message}"):
         load(tmp_path, groups=[{"particles": "own.npz", "material": "sand"}])
+
+
+def test_numbers_that_are_none(tmp_path):
+    """Zero, a decimal that begins with it, a date of the name, and anchors used twice are no surprise."""
+    text = ONE_CUBE.replace("[0.5, 0.8, 0.5]", "&middle [0.5, 0.8, 0.5]") + "obstacles:\n"
+    text += "  - {shape: cone, size: 00.1, position: [0.2, 0.2, 0.2]}\nseed: 0\ngravity: [0, -0.98e1, +0]\n"
+    assert load_scene(write(tmp_path, text)).gravity == (0, -9.8, 0)
+
+
+@pytest.mark.parametrize(
+    ("scale", "note"), [(1000, "no surface in the domain"), (1, None), (1e-3, "smaller than a cell")]
+)
+def test_units_of_a_bowl(tmp_path, scale, note):
+    """A sheet around the whole domain, as a bowl in millimetres, is noted, and the scale that helps."""
+    bowl = trimesh.creation.icosphere(subdivisions=2)
+    bowl.update_faces(bowl.triangles_center[:, 1] < 0.5)
+    bowl.apply_scale(0.3 * scale)
+    bowl.export(tmp_path / "bowl.obj")
+    text = ONE_CUBE + "obstacles: [{mesh: bowl.obj, position: [0.5, 0.4, 0.5]}]\n"
+    notes = notes_on_files(load_scene(write(tmp_path, text)))
+    assert len(notes) == 1 + (note is not None) and (note is None or note in notes[1])
+
+
+@pytest.mark.parametrize("inside", [0, 1, 7])
+def test_stored_particles_inside_an_obstacle(tmp_path, inside):
+    """They are noted with their number, for obstacles of any kind; an empty file is refused."""
+    position_N3 = np.full((20, 3), 0.8, np.float32)
+    position_N3[:inside] = (0.5, 0.3, 0.5)
+    np.savez(tmp_path / "stored.npz", position=position_N3)
+    trimesh.creation.box(extents=(0.3, 0.3, 0.3)).export(tmp_path / "box.ply")
+    told = [f"{inside} of 20 particles of stored.npz"] * (inside > 0)
+    for kind in ({"shape": "cone", "size": 0.3}, {"mesh": "box.ply"}):
+        obstacles = [kind | {"position": [0.5, 0.3, 0.5]}]
+        scene = load(tmp_path, groups=[{"particles": "stored.npz", "material": "sand"}], obstacles=obstacles)
+        assert [note.partition(" lie")[0] for note in notes_on_files(scene)] == told
+    np.savez(tmp_path / "stored.npz", position=position_N3[:0])
+    with pytest.raises(ConfigError, match="position must be of one particle or more"):
+        load_scene(tmp_path / "scene.yaml")

@@ -33,27 +33,20 @@ def make_run(folder, updates=40, pause=0.0, repeated=0, error=1e-6, ranks=1):
     return folder
 
 
-def test_figure_and_rows_of_one_run(tmp_path):
-    """The picture is drawn, and the JSON has all records."""
-    run = make_run(tmp_path / "first")
-    assert main({"runs": [str(run)], "out": str(tmp_path / "curves")}) == 0
-    with Image.open(tmp_path / "curves.png") as picture:
-        assert picture.width > 1000 and picture.height > 300
-    (written,) = json.loads((tmp_path / "curves.json").read_text())["runs"]
-    assert written["name"] == "first" and written["meta"]["device"] == "a device"
-    assert [row["update"] for row in written["rows"] if "loss" in row] == list(range(40))
-    errors = [row["one_step/validation"] for row in written["rows"] if "one_step/validation" in row]
-    assert errors == [1e-6 / update for update in (9, 19, 29, 39)]
-
-
 def test_several_runs(tmp_path):
-    """Each run has a curve and a name; the scenes of an update count on all ranks."""
+    """Each run has a curve, a name and all its records; the scenes of an update count on all ranks."""
     runs = [str(make_run(tmp_path / "x", ranks=2)), str(make_run(tmp_path / "y", error=1e-7))]
     assert main({"runs": runs, "out": str(tmp_path / "curves")}) == 0
-    written = json.loads((tmp_path / "curves.json").read_text())["runs"]
-    assert [run["name"] for run in written] == ["x", "y"]
-    assert [(run["rows"][-1]["update"], run["rows"][-1]["scenes"]) for run in written] == [(39, 39 * 4), (39, 39 * 2)]
+    first, second = json.loads((tmp_path / "curves.json").read_text())["runs"]
+    assert (first["name"], second["name"], first["meta"]["device"]) == ("x", "y", "a device")
+    assert [(run["rows"][-1]["update"], run["rows"][-1]["scenes"]) for run in (first, second)] == [
+        (39, 39 * 4), (39, 39 * 2)
+    ]  # fmt: skip
+    assert [row["update"] for row in first["rows"] if "loss" in row] == list(range(40))
+    errors = [row["one_step/validation"] for row in first["rows"] if "one_step/validation" in row]
+    assert errors == [1e-6 / update for update in (9, 19, 29, 39)]
     with Image.open(tmp_path / "curves.png") as picture:
+        assert picture.width > 1000 and picture.height > 300
         colours = {colour for _, colour in picture.convert("RGB").getcolors(1 << 24)}
     assert {(31, 119, 180), (255, 127, 14)} <= colours  # both lines are drawn
 

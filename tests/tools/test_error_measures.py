@@ -3,6 +3,7 @@
 import io
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -22,6 +23,7 @@ from tools.error_vs_time import score
 from tools.error_vs_time.contenders import BaselineContender, TritonPredictor
 from tools.error_vs_time.paired import paired_difference, paired_rows, paired_table
 from tools.error_vs_time.plot import draw_frames, draw_pareto
+from tools.error_vs_time.run import draw
 from tools.error_vs_time.sinkhorn import sinkhorn_divergences
 from tools.measures import energies, energy_scale, momentum_error, outside_domain
 from tools.timing import FrameClock
@@ -240,9 +242,9 @@ def test_the_figures_show_what_diverged(tmp_path):
     meta |= {"scenes": 2, "split": "test", "data": "d", "device": "a GPU", "reference": "the solver"}
     rows = report_rows()
     rows[2] |= {"position_mse": {"50": 1e-6}, "scenes_reached": {"50": 2, "299": 0}, "failed_scenes": 2}
-    for picture in (
-        *(draw_pareto(rows, meta), draw_pareto([], meta, batched=True)),
-        *(draw_frames(rows, meta), draw_frames([], meta)),
-    ):
+    names = draw(str(tmp_path / "report"), rows, meta)
+    assert [Path(name).name for name in names] == ["report.png", "report_batched.png", "report_frames.png"]
+    empty = (draw_pareto([], meta, batched=True), draw_frames([], meta))
+    for picture in (*(Path(name).read_bytes() for name in names), *empty):
         with Image.open(io.BytesIO(picture)) as image:
             assert image.width > 500

@@ -5,14 +5,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 import yaml
-from docs.pages import run_module
-from network.states import network_of
+from runtime.stability import still_weights
 
 from hgn.runtime.rollouts import RolloutResult
-from hgn.runtime.weights import WeightsInfo, save_weights
-from hgn.scene.scene_file import scene_files
+from hgn.scene.scene_file import find_scene, load_scene, scene_files
 from hgn.schema import ConfigError
 from tools import render
 from tools.scenes import filled
@@ -48,17 +45,6 @@ def tiny_file(folder, **changes):
     path = folder / "tiny.yaml"
     path.write_text(yaml.safe_dump({k: v for k, v in content.items() if v is not None}))
     return path
-
-
-def still_weights(folder):
-    """A file of a network that never accelerates particles."""
-    still = network_of(torch.float32, width=8, message_passing_steps=1, levels=2)
-    with torch.no_grad():
-        still.decode.second.weight.zero_()
-        still.decode.second.bias.zero_()
-    still.normaliser.acceleration_mean.zero_()
-    save_weights(folder / "still.safetensors", still, WeightsInfo(still.config, 60.0, 1 / 64, updates=3))
-    return str(folder / "still.safetensors")
 
 
 def film_of(path_TN3, **more):
@@ -139,9 +125,15 @@ def test_gallery_files(draw):
         assert not same and all(case.content["seed"] == draw for case in cases)
 
 
+OUTSIDE = {"shape": "cube", "size": 0.03, "position": [0.2, 0.12, 0.2], "material": "water"}
+
+
 @pytest.mark.parametrize(
     ("bounds", "message"),
     [
+        (None, "measure must be a section with frames and bounds"),
+        ({"far": OUTSIDE}, "measure.far: groups[0] (cube of water) must lie between"),
+        ({"vary": [{"range": [0, 1], "add": {"groups.7.size": 1}}]}, "measure.vary[0].add must be places "),
         ([], "measure.bounds must be at least one, got []"),
         ([{"of": "hight"}], "measure.bounds[0].of must be one of height, "),
         ([{"of": "energy_gain", "group": 2}], "measure.bounds[0].group must be one of the 2 groups"),
@@ -159,28 +151,16 @@ def test_gallery_files(draw):
     ],
 )
 def test_bad_files(tmp_path, bounds, message):
-    """A mistake in a gallery file is one line that starts with the file."""
-    whole = [{"frames": [5, 10], "between": [0, 1]} | bound for bound in bounds]
-    whole = [{k: v for k, v in bound.items() if v is not None} for bound in whole]
-    path = tiny_file(tmp_path, bounds=whole, far=None)
+    """A mistake in a gallery file is one line that starts with the file: a bound, a place, or no measure at all."""
+    if isinstance(bounds, list):
+        whole = [{"frames": [5, 10], "between": [0, 1]} | bound for bound in bounds]
+        bounds = {"bounds": [{k: v for k, v in bound.items() if v is not None} for bound in whole], "far": None}
+    path = tiny_file(tmp_path, **(bounds or {}))
+    if bounds is None:
+        path.write_text(TINY[: TINY.index("measure:")])
     with pytest.raises(ConfigError) as error:
         load_case("tiny", path)
     assert str(error.value).startswith(f"{path}: {message}") and "\n" not in str(error.value)
-
-
-def test_files_without_measure_and_wrong_places(tmp_path):
-    """A scene file without `measure`, and a variation of a value that is not there, are refused by file and place."""
-    path = tmp_path / "plain.yaml"
-    path.write_text(TINY[: TINY.index("measure:")])
-    with pytest.raises(ConfigError, match=r"plain.yaml: measure must be a section with frames and bounds"):
-        load_case("plain", path)
-    outside = {"shape": "cube", "size": 0.03, "position": [0.2, 0.12, 0.2], "material": "water"}
-    path = tiny_file(tmp_path, far=outside)
-    with pytest.raises(ConfigError, match=r"tiny.yaml: measure.far: groups\[0\] \(cube of water\) must lie between"):
-        load_case("tiny", path)
-    path = tiny_file(tmp_path, vary=[{"range": [0, 1], "add": {"groups.7.size": 1}}])
-    with pytest.raises(ConfigError, match=r"tiny.yaml: measure.vary\[0\].add must be places .*, got groups.7.size"):
-        load_case("tiny", path)
 
 
 def test_draws(tmp_path):
@@ -282,17 +262,8 @@ def test_a_scene_is_drawn_beside_the_solver(tmp_path, monkeypatch, capsys):
         render.main(options)
 
 
-def test_a_mistake_ends_with_code_2(capsys):
-    """Cases are gallery or gallery_NUMBER; anything else is one line and exit code 2."""
-    assert run_module("tools.stability", ["solver", "cases=[galery]"]) == 2
-    refused = capsys.readouterr().err
-    assert refused.startswith("error: cases[0] must be one of steps, ") and refused.count("\n") == 1
-
-
 def test_scenes_load_as_scene_files():
     """Commands that take scene files find the gallery's by name and ignore `measure`."""
-    from hgn.scene.scene_file import find_scene, load_scene
-
     names = scene_files("gallery")
     assert not names.keys() & scene_files("example").keys()
     assert find_scene("pool_medium") == names["pool_medium"]

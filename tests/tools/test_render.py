@@ -37,20 +37,6 @@ def names_in(folder):
     return {entry.name for entry in folder.iterdir()}
 
 
-@pytest.mark.parametrize("reference", [False, True])
-def test_folder(tmp_path, capsys, reference):
-    """A folder gets the grid, the animation and, with ground truth, the error; each path is printed."""
-    path = rollout_file(tmp_path, reference)
-    main({"rollout": str(path), "out": str(tmp_path / "pictures"), "size": 80})
-    wanted = ["fall.png", "fall.gif", *["fall_error.png"] * reference]
-    assert [Path(line).name for line in capsys.readouterr().out.split()] == wanted
-    assert names_in(tmp_path / "pictures") == set(wanted)
-    for name in wanted:
-        with Image.open(tmp_path / "pictures" / name) as picture:
-            picture.load()
-            assert getattr(picture, "n_frames", 1) == (3 if name.endswith("gif") else 1)
-
-
 @pytest.mark.parametrize("ending", ["png", "gif", "webp"])
 def test_single_file(tmp_path, ending):
     """A file name as `out` gets that picture alone, with the frames asked for."""
@@ -85,26 +71,27 @@ def test_an_episode_and_rollouts_beside_it(tmp_path, small_dataset):
         main(mapping | {"episode": "validation-000009", "out": str(tmp_path / "bad")})
 
 
-def test_other_rollouts_stand_beside_it(tmp_path):
-    """Each other rollout has a row and a column of its own; one of another scene is refused."""
+def test_other_rollouts_stand_beside_it(tmp_path, capsys):
+    """A folder gets the grid, the animation and, with ground truth, the error; each path is printed. Each other rollout
+    has a row and a column of its own; one of another scene is refused."""
     path = rollout_file(tmp_path, True)
     (tmp_path / "other").mkdir()
-    other = rollout_file(tmp_path / "other", False)
+    other, wanted = rollout_file(tmp_path / "other", False), ["fall.png", "fall.gif", "fall_error.png"]
     sizes = []
     for others in ([], [str(other)]):
         out = tmp_path / f"{len(others)}"
         names = ["ours", "theirs"][: 1 + len(others)]
         main({"rollout": str(path), "others": others, "names": names, "out": str(out), "size": 80})
+        assert [Path(line).name for line in capsys.readouterr().out.split()] == wanted
+        assert names_in(out) == set(wanted)
         with Image.open(out / "fall.png") as still, Image.open(out / "fall.gif") as moving:
+            assert (getattr(still, "n_frames", 1), moving.n_frames) == (1, 3)
             sizes.append((still.height, moving.width))
     assert sizes[1][0] > sizes[0][0] + 60 and sizes[1][1] > sizes[0][1] + 60
     rollout, bad = read_rollout(other), {"rollout": str(path), "others": [str(other)], "out": str(tmp_path / "bad")}
     for change, message in (
         ({"frame_rate_hz": 30.0}, r"others\[0\] must have 60 frames a second, got 30"),
-        (
-            {"position_TN3": rollout.position_TN3 + np.float32(0.1)},
-            r"others\[0\] must begin with the same particles as",
-        ),
+        ({"position_TN3": rollout.position_TN3 + np.float32(0.1)}, r"others\[0\] must begin with the same particles"),
     ):
         write_rollout(other, dataclasses.replace(rollout, **change))
         with pytest.raises(ConfigError, match=message):

@@ -67,7 +67,8 @@ def test_leaks(monkeypatch):
 def test_validation_rows(monkeypatch):
     """Even four cells of water differ from the experiment by less than 18 %; columns have a run-out and a height.
     Rows of a column whose sand reaches the walls of the basin fail, with a note."""
-    for name, value in {"DAM_CELLS": (4, 5), "COLUMN_CELLS": 4, "COLUMN_ASPECTS": (1.0,), "REST_S": 3.0}.items():
+    short = {"DAM_CELLS": (4, 5), "COLUMN_CELLS": 4, "COLUMN_ASPECTS": (1.0,), "REST_S": 0.5, "SETTLED_S": 0.25}
+    for name, value in short.items():
         monkeypatch.setattr(validation, name, value)
     level, *dams = [*validation.rest(CPU), *validation.dam_breaks(CPU)]
     assert level.case.startswith("level of water at rest") and len(dams) == 3 and dams[0].held and dams[1].held
