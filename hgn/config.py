@@ -52,6 +52,7 @@ MaterialName = Annotated[
 DeviceName = Annotated[str, one_of("auto", "cpu", "cuda")]
 BackendName = Annotated[str, one_of(*BACKENDS)]
 Precision = Annotated[str, one_of(*PRECISIONS)]
+PrecisionOrAuto = Annotated[str, one_of("auto", *PRECISIONS)]
 StoredPrecision = Annotated[str, one_of("fp32", "fp16")]
 Split = Annotated[str, one_of("train", "validation", "test")]
 MATERIAL_EMBEDDING = 16  # numbers that a network learns for each material (paper: E)
@@ -252,7 +253,7 @@ class SimulatorConfig:
     device: str = "auto"  # or cpu, cuda, cuda:1
     # torch, triton (kernels in CUDA graphs), cpu (compiled C); auto: the fastest that runs
     backend: BackendName = "auto"
-    precision: Precision = "tf32"  # of matrix products: fp32, tf32 (on a GPU), fp16 (backend triton)
+    precision: PrecisionOrAuto = "auto"  # of matrix products: fp32, tf32, fp16; auto: the fastest that passes its check
 
 
 @dataclass(frozen=True)
@@ -395,14 +396,15 @@ class TrainingConfig:
     seed: NonNegative[int] = 0  # of initial parameters, order of samples, noise and simulations
     device: DeviceName = "auto"  # cpu or cuda; auto: cuda where there is a GPU
     devices: OneOrMore | None = None  # on each machine; null: as launched, without a launcher all GPUs, or one CPU
-    precision: Precision = "tf32"  # of matrix products: fp32, tf32 (on a GPU), fp16 (backend triton, and GNS)
+    precision: PrecisionOrAuto = "auto"  # of matrix products: fp32, tf32, fp16; auto: the fastest that passes its check
     # torch, or triton (kernels in CUDA graphs); auto: triton where it runs
     backend: Annotated[str, one_of("auto", "torch", "triton")] = "auto"
     minimum_episodes: Positive[int] = 1  # training starts once this number of training episodes is published
     generate: bool = True  # start the generator where the data set is missing or incomplete
     log_every: Positive[int] = 50  # updates between log lines
     checkpoint_every: Positive[int] = 1_000  # updates between checkpoints
-    monitor_every: Positive[int] = 100_000  # updates between measurements of one-step and rollout errors
+    # updates between measurements of one-step and rollout errors; the first interval is halved down to 2,000
+    monitor_every: Positive[int] = 100_000
     monitor_rollout_frames: NonNegative[int] = 300  # of each rollout that is measured; 0: no rollouts
 
     def __post_init__(self) -> None:

@@ -64,7 +64,7 @@ def main(mapping: dict[str, Any]) -> int:
         if first_rank() and config.training.generate and not is_remote(folder) and not is_complete(config):
             generator = Generator(config.datagen, run / "datagen")
             stack.callback(generator.stop)
-        precompilation = precompile_kernels(config, stack)
+        precompilation = precompile_kernels(config, resume, stack)
         store = wait_for_episodes(config, generator, stop, others)
         if store is None:
             print("stopped before the first episode was published; the same command resumes it", file=sys.stderr)

@@ -126,7 +126,7 @@ RULES = {
     command(StabilityNetworkConfig, weights="w"): [
         ({"cases": ["wide"]}, r"cases\[0\] must be one of throw"),
         ({"frames": 1}, "frames must be at least 2"),
-        ({"precision": "fp8"}, "precision must be one of fp32, tf32, fp16"),
+        ({"precision": "fp8"}, "precision must be one of auto, fp32, tf32, fp16"),
         ({"backend": "quick"}, "backend must be one of auto, torch, triton, cpu"),
     ],
     command(StabilitySolverConfig): [

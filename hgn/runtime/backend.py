@@ -42,7 +42,7 @@ class CpuBackend(Backend):
 def choose(
     device: torch.device,
     network: ParticleNetwork,
-    precision: str = "tf32",
+    precision: str = "auto",
     backend: str = "auto",
     field: str = "backend",
 ) -> Backend:
@@ -50,7 +50,7 @@ def choose(
 
     Raises: ConfigError naming `field` for an unknown backend, or with the reason why it cannot run here.
     """
-    for name, value, known in ((field, backend, BACKENDS), ("precision", precision, PRECISIONS)):
+    for name, value, known in ((field, backend, BACKENDS), ("precision", precision, ("auto", *PRECISIONS))):
         require(value in known, name, f"one of {', '.join(known)}", value)
     config = network.config
     reasons = {
@@ -58,27 +58,29 @@ def choose(
         "cpu": cpu_unsupported_reason(device, config, precision),
         "torch": torch_unsupported_reason(precision),
     }
-    name, note = pick(reasons, backend, precision, field)
+    name, report = pick(reasons, backend, precision, field)
+    chosen = build(name, network, precision)
+    chosen.note = f"{report}, precision {chosen.precision}"
     if name == "cpu":
-        note = f"{note}, {compiled.describe(config.width)}"
-    return build(name, network, precision, note)
+        chosen.note = f"{chosen.note}, {compiled.describe(config.width)}"
+    return chosen
 
 
-def build(name: str, network: ParticleNetwork, precision: str = "tf32", note: str = "") -> Backend:
+def build(name: str, network: ParticleNetwork, precision: str = "auto") -> Backend:
     """Returns the named backend, whether the machine supports it or not."""
     if name == "triton":
         # Triton, which the others do without, is loaded here.
         from hgn.runtime.triton_backend import TritonBackend
 
         assert isinstance(network, HierarchicalGraphNetwork)
-        return TritonBackend(network, precision, note)
+        return TritonBackend(network, precision)
     if name == "cpu":
         assert isinstance(network, HierarchicalGraphNetwork)
-        return CpuBackend(network, precision, note)
-    return Backend(network, precision, note)
+        return CpuBackend(network, precision)
+    return Backend(network, precision)
 
 
-def fastest_stepped(network: ParticleNetwork, precision: str = "tf32") -> Backend:
+def fastest_stepped(network: ParticleNetwork, precision: str = "auto") -> Backend:
     """Returns the fastest backend that computes frames one by one, for any network and device."""
     if cpu_unsupported_reason(next(network.parameters()).device, network.config, precision) is None:
         return build("cpu", network, precision)
@@ -100,7 +102,7 @@ def pick(reasons: Mapping[str, str | None], backend: str, precision: str, field:
         raise ConfigError(f"precision must be tf32 or fp32 on backend torch, got {precision}; {cause}")
     because = f" (not {first}: {reasons[first]})" if backend == "auto" and chosen != first else ""
     where = field.rpartition(".")[0] or "runtime"
-    return chosen, f"{where} backend: {chosen}{because}, precision {precision}"
+    return chosen, f"{where} backend: {chosen}{because}"
 
 
 def torch_unsupported_reason(precision: str) -> str | None:
@@ -117,7 +119,7 @@ def cpu_unsupported_reason(device: torch.device, config: NetworkConfig, precisio
     return "it computes float32" if precision == "fp16" else None
 
 
-def triton_unsupported_reason(device: torch.device, config: NetworkConfig, precision: str = "tf32") -> str | None:
+def triton_unsupported_reason(device: torch.device, config: NetworkConfig, precision: str = "auto") -> str | None:
     """Returns why backend triton cannot simulate a network, or None."""
     if device.type != "cuda":
         return f"it needs a CUDA device, not {device.type}"

@@ -24,6 +24,10 @@ class Quantity:
     least: float = 0.0
 
 
+class ParityError(ConfigError):
+    """Kernels compute other results than PyTorch on this machine."""
+
+
 # Normalised accelerations. Latents have size 1 whatever the output, so rounding to 11 bits (fp16, tf32) changes small
 # outputs as much as large ones: by 6e-4 on an H100, where almost nothing is accelerated. The bound is 2.5 times that.
 OUTPUTS = Quantity("outputs", 0.05, least=0.03)
@@ -40,15 +44,18 @@ def relative_error(computed: torch.Tensor, expected: torch.Tensor, least: float 
     return 0.0 if difference == 0 else math.inf
 
 
-def require_parity(computed: torch.Tensor, expected: torch.Tensor, quantity: Quantity, field: str = "backend") -> float:
-    """Returns the relative error of kernels against PyTorch.
+def require_parity(
+    computed: torch.Tensor, expected: torch.Tensor, quantity: Quantity, precision: str, section: str = ""
+) -> float:
+    """Returns the relative error of kernels of this precision against PyTorch.
 
-    Raises: ConfigError where it exceeds its bound; `field` names the setting that must be torch then.
+    Raises: ParityError where it exceeds its bound. It names the setting to change, in `section` ("training." or none).
     """
     error = relative_error(computed, expected, quantity.least)
     if not error <= quantity.bound:  # NaN fails
-        raise ConfigError(
-            f"{field} must be torch on this machine, got triton: its {quantity.name} differ by {error:.1e} from "
-            f"PyTorch's (at most {quantity.bound}); set {field}=torch, and report device and versions"
+        field, wanted, used = ("precision", "tf32", "fp16") if precision == "fp16" else ("backend", "torch", "triton")
+        raise ParityError(
+            f"{section}{field} must be {wanted} on this machine, got {used}: its {quantity.name} differ by {error:.1e} "
+            f"from PyTorch's (at most {quantity.bound}); set {section}{field}={wanted}, and report device and versions"
         )
     return error

@@ -128,7 +128,7 @@ class Simulator:
         network: ParticleNetwork,
         frame_rate_hz: float,
         backend: str | Backend = "auto",
-        precision: str = "tf32",
+        precision: str = "auto",
         info: WeightsInfo | None = None,
     ) -> None:
         """`backend` is one of hgn.runtime.backend, or the name of one: torch, triton or cpu, whether this machine
@@ -143,7 +143,7 @@ class Simulator:
 
     @staticmethod
     def load(
-        weights: str | Path = DEFAULT_WEIGHTS, device: str = "auto", backend: str = "auto", precision: str = "tf32"
+        weights: str | Path = DEFAULT_WEIGHTS, device: str = "auto", backend: str = "auto", precision: str = "auto"
     ) -> Simulator:
         """Loads exported weights: a file, or the name of shipped ones. The options are those of hgn.rollout.
 
@@ -153,8 +153,8 @@ class Simulator:
         place = choose_device(device)
         network, info = load_weights(find_weights(str(weights)), place)
         chosen = choose(place, network, precision, backend)
-        set_matmul_precision(precision)
-        return Simulator(network, info.frame_rate_hz, chosen, precision, info=info)
+        set_matmul_precision(chosen.precision)
+        return Simulator(network, info.frame_rate_hz, chosen, info=info)
 
     @property
     def info(self) -> WeightsInfo:

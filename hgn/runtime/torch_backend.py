@@ -14,16 +14,28 @@ from hgn.runtime.torch_stepper import TorchStepper
 from hgn.step.reference import accelerations
 
 
+def precisions_to_try(precision: str, device: torch.device, backend: str) -> tuple[str, ...]:
+    """Returns the given precision, or for `auto` those of a backend from the fastest on."""
+    if precision != "auto":
+        return (precision,)
+    if device.type == "cpu":
+        return ("fp32",)
+    return ("fp16", "tf32") if backend == "triton" else ("tf32",)
+
+
 class Backend:
     """PyTorch on the device of the network, which every other backend is compared with and takes the signature of."""
 
     name = "torch"
     stepped = True  # frames begin one by one, so that scenes that diverge can be left out of the next
 
-    def __init__(self, network: ParticleNetwork, precision: str = "tf32", note: str = "") -> None:
-        self.network, self.precision, self.note = network, precision, note
+    def __init__(self, network: ParticleNetwork, precision: str = "auto") -> None:
+        self.network = network
+        self.note = ""  # reports which backend computes, and why
         self.step = network.step  # the constraints of its simulations
         self.device = next(network.parameters()).device
+        self.precisions = precisions_to_try(precision, self.device, self.name)
+        self.precision = self.precisions[0]
         self.growths = 0  # of buffers, in all rollouts
         if self.device.type == "cpu":
             keep_freed_memory()

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 
 from hgn.network.features import ParticleState
 from hgn.network.hgn import HierarchicalGraphNetwork
+from hgn.runtime.parity import ParityError
 from hgn.runtime.torch_backend import Backend
 from hgn.runtime.triton_stepper import CHECKED_PARTICLES, TritonStepper
 
@@ -21,8 +23,8 @@ class TritonBackend(Backend):
     stepped = False
     network: HierarchicalGraphNetwork
 
-    def __init__(self, network: HierarchicalGraphNetwork, precision: str = "tf32", note: str = "") -> None:
-        super().__init__(network, precision, note)
+    def __init__(self, network: HierarchicalGraphNetwork, precision: str = "auto") -> None:
+        super().__init__(network, precision)
         self.idle: dict[int, TritonStepper] = {}  # by number of scenes
 
     @contextmanager
@@ -30,9 +32,7 @@ class TritonBackend(Backend):
         """Yields a stepper, new or idle; it is idle again on exit."""
         stepper = self._idle_stepper(state, capacity)
         if stepper is None:
-            stepper = TritonStepper(self.network, state, self.precision, capacity=capacity, step=self.step)
-            if len(state.position_N3) <= CHECKED_PARTICLES:
-                stepper.require_parity(self.network, state)
+            stepper = self._new_stepper(state, capacity)
         before = stepper.growths
         try:
             yield stepper
@@ -42,6 +42,21 @@ class TritonBackend(Backend):
             if len(self.idle) == IDLE_STEPPERS:
                 del self.idle[next(iter(self.idle))]
             self.idle[state.scene_count] = stepper
+
+    def _new_stepper(self, state: ParticleState, capacity: int) -> TritonStepper:
+        """Allocates a stepper and checks it. Precision `auto` becomes tf32 for good when fp16 fails the check."""
+        stepper = TritonStepper(self.network, state, self.precision, capacity=capacity, step=self.step)
+        if len(state.position_N3) > CHECKED_PARTICLES:
+            return stepper
+        try:
+            stepper.require_parity(self.network, state)
+        except ParityError as error:
+            if self.precision == self.precisions[-1]:
+                raise
+            self.precision = self.precisions[-1]
+            warnings.warn(f"{error}. precision=auto computes in {self.precision} from here on", stacklevel=1)
+            return self._new_stepper(state, capacity)
+        return stepper
 
     def _idle_stepper(self, state: ParticleState, capacity: int) -> TritonStepper | None:
         """Takes an idle stepper that fits the state and starts it from there; its launches are captured already.

@@ -243,16 +243,16 @@ class TritonStepper:
         self._integrate()
         self.grid.status.zero_()
 
-    def require_parity(self, network: HierarchicalGraphNetwork, state: ParticleState, field: str = "backend") -> None:
+    def require_parity(self, network: HierarchicalGraphNetwork, state: ParticleState, section: str = "") -> None:
         """Compares the first output with PyTorch's. Call it before the first frame; `state` is that of the start, or
-        its first scenes. Raises: ConfigError.
+        its first scenes. `section` of the settings has the precision. Raises: ParityError.
         """
         if self.graph is None:
             self._network_pass()
         output_N3 = self.fused.output[: len(state.position_N3), :3]
         with torch.no_grad():
             expected_N3 = rested(network, state, network.prediction(state), self.step_config)
-            require_parity(output_N3, expected_N3, OUTPUTS, field)
+            require_parity(output_N3, expected_N3, OUTPUTS, self.precision, section=section)
 
     def frame_launches(self) -> None:
         """Makes all launches of one frame, which the graph contains."""

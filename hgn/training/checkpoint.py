@@ -14,7 +14,7 @@ from typing import Any
 
 import torch
 
-from hgn.config import NetworkConfig, TrainConfig
+from hgn.config import PRECISIONS, NetworkConfig, TrainConfig
 from hgn.data.sampler import SamplerState
 from hgn.network.base import ParticleNetwork
 from hgn.network.build import build_network
@@ -56,6 +56,7 @@ class Progress:
     updates: int
     skipped: int  # of the updates, because a gradient was not finite
     sampler_state: SamplerState  # the place in the order of samples
+    precision: str | None = None  # of the updates; checkpoints of 0.2.0 and before lack it
 
     @staticmethod
     def of(checkpoint: dict[str, Any]) -> Progress:
@@ -64,7 +65,9 @@ class Progress:
         state = from_stored(SamplerState, section.get("sampler_state"), "sampler_state")
         counts = section.get("updates"), section.get("skipped", guard.get("skipped", 0))
         require(all(type(count) is int for count in counts), "checkpoint updates, skipped", "whole numbers", counts)
-        return Progress(*counts, state)  # type: ignore[arg-type]
+        precision = section.get("precision")
+        require(precision in (None, *PRECISIONS), "checkpoint precision", f"one of {', '.join(PRECISIONS)}", precision)
+        return Progress(*counts, state, precision)  # type: ignore[arg-type]
 
 
 @dataclass(frozen=True)

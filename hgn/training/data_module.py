@@ -22,6 +22,7 @@ from hgn.schema import ConfigError
 from hgn.system.patience import standard_patience_s, without_patience
 from hgn.training.pushforward import Starts, drawn_starts
 from hgn.training.readers import ChunkReader, DrawnChunk
+from hgn.training.schedule import next_measurement
 
 CHUNKS_AHEAD = 2
 LOOK_S = 1.0  # between looks for a signal while there is no chunk
@@ -150,10 +151,11 @@ def chunk_length(training: TrainingConfig, first_update: int, update: int, most:
 
     The first chunks are short: they need the most episodes that are not in memory yet.
     """
-    due = [training.log_every, training.checkpoint_every, training.monitor_every]
+    due = [training.log_every, training.checkpoint_every]
     if training.pushforward_fraction > 0:
         due.append(training.pushforward_every)
-    until_due = min([every - update % every for every in due])
+    until_due = min(every - update % every for every in due)
+    until_due = min(until_due, next_measurement(training, update) - update)
     return min(until_due, training.maximum_updates - update, most, max(1, update - first_update))
 
 

@@ -32,14 +32,20 @@ class TrainingModule(LightningModule):
     updates: Updates  # from on_train_start on
 
     def __init__(
-        self, network: ParticleNetwork, training: TrainingConfig, data: DataInfo, backend: str = "torch"
+        self,
+        network: ParticleNetwork,
+        training: TrainingConfig,
+        data: DataInfo,
+        backend: str = "torch",
+        precisions: tuple[str, ...] = ("fp32",),
     ) -> None:
-        """`backend` is torch or triton."""
+        """`backend` is torch or triton; `precisions` are those that its updates may have, the preferred one first."""
         super().__init__()
         self.automatic_optimization = False
         self.network = network
         self.averaged = copy.deepcopy(network).requires_grad_(False) if training.ema_decay else None
         self.training_config, self.data, self.backend = training, data, backend
+        self._precisions = precisions
         self.update = 0  # updates made
         self.skipped = 0  # of those, skipped until the last log line
         self.sampler_state = SamplerState()
@@ -83,7 +89,7 @@ class TrainingModule(LightningModule):
 
     def simulating_backend(self) -> Backend:
         """Returns what simulates with `result`: the kernels that train, else the fastest that steps by frames."""
-        precision = self.training_config.precision
+        precision = self.updates.precision
         if self.backend == "triton":
             return build("triton", self.result, precision)
         return fastest_stepped(self.result, precision)
@@ -99,13 +105,15 @@ class TrainingModule(LightningModule):
             self.network, optimizer, self.loss_sum, counters=self.gradient_counters, averaged=self.averaged
         )
         if self.backend == "torch":
-            self.updates = TorchUpdates(trained, config, rank, self.manual_backward)
+            self.updates = TorchUpdates(trained, config, rank, self.manual_backward, precision=self._precisions[0])
         else:
             # Triton, which backend torch does without, is loaded here.
             from hgn.training.triton_updates import TritonUpdates
 
             ranks = Ranks(rank, self.trainer.world_size)
-            self.updates = TritonUpdates(trained, config, self.data.obstacle_cell_size, ranks)
+            self.updates = TritonUpdates(
+                trained, config, self.data.obstacle_cell_size, ranks, precisions=self._precisions
+            )
 
     def training_step(self, chunk: WindowChunk | EpisodeChunk) -> None:
         self.updates.run(chunk, self.update)
@@ -117,6 +125,7 @@ class TrainingModule(LightningModule):
             "network": to_mapping(self.network.config),
             "step": to_mapping(self.network.step),
             "noise_std": self.training_config.noise_std,
+            "precision": self.updates.precision,
             "data": to_mapping(self.data),
             "sampler_state": to_mapping(self.sampler_state),
             "updates": self.update,

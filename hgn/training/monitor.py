@@ -32,6 +32,7 @@ from hgn.training.errors import (
     rollout_errors,
 )
 from hgn.training.module import TrainingModule
+from hgn.training.schedule import next_measurement
 from hgn.training.stop import StopRequest
 from hgn.training.tensorboard import show_pictures, write_pictures
 
@@ -53,7 +54,7 @@ class Monitor(Callback):
 
     def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
         assert isinstance(pl_module, TrainingModule)
-        if pl_module.update % pl_module.training_config.monitor_every == 0:
+        if next_measurement(pl_module.training_config, pl_module.update - 1) == pl_module.update:
             self.measure(trainer, pl_module)
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
@@ -107,7 +108,7 @@ class Monitor(Callback):
         network = module.result
         ranks = {"rank": trainer.global_rank, "world_size": trainer.world_size}
         batches = frame_batches(episodes, network, FRAME_STRIDE, **ranks)
-        backend = fastest_stepped(network, module.training_config.precision)
+        backend = fastest_stepped(network, module.updates.precision)
         predictors = {"network": network_predictor(backend)} | baselines(network)
         materials = network.config.materials
         interrupted: Callable[[], bool] = lambda: trainer.world_size == 1 and self.stop.signal is not None  # noqa: E731

@@ -28,7 +28,7 @@ def require_update_parity(
     """Returns the relative errors of outputs and of all gradients on the batch of `updates`, of these episodes' images;
     NaN for a batch of more than CHECKED_PARTICLES.
 
-    Raises: ConfigError when one of them exceeds its bound.
+    Raises: ParityError when one of them exceeds its bound.
     """
     network, fused, count = updates.network, updates.fused, int(updates.buffers.count)
     if count > CHECKED_PARTICLES:
@@ -39,7 +39,9 @@ def require_update_parity(
     parameters = list(network.parameters())
     output_N3 = network.normalised_acceleration(state, origin_S3)
     slopes = torch.autograd.grad((output_N3 * weight_N3).sum(), parameters, allow_unused=True)
-    output_error = require_parity(fused.output[:count, :3], output_N3.detach(), OUTPUTS, "training.backend")
+    output_error = require_parity(
+        fused.output[:count, :3], output_N3.detach(), OUTPUTS, updates.precision, section="training."
+    )
     fused.output_gradient[:count].zero_()
     fused.output_gradient[:count, :3] = weight_N3 / fused.unscale
     fused.backward()
@@ -47,7 +49,7 @@ def require_update_parity(
     updates.packed.scatter(fused.totals[: updates.packed.size], gradients)
     expected = [torch.zeros_like(p) if g is None else g for p, g in zip(parameters, slopes, strict=True)]
     flat, expected_flat = (torch.cat([tensor.flatten() for tensor in each]) for each in (gradients, expected))
-    gradient_error = require_parity(flat, expected_flat, GRADIENTS, "training.backend")
+    gradient_error = require_parity(flat, expected_flat, GRADIENTS, updates.precision, section="training.")
     if updates.device.type == "cuda":
         del output_N3, slopes, expected, expected_flat
         torch.cuda.empty_cache()  # free memory decides where episodes are stored

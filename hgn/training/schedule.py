@@ -1,8 +1,10 @@
-"""Learning rate and moving average as functions of the number of updates made before."""
+"""Learning rate, moving average and measurements as functions of the number of updates made before."""
 
 from __future__ import annotations
 
 from hgn.config import TrainingConfig
+
+FIRST_MEASUREMENT = 2_000  # least number of updates before the first one, where monitor_every is larger
 
 
 def learning_rate(training: TrainingConfig, update: int) -> float:
@@ -18,3 +20,15 @@ def average_weight(training: TrainingConfig, update: int) -> float:
     Early parameters are forgotten soon: while there are few updates, the average is over the last tenth of them.
     """
     return 1.0 - min(training.ema_decay, (1 + update) / (10 + update))
+
+
+def next_measurement(training: TrainingConfig, update: int) -> int:
+    """Returns the number of updates at which errors are measured next, after `update` of them.
+
+    Errors are measured at every multiple of `monitor_every`. The first interval is halved while the half is at least
+    FIRST_MEASUREMENT, so that a long training has a best checkpoint early.
+    """
+    due = training.monitor_every * (1 + update // training.monitor_every)
+    while due // 2 > update and due // 2 >= FIRST_MEASUREMENT and due <= training.monitor_every:
+        due //= 2
+    return due

@@ -6,7 +6,7 @@ import math
 import sys
 from collections.abc import Callable
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,6 +20,7 @@ from hgn.data.storage import faults_outlived
 from hgn.network.base import ParticleNetwork
 from hgn.network.build import build_network
 from hgn.runtime.backend import pick, set_matmul_precision, torch_unsupported_reason, triton_unsupported_reason
+from hgn.runtime.torch_backend import precisions_to_try
 from hgn.schema import to_mapping, without_passwords
 from hgn.system.device import keep_to_quota
 from hgn.system.files import make_folder, write_atomically
@@ -65,7 +66,7 @@ def train_network(config: TrainConfig, start: Start, stop: StopRequest, publishe
     training, run, store, resume = config.training, Path(config.run), start.store, start.resume
     lightning_compat.quieten()
     devices, nodes = layout(training)
-    backend, text = _backend(config)
+    backend, precisions, text = _backend(config, resume)
     if first_rank():
         print(text, file=sys.stderr)
         if not config.dataset.validation_scenes and not len(store.of_split("validation")):
@@ -73,9 +74,9 @@ def train_network(config: TrainConfig, start: Start, stop: StopRequest, publishe
                 f"no validation scenes: there will be no {BEST_NAME}, nor errors and pictures of them", file=sys.stderr
             )
     keep_to_quota()
-    set_matmul_precision(training.precision)
+    set_matmul_precision(precisions[0])
     seed_everything(training.seed, verbose=False)
-    module = _module(config, start, backend)
+    module = _module(config, start, backend, precisions)
     if backend == "triton":
         reader: ChunkReader = EpisodeReader(store, config.network, training, config.step)
     else:
@@ -119,7 +120,7 @@ def train_network(config: TrainConfig, start: Start, stop: StopRequest, publishe
     return 0 if module.update >= training.maximum_updates else stop.exit_code
 
 
-def _module(config: TrainConfig, start: Start, backend: str) -> TrainingModule:
+def _module(config: TrainConfig, start: Start, backend: str, precisions: tuple[str, ...]) -> TrainingModule:
     from hgn.training.module import TrainingModule
 
     data = DataInfo(
@@ -129,7 +130,8 @@ def _module(config: TrainConfig, start: Start, backend: str) -> TrainingModule:
         config.scene.gravity,
         maximum_initial_speed=config.scene.maximum_initial_speed,
     )
-    module = TrainingModule(build_network(config.network, config.step), config.training, data, backend)
+    network = build_network(config.network, config.step)
+    module = TrainingModule(network, config.training, data, backend, precisions=precisions)
     if start.initial is None:
         module.set_statistics(start.store.statistics())
     else:
@@ -137,8 +139,11 @@ def _module(config: TrainConfig, start: Start, backend: str) -> TrainingModule:
     return module
 
 
-def _backend(config: TrainConfig) -> tuple[str, str]:
-    """Returns `torch` or `triton`, and a line that reports it."""
+def _backend(config: TrainConfig, resume: Resume | None) -> tuple[str, tuple[str, ...], str]:
+    """Returns `torch` or `triton`, the precisions to try in order, and a line that reports both.
+
+    A training with precision `auto` goes on in the precision of its checkpoint.
+    """
     training = config.training
     on_gpu = training.device != "cpu" and torch.cuda.is_available()
     device = torch.device("cuda" if on_gpu else "cpu")
@@ -146,13 +151,17 @@ def _backend(config: TrainConfig) -> tuple[str, str]:
         "triton": triton_unsupported_reason(device, config.network, training.precision),
         "torch": torch_unsupported_reason(training.precision),
     }
-    return pick(reasons, training.backend, training.precision, "training.backend")
+    backend, report = pick(reasons, training.backend, training.precision, "training.backend")
+    precisions = precisions_to_try(training.precision, device, backend)
+    if resume is not None and resume.progress.precision in precisions:
+        precisions = (resume.progress.precision,)
+    return backend, precisions, f"{report}, precision {precisions[0]}"
 
 
-def precompile_kernels(config: TrainConfig, stack: ExitStack) -> Precompilation | None:
+def precompile_kernels(config: TrainConfig, resume: Resume | None, stack: ExitStack) -> Precompilation | None:
     """Starts compiling the kernels during the wait for data, in the first process of a machine with GPUs."""
     training = config.training
-    backend, _ = _backend(config)
+    backend, precisions, _ = _backend(config, resume)
     on_gpu = training.device != "cpu" and torch.cuda.is_available() and torch.version.hip is None
     if backend != "triton" or not on_gpu or not first_on_machine():
         return None
@@ -161,6 +170,7 @@ def precompile_kernels(config: TrainConfig, stack: ExitStack) -> Precompilation 
     from hgn.training.precompile import job_of_training
 
     devices, nodes = layout(training)
+    config = replace(config, training=replace(training, precision=precisions[0]))
     precompilation = Precompilation(job_of_training(config, torch.cuda.get_device_capability(), devices * nodes > 1))
     stack.callback(precompilation.stop)
     return precompilation

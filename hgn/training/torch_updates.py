@@ -29,9 +29,13 @@ class TorchUpdates:
         training: TrainingConfig,
         rank: int = 0,
         backward: Callable[[torch.Tensor], None] = torch.Tensor.backward,
+        precision: str = "fp32",
     ) -> None:
-        """`backward` computes the gradients of a loss, averaged over the ranks."""
+        """`backward` computes the gradients of a loss, averaged over the ranks; `precision` is what PyTorch is set
+        to.
+        """
         self.trained, self.training, self._backward = trained, training, backward
+        self.precision = precision
         self._device = next(trained.network.parameters()).device
         if self._device.type == "cpu":
             keep_freed_memory()

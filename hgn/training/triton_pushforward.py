@@ -30,9 +30,11 @@ SPARE = 1.1  # capacity for particles, as a multiple of those of the first simul
 class TritonScenes:
     """Implements hgn.training.pushforward.SimulatedScenes."""
 
-    def __init__(self, network: HierarchicalGraphNetwork, training: TrainingConfig, obstacle_cell_size: float) -> None:
+    def __init__(
+        self, network: HierarchicalGraphNetwork, training: TrainingConfig, obstacle_cell_size: float, precision: str
+    ) -> None:
         """`network` simulates with the parameters in `values`; it also checks the kernels, the first time."""
-        self._network, self._training = network, training
+        self._network, self._training, self._precision = network, training, precision
         self._obstacle_cell_size = obstacle_cell_size
         self._history = network.config.velocity_history
         self._stepper: TritonStepper | None = None
@@ -119,7 +121,7 @@ class TritonScenes:
         stepper = TritonStepper(
             self._network,
             state,
-            self._training.precision,
+            self._precision,
             capacities,
             capacity=particles,
             obstacles=table,
@@ -129,7 +131,7 @@ class TritonScenes:
         if capacities is None:
             first = self._first_scenes(episodes, state)
             if first is not None:
-                stepper.require_parity(self._network, first, "training.backend")
+                stepper.require_parity(self._network, first, "training.")
                 if device.type == "cuda":
                     torch.cuda.empty_cache()  # free memory decides where episodes are stored
         stepper.use_values(values)

@@ -22,6 +22,7 @@ from hgn.kernels.triton_compat import JitMisses
 from hgn.kernels.update.op import DeviceEpisode, DeviceSample, Updates, UpdateSettings
 from hgn.network.base import ParticleNetwork
 from hgn.network.hgn import HierarchicalGraphNetwork
+from hgn.runtime.parity import ParityError
 from hgn.runtime.triton_host import kernel_precision
 from hgn.scene.symmetry import drawn_symmetry
 from hgn.training.distributed import sum_over_ranks
@@ -39,37 +40,50 @@ class TritonUpdates:
     """Trains on chunks of samples with CUDA graphs; hgn.training.updates.Updates describes the methods."""
 
     def __init__(
-        self, trained: TrainedNetwork, training: TrainingConfig, obstacle_cell_size: float, ranks: Ranks
+        self,
+        trained: TrainedNetwork,
+        training: TrainingConfig,
+        obstacle_cell_size: float,
+        ranks: Ranks,
+        precisions: tuple[str, ...] = ("fp32",),
     ) -> None:
+        """`precisions` are tried in order: the first whose kernels agree with PyTorch's trains."""
         self._start_s, self._made, self._jit_misses = time.monotonic(), 0, JitMisses()
         self._seconds: dict[str, float] = defaultdict(float)
         self.training, self._ranks = training, ranks
+        assert isinstance(trained.network, HierarchicalGraphNetwork)
         self.network, self.optimizer = trained.network, trained.optimizer
         self.device = next(self.network.parameters()).device
-        assert isinstance(self.network, HierarchicalGraphNetwork)
         self._take_over()
+        self._averaged = None if trained.averaged is None else _flattened(trained.averaged)
+        self._trained, self._obstacle_cell_size = trained, obstacle_cell_size
+        self._build(precisions[0])
+        self._other_precisions = precisions[1:]
+        self._episodes: dict[int, DeviceEpisode] = {}
+        self.parity: tuple[float, float] | None = None  # with PyTorch, see hgn.training.parity
+
+    def _build(self, precision: str) -> None:
+        """Makes the kernels' updates and simulations of this precision, from the network as it is."""
+        trained, training, ranks = self._trained, self.training, self._ranks
+        self.precision = precision
         self.updates = Updates(
             self.network,
-            UpdateSettings.of(training, obstacle_cell_size),
-            kernel_precision(training.precision, self.device),
+            UpdateSettings.of(training, self._obstacle_cell_size),
+            kernel_precision(precision, self.device),
             trained.loss_sum,
             counters=trained.counters,
             reduce=sum_over_ranks if ranks.count > 1 else None,
             ranks=ranks.count,
         )
         self._read_moments()
-        self._averaged = None
-        if trained.averaged is not None:
-            self._averaged = _flattened(trained.averaged)
+        if self._averaged is not None:
             self.updates.average = self._packed(self._averaged)
-        self._episodes: dict[int, DeviceEpisode] = {}
         self._pool: PushforwardPool[DeviceEpisode, DeviceSample] | None = None
         if training.pushforward_fraction > 0:
             simulated = trained.result
             assert isinstance(simulated, HierarchicalGraphNetwork)
-            self._scenes = TritonScenes(simulated, training, obstacle_cell_size)
+            self._scenes = TritonScenes(simulated, training, self._obstacle_cell_size, precision)
             self._pool = PushforwardPool(self._scenes, training, ranks.rank)
-        self.parity: tuple[float, float] | None = None  # with PyTorch, see hgn.training.parity
 
     @property
     def pool_figures(self) -> dict[str, float]:
@@ -111,7 +125,24 @@ class TritonUpdates:
         shown = None
         if self.training.symmetry != "none":
             shown = [drawn_symmetry(e.symmetries, s.seed) for e, s in zip(episodes, first, strict=True)]
-        outputs, gradients = self.parity = require_update_parity(self.updates, episodes, shown)
+        failure = None
+        try:
+            self.parity = require_update_parity(self.updates, episodes, shown)
+        except ParityError as error:
+            failure = error
+        failures = torch.tensor(float(failure is not None), device=self.device)
+        if self._ranks.count > 1:
+            sum_over_ranks(failures)
+        if failures > 0:
+            if not self._other_precisions:
+                raise failure or ParityError("the kernels compute wrongly on another rank, whose message has the error")
+            precision, self._other_precisions = self._other_precisions[0], self._other_precisions[1:]
+            self._say(f"{failure or 'a check failed on another rank'}; precision=auto trains in {precision}")
+            self._build(precision)
+            self._check(chunk)
+            return
+        assert self.parity is not None
+        outputs, gradients = self.parity
         text = f"outputs within {outputs:.0e}, gradients within {gradients:.0e} of PyTorch's"
         self._say(text if math.isfinite(outputs) else "batch too large to check")
 

@@ -45,6 +45,8 @@ class Ranks:
 class Updates(Protocol):
     """Trains on chunks of samples."""
 
+    precision: str  # of matrix products: fp32, tf32 or fp16
+
     @property
     def pool_figures(self) -> dict[str, float]:
         """Metrics of the pushforward pool, empty without one."""

@@ -199,8 +199,30 @@ def test_free_flight_is_not_refused():
     other = network(2, inputs="relative")
     with torch.no_grad():
         other.decode.second.weight.mul_(1.5)
-    with pytest.raises(ConfigError, match=r"backend must be torch on this machine.*its outputs differ by"):
+    with pytest.raises(ConfigError, match=r"precision must be tf32 on this machine.*its outputs differ by"):
         rollout.require_parity(other, stirred)
+
+
+def test_automatic_precision_is_lowered_where_refused(monkeypatch):
+    """With precision auto a backend whose fp16 fails the check warns once and simulates in the next precision; a named
+    precision is refused."""
+    check = triton_stepper.require_parity
+    wrong = lambda computed, expected, quantity, precision, section="": check(  # noqa: E731
+        computed * (0.5 if precision == "fp16" else 1.0), expected, quantity, precision, section
+    )
+    monkeypatch.setattr(triton_stepper, "require_parity", wrong)
+    monkeypatch.setattr(
+        "hgn.runtime.torch_backend.precisions_to_try", lambda p, *_: ("fp16", "fp32") if p == "auto" else (p,)
+    )
+    (expected,) = Simulator(network(), 60.0, "triton", "fp32").rollout([scene(3)], 2)
+    simulator = Simulator(network(), 60.0, "triton")
+    with pytest.warns(UserWarning, match="got fp16: its outputs differ.*precision=auto computes in fp32 from here on"):
+        (lowered,) = simulator.rollout([scene(3)], 2)
+    np.testing.assert_array_equal(lowered, expected)
+    simulator.backend.release()
+    np.testing.assert_array_equal(simulator.rollout([scene(3)], 2)[0], expected)
+    with pytest.raises(ConfigError, match="precision must be tf32 on this machine, got fp16"):
+        Simulator(network(), 60.0, "triton", "fp16").rollout([scene(3)], 2)
 
 
 def test_later_simulations_begin_anew():

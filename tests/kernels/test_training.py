@@ -11,6 +11,8 @@ from training.test_weights import data as data
 from hgn import train
 from hgn.config import TrainingConfig
 from hgn.kernels.update.op import Updates, UpdateSettings
+from hgn.schema import ConfigError
+from hgn.training import parity, schedule
 from hgn.training.checkpoint import read_checkpoint
 from hgn.training.data_module import chunk_length
 from hgn.training.module import TrainingModule
@@ -100,6 +102,37 @@ def test_fast_training_is_the_plain_one(data, tmp_path, monkeypatch, capsys):
     assert found == pytest.approx(wanted, rel=1e-3)
 
 
+def test_automatic_precision_of_a_training(data, tmp_path, monkeypatch, capsys):
+    """With precision auto a training whose fp16 fails the check is bitwise one in the next precision, pushforward and
+    average included; it resumes in that precision without trying fp16. A named precision is refused."""
+    check = parity.require_parity
+    wrong = lambda computed, expected, quantity, precision, section="": check(  # noqa: E731
+        computed * (0.5 if precision == "fp16" else 1.0), expected, quantity, precision, section
+    )
+    monkeypatch.setattr(parity, "require_parity", wrong)
+    monkeypatch.setattr("hgn.training.session.triton_unsupported_reason", lambda *_: None)
+    monkeypatch.setattr(
+        "hgn.training.session.precisions_to_try", lambda p, *_: ("fp16", "fp32") if p == "auto" else (p,)
+    )
+    values = {"ema_decay": 0.7, "pushforward_fraction": 0.5, "pushforward_every": 1, "pushforward_frames": 2}
+    ends = []
+    for precision in ("fp32", "auto"):
+        for updates in (1, 2) if precision == "auto" else (2,):
+            with monkeypatch.context() as patch:
+                stop_at(patch, updates)
+                run = run_mapping(data, tmp_path / precision, precision=precision, **values)
+                assert train.main(run) == 0
+        ends.append(read_checkpoint(tmp_path / precision / "checkpoints" / "last.ckpt"))
+    errors = capsys.readouterr().err
+    assert errors.count("got fp16: its outputs differ") == 1 and "precision=auto trains in fp32" in errors
+    assert ends[0]["hgn"] == ends[1]["hgn"] and ends[1]["hgn"]["precision"] == "fp32"
+    for key, value in ends[0]["state_dict"].items():
+        assert torch.equal(ends[1]["state_dict"][key], value), key
+    refused = run_mapping(data, tmp_path / "refused", precision="fp16", **values)
+    with pytest.raises(ConfigError, match=r"training\.precision must be tf32 on this machine, got fp16"):
+        train.main(refused)
+
+
 def test_a_part_of_the_data_is_enough(make_config, make_dataset, tmp_path, monkeypatch):
     """A training that holds 6 of 14 episodes at a time, into its second epoch, gives the kernels the windows, rates and
     weights of one that holds all, bitwise, and each episode comes once an epoch."""
@@ -152,9 +185,10 @@ def stop_at(monkeypatch, update):
     monkeypatch.setattr(Stopper, "on_train_batch_end", on_train_batch_end)
 
 
-def test_chunks_end_where_something_is_due():
+def test_chunks_end_where_something_is_due(monkeypatch):
     """Chunks meet every multiple of the log, checkpoint, monitor and rollout intervals and the last update, whatever
-    update a training begins at, and the first ones are short."""
+    update a training begins at, and the first ones are short. Measurements begin early and become rarer."""
+    monkeypatch.setattr(schedule, "FIRST_MEASUREMENT", 60)
     training = TrainingConfig(
         maximum_updates=1000,
         log_every=50,
@@ -171,4 +205,11 @@ def test_chunks_end_where_something_is_due():
             update += count
             ends.append(update)
         due = {n for every in (50, 70, 300, 32) for n in range(every, 1001, every) if n > begun} | {1000}
+        due |= {n for n in (75, 150) if n > begun}
         assert due <= set(ends) and ends[-1] == 1000 and ends[0] == begun + 1
+    monkeypatch.undo()
+    measured = [0]
+    while measured[-1] < 150_000:
+        measured.append(schedule.next_measurement(replace(training, monitor_every=50_000), measured[-1]))
+    assert measured[1:] == [3125, 6250, 12_500, 25_000, 50_000, 100_000, 150_000]
+    assert schedule.next_measurement(replace(training, monitor_every=1000), 0) == 1000

@@ -11,6 +11,7 @@ import torch
 from hgn.config import NetworkConfig
 from hgn.network.build import build_network
 from hgn.runtime.backend import choose, pick, triton_unsupported_reason
+from hgn.runtime.torch_backend import precisions_to_try
 from hgn.runtime.triton_host import host_unsupported_reason
 from hgn.schema import ConfigError
 
@@ -21,9 +22,9 @@ CPU, GPU = torch.device("cpu"), torch.device("cuda")
 @pytest.mark.parametrize(
     ("backend", "precision", "reasons", "expected"),
     [
-        ("auto", "tf32", (None, None), ("triton", "training backend: triton, precision tf32")),
-        ("torch", "tf32", (None, None), ("torch", "training backend: torch, precision tf32")),
-        ("auto", "tf32", (GOLD, None), ("torch", f"training backend: torch (not triton: {GOLD}), precision tf32")),
+        ("auto", "tf32", (None, None), ("triton", "training backend: triton")),
+        ("torch", "tf32", (None, None), ("torch", "training backend: torch")),
+        ("auto", "tf32", (GOLD, None), ("torch", f"training backend: torch (not triton: {GOLD})")),
         ("triton", "tf32", (GOLD, None), "training.backend must be torch or auto here, got triton: it needs gold"),
         ("auto", "fp16", (GOLD, HALF), "precision must be tf32 or fp32 on backend torch, got fp16; triton: it"),
         ("torch", "fp16", (None, HALF), "got fp16; training.backend=torch was asked for"),
@@ -60,6 +61,22 @@ def test_what_a_cpu_takes(kind, precision, backend, expected):
         return
     with pytest.raises(ConfigError, match=expected):
         choose(CPU, network, precision, backend)
+
+
+@pytest.mark.parametrize(
+    ("precision", "device", "backend", "expected"),
+    [
+        ("auto", GPU, "triton", ("fp16", "tf32")),
+        ("auto", GPU, "torch", ("tf32",)),
+        ("auto", CPU, "cpu", ("fp32",)),
+        ("auto", CPU, "triton", ("fp32",)),
+        ("tf32", GPU, "triton", ("tf32",)),
+        ("fp16", GPU, "triton", ("fp16",)),
+    ],
+)
+def test_automatic_precision(precision, device, backend, expected):
+    """auto tries the precisions of a backend from the fastest on; a named precision has no alternative."""
+    assert precisions_to_try(precision, device, backend) == expected
 
 
 @pytest.mark.parametrize(

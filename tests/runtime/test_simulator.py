@@ -155,7 +155,7 @@ def test_frame_by_frame(tmp_path):
     """Frames asked for one by one are those of a rollout, beside another scene's; a Scene is taken as it is."""
     simulator = loaded(tmp_path, network_of(torch.float32))
     assert simulator.frame_rate_hz == 60.0 and simulator.backend.note.startswith(
-        "runtime backend: cpu (not triton: it needs a CUDA device, not cpu), precision tf32, rows "
+        "runtime backend: cpu (not triton: it needs a CUDA device, not cpu), precision fp32, rows "
     )
     start, other = initial(30), initial(10, 1)
     scene = Scene(start.position_N3, start.velocity_N3, start.material_N)

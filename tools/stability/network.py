@@ -19,7 +19,7 @@ import torch
 from PIL import Image
 
 from hgn.command import run_command
-from hgn.config import DEFAULT_WEIGHTS, MpmConfig, Precision, SceneConfig, SimulatorConfig
+from hgn.config import DEFAULT_WEIGHTS, MpmConfig, SceneConfig, SimulatorConfig
 from hgn.render.pictures import compare_picture, spread, stacked, write_picture
 from hgn.runtime.rollouts import RolloutResult, simulate_scenes
 from hgn.runtime.simulator import InitialState, Simulator
@@ -83,7 +83,7 @@ def main(mapping: dict[str, Any]) -> int:
     runner = Runner(simulator, cases, mpm)
     pictures = Pictures(config.picture, simulator, report.meta["weights"])
     if cases:
-        compile_kernels(simulator, cases, config.precision)
+        compile_kernels(simulator, cases)
     report.meta["seconds_before_cases"] = time.monotonic() - started
     for case in cases:
         rows, trials = runner.rows(case)
@@ -112,18 +112,22 @@ def cases_of(config: StabilityNetworkConfig, simulator: Simulator) -> list[Case]
 
 def _meta(config: StabilityNetworkConfig, simulator: Simulator) -> dict[str, Any]:
     meta = meta_of(config, simulator.device) | {"weights": Path(config.weights).name}
-    meta |= {"updates": simulator.info.updates, "backend": simulator.backend.name}
+    meta |= {
+        "updates": simulator.info.updates,
+        "backend": simulator.backend.name,
+        "precision": simulator.backend.precision,
+    }
     return meta | {"network": to_mapping(simulator.info.network)}
 
 
-def compile_kernels(simulator: Simulator, cases: Sequence[Case], precision: Precision) -> None:
+def compile_kernels(simulator: Simulator, cases: Sequence[Case]) -> None:
     """Compiles the kernels of backend triton in several processes."""
     if simulator.backend.stepped:
         return
     from hgn.runtime.precompile import precompile_frames  # loads Triton
 
     particles = [sum(scene.particle_count for scene in case.scenes) for case in cases]
-    network = simulator.network
+    network, precision = simulator.network, simulator.backend.precision
     ahead = precompile_frames([(network.config, network.step)], [precision], simulator.device, particles)
     if ahead is not None:
         with ahead:
