@@ -17,7 +17,7 @@ from hgn.config import DatagenConfig, MpmConfig
 from hgn.scene.distance import closest_points
 from hgn.scene.scene import Scene
 
-STREAM = 4  # of random numbers; hgn.scene.random_scene uses those before it
+STREAM = 4  # of random numbers; hgn.scene.random_scene uses 1 to 3, hgn.scene.world 5
 SURFACE_FRACTION = 0.9  # of the distance to an obstacle's surface, at which children may begin
 
 

@@ -342,7 +342,7 @@ def draw_layout(config: SceneConfig, seed: int) -> tuple[str, Layout | SceneConf
     Returns the kind, with a Layout, or for the kinds of `_paper` with settings for `hgn.scene.random_scene`.
     Raises: ConfigError if a kind does not fit into `config.domain_size`; those of the shipped experiments fit.
     """
-    rng = np.random.Generator(np.random.PCG64([seed, 4]))
+    rng = np.random.Generator(np.random.PCG64([seed, 5]))
     kind = draw_kind(config.kinds, rng)
     for _ in range(DRAWS):
         new = Layout(config, kind, rng)
