@@ -97,12 +97,12 @@ def main(mapping: dict[str, Any]) -> int:
         print(config.arrays)
     if config.onnx is not None or config.package is not None:
         program = traced_step(network, info)
+    if config.package is not None:  # first: what writes ONNX leaves symbols in the graph that the compiler refuses
+        write_package(Path(config.package), program, info)
+        print(config.package)
     if config.onnx is not None:
         write_onnx(Path(config.onnx), program, info)
         print(config.onnx)
-    if config.package is not None:
-        write_package(Path(config.package), program, info)
-        print(config.package)
     return 0
 
 

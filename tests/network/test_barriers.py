@@ -1,18 +1,15 @@
 """Obstacles that nothing passes: where ways end that meet triangles, and that none is passed."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import torch
 from network.barrier_scenes import CELL, CLEARANCE, DOMAIN, ball, barriers_of, crossings, gutter, scattered, square
 
-from hgn.network.barriers import Barriers, barrier_rows
 from hgn.network.features import ParticleState
-from hgn.scene.barrier import CELLS, MARGIN, barrier_of_pieces, barrier_pieces, build_barrier
+from hgn.scene.barrier import CELLS, MARGIN, build_barrier
 from hgn.scene.rotation import euler_rotation
 from hgn.schema import ConfigError
-from hgn.step.reference import SLACK, FreeMotion, constrained, first_stop, pairs_of_boxes
+from hgn.step.reference import SLACK, FreeMotion, constrained, pairs_of_boxes
 from hgn.step_config import StepConfig
 
 MORE, RIM = SLACK * CLEARANCE, MARGIN * CLEARANCE
@@ -225,33 +222,6 @@ def test_lists_hold_all_that_is_met(monkeypatch):
     assert (listed_N3 != after_N3).any(1).all()
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_rows_of_an_exported_graph(dtype):
-    """Those of the lists' triangles, from corners in either precision; nothing meets a triangle without area."""
-    corner_F33, _, _ = scattered(8)
-    pieces_F33 = barrier_pieces(corner_F33, CELL, DOMAIN)
-    barrier = barrier_of_pieces(pieces_F33, CELL, CLEARANCE)
-    row_F24 = barrier_rows(torch.from_numpy(pieces_F33).to(dtype), CLEARANCE)
-    np.testing.assert_allclose(row_F24.numpy(), barrier.row_F24, rtol=0, atol=6e-8)  # a rounding to float32
-    flat_F33 = torch.tensor([[[0.5] * 3] * 3, [[0.3] * 3, [0.5] * 3, [0.7] * 3]], dtype=dtype)
-    flat = replace(Barriers.of([barrier]), row_F24=barrier_rows(flat_F33, CLEARANCE))
-    assert not len(pairs_of_boxes(flat, torch.zeros(1, 3), torch.ones(1, 3))[0])
-
-
-def test_scenes_side_by_side():
-    """Each scene has its own obstacles, one of them none."""
-    corners, befores, afters = zip(*(scattered(seed, 300) for seed in (0, 1, 2)), strict=True)
-    corners = (corners[0], np.zeros((0, 3, 3)), corners[2])
-    scene_N = np.repeat(np.arange(3), 300)
-    together = ended(np.concatenate(befores), np.concatenate(afters), barriers_of(*corners), scene=scene_N)[0]
-    alone = [
-        ended(before, after, barriers_of(corner))[0]
-        for corner, before, after in zip(corners, befores, afters, strict=True)
-    ]
-    assert np.array_equal(together, np.concatenate(alone))
-    assert np.array_equal(alone[1], afters[1])
-
-
 def test_obstacles_that_are_none():
     """Nothing, and triangles without area, make no barrier; a bad clearance is refused."""
     nothing, flat = np.zeros((0, 3, 3)), np.array([[[0.2] * 3, [0.3] * 3, [0.4] * 3]])
@@ -259,19 +229,6 @@ def test_obstacles_that_are_none():
     for clearance in (0.0, 0.02, float("nan")):
         with pytest.raises(ConfigError, match=r"obstacle_clearance must be above 0, up to a cell \(0.015625\), got"):
             build_barrier(square((0.5,) * 3, 0), CELL, clearance, DOMAIN)
-
-
-def test_gradients_are_those_of_what_is_left():
-    """Along a surface a held particle moves as it would without; across it, it does not move."""
-    barriers = barriers_of(square((0.5,) * 3, 1))
-    after_N3 = torch.tensor([[0.52, 0.45, 0.5]], dtype=torch.float64, requires_grad=True)
-    before_N3 = torch.tensor([[0.5, 0.55, 0.5]], dtype=torch.float64)
-    hit_N, shift_N1, normal_N3, _ = first_stop(barriers, before_N3, after_N3, torch.zeros(1, dtype=torch.int64))
-    end_N3 = after_N3 + shift_N1 * normal_N3
-    assert bool(hit_N[0])
-    for axis, expected in ((0, (1.0, 0.0, 0.0)), (1, (0.0, 0.0, 0.0))):
-        (gradient,) = torch.autograd.grad(end_N3[0, axis], after_N3, retain_graph=True)
-        assert gradient[0].numpy() == pytest.approx(expected, abs=1e-6)
 
 
 def test_obstacles_that_are_split_hold_where_they_were_split():

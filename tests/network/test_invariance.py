@@ -1,30 +1,14 @@
-"""What leaves a network's accelerations as they are, and what turns them: for any weights, in float64."""
+"""What leaves a network's accelerations as they are, and what they keep: for any weights, in float64."""
 
 from dataclasses import replace
 from functools import partial
 
-import numpy as np
 import pytest
 import torch
-from network.states import (
-    airborne,
-    chosen,
-    drawn_outputs,
-    gns_of,
-    in_flight,
-    network_of,
-    random_grid,
-    random_state,
-    scene_of,
-)
-from scene.test_symmetry import CUBE, matrix_of
+from network.states import ODD_BODIES, airborne, chosen, gns_of, in_flight, network_of, scene_of
 
-from hgn.network.cell_keys import unpack
-from hgn.network.grid import build_hierarchy
-from hgn.network.obstacles import ObstacleCells
-from hgn.network.relative import STRESS_33, Contacts, balanced
-from hgn.scene.obstacle_grid import ObstacleGrid
-from hgn.scene.symmetry import scene_symmetries
+from hgn.network.features import Normaliser
+from hgn.network.relative import balanced
 
 KINDS = {
     "absolute": network_of,
@@ -33,8 +17,7 @@ KINDS = {
     "gns": gns_of,
 }
 SHIFT_3 = torch.tensor([0.07, -0.05, 0.11], dtype=torch.float64)
-CONTACT, WALLS, NORMALS = slice(21, 24), slice(24, 30), slice(30, 36)  # with five velocities and three levels
-ALL_48 = scene_symmetries((0.0, 0.0, 0.0), CUBE, 1 / 64)
+MOTION = slice(0, 21)  # columns with five velocities and three levels
 
 
 def reordered(state):
@@ -92,18 +75,6 @@ def test_each_scene_is_alone(kind):
     assert network(chosen(state, slice(0))).shape == (0, 3)
 
 
-def test_translation_by_coarsest_cells_changes_nothing():
-    """Moving particles by whole coarsest cells, latent features held fixed, leaves every output bitwise as it was."""
-    network, state = network_of(cell_size=1 / 32, levels=4), random_state((60,), obstacles=False, spread=0.5)
-    position_N3 = torch.round(state.position_N3 * 2**20) / 2**20  # so that the shifted positions are exact
-    latent_NW, origin_13 = network.encode_particles(state), torch.zeros(1, 3, dtype=torch.float64)
-    outputs = [
-        network.propagate(latent_NW, build_hierarchy(place_N3, state.scene_N, origin_13, 1 / 32, 4))
-        for place_N3 in (position_N3, position_N3 + torch.tensor([3, -5, 2]) * 8 / 32)
-    ]
-    assert torch.equal(*outputs)
-
-
 @pytest.mark.parametrize(
     ("velocity", "gravity"),
     [
@@ -120,53 +91,63 @@ def test_free_flight_in_one_piece_is_exact(velocity, gravity):
     state = in_flight(airborne(), velocity, gravity_3)
     torch.testing.assert_close(network(state), gravity_3.expand_as(state.position_N3), rtol=0, atol=1e-15)
     found = network.relative_features(state, network.grid(state))[0]
-    assert float(found[:, : CONTACT.start].abs().max()) < 1e-11 and not found[:, CONTACT.start :].any()
+    assert float(found[:, MOTION].abs().max()) < 1e-11 and not found[:, MOTION.stop :].any()
     assert velocity[0] == 1.7e-1 or not found[:, :12].any()
 
 
-def turned_outputs(output_N9, turn_33):
-    """An acceleration turns as a vector, a stress as a tensor."""
-    stress_N33 = turn_33 @ output_N9[:, torch.tensor(STRESS_33)] @ turn_33.T
-    rows, columns = [0, 1, 2, 1, 0, 0], [0, 1, 2, 2, 2, 1]
-    return torch.cat([output_N9[:, :3] @ turn_33.T, stress_N33[:, rows, columns]], 1)
+@pytest.mark.parametrize("levels", [1, 2, 3])
+def test_momentum_is_kept_where_nothing_touches(levels):
+    """With any weights, the accelerations of particles that move as they please, over many coarsest cells and alone in
+    theirs, on lines, planes and in one place, sum to gravity's, and their moments to 0. Near a wall they do not, nor do
+    those of a part; and the means of cells differ."""
+    network = network_of(inputs="relative", levels=levels)
+    state = airborne((60, 17, 1, 40, *map(len, ODD_BODIES)))
+    place_N3 = torch.where((state.scene_N == 3)[:, None], 0.35 + state.position_N3 / 2, state.position_N3)
+    place_N3[118:] = torch.cat(ODD_BODIES)
+    state = replace(state, position_N3=place_N3)  # the fourth scene lies closely
+    extra_N3 = (network(state) - state.gravity_S3[state.scene_N]).detach()
+    moment_N3 = torch.linalg.cross(place_N3 - 0.5, extra_N3)
+    for scene in range(state.scene_count):
+        mine_N3, turn_3 = extra_N3[state.scene_N == scene], moment_N3[state.scene_N == scene].sum(0)
+        sizes = float(mine_N3.abs().sum())
+        assert float(mine_N3.sum(0).abs().max()) < 1e-12 * sizes + 3e-16
+        assert float(turn_3.abs().max()) < 1e-11 * sizes + 3e-16
+        if scene < 4 and len(mine_N3) > 1:
+            assert float(mine_N3[::2].sum(0).abs().max()) > 1e-3 * sizes
+    grid = network.grid(state)
+    contacts = network.relative_features(state, grid)[1]
+    assert not contacts.touched_C.any()
+    stressed = torch.cat([torch.zeros(len(extra_N3), 3), torch.randn(len(extra_N3), 6)], 1).double()
+    pushed_N3 = balanced(stressed, contacts, grid)
+    assert float(pushed_N3.abs().max()) > 1e-2
+    by_wall = replace(state, domain_S3=state.position_N3.max(0).values.expand(state.scene_count, 3))
+    extra_N3 = (network(by_wall) - state.gravity_S3[state.scene_N]).detach()
+    assert float(extra_N3[state.scene_N == 0].sum(0).abs().max()) > 1e-2 * float(extra_N3.abs().max())
 
 
-@pytest.mark.parametrize("symmetry", ALL_48[1::8], ids=lambda s: f"{s.source}{s.mirrored}")
-def test_columns_and_impulses_turn_with_the_scene(symmetry):
-    """Scene and gravity turned and mirrored together by what keeps a cube, obstacles and walls within reach: columns of
-    vectors do as they, walls change places; and so does what `balanced` makes of outputs. The grid's cells are their
-    own images here."""
-    network, grid = network_of(inputs="relative", cell_size=1 / 8), random_grid(3, 40_000, extent=64)
-    state = replace(random_state((60,), spread=0.95), obstacles=ObstacleCells.of([grid]))
-    state = replace(state, velocity_NM3=10 * state.velocity_NM3)
-    turn_33 = torch.tensor(matrix_of(symmetry), dtype=torch.float64)
-    centre_K3 = (grid.cell_K3 + 0.5) / 64 - 0.5
-    cell_K3 = np.floor((centre_K3 @ turn_33.numpy().T + 0.5) * 64).astype(np.int32)
-    order = np.lexsort(cell_K3.T[::-1])
-    normal_K3 = (grid.normal_K3 @ turn_33.numpy().T.astype(np.float32))[order]
-    image = replace(
-        state,
-        position_N3=(state.position_N3 - 0.5) @ turn_33.T + 0.5,
-        velocity_NM3=state.velocity_NM3 @ turn_33.T,
-        gravity_S3=state.gravity_S3 @ turn_33.T,
-        obstacles=ObstacleCells.of([ObstacleGrid(1 / 64, cell_K3[order], normal_K3)]),
-    )
-    before, after = (network.relative_features(x, network.grid(x))[0] for x in (state, image))
-    assert before.abs().amax(0).min() > 0, "every column shows something"
-    vectors = [*range(0, CONTACT.stop), *range(NORMALS.start, NORMALS.stop)]
-    expected = (before[:, vectors].unflatten(1, (-1, 3)) @ turn_33.T).flatten(1)
-    torch.testing.assert_close(after[:, vectors], expected, rtol=0, atol=1e-10)
-    outward_63 = torch.cat([-torch.eye(3), torch.eye(3)]).double()
-    place_6 = (outward_63 @ turn_33.T @ outward_63.T).argmax(1)  # of each wall's image
-    torch.testing.assert_close(after[:, WALLS][:, place_6], before[:, WALLS], rtol=0, atol=1e-12)
+@pytest.mark.parametrize("height", [0.4, 2.2, 2.98])  # R above the floor: the gate is 1, below 1, and next to 0
+def test_bodies_slip_on_a_plane(height):
+    """A floor pushes a body up or down only, whatever the weights, motions and materials: along it what is added to
+    gravity sums to 0."""
+    network, state = network_of(inputs="relative"), airborne((40,))
+    low = state.position_N3[:, 1].min() - height * network.config.cell_size
+    state = replace(state, position_N3=state.position_N3 - low * torch.tensor([0.0, 1.0, 0.0]).double())
+    extra_N3 = (network(state) - state.gravity_S3[state.scene_N]).detach()
+    extra_3 = extra_N3.sum(0) / extra_N3.abs().sum()
+    assert float(extra_3[::2].abs().max()) < 1e-12
+    assert height > 2.9 or float(extra_3[1].abs()) > 1e-3
 
-    output_N9 = drawn_outputs(60)
-    # of the coarsest cells: functions of their centres' distance from the domain's
-    results = []
-    for outputs, scene in ((output_N9, state), (turned_outputs(output_N9, turn_33), image)):
-        hierarchy = network.grid(scene)
-        place_C3 = (unpack(hierarchy.levels[-1].key_C)[1].double() + 0.5) * 4 / 8 - 0.5
-        normal_C33, distance_C = place_C3[:, :, None] * place_C3[:, None, :], place_C3.square().sum(1)
-        results.append(balanced(outputs, Contacts(torch.exp(-distance_C), distance_C / 4, normal_C33), hierarchy))
-    assert float(results[0].norm()) > 1
-    torch.testing.assert_close(results[1], results[0] @ turn_33.T, rtol=0, atol=1e-12)
+
+def test_one_scale_for_all_axes():
+    """The scale is the root mean square of the axes' spreads with the noise, there are no means; the target is the
+    inverse of what the output means."""
+    normaliser = Normaliser()
+    normaliser.set_isotropic(torch.tensor([3e-3, 0.0, 6e-3]), 4e-3)
+    expected = ((9 + 0 + 36) / 3 + 16) ** 0.5 * 1e-3
+    for quantity in ("velocity", "acceleration"):
+        torch.testing.assert_close(getattr(normaliser, f"{quantity}_std"), torch.full((3,), expected))
+        assert not getattr(normaliser, f"{quantity}_mean").any()
+    network, state = network_of(inputs="relative"), airborne()
+    raw = network.normalised_acceleration(state)
+    back = network.target(network.restored_acceleration(raw, state), state.gravity_S3[state.scene_N])
+    torch.testing.assert_close(back, raw, rtol=1e-9, atol=1e-9)

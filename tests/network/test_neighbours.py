@@ -1,4 +1,4 @@
-"""Neighbour lists against all pairs, and sums over segments."""
+"""Neighbour lists against all pairs."""
 
 import pytest
 import torch
@@ -6,11 +6,8 @@ from network.naive_gns import naive_edges
 
 from hgn.network.grid import GridRangeError, build_hierarchy
 from hgn.network.neighbours import neighbour_list
-from hgn.network.segments import Segments
 
 RADIUS = 0.1
-LENGTHS = torch.tensor([0, 3, 1, 0, 4, 0])
-SEGMENTS = Segments(torch.cat([torch.zeros(1, dtype=torch.long), LENGTHS.cumsum(0)]), torch.repeat_interleave(LENGTHS))
 
 
 def pairs_of(found):
@@ -67,12 +64,3 @@ def test_positions_out_of_range(value):
         neighbour_list(position, scene, RADIUS)
     with pytest.raises(GridRangeError, match="must be finite and within"):
         build_hierarchy(position, scene, torch.zeros(1, 3, dtype=torch.float64), 0.25, 2)
-
-
-def test_segment_sums():
-    """Sums and spreads equal loops, with empty segments, and each is the other's gradient."""
-    rows = torch.randn(8, 3, dtype=torch.float64, requires_grad=True)
-    value = torch.randn(6, 3, dtype=torch.float64, requires_grad=True)
-    expected = torch.stack([part.sum(0) for part in rows.split(LENGTHS.tolist())])
-    torch.testing.assert_close(SEGMENTS.sum(rows), expected)
-    assert torch.autograd.gradcheck(SEGMENTS.sum, (rows,)) and torch.autograd.gradcheck(SEGMENTS.spread, (value,))

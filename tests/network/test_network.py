@@ -9,7 +9,7 @@ import pytest
 import torch
 from network.comparison import assert_same_function
 from network.naive import naive_normalised_acceleration
-from network.states import network_of, random_grid, random_state, scene_of
+from network.states import airborne, in_flight, network_of, random_grid, random_state, scene_of
 
 from hgn.config import NetworkConfig
 from hgn.cpu import network as cpu_network
@@ -31,35 +31,82 @@ def test_parameter_counts_are_the_papers(changes, millions):
 PLACES = [*([x, 0.125, 0.125] for x in (0.125, 0.25, -0.1)), [0.25, 0.125, 0.3], [0.25, 0.125, 0.3], [0.5, 0.5, 0.125]]
 
 
+def on_borders():
+    """Particles on cell centres, faces and one another, and outside of the domain."""
+    return replace(random_state((len(PLACES),)), position_N3=torch.tensor(PLACES, dtype=torch.float64))
+
+
+def fast():
+    """Particles that see obstacles ahead of them, one of them far beyond two walls."""
+    state = random_state((6, 3), spread=0.3)
+    state.position_N3[0] = torch.tensor([-0.3, 0.1, 1.4])
+    return replace(state, velocity_NM3=20 * state.velocity_NM3)
+
+
+def drifting():
+    """Particles in free flight, one of which is hardly slower than the others."""
+    state = in_flight(airborne((5, 4)), (1e-2, 0.0, 0.0), torch.zeros(3, dtype=torch.float64))
+    velocity_NH3 = state.velocity_NM3.clone()
+    velocity_NH3[2, :, 0] -= 4e-6
+    return replace(state, velocity_NM3=velocity_NH3)
+
+
+def on_a_floor():
+    """A particle within reach of a floor in a pile that reaches above the next coarsest cells."""
+    state = airborne((8,))
+    height_N = 0.035 * torch.tensor([0.7, 3.1, 3.3, 5.2, 6.8, 7.4, 8.6, 12.1], dtype=torch.float64)
+    return replace(state, position_N3=torch.stack([0 * height_N + 0.5, height_N, 0 * height_N + 0.5], 1))
+
+
+def case_of(given, changes):
+    """A network, a state, and origins of its grids."""
+    network = network_of(**changes)
+    obstacles = changes.get("obstacle_features", True)
+    state = given() if callable(given) else random_state(given, obstacles=obstacles, spread=0.12)
+    generator = torch.Generator().manual_seed(1)
+    random_S3 = torch.rand(state.scene_count, 3, generator=generator, dtype=torch.float64)
+    return network, state, -network.config.cell_size * random_S3
+
+
 @pytest.mark.parametrize(
-    ("counts", "changes"),
+    ("given", "changes"),
     [
-        ((6, 3), {}),
+        ((4, 1), {}),
         ((1,), {}),
-        ((1, 9, 3), {"levels": 1}),
+        ((1, 5, 2), {"levels": 1}),
         ((6,), {"levels": 4, "message_passing_steps": 1, "width": 7}),
         ((8,), {"obstacle_features": False, "velocity_history": 5}),
-        ((5, 2), {"inputs": "relative"}),
-        ((7, 2), {"inputs": "relative", "levels": 2, "obstacle_features": False}),
-        ((1, 7), {"inputs": "relative", "levels": 1}),
-        ((6, 2), {"inputs": "relative", "rest_threshold": 2.0}),
-        ((6, 2), {"inputs": "relative", "levels": 1, "rest_threshold": 2.0}),
-        ((6, 2), {"inputs": "relative", "levels": 1, "rest_threshold": 2.0, "materials": ("snow", "sand", "goop")}),
-        (PLACES, {"cell_size": 0.25, "levels": 2}),
+        (on_borders, {"cell_size": 0.25, "levels": 2}),
     ],
 )
-def test_network_equals_the_literal_definition(counts, changes):
-    """Outputs and all parameter gradients equal the naive network's, in float64; also of particles exactly on cell
-    centres, faces and one another, and outside of the domain."""
-    network = network_of(**changes)
-    if counts is PLACES:
-        state = replace(random_state((len(PLACES),)), position_N3=torch.tensor(PLACES, dtype=torch.float64))
-        origin = torch.zeros(1, 3, dtype=torch.float64)
-    else:
-        state = random_state(counts, obstacles=changes.get("obstacle_features", True), spread=0.12)
-        origin = -network.config.cell_size * torch.rand(len(counts), 3, dtype=torch.float64)
-    expected = naive_normalised_acceleration(network, state, origin)
-    assert_same_function(network, rested(network, state, network.prediction(state, origin)), expected)
+def test_network_equals_the_literal_definition(given, changes):
+    """Outputs and all parameter gradients equal the naive network's, in float64."""
+    network, state, origin_S3 = case_of(given, changes)
+    if given is on_borders:
+        origin_S3 = 0 * origin_S3
+    expected = naive_normalised_acceleration(network, state, origin_S3)
+    assert_same_function(network, network.normalised_acceleration(state, origin_S3), expected)
+
+
+@pytest.mark.parametrize(
+    ("given", "changes", "expected"),
+    [
+        (fast, {}, 2.1235012450090185),
+        (drifting, {}, -0.004471441378793817),
+        (on_a_floor, {}, -0.5635802959014364),
+        ((7, 2), {"levels": 2, "obstacle_features": False}, 1.1330245403184032),
+        ((1, 7), {"levels": 1}, -0.8592312746167745),
+        ((6, 2), {"rest_threshold": 2.0}, -0.8560388855948935),
+        ((6, 2), {"levels": 1, "rest_threshold": 2.0, "materials": ("snow", "sand", "goop")}, 0.8321850628598952),
+    ],
+)
+def test_relative_inputs_and_rest_stay_what_they_were(given, changes, expected):
+    """A weighted sum of the outputs is the one with which weights were trained, in float64: what the numbers of
+    hgn.network.relative and of rest are for. That the rules are right is seen by hgn.kernels, which has its own."""
+    network, state, origin_S3 = case_of(given, changes | {"inputs": "relative"})
+    output_N3 = rested(network, state, network.prediction(state, origin_S3)).detach()
+    weight_N3 = torch.arange(1.0, output_N3.numel() + 1, dtype=torch.float64).cos().view_as(output_N3)
+    assert float((output_N3 * weight_N3).sum()) == pytest.approx(expected, rel=1e-9)
 
 
 # how frames are computed: precision, its tolerance, and the rows of the CPU backend, None where there is a compiler
@@ -141,29 +188,6 @@ def test_frames_on_a_cpu(monkeypatch, counts, rows, kind, threads, changes):
                 parameter.data.mul_(1.5)
     finally:
         torch.set_num_threads(before)
-
-
-def test_scene_without_obstacles_equals_zero_normals():
-    """Leaving the normal columns out is exact: normals given as zeros change nothing, bitwise."""
-    network = network_of()
-    state = random_state((30,), obstacles=False)
-    far = random_grid(0, 50)
-    far = ObstacleCells.of([replace(far, cell_K3=far.cell_K3 + 1000, normal_K3=far.normal_K3)])
-    assert far is not None and not far.normals(state.position_N3, state.scene_N).any()
-    assert torch.equal(network(state), network(replace(state, obstacles=far)))
-
-
-def test_obstacle_lookup():
-    """A particle gets the normal of its own cell in its own scene, and zero elsewhere."""
-    grid = random_grid(1, 30)
-    empty = replace(grid, cell_K3=grid.cell_K3[:0], normal_K3=grid.normal_K3[:0])
-    cells = ObstacleCells.of([empty, grid])
-    assert cells is not None
-    centre = torch.from_numpy((grid.cell_K3 + 0.5) * grid.cell_size)
-    scene = torch.ones(len(centre), dtype=torch.long)
-    assert torch.equal(cells.normals(centre, scene), torch.from_numpy(grid.normal_K3).double())
-    assert not cells.normals(centre, torch.zeros_like(scene)).any()
-    assert ObstacleCells.of([empty, empty]) is None
 
 
 def test_the_normaliser():

@@ -1,6 +1,5 @@
 """Slow deformations of what touches rest: what holds for any weights, in float64."""
 
-import math
 from dataclasses import replace
 
 import pytest
@@ -98,74 +97,3 @@ def test_a_pile_comes_to_rest(shift):
     torch.testing.assert_close(rest(rigid_N3, moving, touched_C, grid, 0.3, ONE, NONE_1), rigid_N3, rtol=0, atol=1e-12)
     swift_N3 = 100 * drawn_outputs(30)[:, :3]
     torch.testing.assert_close(rest(swift_N3, moving, touched_C, grid, 0.3, ONE, NONE_1), swift_N3, rtol=0, atol=0)
-
-
-@pytest.mark.parametrize("shift", [0.0, 0.31])
-def test_what_is_larger_than_coarsest_cells_rests(shift):
-    """A sheet of three by six coarsest cells whose middle slowly moves against both its ends: between coarsest cells
-    little of that is a deformation, and it goes on; between larger ones it comes to rest, and a rigid motion
-    of the whole goes on, as does what is faster."""
-    steps = torch.arange(0.0, 0.42, 0.02, dtype=torch.float64)
-    place_N3 = torch.cartesian_prod(steps + shift, torch.tensor([0.1, 0.12]).double(), 2 * steps + shift)
-    state, grid, touched_C = on_cells(place_N3)  # of 0.14
-    along_N, across_N = place_N3[:, 2] - shift, place_N3[:, 0] - shift
-    speed_N3 = torch.zeros_like(place_N3)
-    speed_N3[:, 0] = torch.cos(2 * math.pi * along_N / 0.82) * torch.sin(math.pi * across_N / 0.42) ** 2
-    rigid_N3 = torch.linalg.cross(torch.tensor([[0.0, 2.0, 0.0]]).double(), place_N3 - place_N3.mean(0)) + 0.5
-    left = {}
-    for widely_1 in (NONE_1, ALL_1):
-        for size in (0.1, 100.0):
-            velocity_N3 = size * speed_N3 + rigid_N3
-            for _ in range(20):
-                moving = replace(state, velocity_NM3=velocity_N3[:, None])
-                velocity_N3 = velocity_N3 + rest(0 * place_N3, moving, touched_C, grid, 0.3, ONE, widely_1)
-            left[int(widely_1), size] = float((velocity_N3 - rigid_N3).norm() / (size * speed_N3).norm())
-    assert left[0, 0.1] > 0.5 and left[1, 0.1] < 0.1
-    assert left[0, 100.0] == pytest.approx(1, abs=2e-2) == left[1, 100.0]
-
-
-def test_what_flows_is_not_stopped_by_larger_cells():
-    """Of two materials in one pile, the one that does not rest between larger cells is left as coarsest cells alone
-    leave it; the other is slowed further, and momenta stay."""
-    place_N3 = torch.cat([within_a_cell(), 4 * within_a_cell(80) - 1.6])
-    state, grid, touched_C = on_cells(place_N3)
-    flows_N = torch.arange(len(place_N3)) % 2
-    state = replace(state, material_N=flows_N, velocity_NM3=0.3 * drawn_outputs(len(place_N3))[:, None, 3:6])
-    acceleration_N3 = drawn_outputs(len(place_N3))[:, :3]
-    one, all_N3, some_N3 = (
-        rest(acceleration_N3, state, touched_C, grid, 1e3, ONE, torch.tensor(widely, dtype=torch.float64))
-        for widely in ([0, 0], [1, 1], [1, 0])
-    )
-    assert torch.equal(some_N3[flows_N == 1], one[flows_N == 1])
-    change_N3 = some_N3 - one
-    assert float(change_N3.abs().max()) > 0.1 and float((some_N3 - all_N3).abs().max()) > 0.1
-    assert float(change_N3.sum(0).abs().max()) < 1e-11
-    assert float(torch.linalg.cross(place_N3 - 0.4, change_N3).sum(0).abs().max()) < 1e-11
-
-
-@THRESHOLDS
-def test_no_boost_is_seen(threshold):
-    """A common velocity or rate of rotation more of all within a cell changes nothing."""
-    place_N3 = within_a_cell()
-    state, grid, touched_C = on_cells(place_N3)
-    acceleration_N3 = drawn_outputs(len(place_N3))[:, :3]
-    boost_N3 = torch.linalg.cross(torch.tensor([[30.0, -20.0, 50.0]]).double(), place_N3 - 0.3) + 7.0
-    boosted = replace(state, velocity_NM3=state.velocity_NM3 + boost_N3[:, None])
-    found = [rest(acceleration_N3, given, touched_C, grid, threshold, ONE, NONE_1) for given in (state, boosted)]
-    torch.testing.assert_close(*found, rtol=0, atol=1e-11)
-
-
-def test_gradients_of_rest():
-    """Those by accelerations, velocities and places are finite differences, below, within and beyond the threshold."""
-    place_N3, output_N9 = within_a_cell(9), drawn_outputs(9)
-    place_N3[4:] += 0.1  # in several cells
-
-    def of(place_N3, acceleration_N3, velocity_N3):
-        state, grid, touched_C = on_cells(place_N3, 2)
-        state = replace(state, velocity_NM3=velocity_N3[:, None])
-        return rest(acceleration_N3, state, touched_C, grid, 1.3, ONE, ALL_1)
-
-    inputs = [x.clone().requires_grad_() for x in (place_N3, output_N9[:, :3], output_N9[:, 3:6])]
-    changed_N = (of(*inputs) - inputs[1]).norm(dim=1)
-    assert changed_N.max() > 0.3 and (changed_N > 0).sum() > 4
-    assert torch.autograd.gradcheck(of, inputs, eps=1e-7, atol=1e-4)

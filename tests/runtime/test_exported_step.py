@@ -32,13 +32,9 @@ from hgn.schema import ConfigError, to_mapping
 EXAMPLES = Path(__file__).resolve().parents[2] / "tools/deploy"
 TOLERANCE = 1e-6  # of positions and displacements in a frame, domain units
 FRAMES = 4
-NETWORKS = {
-    # at its walls random states begin, or end, for some particles, and their ways meet the triangles below
-    "held": {"wall_clearance": (0.1, 0.7), "obstacle_clearance": 1e-3},
-    "walled": {"wall_clearance": (0.1, 0.7)},
-    "relative": {"inputs": "relative"},
-    "contacts": {"inputs": "relative", "rest_threshold": 0.3},
-}
+# At its walls random states begin, or end, for some particles.
+WALLED = {"wall_clearance": (0.1, 0.7)}
+CONSTRAINED = WALLED | {"obstacle_clearance": 1e-3}
 SIZES = [(particles, obstacles) for particles in (1, 216, 3_000) for obstacles in (True, False)]
 CELL = 1 / 64
 SCENE = """
@@ -51,14 +47,10 @@ groups:
 
 
 class Written(NamedTuple):
-    """A network, and the file that holds its step; beside its folder the folder `arrays` of a scene, and its file."""
+    """A network and the folder with `step.onnx`, `step.pt2`, `scene.yaml` and the folder `arrays` of that scene."""
 
     network: HierarchicalGraphNetwork
-    path: Path
-
-    @property
-    def scene(self):
-        return load_scene(self.path.parents[1] / "scene.yaml")
+    folder: Path
 
 
 @pytest.fixture(autouse=True)
@@ -70,39 +62,57 @@ def whole_precision():
     torch.set_float32_matmul_precision(before)
 
 
+@pytest.fixture(autouse=True, scope="module")
+def one_turn():
+    """A triangle stops a way once, and bodies rest between cells of one size: each turn more is more of the same."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("hgn.step.reference.SURFACES", 1)
+        patch.setattr("hgn.step.reference.REST_SIZES", 1)
+        yield
+
+
 @pytest.fixture(scope="module")
-def onnx_step(request, tmp_path_factory):
-    """A network's step as ONNX, and what the scene SCENE starts with."""
-    return exported(tmp_path_factory.mktemp("onnx"), request.param, "onnx")
+def as_onnx(tmp_path_factory):
+    """A network of absolute inputs as ONNX."""
+    return exported(tmp_path_factory.mktemp("onnx"), WALLED | {"levels": 2}, ("onnx",))
 
 
-HELD = pytest.mark.parametrize("onnx_step", ["held"], indirect=True)
-ALL = pytest.mark.parametrize(
-    "onnx_step",
-    ["walled", *(pytest.param(name, marks=pytest.mark.slow) for name in ("held", "relative", "contacts"))],
-    indirect=True,
-)
+@pytest.fixture(scope="module")
+def in_both_formats(tmp_path_factory):
+    """A network of relative inputs with all constraints, in both formats, of one graph."""
+    relative = CONSTRAINED | {"inputs": "relative", "rest_threshold": 0.3, "levels": 1}
+    return exported(tmp_path_factory.mktemp("both"), relative, ("onnx", "package"))
 
 
 def test_the_graph_is_the_step():
     """What both formats are made of, run by PyTorch: also where obstacles hold some particles."""
-    network = network_of(torch.float32, levels=1, message_passing_steps=1, **NETWORKS["held"])
+    network = network_of(torch.float32, levels=1, message_passing_steps=1, **CONSTRAINED)
     graph = traced_step(network, WeightsInfo(network.config, 60.0, CELL, step=network.step)).module()
     compare(network, lambda arrays: [x.detach().numpy() for x in graph(*map(torch.from_numpy, arrays.values()))])
 
 
-@ALL
-def test_onnx_is_the_step(onnx_step):
-    """ONNX Runtime computes the step to 1e-6 at any number of particles, with and without obstacles, which may hold
-    some of them; the file says what its weights say of themselves; the example in Python simulates a scene's arrays."""
-    network, path = onnx_step
-    session = onnxruntime.InferenceSession(path)
-    assert [item.name for item in session.get_inputs()] == list(INPUTS)
-    declared = json.loads(session.get_modelmeta().custom_metadata_map["hgn"])
-    assert declared["frame_rate_hz"] == 60.0 and declared["network"] == to_mapping(network.config)
-    compare(network, lambda arrays: session.run(None, arrays))
-    simulate = runpy.run_path(str(EXAMPLES / "step_onnx.py"))["simulate"]
-    assert_rollout(onnx_step, simulate(str(path), str(path.parents[1] / "arrays"), FRAMES))
+def test_onnx_is_the_step(as_onnx):
+    """ONNX Runtime computes the step to 1e-6 at any number of particles, with and without obstacles; the file says what
+    its weights say of themselves; the example in Python simulates a scene's arrays."""
+    assert_onnx(as_onnx)
+
+
+@pytest.mark.slow
+def test_both_formats_are_the_step(in_both_formats):
+    """The same with relative inputs, rest, and obstacles that hold some particles; and of a package of PyTorch."""
+    assert_onnx(in_both_formats)
+    package = torch._inductor.aoti_load_package(str(in_both_formats.folder / "new/step.pt2"))
+    compare(
+        in_both_formats.network, lambda arrays: [x.numpy() for x in package(*map(torch.from_numpy, arrays.values()))]
+    )
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(shutil.which("cmake") is None, reason="needs cmake")
+def test_a_package_runs_in_cpp(in_both_formats):
+    """The example in C++ simulates a scene's arrays."""
+    options = [f"-DCMAKE_PREFIX_PATH={torch.utils.cmake_prefix_path}", "-DCMAKE_BUILD_TYPE=Debug"]
+    assert_rollout(in_both_formats, built_and_run("step_package", in_both_formats.folder, "new/step.pt2", options))
 
 
 @pytest.mark.slow
@@ -110,24 +120,10 @@ def test_onnx_is_the_step(onnx_step):
 @pytest.mark.skipif(
     "ONNXRUNTIME_FOLDER" not in os.environ, reason="needs ONNXRUNTIME_FOLDER, a release of ONNX Runtime"
 )
-@HELD
-def test_onnx_runs_in_cpp(onnx_step):
+def test_onnx_runs_in_cpp(as_onnx):
     """The example in C++ simulates a scene's arrays."""
     options = [f"-DONNXRUNTIME_FOLDER={os.environ['ONNXRUNTIME_FOLDER']}", "-DCMAKE_DISABLE_FIND_PACKAGE_Torch=ON"]
-    assert_rollout(onnx_step, built_and_run("step_onnx", onnx_step.path, options))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["held", "relative", "contacts"])
-def test_package_is_the_step(tmp_path, name):
-    """The same of a package that PyTorch compiled, and of the example in C++."""
-    written = exported(tmp_path, name, "package")
-    package = torch._inductor.aoti_load_package(str(written.path))
-    compare(written.network, lambda arrays: [x.numpy() for x in package(*map(torch.from_numpy, arrays.values()))])
-    if shutil.which("cmake") is None:
-        pytest.skip("the C++ example needs cmake")
-    options = [f"-DCMAKE_PREFIX_PATH={torch.utils.cmake_prefix_path}"]
-    assert_rollout(written, built_and_run("step_package", written.path, options))
+    assert_rollout(as_onnx, built_and_run("step_onnx", as_onnx.folder, "new/step.onnx", options))
 
 
 @pytest.mark.parametrize(
@@ -150,7 +146,7 @@ def test_what_is_refused(options, message):
 def test_a_gns_is_refused(tmp_path):
     """Neighbour lists are not exported."""
     network, path = gns_of(torch.float32), tmp_path / "gns.safetensors"
-    save_weights(path, network, WeightsInfo(network.config, 60.0, 1 / 64))
+    save_weights(path, network, WeightsInfo(network.config, 60.0, CELL))
     with pytest.raises(ConfigError, match="weights must be an hgn network, got 'gns'"):
         export.main({"weights": str(path), "onnx": str(tmp_path / "a.onnx")})
     assert not (tmp_path / "a.onnx").exists()
@@ -170,16 +166,31 @@ def test_a_package_that_is_cut_off_leaves_nothing(tmp_path, monkeypatch):
     assert not list(tmp_path.iterdir())
 
 
-def exported(folder, name, kind):
-    """What the command writes of a small network, and beside it a scene and its arrays."""
-    network = network_of(torch.float32, levels=2, message_passing_steps=1, **NETWORKS[name])
+def exported(folder, changes, formats):
+    """What the command writes of a small network, and a scene and its arrays."""
+    network = network_of(torch.float32, message_passing_steps=1, **changes)
     save_weights(folder / "w.safetensors", network, WeightsInfo(network.config, 60.0, CELL, step=network.step))
     shutil.copy(config_directory() / "example/ramp.obj", folder)
     (folder / "scene.yaml").write_text(SCENE)
-    path = folder / "new" / ("step.onnx" if kind == "onnx" else "step.pt2")
-    options = {kind: str(path), "scene": str(folder / "scene.yaml"), "arrays": str(folder / "arrays"), "device": "cpu"}
-    assert export.main({"weights": str(folder / "w.safetensors"), **options}) == 0
-    return Written(network, path)
+    files = {"onnx": "new/step.onnx", "package": "new/step.pt2"}
+    options = {name: str(folder / files[name]) for name in formats} | {"device": "cpu"}
+    options |= {"scene": str(folder / "scene.yaml"), "arrays": str(folder / "arrays")}
+    # the wrapper, which calls the kernels, is compiled without optimisation
+    with torch._inductor.config.patch({"aot_inductor.compile_wrapper_opt_level": "O0"}):
+        assert export.main({"weights": str(folder / "w.safetensors"), **options}) == 0
+    return Written(network, folder)
+
+
+def assert_onnx(written):
+    """The file's inputs, metadata, step, and rollout by the example."""
+    path = str(written.folder / "new/step.onnx")
+    session = onnxruntime.InferenceSession(path)
+    assert [item.name for item in session.get_inputs()] == list(INPUTS)
+    declared = json.loads(session.get_modelmeta().custom_metadata_map["hgn"])
+    assert declared["frame_rate_hz"] == 60.0 and declared["network"] == to_mapping(written.network.config)
+    compare(written.network, lambda arrays: session.run(None, arrays))
+    simulate = runpy.run_path(str(EXAMPLES / "step_onnx.py"))["simulate"]
+    assert_rollout(written, simulate(path, str(written.folder / "arrays"), FRAMES))
 
 
 def compare(network, step):
@@ -202,21 +213,20 @@ def compare(network, step):
 
 def assert_rollout(written, found_TN3):
     """The frames of backend torch, in some of which obstacles hold particles where the network asks for it."""
-    simulator = Simulator(written.network, 60.0, "torch")
-    (expected_TN3,) = simulator.rollout([written.scene], FRAMES)
+    simulator, scene = Simulator(written.network, 60.0, "torch"), load_scene(written.folder / "scene.yaml")
+    (expected_TN3,) = simulator.rollout([scene], FRAMES)
     np.testing.assert_allclose(found_TN3, expected_TN3, rtol=0, atol=FRAMES * TOLERANCE)
     if written.network.step.obstacle_clearance is not None:
-        state = replace(simulator.start([written.scene]), barriers=None)
+        state = replace(simulator.start([scene]), barriers=None)
         for _ in range(FRAMES - 1):
             state = simulator.step(state)
         assert np.abs(state.position_N3.numpy() - found_TN3[-1]).max() > 0.01
 
 
-def built_and_run(program, model, options):
+def built_and_run(program, folder, model, options):
     """Positions that a C++ example writes."""
-    folder = model.parents[1]
     subprocess.run(["cmake", "-S", EXAMPLES, "-B", folder / "build", *options], check=True, capture_output=True)
     subprocess.run(["cmake", "--build", folder / "build", "--target", program], check=True, capture_output=True)
-    arguments = [folder / "build" / program, model, folder / "arrays", str(FRAMES), folder / "out.npy"]
+    arguments = [folder / "build" / program, folder / model, folder / "arrays", str(FRAMES), folder / "out.npy"]
     subprocess.run(arguments, check=True, capture_output=True)
     return np.load(folder / "out.npy")

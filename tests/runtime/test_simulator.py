@@ -42,24 +42,18 @@ def loaded(folder, network):
 
 @pytest.mark.parametrize("obstacles", [(True, False, True), (False, False, False)])
 def test_batch_equals_each_alone(obstacles):
-    """Scenes of different sizes, with and without obstacles, in one batch move as each does alone."""
+    """Scenes of different sizes, with and without obstacles, in one batch move as each does alone. Each simulated frame
+    is reported once, frame 0 is the initial state, and the caller's arrays stay as they are."""
     simulator = Simulator(network_of(torch.float32), 60.0)
     scenes = [initial(n, seed, wanted) for seed, (n, wanted) in enumerate(zip((40, 1, 90), obstacles, strict=True))]
-    together = simulator.rollout(scenes, 6)
-    for scene, path_TN3 in zip(scenes, together, strict=True):
+    before, seen = [scene.position_N3.copy() for scene in scenes], []
+    together = simulator.rollout(scenes, 6, seen.append)
+    assert seen == [1, 2, 3, 4, 5]
+    for scene, path_TN3, begin_N3 in zip(scenes, together, before, strict=True):
+        assert np.array_equal(path_TN3[0], begin_N3) and np.array_equal(scene.position_N3, begin_N3)
         assert path_TN3.shape == (6, len(scene.position_N3), 3) and path_TN3.dtype == np.float32
         (alone_TN3,) = simulator.rollout([scene], 6)
         np.testing.assert_allclose(path_TN3, alone_TN3, rtol=0, atol=2e-6)
-
-
-@pytest.mark.parametrize("sees", [True, False])
-def test_obstacles_are_felt(sees):
-    """The same particles move differently beside obstacles, for the normals reach the network; one without normals
-    ignores them."""
-    simulator = Simulator(network_of(torch.float32, obstacle_features=sees), 60.0)
-    (with_TN3,), (without_TN3,) = (simulator.rollout([initial(60, obstacles=wanted)], 4) for wanted in (True, False))
-    difference_TN3 = np.abs(with_TN3 - without_TN3)
-    assert difference_TN3[-1].max() > 1e-5 if sees else not difference_TN3.any()
 
 
 def test_history_at_the_start_is_ballistic():
@@ -91,17 +85,6 @@ def test_free_flight_is_the_closed_form(tmp_path, gravity):
         paths.append((scenes[0], absolute.rollout(scenes[:1], 9)[0]))
     for scene, path_TN3 in paths:
         np.testing.assert_allclose(path_TN3, free_flight(scene, 9), rtol=0, atol=2e-6)
-
-
-def test_frames_are_reported_and_scenes_untouched():
-    """Each simulated frame is reported once, frame 0 is the initial state, and the caller's arrays stay as they are."""
-    simulator = Simulator(network_of(torch.float32), 60.0)
-    scene = initial(30)
-    before = scene.position_N3.copy()
-    seen: list[int] = []
-    (path_TN3,) = simulator.rollout([scene], 5, seen.append)
-    assert seen == [1, 2, 3, 4]
-    assert np.array_equal(path_TN3[0], before) and np.array_equal(scene.position_N3, before)
 
 
 @pytest.mark.parametrize(

@@ -1,16 +1,14 @@
 """Walls that nothing passes (`step.wall_clearance`): what is held, what is free, and what has still come apart."""
 
-from dataclasses import replace
 from functools import partial
 
 import numpy as np
 import pytest
 import torch
-from network.states import gns_of, network_of, random_state, silent
+from network.states import gns_of, network_of, random_state
 from runtime.scenes import random_scene
 
 from hgn.network.features import ParticleState
-from hgn.runtime.divergence import DivergedError
 from hgn.runtime.rollouts import simulate_scenes
 from hgn.runtime.simulator import Simulator
 from hgn.step.reference import advanced
@@ -98,31 +96,3 @@ def test_nothing_leaves_the_domain(name, backend):
                 continue
             assert result.cause is None and path_TN3.shape == (12, 40, 3)
             assert (path_TN3 >= WALLS[0] - 1e-7).all() and (path_TN3 <= np.subtract(DOMAIN, WALLS[1]) + 1e-7).all()
-
-
-def test_what_rests_on_a_wall_leaves_it():
-    """A particle that is pressed against the floor lies still, and its velocity is 0: it leaves with the first
-    acceleration away from it."""
-    network = silent(NETWORKS["relative"](wall_clearance=WALLS))
-    scene = random_scene(1, low=0.1, velocity_N3=np.zeros((1, 3), np.float32), gravity=(0.0, -90.0, 0.0))
-    simulator = Simulator(network, 60.0, "torch")
-    state = simulator.start([scene])
-    for _ in range(8):
-        state = simulator.step(state)
-    assert float(state.position_N3[0, 1]) == pytest.approx(0.03, abs=1e-7) and not state.velocity_NM3[0, 0].any()
-    state = simulator.step(replace(state, gravity_S3=torch.tensor([[0.0, 0.01, 0.0]])))
-    assert float(state.position_N3[0, 1]) == pytest.approx(0.04, abs=1e-7)
-
-
-@pytest.mark.parametrize("value", [0.9, -0.9, NAN, INF])
-def test_divergence_is_seen(value):
-    """By what positions would be without walls: a network that makes no numbers, or throws particles farther than the
-    domain's own size, ends the simulation at the frame where it would without walls."""
-    messages = []
-    for walls in (None, WALLS):
-        network = silent(NETWORKS["absolute"](wall_clearance=walls))
-        network.normaliser.acceleration_mean.copy_(torch.tensor([2.5 * value, 0.0, 0.0]))
-        with pytest.raises(DivergedError) as caught:
-            Simulator(network, 60.0, "torch").rollout([random_scene(4)], 4)
-        messages.append(str(caught.value))
-    assert messages[0] == messages[1] and "diverged at frame 1: 4 of 4 particles" in messages[0]

@@ -9,9 +9,7 @@ import torch
 from network.states import network_of, random_state
 from safetensors import safe_open
 from safetensors.torch import save_file
-from training.runs import train_mapping
 
-from hgn import train
 from hgn.config import NetworkConfig
 from hgn.export import export
 from hgn.runtime.weights import WeightsInfo, load_weights, save_weights
@@ -45,18 +43,17 @@ def rewrite(path, change, structure=None):
     save_file(tensors, path, metadata={"hgn": json.dumps(mapping) if structure is None else structure})
 
 
-def test_exported_checkpoint_is_the_trained_network(data, tmp_path):
+def test_exported_checkpoint_is_the_trained_network(finished_once, tmp_path):
     """A checkpoint of the trainer, exported and loaded, predicts what the checkpoint's network does (to 1e-6) and
     remembers what it was trained on."""
-    assert train.main(train_mapping(data, tmp_path / "run", maximum_updates=3)) == 0
-    checkpoint, path = tmp_path / "run" / "checkpoints" / "last.ckpt", tmp_path / "shipped" / "weights.safetensors"
+    checkpoint, path = finished_once[1] / "checkpoints" / "last.ckpt", tmp_path / "shipped" / "weights.safetensors"
     export(checkpoint, path)
     loaded, info = load_weights(path)
     expected = network_of_checkpoint(read_checkpoint(checkpoint), checkpoint)
     assert expected.normaliser.velocity_std.min() > 0.001  # the data's, no longer the identity
     with torch.no_grad():
         torch.testing.assert_close(loaded(STATE), expected(STATE), rtol=1e-6, atol=1e-6)
-    assert (info.updates, info.frame_rate_hz, info.obstacle_cell_size) == (3, 60.0, 1 / 64)
+    assert (info.updates, info.frame_rate_hz, info.obstacle_cell_size) == (12, 60.0, 1 / 64)
     assert info.network == expected.config and info.provenance["checkpoint"] == "last.ckpt"
     assert [file.name for file in path.parent.iterdir()] == ["weights.safetensors"]
 
