@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import copy
 import datetime
+import gc
 import itertools
 import json
 import time
@@ -186,23 +187,26 @@ def measure(rank: int, count: int, config: ScalingConfig, device_type: str, fold
     dist.init_process_group(
         "gloo", init_method=f"file://{folder / 'store'}", rank=rank, world_size=count, timeout=PATIENCE
     )
-    try:
-        backend = "nccl" if device.type == "cuda" else "gloo"
-        sizes = [size for size in (1, 2, 4, 8, 16, 32, 64) if size < count] + [count]
-        groups = {size: dist.new_group(range(size), PATIENCE, backend) for size in sizes if size > 1}
-        contenders = _contenders(config, sizes, device)
-        for contender in contenders:
-            _prepare(contender, config, rank, groups, device)
-        ready = [contender for contender in contenders if contender.check == PASS]
-        for contender, times in zip(ready, alternate(ready, ROUNDS, _until(config.seconds)), strict=True):
-            contender.milliseconds = times
-        for contender in contenders:
-            _check_weights(contender, groups, rank)
-        if rank == 0:
-            (folder / "rows.json").write_text(json.dumps([_row(c, config, device) for c in contenders]))
-        dist.barrier()
-    finally:
-        dist.destroy_process_group()
+    backend = "nccl" if device.type == "cuda" else "gloo"
+    sizes = [size for size in (1, 2, 4, 8, 16, 32, 64) if size < count] + [count]
+    groups = {size: dist.new_group(range(size), PATIENCE, backend) for size in sizes if size > 1}
+    contenders = _contenders(config, sizes, device)
+    for contender in contenders:
+        _prepare(contender, config, rank, groups, device)
+    ready = [contender for contender in contenders if contender.check == PASS]
+    for contender, times in zip(ready, alternate(ready, ROUNDS, _until(config.seconds)), strict=True):
+        contender.milliseconds = times
+    for contender in contenders:
+        _check_weights(contender, groups, rank)
+    if rank == 0:
+        (folder / "rows.json").write_text(json.dumps([_row(c, config, device) for c in contenders]))
+    dist.barrier()
+    # Destroying a group waits for ever while a CUDA graph contains its messages. After an error the traceback keeps the
+    # graphs, so the process then ends without it.
+    for contender in contenders:
+        contender.update = None
+    gc.collect()
+    dist.destroy_process_group()
 
 
 def _torch_precision(config: ScalingConfig, device: torch.device) -> str:
