@@ -120,6 +120,12 @@ class TrainingModule(LightningModule):
         self.update += len(chunk.samples)
         self.sampler_state = chunk.sampler_state
 
+    def release(self) -> None:
+        """Drops the updates with their CUDA graphs. Lightning destroys its process groups when the process ends, and
+        NCCL waits for ever to destroy a group that a graph still uses.
+        """
+        self.__dict__.pop("updates", None)
+
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         checkpoint[SECTION] = {
             "network": to_mapping(self.network.config),

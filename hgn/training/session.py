@@ -112,8 +112,11 @@ def train_network(config: TrainConfig, start: Start, stop: StopRequest, publishe
         if stop.requested:
             return stop.exit_code
         stop.end_at_once()
-    with lightning_compat.interrupts_passed_on(), faults_outlived():
-        trainer.fit(module, feed, ckpt_path=resume.path if resume else None, weights_only=True)
+    try:
+        with lightning_compat.interrupts_passed_on(), faults_outlived():
+            trainer.fit(module, feed, ckpt_path=resume.path if resume else None, weights_only=True)
+    finally:
+        module.release()
     if trainer.is_global_zero:
         _report(config, module.update, monitor.last, stop)
     # a signal that came after the last update changed nothing

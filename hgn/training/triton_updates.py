@@ -125,19 +125,20 @@ class TritonUpdates:
         shown = None
         if self.training.symmetry != "none":
             shown = [drawn_symmetry(e.symmetries, s.seed) for e, s in zip(episodes, first, strict=True)]
-        failure = None
+        failure = ""
         try:
             self.parity = require_update_parity(self.updates, episodes, shown)
         except ParityError as error:
-            failure = error
-        failures = torch.tensor(float(failure is not None), device=self.device)
+            failure = str(error)  # the error itself would keep the graphs
+        failures = torch.tensor(float(failure != ""), device=self.device)
         if self._ranks.count > 1:
             sum_over_ranks(failures)
         if failures > 0:
+            failure = failure or "the kernels compute wrongly on another rank, whose message has the error"
             if not self._other_precisions:
-                raise failure or ParityError("the kernels compute wrongly on another rank, whose message has the error")
+                raise ParityError(failure)
             precision, self._other_precisions = self._other_precisions[0], self._other_precisions[1:]
-            self._say(f"{failure or 'a check failed on another rank'}; precision=auto trains in {precision}")
+            self._say(f"{failure}; precision=auto trains in {precision}")
             self._build(precision)
             self._check(chunk)
             return
