@@ -50,13 +50,15 @@ class TritonBackend(Backend):
             return stepper
         try:
             stepper.require_parity(self.network, state)
+            return stepper
         except ParityError as error:
             if self.precision == self.precisions[-1]:
                 raise
-            self.precision = self.precisions[-1]
-            warnings.warn(f"{error}. precision=auto computes in {self.precision} from here on", stacklevel=1)
-            return self._new_stepper(state, capacity)
-        return stepper
+            message = str(error)
+        del stepper  # before the next one is allocated
+        self.precision = self.precisions[-1]
+        warnings.warn(f"{message}. precision=auto computes in {self.precision} from here on", stacklevel=1)
+        return self._new_stepper(state, capacity)
 
     def _idle_stepper(self, state: ParticleState, capacity: int) -> TritonStepper | None:
         """Takes an idle stepper that fits the state and starts it from there; its launches are captured already.
