@@ -25,7 +25,7 @@ def fine_scene(scene: Scene, cell_size: float, wall: float) -> Scene:
     """Returns the scene with its particles' children, for a grid of `cell_size`; the scene itself on its own grid.
 
     The number of children is the ratio of the cells' volumes, rounded. They fill the volume that a particle has at the
-    start, but cross neither the domain's walls, whose thickness is `wall`, nor the surface of an obstacle.
+    start. They stay at least `wall` from the domain's planes, and do not cross the surface of an obstacle.
     """
     volume = (scene.cell_size / cell_size) ** 3
     children = max(1, round(volume))
@@ -46,7 +46,7 @@ def fine_scene(scene: Scene, cell_size: float, wall: float) -> Scene:
 
 
 def wall_thickness(config: MpmConfig, cell_size: float) -> float:
-    """Returns where walls end: at the last of their nodes."""
+    """Returns the thickness of the near walls, up to their last node. Far walls are one cell thicker."""
     return (config.wall_cells - 1) * cell_size
 
 

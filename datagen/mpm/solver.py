@@ -1,6 +1,6 @@
 """Simulates batches of scenes: MLS-MPM with water, sand, snow, elastic solids and mesh obstacles, on a CPU or a GPU.
 
-The method is the paper's simulator, Taichi Elements, with the corrections that hgn.config.MpmConfig names.
+The method is the paper's simulator, Taichi Elements, with the corrections that hgn.solver_method lists.
 Shape legend: T frames, N particles of a scene, B scenes.
 """
 

@@ -1,8 +1,8 @@
 """The pool of workers that generate the missing episodes of a data set: makers build scenes, solvers simulate them.
 
-The pool distributes work, publishes shards and replaces dead workers. A scene whose worker died is simulated again
-alone; after MAXIMUM_ATTEMPTS it is quarantined and replaced by the next seed. Workers run on this machine
-(datagen/pool/local_workers.py) or on a Ray cluster (datagen/pool/ray_workers.py).
+The pool distributes work, publishes shards and replaces dead workers. The scenes of a dead worker are simulated again
+in halves, then quarters, down to single scenes. A scene that was alone in MAXIMUM_ATTEMPTS dead workers is quarantined,
+and the next seed replaces it. Workers run on this machine (local_workers.py) or on a Ray cluster (ray_workers.py).
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """Scenes as users make them, by kind: pools, dam breaks, columns, slopes, edges, bowls, stairs and others.
 
-A kind draws a domain from DOMAINS, numbers uniformly from its RANGES, and places obstacles and bodies. As in
-`hgn.scene.random_scene`, a scene is determined by (config, seed), bitwise on every machine. Lengths are in domain
-units, speeds in domain units per second. Bodies are boxes or balls; "tilt" is the tangent of half an angle, so
-rotations need no sine or cosine.
+A kind draws a domain from DOMAINS and numbers from its RANGES, and places obstacles and bodies. Some numbers are drawn
+uniformly, others with small values more often. As in `hgn.scene.random_scene`, a scene is determined by (config, seed),
+bitwise on every machine. Lengths are in domain units, speeds in domain units per second. Bodies are boxes or balls.
+"tilt" is the tangent of half an angle, so rotations need no sine or cosine.
 """
 
 from __future__ import annotations

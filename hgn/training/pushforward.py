@@ -206,7 +206,7 @@ class PushforwardPool(Generic[E, T]):
         self.figures = {f"pushforward/{name}": value for name, value in values.items()}
 
     def replaced(self, samples: Sequence[T], update: int) -> list[T]:
-        """Returns the samples of an update with a fraction from the pool. Seeds stay, and noise, jitter, symmetry."""
+        """Returns an update's samples with a fraction from the pool: seeds stay, noise scales are computed anew."""
         samples, scenes = list(samples), self._scenes
         for slot, (number, rarity) in enumerate(self._draws.drawn(update)):
             own, acceleration = self._samples[number]
