@@ -28,7 +28,7 @@ class SolverMethod(NamedTuple):
     # Particles and grid exchange velocities every cell_size / this, 32 times a frame of 1/60 s at 64 cells, with as
     # many steps of stress between as the materials need. None: at every step. Fewer transfers smooth velocities less.
     transfer_speed_m_s: float | None
-    # Distance in cells from a closed body thinner than a cell, within which nodes outside the body stop motion; at least
+    # Distance in cells from a closed body thinner than a cell. Nodes outside the body within it stop motion. At least
     # one cell is used. A larger distance keeps material farther off.
     collider_band_cells: float
 
