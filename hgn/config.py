@@ -46,8 +46,7 @@ SIMULATED_FRAMES = 3  # an episode needs for pushforward: the start, a simulated
 DEFAULT_WEIGHTS = "mechanics"  # shipped weights that commands and `Simulator.load` use
 Material = Annotated[str, one_of(*MATERIALS)]
 MaterialName = Annotated[
-    str,
-    Bound("a name of lower-case letters, digits and _", lambda name: MATERIAL_NAME.fullmatch(name) is not None),
+    str, Bound("a name of lower-case letters, digits and _", lambda name: MATERIAL_NAME.fullmatch(name) is not None)
 ]
 DeviceName = Annotated[str, one_of("auto", "cpu", "cuda")]
 BackendName = Annotated[str, one_of(*BACKENDS)]

@@ -115,12 +115,7 @@ def export(checkpoint_path: Path, out: Path, stored_precision: str = "fp32", **s
     from hgn.system.provenance import provenance
 
     # Lightning, which the other exports do without, is loaded here
-    from hgn.training.checkpoint import (
-        Progress,
-        data_of_checkpoint,
-        network_of_checkpoint,
-        read_checkpoint,
-    )
+    from hgn.training.checkpoint import Progress, data_of_checkpoint, network_of_checkpoint, read_checkpoint
 
     checkpoint = read_checkpoint(checkpoint_path)
     network = network_of_checkpoint(checkpoint, checkpoint_path)

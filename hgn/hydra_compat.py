@@ -31,12 +31,7 @@ OPTIONS = (
 _FOLDERS = ("--config-dir", "-cd", "--config-path", "-cp")  # options with a folder of configs
 
 # Hydra creates no folder and no log file; commands choose where they write
-_QUIET = (
-    "hydra.run.dir=.",
-    "hydra.output_subdir=null",
-    "hydra/job_logging=none",
-    "hydra/hydra_logging=none",
-)
+_QUIET = ("hydra.run.dir=.", "hydra.output_subdir=null", "hydra/job_logging=none", "hydra/hydra_logging=none")
 _DATACLASS = re.compile(r"(?:hgn|datagen|tools)(?:\.\w+)+\.[A-Z]\w*Config")
 
 

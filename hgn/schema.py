@@ -54,9 +54,7 @@ Port = Annotated[int, Bound("0 to 65535", lambda value: 0 <= value < 65536)]
 FolderName = Annotated[str, Bound("a folder name", bool)]
 FileName = Annotated[str, Bound("a file name", lambda name: Path(name).name != "")]
 FrameCount = Annotated[
-    int,
-    Bound("at least 2", lambda value: value >= 2),
-    Bound("at most 1,000,000", lambda value: value <= 1_000_000),
+    int, Bound("at least 2", lambda value: value >= 2), Bound("at most 1,000,000", lambda value: value <= 1_000_000)
 ]
 LayerSize = Annotated[Positive[int], Bound("at most 65,536", lambda value: value <= 65_536)]
 OrdinarySize = Annotated[float, Bound("from 1e-9 to 1e9", lambda value: 1e-9 <= value <= 1e9)]

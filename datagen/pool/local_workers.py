@@ -244,8 +244,7 @@ def _stage(send: _Sender, config: DatagenConfig, config_hash: str, inbox: _Inbox
             send("failed", made.task.key, grid)
             return
         stage_episode(
-            Path(config.dataset.folder),
-            make_episode(replace(made, obstacle_grid=grid), result, config, config_hash),
+            Path(config.dataset.folder), make_episode(replace(made, obstacle_grid=grid), result, config, config_hash)
         )
         send("staged", made.task.key)
 

@@ -137,12 +137,7 @@ def _to_parents(
 
 
 def _to_children(
-    rows: Rows,
-    coarse_CW: torch.Tensor,
-    down_CW: torch.Tensor,
-    cells: _Cells,
-    offset_83: torch.Tensor,
-    threads: int,
+    rows: Rows, coarse_CW: torch.Tensor, down_CW: torch.Tensor, cells: _Cells, offset_83: torch.Tensor, threads: int
 ) -> torch.Tensor:
     """Returns the cells on the way up, from their parents and their values on the way down."""
     assert cells.level.parent_C is not None and cells.level.octant_C is not None
@@ -184,12 +179,7 @@ def _to_cells(rows: Rows, particle_NW: torch.Tensor, grid: GridHierarchy, thread
 
 
 def _to_particles(
-    rows: Rows,
-    decode: Rows,
-    particle_NW: torch.Tensor,
-    cell_CW: torch.Tensor,
-    grid: GridHierarchy,
-    threads: int,
+    rows: Rows, decode: Rows, particle_NW: torch.Tensor, cell_CW: torch.Tensor, grid: GridHierarchy, threads: int
 ) -> torch.Tensor:
     """Returns the decoder's output [N, 3 or 9]: steps 11 and 12."""
     count, others, particles = len(cell_CW), len(cell_CW) + len(CORNER_83), len(particle_NW)

@@ -1,4 +1,4 @@
-"""The triangles of obstacles on the device, and the cells that they are looked up by (hgn.step.reference).
+"""The triangles of obstacles on the device, and the cells that list them (see hgn.step.reference).
 
 Shape legend: Q cells of all scenes, E entries of their lists, F triangles.
 """
@@ -15,26 +15,26 @@ from hgn.network.cell_keys import pack
 from hgn.scene.barrier import CELLS, LEAST_HEIGHT, MARGIN, Barrier
 from hgn.schema import require
 
-NOWHERE = 1e30  # domain units: lowest corner of an empty box, whose highest corner is at minus that
+NOWHERE = 1e30  # coordinates of an empty box, domain units: lowest corner at NOWHERE, highest at -NOWHERE
 
 
 @dataclass(frozen=True, eq=False)
 class Barriers:
-    """The barriers of a batch: sorted cell keys, and the triangles that each cell lists."""
+    """The barriers of a batch: sorted cell keys, and each cell's list of triangles."""
 
     key_Q: torch.Tensor  # int64
     start_Q: torch.Tensor  # int64 [Q + 1]
     triangle_E: torch.Tensor  # int64
-    row_F24: torch.Tensor  # as in hgn.scene.barrier
+    row_F24: torch.Tensor  # columns as in hgn.scene.barrier
     scene_F: torch.Tensor  # int64
     cell_size: float
     clearance: float
 
     @staticmethod
     def of(barriers: Sequence[Barrier]) -> Barriers | None:
-        """Returns the barriers of a batch, scene s from barriers[s]; None if no scene has an obstacle.
+        """Returns the barriers of a batch, with barriers[s] for scene s; None if no scene has an obstacle.
 
-        Raises: ConfigError where scenes with obstacles have cells of more than one size.
+        Raises: ConfigError if scenes with obstacles have different cell sizes.
         """
         if not any(len(barrier.row_F24) for barrier in barriers):
             return None
@@ -69,9 +69,9 @@ class Barriers:
 
 
 def barrier_rows(corner_F33: torch.Tensor, clearance: float) -> torch.Tensor:
-    """Returns the rows of triangles of hgn.scene.barrier, float64 [F, 24], with gradients by the corners.
+    """Returns the rows of triangles (see hgn.scene.barrier), float64 [F, 24], differentiable by the corners.
 
-    The row of a triangle without area covers nothing.
+    The row of a triangle without area covers no point.
     """
     corner_F33 = corner_F33.double()
     a_F3, b_F3, c_F3 = corner_F33.unbind(1)

@@ -1,4 +1,4 @@
-"""The parts that all networks of particles share: features, their normalisation, and the encoder (paper sec. 3.1).
+"""The common parts of all particle networks: features, their normalisation, and the encoder (paper sec. 3.1).
 
 Shape legend: N particles, W width, S scenes.
 """
@@ -21,8 +21,9 @@ from hgn.step_config import UNCONSTRAINED, StepConfig
 
 @dataclass(frozen=True, eq=False)
 class Prediction:
-    """A network's raw output: normalised accelerations [N, 3], with relative inputs less gravity; and with these the
-    contacts and the grid that they come from.
+    """A network's raw output: normalised accelerations [N, 3]. With relative inputs they do not contain gravity.
+
+    With relative inputs a prediction also contains the contacts and the grid of its computation.
     """
 
     acceleration_N3: torch.Tensor
@@ -31,8 +32,9 @@ class Prediction:
 
 
 class ParticleNetwork(nn.Module, ABC):
-    """Predicts the acceleration of every particle, in frame units. `step` holds the constraints of its frames, which
-    simulations apply (hgn.step), not the network.
+    """Predicts the acceleration of every particle, in frame units.
+
+    `step` contains the constraints of its frames. Simulations apply them (hgn.step), the network does not.
     """
 
     def __init__(self, config: NetworkConfig, slope: float = LEAKY_SLOPE) -> None:
@@ -56,12 +58,12 @@ class ParticleNetwork(nn.Module, ABC):
         return self.restored_acceleration(self.normalised_acceleration(state, origin_S3), state)
 
     def restored_acceleration(self, normalised_N3: torch.Tensor, state: ParticleState) -> torch.Tensor:
-        """Returns the raw output in frame units, with relative inputs without gravity."""
+        """Returns accelerations in frame units from the raw output. With relative inputs gravity is added."""
         acceleration_N3 = self.normaliser.restore_acceleration(normalised_N3)
         return acceleration_N3 + state.gravity_S3[state.scene_N] if self.config.relative else acceleration_N3
 
     def target(self, acceleration_N3: torch.Tensor, gravity_N3: torch.Tensor) -> torch.Tensor:
-        """Returns the raw output for these accelerations and gravity, all in frame units: the inverse."""
+        """Returns the raw output for accelerations and gravity in frame units: inverts `restored_acceleration`."""
         return self.normaliser.normalise_acceleration(
             acceleration_N3 - gravity_N3 if self.config.relative else acceleration_N3
         )
@@ -70,15 +72,15 @@ class ParticleNetwork(nn.Module, ABC):
     def normalised_acceleration(self, state: ParticleState, origin_S3: torch.Tensor | None = None) -> torch.Tensor:
         """Returns the network's raw output [N, 3], which the loss compares with the normalised target.
 
-        `origin_S3` moves the grid, where the network has one.
+        `origin_S3` is the origin of the grid in each scene. It has no effect on a network without a grid.
         """
 
     def prediction(self, state: ParticleState, origin_S3: torch.Tensor | None = None) -> Prediction:
-        """Returns the raw output with the contacts that rest needs."""
+        """Returns the raw output, and the contacts that the rest constraint needs."""
         return Prediction(self.normalised_acceleration(state, origin_S3))
 
     def relative_features(self, state: ParticleState, grid: GridHierarchy) -> tuple[torch.Tensor, Contacts]:
-        """Returns all columns but the material's, [N, F], and the disturbances and surfaces of the coarsest cells."""
+        """Returns all columns except the material's, [N, F], and the contacts of the coarsest cells."""
         return relative_features(state, grid, self.config, self.normaliser.acceleration_std[0])
 
     def encode_features(self, feature_NF: torch.Tensor, material_N: torch.Tensor) -> torch.Tensor:
@@ -87,9 +89,9 @@ class ParticleNetwork(nn.Module, ABC):
         return self.encode.finish(self.encode.add_projection(material_MH.index_select(0, material_N), 0, feature_NF))
 
     def encode_particles(self, state: ParticleState, grid: GridHierarchy | None = None) -> torch.Tensor:
-        """Returns latent vectors [N, W] of the particles (sec. 3.2, step 0). Zero normals are not multiplied.
+        """Returns latent vectors [N, W] of the particles (sec. 3.2, step 0). Relative inputs require the grid.
 
-        Relative inputs depend on the grid's cells, too.
+        If no scene has an obstacle, the product with the zero normals is skipped.
         """
         if self.config.relative:
             assert grid is not None

@@ -10,9 +10,9 @@ from hgn.step_config import UNCONSTRAINED, StepConfig
 
 
 def build_network(config: NetworkConfig, step: StepConfig = UNCONSTRAINED) -> ParticleNetwork:
-    """Returns a new network with random weights, and the constraints of its frames.
+    """Returns a new network with random parameters and with the constraints `step`.
 
-    Raises: ConfigError where the network cannot have these constraints.
+    Raises: ConfigError if the network does not support these constraints.
     """
     step.require_fits(config.relative, config.dimensions)
     network: ParticleNetwork = (HierarchicalGraphNetwork if config.kind == "hgn" else GraphNetworkSimulator)(config)

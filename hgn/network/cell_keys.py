@@ -1,7 +1,7 @@
 """Integer keys of grid cells: scene index and cell coordinates packed into one int64.
 
-Sorted keys group cells by scene, and neighbours differ by a constant, so that a batch of scenes needs no
-other structure than one sorted list. Shape legend: … any leading shape, B hash buckets.
+Sorted keys group cells by scene, and keys of neighbours differ by a constant. So one sorted list represents all scenes
+of a batch. Shape legend: … any leading shape, B hash buckets.
 """
 
 from __future__ import annotations
@@ -12,17 +12,17 @@ import torch
 from torch.compiler import is_exporting
 
 COORDINATE_BITS = 17
-COORDINATE_LIMIT = 1 << (COORDINATE_BITS - 1)  # cells run from -limit to limit - 1 on each axis
+COORDINATE_LIMIT = 1 << (COORDINATE_BITS - 1)  # coordinates range from -limit to limit - 1 on each axis
 SCENE_LIMIT = 1 << (63 - 3 * COORDINATE_BITS)
-HASH_PRIMES = (73856093, 19349663, 83492791)  # of x, y, z (Teschner et al. 2003); products stay far below 2^63
-LARGEST_EXPORTED = 1 << 24  # particles or cells of an exported graph: bounds that compilers need
+HASH_PRIMES = (73856093, 19349663, 83492791)  # factors of x, y, z (Teschner et al. 2003); products stay far below 2^63
+LARGEST_EXPORTED = 1 << 24  # upper bound of particles or cells in an exported graph; compilers need one
 AXIS_STRIDE = (1 << (2 * COORDINATE_BITS), 1 << COORDINATE_BITS, 1)  # key difference of neighbours in x, y, z
 
 
 def pack(scene: torch.Tensor, cell_3: torch.Tensor) -> torch.Tensor:
     """Returns keys int64 […] of scene indices int64 […] and cell coordinates int64 […, 3].
 
-    Coordinates must lie within ±COORDINATE_LIMIT; callers keep particles in range.
+    Coordinates must lie within ±COORDINATE_LIMIT. Callers check the range of particles.
     """
     shifted = cell_3 + COORDINATE_LIMIT
     key = scene
@@ -32,7 +32,7 @@ def pack(scene: torch.Tensor, cell_3: torch.Tensor) -> torch.Tensor:
 
 
 def of_scene(key: torch.Tensor, scene: int) -> torch.Tensor:
-    """Returns keys of scene 0 as keys of another scene."""
+    """Converts keys of scene 0 to keys of another scene."""
     return key + (scene << (3 * COORDINATE_BITS))
 
 
@@ -45,8 +45,10 @@ def unpack(key: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
 
 
 def in_buckets(cell_K3: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Sorts a scene's cells int [K, 3] into hash buckets. Returns the limits of the buckets, int32 [B + 1], and in
-    their order the keys of the cells in scene 0 and the numbers of the cells, both int64 [K].
+    """Sorts a scene's cells int [K, 3] into hash buckets.
+
+    Returns the limits of the buckets, int32 [B + 1], and in bucket order the cells' keys in scene 0 and the cells'
+    numbers, both int64 [K].
     """
     count = len(cell_K3)
     mask = (1 << max(4, math.ceil(math.log2(2 * max(count, 1))))) - 1
@@ -62,7 +64,7 @@ def in_buckets(cell_K3: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch
 
 
 def unique(key: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Returns the different keys, sorted, int64 [K], and the place of each of `key` among them."""
+    """Returns the different keys, sorted, int64 [K], and the index of each element of `key` among them."""
     key_K, index = torch.unique(key, return_inverse=True)
     if is_exporting():
         torch._check(key_K.shape[0] <= LARGEST_EXPORTED)
@@ -81,7 +83,7 @@ def find(sorted_key_K: torch.Tensor, key: torch.Tensor) -> tuple[torch.Tensor, t
 
 
 def _find_by_unique(sorted_key_K: torch.Tensor, key: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Does the same without a search, which ONNX lacks."""
+    """Computes `find` without a search, which ONNX does not have."""
     count = sorted_key_K.shape[0]
     key_U, place = unique(torch.cat([sorted_key_K, key.flatten()]))
     absent_U = torch.full_like(key_U, -1)

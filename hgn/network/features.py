@@ -1,7 +1,12 @@
 """Particle features (paper sec. 3.1) and their normalisation.
 
-f_i = (v^n … v^{n-m+1}, n_o, d, e): velocities in frame units, normalised per axis; the obstacle normal as it is;
-distances to the domain's six planes, clamped to d_max and divided by it; a learned embedding of the material.
+f_i = (v^n … v^{n-m+1}, n_o, d, e):
+
+    v    velocities in frame units, normalised per axis
+    n_o  normal of the particle's obstacle cell
+    d    distances to the domain's six planes, clamped to d_max and divided by it
+    e    learned embedding of the material
+
 Shape legend: N particles, m velocities, S scenes.
 """
 
@@ -20,7 +25,7 @@ from hgn.scene.material import MATERIALS
 from hgn.schema import ConfigError
 
 WALL_DISTANCE_CELLS = 8.0  # d_max / R of the paper
-# The standard deviation of accelerations along an axis without motion: positions end with it, divisions do not.
+# Standard deviation of accelerations along an axis without motion: as a factor it changes no position, and it is not 0.
 STILL = 1e-30
 
 
@@ -33,9 +38,9 @@ class ParticleState:
     material_N: torch.Tensor  # int64, index into the network's materials
     scene_N: torch.Tensor  # int64, index of the particle's scene
     domain_S3: torch.Tensor  # domain size of each scene
-    gravity_S3: torch.Tensor  # of each scene, domain units per frame squared
+    gravity_S3: torch.Tensor  # gravity of each scene, domain units per frame squared
     obstacles: ObstacleCells | None
-    barriers: Barriers | None = None  # with step.obstacle_clearance
+    barriers: Barriers | None = None  # triangles of obstacles; only with step.obstacle_clearance
 
     @property
     def scene_count(self) -> int:
@@ -45,8 +50,8 @@ class ParticleState:
 class Normaliser(nn.Module):
     """Mean and standard deviation per axis of velocity and acceleration, in frame units.
 
-    The noise that training adds enters the standard deviations in quadrature, as in GNS (Sanchez-Gonzalez et
-    al. 2020, reference implementation).
+    Training noise is added to the standard deviations in quadrature, as in GNS (Sanchez-Gonzalez et al. 2020, reference
+    implementation).
     """
 
     velocity_mean: torch.Tensor
@@ -63,9 +68,9 @@ class Normaliser(nn.Module):
     def set(
         self, quantity: str, mean_3: torch.Tensor, std_3: torch.Tensor, noise_std: float, dimensions: int = 3
     ) -> None:
-        """Sets `velocity` or `acceleration` from the data's statistics. An axis without spread keeps a tiny one.
+        """Sets `velocity` or `acceleration` from the data's statistics. The smallest standard deviation is 1e-9.
 
-        Axes from `dimensions` on get STILL: the network's output along them moves particles by less than rounding.
+        Unused axes (`dimensions` and above) get STILL. Output along them moves particles by less than rounding.
         """
         getattr(self, f"{quantity}_mean").copy_(mean_3)
         total_3 = torch.sqrt(std_3.double() ** 2 + noise_std**2).clamp(min=1e-9)
@@ -74,13 +79,13 @@ class Normaliser(nn.Module):
         getattr(self, f"{quantity}_std")[dimensions:] = 1.0 if quantity == "velocity" else STILL
 
     def set_isotropic(self, acceleration_std_3: torch.Tensor, noise_std: float, dimensions: int = 3) -> None:
-        """Sets the normaliser for relative inputs: no means, and one scale, the rms over the axes, with the noise."""
+        """Sets the normaliser for relative inputs: zero means and one scale, the rms over the axes, noise included."""
         for quantity in ("velocity", "acceleration"):
             scale = acceleration_std_3[:dimensions].double().square().mean().sqrt().expand(3)
             self.set(quantity, torch.zeros(3), scale, noise_std, dimensions)
 
     def feature_scale(self, relative: bool) -> tuple[torch.Tensor, torch.Tensor]:
-        """Returns mean and standard deviation [3] of velocity features; relative ones are of accelerations."""
+        """Returns mean and standard deviation [3] of velocity features. Relative inputs use those of accelerations."""
         quantity = "acceleration" if relative else "velocity"
         return getattr(self, f"{quantity}_mean"), getattr(self, f"{quantity}_std")
 
@@ -95,13 +100,13 @@ class Normaliser(nn.Module):
 
 
 def wall_distances(position_N3: torch.Tensor, domain_N3: torch.Tensor, maximum: float) -> torch.Tensor:
-    """Returns signed distances to the lower and upper planes of the domain, clamped to ±maximum, over it, [N, 6]."""
+    """Returns signed distances to the domain's lower and upper planes, clamped to and divided by maximum, [N, 6]."""
     distance_N6 = torch.cat([position_N3, domain_N3 - position_N3], dim=-1)
     return distance_N6.clamp(-maximum, maximum) / maximum
 
 
 def material_rows(material_N: np.ndarray, materials: Sequence[str], names: Sequence[str] = MATERIALS) -> torch.Tensor:
-    """Returns indices into a network's material list, int64 [N], from indices into `names`.
+    """Converts indices into `names` to indices into a network's material list, int64 [N].
 
     Raises: ConfigError for a material that the network was not trained with.
     """

@@ -1,10 +1,9 @@
 """The graph network simulator that the paper compares with: message passing between neighbouring particles.
 
 Sanchez-Gonzalez et al. 2020 (GNS), with the paper's choices (sec. 4): connectivity radius R, wall distances clamped
-at 8 R, 10 message-passing steps, one hidden layer in every MLP. Each particle is its own neighbour too, as in GNS.
-Obstacles are normal features, as in the HGN.
-The first layers are split over their concatenated inputs, so that a particle's part is multiplied once, not once an
-edge: exactly the same function.
+at 8 R, 10 message-passing steps, one hidden layer in every MLP. As in GNS each particle is also its own neighbour.
+Obstacles are normal features, as in the HGN. First layers are split over their concatenated inputs. Then a particle's
+part is multiplied once instead of once an edge. The function is the same.
 Shape legend: N particles, E directed edges, W width, H hidden.
 """
 
@@ -25,7 +24,7 @@ RELU = 0.0  # slope below zero
 
 
 class InteractionStep(nn.Module):
-    """One message-passing step: edges from both ends, particles from their edges' sum, residuals on both."""
+    """One message-passing step: edges from both ends, particles from the sum of their edges, residuals on both."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
@@ -33,7 +32,7 @@ class InteractionStep(nn.Module):
         self.node = MLP((width, width), width, width, slope=RELU)  # particle, sum of the edges' updates
 
     def update(self, node_NW: torch.Tensor, sum_NW: torch.Tensor) -> torch.Tensor:
-        """The particles' new state [N, W]."""
+        """Returns the particles' new state [N, W]."""
         own, total = self.node.first.weight.split(self.node.parts, dim=1)
         hidden_NH = linear(node_NW, own, self.node.first.bias) + linear(sum_NW, total)
         return node_NW + self.node.finish(hidden_NH)
@@ -50,20 +49,20 @@ class GraphNetworkSimulator(ParticleNetwork):
         self.decode = MLP((width,), width, 3, layer_norm=False, slope=RELU)
 
     def normalised_acceleration(self, state: ParticleState, origin_S3: torch.Tensor | None = None) -> torch.Tensor:
-        """Returns the raw output [N, 3]. `origin_S3` has no effect: GNS has no grid.
+        """Returns the raw output [N, 3]. `origin_S3` has no effect, because GNS has no grid.
 
         Raises: GridRangeError when a particle is not finite or too far from the origin.
         """
         return self.propagate(state, self.neighbours(state))
 
     def neighbours(self, state: ParticleState) -> NeighbourList:
-        """Returns all pairs of particles of a scene within R."""
+        """Returns all pairs of particles of a scene that are closer than R."""
         return neighbour_list(state.position_N3.detach(), state.scene_N, self.config.cell_size)
 
     def propagate(self, state: ParticleState, neighbours: NeighbourList) -> torch.Tensor:
         """Returns the raw output [N, 3] for a state and its neighbour list."""
         order_N, sender_E, receivers = neighbours.order_N, neighbours.sender_E, neighbours.receivers
-        # Reorder the inputs: a gather of latent states would need a sum over rows in the backward pass.
+        # Inputs are reordered: a gather of latent states would need a sum over rows in the backward pass.
         state = replace(
             state,
             position_N3=state.position_N3[order_N],
@@ -85,7 +84,7 @@ class GraphNetworkSimulator(ParticleNetwork):
         return torch.empty_like(decoded_N3).index_copy(0, order_N, decoded_N3)
 
     def _edges(self, position_N3: torch.Tensor, sender_E: torch.Tensor, receiver_E: torch.Tensor) -> torch.Tensor:
-        """Returns latent edges [E, W] from sender minus receiver and their distance, in radii."""
+        """Returns latent edges [E, W] from the offset (sender minus receiver) and its length, both in radii."""
         offset_E3 = position_N3.index_select(0, sender_E) - position_N3.index_select(0, receiver_E)
         offset_E3 = offset_E3 / self.config.cell_size
         return self.encode_edges(torch.cat([offset_E3, offset_E3.norm(dim=-1, keepdim=True)], dim=-1))

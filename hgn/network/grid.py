@@ -1,8 +1,8 @@
 """The sparse grid hierarchy (paper sec. 3.2, fig. 2 and 3), built with plain tensor operations.
 
-Cell k of the finest level spans [k, k + 1) * cell_size + origin. A cell is active if its centre has non-zero
-trilinear weight for some particle; the parent of k is floor(k / 2), active iff a child is. Edges join
-face-adjacent active cells of one level, in both directions.
+Cell k of the finest level spans [k, k + 1) * cell_size + origin. A cell is active if its centre has a non-zero
+trilinear weight for some particle. The parent of cell k is floor(k / 2). It is active if one of its children is.
+Edges join active cells of one level that share a face, in both directions.
 Shape legend: N particles, C cells of a level, E directed edges of a level, S scenes.
 """
 
@@ -17,7 +17,7 @@ from hgn.network.cell_keys import AXIS_STRIDE, COORDINATE_LIMIT, find, pack, uni
 
 # The 8 corners of a unit cube, z fastest: the offsets of a particle's cells, and of children in a parent.
 CORNER_83 = torch.tensor([[i >> 2 & 1, i >> 1 & 1, i & 1] for i in range(8)])
-# The 6 directions in which an edge's sender lies, seen from its receiver.
+# The 6 directions from an edge's receiver to its sender.
 DIRECTION_63 = torch.tensor([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]])
 
 
@@ -33,8 +33,8 @@ class Level:
     sender_E: torch.Tensor
     receiver_E: torch.Tensor
     direction_E: torch.Tensor  # row of DIRECTION_63
-    parent_C: torch.Tensor | None = None  # index into the next level; none on the coarsest
-    octant_C: torch.Tensor | None = None  # row of CORNER_83: which child of its parent a cell is
+    parent_C: torch.Tensor | None = None  # index into the next level; None on the coarsest
+    octant_C: torch.Tensor | None = None  # row of CORNER_83: the cell's place in its parent
 
     @property
     def cell_count(self) -> int:
@@ -43,25 +43,21 @@ class Level:
 
 @dataclass(frozen=True, eq=False)
 class GridHierarchy:
-    """All levels, finest first, and the 8 (particle, cell) pairs of each particle."""
+    """All levels, finest first, and the 8 cells of each particle."""
 
     levels: tuple[Level, ...]
     cell_N8: torch.Tensor  # int64, index into the finest level; corner order of CORNER_83
-    weight_N8: torch.Tensor  # trilinear, sums to 1; zero where the particle lies on a cell centre's plane
+    weight_N8: torch.Tensor  # trilinear, sums to 1; some are zero if the particle lies on a plane of cell centres
     fraction_N3: torch.Tensor  # particle minus the centre of its first corner's cell, in cells, [0, 1)
 
 
 def build_hierarchy(
-    position_N3: torch.Tensor,
-    scene_N: torch.Tensor,
-    origin_S3: torch.Tensor,
-    cell_size: float,
-    levels: int,
+    position_N3: torch.Tensor, scene_N: torch.Tensor, origin_S3: torch.Tensor, cell_size: float, levels: int
 ) -> GridHierarchy:
-    """Builds the grids of all scenes; cells of different scenes are never neighbours.
+    """Builds the grids of all scenes. Cells of different scenes are never neighbours.
 
-    position_N3 in domain units, scene_N int64 indices into origin_S3 (the finest grid's origin in each scene).
-    Raises: GridRangeError when a particle is not finite or lies beyond ±65,536 cells.
+    position_N3 is in domain units. scene_N contains int64 indices into origin_S3, the finest grid's origins.
+    Raises: GridRangeError if a particle is not finite or beyond ±65,536 cells.
     """
     grid_N3 = (position_N3 - origin_S3[scene_N]) / cell_size - 0.5
     # an exported graph cannot raise
@@ -74,8 +70,8 @@ def build_hierarchy(
     fraction_N3 = grid_N3 - base_N3
     corner_83 = CORNER_83.to(position_N3.device)
     weight_N8 = torch.where(corner_83.bool(), fraction_N3[:, None], 1 - fraction_N3[:, None]).prod(-1)
-    # A particle exactly on a plane of centres gives the far corners no weight: they must not become active, so
-    # their pairs point at the near corner instead, with weight zero.
+    # A particle exactly on a plane of centres gives the far corners no weight, so these must not become active.
+    # Their entries point at the near corner instead, with weight zero.
     reached_N83 = corner_83 * (fraction_N3 > 0)[:, None].long()
     key_N8 = pack(scene_N[:, None], base_N3.long()[:, None] + reached_N83)
     key_C, cell_N8 = unique(key_N8)

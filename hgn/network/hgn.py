@@ -1,8 +1,10 @@
-"""The hierarchical graph network (paper sec. 3.2, fig. 2): plain torch, the reference for every faster path.
+"""The hierarchical graph network (paper sec. 3.2, fig. 2) in plain torch: the reference of every faster backend.
 
-Steps: encode particles (0), particles to cells (1), message passing on each level down (2, 4, …) with fine to
-coarse (3, 5, …) between, message passing on each level up (8, 10, …) after coarse to fine (7, 9, …), cells to
-particles (11), decode to the acceleration (12). With L levels there are 2 L - 1 message-passing blocks.
+Steps in the paper's numbers, with four levels:
+0: encode particles. 1: particles to cells.
+2, 4, …: message passing on each level, from the finest to the coarsest. 3, 5, …: fine to coarse, between these.
+7, 9, …: coarse to fine. 8, 10, …: message passing on each level but the coarsest, up to the finest.
+11: cells to particles. 12: decode the acceleration. With L levels there are 2 L - 1 message-passing blocks.
 Shape legend: N particles, C cells, E directed edges, W width, S scenes.
 """
 
@@ -22,7 +24,7 @@ from hgn.network.relative import OUTPUTS, balanced
 
 
 class MessagePassing(nn.Module):
-    """Steps 2, 4, …: M iterations on the cells of one level (paper fig. 5), weights unshared."""
+    """Steps 2, 4, …: M iterations on the cells of one level (paper fig. 5). Each has its own parameters."""
 
     def __init__(self, steps: int, width: int) -> None:
         super().__init__()
@@ -32,7 +34,7 @@ class MessagePassing(nn.Module):
     def forward(self, cell_CW: torch.Tensor, level: Level) -> torch.Tensor:
         """Returns the updated cell features [C, W]."""
         edge_EW: torch.Tensor | None = None
-        # Receiver minus sender in cells: the opposite of where the sender lies.
+        # Receiver minus sender in cells. DIRECTION_63 points from receiver to sender, hence the sign.
         offset_63 = -DIRECTION_63.to(cell_CW)
         for edge_network, cell_network in zip(self.edge, self.cell, strict=True):
             assert isinstance(edge_network, MLP) and isinstance(cell_network, MLP)
@@ -55,8 +57,8 @@ class MessagePassing(nn.Module):
 class HierarchicalGraphNetwork(ParticleNetwork):
     """Predicts the acceleration of every particle, in frame units.
 
-    Without obstacle features the input lacks the normals (the paper's second data set); with them, a scene
-    without obstacles leaves their columns out, which is exact since the normals are zero.
+    Without obstacle features the input has no normals (the paper's second data set). With them, a scene without
+    obstacles skips the product with their columns. This is exact, because the normals are zero.
     """
 
     def __init__(self, config: NetworkConfig) -> None:
@@ -77,7 +79,7 @@ class HierarchicalGraphNetwork(ParticleNetwork):
     def normalised_acceleration(self, state: ParticleState, origin_S3: torch.Tensor | None = None) -> torch.Tensor:
         """Returns the network's raw output [N, 3], which the loss compares with the normalised target.
 
-        The finest grid's origin in each scene is 0 unless given.
+        `origin_S3` is the finest grid's origin in each scene, by default 0.
         """
         return self.prediction(state, origin_S3).acceleration_N3
 
@@ -90,7 +92,7 @@ class HierarchicalGraphNetwork(ParticleNetwork):
         grid: GridHierarchy,
         propagate: Callable[[torch.Tensor, GridHierarchy], torch.Tensor],
     ) -> Prediction:
-        """Returns the prediction on a grid, with `propagate` for steps 1 to 12."""
+        """Returns the prediction on a grid. `propagate` computes steps 1 to 12."""
         if not self.config.relative:
             return Prediction(propagate(self.encode_particles(state, grid), grid))
         feature_NF, contacts = self.relative_features(state, grid)
@@ -104,10 +106,12 @@ class HierarchicalGraphNetwork(ParticleNetwork):
         return build_hierarchy(state.position_N3, state.scene_N, origin_S3, self.config.cell_size, self.config.levels)
 
     def propagate(self, particle_NW: torch.Tensor, grid: GridHierarchy) -> torch.Tensor:
-        """Returns the decoder's output for latent particles (steps 1 to 12): normalised accelerations [N, 3], or with
-        relative inputs [N, 9], for hgn.network.relative.balanced."""
+        """Returns the decoder's output for latent particles (steps 1 to 12).
+
+        It is [N, 3] normalised accelerations, or [N, 9] with relative inputs, the input of `relative.balanced`.
+        """
         corner_83 = CORNER_83.to(particle_NW)
-        # Towards the parent's centre, in fine cells: from octant o the parent's centre lies at 1/2 - o.
+        # Offset from a fine cell in octant o to its parent's centre, in fine cells: 1/2 - o.
         parent_offset_83 = 0.5 - corner_83
 
         network = self.particle_to_cell

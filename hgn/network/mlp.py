@@ -1,8 +1,8 @@
 """The building block of the paper's network (sec. 3.2, fig. 4): one hidden layer, LeakyReLU, LayerNorm.
 
-The first layer acts on a concatenation of parts. Since it is linear, each part can be multiplied where it lives
-(once a particle or a cell) and only the products be gathered to pairs or edges: exactly the same function
-for a fraction of the arithmetic. `forward` is the plain definition, `project` and `finish` are its halves.
+The first layer acts on a concatenation of parts. It is linear, so each part can be multiplied before it is gathered:
+once a particle or a cell, not once a pair or an edge. The function is exactly the same, with less arithmetic.
+`forward` is the plain definition; `project` and `finish` are its two halves.
 """
 
 from __future__ import annotations
@@ -15,14 +15,13 @@ from torch.compiler import is_exporting
 from torch.nn import functional
 
 LEAKY_SLOPE = 0.01
-# For a handful of rows, CPU matrix libraries take other kernels, which sum in another order. Padding keeps a scene's
-# result independent, to the last bit, of what shares its batch.
+# CPU matrix libraries use other kernels for fewer rows, which sum in another order. Padding to MINIMUM_ROWS makes a
+# scene's result bitwise independent of the other scenes of its batch.
 MINIMUM_ROWS = 16
 
 
 def linear(value: torch.Tensor, weight: torch.Tensor, bias: torch.Tensor | None = None) -> torch.Tensor:
-    """Returns the affine map of rows [R, in] (or [..., in]) to [R, out]; a row does not depend on the number of
-    rows."""
+    """Returns the affine map of rows [..., in] to [..., out]. A row does not depend on the number of rows."""
     if not _few(value):
         return functional.linear(value, weight, bias)
     rows = value.shape[:-1].numel()
@@ -31,7 +30,7 @@ def linear(value: torch.Tensor, weight: torch.Tensor, bias: torch.Tensor | None 
 
 
 def _few(value: torch.Tensor) -> bool:
-    """Returns whether the rows are padded. An exported graph, which serves all sizes, does not pad."""
+    """Returns whether the rows are padded. An exported graph does not pad, because it has any number of rows."""
     return value.device.type == "cpu" and not is_exporting() and value.shape[:-1].numel() < MINIMUM_ROWS
 
 
@@ -42,7 +41,7 @@ class MLP(nn.Module):
         self, parts: Sequence[int], hidden: int, out: int, layer_norm: bool = True, slope: float = LEAKY_SLOPE
     ) -> None:
         super().__init__()
-        self.slope = slope  # of the activation below zero
+        self.slope = slope  # slope of the activation below zero
         self.parts = tuple(parts)
         self.first = nn.Linear(sum(parts), hidden)
         self.second = nn.Linear(hidden, out)
@@ -53,7 +52,7 @@ class MLP(nn.Module):
         return linear(value, self.columns(part))
 
     def add_projection(self, hidden: torch.Tensor, part: int, value: torch.Tensor) -> torch.Tensor:
-        """Adds that product with rows [R, parts[part]] to `hidden` [R, hidden], in place and in one pass."""
+        """Adds `project(part, value)` of rows [R, parts[part]] to `hidden` [R, hidden], in place and in one pass."""
         if not _few(value):
             return hidden.addmm_(value, self.columns(part).T)
         return hidden.add_(self.project(part, value))

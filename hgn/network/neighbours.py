@@ -1,7 +1,7 @@
-"""Neighbour lists: all pairs of particles nearer than a radius, found through a sorted list of cells.
+"""Neighbour lists: all pairs of particles closer than a radius, found with a sorted list of cells.
 
-Cells are half a radius wide, so that a particle's neighbours lie in 5 x 5 x 5 of them; with z fastest in the keys
-those are 25 contiguous runs of the sorted particles. The work is proportional to the number of neighbours.
+Cells are half a radius wide, so a particle's neighbours lie in 5 x 5 x 5 of them. z varies fastest in the keys, so they
+are 25 contiguous runs of the sorted particles. The work is proportional to the number of neighbours.
 Shape legend: N particles, K candidate pairs, E directed edges.
 """
 
@@ -16,15 +16,15 @@ from hgn.network.grid import GridRangeError
 from hgn.network.segments import Segments
 
 REACH = 2  # cells on each side
-# Particles a radius apart must never fall more than REACH cells apart. Rounding moves a quotient by up to 0.004 cells
-# at the greatest coordinates, so the cells are a little wider than half a radius.
+# Two particles within a radius must be at most REACH cells apart. Rounding changes a quotient by up to 0.004 cells at
+# the largest coordinates, so cells are SLACK times half a radius wide.
 SLACK = 1.01
 
 
 @dataclass(frozen=True, eq=False)
 class NeighbourList:
-    """Directed edges between particles in the order of `order_N`, grouped by receiver; each particle is its own
-    neighbour too."""
+    """Directed edges between particles in the order of `order_N`, grouped by receiver. Each particle has an edge to
+    itself."""
 
     order_N: torch.Tensor  # int64: the particle at each place of the sorted order
     sender_E: torch.Tensor  # int64, places in the sorted order
@@ -36,7 +36,7 @@ class NeighbourList:
 
 
 def neighbour_list(position_N3: torch.Tensor, scene_N: torch.Tensor, radius: float) -> NeighbourList:
-    """Returns all ordered pairs of particles of one scene closer than `radius`, each particle with itself included.
+    """Returns all ordered pairs of particles of one scene closer than `radius`, including each particle with itself.
 
     Raises: GridRangeError when a particle is not finite or too far from the origin.
     """
@@ -44,7 +44,7 @@ def neighbour_list(position_N3: torch.Tensor, scene_N: torch.Tensor, radius: flo
     key_N, order_N = torch.sort(key_N, stable=True)
     position_N3 = position_N3[order_N]
     first_NR, length_NR = _runs(key_N)
-    # One row a candidate pair: its receiver, and its place in that receiver's runs.
+    # One row a candidate pair: its receiver, and its place in the receiver's runs.
     runs = length_NR.shape[1]
     length_Q = length_NR.flatten()
     end_Q = length_Q.cumsum(0)

@@ -1,6 +1,6 @@
 """Obstacles on the device: the normals of sparse cells, found by key.
 
-Paper sec. 3: n_o is the normal of the solver-sized cell that contains the particle, zero where there is none.
+Paper sec. 3: n_o is the normal of the obstacle cell that contains the particle. Without such a cell it is zero.
 Shape legend: K obstacle cells of all scenes, N particles.
 """
 
@@ -16,7 +16,7 @@ import torch
 from hgn.network.cell_keys import find, of_scene, pack
 from hgn.scene.obstacle_grid import ObstacleGrid
 
-REMEMBERED_SCENES = 32  # whose keys are: batches of many frames of a scene need them again and again
+REMEMBERED_SCENES = 32  # number of scenes whose keys are cached; batches often contain several frames of a scene
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,7 +29,7 @@ class ObstacleCells:
 
     @staticmethod
     def of(grids: Sequence[ObstacleGrid]) -> ObstacleCells | None:
-        """Returns the cells of a batch, scene s from grids[s]; None if no scene has an obstacle."""
+        """Returns the cells of a batch, with grids[s] for scene s; None if no scene has an obstacle."""
         if not any(len(grid.cell_K3) for grid in grids):
             return None
         cell_size = grids[0].cell_size

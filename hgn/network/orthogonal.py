@@ -12,18 +12,18 @@ import torch
 from hgn.network.base import ParticleNetwork
 from hgn.network.mlp import MLP
 
-# Keller Jordan 2024 (Muon): the slope at zero is the steepest that keeps singular values between 0.7 and 1.2
+# Keller Jordan 2024 (Muon): the largest slope at zero for which singular values end between 0.7 and 1.2
 COEFFICIENTS = (3.4445, -4.7750, 2.0315)
 ITERATIONS = 5
 EPSILON = 1e-7
 MOMENTUM = 0.95
-RELATIVE_STEP = 0.2  # rms of a step in learning rates, as Adam's is in practice (Liu et al. 2025): rates mean the same
+RELATIVE_STEP = 0.2  # rms of a step in learning rates, as Adam's is in practice (Liu et al. 2025)
 
 
 def square_blocks(network: ParticleNetwork) -> torch.Tensor:
-    """Returns the places of all blocks from latent to latent in the concatenated parameters, int64 [K, W, W].
+    """Returns the indices of all latent-to-latent blocks in the concatenated parameters, int64 [K, W, W].
 
-    A first layer on several parts is several matrices side by side, each a block; the encoder's is not one.
+    A first layer on several parts consists of several matrices side by side. Each is a block, except in the encoder.
     """
     width = network.config.width
     start, total = {}, 0
@@ -43,19 +43,20 @@ def square_blocks(network: ParticleNetwork) -> torch.Tensor:
 
 
 def step_size(width: int) -> float:
-    """Returns the size of a step along an orthogonal matrix (elements of rms width^-1/2), in learning rates."""
+    """Returns the length of a step along an orthogonal matrix (elements of rms width^-1/2), in learning rates."""
     return RELATIVE_STEP * math.sqrt(width)
 
 
 def normalised(matrix_KWW: torch.Tensor) -> torch.Tensor:
-    """Scales matrices to Frobenius norm 1, so that no singular value is above 1."""
+    """Scales matrices to Frobenius norm 1. Then no singular value is above 1."""
     return matrix_KWW / (matrix_KWW.norm(dim=(1, 2), keepdim=True) + EPSILON)
 
 
 def orthogonalised(matrix_KWW: torch.Tensor) -> torch.Tensor:
-    """Returns approximately U V^T of the SVD of matrices of norm 1: singular values near 1, the same singular vectors.
+    """Returns approximately U V^T of the SVD of matrices of norm 1.
 
-    Newton-Schulz iterations of odd degree five: three products each.
+    Singular vectors stay, and singular values become nearly 1. The iterations are those of Newton and Schulz, of odd
+    degree five, with three products each.
     """
     a, b, c = COEFFICIENTS
     x_KWW = matrix_KWW

@@ -1,10 +1,10 @@
-"""Obstacles whose pose may have gradients: normals looked up in each obstacle's own frame, and turned with it.
+"""Obstacles whose pose may have gradients: normals are looked up in each obstacle's own frame and turned back.
 
-An obstacle's cells are made once, where the scene has it. A particle is expressed in that frame, x' = R^T (x - t - c)
-+ c with pivot c, and the normal found there is turned back, R n: its direction follows the rotation exactly. Which cell
-a particle lies in is piecewise constant: a shift has no gradient, and no gradient says that a surface comes nearer.
-With `smoothing` s the normal is the mean over a cube of s cells around the particle, which is continuous and piecewise
-polynomial in position and pose; 0 is what networks were trained with.
+An obstacle's cells are computed once, at its place in the scene. A particle is expressed in that frame by
+x' = R^T (x - t - c) + c with pivot c. The normal n found there becomes R n, so its direction follows the rotation
+exactly. The cell of a particle is piecewise constant: shifts have no gradient, and distance from the surface has none.
+With `smoothing` s the normal is the mean over a cube of s cells around the particle. The mean is continuous, and
+piecewise polynomial in position and pose. Networks were trained with s = 0.
 Shape legend: N particles, K obstacle cells.
 """
 
@@ -21,7 +21,7 @@ from hgn.network.obstacles import ObstacleCells
 
 @dataclass(frozen=True, eq=False)
 class Placement:
-    """The pose of an obstacle relative to that in its scene: x -> R (x - c) + c + t."""
+    """The pose of an obstacle relative to its place in the scene: x -> R (x - c) + c + t."""
 
     rotation_33: torch.Tensor
     pivot_3: torch.Tensor  # c, domain units
@@ -35,19 +35,19 @@ class Placement:
         return Placement(*(tensor.to(dtype) for tensor in (self.rotation_33, self.pivot_3, self.translation_3)))
 
     def undo(self, position_N3: torch.Tensor) -> torch.Tensor:
-        """Moves points into the frame of the obstacle's cells: the inverse."""
+        """Moves points from the obstacle's pose to the frame of its cells. Inverts `place`."""
         return (position_N3 - self.translation_3 - self.pivot_3) @ self.rotation_33 + self.pivot_3
 
 
 @dataclass(frozen=True, eq=False)
 class PosedObstacleCells(ObstacleCells):
-    """Cells of the obstacles that stay, as in ObstacleCells, and of each that has a placement. One scene."""
+    """Cells of one scene: those of fixed obstacles, as in ObstacleCells, and those of each placed obstacle."""
 
     placed: tuple[tuple[ObstacleCells, Placement], ...] = ()
-    smoothing: float = 0.0  # side of the cube that normals are the mean over, in cells, 0 to 1
+    smoothing: float = 0.0  # side of the cube for mean normals, in cells, 0 to 1
 
     def normals(self, position_N3: torch.Tensor, scene_N: torch.Tensor) -> torch.Tensor:
-        """Returns n_o of each particle, [N, 3]: the sum over obstacles, of length 1 at most."""
+        """Returns n_o of each particle, [N, 3]: the sum over obstacles, shortened to length 1."""
         normal_N3 = smoothed_normals(self, position_N3, scene_N, self.smoothing)
         for cells, placement in self.placed:
             own_N3 = smoothed_normals(cells, placement.undo(position_N3), scene_N, self.smoothing)
@@ -66,7 +66,7 @@ def smoothed_normals(
         return ObstacleCells.normals(cells, position_N3, scene_N)
     grid_N3 = position_N3 / cells.cell_size
     low_N3 = torch.floor(grid_N3 - 0.5 * smoothing).detach()
-    upper_N3 = ((grid_N3 + 0.5 * smoothing - low_N3 - 1) / smoothing).clamp(0, 1)  # share of the cube in the next cell
+    upper_N3 = ((grid_N3 + 0.5 * smoothing - low_N3 - 1) / smoothing).clamp(0, 1)  # fraction in the next cell
     corner_83 = CORNER_83.to(position_N3.device)
     weight_N8 = torch.where(corner_83.bool(), upper_N3[:, None], 1 - upper_N3[:, None]).prod(-1)
     index_N8, found_N8 = find(cells.key_K, pack(scene_N[:, None], low_N3.long()[:, None] + corner_83))

@@ -1,26 +1,28 @@
 """Relative inputs: features that do not change with a motion common to all particles (`network.inputs: relative`).
 
-Not the paper's (sec. 3.1 has absolute velocities and wall distances). Away from surfaces the features do not depend on
-a common velocity, and in free flight not on gravity, to which the output is added: g + s_a * decoder. Columns, in this
-order, with f(x) = asinh(x / s_a), s_a the normaliser's scale; f is odd, so that features transform with the symmetries
-of the cube:
+The paper (sec. 3.1) has absolute velocities and wall distances instead. Away from surfaces these features do not depend
+on a common velocity. In free flight they do not depend on gravity either. The acceleration is g plus the output.
+f(x) = asinh(x / s_a), where s_a is the normaliser's scale. f is odd, so features transform with the symmetries of the
+cube. The columns are, in this order:
 
 | columns | value |
 |---|---|
 | 3 (H - 1) | f(v^{n-k} - v^{n-k-1} - g), k = 0 … H - 2: zero in free flight |
-| 3 L | f(v_p - U_l(x_p)) on each level, finest first, U_l the momentum over the mass of the cells around |
-| 3 | G f(v^n): the velocity relative to surfaces, near one |
+| 3 L | f(v_p - U_l(x_p)) on each level, finest first; U_l is momentum over mass of the surrounding cells |
+| 3 | G f(v^n): the velocity relative to surfaces, if one is near |
 | 6 | walls within CONTACT_REACH_CELLS R, lower x, y, z, then upper |
-| 3 + 3 | obstacle normals, at the particle and ahead of it; only with obstacle_features |
+| 3 + 3 | obstacle normals at the particle and ahead of it; only with obstacle_features |
 
-G = sum_C w_pC t_C, with t_C of `disturbance`: at least the particle's own `surface_gate`, and above 0 inside a pile of
-which only the foot is within reach of a surface. Surfaces push along their normals only (`balanced`).
+G = sum_C w_pC t_C uses t_C of `disturbance`. It is at least the particle's own `surface_gate`. In a pile it is above 0
+even for particles out of reach, if particles in the same coarsest cell or in one across a face are near a surface.
 
-The decoder's nine numbers are an acceleration r and a stress sigma of each particle; `balanced` turns them into the
-acceleration without gravity. It is 0 without relative motion: a body that flies freely without deforming has exactly
-the acceleration g, for any parameters. Where no surface is within reach it conserves momentum, for any parameters: the
-mean of r over a coarsest cell is subtracted, and cells push each other across their faces only by antisymmetric
-impulses; and angular momentum: the rotation of a cell is subtracted too, and that of two cells that push each other.
+The decoder returns an acceleration r and a stress sigma for each particle. `balanced` computes the acceleration from
+them. These properties hold for any parameters:
+- Without relative motion the output is 0, so a body that flies freely without deforming has exactly acceleration g.
+- Without a surface in reach momentum is conserved. The mean of r over a coarsest cell is subtracted, and cells exchange
+  only antisymmetric impulses across their faces.
+- Angular momentum is conserved there too. The rotation of a cell, and of each pair of neighbours, is subtracted.
+- Surfaces push along their normals only.
 Shape legend: N particles, H velocities, L levels, C cells of a level, E directed edges, S scenes.
 """
 
@@ -35,24 +37,25 @@ from hgn.network.features import ParticleState
 from hgn.network.grid import CORNER_83, DIRECTION_63, GridHierarchy
 from hgn.network.obstacles import ObstacleCells
 
-CONTACT_REACH_CELLS = 3.0  # R within which walls are seen
-WALL_LIMIT = 2.0  # of wall_nearness: beyond the plane by the reach
-STEPS_AHEAD = 4  # places looked at on the way of one frame
-QUIET = 0.01  # s_a: changes and differences of velocity below it count by their square; rounding leaves 1e-5 to 1e-4
-OUTPUTS = 9  # of the decoder, a particle: an acceleration, and a stress xx, yy, zz, yz, xz, xy
-STRESS_33 = ((3, 8, 7), (8, 4, 6), (7, 6, 5))  # its columns
-SMALLEST_MASS = 1e-30  # a cell that rounding gave no weight has no velocity either
-# Particles that touch, and the share of those that touch in a direction, below which a surface fades away
+CONTACT_REACH_CELLS = 3.0  # distance from a wall, in R, at which the network begins to see it
+WALL_LIMIT = 2.0  # largest wall_nearness: the particle is behind the plane by the reach
+STEPS_AHEAD = 4  # number of places on the path of the next frame that are searched for an obstacle
+QUIET = 0.01  # changes and differences of velocity that count as full disturbance, in s_a; rounding is 1e-5 to 1e-4
+OUTPUTS = 9  # numbers of the decoder per particle: an acceleration, and a stress xx, yy, zz, yz, xz, xy
+STRESS_33 = ((3, 8, 7), (8, 4, 6), (7, 6, 5))  # columns of the stress in the decoder's output
+SMALLEST_MASS = 1e-30  # lower bound of a cell's mass; a cell without weight gets velocity 0
+# A surface's effect fades below FEW particles in contact, and below the fraction RARE of contacts in its direction.
 FEW, RARE = 0.1, 1e-3
-# What lies on a line has no rotation to take out: where the principal moments' product is below that of this share of
-# their mean, outputs fade away; and so they do where the mean itself is below …
+# Particles on a line define no rotation about it. A rotation fades out if the product of the principal moments is below
+# (THIN times their mean)^3, or if their mean is below POINT. POINT is in squared edges of a coarsest cell, as moments
+# are; a cube with edges of a thirteenth of the cell's edge has this moment.
 THIN = 0.2
-POINT = 1e-3  # of a coarsest cell's edge squared: a cube has it whose edge is a thirteenth of that
+POINT = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
 class Contacts:
-    """Contacts of the coarsest cells: the two values of `disturbance`, 0 to 1, [C], and `touched_normals` [C, 3, 3]."""
+    """Contacts of the coarsest cells: the two results of `disturbance` [C], 0 to 1, and `touched_normals` [C, 3, 3]."""
 
     disturbed_C: torch.Tensor
     touched_C: torch.Tensor
@@ -62,14 +65,13 @@ class Contacts:
 def relative_features(
     state: ParticleState, grid: GridHierarchy, config: NetworkConfig, scale: torch.Tensor
 ) -> tuple[torch.Tensor, Contacts]:
-    """Returns all columns but the embedding, [N, feature_width - 16], and the coarsest cells' contacts;
-    `scale` is s_a, frame units."""
+    """Returns all columns except the embedding, [N, feature_width - 16], and the contacts of the coarsest cells.
+
+    `scale` is s_a in frame units.
+    """
     velocity_N3 = state.velocity_NM3[:, 0]
     wall_N6 = wall_nearness(
-        state.position_N3,
-        velocity_N3,
-        state.domain_S3[state.scene_N],
-        CONTACT_REACH_CELLS * config.cell_size,
+        state.position_N3, velocity_N3, state.domain_S3[state.scene_N], CONTACT_REACH_CELLS * config.cell_size
     )
     normal_N6 = None
     if config.obstacle_features:
@@ -89,15 +91,16 @@ def relative_features(
 
 
 def history(velocity_NH3: torch.Tensor, gravity_N3: torch.Tensor) -> torch.Tensor:
-    """Returns the accelerations of the past frames less gravity, newest first, [N, 3 (H - 1)]."""
+    """Returns the accelerations of the past frames minus gravity, newest first, [N, 3 (H - 1)]."""
     return (velocity_NH3[:, :-1] - velocity_NH3[:, 1:] - gravity_N3[:, None]).flatten(1)
 
 
 def surroundings(velocity_N3: torch.Tensor, grid: GridHierarchy) -> torch.Tensor:
-    """Returns velocities less those of the cells around on each level, [N, 3 L].
+    """Returns velocities minus the mean velocities of the surrounding cells on each level, [N, 3 L].
 
-    A cell's velocity is sum(m v) / sum(m), on the finest level over its particles with their trilinear weights, above
-    over its children; a particle interpolates those of its 8 cells' ancestors with its own weights.
+    A cell's velocity is sum(m v) / sum(m). On the finest level the sums are over particles, with their trilinear
+    weights; on other levels they are over the children. A particle interpolates between the ancestors of its 8 cells
+    with its own weights.
     """
     weight_N8 = grid.weight_N8
     value_N84 = weight_N8[..., None] * torch.cat([velocity_N3, torch.ones_like(velocity_N3[:, :1])], -1)[:, None]
@@ -117,8 +120,10 @@ def surroundings(velocity_N3: torch.Tensor, grid: GridHierarchy) -> torch.Tensor
 def wall_nearness(
     position_N3: torch.Tensor, velocity_N3: torch.Tensor, domain_N3: torch.Tensor, reach: float
 ) -> torch.Tensor:
-    """Returns the nearness of the domain's six planes, lower ones first, [N, 6]: 0 from `reach` on, 1 at the plane, at
-    most 2. For a particle that approaches a plane it is that of the next frame.
+    """Returns the nearness of the domain's six planes, lower planes first, [N, 6].
+
+    It is 0 at distances of `reach` and more, 1 at the plane, and at most 2. For a particle that approaches a plane it
+    is the nearness after the next frame.
     """
     distance_N6 = torch.cat([position_N3, domain_N3 - position_N3], dim=-1)
     away_N6 = torch.cat([velocity_N3, -velocity_N3], dim=-1)
@@ -128,8 +133,10 @@ def wall_nearness(
 def obstacle_normals(
     position_N3: torch.Tensor, velocity_N3: torch.Tensor, scene_N: torch.Tensor, obstacles: ObstacleCells | None
 ) -> torch.Tensor:
-    """Returns the normal at the particle, and the first one at a quarter, a half … of the path to the next frame, or 0,
-    [N, 6]."""
+    """Returns the normal at the particle and the first normal on its path to the next frame, [N, 6].
+
+    STEPS_AHEAD evenly spaced places of the path are tested. Without an obstacle a normal is 0.
+    """
     here_N3, ahead_N3 = torch.zeros_like(position_N3), torch.zeros_like(position_N3)
     if obstacles is not None:
         here_N3 = obstacles.normals(position_N3, scene_N)
@@ -140,15 +147,17 @@ def obstacle_normals(
 
 
 def surface_gate(wall_N6: torch.Tensor, normal_N6: torch.Tensor | None) -> torch.Tensor:
-    """Returns how near particles are to a surface, [N]: 0 beyond reach, 1 at a normal and from half way to a wall."""
+    """Returns the nearness of surfaces, [N]: 0 beyond reach, 1 at a normal and within half the reach of a wall."""
     gate_N = (2 * wall_N6.amax(-1)).clamp(max=1)
     return gate_N if normal_N6 is None else torch.where(normal_N6.any(-1), 1, gate_N)
 
 
 def surface_normals(wall_N6: torch.Tensor, normal_N6: torch.Tensor | None) -> torch.Tensor:
-    """Returns sum n n^T of the walls within reach, gated as in `surface_gate`, and of the obstacle's normal, at the
-    particle or else ahead of it, [N, 3, 3]. It has no sign, so that nothing jumps between surfaces that face each
-    other."""
+    """Returns the sum of n n^T of the surfaces within reach, [N, 3, 3].
+
+    Walls count with the gate of `surface_gate`. The obstacle's normal at the particle counts; if it is 0, the one ahead
+    counts. n n^T has no sign, so the sum does not jump between surfaces that face each other.
+    """
     near_N6 = (2 * wall_N6).clamp(max=1)
     normal_N33 = torch.diag_embed(near_N6[:, :3] + near_N6[:, 3:])
     if normal_N6 is None:
@@ -166,9 +175,11 @@ def touched_normals(normal_N33: torch.Tensor, grid: GridHierarchy) -> torch.Tens
 
 
 def slip(normal_C33: torch.Tensor) -> torch.Tensor:
-    """Returns Q [C, 3, 3], the projection on directions that surfaces leave free: (1 + S / (FEW + RARE tr S))^-1 of the
-    `touched_normals` S. Near a plane it is 1 along the plane and almost 0 along its normal, in a corner 1 only along
-    the corner, and 1 away from surfaces."""
+    """Returns Q = (1 + S / (FEW + RARE tr S))^-1 [C, 3, 3] of the `touched_normals` S.
+
+    Q projects on directions that surfaces leave free. Away from surfaces it is 1. Near a plane it is 1 along the plane
+    and almost 0 along its normal. In a corner it is 1 only along the corner.
+    """
     ratio_C33 = normal_C33 / (FEW + RARE * trace(normal_C33))[:, None, None]
     determinant_C, adjugate_C33 = adjugate(ratio_C33 + torch.eye(3, dtype=ratio_C33.dtype, device=ratio_C33.device))
     return adjugate_C33 / determinant_C[:, None, None]
@@ -188,12 +199,12 @@ def adjugate(matrix_K33: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
 def disturbance(
     motion_NK: torch.Tensor, touch_N: torch.Tensor, grid: GridHierarchy
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Returns how far the particles around each coarsest cell are from free flight as one rigid body, and how much
-    surfaces disturb them, from 0 to 1, [C] each.
+    """Returns `disturbed` and `touched` of each coarsest cell, [C] each, from 0 to 1.
 
-    A particle is disturbed by a surface within reach (`surface_gate`), or if a column of history or surroundings is
-    not small against QUIET (rounding leaves 0). A coarsest cell is as disturbed as the most disturbed particle in it
-    and in the cells across its faces: within a frame an impact is felt through a body. The second is of surfaces alone.
+    `disturbed` is 0 if all particles in the surroundings fly freely as one rigid body. A particle is disturbed by a
+    surface within reach (`surface_gate`), or if a column of history or surroundings is not small against QUIET. A
+    coarsest cell is as disturbed as the most disturbed particle in it and in the cells across its faces, because an
+    impact acts through a body within a frame. `touched` is computed in the same way, from surfaces only.
     """
     own_N = (touch_N + (motion_NK / QUIET).square().sum(-1)).clamp(max=1)
     cell_N8, coarsest = coarsest_cells(grid), grid.levels[-1]
@@ -207,7 +218,7 @@ def disturbance(
 
 
 def coarsest_cells(grid: GridHierarchy) -> torch.Tensor:
-    """Returns the coarsest cells above each particle's eight, [N, 8]; several may be the same."""
+    """Returns the coarsest ancestors of each particle's eight cells, [N, 8]. Some may be equal."""
     cell_N8 = grid.cell_N8
     for level in grid.levels[:-1]:
         assert level.parent_C is not None
@@ -216,22 +227,28 @@ def coarsest_cells(grid: GridHierarchy) -> torch.Tensor:
 
 
 def balanced(output_N9: torch.Tensor, contacts: Contacts, grid: GridHierarchy) -> torch.Tensor:
-    """Returns normalised accelerations less gravity, [N, 3], of the decoder's output and the contacts of `disturbance`.
+    """Returns normalised accelerations without gravity, [N, 3], from the decoder's output and the contacts.
 
-    With a particle's weights w_pC in the coarsest cells, their mass M, mean acceleration R and mean stress S, e from a
-    cell to its neighbour C', d disturbed and t touched: a_p = sum_C w_pC d_C (r_p - (1 - t_C) R_C + A_C), where
-    A_C = sum_C' d_C' f' T, T = (S_C + S_C') e / 2, f = M_C / (M_C + M_C') and f' = 1 - f. Times M_C d_C this is
-    antisymmetric, without a division by a small mass: sum_p a_p = sum_C d_C t_C M_C R_C, which is 0 where no surface is
-    within reach. (Cells exchange momentum across faces as in finite volumes; a symmetric stress causes no rotation.)
+        a_p = sum_C w_pC d_C (r_p - (1 - t_C) R_C + A_C),    A_C = sum_C' d_C' f' T,    T = (S_C + S_C') e / 2
 
-    Rotation is subtracted, so that sum_p x_p x a_p is 0 there, too. y_p is a particle's place relative to the cell's
-    centre of mass X, I and L are sums of w over M of its inertia and of y x r, and (q, W) = `rotation`(I, L): r_p - R
-    is replaced by q (r_p - R) - W x y_p. For T on one cell and -T on another, at the distance D = X' - X, the rotation
-    of both about their common centre is subtracted: with (q, W) of I f + I' f' + f f' (D^2 - D D^T) and of -f f' D x T
-    a cell gets f' (q T + W x D) - W x y_p. That is a projection: nothing grows, however small or thin bodies are.
+        w_pC           weight of particle p in coarsest cell C
+        M_C, R_C, S_C  mass of the cell, its mean acceleration and its mean stress, with these weights
+        d_C, t_C       disturbed and touched (see `disturbance`)
+        e              unit vector from the cell to its neighbour C'
+        f, f'          M_C / (M_C + M_C') and 1 - f
 
-    t_C Q_C R_C, with Q = `slip` of the `touched_normals`, is subtracted, too: the mean force of surfaces on a cell is
-    along their normals, and bodies slide on a plane without friction or propulsion, for any parameters.
+    Times M_C d_C the term A_C is antisymmetric, and there is no division by a small mass. So sum_p a_p is
+    sum_C d_C t_C M_C R_C, which is 0 without a surface in reach. Cells exchange momentum across faces as in finite
+    volumes. A symmetric stress causes no rotation.
+
+    Rotation is subtracted so that sum_p x_p x a_p is 0 there too. y_p is the particle's place relative to the cell's
+    centre of mass X. I and L are the cell's means of inertia and of y x r. With (q, W) = `rotation`(I, L), r_p - R
+    becomes q (r_p - R) - W x y_p. T on one cell and -T on the other, at the distance D = X' - X, turn the pair. Its
+    rotation about the common centre is subtracted: with (q, W) of I f + I' f' + f f' (D^2 - D D^T) and of -f f' D x T
+    a cell gets f' (q T + W x D) - W x y_p. This is a projection, so small and thin bodies do not amplify anything.
+
+    t_C Q_C R_C is subtracted too, where Q is `slip` of the `touched_normals`. Then the mean force of surfaces on a cell
+    is along their normals. Bodies slide on a plane without friction or propulsion, for any parameters.
     """
     disturbed_C, touched_C = contacts.disturbed_C, contacts.touched_C
     level, cell_N8, weight_N8 = grid.levels[-1], coarsest_cells(grid), grid.weight_N8
@@ -274,7 +291,7 @@ def balanced(output_N9: torch.Tensor, contacts: Contacts, grid: GridHierarchy) -
 
 
 def coarsest_places(grid: GridHierarchy) -> torch.Tensor:
-    """Returns the particles' places in the coarsest cells above their eight, [N, 8, 3]: from the middle, in edges."""
+    """Returns the places of particles in the ancestors of `coarsest_cells`, [N, 8, 3]: from the centre, in edges."""
     corner_83 = CORNER_83.to(grid.fraction_N3)
     place_N83, cell_N8 = grid.fraction_N3[:, None] - corner_83, grid.cell_N8
     for level in grid.levels[:-1]:
@@ -285,16 +302,16 @@ def coarsest_places(grid: GridHierarchy) -> torch.Tensor:
 
 
 def inertia(spread_K33: torch.Tensor) -> torch.Tensor:
-    """Returns tr(G) - G of the second moments G of masses about their centre."""
+    """Returns tr(G) - G of the second moments G [K, 3, 3] of masses about their centre."""
     one_33 = torch.eye(3, dtype=spread_K33.dtype, device=spread_K33.device)
     return trace(spread_K33)[:, None, None] * one_33 - spread_K33
 
 
 def rotation(inertia_K33: torch.Tensor, moment_K3: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Returns how well a rotation is determined, q [K] from 0 (a line or a point) to 1, and W [K, 3] with I W = q L.
+    """Returns q [K], from 0 (a line or a point) to 1 (a determined rotation), and W [K, 3] with I W = q L.
 
-    q = det I / (det I + m), W = adj(I) L / (det I + m), where m = (THIN (tr I / 3 + POINT))^3: both polynomials over
-    what is never 0, so that nothing jumps, and what is q times a field less W is without any angular momentum.
+    q = det I / (det I + m) and W = adj(I) L / (det I + m), with m = (THIN (tr I / 3 + POINT))^3. The denominator is
+    positive, so neither jumps. A field times q, minus W, has no angular momentum.
     """
     determinant_K, adjugate_K33 = adjugate(inertia_K33)
     determinant_K = determinant_K.clamp(min=0)

@@ -1,6 +1,6 @@
-"""Sums over the rows of each segment, and the spreading of one row to its segment: each is the other's gradient.
+"""Sums over the rows of each segment, and copies of one row to its segment: each is the other's gradient.
 
-The rows of a segment are contiguous, so that a sum needs no atomic additions and has a fixed order.
+The rows of a segment are contiguous, so a sum needs no atomic additions and has a fixed order.
 Shape legend: E rows, N segments, W width.
 """
 
@@ -23,18 +23,18 @@ class Segments:
         return len(self.offset_N1) - 1
 
     def sum(self, row_EW: torch.Tensor) -> torch.Tensor:
-        """Returns the sum of the rows of each segment, [N, W]; zero for an empty one."""
+        """Returns the sum of the rows of each segment, [N, W]; zero for an empty segment."""
         result: torch.Tensor = _Sum.apply(row_EW, self)
         return result
 
     def spread(self, value_NW: torch.Tensor) -> torch.Tensor:
-        """Returns each segment's value at its rows, [E, W]."""
+        """Returns each segment's value for all of its rows, [E, W]."""
         result: torch.Tensor = _Spread.apply(value_NW, self)
         return result
 
 
 def _sum(row_EW: torch.Tensor, segments: Segments) -> torch.Tensor:
-    if row_EW.device.type == "cpu":  # the faster way there, in the same order
+    if row_EW.device.type == "cpu":  # faster on a CPU; sums in the same order
         return row_EW.new_zeros(segments.count, row_EW.shape[1]).index_add_(0, segments.segment_E, row_EW)
     return torch.segment_reduce(row_EW.contiguous(), "sum", offsets=segments.offset_N1, axis=0, unsafe=True)
 

@@ -53,9 +53,7 @@ def compare_picture(
     gap, header, footer = size // 30, _header_height(size), _header_height(size)
     left = header if rows[0][0] else 0
     picture = Image.new(
-        "RGB",
-        (left + len(frames) * (width + gap), header + len(rows) * (height + gap) + footer),
-        _background(),
+        "RGB", (left + len(frames) * (width + gap), header + len(rows) * (height + gap) + footer), _background()
     )
     for column, frame in enumerate(frames):
         x = left + column * (width + gap)
@@ -141,14 +139,7 @@ def animate(
         pictures = map(_Palette(samples).apply, drawn())
         duration = 10 * round(100 / rate)
         next(pictures).save(
-            buffer,
-            "GIF",
-            save_all=True,
-            append_images=pictures,
-            duration=duration,
-            loop=0,
-            disposal=1,
-            optimize=False,
+            buffer, "GIF", save_all=True, append_images=pictures, duration=duration, loop=0, disposal=1, optimize=False
         )
     write_picture(path, buffer.getvalue())
 
@@ -359,12 +350,7 @@ def _legend(picture: Image.Image, y: float, rollout: Rollout, text_size: int) ->
 
 
 def _write(
-    picture: Image.Image,
-    place: tuple[float, float],
-    text: str,
-    size: int,
-    anchor: str = "mm",
-    halo: int = 0,
+    picture: Image.Image, place: tuple[float, float], text: str, size: int, anchor: str = "mm", halo: int = 0
 ) -> None:
     """Draws text. halo: width in pixels of a border in the background colour, for text over obstacles."""
     ImageDraw.Draw(picture).text(

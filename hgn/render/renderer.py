@@ -54,11 +54,7 @@ class Camera:
     def __init__(self, domain_size: Vector, size: int) -> None:
         azimuth, elevation = math.radians(AZIMUTH_DEG), math.radians(ELEVATION_DEG)
         back = np.array(
-            (
-                math.sin(azimuth) * math.cos(elevation),
-                math.sin(elevation),
-                math.cos(azimuth) * math.cos(elevation),
-            )
+            (math.sin(azimuth) * math.cos(elevation), math.sin(elevation), math.cos(azimuth) * math.cos(elevation))
         )
         right = np.array((math.cos(azimuth), 0.0, -math.sin(azimuth)))
         self.axes = np.stack((right, np.cross(back, right), back))  # rows: right, up, towards the viewer
@@ -98,13 +94,7 @@ class Stage:
 
     camera_type: type[Camera] = Camera
 
-    def __init__(
-        self,
-        domain_size: Vector,
-        obstacles: Sequence[Obstacle],
-        particle_radius: float,
-        size: int,
-    ) -> None:
+    def __init__(self, domain_size: Vector, obstacles: Sequence[Obstacle], particle_radius: float, size: int) -> None:
         self.domain_size = domain_size
         self.camera = self.camera_type(domain_size, size)
         self.radius = particle_radius

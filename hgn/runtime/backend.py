@@ -6,7 +6,7 @@
 | triton | Triton kernels, frames and updates in CUDA graphs | hgn | of its own kernels |
 | cpu | compiled C in blocks of rows, a core each | hgn | no |
 
-All have the same signature. `choose` takes the fastest that runs and says why; nobody else asks for a network's class.
+All have the same signature. `choose` returns the fastest supported backend and reports why.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ TRITON_LEVELS = 8
 
 
 class CpuBackend(Backend):
-    """A frame in blocks of rows on a CPU, compiled if there is a compiler; without gradients."""
+    """Computes frames in blocks of rows on a CPU, with compiled C if there is a compiler; without gradients."""
 
     name = "cpu"
     network: HierarchicalGraphNetwork
@@ -46,9 +46,9 @@ def choose(
     backend: str = "auto",
     field: str = "backend",
 ) -> Backend:
-    """Returns the named backend, or with `auto` the fastest that runs; its `note` reports which and why.
+    """Returns the named backend, or with `auto` the fastest supported one. Its `note` reports the choice and why.
 
-    Raises: ConfigError naming `field` for an unknown backend, or with the reason why it cannot run here.
+    Raises: ConfigError naming `field` for an unknown backend, or with the reason why it is not supported here.
     """
     for name, value, known in ((field, backend, BACKENDS), ("precision", precision, ("auto", *PRECISIONS))):
         require(value in known, name, f"one of {', '.join(known)}", value)
@@ -67,9 +67,9 @@ def choose(
 
 
 def build(name: str, network: ParticleNetwork, precision: str = "auto") -> Backend:
-    """Returns the named backend, whether the machine supports it or not."""
+    """Returns the named backend, even if this machine does not support it."""
     if name == "triton":
-        # Triton, which the others do without, is loaded here.
+        # imported here, because the other backends do without Triton
         from hgn.runtime.triton_backend import TritonBackend
 
         assert isinstance(network, HierarchicalGraphNetwork)
@@ -88,9 +88,10 @@ def fastest_stepped(network: ParticleNetwork, precision: str = "auto") -> Backen
 
 
 def pick(reasons: Mapping[str, str | None], backend: str, precision: str, field: str) -> tuple[str, str]:
-    """Returns a backend's name, and a line that reports it; `reasons` has why each cannot run, or None, fastest first.
+    """Returns a backend's name and a line that reports it.
 
-    Raises: ConfigError when the wanted backend cannot run, or none has this precision.
+    `reasons` names for each backend, fastest first, why it cannot run; None: it can.
+    Raises: ConfigError if the wanted backend cannot run, or if no backend has this precision.
     """
     running = [name for name, reason in reasons.items() if reason is None]
     if backend not in (*running, "auto", "torch"):
@@ -137,10 +138,10 @@ def triton_unsupported_reason(device: torch.device, config: NetworkConfig, preci
 
 
 def _too_little_shared_memory(device: torch.device, width: int) -> str | None:
-    """Returns why weights do not fit: kernels keep five matrices of the cells' MLP in shared memory, in float16."""
+    """Returns why weights do not fit into shared memory, or None. Kernels keep five float16 matrices in it."""
     needed = shared = 10 * width**2
     if torch.cuda.is_available():
-        # a name that torch's own annotations leave out
+        # torch's own annotations do not contain this name
         shared = getattr(torch.cuda.get_device_properties(device), "shared_memory_per_block_optin", needed)
     if shared < needed:
         return f"its kernels need {needed >> 10} KB of shared memory at width {width}, and this GPU has {shared >> 10}"

@@ -1,6 +1,6 @@
-"""Simulation with gradients by its initial state and the poses of its obstacles.
+"""Simulation with gradients by the initial state and by the poses of obstacles.
 
-docs/how_to/gradients.md lists which gradients are exact, which hold only within a cell, and for how long.
+docs/how_to/gradients.md lists which gradients are exact, which are valid only within a cell, and for how many frames.
 Shape legend: T frames, N particles, H velocities, F triangles.
 """
 
@@ -29,32 +29,32 @@ from hgn.step.reference import Accelerations, advanced
 
 @dataclass(frozen=True, eq=False)
 class Pose:
-    """A change of an obstacle's place: rotation about a pivot, then translation. None leaves it as it is."""
+    """A change of an obstacle's place: a rotation about a pivot, then a translation. None means no change."""
 
     rotation_3: torch.Tensor | None = None  # axis times angle, radians
     translation_3: torch.Tensor | None = None  # domain units
-    pivot_3: tuple[float, float, float] | None = None  # domain units; None: the middle of the bounding box
+    pivot_3: tuple[float, float, float] | None = None  # domain units; None: the centre of the bounding box
 
 
 @dataclass(frozen=True, eq=False)
 class Inputs:
-    """Tensors that replace a scene's own, with gradients if they require them. Units: domain units, seconds."""
+    """Tensors that replace a scene's own. They may require gradients. Units: domain units, seconds."""
 
     position_N3: torch.Tensor | None = None
     velocity_N3: torch.Tensor | None = None
     gravity_3: torch.Tensor | None = None
     domain_size_3: torch.Tensor | None = None
     poses: Mapping[int, Pose] | None = None  # by the obstacle's number in the scene
-    smoothing: float = 0.0
+    smoothing: float = 0.0  # see hgn.network.posed_obstacles
 
 
 def simulate(
     network: ParticleNetwork, start: ParticleState, scene: Scene, frame_rate_hz: float, frames: int, inputs: Inputs
 ) -> torch.Tensor:
-    """Returns positions [T, N, 3]; `start` is the scene's state at frame 0, of `Simulator.start`.
+    """Returns positions [T, N, 3]. `start` is the scene's state at frame 0 from `Simulator.start`.
 
-    The backward pass computes each frame again: memory holds one frame and the states between frames.
-    The network's own weights have no gradients. Raises: ConfigError, DivergedError.
+    The backward pass computes each frame again. So memory contains one frame and the states between frames.
+    The network's parameters get no gradients. Raises: ConfigError, DivergedError.
     """
     require(frames >= 1, "frames", "at least 1", frames)
     require(0 <= inputs.smoothing <= 1, "smoothing", "0 to 1 cells", inputs.smoothing)
@@ -83,9 +83,9 @@ def simulate(
 
 
 class _Frame(torch.autograd.Function):
-    """A frame without its intermediate results, which the backward pass computes again.
+    """A frame without its intermediate results. The backward pass computes them again.
 
-    torch.utils.checkpoint calls Python for each result, which takes as long as the results on a GPU.
+    torch.utils.checkpoint calls Python for each result. On a GPU these calls take as long as the results.
     """
 
     @staticmethod
@@ -103,7 +103,7 @@ class _Frame(torch.autograd.Function):
         with torch.enable_grad():
             outputs = context.step(*variables)
         wanted = [tensor for tensor in variables if tensor.requires_grad]
-        # where no obstacle stops a particle, the frame does not depend on their poses
+        # outputs without a gradient are left out, e.g. by poses when no obstacle stops a particle
         reached = [pair for pair in zip(outputs, gradients, strict=True) if pair[0].requires_grad]
         ends, slopes = [output for output, _ in reached], [gradient for _, gradient in reached]
         computed = iter(torch.autograd.grad(ends, wanted, slopes, allow_unused=True))
@@ -120,7 +120,7 @@ def _variables(state: ParticleState) -> list[torch.Tensor]:
 
 
 def _with_variables(state: ParticleState, variables: Sequence[torch.Tensor]) -> ParticleState:
-    """Returns the state with these tensors: the inverse."""
+    """Returns the state with these tensors. Inverts `_variables`."""
     position_N3, velocity_NM3, domain_S3, gravity_S3, *others = variables
     rest, obstacles = iter(others), state.obstacles
     if isinstance(obstacles, PosedObstacleCells):
@@ -143,14 +143,14 @@ def _with_variables(state: ParticleState, variables: Sequence[torch.Tensor]) -> 
 def _started(
     network: ParticleNetwork, start: ParticleState, scene: Scene, frame_rate_hz: float, inputs: Inputs
 ) -> ParticleState:
-    """Returns the state at frame 0 with the given inputs, in the network's precision."""
+    """Returns the state at frame 0 with `inputs`, in the network's precision."""
     config, device = network.config, start.position_N3.device
     dtype = next(network.parameters()).dtype
 
     def given(name: str, value: torch.Tensor | None, default: np.ndarray, shape: tuple[int, ...]) -> torch.Tensor:
         tensor = torch.as_tensor(default) if value is None else value
         require(tuple(tensor.shape) == shape, name, f"of shape {shape}", tuple(tensor.shape))
-        return tensor.to(device, torch.float64)  # as the simulator computes its history
+        return tensor.to(device, torch.float64)  # the simulator computes its history in float64 too
 
     require(
         inputs.gravity_3 is None or config.relative,
@@ -169,7 +169,7 @@ def _started(
     return replace(
         start,
         position_N3=position_N3.to(dtype),
-        velocity_NM3=(velocity_N3[:, None] - age_H1 * gravity_3).to(dtype),  # as hgn.scene.history has it
+        velocity_NM3=(velocity_N3[:, None] - age_H1 * gravity_3).to(dtype),  # as in hgn.scene.history
         domain_S3=domain_3[None].to(dtype),
         gravity_S3=gravity_3[None].to(dtype),
         obstacles=obstacles,
@@ -203,11 +203,11 @@ def _obstacles(
 def _barriers(
     scene: Scene, placements: Mapping[int, Placement], clearance: float, device: torch.device, dtype: torch.dtype
 ) -> Barriers | None:
-    """Returns barriers of the placed obstacles: rows with gradients by the poses, lists of cells without."""
+    """Returns barriers of the placed obstacles. Rows have gradients by the poses; lists of cells have none."""
     cell_size, parts = scene.cell_size, []
     for i, obstacle in enumerate(scene.obstacles):
         staying = i not in placements
-        # uncut by the domain: an obstacle may be moved into it
+        # not cut at the domain: an obstacle may be moved into it
         piece_F33 = barrier_pieces(obstacle.corners, cell_size, scene.domain_size if staying else None)
         corner_F33 = torch.from_numpy(piece_F33).to(device)
         parts.append(corner_F33 if staying else placements[i].to(torch.float64).place(corner_F33))
@@ -217,7 +217,7 @@ def _barriers(
 
 
 def _cells(scene: Scene, obstacles: list[Obstacle], device: torch.device) -> ObstacleCells:
-    # uncut by the domain: an obstacle may be moved into it
+    # not cut at the domain: an obstacle may be moved into it
     grid: ObstacleGrid = build_obstacle_grid(obstacles, scene.cell_size, scene.seed)
     cells = ObstacleCells.of([grid])
     if cells is None:
@@ -237,5 +237,5 @@ def _placement(obstacle: Obstacle, pose: Pose, device: torch.device, dtype: torc
     x, y, z = parts["rotation_3"].to(device, torch.float64).unbind()
     zero = torch.zeros_like(x)
     cross_33 = torch.stack([torch.stack(row) for row in ((zero, -z, y), (z, zero, -x), (-y, x, zero))])
-    rotation_33 = torch.linalg.matrix_exp(cross_33)  # smooth at no rotation, too
+    rotation_33 = torch.linalg.matrix_exp(cross_33)  # differentiable at angle 0 too
     return Placement(rotation_33.to(dtype), pivot_3.to(device, dtype), parts["translation_3"].to(device, dtype))

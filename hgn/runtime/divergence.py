@@ -1,4 +1,4 @@
-"""The rule by which a simulation has diverged, for all backends and for pushforward."""
+"""The rule for divergence of a simulation, for all backends and for pushforward."""
 
 from __future__ import annotations
 

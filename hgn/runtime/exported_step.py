@@ -1,9 +1,9 @@
 """One frame of a network as a graph that runs without this package: ONNX, or a compiled package (AOTInductor).
 
-The graph is traced from the reference, hgn.network, and contains features, grid, network, integration, and the
-constraints of walls and obstacles. The numbers of particles, obstacle cells and triangles may change from frame to
-frame, up to LARGEST_EXPORTED. The graph raises no errors: its caller checks that positions are finite. INPUTS and
-OUTPUTS name its tensors; `initial_arrays` returns those of a scene.
+The graph is traced from the reference, hgn.network. It contains features, grid, network, constraints and integration.
+The numbers of particles, obstacle cells and triangles may change from frame to frame, up to LARGEST_EXPORTED. The graph
+raises no errors, so its caller checks that positions are finite. INPUTS and OUTPUTS name its tensors. `initial_arrays`
+returns the inputs of a scene.
 Shape legend: N particles, H velocities, K obstacle cells, F triangles of obstacles.
 """
 
@@ -34,7 +34,7 @@ INPUTS = (
     "obstacle_triangle",
 )  # fmt: skip
 OUTPUTS = ("next_position", "next_velocity")
-EXAMPLE_PARTICLES, EXAMPLE_CELLS, EXAMPLE_TRIANGLES = 64, 32, 16  # of the trace; the numbers do not matter
+EXAMPLE_PARTICLES, EXAMPLE_CELLS, EXAMPLE_TRIANGLES = 64, 32, 16  # sizes for tracing; the graph does not depend on them
 
 
 class Step(nn.Module):
@@ -57,11 +57,11 @@ class Step(nn.Module):
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Returns positions [N, 3] and velocities [N, H, 3], newest first, a frame later; units: domain units, frames.
 
-        material int64 [N] indexes the network's materials; domain_size and gravity [3]; obstacle_cell int64 [K, 3],
-        each once, and obstacle_normal [K, 3]; obstacle_triangle [F, 3, 3], corners. Networks of absolute inputs ignore
-        gravity, and networks without `obstacle_clearance` ignore triangles.
+        `material`, int64 [N], indexes the network's materials. `domain_size` and `gravity` are [3]. `obstacle_cell` is
+        int64 [K, 3] without repetition, `obstacle_normal` [K, 3]. `obstacle_triangle` [F, 3, 3] has corners. Networks
+        with absolute inputs ignore gravity; networks without `obstacle_clearance` ignore triangles.
         """
-        # At least one cell, which no particle reaches.
+        # The lists are never empty: this cell is out of reach of every particle.
         far_13 = torch.full_like(domain_size[None], COORDINATE_LIMIT - 1).to(torch.int64)
         cell_K3 = torch.cat([obstacle_cell, far_13])
         normal_K3 = torch.cat([obstacle_normal, torch.zeros_like(domain_size[None])])
@@ -81,11 +81,11 @@ class Step(nn.Module):
         return after.position_N3, after.velocity_NM3
 
     def _barriers(self, corner_F33: torch.Tensor) -> Barriers | None:
-        """Returns barriers without lists of cells; the graph finds pairs by bounding boxes."""
+        """Returns barriers without lists of cells, because the graph finds pairs by bounding boxes."""
         clearance = self.network.step.obstacle_clearance
         if clearance is None:
             return None
-        # At least one triangle, which has no area.
+        # The list is never empty: this triangle has no area.
         corner_F33 = torch.cat([corner_F33, corner_F33.new_zeros(1, 3, 3)])
         row_F24 = barrier_rows(corner_F33, clearance).to(corner_F33.dtype)
         none = torch.zeros(0, dtype=torch.int64, device=corner_F33.device)
@@ -94,10 +94,10 @@ class Step(nn.Module):
 
 
 def initial_arrays(state: ParticleState, corner_F33: np.ndarray | None = None) -> dict[str, np.ndarray]:
-    """Returns the first inputs of the graph, by the names of INPUTS, for a simulator's state of one scene.
+    """Returns the first inputs of the graph by name for a simulator's state of one scene.
 
-    corner_F33: corners of the obstacles' triangles in domain units, of `hgn.scene.barrier.barrier_pieces`; None: no
-    triangles.
+    `corner_F33` contains the corners of the obstacles' triangles in domain units, from
+    `hgn.scene.barrier.barrier_pieces`; None: no triangles.
     """
     require(state.scene_count == 1, "scenes", "one", state.scene_count)
     cells, normals = np.zeros((0, 3), np.int64), np.zeros((0, 3), np.float32)
@@ -111,7 +111,7 @@ def initial_arrays(state: ParticleState, corner_F33: np.ndarray | None = None) -
 
 
 def traced_step(network: ParticleNetwork, info: WeightsInfo) -> torch.export.ExportedProgram:
-    """Returns the graph. Raises: ConfigError for a GNS: neighbour lists are not exported."""
+    """Returns the graph. Raises: ConfigError for a GNS, because neighbour lists cannot be exported."""
     require(isinstance(network, HierarchicalGraphNetwork), "weights", "an hgn network", network.config.kind)
     assert isinstance(network, HierarchicalGraphNetwork)
     device, config = next(network.parameters()).device, network.config
@@ -130,7 +130,7 @@ def traced_step(network: ParticleNetwork, info: WeightsInfo) -> torch.export.Exp
     cells = {0: torch.export.Dim("obstacle_cells", min=0, max=LARGEST_EXPORTED)}
     triangles = {0: torch.export.Dim("obstacle_triangles", min=0, max=LARGEST_EXPORTED)}
     step = Step(network, info.obstacle_cell_size).eval()
-    # One graph for 0, 1 and more of each.
+    # One graph serves 0, 1 and more particles, cells and triangles.
     with (
         torch.no_grad(),
         torch.fx.experimental._config.patch(  # type: ignore[attr-defined]
@@ -146,8 +146,8 @@ def traced_step(network: ParticleNetwork, info: WeightsInfo) -> torch.export.Exp
 
 
 def write_onnx(path: Path, program: torch.export.ExportedProgram, info: WeightsInfo) -> None:
-    """Writes the graph as ONNX with its parameters; the metadata `hgn` holds the weights' info."""
-    import onnxscript  # noqa: F401 - torch's own error does not name it
+    """Writes the graph as ONNX with its parameters. The metadata entry `hgn` contains the weights' info."""
+    import onnxscript  # noqa: F401 - imported first, because torch's own error does not name it
 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # torch warns about its dependencies
@@ -162,14 +162,14 @@ def write_onnx(path: Path, program: torch.export.ExportedProgram, info: WeightsI
 def _added_in_order(
     sums: torch.Tensor, dim: int, index: torch.Tensor, source: torch.Tensor, alpha: float = 1
 ) -> torch.Tensor:
-    """Writes `index_add` as ScatterElements. In ScatterND, the default, threads of ONNX Runtime 1.32 overwrite each
-    other's sums: repeated frames of 4,096 particles differed by 1e-4 domain units."""
+    """Writes `index_add` as ScatterElements. By default it becomes ScatterND, in which threads of ONNX Runtime 1.32
+    overwrite each other's sums. Repeated frames of 4,096 particles then differed by 1e-4 domain units."""
     shape = [-1 if axis == dim else 1 for axis in range(source.dim())]
     return sums.scatter_add(dim, index.reshape(shape).expand(source.shape), alpha * source)
 
 
 def write_package(path: Path, program: torch.export.ExportedProgram, info: WeightsInfo) -> None:
-    """Writes the graph compiled for its device, for PyTorch's C++ library; needs a C++ compiler and takes minutes."""
+    """Writes the graph compiled for its device, for PyTorch's C++ library. Needs a C++ compiler and takes minutes."""
     make_folder(path.parent)
     with TemporaryDirectory(prefix=f".{path.stem}.", dir=path.parent) as folder, warnings.catch_warnings():
         temporary = Path(folder) / path.name

@@ -1,4 +1,4 @@
-"""A scene that changes while it is simulated: particles enter, obstacles and gravity are replaced, time goes back.
+"""A scene that changes while it is simulated: particles enter, obstacles and gravity change, time goes back.
 
 Shape legend: N particles, A particles that enter, M velocities of a history.
 """
@@ -21,14 +21,14 @@ from hgn.schema import require
 class LiveSimulation:
     """One scene, a frame at a time, on the simulator's backend. Use it as a context manager, or close it.
 
-    A change between two frames takes effect from the next frame on; positions and velocity histories of the particles
-    stay as they are, bit for bit. Particles keep their order, and those that enter come behind them.
+    A change between two frames acts from the next frame. Positions and velocity histories of the particles stay
+    bitwise equal. Particles keep their order; new particles follow them.
     """
 
     def __init__(self, simulator: Simulator, scene: InitialState | Scene, capacity: int = 0) -> None:
-        """`capacity`: particles that backend triton allocates buffers for. With more particles than that it captures
-        its frame again, which takes about a second.
+        """`capacity` is the number of particles for which backend triton allocates buffers.
 
+        With more particles it captures its frame again, which takes about a second.
         Raises: ConfigError as `Simulator.start`.
         """
         self.simulator, self.scene = simulator, InitialState.of(scene)
@@ -43,12 +43,12 @@ class LiveSimulation:
         self.close()
 
     def close(self) -> None:
-        """Returns the simulation's buffers to the backend, which keeps them for the next."""
+        """Returns the simulation's buffers to the backend, which uses them for the next simulation."""
         self.simulation.close()
 
     @property
     def frame(self) -> int:
-        """The number of the last frame; it may be set."""
+        """The number of the last frame. It can be set."""
         return self.simulation.frame
 
     @frame.setter
@@ -72,10 +72,10 @@ class LiveSimulation:
         return np.asarray(self.simulation.run(1)[0])
 
     def add_particles(self, position_A3: np.ndarray, velocity_A3: np.ndarray, material_A: np.ndarray) -> np.ndarray:
-        """Adds particles that were in free flight: domain units, domain units per second, indices into MATERIALS.
+        """Adds particles that come from free flight: domain units, domain units per second, indices into MATERIALS.
 
         Returns their velocity histories, float32 [A, M, 3] in domain units per frame, newest first.
-        Raises: ConfigError for a material that the network does not know, or arrays that do not fit each other.
+        Raises: ConfigError for a material that the network was not trained with, and for arrays of different lengths.
         """
         count = len(position_A3)
         for name, value, shape in (
@@ -95,7 +95,7 @@ class LiveSimulation:
         return new.velocity_NM3.cpu().numpy()
 
     def replace_obstacles(self, scene: InitialState | Scene) -> None:
-        """Replaces the obstacles by those of another scene, at rest; the particles of that scene are ignored.
+        """Replaces the obstacles by those of another scene, at rest. Its particles are ignored.
 
         Raises: ConfigError as `Simulator.start`.
         """
@@ -105,15 +105,16 @@ class LiveSimulation:
         self._change_scene(replace(self.scene, **obstacles), ("obstacles", "barriers"))
 
     def set_gravity(self, gravity: tuple[float, float, float]) -> None:
-        """Replaces gravity, domain units per second squared.
+        """Replaces gravity, in domain units per second squared.
 
-        Raises: ConfigError for weights of absolute inputs, which only have the gravity of their data.
+        Raises: ConfigError for weights with absolute inputs, which support only the gravity of their data.
         """
         self._change_scene(replace(self.scene, gravity=gravity), ("gravity_S3",))
 
     def restore(self, position_N3: np.ndarray, velocity_NM3: np.ndarray, frame: int) -> None:
-        """Restores an earlier frame of the first particles; particles that entered later are removed. Obstacles and
-        gravity stay.
+        """Restores an earlier frame of the first particles. Particles that entered later are removed.
+
+        Obstacles and gravity stay.
 
         position_N3: float32, domain units. velocity_NM3: float32, domain units per frame, newest first.
         """

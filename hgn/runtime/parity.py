@@ -1,6 +1,6 @@
-"""The check of kernels, as compiled for this machine, against PyTorch.
+"""Compares kernels, as compiled for this machine, with PyTorch.
 
-Both round, and rounding moves activations across their kinks, so the bounds are wide; wrong kernels exceed them by far.
+Both round, and rounding moves activations across their kinks, so the bounds are wide. Wrong kernels exceed them by far.
 """
 
 from __future__ import annotations
@@ -15,9 +15,7 @@ from hgn.schema import ConfigError
 
 @dataclass(frozen=True)
 class Quantity:
-    """A result that is compared: the largest relative error of its norm, and the root mean square that smaller results
-    are treated as.
-    """
+    """A result to compare: the largest relative error of its norm, and the smallest rms that it is related to."""
 
     name: str
     bound: float
@@ -25,18 +23,19 @@ class Quantity:
 
 
 class ParityError(ConfigError):
-    """Kernels compute other results than PyTorch on this machine."""
+    """The results of kernels on this machine differ from PyTorch's."""
 
 
-# Normalised accelerations. Latents have size 1 whatever the output, so rounding to 11 bits (fp16, tf32) changes small
-# outputs as much as large ones: by 6e-4 on an H100, where almost nothing is accelerated. The bound is 2.5 times that.
+# Normalised accelerations. Latent vectors have size 1 for any output, so rounding to 11 bits (fp16, tf32) changes small
+# and large outputs by the same amount: 6e-4 on an H100, in a scene at rest. The bound is 2.5 times that.
 OUTPUTS = Quantity("outputs", 0.05, least=0.03)
 GRADIENTS = Quantity("gradients", 0.3)
 
 
 def relative_error(computed: torch.Tensor, expected: torch.Tensor, least: float = 0.0) -> float:
-    """Returns the error's norm over that of `expected`, or over that of values of size `least` if it is larger; where
-    both are zero, 0 for no error and infinity for any.
+    """Returns the norm of the error over that of `expected`, or over that of values of size `least` if that is larger.
+
+    If the divisor is zero, the result is 0 without an error and infinity with one.
     """
     difference, size = float((computed - expected).norm()), max(float(expected.norm()), least * expected.numel() ** 0.5)
     if size > 0:
@@ -49,10 +48,10 @@ def require_parity(
 ) -> float:
     """Returns the relative error of kernels of this precision against PyTorch.
 
-    Raises: ParityError where it exceeds its bound. It names the setting to change, in `section` ("training." or none).
+    Raises: ParityError if the error exceeds its bound. It names the setting to change, in `section` ("training." or "").
     """
     error = relative_error(computed, expected, quantity.least)
-    if not error <= quantity.bound:  # NaN fails
+    if not error <= quantity.bound:  # NaN fails too
         field, wanted, used = ("precision", "tf32", "fp16") if precision == "fp16" else ("backend", "torch", "triton")
         raise ParityError(
             f"{section}{field} must be {wanted} on this machine, got {used}: its {quantity.name} differ by {error:.1e} "

@@ -1,8 +1,8 @@
 """Compiles Triton kernels before they are needed, in child processes.
 
-Triton compiles a kernel at its first launch, one after the other, a second or more each: a minute before a training's
-first update, and again when the buffers of a simulation grow. The children fill its cache on disk; other kernels are
-compiled at their first launch.
+Triton compiles a kernel at its first launch, one kernel after the other, in a second or more each. This takes a minute
+before a training's first update, and time again when the buffers of a simulation grow. The children fill Triton's cache
+on disk. Kernels that are not in it are compiled at their first launch.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from hgn.step_config import StepConfig
 from hgn.system.machine import available_cpus
 from hgn.system.processes import Program, last_message
 
-MOST_PROCESSES = 12
-CELL_FRACTIONS = (0.1, 0.4, 1.2)  # of the particles
+MOST_PROCESSES = 12  # largest number of compiling processes
+CELL_FRACTIONS = (0.1, 0.4, 1.2)  # finest cells per particle, from dense to spread groups
 COMMAND = (sys.executable, "-m", "hgn.runtime.precompile_program")
 
 
@@ -34,7 +34,7 @@ class Precompilation:
     def __init__(
         self, job: PrecompileJob | FrameJob, processes: int | None = None, command: Sequence[str] = COMMAND
     ) -> None:
-        """Starts `processes` with low priority; by default as many as there are cores, less two."""
+        """Starts `processes` with low priority, by default two fewer than there are cores."""
         processes = processes or max(1, min(MOST_PROCESSES, available_cpus() - 2))
         self._started = time.monotonic()
         self._files = contextlib.ExitStack()
@@ -55,7 +55,7 @@ class Precompilation:
         return any(program.exit_code is None for program in self._programs)
 
     def wait(self, interrupted: Callable[[], bool] = lambda: False) -> str:
-        """Waits until all have ended or `interrupted` returns True; returns a message for the user."""
+        """Waits until all have ended or `interrupted` returns True. Returns a message for the user."""
         while self.running:
             if interrupted():
                 self.stop()
@@ -73,7 +73,7 @@ class Precompilation:
         return f"backend triton: {count} kernels ready {seconds:.0f} s after the start"
 
     def stop(self) -> None:
-        """Ends those that still run; the cache contains whole kernels only."""
+        """Ends those that still run. The cache contains only complete kernels."""
         for program in self._programs:
             program.stop()
         self._files.close()
@@ -85,7 +85,7 @@ def precompile_frames(
     device: torch.device,
     particles: Sequence[int],
 ) -> Precompilation | None:
-    """Starts to compile the kernels of simulations with these numbers of particles; None without backend triton."""
+    """Starts to compile the kernels of simulations with these particle counts; None without backend triton."""
     if device.type != "cuda" or torch.version.hip is not None:
         return None
     pairs = [
@@ -101,7 +101,7 @@ def precompile_frames(
 
 
 def frame_sizes(particles: Sequence[int]) -> tuple[tuple[int, int], ...]:
-    """Returns particles and cells of the finest level, from dense to spread groups: kernels differ by rows."""
+    """Returns pairs of particles and finest cells, from dense to spread groups. Kernels depend on the row count."""
     some = sorted(set(particles))
     some = sorted({some[0], some[len(some) // 2], some[-1]})
     return tuple((count, max(1, int(fraction * count))) for count in some for fraction in CELL_FRACTIONS)

@@ -1,7 +1,7 @@
 """python -m hgn.runtime.precompile_program: compiles kernels into Triton's cache on disk.
 
-The launches are those of Updates and TritonStepper on tensors without memory, so that no kernel and no specialisation
-is listed twice. Only sizes are guesses (they choose between few variants); other variants are compiled at first use.
+The launches are those of Updates and TritonStepper on tensors without memory, so the list of kernels and variants
+exists only once. Sizes are guesses; they choose between few variants. Other variants are compiled at first use.
 """
 
 from __future__ import annotations
@@ -25,36 +25,36 @@ from hgn.runtime.triton_stepper import TritonStepper, first_capacities
 from hgn.schema import from_mapping, to_mapping
 from hgn.step_config import UNCONSTRAINED, StepConfig
 
-NICENESS = 10
+NICENESS = 10  # low priority of the compiling processes
 
 
 @dataclass(frozen=True)
 class PrecompileJob:
-    """A training whose kernels are compiled."""
+    """A training whose kernels are compiled ahead."""
 
     network: NetworkConfig
     settings: UpdateSettings
     precision: str
     several_ranks: bool
-    averages: bool  # the weights over the updates
-    particles: int  # of an update, about
-    cells: tuple[int, ...]  # of each level, about
-    capability: int  # of the GPU: 90 for an H100
-    pushforward_scenes: tuple[int, ...] = ()  # that the network simulates at once, to train on them and to measure
-    step: StepConfig = UNCONSTRAINED  # of what it simulates
+    averages: bool  # whether the training averages its parameters
+    particles: int  # approximate number of particles in an update
+    cells: tuple[int, ...]  # approximate number of cells on each level
+    capability: int  # capability of the GPU: 90 for an H100
+    pushforward_scenes: tuple[int, ...] = ()  # numbers of scenes that the network simulates together in the training
+    step: StepConfig = UNCONSTRAINED  # constraints of these simulations
 
 
 @dataclass(frozen=True)
 class FrameJob:
-    """Simulations whose kernels are compiled."""
+    """Simulations whose kernels are compiled ahead."""
 
-    networks: tuple[tuple[NetworkConfig, StepConfig, str], ...]  # with their precisions
-    sizes: tuple[tuple[int, int], ...]
-    capability: int  # of the GPU: 90 for an H100
+    networks: tuple[tuple[NetworkConfig, StepConfig, str], ...]  # network, constraints, precision
+    sizes: tuple[tuple[int, int], ...]  # pairs of particles and finest cells
+    capability: int  # capability of the GPU: 90 for an H100
 
 
 def launches_of(job: PrecompileJob | FrameJob, device: str = "meta") -> Launches:
-    """Returns every kernel of a job with its specialisation, by a key of both; Triton's driver needs a target."""
+    """Returns every kernel of a job with its specialisation, by a key of both. Triton's driver needs a target."""
     with noted_launches() as launches:
         if isinstance(job, PrecompileJob):
             _update_launches(job, device)
@@ -73,7 +73,7 @@ def _update_launches(job: PrecompileJob, device: str) -> None:
     updates.average = torch.zeros_like(updates.values) if job.averages else None
     updates.allocate(job.particles, job.cells)
     updates.launches()
-    for scenes in job.pushforward_scenes:  # of hgn.training.triton_pushforward, or of a monitored rollout
+    for scenes in job.pushforward_scenes:  # simulations of hgn.training.triton_pushforward and of monitored rollouts
         fraction = scenes / job.settings.scenes
         particles = round(fraction * job.particles)
         capacities = first_capacities([round(fraction * cells) for cells in job.cells], particles)
@@ -84,7 +84,7 @@ def _update_launches(job: PrecompileJob, device: str) -> None:
 def _frame_launches(
     config: NetworkConfig, step: StepConfig, precision: str, sizes: tuple[tuple[int, int], ...], device: str
 ) -> None:
-    """Makes the launches of hgn.runtime.simulator; a level has a quarter of the cells of the one below."""
+    """Makes the launches of hgn.runtime.simulator. Each level has a quarter of the cells of the next finer one."""
     with torch.device(device):
         network = HierarchicalGraphNetwork(config)
     for particles, cells in sizes:
@@ -93,7 +93,7 @@ def _frame_launches(
 
 
 class _Unplaced(TritonStepper):
-    """A simulation of particles that are nowhere."""
+    """A simulation whose particles have no positions."""
 
     def _window(self) -> Window:
         return Window.around((0.0, 0.0, 0.0), (1.0, 1.0, 1.0), self.config.cell_size, self.config.levels)
@@ -113,7 +113,7 @@ def _simulation_launches(
     if config.obstacle_features:
         obstacles = SceneTable([None] * scenes, OBSTACLE_COLUMNS, device, cell_size=1.0)
     state = ParticleState(
-        # one particle a cell: they are not crowded
+        # one particle a cell, so that no cell is crowded
         position_N3=config.cell_size * torch.arange(particles, device=device)[:, None].expand(-1, 3),
         velocity_NM3=torch.zeros(particles, config.velocity_history, 3, device=device),
         material_N=torch.zeros(particles, dtype=torch.int32, device=device),
@@ -126,7 +126,7 @@ def _simulation_launches(
 
 
 def compile_part(job: PrecompileJob | FrameJob, part: int, parts: int) -> int:
-    """Compiles every `parts`-th kernel from number `part` on; returns how many those are."""
+    """Compiles every `parts`-th kernel, starting with number `part`. Returns the number of these kernels."""
     mine = list(launches_of(job).values())[part::parts]
     for function, data in mine:
         build_launcher(preload(function, data))

@@ -15,7 +15,7 @@ class RolloutResult:
     """The frames of one scene, and the reason if they end early."""
 
     position_TN3: np.ndarray  # float32, domain units; frame 0 is the initial state
-    cause: str | None = None  # of an end before the last frame
+    cause: str | None = None  # why the rollout ended before the last frame
 
     @property
     def frame_count(self) -> int:
@@ -25,7 +25,7 @@ class RolloutResult:
 def simulate_scenes(
     simulator: Simulator, scenes: Sequence[InitialState], frames: int, on_frame: Callable[[int], None] | None = None
 ) -> list[RolloutResult]:
-    """Simulates scenes side by side. A scene that diverges ends, and the others continue."""
+    """Simulates scenes together. A scene that diverges ends, and the others continue."""
     if not scenes:
         return []
     paths, ended = simulator.paths(scenes, frames, on_frame, isolate=True)

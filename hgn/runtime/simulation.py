@@ -1,7 +1,7 @@
 """A simulation in progress: the one loop of frames, for every backend and every caller.
 
-A backend contributes a `Stepper`, which computes frames. Divergence, particles that enter and other changes between
-frames are handled here.
+A backend contributes a `Stepper`, which computes frames. This module handles divergence, particles that enter, and
+other changes between frames.
 Shape legend: T frames, N particles of all scenes, A particles that enter, M velocities of a history, S scenes.
 """
 
@@ -28,9 +28,9 @@ class Stepper(Protocol):
     """Computes the frames that follow a state, on the device of the state."""
 
     def blocks(self, frames: int) -> Iterator[tuple[torch.Tensor, bool]]:
-        """Yields (block, diverged) for the next `frames` frames; a block has positions [T, N, 3].
+        """Yields (block, diverged) for the next `frames` frames. A block contains positions [T, N, 3].
 
-        If particles diverged in a block's last frame, no block follows. A block is valid until the next is requested.
+        A block whose last frame diverged is the last block. A block is valid until the next one is requested.
         """
 
     def motion(self) -> tuple[torch.Tensor, torch.Tensor]:
@@ -40,19 +40,19 @@ class Stepper(Protocol):
         """Removes the particles for which `kept_N`, bool [N], is false."""
 
     def take(self, state: ParticleState) -> bool:
-        """Continues from another state. Returns False, and changes nothing, if the buffers do not fit it."""
+        """Continues from another state. Returns False, and changes nothing, if the state does not fit the buffers."""
 
 
 @dataclass(frozen=True, eq=False)
 class Entry:
-    """Particles that enter in a frame; they are appended to the existing ones."""
+    """Particles that enter in a frame. They are appended to the existing particles."""
 
     frame: int
     state: ParticleState
 
 
 class Simulation:
-    """Scenes that are simulated side by side. Use it as a context manager, or close it."""
+    """Scenes that are simulated together. Use it as a context manager, or close it."""
 
     def __init__(
         self,
@@ -61,9 +61,9 @@ class Simulation:
         isolate: bool = False,
         entries: Sequence[Entry] = (),
     ) -> None:
-        """`stepper_of` allocates buffers and frees them on exit: Backend.stepper. `entries` are sorted by frame.
+        """`stepper_of` (Backend.stepper) allocates buffers and frees them on exit. `entries` are sorted by frame.
 
-        isolate: a scene that diverges ends and is recorded in `ended`, and the others continue; otherwise the first
+        With `isolate` a scene that diverges ends and is recorded in `ended`; the others continue. Without it the first
         divergence raises DivergedError. A scene beyond the range of the grid ends all scenes.
         """
         self.isolate, self.frame, self.entries = isolate, 0, list(entries)
@@ -85,7 +85,7 @@ class Simulation:
 
     @property
     def state(self) -> ParticleState:
-        """The state after the last frame, without scenes that ended; read-only."""
+        """The state after the last frame, without ended scenes; read-only."""
         if self.stepper is None:
             return self._state
         position_N3, velocity_NM3 = self.stepper.motion()
@@ -93,7 +93,7 @@ class Simulation:
 
     @property
     def static_state(self) -> ParticleState:
-        """`state`, but with the positions and velocities of the last edit; needs no copy from the device."""
+        """`state`, but with the positions and velocities of the last edit. It needs no copy from the device."""
         return self._state
 
     @property
@@ -104,11 +104,11 @@ class Simulation:
         """Replaces the state and clears `ended`."""
         self.ended.clear()
         self._row_count = len(state.position_N3)
-        self._row_N: torch.Tensor | None = None  # output row of each remaining particle; None: all, in order
+        self._row_N: torch.Tensor | None = None  # output row of each remaining particle; None: all rows in order
         self._begin(state)
 
     def add(self, new: ParticleState) -> None:
-        """Appends particles to the existing ones; those of scenes that ended get an output row of NaN."""
+        """Appends particles to the existing ones. Particles of ended scenes get an output row of NaN."""
         old, rows_N = self.state, self._rows()
         going_A = torch.tensor([i not in self.ended for i in range(old.scene_count)], device=old.scene_N.device)
         going_A = going_A[new.scene_N]
@@ -122,8 +122,7 @@ class Simulation:
     def run(self, frames: int, on_frame: Callable[[int], Any] | None = None) -> np.ndarray:
         """Returns positions of the next `frames` frames, float32 [T, N, 3]; calls `on_frame(number)` after each.
 
-        Positions are NaN in a scene that ended, and of particles before they enter. Raises: DivergedError without
-        `isolate`.
+        Positions are NaN in ended scenes, and before a particle enters. Raises: DivergedError without `isolate`.
         """
         first, done = self.frame, 0
         entering = [len(entry.state.position_N3) for entry in self.entries if entry.frame <= first + frames]
@@ -139,8 +138,8 @@ class Simulation:
     def blocks(self, frames: int) -> Iterator[torch.Tensor]:
         """Yields positions [T, N, 3] of the next `frames` frames in blocks on the device.
 
-        As in `run`, positions are NaN in a scene that ended; blocks lack the particles that enter later. Raises as
-        `run`. A block is valid until the next one is requested.
+        Positions are NaN in ended scenes. Particles that enter later have no rows yet. Raises as `run`. A block is
+        valid until the next one is requested.
         """
         end = self.frame + frames
         while self.entries and self.entries[0].frame <= end:
@@ -194,7 +193,7 @@ class Simulation:
         return diverged(position_N3, self._state.domain_S3[self._state.scene_N.long()])
 
     def _without_diverged(self, block_TN3: torch.Tensor, stepper: Stepper) -> torch.Tensor:
-        """Ends the scenes with particles that diverged; returns the block without them in its last frame."""
+        """Ends scenes with diverged particles. Returns the block with NaN for these scenes in its last frame."""
         state, scenes = self._state, self._state.scene_count
         lost_N = self._diverged(block_TN3[-1])
         lost_S = torch.bincount(state.scene_N[lost_N], minlength=scenes)
@@ -219,7 +218,7 @@ class Simulation:
         return torch.arange(self._row_count, device=self._state.scene_N.device) if self._row_N is None else self._row_N
 
     def _whole(self, block_TN3: torch.Tensor) -> torch.Tensor:
-        """A block with a row for each particle, NaN for those of scenes that ended."""
+        """Returns a block with a row for each particle; rows of ended scenes are NaN."""
         if self._row_N is None:
             return block_TN3
         whole_TN3 = block_TN3.new_full((len(block_TN3), self._row_count, 3), torch.nan)
@@ -229,7 +228,7 @@ class Simulation:
 
 @torch.inference_mode()
 def selected(state: ParticleState, selected_N: torch.Tensor) -> ParticleState:
-    """Returns a state with some of the particles; scenes keep their numbers."""
+    """Returns a state with the selected particles. Scenes keep their numbers."""
     some: dict[str, Any] = {name: getattr(state, name)[selected_N] for name in OF_PARTICLES}
     return replace(state, **some)
 

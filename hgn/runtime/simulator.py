@@ -37,13 +37,13 @@ from hgn.scene.scene import Scene, all_corners, whole_cells
 from hgn.schema import require
 from hgn.system.device import choose_device
 
-LARGEST_GRAVITY = 98.0  # domain units per second squared
-SAME_GRAVITY = 1e-3  # relative difference; estimates from the trajectories of two sets differ by a few 1e-5
+LARGEST_GRAVITY = 98.0  # largest supported gravity, domain units per second squared
+SAME_GRAVITY = 1e-3  # relative difference below which gravities are equal; estimates of data sets differ by a few 1e-5
 
 
 @dataclass(frozen=True, eq=False)
 class InitialState:
-    """The start of a simulation. Units: domain units, seconds."""
+    """The start of a simulation in domain units and seconds."""
 
     position_N3: np.ndarray
     velocity_N3: np.ndarray
@@ -51,13 +51,13 @@ class InitialState:
     obstacle_grid: ObstacleGrid
     domain_size: tuple[float, float, float]
     gravity: tuple[float, float, float]
-    # corners of the obstacles' triangles, float64 [F, 3, 3], for networks with obstacle_clearance; None: only the cells
-    # of obstacles are known, and none is passed by a triangle
+    # corners of the obstacles' triangles, float64 [F, 3, 3], for networks with obstacle_clearance; None: only the
+    # obstacles' cells are known, and the obstacle constraint does not act
     corners: Callable[[], np.ndarray] | None = None
     materials: tuple[str, ...] = MATERIALS
-    past_HN3: np.ndarray | None = None  # frames before this one, oldest first; None: free flight
+    past_HN3: np.ndarray | None = None  # frames before this one, oldest first; None: free flight before it
     dimensions: int = 3
-    emitting: Scene | None = None  # the scene with the particles that enter later, behind the others
+    emitting: Scene | None = None  # the scene, if particles enter later; they follow the others
 
     @staticmethod
     def of_episode(episode: Episode) -> InitialState:
@@ -77,10 +77,10 @@ class InitialState:
 
     @staticmethod
     def of_scene(scene: Scene) -> InitialState:
-        """Returns a scene's initial particles; obstacles are sampled into cells.
+        """Returns a scene's initial particles. Obstacles become cells.
 
-        Raises: ConfigError where obstacles move, because a network knows obstacles at rest, and for a domain that is
-        not whole solver cells, which the solver refuses too.
+        Raises: ConfigError if obstacles move (a network sees obstacles at rest), or if the domain is not a whole number
+        of solver cells, which the solver refuses too.
         """
         whole_cells(scene.domain_size, scene.cell_size)
         remedy = "leave keyframes out, or run datagen.solve"
@@ -103,9 +103,9 @@ class InitialState:
         return InitialState.of_scene(scene) if isinstance(scene, Scene) else scene
 
     def velocities(self, history: int, frame_rate_hz: float) -> np.ndarray:
-        """Returns displacements in the frames up to now, newest first, float32 [N, history, 3], domain units per frame.
+        """Returns displacements in the last frames, newest first, float32 [N, history, 3], domain units per frame.
 
-        Raises: ConfigError where fewer frames before this one are known.
+        Raises: ConfigError if fewer earlier frames are known.
         """
         if self.past_HN3 is None:
             gravity_3 = np.array(self.gravity, np.float64) / frame_rate_hz**2
@@ -121,7 +121,7 @@ class InitialState:
 
 
 class Simulator:
-    """Simulates scenes with a trained network, one or several side by side."""
+    """Simulates scenes with a trained network, one scene or several at the same time."""
 
     def __init__(
         self,
@@ -131,8 +131,10 @@ class Simulator:
         precision: str = "auto",
         info: WeightsInfo | None = None,
     ) -> None:
-        """`backend` is one of hgn.runtime.backend, or the name of one: torch, triton or cpu, whether this machine
-        supports it or not; auto: the fastest supported one. `info` is the metadata of the weights file.
+        """`backend` is a backend of hgn.runtime.backend, or a name: torch, triton or cpu.
+
+        A named backend is used even if this machine does not support it. auto is the fastest supported backend. `info`
+        is the metadata of the weights file.
         """
         self.network, self.frame_rate_hz, self._info = network, frame_rate_hz, info
         self.device = next(network.parameters()).device
@@ -145,10 +147,10 @@ class Simulator:
     def load(
         weights: str | Path = DEFAULT_WEIGHTS, device: str = "auto", backend: str = "auto", precision: str = "auto"
     ) -> Simulator:
-        """Loads exported weights: a file, or the name of shipped ones. The options are those of hgn.rollout.
+        """Loads exported weights: a file, or the name of shipped weights. The options are those of hgn.rollout.
 
-        Sets the precision of PyTorch's own float32 products, too.
-        Raises: ConfigError when the weights, the device or the backend do not exist or do not fit each other.
+        It also sets the precision of PyTorch's own float32 products.
+        Raises: ConfigError if weights, device or backend do not exist or do not fit each other.
         """
         place = choose_device(device)
         network, info = load_weights(find_weights(str(weights)), place)
@@ -158,15 +160,16 @@ class Simulator:
 
     @property
     def info(self) -> WeightsInfo:
-        """The metadata of the weights file, for a simulator of `load`."""
+        """The metadata of the weights file. Only a simulator of `load` has it."""
         assert self._info is not None
         return self._info
 
     def start(self, scenes: Sequence[InitialState | Scene]) -> ParticleState:
         """Returns the state at frame 0, with a ballistic history.
 
-        Raises: ConfigError when a scene has a material that the network was not trained with, or, for loaded weights,
-        an unsupported gravity (absolute inputs: another, relative: a huge one) or obstacle cells of another size.
+        Raises: ConfigError if a scene has a material that the network was not trained with. For loaded weights it is
+        also raised for obstacle cells of another size and for an unsupported gravity. Absolute inputs support only the
+        gravity of their data; relative inputs support up to LARGEST_GRAVITY.
         """
         config, states = self.network.config, _initial(scenes)
         for state in states:
@@ -197,15 +200,12 @@ class Simulator:
         return stepped(self.backend.predict, state, self.backend.step, self.network.config.dimensions)
 
     def rollout(
-        self,
-        scenes: Sequence[InitialState | Scene],
-        frames: int,
-        on_frame: Callable[[int], None] | None = None,
+        self, scenes: Sequence[InitialState | Scene], frames: int, on_frame: Callable[[int], None] | None = None
     ) -> list[np.ndarray]:
-        """Simulates `frames` frames, frame 0 included; float32 [frames, N, 3] for each scene.
+        """Simulates `frames` frames including frame 0. Returns float32 [frames, N, 3] for each scene.
 
-        A particle that enters later is NaN until then. `on_frame(t)` is called when frame t is complete.
-        Raises: ConfigError as `start`; DivergedError with the frame; the network must be trained further then.
+        A particle that enters later is NaN until its frame. `on_frame(t)` is called after frame t.
+        Raises: ConfigError as `start`; DivergedError with the frame, after which only more training helps.
         """
         return self.paths(scenes, frames, on_frame)[0]
 
@@ -216,8 +216,9 @@ class Simulator:
         on_frame: Callable[[int], None] | None = None,
         isolate: bool = False,
     ) -> tuple[list[np.ndarray], dict[int, DivergedError]]:
-        """As `rollout`. With `isolate` a scene that diverges is NaN from that frame on, and the others continue; the
-        causes are returned by the number of the scene.
+        """As `rollout`, and returns the causes of divergence by scene number.
+
+        With `isolate` a diverged scene is NaN from that frame, and the others continue.
         """
         require(frames >= 1, "frames", "at least 1", frames)
         states = _initial(scenes)
@@ -234,10 +235,10 @@ class Simulator:
         return np.split(position_TN3, ends, axis=1), simulation.ended
 
     def frames(self, scene: InitialState | Scene) -> Iterator[np.ndarray]:
-        """Yields positions float32 [N, 3] of frame after frame without end, the initial ones first.
+        """Yields positions float32 [N, 3] of every frame without end, starting with the initial positions.
 
-        Backend triton computes some frames ahead. Several scenes may be simulated side by side, each by a call of its
-        own. Raises: what `rollout` does, ConfigError with the first frame and DivergedError after the last good one.
+        Backend triton computes some frames ahead. Several scenes may be simulated at the same time by separate calls.
+        Raises: ConfigError with the first frame; DivergedError after the last good frame.
         """
         states = _initial([scene])
         entries = self._entries(states)
@@ -251,7 +252,7 @@ class Simulator:
     def simulation(
         self, state: ParticleState, capacity: int = 0, isolate: bool = False, entries: Sequence[Entry] = ()
     ) -> Simulation:
-        """Begins a simulation of a state; backend triton allocates buffers for `capacity` particles."""
+        """Starts a simulation of a state. Backend triton allocates buffers for `capacity` particles."""
         return Simulation(functools.partial(self.backend.stepper, capacity=capacity), state, isolate, entries)
 
     def _entries(self, states: Sequence[InitialState]) -> list[Entry]:
@@ -268,7 +269,7 @@ class Simulator:
                 particles = {
                     name: getattr(entered, name)[new_N] for name in ("position_N3", "velocity_N3", "material_N")
                 }
-                new = self.start([replace(state, corners=None, **particles)])  # without barriers, which take long
+                new = self.start([replace(state, corners=None, **particles)])  # barriers take long and are not needed
                 entries.append(Entry(frame, replace(new, scene_N=new.scene_N + number)))
         return sorted(entries, key=lambda entry: entry.frame)
 
@@ -284,19 +285,19 @@ class Simulator:
         poses: Mapping[int, Pose] | None = None,
         smoothing: float = 0.0,
     ) -> torch.Tensor:
-        """`rollout` of a scene with gradients: positions [frames, N, 3] as a tensor, in the network's precision.
+        """Computes `rollout` of a scene with gradients: positions [frames, N, 3], a tensor in the network's precision.
 
-        What is given takes the place of the scene's own: positions and velocities [N, 3], gravity [3] (relative inputs
-        only), the domain's size [3], in domain units and seconds; `poses` turns and shifts obstacles by their number.
-        `smoothing`, in obstacle cells up to 1, makes normals continuous (hgn.network.posed_obstacles). Always computed
-        by PyTorch, one frame's work in memory at a time. docs/how_to/gradients.md says what is differentiable.
+        Arguments replace the scene's own values: positions and velocities [N, 3], gravity [3] (relative inputs only),
+        the domain's size [3]. Units are domain units and seconds. `poses` rotates and shifts obstacles by number.
+        `smoothing`, 0 to 1 obstacle cells, makes normals continuous (hgn.network.posed_obstacles). PyTorch computes it
+        with one frame's intermediate results in memory. docs/how_to/gradients.md lists what is differentiable.
         Raises: ConfigError and DivergedError as `rollout`.
         """
         inputs = Inputs(position_N3, velocity_N3, gravity_3, domain_size_3, poses=poses, smoothing=smoothing)
         return simulate(self.network, self.start([scene]), scene, self.frame_rate_hz, frames=frames, inputs=inputs)
 
     def require_fits(self, scene: InitialState) -> None:
-        """Raises ConfigError where loaded weights do not fit a scene; `start` checks its materials."""
+        """Raises ConfigError if loaded weights do not fit a scene. `start` checks its materials."""
         info, cell_size = self._info, scene.obstacle_grid.cell_size
         dimensions = self.network.config.dimensions
         rule = f"the network's {dimensions}"

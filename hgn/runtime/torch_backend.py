@@ -1,4 +1,4 @@
-"""The backend torch, whose signature all have; which one computes a network is decided in hgn.runtime.backend."""
+"""The backend torch. All backends have its signature; hgn.runtime.backend chooses one for a network."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from hgn.step.reference import accelerations
 
 
 def precisions_to_try(precision: str, device: torch.device, backend: str) -> tuple[str, ...]:
-    """Returns the given precision, or for `auto` those of a backend from the fastest on."""
+    """Returns the given precision, or for `auto` the precisions of a backend, fastest first."""
     if precision != "auto":
         return (precision,)
     if device.type == "cpu":
@@ -24,19 +24,19 @@ def precisions_to_try(precision: str, device: torch.device, backend: str) -> tup
 
 
 class Backend:
-    """PyTorch on the device of the network, which every other backend is compared with and takes the signature of."""
+    """Runs PyTorch on the device of the network: the reference for every other backend."""
 
     name = "torch"
-    stepped = True  # frames begin one by one, so that scenes that diverge can be left out of the next
+    stepped = True  # frames begin one by one, so that diverged scenes can be left out of the next
 
     def __init__(self, network: ParticleNetwork, precision: str = "auto") -> None:
         self.network = network
         self.note = ""  # reports which backend computes, and why
-        self.step = network.step  # the constraints of its simulations
+        self.step = network.step  # constraints of its simulations
         self.device = next(network.parameters()).device
         self.precisions = precisions_to_try(precision, self.device, self.name)
         self.precision = self.precisions[0]
-        self.growths = 0  # of buffers, in all rollouts
+        self.growths = 0  # number of times that buffers grew, in all rollouts
         if self.device.type == "cpu":
             keep_freed_memory()
 
@@ -45,16 +45,16 @@ class Backend:
         return self.prediction(state, origin_S3).acceleration_N3
 
     def prediction(self, state: ParticleState, origin_S3: torch.Tensor | None = None) -> Prediction:
-        """Returns the raw output with the contacts that rest needs."""
+        """Returns the raw output, and the contacts that the rest constraint needs."""
         return self.network.prediction(state, origin_S3)
 
     def predict(self, state: ParticleState) -> torch.Tensor:
-        """Returns the accelerations of a simulation [N, 3] in frame units, with rest."""
+        """Returns the accelerations of a simulation [N, 3] in frame units, after the rest constraint."""
         return accelerations(self.network, state, self.prediction(state), self.step)
 
     def stepper(self, state: ParticleState, capacity: int = 0) -> AbstractContextManager[Stepper]:
-        """Computes the frames that follow a state; backend triton allocates buffers for `capacity` particles."""
+        """Returns a stepper for the frames after a state. Backend triton allocates buffers for `capacity` particles."""
         return nullcontext(TorchStepper(self.predict, state, self.step, self.network.config.dimensions))
 
     def release(self) -> None:
-        """Gives back the buffers that simulations keep for those that follow."""
+        """Frees the buffers that are kept for later simulations."""

@@ -25,7 +25,7 @@ def stepped(
 
 
 class TorchStepper:
-    """`predict` returns accelerations [N, 3] of a state, in frame units; `step` constrains the frames."""
+    """Computes frames with `predict`, which returns accelerations [N, 3] in frame units; `step` constrains them."""
 
     def __init__(
         self, predict: Callable[[ParticleState], torch.Tensor], state: ParticleState, step: StepConfig, dimensions: int
@@ -34,7 +34,7 @@ class TorchStepper:
         self._step, self._dimensions = step, dimensions
 
     def blocks(self, frames: int) -> Iterator[tuple[torch.Tensor, bool]]:
-        """Yields each frame as a block. Raises: GridRangeError where positions are beyond the range of a grid."""
+        """Yields each frame as a block. Raises: GridRangeError if positions are beyond the range of a grid."""
         for _ in range(frames):
             self.state = stepped(self.predict, self.state, self._step, self._dimensions)
             domain_N3 = self.state.domain_S3[self.state.scene_N]

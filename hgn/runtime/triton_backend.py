@@ -1,4 +1,4 @@
-"""The backend triton: simulations in CUDA graphs, kept for the next."""
+"""The backend triton: simulations in CUDA graphs, which are kept for later simulations."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from hgn.runtime.parity import ParityError
 from hgn.runtime.torch_backend import Backend
 from hgn.runtime.triton_stepper import CHECKED_PARTICLES, TritonStepper
 
-IDLE_STEPPERS = 2  # kept for the next simulations, of different numbers of scenes
-LEAST_FILLING = 0.5  # fraction of a stepper's capacity that is used at least: launches have the size of the capacity
+IDLE_STEPPERS = 2  # number of steppers kept for later simulations, for different numbers of scenes
+LEAST_FILLING = 0.5  # smallest used fraction of a stepper's capacity; launches have the size of the capacity
 
 
 class TritonBackend(Backend):
-    """A hierarchical graph network; a single frame (`predict`) is PyTorch's."""
+    """Runs a hierarchical graph network in Triton's kernels. PyTorch computes single frames (`predict`)."""
 
     name = "triton"
     stepped = False
@@ -29,7 +29,7 @@ class TritonBackend(Backend):
 
     @contextmanager
     def stepper(self, state: ParticleState, capacity: int = 0) -> Iterator[TritonStepper]:
-        """Yields a stepper, new or idle; it is idle again on exit."""
+        """Yields a new or idle stepper. It becomes idle on exit."""
         stepper = self._idle_stepper(state, capacity)
         if stepper is None:
             stepper = self._new_stepper(state, capacity)
@@ -61,7 +61,7 @@ class TritonBackend(Backend):
         return self._new_stepper(state, capacity)
 
     def _idle_stepper(self, state: ParticleState, capacity: int) -> TritonStepper | None:
-        """Takes an idle stepper that fits the state and starts it from there; its launches are captured already.
+        """Starts an idle stepper from a state that it fits. Its launches are already captured.
 
         An idle stepper that does not fit is freed before another one is allocated.
         """

@@ -19,11 +19,11 @@ def host_unsupported_reason() -> str | None:
     if importlib.util.find_spec("triton") is None:
         return "it needs the package triton"
     if torch.cuda.is_available():
-        from hgn.kernels.triton_compat import unsupported_reason  # loads Triton
+        from hgn.kernels.triton_compat import unsupported_reason  # this import loads Triton
 
         if reason := unsupported_reason():
             return reason
-    if not torch.cuda.is_available() or any(_cache().glob("*/cuda_utils*")):  # built before, perhaps on another machine
+    if not torch.cuda.is_available() or any(_cache().glob("*/cuda_utils*")):  # an earlier build, perhaps elsewhere
         return None
     if not (os.environ.get("CC") or shutil.which("gcc") or shutil.which("clang")):
         return "Triton needs a C compiler: gcc, clang or CC=…"
@@ -34,7 +34,7 @@ def host_unsupported_reason() -> str | None:
 
 
 def kernel_precision(precision: str, device: torch.device) -> str:
-    """Returns the precision for the kernels: a CPU has no TF32."""
+    """Returns the precision for the kernels. A CPU has no TF32."""
     return "fp32" if device.type == "cpu" and precision == "tf32" else precision
 
 

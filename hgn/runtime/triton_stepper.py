@@ -1,8 +1,8 @@
 """Frames of a simulation as CUDA graphs (paper algorithm 1), without synchronisation within a block of frames.
 
 The host reads the status after each block of `look_frames` frames, while the device computes the next block. If the
-grid needed more memory than it had, the frames before are kept, the buffers grow, and the simulation continues from the
-last good frame; no frame is computed twice.
+grid needed more memory than it had, the completed frames are kept and the buffers grow. The simulation continues from
+the last good frame, so no frame is computed twice.
 Shape legend: N particles of all scenes, S scenes, T frames.
 """
 
@@ -30,20 +30,20 @@ from hgn.runtime.triton_host import kernel_precision
 from hgn.step.reference import rested
 from hgn.step_config import StepConfig
 
-LOOK_FRAMES, FEWEST_FRAMES = 32, 4
-CROWDED = 140  # particles in a cell of the finest level, 1.5 times those in bodies of the data
-PATH_BYTES = 1 << 27  # of positions on their way to the host: fewer frames where there are many particles
-GROWTH = 2.0  # capacity when buffers grow, in cells
-# The same where there are more than ROOMY_CELLS of them: at first, and for what was needed when there was too little.
+LOOK_FRAMES, FEWEST_FRAMES = 32, 4  # largest and smallest number of frames in a block
+CROWDED = 140  # particles in a finest cell above which it is crowded; 1.5 times the density of bodies in the data
+PATH_BYTES = 1 << 27  # memory of positions on their way to the host; with many particles it shortens blocks
+GROWTH = 2.0  # factor from the needed cells to the new capacity when buffers grow
+# The same factors above ROOMY_CELLS cells: for the first capacity, and when buffers grow.
 TIGHT_START, TIGHT_GROWTH = 1.25, 1.5
-HEADROOM = 8.0  # times the cells of a scene's start: groups that fall and lie spread need up to six times as many,
-SPREAD_CELLS = (0.6, 0.1, 0.035, 0.02)  # most cells per particle on each level; coarser levels as the last
-ROOMY_CELLS = 65_536  # of the finest level, up to which there is such headroom: beyond, memory counts
-CHECKED_PARTICLES = 50_000  # at most; PyTorch needs memory
+HEADROOM = 8.0  # first capacity over the cells of a scene's start; groups that fall and spread need up to six times
+SPREAD_CELLS = (0.6, 0.1, 0.035, 0.02)  # largest number of cells per particle, by level; coarser ones as the last
+ROOMY_CELLS = 65_536  # finest cells up to which a first capacity has HEADROOM; above it memory is scarce
+CHECKED_PARTICLES = 50_000  # largest number of particles in the comparison with PyTorch, which needs memory
 
 
 def first_capacities(cells: Sequence[int], particles: int) -> tuple[int, ...]:
-    """Returns capacities for a scene that starts with `cells` on each level; few simulations need more later."""
+    """Returns capacities for a scene that starts with `cells` on each level. Few simulations need more later."""
     capacities = []
     for level, count in enumerate(cells):
         spread = SPREAD_CELLS[min(level, len(SPREAD_CELLS) - 1)] * particles
@@ -53,7 +53,7 @@ def first_capacities(cells: Sequence[int], particles: int) -> tuple[int, ...]:
 
 
 def crowded(position_N3: torch.Tensor, scene_N: torch.Tensor, cell_size: float) -> bool:
-    """Returns whether more than a twentieth of the particles are in cells whose float16 sums would lose small terms."""
+    """Returns whether more than 5 % of the particles are in crowded cells, where float16 sums lose small terms."""
     cell_N3 = torch.floor(position_N3 / cell_size).long()
     inside_N = (cell_N3.abs() < COORDINATE_LIMIT).all(-1)
     key_N = pack(scene_N[inside_N].long(), cell_N3[inside_N])
@@ -62,24 +62,24 @@ def crowded(position_N3: torch.Tensor, scene_N: torch.Tensor, cell_size: float) 
 
 
 def _room(count: int, level: int, tight: float) -> int:
-    """Returns GROWTH times the count, but for more than ROOMY_CELLS less, and at least `tight` times the count."""
+    """Returns GROWTH times the count. Counts above ROOMY_CELLS get less, but at least `tight` times the count."""
     return max(int(tight * count), int(GROWTH * min(count, ROOMY_CELLS >> 2 * level)))
 
 
 @dataclass(frozen=True, eq=False)
 class _Look:
-    """Frames that were launched: their number, the place of the first, and frame and status after the last."""
+    """Launched frames: their number, the place of the first one, and `frame` and `status` after the last one."""
 
     frames: int
     first: int
-    seen: torch.Tensor  # int32 [2], on the host after `end`
+    seen: torch.Tensor  # int32 [2] on the host, valid after `end`
     end: torch.cuda.Event | None
 
 
 class TritonStepper:
-    """Computes frames on one device. Without CUDA the same launches run one by one, in Triton's interpreter."""
+    """Computes frames on one device. Without CUDA the same launches run one by one in Triton's interpreter."""
 
-    live: int  # particles of the state; the buffers have more rows
+    live: int  # number of particles of the state; buffers may have more rows
 
     def __init__(
         self,
@@ -92,10 +92,10 @@ class TritonStepper:
         barriers: SceneTable | None = None,
         step: StepConfig | None = None,
     ) -> None:
-        """`capacities` are cells of each level at the start.
+        """`capacities` are the numbers of cells on each level for which buffers are allocated at first.
 
-        `capacity` is the least number of particles that buffers are allocated for. `obstacles` and `barriers` replace
-        those of the state; `step` replaces the network's.
+        Buffers have rows for at least `capacity` particles. `obstacles` and `barriers` replace those of the state, and
+        `step` replaces the network's.
         """
         self.config, self.device = network.config, state.position_N3.device
         self.step_config = network.step if step is None else step
@@ -116,7 +116,7 @@ class TritonStepper:
         affordable = PATH_BYTES // (2 * 3 * 4 * max(1, self.particles))
         self.look_frames = max(FEWEST_FRAMES, min(LOOK_FRAMES, affordable))
         self.path_TN3 = torch.zeros(2 * self.look_frames, self.particles, 3, device=self.device)
-        self.overlap = self.device.type == "cuda"  # frames are started before those before them are taken away
+        self.overlap = self.device.type == "cuda"  # the next block starts before the results of this one are fetched
         normaliser = network.normaliser
         mean_3, std_3 = normaliser.feature_scale(self.config.relative)
         self.scale = (mean_3.float(), std_3.float())
@@ -127,8 +127,10 @@ class TritonStepper:
         self._build(capacities or self._first_capacities())
 
     def fits(self, state: ParticleState) -> bool:
-        """Returns whether `begin` can continue from a state: the same scenes' domains and obstacle cells, no more
-        particles than the capacity, and no crowds that need float32 sums.
+        """Returns whether `begin` can continue from a state.
+
+        The state needs the same domains and the same size of obstacle cells. It needs a row for each particle, and no
+        crowds that require float32 sums.
         """
         if state.scene_count != self.scenes or len(state.position_N3) > self.particles:
             return False
@@ -141,8 +143,8 @@ class TritonStepper:
     def begin(self, state: ParticleState, new_obstacles: bool = False) -> None:
         """Continues from another state that `fits`.
 
-        Obstacles are those of the tables `self.obstacles` and `self.barriers`, which the caller may write, or with
-        `new_obstacles` those of the state.
+        By default obstacles are those of `self.obstacles` and `self.barriers`, which the caller may change. With
+        `new_obstacles` they are those of the state.
         """
         if new_obstacles and self.barriers is not None and not self.barriers.is_of(state.barriers):
             self.barriers.take(SceneTable.of_barriers(state.barriers, self.scenes, self.device))
@@ -161,7 +163,7 @@ class TritonStepper:
         return True
 
     def keep(self, kept_N: torch.Tensor) -> None:
-        """Removes particles after a divergence; cells, obstacles and launches stay."""
+        """Removes particles after a divergence. Cells, obstacles and launches stay."""
         buffers = (self.buffers.position_N3, self.buffers.velocity_NV, self.buffers.scene_N, self.buffers.material_N)
         remaining = [buffer[: self.live][kept_N] for buffer in buffers]
         self.live = len(remaining[0])
@@ -190,11 +192,11 @@ class TritonStepper:
             buffers.gravity_S3.copy_(state.gravity_S3)
 
     def _crowded(self, state: ParticleState) -> bool:
-        nowhere = state.position_N3.device.type == "meta"  # kernels are compiled ahead, for no particles
+        nowhere = state.position_N3.device.type == "meta"  # kernels are compiled ahead with empty tensors
         return not nowhere and crowded(state.position_N3, state.scene_N, self.config.cell_size)
 
     def use_values(self, values: torch.Tensor) -> None:
-        """Replaces the parameters, in the packed layout."""
+        """Replaces the parameters by `values` in the packed layout."""
         self.values.copy_(values)
         self.fused.refresh()
 
@@ -215,7 +217,7 @@ class TritonStepper:
     def _build(self, capacities: tuple[int, ...]) -> None:
         config, window = self.config, self._window()
         self.graph = None
-        # never more than the window or the particles' corners can hold
+        # limits: the cells of the window, and eight cells a particle
         limits = [self.scenes * math.prod(n >> i for n in window.cells) for i in range(config.levels)]
         limits = [min(limit, 8 * self.particles) for limit in limits]
         rounded = tuple(16 * math.ceil(max(1, min(c, m)) / 16) for c, m in zip(capacities, limits, strict=True))
@@ -237,15 +239,18 @@ class TritonStepper:
         return captured([self.frame_launches], self._warm_up)[0]
 
     def _warm_up(self) -> None:
-        """Compiles the kernels without moving anything: a status that is not zero stops the integration."""
+        """Compiles the kernels without moving a particle: a non-zero status disables the integration."""
         self._network_pass()
         self.grid.status.fill_(OVERFLOW)
         self._integrate()
         self.grid.status.zero_()
 
     def require_parity(self, network: HierarchicalGraphNetwork, state: ParticleState, section: str = "") -> None:
-        """Compares the first output with PyTorch's. Call it before the first frame; `state` is that of the start, or
-        its first scenes. `section` of the settings has the precision. Raises: ParityError.
+        """Compares the first output with PyTorch's. Call it before the first frame.
+
+        `state` is the state of the start, or its first scenes. `section` of the settings contains the precision.
+        Raises: ParityError.
+
         """
         if self.graph is None:
             self._network_pass()
@@ -255,7 +260,7 @@ class TritonStepper:
             require_parity(output_N3, expected_N3, OUTPUTS, self.precision, section=section)
 
     def frame_launches(self) -> None:
-        """Makes all launches of one frame, which the graph contains."""
+        """Makes all launches of one frame. The CUDA graph records them."""
         self._network_pass()
         self._integrate()
 
@@ -272,16 +277,16 @@ class TritonStepper:
         )  # fmt: skip
 
     def blocks(self, frames: int) -> Iterator[tuple[torch.Tensor, bool]]:
-        """Yields up to `look_frames` frames a block; while a block is processed, the device computes the next one.
+        """Yields blocks of up to `look_frames` frames. While a block is processed, the device computes the next one.
 
-        Raises: torch.OutOfMemoryError where buffers cannot grow; the stepper continues from there when there is memory.
+        Raises: torch.OutOfMemoryError if buffers cannot grow. A later call continues from that frame.
         """
         done, half = 0, 0
         ahead: _Look | None = None
         while done < frames:
             look = ahead or self._launch(min(self.look_frames, frames - done), half)
             remaining, half = frames - done - look.frames, 1 - half
-            # With a status that is not zero these launches change nothing.
+            # If this block ends with a non-zero status, these launches change nothing.
             ahead = self._launch(min(self.look_frames, remaining), half) if self.overlap and remaining else None
             path_TN3, status = self._settle(look)
             done += len(path_TN3)
@@ -296,7 +301,7 @@ class TritonStepper:
                 self._grow()
 
     def _launch(self, frames: int, half: int) -> _Look:
-        """Starts some frames, whose positions are written to one half of the path."""
+        """Starts some frames. Their positions are written to one half of the path."""
         first = half * self.look_frames
         self.frame.fill_(first)
         for _ in range(frames):
@@ -313,7 +318,7 @@ class TritonStepper:
         return _Look(frames, first, seen, end)
 
     def _settle(self, look: _Look) -> tuple[torch.Tensor, int]:
-        """Waits for started frames; returns positions of the completed ones, and the status after them."""
+        """Waits for started frames. Returns the positions of the completed frames and the status after them."""
         if look.end is not None:
             look.end.synchronize()
         last, status = look.seen.tolist()
@@ -322,18 +327,18 @@ class TritonStepper:
         return self.path_TN3.view(-1)[start : start + 3 * taken * self.live].view(taken, self.live, 3), status
 
     def _grow(self) -> None:
-        # all levels: the others are nearly full too, and would soon require another capture
+        # all levels grow, because the others are nearly full and would soon require another capture
         before, needed = self.grid.capacities, self.grid.needed_L.tolist()
         pairs = zip(before, needed, strict=True)
         capacities = tuple(max(c, _room(n, i, TIGHT_GROWTH)) for i, (c, n) in enumerate(pairs))
         self.growths += 1
-        # Free the old buffers first, so that memory never has to hold both; particles are stored elsewhere.
+        # Free the old buffers first, so that memory need not contain both; particles are stored elsewhere.
         self.graph = None
         del self.fused, self.grid, self.step
         try:
             self._build(capacities)
             return
         except torch.OutOfMemoryError as error:
-            reason = str(error)  # the error itself keeps what was allocated so far
+            reason = str(error)  # the error object would keep the partial allocation
         self._build(before)
         raise torch.OutOfMemoryError(reason)

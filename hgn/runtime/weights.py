@@ -1,5 +1,6 @@
-"""Inference weights: one safetensors file with the network's parameters and normaliser, and its structure as JSON in
-the metadata. Nothing in it is unpickled or executed.
+"""Inference weights: a safetensors file with the network's parameters and normaliser, and its structure as JSON.
+
+Reading a file neither unpickles nor executes any of its content.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from hgn.system.hub import PREFIX, hub_weights
 
 FORMAT_VERSION = 1
 SUFFIX = ".safetensors"
-SHIPPED = Path(__file__).resolve().parents[1] / "weights"  # with a card NAME.md for each file
+SHIPPED = Path(__file__).resolve().parents[1] / "weights"  # folder of the shipped files, each with a card NAME.md
 
 
 @dataclass(frozen=True)
@@ -34,14 +35,14 @@ class WeightsInfo:
     """The metadata of a weights file."""
 
     network: NetworkConfig
-    frame_rate_hz: OrdinarySize  # of the data: one step of the network is one frame
+    frame_rate_hz: OrdinarySize  # frame rate of the data; a step of the network is one frame
     obstacle_cell_size: OrdinarySize
-    gravity: tuple[float, float, float] = (0.0, -9.8, 0.0)  # of the data; absolute inputs cannot take another
-    # of the data's groups, domain units per second; null: not known
+    gravity: tuple[float, float, float] = (0.0, -9.8, 0.0)  # gravity of the data; absolute inputs support no other
+    # largest initial speed of the data's groups, domain units per second; null: unknown
     maximum_initial_speed: float | None = None
     format_version: int = FORMAT_VERSION
-    step: StepConfig = field(default_factory=StepConfig)  # constraints of its frames
-    updates: int = 0
+    step: StepConfig = field(default_factory=StepConfig)  # constraints of each frame
+    updates: int = 0  # number of updates of the training
     provenance: dict[str, Any] = field(default_factory=dict)  # commit, data set, date, versions
 
     def __post_init__(self) -> None:
@@ -49,9 +50,9 @@ class WeightsInfo:
 
 
 def save_weights(path: Path, network: ParticleNetwork, info: WeightsInfo, stored_precision: str = "fp32") -> None:
-    """Writes the file atomically, with the network's own structure and constraints in place of those in `info`.
+    """Writes the file atomically. Structure and constraints are the network's own, not those in `info`.
 
-    With fp16 the parameters are rounded; the normaliser is not.
+    With fp16 the parameters are rounded. The normaliser is not rounded.
     """
     info = replace(info, network=network.config, step=network.step)
     tensors = {}
@@ -64,12 +65,12 @@ def save_weights(path: Path, network: ParticleNetwork, info: WeightsInfo, stored
 
 
 def shipped_weights() -> dict[str, Path]:
-    """Returns the files of this package by name."""
+    """Returns the shipped files of this package by name."""
     return {path.stem: path for path in sorted(SHIPPED.glob(f"*{SUFFIX}"))}
 
 
 def find_weights(name: str, field: str = "weights") -> Path:
-    """Returns the file of shipped weights by name, of a repository at hf://, or at a path.
+    """Returns the file of shipped weights by name, of a repository (hf://), or at a path.
 
     Raises: ConfigError for a name that is neither shipped nor looks like a path.
     """
@@ -92,8 +93,8 @@ def load_weights(
 ) -> tuple[ParticleNetwork, WeightsInfo]:
     """Returns the network in evaluation mode, float32, on `device`. `field` names the setting in messages.
 
-    Raises: ConfigError when the file is missing, is not a weights file, has another format version, or holds tensors
-    that do not fit the structure it declares.
+    Raises: ConfigError if the file is missing, is not a weights file, has another format version, or contains tensors
+    that do not fit its declared structure.
     """
     if not path.is_file():
         raise ConfigError(f"{field} must be an existing file, got {path}; write one with python -m hgn.export")
@@ -120,7 +121,7 @@ def load_weights(
 def network_with(
     config: NetworkConfig, step: StepConfig, tensors: Mapping[str, torch.Tensor], *, path: Path, field: str
 ) -> ParticleNetwork:
-    """Returns the declared network with the tensors of a file, float32; nothing is allocated before they fit.
+    """Returns the declared network with the tensors of a file in float32. It allocates nothing before they fit.
 
     Raises: ConfigError naming the tensor that does not fit.
     """
@@ -128,7 +129,7 @@ def network_with(
     for name, tensor in tensors.items():
         claims.add(f"{field} tensor {name}", tensor.numel(), 4)
         numbers += tensor.numel()
-    # of each step of message passing two square matrices: the network is not much larger than these
+    # message passing has two square matrices a step; a network is not much larger than these
     count = 2 * config.message_passing_steps * (2 * config.levels - 1)
     rule = (
         f"at least {count} with {count * config.width**2} numbers for network.levels, message_passing_steps and width"
@@ -150,7 +151,7 @@ def network_with(
 
 
 def require_frame_rate(info: WeightsInfo, frame_rate_hz: float) -> None:
-    """Raises ConfigError where data and weights differ in frame rate: a step of a network is a frame of its data."""
+    """Raises ConfigError if data and weights differ in frame rate. A step of a network is a frame of its data."""
     require(
         frame_rate_hz == info.frame_rate_hz,
         "data frame_rate_hz",

@@ -53,11 +53,7 @@ def frames_before(episode: Episode, first: int) -> np.ndarray:
         require_past(episode.past_HN3, -first)
         return np.array(episode.past_HN3[len(episode.past_HN3) + first :])
     return ballistic_positions(
-        episode.position_TN3[0],
-        episode.initial_velocity_N3,
-        episode.gravity,
-        episode.frame_rate_hz,
-        range(first, 0),
+        episode.position_TN3[0], episode.initial_velocity_N3, episode.gravity, episode.frame_rate_hz, range(first, 0)
     )
 
 

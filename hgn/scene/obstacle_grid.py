@@ -31,10 +31,7 @@ class ObstacleGrid:
 
 
 def build_obstacle_grid(
-    obstacles: Sequence[Obstacle],
-    cell_size: float,
-    seed: int,
-    domain_size: Vector | None = None,
+    obstacles: Sequence[Obstacle], cell_size: float, seed: int, domain_size: Vector | None = None
 ) -> ObstacleGrid:
     """Returns the mean obstacle normal of every cell that a surface passes through (Paper sec. 3).
 
@@ -50,10 +47,7 @@ def build_obstacle_grid(
 
 
 def surface_samples(
-    obstacles: Sequence[Obstacle],
-    cell_size: float,
-    seed: int,
-    domain_size: Vector | None = None,
+    obstacles: Sequence[Obstacle], cell_size: float, seed: int, domain_size: Vector | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
     """Returns the samples of `build_obstacle_grid`, float64 [S, 3], and the unit normals of their triangles.
 

@@ -1,8 +1,8 @@
-"""Random scenes after the paper (sec. 3.3): disjoint obstacles, and groups of particles clear of them.
+"""Random scenes after the paper (sec. 3.3): disjoint obstacles, and groups of particles at a distance from them.
 
-A scene follows from (config, seed) alone, bitwise on every machine: all randomness is `PCG64` through
-`Generator.random()`, all geometry that reaches the scene is sums, products and square roots, and the only
-sines and cosines (in the unit shapes) are rounded to float32.
+Config and seed determine a scene bitwise on every machine. All randomness is `PCG64` through `Generator.random()`.
+Coordinates are computed by sums, products and square roots. Only the unit shapes use sines and cosines, rounded to
+float32.
 """
 
 from __future__ import annotations
@@ -15,13 +15,7 @@ import numpy as np
 
 from hgn.config import SceneConfig, is_mesh_file
 from hgn.scene.funnel import Funnel, draw_funnel
-from hgn.scene.group import (
-    WALL_CELLS,
-    Region,
-    points_in_ball,
-    random_direction,
-    region_of,
-)
+from hgn.scene.group import WALL_CELLS, Region, points_in_ball, random_direction, region_of
 from hgn.scene.placement import (
     CLEARANCE_CELLS,
     ROUNDING,
@@ -44,30 +38,29 @@ from hgn.scene.surface import point_tree
 from hgn.scene.world import Layout, draw_layout
 from hgn.schema import ConfigError, Vector, require
 
-REPORT_SEED = 1_000_000  # the first of scenes that reports draw for themselves: a data set's seeds are hashes
+REPORT_SEED = 1_000_000  # first seed of scenes that reports draw; seeds of data sets are hashes
 MAXIMUM_TILTED_GRAVITY = 19.6  # domain units per second squared
-LAYOUTS = 5  # whole scenes begun afresh before giving up
-SHAPES_PER_ITEM = 20  # sizes, shapes and orientations drawn for one obstacle or group
+LAYOUTS = 5  # largest number of layouts that are started for a scene
+SHAPES_PER_ITEM = 20  # attempts for one obstacle or group; each draws size, shape and orientation
 PLACES_PER_SHAPE = 50
-FUNNELS = 300  # drawn for one that fits
-LONE_CELLS = 6  # solver cells from a lone particle to any other: beyond what a network looks at for neighbours
+FUNNELS = 300  # attempts to draw a funnel that fits into the domain
+LONE_CELLS = 6  # solver cells from a lone particle to any other; more than the reach of a network
 
 
 class _NoRoomError(Exception):
-    """One item found no place in this layout."""
+    """An item found no place in this layout."""
 
 
 def generate_scene(config: SceneConfig, seed: int) -> Scene:
-    """A random scene with particles at rest, or with one velocity per group; a lone particle is a group of size 0.
-    Its gravity is the config's, none, or a drawn one. With `kinds`, the scene is of one of them (hgn.scene.world).
+    """Returns a random scene of particle groups at rest or in motion. A lone particle is a group of size 0.
 
-    Obstacles lie completely inside the domain, CLEARANCE_CELLS solver cells from each other and none inside
-    another, but for the four squares of a funnel, which cross; groups keep the same distance to obstacles, to
-    each other and to the solver's walls. Items are placed by rejection: a new place, then a new size, shape and
-    orientation, then a new layout.
+    The scene's gravity is the config's, zero, or drawn. If the config names `kinds`, the scene is of one of them
+    (hgn.scene.world). Obstacles lie inside the domain, CLEARANCE_CELLS solver cells from each other. No obstacle lies
+    inside another. Only the four squares of a funnel cross. Groups keep the same distance from obstacles, from each
+    other and from the solver's walls. An item that does not fit gets a new place, then a new shape, then a new layout.
     `Scene.specification` records every choice in plain JSON types.
 
-    Raises: ConfigError when an item finds no room, with what to change.
+    Raises: ConfigError if an item does not fit. The message names the setting to change.
     """
     require(isinstance(seed, int) and seed >= 0, "seed", "a whole number >= 0", seed)
     kind = None
@@ -77,7 +70,7 @@ def generate_scene(config: SceneConfig, seed: int) -> Scene:
             return assemble(drawn.config, seed, drawn.gravity, drawn.obstacles, drawn.bodies, kind)
         config = drawn
     rng = np.random.Generator(np.random.PCG64(seed))
-    # the rest of a scene is the same without them
+    # separate streams: these draws do not change the scene's other numbers
     lone_rng, motion_rng, funnel_rng = (np.random.Generator(np.random.PCG64([seed, stream])) for stream in (1, 2, 3))
     gravity = _draw_gravity(config, motion_rng)
     colliding = motion_rng.random() < config.colliding_scene_fraction
@@ -103,13 +96,13 @@ def generate_scene(config: SceneConfig, seed: int) -> Scene:
 
 @dataclass(frozen=True)
 class _PlacedFunnel:
-    """A funnel, and where the middle of its hole is."""
+    """A funnel and the place of its hole's centre."""
 
     funnel: Funnel
     hole_3: np.ndarray
 
     def place(self, rng: np.random.Generator) -> np.ndarray:
-        """Above the hole and the inner part of the squares, uniform."""
+        """Draws a uniform place above the hole and the inner part of the squares."""
         low_3, high_3 = self.funnel.low_3, self.funnel.high_3
         local_3 = low_3 + (high_3 - low_3) * rng.random(3)
         return self.hole_3 + rotate(local_3[None], self.funnel.rotation_33)[0]
@@ -137,7 +130,7 @@ def _squares(funnel: Funnel, hole_3: np.ndarray) -> list[Placed]:
 
 
 def _place_obstacles(config: SceneConfig, sheets: list[Placed], rng: np.random.Generator) -> list[Placed]:
-    """`sheets` are placed, and count."""
+    """Returns all obstacles. `sheets` are already placed and count as obstacles."""
     placed = list(sheets)
     for index in range(len(sheets), config.obstacle_count):
         placed.append(_place_obstacle(config, placed, index, rng))
@@ -254,7 +247,7 @@ def _fill_group(config: SceneConfig, shape: str, region: Region, rng: np.random.
 
 
 def _draw_gravity(config: SceneConfig, rng: np.random.Generator) -> Vector:
-    """One of the three kinds; a tilted one is uniform in direction and in size."""
+    """Draws the config's, zero or tilted gravity. Tilted gravity is uniform in direction and in size."""
     kind, size = rng.random(2).tolist()
     direction_3 = random_direction(rng)
     if kind < config.zero_gravity_fraction:
@@ -265,8 +258,9 @@ def _draw_gravity(config: SceneConfig, rng: np.random.Generator) -> Vector:
 
 
 def _purify(config: SceneConfig, bodies: list[Body], gravity: Vector, rng: np.random.Generator) -> list[Body]:
-    """Gives some of the moving groups a velocity exactly along gravity, against it or across it, uniform in size;
-    y is up where there is no gravity.
+    """Gives some of the moving groups a velocity exactly along gravity, against it or across it, uniform in size.
+
+    Without gravity y is up.
     """
     if config.pure_direction_fraction == 0:
         return bodies
@@ -285,8 +279,9 @@ def _purify(config: SceneConfig, bodies: list[Body], gravity: Vector, rng: np.ra
 
 
 def _collide(config: SceneConfig, bodies: list[Body], rng: np.random.Generator) -> list[Body]:
-    """Throws groups, two by two or all, so that they meet in the middle, off centre by up to half a group's size: the
-    fastest at half the maximum speed or more. A group without a partner rests.
+    """Throws groups at each other, in pairs or all together. A group without a partner rests.
+
+    They meet off centre by up to half a group's size. The fastest one has at least half the maximum speed.
     """
     pairs, changed = rng.random() < 0.5, [thrown(body, np.zeros(3)) for body in bodies]
     size = 2 if pairs else max(len(bodies), 1)

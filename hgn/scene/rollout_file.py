@@ -184,8 +184,7 @@ def cell_obstacles(grid: ObstacleGrid, plane_z: float | None = None) -> tuple[Ob
         side_K3, other_K3 = np.eye(3)[:2, None]
     half = 0.5 * grid.cell_size
     corner_K43 = np.stack(
-        [center_K3 + half * (a * side_K3 + b * other_K3) for a, b in ((-1, -1), (1, -1), (1, 1), (-1, 1))],
-        axis=1,
+        [center_K3 + half * (a * side_K3 + b * other_K3) for a, b in ((-1, -1), (1, -1), (1, 1), (-1, 1))], axis=1
     )
     first_K = 4 * np.arange(len(center_K3))
     triangle_F3 = np.concatenate([np.stack((first_K, first_K + i, first_K + i + 1), axis=1) for i in (1, 2)])

@@ -132,10 +132,4 @@ def _circle(segments: int) -> list[tuple[float, float]]:
     return [(math.cos(angle), math.sin(angle)) for angle in angles]
 
 
-_BUILDERS = {
-    "half_box": _half_box,
-    "square": _square,
-    "half_sphere": _half_sphere,
-    "cone": _cone,
-    "pyramid": _pyramid,
-}
+_BUILDERS = {"half_box": _half_box, "square": _square, "half_sphere": _half_sphere, "cone": _cone, "pyramid": _pyramid}

@@ -1,19 +1,22 @@
 """The constraints of a frame in PyTorch: rest, walls and obstacles; the reference of the backend triton.
 
-Each stage takes what the stage before returns:
+Each stage takes the result of the stage before:
 
     Prediction --rested--> accelerations --moved--> FreeMotion --constrained--> Motion --next_state--> ParticleState
 
-docs/concepts/constraints.md derives them. P of **rest** is sum_K w_pK min(1, 2 q_K) (value_p - mean_K - Omega_K x y_p):
-K are the middles of coarsest cells, w_pK trilinear weights times the particle's gate sum_C w_pC t_C; mean, rate of
-rotation Omega_K and centre of mass are those with these weights, and q_K says how well rotation is known (`rotation`).
-With the next displacement u = v + a and d = P u accelerations become a - P (phi d), where phi = 2 - |d|^2 /
-(threshold |g|)^2 within 0 and 1. The same follows between cells of four times that size, with what the first has left;
-FRICTIONLESS materials are not part of it.
+docs/concepts/constraints.md derives the constraints. `Deformation` computes the operator P of the **rest** constraint:
 
-**Obstacles**: a particle exactly on a plane stays on the side of the normal. Contact is tested nearer, by SLACK of the
-clearance, than ends are placed, so that rounding never triggers a contact again.
-Shape legend: N particles, C coarsest cells, K middles of cells, F triangles, P pairs of particles and triangles.
+    (P u)_p = sum_K w_pK min(1, 2 q_K) (u_p - mean_K - Omega_K x y_pK),    accelerations become a - P (phi P (v + a))
+
+    K        centre of a coarsest cell; its mean, rotation and centre of mass use the weights w_pK
+    w_pK     trilinear weight of centre K at particle p, times the particle's gate sum_C w_pC t_C (t = touched)
+    mean_K   mean of u; Omega_K is the rate of rotation of u; y_pK is the place of p relative to the centre of mass
+    q_K      1 where the rotation is determined by the particles, 0 where it is not (`rotation`)
+    phi      2 - |d|^2 / (threshold |g|)^2, clamped to 0 to 1, for d = P (v + a)
+
+The remaining deformation is reduced in the same way on cells four times as large, except for FRICTIONLESS materials.
+**Obstacles** act on both sides of a triangle. A particle exactly on a plane counts as on the normal's side.
+Shape legend: N particles, C coarsest cells, K centres of cells, F triangles, P pairs of particles and triangles.
 """
 
 from __future__ import annotations
@@ -32,13 +35,15 @@ from hgn.network.grid import CORNER_83, GridHierarchy
 from hgn.network.relative import SMALLEST_MASS, coarsest_cells, coarsest_places, inertia, rotation
 from hgn.step_config import StepConfig
 
-SURE = 0.5  # q from which on rotation counts as known
-LEAST = 1e-30  # of a limit squared
-REST_SIZES, LEVEL_SHIFT = 2, 2  # sizes of cells, and the shift from one to the next: 2^LEVEL_SHIFT times as large
-FRICTIONLESS = ("water",)  # materials that do not rest between the larger cells
-SLACK = 0.02  # of the clearance; a particle that starts nearer and approaches ends farther out by this
-SURFACES = 3  # triangles that move the end of one way; where a further one stops it, it ends there
-LEAST_CREASE = 1e-4  # squared sine of the angle between two planes, below which they are one
+SURE = 0.5  # smallest q at which rotation is removed in full
+LEAST = 1e-30  # lower bound of a squared limit; avoids a division by zero
+REST_SIZES, LEVEL_SHIFT = 2, 2  # number of cell sizes; each size is 2^LEVEL_SHIFT times the size before
+FRICTIONLESS = ("water",)  # materials without rest on the larger cells
+# Contact is tested at (1 - SLACK) clearance. End points lie at the clearance, so rounding triggers no second contact.
+# A particle that starts nearer than the test distance and approaches ends farther away by SLACK clearance.
+SLACK = 0.02
+SURFACES = 3  # largest number of triangles that shift the end of one path; at the next triangle the path ends
+LEAST_CREASE = 1e-4  # squared sine of the angle between two planes; planes at a smaller angle count as one
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,12 +65,12 @@ class Motion:
 def accelerations(
     network: ParticleNetwork, state: ParticleState, prediction: Prediction, step: StepConfig | None = None
 ) -> torch.Tensor:
-    """Returns accelerations [N, 3] in frame units with the rest of `step`, by default `network.step`."""
+    """Returns accelerations [N, 3] in frame units after the rest constraint of `step` (default: `network.step`)."""
     return network.restored_acceleration(rested(network, state, prediction, step), state)
 
 
 class Accelerations(nn.Module):
-    """`accelerations` as a module of a state, for graphs and gradients."""
+    """Computes `accelerations` of a state as a module, for CUDA graphs and gradients."""
 
     def __init__(self, network: ParticleNetwork) -> None:
         super().__init__()
@@ -78,7 +83,7 @@ class Accelerations(nn.Module):
 def rested(
     network: ParticleNetwork, state: ParticleState, prediction: Prediction, step: StepConfig | None = None
 ) -> torch.Tensor:
-    """Returns the network's normalised accelerations [N, 3] with the rest of `step`, by default `network.step`."""
+    """Returns the normalised accelerations [N, 3] after the rest constraint of `step` (default: `network.step`)."""
     step = network.step if step is None else step
     if not step.rests:
         return prediction.acceleration_N3
@@ -90,7 +95,7 @@ def rested(
 
 
 def advanced(state: ParticleState, acceleration_N3: torch.Tensor, step: StepConfig, dimensions: int) -> ParticleState:
-    """Returns the state after a frame with these accelerations in frame units."""
+    """Returns the state after a frame with these accelerations [N, 3] in frame units."""
     return next_state(state, constrained(state, moved(state, acceleration_N3), step, dimensions))
 
 
@@ -101,9 +106,9 @@ def moved(state: ParticleState, acceleration_N3: torch.Tensor) -> FreeMotion:
 
 
 def constrained(state: ParticleState, motion: FreeMotion, step: StepConfig, dimensions: int) -> Motion:
-    """Applies walls, then obstacles. `state` is the one before the frame. A changed position changes the velocity.
+    """Applies walls, then obstacles. `state` is the state before the frame. A shifted end changes the velocity.
 
-    Particles that are not `within_range` stay as they are, so that divergence shows in their positions.
+    Particles that are not `within_range` keep their positions, so that divergence stays visible.
     """
     position_N3 = motion.position_N3
     if step.wall_clearance is None and step.obstacle_clearance is None:
@@ -117,7 +122,7 @@ def constrained(state: ParticleState, motion: FreeMotion, step: StepConfig, dime
 
 
 def next_state(state: ParticleState, motion: Motion) -> ParticleState:
-    """Returns the state after a motion. Velocity is kept as state, not as a difference of positions."""
+    """Returns the state after a motion. It stores the velocity itself, not a difference of positions."""
     history_NM3 = torch.cat([motion.velocity_N3[:, None], state.velocity_NM3[:, :-1]], dim=1)
     return replace(state, position_N3=motion.position_N3, velocity_NM3=history_NM3)
 
@@ -131,10 +136,10 @@ def within_range(position_N3: torch.Tensor, domain_N3: torch.Tensor) -> torch.Te
 
 
 class Deformation:
-    """The operator P between cells 2^shift times as large as the coarsest cells of a grid.
+    """The operator P on cells 2^shift times as large as the coarsest cells of a grid.
 
-    It acts in cells with `touched_C` and on particles with `share_N` = 1. Called with a field [N, 3], it returns the
-    part that deforms.
+    Called with a field [N, 3], it returns the deformation part of the field [N, 3].
+    Weights are multiplied by `touched_C` of the cells, and by `share_N` of the particles.
     """
 
     def __init__(
@@ -174,7 +179,7 @@ class Deformation:
         return (self.weight_N8[..., None] * part_N83).sum(1)
 
     def _sums(self, value_N8X: torch.Tensor) -> torch.Tensor:
-        """Returns weighted sums, [K, X]."""
+        """Returns weighted sums over the particles of each centre, [K, X]."""
         value_N8X = self.weight_N8[..., None] * value_N8X
         sum_KX = value_N8X.new_zeros(self.count, value_N8X.shape[-1])
         return sum_KX.index_add(0, self.middle_N8.flatten(), value_N8X.flatten(0, 1))
@@ -189,26 +194,27 @@ def rest(
     scale: torch.Tensor,
     widely_M: torch.Tensor,
 ) -> torch.Tensor:
-    """Returns accelerations less gravity, as `balanced` gives them, without slow deformations, [N, 3], in units of the
-    normaliser's `scale`. `widely_M` is 1 for the materials that rest between larger cells, too.
+    """Returns normalised accelerations [N, 3] without slow deformation. Input and result do not contain gravity.
+
+    `scale` is the unit of the accelerations. `widely_M` is 1 for materials that also rest on the larger cells.
     """
     widely_N = widely_M[state.material_N]
     limit_N = ((threshold / scale) ** 2 * state.gravity_S3.square().sum(-1))[state.scene_N]
     for level in range(REST_SIZES):
         deformation = Deformation(touched_C, grid, level * LEVEL_SHIFT, widely_N if level else None)
-        # gravity, which is the same for all of a scene, is no part of a deformation
+        # gravity is equal for all particles of a scene, so P removes it
         rate_N3 = deformation(acceleration_N3 + state.velocity_NM3[:, 0] / scale)
         acceleration_N3 = acceleration_N3 - deformation(slow(rate_N3, limit_N))
     return acceleration_N3
 
 
 def rests_widely(materials: tuple[str, ...]) -> list[bool]:
-    """Returns whether each material rests between cells larger than the coarsest, too."""
+    """Returns for each material whether it rests on the larger cells too."""
     return [name not in FRICTIONLESS for name in materials]
 
 
 def slow(rate_N3: torch.Tensor, limit_N: torch.Tensor) -> torch.Tensor:
-    """Returns phi d of d and of the threshold's square, which may be 0."""
+    """Returns phi(d) d of the deformation d [N, 3]. `limit_N` is the squared threshold; 0 disables the constraint."""
     ratio_N = rate_N3.square().sum(-1) / limit_N.clamp(min=LEAST)
     return torch.where(limit_N > 0, (2 - ratio_N).clamp(0, 1), 0)[:, None] * rate_N3
 
@@ -232,10 +238,10 @@ def _walled(
 def _outside_obstacles(
     state: ParticleState, position_N3: torch.Tensor, step: StepConfig, dimensions: int, barriers: Barriers
 ) -> torch.Tensor:
-    """Stops the straight path of a frame at up to SURFACES triangles, one after the other, and at walls after each.
+    """Stops the straight path of a frame at up to SURFACES triangles in turn, with walls again after each shift.
 
-    Each triangle shifts the end. If the shift would bring the end nearer to the plane of the previous shift, the end
-    moves along the crease of both planes instead: alternating between the planes of a gutter needs more shifts.
+    Each triangle shifts the end along its normal. If that shift leads back across the plane of the previous shift, the
+    end moves along both planes instead. Otherwise a path in a gutter would alternate between the two planes.
     """
     before_N3, domain_N3 = state.position_N3, state.domain_S3[state.scene_N]
     lost_N1 = ~within_range(position_N3, domain_N3).all(-1, keepdim=True)
@@ -257,8 +263,10 @@ def _outside_obstacles(
 
 
 def _direction(normal_N3: torch.Tensor, last_N3: torch.Tensor) -> torch.Tensor:
-    """Returns shifts along the normals, or where these lead back across the previous planes, along those planes and
-    longer, so that the distance from the new ones is the same."""
+    """Returns the unit normals, or directions along the previous planes if the normals lead back across these.
+
+    Such a direction is longer than 1, so that the end moves by the same distance from the new plane.
+    """
     cosine_N1 = (normal_N3 * last_N3).sum(-1, keepdim=True)
     along_N3 = normal_N3 - cosine_N1 * last_N3
     square_N1 = (along_N3 * along_N3).sum(-1, keepdim=True)
@@ -269,11 +277,11 @@ def _direction(normal_N3: torch.Tensor, last_N3: torch.Tensor) -> torch.Tensor:
 def first_stop(
     barriers: Barriers, before_N3: torch.Tensor, after_N3: torch.Tensor, scene_N: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Returns which paths a triangle stops, bool [N]; the shifts of their ends [N, 1] along unit normals [N, 3]; and
-    the fraction of each path before the first triangle, [N, 1].
+    """Returns the stops of the straight paths [N, 3] from `before_N3` to `after_N3` at their first triangles.
 
-    Shifts and normals are zero for paths that nothing stops. Positions are finite. Another triangle may stop the path
-    to a shifted end.
+    Results: whether a triangle stops the path, bool [N]; the shift of the end [N, 1]; the unit normal of the shift
+    [N, 3]; the fraction of the path before the first triangle [N, 1]. Without a stop, shift and normal are zero.
+    Positions must be finite. Another triangle may stop the path to the shifted end.
     """
     particle_P, triangle_P = _pairs(barriers, before_N3, after_N3, scene_N)
     row_P24 = barriers.row_F24.to(before_N3.dtype)[triangle_P]
@@ -293,12 +301,12 @@ def first_stop(
     time_P = torch.where(stops_P, torch.where(meets_P, contact_P, crossing_P), 2.0)
     least_N = torch.full_like(before_N3[:, 0], 2.0).scatter_reduce(0, particle_P, time_P.detach(), "amin")
     first_P = stops_P & (time_P == least_N[particle_P])
-    # of several triangles at one time the one with the lowest number
+    # if a path meets several triangles at the same time, the one with the lowest number stops it
     count, pairs = barriers.row_F24.shape[0], particle_P.shape[0]
     number_P = torch.where(first_P, triangle_P, count)
     number_N = torch.full_like(scene_N, count).scatter_reduce(0, particle_P, number_P, "amin")
     first_P = first_P & (triangle_P == number_N[particle_P])
-    # the pair of each particle, a last one that moves nothing for the others
+    # the index of each particle's pair; without a pair, the index of the zero row that is appended below
     place_P = torch.where(first_P, torch.arange(pairs, device=scene_N.device), pairs)
     pair_N = torch.full_like(scene_N, pairs).scatter_reduce(0, particle_P, place_P, "amin")
     push_P4 = torch.cat([(distance_P.clamp(max=within) + slack - end_P)[:, None], side_P[:, None] * normal_P3], 1)
@@ -311,7 +319,7 @@ def first_stop(
 def _pairs(
     barriers: Barriers, before_N3: torch.Tensor, after_N3: torch.Tensor, scene_N: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Returns particles and triangles int64 [P] that include all that meet."""
+    """Returns candidate pairs: particles and triangles, int64 [P]. They include every pair that meets."""
     if is_exporting():
         return pairs_of_boxes(barriers, before_N3, after_N3)
     before_N3, after_N3 = before_N3.detach(), after_N3.detach()
@@ -336,7 +344,7 @@ def _pairs(
 def pairs_of_boxes(
     barriers: Barriers, before_N3: torch.Tensor, after_N3: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Returns pairs of particles and triangles whose boxes meet, without loops, for the export of one scene."""
+    """Returns the pairs of particles and triangles whose boxes meet. It has no loops, for the exported step."""
     low_N3, high_N3 = torch.minimum(before_N3, after_N3), torch.maximum(before_N3, after_N3)
     low_F3, high_F3 = barriers.row_F24[:, 16:19], barriers.row_F24[:, 20:23]
     meets_NF = (low_N3[:, None, 0] <= high_F3[None, :, 0]) & (high_N3[:, None, 0] >= low_F3[None, :, 0])
@@ -350,7 +358,7 @@ def pairs_of_boxes(
 
 
 def _covers(row_P24: torch.Tensor, place_P3: torch.Tensor) -> torch.Tensor:
-    """Returns whether a triangle covers a place in its plane, bool [P]."""
+    """Returns whether a triangle covers a point in its plane, bool [P]."""
     inside_P = ((place_P3 >= row_P24[:, 16:19]) & (place_P3 <= row_P24[:, 20:23])).all(-1)
     for plane in (4, 8, 12):
         inside_P = inside_P & ((row_P24[:, plane : plane + 3] * place_P3).sum(-1) <= row_P24[:, plane + 3])

@@ -1,14 +1,17 @@
 """Pushforward: the network simulates, and learns to return from the simulated states to the data.
 
-The idea of Brandstetter et al. 2022, collected as in DAgger (Ross et al. 2011). Every `pushforward_every` updates the
-present parameters (their moving average where there is one) simulate `pushforward_scenes` scenes, each from a random
-frame of the data on for `pushforward_frames` (in long episodes for `pushforward_episode_fraction` of their frames), or
-to the end of the episode. Each simulated frame becomes a window in a pool, and until the next simulation a fraction of
-the samples is taken from the pool. Noise shows a network random errors, while its own are biased and common to a body.
-Everything is drawn from seed, update and rank. The pool is not part of a checkpoint: a resumed training simulates anew,
-with the same result where the checkpoint is at a multiple of `pushforward_every`.
+The idea is that of Brandstetter et al. 2022. Samples are collected as in DAgger (Ross et al. 2011):
 
-The rule and the pool are here; scenes of a backend are in hgn.training.torch_pushforward and triton_pushforward.
+1. Every `pushforward_every` updates the present parameters (or their moving average) simulate `pushforward_scenes`
+   scenes, each from a random frame of the data. A simulation lasts `pushforward_frames`, or
+   `pushforward_episode_fraction` of the episode's frames if that is more; it stops at the end of the episode.
+2. Each simulated frame becomes a window in a pool. A fraction of the samples of later updates comes from the pool.
+
+Noise shows the network random errors. The network's own errors are biased, and common to a body.
+Seed, update and rank determine all draws. The pool is not part of a checkpoint; a resumed training simulates again.
+Its result is the same if the checkpoint is at a multiple of `pushforward_every`.
+
+This module contains the rule and the pool; torch_pushforward and triton_pushforward simulate.
 Shape legend: H velocity history, F simulated frames, W = H + 2 frames of a window, N particles, S scenes.
 """
 
@@ -42,25 +45,25 @@ class Sample(Protocol):
 
 
 T = TypeVar("T", bound=Sample)
-Starts = tuple[tuple[int, int], ...]  # episodes and frames that the network simulates from
+Starts = tuple[tuple[int, int], ...]  # (episode, frame) of each simulation's start
 START_STREAM, SAMPLE_STREAM = 0x57A7, 0xE217
-# In finest cells, root mean square over a scene. Frames farther from the data are dropped, because its motion is no
-# target for them, and they would dominate the loss; of an untrained network most frames are.
+# Root mean square distance from the data over a scene, in finest cells. Frames beyond it are dropped: the data's motion
+# is no target for them, and they would dominate the loss. Most frames of an untrained network are dropped.
 DROPPED_BEYOND = 0.5
-PULLED_WITHIN = 1.0  # finest cells on each axis: the distance that a target takes a fraction of is clamped to this
+PULLED_WITHIN = 1.0  # largest position error on each axis that a target corrects, in finest cells
 
 
 def simulated_frames(training: TrainingConfig, frame_count: int) -> int:
-    """Returns how many frames are simulated in an episode of `frame_count` frames, if it is long enough."""
+    """Returns the number of frames to simulate in an episode of `frame_count` frames, if the episode is long enough."""
     return max(training.pushforward_frames, int(training.pushforward_episode_fraction * frame_count))
 
 
 def drawn_starts(training: TrainingConfig, update: int, rank: int, frame_counts: Sequence[int]) -> Starts:
-    """Draws episode and frame of each simulation before `update`, from episodes with `frame_counts` frames.
+    """Draws the episode and the start frame of each simulation before `update`.
 
-    Every episode is drawn once before one is drawn twice. After the start frame the episode has as many frames as are
-    simulated and one more, for the last target; or half of its frames, if that is less.
-    Raises: ConfigError when all episodes are too short.
+    Every episode is drawn once before one is drawn twice. The start leaves frames for the whole simulation and one
+    target, or for half of the episode if that is less. `frame_counts` are the numbers of frames of the episodes.
+    Raises: ConfigError if all episodes are too short.
     """
     last = {
         i: count - 2 - min(simulated_frames(training, count), (count - 1) // 2) for i, count in enumerate(frame_counts)
@@ -79,7 +82,7 @@ def drawn_starts(training: TrainingConfig, update: int, rank: int, frame_counts:
 
 
 class PoolDraws:
-    """Draws windows of a pool, by their target accelerations as far as `training.pushforward_importance` says."""
+    """Draws windows of a pool: `training.pushforward_importance` of them by target acceleration, the others evenly."""
 
     def __init__(self, training: TrainingConfig, rank: int, accelerations: Sequence[float]) -> None:
         self._training, self._rank = training, rank
@@ -87,8 +90,9 @@ class PoolDraws:
         self._by_size = DrawnBySize.of(np.array(accelerations, np.float64), training.pushforward_importance)
 
     def drawn(self, update: int) -> list[tuple[int, float]]:
-        """Returns the windows that replace the first samples of an update, `pushforward_fraction` of them on average,
-        each with its loss weight.
+        """Returns the numbers and loss weights of the windows that replace the first samples of an update.
+
+        On average they replace `pushforward_fraction` of the update's samples.
         """
         if not self._windows:
             return []
@@ -98,7 +102,7 @@ class PoolDraws:
 
 
 def known_frames(simulated: int, frame_count: int, frame: int) -> int:
-    """Returns how many of the frames simulated from `frame` on have a target, in an episode of `frame_count` frames."""
+    """Returns how many of the frames simulated after `frame` have a target in an episode of `frame_count` frames."""
     return min(simulated, frame_count - 2 - frame)
 
 
@@ -107,9 +111,9 @@ def pushforward_windows(
 ) -> torch.Tensor:
     """Returns the windows of one scene's simulation, [F, W, N, 3].
 
-    true_TN3 has the frames n - H to n + F + 1 of the data, simulated_FN3 the frames n + 1 to n + F. The last frame of
-    the window of frame k is x_k + (true_{k+1} - true_k) + pull (true_k - x_k): the network undoes its velocity error,
-    and a fraction of its position error, which also brings back particles that crossed a wall.
+    true_TN3 contains the frames n - H to n + F + 1 of the data, simulated_FN3 the frames n + 1 to n + F. The last frame
+    of the window of frame k is x_k + (true_{k+1} - true_k) + pull (true_k - x_k). With this target the network corrects
+    its velocity error and a fraction of its position error. The second part also brings back particles behind a wall.
     """
     frames = len(simulated_FN3)
     history = len(true_TN3) - frames - 2
@@ -124,37 +128,38 @@ def pushforward_windows(
 def usable_frames(
     true_TN3: torch.Tensor, simulated_FN3: torch.Tensor, domain_3: torch.Tensor, cell_size: float
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Returns how many frames can be trained on, from the first on, and the mean squared distance from the data in the
-    last of them, both [] on the device.
+    """Returns the number of leading frames usable for training, and the last one's error. Both are [] on the device.
+
+    The error is the mean squared distance from the data in the last usable frame.
     """
     now_FN3 = true_TN3[len(true_TN3) - len(simulated_FN3) - 1 : -1]
     square_F = (simulated_FN3 - now_FN3).square().sum(-1).mean(-1)
     good_F = (square_F <= (DROPPED_BEYOND * cell_size) ** 2) & ~diverged(simulated_FN3, domain_3).any(
         -1
-    )  # NaN diverged
+    )  # NaN counts as diverged
     count = good_F.int().cumprod(0).sum()
     return count, square_F[(count - 1).clamp(min=0)]
 
 
 @functools.lru_cache(maxsize=256)
 def simulated_barrier(episode: Episode, clearance: float) -> Barrier:
-    """Returns the barrier of an episode's obstacles, empty where only their cells are known.
+    """Returns the barrier of an episode's obstacles; it is empty if only the obstacles' cells are stored.
 
-    Barriers of the last episodes are cached; that of a large mesh takes 0.1 s and more.
+    The last barriers are cached: a large mesh takes 0.1 s or more.
     Raises: ConfigError for a clearance of more than a cell.
     """
     return InitialState.of_episode(episode).barrier(clearance)
 
 
 class SimulatedScenes(Protocol[E, T]):
-    """Scenes of a backend: its episodes, simulations from their frames, and its samples."""
+    """The interface that pushforward needs of a backend: episodes, simulations from their frames, and samples."""
 
     @property
     def cell_size(self) -> float:
-        """The size of the finest cells."""
+        """Returns the size of the finest cells in domain units."""
 
     def frame_count(self, episode: E) -> int:
-        """Returns the number of frames of an episode, without those before frame 0."""
+        """Returns the number of frames of an episode, without the frames before frame 0."""
 
     def domain_size(self, episode: E) -> torch.Tensor:
         """Returns the domain size, [3] on the device."""
@@ -163,7 +168,7 @@ class SimulatedScenes(Protocol[E, T]):
         """Divides scenes into groups that fit into memory."""
 
     def simulate(self, starts: Sequence[tuple[E, int]], frames: int) -> list[torch.Tensor]:
-        """Returns simulated positions [F, N, 3] of each scene of a group; anything after a divergence."""
+        """Returns simulated positions [F, N, 3] of each scene of a group. Values after a divergence are undefined."""
 
     def true_frames(self, episode: E, frame: int, known: int) -> torch.Tensor:
         """Returns the frames of the data from `frame` - H to `frame` + `known` + 1, [T, N, 3]."""
@@ -176,21 +181,21 @@ class SimulatedScenes(Protocol[E, T]):
 
 
 class PushforwardPool(Generic[E, T]):
-    """Windows of the last simulations."""
+    """The windows of the last simulations."""
 
     def __init__(self, scenes: SimulatedScenes[E, T], training: TrainingConfig, rank: int) -> None:
         self._scenes, self.training, self._rank = scenes, training, rank
-        self._samples: list[tuple[T, float]] = []  # with the rms of the target acceleration
+        self._samples: list[tuple[T, float]] = []  # samples, and the rms of their target accelerations
         self._draws = PoolDraws(training, rank, [])
         self.figures: dict[str, float] = {}
 
     def refresh(self, starts: Sequence[tuple[E, int]]) -> None:
-        """Simulates from these frames, and fills the pool with the windows.
+        """Simulates from these starts and fills the pool with the windows.
 
-        Raises: ConfigError the first time, when the backend computes wrongly on this machine.
+        Raises: ConfigError in the first call, if the backend's results differ from PyTorch's.
         """
         begin_s = time.monotonic()
-        self._samples = []  # frees the memory
+        self._samples = []  # frees memory before the simulations
         squares, known = [], 0
         for frames, alike in self._by_frames(starts):
             for group in self._scenes.groups(alike):
@@ -206,7 +211,8 @@ class PushforwardPool(Generic[E, T]):
         self.figures = {f"pushforward/{name}": value for name, value in values.items()}
 
     def replaced(self, samples: Sequence[T], update: int) -> list[T]:
-        """Returns an update's samples with a fraction from the pool: seeds stay, noise scales are computed anew."""
+        """Returns an update's samples with a fraction from the pool. Slots keep seeds; noise scales are recomputed."""
+
         samples, scenes = list(samples), self._scenes
         for slot, (number, rarity) in enumerate(self._draws.drawn(update)):
             own, acceleration = self._samples[number]
@@ -216,7 +222,7 @@ class PushforwardPool(Generic[E, T]):
         return samples
 
     def _by_frames(self, starts: Sequence[tuple[E, int]]) -> list[tuple[int, list[tuple[E, int]]]]:
-        """Groups the starts by the number of frames to simulate; the largest group first."""
+        """Groups the starts by the number of frames to simulate. The largest group comes first."""
         groups: dict[int, list[tuple[E, int]]] = {}
         for episode, frame in starts:
             frames = simulated_frames(self.training, self._scenes.frame_count(episode))
@@ -224,8 +230,9 @@ class PushforwardPool(Generic[E, T]):
         return sorted(groups.items(), key=lambda group: -len(group[1]))
 
     def _add(self, starts: Sequence[tuple[E, int]], simulated: Sequence[torch.Tensor]) -> list[float]:
-        """Adds the windows of simulated scenes; returns the mean squared distance from the data in the last frame of
-        each scene that is usable until then.
+        """Adds the windows of simulated scenes to the pool.
+
+        Returns the mean squared distances from the data in the last frame, for scenes whose frames are all usable.
         """
         scenes, cell_size, squares = self._scenes, self._scenes.cell_size, []
         pairs = list(zip(starts, simulated, strict=True))
