@@ -1,8 +1,9 @@
 """Obstacle triangles near each cell, for the step constraint that keeps particles outside obstacles.
 
 A triangle covers the points within `clearance` of its plane and at most MARGIN * clearance beyond its edges. Its row
-contains four planes (unit normal and offset): its own, then one for each edge, pointing outwards and moved out by that
-margin; and the box of its corners, widened by 2 * clearance. The covered points are inside the edge planes and the box.
+contains four planes (unit normal and offset) and a box. The first plane is its own; the others are those of the edges,
+which point outwards and are moved out by the margin. The box of the corners is widened by 2 * clearance. Covered points
+are inside the edge planes and the box.
 Shape legend: F triangles, Q cells, E entries of their lists, C cells of a box.
 """
 
@@ -18,21 +19,21 @@ from hgn.scene.rotation import round_to_float32
 from hgn.scene.surface import area_vectors, split_long_edges
 from hgn.schema import Vector, require
 
-ROW = 24  # numbers of a triangle: four planes of four; the box, its corners padded with zeros
-CELLS = 2  # obstacle cells per cell: narrower cells have equally long lists, and more of them
-# of the clearance: enough for rounding at shared edges; a margin as wide as the clearance would form a lip at convex
-# edges that stops sliding particles
+ROW = 24  # numbers of a triangle: four planes of four, then the box's two corners, padded with zeros
+CELLS = 2  # obstacle cells per cell; narrower cells would have lists of the same length, and more of them
+# fraction of the clearance, enough for rounding at shared edges; a margin as wide as the clearance would form a lip at
+# convex edges, and stop sliding particles
 MARGIN = 0.1
-LEAST_HEIGHT = 1e-9  # domain units, of a triangle above its longest edge; thinner ones are covered by others
-CELLS_AT_ONCE = 1 << 18  # of triangles' boxes, to bound memory
+LEAST_HEIGHT = 1e-9  # smallest height above the longest edge, domain units; neighbours cover thinner triangles
+CELLS_AT_ONCE = 1 << 18  # number of cells of triangles' boxes in a pass; limits memory
 
 
 @dataclass(frozen=True, eq=False)
 class Barrier:
-    """The obstacles of one scene; cell q spans [q, q + 1) * cell_size.
+    """The obstacles of one scene. Cell q spans [q, q + 1) * cell_size.
 
-    For a path cut into pieces no longer than a cell, the lists of the cells at the pieces' midpoints contain every
-    triangle that covers a part of it.
+    A path is cut into pieces no longer than a cell. The lists of the cells at the pieces' midpoints contain every
+    triangle that covers a part of the path.
     """
 
     cell_size: float
@@ -44,19 +45,18 @@ class Barrier:
 
 
 def build_barrier(corner_F33: np.ndarray, cell_size: float, clearance: float, domain_size: Vector) -> Barrier:
-    """Returns the barrier of triangles, corners [F, 3, 3] in domain units; `cell_size` is that of obstacle cells. Parts
-    more than a cell outside the domain are left out.
+    """Returns the barrier of triangles, corners [F, 3, 3] in domain units. `cell_size` is the obstacle cells'.
 
-    Raises: ConfigError for an invalid clearance.
+    Parts more than a cell outside the domain are omitted. Raises: ConfigError for an invalid clearance.
     """
     return barrier_of_pieces(barrier_pieces(corner_F33, cell_size, domain_size), cell_size, clearance)
 
 
 def barrier_pieces(corner_F33: np.ndarray, cell_size: float, domain_size: Vector | None = None) -> np.ndarray:
-    """Returns the triangles of a barrier, corners float64 [F', 3, 3]: long ones cut to pieces, none without area.
+    """Returns the triangles of a barrier, corners float64 [F', 3, 3]: long ones are cut, those without area omitted.
 
-    With `domain_size`, pieces more than a cell outside are dropped. Corners are rounded to float32, so that float32
-    input gives the same rows.
+    With `domain_size`, pieces more than a cell outside are omitted. Corners are rounded to float32, so float32 input
+    gives the same rows.
     """
     box = None
     if domain_size is not None:
@@ -68,7 +68,7 @@ def barrier_pieces(corner_F33: np.ndarray, cell_size: float, domain_size: Vector
 
 
 def barrier_of_pieces(corner_F33: np.ndarray, cell_size: float, clearance: float) -> Barrier:
-    """Returns the barrier of `barrier_pieces`, row f from triangle f. Raises: ConfigError for an invalid clearance."""
+    """Returns the barrier of `barrier_pieces`: row f is triangle f. Raises: ConfigError for an invalid clearance."""
     require(0 < clearance <= cell_size, "obstacle_clearance", f"above 0, up to a cell ({cell_size:g})", clearance)
     row_F24, cell_size = _rows(corner_F33, clearance), CELLS * cell_size
     cell_Q3, start_Q, triangle_E = _lists(row_F24, cell_size, clearance)
@@ -101,14 +101,14 @@ def _rows(corner_F33: np.ndarray, clearance: float) -> np.ndarray:
 def _lists(row_F24: np.ndarray, cell_size: float, clearance: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Returns cells [Q, 3], the start of each cell's list [Q + 1], and the triangles of all lists [E].
 
-    A list contains the triangles within half a cell, because a piece of a path may reach half a cell beyond the cell of
-    its midpoint.
+    A list contains the triangles within half a cell, because a piece of a path may extend half a cell beyond the cell
+    of its midpoint.
     """
     reach = 0.5 * cell_size * (1 + 1e-3)
     low_F3 = np.floor((row_F24[:, 16:19] - reach) / cell_size).astype(np.int64)
     extent_F3 = np.floor((row_F24[:, 20:23] + reach) / cell_size).astype(np.int64) - low_F3 + 1
     origin_3 = low_F3.min(axis=0, initial=0)
-    all_cells = tuple((low_F3 + extent_F3).max(axis=0, initial=1) - origin_3)  # extents, for numbering cells
+    all_cells = tuple((low_F3 + extent_F3).max(axis=0, initial=1) - origin_3)  # extents, which number the cells
     low_F = np.ravel_multi_index(tuple((low_F3 - origin_3).T), all_cells)
     numbers, triangles = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)]
     for triangle_F, cell_3C in _alike(extent_F3):
@@ -125,7 +125,7 @@ def _lists(row_F24: np.ndarray, cell_size: float, clearance: float) -> tuple[np.
 
 
 def _alike(extent_F3: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Yields triangles [F'] whose boxes have equal extents, and the cells of such a box, [3, C]."""
+    """Groups triangles [F'] by the extents of their boxes. Yields them with the cells of such a box, [3, C]."""
     shape = tuple(extent_F3.max(axis=0, initial=0) + 1)
     extent_F = np.ravel_multi_index(tuple(extent_F3.T), shape)
     for extent in np.unique(extent_F):
@@ -138,7 +138,7 @@ def _alike(extent_F3: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
 def _near(
     row_F24: np.ndarray, low_F3: np.ndarray, cell_3C: np.ndarray, cell_size: float, reach: float, clearance: float
 ) -> np.ndarray:
-    """Returns whether a triangle's covered volume may come within `reach` of a cell, by its planes, bool [F, C]."""
+    """Returns whether the planes allow a triangle's covered volume within `reach` of a cell, bool [F, C]."""
     centre_F3, half = (low_F3 + 0.5) * cell_size, 0.5 * cell_size + reach
     near_FC = np.ones((len(row_F24), cell_3C.shape[1]), bool)
     for plane in range(4):

@@ -14,20 +14,19 @@ import numpy as np
 from hgn.scene.scene import Obstacle
 from hgn.scene.surface import area_vectors
 
-POINTS_PER_CHUNK = 1 << 14  # temporaries stay in a core's cache
-PAIRS_PER_CHUNK = 1 << 14  # of dense solid-angle sums, for the same reason
-DIRECT_TRIANGLES = 1024  # with more the tree is faster than the dense sum
-LEAF_TRIANGLES = 16
-FAR_FIELD_RATIO = 2.5  # in radii of a cluster
+POINTS_PER_CHUNK = 1 << 14  # limit for which temporary arrays fit into a core's cache
+PAIRS_PER_CHUNK = 1 << 14  # the same limit for dense sums of solid angles
+DIRECT_TRIANGLES = 1024  # number of triangles above which the tree is faster than the dense sum
+LEAF_TRIANGLES = 16  # largest number of triangles in a leaf of the tree
+FAR_FIELD_RATIO = 2.5  # distance over a cluster's radius at which it counts as a dipole
 
 
 def closest_points(point_P3: np.ndarray, triangle_P33: np.ndarray) -> np.ndarray:
     """Returns the point of each triangle that is closest to its partner point, float64 [P, 3].
 
-    `triangle_P33` holds corners, [pair, corner, axis]. The nearest of the foot of the perpendicular
-    (where it lies inside) and of the nearest points of the three edges; it equals the region walk of Ericson,
-    Real-Time Collision Detection, sec. 5.1.5, and needs no area: triangles that are a segment or a single
-    point give the closest point of that segment or point.
+    `triangle_P33` contains corners, [pair, corner, axis]. The closest point is the nearest of four: the foot of the
+    perpendicular, if it lies inside, and the closest points of the three edges. The result equals the region walk of
+    Ericson, Real-Time Collision Detection, sec. 5.1.5. Triangles without area, segments or points, are valid.
     """
     point, corner = np.asarray(point_P3, np.float64), np.asarray(triangle_P33, np.float64)
     closest = np.empty(point.shape)
@@ -42,10 +41,10 @@ def closest_points(point_P3: np.ndarray, triangle_P33: np.ndarray) -> np.ndarray
 def winding_numbers(point_P3: np.ndarray, triangle_F33: np.ndarray) -> np.ndarray:
     """Returns the generalised winding number of the triangles about each point, float64 [P].
 
-    +1 or -1 inside a closed mesh (by its orientation), 0 outside; between for meshes with holes. Zero-area
-    triangles add nothing. Up to DIRECT_TRIANGLES the solid angles are summed exactly (van Oosterom and
-    Strackee 1983; Jacobson et al. 2013), in bounded memory; larger meshes take clusters that are far away as
-    dipoles (Barill et al. 2018), with errors of the order of 0.01.
+    It is +1 or -1 inside a closed mesh (by its orientation), 0 outside, and between for meshes with holes. Zero-area
+    triangles add nothing. Up to DIRECT_TRIANGLES solid angles are summed exactly (van Oosterom and Strackee 1983;
+    Jacobson et al. 2013) in bounded memory. For larger meshes distant clusters count as dipoles (Barill et al. 2018),
+    with errors of about 0.01.
     """
     point = np.asarray(point_P3, np.float64).reshape(-1, 3)
     triangle = np.asarray(triangle_F33, np.float64).reshape(-1, 3, 3)
@@ -63,9 +62,9 @@ def winding_numbers(point_P3: np.ndarray, triangle_F33: np.ndarray) -> np.ndarra
 
 
 def contains(point_P3: np.ndarray, obstacle: Obstacle) -> np.ndarray:
-    """Returns whether each point lies inside the obstacle, bool [P]; no point is inside a sheet.
+    """Returns whether each point lies inside the obstacle, bool [P]. No point is inside a sheet.
 
-    Triangle orientation does not matter: inside is |winding number| > 0.5.
+    Inside means |winding number| > 0.5, so the orientation of triangles has no effect.
     """
     point = np.asarray(point_P3, np.float64).reshape(-1, 3)
     inside = np.zeros(len(point), bool)
@@ -87,7 +86,7 @@ def fraction_inside(position_N3: np.ndarray, obstacles: Sequence[Obstacle]) -> f
 
 
 def _closest_of_axes(point: np.ndarray, corner: np.ndarray) -> np.ndarray:
-    """`closest_points`, with an array for each axis: points [3, P], corners [3, 3, P]."""
+    """Computes `closest_points` with an array for each axis: points [3, P], corners [3, 3, P]."""
     a, b, c = corner
     ab, ac, ap = b - a, c - a, point - a
     best = _closest_on_segment(ap, a, ab)
@@ -103,7 +102,7 @@ def _closest_of_axes(point: np.ndarray, corner: np.ndarray) -> np.ndarray:
     divisor = np.where(normal_square > 0, normal_square, 1.0)
     u = dot(cross(ap, ac), normal) / divisor
     v = dot(cross(ab, ap), normal) / divisor
-    # measured from the corner, so that a sliver's inaccurate normal cannot leave the triangle
+    # measured from the corner, so that the inaccurate normal of a sliver cannot move the foot out of the triangle
     foot = a + u * ab + v * ac
     better = (normal_square > 0) & (u >= 0) & (v >= 0) & (u + v <= 1) & (square(point - foot) < best_square)
     np.copyto(best, foot, where=better)
@@ -119,7 +118,7 @@ def _closest_on_segment(from_start: np.ndarray, start: np.ndarray, edge: np.ndar
 def _solid_angles(point: np.ndarray, triangle: np.ndarray) -> np.ndarray:
     """Returns the signed solid angle of triangles, corners [3, 3, ...], from points [3, ...]; trailing axes broadcast.
 
-    Seen from a point in its own plane a triangle has solid angle 0 outside and is undefined inside.
+    Seen from a point in its own plane, a triangle has solid angle 0 outside it. Inside it the angle is undefined.
     """
     a, b, c = (corner - point for corner in triangle)
     la, lb, lc = (np.sqrt(square(side)) for side in (a, b, c))
@@ -130,7 +129,7 @@ def _solid_angles(point: np.ndarray, triangle: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class _Tree:
-    """A binary tree over triangles sorted so that each node owns the slice [first, last)."""
+    """A binary tree over sorted triangles. A node contains the slice [first, last)."""
 
     first_T: np.ndarray
     last_T: np.ndarray
@@ -142,7 +141,7 @@ class _Tree:
 
 
 def _build_tree(triangle_F33: np.ndarray) -> _Tree:
-    """Splits at the median of the longest axis, one level of the tree at a time."""
+    """Splits nodes at the median of the longest axis, one level of the tree after the other."""
     centroid = triangle_F33.mean(axis=1)
     order = np.arange(len(triangle_F33))
     first, last, children = [0], [len(order)], [[-1, -1]]
@@ -191,7 +190,7 @@ def _slice_sums(value: np.ndarray, first: np.ndarray, last: np.ndarray) -> np.nd
 def _tree_winding_numbers(point: np.ndarray, triangle_F33: np.ndarray) -> np.ndarray:
     tree = _build_tree(triangle_F33)
     solid_angle = np.zeros(len(point))
-    rows = 4096  # points at once, to bound memory
+    rows = 4096  # number of points in a pass; limits memory
     for start in range(0, len(point), rows):
         chunk = point[start : start + rows]
         total = solid_angle[start : start + rows]
@@ -225,7 +224,7 @@ def _leaf_solid_angles(point: np.ndarray, who: np.ndarray, node: np.ndarray, tre
 
 
 def dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Returns scalar products of vectors [3, ...]; arrays of axes take a third of the time of rows of three."""
+    """Returns scalar products of vectors [3, ...]. One array per axis takes a third of the time of rows of three."""
     return np.asarray(a[0] * b[0] + a[1] * b[1] + a[2] * b[2])
 
 

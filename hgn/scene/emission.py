@@ -15,17 +15,17 @@ from hgn.scene.group import points_in_ball
 from hgn.scene.scene import Scene
 from hgn.schema import Vector, require
 
-WAYS = 256  # entering particles whose paths are checked for obstacles
+WAYS = 256  # largest number of entering particles whose paths are checked for obstacles
 
 
 @dataclass(frozen=True)
 class Face:
-    """A disc, or a rectangle where `edges` are not zero, perpendicular to a velocity. Domain units."""
+    """A disc, or a rectangle if `edges` are not zero, perpendicular to a velocity. Domain units."""
 
     centre: Vector
-    velocity: Vector  # domain units per second, of entering particles
+    velocity: Vector  # velocity of entering particles, domain units per second
     radius: float = 0.0
-    edges: tuple[float, float] = (0.0, 0.0)  # the first is horizontal, along x for a vertical velocity
+    edges: tuple[float, float] = (0.0, 0.0)  # the first edge is horizontal, and along x for a vertical velocity
 
     @property
     def area(self) -> float:
@@ -48,7 +48,7 @@ class Face:
         return np.asarray(0.5 * np.array(self.edges) @ np.abs(self.axes))
 
     def count(self, seconds: float, particles_per_cell: float, cell_size: float) -> int:
-        """Returns the number of particles that enter in this time, at the density of groups."""
+        """Returns the number of particles that enter in this time at the density of groups."""
         volume = self.area * float(np.linalg.norm(self.velocity)) * seconds
         return round(particles_per_cell * volume / cell_size**3)
 
@@ -66,14 +66,14 @@ class Face:
 
 
 def entry_frames(scene: Scene, frame_rate_hz: float) -> np.ndarray:
-    """Returns the first frame of each particle, int64 [N], at its time of entry or after it."""
+    """Returns the first frame of each particle, int64 [N]: the first one at or after its time of entry."""
     if scene.entry_s_N is None:
         return np.zeros(scene.particle_count, np.int64)
     return np.maximum(np.ceil(scene.entry_s_N * frame_rate_hz - 1e-9), 0).astype(np.int64)
 
 
 def at_entry(scene: Scene, frame_rate_hz: float) -> Scene:
-    """Returns the scene with each particle at its first frame, in free flight from the face."""
+    """Returns the scene with each particle at its first frame, after free flight from the face."""
     if scene.entry_s_N is None:
         return scene
     time_N1 = (entry_frames(scene, frame_rate_hz) / frame_rate_hz - scene.entry_s_N)[:, None]
@@ -101,8 +101,9 @@ def at_start(scene: Scene) -> Scene:
 
 
 def require_free_entries(scene: Scene, entered: Scene) -> None:
-    """Raises ConfigError where an obstacle in its initial pose blocks the path from an emitter to the particles' first
-    positions (`entered`, from `at_entry`).
+    """Raises ConfigError if an obstacle in its initial pose blocks an entering particle's path.
+
+    The path leads from the emitter to the particle's first position (`entered`, from `at_entry`).
     """
     if scene.entry_s_N is None:
         return
@@ -118,7 +119,7 @@ def require_free_entries(scene: Scene, entered: Scene) -> None:
 
 
 def _crosses(start_3: np.ndarray, way_3: np.ndarray, corner_F33: np.ndarray) -> bool:
-    """Returns whether a path meets a triangle (Möller and Trumbore 1997)."""
+    """Returns whether a straight path meets a triangle (Möller and Trumbore 1997)."""
     edge_1, edge_2 = corner_F33[:, 1] - corner_F33[:, 0], corner_F33[:, 2] - corner_F33[:, 0]
     across = np.cross(way_3, edge_2)
     determinant = (edge_1 * across).sum(axis=1)

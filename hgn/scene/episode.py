@@ -1,7 +1,7 @@
 """An episode: one scene's simulated trajectory, as stored in shards and read by the trainer.
 
-Each field is a member of its own (`position.npy`, `material.npy`, ..., `json`), so that any WebDataset or tar client
-reads it and a trainer can memory-map the positions. No pickles are used.
+Each field is a member of its own (`position.npy`, `material.npy`, ..., `json`). So any WebDataset or tar client can
+read it, and a trainer can memory-map the positions. Pickles are not used.
 Shape legend: T frames, N particles, K obstacle cells, H frames before frame 0, P particles of obstacles.
 """
 
@@ -27,7 +27,7 @@ SCHEMA_VERSION = 1
 POSITION_MEMBER = "position.npy"
 DESCRIPTION_MEMBER = "json"
 PARAMETER_PREFIX = "parameter_"
-# arrays, each a member NAME.npy: stored type, and axes by the shape legend
+# arrays by name, each stored as a member NAME.npy: stored type, and axes by the shape legend
 _ARRAYS = {
     "position": ("<f4", "TN3"),
     "velocity": ("<f4", "N3"),
@@ -47,8 +47,8 @@ _NAME = re.compile(r"[A-Za-z0-9_-]+")
 class Episode:
     """A trajectory. Frame 0 is the initial state, so T frames are T - 1 steps of 1 / frame_rate_hz seconds.
 
-    Raises: ConfigError for a wrong shape, type or value. Positions are not checked to be finite here (they may be a
-    memory map of a verified file), but by `encode_episode` and `decode_episode`.
+    Raises: ConfigError for a wrong shape, type or value. `encode_episode` and `decode_episode` check that positions
+    are finite; the class does not, because positions may be a memory map of a verified file.
     """
 
     key: str  # sample name inside the data set, without dots: train-000012
@@ -60,11 +60,11 @@ class Episode:
     gravity: Vector  # domain units per second squared
     frame_rate_hz: Positive[float]
     seed: int
-    specification: dict[str, Any]  # how the scene was made
+    specification: dict[str, Any]  # all choices that made the scene
     solver: dict[str, Any]  # settings and counters: substeps, projections, floors hit
     # per-particle material parameters that differ from the solver's defaults, float32 [N] by name
     material_parameters: dict[str, np.ndarray] = field(default_factory=dict)
-    materials: tuple[str, ...] = MATERIALS  # imported sets append names of their own
+    materials: tuple[str, ...] = MATERIALS  # imported sets append their own names
     past_HN3: np.ndarray | None = None  # float32, the frames before frame 0, oldest first; None: free flight
     boundary_P3: np.ndarray | None = None  # float32, particles at rest that represent obstacles
 
@@ -104,7 +104,7 @@ class Episode:
 
     @property
     def dimensions(self) -> int:
-        """Dimensions of the motion; 2 where z is constant."""
+        """The number of dimensions of the motion; with 2, z is constant."""
         return int(self.specification.get("dimensions", 3))
 
     @property
@@ -148,10 +148,9 @@ class _Description:
 def encode_episode(episode: Episode) -> dict[str, bytes]:
     """Returns the members of an episode by their name after `<key>.`, in storage order.
 
-    The same episode gives the same bytes on every machine: plain `.npy` (version 1.0, little-endian, C order)
-    and JSON with sorted keys.
-
-    Raises: ConfigError when positions are not finite or specification, solver cannot be written as JSON.
+    The same episode gives the same bytes on every machine: plain `.npy` (version 1.0, little-endian, C order) and JSON
+    with sorted keys.
+    Raises: ConfigError if positions are not finite, or if specification or solver cannot be written as JSON.
     """
     _require_finite_positions(episode)
     members = {
@@ -184,9 +183,8 @@ def encode_episode(episode: Episode) -> dict[str, bytes]:
 def decode_episode(key: str, members: Mapping[str, bytes | np.ndarray], scan_positions: bool = True) -> Episode:
     """Decodes the members of `encode_episode`.
 
-    Members are bytes or flat uint8 arrays. Arrays are views of the members: a slice of a memory map stays a memory map.
+    Members are bytes or flat uint8 arrays. Arrays are views of the members, so a slice of a memory map stays one.
     `scan_positions=False` skips the check for finite positions, for verified bytes.
-
     Raises: ConfigError for a missing or unknown member, another schema version, a wrong shape, type or value.
     """
     if DESCRIPTION_MEMBER not in members:
@@ -231,8 +229,8 @@ def decode_episode(key: str, members: Mapping[str, bytes | np.ndarray], scan_pos
 def decode_array(name: str, data: bytes | np.ndarray, dtype: str, dimensions: int) -> np.ndarray:
     """Returns the array of a plain `.npy` file in memory (bytes or a flat uint8 array), as a view.
 
-    Raises: ConfigError naming the member when it is no such file, of another type or number of dimensions, cut, or
-    longer than its header says.
+    Raises: ConfigError naming the member if it is not such a file, has another type or number of dimensions, or is
+    shorter or longer than its header states.
     """
     raw = np.frombuffer(data, dtype=np.uint8) if isinstance(data, bytes) else data
     head = io.BytesIO(raw[:4096].tobytes())
@@ -247,7 +245,7 @@ def decode_array(name: str, data: bytes | np.ndarray, dtype: str, dimensions: in
         raise ConfigError(f"{name} must hold {size} bytes for shape {shape}, got {len(raw) - start}")
     try:
         return raw[start:].view(stored).reshape(shape)
-    except ValueError as error:  # one length is 0, another is too large
+    except ValueError as error:  # one length is 0 and another is too large
         raise ConfigError(f"{name} must have another shape, got {shape} ({error})") from None
 
 
@@ -261,7 +259,7 @@ def _decode_description(key: str, text: bytes) -> _Description:
 
 
 def require_schema_version(mapping: object, name: str) -> None:
-    """Raises ConfigError unless `mapping["schema_version"]` is the current version; to be checked first."""
+    """Raises ConfigError unless `mapping["schema_version"]` is the current version. Call it before other checks."""
     version = mapping.get("schema_version") if isinstance(mapping, Mapping) else None
     if version != SCHEMA_VERSION:
         raise ConfigError(
@@ -271,7 +269,7 @@ def require_schema_version(mapping: object, name: str) -> None:
 
 
 def _require_finite_positions(episode: Episode) -> None:
-    # frame by frame, so that a memory map is not loaded as a whole
+    # frame by frame, so that a memory map is not loaded completely
     for frame, position_N3 in enumerate(np.asarray(episode.position_TN3)):
         if not np.isfinite(position_N3).all():
             raise ConfigError(

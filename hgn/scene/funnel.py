@@ -1,7 +1,7 @@
-"""Funnels: four tilted squares that leave a hole, with the groups above it.
+"""Funnels: four tilted squares around a hole, with groups above it.
 
-All numbers are sums, products, quotients and square roots of what is drawn, so that they are the same bits on every
-machine. Shape legend: P points.
+Numbers are sums, products, quotients and square roots of drawn numbers, so they have the same bits on every machine.
+Shape legend: P points.
 """
 
 from __future__ import annotations
@@ -17,26 +17,27 @@ from hgn.schema import Vector
 
 Quaternion = tuple[float, float, float, float]
 
-STEEPEST = 0.87  # sine of the slope, drawn from 0 on: 60 degrees
-CAUGHT = 0.5  # of a square's width over the ground: groups are placed above that inner part
+STEEPEST = 0.87  # largest sine of the slope, that of 60 degrees; the smallest is 0
+CAUGHT = 0.5  # inner fraction of a square's horizontal width; groups are placed above it
 
 
 @dataclass(frozen=True)
 class Funnel:
-    """The places of a funnel's parts, from the middle of its hole. Domain units."""
+    """The places of a funnel's parts relative to the centre of its hole. Domain units."""
 
     size: float  # side of the four squares
-    quaternion: tuple[Quaternion, ...]  # of each square
+    quaternion: tuple[Quaternion, ...]  # rotation of each square
     centre_43: np.ndarray
-    low_3: np.ndarray  # of where groups are placed, in the funnel's axes, y against gravity
+    low_3: np.ndarray  # lowest corner of the space for groups, in the funnel's axes, with y against gravity
     high_3: np.ndarray
-    rotation_33: np.ndarray  # from the funnel's axes
-    extent_P3: np.ndarray  # corners of the squares, and points below and above: all must be in the domain
+    rotation_33: np.ndarray  # rotation from the funnel's axes to the scene's
+    extent_P3: np.ndarray  # points that must be in the domain: corners of the squares, and points below and above
 
 
 def draw_funnel(config: SceneConfig, gravity: Vector, rng: np.random.Generator) -> Funnel:
-    """Width of the hole, size of the squares, sine of their slope and turn about gravity, each uniform in its range.
-    Gravity must not be zero.
+    """Draws a funnel: width of the hole, size of the squares, sine of their slope and turn about gravity.
+
+    Each is uniform in its range. Gravity must not be zero.
     """
     (narrow, wide), (small, large) = config.funnel_hole, FUNNEL_SQUARES
     below, above = (config.group_size * size for size in FUNNEL_HEIGHT)

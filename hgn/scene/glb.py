@@ -1,6 +1,6 @@
-"""Triangles of GLB files (glTF 2.0), with all core features that shape them, and instances.
+"""Triangles of GLB files (glTF 2.0), with all core features that affect shapes, and with instances.
 
-Materials, textures, cameras, lights and animations are not read. Skins are refused.
+Materials, textures, cameras, lights and animations are ignored. Skins are refused.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from hgn.system.claims import Claims
 INSTANCES = "EXT_mesh_gpu_instancing"
 READ = (INSTANCES, "KHR_mesh_quantization")  # extensions that change geometry
 NEUTRAL = re.compile(r"[A-Z]+_(materials|texture|lights|xmp|animation|audio)\w*")  # extensions that do not
-MAXIMUM_SPARSE = 1_000_000  # values of an accessor without data of its own
-TRIANGLES, STRIP, FAN = 4, 5, 6  # modes of primitives; the others are points and lines
+MAXIMUM_SPARSE = 1_000_000  # largest number of values of a sparse accessor without own data
+TRIANGLES, STRIP, FAN = 4, 5, 6  # modes of primitives; the other modes are points and lines
 _TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 
@@ -31,8 +31,8 @@ _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 def read_glb(path: Path) -> tuple[np.ndarray, np.ndarray]:
     """Returns vertices, float64 [V, 3], and triangles, int64 [F, 3], of the file's scene.
 
-    Raises: ValueError, LookupError, TypeError, struct.error or OSError for a damaged file, missing data, and features
-    that are not read.
+    Raises: ValueError, LookupError, TypeError, struct.error or OSError for a damaged file, missing data, and
+    unsupported features.
     """
     tree, binary = _chunks(path.read_bytes())
     unknown = [n for n in tree.get("extensionsRequired", ()) if n not in READ and not NEUTRAL.fullmatch(n)]
@@ -64,14 +64,14 @@ def _chunks(data: bytes) -> tuple[dict[str, Any], bytes]:
 
 
 class _File:
-    """The tree of a file and its buffers."""
+    """The JSON tree of a file, and its buffers."""
 
     def __init__(self, tree: dict[str, Any], binary: bytes, folder: Path) -> None:
         self.tree, self.binary, self.folder = tree, binary, folder.resolve()
         self.buffer = cache(self._buffer)
 
     def placed(self) -> list[tuple[dict[str, Any], list[float], np.ndarray]]:
-        """Returns the meshes of the scene, their weights of morph targets, and their places [M, 4, 4]."""
+        """Returns the meshes of the scene, the weights of their morph targets, and their matrices [M, 4, 4]."""
         nodes = self.tree.get("nodes", [])
         if "scenes" in self.tree:
             roots = self.tree["scenes"][self.tree.get("scene", 0)].get("nodes", [])
@@ -102,7 +102,7 @@ class _File:
         return result
 
     def surfaces(self, mesh: dict[str, Any], weights: list[float]) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Returns positions [V, 3] and triangles [F, 3] of the primitives that have triangles."""
+        """Returns positions [V, 3] and triangles [F, 3] of the primitives with triangles."""
         result = []
         for primitive in mesh["primitives"]:
             mode = primitive.get("mode", TRIANGLES)
@@ -129,7 +129,7 @@ class _File:
         return result
 
     def accessor(self, index: int) -> np.ndarray:
-        """Returns the values of an accessor, [count, width]; integers that stand for fractions as these."""
+        """Returns the values of an accessor, [count, width]. Normalised integers become fractions."""
         entry = self.tree["accessors"][index]
         dtype, shape = np.dtype(_TYPES[entry["componentType"]]), (entry["count"], _WIDTHS[entry["type"]])
         sparse = entry.get("sparse")
@@ -175,7 +175,7 @@ class _File:
 
 
 def _places(translation: Any, rotation: Any, scale: Any) -> np.ndarray:
-    """Returns matrices [M, 4, 4] of translations [M, 3], quaternions x y z w [M, 4] and scales [M, 3], or of one."""
+    """Returns matrices [M, 4, 4] of translations [M, 3], quaternions x y z w [M, 4], scales [M, 3], or of one each."""
     given = [
         np.atleast_2d(np.array(value, np.float64)) for value in (translation, rotation, scale) if value is not None
     ]

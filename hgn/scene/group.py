@@ -1,7 +1,7 @@
 """Groups of particles: solid shapes filled with random points.
 
-Every number comes from `Generator.random()` through sums, products and square roots, so that the same seed
-gives the same bits on every machine. Shape legend: N particles, P points.
+Numbers are sums, products and square roots of those of `Generator.random()`, so the same seed gives the same bits on
+every machine. Shape legend: N particles, P points.
 """
 
 from __future__ import annotations
@@ -13,12 +13,12 @@ import numpy as np
 
 from hgn.schema import Vector
 
-WALL_CELLS = 3  # of the solver's walls (MpmConfig.wall_cells); no particle starts inside them
+WALL_CELLS = 3  # thickness of the solver's walls (MpmConfig.wall_cells); no particle starts inside them
 
 
 @dataclass(frozen=True)
 class Region:
-    """An axis-aligned box, or a ball where `half_width` is zero and `radius` is not. Domain units."""
+    """An axis-aligned box, or a ball if only `radius` is not zero. Domain units."""
 
     centre: Vector
     half_width: Vector = (0.0, 0.0, 0.0)
@@ -35,24 +35,24 @@ class Region:
         return np.sqrt((outside * outside).sum(axis=1)) - self.radius
 
     def distance(self, other: Region) -> float:
-        """Returns the distance to another region; negative or zero where they overlap."""
+        """Returns the distance to another region; negative or zero if they overlap."""
         width = np.array(self.half_width) + np.array(other.half_width)
         outside = np.maximum(np.abs(np.array(self.centre) - np.array(other.centre)) - width, 0.0)
         return float(np.sqrt((outside * outside).sum())) - self.radius - other.radius
 
 
 def region_of(shape: str, size: Vector, centre: Vector) -> Region:
-    """Returns the region of a cube, box (edges) or sphere (diameter, three times)."""
+    """Returns the region of a cube or box (three edges) or of a sphere (its diameter, three times)."""
     if shape == "sphere":
         return Region(centre, radius=0.5 * size[0])
     return Region(centre, half_width=(0.5 * size[0], 0.5 * size[1], 0.5 * size[2]))
 
 
 def particle_count(region: Region, particles_per_cell: float, cell_size: float) -> int:
-    """Returns the particles that fill a region, as in Taichi Elements: int(n + 1) in boxes, ceil(n) in balls.
+    """Returns the number of particles that fill a region, as in Taichi Elements: int(n + 1) in boxes, ceil(n) in balls.
 
-    At 8 per cell of 1/64 a cube of 0.08 has 1,074 particles: four make the 4,296 of the paper's scenes
-    without obstacles (sec. 4).
+    At 8 per cell of 1/64 a cube of 0.08 has 1,074 particles. Four cubes have the 4,296 of the paper's scenes without
+    obstacles (sec. 4).
     """
     if region.radius > 0:
         volume = 4 / 3 * math.pi * region.radius * region.radius * region.radius
@@ -80,7 +80,7 @@ def points_in_ball(count: int, dimensions: int, rng: np.random.Generator) -> np.
 
 
 def random_direction(rng: np.random.Generator, dimensions: int = 3) -> np.ndarray:
-    """Returns a uniformly random unit vector by rejection; with four dimensions, a rotation's quaternion."""
+    """Returns a uniformly random unit vector by rejection. With four dimensions it is a rotation's quaternion."""
     while True:
         point = points_in_ball(1, dimensions, rng)[0]
         length = float(np.sqrt((point * point).sum()))

@@ -1,4 +1,4 @@
-"""Reads untrusted HDF5 files: links to other files are refused, damage ends in one message."""
+"""Reads untrusted HDF5 files: links to other files are refused, and damage results in one message."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from hgn.system.claims import Claims
 if TYPE_CHECKING:
     import h5py
 
-_DEPTH = 8  # of groups
+_DEPTH = 8  # largest depth of groups
 # exceptions of h5py for damage, and of NumPy for a size in a damaged file
 _DAMAGE = (LookupError, OSError, ValueError, RuntimeError, TypeError, AttributeError, ArithmeticError, MemoryError)
 
 
 @contextlib.contextmanager
 def damage_named(rule: str, remedy: str) -> Iterator[None]:
-    """Turns exceptions of reading a damaged file into a ConfigError `<rule>, got <cause>; <remedy>`.
+    """Converts exceptions of reading a damaged file to a ConfigError `<rule>, got <cause>; <remedy>`.
 
     `rule` names the file, as in `a.h5: position must be whole`.
     """
@@ -34,7 +34,7 @@ def damage_named(rule: str, remedy: str) -> Iterator[None]:
 
 
 def open_hdf5(path: Path, rule: str, remedy: str) -> h5py.File:
-    """Opens a file that contains all its data itself, each object once, and has the size for it.
+    """Opens a file that contains all its data, each object once, and is large enough for them.
 
     Raises: ConfigError, as `damage_named` does.
     """
@@ -48,9 +48,8 @@ def open_hdf5(path: Path, rule: str, remedy: str) -> h5py.File:
 
 
 def _require_own_data(group: h5py.Group, path: Path, claims: Claims, visited: set[int], depth: int = 0) -> None:
-    """Raises ConfigError where a file refers to others, which HDF5 would read with this reader's rights, and where an
-    object has two names or is larger than the file.
-    """
+    """Raises ConfigError for a reference to another file, which HDF5 would read with this reader's rights, and for an
+    object that has two names or is larger than the file."""
     import h5py
 
     for name in group:

@@ -1,7 +1,7 @@
 """The frames before the start of a simulation: ballistic motion into the initial state.
 
-The history before frame 0 is the ballistic back-extrapolation of the initial state, in training and in rollouts, so
-that a network can start from any scene.
+The history before frame 0 is the ballistic back-extrapolation of the initial state, in training and in rollouts. So a
+network can start from any scene.
 Shape legend: H history steps, N particles, W = H + 2 window frames.
 """
 
@@ -24,8 +24,8 @@ def ballistic_positions(
 ) -> np.ndarray:
     """Returns positions of particles in free flight at the given frames (0 is now, negative is the past).
 
-    Units: domain units, domain units per second (squared). Returns float32 [len(frame_indices), N, 3];
-    computed in float64.
+    Units: domain units, domain units per second (squared). Returns float32 [len(frame_indices), N, 3], computed in
+    float64.
     """
     time_T11 = np.asarray(frame_indices, np.float64)[:, None, None] / frame_rate_hz
     fall_3 = 0.5 * np.asarray(gravity, np.float64)
@@ -35,8 +35,8 @@ def ballistic_positions(
 def ballistic_velocities(velocity_N3: np.ndarray, gravity_3: np.ndarray, history: int) -> np.ndarray:
     """Returns displacements in the last frames of free flight, newest first, float32 [N, history, 3].
 
-    Units: domain units per frame (squared). Over a frame that ends k frames ago a particle moves v - (k + 1/2) g;
-    computed in float64, so that two of them differ by g to rounding of the velocity, not of the position.
+    Units: domain units per frame (squared). Over a frame that ends k frames ago a particle moves by v - (k + 1/2) g.
+    With float64, two displacements differ by g up to the rounding of the velocity, not of the position.
     """
     age_H1 = np.arange(history)[:, None] + 0.5
     return (velocity_N3[:, None].astype(np.float64) - age_H1 * np.asarray(gravity_3, np.float64)).astype(np.float32)
@@ -45,9 +45,7 @@ def ballistic_velocities(velocity_N3: np.ndarray, gravity_3: np.ndarray, history
 def frames_before(episode: Episode, first: int) -> np.ndarray:
     """Returns the frames `first` (negative) to -1 of an episode, float32 [-first, N, 3].
 
-    They are ballistic, or stored in imported episodes.
-
-    Raises: ConfigError when too few are stored.
+    Those of imported episodes are stored; others are ballistic. Raises: ConfigError if too few are stored.
     """
     if episode.past_HN3 is not None:
         require_past(episode.past_HN3, -first)

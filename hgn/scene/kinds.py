@@ -1,4 +1,4 @@
-"""The kinds of scenes that `scene.kinds` draws from; `hgn.scene.world` makes them."""
+"""The kinds of scenes for `scene.kinds`. `hgn.scene.world` makes the scenes."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 
 from hgn.schema import require
 
-MAXIMUM_PARTICLES = 16_000  # of a scene; larger ones are drawn again
+MAXIMUM_PARTICLES = 16_000  # largest number in a scene; larger scenes are drawn again
 
 # Smallest and largest value of each number that a kind draws.
 RANGES: dict[str, dict[str, tuple[float, float]]] = {
@@ -32,11 +32,11 @@ RANGES: dict[str, dict[str, tuple[float, float]]] = {
     "jet": {"length": (0.08, 0.3), "width": (0.05, 0.12), "speed": (1.5, 6.0)},
 }  # fmt: skip
 SCENE_KINDS = tuple(RANGES)
-FREE = ("domain_size", "cell_size", "materials", "particles_per_cell", "kinds")  # settings that no kind draws
+FREE = ("domain_size", "cell_size", "materials", "particles_per_cell", "kinds")  # settings that kinds do not draw
 
 
 def require_kinds(scene: Any) -> None:
-    """Checks the kinds of a SceneConfig, and that settings which they draw have defaults. Raises: ConfigError."""
+    """Checks the kinds of a SceneConfig, and that the settings which kinds draw are defaults. Raises: ConfigError."""
     for kind, share in scene.kinds.items():
         require(kind in SCENE_KINDS, "kinds", f"of {', '.join(SCENE_KINDS)}", kind)
         require(0 <= share < math.inf, f"kinds.{kind}", "a finite share >= 0", share)

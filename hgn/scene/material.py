@@ -1,6 +1,6 @@
-"""The materials of scenes; episodes store the index into `MATERIALS`.
+"""The materials of scenes. Episodes store the index into `MATERIALS`.
 
-docs/how_to/add_material.md lists what a new material needs. Append its name here: old episodes keep their indices.
+docs/how_to/add_material.md lists the steps for a new material. Append its name here, so that old indices stay valid.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from hgn.schema import ConfigError, require
 MATERIALS: tuple[str, ...] = ("water", "sand", "snow", "elastic")
 WATER, SAND, SNOW, ELASTIC = range(4)
 PAPER_MATERIALS = MATERIALS[:3]  # defaults of data and networks
-FLUIDS: tuple[int, ...] = (WATER,)  # without a deformation gradient: their only memory is their volume
-MATERIAL_BITS = 4  # of a particle's label in the solver: the material, below the scene
+FLUIDS: tuple[int, ...] = (WATER,)  # materials without a deformation gradient; their only memory is their volume
+MATERIAL_BITS = 4  # bits of a particle's label in the solver for the material, below those for the scene
 MATERIAL_MASK = (1 << MATERIAL_BITS) - 1
 assert len(MATERIALS) <= 1 << MATERIAL_BITS
 # constants that may differ between particles of one material; MpmConfig has the defaults
@@ -43,7 +43,7 @@ def material_index(name: str) -> int:
     return MATERIALS.index(name)
 
 
-MATERIAL_NAME = re.compile(r"[a-z][a-z0-9_]{0,31}")  # of an imported set's materials
+MATERIAL_NAME = re.compile(r"[a-z][a-z0-9_]{0,31}")  # names of an imported set's materials
 
 
 def require_materials(owner: str, material_N: np.ndarray, materials: Sequence[str]) -> None:

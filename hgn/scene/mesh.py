@@ -27,7 +27,7 @@ _ASCII_STL = re.compile(rb"\s*solid.*\n\s*(facet|endsolid)", re.IGNORECASE)
 
 
 def load_mesh(path: str | Path, field: str = "mesh", **placing: Any) -> Obstacle:
-    """Reads a mesh file as one obstacle, a solid if all parts are watertight; options and errors of `load_bodies`."""
+    """Reads a mesh file as one obstacle, closed if all parts are watertight. Options and errors as in `load_bodies`."""
     first, *others = load_bodies(path, field, **placing)
     for other in others:
         vertex_V3 = np.concatenate([first.vertex_V3, other.vertex_V3])
@@ -46,13 +46,13 @@ def load_bodies(
 ) -> tuple[Obstacle, ...]:
     """Reads a mesh file as a solid of its watertight bodies, a sheet of its other triangles, or both.
 
-    It is scaled, then turned about the fixed x, y and z axes (degrees, in this order), then moved.
-    A body is watertight if two triangles meet at each of its edges, and orientable; it gets a consistent orientation.
-    Corners with equal float32 coordinates are merged, zero-area and repeated triangles dropped, both after that check.
-    A mesh may reach outside the domain.
+    The mesh is scaled, then turned about the fixed x, y and z axes (degrees, in this order), then moved. It may extend
+    beyond the domain. A body is watertight if it is orientable and exactly two triangles meet at each of its edges; its
+    triangles get a consistent orientation. After this check corners with equal float32 coordinates are merged, and
+    zero-area and repeated triangles are removed.
 
-    Raises: ConfigError naming `field` for a missing or unreadable file, an unknown suffix, no triangles,
-    non-finite coordinates, only zero-area triangles, or a bad scale, translation or rotation.
+    Raises: ConfigError naming `field` for a missing or unreadable file, an unknown suffix, no triangles, coordinates
+    that are not finite, only zero-area triangles, or a bad scale, translation or rotation.
     """
     path = Path(path)
     require(0 < scale < np.inf, f"{field}: scale", "a finite number > 0", scale)
@@ -71,7 +71,7 @@ def load_bodies(
         raise ConfigError(f"{field} must stay within {limit:.1e} after scaling, got more for {path}; lower scale")
     closed_F, flip_F = _bodies(vertex_V3, triangle_F3)
     rounded_V3 = round_to_float32(placed)
-    if not closed_F.all():  # corners that differ in their last digits, perhaps
+    if not closed_F.all():  # for corners that differ in their last digits
         also_F, other_F = _bodies(rounded_V3, triangle_F3)
         closed_F, flip_F = closed_F | also_F, np.where(closed_F, flip_F, other_F)
     triangle_F3[flip_F] = triangle_F3[flip_F][:, ::-1]
@@ -97,7 +97,7 @@ def _read(path: Path, field: str) -> tuple[np.ndarray, np.ndarray]:
         vertex, triangle = read_glb(path) if path.suffix.lower() == ".glb" else _read_polygons(path)
     except ConfigError:
         raise
-    except Exception as error:  # of any kind: damaged files are read too
+    except Exception as error:  # damaged files raise any kind of error
         raise ConfigError(
             f"{field} must be a readable {path.suffix[1:].upper()} file, got {path} ({error}); export the mesh again"
         ) from error
@@ -112,28 +112,28 @@ def _read(path: Path, field: str) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _read_polygons(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Reads STL, OBJ and PLY: STL and OBJ through trimesh, but concave polygons, which it would cut into fans."""
+    """Reads STL, OBJ and PLY. trimesh reads STL and OBJ, but would cut concave polygons into fans."""
     data, kind = path.read_bytes(), path.suffix[1:].lower()
     if kind == "ply":
         vertex_V3, faces = polygons_of_ply(data)
         cut_F3 = concave_cut(vertex_V3, faces)
         return vertex_V3, trimesh.geometry.triangulate_quads(faces).reshape(-1, 3) if cut_F3 is None else cut_F3
     if kind == "stl" and not _ASCII_STL.match(data):
-        data = data[: 84 + 50 * int.from_bytes(data[80:84], "little")]  # some programs write more behind the triangles
+        data = data[: 84 + 50 * int.from_bytes(data[80:84], "little")]  # some programs append bytes to the triangles
     if kind == "obj":
         data = plain_obj(data)
         vertex_V3, faces = polygons_of_obj(data)
         if (cut_F3 := concave_cut(vertex_V3, faces)) is not None:
             return vertex_V3, cut_F3
-    # processing would silently remove non-finite vertices
+    # trimesh's processing would silently remove vertices that are not finite
     mesh = trimesh.load_scene(io.BytesIO(data), file_type=kind, process=False, skip_materials=True).to_mesh()
     return np.array(mesh.vertices, np.float64).reshape(-1, 3), np.array(mesh.faces, np.int64).reshape(-1, 3)
 
 
 def _bodies(vertex_V3: np.ndarray, triangle_F3: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns whether each triangle belongs to a watertight body, and whether it is to be flipped, both bool [F].
+    """Returns whether each triangle belongs to a watertight body, and whether it must be flipped, both bool [F].
 
-    Vertices at equal positions are one. Triangles without three vertices, and repeated ones, are not counted.
+    Vertices at equal positions count as one. Triangles with fewer than three vertices, and repeated ones, do not count.
     """
     _, index = np.unique(vertex_V3 + 0.0, axis=0, return_inverse=True)
     triangle = index.reshape(-1)[triangle_F3]
@@ -147,8 +147,8 @@ def _bodies(vertex_V3: np.ndarray, triangle_F3: np.ndarray) -> tuple[np.ndarray,
 
 
 def _weld(vertex_V3: np.ndarray, triangle_F3: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Merges equal vertices; drops zero-area and repeated triangles and unused vertices."""
-    unique, index = np.unique(vertex_V3 + 0.0, axis=0, return_inverse=True)  # + 0.0 turns -0 to 0
+    """Merges equal vertices. Removes zero-area and repeated triangles, and unused vertices."""
+    unique, index = np.unique(vertex_V3 + 0.0, axis=0, return_inverse=True)  # + 0.0 turns -0 into 0
     triangle = index.reshape(-1)[triangle_F3]
     triangle = triangle[(area_vectors(unique[triangle]) != 0).any(axis=1)]
     _, first = np.unique(np.sort(triangle, axis=1), axis=0, return_index=True)
@@ -158,11 +158,11 @@ def _weld(vertex_V3: np.ndarray, triangle_F3: np.ndarray) -> tuple[np.ndarray, n
 
 
 def _orientation(triangle_F3: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns which triangles belong to watertight bodies, and which of these to flip so that all agree, bool [F].
+    """Returns which triangles belong to watertight bodies, and which of these to flip for one orientation, bool [F].
 
-    A body keeps the orientation of most of its triangles. Two copies of every triangle, one per orientation, are
-    connected to the copies of the neighbours that agree with them: an orientable body has two components, a one-sided
-    body has one.
+    A body keeps the orientation of most of its triangles. Each triangle has two copies, one per orientation. A copy is
+    connected to the copies of its neighbours with the same orientation. So an orientable body has two components, and
+    a one-sided body has one.
     """
     count = len(triangle_F3)
     start_E, end_E = triangle_F3.T.reshape(-1), np.roll(triangle_F3, -1, axis=1).T.reshape(-1)
@@ -177,13 +177,13 @@ def _orientation(triangle_F3: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     column = np.concatenate([face_two + np.where(disagree, count, 0), face_two + np.where(disagree, 0, count)])
     parts, label = _components(row, column, 2 * count)
     upright, flipped = label[:count], label[count:]
-    # bodies are connected by all shared edges
+    # triangles that share any edge belong to one body
     same = edge_E[order[1:]] == edge_E[order[:-1]]
     bodies, body_F = _components(order[1:][same] % count, order[:-1][same] % count, count)
     open_B = np.zeros(bodies, bool)
     open_B[body_F[upright == flipped]] = True
     open_B[body_F[np.flatnonzero(uses[edge_E] != 2) % count]] = True
-    # a component and its mirror image hold the same triangles; the one with more unflipped ones wins
+    # a component and its mirror image contain the same triangles; the one with more unflipped triangles is kept
     votes = np.bincount(upright, minlength=parts)
     kept_wins = (votes[upright] > votes[flipped]) | ((votes[upright] == votes[flipped]) & (upright < flipped))
     closed_F = ~open_B[body_F]

@@ -18,8 +18,8 @@ from hgn.schema import Vector, require
 class Motion:
     """Rigid motion: rotation about `pivot`, then translation, relative to the pose in the scene.
 
-    Between keyframes translation is linear and angular velocity constant, by the shorter way; before the first and
-    after the last keyframe the obstacle is at rest.
+    Between keyframes translation is linear, and angular velocity is constant along the shorter way. Before the first
+    and after the last keyframe the obstacle is at rest.
     """
 
     time_T: np.ndarray  # float64, seconds, increasing
@@ -58,8 +58,9 @@ class Motion:
         return self.pose(time)[0], self.place(np.zeros((1, 3)), time)[0]
 
     def rates(self, begin: float, end: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Returns mean angular velocity, rad/s [3], and mean velocity [3] of the pivot between two times, and the
-        pivot's position [3] at the first.
+        """Returns mean angular velocity, rad/s [3], and mean velocity [3] of the pivot between two times.
+
+        The third result is the pivot's position [3] at the first time.
         """
         rotation, translation = self.pose(begin)
         later_rotation, later_translation = self.pose(end)
@@ -83,7 +84,7 @@ def turning(rotation_33: np.ndarray) -> np.ndarray:
         return np.asarray(axis * (0.5 * angle / sine))
     if cosine > 0:
         return np.asarray(0.5 * axis)
-    # an angle of pi: R + I is twice the projection on the axis
+    # the angle is pi, so R + I is twice the projection on the axis
     column = (rotation_33 + np.eye(3))[:, int(np.argmax(np.diag(rotation_33)))]
     return np.asarray(angle * column / np.linalg.norm(column))
 

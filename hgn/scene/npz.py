@@ -1,7 +1,7 @@
-"""Reads untrusted NumPy files: headers are checked, and pickles can create arrays only.
+"""Reads untrusted NumPy files: headers are checked, and pickles can only create arrays.
 
 geoelements/gns stores trajectories as object arrays, which NumPy pickles. NumPy's loader would run any code in such a
-file, and an invalid array state makes it write outside its memory.
+file. An invalid array state would make it write outside its memory.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from hgn.system.claims import Claims, require_plain_pickle
 
 _MULTIARRAY = ("numpy.core.multiarray", "numpy._core.multiarray")
 _PLAIN_TYPE = re.compile(r"b1|[iu][1248]|f[248]|O8?")
-# of headers, which NumPy evaluates as Python, of the sizes in them, and of unpickling
+# errors of headers, which NumPy evaluates as Python, of the sizes in them, and of unpickling
 _ERRORS = (
     *(pickle.UnpicklingError, ValueError, TypeError, OverflowError, EOFError, OSError, AttributeError, LookupError),
     *(SyntaxError, tokenize.TokenError, RecursionError, MemoryError),
@@ -32,7 +32,7 @@ _ERRORS = (
 
 
 class _Type:
-    """The type of a pickled array. NumPy's own would accept any state, and is shared by the whole process."""
+    """The type of a pickled array. NumPy's own type would accept any state, and is shared by the whole process."""
 
     def __init__(self, name: str, *_: Any) -> None:
         if _PLAIN_TYPE.fullmatch(name) is None:
@@ -44,7 +44,7 @@ class _Type:
 
 
 class _Array(np.ndarray):
-    """An array that accepts only a state of its own size."""
+    """An array that accepts only a state of matching size."""
 
     def __setstate__(self, state: Any) -> None:
         _, shape, kind, fortran_order, content = state
@@ -79,10 +79,10 @@ def _scalar(kind: _Type, content: bytes) -> Any:
 
 
 def read_npz(path: Path | BinaryIO, objects: bool = False) -> Iterator[tuple[str, np.ndarray]]:
-    """Yields names and read-only arrays of an archive, those of a folder in succession. With `objects` arrays may
-    contain arrays, numbers, tuples, lists and dicts.
+    """Yields names and read-only arrays of an archive. Arrays of one folder follow one another.
 
-    Raises: ConfigError naming the file and the array that is cut, altered, or contains other objects.
+    With `objects` arrays may contain arrays, numbers, tuples, lists and dicts. Raises: ConfigError naming the file and
+    the array that is incomplete, altered, or contains other objects.
     """
     try:
         with zipfile.ZipFile(path) as archive:
@@ -90,7 +90,7 @@ def read_npz(path: Path | BinaryIO, objects: bool = False) -> Iterator[tuple[str
             for info in archive.infolist():
                 claims.add(info.filename, info.file_size)
                 folders.setdefault(info.filename.rpartition("/")[0] or info.filename, len(folders))
-            # the members of a folder follow one another
+            # sorted, so that the members of a folder follow one another
             for info in sorted(archive.infolist(), key=lambda i: folders[i.filename.rpartition("/")[0] or i.filename]):
                 member = info.filename.removesuffix(".npy")
                 kinds = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
@@ -106,7 +106,7 @@ def read_header(
 ) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
     """Returns shape, Fortran order and type of the array that follows a `.npy` header.
 
-    Raises: ConfigError naming `name` for another file, or a version after `newest`.
+    Raises: ConfigError naming `name` for another kind of file, or a version after `newest`.
     """
     try:
         version = np.lib.format.read_magic(file)

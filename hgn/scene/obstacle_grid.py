@@ -1,7 +1,7 @@
-"""Obstacle cells, the network's input: a mean normal in each cell that an obstacle passes through.
+"""Obstacle cells, the network's input: a mean normal for each cell that an obstacle passes through.
 
-Paper sec. 3: sample the surface with points no closer than cell_size / 4, flip each sample's normal where it
-points away from the centre of its cell, sum per cell, normalise. Stored sparsely.
+Paper sec. 3: sample the surface with points at least cell_size / 4 apart. Flip a sample's normal if it points away from
+the centre of its cell. Sum the normals of a cell, and normalise. Cells are stored sparsely.
 Shape legend: K obstacle cells, S surface samples, F triangles.
 """
 
@@ -16,14 +16,14 @@ from hgn.scene.scene import Obstacle, all_corners
 from hgn.scene.surface import area_vectors, sample_surface, split_long_edges
 from hgn.schema import ConfigError, Vector, require
 
-CANCELLED = 0.25  # mean length below which normals cancel; three faces of a corner give 0.58
-NORMAL_SPACING_CELLS = 0.25  # of the samples for normals
-SPLIT_CELLS = 16.0  # longest edge of the pieces that are cut to the domain
+CANCELLED = 0.25  # mean length of the normals below which they cancel; three faces of a corner give 0.58
+NORMAL_SPACING_CELLS = 0.25  # distance of the samples, in cells
+SPLIT_CELLS = 16.0  # longest edge of pieces before they are cut at the domain, in cells
 
 
 @dataclass(frozen=True, eq=False)
 class ObstacleGrid:
-    """Sparse cells with unit normals; cell k spans [k, k + 1) * cell_size."""
+    """Sparse cells with unit normals. Cell k spans [k, k + 1) * cell_size."""
 
     cell_size: float
     cell_K3: np.ndarray  # int32, unique rows, lexicographically sorted
@@ -35,13 +35,12 @@ def build_obstacle_grid(
 ) -> ObstacleGrid:
     """Returns the mean obstacle normal of every cell that a surface passes through (Paper sec. 3).
 
-    Samples of all obstacles are at least cell_size / 4 apart. Each contributes its triangle's normal, negated where it
-    points away from the cell's centre; the sum per cell is normalised. Where the sum cancels (two sheets on both sides
-    of the centre) the cell takes the normal of the sample nearest to its centre, because zero would mean "no obstacle".
-    Zero-area triangles are skipped. With `domain_size`, cells more than a cell outside the domain are left out, which
-    bounds the cost of large meshes. Deterministic.
-
-    Raises: ConfigError for a bad cell size, or a surface too large to sample.
+    Samples of all obstacles are at least cell_size / 4 apart. A sample contributes its triangle's normal, negated if it
+    points away from the cell's centre. The sum of a cell is normalised. If the sum cancels (two sheets on both sides of
+    the centre), the cell gets the normal of the sample nearest to its centre, because zero would mean "no obstacle".
+    Zero-area triangles are skipped. With `domain_size`, cells more than a cell outside the domain are omitted, which
+    limits the cost of large meshes. The result is deterministic.
+    Raises: ConfigError for a bad cell size, or for a surface that is too large to sample.
     """
     return grid_of_samples(*surface_samples(obstacles, cell_size, seed, domain_size), cell_size)
 
@@ -51,7 +50,7 @@ def surface_samples(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Returns the samples of `build_obstacle_grid`, float64 [S, 3], and the unit normals of their triangles.
 
-    They can be moved with an obstacle, to compute its cells elsewhere without sampling it again.
+    They can be moved with an obstacle to compute its cells elsewhere without sampling it again.
     Raises: ConfigError as `build_obstacle_grid`.
     """
     corner_F33, point_S3, owner_S = _samples(obstacles, cell_size, seed, domain_size)
@@ -85,7 +84,7 @@ def grid_of_samples(point_S3: np.ndarray, normal_S3: np.ndarray, cell_size: floa
 def _samples(
     obstacles: Sequence[Obstacle], cell_size: float, seed: int, domain_size: Vector | None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Returns triangle corners, surface points no closer than NORMAL_SPACING_CELLS, and the triangle of each point."""
+    """Returns triangle corners, surface points at least NORMAL_SPACING_CELLS apart, and the triangle of each point."""
     require(0 < cell_size < np.inf, "cell_size", "a finite number > 0", cell_size, "the paper uses 1/64")
     corner_F33 = all_corners(obstacles)
     if domain_size is not None:
@@ -100,7 +99,7 @@ def _samples(
 
 
 def _lexicographic_keys(floor_S3: np.ndarray) -> tuple[np.ndarray, np.ndarray, tuple[int, ...]]:
-    """Returns an integer per cell that sorts like its coordinates, the lowest cell and the extent."""
+    """Returns an integer per cell that sorts like its coordinates, then the lowest cell and the extent."""
     low, high = floor_S3.min(axis=0), floor_S3.max(axis=0)
     extent = [int(length) + 1 for length in high - low]
     if max(abs(low).max(), abs(high).max()) >= 2**31 or extent[0] * extent[1] * extent[2] >= 2**63:

@@ -1,4 +1,4 @@
-"""Items of random scenes: placed obstacles and filled groups, and whether they keep their distance.
+"""Items of random scenes: placed obstacles, filled groups, and checks of their distances.
 
 Shape legend: N particles, P points, V vertices.
 """
@@ -26,15 +26,15 @@ from hgn.schema import Vector
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree
 
-CLEARANCE_CELLS = 2.0  # between obstacles, groups and walls, in solver cells
-SURFACE_DETAIL = 0.045  # longest edge, relative to the size, of the pieces that distances are taken between
-FEW = 32
-ROUNDING = 1e-6  # of a length; keeps float32 rounding on the right side of every bound
+CLEARANCE_CELLS = 2.0  # smallest distance between obstacles, groups and walls, in solver cells
+SURFACE_DETAIL = 0.045  # longest edge, relative to the size, of the surface pieces for distances
+FEW = 32  # the first test of an overlap uses every FEW-th point
+ROUNDING = 1e-6  # relative margin that keeps float32 rounding within every bound
 
 
 @dataclass(frozen=True)
 class Placed:
-    """An obstacle with points of its surface; no surface point is farther than `gap` from one of them."""
+    """An obstacle with points of its surface. Every surface point is within `gap` of one of them."""
 
     obstacle: Obstacle
     point_P3: np.ndarray
@@ -46,7 +46,7 @@ class Placed:
 
 
 def place_shape(shape: str, size: float, position: Vector, quaternion: Quaternion, index: int) -> Placed:
-    """Returns obstacle number `index` of a scene: a built-in shape of a size, about a position."""
+    """Returns obstacle number `index` of a scene: a built-in shape with its size and place."""
     rotation_33 = quaternion_rotation(quaternion)
     obstacle = shape_obstacle(shape, size, position, rotation_33, f"obstacle_{index}_{shape}")
     unit_surface_P3, unit_gap = unit_surface_points(shape)
@@ -59,14 +59,14 @@ def place_shape(shape: str, size: float, position: Vector, quaternion: Quaternio
 
 def too_near(obstacle: Obstacle, point: np.ndarray, gap: float, other: Placed, clearance: float) -> bool:
     low, high = obstacle.vertex_V3.min(axis=0), obstacle.vertex_V3.max(axis=0)
-    bound = clearance + gap + other.gap  # apart by this, the points prove the surfaces apart by the clearance
+    bound = clearance + gap + other.gap  # if all points are this far apart, the surfaces keep the clearance
     if (low > other.high + bound).any() or (high < other.low - bound).any():
         return False
     point = point[((point >= other.low - bound) & (point <= other.high + bound)).all(axis=1)]
-    for subset in (point[::FEW], point):  # most overlaps show at a few points already
+    for subset in (point[::FEW], point):  # most overlaps already show at a few points
         if np.isfinite(other.tree.query(subset, distance_upper_bound=bound)[0]).any():
             return True
-    # the surfaces do not meet, so one vertex tells whether one body holds the other
+    # the surfaces do not meet, so one vertex tells whether one body contains the other
     holds = contains(obstacle.vertex_V3[:1], other.obstacle) | contains(other.obstacle.vertex_V3[:1], obstacle)
     return bool(holds.any())
 
@@ -94,7 +94,7 @@ class Body:
 def filled(
     config: SceneConfig, shape: str, region: Region, material: str, velocity_3: np.ndarray, *, rng: np.random.Generator
 ) -> Body:
-    """Returns a group of a shape, filled with random particles."""
+    """Returns a group that fills a region with random particles."""
     count = particle_count(region, config.particles_per_cell, config.cell_size)
     size = (2 * region.reach).tolist()
     record = {
@@ -109,7 +109,7 @@ def filled(
 
 
 def thrown(body: Body, velocity_3: np.ndarray) -> Body:
-    velocity_3 = velocity_3 + 0.0  # no -0.0
+    velocity_3 = velocity_3 + 0.0  # turns -0.0 into 0.0
     return replace(body, velocity_3=velocity_3, record=body.record | {"velocity": velocity_3.tolist()})
 
 
@@ -121,7 +121,7 @@ def assemble(
     bodies: list[Body],
     layout: str | None = None,
 ) -> Scene:
-    """Returns the scene of placed items; `layout` is its kind, where the config has several."""
+    """Returns the scene of placed items. `layout` is its kind, if the config has several."""
     none = np.zeros((0, 3), np.float32)
     counts = [len(body.position_N3) for body in bodies]
     materials = np.array([material_index(body.material) for body in bodies], np.uint8)
@@ -148,7 +148,7 @@ def assemble(
 
 @functools.cache
 def unit_surface_points(shape: str) -> tuple[np.ndarray, float]:
-    """Points on the shape of size 1, and how far the rest of its surface is from them at most."""
+    """Returns points on the shape of size 1, and the largest distance of its surface from the nearest of them."""
     vertex, triangle, _ = unit_shape(shape)
     pieces = split_long_edges(vertex[triangle], SURFACE_DETAIL)
     centroid = (pieces[:, 0] + pieces[:, 1] + pieces[:, 2]) / 3
@@ -157,7 +157,7 @@ def unit_surface_points(shape: str) -> tuple[np.ndarray, float]:
 
 
 def choice(options: Sequence[str], rng: np.random.Generator) -> str:
-    """Returns one of the options, all equally likely."""
+    """Returns one of the options with equal probabilities."""
     return options[int(rng.random() * len(options))]
 
 

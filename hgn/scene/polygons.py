@@ -1,6 +1,6 @@
-"""Polygons of OBJ and PLY files, cut into triangles: concave ones by ears, where mesh readers would cut fans.
+"""Cuts polygons of OBJ and PLY files into triangles. Concave ones are cut by ears; mesh readers would cut fans.
 
-Shape legend: V vertices, K corners of a polygon, M polygons of equally many corners, F triangles.
+Shape legend: V vertices, K corners of a polygon, M polygons with the same number of corners, F triangles.
 """
 
 from __future__ import annotations
@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-FLAT = 1e-9  # smallest turn at a corner that counts as concave, relative to the polygon's area
-MAXIMUM_CORNERS = 2_000  # of a concave face, whose cutting takes the square of their number
+FLAT = 1e-9  # smallest turn at a corner that counts as concave, as a fraction of the polygon's area
+MAXIMUM_CORNERS = 2_000  # largest number of corners of a concave face; cutting takes the square of it
 _LINE = re.compile(rb"^[ \t]*([vf])[ \t]+(.*)$", re.MULTILINE)
 _JOINED = re.compile(rb"\\\r?\n")
 _COMMENT = re.compile(rb"[ \t]#.*")
@@ -25,7 +25,7 @@ _TYPES = {
 
 
 def plain_obj(data: bytes) -> bytes:
-    """Returns an OBJ file without comments behind numbers or continued lines, which trimesh cannot read."""
+    """Returns an OBJ file without comments after numbers and without continued lines, which trimesh cannot read."""
     return _COMMENT.sub(b"", _JOINED.sub(b" ", data))
 
 
@@ -39,12 +39,12 @@ def polygons_of_obj(data: bytes) -> tuple[np.ndarray, list[np.ndarray]]:
             vertices.append(words[:3])
             continue
         index = np.array([int(word.partition(b"/")[0]) for word in words])
-        faces.append(np.where(index > 0, index - 1, index + len(vertices)))  # negative ones count backwards
+        faces.append(np.where(index > 0, index - 1, index + len(vertices)))  # negative indices count backwards
     return np.array(vertices, np.float64).reshape(-1, 3), faces
 
 
 def polygons_of_ply(data: bytes) -> tuple[np.ndarray, list[np.ndarray]]:
-    """Returns the same of a PLY file. Raises: ValueError or LookupError for a damaged one."""
+    """Returns vertices and faces of a PLY file, as `polygons_of_obj`. Raises: ValueError or LookupError if damaged."""
     end = re.search(rb"end_header[ \t]*\r?\n", data)
     if end is None or not data.startswith(b"ply"):
         raise ValueError("it has no header of PLY")
@@ -72,14 +72,14 @@ def polygons_of_ply(data: bytes) -> tuple[np.ndarray, list[np.ndarray]]:
 
 
 class _Numbers:
-    """The numbers behind the header of a PLY file; `order` is that of bytes, or empty for text."""
+    """The numbers after the header of a PLY file. `order` is the byte order; it is empty for text."""
 
     def __init__(self, data: bytes, order: str) -> None:
         self.order, self.place = order, 0
         self.bytes, self.words = data, np.zeros(0) if order else np.array(data.split(), np.float64)
 
     def columns(self, count: int, properties: list[list[str]]) -> list[Any]:
-        """Returns the next rows of these properties as columns; a column of lists contains arrays."""
+        """Returns the next rows of these properties as columns. A column of lists contains arrays."""
         start = self.place
         if not properties:
             return []
@@ -90,7 +90,7 @@ class _Numbers:
         return list(zip(*(self._row(properties) for _ in range(count)), strict=True)) or [[] for _ in properties]
 
     def _alike(self, count: int, properties: list[list[str]]) -> list[np.ndarray]:
-        """Reads rows whose lists are as long as those of the first row. Raises: ValueError for others."""
+        """Reads rows whose lists have the same lengths as in the first row. Raises: ValueError for other lengths."""
         start = self.place
         lengths = [np.size(value) for value in self._row(properties)] if count else [1] * len(properties)
         self.place, kinds, firsts = start, list[str](), list[int]()
@@ -119,7 +119,7 @@ class _Numbers:
         return row
 
     def _take(self, count: int, kinds: list[str]) -> np.ndarray:
-        """Returns the next numbers, float64 [count, kinds]. Raises: ValueError beyond the end of the file."""
+        """Returns the next numbers, float64 [count, kinds]. Raises: ValueError at the end of the file."""
         if not self.order:
             last = self.place + count * len(kinds)
             if last > len(self.words):
@@ -136,9 +136,9 @@ class _Numbers:
 
 
 def concave_cut(vertex_V3: np.ndarray, faces: list[np.ndarray]) -> np.ndarray | None:
-    """Returns the triangles of all faces, int64 [F, 3], or None where no face is concave.
+    """Returns the triangles of all faces, int64 [F, 3], or None if no face is concave.
 
-    Raises: ValueError naming a face that cannot be cut, because its edges cross, or with a vertex that does not exist.
+    Raises: ValueError naming a face whose edges cross, or which has a vertex that does not exist.
     """
     concave = _concave(vertex_V3, faces)
     if not concave:
@@ -161,11 +161,11 @@ def _concave(vertex_V3: np.ndarray, faces: list[np.ndarray]) -> set[int]:
         number_M = np.flatnonzero(sizes == size)
         face_MK = np.stack([faces[number] for number in number_M])
         if face_MK.min() < 0 or face_MK.max() >= len(vertex_V3):
-            return set()  # refused elsewhere
+            return set()  # other code refuses such a file
         point_MK3 = vertex_V3[face_MK]
         edge_MK3 = np.roll(point_MK3, -1, axis=1) - point_MK3
         turn_MK3 = np.cross(np.roll(edge_MK3, 1, axis=1), edge_MK3)
-        # Newell's normal, from the first corner, which keeps it exact far from the origin
+        # Newell's normal relative to the first corner, which keeps it exact far from the origin
         local_MK3 = point_MK3 - point_MK3[:, :1]
         normal_M3 = np.cross(local_MK3, np.roll(local_MK3, -1, axis=1)).sum(axis=1)
         inward_MK = np.einsum("mka,ma->mk", turn_MK3, normal_M3)
@@ -185,14 +185,14 @@ def _flattened(point_K3: np.ndarray) -> np.ndarray:
 
 
 def _ears(point_K2: np.ndarray, number: int) -> np.ndarray:
-    """Returns the triangles of a polygon, corners int [K - 2, 3]: repeatedly cuts off a corner that contains no other.
+    """Returns the triangles of a polygon, corners int [K - 2, 3]. Repeatedly cuts off a corner that contains no other.
 
     Corners on a straight line become triangles without area, so that neighbouring faces still share their edges.
     """
     rest, ears = list(range(len(point_K2))), []
     area = float(_cross(point_K2, np.roll(point_K2, -1, axis=0)).sum())
     edge_K2 = np.roll(point_K2, -1, axis=0) - point_K2
-    side_KK = _cross(edge_K2[:, None], point_K2[None] - point_K2[:, None])  # of edge i, on which corner j lies
+    side_KK = _cross(edge_K2[:, None], point_K2[None] - point_K2[:, None])  # side of edge i, at corner j
     apart_KK = side_KK * np.roll(side_KK, -1, axis=1) < 0
     if area <= 0 or (apart_KK & apart_KK.T).any():
         raise ValueError(f"face {number} cannot be cut into triangles, because its edges cross")
@@ -200,7 +200,7 @@ def _ears(point_K2: np.ndarray, number: int) -> np.ndarray:
         point_K2_left = point_K2[rest]
         before, after = np.roll(point_K2_left, 1, axis=0), np.roll(point_K2_left, -1, axis=0)
         turn_K = _cross(point_K2_left - before, after - point_K2_left)
-        # the widest ears first: triangles without area are last, or where nothing else is left
+        # widest ears first; triangles without area come last
         for k in np.argsort(-turn_K, kind="stable"):
             if turn_K[k] < -FLAT * area:
                 raise ValueError(f"face {number} cannot be cut into triangles, because its edges touch")

@@ -2,15 +2,14 @@
 
 Two top-level groups:
 
-/VTKHDF  a temporal PolyData of the VTKHDF specification (version 2): the obstacles' triangles, whose vertices come
-         first in each step, and a vertex cell for each particle. PointData `material` (255 on obstacles) and
-         `velocity`, CellData `obstacle` (its number, -1 for particles). Topology and materials are stored once; each
-         step refers to as many of the particles as are present.
-/hgn     data without a place in VTK: domain, gravity, obstacles, source, ground truth. The specification leaves groups
-         outside /VTKHDF to the writer.
+/VTKHDF  a temporal PolyData of the VTKHDF specification (version 2). A step contains the obstacles' triangles, whose
+         vertices come first, and a vertex cell for each particle. PointData has `material` (255 on obstacles) and
+         `velocity`. CellData has `obstacle`, its number, or -1 for particles. Topology and materials are stored once;
+         each step refers to those of the particles that are present.
+/hgn     data without a place in VTK: domain, gravity, obstacles, source, ground truth. The specification allows other
+         groups outside /VTKHDF.
 
-ParaView selects its VTKHDF reader by the endings .vtkhdf and .hdf; for other endings choose it in the dialogue.
-
+ParaView selects its VTKHDF reader by the suffixes .vtkhdf and .hdf. For other suffixes choose it in the dialogue.
 Shape legend: T frames, N particles, R frames of ground truth, V vertices, F triangles.
 """
 
@@ -40,10 +39,10 @@ if TYPE_CHECKING:
     import h5py
 
 FORMAT_NAME = "hgn rollout"
-FORMAT_VERSION = 2  # 1 had no obstacles in /VTKHDF
+FORMAT_VERSION = 2  # version 1 had no obstacles in /VTKHDF
 OBSTACLE_MATERIAL = 255
 MOTION_FIELDS = ("time_T", "translation_T3", "rotation_T33")
-VTKHDF_VERSION = (2, 0)  # the oldest with temporal PolyData, so that older ParaViews open the file too
+VTKHDF_VERSION = (2, 0)  # the oldest version with temporal PolyData, for older ParaViews
 CELL_CATEGORIES = ("Vertices", "Lines", "Polygons", "Strips")  # in the order of Steps/CellOffsets
 
 
@@ -51,9 +50,8 @@ CELL_CATEGORIES = ("Vertices", "Lines", "Polygons", "Strips")  # in the order of
 class Rollout:
     """A simulated trajectory with all data for drawing it. Frame 0 is the initial state.
 
-    Positions of a diverged rollout may be NaN. The ground truth may be shorter or longer than the rollout.
-
-    Raises: ConfigError on shapes or materials that do not fit together, and on numbers out of bounds.
+    Positions of a diverged rollout may be NaN. The ground truth may have fewer or more frames than the rollout.
+    Raises: ConfigError for shapes or materials that do not fit each other, and for numbers out of bounds.
     """
 
     position_TN3: np.ndarray  # float32, domain units
@@ -62,15 +60,15 @@ class Rollout:
     domain_size: BoxSize
     frame_rate_hz: Positive[float]
     gravity: Vector = (0.0, -9.8, 0.0)  # domain units per second squared
-    cell_size: Positive[float] = 1 / 64  # of obstacle cells
-    # JSON-able: weights and their sha256, the scene's specification, settings
+    cell_size: Positive[float] = 1 / 64  # edge of obstacle cells
+    # plain JSON types: weights and their sha256, the scene's specification, settings
     source: dict[str, Any] = field(default_factory=dict)
     reference_TN3: np.ndarray | None = None  # float32 [R, N, 3], ground truth at the same frame rate
-    # int64 [N], sorted: the first frame of each particle, before which its positions are ignored and read as NaN; None:
-    # all particles are present from the start
+    # int64 [N], sorted: the first frame of each particle; its earlier positions are ignored and read as NaN. None: all
+    # particles are present from the start
     entry_frame_N: np.ndarray | None = None
     materials: tuple[str, ...] = MATERIALS
-    # of the motion; with 2 all particles lie on the plane in the middle of the domain across z
+    # number of dimensions of the motion; with 2 all particles lie in the plane at half of the domain's size in z
     dimensions: Annotated[int, Bound("2 or 3", lambda count: count in (2, 3))] = 3
 
     def __post_init__(self) -> None:
@@ -99,7 +97,7 @@ class Rollout:
         return self.position_TN3.shape[1]
 
     def present(self, frame: int) -> int:
-        """Returns the number of particles present in a frame, which are the first of all."""
+        """Returns the number of particles present in a frame. They are the first particles."""
         if self.entry_frame_N is None:
             return self.particle_count
         return int(np.searchsorted(self.entry_frame_N, frame, side="right"))
@@ -108,7 +106,7 @@ class Rollout:
 def frame_velocity(position_TN3: np.ndarray, frame_rate_hz: float) -> np.ndarray:
     """Returns the velocity into each frame, float32 [T, N, 3] in domain units per second.
 
-    Backward differences, the network's own definition (paper sec. 3.1); frame 0 repeats the first step.
+    It is the backward difference, as in the network (paper sec. 3.1). Frame 0 repeats the velocity of frame 1.
     """
     velocity_TN3 = np.zeros(position_TN3.shape, np.float32)
     velocity_TN3[1:] = np.diff(position_TN3, axis=0) * np.float32(frame_rate_hz)
@@ -118,7 +116,7 @@ def frame_velocity(position_TN3: np.ndarray, frame_rate_hz: float) -> np.ndarray
 
 
 def rollout_velocity(rollout: Rollout) -> np.ndarray:
-    """Returns `frame_velocity`, where entering particles take the velocity of their second frame, or zero."""
+    """Returns `frame_velocity`; entering particles get the velocity of their second frame, or zero without one."""
     velocity_TN3 = frame_velocity(rollout.position_TN3, rollout.frame_rate_hz)
     if rollout.entry_frame_N is not None:
         last = rollout.frame_count - 1
@@ -130,7 +128,7 @@ def rollout_velocity(rollout: Rollout) -> np.ndarray:
 
 
 def obstacles_of_episode(episode: Episode) -> tuple[Obstacle, ...]:
-    """Returns the meshes of an episode's obstacles; where only its cells are known, a square for each cell."""
+    """Returns the meshes of an episode's obstacles. If only cells are known, returns a square for each cell."""
     meshes = known_obstacles(episode)
     if meshes is None:
         return cell_obstacles(episode.obstacle_grid, episode.domain_size[2] / 2 if episode.dimensions == 2 else None)
@@ -138,10 +136,10 @@ def obstacles_of_episode(episode: Episode) -> tuple[Obstacle, ...]:
 
 
 def known_obstacles(episode: Episode) -> tuple[Obstacle, ...] | None:
-    """Returns the meshes of an episode's obstacles, which shards do not contain, or None.
+    """Returns the meshes of an episode's obstacles or None. Shards do not contain them.
 
-    The meshes of a random scene are rebuilt from its specification. They are unknown where that names a mesh file that
-    is missing, and for all other scenes.
+    The meshes of a random scene are rebuilt from its specification. Other scenes have none, nor do scenes with a mesh
+    file that is missing.
     """
     records = episode.specification.get("obstacles", ())
     if episode.specification.get("kind") != "random" or not all(_is_here(record) for record in records):
@@ -168,7 +166,7 @@ def _is_here(record: dict[str, Any]) -> bool:
 def cell_obstacles(grid: ObstacleGrid, plane_z: float | None = None) -> tuple[Obstacle, ...]:
     """Returns one square in each obstacle cell, for episodes without meshes.
 
-    The square is perpendicular to the cell's normal; for a 2D set it is the cell's section with the plane at `plane_z`.
+    The square is perpendicular to the cell's normal. In a 2D set it is the cell's section with the plane at `plane_z`.
     """
     if not len(grid.cell_K3):
         return ()
@@ -192,10 +190,7 @@ def cell_obstacles(grid: ObstacleGrid, plane_z: float | None = None) -> tuple[Ob
 
 
 def write_rollout(path: str | Path, rollout: Rollout) -> None:
-    """Writes `rollout` to `path`, atomically; makes missing folders.
-
-    Folders are made as needed.
-    """
+    """Writes `rollout` to `path` atomically. Creates missing folders."""
     import h5py
 
     path = Path(path)
@@ -213,7 +208,7 @@ def write_rollout(path: str | Path, rollout: Rollout) -> None:
 def read_rollout(path: str | Path) -> Rollout:
     """Reads a file of `write_rollout`.
 
-    Raises: ConfigError when the file is missing, damaged, or not a rollout of this version.
+    Raises: ConfigError if the file is missing, damaged, or not a rollout of this version.
     """
     path = Path(path)
     if not path.is_file():
@@ -273,7 +268,7 @@ def _write_vtkhdf(group: h5py.Group, rollout: Rollout) -> None:
 
 
 def _triangles(obstacles: tuple[Obstacle, ...], time_T: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Returns vertices of all obstacles at each time, float32 [T, V, 3], triangles [F, 3], and obstacle numbers [F]."""
+    """Returns vertices of all obstacles at each time, float32 [T, V, 3], triangles [F, 3] and obstacle numbers [F]."""
     places = [np.zeros((len(time_T), 0, 3), np.float32)]
     triangles, first = [np.zeros((0, 3), np.int64)], 0
     for obstacle in obstacles:
@@ -288,7 +283,7 @@ def _triangles(obstacles: tuple[Obstacle, ...], time_T: np.ndarray) -> tuple[np.
 
 
 def _stacked(value_TV3: np.ndarray, value_TN3: np.ndarray, present_T: np.ndarray) -> np.ndarray:
-    """Returns the vertices' and the present particles' rows, frame by frame, float32 [rows, 3]."""
+    """Returns the rows of the vertices and of the present particles, frame by frame, float32 [rows, 3]."""
     if not value_TV3.shape[1] and (present_T == value_TN3.shape[1]).all():
         return value_TN3.reshape(-1, 3).astype(np.float32, copy=False)
     parts = zip(value_TV3, value_TN3, present_T, strict=True)
@@ -345,7 +340,7 @@ def _read(file: h5py.File, claims: Claims) -> Rollout:
     own, vtk = file["hgn"], file["VTKHDF"]
     count_T = vtk["NumberOfPoints"][()]
     points, material_P = vtk["Points"], vtk["PointData/material"][()]
-    vertices = len(material_P) - len(vtk["Vertices/Connectivity"])  # of obstacles, stored before the particles
+    vertices = len(material_P) - len(vtk["Vertices/Connectivity"])  # vertices of obstacles precede the particles
     material_N = material_P[vertices:]
     shape = (len(count_T), len(material_N), 3)
     entry_N = own["entry_frame"][()] if "entry_frame" in own else np.zeros(shape[1], np.int64)

@@ -1,4 +1,4 @@
-"""Rotations of points by plain sums and products, so that results do not depend on a BLAS."""
+"""Rotations of points by plain sums and products, so that results do not depend on a BLAS library."""
 
 from __future__ import annotations
 
@@ -37,9 +37,9 @@ def quaternion_product(
 
 
 def euler_rotation(degrees: Vector) -> np.ndarray:
-    """Returns the matrix, float64 [3, 3], that turns about the fixed x axis, then y, then z.
+    """Returns the matrix, float64 [3, 3], of turns about the fixed x axis, then y, then z.
 
-    Quarter turns are exact: an axis-aligned mesh stays axis-aligned.
+    Quarter turns are exact, so an axis-aligned mesh stays axis-aligned.
     """
     matrix = np.eye(3)
     for axis, angle in enumerate(degrees):
@@ -50,7 +50,7 @@ def euler_rotation(degrees: Vector) -> np.ndarray:
         first, second = (axis + 1) % 3, (axis + 2) % 3
         turn[first, first], turn[first, second] = cosine, -sine
         turn[second, first], turn[second, second] = sine, cosine
-        matrix = rotate(matrix.T, turn).T  # turn times matrix: rotate() takes the columns as points
+        matrix = rotate(matrix.T, turn).T  # turn times matrix; rotate() treats the columns as points
     return matrix
 
 
@@ -61,5 +61,5 @@ def rotate(point_P3: np.ndarray, rotation_33: np.ndarray) -> np.ndarray:
 
 
 def round_to_float32(point_P3: np.ndarray) -> np.ndarray:
-    """Rounds to float32 values, as float64: last-bit differences between maths libraries vanish."""
+    """Rounds to float32 values, as float64. Differences in the last bits between maths libraries disappear."""
     return point_P3.astype(np.float32).astype(np.float64)

@@ -1,6 +1,6 @@
 """Scenes: particles in their initial state, and obstacles as triangle meshes.
 
-A scene is immutable. Lengths are in domain units (the paper's domain is 1 x 1 x 1), y points up.
+A scene is immutable. Lengths are in domain units (the paper's domain is 1 x 1 x 1). y points up.
 Shape legend: N particles, V vertices, F triangles.
 """
 
@@ -17,13 +17,13 @@ from hgn.scene.material import MATERIAL_PARAMETERS, MATERIALS, require_materials
 from hgn.scene.motion import Motion
 from hgn.schema import ConfigError, Vector, require
 
-CELL_TOLERANCE = 1e-3  # of a cell that a domain may be longer or shorter than whole cells
+CELL_TOLERANCE = 1e-3  # largest difference of a domain's length from whole cells, in cells
 
 
 def whole_cells(domain_size: Vector, cell_size: float) -> tuple[int, int, int]:
     """Returns the number of solver cells along each side of a domain.
 
-    Raises: ConfigError for a side that is not a whole number of cells.
+    Raises: ConfigError if a side is not a whole number of cells.
     """
     require(0 < cell_size < math.inf, "cell_size", "a finite number > 0", cell_size)
     counts = [length / cell_size for length in domain_size]
@@ -40,7 +40,7 @@ def whole_cells(domain_size: Vector, cell_size: float) -> tuple[int, int, int]:
 class Obstacle:
     """A triangle mesh, at rest or in motion.
 
-    `closed` means a watertight solid; the solver treats solids and sheets differently.
+    `closed` marks a watertight solid. The solver treats solids and sheets differently.
     """
 
     name: str
@@ -52,7 +52,7 @@ class Obstacle:
 
     @property
     def corners(self) -> np.ndarray:
-        """The corners of its triangles, float64 [F, 3, 3]."""
+        """The corners of the obstacle's triangles, float64 [F, 3, 3]."""
         return np.asarray(self.vertex_V3, np.float64)[self.triangle_F3]
 
 
@@ -63,25 +63,25 @@ def all_corners(obstacles: Sequence[Obstacle]) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """A scene, input of the solver and of a network's rollout."""
+    """A scene: the input of the solver and of a network's rollout."""
 
     position_N3: np.ndarray  # float32, domain units
     velocity_N3: np.ndarray  # float32, domain units per second
     material_N: np.ndarray  # uint8, index into MATERIALS
     obstacles: tuple[Obstacle, ...] = ()
     domain_size: Vector = (1.0, 1.0, 1.0)
-    cell_size: float = 1 / 64  # spacing of the solver's grid and of the obstacle cells
+    cell_size: float = 1 / 64  # edge of the cells of the solver's grid and of obstacle cells
     gravity: Vector = (0.0, -9.8, 0.0)  # domain units per second squared
-    seed: int = 0  # of the obstacles' surface samples
-    specification: dict[str, Any] = field(default_factory=dict)  # JSON-able: how the scene was made
-    # float32 [N] by name (hgn.scene.material.MATERIAL_PARAMETERS), in place of the solver's settings; NaN: as these
+    seed: int = 0  # seed of the obstacles' surface samples
+    specification: dict[str, Any] = field(default_factory=dict)  # plain JSON types: all choices that made the scene
+    # float32 [N] by name (hgn.scene.material.MATERIAL_PARAMETERS); they replace the solver's settings, except for NaN
     material_parameters: dict[str, np.ndarray] = field(default_factory=dict)
-    # of the initial filling, where it is known: the solver then relaxes the density of water towards it
+    # density of the initial filling, if known; the solver then relaxes the density of water towards it
     particles_per_cell: float | None = None
     # Coulomb coefficients of the domain's walls across x, y (floor and ceiling) and z
     wall_friction: Vector = (0.0, 0.0, 0.0)
-    # float64 [N], seconds, sorted: the time at which each particle enters at its position and velocity; 0: present from
-    # the start. None: all are present
+    # float64 [N], seconds, sorted: the time at which each particle enters at its position and velocity; 0: it is
+    # present from the start. None: all are
     entry_s_N: np.ndarray | None = None
 
     def __post_init__(self) -> None:

@@ -40,16 +40,16 @@ from hgn.schema import (
 from hgn.system.yaml_files import read_yaml
 
 GROUP_SHAPES, EMITTER_SHAPES = ("cube", "sphere", "box"), ("disc", "rectangle")
-MAXIMUM_BYTES = 250_000  # of a scene file
-MAXIMUM_PARTICLES, MAXIMUM_ENTRIES = 50_000_000, 256  # entries: obstacles, or groups and emitters
-MEASURE = "measure"  # section of the files in conf/gallery that tools.stability reads
+MAXIMUM_BYTES = 250_000  # largest size of a scene file
+MAXIMUM_PARTICLES, MAXIMUM_ENTRIES = 50_000_000, 256  # entries are obstacles, or groups and emitters
+MEASURE = "measure"  # section of files in conf/gallery that tools.stability reads
 MILLIMETRES = "a file in millimetres needs scale: 0.001"
-EMITTER_STREAM = 2**31  # of random numbers, separate from those of groups
+EMITTER_STREAM = 2**31  # key of the emitters' random streams, which are separate from those of groups
 
 
 @dataclass(frozen=True)
 class KeyframeEntry:
-    """A pose of an obstacle, relative to where its entry places it."""
+    """A pose of an obstacle relative to its initial place."""
 
     time: NonNegative[float]  # seconds
     translation: Vector = (0.0, 0.0, 0.0)
@@ -61,16 +61,16 @@ class KeyframeEntry:
 
 @dataclass(frozen=True)
 class ObstacleEntry:
-    """Either `mesh` (a file, with `scale`) or `shape` (a built-in one, with `size`)."""
+    """An obstacle: either `mesh` (a file, with `scale`) or `shape` (a built-in one, with `size`)."""
 
     mesh: str | None = None  # path relative to the scene file
-    scale: Positive[float] | None = None  # of the mesh; null: 1
+    scale: Positive[float] | None = None  # factor for the mesh; null: 1
     shape: str | None = None
     size: Positive[float] | None = None  # side, diameter, or base width and height
     position: Vector | None = None  # translation of a mesh (null: none), or centre of a shape
     rotation: Vector = (0.0, 0.0, 0.0)  # degrees about the fixed x axis, then y, then z
     friction: NonNegative[float] | None = None  # Coulomb coefficient; null: mpm.collider_friction
-    keyframes: tuple[KeyframeEntry, ...] = ()  # poses in order of time; empty: at rest
+    keyframes: tuple[KeyframeEntry, ...] = ()  # poses in order of time; empty: the obstacle is at rest
 
     def __post_init__(self) -> None:
         require_bounds(self)
@@ -87,7 +87,7 @@ class ObstacleEntry:
         self.motion()
 
     def motion(self) -> Motion | None:
-        """The motion of the obstacle, or None."""
+        """Returns the motion of the obstacle, or None."""
         if not self.keyframes:
             return None
         return Motion(
@@ -127,11 +127,11 @@ class MaterialEntry:
 
 @dataclass(frozen=True, kw_only=True)
 class GroupEntry(MaterialEntry):
-    """A solid of one material, filled with random particles; or `particles`, a file of particles."""
+    """A solid of one material, filled with random particles; or `particles`, a file that contains them."""
 
     shape: str | None = None  # cube, sphere or box
     size: float | tuple[float, float, float] | None = None  # side, diameter, or the three edges of a box
-    position: Vector | None = None  # of the centre
+    position: Vector | None = None  # place of the centre
     particles: str | None = None  # .npz with position and optionally velocity [N, 3], relative to the scene file
     velocity: Vector = (0.0, 0.0, 0.0)  # domain units per second
 
@@ -165,13 +165,13 @@ class GroupEntry(MaterialEntry):
 
 @dataclass(frozen=True, kw_only=True)
 class EmitterEntry(MaterialEntry):
-    """A face that particles enter through, at the density of groups."""
+    """A face through which particles enter, at the density of groups."""
 
-    shape: str  # disc or rectangle, across the velocity
-    size: float | tuple[float, float]  # diameter, or the two edges of a rectangle, the first horizontal
-    position: Vector  # of the centre
-    velocity: Vector  # domain units per second, of entering particles
-    stop: NonNegative[float]  # seconds
+    shape: str  # disc or rectangle, perpendicular to the velocity
+    size: float | tuple[float, float]  # diameter, or the edges of a rectangle; the first one is horizontal
+    position: Vector  # place of the centre
+    velocity: Vector  # velocity of entering particles, domain units per second
+    stop: NonNegative[float]  # seconds after the start of the simulation
     start: NonNegative[float] = 0.0
 
     def __post_init__(self) -> None:
@@ -193,18 +193,18 @@ class EmitterEntry(MaterialEntry):
 
 @dataclass(frozen=True)
 class SceneFile:
-    """The content of a scene file; the defaults are the paper's."""
+    """The content of a scene file. The defaults are the paper's."""
 
     groups: tuple[GroupEntry, ...] = ()
     emitters: tuple[EmitterEntry, ...] = ()
     obstacles: tuple[ObstacleEntry, ...] = ()
     domain_size: BoxSize = (1.0, 1.0, 1.0)
-    cell_size: Positive[float] = 1 / 64  # of the solver's grid and of obstacle cells
+    cell_size: Positive[float] = 1 / 64  # edge of the cells of the solver's grid and of obstacle cells
     gravity: Vector = (0.0, -9.8, 0.0)  # domain units per second squared
     particles_per_cell: Positive[float] = 8.0
     floor_friction: NonNegative[float] = 0.0  # Coulomb coefficient of the domain's floor and ceiling
     wall_friction: NonNegative[float] = 0.0  # Coulomb coefficient of the side walls
-    seed: int = 0  # of the particles and of the obstacle samples
+    seed: int = 0  # seed of the particles and of the obstacle samples
 
     def __post_init__(self) -> None:
         require_bounds(self)
@@ -215,9 +215,9 @@ class SceneFile:
 
 
 def find_scene(name: str) -> Path:
-    """Returns the file of a path, or of a scene in conf/example or conf/gallery by its name, as in `funnel`.
+    """Returns the file at a path, or the scene in conf/example or conf/gallery with a name such as `funnel`.
 
-    Raises: ConfigError for a name without an ending that is neither a file nor an example.
+    Raises: ConfigError for a name without suffix that is neither a file nor an example.
     """
     if Path(name).is_file() or not re.fullmatch(r"\w+", name):
         return Path(name)
@@ -234,10 +234,9 @@ def scene_files(folder: str) -> dict[str, Path]:
 def load_scene(path: str | Path) -> Scene:
     """Reads a scene file.
 
-    Each group has its own random stream, so that editing one does not move the particles of others.
-
+    Each group has its own random stream, so a change of one group does not move the particles of others.
     Raises: ConfigError, starting with the path, for unknown keys, invalid values, unreadable meshes, and groups that
-    reach into the solver's walls (3 cells) or into closed obstacles.
+    overlap the solver's walls (3 cells) or closed obstacles.
     """
     return scene_of(read_mapping(path), path)
 
@@ -255,7 +254,7 @@ def read_mapping(path: str | Path) -> dict[str, Any]:
 
 
 def scene_of(mapping: Mapping[str, Any], path: str | Path) -> Scene:
-    """Returns the scene of a file's content; meshes are found beside `path`. Raises: ConfigError as load_scene."""
+    """Returns the scene of a file's content. Meshes are relative to `path`. Raises: ConfigError as load_scene."""
     content = {key: value for key, value in mapping.items() if key != MEASURE}
     try:
         return _build(from_mapping(SceneFile, content), Path(path).parent)
@@ -264,8 +263,10 @@ def scene_of(mapping: Mapping[str, Any], path: str | Path) -> Scene:
 
 
 def notes_on_files(scene: Scene) -> list[str]:
-    """Returns warnings about the files of a scene: meshes that are sheets, or (in another unit, perhaps) smaller than a
-    cell or without a surface in the domain; and stored particles inside obstacles.
+    """Returns warnings about the files of a scene.
+
+    They concern meshes that are sheets, smaller than a cell (perhaps in another unit) or without a surface in the
+    domain, and stored particles inside obstacles.
     """
     if scene.specification.get("kind") != "file":
         return []
@@ -306,7 +307,7 @@ def _reaches(obstacle: Obstacle, domain_size: Vector, cell_size: float) -> bool:
 def _build(file: SceneFile, folder: Path) -> Scene:
     whole_cells(file.domain_size, file.cell_size)
     bodies = [_obstacle(entry, index, folder) for index, entry in enumerate(file.obstacles)]
-    # the sheets of meshes that are partly watertight are last, so that obstacle i is that of entry i
+    # sheets of partly watertight meshes come last, so that entry i has obstacle i
     obstacles = (*(first for first, *_ in bodies), *(sheet for _, *others in bodies for sheet in others))
     stored = {i: _read_particles(entry, i, folder, file) for i, entry in enumerate(file.groups) if entry.particles}
     filling = file.particles_per_cell, file.cell_size
@@ -356,7 +357,7 @@ def _build(file: SceneFile, folder: Path) -> Scene:
     for index, (_, own_N3) in stored.items():
         velocity_N3[begins[index] : begins[index] + sizes[index]] += own_N3
     entry_s_N = np.concatenate(times)
-    order = np.argsort(entry_s_N, kind="stable")  # groups first
+    order = np.argsort(entry_s_N, kind="stable")  # groups come first
     return Scene(
         position_N3=np.concatenate(positions)[order],
         velocity_N3=velocity_N3[order],
@@ -401,7 +402,7 @@ def _read_particles(entry: GroupEntry, index: int, folder: Path, file: SceneFile
 
 
 def _material_parameters(groups: Sequence[MaterialEntry], counts: list[int]) -> dict[str, np.ndarray]:
-    """Returns the constants that any group gives, float32 [N]; NaN for groups without them."""
+    """Returns the constants of the groups by name, float32 [N]; NaN for groups without the constant."""
     names = [name for name in MATERIAL_PARAMETERS if any(name in group.parameters for group in groups)]
     return {
         name: np.repeat(np.array([group.parameters.get(name, np.nan) for group in groups], np.float32), counts)
@@ -420,7 +421,7 @@ def _obstacle(entry: ObstacleEntry, index: int, folder: Path) -> tuple[Obstacle,
         finite = bool(np.isfinite(bodies[0].vertex_V3).all())
         require(finite, f"obstacles[{index}].size", "in the range of float32", entry.size)
     else:
-        # trimesh takes a second to import
+        # importing trimesh takes a second
         from hgn.scene.mesh import load_bodies
 
         bodies = load_bodies(

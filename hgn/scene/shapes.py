@@ -1,7 +1,7 @@
-"""The five obstacles of the paper (sec. 3.3) as small triangle meshes, and mesh files in their place.
+"""The five obstacles of the paper (sec. 3.3) as small triangle meshes, and mesh files instead of them.
 
-Half box and half sphere are bowls without a lid, the square is a sheet; cone and pyramid are closed and
-oriented outwards. The open sides and the tips point along +y before rotation.
+Half box and half sphere are bowls without a lid. The square is a sheet. Cone and pyramid are closed and oriented
+outwards. Open sides and tips point along +y before rotation.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from hgn.scene.scene import Obstacle
 from hgn.schema import Vector
 
 CLOSED_SHAPES = frozenset({"cone", "pyramid"})
-SEGMENTS = 32  # around a cone
+SEGMENTS = 32  # number of segments around a cone
 SPHERE_SEGMENTS, SPHERE_RINGS = 24, 6  # facets deviate by at most 0.9 % of the radius
 
 
@@ -30,14 +30,13 @@ def shape_obstacle(
     rotation_33: np.ndarray | None = None,
     name: str | None = None,
 ) -> Obstacle:
-    """Returns an obstacle of a known shape; `position` is the middle of its unrotated bounding box.
+    """Returns an obstacle of a known shape. `position` is the centre of its unrotated bounding box.
 
-    `size` in domain units is the side of the square and of the half box (which is half as high), the diameter
-    of the half sphere, the base width and the height of cone and pyramid, the longest side of a mesh file's bounding
-    box. Vertices are rounded to float32.
-
-    Raises: KeyError for a shape that is neither one of hgn.config.OBSTACLE_SHAPES nor a mesh file; ConfigError for a
-    mesh that cannot be read.
+    `size`, in domain units, is the side of the square and of the half box (whose height is half of it), the diameter of
+    the half sphere, the base width and height of cone and pyramid, or the longest side of a mesh file's bounding box.
+    Vertices are rounded to float32.
+    Raises: KeyError for a shape that is neither in hgn.config.OBSTACLE_SHAPES nor a mesh file; ConfigError for an
+    unreadable mesh.
     """
     vertex, triangle, closed = unit_shape(shape)
     scaled = size * vertex
@@ -52,7 +51,7 @@ def unit_shape(shape: str) -> tuple[np.ndarray, np.ndarray, bool]:
     is closed."""
     closed = shape in CLOSED_SHAPES
     if is_mesh_file(shape):
-        # trimesh takes half a second to import, and few scenes need it
+        # importing trimesh takes half a second, and few scenes need it
         from hgn.scene.mesh import load_mesh
 
         mesh = load_mesh(shape, "obstacle_shapes")
@@ -70,9 +69,9 @@ def unit_shape(shape: str) -> tuple[np.ndarray, np.ndarray, bool]:
 
 @functools.cache
 def mesh_sha256(shape: str) -> str:
-    """Returns the sha256 of a mesh file, which identifies it in data sets.
+    """Returns the sha256 of a mesh file. It identifies the mesh in data sets.
 
-    Raises: ConfigError for a mesh that cannot be read.
+    Raises: ConfigError for an unreadable mesh.
     """
     unit_shape(shape)
     return hashlib.sha256(Path(shape).read_bytes()).hexdigest()

@@ -14,21 +14,20 @@ from hgn.schema import ConfigError, require
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree
 
-CANDIDATES = 1.0  # per spacing^2 and round; a dense Poisson-disk set has about 0.7
+CANDIDATES = 1.0  # number per spacing^2 and round; a dense Poisson-disk set has about 0.7
 MINIMUM_ROUNDS, MAXIMUM_ROUNDS = 4, 12
-SETTLED = 0.02  # rounds end when one adds less than this fraction
-MINIMUM_CANDIDATES = 64
+SETTLED = 0.02  # rounds end after one that adds less than this fraction
+MINIMUM_CANDIDATES = 64  # added to the number of candidates of a round
 MAXIMUM_SAMPLES, MAXIMUM_PIECES = 5_000_000, 2_000_000
 
 
 def sample_surface(corner_F33: np.ndarray, spacing: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """Returns random points of triangles, no two closer than `spacing` (Paper sec. 3: Poisson disks).
 
-    Returns float64 [S, 3] and the triangle of each, int64 [S]. Candidates are drawn by area (slivers narrower than
-    about the spacing by length) and kept unless too close to an earlier one, in rounds until few are added. Zero-area
-    triangles get no samples. The result is determined by the state of `rng`.
-
-    Raises: ConfigError when the surface is too large for the spacing.
+    Returns float64 [S, 3] and the triangle of each point, int64 [S]. Candidates are drawn by area; slivers thinner than
+    about the spacing are drawn by length. A candidate is accepted unless it is too close to an earlier point. Rounds
+    end when few are added. Zero-area triangles get no points. The state of `rng` determines the result.
+    Raises: ConfigError if the surface is too large for the spacing.
     """
     weight = _weights(corner_F33, spacing)
     usable = np.flatnonzero(weight > 0)
@@ -49,7 +48,7 @@ def sample_surface(corner_F33: np.ndarray, spacing: float, rng: np.random.Genera
         point = _uniform_in_triangles(corner_F33[owner], rng)
         if len(points):
             near = point_tree(points).query(point, distance_upper_bound=spacing)[0]
-            free = near >= spacing  # infinite where nothing is nearer
+            free = near >= spacing  # infinite if no point is nearer
             point, owner = point[free], owner[free]
         selected = _spread_out(point, spacing)
         points = np.concatenate([points, point[selected]])
@@ -62,9 +61,9 @@ def sample_surface(corner_F33: np.ndarray, spacing: float, rng: np.random.Genera
 def split_long_edges(
     corner_F33: np.ndarray, longest: float, box: tuple[np.ndarray, np.ndarray] | None = None
 ) -> np.ndarray:
-    """Bisects triangles at their longest edge until no edge exceeds `longest`: corners, float64 [F', 3, 3].
+    """Bisects triangles at their longest edge until no edge exceeds `longest`. Returns corners, float64 [F', 3, 3].
 
-    Pieces whose bounding box misses `box` (lowest and highest corner) are dropped.
+    Pieces whose bounding box is outside `box` (lowest and highest corner) are dropped.
     Raises: ConfigError for more than MAXIMUM_PIECES.
     """
     corner = np.asarray(corner_F33, np.float64)
@@ -88,7 +87,7 @@ def split_long_edges(
 
 
 def area_vectors(corner_F33: np.ndarray) -> np.ndarray:
-    """Returns normals with the length of the area, float64 [F, 3]."""
+    """Returns normals whose length is the triangle's area, float64 [F, 3]."""
     return 0.5 * np.cross(corner_F33[:, 1] - corner_F33[:, 0], corner_F33[:, 2] - corner_F33[:, 0])
 
 
@@ -101,7 +100,7 @@ def _weights(corner: np.ndarray, spacing: float) -> np.ndarray:
 
 
 def point_tree(point_S3: np.ndarray) -> cKDTree:
-    """Returns a nearest-neighbour tree. SciPy's take half a second to import, and most commands need none."""
+    """Returns a nearest-neighbour tree. Importing SciPy's takes half a second, and most commands need none."""
     from scipy.spatial import cKDTree
 
     return cKDTree(point_S3, balanced_tree=False)
@@ -114,7 +113,7 @@ def _uniform_in_triangles(corner_S33: np.ndarray, rng: np.random.Generator) -> n
 
 
 def _spread_out(point: np.ndarray, spacing: float) -> np.ndarray:
-    """Returns the points that a loop would keep that drops each point too close to one kept before."""
+    """Returns the points of a loop that drops each point too close to an earlier point that it kept."""
     if len(point) == 0:
         return np.zeros(0, np.int64)
     pair = point_tree(point).query_pairs(spacing, output_type="ndarray").astype(np.int64)

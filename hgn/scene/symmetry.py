@@ -1,10 +1,10 @@
 """The symmetries of a scene's box that keep gravity, for augmentation in training.
 
-Each exchanges axes or mirrors them. With gravity along an axis there are eight if the other two sides are equal (four
-quarter turns about gravity, each also mirrored), else four.
+A symmetry exchanges axes or mirrors them. With gravity along an axis there are eight if the other two sides are equal
+(four quarter turns about gravity, each also mirrored). Otherwise there are four.
 The box spans the solver's nodes: (n - 1) cells on an axis of n nodes. Its walls have the same number of nodes at both
-ends, so particles rest at 2 and at 61 of 64 cells. A mirror therefore maps x to (n - 1) cells minus x, nodes to nodes;
-a mirror at the middle of the domain would move the walls by a cell.
+ends, so particles rest at 2 and at 61 of 64 cells. A mirror therefore maps x to (n - 1) cells minus x, and nodes to
+nodes. A mirror at the middle of the domain would move the walls by a cell.
 """
 
 from __future__ import annotations
@@ -16,17 +16,17 @@ from itertools import permutations, product
 from hgn.schema import Vector
 from hgn.system.splitmix import splitmix64
 
-CELL_BITS = 17  # as in a cell's key
-CODE_BITS = 3 + CELL_BITS  # of an axis: two bits for the source, one for the mirror, the box's cells
+CELL_BITS = 17  # bits for a number of cells, as in a cell's key
+CODE_BITS = 3 + CELL_BITS  # bits of an axis: two for the source, one for the mirror, the others for the box's cells
 
 
 @dataclass(frozen=True)
 class Symmetry:
-    """Coordinate i of the image is coordinate `source[i]`, or `cells[i]` cells minus it where `mirrored[i]`."""
+    """Coordinate i of the image is coordinate `source[i]`; if `mirrored[i]`, it is `cells[i]` cells minus that."""
 
     source: tuple[int, int, int] = (0, 1, 2)
     mirrored: tuple[bool, bool, bool] = (False, False, False)
-    cells: tuple[int, int, int] = (0, 0, 0)  # between the solver's first node and its last
+    cells: tuple[int, int, int] = (0, 0, 0)  # number of cells between the solver's first node and its last
     cell_size: float = 1 / 64
 
     @property
@@ -42,7 +42,7 @@ class Symmetry:
 
     @cached_property
     def code(self) -> int:
-        """The symmetry without the cell size as an integer below 2^60, for the kernels."""
+        """The symmetry as an integer below 2^60 for the kernels, without the cell size."""
         assert min(self.cells) >= 0 and max(self.cells) < 1 << CELL_BITS
         axes = zip(self.source, self.mirrored, self.cells, strict=True)
         return sum((s | m << 2 | cells << 3) << CODE_BITS * i for i, (s, m, cells) in enumerate(axes))
@@ -52,11 +52,11 @@ class Symmetry:
 def scene_symmetries(
     gravity: Vector, domain_size: Vector, cell_size: float, less: int = 1, dimensions: int = 3
 ) -> tuple[Symmetry, ...]:
-    """Returns all exchanges and mirrors of axes that keep gravity and the domain, the identity first.
+    """Returns all exchanges and mirrors of axes that keep gravity and the domain, starting with the identity.
 
-    Without gravity all 48 symmetries of a cube remain, with an oblique one perhaps only the identity. `cell_size` is
-    the solver's, whose box is `less` cells smaller than the domain; the box of an imported set is its domain. An axis
-    that is no whole number of cells is not mirrored. Axes from `dimensions` on are unchanged.
+    Without gravity all 48 symmetries of a cube remain; with oblique gravity perhaps only the identity. `cell_size` is
+    the solver's. Its box is `less` cells smaller than the domain; the box of an imported set is its domain. An axis
+    without a whole number of cells is not mirrored. Axes with numbers from `dimensions` are unchanged.
     """
     x, y, z = (round(length / cell_size) - less for length in domain_size)
     cells = x, y, z

@@ -1,4 +1,4 @@
-"""Scenes as users make them, by kind: pools, dam breaks, columns, slopes, edges, bowls, stairs and others.
+"""Scenes of everyday kinds: pools, dam breaks, columns, slopes, edges, bowls, stairs and others.
 
 A kind draws a domain from DOMAINS and numbers from its RANGES, and places obstacles and bodies. Some numbers are drawn
 uniformly, others with small values more often. As in `hgn.scene.random_scene`, a scene is determined by (config, seed),
@@ -24,7 +24,7 @@ DRAWS = 500  # attempts to place one scene
 FALLING = (0.0, -9.8, 0.0)
 UNTURNED = (1.0, 0.0, 0.0, 0.0)
 
-# Edges in solver cells of 1/64. Few, because only scenes with equal domains share a launch.
+# Edges in solver cells of 1/64. There are few domains, because only scenes with equal domains share a launch.
 DOMAINS: dict[str, tuple[int, int, int]] = {
     "small": (24, 40, 24),
     "box": (20, 32, 20),
@@ -43,7 +43,7 @@ class _DrawAgainError(Exception):
 
 @dataclass
 class Layout:
-    """An unfinished scene. layout('size') draws a number from RANGES[kind]['size']."""
+    """An unfinished scene. For example, layout('size') draws a number from RANGES[kind]['size']."""
 
     config: SceneConfig
     kind: str
@@ -56,13 +56,13 @@ class Layout:
     particles: int = 0
 
     def __call__(self, name: str, small: bool = False) -> float:
-        """Returns a number of the range; with `small` the square of a uniform number is used."""
+        """Returns a uniform number of the range. With `small` low numbers are likelier: the uniform part is squared."""
         low, high = RANGES[self.kind][name]
         part = self.rng.random()
         return low + (high - low) * (part * part if small else part)
 
     def count(self, name: str) -> int:
-        """Returns a whole number of the range, ends included."""
+        """Returns a whole number of the range, limits included."""
         low, high = RANGES[self.kind][name]
         return int(low + int(self.rng.random() * (high - low + 1)))
 
@@ -73,7 +73,7 @@ class Layout:
         return choice(names, self.rng)
 
     def take_domain(self, *names: str) -> None:
-        """Draws the domain. Raises: _DrawAgainError where it is larger than the configured one."""
+        """Draws the domain. Raises: _DrawAgainError if it is larger than the configured domain."""
         x, y, z = DOMAINS[self.one_of(*names)]
         self.domain = (x / 64, y / 64, z / 64)
         if any(own > largest for own, largest in zip(self.domain, self.config.domain_size, strict=True)):
@@ -81,7 +81,7 @@ class Layout:
 
     @property
     def low(self) -> float:
-        """The smallest coordinate of particles: the inner face of the solver's walls."""
+        """The smallest coordinate of particles, at the inner face of the solver's walls."""
         return WALL_CELLS * self.config.cell_size + ROUNDING
 
     def high(self, axis: int) -> float:
@@ -89,7 +89,7 @@ class Layout:
         return self.domain[axis] - self.low
 
     def along(self, axis: int, half: float) -> float:
-        """Returns a coordinate at which a body with this half width is clear of the walls."""
+        """Returns a random coordinate at which a body with this half width does not touch the walls."""
         first = self.low + half + ROUNDING
         span = self.high(axis) - half - ROUNDING - first
         if span < 0:
@@ -97,7 +97,7 @@ class Layout:
         return first + span * self.rng.random()
 
     def place(self, shape: str, size: float, position: Vector, quaternion: Quaternion = UNTURNED) -> None:
-        """Adds an obstacle. Raises: _DrawAgainError where it reaches out of the domain."""
+        """Adds an obstacle. Raises: _DrawAgainError if a part of it is outside the domain."""
         item = place_shape(shape, size, position, quaternion, len(self.obstacles))
         if (item.low < 0).any() or (item.high > np.array(self.domain)).any():
             raise _DrawAgainError
@@ -108,7 +108,7 @@ class Layout:
     ) -> None:
         """Adds a body of a drawn material, or of the named one if config.materials contains it.
 
-        Raises: _DrawAgainError where it is not clear of walls, obstacles and other bodies, or too large.
+        Raises: _DrawAgainError if it is too large, or too near to walls, obstacles or other bodies.
         """
         region, clearance = region_of(shape, size, centre), CLEARANCE_CELLS * self.config.cell_size
         inside = (region.reach > 0).all() and (np.array(centre) - region.reach >= self.low - ROUNDING).all()
@@ -135,7 +135,7 @@ class Layout:
         self.add("box", size, triple(0.5 * (np.array(low) + np.array(high))), velocity, material)
 
     def tilt_gravity(self, tangent: float) -> None:
-        """Turns gravity about a horizontal axis by twice the arc tangent of a number."""
+        """Turns gravity about a random horizontal axis, by twice the arc tangent of `tangent`."""
         across_x, across_z = random_direction(self.rng, 2).tolist()
         cosine, sine = _turn(tangent)
         size = -FALLING[1]
@@ -155,7 +155,7 @@ def _about_z(tangent: float) -> Quaternion:
 
 
 def _pool(new: Layout) -> None:
-    """Material lies from wall to wall, often at rest; gravity may be tilted, or a body falls in."""
+    """Fills the floor from wall to wall, often with water at rest. Gravity may be tilted, or a body falls in."""
     new.take_domain("small", "box", "tray", "flume")
     top = new.low + new("depth")
     material = "water" if new.chance(0.6) else ""
@@ -169,14 +169,14 @@ def _pool(new: Layout) -> None:
 
 
 def _dam(new: Layout) -> None:
-    """A block of water, at times of another material, stands at one end of a channel and fills the width."""
+    """Places a block, mostly of water, at one end of a channel, over its whole width."""
     new.take_domain("flume", "long", "tray", "small")
     far = (new.low + new("length"), new.low + new("height"), new.high(2))
     new.box((new.low,) * 3, far, material="water" if new.chance(0.75) else "")
 
 
 def _column(new: Layout) -> None:
-    """A column stands on the floor and collapses on all sides."""
+    """Places a column on the floor, which collapses on all sides."""
     new.take_domain("room", "hall", "tall")
     width, height, depth = new("width"), new("height", small=True), new("depth")
     x, z = new.along(0, 0.5 * width), new.along(2, 0.5 * depth)
@@ -185,7 +185,7 @@ def _column(new: Layout) -> None:
 
 
 def _drop(new: Layout) -> None:
-    """One body falls, or is thrown."""
+    """Drops or throws one body."""
     new.take_domain("room", "hall", "tall")
     size = new("size")
     height = new.low + 0.5 * size + new("height", small=True) + ROUNDING
@@ -196,7 +196,7 @@ def _drop(new: Layout) -> None:
 
 
 def _slope(new: Layout) -> None:
-    """One or two bodies lie on a tilted plate, and slide off its lower end."""
+    """Places one or two bodies on a tilted plate. They slide off its lower end."""
     new.take_domain("room", "hall")
     plate, tangent = new("plate"), new("tilt")
     cosine, sine = _turn(tangent)
@@ -212,7 +212,7 @@ def _slope(new: Layout) -> None:
 
 
 def _edge(new: Layout) -> None:
-    """A body falls onto the edge of a plate, or past it."""
+    """Drops a body onto the edge of a plate, or past it."""
     new.take_domain("room", "tall")
     plate, size = new("plate"), new("size")
     x, y, z = new.along(0, 0.5 * plate), new.low + new("height"), new.along(2, 0.5 * plate)
@@ -224,7 +224,7 @@ def _edge(new: Layout) -> None:
 
 
 def _stack(new: Layout) -> None:
-    """Bodies stand above one another."""
+    """Places bodies above one another."""
     new.take_domain("room", "tall")
     size = new("size")
     x, z, y = new.along(0, size), new.along(2, size), new.low + ROUNDING
@@ -234,7 +234,7 @@ def _stack(new: Layout) -> None:
 
 
 def _apart(new: Layout) -> None:
-    """Bodies lie on the floor without contact; some slide slowly. A tilted gravity moves all."""
+    """Places bodies on the floor without contact. Some slide slowly. A tilted gravity moves all of them."""
     new.take_domain("room", "hall", "long")
     for _ in range(new.count("bodies")):
         size, velocity = new("size"), (0.0, 0.0, 0.0)
@@ -249,7 +249,7 @@ def _apart(new: Layout) -> None:
 
 
 def _bowl(new: Layout) -> None:
-    """Bodies fall into a bowl that stands on the floor."""
+    """Drops bodies into a bowl that stands on the floor."""
     new.take_domain("room", "tall")
     width, size = new("bowl"), new("size")
     x, z = new.along(0, 0.5 * width), new.along(2, 0.5 * width)
@@ -263,7 +263,7 @@ def _bowl(new: Layout) -> None:
 
 
 def _channel(new: Layout) -> None:
-    """A block is released between two upright plates."""
+    """Releases a block between two upright plates."""
     new.take_domain("room", "hall")
     plate, width, length = new("plate"), new("width"), new("length")
     x, z, y = new.along(0, 0.5 * plate), new.along(2, 0.5 * width), 0.5 * plate
@@ -277,7 +277,7 @@ def _channel(new: Layout) -> None:
 
 
 def _stairs(new: Layout) -> None:
-    """A body is poured down steps."""
+    """Drops a body onto the top of a flight of steps."""
     new.take_domain("hall", "room")
     plate, rise, size, steps = new("plate"), new("rise"), new("size"), new.count("steps")
     tread = 0.7 * plate
@@ -289,7 +289,7 @@ def _stairs(new: Layout) -> None:
 
 
 def _jet(new: Layout) -> None:
-    """A bar flies along itself, often against a wall; half of the jets have no gravity."""
+    """Throws a bar along its axis, often against a wall. Half of the jets have no gravity."""
     new.take_domain("hall", "room", "long")
     length, width = new("length"), new("width")
     centre = (new.along(0, 0.5 * length), new.along(1, 0.5 * width), new.along(2, 0.5 * width))
@@ -305,7 +305,7 @@ _PLACED: dict[str, Callable[[Layout], None]] = {
 
 
 def _paper(new: Layout) -> SceneConfig:
-    """Returns settings for random_scene, for a kind that places its items at random, as in the paper."""
+    """Returns settings for random_scene, for a kind whose items have random places as in the paper."""
     new.take_domain("room", "hall")
     config = replace(new.config, kinds={}, domain_size=new.domain, group_size=new("size"))
     volume = (config.group_size / config.cell_size) * (config.group_size / config.cell_size)
@@ -327,7 +327,7 @@ def _paper(new: Layout) -> SceneConfig:
 
 
 def draw_kind(kinds: Mapping[str, float], rng: np.random.Generator) -> str:
-    """Returns one of the kinds, with the probability of its share."""
+    """Returns one of the kinds, with the probability of its fraction."""
     rest = rng.random() * sum(kinds.values())
     for kind, share in kinds.items():
         rest -= share
@@ -339,8 +339,8 @@ def draw_kind(kinds: Mapping[str, float], rng: np.random.Generator) -> str:
 def draw_layout(config: SceneConfig, seed: int) -> tuple[str, Layout | SceneConfig]:
     """Draws a scene of a kind in `config.kinds`.
 
-    Returns the kind, with a Layout, or for the kinds of `_paper` with settings for `hgn.scene.random_scene`.
-    Raises: ConfigError if a kind does not fit into `config.domain_size`; those of the shipped experiments fit.
+    Returns the kind and a Layout. For the kinds of `_paper` it returns settings for `hgn.scene.random_scene` instead.
+    Raises: ConfigError if a kind does not fit into `config.domain_size`. Those of the shipped experiments fit.
     """
     rng = np.random.Generator(np.random.PCG64([seed, 5]))
     kind = draw_kind(config.kinds, rng)

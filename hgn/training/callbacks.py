@@ -1,7 +1,7 @@
 """Callbacks between chunks of updates: the same parameters on all ranks, checkpoints, log lines, stopping.
 
-Files of a run: checkpoints/last.ckpt, metrics.jsonl, tensorboard/; with validation scenes also checkpoints/best.ckpt
-(lowest one-step validation error) and pictures/.
+A run's folder contains checkpoints/last.ckpt, metrics.jsonl and tensorboard/. With validation scenes it also contains
+pictures/ and checkpoints/best.ckpt, the network with the lowest one-step validation error.
 """
 
 from __future__ import annotations
@@ -36,17 +36,17 @@ METRICS = "metrics.jsonl"
 
 
 class SameWeights(Callback):
-    """Requires the same update, next samples, parameters and normaliser on all ranks at the start, and at each log line
-    the same parameters, bit for bit.
+    """Requires equal updates, next samples, parameters and normalisers on all ranks at the start. At each log line it
+    requires bitwise equal parameters.
 
-    Most updates exchange nothing but gradients; ranks exchange more where they log, save, measure or agree to stop.
+    Most updates exchange only gradients. Ranks exchange more when they log, save, measure or agree to stop.
     """
 
     def __init__(self, feed: EpisodeDataModule) -> None:
         self.feed = feed
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Raises: ConfigError on every rank when one of them resumes from another checkpoint."""
+        """Raises: ConfigError on every rank if one of them resumes from another checkpoint."""
         if trainer.world_size == 1:
             return
         lightning_compat.skip_sigterm_broadcast(trainer)
@@ -57,12 +57,12 @@ class SameWeights(Callback):
                 f"run must be a folder that all machines share, got another checkpoint on some of them (rank "
                 f"{trainer.global_rank}: {mine}, rank 0: {first}); give them one run=FOLDER"
             )
-        # The statistics of a data set that grows may differ on a rank that read them later.
+        # If a data set grows, a rank that read its statistics later may have other values.
         for tensor in (*pl_module.parameters(), *pl_module.buffers()):
             torch.distributed.broadcast(tensor.detach(), 0)
 
     def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
-        """Raises: ConfigError on every rank when one of them has other weights."""
+        """Raises: ConfigError on every rank if one of them has other parameters."""
         update = _update(pl_module)
         if trainer.world_size == 1 or update % self.feed.training.log_every:
             return
@@ -74,7 +74,7 @@ class SameWeights(Callback):
 
 
 class Checkpoints(Callback):
-    """Saves checkpoints when they are due; `writer` writes them while the next updates run."""
+    """Saves checkpoints when they are due. `writer` writes them during the next updates."""
 
     def __init__(self, folder: Path, every: int, writer: CheckpointWriter) -> None:
         self.folder, self.every, self.writer = folder, every, writer
@@ -93,47 +93,47 @@ class Checkpoints(Callback):
                 left_by_a_crash.unlink()
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        self._saved_update = _update(pl_module) or -1  # a run that resumes has this checkpoint
+        self._saved_update = _update(pl_module) or -1  # a resumed run starts with this checkpoint
 
     def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
         if _update(pl_module) % self.every == 0:
             self.save_last(trainer, _update(pl_module))
 
     def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
-        """Saves before a training ends because its data stay away; several ranks cannot agree on it any more."""
+        """Saves before a training ends because its data stay unreachable. Several ranks cannot agree on it any more."""
         if isinstance(exception, (StorageError, OSError)) and trainer.world_size == 1 and _update(pl_module):
             self.save_last(trainer, _update(pl_module))
 
     def save_last(self, trainer: Trainer, update: int) -> None:
-        """All ranks call this; rank 0 writes, see CheckpointWriter."""
+        """Saves a checkpoint. All ranks call this; rank 0 writes (see CheckpointWriter)."""
         if self._saved_update != update:
             trainer.save_checkpoint(self.folder / LAST_NAMES[0])
             self._saved_update = update
 
     def offer(self, trainer: Trainer, error: float) -> None:
-        """Keeps the network as the best so far if its one-step validation error is the lowest."""
+        """Saves the network as the best one if its one-step validation error is the lowest."""
         if error < self.best_error:
             self.best_error = error
-            self._saved_update = -1  # last.ckpt has to contain the new best error
+            self._saved_update = -1  # last.ckpt must contain the new best error
             trainer.save_checkpoint(self.folder / BEST_NAME)
 
     def finish(self, trainer: Trainer, update: int) -> None:
-        """Waits until the last checkpoint is on disk; all ranks call this at the end."""
+        """Waits until the last checkpoint is on disk. All ranks call this at the end."""
         self.save_last(trainer, update)
         self.writer.wait()
-        trainer.strategy.barrier()  # a rank that ends before this may take the others with it
+        trainer.strategy.barrier()  # a rank that ends earlier may end the others too
 
 
 class LogLines(Callback):
     """Writes loss, learning rate and speed to TensorBoard, metrics.jsonl and a progress bar.
 
-    The loss is the mean over all ranks; speed, waiting time and GPU memory are those of rank 0.
+    The loss is the mean over all ranks. Speed, waiting time and GPU memory are those of rank 0.
     """
 
     def __init__(
         self, run: Path, measured: dict[str, float], feed: EpisodeDataModule, published: Callable[[], str]
     ) -> None:
-        """`measured` is filled by the monitor."""
+        """`measured` is a dictionary that the monitor fills."""
         self.run, self.measured, self.feed, self.published = run, measured, feed, published
         self._bar: tqdm[Any] | None = None
         self._time, self._update, self._waited_s = time.monotonic(), 0, 0.0
@@ -186,9 +186,9 @@ class LogLines(Callback):
 
 
 class Stopper(Callback):
-    """Ends the loop between two chunks on every rank, after a checkpoint."""
+    """Ends the loop on every rank between two chunks, after a checkpoint."""
 
-    AGREE_EVERY = 10  # updates between agreements of several ranks
+    AGREE_EVERY = 10  # number of updates between agreements of several ranks
 
     def __init__(self, stop: StopRequest, checkpoints: Checkpoints) -> None:
         self.stop, self.checkpoints = stop, checkpoints
@@ -196,8 +196,8 @@ class Stopper(Callback):
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         self._agreed_update = _update(pl_module)
-        # Lightning has just installed a handler before ours: on SIGTERM it communicates with the other ranks inside the
-        # handler, and leaves the loop by an exception, without a checkpoint.
+        # Lightning has just installed a handler before ours. On SIGTERM it would communicate with the other ranks
+        # inside the handler, and leave the loop by an exception without a checkpoint.
         self.stop.listen()
         lightning_compat.forget_sigterm(trainer)
 
@@ -208,7 +208,7 @@ class Stopper(Callback):
         self._agreed_update = update
         if trainer.strategy.reduce_boolean_decision(self.stop.requested, all=False):
             trainer.should_stop = True
-            # A signal may have reached only one rank; all end with its exit code.
+            # A signal may have reached only one rank. All ranks end with its exit code.
             mine = 0 if self.stop.signal is None else 1 + BY_WEIGHT.index(self.stop.signal)
             heaviest = int(trainer.strategy.reduce(torch.tensor(mine, device=pl_module.device), reduce_op="max"))
             self.stop.signal = int(BY_WEIGHT[heaviest - 1]) if heaviest else None
@@ -218,7 +218,7 @@ class Stopper(Callback):
 
 
 def _update(module: LightningModule) -> int:
-    """Returns the number of updates made."""
+    """Returns the number of updates of a module."""
     assert isinstance(module, TrainingModule)
     return module.update
 

@@ -1,6 +1,6 @@
-"""Checkpoints on disk: reading, comparison with a configuration, and the network in them.
+"""Checkpoints on disk: reading, comparison with a configuration, and their network.
 
-Nothing here needs Lightning: checkpoints contain plain containers and tensors.
+This module needs no Lightning, because checkpoints consist of plain containers and tensors.
 """
 
 from __future__ import annotations
@@ -26,24 +26,24 @@ from hgn.system.claims import Claims, require_few_items, require_plain_pickle
 
 SECTION = "hgn"  # key of this project's entries in a checkpoint
 LAST_NAMES = ("last.ckpt", "last-1.ckpt", "last-2.ckpt")  # newest first
-BEST_NAME = "best.ckpt"  # has the lowest one-step validation error; missing where no validation scene was measured
+BEST_NAME = "best.ckpt"  # network with the lowest one-step validation error; missing without measured validation scenes
 _CALLED = re.compile(r"collections OrderedDict|torch \w+|torch\._utils _rebuild_(tensor_v2|parameter)")
-NETWORK, AVERAGED = "network.", "averaged."  # prefixes of the trained tensors, and of their moving average
+NETWORK, AVERAGED = "network.", "averaged."  # prefixes of the names of trained tensors, and of their moving average
 
 
 class DamagedError(ConfigError):
-    """The bytes of a checkpoint changed since it was written."""
+    """A checkpoint's bytes changed after it was written."""
 
 
 @dataclass(frozen=True)
 class DataInfo:
-    """Facts about the training data that are stored with a network."""
+    """Facts about the training data. They are stored with the network."""
 
     config_hash: str
     frame_rate_hz: OrdinarySize
     obstacle_cell_size: OrdinarySize
     gravity: tuple[float, float, float] = (0.0, -9.8, 0.0)
-    maximum_initial_speed: float | None = None  # of the groups, domain units per second; None: unknown
+    maximum_initial_speed: float | None = None  # largest of the groups, domain units per second; None: unknown
 
     def __post_init__(self) -> None:
         require_bounds(self)
@@ -54,9 +54,9 @@ class Progress:
     """The progress of a run when a checkpoint was written."""
 
     updates: int
-    skipped: int  # of the updates, because a gradient was not finite
-    sampler_state: SamplerState  # the place in the order of samples
-    precision: str | None = None  # of the updates; checkpoints of 0.2.0 and before lack it
+    skipped: int  # number of updates skipped because of a gradient that was not finite
+    sampler_state: SamplerState  # position in the order of samples
+    precision: str | None = None  # precision of the updates; missing in checkpoints of 0.2.0 and before
 
     @staticmethod
     def of(checkpoint: dict[str, Any]) -> Progress:
@@ -79,10 +79,10 @@ class Resume:
 
 
 def read_checkpoint(path: Path) -> dict[str, Any]:
-    """Returns the content of a checkpoint; only plain containers and tensors are loaded.
+    """Returns the content of a checkpoint. Only plain containers and tensors are loaded.
 
-    Raises: DamagedError when it is incomplete or any bit of it changed, which torch does not detect; ConfigError when
-    the file is missing, or is no checkpoint of this project.
+    Raises: DamagedError if the file is incomplete or has changed bits, which torch does not detect; ConfigError if it
+    is missing, or is no checkpoint of this project.
     """
     try:
         with zipfile.ZipFile(path) as records:
@@ -100,7 +100,7 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
         if path.name == BEST_NAME and last.is_file():
             remedy = f"no validation scene was measured, so take {last}"
         raise ConfigError(f"checkpoint must be an existing file, got {path}; {remedy}") from None
-    except Exception as error:  # of any kind: torch reads damaged files too
+    except Exception as error:  # torch raises any kind of error for damaged files
         reason = str(error).strip().split("\n")[0]
         raise DamagedError(f"checkpoint must be a whole checkpoint file, got {path}: {reason}") from error
     state = checkpoint.get("state_dict") if isinstance(checkpoint, dict) else None
@@ -111,12 +111,12 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
 
 
 def check_checkpoint(checkpoint: dict[str, Any], config: TrainConfig, config_hash: str, path: Path) -> None:
-    """Compares a checkpoint with the configuration that is to resume it.
+    """Compares a checkpoint with the configuration of the run that resumes it.
 
     Raises: ConfigError naming the first key that differs.
     """
     remedy = "set it so, or choose another run=FOLDER"
-    # The dataclass adds the default of a key that the checkpoint lacks.
+    # NetworkConfig and StepConfig add the defaults of keys that the checkpoint does not have.
     stored, section = _network_config(checkpoint, path), checkpoint[SECTION]
     pairs = _pairs("network", stored, config.network) + _pairs("step", _step_config(checkpoint), config.step)
     noise_std, data = section.get("noise_std"), data_of_checkpoint(checkpoint)
@@ -144,8 +144,8 @@ def _require_equal(pairs: list[tuple[str, Any, Any]], why: str, remedy: str) -> 
 def network_of_weights(config: TrainConfig) -> ParticleNetwork:
     """Returns the network of training.init_weights with its normaliser, as the initial state of a new run.
 
-    Rest, walls and the clearance of obstacles may differ from those of the weights, because they change no tensor.
-    Raises: ConfigError for a file without weights, and for another network or other data.
+    The rest constraint and the clearances of walls and obstacles may differ from those of the weights, because they do
+    not change tensors. Raises: ConfigError for a file without weights, another network, or other data.
     """
     assert config.training.init_weights is not None
     path = find_weights(config.training.init_weights, "training.init_weights")
@@ -162,9 +162,9 @@ def network_of_weights(config: TrainConfig) -> ParticleNetwork:
 
 
 def network_of_checkpoint(checkpoint: dict[str, Any], path: Path) -> ParticleNetwork:
-    """Returns the network of a checkpoint with its normaliser, in evaluation mode; the moving average if there is one.
+    """Returns a checkpoint's network with its normaliser in evaluation mode; the moving average if there is one.
 
-    Raises: ConfigError for a network that this version does not build.
+    Raises: ConfigError for a network that this version cannot build.
     """
     state = checkpoint["state_dict"]
     prefix = AVERAGED if any(name.startswith(AVERAGED) for name in state) else NETWORK
@@ -192,5 +192,5 @@ def _other_version(path: Path, reason: str) -> str:
 
 
 def data_of_checkpoint(checkpoint: dict[str, Any]) -> DataInfo:
-    """Returns the description of the training data."""
+    """Returns the facts about the training data."""
     return from_stored(DataInfo, checkpoint[SECTION].get("data"), "data")

@@ -1,4 +1,4 @@
-"""Writes checkpoints in a thread, while the next updates run."""
+"""Writes checkpoints in a thread during the next updates."""
 
 from __future__ import annotations
 
@@ -19,15 +19,14 @@ from lightning_utilities.core.apply_func import apply_to_collection
 from hgn.system.files import make_folder, temporary_file, write_atomically
 from hgn.training.checkpoint import LAST_NAMES
 
-TURN_S = 1e-4  # Python's switch interval while a checkpoint is pickled; the default is 5e-3
+TURN_S = 1e-4  # Python's switch interval during pickling of a checkpoint; the default is 5e-3
 
 
 class CheckpointWriter(TorchCheckpointIO):
-    """Copies a checkpoint, and writes the copy in a thread, whole or not at all.
+    """Copies a checkpoint, and writes the copy atomically in a thread.
 
-    At most one write is in progress: the next one waits for it. An error of a write is raised by the next write, by
-    `wait`, or at the end of the training. (Lightning's AsyncCheckpointIO queues any number of copies, and raises an
-    error one write later or at the end.)
+    At most one write is in progress; the next one waits for it. The next write, `wait`, or the end of the training
+    raises the error of a write. (Lightning's AsyncCheckpointIO queues any number of copies.)
     """
 
     def __init__(self) -> None:
@@ -42,13 +41,13 @@ class CheckpointWriter(TorchCheckpointIO):
     def wait(self) -> None:
         """Returns when the last checkpoint is on disk. Raises: OSError if it could not be written."""
         if self._writing is not None:
-            # a second Ctrl-C interrupts this wait; then `teardown` waits, and raises errors
+            # a second Ctrl-C interrupts this wait; then `teardown` waits and raises errors
             futures.wait([self._writing])
             writing, self._writing = self._writing, None
             writing.result()
 
     def teardown(self) -> None:
-        """Waits at the end of the training, also after an exception."""
+        """Waits at the end of the training, even after an exception."""
         try:
             self.wait()
         finally:
@@ -75,7 +74,7 @@ def snapshot(checkpoint: dict[str, Any]) -> dict[str, Any]:
 
 
 def _keep_earlier(folder: Path) -> None:
-    """Renames each earlier checkpoint to the next older name; last.ckpt stays until it is replaced."""
+    """Renames each earlier checkpoint to the next older name. last.ckpt stays until it is replaced."""
     for earlier, later in pairwise(reversed(LAST_NAMES)):
         if (folder / later).exists():
             with temporary_file(folder / earlier) as temporary:
@@ -98,9 +97,8 @@ def _write(checkpoint: dict[str, Any], path: Path) -> None:
 
 @contextmanager
 def _short_turns() -> Iterator[None]:
-    """Shortens Python's switch interval: pickling holds the interpreter lock, and the training needs it after each
-    operation of torch, so with the default interval the two run almost one after the other.
-    """
+    """Shortens Python's switch interval. Pickling keeps the interpreter lock, which the training needs after each
+    operation of torch. With the default interval the two would run almost one after the other."""
     before = sys.getswitchinterval()
     sys.setswitchinterval(TURN_S)
     try:

@@ -24,13 +24,14 @@ from hgn.training.pushforward import Starts, drawn_starts
 from hgn.training.readers import ChunkReader, DrawnChunk
 from hgn.training.schedule import next_measurement
 
-CHUNKS_AHEAD = 2
-LOOK_S = 1.0  # between looks for a signal while there is no chunk
+CHUNKS_AHEAD = 2  # number of chunks that are read while another one is trained on
+LOOK_S = 1.0  # interval of checks for a signal while there is no chunk
 
 
 class EpisodeDataModule(LightningDataModule):
-    """Chunks of updates in the deterministic order, until the last update; each epoch sees what was published when it
-    began.
+    """Yields chunks of updates in the deterministic order, until the last update.
+
+    An epoch contains the episodes that were published when it began.
     """
 
     def __init__(
@@ -41,27 +42,27 @@ class EpisodeDataModule(LightningDataModule):
         chunks_ahead: int = CHUNKS_AHEAD,
         interrupted: Callable[[], bool] = lambda: False,
     ) -> None:
-        """Once `interrupted`, the chunks end instead of waiting for data."""
+        """When `interrupted` returns True, the chunks end instead of waiting for data."""
         super().__init__()
         assert chunks_ahead >= 0
         self.store, self.training, self.reader = store, training, reader
-        self.chunks_ahead = chunks_ahead  # read while another is trained on; 0: read when it is needed
+        self.chunks_ahead = chunks_ahead  # number of chunks read ahead; 0: a chunk is read when it is needed
         self.interrupted = interrupted
-        self.sampler_state, self.first_update = SamplerState(), 0  # where to begin; from the checkpoint on a resume
-        self._fetched_from = (-1, -1)  # epoch and quarter of a window of the last request for shards
+        self.sampler_state, self.first_update = SamplerState(), 0  # where to begin; in the checkpoint of a resumed run
+        self._fetched_from = (-1, -1)  # epoch and quarter of a window at the last request for shards
         self.waited_s = 0.0  # time that the training has waited for a chunk
 
     def train_dataloader(self) -> DataLoader[WindowChunk | EpisodeChunk]:
-        # The windows are memory-mapped and small: a worker process would cost more than it saves.
+        # The windows are memory-mapped and small, so a worker process would cost more than it saves.
         return DataLoader(_Stream(self), batch_size=None, num_workers=0)
 
     def transfer_batch_to_device(self, batch: Any, device: torch.device, dataloader_idx: int) -> Any:
-        return batch  # the updates do so
+        return batch  # the updates copy it themselves
 
     def chunks(self) -> Iterator[WindowChunk | EpisodeChunk]:
-        """Yields this rank's chunks. A chunk ends wherever something is due between updates."""
+        """Yields this rank's chunks. A chunk ends at every update after which something is due."""
         drawn = self._drawn()
-        # The order may have to ask other ranks, so it stays in this thread; reading runs ahead in another.
+        # The order may communicate with other ranks, so it stays in this thread. Another thread reads ahead.
         executor = ThreadPoolExecutor(1)
         try:
             waiting: deque[Future[WindowChunk | EpisodeChunk]] = deque()
@@ -95,14 +96,14 @@ class EpisodeDataModule(LightningDataModule):
             yield DrawnChunk(samples, order.state, starts)
 
     def _fetch_window(self, order: EpisodeSampler) -> None:
-        """Has the shards of a window of samples fetched before they are needed; each quarter of it."""
+        """Requests the shards of a window of samples before they are needed, once for each quarter of the window."""
         quarter = order.window_samples // 4
         if quarter and (place := (order.state.epoch, order.state.position // quarter)) != self._fetched_from:
             self._fetched_from = place
             self.store.fetch_ahead(order.upcoming(order.window_samples + quarter))
 
     def _starts(self, order: EpisodeSampler, update: int) -> Starts:
-        """Returns episodes and frames that the network simulates from before this update, none where it is not due."""
+        """Returns the episodes and frames from which the network simulates before this update; empty if not due."""
         due = update == self.first_update or update % self.training.pushforward_every == 0
         if self.training.pushforward_fraction == 0 or not due:
             return ()
@@ -124,7 +125,7 @@ class EpisodeDataModule(LightningDataModule):
         )
 
     def _ends(self) -> bool:
-        """Ends a training that waits for data after a stop request, unless other ranks need its gradients."""
+        """Ends a training that waits for data after a stop request. With several ranks others need its gradients."""
         trainer = self.trainer
         if trainer is None:
             return self.interrupted()
@@ -134,7 +135,7 @@ class EpisodeDataModule(LightningDataModule):
         return True
 
     def _published(self, epoch: int) -> list[int]:
-        """Returns the frames of each published episode, as rank 0 sees them."""
+        """Returns the number of frames of each published episode, as rank 0 sees them."""
         self.store.refresh()
         if not 0 < self.training.shuffle_episodes < len(self.store):
             self.store.fetch_ahead()
@@ -146,10 +147,9 @@ class EpisodeDataModule(LightningDataModule):
 
 
 def chunk_length(training: TrainingConfig, first_update: int, update: int, most: int) -> int:
-    """Returns the updates of the chunk that begins at `update`, in a training that began at `first_update`; at most
-    `most`, and the same on all ranks.
+    """Returns the number of updates in the chunk that begins at `update`, at most `most`. It is equal on all ranks.
 
-    The first chunks are short: they need the most episodes that are not in memory yet.
+    The first chunks after `first_update`, the start of the training, are short: most of their episodes must be loaded.
     """
     due = [training.log_every, training.checkpoint_every]
     if training.pushforward_fraction > 0:
@@ -160,12 +160,12 @@ def chunk_length(training: TrainingConfig, first_update: int, update: int, most:
 
 
 def agreed_count(store: AnyStore, trainer: Trainer, order: Mapping[str, int] | None = None) -> int:
-    """Returns the number of episodes that rank 0 sees; the other ranks wait for them. All ranks call this.
+    """Returns the number of episodes that rank 0 sees. The other ranks wait for them. All ranks call this.
 
-    Episodes are in the order of their publication, so the first ones are the same on all ranks. `order` has the
-    settings of `training` that decide the order of samples.
-    Raises: ConfigError when a node does not see them within the standard patience; on every rank when one of them
-    sees other episodes or has other settings.
+    Episodes are in the order of their publication, so the first ones are the same on all ranks. `order` contains the
+    settings of `training` that determine the order of samples.
+    Raises: ConfigError if a node does not see them within the standard patience; on every rank if one of them sees
+    other episodes or has other settings.
     """
     if trainer.world_size == 1:
         return len(store)

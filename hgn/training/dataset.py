@@ -1,4 +1,4 @@
-"""The data set of a training: whether it is complete, waiting for its episodes, and its progress."""
+"""The data set of a training: its completeness, the wait for its episodes, and its progress."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from hgn.training.distributed import first_rank
 from hgn.training.generator import Generator
 from hgn.training.stop import StopRequest
 
-BETWEEN_LOOKS_S = 10.0  # between reads of the manifest for the progress line
+BETWEEN_LOOKS_S = 10.0  # interval between reads of the manifest for the progress line
 
 
 def is_complete(config: TrainConfig) -> bool:
@@ -72,10 +72,10 @@ def _require_goes_with(config: TrainConfig, store: EpisodeStore, field: str) -> 
 def wait_for_episodes(
     config: TrainConfig, generator: Generator | None, stop: StopRequest, others: Sequence[EpisodeStore] = ()
 ) -> AnyStore | None:
-    """Waits until enough training episodes are published, including those of `others`, and shows the progress. Returns
-    None after a stop request.
+    """Waits until enough training episodes are published, those of `others` included. Shows the progress.
 
-    Raises: ConfigError when the generator failed, or no process makes the missing episodes.
+    Returns None after a stop request.
+    Raises: ConfigError if the generator failed, or if no process generates the missing episodes.
     """
     folder = config.dataset.folder
     present = sum(map(len, others))
@@ -117,8 +117,8 @@ def wait_for_episodes(
 class PublishedEpisodes:
     """Returns the progress of the data set when called: `5/800 episodes`.
 
-    A manifest of hundreds of scenes takes 0.1 s to read, so it is read at most every BETWEEN_LOOKS_S, and not again
-    once it is complete.
+    Reading a manifest of hundreds of scenes takes 0.1 s. So it is read at most every BETWEEN_LOOKS_S, and no more after
+    the data set is complete.
     """
 
     def __init__(self, config: TrainConfig, generator: Generator | None) -> None:
@@ -131,7 +131,7 @@ class PublishedEpisodes:
             return self._text
         try:
             count = Manifest.load(self.folder, patience_s=0.0).published("train")
-        except (ConfigError, OSError) as error:  # the data module ends a training whose data stay away
+        except (ConfigError, OSError) as error:  # the data module ends a training whose data stay unreachable
             away = isinstance(error, UnreachableError)
             count, self._text = 0, "the service does not answer" if away else "the manifest cannot be read"
         else:

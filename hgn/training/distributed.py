@@ -1,8 +1,8 @@
 """The processes that train together, the run's folder, and the averaging of gradients.
 
-Launchers set environment variables: torchrun sets RANK, WORLD_SIZE and LOCAL_WORLD_SIZE, srun sets SLURM_PROCID,
-SLURM_NTASKS and SLURM_NNODES, Lightning's own launcher, which starts the other processes of a machine itself, sets
-LOCAL_RANK and NODE_RANK in them.
+Launchers set environment variables. torchrun sets RANK, WORLD_SIZE and LOCAL_WORLD_SIZE. srun sets SLURM_PROCID,
+SLURM_NTASKS and SLURM_NNODES. Lightning's own launcher starts the other processes of a machine and sets LOCAL_RANK and
+NODE_RANK in them.
 """
 
 from __future__ import annotations
@@ -19,15 +19,15 @@ import torch
 from hgn.config import TrainingConfig
 from hgn.schema import ConfigError, require
 
-RUN_VARIABLE = "HGN_RUN"
-MESSAGE_MB = 4  # gradients of the network's last layers are on their way while those of its first are computed
+RUN_VARIABLE = "HGN_RUN"  # environment variable with the run's name or folder
+MESSAGE_MB = 4  # size of a message: gradients of the last layers are sent while those of the first layers are computed
 _RANDOM_ID = re.compile(r"[0-9a-f]{8}(-[0-9a-f]{4}){3}-[0-9a-f]{12}")
 
 
 def first_rank() -> bool:
     """Returns whether this process starts the generator and writes the run's files."""
     if "RANK" in os.environ:
-        # torchrun's variable comes first: inside Slurm its rank 0 may be on any of the nodes
+        # torchrun's variable comes first: inside Slurm, torchrun's rank 0 may be on any of the nodes
         return os.environ["RANK"] == "0"
     return all(os.environ.get(name, "0") == "0" for name in ("SLURM_PROCID", "NODE_RANK", "LOCAL_RANK"))
 
@@ -40,14 +40,14 @@ def first_on_machine() -> bool:
 
 
 def default_run(name: str) -> Path:
-    """Returns the run's folder where the configuration names none: the same in all processes and after every restart.
+    """Returns the run's default folder. It is the same in all processes and after every restart.
 
-    It is in runs/ and has the first of these names that is set: HGN_RUN (which may be a path), torchrun's run id
-    (--rdzv-id), `name` with Slurm's job id (which a requeued job keeps), `name`. So each job gets its own folder.
+    The folder is in runs/. Its name is the first of these that is set: HGN_RUN (which may be a path), torchrun's run id
+    (--rdzv-id), `name` with Slurm's job id (a requeued job keeps it), `name`. So each job gets its own folder.
     """
-    torchrun_id = os.environ.get("TORCHELASTIC_RUN_ID", "none")  # none: no id was given
+    torchrun_id = os.environ.get("TORCHELASTIC_RUN_ID", "none")  # torchrun sets "none" if no id was given
     if _RANDOM_ID.fullmatch(torchrun_id):
-        torchrun_id = "none"  # torchrun --standalone draws one at each start: no run could be resumed
+        torchrun_id = "none"  # torchrun --standalone draws an id at each start, so such a run could not be resumed
     if os.environ.get(RUN_VARIABLE):
         return Path("runs", os.environ[RUN_VARIABLE])
     if torchrun_id != "none":
@@ -60,7 +60,7 @@ def default_run(name: str) -> Path:
 def layout(training: TrainingConfig) -> tuple[int, int]:
     """Returns (processes on each machine, machines): as launched, else as configured, else all GPUs of this machine.
 
-    Raises: ConfigError when there are not as many GPUs, or the launcher started another number of processes.
+    Raises: ConfigError if there are fewer GPUs, or if the launcher started another number of processes.
     """
     _check_restarts()
     _check_launcher()
@@ -69,7 +69,7 @@ def layout(training: TrainingConfig) -> tuple[int, int]:
     if launched is None:
         return devices, 1
     if devices != launched[0]:
-        # each process would train alone and overwrite the others' checkpoints, or wait forever
+        # each process would train on its own and overwrite the others' checkpoints, or wait forever
         raise ConfigError(
             f"training.devices must be the {launched[0]} processes that the launcher started on each of {launched[1]} "
             f"machines, got {devices}; leave it out, and under Slurm start one task for each device with srun"
@@ -78,28 +78,28 @@ def layout(training: TrainingConfig) -> tuple[int, int]:
 
 
 def averaging_options() -> dict[str, Any]:
-    """Returns arguments of DistributedDataParallel, by which backend torch averages gradients.
+    """Returns the arguments of DistributedDataParallel, with which backend torch averages gradients.
 
-    Gradients are sent in buckets while the backward pass still runs. Buffers are not sent: the normaliser is constant,
-    and each rank has its own sum of losses.
+    Gradients are sent in buckets while the backward pass still runs. Buffers are not sent, because the normaliser is
+    constant and each rank has its own sum of losses.
     """
     from torch.nn.parallel import DistributedDataParallel
 
-    # torch 2.13 has another name for it
+    # torch 2.13 renamed this argument
     renamed = "forward_sync_buffers" in inspect.signature(DistributedDataParallel).parameters
     keep_buffers = "forward_sync_buffers" if renamed else "broadcast_buffers"
     return {"gradient_as_bucket_view": True, "bucket_cap_mb": MESSAGE_MB, keep_buffers: False}
 
 
 def sum_over_ranks(tensor: torch.Tensor) -> None:
-    """Sums a tensor over all ranks in place; backend triton sends an update's gradients so, in one message."""
+    """Sums a tensor over all ranks in place. Backend triton sends the gradients of an update in one such message."""
     torch.distributed.all_reduce(tensor)
 
 
 def checksum(tensors: Iterable[torch.Tensor]) -> torch.Tensor:
-    """Returns a checksum of float32 tensors, int64 [] on their device; a change of any one value changes it."""
+    """Returns a checksum of float32 tensors, int64 [] on their device. A change of any single value changes it."""
     bits = torch.cat([tensor.detach().flatten() for tensor in tensors]).view(torch.int32)
-    # modulo 2^64 no difference becomes 0 by multiplication with an odd number
+    # modulo 2^64 the product of a non-zero difference and an odd number is not 0
     return (bits * torch.arange(1, 2 * len(bits), 2, device=bits.device)).sum()
 
 
@@ -133,9 +133,9 @@ def _devices(device: str, wanted: int | None) -> int:
 
 
 def _launched(devices: int | None) -> tuple[int, int] | None:
-    """Returns (processes on each machine, machines) that a launcher started, None without one.
+    """Returns (processes on each machine, machines) of a launcher; None without a launcher.
 
-    Where the launcher reports the sum only, `devices` are on each machine if they divide it.
+    If the launcher reports only the total, each machine has `devices` processes if `devices` divides the total.
     """
     here: int | None = None
     if "RANK" in os.environ and "WORLD_SIZE" in os.environ:
@@ -152,7 +152,7 @@ def _launched(devices: int | None) -> tuple[int, int] | None:
 
 
 def _check_launcher() -> None:
-    """Refuses variables of a launcher that did not start this process: it would wait for the others forever."""
+    """Refuses variables of a launcher that did not start this process, which would wait for the others forever."""
     if "RANK" in os.environ:
         missing = [name for name in ("WORLD_SIZE", "LOCAL_RANK") if name not in os.environ]
         if missing and os.environ.get("WORLD_SIZE") != "1":
@@ -168,7 +168,7 @@ def _check_launcher() -> None:
 
 
 def started_by_srun() -> bool:
-    """Returns whether srun started this process, with SLURM_NTASKS in all: no batch script or shell of Slurm."""
+    """Returns whether srun started this process as one of SLURM_NTASKS. Batch scripts and shells do not count."""
     own = os.environ.get("SLURM_STEP_NUM_TASKS", os.environ.get("SLURM_NTASKS"))
     return _inside_slurm_step() and "SLURM_STEP_ID" in os.environ and own == os.environ["SLURM_NTASKS"]
 

@@ -1,7 +1,7 @@
 """One-step and rollout errors of the network, and of baselines without learned parameters.
 
-Conventions: squared errors sum over axes and average over particles, in frame units (domain units per frame
-squared for accelerations, domain units for positions).
+Squared errors are summed over axes and averaged over particles, in frame units: domain units for positions, domain
+units per frame squared for accelerations.
 """
 
 from __future__ import annotations
@@ -18,15 +18,15 @@ from hgn.network.base import ParticleNetwork
 from hgn.runtime.torch_backend import Backend
 from hgn.scene.episode import Episode
 
-REPORTED_FRAMES = (10, 50, 150, 299)  # of rollouts
-FRAMES_AT_ONCE = 16  # in float64
-MONITORED_SCENES = 5  # of each split, while a training runs
-PARTICLES_PER_BATCH = 32_768  # bounds the memory of frames that are computed together
+REPORTED_FRAMES = (10, 50, 150, 299)  # frames of a rollout whose errors are reported
+FRAMES_AT_ONCE = 16  # number of frames converted to float64 together
+MONITORED_SCENES = 5  # number of scenes of each split that a training measures
+PARTICLES_PER_BATCH = 32_768  # limits the memory of frames that are computed together
 Predictor = Callable[[Batch], torch.Tensor]  # accelerations [N, 3] in frame units
 
 
 def format_ratio(gain: float) -> str:
-    """Returns a text: an error is this many times below another one, which is `gain` times as large, or above it."""
+    """Describes an error by the gain over another one: 2 gives "2.00 times below", 0.5 "2.00 times above" it."""
     if not 0 < gain < 1:
         return f"{gain:.2f} times below"
     return f"{1 / gain:.2f} times above"
@@ -34,7 +34,7 @@ def format_ratio(gain: float) -> str:
 
 @dataclass
 class SquaredError:
-    """Sums of squared errors and particle counts by material; `mse` is over all materials."""
+    """Sums of squared errors and particle counts by material. `mse` is the mean over all materials."""
 
     total: dict[str, float] = field(default_factory=dict)
     count: dict[str, int] = field(default_factory=dict)
@@ -58,7 +58,7 @@ class SquaredError:
 
 
 def ballistic(batch: Batch) -> torch.Tensor:
-    """Predicts free fall."""
+    """Returns the acceleration of free fall [N, 3]."""
     return batch.gravity_S3[batch.scene_N]
 
 
@@ -73,7 +73,7 @@ def baselines(network: ParticleNetwork) -> dict[str, Predictor]:
 
 
 def network_predictor(backend: Backend) -> Predictor:
-    """Returns the prediction of a backend, without noise and jitter."""
+    """Returns the predictions of a backend as a function, without noise and jitter."""
     return lambda batch: backend.predict(batch.state())
 
 
@@ -85,7 +85,7 @@ def frame_batches(
     rank: int = 0,
     world_size: int = 1,
 ) -> Iterator[Batch]:
-    """Yields batches of every stride-th frame of every episode; rank r takes each world_size-th of them."""
+    """Yields batches of every stride-th frame of every episode. Each rank takes an equal part of the frames."""
     config = network.config
     pairs = [(e, n) for e in episodes for n in range(0, len(e.position_TN3) - 1, stride)][rank::world_size]
     while pairs:
@@ -104,7 +104,7 @@ def one_step_errors(
     materials: Sequence[str],
     stop: Callable[[], bool] = lambda: False,
 ) -> dict[str, SquaredError]:
-    """Returns squared errors of accelerations of each predictor over the batches."""
+    """Returns the squared errors of each predictor's accelerations over the batches."""
     errors = {name: SquaredError() for name in predictors}
     with torch.inference_mode():
         for batch in batches:
@@ -131,8 +131,8 @@ def position_mse(predicted_TN3: np.ndarray, reference_TN3: np.ndarray) -> np.nda
 def rollout_errors(predicted: Sequence[np.ndarray], episodes: Sequence[Episode]) -> dict[str, np.ndarray]:
     """Returns the position MSE at each frame, float64 [T], for `all` particles and for each material.
 
-    Each frame's value is the mean over the scenes that reached it and have the material, NaN without any. `predicted`
-    has positions [T, N, 3] of each episode; the result has the length of the longest.
+    A value is the mean over the scenes that reached the frame and have the material; NaN without such scenes.
+    `predicted` contains positions [T, N, 3] of each episode. The result has the length of the longest rollout.
     """
     frames = max(len(path_TN3) for path_TN3 in predicted)
     curves: dict[str, list[np.ndarray]] = {}
@@ -147,12 +147,11 @@ def rollout_errors(predicted: Sequence[np.ndarray], episodes: Sequence[Episode])
 
 
 def set_convention(one_step_mse: float, predicted: Sequence[np.ndarray], episodes: Sequence[Episode]) -> dict[str, Any]:
-    """Returns errors as the papers of imported sets report them: means also over axes, of free particles and of all.
+    """Returns errors as papers on imported sets report them: means also over axes, of free and of all particles.
 
-    Boundary particles do not move and have no error; GNS includes them in its averages. Positions are compared over
-    all predicted frames or the first 20, scene by scene, as GNS does for its one-step and rollout MSE
-    (Sanchez-Gonzalez et al. 2020), and LagrangeBench for MSE20 (Toshev et al. 2023).
-    Units: the set's unit of length, squared.
+    Boundary particles do not move, so they have no error; GNS includes them in its averages. Positions are compared
+    scene by scene over all predicted frames, as GNS does (Sanchez-Gonzalez et al. 2020), and over the first 20, as
+    LagrangeBench does for MSE20 (Toshev et al. 2023). Units: the set's unit of length, squared.
     """
     dimensions = episodes[0].dimensions
     still = [0 if episode.boundary_P3 is None else len(episode.boundary_P3) for episode in episodes]
@@ -172,7 +171,7 @@ def set_convention(one_step_mse: float, predicted: Sequence[np.ndarray], episode
 
 
 def mean_so_far(value_ST: np.ndarray) -> np.ndarray:
-    """Returns the mean at each frame over the scenes that are not NaN there, float64 [T]."""
+    """Returns the mean at each frame over the scenes with a finite value there, float64 [T]."""
     there_ST = np.isfinite(value_ST)
     count_T = there_ST.sum(0)
     return np.where(count_T > 0, np.where(there_ST, value_ST, 0).sum(0) / np.maximum(count_T, 1), np.nan)

@@ -1,4 +1,4 @@
-"""The generator that a training starts where its data set is missing or incomplete."""
+"""The generator that a training starts if its data set is missing or incomplete."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ STOP_PATIENCE_S = 60.0
 
 
 class Generator:
-    """Runs `python -m datagen` as a child process with its own log; it ends with its parent."""
+    """Runs `python -m datagen` as a child process with its own log. The process ends with its parent."""
 
     def __init__(self, config: DatagenConfig, folder: Path) -> None:
         """Writes the resolved configuration to `folder`/dataset.yaml and starts the process."""
@@ -31,7 +31,7 @@ class Generator:
         (folder / "dataset.yaml").write_text(yaml.safe_dump(mapping, sort_keys=False), encoding="utf-8")
         self.log_path = folder / "datagen.log"
         self._read_to = self._finished = self._frames_per_episode = 0
-        self._running: dict[int, int] = {}  # frames of the launch that each worker is in
+        self._running: dict[int, int] = {}  # frames of each worker's present launch
         command = (sys.executable, "-m", "datagen", "--config-path", str(folder.resolve()), "--config-name", "dataset")
         with self.log_path.open("wb") as log:
             self._program = Program(command, log)
@@ -41,7 +41,7 @@ class Generator:
         return self._program.exit_code is None
 
     def check(self) -> None:
-        """Raises: ConfigError with the generator's message when it has failed."""
+        """Raises: ConfigError with the generator's message if it has failed."""
         code = self._program.exit_code
         if code not in (None, 0):
             with self.log_path.open("rb") as log:
@@ -69,5 +69,5 @@ class Generator:
             self._finished += 1
 
     def stop(self) -> None:
-        """Ends the process as Ctrl-C does: finished episodes are kept, and a later start continues."""
+        """Ends the process as Ctrl-C does. Finished episodes are kept, and a later start continues."""
         self._program.stop(STOP_PATIENCE_S)

@@ -1,7 +1,7 @@
 """Gradients that are not finite: such an update is skipped and counted, and too many in a row end the training.
 
-Counting happens on the device, and the host reads the counters where it writes a log line. Counters [5]: sum of the
-finite norms, their number, updates skipped, skipped in a row until now, most in a row since the last log line.
+The device counts, and the host reads the counters at log lines. Counters [5]: sum of the finite norms, their number,
+skipped updates, updates skipped in a row now, largest number skipped in a row since the last log line.
 """
 
 from __future__ import annotations
@@ -12,15 +12,15 @@ import torch
 
 from hgn.schema import ConfigError
 
-MAXIMUM_SKIPPED = 100  # updates in a row, after which a training ends
+MAXIMUM_SKIPPED = 100  # number of skipped updates in a row that ends a training
 
 
 class GradientGuard:
     """Skips updates that would put a NaN into the parameters. The Triton kernels do the same (finish_update).
 
-    Gradients are checked after they were averaged over the ranks, so all ranks skip the same updates. A norm above
-    the largest float32 counts as not finite. A skipped update still counts as one: the sample is used up, the learning
-    rate decays; parameters and moments stay as they were.
+    Gradients are checked after their average over the ranks, so all ranks skip the same updates. A norm above the
+    largest float32 counts as not finite. A skipped update is still counted: its samples are used up, and the learning
+    rate decays. Parameters and moments do not change.
     """
 
     def __init__(self, counters: torch.Tensor) -> None:
@@ -37,14 +37,14 @@ class GradientGuard:
         self._counters[:3] += torch.stack([torch.where(finite, norm, 0), 1 - self._skip, self._skip])
         self._counters[3] = in_a_row
         self._counters[4] = torch.maximum(self._counters[4], in_a_row)
-        # the attribute by which loss scaling tells fused optimisers to leave everything as it is
+        # loss scaling uses this attribute to make fused optimisers skip a step
         optimizer.found_inf = self._skip  # type: ignore[attr-defined]
 
 
 def take_counters(counters: torch.Tensor, update: int) -> tuple[int, dict[str, float]]:
-    """Returns the updates skipped since the last call, and the mean norm of the finite gradients if there were any.
+    """Returns the number of skipped updates since the last call, and the mean norm of the finite gradients if any.
 
-    Raises: ConfigError when MAXIMUM_SKIPPED updates in a row had to be skipped.
+    Raises: ConfigError if MAXIMUM_SKIPPED updates in a row were skipped.
     """
     norm_sum, finite, skipped, _, most_in_a_row = counters.tolist()
     counters[:3] = 0

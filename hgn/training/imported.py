@@ -1,4 +1,4 @@
-"""Training on an imported data set, which provides the settings that are null."""
+"""Training on an imported data set, which determines the settings that are null."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ FLAG = "+experiment=imported"
 
 
 def settings_of_imported(mapping: Mapping[str, Any]) -> dict[str, Any]:
-    """Returns the composed settings, with values of the imported set where +experiment=imported leaves them null.
+    """Returns the composed settings with the imported set's values for those that +experiment=imported leaves null.
 
     `scene` and `dataset` become the set's. Noise and cells are the paper's, scaled by the set's radius.
-    Raises: ConfigError for an imported set without that experiment, or another set with it.
+    Raises: ConfigError for an imported set without that experiment, and for another set with it.
     """
     mapping = {key: dict(value) if isinstance(value, Mapping) else value for key, value in mapping.items()}
     folder, asked = mapping["dataset"]["folder"], bool(mapping.get("imported"))

@@ -19,15 +19,15 @@ from hgn.training.distributed import averaging_options, started_by_srun
 
 
 def quieten() -> None:
-    """Silences messages and hints of Lightning: the commands print their own."""
+    """Silences messages and hints of Lightning, because the commands print their own."""
     logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
     warnings.filterwarnings("ignore", ".*does not have many workers.*")
     warnings.filterwarnings("ignore", ".*LeafSpec.*")
-    warnings.filterwarnings("ignore", ".*GPU available but not used.*")  # training.device=cpu says so
+    warnings.filterwarnings("ignore", ".*GPU available but not used.*")  # training.device=cpu was chosen on purpose
 
 
 def own_launcher() -> list[LightningEnvironment]:
-    """Returns the environment of processes without a launcher, where Slurm's variables would mislead Lightning."""
+    """Returns the environment for processes without a launcher, in which Slurm's variables would mislead Lightning."""
     mislead = "SLURM_NTASKS" in os.environ and "RANK" not in os.environ and not started_by_srun()
     return [LightningEnvironment()] if mislead else []
 
@@ -54,16 +54,14 @@ def interrupts_passed_on() -> Iterator[None]:
 
 
 def skip_sigterm_broadcast(trainer: Trainer) -> None:
-    """Removes a broadcast before each training step, by which Lightning shares a SIGTERM of rank 0 and makes the host
-    wait for the device (its issue 21487). hgn.training.callbacks.Stopper shares signals every few updates instead.
-    """
+    """Removes a broadcast before each training step. With it Lightning shares a SIGTERM of rank 0, and the host waits
+    for the device (its issue 21487). hgn.training.callbacks.Stopper shares signals every few updates instead."""
     trainer.fit_loop.epoch_loop._broadcast_sigterm_tensor = _nothing  # type: ignore[method-assign]
 
 
 def forget_sigterm(trainer: Trainer) -> None:
-    """Clears a SIGTERM that Lightning's own handler received, which also called ours: Lightning would leave the loop by
-    an exception, without a checkpoint and with exit code 0.
-    """
+    """Clears a SIGTERM that Lightning's own handler received, which also called ours. Otherwise Lightning would leave
+    the loop by an exception, without a checkpoint and with exit code 0."""
     trainer._signal_connector.received_sigterm = False
 
 

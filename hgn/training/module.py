@@ -26,10 +26,10 @@ from hgn.training.updates import Ranks, TrainedNetwork, Updates, build_optimizer
 class TrainingModule(LightningModule):
     """Trains a network on one-step accelerations (paper sec. 3.3). A training step is a chunk of updates.
 
-    Optimisation is manual: Lightning's own counters stand still, `update` counts.
+    Optimisation is manual. Lightning's own counters do not change; `update` counts the updates.
     """
 
-    updates: Updates  # from on_train_start on
+    updates: Updates  # set by on_train_start
 
     def __init__(
         self,
@@ -39,24 +39,24 @@ class TrainingModule(LightningModule):
         backend: str = "torch",
         precisions: tuple[str, ...] = ("fp32",),
     ) -> None:
-        """`backend` is torch or triton; `precisions` are those that its updates may have, the preferred one first."""
+        """`backend` is torch or triton. `precisions` are those that its updates may have, the preferred one first."""
         super().__init__()
         self.automatic_optimization = False
         self.network = network
         self.averaged = copy.deepcopy(network).requires_grad_(False) if training.ema_decay else None
         self.training_config, self.data, self.backend = training, data, backend
         self._precisions = precisions
-        self.update = 0  # updates made
-        self.skipped = 0  # of those, skipped until the last log line
+        self.update = 0  # number of updates
+        self.skipped = 0  # number of skipped updates at the last log line
         self.sampler_state = SamplerState()
-        # see TrainedNetwork; kept on the device: no synchronisation
+        # see TrainedNetwork; they stay on the device, which avoids synchronisation
         self.loss_sum: torch.Tensor
         self.register_buffer("loss_sum", torch.zeros(2), persistent=False)
         self.gradient_counters: torch.Tensor
         self.register_buffer("gradient_counters", torch.zeros(5), persistent=False)
 
     def set_statistics(self, statistics: Statistics) -> None:
-        """Freezes the normaliser; noise enters in quadrature. Done once, when a run begins."""
+        """Sets the normaliser when a run begins; it stays constant. Noise is added in quadrature."""
         noise, axes = self.training_config.noise_std, self.network.config.dimensions
         normaliser = self.network.normaliser
         if self.network.config.relative:
@@ -69,7 +69,7 @@ class TrainingModule(LightningModule):
         self._begin_average()
 
     def load_weights(self, network: ParticleNetwork) -> None:
-        """Takes over parameters and normaliser; instead of `set_statistics`, when a run begins."""
+        """Copies parameters and normaliser when a run begins. It replaces `set_statistics`."""
         self.network.load_state_dict(network.state_dict())
         self._begin_average()
 
@@ -79,7 +79,7 @@ class TrainingModule(LightningModule):
 
     @property
     def result(self) -> ParticleNetwork:
-        """The measured and exported network: the moving average where there is one."""
+        """The measured and exported network: the moving average if there is one."""
         return self.network if self.averaged is None else self.averaged
 
     @property
@@ -88,7 +88,7 @@ class TrainingModule(LightningModule):
         return learning_rate(self.training_config, self.update)
 
     def simulating_backend(self) -> Backend:
-        """Returns what simulates with `result`: the kernels that train, else the fastest that steps by frames."""
+        """Returns the backend that simulates `result`: the training's, else the fastest that steps by frames."""
         precision = self.updates.precision
         if self.backend == "triton":
             return build("triton", self.result, precision)
@@ -107,7 +107,7 @@ class TrainingModule(LightningModule):
         if self.backend == "torch":
             self.updates = TorchUpdates(trained, config, rank, self.manual_backward, precision=self._precisions[0])
         else:
-            # Triton, which backend torch does without, is loaded here.
+            # imported here, because backend torch does without Triton
             from hgn.training.triton_updates import TritonUpdates
 
             ranks = Ranks(rank, self.trainer.world_size)
@@ -141,8 +141,8 @@ class TrainingModule(LightningModule):
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         progress = Progress.of(checkpoint)
         self.update, self.skipped, self.sampler_state = progress.updates, progress.skipped, progress.sampler_state
-        checkpoint.pop("loops", None)  # Lightning's counters
-        checkpoint["callbacks"].pop("GradientGuard", None)  # 0.1.0 counted skipped updates there
+        checkpoint.pop("loops", None)  # Lightning's own counters
+        checkpoint["callbacks"].pop("GradientGuard", None)  # version 0.1.0 counted skipped updates here
         state = checkpoint["state_dict"]
         if self.averaged is None:
             for name in [name for name in state if name.startswith(AVERAGED)]:

@@ -36,7 +36,7 @@ from hgn.training.schedule import next_measurement
 from hgn.training.stop import StopRequest
 from hgn.training.tensorboard import show_pictures, write_pictures
 
-FRAME_STRIDE = 4  # neighbouring frames say the same
+FRAME_STRIDE = 4  # neighbouring frames have almost the same errors
 
 
 class Monitor(Callback):
@@ -50,7 +50,7 @@ class Monitor(Callback):
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         assert isinstance(pl_module, TrainingModule)
-        self._measured_update = pl_module.update  # nothing is new before the next update
+        self._measured_update = pl_module.update  # nothing to measure before the next update
 
     def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
         assert isinstance(pl_module, TrainingModule)
@@ -63,10 +63,9 @@ class Monitor(Callback):
             self.measure(trainer, pl_module, standard_patience_s())
 
     def measure(self, trainer: Trainer, module: TrainingModule, patience_s: float = 0.0) -> None:
-        """Measures and logs. One-step frames are divided among the ranks, rank 0 does the rollouts; a stop request ends
-        it early.
+        """Measures and logs. One-step frames are divided among the ranks; rank 0 simulates the rollouts.
 
-        If scenes are still on a server that does not answer, nothing is measured, with a message.
+        A stop request ends it early. If scenes are on a server that does not answer, it only prints a message.
         """
         if self._measured_update == module.update:
             return
@@ -129,7 +128,7 @@ class Monitor(Callback):
     def _rollout(
         self, trainer: Trainer, module: TrainingModule, episodes: list[Episode], frames: int
     ) -> dict[str, float]:
-        """Returns rollout errors, means over the scenes that reached each frame, and the fraction that finished."""
+        """Returns rollout errors, averaged over the scenes that reached each frame, and the fraction that finished."""
         simulator = Simulator(module.result, episodes[0].frame_rate_hz, module.simulating_backend())
         frames = min(frames, *(len(episode.position_TN3) for episode in episodes))
         trials = simulate_scenes(simulator, [InitialState.of_episode(episode) for episode in episodes], frames)

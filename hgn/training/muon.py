@@ -1,4 +1,4 @@
-"""Muon (Jordan 2024): hidden matrices step along their orthogonalised momentum, everything else as in Adam."""
+"""Muon (Jordan 2024): hidden matrices step along their orthogonalised momentum; all others step as in Adam."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from hgn.network.orthogonal import MOMENTUM, normalised, orthogonalised, square_
 class Muon(torch.optim.Adam):
     """torch.optim.Adam whose square blocks (hgn.network.orthogonal) take Muon's step instead, with Nesterov's momentum.
 
-    A block's momentum is stored as its `exp_avg`; its `exp_avg_sq` is not used.
+    `exp_avg` of a block contains its momentum. Its `exp_avg_sq` is not used.
     """
 
     def __init__(self, network: ParticleNetwork, lr: float) -> None:
@@ -40,7 +40,7 @@ class Muon(torch.optim.Adam):
         direction_KWW = orthogonalised(normalised(torch.lerp(stepped_KWW, gradient_KWW, 1 - MOMENTUM)))
         rate, size = self.param_groups[0]["lr"], step_size(block_KWW.shape[-1])
         moved_KWW = value_KWW - rate * (size * direction_KWW)
-        skip = getattr(self, "found_inf", None)  # as fused Adam reads it
+        skip = getattr(self, "found_inf", None)  # fused Adam reads the same attribute
         if skip is not None:
             stepped_KWW = torch.where(skip > 0, momentum_KWW, stepped_KWW)
             moved_KWW = torch.where(skip > 0, value_KWW, moved_KWW)

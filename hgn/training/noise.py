@@ -1,8 +1,8 @@
 """Input noise and grid jitter (paper sec. 3.3), each drawn from the sample's own seed.
 
-`noise_scale` returns the scale of a sample's noise for both backends. The noise itself is drawn here for backend torch
-(`perturbed_window`, called by hgn.training.torch_updates), and in hgn.kernels.update for triton (`Updates._assemble`,
-with the kernels `draw_waves` and `assemble_batch`).
+`noise_scale` returns the scale of a sample's noise for both backends. Backend torch draws the noise in this module
+(`perturbed_window`, called by hgn.training.torch_updates). Backend triton draws it in hgn.kernels.update
+(`Updates._assemble`, kernels `draw_waves` and `assemble_batch`).
 Shape legend: W = m + 2 window frames (m velocities), N particles, F windows, S scenes, K waves.
 """
 
@@ -16,7 +16,7 @@ from hgn.config import CORRELATED_WAVELENGTHS, CORRELATED_WAVES, TrainingConfig
 from hgn.data.batch import Batch
 from hgn.system.splitmix import splitmix64
 
-# Keys of random streams other than the particles' noise: with the same seed they would repeat its first numbers.
+# Keys of random streams other than the particles' noise. With its seed they would repeat its first numbers.
 JITTER_STREAM, WAVE_STREAM, SCALE_STREAM = 0x5DEECE66D, 0x2545F4914F, 0x9E6D62D06F6A9A9B
 
 SMALLEST_ACCELERATION = 1e-30  # avoids a division by 0
@@ -26,14 +26,13 @@ QUIET_WEIGHT = 4.0  # largest loss weight of a frame below training.quiet_accele
 def noise_scale(training: TrainingConfig, acceleration: float, seed: int) -> tuple[float, float]:
     """Returns the scale of a sample's noise in units of `noise_std`, and the loss weight of the sample.
 
-    `acceleration` is the root mean square of the target, domain units per frame squared. Where it is a fraction
-    r < 1 of `noise_std`, the scale is log-uniform between max(r, training.noise_min_scale) and 1, drawn from the
-    sample's seed only, and the loss weight is 1 / scale^2; elsewhere both are 1. The loss weight is also multiplied by
-    `quiet_weight`.
+    `acceleration` is the root mean square of the target, domain units per frame squared, and r is its ratio to
+    `noise_std`. If r < 1, the scale is log-uniform between max(r, training.noise_min_scale) and 1. It is drawn from the
+    sample's seed, and the loss weight is 1 / scale^2. Otherwise both are 1. `quiet_weight` multiplies the loss weight.
 
-    A network does not learn errors that are small compared with the noise: at rest its bias stays at a twentieth of the
-    noise, and bodies at rest creep over thousands of frames. So noise is drawn from a wide range of scales in frames
-    with small accelerations, like the noise levels of a denoiser (Song & Ermon 2019), and all scales weigh the same.
+    A network does not learn errors that are small compared with the noise. At rest its bias stays at a twentieth of the
+    noise, and resting bodies creep over thousands of frames. So frames with small accelerations get noise of many
+    scales, like the noise levels of a denoiser (Song & Ermon 2019). All scales have equal weight in the loss.
     """
     quiet = quiet_weight(training, acceleration)
     if training.noise_min_scale == 1.0 or training.noise_std == 0.0:
@@ -48,8 +47,8 @@ def noise_scale(training: TrainingConfig, acceleration: float, seed: int) -> tup
 def quiet_weight(training: TrainingConfig, acceleration: float) -> float:
     """Returns the loss weight of a sample whose target has this root mean square.
 
-    Errors at rest are small compared with those of impacts and hardly change the mean, but they are the same in every
-    frame: bodies at rest creep over thousands of frames.
+    Errors at rest are much smaller than those of impacts, so they hardly change the mean. But they are equal in every
+    frame, so resting bodies creep over thousands of frames.
     """
     if not acceleration < training.quiet_acceleration:
         return 1.0
@@ -71,8 +70,9 @@ def random_walk(shape_MN3: tuple[int, int, int], std_last: float, generator: tor
 def correlated_walk(
     position_N3: torch.Tensor, history: int, std_last: float, cell_size: float, generator: torch.Generator
 ) -> torch.Tensor:
-    """Returns velocity noise [m, N, 3] that neighbours have in common: a sum of plane waves, random Fourier features
-    (Rahimi, Recht 2007), whose amplitudes are a `random_walk`. Its standard deviation is the same everywhere.
+    """Returns velocity noise [m, N, 3] that is similar for neighbours, with the same standard deviation everywhere.
+
+    It is a sum of plane waves, random Fourier features (Rahimi, Recht 2007). Amplitudes follow a `random_walk`.
     """
     waves, device = CORRELATED_WAVES, generator.device
     direction_K3 = torch.randn(waves, 3, generator=generator, device=device)
@@ -91,11 +91,11 @@ def perturbed_window(
 ) -> torch.Tensor:
     """Returns a copy of the batch's window with noise in its input frames, [W, N, 3].
 
-    The random walk is added to the velocities, and positions follow as their sums. The next position moves with the
-    last one, so the target becomes v_true^{n+1} - v_noisy^n: the network learns to undo the velocity error (as in GNS,
-    Sanchez-Gonzalez et al. 2020). `correlated` is the fraction of the variance that neighbours have in common: in a
-    rollout the errors of a body's particles are correlated, while independent noise averages out over a body. Each
-    scene's noise is multiplied by `batch.noise_scale_S`. Axes from `dimensions` on have no noise.
+    The random walk is added to the velocities, and its sums to the positions. The next position is shifted like the
+    last one, so the target becomes v_true^{n+1} - v_noisy^n. The network learns to undo the velocity error, as in GNS
+    (Sanchez-Gonzalez et al. 2020). `correlated` is the fraction of the variance that neighbours have in common. In a
+    rollout the errors of a body's particles are correlated; independent noise averages out over a body. Each scene's
+    noise is multiplied by `batch.noise_scale_S`. Axes with numbers from `dimensions` have no noise.
     """
     window_WN3 = batch.window_WN3
     if std_last == 0:
@@ -120,7 +120,7 @@ def perturbed_window(
 
 
 def jittered_origin(batch: Batch, cell_size: float, dimensions: int = 3) -> torch.Tensor:
-    """Returns grid origins uniform in [-cell_size, 0]^3, [S, 3]; 0 on axes from `dimensions` on."""
+    """Returns grid origins uniform in [-cell_size, 0]^3, [S, 3]; 0 on axes with numbers from `dimensions`."""
     origins = []
     for seed in batch.seeds_S:
         generator = torch.Generator().manual_seed(seed ^ JITTER_STREAM)

@@ -1,5 +1,6 @@
-"""The check of training kernels against PyTorch, before the first update and on its batch: outputs, and gradients of a
-random weighted sum of them. hgn.runtime.parity has the bounds.
+"""Compares training kernels with PyTorch on the first batch, before the first update (bounds: hgn.runtime.parity).
+
+Compared are the outputs, and the gradients of a random weighted sum of the outputs.
 
 Shape legend: N particles of all scenes, S scenes.
 """
@@ -19,16 +20,15 @@ from hgn.runtime.parity import GRADIENTS, OUTPUTS, require_parity
 from hgn.scene.symmetry import Symmetry
 from hgn.training.symmetry import obstacles_under
 
-CHECKED_PARTICLES = 200_000  # at most: autograd needs memory
+CHECKED_PARTICLES = 200_000  # largest number of particles to check; autograd needs memory
 
 
 def require_update_parity(
     updates: Updates, episodes: Sequence[EpisodeTensors], symmetries: Sequence[Symmetry] | None = None
 ) -> tuple[float, float]:
-    """Returns the relative errors of outputs and of all gradients on the batch of `updates`, of these episodes' images;
-    NaN for a batch of more than CHECKED_PARTICLES.
+    """Returns the relative errors of outputs and gradients on the batch of `updates`, which has images of `episodes`.
 
-    Raises: ParityError when one of them exceeds its bound.
+    They are NaN for a batch of more than CHECKED_PARTICLES. Raises: ParityError if an error exceeds its bound.
     """
     network, fused, count = updates.network, updates.fused, int(updates.buffers.count)
     if count > CHECKED_PARTICLES:
@@ -52,14 +52,14 @@ def require_update_parity(
     gradient_error = require_parity(flat, expected_flat, GRADIENTS, updates.precision, section="training.")
     if updates.device.type == "cuda":
         del output_N3, slopes, expected, expected_flat
-        torch.cuda.empty_cache()  # free memory decides where episodes are stored
+        torch.cuda.empty_cache()  # free memory determines where episodes are stored
     return output_error, gradient_error
 
 
 def _state(
     updates: Updates, episodes: Sequence[EpisodeTensors], symmetries: Sequence[Symmetry] | None, count: int
 ) -> tuple[ParticleState, torch.Tensor]:
-    """Returns the batch as PyTorch reads it, noise and jitter included."""
+    """Returns the batch as PyTorch's input, noise and jitter included."""
     config = updates.config
     obstacles = ObstacleCells.of([episode.obstacle_grid for episode in episodes])
     if obstacles is not None and symmetries is not None:

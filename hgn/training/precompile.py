@@ -1,4 +1,4 @@
-"""The kernels that a training compiles while the first episodes are generated."""
+"""Lists the kernels that a training compiles while the first episodes are generated."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from hgn.training.errors import MONITORED_SCENES
 
 
 def job_of_training(config: TrainConfig, capability: tuple[int, int], several_ranks: bool) -> PrecompileJob:
-    """Returns the kernels that a training on such a GPU needs; sizes follow from the scenes' distribution."""
+    """Returns the kernels that a training on such a GPU needs. The distribution of scenes determines their sizes."""
     training, network = config.training, config.network
     particles, cells = _sizes(config.scene, network.levels)
     own = [training.pushforward_scenes] if training.pushforward_fraction > 0 else []
@@ -29,7 +29,7 @@ def job_of_training(config: TrainConfig, capability: tuple[int, int], several_ra
 
 
 def _sizes(scene: SceneConfig, levels: int) -> tuple[int, list[int]]:
-    """Returns the initial particles and cells of each level of a scene whose groups are cubes."""
+    """Returns the numbers of initial particles and of cells on each level, for a scene whose groups are cubes."""
     edge = scene.group_size / scene.cell_size
     particles = scene.group_count * scene.particles_per_cell * edge**3
     cells, length = [], edge + 2  # neighbours of a particle's cell are active too

@@ -21,22 +21,22 @@ from hgn.step_config import UNCONSTRAINED, StepConfig
 from hgn.training.noise import noise_scale
 from hgn.training.pushforward import Starts, simulated_barrier
 
-READERS = 8  # threads that copy whole episodes
+READERS = 8  # number of threads that copy whole episodes
 
 
 class DrawnChunk(NamedTuple):
-    """A chunk in the deterministic order, before anything is read."""
+    """A chunk in the deterministic order, before its data are read."""
 
-    samples: list[list[Sample]]  # of each update
-    sampler_state: SamplerState  # the order's state once these are trained on
+    samples: list[list[Sample]]  # samples of each update
+    sampler_state: SamplerState  # state of the order after these samples
     starts: Starts
 
 
 class ChunkReader(Protocol):
-    updates_at_once: int  # in a chunk, at most
+    updates_at_once: int  # largest number of updates in a chunk
 
     def read(self, drawn: DrawnChunk) -> WindowChunk | EpisodeChunk:
-        """Reads a chunk; called for one chunk after the other, in their order."""
+        """Reads a chunk. It is called for the chunks in their order."""
 
 
 class FrameDraws:
@@ -49,16 +49,16 @@ class FrameDraws:
         self.measures_frames = training.frame_importance > 0 or low_noise
 
     def measured(self, episode: Episode) -> FrameImportance | None:
-        """Returns an episode's accelerations, None where nothing depends on them."""
+        """Returns an episode's accelerations; None if no setting depends on them."""
         return FrameImportance.of(episode, self._training.frame_importance) if self.measures_frames else None
 
     def add(self, index: int, importance: FrameImportance | None) -> None:
-        """Keeps what `measured` returned of the episode with this index."""
+        """Stores the result of `measured` for the episode with this index."""
         if importance is not None:
             self._importance[index] = importance
 
     def drawn(self, samples: Sequence[Sample]) -> tuple[Sample, ...]:
-        """Returns the samples as they are trained on."""
+        """Returns the samples with the drawn frames, loss weights and noise scales."""
         fraction = self._training.frame_importance
         if not self.measures_frames:
             return tuple(samples)
@@ -99,7 +99,7 @@ class WindowReader:
 
 
 class EpisodeReader:
-    """Reads the episodes that the device does not hold yet, and names those that it may free."""
+    """Reads the episodes that are not yet on the device, and names the episodes that it may free."""
 
     updates_at_once = 64
 
@@ -110,9 +110,9 @@ class EpisodeReader:
         self._draws = FrameDraws(store, training)
         self._clearance = step.obstacle_clearance if training.pushforward_fraction > 0 else None
         shuffled = training.shuffle_episodes
-        # two windows of the order, where it has windows
+        # episodes on the device: two windows of the order, if the order has windows
         self.capacity = 2 * max(shuffled, BLOCK_EPISODES) if shuffled else sys.maxsize
-        self._on_device: OrderedDict[int, None] = OrderedDict()  # the longest unused first
+        self._on_device: OrderedDict[int, None] = OrderedDict()  # least recently used first
 
     def read(self, drawn: DrawnChunk) -> EpisodeChunk:
         needed = {sample.episode for update in drawn.samples for sample in update}
@@ -130,7 +130,7 @@ class EpisodeReader:
         return EpisodeChunk(samples, episodes, drawn.sampler_state, dropped=dropped, starts=drawn.starts)
 
     def _whole(self, indices: Sequence[int]) -> dict[int, EpisodeTensors]:
-        """Reads several episodes together: a data set's first pass is gigabytes, and copies release Python's lock."""
+        """Reads several episodes together. The first pass over a data set copies gigabytes without Python's lock."""
 
         def read(episode: Episode) -> tuple[EpisodeTensors, FrameImportance | None]:
             barrier = None if self._clearance is None else simulated_barrier(episode, self._clearance)

@@ -1,14 +1,14 @@
-"""Learning rate, moving average and measurements as functions of the number of updates made before."""
+"""Learning rate, moving average and measurements as functions of the number of earlier updates."""
 
 from __future__ import annotations
 
 from hgn.config import TrainingConfig
 
-FIRST_MEASUREMENT = 2_000  # least number of updates before the first one, where monitor_every is larger
+FIRST_MEASUREMENT = 2_000  # smallest number of updates before the first measurement, if monitor_every is larger
 
 
 def learning_rate(training: TrainingConfig, update: int) -> float:
-    """Returns the learning rate of update number `update`, from 0: exponential decay, after a linear warm-up."""
+    """Returns the learning rate of update number `update`, from 0: a linear warm-up, then exponential decay."""
     decay = (training.final_learning_rate / training.learning_rate) ** (1 / training.maximum_updates)
     warmth = min(1.0, (update + 1) / training.warmup_updates) if training.warmup_updates else 1.0
     return training.learning_rate * (decay**update * warmth)
@@ -17,15 +17,15 @@ def learning_rate(training: TrainingConfig, update: int) -> float:
 def average_weight(training: TrainingConfig, update: int) -> float:
     """Returns the weight of the new parameters in their moving average, after update number `update`, from 0.
 
-    Early parameters are forgotten soon: while there are few updates, the average is over the last tenth of them.
+    Early parameters lose weight soon: after few updates, the average is over about the last tenth of them.
     """
     return 1.0 - min(training.ema_decay, (1 + update) / (10 + update))
 
 
 def next_measurement(training: TrainingConfig, update: int) -> int:
-    """Returns the number of updates at which errors are measured next, after `update` of them.
+    """Returns the number of updates at the next measurement of errors, after `update` updates.
 
-    Errors are measured at every multiple of `monitor_every`. The first interval is halved while the half is at least
+    Errors are measured at every multiple of `monitor_every`. The first interval is halved while its half is at least
     FIRST_MEASUREMENT, so that a long training has a best checkpoint early.
     """
     due = training.monitor_every * (1 + update // training.monitor_every)

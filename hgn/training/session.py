@@ -1,4 +1,4 @@
-"""One training from its start or its last checkpoint to its end: network, data, callbacks and Lightning's trainer."""
+"""One training from its start or its last checkpoint to its end: network, data, callbacks and trainer."""
 
 from __future__ import annotations
 
@@ -40,17 +40,17 @@ class Start:
     """Data and network at the start of a training."""
 
     store: AnyStore
-    resume: Resume | None  # the checkpoint to go on from
-    initial: ParticleNetwork | None  # parameters and normaliser of a new run; None: drawn, and the data's
+    resume: Resume | None  # the checkpoint to resume from
+    initial: ParticleNetwork | None  # source of parameters and normaliser; None: random, and from the data
     precompilation: Precompilation | None
 
 
 def train_network(config: TrainConfig, start: Start, stop: StopRequest, published: Callable[[], str]) -> int:
-    """Trains until `training.maximum_updates` or a stop request; returns the exit code.
+    """Trains until `training.maximum_updates` or a stop request. Returns the exit code.
 
-    `published` reports how much of the data set is there. Every rank calls this.
+    `published` reports how many episodes are published. Every rank calls this.
     """
-    # Lightning loads for seconds: not before the waiting is over, and never for the other commands.
+    # Importing Lightning takes seconds. It is imported after the wait for data, and by no other command.
     from lightning.pytorch import Trainer, seed_everything
     from lightning.pytorch.loggers import TensorBoardLogger
 
@@ -119,7 +119,7 @@ def train_network(config: TrainConfig, start: Start, stop: StopRequest, publishe
         module.release()
     if trainer.is_global_zero:
         _report(config, module.update, monitor.last, stop)
-    # a signal that came after the last update changed nothing
+    # a signal after the last update has no effect
     return 0 if module.update >= training.maximum_updates else stop.exit_code
 
 
@@ -162,13 +162,13 @@ def _backend(config: TrainConfig, resume: Resume | None) -> tuple[str, tuple[str
 
 
 def precompile_kernels(config: TrainConfig, resume: Resume | None, stack: ExitStack) -> Precompilation | None:
-    """Starts compiling the kernels during the wait for data, in the first process of a machine with GPUs."""
+    """Starts to compile kernels during the wait for data, in the first process of a machine with GPUs."""
     training = config.training
     backend, precisions, _ = _backend(config, resume)
     on_gpu = training.device != "cpu" and torch.cuda.is_available() and torch.version.hip is None
     if backend != "triton" or not on_gpu or not first_on_machine():
         return None
-    # Triton, which backend torch does without, is loaded here.
+    # imported here, because backend torch does without Triton
     from hgn.runtime.precompile import Precompilation
     from hgn.training.precompile import job_of_training
 
@@ -180,7 +180,7 @@ def precompile_kernels(config: TrainConfig, resume: Resume | None, stack: ExitSt
 
 
 def _public(config: TrainConfig) -> dict[str, Any]:
-    """Returns the settings without the passwords in URLs."""
+    """Returns the settings, without passwords in URLs."""
     mapping: dict[str, Any] = to_mapping(config)
     mapping["dataset"]["folder"] = without_passwords(config.dataset.folder)
     mapping["training"]["more_data"] = [without_passwords(folder) for folder in config.training.more_data]
@@ -188,7 +188,7 @@ def _public(config: TrainConfig) -> dict[str, Any]:
 
 
 def _write_run_files(config: TrainConfig, manifest: Manifest) -> None:
-    """Writes the resolved configuration, with the commit and the machine."""
+    """Writes the resolved configuration with the commit and the machine."""
     run = Path(config.run)
     make_folder(run)
     if not first_rank():

@@ -1,6 +1,6 @@
-"""Stopping a training: by Ctrl-C, SIGTERM, SIGUSR1 (which schedulers send before the end), or a time limit.
+"""Stops a training on Ctrl-C, SIGTERM, SIGUSR1 (which schedulers send before the end), or at a time limit.
 
-A signal only sets a flag: the loop ends at the next update, after a checkpoint. A second Ctrl-C ends it at once.
+A signal sets a flag. The loop ends at the next update, after a checkpoint. A second Ctrl-C ends it immediately.
 """
 
 from __future__ import annotations
@@ -9,27 +9,26 @@ import signal
 import time
 from types import FrameType
 
-# After several signals the exit code is that of the last in this order: a scheduler that sent SIGUSR1 queues the job
-# again, and may send SIGTERM too.
+# After several signals the last one in this order determines the exit code. A scheduler that sent SIGUSR1 queues the
+# job again, and may send SIGTERM too.
 BY_WEIGHT = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1)
 
 
 class StopRequest:
-    """Records whether and why this process should stop training."""
+    """Records whether, and why, this process should stop training."""
 
     def __init__(self) -> None:
         self.signal: int | None = None
         self._deadline: float | None = None
 
     def listen(self) -> None:
-        """Takes over SIGINT, SIGTERM and SIGUSR1; only the main thread may call this."""
+        """Installs handlers for SIGINT, SIGTERM and SIGUSR1. Only the main thread may call this."""
         for number in BY_WEIGHT:
             signal.signal(number, self._on_signal)
 
     def end_at_once(self) -> None:
-        """Lets a signal end the process until the next `listen`: while ranks wait for each other, in C++, Python would
-        not see it.
-        """
+        """Lets a signal end the process until the next `listen`. While ranks wait for each other in C++, Python's
+        handlers do not run."""
         for number in BY_WEIGHT:
             signal.signal(number, signal.SIG_DFL)
 

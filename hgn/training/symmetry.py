@@ -17,12 +17,12 @@ from hgn.scene.symmetry import Symmetry, drawn_symmetry
 
 
 def drawn_symmetries(batch: Batch) -> list[Symmetry]:
-    """Returns a symmetry of each scene, drawn from its sample's seed."""
+    """Returns a symmetry for each scene, drawn from its sample's seed."""
     return [drawn_symmetry(own, seed) for own, seed in zip(batch.symmetries_S, batch.seeds_S, strict=True)]
 
 
 def under_symmetries(batch: Batch, symmetries: Sequence[Symmetry]) -> Batch:
-    """Returns a copy of the batch with the images of its scenes; domains are invariant."""
+    """Returns a copy of the batch with the images of its scenes. Domains do not change."""
     return replace(
         batch,
         window_WN3=_points(batch.window_WN3, batch.scene_N, symmetries),
@@ -32,7 +32,7 @@ def under_symmetries(batch: Batch, symmetries: Sequence[Symmetry]) -> Batch:
 
 
 def obstacles_under(obstacles: ObstacleCells, symmetries: Sequence[Symmetry]) -> ObstacleCells:
-    """Returns cells and normals of the images. A mirrored cell k becomes n - 2 - k, where the solver has n nodes.
+    """Returns cells and normals of the images. With n nodes of the solver a mirrored cell k becomes n - 2 - k.
 
     A particle exactly on a face belongs to the cell above it, also in the image.
     """

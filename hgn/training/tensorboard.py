@@ -16,22 +16,23 @@ from hgn.scene.rollout_file import Rollout
 from hgn.training.module import TrainingModule
 from hgn.training.stop import StopRequest
 
-PICTURES = 4  # frames in a picture
-ANIMATION_PICTURES = 24
-ANIMATION_SIZE = 200  # pixels of a panel
+PICTURES = 4  # number of frames in a picture
+ANIMATION_PICTURES = 24  # largest number of pictures in an animation
+ANIMATION_SIZE = 200  # edge of a panel in pixels
 FINAL_PREFIXES = ("one_step/", "baseline_ratio/", "rollout/")
 
 
 def write_pictures(folder: Path, update: int, rollout: Rollout, error_T: dict[str, np.ndarray]) -> dict[str, Path]:
-    """Writes a rollout and its ground truth, as a picture and as a GIF, and `error_T`, position MSE over time by
-    material. Returns their files by TensorBoard's tags.
+    """Writes a rollout and its ground truth as a picture and a GIF, and the position MSE `error_T` by material.
+
+    Returns their files by TensorBoard's tags.
     """
     names = {"picture": "rollout_{:09d}.png", "error_over_time": "error_{:09d}.png", "animation": "rollout_{:09d}.gif"}
     paths = {f"rollout/{name}": folder / file.format(update) for name, file in names.items()}
     frames = np.linspace(0, rollout.frame_count - 1, PICTURES).astype(int).tolist()
     write_picture(paths["rollout/picture"], compare_picture(rollout, frames))
     write_picture(paths["rollout/error_over_time"], error_curve(error_T, rollout.frame_rate_hz))
-    # at most 50 pictures a second, which viewers keep
+    # viewers play at most 50 pictures a second
     every = max(-(-rollout.frame_count // ANIMATION_PICTURES), -(-int(rollout.frame_rate_hz) // 50))
     animate(rollout, paths["rollout/animation"], every=every, size=ANIMATION_SIZE)
     return paths
@@ -50,7 +51,7 @@ def show_pictures(logger: Any, update: int, paths: dict[str, Path]) -> None:
 
 
 def add_animation(logger: TensorBoardLogger, tag: str, path: Path, step: int) -> None:
-    """Adds a GIF file as an image summary, which TensorBoard plays; `add_video` would need a video library."""
+    """Adds a GIF file as an image summary, which TensorBoard plays. `add_video` would need a video library."""
     from tensorboard.compat.proto.summary_pb2 import Summary
 
     with Image.open(path) as opened:
@@ -63,7 +64,7 @@ class FinalMetrics(Callback):
     """Writes hyper-parameters and the last errors for TensorBoard's HPARAMS page, unless a signal ended the run."""
 
     def __init__(self, settings: dict[str, Any], last: dict[str, float], stop: StopRequest) -> None:
-        """`settings` is the resolved configuration; `last` is filled by the monitor."""
+        """`settings` is the resolved configuration. The monitor fills `last`."""
         self.settings, self.last, self.stop = settings, last, stop
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:

@@ -25,7 +25,7 @@ class TorchScenes:
     """Implements hgn.training.pushforward.SimulatedScenes."""
 
     def __init__(self, network: ParticleNetwork) -> None:
-        """`network` simulates."""
+        """`network` computes the simulations."""
         self._network, self._backend = network, fastest_stepped(network)
         self._backend.step = network.step.in_training
 
@@ -41,7 +41,7 @@ class TorchScenes:
 
     def groups(self, starts: Sequence[tuple[Episode, int]]) -> list[Sequence[tuple[Episode, int]]]:
         groups: list[list[tuple[Episode, int]]] = []
-        capacity = 0  # particles that fit into the last group
+        capacity = 0  # remaining capacity of the last group, in particles
         for start in starts:
             if capacity <= 0:
                 groups.append([])
@@ -67,7 +67,7 @@ class TorchScenes:
         return replace(sample, seed=seed, weight=weight, noise_scale=scale)
 
     def _barriers(self, episodes: Sequence[Episode]) -> Barriers | None:
-        """Returns the obstacles that constrain simulations; windows are trained on without."""
+        """Returns the obstacles that constrain simulations. Training windows have no barriers."""
         clearance = self._backend.step.obstacle_clearance
         if clearance is None:
             return None

@@ -21,7 +21,7 @@ from hgn.training.updates import TrainedNetwork
 
 
 class TorchUpdates:
-    """Trains on chunks of samples with PyTorch; hgn.training.updates.Updates describes the methods."""
+    """Trains on chunks of samples with PyTorch. hgn.training.updates.Updates describes the methods."""
 
     def __init__(
         self,
@@ -67,7 +67,7 @@ class TorchUpdates:
         self.step(update)
 
     def step(self, update: int) -> None:
-        """Moves the parameters along their gradients, unless one is not finite, and their average after them."""
+        """Moves the parameters along their gradients, then their average. Skips gradients that are not finite."""
         network, averaged, optimizer = self.trained.network, self.trained.averaged, self.trained.optimizer
         optimizer.param_groups[0]["lr"] = learning_rate(self.training, update)
         self._guard.check(network.parameters(), optimizer)
@@ -81,7 +81,7 @@ class TorchUpdates:
 def batch_loss(network: ParticleNetwork, batch: Batch, training: TrainingConfig, jitter: bool = True) -> torch.Tensor:
     """Returns the mean squared error of the normalised acceleration: over axes, over particles, over scenes.
 
-    Noise, jitter and symmetry are drawn here for backend torch; hgn.kernels.update does so for triton.
+    This function draws noise, jitter and symmetry for backend torch. hgn.kernels.update draws them for triton.
     """
     if training.symmetry != "none":
         batch = under_symmetries(batch, drawn_symmetries(batch))

@@ -1,7 +1,7 @@
-"""Pushforward on backend triton: scenes simulated, cut into windows and read on the device.
+"""Pushforward on backend triton: scenes are simulated, cut into windows and read on the device.
 
-A window is an episode of W frames with its scene's material and obstacles, so that the kernels of an update read it
-like any other episode. Buffers and the captured graph are kept from one simulation to the next.
+A window is an episode of W frames with its scene's material and obstacles, so the kernels of an update read it like any
+other episode. Buffers and the captured graph are reused by the next simulation.
 Shape legend: as in hgn.training.pushforward.
 """
 
@@ -24,7 +24,7 @@ from hgn.network.obstacles import ObstacleCells
 from hgn.runtime.simulation import Simulation
 from hgn.runtime.triton_stepper import CHECKED_PARTICLES, TritonStepper
 
-SPARE = 1.1  # capacity for particles, as a multiple of those of the first simulation
+SPARE = 1.1  # capacity for particles over the number in the first simulation
 
 
 class TritonScenes:
@@ -33,7 +33,8 @@ class TritonScenes:
     def __init__(
         self, network: HierarchicalGraphNetwork, training: TrainingConfig, obstacle_cell_size: float, precision: str
     ) -> None:
-        """`network` simulates with the parameters in `values`; it also checks the kernels, the first time."""
+        """`network` simulates with the parameters in `values`. Its own outputs check the kernels in the first call."""
+
         self._network, self._training, self._precision = network, training, precision
         self._obstacle_cell_size = obstacle_cell_size
         self._history = network.config.velocity_history
@@ -63,16 +64,16 @@ class TritonScenes:
         return sample._replace(seed=seed, weight=weight, noise_scale=scale)
 
     def simulate(self, starts: Sequence[tuple[DeviceEpisode, int]], frames: int) -> list[torch.Tensor]:
-        """Raises: ConfigError the first time, when the kernels are wrong on this machine."""
+        """Raises: ConfigError in the first call, if the kernels' results differ from PyTorch's on this machine."""
         episodes, state = [episode for episode, _ in starts], self._state(starts)
         with Simulation(lambda _: nullcontext(self._begun(episodes, state)), state, isolate=True) as simulation:
             path_FN3 = torch.cat([block_TN3.clone() for block_TN3 in simulation.blocks(frames)])
         return list(path_FN3.split([episode.particles for episode in episodes], dim=1))
 
     def _state(self, starts: Sequence[tuple[DeviceEpisode, int]]) -> ParticleState:
-        """Returns the true state that the simulation starts from; obstacles have tables of their own.
+        """Returns the true state at the start of the simulation, without obstacles, which have their own tables.
 
-        Scenes up to `pushforward_scenes` are empty, so that simulations of fewer scenes fit the same buffers.
+        Empty scenes fill it up to `pushforward_scenes`, so that the same buffers fit simulations of fewer scenes.
         """
         device, episodes = self.values.device, [episode for episode, _ in starts]
         last = self._history + 1
@@ -80,7 +81,7 @@ class TritonScenes:
         past_TN3 = torch.cat(pasts, dim=1)
         counts = torch.tensor([episode.particles for episode in episodes], device=device)
         empty = max(0, self._training.pushforward_scenes - len(episodes))
-        placed = [*episodes, *[episodes[0]] * empty]  # empty scenes have the domain of any
+        placed = [*episodes, *[episodes[0]] * empty]  # an empty scene has any domain
         return ParticleState(
             position_N3=past_TN3[-1],
             velocity_NM3=past_TN3.diff(dim=0).flip(0).transpose(0, 1),
@@ -92,7 +93,7 @@ class TritonScenes:
         )
 
     def _begun(self, episodes: Sequence[DeviceEpisode], state: ParticleState) -> TritonStepper:
-        """Returns a stepper at its start: the previous one if its buffers are large enough."""
+        """Returns a stepper at its start. It is the previous stepper if its buffers are large enough."""
         config, values = self._network.config, self.values
         device = values.device
         table, barriers, empty = None, None, [None] * (state.scene_count - len(episodes))
@@ -116,7 +117,7 @@ class TritonScenes:
         capacities = None
         if stepper is not None:
             capacities = stepper.grid.capacities
-            self._stepper = stepper = None  # before the new one is allocated
+            self._stepper = stepper = None  # freed before the new one is allocated
         particles = 16 * math.ceil(SPARE * len(state.position_N3) / 16)
         stepper = TritonStepper(
             self._network,
@@ -133,13 +134,13 @@ class TritonScenes:
             if first is not None:
                 stepper.require_parity(self._network, first, "training.")
                 if device.type == "cuda":
-                    torch.cuda.empty_cache()  # free memory decides where episodes are stored
+                    torch.cuda.empty_cache()  # free memory determines where episodes are stored
         stepper.use_values(values)
         self._stepper = stepper
         return stepper
 
     def _first_scenes(self, episodes: Sequence[DeviceEpisode], state: ParticleState) -> ParticleState | None:
-        """Returns as many of the first scenes as PyTorch can check, with obstacles; None if the first is too large."""
+        """Returns the first scenes, with obstacles, up to the size that PyTorch can check; None if one is too large."""
         scenes, count = 0, 0
         while scenes < len(episodes) and count + episodes[scenes].particles <= CHECKED_PARTICLES:
             count += episodes[scenes].particles
@@ -149,7 +150,7 @@ class TritonScenes:
         seen = [(scene, e.obstacles) for scene, e in enumerate(episodes[:scenes]) if e.obstacles is not None]
         obstacles = None
         if seen:
-            # a hash has the keys of scene 0
+            # the keys of a hash are those of scene 0
             key_K = torch.cat([cells.key_K + (scene << 3 * COORDINATE_BITS) for scene, cells in seen])
             order_K = torch.argsort(key_K)
             normal_K3 = torch.cat([cells.value_K for _, cells in seen])[order_K]

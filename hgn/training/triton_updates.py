@@ -1,7 +1,7 @@
 """Training updates in Triton kernels (hgn.kernels.update), captured as CUDA graphs.
 
-Parameters and Adam's moments are in the kernels' layout while a chunk of updates runs, and are copied back after it,
-so that a checkpoint has one content, whatever the backend.
+While a chunk of updates runs, parameters and Adam's moments are in the kernels' layout. They are copied back after it,
+so checkpoints do not depend on the backend.
 """
 
 from __future__ import annotations
@@ -32,12 +32,12 @@ from hgn.training.schedule import average_weight, learning_rate
 from hgn.training.triton_pushforward import TritonScenes
 from hgn.training.updates import Ranks, TrainedNetwork
 
-REPORTED_UPDATES = 256  # number of first updates, the slowest ones, whose times are printed
-DATA_FRACTION = 0.6  # largest fraction of a GPU's memory for episodes; the others stay in host memory
+REPORTED_UPDATES = 256  # number of first updates whose times are printed; they are the slowest
+DATA_FRACTION = 0.6  # largest fraction of a GPU's memory that episodes use; other episodes stay in host memory
 
 
 class TritonUpdates:
-    """Trains on chunks of samples with CUDA graphs; hgn.training.updates.Updates describes the methods."""
+    """Trains on chunks of samples with CUDA graphs. hgn.training.updates.Updates describes the methods."""
 
     def __init__(
         self,
@@ -90,9 +90,8 @@ class TritonUpdates:
         return {} if self._pool is None else self._pool.figures
 
     def run(self, chunk: EpisodeChunk, first_update: int) -> None:
-        """Raises: ConfigError when positions are not finite, or before the first update when the kernels are wrong
-        here.
-        """
+        """Raises: ConfigError if positions are not finite; before the first update also if the kernels' results differ
+        from PyTorch's on this machine."""
         for index in chunk.dropped:
             del self._episodes[index]
         with self._timed("placing episodes"):
@@ -158,7 +157,7 @@ class TritonUpdates:
         self._seconds[what] += time.monotonic() - start_s
 
     def _report(self) -> None:
-        """Prints where the time of the first updates went, once, when REPORTED_UPDATES are made."""
+        """Prints once how long the parts of the first REPORTED_UPDATES updates took."""
         if not self._start_s or self._made < REPORTED_UPDATES:
             return
         total, updates, misses = time.monotonic() - self._start_s, self.updates, self._jit_misses
@@ -171,7 +170,7 @@ class TritonUpdates:
         )
 
     def _placed(self, episode: EpisodeTensors) -> DeviceEpisode:
-        """Copies an episode to the device if it fits, else to pinned memory, which the kernels read through the bus."""
+        """Copies an episode to the device if it fits. Otherwise pins its memory; kernels read it over the bus."""
         position_TN3 = episode.position_TN3
         if self.device.type == "cuda":
             free, total = torch.cuda.mem_get_info(self.device)
@@ -190,7 +189,7 @@ class TritonUpdates:
         )
 
     def _take_over(self) -> None:
-        """Makes parameters and moments views of flat buffers, so that one launch copies all of them."""
+        """Makes parameters and moments views of flat buffers, so that one launch copies them all."""
         parameters = list(self.network.parameters())
         self._flat = _flattened(self.network)
         self._moments = torch.zeros(2, len(self._flat), device=self.device)
@@ -214,7 +213,7 @@ class TritonUpdates:
         for flat, packed in zip(self._moments, (self.updates.first_moment, self.updates.second_moment), strict=True):
             packed.copy_(self._packed(flat))
         self.updates.step.fill_(float(self._steps.max()))
-        # of each parameter element in the packed buffers
+        # index of each parameter element in the packed buffers
         self._place = torch.empty_like(index[used], dtype=torch.int64)
         self._place[index[used]] = torch.nonzero(used).flatten()
 
@@ -230,7 +229,7 @@ class TritonUpdates:
 
 
 def _flattened(network: ParticleNetwork) -> torch.Tensor:
-    """Makes a network's parameters views of a flat buffer, which it returns."""
+    """Makes a network's parameters views of a flat buffer. Returns the buffer."""
     parameters = list(network.parameters())
     flat = torch.cat([parameter.detach().reshape(-1) for parameter in parameters])
     for parameter, view in zip(parameters, flat.split([p.numel() for p in parameters]), strict=True):

@@ -1,4 +1,4 @@
-"""The interface for training on chunks of samples, which both backends implement, and the state that it changes.
+"""The interface for training on chunks of samples, and the state that training changes. Both backends implement it.
 
 | backend | class | updates of a chunk |
 |---|---|---|
@@ -20,23 +20,23 @@ from hgn.training.muon import Muon
 
 @dataclass(frozen=True, eq=False)
 class TrainedNetwork:
-    """A network with the other state that its updates change."""
+    """A network and the other state that its updates change."""
 
     network: ParticleNetwork
     optimizer: torch.optim.Adam
-    loss_sum: torch.Tensor  # [2]: sum of the finite losses since the last log line, and their number
+    loss_sum: torch.Tensor  # [2]: sum and number of the finite losses since the last log line
     counters: torch.Tensor  # [5]: see hgn.training.gradients
-    averaged: ParticleNetwork | None = None  # holds the moving average of the parameters
+    averaged: ParticleNetwork | None = None  # the moving average of the parameters
 
     @property
     def result(self) -> ParticleNetwork:
-        """The measured, simulated and exported network: the moving average where there is one."""
+        """The measured, simulated and exported network: the moving average if there is one."""
         return self.network if self.averaged is None else self.averaged
 
 
 @dataclass(frozen=True)
 class Ranks:
-    """This process among those that train together."""
+    """This process and the number of processes that train together."""
 
     rank: int = 0
     count: int = 1
@@ -49,13 +49,13 @@ class Updates(Protocol):
 
     @property
     def pool_figures(self) -> dict[str, float]:
-        """Metrics of the pushforward pool, empty without one."""
+        """The metrics of the pushforward pool; empty without one."""
 
     def run(self, chunk: Any, first_update: int) -> None:
-        """Makes an update for each entry of `chunk.samples`; `first_update` is the number of the first one, from 0.
+        """Makes an update for each entry of `chunk.samples`. `first_update` is the number of the first one, from 0.
 
-        Losses and gradient norms are added to the TrainedNetwork's tensors: nothing waits for the device.
-        Raises: ConfigError when the backend computes wrongly on this machine.
+        Losses and gradient norms are added to the TrainedNetwork's tensors, so the host does not wait for the device.
+        Raises: ConfigError if the backend's results are wrong on this machine.
         """
 
 
@@ -63,5 +63,5 @@ def build_optimizer(network: ParticleNetwork, training: TrainingConfig) -> torch
     """Returns the optimiser of a training."""
     if training.optimizer == "muon":
         return Muon(network, training.learning_rate)
-    # One launch; and only fused Adam skips a step whose gradients are not finite, without the host.
+    # One launch. Only fused Adam skips a step with gradients that are not finite without the host.
     return torch.optim.Adam(network.parameters(), lr=training.learning_rate, fused=True)

@@ -1,6 +1,6 @@
-"""Ends a rank that waits for another one that was stopped: neither time-outs nor signals reach it inside a collective.
+"""Ends a rank that waits for a stopped rank. Inside a collective, neither time-outs nor signals would end it.
 
-Each rank writes a count to the run's folder every BEAT_S and reads those of the others.
+Each rank writes a count to the run's folder every BEAT_S, and reads the counts of the others.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from hgn.command import EXIT_MACHINE
 from hgn.training.module import TrainingModule
 from hgn.training.stop import BY_WEIGHT
 
-BEAT_S = 5.0
-SILENCE_S = 300.0  # without a count of another rank; network file systems show files up to a minute late
-GRACE_S = 45.0  # after a signal, without an update, less than what schedulers give
+BEAT_S = 5.0  # interval between counts
+SILENCE_S = 300.0  # longest time without a new count of a rank; network file systems may delay files by a minute
+GRACE_S = 45.0  # longest time without an update after a signal; schedulers grant more
 
 
 class RankWatch(Callback):
@@ -32,7 +32,7 @@ class RankWatch(Callback):
     def __init__(self, run: Path) -> None:
         self._folder = run / ".ranks"
         self._ended = threading.Event()
-        self._counts: dict[int, tuple[str, float]] = {}  # of each other rank, and when it changed
+        self._counts: dict[int, tuple[str, float]] = {}  # last count of each other rank, and the time of its change
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         if trainer.world_size == 1:
@@ -44,7 +44,7 @@ class RankWatch(Callback):
         self._counts = {rank: ("", now) for rank in range(trainer.world_size) if rank != trainer.global_rank}
         self._woken, wake = os.pipe()
         os.set_blocking(wake, False)
-        signal.set_wakeup_fd(wake, warn_on_full_buffer=False)  # written to even while the main thread waits
+        signal.set_wakeup_fd(wake, warn_on_full_buffer=False)  # Python writes to it even while the main thread waits
         threading.Thread(target=self._watch, args=(pl_module,), name="ranks", daemon=True).start()
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
@@ -78,14 +78,14 @@ class RankWatch(Callback):
                 deadline, update = time.monotonic() + GRACE_S, module.update
 
     def _silent_ranks(self, count: str) -> list[int]:
-        """Writes this rank's count; returns the ranks whose count has not changed for SILENCE_S."""
+        """Writes this rank's count. Returns the ranks whose count did not change for SILENCE_S."""
         now = time.monotonic()
         try:
             self._own.write_text(count)
             for rank, (before, _) in self._counts.items():
                 if (text := self._read(rank)) != before:
                     self._counts[rank] = text, now
-        except OSError:  # the folder is away, and says nothing about ranks
+        except OSError:  # the folder is unreachable, so ranks may be alive
             self._counts = {rank: (before, now) for rank, (before, _) in self._counts.items()}
         return [rank for rank, (_, changed) in self._counts.items() if now - changed > SILENCE_S]
 
