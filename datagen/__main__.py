@@ -1,4 +1,4 @@
-"""`python -m datagen +experiment=obstacles scenes=800 out=data/obstacles`: makes a data set, or completes one."""
+"""`python -m datagen +experiment=obstacles scenes=800 out=data/obstacles`: generates or completes a data set."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from hgn.schema import require
 
 
 def main(mapping: dict[str, Any], backend: Backend | None = None) -> int:
-    """Runs the generator on a composed config; the exit code is 0, or 128 + the signal that stopped it."""
+    """Runs the generator on a composed config. The exit code is 0, or 128 + the signal that stopped it."""
     kind = mapping.get("progress", "bar")
     require(kind in PROGRESS_KINDS, "progress", f"one of {', '.join(PROGRESS_KINDS)}", kind)
     config = datagen_config(mapping)
     with StopSignal() as stop:
-        # progress=json is read by a training that waits for the first episodes
+        # a training that waits for the first episodes reads progress=json
         finished = generate(config, make_progress(kind), stop.requested, backend, early=kind == "json")
     return 0 if finished else 128 + (stop.signal or 0)
 

@@ -1,9 +1,10 @@
 """Simulates the scenes of a data set on a finer grid than the networks see, with more particles.
 
-Each visible particle of a scene is represented by the same number of fine particles, its children: one begins at its
-place, the others around it, with their mean there. So all fine particles have the same mass, and a scene's first frame,
-total mass, momentum and centre of mass do not depend on the grid. An episode contains the first child of each visible
-particle: the mean of all is no point of the material once they part (results/solver/README.md).
+Each visible particle of a scene is represented by the same number of fine particles, its children. One child starts at
+its place. The others start around it, with their mean there. So all fine particles have the same mass, and a scene's
+first frame, total mass, momentum and centre of mass do not depend on the grid. An episode contains the first child of
+each visible particle. The mean of all children is no point of the material once they separate
+(results/solver/README.md).
 Shape legend: T frames, N visible particles, C children of each, M = N C fine particles, F triangles.
 """
 
@@ -17,12 +18,13 @@ from hgn.config import DatagenConfig, MpmConfig
 from hgn.scene.distance import closest_points
 from hgn.scene.scene import Scene
 
-STREAM = 4  # of random numbers; hgn.scene.random_scene uses 1 to 3, hgn.scene.world 5
-SURFACE_FRACTION = 0.9  # of the distance to an obstacle's surface, at which children may begin
+STREAM = 4  # number of the random stream; hgn.scene.random_scene uses 1 to 3, hgn.scene.world 5
+SURFACE_FRACTION = 0.9  # fraction of the distance to an obstacle's surface within which children may start
+
 
 
 def fine_scene(scene: Scene, cell_size: float, wall: float) -> Scene:
-    """Returns the scene with its particles' children, for a grid of `cell_size`; the scene itself on its own grid.
+    """Returns the scene with its particles' children for a grid of `cell_size`; the same scene for its own cell size.
 
     The number of children is the ratio of the cells' volumes, rounded. They fill the volume that a particle has at the
     start. They stay at least `wall` from the domain's planes, and do not cross the surface of an obstacle.
@@ -53,27 +55,28 @@ def wall_thickness(config: MpmConfig, cell_size: float) -> float:
 def solver_on_grid(config: MpmConfig, cell_size: float, own_cell_size: float) -> MpmConfig:
     """Returns the solver's settings for another cell size.
 
-    Near walls end at the same place on a finer grid, far ones less than a cell further out; coarser: within a cell.
+    On a finer grid near walls end at the same place, and far walls less than a cell further out. On a coarser grid they
+    end within a cell.
     """
     ratio = own_cell_size / cell_size
     return dataclasses.replace(config, wall_cells=max(2, 1 + int((config.wall_cells - 1) * ratio + 1e-6)))
 
 
 def visible_positions(position_TM3: np.ndarray, visible: int) -> np.ndarray:
-    """Returns the positions of `visible` particles from those of all their children, float32 [T, N, 3]."""
+    """Returns the positions of `visible` particles from the positions of all children, float32 [T, N, 3]."""
     children = position_TM3.shape[1] // max(visible, 1)
     return position_TM3 if children <= 1 else np.ascontiguousarray(position_TM3[:, ::children])
 
 
 def scene_to_simulate(scene: Scene, config: DatagenConfig) -> Scene:
-    """Returns a scene of a data set as the solver simulates it, with the settings of `solver_on_grid`."""
+    """Returns the scene that the solver simulates for a scene of a data set, with settings of `solver_on_grid`."""
     return fine_scene(scene, config.reference_cell_size, wall_thickness(config.mpm, scene.cell_size))
 
 
 def _offsets(scene: Scene, children: int, wall: float) -> np.ndarray:
-    """Returns the children's offsets, float64 [N, C, 3]; the first is zero, and so is the mean."""
+    """Returns the children's offsets, float64 [N, C, 3]. The first offset and their mean are zero."""
     generator = np.random.Generator(np.random.PCG64([scene.seed, STREAM]))
-    # the cube that a particle fills; in single precision, because cubic roots differ between machines
+    # edge of the cube that a particle fills; in single precision, because cubic roots differ between machines
     edge = scene.cell_size / float(np.float32((scene.particles_per_cell or 8.0) ** (1 / 3)))
     offset_NC3 = np.zeros((scene.particle_count, children, 3))
     others_NC3 = offset_NC3[:, 1:]
@@ -91,7 +94,7 @@ def _offsets(scene: Scene, children: int, wall: float) -> np.ndarray:
 
 
 def _surface_distances(scene: Scene, reach: float) -> np.ndarray:
-    """Returns the particles' distances to obstacles in their first pose, float64 [N]; inf where beyond `reach`."""
+    """Returns the particles' distances to obstacles in their first pose, float64 [N]; inf if more than `reach`."""
     from scipy.spatial import cKDTree
 
     distance_N = np.full(scene.particle_count, np.inf)

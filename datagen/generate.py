@@ -1,4 +1,4 @@
-"""One run of the generator on a folder, until its share of the data set is published or it is asked to stop."""
+"""One run of the generator on a folder, until its part of the data set is published or a stop is requested."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from hgn.schema import ConfigError, from_mapping, known_keys, require
 from hgn.system.machine import available_cpus, available_memory
 
 _SECTIONS = ("scene", "mpm", "dataset")
-# keys of the command that are of the section `dataset`, there under these names
+# keys of the command that belong to the section `dataset`, with their names there
 _OF_DATASET = {
     "scenes": "training_scenes",
     "out": "folder",
@@ -29,14 +29,13 @@ _OF_DATASET = {
     "array_task": "array_task",
     "array_tasks": "array_tasks",
 }
-# an experiment file serves all commands: what only hgn.train needs is left out
+# experiment files serve all commands; these keys are ignored, because only hgn.train needs them
 _OTHERS = ("frozen", "name", "network", "step", "training", "progress")
 
 
 class StopSignal:
-    """Ctrl-C or SIGTERM while it is entered: noted, so that what is being written is finished. A second one acts
-    at once.
-    """
+    """Notes Ctrl-C or SIGTERM while it is entered, so that current writes are finished. A second signal ends the
+    process."""
 
     def __init__(self) -> None:
         self.signal: int | None = None
@@ -61,9 +60,9 @@ class StopSignal:
 
 
 def datagen_config(mapping: Mapping[str, Any], others: Sequence[str] = ()) -> DatagenConfig:
-    """The generator's configuration out of a composed one; with `frozen` its seed is drawn.
+    """Returns the generator's configuration from a composed one. With `frozen` its seed is drawn.
 
-    Raises: ConfigError, also for a key that is neither its own nor one of `others`, which the caller reads.
+    Raises: ConfigError, also for a key that is neither a generator's nor one of `others`, which the caller reads.
     """
     names = (*_SECTIONS, *_OF_DATASET, *_OTHERS, *others)
     for key in mapping:
@@ -83,7 +82,7 @@ def datagen_config(mapping: Mapping[str, Any], others: Sequence[str] = ()) -> Da
 
 
 def require_local_folder(config: DatagenConfig) -> None:
-    """Raises ConfigError where the folder to write to is a URL: remote folders are read, never written."""
+    """Raises ConfigError if the folder to write to is a URL. Remote folders can only be read."""
     folder = config.dataset.folder
     require("://" not in folder, "out", "a folder to write to", folder, "a URL can only be read, by hgn.train")
 
@@ -95,10 +94,10 @@ def generate(
     backend: Backend | None = None,
     early: bool = False,
 ) -> bool:
-    """Makes what is missing; False when it was asked to stop before the end, and the folder can be gone on with.
+    """Generates the missing episodes. Returns False after a stop request; the same folder can be resumed.
 
-    early: a GPU begins with few scenes, because something waits for the first episodes; all take longer then.
-    Raises: ConfigError, OSError, RuntimeError: what is published and staged is kept then too.
+    early: a GPU begins with few scenes, because a reader waits for the first episodes. The whole run then takes longer.
+    Raises: ConfigError, OSError, RuntimeError. Published and staged episodes are kept in every case.
     """
     require_local_folder(config)
     backend = backend or Backend()

@@ -1,7 +1,7 @@
-"""python -m datagen.solve scene=my_scene.yaml out=truth.vtkhdf: the solver's own simulation of a scene file.
+"""python -m datagen.solve scene=my_scene.yaml out=truth.vtkhdf: simulates a scene file with the solver.
 
-What networks learn from, for a scene of one's own. Beside a network's rollout of the same scene
-`python -m tools.render rollout=truth.vtkhdf others=[rollout.vtkhdf]` draws both, and how far they are apart.
+The result is what networks learn from, for your own scene. `python -m tools.render rollout=truth.vtkhdf
+others=[rollout.vtkhdf]` draws it next to a network's rollout of the same scene, with the distance between them.
 """
 
 from __future__ import annotations
@@ -37,9 +37,9 @@ class SolveConfig:
 
 
 def main(mapping: dict[str, Any]) -> int:
-    """Simulates and writes the file; returns the exit code.
+    """Simulates the scene and writes the file. Returns the exit code.
 
-    Raises: ConfigError for bad input, a scene that the solver cannot keep together among it; nothing is written then.
+    Raises: ConfigError for bad input, and for a scene that the solver cannot simulate. Then no file is written.
     """
     config = from_mapping(SolveConfig, mapping)
     file = find_scene(config.scene)
@@ -48,7 +48,7 @@ def main(mapping: dict[str, Any]) -> int:
     scene = load_scene(file)
     for note in notes_on_files(scene):
         print(note, file=sys.stderr)
-    # Taichi takes seconds to load, and bad input is answered before.
+    # Taichi takes seconds to import, so bad input is reported before.
     from datagen.mpm.solver import SceneFailure, simulate
 
     with bar("simulating", total=config.frames, unit="frame") as progress:

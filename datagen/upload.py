@@ -1,7 +1,7 @@
 """`python -m datagen.upload data=data/obstacles to=s3://bucket/obstacles`: copies a data set to an object store.
 
 Training then reads it with `dataset.folder=s3://bucket/obstacles`. Shards are copied first and the manifest last, so
-that all listed shards are complete. Run again, the command copies what is new.
+that all listed shards are complete. A second run copies only new shards.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ from hgn.system.progress import bar
 
 @dataclass(frozen=True)
 class UploadConfig:
-    """`python -m datagen.upload`: what is copied where."""
+    """`python -m datagen.upload`: source and destination."""
 
     data: str  # folder of a data set
     to: str  # URL; training reads it with dataset.folder=URL
 
 
 def main(mapping: dict[str, Any]) -> int:
-    """Copies; the exit code is 0, or 128 + the signal that stopped it."""
+    """Copies the data set. The exit code is 0, or 128 + the signal that stopped it."""
     config = from_mapping(UploadConfig, mapping)
     require(is_remote(config.to), "to", "a URL", config.to, "as in to=s3://bucket/obstacles")
     require(not is_remote(config.data), "data", "a folder of this machine", config.data)
@@ -40,10 +40,10 @@ def main(mapping: dict[str, Any]) -> int:
 
 
 class Target:
-    """A data set at a URL that can be written to: an object store, whose files appear whole or not at all."""
+    """A data set at a writable URL: an object store, which writes files atomically."""
 
     def __init__(self, url: str) -> None:
-        """Raises: ConfigError when what is there cannot be read; UnreachableError."""
+        """Raises: ConfigError if the existing data set cannot be read; UnreachableError."""
         self._url = url.rstrip("/")
         self._manifest: Manifest | None = None
         with contextlib.suppress(FileNotFoundError):
@@ -61,10 +61,9 @@ class Target:
         return self._manifest is not None and self._manifest.complete
 
     def copy(self, folder: Path, stop: StopSignal) -> None:
-        """Copies the shards that are not there yet, then the index and the manifest; leaves these out when asked to
-        stop before.
+        """Copies the missing shards, then the index and the manifest. After a stop request it copies no more.
 
-        Raises: ConfigError when another data set is there, a shard here is altered or gone, or nothing can be written;
+        Raises: ConfigError if the URL has another data set, a local shard is altered or missing, or writing fails;
         UnreachableError.
         """
         try:
@@ -91,7 +90,7 @@ class Target:
             for name, size in manifest.shards.files():
                 if (name, size) not in have:
                     write_remote(self._url, name, (folder / name).read_bytes()[:size])
-            write_remote(self._url, MANIFEST_NAME, content)  # as it was read: the file may have grown since
+            write_remote(self._url, MANIFEST_NAME, content)  # the bytes that were read, because the file may have grown
             self._manifest = Manifest.parse(content, folder)
 
     def _require_beginning(self, there: Manifest, manifest: Manifest) -> None:

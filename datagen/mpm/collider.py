@@ -1,22 +1,22 @@
 """Contact nodes of mesh obstacles: grid nodes near or inside a mesh, each with the free direction of motion.
 
-The paper's cell normals leak when used as a collider, so the solver builds its own from the triangles.
+A collider from the paper's cell normals leaks, so the solver builds its own from the triangles.
 Shape legend: K contact nodes, P points, F triangles, V vertices.
 
-Closed bodies: nodes inside and up to a quarter of a cell above the surface stop inward motion. Where a body is thinner
+Closed bodies: nodes inside and up to a quarter of a cell above the surface stop inward motion. If a body is thinner
 than a cell, nodes outside stop it too, in a band of at least one cell.
 
 Sheets (open meshes): particles on both sides reach the same nodes, which would couple them. So a node near a sheet has
-two fields of mass and velocity (Bardenhagen et al. 2000): one for particles that see it, and one for particles from
-which the sheet hides it (the "colours" of Hu et al. 2018, by line of sight). For the latter the node lies beyond the
-surface, like the inside of a body, with the normal toward the sheet.
+two fields of mass and velocity (Bardenhagen et al. 2000). Particles that see the node use the first field. Particles
+from which the sheet hides it use the second (the "colours" of Hu et al. 2018, by line of sight). For the latter the
+node lies behind the surface, like the inside of a body, with the normal toward the sheet.
 
 A particle's spline reaches 1.5 cells, so a node would stop material at a distance and leave a gap. Therefore a node
-near the surface stops motion only if its mass is at least what it has when material is 0.75 cells from the surface.
-Without nodes at the surface three quarters of the load would have no support: the lowest cell of sand would collapse
-into a layer, which only the swept test stops, with too much friction.
+near the surface stops motion only if its mass is at least that of material 0.75 cells from the surface. Without nodes
+at the surface three quarters of the load would have no support. Then the lowest cell of sand would collapse into a
+layer that only the swept test stops, with too much friction.
 
-Where two obstacles claim a node, the nearer surface counts. The swept test stops remaining crossings, with the same
+If two obstacles claim a node, the nearer surface counts. The swept test stops remaining crossings, with the same
 friction.
 """
 
@@ -35,15 +35,15 @@ from hgn.scene.scene import Obstacle, Scene
 from hgn.schema import ConfigError
 
 SEEN, HIDDEN = 0, 1  # the two fields of a node
-ON_SURFACE_CELLS = 0.05  # at smaller distances the direction to the surface is rounding
+ON_SURFACE_CELLS = 0.05  # distance below which the direction to the surface is rounding
 MOVE_CELLS = 0.1  # largest motion of an obstacle until its contacts are built again
 BEARING_CELLS = 0.25  # height above a surface up to which nodes stop motion
-SIDE_CELLS = 0.51  # more than half the distance of two nodes
+SIDE_CELLS = 0.51  # a little more than half the distance of two nodes
 GAP_CELLS = 0.75  # distance of material from a surface at which nodes begin to stop it
-STENCIL_CELLS = 1.501  # from a particle to its nodes, along each axis, with rounding
+STENCIL_CELLS = 1.501  # largest distance of a particle's nodes along each axis, with rounding
 ON_EDGE = 1e-6  # barycentric coordinate below which a point lies on a triangle's edge
-WIDENED = 1 + 1e-3  # factor for triangles, since kernels look a ten-thousandth beyond their edges
-REACH_CELLS = WIDENED * STENCIL_CELLS * np.sqrt(3.0)  # of a particle, in any direction
+WIDENED = 1 + 1e-3  # factor for triangles, because kernels search a ten-thousandth beyond their edges
+REACH_CELLS = WIDENED * STENCIL_CELLS * np.sqrt(3.0)  # largest distance of a particle's nodes in any direction
 # squared area over fourth power of the longest edge, below which a triangle has no direction
 FLAT_TRIANGLE = 1e-20
 # nodes: flat index in a box [P], signed distance from the surface in cells [P], free direction [P, 3], least mass [P]
@@ -57,7 +57,7 @@ class Collider:
     node_K3: np.ndarray  # int32, unique
     normal_K23: np.ndarray  # float32, free direction in each field, unit length; zero where all motion is free
     obstacle_K2: np.ndarray  # int32, the obstacle in contact in each field
-    least_K2: np.ndarray  # float32: fraction of a full cell's mass from which the node stops that field's motion
+    least_K2: np.ndarray  # float32: smallest fraction of a full cell's mass with which the node stops motion
     doubled_K: np.ndarray  # bool: sheets hide the node from some particles
     closed: tuple[Obstacle, ...]
     sweep: Sweep
@@ -73,9 +73,9 @@ class Collider:
 def build_collider(scene: Scene, band_cells: float, time: float = 0.0) -> Collider:
     """Returns the contact nodes of all obstacles of a scene in their pose at `time`, in seconds.
 
-    Nodes lie at multiples of scene.cell_size. They are valid until an obstacle has moved by MOVE_CELLS. Any number and
-    size of triangles takes bounded memory. Triangles without area and parts outside the domain are left out.
-    Raises: ConfigError when vertices of an obstacle are not finite, or indices of its triangles are out of range.
+    Nodes lie at multiples of scene.cell_size. They are valid until an obstacle has moved by MOVE_CELLS. Memory is
+    bounded for any number and size of triangles. Triangles without area and parts outside the domain are omitted.
+    Raises: ConfigError if vertices of an obstacle are not finite, or indices of its triangles are out of range.
     """
     shape = tuple(round(length / scene.cell_size) for length in scene.domain_size)
     count = int(np.prod(shape))
@@ -90,7 +90,7 @@ def build_collider(scene: Scene, band_cells: float, time: float = 0.0) -> Collid
         owners[obstacle.closed].append(np.full(len(triangle_F33), index, np.int32))
         if not len(triangle_F33):
             continue
-        # the way out is exact at all nodes that a particle outside may reach
+        # the direction out of a body is exact at all nodes that an outside particle may reach
         box = _Box(triangle_F33, max(band_cells, REACH_CELLS) if obstacle.closed else REACH_CELLS, shape)
         if obstacle.closed:
             contacts = _closed_contacts(obstacle, triangle_F33, band_cells, box, scene.cell_size)
@@ -120,7 +120,7 @@ def build_collider(scene: Scene, band_cells: float, time: float = 0.0) -> Collid
 
 
 def placed(obstacle: Obstacle, time: float) -> Obstacle:
-    """Returns the obstacle in its pose at a time."""
+    """Returns the obstacle in its pose at a time in seconds."""
     if obstacle.motion is None:
         return obstacle
     return dataclasses.replace(obstacle, vertex_V3=obstacle.motion.place(obstacle.vertex_V3, time))
@@ -171,8 +171,9 @@ class _Surface:
 
 
 def reached(height: np.ndarray) -> np.ndarray:
-    """Returns the fraction of a full cell's mass of nodes at heights above a surface, in cells, if material fills the
-    half-space that begins GAP_CELLS above it: the spline's integral.
+    """Returns the fraction of a full cell's mass at nodes with these heights above a surface, in cells.
+
+    Material fills the half-space above GAP_CELLS. The fraction is the integral of the spline.
     """
     below = GAP_CELLS - height
     far = np.clip(1.5 - np.abs(below), 0, 1) ** 3 / 6
@@ -182,8 +183,9 @@ def reached(height: np.ndarray) -> np.ndarray:
 
 
 def _triangles(obstacle: Obstacle, index: int, cell_size: float) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the corners of the triangles that have an area, in cells, float64 [F, 3, 3], and which of their parts lie
-    on the rim, bool [F, 6]: the edges opposite to the corners, then the corners. Edges of one triangle form the rim.
+    """Returns the corners of triangles with an area, in cells, float64 [F, 3, 3], and parts on the rim, bool [F, 6].
+
+    The parts are the edges opposite to the corners, then the corners. Edges of only one triangle form the rim.
     """
     vertex = np.asarray(obstacle.vertex_V3, np.float64)
     triangle = np.asarray(obstacle.triangle_F3)
@@ -202,7 +204,7 @@ def _triangles(obstacle: Obstacle, index: int, cell_size: float) -> tuple[np.nda
     corner = corner[has_area] / cell_size
     if obstacle.closed or not len(corner):
         return corner, np.zeros((len(corner), 6), bool)
-    # corners at one place are one: mesh files repeat them
+    # corners at one place count as one, because mesh files repeat them
     _, place_F3 = np.unique(corner.reshape(-1, 3), axis=0, return_inverse=True)
     place_F3 = place_F3.reshape(-1, 3)
     ends = np.sort(place_F3[:, [[1, 2], [2, 0], [0, 1]]], axis=2).reshape(-1, 2).astype(np.int64)
@@ -230,7 +232,7 @@ def _rasterise(triangle_F33: np.ndarray, box: _Box) -> tuple[np.ndarray, ...]:
         np.ascontiguousarray(of_triangle.T) for of_triangle in (centre, triangle_F33[:, 0], normal)
     )
     slab = np.full(len(triangle_F33), box.reach)
-    # a triangle counts at a node only if its sphere comes nearer than the nearest centre of all
+    # a triangle can be nearest only if its sphere comes nearer than the nearest centre of any triangle
     bound = np.full(box.count, box.reach)
     for node_3P, triangle in near_pairs(triangle_F33, normal, box.reach, slab, box.grid):
         np.minimum.at(bound, box.flat(node_3P), np.sqrt(square(node_3P - centre_3F.take(triangle, axis=1))))
@@ -245,7 +247,7 @@ def _rasterise(triangle_F33: np.ndarray, box: _Box) -> tuple[np.ndarray, ...]:
         distance = np.sqrt(square((node - foot).T))
         nearer = np.flatnonzero((distance <= box.reach) & (distance < best[flat]))
         np.minimum.at(best, flat[nearer], distance[nearer])
-        # the first of several at a node is written last
+        # written in reverse order, so that the first of several triangles at a node stays
         nearest = nearer[distance[nearer] == best[flat[nearer]]][::-1]
         closest[flat[nearest]], owner[flat[nearest]] = foot[nearest], triangle[nearest]
     near = np.flatnonzero(owner >= 0)
@@ -258,13 +260,13 @@ def _face_normals(triangle_F33: np.ndarray) -> np.ndarray:
 
 
 def _sheet_contacts(triangle_F33: np.ndarray, rim_F6: np.ndarray, box: _Box) -> tuple[Contacts, Contacts]:
-    """Returns the contacts of nodes near a sheet for particles on their side of it, and on the other side."""
+    """Returns the contacts of nodes near a sheet, for particles on the node's side and for those on the other side."""
     node, distance, foot, owner = _rasterise(triangle_F33, box)
     face = _face_normals(triangle_F33)[owner]
     offset = box.node(node) - foot
     height = (offset * face).sum(axis=1)
     away = offset / np.where(distance < ON_SURFACE_CELLS, 1.0, distance)[:, None]
-    # around the rim the way to the foot leads along the sheet, not through it
+    # at the rim the direction to the foot is along the sheet, not through it
     on_rim = _on_rim(foot, triangle_F33[owner], rim_F6[owner])
     across = (distance < ON_SURFACE_CELLS) | on_rim
     away[across] = face[across] * np.where(height[across] < -ON_TRIANGLE, -1.0, 1.0)[:, None]
@@ -281,7 +283,7 @@ def _on_rim(foot_P3: np.ndarray, triangle_P33: np.ndarray, rim_P6: np.ndarray) -
     from_corner = foot_P3 - triangle_P33[:, 0]
     share_1 = (np.cross(from_corner, edge_2) * normal).sum(axis=1) / square
     share_2 = (np.cross(edge_1, from_corner) * normal).sum(axis=1) / square
-    # a point lies on the edge opposite to a corner of weight 0, and at a corner of weight 1
+    # on the edge opposite to a corner this corner's weight is 0; at the corner it is 1
     share_P3 = np.stack([1 - share_1 - share_2, share_1, share_2], axis=1)
     on_edge, at_corner = share_P3 < ON_EDGE, share_P3 > 1 - ON_EDGE
     return np.asarray((np.concatenate([on_edge, at_corner], axis=1) & rim_P6).any(axis=1))
@@ -291,7 +293,7 @@ def _closed_contacts(
     obstacle: Obstacle, triangle_F33: np.ndarray, band: float, box: _Box, cell_size: float
 ) -> Contacts:
     node, distance, foot, owner = _rasterise(triangle_F33, box)
-    if not len(node):  # the surface lies outside of the grid: there is no way out of a body around all of it
+    if not len(node):  # the grid lies inside the body, so there is no direction out of it
         return node, distance, foot, distance
     inside = _inside(node[distance <= SIDE_CELLS], box, obstacle, cell_size)
     within = inside.ravel()[node]
@@ -303,16 +305,16 @@ def _closed_contacts(
     on_surface = distance < ON_SURFACE_CELLS
     away = (point - foot) * (sign / np.where(on_surface, 1.0, distance))[:, None]
     face = _face_normals(triangle_F33)[owner]
-    # face normals may point inwards: the side that lies inside decides
+    # face normals may point inwards, so a test of one side decides
     on = np.flatnonzero(on_surface)
     inward = contains((foot[on] + 0.1 * face[on]) * cell_size, obstacle)
     face[on[inward]] *= -1
     normal = np.where(on_surface[:, None], face, away)
 
-    # a body is thin where the point one cell further on, past the surface, lies outside again
+    # a body is thin if the point one cell further, behind the surface, is outside again
     height = sign * distance
     thin = np.zeros(len(node), bool)
-    # one cell at least: a line of nodes that crosses the surface then meets a node of the band
+    # one cell at least, so that a line of nodes across the surface contains a node of the band
     outside = np.flatnonzero((height > -BEARING_CELLS) & (height <= max(band, 1.0)))
     thin[outside] = ~contains((foot[outside] - normal[outside]) * cell_size, obstacle)
     chosen = (height <= BEARING_CELLS) | thin
@@ -324,7 +326,7 @@ def _closed_contacts(
     )
 
     deep = np.flatnonzero(inside.ravel() & ~near.ravel())
-    if len(deep):  # the way out leads to the surface that is nearest to the nearest node of the band
+    if len(deep):  # the direction out is that to the surface nearest to the nearest node of the band
         feet = np.zeros((box.count, 3))
         feet[np.flatnonzero(near.ravel())] = foot
         nearest = ndimage.distance_transform_edt(~near, return_distances=False, return_indices=True)
@@ -338,9 +340,9 @@ def _closed_contacts(
 
 
 def _inside(close: np.ndarray, box: _Box, obstacle: Obstacle, cell_size: float) -> np.ndarray:
-    """Returns the nodes inside a body, bool [box], from flat indices of those up to SIDE_CELLS from its surface.
+    """Returns the nodes inside a body, bool [box], from flat indices of nodes within SIDE_CELLS of its surface.
 
-    No surface lies between neighbours that are farther away: one test for each connected region of them is enough.
+    No surface lies between neighbouring nodes that are farther away, so one test for each connected region is enough.
     """
     apart, inside = np.ones(box.shape, bool), np.zeros(box.shape, bool)
     apart.ravel()[close] = False

@@ -1,10 +1,9 @@
 """The constitutive laws of one particle, for Taichi kernels: water, sand, snow (Taichi Elements' materials), elastic.
 
-Every law maps the trial deformation of a step to the new state and the Kirchhoff stress (stress times J, per
-initial volume, in pascals). `law` holds a row of constants (layout.Constant) for each kind of material, and `row`
-is where the particle's begins. State per particle: F (sand, snow), and one scalar, `volume`: J for water, the
-volume correction v_c for sand (Tampubolon et al. 2017), the plastic volume ratio Jp for snow (Stomakhin et al.
-2013).
+Every law maps the trial deformation of a step to the new state and the Kirchhoff stress (stress times J, per initial
+volume, in pascals). `law` contains rows of constants (layout.Constant), and `row` is the begin of the particle's row.
+The state of a particle is F (sand, snow) and one scalar, `volume`: J for water, the volume correction v_c for sand
+(Tampubolon et al. 2017), the plastic volume ratio Jp for snow (Stomakhin et al. 2013).
 """
 
 import taichi as ti
@@ -14,14 +13,14 @@ from datagen.mpm.svd import svd3
 from hgn.scene.material import ELASTIC, SAND, SNOW, WATER
 from hgn.solver_method import MINIMUM_SINGULAR_VALUE, WATER_MINIMUM_VOLUME_RATIO
 
-# Jp beyond these is rounding: hardening is capped, or nothing is left of it
+# bounds of Jp; beyond them hardening is capped or has vanished
 SMALLEST_PLASTIC_VOLUME, LARGEST_PLASTIC_VOLUME = 1e-3, 1e3
-LARGEST_VOLUME = 1e12  # of an elastic solid, whose stress goes with its square
-# of an elastic solid's stiffness, for the step: a single particle that hits the floor at 10 m/s gains energy with steps
-# of 0.8 of the limit, and none with 0.65
+LARGEST_VOLUME = 1e12  # bound of an elastic solid's J; the stress contains its square
+# factor of an elastic solid's stiffness for the time step: a single particle that hits the floor at 10 m/s gains energy
+# with steps of 0.8 of the limit, and none with 0.65
 ELASTIC_MARGIN = 1.6
-# mu(I) = mu_s (1 + RATE_FRICTION / (1 + RATE_NUMBER / I)), as Jop, Forterre and Pouliquen 2006 have it of glass beads:
-# mu_s = tan 20.9, mu_2 = tan 32.76 degrees
+# mu(I) = mu_s (1 + RATE_FRICTION / (1 + RATE_NUMBER / I)). The values are those of Jop, Forterre and Pouliquen 2006 for
+# glass beads: mu_s = tan 20.9, mu_2 = tan 32.76 degrees
 RATE_FRICTION, RATE_NUMBER = 0.685, 0.279
 
 
@@ -33,34 +32,26 @@ def count_event(counter: ti.template(), scene: ti.i32, event: ti.template(), tim
 
 @ti.func
 def hardening(plastic_volume: ti.f32, law: ti.template(), row: ti.i32) -> ti.f32:
-    """exp(xi (1 - Jp)), capped."""
+    """Returns exp(xi (1 - Jp)), capped."""
     cap = law[row + CONSTANT.maximum_hardening]
     exponent = law[row + CONSTANT.hardening] * (1.0 - plastic_volume)
     return ti.min(ti.exp(ti.min(exponent, 80.0)), cap)
 
 
 @ti.func
-def water(
-    volume: ti.f32,
-    expansion: ti.f32,
-    law: ti.template(),
-    row: ti.i32,
-    counter: ti.template(),
-    scene: ti.i32,
-):
-    """Returns J (1 + expansion) with its floor, the Kirchhoff pressure term lambda J (J - 1), and the present
-    stiffness, Pa.
+def water(volume: ti.f32, expansion: ti.f32, law: ti.template(), row: ti.i32, counter: ti.template(), scene: ti.i32):
+    """Returns J (1 + expansion), bounded below, the Kirchhoff pressure lambda J (J - 1), and the present stiffness, Pa.
 
     The expansion of a step is dt tr C. Taichi Elements' det(1 + dt C) - 1 expands rotating water and compresses sheared
-    water, to second order in the step. Stretched water bears the fraction of its tension that the law contains; with 0
-    it has no pressure until it is compressed again.
+    water, to second order in the step. Stretched water bears the law's fraction of its tension. With 0 it has no
+    pressure until it is compressed again.
     """
     bulk = law[row + CONSTANT.bulk]
     J = volume * (1.0 + expansion)
     if J < WATER_MINIMUM_VOLUME_RATIO:
         J = WATER_MINIMUM_VOLUME_RATIO
         count_event(counter, scene, COUNT.water_volume_floors, 1)
-    # d(tau) / d(log J) is lambda J (2 J - 1): stretched water is stiffer than water at rest
+    # d(tau) / d(log J) is lambda J (2 J - 1), so stretched water is stiffer than water at rest
     stress = bulk * J * (J - 1.0)
     stiffness = J * (2.0 * J - 1.0)
     if J > 1.0:
@@ -70,10 +61,10 @@ def water(
 
 @ti.func
 def settled(volume: ti.f32, density: ti.f32, share: ti.f32) -> ti.f32:
-    """Water's J, moved by a share towards the volume that its density tells; density is 1 at rest.
+    """Returns water's J, moved by the fraction `share` towards the volume that its density implies (1 at rest).
 
-    J is integrated along the way of each particle, which samples a flow between the others, so that J and density part
-    company. Below a free surface alone: density is that of a kernel, and falls where it reaches out of the water.
+    J is integrated along the path of each particle. Particles sample the flow at few points, so J and density drift
+    apart. Only water below a free surface is changed, because near the surface the kernel extends out of the water.
     """
     inside = ti.min(ti.max(10.0 * (density - 0.85), 0.0), 1.0)
     told = 1.0 / ti.min(ti.max(density, 0.8), 1.25)
@@ -82,14 +73,14 @@ def settled(volume: ti.f32, density: ti.f32, share: ti.f32) -> ti.f32:
 
 @ti.func
 def _project_sand(log_strain, volume: ti.f32, law: ti.template(), row: ti.i32, step: ti.f32, variant: ti.template()):
-    """Return mapping of the principal log strains: new ones, and the new volume correction.
+    """Returns the principal log strains after the return mapping, and the new volume correction.
 
-    Stress yields where |s| > alpha (-tr tau), s its deviator: alpha is such that the largest and the smallest principal
-    stress differ by sin phi of their sum (Mohr-Coulomb), or constant in Taichi Elements (Drucker-Prager). The deviator
-    shrinks and keeps its direction, so plastic flow does not change the volume. With grains alpha grows with the
-    inertial number I = rate d sqrt(rho_grain / p) of the plastic shear of this step (Jop, Forterre, Pouliquen 2006).
+    Stress yields if |s| > alpha (-tr tau), where s is its deviator. With this alpha the largest and smallest principal
+    stress differ by sin phi of their sum (Mohr-Coulomb). In Taichi Elements alpha is constant (Drucker-Prager). The
+    deviator shrinks and keeps its direction, so plastic flow does not change the volume. With grains alpha grows with
+    the inertial number I = rate d sqrt(rho_grain / p) of the step's plastic shear (Jop, Forterre, Pouliquen 2006).
 
-    Volume correction (Tampubolon et al. 2017): v_c / 3 joins each log strain first, and
+    Volume correction (Tampubolon et al. 2017): v_c / 3 is added to each log strain first, and
     v_c += log det F_trial - log det F_new. In Taichi Elements v_c enters the trace but not the strains.
     """
     strain = log_strain
@@ -111,12 +102,12 @@ def _project_sand(log_strain, volume: ti.f32, law: ti.template(), row: ti.i32, s
             # principal stresses are |s| n - p: |s| (n1 - n3) = (2 p + |s| n2) sin phi, n1 the largest, n3 the smallest
             direction = deviator / size
             largest, least = direction.max(), direction.min()
-            # a denominator below 0.8 is that of a deviator of rounding errors
+            # only rounding errors have a denominator below 0.8
             alpha = 2.0 / 3.0 * sine / ti.max(largest - least + sine * (largest + least), 0.5)
         bearing = -(3.0 * bulk + 2.0 * shear) / (2.0 * shear) * trace * alpha
         excess = ti.max(size - bearing, 0.0)
         if ti.static(bool(variant & VARIANT.rate_of_sand)):
-            # of the excess x is plastic: (excess - x) (k x + RATE_NUMBER) = bearing RATE_FRICTION k x, where k x is I
+            # x, the plastic excess, solves (excess - x) (k x + RATE_NUMBER) = bearing RATE_FRICTION k x; k x is I
             pressure = ti.max(-(3.0 * bulk + 2.0 * shear) / 3.0 * trace, 1e-3)
             k = law[row + CONSTANT.grain] / (step * ti.sqrt(pressure))
             half = 0.5 * (RATE_NUMBER + k * (bearing * RATE_FRICTION - excess))
@@ -125,7 +116,7 @@ def _project_sand(log_strain, volume: ti.f32, law: ti.template(), row: ti.i32, s
                 excess = excess * RATE_NUMBER / (half + root)
             else:
                 excess = (root - half) / k
-        # the mapping keeps the trace, so log det F takes up all of v_c, which ends at 0
+        # the mapping keeps the trace, so log det F contains all of v_c, which becomes 0
         new_strain = strain - deviator * (excess / size)
     return new_strain, new_volume
 
@@ -141,8 +132,10 @@ def foreseen_stiffness(
     row: ti.i32,
     variant: ti.template(),
 ) -> ti.f32:
-    """Returns (3 lambda + 2 mu) / density of a particle after `time` with the velocity gradient C. Elastic solids,
-    whose stretch only a decomposition would give, count as stiffer than any other: they take no steps of their own.
+    """Returns (3 lambda + 2 mu) / density of a particle after `time` with the velocity gradient C.
+
+    For elastic solids it returns 1e30, because only a decomposition would give their stretch. So they never take longer
+    steps of their own.
     """
     density = law[row + CONSTANT.density]
     bulk = 3.0 * law[row + CONSTANT.bulk]
@@ -175,11 +168,10 @@ def solid(
     variant: ti.template(),
     step: ti.f32,
 ):
-    """Sand, snow and elastic solids from the trial F: new F, new volume, Kirchhoff stress, and the present stiffness,
-    3 lambda + 2 mu at rest shape.
+    """Returns new F, new volume, Kirchhoff stress and present stiffness of sand, snow and elastic solids from trial F.
 
-    Elastic solids are fixed corotated (Stomakhin et al. 2012), tau = 2 mu (F - R) Fᵀ + lambda J (J - 1), as snow is
-    until it yields; stretched they are stiffer by d(tau) / d(log sigma).
+    At rest shape the stiffness is 3 lambda + 2 mu. Elastic solids are fixed corotated (Stomakhin et al. 2012), tau =
+    2 mu (F - R) Fᵀ + lambda J (J - 1), as snow is until it yields. Stretch makes them stiffer by d(tau) / d(log sigma).
     """
     sand = ti.static(bool(variant & VARIANT.sand))
     snow = ti.static(bool(variant & VARIANT.snow))
@@ -239,14 +231,14 @@ def solid(
             stiffness += 2.0 * shear * ti.max(1.0, widest * (2.0 * widest - 1.0))
             stiffness *= ELASTIC_MARGIN
     new_F = F
-    if plastic > 0:  # recomposed only then: each decomposition costs a rounding of det F
+    if plastic > 0:  # only then, because a decomposition and composition round det F
         new_F = _compose(U, new_sigma, V)
     return new_F, new_volume, _compose(U, stress, U), stiffness
 
 
 @ti.func
 def _compose(U, diagonal, V):
-    """U diag(diagonal) Vᵀ."""
+    """Returns U diag(diagonal) Vᵀ."""
     out = ti.Matrix.zero(ti.f32, 3, 3)
     for i, j in ti.static(ti.ndrange(3, 3)):
         out[i, j] = U[i, 0] * diagonal[0] * V[j, 0] + U[i, 1] * diagonal[1] * V[j, 1] + U[i, 2] * diagonal[2] * V[j, 2]

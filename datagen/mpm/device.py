@@ -1,4 +1,4 @@
-"""Starts Taichi once a process, on the device that the solver's config asks for."""
+"""Starts Taichi once in a process, on the device of the solver's config."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from pathlib import Path
 from hgn.schema import ConfigError, require
 from hgn.system.machine import available_cpus, available_memory, writable_folder
 
-# Taichi aborts the process where HOME is not set, as in a system's service; a user without a name has none
+# Taichi aborts the process if HOME is not set, as in a system's service; a user without a name has no home
 os.environ.setdefault("HOME", os.path.expanduser("~").replace("~", "/nonexistent"))  # noqa: PTH111
 os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")  # stdout belongs to the command
 os.environ.setdefault("TI_SKIP_VERSION_CHECK", "ON")  # a simulation makes no network calls
@@ -28,22 +28,22 @@ class Device:
     """The device that this process simulates on."""
 
     kind: str  # cpu or cuda
-    threads: int  # of the CPU; 1 on a GPU
-    processors: int = 1  # of the GPU: thread blocks at work at once
+    threads: int  # number of threads of the CPU; 1 on a GPU
+    processors: int = 1  # multiprocessors of the GPU
 
 
 _started: Device | None = None
 
 
 def initialise(device: str = "auto", cpu_threads: int | None = None) -> Device:
-    """Starts Taichi, or returns what an earlier call of this process started.
+    """Starts Taichi, or returns the device that an earlier call of this process started.
 
-    `device` is auto (CUDA if this machine has it, else the CPU), cpu or cuda. `cpu_threads` is the number of
-    threads on a CPU; none takes all cores that this process may use. Compiled kernels are kept in Taichi's
-    cache on disk, so that the next process starts fast.
+    `device` is auto (CUDA if this machine has it, else the CPU), cpu or cuda. `cpu_threads` is the number of threads on
+    a CPU; None: all cores that this process may use. Compiled kernels are stored in Taichi's cache on disk, so the next
+    process starts fast.
 
-    Raises: ConfigError when cuda is requested and there is no GPU, or when the process already runs on another
-    device or number of threads (Taichi has one runtime a process).
+    Raises: ConfigError if cuda is requested without a GPU, or if the process already uses another device or number of
+    threads (Taichi has one runtime a process).
     """
     global _started
     require(device in ("auto", "cpu", "cuda"), "device", "one of auto, cpu, cuda", device)
@@ -61,12 +61,12 @@ def initialise(device: str = "auto", cpu_threads: int | None = None) -> Device:
             )
         return _started
     name_lines_alone()
-    ti.set_logging_level(ti.ERROR)  # the search for CUDA warns where there is none
+    ti.set_logging_level(ti.ERROR)  # without a GPU the search for CUDA warns
     has_gpu = device != "cpu" and ti.lang.misc.is_arch_supported(ti.cuda)
     if device == "cuda" and not has_gpu:
         raise ConfigError("device must be cpu or auto where CUDA finds no device, got 'cuda'")
     threads = cpu_threads or available_cpus()
-    # where it cannot write to its cache Taichi crashes as the process ends
+    # if Taichi cannot write to its cache, it crashes at the end of the process
     kernels = writable_folder(Path(ti.lang.impl.default_cfg().offline_cache_file_path), "taichi")
     with contextlib.redirect_stdout(io.StringIO()):
         ti.init(
@@ -76,10 +76,10 @@ def initialise(device: str = "auto", cpu_threads: int | None = None) -> Device:
             offline_cache_file_path=str(kernels),
             default_fp=ti.f32,
             default_ip=ti.i32,
-            fast_math=False,  # it reorders sums by what stands beside them, and drops tests for NaN
-            # nine tenths of the time to compile, and LLVM does the same again
+            fast_math=False,  # it would reorder sums depending on nearby code, and remove tests for NaN
+            # this takes nine tenths of the time to compile, and LLVM does the same again
             cfg_optimization=False,
-            opt_level=0,  # expressions that stand twice
+            opt_level=0,  # elimination of common subexpressions
             log_level=ti.ERROR,
         )
     _started = Device("cuda", 1, _processors()) if has_gpu else Device("cpu", threads)
@@ -87,7 +87,7 @@ def initialise(device: str = "auto", cpu_threads: int | None = None) -> Device:
 
 
 def _processors() -> int:
-    """Returns the number of multiprocessors of the GPU that Taichi started."""
+    """Returns the number of multiprocessors of the GPU that Taichi uses."""
     count = ctypes.c_int()
     multiprocessors, device = 16, 0
     status = cuda_driver().cuDeviceGetAttribute(ctypes.byref(count), multiprocessors, device)
@@ -97,7 +97,7 @@ def _processors() -> int:
 
 
 def memory_bytes(device: Device) -> int:
-    """Returns the size of the memory that the device simulates in."""
+    """Returns the size of the memory that simulations on the device use."""
     if device.kind == "cpu":
         return available_memory()
     size = ctypes.c_size_t()
@@ -109,5 +109,5 @@ def memory_bytes(device: Device) -> int:
 
 @functools.cache
 def cuda_driver() -> ctypes.CDLL:
-    """CUDA's driver, for what Taichi does not ask it."""
+    """Returns CUDA's driver, for functions that Taichi does not provide."""
     return ctypes.CDLL("libcuda.so.1")

@@ -1,8 +1,8 @@
 """Floats in a device's memory at an address, which Taichi's kernels take as a number (see device_memory.ll).
 
-The team's kernel alone needs it, so GPUs, and CPUs in tests. Taichi reads the bitcode of LLVM 14 beside this file as it
-compiles; after a change of the source `llvmlite.binding.parse_assembly(source).as_bitcode()` of llvmlite 0.43 makes it.
-`base` is a variable of the kernel that holds the address: copies of it cost a third of the time to compile.
+Only the team's kernel needs it, on GPUs, and on CPUs in tests. During compilation Taichi reads the bitcode of LLVM 14
+beside this file. After a change of the source, `llvmlite.binding.parse_assembly(source).as_bitcode()` of llvmlite 0.43
+creates it. `base` is a kernel variable that contains the address. Copies of it would take a third of the compile time.
 """
 
 from pathlib import Path
@@ -10,8 +10,8 @@ from pathlib import Path
 import taichi as ti
 from taichi.lang.source_builder import SourceBuilder
 
-ALIGNMENT = 16  # bytes, of an address that four floats are read from
-# as SourceBuilder.from_file, which asks for a device that is started
+ALIGNMENT = 16  # bytes; an address from which four floats are read is a multiple of it
+# like SourceBuilder.from_file, which requires a started device
 _functions = SourceBuilder()
 _functions.bc, _functions.mode = str(Path(__file__).with_suffix(".bc")), "bc"
 
@@ -37,13 +37,13 @@ def store(base: ti.template(), entry: ti.i32, value: ti.f32):
 
 @ti.func
 def add(base: ti.template(), entry: ti.i32, value: ti.f32):
-    """An atomic sum, whose result nobody waits for."""
+    """Adds atomically. No thread waits for the result."""
     _functions.memory_add(base, entry, value)
 
 
 @ti.func
 def load4(base: ti.template(), entry: ti.i32):
-    """Four floats from an entry that four divides."""
+    """Returns four floats at an entry that is a multiple of four."""
     x = 0.0
     y = 0.0
     z = 0.0

@@ -1,8 +1,8 @@
 """One substep of explicit MLS-MPM for a batch of scenes, as a single Taichi kernel.
 
-The method is that of datagen.mpm.mls_mpm. On a CPU each (scene, part) of the particles scatters into its own copy of
-the grid, and the copies are summed in order: the result does not depend on the number of threads. On a GPU all
-particles scatter into one copy with atomics.
+The method is that of datagen.mpm.mls_mpm. On a CPU each part of a scene's particles is scattered into its own copy of
+the grid, and the copies are summed in order. So the result does not depend on the number of threads. On a GPU all
+particles are scattered into one copy with atomics.
 """
 
 from collections import namedtuple
@@ -30,7 +30,7 @@ from datagen.mpm.nodes import ghost_place, interpolate, interpolate_hidden, mark
 from datagen.mpm.time_step import choose_time_step, falls, raise_maximum
 from hgn.scene.material import MATERIAL_BITS, MATERIAL_MASK, SAND, WATER
 
-# The arguments of `substep`, which its functions take as one. Taichi resolves the names as it compiles.
+# The arguments of `substep`, passed to its functions as one. Taichi resolves the names during compilation.
 GridArrays = namedtuple(
     "GridArrays",
     [
@@ -43,8 +43,9 @@ GridArrays = namedtuple(
 
 @ti.func
 def _particle_to_grid(p: ti.i32, copy: ti.i32, scene: ti.i32, step: ti.f32, arrays: ti.template()):
-    """Updates the particle's deformation where it acts, and adds what it gives to its nodes to one copy of the grid:
-    momentum and mass in the first substep of an interval, later what its stress changes alone.
+    """Updates a particle's deformation if it acts, and adds its contribution to the nodes of one copy of the grid.
+
+    It contributes momentum and mass in the first substep of an interval, and only the impulse of its stress later.
     """
     dx = arrays.setting[SETTING.cell_size]
     inverse_dx = arrays.setting[SETTING.inverse_cell_size]
@@ -69,7 +70,7 @@ def _particle_to_grid(p: ti.i32, copy: ti.i32, scene: ti.i32, step: ti.f32, arra
         C = arrays.affine[p]
         stretch = ti.Matrix.zero(ti.f32, 3, 3)
         if begins == 0.0:
-            stretch = arrays.affine[p]  # which holds it until the interval ends
+            stretch = arrays.affine[p]  # contains it until the interval ends
             v_now, C_now = interpolate(
                 arrays.position[p], scene * arrays.shape[SHAPE.scene_blocks] * BLOCK_NODES, arrays, inverse_dx
             )
@@ -141,7 +142,7 @@ def _particle_to_grid(p: ti.i32, copy: ti.i32, scene: ti.i32, step: ti.f32, arra
 
 @ti.func
 def _mass_around(x, first_node: ti.i32, arrays: ti.template(), inverse_dx: ti.f32) -> ti.f32:
-    """The masses of the nodes around x, interpolated."""
+    """Returns the mass interpolated from the nodes around x."""
     scaled = x * inverse_dx
     base = ti.floor(scaled - 0.5, ti.i32)
     w0, w1, w2 = weights(scaled - ti.cast(base, ti.f32))
@@ -155,7 +156,7 @@ def _mass_around(x, first_node: ti.i32, arrays: ti.template(), inverse_dx: ti.f3
 
 @ti.func
 def _grid_to_particle(p: ti.i32, scene: ti.i32, arrays: ti.template(), is_water: ti.i32):
-    """New velocity and its gradient, then advection."""
+    """Computes a particle's new velocity and its gradient, then its new position."""
     x = arrays.position[p]
     first_node = scene * arrays.shape[SHAPE.scene_blocks] * BLOCK_NODES
     v, C = interpolate(x, first_node, arrays, arrays.setting[SETTING.inverse_cell_size])
@@ -199,21 +200,23 @@ def substep(
     contact_normal: Vectors,
     variant: ti.template(),
 ):
-    """Advances every scene that has time left by one substep of its own length.
+    """Advances every scene with remaining time by one substep of its own length.
 
-    Particles that enter later belong to no scene, but to a row of scene_value that never has time.
+    Particles that enter later belong to an additional row of scene_value, which never has time.
+    Order: time step; in the first substep of an interval marks of blocks; particles to grid (deformation, plasticity,
+    stress), gravity, colliders, walls; in the last substep grid to particles and advection.
 
-    Order: time step; in the first substep of an interval mark blocks; particles to grid (deformation, plasticity,
-    stress), gravity, colliders, walls; in the last grid to particles, advection. `label` holds scene and material of
-    each particle, `node` [scenes * blocks * 64] velocity and mass of nodes, `gain` [parts * scenes * blocks * 64] what
-    comes to them, a copy of the grid for each part; both end with the second fields of nodes that sheets hide from some
-    particles, which `hidden` names for each particle (see surface_kernel.hidden_nodes). `block` holds flags and list of
-    touched blocks (see mark), the list's length, whether it is made anew, for all scenes, because an interval begins in
-    one, and the marks of own_step.
-    `contact` begins with the entry of each node, or -1: the place of its vectors in `contact_normal` (see
-    surface_kernel.NODE_VECTORS), and below SHAPE.ghosts that of its second field from SHAPE.ghost_begin on. Then comes,
-    for each base node, where its list of triangles begins in `contact` itself, or -1; then those lists, with their
-    heads (see surface_kernel.LIST_HEAD). An entry is the place in `contact_normal` of the triangle's vectors.
+    label    scene and material of each particle
+    node     [scenes * blocks * 64] velocity and mass of nodes
+    gain     [parts * scenes * blocks * 64] contributions to them, a copy of the grid for each part
+    hidden   bits of each particle's nodes that sheets hide from it (see surface_kernel.hidden_nodes); second fields of
+             these nodes are at the end of node and gain
+    block    flags and list of touched blocks (see mark), the list's length, 1 if an interval begins in any scene and
+             the list is built again, and the marks of own_step
+    contact  entry of each node or -1: the place of its vectors in `contact_normal` (see surface_kernel.NODE_VECTORS),
+             and if below SHAPE.ghosts the place of its second field after SHAPE.ghost_begin. Then for each base node
+             the begin of its list of triangles in `contact`, or -1; then these lists with their heads (see
+             surface_kernel.LIST_HEAD), which contain places of triangles' vectors in `contact_normal`
     """
     arrays = ti.static(GridArrays(
         position, velocity, affine, deformation, volume, strained, covered, spread, response, label, law_row,
@@ -317,7 +320,7 @@ def start(
     counter: ti.types.ndarray(dtype=ti.i64, ndim=2),
     law: Scalars,
 ):
-    """Particles at rest shape, and the maxima that the first time step needs."""
+    """Writes undeformed particles, and the maxima for the first time step."""
     for p in range(velocity.shape[0]):
         scene = label[p] >> MATERIAL_BITS
         material = label[p] & MATERIAL_MASK
@@ -342,8 +345,9 @@ def enter(
     setting: Scalars,
     law: Scalars,
 ):
-    """Particles join their scenes between two intervals: velocities are those of the present, the solver's of the
-    middle of the last interval.
+    """Adds particles to their scenes between two intervals.
+
+    Their velocities are the present ones; those of the solver belong to the middle of the last interval.
     """
     for i in range(which.shape[0]):
         p = which[i]
@@ -363,7 +367,7 @@ def begin_part(
     scene_value: ti.types.ndarray(dtype=ti.f32, ndim=2),
     counter: ti.types.ndarray(dtype=ti.i64, ndim=2),
 ):
-    """Gives every running scene the time of a part of a frame; substeps are counted from the frame's first part on."""
+    """Gives every running scene the time of a part of a frame. The first part resets the frame's count of substeps."""
     for scene in range(scene_value.shape[0]):
         if first == 1:
             counter[scene, COUNT.frame_substeps] = ti.cast(0, ti.i64)

@@ -1,4 +1,4 @@
-"""One substep of all scenes a launch: the way on a CPU, and for a scene so large that it fills a GPU by itself."""
+"""Runs one substep of all scenes in a launch: on a CPU, and for a scene that is large enough for a whole GPU."""
 
 from __future__ import annotations
 
@@ -20,24 +20,22 @@ import taichi as ti  # isort: skip
 
 from datagen.mpm import grid_kernel  # isort: skip
 
-MAXIMUM_PARTS = 4  # copies of the grid on a CPU, one a thread
-SUBSTEPS_PER_CHECK = 64  # at most; on a GPU each check waits for the device
-
-
-MAXIMUM_MOVE_CELLS = 100.0  # of a moving obstacle in a frame
+MAXIMUM_PARTS = 4  # largest number of copies of the grid on a CPU, one for each thread
+SUBSTEPS_PER_CHECK = 64  # largest number of substeps between two checks; on a GPU each check waits for the device
+MAXIMUM_MOVE_CELLS = 100.0  # largest motion of an obstacle in a frame
 
 
 def motion_parts(scenes: Sequence[Scene], begin: float, end: float) -> int:
-    """Into how many parts a frame is cut, so that no obstacle moves by more than MOVE_CELLS in any; 0 where none moves.
+    """Returns the number of parts of a frame in which no obstacle moves more than MOVE_CELLS; 0 if none moves.
 
-    Raises: ConfigError where one moves by more than MAXIMUM_MOVE_CELLS in the frame.
+    Raises: ConfigError if one moves more than MAXIMUM_MOVE_CELLS in the frame.
     """
     most = 0.0
     for index, scene in enumerate(scenes):
         for number, obstacle in enumerate(scene.obstacles):
             if obstacle.motion is None:
                 continue
-            # keyframes within the frame too: what goes and comes back moves
+            # keyframes within the frame count, because an obstacle may move and return
             stops = obstacle.motion.time_T[(obstacle.motion.time_T > begin) & (obstacle.motion.time_T < end)]
             way = 0.0
             for first, last in itertools.pairwise([begin, *stops, end]):
@@ -57,7 +55,7 @@ def motion_parts(scenes: Sequence[Scene], begin: float, end: float) -> int:
 
 
 class GridLaunch(Launch):
-    """Particles in arrays of vectors and matrices; a CPU sums in parts, a GPU with atomics."""
+    """Runs a batch substep by substep. A CPU sums in parts, a GPU with atomics."""
 
     def __init__(self, device: Device, *batch: Any) -> None:
         if device.kind == "cpu":
@@ -105,7 +103,7 @@ class GridLaunch(Launch):
             yield self.position.to_numpy()[None], completed
 
     def _enter(self, frame: int) -> None:
-        """The particles that are seen first in a frame join their scenes."""
+        """Adds the particles that are present for the first time in a frame to their scenes."""
         which = np.flatnonzero(self.entry_frame == frame)
         if len(which):
             grid_kernel.enter(
@@ -114,7 +112,7 @@ class GridLaunch(Launch):
             )  # fmt: skip
 
     def _move(self, begin: float, end: float) -> None:
-        """Makes the contacts of scenes in which obstacles move anew, as they lie at `begin`."""
+        """Rebuilds the contacts of scenes with moving obstacles in their poses at `begin`."""
         self.colliders = [
             build_collider(scene, self.config.choices.collider_band_cells, begin) if scene.moves else collider
             for scene, collider in zip(self.scenes, self.colliders, strict=True)
@@ -124,7 +122,7 @@ class GridLaunch(Launch):
         self._place_contacts(begin, end)
 
     def _run_part(self) -> None:
-        """Substeps until no scene has time left; the host looks only when the last estimate has run out."""
+        """Runs substeps until no scene has time left. The host checks only after the last estimate of their number."""
         pending = 1
         while pending:
             for _ in range(min(pending, SUBSTEPS_PER_CHECK)):

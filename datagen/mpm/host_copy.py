@@ -1,8 +1,8 @@
-"""What a device has computed, in memory of the host.
+"""Copies results of a device to host memory.
 
-Taichi's to_numpy takes memory that is new each time, copies it to a GPU as it is, and then the result back into it,
-while the GPU has nothing else to do. Here the result alone is copied, into memory that is kept, and locked in its place
-where the system allows that: a GPU then writes to it at the speed of its bus.
+Taichi's to_numpy allocates new memory each time. It copies this memory to the GPU as it is, and then the result back,
+while the GPU is idle. Here only the result is copied, into memory that is reused. If the system allows it, the memory
+is locked in its place, so that a GPU writes to it at the speed of its bus.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ SUCCESS = 0  # CUresult
 
 
 class HostCopy:
-    """Memory that arrays of float32 are read into, one after another; it grows to the largest."""
+    """Memory into which arrays of float32 are read, one after another. It grows to the largest of them."""
 
     def __init__(self) -> None:
         self._on_gpu = ti.lang.impl.current_cfg().arch == ti.cuda
@@ -29,7 +29,7 @@ class HostCopy:
     def read(self, array: ti.ScalarNdarray) -> np.ndarray:
         """Returns the array's values after all kernels, float32 [its length]; the next read overwrites them.
 
-        Raises: RuntimeError where the GPU cannot be read, as after an error of a kernel.
+        Raises: RuntimeError if the GPU cannot be read, for example after an error of a kernel.
         """
         ti.sync()
         (count,) = array.shape
@@ -50,7 +50,7 @@ class HostCopy:
         return values
 
     def release(self) -> None:
-        """Lets the memory go."""
+        """Frees the memory."""
         if self._locked:
             memory = ctypes.c_void_p(self._memory.ctypes.data)
             _require_success("cuMemHostUnregister", cuda_driver().cuMemHostUnregister(memory))

@@ -1,4 +1,4 @@
-"""Device arrays of a batch of scenes, the loop over frames, failures and counters, for all ways to run a batch.
+"""Device arrays of a batch of scenes, the loop over frames, failures and counters. All ways to run a batch share it.
 
 Shape legend: T frames, N particles of a scene, P particles of all scenes, B scenes, K constants.
 """
@@ -47,7 +47,7 @@ from datagen.mpm.surface_kernel import (  # isort: skip
     place_contacts,
 )
 
-MAXIMUM_BLOCKS = 1024  # along an axis: kernels keep ten bits of it
+MAXIMUM_BLOCKS = 1024  # blocks along an axis; kernels store the number in ten bits
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,12 +56,12 @@ class Simulated:
 
     # float32, domain units; frame 0 is the initial state, bitwise; NaN before the frame in which a particle enters
     position_TN3: np.ndarray
-    counters: dict[str, Any]  # JSON-able: substeps, smallest_time_step_s, floors hit
+    counters: dict[str, Any]  # plain JSON types: substeps, smallest_time_step_s, floors hit
 
 
 @dataclass(frozen=True)
 class SceneFailure:
-    cause: str  # why the scene was stopped; others of its batch are unaffected
+    cause: str  # why the scene was stopped; other scenes of its batch continue
 
 
 def no_counters() -> dict[str, Any]:
@@ -71,19 +71,19 @@ def no_counters() -> dict[str, Any]:
 
 
 def particle_bounds(scene: Scene, config: MpmConfig) -> tuple[np.ndarray, np.ndarray]:
-    """The smallest and largest coordinates that particles may have, float32 [3] each, domain units.
+    """Returns the smallest and largest coordinates that particles may have, float32 [3] each, domain units.
 
-    Beyond them all nodes of a particle are wall nodes, or lie outside the grid.
+    Beyond them all nodes of a particle are wall nodes, or outside the grid.
     """
     nodes = np.array([round(length / scene.cell_size) for length in scene.domain_size])
     low = np.full(3, (config.wall_cells - 1.5) * scene.cell_size)
     high = np.minimum(nodes - config.wall_cells + 0.5, nodes - 1.5) * scene.cell_size
-    # a rounding inside, so that the scaled coordinate cannot round to the next base node
+    # one rounding inside, so that the scaled coordinate cannot round to the next base node
     return (low * (1 + 1e-6)).astype(np.float32), (high * (1 - 1e-6)).astype(np.float32)
 
 
 def cell_mass(scene: Scene) -> float:
-    """The particles that fill a cell: as the scene says, or else the median of those that share one with a particle."""
+    """Returns the scene's particles per cell; if unknown, the median over particles of the number in their cell."""
     if scene.particles_per_cell is not None:
         return scene.particles_per_cell
     cell = np.floor(np.asarray(scene.position_N3, np.float64) / scene.cell_size).astype(np.int64)
@@ -92,20 +92,20 @@ def cell_mass(scene: Scene) -> float:
 
 
 def fixed_substeps(config: MpmConfig, frame_rate_hz: float) -> int:
-    """Returns the number of fixed time steps that it takes to reach the end of a frame."""
+    """Returns the number of fixed time steps up to the end of a frame."""
     assert config.fixed_time_step_s is not None
     return max(1, math.ceil(1 / (frame_rate_hz * config.fixed_time_step_s) - 1e-6))
 
 
 class Launch(ABC):
-    """The device arrays of one batch of scenes, each with at least one particle, and the loop over frames.
+    """The device arrays of a batch of scenes, each with at least one particle, and the loop over frames.
 
-    A subclass has the particles, and runs frames in `_advance`.
+    A subclass stores the particles, and computes frames in `_advance`.
     """
 
-    parts = 1  # bounds that each scene's particles are cut at
-    copies = 1  # of the grid
-    entries_a_node = 1  # in the array of nodes
+    parts = 1  # number of parts that each scene's particles are divided into
+    copies = 1  # number of copies of the grid
+    entries_a_node = 1  # numbers per node in the array of nodes
 
     def __init__(
         self,
@@ -124,7 +124,7 @@ class Launch(ABC):
         self.particles = int(self.particle_begin[-1])
         self.blocks = tuple(-(-count // BLOCK) for count in node_counts)
         self.scene_nodes = math.prod(self.blocks) * BLOCK_NODES
-        # second fields of nodes come last, in blocks of their own
+        # second fields of nodes come last, in separate blocks
         self.ghosts = sum(int(collider.doubled_K.sum()) for collider in colliders)
         self.moving = any(scene.moves for scene in scenes)
         ghost_room = self.scene_nodes * len(scenes) if self.moving and self._has_sheets() else self.ghosts
@@ -145,7 +145,7 @@ class Launch(ABC):
         )
         self.entry_frame = np.concatenate([entry_frames(scene, frame_rate_hz) for scene in scenes])
         self.own_label = label.astype(np.int32)
-        # one scene more, which never runs: of particles that enter later
+        # one scene more for particles that enter later; it never runs
         self.rows = len(scenes) + bool(self.entry_frame.any())
         label = np.where(self.entry_frame > 0, (len(scenes) << MATERIAL_BITS) + (label & MATERIAL_MASK), label)
         laws, row = material_laws(scenes, config)
@@ -179,7 +179,7 @@ class Launch(ABC):
         return any(not obstacle.closed for scene in self.scenes for obstacle in scene.obstacles)
 
     def _place_contacts(self, begin: float, end: float) -> None:
-        """Puts the colliders' contacts where kernels read them; what moves does so at its mean rates of a time."""
+        """Writes the colliders' contacts into device arrays. Moving obstacles get their mean velocities of the time."""
         self.shape = device_array(self._shape())
         of_node = MOVING_NODE_VECTORS if self.moving else NODE_VECTORS
         of_triangle = MOVING_TRIANGLE_VECTORS if self.moving else TRIANGLE_VECTORS
@@ -205,13 +205,13 @@ class Launch(ABC):
 
     @abstractmethod
     def _node_array(self, nodes: int) -> Any:
-        """Momentum or velocity, and mass, of so many nodes."""
+        """Allocates momentum or velocity, and mass, of `nodes` nodes."""
 
     def _vector_arrays(self) -> list[Any]:
         return [self.contact_normal]
 
     def release(self) -> None:
-        """Gives the device memory back: Taichi 1.7.4 frees scalar arrays by itself, but not those of vectors."""
+        """Frees the device memory. Taichi 1.7.4 frees scalar arrays by itself, but not arrays of vectors."""
         program = ti.lang.impl.get_runtime().prog
         for array in self._vector_arrays():
             program.delete_ndarray(array.arr)
@@ -223,7 +223,7 @@ class Launch(ABC):
         value[:, VALUE.smallest_time_step] = np.inf
         value[: len(self.scenes), VALUE.stability_fraction] = stability_fractions or self.config.stability_fraction
         shear, bulk = laws[:, CONSTANT.shear], laws[:, CONSTANT.bulk]
-        # per material and row; hardening may take all stiffness from snow
+        # by material and row; hardening may take all stiffness from snow
         density = laws[:, CONSTANT.density]
         viscous = 4 * laws[:, CONSTANT.viscosity] / (density * self.scenes[0].cell_size)
         solid = (3 * bulk + 2 * shear) / density
@@ -233,14 +233,14 @@ class Launch(ABC):
             own = slice(self.particle_begin[index], self.particle_begin[index + 1])
             value[index, VALUE.gravity : VALUE.gravity + 3] = scene.gravity
             value[index, VALUE.wall_friction : VALUE.wall_friction + 3] = scene.wall_friction
-            # what is heavier beside it would pass for water that is pressed together
+            # heavier particles next to water would look like compressed water
             alike = (laws[row[own], CONSTANT.mass] == 1).all()
             value[index, VALUE.water_density] = (scene.particles_per_cell or 0.0) if alike else 0.0
             value[index, VALUE.least_stiffness] = least[scene.material_N, row[own]].max()
         return value
 
     def _shape(self) -> np.ndarray:
-        """The int32 shape that kernels read, with the bounds of the parts that each scene's particles fall into."""
+        """Returns the int32 shape for kernels, and the first particle of each part of each scene."""
         begin = [
             start + (stop - start) * part // self.parts
             for start, stop in zip(self.particle_begin[:-1], self.particle_begin[1:], strict=True)
@@ -277,8 +277,9 @@ class Launch(ABC):
         return setting
 
     def _rates(self, begin: float, end: float) -> list[np.ndarray]:
-        """Returns for each scene the motion of its obstacles between two times, float64 [obstacles, 3, 3]: angular
-        velocity, velocity of a point, and the point.
+        """Returns the motion of each scene's obstacles between two times, float64 [obstacles, 3, 3].
+
+        The rows of an obstacle are angular velocity, velocity of a point, and this point.
         """
         rates = [np.zeros((max(len(scene.obstacles), 1), 3, 3)) for scene in self.scenes]
         for own, scene in zip(rates, self.scenes, strict=True):
@@ -288,8 +289,8 @@ class Launch(ABC):
         return rates
 
     def _contacts(self, begin: float, end: float, vector: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Places of contact nodes, and the entry of each (see grid_kernel.substep). Fills in the entries' vectors."""
-        # one scene after another, whose arrays stay in a core's cache; nodes of two fields have the first entries
+        """Returns the places and entries of contact nodes (see grid_kernel.substep). Writes the entries' vectors."""
+        # scene after scene, so that arrays stay in a core's cache; nodes with two fields get the first entries
         places, entries = np.empty(len(vector), np.int32), np.empty(len(vector), np.int32)
         filled, doubled, single = 0, 0, self.ghosts
         for index, (scene, own, friction, rates) in enumerate(
@@ -313,7 +314,7 @@ class Launch(ABC):
         return places, entries
 
     def _frictions(self) -> list[np.ndarray]:
-        """Returns the Coulomb coefficients of each scene's obstacles, at least one entry each."""
+        """Returns the Coulomb coefficients of each scene's obstacles, at least one entry for each scene."""
         own = self.config.collider_friction
         return [
             np.array([own if o.friction is None else o.friction for o in scene.obstacles] or [own], np.float32)
@@ -329,8 +330,9 @@ class Launch(ABC):
     def _sweeps(
         self, first_vector: int, begin: float, end_s: float, vector: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, int]:
-        """Entries of the contact array for the swept test (see grid_kernel.substep): places, values; and the array's
-        length. Fills in the triangles' vectors.
+        """Returns entries of the contact array for the swept test (see grid_kernel.substep), and the array's length.
+
+        Entries are given by places and values. Writes the triangles' vectors.
         """
         all_nodes = self.all_blocks * BLOCK_NODES
         sweeps = [collider.sweep for collider in self.colliders]
@@ -374,12 +376,14 @@ class Launch(ABC):
 
     @abstractmethod
     def _advance(self, frames: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        """Runs `frames` frames; gives, a few at a time, positions [frames, P, 3], which hold until the next are asked
-        for, and how many of all the frames so far each scene has completed [B].
+        """Computes `frames` frames, and yields them a few at a time.
+
+        Yields positions [frames, P, 3], valid until the next request, and the number of frames that each scene has
+        completed so far [B].
         """
 
     def run(self, frames: int, on_frame: Callable[[int], None] | None) -> list[Simulated | SceneFailure]:
-        """The frames of each scene, the initial state among them, or why it was stopped."""
+        """Returns the frames of each scene, the initial state included, or why the scene was stopped."""
         trajectory = [np.empty((frames, scene.particle_count, 3), np.float32) for scene in self.scenes]
         absent = []
         for rows, scene, begin in zip(trajectory, self.scenes, self.particle_begin, strict=False):

@@ -1,6 +1,6 @@
-"""Where the solver's kernels find what the host sends them: positions in small arrays, and the constants.
+"""Positions of numbers in the small arrays that the host passes to the solver's kernels, and the laws' constants.
 
-Kernels take few arrays rather than many scalars, since each argument of a launch costs time.
+Kernels take few arrays instead of many scalars, because each argument of a launch takes time.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from hgn.scene.scene import Scene
 
 BLOCK = 4  # nodes along the side of a block of the grid
 BLOCK_NODES = BLOCK**3
-SOLID_FRACTION = 0.6  # of sand: grains are denser by as much
+SOLID_FRACTION = 0.6  # volume fraction of grains in sand; the density of grains is that of sand divided by it
 
 
 class Constant(NamedTuple):
@@ -28,19 +28,19 @@ class Constant(NamedTuple):
     density: int = 2
     sand_alpha: int = 3  # slope of the Drucker-Prager cone
     hardening: int = 4
-    snow_smallest: int = 5  # singular values that snow bears elastically
+    snow_smallest: int = 5  # smallest and largest singular value that snow bears elastically
     snow_largest: int = 6
     maximum_hardening: int = 7
-    mass: int = 8  # of a particle, in units of the config's
+    mass: int = 8  # mass of a particle over that with the config's density
     sand_sine: int = 9  # sine of the friction angle
     water_tension: int = 10  # fraction of the tension that stretched water bears
-    viscosity: int = 11  # of water, Pa s
-    grain: int = 12  # of sand, d sqrt(2 rho_grain), sqrt(kg / m): see constitutive
+    viscosity: int = 11  # viscosity of water, Pa s
+    grain: int = 12  # grains of sand, d sqrt(2 rho_grain), sqrt(kg / m): see constitutive
     length: int = 13
 
 
 class Count(NamedTuple):
-    """Positions in the int64 state of each scene: what is counted and reported, then what runs the scene."""
+    """Positions in the int64 state of each scene: reported counts, then numbers that control the scene."""
 
     substeps: int = 0
     transfers: int = 1
@@ -51,12 +51,12 @@ class Count(NamedTuple):
     position_clamps: int = 6
     surface_projections: int = 7
     status: int = 8
-    frame_substeps: int = 9  # taken in the present frame
-    # Maxima of the last step, the bits of a float32 that is not negative: such bits are ordered like the numbers, and
-    # a GPU has no maximum of floats that many threads may take at once.
-    stiffness_bits: int = 10  # of (3 lambda + 2 mu) / density, m²/s²
+    frame_substeps: int = 9  # number of substeps in the present frame
+    # Maxima of the last step as bits of a float32 >= 0. Such bits have the order of the numbers. A GPU has no atomic
+    # maximum of floats.
+    stiffness_bits: int = 10  # bits of (3 lambda + 2 mu) / density, m²/s²
     speed_square_bits: int = 11
-    held_stiffness_bits: int = 12  # the same of particles that take longer steps of their own, in this interval
+    held_stiffness_bits: int = 12  # the same in this interval, of particles with longer steps of their own
     length: int = 13
 
 
@@ -66,28 +66,28 @@ REPORTED = Count._fields[:8]
 class SceneValue(NamedTuple):
     """Positions in the float32 state of each scene."""
 
-    remaining: int = 0  # of the frame, s
-    time_step: int = 1  # of the present substep, s; 0 while the scene idles
+    remaining: int = 0  # remaining time of the frame, s
+    time_step: int = 1  # time of the present substep, s; 0 while the scene idles
     smallest_time_step: int = 2
-    least_stiffness: int = 3  # of the materials at rest whose stiffness never falls below, m²/s²
+    least_stiffness: int = 3  # m²/s²; largest stiffness at rest over materials that never get softer
     gravity: int = 4  # 4, 5, 6
-    substeps_ahead: int = 7  # estimated, after the present one
-    largest_speed_square: int = 8  # of the steps before the present one
-    interval: int = 9  # as planned, from the last transfer to the next, s
-    interval_elapsed: int = 10  # with the present substep, s
-    interval_remaining: int = 11  # after the present substep, s; at 0 velocities go back to the particles
-    begins: int = 12  # 1 where the present substep is the first of its interval, else 0
-    stability_fraction: int = 13  # of the limit of stability: the longest step of stress
-    gravity_time: int = 14  # for which gravity acts in the present substep, s: see mls_mpm
-    water_density: int = 15  # at rest, in masses of a particle a cell; 0 where it is not known
-    wall_friction: int = 16  # 16, 17, 18: of the domain's walls across x, y, z
-    part: int = 19  # length of the present part of a frame, s: of all of it where nothing moves
-    stiffness: int = 20  # largest in the step before, m²/s²
-    last_interval: int = 21  # how long the interval before was, s
-    fallen: int = 22  # for which gravity has acted in this interval before the present substep, s
-    synchronised: int = 23  # 1 where the interval's first and last substep are half as long as others, else 0
-    whole_step: int = 24  # of the others, s
-    catch_up: int = 25  # by how much strain is behind where an interval begins, s, less than 0 where ahead
+    substeps_ahead: int = 7  # estimated number of substeps after the present one
+    largest_speed_square: int = 8  # largest square of speed before the present step
+    interval: int = 9  # planned time from the last transfer to the next, s
+    interval_elapsed: int = 10  # time of the interval including the present substep, s
+    interval_remaining: int = 11  # time after the present substep, s; at 0 particles take velocities from nodes
+    begins: int = 12  # 1 if the present substep is the first of its interval, else 0
+    stability_fraction: int = 13  # longest step of stress as a fraction of the stability limit
+    gravity_time: int = 14  # time of gravity in the present substep, s: see mls_mpm
+    water_density: int = 15  # number of particles a cell at rest; 0 if unknown
+    wall_friction: int = 16  # 16, 17, 18: friction of the domain's walls across x, y, z
+    part: int = 19  # length of the present part of a frame, s; without moving obstacles the whole frame
+    stiffness: int = 20  # largest stiffness in the step before, m²/s²
+    last_interval: int = 21  # length of the interval before, s
+    fallen: int = 22  # time of gravity in this interval before the present substep, s
+    synchronised: int = 23  # 1 if the interval's first and last substep are half as long as the others, else 0
+    whole_step: int = 24  # length of the other substeps, s
+    catch_up: int = 25  # time by which strain is behind when an interval begins, s; negative if ahead
     length: int = 26
 
 
@@ -96,7 +96,7 @@ class Status(NamedTuple):
     not_finite: int = 1
     left_domain: int = 2
     too_many_substeps: int = 3
-    waiting: int = 4  # no scene, but the row of particles that enter later
+    waiting: int = 4  # not a scene, but the row of particles that enter later
 
 
 class Setting(NamedTuple):
@@ -105,13 +105,13 @@ class Setting(NamedTuple):
     cell_size: int = 0
     inverse_cell_size: int = 1
     fixed_time_step: int = 2  # s; 0 for the adaptive rule
-    fixed_substeps: int = 3  # a frame, where the time step is fixed
-    density_relaxation: int = 4  # of water's J to its density, 1/s
+    fixed_substeps: int = 3  # number of substeps a frame, with a fixed time step
+    density_relaxation: int = 4  # rate of relaxation of water's J to its density, 1/s
     low: int = 5  # 5, 6, 7: smallest coordinates of a particle
-    high: int = 8  # 8, 9, 10: largest
-    size: int = 11  # 11, 12, 13: of the domain
-    transfer_interval: int = 14  # s; 0 where every substep is a transfer
-    leapfrog: int = 15  # 1 where velocities belong to the middle of an interval, 0 to its end
+    high: int = 8  # 8, 9, 10: largest coordinates
+    size: int = 11  # 11, 12, 13: size of the domain
+    transfer_interval: int = 14  # s; 0 if every substep is a transfer
+    leapfrog: int = 15  # 1 if velocities belong to the middle of an interval, 0 if to its end
     length: int = 16
 
 
@@ -121,31 +121,31 @@ class Shape(NamedTuple):
     nodes: int = 0  # 0, 1, 2: along each axis
     blocks: int = 3  # 3, 4, 5: along each axis
     scene_blocks: int = 6
-    all_blocks: int = 7  # of all scenes
+    all_blocks: int = 7  # number of blocks of all scenes
     wall_cells: int = 8
     maximum_substeps: int = 9
-    ghosts: int = 10  # nodes that sheets hide from particles near them, of all scenes: see mls_mpm
-    ghost_begin: int = 11  # the first of their second fields in the array of nodes
-    part_begin: int = 12  # from here on: first particle of each (scene, part), and the end
+    ghosts: int = 10  # nodes of all scenes that sheets hide from particles near them: see collider
+    ghost_begin: int = 11  # first of their second fields in the array of nodes
+    part_begin: int = 12  # first of the following: first particle of each (scene, part), and the end
 
 
 class Variant(NamedTuple):
-    """Bits of the number that a kernel is compiled for, so that a launch does only what its scenes need."""
+    """Bits of the variant of a kernel. A launch compiles only the features that its scenes need."""
 
     water: int = 1
     sand: int = 2
     snow: int = 4
     contact: int = 8
     taichi_elements: int = 16  # laws of sand and water as in Taichi Elements
-    atomic: int = 32  # sums with atomics, on a GPU; else in parts, one after another
-    several_laws: int = 64  # particles of one kind differ in their constants
+    atomic: int = 32  # sums with atomics on a GPU; otherwise sums in parts, in order
+    several_laws: int = 64  # particles of one material differ in their constants
     sweep: int = 128  # particles are stopped at triangles
     sheets: int = 256  # some nodes have two fields
     moving: int = 512  # obstacles move
     elastic: int = 1024
     rate_of_sand: int = 2048  # friction grows with the rate of flow
-    each_step: int = 4096  # is an interval of its own
-    parts: int = 8192  # times the number of parts; must be the last
+    each_step: int = 4096  # each step is an interval of its own
+    parts: int = 8192  # factor of the number of parts; must be the last
 
 
 class Field(NamedTuple):
@@ -166,17 +166,17 @@ class Tag(NamedTuple):
 
     material: int = 0
     law_row: int = 1
-    origin: int = 2  # its index within the scene as given
+    origin: int = 2  # index of the particle in its scene
     length: int = 3
 
 
 class Live(NamedTuple):
-    """Positions in the int32 state of a scene that its team shares."""
+    """Positions in the int32 state of a scene, which its team shares."""
 
-    blocks: int = 0  # touched, in this interval
-    cursor: int = 1  # particles that have a place in the order
-    copy: int = 2  # which of the two copies of the particles is the present one
-    frames: int = 3  # completed
+    blocks: int = 0  # number of touched blocks in this interval
+    cursor: int = 1  # number of particles with a place in the order
+    copy: int = 2  # which of the two copies of the particles is valid
+    frames: int = 3  # number of completed frames
     length: int = 4
 
 
@@ -188,17 +188,17 @@ SOLID_VARIANTS = sum(bit for material, bit in enumerate(MATERIAL_VARIANTS) if ma
 
 
 def has_solid(variant: int) -> bool:
-    """Returns whether a kernel of this variant (bits of `Variant`) has particles with a deformation gradient."""
+    """Returns whether a kernel of this variant has particles with a deformation gradient."""
     return variant & SOLID_VARIANTS != 0
 
 
 def is_only_solid(variant: int, kind: int) -> bool:
-    """Returns whether the only solid of a kernel of this variant is that of bit `kind`."""
+    """Returns whether the only solid of a kernel of this variant is the material with bit `kind`."""
     return variant & SOLID_VARIANTS == kind
 
 
 def lame_parameters(config: MpmConfig) -> tuple[float, float]:
-    """(mu, lambda) in Pa from Young's modulus and Poisson's ratio."""
+    """Returns (mu, lambda) in Pa from Young's modulus and Poisson's ratio."""
     modulus, ratio = config.youngs_modulus_pa, config.poisson_ratio
     return modulus / (2 * (1 + ratio)), modulus * ratio / ((1 + ratio) * (1 - 2 * ratio))
 
@@ -215,7 +215,7 @@ def sand_alpha(config: MpmConfig) -> float:
 
 
 def constants(config: MpmConfig, unit_density: float | None = None) -> np.ndarray:
-    """A row of what the laws read, float32 [Constant.length]; masses are in units of `unit_density`."""
+    """Returns a row of the laws' constants, float32 [Constant.length]. Masses are in units of `unit_density`."""
     shear, bulk = lame_parameters(config)
     out = np.zeros(CONSTANT.length, np.float32)
     out[CONSTANT.shear] = shear
@@ -235,13 +235,12 @@ def constants(config: MpmConfig, unit_density: float | None = None) -> np.ndarra
 
 
 def material_laws(scenes: Sequence[Scene], config: MpmConfig) -> tuple[np.ndarray, np.ndarray]:
-    """The different rows of constants, float32 [rows, K], and the row of each particle, int32 [N of all scenes].
+    """Returns the different rows of constants, float32 [rows, K], and each particle's row, int32 [N of all scenes].
 
-    What a scene's material_parameters leave open (a name, or NaN for a particle) is the config's. The first row is
-    the config's own.
-    Raises: ConfigError for a value that MpmConfig refuses.
+    A constant that a scene's material_parameters do not set (a missing name, or NaN) is the config's. The first row is
+    the config's. Raises: ConfigError for a value that MpmConfig refuses.
     """
-    if not any(scene.material_parameters for scene in scenes):  # to sort a million rows takes seconds
+    if not any(scene.material_parameters for scene in scenes):  # sorting a million rows takes seconds
         return constants(config, config.density_kg_m3)[None], np.zeros(sum(s.particle_count for s in scenes), np.int32)
     own = {name: np.float32(getattr(config, name)) for name in MATERIAL_PARAMETERS}
     columns = [

@@ -1,53 +1,42 @@
 """The parts of a substep of explicit MLS-MPM, for the Taichi kernels grid_kernel and team_kernel.
 
-APIC transfers with quadratic B-splines (Jiang et al. 2015; Hu et al. 2018). Only blocks of nodes with particles nearby
-are updated. Contributions of particles are summed separately from the nodes' velocities. Masses are in units of a
-particle of the config's density.
+APIC transfers with quadratic B-splines (Jiang et al. 2015; Hu et al. 2018). Only blocks of nodes near particles are
+updated. Contributions of particles are summed separately from the nodes' velocities. Masses are in units of the mass of
+a particle with the config's density.
 
-Each transfer smooths velocities, so transfers have their own rate: the interval between two contains as many substeps
-as the stiffest particle needs. With adaptive steps an interval is synchronised if it needs three or more substeps, or
-if a fast particle shortens it. It then has one substep more, and its first and last are half as long as the others:
-stress acts from half a step before to half a step after its time (velocity Verlet). Velocities half a step ahead of the
-stresses would feed oscillations of two periods an interval, whose energy could double in each.
+Each transfer smooths velocities, so transfers have their own rate. The interval between two transfers contains as many
+substeps as the stiffest particle needs. With adaptive steps an interval is synchronised if it needs three or more
+substeps, or if a fast particle shortens it. Then it has one more substep, and its first and last are half as long as
+the others. Stress acts from half a step before to half a step after its time (velocity Verlet). Velocities half a step
+ahead of the stresses would feed oscillations of two periods an interval. Their energy could double in each interval.
 
-At the end of an interval that is not synchronised strain is one step behind, and velocity half a step. The first
+At the end of an interval that is not synchronised, strain is one step behind, and velocity half a step. The first
 substep of a following synchronised interval compensates both (VALUE.catch_up). In the opposite case the first substep
 does not strain, and its stress acts for half of it.
 
-In the first substep of an interval particles transfer mass, momentum and force to the nodes. In the others they keep
-their place on the grid, compute strain and stress from the gradient of the nodes' velocities, and transfer force only,
-as in the Lagrangian phase of the classical method (Sulsky et al. 1994). After the last they take velocity and gradient
-from the grid and move by the interval times the velocity. Momentum and angular momentum are conserved, because stresses
-are symmetric and each particle moves along its velocity. multiple_time_stepping chooses which particles compute a new
-stress in a substep.
+In the first substep of an interval particles transfer mass, momentum and force to the nodes. In the other substeps they
+keep their place on the grid. They compute strain and stress from the gradient of the nodes' velocities, and transfer
+only force, as in the Lagrangian phase of the classical method (Sulsky et al. 1994). After the last substep they take
+velocity and gradient from the grid, and move by the interval times the velocity. Momentum and angular momentum are
+conserved, because stresses are symmetric and each particle moves along its velocity. multiple_time_stepping chooses the
+particles that compute a new stress in a substep.
 
-Positions belong to the ends of intervals, velocities to their middles (leapfrog): gravity acts for half of the last and
-half of the present interval, so that free fall is exactly v t + g t² / 2 at the end of each interval. Stresses and
-contacts act as in the symplectic Euler scheme, which Taichi Elements uses for gravity too.
+Positions belong to the ends of intervals, velocities to their middles (leapfrog). Gravity acts for half of the last and
+half of the present interval, so free fall is exactly v t + g t² / 2 at the end of each interval. Stresses and contacts
+act as in the symplectic Euler scheme. Taichi Elements uses this scheme for gravity too.
 
-Time step, interval, remaining time, state and counters are per scene. Scenes that are done or failed idle.
+Time step, interval, remaining time, state and counters are per scene. Finished and failed scenes idle.
 """
 
 import taichi as ti
 
 from datagen.mpm.constitutive import count_event, hardening, settled, solid, water
-from datagen.mpm.layout import (
-    BLOCK,
-    BLOCK_NODES,
-    CONSTANT,
-    COUNT,
-    SETTING,
-    SHAPE,
-    STATUS,
-    VALUE,
-    VARIANT,
-    has_solid,
-)
+from datagen.mpm.layout import BLOCK, BLOCK_NODES, CONSTANT, COUNT, SETTING, SHAPE, STATUS, VALUE, VARIANT, has_solid
 from datagen.mpm.nodes import base_node, node_place, weights
 from datagen.mpm.surface_kernel import MOVING_NODE_VECTORS, NODE_VECTORS, hidden_nodes, meet, stop_at_surface
 from hgn.scene.material import FLUIDS, SNOW
 
-SMALLEST_MASS = 1e-10  # of a particle; lighter nodes are at the rounding of the weights
+SMALLEST_MASS = 1e-10  # smallest mass of a node with a velocity, in particles; smaller ones are rounding of the weights
 
 Scalars = ti.types.ndarray(dtype=ti.f32, ndim=1)
 Integers = ti.types.ndarray(dtype=ti.i32, ndim=1)
@@ -65,15 +54,14 @@ def _not_finite(value) -> ti.i32:
 def respond(
     C, stretch, F, volume: ti.f32, material: ti.i32, row: ti.i32, step: ti.f32, scene: ti.i32, arrays: ti.template()
 ):
-    """The material's answer to a step of `step` seconds with the velocity gradient C, 1/s.
+    """Computes a material's response to a step of `step` seconds with the velocity gradient C, 1/s.
 
-    Particles stay where the interval began, so C is a gradient by positions of then. By those of now it is
-    C - (C + Cᵀ) / 2 stretch, in first order of `stretch`, the sum of dt (C + Cᵀ) / 2 over the interval's steps so far.
-    With it the steps of an interval together stretch F as one step would.
+    Particles keep the place that they had when the interval began, so C is a gradient by those positions. By present
+    positions it is C - (C + Cᵀ) / 2 stretch, to first order in `stretch`, the sum of dt (C + Cᵀ) / 2 over the steps so
+    far. With it the steps of an interval together stretch F as one step would.
 
-    Returns the response, - V0 (4 / dx²) stress / mass, by which stress changes APIC's C in a second; the new stretch
-    and F, both as they were for water; the new volume (see constitutive); and the present (3 lambda + 2 mu) / density,
-    m²/s².
+    Returns the response - V0 (4 / dx²) stress / mass, the rate at which stress changes APIC's C; the new stretch and F
+    (unchanged for water); the new volume (see constitutive); and the present (3 lambda + 2 mu) / density, m²/s².
     """
     has_water = ti.static(bool(arrays.variant & VARIANT.water))
     solids = ti.static(has_solid(arrays.variant))
@@ -97,7 +85,7 @@ def respond(
             if viscosity > 0.0:
                 rate = 0.5 * (C + C.transpose())
                 response += scale * 2.0 * viscosity * J * (rate - C.trace() / 3.0 * ti.Matrix.identity(ti.f32, 3))
-                # the shear of a lone particle is reversed, no smaller, by a step of rho dx² / (4 viscosity)
+                # the stability limit of viscosity: a step of rho dx² / (4 viscosity) reverses a lone particle's shear
                 rough = ti.sqrt(water_stiffness) + 4.0 * viscosity * inverse_dx / ti.sqrt(density)
                 stiffness = rough * rough
             for i in ti.static(range(3)):
@@ -109,15 +97,7 @@ def respond(
             gradient = C - rate @ stretch
             trial_F = F + step * (gradient @ F)
             solid_F, solid_volume, stress, solid_stiffness = solid(
-                trial_F,
-                volume,
-                material,
-                arrays.law,
-                row,
-                arrays.counter,
-                scene,
-                arrays.variant,
-                step,
+                trial_F, volume, material, arrays.law, row, arrays.counter, scene, arrays.variant, step
             )
             new_F = solid_F
             new_volume = solid_volume
@@ -138,11 +118,11 @@ def node_velocity(
     scene: ti.i32,
     arrays: ti.template(),
 ):
-    """The new velocity of a node's field: what colliders, then walls, leave of `before` + `momentum` / `mass` + `fall`;
-    the momentum is what came to it, `fall` is gravity's. 0 where the mass is at the rounding of the weights.
+    """Returns the new velocity of a node's field: `before` + `momentum` / `mass` + `fall` after colliders and walls.
 
-    The node is the `local` one of a block whose place along x, y, z is `corner`, in ten bits each. `facing` is twice
-    the node's entry in `contact_normal`, plus 1 for its second field, or less than 0 where no collider is.
+    `momentum` is the sum of contributions, and `fall` the change by gravity. The result is 0 for a mass that is only
+    rounding of the weights. The node has number `local` in a block whose place along x, y, z is `corner`, in ten bits
+    each. `facing` is twice the node's entry in `contact_normal`, plus 1 for its second field; negative: no collider.
     """
     v = ti.Vector([0.0, 0.0, 0.0])
     if mass > SMALLEST_MASS:
@@ -164,7 +144,7 @@ def node_velocity(
                         v = meet(v - surface, arrays.contact_normal[at + field], friction) + surface
                     else:
                         v = meet(v, arrays.contact_normal[at + field], friction)
-        # walls last: whatever a collider leaves, nothing leaves the domain
+        # walls act last, so that a collider cannot push material out of the domain
         index = ti.Vector(
             [
                 (corner >> 20) * BLOCK + (local >> 4),
@@ -188,14 +168,12 @@ def node_velocity(
 
 @ti.func
 def _room(fx, base: ti.i32, axis: ti.template(), shape: ti.template()) -> ti.f32:
-    """The share of a particle's nodes, by weight, that lies between the walls of an axis; of each node the share of its
-    own spline that does.
-    """
+    """Returns the weighted fraction of a particle's nodes, and of their splines, between the walls of an axis."""
     w0, w1, w2 = weights(fx)
     wall = shape[SHAPE.wall_cells]
     room = 0.0
     for offset, w in ti.static(((0, w0), (1, w1), (2, w2))):
-        # in cells within the wall; a node's own spline reaches 1.5 cells
+        # depth in cells within the wall; a node's own spline reaches 1.5 cells
         depth = ti.min(base + offset - (wall - 1), shape[SHAPE.nodes + axis] - wall - base - offset)
         share = 1.0
         if depth == 1:
@@ -218,8 +196,9 @@ def settles(scene: ti.i32, arrays: ti.template()) -> ti.i32:
 
 @ti.func
 def settle(x, volume: ti.f32, mass: ti.f32, scene: ti.i32, arrays: ti.template()) -> ti.f32:
-    """J of a particle of water after an interval, nearer to what its density tells: that of the nodes around, whose
-    masses are interpolated to `mass`.
+    """Returns J of a water particle after an interval, moved towards the volume that its density implies.
+
+    The density follows from `mass`, which is interpolated from the masses of the surrounding nodes.
     """
     scaled = x * arrays.setting[SETTING.inverse_cell_size]
     base = ti.floor(scaled - 0.5, ti.i32)
@@ -243,9 +222,9 @@ def _triangle_list(x, scene: ti.i32, arrays: ti.template()) -> ti.i32:
 
 @ti.func
 def find_hidden(x, scene: ti.i32, elapsed: ti.f32, arrays: ti.template()) -> ti.i32:
-    """Returns in bits which of a particle's nodes sheets hide from it (see surface_kernel.hidden_nodes).
+    """Returns in bits which of a particle's nodes are hidden from it by sheets (see surface_kernel.hidden_nodes).
 
-    All particles that a node is hidden from share its second field. Moving contacts were placed `elapsed` seconds ago.
+    All particles on the hidden side of a node share its second field. Moving contacts are `elapsed` seconds old.
     """
     bits = 0
     list_at = _triangle_list(x, scene, arrays)
@@ -258,9 +237,9 @@ def find_hidden(x, scene: ti.i32, elapsed: ti.f32, arrays: ti.template()) -> ti.
 
 @ti.func
 def move(x, v, C, scene: ti.i32, arrays: ti.template()):
-    """The particle's position and velocity at the end of an interval, as triangles and bounds leave them, and v².
+    """Returns a particle's position and velocity after an interval, constrained by triangles and bounds, and v².
 
-    What is not finite, or leaves the domain, stops its scene; v² is 0 then.
+    A particle that is not finite or leaves the domain stops its scene; v² is then 0.
     """
     out = x + arrays.scene_value[scene, VALUE.interval_elapsed] * v
     speed = v
@@ -293,7 +272,7 @@ def move(x, v, C, scene: ti.i32, arrays: ti.template()):
         arrays.scene_value[scene, VALUE.remaining] = 0.0
         speed_square = 0.0
     elif outside:
-        # a value that is not finite is the better cause to report
+        # a value that is not finite is the better cause to report, so it is not replaced
         if arrays.counter[scene, COUNT.status] != STATUS.not_finite:
             arrays.counter[scene, COUNT.status] = ti.cast(STATUS.left_domain, ti.i64)
         arrays.scene_value[scene, VALUE.remaining] = 0.0
@@ -315,7 +294,7 @@ def is_fluid(material: ti.i32) -> ti.i32:
 
 @ti.func
 def initial_stiffness(material: ti.i32, law: ti.template(), row: ti.i32) -> ti.f32:
-    """(3 lambda + 2 mu) / density of a particle at rest shape."""
+    """Returns (3 lambda + 2 mu) / density of an undeformed particle."""
     stiffness = 3.0 * law[row + CONSTANT.bulk]
     if not is_fluid(material):
         stiffness += 2.0 * law[row + CONSTANT.shear]

@@ -1,14 +1,14 @@
 """Multiple time stepping (Streett et al. 1978) for Taichi kernels: soft particles take longer steps.
 
-The substeps of an interval between two transfers are as short as the stiffest particle of the scene needs. In a
-synchronised interval (see mls_mpm) softer particles take steps of several substeps, as long as their own wave speed
-allows, and compute strain and stress once a step.
+The stiffest particle of a scene determines the substep of an interval between two transfers. In a synchronised interval
+(see mls_mpm) softer particles take steps of several substeps. Their own wave speed limits these steps. They compute
+strain and stress once a step.
 
-The stress acts evenly over the substeps of a step, because particles with shorter steps read the velocities of the same
-nodes in each of them. The whole impulse at once would give them wrong velocities, even at rest.
+The stress of a step acts evenly over its substeps, because particles with shorter steps read the velocities of the same
+nodes in each substep. The whole impulse in one substep would give these particles wrong velocities, even at rest.
 
-Where all particles in a block of nodes take the same steps, its nodes are not read within a step. There the impulse of
-the whole step and of gravity is applied in the first substep, and the block is not updated until the next step.
+If all particles in a block of nodes take the same steps, no particle reads its nodes within a step. Then the block
+receives the impulses of stress and gravity of the whole step in the first substep. It is not updated until the next.
 """
 
 import taichi as ti
@@ -17,13 +17,13 @@ from datagen.mpm.constitutive import foreseen_stiffness
 from datagen.mpm.layout import COUNT, SETTING, SHAPE, VALUE
 from datagen.mpm.nodes import base_node
 
-MANY = 32  # substeps of a step of a particle's own at most, and as far as marks count
-SLACK = 1e-3  # of a substep, within which times are the same
+MANY = 32  # largest number of substeps in a particle's own step; also the base of the marks
+SLACK = 1e-3  # times that differ by less than this fraction of a substep count as equal
 
 
 @ti.func
 def _corner_block(first, last, n: ti.template(), scene: ti.i32, shape: ti.template()) -> ti.i32:
-    """Returns the block at corner n of eight of the blocks `first` to `last` that contain a particle's nodes."""
+    """Returns the index of corner n (0 to 7) of the blocks `first` to `last` that contain a particle's nodes."""
     corner = ti.Vector([last[axis] if n >> (2 - axis) & 1 else first[axis] for axis in range(3)])
     index = (corner[0] * shape[SHAPE.blocks + 1] + corner[1]) * shape[SHAPE.blocks + 2] + corner[2]
     return index + scene * shape[SHAPE.scene_blocks]
@@ -31,10 +31,13 @@ def _corner_block(first, last, n: ti.template(), scene: ti.i32, shape: ti.templa
 
 @ti.func
 def _raise_marks(base, least: ti.i32, scene: ti.i32, arrays: ti.template(), begin: ti.i32):
-    """Marks of all blocks that the nodes from `base` on lie in, from block[begin] on, become `least` at least."""
+    """Raises the marks of all blocks that contain a particle's nodes to `least` or more. Marks start at block[begin].
+
+    `base` is the lowest of the particle's 3³ nodes.
+    """
     first, last = base >> 2, (base + 2) >> 2
     index = ti.Vector([begin + _corner_block(first, last, n, scene, arrays.shape) for n in range(8)])
-    found = ti.Vector([arrays.block[index[n]] for n in range(8)])  # all at once: each is a way to memory
+    found = ti.Vector([arrays.block[index[n]] for n in range(8)])  # loads are issued together to hide the latency
     for n in ti.static(range(8)):
         own = found[n] < least
         for axis in ti.static(range(3)):
@@ -46,10 +49,10 @@ def _raise_marks(base, least: ti.i32, scene: ti.i32, arrays: ti.template(), begi
 
 @ti.func
 def mark_changed(x, scene: ti.i32, now: ti.i32, many: ti.f32, inverse_dx: ti.f32, arrays: ti.template(), begin: ti.i32):
-    """Marks the blocks of the particle's nodes: in the substep `now` it gives them the impulse of `many` substeps.
+    """Marks the blocks of a particle's nodes: in the substep `now` they receive the impulse of `many` substeps.
 
-    A block's mark is block[begin + its index], the largest now MANY + MANY - many of all that change the block: of the
-    latest substep that anything did, by the fewest substeps. change_of reads it.
+    A block's mark is block[begin + its index], the maximum of now MANY + MANY - many over all changes. So it stores the
+    latest substep with a change and the smallest number of substeps among this substep's changes (see change_of).
     """
     base = base_node(x, inverse_dx)
     change = now * MANY + MANY - ti.cast(many, ti.i32)
@@ -60,12 +63,15 @@ def mark_changed(x, scene: ti.i32, now: ti.i32, many: ti.f32, inverse_dx: ti.f32
 def _alike_around(
     x, scene: ti.i32, interval: ti.i32, own: ti.f32, inverse_dx: ti.f32, arrays: ti.template(), begin: ti.i32
 ) -> ti.i32:
-    """Returns whether all particles in the blocks of a particle's nodes began the previous interval with steps of `own`
-    substeps, and marks this particle's step for the next interval.
+    """Returns whether all particles around a particle began the previous interval with steps of `own` substeps.
 
-    A block has four marks, each in an array of all blocks, the first from block[begin] on: the fewest substeps in even
-    intervals, the most in them, and both in odd ones. A mark holds the number of its interval too, so that one from
-    earlier is no match.
+    "Around" means in the blocks of its nodes. It also marks the particle's own step for the next interval.
+    A block has four marks, each in its own array of all blocks; the first array starts at block[begin]:
+
+        smallest number of substeps in even intervals    the largest in even intervals
+        smallest number of substeps in odd intervals     the largest in odd intervals
+
+    A mark contains the number of its interval, so a mark from an earlier interval does not match.
     """
     base = base_node(x, inverse_dx)
     blocks = arrays.shape[SHAPE.all_blocks]
@@ -85,8 +91,9 @@ def _alike_around(
 
 @ti.func
 def change_of(mark: ti.i32, now: ti.i32) -> ti.f32:
-    """Returns the number of substeps whose impulses a block takes in the substep `now`, from its mark (see
-    mark_changed); 0 for a block without changes.
+    """Returns the number of substeps whose impulses a block receives in the substep `now`; 0 without changes.
+
+    `mark` is the block's mark (see mark_changed).
     """
     many = 0.0
     if mark // MANY == now:
@@ -96,8 +103,10 @@ def change_of(mark: ti.i32, now: ti.i32) -> ti.f32:
 
 @ti.func
 def acts(covered: ti.f32, begins: ti.f32, step: ti.f32, scene: ti.i32, scene_value: ti.template()) -> ti.i32:
-    """Returns whether a particle begins its own step in this substep: always in an interval's first one, later if its
-    last stress acts only until `covered` (s, within the interval), before the substep ends.
+    """Returns whether a particle begins its own step in this substep.
+
+    It does in an interval's first substep, and if its last stress ends before the substep does. `covered` is the end of
+    that stress in s from the start of the interval.
     """
     return begins == 1.0 or covered < scene_value[scene, VALUE.interval_elapsed] - SLACK * step
 
@@ -118,21 +127,26 @@ def own_step(
     arrays: ti.template(),
     marks: ti.i32,
 ):
-    """The step of its own that a particle begins in this substep (see acts). Times are in s, within the interval.
+    """Computes the particle's own step that begins in this substep (see acts). Times are in s since the interval began.
 
-    `strained` says until when the steps before have strained the particle, less than 0 before the first of all;
-    `covered` until when their stress acts; `spread` whether evenly. From block[marks] on lie the marks of mark_changed,
-    one a block, then those of _alike_around.
+    strained   end of the strain of the steps before; negative before the first step
+    covered    end of the stress of the steps before
+    spread     1 if that stress acts evenly over its substeps
+    marks      block[marks] is the first mark of mark_changed, one a block; the marks of _alike_around follow
 
-    Returns how long the step strains the particle; the new `strained` and `covered`; how many substeps the stress acts
-    for; the new `spread`; and for how long the stress acts in this substep: for the substep where evenly, else for all
-    of the step that the one before did not cover.
+    Returns six values:
+    1. the time by which the step strains the particle
+    2. the new `strained`
+    3. the new `covered`
+    4. the number of substeps in which the stress acts
+    5. the new `spread`
+    6. the time of stress in this substep: the substep, if spread evenly; else the part that is not yet covered
 
-    In a synchronised interval stress acts from half a step before to half a step after the time that it is of. The
-    first, of the interval's begin, and the last, of its end, act for half a step. What is left to strain is cut into as
-    few equal steps as the particle's own stiffness allows, rounded down to substeps. `alike` is how many substeps such
-    a step has; particles that keep the same `alike` have the same steps. In an interval that is not synchronised, and
-    in the last substep of each, a step is a substep.
+    In a synchronised interval a stress computed at time t acts from half a step before t to half a step after t. The
+    stresses of the interval's begin and end act for half a step. The remaining time of strain is divided into equal
+    steps. They are as long as the particle's stiffness allows, rounded down to substeps. `alike` is their number of
+    substeps; particles with the same `alike` have the same steps. In other intervals, and in the last substep of each,
+    a step is a substep.
     """
     elapsed = arrays.scene_value[scene, VALUE.interval_elapsed]
     left = arrays.scene_value[scene, VALUE.interval_remaining]

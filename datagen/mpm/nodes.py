@@ -1,6 +1,6 @@
-"""Nodes of the grid for Taichi kernels: where they lie in arrays, and quadratic B-splines between them and particles.
+"""Nodes of the grid for Taichi kernels: their places in arrays, and quadratic B-splines between them and particles.
 
-A particle at x reaches the nodes base .. base + 2 with base = floor(x / dx - 1/2); node I lies at I dx. Nodes are
+A particle at x reaches the nodes base .. base + 2 with base = floor(x / dx - 1/2). Node I lies at I dx. Nodes are
 stored by blocks of 4 x 4 x 4, [scene, block, node in block].
 """
 
@@ -11,17 +11,13 @@ from datagen.mpm.layout import BLOCK, BLOCK_NODES, SHAPE
 
 @ti.func
 def weights(fx):
-    """Quadratic B-spline weights of nodes 0, 1, 2 for an offset fx in [0.5, 1.5) cells, per axis."""
-    return (
-        0.5 * (1.5 - fx) ** 2,
-        0.75 - (fx - 1.0) ** 2,
-        0.5 * (fx - 0.5) ** 2,
-    )
+    """Returns the quadratic B-spline weights of nodes 0, 1, 2 for an offset fx in [0.5, 1.5) cells, per axis."""
+    return (0.5 * (1.5 - fx) ** 2, 0.75 - (fx - 1.0) ** 2, 0.5 * (fx - 0.5) ** 2)
 
 
 @ti.func
 def spline(distance: ti.f32) -> ti.f32:
-    """The weight of a node from the distance to it along one axis, in (-1.5, 1.5) cells."""
+    """Returns the weight of a node from its distance along one axis, in (-1.5, 1.5) cells."""
     away = ti.abs(distance)
     outer = 1.5 - away
     return 0.75 - away * away if away < 0.5 else 0.5 * outer * outer
@@ -48,11 +44,11 @@ def mark(
     length: ti.template(),
     length_at: ti.i32,
 ):
-    """Adds the blocks that the particle's nodes lie in, up to eight, to a list.
+    """Adds the blocks of a particle's nodes, up to eight, to a list.
 
-    `block` begins with a flag for each of the all_blocks blocks of all scenes. From `list_begin` on it lists the
-    indices of touched ones, length[length_at] of them; all_blocks after each entry lies its block's place along x, y,
-    z, in ten bits each.
+    `block` begins with a flag for each of the all_blocks blocks of all scenes. The list of touched blocks' indices
+    begins at `list_begin` and has length[length_at] entries. The place of an entry's block along x, y, z, in ten bits
+    each, is stored all_blocks after the entry.
     """
     base = base_node(x, inverse_dx)
     first = base >> 2
@@ -66,7 +62,7 @@ def mark(
             for n in range(8)
         ]
     )
-    flag = ti.Vector([arrays.block[index[n]] for n in range(8)])  # all at once: each is a way to memory
+    flag = ti.Vector([arrays.block[index[n]] for n in range(8)])  # loads are issued together to hide the latency
     for n in ti.static(range(8)):
         fresh = flag[n] == 0
         for axis in ti.static(range(3)):
@@ -85,7 +81,7 @@ def mark(
 def node_places(base, first_entry: ti.i32, shape: ti.template(), entries: ti.template()):
     """Returns the array indices of nodes base .. base + 2 by axis, for `entries` numbers per node.
 
-    Node base + (i, j, k) begins at the sum of entries i, j and k of the three results, the scene at `first_entry`.
+    Node base + (i, j, k) begins at the sum of entries i, j and k of the three results. The scene is at `first_entry`.
     """
     stride_z = BLOCK_NODES * entries
     stride_y = shape[SHAPE.blocks + 2] * stride_z
@@ -116,7 +112,7 @@ def ghost_place(index, scene: ti.i32, arrays: ti.template()) -> ti.i32:
 
 @ti.func
 def interpolate(x, first_node: ti.i32, arrays: ti.template(), inverse_dx: ti.f32):
-    """The velocity at x from the nodes around, and its gradient, APIC's C, 1/s. The scene's begin at `first_node`."""
+    """Returns the velocity at x and its gradient, APIC's C, 1/s, from nodes. `first_node` is the scene's first one."""
     scaled = x * inverse_dx
     base = ti.floor(scaled - 0.5, ti.i32)
     fx = scaled - ti.cast(base, ti.f32)
@@ -151,7 +147,7 @@ def interpolate(x, first_node: ti.i32, arrays: ti.template(), inverse_dx: ti.f32
 
 @ti.func
 def interpolate_hidden(x, v, C, hidden: ti.i32, scene: ti.i32, arrays: ti.template(), inverse_dx: ti.f32):
-    """The v and C that `interpolate` gave, with the second fields of hidden nodes in place of their first."""
+    """Returns v and C of `interpolate` with the second fields of hidden nodes instead of their first."""
     scaled = x * inverse_dx
     base = ti.floor(scaled - 0.5, ti.i32)
     new_v = v

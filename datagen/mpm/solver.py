@@ -26,17 +26,17 @@ from hgn.scene.scene import Scene, whole_cells
 from hgn.scene.shapes import shape_obstacle
 from hgn.schema import ConfigError, require
 
-# that run on a processor at once, of any size: Taichi has kernels compiled with so many registers a thread that two do.
-# With 512 threads a block these are 64, with 256 they are 128, with 128 they are 255
+# Thread blocks that run on a processor concurrently. Taichi compiles kernels for two of any size: a thread has 64
+# registers with 512 threads a block, 128 with 256, and 255 with 128.
 GPU_BLOCKS = 2
-TEAM_THREADS, TEAM_BLOCKS, TEAM_RUN = 256, 3, 4  # of many scenes, which teams take in turn
-EVEN = 0.95  # of the time of a launch, that the mean scene takes at least where each has one block
-SHARED_THREADS, SHARED_BLOCKS = 128, 8  # of a block, where each of a few scenes has so many and more
-SHARED_PARTICLES = 8  # at least, of each of several
-LARGE_PARTICLES = 4096  # for each processor, from which on a scene's blocks are as large as those of many scenes
-WARM_SCENES = 16
-USUAL_PARTICLES = 4_000  # of a random scene
-PARTICLE_BYTES, NODE_BYTES = 340, 50  # of a launch's arrays
+TEAM_THREADS, TEAM_BLOCKS, TEAM_RUN = 256, 3, 4  # for many scenes, which teams compute in turn
+EVEN = 0.95  # with one block a scene, the smallest ratio of the mean scene's time to the launch's
+SHARED_THREADS, SHARED_BLOCKS = 128, 8  # threads a block, and fewest blocks of each of a few scenes
+SHARED_PARTICLES = 8  # fewest particles of such a block
+LARGE_PARTICLES = 4096  # particles per processor above which a scene's blocks are as large as those of many scenes
+WARM_SCENES = 16  # largest number of scenes in a warm-up
+USUAL_PARTICLES = 4_000  # number of particles in a random scene
+PARTICLE_BYTES, NODE_BYTES = 340, 50  # memory of a launch's arrays
 
 __all__ = [
     "SceneFailure",
@@ -61,31 +61,29 @@ def simulate(
     team: Team | None = None,
     stability_fractions: Sequence[float] | None = None,
 ) -> list[Simulated | SceneFailure]:
-    """Simulates `scenes` side by side and returns `frames` frames of each, the initial state among them.
+    """Simulates `scenes` together, and returns `frames` frames of each, the initial state included.
 
-    The scenes may differ in particles, materials, obstacles and gravity, but share domain and cell size. With
-    adaptive time steps particles and grid exchange velocities every dx / transfer_speed_m_s, or every step of stress
-    where that is longer, at most every SPEED_FRACTION dx / |v|max, spread evenly over what is left of the frame. Each
-    scene takes its own steps of stress between: at most stability_fraction dx sqrt(rho / (3 lambda_h + 2 mu_h)). A
-    fixed time step, each with its transfer, is taken ceil(frame / step) times a frame in full, as Taichi Elements does:
-    54 times at 60 Hz and 3.125e-4 s, which is 1.25 % more than the frame.
+    Scenes may differ in particles, materials, obstacles and gravity. They share domain and cell size.
+    With adaptive time steps particles and grid exchange velocities every dx / transfer_speed_m_s, or every step of
+    stress if that is longer, but at least every SPEED_FRACTION dx / |v|max. Intervals are equal up to the end of the
+    frame. Each scene takes its own steps of stress between, of at most stability_fraction dx sqrt(rho / (3 lambda_h +
+    2 mu_h)). A fixed time step has a transfer in each step. It is taken ceil(frame / step) times a frame, as in Taichi
+    Elements: 54 times at 60 Hz and 3.125e-4 s, which is 1.25 % more than the frame.
 
-    `on_frame(t)` is called when frame t of all scenes is complete, from 0.
-    `cpu_threads` counts from the process's first simulation; see `initialise`. `colliders` are the scenes' own from
-    `build_collider`, where they were built before. `team` says who runs a scene; none takes what suits the device and
-    the scenes. `stability_fractions` are the scenes' own where they differ from the config's.
+    `on_frame(t)` is called when frame t of all scenes is complete, from 0. `cpu_threads` applies to the process's first
+    simulation (see `initialise`). `colliders` are results of `build_collider` for the scenes; None: they are built.
+    `team` computes a scene; None: chosen by device and scenes. `stability_fractions` replace the config's.
 
-    On a CPU the result of a scene is the same, bitwise, whatever its batch mates do, and depends on
-    `cpu_threads` only through the number of parts that particles are summed in, min(cpu_threads, 4). Where obstacles
-    move, frames of all scenes are cut into parts (see grid_launch.motion_parts). On a GPU sums are in no fixed order.
+    On a CPU a scene's result does not depend on its batch, bitwise. It depends on `cpu_threads` only by the number of
+    parts in which particles are summed, min(cpu_threads, 4). If obstacles move, frames of all scenes are divided into
+    parts (see grid_launch.motion_parts). On a GPU sums have no fixed order.
 
-    Particles with an entry time are NaN in the frames before; they enter in free flight from the place given.
+    A particle with an entry time is NaN before it; it enters in free flight from its given place. A scene that is not
+    finite, leaves the domain or needs more than MAXIMUM_SUBSTEPS a frame ends as a SceneFailure with cause and frame. A
+    scene without particles has [frames, 0, 3].
 
-    A scene that turns non-finite, leaves the domain or needs more than MAXIMUM_SUBSTEPS a frame ends as a
-    SceneFailure with cause and frame. A scene without particles gives [frames, 0, 3].
-
-    Raises: ConfigError for scenes that do not share a grid, particles outside the walls, obstacles that are
-    not finite, fewer than one frame, or a device that is not there.
+    Raises: ConfigError for scenes that do not share a grid, particles outside the walls, obstacles that are not finite,
+    fewer than one frame, or a missing device.
     """
     require(frames >= 1, "frames", "at least 1", frames)
     require(frame_rate_hz > 0 and math.isfinite(frame_rate_hz), "frame_rate_hz", "a finite number > 0", frame_rate_hz)
@@ -121,7 +119,7 @@ def simulate(
         require(not moving or step_s is None, "fixed_time_step_s", "null where obstacles move", step_s)
         _require_memory(device, batch[0], node_counts)
         if moving or any(scene.emits for scene in batch[0]):
-            team = Team(0)  # contacts that move are placed between launches, and particles enter there
+            team = Team(0)  # moving contacts are placed, and particles enter, between launches
         elif team is None:
             team = _team(device, [scene.particle_count for scene in batch[0]])
         with _arrays_freed_here():
@@ -157,21 +155,23 @@ def _launched(launch: Launch, frames: int, on_frame: Callable[[int], None] | Non
 
 @contextlib.contextmanager
 def _arrays_freed_here() -> Iterator[None]:
-    """Taichi's copies leave arrays in reference cycles, which are freed by whichever thread happens to collect garbage;
-    one that has no CUDA context ends the process. So garbage is collected by this thread alone.
+    """Collects garbage in this thread only.
+
+    Taichi's copies leave arrays in reference cycles, which are freed by the thread that happens to collect garbage. A
+    thread without CUDA context would end the process.
     """
     automatic = gc.isenabled()
     gc.disable()
     try:
         yield
     finally:
-        gc.collect(1)  # all that was made here; generation 2 is older, and takes a third of a second with torch
+        gc.collect(1)  # all garbage of this call; generation 2 is older, and takes a third of a second with torch
         if automatic:
             gc.enable()
 
 
 def warm_up(scene: SceneConfig, config: MpmConfig, scenes: int) -> None:
-    """Starts a GPU and compiles what a launch of so many random scenes of `scene` needs; nothing on a CPU."""
+    """Starts a GPU and compiles the kernels for a launch of `scenes` random scenes. Does nothing on a CPU."""
     device = initialise(config.device)
     if device.kind == "cpu":
         return
@@ -197,7 +197,7 @@ def warm_up(scene: SceneConfig, config: MpmConfig, scenes: int) -> None:
 
 
 def _team(device: Device, counts: Sequence[int]) -> Team:
-    """Who runs scenes of so many particles soonest."""
+    """Returns the team that is expected to compute scenes with these particle counts fastest."""
     scenes, most = len(counts), max(counts)
     if device.kind == "cpu" or most > MAXIMUM_PARTICLES:
         return Team(0)
@@ -207,12 +207,12 @@ def _team(device: Device, counts: Sequence[int]) -> Team:
     room = _blocks_at_once(device)
     blocks = min(room // scenes, -(-most // SHARED_PARTICLES))
     if blocks >= SHARED_BLOCKS:
-        # where each thread has a particle at most, it is done sooner alone
+        # with at most one particle a thread, sums over runs of particles do not pay
         return Team(SHARED_THREADS, blocks, 1) if most <= SHARED_THREADS * blocks else Team(SHARED_THREADS, blocks)
     rounds = -(-scenes // room)
     if scenes > EVEN * rounds * room and sum(counts) > EVEN * scenes * most:
-        return Team(TEAM_THREADS)  # all are done at once
-    # a launch lasts as long as its longest scene: a larger team is done with that sooner, a smaller one waits less
+        return Team(TEAM_THREADS)  # all scenes end at about the same time
+    # a launch lasts as long as its longest scene: a larger team computes it sooner, a smaller team waits less
     return Team(TEAM_THREADS, max(blocks, TEAM_BLOCKS), TEAM_RUN)
 
 
@@ -221,7 +221,7 @@ def _blocks_at_once(device: Device) -> int:
 
 
 def _teams_at_once(device: Device, team: Team) -> int:
-    """Returns the number of teams that run at once; blocks of a team wait for each other."""
+    """Returns the number of teams that run concurrently. Blocks of a team wait for each other."""
     room = _blocks_at_once(device)
     require(team.blocks <= room, "team.blocks", f"at most {room}, which run at once", team.blocks)
     return room // team.blocks

@@ -5,24 +5,25 @@ import taichi as ti
 from datagen.mpm.layout import COUNT, SETTING
 from datagen.mpm.sweep import ON_TRIANGLE
 
-CLEARANCE = 1e-3  # cells from a triangle, nearer than which a particle may not come; rounding is 1e-5
-STOP = 1.5 * CLEARANCE  # where it is put, so that rounding does not bring it nearer
-EDGE = 1e-4  # of a triangle's edge: how far past it a crossing still counts, so that none slips between two
-# Vectors of a node's contact: what is free for particles that see it, and for those that a sheet hides it from (zero
-# where all motion is), the friction of each, and the mass from which on the node stops each
+CLEARANCE = 1e-3  # smallest distance of a particle from a triangle, in cells; rounding is 1e-5
+STOP = 1.5 * CLEARANCE  # distance at which a particle is placed, so that rounding brings it no nearer
+EDGE = 1e-4  # distance beyond an edge, relative to it, at which a crossing counts; closes gaps between triangles
+# Vectors of a node's contact: the free direction for particles that see the node, and for those from which a sheet
+# hides it (zero if all motion is free); the friction of each; the smallest mass with which the node stops each
 NODE_VECTORS = 4
-MOVING_NODE_VECTORS = 6  # and the surface's velocity in each, domain units a second
-TRIANGLE_VECTORS = 5  # those of datagen.mpm.sweep.Sweep, and its friction
-MOVING_TRIANGLE_VECTORS = 7  # and its first corner's velocity, cells a second, and its angular velocity
-LIST_HEAD = 2  # of a list of triangles: how many, and how many of them sheets', which come first
-STENCIL = 27  # nodes of a particle
-ATTEMPTS = 3  # to end a way before all triangles
+MOVING_NODE_VECTORS = 6  # in addition the surface's velocity in each field, domain units a second
+TRIANGLE_VECTORS = 5  # the vectors of datagen.mpm.sweep.Sweep, and the friction
+MOVING_TRIANGLE_VECTORS = 7  # in addition the first corner's velocity, cells a second, and the angular velocity
+LIST_HEAD = 2  # head of a list: number of triangles, and number of those of sheets, which come first
+STENCIL = 27  # number of nodes of a particle
+ATTEMPTS = 3  # number of triangles that may stop a path; the third stops the particle
 
 
 @ti.func
 def meet(v, normal, friction: ti.f32):
-    """The velocity that a surface leaves: separation is free; approach ends, and Coulomb friction brakes what slides by
-    at most the coefficient times the speed that the approach lost.
+    """Returns the velocity after contact with a surface: separation is free, and approach ends.
+
+    Coulomb friction reduces the sliding speed by at most the coefficient times the lost approach speed.
     """
     out = v
     along = v.dot(normal)
@@ -34,15 +35,17 @@ def meet(v, normal, friction: ti.f32):
 
 @ti.func
 def _drift(scaled, triangle: ti.i32, contact_normal: ti.template()):
-    """The velocity of a moving triangle where a particle is, cells a second."""
+    """Returns the velocity of a moving triangle at a particle, cells a second."""
     return contact_normal[triangle + 5] + contact_normal[triangle + 6].cross(scaled - contact_normal[triangle])
 
 
 @ti.func
 def hidden_nodes(scaled, list_at: ti.i32, elapsed: ti.f32, arrays: ti.template(), moving: ti.template()) -> ti.i32:
-    """Returns which of a particle's nodes sheets hide from it: bit 9 i + 3 j + k is 1 if the line to node base +
-    (i, j, k) crosses a triangle of a sheet. The particle is at `scaled`, in cells; its base node's list begins at
-    list_at. Triangles have moved for `elapsed` seconds since they were listed; the sides of nodes date from then.
+    """Returns which of a particle's nodes sheets hide from it.
+
+    Bit 9 i + 3 j + k is 1 if the line to node base + (i, j, k) crosses a triangle of a sheet. The particle is at
+    `scaled`, in cells; its base node's list begins at list_at. Triangles have moved for `elapsed` seconds since the
+    list was built. The sides of nodes are those of that time.
     """
     bits = 0
     to_base = ti.floor(scaled - 0.5) - scaled
@@ -77,11 +80,11 @@ def hidden_nodes(scaled, list_at: ti.i32, elapsed: ti.f32, arrays: ti.template()
 def _first_crossing(
     start, end, list_at: ti.i32, elapsed: ti.f32, interval: ti.f32, arrays: ti.template(), moving: ti.template()
 ):
-    """The triangle that the way from start to end (in cells) meets first, of the list that begins at list_at.
+    """Returns the first triangle of the list at list_at that the path from start to end (in cells) meets.
 
-    Returns the fraction of the way (2 where there is none), the end without what of it leads through the triangle, the
-    direction that is free there (the triangle's normal on the side of the start), the friction, and the triangle's
-    velocity in cells a second. Triangles have moved for `elapsed` seconds when the particle starts.
+    Results: the fraction of the path (2 without a triangle); the end, moved back in front of the triangle; the free
+    direction (the triangle's normal on the side of the start); the friction; the triangle's velocity in cells a second.
+    Triangles have moved for `elapsed` seconds when the particle starts.
     """
     first = 2.0
     stop = end
@@ -95,7 +98,7 @@ def _first_crossing(
         begin = start - corner
         finish = end - corner
         drift = ti.Vector([0.0, 0.0, 0.0])
-        if ti.static(moving):  # in the frame in which the triangle lies where it was listed
+        if ti.static(moving):  # in the frame of the triangle at the time of the list
             drift = _drift(start, triangle, arrays.contact_normal)
             begin -= elapsed * drift
             finish -= (elapsed + interval) * drift
@@ -132,10 +135,10 @@ def stop_at_surface(
     arrays: ti.template(),
     moving: ti.template(),
 ):
-    """The place that a particle from x reaches on its way to out, and its velocity there.
+    """Returns the end of a particle's path from x to out, and its velocity there.
 
-    A triangle in the way takes what leads through it, and the particle slides on along it with what its friction leaves
-    of the velocity. What then leads through a third triangle (in a corner) stays at x.
+    A triangle in the path stops motion through it. The particle slides along it with the velocity that friction leaves.
+    If a third triangle is in the path (in a corner), the particle stays at x.
     """
     dx = arrays.setting[SETTING.cell_size]
     start = x * arrays.setting[SETTING.inverse_cell_size]
@@ -172,6 +175,6 @@ def place_contacts(
     where: ti.types.ndarray(dtype=ti.i32, ndim=1),
     value: ti.types.ndarray(dtype=ti.i32, ndim=1),
 ):
-    """contact[where] = value."""
+    """Sets contact[where] = value."""
     for i in range(where.shape[0]):
         contact[where[i]] = value[i]

@@ -1,20 +1,20 @@
 """Singular value decomposition of 3 x 3 matrices in float32, for Taichi kernels.
 
-Jacobi rotations diagonalise AᵀA; the columns of A V are then made orthogonal from the largest to the smallest,
-so that A = U diag(sigma) Vᵀ holds to a few float32 roundings of the largest singular value also where A is
-singular or inverted. U and V are rotations; an inverted A gives its smallest singular value a minus sign.
+Jacobi rotations diagonalise AᵀA. Then the columns of A V are made orthogonal, from the largest to the smallest. So
+A = U diag(sigma) Vᵀ holds to a few float32 roundings of the largest singular value, also for singular and inverted A. U
+and V are rotations. An inverted A gives its smallest singular value a minus sign.
 """
 
 import taichi as ti
 
 SWEEPS = 6
-# of sqrt(a_pp a_qq): below it an off-diagonal term is rounding
+# relative to sqrt(a_pp a_qq); a smaller off-diagonal term is rounding
 OFF_DIAGONAL_SQUARE = 1e-14
 
 
 @ti.func
 def _inverse_root(x: ti.f32) -> ti.f32:
-    """1 / sqrt(x) to rounding: a GPU's own is off by more."""
+    """Returns 1 / sqrt(x) to rounding. A GPU's own function is less accurate."""
     y = ti.rsqrt(x)
     return y * (1.5 - 0.5 * x * y * y)
 
@@ -23,7 +23,7 @@ def _inverse_root(x: ti.f32) -> ti.f32:
 def _rotate(S: ti.template(), V: ti.template(), p: ti.template(), q: ti.template()):
     r = ti.static(3 - p - q)
     apq = S[p, q]
-    # the half of the angle whose tangent is 2 a_pq / (a_qq - a_pp), at most 45 degrees
+    # the rotation has half the angle whose tangent is 2 a_pq / (a_qq - a_pp), so at most 45 degrees
     difference = S[q, q] - S[p, p]
     inverse = _inverse_root(difference * difference + 4.0 * apq * apq)
     square = 0.5 + 0.5 * ti.abs(difference) * inverse
@@ -57,7 +57,7 @@ def _significant(S: ti.template(), p: ti.template(), q: ti.template()) -> ti.i32
 
 @ti.func
 def _swap_columns(B: ti.template(), V: ti.template(), square: ti.template(), p: ti.template(), q: ti.template()):
-    """Orders columns p < q by length, descending; one of the two changes sign, so V stays a rotation."""
+    """Orders columns p < q by length, descending. One of the two changes its sign, so V stays a rotation."""
     if square[p] < square[q]:
         square[p], square[q] = square[q], square[p]
         for i in ti.static(range(3)):
@@ -71,7 +71,7 @@ def _swap_columns(B: ti.template(), V: ti.template(), square: ti.template(), p: 
 
 @ti.func
 def _perpendicular(u: ti.template()) -> ti.math.vec3:
-    """A unit vector perpendicular to the unit vector u."""
+    """Returns a unit vector perpendicular to the unit vector u."""
     other = ti.Vector([1.0, 0.0, 0.0])
     if ti.abs(u[0]) > 0.6:
         other = ti.Vector([0.0, 1.0, 0.0])
@@ -81,7 +81,7 @@ def _perpendicular(u: ti.template()) -> ti.math.vec3:
 
 @ti.func
 def svd3(A: ti.template()):
-    """U, sigma, V of a finite matrix; sigma descends in size, and only its last is negative beyond rounding."""
+    """Returns U, sigma, V of a finite matrix. sigma descends in size; only its last can be negative beyond rounding."""
     scale = 0.0
     for i, j in ti.static(ti.ndrange(3, 3)):
         scale = ti.max(scale, ti.abs(A[i, j]))
@@ -118,7 +118,7 @@ def svd3(A: ti.template()):
         b1 -= u0 * u0.dot(b1)
         length_square = b1.dot(b1)
         u1 = _perpendicular(u0)
-        if length_square > 1e-14:  # of the largest entry's square: below it the direction is rounding
+        if length_square > 1e-14:  # relative to the largest entry's square; below it the direction is rounding
             u1 = b1 * _inverse_root(length_square)
             u1 -= u0 * u0.dot(u1)
             u1 *= _inverse_root(u1.dot(u1))

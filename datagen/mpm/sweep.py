@@ -1,7 +1,7 @@
-"""Lists of the triangles near particles, by base node: a particle may not cross them, and sheets may hide nodes.
+"""Lists of triangles near particles, by base node: a particle may not cross them, and sheets may hide nodes.
 
-A particle with base node I lies half to one and a half cells above it along each axis, and its nodes are I to I + 2.
-So all points on the way to a node, or within half a cell, lie between I and I + 2. All lengths are in cells.
+A particle with base node I lies half to one and a half cells above it along each axis. Its nodes are I to I + 2. So all
+points on the path to a node, or within half a cell, lie between I and I + 2. All lengths are in cells.
 Shape legend: F triangles, K base nodes near triangles, L entries of all lists.
 """
 
@@ -14,23 +14,23 @@ import numpy as np
 
 from hgn.scene.distance import dot
 
-# cells: a node nearer to a triangle counts as on the side of the normal, whatever the rounding
+# cells; a node nearer to a triangle's plane counts as on the side of the normal, despite rounding
 ON_TRIANGLE = 1e-4
-SMALLEST_SLOPE = 1e-6  # of a normal along z; a plane that is steeper counts as this steep
-SLAB_MARGIN = 1e-2  # cells; more than that and rounding change
-COLUMNS_PER_CHUNK = 1 << 11  # of nodes along z, held at once: some 20,000 pairs, which stay in a core's cache
+SMALLEST_SLOPE = 1e-6  # smallest component of a normal along z; a steeper plane gets this component
+SLAB_MARGIN = 1e-2  # cells; larger than SMALLEST_SLOPE's effect and rounding
+COLUMNS_PER_CHUNK = 1 << 11  # columns of nodes along z in a pass; about 20,000 pairs, which fit into a core's cache
 
 
 @dataclass(frozen=True, eq=False)
 class Sweep:
     """Triangles, and for each base node near them a list of those that its particles may meet, sheets first."""
 
-    # float32: a corner, the unit normal, and two vectors; the products of these with an offset from the corner are its
-    # coordinates along the two edges that begin there
+    # float32: a corner, the unit normal, and two vectors; the products of these vectors with an offset from the corner
+    # are the offset's coordinates along the two edges at the corner
     triangle_F43: np.ndarray
     obstacle_F: np.ndarray  # int32, index of the triangle's obstacle
     base_K3: np.ndarray  # int32
-    begin_K: np.ndarray  # int64, into triangle_L; a list ends where the next begins
+    begin_K: np.ndarray  # int64, begin of each list in triangle_L; it ends at the next begin
     sheets_K: np.ndarray  # int32, number of triangles of sheets in each list
     triangle_L: np.ndarray  # int32
 
@@ -83,15 +83,15 @@ def near_pairs(
 ) -> Iterator[tuple[np.ndarray, ...]]:
     """Yields chunks of (node, triangle index), int64 [3, P] and [P], one triangle after another.
 
-    The nodes lie in each triangle's box widened by `band` cells. Most that are more than `slab_F` cells from its plane
-    are left out: a large triangle's box has many more nodes than its surroundings.
+    The nodes lie in each triangle's box widened by `band` cells. Most nodes more than `slab_F` cells from its plane are
+    omitted, because a large triangle's box has many more nodes than its surroundings.
     """
     low = np.clip(np.ceil(triangle_F33.min(axis=1) - band), 0, np.array(shape)).astype(np.int64)
     high = np.clip(np.floor(triangle_F33.max(axis=1) + band) + 1, 0, np.array(shape)).astype(np.int64)
     size = np.maximum(high - low, 0)
-    columns = size[:, 0] * size[:, 1] * (size[:, 2] > 0)  # of nodes along z
+    columns = size[:, 0] * size[:, 1] * (size[:, 2] > 0)  # number of columns of nodes along z
     end = np.cumsum(columns)
-    # the slab meets a column at the plane's height there, and so far above and below
+    # the slab meets a column at the plane's height there, and within `half` above and below
     steep = np.where(np.abs(normal_F3[:, 2]) > SMALLEST_SLOPE, normal_F3[:, 2], SMALLEST_SLOPE)
     half = (slab_F + SLAB_MARGIN) / np.abs(steep)
     offset = (triangle_F33[:, 0] * normal_F3).sum(axis=1)

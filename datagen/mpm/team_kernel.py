@@ -1,14 +1,14 @@
-"""Frames of explicit MLS-MPM in one launch, with a team of threads for each scene: the fast way on a GPU.
+"""Frames of explicit MLS-MPM in one launch, with a team of threads for each scene: the fastest way on a GPU.
 
 The method and its parts are those of datagen.mpm.mls_mpm. A scene of a few thousand particles needs hundreds of steps a
-frame, each of a few microseconds, so a team runs a scene step after step within one launch, independently of other
-scenes. A team is one or several thread blocks that share a scene's particles and wait for each other
-(datagen.mpm.team_meeting), so all blocks of a launch must run at the same time. A team takes one scene after another.
+frame, each of a few microseconds. So a team computes step after step of a scene within one launch, independently of
+other scenes. A team is one or several thread blocks that share a scene's particles and wait for each other
+(datagen.mpm.team_meeting), so all blocks of a launch must run concurrently. A team computes one scene after another.
 
-Strain, stress and contact with triangles are computed by one thread for each particle. At each frame the particles are
-sorted by their cells into the other copy of the state, so that neighbours in space are neighbours in memory.
+One thread for each particle computes strain, stress and contact with triangles. At each frame the particles are sorted
+by their cells into the other copy of the state, so that neighbours in space are neighbours in memory.
 
-With one thread a block it runs on a CPU too, where tests compare it with the other kernel.
+With one thread a block the kernel also runs on a CPU, where tests compare it with the other kernel.
 """
 
 from collections import namedtuple
@@ -62,11 +62,11 @@ from datagen.mpm.team_transfers import gather, scatter, update_nodes
 from datagen.mpm.time_step import raise_maximum
 from hgn.scene.material import MATERIAL_BITS, MATERIAL_MASK, SAND, WATER
 
-CPU_ITEMS = 512  # of a loop, that Taichi gives to a thread of a CPU at once: a block of one thread
-CHUNK = 32  # particles that follow each other, of one block of a team
+CPU_ITEMS = 512  # consecutive loop items that Taichi gives to a CPU thread; they form a block of one thread
+CHUNK = 32  # number of consecutive particles that belong to the same block of a team
 
 
-# The arguments of `advance`, which its functions take as one. Taichi resolves the names as it compiles.
+# The arguments of `advance`, passed to its functions as one. Taichi resolves the names during compilation.
 TeamArrays = namedtuple(
     "TeamArrays",
     [
@@ -90,9 +90,10 @@ def _strain(
     some_wait: ti.i32,
     arrays: ti.template(),
 ):
-    """The materials' answer of each particle that acts to the gradient of the nodes' velocities, left in place of C; in
-    the first step of an interval to C, and also which nodes it touches. Where particles take steps of their own, those
-    act that list_acting found, else all.
+    """Computes the materials' response of particles that act in this substep, and writes it over C.
+
+    It uses the gradient of the nodes' velocities. In the first step of an interval it uses C, and also marks the blocks
+    that a particle touches. If particles take their own steps, those listed by list_acting act; otherwise all do.
     """
     solid = ti.static(has_solid(arrays.variant))
     intervals = ti.static(not arrays.variant & VARIANT.each_step)
@@ -174,7 +175,7 @@ def _strain(
 
 @ti.func
 def _move(share: ti.template(), thread: ti.template(), particles: ti.i32, tags: ti.i32, arrays: ti.template()):
-    """New velocities and their gradients, as obstacles leave them, and new positions."""
+    """Computes new velocities and their gradients after contact with obstacles, and new positions."""
     largest = 0.0
     own = thread.lane
     while own < share.owned:
@@ -239,21 +240,23 @@ def advance(
 ):
     """Advances every scene by `frames` frames, and writes each frame's positions to output[frame, particle, axis].
 
-    Each of `teams` has `blocks` blocks of `threads` threads, and takes one scene after another, `stretch` frames of
-    each until it is its turn again; with `several` blocks all of the launch have to run at once. Particles are sorted
-    at the begin of each frame. With P particles and G nodes of all scenes there are at addresses (see device_memory)
-    state [2 * fields * P], and node [2, G, 4], which holds what comes to momentum in a step and to mass in an interval,
-    zero between them, and then velocities, with the mass for an interval's end. Arrays: tag [2 * 3 * P]; rank, spread,
-    response [6 * P], hidden (see grid_kernel.substep) and column_list [P] are work space; cell_count [G], column_count
-    [G / 4], the flags in block [8 * G / 64], columns [6 * blocks * teams] and meeting [MEETING * (teams + 1) + scenes]
-    are zero at first; turn [scenes] says which scene comes when (long ones first). A scene that failed keeps still.
+    Each of `teams` teams has `blocks` blocks of `threads` threads. It computes `stretch` frames of one scene, then of
+    the next, until all are done. With `several` blocks, all blocks of the launch must run concurrently. Particles are
+    sorted at the begin of each frame. P and G are the numbers of particles and nodes of all scenes.
+
+    At addresses (see device_memory): state [2 * fields * P]; node [2, G, 4], first changes of momentum in a step and
+    of mass in an interval (zero between them), then velocities, and at an interval's end the mass.
+    Arrays: tag [2 * 3 * P]; work space rank, spread, response [6 * P], hidden (see grid_kernel.substep) and column_list
+    [P]; zero at first are cell_count [G], column_count [G / 4], the flags in block [8 * G / 64], columns
+    [6 * blocks * teams] and meeting [MEETING * (teams + 1) + scenes]; turn [scenes] is the order of the scenes, long
+    ones first. Scenes that failed do not change.
     """
     ti.loop_config(block_dim=threads)
     for item in range(teams * (blocks * ti.static(threads if threads > 1 else CPU_ITEMS))):
         fields = ti.static(FIELD.solid if has_solid(variant) else FIELD.fluid)
         items = ti.static(threads if threads > 1 else CPU_ITEMS)
         members = blocks * threads
-        # a CPU's threads take a stretch of items each: blocks that wait for each other are not of the same
+        # a CPU thread gets consecutive items, so blocks that wait for each other must not be among the same items
         team = item // items % teams
         part = item // items // teams
         lane = item % items
@@ -278,7 +281,7 @@ def advance(
         if lane < threads:
             if member == 0:
                 take_turn(at, meeting)
-            # whether all blocks are at work at once shows before anything is simulated
+            # this meeting shows before the simulation whether all blocks run concurrently
             meet_team(thread, meetings, arrays)
             if frames > 0 and columns[segment + LEAVES] == 0:
                 turns = scenes * ((frames + stretch - 1) // stretch)
@@ -342,7 +345,7 @@ def advance(
                         meet_team(thread, meetings, arrays)
                         if ti.static(listed):
                             start_lists(thread, columns)
-                        # a thread that hardly has nodes of its own, while the others are at theirs
+                        # the last thread has few nodes of its own, so it chooses while the others update theirs
                         if not ends and member == members - 1:
                             choose(scene, arrays)
                         update_nodes(
@@ -390,7 +393,7 @@ def start_team(
     law: Scalars,
     fields: ti.template(),
 ):
-    """Particles at rest shape in the first copy, order[p] as p, and the maxima that the first time step needs."""
+    """Writes undeformed particles into the first copy, order[p] at p, and the maxima for the first time step."""
     for p in range(label.shape[0]):
         stride = label.shape[0]
         source = order[p]

@@ -1,4 +1,4 @@
-"""Whole frames of all scenes a launch, a team of GPU threads for each scene."""
+"""Runs whole frames of all scenes in a launch, with a team of GPU threads for each scene."""
 
 from __future__ import annotations
 
@@ -21,28 +21,28 @@ from datagen.mpm.host_copy import HostCopy  # isort: skip
 from datagen.mpm.team_meeting import APART, MEETING, SEGMENT  # isort: skip
 from datagen.mpm.team_transfers import LANES  # isort: skip
 
-LAUNCH_SECONDS = 6.0  # aimed at: one launch runs as many frames as fit in; scenes wait for each other at its end
-MAXIMUM_OUTPUT_BYTES = 2**30  # of positions, a launch
-MAXIMUM_PARTICLES = (2**31 - 1) // (2 * FIELD.solid)  # whose fields kernels count in int32
-PAUSE = 0.8  # of the time that a launch is expected to take
-SHORT_SECONDS = 0.1  # of a launch that nobody sleeps for
-PATIENCE = (2**31 - 1, 2**22)  # looks at a counter, of a CPU's and a GPU's block: seconds
+LAUNCH_SECONDS = 6.0  # target time of a launch, which determines its frames; scenes wait for each other at its end
+MAXIMUM_OUTPUT_BYTES = 2**30  # largest size of a launch's positions
+MAXIMUM_PARTICLES = (2**31 - 1) // (2 * FIELD.solid)  # largest number of particles whose fields int32 can count
+PAUSE = 0.8  # fraction of a launch's expected time in which the host sleeps
+SHORT_SECONDS = 0.1  # launches that are expected to be shorter are awaited without sleep
+PATIENCE = (2**31 - 1, 2**22)  # largest number of reads of a counter on a CPU and on a GPU; the latter takes seconds
 
 
 class Team(NamedTuple):
-    """Who runs a scene: so many thread blocks, which wait for each other, so all of them have to be at work at once."""
+    """The thread blocks that compute a scene. They wait for each other, so all must run concurrently."""
 
-    threads: int  # of a block: of a GPU a multiple of 32, of a CPU 1; 0: nobody, but one launch a substep
+    threads: int  # threads a block: a multiple of 32 on a GPU, 1 on a CPU; 0: no team, one launch a substep
     blocks: int = 1
-    run: int = 8  # particles in the order of their cells, that a thread adds up before it adds to nodes
+    run: int = 8  # number of particles that a thread sums, in the order of their cells, before it adds to nodes
 
 
 class BlocksApartError(Exception):
-    """Blocks that wait for each other were not all at work at once."""
+    """Blocks that wait for each other did not run concurrently."""
 
 
 class TeamLaunch(Launch):
-    """Particles in one array, field by field, in two copies."""
+    """Runs a batch with teams. Particles are in one array, field by field, in two copies."""
 
     entries_a_node = 2 * LANES
 
@@ -91,7 +91,7 @@ class TeamLaunch(Launch):
         )  # fmt: skip
 
     def _order(self) -> np.ndarray:
-        """Particles in the order that the kernel sorts them into, int32 [P]."""
+        """Returns the particles in the order in which the kernel sorts them, int32 [P]."""
         keys = []
         for index, scene in enumerate(self.scenes):
             base = np.floor(scene.position_N3 / scene.cell_size - 0.5).astype(np.int32)
@@ -111,18 +111,18 @@ class TeamLaunch(Launch):
         most = max(1, MAXIMUM_OUTPUT_BYTES // (12 * self.particles))
         done, size, substeps, expected = 0, min(1, frames), np.zeros(len(self.scenes), np.int64), 0.0
         work = np.array([scene.particle_count for scene in self.scenes])
-        self._launch(0, work)  # compiles
+        self._launch(0, work)  # compiles the kernel
         self._require_together()
         begin, output = time.perf_counter(), self._launch(size, work)
         while size:
-            # Taichi holds the interpreter's lock while it waits for the device: other threads run before that
+            # Taichi keeps the interpreter's lock while it waits for the device; this sleep lets other threads run
             pause = PAUSE * min(expected * size, LAUNCH_SECONDS)
             if pause > SHORT_SECONDS:
                 time.sleep(max(0.0, begin + pause - time.perf_counter()))
             woken = time.perf_counter()
             position = self.host_copy.read(output).reshape(size, self.particles, 3)
             taken = time.perf_counter() - begin
-            if pause > SHORT_SECONDS and taken < 1.05 * (woken - begin):  # it was done before, nobody knows when
+            if pause > SHORT_SECONDS and taken < 1.05 * (woken - begin):  # it ended at an unknown time before
                 taken *= 0.5
             self._require_together()
             total = self.counter.to_numpy()[:, COUNT.substeps]
@@ -131,9 +131,9 @@ class TeamLaunch(Launch):
             done += size
             expected = taken / size
             size = min(max(1, min(2 * size, int(LAUNCH_SECONDS / expected))), most, frames - done)
-            del output  # before the device is at work: memory may only come free when it rests
-            gc.collect(0)  # its cycle, see solver: none is collected by itself
-            # which it does not need to while these frames are taken away
+            del output  # before the next launch: memory may be freed only while the device is idle
+            gc.collect(0)  # frees its reference cycle; see solver: collection is not automatic
+            # the device computes while the caller processes these frames
             begin, output = time.perf_counter(), self._launch(size, work)
             yield position, completed
 
@@ -142,13 +142,14 @@ class TeamLaunch(Launch):
             raise BlocksApartError
 
     def _launch(self, frames: int, work: np.ndarray) -> ti.ScalarNdarray:
-        """Starts that many frames of the scenes, long ones first so that none is left alone at the end; the positions
-        once the device is done.
+        """Starts `frames` frames of the scenes. Returns the array of their positions, valid when the device is done.
+
+        Scenes with much work come first, so that none runs by itself at the end.
         """
         output = ti.ndarray(ti.f32, 3 * max(frames, 1) * self.particles)
         self.turn.from_numpy(np.argsort(-work, kind="stable").astype(np.int32))
         self.meeting.fill(0)
-        # a frame in turn: else most teams had no scene while the last ones are done
+        # one frame a turn, because otherwise most teams would be without a scene during the last ones
         stretch = 1 if self.teams < len(self.scenes) else max(frames, 1)
         team_kernel.advance(
             frames, stretch, self.teams, self.team.blocks, PATIENCE[self.team.threads > 1], self.frame_s,

@@ -17,15 +17,15 @@ from datagen.mpm.multiple_time_stepping import acts, mark_changed
 from datagen.mpm.team_meeting import ACTING, GOING_ON, WARP
 from datagen.mpm.team_particles import dealt, get_vector
 
-FULL = 0xFFFFFFFF  # all threads of a warp
+FULL = 0xFFFFFFFF  # mask of all threads of a warp
 IDLE = -(2**31)
 
 
 @ti.func
 def _places(entry, arrays: ti.template(), thread: ti.template()):
-    """Returns the positions of this thread's new entries in three lists; an entry is new where `entry` is 1.
+    """Returns the positions of this thread's new entries in three lists. An entry is new if `entry` is 1.
 
-    All threads of a warp get their positions together, in their order.
+    All threads of a warp get their positions together, in thread order.
     """
     before = ti.Vector([0, 0, 0])
     if ti.static(arrays.threads > 1):
@@ -89,7 +89,7 @@ def mark_going_on(share: ti.template(), thread: ti.template(), particles: ti.i32
 
 @ti.func
 def start_lists(thread: ti.template(), columns: ti.template()):
-    """Counts of 0, which the block sees after its next meeting."""
+    """Sets the counts to 0. The block sees this after its next meeting."""
     if thread.lane == 0:
         for i in ti.static(range(3)):
             columns[thread.segment + ACTING + i] = 0
@@ -105,8 +105,9 @@ def gives_now(
     some_wait: ti.i32,
     arrays: ti.template(),
 ) -> ti.i32:
-    """Returns whether a particle begins its own step, in a block whose particles keep their order; fills its entry in
-    `giving`, and marks a particle that continues its step.
+    """Returns whether a particle begins its own step. It writes the particle's entry in `giving`.
+
+    It also marks a particle that continues its step. The block's particles keep their order.
     """
     begins_own = acts(arrays.covered[share.first + p], 0.0, step, share.scene, arrays.scene_value)
     if begins_own:

@@ -1,8 +1,8 @@
 """Barriers between the thread blocks of a team: counters in global memory.
 
-On a CPU a block has one thread. A block reads the counter `patience` times at most: blocks that do not run at the same
-time would wait for each other for ever. Then it sets meeting[APART] and columns[segment + LEAVES], all blocks leave the
-launch, and its results are discarded.
+On a CPU a block has one thread. A block reads a counter at most `patience` times, because blocks that do not run
+concurrently would wait for each other forever. Then it sets meeting[APART] and columns[segment + LEAVES]. All blocks
+leave the launch, and its results are discarded.
 """
 
 import taichi as ti
@@ -11,18 +11,18 @@ from datagen.mpm.layout import LIVE, SHAPE, VALUE
 from datagen.mpm.time_step import choose_time_step, raise_maximum
 
 WARP = 32
-MEETING = 96  # integers of a team, in thirds: how many blocks have come, how often all were let go, its next turn
+MEETING = 96  # integers of a team, in thirds: number of blocks that arrived, number of releases, its next turn
 TURN = 2 * MEETING // 3
-QUEUE, APART = 0, 1  # before the teams' own: turns that were taken, and whether blocks are not at work at once
-SEGMENT, LEAVES = 6, 2  # integers of a block, and which of them says that it leaves
-ACTING, GOING_ON, GIVING = 3, 4, 5  # which of them are counts of its lists (see team_lists)
-EVER = 2**31 - 1  # looks
-LOOKS = 64  # at a counter, between two at whether all leave
+QUEUE, APART = 0, 1  # before the teams' integers: number of turns taken, and 1 if blocks do not run concurrently
+SEGMENT, LEAVES = 6, 2  # integers of a block, and the index of the one that is set when it leaves
+ACTING, GOING_ON, GIVING = 3, 4, 5  # indices of the counts of its lists (see team_lists)
+EVER = 2**31 - 1  # number of reads of a counter without a limit
+LOOKS = 64  # number of reads of a counter between two checks whether all leave
 
 
 @ti.func
 def wait(threads: ti.template()):
-    """Until the whole block is here, and sees what each has written."""
+    """Waits until all threads of the block are here. Then each sees the writes of all."""
     if ti.static(threads > 1):
         ti.simt.block.sync()
 
@@ -38,7 +38,7 @@ def fence(threads: ti.template()):
 def await_count(arrays: ti.template(), entry: ti.i32, target: ti.i32, segment: ti.i32, patience: ti.i32):
     looks = 0
     while looks >= 0:
-        if ti.atomic_max(arrays.meeting[entry], 0) >= target:  # Taichi has no load that passes by the caches
+        if ti.atomic_max(arrays.meeting[entry], 0) >= target:  # Taichi has no load that bypasses the caches
             looks = -1
         else:
             looks += 1
@@ -53,7 +53,7 @@ def await_count(arrays: ti.template(), entry: ti.i32, target: ti.i32, segment: t
 
 @ti.func
 def meet_team(thread: ti.template(), meetings: ti.template(), arrays: ti.template()):
-    """Until the whole team is here, and sees what each has written; `meetings` counts a block's own."""
+    """Waits until the whole team is here. Then each thread sees the writes of all. `meetings` counts the meetings."""
     wait(arrays.threads)
     if ti.static(arrays.several):
         if thread.lane == 0:
@@ -66,15 +66,13 @@ def meet_team(thread: ti.template(), meetings: ti.template(), arrays: ti.templat
 
 @ti.func
 def take_turn(at: ti.i32, meeting: ti.template()):
-    """The next turn of all, for the team whose integers begin at `at`; it is in their order that turns are taken, by
-    teams that are at work.
-    """
+    """Writes the next turn for the team whose integers begin at `at`. Running teams take turns in their order."""
     meeting[at + TURN] = ti.atomic_add(meeting[QUEUE], 1)
 
 
 @ti.func
 def leave_scene(entry: ti.i32, lane: ti.i32, arrays: ti.template()):
-    """Counts at `entry`, which is the scene's, that this block has had a turn with it."""
+    """Counts at `entry`, the scene's, that this block has finished a turn with it."""
     wait(arrays.threads)
     if lane == 0:
         fence(arrays.threads)
@@ -83,9 +81,8 @@ def leave_scene(entry: ti.i32, lane: ti.i32, arrays: ti.template()):
 
 @ti.func
 def await_scene(entry: ti.i32, count: ti.i32, thread: ti.template(), arrays: ti.template()):
-    """Until so many have left the scene, however long the team takes that has it: its turn came before, so it is at
-    work.
-    """
+    """Waits until `count` blocks have left the scene, without a time limit. The team that has it is running, because
+    its turn came earlier."""
     if thread.lane == 0:
         await_count(arrays, entry, count, thread.segment, EVER)
 
@@ -101,7 +98,7 @@ def choose(scene: ti.i32, arrays: ti.template()):
 def meet_and_choose(
     thread: ti.template(), scene: ti.i32, meetings: ti.template(), choices: ti.template(), arrays: ti.template()
 ):
-    """A meeting where the last block to come chooses the next step; `choices` counts them."""
+    """Waits for the team. The last block to arrive chooses the next step. `choices` counts these meetings."""
     wait(arrays.threads)
     if thread.lane == 0:
         last = 1
@@ -125,7 +122,7 @@ def meet_and_choose(
 
 @ti.func
 def raise_by_warps(lane: ti.i32, arrays: ti.template(), scene: ti.i32, entry: ti.template(), value: ti.f32):
-    """raise_maximum for all threads of a block, one for a warp."""
+    """Computes raise_maximum for all threads of a block, once for each warp."""
     if ti.static(arrays.threads > 1):
         bits = ti.bit_cast(ti.max(value, 0.0), ti.i32)
         for step in ti.static((16, 8, 4, 2, 1)):
@@ -133,6 +130,6 @@ def raise_by_warps(lane: ti.i32, arrays: ti.template(), scene: ti.i32, entry: ti
         if lane % WARP == 0 and bits > 0:
             ti.atomic_max(
                 arrays.counter[scene, entry], ti.cast(bits, ti.i64)
-            )  # without a look, which would be waited for
+            )  # no read before, because it would wait for memory
     else:
         raise_maximum(arrays.counter, scene, entry, value)

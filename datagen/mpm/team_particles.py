@@ -1,6 +1,6 @@
-"""The particles of a team's scene: their distribution over blocks, state in memory, and order.
+"""The particles of a team's scene: their distribution over blocks, their state in memory, and their order.
 
-State is stored by field, `state[copy, field, particle]`, in two copies; sorting goes from one to the other.
+State is stored by field, `state[copy, field, particle]`, in two copies. Sorting writes one from the other.
 """
 
 from collections import namedtuple
@@ -12,23 +12,23 @@ from datagen.mpm.layout import BLOCK, BLOCK_NODES, FIELD, LIVE, SETTING, TAG
 from datagen.mpm.nodes import base_node, node_place
 from datagen.mpm.team_meeting import meet_team, wait
 
-COPIED = 16  # fields at once
+COPIED = 16  # number of fields that are copied together
 
 # Variables of a kernel that its functions take as one.
-# Of a thread: its number in its block, the block's in the team, the number of blocks; its number in the team, and that
-# of its threads; the number of all particles; where velocities begin in `node`, the team's integers in `meeting`, the
-# block's in `columns`; and how often it reads a counter.
+# Thread: the thread's number in its block, the block's number in the team, the number of blocks; the thread's number in
+# the team, and the team's number of threads; the number of all particles; the begin of velocities in `node`, of the
+# team's integers in `meeting`, and of the block's in `columns`; and the largest number of reads of a counter.
 Thread = namedtuple(
     "Thread", ["lane", "part", "blocks", "member", "members", "stride", "velocities", "at", "segment", "patience"]
 )
-# Of a block's particles: their scene, its first particle, how many that follow each other are dealt out together, and
-# the number of the block's own.
+# Share: the scene of a block's particles, its first particle, the number of consecutive particles that are dealt out
+# together, and the number of the block's particles.
 Share = namedtuple("Share", ["scene", "first", "chunk", "owned"])
 
 
 @ti.func
 def dealt(own: ti.i32, thread: ti.template(), chunk: ti.i32) -> ti.i32:
-    """Returns the scene's index of a block's particle `own`; blocks get chunks in turn, to share slow particles."""
+    """Returns the index in the scene of a block's particle `own`. Chunks are dealt out in turn, to share slow ones."""
     return (own // chunk * thread.blocks + thread.part) * chunk + own % chunk
 
 
@@ -56,7 +56,7 @@ def put_matrix(state: ti.template(), place: ti.i32, stride: ti.i32, field: ti.te
 
 @ti.func
 def get_symmetric(state: ti.template(), place: ti.i32, stride: ti.i32, field: ti.template()):
-    """A matrix from xx, yy, zz, xy, xz, yz."""
+    """Returns a symmetric matrix stored as xx, yy, zz, xy, xz, yz."""
     s = ti.Vector([load(state, place + (field + i) * stride) for i in range(6)])
     return ti.Matrix([[s[0], s[3], s[4]], [s[3], s[1], s[5]], [s[4], s[5], s[2]]])
 
@@ -69,8 +69,9 @@ def put_symmetric(state: ti.template(), place: ti.i32, stride: ti.i32, field: ti
 
 @ti.func
 def _cell(x, scene: ti.i32, arrays: ti.template()) -> ti.i32:
-    """The number of a particle's cell in the order: BLOCK of them above each other are a column. Material falls, so
-    what follows in a column stays beside each other for longest.
+    """Returns the number of a particle's cell in the order. BLOCK cells above each other form a column.
+
+    Material falls, so consecutive particles of a column stay neighbours for longest.
     """
     base = base_node(x, arrays.setting[SETTING.inverse_cell_size])
     place = node_place(base, scene, arrays.shape)
@@ -87,7 +88,7 @@ def sort(
     arrays: ti.template(),
     fields: ti.template(),
 ):
-    """Copies all particles to the other copy, in the order of their columns; a meeting at its end."""
+    """Copies all particles to the other copy in the order of their columns. It ends with a meeting of the team."""
     own = thread.lane
     while own < share.owned:
         p = dealt(own, thread, share.chunk)
@@ -102,7 +103,7 @@ def sort(
             arrays.column_list[share.first + dealt(listed, thread, share.chunk)] = cell // BLOCK
         own += arrays.threads
     meet_team(thread, meetings, arrays)
-    # the columns that a block came upon first stay together
+    # the columns that a block found first stay together
     c = thread.lane
     while c < arrays.columns[thread.segment]:
         ti.atomic_add(
@@ -131,7 +132,7 @@ def sort(
         p = dealt(own, thread, share.chunk)
         source = copy * fields * thread.stride + share.first + p
         cell = _cell(get_vector(arrays.state, source, thread.stride, FIELD.position), share.scene, arrays)
-        # within memory also where blocks leave, and counts are not whole
+        # bounded, because counts are incomplete after blocks have left
         place = ti.min(share.first + arrays.cell_count[cell] + arrays.rank[share.first + p], thread.stride - 1)
         target = (1 - copy) * fields * thread.stride + place
         for group in ti.static(range(0, fields, COPIED)):

@@ -1,7 +1,7 @@
 """Transfers between the particles of a team's scene and its nodes.
 
 Nodes are read whole. In the transfer to nodes four threads share a particle, one for each component of a node (momentum
-along x, y, z, and mass), so that they write whole sectors of memory.
+along x, y, z, and mass). So they write whole sectors of memory.
 """
 
 import taichi as ti
@@ -16,8 +16,8 @@ from datagen.mpm.team_meeting import GIVING
 from datagen.mpm.team_particles import dealt, get_vector
 from datagen.mpm.time_step import falls
 
-LANES = 4  # components of a node, and threads that share a particle where it gives to nodes
-MASS = 3  # the component
+LANES = 4  # components of a node, and threads that share a particle in the transfer to nodes
+MASS = 3  # number of this component
 
 
 @ti.func
@@ -27,7 +27,7 @@ def _vector(entries):
 
 @ti.func
 def gather(x, bits: ti.i32, scene: ti.i32, velocities: ti.i32, arrays: ti.template()):
-    """Velocity, its gradient and the mass at x from the nodes around, of which sheets hide `bits`."""
+    """Returns velocity, its gradient and mass at x from the surrounding nodes; sheets hide the nodes in `bits`."""
     inverse_dx = arrays.setting[SETTING.inverse_cell_size]
     scaled = x * inverse_dx
     base = ti.floor(scaled - 0.5, ti.i32)
@@ -79,7 +79,7 @@ def gather(x, bits: ti.i32, scene: ti.i32, velocities: ti.i32, arrays: ti.templa
 
 @ti.func
 def _entry(at: ti.i32, first: ti.i32, own_steps: ti.i32, arrays: ti.template()) -> ti.i32:
-    """A particle that gives in this substep: as team_lists has it where some take steps of their own, else all do."""
+    """Returns a contributing particle's entry: that of team_lists if particles take their own steps, else `at`."""
     entry = at
     if ti.static(not arrays.variant & VARIANT.each_step):  # noqa: SIM102 (this one is the compiler's)
         if own_steps:
@@ -103,9 +103,11 @@ def scatter(
     step: ti.f32,
     arrays: ti.template(),
 ):
-    """Adds what particles give to their 27 nodes: momentum and mass; in later steps of an interval, of those alone that
-    team_lists has, what forces change in momentum. A thread adds up what `run` particles in their order give, in a
-    window of nodes that goes up a column with them; what it leaves goes to the nodes.
+    """Adds the contributions of particles to their 27 nodes: momentum and mass.
+
+    In later steps of an interval only particles in team_lists contribute, and only the impulse of forces. A thread sums
+    over `run` particles in their order, in a window of nodes that moves up a column with them. Nodes that leave the
+    window are written.
     """
     dx = arrays.setting[SETTING.cell_size]
     inverse_dx = arrays.setting[SETTING.inverse_cell_size]
@@ -147,7 +149,7 @@ def scatter(
                             for j in range(3)
                         ]
                     )
-                else:  # what acts evenly, of xx, yy, zz, xy, xz, yz
+                else:  # stress that acts evenly: xx, yy, zz, xy, xz, yz
                     for j in ti.static(range(3)):
                         which = j if component == j else 2 + component + j
                         A[j] = step * arrays.response[share.first + p + which * thread.stride]
@@ -205,8 +207,9 @@ def scatter(
 
 @ti.func
 def _read_node(place: ti.i32, velocities: ti.i32, begins: ti.f32, node: ti.template()):
-    """Returns a node's gain of momentum, its mass, and its velocity before (zero at the begin of an interval) with its
-    time of fall in this interval.
+    """Returns a node's gain of momentum, its mass, and its earlier velocity with its time of fall in this interval.
+
+    At the begin of an interval the earlier velocity is zero.
     """
     before = ti.Vector([0.0, 0.0, 0.0, 0.0])
     if begins == 0.0:
@@ -259,9 +262,7 @@ def update_nodes(
     fallen: ti.f32,
     arrays: ti.template(),
 ):
-    """New velocities of the nodes of all blocks that particles touch; within an interval of those alone whose particles
-    act.
-    """
+    """Computes new velocities of the nodes of all touched blocks; within an interval only of blocks with changes."""
     block_list = arrays.shape[SHAPE.all_blocks] + scene * arrays.shape[SHAPE.scene_blocks]
     count = arrays.live[scene * LIVE.length + LIVE.blocks] * BLOCK_NODES
     n = thread.member
@@ -276,7 +277,7 @@ def update_nodes(
             if many == 0.0:
                 continue
         lead = ti.min((many - 1.0) * whole_step, left)
-        # all that is read, before anything is written: Taichi looks up where an array lies anew after each store
+        # all reads come before writes, because Taichi loads an array's address again after each store
         place = LANES * (touched * BLOCK_NODES + local)
         entry = -1
         if ti.static(bool(arrays.variant & VARIANT.contact)):
@@ -284,7 +285,7 @@ def update_nodes(
         gain, mass, before = _read_node(place, thread.velocities, begins, arrays.node)
         if local == 0:
             arrays.block[touched] = 0
-        if mass > 0.0:  # others keep a velocity of before, in which no particle has a share
+        if mass > 0.0:  # other nodes keep an earlier velocity, which has weight 0 for every particle
             _update(
                 place, 2 * entry, gain, mass, before, thread.velocities, local, corner, scene, begins, ends,
                 gravity_time, lead, fallen, arrays,

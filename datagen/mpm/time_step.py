@@ -1,19 +1,20 @@
-"""How long a scene's next substep is, for Taichi kernels; see mls_mpm for intervals and gravity."""
+"""Chooses a scene's next substep, for Taichi kernels. See mls_mpm for intervals and gravity."""
 
 import taichi as ti
 
 from datagen.mpm.layout import COUNT, SETTING, STATUS, VALUE
 from hgn.solver_method import SPEED_FRACTION
 
-# steps of stress of an interval, from which on it is synchronised (see mls_mpm). Of fewer, no material at rest was seen
-# to gain energy, but what hits the ground at 10 m/s ended 6 % from where half the step takes it: fast ones are, too.
+# number of steps of stress in an interval from which it is synchronised (see mls_mpm). With fewer no material at rest
+# gained energy, but material that hit the ground at 10 m/s ended 6 % from the result with half the step. So intervals
+# of fast particles are synchronised too.
 SYNCHRONISED_FROM = 3.0
-SPEED_MARGIN = 1.25  # times the way planned for an interval, which a particle that gains speed may go
+SPEED_MARGIN = 1.25  # a particle that gains speed may move this much farther than planned for an interval
 
 
 @ti.func
 def raise_maximum(counter: ti.template(), scene: ti.i32, entry: ti.template(), value: ti.f32):
-    """The maximum of a value > 0 and what is there, both by their bits (see layout.Count); NaN is left out."""
+    """Replaces a stored maximum by a larger value > 0, both as bits (see layout.Count). NaN is ignored."""
     if value > 0.0:
         bits = ti.cast(ti.bit_cast(value, ti.i32), ti.i64)
         if counter[scene, entry] < bits:
@@ -27,19 +28,15 @@ def _maximum(counter: ti.template(), scene: ti.i32, entry: ti.template()) -> ti.
 
 @ti.func
 def _parts(whole: ti.f32, longest: ti.f32) -> ti.f32:
-    """Into how many equal parts, none longer than `longest`, a time is cut."""
+    """Returns the number of equal parts of a time, none longer than `longest`."""
     return ti.max(ti.ceil(ti.min(whole / longest, 1e9) - 1e-4), 1.0)
 
 
 @ti.func
 def choose_time_step(
-    scene: ti.i32,
-    scene_value: ti.template(),
-    counter: ti.template(),
-    setting: ti.template(),
-    maximum_substeps: ti.i32,
+    scene: ti.i32, scene_value: ti.template(), counter: ti.template(), setting: ti.template(), maximum_substeps: ti.i32
 ):
-    # all that is read, at once and before anything is written: else each would wait for a way to memory of its own
+    # all reads are issued together, before any write, to hide the latency of memory
     remaining = scene_value[scene, VALUE.remaining]
     status = counter[scene, COUNT.status]
     least = scene_value[scene, VALUE.least_stiffness]
@@ -69,12 +66,12 @@ def choose_time_step(
     fallen = scene_value[scene, VALUE.fallen] + scene_value[scene, VALUE.gravity_time]
     step = 0.0
     if remaining > 0.0 and status == STATUS.running:
-        # what stiffens as it is pressed together goes on to do so in the step
+        # material that stiffens by compression is assumed to stiffen further in the step
         growth = ti.max(stiffness / ti.max(last_stiffness, 1e-3), 1.0) if last_stiffness > 0.0 else 1.0
         limit = fraction * dx / ti.sqrt(stiffness * ti.min(growth, 2.0))
         begins = left == 0.0
         catch_up = 0.0
-        shift = 0.0  # from the middle of the last interval to that of the present one is not its length
+        shift = 0.0  # difference of the time between the middles of two intervals and the present interval
         if begins:
             last_interval = elapsed
             elapsed = 0.0
@@ -85,7 +82,7 @@ def choose_time_step(
             bound = speed_fraction * dx / ti.max(speed, 1e-20)
             fast = bound < ti.min(longest, remaining)
             longest = ti.min(longest, bound)
-            # equal intervals to the end of the frame: no sliver at its end
+            # equal intervals to the end of the frame, so that no short one remains
             last = interval
             interval = remaining / _parts(remaining, longest)
             left = interval
@@ -99,7 +96,7 @@ def choose_time_step(
                 catch_up = last_step
             elif were and synchronised == 0.0:
                 catch_up = -left / _parts(left, limit)
-        # steps in this interval, and with those after it
+        # number of steps in this interval
         ahead = _parts(left, limit)
         whole = left / ahead
         step = whole
@@ -108,7 +105,7 @@ def choose_time_step(
                 step = 0.5 * whole
                 ahead += 1.0
             else:
-                full = ti.max(ti.ceil(ti.min(left / limit, 1e9) - 0.5 - 1e-4), 0.0)  # before the last, which is half
+                full = ti.max(ti.ceil(ti.min(left / limit, 1e9) - 0.5 - 1e-4), 0.0)  # steps before the last, half one
                 ahead = full + 1.0
                 whole = left / (full + 0.5)
                 step = whole if full > 0.0 else left
@@ -118,7 +115,7 @@ def choose_time_step(
         if fixed > 0.0:
             ahead = 1.0
             total = fixed_substeps - ti.cast(done, ti.f32)
-        if not (begins and synchronised == 1.0):  # whose first substep strains nothing
+        if not (begins and synchronised == 1.0):  # the first substep of a synchronised interval does not strain
             scene_value[scene, VALUE.stiffness] = stiffness
         scene_value[scene, VALUE.largest_speed_square] = ti.max(largest_speed_square, speed_square)
         if not total <= ti.cast(maximum_substeps - done, ti.f32):
@@ -130,7 +127,7 @@ def choose_time_step(
             remaining -= step
             left -= step
             elapsed += step
-            # an interval also ends where material has become much faster in it
+            # an interval also ends if material has become much faster in it
             reach = SPEED_MARGIN * speed_fraction * dx
             if ahead <= 1.0 or (not begins and elapsed * ti.sqrt(speed_square) > reach):
                 left = 0.0
@@ -152,7 +149,7 @@ def choose_time_step(
             counter[scene, COUNT.transfers] = transfers + ti.cast(begins, ti.i64)
             counter[scene, COUNT.frame_substeps] = ti.cast(done + 1, ti.i64)
             counter[scene, COUNT.substeps] = substeps + ti.cast(1, ti.i64)
-            # maxima are gathered anew while the step runs, or the interval
+            # maxima are computed again in each step; held_stiffness_bits in each interval
             if begins:
                 counter[scene, COUNT.held_stiffness_bits] = ti.cast(0, ti.i64)
             counter[scene, COUNT.stiffness_bits] = ti.cast(0, ti.i64)

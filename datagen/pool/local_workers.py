@@ -1,6 +1,6 @@
 """Workers in processes of this machine.
 
-A worker ends with its parent, and leaves signals from the terminal to it. Errors inside are sent to the parent.
+A worker ends with its parent, and ignores signals from the terminal. Its errors are sent to the parent.
 """
 
 from __future__ import annotations
@@ -42,13 +42,13 @@ from hgn.data.identity import dataset_identity, identity_hash
 from hgn.scene.obstacle_grid import ObstacleGrid
 from hgn.system.processes import cause_of_exit, start_child
 
-_FRAME_REPORT_SECONDS = 1.0  # between reports of a worker; each is a line of a log with progress=json
+_FRAME_REPORT_SECONDS = 1.0  # interval between a worker's reports; each is a line with progress=json
 _STAGING_THREADS = 8
-_END_SECONDS = 10.0  # which a dismissed worker has
+_END_SECONDS = 10.0  # time that a dismissed worker has to end
 
 
 class LocalWorker(Worker):
-    """A process of this machine."""
+    """A worker in a process of this machine."""
 
     speaks = True
 
@@ -61,7 +61,7 @@ class LocalWorker(Worker):
     def give(self, message: object) -> None:
         self.idle, self.heard_at = False, time.monotonic()
         if isinstance(message, list):
-            for made in message:  # a launch is a gigabyte, which would be copied several times in one piece
+            for made in message:  # sent one by one, because a whole launch (a gigabyte) would be copied several times
                 self.tell(made)
             message = None
         self.tell(message)
@@ -71,12 +71,12 @@ class LocalWorker(Worker):
             self.connection.send(message)
 
     def dismiss(self) -> None:
-        # Taichi writes what it compiled to its cache as the process ends
+        # at its end the process writes compiled kernels to Taichi's cache
         self.connection.close()
         self._patience_s = _END_SECONDS
 
     def kill(self) -> None:
-        # staged files appear whole or not at all, so nothing is half-written
+        # staged files are written atomically, so no partial file remains
         self.process.join(self._patience_s)
         self.process.kill()
         self.process.join()
@@ -88,18 +88,19 @@ class LocalWorker(Worker):
 
 
 class LocalWorkerFactory:
-    """Processes of this machine."""
+    """Starts workers in processes of this machine."""
 
     def __init__(self, config: DatagenConfig, backend: Backend, plan: WorkerPlan) -> None:
         self.plan, self._config, self._backend = plan, config, backend
 
     def start_maker(self) -> Worker:
-        """Starts a process that answers a SceneTask with a MadeScene or a cause, and a GridTask with a BuiltGrid."""
+        """Starts a process that answers a SceneTask by a MadeScene or a cause, and a GridTask by a BuiltGrid."""
         return LocalWorker(_make_scenes, self._config, self._backend)
 
     def start_solver(self, number: int) -> Worker:
-        """Starts a process that simulates batches of MadeScene, sent one by one and ended by None; it accepts their
-        BuiltGrid at any time. With several solvers each sees one CUDA device.
+        """Starts a process that simulates batches: MadeScene one by one, then None. It accepts BuiltGrid at any time.
+
+        With several solvers each uses one CUDA device.
         """
         plan = self.plan
         gpu = plan.gpus[number % len(plan.gpus)] if plan.solvers > 1 and plan.gpus else None
@@ -134,7 +135,7 @@ class _Sender:
             try:
                 self._connection.send(message)
             except (BrokenPipeError, ConnectionResetError):
-                os._exit(0)  # the parent has gone
+                os._exit(0)  # the parent has ended
 
 
 @contextlib.contextmanager
@@ -164,12 +165,12 @@ class _Inbox:
         threading.Thread(target=self._read, args=(connection, send), name="inbox", daemon=True).start()
 
     def batches(self) -> Iterator[list[MadeScene]]:
-        """Yields batches until the pool is gone."""
+        """Yields batches until the pool ends."""
         while (batch := self._batches.get()) is not None:
             yield batch
 
     def grid(self, made: MadeScene) -> ObstacleGrid | str:
-        """Waits for the grid of a scene and returns it, or why there is none."""
+        """Waits for the grid of a scene. Returns the grid, or why it could not be built."""
         if made.obstacle_grid is not None:
             return made.obstacle_grid
         grid = self._coming(made.task).result()
@@ -199,7 +200,7 @@ class _Inbox:
                 for grid in self._grids.values():
                     grid.cancel()
             return
-        os._exit(1)  # else the parent could wait for ever for its message to be read
+        os._exit(1)  # otherwise the parent could wait forever for its message to be read
 
 
 def _solve(
@@ -216,13 +217,13 @@ def _solve(
     config_hash = identity_hash(dataset_identity(config))
     inbox = _Inbox(connection, send)
     on_gpu = threads is None
-    if on_gpu:  # compiles while the first scenes are built
+    if on_gpu:  # compiles kernels while the first scenes are built
         pkgutil.resolve_name(backend.warm_up)(config.scene, config.mpm, first_launch)
-    # a batch is staged while the next is simulated, so that a GPU does not wait for the disk
+    # one batch is staged while the next is simulated, so that a GPU does not wait for the disk
     with ThreadPoolExecutor(max_workers=_STAGING_THREADS) as stager:
         staging: list[Future[None]] = []
         for batch in inbox.batches():
-            if on_gpu:  # the next may come already
+            if on_gpu:  # the next batch may be sent
                 send("idle")
             results = simulate_batch(batch, config, backend, threads, lambda count: _frame_reporter(send, count))
             for future in staging:
@@ -271,7 +272,7 @@ def _received(connection: Connection) -> Iterator[Any]:
 
 @contextlib.contextmanager
 def _terminal_signals_blocked() -> Iterator[None]:
-    # A child inherits the mask: only the parent acts on Ctrl-C, which reaches the whole process group.
+    # A child inherits the mask, so only the parent handles Ctrl-C, which reaches the whole process group.
     # Starting the resource tracker unblocks the signal, so it is started first.
     resource_tracker.ensure_running()
     previous = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})

@@ -1,8 +1,8 @@
 """Locks on episodes, so that several generators share one folder without a coordinator.
 
-A data set's `.lock` file stands for its state, byte by byte: who changes the manifest locks the first byte, every
-generator shares the second, and an episode that is being made has its byte locked by its generator. The kernel frees
-the locks of a process that ends, however it ends: no claim goes stale, and no clock is asked.
+A byte of a data set's `.lock` file represents each state. A process that changes the manifest locks the first byte.
+Every generator shares a lock of the second. A generator locks the bytes of the episodes that it makes. The kernel frees
+the locks of an ended process in every case. So no claim becomes stale, and no clock is needed.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ from hgn.system.locks import NO_LOCKS, lock_bytes
 LOCK_NAME = ".lock"
 _MANIFEST_BYTE, _GENERATORS_BYTE, _FIRST_EPISODE_BYTE = 0, 1, 2
 _REMEDY = "mount it with them (NFS with its lock service, Lustre with -o flock) or choose another out=..."
-_EPISODES_OF_A_SPLIT = 1 << 40  # bytes from one split to the next; a lock needs no byte to be there
+_EPISODES_OF_A_SPLIT = 1 << 40  # bytes between two splits; a locked byte need not exist
 
 
 class ShardLocks:
     """One generator's locks on a folder; a context manager."""
 
     def __init__(self, folder: Path) -> None:
-        """Raises: ConfigError where the file system knows no locks, or grants them to everybody."""
+        """Raises: ConfigError if the file system has no locks, or grants them to everybody."""
         self._path = folder / LOCK_NAME
         self._file = os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
         try:
@@ -39,9 +39,9 @@ class ShardLocks:
             raise
 
     def _require_exclusion(self) -> None:
-        """Raises ConfigError where locks are granted to everybody: generators would write over each other."""
+        """Raises ConfigError if locks are granted to everybody, because generators would overwrite other's files."""
         if not hasattr(fcntl, "F_OFD_SETLK"):
-            return  # locks of a process, which do not exclude itself
+            return  # locks belong to the process and do not exclude it
         other = os.open(self._path, os.O_RDWR | os.O_CLOEXEC)
         try:
             if self._lock(fcntl.F_WRLCK, _GENERATORS_BYTE, file=other):
@@ -58,7 +58,7 @@ class ShardLocks:
 
     @contextlib.contextmanager
     def manifest(self) -> Iterator[None]:
-        """The right to change the manifest; waits until no other generator has it."""
+        """Locks the manifest for a change. Waits until no other generator has the lock."""
         self._lock(fcntl.F_WRLCK, _MANIFEST_BYTE, wait=True)
         try:
             yield
@@ -66,16 +66,16 @@ class ShardLocks:
             self._lock(fcntl.F_UNLCK, _MANIFEST_BYTE)
 
     def take(self, shard: ShardRange) -> bool:
-        """Claims the episodes of a range; False when another generator has any of them."""
+        """Claims the episodes of a range. Returns False if another generator has any of them."""
         return self._lock(fcntl.F_WRLCK, *_bytes_of(shard))
 
     def free(self, shard: ShardRange) -> None:
-        """Gives a claim back."""
+        """Frees a claim."""
         self._lock(fcntl.F_UNLCK, *_bytes_of(shard))
 
     @contextlib.contextmanager
     def alone(self) -> Iterator[bool]:
-        """Yields whether this is the only generator; if so, others wait before they begin."""
+        """Yields whether this is the only generator. If it is, others wait before they begin."""
         alone = self._lock(fcntl.F_WRLCK, _GENERATORS_BYTE)
         try:
             yield alone

@@ -1,4 +1,4 @@
-"""What a data set consists of: keys, seeds, shard ranges and the order of work, all pure functions.
+"""The plan of a data set: keys, seeds, shard ranges and the order of work. All functions are pure.
 
 An episode is the unit of simulation, a shard the unit of publication. Training may start after the first shard, so
 the first shards are small and the first validation episode comes early.
@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from hgn.data.manifest import SPLITS
 
 _SHARD_NAME = re.compile(rf"({'|'.join(SPLITS)})-(\d{{6,}})-(\d{{6,}})\.tar")
-_SINGLE_EPISODE_SHARDS = 5  # of validation and test
+_SINGLE_EPISODE_SHARDS = 5  # number of leading shards of validation and test with one episode
 
 
 @dataclass(frozen=True)
@@ -23,7 +23,7 @@ class SceneTask:
 
     split: str
     index: int
-    attempt: int  # grows when a seed turned out not to be simulable
+    attempt: int  # number of earlier seeds that could not be simulated
     seed: int
 
     @property
@@ -53,18 +53,18 @@ class ShardRange:
 
 
 def episode_key(split: str, index: int) -> str:
-    """The sample name of an episode; without a dot, at which WebDataset would cut it."""
+    """Returns the sample name of an episode. It has no dot, because WebDataset would cut it there."""
     return f"{split}-{index:06d}"
 
 
 def scene_seed(dataset_seed: int, split: str, index: int, attempt: int) -> int:
-    """The 63-bit seed of a scene; the same on every machine and in every version of Python."""
+    """Returns the 63-bit seed of a scene. It is the same on every machine and in every version of Python."""
     text = f"{dataset_seed}/{split}/{index}/{attempt}"
     return int.from_bytes(hashlib.sha256(text.encode()).digest()[:8], "big") >> 1
 
 
 def parse_shard_name(name: str) -> ShardRange | None:
-    """The range that a file name stands for; None when it is no shard of ours."""
+    """Returns the range of a shard's file name; None if it is not the name of a shard."""
     match = _SHARD_NAME.fullmatch(name)
     if match is None:
         return None
@@ -73,7 +73,7 @@ def parse_shard_name(name: str) -> ShardRange | None:
 
 
 def parse_episode_key(key: str) -> ShardRange | None:
-    """The range of one episode that a key stands for; None when it is no key of ours."""
+    """Returns the range of a key's episode; None if it is not a key of an episode."""
     split, _, number = key.rpartition("-")
     if split not in SPLITS or not number.isdecimal() or episode_key(split, int(number)) != key:
         return None
@@ -81,10 +81,10 @@ def parse_episode_key(key: str) -> ShardRange | None:
 
 
 def shard_ranges(split: str, count: int, episodes_per_shard: int) -> list[ShardRange]:
-    """The shards of a split of `count` episodes.
+    """Returns the shards of a split of `count` episodes.
 
-    Training shards double from one episode up to `episodes_per_shard` (0, 1, 2, 4, 8, 16, 24, ... for 8);
-    validation and test have one episode a shard for the first five.
+    Sizes of training shards double from one episode up to `episodes_per_shard` (begins 0, 1, 2, 4, 8, 16, 24, ... for
+    8). The first five shards of validation and test have one episode each.
     """
     ranges, first = [], 0
     while first < count:
@@ -99,15 +99,15 @@ def shard_ranges(split: str, count: int, episodes_per_shard: int) -> list[ShardR
 
 
 def work_order(requested: Mapping[str, int], episodes_per_shard: int) -> list[ShardRange]:
-    """All shards of a data set, in the order in which they are completed."""
+    """Returns all shards of a data set in the order of their completion."""
     shards = [shard for split in SPLITS for shard in shard_ranges(split, requested[split], episodes_per_shard)]
     return sorted(shards, key=lambda shard: generation_place(shard.split, shard.stop - 1))
 
 
 def missing_ranges(planned: Iterable[ShardRange], published: Mapping[str, Sequence[int]]) -> list[ShardRange]:
-    """The planned shards without the episodes that are published; a shard with a hole becomes several.
+    """Returns the planned shards without published episodes. A shard with a gap becomes several.
 
-    published: for each split, whether an episode is; those beyond the end are not.
+    `published` contains a flag for each episode of a split. Episodes after its end are not published.
     """
     missing = []
     for shard in planned:
@@ -124,5 +124,5 @@ def missing_ranges(planned: Iterable[ShardRange], published: Mapping[str, Sequen
 
 
 def generation_place(split: str, index: int) -> tuple[bool, int, bool]:
-    """Returns an episode's sort key: training and validation in turn, the rest of training, then test."""
+    """Returns an episode's sort key: training and validation alternate, then the rest of training, then test."""
     return split == "test", index, split == "validation"

@@ -19,19 +19,19 @@ from datagen.pool.worker import BuiltGrid, GridTask, MadeScene, Worker, WorkerFa
 from datagen.pool.writer import DatasetWriter
 from hgn.schema import ConfigError
 
-MAXIMUM_ATTEMPTS = 3  # of a scene whose worker dies, before it is quarantined
-_WAIT_SECONDS = 0.2  # maximum delay of a stop request
+MAXIMUM_ATTEMPTS = 3  # deaths of workers with a single scene, before this scene is quarantined
+_WAIT_SECONDS = 0.2  # longest time until a stop request is noticed
 _PACKING_SECONDS = 0.02  # maximum delay between packing and publishing a shard
 _LOOK_SECONDS = 1.0  # interval of checks for shards of other generators
 _LAUNCH_GROWTH = 32  # factor between the sizes of two launches, up to the full size
 
 
 class Stopped(Exception):  # noqa: N818 - a request, not an error
-    """The run was asked to stop; what is staged is kept."""
+    """The run was asked to stop; staged episodes are kept."""
 
 
 class Pool:
-    """Generates the episodes of a writer's share that no other generator has claimed, and publishes the shards."""
+    """Generates the unclaimed episodes of the shards that this generator makes, and publishes the shards."""
 
     def __init__(
         self,
@@ -45,19 +45,19 @@ class Pool:
         self._launch_size = self._largest_launch = self._plan.first_launch
         self._launches = 0
         self._deaths_in_a_row = 0
-        # of keys whose worker died: deaths while they ran alone, and the group that they are tried again with
+        # deaths of workers that had only this scene, and the group in which a scene is tried again; both by key
         self._alone: dict[str, int] = {}
         self._group: dict[str, int] = {}
         self._grid_deaths: dict[SceneTask, int] = {}
 
     def run(self) -> None:
-        """Runs until the share is published, and ends all workers.
+        """Runs until all shards of this generator are published, then ends all workers.
 
         Raises: Stopped; ConfigError, OSError or RuntimeError from a worker.
         """
         self._todo: list[SceneTask] = []
         self._ready: list[MadeScene] = []
-        self._gridless: list[MadeScene] = []  # scenes whose obstacle grid no maker builds yet
+        self._gridless: list[MadeScene] = []  # scenes whose obstacle grid is not yet given to a maker
         self._makers: list[Worker] = []
         self._solvers: list[Worker] = []
         self._counted, self._next_look, self._said_waiting = self._writer.done, 0.0, False
@@ -90,13 +90,13 @@ class Pool:
         self._launch_size = min(self._largest_launch, self._even_launch(0))
 
     def _even_launch(self, taken: int) -> int:
-        """Returns the launch size that divides the remaining scenes evenly; `taken` scenes are about to be given."""
+        """Returns the launch size that divides the remaining scenes evenly. `taken` ones do not count as remaining."""
         left = self._writer.total - self._writer.done - sum(len(solver.tasks) for solver in self._solvers) - taken
         share = max(1, math.ceil(left / len(self._solvers)))
         return math.ceil(share / math.ceil(share / self._plan.scenes_per_launch))
 
     def _claim(self) -> None:
-        """Claims shards as the makers need them, and leaves others to other generators on the folder."""
+        """Claims as many shards as the makers need. The remaining shards are left to other generators."""
         if len(self._todo) >= self._plan.makers or time.monotonic() < self._next_look:
             return
         self._writer.refresh()
@@ -117,13 +117,13 @@ class Pool:
             self._progress.message("other generators make the rest; waiting for them")
 
     def _publish(self) -> bool:
-        shard = self._writer.publish_next(wait=False)  # more episodes are staged while it is packed
+        shard = self._writer.publish_next(wait=False)  # other episodes are staged while the shard is packed
         if shard is not None:
             self._progress.shard(shard.name, len(shard.episodes), self._writer.manifest.revision)
         return shard is not None
 
     def _hand_out(self) -> None:
-        # a GPU's solver is idle as soon as it has scenes: solvers without scenes come first, even while they start
+        # a solver on a GPU reports idle once it has received scenes, so solvers without scenes come first
         for solver in sorted(self._solvers, key=lambda solver: (bool(solver.tasks), solver.given)):
             others_first = solver.tasks and any(other.idle and not other.tasks for other in self._solvers)
             if solver.idle and not others_first and (batch := self._next_batch(solver)):
@@ -136,7 +136,10 @@ class Pool:
                 maker.give(task)
 
     def _next_task(self) -> SceneTask | GridTask | None:
-        """Returns a maker's next task: scenes until the next launch is full, then grids, needed at a launch's end."""
+        """Returns a maker's next task, or None. Scenes for the next launch come first.
+
+        Grids come second, because a launch needs them only at its end.
+        """
         coming = len(self._ready) + len(self._being_made())
         short = coming < self._launch_size
         if self._todo and short:
@@ -154,12 +157,12 @@ class Pool:
         return [task for maker in self._makers for task in maker.tasks.values() if isinstance(task, SceneTask)]
 
     def _next_batch(self, solver: Worker) -> list[MadeScene]:
-        """Returns the next scenes to simulate, or none where waiting for more is better."""
+        """Returns the next scenes to simulate; none, if it is better to wait for more."""
         self._ready.sort(key=lambda made: made.task.place)
         for made in self._ready:
             group = self._group.get(made.task.key)
             if group is not None:
-                if solver.tasks:  # still being staged; with others the cause of a death would be unclear
+                if solver.tasks:  # being staged; next to other scenes the cause of a death would be unclear
                     return []
                 batch = [other for other in self._ready if self._group.get(other.task.key) == group]
                 self._ready = [other for other in self._ready if self._group.get(other.task.key) != group]
@@ -168,7 +171,7 @@ class Pool:
         unmade = [*self._todo, *self._being_made()]
         if not self._ready or (unmade and len(self._ready) < size):
             return []
-        # training waits for the first shards in order, so small launches must not overtake unfinished scenes
+        # training waits for the first shards in order, so a small launch must not overtake unfinished scenes
         growing = self._largest_launch < self._plan.scenes_per_launch
         if growing and any(task.place < self._ready[size - 1].task.place for task in unmade):
             return []
@@ -188,7 +191,7 @@ class Pool:
                 raise Stopped
             else:
                 self._replace(worker, worker.cause_of_death())
-        # a stopped process, or one that waits for a device for ever, sends nothing
+        # a stopped process sends nothing; nor does one that waits for a device forever
         silence, now = self._settings.worker_silence_s, time.monotonic()
         slept, self._awake_at = now - self._awake_at > silence / 2, now
         for worker in (*self._makers, *self._solvers):
@@ -227,7 +230,7 @@ class Pool:
             raise RuntimeError(f"a worker failed:\n{values[0]}")
 
     def _grid_built(self, built: BuiltGrid) -> None:
-        """Adds a grid to its scene, which is ready to be simulated, or in a solver."""
+        """Adds a grid to its scene. The scene waits for a launch, or a solver has it."""
         key, grid = built.task.key, built.grid
         for place, made in enumerate(self._ready):
             if made.task == built.task:
@@ -284,7 +287,7 @@ class Pool:
             if isinstance(item, MadeScene) and self._writer.is_staged(task.split, task.index):
                 self._accept(task)
                 continue
-            # any scene of a launch may be the cause: halves are tried alone, down to one scene, whose deaths count
+            # any scene of a launch may be the cause, so halves are tried; deaths count only for a scene that ran alone
             if blamable:
                 self._alone[task.key] = self._alone.get(task.key, 0) + (len(lost) == 1)
                 self._group[task.key] = groups + (2 * place >= len(lost))

@@ -1,4 +1,4 @@
-"""What a person or a program sees of a running generator."""
+"""Reports of a running generator to a person or a program."""
 
 from __future__ import annotations
 
@@ -10,36 +10,36 @@ from typing import Any, TextIO
 from tqdm import tqdm
 
 PROGRESS_KINDS = ("bar", "json", "off")
-_SPARSE_SECONDS = 30.0  # between lines where stderr is no terminal
+_SPARSE_SECONDS = 30.0  # interval between lines if stderr is not a terminal
 
 
 class Progress:
-    """Reports nothing; the base of the others."""
+    """Reports nothing. It is the base of the other classes."""
 
     def start(self, done: int, total: int, frames: int) -> None:
-        """`total` episodes of `frames` frames, of which `done` are finished already."""
+        """Starts with `total` episodes of `frames` frames, of which `done` are finished."""
 
     def frame(self, worker: int, frame: int, scenes: int) -> None:
-        """A worker has reached `frame` in a launch of `scenes` scenes; scenes = 0 when it has none."""
+        """Notes that a worker reached `frame` in a launch of `scenes` scenes; 0 scenes: the worker has none."""
 
     def episode(self, key: str) -> None:
-        """An episode was simulated and staged."""
+        """Notes that an episode was simulated and staged."""
 
     def found(self, count: int) -> None:
-        """`count` more episodes are there: another generator published them, or an earlier run had staged them."""
+        """Notes `count` more episodes: another generator published them, or an earlier run staged them."""
 
     def shard(self, name: str, episodes: int, revision: int) -> None:
-        """A shard was published."""
+        """Notes that a shard was published."""
 
     def message(self, text: str) -> None:
-        """Something that a person should know: a quarantined scene, a worker that died."""
+        """Reports an event to a person: a quarantined scene, a worker that died."""
 
     def close(self) -> None:
-        """The end, whatever its cause."""
+        """Ends the report for any cause."""
 
 
 class BarProgress(Progress):
-    """A bar that counts simulated frames, so that it moves within a long episode; sparse lines without a terminal."""
+    """Shows a bar that counts simulated frames, so that it moves within a long episode; without terminal few lines."""
 
     def __init__(self, stream: TextIO | None = None) -> None:
         self._stream = stream or sys.stderr
@@ -85,7 +85,7 @@ class BarProgress(Progress):
         frames = min(self._done * self._frames + sum(self._running.values()), self._total * self._frames)
         text = f"episodes {self._done}/{self._total}"
         if self._bar is not None:
-            # a launch that failed takes its frames back; tqdm moves by assignment
+            # a failed launch takes its frames back; tqdm allows this only by assignment
             self._bar.n = frames
             self._bar.set_description(text, refresh=False)
             self._bar.update(0)
@@ -97,7 +97,7 @@ class BarProgress(Progress):
 
 
 class JsonProgress(Progress):
-    """One JSON object a line on standard output, each with an `event`."""
+    """Writes one JSON object a line to standard output, each with an `event`."""
 
     def __init__(self, stream: TextIO | None = None) -> None:
         self._stream = stream or sys.stdout
@@ -129,5 +129,5 @@ class JsonProgress(Progress):
 
 
 def make_progress(kind: str) -> Progress:
-    """The reporter for `progress=bar|json|off`."""
+    """Returns the reporter for `progress=bar|json|off`."""
     return {"bar": BarProgress, "json": JsonProgress, "off": Progress}[kind]()

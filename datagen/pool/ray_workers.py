@@ -1,8 +1,8 @@
 """Workers on a Ray cluster: `ray start --head` on one machine, `ray start --address=...` on others, then `pool=ray`.
 
-Makers and solvers are Ray actors; the pool schedules, retries and publishes as with local processes. Episodes travel
-through Ray's object store: only the pool's machine needs the data set's folder, and all machines need this project in
-the same Python. An actor waits until a machine has room for it, so machines may leave and join at any time.
+Makers and solvers are Ray actors. The pool schedules, retries and publishes as with local processes. Episodes travel
+through Ray's object store, so only the pool's machine needs the data set's folder. All machines need this project in
+the same Python. An actor waits until a machine has capacity, so machines may leave and join at any time.
 """
 
 from __future__ import annotations
@@ -38,10 +38,10 @@ _CONNECT_REMEDY = (
 
 
 class RayWorkerFactory:
-    """Starts actors on a cluster; a context manager for the connection."""
+    """Starts actors on a cluster. As a context manager it connects to the cluster."""
 
     def __init__(self, config: DatagenConfig, backend: Backend, early: bool = False) -> None:
-        """Raises: ConfigError when Ray is not installed."""
+        """Raises: ConfigError if Ray is not installed."""
         try:
             import ray
         except ImportError:
@@ -51,7 +51,7 @@ class RayWorkerFactory:
         self._ray, self._config, self._backend, self._early = ray, config, backend, early
 
     def __enter__(self) -> RayWorkerFactory:
-        """Raises: ConfigError when no cluster answers."""
+        """Raises: ConfigError if no cluster answers."""
         address = os.environ.get("RAY_ADDRESS") or "auto"
         try:
             self._ray.init(address=address, log_to_driver=False, logging_level=logging.WARNING)
@@ -87,7 +87,7 @@ class RayWorkerFactory:
                 kind, *values = self._ray.get(ref)
             except self._ray.exceptions.RayError as error:
                 worker.cause = f"{type(error).__name__} on node {worker.node or 'not yet known'}"
-                # a silent node is first reported as unavailable; an actor killed by its scene as dead
+                # Ray reports a silent node as unavailable first, and an actor killed by its scene as dead
                 worker.silent = isinstance(error, self._ray.exceptions.ActorUnavailableError)
                 yield worker, None
                 continue
@@ -103,13 +103,13 @@ class RayWorkerFactory:
                 yield worker, ("idle",)
 
     def _start(self, kind: type, *arguments: object, **options: Any) -> RayWorker:
-        # Ray neither restarts nor retries: the pool counts a scene's deaths and replaces workers
+        # Ray neither restarts nor retries, because the pool counts a scene's deaths and replaces workers
         actor: Any = self._ray.remote(kind).options(max_restarts=0, max_task_retries=0, **options).remote(*arguments)
         return RayWorker(self._ray, actor)
 
 
 class RayWorker(Worker):
-    """The pool's view of an actor, which is idle once the cluster has placed it."""
+    """The pool's view of an actor. It is idle once the cluster has placed it."""
 
     def __init__(self, ray: Any, actor: Any) -> None:
         super().__init__()

@@ -1,4 +1,4 @@
-"""Tar files of episodes: staged one by one, and read back whole before anything relies on them."""
+"""Tar files of episodes: they are staged one by one, and verified completely before use."""
 
 from __future__ import annotations
 
@@ -29,28 +29,28 @@ _COPY_BYTES = 1 << 22
 
 
 def staged_path(folder: Path, split: str, index: int) -> Path:
-    """Returns the path of the tar file of a finished episode until its shard is complete."""
+    """Returns the path of a finished episode's tar file until its shard is complete."""
     return folder / STAGING_NAME / f"{episode_key(split, index)}.tar"
 
 
 def stage_episode(folder: Path, episode: Episode) -> None:
-    """Writes `<folder>/.staging/<key>.tar`. Safe to call from worker processes.
+    """Writes `<folder>/.staging/<key>.tar`. Worker processes may call it concurrently.
 
-    `episode.solver["dataset"]` holds `config_hash` and `attempt`, by which a later run knows the episode.
+    `episode.solver["dataset"]` contains `config_hash` and `attempt`, which identify the episode in later runs.
     Raises: OSError (a full disk), ConfigError (positions that are not finite).
     """
     stage_parts(folder, episode.key, episode_tar(episode))
 
 
 def pack_episode(episode: Episode) -> bytes:
-    """The tar file of one episode. Raises: ConfigError (positions that are not finite)."""
+    """Returns the tar file of one episode. Raises: ConfigError (positions that are not finite)."""
     return b"".join(episode_tar(episode))
 
 
 def stage_parts(folder: Path, key: str, parts: Iterable[bytes]) -> None:
-    """Writes the parts of an episode's tar file, whole or not at all, and behind its end their sha256.
+    """Writes the parts of an episode's tar file atomically, and appends their sha256.
 
-    It is not on the disk yet: `DatasetWriter` brings it there, unless its shard is packed before.
+    The file is not synced. `DatasetWriter` syncs it, unless its shard is packed before.
     Raises: OSError (a full disk).
     """
     target, digest = folder / STAGING_NAME / f"{key}.tar", hashlib.sha256()
@@ -60,19 +60,19 @@ def stage_parts(folder: Path, key: str, parts: Iterable[bytes]) -> None:
                 data = _seal(digest) if part is None else part
                 digest.update(data)
                 rest = memoryview(data)
-                while rest:  # a write takes 2 GB at most
+                while rest:  # a write takes at most 2 GB
                     rest = rest[file.write(rest) :]
         temporary.replace(target)
 
 
 def sync_staged(path: Path) -> None:
-    """Brings a staged file to the disk; nothing where it has gone, with its shard. Raises: OSError (a full disk)."""
+    """Syncs a staged file. Does nothing if the file was removed with its shard. Raises: OSError (a full disk)."""
     with errors_name(path), contextlib.suppress(FileNotFoundError), path.open("rb") as file:
         sync_file(file)
 
 
 def require_sealed(path: Path) -> None:
-    """Raises ConfigError where a staged file is not what was written: a disk failed, or the machine lost its power."""
+    """Raises ConfigError if a staged file has changed: a disk failed, or the machine lost its power."""
     digest, seal = hashlib.sha256(), len(_seal(hashlib.sha256()))
     with path.open("rb") as file:
         size = max(os.fstat(file.fileno()).st_size - seal, 0)
@@ -87,14 +87,14 @@ def _seal(digest: Any) -> bytes:
 
 
 def join_tars(file: BinaryIO, sources: Iterable[Path]) -> None:
-    """Writes the members of several staged tars as one. Raises: ConfigError where one is not what was staged."""
+    """Writes the members of several staged tars as one tar. Raises: ConfigError if a staged file has changed."""
     written = 0
     for source in sources:
         require_sealed(source)
         members = (place for named in locate_members(source).values() for place in named.values())
         length = max((offset + size for offset, size in members), default=0)
         length += -length % tarfile.BLOCKSIZE
-        with source.open("rb") as staged:  # buffered: else a read may bring less than was asked for
+        with source.open("rb") as staged:  # buffered, because an unbuffered read may return fewer bytes
             for start in range(0, length, _COPY_BYTES):
                 file.write(staged.read(min(_COPY_BYTES, length - start)))
         written += length
@@ -102,9 +102,9 @@ def join_tars(file: BinaryIO, sources: Iterable[Path]) -> None:
 
 
 def inspect_shard(path: Path, shard: ShardRange, config: DatagenConfig) -> ShardEntry:
-    """Reads a tar back whole: every member, value and seed, and that it holds just this range of this data set.
+    """Checks a whole tar: every member, value and seed, and that it contains exactly this range of this data set.
 
-    Raises: ConfigError naming what does not fit, and the remedy.
+    Raises: ConfigError naming the difference and the remedy.
     """
     located = locate_members(path)
     expected = [episode_key(shard.split, index) for index in shard.indices]

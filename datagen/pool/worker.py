@@ -1,4 +1,4 @@
-"""The work of the pool's makers and solvers, wherever they run, and the pool's view of a worker."""
+"""The work of the pool's makers and solvers on any machine, and the pool's view of a worker."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from hgn.system.extras import missing_extra
 
 @dataclass(frozen=True)
 class Backend:
-    """The functions that do the work, as `module:function`. Only workers resolve them: the pool imports no solver."""
+    """The functions that do the work, as `module:function`. Only workers import them; the pool imports no solver."""
 
     generate_scene: str = "hgn.scene.random_scene:generate_scene"
     build_obstacle_grid: str = "hgn.scene.obstacle_grid:build_obstacle_grid"
@@ -40,7 +40,7 @@ _Value = TypeVar("_Value")
 
 
 class Parcel(Generic[_Value]):
-    """A value that is passed on as pickled bytes and unpickled only where it is opened."""
+    """A value that is passed on as pickled bytes and unpickled only when it is opened."""
 
     def __init__(self, value: _Value) -> None:
         self._value: _Value | None = value
@@ -67,7 +67,7 @@ class MadeScene:
 
     task: SceneTask
     scene: Parcel[Scene]
-    obstacle_grid: ObstacleGrid | None  # None: sent later, as the solver does not need it
+    obstacle_grid: ObstacleGrid | None  # None: sent later, because the solver does not need it
     collider: Parcel[Any] = field(default_factory=lambda: Parcel(None))  # the solver's form of the obstacles
 
 
@@ -81,41 +81,41 @@ class GridTask:
 
 @dataclass(frozen=True)
 class BuiltGrid:
-    """The result of a GridTask: the grid, or why there is none."""
+    """The result of a GridTask: the grid, or why it could not be built."""
 
     task: SceneTask
     grid: ObstacleGrid | str
 
 
 class Worker(ABC):
-    """The pool's end of a worker, wherever it runs."""
+    """The pool's view of a worker."""
 
-    speaks = False  # whether it reports more often than dataset.worker_silence_s while it works
+    speaks = False  # whether a working worker reports more often than dataset.worker_silence_s
 
     def __init__(self) -> None:
         self.idle = False
-        self.tasks: dict[str, SceneTask | MadeScene | GridTask] = {}  # unanswered, by key
-        self.given = 0  # scenes to simulate, in total
-        self.heard_at = time.monotonic()  # of the last message in either direction
+        self.tasks: dict[str, SceneTask | MadeScene | GridTask] = {}  # unanswered tasks by key
+        self.given = 0  # total number of scenes given to simulate
+        self.heard_at = time.monotonic()  # time of the last message in either direction
 
     @abstractmethod
     def give(self, message: object) -> None:
-        """Sends work. A dead worker is noticed at the next receive."""
+        """Sends work. The next `receive` notices a dead worker."""
 
     def tell(self, message: object) -> None:
         """Sends the missing part of a task that the worker already has."""
         raise NotImplementedError
 
     def dismiss(self) -> None:  # noqa: B027 - Ray ends its actors itself
-        """Tells an idle worker to end; `kill` then waits a little."""
+        """Asks an idle worker to end. `kill` then waits for a short time."""
 
     @abstractmethod
     def kill(self) -> None:
-        """Ends it at once."""
+        """Ends the worker."""
 
     @abstractmethod
     def cause_of_death(self) -> str:
-        """Returns why a worker that no longer answers has ended."""
+        """Returns why a worker that does not answer has ended."""
 
     def blamable(self) -> bool:
         """Returns whether its task may have caused its death; False if its machine is gone."""
@@ -132,19 +132,19 @@ class WorkerFactory(Protocol):
     def start_solver(self, number: int) -> Worker: ...
 
     def receive(self, workers: Sequence[Worker], timeout: float) -> Iterator[tuple[Worker, tuple[Any, ...] | None]]:
-        """Yields messages of workers, None from a dead one; waits `timeout` seconds at most for the first."""
+        """Yields messages of workers, and None for a dead one. Waits at most `timeout` seconds for the first."""
 
 
 def make_scene(task: SceneTask, config: DatagenConfig, backend: Backend, with_grid: bool = True) -> tuple[Any, ...]:
-    """Returns a maker's answer: ("made", MadeScene), or ("failed", key, cause)."""
+    """Returns a maker's answer: ("made", MadeScene) or ("failed", key, cause)."""
     generate_scene = pkgutil.resolve_name(backend.generate_scene)
     build_collider = pkgutil.resolve_name(backend.build_collider)
     try:
         scene = generate_scene(config.scene, task.seed)
-        # built here, because in the solver the device would wait for one scene after another
+        # built by makers, because in a solver the device would wait for one scene after the other
         finer = replace(scene, cell_size=config.reference_cell_size)
         collider = build_collider(finer, config.mpm.choices.collider_band_cells)
-    except ConfigError as error:  # for example no room for the obstacles; another seed may fit
+    except ConfigError as error:  # e.g. an obstacle does not fit; another seed may work
         return "failed", task.key, str(error)
     made = MadeScene(task, Parcel(scene), None, Parcel(collider))
     if with_grid:
@@ -172,9 +172,9 @@ def simulate_batch(
     threads: int | None,
     reporter: Callable[[int], Callable[[int], None]] | None = None,
 ) -> list[Any]:
-    """Simulates a batch, in one launch for each episode length and domain, and returns the solver's results.
+    """Simulates a batch in one launch per episode length and domain. Returns the solver's results.
 
-    `reporter` maps the scene count of a launch to a function that is called with each of its frames.
+    `reporter` maps the number of scenes in a launch to a function that is called with each frame.
     """
     simulate = pkgutil.resolve_name(backend.simulate)
     launches: dict[tuple[int, Vector], list[MadeScene]] = {}
@@ -204,7 +204,7 @@ def _visible(scene: Scene, result: Any) -> Any:
 
 
 def failure_of(result: Any) -> str | None:
-    """Returns why a result of the solver is no episode, or None."""
+    """Returns why a result of the solver is not an episode, or None."""
     cause = getattr(result, "cause", None)
     if cause is not None:
         return str(cause)
@@ -241,7 +241,7 @@ def make_episode(made: MadeScene, result: Any, config: DatagenConfig, config_has
 
 
 def error_message(error: Exception) -> tuple[Any, ...]:
-    """Returns a worker's message about an error that no scene caused."""
+    """Returns a worker's message about an error without a scene as its cause."""
     if isinstance(error, ConfigError):
         return "config_error", str(error)
     if isinstance(error, ModuleNotFoundError) and (missing := missing_extra(error)):

@@ -12,11 +12,11 @@ from hgn.config import DatagenConfig
 from hgn.scene.kinds import MAXIMUM_PARTICLES
 from hgn.schema import require
 
-GPU_SCENES_PER_LAUNCH = 416  # several for each thread-block team
+GPU_SCENES_PER_LAUNCH = 416  # several scenes for each thread-block team
 GPU_NODES_PER_LAUNCH = 832 * 64**3  # grid nodes of all scenes, about 50 bytes each
-GPU_EARLY_LAUNCH = 2  # scenes of the first launch where episodes are needed early
-MAXIMUM_MAKERS = 32
-_CLUSTER_THREADS = 2  # of a solver without a GPU
+GPU_EARLY_LAUNCH = 2  # number of scenes in the first launch if episodes are needed early
+MAXIMUM_MAKERS = 32  # largest number of makers
+_CLUSTER_THREADS = 2  # threads of a solver without a GPU
 
 
 @dataclass(frozen=True)
@@ -24,7 +24,7 @@ class WorkerPlan:
     """Numbers of workers and batch sizes."""
 
     solvers: int
-    threads: int | None  # of each solver; None on a GPU
+    threads: int | None  # threads of each solver; None on a GPU
     makers: int
     scenes_per_launch: int
     first_launch: int
@@ -34,7 +34,7 @@ class WorkerPlan:
 def plan_workers(
     config: DatagenConfig, gpus: tuple[str, ...], cpu_count: int, memory_bytes: float, early: bool = False
 ) -> WorkerPlan:
-    """Plans one solver for two cores of a CPU, or one for each GPU with makers on the cores."""
+    """Plans one solver for each GPU, with makers on the cores; without a GPU one solver for two cores."""
     workers, launch = config.dataset.workers, config.mpm.scenes_per_launch
     if config.mpm.device == "cuda" or (config.mpm.device == "auto" and gpus):
         solvers = workers or max(1, len(gpus))
@@ -47,7 +47,7 @@ def plan_workers(
 
 
 def plan_cluster(config: DatagenConfig, nodes: Sequence[Mapping[str, float]], early: bool = False) -> WorkerPlan:
-    """Plans one solver for each GPU of the cluster, or without GPUs for two cores of a node."""
+    """Plans one solver for each GPU of the cluster; without GPUs one solver for two cores of a node."""
     workers, launch = config.dataset.workers, config.mpm.scenes_per_launch
     gpus = int(sum(node.get("GPU", 0) for node in nodes))
     if config.mpm.device == "cuda" or (config.mpm.device == "auto" and gpus):
@@ -63,8 +63,9 @@ def plan_cluster(config: DatagenConfig, nodes: Sequence[Mapping[str, float]], ea
 
 
 def gpu_scenes_per_launch(config: DatagenConfig, memory_bytes: float) -> int:
-    """Returns a launch size that fills a GPU; less where grids are large, or where frames, which stay in host memory
-    until they are published, would need more than half of it.
+    """Returns a launch size that fills a GPU. It is smaller for large grids, and if frames would need too much memory.
+
+    Frames stay in host memory until they are published, and may fill half of it.
     """
     scene = config.scene
     nodes = math.prod(math.ceil(length / config.reference_cell_size) for length in scene.domain_size)
@@ -80,8 +81,9 @@ def gpu_scenes_per_launch(config: DatagenConfig, memory_bytes: float) -> int:
 
 
 def gpu_first_launch(launch: int, early: bool) -> int:
-    """Returns the size of the first launch: small only where training or the service waits for episodes, because a
-    launch takes as long as its longest scene.
+    """Returns the size of the first launch. It is small only if training or the service waits for episodes.
+
+    A launch takes as long as its longest scene.
     """
     return min(launch, GPU_EARLY_LAUNCH) if early else launch
 

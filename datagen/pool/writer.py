@@ -1,10 +1,10 @@
-"""Episodes to shards: each finished episode is staged at once, a shard is published when its range is complete.
+"""Episodes to shards: each finished episode is staged, and a shard is published when its range is complete.
 
-Files are created atomically in the order `.staging/<key>.tar`, shard, manifest; staged files are deleted last. So
-after a crash the folder shows what is left to do, and no finished episode is simulated again. Published shards are
-synced. A staged episode is synced on its own only if its shard is still incomplete after 2 s, so most episodes are
-written once; a power loss may lose others that are not yet packed. Several generators may write to one folder: each
-claims the shards that it makes, the first to publish an episode wins, and the manifest changes only under its lock.
+Files are created atomically in the order `.staging/<key>.tar`, shard, manifest. Staged files are deleted last. So after
+a crash the folder shows the remaining work, and no finished episode is simulated again. Published shards are synced. A
+staged episode is synced by itself only if its shard is still incomplete after 2 s, so most episodes are written once. A
+power loss may lose other staged episodes. Several generators may write to one folder: each claims the shards that it
+makes, the first to publish an episode wins, and the manifest changes only under its lock.
 """
 
 from __future__ import annotations
@@ -49,10 +49,9 @@ from hgn.system.files import (
 )
 from hgn.system.machine import available_cpus
 
-# seeds tried for one episode before the settings of scenes are blamed
-MAXIMUM_REPLACEMENTS = 20
-STAGED_SECONDS = 2.0  # after which a staged episode is synced on its own if its shard is still incomplete
-PACKED_AT_ONCE = max(4, min(12, available_cpus() - 1))  # shards packed in parallel; 0.1 GB each
+MAXIMUM_REPLACEMENTS = 20  # seeds tried for one episode before the scene settings are reported as the cause
+STAGED_SECONDS = 2.0  # time after which a staged episode of an incomplete shard is synced by itself
+PACKED_AT_ONCE = max(4, min(12, available_cpus() - 1))  # number of shards packed in parallel; 0.1 GB each
 
 
 _Packed = tuple[ExitStack, Path, ShardEntry]
@@ -61,11 +60,10 @@ _Packed = tuple[ExitStack, Path, ShardEntry]
 class DatasetWriter:
     """Writes one generator's shards to a data set folder; a context manager.
 
-    Entering recovers what earlier runs left: shards that are not yet in the index are checked and listed, and
-    partial files that nobody is writing are removed. Raises: ConfigError when the folder contains another data set, or
-    a file that was altered.
+    Entering recovers the folder after earlier runs: shards missing in the index are checked and listed, and abandoned
+    partial files are removed. Raises: ConfigError if the folder contains another data set or an altered file.
 
-    With `dataset.array_tasks` each writer makes only its share of the shards; without it the share is everything.
+    With `dataset.array_tasks` a writer makes only its part of the shards, its share. Otherwise the share is all shards.
     """
 
     def __init__(self, config: DatagenConfig, report: Callable[[str], None] = lambda message: None) -> None:
@@ -78,17 +76,17 @@ class DatasetWriter:
         self._report = report
         tasks, task = config.dataset.array_tasks or 1, config.dataset.array_task or 0
         self._share = work_order(self.requested, config.dataset.episodes_per_shard)[task::tasks]
-        self.total = sum(len(shard.indices) for shard in self._share)  # episodes
-        self._in_share = {split: bytearray(count) for split, count in self.requested.items()}  # a byte an episode
+        self.total = sum(len(shard.indices) for shard in self._share)  # number of episodes
+        self._in_share = {split: bytearray(count) for split, count in self.requested.items()}  # a byte per episode
         for shard in self._share:
             self._in_share[shard.split][shard.first : shard.stop] = b"\1" * len(shard.indices)
-        self._begun = 0  # number of shards at the share's beginning that are all published
+        self._begun = 0  # number of leading shards of the share that are all published
         self._claimed: list[ShardRange] = []  # shards that this writer makes
-        # staged episodes of these shards: the time of staging, or inf once its sync has been requested
+        # staged episodes of these shards: the time of staging, or inf after the request to sync them
         self._staged: dict[tuple[str, int], float] = {}
         self._syncing: list[Future[None]] = []
         self._packers = ThreadPoolExecutor(PACKED_AT_ONCE, "packer")
-        self._packing: dict[ShardRange, Future[_Packed]] = {}  # shards that are published next
+        self._packing: dict[ShardRange, Future[_Packed]] = {}  # shards to publish next
         self._content = b""  # bytes of the manifest file that `manifest` was read from
         self._failures: list[QuarantinedScene] = []
         self._forget_published()
@@ -124,15 +122,15 @@ class DatasetWriter:
             self._locks.close()
 
     def claim_next(self) -> ShardRange | None:
-        """Takes the next shard of the share that is neither published nor being made by another generator.
+        """Claims the next shard of the share that is neither published nor claimed by another generator.
 
-        Its staged episodes are checked and kept. None if there is none now; call again later, because another
-        generator may end without publishing its shards.
+        Its staged episodes are checked and kept. Returns None if there is no such shard now. Call it again later,
+        because another generator may end without publishing its shards.
         """
         for shard in self._pending():
             if shard in self._claimed or not self._locks.take(shard):
                 continue
-            # its former owner may have published it, or ended before it could list it
+            # its former owner may have published it, or ended before listing it
             with self._locks.manifest():
                 self.refresh()
                 self._list_unlisted(self._packed_names(shard))
@@ -145,7 +143,7 @@ class DatasetWriter:
         return None
 
     def remaining(self) -> list[tuple[str, int]]:
-        """Returns the episodes (split, index) of claimed shards that are not staged, in the order to simulate them."""
+        """Returns the episodes (split, index) of claimed shards that are not staged, in the order of simulation."""
         wanted = {(shard.split, index) for shard in self._claimed for index in shard.indices} - self._staged.keys()
         return sorted(wanted, key=lambda item: generation_place(*item))
 
@@ -165,9 +163,9 @@ class DatasetWriter:
         return self._published_of_share == self.total
 
     def task(self, split: str, index: int) -> SceneTask:
-        """Returns the scene to simulate for an episode: the first seed that is not quarantined.
+        """Returns the scene to simulate for an episode, with the first seed that is not quarantined.
 
-        Raises: ConfigError when too many seeds in a row could not be simulated.
+        Raises: ConfigError if too many seeds in a row could not be simulated.
         """
         key = episode_key(split, index)
         if len(self._failures) < self.manifest.shards.state.quarantined:
@@ -182,7 +180,7 @@ class DatasetWriter:
         return SceneTask(split, index, attempt, scene_seed(self.config.dataset.seed, split, index, attempt))
 
     def quarantine(self, task: SceneTask, cause: str) -> SceneTask:
-        """Records that a scene could not be simulated and returns the one that takes its place."""
+        """Records that a scene could not be simulated, and returns its replacement."""
         failure = QuarantinedScene(task.key, task.attempt, task.seed, cause)
         with self._locks.manifest():
             self.refresh()
@@ -194,7 +192,7 @@ class DatasetWriter:
         self._staged[split, index] = time.monotonic()
 
     def is_staged(self, split: str, index: int) -> bool:
-        """Returns whether a staged file exists, reported or not: a worker may die between the two."""
+        """Returns whether a staged file exists. A worker may die after staging and before its report."""
         return staged_path(self.folder, split, index).is_file()
 
     @property
@@ -205,8 +203,8 @@ class DatasetWriter:
     def publish_next(self, wait: bool = True) -> ShardEntry | None:
         """Publishes one claimed shard whose episodes are all staged, and returns its entry.
 
-        None if no shard is complete, or with wait=False if none is packed yet. Raises: OSError (a full disk); no
-        partial file is left then, and published shards are unchanged.
+        Returns None if no shard is complete, or with wait=False if none is packed yet. Raises: OSError (a full disk).
+        Then no partial file remains, and published shards are unchanged.
         """
         ready = [
             shard for shard in self._claimed if all((shard.split, index) in self._staged for index in shard.indices)
@@ -227,7 +225,7 @@ class DatasetWriter:
         return entry
 
     def _sync_staged(self, ready: Sequence[ShardRange], before: float) -> None:
-        """Syncs episodes staged before `before`, unless their shard is among the `ready` ones."""
+        """Syncs episodes staged before the time `before`, unless their shard is among the `ready` ones."""
         packed = {(shard.split, index) for shard in ready for index in shard.indices}
         for episode, since in self._staged.items():
             if since <= before and episode not in packed:
@@ -238,7 +236,7 @@ class DatasetWriter:
             done.result()
 
     def _pack(self, shard: ShardRange) -> _Packed:
-        """Writes a shard to a temporary file that closing the stack deletes; returns both and the checked entry."""
+        """Writes a shard to a temporary file. Returns the stack that deletes it, the file and the checked entry."""
         with ExitStack() as stack:
             temporary = stack.enter_context(temporary_file(self.folder / STAGING_NAME / shard.name))
             with temporary.open("wb") as file:
@@ -265,7 +263,7 @@ class DatasetWriter:
         return entry
 
     def _winner(self, shard: ShardRange) -> ShardEntry | None:
-        """Returns another generator's shard with these episodes, or None. Guards against locks that do not work."""
+        """Returns another generator's shard with these episodes, or None. It protects against locks without effect."""
         self.refresh()
         if missing_ranges([shard], self._published) == [shard]:
             return None
@@ -282,14 +280,14 @@ class DatasetWriter:
         if len(present) < len(shards):
             self._rewrite_list(present)
         self._list_unlisted({path.name for path in self.folder.glob("*.tar")} - {shard.name for shard in present})
-        # a complete folder that is asked for less, or for the same again, stays as it is
+        # a complete folder stays unchanged if fewer or the same episodes are requested
         asks_anew = self.requested != self.manifest.requested and not (self.complete and self.manifest.complete)
         if asks_anew or not (self.folder / MANIFEST_NAME).exists():
             self._publish_list()
         for path in (self.folder / STAGING_NAME).glob("*.tar"):
             episode = parse_episode_key(path.stem)
             if episode is None or not missing_ranges([episode], self._published):
-                path.unlink(missing_ok=True)  # its publisher may be about to do the same
+                path.unlink(missing_ok=True)  # its publisher may delete it at the same time
 
     def _is_present(self, shard: ShardEntry) -> bool:
         path = self.folder / shard.name
@@ -304,13 +302,13 @@ class DatasetWriter:
         return True
 
     def _packed_names(self, shard: ShardRange) -> set[str]:
-        """Returns the names of shards that overlap this range, with a leftover temporary file."""
+        """Returns the names of shards that overlap this range and have a leftover temporary file."""
         names = {temporary_target(path) for path in (self.folder / STAGING_NAME).glob(f".*{TEMPORARY_SUFFIX}")}
         ranges = {name: parse_shard_name(name) for name in names}
         return {name for name, other in ranges.items() if other is not None and _overlap(shard, other)}
 
     def _list_unlisted(self, names: set[str]) -> None:
-        """Lists those shards that were published by a generator that ended before it could list them."""
+        """Lists the given shards if a generator published them and ended before listing them."""
         for name in sorted(names):
             shard, path = parse_shard_name(name), self.folder / name
             if shard is None or not path.exists():
@@ -324,7 +322,7 @@ class DatasetWriter:
             self._report(f"{name} was published but not yet listed; checked and listed")
 
     def _find_staged(self, shard: ShardRange) -> None:
-        """Checks the staged episodes of a shard that was just claimed, and removes partial files of earlier runs."""
+        """Checks the staged episodes of a newly claimed shard. Removes partial files of earlier runs."""
         for index in shard.indices:
             path = staged_path(self.folder, shard.split, index)
             for partial in path.parent.glob(f".{path.name}.*{TEMPORARY_SUFFIX}"):
@@ -341,7 +339,7 @@ class DatasetWriter:
                 self.add_staged(shard.split, index)
 
     def _sweep(self) -> None:
-        """Removes partial files of ended writers: those whose shard or episode no one has locked."""
+        """Removes partial files of ended writers, whose shard or episode is not locked."""
         for folder in (self.folder, self.folder / STAGING_NAME):
             for path in folder.glob(f".*{TEMPORARY_SUFFIX}"):
                 name = temporary_target(path)
@@ -362,12 +360,12 @@ class DatasetWriter:
             yield from missing
 
     def _forget_published(self) -> None:
-        self._published = {split: bytearray(count) for split, count in self.requested.items()}  # a byte an episode
+        self._published = {split: bytearray(count) for split, count in self.requested.items()}  # a byte per episode
         self._listed = self._begun = self._published_of_share = 0
         self._failures = []
 
     def _note_published(self) -> None:
-        """Reads the shards that `manifest` has in addition."""
+        """Adds the new shards of `manifest` to the published episodes."""
         for shard in self.manifest.shards.since(self._listed):
             published, in_share = self._published[shard.split], self._in_share[shard.split]
             published.extend(bytes(max(shard.stop - len(published), 0)))
@@ -379,7 +377,7 @@ class DatasetWriter:
         """Reads the shards that other generators have published."""
         try:
             content = read_replaced(self.folder / MANIFEST_NAME)
-        except FileNotFoundError:  # removed by hand: it is written anew with the next shard
+        except FileNotFoundError:  # removed by hand; the next shard writes it again
             return
         if content != self._content:
             manifest = Manifest.parse(content, self.folder)
@@ -419,7 +417,7 @@ def _overlap(one: ShardRange | ShardEntry, other: ShardRange | ShardEntry) -> bo
 
 
 def _link(temporary: Path, target: Path) -> bool:
-    """Gives a finished file its name. Returns False if the name is taken: an existing file is never replaced."""
+    """Gives a finished file its name. Returns False if the name exists. Existing files are never replaced."""
     try:
         target.hardlink_to(temporary)
     except FileExistsError:
@@ -429,5 +427,5 @@ def _link(temporary: Path, target: Path) -> bool:
             raise
         if target.exists():
             return False
-        shutil.move(temporary, target)  # a file system without hard links; the manifest's lock keeps others away
+        shutil.move(temporary, target)  # without hard links; the manifest's lock excludes other writers
     return True

@@ -1,7 +1,7 @@
 """`python -m datagen.service +experiment=obstacles out=data/obstacles`: generates a data set and serves it over HTTP.
 
-Training reads it from anywhere with `dataset.folder=http://HOST:PORT`, while it grows. Ctrl-C or SIGTERM leaves a
-folder that can be gone on with. Started again on a complete data set, it only serves.
+Training reads it from any machine with `dataset.folder=http://HOST:PORT`, while it grows. After Ctrl-C or SIGTERM the
+folder can be resumed. Started on a complete data set, the command only serves.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class ServiceConfig:
 
     host: str = "127.0.0.1"  # address to listen on; any other needs a token in $HGN_DATASET_TOKEN
     port: Port = 8000  # 0: any free port
-    health_port: Port | None = None  # also answers /healthz there, for the probes of a busy service; null: none
+    health_port: Port | None = None  # also answers /healthz at this port, for the probes of a busy service; null: no
     connections: Positive[int] = 1024  # simultaneous connections; others are answered with 503
 
     def __post_init__(self) -> None:
@@ -45,7 +45,7 @@ class ServiceConfig:
 
 
 def main(mapping: dict[str, Any], backend: Backend | None = None) -> int:
-    """Serves until it is stopped; the exit code is 128 + the signal."""
+    """Serves until it is stopped. The exit code is 128 + the signal."""
     kind = mapping.get("progress", "bar")
     require(kind in PROGRESS_KINDS, "progress", f"one of {', '.join(PROGRESS_KINDS)}", kind)
     config = datagen_config(mapping, _SERVICE_KEYS)
@@ -61,7 +61,7 @@ def main(mapping: dict[str, Any], backend: Backend | None = None) -> int:
         page = None
         if service.health_port is not None:
             page = stack.enter_context(HealthPage(_listen(service.host, service.health_port, token)))
-        # this loads for a second, and the pool's processes, which import this file, do not need it
+        # this import takes a second, and the pool's processes, which import this file, do not need it
         from datagen.service.server import make_app, make_server, telling
 
         progress = make_progress(kind)
@@ -89,9 +89,9 @@ def main(mapping: dict[str, Any], backend: Backend | None = None) -> int:
 
 
 def _listen(host: str, port: int, token: str | None) -> socket.socket:
-    """The socket to serve on.
+    """Returns the socket to serve on.
 
-    Raises: ConfigError when the port is taken, the host is none of this machine's, or anybody could read.
+    Raises: ConfigError if the port is taken, the host is not an address of this machine, or everybody could read.
     """
     try:
         family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
@@ -101,7 +101,7 @@ def _listen(host: str, port: int, token: str | None) -> socket.socket:
                 "environment of the service and of its readers"
             )
         return socket.create_server(address[:2], family=family, backlog=1024)
-    except (OSError, UnicodeError) as error:  # the second for what can be no host's name
+    except (OSError, UnicodeError) as error:  # UnicodeError: text that cannot be a host name
         number, cause = (error.errno, error.strerror) if isinstance(error, OSError) else (None, error)
         remedies = {
             errno.EADDRINUSE: "stop what uses it or choose another port=... (0: any free one)",

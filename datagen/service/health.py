@@ -1,7 +1,7 @@
-"""/healthz at a port of its own, from a process of its own: a thread of the service would wait for Python's lock.
+"""Serves /healthz at a separate port from a separate process. A thread of the service would wait for Python's lock.
 
-The service reports its state every second. After SILENCE_S without a report the answer is 503, so that a service that
-hangs is noticed.
+The service reports its state every second. After SILENCE_S without a report the answer is 503, which shows a service
+that hangs.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from pathlib import Path
 from typing import Any
 
 SILENCE_S = 30.0
-_PATIENCE_S = 2.0  # for a request
-_PIPE_BYTES = 4096  # of reports that are not read yet: a minute of them
+_PATIENCE_S = 2.0  # longest time for a request
+_PIPE_BYTES = 4096  # size of the pipe for reports; it contains those of a minute
 
 
 class HealthPage:
@@ -30,7 +30,7 @@ class HealthPage:
         self._listener = listener
 
     def tell(self, status: int, content: dict[str, Any]) -> None:
-        """Sets the answer from now on, without waiting; a process that ended or was stopped is replaced."""
+        """Sets the answer without waiting. A process that ended or was stopped is replaced."""
         content = {name: str(text)[:1000] for name, text in content.items()}
         try:
             os.write(self._reports, json.dumps([status, content]).encode() + b"\n")
@@ -48,7 +48,7 @@ class HealthPage:
 
     def _begin(self) -> None:
         command = [sys.executable, "-m", "datagen.service.health", str(self._listener.fileno())]
-        # the package is found where this one was; a group of its own: Ctrl-C is for the service
+        # the package is found from this folder; Ctrl-C is sent only to the service's process group
         folder = Path(__file__).resolve().parents[2]
         self.process = subprocess.Popen(
             command, stdin=subprocess.PIPE, pass_fds=[self._listener.fileno()], cwd=folder, process_group=0
@@ -65,7 +65,7 @@ class HealthPage:
 
 
 class Page(ThreadingHTTPServer):
-    """The server in the process: answers with the last line that `read` got."""
+    """The server in the separate process. It answers with the last line that `read` received."""
 
     def __init__(self, listener: socket.socket) -> None:
         super().__init__(listener.getsockname()[:2], _Handler, bind_and_activate=False)
@@ -74,7 +74,7 @@ class Page(ThreadingHTTPServer):
         self.report = time.monotonic(), 503, {"status": "the service has not begun"}
 
     def read(self, line: str) -> None:
-        """Takes a report."""
+        """Stores a report."""
         status, content = json.loads(line)
         self.report = time.monotonic(), status, content
 
@@ -100,7 +100,7 @@ class _Handler(BaseHTTPRequestHandler):
         self.wfile.write(body)
 
     def log_message(self, format: str, *arguments: Any) -> None:
-        """Writes no log."""
+        """Writes nothing."""
 
 
 if __name__ == "__main__":

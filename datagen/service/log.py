@@ -1,8 +1,8 @@
-"""The service's log, which holds nobody up: whoever reads it may stop reading.
+"""The service's log. It does not stop the service if its reader stops reading.
 
-A write to a full pipe waits until its reader goes on (`| less`, a stopped `tee`, a log daemon that hangs). So would the
-service, its pool and every solver, each at its next line. Here their lines go through a pipe that is always read, and
-what the log does not take is left out.
+A write to a full pipe waits until its reader continues (`| less`, a stopped `tee`, a log daemon that hangs). The
+service, its pool and every solver would wait too, each at its next line. Here their lines go through a pipe that is
+always read. Lines that the log does not accept are dropped.
 """
 
 from __future__ import annotations
@@ -18,14 +18,15 @@ from collections.abc import Sequence
 from types import TracebackType
 
 _PIECE_BYTES = 4096
-_WAITING = 256  # pieces
-_END_S = 2.0  # for what waits at the end
+_WAITING = 256  # largest number of waiting pieces
+_END_S = 2.0  # time for waiting pieces at the end
 _LEFT_OUT = b"\n(lines are missing here: nobody read the log)\n"
 
 
 class UnhurriedLog:
-    """While it is entered, what this process and its children write to `files` goes to the same places, if these take
-    it; a context manager. A terminal stays as it is: who stops it waits at it."""
+    """While it is entered, output of this process and its children to `files` goes to the same places if possible.
+
+    It is a context manager. A terminal is written directly, because its user may stop the output."""
 
     def __init__(self, files: Sequence[int] = (1, 2)) -> None:
         self._files = files
@@ -33,7 +34,7 @@ class UnhurriedLog:
 
     @property
     def error(self) -> str:
-        """Why what was written last is not in the log."""
+        """Why the last lines are not in the log."""
         return next((stream.error for stream in self._streams if stream.error), "")
 
     def __enter__(self) -> UnhurriedLog:
@@ -63,7 +64,7 @@ class _Stream:
             threading.Thread(target=target, daemon=True).start()
 
     def close(self) -> None:
-        """The file is what it was, but not where its last lines would wait for its reader."""
+        """Restores the file, unless the last lines still wait for its reader."""
         deadline = time.monotonic() + _END_S
         while waits := select.select([self._source], [], [], 0)[0] or self._pieces.unfinished_tasks:
             if time.monotonic() > deadline:

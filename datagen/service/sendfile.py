@@ -1,8 +1,8 @@
 """Files over HTTP without their bytes passing through Python: the kernel sends them.
 
-`FileRange` answers a request for a file or one range of it, in any ASGI server. In one that knows the ASGI extension
-`http.response.zerocopysend` it asks for that; datagen.service.uvicorn_compat teaches it to Uvicorn. On two cores and
-eight readers this carries half as much again as sending pieces, and holds none of them in memory.
+`FileRange` answers a request for a file or one range of it, in any ASGI server. If the server supports the ASGI
+extension `http.response.zerocopysend`, it uses the extension; datagen.service.uvicorn_compat adds it to Uvicorn. On two
+cores with eight readers this is 50 % faster than sending pieces, and no pieces are kept in memory.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ _RANGE = re.compile(r"bytes=(\d{0,18})-(\d{0,18})")
 
 
 class FileRange(Response):
-    """A file's bytes: all of them, or the range that is asked for (one; of several the whole file is sent).
+    """Sends a file's bytes: all of them, or one requested range. For several ranges it sends the whole file.
 
-    `headers` must hold the file's ETag. A file that turns out shorter ends the connection, so that nobody takes what
-    came for the whole.
+    `headers` must contain the file's ETag. If the file is too short, the connection is closed, so that no reader takes
+    a part for the whole.
     """
 
     def __init__(self, path: Path, size: int, headers: dict[str, str], media_type: str) -> None:
@@ -67,7 +67,7 @@ class FileRange(Response):
 
 
 def _bounds(first: str, last: str, size: int) -> tuple[int, int]:
-    """The half-open range of an HTTP one, whose last byte counts."""
+    """Returns the half-open range of an HTTP range, which includes its last byte."""
     if not first:
         return max(size - int(last), 0), size
     return int(first), min(int(last) + 1, size) if last else size

@@ -1,16 +1,16 @@
-"""The data set over HTTP, read-only: the manifest, the shards it lists, and how far the generator is.
+"""Serves a data set over HTTP, read-only: the manifest, the listed shards, and the progress of the generator.
 
 | path | what | |
 |---|---|---|
-| /manifest.json | the manifest: what the data set is, and how much of it is published | ETag: sha256 of its bytes |
-| /index/... | the index's files, see `hgn.data.index` | Range |
+| /manifest.json | the manifest: contents of the data set, and the published part | ETag: sha256 of its bytes |
+| /index/... | the index's files (see `hgn.data.index`) | Range |
 | /<shard>.tar | a published shard | ETag: its sha256; Range, If-Range |
 | /progress | counts and the pool's state, JSON | |
 | /metrics | the same for Prometheus | |
-| /healthz | 200 while the service serves; needs no token; see `datagen.service.health` for a busy one | |
+| /healthz | 200 while the service works; needs no token; see `datagen.service.health` for a busy service | |
 
-Nothing else of the folder can be reached, and no shard whose bytes are not those that the manifest promises. With a
-token each request must carry `Authorization: Bearer <token>`.
+No other file of the folder can be read, nor a shard whose bytes differ from the manifest. With a token each request
+must contain `Authorization: Bearer <token>`.
 """
 
 from __future__ import annotations
@@ -44,17 +44,17 @@ from hgn.schema import ConfigError
 from hgn.system.files import read_replaced
 
 _OPEN_PATHS = ("/healthz",)
-_GRACE_S = 5  # for answers that are being sent when the service is stopped; readers go on where they were cut
-_FRESH_S = 0.05  # for which a look at the manifest counts: a thousand readers may ask in a second
-_BACKLOG = 256  # connections that are accepted before any of them is looked at
-_OTHER_FILES = 64
-OPEN_FILES = 1024  # of a process, where nothing else is said
+_GRACE_S = 5  # time for running answers after a stop; readers later resume interrupted downloads
+_FRESH_S = 0.05  # age up to which a read manifest is used; a thousand readers may ask in a second
+_BACKLOG = 256  # connections that the system accepts before the service handles them
+_OTHER_FILES = 64  # open files besides connections and shards
+OPEN_FILES = 1024  # assumed limit of open files
 _REMEDY = "delete it and run the generator again"
 
 
 @dataclass(frozen=True)
 class Snapshot:
-    """A manifest as it was read."""
+    """A manifest with its bytes and ETag."""
 
     content: bytes
     etag: str
@@ -62,24 +62,24 @@ class Snapshot:
 
 
 class Published:
-    """The manifest of a folder, and where its shards are.
+    """The manifest of a folder, and the places of its shards.
 
-    It is read once when the file has changed, and index lines once when they are needed, however many ask; what a
-    request finds stays as it is.
+    A changed file is read once, and index lines are read once when needed, for any number of requests. A snapshot of a
+    request does not change.
     """
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self._stamp: tuple[int, ...] | None = None
         self._snapshot: Snapshot | None = None
-        self._looked_at = 0.0  # by the loop's clock
-        self._shards: dict[str, tuple[str, int]] = {}  # sha256, bytes
-        self._listed: Index | None = None  # whose shards these are
+        self._looked_at = 0.0  # time by the loop's clock
+        self._shards: dict[str, tuple[str, int]] = {}  # sha256 and bytes by name
+        self._listed: Index | None = None  # the index of these shards
         self._reading, self._listing = asyncio.Lock(), asyncio.Lock()
-        self._threads = CapacityLimiter(2)  # its own: others may wait for shards to be hashed
+        self._threads = CapacityLimiter(2)  # separate threads, because those of the app may be hashing shards
 
     async def snapshot(self) -> Snapshot:
-        """Raises: ConfigError when there is no manifest that this version can read."""
+        """Returns the present manifest. Raises: ConfigError if there is none that this version can read."""
         time = asyncio.get_running_loop().time
         if self._snapshot is None or time() > self._looked_at + _FRESH_S:
             async with self._reading:
@@ -91,7 +91,7 @@ class Published:
         return self._snapshot
 
     async def shard(self, name: str) -> tuple[str, int] | None:
-        """The sha256 and size of a published shard."""
+        """Returns the sha256 and size of a published shard, or None."""
         index = (await self.snapshot()).manifest.shards
         if name not in self._shards:
             async with self._listing:
@@ -118,12 +118,12 @@ class Published:
         listed = self._listed
         first = len(listed) if listed is not None and listed.state.generation == index.state.generation else 0
         new = {shard.name: (shard.sha256, shard.bytes) for shard in index.since(first)}
-        self._shards = (self._shards if first else {}) | new  # as a whole: requests read it meanwhile
+        self._shards = (self._shards if first else {}) | new  # replaced as a whole, because requests read it meanwhile
         self._listed = index
 
 
 class Guard:
-    """Asks each request for the token, and counts what is answered."""
+    """Checks the token of each request, and counts answers."""
 
     def __init__(self, app: ASGIApp, token: str | None, counters: Counter[str]) -> None:
         self._app, self._counters = app, counters
@@ -144,7 +144,7 @@ class Guard:
         ):
             await PlainTextResponse("nothing can be sent here\n", 413, {"connection": "close"})(scope, receive, counted)
             return
-        if self._expected is None and not _is_own_name(scope):  # a page elsewhere that named this machine its own
+        if self._expected is None and not _is_own_name(scope):  # a page elsewhere may give this machine its own name
             await PlainTextResponse("ask by the address of this machine, or set a token\n", 421)(
                 scope, receive, counted
             )
@@ -161,12 +161,12 @@ class Guard:
         if self._expected is None or scope["path"] in _OPEN_PATHS:
             return True
         given = [value for name, value in scope["headers"] if name == b"authorization"]
-        # in constant time, so that the answer's delay tells nothing of the token
+        # in constant time, so that the delay of the answer reveals nothing about the token
         return len(given) == 1 and hmac.compare_digest(given[0], self._expected)
 
 
 def make_app(folder: Path, token: str | None, pool: Callable[[], PoolState]) -> Starlette:
-    """The service as an ASGI application."""
+    """Returns the service as an ASGI application."""
     published, counters = Published(folder), Counter[str]()
     hashing: defaultdict[str, asyncio.Lock] = defaultdict(asyncio.Lock)
 
@@ -183,7 +183,7 @@ def make_app(folder: Path, token: str | None, pool: Callable[[], PoolState]) -> 
         size = await to_thread.run_sync(index.size, name)
         if size is None:
             return PlainTextResponse("the index has no such file\n", 404)
-        # what was sent of it never changes: it may only be longer another time
+        # sent bytes of this file never change; it can only grow
         headers = {"etag": f'"{request.path_params["name"]}"', "cache-control": "private, no-cache"}
         return FileRange(folder / name, size, headers, "application/jsonl")
 
@@ -194,7 +194,7 @@ def make_app(folder: Path, token: str | None, pool: Callable[[], PoolState]) -> 
             return PlainTextResponse("the manifest lists no such shard\n", 404)
         (sha256, size), path = entry, folder / name
         try:
-            # many ask for a new shard at once: its sha256 is taken by the first
+            # many readers request a new shard together; only the first request computes its sha256
             async with hashing[name]:
                 await to_thread.run_sync(verify_file, path, sha256, size, _REMEDY)
         except FileNotFoundError:
@@ -202,7 +202,7 @@ def make_app(folder: Path, token: str | None, pool: Callable[[], PoolState]) -> 
         except ConfigError:
             return PlainTextResponse(f"{name} is damaged here; {_REMEDY}\n", 410)
         etag = f'"{sha256}"'
-        # another data set may have a shard of this name, at this address, later
+        # later another data set may have a shard with this name at this address
         headers = {"etag": etag, "cache-control": "private, no-cache"}
         if _unchanged(request, etag):
             return Response(status_code=304, headers=headers)
@@ -245,7 +245,7 @@ def make_app(folder: Path, token: str | None, pool: Callable[[], PoolState]) -> 
 
 
 def telling(page: HealthPage, app: Starlette) -> Callable[[], Awaitable[None]]:
-    """Tells `page` how an app of `make_app` is, without waiting for it: a folder may not answer."""
+    """Returns a function that reports the state of an app to `page`. It does not wait for a folder that hangs."""
     looks: set[asyncio.Task[None]] = set()
 
     async def look() -> None:
@@ -269,7 +269,7 @@ def make_server(
     patience_s: float = SendfileProtocol.patience_s,
     every_second: Callable[[], Awaitable[None]] | None = None,
 ) -> uvicorn.Server:
-    """Serves `app` to as many connections at once, or as `open_files` are enough for; more are told to come back."""
+    """Returns a server for `connections`, or fewer if `open_files` are too few. Others are asked to retry later."""
     most = max(1, min(connections, (open_files - _BACKLOG - _OTHER_FILES) // 2))  # a socket and a shard each
     limits = {"most_connections": most, "patience_s": patience_s}
     return uvicorn.Server(
@@ -277,7 +277,7 @@ def make_server(
             app,
             http=type("Protocol", (SendfileProtocol,), limits),
             backlog=_BACKLOG,
-            loop="asyncio",  # uvloop, which Uvicorn takes where it is installed, cannot send files
+            loop="asyncio",  # uvloop, which Uvicorn prefers if installed, cannot send files
             lifespan="off",
             ws="none",
             log_level="warning",
@@ -286,13 +286,13 @@ def make_server(
             limit_concurrency=most + 1,
             timeout_graceful_shutdown=_GRACE_S,
             callback_notify=every_second,
-            timeout_notify=0,  # s; it is looked at every second
+            timeout_notify=0,  # seconds; it is called every second
         )
     )
 
 
 def _is_own_name(scope: Scope) -> bool:
-    """Returns whether a request names this machine: by localhost, or the address that it was sent to."""
+    """Returns whether a request names this machine: localhost, or the address to which it was sent."""
     hosts = [value.decode("latin-1") for name, value in scope["headers"] if name == b"host"]
     names = [re.sub(r":\d+$", "", host).strip("[]") for host in hosts]
     own = ("localhost", "127.0.0.1", "::1", str((scope.get("server") or ("",))[0]))

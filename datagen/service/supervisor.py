@@ -1,8 +1,8 @@
-"""The pool as a process of its own, kept alive by the service: whatever becomes of it, what is published is served.
+"""Runs the pool in a process of its own and keeps it alive. The service serves published episodes in every case.
 
-A pool that dies, says nothing, or ends for want of disk space, is started again after a pause that grows while no
-episode gets finished. One whose configuration is at fault is not: the service says so and goes on serving. A log that
-cannot be written ends nothing; a fault of the supervisor itself ends the service.
+A pool that dies, reports nothing, or ends because the disk is full is started again after a pause. The pause grows
+until another episode is finished. A pool with a wrong configuration is not started again; the service reports the error
+and continues to serve. An unwritable log ends nothing. An error of the supervisor itself ends the service.
 """
 
 from __future__ import annotations
@@ -24,31 +24,31 @@ from hgn.system.processes import cause_of_exit, start_child
 
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 1.0, 60.0
 _STOP_PATIENCE_S = 60.0
-_LOOK_S, _BEAT_S = 0.2, 1.0
+_LOOK_S, _BEAT_S = 0.2, 1.0  # interval of checks, and of the pool's reports
 _EVENTS = ("start", "frame", "episode", "found", "shard", "message", "close")
 
 
 @dataclass(frozen=True)
 class PoolState:
-    """The pool as last seen; `status` is starting, running, complete, waiting (to start again), failed or stopped."""
+    """The last state of the pool. `status`: starting, running, complete, waiting (to start), failed or stopped."""
 
     status: str = "starting"
     starts: int = 0
-    done: int = 0  # episodes published or staged
+    done: int = 0  # number of episodes published or staged
     total: int = 0
-    frames: int = 0  # of an episode
-    running: dict[int, tuple[int, int]] = field(default_factory=dict)  # worker -> frame reached, scenes at once
-    error: str = ""  # the last one
+    frames: int = 0  # number of frames of an episode
+    running: dict[int, tuple[int, int]] = field(default_factory=dict)  # worker -> frame, number of scenes
+    error: str = ""  # the last error
     log_error: str = ""  # why the last line of the log could not be written
 
 
 class Supervisor:
-    """Runs the pool until it is left; a context manager."""
+    """Runs the pool while it is entered; a context manager."""
 
     def __init__(self, config: DatagenConfig, progress: Progress, backend: Backend | None = None) -> None:
         self._config, self._progress, self._backend = config, progress, backend
-        self.state = PoolState()  # replaced as a whole, so that other threads may read it at any time
-        self.unusable: str | None = None  # why the service has to end
+        self.state = PoolState()  # replaced as a whole, so that other threads can read it at any time
+        self.unusable: str | None = None  # why the service must end
         self.on_unusable = lambda: None
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name="pool supervisor")
@@ -60,7 +60,7 @@ class Supervisor:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Ends the pool as Ctrl-C does: it keeps what it has finished."""
+        """Ends the pool as Ctrl-C does. Finished episodes are kept."""
         self._stopping.set()
         self._thread.join()
 
@@ -98,8 +98,8 @@ class Supervisor:
         self._set(status="stopped", running={})
 
     def _run_once(self) -> tuple[str, str]:
-        """Runs a pool to its end: complete, stopped, config_error, os_error, error or died, and in words why."""
-        # should the service be killed, the pool ends as it would at Ctrl-C
+        """Runs a pool to its end. Returns complete, stopped, config_error, os_error, error or died, and the reason."""
+        # if the service is killed, the pool ends as after Ctrl-C
         process, connection = start_child(
             _generate, self._config, self._backend, number=signal.SIGTERM, duplex=False, daemon=False
         )
@@ -113,7 +113,7 @@ class Supervisor:
                     asked = True
                 if not connection.poll(_LOOK_S):
                     patience -= _LOOK_S * asked
-                    silent_s += _LOOK_S  # by looks, not by a clock: this process may have been stopped, too
+                    silent_s += _LOOK_S  # counted in checks, because this process may have been stopped too
                     if patience < 0 or silent_s > silence:
                         process.kill()
                     continue
@@ -148,7 +148,7 @@ class Supervisor:
     def _say(self, kind: str, *values: Any) -> None:
         try:
             getattr(self._progress, kind)(*values)
-        except OSError as error:  # whoever read the log has gone, or its disk is full
+        except OSError as error:  # the log's reader has ended, or its disk is full
             self._set(log_error=str(error))
         else:
             if self.state.log_error:
@@ -159,7 +159,7 @@ class Supervisor:
 
 
 class _PipeProgress(Progress):
-    """Tells the service everything, as (event, *values)."""
+    """Sends every event to the service as (event, *values)."""
 
     def __init__(self, connection: Connection) -> None:
         for event in _EVENTS:
@@ -173,7 +173,7 @@ def _generate(connection: Connection, config: DatagenConfig, backend: Backend | 
 
             def should_stop() -> bool:
                 nonlocal spoke_at
-                if time.monotonic() - spoke_at > _BEAT_S:  # so that a pool that is stopped is noticed
+                if time.monotonic() - spoke_at > _BEAT_S:  # reports, so that a stopped pool is noticed
                     spoke_at = time.monotonic()
                     connection.send(("alive",))
                 return stop.requested()
@@ -181,7 +181,7 @@ def _generate(connection: Connection, config: DatagenConfig, backend: Backend | 
             finished = generate(config, _PipeProgress(connection), should_stop, backend, early=True)
             connection.send(("complete",) if finished else ("stopped",))
         except (BrokenPipeError, ConnectionResetError):
-            return  # the service is gone; what is finished is kept
+            return  # the service has ended; finished episodes are kept
         except (ConfigError, OSError) as error:
             connection.send(error_message(error))
         except Exception as error:  # noqa: BLE001 - not swallowed: the service reports it

@@ -1,6 +1,6 @@
-"""What of Uvicorn's HTTP protocol is changed from within; pyproject.toml bounds its version.
+"""Changes to Uvicorn's HTTP protocol from within. pyproject.toml bounds its version.
 
-`tests/datagen/test_sendfile.py` fails when a new version has changed it: the extension would lack.
+`tests/datagen/test_sendfile.py` fails if a new version changes the internals; the extension would then not work.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from datagen.service.sendfile import EXTENSION
 
-_PIECE_BYTES = 2**20  # a reader must take so much in `patience_s`
+_PIECE_BYTES = 2**20  # number of bytes that a reader must accept within `patience_s`
 
 
 class _Length:
-    """Stands for bytes that h11 counts and does not see."""
+    """Stands for bytes that h11 counts but does not see."""
 
     def __init__(self, count: int) -> None:
         self._count = count
@@ -29,11 +29,11 @@ class _Length:
 
 
 class SendfileProtocol(H11Protocol):
-    """Uvicorn's HTTP on asyncio's own loop with `http.response.zerocopysend`, and with an end to all waiting.
+    """Adds `http.response.zerocopysend` and time limits to Uvicorn's HTTP on asyncio's own loop.
 
-    A connection on which no whole request comes for `patience_s`, or whose answer is taken too slowly, is cut. Where
-    there are more than `most_connections`, the one that has been without a request for longest makes room. Uvicorn's
-    own limits are silent until a first answer was sent, and count connections without a request as load.
+    A connection is closed if no whole request arrives for `patience_s`, or if its answer is accepted too slowly. With
+    more than `most_connections`, the one that has been without a request for longest is closed. Uvicorn's own limits
+    act only after a first answer, and count connections without a request as load.
     """
 
     patience_s = 30.0
@@ -56,7 +56,7 @@ class SendfileProtocol(H11Protocol):
 
     @property
     def busy(self) -> bool:
-        """Returns whether a request is being answered."""
+        """Returns whether a request is in progress."""
         return self.cycle is not None and not self.cycle.response_complete
 
     def _look(self) -> None:
@@ -85,7 +85,7 @@ class SendfileProtocol(H11Protocol):
         await app({**scope, "extensions": extensions}, receive, send_all)
 
     async def _send_file(self, file: BinaryIO, offset: int, count: int) -> bool:
-        """Whether the bytes are on their way; not so when the reader has gone, or the file is too short."""
+        """Sends a part of a file. Returns False if the reader has gone or the file is too short."""
         self.conn.send_with_data_passthrough(h11.Data(data=cast(bytes, _Length(count))))
         try:
             for start in range(offset, offset + count, _PIECE_BYTES):
