@@ -22,7 +22,6 @@ STREAM = 4  # number of the random stream; hgn.scene.random_scene uses 1 to 3, h
 SURFACE_FRACTION = 0.9  # fraction of the distance to an obstacle's surface within which children may start
 
 
-
 def fine_scene(scene: Scene, cell_size: float, wall: float) -> Scene:
     """Returns the scene with its particles' children for a grid of `cell_size`; the same scene for its own cell size.
 

@@ -1,7 +1,7 @@
-"""Settings shared by the commands, as dataclasses: Hydra composes YAML, the dataclasses validate it once per command.
+"""Settings shared by the commands, as dataclasses. Hydra composes YAML; the dataclasses validate it once per command.
 Settings of one command are at the top of its file.
 
-Only plain dataclasses are passed on, no DictConfig. Numbers that follow from others are properties, not settings.
+Other code sees only dataclasses, never a DictConfig. Numbers that follow from settings are properties.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ GROUP_SHAPES = ("cube", "sphere")
 NETWORK_KINDS = ("hgn", "gns")
 BACKENDS = ("auto", "torch", "triton", "cpu")
 PRECISIONS = ("fp32", "tf32", "fp16")
-SIMULATED_FRAMES = 3  # an episode needs for pushforward: the start, a simulated frame and its target
+SIMULATED_FRAMES = 3  # frames that pushforward needs of an episode: start, one simulated frame, its target
 DEFAULT_WEIGHTS = "mechanics"  # shipped weights that commands and `Simulator.load` use
 Material = Annotated[str, one_of(*MATERIALS)]
 MaterialName = Annotated[
@@ -54,11 +54,11 @@ Precision = Annotated[str, one_of(*PRECISIONS)]
 PrecisionOrAuto = Annotated[str, one_of("auto", *PRECISIONS)]
 StoredPrecision = Annotated[str, one_of("fp32", "fp16")]
 Split = Annotated[str, one_of("train", "validation", "test")]
-MATERIAL_EMBEDDING = 16  # numbers that a network learns for each material (paper: E)
+MATERIAL_EMBEDDING = 16  # number of values that a network learns for each material (paper: E)
 
 
 def config_directory() -> Path:
-    """Returns the folder with the Hydra configs: inside the installed package, or beside it in a checkout."""
+    """Returns the folder with the Hydra configs: inside the installed package, or next to it in a checkout."""
     package = Path(__file__).resolve().parent
     for candidate in (package / "conf", package.parent / "conf"):
         if (candidate / "datagen.yaml").is_file():
@@ -67,13 +67,14 @@ def config_directory() -> Path:
 
 
 def is_mesh_file(name: str | Path) -> bool:
-    """Returns whether a name is that of a mesh file, and not of a built-in shape."""
+    """Returns whether a name has the suffix of a mesh file."""
     return Path(name).suffix.lower() in MESH_SUFFIXES
 
 
 def require_rollout_name(field: str, name: str | None, *more: str) -> None:
-    """Refuses names of folders, pictures and other formats for a rollout file; `more` are accepted endings in addition
-    to ROLLOUT_ENDINGS.
+    """Refuses names of folders, pictures and other formats for a rollout file.
+
+    `more` are accepted suffixes in addition to ROLLOUT_ENDINGS.
     """
     *some, last = (*ROLLOUT_ENDINGS, *more)
     made = "pictures" if more else "pictures, USD and PLY"
@@ -82,41 +83,41 @@ def require_rollout_name(field: str, name: str | None, *more: str) -> None:
     require(ends, field, rule, name, f"tools.render makes {made} of a rollout file")
 
 
-FUNNEL_SQUARES = (0.5, 0.8)  # smallest and largest side of a funnel's squares, in units of the largest obstacle
-FUNNEL_HEIGHT = (2.0, 5.0)  # of the domain below and above a funnel's hole, in group sizes
+FUNNEL_SQUARES = (0.5, 0.8)  # smallest and largest side of a funnel's squares, relative to the largest obstacle
+FUNNEL_HEIGHT = (2.0, 5.0)  # free height below and above a funnel's hole, in group sizes
 
 
 @dataclass(frozen=True)
 class SceneConfig:
-    """The distribution that random scenes are drawn from (paper sec. 3.3). Lengths in domain units."""
+    """The distribution of random scenes (paper sec. 3.3). Lengths are in domain units."""
 
-    domain_size: BoxSize = (1.0, 1.0, 1.0)  # edges of the box from the origin
-    cell_size: Positive[float] = 1 / 64  # of the solver
+    domain_size: BoxSize = (1.0, 1.0, 1.0)  # edges of the box, which starts at the origin
+    cell_size: Positive[float] = 1 / 64  # edge of the solver's cells
     gravity: Vector = (0.0, -9.8, 0.0)  # domain units per second squared
-    obstacle_count: NonNegative[int] = 5  # obstacles in a scene
+    obstacle_count: NonNegative[int] = 5  # number of obstacles in a scene
     obstacle_shapes: tuple[str, ...] = OBSTACLE_SHAPES  # or mesh files, scaled so that the longest side is the size
-    obstacle_size: tuple[float, float] = (0.1, 0.5)  # smallest and largest size
-    group_count: NonNegative[int] = 4  # groups of particles in a scene
-    group_shapes: tuple[Annotated[str, one_of(*GROUP_SHAPES)], ...] = GROUP_SHAPES  # drawn for each group
-    group_size: Positive[float] = 0.08  # side or diameter
-    materials: tuple[Material, ...] = PAPER_MATERIALS  # drawn for each group
-    particles_per_cell: Positive[float] = 8.0  # of the solver, at the start
-    maximum_initial_speed: NonNegative[float] = 0.0  # domain units per second; each moving group draws a velocity
-    # fraction of groups with an initial velocity, where maximum_initial_speed is above 0
+    obstacle_size: tuple[float, float] = (0.1, 0.5)  # smallest and largest size of an obstacle
+    group_count: NonNegative[int] = 4  # number of particle groups in a scene
+    group_shapes: tuple[Annotated[str, one_of(*GROUP_SHAPES)], ...] = GROUP_SHAPES  # shapes to draw from for each group
+    group_size: Positive[float] = 0.08  # side or diameter of a group
+    materials: tuple[Material, ...] = PAPER_MATERIALS  # materials to draw from for each group
+    particles_per_cell: Positive[float] = 8.0  # particles in a solver cell at the start
+    maximum_initial_speed: NonNegative[float] = 0.0  # domain units per second; moving groups draw a velocity
+    # fraction of groups with an initial velocity, if maximum_initial_speed is above 0
     moving_group_fraction: Fraction[float] = 1.0
-    lone_particles: NonNegative[int] = 0  # far from all others; without them networks learn that lone particles rest
+    lone_particles: NonNegative[int] = 0  # number of single particles far from all others; networks learn their rest
     # fraction of moving groups whose velocity is exactly along gravity, against it or perpendicular to it
     pure_direction_fraction: Fraction[float] = 0.0
-    colliding_scene_fraction: Fraction[float] = 0.0  # fraction of scenes with colliding groups and no obstacles
+    colliding_scene_fraction: Fraction[float] = 0.0  # fraction of scenes with colliding groups and without obstacles
     zero_gravity_fraction: Fraction[float] = 0.0  # fraction of scenes without gravity
     # fraction of scenes with gravity of any direction and any size up to 19.6 domain units per second squared
     tilted_gravity_fraction: Fraction[float] = 0.0
-    # fraction of scenes (with gravity, without collisions) in which four square obstacles, of 0.5 to 0.8 times the
-    # largest obstacle_size, form a funnel below the groups
+    # fraction of scenes with a funnel below the groups, if they have gravity and no collisions; it consists of four
+    # square obstacles of 0.5 to 0.8 times the largest obstacle_size
     funnel_scene_fraction: Fraction[float] = 0.0
     funnel_hole: tuple[float, float] = (0.035, 0.14)  # smallest and largest side of a funnel's square hole
-    # kinds of hgn.scene.world and their shares, as in conf/scene/world.yaml, which draw all but domain_size (the
-    # largest), cell_size, materials and particles_per_cell; empty: all scenes are as the settings above say
+    # fraction of each kind of hgn.scene.world, as in conf/scene/world.yaml; kinds draw all settings but domain_size
+    # (the largest), cell_size, materials and particles_per_cell; empty: scenes follow the settings above
     kinds: dict[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -156,48 +157,47 @@ class SceneConfig:
 
 @dataclass(frozen=True)
 class MpmConfig:
-    """The MLS-MPM solver. The defaults correct Taichi Elements; conf/mpm/taichi_elements.yaml computes as it does."""
+    """The MLS-MPM solver. The defaults correct Taichi Elements; conf/mpm/taichi_elements.yaml reproduces it."""
 
-    youngs_modulus_pa: Positive[float] = 1e6  # stiffness of all materials; stiffer ones need shorter steps
-    # of all materials; water has the pressure of its Lame parameter lambda
+    youngs_modulus_pa: Positive[float] = 1e6  # Young's modulus of all materials; stiffer ones need shorter steps
+    # Poisson's ratio of all materials; the pressure of water follows from its Lame parameter lambda
     poisson_ratio: Annotated[float, Bound("in [0, 0.5)", lambda ratio: 0 <= ratio < 0.5)] = 0.2
-    density_kg_m3: Positive[float] = 1000.0  # of all materials at the start
-    # Friction angle of quartz sand at its critical state (Bolton 1986).
+    density_kg_m3: Positive[float] = 1000.0  # density of all materials at the start
+    # Friction angle of sand; the default is that of quartz sand at its critical state (Bolton 1986).
     sand_friction_angle_deg: Annotated[NonNegative[float], Bound("< 90", lambda angle: angle < 90)] = 33.0
-    # Diameter of grains, which make friction grow with the rate of flow: mu(I) of Jop, Forterre and Pouliquen (2006).
-    # With the default, the columns that the solver is checked against are 200 grains in radius. 0: friction does not
-    # depend on the rate.
+    # Diameter of grains. With it friction grows with the flow rate: mu(I) of Jop, Forterre and Pouliquen (2006). With
+    # the default, the columns in the solver's checks are 200 grains in radius. 0: friction does not depend on the rate.
     sand_grain_diameter_m: NonNegative[float] = 0.0025
     snow_hardening: NonNegative[float] = 10.0  # exponent of the stiffness of compressed snow
     snow_critical_compression: BelowOne[float] = 0.025  # snow is elastic down to singular values of 1 minus this
     snow_critical_stretch: NonNegative[float] = 0.0045  # snow is elastic up to singular values of 1 plus this
-    # Fraction of its tension that stretched water bears. 1 as in Taichi Elements.
+    # Fraction of its tension that stretched water bears; 1 as in Taichi Elements.
     water_tension: AtMostOne[NonNegative[float]] = 1.0
-    # Added to the viscosity of the grid, which is larger than that of real water.
+    # Viscosity in addition to that of the grid, which is larger than that of real water.
     water_viscosity_pa_s: NonNegative[float] = 0.0
     collider_friction: NonNegative[float] = 0.0  # Coulomb coefficient of obstacles; 0: frictionless
-    # corrected, or taichi_elements: numerical choices as in the paper's simulator (hgn/solver_method.py lists them).
+    # corrected, or taichi_elements: numerical choices of the paper's simulator (hgn/solver_method.py lists them).
     method: Annotated[str, one_of(*METHODS)] = "corrected"
     fixed_time_step_s: Positive[float] | None = None  # null: each scene takes steps as long as its materials allow
-    # Fraction of the stability limit dx sqrt(rho / (3 lambda + 2 mu)) of a single particle that adaptive steps use.
+    # Adaptive steps as a fraction of a single particle's stability limit dx sqrt(rho / (3 lambda + 2 mu)).
     stability_fraction: AtMostOne[Positive[float]] = 0.875
-    # Grid nodes at each face of the domain that stop outgoing motion; a grid of other cells needs another number for
-    # walls in the same place.
+    # Number of grid nodes at each face of the domain that stop outgoing motion. A grid with other cells needs another
+    # number for walls at the same place.
     wall_cells: Annotated[int, Bound("at least 2, the reach of a particle", lambda count: count >= 2)] = 3
-    device: DeviceName = "auto"  # cpu, cuda, or auto: cuda where there is a GPU
-    scenes_per_launch: OneOrMore | None = None  # null: 1 on a CPU, 416 on a GPU
+    device: DeviceName = "auto"  # cpu, cuda, or auto: cuda if there is a GPU
+    scenes_per_launch: OneOrMore | None = None  # number of scenes in a launch; null: 1 on a CPU, up to 416 on a GPU
 
     def __post_init__(self) -> None:
         require_bounds(self)
 
     @property
     def choices(self) -> SolverMethod:
-        """Returns the choices of the method."""
+        """Returns the numerical choices of the method."""
         return METHODS[self.method]
 
 
 def _spread(number: int, fraction: float) -> bool:
-    """Returns whether item `number`, from 1, belongs to an evenly spread fraction of all."""
+    """Returns whether item `number`, from 1, belongs to an evenly distributed fraction of all items."""
     return math.floor(number * fraction + 1e-9) > math.floor((number - 1) * fraction + 1e-9)
 
 
@@ -205,25 +205,25 @@ def _spread(number: int, fraction: float) -> bool:
 class DatasetConfig:
     """The episodes of a data set: their number, length, folder and generation."""
 
-    folder: FolderName = "data/obstacles"  # of shards, index and manifest; or a URL to read from
-    training_scenes: NonNegative[int] = 800  # episodes of the split train
-    validation_scenes: NonNegative[int] = 5  # episodes of the split validation
-    test_scenes: NonNegative[int] = 20  # episodes of the split test
-    frames: FrameCount = 300  # of an episode; frame 0 is the initial state
-    long_fraction: Fraction[float] = 0.0  # fraction of each split's episodes, evenly spread, that have long_frames
-    long_frames: FrameCount = 300  # of a long episode
+    folder: FolderName = "data/obstacles"  # folder of shards, index and manifest; or a URL to read from
+    training_scenes: NonNegative[int] = 800  # number of episodes of the split train
+    validation_scenes: NonNegative[int] = 5  # number of episodes of the split validation
+    test_scenes: NonNegative[int] = 20  # number of episodes of the split test
+    frames: FrameCount = 300  # number of frames of an episode; frame 0 is the initial state
+    long_fraction: Fraction[float] = 0.0  # fraction of each split's episodes, evenly distributed, with long_frames
+    long_frames: FrameCount = 300  # number of frames of a long episode
     frame_rate_hz: Positive[float] = 60.0  # frames per simulated second
-    # cells per unit of a finer grid that scenes are simulated on, with more particles; their episodes contain those of
-    # scene.cell_size only. null: the grid of scene.cell_size, which has 64 by default
+    # cells per domain unit of a finer grid for simulation, with more particles; episodes contain only particles of the
+    # grid of scene.cell_size; null: no finer grid
     reference_cells: OneOrMore | None = None
-    seed: NonNegative[int] = 0  # of all scenes of the data set
+    seed: NonNegative[int] = 0  # seed of all scenes of the data set
     episodes_per_shard: Positive[int] = 8  # the first shards are smaller, so that training can start early
-    workers: OneOrMore | None = None  # processes that simulate; null: one per GPU, or per two cores of a CPU
+    workers: OneOrMore | None = None  # number of simulating processes; null: one per GPU, or per two cores of a CPU
     worker_silence_s: Positive[float] = 600.0  # seconds without progress after which a worker is replaced
     pool: Annotated[str, one_of("local", "ray")] = "local"  # local: processes of this machine; ray: of a Ray cluster
-    # number of this generator, 0 to array_tasks - 1, as in a Slurm array; each generates its own shards of one folder
+    # number of this generator, 0 to array_tasks - 1, as in a Slurm array; each generates its own shards in one folder
     array_task: int | None = None
-    array_tasks: OneOrMore | None = None  # number of generators on one folder
+    array_tasks: OneOrMore | None = None  # number of generators that write to one folder
 
     def __post_init__(self) -> None:
         require_bounds(self)
@@ -234,11 +234,11 @@ class DatasetConfig:
 
     @property
     def most_frames(self) -> int:
-        """The frames of the longest episode."""
+        """The number of frames of the longest episode."""
         return max(self.frames, self.long_frames) if self.long_fraction > 0 else self.frames
 
     def frames_of(self, index: int) -> int:
-        """Returns the frames of an episode by its index within its split."""
+        """Returns the number of frames of an episode by its index in its split."""
         return self.long_frames if _spread(index + 1, self.long_fraction) else self.frames
 
     def scenes(self, split: str) -> int:
@@ -247,17 +247,17 @@ class DatasetConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class SimulatorConfig:
-    """The settings that commands which simulate with a network have in common."""
+    """Settings of all commands that simulate with a network."""
 
-    device: str = "auto"  # or cpu, cuda, cuda:1
-    # torch, triton (kernels in CUDA graphs), cpu (compiled C); auto: the fastest that runs
+    device: str = "auto"  # auto (a GPU if there is one), cpu, cuda or cuda:1
+    # torch, triton (kernels in CUDA graphs), cpu (compiled C); auto: the fastest one that is supported
     backend: BackendName = "auto"
-    precision: PrecisionOrAuto = "auto"  # of matrix products: fp32, tf32, fp16; auto: the fastest that passes its check
+    precision: PrecisionOrAuto = "auto"  # fp32, tf32 or fp16 products; auto: the fastest that passes its check
 
 
 @dataclass(frozen=True)
 class DatagenConfig:
-    """`python -m datagen`: everything that defines a data set."""
+    """`python -m datagen`: all settings that define a data set."""
 
     scene: SceneConfig = field(default_factory=SceneConfig)
     mpm: MpmConfig = field(default_factory=MpmConfig)
@@ -277,19 +277,19 @@ class DatagenConfig:
 
     @property
     def reference_cell_size(self) -> float:
-        """The cell size of the grid that scenes are simulated on."""
+        """The cell size of the grid on which scenes are simulated."""
         cells = self.dataset.reference_cells
         return self.scene.cell_size if cells is None else 1 / cells
 
     @property
     def reference_ratio(self) -> float:
-        """The cell size of scenes, divided by that of the grid that they are simulated on."""
+        """The cell size of scenes divided by that of the grid on which they are simulated."""
         ratio = self.scene.cell_size / self.reference_cell_size
         return 1.0 if abs(ratio - 1) < 1e-6 else ratio
 
     @property
     def reference(self) -> dict[str, Any] | None:
-        """Returns the record of the finer grid in a data set, or None on the visible grid."""
+        """Returns the record of the finer grid in a data set; None without a finer grid."""
         if self.reference_ratio == 1:
             return None
         children = round(self.reference_ratio**3)
@@ -298,20 +298,20 @@ class DatagenConfig:
 
 @dataclass(frozen=True)
 class NetworkConfig:
-    """The hierarchical graph network (paper sec. 3.1, 3.2), or one it is compared with. Lengths in domain units."""
+    """The hierarchical graph network (paper sec. 3.1, 3.2), or one to compare with it. Lengths are in domain units."""
 
-    kind: Annotated[str, one_of(*NETWORK_KINDS)] = "hgn"  # or gns: Sanchez-Gonzalez et al. 2020, on backend torch
-    cell_size: Positive[float] = 0.035  # R: the finest level; the connectivity radius of GNS
-    levels: FewLayers = 4  # L; GNS has one, the particles
-    message_passing_steps: FewLayers = 4  # M, in each of the 2 L - 1 blocks
-    width: LayerSize = 128  # latent and hidden
-    velocity_history: FewLayers = 5  # m
-    obstacle_features: bool = True  # inputs from the nearest obstacle; false: only for scenes without obstacles
-    # absolute: velocities and wall distances, the paper's; relative: hgn.network.relative, where free motion and
-    # gravity are exact
+    kind: Annotated[str, one_of(*NETWORK_KINDS)] = "hgn"  # hgn, or gns: Sanchez-Gonzalez et al. 2020, on backend torch
+    cell_size: Positive[float] = 0.035  # R: edge of the finest cells; the connectivity radius of GNS
+    levels: FewLayers = 4  # L: number of levels; GNS has one, the particles
+    message_passing_steps: FewLayers = 4  # M: message-passing steps in each of the 2 L - 1 blocks
+    width: LayerSize = 128  # number of values in latent vectors and hidden layers
+    velocity_history: FewLayers = 5  # m: number of past velocities in the input
+    obstacle_features: bool = True  # inputs from the nearest obstacle; false is only for scenes without obstacles
+    # absolute: velocities and wall distances, as in the paper; relative: inputs of hgn.network.relative, with which
+    # free motion and gravity are exact
     inputs: Annotated[str, one_of("absolute", "relative")] = "absolute"
-    materials: tuple[MaterialName, ...] = PAPER_MATERIALS  # each has an embedding of its own
-    # 2: z is that of a plane; imported data alone have it
+    materials: tuple[MaterialName, ...] = PAPER_MATERIALS  # each of the materials has its own embedding
+    # number of dimensions; with 2, which only imported data have, z is constant
     dimensions: Annotated[int, Bound("2 or 3", lambda count: count in (2, 3))] = 3
 
     def __post_init__(self) -> None:
@@ -326,20 +326,20 @@ class NetworkConfig:
 
     @property
     def relative(self) -> bool:
-        """Returns whether inputs are relative: nothing depends on a motion that all particles have in common."""
+        """Returns whether inputs are relative. Then they do not depend on a motion common to all particles."""
         return self.inputs == "relative"
 
     @property
     def feature_width(self) -> int:
-        """Numbers per particle, the embedding last: paper sec. 3.1, or hgn.network.relative."""
+        """The number of inputs per particle, the embedding last (paper sec. 3.1, or hgn.network.relative)."""
         if self.relative:
             motion = 3 * (self.velocity_history - 1) + 3 * self.levels + 3
             return motion + 6 + 6 * self.obstacle_features + MATERIAL_EMBEDDING
         return 3 * self.velocity_history + 3 * self.obstacle_features + 6 + MATERIAL_EMBEDDING
 
 
-# Plane waves of the correlated noise, and the lengths that they are drawn from, in finest cells: short ones stir a
-# body, long ones shift it.
+# Number of plane waves in correlated noise, and the range of their lengths in finest cells. Short waves stir a body,
+# long waves shift it.
 CORRELATED_WAVES, CORRELATED_WAVELENGTHS = 16, (4, 64)
 
 
@@ -347,64 +347,64 @@ CORRELATED_WAVES, CORRELATED_WAVELENGTHS = 16, (4, 64)
 class TrainingConfig:
     """The training of a network (paper sec. 3.3)."""
 
-    maximum_updates: Positive[int] = 20_000_000  # updates of the optimiser until the training ends
-    maximum_minutes: Positive[float] | None = None  # wall time of this start; null: no limit
+    maximum_updates: Positive[int] = 20_000_000  # number of updates of the optimiser after which the training ends
+    maximum_minutes: Positive[float] | None = None  # wall time after which this start ends, in minutes; null: no limit
     batch_scenes: Positive[int] = 1  # frames of random scenes in one update, on each device
-    # adam, or muon (Jordan 2024): hidden matrices step along their orthogonalised momentum, all else as in Adam
+    # adam, or muon (Jordan 2024): hidden matrices step along their orthogonalised momentum, all others as in Adam
     optimizer: Annotated[str, one_of("adam", "muon")] = "adam"
-    learning_rate: Positive[float] = 1e-4  # at the first update, after the warm-up
-    final_learning_rate: Positive[float] = 1e-6  # reached at maximum_updates by exponential decay
-    warmup_updates: NonNegative[int] = 0  # first updates, over which the rate grows linearly to its usual value
-    # weights that a new run starts from: a file of python -m hgn.export, or shipped weights by name; a run that
-    # resumes takes its checkpoint
+    learning_rate: Positive[float] = 1e-4  # learning rate of the first update after the warm-up
+    final_learning_rate: Positive[float] = 1e-6  # learning rate at maximum_updates, after exponential decay
+    warmup_updates: NonNegative[int] = 0  # number of first updates with a linear increase of the rate
+    # weights from which a new run starts: a file of python -m hgn.export, or shipped weights by name; a resumed run
+    # ignores it
     init_weights: str | None = None
     # decay of a moving average of the parameters per update, for example 0.9999; the average is monitored and
     # exported; 0: no average
     ema_decay: BelowOne[float] = 0.0
     noise_std: NonNegative[float] = 0.000848528  # input noise of the last velocity, domain units per frame
-    # fraction of the noise's variance that neighbours have in common, as waves of 4 to 64 cells; the paper's: 0
+    # fraction of the noise's variance in waves of 4 to 64 cells, which neighbours have in common; the paper's is 0
     noise_correlated_fraction: Fraction[float] = 0.1
-    # smallest scale of the noise in a frame whose rms acceleration a is below noise_std: the scale is drawn down to
-    # max(a / noise_std, this); 1: the same noise in all frames
+    # smallest scale of the noise in a frame whose rms acceleration a is below noise_std; the scale is drawn between
+    # max(a / noise_std, this) and 1; 1: equal noise in all frames
     noise_min_scale: AtMostOne[Positive[float]] = 1.0
-    # squared errors of a frame whose rms acceleration a, domain units per frame squared, is below this are multiplied
-    # by this / a, at most by 4; 0: all frames weigh the same
+    # acceleration, domain units per frame squared; squared errors of a frame with smaller rms acceleration a are
+    # multiplied by this / a, at most by 4; 0: all frames have equal loss weights
     quiet_acceleration: NonNegative[float] = 0.0
-    # fraction of an episode's samples drawn in proportion to the acceleration in their frames, with weights that keep
+    # fraction of an episode's samples drawn in proportion to their frames' acceleration, with loss weights that keep
     # the expected loss; 0: all frames are equally likely
     frame_importance: BelowOne[float] = 0.0
-    # folders of data sets that are trained on too, with the episodes published when the run starts; they need the same
+    # folders of additional data sets; their episodes published at the start of the run are used; they need the same
     # physics, frame rate and solver cells
     more_data: tuple[str, ...] = ()
     # number of episodes whose samples are shuffled together, for data larger than the cache or the GPU's memory; 0: all
     shuffle_episodes: NonNegative[int] = 0
     # gravity: samples are rotated and mirrored at random by the symmetries of gravity and domain; none: they are not
     symmetry: Annotated[str, one_of("none", "gravity")] = "none"
-    # fraction of an update's samples taken from the network's own simulations, for example 0.25; 0: no simulations
+    # fraction of an update's samples from the network's own simulations, for example 0.25; 0: no simulations
     pushforward_fraction: BelowOne[float] = 0.0
-    pushforward_every: Positive[int] = 500  # updates between such simulations
-    pushforward_scenes: Positive[int] = 64  # simulated side by side on each device, from random frames of the data
-    pushforward_frames: Positive[int] = 16  # simulated from there, at most to the end of the episode
-    # simulated frames as a fraction of the episode's, where that is more than pushforward_frames: slow drifts show only
-    # in long episodes
+    pushforward_every: Positive[int] = 500  # number of updates between these simulations
+    pushforward_scenes: Positive[int] = 64  # scenes simulated together on each device, from random frames of the data
+    pushforward_frames: Positive[int] = 16  # number of simulated frames, at most to the end of the episode
+    # simulated frames as a fraction of the episode's, if that is more than pushforward_frames; slow drifts show only in
+    # long simulations
     pushforward_episode_fraction: BelowOne[float] = 0.0
-    pushforward_pull: Fraction[float] = 0.1  # fraction of the distance from the data that a target takes back
-    # fraction of these samples drawn in proportion to their target acceleration, with weights that keep the expected
-    # loss; 0: all are equally likely
+    pushforward_pull: Fraction[float] = 0.1  # fraction of the distance from the data that a target corrects
+    # fraction of these samples drawn in proportion to their target acceleration, with loss weights that keep the
+    # expected loss; 0: all are equally likely
     pushforward_importance: BelowOne[float] = 0.0
-    seed: NonNegative[int] = 0  # of initial parameters, order of samples, noise and simulations
-    device: DeviceName = "auto"  # cpu or cuda; auto: cuda where there is a GPU
-    devices: OneOrMore | None = None  # on each machine; null: as launched, without a launcher all GPUs, or one CPU
-    precision: PrecisionOrAuto = "auto"  # of matrix products: fp32, tf32, fp16; auto: the fastest that passes its check
-    # torch, or triton (kernels in CUDA graphs); auto: triton where it runs
+    seed: NonNegative[int] = 0  # seed of initial parameters, order of samples, noise and simulations
+    device: DeviceName = "auto"  # cpu or cuda; auto: cuda if there is a GPU
+    devices: OneOrMore | None = None  # devices on each machine; null: as launched, else all GPUs, or one CPU
+    precision: PrecisionOrAuto = "auto"  # fp32, tf32 or fp16 products; auto: the fastest that passes its check
+    # torch, or triton (kernels in CUDA graphs); auto: triton if it is supported
     backend: Annotated[str, one_of("auto", "torch", "triton")] = "auto"
-    minimum_episodes: Positive[int] = 1  # training starts once this number of training episodes is published
-    generate: bool = True  # start the generator where the data set is missing or incomplete
-    log_every: Positive[int] = 50  # updates between log lines
-    checkpoint_every: Positive[int] = 1_000  # updates between checkpoints
-    # updates between measurements of one-step and rollout errors; the first interval is halved down to 2,000
+    minimum_episodes: Positive[int] = 1  # number of published training episodes at which training starts
+    generate: bool = True  # whether to start the generator if the data set is missing or incomplete
+    log_every: Positive[int] = 50  # number of updates between log lines
+    checkpoint_every: Positive[int] = 1_000  # number of updates between checkpoints
+    # number of updates between measurements of one-step and rollout errors; the first interval is halved down to 2,000
     monitor_every: Positive[int] = 100_000
-    monitor_rollout_frames: NonNegative[int] = 300  # of each rollout that is measured; 0: no rollouts
+    monitor_rollout_frames: NonNegative[int] = 300  # number of frames of each measured rollout; 0: no rollouts
 
     def __post_init__(self) -> None:
         require_bounds(self)
@@ -414,7 +414,7 @@ class TrainingConfig:
 
 @dataclass(frozen=True)
 class TrainConfig:
-    """`python -m hgn.train`: the data set it needs, the network, the training, and the run's folder."""
+    """`python -m hgn.train`: the data set, the network, the training, and the run's folder."""
 
     scene: SceneConfig = field(default_factory=SceneConfig)
     mpm: MpmConfig = field(default_factory=MpmConfig)
@@ -423,7 +423,7 @@ class TrainConfig:
     step: StepConfig = field(default_factory=StepConfig)
     training: TrainingConfig = field(default_factory=TrainingConfig)
     run: FolderName = "runs/obstacles"  # folder of checkpoints, logs and pictures
-    # the data set was imported (hgn.import_trajectories) and determines `scene` and `dataset`: +experiment=imported
+    # whether the data set was imported and determines `scene` and `dataset`, as with +experiment=imported
     imported: bool = False
 
     def __post_init__(self) -> None:

@@ -1,4 +1,4 @@
-"""Settings of earlier releases: the one table that answers their names and lets old files load.
+"""Settings of earlier releases. This table answers their names on command lines, and lets old files load.
 
 | what changed | table | on a command line | in checkpoints, weights and manifests |
 |---|---|---|---|
@@ -24,10 +24,10 @@ ANY = object()
 
 @dataclass(frozen=True)
 class Removed:
-    """The value that a removed setting always has now, and what to do instead of setting it.
+    """The value that a removed setting always has now, and the remedy for its use.
 
-    With ANY a setting has no fixed value, and stored files load whatever they say of it; so do files whose section
-    gives it no effect.
+    With ANY a setting has no fixed value, and stored files load with any value. So do files with a section in which the
+    setting has no effect.
     """
 
     value: Any = ANY
@@ -35,7 +35,7 @@ class Removed:
     has_effect: Callable[[Mapping[str, Any]], bool] = lambda section: True
 
     def allows(self, value: Any, section: Mapping[str, Any]) -> bool:
-        """Returns whether a stored section with this value computes what is computed now."""
+        """Returns whether a stored section with this value gives the same results now."""
         return self.value is ANY or value == self.value or not self.has_effect(section)
 
 
@@ -48,7 +48,7 @@ def _rests(network: Mapping[str, Any]) -> bool:
 
 
 def _rests_otherwise(network: Mapping[str, Any]) -> bool:
-    """Returns whether other materials than those with friction rest between larger cells."""
+    """Returns whether the materials that rest on larger cells are not exactly those with friction."""
     materials = set(network.get("materials", ()))
     large = network.get("rest_large_materials")
     return _rests(network) and (materials if large is None else set(large)) != materials - {"water"}
@@ -101,7 +101,7 @@ REMOVED: dict[str, Removed] = {
 STEP = ("rest_threshold", "wall_clearance", "obstacle_clearance")
 REMOVED |= {f"network.{key}": Removed(remedy=f"write step.{key}") for key in STEP}
 
-# Values that a setting or a config group no longer takes, by the last part of its key, and what to do instead.
+# Removed values of settings and config groups, by the last part of the key, and the remedy.
 _GNS_PARTICLES = {"gns_particles": LAST_COMMIT}
 REMOVED_CHOICES: dict[str, dict[Any, str]] = {
     "kind": _GNS_PARTICLES,
@@ -114,7 +114,7 @@ REMOVED_CHOICES: dict[str, dict[Any, str]] = {
     },
 }
 
-# Old key to new key, as on a command line; a key stays in its section.
+# Old key to new key, as on a command line. A key stays in its section.
 KEYS = {
     "half": "stored_precision",
     "path": "backend",
@@ -151,7 +151,7 @@ VALUES: dict[str, dict[Any, str]] = {
 # Choices of config groups, old to new, as on a command line.
 CHOICES = {"scene=mechanics": "scene=motion", "dataset=mechanics": "dataset=motion"}
 
-# Settings that data sets and weights of 0.1.0 lack, and their values then.
+# Settings that data sets and weights of 0.1.0 do not have, and the values that they had in effect.
 BEFORE: dict[str, Any] = {
     "network.contact_forces": "any",
     "network.contact_gate": "particle",
@@ -168,7 +168,7 @@ METRICS = {"trivial/": "baseline/", "one_step_gain/": "baseline_ratio/", "own_st
 
 
 def current_metrics(record: Mapping[str, float]) -> dict[str, float]:
-    """Returns a record of metrics.jsonl under today's names."""
+    """Returns a record of metrics.jsonl with the present names."""
     result = {}
     for name, value in record.items():
         old = next((prefix for prefix in METRICS if name.startswith(prefix)), "")
@@ -177,18 +177,18 @@ def current_metrics(record: Mapping[str, float]) -> dict[str, float]:
 
 
 def current_value(key: str, value: Any) -> Any:
-    """Returns today's name of a value; `key` may be dotted, or that of an item of a list."""
+    """Returns the present name of a value. `key` may be dotted, or that of an item of a list."""
     values = VALUES.get(_last(key), {})
     return values.get(value, value) if isinstance(value, (str, bool)) else value
 
 
 def current_names(mapping: Mapping[str, Any], section: str = "") -> dict[str, Any]:
-    """Returns a stored mapping with today's keys and values.
+    """Returns a stored mapping with the present keys and values.
 
-    `section` is its dotted name in the configuration. Settings that are younger than the file are added, removed ones
-    are dropped. A removed one with another value than the fixed one stays, for `from_mapping` to refuse.
+    `section` is its dotted name in the configuration. Settings that are newer than the file are added, and removed
+    settings are dropped. A removed setting with another value than the fixed one stays, and `from_mapping` refuses it.
     """
-    # Of the networks, only those of 0.1.0 have this key.
+    # only networks of 0.1.0 have the key material_embedding
     if section == "mpm" or (section == "network" and "material_embedding" in mapping):
         before = {_last(key): value for key, value in BEFORE.items() if key.startswith(f"{section}.")}
         mapping = before | dict(mapping)
@@ -203,8 +203,9 @@ def current_names(mapping: Mapping[str, Any], section: str = "") -> dict[str, An
 
 
 def _current_solver(stored: dict[str, Any]) -> dict[str, Any]:
-    """Returns settings of the solver with `method` in place of the values that it decides. Values that belong to no
-    method stay, for `from_mapping` to refuse.
+    """Returns settings of the solver with `method` instead of the values that it determines.
+
+    Values that belong to no method stay, and `from_mapping` refuses them.
     """
     result = dict(stored)
     for method, choices in METHODS.items():
@@ -216,8 +217,9 @@ def _current_solver(stored: dict[str, Any]) -> dict[str, Any]:
 
 
 def with_step(mapping: Mapping[str, Any]) -> dict[str, Any]:
-    """Returns the mapping of a weights file or checkpoint with a section `step`; 0.1.0 wrote the constraints of a frame
-    among the network's settings.
+    """Returns the mapping of a weights file or checkpoint with a section `step`.
+
+    0.1.0 wrote the constraints of a frame into the network's settings.
     """
     network = mapping.get("network")
     if "step" in mapping or not isinstance(network, Mapping):
@@ -226,8 +228,9 @@ def with_step(mapping: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def stored_names(mapping: Mapping[str, Any], section: str) -> dict[str, Any]:
-    """Returns a section of today's configuration as it identifies a data set: with the first release's keys, and with
-    the fixed values of removed settings.
+    """Returns a section of the present configuration in the form that identifies a data set.
+
+    It has the first release's keys, and the fixed values of removed settings.
     """
     old_keys = {new: old.rpartition(".")[2] for old, new in KEYS.items()}
     owners = {key.rpartition("."): removed.value for key, removed in REMOVED.items()}
@@ -241,7 +244,7 @@ def stored_names(mapping: Mapping[str, Any], section: str) -> dict[str, Any]:
 
 
 def renamed_remedy(key: str, value: Any) -> str | None:
-    """Returns what to write instead of an old key, which is dotted, or None for a key that was not renamed."""
+    """Returns the replacement for an old, dotted key; None for a key that was not renamed."""
     if key not in KEYS:
         return None
     value = current_value(KEYS[key], value)
@@ -250,7 +253,7 @@ def renamed_remedy(key: str, value: Any) -> str | None:
 
 
 def removed_remedy(section: str, key: str, value: Any) -> str | None:
-    """Returns what to do about a removed setting that was given this value, or None for any other setting."""
+    """Returns the remedy for a removed setting with this value; None for any other setting."""
     removed = REMOVED.get(_join(section, key))
     if section == "mpm" and key == "time_step":
         return "it was removed; mpm.fixed_time_step_s is null for adaptive steps"
@@ -266,7 +269,7 @@ def removed_remedy(section: str, key: str, value: Any) -> str | None:
 
 
 def value_remedy(key: str, value: Any) -> str:
-    """Returns what to write instead of an old value, or an empty text for any other value."""
+    """Returns the replacement for an old value; an empty text for any other value."""
     if not isinstance(value, (str, bool)):
         return ""
     new = current_value(key, value)
@@ -275,7 +278,7 @@ def value_remedy(key: str, value: Any) -> str:
 
 
 def _last(key: str) -> str:
-    """The last part of a dotted key, without the number of an item."""
+    """Returns the last part of a dotted key, without the number of an item."""
     return key.rpartition(".")[2].partition("[")[0]
 
 

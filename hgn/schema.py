@@ -1,7 +1,7 @@
 """Strict conversion of plain mappings (YAML, JSON) to dataclasses.
 
-Every file of a user (configs, scene files) or of another version (manifests, weights) passes through `from_mapping`:
-unknown keys, wrong types and missing fields end in one `ConfigError` that names field, rule, value and remedy.
+Every file from a user (configs, scene files) or of another version (manifests, weights) passes through `from_mapping`.
+Unknown keys, wrong types and missing fields raise a `ConfigError` that names field, rule, value and remedy.
 """
 
 from __future__ import annotations
@@ -22,20 +22,20 @@ from typing import Annotated, Any, TypeVar
 from hgn.renamed import KEYS, current_names, removed_remedy, renamed_remedy, value_remedy
 
 T = TypeVar("T")
-# of a value: the owner's path and its own name or index, joined for messages
+# the owner's path, and the value's own name or index; joined for messages
 _Path = str | tuple[Any, str | int]
 
 
 @dataclasses.dataclass(frozen=True)
 class Bound:
-    """A rule for a value: its words, and a predicate that is false for NaN; see `require_bounds`."""
+    """A rule for a value: a text, and a predicate that is false for NaN (see `require_bounds`)."""
 
     rule: str
     holds: Callable[[Any], bool]
 
 
 def one_of(*choices: str) -> Bound:
-    """Returns the rule of a value among choices."""
+    """Returns the rule that a value is among choices."""
     return Bound(f"one of {', '.join(choices)}", choices.__contains__)
 
 
@@ -71,15 +71,14 @@ class ConfigError(ValueError):
 
 
 def without_passwords(text: str) -> str:
-    """Returns a text whose URLs name no user and password."""
+    """Returns a text without users and passwords in its URLs."""
     return re.sub(r"(\w://)[^/\s@]*@", r"\1", text)
 
 
 def from_mapping(cls: type[T], mapping: object, path: _Path = "") -> T:
     """Builds dataclass `cls` from `mapping`, recursively.
 
-    Integers are accepted for floats, lists for tuples; nothing else is converted. `path` prefixes names in messages.
-
+    Integers are accepted for floats, and lists for tuples. No other type is converted. `path` prefixes names in errors.
     Raises: ConfigError.
     """
     if not isinstance(mapping, Mapping):
@@ -111,7 +110,7 @@ def from_mapping(cls: type[T], mapping: object, path: _Path = "") -> T:
 
 @functools.cache
 def _fields(cls: type) -> tuple[dict[str, Any], dict[str, bool]]:
-    """Returns the types of a dataclass's fields, and whether each is required; cached, because it is slow."""
+    """Returns the types of a dataclass's fields, and whether each is required. Cached, because it is slow."""
     given = {field.name: field for field in dataclasses.fields(cls) if field.init}
     missing = dataclasses.MISSING
     return typing.get_type_hints(cls), {
@@ -120,7 +119,7 @@ def _fields(cls: type) -> tuple[dict[str, Any], dict[str, bool]]:
 
 
 def section_of(cls: type) -> str:
-    """Returns the section of the configuration that a dataclass is, as in error_vs_time for ErrorVsTimeConfig."""
+    """Returns the section of the configuration for a dataclass, e.g. error_vs_time for ErrorVsTimeConfig."""
     return re.sub(r"(?<=[a-z])(?=[A-Z])", "_", cls.__name__.removesuffix("Config")).lower()
 
 
@@ -131,7 +130,7 @@ def _shape(hint: Any) -> tuple[Any, tuple[Any, ...], bool]:
 
 
 def from_stored(cls: type[T], mapping: object, section: str) -> T:
-    """Builds a dataclass from a section of a stored file, perhaps of an earlier release."""
+    """Builds a dataclass from a section of a stored file, possibly of an earlier release."""
     return from_mapping(cls, current_names(mapping, section) if isinstance(mapping, Mapping) else mapping, section)
 
 
@@ -143,7 +142,7 @@ def known_keys(key: str, names: Iterable[str]) -> str:
 
 
 def to_mapping(value: Any) -> Any:
-    """Converts to plain dicts, lists and scalars for JSON or YAML; the inverse of `from_mapping`."""
+    """Converts to plain dicts, lists and scalars for JSON or YAML. Inverts `from_mapping`."""
     if type(value) in (int, float, str, bool):
         return value
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
@@ -156,7 +155,7 @@ def to_mapping(value: Any) -> Any:
 
 
 def default_mapping(cls: type) -> dict[str, Any]:
-    """Returns a dataclass's defaults, inherited ones last, as plain containers, with Hydra's `???` where required."""
+    """Returns a dataclass's defaults as plain containers, inherited ones last, with Hydra's `???` for required ones."""
     result: dict[str, Any] = {}
     for field in sorted(dataclasses.fields(cls), key=lambda field: field.name not in cls.__annotations__):
         if field.default is not dataclasses.MISSING:
@@ -169,7 +168,7 @@ def default_mapping(cls: type) -> dict[str, Any]:
 
 
 def field_comments(cls: type) -> dict[str, str]:
-    """Returns the comment of each field of a dataclass: the lines above it, and the one beside it."""
+    """Returns the comment of each field of a dataclass: the lines above it, and the comment on its line."""
     comments: dict[str, str] = {}
     for base in filter(dataclasses.is_dataclass, cls.__bases__):
         comments |= field_comments(base)
@@ -216,7 +215,7 @@ def _require_bound(hint: Any, value: Any, name: str) -> None:
     if typing.get_origin(hint) is tuple:
         for i, item in enumerate(value):
             _require_bound(options[0], item, f"{name}[{i}]")
-    elif options and value is not None:  # of an optional type
+    elif options and value is not None:  # an optional type
         _require_bound(options[0], value, name)
 
 

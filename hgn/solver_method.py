@@ -1,6 +1,6 @@
-"""Choices of the MLS-MPM solver that are no settings: those of a method, and constants.
+"""Choices of the MLS-MPM solver that are not settings: those of a method, and constants.
 
-A data set's identity contains them, under these names (see hgn.renamed).
+The identity of a data set contains them under these names (see hgn.renamed).
 """
 
 from __future__ import annotations
@@ -9,24 +9,25 @@ from typing import NamedTuple
 
 
 class SolverMethod(NamedTuple):
-    """The choices by which the solver's own method and that of Taichi Elements differ."""
+    """The choices in which the solver's own method and that of Taichi Elements differ."""
 
     # mohr_coulomb: the friction angle on every stress path; compression: the Drucker-Prager cone with that angle in
     # triaxial compression.
     sand_friction_law: str
-    # tampubolon: the correction joins the strains (Tampubolon et al. 2017); taichi_elements: only their trace.
+    # tampubolon: the correction is added to the strains (Tampubolon et al. 2017); taichi_elements: only to their trace.
     sand_volume_correction: str
-    # Bound on the hardening factor exp(hardening * (1 - Jp)). It is exceeded beyond about 5 m/s, and counted.
+    # Bound of the hardening factor exp(hardening * (1 - Jp)). Impacts faster than about 5 m/s reach it; it counts hits.
     snow_maximum_hardening: float
     # trace: J *= 1 + dt tr C; taichi_elements: J *= det(1 + dt C).
     water_volume_update: str
-    # Seconds in which the volume of water below a free surface approaches its particles' density. Without it water at
-    # rest sinks in a random filling.
+    # Time in seconds in which the volume of water below a free surface approaches its particles' density. Without it
+    # water at rest sinks in a random filling.
     water_density_relaxation_s: float | None
     # leapfrog: free fall is exact; symplectic_euler: it is ahead by g t dt / 2.
     time_integration: str
-    # Particles and grid exchange velocities every cell_size / this, 32 times a frame of 1/60 s at 64 cells, with as
-    # many steps of stress between as the materials need. None: at every step. Fewer transfers smooth velocities less.
+    # Particles and grid exchange velocities every cell_size / this, 32 times a frame of 1/60 s at 64 cells. Between
+    # transfers there are as many steps of stress as the materials need. None: a transfer in every step. Few transfers
+    # smooth velocities less.
     transfer_speed_m_s: float | None
     # Distance in cells from a closed body thinner than a cell. Nodes outside the body within it stop motion. At least
     # one cell is used. A larger distance keeps material farther off.
@@ -56,12 +57,12 @@ METHODS = {
     ),
 }
 
-SPEED_FRACTION = 0.3  # of a cell that the fastest particle may cross between two transfers
-MINIMUM_SINGULAR_VALUE = 0.05  # floor on the singular values of F; hits are counted
-WATER_MINIMUM_VOLUME_RATIO = 0.1  # floor on J; hits are counted
-MAXIMUM_SUBSTEPS = 20_000  # per frame; a scene that needs more is stopped and reported
+SPEED_FRACTION = 0.3  # largest fraction of a cell that the fastest particle crosses between two transfers
+MINIMUM_SINGULAR_VALUE = 0.05  # lower bound of the singular values of F; hits are counted
+WATER_MINIMUM_VOLUME_RATIO = 0.1  # lower bound of J; hits are counted
+MAXIMUM_SUBSTEPS = 20_000  # largest number per frame; a scene that needs more is stopped and reported
 
-# Constants as settings of 0.1.0 recorded them.
+# Constants that 0.1.0 recorded as settings.
 CONSTANTS = {
     "speed_fraction": SPEED_FRACTION,
     "minimum_singular_value": MINIMUM_SINGULAR_VALUE,

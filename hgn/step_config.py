@@ -11,13 +11,13 @@ WallClearance = tuple[NonNegative[float], NonNegative[float]]
 
 @dataclass(frozen=True)
 class StepConfig:
-    """The constraints of simulated frames, which need no training (hgn.step). Lengths in domain units."""
+    """The constraints of simulated frames (hgn.step). They need no training. Lengths are in domain units."""
 
-    # deformations of particles in contact by less than this many |g| a frame stop; 0: none do
+    # deformation of particles in contact stops if it is slower than this times |g| per frame; 0: none stops
     rest_threshold: NonNegative[float] = 0.0
-    # least distances from the domain's planes at the near sides (0) and at the far sides; null: no walls
+    # smallest distance from the domain's planes at the near sides (0) and at the far sides; null: no walls
     wall_clearance: WallClearance | None = None
-    # least distance from an obstacle's triangles, which no particle passes; null: particles may pass
+    # smallest distance from an obstacle's triangles, which no particle passes; null: particles may pass
     obstacle_clearance: Positive[float] | None = None
 
     def __post_init__(self) -> None:
@@ -30,11 +30,11 @@ class StepConfig:
 
     @property
     def in_training(self) -> StepConfig:
-        """The constraints of pushforward simulations: obstacles only, so that errors at rest and at walls show."""
+        """The constraints of pushforward simulations: only obstacles, so that errors at rest and walls are visible."""
         return StepConfig(obstacle_clearance=self.obstacle_clearance)
 
     def require_fits(self, relative: bool, dimensions: int) -> None:
-        """Raises ConfigError where a network with relative inputs or not cannot have these constraints."""
+        """Raises ConfigError if a network with these inputs and dimensions does not support the constraints."""
         name, value = "step.rest_threshold", self.rest_threshold
         require(not self.rests or relative, name, "0 with inputs=absolute", value)
         require(not self.rests or dimensions == 3, name, "0 with dimensions=2", value)

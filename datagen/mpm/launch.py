@@ -277,10 +277,8 @@ class Launch(ABC):
         return setting
 
     def _rates(self, begin: float, end: float) -> list[np.ndarray]:
-        """Returns the motion of each scene's obstacles between two times, float64 [obstacles, 3, 3].
-
-        The rows of an obstacle are angular velocity, velocity of a point, and this point.
-        """
+        """Returns the motion of each scene's obstacles between two times, float64 [obstacles, 3, 3]. The rows of an
+        obstacle are angular velocity, velocity of a point, and this point."""
         rates = [np.zeros((max(len(scene.obstacles), 1), 3, 3)) for scene in self.scenes]
         for own, scene in zip(rates, self.scenes, strict=True):
             for index, obstacle in enumerate(scene.obstacles):
@@ -330,10 +328,9 @@ class Launch(ABC):
     def _sweeps(
         self, first_vector: int, begin: float, end_s: float, vector: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, int]:
-        """Returns entries of the contact array for the swept test (see grid_kernel.substep), and the array's length.
+        """Returns places and values of the contact array for the swept test (see grid_kernel.substep), and its length.
+        Writes the triangles' vectors."""
 
-        Entries are given by places and values. Writes the triangles' vectors.
-        """
         all_nodes = self.all_blocks * BLOCK_NODES
         sweeps = [collider.sweep for collider in self.colliders]
         length = vector.shape[1]

@@ -1,4 +1,4 @@
-"""Batches: the position windows of some frames of some episodes, concatenated over their particles.
+"""Batches: position windows around frames of episodes, concatenated over their particles.
 
 Shape legend: H velocity history, W = H + 2 frames, N particles of all scenes, S scenes.
 """
@@ -23,19 +23,19 @@ from hgn.scene.symmetry import Symmetry
 
 @dataclass(frozen=True, eq=False)
 class Batch:
-    """Windows x^{n-H} … x^{n+1}: the last frame is the target, the others are the input."""
+    """Windows x^{n-H} … x^{n+1}. The last frame is the target, the others are the input."""
 
     window_WN3: torch.Tensor  # float32, domain units
     material_N: torch.Tensor  # int64, index into the network's materials
     scene_N: torch.Tensor  # int64
-    particles_S: tuple[int, ...]  # particles of each scene, on the host
+    particles_S: tuple[int, ...]  # number of particles of each scene, on the host
     domain_S3: torch.Tensor
     gravity_S3: torch.Tensor  # domain units per frame squared
     obstacles: ObstacleCells | None
-    seeds_S: tuple[int, ...]  # of noise, jitter and symmetry
-    symmetries_S: tuple[tuple[Symmetry, ...], ...] = ()  # of each scene, that training may apply
-    weight_S: tuple[float, ...] = ()  # of each scene's loss; empty: 1
-    noise_scale_S: tuple[float, ...] = ()  # of each scene, in units of training.noise_std; empty: 1
+    seeds_S: tuple[int, ...]  # seeds of noise, jitter and symmetry
+    symmetries_S: tuple[tuple[Symmetry, ...], ...] = ()  # symmetries of each scene that training may apply
+    weight_S: tuple[float, ...] = ()  # loss weight of each scene; empty: 1
+    noise_scale_S: tuple[float, ...] = ()  # noise scale of each scene in units of training.noise_std; empty: 1
 
     def to(self, device: torch.device, non_blocking: bool = False) -> Batch:
         names = ("window_WN3", "material_N", "scene_N", "domain_S3", "gravity_S3")
@@ -44,7 +44,7 @@ class Batch:
         return replace(self, obstacles=obstacles, **moved)
 
     def state(self, window_WN3: torch.Tensor | None = None) -> ParticleState:
-        """Returns the network's input at frame n, from this window or a perturbed copy of it."""
+        """Returns the network's input at frame n from this window, or from a perturbed copy of it."""
         if window_WN3 is None:
             window_WN3 = self.window_WN3
         velocity_MN3 = (window_WN3[1:-1] - window_WN3[:-2]).flip(0)
@@ -65,7 +65,7 @@ class Batch:
         return (window_WN3[-1] - window_WN3[-2]) - (window_WN3[-2] - window_WN3[-3])
 
     def mean_over_scenes(self, value_N: torch.Tensor) -> torch.Tensor:
-        """Returns the mean over scenes of each scene's weight times its mean over particles: a scalar."""
+        """Returns the mean over scenes of each scene's loss weight times its mean over particles: a scalar."""
         weight_S = self.weight_S or (1.0,) * len(self.particles_S)
         pairs = zip(weight_S, self.particles_S, strict=True)
         factor_S = torch.tensor([weight / (len(weight_S) * max(count, 1)) for weight, count in pairs])
@@ -74,24 +74,24 @@ class Batch:
 
 @dataclass(frozen=True, eq=False)
 class BatchSample:
-    """A frame of an episode to train on; hgn.kernels.update.op.DeviceSample is its counterpart in backend triton."""
+    """A frame of an episode to train on. In backend triton it is a hgn.kernels.update.op.DeviceSample."""
 
     episode: Episode
     frame: int
-    window_WN3: np.ndarray  # positions around the frame, the episode's or simulated ones
-    seed: int = 0  # of noise, jitter and symmetry
-    weight: float = 1.0  # of its loss
-    noise_scale: float = 1.0  # of its noise, in units of training.noise_std
+    window_WN3: np.ndarray  # positions around the frame, from the episode or from a simulation
+    seed: int = 0  # seed of noise, jitter and symmetry
+    weight: float = 1.0  # loss weight
+    noise_scale: float = 1.0  # scale of its noise in units of training.noise_std
 
 
 @dataclass(frozen=True, eq=False)
 class WindowChunk:
-    """The samples of one update on backend torch. hgn.data.episode_tensors.EpisodeChunk is the same for triton."""
+    """The samples of one update on backend torch. For triton it is a hgn.data.episode_tensors.EpisodeChunk."""
 
-    samples: tuple[tuple[BatchSample, ...], ...]  # of each update: here of one
-    sampler_state: SamplerState  # after this update
-    starts: tuple[tuple[Episode, int], ...] = ()  # where simulations start before this update
-    batch: Batch | None = None  # the samples as tensors; None where the pushforward pool may replace some of them
+    samples: tuple[tuple[BatchSample, ...], ...]  # samples of each update; here one update
+    sampler_state: SamplerState  # state of the order after this update
+    starts: tuple[tuple[Episode, int], ...] = ()  # starts of the simulations before this update
+    batch: Batch | None = None  # the samples as tensors; None if the pushforward pool may replace some of them
 
 
 def make_batch(

@@ -1,6 +1,6 @@
-"""HTTP answers of bounded size: the requested range, or else the size of a data set's largest file.
+"""HTTP answers of bounded size: at most the requested range, or the size of a data set's largest file.
 
-Imported only for data sets at HTTP URLs.
+It is imported only for data sets at HTTP URLs.
 """
 
 from __future__ import annotations
@@ -12,16 +12,16 @@ import aiohttp
 
 from hgn.schema import ConfigError
 
-LARGEST_BYTES = 2**29  # of whole files: manifests of the first release, and shards of servers without ranges
-LEAST_BYTES_S, SLOW_S = 4096, 20.0  # speed below which a server does not answer, after a start of seconds
+LARGEST_BYTES = 2**29  # limit for whole files: manifests of the first release, and shards of servers without ranges
+LEAST_BYTES_S, SLOW_S = 4096, 20.0  # smallest speed of an answer, and the time after which it is checked
 _RANGE = re.compile(r"bytes=(\d+)-(\d+)")
 
 
 class BoundedResponse(aiohttp.ClientResponse):
-    """An answer whose body is read in pieces, up to its limit, no slower than LEAST_BYTES_S."""
+    """An answer whose body is read in pieces up to its limit, at LEAST_BYTES_S or faster."""
 
     async def read(self) -> bytes:
-        """Returns the body. Raises: ConfigError for a longer one; ConnectionError for a slow one."""
+        """Returns the body. Raises: ConfigError if it is too long; ConnectionError if it is too slow."""
         if self._body is None:
             requested = _RANGE.fullmatch(self.request_info.headers.get("Range", ""))
             partial = requested is not None and self.status == 206

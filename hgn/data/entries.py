@@ -15,7 +15,7 @@ from hgn.schema import Bound, ConfigError, NonNegative, require, require_bounds
 
 SPLITS = ("train", "validation", "test")
 REMEDY = "if it stays so, run the generator again without manifest.json: published shards are found and kept"
-MOST = 10_000_000  # shards, and episodes of a split, in a data set
+MOST = 10_000_000  # largest number of shards of a data set, and of episodes of a split
 Count = Annotated[int, Bound(f"from 0 to {MOST}", lambda value: 0 <= value <= MOST)]
 _FILE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,200}")
 _SHA256 = re.compile(r"[0-9a-f]{64}")
@@ -26,12 +26,12 @@ class EpisodeEntry:
     """An episode in a shard."""
 
     key: str
-    index: int  # within its split
+    index: int  # number of the episode in its split
     seed: int
     attempt: int  # 0, or the number of quarantined seeds of this index
     particles: int
     frames: int
-    members: dict[str, tuple[int, int]]  # name after `<key>.` -> offset in the tar, bytes
+    members: dict[str, tuple[int, int]]  # offset in the tar and size, by the name after `<key>.`
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class ShardEntry:
 
     def __post_init__(self) -> None:
         require_bounds(self)
-        # both become file names, and an index may come from any server
+        # name and sha256 become file names, and an index may come from any server
         require(_FILE_NAME.fullmatch(self.name) is not None, "name", "a plain file name", self.name)
         require(_SHA256.fullmatch(self.sha256) is not None, "sha256", "64 hexadecimal digits", self.sha256)
         numbers = [episode.index for episode in self.episodes]
@@ -60,7 +60,7 @@ class ShardEntry:
 
 @dataclass(frozen=True)
 class QuarantinedScene:
-    """A scene that could not be simulated, and was replaced by the next attempt's seed."""
+    """A scene that could not be simulated. The next attempt's seed replaced it."""
 
     key: str
     attempt: int
@@ -75,7 +75,7 @@ class SplitTotals:
     shards: Count = 0
     episodes: Count = 0
     bytes: NonNegative[int] = 0
-    digest: str = ""  # over the shards' sha256 in publication order; identifies the order of samples
+    digest: str = ""  # digest of the shards' sha256 in publication order; identifies the order of samples
     statistics: Statistics | None = None  # only in the head
 
     def __post_init__(self) -> None:

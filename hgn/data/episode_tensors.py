@@ -29,13 +29,13 @@ class EpisodeTensors:
     obstacle_grid: ObstacleGrid  # without cells for networks without obstacle features
     domain_size: Vector
     gravity: Vector  # domain units per frame squared
-    symmetries: tuple[Symmetry, ...] = ()  # that training may apply to the scene
-    barrier: Barrier | None = None  # of the scene's obstacles, where simulations respect them
+    symmetries: tuple[Symmetry, ...] = ()  # symmetries that training may apply to the scene
+    barrier: Barrier | None = None  # barrier of the scene's obstacles, if simulations respect them
 
 
 @dataclass(frozen=True, eq=False)
 class EpisodeChunk:
-    """The samples of successive updates, and their episodes that are not on the device yet."""
+    """The samples of successive updates, and those of their episodes that are not yet on the device."""
 
     samples: tuple[tuple[Sample, ...], ...]
     episodes: dict[int, EpisodeTensors]

@@ -1,4 +1,4 @@
-"""A test set that no choice has seen: its seed is drawn when the weights are frozen, and stored with their hashes.
+"""A test set that no choice has seen. Its seed is drawn when the weights are frozen, and stored with their hashes.
 
 `fresh.json` in the data set's folder is written once, before the first scene is generated.
 """
@@ -24,7 +24,7 @@ FRESH_NAME = "fresh.json"
 
 @dataclass(frozen=True)
 class FreshSeed:
-    """A seed, its time (UTC, ISO 8601), and the sha256 of the weights that were frozen then, by file name."""
+    """A seed, its time (UTC, ISO 8601), and the sha256 of the weights frozen at that time, by file name."""
 
     seed: int
     drawn: str
@@ -32,9 +32,9 @@ class FreshSeed:
 
 
 def draw_fresh(folder: Path | str, weights: Sequence[str]) -> FreshSeed:
-    """Draws the seed of a new data set, or reads the one that was drawn for these weights.
+    """Draws the seed of a new data set, or reads the seed that was drawn for these weights.
 
-    Raises: ConfigError for a file that is not there, for a data set that is there already, and for other weights.
+    Raises: ConfigError for a missing file, for a data set that already exists, and for other weights.
     """
     files = [Path(name) for name in weights]
     for i, file in enumerate(files):
@@ -70,7 +70,7 @@ def read_fresh(folder: Path | str) -> FreshSeed | None:
 
 
 def set_record(folder: Path | str, seed: int, files: Iterable[Path]) -> dict[str, Any]:
-    """Returns a report's record: the seed, when it was drawn (None: chosen), and weights that were not frozen then."""
+    """Returns a report's record: the seed, the time of its draw (None: chosen), and weights not frozen at that time."""
     fresh, drawn = read_fresh(folder), None
     later = [file.name for file in files if fresh is None or fresh.weights.get(file.name) != file_sha256(file)]
     if fresh is not None:

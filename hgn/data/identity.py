@@ -1,6 +1,6 @@
-"""The identity of a data set: everything that its trajectories depend on, and nothing else.
+"""The identity of a data set: all settings that its trajectories depend on, and no others.
 
-Counts, folder, workers, device and launch size are left out, so a data set can grow, move to another machine and
+Counts, folder, workers, device and launch size are not part of it. So a data set can grow, move to another machine and
 be completed there.
 """
 
@@ -18,9 +18,9 @@ from hgn.scene.episode import SCHEMA_VERSION
 from hgn.scene.shapes import mesh_sha256
 from hgn.schema import ConfigError, to_mapping
 
-# settings of the solver that change trajectories by no more than rounding
+# settings of the solver that change trajectories only by rounding
 _NOT_PHYSICS = ("device", "scenes_per_launch")
-# settings of scenes that older data sets lack, and which are left out at their defaults
+# settings of scenes that older data sets do not have; they are omitted at their defaults
 _LATER_OPTIONS = (
     "pure_direction_fraction", "colliding_scene_fraction", "zero_gravity_fraction", "tilted_gravity_fraction",
     "maximum_tilted_gravity", "funnel_scene_fraction", "funnel_hole", "kinds",
@@ -30,8 +30,8 @@ _LATER_OPTIONS = (
 def dataset_identity(config: DatagenConfig) -> dict[str, Any]:
     """Returns the mapping that defines the episodes: scenes, physics, frames, rate, seed, schema, a finer grid.
 
-    Keys are those of the first release, so that the identity does not change. Mesh files count by their content.
-    Raises: ConfigError for one that cannot be read.
+    Keys are those of the first release, so the identity does not change. Mesh files are represented by their content.
+    Raises: ConfigError for an unreadable mesh file.
     """
     shapes = config.scene.obstacle_shapes
     named = [f"{Path(shape).name} {mesh_sha256(shape)}" if is_mesh_file(shape) else shape for shape in shapes]
@@ -68,7 +68,7 @@ def identity_hash(identity: Mapping[str, Any]) -> str:
 
 
 def identity_differences(stored: Mapping[str, Any], requested: Mapping[str, Any], path: str = "") -> list[str]:
-    """Returns a line for each key that differs: `scene.obstacle_count is 5 there, 3 is asked for`."""
+    """Returns a line for each different key: `scene.obstacle_count is 5 there, 3 is asked for`."""
     lines = []
     for key in sorted(stored.keys() | requested.keys()):
         name = f"{path}.{key}" if path else key
@@ -81,7 +81,7 @@ def identity_differences(stored: Mapping[str, Any], requested: Mapping[str, Any]
 
 
 def require_same_dataset(stored: Mapping[str, Any], config: DatagenConfig, folder: object) -> None:
-    """Checks that a folder's data set (its manifest's `config`) is that of a configuration.
+    """Checks that a folder's data set (its manifest's `config`) is the data set of a configuration.
 
     Raises: ConfigError naming the first keys that differ, and the remedy.
     """

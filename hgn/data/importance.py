@@ -1,7 +1,7 @@
-"""Importance sampling of frames by acceleration, with loss weights that keep the expected loss.
+"""Importance sampling of frames by acceleration, with loss weights that keep the expected loss unchanged.
 
 Most of the error arises in the few frames with collisions. Importance sampling (Kahn & Marshall 1953; for gradients
-Katharopoulos & Fleuret 2018) draws those frames more often and weights them less.
+Katharopoulos & Fleuret 2018) draws those frames more often, with smaller loss weights.
 Shape legend: T frames, N particles, F = T - 1 frames with a successor.
 """
 
@@ -16,7 +16,7 @@ import numpy as np
 from hgn.scene.episode import Episode
 from hgn.scene.history import frames_before
 
-PARTICLES = 512  # of an episode, about, that accelerations are computed from
+PARTICLES = 512  # approximate number of an episode's particles from which accelerations are computed
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,11 +24,11 @@ class DrawnBySize:
     """A distribution over F items by size, and weights that keep the mean over draws unbiased."""
 
     cumulative_F: np.ndarray  # float64, ends with 1
-    weight_F: np.ndarray  # the inverse of the relative frequency, 1 for uniform draws
+    weight_F: np.ndarray  # inverse of the relative frequency; 1 for uniform draws
 
     @staticmethod
     def of(size_F: np.ndarray, fraction: float) -> DrawnBySize:
-        """Draws a `fraction` in proportion to size, the others uniformly."""
+        """Draws a `fraction` in proportion to size, and the others uniformly."""
         total = size_F.sum()
         often_F = (1 - fraction) + fraction * (size_F * len(size_F) / total if total > 0 else np.ones(len(size_F)))
         cumulative_F = often_F.cumsum()
@@ -42,7 +42,7 @@ class DrawnBySize:
 
     @cached_property
     def _lists(self) -> tuple[list[float], list[float]]:
-        """Plain lists, in which a single number is found faster than in an array."""
+        """The same as lists, in which access to one number is faster than in an array."""
         return self.cumulative_F.tolist(), self.weight_F.tolist()
 
 
@@ -55,7 +55,7 @@ class FrameImportance:
 
     @staticmethod
     def of(episode: Episode, fraction: float) -> FrameImportance:
-        """Draws a `fraction` in proportion to root mean square acceleration, the others uniformly."""
+        """Draws a `fraction` in proportion to root mean square acceleration, and the others uniformly."""
         step = max(1, episode.particle_count // PARTICLES)
         past_1N3 = frames_before(episode, -1)[:, ::step]
         position_TN3 = np.concatenate([past_1N3, episode.position_TN3[:, ::step]], dtype=np.float64)
@@ -64,9 +64,9 @@ class FrameImportance:
         return FrameImportance(DrawnBySize.of(size_F, fraction), size_F)
 
     def draw(self, slot: int, seed: int) -> tuple[int, float]:
-        """Returns the frame for sample number `slot` of F, and its weight; together the slots cover the distribution.
+        """Returns the frame for sample number `slot` of F, and its loss weight.
 
-        Stratified: each slot has its own F-th of the distribution, within which `seed` chooses.
+        Draws are stratified: each slot has its own F-th of the distribution, in which `seed` chooses.
         """
         return self.draws.at((slot + _fraction(seed)) / len(self.acceleration_F))
 

@@ -6,9 +6,9 @@
 | `G-segments.jsonl` | the totals up to the end of each full segment |
 | `G-quarantined.jsonl` | scenes that could not be simulated |
 
-`manifest.json`, the head, contains the valid sizes of the last segment and of the other two files. Bytes beyond them
-are not published and are overwritten. A publication costs the same for any number of shards, and a reader reads only
-the shards that it does not know. A list that loses a shard is written again as the next generation.
+The head, `manifest.json`, contains the valid sizes of the last segment and of the other two files. Bytes after them are
+not published and are overwritten. The cost of a publication does not depend on the number of shards, and a reader reads
+only new shards. A list that loses a shard is written again as the next generation.
 """
 
 from __future__ import annotations
@@ -42,9 +42,9 @@ from hgn.schema import ConfigError, NonNegative, from_mapping, require_bounds, t
 from hgn.system.files import errors_name, make_folder, sync_file, sync_folder
 
 INDEX_NAME = "index"
-SEGMENT_SHARDS = 128
-_IN_MEMORY = 0  # the generation of an index without files
-_SEGMENTS_CACHED = 64  # segments that stay in memory: 8,192 shards
+SEGMENT_SHARDS = 128  # number of shards in a segment
+_IN_MEMORY = 0  # generation of an index without files
+_SEGMENTS_CACHED = 64  # number of segments in memory: 8,192 shards
 
 T = TypeVar("T")
 
@@ -55,7 +55,7 @@ class IndexState:
 
     generation: NonNegative[int] = 1
     shards: Count = 0
-    segment_bytes: NonNegative[int] = 0  # of the last segment
+    segment_bytes: NonNegative[int] = 0  # size of the last segment
     table_bytes: NonNegative[int] = 0
     quarantined: NonNegative[int] = 0
     quarantine_bytes: NonNegative[int] = 0
@@ -72,17 +72,17 @@ class IndexState:
 class _SegmentEnd:
     """A line of `segments.jsonl`."""
 
-    bytes: int  # of the segment
-    totals: dict[str, SplitTotals]  # up to its end, without statistics
+    bytes: int  # size of the segment
+    totals: dict[str, SplitTotals]  # totals up to its end, without statistics
 
 
 @dataclass(frozen=True)
 class _Segment:
-    """The lines that were read of a segment."""
+    """The lines of a segment that have been read."""
 
     shards: list[ShardEntry]
     bytes: int
-    totals: Totals  # up to its end, without statistics
+    totals: Totals  # totals up to its end, without statistics
 
 
 class _Read:
@@ -90,16 +90,16 @@ class _Read:
 
     def __init__(self) -> None:
         self.lock = threading.RLock()
-        self.ends: list[_SegmentEnd] = []  # of the full segments
+        self.ends: list[_SegmentEnd] = []  # ends of the full segments
         self.ends_bytes = 0
         self.segments: OrderedDict[int, _Segment] = OrderedDict()
-        # the episodes of each shard that was read, sorted
+        # the episode ranges of the shards that have been read, sorted
         self.ranges: dict[str, list[tuple[int, int]]] = {split: [] for split in SPLITS}
-        self.seen: dict[int, int] = {}  # number of shards by segment in `ranges`
-        self.particles = {split: array("i") for split in SPLITS}  # of each episode; -1: not read
+        self.seen: dict[int, int] = {}  # number of shards in `ranges` by segment
+        self.particles = {split: array("i") for split in SPLITS}  # particle count of each episode; -1: not read
 
     def see(self, segment: int, shards: Sequence[ShardEntry]) -> None:
-        """Records the shards of a segment. Raises: ConfigError where an episode is listed twice."""
+        """Records the shards of a segment. Raises: ConfigError if an episode is listed twice."""
         for shard in shards[self.seen.get(segment, 0) :]:
             ranges, own = self.ranges[shard.split], (shard.first, shard.stop)
             place = bisect_left(ranges, own)
@@ -111,9 +111,9 @@ class _Read:
 
 
 class Index(Sequence[ShardEntry]):
-    """The published shards of a data set, in publication order; segments are read when needed.
+    """The published shards of a data set, in publication order. Segments are read when needed.
 
-    Raises on access: ConfigError where a line is invalid or the lines contradict the head; UnreachableError.
+    Raises on access: ConfigError if a line is invalid or the lines contradict the head; UnreachableError.
     """
 
     def __init__(self, folder: Path | str, state: IndexState, totals: Totals) -> None:
@@ -121,7 +121,7 @@ class Index(Sequence[ShardEntry]):
         self._read = _Read()
 
     def continued(self, later: Index) -> Index:
-        """Passes the cache to a later state of the same index, and returns that."""
+        """Passes the cache to a later state of the same index. Returns the later state."""
         if later.state.generation == self.state.generation != _IN_MEMORY and len(later) >= len(self):
             later._read = self._read
         return later
@@ -150,7 +150,7 @@ class Index(Sequence[ShardEntry]):
         return self.since(0)
 
     def since(self, count: int) -> Iterator[ShardEntry]:
-        """Yields all shards but the first `count`."""
+        """Yields all shards except the first `count`."""
         while count < len(self):
             rest = self._segment(count // SEGMENT_SHARDS)[count % SEGMENT_SHARDS :][: len(self) - count]
             yield from rest
@@ -170,7 +170,7 @@ class Index(Sequence[ShardEntry]):
         return shard, shard.episodes[episode - before]
 
     def particles(self, split: str, episodes: Sequence[int]) -> list[int]:
-        """Returns particle counts by place in the split; reads a segment once."""
+        """Returns particle counts by place in the split. Each segment is read once."""
         particles = self._read.particles[split]
         with self._read.lock:
             particles.extend([-1] * (self.totals[split].episodes - len(particles)))
@@ -183,7 +183,7 @@ class Index(Sequence[ShardEntry]):
         return [particles[episode] for episode in episodes]
 
     def digest(self, split: str, episodes: int) -> str | None:
-        """Returns the digest of the shards with the first `episodes`, or None where no shard ends there."""
+        """Returns the digest of the shards with the first `episodes`, or None if no shard ends there."""
         totals = self.totals[split]
         if episodes < totals.episodes:
             segment = self._first_beyond(split, episodes)
@@ -203,7 +203,7 @@ class Index(Sequence[ShardEntry]):
         return self._rows(QuarantinedScene, "quarantined", 0, self.state.quarantine_bytes, self.state.quarantined)
 
     def files(self) -> Iterator[tuple[str, int]]:
-        """Yields names and sizes of the files, in the order in which they are to be written."""
+        """Yields names and sizes of the files in the order in which they must be written."""
         for kind in (*range(len(self) // SEGMENT_SHARDS + 1), "segments", "quarantined"):
             if size := self._bytes(kind):
                 yield self.state.path(kind), size
@@ -215,7 +215,7 @@ class Index(Sequence[ShardEntry]):
         return self._bytes(kind) or None if name == self.state.path(kind) else None
 
     def _bytes(self, kind: int | str) -> int:
-        """Returns the valid size of a segment or another file; 0 for a missing one."""
+        """Returns the valid size of a segment or another file; 0 if there is none."""
         state, full = self.state, len(self) // SEGMENT_SHARDS
         if isinstance(kind, int) and kind < full:
             return self._ends()[kind].bytes
@@ -246,7 +246,7 @@ class Index(Sequence[ShardEntry]):
         return ask(self.folder, read)
 
     def _ends(self) -> list[_SegmentEnd]:
-        """Returns the ends of the full segments, and of later ones that were read."""
+        """Returns the ends of the full segments, and of later segments that have been read."""
         read, full = self._read, len(self) // SEGMENT_SHARDS
         with read.lock:
             if len(read.ends) < full:
@@ -260,11 +260,11 @@ class Index(Sequence[ShardEntry]):
         return self._ends()[segment - 1].totals if segment else {split: SplitTotals() for split in SPLITS}
 
     def _first_beyond(self, split: str, episode: int) -> int:
-        """Returns the segment with an episode."""
+        """Returns the segment that contains an episode."""
         return bisect_right(self._ends(), episode, key=lambda end: end.totals[split].episodes)
 
     def _segment(self, number: int) -> list[ShardEntry]:
-        """Returns the shards of a segment, perhaps with later ones."""
+        """Returns the shards of a segment, possibly with later ones."""
         read, count = self._read, min(SEGMENT_SHARDS, len(self) - number * SEGMENT_SHARDS)
         with read.lock:
             segment = read.segments.get(number) or _Segment([], 0, self._before(number))
@@ -288,7 +288,7 @@ class Index(Sequence[ShardEntry]):
 
 
 class ListedIndex(Index):
-    """An index in memory, for example of a manifest of the first release."""
+    """An index in memory, for example that of a manifest of the first release."""
 
     def __init__(self, shards: Sequence[ShardEntry], quarantined: Sequence[QuarantinedScene] = ()) -> None:
         state = IndexState(_IN_MEMORY, len(shards), quarantined=len(quarantined))
@@ -316,9 +316,9 @@ class ListedIndex(Index):
 def extend(
     folder: Path, index: Index, shards: Iterable[ShardEntry], quarantined: Sequence[QuarantinedScene] = ()
 ) -> Index:
-    """Appends to the files of an index. The lines count once a head with the returned state is written.
+    """Appends to the files of an index. The lines are valid after a head with the returned state is written.
 
-    Raises: OSError; ConfigError where the files are shorter than the index says.
+    Raises: OSError; ConfigError if the files are shorter than the index states.
     """
     state, totals = index.state, index.totals
     make_folder(folder / INDEX_NAME)
@@ -340,8 +340,8 @@ def extend(
 
 
 def begin(folder: Path, current: int = 0) -> Index:
-    """Returns an empty index of a new generation. Removes generations before the head's (`current`), which nobody
-    reads; keeps later ones, whose heads were not written."""
+    """Returns an empty index of a new generation. Removes generations before the head's (`current`), which have no
+    reader. Keeps later ones, whose heads were not written."""
     files = {path: int(path.name.partition("-")[0]) for path in (folder / INDEX_NAME).glob("[0-9]*-*.jsonl")}
     for path, generation in files.items():
         if generation < current:
@@ -350,7 +350,7 @@ def begin(folder: Path, current: int = 0) -> Index:
 
 
 def parse_json(content: bytes, path: str) -> Any:
-    """Parses strict JSON. Raises: ConfigError, for NaN and infinities too."""
+    """Parses strict JSON. Raises: ConfigError, also for NaN and infinities."""
     try:
         return json.loads(content, parse_constant=_refuse)
     except (ValueError, RecursionError) as error:
@@ -362,12 +362,12 @@ def _refuse(constant: str) -> None:
 
 
 def _append(path: Path, at: int, rows: Sequence[Any]) -> int:
-    """Writes lines at an offset of a file, truncates it there and syncs it; returns its size."""
+    """Writes lines at an offset of a file, truncates it after them and syncs it. Returns its size."""
     content = b"".join(
         json.dumps(to_mapping(row), sort_keys=True, allow_nan=False, separators=(",", ":")).encode() + b"\n"
         for row in rows
     )
-    # no check that the file exists: a network file system may have cached that it does not
+    # the existence of the file is not checked, because a network file system may have cached an old answer
     flags = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC
     with errors_name(path), os.fdopen(os.open(path, flags, 0o644), "r+b") as file:
         if file.seek(0, 2) < at:

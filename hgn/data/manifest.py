@@ -1,8 +1,8 @@
-"""The manifest of a data set: its published shards, their content, and how they were made.
+"""The manifest of a data set: its published shards, their content, and the settings that made them.
 
-`manifest.json` is written last and atomically, so all that it lists is complete. Its size does not depend on the number
-of shards, which are in the append-only files of `hgn.data.index`. Manifests of the first release list the shards
-themselves.
+`manifest.json` is written last and atomically, so all listed shards are complete. Its size does not depend on the
+number of shards, which are in the append-only files of `hgn.data.index`. Manifests of the first release contain the
+shards themselves.
 """
 
 from __future__ import annotations
@@ -38,11 +38,11 @@ MOST_BYTES = 32 << 20  # enough for 8,000 shards in a manifest of the first rele
 
 @dataclass(frozen=True)
 class _Identity:
-    """Fields of the manifests of every release."""
+    """The fields of manifests of every release."""
 
-    config_hash: str  # of `config`
+    config_hash: str  # hash of `config`
     config: dict[str, Any]  # `hgn.data.identity.dataset_identity`
-    requested: dict[str, int]  # episodes per split
+    requested: dict[str, int]  # number of episodes per split
     revision: int = 0  # grows by one with each publication
     schema_version: int = field(default=SCHEMA_VERSION, kw_only=True)
 
@@ -71,10 +71,10 @@ class Manifest(_Identity):
 
     @staticmethod
     def load(folder: Path | str, patience_s: float | None = None) -> Manifest:
-        """Reads `<folder>/manifest.json`; a server may be away for `patience_s`.
+        """Reads `<folder>/manifest.json`. A server may be silent for `patience_s`.
 
-        Raises: ConfigError when it is missing, no JSON, of another schema version, or wrong in any field;
-        UnreachableError when the server stays away.
+        Raises: ConfigError if it is missing, not JSON, has another schema version, or any wrong field;
+        UnreachableError if the server does not answer.
         """
 
         def read(files: Storage) -> Manifest:
@@ -91,9 +91,9 @@ class Manifest(_Identity):
 
     @staticmethod
     def parse(content: bytes, folder: Path | str) -> Manifest:
-        """Parses the bytes of a manifest, whose index lies in `folder`.
+        """Parses the bytes of a manifest whose index is in `folder`.
 
-        Raises: ConfigError when they are no JSON, of another schema version, or wrong in any field.
+        Raises: ConfigError if they are not JSON, have another schema version, or any wrong field.
         """
         path = f"{folder}/{MANIFEST_NAME}"
         require(len(content) <= MOST_BYTES, path, f"at most {MOST_BYTES} bytes", len(content))
@@ -117,10 +117,10 @@ class Manifest(_Identity):
         return Manifest(head.config_hash, head.config, head.requested, head.revision, shards)
 
     def save(self, folder: Path | str) -> Manifest:
-        """Replaces the folder's list by this one, as a new generation; returns the manifest as it is read there."""
+        """Replaces the folder's list by this one, as a new generation. Returns the manifest as it is read there."""
         try:
             current = json.loads((Path(folder) / MANIFEST_NAME).read_bytes())["index"]["generation"]
-        except (FileNotFoundError, ValueError, LookupError, TypeError):  # none, or of the first release
+        except (FileNotFoundError, ValueError, LookupError, TypeError):  # no manifest, or one of the first release
             current = 0
         return replace(self, shards=begin(Path(folder), current)).extended(
             Path(folder), self.shards, self.quarantined, revision=self.revision
@@ -133,9 +133,9 @@ class Manifest(_Identity):
         quarantined: Sequence[QuarantinedScene] = (),
         **changes: Any,
     ) -> Manifest:
-        """Publishes more in this manifest's folder, at a cost independent of its size; `changes` are other fields.
+        """Publishes more in this manifest's folder, at a cost independent of its size. `changes` are other fields.
 
-        Raises: OSError; ConfigError where the index was changed by another program.
+        Raises: OSError; ConfigError if another program changed the index.
         """
         if isinstance(self.shards, ListedIndex):
             whole = ListedIndex([*self.shards, *shards], [*self.quarantined, *quarantined])
@@ -154,7 +154,7 @@ class Manifest(_Identity):
 
     @property
     def quarantined(self) -> list[QuarantinedScene]:
-        """The scenes that could not be simulated, in order; read each time."""
+        """The scenes that could not be simulated, in order. Each access reads them."""
         return self.shards.quarantined()
 
     def statistics(self, split: str = "train") -> Statistics:

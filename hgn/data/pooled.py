@@ -1,4 +1,4 @@
-"""Several data sets as one: fixed ones first, then one that may grow."""
+"""Several data sets as one: fixed data sets first, then one that may grow."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from hgn.scene.episode import Episode
 
 
 class PooledStore(Episodes):
-    """One split of `own` after the same split of `others`, which are fixed once opened.
+    """One split of `own` after the same split of `others`, which stay as they were opened.
 
-    It is used like an EpisodeStore: places count over all data sets, and only `own` grows.
+    It is used like an EpisodeStore. Places count over all data sets, and only `own` grows.
     """
 
     def __init__(self, own: EpisodeStore, others: Sequence[EpisodeStore]) -> None:
@@ -73,7 +73,7 @@ class PooledStore(Episodes):
         return chain.from_iterable(store.entries for store in (*self.others, self.own))
 
     def frames(self, count: int | None = None) -> list[int]:
-        """Returns the frames of the first `count` episodes, which include all of `others`."""
+        """Returns the frame counts of the first `count` episodes, which include all of `others`."""
         own = None if count is None else count - self._still
         return [*chain.from_iterable(store.frames() for store in self.others), *self.own.frames(own)]
 
@@ -97,7 +97,7 @@ class PooledStore(Episodes):
         return store.read(place)
 
     def _place(self, index: int) -> tuple[EpisodeStore, int]:
-        """Returns the store of an episode, and its place there."""
+        """Returns the store of an episode, and the episode's place in it."""
         number = int(np.searchsorted(self._ends, index, side="right"))
         if number == len(self.others):
             return self.own, index - self._still

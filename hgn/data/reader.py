@@ -1,7 +1,7 @@
 """Published episodes of a data set. Positions are memory-mapped, so a window of frames reads only its own pages.
 
-Each shard is checked against the index (size, then sha256) before it is used: a tar cut at a member boundary would
-otherwise read as fewer samples without an error. Remote shards are read from a cache (`hgn.data.shard_cache`).
+Each shard is checked against the index (size, then sha256) before use. Otherwise a tar cut at a member boundary would
+read as fewer samples without an error. Remote shards are read from a cache (`hgn.data.shard_cache`).
 """
 
 from __future__ import annotations
@@ -31,25 +31,25 @@ from hgn.scene.episode import POSITION_MEMBER, Episode, decode_episode
 from hgn.schema import ConfigError, require, without_passwords
 from hgn.system.patience import UnreachableError, standard_patience_s
 
-AGAIN_S, FORGOTTEN_S = 1.0, 60.0  # between looks at a manifest that could not be read
-MAPPED_SHARDS = 256  # mapped at once, and at most a quarter of the files that a process may open
+AGAIN_S, FORGOTTEN_S = 1.0, 60.0  # interval of reads after a fault of the manifest; time after which it is forgotten
+MAPPED_SHARDS = 256  # largest number of mapped shards; also at most a quarter of the files that a process may open
 
 
 class Episodes(Sequence[Episode], ABC):
     """A sequence of episodes.
 
-    An episode is opened, and its shard verified, on first use. In a folder of others the positions are a copy, because
-    a file that is cut would end the process; in this machine's cache, and with `open`, a read-only `np.memmap`.
-    Raises on access: ConfigError when a shard is missing or altered.
+    An episode is opened, and its shard verified, on first use. In another folder the positions are a copy, because
+    truncation of a mapped file would end the process. In this machine's cache, and with `open`, they are a read-only
+    `np.memmap`. Raises on access: ConfigError if a shard is missing or altered.
     """
 
     @abstractmethod
     def open(self, index: int) -> Episode:
-        """Returns the episode at a place from 0 on, to be read at once: the positions are mapped."""
+        """Returns the episode at a place from 0. Read it soon, because its positions are mapped."""
 
     @abstractmethod
     def read(self, index: int) -> Episode:
-        """Returns the episode at a place from 0 on."""
+        """Returns the episode at a place from 0."""
 
     @property
     @abstractmethod
@@ -74,20 +74,20 @@ class Episodes(Sequence[Episode], ABC):
 
 
 class EpisodeStore(Episodes):
-    """The published episodes of one split of a data set, in publication order; it only grows.
+    """The published episodes of one split of a data set, in publication order. Its number only grows.
 
-    Picklable for spawned workers: the folder, split and manifest travel, open files and maps do not.
+    It can be pickled for spawned workers with folder, split and manifest, but without open files and maps.
     """
 
     _fetcher: threading.Thread | None = None
-    _faulty_since: float | None = None  # of the manifest
+    _faulty_since: float | None = None  # time of the manifest's first fault
     _looked_s = 0.0
     _lock: threading.Lock
-    _wanted: list[ShardEntry]  # to be fetched next
+    _wanted: list[ShardEntry]  # shards to fetch next
     _spared: frozenset[str]  # sha256 of shards that stay in a full cache
 
     def __init__(self, folder: Path | str, split: str) -> None:
-        """Raises: ConfigError when there is no readable manifest or the split is unknown; UnreachableError."""
+        """Raises: ConfigError if there is no readable manifest or the split is unknown; UnreachableError."""
         require(split in SPLITS, "split", f"one of {', '.join(SPLITS)}", split)
         self.folder = folder
         self.split = split
@@ -96,9 +96,9 @@ class EpisodeStore(Episodes):
 
     @staticmethod
     def available(folder: Path | str) -> bool:
-        """Returns whether a data set exists there, complete or not, with shards or not.
+        """Returns whether a data set exists there, complete or not, with or without shards.
 
-        Raises: ConfigError where access is refused; UnreachableError.
+        Raises: ConfigError if access is refused; UnreachableError.
         """
         try:
             open_storage(folder).manifest(MANIFEST_NAME)
@@ -107,18 +107,18 @@ class EpisodeStore(Episodes):
         return True
 
     def of_split(self, split: str) -> EpisodeStore:
-        """Returns another split of the same data set without asking the server."""
+        """Returns another split of the same data set without a request to the server."""
         require(split in SPLITS, "split", f"one of {', '.join(SPLITS)}", split)
         store = EpisodeStore.__new__(EpisodeStore)
         store.__setstate__(self.__getstate__() | {"split": split})
         return store
 
     def refresh(self) -> bool:
-        """Reads the manifest again; returns whether this split has more episodes than before.
+        """Reads the manifest again. Returns whether this split has more episodes than before.
 
-        When a server does not answer, the known episodes stay; where faults are outlived, they stay after any fault
-        that lasts no longer than the patience, and `ask_again` looks once a second whether it is over.
-        Raises: ConfigError when the folder contains another data set, or published shards were removed.
+        If a server does not answer, the known episodes stay. Inside `faults_outlived` they stay after any fault that
+        lasts no longer than the patience, and `ask_again` reads the manifest once a second.
+        Raises: ConfigError if the folder contains another data set, or published shards were removed.
         """
         previous_s, self._looked_s = self._looked_s, time.monotonic()
         try:
@@ -128,7 +128,7 @@ class EpisodeStore(Episodes):
             return False
         except (ConfigError, OSError) as error:
             patience_s = standard_patience_s()
-            if self._looked_s - previous_s > patience_s + FORGOTTEN_S:  # it may have been over in between
+            if self._looked_s - previous_s > patience_s + FORGOTTEN_S:  # it may have ended in between
                 self._faulty_since = None
             since = self._looked_s if self._faulty_since is None else self._faulty_since
             if not outliving():
@@ -166,9 +166,9 @@ class EpisodeStore(Episodes):
         return manifest
 
     def within_reach(self, indices: Sequence[int], patience_s: float) -> bool:
-        """Fetches the shards of these episodes; returns False if a server does not answer within the patience.
+        """Fetches the shards of these episodes. Returns False if a server does not answer within the patience.
 
-        Raises: ConfigError when a shard is missing or altered.
+        Raises: ConfigError if a shard is missing or altered.
         """
         for shard in self._shards(indices):
             try:
@@ -178,8 +178,10 @@ class EpisodeStore(Episodes):
         return True
 
     def fetch_ahead(self, episodes: Sequence[int] | None = None) -> None:
-        """Starts to fetch shards in the background, one after the other: all that are published, or those of `episodes`
-        in their order. Only with `episodes` are older shards removed from a full cache. Does nothing for a folder.
+        """Starts to fetch shards in the background, one after the other. It does nothing for a folder.
+
+        It fetches all published shards, or those of `episodes` in their order. Only with `episodes` are older shards
+        removed from a full cache.
         """
         if not is_remote(self.folder):
             return
@@ -194,7 +196,7 @@ class EpisodeStore(Episodes):
                 self._fetcher = threading.Thread(target=target, name="shards", daemon=True)
                 self._fetcher.start()
 
-    # errors are ignored here: the reader that needs the shard meets and reports them
+    # errors are ignored here; the reader that needs the shard raises them
 
     def _fetch_all(self) -> None:
         with contextlib.suppress(ConfigError, OSError):
@@ -214,7 +216,7 @@ class EpisodeStore(Episodes):
                 self._bring(shard, spared=spared)
 
     def digest(self, count: int) -> str | None:
-        """Returns a digest of the first `count` episodes, or None where no shard ends with the last of them."""
+        """Returns a digest of the first `count` episodes, or None if no shard ends with the last of them."""
         return self.manifest.shards.digest(self.split, count)
 
     @property
@@ -222,7 +224,7 @@ class EpisodeStore(Episodes):
         return (entry for shard in self.manifest.shards_of(self.split) for entry in shard.episodes)
 
     def frames(self, count: int | None = None) -> list[int]:
-        """Returns the frame counts of the first `count` episodes (None: all), from the index only where they differ."""
+        """Returns the frame counts of the first `count` episodes (None: all). Reads the index only if they differ."""
         count, config = len(self) if count is None else count, self.manifest.config
         if "frames" in config and "long_fraction" not in config:
             return [config["frames"]] * count
@@ -254,7 +256,7 @@ class EpisodeStore(Episodes):
         self._scanned: set[str] = set()  # keys of episodes whose positions are finite
         self._fetcher = None
         self._faulty_since = None
-        self._frames: list[int] = []  # of the episodes in the first shards, where lengths differ
+        self._frames: list[int] = []  # frame counts of the episodes in the first shards, if they differ
         self._measured = 0  # number of these shards
         self._fetched = 0  # number of shards that were fetched ahead
         self._wanted, self._spared = [], frozenset()
@@ -262,21 +264,21 @@ class EpisodeStore(Episodes):
         holders.add(self)
 
     def _bring(self, shard: ShardEntry, **options: Any) -> Path:
-        """Returns a shard's verified file on this machine; options and errors as for `Storage.shard`."""
+        """Returns a shard's verified file on this machine. Options and errors as for `Storage.shard`."""
         return ask(self.folder, lambda files: files.shard(shard.name, shard.sha256, shard.bytes, **options))
 
     def _locate(self, index: int) -> tuple[ShardEntry, EpisodeEntry]:
         return self.manifest.shards.locate(self.split, index)
 
     def _shards(self, indices: Sequence[int]) -> list[ShardEntry]:
-        """Returns the shards of these episodes, each once, in order."""
+        """Returns the shards of these episodes in order, each once."""
         return list({shard.name: shard for shard, _ in map(self._locate, indices)}.values())
 
     def open(self, index: int) -> Episode:
         shard, entry = self._locate(index)
         while True:
             opened = self._open_shards.get(shard.name)
-            if opened is None:  # outside the lock, because this may wait for a server
+            if opened is None:  # outside the lock, because a server may answer late
                 opened = _OpenShard(self._bring(shard))
             with self._lock:
                 opened = self._open_shards.setdefault(shard.name, opened)
@@ -285,10 +287,10 @@ class EpisodeStore(Episodes):
                 if len(self._open_shards) > min(MAPPED_SHARDS, resource.getrlimit(resource.RLIMIT_NOFILE)[0] // 4):
                     self._open_shards.popitem(last=False)
                 size = opened.size()
-                if size is None and is_remote(self.folder):  # it was removed from a full cache, and is fetched again
+                if size is None and is_remote(self.folder):  # removed from a full cache; it is fetched again
                     del self._open_shards[shard.name]
                     continue
-                if size is not None and size < shard.bytes:  # reading beyond the file's end would kill the process
+                if size is not None and size < shard.bytes:  # reading after the file's end would kill the process
                     raise ConfigError(
                         f"{opened.path} must have {shard.bytes} bytes, got {size}: it was cut while it was open"
                     )
@@ -305,13 +307,13 @@ class EpisodeStore(Episodes):
         return replace(episode, position_TN3=position_TN3)
 
     def release(self, path: Path) -> None:
-        """Closes a shard; its episodes that are in use stay readable."""
+        """Closes a shard. Its episodes in use stay readable."""
         with self._lock:
             for name in [name for name, opened in self._open_shards.items() if opened.path == path]:
                 del self._open_shards[name]
 
     def _read(self, content: np.ndarray, shard: ShardEntry, entry: EpisodeEntry) -> Episode:
-        scan = entry.key not in self._scanned  # verified bytes may be those of positions that are not finite
+        scan = entry.key not in self._scanned  # verified bytes may contain positions that are not finite
         try:
             episode = read_episode(content, shard.name, entry.key, entry.members, scan_positions=scan)
         except ConfigError as error:
@@ -356,9 +358,9 @@ def read_episode(
     located: Mapping[str, tuple[int, int]],
     scan_positions: bool = False,
 ) -> Episode:
-    """Decodes an episode from a shard's bytes (flat uint8, mapped or in memory); positions stay a view of them.
+    """Decodes an episode from a shard's bytes (flat uint8, mapped or in memory). Positions are a view of them.
 
-    `located` gives offset and size of each member. Raises: ConfigError when it does not fit the bytes.
+    `located` gives offset and size of each member. Raises: ConfigError if a member is not within the bytes.
     """
     members: dict[str, bytes | np.ndarray] = {}
     for member, (offset, size) in located.items():
@@ -373,10 +375,7 @@ def read_episode(
 
 
 def first_episodes(store: EpisodeStore, count: int) -> list[Episode]:
-    """Returns the `count` episodes of lowest index.
-
-    Raises: ConfigError when there are none.
-    """
+    """Returns the `count` episodes with the lowest indices. Raises: ConfigError if there are none."""
     if not len(store):
         others = ", ".join(f"split={split}" for split in SPLITS if len(store.of_split(split)))
         remedy = f"; it has others: {others}" if others else ""
@@ -385,10 +384,7 @@ def first_episodes(store: EpisodeStore, count: int) -> list[Episode]:
 
 
 def find_episode(folder: Path | str, key: str) -> Episode:
-    """Returns the episode with a key, for example validation-000000.
-
-    Raises: ConfigError when the data set does not hold it.
-    """
+    """Returns the episode with a key, for example validation-000000. Raises: ConfigError if there is none."""
     split = key.rsplit("-", 1)[0]
     if split not in SPLITS:
         raise ConfigError(f"episode must begin with one of {', '.join(SPLITS)}, got {key!r}; e.g. validation-000000")

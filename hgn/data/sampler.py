@@ -1,8 +1,8 @@
 """The order of training samples: a pure function of seed, epoch, episodes, batch and world size.
 
-A sample is one frame of one episode. An epoch is a permutation of all samples of the episodes that were
-published when it began; epochs follow each other without a gap, so that every sample comes exactly once an
-epoch on any number of ranks, batches are all of one size, and the whole state of the order is a `SamplerState`.
+A sample is one frame of one episode. An epoch is a permutation of all samples of the episodes that were published when
+it began. Epochs follow each other without a gap. So every sample comes exactly once an epoch on any number of ranks,
+all batches have one size, and a `SamplerState` is the whole state of the order.
 """
 
 from __future__ import annotations
@@ -19,35 +19,35 @@ from hgn.system.splitmix import splitmix64
 
 @dataclass(frozen=True)
 class SamplerState:
-    """The position in the order, over all ranks together."""
+    """The position in the order, over all ranks."""
 
     epoch: int = 0
-    position: int = 0  # samples of this epoch already taken
-    episodes: int = 0  # in this epoch; 0: not fixed yet
-    digest: str = ""  # of the shards with these episodes; empty: unknown (checkpoints of 0.1.0)
-    window: int = 0  # episodes whose samples are shuffled together; 0: all
-    seed: int | None = None  # of the order; None: unknown (checkpoints of 0.1.0)
+    position: int = 0  # number of samples of this epoch that were taken
+    episodes: int = 0  # number of episodes in this epoch; 0: not yet fixed
+    digest: str = ""  # digest of the shards with these episodes; empty: unknown (checkpoints of 0.1.0)
+    window: int = 0  # number of episodes whose samples are shuffled together; 0: all
+    seed: int | None = None  # seed of the order; None: unknown (checkpoints of 0.1.0)
 
 
-class Sample(NamedTuple):  # faster to construct than a dataclass: a thousand are drawn a second
-    """Frame n of an episode: the network sees frames up to n and predicts n + 1."""
+class Sample(NamedTuple):  # faster to construct than a dataclass; a thousand are drawn a second
+    """Frame n of an episode. The network sees frames up to n and predicts n + 1."""
 
     episode: int
     frame: int
-    seed: int  # of its noise, grid jitter and symmetry
-    weight: float = 1.0  # of its loss
-    noise_scale: float = 1.0  # of its noise, in units of training.noise_std, see hgn.training.noise
+    seed: int  # seed of its noise, grid jitter and symmetry
+    weight: float = 1.0  # loss weight
+    noise_scale: float = 1.0  # scale of its noise in units of training.noise_std (see hgn.training.noise)
 
 
-BLOCK_EPISODES = 8  # consecutive in publication order; as many as most shards have
+BLOCK_EPISODES = 8  # consecutive episodes in publication order; most shards have as many
 
 
 def epoch_order(seed: int, epoch: int, first_sample: np.ndarray, window: int = 0) -> np.ndarray:
-    """Returns the order of an epoch, int64 [samples]; `first_sample` is that of each episode, then the total.
+    """Returns the order of an epoch, int64 [samples]. `first_sample` is each episode's first sample, then the total.
 
     Without a `window` all samples are shuffled together. With one, blocks of BLOCK_EPISODES are shuffled, then the
-    samples of as many blocks as make a window. A rank then needs the shards of at most two windows at a time, and each
-    shard once an epoch (twice where it lies in two blocks).
+    samples of the blocks in a window. A rank then needs the shards of at most two windows at a time, and each shard
+    once an epoch (twice if it is in two blocks).
     """
     generator = np.random.Generator(np.random.PCG64([seed, epoch]))
     episodes = len(first_sample) - 1
@@ -66,10 +66,10 @@ def epoch_order(seed: int, epoch: int, first_sample: np.ndarray, window: int = 0
 
 
 def balanced_parts(size_K: np.ndarray, ranks: int) -> np.ndarray:
-    """Assigns K samples to ranks, int64 [ranks, K / ranks]: equal counts, about equal total sizes.
+    """Assigns K samples to ranks, int64 [ranks, K / ranks], with equal counts and about equal total sizes.
 
-    The largest remaining samples, one for each rank, go to the ranks with the smallest sums so far (longest processing
-    time first, Graham 1969, with equal counts). Equal sizes keep their order, so that all ranks agree.
+    In each round the largest remaining samples, one per rank, go to the ranks with the smallest sums (longest
+    processing time first, Graham 1969, with equal counts). Equal sizes keep their order, so all ranks agree.
     """
     row_order = np.argsort(-size_K, kind="stable").reshape(-1, ranks)
     load, parts = np.zeros(ranks), np.empty_like(row_order)
@@ -82,11 +82,11 @@ def balanced_parts(size_K: np.ndarray, ranks: int) -> np.ndarray:
 class EpisodeSampler:
     """Iterates over epochs in batches and returns each rank's part.
 
-    `published(epoch)` is called when an epoch begins and returns the number of frames of each published episode, in
+    `published(epoch)` is called when an epoch begins. It returns the number of frames of each published episode, in
     publication order. It must return the same list on every rank, and continue the list of the epoch before. Episodes
-    published after a resumed epoch began wait for the next epoch. `digest(count)` identifies the first `count`
-    episodes (`hgn.data.index`). `particles(episodes)` returns particle counts, by which scenes are balanced over ranks
-    so that no rank waits for the slowest.
+    published after a resumed epoch began wait for the next epoch. `digest(count)` identifies the first `count` episodes
+    (`hgn.data.index`). `particles(episodes)` returns particle counts. With them scenes are balanced over ranks, so that
+    no rank waits for the slowest.
     """
 
     def __init__(
@@ -101,7 +101,7 @@ class EpisodeSampler:
         window: int = 0,
         particles: Callable[[Sequence[int]], Sequence[int]] | None = None,
     ) -> None:
-        """Raises: ConfigError where the state's epoch cannot be resumed; see `epoch_order` for `window`."""
+        """Raises: ConfigError if the state's epoch cannot be resumed. See `epoch_order` for `window`."""
         assert 0 <= rank < world_size and batch_scenes >= 1
         self.seed, self.batch_scenes, self.rank, self.world_size = seed, batch_scenes, rank, world_size
         self.state = state or SamplerState()
@@ -119,14 +119,14 @@ class EpisodeSampler:
             )
         self._order = np.zeros(0, np.int64)
         self._first_sample = np.zeros(1, np.int64)
-        self._first_seed = np.uint64(0)  # of an epoch's first sample; the seeds of the others follow
+        self._first_seed = np.uint64(0)  # seed of an epoch's first sample; the seeds of the others follow
         self._begin_epoch(self.state.epoch, self.state.position, self.state.episodes, self.state.digest)
 
     def next_batch(self) -> list[Sample]:
         """Returns this rank's `batch_scenes` samples of the next global batch, and advances the state."""
         total = self.batch_scenes * self.world_size
-        parts: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []  # episodes, frames and seeds of each epoch's
-        taken = 0  # of the global batch, which may span two epochs
+        parts: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []  # episodes, frames and seeds by epoch
+        taken = 0  # number of samples taken of the global batch, which may span two epochs
         while taken < total:
             if self.state.position == len(self._order):
                 self._begin_epoch(self.state.epoch + 1, 0, 0, "")
@@ -142,7 +142,7 @@ class EpisodeSampler:
         return [Sample(episode, frame, splitmix64(seed) >> 1) for episode, frame, seed in rows]
 
     def upcoming(self, samples: int) -> list[int]:
-        """Returns the episodes of this epoch's next samples, of all ranks, in the order in which they are needed."""
+        """Returns the episodes of this epoch's next samples, of all ranks, in the order of their use."""
         ahead = self._order[self.state.position :][:samples]
         return list(dict.fromkeys((self._first_sample.searchsorted(ahead, side="right") - 1).tolist()))
 

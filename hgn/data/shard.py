@@ -11,7 +11,7 @@ from hgn.schema import ConfigError
 
 
 def episode_tar(episode: Episode) -> Iterator[bytes]:
-    """Yields the parts of an episode's tar; without times and owners, the same episode gives the same bytes."""
+    """Yields the parts of an episode's tar. It has no times and owners, so an episode always gives the same bytes."""
     written = 0
     for name, data in encode_episode(episode).items():
         info = tarfile.TarInfo(f"{episode.key}.{name}")
@@ -29,9 +29,9 @@ def tar_end(written: int) -> bytes:
 
 
 def locate_members(path: Path) -> dict[str, dict[str, tuple[int, int]]]:
-    """Returns where each member's data lies in a tar: key -> name after `<key>.` -> (offset, bytes).
+    """Returns the place of each member's data in a tar: key -> name after `<key>.` -> (offset, bytes).
 
-    Raises: ConfigError when the file is not a whole tar.
+    Raises: ConfigError if the file is not a complete tar.
     """
     located: dict[str, dict[str, tuple[int, int]]] = {}
     try:

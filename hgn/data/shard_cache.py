@@ -1,7 +1,7 @@
-"""A cache of remote shards, named by their sha256, so that data sets do not collide.
+"""A cache of remote shards. They are named by their sha256, so data sets do not collide.
 
-One process fetches a shard, the others of this machine wait for it. `HGN_CACHE` is the cache's folder (default
-`~/.cache/hgn`), `HGN_CACHE_GB` its limit (default: none but the disk). A full cache drops the oldest shards.
+One process fetches a shard, and the others of this machine wait for it. `HGN_CACHE` is the cache's folder (default
+`~/.cache/hgn`). `HGN_CACHE_GB` limits its size (default: only the disk). A full cache removes the oldest shards.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _FULL = (errno.ENOSPC, errno.EDQUOT)
 
 
 class Holder(Protocol):
-    """A reader with open files of the cache, which occupy the disk until they are closed."""
+    """A reader with open files of the cache. They occupy the disk until they are closed."""
 
     def release(self, path: Path) -> None:
         """Closes a file that is about to be removed."""
@@ -70,11 +70,11 @@ Fill = Callable[[BufferedRandom], None]
 
 
 def cached_shard(shard: CachedShard, patience_s: float, spared: Collection[str] | None, fill: Fill) -> Path:
-    """Returns the verified file of a shard. For a missing one, `fill` completes a file that may hold its beginning.
+    """Returns the verified file of a shard. If it is missing, `fill` completes a file that may contain its beginning.
 
-    A full cache makes room for it, except of shards whose sha256 is in `spared`; with None it removes nothing.
+    A full cache removes shards for it, except those with a sha256 in `spared`; with None it removes none.
     Raises: ConfigError; UnreachableError while another process fetches the file without progress; OSError (full disk or
-    cache); the exceptions of `fill`.
+    cache); exceptions of `fill`.
     """
     path = cache_folder() / f"{shard.sha256}.tar"
     for last_try in (False, True):
@@ -96,7 +96,7 @@ def _fetch(path: Path, shard: CachedShard, patience_s: float, spared: Collection
     with _locked_partial(path, shard.url, patience_s) as file:
         if file is None:
             return
-        while True:  # only the process that has the lock frees space: two that need one shard would do it twice
+        while True:  # only the process with the lock frees space, because two would free it twice
             lacking = shard.size - os.fstat(file.fileno()).st_size - shutil.disk_usage(path.parent).free
             over = max(_bytes_over(path.parent, shard.size), lacking)
             try:
@@ -110,7 +110,7 @@ def _fetch(path: Path, shard: CachedShard, patience_s: float, spared: Collection
                 if not _free_space(path.parent, over, max(over, shard.size), spared):
                     raise
         os.fsync(file.fileno())
-        # the newest shard must have the latest time, wherever this machine's clock stood before
+        # the newest shard must have the latest time, even after a change of this machine's clock
         latest = max((time_ns for time_ns, _, _ in _cached(path.parent)), default=0)
         if os.fstat(file.fileno()).st_mtime_ns <= latest:
             os.utime(file.fileno(), ns=(latest + 1, latest + 1))
@@ -120,7 +120,7 @@ def _fetch(path: Path, shard: CachedShard, patience_s: float, spared: Collection
 
 
 def _make_folder(folder: Path) -> None:
-    """Raises: ConfigError naming the variable, where the folder cannot be created."""
+    """Creates the folder. Raises: ConfigError naming the variable, if it cannot be created."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -133,7 +133,7 @@ def _make_folder(folder: Path) -> None:
 
 
 def _cached(folder: Path) -> list[tuple[int, int, Path]]:
-    """Returns time, bytes and path of each cached shard, oldest first; other processes may remove some meanwhile."""
+    """Returns time, bytes and path of each cached shard, oldest first. Other processes may remove shards meanwhile."""
     shards = []
     for path in folder.glob("*.tar"):
         with contextlib.suppress(FileNotFoundError):
@@ -143,7 +143,7 @@ def _cached(folder: Path) -> list[tuple[int, int, Path]]:
 
 
 def _bytes_over(folder: Path, size: int) -> float:
-    """Returns by how many bytes one more file would exceed the cache's limit. Raises: ConfigError."""
+    """Returns the number of bytes by which one more file would exceed the cache's limit. Raises: ConfigError."""
     limit = os.environ.get(LIMIT_VARIABLE)
     if not limit:
         return 0
@@ -156,9 +156,9 @@ def _bytes_over(folder: Path, size: int) -> float:
 
 
 def _free_space(folder: Path, least: float, size: float, spared: Collection[str]) -> bool:
-    """Removes the oldest shards that are not spared, up to `size` bytes; returns whether there was any.
+    """Removes the oldest shards that are not spared, up to `size` bytes. Returns whether it removed any.
 
-    Removes none where all of them together are less than `least`: a size that an index claims may be wrong.
+    It removes none if all of them are smaller than `least` in total, because a size in an index may be wrong.
     """
     removable = [(cached, path) for _, cached, path in _cached(folder) if path.stem not in spared]
     if sum(cached for cached, _ in removable) < least:
@@ -176,10 +176,10 @@ def _free_space(folder: Path, least: float, size: float, spared: Collection[str]
 
 @contextlib.contextmanager
 def _locked_partial(path: Path, url: str, patience_s: float) -> Iterator[BufferedRandom | None]:
-    """The partial file of `path`, locked, with the bytes that others had written; None once `path` exists.
+    """Yields the locked partial file of `path` with the bytes from other processes; None once `path` exists.
 
-    The kernel releases the lock of a process that ends, so the next one continues the file.
-    Raises: UnreachableError when another process has the lock and writes nothing for `patience_s`.
+    The kernel frees the lock of a process that ends, so the next process continues the file.
+    Raises: UnreachableError if another process has the lock and writes nothing for `patience_s`.
     """
     partial = path.with_name(f".{path.name}{TEMPORARY_SUFFIX}")
     while True:
@@ -210,7 +210,7 @@ def _locked_partial(path: Path, url: str, patience_s: float) -> Iterator[Buffere
 
 
 def _lock(file: BufferedRandom, folder: Path, url: str, patience_s: float) -> None:
-    """Locks a file; waits for another process as long as the file grows, since that process may have been stopped."""
+    """Locks a file. It waits while the file grows; a process that stopped writing may itself have been stopped."""
     size, start = -1, time.monotonic()
     try:
         while not lock_file(file):

@@ -1,6 +1,6 @@
 """Mean and spread of velocity and acceleration, merged over episodes and shards.
 
-In frame units, as the network sees them: v^n = x^n - x^(n-1), a^n = v^(n+1) - v^n.
+In frame units, as in the network: v^n = x^n - x^(n-1), a^n = v^(n+1) - v^n.
 Shape legend: T frames, N particles.
 """
 
@@ -13,15 +13,15 @@ import numpy as np
 
 from hgn.schema import Vector
 
-_BLOCK_PARTICLES = 1 << 18  # particles times frames handled at once
-_ROWS_ABREAST = 512
+_BLOCK_PARTICLES = 1 << 18  # particles times frames in a pass
+_ROWS_ABREAST = 512  # rows of three that are summed side by side
 
 
 @dataclass(frozen=True)
 class Moments:
     """Count, mean and sum of squared deviations of 3-vectors, per axis, in float64.
 
-    Merging follows Chan, Golub, LeVeque (1979), which loses no digits where the mean is far from zero.
+    Merging follows Chan, Golub, LeVeque (1979), which loses no digits if the mean is far from zero.
     """
 
     count: int = 0
@@ -59,7 +59,7 @@ class Moments:
 
 @dataclass(frozen=True)
 class Statistics:
-    """Velocity and acceleration in frame units (domain units per frame, per frame squared)."""
+    """Moments of velocity and acceleration in frame units (domain units per frame, per frame squared)."""
 
     velocity: Moments = Moments()
     acceleration: Moments = Moments()
@@ -71,14 +71,14 @@ class Statistics:
 def episode_statistics(position_TN3: np.ndarray) -> Statistics:
     """Returns the statistics of one trajectory.
 
-    Differences are taken in float64, over blocks of frames so that memory stays bounded; the blocks depend on the
-    number of particles alone, so the result does not depend on how a data set is cut into shards.
+    Differences are computed in float64, over blocks of frames to limit memory. Blocks depend only on the number of
+    particles, so the result does not depend on the division of a data set into shards.
     """
     frames, particles = position_TN3.shape[:2]
     block = max(2, _BLOCK_PARTICLES // max(particles, 1))
     statistics = Statistics()
     for first in range(0, frames - 1, block):
-        # the velocities that end in frames first + 1 ... first + block, and the one before them
+        # the velocities into frames first + 1 … first + block, and the velocity before them
         start = max(first - 1, 0)
         velocity = np.diff(np.asarray(position_TN3[start : first + block + 1], np.float64), axis=0)
         statistics = statistics.merge(
@@ -88,7 +88,7 @@ def episode_statistics(position_TN3: np.ndarray) -> Statistics:
 
 
 def merge_statistics(parts: Iterable[Statistics]) -> Statistics:
-    """Merges all parts in the order given."""
+    """Merges all parts in their order."""
     total = Statistics()
     for part in parts:
         total = total.merge(part)
@@ -96,7 +96,7 @@ def merge_statistics(parts: Iterable[Statistics]) -> Statistics:
 
 
 def _sums(flat: np.ndarray, origin: np.ndarray, power: int) -> np.ndarray:
-    """Returns the sum of (flat - origin)^power per axis, many rows at once: NumPy is slow on rows of three."""
+    """Returns the sum of (flat - origin)^power per axis. Rows are added in groups; short rows are slow in NumPy."""
     total = np.zeros(3)
     whole = len(flat) // _ROWS_ABREAST * _ROWS_ABREAST
     for part, abreast in ((flat[:whole], _ROWS_ABREAST), (flat[whole:], 1)):

@@ -1,7 +1,7 @@
-"""Where a data set lies: a folder of this machine, or a URL (a dataset service, a file server, an object store).
+"""The place of a data set: a folder of this machine, or a URL (a dataset service, a file server, an object store).
 
 Shards of a URL are cached on this machine (`hgn.data.shard_cache`). `HGN_DATASET_TOKEN` is the token of a dataset
-service; with `HGN_DATASET_HOST` only that host (or host:port) receives it.
+service. With `HGN_DATASET_HOST` only that host (or host:port) receives it.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ from hgn.system.patience import UnreachableError, inside, patiently, standard_pa
 
 TOKEN_VARIABLE = "HGN_DATASET_TOKEN"
 TOKEN_HOST_VARIABLE = "HGN_DATASET_HOST"
-_CHUNK_BYTES = 16 * 2**20  # of a shard in one request; a lost connection costs at most one
-_CONNECT_S, _SILENCE_S, _ANSWER_S = 10.0, 60.0, 1800.0  # the last of them for a whole file at most
-_AWAY_S = 10.0  # after a server did not answer, callers without patience do not ask it
+_CHUNK_BYTES = 16 * 2**20  # bytes of a shard per request; a lost connection costs at most one request
+_CONNECT_S, _SILENCE_S, _ANSWER_S = 10.0, 60.0, 1800.0  # time limits of a connection, of silence, and of a whole file
+_AWAY_S = 10.0  # time after a server did not answer in which callers without patience do not ask it
 _NETWORK_PACKAGES = {"aiohttp", "botocore", "aiobotocore", "gcsfs", "google", "azure"}
 
 T = TypeVar("T")
@@ -41,21 +41,21 @@ _outliving = threading.Event()
 
 
 class StorageError(ConfigError):
-    """A file of a data set that is missing, refused, cut or no JSON, perhaps for a moment."""
+    """A file of a data set is missing, refused, cut or not JSON, perhaps temporarily."""
 
 
 def faults_outlived() -> contextlib.AbstractContextManager[None]:
-    """Inside it `ask` repeats what fails, for the standard patience: a training knows that its data were there."""
+    """Lets `ask` repeat failed reads for the standard patience, because the data of a training existed before."""
     return inside(_outliving)
 
 
 def outliving() -> bool:
-    """Returns whether faults are outlived, see `faults_outlived`."""
+    """Returns whether failed reads are repeated (see `faults_outlived`)."""
     return _outliving.is_set()
 
 
 def ask(folder: Path | str, read: Callable[[Storage], T]) -> T:
-    """Returns `read` of the storage of a data set. Raises: as `read`; UnreachableError where faults are outlived."""
+    """Returns `read` of a data set's storage. Raises: as `read`; UnreachableError inside `faults_outlived`."""
     storage, place = open_storage(folder), str(folder)
     if not outliving():
         return read(storage)
@@ -68,7 +68,7 @@ def _may_pass(error: Exception) -> str | None:
 
 
 class Storage(ABC):
-    """The files of a data set, wherever they are."""
+    """The files of a data set at any place."""
 
     @abstractmethod
     def manifest(self, name: str, patience_s: float | None = None) -> bytes:
@@ -84,13 +84,13 @@ class Storage(ABC):
     ) -> Path:
         """Returns the path of a verified shard on this machine.
 
-        A full cache makes room for it, except of shards whose sha256 is in `spared`; with None it removes nothing.
+        A full cache removes shards for it, except those with a sha256 in `spared`; with None it removes none.
         Raises: ConfigError; UnreachableError; OSError (full disk or cache).
         """
 
 
 def is_remote(folder: Path | str) -> bool:
-    """Returns whether a data set lies at a URL."""
+    """Returns whether a data set is at a URL."""
     return "://" in str(folder) and not str(folder).startswith("file://")
 
 
@@ -100,9 +100,9 @@ def local_folder(folder: Path | str) -> Path:
 
 
 def open_storage(folder: Path | str) -> Storage:
-    """Returns the storage of a data set, the same object for the same URL.
+    """Returns the storage of a data set; the same object for the same URL.
 
-    Raises: ConfigError for a URL with an unknown protocol, or one whose package is not installed.
+    Raises: ConfigError for a URL with an unknown protocol, or whose package is not installed.
     """
     if is_remote(folder):
         return _remote(str(folder).rstrip("/"))
@@ -110,12 +110,12 @@ def open_storage(folder: Path | str) -> Storage:
 
 
 def write_remote(url: str, name: str, source: Path | bytes) -> None:
-    """Writes a file, or bytes, to a data set's URL. Raises: ConfigError where writing fails; UnreachableError."""
+    """Writes a file, or bytes, to a data set's URL. Raises: ConfigError if writing fails; UnreachableError."""
     _remote(url.rstrip("/")).write(name, source)
 
 
 def dataset_token() -> str | None:
-    """Returns the token of $HGN_DATASET_TOKEN. Raises: ConfigError for one that an HTTP header cannot carry."""
+    """Returns the token of $HGN_DATASET_TOKEN. Raises: ConfigError if an HTTP header cannot contain it."""
     token = os.environ.get(TOKEN_VARIABLE)
     if token is None:
         return None
@@ -172,10 +172,10 @@ def _remote(url: str) -> _Remote:
 
 
 class _Remote(Storage):
-    """A URL that fsspec reads."""
+    """A data set at a URL, read by fsspec."""
 
     def __init__(self, url: str) -> None:
-        import fsspec  # slow to import, and local data sets do not need it
+        import fsspec  # importing it is slow, and local data sets do not need it
 
         self._url, hub = url, url.startswith(PREFIX)
         address = HubPlace.parse(url, "dataset.folder").address if hub else url
@@ -203,14 +203,14 @@ class _Remote(Storage):
         try:
             self._files, self._root = fsspec.core.url_to_fs(address, **options)
         except (ValueError, ImportError) as error:
-            cause = error.__cause__  # fsspec's ImportError is caused by the missing package's
+            cause = error.__cause__  # the missing package's error caused fsspec's ImportError
             reason = (isinstance(cause, ModuleNotFoundError) and missing_extra(cause)) or error
             raise ConfigError(
                 f"dataset.folder must be a folder or a URL that fsspec can read, got {url!r} ({reason})"
             ) from None
-        self._manifest: tuple[bytes, str] | None = None  # the last one, and its ETag at a dataset service
+        self._manifest: tuple[bytes, str] | None = None  # the last manifest, and its ETag at a dataset service
         self._lock = threading.Lock()
-        self._away = (0.0, "")  # when callers without patience may ask again, and the cause
+        self._away = (0.0, "")  # earliest time for callers without patience to ask again, and the cause
 
     def manifest(self, name: str, patience_s: float | None = None) -> bytes:
         with self._lock:
@@ -219,7 +219,7 @@ class _Remote(Storage):
             if self._http and self._manifest is not None:
                 options["headers"] = {"If-None-Match": self._manifest[1]}
             content = self._patiently(name, patience_s, lambda path: self._files.cat_file(path, **options))
-            if not content and self._manifest is not None:  # not modified
+            if not content and self._manifest is not None:  # the server answered that it is not modified
                 return self._manifest[0]
             self._manifest = content, f'"{hashlib.sha256(content).hexdigest()}"'
             return content
@@ -232,7 +232,7 @@ class _Remote(Storage):
             return data
 
         data = self._patiently(name, None, whole)
-        if len(data) > stop - start:  # from a server without ranges
+        if len(data) > stop - start:  # the server does not support ranges
             data = data[start:stop]
         return _whole(data, f"{self._url}/{name}", start, stop)
 
@@ -242,7 +242,7 @@ class _Remote(Storage):
         def fill(file: BufferedRandom) -> None:
             self._require_not_away(name, patience_s)
             try:
-                # a second time from the start, in case the disk did not keep what another process had fetched
+                # the second time from the start, because the disk may have lost bytes that another process fetched
                 if self._fill(file, name, size, patience_s) == sha256:
                     return
                 file.truncate(0)
@@ -278,7 +278,7 @@ class _Remote(Storage):
             raise ConfigError(f"{self._url}/{name} must have {expected} bytes, got {written}; copy it again")
 
     def _fill(self, file: BufferedRandom, name: str, size: int, patience_s: float | None) -> str:
-        """Appends the missing bytes and returns the sha256 of the whole file."""
+        """Appends the missing bytes. Returns the sha256 of the whole file."""
         if os.fstat(file.fileno()).st_size > size:
             file.truncate(0)
         file.seek(0)
@@ -288,7 +288,7 @@ class _Remote(Storage):
             stop = min(have + _CHUNK_BYTES, size)
             read = functools.partial(self._files.cat_file, start=have, end=stop)
             data = self._patiently(name, patience_s, read)
-            if len(data) == size > stop - have:  # from a server without ranges
+            if len(data) == size > stop - have:  # the server does not support ranges
                 data = data[have:]
             elif len(data) != stop - have:
                 raise _cut(f"{self._url}/{name}", size, have + len(data))
@@ -303,13 +303,13 @@ class _Remote(Storage):
             raise UnreachableError(f"{self._url}/{name}", 0.0, self._away[1])
 
     def _patiently(self, name: str, patience_s: float | None, read: Callable[[str], T]) -> T:
-        """Reads, and retries while the server is away. Raises: as `Storage.manifest`."""
+        """Reads, and retries while the server does not answer. Raises: as `Storage.manifest`."""
         url, path = f"{self._url}/{name}", f"{self._root}/{name}"
         patience_s = standard_patience_s() if patience_s is None else patience_s
         try:
             result = patiently(lambda: read(path), lambda error: _transient(error, url), url, self._url, patience_s)
         except UnreachableError as error:
-            # each request to a machine that is off would take _CONNECT_S
+            # otherwise each request to a switched-off machine would take _CONNECT_S
             self._away = time.monotonic() + _AWAY_S, error.cause
             raise
         self._away = 0.0, ""
@@ -331,7 +331,7 @@ def _missing(path: Path | str) -> StorageError:
 
 
 def _transient(error: Exception, url: str) -> str | None:
-    """Returns the cause of an error that may pass, or None for any other. Raises: ConfigError (access refused)."""
+    """Returns the cause of a temporary error, or None for another error. Raises: ConfigError (access refused)."""
     if isinstance(error, FileNotFoundError):
         return None
     status = getattr(error, "status", None)

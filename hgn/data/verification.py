@@ -1,4 +1,4 @@
-"""Verification of files by size and sha256, once a process."""
+"""Verification of files by size and sha256, once in a process."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ def file_sha256(path: Path) -> str:
 
 
 def verify_file(path: Path, sha256: str, size: int, remedy: str) -> None:
-    """Checks size and sha256 of a file, once a process as long as it does not change.
+    """Checks size and sha256 of a file. In a process it does so once, unless the file changes.
 
-    Raises: ConfigError naming the file, what was expected and found, and the remedy; FileNotFoundError.
+    Raises: ConfigError naming file, expected and actual value, and remedy; FileNotFoundError.
     """
     status = path.stat()
     if status.st_size != size:
@@ -34,12 +34,12 @@ def verify_file(path: Path, sha256: str, size: int, remedy: str) -> None:
 
 
 def note_verified(path: Path, sha256: str) -> None:
-    """Records a file as verified whose bytes were hashed while they were written."""
+    """Records a file as verified. Its bytes were hashed while they were written."""
     _verified.add(_identity(path, sha256))
 
 
 def _identity(path: Path, sha256: str) -> tuple[str | int, ...]:
-    """Returns an identity that changes with the file: a modification time can be set back, a change time cannot."""
+    """Returns an identity that changes with the file. A modification time can be set back; a change time cannot."""
     status = path.stat()
     times = status.st_mtime_ns, status.st_ctime_ns
     return str(path.resolve()), status.st_dev, status.st_ino, status.st_size, *times, sha256

@@ -48,7 +48,7 @@ def require_parity(
 ) -> float:
     """Returns the relative error of kernels of this precision against PyTorch.
 
-    Raises: ParityError if the error exceeds its bound. It names the setting to change, in `section` ("training." or "").
+    Raises: ParityError if the error exceeds its bound. It names the setting to change, in `section`.
     """
     error = relative_error(computed, expected, quantity.least)
     if not error <= quantity.bound:  # NaN fails too

@@ -11,10 +11,10 @@ from scipy.spatial import KDTree
 from hgn.scene.obstacle_grid import ObstacleGrid, grid_of_samples
 from hgn.schema import require
 
-NEAR = 1.9  # spacings: the neighbourhood that normals are computed from, two layers and not three
-THIN = 0.1  # ratio of the spreads across and along a surface, below which it is one layer
-CROWD = 1000  # mean number of neighbours; a body has about 30
-ONE_SIDED = 0.25  # spacings: a mean neighbour offset above it points into a body
+NEAR = 1.9  # neighbourhood for normals, in spacings; it contains two layers and not three
+THIN = 0.1  # ratio of the spreads across and along a surface below which the surface is one layer
+CROWD = 1000  # largest mean number of neighbours; a body has about 30
+ONE_SIDED = 0.25  # mean neighbour offset, in spacings, above which it points into a body
 
 
 def spacing(point_PD: np.ndarray) -> float:
@@ -27,8 +27,8 @@ def spacing(point_PD: np.ndarray) -> float:
 def boundary_grid(point_P3: np.ndarray, dimensions: int, cell_size: float) -> ObstacleGrid:
     """Returns the cells that contain particles of the boundary, with the normals of its surface.
 
-    At the surface of a body a normal points away from the other particles. In a thin layer it is the direction of least
-    spread. As for meshes, its sign is chosen towards the centre of the cell.
+    At the surface of a body a normal points away from the other particles. In a thin layer it has the direction of
+    least spread. As for meshes, its sign is chosen towards the centre of the cell.
     """
     point_PD = point_P3[:, :dimensions].astype(np.float64)
     normal_P3 = np.zeros((len(point_PD), 3))

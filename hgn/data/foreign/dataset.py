@@ -1,4 +1,4 @@
-"""Writes an imported set as a data set: shards, index and, last, the manifest."""
+"""Writes an imported set as a data set: first shards, then the index, and last the manifest."""
 
 from __future__ import annotations
 
@@ -27,18 +27,18 @@ from hgn.scene.episode import SCHEMA_VERSION, Episode
 from hgn.schema import ConfigError, require
 from hgn.system.files import make_folder, sync_file, sync_folder, temporary_file
 
-SHARD_BYTES = 128 << 20
-LOOKED_AT = 4  # trajectories from which gravity and the spacing of boundaries are estimated
+SHARD_BYTES = 128 << 20  # size of a shard after which another one begins
+LOOKED_AT = 4  # number of trajectories for estimates of gravity and of the spacing of boundaries
 
 
 def import_set(
     source: Path, config: ImportConfig, progress: Callable[[Episode], Any] = lambda _: None
 ) -> tuple[Manifest, str | None]:
-    """Reads the trajectories of a folder and writes them as a data set; calls `progress` for each episode.
+    """Reads the trajectories of a folder and writes them as a data set. Calls `progress` for each episode.
 
-    Returns: the manifest, and a warning about trajectories that leave their bounds, or None.
-    Raises: ConfigError naming file and field that cannot be read; OSError. The manifest is written last, so that an
-    interrupted import starts again.
+    Returns the manifest, and a warning about trajectories that leave their bounds, or None.
+    Raises: ConfigError naming an unreadable file and field; OSError. The manifest is written last, so an interrupted
+    import starts again.
     """
     out = Path(config.out)
     require(not (out / MANIFEST_NAME).exists(), "out", "a new folder", config.out, "this holds a data set")
@@ -86,11 +86,11 @@ def _gravity(first: list[Trajectory], info: SetInfo) -> tuple[float, ...]:
     without = [trajectory for trajectory in first if trajectory.gravity is None]
     if without:
         return _estimated(without, info)
-    for trajectory in first if info.format == "neuralmpm" else ():  # whose units are not documented
+    for trajectory in first if info.format == "neuralmpm" else ():  # neuralmpm does not document its units
         stored_3 = np.array(trajectory.gravity)
         try:
             estimated_3 = np.array(_estimated([trajectory], info))
-        except ConfigError:  # too few particles in free flight
+        except ConfigError:  # too few particles are in free flight
             continue
         if np.linalg.norm(estimated_3 - stored_3) > 0.1 * np.linalg.norm(stored_3):
             raise ConfigError(
@@ -122,7 +122,7 @@ def _boundary(trajectory: Trajectory, info: SetInfo) -> np.ndarray:
 def _shards(
     folder: Path, split: str, episodes: Iterator[Episode], progress: Callable[[Episode], Any]
 ) -> Iterator[ShardEntry]:
-    """Writes and yields shards; each file appears whole or not at all."""
+    """Writes and yields shards. Each file is written atomically."""
     following = next(episodes, None)
     first = 0
     while following is not None:

@@ -1,8 +1,8 @@
 """Converts trajectories to episodes.
 
-Lengths keep the set's unit, and the box starts at the origin. Network cells have the width of the set's radius,
-obstacle cells are in proportion (`obstacle_cell_size`). A 2D set lies on a plane of constant z through cell centres, so
-that each level of the hierarchy has one layer of cells; its walls in z are out of reach.
+Lengths keep the set's unit, and the box starts at the origin. Network cells have the width of the set's radius, and
+obstacle cells are in proportion (`obstacle_cell_size`). A 2D set lies in a plane of constant z through cell centres. So
+each level of the hierarchy has one layer of cells, and the walls in z are out of reach.
 Shape legend: T frames, N particles, P particles of the boundary, K obstacle cells, H frames before frame 0.
 """
 
@@ -21,8 +21,8 @@ from hgn.scene.obstacle_grid import ObstacleGrid
 from hgn.schema import ConfigError, Vector, require
 
 CELL_OF_RADIUS = 1 / 64 / NetworkConfig.cell_size  # ratio of the paper's obstacle cells to its networks' cells
-AT_REST = 1e-3  # of the radius: particles of a boundary may move by no more
-OUTSIDE = 0.01  # of the particles: no more may start farther than a radius outside the box
+AT_REST = 1e-3  # largest motion of a boundary's particles, in radii
+OUTSIDE = 0.01  # largest fraction of particles that may start more than a radius outside the box
 
 
 @dataclass(frozen=True)
@@ -30,9 +30,9 @@ class Outside:
     """The particle of a trajectory that goes farthest out of the bounds."""
 
     trajectory: str
-    excess: float  # beyond the bound, the set's unit of length
+    excess: float  # distance from the bound, in the set's unit of length
     axis: int
-    frame: int  # of the file
+    frame: int  # number of the frame in the file
     coordinate: float
 
 
@@ -44,11 +44,11 @@ class Converter:
     gravity: tuple[float, ...]  # length per second squared, for trajectories without their own
     history: int
     obstacle_cell_size: float
-    present: set[str] = field(default_factory=set)  # materials
+    present: set[str] = field(default_factory=set)  # names of the materials that occur
     gravities: set[Vector] = field(default_factory=set)
     maximum_initial_speed: float = 0.0  # length per second
     with_obstacles: bool = False
-    # one for each trajectory that leaves the bounds by more than a radius
+    # one entry for each trajectory that leaves the bounds by more than a radius
     outside: list[Outside] = field(default_factory=list)
 
     def __post_init__(self) -> None:
@@ -65,8 +65,10 @@ class Converter:
         self.domain_size = x, y, z
 
     def episode(self, trajectory: Trajectory, key: str, index: int) -> Episode:
-        """Raises: ConfigError naming the trajectory, for unknown types, moving boundaries, too few frames, and
-        particles outside of the box or at a periodic side of it.
+        """Converts a trajectory to an episode.
+
+        Raises: ConfigError naming the trajectory, for unknown types, moving boundaries, too few frames, and particles
+        outside the box or at a periodic side of it.
         """
         info, name = self.info, trajectory.name
         frames, first = len(trajectory.position_TND), self.history
@@ -93,7 +95,7 @@ class Converter:
         grid = self._grid(trajectory, boundary_P3)
         gravity = trajectory.gravity or self.gravity
         x, y, z = (*gravity, 0.0)[:3]
-        # the velocity that takes frame -1 to frame 0 in free flight
+        # the velocity with which free flight leads from frame -1 to frame 0
         velocity_N3 = (free_TN3[first].astype(np.float64) - free_TN3[first - 1]) / info.frame_dt_s
         velocity_N3 += 0.5 * info.frame_dt_s * np.array((x, y, z))
         material_N = self._materials(name, trajectory.type_N[~fixed_N])
@@ -121,7 +123,7 @@ class Converter:
                 "format": info.format,
                 "trajectory": name,
                 "dimensions": info.dimensions,
-                "offset": list(self.offset),  # that was subtracted from positions
+                "offset": list(self.offset),  # subtracted from positions
             },
             solver={},
             material_parameters=properties,
@@ -152,7 +154,7 @@ class Converter:
             )
 
     def _note_outside(self, name: str, position_TND: np.ndarray) -> None:
-        """Records a trajectory that leaves its bounds: one splash over an edge is no reason to refuse a set."""
+        """Records a trajectory that leaves its bounds. One splash over an edge is no reason to refuse a set."""
         low_D, high_D = np.array(self.info.bounds).T
         excess_2D = np.stack([low_D - position_TND.min((0, 1)), position_TND.max((0, 1)) - high_D])
         above, axis = (int(index) for index in np.unravel_index(excess_2D.argmax(), excess_2D.shape))
@@ -176,7 +178,7 @@ class Converter:
         )
 
     def _require_not_across(self, name: str, free_TN3: np.ndarray) -> None:
-        """Refuses particles near a periodic side; others do not see it (LagrangeBench's dam break has walls there)."""
+        """Refuses particles near a periodic side. Others do not see it (LagrangeBench's dam break has walls there)."""
         for axis, periodic in enumerate(self.info.periodic):
             path_TN, high = free_TN3[..., axis], self.domain_size[axis]
             if periodic and path_TN.size and min(path_TN.min(), high - path_TN.max()) < self.info.radius:
@@ -209,9 +211,9 @@ class Converter:
 
 
 def obstacle_cell_size(info: SetInfo, boundaries: list[np.ndarray]) -> float:
-    """Returns the width of obstacle cells: in proportion to the radius, and at least a boundary's spacing.
+    """Returns the width of obstacle cells. It is in proportion to the radius, and at least a boundary's spacing.
 
-    It divides the box on x into a whole number of cells, so that mirrors map cells to cells.
+    It divides the box along x into a whole number of cells, so that mirrors map cells to cells.
     """
     if info.obstacle_cell_size is not None:
         return float(info.obstacle_cell_size)
@@ -222,10 +224,10 @@ def obstacle_cell_size(info: SetInfo, boundaries: list[np.ndarray]) -> float:
 
 
 def flat_plane(radius: float, obstacle_cell: float) -> float:
-    """Returns a z in the middle between two cell faces of both sizes, whose cell is computed exactly.
+    """Returns a z in the middle between cell faces of both sizes, for which float32 computes the cell exactly.
 
-    (z / radius - 1/2) is a whole number in float32 for a division and for a product with the reciprocal, with or
-    without rounding before the subtraction. z is at least 16 radii, beyond the reach of walls.
+    (z / radius - 1/2) is a whole number in float32 for a division and for a product with the reciprocal, with and
+    without rounding before the subtraction. z is at least 16 radii, so walls are out of reach.
     """
     cell = np.float32(radius)
     inverse = np.float32(1) / cell

@@ -1,4 +1,4 @@
-"""The formats of particle trajectories: their files, their content and their units.
+"""The formats of particle trajectories: their files, content and units.
 
 | format | files | made by |
 |---|---|---|
@@ -29,13 +29,13 @@ from hgn.schema import ConfigError, require
 from hgn.system.yaml_files import read_json
 
 SPLIT_NAMES = {"train": ("train",), "validation": ("valid", "validation"), "test": ("test",)}
-# particle types of DeepMind's sets, which geoelements and NeuralMPM share, and of LagrangeBench's
+# particle types of DeepMind's sets, which geoelements and NeuralMPM use too, and of LagrangeBench's
 _DEEPMIND = {0: "rigid", FLUID: "fluid", 5: "water", 6: "sand", 7: "goop"}
 _LAGRANGEBENCH = {0: "fluid", 3: "rigid", 5: "water", 6: "sand", 7: "goop"}  # 5 to 7: its copies of DeepMind's sets
 
 
 def find_format(folder: Path, required: str) -> str:
-    """Returns the format of a folder's files. Raises: ConfigError where there are none, or of another format."""
+    """Returns the format of a folder's files. Raises: ConfigError without such files, or for another format."""
     require(folder.is_dir(), "from", "a folder with trajectories", str(folder))
     formats = []
     if _file(folder, "train", ".tfrecord"):
@@ -54,16 +54,16 @@ def find_format(folder: Path, required: str) -> str:
     if required == "auto":
         require(len(formats) == 1, "format", f"one of {', '.join(formats)}, which {folder} has", required)
         return formats[0]
-    alike = {"lagrangebench", "plain"}  # the same files
+    alike = {"lagrangebench", "plain"}  # formats with the same files
     fits = required in formats or (required in alike and bool(alike & set(formats)))
     require(fits, "format", " or ".join(formats), required)
     return required
 
 
 def set_info(folder: Path, name: str, config: ImportConfig) -> SetInfo:
-    """Reads the metadata of a set; settings of the command line replace them.
+    """Reads the metadata of a set. Settings of the command line replace its values.
 
-    Raises: ConfigError naming what is missing or wrong, and for forces that change with time.
+    Raises: ConfigError naming the missing or wrong value, and for forces that change with time.
     """
     raw = _metadata(folder)
     if isinstance(raw.get("train"), Mapping):  # geoelements' metadata may differ between training and rollout
@@ -76,7 +76,7 @@ def set_info(folder: Path, name: str, config: ImportConfig) -> SetInfo:
     types, boundary = (_LAGRANGEBENCH, [1, 2]) if name == "lagrangebench" else (_DEEPMIND, [3])
 
     def given(key: str, option: Any, shape: tuple[int | None, ...], standard: Any = None) -> Any:
-        """Returns numbers of the command line, or else of the metadata, as lists of floats."""
+        """Returns numbers from the command line, or else from the metadata, as lists of floats."""
         value = option if option is not None else raw.get(key)
         return standard if value is None else _numbers(f"{folder}/metadata.json: {key}", value, shape)
 
@@ -121,7 +121,7 @@ def set_info(folder: Path, name: str, config: ImportConfig) -> SetInfo:
 
 
 def _numbers(name: str, value: Any, shape: tuple[int | None, ...]) -> Any:
-    """Returns a float, or nested lists of floats, of this shape, where None stands for any length."""
+    """Returns a float, or nested lists of floats, of this shape. None in the shape means any length."""
     try:
         array = np.asarray(value, np.float64)
     except (TypeError, ValueError, OverflowError):
@@ -139,9 +139,9 @@ def _material(value: object, folder: Path) -> str:
 
 
 def read_split(folder: Path, split: str, info: SetInfo) -> Iterator[Trajectory]:
-    """Yields the trajectories of a split in the order of their names; none where there is no file.
+    """Yields the trajectories of a split in the order of their names; none if there is no file.
 
-    Raises: ConfigError naming the file, the trajectory and the field that is missing, cut, altered or of a wrong type.
+    Raises: ConfigError naming file, trajectory and field that is missing, cut, altered or of a wrong type.
     """
     return _READERS[info.format](folder, split, info)
 
@@ -272,7 +272,7 @@ def _require_cells(name: str, cell_K3: np.ndarray, normal_K3: np.ndarray) -> Non
 
 
 def _properties(name: str, given: Any, count: int) -> np.ndarray | None:
-    """Returns numbers of each particle, float32 [N, K], from one for all, one for each or several for each."""
+    """Returns numbers of each particle, float32 [N, K], from one number for all, or one or several for each."""
     if given is None:
         return None
     array = as_array(f"{name}: material_property", given)
@@ -298,7 +298,7 @@ def _read_neuralmpm(folder: Path, split: str, info: SetInfo) -> Iterator[Traject
         moved = np.abs(boundary - boundary[:1]).max(initial=0)
         require(moved <= 1e-3 * info.radius, f"{path}: boundary", "at rest", f"a motion by {moved:.3g}")
         gravity = None
-        if own is not None and info.gravity is None:  # from sets with a gravity for each simulation
+        if own is not None and info.gravity is None:  # these sets have a gravity for each simulation
             gravity = tuple(floats(f"{path}: grav", own, (axes,)).tolist())
         yield Trajectory(
             str(path), position_TND, type_N, boundary[0] if boundary.size else None, gravity=gravity
@@ -306,7 +306,7 @@ def _read_neuralmpm(folder: Path, split: str, info: SetInfo) -> Iterator[Traject
 
 
 def _wide(path: Path, file: h5py.File, key: str, axes: int) -> np.ndarray:
-    """Returns the first columns of an array [frames, particles, columns]; a boundary may have no particles."""
+    """Returns the first columns of an array [frames, particles, columns]. A boundary may have no particles."""
     array = _dataset(str(path), file, key)
     rule = f"[frames, particles, {axes} or more columns]"
     require(array.ndim == 3 and array.shape[2] >= axes, f"{path}: {key}", rule, list(array.shape))
@@ -321,7 +321,7 @@ _READERS: dict[str, Callable[[Path, str, SetInfo], Iterator[Trajectory]]] = {
     "plain": _read_hdf5,
 }
 _AGAIN = "fetch it again"
-_MOST_CELLS = 1 << 16  # along an axis
+_MOST_CELLS = 1 << 16  # largest number of cells along an axis
 _EXAMPLES = {"bounds": "[[0.1,0.9],[0.1,0.9]]", "dt": "0.0025", "radius": "0.015"}
 
 

@@ -1,4 +1,4 @@
-"""Estimates gravity from particles in free flight, for sets that do not contain it.
+"""Estimates gravity from particles in free flight, for data sets that do not contain it.
 
 Shape legend: T frames, N particles, D dimensions, S stretches, W frames of a stretch.
 """
@@ -11,11 +11,11 @@ import numpy as np
 
 from hgn.schema import ConfigError
 
-STRETCH = 6  # consecutive accelerations that must agree
-CONSTANT = 0.02  # of their mean: the largest deviation in a stretch
-ALIKE = 0.05  # of the median: the largest deviation of stretches that agree
-FEWEST = 20  # stretches
-LARGEST = 4_000_000  # numbers of a trajectory that are processed
+STRETCH = 6  # number of consecutive accelerations that must agree
+CONSTANT = 0.02  # largest deviation in a stretch, relative to its mean
+ALIKE = 0.05  # largest deviation of stretches that agree, relative to the median
+FEWEST = 20  # smallest number of stretches
+LARGEST = 4_000_000  # largest number of a trajectory's coordinates that are processed
 
 
 def estimate_gravity(paths: Sequence[np.ndarray], frame_dt_s: float) -> tuple[float, ...]:
@@ -23,7 +23,7 @@ def estimate_gravity(paths: Sequence[np.ndarray], frame_dt_s: float) -> tuple[fl
 
     A stretch is in flight if its accelerations are equal and not zero, which excludes rest, even sliding and
     collisions. The accuracy is that of positions in float32.
-    Raises: ConfigError where too few particles fly, or their accelerations differ.
+    Raises: ConfigError if too few particles fly, or if their accelerations differ.
     """
     acceleration_SD = np.concatenate([_flights(path_TND) for path_TND in paths])
     count = len(acceleration_SD)

@@ -24,7 +24,7 @@ class ImportConfig:
     bounds: tuple[tuple[float, float], ...] | None = None
     dimensions: int | None = None  # 2 or 3; null: as in metadata.json
     dt: Positive[float] | None = None  # seconds between frames; null: as in metadata.json
-    radius: Positive[float] | None = None  # of neighbours, the size of network cells; null: as in metadata.json
+    radius: Positive[float] | None = None  # reach of neighbours and size of cells; null: as in metadata.json
     gravity: tuple[float, ...] | None = None  # length per second squared; null: as in metadata.json, or estimated
 
     def __post_init__(self) -> None:

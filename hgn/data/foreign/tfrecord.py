@@ -1,8 +1,8 @@
 """TFRecord files of tf.SequenceExample messages, read without TensorFlow.
 
-A record is its length (uint64), that number's masked CRC-32C, the bytes, and theirs (tensorflow.org/tutorials/
-load_data/tfrecord). A message is fields of a number, a wire type and a value (protobuf.dev/programming-guides/
-encoding); of tensorflow/core/example/example.proto and feature.proto these are read:
+A record consists of its length (uint64), the length's masked CRC-32C, the bytes, and their masked CRC-32C
+(tensorflow.org/tutorials/load_data/tfrecord). A message consists of fields with a number, a wire type and a value
+(protobuf.dev/programming-guides/encoding). These parts of tensorflow/core/example/*.proto are read:
 
     SequenceExample {Features context = 1; FeatureLists feature_lists = 2}
     Features {map<string, Feature> feature = 1}    FeatureLists {map<string, FeatureList> feature_list = 1}
@@ -22,7 +22,7 @@ _VARINT, _FIXED64, _BYTES, _FIXED32 = 0, 1, 2, 5
 
 
 def read_records(path: Path) -> Iterator[bytes]:
-    """Yields the records of a file. Raises: ConfigError naming the record that is cut or altered."""
+    """Yields the records of a file. Raises: ConfigError naming an incomplete or altered record."""
     with path.open("rb") as file:
         number, size = 0, path.stat().st_size
         while head := file.read(12):
@@ -44,8 +44,8 @@ def _checked(file: BinaryIO, length: int, name: str) -> bytes:
 
 
 def masked_crc(data: bytes) -> int:
-    """Returns the CRC-32C, rotated and offset as TFRecord defines it."""
-    import google_crc32c  # an extra that only TFRecords need
+    """Returns the CRC-32C, rotated and shifted as TFRecord defines it."""
+    import google_crc32c  # an extra package that only TFRecords need
 
     crc = google_crc32c.value(data)
     return ((crc >> 15 | crc << 17) + 0xA282EAD8) & 0xFFFFFFFF
@@ -58,9 +58,9 @@ def _require_crc(name: str, data: bytes, stored: bytes) -> None:
 
 
 def parse_sequence_example(data: bytes, name: str) -> tuple[dict[str, list[bytes]], dict[str, list[bytes]]]:
-    """Returns the bytes values of a message by key: of its context, and of its feature lists, joined.
+    """Returns the byte values of a message by key: those of its context, and those of its feature lists, joined.
 
-    Features that hold numbers instead have no values here. Raises: ConfigError where it is no such message.
+    Features with numbers have no values here. Raises: ConfigError if it is not such a message.
     """
     try:
         context: dict[str, list[bytes]] = {}
@@ -88,7 +88,7 @@ def _bytes_values(feature: bytes) -> list[bytes]:
 
 
 def _fields(data: bytes) -> Iterator[tuple[int, bytes]]:
-    """Numbers and contents of a message's fields of bytes; numbers are passed over."""
+    """Yields numbers and contents of a message's byte fields. Fields with numbers are skipped."""
     place = 0
     while place < len(data):
         tag, place = _varint(data, place)

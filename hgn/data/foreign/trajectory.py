@@ -1,4 +1,4 @@
-"""The common form of all formats, checked in one place.
+"""The common form of trajectories of all formats, with its checks.
 
 Shape legend: T frames, N particles of all kinds, P particles of the boundary, D dimensions, 2 or 3.
 """
@@ -14,8 +14,8 @@ import numpy as np
 from hgn.schema import ConfigError, require
 from hgn.system.claims import require_few_items
 
-COARSEST = 1e-3  # spacing of stored numbers, in radii: gravity moves a particle by a few of these in a frame
-MOST_RADII = 1 << 14  # across the box, because cells are indexed by integers
+COARSEST = 1e-3  # largest spacing of stored numbers, in radii; gravity moves a particle by a few of these in a frame
+MOST_RADII = 1 << 14  # largest size of the box in radii, because cells are indexed by integers
 FLUID = 1  # the type of particles in files without types
 
 
@@ -23,14 +23,14 @@ FLUID = 1  # the type of particles in files without types
 class Trajectory:
     """One simulation in the file's own units."""
 
-    name: str  # file and position in it, for messages
+    name: str  # file, and position in it, for messages
     position_TND: np.ndarray  # float32 or float64
     type_N: np.ndarray  # int64, the set's own numbers
-    boundary_PD: np.ndarray | None = None  # at rest; None: they are among the particles
+    boundary_PD: np.ndarray | None = None  # particles at rest; None: they are among the other particles
     property_NK: np.ndarray | None = None  # float32, geoelements' material_property
-    obstacle_cell_K3: np.ndarray | None = None  # of the plain format: obstacle cells and normals
+    obstacle_cell_K3: np.ndarray | None = None  # obstacle cells of the plain format; their normals follow
     obstacle_normal_K3: np.ndarray | None = None
-    gravity: tuple[float, ...] | None = None  # of this trajectory, length per second squared
+    gravity: tuple[float, ...] | None = None  # gravity of this trajectory, length per second squared
 
 
 @dataclass(frozen=True)
@@ -40,15 +40,15 @@ class SetInfo:
     format: str
     dimensions: int
     frame_dt_s: float
-    bounds: tuple[tuple[float, float], ...]  # of the box on each axis, in the set's unit of length
-    radius: float  # of neighbours, in the set's unit of length
+    bounds: tuple[tuple[float, float], ...]  # limits of the box on each axis, in the set's unit of length
+    radius: float  # largest distance of neighbours, in the set's unit of length
     materials: Mapping[int, str]  # names by type
     boundary_types: frozenset[int]
     ignored_types: frozenset[int] = frozenset()  # padding
     gravity: tuple[float, ...] | None = None  # length per second squared; None: estimated
-    gravity_size: float | None = None  # where only the magnitude is known
+    gravity_size: float | None = None  # size of gravity, if only that is known
     obstacle_cell_size: float | None = None
-    periodic: tuple[bool, ...] = ()  # of each axis
+    periodic: tuple[bool, ...] = ()  # whether each axis is periodic
     raw: Mapping[str, Any] = field(default_factory=dict)  # the unprocessed metadata
 
     def __post_init__(self) -> None:
@@ -74,15 +74,15 @@ class SetInfo:
 
 
 def checked(name: str, position: Any, types: Any, dimensions: int) -> tuple[np.ndarray, np.ndarray]:
-    """Returns positions [T, N, D] and types int64 [N] of a file; `types` may be one number for all particles.
+    """Returns positions [T, N, D] and types int64 [N] of a file. `types` may be one number for all particles.
 
-    Raises: ConfigError naming the file and the field, for another type or shape, and for what is not finite.
+    Raises: ConfigError naming file and field, for another type or shape, and for values that are not finite.
     """
     position_TND = floats(f"{name}: position", position, (None, None, dimensions))
     type_N = as_array(f"{name}: particle_type", types)
     if type_N.dtype.kind not in "iu":
         whole = type_N.dtype.kind == "f" and bool((np.isfinite(type_N) & (type_N == np.round(type_N))).all())
-        if not whole:  # geoelements' writers store some as float64
+        if not whole:  # some of geoelements' writers store float64
             raise ConfigError(f"{name}: particle_type must be whole numbers, got {type_N.dtype}")
     count = position_TND.shape[1]
     if type_N.ndim == 0 or (type_N.shape == (1,) and count != 1):
@@ -102,7 +102,7 @@ def as_array(name: str, value: Any) -> np.ndarray:
 
 
 def floats(name: str, array: Any, shape: tuple[int | None, ...]) -> np.ndarray:
-    """Returns a finite array of float32 or float64 of this shape, where None stands for any length above 0.
+    """Returns a finite array of float32 or float64 of this shape. None in the shape means any length above 0.
 
     Raises: ConfigError naming the file and the field.
     """
@@ -122,7 +122,7 @@ def floats(name: str, array: Any, shape: tuple[int | None, ...]) -> np.ndarray:
 
 
 def require_fine(name: str, position_TND: np.ndarray, radius: float) -> None:
-    """Refuses positions that their type stores too coarsely, perhaps before they were stored as float64."""
+    """Refuses positions that are stored too coarsely, possibly in float32 before they were stored as float64."""
     single = position_TND.astype(np.float32)
     stored = single if np.array_equal(single, position_TND) else position_TND
     largest = np.abs(stored).max(initial=0)
