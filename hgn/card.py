@@ -10,11 +10,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+from urllib.parse import quote
 
 import yaml
 
 from hgn.command import run_command
-from hgn.data.manifest import SPLITS, Manifest
+from hgn.data.manifest import SPLITS, Manifest, errors_in_config
 from hgn.data.storage import is_remote
 from hgn.scene.kinds import RANGES
 from hgn.schema import from_mapping, require
@@ -63,7 +64,9 @@ def main(mapping: dict[str, Any]) -> int:
         assert config.data is not None
         require(not is_remote(config.data), "data", "a folder of this machine", config.data)
         folder = Path(config.data)
-        text = data_card(Manifest.load(folder), config.name or folder.name, config.license)
+        manifest = Manifest.load(folder)
+        with errors_in_config(folder):
+            text = data_card(manifest, config.name or folder.name, config.license)
     target = folder / CARD
     require(not target.exists(), "out" if config.weights else "data", f"a folder without {CARD}", str(folder))
     folder.mkdir(parents=True, exist_ok=True)
@@ -87,7 +90,7 @@ def weights_card(info: WeightsInfo, name: str, file: str, licence: str) -> str:
         "gravity": "any" if network.relative else _vector(info.gravity),
         "updates": str(info.updates),
     }
-    use = f"python -m hgn.rollout weights=hf://USER/NAME/{file}"
+    use = f"python -m hgn.rollout weights=hf://USER/NAME/{quote(file)}"
     return _page(metadata, name, "Weights of a particle simulator, for HGN.", rows, use)
 
 
@@ -139,14 +142,19 @@ def _kind_rows(kinds: Mapping[str, float]) -> dict[str, str]:
     }
 
 
+def _plain(text: str) -> str:
+    """Returns a text as Markdown shows it, whatever it contains."""
+    return re.sub(r"[^\w .,;:%/'()+-]", lambda match: f"&#{ord(match[0])};", text)
+
+
 def _vector(value: Sequence[float]) -> str:
     return ", ".join(f"{component:.6g}" for component in value)
 
 
 def _page(metadata: dict[str, Any], name: str, what: str, rows: dict[str, str], use: str) -> str:
     head = yaml.safe_dump(metadata, sort_keys=False)
-    table = "".join(f"| {key} | {value} |\n" for key, value in rows.items())
-    return f"---\n{head}---\n\n# {name}\n\n{what}\n\n| | |\n|---|---|\n{table}\n```sh\n{use}\n```\n"
+    table = "".join(f"| {_plain(key)} | {_plain(value)} |\n" for key, value in rows.items())
+    return f"---\n{head}---\n\n# {_plain(name)}\n\n{what}\n\n| | |\n|---|---|\n{table}\n```sh\n{use}\n```\n"
 
 
 if __name__ == "__main__":

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any, NoReturn, cast
 
 from hgn.config import config_directory
-from hgn.schema import ConfigError, require, without_passwords
+from hgn.schema import ConfigError, printable, require
 from hgn.system.extras import missing_extra
 
 EXIT_MACHINE, EXIT_INPUT, EXIT_INTERRUPTED, EXIT_UNREAD = 1, 2, 130, 141
@@ -166,5 +166,5 @@ def _with_json_as_override(arguments: list[str]) -> list[str]:
 
 
 def _fail(message: str, code: int) -> int:
-    print(f"error: {' '.join(without_passwords(message).split())}", file=sys.stderr, flush=True)
+    print(f"error: {printable(' '.join(message.split()))}", file=sys.stderr, flush=True)
     return code

@@ -22,6 +22,7 @@ from typing import Annotated, Any, TypeVar
 from hgn.renamed import KEYS, current_names, removed_remedy, renamed_remedy, value_remedy
 
 T = TypeVar("T")
+_CONTROL = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069]")  # of terminals and text direction
 # the owner's path, and the value's own name or index; joined for messages
 _Path = str | tuple[Any, str | int]
 
@@ -67,12 +68,16 @@ _shown.maxlist = _shown.maxtuple = _shown.maxdict = _shown.maxset = 12
 
 
 class ConfigError(ValueError):
-    """An invalid value: the message names field, rule, value and remedy."""
+    """An invalid value: the message names field, rule, value and remedy, as `printable`."""
+
+    def __init__(self, message: str) -> None:
+        super().__init__(printable(message))
 
 
-def without_passwords(text: str) -> str:
-    """Returns a text without users and passwords in its URLs."""
-    return re.sub(r"(\w://)[^/\s@]*@", r"\1", text)
+def printable(text: str) -> str:
+    """Returns a text for terminals and pages: without users and passwords in its URLs, control characters escaped."""
+    text = re.sub(r"(\w://)[^/\s?#]*@", r"\1", text)
+    return "".join(c if c.isprintable() or c == "\n" else repr(c)[1:-1] for c in text)
 
 
 def from_mapping(cls: type[T], mapping: object, path: _Path = "") -> T:
@@ -230,6 +235,8 @@ def _text(path: _Path) -> str:
 
 def _convert(hint: Any, value: Any, path: _Path) -> Any:
     if hint is type(value) and hint in (float, str, bool):
+        if hint is str and _CONTROL.search(value):
+            raise ConfigError(f"{_text(path)} must be text without control characters, got {_shown.repr(value)}")
         return value
     if type(value) is int and not -(2**63) <= value < 2**63:
         raise ConfigError(f"{_text(path)} must be a number of at most 63 bits, got one of {value.bit_length()}")

@@ -5,20 +5,27 @@ It is imported only for data sets at HTTP URLs.
 
 from __future__ import annotations
 
+import asyncio
 import re
 import time
 
 import aiohttp
+from aiohttp.connector import Connection
 
 from hgn.schema import ConfigError
 
 LARGEST_BYTES = 2**29  # limit for whole files: manifests of the first release, and shards of servers without ranges
 LEAST_BYTES_S, SLOW_S = 4096, 20.0  # smallest speed of an answer, and the time after which it is checked
+HEAD_S = 150.0  # limit for the head of an answer: a service may hash a shard first
 _RANGE = re.compile(r"bytes=(\d+)-(\d+)")
 
 
 class BoundedResponse(aiohttp.ClientResponse):
     """An answer whose body is read in pieces up to its limit, at LEAST_BYTES_S or faster."""
+
+    async def start(self, connection: Connection) -> aiohttp.ClientResponse:
+        """Reads the head. Raises: TimeoutError for one that drips."""
+        return await asyncio.wait_for(super().start(connection), HEAD_S)
 
     async def read(self) -> bytes:
         """Returns the body. Raises: ConfigError if it is too long; ConnectionError if it is too slow."""

@@ -7,6 +7,7 @@ shards themselves.
 
 from __future__ import annotations
 
+import contextlib
 import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
@@ -173,3 +174,14 @@ class Manifest(_Identity):
     def complete(self) -> bool:
         """Returns whether every requested episode is published."""
         return all(self.published(split) >= count for split, count in self.requested.items())
+
+
+@contextlib.contextmanager
+def errors_in_config(folder: Path | str) -> Iterator[None]:
+    """Turns errors of code that reads a manifest's config into a ConfigError, because any file may contain another."""
+    try:
+        yield
+    except ConfigError:
+        raise
+    except (LookupError, TypeError, ValueError, AttributeError) as error:
+        raise ConfigError(f"{folder} must have a config as this version writes it, got {error!r} of it") from error

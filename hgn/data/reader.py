@@ -28,7 +28,7 @@ from hgn.data.shard_cache import holders
 from hgn.data.statistics import Statistics
 from hgn.data.storage import StorageError, ask, is_remote, open_storage, outliving
 from hgn.scene.episode import POSITION_MEMBER, Episode, decode_episode
-from hgn.schema import ConfigError, require, without_passwords
+from hgn.schema import ConfigError, printable, require
 from hgn.system.patience import UnreachableError, standard_patience_s
 
 AGAIN_S, FORGOTTEN_S = 1.0, 60.0  # interval of reads after a fault of the manifest; time after which it is forgotten
@@ -143,7 +143,7 @@ class EpisodeStore(Episodes):
         return len(self) > before
 
     def _tell(self, text: str) -> None:
-        print(without_passwords(text), file=sys.stderr)
+        print(printable(text), file=sys.stderr)
 
     def ask_again(self) -> None:
         """Refreshes after a fault, at most once a second. Raises: as `refresh`."""

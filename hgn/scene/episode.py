@@ -252,7 +252,7 @@ def decode_array(name: str, data: bytes | np.ndarray, dtype: str, dimensions: in
 def _decode_description(key: str, text: bytes) -> _Description:
     try:
         mapping = json.loads(text)
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise ConfigError(f"{key}.json must be JSON, got {error}") from None
     require_schema_version(mapping, f"{key}.json")
     return from_mapping(_Description, mapping, f"{key}.json")

@@ -22,7 +22,6 @@ from hgn.system.claims import Claims
 INSTANCES = "EXT_mesh_gpu_instancing"
 READ = (INSTANCES, "KHR_mesh_quantization")  # extensions that change geometry
 NEUTRAL = re.compile(r"[A-Z]+_(materials|texture|lights|xmp|animation|audio)\w*")  # extensions that do not
-MAXIMUM_SPARSE = 1_000_000  # largest number of values of a sparse accessor without own data
 TRIANGLES, STRIP, FAN = 4, 5, 6  # modes of primitives; the other modes are points and lines
 _TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
@@ -38,7 +37,8 @@ def read_glb(path: Path) -> tuple[np.ndarray, np.ndarray]:
     unknown = [n for n in tree.get("extensionsRequired", ()) if n not in READ and not NEUTRAL.fullmatch(n)]
     if unknown:
         raise ValueError(f"it requires {', '.join(unknown)}, which is not read; export it without")
-    file, claims = _File(tree, binary, path.parent), Claims(path)
+    claims = Claims(path)
+    file = _File(tree, binary, path.parent, claims)
     vertices, triangles, vertex_count = [np.zeros((0, 3))], [np.zeros((0, 3), np.int64)], 0
     for mesh, weights, place_M44 in file.placed():
         for position_V3, triangle_F3 in file.surfaces(mesh, weights):
@@ -66,8 +66,8 @@ def _chunks(data: bytes) -> tuple[dict[str, Any], bytes]:
 class _File:
     """The JSON tree of a file, and its buffers."""
 
-    def __init__(self, tree: dict[str, Any], binary: bytes, folder: Path) -> None:
-        self.tree, self.binary, self.folder = tree, binary, folder.resolve()
+    def __init__(self, tree: dict[str, Any], binary: bytes, folder: Path, claims: Claims) -> None:
+        self.tree, self.binary, self.folder, self.claims = tree, binary, folder.resolve(), claims
         self.buffer = cache(self._buffer)
 
     def placed(self) -> list[tuple[dict[str, Any], list[float], np.ndarray]]:
@@ -96,6 +96,8 @@ class _File:
                 raise ValueError(f"node {index} has a skin; apply the armature")
             instances = node.get("extensions", {}).get(INSTANCES, {}).get("attributes", {})
             given = [instances.get(name) for name in ("TRANSLATION", "ROTATION", "SCALE")]
+            for i in given:
+                self.claims.add("instances", 1 if i is None else self.tree["accessors"][i]["count"], 128)
             place_M44 = place_44 @ _places(*(None if i is None else self.accessor(i) for i in given))
             mesh = self.tree["meshes"][node["mesh"]]
             result.append((mesh, node.get("weights", mesh.get("weights", [])), place_M44))
@@ -111,6 +113,7 @@ class _File:
             position_V3 = self.accessor(primitive["attributes"]["POSITION"]).astype(np.float64)
             for target, weight in zip(primitive.get("targets", ()), weights, strict=False):
                 if weight and "POSITION" in target:
+                    self.claims.add("morph targets", position_V3.nbytes)
                     position_V3 = position_V3 + weight * self.accessor(target["POSITION"])
             if "indices" in primitive:
                 index = self.accessor(primitive["indices"])[:, 0].astype(np.int64)
@@ -135,7 +138,8 @@ class _File:
         sparse = entry.get("sparse")
         if "bufferView" in entry:
             value = self._values(entry, dtype, shape)
-        elif sparse and 0 <= entry["count"] <= MAXIMUM_SPARSE:
+        elif sparse:
+            self.claims.add(f"accessor {index}", *shape, 8)
             value = np.zeros(shape, dtype)
         else:
             used = ", ".join(self.tree.get("extensionsUsed", ())) or "no extension"
@@ -152,7 +156,7 @@ class _File:
     def _values(self, entry: dict[str, Any], dtype: np.dtype[Any], shape: tuple[int, int]) -> np.ndarray:
         view = self.tree["bufferViews"][entry["bufferView"]]
         start, offset = view.get("byteOffset", 0), entry.get("byteOffset", 0)
-        stride = view.get("byteStride", shape[1] * dtype.itemsize)
+        stride = view.get("byteStride") or shape[1] * dtype.itemsize
         data = self.buffer(view["buffer"])[start : start + view["byteLength"]]
         last = offset + (shape[0] - 1) * stride + shape[1] * dtype.itemsize
         if min(start, offset, stride, *shape) < 0 or (shape[0] and last > len(data)):

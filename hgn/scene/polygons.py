@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 FLAT = 1e-9  # smallest turn at a corner that counts as concave, as a fraction of the polygon's area
-MAXIMUM_CORNERS = 2_000  # largest number of corners of a concave face; cutting takes the square of it
+MAXIMUM_CORNERS = 2_000  # of one concave face; cutting takes the square, which is limited for the sum of all faces
 _LINE = re.compile(rb"^[ \t]*([vf])[ \t]+(.*)$", re.MULTILINE)
 _JOINED = re.compile(rb"\\\r?\n")
 _COMMENT = re.compile(rb"[ \t]#.*")
@@ -143,11 +143,13 @@ def concave_cut(vertex_V3: np.ndarray, faces: list[np.ndarray]) -> np.ndarray | 
     concave = _concave(vertex_V3, faces)
     if not concave:
         return None
+    if sum(len(faces[number]) ** 2 for number in concave) > MAXIMUM_CORNERS**2:
+        largest = max(concave, key=lambda number: len(faces[number]))
+        text = f"face {largest} is concave and has {len(faces[largest])} corners"
+        raise ValueError(f"{text}, as one of {len(concave)} concave ones; cut them into triangles")
     pieces = []
     for number, face in enumerate(faces):
         if number in concave:
-            if len(face) > MAXIMUM_CORNERS:
-                raise ValueError(f"face {number} is concave and has {len(face)} corners; cut it into triangles")
             pieces.append(face[_ears(_flattened(vertex_V3[face]), number)])
         elif len(face) > 2:
             pieces.append(np.stack([np.full(len(face) - 2, face[0]), face[1:-1], face[2:]], axis=1))

@@ -16,7 +16,7 @@ import time
 from collections.abc import Callable, Iterator
 from typing import TypeVar
 
-from hgn.schema import require, without_passwords
+from hgn.schema import printable, require
 
 VARIABLE = "HGN_PATIENCE_S"
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.25, 10.0
@@ -76,6 +76,6 @@ def patiently(
             if not warned and pause > 1:
                 warned = True
                 text = f"{server} does not answer ({cause}); retrying for {patience_s:.0f} s"
-                print(without_passwords(text), file=sys.stderr)
+                print(printable(text), file=sys.stderr)
             without.wait(pause * random.uniform(0.5, 1.0))  # readers must not return all at the same moment
             pause = min(2 * pause, LONGEST_PAUSE_S)

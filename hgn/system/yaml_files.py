@@ -18,6 +18,7 @@ from hgn.schema import ConfigError
 from hgn.system.claims import count_items
 
 MAXIMUM_NODES = 100_000  # of a file
+LINES_BYTES = 250_000  # of a JSON file, in which a repeated key is looked for: YAML takes a CPU second for 50 kB
 _OCTAL = re.compile(r"[-+]?0[0-7_]*[1-7][0-7_]*")
 _SEXAGESIMAL = re.compile(r"[-+]?[0-9][0-9_]*(:[0-5]?[0-9])+(\.[0-9_]*)?")
 
@@ -43,7 +44,9 @@ def read_json(path: Path) -> Any:
 
     def unique(pairs: Sequence[tuple[str, Any]]) -> dict[str, Any]:
         if len(dict(pairs)) < len(pairs):
-            _load(text.replace("\t", " "))  # finds key and line
+            if len(text) < LINES_BYTES:
+                _load(text.replace("\t", " "))  # finds key and line
+            raise ValueError(f"a key is given twice, one of {', '.join(dict(pairs))[:100]}")
         return dict(pairs)
 
     try:
@@ -95,11 +98,11 @@ def _check(node: yaml.Node, name: str, visited: set[int]) -> None:
             _check(item, name, visited)
     elif node.tag.endswith((":int", ":float")):
         if _OCTAL.fullmatch(node.value):
-            remedy = f"write {node.value.replace('0', '', 1)}, or {int(node.value.replace('_', ''), 8)}"
-            raise ValueError(f"line {line}: {name}: {node.value} is an octal number in YAML; {remedy}")
+            remedy = f"write {node.value.replace('0', '', 1)[:40]}, or {int(node.value.replace('_', '')[:20], 8)}"
+            raise ValueError(f"line {line}: {name}: {node.value[:40]} is an octal number in YAML; {remedy}")
         if _SEXAGESIMAL.fullmatch(node.value):
             remedy = "write it in decimals, or in quotes"
-            raise ValueError(f"line {line}: {name}: {node.value} is a number of base 60 in YAML; {remedy}")
+            raise ValueError(f"line {line}: {name}: {node.value[:40]} is a number of base 60 in YAML; {remedy}")
 
 
 _Loader.add_implicit_resolver(

@@ -100,9 +100,11 @@ class Checkpoints(Callback):
             self.save_last(trainer, _update(pl_module))
 
     def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
-        """Saves before a training ends because its data stay unreachable. Several ranks cannot agree on it any more."""
-        if isinstance(exception, (StorageError, OSError)) and trainer.world_size == 1 and _update(pl_module):
-            self.save_last(trainer, _update(pl_module))
+        """Saves before a training ends because its data stay unreachable. Each rank that misses them saves, because it is
+        between two updates, while the others wait inside one.
+        """
+        if isinstance(exception, (StorageError, OSError)) and self._saved_update != _update(pl_module) > 0:
+            lightning_compat.save_alone(trainer, self.folder / LAST_NAMES[0])
 
     def save_last(self, trainer: Trainer, update: int) -> None:
         """Saves a checkpoint. All ranks call this; rank 0 writes (see CheckpointWriter)."""

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from hgn.config import NetworkConfig, TrainConfig, TrainingConfig
-from hgn.data.manifest import Manifest
+from hgn.data.manifest import Manifest, errors_in_config
 from hgn.data.reader import EpisodeStore
 from hgn.schema import require
 
@@ -30,34 +30,35 @@ def settings_of_imported(mapping: Mapping[str, Any]) -> dict[str, Any]:
     require(asked, "dataset.folder", rule, folder, remedy=f"it is imported; add {FLAG}")
     assert manifest is not None
     network, training = mapping["network"], mapping["training"]
-    left_open = {
-        "cell_size": own["radius"],
-        "dimensions": own["dimensions"],
-        "materials": own["materials"],
-        "obstacle_features": own["obstacles"],
-        "velocity_history": own["history"],
-    }
-    network |= {key: value for key, value in left_open.items() if network.get(key) is None}
-    if training.get("noise_std") is None:
-        training["noise_std"] = TrainingConfig.noise_std * own["radius"] / NetworkConfig.cell_size
-    training["generate"] = False
-    splits = {"training_scenes": "train", "validation_scenes": "validation", "test_scenes": "test"}
-    mapping["dataset"] |= {name: manifest.published(split) for name, split in splits.items()}
-    mapping["dataset"] |= {"frame_rate_hz": manifest.config["frame_rate_hz"], "seed": manifest.config["seed"]}
-    mapping["dataset"] |= {"frames": min(EpisodeStore(folder, "train").frames()), "long_fraction": 0.0}
-    mapping["scene"] |= {
-        "domain_size": own["domain_size"],
-        "cell_size": own["obstacle_cell_size"],
-        "gravity": own["gravity"],
-        "tilted_gravity_fraction": float(own["several_gravities"]),
-        "zero_gravity_fraction": 0.0,
-        "obstacle_count": int(own["obstacles"]),
-        "maximum_initial_speed": own["maximum_initial_speed"],
-        "moving_group_fraction": 1.0,
-        "pure_direction_fraction": 0.0,
-        "colliding_scene_fraction": 0.0,
-        "funnel_scene_fraction": 0.0,
-    }
+    with errors_in_config(folder):
+        left_open = {
+            "cell_size": own["radius"],
+            "dimensions": own["dimensions"],
+            "materials": own["materials"],
+            "obstacle_features": own["obstacles"],
+            "velocity_history": own["history"],
+        }
+        network |= {key: value for key, value in left_open.items() if network.get(key) is None}
+        if training.get("noise_std") is None:
+            training["noise_std"] = TrainingConfig.noise_std * own["radius"] / NetworkConfig.cell_size
+        training["generate"] = False
+        splits = {"training_scenes": "train", "validation_scenes": "validation", "test_scenes": "test"}
+        mapping["dataset"] |= {name: manifest.published(split) for name, split in splits.items()}
+        mapping["dataset"] |= {"frame_rate_hz": manifest.config["frame_rate_hz"], "seed": manifest.config["seed"]}
+        mapping["dataset"] |= {"frames": min(EpisodeStore(folder, "train").frames()), "long_fraction": 0.0}
+        mapping["scene"] |= {
+            "domain_size": own["domain_size"],
+            "cell_size": own["obstacle_cell_size"],
+            "gravity": own["gravity"],
+            "tilted_gravity_fraction": float(own["several_gravities"]),
+            "zero_gravity_fraction": 0.0,
+            "obstacle_count": int(own["obstacles"]),
+            "maximum_initial_speed": own["maximum_initial_speed"],
+            "moving_group_fraction": 1.0,
+            "pure_direction_fraction": 0.0,
+            "colliding_scene_fraction": 0.0,
+            "funnel_scene_fraction": 0.0,
+        }
     return mapping
 
 

@@ -10,6 +10,7 @@ import os
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 
 from lightning.pytorch import Trainer
 from lightning.pytorch.plugins.environments import LightningEnvironment
@@ -63,6 +64,11 @@ def forget_sigterm(trainer: Trainer) -> None:
     """Clears a SIGTERM that Lightning's own handler received, which also called ours. Otherwise Lightning would leave
     the loop by an exception, without a checkpoint and with exit code 0."""
     trainer._signal_connector.received_sigterm = False
+
+
+def save_alone(trainer: Trainer, path: Path) -> None:
+    """Saves a checkpoint on this rank, whichever it is, without the others."""
+    trainer.strategy.checkpoint_io.save_checkpoint(trainer._checkpoint_connector.dump_checkpoint(), path)
 
 
 def _nothing() -> None:

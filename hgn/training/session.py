@@ -21,7 +21,7 @@ from hgn.network.base import ParticleNetwork
 from hgn.network.build import build_network
 from hgn.runtime.backend import pick, set_matmul_precision, torch_unsupported_reason, triton_unsupported_reason
 from hgn.runtime.torch_backend import precisions_to_try
-from hgn.schema import to_mapping, without_passwords
+from hgn.schema import printable, to_mapping
 from hgn.system.device import keep_to_quota
 from hgn.system.files import make_folder, write_atomically
 from hgn.system.provenance import provenance
@@ -182,8 +182,8 @@ def precompile_kernels(config: TrainConfig, resume: Resume | None, stack: ExitSt
 def _public(config: TrainConfig) -> dict[str, Any]:
     """Returns the settings, without passwords in URLs."""
     mapping: dict[str, Any] = to_mapping(config)
-    mapping["dataset"]["folder"] = without_passwords(config.dataset.folder)
-    mapping["training"]["more_data"] = [without_passwords(folder) for folder in config.training.more_data]
+    mapping["dataset"]["folder"] = printable(config.dataset.folder)
+    mapping["training"]["more_data"] = [printable(folder) for folder in config.training.more_data]
     return mapping
 
 

@@ -16,6 +16,7 @@ import viser
 from hgn.render.pictures import rollout_spacing
 from hgn.scene.rollout_file import Rollout
 from hgn.schema import require
+from hgn.viewer.placed import plain
 from hgn.viewer.stage import StageView, quaternion
 from hgn.viewer.viser_compat import start_server, stop_server
 
@@ -32,7 +33,7 @@ class _Film:
         )
         self.moving = []
         for index, obstacle in enumerate(rollout.obstacles):
-            mesh = self.stage.add_obstacle(f"{index}_{obstacle.name}", obstacle, *REST)
+            mesh = self.stage.add_obstacle(f"{index}_{plain(obstacle.name)}", obstacle, *REST)
             if obstacle.motion is not None:
                 self.moving.append((mesh, obstacle.motion))
 

@@ -14,9 +14,11 @@ from scene.test_rollout_file import make_rollout
 
 from hgn.data.foreign.dataset import import_set
 from hgn.data.foreign.settings import ImportConfig
+from hgn.data.foreign.tfrecord import masked_crc
 from hgn.data.identity import identity_hash
 from hgn.data.index import ListedIndex
 from hgn.data.manifest import Manifest
+from hgn.data.shard import locate_members
 from hgn.scene.rollout_file import read_rollout, write_rollout
 from hgn.scene.scene_file import load_scene
 
@@ -61,6 +63,24 @@ def chunked(file):
     file.create_dataset("00000/position", (1,), "f4", **options)
 
 
+def external(file):
+    """A dataset whose numbers are another file's bytes, and a link to another file."""
+    del file["hgn/source"]
+    file.create_dataset("hgn/source", (1,), "S64", external=[("/etc/hostname", 0, 64)])
+    file["hgn/elsewhere"] = h5py.ExternalLink("/proc/self/mem", "/")
+
+
+def soft(file):
+    """A dataset's name that leads to itself, through another."""
+    del file["hgn/source"]
+    file["hgn/source"], file["hgn/other"] = h5py.SoftLink("/hgn/other"), h5py.SoftLink("/hgn/source")
+
+
+def attributes(file):
+    for number in range(3000):
+        file["hgn"].attrs[f"a{number}"] = "x" * 100
+
+
 def loop(file):
     file["hgn/self"] = file["hgn"]
 
@@ -101,6 +121,9 @@ cases(
         "reference": rollout(claimed("hgn/reference", (10**4, 10**6, 3), "f4")),
         "text": rollout(claimed("hgn/source", (10**10,), "S64")),
         "hard links": rollout(links),
+        "other files": rollout(external),
+        "soft links": rollout(soft),
+        "attributes": rollout(attributes),
         "loop": rollout(loop),
         "linked obstacles": rollout(linked_obstacles),
         "frames of nobody": rollout(frames_of_nobody),
@@ -192,6 +215,12 @@ def raw_pickle(data):
     return on
 
 
+def tfrecords(folder):
+    """A record that claims 2^40 bytes, under a checksum that holds."""
+    length = struct.pack("<Q", 2**40)
+    (folder / "train.tfrecord").write_bytes(length + struct.pack("<I", masked_crc(length)) + bytes(1000))
+
+
 def crowded(file):
     """A wall of 80,000 particles at one place."""
     del file["boundary"]
@@ -213,12 +242,42 @@ cases(
         "memo": imported("geoelements", raw_pickle(b"\x80\x02}r\xff\xff\xff\x7f.")),
         "long bytes": imported("geoelements", raw_pickle(b"\x80\x04\x8e" + struct.pack("<Q", 10**11) + b"x.")),
         "sequence length": imported("deepmind", sequence_length=10**30),
+        "repeated key": imported(
+            "plain",
+            lambda folder: (folder / "metadata.json").write_text('{"a": 1, "a": 2, "b": [' + 240_000 * "[], " + "0]}"),
+        ),
+        "records": imported("deepmind", tfrecords),
         "nested metadata": imported(
             "plain", lambda folder: (folder / "metadata.json").write_text(300_000 * "[" + 300_000 * "]")
         ),
+        "tiny radius": imported("plain", default_connectivity_radius=5e-324),
+        "tiny step": imported("plain", dt=5e-324),
         "bounds": imported("plain", bounds=[[0, 1e300]] * 3, default_connectivity_radius=1e296),
     },
     lambda source: import_set(source, ImportConfig(out=str(source.parent / "out"), gravity=(0.0, -9.8, 0.0))),
+)
+
+# shards
+
+
+def tar_headers(kind, count, size=b"00000000001"):
+    """Headers of one kind, with a block each."""
+    head = b"a".ljust(100, b"\0") + b"0000644\0" + b"0000000\0" * 2 + size + b"\0" + b"0" * 11 + b"\0"
+    head += b" " * 8 + kind + bytes(355)
+    return saved("a.tar", count * (head[:148] + f"{sum(head):06o}\0 ".encode() + head[156:] + bytes(512)) + bytes(1024))
+
+
+cases(
+    "tar",
+    {
+        "long names": tar_headers(b"L", 900),
+        "a long name": tar_headers(b"L", 1, b"77777777777"),
+        "pax heads": tar_headers(b"x", 900),
+        "a large head": tar_headers(b"x", 1, b"77777777777"),
+        "sparse files": tar_headers(b"S", 900, b"77777777777"),
+        "links": tar_headers(b"2", 900),
+    },
+    lambda path: [*locate_members(path)],
 )
 
 # manifests
@@ -283,6 +342,9 @@ cases(
         "bytes of the table": manifest(lambda head: (totals(shards=1000)(head), state(table_bytes=10**12)(head))),
         "bytes of the quarantine": manifest(state(quarantine_bytes=10**12, quarantined=10**12)),
         "range": listing(stop=10**11),
+        "negative range": listing(first=2**62, stop=-(2**62)),
+        "control characters": listing(name="\x1b[31m.tar"),
+        "a name elsewhere": listing(name="../../etc/passwd"),
         "nesting": saved("manifest.json", 400_000 * b"["),
         "config": manifest(config={"a": [[]] * 100_000}),
     },

@@ -1,10 +1,12 @@
 """Files of at most 1 MB that claim far more than they hold: weights, checkpoints, meshes and scenes."""
 
 import json
+import math
 import pickle
 import struct
 import zipfile
 
+import numpy as np
 import torch
 import trimesh
 from safetensors.torch import save
@@ -64,6 +66,12 @@ cases(
         "gns": weights(kind="gns", levels=1, message_passing_steps=1000, width=65_536),
         "many materials": weights(materials=[f"m{number}" for number in range(50_000)]),
         "nested": weights(text=100_000 * "["),
+        "digits": weights(text='{"format_version": ' + 100_000 * "9" + "}"),
+        "a long head": saved("w.safetensors", struct.pack("<Q", 2**62) + b"{}" + bytes(1000)),
+        "no head": saved("w.safetensors", struct.pack("<Q", 900_000) + 900_000 * b"["),
+        "rate": weights(
+            text=json.dumps(to_mapping(WeightsInfo(NetworkConfig(), 60.0, 1 / 64)) | {"frame_rate_hz": 1e308})
+        ),
         "long list": weights(text='{"format_version": 1, "network": [' + 150_000 * "[]," + "0]}"),
     },
     load_weights,
@@ -86,6 +94,15 @@ def deflated(path, pickled=None):
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED if pickled is None else zipfile.ZIP_STORED) as archive:
         for name, data in records.items():
             archive.writestr(name, pickled if pickled is not None and name.endswith("data.pkl") else data)
+    return path
+
+
+def deflated_many(path):
+    """An archive of eight thousand records."""
+    with zipfile.ZipFile(path, "w") as archive:
+        for number in range(8000):
+            archive.writestr(f"c/data/{number}", b"")
+        archive.writestr("c/data.pkl", b"\x80\x02}.")
     return path
 
 
@@ -130,6 +147,9 @@ cases(
         "bytearray": pickled(called(bytearray, 10**11)),
         "memo": pickled(b"\x80\x02}r\xff\xff\xff\x7f."),
         "called storage": pickled(b"\x80\x02ctorch\nFloatStorage\n\x8a\x05\x00\xe8vH\x17\x85R."),
+        "empty section": checkpoint({"hgn": {}, "state_dict": {}}),
+        "nested lists": pickled(b"\x80\x02" + 400_000 * b"]" + 399_999 * b"a" + b"."),
+        "many records": lambda folder: deflated_many(folder / "c.ckpt"),
         "long text": pickled(b"\x80\x04\x8d" + struct.pack("<Q", 10**11) + b"x."),
     },
     lambda path: network_of_checkpoint(read_checkpoint(path), path),
@@ -167,6 +187,37 @@ def accessor(**values):
 def sparse(header):
     header["accessors"][0] |= {"count": 120_000_000, "sparse": {"count": 1, "indices": {}, "values": {}}}
     del header["accessors"][0]["bufferView"]
+
+
+def stride_0(header):
+    for view in header["bufferViews"]:
+        view["byteStride"] = 0
+    accessor(count=100_000_000)(header)
+
+
+def targets(header):
+    """Thirty thousand morph targets that are all the mesh itself."""
+    primitive = header["meshes"][0]["primitives"][0]
+    primitive["targets"] = [{"POSITION": primitive["attributes"]["POSITION"]}] * 30_000
+    header["meshes"][0]["weights"] = [1e-9] * 30_000
+
+
+def sparse_instances(header):
+    """Forty nodes of a million instances, none of which is in the file."""
+    count = len(header["accessors"])
+    value = {"componentType": 5126, "count": 10**6, "type": "VEC3", "sparse": {"count": 0, "indices": {}, "values": {}}}
+    value["sparse"] |= {"indices": {"bufferView": 0, "componentType": 5125}, "values": {"bufferView": 0}}
+    header["accessors"].append(value)
+    attributes = {"EXT_mesh_gpu_instancing": {"attributes": {"TRANSLATION": count, "SCALE": count}}}
+    header["nodes"] += [{"mesh": 0, "extensions": attributes}] * 40
+    header["scenes"][0]["nodes"] = list(range(len(header["nodes"])))
+
+
+def star(count):
+    """The lines of one polygon, every other corner of which is concave."""
+    corners = [(index / count * 2 * math.pi, 1 + index % 2) for index in range(count)]
+    points = "".join(f"v {radius * math.cos(a):.4f} {radius * math.sin(a):.4f} 0\n" for a, radius in corners)
+    return f"{points}f {' '.join(map(str, range(1, count + 1)))}\n".encode()
 
 
 def instances(count):
@@ -211,17 +262,49 @@ cases(
         "instances by paths": glb(branching),
         "cycle": glb(cyclic),
         "primitives": glb(repeated_primitives),
+        "stride 0": glb(stride_0),
+        "targets": glb(targets),
+        "sparse instances": glb(sparse_instances),
+        "no buffers": glb(lambda header: header.pop("buffers")),
+        "no such buffer": glb(lambda header: header["bufferViews"][0].update(buffer=-7)),
+        "views that are text": glb(lambda header: header.update(bufferViews="abc")),
+        "nodes that are numbers": glb(lambda header: header.update(nodes=[1, 2, None])),
+        "a matrix of text": glb(lambda header: header["nodes"][0].update(matrix=["x"] * 16)),
+        "a tree that is a list": saved("m.glb", b"glTF\2\0\0\0\x18\0\0\0\4\0\0\0JSON[  ]"),
         "stl": saved("m.stl", bytes(80) + struct.pack("<I", 2**32 - 1) + bytes(1000)),
         "text stl": saved("m.stl", b"solid a\n" + 15_000 * b"facet normal 0 0 1\nouter loop\nvertex 0 0 1\n"),
         "ply": ply(10**11),
         "binary ply": ply(10**11, "binary_little_endian", bytes(1000)),
         "ply with long lists": ply(3, "binary_little_endian", bytes(36) + b"\xff" + bytes(1000)),
+        "ply of a star": saved(
+            "m.ply",
+            b"ply\nformat binary_little_endian 1.0\nelement vertex 60000\nproperty float x\nproperty float y\n"
+            b"property float z\nelement face 1\nproperty list uint uint vertex_indices\nend_header\n"
+            + np.random.default_rng(0).random((60_000, 3), np.float32).tobytes()
+            + np.array([60_000, *range(60_000)], np.uint32).tobytes(),
+        ),
+        "ply of a long list": saved(
+            "m.ply",
+            b"ply\nformat binary_little_endian 1.0\nelement vertex 3\nproperty float x\nproperty float y\n"
+            b"property float z\nelement face 1\nproperty list uint uint vertex_indices\nend_header\n"
+            + bytes(36)
+            + b"\xff\xff\xff\x7f"
+            + bytes(1000),
+        ),
+        "ply of many properties": saved(
+            "m.ply", b"ply\nformat ascii 1.0\nelement vertex 3\n" + 40_000 * b"property float x\n" + b"end_header\n"
+        ),
         "ply of other elements": saved(
             "m.ply", b"ply\nformat binary_little_endian 1.0\nelement odd 100000000000\nproperty float x\nend_header\n"
         ),
         "obj of lines": saved("m.obj", b"v 0 0 0\n" + 200_000 * b"l 1\n"),
         "obj of polygons": saved("m.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\n" + 80_000 * b"f 1 2 3 1\n"),
         "obj of one polygon": saved("m.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf" + 160_000 * b" 1 2 3"),
+        "obj of a star": saved("m.obj", star(30_000)),
+        "obj of stars": saved(
+            "m.obj", star(300) + 700 * (b"f " + b" ".join(b"%d" % (i + 1) for i in range(300)) + b"\n")
+        ),
+        "obj of large numbers": saved("m.obj", b"v " + 900_000 * b"1" + b" 0 0\nf 1 1 1\n"),
         "obj of groups": saved("m.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\n" + 60_000 * b"o a\nf 1 2 3\n"),
         "obj of materials": saved("m.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\n" + 40_000 * b"usemtl a\nf 1 2 3\n"),
         "obj index": saved("m.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 2000000000\n"),
@@ -270,6 +353,17 @@ cases(
         "deep flow": scene("groups: " + 240_000 * "["),
         "short lists": scene("groups: [" + 40_000 * "[]," + "]"),
         "anchors": scene("a: &a " + 100_000 * "[1]\n"),
+        "ten megabytes": scene("groups: [" + 2_500_000 * "[], " + "]"),
+        "merges": scene(
+            "a0: &a0 {x: 1}\n" + "".join(f"a{n}: &a{n} {{<<: [{9 * f'*a{n - 1}, '}]}}\n" for n in range(1, 12))
+        ),
+        "itself": scene("groups: &a [*a, *a]\n"),
+        "complex keys": scene(100_000 * "? "),
+        "nested keys": scene("".join(" " * n + "a:\n" for n in range(600))),
+        "digits": scene("cell_size: " + 200_000 * "9" + "\n" + GROUP),
+        "hexadecimal digits": scene("seed: 0x" + 200_000 * "f" + "\n" + GROUP),
+        "base 60": scene("cell_size: 1" + 80_000 * ":10" + "\n" + GROUP),
+        "objects": scene("a: !!python/object/apply:os.system [true]\n"),
     },
     cells,
 )  # fmt: skip

@@ -26,7 +26,7 @@ from hgn.data.manifest import Manifest
 from hgn.data.reader import EpisodeStore
 from hgn.data.shard_cache import CACHE_VARIABLE, LIMIT_VARIABLE, CachedShard, cached_shard
 from hgn.scene.npz import read_npz
-from hgn.schema import ConfigError, without_passwords
+from hgn.schema import ConfigError, printable
 from hgn.system.locks import locked
 from hgn.system.patience import VARIABLE, UnreachableError, standard_patience_s
 
@@ -66,7 +66,7 @@ def test_a_full_cache_makes_room(tmp_path, monkeypatch):
     assert path.stat().st_size == 2000 and sum(other.exists() for other in others) == 3
 
 
-@pytest.mark.parametrize("dripping", ["manifest.json", ".tar"])
+@pytest.mark.parametrize("dripping", ["manifest.json", ".tar", "head"])
 def test_a_server_that_drips_does_not_answer(data, monkeypatch, dripping):
     """A body that comes more slowly than the least speed ends like one that does not come."""
     monkeypatch.setattr("hgn.data.bounded_http.SLOW_S", 0.0)
@@ -84,8 +84,20 @@ def test_a_server_that_drips_does_not_answer(data, monkeypatch, dripping):
                         time.sleep(0.001)
             outputfile.write(content[50:])
 
+        def send_response(self, code, message=None):
+            super().send_response(code, message)
+            if dripping == "head" and not self.path.startswith("/index"):
+                with contextlib.suppress(ConnectionError):
+                    for byte in b"X-Long: " + 1000 * b"x":
+                        self.wfile.write(bytes([byte]))
+                        time.sleep(0.005)
+
     server = answering(functools.partial(Drip, directory=data.dataset.folder))
-    with server as url, pytest.raises(UnreachableError, match="bytes a second"):
+    monkeypatch.setattr("hgn.data.bounded_http.HEAD_S", 0.2 if dripping == "head" else 150.0)
+    with (
+        server as url,
+        pytest.raises(UnreachableError, match="TimeoutError" if dripping == "head" else "bytes a second"),
+    ):
         store = EpisodeStore(url, "train")
         store.manifest = whole.manifest
         assert store[0]
@@ -95,13 +107,16 @@ def test_a_server_that_drips_does_not_answer(data, monkeypatch, dripping):
     ("text", "shown"),
     [
         ("http://user:secret@host:80/a b", "http://host:80/a b"),
+        ("https://user:p@ss:w@rd@host/a http://h?x=a@b", "https://host/a http://h?x=a@b"),
         ("got s3://key:se%40cret@bucket, ftp://u@h", "got s3://bucket, ftp://h"),
         ("hf://datasets/a@main/b", "hf://datasets/a@main/b"),
         ("a@b.c file:///x@y http://h/p@q", "a@b.c file:///x@y http://h/p@q"),
+        ("\x1b]0;title\x07\x9b31m\u202egpj.\r\udc80", r"\x1b]0;title\x07\x9b31m\u202egpj.\r\udc80"),
+        ("two\nlines of ü 日本 🙂", "two\nlines of ü 日本 🙂"),
     ],
 )
-def test_passwords_in_urls(text, shown):
-    assert without_passwords(text) == shown
+def test_passwords_and_control_characters(text, shown):
+    assert printable(text) == shown == str(ConfigError(text))
 
 
 def test_no_file_of_a_run_has_the_password(data, tmp_path, capsys):
@@ -128,6 +143,8 @@ class Files(Quiet, http.server.SimpleHTTPRequestHandler):
         (OSError(errno.ENFILE, "Too many open files in system"), 1, "close other programs"),
         (OSError(errno.ESTALE, "Stale file handle"), 1, "Stale file handle; check the disk"),
         (OSError("no number"), 1, "no number; check the disk"),
+        (OSError(errno.EIO, "Input/output error", "/data/\x1b[2Ja.tar"), 1, r"/data/\x1b[2Ja.tar; check"),
+        (ConfigError("name must be a\u202eb"), 2, r"a\u202eb"),
         (MemoryError("Unable to allocate 5 TiB"), 1, "memory is full (Unable to allocate 5 TiB)"),
         (ConfigError("http://user:secret@host must be"), 2, "http://host must be"),
     ],

@@ -22,6 +22,8 @@ from hypothesis import strategies as st
 from scene.test_rollout_file import make_rollout
 
 from datagen.solve import SolveConfig
+from hgn import card
+from hgn.card import weights_card
 from hgn.config import NetworkConfig
 from hgn.data.entries import SPLITS, QuarantinedScene
 from hgn.data.foreign.formats import read_split, set_info
@@ -39,6 +41,7 @@ from hgn.scene.rollout_file import read_rollout, write_rollout
 from hgn.scene.scene_file import load_scene
 from hgn.schema import ConfigError, from_mapping
 from hgn.training.checkpoint import read_checkpoint
+from hgn.training.imported import settings_of_imported
 
 
 @pytest.mark.parametrize(
@@ -49,12 +52,37 @@ from hgn.training.checkpoint import read_checkpoint
         (NetworkConfig, {"width": 10**9}, "width must be at most 65,536"),
         (NetworkConfig, {"levels": 10**400}, "levels must be a number of at most 63 bits"),
         (NetworkConfig, {"cell_size": 10**400}, "cell_size must be a number of at most 63 bits"),
+        (SolveConfig, {"scene": "a\x1b[31m"}, r"scene must be text without control characters, got 'a\\x1b\[31m'"),
+        (NetworkConfig, {"kind": "hgn\u202e"}, "kind must be text without control characters"),
     ],
 )
 def test_sizes_that_no_machine_has(cls, mapping, message):
     """Numbers that would end in MemoryError, or in hours of building a network, are refused by name."""
     with pytest.raises(ConfigError, match=message):
         from_mapping(cls, mapping)
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["<script>alert(1)</script>", "a | b", "x\n# y\n", "`a`", "[x](javascript:alert(1))", "```\n<b>", "\x1b[31m"],
+)
+def test_cards_show_names_as_words(name):
+    """A file's or folder's name is text on a card, and opens no element, table, link or code."""
+    info = WeightsInfo(NetworkConfig(), 60.0, 1 / 64)
+    text, usual = (weights_card(info, each, f"{each}.safetensors", "mit").split("---\n")[2] for each in (name, "a"))
+    assert not set("<[\x1b") & set(text)
+    assert all(text.count(character) == usual.count(character) for character in "\n|`")
+
+
+@pytest.mark.parametrize("config", [{}, {"scene": 3}, {"imported": {}}, {"imported": 5, "frame_rate_hz": "x"}])
+def test_configs_of_other_data_sets(tmp_path, config):
+    """A manifest whose config is none of this version ends in one line: of a card, and of a training on it."""
+    Manifest(identity_hash(config), config, {"train": 1}, 1, ListedIndex([shard(0)])).save(tmp_path)
+    sections = {name: {} for name in ("network", "training", "scene")}
+    mapping = {"dataset": {"folder": str(tmp_path)}, "imported": True, **sections}
+    for read in (lambda: card.main({"data": str(tmp_path)}), lambda: settings_of_imported(mapping)):
+        with pytest.raises(ConfigError, match=r"must have a config as this version writes it|must be a data set of"):
+            read()
 
 
 @pytest.mark.parametrize("uri", ["pipe", "../outside.bin", "/etc/hostname", None])

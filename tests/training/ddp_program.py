@@ -2,7 +2,7 @@
 
 Trains as FOLDER/mapping.json says. FOLDER/faults.json holds [restart, rank, update, fault, target] rows: in that start,
 that rank sends a signal (its number) at that update to itself (target self) or to torchrun (launcher), meets an error
-of its own ("error"), or gets other weights ("weights").
+of its own ("error"), misses its data ("storage"), or gets other weights ("weights").
 Keeps what this rank saw: FOLDER/gradients_RANK.pt of the first update, FOLDER/end_RANK.pt with the weights, the update
 and the exit code, FOLDER/starts_RANK with the update of each start, FOLDER/talk_RANK.json with the updates at which
 ranks talked of anything but gradients.
@@ -17,6 +17,7 @@ from typing import Any
 import torch
 
 from hgn import train
+from hgn.data.storage import StorageError
 from hgn.schema import ConfigError
 from hgn.training.module import TrainingModule
 from hgn.training.torch_updates import TorchUpdates
@@ -46,6 +47,8 @@ def main(folder):
     def at_update(module, *_):
         nonlocal update
         update = module.update + 1
+        if faults.get(module.update, (None,))[0] == "storage":
+            raise StorageError("the data stay away")
 
     def at_start(module):
         with (folder / f"starts_{rank}").open("a") as file:

@@ -365,13 +365,13 @@ GPUS = (pytest.mark.multigpu, pytest.mark.skipif(torch.cuda.device_count() < 2, 
 @pytest.mark.parametrize(
     ("device", "fault", "failing"),
     [
-        ("cpu", "weights", 1),
+        *(("cpu", fault, rank) for fault, rank in (("weights", 1), ("storage", 0), ("storage", 1))),
         *(pytest.param("cuda", fault, rank, marks=GPUS) for fault in ("error", "weights") for rank in (0, 1)),
     ],
 )
 def test_no_rank_waits_for_one_that_fails(data, no_launcher, warm_python, tmp_path, device, fault, failing):
-    """Two ranks of Lightning's own launcher end where one of them meets an error of its own, and where one has other
-    weights, which the next log line finds."""
+    """Two ranks of Lightning's own launcher end where one of them meets an error of its own, where one has other
+    weights, which the next log line finds, and where one misses its data, which saves first."""
     options: dict[str, Any] = {"device": device, "backend": "torch", "devices": 2, "maximum_updates": 10**6}
     (tmp_path / "mapping.json").write_text(json.dumps(train_mapping(data, tmp_path / "run", **options)))
     (tmp_path / "faults.json").write_text(json.dumps([(0, failing, 3, fault, "self")]))
@@ -385,7 +385,10 @@ def test_no_rank_waits_for_one_that_fails(data, no_launcher, warm_python, tmp_pa
     )
     text = output(process)
     assert process.returncode != 0
-    assert ("this rank fails" if fault == "error" else "weights must be the same on all ranks, got others at") in text
+    texts = {"error": "this rank fails", "storage": "the data stay away"}
+    assert texts.get(fault, "weights must be the same on all ranks, got others at") in text
+    if fault == "storage":
+        assert read_checkpoint(tmp_path / "run/checkpoints/last.ckpt")["hgn"]["updates"] == 3
 
 
 @pytest.mark.parametrize(("local_rank", "expected"), [("0", []), ("1", [signal.SIGKILL])])

@@ -25,7 +25,7 @@ from hgn.export import export
 from hgn.runtime.rollouts import RolloutResult
 from hgn.schema import ConfigError, from_mapping
 from hgn.system.locks import locked
-from hgn.training import gradients, monitor
+from hgn.training import gradients, monitor, session
 from hgn.training.callbacks import LogLines
 from hgn.training.checkpoint import LAST_NAMES, Progress, read_checkpoint
 from hgn.training.data_module import EpisodeDataModule
@@ -127,6 +127,15 @@ def test_a_scene_that_diverges_leaves_the_others_measured(data, run, monkeypatch
     assert (last["rollout/finished"], last["rollout/frames"]) == (0.5, 2.0)
     assert all(math.isfinite(value) for name, value in last.items() if name.startswith("rollout/mse"))
     assert (run / "pictures" / "rollout_000000001.png").is_file()
+
+
+def test_the_end_of_a_diverged_run_is_reported(make_config, run, capsys):
+    """Where the last measurement gave no ratio, the report names none."""
+    mapping = train_mapping(make_config(), run)
+    mapping.pop("name")
+    config = from_mapping(TrainConfig, mapping)
+    session._report(config, 3, {"one_step/validation": math.inf}, StopRequest())
+    assert "one-step validation MSE inf" in capsys.readouterr().out
 
 
 def test_updates_without_a_finite_gradient_are_skipped(data, run, monkeypatch):
