@@ -41,7 +41,7 @@ SENT = (
 )  # by viewers, besides the values of controls
 Process = Callable[[Any, Request], Response | None]
 # Viser keeps what it broadcasts under its key, and had one for each part of each upload
-messages.FileTransferPartAck.redundancy_key = (  # type: ignore[method-assign]
+messages.FileTransferPartAck.redundancy_key = (  # type: ignore[assignment, method-assign]
     lambda ack: f"{type(ack).__name__}-{zlib.crc32(ack.transfer_uuid.encode()) % 64}"
 )
 
@@ -62,8 +62,9 @@ def start_server(host: str, port: int, label: str) -> tuple[viser.ViserServer, s
         options["max_size"] = MAXIMUM_MESSAGE_BYTES
         return serve(*args, process_request=guarded(process_request, token), **options)
 
-    names = ("_handle_file_transfer_start", "_handle_file_transfer_part")
-    limits = mock.patch.multiple(GuiApi, **{name: bounded(getattr(GuiApi, name)) for name in names})
+    handlers = ("_handle_file_transfer_start", "_handle_file_transfer_part")
+    limited: dict[str, Any] = {name: bounded(getattr(GuiApi, name)) for name in handlers}
+    limits = mock.patch.multiple(GuiApi, **limited)
     unsaid = contextlib.redirect_stdout(io.StringIO())  # Viser's own lines have an address without the token
     with unsaid, limits, mock.patch.object(websockets.asyncio.server, "serve", guarded_serve):
         server = viser.ViserServer(host, port, label, verbose=False)
