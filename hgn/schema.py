@@ -68,10 +68,11 @@ _shown.maxlist = _shown.maxtuple = _shown.maxdict = _shown.maxset = 12
 
 
 class ConfigError(ValueError):
-    """An invalid value: the message names field, rule, value and remedy, as `printable`."""
+    """An invalid value: the message names field, rule, value and remedy, as `printable`; long ones without a middle."""
 
     def __init__(self, message: str) -> None:
-        super().__init__(printable(message))
+        message = printable(message)
+        super().__init__(message if len(message) <= 1400 else f"{message[:1000]} … {message[-350:]}")
 
 
 def printable(text: str) -> str:

@@ -6,13 +6,14 @@ import hashlib
 from pathlib import Path
 
 from hgn.schema import ConfigError
+from hgn.system.files import open_at_once
 
 _verified: set[tuple[str | int, ...]] = set()  # identities of the files that this process has verified
 
 
 def file_sha256(path: Path) -> str:
     """Returns the sha256 of a file in hexadecimal."""
-    with path.open("rb") as file:
+    with open_at_once(path) as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 

@@ -247,7 +247,13 @@ class PlaySession:
         return self.add_obstacle(ObstacleEntry(mesh=path.name, scale=scale, position=(x, y, z)), path.parent)
 
     def move_obstacle(self, moved: PlacedObstacle) -> None:
-        """The obstacle of the same body is there from now on; nothing happens where it was removed."""
+        """The obstacle of the same body is there from now on; nothing happens where it was removed.
+
+        Raises: ConfigError for a place or an angle that is not finite, or far outside the domain.
+        """
+        reach, angles = 10 * max(self.domain_size), moved.rotation
+        inside = all(abs(value) <= reach for value in moved.position) and all(map(math.isfinite, angles))
+        require(inside, "obstacle", f"within {reach:g} of the origin, at finite angles", [*moved.position, *angles])
         self._set_obstacles(tuple(moved if o.body is moved.body else o for o in self.obstacles))
 
     def remove_obstacle(self, number: int) -> None:

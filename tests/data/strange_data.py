@@ -2,6 +2,7 @@
 
 import io
 import json
+import os
 import struct
 import zipfile
 
@@ -333,9 +334,24 @@ def used(folder):
     return list(store.entries), store.manifest.quarantined
 
 
+def piped(name):
+    """A pipe in the place of a file."""
+
+    def make(folder):
+        Manifest(identity_hash({}), {}, {"train": 1}, 1, ListedIndex([shard(0)])).save(folder)
+        (path,) = folder.rglob(name)
+        path.unlink()
+        os.mkfifo(path)
+        return folder
+
+    return make
+
+
 cases(
     "manifest",
     {
+        "pipe": piped("manifest.json"),
+        "pipe of the index": piped("*-000000.jsonl"),
         "episodes": manifest(totals(episodes=10**12), config={"frames": 6}, config_hash=identity_hash({"frames": 6})),
         "shards": manifest(totals(episodes=10**12, shards=10**12)),
         "bytes of a segment": manifest(state(segment_bytes=10**12)),

@@ -265,6 +265,7 @@ cases(
         "stride 0": glb(stride_0),
         "targets": glb(targets),
         "sparse instances": glb(sparse_instances),
+        "long names": glb(lambda header: header.update(extensionsRequired=[f"x{n}" for n in range(100_000)])),
         "no buffers": glb(lambda header: header.pop("buffers")),
         "no such buffer": glb(lambda header: header["bufferViews"][0].update(buffer=-7)),
         "views that are text": glb(lambda header: header.update(bufferViews="abc")),

@@ -5,6 +5,7 @@ seconds of a core, and prints how that ended.
 import json
 import os
 import resource
+import signal
 import sys
 import tempfile
 import traceback
@@ -26,6 +27,7 @@ def outcome(name, folder):
     if child == 0:
         os.close(reader)
         resource.setrlimit(resource.RLIMIT_CPU, (CPU_S, CPU_S))
+        signal.alarm(60)  # for what waits instead
         resource.setrlimit(resource.RLIMIT_DATA, (MEMORY_BYTES, MEMORY_BYTES))
         try:
             CASES[name](folder)

@@ -7,7 +7,6 @@ import functools
 import json
 import math
 import operator
-from pathlib import Path
 
 import pytest
 from written_files import first_release
@@ -20,6 +19,7 @@ from hgn.data.manifest import EpisodeEntry, Manifest, QuarantinedScene, ShardEnt
 from hgn.data.reader import EpisodeStore
 from hgn.data.statistics import Moments, Statistics
 from hgn.schema import ConfigError
+from hgn.system import files
 
 
 def make_manifest():
@@ -68,15 +68,15 @@ def test_identity(make_config):
 def test_manifest_that_is_replaced_while_it_is_read(make_config, folder, monkeypatch):
     """On NFS a file that another machine has replaced is lost to whoever had opened it: reader, writer and service read
     the one in its place."""
-    real, lost = Path.read_bytes, 0
+    real, lost = files.open_at_once, 0
 
-    def read_bytes(path):
+    def opened(path):
         nonlocal lost
         if path.name == "manifest.json" and (lost := lost + 1) % 3:
             raise OSError(errno.ESTALE, "Stale file handle")
         return real(path)
 
-    monkeypatch.setattr(Path, "read_bytes", read_bytes)
+    monkeypatch.setattr(files, "open_at_once", opened)
     assert Manifest.load(folder).complete
     with DatasetWriter(make_config()) as writer:
         assert writer.complete

@@ -98,6 +98,10 @@ def weights(name):
     return lambda page: page._use(name)
 
 
+def moved(**place):
+    return lambda page: page.session.move_obstacle(replace(page.session.obstacles[0], **place))
+
+
 INFINITE, NAN, LISTED = float("inf"), float("nan"), "weights must be one of floating, other"
 REFUSED = [
     (file("x\0y.obj", TRIANGLES), "null"),
@@ -108,6 +112,8 @@ REFUSED = [
     (file("x.obj", bytes(MAXIMUM_UPLOAD_BYTES + 1)), "at most 64 MiB"),
     *((click(*ray), "ray") for ray in ((0.0, 0.0, 0.0), (NAN, 0.0, 1.0), (INFINITE, 0.0, 0.0))),
     *((gravity(*value), "gravity") for value in ((NAN, 0.0, 0.0), (0.0, INFINITE, 0.0), (0.0, 1e30, 0.0))),
+    *((moved(position=value), "obstacle") for value in ((NAN, 0.0, 0.0), (0.0, 1e30, 0.0), (0.0, 0.0, -INFINITE))),
+    (moved(rotation=(0.0, NAN, 0.0)), "obstacle"),
     *((weights(name), LISTED) for name in ("/etc/passwd", "hf://someone/weights", "../weights", "")),
 ]
 
