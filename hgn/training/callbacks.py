@@ -100,7 +100,7 @@ class Checkpoints(Callback):
             self.save_last(trainer, _update(pl_module))
 
     def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
-        """Saves before a training ends because its data stay unreachable. Each rank that misses them saves, because it is
+        """Saves before a training ends because its data stay unreachable. Each rank that misses them saves, since it is
         between two updates, while the others wait inside one.
         """
         if isinstance(exception, (StorageError, OSError)) and self._saved_update != _update(pl_module) > 0:
