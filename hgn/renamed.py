@@ -88,6 +88,7 @@ REMOVED: dict[str, Removed] = {
     "training.noise_weight_power": Removed(2.0),
     "training.quiet_weight": Removed(4.0),
     "evaluate.particles_per_batch": Removed(32_768),
+    "bench.public_gns": Removed(remedy="commit e7e6c37 is the last with it"),
     "bench.rounds": Removed(50, "set seconds for a shorter measurement"),
     "scaling.rounds": Removed(20, "set seconds for a shorter measurement"),
     "render.gif": Removed(True, "give a file that ends in .png as out for a picture without animation"),

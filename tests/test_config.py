@@ -97,7 +97,6 @@ RULES = {
         ({"particles": [0]}, r"particles\[0\] must be at least 1"),
         ({"precisions": ["fp8"]}, r"precisions\[0\] must be one of fp32, tf32, fp16"),
         ({"seconds": 0}, "seconds must be a finite number > 0"),
-        ({"cases": ["public_gns_train"]}, "public_gns must be a folder with the public code for public_gns_train"),
     ],
     command(CurvesConfig, out="curves"): [({"runs": ["a/x", "b/x"]}, "runs must be folders of different names")],
     command(ErrorVsTimeConfig, data="d", out="o"): [

@@ -8,7 +8,6 @@ from __future__ import annotations
 import functools
 import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -21,7 +20,6 @@ from hgn.system.progress import bar
 from tools import report
 from tools.bench.config import CASES, FRAME_CASES, TRAIN_CASES, BenchConfig
 from tools.bench.contenders import Contender, Frame, MpmFrame, Train, checked_workload
-from tools.bench.public_gns import PublicFrame, PublicTrain
 from tools.bench.states import TILE_PARTICLES, Workload
 from tools.bench.triton_contenders import TritonFrame, TritonTrain
 from tools.report import EXIT_RED, PASS
@@ -131,9 +129,6 @@ def _maker(
 ) -> tuple[Callable[..., Contender], str | None]:
     """Returns the class of a contender, and the name of its backend if it is an HGN."""
     frame = case in FRAME_CASES
-    if case.startswith("public"):
-        assert config.public_gns is not None  # checked by BenchConfig
-        return functools.partial(PublicFrame if frame else PublicTrain, Path(config.public_gns)), None
     if case in ("frame", "train") and triton_unsupported_reason(device, config.network, precision) is None:
         return TritonFrame if frame else TritonTrain, "triton"
     backend = None if "gns" in case else "cpu" if case == "frame" and device.type == "cpu" else "torch"
@@ -145,7 +140,6 @@ def _wanted(config: BenchConfig, device: torch.device, precision: str, cases: tu
     triton = triton_unsupported_reason(device, config.network, precision) is None
     if precision == "fp16":
         return [case for case in ("frame", "train") if triton and case in cases and case in (config.cases or CASES)]
-    left_out = set() if config.public_gns else {"public_gns_frame", "public_gns_train"}
-    left_out |= set() if triton or device.type == "cpu" else {"torch_frame"}  # the same as frame
+    left_out = set() if triton or device.type == "cpu" else {"torch_frame"}  # the same as frame
     left_out |= set() if triton else {"torch_train"}
     return [case for case in cases if (case in config.cases if config.cases else case not in left_out)]

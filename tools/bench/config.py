@@ -8,8 +8,8 @@ from hgn.config import PRECISIONS, NetworkConfig
 from hgn.schema import OneOrMore, Positive, require, require_bounds
 from tools.report import ReportConfig
 
-FRAME_CASES = ("frame", "torch_frame", "gns_frame", "public_gns_frame", "mpm_frame")
-TRAIN_CASES = ("train", "torch_train", "gns_train", "public_gns_train")
+FRAME_CASES = ("frame", "torch_frame", "gns_frame", "mpm_frame")
+TRAIN_CASES = ("train", "torch_train", "gns_train")
 CASES = (*FRAME_CASES, *TRAIN_CASES)
 
 
@@ -17,8 +17,8 @@ CASES = (*FRAME_CASES, *TRAIN_CASES)
 class BenchConfig(ReportConfig):
     """The options of `python -m tools.bench`."""
 
-    # frame, train (the fastest backend), torch_frame, torch_train, gns_frame, gns_train, public_gns_frame,
-    # public_gns_train, mpm_frame (the solver); null: all that differ on this machine
+    # frame, train (the fastest backend), torch_frame, torch_train, gns_frame, gns_train, mpm_frame (the solver);
+    # null: all that differ on this machine
     cases: tuple[str, ...] | None = None
     particles: tuple[OneOrMore, ...] | None = None  # of a scene; null: 4296, 40000, 400000 on a GPU, 4296 on a CPU
     # scenes side by side, with the smallest number of particles; null: 1, 8, 32 on a GPU, 1 on a CPU
@@ -26,7 +26,6 @@ class BenchConfig(ReportConfig):
     # fp32, tf32, fp16 (backend triton); null: tf32 and fp16 on a GPU, fp32 on a CPU
     precisions: tuple[str, ...] | None = None
     network: NetworkConfig = field(default_factory=NetworkConfig)  # GNS has its width, and 10 steps
-    public_gns: str | None = None  # a folder with a copy of github.com/geoelements/gns, which needs PyTorch Geometric
     # after which contenders that take turns are sampled no more, but five times at least and 50 times at most
     seconds: Positive[float] = 20.0
 
@@ -36,9 +35,6 @@ class BenchConfig(ReportConfig):
             for i, value in enumerate(getattr(self, name) or ()):
                 require(value in known, f"{name}[{i}]", f"one of {', '.join(known)}", value)
         require(self.network.kind == "hgn", "network.kind", "hgn", self.network.kind)
-        for case in self.cases or ():
-            given = self.public_gns is not None or not case.startswith("public")
-            require(given, "public_gns", f"a folder with the public code for {case}", None)
 
     @property
     def gns(self) -> NetworkConfig:
