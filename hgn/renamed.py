@@ -92,6 +92,7 @@ REMOVED: dict[str, Removed] = {
     "bench.rounds": Removed(50, "set seconds for a shorter measurement"),
     "scaling.rounds": Removed(20, "set seconds for a shorter measurement"),
     "render.gif": Removed(True, "give a file that ends in .png as out for a picture without animation"),
+    "stability_network.picture": Removed(remedy="leave it out: python -m tools.render draws scenes"),
     "stability_solver.picture": Removed(remedy="leave it out: make docs draws it from the JSON"),
     "render.fps": Removed(remedy="leave it out: animations play in real time"),
     "upload.follow": Removed(remedy="run the command again, as with watch -n 60: it copies what is new"),
@@ -105,6 +106,7 @@ REMOVED |= {f"network.{key}": Removed(remedy=f"write step.{key}") for key in STE
 # Removed values of settings and config groups, by the last part of the key, and the remedy.
 _GNS_PARTICLES = {"gns_particles": LAST_COMMIT}
 REMOVED_CHOICES: dict[str, dict[Any, str]] = {
+    "cases": {name: "cases=[gallery] has such scenes" for name in ("apart", "hole")},
     "kind": _GNS_PARTICLES,
     "network": _GNS_PARTICLES,
     "experiment": _GNS_PARTICLES,

@@ -72,16 +72,6 @@ def compare_picture(
     return picture
 
 
-def stacked(pictures: Sequence[Image.Image]) -> Image.Image:
-    """Returns one picture with the given ones below each other."""
-    size = max(picture.width for picture in pictures), sum(picture.height for picture in pictures)
-    whole, y = Image.new("RGB", size, _background()), 0
-    for picture in pictures:
-        whole.paste(picture, (0, y))
-        y += picture.height
-    return whole
-
-
 def animate(
     rollout: Rollout,
     path: str | Path,

@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
 from network.states import network_of
 from runtime.stability import family, one_particle, outcome_of
 
@@ -15,9 +14,9 @@ from hgn.scene.obstacle_grid import ObstacleGrid
 from tools.measures import neighbours
 from tools.stability.case import Case, Limit, Outcome
 from tools.stability.checks import row_of, violation
-from tools.stability.measures import STIR_FRAMES, energy_growth, energy_rise, far_effect, kinetic_change, passed, pull
+from tools.stability.measures import STIR_FRAMES, energy_growth, energy_rise
 from tools.stability.network import Runner
-from tools.stability.network_cases import PASSES, RESTS, SPREADS
+from tools.stability.network_cases import RESTS, SPREADS
 
 CPU = MpmConfig(device="cpu")
 SCENE = {"obstacle_count": 1, "obstacle_size": [0.1, 0.2]}
@@ -65,70 +64,6 @@ def test_collapse_beside_the_solver():
         assert f"collapse.{field} (scene" in str(failure(SPREADS[2:4], {"collapse": other}, {"collapse": truth}))
 
 
-@pytest.mark.parametrize(
-    ("through", "leaked", "beyond"),
-    [
-        (0.7, 0.0, None),
-        (0.55, 0.15, None),
-        (0.55, 0.4, "passed.leaked (hole_cells 2.0) 0.4, must be at most 0.15 (solver 0.1)"),
-        (0.1, 0.0, "passed.through (hole_cells 2.0) 0.1, must be 0.5 to 0.9 (solver 0.7)"),
-        (1.0, 0.0, "passed.through (hole_cells 2.0) 1, must be 0.5 to 0.9 (solver 0.7)"),
-        (0.1, 0.6, "passed.through (hole_cells 2.0) 0.1, must be 0.5 to 0.9 (solver 0.7)"),
-    ],
-)
-def test_holes_beside_the_solver(through, leaked, beyond):
-    """Particles that cross the edge's height within the hole pass, others leak, and those that come back do neither.
-    At most a fifth of all may pass more or less than with the solver, and a twentieth more leak."""
-    still_N3 = np.zeros((20, 3), np.float32)
-    scene = one_particle(
-        position_N3=still_N3 + np.float32(0.5), velocity_N3=still_N3, material_N=np.zeros(20, np.uint8)
-    )
-
-    def falls(through, leaked):
-        """Through the hole at 0.4 and then far aside; or past it and then to the middle; or in and out again."""
-        path_TN3 = np.stack([scene.position_N3] * 4)
-        ways = [[(0.52, 0.3), (0.9, 0.1), (0.9, 0.1)], [(0.6, 0.3), (0.5, 0.1), (0.5, 0.1)]]
-        ways.append([(0.5, 0.3), (0.5, 0.6), (0.5, 0.6)])
-        first, second = round(20 * through), round(20 * (through + leaked))
-        for axes, some, way in zip(
-            ((0, 1), (2, 1), (0, 1)), np.split(np.arange(20), (first, second)), ways, strict=True
-        ):
-            path_TN3[np.ix_((1, 2, 3), some, axes)] = np.array(way)[:, None]
-        return RolloutResult(path_TN3)
-
-    limits = PASSES[2:4]  # these particles fall faster than gravity says
-    case = Case("holes", (scene,) * 2, 4, limits, also=("pull",), hole_cells=(1.0, 2.0), hole_height=0.4)
-    own, solvers = [falls(0.0, 0.0), falls(through, leaked)], [falls(0.1, 0.0), falls(0.7, 0.1)]
-    row = row_of(outcome_of(case, own, solver=solvers), {})
-    hole = row.more["passed"][1]
-    assert hole == {"hole_cells": 2.0, "through": pytest.approx(through), "leaked": pytest.approx(leaked)}
-    assert row.held == (beyond is None) and (row.held or row.beyond == beyond)
-    assert row.more["pull"] == row.more["solver_pull"] == [None, None]  # four frames are fewer than a history
-    early = [own[0], RolloutResult(own[1].position_TN3[:3], "diverged at frame 3")]
-    row = row_of(outcome_of(case, early, solver=solvers), {})
-    assert not row.held and row.beyond == "diverged at frame 3" and row.more["passed"] is None
-    row = row_of(outcome_of(case, own, solver=early), {})
-    assert not row.held and row.beyond == "passed: the solver did not come to the end"
-    assert passed(outcome_of(case, early)) is None
-
-
-def test_pull_in_a_hole():
-    """Only particles in the hole of the solver's trajectory count: without contacts the network's fall with gravity,
-    whatever its parameters; the solver's hung there, or fell at half the acceleration."""
-    free = network_of(torch.float32, inputs="relative", obstacle_features=False)
-    place_N3 = np.array([[0.5, 0.4, 0.49], [0.51, 0.405, 0.5], [0.5, 0.6, 0.5], [0.8, 0.4, 0.5]], np.float32)
-    scene = one_particle(position_N3=place_N3, velocity_N3=0 * place_N3, material_N=np.zeros(4, np.uint8))
-    case = Case("passes holes", (scene,) * 2, 20, hole_cells=(2.0, 2.0), hole_height=0.4)
-    fall_T = 0.5 * scene.gravity[1] / 60**2 * np.arange(20.0) ** 2
-    paths = [np.stack([place_N3] * 20), np.stack([place_N3] * 20)]
-    paths[1][:, :2, 1] += (0.5 * (fall_T - fall_T[10]))[:, None]
-    films = [RolloutResult(path) for path in paths]
-    outcome = outcome_of(case, films, Simulator(free, 60.0), films)
-    assert pull(outcome) == [pytest.approx(1, abs=1e-3)] * 2
-    assert outcome.solver is not None
-    assert pull(outcome.solver) == [pytest.approx(0, abs=1e-3), pytest.approx(0.5, abs=1e-3)]
-
-
 def test_energy_growth_against_a_closed_form():
     """Free fall from rest adds no energy; a sudden throw upwards adds that of its speed."""
     scene = one_particle()
@@ -139,39 +74,18 @@ def test_energy_growth_against_a_closed_form():
     assert found == [pytest.approx(0, abs=1e-4), pytest.approx(0.5 * 1.4**2 / 9.8, rel=5e-3), 0]
 
 
-def test_energy_rise_and_kinetic_change():
-    """Energy that was lost and comes back is a rise, but no growth; kinetic energy may neither grow nor shrink."""
+def test_energy_rise():
+    """Energy that was lost and comes back is a rise, but no growth."""
     scene, time_T = one_particle(), np.arange(21) / 60
     scene = one_particle(velocity_N3=np.array([[2.0, 0.0, 0.0]], np.float32))
     case, fall_T = Case("single", (scene,), 21), -0.5 * 9.8 * time_T**2
-    for middle, rise, change in ((2.0, 0.0, 0.0), (1.0, 1.5 / 9.8, -0.75), (3.0, 2.5 / 9.8, 1.25)):
+    for middle, rise in ((2.0, 0.0), (1.0, 1.5 / 9.8), (3.0, 2.5 / 9.8)):
         speed_T = np.where(np.arange(20) // 7 == 1, middle, 2.0)
         x_T = np.concatenate([[0.0], np.cumsum(speed_T) / 60])
         path_TN3 = np.stack([x_T, 0 * x_T, 0 * x_T], axis=1)[:, None] + scene.position_N3
-        found = outcome_of(case, [RolloutResult(path_TN3.astype(np.float32))])
-        assert kinetic_change(found) == pytest.approx(change, abs=1e-3)
         path_TN3[..., 1] += fall_T[:, None]
         found = outcome_of(case, [RolloutResult(path_TN3.astype(np.float32))])
         assert energy_rise(found) == pytest.approx(rise, abs=2e-3)
-
-
-def test_bodies_apart():
-    """Passing bodies start PASSING_GAP apart and are level in the middle of the case; a push of the far body shows."""
-    passing, far = family("apart", network_of(materials=("snow",)).config)
-    (scene,) = passing.scenes
-    half = len(scene.position_N3) // 2
-    ways = [scene.position_N3[own].astype(np.float64) for own in (slice(half), slice(half, None))]
-    assert ways[1][:, 0].min() - ways[0][:, 0].max() == pytest.approx(0.14, abs=2e-3)
-    middles = [w.mean(axis=0) + passing.frames / 120 * scene.velocity_N3[k] for w, k in zip(ways, (0, -1), strict=True)]
-    assert middles[0][2] == pytest.approx(middles[1][2], abs=5e-3)
-    count = far.scenes[0].particle_count
-    assert (far.scenes[1].position_N3[:count] == far.scenes[0].position_N3).all()
-    films = [RolloutResult(np.stack([each.position_N3] * far.frames)) for each in far.scenes]
-    assert far_effect(outcome_of(far, films)) == 0.0 and row_of(outcome_of(far, films), {}).held
-    pushed_TN3 = films[1].position_TN3.copy()
-    pushed_TN3[-1, :count, 0] += 0.5 / 64
-    pushed = outcome_of(far, [films[0], RolloutResult(pushed_TN3)])
-    assert far_effect(pushed) == pytest.approx(0.5, rel=1e-3) and not row_of(pushed, {}).held
 
 
 @pytest.mark.parametrize(

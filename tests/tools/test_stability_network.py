@@ -8,7 +8,6 @@ import pytest
 import torch
 from docs.pages import run_module
 from network.states import network_of, silent
-from PIL import Image
 from runtime.stability import family, one_particle, outcome_of, still_weights
 
 from hgn.config import MpmConfig, SceneConfig
@@ -36,11 +35,9 @@ def test_every_case_has_a_row(tmp_path, monkeypatch, capsys):
         monkeypatch.setattr(network_cases, name, value)
     monkeypatch.setattr(network_cases, "TURNED_FRAMES", 3)
     monkeypatch.setattr(network_cases, "MEETING_FRAMES", 12)
-    path, picture = tmp_path / "reports" / "stability.json", tmp_path / "reports" / "stability.png"
+    path = tmp_path / "reports" / "stability.json"
     weights = still_weights(tmp_path, materials=("sand",))
-    assert main(SMALL | {"weights": weights, "json": str(path), "picture": str(picture)}) == 0
-    with Image.open(picture) as drawn:
-        assert drawn.height > 6 * 300
+    assert main(SMALL | {"weights": weights, "json": str(path)}) == 0
     report = json.loads(path.read_text())
     assert {"device", "versions", "commit", "date", "command", "config"} <= report["meta"].keys()
     rows = {row["case"]: row for row in report["rows"]}
@@ -48,14 +45,11 @@ def test_every_case_has_a_row(tmp_path, monkeypatch, capsys):
     turned = [f"to rest in gravity along {way}" for way in ("-x", "-z")]
     families = (flights, [*(f"gravity {kind}" for kind in GRAVITIES), *turned], ["two bodies meet without gravity"])
     motion = [f"{case}, sand" for some in families for case in some]
-    apart = [f"{case}, sand" for case in ("two bodies pass without contact", "alone and with a far body")]
     rests, singles = ["5 frames, sand"], ["single particle, sand"]
     slopes = [f"slides down {angle} degrees, sand" for angle in (15, 30, 45)]
     thrown = f"thrown at up to {8 * (2 * 9.8) ** 0.5:.1f} a second"
     held = ["particles x10", "domain x4", "at the end of 64000 cells"]
-    assert list(rows) == [
-        *motion, *apart, *rests, *held[:2], thrown, *singles, *slopes, held[2], "a weight that explodes"
-    ]  # fmt: skip
+    assert list(rows) == [*motion, *rests, *held[:2], thrown, *singles, *slopes, held[2], "a weight that explodes"]
     assert all(rows[f"{case}, sand"]["measured"] == pytest.approx(1.0, rel=1e-3) for case in flights)
     assert rows["thrown at 0.1 a second, sand"]["kept"] == pytest.approx(1.0, abs=1e-3)
     assert not any(rows[name]["held"] for name in motion if "none" not in name and rows[name]["measured"] != "refused")
@@ -106,7 +100,7 @@ def rows_of(model, names, **scene):
     config = replace(simulator.network.config, materials=("sand",))
     cases = [case for name in names for case in family(name, config, solver=False, **({"group_size": 0.04} | scene))]
     runner = Runner(simulator, cases, None)
-    return {case.name: runner.rows(case)[0][0] for case in cases}
+    return {case.name: runner.rows(case)[0] for case in cases}
 
 
 def test_flight_against_its_closed_form():
@@ -160,40 +154,6 @@ def test_flight_ends_before_the_walls():
                 assert ((place_N3 > 0.07) & (place_N3 < 0.93)).all() == clear or last == 60
 
 
-def test_bodies_apart_keep_their_energy():
-    """Exact motion keeps the energy of passing bodies; a drag or a push does not pass."""
-    for factor, drag in ((1.0, 0.0), (1.0, 0.005), (1.0, -0.001)):
-        row = rows_of(Repeats(factor, drag), ("apart",))["two bodies pass without contact, sand"]
-        assert row.held is (drag == 0.0) and (row.held or np.sign(row.measured) == -np.sign(drag)), row
-
-
-def test_funnels_have_holes_of_the_given_width():
-    """Sheets leave a square hole at the height where particles are counted, with a cube above it that keeps the
-    clearance. Without the solver, obstacles in the input, or enough frames there is no such case."""
-    config = network_of(cell_size=0.03).config
-    made = family("hole", config, domain_size=(1.5, 1.0, 2.0))
-    loads = ("passes holes", "passes holes under load")
-    assert [case.name for case in made] == [f"{load}, {name}" for name in MATERIAL_NAMES for load in loads]
-    light, heavy = (case.scenes[0].particle_count for case in made[:2])
-    assert heavy == pytest.approx(1.5**3 * light, rel=1e-2)
-    assert all(case.solver and case.frames == 150 for case in made)
-    for cells, scene in zip(made[0].hole_cells, made[0].scenes, strict=True):
-        middle_3 = 0.5 * np.array(scene.domain_size)
-        for sheet in scene.obstacles:
-            corner_43 = sheet.vertex_V3 - middle_3
-            lowest_23 = corner_43[np.argsort(corner_43[:, 1])[:2]]
-            assert middle_3[1] + lowest_23[:, 1] == pytest.approx(made[0].hole_height, abs=1e-6)
-            # an edge of the hole: across its axis at half the hole's width, and beyond the hole along it
-            aside_23 = np.sort(np.abs(lowest_23[:, [0, 2]]), axis=1)
-            assert aside_23 == pytest.approx(np.tile([0.5 * cells * 0.03, 0.18], (2, 1)), abs=1e-6)
-            plane_3 = np.cross(corner_43[1] - corner_43[0], corner_43[2] - corner_43[0])
-            off_N = (scene.position_N3 - middle_3 - corner_43[0]) @ (plane_3 / np.linalg.norm(plane_3))
-            assert np.abs(off_N).min() > 2 * scene.cell_size and abs(np.sign(off_N).sum()) == len(off_N)
-        assert scene.position_N3.mean(axis=0)[[0, 2]] == pytest.approx(middle_3[[0, 2]], abs=5e-3)
-    assert not family("hole", network_of(obstacle_features=False).config)
-    assert not family("hole", config, frames=149) and not family("hole", config, solver=False)
-
-
 @pytest.mark.parametrize(("wind", "held"), [(0.0, True), (-1e-3, False)])
 def test_turned_gravity(wind, held, monkeypatch):
     """A hanging body is as far from a fall whichever way gravity points; with a wind along y it is not."""
@@ -209,7 +169,7 @@ def test_turned_gravity(wind, held, monkeypatch):
     config = replace(network_of().config, materials=("snow",))
     turned = [case for case in family("gravity", config, group_size=0.03) if case.upright]
     runner = Runner(simulator_of(Repeats(0.0, 0.0, wind)), turned, CPU)
-    rows = [runner.rows(case)[0][0] for case in turned]
+    rows = [runner.rows(case)[0] for case in turned]
     assert [row.held for row in rows] == [held] * 2 and calls == [8]  # both share the upright scenes
     assert not held or rows[0].measured == pytest.approx(1.0, rel=1e-3)
 
@@ -239,7 +199,7 @@ def test_failures_are_reported():
     case = Case("single", (one_particle(),), 16, WAY, known_3=GRAVITY, known_frames=12)
 
     def row(case):
-        return Runner(simulator, [case], None).rows(case)[0][0]
+        return Runner(simulator, [case], None).rows(case)[0]
 
     assert row(case).held and row(case).more["share_of_way"] == pytest.approx(1, rel=1e-3)
     push[0] = 1e-2

@@ -48,8 +48,6 @@ class Case:
     known_3: tuple[float, float, float] | None = None  # acceleration of the particles in the first `known_frames`
     known_frames: int = 0
     at_frames: tuple[int, ...] = ()  # frames in which `collapse` is measured
-    hole_cells: tuple[float, ...] = ()  # width of each scene's hole, in the network's finest cells
-    hole_height: float = 0.0  # of the holes' edges
     settled: int = 0  # frame from which on all particles rest
     upright: tuple[Scene, ...] = ()  # the scenes before they were turned
     gallery: GalleryCase | None = None  # the file of a gallery scene, which has bounds instead of limits

@@ -107,7 +107,7 @@ def _values(figure: Any, field: str) -> Iterator[tuple[str, float]]:
         if not isinstance(record, dict):
             yield "", record
         elif record[field] is not None:
-            places = [f"{key} {record[key]}" for key in ("scene", "frame", "hole_cells") if key in record]
+            places = [f"{key} {record[key]}" for key in ("scene", "frame") if key in record]
             yield f" ({', '.join(places)})" if places else "", record[field]
 
 

@@ -7,11 +7,9 @@ Shape legend: T frames, N particles.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
-import torch
 
 from hgn.network.relative import CONTACT_REACH_CELLS
 from hgn.runtime.rollouts import RolloutResult
@@ -21,8 +19,6 @@ from tools.measures import energies, energy_scale, neighbours, outside_domain
 from tools.stability.case import Outcome
 
 EARTH = 9.8  # domain units per second squared
-HOLE_MARGIN_CELLS = 0.5  # of the solver: the contact band of a hole's sheets still counts as the hole
-PULLED_CELLS, PULLED_EVERY = 0.3, 5  # finest cells within which a particle is in the hole; stride of frames
 STIR_FRAMES = 60  # at the end, over which the squared speed at rest is averaged
 TURNS = {"-x": (1, 0, 2), "-z": (0, 2, 1)}  # exchanges of axes that turn upright gravity
 
@@ -53,29 +49,6 @@ def energy_rise(outcome: Outcome) -> float:
             rise = float((energy_T - np.minimum.accumulate(energy_T)).max())
             rises.append(rise / energy_scale(gravity_3, scene.domain_size))
     return max(rises)
-
-
-def kinetic_change(outcome: Outcome) -> float:
-    """Returns the largest change of the kinetic energy, free of gravity and contact, as a fraction of the first."""
-    changes = []
-    for trial, scene in zip(outcome.trials, outcome.scenes, strict=True):
-        started = float((scene.velocity_N3.astype(np.float64) ** 2).sum(axis=1).mean())
-        energy_T = 2 * outcome.frame_rate_hz**2 * energies(trial.position_TN3, np.zeros(3))
-        changes.append(energy_T[np.abs(energy_T - started).argmax()] / started - 1)
-    return float(max(changes, key=abs))
-
-
-def far_effect(outcome: Outcome) -> float | None:
-    """Returns the largest root mean square distance, in obstacle cells, between a body alone and with another far away.
-
-    The first scene contains the body, the second one also the other.
-    """
-    if not outcome.complete:
-        return None
-    (alone, together), scene = outcome.trials, outcome.scenes[0]
-    own = slice(len(scene.position_N3))
-    way_TN3 = together.position_TN3[:, own].astype(np.float64) - alone.position_TN3
-    return float(np.sqrt(np.square(way_TN3).sum(axis=2).mean(axis=1)).max()) / scene.obstacle_grid.cell_size
 
 
 def outside(outcome: Outcome) -> float:
@@ -212,57 +185,6 @@ def collapse(outcome: Outcome) -> list[dict[str, float]] | None:
     return rows
 
 
-def passed(outcome: Outcome) -> list[dict[str, float]] | None:
-    """Returns the fractions of each scene's particles that end below the edge of its hole.
-
-    `through` counts those that first crossed this height within the hole, `leaked` all others.
-    """
-    if not outcome.complete:
-        return None
-    case, rows = outcome.case, []
-    for cells, trial, scene in zip(case.hole_cells, outcome.trials, outcome.scenes, strict=True):
-        below_TN = trial.position_TN3[..., 1] < case.hole_height
-        passed_N = np.flatnonzero(below_TN[-1])
-        crossed_N = below_TN[:, passed_N].argmax(axis=0)
-        before_N3, after_N3 = (trial.position_TN3[crossed_N - i, passed_N].astype(np.float64) for i in (1, 0))
-        way_N1 = (case.hole_height - before_N3[:, 1:2]) / (after_N3 - before_N3)[:, 1:2]
-        aside_N3 = np.abs(before_N3 + way_N1 * (after_N3 - before_N3) - 0.5 * np.array(scene.domain_size))
-        finest = outcome.simulator.network.config.cell_size
-        half = 0.5 * cells * finest + HOLE_MARGIN_CELLS * scene.obstacle_grid.cell_size
-        within_N = (aside_N3[:, [0, 2]] <= half).all(axis=1)
-        through, leaked = (float(some_N.sum() / below_TN.shape[1]) for some_N in (within_N, ~within_N))
-        rows.append({"hole_cells": cells, "through": through, "leaked": leaked})
-    return rows
-
-
-def pull(outcome: Outcome) -> list[float | None]:
-    """Returns the mean acceleration along gravity, in gravities, of the particles in each scene's hole.
-
-    The particles are those of the solver's trajectory; a network predicts one frame from each of its states. None if
-    the hole is empty. The figure says by how much a body passes the hole, or fails to.
-    """
-    solver, simulator, case = outcome.solver or outcome, outcome.simulator, outcome.case
-    finest, history = simulator.network.config.cell_size, simulator.network.config.velocity_history
-    means: list[float | None] = []
-    for cells, scene, trial in zip(case.hole_cells, outcome.scenes, solver.trials, strict=True):
-        position_TN3 = torch.from_numpy(trial.position_TN3).to(simulator.device)
-        aside_TN3 = (position_TN3 - 0.5 * torch.tensor(scene.domain_size).to(position_TN3)).abs()
-        within_TN = (aside_TN3[..., [0, 2]] <= 0.5 * cells * finest).all(-1)
-        within_TN &= (position_TN3[..., 1] - case.hole_height).abs() <= PULLED_CELLS * finest
-        changes: list[torch.Tensor] = []
-        for frame in range(history, len(position_TN3) - 1, PULLED_EVERY):
-            if not bool(within_TN[frame].any()):
-                continue
-            past = replace(scene, position_N3=trial.position_TN3[frame], past_HN3=trial.position_TN3[:frame])
-            state = simulator.start([past])
-            after_N3 = position_TN3[frame + 1] if outcome is solver else simulator.step(state).position_N3
-            change_N = (after_N3 - state.position_N3 - state.velocity_NM3[:, 0])[..., 1]
-            changes.append(change_N[within_TN[frame]].double())
-        gravity = scene.gravity[1] / simulator.frame_rate_hz**2
-        means.append(float(torch.cat(changes).mean()) / gravity if changes else None)
-    return means
-
-
 def rest(outcome: Outcome) -> dict[str, float] | None:
     """Measures the particles of all scenes from frame `settled` to the end, lengths in obstacle cells.
 
@@ -299,8 +221,6 @@ def rest(outcome: Outcome) -> dict[str, float] | None:
 MEASURES: dict[str, Callable[[Outcome], Any]] = {
     "energy_growth": energy_growth,
     "energy_rise": energy_rise,
-    "kinetic_change": kinetic_change,
-    "far_effect": far_effect,
     "outside_domain": outside,
     "share_of_way": share_of_way,
     "throws": throws,
@@ -311,7 +231,5 @@ MEASURES: dict[str, Callable[[Outcome], Any]] = {
     "met": lambda outcome: conserved(outcome)[2],
     "turned_ratio": turned_ratio,
     "collapse": collapse,
-    "passed": passed,
-    "pull": pull,
     "rest": rest,
 }

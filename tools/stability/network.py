@@ -16,14 +16,11 @@ from typing import Annotated, Any
 
 import numpy as np
 import torch
-from PIL import Image
 
 from hgn.command import run_command
 from hgn.config import DEFAULT_WEIGHTS, MpmConfig, SceneConfig, SimulatorConfig
-from hgn.render.pictures import compare_picture, spread, stacked, write_picture
 from hgn.runtime.rollouts import RolloutResult, simulate_scenes
 from hgn.runtime.simulator import InitialState, Simulator
-from hgn.scene.rollout_file import Rollout
 from hgn.scene.scene import Scene
 from hgn.schema import Bound, ConfigError, FrameCount, Vector, from_mapping, require_bounds, to_mapping
 from tools.report import meta_of
@@ -40,9 +37,6 @@ CASES = (*FAMILIES, GUARD)
 CaseName = Annotated[
     str, Bound(f"one of {', '.join(CASES)}, gallery, gallery_NUMBER", lambda n: n in CASES or is_gallery(n))
 ]
-PICTURES, PICTURE_SIZE = 4, 300  # frames of each case; width of a frame in pixels
-LONGEST = 100.0  # domain that is drawn whole, in heights
-DRAWN_EVERY_S = 5.0  # the picture of all cases so far takes longer with each
 FAR_DOMAINS, GUARD_FRAMES = 100.0, 4  # distance that the broken network throws particles, and in how many frames
 ON_THE_FLOOR = 0.04  # times the height of a particle in the middle: 0.02 domain heights
 
@@ -52,18 +46,17 @@ class StabilityNetworkConfig(SimulatorConfig):
     """The options of `python -m tools.stability network`."""
 
     weights: str = DEFAULT_WEIGHTS  # a file of python -m hgn.export, or the name of shipped weights
-    # throw, gravity, collision, apart, collapse, hole, rest, particles, domain, speed, single, slope, far, guard;
-    # null: all of these. gallery: the scenes of conf/gallery beside the solver's figures; gallery_1: the draw for
+    # throw, gravity, collision, collapse, rest, particles, domain, speed, single, slope, far, guard; null: all of
+    # these. gallery: the scenes of conf/gallery beside the solver's figures; gallery_1: the draw for
     # choices; gallery_2: the draw for reports; gallery_NUMBER: another draw
     cases: tuple[CaseName, ...] | None = None
     frames: FrameCount = 300  # of each rollout
     long_frames: FrameCount = 3000  # of the case rest
-    # false: without the solver, which needs Taichi; collapse, hole and rest are left out, slope and collision have
-    # limits of their own
+    # false: without the solver, which needs Taichi; collapse and rest are left out, slope and collision have limits of
+    # their own
     solver: bool = True
     mpm: MpmConfig = field(default_factory=MpmConfig)  # the solver; its sand must be that of the network's data
     scene: SceneConfig = field(default_factory=SceneConfig)  # the scenes of the training
-    picture: str | None = None  # a PNG that shows the first scene of each case
     json: str | None = None  # file for the rows; --json FILE does the same
 
     def __post_init__(self) -> None:
@@ -71,7 +64,7 @@ class StabilityNetworkConfig(SimulatorConfig):
 
 
 def main(mapping: dict[str, Any]) -> int:
-    """Prints a table, and writes JSON and the picture if asked to. A case that fails is a finding: exit code 0."""
+    """Prints a table, and writes JSON if asked to. A case that fails is a finding: exit code 0."""
     started = time.monotonic()
     config = from_mapping(StabilityNetworkConfig, mapping)
     simulator = Simulator.load(config.weights, config.device, config.backend, config.precision)
@@ -81,20 +74,15 @@ def main(mapping: dict[str, Any]) -> int:
     cases = cases_of(config, simulator)
     mpm = replace(config.mpm, device=simulator.device.type) if config.solver else None
     runner = Runner(simulator, cases, mpm)
-    pictures = Pictures(config.picture, simulator, report.meta["weights"])
     if cases:
         compile_kernels(simulator, cases)
     report.meta["seconds_before_cases"] = time.monotonic() - started
     for case in cases:
-        rows, trials = runner.rows(case)
-        report.add(rows)
-        if case.reported is None and trials:
-            pictures.add(case, trials[0])
+        report.add(runner.rows(case))
     if GUARD in wanted:
         report.add([guard_row(simulator, config.scene)])
     report.meta["seconds"] = time.monotonic() - started
     report.write()
-    pictures.write()
     print(table(report.rows))
     return 0
 
@@ -147,15 +135,15 @@ class Runner:
             for scene in (*(case.scenes if case.solver else ()), *case.upright):
                 self._to_solve.setdefault((case.frames, scene.domain_size), {})[id(scene)] = scene
 
-    def rows(self, case: Case) -> tuple[list[Row], Sequence[RolloutResult]]:
-        """Returns a case's rows, one but for gallery scenes, and the network's trajectories."""
+    def rows(self, case: Case) -> list[Row]:
+        """Returns a case's rows, one but for gallery scenes."""
         backend, clock = self.simulator.backend, FrameClock()
         started, growths, compiled = time.monotonic(), backend.growths, self.compiled()
         try:
             initial = [InitialState.of_scene(scene) for scene in case.scenes]
             trials = simulate_scenes(self.simulator, initial, case.frames, clock)
         except ConfigError as refusal:
-            return refused(case, str(refusal)), []
+            return refused(case, str(refusal))
         if case.last_frames:
             trials = cut(trials, case.last_frames)
         solver, upright = None, None
@@ -167,7 +155,7 @@ class Runner:
         more |= {"ms": clock.milliseconds()} if case.reported is None else {}
         more["seconds"] = time.monotonic() - started
         outcome = Outcome(case, initial, trials, self.simulator, solver, upright)
-        return (gallery_rows(outcome, more) if case.gallery else [row_of(outcome, more)]), trials
+        return gallery_rows(outcome, more) if case.gallery else [row_of(outcome, more)]
 
     def _straight(self, case: Case) -> list[RolloutResult]:
         if id(case.upright) not in self._upright:
@@ -193,39 +181,6 @@ def _compiled_kernels(backend: str) -> Callable[[], int]:
 
     misses = JitMisses()
     return lambda: misses.count
-
-
-class Pictures:
-    """Draws frames of each case's first scene into one picture."""
-
-    def __init__(self, file: str | None, simulator: Simulator, weights: str) -> None:
-        self.file, self.simulator, self.weights = file, simulator, weights
-        self.pictures: list[Image.Image] = []
-        self.written = 0.0  # time
-
-    def add(self, case: Case, trial: RolloutResult) -> None:
-        """Adds a case; of a very long domain only the end is drawn, where the particles are."""
-        if self.file is None:
-            return
-        scene, (length, height, depth) = case.scenes[0], case.scenes[0].domain_size
-        shift_3 = np.array([length - height if length > LONGEST * height else 0.0, 0.0, 0.0])
-        rollout = Rollout(
-            (trial.position_TN3 - shift_3).astype(np.float32),
-            scene.material_N,
-            tuple(replace(mesh, vertex_V3=mesh.vertex_V3 - shift_3) for mesh in scene.obstacles),
-            (length - float(shift_3[0]), height, depth),
-            self.simulator.frame_rate_hz,
-            source={"weights": self.weights},
-        )
-        self.pictures.append(compare_picture(rollout, spread(trial.frame_count, PICTURES), PICTURE_SIZE, case.name))
-        if time.monotonic() - self.written > DRAWN_EVERY_S:
-            self.write()
-
-    def write(self) -> None:
-        """Writes the picture, if there is one."""
-        if self.file is not None and self.pictures:
-            write_picture(self.file, stacked(self.pictures))
-            self.written = time.monotonic()
 
 
 def guard_row(simulator: Simulator, config: SceneConfig) -> Row:

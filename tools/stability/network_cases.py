@@ -13,10 +13,9 @@ from typing import Any
 import numpy as np
 
 from hgn.config import NetworkConfig, SceneConfig
-from hgn.scene.funnel import funnel_squares
 from hgn.scene.material import MATERIALS
-from hgn.scene.random_scene import CLEARANCE_CELLS, REPORT_SEED, generate_scene
-from hgn.scene.rotation import euler_rotation, quaternion_rotation
+from hgn.scene.random_scene import REPORT_SEED, generate_scene
+from hgn.scene.rotation import euler_rotation
 from hgn.scene.scene import Scene
 from hgn.scene.shapes import shape_obstacle
 from hgn.schema import ConfigError
@@ -44,14 +43,8 @@ TURNED_FRAMES, TURNED_CUBES = 90, 8  # the error of a single cube varies by a fa
 TURNED_SPREAD = 0.1  # of the domain's sides, about its middle: where the cubes start
 MEETING = (1.5, -0.5)  # domain units per second along x, of the two cubes
 MEETING_FRAMES = 40
-FLOOR_CELLS = 3.0  # of the solver, from the lower plane to where bodies may start
 COLLAPSE_CELLS = (5.0, 20.0)  # of the solver, from the lower plane to cubes that fall
 COLLAPSE_FRAMES = (30, 60, 150)  # while spreading, when walls are reached, and at rest
-PASSING_GAP, PASSING_SPEED = 0.14, 0.3  # domain units between two bodies; domain units per second
-FAR_SPEED, FAR_FRAMES = 0.14, 90  # of a body that slides far from another
-HOLE_CELLS = {1.0: (1.5, 2.0, 3.0, 4.0), 1.5: (1.7, 2.0, 4.0)}  # widths in finest cells, by the cube's side in groups
-HOLE_FRAMES = 150
-FUNNEL_SIDE, FUNNEL_TILT_DEG = 0.36, 45.0  # side of a funnel's squares, of the domain's smallest side
 SLOPES_DEG = (15.0, 30.0, 45.0)
 SLOPE_SIDE, SLOPE_WAY = 0.6, 0.35  # of the domain's smallest side: the slope, and the distance slid
 FALL_FRAMES = 12  # in which a falling particle meets nothing
@@ -81,15 +74,6 @@ SPREADS = (
     Limit("collapse.neighbours", 0.0, 0.0, below=0.7, above=1.4),
     INSIDE,
 )
-# The solver's own fractions vary by at most 0.012 over three fillings. A hole that is wrongly closed or open differs by
-# far more than 0.2.
-PASSES = (
-    ENERGY,
-    RISE,
-    Limit("passed.through", -0.2, 0.2, below=1.0, above=1.0),
-    Limit("passed.leaked", high=0.05, above=1.0),
-    INSIDE,
-)
 # The floor of the squared speed is twice its standard deviation over five fillings of 135 particles of water or sand.
 # Mixed water drifts by 0.6 of the space between the walls; 1.3 times as much is less than the space.
 RESTS = (
@@ -102,8 +86,6 @@ RESTS = (
     Limit("rest.squared_speed", -5e-4, 5e-4, below=0.5, above=2.0),
     INSIDE,
 )
-APART = (Limit("kinetic_change", -0.01, 0.01),)
-FAR_BODY = (ENERGY, Limit("far_effect", high=0.1), INSIDE)
 
 
 @dataclass(frozen=True)
@@ -152,43 +134,12 @@ def collisions(context: Context) -> Iterator[Case]:
         )  # fmt: skip
 
 
-def bodies_apart(context: Context) -> Iterator[Case]:
-    """Bodies that never touch: their energy stays, and none feels another one far away."""
-    config, size_3 = context.scene, np.array(context.scene.domain_size)
-    for material in context.network.materials:
-        free, side = replace(config, gravity=(0.0, 0.0, 0.0)), config.group_size
-        aside_3, along_3 = np.array([0.5 * (side + PASSING_GAP), 0.0, 0.0]), np.array([0.0, 0.0, PASSING_SPEED])
-        ahead_3 = 0.5 * MEETING_FRAMES / context.frame_rate_hz * along_3
-        passing = joined([
-            cube(free, material, 0.5 * size_3 + way * (aside_3 - ahead_3), way * along_3, seed)
-            for seed, way in enumerate((-1, 1))
-        ])  # fmt: skip
-        name = f"two bodies pass without contact, {material}"
-        yield Case(name, (passing,), MEETING_FRAMES, APART, reported="kinetic_change")
-        low = (FLOOR_CELLS + 0.5) * config.cell_size + 0.5 * side
-        own, other = (
-            cube(config, material, np.array([x * size_3[0], low, 0.5 * size_3[2]]), np.array([speed, 0.0, 0.0]), seed)
-            for seed, (x, speed) in enumerate(((0.2, 0.0), (0.8, -FAR_SPEED)))
-        )
-        name, frames = f"alone and with a far body, {material}", min(FAR_FRAMES, context.frames)
-        yield Case(name, (own, joined([own, other])), frames, FAR_BODY, reported="far_effect")
-
-
 def collapses(context: Context) -> Iterator[Case]:
     times = tuple(frame for frame in COLLAPSE_FRAMES if frame < context.frames)
     for material in context.scene.materials if context.solver and times else ():
         scenes = tuple(_above_floor(context.scene, material, cells) for cells in COLLAPSE_CELLS)
         name = f"falls and spreads, {material}"
         yield Case(name, scenes, times[-1] + 1, SPREADS, solver=True, at_frames=times)
-
-
-def holes(context: Context) -> Iterator[Case]:
-    judged = context.solver and context.network.obstacle_features and context.frames >= HOLE_FRAMES
-    for material in context.scene.materials if judged else ():
-        for side, widths in HOLE_CELLS.items():
-            name = f"passes holes{'' if side == 1 else ' under load'}, {material}"
-            larger = replace(context.scene, group_size=side * context.scene.group_size)
-            yield _funnels(name, larger, material, widths, context.network.cell_size)
 
 
 def rests(context: Context) -> Iterator[Case]:
@@ -245,9 +196,8 @@ def far_end(context: Context) -> Iterator[Case]:
 
 
 FAMILIES: dict[str, Callable[[Context], Iterator[Case]]] = {
-    "throw": throws, "gravity": gravities, "collision": collisions, "apart": bodies_apart, "collapse": collapses,
-    "hole": holes,
-    "rest": rests, "particles": many_particles, "domain": large_domains, "speed": fast_groups,
+    "throw": throws, "gravity": gravities, "collision": collisions, "collapse": collapses, "rest": rests,
+    "particles": many_particles, "domain": large_domains, "speed": fast_groups,
     "single": single_particles, "slope": slopes, "far": far_end,
 }  # fmt: skip
 
@@ -329,28 +279,6 @@ def _above_floor(config: SceneConfig, material: str, cells: float) -> Scene:
     middle_3 = 0.5 * np.array(config.domain_size)
     middle_3[1] = cells * config.cell_size - cube_places(config)[:, 1].min()
     return cube(config, material, middle_3, np.zeros(3))
-
-
-def _funnels(name: str, config: SceneConfig, material: str, hole_cells: tuple[float, ...], network_cell: float) -> Case:
-    """Returns funnels of four tilted squares about the middle of the domain, with a cube above each hole.
-
-    Above a hole of no width the cube would be as far from the sheets as a scene's groups are from obstacles.
-    """
-    side, middle_3 = FUNNEL_SIDE * min(config.domain_size), 0.5 * np.array(config.domain_size)
-    tilt = math.radians(FUNNEL_TILT_DEG)
-    edge, half = float(middle_3[1]) - 0.5 * side * math.sin(tilt), 0.5 * config.group_size
-    clear = (half * math.sin(tilt) + CLEARANCE_CELLS * config.cell_size) / math.cos(tilt)
-    above = cube(config, material, np.array([middle_3[0], edge + clear + half, middle_3[2]]), np.zeros(3))
-    hole_3 = np.array([middle_3[0], edge, middle_3[2]])
-    scenes = []
-    for cells in hole_cells:
-        squares = tuple(
-            shape_obstacle("square", side, tuple((hole_3 + centre_3).tolist()), quaternion_rotation(quaternion))
-            for quaternion, centre_3 in zip(*funnel_squares(cells * network_cell, side, math.sin(tilt)), strict=True)
-        )
-        scenes.append(replace(above, obstacles=squares))
-    more: dict[str, Any] = {"hole_cells": hole_cells, "hole_height": edge}
-    return Case(name, tuple(scenes), HOLE_FRAMES, PASSES, solver=True, also=("pull",), **more)
 
 
 def _slope(context: Context, material: str, degrees: float) -> Case:
