@@ -55,6 +55,8 @@ def _rests_otherwise(network: Mapping[str, Any]) -> bool:
 
 
 LAST_COMMIT = "commit a0b88cb, before release 0.2.0, is the last with it"
+REPORTS_COMMIT = "commit e7e6c37 is the last with it"
+GRIDS = f"tools.error_vs_time and cases=[gallery] compare grids; {REPORTS_COMMIT}"
 TRAIN_ANEW = "leave it out; weights with another value must be trained anew"
 
 
@@ -88,11 +90,12 @@ REMOVED: dict[str, Removed] = {
     "training.noise_weight_power": Removed(2.0),
     "training.quiet_weight": Removed(4.0),
     "evaluate.particles_per_batch": Removed(32_768),
-    "bench.public_gns": Removed(remedy="commit e7e6c37 is the last with it"),
+    "bench.public_gns": Removed(remedy=REPORTS_COMMIT),
     "bench.rounds": Removed(50, "set seconds for a shorter measurement"),
     "scaling.rounds": Removed(20, "set seconds for a shorter measurement"),
     "render.gif": Removed(True, "give a file that ends in .png as out for a picture without animation"),
     "stability_network.picture": Removed(remedy="leave it out: python -m tools.render draws scenes"),
+    "stability_solver.grid_cells": Removed(remedy=GRIDS),
     "stability_solver.picture": Removed(remedy="leave it out: make docs draws it from the JSON"),
     "render.fps": Removed(remedy="leave it out: animations play in real time"),
     "upload.follow": Removed(remedy="run the command again, as with watch -n 60: it copies what is new"),
@@ -106,7 +109,8 @@ REMOVED |= {f"network.{key}": Removed(remedy=f"write step.{key}") for key in STE
 # Removed values of settings and config groups, by the last part of the key, and the remedy.
 _GNS_PARTICLES = {"gns_particles": LAST_COMMIT}
 REMOVED_CHOICES: dict[str, dict[Any, str]] = {
-    "cases": {name: "cases=[gallery] has such scenes" for name in ("apart", "hole")},
+    "cases": dict.fromkeys(("apart", "hole"), "cases=[gallery] has such scenes")
+    | {"convergence": REPORTS_COMMIT, "grid": GRIDS},
     "kind": _GNS_PARTICLES,
     "network": _GNS_PARTICLES,
     "experiment": _GNS_PARTICLES,

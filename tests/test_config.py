@@ -130,7 +130,7 @@ RULES = {
     ],
     command(StabilitySolverConfig): [
         ({"cases": ["stesp"]}, r"cases\[0\] must be one of steps"),
-        ({"cases": ["grid"], "grid_cells": [16, 8, 12]}, "grid_cells must be three or more rising numbers"),
+        ({"cases": ["grid"]}, r"cases\[0\] must be .*, got 'grid'; tools.error_vs_time and cases=\[gallery\] compare"),
     ],
 }
 

@@ -9,11 +9,8 @@ from hgn.config import MpmConfig
 from hgn.scene.material import ELASTIC, WATER
 from tools.stability import solver_leak, solver_steps
 from tools.stability import solver_validation as validation
-from tools.stability.row import Row
 from tools.stability.solver import main
 from tools.stability.solver_leak import crossing_paths, leaks
-from tools.stability.solver_loads import _sinks_until
-from tools.stability.solver_scenes import front_cells, thickness_cells
 
 CPU = MpmConfig(device="cpu")
 
@@ -84,22 +81,6 @@ def test_validation_rows(monkeypatch):
     assert all("reached the walls of the basin, 10 cells wide" in row.beyond for row in crowded)
 
 
-def test_grids(monkeypatch):
-    """Fronts, run-outs and heights on each grid, with their order of convergence."""
-
-    def columns(aspect, base, cells):
-        return [Row(f"column, {what}", 3.0, 3 - 2 / cells, True, "") for what in ("run-out", "height")]
-
-    monkeypatch.setattr(validation, "column_rows", columns)
-    monkeypatch.setattr(validation, "PAPER_MATERIALS", ("water",))
-    front, run_out, height, block = validation.grids(CPU, (4, 5, 6))
-    assert ("front of the dam" in front.case, "height of a block of water" in block.case) == (True, True)
-    assert run_out.more["order"] == height.more["order"] == pytest.approx(1.0, rel=0.02)
-    assert run_out.measured == pytest.approx((3 - 2 / 6) / (3 - 2 / 5) - 1)
-    assert all(2.9 < value < 3.5 for value in front.more["series"])  # widths
-    assert all(0.1 < value < 0.3 for value in block.more["series"])  # of a side: it has spread by then
-
-
 def test_rows_of_slopes(monkeypatch):
     """Slopes should rest at the angle of shear: tan = sin of the friction angle. Moving slopes fail. The angle of
     repose of quartz sand is a row of its own."""
@@ -115,32 +96,6 @@ def test_rows_of_slopes(monkeypatch):
     assert [row.predicted for row in rows] == pytest.approx(asked, abs=0.05)
     assert [row.held for row in rows] == [True, False, *[True] * 5]
     assert rows[4].case.endswith("as quartz sand has it")
-
-
-@pytest.mark.parametrize("order", [0.5, 1.0, 2.0])
-def test_order_of_convergence(order):
-    """Order and limit of a power law are found; values that are not monotonic, or diverge, have neither."""
-    cells = (8, 12, 16, 32)
-    found, limit = validation.convergence_order(cells, [3 - 2 / count**order for count in cells])
-    assert (found, limit) == pytest.approx((order, 3.0), rel=0.02)
-    assert validation.convergence_order(cells, [1.0, 1.2, 1.1, 1.0]) == (None, None)
-    assert validation.convergence_order(cells, [1.0, 1.1, 1.3, 2.3]) == (None, None)
-
-
-def test_height_is_measured_while_the_block_sinks():
-    """Frames are measured until the centre rises or the block is thinner than two cells."""
-    block = np.random.default_rng(0).uniform(0, 8 / 64, (100, 3))
-    sinking = np.stack([block * (1, size, 1) for size in (1.0, 0.8, 0.6, 0.1)])
-    assert _sinks_until(sinking) == 3
-    rising = np.stack([block - (0, shift / 64, 0) for shift in (0, 1, 2, 1, 3)])
-    assert _sinks_until(rising) == 2
-
-
-def test_extents():
-    """Thickness is between the 0.05 and 0.95 quantiles; the front is measured from the wall."""
-    position = np.repeat(np.linspace(0, 1, 101)[:, None], 3, axis=1)
-    assert thickness_cells(position) == pytest.approx(0.9 * 64)
-    assert front_cells(position) == pytest.approx(0.99 * 64 - 2)
 
 
 def test_published_columns():

@@ -1,8 +1,8 @@
 """python -m tools.stability solver [--json FILE]: checks the solver against formulas and experiments.
 
-Rows: the largest stable step, stiffness, speed of impact, convergence of the default step, free flight from obstacles
-and friction on them, leaks, a long run, published experiments (water at rest, dams, columns and slopes of sand), and
-convergence on the grid. On two CPU cores most cases take minutes; leaks, columns and fine grids need a GPU.
+Rows: the largest stable step, stiffness, speed of impact, free flight from obstacles and friction on them, leaks, a
+long run, and published experiments (water at rest, dams, columns and slopes of sand). On two CPU cores most cases take
+minutes; leaks and columns need a GPU.
 """
 
 from __future__ import annotations
@@ -10,25 +10,21 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import partial
-from itertools import pairwise
 from typing import Annotated, Any
 
 from hgn.config import MpmConfig
-from hgn.schema import Bound, from_mapping, require, require_bounds, to_mapping
+from hgn.schema import Bound, from_mapping, require_bounds, to_mapping
 from tools.report import ReportConfig, meta_of
 from tools.stability.gallery import is_gallery
 from tools.stability.row import Report, Row, table
 from tools.stability.solver_contact import contacts
 from tools.stability.solver_gallery import broken_table, gallery_rows
 from tools.stability.solver_leak import leaks
-from tools.stability.solver_loads import convergence, impacts, long_run, stiffnesses
+from tools.stability.solver_loads import impacts, long_run, stiffnesses
 from tools.stability.solver_steps import Point, largest_steps
-from tools.stability.solver_validation import columns, dam_breaks, grids, reposes, rest
+from tools.stability.solver_validation import columns, dam_breaks, reposes, rest
 
-NAMES = (
-    *("steps", "stiffness", "impact", "convergence", "contact", "leak"),
-    *("long", "rest", "dam", "column", "repose", "grid"),
-)
+NAMES = ("steps", "stiffness", "impact", "contact", "leak", "long", "rest", "dam", "column", "repose")
 CaseName = Annotated[
     str, Bound(f"one of {', '.join(NAMES)}, gallery, gallery_NUMBER", lambda n: n in NAMES or is_gallery(n))
 ]
@@ -38,18 +34,12 @@ CaseName = Annotated[
 class StabilitySolverConfig(ReportConfig):
     """The options of `python -m tools.stability solver`."""
 
-    # steps, stiffness, impact, convergence, contact, leak, long, rest, dam, column, repose, grid; null: all of these.
-    # gallery: the scenes of conf/gallery, which networks are compared with; gallery_NUMBER: a draw of them
+    # steps, stiffness, impact, contact, leak, long, rest, dam, column, repose; null: all of these. gallery: the scenes
+    # of conf/gallery, which networks are compared with; gallery_NUMBER: a draw of them
     cases: tuple[CaseName, ...] | None = None
-    # resolutions of the case grid: cells in the width of dams, the radius of columns and the side of blocks. A domain
-    # is about four times as wide; 32 cells need a GPU
-    grid_cells: tuple[int, ...] = (8, 12, 16)
 
     def __post_init__(self) -> None:
         require_bounds(self)
-        cells = self.grid_cells
-        rising = len(cells) > 2 and cells[0] > 3 and all(a < b for a, b in pairwise(cells))
-        require(rising, "grid_cells", "three or more rising numbers from 4 on", list(cells))
 
 
 def main(mapping: dict[str, Any]) -> int:
@@ -62,8 +52,8 @@ def main(mapping: dict[str, Any]) -> int:
     points: list[Point] = []
     cases: dict[str, Callable[[MpmConfig], Iterable[Row]]] = {
         "steps": partial(largest_steps, points=points), "stiffness": stiffnesses, "impact": impacts,
-        "convergence": convergence, "contact": contacts, "leak": leaks, "long": long_run, "rest": rest,
-        "dam": dam_breaks, "column": columns, "repose": reposes, "grid": partial(grids, cells=config.grid_cells),
+        "contact": contacts, "leak": leaks, "long": long_run, "rest": rest, "dam": dam_breaks, "column": columns,
+        "repose": reposes,
     }  # fmt: skip
     scenes: dict[str, Any] = {}
     report = Report("solver", meta, config.json, steps=points, scenes=scenes)

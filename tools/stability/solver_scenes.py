@@ -44,12 +44,6 @@ def rms_speed(path_TN3: np.ndarray, rate_hz: float) -> float:
     return float(np.sqrt((np.diff(path_TN3.astype(np.float64), axis=0) ** 2).sum(axis=2).mean())) * rate_hz
 
 
-def thickness_cells(position_N3: np.ndarray) -> float:
-    """Returns the height between the 0.05 and 0.95 quantiles."""
-    low, high = np.quantile(position_N3[:, 1], (0.05, 0.95))
-    return float(high - low) / CELL
-
-
 def height_cells(position_N3: np.ndarray) -> float:
     """Returns the 0.95 quantile of heights above the last node of the floor."""
     return float(np.quantile(position_N3[:, 1], 0.95)) / CELL - (FLOOR_CELLS - 1)
@@ -58,8 +52,3 @@ def height_cells(position_N3: np.ndarray) -> float:
 def centre_cells(position_N3: np.ndarray) -> float:
     """Returns the mean height above the last node of the floor."""
     return float(position_N3[:, 1].mean()) / CELL - (FLOOR_CELLS - 1)
-
-
-def front_cells(position_N3: np.ndarray) -> float:
-    """Returns the 0.99 quantile of distances from the last wall node."""
-    return float(np.quantile(position_N3[:, 0], 0.99)) / CELL - (FLOOR_CELLS - 1)

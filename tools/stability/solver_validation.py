@@ -11,14 +11,13 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Iterator, Sequence
-from typing import Any
 
 import numpy as np
 
 from datagen.mpm.layout import sand_sine
 from datagen.mpm.solver import simulate
 from hgn.config import MpmConfig
-from hgn.scene.material import PAPER_MATERIALS, SAND, WATER
+from hgn.scene.material import SAND, WATER
 from hgn.scene.scene import Obstacle, Scene
 from tools.scenes import PARTICLES_PER_CELL, filled, random_places, some
 from tools.stability.row import Row, within
@@ -44,13 +43,6 @@ DAM_RATE_HZ = 200.0
 REST_CELLS, REST_DEPTH = 6, 0.375  # m
 REST_S, REST_RATE_HZ, REST_WITHIN = 20.0, 4.0, 0.005
 SETTLED_S = 2.5  # until its first waves are gone
-
-# one scene on several grids
-GRID_ASPECT = 1.0
-GRID_DAM_S, GRID_IMPACT_S = 0.25, 1 / 30
-GRID_WITHIN = 0.05
-ORDERS = (0.1, 4.0, 391)
-IMPACT_SIDE, IMPACT_DROP, IMPACT_SPEED = 0.125, 0.125, 4.5  # m; sides above the floor; m/s
 
 # Quarters of round columns on a rough floor. Lube et al. 2004 and Lajeunesse et al. 2004 differ by up to a third; a
 # column between them agrees with the experiments.
@@ -118,57 +110,6 @@ def rest(base: MpmConfig) -> Iterator[Row]:
     beyond = f"{change[0]:+.2%} after {SETTLED_S:g} s, {change[-1]:+.2%} after {REST_S:g} s"
     worst = float(change[np.abs(change).argmax()])
     yield within("level of water at rest, random filling", REST_WITHIN, worst, beyond)
-
-
-def grids(base: MpmConfig, cells: Sequence[int]) -> Iterator[Row]:
-    """Measures how fronts, run-outs and heights change with the grid, and the order of convergence.
-
-    `cells`, three or more, are the width of a dam, the radius of a column, and the side of blocks that hit the floor.
-    """
-    measured: dict[str, list[float]] = {}
-    for count in cells:
-        path = _path(dam(count), base, 2 + math.ceil(GRID_DAM_S * DAM_RATE_HZ))
-        measured.setdefault("front of the dam break, in widths", []).append(dam_front(path[-1], count))
-        for row in column_rows(GRID_ASPECT, base, count):
-            what = row.case.rsplit(", ", 1)[1]
-            measured.setdefault(f"{what} of a sand column, in radii", []).append(float(row.measured))
-        for kind, name in enumerate(PAPER_MATERIALS):
-            path = _path(impact(kind, count), base, 2, 1 / GRID_IMPACT_S)
-            height = float(np.quantile(path[-1][:, 1], 0.95)) / IMPACT_SIDE - WALL / count
-            measured.setdefault(f"height of a block of {name} after its impact, in sides", []).append(height)
-    for name, values in measured.items():
-        order, limit = convergence_order(cells, values)
-        series = ", ".join(f"{value:.3f} at {count}" for value, count in zip(values, cells, strict=True)) + " cells; "
-        leads = "no limit yet" if order is None else f"order {order:.2g}, limit {limit:.3f}"
-        more: dict[str, Any] = {"cells": list(cells), "series": values, "order": order, "limit": limit}
-        case, change = f"grid of {cells[-1]} cells beside {cells[-2]}: {name}", abs(values[-1] / values[-2] - 1)
-        yield within(case, GRID_WITHIN, change, series + leads, more)
-
-
-def convergence_order(cells: Sequence[int], values: Sequence[float]) -> tuple[float, float] | tuple[None, None]:
-    """Fits limit + c / cells^p to the values and returns p and the limit.
-
-    Returns None if the values are not monotonic, change no less with finer cells, or p is not between 0.1 and 4.
-    """
-    steps = np.diff(values)
-    slopes = steps / np.diff(np.log(cells))
-    if not ((steps > 0).all() or (steps < 0).all()) or abs(slopes[-1]) >= abs(slopes[0]):
-        return None, None
-    fits = []
-    for order in np.linspace(*ORDERS):
-        basis = np.stack([np.ones(len(cells)), np.asarray(cells, float) ** -order], axis=1)
-        solution = np.linalg.lstsq(basis, np.asarray(values), rcond=None)[0]
-        fits.append((float(np.square(basis @ solution - values).sum()), float(order), float(solution[0])))
-    _, order, limit = min(fits)
-    return (order, limit) if ORDERS[0] < order < ORDERS[1] else (None, None)
-
-
-def impact(kind: int, cells: int) -> Scene:
-    """Returns a block of `cells` a side that is about to hit the floor of a basin four times as wide."""
-    scene = basin(kind, (cells,) * 3, (4 * cells, 2 * cells, 4 * cells), IMPACT_SIDE / cells)
-    position_N3 = (scene.position_N3 + np.array([1.5, IMPACT_DROP, 1.5]) * IMPACT_SIDE).astype(np.float32)
-    velocity_N3 = scene.velocity_N3 + np.array([0, -IMPACT_SPEED, 0], np.float32)
-    return dataclasses.replace(scene, position_N3=position_N3, velocity_N3=velocity_N3)
 
 
 def columns(base: MpmConfig) -> Iterator[Row]:
