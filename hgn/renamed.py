@@ -92,6 +92,8 @@ REMOVED: dict[str, Removed] = {
     "evaluate.particles_per_batch": Removed(32_768),
     "bench.public_gns": Removed(remedy=REPORTS_COMMIT),
     "bench.rounds": Removed(50, "set seconds for a shorter measurement"),
+    "error_vs_time.earlier": Removed(remedy="leave it out: make docs draws the figures from the JSON"),
+    "error_vs_time.times_last": Removed(False),
     "scaling.rounds": Removed(20, "set seconds for a shorter measurement"),
     "render.gif": Removed(True, "give a file that ends in .png as out for a picture without animation"),
     "service.health_port": Removed(remedy="leave it out: /healthz is at the service's port"),

@@ -100,7 +100,6 @@ RULES = {
     ],
     command(CurvesConfig, out="curves"): [({"runs": ["a/x", "b/x"]}, "runs must be folders of different names")],
     command(ErrorVsTimeConfig, data="d", out="o"): [
-        ({"data": None}, "data must be a data set, got None; make one with python -m datagen, or"),
         ({"mpm_grids": [4]}, r"mpm_grids\[0\] must be at least 8"),
         ({"weights": ["a/x.safetensors", "b/x.safetensors"]}, "weights must be files of different names"),
         ({"frames": 1}, "frames must be at least 2"),

@@ -299,48 +299,8 @@ def test_shipped_weights_that_fit(data, tmp_path, monkeypatch, capsys):
 
 
 @pytest.mark.usefixtures("undrawn")
-def test_an_interrupted_report_continues(compare, data, tmp_path, monkeypatch, on_score):
-    """Rows of an earlier report are neither simulated nor scored again; rows without run times are timed, with device,
-    commit and date. Without data they are only drawn again."""
-    simulated: list[set[float]] = []
-
-    def noted(scenes, config, *more, stability_fractions, **others):
-        simulated.append(set(stability_fractions))
-        return fake_simulate(scenes, config, *more, stability_fractions=stability_fractions, **others)
-
-    monkeypatch.setattr(datagen.mpm.solver, "simulate", noted)
-    drawn: list[str] = []
-    monkeypatch.setattr("tools.error_vs_time.command.draw", lambda out, *_: drawn.append(out) or [])
-    monkeypatch.setattr("tools.error_vs_time.command.STEPS", (0.5,))
-    report = compare("first", mpm_grids=[64])
-    rows = {row["system"]: row for row in report["rows"]}
-    rows["gns"]["ms"], rows["mpm"]["ms"] = None, 9.0  # frames of fake_simulate end together
-    first, second = tmp_path / "first.json", tmp_path / "second.json"
-    first.write_text(json.dumps(report))
-    simulated.clear()
-    scored: list[str] = []
-    on_score(lambda row: scored.append(row["system"]))
-    again = compare("second", mpm_grids=[64], earlier=[str(first)])
-    assert scored == [] and simulated == [{0.25}]
-    (timed,) = (row for row in again["rows"] if "timed" in row)
-    assert timed["system"] == "gns" and timed["ms"] > 0 and timed["timed"].keys() == {"device", "commit", "date"}
-    assert timed["by_scene"] == rows["gns"]["by_scene"]
-    assert sorted(systems(again)) == sorted(systems(report))
-    assert main({"out": str(tmp_path / "drawn"), "earlier": [str(second)]}) == 0
-    assert json.loads((tmp_path / "drawn.json").read_text())["rows"] == again["rows"]
-    assert drawn == [str(tmp_path / "drawn")]
-    with pytest.raises(ConfigError, match=r"earlier\[0\] frames must be 4 as in this report, got 6; take the data"):
-        compare("second", earlier=[str(first)], frames=4)
-    (tmp_path / "other.json").write_text("{}")
-    for name, cause in (("other", "JSON that python -m tools.error_vs_time wrote"), ("none", "an existing file")):
-        with pytest.raises(ConfigError, match=rf"earlier\[0\] must be {cause}"):
-            main({"out": "x", "earlier": [str(tmp_path / f"{name}.json")]})
-
-
-@pytest.mark.usefixtures("undrawn")
-@pytest.mark.parametrize("times_last", [False, True])
-def test_a_killed_run_leaves_complete_rows(compare, tmp_path, monkeypatch, on_score, times_last):
-    """After each contender the file contains its errors and, unless times come last, its run times. Without a solver
+def test_a_killed_run_leaves_complete_rows(compare, tmp_path, monkeypatch, on_score):
+    """After each contender the file contains its errors and its run times. Without a solver
     the data is the reference; ballistic motion has no error on ballistic data."""
     monkeypatch.delattr(datagen.mpm.solver, "simulate")
 
@@ -350,12 +310,12 @@ def test_a_killed_run_leaves_complete_rows(compare, tmp_path, monkeypatch, on_sc
 
     on_score(killed)
     with pytest.raises(KeyboardInterrupt):
-        compare(resimulate=False, times_last=times_last)
+        compare(resimulate=False)
     rows = {
         row.get("predictor", row["system"]): row for row in json.loads((tmp_path / "report.json").read_text())["rows"]
     }
     assert rows["hgn"]["one_step_mse"] > 0 and rows["hgn"]["position_mse"]["5"] > 0
-    assert "ms" not in rows["hgn"] if times_last else rows["hgn"]["ms"] > 0
+    assert rows["hgn"]["ms"] > 0
     falls, flies = rows["ballistic motion"], rows["constant velocity"]
     assert falls["position_mse"]["5"] < 1e-13 < flies["position_mse"]["5"]
     assert falls["one_step_mse"] < 1e-13 < flies["one_step_mse"]

@@ -30,7 +30,6 @@ from hgn.runtime.weights import find_weights, load_weights, require_frame_rate, 
 from hgn.scene.episode import Episode
 from hgn.schema import ConfigError, from_mapping, from_stored, require
 from hgn.system.device import choose_device
-from hgn.system.files import write_json
 from hgn.system.machine import available_cpus
 from hgn.system.progress import bar
 from tools.error_vs_time.contenders import (
@@ -45,7 +44,7 @@ from tools.error_vs_time.contenders import (
 )
 from tools.error_vs_time.paired import paired_rows, paired_table
 from tools.error_vs_time.plot import CONVENTION
-from tools.error_vs_time.run import Row, Run, draw, is_untimed, read_report, require_same, same_row
+from tools.error_vs_time.run import Run
 from tools.error_vs_time.score import table
 from tools.error_vs_time.settings import ErrorVsTimeConfig
 from tools.report import meta_of
@@ -61,10 +60,7 @@ def main(mapping: dict[str, Any]) -> int:
     """Prints a table and writes the report; returns the exit code."""
     started = time.monotonic()
     config = from_mapping(ErrorVsTimeConfig, mapping)
-    earlier = [read_report(file, f"earlier[{i}]") for i, file in enumerate(config.earlier)]
     Path(config.out).parent.mkdir(parents=True, exist_ok=True)
-    if config.data is None:
-        return _draw_again(config, earlier)
     device = choose_device(config.device)
     store = EpisodeStore(config.data, config.split)
     episodes = first_episodes(store, config.scenes)
@@ -72,9 +68,6 @@ def main(mapping: dict[str, Any]) -> int:
     finer = store.manifest.config.get("reference")
     resimulate = config.resimulate and finer is None  # a finer grid is nearer to the truth than the data's own
     same = {"episodes": [e.key for e in episodes], "frames": frames, "reference": _reference_name(resimulate, finer)}
-    for i, (meta, _) in enumerate(earlier):
-        require_same(meta, f"earlier[{i}]", same)
-    known = [row for _, rows in earlier for row in rows]
     mpm = replace(from_stored(MpmConfig, store.manifest.config["mpm"], "mpm"), device=device.type)
     own_cell, rate = episodes[0].obstacle_grid.cell_size, episodes[0].frame_rate_hz
     own_grid = round(1 / own_cell)
@@ -87,13 +80,9 @@ def main(mapping: dict[str, Any]) -> int:
         cell_size = own_cell if grid == own_grid else 1 / grid
         return SolverLaunches(solver_on_grid(mpm, cell_size, own_cell), cell_size, rate, most)
 
-    every: list[Contender] = list(network_contenders(config, device, episodes))
-    every += baseline_contenders(store, device, wall_thickness(mpm, own_cell))
-    every += solver_contenders(config, mpm, launches, own_grid, reference_grid, resimulate)
-    measured = [row for row in known if not is_untimed(row)]
-    contenders = [contender for contender in every if same_row(contender.row, measured) is None]
-    networks = [contender for contender in contenders if isinstance(contender, NetworkContender)]
-    solvers = [contender for contender in contenders if isinstance(contender, SolverContender)]
+    networks = network_contenders(config, device, episodes)
+    solvers = solver_contenders(config, mpm, launches, own_grid, reference_grid, resimulate)
+    contenders = [*networks, *baseline_contenders(store, device, wall_thickness(mpm, own_cell)), *solvers]
     for solver in solvers:
         solver.launches.add(solver.setting)
     limit = None if config.seconds is None else started + COMPILING_FRACTION * config.seconds
@@ -111,25 +100,13 @@ def main(mapping: dict[str, Any]) -> int:
     meta |= {"data": Path(config.data).name, "split": config.split, "scenes": len(references), "left_out": left_out}
     meta["set"] = set_record(config.data, store.manifest.config["seed"], {c.file for c in networks})
     meta |= {"convention": CONVENTION, "seconds_before_scoring": time.monotonic() - started}
-    run = Run(config, contenders, references, device, meta, started, known)
+    run = Run(config, contenders, references, device, meta, started)
     run.measure()
     run.write(drawn=True)
     print(table(run.rows), paired_table(paired_rows(run.rows)), f"{run.out}.png {run.file}", sep="\n\n")
     if run.failed:
         print(f"error: {run.failed} of the measurements failed; see above, and not_run in {run.file}", file=sys.stderr)
     return EXIT_MACHINE if run.failed else 0
-
-
-def _draw_again(config: ErrorVsTimeConfig, earlier: Sequence[tuple[dict[str, Any], list[Row]]]) -> int:
-    """Draws and prints the rows of earlier reports."""
-    first = earlier[0][0]
-    for i, (meta, _) in enumerate(earlier):
-        require_same(meta, f"earlier[{i}]", {name: first[name] for name in ("episodes", "frames", "reference")})
-    rows = [row for _, report_rows in earlier for row in report_rows]
-    files, paired = draw(config.out, rows, first), paired_rows(rows)
-    write_json(config.json or f"{config.out}.json", {"meta": first, "rows": rows, "paired": paired}, allow_nan=False)
-    print(table(rows), paired_table(paired), " ".join(files), sep="\n\n")
-    return 0
 
 
 def _reference_name(resimulate: bool, finer: dict[str, Any] | None) -> str:
@@ -239,7 +216,7 @@ def solver_contenders(
     own_grid: int,
     reference_grid: int,
     resimulate: bool,
-) -> list[Contender]:
+) -> list[SolverContender]:
     """Returns the solver with each setting, and the chaos floor: the reference compared with itself, displaced."""
     step = REFERENCE_STEP if resimulate else mpm.stability_fraction
 
@@ -247,7 +224,7 @@ def solver_contenders(
         importance = SAME_GRID if grid == own_grid else COARSE_GRIDS
         return SolverContender(launches(grid), Setting(step, perturbation), config.mpm_frames, importance, named)
 
-    contenders: list[Contender] = [solver(grid, step) for grid in config.mpm_grids for step in STEPS]
+    contenders = [solver(grid, step) for grid in config.mpm_grids for step in STEPS]
     if config.perturbation:
         floor = f"perturbed by {config.perturbation:g}" if reference_grid == own_grid else "other children"
         contenders.append(solver(reference_grid, step, config.perturbation, system="chaos", floor=floor))

@@ -5,7 +5,6 @@ An interrupted run leaves a valid file with all that was measured.
 
 from __future__ import annotations
 
-import json
 import math
 import sys
 import time
@@ -16,9 +15,8 @@ from typing import Any
 
 import torch
 
-from hgn.renamed import current_names
 from hgn.scene.episode import Episode
-from hgn.schema import ConfigError, require
+from hgn.schema import ConfigError
 from hgn.system.files import write_atomically, write_json
 from hgn.system.progress import bar
 from tools.error_vs_time.contenders import Contender
@@ -31,36 +29,7 @@ from tools.timing import Stopwatch
 START_FRACTION, ROUND_FRACTION = 0.85, 0.95  # of the seconds given, until which contenders and rounds may start
 ROUNDS = 2  # of each timed scene
 DRAWN_EVERY_S = 60.0  # figures take some seconds
-# settings of a contender: rows of earlier reports with the same settings are not measured again
-IDENTITY = ("system", "weights", "backend", "precision", "updates", "grid", "step", "predictor", "floor")
 Row = dict[str, Any]
-
-
-def read_report(file: str, field: str) -> tuple[dict[str, Any], list[Row]]:
-    """Reads meta and rows of an earlier report. Raises: ConfigError if there is no such file, or it is no report."""
-    remedy = "leave it out to start anew"
-    try:
-        report = json.loads(Path(file).read_text(encoding="utf-8"))
-        meta, rows = report["meta"], [current_names(row) for row in report["rows"]]
-        valid = all("curve" in row for row in rows) and {"episodes", "frames", "reference"} <= meta.keys()
-    except FileNotFoundError:
-        raise ConfigError(f"{field} must be an existing file, got {file}; {remedy}") from None
-    except (json.JSONDecodeError, UnicodeDecodeError, KeyError, TypeError, AttributeError):
-        valid = False
-    require(valid, field, "JSON that python -m tools.error_vs_time wrote", file, remedy)
-    return meta, rows
-
-
-def require_same(meta: Mapping[str, Any], field: str, expected: Mapping[str, Any]) -> None:
-    """Raises: ConfigError if an earlier report has other scenes, fewer frames, or another reference."""
-    remedy = "take the data and options of that report, or leave it out"
-    for name, value in expected.items():
-        require(meta[name] == value, f"{field} {name}", f"{value} as in this report", meta[name], remedy)
-
-
-def same_row(row: Mapping[str, Any], known: Sequence[Row]) -> Row | None:
-    """Returns the first row with the settings of `row`, if any."""
-    return next((other for other in known if all(row.get(name) == other.get(name) for name in IDENTITY)), None)
 
 
 def is_untimed(row: Mapping[str, Any]) -> bool:
@@ -79,26 +48,20 @@ class Run:
         device: torch.device,
         meta: dict[str, Any],
         started: float,
-        earlier: Sequence[Row] = (),
     ) -> None:
-        """`started` is a time of time.monotonic(). `earlier` are rows of reports before; those without run times are
-        timed only, and note device, commit and date of the times in `timed`."""
+        """`started` is a time of time.monotonic()."""
         self.config, self.contenders, self.references, self.device = config, contenders, references, device
         self.started, self.meta = started, meta | {"not_run": [], "not_timed": []}
-        self.earlier = [row for row in earlier if not is_untimed(row)]
         self.failed = 0  # contenders that raised an unexpected error
         self.watches: dict[int, Stopwatch] = {}
-        untimed = [row for row in earlier if is_untimed(row)]
-        known = {i: same_row(contender.row, untimed) for i, contender in enumerate(contenders)}
-        self._rows: dict[int, Row] = {i: dict(row) for i, row in known.items() if row is not None}
-        self._scored_before = set(self._rows)
+        self._rows: dict[int, Row] = {}
         self._given_up: set[int] = set()
         self._drawn = time.monotonic()
         self.out, self.file = config.out, config.json or f"{config.out}.json"
 
     @property
     def rows(self) -> list[Row]:
-        return [*self.earlier, *(self._rows[i] for i in sorted(self._rows))]
+        return [self._rows[i] for i in sorted(self._rows)]
 
     def is_past(self, fraction: float) -> bool:
         """Says whether this fraction of the given time is over."""
@@ -107,18 +70,16 @@ class Run:
     def measure(self) -> None:
         """Scores and times every contender in order of importance, then repeats the timing in turns."""
         order = sorted(range(len(self.contenders)), key=lambda i: self.contenders[i].importance)
-        turns = [[self._errors], [self._times]] if self.config.times_last else [[self._errors, self._times]]
-        with bar("contenders", total=len(turns) * len(order), unit="contender") as progress:
-            for steps in turns:
-                for i in order:
-                    # the baselines, which take no time, are in every report
-                    if not self.is_past(START_FRACTION) or self.contenders[i].row["system"] == "baseline":
-                        for step in steps:
-                            self._attempt(i, step)
-                    elif i not in self._rows and i not in self._given_up:
-                        self._leave_out(i, "the time was over")
-                    self.write(drawn=time.monotonic() - self._drawn > DRAWN_EVERY_S)
-                    progress.update()
+        with bar("contenders", total=len(order), unit="contender") as progress:
+            for i in order:
+                # the baselines, which take no time, are in every report
+                if not self.is_past(START_FRACTION) or self.contenders[i].row["system"] == "baseline":
+                    self._attempt(i, self._errors)
+                    self._attempt(i, self._times)
+                else:
+                    self._leave_out(i, "the time was over")
+                self.write(drawn=time.monotonic() - self._drawn > DRAWN_EVERY_S)
+                progress.update()
         for _ in range(1, ROUNDS):
             for i in sorted(self.watches):
                 if not self.is_past(ROUND_FRACTION):
@@ -137,8 +98,6 @@ class Run:
             self._drawn = time.monotonic()
 
     def _errors(self, i: int) -> None:
-        if i in self._rows:
-            return
         started = time.monotonic()
         try:
             row = score(self.contenders[i], self.references, self.device)
@@ -153,8 +112,6 @@ class Run:
             self.watches[i] = Stopwatch(self.contenders[i], self.references, self.device)
             self._time(i)
             self._rows[i]["timing_s"] = time.monotonic() - started
-            if i in self._scored_before:
-                self._rows[i]["timed"] = {name: self.meta[name] for name in ("device", "commit", "date")}
 
     def _time(self, i: int) -> None:
         self._rows[i] |= self.watches[i].round()

@@ -20,10 +20,9 @@ class ErrorVsTimeConfig(ReportConfig):
     # writes OUT.json (or the file `json`), OUT.png (error against run time), OUT_batched.png (side by side) and
     # OUT_frames.png (over frames)
     out: str
-    # data set whose scenes the solver simulates again with a finer step, as the reference; null: draws `earlier` again
-    data: str | None = None
-    # JSON of reports on the same scenes: their rows are not measured again. An interrupted report continues this way
-    earlier: tuple[str, ...] = ()
+    # data set whose scenes the solver simulates again with a finer step, as the reference; make one with
+    # python -m datagen
+    data: str
     # files of python -m hgn.export or names of shipped weights; null: all shipped weights that fit the data
     weights: tuple[str, ...] | None = None
     split: Split = "test"  # of the data set
@@ -36,13 +35,10 @@ class ErrorVsTimeConfig(ReportConfig):
     resimulate: bool = True  # false: the data is the reference; with mpm_grids=[] perturbation=0 no solver runs
     # initial displacement, domain units, by which the solver is compared with itself (chaos floor); 0: no such row
     perturbation: NonNegative[float] = 1e-6
-    times_last: bool = False  # true: measures all errors before all run times, on a device that is shared until then
     seconds: Positive[float] | None = None  # time limit, after which no measurement starts; null: none
 
     def __post_init__(self) -> None:
         require_bounds(self)
         require(self.out != "", "out", "a file name without its ending", self.out)
-        remedy = "make one with python -m datagen, or give earlier=[report.json] to draw a report again"
-        require(bool(self.data or self.earlier), "data", "a data set", self.data, remedy)
         names = [Path(file).name for file in self.weights or ()]
         require(len(set(names)) == len(names), "weights", "files of different names", names)
