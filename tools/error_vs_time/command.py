@@ -1,9 +1,4 @@
-"""python -m tools.error_vs_time data=… weights=[…] out=results/error_vs_time: error against run time.
-
-Compares networks (by default the shipped ones), the solver on coarser grids and with larger steps, and baselines on
-the same test scenes; a converged simulation is the reference. Writes a table, OUT.json, OUT.png, OUT_batched.png and
-OUT_frames.png.
-"""
+"""Chooses contenders and reference of tools.error_vs_time, and starts the run."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""python -m tools.scaling [--json FILE]: weak scaling of training on this machine's devices.
-
-A contender is timed only if it passes its check. The JSON contains {"meta": provenance, "rows"}.
-"""
+"""Starts the timed processes of tools.scaling, and writes their rows."""
 
 from __future__ import annotations
 

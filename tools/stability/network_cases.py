@@ -130,7 +130,6 @@ def collisions(context: Context) -> Iterator[Case]:
         yield Case(
             f"two bodies meet without gravity, {material}", (meeting(context.scene, material),), MEETING_FRAMES,
             MEETS if context.solver else MEETS_ALONE, solver=context.solver, reported="momentum",
-            also=("angular", "met"),
         )  # fmt: skip
 
 
