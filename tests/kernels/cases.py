@@ -41,12 +41,12 @@ def border_state():
 
 def flying_state():
     """Two scenes in free flight, of which one particle of the second is hardly accelerated, and one in motion."""
-    state = moving_state((30, 30, 30), obstacles=False, spread=0.15)
+    state = moving_state((10, 10, 10), obstacles=False, spread=0.15)
     velocity_NH3, gravity_N3 = state.velocity_NM3.clone(), state.gravity_S3[state.scene_N]
     age_1H1 = torch.arange(velocity_NH3.shape[1], dtype=torch.float64)[None, :, None]
     quiet_N = state.scene_N < 2
     velocity_NH3[quiet_N] = (torch.tensor([1e-2, 2e-2, 0.0]) - age_1H1 * gravity_N3[:, None])[quiet_N]
-    velocity_NH3[35, 0] += 2e-3 * 1.5e-3
+    velocity_NH3[12, 0] += 2e-3 * 1.5e-3
     return replace(state, position_N3=state.position_N3 + 0.4, velocity_NM3=velocity_NH3)
 
 

@@ -10,7 +10,7 @@ from unittest import mock
 
 import torch
 from kernels.interpreter import dropped_bits
-from kernels.references import Added, ProgramSums, rows
+from kernels.references import Added, rows
 from triton.runtime.jit import KernelInterface
 
 from hgn.config import MATERIAL_EMBEDDING
@@ -52,9 +52,6 @@ class Launch:
                 shape = output.value.shape
                 after, before = (rows(x["totals"].flatten()[output.at :], *shape) for x in (self.left, self.given))
                 yield name, (after.double() - before.double()) / self.given["unscale"], output.value, output.summands
-            elif isinstance(output, ProgramSums):
-                total = self.left["partial"].double().sum(0)
-                yield name, total[output.first : output.first + len(output.value)], output.value, 0.0
             else:
                 promised = ~output.isnan()
                 yield name, rows(self.left[name], *output.shape).double()[promised], output[promised], 0.0

@@ -31,16 +31,8 @@ class Added:
     summands: float = 0.0
 
 
-@dataclass(frozen=True)
-class ProgramSums:
-    """What the rows from `first` on of the buffer `partial` [programs, ROWS, ...] add up to over all programs."""
-
-    first: int
-    value: torch.Tensor
-
-
 # By the buffer's name, or one that says what is added. A tensor: the buffer's first elements (NaN: not promised).
-Outputs = dict[str, torch.Tensor | Added | ProgramSums]
+Outputs = dict[str, torch.Tensor | Added]
 
 
 def rows(x: torch.Tensor, *shape: int) -> torch.Tensor:

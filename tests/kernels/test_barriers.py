@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from equality import assert_same
 from kernels.engines import device
 from network.barrier_scenes import CELL, CLEARANCE, DOMAIN, ball, barriers_of, crossings, gutter, scattered, square
 
@@ -65,63 +66,55 @@ def on_device(barriers):
     return barriers and barriers.to(device())
 
 
-def met(seed, stopped=12, others=9):
-    """Of ways among scattered obstacles the first of those that are stopped, and of the others; float32."""
+def met(seed):
+    """A few of the ways among scattered obstacles that are stopped, and of the others."""
     corner_F33, *ways = scattered(seed, 1000)
     before_N3, after_N3 = (torch.as_tensor(x, dtype=torch.float32) for x in ways)
     hit_N, *_ = first_stop(barriers_of(corner_F33), before_N3, after_N3, torch.zeros(len(before_N3), dtype=torch.int64))
-    chosen_N = torch.where(hit_N, torch.cumsum(hit_N, 0) <= stopped, torch.cumsum(~hit_N, 0) <= others)
+    chosen_N = torch.where(hit_N, torch.cumsum(hit_N, 0) <= 6, torch.cumsum(~hit_N, 0) <= 8)
     return corner_F33, before_N3[chosen_N].numpy(), after_N3[chosen_N].numpy()
 
 
-@pytest.mark.parametrize("walls", [None, (0.3, 0.3)])
-def test_ways_end_where_the_reference_ends_them(walls):
-    """Scenes side by side, one without obstacles: ways of all lengths end where they do by PyTorch, to rounding, and
-    pass no triangle. A table of a batch's barriers is as good as one of each scene's own."""
-    corners, befores, afters = (list(x) for x in zip(*(met(seed) for seed in (0, 1, 2)), strict=True))
-    corners[1] = NO_CORNERS
-    scene_N = np.repeat(np.arange(3), [len(before_N3) for before_N3 in befores])
-    before_N3, after_N3, barriers = np.concatenate(befores), np.concatenate(afters), on_device(barriers_of(*corners))
-    table = table_of(*corners) if walls is None else SceneTable.of_barriers(barriers, 3, device())
-    expected_N3, found_N3 = both(before_N3, after_N3, scene_N, barriers, table, walls)
-    np.testing.assert_allclose(found_N3, expected_N3, rtol=0, atol=1e-6)
-    for scene, corner_F33 in enumerate(corners):
-        own = scene_N == scene
-        begin_N3, free_N3, end_N3 = (x[own].astype(np.float64) for x in (before_N3, after_N3, found_N3))
-        assert crossings(begin_N3, end_N3, corner_F33) == 0
-        assert ((end_N3 != free_N3).any(-1).sum() > 8) == (scene != 1 or walls is not None)
-
-
-def test_what_several_triangles_stop():
-    """In a gutter of 60 degrees, where ends move along its crease, and in a ball of many triangles, where a way passes
-    more than stop it: ways end where they do by PyTorch, and within."""
-    generator, count = np.random.default_rng(0), 24
+def within(count=8):
+    """Ways in a gutter of 60 degrees, and in a ball of many triangles, of which one passes more than stop it."""
+    generator = np.random.default_rng(0)
     begin_N3 = generator.uniform((0.498, 0.404, 0.45), (0.502, 0.406, 0.55), (count, 3))
     angle_N = generator.uniform(0, 2 * np.pi, count)
     around_N3 = np.stack([np.cos(angle_N), 0 * angle_N, np.sin(angle_N)], 1)
-    befores = [begin_N3, 0.5 + 0.29 * around_N3]
-    afters = [begin_N3 + generator.normal((0, -0.01, 0.01), 0.002, (count, 3)), 0.5 + 0.32 * np.roll(around_N3, 1, 0)]
-    corners, scene_N = [gutter(60), ball(12, 0.3) + 0.5], np.repeat((0, 1), count)
-    barriers, before_N3 = on_device(barriers_of(*corners)), np.concatenate(befores).astype(np.float32)
-    after_N3 = np.concatenate(afters).astype(np.float32)
-    expected_N3, found_N3 = both(before_N3, after_N3, scene_N, barriers, table_of(*corners))
-    np.testing.assert_allclose(found_N3, expected_N3, rtol=0, atol=2e-6)
-    assert (found_N3[:count, 2] - after_N3[:count, 2] == pytest.approx(0, abs=1e-6)) and (
-        found_N3[:count, 1] > 0.4
-    ).all()
-    assert (np.linalg.norm(found_N3[count:] - 0.5, axis=1) < 0.3).all()
+    return (
+        (gutter(60), begin_N3, begin_N3 + generator.normal((0, -0.01, 0.01), 0.002, (count, 3))),
+        (ball(12, 0.3) + 0.5, 0.5 + 0.29 * around_N3, 0.5 + 0.32 * np.roll(around_N3, 1, 0)),
+    )
 
 
-def test_where_nothing_stops_nothing_changes():
-    """Bitwise: ways between the obstacles, and whatever has come apart."""
-    corner_F33, before_N3, after_N3 = met(4, 20, 40)
-    after_N3[::7], after_N3[3::7] = np.nan, 2.5
+def test_ways_end_where_the_reference_ends_them():
+    """Scenes side by side, between walls: scattered obstacles, none, a gutter, where ends move along the crease, and a
+    ball. Ways of all lengths end where they do by PyTorch, to rounding, and pass no triangle; where nothing stops them
+    nothing changes, bitwise, nor of whatever has come apart. A table of a batch's barriers is that of each scene's."""
+    corners, befores, afters = (list(x) for x in zip(met(0), met(1), *within(), strict=True))
+    corners[1] = NO_CORNERS
+    befores[1][0], afters[1][0] = (0.5, 0.3, 0.5), (0.5, 0.1, 0.5)
+    afters[0][-2:] = [[np.nan] * 3, [2.5] * 3]
+    scene_N = np.repeat(np.arange(4), [len(before_N3) for before_N3 in befores])
+    before_N3, after_N3 = (np.concatenate(x).astype(np.float32) for x in (befores, afters))
     after_N3 = before_N3 + (after_N3 - before_N3)  # as the integration rounds it
-    barriers, scene_N = on_device(barriers_of(corner_F33)), np.zeros(len(after_N3), np.int64)
-    expected_N3, found_N3 = both(before_N3, after_N3, scene_N, barriers, table_of(corner_F33))
-    free_N = ~(expected_N3 != after_N3).any(-1) | np.isnan(after_N3[:, 0])
-    assert 20 < free_N.sum() < len(free_N) - 8
-    np.testing.assert_array_equal(found_N3[free_N], after_N3[free_N])
+    barriers = on_device(barriers_of(*corners))
+    table = SceneTable.of_barriers(barriers, 4, device())
+    for found, expected in zip(table._hashes, table_of(*corners)._hashes, strict=True):
+        assert_same(found and vars(found), expected and vars(expected))
+    expected_N3, found_N3 = both(before_N3, after_N3, scene_N, barriers, table, (0.3, 0.3))
+    np.testing.assert_allclose(found_N3, expected_N3, rtol=0, atol=2e-6)
+    same_N = ~(expected_N3 != after_N3).any(-1) | np.isnan(after_N3[:, 0])
+    np.testing.assert_array_equal(found_N3[same_N], after_N3[same_N])
+    stopped, passed = [], []
+    for scene, corner_F33 in enumerate(corners):
+        own_N = (scene_N == scene) & (np.abs(found_N3) < 1).all(1)
+        stopped.append((~same_N & own_N).sum())
+        passed.append(crossings(before_N3[own_N].astype(float), found_N3[own_N].astype(float), corner_F33))
+    assert min(stopped) > 0 and stopped[0] > 3 and passed == [0] * 4 and same_N[scene_N == 0].sum() > 4
+    in_gutter, in_ball = (found_N3[scene_N == scene] for scene in (2, 3))
+    assert in_gutter[:, 2] - afters[2][:, 2] == pytest.approx(0, abs=1e-6) and (in_gutter[:, 1] > 0.4).all()
+    assert (np.linalg.norm(in_ball - 0.5, axis=1) < 0.3).all()
 
 
 def test_a_table_takes_the_rows_of_another():

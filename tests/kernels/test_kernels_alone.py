@@ -199,15 +199,15 @@ def test_inference(precision, half_cells, half_sums, table):
     assert not judge.wrong
 
 
-@pytest.mark.parametrize("precision", ["tf32", "fp16"] if NATIVE else ["fp16"])
+@pytest.mark.gpu
+@pytest.mark.skipif(not NATIVE, reason="the same kernels as in test_several_scenes, of width 128")
+@pytest.mark.parametrize("precision", ["tf32", "fp16"])
 def test_a_trained_network(precision, table):
     """The shipped one, of width 128, with four iterations on each of four levels."""
     network, _ = load_weights(find_weights("obstacles"))
     assert isinstance(network, HierarchicalGraphNetwork)
-    network.double()
-    state = float32_state((300, 131), spread=0.2) if NATIVE else float32_state((2,), spread=0.04)
-    judge = Judge(table, precision)
-    judged(judge, made(network, state, precision, ROOM if NATIVE else 16), network, state)
+    judge, state = Judge(table, precision), float32_state((300, 131), spread=0.2)
+    judged(judge, made(network.double(), state, precision, ROOM), network, state)
     assert not judge.wrong
 
 

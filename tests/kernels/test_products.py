@@ -7,6 +7,7 @@ import triton.language as tl
 from kernels.engines import device
 
 from hgn.kernels.blocks import finer_product, nearest_tf32, product
+from hgn.kernels.packing import rounded_to_tf32
 
 LAST_BIT = 2.0**-10  # of TF32, of a number's power of two
 
@@ -51,13 +52,13 @@ def test_numbers_are_rounded_to_the_nearest():
 
 
 def test_a_product_rounds_what_it_is_given():
-    """A TF32 product of activations and weights that come rounded is the product of the rounded ones."""
+    """A TF32 product of activations and of weights, which come rounded, is the product of the rounded ones."""
     generator = torch.Generator().manual_seed(0)
     x, w = torch.randn(2, 16, 16, generator=generator)
-    w = rounded(w).float()
+    exact, w = w, rounded_to_tf32(w)
     y = torch.empty(16, 16, device=device())
     _product[(1,)](x.to(device()), w.to(device()), y, SIZE=16, PRECISION="tf32")
-    torch.testing.assert_close(y.cpu().double(), rounded(x) @ w.double(), rtol=1e-5, atol=1e-6)
+    torch.testing.assert_close(y.cpu().double(), rounded(x) @ rounded(exact), rtol=1e-5, atol=1e-6)
 
 
 @pytest.mark.parametrize("precision", ["fp16", "tf32", "fp32"])

@@ -38,7 +38,7 @@ def placed(made, network):
 
 def pools_of(network, training):
     """The pool of each backend, triton's first."""
-    scenes = TritonScenes(network, training, CELL_SIZE)
+    scenes = TritonScenes(network, training, CELL_SIZE, training.precision)
     return PushforwardPool(scenes, training, 0), PushforwardPool(TorchScenes(network), training, 0)
 
 
@@ -64,7 +64,7 @@ def assert_same_pools(fast, plain):
 
 
 @pytest.mark.parametrize(
-    "changes", [{}, {"inputs": "relative", "wall_clearance": (0.45, 0.45)}, {"obstacle_clearance": 5e-3}]
+    "changes", [{"inputs": "relative", "wall_clearance": (0.45, 0.45)}, {"obstacle_clearance": 5e-3}]
 )
 def test_the_pool_is_that_of_the_plain_path(changes):
     """Scenes with and without obstacles, first and later frames, one simulation after the other with other weights and

@@ -12,7 +12,7 @@ from kernels.test_pushforward import placed
 from kernels.test_training import without_jitter
 from kernels.test_update import HISTORY, parameters_of, updates_of
 from network.states import network_of
-from training.test_symmetry import CELL_SIZE, CYCLIC, EIGHT, doubled, scene_with_obstacles, seeds_of
+from training.test_symmetry import ALL_48, CELL_SIZE, EIGHT, doubled, scene_with_obstacles, seeds_of
 
 from hgn.config import TrainingConfig
 from hgn.data.batch import make_batch
@@ -20,7 +20,6 @@ from hgn.data.episode_tensors import EpisodeChunk, whole_episode
 from hgn.data.sampler import Sample, SamplerState
 from hgn.runtime.parity import relative_error
 from hgn.scene.obstacle_grid import ObstacleGrid
-from hgn.scene.symmetry import scene_symmetries
 from hgn.training.symmetry import under_symmetries
 from hgn.training.triton_updates import TritonUpdates
 from hgn.training.updates import Ranks, TrainedNetwork
@@ -34,24 +33,17 @@ def small_network():
     return network_of(width=16, levels=1, message_passing_steps=1, cell_size=0.1)
 
 
-@pytest.mark.parametrize("kind", ["hgn", "relative"])
-def test_an_update_under_symmetries_is_the_plain_one(kind, monkeypatch):
-    """An update of eight scenes, each under another symmetry, one without obstacles, one without gravity: positions,
-    velocities, targets, normals, loss and gradients are those of backend torch in float64, and the check passes. With
-    relative inputs the symmetries are any of the cube's, which turn gravity."""
-    network = small_network()
-    if kind == "relative":
-        network = network_of(width=16, levels=1, message_passing_steps=1, cell_size=0.1, inputs="relative")
+def test_an_update_under_symmetries_is_the_plain_one(monkeypatch):
+    """An update of eight scenes, each under another of the cube's symmetries, which turn gravity, one without
+    obstacles, one without gravity: positions, velocities, targets, normals, loss and gradients are those of backend
+    torch in float64, and the check passes."""
+    network = network_of(width=16, levels=1, message_passing_steps=1, cell_size=0.1, inputs="relative")
     episodes = [scene_with_obstacles(i, 2 + i) for i in range(8)]
     bare = ObstacleGrid(CELL_SIZE, np.zeros((0, 3), np.int32), np.zeros((0, 3), np.float32))
     episodes[2] = replace(episodes[2], obstacle_grid=bare)
     episodes[0] = replace(episodes[0], gravity=(0.0, 0.0, 0.0))
-    shown = [CYCLIC, *EIGHT[1:]]
-    free = scene_symmetries((0.0, 0.0, 0.0), (1.0, 1.0, 1.0), CELL_SIZE)
-    seeds = (*seeds_of([CYCLIC], free), *seeds_of(EIGHT[1:]))
-    if kind == "relative":
-        shown = [*free[1::6]]
-        seeds = seeds_of(shown, free)
+    shown = [*ALL_48[1::6]]
+    seeds = seeds_of(shown, ALL_48)
     batch = under_symmetries(doubled(make_batch([(e, FRAME) for e in episodes], network.config, seeds)), shown)
     state = batch.state()
     target = network.target(batch.acceleration(), batch.gravity_S3[batch.scene_N])
@@ -68,7 +60,7 @@ def test_an_update_under_symmetries_is_the_plain_one(kind, monkeypatch):
     wholes = {i: whole_episode(made, network.config) for i, made in enumerate(episodes)}
     fast.run(EpisodeChunk((samples,), wholes, SamplerState()), 0)
     updates, count = fast.updates, len(state.position_N3)
-    width = 3 * HISTORY + (9 if kind == "relative" else 0)
+    width = 3 * HISTORY + 9
     assert fast.parity is not None and max(fast.parity) < 1e-3
     near = {"rtol": 0, "atol": 1e-7}
     torch.testing.assert_close(updates.buffers.position_N3[:count].cpu().double(), state.position_N3, **near)
@@ -84,7 +76,7 @@ def test_an_update_under_symmetries_is_the_plain_one(kind, monkeypatch):
     found = [torch.zeros_like(parameter) for parameter in network.parameters()]
     updates.packed.scatter(updates.fused.totals[: updates.packed.size].cpu(), found)
     # differences of velocities have the rounding of positions in float32
-    assert relative_error(flat(found), expected) < (1e-3 if kind == "relative" else 1e-4)
+    assert relative_error(flat(found), expected) < 1e-3
 
 
 def test_without_symmetry_nothing_changes():

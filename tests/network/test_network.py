@@ -101,8 +101,8 @@ def test_network_equals_the_literal_definition(given, changes):
     ],
 )
 def test_relative_inputs_and_rest_stay_what_they_were(given, changes, expected):
-    """A weighted sum of the outputs is the one with which weights were trained, in float64: what the numbers of
-    hgn.network.relative and of rest are for. That the rules are right is seen by hgn.kernels, which has its own."""
+    """A weighted sum of the outputs is the one that the shipped weights were trained with, in float64. It depends on
+    every constant of hgn.network.relative and of rest; hgn.kernels implements their rules a second time."""
     network, state, origin_S3 = case_of(given, changes | {"inputs": "relative"})
     output_N3 = rested(network, state, network.prediction(state, origin_S3)).detach()
     weight_N3 = torch.arange(1.0, output_N3.numel() + 1, dtype=torch.float64).cos().view_as(output_N3)

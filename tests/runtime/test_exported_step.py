@@ -32,9 +32,9 @@ from hgn.schema import ConfigError, to_mapping
 EXAMPLES = Path(__file__).resolve().parents[2] / "tools/deploy"
 TOLERANCE = 1e-6  # of positions and displacements in a frame, domain units
 FRAMES = 4
-# At its walls random states begin, or end, for some particles.
+# At its walls random states begin, or end, for some particles, and their ways meet the triangles below.
 WALLED = {"wall_clearance": (0.1, 0.7)}
-CONSTRAINED = WALLED | {"obstacle_clearance": 1e-3}
+WHOLE = WALLED | {"inputs": "relative", "rest_threshold": 0.3, "obstacle_clearance": 1e-3, "levels": 1}
 SIZES = [(particles, obstacles) for particles in (1, 216, 3_000) for obstacles in (True, False)]
 CELL = 1 / 64
 SCENE = """
@@ -73,46 +73,45 @@ def one_turn():
 
 @pytest.fixture(scope="module")
 def as_onnx(tmp_path_factory):
-    """A network of absolute inputs as ONNX."""
-    return exported(tmp_path_factory.mktemp("onnx"), WALLED | {"levels": 2}, ("onnx",))
+    """A network of relative inputs with all constraints, as the default weights are, as ONNX."""
+    return exported(tmp_path_factory.mktemp("onnx"), "onnx")
 
 
 @pytest.fixture(scope="module")
-def in_both_formats(tmp_path_factory):
-    """A network of relative inputs with all constraints, in both formats, of one graph."""
-    relative = CONSTRAINED | {"inputs": "relative", "rest_threshold": 0.3, "levels": 1}
-    return exported(tmp_path_factory.mktemp("both"), relative, ("onnx", "package"))
+def as_package(tmp_path_factory):
+    """The same compiled."""
+    return exported(tmp_path_factory.mktemp("package"), "package")
 
 
 def test_the_graph_is_the_step():
-    """What both formats are made of, run by PyTorch: also where obstacles hold some particles."""
-    network = network_of(torch.float32, levels=1, message_passing_steps=1, **CONSTRAINED)
+    """What both formats are made of, run by PyTorch, with absolute inputs on two levels."""
+    network = network_of(torch.float32, levels=2, message_passing_steps=1, **WALLED)
     graph = traced_step(network, WeightsInfo(network.config, 60.0, CELL, step=network.step)).module()
     compare(network, lambda arrays: [x.detach().numpy() for x in graph(*map(torch.from_numpy, arrays.values()))])
 
 
 def test_onnx_is_the_step(as_onnx):
-    """ONNX Runtime computes the step to 1e-6 at any number of particles, with and without obstacles; the file says what
-    its weights say of themselves; the example in Python simulates a scene's arrays."""
-    assert_onnx(as_onnx)
+    """ONNX Runtime computes the step to 1e-6 at any number of particles, with and without obstacles, which hold some of
+    them; the file says what its weights say of themselves; the example in Python simulates a scene's arrays."""
+    network, folder = as_onnx
+    session = onnxruntime.InferenceSession(folder / "new/step.onnx")
+    assert [item.name for item in session.get_inputs()] == list(INPUTS)
+    declared = json.loads(session.get_modelmeta().custom_metadata_map["hgn"])
+    assert declared["frame_rate_hz"] == 60.0 and declared["network"] == to_mapping(network.config)
+    compare(network, lambda arrays: session.run(None, arrays))
+    simulate = runpy.run_path(str(EXAMPLES / "step_onnx.py"))["simulate"]
+    assert_rollout(as_onnx, simulate(str(folder / "new/step.onnx"), str(folder / "arrays"), FRAMES))
 
 
 @pytest.mark.slow
-def test_both_formats_are_the_step(in_both_formats):
-    """The same with relative inputs, rest, and obstacles that hold some particles; and of a package of PyTorch."""
-    assert_onnx(in_both_formats)
-    package = torch._inductor.aoti_load_package(str(in_both_formats.folder / "new/step.pt2"))
-    compare(
-        in_both_formats.network, lambda arrays: [x.numpy() for x in package(*map(torch.from_numpy, arrays.values()))]
-    )
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(shutil.which("cmake") is None, reason="needs cmake")
-def test_a_package_runs_in_cpp(in_both_formats):
-    """The example in C++ simulates a scene's arrays."""
+def test_a_package_is_the_step(as_package):
+    """The same of a package that PyTorch compiled, and of the example in C++."""
+    package = torch._inductor.aoti_load_package(str(as_package.folder / "new/step.pt2"))
+    compare(as_package.network, lambda arrays: [x.numpy() for x in package(*map(torch.from_numpy, arrays.values()))])
+    if shutil.which("cmake") is None:
+        pytest.skip("the C++ example needs cmake")
     options = [f"-DCMAKE_PREFIX_PATH={torch.utils.cmake_prefix_path}", "-DCMAKE_BUILD_TYPE=Debug"]
-    assert_rollout(in_both_formats, built_and_run("step_package", in_both_formats.folder, "new/step.pt2", options))
+    assert_rollout(as_package, built_and_run("step_package", as_package.folder, "new/step.pt2", options))
 
 
 @pytest.mark.slow
@@ -152,6 +151,18 @@ def test_a_gns_is_refused(tmp_path):
     assert not (tmp_path / "a.onnx").exists()
 
 
+def test_a_package_is_written_first(tmp_path, monkeypatch):
+    """What writes ONNX leaves symbols in the graph, of both formats, that the compiler refuses."""
+    network, written = network_of(torch.float32), []
+    save_weights(tmp_path / "w.safetensors", network, WeightsInfo(network.config, 60.0, CELL))
+    monkeypatch.setattr("hgn.runtime.exported_step.traced_step", lambda *_: None)
+    for kind in ("onnx", "package"):
+        monkeypatch.setattr(f"hgn.runtime.exported_step.write_{kind}", lambda path, *_: written.append(path.name))
+    files = {"onnx": str(tmp_path / "a.onnx"), "package": str(tmp_path / "a.pt2")}
+    assert export.main({"weights": str(tmp_path / "w.safetensors"), "device": "cpu"} | files) == 0
+    assert written == ["a.pt2", "a.onnx"]
+
+
 def test_a_package_that_is_cut_off_leaves_nothing(tmp_path, monkeypatch):
     """Ctrl-C while the compiler is at it."""
 
@@ -166,31 +177,18 @@ def test_a_package_that_is_cut_off_leaves_nothing(tmp_path, monkeypatch):
     assert not list(tmp_path.iterdir())
 
 
-def exported(folder, changes, formats):
+def exported(folder, kind):
     """What the command writes of a small network, and a scene and its arrays."""
-    network = network_of(torch.float32, message_passing_steps=1, **changes)
+    network = network_of(torch.float32, message_passing_steps=1, **WHOLE)
     save_weights(folder / "w.safetensors", network, WeightsInfo(network.config, 60.0, CELL, step=network.step))
     shutil.copy(config_directory() / "example/ramp.obj", folder)
     (folder / "scene.yaml").write_text(SCENE)
-    files = {"onnx": "new/step.onnx", "package": "new/step.pt2"}
-    options = {name: str(folder / files[name]) for name in formats} | {"device": "cpu"}
-    options |= {"scene": str(folder / "scene.yaml"), "arrays": str(folder / "arrays")}
+    path = folder / "new" / ("step.onnx" if kind == "onnx" else "step.pt2")
+    options = {kind: str(path), "scene": str(folder / "scene.yaml"), "arrays": str(folder / "arrays"), "device": "cpu"}
     # the wrapper, which calls the kernels, is compiled without optimisation
     with torch._inductor.config.patch({"aot_inductor.compile_wrapper_opt_level": "O0"}):
         assert export.main({"weights": str(folder / "w.safetensors"), **options}) == 0
     return Written(network, folder)
-
-
-def assert_onnx(written):
-    """The file's inputs, metadata, step, and rollout by the example."""
-    path = str(written.folder / "new/step.onnx")
-    session = onnxruntime.InferenceSession(path)
-    assert [item.name for item in session.get_inputs()] == list(INPUTS)
-    declared = json.loads(session.get_modelmeta().custom_metadata_map["hgn"])
-    assert declared["frame_rate_hz"] == 60.0 and declared["network"] == to_mapping(written.network.config)
-    compare(written.network, lambda arrays: session.run(None, arrays))
-    simulate = runpy.run_path(str(EXAMPLES / "step_onnx.py"))["simulate"]
-    assert_rollout(written, simulate(path, str(written.folder / "arrays"), FRAMES))
 
 
 def compare(network, step):
@@ -212,15 +210,14 @@ def compare(network, step):
 
 
 def assert_rollout(written, found_TN3):
-    """The frames of backend torch, in some of which obstacles hold particles where the network asks for it."""
+    """The frames of backend torch, in some of which obstacles hold particles."""
     simulator, scene = Simulator(written.network, 60.0, "torch"), load_scene(written.folder / "scene.yaml")
     (expected_TN3,) = simulator.rollout([scene], FRAMES)
     np.testing.assert_allclose(found_TN3, expected_TN3, rtol=0, atol=FRAMES * TOLERANCE)
-    if written.network.step.obstacle_clearance is not None:
-        state = replace(simulator.start([scene]), barriers=None)
-        for _ in range(FRAMES - 1):
-            state = simulator.step(state)
-        assert np.abs(state.position_N3.numpy() - found_TN3[-1]).max() > 0.01
+    state = replace(simulator.start([scene]), barriers=None)
+    for _ in range(FRAMES - 1):
+        state = simulator.step(state)
+    assert np.abs(state.position_N3.numpy() - found_TN3[-1]).max() > 0.01
 
 
 def built_and_run(program, folder, model, options):

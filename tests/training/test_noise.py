@@ -1,4 +1,4 @@
-"""Noise injection and grid jitter."""
+"""Noise injection, how much noise a sample gets by how much happens in it, and grid jitter."""
 
 import math
 from dataclasses import replace
@@ -8,9 +8,16 @@ import pytest
 import torch
 from scene.test_episode import make_episode
 
-from hgn.config import NetworkConfig
+from hgn.config import NetworkConfig, TrainingConfig
 from hgn.data.batch import make_batch
-from hgn.training.noise import jittered_origin, perturbed_window, random_walk
+from hgn.training.noise import (
+    jittered_origin,
+    noise_scale,
+    perturbed_window,
+    quiet_weight,
+    random_walk,
+    target_acceleration,
+)
 
 STD = 0.000848528
 
@@ -44,16 +51,6 @@ def test_walk_has_the_papers_spread():
     assert float((correlation - torch.eye(5)).abs().max()) < 0.02
 
 
-def test_noise_in_the_window_is_that_walk():
-    """Positions are the sums of the velocity noise; the oldest position is exact; the next one moves with the last."""
-    batch = batch_of(episode(20_000))
-    noise_WN3 = perturbed_window(batch, STD).double() - batch.window_WN3.double()
-    assert not noise_WN3[0].any()
-    velocity_noise = noise_WN3[1:-1] - noise_WN3[:-2]
-    assert abs(float(velocity_noise[-1].std()) / STD - 1) < 0.02
-    torch.testing.assert_close(noise_WN3[-1], noise_WN3[-2], rtol=0, atol=2e-7)
-
-
 def test_correlated_noise():
     """The waves' share of the variance is asked for; what is left of it are the particles' own walks. Neighbours have
     the waves in common, particles far apart do not, nor do other scenes; no share is bitwise the noise without."""
@@ -79,24 +76,6 @@ def test_correlated_noise():
     assert torch.equal(perturbed_window(batch, STD, 0.0), perturbed_window(batch, STD))
 
 
-def test_target_undoes_the_velocity_error():
-    """The target is v_true^{n+1} - v_noisy^n."""
-    batch = batch_of(episode(500), episode(300, seed=1))
-    noisy = perturbed_window(batch, STD)
-    true_next = batch.window_WN3[-1] - batch.window_WN3[-2]
-    noisy_velocity = batch.state(noisy).velocity_NM3[:, 0]
-    torch.testing.assert_close(batch.acceleration(noisy), true_next - noisy_velocity, rtol=0, atol=3e-7)
-
-
-def test_noise_belongs_to_the_sample():
-    """A sample's noise depends on its seed alone, not on what shares its batch; other seeds give other noise."""
-    first, second = episode(50), episode(30, seed=1)
-    alone = perturbed_window(batch_of(first, seeds=(7,)), STD)
-    together = perturbed_window(batch_of(second, first, seeds=(9, 7)), STD)
-    assert torch.equal(together[:, 30:], alone)
-    assert not torch.equal(perturbed_window(batch_of(first, seeds=(8,)), STD), alone)
-
-
 @pytest.mark.parametrize("smooth", [0.0, 0.3])
 def test_a_scene_can_have_less_noise(smooth):
     """Each scene's noise is its scale times what its seed draws; without scales it is all of it."""
@@ -105,24 +84,6 @@ def test_a_scene_can_have_less_noise(smooth):
     scaled = perturbed_window(replace(batch, noise_scale_S=(0.25, 1.0)), STD, smooth, 0.035).double()
     torch.testing.assert_close(scaled[:, :50] - clean[:, :50], (whole - clean)[:, :50] / 4, rtol=0, atol=1e-7)
     assert torch.equal(scaled[:, 50:], whole[:, 50:])
-
-
-def test_no_noise_is_no_copy():
-    """With noise off, the window is used as it is."""
-    batch = batch_of(episode(5))
-    assert perturbed_window(batch, 0.0) is batch.window_WN3
-
-
-def test_stored_episode_is_never_changed():
-    """Making, perturbing and moving batches leaves the episode's arrays bitwise as they were."""
-    stored = episode(40)
-    stored.position_TN3.setflags(write=False)
-    before = stored.position_TN3.tobytes()
-    for frame in range(11):
-        batch = batch_of(stored, frame=frame)
-        perturbed_window(batch, STD)
-        batch.window_WN3.add_(1.0)
-    assert stored.position_TN3.tobytes() == before
 
 
 def test_history_before_the_start_is_ballistic():
@@ -137,19 +98,78 @@ def test_history_before_the_start_is_ballistic():
     torch.testing.assert_close(batch.gravity_S3[0].double(), gravity, rtol=1e-6, atol=0)
 
 
+def test_noise_in_the_window_is_that_walk():
+    """Positions are the sums of the velocity noise; the oldest position is exact; the next one moves with the last, so
+    that the target is v_true^{n+1} - v_noisy^n. A sample's noise depends on its seed alone. With noise off, the window
+    is used as it is; the episode's arrays stay as they are."""
+    stored, other = episode(20_000), episode(30, seed=1)
+    stored.position_TN3.setflags(write=False)
+    before, batch = stored.position_TN3.tobytes(), batch_of(stored, seeds=(7,))
+    noisy = perturbed_window(batch, STD)
+    noise_WN3 = noisy.double() - batch.window_WN3.double()
+    assert not noise_WN3[0].any()
+    velocity_noise = noise_WN3[1:-1] - noise_WN3[:-2]
+    assert abs(float(velocity_noise[-1].std()) / STD - 1) < 0.02
+    torch.testing.assert_close(noise_WN3[-1], noise_WN3[-2], rtol=0, atol=2e-7)
+    true_next = batch.window_WN3[-1] - batch.window_WN3[-2]
+    expected = true_next - batch.state(noisy).velocity_NM3[:, 0]
+    torch.testing.assert_close(batch.acceleration(noisy), expected, rtol=0, atol=3e-7)
+    assert torch.equal(perturbed_window(batch_of(other, stored, seeds=(9, 7)), STD)[:, 30:], noisy)
+    assert not torch.equal(perturbed_window(batch_of(stored, seeds=(8,)), STD), noisy)
+    assert perturbed_window(batch, 0.0) is batch.window_WN3
+    batch.window_WN3.add_(1.0)
+    assert stored.position_TN3.tobytes() == before
+
+
 def test_jitter_fills_a_cell():
-    """Grid origins are uniform in [-R, 0]^3, one for each scene, and belong to the sample."""
+    """Grid origins are uniform in [-R, 0]^3, one for each scene, and belong to the sample. In the loss a scene with
+    many particles counts as much as one with few."""
     stored = episode(2)
     origins = jittered_origin(batch_of(*[stored] * 2000, seeds=tuple(range(2000))), 0.035)
     assert origins.shape == (2000, 3)
     assert float(origins.max()) <= 0 and float(origins.min()) >= -0.035
     torch.testing.assert_close(origins.mean(0), torch.full((3,), -0.0175), rtol=0.05, atol=0)
-    again = jittered_origin(batch_of(stored, seeds=(5,)), 0.035)
-    assert torch.equal(again[0], origins[5])
+    assert torch.equal(jittered_origin(batch_of(stored, seeds=(5,)), 0.035)[0], origins[5])
+    value = torch.tensor([2.0] * 10 + [4.0] * 30)
+    mean = batch_of(episode(10), episode(30, seed=1)).mean_over_scenes(value)
+    torch.testing.assert_close(mean, torch.tensor(3.0))
 
 
-def test_loss_weighs_scenes_alike():
-    """A scene with many particles counts as much as one with few."""
-    batch = batch_of(episode(10), episode(30, seed=1))
-    value = torch.cat([torch.full((10,), 2.0), torch.full((30,), 4.0)])
-    torch.testing.assert_close(batch.mean_over_scenes(value), torch.tensor(3.0))
+@pytest.mark.parametrize(("acceleration", "smallest"), [(0.0, 0.02), (1e-5, 0.02), (1e-4, 0.1), (5e-4, 0.5)])
+def test_scales_are_log_uniform_down_to_what_happens(acceleration, smallest):
+    """From the larger of the least scale and the frame's own acceleration up to 1, each seed its own; errors count in
+    units of the noise. It is as asked where more happens, where no other scale is asked for, and without noise."""
+    training = TrainingConfig(noise_std=1e-3, noise_min_scale=0.02)
+    drawn = [noise_scale(training, acceleration, seed) for seed in range(4000)]
+    assert drawn[7] == noise_scale(training, acceleration, 7)
+    scales = np.array([scale for scale, _ in drawn])
+    assert smallest <= scales.min() < smallest * 1.01 and 0.99 < scales.max() <= 1
+    share = np.sort(np.log(scales) / np.log(smallest))
+    assert np.abs(share - np.linspace(0, 1, len(share))).max() < 0.03
+    assert [weight for _, weight in drawn] == pytest.approx(1 / scales**2)
+    noiseless = TrainingConfig(noise_std=0.0, noise_min_scale=0.02)
+    for elsewhere, above in ((training, 1e-3), (training, 0.1), (training, float("nan")), (noiseless, 0.0)):
+        assert noise_scale(elsewhere, above, 5) == noise_scale(TrainingConfig(noise_std=1e-3), 0.0, 5) == (1.0, 1.0)
+
+
+def test_what_is_asked_for():
+    """Root mean square over axes and particles of the last acceleration of each window."""
+    time = torch.arange(7.0)
+    window_7N3 = torch.zeros(7, 4, 3)
+    window_7N3[:, 0, 1] = 0.3 * time**2  # 0.6 a frame squared, of one of 12 coordinates
+    still_7N3 = window_7N3[:, [1, 1, 1, 1]] + time[:, None, None]
+    found = target_acceleration(torch.stack([window_7N3, still_7N3]))
+    torch.testing.assert_close(found, torch.tensor([0.6 / 12**0.5, 0.0]))
+
+
+def test_what_rests_counts_more():
+    """Below `quiet_acceleration` a sample counts as often as its acceleration is smaller, up to `quiet_weight`, without
+    noise and beside the weight that noise gives it; by default all count alike."""
+    quiet = TrainingConfig(noise_std=0.0, quiet_acceleration=1e-3)
+    asked = (1.0, 1e-3, 5e-4, 1e-4, 1e-6, 0.0)
+    assert [quiet_weight(quiet, acceleration) for acceleration in asked] == pytest.approx([1, 1, 2, 4, 4, 4])
+    assert noise_scale(quiet, 5e-4, 5) == (1.0, quiet_weight(quiet, 5e-4))
+    assert quiet_weight(quiet, float("nan")) == quiet_weight(TrainingConfig(), 0.0) == 1.0
+    noisy = TrainingConfig(noise_std=1e-3, noise_min_scale=0.02, quiet_acceleration=1e-3)
+    scale, weight = noise_scale(noisy, 4e-4, 5)
+    assert scale < 1 and weight == pytest.approx(2.5 / scale**2)

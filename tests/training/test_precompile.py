@@ -1,7 +1,7 @@
 """Kernels compiled ahead: processes that compile, what the user hears of them, and that the cache then has it all."""
 
+import re
 import sys
-import time
 
 import pytest
 from processes import run_compiled
@@ -17,19 +17,6 @@ def job(batch_scenes=8):
     training = TrainingConfig(batch_scenes=batch_scenes, precision="fp16")
     config = TrainConfig(SceneConfig(), network=NetworkConfig(width=16, levels=2), training=training)
     return job_of_training(config, (9, 0), False)
-
-
-@pytest.fixture
-def started():
-    all_started: list[Precompilation] = []
-    yield all_started
-    for ahead in all_started:
-        ahead.stop()
-
-
-def start(started, program):
-    started.append(Precompilation(job(), 2, (sys.executable, "-c", f"import sys; {program}")))
-    return started[0]
 
 
 def test_the_job_follows_from_the_configuration():
@@ -53,25 +40,30 @@ def test_jobs_of_simulations():
     assert len(frame_sizes(range(1, 1000))) == 9
 
 
-def test_what_was_compiled_is_counted(started):
-    """Each process gets its share and the job; the counts of all are told together."""
-    ahead = start(started, "assert 'fp16' in sys.stdin.read(); print(10 + int(sys.argv[1]) + int(sys.argv[2]))")
-    assert "backend triton: 25 kernels ready" in ahead.wait(lambda: False)
-
-
-def test_a_failure_is_told(started):
-    """When a process fails, its exit code and last line are told, and that nothing is lost."""
-    text = start(started, "sys.exit('no ptxas' if sys.argv[1] == '1' else 0)").wait(lambda: False)
-    assert "1 of 2 processes" in text and "exit code 1: no ptxas" in text and "when it is first used" in text
-
-
-def test_an_interruption_ends_them(started):
-    """Whoever is interrupted waits no longer, and no process is left."""
-    ahead = start(started, "import time; time.sleep(60)")
-    begin = time.monotonic()
-    assert "interrupted" in ahead.wait(lambda: True)
-    assert time.monotonic() - begin < 30
-    assert not ahead.running
+@pytest.mark.parametrize(
+    ("program", "interrupted", "expected"),
+    [  # each process gets its share and the job; the counts of all are told together
+        (
+            "assert 'fp16' in sys.stdin.read(); print(10 + sum(map(int, sys.argv[1:])))",
+            False,
+            "25 kernels ready",
+        ),
+        (
+            "sys.exit('no ptxas' if sys.argv[1] == '1' else 0)",
+            False,
+            "1 of 2 .*exit code 1: no ptxas.*when it is first",
+        ),
+        ("import time; time.sleep(600)", True, "interrupted"),
+    ],
+)
+def test_what_is_told(program, interrupted, expected):
+    """What was compiled is counted; when a process fails, its exit code and last line are told, and that nothing is
+    lost; whoever is interrupted waits no longer, and no process is left."""
+    ahead = Precompilation(job(), 2, (sys.executable, "-c", f"import sys; {program}"))
+    try:
+        assert re.search(expected, ahead.wait(lambda: interrupted)) and not ahead.running
+    finally:
+        ahead.stop()
 
 
 def test_the_launches_are_those_of_an_update(warm_python, tmp_path):

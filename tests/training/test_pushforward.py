@@ -1,30 +1,21 @@
 """Pushforward on backend torch."""
 
-import itertools
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
-from equality import assert_same
-from network.barrier_scenes import crossings
 from network.states import gns_of, network_of
-from training.runs import metrics, train_mapping
 from training.test_noise import episode
-from training.test_resume import stop_at as stop_at
 from training.test_symmetry import scene_with_obstacles
 
-from hgn import train
 from hgn.config import TrainingConfig
 from hgn.data.batch import BatchSample, join, make_batch
 from hgn.runtime import simulator
 from hgn.runtime.simulator import Simulator
 from hgn.scene.history import window
-from hgn.scene.rollout_file import known_obstacles
-from hgn.scene.scene import all_corners
 from hgn.schema import ConfigError
 from hgn.step_config import StepConfig
-from hgn.training.checkpoint import read_checkpoint
 from hgn.training.pushforward import PoolDraws, PushforwardPool, drawn_starts, pushforward_windows
 from hgn.training.torch_pushforward import TorchScenes
 
@@ -207,25 +198,6 @@ def with_square(episode, at, size=0.6):
     return replace(episode, specification={"kind": "random", "obstacles": [record]})
 
 
-def test_obstacles_hold():
-    """Where obstacles let nothing pass, nothing of what the network does in a scene passes its own; in another scene it
-    does, and without clearance in both."""
-    network = wild_network()
-    scenes = [with_square(episode(6, seed=1), (0.5, 0.53, 0.5)), episode(6, seed=2)]
-    corner_F33 = all_corners(known_obstacles(scenes[0]) or ())
-    for clearance, expected in ((None, [6, 6]), (2e-3, [0, 6])):
-        network.step = StepConfig(obstacle_clearance=clearance)
-        own = pool_of(network)
-        own.refresh([(scene, 2) for scene in scenes])
-        passed = []
-        for scene in scenes:
-            windows = [sample.window_WN3 for sample, _ in own._samples if sample.episode is scene]
-            assert len(windows) == 3
-            path_TN3 = np.stack([windows[0][-3], *(window_WN3[-2] for window_WN3 in windows)]).astype(np.float64)
-            passed.append(sum(crossings(*ways, corner_F33) for ways in itertools.pairwise(path_TN3)))
-        assert passed == expected
-
-
 def test_barriers_are_remembered(monkeypatch):
     """The pool is made anew, from other frames of the same episodes, without their obstacles' lists being built again;
     another clearance has its own."""
@@ -260,25 +232,3 @@ def test_lost_scenes_are_dropped():
     assert own._samples == [] and own.figures["pushforward/windows"] == 0 and "pushforward/mse" not in own.figures
     samples = samples_of([small] * 4, 2, seeds=(5, 6, 7, 8))
     assert own.replaced(samples, 0) == samples
-
-
-def test_a_resume_where_the_pool_is_made_anew_changes_nothing(data, tmp_path, stop_at):
-    """Interrupted at a multiple of pushforward_every, a training ends where an uninterrupted one does, bit by bit, and
-    it tells how many windows it has; interrupted elsewhere it goes on with a pool of its own."""
-    own = {"pushforward_fraction": 0.5, "pushforward_every": 4, "pushforward_scenes": 3, "pushforward_frames": 2}
-
-    def trained(name, stops):
-        for stop in (*stops, None):
-            stop_at(stop)
-            train.main(train_mapping(data, tmp_path / name, backend="torch", ema_decay=0.8, **own))
-        return read_checkpoint(tmp_path / name / "checkpoints" / "last.ckpt")
-
-    whole, again, elsewhere = trained("whole", []), trained("again", [8]), trained("elsewhere", [6])
-    for part in ("state_dict", "optimizer_states", "hgn"):
-        assert_same(again[part], whole[part], part)
-    assert elsewhere["hgn"] == whole["hgn"]
-    assert any(not torch.equal(elsewhere["state_dict"][name], value) for name, value in whole["state_dict"].items())
-    lines = [line for line in metrics(tmp_path / "whole") if "loss" in line]
-    resumed = [line for line in metrics(tmp_path / "elsewhere") if "loss" in line]
-    assert all(line["pushforward/windows"] > 0 for line in resumed)  # also between updates 6 and 8
-    assert all(line["pushforward/windows"] == 6 and line["pushforward/dropped"] == 0 for line in lines)

@@ -5,11 +5,11 @@ from itertools import islice
 from typing import Any
 
 import numpy as np
-import pytest
+import torch
 from equality import assert_same
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from training.runs import NETWORK, TRAINING, train_mapping
+from training.runs import NETWORK, TRAINING, metrics, train_mapping
 
 from hgn import train
 from hgn.config import NetworkConfig, TrainingConfig
@@ -24,6 +24,7 @@ from hgn.training.stop import StopRequest
 
 UPDATES = 16  # of 2 samples, where an epoch has 25
 MORE = {"optimizer": "muon", "symmetry": "gravity", "warmup_updates": 6, "ema_decay": 0.8}
+MORE |= {"pushforward_fraction": 0.5, "pushforward_every": 4, "pushforward_scenes": 3, "pushforward_frames": 2}
 STARTS = ((1, 8), (1, 2), (0, 3), (1, 4))  # from, to: ranks, scenes each, batches read ahead, batches
 
 
@@ -135,44 +136,33 @@ def test_feeds_of_all_ranks_resume_anywhere(data):
     interrupted()
 
 
-@pytest.fixture
-def stop_at(monkeypatch):
-    """Makes the next start of a training stop once it has made that many updates in all."""
-    place: dict[str, Any] = {"update": None, "module": None}
-    original = TrainingModule.training_step
+def test_resume_equals_no_interruption(data, tmp_path, monkeypatch):
+    """Interrupted at any updates at which a pushforward pool is made anew, a training ends where an uninterrupted one
+    does, bit by bit: weights, their average, both moments, learning rate and order; noise, jitter and symmetries come
+    from the samples' seeds, so they agree too. Interrupted elsewhere it goes on with a pool of its own."""
+    place: dict[str, Any] = {}
+    step = TrainingModule.training_step
+    monkeypatch.setattr(TrainingModule, "training_step", lambda m, chunk: place.update(module=m) or step(m, chunk))
+    requested = property(lambda _: "module" in place and place["module"].update >= place["stop"])
+    monkeypatch.setattr(StopRequest, "requested", requested)
 
-    def training_step(module, chunk):
-        place["module"] = module
-        return original(module, chunk)
-
-    def requested(_):
-        module = place["module"]
-        return place["update"] is not None and module is not None and module.update >= place["update"]
-
-    monkeypatch.setattr(TrainingModule, "training_step", training_step)
-    monkeypatch.setattr(StopRequest, "requested", property(requested))
-    return lambda update: place.update(update=update, module=None)
-
-
-def test_resume_equals_no_interruption(data, tmp_path, stop_at):
-    """Interrupted at any updates, once or several times, a training ends where an uninterrupted one does, bit by bit:
-    weights, their average, both moments, learning rate and order; noise, jitter and symmetries come from the samples'
-    seeds, so they agree too."""
-
-    def trained(run, stops):
-        for stop in (*stops, None):
-            stop_at(stop)
-            mapping = train_mapping(data, run, maximum_updates=UPDATES, monitor_every=1000, **MORE)
+    def trained(name, *stops):
+        for stop in (*stops, UPDATES):
+            place.clear()
+            place["stop"] = stop
+            mapping = train_mapping(data, tmp_path / name, maximum_updates=UPDATES, monitor_every=1000, **MORE)
             assert train.main(mapping) == 0
-            updates = read_checkpoint(run / "checkpoints" / "last.ckpt")["hgn"]["updates"]
-            assert updates == (UPDATES if stop is None else stop)
-        return read_checkpoint(run / "checkpoints" / "last.ckpt")
+            stored = read_checkpoint(tmp_path / name / "checkpoints" / "last.ckpt")
+            assert stored["hgn"]["updates"] == stop
+        return stored, [line for line in metrics(tmp_path / name) if "loss" in line]
 
-    whole = trained(tmp_path / "whole", [])
+    (whole, lines), (again, _), (elsewhere, resumed) = trained("whole"), trained("cut", 4, 12), trained("pool", 1, 6)
     digest = EpisodeStore(data.dataset.folder, "train").digest(5)
     expected = SamplerState(1, 7, 5, digest, seed=TrainingConfig(**TRAINING).seed)
     assert dataclasses.asdict(expected) == whole["hgn"]["sampler_state"]
-    for number, stops in enumerate(([5], [1, 11])):
-        cut = trained(tmp_path / f"cut_{number}", stops)
-        for part in ("state_dict", "optimizer_states", "hgn"):
-            assert_same(cut[part], whole[part], part)
+    for part in ("state_dict", "optimizer_states", "hgn"):
+        assert_same(again[part], whole[part], part)
+    assert elsewhere["hgn"] == whole["hgn"]
+    assert any(not torch.equal(elsewhere["state_dict"][name], value) for name, value in whole["state_dict"].items())
+    assert all(line["pushforward/windows"] > 0 for line in resumed)  # also between updates 6 and 8
+    assert all(line["pushforward/windows"] == 6 and line["pushforward/dropped"] == 0 for line in lines)

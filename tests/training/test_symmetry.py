@@ -12,17 +12,14 @@ from training.test_noise import episode
 from hgn.config import TrainingConfig
 from hgn.data.batch import make_batch
 from hgn.network.obstacles import ObstacleCells
-from hgn.scene.obstacle_grid import ObstacleGrid, build_obstacle_grid
-from hgn.scene.scene import Obstacle
-from hgn.scene.symmetry import Symmetry, drawn_symmetry, scene_symmetries
+from hgn.scene.obstacle_grid import ObstacleGrid
+from hgn.scene.symmetry import drawn_symmetry, scene_symmetries
 from hgn.training.symmetry import drawn_symmetries, obstacles_under, under_symmetries
 from hgn.training.torch_updates import batch_loss
 
 CELL_SIZE = 1 / 64
 EIGHT = scene_symmetries((0.0, -9.8, 0.0), (1.0, 1.0, 1.0), CELL_SIZE)
 ALL_48 = scene_symmetries((0.0, 0.0, 0.0), (1.0, 1.0, 1.0), CELL_SIZE)
-# of a scene without gravity: its square is not the identity, nor is it its own inverse
-CYCLIC = Symmetry((1, 2, 0), (True, False, False), (63, 63, 63), CELL_SIZE)
 CENTRE = np.full(3, 63 / 128)  # of the solver's nodes
 
 
@@ -100,49 +97,6 @@ def test_training_sees_the_image(network, shown):
     assert float((gradient - expected).norm() / expected.norm()) < bound
     other_loss, other = loss_and_gradients(network, batch, "none")
     assert abs(other_loss - loss) > 1e-4 * loss and float((gradient - other).norm() / expected.norm()) > 1e-3
-
-
-def test_particles_meet_the_same_obstacles():
-    """Each particle's normal in the image is the image of its normal, and those of a scene's cells exist; velocities
-    and target accelerations are images too."""
-    episodes = [scene_with_obstacles(i, 200) for i in range(8)]
-    batch = doubled(make_batch([(e, 6) for e in episodes], network_of().config))
-    shown = [CYCLIC, *EIGHT[1:]]
-    image = under_symmetries(batch, shown)
-    assert batch.obstacles is not None and image.obstacles is not None
-    matrix_N33 = torch.tensor(np.array([matrix_of(s) for s in shown]))[batch.scene_N]
-
-    def turned(vector_N3):
-        return torch.einsum("nij,nj->ni", matrix_N33, vector_N3)
-
-    before = batch.obstacles.normals(batch.window_WN3[-2], batch.scene_N)
-    assert before.abs().sum(-1).gt(0).float().mean() > 0.1
-    assert torch.equal(image.obstacles.normals(image.window_WN3[-2], image.scene_N), turned(before))
-    for k in range(5):
-        velocity = image.state().velocity_NM3[:, k]
-        torch.testing.assert_close(velocity, turned(batch.state().velocity_NM3[:, k]), rtol=0, atol=1e-15)
-    torch.testing.assert_close(image.acceleration(), turned(batch.acceleration()), rtol=0, atol=1e-15)
-    turn_S33 = torch.tensor(np.array([matrix_of(s) for s in shown])).to(batch.gravity_S3)
-    assert torch.equal(image.gravity_S3, torch.einsum("sij,sj->si", turn_S33, batch.gravity_S3))
-    assert torch.equal(image.domain_S3, batch.domain_S3)
-
-
-def test_cells_are_those_of_the_mirrored_mesh():
-    """Three axis-aligned sheets give in the image the cells and normals that their mirrored meshes give."""
-    low, high, at = 10.5 * CELL_SIZE, 20.5 * CELL_SIZE, np.array([30.3, 40.8, 50.4]) * CELL_SIZE
-    corner = np.array([(low, low), (high, low), (high, high), (low, high)])
-    sheets = [np.insert(corner, axis, at[axis], axis=1) for axis in range(3)]
-    triangle = np.array([[0, 1, 2], [0, 2, 3]], np.int32)
-
-    def grid(symmetry):
-        moved = [(sheet - CENTRE) @ matrix_of(symmetry).T + CENTRE for sheet in sheets]
-        return build_obstacle_grid([Obstacle("sheet", v, triangle, False) for v in moved], CELL_SIZE, 3)
-
-    original = grid(EIGHT[0])
-    found = obstacles_under(ObstacleCells.of([original] * 8), EIGHT)
-    expected = ObstacleCells.of([grid(symmetry) for symmetry in EIGHT])
-    assert expected is not None and torch.equal(found.key_K, expected.key_K)
-    torch.testing.assert_close(found.normal_K3, expected.normal_K3, rtol=0, atol=1e-6)
 
 
 def test_a_particle_on_a_face_takes_the_cell_above_in_the_image():
