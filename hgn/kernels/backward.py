@@ -1,5 +1,6 @@
-"""The fused network's backward pass: its launches in the reverse order of the forward pass, then all weight gradients
-in one launch for each type of operand.
+"""Launches the backward pass of the fused network in the reverse order of the forward pass.
+
+At the end one launch for each type of operand computes all weight gradients.
 
 Shape legend: N particles, C cells, W width.
 """
@@ -27,13 +28,13 @@ from hgn.kernels.triton_compat import interpreting
 from hgn.kernels.tuning import Tuning, many
 from hgn.kernels.weight_gradient.kernel import JOB_COLUMNS, weight_gradient
 
-CHUNK_ROWS = (512, 2048)  # of a program of the weights' products: where there are few rows, and many
+CHUNK_ROWS = (512, 2048)  # rows of a program of the weight gradients: for few rows, and for at least MANY_ROWS
 MANY_ROWS = 16384
 
 
 @dataclass(frozen=True)
 class MLPGradients:
-    """Gradients of an MLP's hidden layer before its activation, and of its second layer's output."""
+    """Holds the gradients of an MLP's hidden layer before its activation, and of the output of its second layer."""
 
     hidden: torch.Tensor
     output: torch.Tensor
@@ -41,7 +42,7 @@ class MLPGradients:
 
 @dataclass(frozen=True)
 class PairGradients:
-    """Gradients of the pairs' second layer [8 N, W], and of the particles' part of the first layer [N, W]."""
+    """Holds the gradients of the pairs' second layer [8 N, W], and of the particles' part of the first layer [N, W]."""
 
     output: torch.Tensor
     by_particle: torch.Tensor
@@ -49,7 +50,7 @@ class PairGradients:
 
 @dataclass(frozen=True)
 class StepGradients:
-    """Gradients of a message-passing iteration: edge MLP [C, 6, W], cell MLP, cell products for edges [C, W]."""
+    """Holds the gradients of one iteration: edge MLP [C, 6, W], cell MLP, and cell products for edges [C, W]."""
 
     edge: MLPGradients
     cell: MLPGradients
@@ -59,7 +60,7 @@ class StepGradients:
 
 @dataclass(frozen=True)
 class Gradients:
-    """Gradients of activations, which those of weights follow from; lists are over levels, finest first."""
+    """Holds the gradients of activations that the weight gradients read. Lists are over levels, finest first."""
 
     encode: MLPGradients
     decode: MLPGradients
@@ -67,13 +68,13 @@ class Gradients:
     cell_to_particle: PairGradients
     down: list[list[StepGradients]]
     up: list[list[StepGradients]]
-    product: list[torch.Tensor]  # what each level's last block gives to who follows [C, W]
+    product: list[torch.Tensor]  # gradient of the product that each level's last block gives to the next launch [C, W]
     fine_to_coarse: list[MLPGradients]
     coarse_to_fine: list[MLPGradients]
 
 
 class FusedTrainingNetwork(FusedNetwork):
-    """A fused network whose `backward` leaves the gradients in `totals`, float32, laid out as `values`."""
+    """Adds the backward pass, which writes gradients to `totals`, float32, laid out as `values`."""
 
     def __init__(
         self,
@@ -86,9 +87,9 @@ class FusedTrainingNetwork(FusedNetwork):
         tuning: Tuning | None = None,
         tail: int = 0,
     ) -> None:
-        """`output_gradient` comes multiplied by `loss_scale`, which float16 gradients need; `totals` are without it.
+        """Takes `output_gradient` multiplied by `loss_scale`, which float16 gradients need; `totals` are without it.
 
-        Behind the gradients `totals` has the encoder's combined first layer, and `tail` elements for other use.
+        Behind the gradients `totals` holds the encoder's combined first layer, and `tail` elements for other use.
         """
         super().__init__(packed, values, grid, particle_count, precision, True, tuning)
         self.unscale, self.copy_precision = 1.0 / loss_scale, precision
@@ -100,13 +101,13 @@ class FusedTrainingNetwork(FusedNetwork):
         self.totals = self._float(self.packed.size + width * grid.features + tail)
         self.output_gradient = self._float(particles, OUT)
         self.latent_gradient = self._float(particles, width)
-        # gradients of the cells' products, to which pairs add
+        # The pairs add to these gradients of the cells' products.
         self.product_gradient = (self._operand if self.tuning.half_sums else self._float)(capacities[0], width)
         self.cell_gradient_up = [self._float(c, width) for c in capacities]
         self.cell_gradient_down = [self._float(c, width) for c in capacities]
         self.edge_gradient = self._operand(capacities[0], 6, width)
         self.sum_gradient = self._operand(capacities[0], width)
-        # one arena for all operands of weight gradients, so that one launch reaches them
+        # One arena holds all operands of weight gradients, so that one launch can address all of them.
         sizes: list[int] = []
 
         def noted(*shape: int) -> torch.Tensor:
@@ -120,7 +121,7 @@ class FusedTrainingNetwork(FusedNetwork):
         self._plan_weight_gradients()
 
     def _gradients(self, take: Callable[..., torch.Tensor]) -> Gradients:
-        """All gradients that the weights' products read, each a piece that `take` makes of a shape."""
+        """Returns all gradients that the weight gradients read. `take` makes a tensor of each shape."""
         width, grid, steps = self.width, self.grid, self.config.message_passing_steps
         particles, capacities = grid.particles, grid.capacities
 
@@ -148,7 +149,7 @@ class FusedTrainingNetwork(FusedNetwork):
 
     def _plan_weight_gradients(self) -> None:
         packed, grid = self.packed, self.grid
-        particles = grid.levels  # row of the counts table
+        particles = grid.levels  # row of the counts table for the particles
         self.counts = torch.zeros(grid.levels + 1, dtype=torch.int32, device=self.device)
         jobs: list[tuple[torch.Tensor, torch.Tensor, int, int, int, int]] = []
 
@@ -195,7 +196,7 @@ class FusedTrainingNetwork(FusedNetwork):
             mine = [entry for entry in alike if entry[1].dtype == dtype]
             if not mine:
                 continue
-            # offsets from the lowest address: allocations are aligned far beyond an element
+            # Offsets count from the lowest address. Allocations are aligned to far more than one element.
             base = min((right for _, right, *_ in mine), key=lambda tensor: tensor.data_ptr())
             rows: list[list[int]] = []
             chunk_job: list[int] = []
@@ -216,7 +217,7 @@ class FusedTrainingNetwork(FusedNetwork):
             self._weight_jobs.append((chunk, base, *on_device))
 
     def backward(self) -> None:
-        """From `output_gradient` [N, OUT] (times the loss scale) to `totals`."""
+        """Computes `totals` from `output_gradient` [N, OUT], which includes the loss scale."""
         packed, grid, g, levels = self.packed, self.grid, self.g, self.config.levels
         self.totals.zero_()
         self._clear(self.product_gradient)
@@ -284,18 +285,18 @@ class FusedTrainingNetwork(FusedNetwork):
         return self._operands() | {"totals": self.totals, "unscale": self.unscale}
 
     def _rows_at_once(self) -> int:
-        """Returns the rows of one step of a weight gradient; more in the interpreter, whose time goes by operations."""
+        """Returns the number of rows of one step of a weight gradient. The interpreter needs large steps."""
         if interpreting():
             return 128
         return 64 if self.precision == "fp16" else 32
 
     def _gradient_of(self, block: Block) -> torch.Tensor:
-        """Returns the buffer that receives the gradient of a block's output, and is left with that of its input."""
+        """Returns the buffer of a block: first it receives the output's gradient, then it holds that of the input."""
         down = any(block is other for other in self.down)
         return (self.cell_gradient_down if down else self.cell_gradient_up)[block.level]
 
     def _encode_gradients(self) -> None:
-        """Takes the gradient of the encoder's combined first layer apart: features, embedding, bias."""
+        """Splits the gradient of the encoder's combined first layer into features, embedding and bias."""
         config = self.config
         used, materials = config.feature_width - MATERIAL_EMBEDDING, len(config.materials)
         size = self.width * self.grid.features
@@ -382,7 +383,7 @@ class FusedTrainingNetwork(FusedNetwork):
         add: bool = False,
         received: tuple[torch.Tensor, int] | None = None,
     ) -> None:
-        """With `received`, x are gradients of edges, and the part through the receivers' weights is added too."""
+        """Launches gather_project_backward. With `received`, x are edges' gradients; receivers' parts are added too."""
         rows = self.grid.capacities[level]
         size, warps = self.tuning.row_tile(rows)
         other, other_at = received or (summed, at)

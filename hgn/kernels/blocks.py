@@ -1,8 +1,8 @@
-"""Functions that kernels share: matrix products at a chosen precision, layer normalisation and its gradient.
+"""Holds functions that several kernels use: matrix products at a chosen precision, layer normalisation, its gradient.
 
-Precision is a compile-time name: "tf32" rounds operands to 10 bits of mantissa with float32's range (weights are
-rounded before, see nearest_tf32), "fp16" to 10 bits with float16's range, "fp32" (for tests) does not round.
-Sums are always float32.
+The precision is a compile-time name. "tf32" rounds operands to 10 bits of mantissa with float32's range, and the host
+rounds weights before (see nearest_tf32). "fp16" rounds to 10 bits with float16's range. "fp32" does not round, and is
+for tests. Sums are always float32.
 """
 
 from __future__ import annotations
@@ -12,16 +12,16 @@ import triton.language as tl
 
 from hgn.kernels.triton_compat import interpreting, settle_keys
 
-# In tests: Triton takes minutes to compile float32's own product natively, or fails at it.
+# Only tests use fp32. Triton takes minutes to compile float32's native product, or fails.
 FP32_PRODUCT = tl.constexpr("ieee" if interpreting() else "tf32x3")
 LEAKY = tl.constexpr(0.01)  # hgn.network.mlp.LEAKY_SLOPE
-LAST_TILE = tl.constexpr(1 << 20)  # beyond all: elements are addressed in int32
+LAST_TILE = tl.constexpr(1 << 20)  # larger than any tile number, because int32 addresses the elements
 EPSILON = tl.constexpr(1e-5)  # torch.nn.LayerNorm's
 
 
 @triton.jit
 def elements(row, WIDTH: tl.constexpr, WIDE: tl.constexpr):
-    """Returns the places of the rows' elements [R, W] in a tensor; WIDE: it has more than int32 can count."""
+    """Returns the indices of the rows' elements [R, W] in a tensor. WIDE: int32 cannot count all its elements."""
     at = row[:, None] * WIDTH
     if WIDE:
         at = row.to(tl.int64)[:, None] * WIDTH
@@ -30,18 +30,18 @@ def elements(row, WIDTH: tl.constexpr, WIDE: tl.constexpr):
 
 @triton.jit
 def nearest_tf32(x):
-    """Returns float32 rounded to 10 bits of mantissa, ties away from zero, like cvt.rna.
+    """Returns float32 rounded to 10 bits of mantissa, ties away from zero, as the instruction cvt.rna does.
 
-    The matrix units only drop the other bits, which would make every operand too small by 2^-12 on average.
+    The matrix units only drop the other bits. Without rounding every operand would be too small by 2^-12 on average.
     """
     bits = x.to(tl.int32, bitcast=True)
     rounded = ((bits + 0x1000) & -0x2000).to(tl.float32, bitcast=True)
-    return tl.where(x == x, rounded, x)  # a NaN's bits would overflow
+    return tl.where(x == x, rounded, x)  # the bits of a NaN would overflow
 
 
 @triton.jit
 def product(x, w, PRECISION: tl.constexpr, total=None):
-    """Returns x [R, K] @ w [K, N] in float32 accumulation, added to the float32 `total` if it is given."""
+    """Returns x [R, K] @ w [K, N] accumulated in float32, plus the float32 `total` if it is given."""
     if PRECISION == "fp16":
         result = tl.dot(x.to(tl.float16), w.to(tl.float16), total)
     elif PRECISION == "tf32":
@@ -53,9 +53,9 @@ def product(x, w, PRECISION: tl.constexpr, total=None):
 
 @triton.jit
 def finer_product(x, w, PRECISION: tl.constexpr):
-    """Does the same for float32 operands of moderate size, to 20 bits instead of 10, by three products in float16.
+    """Returns x @ w for float32 operands of moderate size, to 20 bits instead of 10, by three products in float16.
 
-    An operand is the sum of a float16 and the float16 of the rest.
+    The code splits an operand into a float16 number and the remainder in float16.
     """
     if PRECISION == "fp16" or PRECISION == "tf32":
         x_high, w_high = x.to(tl.float16), w.to(tl.float16)
@@ -71,9 +71,9 @@ def finer_product(x, w, PRECISION: tl.constexpr):
 
 @triton.jit
 def weighted_sums(w, x, PRECISION: tl.constexpr):
-    """Returns w [S, R] @ x [R, W]: S sums of x's rows, in float32 of operands rounded as those of `product`.
+    """Returns w [S, R] @ x [R, W]: S sums of x's rows in float32. Operands are rounded as those of `product`.
 
-    Sums inside a tile run on the matrix units; reductions would pass the rows from thread to thread.
+    The matrix units compute sums inside a tile. Reductions would pass the rows from thread to thread.
     """
     if PRECISION == "fp16":
         result = tl.dot(w.to(tl.float16), x.to(tl.float16))
@@ -86,7 +86,7 @@ def weighted_sums(w, x, PRECISION: tl.constexpr):
 
 @triton.jit
 def members(SUMS: tl.constexpr, ROWS: tl.constexpr, EACH: tl.constexpr):
-    """Returns [SUMS, ROWS]: one for the EACH rows of a sum, else zero."""
+    """Returns a matrix [SUMS, ROWS]: one where a row belongs to a sum, which has EACH successive rows, else zero."""
     return tl.where(tl.arange(0, ROWS)[None, :] // EACH == tl.arange(0, SUMS)[:, None], 1.0, 0.0)
 
 
@@ -108,11 +108,10 @@ def transposed(pointer, ROWS: tl.constexpr, COLUMNS: tl.constexpr):
 
 @triton.jit
 def vectors(pointer, at_0, at_1, at_2, at_3, at_4, WIDTH: tl.constexpr):
-    """Loads up to five vectors [WIDTH], as rows of a matrix [8, WIDTH] for `vector`, in a loop over tiles; zeros where
-    the place is below zero.
+    """Loads up to five vectors [WIDTH] as rows of a matrix [8, WIDTH], which `vector` reads in a loop over tiles.
 
-    The compiler repeats a plain load with fewer elements than threads in each layout that uses it, and keeps each copy
-    in registers, of which there are too few. It does not repeat a load of this size.
+    A row is zero if its place is below zero. The compiler repeats a plain load with fewer elements than threads in each
+    layout that uses it. Each copy takes registers, which are scarce. It does not repeat a load of this size.
     """
     row = tl.arange(0, 8)
     at = tl.where(row == 0, at_0, tl.where(row == 1, at_1, tl.where(row == 2, at_2, tl.where(row == 3, at_3, at_4))))
@@ -121,8 +120,8 @@ def vectors(pointer, at_0, at_1, at_2, at_3, at_4, WIDTH: tl.constexpr):
 
 @triton.jit
 def optional_vector(pointer, at, WIDTH: tl.constexpr):
-    """Loads the vector [WIDTH] at place `at`, zeros where that is below zero."""
-    place = at + tl.zeros((WIDTH,), tl.int32)  # a mask of one number Triton 3.9's interpreter does not take
+    """Loads the vector [WIDTH] at place `at`, or zeros if `at` is below zero."""
+    place = at + tl.zeros((WIDTH,), tl.int32)  # Triton 3.9's interpreter does not take a mask of one number
     return tl.load(pointer + place + tl.arange(0, WIDTH), mask=place >= 0, other=0.0)
 
 
@@ -133,30 +132,30 @@ def vector(matrix, number: tl.constexpr):
 
 @triton.jit
 def once_both(x, y, never):
-    """Returns x after the loads of both x and y; `never` is false, which the compiler does not know.
+    """Returns x, but only after the loads of x and y. `never` is false, which the compiler does not know.
 
-    The compiler moves loaded values to shared memory and waits for them before it begins the next load.
+    The compiler otherwise moves the first values to shared memory, and waits for them, before it begins the next load.
     """
     return added(x, tl.where(never, y.to(x.dtype), 0.0))
 
 
 @triton.jit
 def nothing_to_do(count, BLOCK: tl.constexpr):
-    """Returns whether a program has no rows. The first one stays, and waits for the previous kernel if all are idle."""
+    """Returns whether a program has no rows. The first program always stays, and waits for the previous kernel."""
     return (tl.program_id(0) * BLOCK >= count) & (tl.program_id(0) > 0)
 
 
 @triton.jit
 def inside(vector, tile):
-    """Returns `vector` as a value inside the loop over tiles. Otherwise it is laid out for the matrix units before the
-    loop, where each thread has a quarter of it, and registers spill. Tiles are numbered from 0."""
+    """Returns `vector` as a value inside the loop over tiles, which are numbered from 0.
+
+    Before the loop each thread would hold a quarter of it in the layout of the matrix units, and registers spill."""
     return tl.where(tile >= 0, vector, 0.0)
 
 
 @triton.jit
 def next_tile(tile, ONCE: tl.constexpr):
-    """Returns the program's next tile. ONCE: there is none; the compiler sees that and drops the loop, before which it
-    would compute addresses that take up registers."""
+    """Returns the program's next tile. ONCE: there is none, and the compiler drops the loop and its addresses."""
     if ONCE:
         tile = tile * 0 + LAST_TILE
     else:
@@ -166,12 +165,12 @@ def next_tile(tile, ONCE: tl.constexpr):
 
 @triton.jit
 def leaky(h):
-    return tl.maximum(h, h * LEAKY)  # two instructions, where a choice by sign takes three
+    return tl.maximum(h, h * LEAKY)  # takes two instructions; a choice by sign takes three
 
 
 @triton.jit
 def leaky_operand(h, PRECISION: tl.constexpr):
-    """Returns leaky(h) for a product: in fp16 of float16 numbers, two in an instruction."""
+    """Returns leaky(h) as a product's operand. In fp16 it computes in float16, two numbers in an instruction."""
     if PRECISION == "fp16":
         h = h.to(tl.float16)
         a = leaky(h)
@@ -182,13 +181,13 @@ def leaky_operand(h, PRECISION: tl.constexpr):
 
 @triton.jit
 def leaky_backward(gradient, a):
-    """Returns the gradient before the activation; `a` is its output, which has the sign of its input."""
+    """Returns the gradient before the activation. Its output `a` has the sign of its input."""
     return tl.where(a > 0, gradient, gradient * LEAKY)
 
 
 @triton.jit
 def normalise(z, WIDTH: tl.constexpr):
-    """Returns rows of zero mean and unit variance, and one over the standard deviation."""
+    """Returns rows scaled to zero mean and unit variance, and one over the standard deviation."""
     centred = z - (tl.sum(z, 1) / WIDTH)[:, None]
     rstd = 1.0 / tl.sqrt(tl.sum(centred * centred, 1) / WIDTH + EPSILON)
     return centred * rstd[:, None], rstd
@@ -196,8 +195,9 @@ def normalise(z, WIDTH: tl.constexpr):
 
 @triton.jit
 def normalise_once(z, WIDTH: tl.constexpr, PRECISION: tl.constexpr):
-    """Does the same, at lower precisions with both sums in one pass: cancellation costs less than rounding operands, as
-    long as a row's mean is within about ten standard deviations."""
+    """Returns the same as `normalise`, and at lower precisions computes both sums in one pass.
+
+    Cancellation costs less than rounded operands if a row's mean is within about ten standard deviations."""
     if PRECISION == "fp16":
         mean = tl.sum(z, 1) / WIDTH
         variance = tl.maximum(tl.sum(z * z, 1) / WIDTH - mean * mean, 0.0)
@@ -210,24 +210,25 @@ def normalise_once(z, WIDTH: tl.constexpr, PRECISION: tl.constexpr):
 
 @triton.jit
 def with_column(value, number, x):
-    """Returns `value` [N, F] with x [N] as column `number`."""
+    """Returns `value` [N, F] with column `number` replaced by x [N]."""
     column = tl.arange(0, value.shape[1])
     return tl.where((column == number)[None, :], x[:, None], value)
 
 
 @triton.jit
 def chosen_rows(ROWS: tl.constexpr, EACH: tl.constexpr, CHOICES: tl.constexpr):
-    """Returns [ROWS, CHOICES]: one for the choice of a row, which EACH successive rows share, else zero.
+    """Returns a matrix [ROWS, CHOICES]: one at a row's choice, else zero. EACH successive rows have the same choice.
 
-    A product with it is exact, and reads each row only once.
+    A product with this matrix is exact, and reads each row only once.
     """
     return tl.where(tl.arange(0, ROWS)[:, None] // EACH == tl.arange(0, CHOICES)[None, :], 1.0, 0.0)
 
 
 @triton.jit
 def high_and_low(pointer, FIRST: tl.constexpr, SUMS: tl.constexpr, WIDTH: tl.constexpr, PRECISION: tl.constexpr):
-    """Returns [SUMS, W]: from row FIRST on, the rows of the matrix [3, W] at `pointer` as operands of a product, then
-    the parts that rounding removes from them; zeros elsewhere."""
+    """Returns rows [SUMS, W] for the matrix [3, W] at `pointer`: from row FIRST the rounded rows as operands.
+
+    The parts that rounding removes follow. Other rows are zero."""
     row = tl.arange(0, SUMS)
     place = row - FIRST
     inside = (place >= 0) & (place < 6)
@@ -244,7 +245,7 @@ def high_and_low(pointer, FIRST: tl.constexpr, SUMS: tl.constexpr, WIDTH: tl.con
 
 @triton.jit
 def normalise_backward(gradient, normalised, rstd, gamma, WIDTH: tl.constexpr):
-    """Returns the gradient before the normalisation, from the gradient after its weight `gamma` [W]."""
+    """Returns the gradient before the normalisation from the gradient after the multiplication by `gamma` [W]."""
     inner = gradient * gamma[None, :]
     mean = tl.sum(inner, 1) / WIDTH
     slope = tl.sum(inner * normalised, 1) / WIDTH
@@ -253,19 +254,19 @@ def normalise_backward(gradient, normalised, rstd, gamma, WIDTH: tl.constexpr):
 
 @triton.jit
 def column_sums(x, ROWS: tl.constexpr, WIDTH: tl.constexpr, APART: tl.constexpr):
-    """Returns sums [APART, W] over the rows of x [ROWS, W], each of every APART-th row, to be added up over many tiles.
+    """Returns sums [APART, W] over every APART-th row of x [ROWS, W], which the caller adds up over many tiles.
 
-    With two rows a warp (which 16-byte loads of 128 float16 fill) a thread adds only its own rows; a whole sum passes
-    them from thread to thread, with barriers, in each tile.
+    With two rows a warp (16-byte loads of 128 float16) a thread adds only its own rows. A whole sum would pass rows
+    from thread to thread, with barriers, in each tile.
     """
     return tl.sum(tl.reshape(x, (ROWS // APART, APART, WIDTH)), 0)
 
 
 @triton.jit
 def listed(table, row, count, capacity, SUM: tl.constexpr, EDGES: tl.constexpr):
-    """Returns for each of `row` the rows that the table [SUM, capacity] lists, as a tuple; below zero: none.
+    """Returns the rows that the table [SUM, capacity] lists for each element of `row`, as a tuple; below zero: none.
 
-    With EDGES they are rows of [capacity, SUM, W]: the part of the opposite direction of the row that is listed.
+    With EDGES they are rows of [capacity, SUM, W]: the part for the opposite direction of the listed row.
     """
     summands = ()
     for i in tl.static_range(SUM):
@@ -278,9 +279,9 @@ def listed(table, row, count, capacity, SUM: tl.constexpr, EDGES: tl.constexpr):
 
 @triton.jit
 def gathered_sum(x, summands, SUM: tl.constexpr, WIDTH: tl.constexpr, BLOCK: tl.constexpr):
-    """Returns the sums [BLOCK, W] of x's rows `summands` of `listed`."""
+    """Returns the sums [BLOCK, W] of the rows `summands` of x, which `listed` returns."""
     column = tl.arange(0, WIDTH)
-    # so many reads begin before the first is waited for
+    # The kernel begins this number of reads before it waits for the first one.
     TOGETHER: tl.constexpr = SUM if BLOCK <= 16 else 2
     for start in tl.static_range(0, SUM, TOGETHER):
         parts = ()

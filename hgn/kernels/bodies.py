@@ -1,4 +1,4 @@
-"""Bodies in coarsest cells: their centres of mass, inertia and rotation, for the kernels of momentum and of rest.
+"""Computes the bodies in coarsest cells: centres of mass, inertia and rotation, for momentum and for rest.
 
 Shape legend: N particles, C cells.
 """
@@ -11,12 +11,12 @@ import triton.language as tl
 from hgn.kernels.triton_compat import settle_keys
 from hgn.network.relative import POINT, THIN
 
-THINNEST, SMALLEST = tl.constexpr(THIN), tl.constexpr(POINT)  # of a cell's contents, for a rotation to be known
+THINNEST, SMALLEST = tl.constexpr(THIN), tl.constexpr(POINT)  # limits of a cell's contents for a known rotation
 
 
 @triton.jit
 def coarsest_cells(coarsest_of, share_of, row, live):
-    """Returns the particles' coarsest cells, each once and -1 elsewhere, and their weights, [N, 8] each."""
+    """Returns the particles' coarsest cells [N, 8], each once and -1 elsewhere, and their weights [N, 8]."""
     at = row[:, None] * 8 + tl.arange(0, 8)[None, :]
     cell = tl.load(coarsest_of + at, mask=live[:, None], other=-1)
     return cell, tl.load(share_of + at, mask=cell >= 0, other=0.0)
@@ -34,9 +34,9 @@ def adjugate(matrix, x, y, z):
 
 @triton.jit
 def rotation(inertia, x, y, z):
-    """Returns how well a rotation is determined by moments about a centre, and its rate: hgn.network.relative.rotation.
+    """Returns how well moments about a centre determine a rotation, and its rate, by hgn.network.relative.rotation.
 
-    The inertia is xx, yy, zz, yz, xz, xy.
+    The inertia is in the order xx, yy, zz, yz, xz, xy.
     """
     xx, yy, zz = inertia[0], inertia[1], inertia[2]
     determinant, turn = adjugate(inertia, x, y, z)
@@ -48,13 +48,13 @@ def rotation(inertia, x, y, z):
 
 @triton.jit
 def inertia_of(xx, yy, zz, yz, xz, xy):
-    """Returns the inertia, as in `rotation`, of second moments about a centre."""
+    """Returns the inertia of second moments about a centre, in the order of `rotation`."""
     return yy + zz, xx + zz, xx + yy, -yz, -xz, -xy
 
 
 @triton.jit
 def body_of(moments, cell, mask, inverse, OUT: tl.constexpr):
-    """Returns centres of mass in coarsest cells, from their middles, and the inertia over the mass, in their edges."""
+    """Returns centres of mass in coarsest cells from their middles, and the inertia over the mass, in cell edges."""
     at = moments + cell * OUT
     x = tl.load(at, mask=mask, other=0.0) * inverse
     y = tl.load(at + 1, mask=mask, other=0.0) * inverse
@@ -70,7 +70,7 @@ def body_of(moments, cell, mask, inverse, OUT: tl.constexpr):
 
 @triton.jit
 def three_columns(table, cell, column, mask, factor, OUT: tl.constexpr):
-    """Returns three neighbouring columns of the cells' rows, times a factor."""
+    """Returns three neighbouring columns of the cells' rows, multiplied by `factor`."""
     at = table + cell * OUT + column
     x = tl.load(at, mask=mask, other=0.0) * factor
     y = tl.load(at + 1, mask=mask, other=0.0) * factor
@@ -84,7 +84,7 @@ def cross(a, b):
 
 @triton.jit
 def one_over(mass):
-    """Returns 1 / x, and 0 for 0."""
+    """Returns 1 / mass, and 0 for a mass of 0."""
     return tl.where(mass > 0, 1 / tl.where(mass > 0, mass, 1.0), 0.0)
 
 

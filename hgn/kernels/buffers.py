@@ -1,4 +1,4 @@
-"""Outputs of the network's launches: in training a buffer each, in inference shared by results of different times.
+"""Allocates the buffers of the network's launches. In inference results of different times share a buffer.
 
 Shape legend: N particles, C cells, W width.
 """
@@ -15,41 +15,40 @@ from hgn.kernels.grid.op import SUMS, DeviceGrid
 from hgn.kernels.packing import PackedMessagePassing, PackedNetwork
 from hgn.kernels.tuning import Tuning
 
-OUT = SUMS  # the decoder's three outputs, nine with relative inputs, padded
+OUT = SUMS  # three outputs of the decoder, or nine with relative inputs, padded
 
 
 class Stored(NamedTuple):
-    """The buffers of a kernel for the backward pass, by its names; one row where it stores nothing."""
+    """Holds a kernel's buffers for the backward pass, by the kernel's names; one row each if it stores nothing."""
 
-    hidden: torch.Tensor  # [R, W]: R are pairs [8 N], edges [C, 6] or cells [C]
+    hidden: torch.Tensor  # [R, W]; the rows R are pairs [8 N], edges [C, 6] or cells [C]
     normalised: torch.Tensor  # [R, W]
-    rstd: torch.Tensor  # one over the deviation, float32 [R]
+    rstd: torch.Tensor  # one over the standard deviation, float32 [R]
 
 
 @dataclass
 class Block:
-    """One message-passing block: its level, weights, and buffers (lists over iterations)."""
+    """Holds a message-passing block: its level, its weights, and its buffers as lists over iterations."""
 
     level: int
     packed: PackedMessagePassing
-    cell: list[torch.Tensor] = field(default_factory=list)  # M + 1 of [C, W]
-    edge: list[torch.Tensor] = field(default_factory=list)  # M - 1 of [C, 6, W]
+    cell: list[torch.Tensor] = field(default_factory=list)  # M + 1 tensors [C, W]
+    edge: list[torch.Tensor] = field(default_factory=list)  # M - 1 tensors [C, 6, W]
     edge_stored: list[Stored] = field(default_factory=list)
     sum: list[torch.Tensor] = field(default_factory=list)
     cell_stored: list[Stored] = field(default_factory=list)
-    send: list[torch.Tensor] = field(default_factory=list)  # 2, by turns; in inference one, read before it is written
+    send: list[torch.Tensor] = field(default_factory=list)  # two in turn; in inference one, read before it is written
     receive: list[torch.Tensor] = field(default_factory=list)
-    product: torch.Tensor | None = None  # of the block's output, for the step that follows
-    next_at: int = 0  # weights of that product
+    product: torch.Tensor | None = None  # product of the block's output, for the next step
+    next_at: int = 0  # place of the weights of that product
 
 
 class Buffers:
-    """The buffers of a network. `down` and `up` are the blocks; messages to parents and hidden layers of the steps
-    between levels are lists over the finer level.
+    """Holds the buffers of a network. `down` and `up` are the blocks.
 
-    Inference may share buffers because a kernel that is launched without a wait inside runs when all before it have
-    ended, and kernels that begin early wait for all before them, before they read or write these buffers.
-    """
+    Messages to parents and hidden layers of the steps between levels are lists over the finer level. Inference may
+    share buffers, because no kernel accesses them before the end of all earlier kernels: a kernel without OVERLAP
+    starts then, and a kernel that begins early waits for it."""
 
     config: NetworkConfig
     packed: PackedNetwork
@@ -60,12 +59,12 @@ class Buffers:
     operand: torch.dtype
     device: torch.device
 
-    latent: torch.Tensor  # [N, W]; likewise what is not said otherwise
+    latent: torch.Tensor  # [N, W], as all tensors without another shape
     by_particle_down: torch.Tensor
     by_particle_up: torch.Tensor
     decoder_input: torch.Tensor
     output: torch.Tensor  # float32 [N, OUT]
-    message: list[torch.Tensor]  # [C, W], to the parents
+    message: list[torch.Tensor]  # messages to the parents [C, W]
     encode_hidden: torch.Tensor
     decode_hidden: torch.Tensor
     transfer_hidden_down: list[torch.Tensor]
@@ -88,7 +87,7 @@ class Buffers:
         return self._operand(*shape) if self.tuning.half_cells else self._float(*shape)
 
     def _first_cell(self, *shape: int) -> torch.Tensor:
-        """Returns the first block's input, which atomics add particles to: rounded sums cost gradients precision."""
+        """Returns the input of the first block, to which atomics add. In training rounded sums would cost precision."""
         return self._cell(*shape) if self.tuning.half_sums and not self.training else self._float(*shape)
 
     def _allocate(self, stores_pair_hidden: bool) -> None:
@@ -137,11 +136,11 @@ class Buffers:
             self._last(level).product = self._operand(capacity, width)
 
     def _allocate_inference(self) -> None:
-        """All edges share one buffer. When there are no edges it contains: the particles' products, until the first
-        pairs have read them; a block's message to the parents, or its product for the next block, until it is read,
-        before the next block's edges; and next to the last of these the decoder's input.
+        """Allocates the buffers of inference. All edges share one buffer, and hidden rows are not stored.
 
-        `output` is where the features were, which only the encoder reads. Hidden rows are not stored.
+        While there are no edges, this buffer holds other data: the particles' products until the first pairs read them;
+        a block's message to the parents, or its product for the next block, until the next block's edges; and beside
+        the last of these the decoder's input. `output` takes the place of the features, which only the encoder reads.
         """
         width, steps = self.width, self.config.message_passing_steps
         particles, capacities = self.grid.particles, self.grid.capacities
@@ -155,8 +154,8 @@ class Buffers:
         self.transfer_hidden_down = self.transfer_hidden_up = self.message
         for level, capacity in enumerate(capacities):
             send, receive, total = (self._operand(capacity, width) for _ in range(3))
-            # A block's iterations write them by turns. The last that the way down wrote is read once more, when the way
-            # up begins with the other.
+            # A block's iterations write these in turn. The last iteration on the way down writes one, which is read
+            # again when the way up begins with the other.
             cells = [self._cell(capacity, width) for _ in range(2)]
             blocks = [(self.down[level], cells)]
             if level < self.config.levels - 1:
@@ -166,7 +165,7 @@ class Buffers:
                 block.sum = [total] * steps
                 block.cell = [turns[m % 2] for m in range(steps + 1)]
                 block.edge = [shared[: 6 * capacity].view(capacity, 6, width)] * (steps - 1)
-                # not kept
+                # nothing is kept for a backward pass
                 block.edge_stored = block.cell_stored = [Stored(send, send, total)] * steps
             self._last(level).product = shared[:capacity]
         if self.tuning.half_cells and not self.tuning.half_sums:

@@ -1,4 +1,4 @@
-"""CUDA graphs of launches, captured in streams that are the same throughout a process."""
+"""Captures CUDA graphs of launches in streams that stay the same throughout a process."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ _streams: dict[int, tuple[torch.cuda.Stream, torch.cuda.Stream]] = {}
 def captured(parts: Sequence[Launches], warm_up: Launches) -> list[torch.cuda.CUDAGraph]:
     """Returns a graph of each of `parts`. `warm_up` runs first: it makes the same launches without lasting changes.
 
-    cuBLAS keeps 32 MiB for each stream that it has run in; torch frees those of a capture's stream when any graph
-    captured there ends, though another graph may read them. The warm-up has a stream of its own, so that cuBLAS's
-    memory in the capture's stream belongs to the graph and lives as long.
+    cuBLAS keeps 32 MiB for each stream in which it ran. torch frees this memory of a capture's stream at the end of any
+    graph captured there, even if another graph reads it. The warm-up therefore has its own stream. cuBLAS's memory in
+    the capture's stream then belongs to the graph and lives as long.
     """
     device = torch.cuda.current_device()
     if device not in _streams:

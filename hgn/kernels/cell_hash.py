@@ -1,7 +1,7 @@
 """Finds cells in a scene's hash buckets (hgn.network.cell_keys.in_buckets) on the device.
 
-A row of a table of scenes, int64, begins with the addresses of the buckets (0: no cells), of their keys, and of the
-values of the cells, and with the mask of the buckets.
+A row of a table of scenes, int64, begins with four numbers: the addresses of the buckets (0: no cells), of their keys,
+and of the values of the cells, and the mask of the buckets.
 """
 
 import triton
@@ -16,8 +16,9 @@ PRIME_X, PRIME_Y, PRIME_Z = (tl.constexpr(prime) for prime in HASH_PRIMES)
 
 @triton.jit
 def find_cell(x, y, z, line, live):
-    """Returns the place of the cell (x, y, z), whole numbers in floats, among its scene's cells, or -1; `line` is the
-    scene's row."""
+    """Returns the index of the cell (x, y, z), whole numbers in floats, among its scene's cells, or -1.
+
+    `line` is the scene's row of the table."""
     near = live & (tl.abs(x) < LIMIT) & (tl.abs(y) < LIMIT) & (tl.abs(z) < LIMIT)
     x = tl.where(near, x, 0.0).to(tl.int64)
     y = tl.where(near, y, 0.0).to(tl.int64)

@@ -1,7 +1,7 @@
-"""The network on fixed-capacity buffers: a fixed list of launches, suitable for capture in one CUDA graph.
+"""Runs the network on buffers of fixed capacity, as a fixed list of launches that one CUDA graph can capture.
 
-Nothing here reads a value back to the host. Each kernel's file describes its launch; the order is the paper's (sec.
-3.2). Shape legend: N particles, C cells, W width.
+Nothing here reads a value back to the host. The docstring of each kernel describes its launch. The order of launches is
+the paper's (sec. 3.2). Shape legend: N particles, C cells, W width.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ from hgn.schema import require
 
 PRECISIONS = ("fp32", "tf32", "fp16")
 CLEAR_ROWS = 64
-ADDRESSED = 2**31  # int32 index limit; larger edge tensors use 64-bit indices
+ADDRESSED = 2**31  # limit of int32 indices; larger edge tensors use 64-bit indices
 REMEDY = "take fewer at once, or backend torch"
-NONE = -1  # bias offset that means: no bias
+NONE = -1  # bias offset of a product without a bias
 
 
 def _require_room(grid: DeviceGrid, width: int, training: bool) -> None:
-    """Raises: ConfigError if a tensor exceeds the int32 index limit, except edge tensors in simulations."""
+    """Raises ConfigError if a tensor exceeds the limit of int32 indices, except edge tensors in simulations."""
     pairs, edges = (8, 6) if training else (1, 1)
     for what, count, each in (("particles", grid.particles, pairs), ("cells", grid.capacities[0], edges)):
         most = (ADDRESSED - 1) // (each * width)
@@ -42,9 +42,9 @@ def _require_room(grid: DeviceGrid, width: int, training: bool) -> None:
 class FusedNetwork(Buffers):
     """Runs a packed network on a DeviceGrid.
 
-    `values` float32 [packed.size] are the parameters. In fp16 and TF32 matrix products use `weights`, a rounded copy of
-    `values`; call `refresh` after every change of `values`. With `training` everything that a backward pass reads is
-    kept.
+    `values` float32 [packed.size] are the parameters. In fp16 and TF32 the matrix products read `weights`, a rounded
+    copy of `values`. Call `refresh` after every change of `values`. With `training` the network keeps everything that
+    a backward pass reads.
     """
 
     def __init__(
@@ -67,7 +67,7 @@ class FusedNetwork(Buffers):
         self.device = values.device
         rounded = precision in ("fp16", "tf32")
         self.weights = torch.empty_like(values, dtype=self.operand) if rounded else values
-        # Finer encoder in simulations: falling particles repeat their features, so its rounding would push all one way.
+        # Simulations use a finer encoder: falling particles repeat their features, and rounding would push all one way.
         self.fine = rounded and not training
         self.encode_weights = torch.zeros(self.width, grid.features, device=self.device)
         self.tuning = tuning or Tuning.of(precision)
@@ -77,13 +77,13 @@ class FusedNetwork(Buffers):
     # parameters
 
     def refresh(self) -> None:
-        """Updates the kernels' copies of the weights: all of them rounded, and the encoder's first layer."""
+        """Updates the kernels' copies of the weights: the rounded copy, and the encoder's first layer."""
         if self.weights is not self.values:
             self.weights.copy_(self._rounded(self.values))
         self.refresh_encoder()
 
     def refresh_encoder(self) -> None:
-        """Folds embedding and bias into the encoder's first layer, so that it takes one-hot materials."""
+        """Folds embedding and bias into the encoder's first layer, which then takes one-hot materials."""
         first, embedding, bias = self._encode_views(self.values)
         used = self.config.feature_width - MATERIAL_EMBEDDING
         materials = len(self.config.materials)
@@ -93,7 +93,7 @@ class FusedNetwork(Buffers):
             self.encode_weights.copy_(self._rounded(self.encode_weights))
 
     def _rounded(self, weights: torch.Tensor) -> torch.Tensor:
-        """Returns the nearest TF32 numbers (hgn.kernels.blocks.nearest_tf32); other precisions: the weights."""
+        """Returns the nearest TF32 numbers (hgn.kernels.blocks.nearest_tf32), or with other precisions the weights."""
         if self.precision != "tf32":
             return weights
         return rounded_to_tf32(weights)
@@ -109,7 +109,7 @@ class FusedNetwork(Buffers):
     # forward
 
     def forward(self) -> None:
-        """Computes `output` [N, OUT] from the grid's features and tables; columns 0 to 2: normalised accelerations."""
+        """Computes `output` [N, OUT] from the grid's features and tables. Columns 0 to 2: normalised accelerations."""
         packed, grid, levels = self.packed, self.grid, self.config.levels
         self._mlp(
             packed.encode, grid.feature_NF, self.particle_count, self.latent, self.encode_hidden,
@@ -156,11 +156,11 @@ class FusedNetwork(Buffers):
             grid.balance(self.output, self.particle_count)
 
     def _operands(self) -> dict[str, Any]:
-        """Returns the arguments of every kernel with products."""
+        """Returns the arguments that every kernel with products takes."""
         return {"weights": self.weights, "values": self.values, "WIDTH": self.width, "PRECISION": self.precision}
 
     def _clear(self, x: torch.Tensor, overlap: bool = False) -> None:
-        """Clears the finest cells' rows of x."""
+        """Sets the rows of x of the finest cells to zero."""
         clear_rows[self._blocks(len(x), CLEAR_ROWS)](
             x=x, count_ptr=self.grid.count(0), WIDTH=self.width, OVERLAP=overlap, BLOCK=CLEAR_ROWS,
             num_warps=4, launch_pdl=overlap,
@@ -170,7 +170,7 @@ class FusedNetwork(Buffers):
         return (triton.cdiv(rows, block),)
 
     def overlaps(self) -> bool:
-        """Returns whether a kernel of a message step starts before the previous one has ended."""
+        """Returns whether a kernel of a message step starts before the end of the previous one."""
         return self.tuning.overlap and overlaps()
 
     def stores_pair_hidden(self) -> bool:
@@ -236,7 +236,7 @@ class FusedNetwork(Buffers):
         )  # fmt: skip
 
     def _gather(self, level: int, x: torch.Tensor, table: torch.Tensor, y: torch.Tensor, edges: bool = False) -> None:
-        """Writes the sums of x's rows that the table lists to y."""
+        """Writes to y the sums of the rows of x that the table lists."""
         rows, size = self.grid.capacities[level], self.tuning.gather_block
         gather_sums[self._blocks(rows, size)](
             x=x, table=table, count_ptr=self.grid.count(level), y=y, capacity=rows, SUM=len(table), EDGES=edges,
@@ -244,7 +244,7 @@ class FusedNetwork(Buffers):
         )  # fmt: skip
 
     def _begin(self, block: Block, from_children: bool) -> None:
-        """Computes the block's input and its products for the first iteration."""
+        """Computes the block's input and the products of it that the first iteration reads."""
         grid, level, edge = self.grid, block.level, block.packed.edge[0]
         rows = grid.capacities[level]
         size, warps = self.tuning.row_tile(rows)

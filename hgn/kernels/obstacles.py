@@ -1,7 +1,7 @@
-"""Obstacle normals at a place, from a scene's hash table on the device.
+"""Computes obstacle normals at a place from a scene's hash table on the device.
 
-Row of the obstacle table of a scene, int64: addresses of its hash buckets (0: no obstacle), keys and normals, the
-mask of the buckets, and the symmetry that it is seen under (hgn.scene.symmetry.Symmetry.code).
+The obstacle table has a row of int64 numbers for each scene: addresses of its hash buckets (0: no obstacle), keys and
+normals, the mask of the buckets, and the symmetry under which it is seen (hgn.scene.symmetry.Symmetry.code).
 """
 
 import triton
@@ -12,9 +12,9 @@ from hgn.kernels.triton_compat import settle_keys
 from hgn.scene import symmetry as codes
 
 OBSTACLE_COLUMNS = tl.constexpr(5)
-BARRIER_COLUMNS = tl.constexpr(7)  # of the step's table
+BARRIER_COLUMNS = tl.constexpr(7)  # columns of the barrier table
 CODE_BITS = tl.constexpr(codes.CODE_BITS)
-CODE_MASK = tl.constexpr((1 << codes.CELL_BITS) - 1)  # of the cells in a symmetry's code
+CODE_MASK = tl.constexpr((1 << codes.CELL_BITS) - 1)  # mask of the cells in a symmetry's code
 
 
 @triton.jit
@@ -27,16 +27,17 @@ def _before_mirror(cell, symmetry, axis: tl.constexpr):
 
 @triton.jit
 def _from_axis(x, y, z, symmetry, axis: tl.constexpr):
-    """Returns the one of the image's coordinates x, y, z that comes from this axis of the scene."""
+    """Returns the coordinate of the image's x, y, z that comes from this axis of the scene."""
     z_or_y = tl.where((symmetry >> CODE_BITS & 3) == axis, y, z)
     return tl.where((symmetry & 3) == axis, x, z_or_y)
 
 
 @triton.jit
 def obstacle_normals(x, y, z, line, live, obstacle_cell_size, SYMMETRY: tl.constexpr):
-    """Returns the three parts of obstacle normals at positions of any shape, zeros without an obstacle; `line` is their
-    scenes' row of the obstacle table. With SYMMETRY the positions are in an image of the table's scene: they are looked
-    up in the scene, and normals are those of the image."""
+    """Returns the three parts of obstacle normals at positions of any shape, zeros without an obstacle.
+
+    `line` is the scenes' row of the obstacle table. With SYMMETRY positions and normals are those of an image of the
+    scene. The function looks the positions up in the scene itself."""
     x = tl.floor(tl.div_rn(x, obstacle_cell_size))
     y = tl.floor(tl.div_rn(y, obstacle_cell_size))
     z = tl.floor(tl.div_rn(z, obstacle_cell_size))

@@ -1,8 +1,8 @@
-"""The network's parameters in one flat buffer, each MLP a contiguous block that the kernels can read in whole tiles.
+"""Packs the network's parameters into one flat buffer. Each MLP is a contiguous block that kernels read in whole tiles.
 
-Block of an MLP: the first layer's wide parts, each [hidden, part] row-major; its narrow parts (offsets), each
-transposed to [part, hidden]; bias; second layer [out, hidden]; its bias; the LayerNorm's weight and bias.
-An output of 3 or 9 is padded with zero rows to PADDED_OUT. Padding never receives a gradient.
+The block of an MLP holds, in this order: the first layer's wide parts, each [hidden, part] row-major; its narrow parts
+(offsets), each transposed to [part, hidden]; its bias; the second layer [out, hidden]; its bias; the LayerNorm's weight
+and bias. Zero rows pad an output of 3 or 9 to PADDED_OUT. Padding never receives a gradient.
 """
 
 from __future__ import annotations
@@ -14,13 +14,13 @@ import torch
 from hgn.network.hgn import HierarchicalGraphNetwork, MessagePassing
 from hgn.network.mlp import MLP
 
-NARROW = 8  # parts of fewer columns are offsets
+NARROW = 8  # parts with fewer columns are offsets
 PADDED_OUT = 16
 
 
 @dataclass(frozen=True)
 class PackedMLP:
-    """Offsets of an MLP's tensors in the flat buffer, in elements."""
+    """Holds the offsets of an MLP's tensors in the flat buffer, in elements."""
 
     parts: tuple[int, ...]
     first_bias: int
@@ -31,7 +31,7 @@ class PackedMLP:
     out: int
 
     def layers(self, second_bias: bool = True) -> dict[str, int]:
-        """Returns the places of the second layer and the norm, by the kernels' names."""
+        """Returns the places of the second layer and of the norm, by the kernels' names."""
         bias = {"second_bias_at": self.second_bias} if second_bias else {}
         norm = {"norm_weight_at": self.norm_weight, "norm_bias_at": self.norm_bias}
         return {"second_at": self.second, **bias, **norm}
@@ -45,7 +45,7 @@ class PackedMessagePassing:
 
 @dataclass(frozen=True)
 class PackedNetwork:
-    """The layout of the buffer. `index` (int32, on the host) maps packed elements to parameters, -1 for padding."""
+    """Holds the layout of the buffer. `index` (int32, on the host) maps elements to parameters, -1 for padding."""
 
     encode: PackedMLP
     particle_to_cell: PackedMLP
@@ -60,8 +60,8 @@ class PackedNetwork:
     index: torch.Tensor
 
     def gather(self, tensors: list[torch.Tensor]) -> torch.Tensor:
-        """Packs tensors shaped as the network's parameters, in their order: float32 [size]."""
-        # a zero behind them, which goes to the padding
+        """Returns float32 [size] packed from tensors with the shapes and order of the network's parameters."""
+        # The zero behind the tensors is the value of the padding.
         zero = torch.zeros(1, device=tensors[0].device)
         flat = torch.cat([*(tensor.detach().reshape(-1).float() for tensor in tensors), zero])
         return flat.index_select(0, self.index.remainder(len(flat)).to(flat.device))
@@ -91,7 +91,7 @@ class _Packer:
     def add(self, positions: torch.Tensor) -> int:
         offset = self.size
         flat = positions.reshape(-1)
-        padding = -len(flat) % 16  # vector loads stay aligned
+        padding = -len(flat) % 16  # keeps vector loads aligned
         self.pieces += [flat, flat.new_full((padding,), -1)]
         self.size += len(flat) + padding
         return offset
@@ -122,7 +122,7 @@ class _Packer:
 
 
 def pack_network(network: HierarchicalGraphNetwork) -> PackedNetwork:
-    """Returns the layout of a network, which depends on its configuration only."""
+    """Returns the layout of a network, which depends only on its configuration."""
     packer = _Packer(network)
     encode = packer.mlp(network.encode, whole_first=True)
     particle_to_cell = packer.mlp(network.particle_to_cell)

@@ -1,4 +1,4 @@
-"""Obstacles of the scenes of a batch, on the device: cells in hash buckets, and a table with a row for each scene.
+"""Holds obstacles of a batch's scenes on the device: cells in hash buckets, and a table with a row for each scene.
 
 Shape legend: K cells of a scene or of all, B hash buckets, E entries of the cells' lists, F triangles, S scenes.
 """
@@ -23,14 +23,14 @@ OBSTACLE_COLUMNS, BARRIER_COLUMNS = obstacles.OBSTACLE_COLUMNS.value, obstacles.
 
 @dataclass(frozen=True, eq=False)
 class SceneHash:
-    """The obstacle cells or barrier cells of one scene; bucket b has the entries bucket_B[b] to bucket_B[b + 1]."""
+    """Holds the obstacle or barrier cells of one scene. Bucket b has the entries bucket_B[b] to bucket_B[b + 1]."""
 
     bucket_B: torch.Tensor  # int32
     key_K: torch.Tensor  # int64
-    # of an obstacle cell its normal, float32 [K, 3]; of a barrier cell the range of its list of triangles, int32 [K, 2]
+    # An obstacle cell has its normal, float32 [K, 3]. A barrier cell has the range of its list of triangles, int32.
     value_K: torch.Tensor
-    lists: tuple[torch.Tensor, ...] = ()  # of a barrier: int32 [E], and the triangles float32 [F, 24]
-    last: int = 0  # last column of the row: the bits of a barrier's cell size; the symmetry of obstacles, set later
+    lists: tuple[torch.Tensor, ...] = ()  # of a barrier: the lists int32 [E], and the triangles float32 [F, 24]
+    last: int = 0  # last column of the row: bits of a barrier's cell size, or the obstacles' symmetry, set later
 
     @staticmethod
     def of_obstacles(cell_K3: torch.Tensor, normal_K3: torch.Tensor) -> SceneHash:
@@ -67,29 +67,29 @@ class SceneHash:
         return SceneHash(bucket_B, key_K, value_K, tuple(lists), self.last)
 
     def row(self) -> list[int]:
-        """Returns the scene's row of a table: addresses, mask of the buckets, addresses of lists, last column. It is
-        valid as long as this object lives.
-        """
+        """Returns the scene's row of a table: addresses, mask of the buckets, addresses of lists, last column.
+
+        The row is valid while this object lives."""
         cells, lists = [self.bucket_B, self.key_K, self.value_K], self.lists
         mask = len(self.bucket_B) - 2
         return [*(part.data_ptr() for part in cells), mask, *(part.data_ptr() for part in lists), self.last]
 
 
 class SceneTable:
-    """A row for each scene of a batch, int64 [S, columns], which the kernels read; zeros for a scene without cells.
+    """Holds a row for each scene of a batch, int64 [S, columns], for the kernels. A scene without cells has zeros.
 
-    The rows may be rewritten on the device.
+    A kernel may rewrite the rows on the device.
     """
 
     def __init__(
         self, hashes: Sequence[SceneHash | None], columns: int, device: torch.device, cell_size: float = 0.0
     ) -> None:
-        """`cell_size` is that of obstacle cells."""
+        """Takes the edge length `cell_size` of obstacle cells."""
         self._hashes = [entry and entry.to(device) for entry in hashes]
         rows = [entry.row() if entry is not None else [0] * columns for entry in self._hashes]
         self.row_SC = torch.tensor(rows, dtype=torch.int64, device=device)
         self.cell_size = cell_size
-        self._barriers: Barriers | None = None  # that it was made of, unless of hashes
+        self._barriers: Barriers | None = None  # the barriers of which the table was made, if of any
 
     @staticmethod
     def of_obstacles(cells: ObstacleCells, scenes: int) -> SceneTable:
@@ -102,7 +102,7 @@ class SceneTable:
 
     @staticmethod
     def of_barriers(barriers: Barriers | None, scenes: int, device: torch.device) -> SceneTable:
-        """Returns the table of a batch's barriers, on their device; None: of scenes without barriers."""
+        """Returns the table of a batch's barriers, on their device. With None the scenes have no barriers."""
         if barriers is None:
             return SceneTable([None] * scenes, BARRIER_COLUMNS, device)
         scene_K, cell_K3 = unpack(barriers.key_Q)
@@ -123,10 +123,10 @@ class SceneTable:
         return table
 
     def is_of(self, barriers: Barriers | None) -> bool:
-        """Returns whether it was made of this very object; False for None, whose table takes no time."""
+        """Returns whether the table was made of this very object; False for None, whose table takes no time to make."""
         return barriers is not None and self._barriers is barriers
 
     def take(self, other: SceneTable) -> None:
-        """Replaces its rows by those of another table, in place."""
+        """Copies the rows of another table into its own rows."""
         self.row_SC.copy_(other.row_SC)
         self._hashes, self._barriers = other._hashes, other._barriers

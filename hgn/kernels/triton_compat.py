@@ -1,6 +1,6 @@
-"""All that is used of Triton beyond its documented interface, and the versions that it was read and tested with.
+"""Contains all uses of Triton beyond its documented interface, and the versions with which they were tested.
 
-tests/kernels/test_triton_compat.py says which of it a new version of Triton has changed.
+tests/kernels/test_triton_compat.py fails if a new version of Triton has changed one of them.
 """
 
 from __future__ import annotations
@@ -18,15 +18,15 @@ from triton.language.extra.cuda import gdc_launch_dependents as gdc_launch_depen
 from triton.language.extra.cuda import gdc_wait as gdc_wait
 from triton.runtime.jit import JITFunction
 
-TESTED_VERSIONS = ("3.6", "3.7", "3.8", "3.9")  # and the ceiling in pyproject.toml
+TESTED_VERSIONS = ("3.6", "3.7", "3.8", "3.9")  # the ceiling in pyproject.toml is the same
 
-Launches = dict[str, tuple[Any, str]]  # kernels with what they are specialised for, by a key of both
+Launches = dict[str, tuple[Any, str]]  # a kernel and its specialisation, by a key of both
 
 
 def unsupported_reason(version: str = triton.__version__, hip: str | None = torch.version.hip) -> str | None:
-    """Returns why this version of Triton cannot be used, or None.
+    """Returns the reason for which this version of Triton cannot be used, or None.
 
-    Faults of a compiler show as wrong numbers; the code that these versions generate was inspected.
+    A compiler's fault shows only as wrong numbers. The code that the tested versions generate was inspected.
     """
     if hip is not None:
         return "its kernels have instructions of NVIDIA's GPUs alone"
@@ -52,19 +52,19 @@ def overlaps() -> bool:
 
 
 def settle_keys(names: dict[str, Any]) -> None:
-    """Asks for the keys of a module's functions in the order of their definition; call it at the module's end.
+    """Computes the keys of a module's functions in the order of their definition. Call it at the module's end.
 
-    Into a function's key go the constants of a function that it calls only if that one had a key before. A kernel's
-    key, and with it whether the cache on disk has it, would depend on which others the process has launched first.
+    A function's key contains the constants of a function that it calls only if that function had a key before. Without
+    this call a kernel's key, and the hit in the disk cache, would depend on the order of launches in the process.
     """
     for value in names.values():
         if isinstance(value, JITFunction):
-            value.cache_key  # noqa: B018 - stored from now on
+            value.cache_key  # noqa: B018 - stores the key
 
 
 @contextmanager
 def noted_launches() -> Iterator[Launches]:
-    """Notes launches, which are neither compiled nor made."""
+    """Yields a dictionary that notes launches. The launches are neither compiled nor made."""
     launches: Launches = {}
 
     def note(*, fn: Any, compile: dict[str, Any], **_: Any) -> bool:
@@ -80,21 +80,21 @@ def noted_launches() -> Iterator[Launches]:
 
 
 def preload(function: Any, specialization: str) -> Any:
-    """Compiles a kernel for what was noted of it.
+    """Compiles a kernel for a noted specialisation.
 
-    Triton's own takes a constant that is called as a type, the precision fp16 say, for that type.
+    Triton's own function takes a constant for a type if it has a type's name, for example the precision fp16.
     """
     with mock.patch.object(tl.dtype, "is_dtype", lambda name: False):
         return function.preload(specialization)
 
 
 def build_launcher(kernel: Any) -> None:
-    """Compiles the C that launches a compiled kernel."""
+    """Compiles the C code that launches a compiled kernel."""
     triton.runtime.driver.active.launcher_cls(kernel.src, kernel.metadata)
 
 
 def use_target(capability: int) -> None:
-    """Lets Triton compile for a GPU without a context on it, which would take memory from those who train."""
+    """Lets Triton compile for a GPU without a CUDA context, whose memory the training ranks need."""
     driver = triton.runtime.driver.active
     driver.get_current_device = lambda: 0
     driver.get_current_stream = lambda device: 0
@@ -102,8 +102,9 @@ def use_target(capability: int) -> None:
 
 
 class JitMisses:
-    """Counts the kernels that were compiled since then in this process, not ahead (hgn.runtime.precompile), and the
-    seconds that took."""
+    """Counts the kernels that this process compiles from now on, and the seconds of their compilation.
+
+    Kernels compiled ahead (hgn.runtime.precompile) do not count."""
 
     def __init__(self) -> None:
         self.count, self.seconds = 0, 0.0

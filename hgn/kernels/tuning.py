@@ -1,6 +1,6 @@
-"""The rows and warps of the kernels' programs, and how many programs an H100 runs at the same time.
+"""Chooses the rows and warps of the kernels' programs, and the number of programs that run at once on an H100.
 
-They change speed, never results.
+The choices change speed, never results.
 """
 
 from __future__ import annotations
@@ -9,10 +9,10 @@ from dataclasses import dataclass, replace
 
 import triton
 
-PROCESSORS = 132  # an H100's
+PROCESSORS = 132  # number of processors of an H100
 RESIDENT_PROGRAMS = 2 * PROCESSORS
 FEW_ROWS = 64 * PROCESSORS
-LIGHT_BLOCK = (64, 4)  # rows and warps of a program that keeps two weights, of which two fit on a processor
+LIGHT_BLOCK = (64, 4)  # rows and warps of a program that keeps two weights; two such programs fit on a processor
 
 
 def many(rows: int) -> bool:
@@ -22,41 +22,39 @@ def many(rows: int) -> bool:
 
 @dataclass(frozen=True)
 class Tuning:
-    """Rows and warps of a program."""
+    """Holds rows, warps and other choices of the programs."""
 
-    cell_block: int  # cells of a tile of edges, eight rows each
+    cell_block: int  # cells of a tile of edges, with eight rows each
     cell_warps: int
-    few_cell_block: int  # the same on a level of few cells
+    few_cell_block: int  # as cell_block, on a level of few cells
     few_cell_warps: int
     row_block: int
     row_warps: int
     row_backward_warps: int
-    pair_particles: int  # eight rows each, at most 13
+    pair_particles: int  # particles of a tile, with eight rows each; at most 13
     pair_warps: int
-    few_cells: int = 0  # up to which a level's cells are few
-    small_block: int = 16  # where there are few rows
+    few_cells: int = 0  # a level with up to this number of cells has few cells
+    small_block: int = 16  # rows of a tile where there are few rows
     small_warps: int = 8
-    dense: bool = False  # six rows a cell in the tiles of edges, not eight
-    overlap: bool = False  # kernels of a message step read their weights before their turn
-    loops: bool = False  # where there are many rows, a program keeps all weights and takes one block after the other
-    gather_block: int = (
-        0  # of a kernel for the sums of many rows' neighbours; 0: the kernel that reads them computes them
-    )
-    cell_backward_block: int = 0  # where there are many rows; 0: as of other rows
+    dense: bool = False  # tiles of edges have six rows a cell instead of eight
+    overlap: bool = False  # kernels of a message step read their weights before the previous kernel ends
+    loops: bool = False  # with many rows a program keeps all weights and takes many blocks in turn
+    gather_block: int = 0  # rows of a kernel that sums neighbours of many rows; 0: no such kernel
+    cell_backward_block: int = 0  # rows of a backward tile with many rows; 0: as for few rows
     cell_backward_warps: int = 8
-    half_cells: bool = False  # cells too are rounded between kernels, as edges are
-    # And particles are added to them rounded, half the traffic of the L2 cache: in training only the pairs' gradients.
+    half_cells: bool = False  # cells are rounded between kernels, as edges always are
+    # Sums of particles in cells are rounded, which halves L2 traffic; in training only the pairs' gradients are.
     half_sums: bool = False
-    light_programs: int = 2  # on a processor, of kernels with one weight: pairs forward, edges of a first iteration
-    light_registers: int | None = None  # of a thread, so that these programs fit
-    weight_registers: int | None = None  # of a thread of the weights' products: 128 for two programs on a processor
+    light_programs: int = 2  # programs on a processor of kernels with one weight: pairs forward, first edges
+    light_registers: int | None = None  # registers of a thread that let these programs fit
+    weight_registers: int | None = None  # registers of a thread in weight gradients; with 128 two programs fit
 
     @staticmethod
     def of(precision: str) -> Tuning:
         """Returns the fastest choices on an H100 at width 128."""
         if precision == "fp32":
             return Tuning(8, 4, 8, 4, 16, 4, 4, 2, 4, 1056, dense=True, loops=True, gather_block=16)
-        if precision == "tf32":  # operands of twice the size
+        if precision == "tf32":  # operands have twice the size
             return Tuning(8, 8, 4, 8, 64, 8, 8, 8, 8, 528)
         half = Tuning(8, 4, 2, 4, 128, 8, 8, 8, 4, 1056, dense=True, overlap=True, loops=True)
         return replace(
@@ -72,33 +70,33 @@ class Tuning:
         )
 
     def row_tile(self, rows: int, backward: bool = False) -> tuple[int, int]:
-        """Returns rows and warps of a program, for this number of rows in all."""
+        """Returns the rows and warps of a program for this total number of rows."""
         if not many(rows):
             return self.small_block, self.small_warps
         return self.row_block, self.row_backward_warps if backward else self.row_warps
 
     def edge_tile(self, cells: int) -> tuple[int, int]:
-        """Returns cells and warps of a tile of edges; tiles are small where there are few."""
+        """Returns the cells and warps of a tile of edges. Levels with few cells have small tiles."""
         few = cells <= self.few_cells
         return (self.few_cell_block, self.few_cell_warps) if few else (self.cell_block, self.cell_warps)
 
     def edge_cells(self, block: int) -> int:
-        """Returns the cells of a tile of edges that has rows for `block` cells of eight rows each."""
+        """Returns the number of cells in a tile of edges with rows for `block` cells of eight rows."""
         return 8 * block // 6 if self.dense else block
 
     def gathers(self, rows: int) -> bool:
-        """Returns whether sums over the neighbours of this number of rows have a kernel of their own."""
+        """Returns whether a separate kernel sums the neighbours of this number of rows."""
         return self.gather_block > 0 and many(rows)
 
     def loops_over(self, rows: int, block: int, least: int = 1) -> bool:
-        """Returns whether a program keeps all its weights and takes several blocks, at least `least`."""
+        """Returns whether a program keeps all its weights and takes at least `least` blocks in turn."""
         return self.loops and many(rows) and rows >= (least - 1) * PROCESSORS * block
 
     def row_programs(self, rows: int, block: int, loops: bool, at_once: int = 1) -> tuple[int]:
-        """Returns the number of programs; `at_once` programs that keep their weights fill a processor."""
+        """Returns the number of programs. `at_once` programs that keep their weights fill a processor."""
         programs = triton.cdiv(rows, block)
         return (min(programs, PROCESSORS * at_once) if loops else programs,)
 
     def programs(self, rows: int, block: int, at_once: int = 2) -> tuple[int]:
-        """Returns the number of programs that take one block after the other; `at_once` run on a processor."""
+        """Returns the number of programs that take blocks in turn, of which `at_once` run on a processor."""
         return (min(triton.cdiv(rows, block), RESIDENT_PROGRAMS * at_once // 2),)

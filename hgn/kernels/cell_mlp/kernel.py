@@ -1,6 +1,6 @@
-"""The cells of one message-passing iteration on a level (paper fig. 5), forward and backward, after its edges.
+"""Computes the cells of one message-passing iteration on a level (paper fig. 5), after its edges; forward and backward.
 
-OVERLAP as in hgn.kernels.edges.kernel. Shape legend: C cells, W width.
+OVERLAP means the same as in hgn.kernels.edges.kernel. Shape legend: C cells, W width.
 """
 
 from __future__ import annotations
@@ -38,10 +38,10 @@ def cell_mlp_forward(
     NEXT: tl.constexpr, SAVE: tl.constexpr, WIDTH: tl.constexpr, BLOCK: tl.constexpr, PRECISION: tl.constexpr,
     RESIDENT: tl.constexpr, LOOP: tl.constexpr, OVERLAP: tl.constexpr,
 ):  # fmt: skip
-    """Computes paper steps 2, 4, … (fig. 5): the cells' new features from their old ones and their edges' sums, all [C,
-    W], and up to two products of them, the second with a bias.
+    """Computes paper steps 2, 4, … (fig. 5): the cells' new features and up to two products of them, all [C, W].
 
-    RESIDENT: all weights are read before the first tile, and kept. LOOP: a program has more than one tile.
+    The inputs are the cells' old features and the sums of their edges. The second product has a bias. RESIDENT: the
+    program reads all weights before the first tile and keeps them. LOOP: a program has more than one tile.
 
     Rule: hgn.network.hgn.MessagePassing; reference and test: tests/kernels/references.py, test_kernels_alone.py.
     """
@@ -51,7 +51,7 @@ def cell_mlp_forward(
     if nothing_to_do(count, BLOCK):
         return
     column = tl.arange(0, WIDTH)
-    IN_PLACE: tl.constexpr = BLOCK > 16 and not LOOP  # where many vectors would not fit into registers
+    IN_PLACE: tl.constexpr = BLOCK > 16 and not LOOP  # for tiles whose vectors do not all fit into registers
     if LOOP:
         lines = vectors(values, bias_at, second_bias_at, norm_weight_at, norm_bias_at, next_bias_at, WIDTH)
         bias, second_bias, norm_weight, norm_bias = (
@@ -131,12 +131,12 @@ def cell_mlp_backward(
     LAST: tl.constexpr, GATHER: tl.constexpr, WIDTH: tl.constexpr, BLOCK: tl.constexpr, PRECISION: tl.constexpr,
     RESIDENT: tl.constexpr, OVERLAP: tl.constexpr,
 ):  # fmt: skip
-    """Turns `gradient` [C, W], in place, from the gradient of cell_out, without the parts through `send` and `receive`
-    of the following iteration, into that of `cell`, again without the parts through its own. The following iteration's
-    parts are added here unless LAST; the gradient through edges that start in a cell is stored in send_gradient.
+    """Replaces the gradient of cell_out in `gradient` [C, W] by that of `cell`.
 
-    sum_gradient [C, W] is that of the edges' sums. Without GATHER send_gradient was computed before. RESIDENT as in
-    cell_mlp_forward.
+    The incoming gradient lacks the parts through `send` and `receive` of the following iteration. The kernel adds them
+    unless LAST. The outgoing gradient lacks the parts through this iteration's products. send_gradient receives the
+    gradient through edges that start in a cell; without GATHER an earlier kernel has computed it. sum_gradient [C, W]
+    is the gradient of the edges' sums. RESIDENT means the same as in cell_mlp_forward.
 
     Rule: hgn.network.hgn.MessagePassing; reference and test: tests/kernels/references.py, test_kernels_alone.py.
     """
@@ -146,7 +146,7 @@ def cell_mlp_backward(
     if nothing_to_do(count, BLOCK):
         return
     column = tl.arange(0, WIDTH)
-    EARLY: tl.constexpr = BLOCK <= 16  # all loads first, where there are registers for it
+    EARLY: tl.constexpr = BLOCK <= 16  # small tiles have registers to load everything first
     if EARLY:
         norm_weight = tl.load(values + norm_weight_at + column)
     if RESIDENT:
@@ -156,7 +156,7 @@ def cell_mlp_backward(
         second = matrix(weights + second_at, WIDTH, WIDTH)
         sum_first = matrix(weights + sum_first_at, WIDTH, WIDTH)
         first = matrix(weights + first_at, WIDTH, WIDTH)
-    sums = tl.arange(0, 16)[:, None]  # of which one is used: the least that the matrix units take
+    sums = tl.arange(0, 16)[:, None]  # one of these sums is used; 16 is the smallest size of the matrix units
     norm_weight_total, norm_bias_total = tl.zeros((16, WIDTH), tl.float32), tl.zeros((16, WIDTH), tl.float32)
     tile = tl.program_id(0)
     while (tile * BLOCK < count) & (tile < LAST_TILE):
@@ -176,7 +176,7 @@ def cell_mlp_backward(
                 received = tl.load(later_receive_gradient + at, mask=here, other=0.0)
         if not LAST:
             if GATHER:
-                # the edges that start here: each in its receiver's row, seen from there in the opposite direction
+                # Edges that start here are in their receivers' rows, in the opposite direction.
                 sent = gathered_sum(later_hidden_gradient, summands, 6, WIDTH, BLOCK)
                 tl.store(send_gradient + at, sent, mask=here)
             else:

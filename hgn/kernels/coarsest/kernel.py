@@ -1,6 +1,6 @@
-"""The part of the coarsest cells in the accelerations of relative inputs, which conserves momentum, and its gradient.
+"""Computes the coarsest cells' part of the accelerations of relative inputs, which conserves momentum; and gradients.
 
-Shape legend: N particles, C coarsest cells; geometry as in hgn.kernels.geometry.
+Shape legend: N particles, C coarsest cells. The geometry table is that of hgn.kernels.geometry.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ DECODED = tl.constexpr(OUTPUTS)
 
 @triton.jit
 def _coarsest_places(place_of, row, live):
-    """Returns the particles' places in these cells, three [N, 8]: from the cells' middles, in edges."""
+    """Returns the particles' places in these cells, three [N, 8], from the cells' middles in edges."""
     corner = tl.arange(0, 8)[None, :]
     at = place_of + row * 3
     x = tl.load(at, mask=live, other=0.0)[:, None] - (corner >> 2 & 1).to(tl.float32)
@@ -32,9 +32,10 @@ def sum_coarsest(
     LEVELS: tl.constexpr, OUT: tl.constexpr, USED: tl.constexpr, FEEL: tl.constexpr,
     OVERLAP: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Adds the first USED columns of the particles' rows of x [N, OUT] to their coarsest cells' sums [C, OUT], with
-    their weights. The next three columns are the moments of columns 0 to 2 about the cells' middles. With FEEL writes
-    the disturbance of coarsest cells to felt [C, 2] (`most_around`). Programs cover particles and coarsest cells.
+    """Adds the first USED columns of the rows of x [N, OUT], with their weights, to the coarsest cells' sums [C, OUT].
+
+    The next three columns are the moments of columns 0 to 2 about the cells' middles. With FEEL it writes the
+    disturbance of coarsest cells to felt [C, 2] (`most_around`). Programs cover particles and coarsest cells.
 
     Rule: hgn.network.relative.balanced and disturbance; test: tests/kernels/test_relative.py.
     """
@@ -56,15 +57,16 @@ def sum_coarsest(
     added = tl.where(part == USED, (share * (py * vz - pz * vy))[:, :, None], added)
     added = tl.where(part == USED + 1, (share * (pz * vx - px * vz))[:, :, None], added)
     added = tl.where(part == USED + 2, (share * (px * vy - py * vx))[:, :, None], added)
-    # up to a multiple of four, which are added at once
+    # The added columns are a multiple of four, because the hardware adds four at once.
     adds = (cell >= 0)[:, :, None] & (part < (USED + 6) // 4 * 4)
     tl.atomic_add(sums + cell[:, :, None] * OUT + part, added, mask=adds, sem="relaxed")
 
 
 @triton.jit
 def _slip(moments, cell, there, few, rare, mean, OUT: tl.constexpr):
-    """Returns the cells' means without the part that surfaces forbid: hgn.network.relative.slip, from the products of
-    normals behind the second moments."""
+    """Returns the cells' means without the part that surfaces forbid, by the rule hgn.network.relative.slip.
+
+    The products of normals follow the second moments."""
     xx, yy, zz = three_columns(moments, cell, 9, there, 1.0, OUT)
     yz, xz, xy = three_columns(moments, cell, 12, there, 1.0, OUT)
     ratio = 1 / (few + rare * (xx + yy + zz))
@@ -79,9 +81,11 @@ def _pairs(
     moments, neighbour, motion, geometry, cell, there, mass, centre, inertia, capacity,
     LEVELS: tl.constexpr, OUT: tl.constexpr,
 ):  # fmt: skip
-    """Returns of the cells across the faces [C, 8], of which the last two do not exist: numbers, one over the masses,
-    axis and sign of the direction to them, this cell's share of both masses, the product of both shares, centres of
-    mass from the cells' middles, the distance of these, and the inertia of both about the centre of all."""
+    """Returns properties of the cells across the faces [C, 8], of which the last two do not exist.
+
+    They are: number, one over the mass, axis and sign of the direction, this cell's share of both masses, product of
+    both shares, centre of mass from the cell's middle, distance of the centres, and inertia of both about their centre.
+    """
     slot = tl.arange(0, 8)[None, :]
     other = tl.load(neighbour + slot * capacity + cell[:, None], mask=there[:, None] & (slot < 6), other=-1)
     found = other >= 0
@@ -108,9 +112,10 @@ def balance(
     sums, moments, felt, motion, neighbour, geometry, counts, table, capacity, few, rare,
     LEVELS: tl.constexpr, OUT: tl.constexpr, OVERLAP: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """From sums of particles' outputs to the table [C, OUT] of the coarsest cells: the acceleration that a cell adds to
-    its particles at its middle (columns 0 to 2), the factor of the particles' own output (3), and the rate of rotation
-    that the cell adds (4 to 6).
+    """Computes the table [C, OUT] of the coarsest cells from sums of particles' outputs.
+
+    Columns 0 to 2 are the acceleration that a cell adds to its particles at its middle. Column 3 is the factor of the
+    particles' own output. Columns 4 to 6 are the rate of rotation that the cell adds.
 
     Rule: hgn.network.relative.balanced; test: tests/kernels/test_relative.py.
     """
@@ -123,7 +128,7 @@ def balance(
     other, beside, axis, sign, part, both, _, apart, whole = _pairs(
         moments, neighbour, motion, geometry, cell, there, mass, centre, inertia, capacity, LEVELS, OUT
     )
-    # until here of places alone
+    # The code above depends on places alone.
     if OVERLAP:
         gdc_wait()
         gdc_launch_dependents()
@@ -136,7 +141,7 @@ def balance(
     known, wx, wy, wz = rotation(inertia, moment[0] - lever[0], moment[1] - lever[1], moment[2] - lever[2])
     traction = ()
     for i in tl.static_range(3):
-        column = tl.where(axis == i, 3 + i, 9 - axis - i)  # of xx, yy, zz, yz, xz, xy behind the accelerations
+        column = tl.where(axis == i, 3 + i, 9 - axis - i)  # column of xx, yy, zz, yz, xz, xy behind the accelerations
         own = tl.load(sums + cell[:, None] * OUT + column, mask=other >= 0, other=0.0) * inverse[:, None]
         theirs = tl.load(sums + other * OUT + column, mask=other >= 0, other=0.0) * beside
         traction = traction + (sign * (own + theirs),)  # noqa: RUF005
@@ -165,9 +170,10 @@ def balance_backward(
     sums, moments, felt, motion, neighbour, geometry, counts, table, capacity, few, rare,
     LEVELS: tl.constexpr, OUT: tl.constexpr, OVERLAP: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """From sums of gradients of the result of `balance`, and of their moments, to the table [C, OUT]: gradients that
-    cells add to their particles' outputs at their middles (columns 0 to 8), the factor of the accelerations' own
-    gradient (9), and the rate of rotation (10 to 12).
+    """Computes the table [C, OUT] from sums of gradients of the result of `balance` and of their moments.
+
+    Columns 0 to 8 are the gradients that cells add to their particles' outputs at their middles. Column 9 is the factor
+    of the accelerations' own gradient. Columns 10 to 12 are the rate of rotation.
 
     Rule: hgn.network.relative.balanced; test: tests/kernels/test_relative.py.
     """
@@ -183,7 +189,7 @@ def balance_backward(
     disturbed, touched = _felt(felt, cell, there)
     free = 1 - touched
     half = 0.5 * tl.load(felt + other * 2, mask=other >= 0, other=0.0)
-    # until here of places alone
+    # The code above depends on places alone.
     if OVERLAP:
         gdc_wait()
         gdc_launch_dependents()
@@ -220,7 +226,7 @@ def balance_backward(
         push = push + (share * (felt_by * gap[i] - swing[i]),)  # noqa: RUF005
     for i in tl.static_range(3):
         tl.store(line + 3 + i, disturbed * tl.sum(tl.where(axis == i, push[i], 0.0), 1), mask=there)
-        # a shear is of two faces
+        # A shear has parts from two faces.
         shear = tl.where(axis == (i + 2) % 3, push[(i + 1) % 3], 0.0)
         shear = tl.where(axis == (i + 1) % 3, push[(i + 2) % 3], shear)
         tl.store(line + 6 + i, disturbed * tl.sum(shear, 1), mask=there)
@@ -228,7 +234,7 @@ def balance_backward(
 
 @triton.jit
 def _coarsest_of(motion, geometry, count, LEVELS: tl.constexpr, BLOCK: tl.constexpr):
-    """Returns this program's coarsest cells, which of them exist, their masses, and one over these, [BLOCK] each."""
+    """Returns this program's coarsest cells, whether they exist, their masses, and one over the masses."""
     cell = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     there = cell < count
     mass = _mass(motion, geometry, cell, there, LEVELS)
@@ -237,7 +243,7 @@ def _coarsest_of(motion, geometry, count, LEVELS: tl.constexpr, BLOCK: tl.conste
 
 @triton.jit
 def _felt(felt, cell, there):
-    """Returns how disturbed cells are, and how much surfaces disturb them."""
+    """Returns the disturbance of cells, and the disturbance of cells by surfaces."""
     return tl.load(felt + cell * 2, mask=there, other=0.0), tl.load(felt + cell * 2 + 1, mask=there, other=0.0)
 
 
@@ -252,9 +258,11 @@ def add_coarsest(
     x, table, coarsest_of, share_of, place_of, particle_count,
     OUT: tl.constexpr, USED: tl.constexpr, COLUMNS: tl.constexpr, OVERLAP: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Multiplies columns 0 to 2 of the particles' rows of x [N, OUT] by column USED of the coarsest cells' table
-    [C, OUT], and adds its columns before that, each with the particles' shares, and the rotation in columns USED + 1 to
-    USED + 3 about the cells' middles. COLUMNS: a power of two above USED.
+    """Applies the coarsest cells' table [C, OUT] to the particles' rows of x [N, OUT].
+
+    Multiplies columns 0 to 2 by the table's column USED. Adds the table's columns before USED, with the particles'
+    shares, and the rotation in columns USED + 1 to USED + 3 about the cells' middles. COLUMNS: a power of two above
+    USED.
 
     Rule: hgn.network.relative.balanced; test: tests/kernels/test_relative.py.
     """

@@ -1,15 +1,15 @@
-"""The edges of one message-passing iteration on a level (paper fig. 5), forward and backward, before its cells.
+"""Computes the edges of one message-passing iteration on a level (paper fig. 5), forward and backward.
 
-A tile has ROWS rows: eight for each cell, six of which may be an edge that ends in it, or with DENSE six (64 rows: ten
-cells instead of eight). A program takes one tile after the other and reads its weights once. Edge arrays are [capacity,
-6, W], [c, d] for the edge to cell c from its neighbour in direction d. Sums over edges are computed inside the tile and
-by gathers in a fixed order. Only gradients of parameters are added by atomics. OVERLAP: a program starts while the
-previous kernel still runs, reads its weights and the results of the grid's kernels (count, neighbours; at least one
-kernel without OVERLAP is between), and waits for the end of the previous kernel before it reads or writes anything
-else. Every program that has rows waits, and the first one always, so that a kernel has ended only after all before it.
-The wait is inside the loop over tiles, where it costs nothing after the first: the compiler then lays out the weights
-for the matrix units before it. AHEAD: the next tile's rows are loaded as soon as this one's have left their registers;
-the previous kernel is waited for, and the first tile's rows are read, before the loop. Shape legend: C cells, W width.
+A tile has ROWS rows. Each cell has eight rows, and up to six of them are edges that end in it. With DENSE each cell has
+six rows, so that 64 rows hold ten cells instead of eight. A program takes many tiles in turn and reads its weights
+once. Edge arrays are [capacity, 6, W]: entry [c, d] is the edge to cell c from its neighbour in direction d. A tile
+computes its sums over edges itself, or gathers them in a fixed order. Atomics add only gradients of parameters.
+OVERLAP: a program starts while the previous kernel runs. It reads its weights and the results of the grid's kernels
+(count, neighbours), and waits for the end of the previous kernel before any other access. At least one kernel without
+OVERLAP runs after those of the grid. Every program with rows waits, and the first program always waits. A kernel
+therefore ends only after all earlier ones. The wait is inside the loop over tiles, because the compiler then lays out
+the weights for the matrix units before the wait. AHEAD: a program loads the next tile's rows when the registers of this
+tile's rows are free. It then waits and reads the first tile's rows before the loop. Shape legend: C cells, W width.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ from hgn.kernels.triton_compat import gdc_launch_dependents, gdc_wait, settle_ke
 
 @triton.jit
 def _edges_of(tile, count, ROWS: tl.constexpr, SLOTS: tl.constexpr):
-    """Returns for each row of a tile its place among the edges, and whether it has one."""
+    """Returns the index of the edge in each row of a tile, and whether the row has an edge."""
     row = tl.arange(0, ROWS)
     BLOCK: tl.constexpr = ROWS // SLOTS
     holds = (tile * BLOCK + row // SLOTS < count) & (row % SLOTS < 6) & (row < SLOTS * BLOCK)
@@ -50,7 +50,7 @@ def _edges_of(tile, count, ROWS: tl.constexpr, SLOTS: tl.constexpr):
 
 @triton.jit
 def _senders(neighbour, slot, owner, used, count, capacity):
-    """Returns the cells that edges come from, -1: none."""
+    """Returns the cells from which edges come, -1 for none."""
     return tl.load(neighbour + slot * capacity + owner, mask=used & (owner < count), other=-1)
 
 
@@ -60,11 +60,10 @@ def _edge_rows(
     FIRST: tl.constexpr, BY_PRODUCT: tl.constexpr, WIDTH: tl.constexpr, SUMS: tl.constexpr, BLOCK: tl.constexpr,
     WIDE: tl.constexpr,
 ):  # fmt: skip
-    """Loads a tile's rows: of `receive` (by cell if BY_PRODUCT, else by edge), of `send`, and of the edges unless
-    FIRST."""
+    """Loads a tile's rows of `receive` (by cell if BY_PRODUCT, else by edge), of `send`, and unless FIRST of edges."""
     column = tl.arange(0, WIDTH)
     there = (other >= 0)[:, None]
-    # all loads before the first use: the compiler keeps their order, and waits at the first
+    # All loads come before the first use: the compiler keeps their order, and waits at the first use.
     if BY_PRODUCT:
         member = tl.arange(0, SUMS)
         mine = tile * BLOCK + member
@@ -88,18 +87,18 @@ def edge_forward(
     FIRST: tl.constexpr, STORE_EDGE: tl.constexpr, SAVE: tl.constexpr, WIDTH: tl.constexpr, ROWS: tl.constexpr,
     DENSE: tl.constexpr, PRECISION: tl.constexpr, OVERLAP: tl.constexpr, AHEAD: tl.constexpr, WIDE: tl.constexpr,
 ):  # fmt: skip
-    """Computes paper steps 2, 4, … (fig. 5): the edges' new features [C, 6, W] and their sums by receiver [C, W]. send
-    and receive [C, W] are the cells' products with the edge MLP's first two parts, receive with the bias.
+    """Computes paper steps 2, 4, … (fig. 5): the edges' new features [C, 6, W] and their sums by receiver [C, W].
 
-    FIRST: edges have no features yet; their unit offset replaces them. The last iteration stores no edges. SAVE stores
-    the inputs of edge_backward: the hidden layer and the normalised output [C, 6, W], and `rstd` [C, 6], one over its
-    standard deviation.
+    send and receive [C, W] are the products of the cells with the first two parts of the edge MLP; receive includes the
+    bias. FIRST: edges have no features yet, and their unit offset replaces them. The last iteration stores no edges.
+    SAVE stores the inputs of edge_backward: the hidden layer and the normalised output [C, 6, W], and `rstd` [C, 6]
+    (one over its standard deviation).
 
     Rule: hgn.network.hgn.MessagePassing; reference and test: tests/kernels/references.py, test_kernels_alone.py.
     """
     if OVERLAP:
         gdc_launch_dependents()
-    SUMS: tl.constexpr = max(16, ROWS // 4)  # the least that the matrix units take
+    SUMS: tl.constexpr = max(16, ROWS // 4)  # 16 is the smallest size of the matrix units
     SLOTS: tl.constexpr = 6 if DENSE else 8
     BLOCK: tl.constexpr = ROWS // SLOTS
     column = tl.arange(0, WIDTH)
@@ -110,16 +109,16 @@ def edge_forward(
     used = (slot < 6) & (tl.arange(0, ROWS) < SLOTS * BLOCK)
     owner = tl.program_id(0) * BLOCK + tl.arange(0, ROWS) // SLOTS
     other = _senders(neighbour, slot, owner, used, count, capacity)
-    # vectors once: in the loop each would be waited for again
+    # The vectors are loaded once. In the loop each load would be waited for again.
     second_bias = tl.load(values + second_bias_at + column)
     norm_weight, norm_bias = tl.load(values + norm_weight_at + column), tl.load(values + norm_bias_at + column)
-    # Where it is exact, a cell's row comes to its edges by a product, with the sides' rows in its spare places.
+    # Where a product is exact, it copies a cell's row to its edges. Its spare places hold the sides' rows.
     BY_PRODUCT: tl.constexpr = PRECISION != "tf32"
     if BY_PRODUCT:
         receiver = chosen_rows(ROWS, SLOTS, SUMS)
         member = tl.arange(0, SUMS)
         if FIRST:
-            # receiver minus sender: the opposite of where the sender lies
+            # The offset is receiver minus sender, which is opposite to the direction of the sender.
             spare = member[None, :] - BLOCK
             side = (slot % 2 * 2 - 1).to(tl.float32)[:, None]
             on_axis = (spare >= 0) & (spare < 6) & (spare % 3 == (slot // 2)[:, None])
@@ -140,7 +139,7 @@ def edge_forward(
         if OVERLAP and not AHEAD:
             gdc_wait()
         holds = used & (owner < count)
-        # a later tile's, which say where its features lie; TF32 has no registers for it
+        # These say where a later tile's features are. TF32 has no registers to load the features early.
         later_owner = owner + tl.num_programs(0) * BLOCK
         if AHEAD:
             last = _senders(neighbour, slot, later_owner + tl.num_programs(0) * BLOCK, used, count, capacity)
@@ -170,7 +169,7 @@ def edge_forward(
             h = product(edge, own, PRECISION, h)
         a = leaky_operand(h, PRECISION)
         if SAVE:
-            # also where there is no edge: what lies there meets zero gradients in the weights' products
+            # Rows without an edge are stored too. The weight gradients multiply them by zero gradients.
             tl.store(hidden + edge_at, a, mask=holds[:, None])
         z = product(a, second, PRECISION)
         z, row_rstd = normalise_once(z + inside(second_bias, tile)[None, :], WIDTH, PRECISION)
@@ -194,7 +193,7 @@ def edge_forward(
             else:
                 tl.store(edge_out + edge_at, z, mask=there)
         if not DENSE and PRECISION == "tf32" and not SAVE:
-            # as a reduction: rounding the product's operands would spill registers here
+            # Here a reduction makes the sum: rounding a product's operands would spill registers.
             mine = tile * BLOCK + tl.arange(0, BLOCK)
             ends = (mine < count)[:, None]
             total = tl.sum(tl.reshape(tl.where(there, z, 0.0), (BLOCK, 8, WIDTH)), 1)
@@ -219,16 +218,16 @@ def edge_backward(
     FIRST: tl.constexpr, LAST: tl.constexpr, WIDTH: tl.constexpr, ROWS: tl.constexpr, DENSE: tl.constexpr,
     PRECISION: tl.constexpr, OVERLAP: tl.constexpr,
 ):  # fmt: skip
-    """Turns edge_gradient [C, 6, W], in place, from the gradient of edge_out without the sums' part (there is none if
-    LAST) into that of edge_in (unless FIRST). receive_gradient [C, W] is that of `receive`.
+    """Replaces the gradient of edge_out in edge_gradient [C, 6, W] by that of edge_in (unless FIRST).
 
-    `rstd` is zero where there is no edge. It is read a tile ahead, because it decides what else is read.
+    The incoming gradient lacks the part of the sums; with LAST it is absent. receive_gradient [C, W] is the gradient of
+    `receive`. `rstd` is zero where there is no edge. It is read a tile ahead, because the other reads depend on it.
 
     Rule: hgn.network.hgn.MessagePassing; reference and test: tests/kernels/references.py, test_kernels_alone.py.
     """
     if OVERLAP:
         gdc_launch_dependents()
-    SUMS: tl.constexpr = max(16, ROWS // 4)  # the least that the matrix units take
+    SUMS: tl.constexpr = max(16, ROWS // 4)  # 16 is the smallest size of the matrix units
     SLOTS: tl.constexpr = 6 if DENSE else 8
     BLOCK: tl.constexpr = ROWS // SLOTS
     column = tl.arange(0, WIDTH)
@@ -252,7 +251,7 @@ def edge_backward(
         if OVERLAP:
             gdc_wait()
         edge_at = place[:, None] * WIDTH + column[None, :]
-        # all loads before the first use: the compiler keeps their order, and waits at the first
+        # All loads come before the first use: the compiler keeps their order, and waits at the first use.
         z = tl.load(normalised + edge_at, mask=there, other=0.0)
         if not LAST:
             later = tl.load(edge_gradient + edge_at, mask=there, other=0.0)
@@ -262,11 +261,11 @@ def edge_backward(
         if not LAST:
             de = added(de, later)
         dy, z = de.to(tl.float32), z.to(tl.float32)
-        if tile >= 0:  # always, and the compiler does not know: else it puts these sums off, and keeps what they are of
+        if tile >= 0:  # always true, unknown to the compiler; otherwise it delays these sums and keeps their operands
             norm_weight_total += column_sums(dy * z, ROWS, WIDTH, 8)
             norm_bias_total += column_sums(dy, ROWS, WIDTH, 8)
         dz = normalise_backward(dy, z, row_rstd, inside(norm_weight, tile), WIDTH)
-        # earlier there are no registers for it; it comes while the product runs
+        # No registers are free for this load earlier. It runs during the product.
         a = tl.load(hidden + edge_at, mask=there, other=0.0)
         tl.store(second_gradient + edge_at, dz, mask=holds[:, None])
         later_place, later_holds = _edges_of(tile + tl.num_programs(0), count, ROWS, SLOTS)
@@ -283,7 +282,7 @@ def edge_backward(
             if PRECISION == "fp16":
                 de = added(de, through.to(de.dtype))
             else:
-                # read again: registers are dearer than a cache
+                # This repeats a read, because a register costs more than a read of the cache.
                 owner = tile * BLOCK + tl.arange(0, ROWS) // SLOTS
                 de = through + tl.load(sum_gradient + owner[:, None] * WIDTH + column[None, :], mask=there, other=0.0)
                 if not LAST:

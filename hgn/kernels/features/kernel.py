@@ -1,6 +1,6 @@
-"""Features of particles on the device: the paper's absolute ones, or relative ones and the motion of cells.
+"""Computes features of particles on the device: the paper's absolute ones, or relative ones and the motion of cells.
 
-hgn.kernels.grid writes what particles read of the grid. Shape legend: N particles, C cells of a level, L levels.
+hgn.kernels.grid writes the inputs from the grid. Shape legend: N particles, C cells of a level, L levels.
 """
 
 from __future__ import annotations
@@ -19,8 +19,9 @@ def sum_motion(
     motion, parent, geometry, counts, disturbed, felt, neighbour, coarsest_capacity,
     LEVELS: tl.constexpr, OVERLAP: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Adds mass and momentum of the finest cells to all cells above them, in `motion` [.., 4] of all levels, and writes
-    the nearness of surfaces to the coarsest cells' `felt` [C, 2] (`most_around`), by a second set of programs.
+    """Adds mass and momentum of the finest cells to all cells above them, in `motion` [.., 4] of all levels.
+
+    A second set of programs writes the nearness of surfaces to the coarsest cells' `felt` [C, 2] (`most_around`).
 
     Rule: hgn.network.relative; test: tests/kernels/test_network.py.
     """
@@ -31,7 +32,7 @@ def sum_motion(
     if tl.program_id(0) * BLOCK >= count:
         return
     cell = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    if tl.program_id(1) == 1:  # beside the sums
+    if tl.program_id(1) == 1:  # these programs run beside those of the sums
         most_around(disturbed, felt, 1, neighbour, cell, cell < tl.load(counts + LEVELS - 1), coarsest_capacity)
         return
     there = cell < count
@@ -39,7 +40,7 @@ def sum_motion(
     value = tl.load(motion + cell[:, None] * 4 + part, mask=there[:, None], other=0.0)
     for level in tl.static_range(1, LEVELS):
         line = geometry + level * GEOMETRY_COLUMNS
-        # a parent past the capacity is none (-1)
+        # A parent past the capacity is -1.
         cell = tl.load(parent + tl.load(line - GEOMETRY_COLUMNS + 6) + cell, mask=there, other=-1)
         there = there & (cell >= 0)
         at = motion + (tl.load(line + 6) + cell)[:, None] * 4 + part
@@ -53,8 +54,9 @@ def prepare_features(
     HISTORY: tl.constexpr, NORMALS: tl.constexpr, OBSTACLES: tl.constexpr, SYMMETRY: tl.constexpr,
     FEATURES: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Writes the absolute features of each particle (velocities, normal if NORMALS, walls, one-hot material),
-    [N, FEATURES]. Without OBSTACLES the normals are zero. SYMMETRY as in obstacle_normals.
+    """Writes the absolute features [N, FEATURES]: velocities, normal if NORMALS, walls, one-hot material.
+
+    Without OBSTACLES the normals are zero. SYMMETRY means the same as in obstacle_normals.
 
     Rule: hgn.network.features; test: tests/kernels/test_network.py.
     """
@@ -67,7 +69,7 @@ def prepare_features(
     column = tl.arange(0, FEATURES)
     axis = column % 3
     here = live[:, None]
-    # 3 * HISTORY velocities: column 3 k + axis
+    # The 3 * HISTORY velocities have component `axis` of velocity k in column 3 k + axis.
     is_velocity = column < 3 * HISTORY
     v = tl.load(velocity + row[:, None] * (3 * HISTORY) + column[None, :], mask=here & is_velocity[None, :], other=0.0)
     centred = v - tl.load(mean + axis)[None, :]
@@ -96,7 +98,7 @@ def prepare_features(
 
 @triton.jit
 def _asinh(x):
-    """Returns asinh(x), exactly odd, and within float32's rounding next to zero too: log(1 + y) by Kahan's method."""
+    """Returns asinh(x), exactly odd, with float32's precision near zero too: log(1 + y) by Kahan's method."""
     size = tl.abs(x)
     y = size + size * size / (1 + tl.sqrt(1 + size * size))
     one = 1 + y
@@ -112,12 +114,13 @@ def prepare_relative_features(
     HISTORY: tl.constexpr, LEVELS: tl.constexpr, NORMALS: tl.constexpr,
     FEATURES: tl.constexpr, OVERLAP: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Writes the features of each particle that no boost and no shift changes, [N, FEATURES]: changes of velocity less
-    gravity, velocity relative to the cells around on each level (`motion`: mass and momentum of the cells of all
-    levels), near a surface the velocity, weighted by `felt` of its coarsest cells, and after the columns of surfaces,
-    which prepare_particles wrote, the one-hot material. Differences of velocity are in units of `scale`, as asinh.
-    Raises the first numbers of the coarsest cells' `disturbed` [C, 2] to the disturbance of their particles, over
-    FULLY.
+    """Writes the features [N, FEATURES] of each particle that no boost and no shift changes.
+
+    They are: changes of velocity minus gravity; the velocity relative to the cells around on each level, whose mass and
+    momentum are in `motion`; near a surface the velocity, weighted by `felt` of the coarsest cells; the columns of
+    surfaces, which prepare_particles wrote; and the one-hot material. Differences of velocity are asinh of multiples of
+    `scale`. The kernel raises the first numbers of the coarsest cells' `disturbed` [C, 2] to the disturbance of their
+    particles over FULLY.
 
     Rule: hgn.network.relative; test: tests/kernels/test_network.py.
     """
@@ -156,7 +159,7 @@ def prepare_relative_features(
             own = tl.load(velocity + row * (3 * HISTORY) + i, mask=live, other=0.0)
             value = with_column(value, HISTORIES + 3 * level + i, own - around)
         if level < LEVELS - 1:
-            # a parent past the capacity: the frame is void, but nothing may be read out of bounds
+            # With a parent past the capacity the frame is void, but no access may be out of bounds.
             cell = tl.maximum(tl.load(parent + first + cell, mask=corners, other=0), 0)
     is_contact = here & ((column >= CONTACT) & (column < WALLS))[None, :]
     v = tl.load(velocity + row[:, None] * (3 * HISTORY) + axis[None, :], mask=is_contact, other=0.0)

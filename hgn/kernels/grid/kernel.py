@@ -1,7 +1,7 @@
-"""The grid hierarchy on the device: marking, numbering, tables. Nothing here waits for the host.
+"""Builds the grid hierarchy on the device: marks, numbers and tables of cells. Nothing here waits for the host.
 
-All levels of all scenes lie in one array of slots: a window of cells around the domain, a border of one cell at each
-level so that neighbours need no bounds check. Shape legend: N particles, C cells of a level, L levels.
+One array of slots holds all levels of all scenes. Each level has a window of cells around the domain with a border of
+one cell, so that neighbours need no check of bounds. Shape legend: N particles, C cells of a level, L levels.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ from hgn.kernels.obstacles import OBSTACLE_COLUMNS, obstacle_normals
 from hgn.kernels.triton_compat import gdc_launch_dependents, gdc_wait, settle_keys
 from hgn.network.relative import STEPS_AHEAD, WALL_LIMIT
 
-NEAREST, STEPS = tl.constexpr(WALL_LIMIT), tl.constexpr(STEPS_AHEAD)  # of relative inputs
-OVERFLOW = tl.constexpr(1)  # more active cells than capacity
-OUT_OF_WINDOW = tl.constexpr(2)  # a particle is not finite or outside the window
+NEAREST, STEPS = tl.constexpr(WALL_LIMIT), tl.constexpr(STEPS_AHEAD)  # constants of relative inputs
+OVERFLOW = tl.constexpr(1)  # status bit: a level has more active cells than its capacity
+OUT_OF_WINDOW = tl.constexpr(2)  # status bit: a particle is not finite or outside the window
 
 
 @triton.jit
@@ -30,12 +30,13 @@ def _base(position, origin, scene, row, live, axis: tl.constexpr, cell_size):
 
 @triton.jit
 def _base_cell(position, origin, scene, row, live, low, geometry, cell_size):
-    """Returns the lowest of each particle's 8 cells, counted from the window's first, its fractions, and whether the
-    window contains all 8; cell 0 if it does not."""
+    """Returns the lowest of each particle's 8 cells, its fractions, and whether the window contains all 8 cells.
+
+    Cells are counted from the window's first one. The lowest cell is 0 if the window does not contain all."""
     x, fx = _base(position, origin, scene, row, live, 0, cell_size)
     y, fy = _base(position, origin, scene, row, live, 1, cell_size)
     z, fz = _base(position, origin, scene, row, live, 2, cell_size)
-    # in floats first: a wild position has no integer
+    # The subtraction is in floats, because a position far outside has no integer.
     x, y, z = x - tl.load(low), y - tl.load(low + 1), z - tl.load(low + 2)
     nx, ny, nz = tl.load(geometry + 7) - 3, tl.load(geometry + 2) - 3, tl.load(geometry + 3) - 3
     inside = live & (x >= 0) & (y >= 0) & (z >= 0) & (x < nx) & (y < ny) & (z < nz)
@@ -47,7 +48,7 @@ def _base_cell(position, origin, scene, row, live, low, geometry, cell_size):
 
 @triton.jit
 def _slots_of(geometry, level: tl.constexpr):
-    """Returns the numbers of a level that `_slot` needs: the compiler would read them again for each slot."""
+    """Returns a level's numbers that `_slot` needs. Otherwise the compiler reads them again for each slot."""
     line = geometry + level * GEOMETRY_COLUMNS
     return tl.load(line), tl.load(line + 2), tl.load(line + 3), tl.load(line + 4)
 
@@ -81,14 +82,14 @@ def mark_cells(
     levels = ()
     for level in tl.static_range(LEVELS):
         levels = levels + (_slots_of(geometry, level),)  # noqa: RUF005 - Triton knows no unpacking here
-    # all levels are read before the first slot is written: the compiler keeps that order, and would wait for each
+        # This loop reads all levels before the first store: the compiler keeps the order and would wait at each.
     for level in tl.static_range(LEVELS):
         slots = levels[level]
         for corner in tl.static_range(8):
             cx = (upper_x if corner >> 2 & 1 else x) >> level
             cy = (upper_y if corner >> 1 & 1 else y) >> level
             cz = (upper_z if corner & 1 else z) >> level
-            # corners that share an ancestor leave it to the lowest of them: each store is traffic of the L2 cache
+            # Corners with the same ancestor leave the store to the lowest of them: each store loads the L2 cache.
             first = inside
             if corner >> 2 & 1:
                 first = first & (cx != x >> level)
@@ -114,15 +115,15 @@ def _number(prefix_sum, slot, first, capacity, there):
 
 @triton.jit
 def _cell(occupied, prefix_sum, slot, first, capacity, ask):
-    """Does the same for the slots where `ask` is true."""
+    """Returns the number of the cell in a slot where `ask` is true, -1 if the cell is not active."""
     return _number(prefix_sum, slot, first, capacity, _marked(occupied, slot, ask))
 
 
 @triton.jit
 def _write_cells(table, cell, live, occupied, prefix_sum, slots, first, capacity, own_capacity, COUNT: tl.constexpr):
-    """Writes the numbers of the cells in slots i of the tuple `slots` to line i of the table [COUNT, own_capacity].
+    """Writes the numbers of the cells in slots i of the tuple `slots` to row i of the table [COUNT, own_capacity].
 
-    All are read before the first is written: the compiler keeps that order, and would wait for each in turn.
+    It reads all numbers before the first store: the compiler keeps the order of accesses and would wait at each.
     """
     there = ()
     for i in tl.static_range(COUNT):
@@ -144,7 +145,7 @@ def fill_tables(
     Rule: hgn.network.grid.build_hierarchy; test: tests/kernels/test_network.py.
     """
     if OVERLAP:
-        gdc_launch_dependents()  # who needs the cells' numbers alone
+        gdc_launch_dependents()  # kernels that need only the numbers of the cells may start
     level = tl.program_id(1)
     line = geometry + level * GEOMETRY_COLUMNS
     start, slots = tl.load(line), tl.load(line + 1)
@@ -211,8 +212,9 @@ def _surfaces(
     position, velocity, domain, row, live, scene, obstacle_table, obstacle_cell_size, reach,
     HISTORY: tl.constexpr, OBSTACLES: tl.constexpr, SYMMETRY: tl.constexpr,
 ):  # fmt: skip
-    """Returns the nearness of walls and the normals here and ahead, columns 0 to 11 of [N, 16]; and the nearness of the
-    nearest surface, from 0 beyond its reach to 1, [N]."""
+    """Returns the nearness of walls and the normals here and ahead, columns 0 to 11 of [N, 16].
+
+    Returns also the nearness of the nearest surface [N], from 0 beyond its reach to 1."""
     column = tl.arange(0, 16)
     axis, upper, walls = column % 3, (column >= 3)[None, :], live[:, None] & (column < 6)[None, :]
     v = tl.load(velocity + row[:, None] * (3 * HISTORY) + axis[None, :], mask=walls, other=0.0)
@@ -222,7 +224,7 @@ def _surfaces(
     value = tl.where(walls, tl.minimum(tl.maximum(1 - distance / reach, 0.0), NEAREST), 0.0)
     touch = tl.minimum(2 * tl.max(value, 1), 1.0)
     if OBSTACLES:
-        # here, and at steps of the next frame's way
+        # The probes are the present position, and steps along the path to the next frame.
         quarters = tl.arange(0, 8)[None, :]
         asked = live[:, None] & (quarters <= STEPS)
         at = position + row[:, None] * 3 + 0 * quarters
@@ -261,9 +263,10 @@ def _surface_normals(surfaces):
 
 @triton.jit
 def _coarsest_part(x, fraction, high, LEVELS: tl.constexpr):
-    """Returns along one axis whether a corner's coarsest cell differs from that of the corner below [N, 8], the weight
-    of a particle in it, and its place [N] in that of the lower corners, from the middle, in edges. x is the lower
-    corners' coordinate."""
+    """Returns along one axis where a corner's coarsest cell differs from that of the corner below [N, 8].
+
+    Returns also the weight of a particle in it, and the place [N] from the middle of the lower corners' cell, in edges.
+    x is the coordinate of the lower corners."""
     ABOVE: tl.constexpr = LEVELS - 1
     EDGE: tl.constexpr = 1 << ABOVE
     split = ((x + (fraction > 0).to(tl.int32)) >> ABOVE) != x >> ABOVE
@@ -281,13 +284,14 @@ def prepare_particles(
     NORMALS: tl.constexpr, OBSTACLES: tl.constexpr, SYMMETRY: tl.constexpr, FEATURES: tl.constexpr,
     OVERLAP: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Writes each particle's 8 cells, their weights, and its fraction. With MOTION adds its parts of the finest cells'
-    mass and momentum to `motion` [.., 4], and writes its coarsest cells `coarsest_of` [N, 8], each once and -1
-    elsewhere, its weights in them, and its place [N, 3] in the lowest, from the middle, in edges. Writes the columns of
-    the features for surfaces and `touch_of` [N], the nearness of the nearest surface, and raises the second number of
-    its coarsest cells in `disturbed` [C, 2] to it, over FULLY. Adds places, their products xx, yy, zz, yz, xz, xy, and
-    after them those of the normals of near surfaces to the coarsest cells' `moments` [C, COLUMNS]. OBSTACLES and
-    SYMMETRY as in prepare_features.
+    """Writes each particle's 8 cells, their weights, and its fraction.
+
+    With MOTION it adds the particle's parts of the finest cells' mass and momentum to `motion` [.., 4]. It writes its
+    coarsest cells `coarsest_of` [N, 8], each once and -1 elsewhere, its weights in them, and its place [N, 3] from the
+    middle of the lowest cell, in edges. It writes the features of surfaces, and `touch_of` [N], the nearness of the
+    nearest surface. It raises the second number of the coarsest cells in `disturbed` [C, 2] to this nearness over
+    FULLY. It adds places, their products xx, yy, zz, yz, xz, xy, and then those of the normals of near surfaces to the
+    coarsest cells' `moments` [C, COLUMNS]. OBSTACLES and SYMMETRY mean the same as in prepare_features.
 
     Rule: hgn.network.grid.build_hierarchy and hgn.network.relative; test: tests/kernels/test_network.py.
     """
@@ -310,7 +314,7 @@ def prepare_particles(
         tl.store(at, surfaces, mask=live[:, None] & (column < 6 + 6 * NORMALS))
     x, y, z, fx, fy, fz, inside = _base_cell(position, origin, scene, row, live, low, geometry, cell_size)
     slots = _slots_of(geometry, 0)
-    # all corners at once, [BLOCK, 8]: what a thread stores lies side by side
+    # [BLOCK, 8] holds all corners at once, so that a thread stores neighbouring elements.
     corner = tl.arange(0, 8)[None, :]
     high_x, high_y, high_z = (corner >> 2 & 1) == 1, (corner >> 1 & 1) == 1, (corner & 1) == 1
     cx = x[:, None] + (high_x & (fx > 0)[:, None]).to(tl.int32)
@@ -328,7 +332,7 @@ def prepare_particles(
     tl.store(fraction_of + row * 3 + 2, fz, mask=live)
     if MOTION:
         part = tl.arange(0, 4)[None, :]
-        # mass, and momentum behind it
+        # Column 0 is the mass, columns 1 to 3 are the momentum.
         v = tl.load(velocity + row[:, None] * (3 * HISTORY) + part - 1, mask=live[:, None] & (part > 0), other=1.0)
         touched = ((cell >= 0) & (weight > 0))[:, :, None] & (part >= 0)[:, None, :]
         at = motion + cell[:, :, None] * 4 + part[:, None, :]
@@ -358,13 +362,13 @@ def prepare_particles(
         product = _surface_normals(surfaces)
         for i in tl.static_range(6):
             added = tl.where(part == 9 + i, share[:, :, None] * product[i][:, None, None], added)
-        # up to a multiple of four, which are added at once
+        # The added columns are a multiple of four, because the hardware adds four at once.
         adds = (coarsest >= 0)[:, :, None] & ((part < 12) | (touch > 0)[:, None, None])
         tl.atomic_add(moments + coarsest[:, :, None] * COLUMNS + part, added, mask=adds, sem="relaxed")
         raise_disturbed(disturbed + 1, coarsest, touch)
     if OVERLAP:
-        gdc_wait()  # reads nothing of the tables that are being filled; who comes next does
-    # cells past the capacity: the frame is void, but nothing may be read or written out of bounds
+        gdc_wait()  # only the next kernels read the tables that earlier kernels are filling
+    # With cells past the capacity the frame is void, but no access may be out of bounds.
     tl.store(cell_of + row[:, None] * 8 + corner, tl.maximum(cell, 0), mask=here)
     tl.store(weight_of + row[:, None] * 8 + corner, weight, mask=here)
 

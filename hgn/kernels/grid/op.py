@@ -1,4 +1,4 @@
-"""The device grid: capacities, buffers and launches of the grid kernels.
+"""Holds the grid on the device: capacities and buffers, and the launches of the grid kernels.
 
 Shape legend: N particles, C cells of a level, S scenes, L levels.
 """
@@ -25,17 +25,17 @@ from hgn.network.relative import CONTACT_REACH_CELLS, FEW, OUTPUTS, QUIET, RARE
 
 MARK_BLOCK = 128
 PARTICLE_BLOCK = 32
-FILL_BLOCK = 4096 if interpreting() else 512  # slots; the interpreter's time goes by programs
-SUMS = 16  # columns of the sums of coarsest cells: those of the decoder's padded output
-MARGIN_CELLS = 4  # of a window, around the box that it must contain
+FILL_BLOCK = 4096 if interpreting() else 512  # slots of a program; the interpreter needs few programs
+SUMS = 16  # columns of the sums of coarsest cells, equal to those of the decoder's padded output
+MARGIN_CELLS = 4  # margin of a window around the box that it must contain
 OVERFLOW, OUT_OF_WINDOW = kernel.OVERFLOW.value, kernel.OUT_OF_WINDOW.value
 
 
 @dataclass(frozen=True)
 class Window:
-    """The cells of the finest level that exist: `low` to `low + cells - 1` on each axis, in every scene.
+    """Names the cells of the finest level that exist in every scene: `low` to `low + cells - 1` on each axis.
 
-    Both are multiples of 2^(levels - 1), so that parents never straddle it.
+    Both are multiples of 2^(levels - 1), so that a parent lies inside or outside the window as a whole.
     """
 
     low: tuple[int, int, int]
@@ -45,7 +45,7 @@ class Window:
     def around(
         lower_3: Sequence[float], upper_3: Sequence[float], cell_size: float, levels: int, margin: int = MARGIN_CELLS
     ) -> Window:
-        """Returns the window of every cell within `margin` cells of a box, in domain units."""
+        """Returns the window of all cells within `margin` cells of a box. The box is in domain units."""
         unit = 1 << (levels - 1)
         low, cells = [], []
         for lower, upper in zip(lower_3, upper_3, strict=True):
@@ -61,23 +61,23 @@ class Window:
 
 
 def feature_columns(config: NetworkConfig) -> int:
-    """Returns the columns of the encoder's input: features, one-hot material, padding to a power of two."""
+    """Returns the number of columns of the encoder's input: features, one-hot material, padding to a power of two."""
     used = config.feature_width - MATERIAL_EMBEDDING + len(config.materials)
     return max(16, triton.next_power_of_2(used))
 
 
 @dataclass(frozen=True, eq=False)
 class DeviceParticles:
-    """The particles of all scenes, padded to the size of the buffers, and their scenes."""
+    """Holds the particles of all scenes, padded to the size of the buffers, and the scene of each particle."""
 
     position_N3: torch.Tensor
-    velocity_NV: torch.Tensor  # histories, newest first
+    velocity_NV: torch.Tensor  # velocity histories, newest first
     scene_N: torch.Tensor  # int32
     material_N: torch.Tensor  # int32
-    origin_S3: torch.Tensor  # of the grid
+    origin_S3: torch.Tensor  # origin of the grid
     domain_S3: torch.Tensor
-    gravity_S3: torch.Tensor  # zero with absolute inputs, which have learned it
-    count: torch.Tensor  # int32 [1]
+    gravity_S3: torch.Tensor  # zero with absolute inputs, whose network has learned gravity
+    count: torch.Tensor  # number of particles, int32 [1]
 
     @staticmethod
     def empty(particles: int, scenes: int, history: int, device: torch.device) -> DeviceParticles:
@@ -91,16 +91,16 @@ class DeviceParticles:
 
 
 class DeviceGrid:
-    """Tables of all levels at fixed capacities; counts stay on the device.
+    """Holds the tables of all levels at fixed capacities. Counts stay on the device.
 
-    Buffers (int32): counts_L (after clipping), needed_L (before), status (sticky flags); neighbour, parent, octant and
-    children of level l as views; per particle cell_N8, weight_N8, fraction_N3, and the encoder's input feature_NF.
-    For relative inputs motion_C4 is mass and momentum of the cells of all levels, one level after the other; and of the
-    coarsest cells there are disturbed_C2, disturbed and touched by their own particles in units of FULLY, felt_C2, by
-    those across their faces too, and what `balance` sums up and spreads, sum_C and table_C, and moment_C, the first and
-    second moments of what they hold, and sums of products of normals. Of each particle there are its coarsest cells,
-    each once and -1 elsewhere, its shares of them, its place in the lowest, and how near it is to a surface:
-    coarsest_N8, share_N8, place_N3, touch_N.
+    Buffers (int32): counts_L are the counts after clipping, needed_L those before, and status has sticky flags.
+    Methods return neighbour, parent, octant and children of a level as views. Each particle has cell_N8, weight_N8,
+    fraction_N3, and the encoder's input feature_NF. Relative inputs need more. motion_C4 is mass and momentum of the
+    cells of all levels, one level after the other. The coarsest cells have disturbed_C2 (disturbed and touched by their
+    own particles, in units of FULLY) and felt_C2 (the maximum with those across their faces). sum_C and table_C are the
+    sums and the table of `balance`. moment_C holds the first and second moments of their contents, and sums of products
+    of normals. Each particle has its coarsest cells coarsest_N8, each once and -1 elsewhere, its shares share_N8 of
+    them, its place place_N3 in the lowest one, and touch_N, the nearness of a surface.
     """
 
     def __init__(
@@ -113,7 +113,7 @@ class DeviceGrid:
         device: torch.device,
         more: tuple[int, ...] = (),
     ) -> None:
-        """`more_cleared` are int32 tensors of `more` numbers for other users; `build` clears them too."""
+        """Adds int32 tensors `more_cleared` with `more` numbers for other users. `build` clears them too."""
         assert scenes < SCENE_LIMIT
         relative, features = config.relative, feature_columns(config)
         self.window, self.scenes, self.capacities, self.particles = window, scenes, tuple(capacities), particles
@@ -134,7 +134,7 @@ class DeviceGrid:
         self.low = torch.tensor(window.low, dtype=torch.int32, device=device)
         coarsest = self.capacities[-1] if relative else 0
         parts = [4 * at if relative else 4, *[SUMS * coarsest] * 3, 2 * coarsest, start, *more]
-        self._cleared = integers(sum(parts))  # in one piece, cleared by one launch
+        self._cleared = integers(sum(parts))  # one launch clears all parts
         motion, *sums, moments, disturbed, self.occupied = self._cleared.split(parts)[:6]
         self.more_cleared = self._cleared.split(parts)[6:]
         self.prefix_sum = integers(start)
@@ -158,12 +158,12 @@ class DeviceGrid:
         self._at = [row[6] for row in rows]
 
     def neighbour(self, level: int) -> torch.Tensor:
-        """[6, capacity]: the cell in each direction of DIRECTION_63, or -1."""
+        """Returns [6, capacity]: the cell in each direction of DIRECTION_63, or -1."""
         at, capacity = self._at[level], self.capacities[level]
         return self._neighbour[6 * at : 6 * (at + capacity)].view(6, capacity)
 
     def children(self, level: int) -> torch.Tensor:
-        """[8, capacity]: the cell of the finer level at each corner of CORNER_83, or -1."""
+        """Returns [8, capacity]: the cell of the finer level at each corner of CORNER_83, or -1."""
         at, capacity = self._at[level], self.capacities[level]
         return self._children[8 * at : 8 * (at + capacity)].view(8, capacity)
 
@@ -200,9 +200,9 @@ class DeviceGrid:
         obstacles: SceneTable | None,
         symmetry: bool = False,
     ) -> None:
-        """Computes cells and features of every particle; without `obstacles` normals are zero.
+        """Computes the cells and the features of every particle. Without `obstacles` normals are zero.
 
-        `scale` is Normaliser.feature_scale. With `symmetry` the obstacles are seen under the symmetries in their rows.
+        `scale` is Normaliser.feature_scale. With `symmetry` the kernel applies the symmetries in the obstacles' rows.
         """
         config, blocks, overlap = self.config, (triton.cdiv(self.particles, PARTICLE_BLOCK),), overlaps()
         surfaces: dict[str, Any] = {
@@ -246,17 +246,17 @@ class DeviceGrid:
         )  # fmt: skip
 
     def balance(self, output: torch.Tensor, count: torch.Tensor) -> None:
-        """Turns the decoder's output [N, OUT] into accelerations less gravity in columns 0 to 2: relative.balanced."""
+        """Turns the decoder's output [N, OUT] into accelerations minus gravity in columns 0 to 2: relative.balanced."""
         self._through_coarsest(output, count, self.sum_C, coarsest_kernel.balance, OUTPUTS, 3)
 
     def balance_backward(self, gradient: torch.Tensor, count: torch.Tensor) -> None:
-        """Turns the gradient of the result of `balance` into that of its input, in place."""
+        """Replaces the gradient of the result of `balance` by that of its input."""
         self._through_coarsest(gradient, count, self.gradient_sum_C, coarsest_kernel.balance_backward, 3, OUTPUTS)
 
     def _through_coarsest(
         self, x: torch.Tensor, count: torch.Tensor, sums: torch.Tensor, between: Any, taken: int, left: int
     ) -> None:
-        """Sums the first columns over coarsest cells, applies `between`, and adds the result to particles."""
+        """Sums the first columns over coarsest cells, launches `between`, and adds the result to particles."""
         particles, capacity, coarsest = self.particles, self.capacities[-1], self.neighbour(self.levels - 1)
         forward, overlap = taken == OUTPUTS, overlaps()
         pairs: dict[str, Any] = {"coarsest_of": self.coarsest_N8, "share_of": self.share_N8, "place_of": self.place_N3}
@@ -264,7 +264,7 @@ class DeviceGrid:
         cells = {"neighbour": coarsest, "counts": self.counts_L, "capacity": capacity, "LEVELS": self.levels}
         sizes = {"OUT": x.shape[1], "OVERLAP": overlap, "BLOCK": PARTICLE_BLOCK}
         cells_too = max(particles, capacity) if forward else particles
-        # in a backward pass, the operation before is no kernel of ours
+        # In a backward pass the previous operation is no kernel of this package.
         coarsest_kernel.sum_coarsest[(triton.cdiv(cells_too, PARTICLE_BLOCK),)](
             x=x, **pairs, **cells, disturbed=self.disturbed_C2, felt=self.felt_C2, sums=sums, USED=taken,
             FEEL=forward, **sizes, launch_pdl=overlap and forward,

@@ -1,7 +1,7 @@
-"""An MLP on rows, forward and backward: encoder, decoder, and the steps between levels.
+"""Computes an MLP on rows, forward and backward: the encoder, the decoder, and the steps between levels.
 
 Forward of row r: h = x W + gathered[index_r] + offset_octant + b; a = leaky(h); y = norm(a W2 + b2) (+ x).
-Up to two products of y follow, with or without biases, for the next kernels. Shape legend: R rows, W width.
+Up to two products of y follow for the next kernels, with or without biases. Shape legend: R rows, W width.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from hgn.kernels.triton_compat import gdc_launch_dependents, gdc_wait, settle_ke
 
 @triton.jit
 def _shift(values, offset_at, octant, SIGN: tl.constexpr, WIDTH: tl.constexpr):
-    """Returns the sum over axes of (1/2 - bit) times the offset weights [3, W]: towards the parent for SIGN = 1."""
+    """Returns the sum over axes of (1/2 - bit) times the offset weights [3, W]. SIGN = 1 points to the parent."""
     column = tl.arange(0, WIDTH)
     result = tl.zeros((octant.shape[0], WIDTH), tl.float32)
     for axis in tl.static_range(3):
@@ -52,7 +52,7 @@ def _rows_of(x, tile, count, INPUT: tl.constexpr, BLOCK: tl.constexpr):
 
 @triton.jit
 def _three_rows(pointer, WIDTH: tl.constexpr):
-    """Loads the matrix [3, W] at `pointer`, filled up to the 16 rows of a product."""
+    """Loads the matrix [3, W] at `pointer`, padded with zeros to the 16 rows of a product."""
     row = tl.arange(0, 16)
     return tl.load(pointer + row[:, None] * WIDTH + tl.arange(0, WIDTH)[None, :], mask=(row < 3)[:, None], other=0.0)
 
@@ -67,16 +67,15 @@ def mlp_forward(
     SAVE: tl.constexpr, FINE: tl.constexpr, BLOCK: tl.constexpr, PRECISION: tl.constexpr, LOOP: tl.constexpr,
     OVERLAP: tl.constexpr,
 ):  # fmt: skip
-    """Computes y [R, OUT] of x [R, INPUT] as above: the encoder (paper step 0, with the products for steps 1 and 11),
-    messages to parents (3, 5, …) and from them (7, 9, …; GATHER), the decoder (12).
+    """Computes y [R, OUT] of x [R, INPUT] by the formula of the module.
 
-    With FINE the MLP's own products are finer than PRECISION, and read the unrounded weights.
-
-    FRACTION: the following products are a particle's part of its pairs: of the first, the product of its fraction [R,
-    3] with the offsets' weights [3, W] is subtracted; to the second it is added.
-
-    LOOP: a program takes one tile after the other, and reads its weights once. OVERLAP: it starts before the previous
-    launch has ended, and reads weights meanwhile.
+    This is the encoder (paper step 0, with the products for steps 1 and 11), the messages to parents (3, 5, …) and from
+    them (7, 9, …; GATHER), and the decoder (12). With FINE the MLP's own products are finer than PRECISION, and read
+    the unrounded weights.
+    FRACTION: the following products are a particle's part of its pairs. The product of its fraction [R, 3] with the
+    offsets' weights [3, W] is subtracted from the first one and added to the second one.
+    LOOP: a program takes many tiles in turn, and reads its weights once. OVERLAP: it starts before the previous launch
+    has ended, and reads weights meanwhile.
 
     Rule: hgn.network.mlp.MLP; reference and test: tests/kernels/references.py, test_kernels_alone.py.
     """
@@ -87,7 +86,7 @@ def mlp_forward(
     if FRACTION:
         offsets_0 = _three_rows(values + fraction_at_0, WIDTH)
         offsets_1 = _three_rows(values + fraction_at_1, WIDTH)
-    IN_PLACE: tl.constexpr = BLOCK > 16 and not LOOP  # where many vectors would not fit into registers
+    IN_PLACE: tl.constexpr = BLOCK > 16 and not LOOP  # for tiles whose vectors do not all fit into registers
     if LOOP:
         lines = vectors(values, bias_at, next_bias_at_0, next_bias_at_1, bias_at, bias_at, WIDTH)
         bias, next_bias_0, next_bias_1 = vector(lines, 0), vector(lines, 1), vector(lines, 2)
@@ -127,7 +126,7 @@ def mlp_forward(
             first = transposed(first_weights + first_at, WIDTH, INPUT)
         h = finer_product(x_tile, first, PRECISION) if FINE else product(x_tile, first, PRECISION)
         if GATHER:
-            # a parent past the capacity is none (-1): the pass is void, and reads nothing in its place
+            # A parent past the capacity is -1. The pass is then void, and the kernel reads nothing for the parent.
             where = tl.load(index + row, mask=row < count, other=-1)
             there = (where >= 0)[:, None]
             h += tl.load(gathered + where[:, None] * WIDTH + column[None, :], mask=there, other=0.0).to(tl.float32)
@@ -155,7 +154,7 @@ def mlp_forward(
             z += x_tile
         tl.store(y + row[:, None] * OUT + outs[None, :], z, mask=live)
         if LOOP:
-            # the next tile's, where there are registers for them
+            # This reads the next tile's rows early; a loop has registers for them.
             x_rows = _rows_of(x, tile + tl.num_programs(0), count, INPUT, BLOCK)
         if NEXT > 0:
             if not RESIDENT:
@@ -193,9 +192,10 @@ def mlp_backward(
 ):  # fmt: skip
     """Computes the gradients of all inputs of mlp_forward.
 
-    The gradient of y is `gradient` (row gradient_index_r if GATHER) plus from_0, from_1 times their products' weights
-    (NEXT). INTO: 0 no gradient of x, 1 write it, 2 add it. Gradients of norm and offset weights are added to `totals`,
-    divided by the loss scale (`unscale`); hidden_gradient and second_gradient are stored for the weights' gradients.
+    The gradient of y is `gradient` (row gradient_index_r if GATHER). With NEXT it is added to from_0 and from_1 times
+    the weights of their products. INTO: 0 no gradient of x, 1 write it, 2 add it. The gradients of norm and offset
+    weights are multiplied by `unscale` and added to `totals`. The kernel stores hidden_gradient and second_gradient,
+    from which other kernels compute the gradients of the weights.
 
     Rule: hgn.network.mlp.MLP; reference and test: tests/kernels/references.py, test_kernels_alone.py.
     """
@@ -225,7 +225,7 @@ def mlp_backward(
         z = product(a, transposed(weights + second_at, OUT, WIDTH), PRECISION)
         z += tl.load(values + second_bias_at + outs)[None, :]
         normalised, rstd = normalise(z, OUT)
-        summand = tl.arange(0, 16)[:, None]  # the least that the matrix units take
+        summand = tl.arange(0, 16)[:, None]  # 16 is the smallest size of the matrix units
         whole = tl.where((summand == 0) & live.trans(), 1.0, 0.0)
         at_norm_weight = totals + norm_weight_at + summand * OUT + outs[None, :]
         at_norm_bias = totals + norm_bias_at + summand * OUT + outs[None, :]
@@ -255,7 +255,7 @@ def mlp_backward(
 
 @triton.jit(do_not_specialize_on_alignment=["count_ptr"])
 def clear_rows(x, count_ptr, WIDTH: tl.constexpr, OVERLAP: tl.constexpr, BLOCK: tl.constexpr):
-    """Clears the rows of x [.., W] that are in use; capacities may be twice as large.
+    """Sets the rows of x [.., W] that are in use to zero. The capacity may be twice as large.
 
     Rule: hgn.network.mlp.MLP; reference and test: tests/kernels/references.py, test_kernels_alone.py.
     """
@@ -264,7 +264,7 @@ def clear_rows(x, count_ptr, WIDTH: tl.constexpr, OVERLAP: tl.constexpr, BLOCK: 
     zeros = tl.zeros((BLOCK, WIDTH), x.dtype.element_ty)
     tl.store(x + row[:, None] * WIDTH + tl.arange(0, WIDTH)[None, :], zeros, mask=(row < count)[:, None])
     if OVERLAP:
-        gdc_wait()  # nobody before it reads or writes these, but who comes next waits for all before
+        gdc_wait()  # earlier kernels do not use these rows, but the next kernel relies on the end of all earlier ones
 
 
 @triton.jit(do_not_specialize_on_alignment=["count_ptr"])
@@ -272,10 +272,10 @@ def gather_sums(
     x, table, count_ptr, y, capacity,
     SUM: tl.constexpr, EDGES: tl.constexpr, WIDTH: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Computes y = the sum of x's rows listed in the table [SUM, capacity] (-1: none), as gathered_sum.
+    """Computes y: each row is the sum of the rows of x that the table [SUM, capacity] lists (-1: none).
 
-    A kernel of its own where there are many rows: its programs are so small that many wait at the same time, while a
-    kernel with products has registers for two rows.
+    This kernel is for many rows. Its programs are small, so that many of them wait for memory at the same time. A
+    kernel with products has registers for only two rows.
 
     Rule: hgn.network.mlp.MLP; reference and test: tests/kernels/references.py, test_kernels_alone.py.
     """
@@ -295,8 +295,10 @@ def gather_project(
     SUM: tl.constexpr, WIDTH: tl.constexpr, BLOCK: tl.constexpr, PRECISION: tl.constexpr, LOOP: tl.constexpr,
     OVERLAP: tl.constexpr,
 ):  # fmt: skip
-    """Computes y = x, or with SUM > 0 the sum of x's rows listed in table [SUM, capacity] (-1: none); and two products
-    of y, the second with a bias. LOOP and OVERLAP as in mlp_forward.
+    """Computes y and two products of y, the second one with a bias.
+
+    y is x, or with SUM > 0 the sum of the rows of x that the table [SUM, capacity] lists (-1: none). LOOP and OVERLAP
+    mean the same as in mlp_forward.
 
     Rule: hgn.network.mlp.MLP; reference and test: tests/kernels/references.py, test_kernels_alone.py.
     """
@@ -329,7 +331,7 @@ def gather_project(
             second = transposed(weights + at_1, WIDTH, WIDTH)
         result = product(rows, second, PRECISION)
         if LOOP:
-            # the next tile's, where there are registers for them
+            # This reads the next tile's rows early; a loop has registers for them.
             rows = _rows_of(x, tile + tl.num_programs(0), count, WIDTH, BLOCK)
         tl.store(next_1 + at, result + inside(bias, tile)[None, :], mask=live)
         tile = next_tile(tile, not LOOP)
@@ -341,10 +343,10 @@ def gather_project_backward(
     SUM: tl.constexpr, EDGES: tl.constexpr, ADD: tl.constexpr, WIDTH: tl.constexpr, BLOCK: tl.constexpr,
     PRECISION: tl.constexpr,
 ):  # fmt: skip
-    """Computes summed = x, or the sum of x's rows listed in the table [SUM, capacity], and gradient (+)= summed W.
+    """Computes summed = x, or the sum of x's rows that the table [SUM, capacity] lists; and gradient (+)= summed W.
 
-    With EDGES, x is [capacity, SUM, W], of which the part of the opposite direction of the listed row is taken, and the
-    product of `other` [capacity, W] with its own weights is added to the gradient.
+    With EDGES, x is [capacity, SUM, W]. The sum then takes the part for the opposite direction of each listed row, and
+    the product of `other` [capacity, W] with its own weights is added to the gradient.
 
     Rule: hgn.network.mlp.MLP; reference and test: tests/kernels/references.py, test_kernels_alone.py.
     """

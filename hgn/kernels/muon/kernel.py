@@ -1,4 +1,4 @@
-"""Muon's momentum and steps on square blocks of the packed weights, see hgn.training.muon; a program a block."""
+"""Computes Muon's momentum and steps on square blocks of the packed weights, see hgn.training.muon."""
 
 from __future__ import annotations
 
@@ -14,9 +14,10 @@ def momentum_directions(
     starts, pitch, gradient, share, first_moment, direction, status, norm, momentum, epsilon,
     WIDTH: tl.constexpr,
 ):  # fmt: skip
-    """Momentum of square blocks (hgn.network.orthogonal), which begin at `starts`, their rows `pitch` apart;
-    Nesterov's, normalised, goes to direction [blocks, WIDTH, WIDTH]. A program a block; nothing where `adam` does
-    nothing.
+    """Updates the momentum of square blocks (hgn.network.orthogonal), and writes Nesterov's normalised momentum.
+
+    The blocks begin at `starts`, and their rows are `pitch` apart. The output is direction [blocks, WIDTH, WIDTH]. Each
+    block has a program. The kernel does nothing where `adam` does nothing.
 
     Rule: hgn.training.muon.Muon; test: tests/kernels/test_update.py.
     """
@@ -42,8 +43,7 @@ def step_blocks(
     starts, pitch, direction, value, weight, rates, update, status, norm, step_size,
     PRECISION: tl.constexpr, WIDTH: tl.constexpr,
 ):  # fmt: skip
-    """Moves square blocks against their directions by rate times `step_size`; values and weights are written as `adam`
-    does.
+    """Moves square blocks against their directions by rate times `step_size`. It writes values and weights as `adam`.
 
     Rule: hgn.training.muon.Muon; test: tests/kernels/test_update.py.
     """

@@ -1,4 +1,4 @@
-"""Muon's steps on the packed weights. Shape legend: K blocks, W width."""
+"""Launches Muon's steps on the packed weights. Shape legend: K blocks, W width."""
 
 from __future__ import annotations
 
@@ -12,13 +12,14 @@ WARPS = 8
 
 
 def direction_dtype(device: torch.device) -> torch.dtype:
-    """Returns the type of the directions. On a GPU products are in bfloat16, summed in float32: the directions are
-    orthogonal to a hundredth, like the iterations."""
+    """Returns the type of the directions, bfloat16 on a GPU. Products are summed in float32.
+
+    The directions are orthogonal only to a hundredth in any type, because the iterations are."""
     return torch.float32 if device.type == "cpu" else torch.bfloat16
 
 
 class SquareBlocks:
-    """The weights that Muon steps, in the packed layout: of each block the rows are pieces, equally far apart."""
+    """Holds the places of the weights that Muon steps in the packed layout. A block's rows are equally far apart."""
 
     def __init__(self, network: ParticleNetwork, index: torch.Tensor, device: torch.device) -> None:
         """`index` maps packed elements to the concatenated parameters, -1 for padding."""
@@ -33,7 +34,7 @@ class SquareBlocks:
         assert (packed_KWW == row_KW[:, :, None] + column_W).all()
         member = torch.zeros(len(index), dtype=torch.int8)
         member[packed_KWW.flatten()] = 1
-        self.member = member.to(device)  # of each element of the packed buffers: whether it is stepped here
+        self.member = member.to(device)  # whether each element of the packed buffers is stepped here
         self._direction_KWW = torch.zeros(block_KWW.shape, dtype=direction_dtype(device), device=device)
 
     def step(
@@ -49,9 +50,9 @@ class SquareBlocks:
         norm: torch.Tensor,
         precision: str,
     ) -> None:
-        """Moves the blocks of `values` and of their rounded copy `weights`, where hgn.kernels.update.kernel.adam moves
-        the rest; `share` times `gradient` goes into `momentum`.
-        """
+        """Moves the blocks of `values` and of the copy `weights`; hgn.kernels.update.kernel.adam moves the rest.
+
+        `share` times `gradient` is added to `momentum`."""
         count, width, _ = self._direction_KWW.shape
         momentum_directions[(count,)](
             starts=self.starts, pitch=self.pitch, gradient=gradient, share=share, first_moment=momentum,

@@ -1,7 +1,7 @@
-"""Particle-cell pairs (paper steps 1 and 11), forward and backward: pair MLP, norm, weight and sum in one launch.
+"""Computes particle-cell pairs (paper steps 1 and 11), forward and backward: MLP, norm, weight and sum in one launch.
 
-Row r of a tile is corner r % 8 of particle r // 8. Sums to cells are atomic additions, whose order, and with it the
-last bits, may differ from run to run. Shape legend: N particles, W width.
+Row r of a tile is corner r % 8 of particle r // 8. Atomic additions sum up the parts of a cell. Their order, and with
+it the last bits of the sums, may differ between runs. Shape legend: N particles, W width.
 """
 
 from __future__ import annotations
@@ -30,21 +30,21 @@ from hgn.kernels.triton_compat import gdc_launch_dependents, gdc_wait, settle_ke
 
 @triton.jit
 def _offset(fraction, particle, corner, live, axis: tl.constexpr):
-    """Returns cell centre minus particle, in cells."""
+    """Returns the centre of the cell minus the position of the particle on an axis, in cell edges."""
     bit = (corner >> (2 - axis)) & 1
     return bit.to(tl.float32) - tl.load(fraction + particle * 3 + axis, mask=live, other=0.0)
 
 
 @triton.jit
 def _cell_of(tile, count, cell_of, ROWS: tl.constexpr):
-    """Returns the cell of each row of a tile; the tile may not exist."""
+    """Returns the cell of each row of a tile, which may be past the last tile."""
     pair = tile * ROWS + tl.arange(0, ROWS)
     return tl.load(cell_of + pair, mask=(pair >= 0) & (pair < count * 8), other=0)
 
 
 @triton.jit
 def _cells_of(tile, count, cell_of, weight_of, ROWS: tl.constexpr):
-    """Returns cell and weight of each row of a tile."""
+    """Returns the cell and the weight of each row of a tile."""
     pair = tile * ROWS + tl.arange(0, ROWS)
     live = pair < count * 8
     return tl.load(cell_of + pair, mask=live, other=0), tl.load(weight_of + pair, mask=live, other=0.0)
@@ -52,7 +52,7 @@ def _cells_of(tile, count, cell_of, weight_of, ROWS: tl.constexpr):
 
 @triton.jit
 def _particles(by_particle, tile, count, PARTICLES: tl.constexpr, SUMS: tl.constexpr, WIDTH: tl.constexpr):
-    """Loads a tile's particles' rows [SUMS, W]."""
+    """Loads the rows [SUMS, W] of a tile's particles."""
     mine = tile * PARTICLES + tl.arange(0, SUMS)
     there = ((tl.arange(0, SUMS) < PARTICLES) & (mine < count))[:, None]
     return tl.load(by_particle + mine[:, None] * WIDTH + tl.arange(0, WIDTH)[None, :], mask=there, other=0.0)
@@ -60,8 +60,10 @@ def _particles(by_particle, tile, count, PARTICLES: tl.constexpr, SUMS: tl.const
 
 @triton.jit
 def _choice(PARTICLES: tl.constexpr, SUMS: tl.constexpr, SIGN: tl.constexpr):
-    """Returns [8 PARTICLES, SUMS]: a pair's particle, and in the spare places the bits of its corner, for the high and
-    the low parts of the offsets' weights (high_and_low)."""
+    """Returns the matrix [8 PARTICLES, SUMS] that chooses a pair's particle.
+
+    Spare columns hold the bits of the pair's corner, for the high and low parts of the offsets' weights (high_and_low).
+    """
     ROWS: tl.constexpr = PARTICLES * 8
     spare = tl.arange(0, SUMS) - PARTICLES
     bit = ((tl.arange(0, ROWS) % 8)[:, None] >> (2 - spare % 3)[None, :]) & 1
@@ -71,8 +73,9 @@ def _choice(PARTICLES: tl.constexpr, SUMS: tl.constexpr, SIGN: tl.constexpr):
 
 @triton.jit
 def _first_layer(choice, rows, of_cells, TO_CELL: tl.constexpr, PRECISION: tl.constexpr):
-    """Returns the first layer of a tile's pairs [ROWS, W] before its activation: of its particles' rows and the
-    offsets', and unless TO_CELL of its cells' [ROWS, W]."""
+    """Returns the first layer of a tile's pairs [ROWS, W] before its activation.
+
+    The summands are the particles' rows, the offsets' rows, and without TO_CELL the cells' rows [ROWS, W]."""
     if TO_CELL:
         h = product(choice, rows, PRECISION)
     else:
@@ -87,26 +90,26 @@ def particle_cell_forward(
     TO_CELL: tl.constexpr, SAVE: tl.constexpr, WIDTH: tl.constexpr, PARTICLES: tl.constexpr,
     PRECISION: tl.constexpr, OVERLAP: tl.constexpr,
 ):  # fmt: skip
-    """Computes paper step 1 (TO_CELL): out [C, W] += weight * MLP(by_particle_n + offset), or step 11: out [N, W] =
-    particle + sum over the corners of weight * MLP(by_cell_c + by_particle_n - offset). by_particle and by_cell are
-    products with first-layer weights; by_particle includes the particle's part of the offset, so that only the corner's
-    bits are left.
+    """Computes the pairs of paper step 1 (TO_CELL) or 11.
 
-    SAVE stores the inputs of particle_cell_backward: the normalised output [8 N, W], `rstd` [8 N], one over its
-    standard deviation, and the hidden layer unless BY_PRODUCT: then it is cheaper to compute again.
+    Step 1: out [C, W] += weight * MLP(by_particle_n + offset). Step 11: out [N, W] = particle + sum over the corners of
+    weight * MLP(by_cell_c + by_particle_n - offset). by_particle and by_cell are products with first-layer weights.
+    by_particle includes the particle's part of the offset, so that the pairs add only the bits of the corner.
+    SAVE stores the inputs of particle_cell_backward: the normalised output [8 N, W], `rstd` [8 N] (one over its
+    standard deviation), and the hidden layer. With BY_PRODUCT the backward pass computes the hidden layer again.
 
     Rule: hgn.network.hgn; reference and test: tests/kernels/references.py, test_kernels_alone.py.
     """
     ROWS: tl.constexpr = PARTICLES * 8
-    SUMS: tl.constexpr = 16  # the least that the matrix units take; room for PARTICLES sums and three more
+    SUMS: tl.constexpr = 16  # PARTICLES sums, three spare places, and padding for the matrix units
     count = tl.load(count_ptr)
     if tl.program_id(0) * PARTICLES >= count:
         return
     column = tl.arange(0, WIDTH)
-    # vectors once: in the loop each would be waited for again
+    # The vectors are loaded once. In the loop each load would be waited for again.
     second_bias = tl.load(values + second_bias_at + column)
     norm_weight, norm_bias = tl.load(values + norm_weight_at + column), tl.load(values + norm_bias_at + column)
-    # Where it is exact, a particle's row comes to its pairs by a product, with the bits' rows in its spare places.
+    # Where a product is exact, it copies a particle's row to its pairs. Its spare places hold the bits' rows.
     BY_PRODUCT: tl.constexpr = PRECISION != "tf32"
     SIGN: tl.constexpr = 1 if TO_CELL else -1
     if BY_PRODUCT:
@@ -121,7 +124,7 @@ def particle_cell_forward(
         gdc_wait()
         gdc_launch_dependents()
     tile = tl.program_id(0)
-    # read a tile ahead: they say where other things are, or are few
+    # These are loaded a tile ahead, because they are few or because other loads need them as addresses.
     cell, weight = _cells_of(tile, count, cell_of, weight_of, ROWS)
     if BY_PRODUCT:
         rows = _particles(by_particle, tile, count, PARTICLES, SUMS, WIDTH)
@@ -160,12 +163,12 @@ def particle_cell_forward(
         z = z * inside(norm_weight, tile)[None, :] + inside(norm_bias, tile)[None, :]
         if TO_CELL:
             z = z * weight[:, None]
-            # a weight of zero points at a cell that may be another's: it adds nothing
+            # A weight of zero comes with an index that may be another cell's. The pair then adds nothing.
             touched = (live & (weight != 0))[:, None]
             tl.atomic_add(out + cell[:, None] * WIDTH + column[None, :], z, mask=touched, sem="relaxed")
         else:
             if PRECISION == "tf32" and not SAVE:
-                # as a reduction: rounding the product's operands would cost more
+                # Here a reduction makes the sum: rounding the operands of a product would cost more.
                 mine = tile * PARTICLES + tl.arange(0, PARTICLES)
                 ends = (mine < count)[:, None]
                 summed = tl.sum(tl.reshape(z * weight[:, None], (PARTICLES, 8, WIDTH)), 1)
@@ -180,7 +183,7 @@ def particle_cell_forward(
 
 @triton.jit
 def _pairs_of(tile, count, cell_of, weight_of, fraction, ROWS: tl.constexpr):
-    """Returns for each row of a tile its cell, its weight, and its offset's three parts."""
+    """Returns the cell, the weight and the three parts of the offset of each row of a tile."""
     row = tl.arange(0, ROWS)
     owner = tile * (ROWS // 8) + row // 8
     corner = row % 8
@@ -199,16 +202,15 @@ def particle_cell_backward(
     by_cell_gradient, unscale,
     TO_CELL: tl.constexpr, WIDTH: tl.constexpr, PARTICLES: tl.constexpr, PRECISION: tl.constexpr,
 ):  # fmt: skip
-    """Computes the gradients of by_particle, and by atomics of by_cell, from that of `out` ([C, W] if TO_CELL, else [N,
-    W]).
+    """Computes the gradients of by_particle and by_cell from that of `out` ([C, W] if TO_CELL, else [N, W]).
 
-    second_gradient [8 N, W] is stored for the weights' gradients. A hidden layer that was not stored is computed again,
-    to the same bits.
+    Atomic additions sum up the gradients of by_cell. The kernel stores second_gradient [8 N, W] for the weight
+    gradients. It computes a hidden layer that was not stored again, to the same bits.
 
     Rule: hgn.network.hgn; reference and test: tests/kernels/references.py, test_kernels_alone.py.
     """
     ROWS: tl.constexpr = PARTICLES * 8
-    SUMS: tl.constexpr = 16  # the least that the matrix units take; room for PARTICLES sums and three more
+    SUMS: tl.constexpr = 16  # as in particle_cell_forward
     count = tl.load(count_ptr)
     if tl.program_id(0) * PARTICLES >= count:
         return
@@ -223,7 +225,7 @@ def particle_cell_backward(
         SIGN: tl.constexpr = 1 if TO_CELL else -1
         choice = _choice(PARTICLES, SUMS, SIGN)
     tile = tl.program_id(0)
-    # read a tile ahead: they say where other things are, and in a loop each thread keeps but one of them
+    # These are loaded a tile ahead: other loads need them as addresses, and in a loop each thread keeps only one.
     cell, weight, side_0, side_1, side_2 = _pairs_of(tile, count, cell_of, weight_of, fraction, ROWS)
     while tile * PARTICLES < count:
         row = tl.arange(0, ROWS)
@@ -232,7 +234,7 @@ def particle_cell_backward(
         live = owner < count
         here = live[:, None]
         pair_at = (owner * 8 + corner)[:, None] * WIDTH + column[None, :]
-        # all loads before the first use: the compiler keeps their order, and waits at the first
+        # All loads come before the first use: the compiler keeps their order, and waits at the first use.
         z = tl.load(normalised + pair_at, mask=here, other=0.0)
         if BY_PRODUCT:
             rows = _particles(by_particle, tile, count, PARTICLES, SUMS, WIDTH)
@@ -244,7 +246,7 @@ def particle_cell_backward(
         else:
             dy = tl.load(gradient + owner[:, None] * WIDTH + column[None, :], mask=here, other=0.0)
         dy, z = dy * weight[:, None], z.to(tl.float32)
-        if tile >= 0:  # always, and the compiler does not know: else it puts these sums off, and keeps what they are of
+        if tile >= 0:  # always true, unknown to the compiler; otherwise it delays these sums and keeps their operands
             norm_weight_total += column_sums(dy * z, ROWS, WIDTH, 8)
             norm_bias_total += column_sums(dy, ROWS, WIDTH, 8)
         dz = normalise_backward(dy, z, row_rstd, inside(norm_weight, tile), WIDTH)
@@ -262,7 +264,7 @@ def particle_cell_backward(
         if not TO_CELL:
             touched = (live & (weight != 0))[:, None]
             tl.atomic_add(by_cell_gradient + cell[:, None] * WIDTH + column[None, :], dh, mask=touched, sem="relaxed")
-        # the sums over a particle's pairs, and in the last rows those of the offsets' weights
+        # The last rows of these sums over a particle's pairs hold the sums of the offsets' weights.
         chosen = members(SUMS, ROWS, 8)
         chosen = tl.where((sums == SUMS - 3)[:, None], side_0[None, :], chosen)
         chosen = tl.where((sums == SUMS - 2)[:, None], side_1[None, :], chosen)
@@ -288,8 +290,7 @@ def _weight_tile(
     TO_CELL: tl.constexpr, WIDTH: tl.constexpr, PARTICLES: tl.constexpr, SUMS: tl.constexpr,
     PRECISION: tl.constexpr,
 ):  # fmt: skip
-    """Returns `total` and `lines` with a tile's part of the gradients added, and the cells of the program's next
-    tile."""
+    """Adds a tile's part of the gradients to `total` and `lines`. Returns both and the cells of the next tile."""
     ROWS: tl.constexpr = PARTICLES * 8
     column = tl.arange(0, WIDTH)
     pair = tile * ROWS + tl.arange(0, ROWS)
@@ -299,7 +300,7 @@ def _weight_tile(
     of_cells = rows
     if not TO_CELL:
         of_cells = tl.load(by_cell + cell[:, None] * WIDTH + column[None, :], mask=here, other=0.0)
-        # read a tile ahead: they say where other things are
+        # These are loaded a tile ahead, because other loads need them as addresses.
         cell = _cell_of(tile - tl.num_programs(0), count, cell_of, ROWS)
     a = leaky_operand(_first_layer(choice, rows.to(tl.float32) + offsets, of_cells, TO_CELL, PRECISION), PRECISION)
     lines += column_sums(dz.to(tl.float32), ROWS, WIDTH, 8)
@@ -313,11 +314,11 @@ def particle_cell_weight_gradient(
     TO_CELL: tl.constexpr, WIDTH: tl.constexpr, PARTICLES: tl.constexpr, PRECISION: tl.constexpr,
     PIPELINED: tl.constexpr,
 ):  # fmt: skip
-    """Computes the gradients of the second layer and its bias, like weight_gradient, where the hidden layer was not
-    stored: it is computed again, to the same bits, from an eighth of the bytes. The last tile is first, because the
-    last writes of particle_cell_backward are still in the L2 cache.
+    """Computes the gradients of the second layer and its bias, as weight_gradient does.
 
-    PIPELINED: in a counted loop, the compiler copies tiles to shared memory two ahead. The interpreter of Triton 3.6
+    This kernel is for a hidden layer that was not stored. It computes the layer again to the same bits, and reads an
+    eighth of the bytes. It begins with the last tile, whose data from particle_cell_backward are still in the L2 cache.
+    PIPELINED: in a counted loop the compiler copies tiles to shared memory two ahead. The interpreter of Triton 3.6
     cannot count to a loaded number.
 
     Rule: hgn.network.hgn; reference and test: tests/kernels/references.py, test_kernels_alone.py.

@@ -1,9 +1,9 @@
-"""The part of a frame after the network's output, on the device: rest, integration, walls and obstacles.
+"""Computes the part of a frame after the network's output: rest, integration, walls and obstacles.
 
-The rules are those of hgn.step.reference. A frame is integrated only if nothing went wrong before it.
-Row of the barrier table of a scene, int64: addresses of the hash buckets of its cells (0: no obstacle), of their keys
-and of the ranges of their lists, the mask of the buckets, addresses of the lists and of the triangles' rows, and the
-bits of the cells' size in float32.
+The rules are those of hgn.step.reference. A frame is integrated only if no earlier frame reported an error.
+The barrier table has a row of int64 numbers for each scene. The row holds, in this order: the address of the hash
+buckets of the cells (0: no obstacle), of their keys, and of the ranges of their lists; the mask of the buckets; the
+addresses of the lists and of the rows of the triangles; and the bits of the cell size in float32.
 Shape legend: N particles, K middles of coarsest or larger cells, T frames between two synchronisations with the host.
 """
 
@@ -20,25 +20,27 @@ from hgn.kernels.triton_compat import gdc_launch_dependents, gdc_wait, settle_ke
 from hgn.scene import barrier
 from hgn.step.reference import LEAST, SURE
 
-RATES = tl.constexpr(8)  # columns of what rest sums up and spreads
+RATES = tl.constexpr(8)  # number of columns of the sums and of the table of rest
 SURELY, TINY = tl.constexpr(SURE), tl.constexpr(LEAST)
 ROW = tl.constexpr(barrier.ROW)
-ONE = tl.constexpr(0x3F800000)  # its bits in float32
+ONE = tl.constexpr(0x3F800000)  # bits of 1.0 in float32
 NO_TRIANGLE = tl.constexpr(0x7FFFFFFF)
 DIVERGED = tl.constexpr(4)
 
 
 @triton.jit
 def _lowest(base_of, gate_of, spot_of, row, live):
-    """Returns the slots of the lowest middles around particles, their gates, and their places from there, in edges."""
+    """Returns the slots of the lowest middles around particles, their gates, and the places relative to them in
+    edges."""
     spot = three_columns(spot_of, row, 0, live, 1.0, 3)
     return tl.load(base_of + row, mask=live, other=0), tl.load(gate_of + row, mask=live, other=0.0), spot
 
 
 @triton.jit
 def _add_bodies(sums, slot, place, weight, value, BODIES: tl.constexpr, COLUMNS: tl.constexpr):
-    """Adds values of particles and their moments to the sums of middles [K, COLUMNS]; with BODIES after mass, places
-    and their products xx, yy, zz, yz, xz, xy."""
+    """Adds values of particles and their moments to the sums of middles [K, COLUMNS].
+
+    With BODIES it adds after the mass also the places and their products xx, yy, zz, yz, xz, xy."""
     at: tl.constexpr = 10 * BODIES
     moment = cross(place, (value[0][:, None], value[1][:, None], value[2][:, None]))
     column = tl.arange(0, COLUMNS)[None, None, :]
@@ -53,14 +55,14 @@ def _add_bodies(sums, slot, place, weight, value, BODIES: tl.constexpr, COLUMNS:
     for i in tl.static_range(3):
         added = tl.where(column == at + i, (weight * value[i][:, None])[:, :, None], added)
         added = tl.where(column == at + 3 + i, (weight * moment[i])[:, :, None], added)
-    # columns of zeros are added too, four at once
+    # The last columns add zeros, because the hardware adds four columns at once.
     there = (weight > 0)[:, :, None] & (column < COLUMNS)
     tl.atomic_add(sums + slot[:, :, None] * COLUMNS + column, added, mask=there, sem="relaxed")
 
 
 @triton.jit
 def _deforming(table, slot, place, weight, value):
-    """Returns the part of particles' values that deforms the bodies around them, by the middles' table [K, RATES]."""
+    """Returns the part of the particles' values that deforms the bodies around them, by the table [K, RATES]."""
     there = weight > 0
     base = three_columns(table, slot, 0, there, weight, RATES)
     swing = cross(three_columns(table, slot, 4, there, weight, RATES), place)
@@ -74,7 +76,7 @@ def _deforming(table, slot, place, weight, value):
 
 @triton.jit
 def _displaced(x, velocity, scale, row, live, OUT: tl.constexpr, HISTORY: tl.constexpr):
-    """Returns the next displacements in units of `scale`: columns 0 to 2 of x [N, OUT] plus the newest velocities."""
+    """Returns the next displacements in units of `scale`: columns 0 to 2 of x [N, OUT] plus the newest velocity."""
     ax, ay, az = three_columns(x, row, 0, live, 1.0, OUT)
     vx, vy, vz = three_columns(velocity, row, 0, live, 1 / tl.load(scale), 3 * HISTORY)
     return ax + vx, ay + vy, az + vz
@@ -87,10 +89,11 @@ def sum_displacements(
     OUT: tl.constexpr, HISTORY: tl.constexpr, LEVELS: tl.constexpr, SHIFT: tl.constexpr, RESTING: tl.constexpr,
     COLUMNS: tl.constexpr, OVERLAP: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Adds the particles' bodies and next displacements, with their moments, to the sums [K, COLUMNS] of the middles
-    around them, between cells 2^SHIFT times as large as coarsest ones. Writes the lowest of these slots to `base_of`
-    [N], the place from there to `spot_of` [N, 3], and the gate to `gate_of` [N]: 0 for materials whose bit is not in
-    RESTING; -1 has all bits.
+    """Adds the particles' bodies, next displacements and their moments to the sums [K, COLUMNS] of the middles around.
+
+    The middles lie between cells 2^SHIFT times as large as the coarsest ones. Writes the slot of the lowest middle to
+    `base_of` [N], the place relative to it to `spot_of` [N, 3], and the gate to `gate_of` [N]. The gate is 0 for
+    materials whose bit is not in RESTING; -1 has all bits.
 
     Rule: hgn.step.reference.Deformation; test: tests/kernels/test_relative.py.
     """
@@ -127,9 +130,10 @@ def find_deformation(
     bodies, sums, table, count,
     AT: tl.constexpr, COLUMNS: tl.constexpr, BODIES: tl.constexpr, OVERLAP: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """From a field's sums [K, COLUMNS] at the middles of cells, from column AT on, and `bodies` [K, BODIES] to
-    their table [K, RATES]: the subtracted motion (columns 0 to 2), the factor of a particle's own (3), and the
-    subtracted rate of rotation (4 to 6).
+    """Computes the table [K, RATES] of the middles from the sums [K, COLUMNS] of a field and `bodies` [K, BODIES].
+
+    The field begins at column AT. The table holds the subtracted motion (columns 0 to 2), the factor of a particle's
+    own motion (3), and the subtracted rate of rotation (4 to 6).
 
     Rule: hgn.step.reference.Deformation; test: tests/kernels/test_relative.py.
     """
@@ -161,8 +165,9 @@ def slow_displacements(
     particle_count,
     OUT: tl.constexpr, HISTORY: tl.constexpr, LEVELS: tl.constexpr, OVERLAP: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Writes the slow part of the deformation by the middles' table to `slow` [N, 3], and adds it with its moments to
-    the sums [K, RATES].
+    """Writes the slow part of the deformation to `slow` [N, 3], and adds it with its moments to the sums [K, RATES].
+
+    The table of the middles gives the deformation.
 
     Rule: hgn.step.reference.rest; test: tests/kernels/test_relative.py.
     """
@@ -192,7 +197,7 @@ def stop_slow(
     x, slow, table, base_of, gate_of, spot_of, geometry, particle_count,
     OUT: tl.constexpr, LEVELS: tl.constexpr, OVERLAP: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Subtracts the part of `slow` [N, 3] that deforms, by the middles' table, from columns 0 to 2 of x [N, OUT].
+    """Subtracts the part of `slow` [N, 3] that deforms, by the table of the middles, from columns 0 to 2 of x [N, OUT].
 
     Rule: hgn.step.reference.Deformation; test: tests/kernels/test_relative.py.
     """
@@ -215,7 +220,7 @@ def stop_slow(
 
 @triton.jit
 def _wall_limit(x, before, size, near, far):
-    """Returns whether a wall stops the path from `before` to x on an axis, and the coordinate where it ends."""
+    """Returns whether a wall stops the path from `before` to x on an axis, and the coordinate of the path's end."""
     low, high = tl.where(before < near, before, near), tl.where(before > size - far, before, size - far)
     inside = (x > -size) & (x < 2 * size)  # NaN is outside
     return inside & ((x < low) | (x > high)), tl.where(x < low, low, high)
@@ -231,7 +236,7 @@ def _between_walls(x, before, size, near, far, WALLED: tl.constexpr):
 
 @triton.jit
 def _distance(row, x, y, z, live):
-    """Returns the distance from the plane at `row`, above 0 in front of it."""
+    """Returns the signed distance from the plane at `row`, positive in front of it."""
     across = tl.load(row, mask=live, other=0.0) * x + tl.load(row + 1, mask=live, other=0.0) * y
     across += tl.load(row + 2, mask=live, other=0.0) * z
     return across - tl.load(row + 3, mask=live, other=0.0)
@@ -250,8 +255,10 @@ def _covers(row, x, y, z, live):
 
 @triton.jit
 def _first_stop(bx, by, bz, x, y, z, line, live, within, slack):
-    """Returns which paths from (bx, by, bz) to (x, y, z) a triangle stops, the shifts of their ends along unit normals,
-    and the fraction of each path before the first triangle: hgn.step.reference.first_stop."""
+    """Returns which paths from (bx, by, bz) to (x, y, z) a triangle stops.
+
+    Returns also the shifts of their ends along unit normals, and the fraction of each path before the first triangle.
+    The rule is hgn.step.reference.first_stop."""
     bits = tl.load(line + 6, mask=live, other=ONE)
     cell_size = bits.to(tl.int32).to(tl.float32, bitcast=True)
     span = tl.load(line + 2, mask=live, other=0).to(tl.pointer_type(tl.int32))
@@ -264,7 +271,7 @@ def _first_stop(bx, by, bz, x, y, z, line, live, within, slack):
     first = tl.zeros_like(x).to(tl.int32) + NO_TRIANGLE
     shift, sx, sy, sz = tl.zeros_like(x), tl.zeros_like(x), tl.zeros_like(x), tl.zeros_like(x)
     while tl.max(live.to(tl.int32)) > 0:
-        share = tl.div_rn(piece + 0.5, pieces)  # at the piece's middle
+        share = tl.div_rn(piece + 0.5, pieces)  # the fraction of the path at the middle of the piece
         cx = tl.floor(tl.div_rn(bx + share * wx, cell_size))
         cy = tl.floor(tl.div_rn(by + share * wy, cell_size))
         cz = tl.floor(tl.div_rn(bz + share * wz, cell_size))
@@ -309,26 +316,26 @@ def _stopped_by_obstacles(
     bx, by, bz, x, y, z, width, height, depth, line, live, within, slack, least_crease, near, far,
     SURFACES: tl.constexpr, WALLED: tl.constexpr,
 ):  # fmt: skip
-    """Returns the ends of paths from (bx, by, bz) to (x, y, z) between the walls of domains of this width, height and
-    depth, outside obstacles. Up to SURFACES triangles stop a path one after the other, and with WALLED the walls after
-    each; where a further one would, the path ends at the triangle that it meets first. `line` is the scenes' row of
-    the barrier table; all are vectors of particles. Particles out of range are not constrained.
+    """Returns the ends of paths from (bx, by, bz) to (x, y, z) between the walls and outside obstacles.
 
-    Triangles stop particles that come within `within` of them, and move them away by `slack`. Planes whose squared sine
-    is at most `least_crease` count as one.
+    The domains have this width, height and depth. Up to SURFACES triangles stop a path one after the other. With
+    WALLED the walls apply after each triangle. Where one more triangle would stop the path, it ends at its first one.
+    `line` is the scenes' row of the barrier table. All arguments are vectors of particles. Particles out of range are
+    not constrained. Triangles stop particles within the distance `within`, and move them away by `slack`. Planes whose
+    squared sine is at most `least_crease` count as one.
     """
     live = live & (x > -width) & (x < 2 * width) & (y > -height) & (y < 2 * height)
-    live = live & (z > -depth) & (z < 2 * depth)  # NaN is not
+    live = live & (z > -depth) & (z < 2 * depth)  # NaN fails these comparisons
     live = live & (tl.load(line, mask=live, other=0) != 0)
     bx, by, bz = tl.where(live, bx, 0.0), tl.where(live, by, 0.0), tl.where(live, bz, 0.0)
     ex, ey, ez = tl.where(live, x, 0.0), tl.where(live, y, 0.0), tl.where(live, z, 0.0)
     ask, surface = live, tl.zeros_like(ex)
-    lx, ly, lz = tl.zeros_like(ex), tl.zeros_like(ex), tl.zeros_like(ex)  # the normals of the shifts before
+    lx, ly, lz = tl.zeros_like(ex), tl.zeros_like(ex), tl.zeros_like(ex)  # normals of the earlier shifts
     while tl.max(ask.to(tl.int32)) > 0:
         hit, shift, nx, ny, nz, free = _first_stop(bx, by, bz, ex, ey, ez, line, ask, within, slack)
         ask = ask & hit
         cosine = nx * lx + ny * ly + nz * lz
-        ax, ay, az = nx - cosine * lx, ny - cosine * ly, nz - cosine * lz  # along the last planes
+        ax, ay, az = nx - cosine * lx, ny - cosine * ly, nz - cosine * lz  # along the planes of the earlier shifts
         square = ax * ax + ay * ay + az * az
         crease = (cosine < 0) & (square > least_crease)
         farther = tl.div_rn(shift, tl.maximum(square, least_crease))
@@ -352,13 +359,12 @@ def integrate(
     COLUMNS: tl.constexpr, WALLED_AXES: tl.constexpr, SURFACES: tl.constexpr, OVERLAP: tl.constexpr,
     BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Computes v += a, x += v, where a is gravity and the restored output, and writes the new positions into path
-    [T, N, 3] at `frame`.
+    """Computes v += a, x += v, and writes the new positions into path [T, N, 3] at `frame`.
 
-    If the status is not zero, nothing changes. Particles that are not finite or farther from the domain than its own
-    size are counted in `lost`, once an axis; `advance` then ends the simulation. All others stay between the walls of
-    the first WALLED_AXES axes, `near` and `far` from the planes, and, with SURFACES, outside the obstacles of
-    `barrier_table`, see `_stopped_by_obstacles`.
+    The acceleration a is gravity plus the restored output. If the status is not zero, nothing changes. `lost` counts
+    particles, once an axis, that are not finite or farther from the domain than its own size. `advance` then ends the
+    simulation. All others stay between the walls of the first WALLED_AXES axes, `near` and `far` from the planes. With
+    SURFACES they also stay outside the obstacles of `barrier_table`, see `_stopped_by_obstacles`.
 
     Rule: hgn.step.reference.advanced; test: tests/kernels/test_rollout.py, tests/kernels/test_barriers.py.
     """
@@ -371,7 +377,7 @@ def integrate(
     if tl.load(status) != 0:
         return
     row = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    column = tl.arange(0, COLUMNS)[None, :]  # of the velocities, newest first: a particle's lie side by side
+    column = tl.arange(0, COLUMNS)[None, :]  # velocities, newest first; those of a particle lie side by side
     axis, newest = column % 3, column < 3
     live = (row < count)[:, None] & (column < 3 * HISTORY)
     live_axis = live & newest
@@ -386,7 +392,7 @@ def integrate(
     before = tl.load(position + entry, mask=live_axis, other=0.0)
     x = before + v
     size = tl.load(domain + scene[:, None] * 3 + axis, mask=live_axis, other=1.0)
-    inside = (x > -size) & (x < 2 * size)  # NaN is outside
+    inside = (x > -size) & (x < 2 * size)  # NaN counts as outside
     if WALLED_AXES > 0:
         stopped, limit = _wall_limit(x, before, size, near, far)
         stopped = stopped & live_axis & (axis < WALLED_AXES)
@@ -395,7 +401,7 @@ def integrate(
     if SURFACES > 0:
         bx, by, bz = three_columns(position, row, 0, row < count, 1.0, 3)
     now = tl.load(frame).to(tl.int64)
-    tl.debug_barrier()  # all have read before one writes
+    tl.debug_barrier()  # all threads have read the frame before one writes
     tl.store(at, v, mask=live)
     tl.store(position + entry, x, mask=live_axis)
     tl.store(path + now * count * 3 + entry, x, mask=live_axis)
@@ -403,7 +409,7 @@ def integrate(
     if outside > 0:
         tl.atomic_add(lost, outside)
     if SURFACES > 0:
-        tl.debug_barrier()  # what other threads wrote is read: as columns of the above, each number would be in 16
+        tl.debug_barrier()  # reads back other threads' stores: as columns, 16 threads would hold each number
         x, y, z = three_columns(position, row, 0, row < count, 1.0, 3)
         width, height, depth = three_columns(domain, scene, 0, row < count, 1.0, 3)
         line = barrier_table + scene * BARRIER_COLUMNS
@@ -421,7 +427,7 @@ def integrate(
 
 @triton.jit
 def advance(status, lost, frame, OVERLAP: tl.constexpr):
-    """Counts the frame, if it was integrated.
+    """Increments the frame if it was integrated.
 
     Rule: hgn.runtime.torch_stepper; test: tests/kernels/test_rollout.py.
     """

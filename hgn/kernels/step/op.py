@@ -1,4 +1,4 @@
-"""The frame behind the network's output on the device: buffers and launches of the kernels.
+"""Holds the buffers and makes the launches of the part of a frame that follows the network's output.
 
 Shape legend: N particles, S scenes, K middles of cells.
 """
@@ -24,15 +24,15 @@ from hgn.step_config import StepConfig
 RATES = kernel.RATES.value
 DIVERGED = kernel.DIVERGED.value
 REST_SUMS = (SUMS, RATES)  # columns of the sums of a `RestLevel`
-INTEGRATE_BLOCK = 64  # particles
+INTEGRATE_BLOCK = 64  # particles of a program
 
 
 @dataclass(frozen=True, eq=False)
 class RestLevel:
-    """Rest between cells of one size: sums of bodies and displacements, and of slow ones, [K, columns]; the table of
-    subtracted motions; of each particle the lowest of its middles, the place from there, the gate and the slow part of
-    its deformation.
-    """
+    """Holds the buffers of rest between cells of one size.
+
+    The sums [K, columns] are those of bodies and displacements, and those of slow ones. The table has the subtracted
+    motions. Each particle has the lowest of its middles, the place from it, the gate and its slow deformation."""
 
     bodies: torch.Tensor
     sums: torch.Tensor
@@ -44,7 +44,7 @@ class RestLevel:
 
     @staticmethod
     def of(grid: DeviceGrid, cleared: Sequence[torch.Tensor]) -> RestLevel:
-        """With sums that the grid clears when it is built."""
+        """Returns a level whose sums the grid clears when it is built."""
         particles, device = grid.particles, grid.feature_NF.device
         bodies, sums = (part.view(torch.float32) for part in cleared)
         spot_N3, slow_N3 = (torch.zeros(particles, 3, device=device) for _ in range(2))
@@ -54,7 +54,7 @@ class RestLevel:
 
 
 def rest_numbers(step: StepConfig, window: Window, scenes: int, levels: int) -> tuple[int, ...]:
-    """Returns the sizes of the sums that rest needs cleared: with rest, one slot a coarsest cell for each size."""
+    """Returns the sizes of the sums of rest, which the grid clears. Each cell size has one slot a coarsest cell."""
     middles = scenes * math.prod((n >> levels - 1) + 2 for n in window.cells)
     return tuple(columns * middles for columns in REST_SUMS * REST_SIZES * step.rests)
 
@@ -63,17 +63,17 @@ class DeviceStep:
     """Launches the part of a frame that follows the network's output."""
 
     def __init__(self, step: StepConfig, grid: DeviceGrid, barriers: SceneTable | None) -> None:
-        """`barriers` are given with `step.obstacle_clearance`."""
+        """Takes `barriers` if `step.obstacle_clearance` is set."""
         self.step, self.config, self.grid, self.barriers = step, grid.config, grid, barriers
         each = len(REST_SUMS)
         parts = [grid.more_cleared[each * level :][:each] for level in range(REST_SIZES * step.rests)]
         self._levels = [RestLevel.of(grid, cleared) for cleared in parts]
         widely = rests_widely(grid.config.materials)
-        # bits of the materials that rest between larger cells; -1: all do
+        # These are bits of the materials that rest between larger cells; -1 has all bits.
         self._widely = -1 if all(widely) else sum(rests << material for material, rests in enumerate(widely))
 
     def rest(self, output: torch.Tensor, particles: DeviceParticles, std_3: torch.Tensor) -> None:
-        """Takes slow deformations out of columns 0 to 2 of the network's output [N, OUT], in place."""
+        """Subtracts slow deformations from columns 0 to 2 of the network's output [N, OUT]."""
         grid, overlap, blocks = self.grid, overlaps(), (triton.cdiv(self.grid.particles, PARTICLE_BLOCK),)
         sizes: dict[str, Any] = {"OVERLAP": overlap, "BLOCK": PARTICLE_BLOCK, "launch_pdl": overlap}
         moving = {"velocity": particles.velocity_NV, "scale": std_3, "HISTORY": self.config.velocity_history}
@@ -106,8 +106,9 @@ class DeviceStep:
         frame: torch.Tensor,
         path_TN3: torch.Tensor,
     ) -> None:
-        """Moves the particles by a rested output between walls and outside obstacles; `normaliser` is mean and standard
-        deviation of accelerations. Counts the frame."""
+        """Moves the particles by a rested output between walls and outside obstacles, and counts the frame.
+
+        `normaliser` is the mean and standard deviation of accelerations."""
         step, config, status, overlap = self.step, self.config, self.grid.status, overlaps()
         near, far = step.wall_clearance or (0.0, 0.0)
         clearance = step.obstacle_clearance or 0.0

@@ -1,8 +1,9 @@
-"""The parts of a training step around the network, on the device: batch, loss, Adam, counters.
+"""Computes the parts of a training step around the network on the device: batch, loss, Adam and counters.
 
-Row of the sample table, int64, one for each scene of each update: address of the window's first frame of positions,
-particles, first row in the batch, seed, address of the materials (int32), weight of the loss, scale of the noise (the
-bits of a float64 each), and the scene's row of the obstacle table, whose last column is the symmetry of the sample.
+The sample table has a row of int64 numbers for each scene of each update. A row holds: the address of the window's
+first frame of positions, number of particles, first row in the batch, seed, address of the materials (int32), weight of
+the loss, scale of the noise (each as the bits of a float64), and the scene's row of the obstacle table. The last column
+of that row is the symmetry of the sample.
 Shape legend: N particles of all scenes, S scenes, H velocity history.
 """
 
@@ -16,10 +17,10 @@ from hgn.kernels.obstacles import CODE_BITS, CODE_MASK, OBSTACLE_COLUMNS
 from hgn.kernels.triton_compat import settle_keys
 
 SAMPLE_COLUMNS = tl.constexpr(12)
-JITTER_OFFSET = tl.constexpr(0x7FFFFFF0)  # in the seed's stream, far from the noise
-WAVES_OFFSET = tl.constexpr(0x7FFFF000)  # of the smooth noise
-REPEAT = tl.constexpr(8)  # another rank must repeat the update
-AGAIN = tl.constexpr(11)  # overflow, out of the window, or REPEAT: the same update again, with more room
+JITTER_OFFSET = tl.constexpr(0x7FFFFFF0)  # offset of the jitter in the seed's stream, far from the noise
+WAVES_OFFSET = tl.constexpr(0x7FFFF000)  # offset of the smooth noise in the seed's stream
+REPEAT = tl.constexpr(8)  # status bit: another rank must repeat the update
+AGAIN = tl.constexpr(11)  # overflow, out of the window, or REPEAT: the same update runs again with larger buffers
 BETA_1 = tl.constexpr(0.9)  # torch.optim.Adam's defaults
 BETA_2 = tl.constexpr(0.999)
 EPSILON = tl.constexpr(1e-8)
@@ -30,10 +31,10 @@ def draw_waves(
     samples, update, waves, amplitude_step, largest_number, log_range, scenes,
     HISTORY: tl.constexpr, WAVES: tl.constexpr,
 ):  # fmt: skip
-    """Draws the plane waves of a scene's smooth velocity noise from its sample's seed; a program for each scene.
+    """Draws the plane waves of a scene's smooth velocity noise from the seed of its sample. Each scene has a program.
 
-    waves [S, WAVES, 4 + 3 HISTORY]: wave vector (direction uniform, length log-uniform), phase, and the change of the
-    amplitude with each velocity, the oldest first.
+    waves [S, WAVES, 4 + 3 HISTORY] hold the wave vector (uniform direction, log-uniform length), the phase, and the
+    change of the amplitude at each velocity, oldest first.
 
     Rule: hgn.training.noise; test: tests/kernels/test_update.py.
     """
@@ -65,13 +66,13 @@ def assemble_batch(
     DIMENSIONS: tl.constexpr, SCENES: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Writes windows with noise in the inputs (paper sec. 3.3): a random walk of velocity noise that positions follow.
-    With NOISE each particle has its own; with WAVES a part comes from the waves of its scene, see draw_waves.
 
-    The target is v_true^{n+1} - v_noisy^n less gravity, normalised. sample_vectors [updates, S, 2, 3] are the domain's
+    With NOISE each particle has its own noise. With WAVES a part of it comes from its scene's waves, see draw_waves.
+    The target is v_true^{n+1} - v_noisy^n minus gravity, normalised. sample_vectors [updates, S, 2, 3] are the domain's
     size and gravity under the sample's symmetry; gravity is zero with absolute inputs. Grid origins are uniform in
-    [-jitter, 0]. Noise and jitter are Philox numbers of the sample's seed, and depend on nothing else. With SYMMETRY
-    the window is the image of the stored one; velocities come from stored positions, because mirrored ones are rounded.
-    SCENES: a power of two, at least `scenes`. Axes from DIMENSIONS on have neither noise nor jitter.
+    [-jitter, 0]. Noise and jitter are Philox numbers that depend only on the sample's seed. With SYMMETRY the window is
+    the image of the stored one. Velocities come from stored positions, because mirrored positions are rounded.
+    SCENES is a power of two, at least `scenes`. Axes from DIMENSIONS on have neither noise nor jitter.
 
     Rule: hgn.training.noise; test: tests/kernels/test_update.py.
     """
@@ -82,7 +83,7 @@ def assemble_batch(
     scene = tl.arange(0, SCENES)
     there = scene < scenes
     if tl.program_id(0) == 0:
-        # all scenes side by side: one after the other, each waits for its reads
+        # One vector holds all scenes. A loop over scenes would wait for the reads of each.
         tl.store(particle_count, count)
         seed = tl.load(table + scene * SAMPLE_COLUMNS + 3, mask=there, other=0)
         for axis in tl.static_range(3):
@@ -100,7 +101,7 @@ def assemble_batch(
         return
     row = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     live = row < count
-    # how many scenes begin at or before the row, less the first
+    # This counts the scenes that begin at or before the row, without the first scene.
     begins = tl.load(table + scene * SAMPLE_COLUMNS + 2, mask=there & (scene > 0), other=1 << 40)
     scene_row = tl.sum((row[:, None] >= begins[None, :]).to(tl.int32), 1)
     line = table + scene_row * SAMPLE_COLUMNS
@@ -149,7 +150,7 @@ def assemble_batch(
                 step = tl.where(mirrored, -step, step)
             v = step + walk
             before = now
-            # newest first
+            # Column 0 is the newest velocity.
             tl.store(velocity + row * (3 * HISTORY) + 3 * (HISTORY - 1 - k) + axis, v, mask=live)
         step = tl.load(column + (HISTORY + 1) * frame, mask=live, other=0.0) - before
         if SYMMETRY:
@@ -166,8 +167,9 @@ def assemble_batch(
 def loss_gradient(
     output, target, share_of, particle_count, gradient, loss, scale, OUT: tl.constexpr, BLOCK: tl.constexpr
 ):
-    """Adds up the mean squared error of the normalised acceleration over axes, particles and scenes; writes its
-    gradient times `scale`.
+    """Computes the mean squared error of the normalised acceleration over axes, particles and scenes.
+
+    Writes also its gradient times `scale`.
 
     Rule: torch's autograd; test: tests/kernels/test_update.py.
     """
@@ -187,7 +189,7 @@ def loss_gradient(
 
 @triton.jit
 def tell_overflow(status, flag):
-    """Writes to the element after the gradient whether this rank must repeat the update: it is sent with the gradient.
+    """Writes behind the gradient whether this rank must repeat the update. The ranks exchange it with the gradient.
 
     Test: tests/kernels/test_ranks.py.
     """
@@ -196,7 +198,7 @@ def tell_overflow(status, flag):
 
 @triton.jit
 def square_norm(gradient, size, share, flag, status, norm, BLOCK: tl.constexpr):
-    """Adds the squares of `gradient` times `share` to norm[0]; not finite if one of them is not.
+    """Adds the squares of `gradient` times `share` to norm[0], which is not finite if one of them is not.
 
     Test: tests/kernels/test_ranks.py.
     """
@@ -215,8 +217,8 @@ def adam(
 ):  # fmt: skip
     """Makes a step of Adam (Kingma & Ba 2015) on flat buffers, if the status is zero and the gradient finite.
 
-    rates [updates]; step, float64 [1], counts the steps. `weight` is the copy for products at this precision. `others`,
-    int8 [size] or None, marks the elements that another optimiser steps.
+    rates [updates] are the learning rates. step, float64 [1], counts the steps. `weight` is the copy for products at
+    this precision. `others`, int8 [size] or None, marks the elements that another optimiser updates.
 
     Rule: torch.optim.Adam; test: tests/kernels/test_update.py.
     """
@@ -250,9 +252,9 @@ def adam(
 
 @triton.jit
 def average_values(value, average, shares, update, status, size, BLOCK: tl.constexpr):
-    """Updates the moving average of the values, with the weights shares [updates] of the new ones.
+    """Updates the moving average of the values. shares [updates] are the weights of the new values.
 
-    Does nothing for an update that is repeated; after a skipped one the values are the old ones.
+    An update that is repeated does nothing here. After a skipped update the new values equal the old ones.
 
     Rule: hgn.training.torch_updates.TorchUpdates; test: tests/kernels/test_training.py.
     """
@@ -269,8 +271,8 @@ def average_values(value, average, shares, update, status, size, BLOCK: tl.const
 def finish_update(status, update, step, loss, norm, loss_sum, counters):
     """Counts the update, unless it is repeated with larger buffers.
 
-    loss_sum: sum and number of finite losses. counters: sum and number of finite norms, skipped updates, skipped in a
-    row, most in a row.
+    loss_sum is the sum and the number of finite losses. counters are the sum and the number of finite norms, the
+    number of skipped updates, the number skipped in a row up to now, and the largest such number.
 
     Test: tests/kernels/test_update.py.
     """

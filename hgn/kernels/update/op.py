@@ -1,7 +1,7 @@
-"""Training updates on the device: batch, grid, forward, backward and Adam, in one CUDA graph for an update.
+"""Makes training updates on the device: batch, grid, forward pass, backward pass and optimiser in one CUDA graph.
 
-Nothing waits for the host: it uploads a table of the samples of many updates, replays the graph as often, and looks
-afterwards. An update whose grid lacked room changes nothing; the host makes room and repeats it.
+The host uploads a table with the samples of many updates and replays the graph once for each update. It reads the
+results only after the last replay. An update whose grid lacks room changes nothing; the host makes room and repeats it.
 Shape legend: K updates, S scenes, N particles of all scenes.
 """
 
@@ -32,26 +32,26 @@ from hgn.schema import ConfigError
 
 SAMPLE_COLUMNS = kernel.SAMPLE_COLUMNS.value
 GROWTH = 1.25
-TABLE_UPDATES = 64  # least capacity of the tables: when they grow, the graph is captured again
+TABLE_UPDATES = 64  # least capacity of the tables in updates; a larger table needs a new capture of the graph
 BLOCK = 128
 FLAT_BLOCK = 1024
-TAIL = 16  # elements behind the gradient; the first reports an overflow to the other ranks
+TAIL = 16  # number of elements behind the gradient; the first one reports an overflow to the other ranks
 
 
 @dataclass(frozen=True, eq=False)
 class DeviceEpisode:
-    """An episode where the kernels can read it: on the device, or in pinned memory of the host.
+    """Holds an episode where the kernels can read it: on the device, or in pinned memory of the host.
 
-    position_TN3 float32 begins with the frames before frame 0, so that each window is one piece of it.
+    position_TN3 float32 begins with the frames before frame 0. Each window is therefore one contiguous piece of it.
     """
 
     position_TN3: torch.Tensor
-    material_N: torch.Tensor  # int32, index into the network's materials
+    material_N: torch.Tensor  # int32, index into the network's list of materials
     obstacles: SceneHash | None
     domain_size: Vector
-    gravity: Vector = (0.0, 0.0, 0.0)  # domain units per frame squared; only for relative inputs
-    symmetries: tuple[Symmetry, ...] = ()  # one is drawn for each sample, if settings.symmetry
-    barrier: SceneHash | None = None  # of its simulations
+    gravity: Vector = (0.0, 0.0, 0.0)  # domain units per frame squared; only relative inputs use it
+    symmetries: tuple[Symmetry, ...] = ()  # if settings.symmetry is set, one of them is drawn for each sample
+    barrier: SceneHash | None = None  # the barrier of the episode's simulations
 
     def __post_init__(self) -> None:
         position_TN3, material_N = self.position_TN3, self.material_N
@@ -78,13 +78,13 @@ class DeviceEpisode:
 
 
 class DeviceSample(NamedTuple):
-    """A frame of an episode to train on."""
+    """Names a frame of an episode to train on."""
 
     episode: DeviceEpisode
     frame: int
-    seed: int  # of noise, jitter and symmetry
-    weight: float = 1.0  # of the loss
-    noise_scale: float = 1.0  # of the noise, in units of the settings' noise_std
+    seed: int  # seed of noise, jitter and symmetry
+    weight: float = 1.0  # weight of this sample in the loss
+    noise_scale: float = 1.0  # standard deviation of the noise in units of settings.noise_std
 
 
 AnySample = DeviceSample | tuple[DeviceEpisode, int, int]
@@ -92,7 +92,7 @@ AnySample = DeviceSample | tuple[DeviceEpisode, int, int]
 
 @dataclass(frozen=True)
 class UpdateSettings:
-    """The settings of hgn.config.TrainingConfig that an update depends on."""
+    """Holds the settings of hgn.config.TrainingConfig that an update depends on."""
 
     scenes: int
     noise_std: float
@@ -111,10 +111,10 @@ class UpdateSettings:
 
 
 class Updates:
-    """Parameters and Adam's moments in flat buffers, and the launches that update them.
+    """Holds parameters and Adam's moments in flat buffers, and makes the launches that update them.
 
-    loss_sum [2] and counters [5] are added to, see finish_update. With `reduce`, which must sum a float32 tensor over
-    all ranks in place, the gradients of `ranks` ranks are averaged; then all make the same updates.
+    The launches add to loss_sum [2] and counters [5], see finish_update. `reduce` must sum a float32 tensor over all
+    ranks in place. With it the updates average the gradients of `ranks` ranks, and all ranks make the same updates.
     """
 
     grid: DeviceGrid
@@ -132,8 +132,9 @@ class Updates:
         capacities: tuple[int, ...] = (),
         one_graph: bool = False,
     ) -> None:
-        """`capacities` are the cells of each level at the start; without them they follow from the first update. With
-        `one_graph` a CUDA graph contains `reduce` too, which must not communicate while it is captured.
+        """Takes the initial number of cells of each level from `capacities`, or measures it at the first update.
+
+        With `one_graph` a CUDA graph contains `reduce` too, which must not communicate during the capture.
         """
         self.network, self.config, self.settings, self.precision = network, network.config, settings, precision
         self.loss_sum, self.counters, self.reduce, self.ranks = loss_sum, counters, reduce, ranks
@@ -142,14 +143,14 @@ class Updates:
         self.packed = pack_network(network)
         self.values = self.packed.gather(list(network.parameters()))
         self.first_moment, self.second_moment = torch.zeros_like(self.values), torch.zeros_like(self.values)
-        self.average: torch.Tensor | None = None  # of the values over the updates; set it before the first one
+        self.average: torch.Tensor | None = None  # average of the values over the updates; set before the first one
         muon = settings.optimizer == "muon"
         self.blocks = SquareBlocks(network, self.packed.index, device) if muon else None
         self.step = torch.zeros(1, dtype=torch.float64, device=device)
         self.update = torch.zeros(1, dtype=torch.int32, device=device)
         self.loss, self.norm = torch.zeros(1, device=device), torch.zeros(1, device=device)
         scenes, normaliser = settings.scenes, network.normaliser
-        columns = 4 + 3 * self.config.velocity_history  # a wave's number and phase, its amplitude in each velocity
+        columns = 4 + 3 * self.config.velocity_history  # number and phase of a wave, and its amplitude in each velocity
         self.waves_SKC = torch.zeros(scenes, CORRELATED_WAVES, columns, device=device)
         sees = self.config.obstacle_features
         table = SceneTable([None] * scenes, OBSTACLE_COLUMNS, device, settings.obstacle_cell_size)
@@ -159,9 +160,9 @@ class Updates:
         self.mean, self.std = normaliser.acceleration_mean.float(), normaliser.acceleration_std.float()
         self.capacities = capacities
         self.particles = 0
-        self.growths = 0  # how often the buffers had to grow
+        self.growths = 0  # number of times that the buffers grew
         self.captures, self.capture_seconds = 0, 0.0
-        self._reach = (torch.zeros(3), torch.zeros(3))  # the box that the window must contain
+        self._reach = (torch.zeros(3), torch.zeros(3))  # corners of the box that the window must contain
         self._graphs: list[torch.cuda.CUDAGraph] = []
         self._samples = self._vectors = self._rates = self._shares = torch.empty(0)
 
@@ -173,9 +174,9 @@ class Updates:
         rates: Sequence[float],
         shares: Sequence[float] | None = None,
     ) -> None:
-        """Makes one update for each entry of `chunk`, which lists the sample of every scene.
+        """Makes one update for each entry of `chunk`, which lists the samples of all scenes.
 
-        `shares` are the weights of the new values in `average`. Raises: ConfigError when positions are not finite.
+        `shares` are the weights of the new values in `average`. Raises ConfigError when positions are not finite.
         """
         assert (shares is None) == (self.average is None)
         self._prepare(chunk, rates)
@@ -211,17 +212,17 @@ class Updates:
             self._build()
 
     def _upload(self, chunk: Sequence[Sequence[AnySample]], rates: Sequence[float]) -> int:
-        """Writes the chunk's tables; returns the most particles of an update."""
+        """Writes the tables of the chunk, and returns the largest number of particles of an update."""
         scenes, history = self.settings.scenes, self.config.velocity_history
         assert all(len(samples) == scenes for samples in chunk)
         flat = [DeviceSample(*sample) for samples in chunk for sample in samples]
-        # kernels read raw addresses, without a check of bounds
+        # The kernels read raw addresses and check no bounds. The host therefore checks them here.
         for episode, frame, *_ in flat:
             assert 0 <= frame <= episode.frames - history - 2, "a window reaches beyond its episode"
         table = np.array([sample.episode.row for sample in flat]).reshape(len(chunk), scenes, SAMPLE_COLUMNS)
         count = table[..., 1]
         table[..., 0] += np.array([sample.frame for sample in flat]).reshape(count.shape) * count * 12
-        table[..., 2] = count.cumsum(1) - count  # the first particle
+        table[..., 2] = count.cumsum(1) - count  # index of the first particle
         table[..., 3] = np.array([sample.seed for sample in flat]).reshape(count.shape)
         real = np.array([(sample.weight, sample.noise_scale) for sample in flat], np.float64)
         table[..., 5:7] = real.view(np.int64).reshape(*count.shape, 2)
@@ -245,7 +246,7 @@ class Updates:
         return most
 
     def _allocate_tables(self, length: int) -> None:
-        self._graphs = []  # they read the old tables
+        self._graphs = []  # the graphs read the old tables
         shape = (length, self.settings.scenes)
         self._samples = torch.zeros(*shape, SAMPLE_COLUMNS, dtype=torch.int64, device=self.device)
         self._vectors = torch.zeros(*shape, 2, 3, device=self.device)
@@ -265,13 +266,13 @@ class Updates:
     # launches
 
     def allocate(self, particles: int, cells: Sequence[int]) -> None:
-        """Allocates buffers for about this number of particles and cells of each level, for precompilation."""
+        """Allocates buffers for about this number of particles and of cells of each level, for precompilation."""
         self._allocate_tables(1)
         self.particles, self.capacities = 16 * math.ceil(particles / 16), self._rounded(cells)
         self._build()
 
     def launches(self) -> None:
-        """Makes all launches of one update, without the other ranks."""
+        """Makes all launches of one update, but no communication with other ranks."""
         self.launches_before_reduction()
         self.launches_after_reduction()
 
@@ -297,7 +298,7 @@ class Updates:
             kernel.tell_overflow[(1,)](status=self.grid.status, flag=fused.totals[-TAIL:])
 
     def launches_after_reduction(self) -> None:
-        """Makes the launches from the gradients to new parameters."""
+        """Makes the launches from the summed gradients to the new parameters."""
         fused, size, share = self.fused, self.packed.size, 1.0 / self.ranks
         blocks = (triton.cdiv(size, FLAT_BLOCK),)
         kernel.square_norm[blocks](
@@ -328,7 +329,7 @@ class Updates:
         )  # fmt: skip
 
     def _assemble(self) -> None:
-        """Launches the assembly of the samples: windows, symmetry, noise, jitter. The rule is hgn.training.noise."""
+        """Launches the assembly of the samples: windows, symmetry, noise and jitter. The rule is hgn.training.noise."""
         settings, config = self.settings, self.config
         correlated, steps = settings.noise_correlated_fraction, config.velocity_history
         wave_step = settings.noise_std * math.sqrt(2 / CORRELATED_WAVES * correlated / steps)
@@ -353,7 +354,7 @@ class Updates:
         )  # fmt: skip
 
     def _grid(self) -> None:
-        """Builds the grid, and cells and features of the particles."""
+        """Builds the grid, and computes the cells and the features of the particles."""
         self.grid.build(self.buffers)
         self.grid.prepare(self.buffers, self.scale, self.obstacles, self.settings.symmetry)
 
@@ -367,11 +368,11 @@ class Updates:
         return bool((self._built_reach[0] <= reach[0]).all() and (self._built_reach[1] >= reach[1]).all())
 
     def _build(self) -> None:
-        """Allocates buffers for `particles` and `capacities`, which are measured first where unknown."""
+        """Allocates buffers for `particles` and `capacities`. It first measures capacities that are unknown."""
         config, device, particles = self.config, self.device, self.particles
         self._graphs = []
         if hasattr(self, "fused"):
-            del self.fused, self.grid  # before the new ones are allocated
+            del self.fused, self.grid  # frees the old buffers before the allocation of the new ones
         self._built_reach = self._reach
         self.buffers = DeviceParticles.empty(particles, self.settings.scenes, config.velocity_history, device)
         self.target_N3 = torch.zeros(particles, 3, device=device)
@@ -385,7 +386,7 @@ class Updates:
         self.fused = self._fused_network()
 
     def _fused_network(self) -> FusedTrainingNetwork:
-        # gradients of the mean over particles are small: float16 would lose them
+        # The gradients of a mean over particles are small. float16 would round them to zero without a scale.
         scale = 2.0 ** round(math.log2(max(self.particles, 2))) if self.precision == "fp16" else 1.0
         return FusedTrainingNetwork(
             self.packed, self.values, self.grid, self.buffers.count, self.precision, scale, tail=TAIL
@@ -415,7 +416,7 @@ class Updates:
             parts = [self.launches if self.reduce is None else self._launches_together]
 
         def warm_up() -> None:
-            self.grid.status.fill_(kernel.REPEAT.value)  # compiles and changes nothing
+            self.grid.status.fill_(kernel.REPEAT.value)  # with this status the launches compile and change nothing
             self.launches()
             self.grid.status.zero_()
 

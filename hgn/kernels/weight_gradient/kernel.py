@@ -1,7 +1,7 @@
-"""All weight and bias gradients: a list of products A^T B over rows, and of column sums of A, cut into chunks of rows.
+"""Computes all weight and bias gradients: products A^T B over rows and column sums of A, cut into chunks of rows.
 
-Row of the job table: offset of A, of B, of the result, rows' count (index), width of A, width of B, rows that a count
-stands for, offset of the column sums (-1: none). Offsets in elements.
+The job table has a row for each product: offsets of A, B and the result, index of the row count, widths of A and B,
+rows for each counted one, offset of the column sums (-1: none). Offsets count elements.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ def weight_gradient(
     TILE: tl.constexpr, CHUNK: tl.constexpr, STEP: tl.constexpr, PRECISION: tl.constexpr,
     PIPELINED: tl.constexpr,
 ):  # fmt: skip
-    """Program i adds its chunk's part of A^T B [width A, width B] to totals; widths are at most TILE.
+    """Adds the part of chunk i of A^T B [width A, width B] to totals in program i. Widths are at most TILE.
 
-    PIPELINED: the compiler has tiles copied to shared memory two ahead, as it has not in the interpreter.
+    PIPELINED: the compiler copies tiles to shared memory two ahead. The interpreter cannot do this.
 
     Rule: torch.nn.Linear; reference and test: tests/kernels/references.py, test_kernels_alone.py.
     """
