@@ -1,7 +1,7 @@
-"""Hierarchical graph networks for learned particle physics.
+"""Learns particle physics with hierarchical graph networks.
 
-The public API is imported from here (`from hgn import Simulator, load_scene`) and loaded on first use: `import hgn`
-loads neither torch nor NumPy.
+Import the public API from here (`from hgn import Simulator, load_scene`). Each name is loaded at its first use, so that
+`import hgn` loads neither torch nor NumPy.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ if TYPE_CHECKING:
     from hgn.scene.scene_file import load_scene as load_scene
     from hgn.schema import ConfigError as ConfigError
 
-# OpenMP reads this as torch loads it. Its idle threads spin otherwise, and take cores from the thread that the others
-# wait for: a training beside another program makes a sixth of the updates, or less.
+# OpenMP reads this when torch loads it. Otherwise its idle threads spin, and take cores from the thread for which they
+# wait. A training beside another program then makes at most a sixth of the updates.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 _MODULES = {

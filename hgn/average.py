@@ -1,7 +1,7 @@
-"""python -m hgn.average weights=[a,b] coefficients=[0.7,0.3] out=…: the mean of several networks' weights.
+"""python -m hgn.average weights=[a,b] coefficients=[0.7,0.3] out=…: averages the weights of several networks.
 
-Networks that were trained from the same weights can be averaged: the mean network has the size of one, no larger
-error, and part of what each has learned (model soups, Wortsman et al. 2022).
+Networks that were trained from the same weights can be averaged. The mean network has the size of one network, no
+larger error, and parts of the abilities of each (model soups, Wortsman et al. 2022).
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     Loaded = tuple[ParticleNetwork, WeightsInfo]
 
-SHARED = ("network", "step", "frame_rate_hz", "obstacle_cell_size", "gravity")  # must be equal in all files
+SHARED = ("network", "step", "frame_rate_hz", "obstacle_cell_size", "gravity")  # fields that must be equal in all files
 
 
 @dataclass(frozen=True)
@@ -30,8 +30,10 @@ class AverageConfig:
     # files of python -m hgn.export or names of shipped weights, as in [a.safetensors,b.safetensors]
     weights: tuple[str, ...]
     out: FileName  # the weights file to write
-    coefficients: tuple[float, ...] | None = None  # of each file, with the sum 1, as in [0.7,0.3]; null: equal
-    stored_precision: StoredPrecision = "fp32"  # of the learned tensors; fp16: files half as large
+    coefficients: tuple[float, ...] | None = (
+        None  # coefficient of each file, with the sum 1, as in [0.7,0.3]; null: equal ones
+    )
+    stored_precision: StoredPrecision = "fp32"  # precision of the learned tensors; fp16 makes files half as large
 
     def __post_init__(self) -> None:
         require_bounds(self)
@@ -43,7 +45,7 @@ class AverageConfig:
 
 
 def main(mapping: dict[str, Any]) -> int:
-    """Writes the weights file; returns the exit code."""
+    """Writes the weights file. Returns the exit code."""
     config = from_mapping(AverageConfig, mapping)
     average(config)
     print(config.out)
@@ -51,9 +53,9 @@ def main(mapping: dict[str, Any]) -> int:
 
 
 def average(config: AverageConfig) -> None:
-    """Writes the mean. `updates` is the largest of the files; `provenance` lists all of them.
+    """Writes the mean. `updates` is the largest number of the files; `provenance` lists all files.
 
-    Raises: ConfigError when a file is missing, or networks, data or normalisers differ.
+    Raises ConfigError if a file is missing, or if networks, data or normalisers differ.
     """
     import torch
 

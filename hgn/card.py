@@ -1,6 +1,6 @@
-"""python -m hgn.card weights=net.safetensors out=FOLDER, or data=FOLDER: a card for the Hugging Face Hub.
+"""python -m hgn.card weights=net.safetensors out=FOLDER, or data=FOLDER: writes a card for the Hugging Face Hub.
 
-Writes README.md with the Hub's metadata and a table of the content of the weights or the data set.
+The card is README.md, with the Hub's metadata and a table of the content of the weights or the data set.
 """
 
 from __future__ import annotations
@@ -33,10 +33,10 @@ class CardConfig:
     """`python -m hgn.card`: the README.md that the Hugging Face Hub shows for weights or a data set."""
 
     weights: str | None = None  # a file of python -m hgn.export, which is copied into out
-    data: str | None = None  # the folder of a data set, for its card, instead of weights
+    data: str | None = None  # folder of a data set, whose card is written instead of a card of weights
     out: str | None = None  # the folder for the card and a copy of the weights; only with weights
-    license: str = "mit"  # a licence by its name on the Hub
-    name: str | None = None  # the heading; null: the name of the file or the folder
+    license: str = "mit"  # name of the licence on the Hub
+    name: str | None = None  # heading; null: name of the file or the folder
 
     def __post_init__(self) -> None:
         one = (self.weights is None) != (self.data is None)
@@ -48,7 +48,7 @@ class CardConfig:
 
 
 def main(mapping: dict[str, Any]) -> int:
-    """Writes the card, and a copy of the weights; never replaces a card. Returns the exit code."""
+    """Writes the card and a copy of the weights, but never replaces a card. Returns the exit code."""
     from hgn.runtime.weights import find_weights, load_weights
 
     config = from_mapping(CardConfig, mapping)
@@ -78,7 +78,7 @@ def main(mapping: dict[str, Any]) -> int:
 
 
 def weights_card(info: WeightsInfo, name: str, file: str, licence: str) -> str:
-    """Returns the card of a weights file: the Hub's metadata, the structure, and a command that uses it."""
+    """Returns the card of a weights file: the Hub's metadata, the structure, and a command that uses the file."""
     network = info.network
     metadata = {"license": licence, "library_name": "hgn", "tags": ["physics", "particles", "simulation", network.kind]}
     rows = {
@@ -132,7 +132,7 @@ def _reference_row(reference: dict[str, Any] | None) -> dict[str, str]:
 
 
 def _kind_rows(kinds: Mapping[str, float]) -> dict[str, str]:
-    """Returns a row for each kind of scenes: its share, and the range of each number that it draws."""
+    """Returns a row for each kind of scene: its share, and the range of each number that it draws."""
     total = sum(kinds.values())
     return {
         f"kind {kind}": f"{share / total:.1%}; "
@@ -143,7 +143,7 @@ def _kind_rows(kinds: Mapping[str, float]) -> dict[str, str]:
 
 
 def _plain(text: str) -> str:
-    """Returns a text as Markdown shows it, whatever it contains."""
+    """Returns a text with all special characters escaped for Markdown."""
     return re.sub(r"[^\w .,;:%/'()+-]", lambda match: f"&#{ord(match[0])};", text)
 
 

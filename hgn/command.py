@@ -1,4 +1,4 @@
-"""Entry point of all commands: Hydra composes the config, and errors that a user can mend end in one line.
+"""Runs all commands: Hydra composes the config, and errors that a user can mend end in one line.
 
 Exit codes: 0 success, 1 machine error (full disk, no permission, existing path), 2 invalid input, 130 Ctrl-C,
 141 closed output pipe (as in `… | head`).
@@ -29,7 +29,7 @@ _MACHINE_ERRORS = {
     errno.EACCES: "check the permissions",
     errno.EPERM: "check the permissions",
     errno.EROFS: "choose a folder that can be written to",
-    # a given path leads through a file, or ends at the wrong kind of file
+    # A given path leads through a file, or names an object of another kind.
     errno.EEXIST: "choose another path",
     errno.ENOTDIR: "choose another path",
     errno.EISDIR: "choose another path",
@@ -46,30 +46,30 @@ Main = Callable[[dict[str, Any]], int | None]
 def run_command(main: Main | str, config_name: str) -> NoReturn:
     """Composes `conf/<config_name>.yaml` with the command line, calls `main` with the plain mapping, and exits.
 
-    `main` may be the name of the module that has it, which is then loaded after the configuration.
+    `main` may be the name of the module with this function, which is then loaded after the configuration.
 
-    The file of a command without config groups lies in `conf/command/`, because Hydra would take its keys
+    The file of a command without config groups lies in `conf/command/`. Otherwise Hydra would take its keys
     (`scene=my_scene.yaml`) for choices of a group.
 
-    Hydra's options (--cfg, --config-path, --config-name, --multirun) work; --help prints keys, values and comments.
-    `main` returns an exit code or None for 0. Errors that a user can mend are printed as one line, `error: ...`.
+    Hydra's options (--cfg, --config-path, --config-name, --multirun) work. --help prints keys, values and comments.
+    `main` returns an exit code, or None for 0. Errors that a user can mend are printed as one line, `error: ...`.
     """
     for name in ("stdout", "stderr"):
-        if getattr(sys, name) is None:  # the process was started without it
+        if getattr(sys, name) is None:  # the process was started without this stream
             setattr(sys, name, Path(os.devnull).open("w"))  # noqa: SIM115 - open as long as the process runs
         elif isinstance(stream := getattr(sys, name), io.TextIOWrapper) and stream.encoding.lower() != "utf-8":
-            stream.reconfigure(errors="replace")  # latin-1 or ASCII, perhaps
+            stream.reconfigure(errors="replace")  # the encoding may be latin-1 or ASCII
     code: int | str | None
     try:
         try:
             code = _exit_code(main, config_name)
-        except SystemExit as end:  # by Hydra, after --help
+        except SystemExit as end:  # Hydra ends the process after --help
             code = end.code
         sys.stdout.flush()
     except BrokenPipeError:
         if not _unread():
             raise
-        for stream in (sys.stdout, sys.stderr):  # their buffers cannot be flushed at exit
+        for stream in (sys.stdout, sys.stderr):  # the buffers cannot be flushed at exit
             with Path(os.devnull).open("wb") as nowhere:
                 os.dup2(nowhere.fileno(), stream.fileno())
         code = EXIT_UNREAD
@@ -96,7 +96,7 @@ def _exit_code(main: Main | str, config_name: str) -> int:
             raise
         code = _fail(missing, EXIT_MACHINE)
     except OSError as error:
-        if isinstance(error, (BrokenPipeError, FileNotFoundError)):  # of a file that we should have looked for
+        if isinstance(error, (BrokenPipeError, FileNotFoundError)):  # an error of this program, not of the user
             raise
         place = f": {error.filename}" if error.filename else ""
         remedy = _MACHINE_ERRORS.get(error.errno or 0, "check the disk and its network")
@@ -109,7 +109,7 @@ def _exit_code(main: Main | str, config_name: str) -> int:
 
 
 def _unread() -> bool:
-    """Returns whether standard output or error is a pipe without a reader."""
+    """Returns whether standard output or standard error is a pipe without a reader."""
     poll = select.poll()
     for stream in (sys.stdout, sys.stderr):
         poll.register(stream.fileno(), 0)
@@ -117,7 +117,7 @@ def _unread() -> bool:
 
 
 def _compose(config_name: str, complete: bool = True) -> list[dict[str, Any]]:
-    """Returns the configurations of the command line; with `complete=False` required keys may be missing."""
+    """Returns the configurations of the command line. With `complete=False` required keys may be missing."""
     from hgn.hydra_compat import compose
 
     arguments = _with_json_as_override(sys.argv)
@@ -139,7 +139,7 @@ def _print_help(config_name: str) -> None:
 
 
 def _require_options(arguments: list[str]) -> None:
-    """Refuses options to which Hydra would print pages, and words without `=`."""
+    """Refuses options after which Hydra would print pages, and words without `=`."""
     from hgn.hydra_compat import OPTIONS
 
     for before, argument in itertools.pairwise(arguments):
@@ -152,7 +152,7 @@ def _require_options(arguments: list[str]) -> None:
 
 
 def _with_json_as_override(arguments: list[str]) -> list[str]:
-    """Replaces `--json FILE` and `--json=FILE` of the reports by json=FILE."""
+    """Replaces the options `--json FILE` and `--json=FILE` of the reports by json=FILE."""
     result: list[str] = []
     waiting = iter(arguments)
     for argument in waiting:

@@ -1,4 +1,4 @@
-"""The output of `--help`: a command's description, and every key with value and comment."""
+"""Prints `--help`: a command's description, and every key with its value and comment."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from hgn.schema import field_comments
 
 
 def help_lines(mapping: Mapping[str, Any], folder: Path, config_name: str) -> Iterator[str]:
-    """Yields a command's composed configuration as YAML with comments; its file lies in `folder`."""
+    """Yields a command's composed configuration as YAML with comments. The command's file lies in `folder`."""
     file = folder / f"{config_name}.yaml"
     cls = dataclass_of(file)
     comments = (field_comments(cls) if cls else {}) | _comments_in(file)

@@ -1,4 +1,4 @@
-"""python -m hgn.evaluate weights=… data=…: one-step and rollout errors, compared with baselines."""
+"""python -m hgn.evaluate weights=… data=…: measures one-step and rollout errors beside those of baselines."""
 
 from __future__ import annotations
 
@@ -33,17 +33,17 @@ class EvaluateConfig(SimulatorConfig):
     data: str  # folder or URL of a data set
     weights: str = DEFAULT_WEIGHTS  # a file of python -m hgn.export, or the name of shipped weights
     split: Split = "validation"  # train, validation or test
-    scenes: Positive[int] = 5  # the first of the split, by index
-    frame_stride: Positive[int] = 1  # distance of the frames whose one-step errors are measured
-    rollout_frames: NonNegative[int] = 300  # of each rollout; 0: no rollouts
-    json: FileName | None = None  # also write the figures to this file
+    scenes: Positive[int] = 5  # number of scenes, the first of the split by index
+    frame_stride: Positive[int] = 1  # distance between two frames whose one-step errors are measured
+    rollout_frames: NonNegative[int] = 300  # length of each rollout in frames; 0: no rollouts
+    json: FileName | None = None  # file for the figures; null: none
 
     def __post_init__(self) -> None:
         require_bounds(self)
 
 
 def main(mapping: dict[str, Any]) -> int:
-    """Prints a table, and writes JSON if `json` is set; returns the exit code."""
+    """Prints a table, and writes JSON if `json` is set. Returns the exit code."""
     from hgn.runtime.simulator import InitialState, Simulator
     from hgn.runtime.weights import find_weights, require_frame_rate
     from hgn.system.provenance import provenance
@@ -106,7 +106,7 @@ def one_step_rows(backend: Backend, episodes: list[Episode], config: EvaluateCon
 
 
 def rollouts(simulator: Simulator, episodes: list[Episode], frames: int) -> list[RolloutResult]:
-    """Simulates the episodes from their first frame to the last frame of the shortest."""
+    """Simulates the episodes from their first frame to the last frame of the shortest one."""
     from hgn.runtime.rollouts import simulate_scenes
     from hgn.runtime.simulator import InitialState
 
@@ -117,7 +117,7 @@ def rollouts(simulator: Simulator, episodes: list[Episode], frames: int) -> list
 
 
 def convention_lines(errors: dict[str, dict[str, float]]) -> str:
-    """Formats the errors of `set_convention`."""
+    """Returns the errors of `set_convention` as text."""
     lines = ["in the set's own convention: mean over axes and frames; free particles, all particles"]
     lines += [f"{name.replace('_', ' '):<20} {error['free']:.3e}, {error['all']:.3e}" for name, error in errors.items()]
     return "\n".join(lines)
@@ -125,7 +125,7 @@ def convention_lines(errors: dict[str, dict[str, float]]) -> str:
 
 def rollout_row(trials: Sequence[RolloutResult], episodes: list[Episode], frames: int) -> dict[str, Any]:
     """Returns {"system", "position_mse": {frame: value}, "scenes_reached": {frame: count}, "mean_position_mse",
-    "by_material", "ends"}; an error is the mean over the scenes that reached its frame.
+    "by_material", "ends"}. An error is the mean over the scenes that reached its frame.
     """
     from hgn.training.errors import REPORTED_FRAMES, rollout_errors
 
@@ -148,9 +148,9 @@ def _at_frames(mse_T: np.ndarray, frames: list[int]) -> dict[str, float]:
 
 
 def end_of_rollout(trial: RolloutResult, episode: Episode) -> dict[str, Any]:
-    """Returns fractions of the particles within closed obstacles, also of the data's, and outside the domain, in the
-    last frame of a rollout, and the cause of an early end.
-    """
+    """Returns properties of a rollout's last frame, and the cause of an early end.
+
+    They are the shares of particles in closed obstacles, also in the data, and of particles outside the domain."""
     from hgn.scene.rollout_file import obstacles_of_episode
 
     obstacles, last = obstacles_of_episode(episode), trial.frame_count - 1
@@ -167,7 +167,7 @@ def end_of_rollout(trial: RolloutResult, episode: Episode) -> dict[str, Any]:
 
 
 def table(rows: list[dict[str, Any]], config: EvaluateConfig, scenes: int) -> str:
-    """Formats the figures. Errors sum over axes and average over particles, in frame units."""
+    """Returns the figures as text. Errors are sums over axes and means over particles, in frame units."""
     from hgn.training.errors import format_ratio
 
     every = "every frame" if config.frame_stride == 1 else f"every {config.frame_stride}th frame"

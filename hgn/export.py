@@ -1,4 +1,4 @@
-"""python -m hgn.export: a checkpoint's network as weights; a network's step as ONNX or as a compiled package."""
+"""python -m hgn.export: writes a checkpoint's network as weights, or a network's step as ONNX or compiled package."""
 
 from __future__ import annotations
 
@@ -27,18 +27,18 @@ if TYPE_CHECKING:
 class ExportConfig:
     """`python -m hgn.export`."""
 
-    checkpoint: str | None = None  # of the network that is exported
-    weights: str | None = None  # a file or the name of shipped weights; only without checkpoint
+    checkpoint: str | None = None  # checkpoint file of the network that is exported
+    weights: str | None = None  # file or name of shipped weights; only without checkpoint
     out: FileName | None = None  # the weights file to write
-    stored_precision: StoredPrecision = "fp32"  # of the learned tensors; fp16: files half as large
+    stored_precision: StoredPrecision = "fp32"  # precision of the learned tensors; fp16 makes files half as large
     rest_threshold: NonNegative[float] | None = None  # step.rest_threshold of `out`; null: as it was
     wall_clearance: WallClearance | None = None  # step.wall_clearance of `out`; null: as it was
     obstacle_clearance: Positive[float] | None = None  # step.obstacle_clearance of `out`; null: as it was
-    # of `out`, or else of `weights`: file of a step's graph, for ONNX Runtime
+    # file for the graph of a step of `out`, or else of `weights`, for ONNX Runtime
     onnx: FileName | None = None
-    package: str | None = None  # file of a step compiled for `device`, for PyTorch's C++ (.pt2)
-    device: str = "cpu"  # or cuda, cuda:1
-    arrays: str | None = None  # folder of what a step is first given for `scene`, as .npy files
+    package: str | None = None  # file for a step compiled for `device`, for PyTorch's C++ (.pt2)
+    device: str = "cpu"  # device of the package: cpu, cuda or cuda:1
+    arrays: str | None = None  # folder for the first inputs of a step of `scene`, as .npy files
     scene: str | None = None  # a scene file, or the name of an example
 
     def __post_init__(self) -> None:
@@ -57,13 +57,13 @@ class ExportConfig:
 
     @property
     def step_changes(self) -> dict[str, Any]:
-        """The constraints of a frame that `out` has other than before, by the names of StepConfig."""
+        """Returns the changed constraints of a frame in `out`, by the names of StepConfig."""
         chosen = {field.name: getattr(self, field.name) for field in fields(StepConfig)}
         return {name: value for name, value in chosen.items() if value is not None}
 
 
 def main(mapping: dict[str, Any]) -> int:
-    """Writes the files that the settings name; returns the exit code."""
+    """Writes the files that the settings name. Returns the exit code."""
     from hgn.runtime.exported_step import traced_step, write_onnx, write_package
     from hgn.runtime.simulator import Simulator
     from hgn.runtime.weights import find_weights, load_weights
@@ -97,7 +97,7 @@ def main(mapping: dict[str, Any]) -> int:
         print(config.arrays)
     if config.onnx is not None or config.package is not None:
         program = traced_step(network, info)
-    if config.package is not None:  # first: what writes ONNX leaves symbols in the graph that the compiler refuses
+    if config.package is not None:  # first: the ONNX export leaves symbols in the graph that the compiler refuses
         write_package(Path(config.package), program, info)
         print(config.package)
     if config.onnx is not None:
@@ -107,14 +107,14 @@ def main(mapping: dict[str, Any]) -> int:
 
 
 def export(checkpoint_path: Path, out: Path, stored_precision: str = "fp32", **step_changes: Any) -> None:
-    """Writes a checkpoint's network as weights, with `step_changes`, fields of StepConfig, in place of its own.
+    """Writes a checkpoint's network as weights. `step_changes`, fields of StepConfig, replace the network's own.
 
-    Raises: ConfigError when the checkpoint is missing or not ours, or holds a network that does not take the changes.
+    Raises ConfigError if the checkpoint is missing or of another program, or if its network refuses the changes.
     """
     from hgn.runtime.weights import WeightsInfo, save_weights
     from hgn.system.provenance import provenance
 
-    # Lightning, which the other exports do without, is loaded here
+    # Lightning is imported here, because the other exports do not need it.
     from hgn.training.checkpoint import Progress, data_of_checkpoint, network_of_checkpoint, read_checkpoint
 
     checkpoint = read_checkpoint(checkpoint_path)
@@ -134,9 +134,9 @@ def export(checkpoint_path: Path, out: Path, stored_precision: str = "fp32", **s
 
 
 def change(file: Path, out: Path, stored_precision: str = "fp32", **step_changes: Any) -> None:
-    """Writes weights to weights, with `step_changes` as in `export`. The provenance of `out` holds that of `file`.
+    """Writes weights to weights, with `step_changes` as in `export`. The provenance of `out` contains that of `file`.
 
-    Raises: ConfigError when the file is missing or not ours, or holds a network that does not take the changes.
+    Raises ConfigError if the file is missing or of another program, or if its network refuses the changes.
     """
     from hgn.runtime.weights import load_weights, save_weights
     from hgn.system.provenance import provenance
@@ -148,14 +148,14 @@ def change(file: Path, out: Path, stored_precision: str = "fp32", **step_changes
 
 
 def change_step(network: ParticleNetwork, changes: dict[str, Any]) -> None:
-    """Changes the constraints of a network's frames. Raises: ConfigError where the network cannot have them."""
+    """Changes the constraints of a network's frames. Raises ConfigError if the network cannot have them."""
     step = replace(network.step, **changes)
     step.require_fits(network.config.relative, network.config.dimensions)
     network.step = step
 
 
 def write_arrays(folder: Path, state: ParticleState, corner_F33: np.ndarray) -> None:
-    """Writes the first inputs of a step, an .npy file each; corners as in `initial_arrays`."""
+    """Writes the first inputs of a step, one .npy file for each. The corners are those of `initial_arrays`."""
     from hgn.runtime.exported_step import initial_arrays
 
     folder.mkdir(parents=True, exist_ok=True)

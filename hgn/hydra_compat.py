@@ -1,6 +1,6 @@
-"""All uses of Hydra, including private and fragile parts; pyproject.toml bounds its version.
+"""Contains all uses of Hydra, including private and fragile parts; pyproject.toml bounds its version.
 
-`tests/test_hydra_compat.py` fails when a new version has changed one of them.
+`tests/test_hydra_compat.py` fails if a new version has changed one of them.
 """
 
 from __future__ import annotations
@@ -30,17 +30,17 @@ OPTIONS = (
 
 _FOLDERS = ("--config-dir", "-cd", "--config-path", "-cp")  # options with a folder of configs
 
-# Hydra creates no folder and no log file; commands choose where they write
+# Hydra creates no folder and no log file. Each command chooses where it writes.
 _QUIET = ("hydra.run.dir=.", "hydra.output_subdir=null", "hydra/job_logging=none", "hydra/hydra_logging=none")
 _DATACLASS = re.compile(r"(?:hgn|datagen|tools)(?:\.\w+)+\.[A-Z]\w*Config")
 
 
 def compose(folder: Path, config_name: str, arguments: list[str], complete: bool = True) -> list[dict[str, Any]]:
-    """Returns the composed configurations as plain containers, several with --multirun; arguments as in `sys.argv`.
+    """Returns the composed configurations as plain containers, several with --multirun. `arguments` are as `sys.argv`.
 
-    A file whose `defaults` name a dataclass, as in hgn.config.NetworkConfig, starts with its defaults. Hydra's own
-    entry point, which composes twice and reads its callers' sources, is used only for Hydra's options.
-    Raises: ConfigError, also for a missing key if the configuration must be `complete`.
+    A file whose `defaults` name a dataclass, as hgn.config.NetworkConfig, starts with the defaults of this class.
+    Hydra's own entry point composes twice and reads its callers' sources. It is used only for Hydra's options.
+    Raises ConfigError, also for a missing key if the configuration must be `complete`.
     """
     from hydra import compose as compose_once
     from hydra import initialize_config_dir
@@ -56,7 +56,7 @@ def compose(folder: Path, config_name: str, arguments: list[str], complete: bool
     try:
         if any(argument.lstrip("+~").startswith(("-", "hydra")) for argument in arguments[1:]):
             sys.argv = _with_quiet(arguments)
-            os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra would print and exit itself otherwise
+            os.environ["HYDRA_FULL_ERROR"] = "1"  # otherwise Hydra would print the error and exit
             with registered_dataclasses(folder, config_name):
                 hydra_main(version_base="1.3", config_path=str(folder), config_name=config_name)(composed.append)()
         else:
@@ -65,7 +65,7 @@ def compose(folder: Path, config_name: str, arguments: list[str], complete: bool
         plain = [OmegaConf.to_container(config, resolve=True, throw_on_missing=complete) for config in composed]
     except MissingMandatoryValue as error:
         raise ConfigError(f"{error.full_key} is missing; it must be given, as in {error.full_key}=…") from error
-    except (HydraException, OmegaConfBaseException, ValueError, yaml.YAMLError) as error:  # Hydra raises ValueErrors
+    except (HydraException, OmegaConfBaseException, ValueError, yaml.YAMLError) as error:  # some by Hydra
         raise ConfigError(" ".join(str(error).split("Config search path:")[0].split())) from error
     finally:
         sys.argv = given
@@ -76,10 +76,9 @@ def compose(folder: Path, config_name: str, arguments: list[str], complete: bool
 
 
 def _check_chosen_files(folder: Path, arguments: list[str]) -> None:
-    """Reads the files that arguments as experiment=NAME choose, strictly: Hydra would print pages about bad YAML, or
-    ignore keys and take numbers for others.
+    """Reads the files that arguments such as experiment=NAME choose, with strict rules. Raises ConfigError.
 
-    Raises: ConfigError.
+    Hydra would print pages about bad YAML, ignore keys, or misread numbers.
     """
     folders = [folder]
     for option, (name, _, value) in itertools.pairwise([("", "", ""), *(a.partition("=") for a in arguments)]):
@@ -118,7 +117,7 @@ def _load(name: str) -> type:
 def registered_dataclasses(folder: Path, config_name: str) -> Iterator[None]:
     """Registers the dataclasses that config files name with Hydra, under these names.
 
-    Hydra's store is global: the groups of another command would be groups of this one.
+    Hydra's store is global. Without a change the groups of another command would be groups of this one.
     """
     from hydra.core.config_store import ConfigStore
 
@@ -136,8 +135,10 @@ def registered_dataclasses(folder: Path, config_name: str) -> Iterator[None]:
 
 
 def _override(argument: str, folder: Path) -> str:
-    """Returns an argument in Hydra's syntax: unknown keys are added, so that the command refuses them and names its
-    keys; experiment=… becomes +experiment=…; values are quoted where necessary."""
+    """Returns an argument in Hydra's syntax.
+
+    Unknown keys are added, so that the command refuses them and names its keys. experiment=… becomes +experiment=….
+    Values are quoted where necessary."""
     key, equals, value = argument.partition("=")
     if not equals or key.startswith("-"):
         return argument
@@ -145,21 +146,22 @@ def _override(argument: str, folder: Path) -> str:
         raise ConfigError(f"{argument} is called {new} now")
     if remedy := REMOVED_CHOICES.get(key.lstrip("+"), {}).get(value):
         raise ConfigError(f"{argument} was removed; {remedy}")
-    if re.search(r"[\[{$]", value) and Path(value).is_file():  # Hydra would take its name for a list or a reference
+    if re.search(r"[\[{$]", value) and Path(value).is_file():  # Hydra would parse the file's name
         value = "'" + value.replace("'", "\\'").replace("$", "\\$") + "'"
     elif value and not _understood(value):
         value = _in_quotes(value)
     if re.fullmatch(r"[A-Za-z][\w.]*", key) and not key.startswith("hydra"):
         if key == "experiment":
             key = "+experiment"
-        elif not (folder / key).is_dir():  # no choice of a group
+        elif not (folder / key).is_dir():  # the key is not a group
             key = f"++{key}"
     return f"{key}={value}"
 
 
 def _in_quotes(value: str) -> str:
-    """Quotes a value that Hydra's grammar refuses (with ü, &, # or (1) in it), also in a flat list; ~/ becomes the home
-    folder. Returns it unchanged where quotes do not help."""
+    """Returns a value with quotes if Hydra's grammar refuses it (with ü, &, # or (1) in it), also in a flat list.
+
+    ~/ becomes the home folder. The value stays unchanged if quotes do not help."""
     if value[0] == "[" and value[-1] == "]" and not re.search("[\"'{}[\\]]", value[1:-1]):
         items = [item.strip() for item in value[1:-1].split(",")]
         return f"[{','.join(_in_quotes(item) if item and not _understood(item) else item for item in items)}]"
@@ -180,7 +182,7 @@ def _understood(value: str) -> list[Any]:
 
 
 def _with_quiet(arguments: list[str]) -> list[str]:
-    # just before the user's overrides: these win, and argparse accepts overrides only in one sequence
+    # These go directly before the user's overrides: later ones win, and argparse accepts only one sequence.
     for place, (before, argument) in enumerate(itertools.pairwise(arguments), 1):
         override = argument.startswith("~") or ("=" in argument and not argument.startswith("-"))
         if override and not before.startswith("--conf"):

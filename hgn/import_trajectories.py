@@ -1,4 +1,4 @@
-"""python -m hgn.import_trajectories from=FOLDER out=data/mine: a data set from the trajectories of another program.
+"""python -m hgn.import_trajectories from=FOLDER out=data/mine: makes a data set from another program's trajectories.
 
 Reads DeepMind's TFRecords, geoelements' npz, LagrangeBench's and NeuralMPM's HDF5, and plain npz or HDF5.
 """
@@ -17,7 +17,7 @@ from hgn.system.progress import bar
 
 
 def main(mapping: dict[str, Any]) -> int:
-    """Imports a set, prints its content and how to train on it; returns the exit code."""
+    """Imports a set, and prints its content and a command for training on it. Returns the exit code."""
     from hgn.data.foreign.dataset import import_set
 
     mapping = dict(mapping)

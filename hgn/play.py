@@ -1,6 +1,6 @@
-"""python -m hgn.play: a scene in the browser, live: pour, drag obstacles, go back, save; or a rollout file.
+"""python -m hgn.play: shows a scene in the browser, live (pour, drag obstacles, go back, save), or a rollout file.
 
-Prints the page's address, which has a token; Ctrl-C ends it.
+Prints the page's address, which contains a token. Ctrl-C ends the program.
 """
 
 from __future__ import annotations
@@ -22,23 +22,23 @@ from hgn.system.files import write_atomically
 if TYPE_CHECKING:
     from hgn.runtime.simulator import Simulator
 
-CPU_WEIGHTS = "obstacles_small"  # M = 2: a viewer waits for each frame
+CPU_WEIGHTS = "obstacles_small"  # two iterations a block (M = 2), because a viewer waits for each frame
 
 
 @dataclass(frozen=True)
 class PlayConfig(SimulatorConfig):
     """`python -m hgn.play`: a scene in the browser, live, or a rollout file."""
 
-    weights: str | None = None  # a file or the name of shipped ones; null: mechanics on a GPU, else obstacles_small
+    weights: str | None = None  # file or name of shipped weights; null: mechanics on a GPU, else obstacles_small
     scene: str = "play"  # a scene file, or the name of one in conf/example
-    rollout: str | None = None  # a file of hgn.rollout to look at instead
-    html: FileName | None = None  # with rollout: write a page that plays it by itself to this file, and end
-    every: Positive[int] = 2  # with html: of its frames
-    host: str = "127.0.0.1"  # to listen on; 0.0.0.0: whoever reaches this machine and has the token
-    port: Port = 8080  # or the next that is free; 0: any
+    rollout: str | None = None  # file of hgn.rollout, which is shown instead of a scene
+    html: FileName | None = None  # with rollout: file for a page that plays it without a server
+    every: Positive[int] = 2  # with html: the page has every `every`-th frame
+    host: str = "127.0.0.1"  # address of the server; 0.0.0.0 lets other machines with the token connect
+    port: Port = 8080  # port, or the next free one; 0: any free port
     browser: bool = True  # open the page in this machine's browser
-    particles: Positive[int] = 40_000  # at most
-    keep_mb: Positive[int] = 1024  # of past frames, to go back to and to save
+    particles: Positive[int] = 40_000  # largest number of particles
+    keep_mb: Positive[int] = 1024  # memory for past frames in MB, for going back and for saving
 
     def __post_init__(self) -> None:
         require_bounds(self)
@@ -46,7 +46,7 @@ class PlayConfig(SimulatorConfig):
 
 
 def main(mapping: dict[str, Any]) -> int:
-    """Serves the page until Ctrl-C, or writes the static one; returns the exit code."""
+    """Serves the page until Ctrl-C, or writes the static page. Returns the exit code."""
     config = from_mapping(PlayConfig, mapping)
     require_installed("viser")
     if config.html is not None:
@@ -56,7 +56,7 @@ def main(mapping: dict[str, Any]) -> int:
     if config.browser:
         webbrowser.open(page.address)
     try:
-        with contextlib.suppress(KeyboardInterrupt):  # the way to end it
+        with contextlib.suppress(KeyboardInterrupt):  # Ctrl-C is the normal end
             page.run()
     finally:
         page.close()
@@ -64,7 +64,7 @@ def main(mapping: dict[str, Any]) -> int:
 
 
 def play_page(config: PlayConfig) -> Any:
-    """A `hgn.viewer.page.PlayPage` of a scene. Raises: ConfigError, as loading and simulating the scene do."""
+    """Returns a `hgn.viewer.page.PlayPage` of a scene. Raises ConfigError as loading and simulating the scene do."""
     from hgn.runtime.simulator import Simulator
     from hgn.runtime.weights import shipped_weights
     from hgn.system.device import choose_device
@@ -88,7 +88,7 @@ def play_page(config: PlayConfig) -> Any:
 
 
 def film_page(config: PlayConfig) -> Any:
-    """A `hgn.viewer.film.FilmPage` of a rollout file. Raises: ConfigError for what is no such file."""
+    """Returns a `hgn.viewer.film.FilmPage` of a rollout file. Raises ConfigError for another file."""
     from hgn.scene.rollout_file import read_rollout
     from hgn.viewer.film import FilmPage
 

@@ -1,6 +1,6 @@
-"""python -m hgn.rollout: simulates a random scene with shipped weights and draws it; scene=… and weights=… take others.
+"""python -m hgn.rollout: simulates a random scene, or the scene of scene=…, and draws pictures.
 
-Writes a VTKHDF file, and pictures beside it.
+The network is that of shipped weights, or that of weights=…. The result is a VTKHDF file with pictures beside it.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ if TYPE_CHECKING:
     from hgn.runtime.weights import WeightsInfo
     from hgn.scene.rollout_file import Rollout
 
-PICTURES = 4  # in the PNG
+PICTURES = 4  # number of pictures in the PNG
 EVERY = 3  # frames of the rollout for one picture of the GIF
-SAME_SPEED = 1e-5  # of it: velocities are stored in float32
+SAME_SPEED = 1e-5  # relative difference of equal speeds, because velocities are stored in float32
 
 
 @dataclass(frozen=True)
@@ -44,14 +44,14 @@ class RolloutConfig(SimulatorConfig):
     weights: str = DEFAULT_WEIGHTS  # a file of python -m hgn.export, or the name of shipped weights
     # the file to write: .vtkhdf, .usdc, .usda, .usd (one stage) or .ply (one a frame); null: rollout/NAME.vtkhdf
     out: str | None = None
-    surface: bool = False  # water also as a closed surface, in USD and PLY
-    render: bool | None = None  # also draw pictures beside it, a PNG and a GIF; null: where out is null
+    surface: bool = False  # also write water as a closed surface, in USD and PLY
+    render: bool | None = None  # also draw a PNG and a GIF beside the file; null: if out is null
     # a scene file, or the name of one in conf/example, for example funnel; null: a random scene, or an episode
     scene: str | None = None
-    seed: NonNegative[int] = 0  # of a random scene, drawn from the distribution of the training scenes
-    data: str | None = None  # folder or URL of a data set, for episode
+    seed: NonNegative[int] = 0  # seed of a random scene, drawn from the distribution of the training scenes
+    data: str | None = None  # folder or URL of the data set of episode
     episode: str | None = None  # an episode of data to simulate, for example validation-000000
-    frames: FrameCount = 300  # frame 0 is the initial state
+    frames: FrameCount = 300  # number of frames; frame 0 is the initial state
 
     def __post_init__(self) -> None:
         require_bounds(self)
@@ -67,7 +67,7 @@ class RolloutConfig(SimulatorConfig):
 
 
 def main(mapping: dict[str, Any]) -> int:
-    """Simulates, writes the rollout file and its pictures; returns the exit code."""
+    """Simulates, and writes the rollout file and its pictures. Returns the exit code."""
     from hgn.render.pictures import animate, compare_picture, spread, write_picture
 
     config = from_mapping(RolloutConfig, mapping)
@@ -84,9 +84,10 @@ def main(mapping: dict[str, Any]) -> int:
 
 
 def rollout(config: RolloutConfig) -> tuple[Path, Rollout]:
-    """Simulates a scene, or an episode that is stored with its truth, and writes the file; returns path and content.
+    """Simulates a scene or an episode, writes the file, and returns its path and content.
 
-    Raises: ConfigError for bad input or a simulation that diverges; nothing is written then.
+    The file of an episode also has the episode's true positions. Raises ConfigError for bad input or a simulation that
+    diverges, and then writes nothing.
     """
     from hgn.render.exchange import require_exchange, save_rollout
     from hgn.runtime.divergence import DivergedError
@@ -109,7 +110,7 @@ def rollout(config: RolloutConfig) -> tuple[Path, Rollout]:
             print(note, file=sys.stderr)
         source["scene"] = config.scene or f"random, seed {config.seed}"
     else:
-        assert config.episode is not None  # RolloutConfig saw to it
+        assert config.episode is not None  # RolloutConfig checks this
         name = config.episode
         episode = find_episode(config.data, config.episode)
         require_frame_rate(simulator.info, episode.frame_rate_hz)
@@ -162,7 +163,7 @@ def _fastest(initial: InitialState) -> float:
 
 
 def _scene(config: RolloutConfig, info: WeightsInfo) -> tuple[str, Scene]:
-    """Returns a scene and its name: a scene file, an example, or a random scene like the training's."""
+    """Returns a scene and its name: a scene file, an example, or a random scene like those of the training."""
     if config.scene is not None:
         path = find_scene(config.scene)
         return path.stem, load_scene(path)
@@ -172,7 +173,7 @@ def _scene(config: RolloutConfig, info: WeightsInfo) -> tuple[str, Scene]:
     require(not imported, "data", rule, None, "for example data=data/mine episode=validation-000000")
     drawn = SceneConfig(gravity=info.gravity, cell_size=info.obstacle_cell_size, materials=info.network.materials)
     if not info.network.obstacle_features:
-        drawn = replace(drawn, obstacle_count=0, group_shapes=("cube",))  # as conf/scene/no_obstacles.yaml says
+        drawn = replace(drawn, obstacle_count=0, group_shapes=("cube",))  # as in conf/scene/no_obstacles.yaml
     return f"random_{config.seed}", generate_scene(drawn, config.seed)
 
 

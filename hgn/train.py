@@ -1,7 +1,7 @@
-"""python -m hgn.train +experiment=obstacles: trains a network, and generates the data it needs.
+"""python -m hgn.train +experiment=obstacles: trains a network, and generates its data.
 
-A run is a folder; the same command again resumes it. Ctrl-C, SIGTERM and SIGUSR1 end the run at the
-next update, after a checkpoint.
+A run is a folder. The same command resumes the run. After Ctrl-C, SIGTERM or SIGUSR1 the run saves a checkpoint at the
+next update and ends.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 
 def main(mapping: dict[str, Any]) -> int:
-    """Trains with the resolved configuration; returns the exit code."""
+    """Trains with the resolved configuration. Returns the exit code."""
     from hgn.training.dataset import PublishedEpisodes, is_complete, more_data, wait_for_episodes
     from hgn.training.distributed import default_run, first_on_machine, first_rank, layout
     from hgn.training.generator import Generator
@@ -43,7 +43,7 @@ def main(mapping: dict[str, Any]) -> int:
         mapping["run"] = str(default_run(name))
     config = from_mapping(TrainConfig, settings_of_imported(mapping))
     if not first_on_machine():
-        # ends this rank when the process that started it ends, without waiting for a time-out
+        # This ends the rank at the end of the process that started it, without a time-out.
         die_with_parent(signal.SIGKILL)
     layout(config.training)
     folder, run = config.dataset.folder, Path(config.run)
@@ -60,7 +60,7 @@ def main(mapping: dict[str, Any]) -> int:
         resume = _checkpoint_to_resume(config, run / "checkpoints")
         initial = _initial_network(config, resume)
         generator = None
-        # the service of a URL generates missing episodes itself
+        # A URL is a service that generates missing episodes itself.
         if first_rank() and config.training.generate and not is_remote(folder) and not is_complete(config):
             generator = Generator(config.datagen, run / "datagen")
             stack.callback(generator.stop)
@@ -75,9 +75,9 @@ def main(mapping: dict[str, Any]) -> int:
 
 
 def _checkpoint_to_resume(config: TrainConfig, folder: Path) -> Resume | None:
-    """Returns the run's last whole checkpoint, checked before anything is started; None without any.
+    """Returns the run's last whole checkpoint, or None without any checkpoint. Call it before anything is started.
 
-    Raises: DamagedError when there are some and none is whole.
+    Raises DamagedError if there are checkpoints and none is whole.
     """
     from hgn.training.checkpoint import LAST_NAMES, DamagedError, Progress, Resume, check_checkpoint, read_checkpoint
 
@@ -102,7 +102,7 @@ def _checkpoint_to_resume(config: TrainConfig, folder: Path) -> Resume | None:
 
 
 def _initial_network(config: TrainConfig, resume: Resume | None) -> ParticleNetwork | None:
-    """Returns the network of training.init_weights for a new run; a run that resumes takes its checkpoint's."""
+    """Returns the network of training.init_weights for a new run. A resumed run takes the network of its checkpoint."""
     from hgn.training.checkpoint import network_of_weights
     from hgn.training.distributed import first_rank
 

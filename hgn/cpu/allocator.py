@@ -1,7 +1,7 @@
 """Keeps memory that PyTorch frees on a CPU in the process, for the next frame.
 
-The GNU C library returns large blocks to the system, which then zeroes 18,000 pages in a frame of 4,296 particles: up
-to a quarter of the frame's time.
+The GNU C library returns large blocks to the system, which then sets 18,000 pages to zero in a frame of 4,296
+particles. This takes up to a quarter of the frame's time.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import functools
 import platform
 
 TRIM_THRESHOLD, MMAP_THRESHOLD = -1, -3  # parameters of mallopt in malloc.h
-LARGEST = 32 << 20  # bytes of a block; mallopt refuses more
+LARGEST = 32 << 20  # largest size of a block in bytes that mallopt takes
 
 
 @functools.cache

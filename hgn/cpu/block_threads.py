@@ -1,7 +1,7 @@
-"""Distributes blocks of work over the cores of a CPU; each thread computes whole blocks.
+"""Distributes blocks of work over the cores of a CPU. Each thread computes whole blocks.
 
-PyTorch would split every operation among its threads. Many operations of a frame are shorter than the waking of a
-sleeping thread.
+PyTorch would split every operation among its threads. Many operations of a frame take less time than a sleeping thread
+needs to wake up.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ from typing import TypeVar
 import torch
 
 Block = TypeVar("Block")
-MAXIMUM_THREADS = 8  # more threads wait for Python's lock, which each operation takes
+MAXIMUM_THREADS = 8  # further threads would wait for Python's lock, which each operation takes
 
 
 @contextmanager
 def single_threaded() -> Iterator[int]:
-    """Limits PyTorch to one thread in operations of this thread; yields the number of threads before."""
+    """Limits PyTorch to one thread in operations of this thread. Yields the earlier number of threads."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
@@ -31,9 +31,9 @@ def single_threaded() -> Iterator[int]:
 
 
 def for_each(work: Callable[[Block], None], blocks: Sequence[Block], threads: int) -> None:
-    """Calls `work` for each block, without gradients, on a number of threads that includes this one.
+    """Calls `work` for each block, without gradients, on `threads` threads including this one.
 
-    A free thread takes the next block. Blocks must write to disjoint memory. Raises: what `work` raises.
+    A free thread takes the next block. Blocks must write to disjoint memory. Raises the errors of `work`.
     """
     remaining, inference = iter(blocks), torch.is_inference_mode_enabled()
 
@@ -53,5 +53,5 @@ def for_each(work: Callable[[Block], None], blocks: Sequence[Block], threads: in
 
 @functools.lru_cache(1)
 def _pool(threads: int, process: int) -> ThreadPoolExecutor:
-    """Returns the threads of a process; a forked process needs its own."""
+    """Returns the threads of a process. A forked process needs its own threads."""
     return ThreadPoolExecutor(threads, "core", lambda: torch.set_num_threads(1))

@@ -1,6 +1,6 @@
-"""Rows of an MLP on a CPU in one pass, by rows.c; hgn.cpu.rows is the reference.
+"""Computes rows of an MLP on a CPU in one pass with rows.c; hgn.cpu.rows is the reference.
 
-PyTorch writes and reads every intermediate result of a block of rows; rows.c keeps a few rows at a time in the fastest
+PyTorch writes and reads every intermediate result of a block of rows. rows.c keeps a few rows at a time in the fastest
 cache from the gather to the sums. The machine's C compiler compiles rows.c for its CPU, once for each width, into
 `$XDG_CACHE_HOME/hgn/rows` (by default `~/.cache/hgn/rows`). Without a compiler PyTorch computes the rows.
 """
@@ -23,15 +23,15 @@ from hgn.cpu.rows import Hidden, Rows, Segments
 from hgn.system.files import sync_written, temporary_file
 
 SOURCE = Path(__file__).with_name("rows.c")
-# No flag changes the order of sums: the result of a row does not depend on the rows around it.
+# No flag changes the order of sums. The result of a row therefore does not depend on the rows around it.
 FLAGS = ("-std=gnu11", "-O3", "-march=native", "-fno-math-errno", "-ffp-contract=fast", "-shared", "-fPIC")
 LANES = 16  # float32 numbers in a vector of AVX-512
-WIDEST = 512  # largest width: two matrices lie on a thread's stack
+WIDEST = 512  # largest width whose two matrices fit on a thread's stack
 COMPILERS = ("cc", "gcc", "clang")
 
 
 def unsupported_reason(width: int, dtype: torch.dtype) -> str | None:
-    """Returns why rows cannot be computed by rows.c, or None."""
+    """Returns the reason for which rows.c cannot compute the rows, or None."""
     if dtype != torch.float32:
         return f"it computes float32, not {dtype}"
     if width % LANES or width > WIDEST:
@@ -45,13 +45,13 @@ def rows_class(width: int, dtype: torch.dtype) -> type[Rows]:
 
 
 def describe(width: int) -> str:
-    """Returns how float32 rows are computed, and why, for messages."""
+    """Returns a message about the computation of float32 rows, with the reason."""
     reason = unsupported_reason(width, torch.float32)
     return "rows compiled for this CPU" if reason is None else f"rows in PyTorch ({reason})"
 
 
 class CompiledRows(Rows):
-    """Computes rows of an MLP whose layers have equal widths; of other MLPs only projections."""
+    """Computes rows of an MLP whose layers have equal widths. For other MLPs it computes only projections."""
 
     def __init__(self, network: torch.nn.Module) -> None:
         super().__init__(network)
@@ -131,7 +131,7 @@ def _library(width: int) -> tuple[ctypes.CDLL | None, str | None]:
             if not compiler:
                 return None, f"it needs a C compiler: {', '.join(COMPILERS)} or CC=…"
             path.parent.mkdir(parents=True, exist_ok=True)
-            with temporary_file(path) as temporary:  # other processes may compile it at the same time
+            with temporary_file(path) as temporary:  # other processes may compile the file at the same time
                 command = [*compiler, *options, str(SOURCE), "-o", str(temporary)]
                 subprocess.run(command, check=True, capture_output=True, text=True)
                 sync_written(temporary)
@@ -139,7 +139,7 @@ def _library(width: int) -> tuple[ctypes.CDLL | None, str | None]:
         return _load(path), None
     except subprocess.CalledProcessError as error:
         return None, f"{compiler[0]} does not compile {SOURCE.name}: {error.stderr.strip()[:200]}"
-    except (OSError, RuntimeError) as error:  # no such compiler, no home folder, no permission
+    except (OSError, RuntimeError) as error:  # no compiler, no home folder, or no permission
         return None, str(error)
 
 
@@ -158,7 +158,7 @@ def _load(path: Path) -> ctypes.CDLL:
 
 
 def _cpu() -> list[str]:
-    """Returns what `-march=native` depends on, because machines may share the cache folder."""
+    """Returns the properties on which `-march=native` depends, because machines may share the cache folder."""
     lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").split("\n\n")[0].splitlines()
     fields = ("vendor_id", "cpu family", "model", "stepping", "flags", "CPU ", "Features")
     return [platform.machine(), *(line for line in lines if line.startswith(fields))]

@@ -1,9 +1,9 @@
-"""The forward pass of the hierarchical graph network on a CPU, in blocks of rows, each on one core; without gradients.
+"""Computes the forward pass of the hierarchical graph network on a CPU, in blocks of rows, without gradients.
 
-hgn.network.hgn is the reference. A block of a level is a run of cells with the edges that end in them: a message
-passing step computes its edges, their sums, the cell network and the products that the next step needs. Pairs of
-particles and cells are sorted by cell. So blocks write to disjoint rows, and the order of sums does not depend on the
-number of threads. Rows are computed in one pass by compiled C where there is a compiler (hgn.cpu.compiled).
+hgn.network.hgn is the reference. Each core computes whole blocks. A block of a level is a run of cells with the edges
+that end in them. A message passing step computes its edges, their sums, the cell network and the products for the next
+step. Pairs of particles and cells are sorted by cell. Blocks therefore write to disjoint rows, and the order of sums
+does not depend on the number of threads. With a compiler, C code computes rows in one pass (hgn.cpu.compiled).
 Shape legend: N particles, P pairs of particles and cells, C cells, E directed edges, W width.
 """
 
@@ -23,24 +23,24 @@ from hgn.network.features import ParticleState
 from hgn.network.grid import CORNER_83, DIRECTION_63, GridHierarchy, Level
 from hgn.network.hgn import HierarchicalGraphNetwork
 
-# Rows of edges or pairs in a block: at width 128 an intermediate result takes 2 MB. Smaller blocks fit into faster
-# caches, but each operation costs some microseconds of Python, during which all other threads wait, and compiled rows
-# transpose their matrices for each block.
+# The number of rows of edges or pairs in a block. At width 128 an intermediate result takes 2 MB. Smaller blocks fit
+# into faster caches. But each operation takes some microseconds of Python, during which all other threads wait, and
+# compiled rows transpose their matrices for each block.
 ROWS_AT_ONCE = 4096
-FEWEST_ROWS = 256  # of a block; for fewer, waking a thread takes longer than the work
+FEWEST_ROWS = 256  # rows of a block; for fewer rows, waking a thread takes longer than the work
 
 
 def prediction(
     network: HierarchicalGraphNetwork, state: ParticleState, origin_S3: torch.Tensor | None = None
 ) -> Prediction:
-    """Returns what the network's own `prediction` does, without gradients."""
+    """Returns the result of the network's own `prediction`, without gradients."""
     with torch.no_grad():
         return network.predicted(state, network.grid(state, origin_S3), partial(propagate, network))
 
 
 def propagate(network: HierarchicalGraphNetwork, particle_NW: torch.Tensor, grid: GridHierarchy) -> torch.Tensor:
     """Returns the decoder's output [N, 3 or 9] for latent particles: steps 1 to 12 of the paper."""
-    # From a cell to its parent's centre, in fine cells, as in hgn.network.hgn.
+    # The offset is from a cell to its parent's centre, in fine cells, as in hgn.network.hgn.
     parent_offset_83 = 0.5 - CORNER_83.to(particle_NW)
     rows_of = rows_class(network.config.width, particle_NW.dtype)
     with torch.no_grad(), single_threaded() as threads:
@@ -66,13 +66,13 @@ def propagate(network: HierarchicalGraphNetwork, particle_NW: torch.Tensor, grid
 
 
 class _Cells:
-    """A level in blocks of cells, each with the edges that end in them."""
+    """Holds a level in blocks of cells, each with the edges that end in them."""
 
     def __init__(self, level: Level, threads: int) -> None:
         count = level.cell_count
         self.blocks = _Blocks(level.receiver_E, count, threads)
-        # An edge sums rows of a table: all cells as senders, all cells as receivers, and the directions, which only the
-        # first step reads.
+        # An edge sums rows of a table. The table has all cells as senders, all cells as receivers, and the directions,
+        # which only the first step reads.
         ends_E3 = torch.stack([level.sender_E, level.receiver_E + count, level.direction_E + 2 * count], -1)
         self.ends_of_first, self.ends_of_others = self.blocks.indices(ends_E3), self.blocks.indices(ends_E3[:, :2])
         self.segments = self.blocks.segments()
@@ -89,7 +89,7 @@ def _passed(
     result_CW, hidden_CW, sum_CW = cell_CW.clone(), torch.empty_like(cell_CW), torch.zeros_like(cell_CW)
     own, hidden, sums = map(blocks.split, (result_CW, hidden_CW, sum_CW))
     edges: list[torch.Tensor | None] = [None] * len(blocks)
-    # A step reads the cells of other blocks as they were before it, so steps alternate between two tables.
+    # A step reads the values that the cells of other blocks had before it. Steps therefore use two tables in turn.
     tables = cell_CW.new_empty(2, 2 * count + len(DIRECTION_63), cell_CW.shape[1])
     tables[1, 2 * count :] = networks[0][0].project(2, -DIRECTION_63.to(cell_CW))
     ends = [(blocks.split(table[:count]), blocks.split(table[count : 2 * count])) for table in tables]
@@ -105,7 +105,7 @@ def _passed(
         edge, cell = networks[step]
         ends_E, each = (cells.ends_of_others, 2) if step else (cells.ends_of_first, 3)
         seen = Hidden(tables[(step + 1) % 2], ends_E[block], each, 2, edges[block])
-        # Each step adds its messages to the sums and to the edges; the edges of the last step are not needed.
+        # Each step adds its messages to the sums and to the edges. The edges of the last step are not needed.
         if step + 1 == len(networks):
             edge.add_sums(sums[block], seen, cells.segments[block])
         else:
@@ -158,12 +158,12 @@ def _to_children(
 
 
 def _to_cells(rows: Rows, particle_NW: torch.Tensor, grid: GridHierarchy, threads: int) -> torch.Tensor:
-    """Returns the finest cells [C, W]: step 1."""
+    """Returns the finest cells [C, W] (step 1 of the paper)."""
     particles, count = len(particle_NW), grid.levels[0].cell_count
     cell_P, pair_P = torch.sort(grid.cell_N8.flatten().int(), stable=True)  # takes half as long as int64
     blocks = _Blocks(cell_P, count, threads)
     ends = blocks.indices(torch.stack([pair_P >> 3, (pair_P & 7) + particles], -1))
-    # The products of the hidden layer with particles and with corners.
+    # The table has the products of the hidden layer with particles and with corners.
     table_NW = particle_NW.new_empty(particles + len(CORNER_83), particle_NW.shape[1])
     table_NW[particles:] = rows.project(1, CORNER_83.to(particle_NW), rows.first_bias)
     _project(rows, table_NW[:particles], threads, (0, particle_NW), (1, -grid.fraction_N3))
@@ -181,9 +181,9 @@ def _to_cells(rows: Rows, particle_NW: torch.Tensor, grid: GridHierarchy, thread
 def _to_particles(
     rows: Rows, decode: Rows, particle_NW: torch.Tensor, cell_CW: torch.Tensor, grid: GridHierarchy, threads: int
 ) -> torch.Tensor:
-    """Returns the decoder's output [N, 3 or 9]: steps 11 and 12."""
+    """Returns the decoder's output [N, 3 or 9] (steps 11 and 12 of the paper)."""
     count, others, particles = len(cell_CW), len(cell_CW) + len(CORNER_83), len(particle_NW)
-    # The products of the hidden layer with cells, corners and particles.
+    # The table has the products of the hidden layer with cells, corners and particles.
     table_KW = particle_NW.new_empty(others + particles, particle_NW.shape[1])
     _project(rows, table_KW[:count], threads, (0, cell_CW))
     table_KW[count:others] = rows.first_bias - rows.project(2, CORNER_83.to(particle_NW))
@@ -206,7 +206,7 @@ def _to_particles(
 
 
 def _project(rows: Rows, out_RW: torch.Tensor, threads: int, *values: tuple[int, torch.Tensor]) -> None:
-    """Writes the sum of products of parts of the first layer with values, without the bias."""
+    """Writes the sum of products of the first layer's parts with values, without the bias."""
     runs = _runs(len(out_RW), ROWS_AT_ONCE, threads)
     out, *split = (x.split_with_sizes(runs) for x in (out_RW, *(value for _, value in values)))
     (first, *others) = (part for part, _ in values)
@@ -220,7 +220,7 @@ def _project(rows: Rows, out_RW: torch.Tensor, threads: int, *values: tuple[int,
 
 
 class _Blocks:
-    """Splits cells into runs with about equal numbers of rows; rows are sorted by cell."""
+    """Splits cells into runs with about equal numbers of rows. The rows are sorted by cell."""
 
     def __init__(self, cell_R: torch.Tensor, count: int, threads: int) -> None:
         rows = len(cell_R)
@@ -229,7 +229,7 @@ class _Blocks:
         cut = torch.searchsorted(offset_C1, wanted).clamp_(max=count)
         places = [[0, 0], *torch.stack([cut, offset_C1[cut]], -1).tolist(), [count, rows]]
         places = [a for a, b in itertools.pairwise(places) if b[0] > a[0]] + places[-1:]
-        self.cells = [b[0] - a[0] for a, b in itertools.pairwise(places)]  # of each block
+        self.cells = [b[0] - a[0] for a, b in itertools.pairwise(places)]  # number of cells of each block
         self.rows = [b[1] - a[1] for a, b in itertools.pairwise(places)]
         self.offset = [offset_C1[a[0] : b[0] + 1] - a[1] for a, b in itertools.pairwise(places)]
 
@@ -250,7 +250,7 @@ class _Blocks:
 
 
 def _runs(rows: int, at_once: int, threads: int) -> list[int]:
-    """Returns the lengths of nearly equal runs of about `at_once` rows, equally many for each thread."""
+    """Returns the lengths of nearly equal runs of about `at_once` rows. Each thread gets the same number of runs."""
     count = -(-rows // (at_once * threads)) * threads
     count = max(1, min(count, rows // min(at_once, FEWEST_ROWS)))
     return [(i + 1) * rows // count - i * rows // count for i in range(count)]

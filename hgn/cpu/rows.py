@@ -1,6 +1,6 @@
-"""Rows of an MLP in PyTorch, without gradients: gathered from a table, multiplied, normalised and summed by segment.
+"""Computes rows of an MLP in PyTorch without gradients: gathers from a table, multiplies, normalises, sums by segment.
 
-The reference for hgn.cpu.compiled. Where only sums are needed, the gain and shift of the norm are applied to the sums.
+This is the reference for hgn.cpu.compiled. Where only sums are needed, gain and shift of the norm are applied to them.
 Shape legend: R rows, K rows of a table, S segments, W width.
 """
 
@@ -16,25 +16,25 @@ from hgn.network.mlp import MINIMUM_ROWS, MLP, linear
 
 
 class Hidden(NamedTuple):
-    """A hidden layer before its activation: the sum of `each` rows of a table, plus a part's product with a value."""
+    """Holds a hidden layer before its activation: sums of `each` rows of a table, plus a product with a value."""
 
     table_KW: torch.Tensor
-    chosen: torch.Tensor | None  # [R * each], int64; None: all rows of the table, which may be overwritten
+    chosen: torch.Tensor | None  # int64 [R * each]; None: all rows of the table, which may be overwritten
     each: int
     part: int = 0
-    value_RW: torch.Tensor | None = None  # None: no product
+    value_RW: torch.Tensor | None = None  # the factor of part `part` of the first layer; None: no product
 
 
 class Segments(NamedTuple):
-    """Runs of rows that are summed, each row times its weight."""
+    """Holds runs of rows that are summed, each row times its weight."""
 
     rows: int
     offset: torch.Tensor  # [S + 1], int64: first row of each run, then the number of rows
-    weight_R: torch.Tensor | None  # None: ones
+    weight_R: torch.Tensor | None  # None: all weights are one
 
 
 class Rows:
-    """An MLP of rows [R, W]. Its matrices are read once a frame: attributes of a module are slow."""
+    """Computes an MLP of rows [R, W]. It reads its matrices once a frame, because attributes of a module are slow."""
 
     def __init__(self, network: nn.Module) -> None:
         assert isinstance(network, MLP)
@@ -62,7 +62,7 @@ class Rows:
         return hidden.addmm_(value, self.parts[part])
 
     def finish(self, hidden: torch.Tensor) -> torch.Tensor:
-        """Returns the output for a hidden layer, which is overwritten."""
+        """Returns the output of a hidden layer, and overwrites the hidden layer."""
         out = _product(nn.functional.leaky_relu_(hidden, self.slope), self.second, self.second_bias)
         if self.norm is None:
             return out
@@ -70,7 +70,7 @@ class Rows:
         return torch.layer_norm(out, gain.shape, gain, shift, epsilon)
 
     def output(self, out_RW: torch.Tensor, hidden: Hidden, residual_RW: torch.Tensor | None = None) -> None:
-        """Writes the output, plus the residual, into `out_RW`, which may be the residual."""
+        """Writes the output plus the residual into `out_RW`, which may be the same tensor as the residual."""
         rows_RW = self.finish(self._hidden(hidden))
         if residual_RW is None:
             out_RW.copy_(rows_RW)
@@ -95,7 +95,7 @@ class Rows:
     def output_and_add_sums(
         self, sum_SW: torch.Tensor, hidden: Hidden, segments: Segments, residual_RW: torch.Tensor | None
     ) -> torch.Tensor:
-        """Returns the outputs plus the residual, which may be overwritten; adds the sums of the outputs to `sum_SW`."""
+        """Returns outputs plus residual, which it may overwrite. Adds the sums of the outputs to `sum_SW`."""
         assert segments.weight_R is None
         rows_RW = self.finish(self._hidden(hidden))
         sum_SW.add_(_summed(rows_RW, segments.offset))
@@ -113,12 +113,12 @@ class Rows:
 
     @cached_property
     def _centred(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """The second layer minus its mean over the outputs: the numerator of the norm."""
+        """Returns the second layer minus its mean over the outputs, which gives the numerator of the norm."""
         return self.second - self.second.mean(1, keepdim=True), self.second_bias - self.second_bias.mean()
 
 
 def _product(value: torch.Tensor, matrix: torch.Tensor, bias: torch.Tensor | None = None) -> torch.Tensor:
-    """Returns rows times a matrix plus bias; as in hgn.network.mlp.linear, the number of rows does not matter."""
+    """Returns rows times a matrix plus bias, independent of the number of rows, as hgn.network.mlp.linear."""
     if len(value) < MINIMUM_ROWS:
         return linear(value, matrix.T, bias)
     return torch.mm(value, matrix) if bias is None else torch.addmm(bias, value, matrix)
@@ -130,7 +130,7 @@ def _summed(
     weight_R: torch.Tensor | None = None,
     chosen: torch.Tensor | None = None,
 ) -> torch.Tensor:
-    """Returns sums of runs of rows, or of chosen rows, in one pass [S, W]."""
+    """Returns the sums [S, W] of runs of rows, or of chosen rows, in one pass."""
     chosen = _steps(len(table_KW)) if chosen is None else chosen
     result: torch.Tensor = torch.embedding_bag(
         table_KW, chosen, offset, per_sample_weights=weight_R, include_last_offset=True
@@ -140,6 +140,6 @@ def _summed(
 
 @lru_cache(64)
 def _steps(end: int, step: int = 1) -> torch.Tensor:
-    """Returns 0 to `end`, exclusive; blocks of the same size recur."""
+    """Returns the numbers from 0 to `end`, exclusive. They are cached, because blocks of the same size recur."""
     with torch.inference_mode(False):
         return torch.arange(0, end, step)

@@ -1,4 +1,4 @@
-"""Pictures of rollouts, and files for other programs."""
+"""Draws pictures of rollouts, and writes files for other programs."""
 
 USD_ENDINGS = (".usdc", ".usda", ".usd")
 PLY_ENDING = ".ply"

@@ -1,4 +1,4 @@
-"""The error of a rollout over time: its values and its plot.
+"""Computes and plots the error of a rollout over time.
 
 Shape legend: T frames, N particles.
 """
@@ -21,7 +21,7 @@ def error_curve(
 ) -> Image.Image:
     """Plots position errors over time on a logarithmic scale, one line for each entry of `error_T`.
 
-    error_T: float64 [T] by name, as `position_error` returns it. size: width and height in pixels.
+    error_T holds float64 [T] by name, as `position_error` returns it. size is width and height in pixels.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -32,7 +32,7 @@ def error_curve(
     shown = False
     for name, error in error_T.items():
         seconds = np.arange(len(error)) / frame_rate_hz
-        positive = np.where(error > 0, error, np.nan)  # frame 0 agrees exactly; a log scale has no zero
+        positive = np.where(error > 0, error, np.nan)  # frame 0 has no error, and a logarithmic scale no zero
         shown |= bool(np.isfinite(positive).any())
         if name in MATERIALS:
             color = tuple(MATERIAL_COLORS[MATERIALS.index(name)] * (0.85 if name == "snow" else 1.0))
@@ -54,10 +54,10 @@ def error_curve(
 def position_error(rollout: Rollout) -> dict[str, np.ndarray]:
     """Returns the position MSE of each frame against the ground truth, float64 [T] in squared domain units.
 
-    Keys: `all`, and every material if the scene has more than one. Squares are summed over axes and averaged over
-    particles, in the frames that both have.
+    Keys are `all`, and every material if the scene has more than one. Squares are summed over axes and averaged over
+    particles, for the frames that both have.
 
-    Raises: ConfigError if the rollout has no ground truth.
+    Raises ConfigError if the rollout has no ground truth.
     """
     if rollout.reference_TN3 is None:
         raise ConfigError("reference must be there to measure an error, got a rollout without ground truth")

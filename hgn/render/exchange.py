@@ -1,7 +1,7 @@
-"""Rollouts as files that other programs read: USD for Blender, Houdini and Omniverse, PLY sequences for any tool.
+"""Writes rollouts for other programs: USD for Blender, Houdini and Omniverse, PLY sequences for any tool.
 
-Both hold particles by material with velocities, the obstacles as meshes and, where asked for, water as a closed
-surface. Needs the extra `files` (usd-core, pysplashsurf); PLY without a surface needs nothing.
+Both formats hold particles by material with velocities, and the obstacles as meshes. On request they hold water as a
+closed surface. USD and surfaces need the extra `files` (usd-core, pysplashsurf).
 Shape legend: T frames, N particles, V vertices, F triangles.
 """
 
@@ -25,20 +25,20 @@ from hgn.schema import ConfigError
 from hgn.system.extras import require_installed
 from hgn.system.files import sync_folder, sync_written
 
-# Of the surface, in particle radii (half the spacing): with these it encloses the volume of a block of 8 particles a
-# cell within 4 %, as a lattice and as a random filling.
+# The values of the surface are in particle radii (half the spacing). With them the volume of a block of 8 particles a
+# cell is correct within 4 %, for a lattice and for a random filling.
 SMOOTHING_LENGTH, CUBE_SIZE, THRESHOLD = 3.0, 1.0, 0.6
 
 
 def save_rollout(
     path: str | Path, rollout: Rollout, surface: bool = False, progress: Callable[[], Any] = lambda: None
 ) -> Path:
-    """Writes `rollout` in the form that the name's ending asks for; returns the (first) file.
+    """Writes `rollout` in the format of the name's suffix, and returns the (first) file.
 
-    `.usdc`, `.usda`, `.usd`: one USD stage. `.ply`: NAME_0000.ply, NAME_0001.ply, …, NAME_obstacle_0.ply, …, and of an
-    obstacle that moves NAME_obstacle_0_0000.ply, ….
-    Anything else: VTKHDF. With `surface` USD and PLY also hold the fluid's surface; `progress` is called once a frame.
-    Raises: ConfigError for a surface in VTKHDF; ModuleNotFoundError without the extra `files`.
+    `.usdc`, `.usda`, `.usd`: one USD stage. `.ply`: NAME_0000.ply, NAME_0001.ply, …, NAME_obstacle_0.ply, …, and
+    NAME_obstacle_0_0000.ply, … for an obstacle that moves. Any other suffix: VTKHDF. With `surface` USD and PLY also
+    hold the fluid's surface. `progress` is called once a frame.
+    Raises ConfigError for a surface in VTKHDF, and ModuleNotFoundError without the extra `files`.
     """
     path = Path(path)
     require_exchange(path, surface)
@@ -60,7 +60,7 @@ def save_rollout(
 
 
 def require_exchange(path: Path, surface: bool) -> None:
-    """Raises what `save_rollout` would raise; call it before a simulation."""
+    """Raises the errors of a later `save_rollout`; call it before a simulation."""
     if path.suffix in USD_ENDINGS:
         require_installed("pxr")
     if surface:
@@ -70,9 +70,9 @@ def require_exchange(path: Path, surface: bool) -> None:
 
 
 def fluid_surface(position_N3: np.ndarray, spacing: float) -> tuple[np.ndarray, np.ndarray]:
-    """The closed surface around a fluid's particles, which lie `spacing` apart: float64 [V, 3], int32 [F, 3].
+    """Returns the closed surface around a fluid's particles with this spacing: float64 [V, 3], int32 [F, 3].
 
-    Marching cubes on SPH's density field, by splashsurf. Empty where there is no particle.
+    splashsurf computes it by marching cubes on SPH's density field. Without particles it is empty.
     """
     if not len(position_N3):
         return np.zeros((0, 3)), np.zeros((0, 3), np.int32)
@@ -111,7 +111,7 @@ def _write_usd(path: Path, rollout: Rollout, surface: bool, progress: Callable[[
     stage.SetEndTimeCode(rollout.frame_count - 1)
     world = UsdGeom.Xform.Define(stage, "/World")
     stage.SetDefaultPrim(world.GetPrim())
-    for name in ("obstacles", "particles"):  # prims without a type would lose the up axis in Blender
+    for name in ("obstacles", "particles"):  # in Blender, prims without a type would lose the up axis
         UsdGeom.Xform.Define(stage, f"/World/{name}")
     world.GetPrim().SetCustomDataByKey("gravity", Gf.Vec3d(*rollout.gravity))
 
@@ -171,14 +171,13 @@ def _write_usd(path: Path, rollout: Rollout, surface: bool, progress: Callable[[
 
 
 def _row_matrix(motion: Motion, time: float) -> list[list[float]]:
-    """The pose at a time for row vectors, as USD multiplies: (x, 1) M."""
+    """Returns the pose at a time for row vectors, which USD multiplies as (x, 1) M."""
     rotation_33, origin_3 = motion.transform(time)
     return [[*row, 0.0] for row in rotation_33.T.tolist()] + [[*origin_3.tolist(), 1.0]]
 
 
 def _identifiers(obstacles: Sequence[Obstacle]) -> list[str]:
-    """Names of prims, of which no two are alike: of a mesh file that is there several times all but the first have
-    their number behind."""
+    """Returns unique names of prims. Further copies of one mesh file have their number as a suffix."""
     from pxr import Tf
 
     names: list[str] = []

@@ -1,4 +1,4 @@
-"""Pictures of flat rollouts: their plane, seen straight on, without perspective or shadows.
+"""Draws flat rollouts: their plane, seen straight on, without perspective or shadows.
 
 Shape legend: N particles, P pixels.
 """
@@ -28,7 +28,7 @@ from hgn.schema import Vector
 
 
 class FlatCamera(Camera):
-    """Looks along z at the rectangle [0, domain_size[:2]], y up; every point is as far away as the others."""
+    """Looks along z at the rectangle [0, domain_size[:2]], y up. All points have the same distance."""
 
     def __init__(self, domain_size: Vector, size: int) -> None:
         margin = 0.02 * size
@@ -45,7 +45,7 @@ class FlatCamera(Camera):
 
 
 class FlatStage(Stage):
-    """Draws frames of particles in a plane; what obstacles cover of it is filled, and lies under the particles."""
+    """Draws frames of particles in a plane. Obstacles are filled areas under the particles."""
 
     camera_type = FlatCamera
 
@@ -61,7 +61,7 @@ class FlatStage(Stage):
 
     def _prepare_room(self, domain_size: Vector) -> None:
         camera = self.camera
-        self.layer_depth_LP = np.empty((0, camera.width * camera.height), np.float32)  # nothing lies before a particle
+        self.layer_depth_LP = np.empty((0, camera.width * camera.height), np.float32)  # nothing lies above a particle
         x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
         place_P2 = (np.stack((x.ravel(), y.ravel()), axis=1) - camera.offset) / (camera.scale, -camera.scale)
         box_2 = np.array(domain_size[:2])

@@ -1,4 +1,4 @@
-"""Pictures of rollouts: a grid of frames and an animation, each with the ground truth where there is one.
+"""Draws pictures of rollouts: a grid of frames and an animation, each with the ground truth if there is one.
 
 Shape legend: T frames, N particles.
 """
@@ -24,7 +24,7 @@ from hgn.scene.rollout_file import Rollout, obstacles_of_episode
 from hgn.schema import ConfigError
 from hgn.system.files import write_atomically
 
-RADIUS_IN_SPACINGS = 0.72  # spheres that overlap a little look like a body, not like a cloud
+RADIUS_IN_SPACINGS = 0.72  # the spheres overlap a little, so that they look like a body
 TEXT_COLOR = (45, 50, 60)
 PALETTE_SAMPLES = 40_000
 WEBP_QUALITY = 70  # at 50 small particles smear, and at 90 the file is as large as a GIF
@@ -41,10 +41,10 @@ def compare_picture(
 ) -> Image.Image:
     """Draws a grid with one column for each frame: the prediction in the first row, the ground truth in the last.
 
-    size: width of a panel in pixels. label: name of the first row. others: positions float32 [T, N, 3] of the same
-    particles from other simulations, by name; each is a row between the two.
+    size is the width of a panel in pixels. label names the first row. others holds positions float32 [T, N, 3] of the
+    same particles from other simulations, by name. Each of them is a row between the two.
 
-    Raises: ConfigError if a frame lies outside the rollout or an entry of `others` has other particles.
+    Raises ConfigError if a frame lies outside the rollout or an entry of `others` has other particles.
     """
     check_frames(frames, rollout.frame_count)
     stage = _stage(rollout, size)
@@ -84,11 +84,11 @@ def animate(
 ) -> None:
     """Writes an animation of every `every`-th frame, with the prediction and the ground truth in adjacent panels.
 
-    path: a .gif or .webp file; WebP is half as large and keeps all colours. fps: pictures per second, None for real
-    time; GIF rounds the duration of a picture to 1/100 s, WebP to 1/1000 s. size: width of a panel in pixels.
+    path: a .gif or .webp file. WebP is half as large and keeps all colours. fps: pictures per second, None for real
+    time. GIF rounds the duration of a picture to 1/100 s, WebP to 1/1000 s. size: width of a panel in pixels.
     progress: called with the number of pictures drawn and their total. label, others: as in `compare_picture`.
 
-    Raises: ConfigError if fps exceeds what viewers play (GIF 50, WebP 60), if every is below 1, or if an entry of
+    Raises ConfigError if fps exceeds the limit of viewers (GIF 50, WebP 60), if every is below 1, or if an entry of
     `others` has other particles.
     """
     webp = Path(path).suffix == ".webp"
@@ -135,7 +135,7 @@ def animate(
 
 
 def write_picture(path: str | Path, picture: Image.Image | bytes, source: Mapping[str, object] | None = None) -> None:
-    """Writes a PNG, or the given bytes, atomically. `source` is stored as JSON in the PNG's Description."""
+    """Writes a PNG, or the given bytes, atomically. The PNG's Description holds `source` as JSON."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     if isinstance(picture, Image.Image):
@@ -151,14 +151,14 @@ def write_picture(path: str | Path, picture: Image.Image | bytes, source: Mappin
 def particle_spacing(position_N3: np.ndarray) -> float:
     """Returns the distance between neighbours in the bulk, in the unit of the positions.
 
-    It is the median distance to the third neighbour: exact in a cubic lattice away from its corners, 11 % too small for
-    random points.
+    It is the median distance to the third neighbour. This is exact in a cubic lattice away from its corners, and 11 %
+    too small for random points.
     """
     position_N3 = position_N3[np.isfinite(position_N3).all(axis=1)]
     from scipy.spatial import KDTree
 
     if len(position_N3) < 4:
-        return 1 / 128  # the usual eight particles in a cell of 1/64
+        return 1 / 128  # spacing of the usual eight particles in a cell of 1/64
     sample_N3 = position_N3[:: max(1, len(position_N3) // 2000)]
     return max(float(np.median(KDTree(position_N3).query(sample_N3, k=4)[0][:, 3])), 1e-6)
 
@@ -259,7 +259,7 @@ def _animation_picture(
         picture.paste(_panel(stage, position_TN3, frame, rollout), (x, header))
         _write(picture, (x + width / 2, header / 2), label, 6 * text // 5)
     seconds = f"t = {frame / rollout.frame_rate_hz:.2f} s"
-    if len(versions) == 1:  # the legend is as wide as the picture
+    if len(versions) == 1:  # here the legend takes the whole width
         _write(picture, (width - gap, header / 2), seconds, text, anchor="rm")
     else:
         _write(picture, (gap, picture.height - header / 2), seconds, text, anchor="lm")
@@ -268,9 +268,9 @@ def _animation_picture(
 
 
 class _Palette:
-    """The 256 colours of an animation.
+    """Holds the 256 colours of an animation.
 
-    Flat colours and the shades of each material are exact. Median cut chooses the others; half of its samples are
+    Flat colours and the shades of each material are exact. Median cut chooses the others. Half of its samples are
     pixels that change, so that a few particles on a large floor keep their colours.
     """
 
@@ -288,7 +288,7 @@ class _Palette:
         chosen = Image.fromarray(np.concatenate(samples)[None], "RGB").quantize(free_colors).getpalette() or []
         exact = np.concatenate((flat, [TEXT_COLOR])).astype(np.uint8)
         self.colors = np.concatenate((exact, np.reshape(chosen, (-1, 3))[:free_colors].astype(np.uint8)))
-        # the nearest colour for the upper six bits of each channel; the search of Pillow is coarser
+        # This table has the nearest colour for the upper six bits of each channel. The search of Pillow is coarser.
         center = np.stack(np.meshgrid(*[np.arange(64) * 4 + 1.5] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
         from scipy.spatial import KDTree
 
@@ -342,7 +342,7 @@ def _legend(picture: Image.Image, y: float, rollout: Rollout, text_size: int) ->
 def _write(
     picture: Image.Image, place: tuple[float, float], text: str, size: int, anchor: str = "mm", halo: int = 0
 ) -> None:
-    """Draws text. halo: width in pixels of a border in the background colour, for text over obstacles."""
+    """Draws text. halo is the width in pixels of a border in the background colour, for text over obstacles."""
     ImageDraw.Draw(picture).text(
         place,
         text,
@@ -356,7 +356,7 @@ def _write(
 
 @functools.cache
 def _font(size: int) -> ImageFont.FreeTypeFont:
-    """Returns the font that Pillow contains."""
+    """Returns the font that Pillow includes."""
     font = ImageFont.load_default(size)
     assert isinstance(font, ImageFont.FreeTypeFont)
     return font

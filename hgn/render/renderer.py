@@ -1,9 +1,9 @@
-"""A small software renderer for particles among translucent obstacles: NumPy only, one core, no display.
+"""Renders particles among translucent obstacles in software: NumPy only, one core, no display.
 
-A `Stage` is set up once for a domain and its obstacles (camera, floor, obstacle layers, their shadows) and then
-draws frame after frame. Particles are shaded sphere impostors, drawn far to near; each pixel keeps up to
-LAYERS obstacle surfaces by depth, blended with the particle that lies before, between or behind them.
-Everything is drawn at twice the size and averaged down.
+A `Stage` is set up once for a domain and its obstacles (camera, floor, layers and shadows of obstacles) and then draws
+frame after frame. Particles are shaded sphere impostors, drawn from far to near. Each pixel keeps up to LAYERS obstacle
+surfaces by depth, and blends them with the particle before, between or behind them. The renderer draws at twice the
+size and averages down.
 
 Shape legend: N particles, P pixels, S fragments (pixels of one triangle or sphere), F triangles, L layers.
 """
@@ -20,12 +20,12 @@ from hgn.scene.scene import Obstacle, all_corners
 from hgn.scene.surface import area_vectors
 from hgn.schema import Vector
 
-# colours as sRGB in [0, 1]; one a material, in the order of hgn.scene.material.MATERIALS
+# Colours are sRGB in [0, 1], one for each material in the order of hgn.scene.material.MATERIALS.
 MATERIAL_COLORS = np.array([(0.13, 0.45, 0.86), (0.87, 0.60, 0.20), (0.70, 0.81, 0.93), (0.36, 0.66, 0.38)], np.float32)
-# of the other materials that imported sets bring, over and over
+# These colours repeat for the other materials of imported sets.
 _FURTHER = np.array([(0.80, 0.29, 0.53), (0.93, 0.83, 0.30), (0.56, 0.42, 0.75), (0.45, 0.45, 0.48)], np.float32)
 _GLOSS = np.array((0.30, 0.06, 0.12, 0.20))
-PARTICLE_COLORS = np.concatenate([MATERIAL_COLORS, np.tile(_FURTHER, (64, 1))])[:256]  # by a rollout's indices
+PARTICLE_COLORS = np.concatenate([MATERIAL_COLORS, np.tile(_FURTHER, (64, 1))])[:256]  # by a rollout's material indices
 PARTICLE_GLOSS = np.concatenate([_GLOSS, np.full(256, 0.12)])[:256]
 OBSTACLE_COLOR = np.array((0.60, 0.58, 0.62), np.float32)
 BACKGROUND_COLOR = np.array((1.0, 1.0, 1.0), np.float32)
@@ -37,16 +37,16 @@ BOX_COLOR = (150, 156, 166)
 SUPERSAMPLING = 2
 LAYERS = 4
 OBSTACLE_OPACITY = 0.34
-CREASE_DEG = 35.0  # between faces; below it a surface is shaded smoothly
+CREASE_DEG = 35.0  # angle between faces below which a surface is shaded smoothly
 AZIMUTH_DEG, ELEVATION_DEG = 28.0, 20.0
-CAMERA_DISTANCE = 3.4  # in domain diagonals; far enough for calm perspective
+CAMERA_DISTANCE = 3.4  # in domain diagonals; a large distance gives a weak perspective
 LIGHT = np.array((-0.30, 1.0, 0.28)) / np.linalg.norm((-0.30, 1.0, 0.28))  # points towards the light
-SHADOW_CELLS = 160  # of the map on the floor, along its longer side
+SHADOW_CELLS = 160  # cells of the map on the floor along its longer side
 FRAGMENTS_AT_ONCE = 2_000_000
 
 
 class Camera:
-    """A perspective camera that looks at the box [0, domain_size], y up, and fits it into `size` pixels width.
+    """Looks in perspective at the box [0, domain_size], y up, and fits it into a width of `size` pixels.
 
     `width` and `height` are those of the supersampled picture.
     """
@@ -60,7 +60,7 @@ class Camera:
         self.axes = np.stack((right, np.cross(back, right), back))  # rows: right, up, towards the viewer
         box = np.array(domain_size)
         self.eye = box / 2 + back * CAMERA_DISTANCE * np.linalg.norm(box)
-        self.nearest = float(0.3 * CAMERA_DISTANCE * np.linalg.norm(box))  # what comes closer is not drawn
+        self.nearest = float(0.3 * CAMERA_DISTANCE * np.linalg.norm(box))  # nearer points are not drawn
         self.scale, self.offset = 1.0, np.zeros(2)
         corner_83 = box_corners(domain_size)
         xy, _ = self.project(corner_83)
@@ -72,24 +72,24 @@ class Camera:
         self.offset = np.array((self.width, self.height)) / 2 - (low + high) / 2 * self.scale
 
     def project(self, point_N3: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Pixel coordinates [N, 2] (y down) and distances along the view axis [N]."""
+        """Returns pixel coordinates [N, 2] (y down) and distances along the view axis [N]."""
         local_N3 = (point_N3 - self.eye) @ self.axes.T
         depth_N = -local_N3[:, 2]
         flat = local_N3[:, :2] / depth_N[:, None] * (1.0, -1.0)
         return flat * self.scale + self.offset, depth_N
 
     def rays(self) -> np.ndarray:
-        """Directions through all pixel centres, row by row, not normalised: [P, 3]."""
+        """Returns directions through all pixel centres, row by row, not normalised: [P, 3]."""
         x, y = np.meshgrid(np.arange(self.width) + 0.5, np.arange(self.height) + 0.5)
         flat = (np.stack((x.ravel(), y.ravel()), axis=1) - self.offset) / self.scale
         return np.stack((flat[:, 0], -flat[:, 1], np.full(len(flat), -1.0)), axis=1) @ self.axes
 
 
 class Stage:
-    """Draws frames of particles in one domain, among obstacles that stay until `place` is called.
+    """Draws frames of particles in one domain, among obstacles that stay until a call of `place`.
 
-    domain_size and particle_radius in domain units; size is the width of the picture in pixels, its height
-    follows from the domain.
+    domain_size and particle_radius are in domain units. size is the width of the picture in pixels. The height follows
+    from the domain.
     """
 
     camera_type: type[Camera] = Camera
@@ -102,18 +102,18 @@ class Stage:
         self.place(obstacles)
 
     def place(self, obstacles: Sequence[Obstacle]) -> None:
-        """Places obstacles where they are."""
+        """Replaces the obstacles."""
         self._prepare_obstacles(obstacles)
         self._prepare_background()
         self._prepare_box(self.domain_size)
 
     @property
     def size(self) -> tuple[int, int]:
-        """Width and height of the pictures in pixels."""
+        """Returns the width and the height of the pictures in pixels."""
         return self.camera.width // SUPERSAMPLING, self.camera.height // SUPERSAMPLING
 
     def draw(self, position_N3: np.ndarray, material_N: np.ndarray) -> Image.Image:
-        """One frame as an RGB picture; particles that are not finite or ten domains away are left out."""
+        """Returns one frame as an RGB picture. Omits particles that are not finite or ten domains away."""
         camera = self.camera
         near = (np.abs(position_N3) < 10 * max(self.domain_size)).all(axis=1)
         position_N3, material_N = position_N3[near].astype(np.float64), material_N[near]
@@ -129,16 +129,16 @@ class Stage:
 
     def _prepare_shadow_map(self, domain_size: Vector) -> None:
         self.map_cell = max(domain_size[0], domain_size[2]) / SHADOW_CELLS
-        # light slants, so the shadows of high particles land beside the floor; the map need not hold those
+        # The light is slanted, so that shadows of high particles fall beside the floor. The map omits them.
         self.map_shape = tuple(math.ceil(domain_size[axis] / self.map_cell) for axis in (2, 0))
 
     def _to_map(self, point_N3: np.ndarray) -> np.ndarray:
-        """Returns where the shadow of a point falls on the floor, in map cells: [N, 2] as (x, z)."""
+        """Returns the place of each point's shadow on the floor, in map cells: [N, 2] as (x, z)."""
         fall_N1 = point_N3[:, 1:2] / LIGHT[1]
         return (point_N3[:, ::2] - fall_N1 * LIGHT[::2]) / self.map_cell
 
     def _map_index(self, point_N3: np.ndarray) -> np.ndarray:
-        """The map cell below each point, -1 outside."""
+        """Returns the map cell of each point's shadow, -1 outside the map."""
         column_N, row_N = np.floor(self._to_map(point_N3)).astype(np.int64).T
         rows, columns = self.map_shape
         inside_N = (column_N >= 0) & (column_N < columns) & (row_N >= 0) & (row_N < rows)
@@ -158,7 +158,7 @@ class Stage:
 
         xy, depth = camera.project(corner_F33.reshape(-1, 3))
         triangle_S, pixel_S, weight_S3 = fragments(xy.reshape(-1, 3, 2), camera.width, camera.height)
-        # 1 / depth is linear on the screen
+        # 1 / depth is linear on the screen.
         inverse_S3 = weight_S3 / depth.reshape(-1, 3)[triangle_S]
         inverse_S = inverse_S3.sum(axis=1)
         depth_S = (1 / inverse_S).astype(np.float32)
@@ -183,15 +183,15 @@ class Stage:
 
     def _obstacle_shade(self, normal_S3: np.ndarray) -> np.ndarray:
         facing_S3 = normal_S3 / np.maximum(np.linalg.norm(normal_S3, axis=1, keepdims=True), 1e-12)
-        # triangles of sheets and of unoriented meshes are lit from whichever side is seen
+        # Sheets and unoriented meshes have no outer side. The side that is seen is lit.
         away_S = facing_S3 @ self.camera.axes[2] < 0
         facing_S3 = np.where(away_S[:, None], -facing_S3, facing_S3)
         return (0.62 + 0.55 * np.clip(facing_S3 @ LIGHT, -0.35, 1.0)).astype(np.float32)
 
     def _darken_outlines(self, triangle_P: np.ndarray, unit_F3: np.ndarray) -> None:
-        """Lines where the nearest obstacle surface jumps or has a crease, so that bodies read as bodies.
+        """Draws lines where the nearest obstacle surface jumps or has a crease, to show the shapes of bodies.
 
-        triangle_P: the nearest triangle of each pixel, -1 for none; unit_F3: normals of the triangles.
+        triangle_P is the nearest triangle of each pixel, -1 for none. unit_F3 are the normals of the triangles.
         """
         shape = (self.camera.height, self.camera.width)
         depth = np.where(triangle_P >= 0, self.layer_depth_LP[0], 1e3).reshape(shape)
@@ -203,13 +203,13 @@ class Stage:
             )
             crease = np.abs((normal[first] * normal[second]).sum(axis=-1)) < math.cos(math.radians(CREASE_DEG))
             edge[first] |= crease
-            # a second difference: steep planes have large first differences everywhere
+            # This is a second difference, because a steep plane has large first differences everywhere.
             inner = tuple(slice(1, -1) if a == axis else slice(None) for a in (0, 1))
             edge[inner] |= np.abs(np.diff(depth, 2, axis=axis)) > 6.0 / self.camera.scale * depth.min()
         self.layer_shade_LP[0, edge.ravel() & (triangle_P >= 0)] *= 0.45
 
     def _prepare_room(self, domain_size: Vector) -> None:
-        """Floor and walls, without obstacles and shadows."""
+        """Draws floor and walls, without obstacles and shadows."""
         self._prepare_shadow_map(domain_size)
         camera = self.camera
         ray_P3 = camera.rays()
@@ -237,7 +237,7 @@ class Stage:
         self.floor_cell_P = row * columns + column
 
     def _prepare_background(self) -> None:
-        """The room behind the obstacles' layers, with their shadow on the floor."""
+        """Draws the room behind the obstacles' layers, with the obstacles' shadow on the floor."""
         pixel_count = len(self.room_P3)
         through_P = np.ones(pixel_count, np.float32)
         gathered_P3 = np.zeros((pixel_count, 3), np.float32)
@@ -251,11 +251,11 @@ class Stage:
         obstacle_shadow = self.map_obstacle.ravel()[self.floor_cell_P]
         self.background_P3[self.floor_P] *= (1 - 0.20 * obstacle_shadow)[:, None]
         self.empty_P3 = to_bytes(gathered_P3 + through_P[:, None] * self.background_P3)
-        # what a floor pixel loses when the floor turns black there
+        # This is the loss of a floor pixel if the floor turns black there.
         self.floor_share_P3 = 255 * through_P[self.floor_P, None] * self.background_P3[self.floor_P]
 
     def _prepare_box(self, domain_size: Vector) -> None:
-        """The box's edges: the far ones under everything, the near ones over the finished picture."""
+        """Prepares the box's edges: far ones under everything, near ones over the finished picture."""
         camera = self.camera
         corner_83 = box_corners(domain_size)
         xy, _ = camera.project(corner_83)
@@ -263,8 +263,8 @@ class Stage:
         back = Image.fromarray(self.empty_P3.reshape(camera.height, camera.width, 3), "RGB")
         over, under = ImageDraw.Draw(front), ImageDraw.Draw(back)
         for a, b in BOX_EDGES:
-            # the eye is nearest to the corner at all far ends: other edges bound only faces turned away from it, or
-            # the silhouette
+            # The eye is nearest to the corner at all far ends. Other edges are on the silhouette, or bound only faces
+            # turned away from the eye.
             near = a.bit_count() == 2
             target, color = (over, (*BOX_COLOR, 120)) if near else (under, BOX_COLOR)
             target.line([tuple(xy[a]), tuple(xy[b])], fill=color, width=SUPERSAMPLING)
@@ -274,11 +274,11 @@ class Stage:
     # the parts that change with every frame
 
     def _cast_shadows(self, picture_P3: np.ndarray, position_N3: np.ndarray) -> np.ndarray:
-        """Darkens the floor below particles; gives each particle's share of light in [0, 1]."""
+        """Darkens the floor below particles. Returns each particle's share of light in [0, 1]."""
         cell_N = self._map_index(position_N3)
         inside_N = cell_N >= 0
         count = np.bincount(cell_N[inside_N], minlength=len(self.map_top)).reshape(self.map_shape)
-        area = (self.map_cell / (2 * self.radius)) ** 2  # particles that fill one map cell
+        area = (self.map_cell / (2 * self.radius)) ** 2  # number of particles that fill one map cell
         sigma = max(1.5, 1.5 * self.radius / self.map_cell)
         cover = _blurred(np.minimum(count / max(area, 1.0), 2.0).astype(np.float32), sigma)
         if area < 1:
@@ -302,7 +302,7 @@ class Stage:
     ) -> None:
         camera = self.camera
         xy_N2, depth_N = camera.project(position_N3)
-        order = np.argsort(-depth_N)  # far first: later ones overwrite
+        order = np.argsort(-depth_N)  # far first, because later particles overwrite earlier ones
         order = order[depth_N[order] > camera.nearest]
         xy_N2, depth_N = xy_N2[order].astype(np.float32), depth_N[order].astype(np.float32)
         radius_N = np.maximum(self.radius * camera.scale / depth_N, 1.1 * SUPERSAMPLING).astype(np.float32)
@@ -355,25 +355,25 @@ class Stage:
         picture_P3[pixel_S] = to_bytes(color_S3)
 
 
-# of its corners' numbers, see below: the second has one more coordinate at its far end
+# An edge joins two of the box's corners. The second corner has one more coordinate at its far end, see box_corners.
 BOX_EDGES = [(a, a | 1 << axis) for a in range(8) for axis in range(3) if not a >> axis & 1]
 
 
 def box_corners(domain_size: Vector) -> np.ndarray:
-    """The corners of [0, domain_size], [8, 3]; corner i has coordinate axis at its far end where bit axis is set."""
+    """Returns the corners of [0, domain_size], [8, 3]. Bit `axis` of i is set if corner i is at the axis's far end."""
     return np.array([[(i >> axis) & 1 for axis in range(3)] for i in range(8)]) * np.array(domain_size)
 
 
 def to_bytes(color: np.ndarray) -> np.ndarray:
-    """Colours in [0, 1] as uint8, clipped."""
+    """Returns colours in [0, 1] as uint8, clipped."""
     return (np.clip(color, 0, 1) * 255 + 0.5).astype(np.uint8)
 
 
 def smooth_normals(corner_F33: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Unit normals of triangles, float64 [F, 3], zero for those without area, and normals at their corners, float64
-    [F, 3, 3]: averaged over the neighbours that bend less than a crease.
+    """Returns unit normals of triangles, float64 [F, 3], and smoothed normals at their corners, float64 [F, 3, 3].
 
-    Corners at the same place count as shared, so meshes need not share vertices.
+    A triangle without area has a zero normal. The smoothed normals average over neighbours that bend less than a
+    crease. Corners at the same place count as shared, so that meshes need not share vertices.
     """
     area_F3 = area_vectors(corner_F33)
     unit_F3 = area_F3 / np.maximum(np.linalg.norm(area_F3, axis=1, keepdims=True), 1e-30)
@@ -382,7 +382,7 @@ def smooth_normals(corner_F33: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     start = np.flatnonzero(np.diff(place.ravel()[order], prepend=-1))
     size = np.diff(np.append(start, len(order)))
     smooth = np.zeros((len(order), 3))
-    # each corner against the corners around its place, one distance in the sorted order at a time
+    # Each step compares the corners with the corners at the same place one distance further in the sorted order.
     largest = int(size.max())
     first_of = np.repeat(start, size)
     size_of = np.repeat(size, size)
@@ -397,9 +397,9 @@ def smooth_normals(corner_F33: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def fragments(corner_F32: np.ndarray, width: int, height: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Pixels whose centres lie in triangles given in pixel coordinates [F, 3, 2].
+    """Returns the pixels whose centres lie in triangles with the pixel coordinates [F, 3, 2].
 
-    Returns: triangle index [S], pixel index (row by row) [S], barycentric weights [S, 3].
+    The results are triangle index [S], pixel index (row by row) [S], and barycentric weights [S, 3].
     """
     low = np.clip(np.floor(corner_F32.min(axis=1)), 0, (width, height)).astype(np.int64)
     high = np.clip(np.ceil(corner_F32.max(axis=1)), 0, (width, height)).astype(np.int64)
@@ -428,13 +428,13 @@ def fragments(corner_F32: np.ndarray, width: int, height: int) -> tuple[np.ndarr
 
 
 def _edge(point: np.ndarray, start: np.ndarray, end: np.ndarray) -> np.ndarray:
-    """Twice the signed area of (start, end, point)."""
+    """Returns twice the signed area of (start, end, point)."""
     return (end[:, 0] - start[:, 0]) * (point[:, 1] - start[:, 1]) - (end[:, 1] - start[:, 1]) * (
         point[:, 0] - start[:, 0]
     )
 
 
 def _blurred(image: np.ndarray, sigma: float) -> np.ndarray:
-    from scipy.ndimage import gaussian_filter  # SciPy takes half a second to import
+    from scipy.ndimage import gaussian_filter  # imported here, because SciPy takes half a second to import
 
     return np.asarray(gaussian_filter(image, sigma))

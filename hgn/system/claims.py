@@ -1,4 +1,4 @@
-"""Comparison of what a file claims to contain with its size, before memory is allocated for it."""
+"""Compares the content that a file claims with its size, before memory is allocated for it."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from typing import Any
 
 from hgn.schema import ConfigError
 
-SMALL_BYTES = 64 << 20  # that any file may claim
+SMALL_BYTES = 64 << 20  # bytes that any file may claim
 EXPANSION = 100  # bytes that a byte of a larger file may claim: arrays of zeros compress well
-MOST_ITEMS = 10_000_000  # of nested lists, with references resolved
+MOST_ITEMS = 10_000_000  # largest number of items of nested lists, with references resolved
 
 
 class Claims:
-    """Adds up the bytes that the content of a file claims; one object a reading of the file."""
+    """Adds up the bytes that the content of a file claims. Each reading of a file needs one object."""
 
     def __init__(self, file: Path | str, file_bytes: int | None = None) -> None:
         self._file = file
@@ -26,9 +26,9 @@ class Claims:
         self._sum = 0
 
     def add(self, name: object, *counts: int) -> None:
-        """Adds the product of `counts`, the last of which is the size of an item.
+        """Adds the product of `counts`. The last count is the size of an item.
 
-        Raises: ConfigError naming the file and `name`, once the sum is more than the file can contain.
+        Raises ConfigError with the file and `name` when the sum exceeds the possible content of the file.
         """
         self._sum += math.prod(map(int, counts)) if min(counts, default=0) >= 0 else self._most + 1
         if self._sum > self._most:
@@ -39,9 +39,9 @@ class Claims:
 
 
 def require_plain_pickle(data: bytes, names: re.Pattern[str] = re.compile(".*")) -> None:
-    """Checks the sizes in a pickle, which Python allocates before it reads on, and what it calls (`module name`).
+    """Checks the sizes in a pickle, for which Python allocates memory at once, and its calls (`module name`).
 
-    Raises: ValueError for a pickle that is cut, has a memo larger than itself, or calls other than `names`.
+    Raises ValueError for a pickle that is cut, has a memo larger than itself, or calls other names than `names`.
     """
     for operation, argument, _ in pickletools.genops(data):
         if "PUT" in operation.name and int(argument or 0) > len(data):
@@ -51,7 +51,7 @@ def require_plain_pickle(data: bytes, names: re.Pattern[str] = re.compile(".*"))
 
 
 def require_few_items(value: Any) -> None:
-    """Checks the number of items of nested lists. Raises: ValueError for more than MOST_ITEMS, references resolved."""
+    """Checks the number of items of nested lists. Raises ValueError for more than MOST_ITEMS, references resolved."""
     if (count := count_items(value)) > MOST_ITEMS:
         raise ValueError(f"references that stand for {count:.3g} items")
 
@@ -63,7 +63,7 @@ def _parts(value: Any) -> Iterable[Any] | None:
 def count_items(
     value: Any, parts: Callable[[Any], Iterable[Any] | None] = _parts, counts: dict[int, float] | None = None
 ) -> float:
-    """Returns the number of values in one, references resolved; infinity for one that contains itself."""
+    """Returns the number of values in `value`, references resolved, or infinity if it contains itself."""
     counts = {} if counts is None else counts
     if (inner := parts(value)) is None:
         return 1

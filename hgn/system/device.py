@@ -1,4 +1,4 @@
-"""Choice of the device that a command computes on."""
+"""Chooses the device on which a command computes."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from hgn.system.machine import available_cpus
 
 
 def choose_device(name: str) -> torch.device:
-    """Returns a torch device: `auto` is CUDA where available; else torch's names (cpu, cuda, cuda:1).
+    """Returns a torch device. `auto` is CUDA if it is available; other names are torch's (cpu, cuda, cuda:1).
 
-    Also limits CPU threads to a container's quota. Raises: ConfigError when the device does not exist.
+    Limits CPU threads to a container's quota. Raises ConfigError if the device does not exist.
     """
     keep_to_quota()
     if name == "auto":
@@ -28,9 +28,9 @@ def choose_device(name: str) -> torch.device:
 
 
 def keep_to_quota() -> None:
-    """Limits PyTorch's threads to a container's CPU quota, beyond which all threads are throttled together.
+    """Limits PyTorch's threads to a container's CPU quota. Above the quota the system would slow all threads.
 
-    A value of OMP_NUM_THREADS is kept.
+    A value of OMP_NUM_THREADS takes precedence.
     """
     if "OMP_NUM_THREADS" not in os.environ and available_cpus() < torch.get_num_threads():
         torch.set_num_threads(available_cpus())

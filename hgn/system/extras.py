@@ -1,11 +1,11 @@
-"""The extra that installs a missing package."""
+"""Names the extra that installs a missing package."""
 
 from __future__ import annotations
 
 import importlib.util
 import sys
 
-# as in pyproject.toml
+# The same names are in pyproject.toml.
 EXTRA_OF = {
     "taichi": "datagen",
     "lightning": "train",
@@ -40,6 +40,6 @@ def missing_extra(error: ModuleNotFoundError) -> str | None:
 
 
 def require_installed(package: str) -> None:
-    """Checks for a package that is imported hours after a command's start. Raises: ModuleNotFoundError."""
+    """Checks for a package that a command imports hours after its start. Raises ModuleNotFoundError."""
     if importlib.util.find_spec(package) is None:
         raise ModuleNotFoundError(f"No module named {package!r}", name=package)

@@ -1,4 +1,4 @@
-"""Atomic file operations: files appear whole or not at all."""
+"""Reads and writes files atomically: a file appears whole or not at all."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 TEMPORARY_SUFFIX = ".partial"
-_LOST_AT_MOST = 10  # retries
+_LOST_AT_MOST = 10  # number of retries
 
 
 def temporary_path(path: Path) -> Path:
-    """Returns a unique name beside `path` for writing it; a crash leaves only a file that ends in `.partial`.
+    """Returns a unique name beside `path` for writing it. A crash leaves only a file that ends in `.partial`.
 
     Names are random, because containers on several machines may have equal process numbers.
     """
@@ -30,7 +30,7 @@ def temporary_target(path: Path) -> str:
 
 @contextlib.contextmanager
 def temporary_file(path: Path) -> Iterator[Path]:
-    """A temporary name beside `path` for writing it, removed at the end unless the caller renamed it.
+    """Yields a temporary name beside `path` for writing it, and removes the file unless the caller renamed it.
 
     An OSError that names no file (a full disk) names `path`.
     """
@@ -45,7 +45,7 @@ def temporary_file(path: Path) -> Iterator[Path]:
 def write_atomically(path: Path, data: bytes) -> None:
     """Writes `data` to a temporary name in the same folder, syncs it and renames it to `path`.
 
-    Raises: OSError (a full disk, no permission); nothing is left behind then and an existing `path` is unchanged.
+    Raises OSError (a full disk, no permission). It then leaves no new file, and an existing `path` is unchanged.
     """
     with temporary_file(path) as temporary:
         with temporary.open("wb") as file:
@@ -56,9 +56,9 @@ def write_atomically(path: Path, data: bytes) -> None:
 
 
 def read_replaced(path: Path) -> bytes:
-    """Reads a file that other machines replace; retries where NFS has lost the file that was opened.
+    """Reads a file that other machines replace. Retries if NFS has lost the opened file.
 
-    Raises: OSError.
+    Raises OSError.
     """
     for attempt in range(_LOST_AT_MOST + 1):
         try:
@@ -71,14 +71,14 @@ def read_replaced(path: Path) -> bytes:
 
 
 def open_at_once(path: Path) -> BinaryIO:
-    """Opens a file for reading. A pipe, where reading would wait for ever, is empty."""
+    """Opens a file for reading. A pipe counts as empty, because reading it would wait for ever."""
     return open(path, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK))
 
 
 def write_json(path: Path | str, value: Any, allow_nan: bool = True) -> None:
-    """Writes `value` as indented JSON, atomically; makes the folder where it is missing.
+    """Writes `value` as indented JSON, atomically, and makes a missing folder.
 
-    Raises: OSError as write_atomically does; ValueError for a number that JSON does not know, unless `allow_nan`.
+    Raises OSError as write_atomically does, and ValueError for a number outside JSON, unless `allow_nan`.
     """
     path = Path(path)
     make_folder(path.parent)
@@ -88,7 +88,7 @@ def write_json(path: Path | str, value: Any, allow_nan: bool = True) -> None:
 def require_place(path: Path) -> None:
     """Checks, before long work, that `path` can be written; creates nothing.
 
-    Raises: OSError, as writing would, where `path` is a folder, leads through a file, or its folder is closed to us.
+    Raises OSError if `path` is a folder, leads through a file, or lies in a folder without permission.
     """
     folder = next(folder for folder in path.absolute().parents if folder.exists())
     for wrong, number, place in (
@@ -105,7 +105,7 @@ def make_folder(path: Path) -> None:
     missing = [folder for folder in (path, *path.parents) if not folder.exists()]
     path.mkdir(parents=True, exist_ok=True)
     for folder in missing:
-        with contextlib.suppress(PermissionError):  # to open the folder above
+        with contextlib.suppress(PermissionError):  # no permission to open the folder above
             sync_folder(folder.parent)
 
 

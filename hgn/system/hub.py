@@ -1,7 +1,7 @@
-"""The Hugging Face Hub: `hf://USER/NAME[@REVISION][/PATH]` is weights, `hf://datasets/USER/NAME` a data set.
+"""Reads the Hugging Face Hub: `hf://USER/NAME[@REVISION][/PATH]` is weights, `hf://datasets/USER/NAME` a data set.
 
-Data sets are read by HTTP ranges from the Hub's file addresses. Weights are downloaded by huggingface_hub to its cache.
-$HF_ENDPOINT is another server, $HF_TOKEN the token for private repositories.
+Data sets are read by HTTP ranges from the Hub's file addresses. huggingface_hub downloads weights to its cache.
+$HF_ENDPOINT names another server, and $HF_TOKEN is the token for private repositories.
 """
 
 from __future__ import annotations
@@ -30,16 +30,16 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class HubPlace:
-    """A place in a repository of the Hub."""
+    """Names a place in a repository of the Hub."""
 
     repository: str  # USER/NAME
     revision: str
-    path: str  # in the repository; empty: its root
+    path: str  # path in the repository; an empty path is the repository's root
     is_dataset: bool
 
     @staticmethod
     def parse(url: str, field: str) -> HubPlace:
-        """Parses an address. Raises: ConfigError naming `field`."""
+        """Parses an address. Raises ConfigError with `field`."""
         match = _PATTERN.fullmatch(url)
         if match is None:
             rule = "an address as hf://USER/NAME or hf://datasets/USER/NAME, @REVISION and /PATH may follow"
@@ -48,7 +48,7 @@ class HubPlace:
 
     @property
     def address(self) -> str:
-        """The URL of its files."""
+        """Returns the URL of the repository's files."""
         kind = "datasets/" if self.is_dataset else ""
         return f"{endpoint()}/{kind}{self.repository}/resolve/{quote(self.revision, safe='')}/{self.path}".rstrip("/")
 
@@ -67,9 +67,9 @@ def hub_token() -> str | None:
 def hub_weights(url: str, field: str = "weights", patience_s: float = _PATIENCE_S) -> Path:
     """Downloads a weights file of a repository, the named or the only one, to huggingface_hub's cache.
 
-    Raises: ConfigError where there is none, or several, or access is refused, or the server stays away.
+    Raises ConfigError if there is no file, or several, if access is refused, or if the server stays away.
     """
-    import huggingface_hub  # slow to import, and an extra
+    import huggingface_hub  # slow to import, and optional
 
     place = HubPlace.parse(url, field)
     if place.is_dataset:
@@ -90,7 +90,7 @@ def hub_weights(url: str, field: str = "weights", patience_s: float = _PATIENCE_
 
 
 def _patiently(ask: Callable[[], T], url: str, field: str, patience_s: float) -> T:
-    """Retries while the server is away: huggingface_hub's and httpx' errors are no OSErrors."""
+    """Retries while the server is away. The errors of huggingface_hub and httpx are not OSErrors."""
     try:
         return patiently(ask, lambda error: _passing(error, url, field), url, endpoint(), patience_s)
     except UnreachableError as error:
@@ -101,7 +101,7 @@ def _patiently(ask: Callable[[], T], url: str, field: str, patience_s: float) ->
 
 
 def _passing(error: Exception, url: str, field: str) -> str | None:
-    """Returns the cause of an error that may pass, or None for any other. Raises: ConfigError for a permanent one."""
+    """Returns the cause of an error that may pass, or None for any other. Raises ConfigError for a permanent one."""
     from huggingface_hub import errors
 
     status = getattr(getattr(error, "response", None), "status_code", None)

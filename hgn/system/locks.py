@@ -1,4 +1,4 @@
-"""File locks, of whole files and of bytes. The kernel releases the locks of a process that ends, however it ends."""
+"""Locks files, or bytes of files. The kernel releases the locks of a process at its end, even after a crash."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from typing import IO, Any
 from hgn.schema import ConfigError
 from hgn.system.files import make_folder
 
-NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP, errno.EINVAL)  # of file systems without locks
+NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP, errno.EINVAL)  # errors of file systems without locks
 
 
 def lock_file(file: IO[Any] | int) -> bool:
-    """Locks a file; returns False if another process has the lock. Raises: OSError with one of NO_LOCKS."""
+    """Locks a file. Returns False if another process has the lock. Raises OSError with one of NO_LOCKS."""
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
@@ -27,13 +27,13 @@ def lock_file(file: IO[Any] | int) -> bool:
 
 
 def lock_bytes(file: int, kind: int, start: int, length: int = 1, wait: bool = False) -> bool:
-    """Locks bytes of an open file, which need not exist; returns False if others have them and it may not wait.
+    """Locks bytes of an open file, which need not exist. Returns False if others have the lock and `wait` is False.
 
-    kind: fcntl.F_RDLCK (shared), F_WRLCK (alone) or F_UNLCK. Raises: OSError with one of NO_LOCKS.
+    kind is fcntl.F_RDLCK (shared), F_WRLCK (exclusive) or F_UNLCK. Raises OSError with one of NO_LOCKS.
     """
     try:
         if hasattr(fcntl, "F_OFD_SETLK"):
-            # a lock of the open file, not of the process: two generators in one process exclude each other too
+            # The lock belongs to the open file, so that two generators in one process exclude each other too.
             request = struct.pack("hhqqi4x", kind, os.SEEK_SET, start, length, 0)
             fcntl.fcntl(file, fcntl.F_OFD_SETLKW if wait else fcntl.F_OFD_SETLK, request)
         else:
@@ -48,9 +48,9 @@ def lock_bytes(file: int, kind: int, start: int, length: int = 1, wait: bool = F
 
 @contextlib.contextmanager
 def locked(path: Path, field: str, refusal: str) -> Iterator[None]:
-    """Locks a file for this process, and its folder, in case somebody deletes the file.
+    """Locks a file for this process, and its folder too, because another user may delete the file.
 
-    Raises: ConfigError `<field> must be ...`, with `refusal`, when another process has the lock. On a file system
+    Raises ConfigError `<field> must be ...`, with `refusal`, if another process has the lock. On a file system
     without locks every process succeeds.
     """
     make_folder(path.parent)
@@ -61,7 +61,7 @@ def locked(path: Path, field: str, refusal: str) -> Iterator[None]:
             try:
                 free = lock_file(opened)
             except OSError as error:
-                if error.errno not in (*NO_LOCKS, errno.EBADF):  # the last of folders on NFS
+                if error.errno not in (*NO_LOCKS, errno.EBADF):  # EBADF is the error of folders on NFS
                     raise
                 free = True
             if not free:

@@ -1,7 +1,7 @@
-"""The cores, the memory and the folders that this process may use, within a container's limits.
+"""Finds the cores, the memory and the folders that this process may use, within a container's limits.
 
-Containers are limited by control groups (Linux, cgroups(7)): a process sees all cores and all memory of the machine, is
-throttled beyond its CPU quota, and killed beyond its memory limit.
+Control groups (Linux, cgroups(7)) limit containers. A process in a container sees all cores and all memory of the
+machine. The system slows it above its CPU quota, and kills it above its memory limit.
 """
 
 from __future__ import annotations
@@ -13,27 +13,25 @@ import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
-ROOT = Path("/")  # of the file system
+ROOT = Path("/")  # root of the file system
 
 
 def available_cpus() -> int:
-    """Returns the cores that this process may use: its CPU affinity, at most its groups' quota, rounded up."""
+    """Returns the number of usable cores: the CPU affinity, but at most the groups' quota, rounded up."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     quotas = [quota for group in _groups("cpu") if (quota := _quota(group)) is not None]
     return max(1, min([cores, *(math.ceil(quota) for quota in quotas)]))
 
 
 def available_memory() -> int:
-    """Returns the bytes of memory that this process may use: the machine's, or its groups' smallest limit."""
+    """Returns the bytes of usable memory: the machine's memory, or the groups' smallest limit."""
     machine = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     limits = [_read(group / name) for group in _groups("memory") for name in ("memory.max", "memory.limit_in_bytes")]
     return min([machine, *(int(limit) for limit in limits if limit not in (None, "max"))])
 
 
 def writable_folder(usual: Path, name: str) -> Path:
-    """Returns a cache's usual folder, or where that cannot be written to (in a container, say) a temporary folder
-    NAME-UID that belongs to this user.
-    """
+    """Returns a cache's usual folder, or a temporary folder NAME-UID of this user if the usual one is not writable."""
     existing = next((folder for folder in (usual, *usual.parents) if os.path.lexists(folder)), usual)
     if usual.is_absolute() and existing.is_dir() and os.access(existing, os.W_OK | os.X_OK):
         return usual
@@ -44,11 +42,11 @@ def writable_folder(usual: Path, name: str) -> Path:
 
 
 def _groups(controller: str) -> Iterator[Path]:
-    """Yields the folders of this process's control groups, down from the outermost visible one."""
+    """Yields the folders of this process's control groups, from the outermost visible one inwards."""
     folder = ROOT / "sys" / "fs" / "cgroup"
     for line in (_read(ROOT / "proc" / "self" / "cgroup") or "").splitlines():
         _, controllers, own = line.split(":", 2)
-        if not controllers:  # version 2: one tree for all controllers
+        if not controllers:  # version 2 has one tree for all controllers
             mount = folder
         elif controller in controllers.split(","):
             mount = folder / controllers if (folder / controllers).is_dir() else folder / controller
@@ -58,7 +56,7 @@ def _groups(controller: str) -> Iterator[Path]:
         group = mount
         for part in Path(own.lstrip("/")).parts:
             group = group / part
-            if part == ".." or not group.is_dir():  # a container may see only its own group, as the outermost
+            if part == ".." or not group.is_dir():  # a container may see only its own group as the outermost
                 break
             yield group
 
@@ -73,7 +71,7 @@ def _quota(group: Path) -> float | None:
 
 
 def _read(file: Path) -> str | None:
-    """Returns the text of a file, or None where it does not exist or cannot be read: no known limit."""
+    """Returns the text of a file, or None if it does not exist or cannot be read. None means no known limit."""
     try:
         return file.read_text(encoding="ascii").strip()
     except OSError:
@@ -81,7 +79,7 @@ def _read(file: Path) -> str | None:
 
 
 def allow_open_files(wanted: int) -> int:
-    """Raises this process's limit of open files towards `wanted`; returns the limit."""
+    """Raises this process's limit of open files up to `wanted`. Returns the limit."""
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     limit = max(soft, min(wanted, hard)) if hard != resource.RLIM_INFINITY else max(soft, wanted)
     resource.setrlimit(resource.RLIMIT_NOFILE, (limit, hard))

@@ -1,6 +1,6 @@
-"""Retries for storage that does not answer, with growing pauses, until patience ends.
+"""Retries requests to storage that does not answer, with growing pauses, for a limited time.
 
-`HGN_PATIENCE_S` is the patience in seconds; default: two minutes.
+`HGN_PATIENCE_S` is this time in seconds. The default is two minutes.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ VARIABLE = "HGN_PATIENCE_S"
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.25, 10.0
 
 T = TypeVar("T")
-without = threading.Event()  # set: no thread waits any more
+without = threading.Event()  # while this is set, no thread waits
 
 
 class UnreachableError(OSError):
-    """A server did not answer within the patience."""
+    """Reports a server that did not answer within the patience."""
 
     def __init__(self, url: str, patience_s: float, cause: str) -> None:
         self.cause = cause
@@ -34,7 +34,7 @@ class UnreachableError(OSError):
 
 
 def standard_patience_s() -> float:
-    """Returns the seconds for which storage may be away. Raises: ConfigError for a variable that is no number."""
+    """Returns the seconds for which storage may be away. Raises ConfigError for a variable that is not a number."""
     given = os.environ.get(VARIABLE, "120")
     number = float(given) if given.replace(".", "", 1).isdecimal() else math.nan
     require(0 <= number <= 1e6, VARIABLE, "a number of seconds from 0 to 1000000", given)
@@ -52,16 +52,16 @@ def inside(event: threading.Event) -> Iterator[None]:
 
 
 def without_patience() -> contextlib.AbstractContextManager[None]:
-    """Inside it no thread of this process waits for a server that does not answer."""
+    """Returns a context in which no thread of this process waits for a server that does not answer."""
     return inside(without)
 
 
 def patiently(
     ask: Callable[[], T], passing: Callable[[Exception], str | None], url: str, server: str, patience_s: float
 ) -> T:
-    """Returns `ask()`, retried while `passing` returns the cause of its error; None marks a permanent error.
+    """Returns `ask()`, and retries it while `passing` returns the cause of its error. None marks a permanent error.
 
-    Raises: UnreachableError naming `url`; a permanent error.
+    Raises UnreachableError with `url`, or a permanent error.
     """
     start, pause, warned = time.monotonic(), FIRST_PAUSE_S, False
     while True:
@@ -77,5 +77,5 @@ def patiently(
                 warned = True
                 text = f"{server} does not answer ({cause}); retrying for {patience_s:.0f} s"
                 print(printable(text), file=sys.stderr)
-            without.wait(pause * random.uniform(0.5, 1.0))  # readers must not return all at the same moment
+            without.wait(pause * random.uniform(0.5, 1.0))  # spreads the readers' retries in time
             pause = min(2 * pause, LONGEST_PAUSE_S)

@@ -1,4 +1,4 @@
-"""Child processes that end with their parent."""
+"""Starts child processes that end with their parent."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnProcess
 from typing import Any, BinaryIO
 
-PR_SET_PDEATHSIG = 1  # linux/prctl.h
+PR_SET_PDEATHSIG = 1  # from linux/prctl.h
 
 
 def die_with_parent(number: int) -> None:
@@ -25,10 +25,10 @@ def die_with_parent(number: int) -> None:
 
 
 class Program:
-    """A command in a process group of its own: Ctrl-C reaches only this process. It gets SIGINT when this one ends."""
+    """Runs a command in its own process group. Ctrl-C reaches only this process, which sends SIGINT when it ends."""
 
     def __init__(self, command: Sequence[str], output: BinaryIO, text: str = "") -> None:
-        """Starts it with `text` as its input; `output` is the file of its messages."""
+        """Starts the command with `text` as its input. `output` is the file of its messages."""
         self.output = output
         self._process = subprocess.Popen(
             command,
@@ -39,16 +39,16 @@ class Program:
             process_group=0,
         )
         assert self._process.stdin is not None
-        with contextlib.suppress(BrokenPipeError), self._process.stdin:  # where it has ended already
+        with contextlib.suppress(BrokenPipeError), self._process.stdin:  # the command may have ended already
             self._process.stdin.write(text.encode())
 
     @property
     def exit_code(self) -> int | None:
-        """None while it runs."""
+        """Returns the exit code, or None while the command runs."""
         return self._process.poll()
 
     def stop(self, patience_s: float = 0.0) -> None:
-        """Ends its group: as Ctrl-C does if there is patience, and then by SIGKILL."""
+        """Ends the group by SIGKILL, and with patience before that by SIGINT, as Ctrl-C does."""
         for number in (signal.SIGINT, signal.SIGKILL)[patience_s == 0 :]:
             if self.exit_code is None:
                 os.killpg(self._process.pid, number)
@@ -57,7 +57,7 @@ class Program:
 
 
 def last_message(file: BinaryIO) -> str:
-    """Returns the last line of a program's output that is no JSON."""
+    """Returns the last line of a program's output that is not JSON."""
     file.seek(0, os.SEEK_END)
     file.seek(max(file.tell() - 8192, 0))
     lines = map(str.strip, file.read().decode("utf-8", "replace").splitlines())
@@ -67,9 +67,9 @@ def last_message(file: BinaryIO) -> str:
 def start_child(
     target: Callable[..., None], *arguments: Any, number: int = signal.SIGKILL, duplex: bool = True, daemon: bool = True
 ) -> tuple[SpawnProcess, Connection]:
-    """Starts `target(connection, *arguments)` in a process of its own, and returns it with this end of the connection.
+    """Starts `target(connection, *arguments)` in a new process, and returns it with this end of the connection.
 
-    The child gets the signal `number` when this process is gone. It is spawned, as a forked Taichi hangs.
+    The child gets the signal `number` when this process ends. It is spawned, because a forked Taichi hangs.
     """
     context = multiprocessing.get_context("spawn")
     connection, child = context.Pipe(duplex)
@@ -80,13 +80,13 @@ def start_child(
 
 
 def cause_of_exit(process: SpawnProcess) -> str:
-    """Returns in words how a process ended."""
+    """Returns a description of a process's end."""
     code = process.exitcode or 0
     return f"ended by {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
 
 
 def _run(target: Callable[..., None], number: int, connection: Connection, *arguments: Any) -> None:
-    die_with_parent(number)  # elsewhere than on Linux a child ends when it next touches its closed pipe
+    die_with_parent(number)  # on other systems a child ends when it next uses its closed pipe
     parent = multiprocessing.parent_process()
     if sys.platform == "linux" and (parent is None or os.getppid() != parent.pid):
         os._exit(0)

@@ -1,4 +1,4 @@
-"""Progress: a bar on a terminal, a line every 15 seconds elsewhere."""
+"""Shows progress: a bar on a terminal, a line every 15 seconds elsewhere."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class _Lines:
 
 
 def bar(what: str, total: int | None, initial: int = 0, unit: str = "it") -> tqdm[Any]:
-    """Returns a tqdm bar on stderr; without a terminal it prints at most a line every 15 seconds."""
+    """Returns a tqdm bar on stderr. Without a terminal it prints at most a line every 15 seconds."""
     terminal = sys.stderr.isatty()
     return tqdm(
         total=total,

@@ -1,4 +1,4 @@
-"""The origin of a file or a figure: versions, commit, date, machine."""
+"""Describes the origin of a file or a figure: versions, commit, date, machine."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ if TYPE_CHECKING:
     import torch
 
 PACKAGES = ("torch", "triton", "lightning", "taichi", "numpy")
-# matches /a/b/c, but not the path of a URL
+# This matches /a/b/c, but not the path of a URL.
 _ABSOLUTE_PATH = re.compile(r"(?<![\w.:/~-])/(?:[^/\s,='\"\[\](){}]+/)*([^/\s,='\"\[\](){}]+)/?")
 
 
 def commit() -> str:
-    """Returns $HGN_COMMIT (for copies without history), else the checkout's commit, with `+changes` where files differ
-    from it, else `unknown`.
-    """
+    """Returns $HGN_COMMIT (for copies without history), or else the checkout's commit.
+
+    The commit has the suffix `+changes` if files differ from it. Without a commit the result is `unknown`."""
     return os.environ.get("HGN_COMMIT") or commit_of(Path(__file__).resolve().parents[2])
 
 
 def commit_of(folder: Path) -> str:
-    """Returns the commit of a checkout, with `+changes` where files differ from it; `unknown` for another folder."""
+    """Returns the commit of a checkout, with `+changes` if files differ from it, or `unknown` for another folder."""
     if not (folder / ".git").exists():
         return "unknown"
     try:

@@ -1,6 +1,7 @@
-"""Reads YAML and JSON files that people write: strictly, because much of YAML 1.1 is a surprise.
+"""Reads YAML and JSON files that people write. It is strict, because much of YAML 1.1 is unexpected.
 
-A key given twice would replace the first, 010 would be eight, and 1:30 ninety; all are refused with key and line.
+In YAML 1.1 a repeated key would replace the first one, 010 would be eight, and 1:30 ninety. This module refuses all of
+these and names the key and the line.
 """
 
 from __future__ import annotations
@@ -17,8 +18,8 @@ import yaml
 from hgn.schema import ConfigError
 from hgn.system.claims import count_items
 
-MAXIMUM_NODES = 100_000  # of a file
-LINES_BYTES = 250_000  # of a JSON file, in which a repeated key is looked for: YAML takes a CPU second for 50 kB
+MAXIMUM_NODES = 100_000  # nodes of a file
+LINES_BYTES = 250_000  # bytes of a JSON file for this search, because YAML takes a CPU second for 50 kB
 _OCTAL = re.compile(r"[-+]?0[0-7_]*[1-7][0-7_]*")
 _SEXAGESIMAL = re.compile(r"[-+]?[0-9][0-9_]*(:[0-5]?[0-9])+(\.[0-9_]*)?")
 
@@ -26,12 +27,12 @@ _SEXAGESIMAL = re.compile(r"[-+]?[0-9][0-9_]*(:[0-5]?[0-9])+(\.[0-9_]*)?")
 def read_yaml(path: Path) -> Any:
     """Returns the content of a YAML file as plain containers.
 
-    Raises: ConfigError, one line that starts with the path, for a file that cannot be read, a repeated key, octal and
+    Raises ConfigError, one line that starts with the path, for: a file that cannot be read, a repeated key, octal or
     sexagesimal numbers, and aliases that expand to more than MAXIMUM_NODES values.
     """
     try:
         return _load(path.read_text(encoding="utf-8"))
-    except (yaml.YAMLError, ValueError, RecursionError) as error:  # a number of thousands of digits, nesting
+    except (yaml.YAMLError, ValueError, RecursionError) as error:  # for example thousands of digits, or deep nesting
         mark = getattr(error, "problem_mark", None)
         place = f"line {mark.line + 1}, column {mark.column + 1}: " if mark else ""
         cause = str(getattr(error, "problem", None) or error).splitlines()
@@ -39,13 +40,13 @@ def read_yaml(path: Path) -> Any:
 
 
 def read_json(path: Path) -> Any:
-    """Returns the content of a JSON file. Raises: ValueError for another file, or a key given twice."""
+    """Returns the content of a JSON file. Raises ValueError for another file, or for a repeated key."""
     text = path.read_text("utf-8")
 
     def unique(pairs: Sequence[tuple[str, Any]]) -> dict[str, Any]:
         if len(dict(pairs)) < len(pairs):
             if len(text) < LINES_BYTES:
-                _load(text.replace("\t", " "))  # finds key and line
+                _load(text.replace("\t", " "))  # raises an error with key and line
             raise ValueError(f"a key is given twice, one of {', '.join(dict(pairs))[:100]}")
         return dict(pairs)
 
@@ -60,7 +61,7 @@ def _load(text: str) -> Any:
 
 
 class _Loader(yaml.SafeLoader):
-    """Reads 1e5 as a number, as YAML 1.2 does; PyYAML requires 1.0e+5."""
+    """Reads 1e5 as a number, as YAML 1.2 does. PyYAML requires 1.0e+5."""
 
     def get_single_node(self) -> yaml.Node | None:
         node = super().get_single_node()
@@ -78,7 +79,7 @@ def _parts(node: Any) -> Any:
 
 
 def _check(node: yaml.Node, name: str, visited: set[int]) -> None:
-    """Refuses repeated keys and numbers that YAML 1.1 reads in other bases. Raises: ValueError."""
+    """Refuses repeated keys, and numbers that YAML 1.1 reads in other bases. Raises ValueError."""
     if id(node) in visited:
         return
     visited.add(id(node))

@@ -1,4 +1,4 @@
-"""Rollout files in the browser: a page with a slider, a notebook's cell, or one static file.
+"""Shows rollout files in the browser: as a page with a slider, in a notebook's cell, or as one static file.
 
 Shape legend: T frames.
 """
@@ -24,7 +24,7 @@ REST = ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
 
 
 class _Film:
-    """A rollout's frames on a server's stage."""
+    """Draws a rollout's frames on a server's stage."""
 
     def __init__(self, server: viser.ViserServer, rollout: Rollout) -> None:
         self.rollout = rollout
@@ -47,7 +47,7 @@ class _Film:
 
 @contextlib.contextmanager
 def _recorded(rollout: Rollout, every: int) -> Iterator[Any]:
-    """Viser's serializer of a scene, with every `every`-th frame."""
+    """Yields Viser's serializer of a scene, with every `every`-th frame."""
     require(every >= 1, "every", "at least 1", every)
     server, _ = start_server("127.0.0.1", 0, "HGN")
     try:
@@ -63,28 +63,28 @@ def _recorded(rollout: Rollout, every: int) -> Iterator[Any]:
 
 
 def film_html(rollout: Rollout, every: int = 2) -> str:
-    """A page that plays every `every`-th frame by itself, without a server or a network: a megabyte and the positions.
+    """Returns a page that plays every `every`-th frame without a server or a network: a megabyte plus the positions.
 
-    Raises: ConfigError for `every` below 1; ModuleNotFoundError without the extra `play`.
+    Raises ConfigError for `every` below 1, and ModuleNotFoundError without the extra `play`.
     """
     with _recorded(rollout, every) as serializer:
         return str(serializer.as_html())
 
 
 def show_film(rollout: Rollout, every: int = 2, height: int = 480) -> None:
-    """The same in a notebook's cell, `height` pixels high; outside notebooks it opens in the browser.
+    """Shows the film in a notebook's cell, `height` pixels high. Outside notebooks it opens the browser.
 
-    Raises: as `film_html`.
+    Raises the errors of `film_html`.
     """
     with _recorded(rollout, every) as serializer:
         serializer.show(height=height)
 
 
 class FilmPage:
-    """A page with a rollout, a slider over its frames, and a button that plays them."""
+    """Serves a page with a rollout, a slider over its frames, and a button that plays them."""
 
     def __init__(self, rollout: Rollout, host: str = "127.0.0.1", port: int = 8080, label: str = "HGN") -> None:
-        """Raises: ConfigError for a host that is not an address of this machine."""
+        """Starts the server. Raises ConfigError for a host that is not an address of this machine."""
         self.server, self.address = start_server(host, port, label)
         self.film, self.rollout = _Film(self.server, rollout), rollout
         gui = self.server.gui
@@ -102,7 +102,7 @@ class FilmPage:
                 self.film.show(min(self.slider.value, rollout.frame_count - 1))
 
     def run(self) -> None:
-        """Plays until `close`."""
+        """Plays until a call of `close`."""
         shown = time.monotonic()
         frame = 0.0
         while not self.ended.wait(1 / 60):
@@ -111,7 +111,7 @@ class FilmPage:
             if not self.playing.value:
                 frame = self.slider.value
                 continue
-            if abs(self.slider.value - int(frame)) > 1:  # someone moved it
+            if abs(self.slider.value - int(frame)) > 1:  # a viewer moved the slider
                 frame = self.slider.value
             frame = (frame + passed * self.speed.value * self.rollout.frame_rate_hz) % self.rollout.frame_count
             self.film.show(int(frame))

@@ -1,10 +1,11 @@
-"""The page of `hgn.play`: one session with its buttons, shared by any number of viewers.
+"""Serves the page of `hgn.play`: one session with its buttons, shared by any number of viewers.
 
-Actions of viewers are queued and run between two frames, so the event loop of the server never waits for a frame. Only
-the last of several moves of one obstacle runs. The state lives here, so a viewer who reconnects finds it again.
+The page queues the actions of viewers and runs them between two frames, so that the server's event loop never waits for
+a frame. Of several moves of one obstacle only the last runs. The page holds the state, and a viewer who reconnects
+finds it again.
 
-Viewers are not trusted: a raw message may contain any value. Values are clamped to their sliders, weights must be
-listed, and every error of an action becomes a message to its viewer.
+Viewers are not trusted: a raw message may contain any value. Values are clamped to the range of their sliders, weights
+must be in the list, and every error of an action becomes a message to its viewer.
 """
 
 from __future__ import annotations
@@ -37,11 +38,11 @@ from hgn.viewer.session import PlaySession, Spout
 from hgn.viewer.stage import StageView, quaternion
 from hgn.viewer.viser_compat import start_server, stop_server
 
-STATUS_S = 0.25  # between two updates of frame and speed
+STATUS_S = 0.25  # seconds between two updates of frame and speed
 BACK_S = {"a frame": 0.0, "1 s": 1.0, "5 s": 5.0}
 TURN_DEGREES = 360.0  # rotation for a drag across the whole window
 MAXIMUM_UPLOAD_BYTES = 64 << 20
-MAXIMUM_ACTIONS = 64  # that wait for the next frame; more are dropped
+MAXIMUM_ACTIONS = 64  # actions that may wait for the next frame; further ones are dropped
 HELP = """
 **Shift + drag** on the floor pours, **Shift + click** drops a ball.
 **Drag** an obstacle to move it, **Ctrl/⌘ + drag** to turn it, **click** to choose it.
@@ -50,7 +51,7 @@ Elsewhere the mouse moves the camera.
 
 
 class PlayPage:
-    """A session's page. `run` simulates, in the thread that calls it; `close` ends it."""
+    """Serves a session's page. `run` simulates in the thread that calls it; `close` ends the server."""
 
     def __init__(
         self,
@@ -60,9 +61,9 @@ class PlayPage:
         host: str = "127.0.0.1",
         port: int = 8080,
     ) -> None:
-        """`weights` are the names to choose from, which `load` makes simulators of.
+        """Takes the names of `weights` to choose from. `load` makes a simulator of a name.
 
-        Raises: ConfigError for a host that is not an address of this machine.
+        Raises ConfigError for a host that is not an address of this machine.
         """
         self.server, self.address = start_server(host, port, "HGN")
         self.session, self.load = session, load
@@ -71,8 +72,8 @@ class PlayPage:
         spacing = session.cell_size / session.particles_per_cell ** (1 / 3)
         self.stage = StageView(self.server, session.domain_size, spacing)
         self.ended, self.playing, self.steps = threading.Event(), True, 0
-        self.diverged = False  # it pauses for that, not because somebody asked for it
-        self.viewed = threading.Event()  # until somebody looks nothing happens
+        self.diverged = False  # whether the page paused because the simulation diverged
+        self.viewed = threading.Event()  # set by the first viewer; the simulation waits for it
         self.actions: dict[object, tuple[Callable[[], Any], Any]] = {}
         self._queueing = threading.Lock()
         self.meshes: dict[int, viser.MeshHandle] = {}
@@ -104,7 +105,7 @@ class PlayPage:
                 action()
             except (ConfigError, DivergedError, OSError) as error:
                 self._notify(str(error), client)
-            # a file or a value of one viewer must not end the session of all
+            # A file or a value of one viewer must not end the session of all viewers.
             except Exception as error:  # noqa: BLE001
                 traceback.print_exception(error, file=sys.stderr)
                 self._notify(f"failed: {type(error).__name__}: {error}", client)
@@ -115,7 +116,7 @@ class PlayPage:
             self._updates(partial(one.add_notification, "HGN", message, auto_close_seconds=10))
 
     def run(self) -> None:
-        """Simulates from the first viewer's arrival until `close`, at most in real time."""
+        """Simulates, at most in real time, from the first viewer's arrival until `close`."""
         due = updated = time.monotonic()
         frames, shown = 0, True
         while not self.ended.is_set():
@@ -124,7 +125,7 @@ class PlayPage:
                 self.steps = max(0, self.steps - 1)
                 try:
                     self.session.step()
-                except Exception as error:  # noqa: BLE001 - nor must what one viewer poured
+                except Exception as error:  # noqa: BLE001 - one viewer's particles must not end the session either
                     if not isinstance(error, DivergedError):
                         traceback.print_exception(error, file=sys.stderr)
                     self.playing, self.diverged = False, True
@@ -141,9 +142,9 @@ class PlayPage:
             self.ended.wait(max(0.0, due - now) if due > now else 0)
 
     def _updates(self, show: Callable[[], Any]) -> bool:
-        """Changes what viewers see; returns False where that failed, to be tried again.
+        """Changes the view of all viewers. Returns False after a failure, and the caller tries again.
 
-        viser wakes its event loop from this thread without a lock, which fails at times while a viewer comes or goes.
+        viser wakes its event loop from this thread without a lock. This fails at times while a viewer comes or goes.
         """
         try:
             show()
@@ -153,7 +154,7 @@ class PlayPage:
         return True
 
     def close(self) -> None:
-        """Ends the server, once `run` is over: `ended.set()` ends it from another thread."""
+        """Ends the server after the end of `run`. `ended.set()` ends `run` from another thread."""
         self.ended.set()
         stop_server(self.server)
 
@@ -260,11 +261,11 @@ class PlayPage:
                 self.do(lambda: self._add_file(file.name, file.content), event.client, "upload")
 
     def play(self, playing: bool) -> None:
-        """Goes on or pauses, as a viewer wants it."""
+        """Continues or pauses on a viewer's request."""
         self.playing, self.diverged = playing, False
 
     def restart(self) -> None:
-        """From the beginning; it stays paused where a viewer paused it, not where it diverged."""
+        """Starts again from the beginning. A pause by a viewer stays; a pause after divergence ends."""
         self.session.restart()
         self.playing, self.diverged = self.playing or self.diverged, False
 
@@ -279,7 +280,7 @@ class PlayPage:
         self.material.options = self._materials()
 
     def _materials(self) -> tuple[str, ...]:
-        """Returns the materials that can be poured: those of the weights that scenes have too."""
+        """Returns the materials that can be poured: the materials of the weights that scenes can have too."""
         return tuple(name for name in self.session.simulator.network.config.materials if name in MATERIALS)
 
     def _middle(self) -> Vector:
@@ -302,7 +303,7 @@ class PlayPage:
             path.write_bytes(content)
             try:
                 added = self.session.add_mesh(path, clamped(self.size), self._middle())
-            except ConfigError as error:  # the viewer knows the file without the folder
+            except ConfigError as error:  # the viewer knows the file without its folder
                 raise ConfigError(str(error).replace(str(path), file)) from None
         self.chosen = added.body.number
 
@@ -335,7 +336,7 @@ class PlayPage:
             self.do(lambda: self._drop(np.array(event.ray_origin), np.array(event.ray_direction)), event.client)
 
     def _pour(self, origin_3: np.ndarray, direction_3: np.ndarray | None) -> None:
-        """Opens the spout where the ray points, or closes it if there is no ray."""
+        """Opens the spout at the target of the ray, or closes it without a ray."""
         self.session.spout = None if direction_3 is None else self._spout(origin_3, direction_3)
 
     def _drop(self, origin_3: np.ndarray, direction_3: np.ndarray) -> None:
@@ -346,7 +347,7 @@ class PlayPage:
     def _spout(self, origin_3: np.ndarray, direction_3: np.ndarray) -> Spout:
         """Returns a spout above the point where a ray meets the floor or leaves through a wall.
 
-        Raises: ConfigError for a ray that is not finite or has no direction.
+        Raises ConfigError for a ray that is not finite or has no direction.
         """
         high_3 = np.array(self.session.domain_size)
         usable = np.isfinite(origin_3).all() and np.isfinite(direction_3).all() and direction_3.any()
@@ -364,7 +365,7 @@ class PlayPage:
         rotation = quaternion(obstacle.rotation_33)
         mesh = self.stage.add_obstacle(obstacle.body.name, obstacle.body.mesh, obstacle.position, rotation)
         self.meshes[number] = mesh
-        grabbed: list[tuple[PlacedObstacle, Any]] = []  # where it was when a drag began, and the event that began it
+        grabbed: list[tuple[PlacedObstacle, Any]] = []  # the obstacle at the drag's start, and the first event
 
         def drag(event: Any, moved: Callable[[PlacedObstacle, Any], PlacedObstacle]) -> None:
             if number not in self.shown:
@@ -398,6 +399,6 @@ class PlayPage:
 
 
 def clamped(slider: Any) -> float:
-    """Returns the value of a slider within its range; NaN becomes the least value."""
+    """Returns the value of a slider within its range, or its lower limit for NaN."""
     value = float(slider.value)
     return float(slider.min) if math.isnan(value) else min(max(value, float(slider.min)), float(slider.max))

@@ -1,4 +1,4 @@
-"""Obstacles that are moved about by hand: sampled once, placed again and again.
+"""Holds obstacles that viewers move: each is sampled once and placed again and again.
 
 Shape legend: V vertices, S surface samples.
 """
@@ -27,15 +27,15 @@ from hgn.scene.scene_file import ObstacleEntry
 from hgn.scene.shapes import shape_obstacle
 from hgn.schema import Vector
 
-LONGEST_STEM = 32  # characters of a file's name that are shown
+LONGEST_STEM = 32  # characters of a file's name that a page shows
 _numbers = itertools.count()
 
 
 @dataclass(frozen=True, eq=False)
 class Body:
-    """An obstacle about its own origin, not yet turned or moved: what all its places have in common."""
+    """Holds an obstacle about its own origin, not rotated or moved: the common part of all its places."""
 
-    entry: ObstacleEntry  # its position and rotation do not count
+    entry: ObstacleEntry  # the position and the rotation of the entry are not used
     mesh: Obstacle
     cell_size: float
     mesh_file: bytes | None = None
@@ -43,19 +43,19 @@ class Body:
 
     @cached_property
     def samples(self) -> tuple[np.ndarray, np.ndarray]:
-        """Points on the surface and their normals, float64 [S, 3]."""
+        """Returns points on the surface and their normals, float64 [S, 3]."""
         return surface_samples((self.mesh,), self.cell_size, seed=0)
 
     @property
     def name(self) -> str:
-        """A name for pages, logs and archives: letters, digits and ._- whatever the file is called."""
+        """Returns a name for pages, logs and archives. It has only letters, digits and ._- for any file name."""
         stem = Path(self.entry.mesh).stem if self.entry.mesh else self.entry.shape
         return f"{plain(str(stem))}_{self.number}"
 
 
 @dataclass(frozen=True, eq=False)
 class PlacedObstacle:
-    """A body at a place: position in domain units, rotation in degrees about the fixed x axis, then y, then z."""
+    """Holds a body at a place: position in domain units, rotation in degrees about the fixed x axis, then y, then z."""
 
     body: Body
     position: Vector
@@ -67,24 +67,24 @@ class PlacedObstacle:
 
     @property
     def entry(self) -> ObstacleEntry:
-        """As a scene file has it."""
+        """Returns the entry for a scene file."""
         return dataclasses.replace(self.body.entry, position=self.position, rotation=self.rotation)
 
     def turned(self, degrees: float) -> PlacedObstacle:
-        """Turned further about the vertical."""
+        """Returns the obstacle rotated further about the vertical."""
         matrix = euler_rotation((0.0, degrees, 0.0)) @ self.rotation_33
         x, y, z = Rotation.from_matrix(matrix).as_euler("xyz", degrees=True)
         return dataclasses.replace(self, rotation=(float(x), float(y), float(z)))
 
     def mesh(self, motion: Motion | None = None) -> Obstacle:
-        """The triangles where they are."""
+        """Returns the triangles at the obstacle's place."""
         mesh = self.body.mesh
         vertex_V3 = round_to_float32(rotate(mesh.vertex_V3, self.rotation_33) + np.array(self.position))
         return dataclasses.replace(mesh, name=self.body.name, vertex_V3=vertex_V3, motion=motion)
 
     @property
     def samples(self) -> tuple[np.ndarray, np.ndarray]:
-        """The body's, where they are; not kept, for past frames have a place each."""
+        """Returns samples at the obstacle's place. They are not kept, because past frames have many places."""
         point_S3, normal_S3 = self.body.samples
         matrix = self.rotation_33
         return rotate(point_S3, matrix) + np.array(self.position), rotate(normal_S3, matrix)
@@ -96,7 +96,7 @@ def plain(name: str) -> str:
 
 
 def placed_by(entry: ObstacleEntry, folder: Path, cell_size: float) -> PlacedObstacle:
-    """The obstacle of an entry. Raises: ConfigError for a mesh that cannot be read, or is too large to sample."""
+    """Returns the obstacle of an entry. Raises ConfigError for a mesh that is unreadable or too large to sample."""
     if entry.mesh is not None:
         path = folder / entry.mesh
         mesh = load_mesh(path, scale=1.0 if entry.scale is None else entry.scale)
@@ -110,7 +110,7 @@ def placed_by(entry: ObstacleEntry, folder: Path, cell_size: float) -> PlacedObs
 
 
 def placed_at_rest(obstacle: Obstacle, cell_size: float) -> PlacedObstacle:
-    """An obstacle as it stands, to be moved about the middle of its bounding box."""
+    """Returns an obstacle at its present place, which can be moved about the middle of its bounding box."""
     vertex_V3 = obstacle.vertex_V3
     x, y, z = (0.5 * (vertex_V3.min(axis=0) + vertex_V3.max(axis=0))).tolist()
     mesh = dataclasses.replace(obstacle, vertex_V3=vertex_V3 - (x, y, z))
@@ -119,7 +119,7 @@ def placed_at_rest(obstacle: Obstacle, cell_size: float) -> PlacedObstacle:
 
 
 def with_obstacles(scene: InitialState, obstacles: Sequence[PlacedObstacle]) -> InitialState:
-    """The scene with these obstacles alone; cells more than one outside the domain are left out."""
+    """Returns the scene with only these obstacles. Omits cells more than one cell outside the domain."""
     cell_size = scene.obstacle_grid.cell_size
     empty = (np.zeros((0, 3)), np.zeros((0, 3)))
     parts = [empty, *(obstacle.samples for obstacle in obstacles)]

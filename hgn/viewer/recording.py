@@ -1,4 +1,4 @@
-"""The frames of a scene that changes, for going back in time and for the rollout file.
+"""Records the frames of a scene that changes, for going back in time and for the rollout file.
 
 Shape legend: N particles, M velocities of a history, T frames.
 """
@@ -19,7 +19,7 @@ from hgn.viewer.placed import PlacedObstacle
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """The content of a frame. Particles keep their order; those that enter later come behind."""
+    """Holds the content of a frame. Particles keep their order, and later ones follow earlier ones."""
 
     position_N3: np.ndarray  # float32, domain units
     velocity_N3: np.ndarray  # float32, domain units per frame
@@ -32,38 +32,38 @@ class Frame:
 
 
 class Recording:
-    """The last frames of a simulation, as many as fit into `limit_bytes`, and never fewer than a history needs."""
+    """Holds the last frames of a simulation within `limit_bytes`, but at least the frames of a velocity history."""
 
     def __init__(self, limit_bytes: int) -> None:
         self.limit_bytes, self.bytes, self.first = limit_bytes, 0, 0
         self.frames: deque[Frame] = deque()
-        # of each particle: the frame it entered behind, its material, and its velocities then and before, newest first
+        # Each particle has the frame before its entry, its material, and its velocities until then, newest first.
         self.entered_N = np.zeros(0, np.int64)
         self.material_N = np.zeros(0, np.uint8)
         self.entry_NM3 = np.zeros((0, 1, 3), np.float32)
 
     @property
     def last(self) -> int:
-        """The number of the newest frame."""
+        """Returns the number of the newest frame."""
         return self.first + len(self.frames) - 1
 
     @property
     def earliest(self) -> int:
-        """The first frame whose velocity histories are known whole."""
+        """Returns the first frame whose velocity histories are known completely."""
         return 0 if self.first == 0 else self.first + self.entry_NM3.shape[1] - 1
 
     def enter(self, material_A: np.ndarray, velocity_AM3: np.ndarray) -> None:
-        """Particles that are in the next frame for the first time."""
+        """Adds particles that appear first in the next frame."""
         behind = np.full(len(material_A), max(self.last, 0))
         self.entered_N = np.concatenate([self.entered_N, behind])
         self.material_N = np.concatenate([self.material_N, np.asarray(material_A, np.uint8)])
         old_NM3 = self.entry_NM3[:, : velocity_AM3.shape[1]]
-        lacking = velocity_AM3.shape[1] - old_NM3.shape[1]  # of weights with a longer history than those before
+        lacking = velocity_AM3.shape[1] - old_NM3.shape[1]  # entries that new weights with a longer history need
         old_NM3 = np.concatenate([old_NM3, np.repeat(old_NM3[:, -1:], lacking, axis=1)], axis=1)
         self.entry_NM3 = np.concatenate([old_NM3, velocity_AM3])
 
     def append(self, frame: Frame) -> None:
-        """The next frame."""
+        """Adds the next frame, and drops old frames above the limit."""
         self.frames.append(frame)
         self.bytes += frame.bytes
         while self.bytes > self.limit_bytes and len(self.frames) > self.entry_NM3.shape[1] + 1:
@@ -74,7 +74,7 @@ class Recording:
         return self.frames[frame - self.first]
 
     def history(self, frame: int) -> np.ndarray:
-        """Velocity histories of a frame's particles, float32 [N, M, 3] in domain units per frame, newest first."""
+        """Returns velocity histories of a frame, float32 [N, M, 3] in domain units per frame, newest first."""
         rule = f"between {self.earliest} and {self.last}, the frames that are kept"
         require(self.earliest <= frame <= self.last, "frame", rule, frame)
         count, length = len(self[frame].position_N3), self.entry_NM3.shape[1]
@@ -92,7 +92,7 @@ class Recording:
         return history_NM3
 
     def back_to(self, frame: int) -> None:
-        """Forgets all frames behind one, and the particles that entered there."""
+        """Forgets all frames after one, and the particles that entered in them."""
         while self.last > frame:
             self.bytes -= self.frames.pop().bytes
         count = len(self[frame].position_N3)
@@ -100,9 +100,9 @@ class Recording:
         self.entry_NM3 = self.entry_NM3[:count]
 
     def rollout(self, domain_size: Vector, frame_rate_hz: float, cell_size: float, source: dict[str, str]) -> Rollout:
-        """All frames that are kept, and in which of them each particle entered.
+        """Returns all frames that are kept, with the entry frame of each particle.
 
-        An obstacle is in all frames, at rest where it first stood until it was placed, and where it last stood since.
+        An obstacle is in all frames. Before its first place and after its last place it is at rest there.
         """
         count = len(self.frames[-1].position_N3)
         position_TN3 = np.full((len(self.frames), count, 3), np.nan, np.float32)
@@ -127,7 +127,7 @@ class Recording:
 
 
 def _motion(path: list[tuple[int, PlacedObstacle]], frame_rate_hz: float) -> Motion | None:
-    """From the places that an obstacle had in some frames; none if they are all one."""
+    """Returns the motion through the places of an obstacle in some frames, or None if all places are equal."""
     keys = {0: path[0][1]}
     for (_, before), (index, after) in pairwise(path):
         if (before.position, before.rotation) != (after.position, after.rotation):

@@ -1,4 +1,4 @@
-"""A scene that someone plays with: what the page's buttons do, without the page.
+"""Holds a scene that viewers change, and the actions of the page's buttons without the page.
 
 Shape legend: N particles, A particles of a place, C candidates to enter.
 """
@@ -30,17 +30,17 @@ from hgn.schema import Vector, from_mapping, require, to_mapping
 from hgn.viewer.placed import Body, PlacedObstacle, placed_at_rest, placed_by, with_obstacles
 from hgn.viewer.recording import Frame, Recording
 
-CLEARANCE = 1.25  # spacings of particles at rest, within which no drop enters
+CLEARANCE = 1.25  # in spacings of particles at rest; no drop enters within this distance of another particle
 MAXIMUM_GRAVITY = 1000.0  # domain units per second squared
-MAXIMUM_OBSTACLES, MAXIMUM_MESH_BYTES = 64, 128 << 20  # the latter of files, also of obstacles in past frames
-FULL_SHARE = 0.5  # of what leaves a spout in a frame: where there is more, nothing leaves
+MAXIMUM_OBSTACLES, MAXIMUM_MESH_BYTES = 64, 128 << 20  # bytes of files, including those of obstacles in past frames
+FULL_SHARE = 0.5  # largest share of a frame's particles that may still be at the spout; above it the spout waits
 
 
 @dataclass(frozen=True)
 class Spout:
-    """A source of a material that runs straight down: domain units, and domain units per second."""
+    """Describes a source from which a material runs straight down, in domain units and domain units per second."""
 
-    position: Vector  # of the disc's centre
+    position: Vector  # centre of the disc
     material: str = "water"
     diameter: float = 0.08
     speed: float = 1.0
@@ -52,7 +52,7 @@ class Spout:
 
 
 class PlaySession:
-    """One simulation with its past. Not for several threads at once."""
+    """Holds one simulation with its past. Only one thread may use it at a time."""
 
     def __init__(
         self,
@@ -63,9 +63,9 @@ class PlaySession:
         keep_bytes: int = 1 << 30,
         weights: str = "",
     ) -> None:
-        """`folder` is where the scene's meshes lie; `keep_bytes` of past frames are kept for going back.
+        """Takes the `folder` of the scene's meshes. Keeps `keep_bytes` of past frames for going back.
 
-        Raises: ConfigError for a scene that the weights cannot take, or more than `maximum_particles`.
+        Raises ConfigError for a scene that the weights do not support, or for more than `maximum_particles`.
         """
         rule, remedy = f"at most {maximum_particles}", "raise particles"
         require(scene.particle_count <= maximum_particles, "scene's particles", rule, scene.particle_count, remedy)
@@ -74,8 +74,8 @@ class PlaySession:
         self.particles_per_cell = scene.particles_per_cell or 8.0
         self.random = np.random.default_rng(scene.seed)
         self.spout: Spout | None = None
-        self._owed = 0.0  # particles, of a spout
-        self._bodies: WeakSet[Body] = WeakSet()  # that were added
+        self._owed = 0.0  # fraction of a particle that the spout has not given yet
+        self._bodies: WeakSet[Body] = WeakSet()  # bodies that viewers have added
         initial = InitialState.of_scene(replace(scene, obstacles=()))
         require(not scene.moves, "obstacles", "at rest for a network", "keyframes", "leave keyframes out")
         self.obstacles: tuple[PlacedObstacle, ...] = tuple(self._placed_by(scene, folder))
@@ -84,7 +84,7 @@ class PlaySession:
         self._record_first()
 
     def restart(self) -> None:
-        """Back to the scene as it was opened, with the weights of now."""
+        """Returns to the scene as it was opened, with the present weights."""
         live = LiveSimulation(self.simulator, self._begin, self.maximum_particles)
         self.live.close()
         self.live, self.obstacles, self.spout = live, self._begin_obstacles, None
@@ -98,7 +98,7 @@ class PlaySession:
 
     @property
     def frame(self) -> int:
-        """The number of the newest frame."""
+        """Returns the number of the newest frame."""
         return self.recording.last
 
     @property
@@ -106,7 +106,7 @@ class PlaySession:
         return self.recording.frames[-1]
 
     def materials(self) -> np.ndarray:
-        """Returns the materials of the newest frame's particles, indices into MATERIALS, uint8 [N]."""
+        """Returns the materials of the newest frame's particles as indices into MATERIALS, uint8 [N]."""
         return self.recording.material_N[: len(self.newest.position_N3)]
 
     @property
@@ -122,9 +122,9 @@ class PlaySession:
         return self.live.scene.gravity
 
     def step(self) -> None:
-        """One frame, behind what the spout gives.
+        """Simulates one frame, after the particles of the spout have entered.
 
-        Raises: DivergedError; the scene then is as it was a frame earlier.
+        Raises DivergedError. The scene then stays at the frame before.
         """
         if self.spout is not None:
             self._pour(self.spout)
@@ -140,9 +140,9 @@ class PlaySession:
         self.recording.append(Frame(position_N3.copy(), velocity_N3.copy(), self.obstacles, self.gravity))
 
     def rewind(self, frame: int) -> None:
-        """Goes back; what came behind that frame is forgotten. The future repeats itself until something is changed.
+        """Goes back to a frame, and forgets all later ones. The future repeats itself until a viewer changes the scene.
 
-        Raises: ConfigError for a frame that is not kept.
+        Raises ConfigError for a frame that is not kept.
         """
         history_NM3 = self.recording.history(frame)
         then = self.recording[frame]
@@ -156,9 +156,9 @@ class PlaySession:
     # what enters
 
     def drop(self, material: str, position: Vector, diameter: float, speed: float = 0.0) -> int:
-        """A ball of a material, moving down; as far as there is place for it. Returns how many particles entered.
+        """Adds a ball of a material that moves down, where there is room. Returns the number of particles that entered.
 
-        Raises: ConfigError for a material that the weights do not know.
+        Raises ConfigError for a material that the weights do not know.
         """
         spout = Spout(position, material, diameter, speed)
         region = Region(self._inside(position, 0.5 * diameter), radius=0.5 * diameter)
@@ -181,11 +181,11 @@ class PlaySession:
         away_3 = np.array([radius, 0.5 * length, radius])
         near_A3 = self._between(np.array(centre) - away_3, np.array(centre) + away_3) - centre
         if (np.hypot(near_A3[:, 0], near_A3[:, 2]) < radius).sum() > FULL_SHARE * count:
-            return  # what left it has not gone
+            return  # the earlier particles are still at the spout
         self._enter((np.array(centre) + offset_C3).astype(np.float32), spout)
 
     def _inside(self, position: Vector, radius: float, half_height: float | None = None) -> Vector:
-        """The nearest place where a ball or a disc is between the walls."""
+        """Returns the nearest place at which a ball or a disc lies between the walls."""
         wall = WALL_CELLS * self.cell_size
         reach = np.array([radius, radius if half_height is None else half_height, radius]) + wall
         high = np.maximum(np.array(self.domain_size) - reach, reach)
@@ -193,7 +193,7 @@ class PlaySession:
         return float(x), float(y), float(z)
 
     def _enter(self, position_C3: np.ndarray, spout: Spout) -> int:
-        """Adds candidates that are not in a closed obstacle, up to the maximum."""
+        """Adds candidates outside closed obstacles, up to the maximum number."""
         position_C3 = position_C3[: max(0, self.maximum_particles - self.live.particle_count)]
         for obstacle in self.obstacles:
             if obstacle.body.mesh.closed:
@@ -206,30 +206,30 @@ class PlaySession:
         return count
 
     def _free(self, position_C3: np.ndarray) -> np.ndarray:
-        """Returns which candidates have no other particle near, bool [C]."""
+        """Returns whether each candidate is far from all other particles, bool [C]."""
         near = CLEARANCE * self.cell_size / self.particles_per_cell ** (1 / 3)
         low, high = position_C3.min(axis=0) - near, position_C3.max(axis=0) + near
         others_A3 = self._between(low, high)
         if not len(others_A3):
             return np.ones(len(position_C3), bool)
         distance_C, _ = KDTree(others_A3).query(position_C3, distance_upper_bound=near)
-        return np.asarray(distance_C >= near)  # infinite where nothing is nearer
+        return np.asarray(distance_C >= near)  # the distance is infinite without a near particle
 
     def _between(self, low_3: np.ndarray, high_3: np.ndarray) -> np.ndarray:
-        """The particles in a box, float32 [A, 3]."""
+        """Returns the particles in a box, float32 [A, 3]."""
         position_N3 = self.live.state.position_N3.cpu().numpy()
         return position_N3[((position_N3 >= low_3) & (position_N3 <= high_3)).all(axis=1)]
 
     # what stands in the way
 
     def _placed_by(self, scene: Scene, folder: Path) -> list[PlacedObstacle]:
-        if scene.specification.get("kind") != "file":  # a random scene's obstacles have no entries
+        if scene.specification.get("kind") != "file":  # the obstacles of a random scene have no entries
             return [placed_at_rest(obstacle, scene.cell_size) for obstacle in scene.obstacles]
         entries = (from_mapping(ObstacleEntry, entry) for entry in scene.specification["obstacles"])
         return [placed_by(entry, folder, scene.cell_size) for entry in entries]
 
     def add_obstacle(self, entry: ObstacleEntry, folder: Path = Path()) -> PlacedObstacle:
-        """An obstacle of a shape, or of a mesh file in a folder. Raises: ConfigError as a scene file."""
+        """Adds an obstacle of a shape, or of a mesh file in a folder. Raises ConfigError as a scene file does."""
         count = len(self.obstacles) + 1
         require(count <= MAXIMUM_OBSTACLES, "obstacles", f"at most {MAXIMUM_OBSTACLES}", count, "remove one")
         placed = placed_by(entry, folder, self.cell_size)
@@ -240,16 +240,16 @@ class PlaySession:
         return placed
 
     def add_mesh(self, path: Path, size: float, middle: Vector) -> PlacedObstacle:
-        """A mesh file, scaled so that the longest side of its bounding box is `size`, with its middle at a place."""
+        """Adds a mesh file around a place. The longest side of its bounding box becomes `size`."""
         low, high = (bound(load_mesh(path).vertex_V3, axis=0) for bound in (np.min, np.max))
         scale = size / float((high - low).max())
         x, y, z = (np.array(middle) - scale * 0.5 * (low + high)).tolist()
         return self.add_obstacle(ObstacleEntry(mesh=path.name, scale=scale, position=(x, y, z)), path.parent)
 
     def move_obstacle(self, moved: PlacedObstacle) -> None:
-        """The obstacle of the same body is there from now on; nothing happens where it was removed.
+        """Replaces the obstacle of the same body by `moved`. Does nothing if the obstacle was removed.
 
-        Raises: ConfigError for a place or an angle that is not finite, or far outside the domain.
+        Raises ConfigError for a place or an angle that is not finite, or far outside the domain.
         """
         reach, angles = 10 * max(self.domain_size), moved.rotation
         inside = all(abs(value) <= reach for value in moved.position) and all(map(math.isfinite, angles))
@@ -257,7 +257,7 @@ class PlaySession:
         self._set_obstacles(tuple(moved if o.body is moved.body else o for o in self.obstacles))
 
     def remove_obstacle(self, number: int) -> None:
-        """By the number of its body."""
+        """Removes the obstacle whose body has this number."""
         self._set_obstacles(tuple(o for o in self.obstacles if o.body.number != number))
 
     def _set_obstacles(self, obstacles: tuple[PlacedObstacle, ...]) -> None:
@@ -267,18 +267,18 @@ class PlaySession:
     # what moves it all
 
     def set_gravity(self, gravity: Vector) -> None:
-        """Sets gravity, domain units per second squared.
+        """Sets gravity in domain units per second squared.
 
-        Raises: ConfigError if it is not finite, above MAXIMUM_GRAVITY, or not supported by the weights.
+        Raises ConfigError if it is not finite, above MAXIMUM_GRAVITY, or not supported by the weights.
         """
         size = math.hypot(*gravity)
         require(size <= MAXIMUM_GRAVITY, "gravity", f"finite and at most {MAXIMUM_GRAVITY:g} in size", list(gravity))
         self.live.set_gravity(gravity)
 
     def use_weights(self, simulator: Simulator, weights: str = "") -> None:
-        """Goes on with other weights, from the positions and velocities of now.
+        """Continues with other weights from the present positions and velocities.
 
-        Raises: ConfigError for weights that do not take the scene, or whose frames are longer or shorter.
+        Raises ConfigError for weights that do not support the scene, or that have another frame rate.
         """
         rate = self.simulator.frame_rate_hz
         require(simulator.frame_rate_hz == rate, "weights", f"of {rate} frames a second", simulator.frame_rate_hz)
@@ -296,9 +296,9 @@ class PlaySession:
     # what is taken away
 
     def scene_archive(self) -> bytes:
-        """The scene as it is now: a zip of `scene.yaml`, a file of particles for each material, and the meshes.
+        """Returns the present scene: a zip of `scene.yaml`, a file of particles for each material, and the meshes.
 
-        Raises: ConfigError where there is no particle, which no scene file may lack.
+        Raises ConfigError without particles, because a scene file needs at least one.
         """
         require(len(self.newest.position_N3) > 0, "scene's particles", "more than none to be saved", 0, "pour some")
         newest, rate = self.newest, self.simulator.frame_rate_hz
@@ -337,7 +337,7 @@ class PlaySession:
         return archive.getvalue()
 
     def rollout(self) -> Rollout:
-        """All frames that are kept."""
+        """Returns all frames that are kept, as a rollout."""
         rate = self.simulator.frame_rate_hz
         return self.recording.rollout(
             self.domain_size, rate, self.cell_size, {"weights": self.weights, "scene": "play"}

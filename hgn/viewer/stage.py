@@ -1,4 +1,4 @@
-"""What all pages draw: the domain, particles as a cloud of each material, obstacles as meshes.
+"""Draws the scene of all pages: the domain, particles as a cloud of each material, obstacles as meshes.
 
 Shape legend: N particles.
 """
@@ -18,19 +18,19 @@ from hgn.scene.material import MATERIALS
 from hgn.scene.scene import Obstacle
 from hgn.schema import Vector
 
-DIAMETER_IN_SPACINGS = 1.2  # points that overlap a little look like a body
+DIAMETER_IN_SPACINGS = 1.2  # the points overlap a little, so that they look like a body
 ROOM_COLOR = (236, 238, 242)
 Quaternion = tuple[float, float, float, float]
 
 
 def quaternion(rotation_33: np.ndarray) -> Quaternion:
-    """(w, x, y, z)."""
+    """Returns a rotation as the quaternion (w, x, y, z)."""
     x, y, z, w = Rotation.from_matrix(rotation_33).as_quat()
     return float(w), float(x), float(y), float(z)
 
 
 class StageView:
-    """The scene of a server of Viser's."""
+    """Draws the scene of a Viser server."""
 
     def __init__(
         self,
@@ -41,8 +41,10 @@ class StageView:
         materials: Sequence[str] = MATERIALS,
         dimensions: int = 3,
     ) -> None:
-        """`spacing` of particles at rest, domain units. With float16 positions are 2^-12 of the domain apart.
-        `materials` are what particles' indices mean. With two dimensions the plane in the middle is looked at straight.
+        """Takes the `spacing` of particles at rest in domain units, and the names of `materials` by index.
+
+        In float16 positions have steps of 2^-12 of the domain. With two dimensions the camera looks straight at the
+        plane in the middle.
         """
         self.scene, self.domain_size = server.scene, domain_size
         self.scene.set_up_direction("+y")
@@ -54,7 +56,7 @@ class StageView:
             size, eye, target = max(domain_size[:2]), (0.0, 0.0, 1.0), (0.0, 0.0, 0.0)
         server.initial_camera.position = tuple(self.middle_3 + size * np.array(eye))
         server.initial_camera.look_at = tuple(self.middle_3 + size * np.array(target))
-        # seen from inside: its near walls are not there
+        # The box is seen from inside, so that its near walls are invisible.
         box = trimesh.creation.box(bounds=(low_3, high_3))
         self.room = self.scene.add_mesh_simple(
             "/room", box.vertices, box.faces, color=ROOM_COLOR, side="back", flat_shading=True, cast_shadow=False
@@ -75,7 +77,7 @@ class StageView:
         ]
 
     def show(self, position_N3: np.ndarray, material_N: np.ndarray) -> None:
-        """The particles of a frame, domain units; those that are not finite are left out."""
+        """Shows the particles of a frame in domain units. Omits those that are not finite."""
         there_N = np.isfinite(position_N3).all(axis=1)
         local_N3 = (position_N3 - self.middle_3).astype(np.float32)
         for index, cloud in enumerate(self.clouds):
@@ -84,7 +86,7 @@ class StageView:
                 cloud.points = local_N3[mine_N]
 
     def add_obstacle(self, name: str, mesh: Obstacle, position: Vector, rotation: Quaternion) -> viser.MeshHandle:
-        """A mesh about its own origin, at a place."""
+        """Adds a mesh, given about its own origin, at a place."""
         return self.scene.add_mesh_simple(
             f"/obstacles/{name}",
             mesh.vertex_V3.astype(np.float32),

@@ -1,8 +1,8 @@
-"""What of Viser is changed from within; pyproject.toml bounds its version.
+"""Contains all changes to Viser's private parts; pyproject.toml bounds its version.
 
-Viser serves its page and its websocket to whoever reaches the port. Here both ask for a token: the page's address has
-it (`/?token=…`) and leaves it as a cookie, which the browser sends with the websocket. `tests/viewer/test_page.py`
-fails when a new version has changed where.
+Viser serves its page and its websocket to every client of the port. Here both require a token. The page's address has
+the token (`/?token=…`) and stores it as a cookie, which the browser sends with the websocket.
+`tests/viewer/test_page.py` fails if a new version has changed these parts.
 """
 
 from __future__ import annotations
@@ -30,26 +30,26 @@ from websockets.http11 import Request, Response
 from hgn.schema import require
 
 COOKIE = "hgn_play"
-MAXIMUM_UNFINISHED_BYTES = 128 << 20  # of uploads that are not whole yet, of all viewers
-UPLOAD_BYTES, PART_BYTES = 1 << 20, 200  # that an upload and each of its parts count at least
-MAXIMUM_MESSAGE_BYTES = 4 << 20  # from a viewer; parts of uploads have 512 KiB
+MAXIMUM_UNFINISHED_BYTES = 128 << 20  # bytes of the incomplete uploads of all viewers
+UPLOAD_BYTES, PART_BYTES = 1 << 20, 200  # least bytes by which an upload and each of its parts count
+MAXIMUM_MESSAGE_BYTES = 4 << 20  # bytes of a message from a viewer; parts of uploads have 512 KiB
 LONGEST_VALUE = 1000  # characters of a control's value
 REFUSAL = b"open the address that hgn.play printed, with its token\n"
 SENT = (
     *(messages.SceneNodeClickMessage, messages.SceneNodeDragMessage, messages.ScenePointerMessage),
     *(messages.FileTransferStartUpload, messages.FileTransferPart),
-)  # by viewers, besides the values of controls
+)  # messages that viewers may send, in addition to values of controls
 Process = Callable[[Any, Request], Response | None]
-# Viser keeps what it broadcasts under its key, and had one for each part of each upload
+# Viser keeps each broadcast under its key. It had a key for each part of each upload, and would keep them all.
 messages.FileTransferPartAck.redundancy_key = (  # type: ignore[assignment, method-assign]
     lambda ack: f"{type(ack).__name__}-{zlib.crc32(ack.transfer_uuid.encode()) % 64}"
 )
 
 
 def start_server(host: str, port: int, label: str) -> tuple[viser.ViserServer, str]:
-    """A server of Viser's, and the address that opens it, token included. A port that is taken: the next that is not.
+    """Returns a Viser server and the address that opens it, with the token. A taken port is replaced by the next free.
 
-    Raises: ConfigError for a host that is not an address of this machine.
+    Raises ConfigError for a host that is not an address of this machine.
     """
     try:
         socket.create_server((host, 0)).close()
@@ -65,7 +65,7 @@ def start_server(host: str, port: int, label: str) -> tuple[viser.ViserServer, s
     handlers = ("_handle_file_transfer_start", "_handle_file_transfer_part")
     limited: dict[str, Any] = {name: bounded(getattr(GuiApi, name)) for name in handlers}
     limits = mock.patch.multiple(GuiApi, **limited)
-    unsaid = contextlib.redirect_stdout(io.StringIO())  # Viser's own lines have an address without the token
+    unsaid = contextlib.redirect_stdout(io.StringIO())  # Viser prints an address without the token
     with unsaid, limits, mock.patch.object(websockets.asyncio.server, "serve", guarded_serve):
         server = viser.ViserServer(host, port, label, verbose=False)
     server._websock_server._handle_incoming_message = admitting(  # type: ignore[method-assign]
@@ -76,7 +76,7 @@ def start_server(host: str, port: int, label: str) -> tuple[viser.ViserServer, s
 
 
 def admitting(handle: Callable[..., Any]) -> Callable[..., Any]:
-    """Drops messages that the page's controls do not send: Viser would set any attribute of a control, for all."""
+    """Drops messages that the controls do not send. Viser would set any attribute of a control for all viewers."""
 
     async def answer(client: int, message: Any) -> None:
         if isinstance(message, messages.GuiUpdateMessage):
@@ -90,7 +90,7 @@ def admitting(handle: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def bounded(handle: Callable[..., None]) -> Callable[..., None]:
-    """Drops the uploads of the viewer with the most bytes where unfinished ones are too large together."""
+    """Drops the uploads of the viewer with the most bytes if all incomplete uploads together are too large."""
 
     def answer(gui: GuiApi, client: int, message: Any) -> None:
         sizes: Counter[int] = Counter({client: len(getattr(message, "content", b""))})
@@ -98,7 +98,7 @@ def bounded(handle: Callable[..., None]) -> Callable[..., None]:
             sizes[state["client_id"]] += state["transferred_bytes"] + PART_BYTES * len(state["parts"]) + UPLOAD_BYTES
         if sizes.total() > MAXIMUM_UNFINISHED_BYTES:
             gui._drop_uploads_from_client(sizes.most_common(1)[0][0])  # type: ignore[arg-type]
-        handle(gui, client, message)  # ignores parts of uploads that were dropped
+        handle(gui, client, message)  # ignores parts of dropped uploads
 
     return answer
 
@@ -112,13 +112,13 @@ def stop_server(server: viser.ViserServer) -> None:
 def guarded(process: Process, token: str) -> Process:
     """Passes on requests that have the token, in the address or in a cookie, and refuses all others.
 
-    Browsers send cookies to every port of a host, so a request whose Origin is another page is refused too.
+    Browsers send cookies to every port of a host. A request whose Origin is another page is therefore refused too.
     """
 
     def answer(connection: Any, request: Request) -> Response | None:
         port = connection.local_address[1]
-        name = f"{COOKIE}_{port}"  # a cookie is for all ports of a host
-        # other programs' cookies for this host come too, with any names and values, so no parser that refuses some
+        name = f"{COOKIE}_{port}"  # a cookie belongs to all ports of a host
+        # Other programs on this host have cookies with any names and values. A strict parser would refuse some.
         cookies = [part.strip() for header in request.headers.get_all("Cookie") for part in header.split(";")]
         tokens = [cookie.removeprefix(f"{name}=") for cookie in cookies if cookie.startswith(f"{name}=")]
         tokens += parse_qs(urlsplit(request.path).query).get("token", [])
