@@ -136,7 +136,6 @@ def registered_dataclasses(folder: Path, config_name: str) -> Iterator[None]:
 
 def _override(argument: str, folder: Path) -> str:
     """Returns an argument in Hydra's syntax.
-
     Unknown keys are added, so that the command refuses them and names its keys. experiment=… becomes +experiment=….
     Values are quoted where necessary."""
     key, equals, value = argument.partition("=")
@@ -160,7 +159,6 @@ def _override(argument: str, folder: Path) -> str:
 
 def _in_quotes(value: str) -> str:
     """Returns a value with quotes if Hydra's grammar refuses it (with ü, &, # or (1) in it), also in a flat list.
-
     ~/ becomes the home folder. The value stays unchanged if quotes do not help."""
     if value[0] == "[" and value[-1] == "]" and not re.search("[\"'{}[\\]]", value[1:-1]):
         items = [item.strip() for item in value[1:-1].split(",")]

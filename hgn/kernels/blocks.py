@@ -148,7 +148,6 @@ def nothing_to_do(count, BLOCK: tl.constexpr):
 @triton.jit
 def inside(vector, tile):
     """Returns `vector` as a value inside the loop over tiles, which are numbered from 0.
-
     Before the loop each thread would hold a quarter of it in the layout of the matrix units, and registers spill."""
     return tl.where(tile >= 0, vector, 0.0)
 
@@ -196,7 +195,6 @@ def normalise(z, WIDTH: tl.constexpr):
 @triton.jit
 def normalise_once(z, WIDTH: tl.constexpr, PRECISION: tl.constexpr):
     """Returns the same as `normalise`, and at lower precisions computes both sums in one pass.
-
     Cancellation costs less than rounded operands if a row's mean is within about ten standard deviations."""
     if PRECISION == "fp16":
         mean = tl.sum(z, 1) / WIDTH
@@ -227,7 +225,6 @@ def chosen_rows(ROWS: tl.constexpr, EACH: tl.constexpr, CHOICES: tl.constexpr):
 @triton.jit
 def high_and_low(pointer, FIRST: tl.constexpr, SUMS: tl.constexpr, WIDTH: tl.constexpr, PRECISION: tl.constexpr):
     """Returns rows [SUMS, W] for the matrix [3, W] at `pointer`: from row FIRST the rounded rows as operands.
-
     The parts that rounding removes follow. Other rows are zero."""
     row = tl.arange(0, SUMS)
     place = row - FIRST

@@ -17,7 +17,6 @@ PRIME_X, PRIME_Y, PRIME_Z = (tl.constexpr(prime) for prime in HASH_PRIMES)
 @triton.jit
 def find_cell(x, y, z, line, live):
     """Returns the index of the cell (x, y, z), whole numbers in floats, among its scene's cells, or -1.
-
     `line` is the scene's row of the table."""
     near = live & (tl.abs(x) < LIMIT) & (tl.abs(y) < LIMIT) & (tl.abs(z) < LIMIT)
     x = tl.where(near, x, 0.0).to(tl.int64)

@@ -23,7 +23,6 @@ def split_slot(local, ny, nz, stride):
 @triton.jit
 def most_around(disturbed, felt, part: tl.constexpr, neighbour, cell, there, capacity):
     """Writes the maximum over a coarsest cell and those across its faces to a column of `felt` [C, 2], from 0 to 1.
-
     The inputs are the same column of `disturbed` [C, 2], in units of FULLY."""
     most = tl.load(disturbed + cell * 2 + part, mask=there, other=0)
     for slot in tl.static_range(6):
@@ -35,7 +34,6 @@ def most_around(disturbed, felt, part: tl.constexpr, neighbour, cell, there, cap
 @triton.jit
 def lowest_middle(k, axis: tl.constexpr, low, place_of, row, live, LEVELS: tl.constexpr, SHIFT: tl.constexpr):
     """Returns along one axis the number of the lowest middle around a particle, and the place from it in cell edges.
-
     The middles count from 0. They lie between cells 2^SHIFT times as large as the coarsest ones. `k` is the number of
     the particle's own coarsest cell in the window."""
     first = tl.load(low + axis) >> LEVELS - 1
@@ -49,7 +47,6 @@ def lowest_middle(k, axis: tl.constexpr, low, place_of, row, live, LEVELS: tl.co
 @triton.jit
 def middles_around(base, gate, spot, geometry, LEVELS: tl.constexpr):
     """Returns the slots [N, 8] of all middles around particles, the places from them, and the weights.
-
     The inputs are the lowest slots, the gates and the spots."""
     line = geometry + (LEVELS - 1) * GEOMETRY_COLUMNS
     corner = tl.arange(0, 8)[None, :]

@@ -68,7 +68,6 @@ class SceneHash:
 
     def row(self) -> list[int]:
         """Returns the scene's row of a table: addresses, mask of the buckets, addresses of lists, last column.
-
         The row is valid while this object lives."""
         cells, lists = [self.bucket_B, self.key_K, self.value_K], self.lists
         mask = len(self.bucket_B) - 2

@@ -23,7 +23,6 @@ _ABSOLUTE_PATH = re.compile(r"(?<![\w.:/~-])/(?:[^/\s,='\"\[\](){}]+/)*([^/\s,='
 
 def commit() -> str:
     """Returns $HGN_COMMIT (for copies without history), or else the checkout's commit.
-
     The commit has the suffix `+changes` if files differ from it. Without a commit the result is `unknown`."""
     return os.environ.get("HGN_COMMIT") or commit_of(Path(__file__).resolve().parents[2])
 

@@ -36,9 +36,8 @@ def import_set(
 ) -> tuple[Manifest, str | None]:
     """Reads the trajectories of a folder and writes them as a data set. Calls `progress` for each episode.
 
-    Returns the manifest, and a warning about trajectories that leave their bounds, or None.
-    Raises: ConfigError naming an unreadable file and field; OSError. The manifest is written last, so an interrupted
-    import starts again.
+    Returns the manifest, and a warning about trajectories that leave their bounds, or None. Raises: ConfigError naming
+    an unreadable file and field; OSError. The manifest is written last, so an interrupted import starts again.
     """
     out = Path(config.out)
     require(not (out / MANIFEST_NAME).exists(), "out", "a new folder", config.out, "this holds a data set")

@@ -65,7 +65,6 @@ def sum_coarsest(
 @triton.jit
 def _slip(moments, cell, there, few, rare, mean, OUT: tl.constexpr):
     """Returns the cells' means without the part that surfaces forbid, by the rule hgn.network.relative.slip.
-
     The products of normals follow the second moments."""
     xx, yy, zz = three_columns(moments, cell, 9, there, 1.0, OUT)
     yz, xz, xy = three_columns(moments, cell, 12, there, 1.0, OUT)
@@ -260,9 +259,8 @@ def add_coarsest(
 ):  # fmt: skip
     """Applies the coarsest cells' table [C, OUT] to the particles' rows of x [N, OUT].
 
-    Multiplies columns 0 to 2 by the table's column USED. Adds the table's columns before USED, with the particles'
-    shares, and the rotation in columns USED + 1 to USED + 3 about the cells' middles. COLUMNS: a power of two above
-    USED.
+    Multiplies columns 0 to 2 by the table's column USED. Adds the table's earlier columns with the particles' shares,
+    and the rotation in the three later columns about the cells' middles. COLUMNS: a power of two above USED.
 
     Rule: hgn.network.relative.balanced; test: tests/kernels/test_relative.py.
     """

@@ -31,7 +31,6 @@ def _base(position, origin, scene, row, live, axis: tl.constexpr, cell_size):
 @triton.jit
 def _base_cell(position, origin, scene, row, live, low, geometry, cell_size):
     """Returns the lowest of each particle's 8 cells, its fractions, and whether the window contains all 8 cells.
-
     Cells are counted from the window's first one. The lowest cell is 0 if the window does not contain all."""
     x, fx = _base(position, origin, scene, row, live, 0, cell_size)
     y, fy = _base(position, origin, scene, row, live, 1, cell_size)
@@ -213,7 +212,6 @@ def _surfaces(
     HISTORY: tl.constexpr, OBSTACLES: tl.constexpr, SYMMETRY: tl.constexpr,
 ):  # fmt: skip
     """Returns the nearness of walls and the normals here and ahead, columns 0 to 11 of [N, 16].
-
     Returns also the nearness of the nearest surface [N], from 0 beyond its reach to 1."""
     column = tl.arange(0, 16)
     axis, upper, walls = column % 3, (column >= 3)[None, :], live[:, None] & (column < 6)[None, :]
@@ -264,7 +262,6 @@ def _surface_normals(surfaces):
 @triton.jit
 def _coarsest_part(x, fraction, high, LEVELS: tl.constexpr):
     """Returns along one axis where a corner's coarsest cell differs from that of the corner below [N, 8].
-
     Returns also the weight of a particle in it, and the place [N] from the middle of the lower corners' cell, in edges.
     x is the coordinate of the lower corners."""
     ABOVE: tl.constexpr = LEVELS - 1

@@ -13,7 +13,6 @@ WARPS = 8
 
 def direction_dtype(device: torch.device) -> torch.dtype:
     """Returns the type of the directions, bfloat16 on a GPU. Products are summed in float32.
-
     The directions are orthogonal only to a hundredth in any type, because the iterations are."""
     return torch.float32 if device.type == "cpu" else torch.bfloat16
 
@@ -51,7 +50,6 @@ class SquareBlocks:
         precision: str,
     ) -> None:
         """Moves the blocks of `values` and of the copy `weights`; hgn.kernels.update.kernel.adam moves the rest.
-
         `share` times `gradient` is added to `momentum`."""
         count, width, _ = self._direction_KWW.shape
         momentum_directions[(count,)](

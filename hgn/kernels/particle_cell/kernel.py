@@ -74,7 +74,6 @@ def _choice(PARTICLES: tl.constexpr, SUMS: tl.constexpr, SIGN: tl.constexpr):
 @triton.jit
 def _first_layer(choice, rows, of_cells, TO_CELL: tl.constexpr, PRECISION: tl.constexpr):
     """Returns the first layer of a tile's pairs [ROWS, W] before its activation.
-
     The summands are the particles' rows, the offsets' rows, and without TO_CELL the cells' rows [ROWS, W]."""
     if TO_CELL:
         h = product(choice, rows, PRECISION)

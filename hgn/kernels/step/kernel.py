@@ -39,7 +39,6 @@ def _lowest(base_of, gate_of, spot_of, row, live):
 @triton.jit
 def _add_bodies(sums, slot, place, weight, value, BODIES: tl.constexpr, COLUMNS: tl.constexpr):
     """Adds values of particles and their moments to the sums of middles [K, COLUMNS].
-
     With BODIES it adds after the mass also the places and their products xx, yy, zz, yz, xz, xy."""
     at: tl.constexpr = 10 * BODIES
     moment = cross(place, (value[0][:, None], value[1][:, None], value[2][:, None]))
@@ -256,7 +255,6 @@ def _covers(row, x, y, z, live):
 @triton.jit
 def _first_stop(bx, by, bz, x, y, z, line, live, within, slack):
     """Returns which paths from (bx, by, bz) to (x, y, z) a triangle stops.
-
     Returns also the shifts of their ends along unit normals, and the fraction of each path before the first triangle.
     The rule is hgn.step.reference.first_stop."""
     bits = tl.load(line + 6, mask=live, other=ONE)

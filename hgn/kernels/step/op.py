@@ -30,7 +30,6 @@ INTEGRATE_BLOCK = 64  # particles of a program
 @dataclass(frozen=True, eq=False)
 class RestLevel:
     """Holds the buffers of rest between cells of one size.
-
     The sums [K, columns] are those of bodies and displacements, and those of slow ones. The table has the subtracted
     motions. Each particle has the lowest of its middles, the place from it, the gate and its slow deformation."""
 
@@ -107,7 +106,6 @@ class DeviceStep:
         path_TN3: torch.Tensor,
     ) -> None:
         """Moves the particles by a rested output between walls and outside obstacles, and counts the frame.
-
         `normaliser` is the mean and standard deviation of accelerations."""
         step, config, status, overlap = self.step, self.config, self.grid.status, overlaps()
         near, far = step.wall_clearance or (0.0, 0.0)

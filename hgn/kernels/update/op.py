@@ -169,10 +169,7 @@ class Updates:
     # updates
 
     def run(
-        self,
-        chunk: Sequence[Sequence[AnySample]],
-        rates: Sequence[float],
-        shares: Sequence[float] | None = None,
+        self, chunk: Sequence[Sequence[AnySample]], rates: Sequence[float], shares: Sequence[float] | None = None
     ) -> None:
         """Makes one update for each entry of `chunk`, which lists the samples of all scenes.
 
