@@ -125,8 +125,7 @@ def convention_lines(errors: dict[str, dict[str, float]]) -> str:
 
 def rollout_row(trials: Sequence[RolloutResult], episodes: list[Episode], frames: int) -> dict[str, Any]:
     """Returns {"system", "position_mse": {frame: value}, "scenes_reached": {frame: count}, "mean_position_mse",
-    "by_material", "ends"}. An error is the mean over the scenes that reached its frame.
-    """
+    "by_material", "ends"}. An error is the mean over the scenes that reached its frame."""
     from hgn.training.errors import REPORTED_FRAMES, rollout_errors
 
     mse_T = rollout_errors([trial.position_TN3 for trial in trials], episodes)

@@ -62,8 +62,7 @@ def funnel_squares(
     hole_width: float, size: float, sine: float, upright: Quaternion = (1.0, 0.0, 0.0, 0.0)
 ) -> tuple[tuple[Quaternion, ...], np.ndarray]:
     """Rotations and centres, float64 [4, 3], of squares of that size that leave a square hole of that width about the
-    origin and rise outwards; `sine` is that of their slope, `upright` turns the y axis upwards.
-    """
+    origin and rise outwards; `sine` is that of their slope, `upright` turns the y axis upwards."""
     cosine = float(np.sqrt(1 - sine * sine))
     half_cosine = float(np.sqrt((1 + cosine) / 2))  # of half the slope's angle, as quaternions have it
     slope = (half_cosine, 0.0, 0.0, sine / (2 * half_cosine))

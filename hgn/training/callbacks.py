@@ -101,8 +101,7 @@ class Checkpoints(Callback):
 
     def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
         """Saves before a training ends because its data stay unreachable. Each rank that misses them saves, since it is
-        between two updates, while the others wait inside one.
-        """
+        between two updates, while the others wait inside one."""
         if isinstance(exception, (StorageError, OSError)) and self._saved_update != _update(pl_module) > 0:
             lightning_compat.save_alone(trainer, self.folder / LAST_NAMES[0])
 

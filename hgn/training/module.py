@@ -122,8 +122,7 @@ class TrainingModule(LightningModule):
 
     def release(self) -> None:
         """Drops the updates with their CUDA graphs. Lightning destroys its process groups when the process ends, and
-        NCCL waits for ever to destroy a group that a graph still uses.
-        """
+        NCCL waits for ever to destroy a group that a graph still uses."""
         self.__dict__.pop("updates", None)
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:

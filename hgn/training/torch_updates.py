@@ -31,9 +31,7 @@ class TorchUpdates:
         backward: Callable[[torch.Tensor], None] = torch.Tensor.backward,
         precision: str = "fp32",
     ) -> None:
-        """`backward` computes the gradients of a loss, averaged over the ranks; `precision` is what PyTorch is set
-        to.
-        """
+        """Takes PyTorch's `precision`, and `backward`, which computes a loss's gradients averaged over the ranks."""
         self.trained, self.training, self._backward = trained, training, backward
         self.precision = precision
         self._device = next(trained.network.parameters()).device
