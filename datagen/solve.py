@@ -1,6 +1,6 @@
 """python -m datagen.solve scene=my_scene.yaml out=truth.vtkhdf: simulates a scene file with the solver.
 
-The result is what networks learn from, for your own scene. `python -m tools.render rollout=truth.vtkhdf
+The result for your own scene is like the data from which networks learn. `python -m tools.render rollout=truth.vtkhdf
 others=[rollout.vtkhdf]` draws it next to a network's rollout of the same scene, with the distance between them.
 """
 

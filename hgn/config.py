@@ -234,7 +234,7 @@ class DatasetConfig:
 
     @property
     def most_frames(self) -> int:
-        """The number of frames of the longest episode."""
+        """Returns the number of frames of the longest episode."""
         return max(self.frames, self.long_frames) if self.long_fraction > 0 else self.frames
 
     def frames_of(self, index: int) -> int:
@@ -277,13 +277,13 @@ class DatagenConfig:
 
     @property
     def reference_cell_size(self) -> float:
-        """The cell size of the grid on which scenes are simulated."""
+        """Returns the cell size of the grid on which scenes are simulated."""
         cells = self.dataset.reference_cells
         return self.scene.cell_size if cells is None else 1 / cells
 
     @property
     def reference_ratio(self) -> float:
-        """The cell size of scenes divided by that of the grid on which they are simulated."""
+        """Returns the cell size of scenes divided by that of the grid on which they are simulated."""
         ratio = self.scene.cell_size / self.reference_cell_size
         return 1.0 if abs(ratio - 1) < 1e-6 else ratio
 
@@ -331,7 +331,7 @@ class NetworkConfig:
 
     @property
     def feature_width(self) -> int:
-        """The number of inputs per particle, the embedding last (paper sec. 3.1, or hgn.network.relative)."""
+        """Returns the number of inputs per particle, the embedding last (paper sec. 3.1, or hgn.network.relative)."""
         if self.relative:
             motion = 3 * (self.velocity_history - 1) + 3 * self.levels + 3
             return motion + 6 + 6 * self.obstacle_features + MATERIAL_EMBEDDING

@@ -1,6 +1,6 @@
 """python -m hgn.rollout: simulates a random scene, or the scene of scene=…, and draws pictures.
 
-The network is that of shipped weights, or that of weights=…. The result is a VTKHDF file with pictures beside it.
+The weights are shipped ones, or those of weights=…. The result is a VTKHDF file with pictures beside it.
 """
 
 from __future__ import annotations

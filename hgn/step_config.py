@@ -30,7 +30,7 @@ class StepConfig:
 
     @property
     def in_training(self) -> StepConfig:
-        """The constraints of pushforward simulations: only obstacles, so that errors at rest and walls are visible."""
+        """Returns the constraints of pushforward simulations: only obstacles. Errors at rest and walls stay visible."""
         return StepConfig(obstacle_clearance=self.obstacle_clearance)
 
     def require_fits(self, relative: bool, dimensions: int) -> None:

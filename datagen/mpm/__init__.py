@@ -2,7 +2,7 @@
 
 import inspect
 
-# For each kernel that is defined Taichi asks for the source of a frame of the import system, which has none: inspect
-# would look through all modules each time, two seconds where PyTorch is loaded
+# At the definition of each kernel Taichi requests the source of a frame of the import system, which has none. inspect
+# would search all modules each time, which takes two seconds after an import of PyTorch.
 for _name in ("_bootstrap", "_bootstrap_external"):
     inspect.modulesbyfile[f"<frozen importlib.{_name}>"] = f"importlib.{_name}"

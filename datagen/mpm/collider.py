@@ -8,8 +8,8 @@ than a cell, nodes outside stop it too, in a band of at least one cell.
 
 Sheets (open meshes): particles on both sides reach the same nodes, which would couple them. So a node near a sheet has
 two fields of mass and velocity (Bardenhagen et al. 2000). Particles that see the node use the first field. Particles
-from which the sheet hides it use the second (the "colours" of Hu et al. 2018, by line of sight). For the latter the
-node lies behind the surface, like the inside of a body, with the normal toward the sheet.
+from which the sheet hides it use the second (the "colours" of Hu et al. 2018, by line of sight). For hidden
+particles the node lies behind the surface, like the inside of a body, with the normal toward the sheet.
 
 A particle's spline reaches 1.5 cells, so a node would stop material at a distance and leave a gap. Therefore a node
 near the surface stops motion only if its mass is at least that of material 0.75 cells from the surface. Without nodes

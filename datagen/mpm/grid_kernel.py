@@ -291,7 +291,7 @@ def substep(
                     ahead = fallen[own] - fallen_before
                 fallen[own] = fallen_before + gravity_time + lead
                 total = gain[own]
-                for part in ti.static(range(1, variant // VARIANT.parts)):  # what copies hold is summed in order
+                for part in ti.static(range(1, variant // VARIANT.parts)):  # sums the copies in a fixed order
                     total += gain[own + part * shape[SHAPE.all_blocks] * BLOCK_NODES]
                 for part in ti.static(range(variant // VARIANT.parts)):
                     gain[own + part * shape[SHAPE.all_blocks] * BLOCK_NODES] = ti.Vector([0.0, 0.0, 0.0, 0.0])

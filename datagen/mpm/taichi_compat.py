@@ -1,6 +1,6 @@
-"""What Taichi does again and again, or for nothing, while it translates a kernel; pyproject.toml fixes its version.
+"""Removes repeated and useless work of Taichi during the translation of a kernel; pyproject.toml fixes its version.
 
-`tests/datagen/mpm/test_device.py` fails when a new version has changed it.
+`tests/datagen/mpm/test_device.py` fails if a new version has changed this work.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from taichi.lang.ast.ast_transformer_utils import ASTTransformerContext
 
 
 def name_lines_alone() -> None:
-    """For the rest of this process a fault in a kernel names file, line and function, without a drawing of the line.
+    """Makes faults in kernels name file, line and function, without a drawing of the line, in this process.
 
     Taichi draws it for each expression that it translates, which takes half of the time that the translation takes.
     """

@@ -26,7 +26,7 @@ MAXIMUM_OUTPUT_BYTES = 2**30  # largest size of a launch's positions
 MAXIMUM_PARTICLES = (2**31 - 1) // (2 * FIELD.solid)  # largest number of particles whose fields int32 can count
 PAUSE = 0.8  # fraction of a launch's expected time in which the host sleeps
 SHORT_SECONDS = 0.1  # launches that are expected to be shorter are awaited without sleep
-PATIENCE = (2**31 - 1, 2**22)  # largest number of reads of a counter on a CPU and on a GPU; the latter takes seconds
+PATIENCE = (2**31 - 1, 2**22)  # largest number of reads of a counter on a CPU and on a GPU, where they take seconds
 
 
 class Team(NamedTuple):

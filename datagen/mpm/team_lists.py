@@ -5,9 +5,9 @@ warp would wait, so threads process lists. Where a thread has at most one partic
 `giving` contains IDLE for inactive particles. In an interval that is not synchronised all particles act.
 
 A block lists its own particles, counted from the scene's first: `column_list` those that begin a step and, backwards
-from its end, those that continue a step whose stress acts evenly; `giving` both, in order, the latter as -1 - p.
-Entries lie at the places of the block's own particles (see team_particles.dealt). Their numbers are in
-columns[segment + ACTING], + GOING_ON and + GIVING.
+from its end, those that continue a step whose stress acts evenly; `giving` lists both in order, continuing
+particles p as -1 - p. Entries lie at the places of the block's own particles (see team_particles.dealt). Their numbers
+are in columns[segment + ACTING], + GOING_ON and + GIVING.
 """
 
 import taichi as ti
@@ -78,7 +78,7 @@ def list_acting(share: ti.template(), thread: ti.template(), step: ti.f32, array
 
 @ti.func
 def mark_going_on(share: ti.template(), thread: ti.template(), particles: ti.i32, arrays: ti.template()):
-    """Marks the blocks of nodes of what goes on with a step whose stress acts evenly (see mark_changed)."""
+    """Marks the blocks of the nodes of columns that continue a step whose stress acts evenly (see mark_changed)."""
     count = arrays.columns[thread.segment + GOING_ON]
     own = thread.lane
     while own < count:

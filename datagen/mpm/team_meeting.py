@@ -22,7 +22,7 @@ LOOKS = 64  # number of reads of a counter between two checks whether all leave
 
 @ti.func
 def wait(threads: ti.template()):
-    """Waits until all threads of the block are here. Then each sees the writes of all."""
+    """Waits until all threads of the block are here. Each thread then sees the writes of all others."""
     if ti.static(threads > 1):
         ti.simt.block.sync()
 
@@ -53,7 +53,7 @@ def await_count(arrays: ti.template(), entry: ti.i32, target: ti.i32, segment: t
 
 @ti.func
 def meet_team(thread: ti.template(), meetings: ti.template(), arrays: ti.template()):
-    """Waits until the whole team is here. Then each thread sees the writes of all. `meetings` counts the meetings."""
+    """Waits until the whole team is here. Each thread then sees all writes. `meetings` counts the meetings."""
     wait(arrays.threads)
     if ti.static(arrays.several):
         if thread.lane == 0:

@@ -34,7 +34,7 @@ class UnhurriedLog:
 
     @property
     def error(self) -> str:
-        """Why the last lines are not in the log."""
+        """Returns the reason for which the last lines are not in the log."""
         return next((stream.error for stream in self._streams if stream.error), "")
 
     def __enter__(self) -> UnhurriedLog:

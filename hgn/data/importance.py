@@ -42,7 +42,7 @@ class DrawnBySize:
 
     @cached_property
     def _lists(self) -> tuple[list[float], list[float]]:
-        """The same as lists, in which access to one number is faster than in an array."""
+        """Returns the same numbers as lists, because access to one number is faster in a list than in an array."""
         return self.cumulative_F.tolist(), self.weight_F.tolist()
 
 
@@ -72,7 +72,7 @@ class FrameImportance:
 
     @cached_property
     def accelerations(self) -> list[float]:
-        """Root mean square acceleration of each frame, domain units per frame squared."""
+        """Returns the root mean square acceleration of each frame, domain units per frame squared."""
         return self.acceleration_F.tolist()
 
 

@@ -150,12 +150,12 @@ class Manifest(_Identity):
 
     @property
     def totals(self) -> Totals:
-        """The totals of each split."""
+        """Returns the totals of each split."""
         return self.shards.totals
 
     @property
     def quarantined(self) -> list[QuarantinedScene]:
-        """The scenes that could not be simulated, in order. Each access reads them."""
+        """Returns the scenes that could not be simulated, in order. Each access reads them."""
         return self.shards.quarantined()
 
     def statistics(self, split: str = "train") -> Statistics:

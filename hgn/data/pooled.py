@@ -33,7 +33,7 @@ class PooledStore(Episodes):
 
     @property
     def manifest(self) -> Manifest:
-        """The manifest of the data set that may grow."""
+        """Returns the manifest of the data set that may grow."""
         return self.own.manifest
 
     def of_split(self, split: str) -> PooledStore:

@@ -54,7 +54,7 @@ class Episodes(Sequence[Episode], ABC):
     @property
     @abstractmethod
     def entries(self) -> Iterator[EpisodeEntry]:
-        """The index entries of all episodes (key, particles, frames), read without opening a shard."""
+        """Returns the index entries of all episodes (key, particles, frames), read without opening a shard."""
 
     def first_indices(self, count: int, published: int | None = None) -> list[int]:
         """Returns the places of the episodes with the lowest indices among the first `published` (None: all)."""

@@ -148,7 +148,7 @@ class EpisodeSampler:
 
     @property
     def window_samples(self) -> int:
-        """The mean number of samples that are shuffled together; 0: all."""
+        """Returns the mean number of samples that are shuffled together; 0: all."""
         blocks = max(1, self._window // BLOCK_EPISODES) * BLOCK_EPISODES
         windowed = 0 < self._window < self.state.episodes
         return -(-len(self._order) * blocks // self.state.episodes) if windowed else 0

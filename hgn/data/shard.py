@@ -39,6 +39,6 @@ def locate_members(path: Path) -> dict[str, dict[str, tuple[int, int]]]:
             for info in tar:
                 key, _, name = info.name.partition(".")
                 located.setdefault(key, {})[name] = (info.offset_data, info.size)
-    except (tarfile.TarError, RecursionError, MemoryError) as error:  # the latter of long names behind one another
+    except (tarfile.TarError, RecursionError, MemoryError) as error:  # long names in a row raise MemoryError
         raise ConfigError(f"{path} must be a whole tar, got {error}; delete it and run the generator again") from None
     return located

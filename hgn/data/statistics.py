@@ -53,7 +53,7 @@ class Moments:
 
     @property
     def std(self) -> Vector:
-        """Standard deviation per axis (divided by the count); zero without values."""
+        """Returns the standard deviation per axis (divided by the count); zero without values."""
         return _vector(np.sqrt(np.array(self.squared_deviation) / max(self.count, 1)))
 
 

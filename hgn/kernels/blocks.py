@@ -1,8 +1,8 @@
 """Holds functions that several kernels use: matrix products at a chosen precision, layer normalisation, its gradient.
 
-The precision is a compile-time name. "tf32" rounds operands to 10 bits of mantissa with float32's range, and the host
-rounds weights before (see nearest_tf32). "fp16" rounds to 10 bits with float16's range. "fp32" does not round, and is
-for tests. Sums are always float32.
+The precision is a compile-time name. With tf32 operands have 10 bits of mantissa and float32's range; the host rounds
+weights before (see nearest_tf32). With fp16 they have 10 bits and float16's range. With fp32, which is for tests,
+nothing is rounded. Sums are always float32.
 """
 
 from __future__ import annotations

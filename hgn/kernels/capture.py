@@ -14,7 +14,7 @@ _streams: dict[int, tuple[torch.cuda.Stream, torch.cuda.Stream]] = {}
 def captured(parts: Sequence[Launches], warm_up: Launches) -> list[torch.cuda.CUDAGraph]:
     """Returns a graph of each of `parts`. `warm_up` runs first: it makes the same launches without lasting changes.
 
-    cuBLAS keeps 32 MiB for each stream in which it ran. torch frees this memory of a capture's stream at the end of any
+    cuBLAS keeps 32 MiB for each stream in which it ran. PyTorch frees this memory of a capture's stream at the end of a
     graph captured there, even if another graph reads it. The warm-up therefore has its own stream. cuBLAS's memory in
     the capture's stream then belongs to the graph and lives as long.
     """

@@ -48,7 +48,7 @@ class LiveSimulation:
 
     @property
     def frame(self) -> int:
-        """The number of the last frame. It can be set."""
+        """Returns the number of the last frame. It can be set."""
         return self.simulation.frame
 
     @frame.setter
@@ -57,7 +57,7 @@ class LiveSimulation:
 
     @property
     def state(self) -> ParticleState:
-        """The input of the network for the next frame, on the simulator's device; read-only."""
+        """Returns the input of the network for the next frame, on the simulator's device; read-only."""
         return self.simulation.state
 
     @property

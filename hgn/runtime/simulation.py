@@ -85,7 +85,7 @@ class Simulation:
 
     @property
     def state(self) -> ParticleState:
-        """The state after the last frame, without ended scenes; read-only."""
+        """Returns the state after the last frame, without ended scenes; read-only."""
         if self.stepper is None:
             return self._state
         position_N3, velocity_NM3 = self.stepper.motion()

@@ -160,7 +160,7 @@ class Simulator:
 
     @property
     def info(self) -> WeightsInfo:
-        """The metadata of the weights file. Only a simulator of `load` has it."""
+        """Returns the metadata of the weights file. Only a simulator of `load` has it."""
         assert self._info is not None
         return self._info
 
@@ -216,7 +216,7 @@ class Simulator:
         on_frame: Callable[[int], None] | None = None,
         isolate: bool = False,
     ) -> tuple[list[np.ndarray], dict[int, DivergedError]]:
-        """As `rollout`, and returns the causes of divergence by scene number.
+        """Does the same as `rollout`, and returns the causes of divergence by scene number.
 
         With `isolate` a diverged scene is NaN from that frame, and the others continue.
         """

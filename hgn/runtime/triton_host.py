@@ -40,7 +40,7 @@ def kernel_precision(precision: str, device: torch.device) -> str:
 
 def _cache() -> Path:
     named = os.environ.get("TRITON_CACHE_DIR")
-    home = os.environ.get("TRITON_HOME") or os.path.expanduser("~")  # noqa: PTH111 - Path's raises where there is none
+    home = os.environ.get("TRITON_HOME") or os.path.expanduser("~")  # noqa: PTH111 - Path's raises without a home folder
     return Path(named) if named else Path(home) / ".triton" / "cache"
 
 

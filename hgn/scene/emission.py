@@ -33,7 +33,7 @@ class Face:
 
     @property
     def axes(self) -> np.ndarray:
-        """Unit vectors along the two edges, float64 [2, 3]."""
+        """Returns unit vectors along the two edges, float64 [2, 3]."""
         along = np.array(self.velocity) / np.linalg.norm(self.velocity)
         level = np.cross([0.0, 1.0, 0.0], along)
         level = np.array([1.0, 0.0, 0.0]) if np.linalg.norm(level) < 1e-9 else level / np.linalg.norm(level)
@@ -41,7 +41,7 @@ class Face:
 
     @property
     def reach(self) -> np.ndarray:
-        """Half the edges of the bounding box, float64 [3]."""
+        """Returns half the edges of the bounding box, float64 [3]."""
         if self.radius:
             along = np.array(self.velocity) / np.linalg.norm(self.velocity)
             return np.asarray(self.radius * np.sqrt(np.maximum(1 - along**2, 0.0)))

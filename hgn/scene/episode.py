@@ -104,7 +104,7 @@ class Episode:
 
     @property
     def dimensions(self) -> int:
-        """The number of dimensions of the motion; with 2, z is constant."""
+        """Returns the number of dimensions of the motion; with 2, z is constant."""
         return int(self.specification.get("dimensions", 3))
 
     @property

@@ -26,7 +26,7 @@ class Region:
 
     @property
     def reach(self) -> np.ndarray:
-        """Half the edges of the bounding box, float64 [3]."""
+        """Returns half the edges of the bounding box, float64 [3]."""
         return np.array(self.half_width) + self.radius
 
     def distances(self, point_P3: np.ndarray) -> np.ndarray:

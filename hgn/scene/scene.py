@@ -52,7 +52,7 @@ class Obstacle:
 
     @property
     def corners(self) -> np.ndarray:
-        """The corners of the obstacle's triangles, float64 [F, 3, 3]."""
+        """Returns the corners of the obstacle's triangles, float64 [F, 3, 3]."""
         return np.asarray(self.vertex_V3, np.float64)[self.triangle_F3]
 
 

@@ -120,7 +120,7 @@ class MaterialEntry:
 
     @property
     def parameters(self) -> dict[str, Any]:
-        """The given constants of the material, by name."""
+        """Returns the given constants of the material, by name."""
         given = {name: getattr(self, name) for name in MATERIAL_PARAMETERS}
         return {name: value for name, value in given.items() if value is not None}
 
@@ -152,13 +152,13 @@ class GroupEntry(MaterialEntry):
 
     @property
     def edges(self) -> Vector:
-        """The three edges, or three times the side or diameter."""
+        """Returns the three edges, or three times the side or diameter."""
         assert self.size is not None
         return self.size if isinstance(self.size, tuple) else (self.size, self.size, self.size)
 
     @property
     def region(self) -> Region:
-        """The region that the shape fills."""
+        """Returns the region that the shape fills."""
         assert self.shape is not None and self.position is not None
         return region_of(self.shape, self.edges, self.position)
 

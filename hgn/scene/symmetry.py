@@ -31,7 +31,7 @@ class Symmetry:
 
     @property
     def mirror_sum(self) -> Vector:
-        """The sum of a mirrored coordinate and its image, domain units."""
+        """Returns the sum of a mirrored coordinate and its image, domain units."""
         x, y, z = (count * self.cell_size for count in self.cells)
         return x, y, z
 
@@ -42,7 +42,7 @@ class Symmetry:
 
     @cached_property
     def code(self) -> int:
-        """The symmetry as an integer below 2^60 for the kernels, without the cell size."""
+        """Returns the symmetry as an integer below 2^60 for the kernels, without the cell size."""
         assert min(self.cells) >= 0 and max(self.cells) < 1 << CELL_BITS
         axes = zip(self.source, self.mirrored, self.cells, strict=True)
         return sum((s | m << 2 | cells << 3) << CODE_BITS * i for i, (s, m, cells) in enumerate(axes))

@@ -81,11 +81,11 @@ class Layout:
 
     @property
     def low(self) -> float:
-        """The smallest coordinate of particles, at the inner face of the solver's walls."""
+        """Returns the smallest coordinate of particles, at the inner face of the solver's walls."""
         return WALL_CELLS * self.config.cell_size + ROUNDING
 
     def high(self, axis: int) -> float:
-        """The largest coordinate of particles along an axis."""
+        """Returns the largest coordinate of particles along an axis."""
         return self.domain[axis] - self.low
 
     def along(self, axis: int, half: float) -> float:

@@ -42,7 +42,7 @@ class EpisodeDataModule(LightningDataModule):
         chunks_ahead: int = CHUNKS_AHEAD,
         interrupted: Callable[[], bool] = lambda: False,
     ) -> None:
-        """When `interrupted` returns True, the chunks end instead of waiting for data."""
+        """Takes `interrupted`; when it returns True, the chunks end instead of waiting for data."""
         super().__init__()
         assert chunks_ahead >= 0
         self.store, self.training, self.reader = store, training, reader

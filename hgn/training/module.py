@@ -79,12 +79,12 @@ class TrainingModule(LightningModule):
 
     @property
     def result(self) -> ParticleNetwork:
-        """The measured and exported network: the moving average if there is one."""
+        """Returns the measured and exported network: the moving average if there is one."""
         return self.network if self.averaged is None else self.averaged
 
     @property
     def rate(self) -> float:
-        """The learning rate of the next update."""
+        """Returns the learning rate of the next update."""
         return learning_rate(self.training_config, self.update)
 
     def simulating_backend(self) -> Backend:

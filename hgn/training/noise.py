@@ -16,7 +16,7 @@ from hgn.config import CORRELATED_WAVELENGTHS, CORRELATED_WAVES, TrainingConfig
 from hgn.data.batch import Batch
 from hgn.system.splitmix import splitmix64
 
-# Keys of random streams other than the particles' noise. With its seed they would repeat its first numbers.
+# Keys of random streams other than the particles' noise. With the seed of that noise they would repeat its numbers.
 JITTER_STREAM, WAVE_STREAM, SCALE_STREAM = 0x5DEECE66D, 0x2545F4914F, 0x9E6D62D06F6A9A9B
 
 SMALLEST_ACCELERATION = 1e-30  # avoids a division by 0

@@ -42,7 +42,7 @@ class StopRequest:
 
     @property
     def exit_code(self) -> int:
-        """128 + the signal's number, or 0 without a signal."""
+        """Returns 128 + the signal's number, or 0 without a signal."""
         return 0 if self.signal is None else 128 + self.signal
 
     def _on_signal(self, number: int, frame: FrameType | None) -> None:

@@ -30,7 +30,7 @@ class TrainedNetwork:
 
     @property
     def result(self) -> ParticleNetwork:
-        """The measured, simulated and exported network: the moving average if there is one."""
+        """Returns the measured, simulated and exported network: the moving average if there is one."""
         return self.network if self.averaged is None else self.averaged
 
 
@@ -49,7 +49,7 @@ class Updates(Protocol):
 
     @property
     def pool_figures(self) -> dict[str, float]:
-        """The metrics of the pushforward pool; empty without one."""
+        """Returns the metrics of the pushforward pool; empty without one."""
 
     def run(self, chunk: Any, first_update: int) -> None:
         """Makes an update for each entry of `chunk.samples`. `first_update` is the number of the first one, from 0.

@@ -148,7 +148,7 @@ class PlayPage:
         """
         try:
             show()
-        except Exception as error:  # noqa: BLE001 - one viewer's connection must not end the session of all
+        except Exception as error:  # noqa: BLE001 - one viewer's connection must not end the session
             traceback.print_exception(error, file=sys.stderr)
             return False
         return True
@@ -158,7 +158,7 @@ class PlayPage:
         self.ended.set()
         stop_server(self.server)
 
-    # what is on screen
+    # the display
 
     def _show(self) -> None:
         session = self.session
@@ -187,7 +187,7 @@ class PlayPage:
         name = self.shown[self.chosen].body.name if self.chosen is not None else "none"
         self.chosen_text.content = f"chosen: {name}"
 
-    # what the viewers do
+    # actions of the viewers
 
     def _add_buttons(self) -> None:
         gui, session = self.server.gui, self.session

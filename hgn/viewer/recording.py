@@ -37,7 +37,7 @@ class Recording:
     def __init__(self, limit_bytes: int) -> None:
         self.limit_bytes, self.bytes, self.first = limit_bytes, 0, 0
         self.frames: deque[Frame] = deque()
-        # Each particle has the frame before its entry, its material, and its velocities until then, newest first.
+        # Each particle has the frame before its entry, its material, and its velocities up to this frame, newest first.
         self.entered_N = np.zeros(0, np.int64)
         self.material_N = np.zeros(0, np.uint8)
         self.entry_NM3 = np.zeros((0, 1, 3), np.float32)

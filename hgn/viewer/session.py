@@ -153,7 +153,7 @@ class PlaySession:
             self.live.set_gravity(then.gravity)
         self.recording.back_to(frame)
 
-    # what enters
+    # particles that enter
 
     def drop(self, material: str, position: Vector, diameter: float, speed: float = 0.0) -> int:
         """Adds a ball of a material that moves down, where there is room. Returns the number of particles that entered.
@@ -220,7 +220,7 @@ class PlaySession:
         position_N3 = self.live.state.position_N3.cpu().numpy()
         return position_N3[((position_N3 >= low_3) & (position_N3 <= high_3)).all(axis=1)]
 
-    # what stands in the way
+    # obstacles
 
     def _placed_by(self, scene: Scene, folder: Path) -> list[PlacedObstacle]:
         if scene.specification.get("kind") != "file":  # the obstacles of a random scene have no entries
@@ -264,7 +264,7 @@ class PlaySession:
         self.live.replace_obstacles(with_obstacles(self.live.scene, obstacles))
         self.obstacles = obstacles
 
-    # what moves it all
+    # gravity and weights
 
     def set_gravity(self, gravity: Vector) -> None:
         """Sets gravity in domain units per second squared.
@@ -293,7 +293,7 @@ class PlaySession:
         self.live.close()
         self.live, self.simulator, self.weights = live, simulator, weights
 
-    # what is taken away
+    # saved files
 
     def scene_archive(self) -> bytes:
         """Returns the present scene: a zip of `scene.yaml`, a file of particles for each material, and the meshes.

@@ -38,7 +38,7 @@ class Outside:
 
 @dataclass(eq=False)
 class Converter:
-    """Converts the trajectories of a set, and records what they contain."""
+    """Converts the trajectories of a set, and records their content."""
 
     info: SetInfo
     gravity: tuple[float, ...]  # length per second squared, for trajectories without their own

@@ -1,7 +1,7 @@
 """Computes particle-cell pairs (paper steps 1 and 11), forward and backward: MLP, norm, weight and sum in one launch.
 
-Row r of a tile is corner r % 8 of particle r // 8. Atomic additions sum up the parts of a cell. Their order, and with
-it the last bits of the sums, may differ between runs. Shape legend: N particles, W width.
+Row r of a tile is corner r % 8 of particle r // 8. Atomic additions sum up the parts of a cell. Their order may
+differ between runs, and the last bits of the sums may differ too. Shape legend: N particles, W width.
 """
 
 from __future__ import annotations
