@@ -307,8 +307,7 @@ class NetworkConfig:
     width: LayerSize = 128  # number of values in latent vectors and hidden layers
     velocity_history: FewLayers = 5  # m: number of past velocities in the input
     obstacle_features: bool = True  # inputs from the nearest obstacle; false is only for scenes without obstacles
-    # absolute: velocities and wall distances, as in the paper; relative: inputs of hgn.network.relative, with which
-    # free motion and gravity are exact
+    # absolute: the paper's velocities and wall distances; relative: hgn.network.relative, exact in free motion
     inputs: Annotated[str, one_of("absolute", "relative")] = "absolute"
     materials: tuple[MaterialName, ...] = PAPER_MATERIALS  # each of the materials has its own embedding
     # number of dimensions; with 2, which only imported data have, z is constant
@@ -355,11 +354,9 @@ class TrainingConfig:
     learning_rate: Positive[float] = 1e-4  # learning rate of the first update after the warm-up
     final_learning_rate: Positive[float] = 1e-6  # learning rate at maximum_updates, after exponential decay
     warmup_updates: NonNegative[int] = 0  # number of first updates with a linear increase of the rate
-    # weights from which a new run starts: a file of python -m hgn.export, or shipped weights by name; a resumed run
-    # ignores it
+    # weights from which a new run starts (not a resumed one): a file of python -m hgn.export or a shipped name
     init_weights: str | None = None
-    # decay of a moving average of the parameters per update, for example 0.9999; the average is monitored and
-    # exported; 0: no average
+    # decay per update of the parameters' average, which is monitored and exported, for example 0.9999; 0: none
     ema_decay: BelowOne[float] = 0.0
     noise_std: NonNegative[float] = 0.000848528  # input noise of the last velocity, domain units per frame
     # fraction of the noise's variance in waves of 4 to 64 cells, which neighbours have in common; the paper's is 0

@@ -84,8 +84,7 @@ def printable(text: str) -> str:
 def from_mapping(cls: type[T], mapping: object, path: _Path = "") -> T:
     """Builds dataclass `cls` from `mapping`, recursively.
 
-    Integers are accepted for floats, and lists for tuples. No other type is converted. `path` prefixes names in errors.
-    Raises: ConfigError.
+    Integers become floats and lists become tuples, nothing else. `path` prefixes names in errors. Raises: ConfigError.
     """
     if not isinstance(mapping, Mapping):
         raise ConfigError(

@@ -11,8 +11,7 @@ from typing import NamedTuple
 class SolverMethod(NamedTuple):
     """The choices in which the solver's own method and that of Taichi Elements differ."""
 
-    # mohr_coulomb: the friction angle on every stress path; compression: the Drucker-Prager cone with that angle in
-    # triaxial compression.
+    # mohr_coulomb: the friction angle on every stress path; compression: the Drucker-Prager cone that fits compression.
     sand_friction_law: str
     # tampubolon: the correction is added to the strains (Tampubolon et al. 2017); taichi_elements: only to their trace.
     sand_volume_correction: str

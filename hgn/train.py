@@ -1,7 +1,6 @@
 """python -m hgn.train +experiment=obstacles: trains a network, and generates its data.
 
-A run is a folder. The same command resumes the run. After Ctrl-C, SIGTERM or SIGUSR1 the run saves a checkpoint at the
-next update and ends.
+A run is a folder. The same command resumes it. On Ctrl-C, SIGTERM or SIGUSR1 the next update saves, and the run ends.
 """
 
 from __future__ import annotations

@@ -71,8 +71,7 @@ class _Cells:
     def __init__(self, level: Level, threads: int) -> None:
         count = level.cell_count
         self.blocks = _Blocks(level.receiver_E, count, threads)
-        # An edge sums rows of a table. The table has all cells as senders, all cells as receivers, and the directions,
-        # which only the first step reads.
+        # An edge sums rows of a table: all cells as senders, all as receivers, and directions for the first step.
         ends_E3 = torch.stack([level.sender_E, level.receiver_E + count, level.direction_E + 2 * count], -1)
         self.ends_of_first, self.ends_of_others = self.blocks.indices(ends_E3), self.blocks.indices(ends_E3[:, :2])
         self.segments = self.blocks.segments()

@@ -1,7 +1,6 @@
 """The identity of a data set: all settings that its trajectories depend on, and no others.
 
-Counts, folder, workers, device and launch size are not part of it. So a data set can grow, move to another machine and
-be completed there.
+Counts, folder, workers, device and launch size are not part of it. A data set can therefore grow on other machines.
 """
 
 from __future__ import annotations

@@ -308,8 +308,7 @@ def settled(total):
 
 @triton.jit
 def added(x, y):
-    """Returns x + y in their type, as a reduction, so that they are added where they were loaded, after both loads
-    began.
+    """Returns x + y in their type as a reduction, which adds them in their layout, after both loads began.
 
     For a plain sum the compiler converts each part to the matrix units' layout, one after the other.
     """

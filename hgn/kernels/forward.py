@@ -43,8 +43,7 @@ class FusedNetwork(Buffers):
     """Runs a packed network on a DeviceGrid.
 
     `values` float32 [packed.size] are the parameters. In fp16 and TF32 the matrix products read `weights`, a rounded
-    copy of `values`. Call `refresh` after every change of `values`. With `training` the network keeps everything that
-    a backward pass reads.
+    copy of `values`. Call `refresh` after every change of `values`. `training` keeps the inputs of a backward pass.
     """
 
     def __init__(

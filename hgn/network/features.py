@@ -50,8 +50,7 @@ class ParticleState:
 class Normaliser(nn.Module):
     """Mean and standard deviation per axis of velocity and acceleration, in frame units.
 
-    Training noise is added to the standard deviations in quadrature, as in GNS (Sanchez-Gonzalez et al. 2020, reference
-    implementation).
+    Training noise is added to the standard deviations in quadrature, as in GNS's code (Sanchez-Gonzalez et al. 2020).
     """
 
     velocity_mean: torch.Tensor

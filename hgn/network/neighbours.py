@@ -23,8 +23,7 @@ SLACK = 1.01
 
 @dataclass(frozen=True, eq=False)
 class NeighbourList:
-    """Directed edges between particles in the order of `order_N`, grouped by receiver. Each particle has an edge to
-    itself."""
+    """Holds directed edges between particles in the order of `order_N`, by receiver, with one from each to itself."""
 
     order_N: torch.Tensor  # int64: the particle at each place of the sorted order
     sender_E: torch.Tensor  # int64, places in the sorted order

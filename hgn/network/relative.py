@@ -99,8 +99,7 @@ def surroundings(velocity_N3: torch.Tensor, grid: GridHierarchy) -> torch.Tensor
     """Returns velocities minus the mean velocities of the surrounding cells on each level, [N, 3 L].
 
     A cell's velocity is sum(m v) / sum(m). On the finest level the sums are over particles, with their trilinear
-    weights; on other levels they are over the children. A particle interpolates between the ancestors of its 8 cells
-    with its own weights.
+    weights; on other levels they are over the children. A particle's weights interpolate between its cells' ancestors.
     """
     weight_N8 = grid.weight_N8
     value_N84 = weight_N8[..., None] * torch.cat([velocity_N3, torch.ones_like(velocity_N3[:, :1])], -1)[:, None]

@@ -151,8 +151,7 @@ def write_picture(path: str | Path, picture: Image.Image | bytes, source: Mappin
 def particle_spacing(position_N3: np.ndarray) -> float:
     """Returns the distance between neighbours in the bulk, in the unit of the positions.
 
-    It is the median distance to the third neighbour. This is exact in a cubic lattice away from its corners, and 11 %
-    too small for random points.
+    It is the median distance to the third neighbour, exact in a cubic lattice and 11 % too small for random points.
     """
     position_N3 = position_N3[np.isfinite(position_N3).all(axis=1)]
     from scipy.spatial import KDTree

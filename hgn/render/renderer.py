@@ -2,8 +2,7 @@
 
 A `Stage` is set up once for a domain and its obstacles (camera, floor, layers and shadows of obstacles) and then draws
 frame after frame. Particles are shaded sphere impostors, drawn from far to near. Each pixel keeps up to LAYERS obstacle
-surfaces by depth, and blends them with the particle before, between or behind them. The renderer draws at twice the
-size and averages down.
+surfaces by depth, and blends them with the particle before, between or behind them. It draws at twice the size.
 
 Shape legend: N particles, P pixels, S fragments (pixels of one triangle or sphere), F triangles, L layers.
 """
@@ -88,8 +87,7 @@ class Camera:
 class Stage:
     """Draws frames of particles in one domain, among obstacles that stay until a call of `place`.
 
-    domain_size and particle_radius are in domain units. size is the width of the picture in pixels. The height follows
-    from the domain.
+    domain_size and particle_radius are in domain units. size is the picture's width in pixels; its height follows.
     """
 
     camera_type: type[Camera] = Camera
@@ -263,8 +261,7 @@ class Stage:
         back = Image.fromarray(self.empty_P3.reshape(camera.height, camera.width, 3), "RGB")
         over, under = ImageDraw.Draw(front), ImageDraw.Draw(back)
         for a, b in BOX_EDGES:
-            # The eye is nearest to the corner at all far ends. Other edges are on the silhouette, or bound only faces
-            # turned away from the eye.
+            # The eye is nearest to the corner at all far ends. Other edges are silhouettes or bound hidden faces.
             near = a.bit_count() == 2
             target, color = (over, (*BOX_COLOR, 120)) if near else (under, BOX_COLOR)
             target.line([tuple(xy[a]), tuple(xy[b])], fill=color, width=SUPERSAMPLING)

@@ -94,8 +94,7 @@ class TritonStepper:
     ) -> None:
         """`capacities` are the numbers of cells on each level for which buffers are allocated at first.
 
-        Buffers have rows for at least `capacity` particles. `obstacles` and `barriers` replace those of the state, and
-        `step` replaces the network's.
+        Buffers have at least `capacity` rows. `obstacles` and `barriers` replace the state's, and `step` the network's.
         """
         self.config, self.device = network.config, state.position_N3.device
         self.step_config = network.step if step is None else step
@@ -129,8 +128,7 @@ class TritonStepper:
     def fits(self, state: ParticleState) -> bool:
         """Returns whether `begin` can continue from a state.
 
-        The state needs the same domains and the same size of obstacle cells. It needs a row for each particle, and no
-        crowds that require float32 sums.
+        The state needs the same domains and obstacle cell size, a row for each particle, and no need of float32 sums.
         """
         if state.scene_count != self.scenes or len(state.position_N3) > self.particles:
             return False
@@ -248,8 +246,7 @@ class TritonStepper:
     def require_parity(self, network: HierarchicalGraphNetwork, state: ParticleState, section: str = "") -> None:
         """Compares the first output with PyTorch's. Call it before the first frame.
 
-        `state` is the state of the start, or its first scenes. `section` of the settings contains the precision.
-        Raises: ParityError.
+        `state` is the initial state, or its first scenes. `section` contains the precision. Raises: ParityError.
 
         """
         if self.graph is None:

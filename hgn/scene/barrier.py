@@ -55,8 +55,7 @@ def build_barrier(corner_F33: np.ndarray, cell_size: float, clearance: float, do
 def barrier_pieces(corner_F33: np.ndarray, cell_size: float, domain_size: Vector | None = None) -> np.ndarray:
     """Returns the triangles of a barrier, corners float64 [F', 3, 3]: long ones are cut, those without area omitted.
 
-    With `domain_size`, pieces more than a cell outside are omitted. Corners are rounded to float32, so float32 input
-    gives the same rows.
+    With `domain_size`, pieces more than a cell outside are omitted. Corners are rounded to float32 for equal rows.
     """
     box = None
     if domain_size is not None:

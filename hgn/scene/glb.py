@@ -30,8 +30,7 @@ _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 def read_glb(path: Path) -> tuple[np.ndarray, np.ndarray]:
     """Returns vertices, float64 [V, 3], and triangles, int64 [F, 3], of the file's scene.
 
-    Raises: ValueError, LookupError, TypeError, struct.error or OSError for a damaged file, missing data, and
-    unsupported features.
+    Raises: ValueError, LookupError, TypeError, struct.error or OSError for damaged, missing or unsupported data.
     """
     tree, binary = _chunks(path.read_bytes())
     unknown = [n for n in tree.get("extensionsRequired", ()) if n not in READ and not NEUTRAL.fullmatch(n)]

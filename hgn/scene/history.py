@@ -24,8 +24,7 @@ def ballistic_positions(
 ) -> np.ndarray:
     """Returns positions of particles in free flight at the given frames (0 is now, negative is the past).
 
-    Units: domain units, domain units per second (squared). Returns float32 [len(frame_indices), N, 3], computed in
-    float64.
+    Units: domain units, domain units per second (squared). Returns float32 [len(frame_indices), N, 3] from float64.
     """
     time_T11 = np.asarray(frame_indices, np.float64)[:, None, None] / frame_rate_hz
     fall_3 = 0.5 * np.asarray(gravity, np.float64)

@@ -1,8 +1,7 @@
 """Random scenes after the paper (sec. 3.3): disjoint obstacles, and groups of particles at a distance from them.
 
 Config and seed determine a scene bitwise on every machine. All randomness is `PCG64` through `Generator.random()`.
-Coordinates are computed by sums, products and square roots. Only the unit shapes use sines and cosines, rounded to
-float32.
+Coordinates are sums, products and square roots. Only the unit shapes use sines and cosines, rounded to float32.
 """
 
 from __future__ import annotations

@@ -138,8 +138,7 @@ def obstacles_of_episode(episode: Episode) -> tuple[Obstacle, ...]:
 def known_obstacles(episode: Episode) -> tuple[Obstacle, ...] | None:
     """Returns the meshes of an episode's obstacles or None. Shards do not contain them.
 
-    The meshes of a random scene are rebuilt from its specification. Other scenes have none, nor do scenes with a mesh
-    file that is missing.
+    A random scene's meshes are rebuilt from its specification. Other scenes, or a missing mesh file, give none.
     """
     records = episode.specification.get("obstacles", ())
     if episode.specification.get("kind") != "random" or not all(_is_here(record) for record in records):

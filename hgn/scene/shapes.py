@@ -35,8 +35,7 @@ def shape_obstacle(
     `size`, in domain units, is the side of the square and of the half box (whose height is half of it), the diameter of
     the half sphere, the base width and height of cone and pyramid, or the longest side of a mesh file's bounding box.
     Vertices are rounded to float32.
-    Raises: KeyError for a shape that is neither in hgn.config.OBSTACLE_SHAPES nor a mesh file; ConfigError for an
-    unreadable mesh.
+    Raises: KeyError for a shape neither in hgn.config.OBSTACLE_SHAPES nor a file; ConfigError for an unreadable mesh.
     """
     vertex, triangle, closed = unit_shape(shape)
     scaled = size * vertex
@@ -47,8 +46,7 @@ def shape_obstacle(
 
 @functools.cache
 def unit_shape(shape: str) -> tuple[np.ndarray, np.ndarray, bool]:
-    """Returns the shape of size 1 about the origin: vertices, float64 [V, 3], triangles, int32 [F, 3], and whether it
-    is closed."""
+    """Returns the shape of size 1 about the origin: vertices float64 [V, 3], triangles int32 [F, 3], whether closed."""
     closed = shape in CLOSED_SHAPES
     if is_mesh_file(shape):
         # importing trimesh takes half a second, and few scenes need it

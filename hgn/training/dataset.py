@@ -117,8 +117,7 @@ def wait_for_episodes(
 class PublishedEpisodes:
     """Returns the progress of the data set when called: `5/800 episodes`.
 
-    Reading a manifest of hundreds of scenes takes 0.1 s. So it is read at most every BETWEEN_LOOKS_S, and no more after
-    the data set is complete.
+    It is read at most every BETWEEN_LOOKS_S, because a reading takes 0.1 s, and not after the data set is complete.
     """
 
     def __init__(self, config: TrainConfig, generator: Generator | None) -> None:

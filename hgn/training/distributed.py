@@ -1,8 +1,7 @@
 """The processes that train together, the run's folder, and the averaging of gradients.
 
 Launchers set environment variables. torchrun sets RANK, WORLD_SIZE and LOCAL_WORLD_SIZE. srun sets SLURM_PROCID,
-SLURM_NTASKS and SLURM_NNODES. Lightning's own launcher starts the other processes of a machine and sets LOCAL_RANK and
-NODE_RANK in them.
+SLURM_NTASKS and SLURM_NNODES. Lightning's launcher sets LOCAL_RANK and NODE_RANK in a machine's other processes.
 """
 
 from __future__ import annotations

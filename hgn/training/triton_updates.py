@@ -90,8 +90,7 @@ class TritonUpdates:
         return {} if self._pool is None else self._pool.figures
 
     def run(self, chunk: EpisodeChunk, first_update: int) -> None:
-        """Raises: ConfigError if positions are not finite; before the first update also if the kernels' results differ
-        from PyTorch's on this machine."""
+        """Raises: ConfigError for positions that are not finite, and at first for kernels unlike PyTorch."""
         for index in chunk.dropped:
             del self._episodes[index]
         with self._timed("placing episodes"):

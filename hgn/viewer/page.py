@@ -1,8 +1,7 @@
 """Serves the page of `hgn.play`: one session with its buttons, shared by any number of viewers.
 
 The page queues the actions of viewers and runs them between two frames, so that the server's event loop never waits for
-a frame. Of several moves of one obstacle only the last runs. The page holds the state, and a viewer who reconnects
-finds it again.
+a frame. Of several moves of one obstacle only the last runs. The page holds the state for viewers who reconnect.
 
 Viewers are not trusted: a raw message may contain any value. Values are clamped to the range of their sliders, weights
 must be in the list, and every error of an action becomes a message to its viewer.

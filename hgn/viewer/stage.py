@@ -43,8 +43,7 @@ class StageView:
     ) -> None:
         """Takes the `spacing` of particles at rest in domain units, and the names of `materials` by index.
 
-        In float16 positions have steps of 2^-12 of the domain. With two dimensions the camera looks straight at the
-        plane in the middle.
+        In float16 positions have steps of 2^-12 of the domain. With two dimensions the camera faces the middle plane.
         """
         self.scene, self.domain_size = server.scene, domain_size
         self.scene.set_up_direction("+y")

@@ -91,8 +91,7 @@ def edge_forward(
 
     send and receive [C, W] are the products of the cells with the first two parts of the edge MLP; receive includes the
     bias. FIRST: edges have no features yet, and their unit offset replaces them. The last iteration stores no edges.
-    SAVE stores the inputs of edge_backward: the hidden layer and the normalised output [C, 6, W], and `rstd` [C, 6]
-    (one over its standard deviation).
+    SAVE stores the inputs of edge_backward: hidden layer and normalised output [C, 6, W], and `rstd` [C, 6] (1 / std).
 
     Rule: hgn.network.hgn.MessagePassing; reference and test: tests/kernels/references.py, test_kernels_alone.py.
     """

@@ -119,8 +119,7 @@ def prepare_relative_features(
     They are: changes of velocity minus gravity; the velocity relative to the cells around on each level, whose mass and
     momentum are in `motion`; near a surface the velocity, weighted by `felt` of the coarsest cells; the columns of
     surfaces, which prepare_particles wrote; and the one-hot material. Differences of velocity are asinh of multiples of
-    `scale`. The kernel raises the first numbers of the coarsest cells' `disturbed` [C, 2] to the disturbance of their
-    particles over FULLY.
+    `scale`. Raises column 0 of the coarsest cells' `disturbed` [C, 2] to their particles' disturbance, times FULLY.
 
     Rule: hgn.network.relative; test: tests/kernels/test_network.py.
     """

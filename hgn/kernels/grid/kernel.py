@@ -286,7 +286,7 @@ def prepare_particles(
     With MOTION it adds the particle's parts of the finest cells' mass and momentum to `motion` [.., 4]. It writes its
     coarsest cells `coarsest_of` [N, 8], each once and -1 elsewhere, its weights in them, and its place [N, 3] from the
     middle of the lowest cell, in edges. It writes the features of surfaces, and `touch_of` [N], the nearness of the
-    nearest surface. It raises the second number of the coarsest cells in `disturbed` [C, 2] to this nearness over
+    nearest surface. It raises the second number of the coarsest cells in `disturbed` [C, 2] to this nearness times
     FULLY. It adds places, their products xx, yy, zz, yz, xz, xy, and then those of the normals of near surfaces to the
     coarsest cells' `moments` [C, COLUMNS]. OBSTACLES and SYMMETRY mean the same as in prepare_features.
 

@@ -297,8 +297,7 @@ def gather_project(
 ):  # fmt: skip
     """Computes y and two products of y, the second one with a bias.
 
-    y is x, or with SUM > 0 the sum of the rows of x that the table [SUM, capacity] lists (-1: none). LOOP and OVERLAP
-    mean the same as in mlp_forward.
+    y is x, or with SUM > 0 the sum of x's rows in the table [SUM, capacity] (-1: none). LOOP, OVERLAP: see mlp_forward.
 
     Rule: hgn.network.mlp.MLP; reference and test: tests/kernels/references.py, test_kernels_alone.py.
     """

@@ -317,8 +317,7 @@ def particle_cell_weight_gradient(
 
     This kernel is for a hidden layer that was not stored. It computes the layer again to the same bits, and reads an
     eighth of the bytes. It begins with the last tile, whose data from particle_cell_backward are still in the L2 cache.
-    PIPELINED: in a counted loop the compiler copies tiles to shared memory two ahead. The interpreter of Triton 3.6
-    cannot count to a loaded number.
+    PIPELINED: a counted loop copies tiles to shared memory two ahead. Triton 3.6's interpreter has no such loops.
 
     Rule: hgn.network.hgn; reference and test: tests/kernels/references.py, test_kernels_alone.py.
     """

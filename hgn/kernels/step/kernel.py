@@ -30,8 +30,7 @@ DIVERGED = tl.constexpr(4)
 
 @triton.jit
 def _lowest(base_of, gate_of, spot_of, row, live):
-    """Returns the slots of the lowest middles around particles, their gates, and the places relative to them in
-    edges."""
+    """Returns the slots of the lowest middles around particles, the gates, and the places relative to them in edges."""
     spot = three_columns(spot_of, row, 0, live, 1.0, 3)
     return tl.load(base_of + row, mask=live, other=0), tl.load(gate_of + row, mask=live, other=0.0), spot
 
