@@ -43,7 +43,7 @@ def winding_numbers(point_P3: np.ndarray, triangle_F33: np.ndarray) -> np.ndarra
 
     It is +1 or -1 inside a closed mesh (by its orientation), 0 outside, and between for meshes with holes. Zero-area
     triangles add nothing. Up to DIRECT_TRIANGLES solid angles are summed exactly (van Oosterom and Strackee 1983;
-    Jacobson et al. 2013) in bounded memory. In larger ones distant clusters are dipoles (Barill et al. 2018; error 0.01).
+    Jacobson et al. 2013) in bounded memory. Larger ones use distant dipoles (Barill et al. 2018; error 0.01).
     """
     point = np.asarray(point_P3, np.float64).reshape(-1, 3)
     triangle = np.asarray(triangle_F33, np.float64).reshape(-1, 3, 3)
