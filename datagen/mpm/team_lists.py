@@ -1,13 +1,13 @@
 """Lists of the particles of a thread block that act in a substep within an interval.
 
-Where particles take steps of their own about a third acts in a substep. With one thread for each particle half of a
-warp would wait, so threads process lists. Where a thread has at most one particle (`run` 1) there are no lists, and
+If particles take their own steps, about a third of them act in a substep. With one thread for each particle half of a
+warp would wait, so threads process lists. If a thread has at most one particle (`run` 1), there are no lists, and
 `giving` contains IDLE for inactive particles. In an interval that is not synchronised all particles act.
 
-A block lists its own particles, counted from the scene's first: `column_list` those that begin a step and, backwards
-from its end, those that continue a step whose stress acts evenly; `giving` lists both in order, continuing
-particles p as -1 - p. Entries lie at the places of the block's own particles (see team_particles.dealt). Their numbers
-are in columns[segment + ACTING], + GOING_ON and + GIVING.
+A block lists its own particles, counted from the scene's first. `column_list` has particles that begin a step and,
+backwards from its end, particles that continue a step whose stress acts evenly. `giving` has both in order, with -1 - p
+for a continuing particle p. Entries lie at the places of the block's own particles (see team_particles.dealt). Their
+numbers are in columns[segment + ACTING], + GOING_ON and + GIVING.
 """
 
 import taichi as ti
@@ -54,7 +54,7 @@ def _places(entry, arrays: ti.template(), thread: ti.template()):
 
 @ti.func
 def list_acting(share: ti.template(), thread: ti.template(), step: ti.f32, arrays: ti.template()):
-    """Makes the block's lists for a substep within an interval; their counts are 0 before."""
+    """Makes the block's lists for a substep within an interval. Their counts must be 0."""
     rounds = (share.owned + arrays.threads - 1) // arrays.threads
     for around in range(rounds):
         own = around * arrays.threads + thread.lane

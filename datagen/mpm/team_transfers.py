@@ -79,7 +79,7 @@ def gather(x, bits: ti.i32, scene: ti.i32, velocities: ti.i32, arrays: ti.templa
 
 @ti.func
 def _entry(at: ti.i32, first: ti.i32, own_steps: ti.i32, arrays: ti.template()) -> ti.i32:
-    """Returns a contributing particle's entry: that of team_lists if particles take their own steps, else `at`."""
+    """Returns a contributing particle's entry: its entry in team_lists if particles take their own steps, else `at`."""
     entry = at
     if ti.static(not arrays.variant & VARIANT.each_step):  # noqa: SIM102 (this one is the compiler's)
         if own_steps:

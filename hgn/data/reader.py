@@ -74,7 +74,7 @@ class Episodes(Sequence[Episode], ABC):
 
 
 class EpisodeStore(Episodes):
-    """The published episodes of one split of a data set, in publication order. Its number only grows.
+    """The published episodes of one split of a data set, in publication order. Their number only grows.
 
     It can be pickled for spawned workers with folder, split and manifest, but without open files and maps.
     """
@@ -128,7 +128,7 @@ class EpisodeStore(Episodes):
             return False
         except (ConfigError, OSError) as error:
             patience_s = standard_patience_s()
-            if self._looked_s - previous_s > patience_s + FORGOTTEN_S:  # it may have ended in between
+            if self._looked_s - previous_s > patience_s + FORGOTTEN_S:  # the fault may have ended since
                 self._faulty_since = None
             since = self._looked_s if self._faulty_since is None else self._faulty_since
             if not outliving():
@@ -180,8 +180,7 @@ class EpisodeStore(Episodes):
     def fetch_ahead(self, episodes: Sequence[int] | None = None) -> None:
         """Starts to fetch shards in the background, one after the other. It does nothing for a folder.
 
-        It fetches all published shards, or those of `episodes` in their order. Only with `episodes` are older shards
-        removed from a full cache.
+        It fetches all published shards, or those of `episodes` in order. Only then a full cache drops older shards.
         """
         if not is_remote(self.folder):
             return

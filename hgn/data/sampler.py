@@ -1,8 +1,8 @@
 """The order of training samples: a pure function of seed, epoch, episodes, batch and world size.
 
 A sample is one frame of one episode. An epoch is a permutation of all samples of the episodes that were published when
-it began. Epochs follow each other without a gap. So every sample comes exactly once an epoch on any number of ranks,
-all batches have one size, and a `SamplerState` is the whole state of the order.
+it began. Epochs follow each other without a gap. Every sample comes exactly once an epoch on any number of ranks.
+All batches have one size. A `SamplerState` is the whole state of the order.
 """
 
 from __future__ import annotations
@@ -85,8 +85,7 @@ class EpisodeSampler:
     `published(epoch)` is called when an epoch begins. It returns the number of frames of each published episode, in
     publication order. It must return the same list on every rank, and continue the list of the epoch before. Episodes
     published after a resumed epoch began wait for the next epoch. `digest(count)` identifies the first `count` episodes
-    (`hgn.data.index`). `particles(episodes)` returns particle counts. With them scenes are balanced over ranks, so that
-    no rank waits for the slowest.
+    (`hgn.data.index`). `particles(episodes)` returns particle counts. They balance the ranks.
     """
 
     def __init__(

@@ -33,7 +33,7 @@ TOKEN_VARIABLE = "HGN_DATASET_TOKEN"
 TOKEN_HOST_VARIABLE = "HGN_DATASET_HOST"
 _CHUNK_BYTES = 16 * 2**20  # bytes of a shard per request; a lost connection costs at most one request
 _CONNECT_S, _SILENCE_S, _ANSWER_S = 10.0, 60.0, 1800.0  # time limits of a connection, of silence, and of a whole file
-_AWAY_S = 10.0  # time after a server did not answer in which callers without patience do not ask it
+_AWAY_S = 10.0  # seconds after a failed request in which callers without patience send no request
 _NETWORK_PACKAGES = {"aiohttp", "botocore", "aiobotocore", "gcsfs", "google", "azure"}
 
 T = TypeVar("T")

@@ -247,7 +247,6 @@ class TritonStepper:
         """Compares the first output with PyTorch's. Call it before the first frame.
 
         `state` is the initial state, or its first scenes. `section` contains the precision. Raises: ParityError.
-
         """
         if self.graph is None:
             self._network_pass()

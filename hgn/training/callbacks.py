@@ -100,8 +100,9 @@ class Checkpoints(Callback):
             self.save_last(trainer, _update(pl_module))
 
     def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
-        """Saves before a training ends because its data stay unreachable. Each rank that misses them saves, since it is
-        between two updates, while the others wait inside one."""
+        """Saves before a training ends because its data stay unreachable.
+
+        Each rank without data saves, because it is between two updates. The other ranks wait inside an update."""
         if isinstance(exception, (StorageError, OSError)) and self._saved_update != _update(pl_module) > 0:
             lightning_compat.save_alone(trainer, self.folder / LAST_NAMES[0])
 
