@@ -1,6 +1,6 @@
-"""The parts of a substep of explicit MLS-MPM, for the Taichi kernels grid_kernel and team_kernel.
+"""Computes the parts of a substep of explicit MLS-MPM, for the Taichi kernels grid_kernel and team_kernel.
 
-APIC transfers with quadratic B-splines (Jiang et al. 2015; Hu et al. 2018). Only blocks of nodes near particles are
+Transfers are APIC with quadratic B-splines (Jiang et al. 2015; Hu et al. 2018). Only blocks of nodes near particles are
 updated. Contributions of particles are summed separately from the nodes' velocities. Masses are in units of the mass of
 a particle with the config's density.
 
@@ -15,7 +15,7 @@ substep of a following synchronised interval compensates both (VALUE.catch_up). 
 does not strain, and its stress acts for half of it.
 
 In the first substep of an interval particles transfer mass, momentum and force to the nodes. In the other substeps they
-keep their place on the grid. They compute strain and stress from the gradient of the nodes' velocities, and transfer
+keep their place on the grid. They compute strain and stress from the gradient of the nodes' velocities. They transfer
 only force, as in the Lagrangian phase of the classical method (Sulsky et al. 1994). After the last substep they take
 velocity and gradient from the grid, and move by the interval times the velocity. Momentum and angular momentum are
 conserved, because stresses are symmetric and each particle moves along its velocity. multiple_time_stepping chooses the

@@ -65,10 +65,10 @@ def simulate(
 
     Scenes may differ in particles, materials, obstacles and gravity. They share domain and cell size.
     With adaptive time steps particles and grid exchange velocities every dx / transfer_speed_m_s, or every step of
-    stress if that is longer, but at least every SPEED_FRACTION dx / |v|max. Intervals are equal up to the end of the
-    frame. Each scene takes its own steps of stress between, of at most stability_fraction dx sqrt(rho / (3 lambda_h +
-    2 mu_h)). A fixed time step has a transfer in each step. It is taken ceil(frame / step) times a frame, as in Taichi
-    Elements: 54 times at 60 Hz and 3.125e-4 s, which is 1.25 % more than the frame.
+    stress if that is longer. The interval is at most SPEED_FRACTION dx / |v|max. Intervals are equal up to the end of
+    the frame. Each scene takes its own steps of stress between, of at most stability_fraction dx sqrt(rho / (3 lambda_h
+    + 2 mu_h)). A fixed time step has a transfer in each step. It is taken ceil(frame / step) times a frame, as in
+    Taichi Elements: 54 times at 60 Hz and 3.125e-4 s, which is 1.25 % more than the frame.
 
     `on_frame(t)` is called when frame t of all scenes is complete, from 0. `cpu_threads` applies to the process's first
     simulation (see `initialise`). `colliders` are results of `build_collider` for the scenes; None: they are built.

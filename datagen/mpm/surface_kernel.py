@@ -14,7 +14,7 @@ NODE_VECTORS = 4
 MOVING_NODE_VECTORS = 6  # in addition the surface's velocity in each field, domain units a second
 TRIANGLE_VECTORS = 5  # the vectors of datagen.mpm.sweep.Sweep, and the friction
 MOVING_TRIANGLE_VECTORS = 7  # in addition the first corner's velocity, cells a second, and the angular velocity
-LIST_HEAD = 2  # head of a list: number of triangles, and number of those of sheets, which come first
+LIST_HEAD = 2  # head of a list: number of triangles, and number of sheets' triangles, which come first
 STENCIL = 27  # number of nodes of a particle
 ATTEMPTS = 3  # number of triangles that may stop a path; the third stops the particle
 

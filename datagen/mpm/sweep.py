@@ -23,7 +23,7 @@ COLUMNS_PER_CHUNK = 1 << 11  # columns of nodes along z in a pass; about 20,000 
 
 @dataclass(frozen=True, eq=False)
 class Sweep:
-    """Triangles, and for each base node near them a list of those that its particles may meet, sheets first."""
+    """Holds triangles. Each base node near them has a list of triangles that its particles may meet, sheets first."""
 
     # float32: a corner, the unit normal, and two vectors; the products of these vectors with an offset from the corner
     # are the offset's coordinates along the two edges at the corner

@@ -3,10 +3,10 @@
 The method and its parts are those of datagen.mpm.mls_mpm. A scene of a few thousand particles needs hundreds of steps a
 frame, each of a few microseconds. So a team computes step after step of a scene within one launch, independently of
 other scenes. A team is one or several thread blocks that share a scene's particles and wait for each other
-(datagen.mpm.team_meeting), so all blocks of a launch must run concurrently. A team computes one scene after another.
+(datagen.mpm.team_meeting). All blocks of a launch must run concurrently. A team computes one scene after another.
 
-One thread for each particle computes strain, stress and contact with triangles. At each frame the particles are sorted
-by their cells into the other copy of the state, so that neighbours in space are neighbours in memory.
+One thread for each particle computes strain, stress and contact with triangles. Each frame sorts the particles by
+their cells into the other copy of the state. Neighbours in space are then neighbours in memory.
 
 With one thread a block the kernel also runs on a CPU, where tests compare it with the other kernel.
 """

@@ -34,7 +34,7 @@ class Tuning:
     pair_particles: int  # particles of a tile, with eight rows each; at most 13
     pair_warps: int
     few_cells: int = 0  # a level with up to this number of cells has few cells
-    small_block: int = 16  # rows of a tile where there are few rows
+    small_block: int = 16  # rows of a tile if there are few rows
     small_warps: int = 8
     dense: bool = False  # tiles of edges have six rows a cell instead of eight
     overlap: bool = False  # kernels of a message step read their weights before the previous kernel ends

@@ -14,7 +14,7 @@ cube. The columns are, in this order:
 | 3 + 3 | obstacle normals at the particle and ahead of it; only with obstacle_features |
 
 G = sum_C w_pC t_C uses t_C of `disturbance`. It is at least the particle's own `surface_gate`. In a pile it is above 0
-even for particles out of reach, if particles in the same coarsest cell or in one across a face are near a surface.
+even for particles out of reach. Particles in the same coarsest cell, or in one across a face, are then in reach.
 
 The decoder returns an acceleration r and a stress sigma for each particle. `balanced` computes the acceleration from
 them. These properties hold for any parameters:
@@ -202,8 +202,8 @@ def disturbance(
 
     `disturbed` is 0 if all particles in the surroundings fly freely as one rigid body. A particle is disturbed by a
     surface within reach (`surface_gate`), or if a column of history or surroundings is not small against QUIET. A
-    coarsest cell is as disturbed as the most disturbed particle in it and in the cells across its faces, because an
-    impact acts through a body within a frame. `touched` is computed in the same way, from surfaces only.
+    coarsest cell is as disturbed as the most disturbed particle in it and in the cells across its faces. An impact acts
+    through a body within a frame. `touched` is computed in the same way, from surfaces only.
     """
     own_N = (touch_N + (motion_NK / QUIET).square().sum(-1)).clamp(max=1)
     cell_N8, coarsest = coarsest_cells(grid), grid.levels[-1]

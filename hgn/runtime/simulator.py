@@ -290,7 +290,7 @@ class Simulator:
         Arguments replace the scene's own values: positions and velocities [N, 3], gravity [3] (relative inputs only),
         the domain's size [3]. Units are domain units and seconds. `poses` rotates and shifts obstacles by number.
         `smoothing`, 0 to 1 obstacle cells, makes normals continuous (hgn.network.posed_obstacles). PyTorch computes it
-        with one frame's intermediate results in memory. docs/how_to/gradients.md lists what is differentiable.
+        with one frame's intermediate results in memory. docs/how_to/gradients.md lists all quantities with gradients.
         Raises: ConfigError and DivergedError as `rollout`.
         """
         inputs = Inputs(position_N3, velocity_N3, gravity_3, domain_size_3, poses=poses, smoothing=smoothing)

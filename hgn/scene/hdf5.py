@@ -48,8 +48,9 @@ def open_hdf5(path: Path, rule: str, remedy: str) -> h5py.File:
 
 
 def _require_own_data(group: h5py.Group, path: Path, claims: Claims, visited: set[int], depth: int = 0) -> None:
-    """Raises ConfigError for a reference to another file, which HDF5 would read with this reader's rights, and for an
-    object that has two names or is larger than the file."""
+    """Raises ConfigError for an object that is in another file, has two names, or is larger than the file.
+
+    HDF5 would read another file with the rights of this reader."""
     import h5py
 
     for name in group:

@@ -36,11 +36,11 @@ def build_obstacle_grid(
     """Returns the mean obstacle normal of every cell that a surface passes through (Paper sec. 3).
 
     Samples of all obstacles are at least cell_size / 4 apart. A sample contributes its triangle's normal, negated if it
-    points away from the cell's centre. The sum of a cell is normalised. If the sum cancels (two sheets on both sides of
-    the centre), the cell gets the normal of the sample nearest to its centre, because zero would mean "no obstacle".
+    points away from the cell's centre. The sum of a cell is normalised. The sum may cancel (two sheets on both sides of
+    the centre). The cell then gets the normal of the sample nearest to its centre. Zero would mean "no obstacle".
     Zero-area triangles are skipped. With `domain_size`, cells more than a cell outside the domain are omitted, which
-    limits the cost of large meshes. The result is deterministic.
-    Raises: ConfigError for a bad cell size, or for a surface that is too large to sample.
+    limits the cost of large meshes. The result is deterministic. Raises: ConfigError for a bad cell size, or for a
+    surface that is too large to sample.
     """
     return grid_of_samples(*surface_samples(obstacles, cell_size, seed, domain_size), cell_size)
 

@@ -32,9 +32,9 @@ def shape_obstacle(
 ) -> Obstacle:
     """Returns an obstacle of a known shape. `position` is the centre of its unrotated bounding box.
 
-    `size`, in domain units, is the side of the square and of the half box (whose height is half of it), the diameter of
-    the half sphere, the base width and height of cone and pyramid, or the longest side of a mesh file's bounding box.
-    Vertices are rounded to float32.
+    `size` is in domain units. It is the side of the square and of the half box, the diameter of the half sphere, and
+    the base width and height of cone and pyramid. The half box is half as high. A mesh file's bounding box has `size`
+    as its longest side. Vertices are rounded to float32.
     Raises: KeyError for a shape neither in hgn.config.OBSTACLE_SHAPES nor a file; ConfigError for an unreadable mesh.
     """
     vertex, triangle, closed = unit_shape(shape)

@@ -150,8 +150,8 @@ def set_convention(one_step_mse: float, predicted: Sequence[np.ndarray], episode
     """Returns errors as papers on imported sets report them: means also over axes, of free and of all particles.
 
     Boundary particles do not move, so they have no error; GNS includes them in its averages. Positions are compared
-    scene by scene over all predicted frames, as GNS does (Sanchez-Gonzalez et al. 2020), and over the first 20, as
-    LagrangeBench does for MSE20 (Toshev et al. 2023). Units: the set's unit of length, squared.
+    scene by scene. GNS compares all predicted frames (Sanchez-Gonzalez et al. 2020), and LagrangeBench the first 20 for
+    MSE20 (Toshev et al. 2023). Units: the set's unit of length, squared.
     """
     dimensions = episodes[0].dimensions
     still = [0 if episode.boundary_P3 is None else len(episode.boundary_P3) for episode in episodes]

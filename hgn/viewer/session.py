@@ -156,7 +156,7 @@ class PlaySession:
     # particles that enter
 
     def drop(self, material: str, position: Vector, diameter: float, speed: float = 0.0) -> int:
-        """Adds a ball of a material that moves down, where there is room. Returns the number of particles that entered.
+        """Adds a ball of a material that moves down, in free places. Returns the number of particles that entered.
 
         Raises ConfigError for a material that the weights do not know.
         """

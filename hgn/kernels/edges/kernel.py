@@ -5,7 +5,7 @@ six rows, so that 64 rows hold ten cells instead of eight. A program takes many 
 once. Edge arrays are [capacity, 6, W]: entry [c, d] is the edge to cell c from its neighbour in direction d. A tile
 computes its sums over edges itself, or gathers them in a fixed order. Atomics add only gradients of parameters.
 OVERLAP: a program starts while the previous kernel runs. It reads its weights and the results of the grid's kernels
-(count, neighbours), and waits for the end of the previous kernel before any other access. At least one kernel without
+(count, neighbours). It waits for the end of the previous kernel before any other access. At least one kernel without
 OVERLAP runs after those of the grid. Every program with rows waits, and the first program always waits. A kernel
 therefore ends only after all earlier ones. The wait is inside the loop over tiles, because the compiler then lays out
 the weights for the matrix units before the wait. AHEAD: a program loads the next tile's rows when the registers of this

@@ -284,11 +284,11 @@ def prepare_particles(
     """Writes each particle's 8 cells, their weights, and its fraction.
 
     With MOTION it adds the particle's parts of the finest cells' mass and momentum to `motion` [.., 4]. It writes its
-    coarsest cells `coarsest_of` [N, 8], each once and -1 elsewhere, its weights in them, and its place [N, 3] from the
-    middle of the lowest cell, in edges. It writes the features of surfaces, and `touch_of` [N], the nearness of the
-    nearest surface. It raises the second number of the coarsest cells in `disturbed` [C, 2] to this nearness times
-    FULLY. It adds places, their products xx, yy, zz, yz, xz, xy, and then those of the normals of near surfaces to the
-    coarsest cells' `moments` [C, COLUMNS]. OBSTACLES and SYMMETRY mean the same as in prepare_features.
+    coarsest cells `coarsest_of` [N, 8], each once and -1 elsewhere. It writes its weights in them, and its place [N, 3]
+    from the middle of the lowest one, in edges. It writes the features of surfaces, and `touch_of` [N], the nearness of
+    the nearest surface. It raises column 1 of the coarsest cells' `disturbed` [C, 2] to this nearness times FULLY. It
+    adds places and their products xx, yy, zz, yz, xz, xy to the coarsest cells' `moments` [C, COLUMNS]. The products of
+    the normals of near surfaces follow. OBSTACLES and SYMMETRY mean the same as in prepare_features.
 
     Rule: hgn.network.grid.build_hierarchy and hgn.network.relative; test: tests/kernels/test_network.py.
     """

@@ -114,7 +114,7 @@ class Updates:
     """Holds parameters and Adam's moments in flat buffers, and makes the launches that update them.
 
     The launches add to loss_sum [2] and counters [5], see finish_update. `reduce` must sum a float32 tensor over all
-    ranks in place. With it the updates average the gradients of `ranks` ranks, and all ranks make the same updates.
+    ranks in place. Updates then average the gradients of `ranks` ranks, and all ranks make the same updates.
     """
 
     grid: DeviceGrid
