@@ -111,7 +111,7 @@ def generate(
             except Stopped:
                 progress.message(
                     f"stopped; {writer.done} of {writer.total} episodes are kept in {writer.folder}: run the same "
-                    "command to resume"
+                    "command to resume; only scenes in the middle of their simulation begin anew"
                 )
                 return False
         progress.message(_summary(config, writer))

@@ -17,7 +17,7 @@ from hgn.data.identity import dataset_identity, identity_hash, require_same_data
 from hgn.data.manifest import Manifest
 from hgn.data.reader import EpisodeStore
 from hgn.data.storage import is_remote
-from hgn.schema import from_mapping
+from hgn.schema import from_mapping, require_replaceable
 from hgn.system.extras import require_installed
 from hgn.system.locks import locked
 from hgn.system.processes import die_with_parent
@@ -41,6 +41,7 @@ def main(mapping: dict[str, Any]) -> int:
     if mapping.get("run") is None:
         mapping["run"] = str(default_run(name))
     config = from_mapping(TrainConfig, settings_of_imported(mapping))
+    require_replaceable("run", Path(config.run) / "config.yaml")
     if not first_on_machine():
         # This ends the rank at the end of the process that started it, without a time-out.
         die_with_parent(signal.SIGKILL)
@@ -66,7 +67,8 @@ def main(mapping: dict[str, Any]) -> int:
         precompilation = precompile_kernels(config, resume, stack)
         store = wait_for_episodes(config, generator, stop, others)
         if store is None:
-            print("stopped before the first episode was published; the same command resumes it", file=sys.stderr)
+            lost = "whole scenes are kept, scenes in the middle of their simulation begin anew"
+            print(f"stopped before the first episode was published; {lost}; the same command resumes", file=sys.stderr)
             return stop.exit_code
         stop.restart_clock(config.training.maximum_minutes)
         start = Start(store, resume, initial, precompilation)

@@ -8,6 +8,7 @@ from typing import Any
 from tqdm import tqdm
 
 LINE_INTERVAL_S = 15.0
+_UNITS = ((86400, "days"), (3600, "hours"), (60, "minutes"), (1, "seconds"))
 
 
 class _Lines:
@@ -20,6 +21,12 @@ class _Lines:
 
     def flush(self) -> None:
         sys.stderr.flush()
+
+
+def duration(seconds: float) -> str:
+    """Returns a time as people say it: 40 seconds, 3.5 hours, 61 days."""
+    size, unit = next(each for each in _UNITS if seconds >= 1.5 * each[0] or each[0] == 1)
+    return f"{seconds / size:.2g} {unit}" if seconds < 100 * size else f"{seconds / size:.0f} {unit}"
 
 
 def bar(what: str, total: int | None, initial: int = 0, unit: str = "it") -> tqdm[Any]:

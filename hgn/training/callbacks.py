@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import math
 import os
+import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -21,7 +22,7 @@ from tqdm import tqdm
 from hgn.data.storage import StorageError
 from hgn.schema import ConfigError, to_mapping
 from hgn.system.files import TEMPORARY_SUFFIX
-from hgn.system.progress import bar
+from hgn.system.progress import bar, duration
 from hgn.training import lightning_compat
 from hgn.training.checkpoint import BEST_NAME, LAST_NAMES
 from hgn.training.checkpoint_writer import CheckpointWriter
@@ -33,6 +34,9 @@ from hgn.training.module import TrainingModule
 from hgn.training.stop import BY_WEIGHT, StopRequest
 
 METRICS = "metrics.jsonl"
+ESTIMATE_AFTER_S = 10.0  # of updates
+LONG_ON_A_CPU_S = 12 * 3600.0
+WAY_OUT = "on a CPU: +experiment=demo (minutes), training.maximum_updates=N, or a GPU (a hundred times faster)"
 
 
 class SameWeights(Callback):
@@ -139,6 +143,8 @@ class LogLines(Callback):
         self.run, self.measured, self.feed, self.published = run, measured, feed, published
         self._bar: tqdm[Any] | None = None
         self._time, self._update, self._waited_s = time.monotonic(), 0, 0.0
+        self._first: tuple[float, int] | None = None  # time and number of an update
+        self._estimated = False
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         self._time, self._update, self._waited_s = time.monotonic(), _update(pl_module), self.feed.waited_s
@@ -150,6 +156,9 @@ class LogLines(Callback):
     def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
         assert isinstance(pl_module, TrainingModule)
         update = pl_module.update
+        if self._bar is not None:
+            self._bar.update(update - self._bar.n)
+            self._estimate(pl_module, self._bar)
         if update % self.feed.training.log_every:
             return
         loss_sum, count = trainer.strategy.reduce(pl_module.loss_sum.clone(), reduce_op="sum").tolist()
@@ -180,7 +189,20 @@ class LogLines(Callback):
             if "baseline_ratio/validation" in self.measured:
                 notes += f", {format_ratio(self.measured['baseline_ratio/validation'])} the best baseline"
             self._bar.set_postfix_str(f"{notes}, {self.published()}", refresh=False)
-            self._bar.update(update - self._bar.n)
+
+    def _estimate(self, module: TrainingModule, progress: tqdm[Any]) -> None:
+        """Prints once how long the training takes, after the first seconds of it."""
+        now, update = time.monotonic(), module.update
+        self._first = self._first or (now, update)  # the first update compiles
+        seconds, updates = now - self._first[0], update - self._first[1]
+        if self._estimated or updates < 2 or seconds < ESTIMATE_AFTER_S:
+            return
+        self._estimated = True
+        left_s = (self.feed.training.maximum_updates - update) * seconds / updates
+        text = f"about {duration(left_s)} for the other updates, at {updates / seconds:.2g} a second"
+        if module.device.type == "cpu" and left_s > LONG_ON_A_CPU_S:
+            text += f"; {WAY_OUT}"
+        progress.write(text, file=sys.stderr)
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         if self._bar is not None:

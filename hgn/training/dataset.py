@@ -6,6 +6,8 @@ import math
 import sys
 import time
 from collections.abc import Sequence
+from pathlib import Path
+from shutil import disk_usage
 
 from hgn.config import SceneConfig, TrainConfig
 from hgn.data.identity import identity_differences, physics_settings
@@ -15,7 +17,7 @@ from hgn.data.reader import EpisodeStore
 from hgn.data.storage import is_remote
 from hgn.schema import ConfigError, from_stored, require
 from hgn.system.patience import UnreachableError
-from hgn.system.progress import bar
+from hgn.system.progress import bar, duration
 from hgn.training.distributed import first_rank
 from hgn.training.generator import Generator
 from hgn.training.stop import StopRequest
@@ -85,12 +87,15 @@ def wait_for_episodes(
             f"dataset.folder must hold a data set, got {folder} without one; generate it with python -m datagen "
             f"out={folder}, or set training.generate=true"
         )
-    progress = None
+    progress, started = None, time.monotonic()
     while not stop.requested:
         store = EpisodeStore(folder, "train") if EpisodeStore.available(folder) else None
         if store is not None and len(store) >= needed:
             if progress is not None:
                 progress.close()
+                frames = 0 if generator is None else generator.frames_done()
+                if frames:
+                    print(estimate(config, frames, time.monotonic() - started), file=sys.stderr)
             return PooledStore(store, others) if others else store
         if generator is not None:
             generator.check()
@@ -112,6 +117,17 @@ def wait_for_episodes(
             progress.update(min(max(frames, progress.n), progress.total) - progress.n)
         time.sleep(0.5)
     return None
+
+
+def estimate(config: TrainConfig, frames: int, seconds: float) -> str:
+    """Returns time and space of the data set, of which `frames` were simulated in `seconds`."""
+    folder = Path(config.dataset.folder)
+    scenes = sum(config.dataset.scenes(split) for split in SPLITS)
+    present = sum(Manifest.load(folder).published(split) for split in SPLITS)
+    size = scenes * sum(path.stat().st_size for path in folder.glob("*-*.tar")) / present
+    left_s = max(0.0, scenes * config.dataset.frames / frames - 1) * seconds
+    space = f"{size / 1e9:.2g} GB in all, {disk_usage(folder).free / 1e9:.2g} GB are free"
+    return f"about {duration(left_s)} for the rest of {scenes} scenes, while training goes on; {space}"
 
 
 class PublishedEpisodes:

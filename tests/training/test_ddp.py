@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 import torch
-from processes import PATIENCE_S
+from processes import PATIENCE_S, answers, free_port, wait_until
 from training.runs import metrics, train_mapping
 
 from hgn import train
@@ -389,6 +389,32 @@ def test_no_rank_waits_for_one_that_fails(data, no_launcher, warm_python, tmp_pa
     assert texts.get(fault, "weights must be the same on all ranks, got others at") in text
     if fault == "storage":
         assert read_checkpoint(tmp_path / "run/checkpoints/last.ckpt")["hgn"]["updates"] == 3
+
+
+def test_signals_before_ranks_have_met(data, no_launcher, warm_python, tmp_path):
+    """A rank whose others never come ends on each signal that ends a training, instead of waiting for a time-out."""
+    processes = []
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1):
+        folder, port = tmp_path / number.name, free_port()
+        folder.mkdir()
+        options: dict[str, Any] = {"device": "cpu", "backend": "torch", "devices": 2}
+        (folder / "mapping.json").write_text(json.dumps(train_mapping(data, folder / "run", **options)))
+        (folder / "faults.json").write_text("[]")
+        place = {
+            "RANK": "0",
+            "LOCAL_RANK": "0",
+            "WORLD_SIZE": "2",
+            "MASTER_ADDR": "127.0.0.1",
+            "MASTER_PORT": str(port),
+        }
+        environment = os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"} | place
+        command = [str(warm_python), str(PROGRAM), str(folder)]
+        processes.append((subprocess.Popen(command, env=environment), port, number))
+    for process, port, number in processes:
+        wait_until(lambda port=port: answers(port))
+        process.send_signal(number)
+    for process, _, number in processes:
+        assert process.wait(PATIENCE_S) == -number
 
 
 @pytest.mark.parametrize(("local_rank", "expected"), [("0", []), ("1", [signal.SIGKILL])])

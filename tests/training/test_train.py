@@ -25,11 +25,12 @@ from hgn.export import export
 from hgn.runtime.rollouts import RolloutResult
 from hgn.schema import ConfigError, from_mapping
 from hgn.system.locks import locked
-from hgn.training import gradients, monitor, session
+from hgn.system.progress import bar, duration
+from hgn.training import callbacks, gradients, monitor, session
 from hgn.training.callbacks import LogLines
 from hgn.training.checkpoint import LAST_NAMES, Progress, read_checkpoint
 from hgn.training.data_module import EpisodeDataModule
-from hgn.training.dataset import PublishedEpisodes
+from hgn.training.dataset import PublishedEpisodes, estimate
 from hgn.training.readers import WindowReader
 from hgn.training.stop import StopRequest
 from hgn.training.torch_updates import TorchUpdates
@@ -244,6 +245,27 @@ def test_the_best_network_is_remembered(data, run, monkeypatch):
     assert train.main(train_mapping(data, run, maximum_updates=5, monitor_every=1000)) == 0
     (error,) = (record["one_step/validation"] for record in metrics(run) if "one_step/validation" in record)
     assert read_checkpoint(run / "checkpoints" / "last.ckpt")["callbacks"]["Checkpoints"] == {"best_error": error}
+
+
+def test_what_a_training_takes_is_said(make_config, make_dataset, tmp_path, monkeypatch, capsys):
+    """The first scenes tell time and space of all, the first updates the time of all; on a CPU there is a way out."""
+    config = make_config()
+    make_dataset(config)
+    frames = config.dataset.frames
+    scenes = sum(config.dataset.scenes(split) for split in ("train", "validation", "test"))
+    text = estimate(config, frames, 3600.0)
+    assert text.startswith(f"about {scenes - 1} hours for the rest of {scenes} scenes") and " GB are free" in text
+    assert duration(40) == "40 seconds" and duration(61.4 * 86400) == "61 days" and duration(12600) == "3.5 hours"
+    monkeypatch.setattr(callbacks, "ESTIMATE_AFTER_S", 0.0)
+    monkeypatch.setattr(callbacks, "LONG_ON_A_CPU_S", 0.0)
+    bars = []
+    monkeypatch.setattr(callbacks, "bar", lambda *given, **named: bars.append(bar(*given, **named)) or bars[-1])
+    monkeypatch.setattr(callbacks.LogLines, "on_train_end", lambda *_: None)
+    assert train.main(train_mapping(config, tmp_path / "run", maximum_updates=3, log_every=50)) == 0
+    assert bars[0].n == 3
+    bars[0].close()
+    (line,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("about ")]
+    assert "for the other updates, at" in line and "on a CPU: +experiment=demo (minutes), " in line
 
 
 def test_without_validation_scenes_there_is_no_best(make_config, make_dataset, tmp_path, capsys):
