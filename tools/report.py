@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from hgn.schema import to_mapping
+from hgn.schema import FileName, to_mapping
+from hgn.system.files import WRITTEN_BY_HGN
 from hgn.system.provenance import provenance, without_folders
 
 if TYPE_CHECKING:
@@ -27,7 +28,7 @@ class ReportConfig:
     """The options that reports have in common."""
 
     device: str = "auto"  # or cpu, cuda, cuda:1
-    json: str | None = None  # file for the rows; --json FILE does the same
+    json: FileName | None = None  # file for the rows; --json FILE does the same
 
 
 def meta_of(config: Any, device: torch.device | str = "cpu") -> dict[str, Any]:
@@ -35,19 +36,19 @@ def meta_of(config: Any, device: torch.device | str = "cpu") -> dict[str, Any]:
     return provenance(device) | {"config": without_folders(to_mapping(config))}
 
 
-def table(head: Sequence[str], rows: Iterable[Sequence[Any]], width: int | None = None) -> str:
+def table(head: Sequence[str], rows: Iterable[Sequence[Any]], width: int = 100) -> str:
     """Returns an aligned Markdown table. If it is wider than `width` columns, the cells of its widest columns wrap."""
     lines = [[str(cell) for cell in line] for line in (head, *rows)]
     widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
     frame = 3 * len(widths) + 1
-    while width is not None and sum(widths) + frame > width:
+    while sum(widths) + frame > width:
         widths[widths.index(max(widths))] -= 1
     ruled = [*lines[:1], ["-" * width for width in widths], *lines[1:]]
     return "\n".join(text for line in ruled for text in _wrapped(line, widths))
 
 
 def _wrapped(line: Sequence[str], widths: Sequence[int]) -> list[str]:
-    cells = [textwrap.wrap(text, width) for text, width in zip(line, widths, strict=True)]
+    cells = [textwrap.wrap(text, width, break_on_hyphens=False) for text, width in zip(line, widths, strict=True)]
     parts = itertools.zip_longest(*cells, fillvalue="")
     return [f"| {' | '.join(map(str.ljust, part, widths))} |" for part in parts]
 
@@ -72,5 +73,5 @@ def new_figure(lines: int, columns: int, size: tuple[float, float], share_y: boo
 
 def as_png(figure: Any, dpi: int = 110) -> bytes:
     buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=dpi)
+    figure.savefig(buffer, format="png", dpi=dpi, metadata={"Software": WRITTEN_BY_HGN})
     return buffer.getvalue()

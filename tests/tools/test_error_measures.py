@@ -230,10 +230,10 @@ def test_paired_rows():
     assert of_hgn == [("GNS M = 4", "one-step MSE"), ("GNS M = 4", "position MSE"), ("MPM 64³", "position MSE")]
     beside = paired_rows([*rows, other, other | {"precision": "another"}])
     assert [(row["error"], row["mean"][0]) for row in beside if "(other" in row["other"]] == [("position MSE", -0.5)]
-    _, _, *told = paired_table(made).splitlines()
-    assert len(told) == len(made)
-    assert any("-1.00e+00 (-1.00e+00 to -1.00e+00): nearer" in line and "GNS" in line for line in told)
-    assert any("MPM 64³, step 0.5" in line and "no difference shown" in line for line in told)
+    told = paired_table(made).splitlines()
+    assert max(map(len, told)) <= 100
+    assert {row["mean_says"] for row in made} == {"nearer", "no difference shown"}
+    assert "nearer" not in "".join(told) and any("-1 (-1 to" in line and "GNS" in line for line in told)
 
 
 def test_the_figures_show_what_diverged(tmp_path):

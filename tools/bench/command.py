@@ -89,7 +89,7 @@ def table(rows: list[Row]) -> str:
         times = report.number(row["ms"], ".3f"), report.spread(row.get("ms_range"), ".3f")
         work = [row[name] for name in named]
         lines.append([*work, *times, report.number(row["memory_gb"], ".3f"), row["check"]])
-    return report.table((*named, "ms", "range", "GB", "check"), lines, width=100)
+    return report.table((*named, "ms", "range", "GB", "check"), lines)
 
 
 def _prepare(

@@ -23,7 +23,7 @@ from hgn.data.reader import EpisodeStore, first_episodes
 from hgn.runtime.simulator import InitialState, Simulator
 from hgn.runtime.weights import find_weights, load_weights, require_frame_rate, shipped_weights
 from hgn.scene.episode import Episode
-from hgn.schema import ConfigError, from_mapping, from_stored, require
+from hgn.schema import ConfigError, from_mapping, from_stored, require, require_replaceable
 from hgn.system.device import choose_device
 from hgn.system.machine import available_cpus
 from hgn.system.progress import bar
@@ -41,7 +41,7 @@ from tools.error_vs_time.paired import paired_rows, paired_table
 from tools.error_vs_time.plot import CONVENTION
 from tools.error_vs_time.run import Run
 from tools.error_vs_time.score import table
-from tools.error_vs_time.settings import ErrorVsTimeConfig
+from tools.error_vs_time.settings import ENDINGS, ErrorVsTimeConfig
 from tools.report import meta_of
 from tools.solver_rollouts import Setting, SolverLaunches
 
@@ -55,6 +55,7 @@ def main(mapping: dict[str, Any]) -> int:
     """Prints a table and writes the report; returns the exit code."""
     started = time.monotonic()
     config = from_mapping(ErrorVsTimeConfig, mapping)
+    require_replaceable("out", *(Path(f"{config.out}{ending}") for ending in ENDINGS))
     Path(config.out).parent.mkdir(parents=True, exist_ok=True)
     device = choose_device(config.device)
     store = EpisodeStore(config.data, config.split)
@@ -106,9 +107,8 @@ def main(mapping: dict[str, Any]) -> int:
 
 def _reference_name(resimulate: bool, finer: dict[str, Any] | None) -> str:
     if finer is not None:
-        return (
-            f"the data: {finer['cells']} cells a unit, {finer['particles_per_visible']} particles for each visible one"
-        )
+        children = f"{finer['particles_per_visible']} particles for each visible one"
+        return f"the data: {finer['cells']} cells a unit, {children}"
     if not resimulate:
         return "the data"
     return f"the solver on the data's grid at {REFERENCE_STEP:g} of the limit of stability"

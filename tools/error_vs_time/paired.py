@@ -63,12 +63,10 @@ def paired_rows(rows: Sequence[Row]) -> list[dict[str, Any]]:
 
 
 def paired_table(rows: Sequence[Row]) -> str:
-    """Returns paired rows as a table: differences, their intervals over scenes, and what these say."""
+    """Returns paired rows as a table: differences and their intervals over scenes."""
     head = ("one", "other", "error", "frame", "scenes", *(f"{name} ({COVERED:.0%} interval)" for name in STATISTICS))
-    lines = []
-    for row in rows:
-        cells = ["{:+.2e} ({:+.2e} to {:+.2e}): ".format(*row[name]) + row[f"{name}_says"] for name in STATISTICS]
-        lines.append((*(row[name] for name in head[:5]), *cells))
+    form = "{:+.2g} ({:+.2g} to {:+.2g})"
+    lines = [[*(row[c] for c in head[:5]), *(form.format(*row[name]) for name in STATISTICS)] for row in rows]
     return report.table(head, lines)
 
 

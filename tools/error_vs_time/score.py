@@ -112,14 +112,16 @@ def rollout_figures(
 def table(rows: Sequence[Mapping[str, Any]]) -> str:
     """Returns a table of the rows."""
     frames = sorted({int(frame) for row in rows for frame in row.get("scenes_reached", {})})
-    head = ["system", "ms", "batched", "one-step MSE", *(f"MSE at {frame}" for frame in frames), "Sinkhorn", "failed"]
+    frames = [frame for frame in frames if frame in (10, 50, frames[-1])]
+    head = ["system", "ms", "batched", "one-step", *(f"MSE {frame}" for frame in frames), "Sinkhorn", "failed"]
     lines = []
     for row in rows:
         last = [values[max(values, key=int)] for values in row["sinkhorn"].values() if values]
         errors = [row["one_step_mse"], *(row["position_mse"].get(str(frame)) for frame in frames)]
         errors.append(float(np.mean(last)) if last else None)
         times = [report.number(row.get(name), ".3f") for name in ("ms", "ms_batched")]
-        lines.append([label(row), *times, *(report.number(error, ".2e") for error in errors), row["failed_scenes"]])
+        shown = [report.number(error, ".2e").replace("e-0", "e-").replace("e+0", "e+") for error in errors]
+        lines.append([label(row).replace(".safetensors", ""), *times, *shown, row["failed_scenes"]])
     return report.table(head, lines)
 
 

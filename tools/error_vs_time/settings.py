@@ -10,6 +10,7 @@ from hgn.config import Precision, Split
 from hgn.schema import Bound, FrameCount, NonNegative, Positive, require, require_bounds
 from tools.report import ReportConfig
 
+ENDINGS = (".json", ".png", "_batched.png", "_frames.png")  # of the files that a report writes
 UNTIMED = ("baseline", "chaos")  # systems without run times
 
 

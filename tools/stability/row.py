@@ -57,7 +57,7 @@ def table(rows: Sequence[Row]) -> str:
     for row in rows:
         measured, predicted = _figures(row)
         lines.append((row.case, predicted, measured, "yes" if row.held else "NO", row.beyond))
-    return report.table(("case", "predicted", "measured", "passes", "details"), lines, width=100)
+    return report.table(("case", "predicted", "measured", "passes", "details"), lines)
 
 
 def _figures(row: Row) -> tuple[str, str]:
