@@ -14,10 +14,10 @@ from typing import Any
 from hgn.command import run_command
 from hgn.config import MpmConfig, require_rollout_name
 from hgn.scene.emission import entry_frames
-from hgn.scene.rollout_file import Rollout, write_rollout
+from hgn.scene.rollout_file import Rollout, rollout_bytes, write_rollout
 from hgn.scene.scene_file import find_scene, load_scene, notes_on_files
-from hgn.schema import ConfigError, FrameCount, Positive, from_mapping, require_bounds, to_mapping
-from hgn.system.files import require_place
+from hgn.schema import ConfigError, FrameCount, Positive, from_mapping, require_bounds, require_replaceable, to_mapping
+from hgn.system.files import require_place, space_reserved
 from hgn.system.progress import bar
 
 
@@ -45,13 +45,15 @@ def main(mapping: dict[str, Any]) -> int:
     file = find_scene(config.scene)
     out = Path(config.out if config.out is not None else f"rollout/{file.stem}_solver.vtkhdf")
     require_place(out)
+    require_replaceable("out", out)
     scene = load_scene(file)
     for note in notes_on_files(scene):
         print(note, file=sys.stderr)
     # Taichi takes seconds to import, so bad input is reported before.
     from datagen.mpm.solver import SceneFailure, simulate
 
-    with bar("simulating", total=config.frames, unit="frame") as progress:
+    space = space_reserved(out, rollout_bytes(config.frames, scene.particle_count))
+    with space, bar("simulating", total=config.frames, unit="frame") as progress:
         (result,) = simulate(
             [scene], config.mpm, config.frames, config.frame_rate_hz, on_frame=lambda _: progress.update()
         )

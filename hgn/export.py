@@ -36,7 +36,7 @@ class ExportConfig:
     obstacle_clearance: Positive[float] | None = None  # step.obstacle_clearance of `out`; null: as it was
     # file for the graph of a step of `out`, or else of `weights`, for ONNX Runtime
     onnx: FileName | None = None
-    package: str | None = None  # file for a step compiled for `device`, for PyTorch's C++ (.pt2)
+    package: FileName | None = None  # file for a step compiled for `device`, for PyTorch's C++ (.pt2)
     device: str = "cpu"  # device of the package: cpu, cuda or cuda:1
     arrays: str | None = None  # folder for the first inputs of a step of `scene`, as .npy files
     scene: str | None = None  # a scene file, or the name of an example
@@ -158,9 +158,12 @@ def write_arrays(folder: Path, state: ParticleState, corner_F33: np.ndarray) -> 
     """Writes the first inputs of a step, one .npy file for each. The corners are those of `initial_arrays`."""
     from hgn.runtime.exported_step import initial_arrays
 
+    arrays = {f"{name}.npy": array for name, array in initial_arrays(state, corner_F33).items()}
+    others = {file.name for file in folder.glob("*.npy")}
+    require(others in (set(), set(arrays)), "arrays", "a new folder, or one that HGN wrote", str(folder))
     folder.mkdir(parents=True, exist_ok=True)
-    for name, array in initial_arrays(state, corner_F33).items():
-        np.save(folder / f"{name}.npy", array)
+    for name, array in arrays.items():
+        np.save(folder / name, array)
 
 
 if __name__ == "__main__":

@@ -6,6 +6,7 @@ The weights are shipped ones, or those of weights=…. The result is a VTKHDF fi
 from __future__ import annotations
 
 import hashlib
+import math
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -23,8 +24,8 @@ from hgn.scene.material import MATERIALS
 from hgn.scene.random_scene import generate_scene
 from hgn.scene.scene import Scene
 from hgn.scene.scene_file import find_scene, load_scene, notes_on_files
-from hgn.schema import ConfigError, FrameCount, NonNegative, from_mapping, require, require_bounds
-from hgn.system.files import require_place
+from hgn.schema import ConfigError, FrameCount, NonNegative, from_mapping, require, require_bounds, require_replaceable
+from hgn.system.files import require_place, space_reserved
 from hgn.system.progress import bar
 
 if TYPE_CHECKING:
@@ -33,7 +34,8 @@ if TYPE_CHECKING:
     from hgn.scene.rollout_file import Rollout
 
 PICTURES = 4  # number of pictures in the PNG
-EVERY = 3  # frames of the rollout for one picture of the GIF
+EVERY = 3  # frames of the rollout for one picture of the GIF, or more
+FASTEST = 50  # pictures a second that viewers of GIFs keep
 SAME_SPEED = 1e-5  # relative difference of equal speeds, because velocities are stored in float32
 
 
@@ -50,7 +52,7 @@ class RolloutConfig(SimulatorConfig):
     scene: str | None = None
     seed: NonNegative[int] = 0  # seed of a random scene, drawn from the distribution of the training scenes
     data: str | None = None  # folder or URL of the data set of episode
-    episode: str | None = None  # an episode of data to simulate, for example validation-000000
+    episode: str | int | None = None  # an episode of data to simulate, for example validation-000000
     frames: FrameCount = 300  # number of frames; frame 0 is the initial state
 
     def __post_init__(self) -> None:
@@ -71,14 +73,18 @@ def main(mapping: dict[str, Any]) -> int:
     from hgn.render.pictures import animate, compare_picture, spread, write_picture
 
     config = from_mapping(RolloutConfig, mapping)
+    drawn = config.render if config.render is not None else config.out is None
+    out = Path(config.out or f"rollout/{_name(config)}.vtkhdf")
+    still, moving = pictures = out.with_suffix(".png"), out.with_suffix(".gif")
+    require_replaceable("out", out, *(pictures if drawn else ()))
     path, result = rollout(config)
     print(path)
-    if config.render if config.render is not None else config.out is None:
-        still, moving = path.with_suffix(".png"), path.with_suffix(".gif")
+    if drawn:
         write_picture(still, compare_picture(result, spread(result.frame_count, PICTURES)), result.source)
         print(still)
-        with bar("drawing", total=len(range(0, result.frame_count, EVERY)), unit="picture") as progress:
-            animate(result, moving, every=EVERY, progress=lambda *_: progress.update())
+        every = max(EVERY, math.ceil(result.frame_rate_hz / FASTEST))
+        with bar("drawing", total=len(range(0, result.frame_count, every)), unit="picture") as progress:
+            animate(result, moving, every=every, progress=lambda *_: progress.update())
         print(moving)
     return 0
 
@@ -93,17 +99,18 @@ def rollout(config: RolloutConfig) -> tuple[Path, Rollout]:
     from hgn.runtime.divergence import DivergedError
     from hgn.runtime.simulator import InitialState, Simulator
     from hgn.runtime.weights import find_weights, require_frame_rate
-    from hgn.scene.rollout_file import Rollout, obstacles_of_episode
+    from hgn.scene.rollout_file import Rollout, obstacles_of_episode, rollout_bytes
 
-    require_exchange(Path(config.out or "rollout.vtkhdf"), config.surface)
-    require_place(Path(config.out or "rollout/rollout.vtkhdf"))
+    out = Path(config.out or f"rollout/{_name(config)}.vtkhdf")
+    require_exchange(out, config.surface)
+    require_place(out)
     simulator = Simulator.load(config.weights, config.device, config.backend, config.precision)
     weights = find_weights(config.weights)
     source = {"weights": weights.name, "weights_sha256": hashlib.sha256(weights.read_bytes()).hexdigest()}
     frames = config.frames
     reference_TN3 = scene = None
     if config.data is None:
-        name, scene = _scene(config, simulator.info)
+        scene = _scene(config, simulator.info)
         initial = InitialState.of_scene(scene)
         obstacles = scene.obstacles
         for note in (*notes_on_files(scene), *_not_used(scene, weights.stem)):
@@ -111,8 +118,7 @@ def rollout(config: RolloutConfig) -> tuple[Path, Rollout]:
         source["scene"] = config.scene or f"random, seed {config.seed}"
     else:
         assert config.episode is not None  # RolloutConfig checks this
-        name = config.episode
-        episode = find_episode(config.data, config.episode)
+        episode = find_episode(config.data, str(config.episode))
         require_frame_rate(simulator.info, episode.frame_rate_hz)
         frames = min(frames, len(episode.position_TN3))
         initial = InitialState.of_episode(episode)
@@ -127,7 +133,8 @@ def rollout(config: RolloutConfig) -> tuple[Path, Rollout]:
             file=sys.stderr,
         )
     print(simulator.backend.note, file=sys.stderr)
-    with bar("simulating", total=frames - 1, unit="frame") as progress:
+    space = space_reserved(out, rollout_bytes(frames, len(initial.material_N), reference_TN3 is not None))
+    with space, bar("simulating", total=frames - 1, unit="frame") as progress:
         try:
             (position_TN3,) = simulator.rollout([initial], frames, lambda _: progress.update())
         except DivergedError as error:
@@ -146,7 +153,7 @@ def rollout(config: RolloutConfig) -> tuple[Path, Rollout]:
         materials=initial.materials,
         dimensions=initial.dimensions,
     )
-    return save_rollout(config.out or f"rollout/{name}.vtkhdf", result, config.surface), result
+    return save_rollout(out, result, config.surface), result
 
 
 def _not_used(scene: Scene, weights: str) -> Iterator[str]:
@@ -162,11 +169,17 @@ def _fastest(initial: InitialState) -> float:
     return float(np.linalg.norm(initial.velocity_N3, axis=-1).max(initial=0.0))
 
 
-def _scene(config: RolloutConfig, info: WeightsInfo) -> tuple[str, Scene]:
-    """Returns a scene and its name: a scene file, an example, or a random scene like those of the training."""
+def _name(config: RolloutConfig) -> str:
+    """Returns the name of the scene or the episode."""
+    return str(config.episode or "") or (
+        find_scene(config.scene).stem if config.scene is not None else f"random_{config.seed}"
+    )
+
+
+def _scene(config: RolloutConfig, info: WeightsInfo) -> Scene:
+    """Returns a scene: a scene file, an example, or a random scene like those of the training."""
     if config.scene is not None:
-        path = find_scene(config.scene)
-        return path.stem, load_scene(path)
+        return load_scene(find_scene(config.scene))
     own = [name for name in info.network.materials if name not in MATERIALS]
     rule = "given with weights of imported data, which random scenes are not like"
     imported = info.network.dimensions != 3 or bool(own)
@@ -174,7 +187,7 @@ def _scene(config: RolloutConfig, info: WeightsInfo) -> tuple[str, Scene]:
     drawn = SceneConfig(gravity=info.gravity, cell_size=info.obstacle_cell_size, materials=info.network.materials)
     if not info.network.obstacle_features:
         drawn = replace(drawn, obstacle_count=0, group_shapes=("cube",))  # as in conf/scene/no_obstacles.yaml
-    return f"random_{config.seed}", generate_scene(drawn, config.seed)
+    return generate_scene(drawn, config.seed)
 
 
 if __name__ == "__main__":

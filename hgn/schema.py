@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 from hgn.renamed import KEYS, current_names, removed_remedy, renamed_remedy, value_remedy
+from hgn.system.files import is_replaceable
 
 T = TypeVar("T")
 _CONTROL = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069]")  # of terminals and text direction
@@ -53,7 +54,8 @@ AtLeastOne = Annotated[N, Bound("at least 1", lambda value: value >= 1)]
 OneOrMore = AtLeastOne[int]
 Port = Annotated[int, Bound("0 to 65535", lambda value: 0 <= value < 65536)]
 FolderName = Annotated[str, Bound("a folder name", bool)]
-FileName = Annotated[str, Bound("a file name", lambda name: Path(name).name != "")]
+_REPLACEABLE = Bound("a new file, or one that HGN wrote", lambda name: is_replaceable(Path(name)))
+FileName = Annotated[str, Bound("a file name", lambda name: Path(name).name != ""), _REPLACEABLE]  # of an output
 FrameCount = Annotated[
     int, Bound("at least 2", lambda value: value >= 2), Bound("at most 1,000,000", lambda value: value <= 1_000_000)
 ]
@@ -196,6 +198,12 @@ def require(rule_holds: bool, field: str, rule: str, value: object, remedy: str 
         raise ConfigError(f"{field} must be {rule}, got {_shown.repr(value)}" + (f"; {remedy}" if remedy else ""))
 
 
+def require_replaceable(field: str, *files: Path) -> None:
+    """Raises ConfigError for a file that another program wrote."""
+    for file in files:
+        require(_REPLACEABLE.holds(file), field, _REPLACEABLE.rule, str(file), "choose another name, or move that file")
+
+
 def require_bounds(owner: object) -> None:
     """Checks the fields of a dataclass, and the items of its tuples, against the `Bound`s of their annotations."""
     cls: Any = type(owner)
@@ -256,9 +264,11 @@ def _convert(hint: Any, value: Any, path: _Path) -> Any:
     if is_dataclass:
         return from_mapping(hint, value, path)
     if origin is tuple:
+        more = len(arguments) == 2 and arguments[1] is Ellipsis
         if not isinstance(value, (list, tuple)):
-            raise ConfigError(f"{_text(path)} must be a list, got {_shown.repr(value)}")
-        if len(arguments) == 2 and arguments[1] is Ellipsis:
+            count = "" if more else f" of {len(arguments)} values"
+            raise ConfigError(f"{_text(path)} must be a list{count}, got {_shown.repr(value)}")
+        if more:
             return tuple([_convert(arguments[0], item, (path, i)) for i, item in enumerate(value)])
         if len(value) != len(arguments):
             raise ConfigError(

@@ -57,6 +57,12 @@ def free_port():
         return listener.getsockname()[1]
 
 
+def answers(port):
+    """Whether somebody listens at a port of this machine."""
+    with socket.socket() as caller:
+        return caller.connect_ex(("127.0.0.1", port)) == 0
+
+
 def run_compiled(python, folder, program, *arguments):
     """Runs a program of the tests with Triton compiling into `folder`, not interpreting; what it printed."""
     environment = {key: value for key, value in os.environ.items() if key != "TRITON_INTERPRET"}

@@ -20,7 +20,7 @@ import yaml
 
 from hgn.command import run_command
 from hgn.renamed import current_metrics
-from hgn.schema import ConfigError, from_mapping, require
+from hgn.schema import ConfigError, from_mapping, require, require_replaceable
 from hgn.system.files import write_atomically, write_json
 
 # prefixes of the figures in the JSON
@@ -62,12 +62,12 @@ def main(mapping: dict[str, Any]) -> int:
     from hgn.system.provenance import provenance
 
     config = from_mapping(CurvesConfig, mapping)
-    runs = [read_run(Path(folder)) for folder in config.runs]
-    parts = []
-    for run in runs:
-        meta = dict(run.settings.get("provenance", {})) | {"config": run.settings}
-        parts.append({"name": run.name, "meta": meta, "rows": measurements(run.records)})
     picture, report = (Path(config.out).with_suffix(ending) for ending in (".png", ".json"))
+    require_replaceable("out", picture, report)
+    runs = [read_run(Path(folder)) for folder in config.runs]
+    metas = [dict(run.settings.get("provenance", {})) | {"config": run.settings} for run in runs]
+    of_runs = zip(runs, metas, strict=True)
+    parts = [{"name": run.name, "meta": meta, "rows": measurements(run.records)} for run, meta in of_runs]
     write_json(report, {"meta": provenance(), "runs": parts})
     write_atomically(picture, draw(runs))
     print(picture, report, sep="\n")

@@ -27,7 +27,7 @@ from hgn.render.exchange import save_rollout
 from hgn.scene.emission import entry_frames
 from hgn.scene.rollout_file import Rollout, read_rollout
 from hgn.scene.scene_file import load_scene, scene_files
-from hgn.schema import ConfigError, OneOrMore, from_mapping, require, require_bounds, to_mapping
+from hgn.schema import ConfigError, OneOrMore, from_mapping, require, require_bounds, require_replaceable, to_mapping
 from hgn.system.progress import bar
 
 PICTURES = 4  # in the PNG by default
@@ -48,10 +48,10 @@ class RenderConfig:
     # labels of rollout (or the episode) and of each of others; null: prediction (ground truth), and the files' names
     names: tuple[str, ...] | None = None
     data: str | None = None  # folder of a data set, instead of rollout
-    episode: str | None = None  # key of an episode of data, for example validation-000000
+    episode: str | int | None = None  # key of an episode of data, for example validation-000000
     frames: tuple[int, ...] | None = None  # of the PNG, for example [0,50,100]; null: four, evenly spaced
     every: OneOrMore = 3  # stride of the frames in the animation, which plays in real time
-    size: int = 360  # width of a panel, pixels
+    size: int | None = None  # width of a panel, pixels; null: 360, and 720 where an animation has one panel
 
     def __post_init__(self) -> None:
         require_bounds(self)
@@ -66,14 +66,13 @@ class RenderConfig:
             count = 1 + len(self.others)
             rule = f"{count} different ones, of rollout and of each of others"
             require(len(set(self.names)) == len(self.names) == count, "names", rule, self.names)
-        require(64 <= self.size <= 4096, "size", "64 to 4096 pixels", self.size)
+        require(64 <= (self.size or 64) <= 4096, "size", "64 to 4096 pixels", self.size)
 
 
 @dataclass(frozen=True)
 class Versions:
     """A rollout or ground truth, and other rollouts of the same scene by label."""
 
-    name: str  # of the files
     rollout: Rollout
     label: str
     others: Mapping[str, np.ndarray]
@@ -83,8 +82,11 @@ class Versions:
 def main(mapping: Mapping[str, Any]) -> int:
     """Draws or writes the files and prints their paths; returns the exit code."""
     config = from_mapping(RenderConfig, mapping)
+    name, out = str(config.episode or "") or Path(config.rollout or "").stem, Path(config.out)
+    in_folder = [out / f"{name}{ending}" for ending in (".png", ".gif", "_error.png")]
+    require_replaceable("out", out, *in_folder)
     versions = _load(config)
-    rollout, out = versions.rollout, Path(config.out)
+    rollout = versions.rollout
     if out.suffix == ".png":
         _write_png(config, versions, out)
     elif out.suffix in ANIMATIONS:
@@ -96,13 +98,12 @@ def main(mapping: Mapping[str, Any]) -> int:
         endings = ", ".join((".png", *ANIMATIONS, *USD_ENDINGS, PLY_ENDING))
         raise ConfigError(f"out must be a folder or end in one of {endings}, got {config.out!r}")
     else:
-        _write_png(config, versions, out / f"{versions.name}.png")
-        _write_animation(config, versions, out / f"{versions.name}.gif")
+        _write_png(config, versions, in_folder[0])
+        _write_animation(config, versions, in_folder[1])
         if versions.truth_TN3 is not None:
-            path = out / f"{versions.name}_error.png"
             curve = error_curve(_errors(versions), rollout.frame_rate_hz)
-            pictures.write_picture(path, curve, rollout.source)
-            print(path)
+            pictures.write_picture(in_folder[2], curve, rollout.source)
+            print(in_folder[2])
     return 0
 
 
@@ -111,13 +112,13 @@ def _load(config: RenderConfig) -> Versions:
     scene = None
     if config.rollout is None:
         assert config.data is not None and config.episode is not None  # checked by RenderConfig
-        rollout = pictures.rollout_of_episode(find_episode(config.data, config.episode))
-        name, first, label = config.episode, f"episode {config.episode}", "ground truth" if config.others else ""
+        rollout = pictures.rollout_of_episode(find_episode(config.data, str(config.episode)))
+        first, label = f"episode {config.episode}", "ground truth" if config.others else ""
         truth_TN3 = rollout.position_TN3 if config.others else None
     else:
         scene = scene_files("gallery").get(config.rollout)
         rollout = read_rollout(config.rollout) if scene is None else solver_rollout(scene)
-        name, first, label = Path(config.rollout).stem, config.rollout, "prediction"
+        first, label = config.rollout, "prediction"
         truth_TN3 = rollout.reference_TN3
         if "solver" in rollout.source:
             label, truth_TN3 = "ground truth", rollout.position_TN3 if config.others else None
@@ -129,11 +130,17 @@ def _load(config: RenderConfig) -> Versions:
         other = read_rollout(file) if scene is None else weights_rollout(rollout, scene, file)
         if not np.array_equal(other.position_TN3[0], rollout.position_TN3[0], equal_nan=True):
             raise ConfigError(f"others[{i}] must begin with the same particles as {first}, got {file}")
+        if not np.array_equal(*map(_corners, (rollout, other))) or other.gravity != rollout.gravity:
+            raise ConfigError(f"others[{i}] must have the obstacles and the gravity of {first}, got {file}")
         rule = f"{rollout.frame_rate_hz:g} frames a second"
         if other.frame_rate_hz != rollout.frame_rate_hz:
             raise ConfigError(f"others[{i}] must have {rule}, got {other.frame_rate_hz:g}")
         others[other_name] = other.position_TN3
-    return Versions(name, rollout, label, others, truth_TN3)
+    return Versions(rollout, label, others, truth_TN3)
+
+
+def _corners(rollout: Rollout) -> np.ndarray:
+    return np.concatenate([np.zeros((0, 3)), *(obstacle.vertex_V3 for obstacle in rollout.obstacles)])
 
 
 def solver_rollout(file: Path) -> Rollout:
@@ -169,15 +176,16 @@ def weights_rollout(solver: Rollout, file: Path, weights: str) -> Rollout:
 def _write_png(config: RenderConfig, versions: Versions, path: Path) -> None:
     rollout = versions.rollout
     frames = pictures.spread(rollout.frame_count, PICTURES) if config.frames is None else config.frames
-    picture = pictures.compare_picture(rollout, frames, config.size, versions.label, versions.others)
+    picture = pictures.compare_picture(rollout, frames, config.size or 360, versions.label, versions.others)
     pictures.write_picture(path, picture, rollout.source)
     print(path)
 
 
 def _write_animation(config: RenderConfig, versions: Versions, path: Path) -> None:
     rollout = versions.rollout
+    pictures.animation_rate(rollout, path, config.every)
     with bar("drawing", total=len(range(0, rollout.frame_count, config.every)), unit="picture") as progress:
-        how = None, config.every, config.size, lambda done, _: progress.update()
+        how = config.every, config.size, lambda done, _: progress.update()
         pictures.animate(rollout, path, *how, versions.label, versions.others)
     print(path)
 
@@ -187,12 +195,12 @@ def _errors(versions: Versions) -> dict[str, np.ndarray]:
     rollout, truth_TN3 = versions.rollout, versions.truth_TN3
     if not versions.others:
         return position_error(rollout)
-    errors = {}
-    for name, position_TN3 in {versions.label: rollout.position_TN3, **versions.others}.items():
-        if position_TN3 is not truth_TN3:
-            version = replace(rollout, position_TN3=position_TN3, reference_TN3=truth_TN3)
-            errors[name] = position_error(version)["all"]
-    return errors
+    trajectories = {versions.label: rollout.position_TN3, **versions.others}
+    return {
+        name: position_error(replace(rollout, position_TN3=position_TN3, reference_TN3=truth_TN3))["all"]
+        for name, position_TN3 in trajectories.items()
+        if position_TN3 is not truth_TN3
+    }
 
 
 if __name__ == "__main__":

@@ -43,9 +43,7 @@ def solver_scene(episode: Episode, cell_size: float | None = None, wall: float =
     if cell_size < own:
         return fine_scene(scene, cell_size, wall)
     return replace(
-        scene,
-        cell_size=cell_size,
-        particles_per_cell=None if density is None else density * (cell_size / own) ** 3,
+        scene, cell_size=cell_size, particles_per_cell=None if density is None else density * (cell_size / own) ** 3
     )
 
 

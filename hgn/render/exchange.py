@@ -21,9 +21,9 @@ from hgn.scene.material import FLUIDS
 from hgn.scene.motion import Motion
 from hgn.scene.rollout_file import Rollout, rollout_velocity, write_rollout
 from hgn.scene.scene import Obstacle
-from hgn.schema import ConfigError
+from hgn.schema import ConfigError, require_replaceable
 from hgn.system.extras import require_installed
-from hgn.system.files import sync_folder, sync_written
+from hgn.system.files import WRITTEN_BY_HGN, sync_folder, sync_written
 
 # The values of the surface are in particle radii (half the spacing). With them the volume of a block of 8 particles a
 # cell is correct within 4 %, for a lattice and for a random filling.
@@ -61,6 +61,8 @@ def save_rollout(
 
 def require_exchange(path: Path, surface: bool) -> None:
     """Raises the errors of a later `save_rollout`; call it before a simulation."""
+    numbered = path.parent.glob(f"{path.stem}_*[0-9].ply") if path.suffix == PLY_ENDING else ()
+    require_replaceable("out", path, *numbered)
     if path.suffix in USD_ENDINGS:
         require_installed("pxr")
     if surface:
@@ -107,6 +109,7 @@ def _write_usd(path: Path, rollout: Rollout, surface: bool, progress: Callable[[
     UsdGeom.SetStageMetersPerUnit(stage, 1.0)
     stage.SetTimeCodesPerSecond(rollout.frame_rate_hz)
     stage.SetFramesPerSecond(rollout.frame_rate_hz)
+    stage.SetMetadata("comment", WRITTEN_BY_HGN)
     stage.SetStartTimeCode(0)
     stage.SetEndTimeCode(rollout.frame_count - 1)
     world = UsdGeom.Xform.Define(stage, "/World")
@@ -198,7 +201,8 @@ def _write_ply(path: Path, rollout: Rollout, surface: bool, progress: Callable[[
     for name, value_N in zip(("red", "green", "blue"), 255 * PARTICLE_COLORS[rollout.material_N].T, strict=True):
         row_N[name] = value_N
     kinds = {"<f4": "float", "u1": "uchar"}
-    header = ["ply", "format binary_little_endian 1.0", f"comment material: {', '.join(rollout.materials)}"]
+    header = ["ply", "format binary_little_endian 1.0", f"comment {WRITTEN_BY_HGN}"]
+    header += [f"comment material: {', '.join(rollout.materials)}"]
     properties = [f"property {kinds[kind]} {name}" for name, kind in fields]
     surfaces = _surfaces(rollout) if surface else iter(())
     digits = max(4, len(str(rollout.frame_count - 1)))
@@ -227,4 +231,5 @@ def _write_ply(path: Path, rollout: Rollout, surface: bool, progress: Callable[[
 def _export(path: Path, vertex_V3: np.ndarray, triangle_F3: np.ndarray) -> None:
     import trimesh
 
-    path.write_bytes(trimesh.exchange.ply.export_ply(trimesh.Trimesh(vertex_V3, triangle_F3, process=False)))
+    content = trimesh.exchange.ply.export_ply(trimesh.Trimesh(vertex_V3, triangle_F3, process=False))
+    path.write_bytes(content.replace(b"end_header", f"comment {WRITTEN_BY_HGN}\nend_header".encode(), 1))

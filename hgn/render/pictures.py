@@ -13,6 +13,7 @@ import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont, PngImagePlugin
@@ -20,9 +21,10 @@ from PIL import Image, ImageDraw, ImageFont, PngImagePlugin
 from hgn.render.flat import FlatStage
 from hgn.render.renderer import BACKGROUND_COLOR, MATERIAL_COLORS, OBSTACLE_COLOR, PARTICLE_COLORS, Stage, to_bytes
 from hgn.scene.episode import Episode
+from hgn.scene.group import WALL_CELLS
 from hgn.scene.rollout_file import Rollout, obstacles_of_episode
 from hgn.schema import ConfigError
-from hgn.system.files import write_atomically
+from hgn.system.files import WRITTEN_BY_HGN, write_atomically
 
 RADIUS_IN_SPACINGS = 0.72  # the spheres overlap a little, so that they look like a body
 TEXT_COLOR = (45, 50, 60)
@@ -75,34 +77,27 @@ def compare_picture(
 def animate(
     rollout: Rollout,
     path: str | Path,
-    fps: float | None = None,
     every: int = 3,
-    size: int = 360,
+    size: int | None = None,
     progress: Callable[[int, int], None] | None = None,
     label: str = "prediction",
     others: Mapping[str, np.ndarray] = NO_OTHERS,
 ) -> None:
     """Writes an animation of every `every`-th frame, with the prediction and the ground truth in adjacent panels.
 
-    path: a .gif or .webp file. WebP is half as large and keeps all colours. fps: pictures per second, None for real
-    time. GIF rounds the duration of a picture to 1/100 s, WebP to 1/1000 s. size: width of a panel in pixels.
-    progress: called with the number of pictures drawn and their total. label, others: as in `compare_picture`.
+    path: a .gif or .webp file; WebP is half as large and keeps all colours. It plays in real time; GIF rounds the
+    duration of a picture to 1/100 s, WebP to 1/1000 s. size: width of a panel in pixels, None for 720 of one panel and
+    360 of several. progress: called with the number of pictures drawn and their total. label, others: as in
+    `compare_picture`.
 
-    Raises ConfigError if fps exceeds the limit of viewers (GIF 50, WebP 60), if every is below 1, or if an entry of
-    `others` has other particles.
+    Raises: ConfigError as `animation_rate`, and if an entry of `others` has other particles.
     """
     webp = Path(path).suffix == ".webp"
-    fastest = 60 if webp else 50
-    if not every >= 1:
-        raise ConfigError(f"every must be at least 1, got {every}")
-    rate = rollout.frame_rate_hz / every if fps is None else fps
-    if not 0 < rate <= fastest:
-        remedy = f"take every >= {math.ceil(rollout.frame_rate_hz / fastest)}" if fps is None else "choose another fps"
-        kind = "WebP" if webp else "GIF"
-        raise ConfigError(f"fps must be in (0, {fastest}], which {kind} viewers keep, got {rate:g}; {remedy}")
+    rate = animation_rate(rollout, path, every)
     frames = range(0, rollout.frame_count, every)
-    stage = _stage(rollout, size)
     versions = _versions(rollout, label, others)
+    size = size or (720 if len(versions) == 1 else 360)
+    stage = _stage(rollout, size)
 
     def drawn() -> Iterator[Image.Image]:
         for count, frame in enumerate(frames, start=1):
@@ -114,24 +109,30 @@ def animate(
     if webp:
         first, *later = drawn()
         duration = round(1000 / rate)
-        first.save(
-            buffer,
-            "WEBP",
-            save_all=True,
-            append_images=later,
-            duration=duration,
-            loop=0,
-            quality=WEBP_QUALITY,
-            method=3,
-        )
+        how: dict[str, Any] = {"quality": WEBP_QUALITY, "method": 3, "xmp": WRITTEN_BY_HGN.encode()}
+        first.save(buffer, "WEBP", save_all=True, append_images=later, duration=duration, loop=0, **how)
     else:
         samples = [_animation_picture(stage, rollout, versions, frames[i], size) for i in spread(len(frames), 6)]
         pictures = map(_Palette(samples).apply, drawn())
         duration = 10 * round(100 / rate)
-        next(pictures).save(
-            buffer, "GIF", save_all=True, append_images=pictures, duration=duration, loop=0, disposal=1, optimize=False
-        )
+        how = {"disposal": 1, "optimize": False, "comment": WRITTEN_BY_HGN.encode()}
+        next(pictures).save(buffer, "GIF", save_all=True, append_images=pictures, duration=duration, loop=0, **how)
     write_picture(path, buffer.getvalue())
+
+
+def animation_rate(rollout: Rollout, path: str | Path, every: int) -> float:
+    """Returns the pictures per second of an animation in real time.
+
+    Raises: ConfigError if viewers do not play as many (GIF 50, WebP 60), or if every is below 1.
+    """
+    kind, fastest = ("WebP", 60) if Path(path).suffix == ".webp" else ("GIF", 50)
+    if not every >= 1:
+        raise ConfigError(f"every must be at least 1, got {every}")
+    rate = rollout.frame_rate_hz / every
+    if not 0 < rate <= fastest:
+        remedy = f"take every >= {math.ceil(rollout.frame_rate_hz / fastest)}"
+        raise ConfigError(f"fps must be in (0, {fastest}], which {kind} viewers keep, got {rate:g}; {remedy}")
+    return rate
 
 
 def write_picture(path: str | Path, picture: Image.Image | bytes, source: Mapping[str, object] | None = None) -> None:
@@ -141,6 +142,7 @@ def write_picture(path: str | Path, picture: Image.Image | bytes, source: Mappin
     if isinstance(picture, Image.Image):
         buffer = io.BytesIO()
         text = PngImagePlugin.PngInfo()
+        text.add_text("Software", WRITTEN_BY_HGN)
         if source is not None:
             text.add_text("Description", json.dumps(source))
         picture.save(buffer, format="PNG", pnginfo=text, optimize=True)
@@ -200,8 +202,12 @@ def check_frames(frames: Sequence[int], frame_count: int) -> None:
 def _stage(rollout: Rollout, size: int) -> Stage:
     radius = rollout_spacing(rollout) * RADIUS_IN_SPACINGS
     radius = min(radius, 0.03 * min(rollout.domain_size[: rollout.dimensions]))
-    stage = FlatStage if rollout.dimensions == 2 else Stage
-    return stage(rollout.domain_size, rollout.obstacles, radius, size)
+    if rollout.dimensions == 2:
+        return FlatStage(rollout.domain_size, rollout.obstacles, radius, size)
+    first_N3 = rollout.position_TN3[:: max(1, rollout.frame_count // 50), : rollout.present(0)].reshape(-1, 3)
+    nearest = np.nanmin(np.minimum(first_N3, np.array(rollout.domain_size) - first_N3), initial=np.inf)
+    wall = min(max(0.0, float(nearest) - radius), WALL_CELLS * rollout.cell_size)
+    return Stage(rollout.domain_size, rollout.obstacles, radius, size, wall)
 
 
 def _place_obstacles(stage: Stage, rollout: Rollout, frame: int) -> None:

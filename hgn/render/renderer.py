@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from PIL import Image, ImageDraw
@@ -92,16 +93,20 @@ class Stage:
 
     camera_type: type[Camera] = Camera
 
-    def __init__(self, domain_size: Vector, obstacles: Sequence[Obstacle], particle_radius: float, size: int) -> None:
-        self.domain_size = domain_size
-        self.camera = self.camera_type(domain_size, size)
+    def __init__(
+        self, domain_size: Vector, obstacles: Sequence[Obstacle], particle_radius: float, size: int, wall: float = 0.0
+    ) -> None:
+        """`wall` is the thickness of the domain's walls, which are not drawn: the floor is where particles rest."""
+        x, y, z = (side - 2 * wall for side in domain_size)
+        self.domain_size, self.wall = (x, y, z), wall
+        self.camera = self.camera_type(self.domain_size, size)
         self.radius = particle_radius
-        self._prepare_room(domain_size)
+        self._prepare_room(self.domain_size)
         self.place(obstacles)
 
     def place(self, obstacles: Sequence[Obstacle]) -> None:
         """Replaces the obstacles."""
-        self._prepare_obstacles(obstacles)
+        self._prepare_obstacles([replace(each, vertex_V3=each.vertex_V3 - self.wall) for each in obstacles])
         self._prepare_background()
         self._prepare_box(self.domain_size)
 
@@ -112,7 +117,7 @@ class Stage:
 
     def draw(self, position_N3: np.ndarray, material_N: np.ndarray) -> Image.Image:
         """Returns one frame as an RGB picture. Omits particles that are not finite or ten domains away."""
-        camera = self.camera
+        camera, position_N3 = self.camera, position_N3 - self.wall
         near = (np.abs(position_N3) < 10 * max(self.domain_size)).all(axis=1)
         position_N3, material_N = position_N3[near].astype(np.float64), material_N[near]
         picture_P3 = self.empty_P3.copy()

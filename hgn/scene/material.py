@@ -39,7 +39,8 @@ def material_index(name: str) -> int:
     Raises: ConfigError when the name is unknown.
     """
     if name not in MATERIALS:
-        raise ConfigError(f"material must be one of {', '.join(MATERIALS)}, got {name!r}")
+        solved = f"; {', '.join(MATERIALS[len(PAPER_MATERIALS) :])} only for the solver"
+        raise ConfigError(f"material must be one of {', '.join(PAPER_MATERIALS)}{solved}, got {name!r}")
     return MATERIALS.index(name)
 
 

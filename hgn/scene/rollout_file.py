@@ -188,6 +188,11 @@ def cell_obstacles(grid: ObstacleGrid, plane_z: float | None = None) -> tuple[Ob
     return (Obstacle("cells", corner_K43.reshape(-1, 3), triangle_F3.astype(np.int32), closed=False),)
 
 
+def rollout_bytes(frames: int, particles: int, reference: bool = False) -> int:
+    """Returns the size of a rollout's file, in any format, without its obstacles: positions and velocities."""
+    return (1 << 20) + 4 * particles * frames * (10 if reference else 7)
+
+
 def write_rollout(path: str | Path, rollout: Rollout) -> None:
     """Writes `rollout` to `path` atomically. Creates missing folders."""
     import h5py

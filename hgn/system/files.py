@@ -5,7 +5,9 @@ from __future__ import annotations
 import contextlib
 import errno
 import json
+import mmap
 import os
+import re
 import secrets
 from collections.abc import Iterator
 from pathlib import Path
@@ -13,6 +15,11 @@ from typing import Any, BinaryIO
 
 TEMPORARY_SUFFIX = ".partial"
 _LOST_AT_MOST = 10  # number of retries
+WRITTEN_BY_HGN = "written by HGN"  # the mark of files without other metadata
+# of all files that the commands write; reports begin with their provenance, binary files have metadata of this name
+_WRITTEN_BY_HGN = re.compile(
+    rb'written by HGN|hgn rollout|"hgn"|\x03hgn\x12|\A\{\s*"meta": \{|^provenance:$', re.MULTILINE
+)
 
 
 def temporary_path(path: Path) -> Path:
@@ -98,6 +105,27 @@ def require_place(path: Path) -> None:
     ):
         if wrong:
             raise OSError(number, os.strerror(number), str(place))
+
+
+def is_replaceable(path: Path) -> bool:
+    """Returns whether no file of another program is lost when `path` is written."""
+    if not path.is_file() or not path.stat().st_size:
+        return True
+    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
+        return _WRITTEN_BY_HGN.search(content) is not None
+
+
+@contextlib.contextmanager
+def space_reserved(path: Path, size: int) -> Iterator[None]:
+    """Reserves `size` bytes beside `path` during long work, so that the disk is not full at its end.
+
+    Raises: OSError, before the work, where the disk has less.
+    """
+    make_folder(path.parent)
+    with temporary_file(path) as reservation:
+        with reservation.open("wb") as file:
+            os.posix_fallocate(file.fileno(), 0, size)
+        yield
 
 
 def make_folder(path: Path) -> None:

@@ -16,6 +16,7 @@ import viser
 from hgn.render.pictures import rollout_spacing
 from hgn.scene.rollout_file import Rollout
 from hgn.schema import require
+from hgn.system.files import WRITTEN_BY_HGN
 from hgn.viewer.placed import plain
 from hgn.viewer.stage import StageView, quaternion
 from hgn.viewer.viser_compat import start_server, stop_server
@@ -68,7 +69,7 @@ def film_html(rollout: Rollout, every: int = 2) -> str:
     Raises ConfigError for `every` below 1, and ModuleNotFoundError without the extra `play`.
     """
     with _recorded(rollout, every) as serializer:
-        return str(serializer.as_html())
+        return f"{serializer.as_html()}\n<!-- {WRITTEN_BY_HGN} -->\n"
 
 
 def show_film(rollout: Rollout, every: int = 2, height: int = 480) -> None:

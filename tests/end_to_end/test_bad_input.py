@@ -1,5 +1,6 @@
 """Bad input to the commands: one line that says what is wrong, a non-zero exit code, and nothing touched."""
 
+import errno
 import json
 import os
 import shutil
@@ -18,14 +19,18 @@ from training.runs import train_arguments
 
 import datagen.__main__
 import datagen.service.__main__
+import tools.bench.command
+import tools.error_vs_time.command
+import tools.scaling.command
 from datagen import solve, upload
-from hgn import evaluate, export, rollout, train
+from hgn import average, evaluate, export, play, rollout, train
 from hgn.command import EXIT_INPUT, EXIT_MACHINE
 from hgn.config import DatagenConfig
 from hgn.data.storage import TOKEN_VARIABLE
 from hgn.runtime.simulator import Simulator
 from hgn.runtime.weights import WeightsInfo, load_weights, save_weights
-from tools import render
+from tools import curves, render
+from tools.stability import network, solver
 
 ROOT = Path(__file__).resolve().parents[2]
 COMMANDS: dict[str, Callable[[dict[str, Any]], int]] = {
@@ -38,6 +43,14 @@ COMMANDS: dict[str, Callable[[dict[str, Any]], int]] = {
     "rollout": rollout.main,
     "evaluate": evaluate.main,
     "render": render.main,
+    "play": play.main,
+    "average": average.main,
+    "bench": tools.bench.command.main,
+    "curves": curves.main,
+    "error_vs_time": tools.error_vs_time.command.main,
+    "scaling": tools.scaling.command.main,
+    "stability_network": network.main,
+    "stability_solver": solver.main,
 }
 SCENE = """
 obstacles:
@@ -220,6 +233,8 @@ VALUES = [
     ("rollout", ["scene=funnel", "data=d", "episode=e"], "scene must be left out where data is given, got 'funnel'"),
     ("rollout", ["out=a.png"], "must be a name that ends in .vtkhdf, .hdf, .hdf5, .h5, .usdc, .usda, .usd or .ply, go"),
     ("rollout", ["out=pictures"], ".usd or .ply, got 'pictures'"),
+    ("rollout", ["data=data", "episode=99"], "episode must begin with one of train, validation, test, got '99'; e.g. "),
+    ("datagen", ["scene.gravity=-9.8"], "scene.gravity must be a list of 3 values, got -9.8"),
     ("rollout", ["scene=funnle"], "scene must be a YAML file or the name of an example (funnel, "),
     ("rollout", ["seed=-1"], "seed must be a finite number >= 0, got -1"),
     ("rollout", [*ROLLOUT, "device=abacus"], "device must be auto, cpu or cuda[:index], got 'abacus'"),
@@ -312,7 +327,7 @@ def test_diverging_weights(place, capsys, monkeypatch):
     """A rollout that diverges reports the frame, and leaves an earlier rollout as it was."""
     place.accelerate(5.0)
     place.path("earlier").mkdir()
-    place.path("earlier/rollout.vtkhdf").write_bytes(b"an earlier one")
+    place.path("earlier/rollout.vtkhdf").write_bytes(b"an earlier hgn rollout")
     message = "weights must keep the simulation together, got weights.safetensors: the simulation diverged at frame 1:"
     check(place, "rollout", [*ROLLOUT, "out=earlier/rollout.vtkhdf"], message, capsys, monkeypatch)
 
@@ -354,6 +369,85 @@ def test_output_is_checked_before_the_work(place, command, arguments, message, c
     code, line = refused(command, place.train(*arguments) if command == "train" else arguments, capsys, monkeypatch)
     assert code in (EXIT_INPUT, EXIT_MACHINE) and message in line, line
     assert content(place.folder) == before and not place.path("closed/new").exists()
+
+
+@pytest.mark.parametrize("command", ["rollout", "solve"])
+def test_full_disks_are_met_before_the_work(place, command, capsys, monkeypatch):
+    """Space for the file is reserved during the simulation; a disk without it is named before."""
+    arguments, sizes, reserve = ["scene=scene.yaml", "out=made/r.vtkhdf", "frames=3"], [], os.posix_fallocate
+    monkeypatch.setattr(os, "posix_fallocate", lambda *given: sizes.append(given[-1]) or reserve(*given))
+    assert exit_code(COMMANDS[command], command, arguments, monkeypatch) == 0
+    (file,) = place.path("made").iterdir()
+    assert sizes[0] >= file.stat().st_size
+    monkeypatch.setattr(os, "posix_fallocate", lambda *_: (_ for _ in ()).throw(OSError(errno.ENOSPC, "No space")))
+    monkeypatch.setattr("hgn.system.progress.bar", lambda *_, **__: pytest.fail("the simulation began"))
+    before = content(place.folder)
+    code, line = refused(command, arguments, capsys, monkeypatch)
+    assert code == EXIT_MACHINE and line.startswith("error: No space: made/r.vtkhdf; free some space"), line
+    assert content(place.folder) == before
+
+
+VTKHDF = ["rollout=rollout.vtkhdf"]
+# command, arguments, file of another program
+FOREIGN = [
+    ("rollout", [*ROLLOUT, "out=mine.h5"], "mine.h5"),
+    ("rollout", [*ROLLOUT, "out=mine.vtkhdf", "render=true"], "mine.gif"),
+    ("rollout", ["out=mine.ply"], "mine_0007.ply"),
+    ("rollout", ["scene=scene.yaml"], "rollout/scene.png"),
+    ("solve", ["scene=scene.yaml", "out=mine.hdf5"], "mine.hdf5"),
+    ("evaluate", [*EVALUATE, "json=mine.json"], "mine.json"),
+    ("export", [OF_THE_RUN, "out=mine.safetensors"], "mine.safetensors"),
+    ("export", ["weights=obstacles", "onnx=mine.onnx"], "mine.onnx"),
+    ("export", ["weights=obstacles", "package=mine.pt2"], "mine.pt2"),
+    ("export", ["weights=obstacles", "arrays=made", "scene=scene.yaml"], "made/mine.npy"),
+    ("average", ["weights=[obstacles,obstacles]", "out=mine"], "mine"),
+    ("play", ["rollout=rollout.vtkhdf", "html=mine.html"], "mine.html"),
+    ("render", [*VTKHDF, "out=mine.webp"], "mine.webp"),
+    ("render", [*VTKHDF, "out=mine.usdc"], "mine.usdc"),
+    ("render", [*VTKHDF, "out=made"], "made/rollout.gif"),
+    ("render", [*VTKHDF, "out=made"], "made/rollout_error.png"),
+    ("bench", ["json=mine.json"], "mine.json"),
+    ("scaling", ["json=mine.json"], "mine.json"),
+    ("curves", ["runs=[run]", "out=mine"], "mine.png"),
+    ("error_vs_time", ["data=data", "out=mine"], "mine_frames.png"),
+    ("error_vs_time", ["data=data", "out=mine"], "mine.json"),
+    ("stability_network", ["picture=mine.png"], "mine.png"),
+    ("stability_solver", ["json=mine.json"], "mine.json"),
+    ("train", ["run=mine"], "mine/config.yaml"),
+]
+
+
+@pytest.mark.parametrize(("command", "arguments", "name"), FOREIGN)
+def test_files_of_other_programs_stay(place, command, arguments, name, capsys, monkeypatch):
+    """No output replaces a file that HGN did not write; it is named before the work."""
+    place.path(name).parent.mkdir(exist_ok=True)
+    place.path(name).write_text("work of years, with hgn in it")
+    monkeypatch.setattr(Simulator, "load", lambda *_: pytest.fail("the simulation began"))
+    before = content(place.folder)
+    code, line = refused(command, place.train(*arguments) if command == "train" else arguments, capsys, monkeypatch)
+    assert code == EXIT_INPUT and "that HGN wrote, got" in line, line
+    assert name in line or name.endswith(".npy")
+    assert content(place.folder) == before
+
+
+def test_pictures_refused_before_a_bar(place, capsys, monkeypatch):
+    """An animation that viewers would not play is refused before its drawing begins."""
+    assert exit_code(rollout.main, "rollout", [*ROLLOUT, "out=r.vtkhdf"], monkeypatch) == 0
+    _, line = refused("render", ["rollout=r.vtkhdf", "out=r.gif", "every=1"], capsys, monkeypatch)
+    assert "take every >= 2" in line and "drawing" not in capsys.readouterr().err
+
+
+def test_own_files_are_replaced(place, monkeypatch):
+    """A command that is run twice replaces the files of its first run, whatever their kind."""
+    exported = ["export", [f"{OF_THE_RUN}", "out=made/w.safetensors", "arrays=made/a", "scene=scene.yaml"]]
+    rollouts = [
+        ["rollout", [*ROLLOUT[:2], f"out=made/r.{end}", "frames=3"]] for end in ("vtkhdf", "ply", "usdc", "usda")
+    ]
+    of_it = "rollout=made/r.vtkhdf"
+    drawn = [["render", [of_it, f"out=made/r.{end}", "every=2"]] for end in ("png", "gif", "webp")]
+    others = [["evaluate", EVALUATE], ["play", [of_it, "html=made/r.html"]], ["curves", ["runs=[run]", "out=made/c"]]]
+    for command, arguments in [exported, *rollouts, *drawn, *others] * 2:
+        assert exit_code(COMMANDS[command], command, arguments, monkeypatch) == 0, (command, arguments)
 
 
 def test_errors_file_makes_its_folder(place, monkeypatch):

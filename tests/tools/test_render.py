@@ -90,6 +90,7 @@ def test_other_rollouts_stand_beside_it(tmp_path, capsys):
     assert sizes[1][0] > sizes[0][0] + 60 and sizes[1][1] > sizes[0][1] + 60
     rollout, bad = read_rollout(other), {"rollout": str(path), "others": [str(other)], "out": str(tmp_path / "bad")}
     for change, message in (
+        ({"gravity": (0.0, -1.6, 0.0)}, r"others\[0\] must have the obstacles and the gravity of"),
         ({"frame_rate_hz": 30.0}, r"others\[0\] must have 60 frames a second, got 30"),
         ({"position_TN3": rollout.position_TN3 + np.float32(0.1)}, r"others\[0\] must begin with the same particles"),
     ):
