@@ -37,7 +37,7 @@ class PlayConfig(SimulatorConfig):
     host: str = "127.0.0.1"  # address of the server; 0.0.0.0 lets other machines with the token connect
     port: Port = 8080  # port, or the next free one; 0: any free port
     browser: bool = True  # open the page in this machine's browser
-    particles: Positive[int] = 40_000  # largest number of particles
+    particles: Positive[int] | None = None  # largest number; null: 40,000 on a GPU, 8,000 or the scene's on a CPU
     keep_mb: Positive[int] = 1024  # memory for past frames in MB, for going back and for saving
 
     def __post_init__(self) -> None:
@@ -82,7 +82,8 @@ def play_page(config: PlayConfig) -> Any:
     scene = load_scene(path)
     for note in notes_on_files(scene):
         print(note, file=sys.stderr)
-    session = PlaySession(simulator, scene, path.parent, config.particles, config.keep_mb << 20, name)
+    most = config.particles or max(8_000 if place.type == "cpu" else 40_000, scene.particle_count)
+    session = PlaySession(simulator, scene, path.parent, most, config.keep_mb << 20, name)
     names = [name, *(shipped for shipped in shipped_weights() if shipped != name)]
     return PlayPage(session, names, load, config.host, config.port)
 

@@ -31,7 +31,7 @@ from hgn.runtime.simulator import Simulator
 from hgn.scene.material import MATERIALS
 from hgn.scene.rollout_file import write_rollout
 from hgn.scene.scene_file import ObstacleEntry
-from hgn.schema import ConfigError, Vector, require
+from hgn.schema import ConfigError, require
 from hgn.viewer.placed import PlacedObstacle, plain
 from hgn.viewer.session import PlaySession, Spout
 from hgn.viewer.stage import StageView, quaternion
@@ -42,6 +42,11 @@ BACK_S = {"a frame": 0.0, "1 s": 1.0, "5 s": 5.0}
 TURN_DEGREES = 360.0  # rotation for a drag across the whole window
 MAXIMUM_UPLOAD_BYTES = 64 << 20
 MAXIMUM_ACTIONS = 64  # actions that may wait for the next frame; further ones are dropped
+ABOUT = {
+    "mechanics": "any motion and gravity, exact flight; slower on a CPU",
+    "obstacles": "scenes that start at rest, gravity 9.8 downwards",
+    "obstacles_small": "as obstacles, in two thirds of the time, with larger errors",
+}
 HELP = """
 **Shift + drag** on the floor pours, **Shift + click** drops a ball.
 **Drag** an obstacle to move it, **Ctrl/⌘ + drag** to turn it, **click** to choose it.
@@ -130,6 +135,9 @@ class PlayPage:
                     self.playing, self.diverged = False, True
                     self._notify(f"{error}; paused a frame before. Back by or Restart")
                 frames, changed = frames + 1, True
+                if self.session.spout is not None and self.session.full:
+                    self.session.spout = None
+                    self._notify(self._limit())
             if changed:
                 shown = self._updates(self._show)
             now = time.monotonic()
@@ -183,6 +191,7 @@ class PlayPage:
         self.status.content = f"{speed}\n\nframe {session.frame} · {backend}"
         self.play_button.label = "Pause" if self.playing else "Play"
         self.gravity.value = session.gravity
+        self.about.content = ABOUT.get(session.weights, "weights of your own")
         name = self.shown[self.chosen].body.name if self.chosen is not None else "none"
         self.chosen_text.content = f"chosen: {name}"
 
@@ -197,6 +206,10 @@ class PlayPage:
         step = gui.add_button("Step")
         back = gui.add_button_group("Back by", tuple(BACK_S))
         restart = gui.add_button("Restart")
+        undo = gui.add_button("Undo")
+        with gui.add_folder("Save"):
+            save_scene = gui.add_button("Scene (YAML, zip)")
+            save_rollout = gui.add_button("Rollout (VTKHDF)")
         with gui.add_folder("Pour"):
             self.material = gui.add_dropdown("Material", self._materials())
             self.diameter = gui.add_slider("Diameter", 0.02, 0.3, 0.01, 0.08)
@@ -213,9 +226,7 @@ class PlayPage:
         with gui.add_folder("World"):
             self.gravity: Any = gui.add_vector3("Gravity", session.gravity, step=0.1)
             self.weights: Any = gui.add_dropdown("Weights", self.names)
-        with gui.add_folder("Save"):
-            save_scene = gui.add_button("Scene (YAML, zip)")
-            save_rollout = gui.add_button("Rollout (VTKHDF)")
+            self.about = gui.add_markdown("")
 
         def one_step() -> None:
             self.play(False)
@@ -229,6 +240,7 @@ class PlayPage:
         self.play_button.on_click(lambda event: self.do(lambda: self.play(not self.playing), event.client))
         step.on_click(lambda event: self.do(one_step, event.client))
         restart.on_click(lambda event: self.do(self.restart, event.client))
+        undo.on_click(lambda event: self.do(session.undo, event.client))
         add.on_click(lambda event: self.do(self._add_shape, event.client))
         remove.on_click(lambda event: self.do(self._remove_chosen, event.client))
         save_scene.on_click(lambda event: self.do(lambda: self._send_scene(event), event.client))
@@ -243,6 +255,7 @@ class PlayPage:
         def _(event: Any) -> None:
             if event.client is not None:
                 x, y, z = (float(value) for value in event.target.value)
+                self.do(session.remember, event.client, "before gravity")
                 self.do(lambda: session.set_gravity((x, y, z)), event.client, "gravity")
 
         @self.weights.on_update
@@ -282,16 +295,14 @@ class PlayPage:
         """Returns the materials that can be poured: the materials of the weights that scenes can have too."""
         return tuple(name for name in self.session.simulator.network.config.materials if name in MATERIALS)
 
-    def _middle(self) -> Vector:
-        x, y, z = self.session.domain_size
-        return 0.5 * x, 0.3 * y, 0.5 * z
-
     def _add_shape(self) -> None:
-        entry = ObstacleEntry(shape=self.shape.value, size=clamped(self.size), position=self._middle())
+        size = clamped(self.size)
+        entry = ObstacleEntry(shape=self.shape.value, size=size, position=self.session.free_place(size))
+        self.session.remember()
         self.chosen = self.session.add_obstacle(entry).body.number
 
     def _add_file(self, name: str, content: bytes) -> None:
-        """Adds a mesh in the middle of the domain, scaled to the size of the slider."""
+        """Adds a mesh at a free place, scaled to the size of the slider."""
         require("\0" not in name, "mesh", "a name without null characters", name)
         file = Path(name).name
         require(Path(file).suffix.lower() in MESH_SUFFIXES, "mesh", f"one of {', '.join(MESH_SUFFIXES)}", file)
@@ -301,13 +312,17 @@ class PlayPage:
             path = Path(folder) / f"{plain(Path(file).stem)}{Path(file).suffix}"
             path.write_bytes(content)
             try:
-                added = self.session.add_mesh(path, clamped(self.size), self._middle())
+                size = clamped(self.size)
+                place = self.session.free_place(size)
+                self.session.remember()
+                added = self.session.add_mesh(path, size, place)
             except ConfigError as error:  # the viewer knows the file without its folder
                 raise ConfigError(str(error).replace(str(path), file)) from None
         self.chosen = added.body.number
 
     def _remove_chosen(self) -> None:
         if self.chosen is not None:
+            self.session.remember()
             self.session.remove_obstacle(self.chosen)
 
     def _send_scene(self, event: Any) -> None:
@@ -336,12 +351,19 @@ class PlayPage:
 
     def _pour(self, origin_3: np.ndarray, direction_3: np.ndarray | None) -> None:
         """Opens the spout at the target of the ray, or closes it without a ray."""
+        if direction_3 is not None and self.session.spout is None:
+            self.session.remember()
         self.session.spout = None if direction_3 is None else self._spout(origin_3, direction_3)
 
     def _drop(self, origin_3: np.ndarray, direction_3: np.ndarray) -> None:
         spout = self._spout(origin_3, direction_3)
+        self.session.remember()
         if not self.session.drop(spout.material, spout.position, spout.diameter, spout.speed):
-            self._notify("there is no room for a ball here")
+            self._notify(self._limit() if self.session.full else "there is no room for a ball here")
+
+    def _limit(self) -> str:
+        most = self.session.maximum_particles
+        return f"no more than {most:,} particles, to stay fast; Undo takes some away, hgn.play particles=N allows more"
 
     def _spout(self, origin_3: np.ndarray, direction_3: np.ndarray) -> Spout:
         """Returns a spout above the point where a ray meets the floor or leaves through a wall.
@@ -370,6 +392,7 @@ class PlayPage:
             if number not in self.shown:
                 return
             if event.phase == "start":
+                self.do(self.session.remember, event.client)
                 grabbed[:] = [(self.shown[number], event)]
                 self.chosen = number
             if grabbed:

@@ -26,13 +26,14 @@ from hgn.scene.mesh import load_mesh
 from hgn.scene.rollout_file import Rollout
 from hgn.scene.scene import Scene
 from hgn.scene.scene_file import ObstacleEntry
-from hgn.schema import Vector, from_mapping, require, to_mapping
+from hgn.schema import ConfigError, Vector, from_mapping, require, to_mapping
 from hgn.viewer.placed import Body, PlacedObstacle, placed_at_rest, placed_by, with_obstacles
 from hgn.viewer.recording import Frame, Recording
 
 CLEARANCE = 1.25  # in spacings of particles at rest; no drop enters within this distance of another particle
 MAXIMUM_GRAVITY = 1000.0  # domain units per second squared
 MAXIMUM_OBSTACLES, MAXIMUM_MESH_BYTES = 64, 128 << 20  # bytes of files, including those of obstacles in past frames
+CHANGES = 100  # largest number of changes that can be undone
 FULL_SHARE = 0.5  # largest share of a frame's particles that may still be at the spout; above it the spout waits
 
 
@@ -75,6 +76,7 @@ class PlaySession:
         self.random = np.random.default_rng(scene.seed)
         self.spout: Spout | None = None
         self._owed = 0.0  # fraction of a particle that the spout has not given yet
+        self._before: list[tuple[int, tuple[PlacedObstacle, ...], Vector]] = []  # frame, obstacles, gravity: for undo
         self._bodies: WeakSet[Body] = WeakSet()  # bodies that viewers have added
         initial = InitialState.of_scene(replace(scene, obstacles=()))
         require(not scene.moves, "obstacles", "at rest for a network", "keyframes", "leave keyframes out")
@@ -100,6 +102,11 @@ class PlaySession:
     def frame(self) -> int:
         """Returns the number of the newest frame."""
         return self.recording.last
+
+    @property
+    def full(self) -> bool:
+        """Returns whether no more particles can enter."""
+        return self.live.particle_count >= self.maximum_particles
 
     @property
     def newest(self) -> Frame:
@@ -152,6 +159,20 @@ class PlaySession:
         if then.gravity != self.gravity:
             self.live.set_gravity(then.gravity)
         self.recording.back_to(frame)
+
+    def remember(self) -> None:
+        """Notes frame, obstacles and gravity before a change, for `undo`."""
+        self._before = [*self._before[1 - CHANGES :], (self.frame, self.obstacles, self.gravity)]
+
+    def undo(self) -> None:
+        """Goes back to the time before the last change, as far as frames are kept. Raises: ConfigError without one."""
+        self._before = [before for before in self._before if before[0] <= self.frame]
+        require(bool(self._before), "undo", "used after a change", "none")
+        frame, obstacles, gravity = self._before.pop()
+        self.rewind(max(frame, self.recording.earliest))
+        self._set_obstacles(obstacles)
+        if gravity != self.gravity:
+            self.live.set_gravity(gravity)
 
     # particles that enter
 
@@ -245,6 +266,22 @@ class PlaySession:
         scale = size / float((high - low).max())
         x, y, z = (np.array(middle) - scale * 0.5 * (low + high)).tolist()
         return self.add_obstacle(ObstacleEntry(mesh=path.name, scale=scale, position=(x, y, z)), path.parent)
+
+    def free_place(self, size: float) -> Vector:
+        """Returns the place nearest to the middle, at 0.3 of the height, for a cube without particles and obstacles.
+
+        Raises: ConfigError where there is none.
+        """
+        surfaces = (obstacle.samples[0] for obstacle in self.obstacles)
+        taken_A3 = np.concatenate([self.newest.position_N3, *surfaces])
+        domain, middle = np.array(self.domain_size), np.array([0.5, 0.3, 0.5])
+        share_C3 = np.stack(np.meshgrid(*[np.linspace(0.1, 0.9, 9)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+        for share_3 in (middle, *share_C3[np.linalg.norm(share_C3 - middle, axis=1).argsort(kind="stable")]):
+            centre = share_3 * domain
+            if not (np.abs(taken_A3 - centre) < 0.5 * size + self.cell_size).all(axis=1).any():
+                x, y, z = centre.tolist()
+                return x, y, z
+        raise ConfigError(f"size must leave room among particles and obstacles, got {size:g}; take a smaller one")
 
     def move_obstacle(self, moved: PlacedObstacle) -> None:
         """Replaces the obstacle of the same body by `moved`. Does nothing if the obstacle was removed.

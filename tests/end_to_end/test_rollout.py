@@ -49,9 +49,9 @@ def test_nothing_said(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     assert rollout.main({"frames": 2}) == 0
     names = capsys.readouterr().out.split()
-    assert names == [f"rollout/random_0.{ending}" for ending in ("vtkhdf", "png", "gif")]
+    assert names == [f"rollout/random_13.{ending}" for ending in ("vtkhdf", "png", "gif")]
     made = read_rollout(tmp_path / names[0])
-    assert len(made.obstacles) == 5 and made.source["scene"] == "random, seed 0"
+    assert len(made.obstacles) == 5 and made.source["scene"] == "random, seed 13"
     assert made.source["weights"] == f"{DEFAULT_WEIGHTS}.safetensors"
     assert all(Path(name).stat().st_size > 1000 for name in names)
 

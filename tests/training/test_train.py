@@ -257,7 +257,7 @@ def test_what_a_training_takes_is_said(make_config, make_dataset, tmp_path, monk
     assert text.startswith(f"about {scenes - 1} hours for the rest of {scenes} scenes") and " GB are free" in text
     assert duration(40) == "40 seconds" and duration(61.4 * 86400) == "61 days" and duration(12600) == "3.5 hours"
     monkeypatch.setattr(callbacks, "ESTIMATE_AFTER_S", 0.0)
-    monkeypatch.setattr(callbacks, "LONG_ON_A_CPU_S", 0.0)
+    monkeypatch.setattr(callbacks, "LONG_ON_A_CPU_S", -1.0)
     bars = []
     monkeypatch.setattr(callbacks, "bar", lambda *given, **named: bars.append(bar(*given, **named)) or bars[-1])
     monkeypatch.setattr(callbacks.LogLines, "on_train_end", lambda *_: None)

@@ -166,6 +166,41 @@ def load_count(session):
     return len(session.recording[0].position_N3)
 
 
+def test_changes_are_undone_one_by_one(session):
+    """Undo goes back to frame, obstacles and gravity before the last change, twice for two changes in one frame; a
+    change after the frame that somebody went back to does not count."""
+    steps(session, 3)
+    then, before = session.newest.position_N3.copy(), session.obstacles
+    session.remember()
+    session.set_gravity((1.0, 0.0, 0.0))
+    session.remember()
+    session.add_obstacle(ObstacleEntry(shape="cone", size=0.1, position=session.free_place(0.1)))
+    steps(session, 2)
+    session.undo()
+    assert session.frame == 3 and session.obstacles == before and session.gravity == (1.0, 0.0, 0.0)
+    session.undo()
+    assert session.gravity == (0.0, -9.8, 0.0) and np.array_equal(session.newest.position_N3, then)
+    steps(session, 1)
+    session.remember()
+    session.rewind(2)
+    with pytest.raises(ConfigError, match="undo must be used after a change"):
+        session.undo()
+
+
+def test_free_places(session):
+    """What is added stands free of particles and obstacles, in the middle where that is free; a full scene says so."""
+    for _ in range(4):
+        place = np.array(session.free_place(0.15))
+        inside = np.abs(session.newest.position_N3 - place) < 0.075
+        assert not inside.all(axis=1).any() and place.min() >= 0.1 - 1e-9 and place.max() <= 0.9 + 1e-9
+        for obstacle in session.obstacles:
+            assert not (np.abs(obstacle.samples[0] - place) < 0.075).all(axis=1).any()
+        session.add_obstacle(ObstacleEntry(shape="half_box", size=0.15, position=tuple(place.tolist())))
+    with pytest.raises(ConfigError, match="size must leave room among particles and obstacles, got 0.9"):
+        session.free_place(0.9)
+    assert not session.full
+
+
 def test_what_is_kept_is_bounded(session):
     """Frames beyond the limit are forgotten, going back to them is refused with the frames that are kept, and the
     oldest that is kept repeats to the bit."""
