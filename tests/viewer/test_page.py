@@ -228,7 +228,7 @@ def test_scene_and_rollout_are_taken_away(viewer, play, tmp_path):
 
 
 def test_own_meshes(viewer, play):
-    """An uploaded mesh stands free of particles, as large as the slider says; what is none is told and changes nothing."""
+    """An uploaded mesh stands free of particles, as large as the slider says; what is none is told."""
     count = len(play.session.obstacles)
     field = viewer.locator("input[type=file]")
     field.set_input_files(files=[{"name": "a.obj", "mimeType": "", "buffer": b"no mesh"}])

@@ -196,7 +196,7 @@ def test_free_places(session):
         for obstacle in session.obstacles:
             assert not (np.abs(obstacle.samples[0] - place) < 0.075).all(axis=1).any()
         session.add_obstacle(ObstacleEntry(shape="half_box", size=0.15, position=tuple(place.tolist())))
-    with pytest.raises(ConfigError, match="size must leave room among particles and obstacles, got 0.9"):
+    with pytest.raises(ConfigError, match=r"size must leave room among particles and obstacles, got 0\.9"):
         session.free_place(0.9)
     assert not session.full
 
