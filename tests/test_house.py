@@ -16,9 +16,9 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 29_124,
+    "hgn": 29_227,
     "datagen": 8_531,
-    "tools": 7_198,
+    "tools": 7_206,
     "tests": 28_700,
 }
 SETTINGS = 239  # fields of the dataclasses behind the commands, *Config
