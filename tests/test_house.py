@@ -18,8 +18,8 @@ PACKAGES = ("hgn", "datagen", "tools")
 LINES = {  # of Python, in tracked files
     "hgn": 29_227,
     "datagen": 8_531,
-    "tools": 7_206,
-    "tests": 28_700,
+    "tools": 7_212,
+    "tests": 28_912,
 }
 SETTINGS = 239  # fields of the dataclasses behind the commands, *Config
 

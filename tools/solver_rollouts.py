@@ -16,6 +16,7 @@ from hgn.scene.episode import Episode
 from hgn.scene.rollout_file import obstacles_of_episode
 from hgn.scene.scene import Scene
 from hgn.system.machine import available_cpus
+from hgn.system.progress import bar
 
 OnFrame = Callable[[int], None] | None
 
@@ -56,7 +57,11 @@ def solver_trials(
     colliders: Sequence[Any] | None = None,
     stability_fractions: Sequence[float] | None = None,
 ) -> list[RolloutResult]:
-    """Returns the solver's trajectories; of a scene that it stops only the initial state."""
+    """Returns the solver's trajectories, of a scene that it stops the initial state; shows a bar without on_frame."""
+    if on_frame is None:
+        with bar("solver", total=frames, unit="frame") as progress:
+            shown = lambda _: progress.update()  # noqa: E731
+            return solver_trials(scenes, config, frames, frame_rate_hz, shown, colliders, stability_fractions)
     from datagen.mpm.solver import SceneFailure, simulate
 
     results = simulate(
@@ -106,13 +111,13 @@ class SolverLaunches:
                     build_collider, scene, self.config.choices.collider_band_cells
                 )
 
-    def trials(self, setting: Setting, episodes: Sequence[Episode], on_frame: OnFrame = None) -> list[RolloutResult]:
+    def trials(self, setting: Setting, episodes: Sequence[Episode]) -> list[RolloutResult]:
         """Returns trajectories from the episodes' first frames."""
         self.add(setting)
         missing = [episode for episode in episodes if (setting, episode.key) not in self._known]
         if missing:
             pairs = [(other, episode) for other in self._settings for episode in missing]
-            simulated = self.simulate(pairs, self.frames, on_frame)
+            simulated = self.simulate(pairs, self.frames, None)
             self._known |= {(s, e.key): trial for (s, e), trial in zip(pairs, simulated, strict=True)}
         return [self._known[setting, episode.key] for episode in episodes]
 

@@ -70,7 +70,9 @@ def test_every_case_has_a_row(tmp_path, monkeypatch, capsys):
     assert broken["held"] and broken["guard"] == "raised" and "diverged at frame 1" in broken["beyond"]
     printed = capsys.readouterr()
     assert all(len(line) <= 100 for line in printed.out.splitlines()) and "explodes" in printed.out
-    assert sum(line.startswith(("passes ", "FAILS ")) for line in printed.err.splitlines()) == len(rows)
+    told = printed.err.splitlines()
+    assert sum(line.startswith(("passes ", "FAILS ")) for line in told) == len(rows)
+    assert sum(line.startswith("case 1 of ") for line in told) == 1  # before it is simulated
 
 
 class Repeats:

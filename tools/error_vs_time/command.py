@@ -26,7 +26,6 @@ from hgn.scene.episode import Episode
 from hgn.schema import ConfigError, from_mapping, from_stored, require, require_replaceable
 from hgn.system.device import choose_device
 from hgn.system.machine import available_cpus
-from hgn.system.progress import bar
 from tools.error_vs_time.contenders import (
     COARSE_GRIDS,
     PARTICLES_AT_ONCE,
@@ -235,8 +234,7 @@ def resimulated(
 
     Further settings of the same grid are simulated in the same launch.
     """
-    with bar("reference", total=launches.frames, unit="frame") as progress:
-        trials = launches.trials(Setting(step), episodes, lambda _: progress.update())
+    trials = launches.trials(Setting(step), episodes)
     pairs = list(zip(episodes, trials, strict=True))
     left_out = {episode.key: trial.cause for episode, trial in pairs if trial.cause is not None}
     return [replace(e, position_TN3=trial.position_TN3) for e, trial in pairs if trial.cause is None], left_out

@@ -77,7 +77,8 @@ def main(mapping: dict[str, Any]) -> int:
     if cases:
         compile_kernels(simulator, cases)
     report.meta["seconds_before_cases"] = time.monotonic() - started
-    for case in cases:
+    for number, case in enumerate(cases, start=1):
+        print(f"case {number} of {len(cases)}: {case.name}", file=sys.stderr, flush=True)
         report.add(runner.rows(case))
     if GUARD in wanted:
         report.add([guard_row(simulator, config.scene)])

@@ -7,6 +7,7 @@ minutes; leaks and columns need a GPU.
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import partial
@@ -59,6 +60,7 @@ def main(mapping: dict[str, Any]) -> int:
     report = Report("solver", meta, config.json, steps=points, scenes=scenes)
     for name in NAMES:
         if config.cases is None or name in config.cases:
+            print(f"case {name}", file=sys.stderr, flush=True)
             report.add(cases[name](mpm))
     for name in filter(is_gallery, config.cases or ()):
         report.add(gallery_rows(name, mpm, meta, scenes))
