@@ -49,10 +49,12 @@ class StageView:
         self.scene.set_up_direction("+y")
         self.middle_3 = 0.5 * np.array(domain_size)
         low_3, high_3 = np.zeros(3), np.array(domain_size)
-        size, eye, target = max(domain_size), (0.55, 0.45, 1.55), (0.0, -0.08, 0.0)
+        # the box fills the height; it stands left of the middle, for the panel is at the right
+        size, eye, target = max(domain_size), (0.86, 0.62, 2.0), (0.14, -0.04, -0.06)
         if dimensions == 2:
             low_3[2], high_3[2] = self.middle_3[2] - spacing, self.middle_3[2] + spacing
-            size, eye, target = max(domain_size[:2]), (0.0, 0.0, 1.0), (0.0, 0.0, 0.0)
+            size, eye, target = max(domain_size[:2]), (0.0, 0.0, 1.7), (0.0, 0.0, 0.0)
+        server.initial_camera.fov = 0.75  # radians
         server.initial_camera.position = tuple(self.middle_3 + size * np.array(eye))
         server.initial_camera.look_at = tuple(self.middle_3 + size * np.array(target))
         # The box is seen from inside, so that its near walls are invisible.
