@@ -16,7 +16,7 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 29_227,
+    "hgn": 29_272,
     "datagen": 8_531,
     "tools": 7_212,
     "tests": 28_912,
