@@ -1,182 +1,31 @@
 """Bad input to the commands: one line that says what is wrong, a non-zero exit code, and nothing touched."""
 
-import errno
 import json
 import os
-import shutil
 import subprocess
-import sys
-from collections.abc import Callable
-from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import pytest
-import torch
-from network.states import network_of
+from end_to_end.places import (
+    EPISODE,
+    EVALUATE,
+    EXPORT,
+    FRESH,
+    OF_THE_RUN,
+    ROLLOUT,
+    ROOT,
+    alter,
+    check,
+    content,
+    refused,
+    truncate,
+)
 from processes import PATIENCE_S, exit_code
-from training.runs import train_arguments
 
-import datagen.__main__
-import datagen.service.__main__
-import tools.bench.command
-import tools.error_vs_time.command
-import tools.scaling.command
-from datagen import solve, upload
-from hgn import average, evaluate, export, play, rollout, train
+from hgn import evaluate
 from hgn.command import EXIT_INPUT, EXIT_MACHINE
-from hgn.config import DatagenConfig
 from hgn.data.storage import TOKEN_VARIABLE
 from hgn.runtime.simulator import Simulator
-from hgn.runtime.weights import WeightsInfo, load_weights, save_weights
-from tools import curves, render
-from tools.stability import network, solver
-
-ROOT = Path(__file__).resolve().parents[2]
-COMMANDS: dict[str, Callable[[dict[str, Any]], int]] = {
-    "datagen": datagen.__main__.main,
-    "service": datagen.service.__main__.main,
-    "solve": solve.main,
-    "upload": upload.main,
-    "train": train.main,
-    "export": export.main,
-    "rollout": rollout.main,
-    "evaluate": evaluate.main,
-    "render": render.main,
-    "play": play.main,
-    "average": average.main,
-    "bench": tools.bench.command.main,
-    "curves": curves.main,
-    "error_vs_time": tools.error_vs_time.command.main,
-    "scaling": tools.scaling.command.main,
-    "stability_network": network.main,
-    "stability_solver": solver.main,
-}
-SCENE = """
-obstacles:
-  - {shape: cone, size: 0.3, position: [0.5, 0.4, 0.5]}
-groups:
-  - {shape: cube, size: 0.05, position: [0.5, 0.8, 0.5], material: water}
-"""
-
-
-@dataclass
-class Place:
-    """A folder with a data set, a finished run, its weights and a scene file; all paths are relative to it."""
-
-    folder: Path
-    config: DatagenConfig
-
-    def path(self, name):
-        return self.folder / name
-
-    def edit_scene(self, old, new):
-        self.path("scene.yaml").write_text(SCENE.replace(old, new))
-
-    def damage(self, split, how):
-        for shard in self.path("data").glob(f"{split}-*.tar"):
-            how(shard)
-
-    def damage_run(self, how):
-        for path in self.path("run/checkpoints").iterdir():
-            how(path)
-
-    def weights(self, materials=None, **changes):
-        """Weights of another kind in the place of the run's."""
-        path = self.path("weights.safetensors")
-        network, info = load_weights(path)
-        if materials is not None:
-            network = network_of(torch.float32, materials=materials)
-        save_weights(path, network, replace(info, network=network.config, **changes))
-
-    def checkpoint(self, change):
-        """A file of torch.save beside the run's checkpoint."""
-        checkpoint = torch.load(self.path("run/checkpoints/last.ckpt"), weights_only=True)
-        change(checkpoint["hgn"])
-        torch.save(checkpoint if checkpoint["hgn"] else {"state_dict": {}}, self.path("foreign.ckpt"))
-
-    def network(self, **changes):
-        self.checkpoint(lambda ours: ours["network"].update(changes))
-
-    def accelerate(self, by):
-        """Puts weights in the place of those that throw all particles out of the domain."""
-        network = network_of(torch.float32)
-        network.normaliser.set("acceleration", torch.full((3,), by), torch.ones(3), 0.0)
-        save_weights(self.path("weights.safetensors"), network, WeightsInfo(network.config, 60.0, 1 / 64))
-
-    def train(self, *arguments, run="run"):
-        return ["+experiment=obstacles", *train_arguments(self.config, self.path(run)), *arguments]
-
-
-@pytest.fixture(scope="session")
-def original(small_dataset, finished_once, tmp_path_factory):
-    """What all tests begin with."""
-    folder = tmp_path_factory.mktemp("original")
-    shutil.copytree(small_dataset, folder / "data")
-    shutil.copytree(finished_once[1], folder / "run")
-    export.export(folder / "run" / "checkpoints" / "last.ckpt", folder / "weights.safetensors")
-    (folder / "scene.yaml").write_text(SCENE)
-    return folder
-
-
-@pytest.fixture
-def untouched(original, make_config, monkeypatch):
-    """The original itself, for commands that leave it as it is."""
-    monkeypatch.chdir(original)
-    return Place(original, make_config(folder=str(original / "data")))
-
-
-@pytest.fixture
-def place(original, make_config, tmp_path, monkeypatch):
-    shutil.copytree(original, tmp_path, dirs_exist_ok=True)
-    monkeypatch.chdir(tmp_path)
-    return Place(tmp_path, make_config())
-
-
-def content(folder):
-    """Every file below a folder, by size and time."""
-    files = ((path, path.stat()) for path in folder.rglob("*") if path.is_file())
-    return {str(path.relative_to(folder)): (status.st_size, status.st_mtime_ns) for path, status in files}
-
-
-def truncate(path):
-    path.write_bytes(path.read_bytes()[:-700])
-
-
-def alter(path):
-    data = bytearray(path.read_bytes())
-    data[700] ^= 1
-    path.write_bytes(data)
-
-
-def refused(command, arguments, capsys, monkeypatch):
-    """Runs a command as its module would; returns the exit code and the one error line."""
-    capsys.readouterr()
-    code = exit_code(COMMANDS[command], command, arguments, monkeypatch)
-    lines = capsys.readouterr().err.splitlines()
-    errors = [line for line in lines if line.startswith("error: ")]
-    # a progress bar may have begun; after the error there is nothing
-    assert errors == lines[-1:] and "Traceback" not in "".join(lines), lines
-    assert sys.argv == [command, *arguments] and "HYDRA_FULL_ERROR" not in os.environ
-    return code, errors[0]
-
-
-def check(place, command, arguments, message, capsys, patch):
-    """The command is refused with that message, changes no file and leaves no half-written one."""
-    before = content(place.folder)
-    code, line = refused(command, arguments, capsys, patch)
-    assert code == EXIT_INPUT and message in line, line
-    after = content(place.folder)
-    assert {name: after.get(name) for name in before} == before
-    assert not [name for name in after if name.endswith(".partial") or name.startswith(("made", "other/checkpoints"))]
-
-
-ROLLOUT = ["weights=weights.safetensors", "scene=scene.yaml", "out=made/rollout.vtkhdf", "frames=3"]
-EPISODE = [*ROLLOUT, "scene=null", "data=data", "episode=validation-000000"]
-EVALUATE = ["weights=weights.safetensors", "data=data", "rollout_frames=3", "json=made/errors.json"]
-EXPORT = ["checkpoint=foreign.ckpt", "out=weights.safetensors"]
-FRESH = ["out=made", "frozen=[weights.safetensors]"]
-OF_THE_RUN = "checkpoint=run/checkpoints/last.ckpt"
 
 # command, arguments, message
 VALUES = [
@@ -369,85 +218,6 @@ def test_output_is_checked_before_the_work(place, command, arguments, message, c
     code, line = refused(command, place.train(*arguments) if command == "train" else arguments, capsys, monkeypatch)
     assert code in (EXIT_INPUT, EXIT_MACHINE) and message in line, line
     assert content(place.folder) == before and not place.path("closed/new").exists()
-
-
-@pytest.mark.parametrize("command", ["rollout", "solve"])
-def test_full_disks_are_met_before_the_work(place, command, capsys, monkeypatch):
-    """Space for the file is reserved during the simulation; a disk without it is named before."""
-    arguments, sizes, reserve = ["scene=scene.yaml", "out=made/r.vtkhdf", "frames=3"], [], os.posix_fallocate
-    monkeypatch.setattr(os, "posix_fallocate", lambda *given: sizes.append(given[-1]) or reserve(*given))
-    assert exit_code(COMMANDS[command], command, arguments, monkeypatch) == 0
-    (file,) = place.path("made").iterdir()
-    assert sizes[0] >= file.stat().st_size
-    monkeypatch.setattr(os, "posix_fallocate", lambda *_: (_ for _ in ()).throw(OSError(errno.ENOSPC, "No space")))
-    monkeypatch.setattr("hgn.system.progress.bar", lambda *_, **__: pytest.fail("the simulation began"))
-    before = content(place.folder)
-    code, line = refused(command, arguments, capsys, monkeypatch)
-    assert code == EXIT_MACHINE and line.startswith("error: No space: made/r.vtkhdf; free some space"), line
-    assert content(place.folder) == before
-
-
-VTKHDF = ["rollout=rollout.vtkhdf"]
-# command, arguments, file of another program
-FOREIGN = [
-    ("rollout", [*ROLLOUT, "out=mine.h5"], "mine.h5"),
-    ("rollout", [*ROLLOUT, "out=mine.vtkhdf", "render=true"], "mine.gif"),
-    ("rollout", ["out=mine.ply"], "mine_0007.ply"),
-    ("rollout", ["scene=scene.yaml"], "rollout/scene.png"),
-    ("solve", ["scene=scene.yaml", "out=mine.hdf5"], "mine.hdf5"),
-    ("evaluate", [*EVALUATE, "json=mine.json"], "mine.json"),
-    ("export", [OF_THE_RUN, "out=mine.safetensors"], "mine.safetensors"),
-    ("export", ["weights=obstacles", "onnx=mine.onnx"], "mine.onnx"),
-    ("export", ["weights=obstacles", "package=mine.pt2"], "mine.pt2"),
-    ("export", ["weights=obstacles", "arrays=made", "scene=scene.yaml"], "made/mine.npy"),
-    ("average", ["weights=[obstacles,obstacles]", "out=mine"], "mine"),
-    ("play", ["rollout=rollout.vtkhdf", "html=mine.html"], "mine.html"),
-    ("render", [*VTKHDF, "out=mine.webp"], "mine.webp"),
-    ("render", [*VTKHDF, "out=mine.usdc"], "mine.usdc"),
-    ("render", [*VTKHDF, "out=made"], "made/rollout.gif"),
-    ("render", [*VTKHDF, "out=made"], "made/rollout_error.png"),
-    ("bench", ["json=mine.json"], "mine.json"),
-    ("scaling", ["json=mine.json"], "mine.json"),
-    ("curves", ["runs=[run]", "out=mine"], "mine.png"),
-    ("error_vs_time", ["data=data", "out=mine"], "mine_frames.png"),
-    ("error_vs_time", ["data=data", "out=mine"], "mine.json"),
-    ("stability_network", ["picture=mine.png"], "mine.png"),
-    ("stability_solver", ["json=mine.json"], "mine.json"),
-    ("train", ["run=mine"], "mine/config.yaml"),
-]
-
-
-@pytest.mark.parametrize(("command", "arguments", "name"), FOREIGN)
-def test_files_of_other_programs_stay(place, command, arguments, name, capsys, monkeypatch):
-    """No output replaces a file that HGN did not write; it is named before the work."""
-    place.path(name).parent.mkdir(exist_ok=True)
-    place.path(name).write_text("work of years, with hgn in it")
-    monkeypatch.setattr(Simulator, "load", lambda *_: pytest.fail("the simulation began"))
-    before = content(place.folder)
-    code, line = refused(command, place.train(*arguments) if command == "train" else arguments, capsys, monkeypatch)
-    assert code == EXIT_INPUT and "that HGN wrote, got" in line, line
-    assert name in line or name.endswith(".npy")
-    assert content(place.folder) == before
-
-
-def test_pictures_refused_before_a_bar(place, capsys, monkeypatch):
-    """An animation that viewers would not play is refused before its drawing begins."""
-    assert exit_code(rollout.main, "rollout", [*ROLLOUT, "out=r.vtkhdf"], monkeypatch) == 0
-    _, line = refused("render", ["rollout=r.vtkhdf", "out=r.gif", "every=1"], capsys, monkeypatch)
-    assert "take every >= 2" in line and "drawing" not in capsys.readouterr().err
-
-
-def test_own_files_are_replaced(place, monkeypatch):
-    """A command that is run twice replaces the files of its first run, whatever their kind."""
-    exported = ["export", [f"{OF_THE_RUN}", "out=made/w.safetensors", "arrays=made/a", "scene=scene.yaml"]]
-    rollouts = [
-        ["rollout", [*ROLLOUT[:2], f"out=made/r.{end}", "frames=3"]] for end in ("vtkhdf", "ply", "usdc", "usda")
-    ]
-    of_it = "rollout=made/r.vtkhdf"
-    drawn = [["render", [of_it, f"out=made/r.{end}", "every=2"]] for end in ("png", "gif", "webp")]
-    others = [["evaluate", EVALUATE], ["play", [of_it, "html=made/r.html"]], ["curves", ["runs=[run]", "out=made/c"]]]
-    for command, arguments in [exported, *rollouts, *drawn, *others] * 2:
-        assert exit_code(COMMANDS[command], command, arguments, monkeypatch) == 0, (command, arguments)
 
 
 def test_errors_file_makes_its_folder(place, monkeypatch):

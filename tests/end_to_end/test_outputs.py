@@ -1,0 +1,98 @@
+"""What commands write: never over files of other programs, and only where there is space for it."""
+
+import errno
+import os
+
+import pytest
+from end_to_end.places import (
+    COMMANDS,
+    EVALUATE,
+    OF_THE_RUN,
+    ROLLOUT,
+    content,
+    refused,
+)
+from processes import exit_code
+
+from hgn import rollout
+from hgn.command import EXIT_INPUT, EXIT_MACHINE
+from hgn.runtime.simulator import Simulator
+
+
+@pytest.mark.parametrize("command", ["rollout", "solve"])
+def test_full_disks_are_met_before_the_work(place, command, capsys, monkeypatch):
+    """Space for the file is reserved during the simulation; a disk without it is named before."""
+    arguments, sizes, reserve = ["scene=scene.yaml", "out=made/r.vtkhdf", "frames=3"], [], os.posix_fallocate
+    monkeypatch.setattr(os, "posix_fallocate", lambda *given: sizes.append(given[-1]) or reserve(*given))
+    assert exit_code(COMMANDS[command], command, arguments, monkeypatch) == 0
+    (file,) = place.path("made").iterdir()
+    assert sizes[0] >= file.stat().st_size
+    monkeypatch.setattr(os, "posix_fallocate", lambda *_: (_ for _ in ()).throw(OSError(errno.ENOSPC, "No space")))
+    monkeypatch.setattr("hgn.system.progress.bar", lambda *_, **__: pytest.fail("the simulation began"))
+    before = content(place.folder)
+    code, line = refused(command, arguments, capsys, monkeypatch)
+    assert code == EXIT_MACHINE and line.startswith("error: No space: made/r.vtkhdf; free some space"), line
+    assert content(place.folder) == before
+
+
+VTKHDF = ["rollout=rollout.vtkhdf"]
+# command, arguments, file of another program
+FOREIGN = [
+    ("rollout", [*ROLLOUT, "out=mine.h5"], "mine.h5"),
+    ("rollout", [*ROLLOUT, "out=mine.vtkhdf", "render=true"], "mine.gif"),
+    ("rollout", ["out=mine.ply"], "mine_0007.ply"),
+    ("rollout", ["scene=scene.yaml"], "rollout/scene.png"),
+    ("solve", ["scene=scene.yaml", "out=mine.hdf5"], "mine.hdf5"),
+    ("evaluate", [*EVALUATE, "json=mine.json"], "mine.json"),
+    ("export", [OF_THE_RUN, "out=mine.safetensors"], "mine.safetensors"),
+    ("export", ["weights=obstacles", "onnx=mine.onnx"], "mine.onnx"),
+    ("export", ["weights=obstacles", "package=mine.pt2"], "mine.pt2"),
+    ("export", ["weights=obstacles", "arrays=made", "scene=scene.yaml"], "made/mine.npy"),
+    ("average", ["weights=[obstacles,obstacles]", "out=mine"], "mine"),
+    ("play", ["rollout=rollout.vtkhdf", "html=mine.html"], "mine.html"),
+    ("render", [*VTKHDF, "out=mine.webp"], "mine.webp"),
+    ("render", [*VTKHDF, "out=mine.usdc"], "mine.usdc"),
+    ("render", [*VTKHDF, "out=made"], "made/rollout.gif"),
+    ("render", [*VTKHDF, "out=made"], "made/rollout_error.png"),
+    ("bench", ["json=mine.json"], "mine.json"),
+    ("scaling", ["json=mine.json"], "mine.json"),
+    ("curves", ["runs=[run]", "out=mine"], "mine.png"),
+    ("error_vs_time", ["data=data", "out=mine"], "mine_frames.png"),
+    ("error_vs_time", ["data=data", "out=mine"], "mine.json"),
+    ("stability_network", ["picture=mine.png"], "mine.png"),
+    ("stability_solver", ["json=mine.json"], "mine.json"),
+    ("train", ["run=mine"], "mine/config.yaml"),
+]
+
+
+@pytest.mark.parametrize(("command", "arguments", "name"), FOREIGN)
+def test_files_of_other_programs_stay(place, command, arguments, name, capsys, monkeypatch):
+    """No output replaces a file that HGN did not write; it is named before the work."""
+    place.path(name).parent.mkdir(exist_ok=True)
+    place.path(name).write_text("work of years, with hgn in it")
+    monkeypatch.setattr(Simulator, "load", lambda *_: pytest.fail("the simulation began"))
+    before = content(place.folder)
+    code, line = refused(command, place.train(*arguments) if command == "train" else arguments, capsys, monkeypatch)
+    assert code == EXIT_INPUT and "that HGN wrote, got" in line, line
+    assert name in line or name.endswith(".npy")
+    assert content(place.folder) == before
+
+
+def test_pictures_refused_before_a_bar(place, capsys, monkeypatch):
+    """An animation that viewers would not play is refused before its drawing begins."""
+    assert exit_code(rollout.main, "rollout", [*ROLLOUT, "out=r.vtkhdf"], monkeypatch) == 0
+    _, line = refused("render", ["rollout=r.vtkhdf", "out=r.gif", "every=1"], capsys, monkeypatch)
+    assert "take every >= 2" in line and "drawing" not in capsys.readouterr().err
+
+
+def test_own_files_are_replaced(place, monkeypatch):
+    """A command that is run twice replaces the files of its first run, whatever their kind."""
+    exported = ["export", [f"{OF_THE_RUN}", "out=made/w.safetensors", "arrays=made/a", "scene=scene.yaml"]]
+    rollouts = [
+        ["rollout", [*ROLLOUT[:2], f"out=made/r.{end}", "frames=3"]] for end in ("vtkhdf", "ply", "usdc", "usda")
+    ]
+    of_it = "rollout=made/r.vtkhdf"
+    drawn = [["render", [of_it, f"out=made/r.{end}", "every=2"]] for end in ("png", "gif", "webp")]
+    others = [["evaluate", EVALUATE], ["play", [of_it, "html=made/r.html"]], ["curves", ["runs=[run]", "out=made/c"]]]
+    for command, arguments in [exported, *rollouts, *drawn, *others] * 2:
+        assert exit_code(COMMANDS[command], command, arguments, monkeypatch) == 0, (command, arguments)
