@@ -19,7 +19,7 @@ LINES = {  # of Python, in tracked files
     "hgn": 29_272,
     "datagen": 8_531,
     "tools": 7_212,
-    "tests": 28_912,
+    "tests": 28_960,
 }
 SETTINGS = 239  # fields of the dataclasses behind the commands, *Config
 
