@@ -139,7 +139,8 @@ def test_the_report(compare, tmp_path, monkeypatch, capsys):
     assert {row["other"].split(",")[0] for row in report["paired"]} == {"GNS M = 3", "MPM 32³", "MPM 64³"}
     printed = capsys.readouterr().out
     names = ("HGN L = 3, M = 2", "GNS M = 3, torch fp32", "MPM 32³, step 1", "chaos floor", "95% interval")
-    assert all(name in printed for name in names)
+    assert all(word in printed for name in names for word in name.split())
+    assert max(map(len, printed.splitlines())) <= 100
 
 
 def test_labels_of_the_figures_lie_side_by_side(monkeypatch):
