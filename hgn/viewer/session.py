@@ -76,7 +76,6 @@ class PlaySession:
         self.random = np.random.default_rng(scene.seed)
         self.spout: Spout | None = None
         self._owed = 0.0  # fraction of a particle that the spout has not given yet
-        self._before: list[tuple[int, tuple[PlacedObstacle, ...], Vector]] = []  # frame, obstacles, gravity: for undo
         self._bodies: WeakSet[Body] = WeakSet()  # bodies that viewers have added
         initial = InitialState.of_scene(replace(scene, obstacles=()))
         require(not scene.moves, "obstacles", "at rest for a network", "keyframes", "leave keyframes out")
@@ -94,6 +93,7 @@ class PlaySession:
 
     def _record_first(self) -> None:
         state = self.live.state
+        self._before: list[tuple[int, tuple[PlacedObstacle, ...], Vector]] = []  # frame, obstacles, gravity: for undo
         self.recording = Recording(self.keep_bytes)
         self.recording.enter(self._begin.material_N, state.velocity_NM3.cpu().numpy())
         self._record(state.position_N3.cpu().numpy())

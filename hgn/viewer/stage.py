@@ -19,6 +19,7 @@ from hgn.scene.scene import Obstacle
 from hgn.schema import Vector
 
 DIAMETER_IN_SPACINGS = 1.2  # the points overlap a little, so that they look like a body
+GOLDEN_RATIO = 0.618034  # multiples of it are spread evenly
 ROOM_COLOR = (236, 238, 242)
 Quaternion = tuple[float, float, float, float]
 
@@ -45,7 +46,7 @@ class StageView:
 
         In float16 positions have steps of 2^-12 of the domain. With two dimensions the camera faces the middle plane.
         """
-        self.scene, self.domain_size = server.scene, domain_size
+        self.server, self.scene, self.domain_size = server, server.scene, domain_size
         self.scene.set_up_direction("+y")
         self.middle_3 = 0.5 * np.array(domain_size)
         low_3, high_3 = np.zeros(3), np.array(domain_size)
@@ -81,10 +82,14 @@ class StageView:
         """Shows the particles of a frame in domain units. Omits those that are not finite."""
         there_N = np.isfinite(position_N3).all(axis=1)
         local_N3 = (position_N3 - self.middle_3).astype(np.float32)
+        # neighbours differ a little, so that a body has depth
+        shade_N1 = 0.7 + 0.3 * np.modf(np.arange(len(position_N3)) * GOLDEN_RATIO)[0][:, None]
         for index, cloud in enumerate(self.clouds):
             mine_N = there_N & (material_N == index)
             if mine_N.any() or len(cloud.points):
-                cloud.points = local_N3[mine_N]
+                with self.server.atomic():
+                    cloud.points = local_N3[mine_N]
+                    cloud.colors = to_bytes(PARTICLE_COLORS[index] * shade_N1[mine_N])
 
     def add_obstacle(self, name: str, mesh: Obstacle, position: Vector, rotation: Quaternion) -> viser.MeshHandle:
         """Adds a mesh, given about its own origin, at a place."""
