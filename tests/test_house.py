@@ -16,10 +16,10 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 29_340,
+    "hgn": 29_345,
     "datagen": 8_531,
-    "tools": 7_212,
-    "tests": 29_336,
+    "tools": 7_198,
+    "tests": 28_700,
 }
 SETTINGS = 239  # fields of the dataclasses behind the commands, *Config
 

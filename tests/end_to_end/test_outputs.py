@@ -59,7 +59,7 @@ FOREIGN = [
     ("curves", ["runs=[run]", "out=mine"], "mine.png"),
     ("error_vs_time", ["data=data", "out=mine"], "mine_frames.png"),
     ("error_vs_time", ["data=data", "out=mine"], "mine.json"),
-    ("stability_network", ["picture=mine.png"], "mine.png"),
+    ("stability_network", ["json=mine.json"], "mine.json"),
     ("stability_solver", ["json=mine.json"], "mine.json"),
     ("train", ["run=mine"], "mine/config.yaml"),
 ]
