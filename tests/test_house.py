@@ -16,7 +16,7 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 29_345,
+    "hgn": 29_309,
     "datagen": 8_531,
     "tools": 7_198,
     "tests": 28_700,
