@@ -32,56 +32,50 @@ class _Handler(http.server.BaseHTTPRequestHandler):
     def log_message(self, *_):
         pass
 
-    def do_HEAD(self):
-        self._answer(with_body=False)
-
     def do_GET(self):
-        self._answer(with_body=True)
-
-    def _answer(self, with_body):
         path = unquote(self.path.partition("?")[0])
         self.server.asked.append(path)
+        status, data, headers = self._answer(path)
+        self.send_response(status)
+        for name, value in headers.items():
+            self.send_header(name, value)
+        self.send_header("Content-Length", str(len(data)))
+        self.end_headers()
+        if self.command == "GET":
+            self.wfile.write(data)
+
+    do_HEAD = do_GET
+
+    def _answer(self, path):
+        """Status, body and headers."""
         if self.server.failures:
             self.server.failures -= 1
-            return self._send(503, b"busy", with_body)
+            return 503, b"busy", {}
         listing = re.fullmatch(r"/api/(models|datasets)/([^/]+/[^/]+)(?:/(revision|tree)/([^/]+))?", path)
         if listing:
             root = self.server.folder / listing[1] / listing[2]
             if not root.is_dir():
-                return self._send(404, b"{}", with_body, {"X-Error-Code": "RepoNotFound"})
+                return 404, b"{}", {"X-Error-Code": "RepoNotFound"}
             names = sorted(str(file.relative_to(root)) for file in root.rglob("*") if file.is_file())
-            if listing[3] == "tree":
-                tree = [{"type": "file", "path": n, "size": (root / n).stat().st_size, "oid": COMMIT} for n in names]
-                return self._send(200, json.dumps(tree).encode(), with_body)
+            tree = [{"type": "file", "path": n, "size": (root / n).stat().st_size, "oid": COMMIT} for n in names]
             about = {"id": listing[2], "sha": COMMIT, "siblings": [{"rfilename": name} for name in names]}
-            return self._send(200, json.dumps(about).encode(), with_body)
+            return 200, json.dumps(tree if listing[3] == "tree" else about).encode(), {}
         match = re.fullmatch(r"/(datasets/)?([^/]+/[^/]+)/resolve/([^/]+)/(.+)", path)
         if match is None:
-            return self._send(404, b"", with_body)
-        kind = "datasets" if match[1] else "models"
+            return 404, b"", {}
         if "private" in match[2] and self.headers.get("Authorization") != f"Bearer {TOKEN}":
-            return self._send(401, b"", with_body, {"X-Error-Code": "RepoNotFound"})
-        file = self.server.folder / kind / match[2] / match[4]
+            return 401, b"", {"X-Error-Code": "RepoNotFound"}
+        file = self.server.folder / (match[1] or "models") / match[2] / match[4]
         if not file.is_file():
-            return self._send(404, b"", with_body, {"X-Error-Code": "EntryNotFound"})
+            return 404, b"", {"X-Error-Code": "EntryNotFound"}
         data = file.read_bytes()
-        digest = hashlib.sha256(data).hexdigest()
-        headers = {"ETag": f'"{digest}"', "X-Repo-Commit": COMMIT, "Accept-Ranges": "bytes"}
+        tag = hashlib.sha256(data).hexdigest()
+        headers = {"ETag": f'"{tag}"', "X-Repo-Commit": COMMIT, "Accept-Ranges": "bytes"}
         asked = re.fullmatch(r"bytes=(\d+)-(\d*)", self.headers.get("Range", ""))
         if asked is None:
-            return self._send(200, data, with_body, headers)
+            return 200, data, headers
         start, stop = int(asked[1]), min(int(asked[2] or len(data)) + 1, len(data))
-        headers["Content-Range"] = f"bytes {start}-{stop - 1}/{len(data)}"
-        return self._send(206, data[start:stop], with_body, headers)
-
-    def _send(self, status, data, with_body, headers=None):
-        self.send_response(status)
-        for name, value in (headers or {}).items():
-            self.send_header(name, value)
-        self.send_header("Content-Length", str(len(data)))
-        self.end_headers()
-        if with_body:
-            self.wfile.write(data)
+        return 206, data[start:stop], headers | {"Content-Range": f"bytes {start}-{stop - 1}/{len(data)}"}
 
 
 @contextmanager

@@ -29,6 +29,10 @@ class Quiet:
         pass
 
 
+class PlainFiles(Quiet, http.server.SimpleHTTPRequestHandler):
+    """Knows no ranges."""
+
+
 @contextlib.contextmanager
 def answering(handler):
     """The URL of a server of its own."""
@@ -85,13 +89,32 @@ def test_proxy_that_remembers():
         assert open_storage(url).read("index", 5, 9) == b"5678"
 
 
+def test_proxies_are_honoured(monkeypatch):
+    """http_proxy serves data of other machines, but not of this one or of hosts in no_proxy."""
+    asked = []
+
+    class Proxy(Quiet, http.server.BaseHTTPRequestHandler):
+        def do_GET(self):
+            asked.append(self.path)
+            self.send_response(200)
+            self.send_header("Content-Length", "5")
+            self.end_headers()
+            self.wfile.write(b"hello")
+
+    with answering(Proxy) as address:
+        for name in ("http_proxy", "HTTP_PROXY"):
+            monkeypatch.setenv(name, address)
+        monkeypatch.setenv("no_proxy", "excepted.example")
+        hgn.data.storage._remote.cache_clear()
+        for url in ("http://data.example:9", address):
+            assert open_storage(f"{url}/set").read("manifest.json", 0, 5) == b"hello"
+    assert asked == ["http://data.example:9/set/manifest.json", "/set/manifest.json"]
+
+
 def test_server_without_ranges(folder, monkeypatch):
     """A plain file server that knows no ranges will do."""
     monkeypatch.setattr(hgn.data.storage, "_CHUNK_BYTES", 4000)
 
-    class Plain(Quiet, http.server.SimpleHTTPRequestHandler):
-        pass
-
-    with answering(functools.partial(Plain, directory=str(folder))) as url:
+    with answering(functools.partial(PlainFiles, directory=str(folder))) as url:
         pairs = list(zip(EpisodeStore(url, "train"), EpisodeStore(folder, "train"), strict=True))
         assert len(pairs) == 5 and all(np.array_equal(a.position_TN3, b.position_TN3) for a, b in pairs)

@@ -99,6 +99,15 @@ def at_the_side(folder):
 WALK = np.zeros((9, 2, 3))
 
 
+def text(content):
+    """Other metadata."""
+    return lambda folder: (folder / "metadata.json").write_text(content)
+
+
+def other_objects(content):
+    return lambda folder: np.savez(folder / "train.npz", arr_0=np.array(content))
+
+
 def pickled(content):
     return lambda folder: pickled_npz(folder / "train.npz", content(folder))
 
@@ -118,7 +127,9 @@ def pickled(content):
         ("deepmind", meta(dim=2.5), r"metadata.json: dim must be 2 or 3, got 2.5"),
         ("deepmind", meta(bounds=[[0, 1], [0, 1], [0, float("inf")]]), r"bounds must be finite numbers in pairs"),
         ("deepmind", meta(default_connectivity_radius=1e-12), r"radius must be 6.1e-05 or more, the box being 1 wide"),
-        ("deepmind", lambda folder: (folder / "metadata.json").write_text("[" * 9**6), r"metadata.json must be JSON"),
+        *(("deepmind", text(one), r"metadata.json must be JSON") for one in ("[" * 9**6, '{"a": 010}', '{"a": 1:30}')),
+        ("plain", text('{"a": 1,\n "b": [[0]],\n "a": 5}'), "line 3: the key a is given twice, first in line 1"),
+        ("plain", text('{"a": 3,\n\t"b": {\n\t"c": 1,\n\t"c": 2}}'), "line 4: the key c .* first in line 3"),
         ("lagrangebench", meta(periodic_boundary_conditions="no"), r"conditions must be finite numbers in a list"),
         ("lagrangebench", meta(write_every=0), r"metadata.json: write_every must be > 0, got 0.0"),
         ("lagrangebench", hdf5("train.h5", "00000/particle_type", lambda a: 0 * a - 1), r"position must be of part"),
@@ -143,6 +154,10 @@ def pickled(content):
         ("geoelements", pickled(lambda _: (WALK, 5, [[1.0], [1.0, 2.0]])), r"material_property must be an array, got"),
         ("geoelements", pickled(lambda _: (np.zeros((9, 2, 3)), [5, 6, 5])), r"\[0\]: particle_type must be one"),
         ("geoelements", pickled(lambda _: (np.zeros((9, 2, 2)), 5)), r"position must have shape \[any, any, 3\], got"),
+        ("plain", other_objects({"a": (WALK, [5, 5]), "b": 3}), r"train\.npz: arr_0.* must "),
+        ("plain", other_objects([{"position": WALK}]), r"train\.npz: arr_0.* must "),
+        ("plain", other_objects({"a": {"particle_type": [5], "material_property": 1}}), r"train\.npz: arr_0.* must "),
+        ("plain", other_objects(None), r"train\.npz: arr_0.* must "),
         ("lagrangebench", cut("train.h5", 2000), r"train.h5 must be a whole HDF5 file"),
         ("lagrangebench", hdf5("train.h5", "00001/position"), r"train.h5: 00001: position is missing"),
         ("lagrangebench", hdf5("train.h5", "00000/particle_type"), r"train.h5: 00000: particle_type must be there"),

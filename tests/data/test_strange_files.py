@@ -14,7 +14,7 @@ TESTS = Path(__file__).parents[1]
 assert strange_data  # which adds its files to CASES
 READ = {  # files that hold what they claim
     "mesh: primitives", "mesh: instances", "mesh: targets", "mesh: obj of polygons", "mesh: obj of one polygon",
-    "mesh: obj of groups", "mesh: obj of materials", "rollout: attributes", "tar: links", "scene: sheet of 9000",
+    "mesh: obj of groups", "rollout: attributes", "tar: links", "scene: sheet of 9000",
     "scene: larger obstacle", "scene: keyframes",
 }  # fmt: skip
 

@@ -1,11 +1,9 @@
 """Storage that lies, drips or fails: caches, servers, passwords, and errors of the machine."""
 
-import asyncio
 import contextlib
 import errno
 import functools
 import hashlib
-import http.server
 import os
 import time
 from dataclasses import replace
@@ -13,12 +11,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from data.test_http import Quiet, answering
-from processes import exit_code
+from data.test_http import PlainFiles, answering
 from training.runs import train_mapping
 
-from datagen.service.server import make_app
-from datagen.service.supervisor import PoolState
 from hgn import train
 from hgn.data import shard_cache
 from hgn.data.index import ListedIndex
@@ -74,7 +69,7 @@ def test_a_server_that_drips_does_not_answer(data, monkeypatch, dripping):
     monkeypatch.setenv(VARIABLE, "0")
     whole = EpisodeStore(data.dataset.folder, "train")
 
-    class Drip(Quiet, http.server.SimpleHTTPRequestHandler):
+    class Drip(PlainFiles):
         def copyfile(self, source, outputfile):
             content = source.read()
             if self.path.endswith(dripping):
@@ -123,42 +118,13 @@ def test_passwords_and_control_characters(text, shown):
 def test_no_file_of_a_run_has_the_password(data, tmp_path, capsys):
     """A training from a URL with a password writes and prints the URL without it."""
     run = tmp_path / "run"
-    with answering(functools.partial(Files, directory=data.dataset.folder)) as url:
+    with answering(functools.partial(PlainFiles, directory=data.dataset.folder)) as url:
         mapping = train_mapping(data, run, monitor_every=100)
         mapping["dataset"]["folder"] = url.replace("://", "://user:secret-word@")
         assert train.main(mapping) == 0
     shown = capsys.readouterr()
     assert "secret-word" not in shown.out + shown.err
     assert not [path for path in run.rglob("*") if path.is_file() and b"secret-word" in path.read_bytes()]
-
-
-class Files(Quiet, http.server.SimpleHTTPRequestHandler):
-    pass
-
-
-@pytest.mark.parametrize(
-    ("error", "code", "message"),
-    [
-        (OSError(errno.EIO, "Input/output error", "/data/a.tar"), 1, "/data/a.tar; check the disk"),
-        (OSError(errno.EMFILE, "Too many open files"), 1, "raise the limit of open files"),
-        (OSError(errno.ENFILE, "Too many open files in system"), 1, "close other programs"),
-        (OSError(errno.ESTALE, "Stale file handle"), 1, "Stale file handle; check the disk"),
-        (OSError("no number"), 1, "no number; check the disk"),
-        (OSError(errno.EIO, "Input/output error", "/data/\x1b[2Ja.tar"), 1, r"/data/\x1b[2Ja.tar; check"),
-        (ConfigError("name must be a\u202eb"), 2, r"a\u202eb"),
-        (MemoryError("Unable to allocate 5 TiB"), 1, "memory is full (Unable to allocate 5 TiB)"),
-        (ConfigError("http://user:secret@host must be"), 2, "http://host must be"),
-    ],
-)
-def test_errors_of_the_machine_are_one_line(error, code, message, monkeypatch, capsys):
-    """Whatever a system call answers, a command prints what failed and what to do."""
-
-    def command(_):
-        raise error
-
-    assert exit_code(command, "card", ["weights=x", "out=y"], monkeypatch) == code
-    said = capsys.readouterr().err
-    assert said.startswith("error: ") and message in said and said.count("\n") == 1
 
 
 @pytest.mark.parametrize("text", ["-1", "x", "nan", "1e9", "10000000", ""])
@@ -212,40 +178,6 @@ def test_a_deleted_lock_file_locks(tmp_path):
             pass
     with locked(path, "run", "no;"):
         pass
-
-
-@pytest.mark.parametrize(
-    ("host", "token", "status"),
-    [
-        (b"127.0.0.1:80", None, 200),
-        (b"localhost", None, 200),
-        (b"[::1]:8000", None, 200),
-        (b"evil.example", None, 421),
-        (b"127.0.0.1.evil.example:80", None, 421),
-        (b"localhost@evil.example", None, 421),
-        (b"10.0.0.1", None, 421),
-        (b"", None, 421),
-        (b"data.example", "correct-horse-battery", 200),
-    ],
-)
-def test_a_page_elsewhere_cannot_ask(folder, host, token, status):
-    """Without a token only requests that name this machine are answered: a browser's page may have given it a name."""
-    headers = [(b"host", host)] + ([] if token is None else [(b"authorization", f"Bearer {token}".encode())])
-    scope = {
-        "type": "http", "method": "GET", "path": "/manifest.json", "raw_path": b"/manifest.json", "query_string": b"",
-        "headers": headers, "server": ("127.0.0.1", 80), "client": ("127.0.0.1", 1), "http_version": "1.1",
-        "scheme": "http", "root_path": "",
-    }  # fmt: skip
-    sent: list[dict[str, object]] = []
-
-    async def send(message):
-        sent.append(message)
-
-    async def receive():
-        return {"type": "http.request", "body": b""}
-
-    asyncio.run(make_app(folder, token, PoolState)(scope, receive, send))
-    assert sent[0]["status"] == status
 
 
 def test_interleaved_members_of_an_archive(tmp_path):

@@ -40,6 +40,10 @@ class SceneFailure:
     cause: str
 
 
+def be_killed():
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
 def control(name):
     return Path(os.environ[FOLDER_VARIABLE]) / name
 
@@ -67,7 +71,7 @@ def build_obstacle_grid(obstacles, cell_size, seed, domain_size):
     kill = control(f"kill-grid-{seed}")
     if kill.exists():
         kill.unlink()
-        os.kill(os.getpid(), signal.SIGKILL)
+        be_killed()
     return ObstacleGrid(cell_size, np.zeros((0, 3), np.int32), np.zeros((0, 3), np.float32))
 
 
@@ -109,7 +113,7 @@ def simulate(scenes, config, frames, frame_rate_hz, on_frame=None, cpu_threads=N
                 kill.unlink()
             else:
                 kill.write_text(str(lives - 1))
-            os.kill(os.getpid(), signal.SIGKILL)
+            be_killed()
         if control(f"fail-{scene.seed}").exists():
             results.append(SceneFailure("diverged in frame 3"))
             continue

@@ -2,22 +2,48 @@
 
 import multiprocessing
 import os
+import signal
+import socket
 import sys
 import threading
 
+import ballistic_solver
 import pytest
 
 from datagen.pool import local_workers
 
 
+class KilledError(BaseException):
+    """Ends a worker's thread like SIGKILL."""
+
+
+def be_killed():
+    raise KilledError
+
+
 class ThreadProcess:
-    """A thread in place of a worker's process. It ends when the pool closes the connection."""
+    """A thread in place of a worker's process. It ends when the pool closes the connection, or is killed by itself."""
 
     exitcode = None
 
-    def __init__(self, work):
-        self._thread = threading.Thread(target=work, daemon=True)
+    def __init__(self, connection, target, *arguments):
+        self._call = connection, target, arguments
+        self._thread = threading.Thread(target=self._work, daemon=True)
         self._thread.start()
+
+    def _work(self):
+        connection, target, arguments = self._call
+        send = local_workers._Sender(connection)
+        try:
+            with local_workers._errors_sent(send):
+                target(connection, send, *arguments)
+            connection.close()
+        except KilledError:
+            self.exitcode = -signal.SIGKILL
+            with socket.socket(fileno=os.dup(connection.fileno())) as end:
+                end.shutdown(socket.SHUT_RDWR)  # also for the worker's other threads, which may be reading
+        except SystemExit:
+            connection.close()  # its pool has gone
 
     def join(self, timeout=None):
         self._thread.join(timeout)
@@ -28,14 +54,7 @@ class ThreadProcess:
 
 def start_thread(run, target, *arguments):
     here, there = multiprocessing.Pipe()
-
-    def work():
-        send = local_workers._Sender(there)
-        with local_workers._errors_sent(send):
-            target(there, send, *arguments)
-        there.close()
-
-    return ThreadProcess(work), here
+    return ThreadProcess(there, target, *arguments), here
 
 
 class ThreadWorker(local_workers.LocalWorker):
@@ -46,7 +65,8 @@ class ThreadWorker(local_workers.LocalWorker):
 
 @pytest.fixture
 def threads(monkeypatch):
-    """Workers of the pool are threads. None may be killed, or kill itself."""
+    """Workers of the pool are threads, also those that the stand-in for the solver kills."""
     monkeypatch.setattr(local_workers, "start_child", start_thread)
     monkeypatch.setattr(local_workers, "LocalWorker", ThreadWorker)
+    monkeypatch.setattr(ballistic_solver, "be_killed", be_killed)
     monkeypatch.setattr(os, "_exit", sys.exit)  # of a worker whose pool has gone: its thread ends

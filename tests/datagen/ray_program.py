@@ -12,8 +12,8 @@ from pathlib import Path
 
 from ballistic_dataset import make_dataset
 from ballistic_solver import BALLISTIC
-from kills import differences
 from ray.cluster_utils import Cluster
+from written_files import differences
 
 from datagen.generate import generate
 from datagen.pool.progress import Progress

@@ -13,7 +13,6 @@ import pytest
 import yaml
 from docs.pages import run_module
 from processes import PATIENCE_S, exit_code, processes_of_session, start_module, wait_until
-from written_files import simulated_once
 
 from datagen.__main__ import main
 from datagen.pool.progress import BarProgress
@@ -23,17 +22,6 @@ from hgn.data.manifest import Manifest
 from hgn.schema import ConfigError, to_mapping
 
 SMALL = ["scenes=3", "dataset.validation_scenes=1", "dataset.test_scenes=0", "dataset.frames=5", "dataset.workers=1"]
-
-
-def start(*arguments, **options):
-    streams = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-    return start_module("ballistic_command", *arguments, **streams, **options)
-
-
-def run(*arguments, **options):
-    process = start(*arguments, **options)
-    output, errors = process.communicate(timeout=PATIENCE_S)
-    return process.returncode, output, errors
 
 
 def test_no_key_is_taken_for_a_config_group():
@@ -50,8 +38,16 @@ def test_no_key_is_taken_for_a_config_group():
     ("error", "code", "message"),
     [
         (ConfigError("frames must be 2"), 2, "error: frames must be 2\n"),
+        (ConfigError("http://user:secret@host must be"), 2, "error: http://host must be\n"),
         (OSError(errno.ENOSPC, "No space left on device", "b/a.tar"), 1, "error: No space left on device: b/a.tar;"),
         (PermissionError(errno.EACCES, "Permission denied", "made"), 1, "error: Permission denied: made; check the"),
+        (OSError(errno.EMFILE, "Too many open files"), 1, "error: Too many open files; raise the limit of open files"),
+        (OSError(errno.ENFILE, "Too many here"), 1, "error: Too many here; close other programs"),
+        (OSError(errno.ESTALE, "Stale file handle"), 1, "error: Stale file handle; check the disk"),
+        (OSError(errno.EIO, "I/O error", "/b/\x1b[2Ja.tar"), 1, r"error: I/O error: /b/\x1b[2Ja.tar; check the disk"),
+        (ConfigError("name must be a\u202eb"), 2, r"error: name must be a\u202eb"),
+        (OSError("no number"), 1, "error: no number; check the disk"),
+        (MemoryError("Unable to allocate 5 TiB"), 1, "error: memory is full (Unable to allocate 5 TiB)"),
         (KeyboardInterrupt(), 130, "error: interrupted\n"),
         (FileNotFoundError(errno.ENOENT, "No such file", "x"), None, None),
     ],
@@ -69,7 +65,8 @@ def test_faults_end_in_one_line(error, code, message, monkeypatch, capsys):
             run_command(fail, "datagen")
     else:
         assert exit_code(fail, "datagen", [], monkeypatch) == code
-        assert capsys.readouterr().err.startswith(message)
+        printed = capsys.readouterr().err
+        assert printed.startswith(message) and printed.count("\n") == 1
 
 
 def test_help_and_config_print(tmp_path, monkeypatch, capfd):
@@ -139,11 +136,11 @@ def test_json_progress(command):
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="looks for orphans in /proc")
-def test_stopping_leaves_a_resumable_folder(backend, control, tmp_path):
+def test_stopping_leaves_a_resumable_folder(control, command, tmp_path):
     """Ctrl-C keeps every staged episode and leaves no process; the same command resumes. `kill -9` is what test_kills
     is about."""
     (control / "slow").touch()
-    process = start(*SMALL, "out=made", cwd=tmp_path)
+    process = start_module("ballistic_command", *SMALL, "out=made", cwd=tmp_path, stderr=subprocess.PIPE, text=True)
     manifest = tmp_path / "made" / "manifest.json"
     wait_until(lambda: manifest.exists() and Manifest.load(manifest.parent).revision >= 1)
     os.killpg(process.pid, signal.SIGINT)  # a terminal signals the whole group
@@ -153,26 +150,10 @@ def test_stopping_leaves_a_resumable_folder(backend, control, tmp_path):
     assert "episodes are kept in made: run the same command to resume" in errors and "Traceback" not in errors
     assert not list((tmp_path / "made").rglob("*.partial"))
     (control / "slow").unlink()
-    code, _, errors = run(*SMALL, "out=made", cwd=tmp_path)
+    code, _, errors = command(*SMALL, "out=made")
     assert code == 0 and Manifest.load(tmp_path / "made").complete, errors
     seeds = (control / "simulated.log").read_text().split()
     assert len(set(seeds)) == 4 and len(seeds) <= 5  # at most the one in flight twice
-
-
-def test_two_generators_at_once(backend, control, tmp_path, make_config, make_dataset):
-    """The same command twice on one folder, at once: each scene is simulated and each shard published once, both end
-    with the whole data set, and it is bitwise the one that a single generator makes."""
-    whole = make_dataset(make_config(training_scenes=4, validation_scenes=2, test_scenes=0, frames=5))
-    (control / "simulated.log").unlink()
-    (control / "slow").touch()
-    arguments = (*SMALL, "out=shared", "scenes=4", "dataset.validation_scenes=2")
-    processes = [start(*arguments, cwd=tmp_path) for _ in range(2)]
-    for process in processes:
-        _, errors = process.communicate(timeout=PATIENCE_S)
-        assert process.returncode == 0 and "shared is complete: 4 train, 2 validation, 0 test episodes" in errors
-    assert simulated_once(control) == 6
-    made = {shard.name: shard.sha256 for shard in Manifest.load(tmp_path / "shared").shards}
-    assert made == {shard.name: shard.sha256 for shard in Manifest.load(whole).shards}
 
 
 class Terminal(io.StringIO):

@@ -58,6 +58,7 @@ async def request(app, path, method="GET", **headers):
         "raw_path": path.encode(),
         "query_string": query.encode(),
         "root_path": "",
+        "server": ("127.0.0.1", 80),
         "headers": [(name.replace("_", "-").encode(), value.encode()) for name, value in headers.items()],
     }
     await app(scope, receive, send)
@@ -175,6 +176,15 @@ def test_refusals(ask, folder):
         assert status == expected, (path, method, given)
         if status == 401:
             assert answer["www-authenticate"] == "Bearer" and TOKEN.encode() not in body
+
+
+def test_a_page_elsewhere_cannot_ask(ask):
+    """Without a token only requests that name this machine are answered: a browser's page may have given it a name."""
+    own = [(host, None, 200) for host in ("127.0.0.1:80", "localhost", "[::1]:8000")]
+    others = ("evil.example", "127.0.0.1.evil.example:80", "localhost@evil.example", "10.0.0.1", "")
+    for host, token, status in (*own, *((host, None, 421) for host in others), ("data.example", TOKEN, 200)):
+        given = {} if token is None else {"authorization": f"Bearer {token}"}
+        assert ask("/manifest.json", token=token, host=host, **given)[0] == status, host
 
 
 def test_damage_is_not_served(ask, folder):

@@ -3,9 +3,12 @@ and a progress that remembers."""
 
 import hashlib
 import json
+from pathlib import Path
 
+from datagen.pool.locks import LOCK_NAME
 from datagen.pool.progress import Progress
-from hgn.data.manifest import Manifest
+from hgn.data.index import INDEX_NAME
+from hgn.data.manifest import MANIFEST_NAME, Manifest
 from hgn.schema import to_mapping
 
 
@@ -19,6 +22,19 @@ def snapshot(folder):
         for path in sorted(folder.rglob("*"))
         if path.is_file() and path.name != ".lock"
     }
+
+
+def differences(one, other):
+    """The names of files that one complete data set has and the other has not, or not the same; indexes may differ."""
+    contents = [
+        {path.name: path.read_bytes() for path in folder.rglob("*") if path.is_file()} for folder in (one, other)
+    ]
+    own = {MANIFEST_NAME, INDEX_NAME, LOCK_NAME}
+    for manifest in (Manifest.load(one), Manifest.load(other)):
+        assert manifest.complete and not manifest.quarantined
+        own |= {Path(name).name for name, _ in manifest.shards.files()}
+    names = contents[0].keys() | contents[1].keys()
+    return sorted(name for name in names - own if contents[0].get(name) != contents[1].get(name))
 
 
 def first_release(folder):

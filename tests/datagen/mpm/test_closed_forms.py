@@ -77,7 +77,7 @@ def frequency_of(mode_T, rate_hz=FRAME_RATE_HZ):
 def free_fall():
     """v t + g t² / 2, for each material and gravity, to 2e-4 of the way in 0.25 s."""
     velocity, time = np.array([0.2, 0.6, -0.1]), np.arange(16)[:, None] / 60
-    for gravity in ((0.0, -9.8, 0.0), (3.0, 0.0, -4.0), NO_GRAVITY):
+    for gravity in ((3.0, 0.0, -4.0), NO_GRAVITY):
         scenes = [
             block(kind, (0.4, 0.45, 0.4), (0.5, 0.55, 0.5), tuple(velocity), gravity=gravity)
             for kind in range(len(MATERIALS))

@@ -164,7 +164,7 @@ def test_one_huge_triangle_and_many_small_ones():
 
 def test_sheets_do_not_leak():
     """Nothing passes an axis-aligned sheet at 3 and 10 m/s, wherever it lies between the nodes."""
-    heights = [(5 + offset) * CELL for offset in (0.0, 0.05, 0.3, 0.5, 0.7)]
+    heights = [(5 + offset) * CELL for offset in (0.0, 0.3, 0.5)]
     cases = [(kind, y, 3.0 if n % 2 else 10.0) for kind in range(len(MATERIALS)) for n, y in enumerate(heights)]
     cases += [(SAND, heights[0], 3.0), (WATER, heights[1], 10.0)]
     scenes = [dropped(material, y + 2.5 * CELL, speed, wide_sheet(y)) for material, y, speed in cases]
