@@ -16,6 +16,7 @@ ROOT = Path(__file__).resolve().parents[2]
 FOLDERS = ("conf", "datagen", "docs", "hgn", "jobs", "results", "tests", "tools")
 # what makes a program of a page short
 FEWER = {"frames=300": "frames=2", "frame == 300": "frame == 1", "range(120)": "range(2)", "frame == 60": "frame == 0"}
+FEWER |= {"arange(12)": "arange(4)"}
 _FENCE = re.compile(r"^( *)(`{3,})([^`\n]*)$")
 _FILE_MARK = re.compile(r"<!-- file: (\S+) -->")
 

@@ -7,11 +7,11 @@ import re
 import shlex
 
 import pytest
+from composition import compose
 from docs.pages import ROOT, blocks_of, markdown_files, prose_lines, shell_lines
-from hydra import compose, initialize_config_dir
+from hydra import initialize_config_dir
 
 from hgn import config
-from hgn.hydra_compat import registered_dataclasses
 from hgn.scene.scene_file import EmitterEntry, GroupEntry, ObstacleEntry, SceneFile
 
 COLUMNS = 100
@@ -149,8 +149,8 @@ def test_commands_compose():
         if "--json" in arguments:
             at = arguments.index("--json")
             arguments[at : at + 2] = [f"json={arguments[at + 1]}"]
-        with registered_dataclasses(folder, name), initialize_config_dir(str(folder), version_base="1.3"):
-            compose(name, arguments)
+        with initialize_config_dir(str(folder), version_base="1.3"):
+            compose(folder, name, arguments)
 
 
 def test_readme_is_short():

@@ -105,18 +105,11 @@ def test_serve(here, monkeypatch):
     """A data set served over HTTP with a token, and two trainings that read it."""
     port = free_port()
     address = f"http://127.0.0.1:{port}"
-    variables = {"DATASET": address, "HGN_DATASET_TOKEN": "", "HGN_CACHE": str(here / "cache")}
-    for name, value in variables.items():
+    for name, value in {"DATASET": address, "HGN_DATASET_TOKEN": "", "HGN_CACHE": str(here / "cache")}.items():
         monkeypatch.setenv(name, value)
-    settings = SETTINGS | {
-        "datagen.service": [*SCENES[:-1], "out=data/mine", "host=127.0.0.1", f"port={port}", "progress=json"],
-        "hgn.train": [
-            *SETTINGS["hgn.train"],
-            *ONE_UPDATE,
-            f"dataset.folder=http://127.0.0.1:{port}",
-            "run=runs/served",
-        ],
-    }
+    served = [*SETTINGS["hgn.train"], *ONE_UPDATE, f"dataset.folder={address}", "run=runs/served"]
+    service = [*SCENES[:-1], "out=data/mine", "host=127.0.0.1", f"port={port}", "progress=json"]
+    settings = SETTINGS | {"datagen.service": service, "hgn.train": served}
     proxy = "tests/jobs/test_nginx.py runs nginx with jobs/nginx.conf"
     lines = (TUTORIALS / "serve.md").read_text().splitlines()
     elsewhere = {line: proxy for line in lines if line.startswith(("export SERVER_NAME", "envsubst", "nginx"))}
@@ -159,12 +152,9 @@ def test_how_to(here):
 def test_gradients():
     """Gradients: of velocities and of a turned obstacle; the launch that hits a target is the closed form's; the
     bucket is filled to 90 % of what a tilt by 16 degrees reaches, near the best of the search."""
-    shorter = {
-        "(scene, 21, velocity": "(scene, 4, velocity",
-        "20 / 60": "3 / 60",
-        "1.5e-4": "2e-6",
-    }  # a flight, minutes
-    runner = Runner(SETTINGS, shorter | {"range(-60, 61, 4)": "(-16,)", "(100, 101, 102)": "(100,)"})
+    shorter = {"(scene, 21, velocity": "(scene, 4, velocity", "20 / 60": "3 / 60", "1.5e-4": "2e-6"}  # a flight
+    shorter |= {"range(-60, 61, 4)": "(-16,)", "(100, 101, 102)": "(100,)"}
+    runner = Runner(SETTINGS, shorter)
     runner.run(ROOT / "docs/how_to/gradients.md")
     names = runner.names
     assert bool(names["turn_3"].grad.any()) and bool(names["velocity_N3"].grad.any())

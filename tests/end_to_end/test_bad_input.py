@@ -120,26 +120,16 @@ def of(method, *arguments, **options):
 
 
 MESH = of("edit_scene", "shape: cone, size: 0.3", "mesh: points.obj")
-EVALUATE_STEPS = [*EVALUATE, "rollout_frames=0"]
+STEPS = [*EVALUATE, "rollout_frames=0"]
 CUT_RUN, OF_RUN = of("damage_run", truncate), [OF_THE_RUN, EXPORT[1]]
 RATE, SNOW = of("weights", frame_rate_hz=30.0), of("weights", materials=("snow",))
 RATES = "data frame_rate_hz must be the weights' 30.0, got 60.0; take a data set or weights of the same"
 # command, arguments, fault, message
 FILES = [
-    (
-        "rollout",
-        ROLLOUT,
-        of("edit_scene", "0.8, 0.5]", "0.45, 0.5]"),
-        "particles inside obstacle_0_cone; move or shrink",
-    ),
+    ("rollout", ROLLOUT, of("edit_scene", "0.8, 0.5]", "0.45, 0.5]"), "particles inside obstacle_0_cone; move or shr"),
     ("rollout", ROLLOUT, MESH, "obstacles[0].mesh must"),
     ("evaluate", EVALUATE, of("damage", "validation", truncate), " bytes, got "),
-    (
-        "evaluate",
-        EVALUATE,
-        of("damage", "validation", alter),
-        ": it was altered; delete it and run the generator again",
-    ),
+    ("evaluate", EVALUATE, of("damage", "validation", alter), ": it was altered; delete it and run the generator agai"),
     ("evaluate", EVALUATE, of("damage", "validation", Path.unlink), " is listed in the index but missing; run the gen"),
     ("train", "other", of("damage", "train", truncate), " bytes, got "),
     ("train", "run", CUT_RUN, "checkpoint must be a whole checkpoint file, got"),
@@ -148,18 +138,9 @@ FILES = [
     ("export", EXPORT, of("network", wings=2), "got foreign.ckpt: network.wings is not a known key; "),
     ("export", EXPORT, of("network", width=16), "got foreign.ckpt: checkpoint tensor "),
     *((*call, RATE, RATES) for call in (("rollout", EPISODE), ("evaluate", EVALUATE))),
-    *(
-        (*call, SNOW, "must be one of the network's (snow), got ")
-        for call in (("rollout", EPISODE), ("evaluate", EVALUATE))
-    ),
-    (
-        *("evaluate", EVALUATE_STEPS, of("weights", gravity=(0.0, -1.6, 0.0))),
-        "gravity must be the weights' (0.0, -1.6, 0.0), which a network of absolute",
-    ),
-    (
-        *("evaluate", EVALUATE_STEPS, of("weights", obstacle_cell_size=1 / 32)),
-        "cell_size must be the weights' 0.03125, the size of the cells",
-    ),
+    *((*call, SNOW, "one of the network's (snow), got ") for call in (("rollout", EPISODE), ("evaluate", EVALUATE))),
+    ("evaluate", STEPS, of("weights", gravity=(0.0, -1.6, 0.0)), "gravity must be the weights' (0.0, -1.6, 0.0)"),
+    ("evaluate", STEPS, of("weights", obstacle_cell_size=1 / 32), "cell_size must be the weights' 0.03125, the siz"),
 ]
 
 

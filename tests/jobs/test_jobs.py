@@ -130,10 +130,7 @@ def test_variables_are_refused(slurm, tmp_path, script, variables, message):
 @pytest.mark.parametrize(
     ("variables", "told"),
     [
-        (
-            {"NODES": "3", "GPUS": "4", "RENDEZVOUS": "node0:29500", "EXPERIMENT": "small"},
-            "3 4 3 node0:29500 small small",
-        ),
+        ({"NODES": "3", "GPUS": "4", "RENDEZVOUS": "node0:1", "EXPERIMENT": "small"}, "3 4 3 node0:1 small small"),
         ({"HGN_RUN": "mine", "RESTARTS": "0"}, "1 1 0 localhost:0 mine obstacles"),
     ],
 )

@@ -32,15 +32,9 @@ def start(folder, text, *arguments, **variables):
         text = Path("list.txt")
     other = ("CUDA_VISIBLE_DEVICES", "SCENES", "SHARE")
     kept = {name: value for name, value in os.environ.items() if name not in other}
-    return subprocess.Popen(
-        [str(JOBS / "queue.sh"), str(text), *arguments],
-        cwd=folder,
-        env=kept | {"PATH": f"{folder / 'programs'}:{os.environ['PATH']}"} | variables,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        start_new_session=True,
-    )
+    environment = kept | {"PATH": f"{folder / 'programs'}:{os.environ['PATH']}"} | variables
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True, "start_new_session": True}
+    return subprocess.Popen([str(JOBS / "queue.sh"), str(text), *arguments], cwd=folder, env=environment, **pipes)
 
 
 def run(folder, text, *arguments, **variables):
@@ -63,16 +57,9 @@ def events(output):
 def test_gpus_share_a_list(machine):
     """Each GPU runs one command at a time, which sees that GPU alone; behind a barrier all before it is done."""
     meet = "touch {0}; until [[ -e {1} ]]; do sleep 0.02; done; echo $CUDA_VISIBLE_DEVICES"  # both at once, or never
-    lines = [
-        f"first: {meet.format('a', 'b')}",
-        "# a comment",
-        "",
-        f"  second:   {meet.format('b', 'a')} ",
-        "third: echo words >&2; sleep 0.2; touch third",
-        "wait",
-        "fourth: [[ -e third ]] && echo $CUDA_VISIBLE_DEVICES",
-        "wait",
-    ]
+    lines = [f"first: {meet.format('a', 'b')}", "# a comment", "", f"  second:   {meet.format('b', 'a')} "]
+    lines += ["third: echo words >&2; sleep 0.2; touch third", "wait"]
+    lines += ["fourth: [[ -e third ]] && echo $CUDA_VISIBLE_DEVICES", "wait"]
     done = run(machine, "\n".join(lines))
     assert (done.returncode, done.stderr) == (0, "")
     said = done.stdout.splitlines()
@@ -108,14 +95,8 @@ def test_without_gpus(machine):
 def test_failing_and_going_on(machine):
     """A command that fails stops no other before the barrier, and all behind it. The same call runs what is not done,
     and that alone; a third finds nothing to do."""
-    lines = [
-        "good: echo good >> ran",
-        "bad: echo bad >> ran; [[ -e mended ]]",
-        "other: echo other >> ran",
-        "wait",
-        "behind: echo behind >> ran",
-    ]
-    text = "\n".join(lines)
+    text = "good: echo good >> ran\nbad: echo bad >> ran; [[ -e mended ]]\nother: echo other >> ran\n"
+    text += "wait\nbehind: echo behind >> ran\n"
     done = run(machine, text)
     told = [what for _, name, what in events(done.stdout) if name == "bad"]
     assert done.returncode == 1 and "end, exit code 1" in told
@@ -194,7 +175,9 @@ def test_nothing_is_left_behind(machine):
 
 
 def test_one_queue_a_folder(machine):
-    """A second queue in the same folder is refused while the first works."""
+    """A second queue in the same folder is refused while the first works. Without a list it says how it is called."""
+    done = subprocess.run([str(JOBS / "queue.sh")], capture_output=True, text=True)
+    assert done.returncode == 2 and done.stderr.startswith("usage: jobs/queue.sh LIST [FOLDER]")
     text = "a: touch a; until [[ -e end ]]; do sleep 0.02; done\n"
     first = start(machine, text)
     wait_until((machine / "a").exists)
@@ -227,10 +210,7 @@ LINES = {  # the third of a list, and what is said of it
     [
         *((f"# list\none: touch began\n{line}\n", message) for line, message in LINES.items()),
         ("# nothing\nwait\n", "list.txt must have a line NAME: COMMAND, got none; add one, as in first: echo 1\n"),
-        (
-            Path("none.txt"),
-            "LIST must be a file that can be read, got 'none.txt'; as in jobs/queue.sh jobs/networks.tx",
-        ),
+        (Path("none.txt"), "LIST must be a file that can be read, got 'none.txt'; as in jobs/queue.sh jobs/netw"),
         ("one: touch began\n", GPUS),
     ],
 )
@@ -242,12 +222,6 @@ def test_faulty_lists_are_refused(machine, text, message):
     assert (done.returncode, done.stdout) == (2, "") and done.stderr.startswith(f"error: {message}")
     assert done.stderr.count("\n") == 1 and not (machine / "began").exists()
     assert not list((machine / "runs").rglob("*.log"))
-
-
-def test_usage():
-    """Called without a list, the queue says how it is called."""
-    done = subprocess.run([str(JOBS / "queue.sh")], capture_output=True, text=True)
-    assert done.returncode == 2 and done.stderr.startswith("usage: jobs/queue.sh LIST [FOLDER]")
 
 
 def calls(machine, file, **variables):
@@ -295,7 +269,7 @@ def trained_and_scored(name, configs, data):
     """A line that trains a network on data made before, exports it and scores it."""
     assert list(configs) == ["hgn.train", "hgn.export", "hgn.evaluate"]
     config, export, score = configs.values()
-    precision = "fp16" if config.network.kind == "hgn" else "tf32"
+    precision = "fp16" if config.network.kind == "hgn" else "auto"
     assert config.run == f"runs/{name}" and config.training.precision == precision
     made = data[config.dataset.folder]
     assert config.dataset.training_scenes == made.dataset.training_scenes

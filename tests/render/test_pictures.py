@@ -46,15 +46,9 @@ def falling_blobs(frames=30, reference_frames=None):
 
     box = trimesh.creation.box((0.3, 0.1, 0.2))
     obstacle = Obstacle("box", box.vertices + np.array((0.7, 0.2, 0.3)), box.faces.astype(np.int32), closed=True)
-    return Rollout(
-        position_TN3=motion(0.4)[:frames],
-        material_N=np.repeat(np.arange(3, dtype=np.uint8), len(lattice)),
-        obstacles=(obstacle,),
-        domain_size=(1.0, 1.0, 1.0),
-        frame_rate_hz=60.0,
-        source={"weights": "model.safetensors"},
-        reference_TN3=None if reference_frames is None else motion(0.1)[:reference_frames],
-    )
+    material_N, source = np.repeat(np.arange(3, dtype=np.uint8), len(lattice)), {"weights": "model.safetensors"}
+    truth = {} if reference_frames is None else {"reference_TN3": motion(0.1)[:reference_frames]}
+    return Rollout(motion(0.4)[:frames], material_N, (obstacle,), (1.0, 1.0, 1.0), 60.0, source=source, **truth)
 
 
 def has_hue(picture, material):

@@ -57,9 +57,8 @@ class Glb:
         return path
 
     def roots(self):
-        return [
-            i for i in range(len(self.tree["nodes"])) if not any(i in n.get("children", ()) for n in self.tree["nodes"])
-        ]
+        children = {child for node in self.tree["nodes"] for child in node.get("children", ())}
+        return [i for i in range(len(self.tree["nodes"])) if i not in children]
 
 
 def volume_of(bodies):
@@ -94,12 +93,8 @@ def test_instances(tmp_path):
     file.save(tmp_path / "a.glb", extensionsUsed=["EXT_mesh_gpu_instancing"])
     bodies = load_bodies(tmp_path / "a.glb")
     assert volume_of(bodies) == pytest.approx(8 * (1 + 1 + 2))
-    assert contains(np.array([(7, 1, 1), (-3.5, 1, 11), (1, 1, 5), (-3.5, 1, 1)]), bodies[0]).tolist() == [
-        True,
-        True,
-        False,
-        False,
-    ]
+    points = np.array([(7, 1, 1), (-3.5, 1, 11), (1, 1, 5), (-3.5, 1, 1)])
+    assert contains(points, bodies[0]).tolist() == [True, True, False, False]
 
 
 def test_nodes_in_nodes(tmp_path):
@@ -169,20 +164,13 @@ def test_buffers_elsewhere(tmp_path):
                 load_mesh(path)
 
 
-@pytest.mark.parametrize(
-    "names",
-    [
-        ["KHR_draco_mesh_compression"],
-        ["KHR_materials_unlit", "EXT_meshopt_compression"],
-        ["VENDOR_geometry_of_its_own"],
-    ],
-)
-def test_required_extensions_that_are_not_read(tmp_path, names):
+@pytest.mark.parametrize("name", ["KHR_draco_mesh_compression", "EXT_meshopt_compression", "VENDOR_geometry"])
+def test_required_extensions_that_are_not_read(tmp_path, name):
     """Each is named; those of materials, textures and lights do not matter."""
     file = Glb()
     file.cube()
-    with pytest.raises(ConfigError, match=f"it requires {names[-1]}, which is not read"):
-        load_mesh(file.save(tmp_path / "a.glb", extensionsRequired=names))
+    with pytest.raises(ConfigError, match=f"it requires {name}, which is not read"):
+        load_mesh(file.save(tmp_path / "a.glb", extensionsRequired=["KHR_materials_unlit", name]))
     neutral = ["KHR_materials_unlit", "KHR_texture_basisu", "EXT_texture_webp", "KHR_lights_punctual"]
     assert load_mesh(file.save(tmp_path / "a.glb", extensionsRequired=neutral)).closed
 

@@ -26,12 +26,8 @@ from tools.bench.triton_contenders import TritonFrame, TritonTrain
 from tools.timing import Timed, alternate, statistics
 
 CPU = torch.device("cpu")
-SMALL = {
-    "particles": [60],
-    "seconds": 1e-9,
-    "network": {"width": 16, "levels": 2, "message_passing_steps": 1},
-    "device": "cpu",
-}
+TINY = {"width": 16, "levels": 2, "message_passing_steps": 1}
+SMALL = {"particles": [60], "seconds": 1e-9, "network": TINY, "device": "cpu"}
 
 
 def fake_simulate(fails):

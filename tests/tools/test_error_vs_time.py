@@ -57,6 +57,27 @@ def fake_simulate(scenes, config, frames, frame_rate_hz, on_frame=None, collider
     return results
 
 
+@pytest.fixture
+def simulated(monkeypatch):
+    """The stand-in for the solver: cells a unit, particles of the scenes, steps and frames of its calls."""
+    calls: list[SimpleNamespace] = []
+
+    def noted(scenes, config, frames, *more, stability_fractions, **others):
+        cells, particles = round(1 / scenes[0].cell_size), [scene.particle_count for scene in scenes]
+        steps = sorted(set(stability_fractions))
+        calls.append(SimpleNamespace(cells=cells, particles=particles, steps=steps, frames=frames))
+        return fake_simulate(scenes, config, frames, *more, stability_fractions=stability_fractions, **others)
+
+    monkeypatch.setattr(datagen.mpm.solver, "simulate", noted)
+    return calls
+
+
+@pytest.fixture
+def one_step(monkeypatch):
+    """The solver is compared at one size of its step."""
+    monkeypatch.setattr("tools.error_vs_time.command.STEPS", (0.5,))
+
+
 def weights_file(path, kind):
     network = (network_of if kind == "hgn" else gns_of)(torch.float32, width=8)
     save_weights(path, network, WeightsInfo(network.config, 60.0, 1 / 64, updates=7))
@@ -106,9 +127,9 @@ def systems(report):
     return [row["system"] for row in report["rows"]]
 
 
+@pytest.mark.usefixtures("simulated")
 def test_the_report(compare, tmp_path, monkeypatch, capsys):
     """Every contender gets a row with the report's keys on the same scenes; failed scenes are counted."""
-    monkeypatch.setattr(datagen.mpm.solver, "simulate", fake_simulate)
     monkeypatch.setattr(timing, "SOLVER_FRAMES", 300)
     drawn: set[str] = set()
     monkeypatch.setattr(run, "draw", lambda out, *_: drawn.add(out))
@@ -157,21 +178,16 @@ def test_labels_of_the_figures_lie_side_by_side(monkeypatch):
 
 
 @pytest.mark.usefixtures("undrawn")
-def test_when_time_is_over(compare, monkeypatch):
+def test_when_time_is_over(compare, simulated, monkeypatch):
     """Contenders that have not started by then are named, and left out; a shorter rollout of the solver is scored up
     to its end, and each setting is simulated once."""
-    calls: list[tuple[float, list[float], int]] = []
-
-    def counted(scenes, config, frames, *more, stability_fractions, **others):
-        calls.append((scenes[0].cell_size, sorted(set(stability_fractions)), frames))
-        return fake_simulate(scenes, config, frames, *more, stability_fractions=stability_fractions, **others)
-
-    monkeypatch.setattr(datagen.mpm.solver, "simulate", counted)
     monkeypatch.setattr("tools.error_vs_time.command.shipped_weights", dict)
     options = {"weights": None, "resimulate": False, "mpm_grids": [64], "mpm_frames": 3}
     report = compare(**options)
-    assert [call for call in calls if call[2] == 3] == [(1 / 64, [0.5, 1.0], 3)]  # of one grid side by side
-    assert {call[2] for call in calls} == {2, 3, 4} and all(len(call[1]) == 1 for call in calls if call[2] != 3)
+    (scored,) = (call for call in simulated if call.frames == 3)
+    assert (scored.cells, scored.steps) == (64, [0.5, 1.0])  # of one grid side by side
+    assert {call.frames for call in simulated} == {2, 3, 4}
+    assert all(len(call.steps) == 1 for call in simulated if call is not scored)
     assert systems(report) == ["baseline"] * 4 + ["mpm", "mpm"]
     assert report["rows"][-1]["scenes_reached"] == {"5": 0} and report["rows"][-1]["failed_scenes"] == 0
     report = compare(seconds=1e-9, **options)
@@ -179,24 +195,16 @@ def test_when_time_is_over(compare, monkeypatch):
     assert [left["cause"] for left in report["meta"]["not_run"]] == ["the time was over"] * 2
 
 
-@pytest.mark.usefixtures("undrawn")
-def test_a_reference_of_a_finer_grid(make_config, make_dataset, compare, monkeypatch):
+@pytest.mark.usefixtures("undrawn", "one_step")
+def test_a_reference_of_a_finer_grid(make_config, make_dataset, compare, simulated):
     """Data of a finer grid is the reference, and is not simulated again on its own. Solvers on finer grids get the
     children of the visible particles, and are scored by the first ones; the floor is another draw of the reference.
     """
     folder = make_dataset(make_config(reference_cells=128))
-    calls = []
-
-    def counted(scenes, *more, **others):
-        calls.append((round(1 / scenes[0].cell_size), [scene.particle_count for scene in scenes]))
-        return fake_simulate(scenes, *more, **others)
-
-    monkeypatch.setattr(datagen.mpm.solver, "simulate", counted)
-    monkeypatch.setattr("tools.error_vs_time.command.STEPS", (0.5,))
     report = compare(data=str(folder), weights=[], mpm_grids=[48, 96], perturbation=1e-6)
     assert report["meta"]["reference"] == "the data: 128 cells a unit, 8 particles for each visible one"
     visible = [len(episode.material_N) for episode in EpisodeStore(folder, "validation")]
-    particles = {grid: counts for grid, counts in calls if len(counts) == len(visible)}
+    particles = {call.cells: call.particles for call in simulated if len(call.particles) == len(visible)}
     assert particles == {48: visible, 96: [3 * count for count in visible], 128: [8 * count for count in visible]}
     assert systems(report) == [*["baseline"] * 4, "mpm", "mpm", "chaos"]
     assert all(row["failed_scenes"] == 0 and row["position_mse"]["5"] < 1e-3 for row in report["rows"][4:])
@@ -214,13 +222,11 @@ def test_fall_and_stop(data):
     assert ((long.position_TN3[-1] < 1 / 32 + 1e-6) | (long.position_TN3[-1] > 31 / 32 - 1e-6)).any(axis=1).all()
 
 
-@pytest.mark.usefixtures("undrawn")
+@pytest.mark.usefixtures("undrawn", "one_step", "simulated")
 def test_order_of_measurements(compare, both, monkeypatch, on_score, capsys):
     """Networks at their first precision, the solver on the data's grid, baselines, GNS, coarse grids, then other
     precisions; the report keeps its own order. A contender that fails is named with the cause, and the others go on;
     an unexpected error is printed, and the exit code is 1."""
-    monkeypatch.setattr(datagen.mpm.solver, "simulate", fake_simulate)
-    monkeypatch.setattr("tools.error_vs_time.command.STEPS", (0.5,))
     monkeypatch.setattr(score, "SINKHORN_SCENES", 0)
     order: list[str] = []
 

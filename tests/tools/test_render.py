@@ -20,15 +20,9 @@ def rollout_file(folder, reference):
     generator = np.random.default_rng(0)
     start = 0.3 + 0.05 * generator.random((60, 3))
     position = (start - np.linspace(0, 0.2, FRAMES)[:, None, None] * (0, 1, 0)).astype(np.float32)
-    rollout = Rollout(
-        position_TN3=position,
-        material_N=np.repeat(np.arange(3, dtype=np.uint8), 20),
-        obstacles=(),
-        domain_size=(1.0, 1.0, 1.0),
-        frame_rate_hz=60.0,
-        source={"weights": "model.safetensors"},
-        reference_TN3=position + np.float32(0.01) if reference else None,
-    )
+    material_N, source = np.repeat(np.arange(3, dtype=np.uint8), 20), {"weights": "model.safetensors"}
+    truth = {"reference_TN3": position + np.float32(0.01)} if reference else {}
+    rollout = Rollout(position, material_N, (), (1.0, 1.0, 1.0), 60.0, source=source, **truth)
     write_rollout(folder / "fall.vtkhdf", rollout)
     return folder / "fall.vtkhdf"
 

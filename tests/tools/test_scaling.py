@@ -17,24 +17,17 @@ from tools.scaling.command import main
 from tools.scaling.config import ScalingConfig
 
 ENVIRONMENT = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])}
-SMALL: dict[str, Any] = {
-    "particles": 20,
-    "scenes": 2,
-    "batches": 2,
-    "seconds": 1e-9,
-    "network": {"width": 16, "levels": 2, "message_passing_steps": 1},
-    "device": "cpu",
-}
+SMALL: dict[str, Any] = {"particles": 20, "scenes": 2, "batches": 2, "seconds": 1e-9, "device": "cpu"}
+SMALL |= {"network": {"width": 16, "levels": 2, "message_passing_steps": 1}}
 
 
 def test_rows_of_every_case(warm_python, tmp_path):
     """Two processes train alone and together, with equal and with unequal scenes, all checked and timed, and
     the table shows them."""
     path = tmp_path / "reports" / "scaling.json"
-    command = [str(warm_python), str(Path(__file__).with_name("scaling_program.py"))]
-    done = subprocess.run(
-        [*command, json.dumps(SMALL | {"json": str(path)})], env=ENVIRONMENT, capture_output=True, text=True
-    )
+    program, options = Path(__file__).with_name("scaling_program.py"), json.dumps(SMALL | {"json": str(path)})
+    command = [str(warm_python), str(program), options]
+    done = subprocess.run(command, env=ENVIRONMENT, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     report = json.loads(path.read_text())
     assert {"device", "versions", "commit", "date", "command", "config"} <= report["meta"].keys()

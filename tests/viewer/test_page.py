@@ -58,6 +58,7 @@ def play():
     scene = Scene(block_N3, 0 * block_N3, np.zeros(600, np.uint8), (cone,), cell_size=1 / 32, gravity=still)
     session = PlaySession(floating(), scene, weights="floating")
     page = PlayPage(session, ("floating", "other"), lambda name: floating(), port=0)
+    page.rate = 20.0  # frames a second: simulation and browser share a core
     thread = threading.Thread(target=page.run)
     thread.start()
     yield page
@@ -208,7 +209,7 @@ def test_pause_step_and_back(viewer, play):
     press(viewer, "Play")
     until(lambda: play.session.frame > frame + 3)
     press(viewer, "1 s")
-    until(lambda: play.session.frame <= max(0, frame - 30) and not play.playing)
+    until(lambda: play.session.frame <= max(0, frame - play.rate / 2) and not play.playing)
     press(viewer, "Play")
     until(lambda: play.playing)
 
