@@ -1,17 +1,20 @@
-"""python -m tools.notebooks: writes the notebooks of docs/notebooks from pages of the documentation.
+"""python -m tools.notebooks [NAME …]: writes docs/notebooks from pages of the documentation, and runs them.
 
-Text becomes Markdown cells, Python blocks code cells, commands `!` lines and files `%%writefile`. The tests run the
-blocks of the pages, which are the only source.
+Text becomes Markdown cells, Python blocks code cells, commands `!` lines and files `%%writefile`. Outputs are kept. The
+pages are the only source; FEWER lists what is smaller, so that each notebook takes minutes on two CPU cores.
 """
 
 from __future__ import annotations
 
 import json
 import re
+import sys
+import tempfile
 from pathlib import Path
 from typing import Any
 
 from hgn.system.files import write_atomically
+from hgn.system.provenance import without_folders
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 NOTEBOOKS = {
@@ -19,44 +22,79 @@ NOTEBOOKS = {
     "own_data": "tutorials/train.md",
     "inverse_problem": "how_to/gradients.md",
 }
+FEWER = {
+    "training_scenes: 200\n": "training_scenes: 4 # 200\n  frames: 40 # 300\n",
+    "validation_scenes: 5\n": "validation_scenes: 1\n  test_scenes: 0\n",
+    "maximum_updates: 20000\n": "maximum_updates: 100 # 20000\n  batch_scenes: 1 # 8\n  monitor_every: 50\n",
+    "training.maximum_updates=5000": "training.maximum_updates=20",
+}
+OPEN = "make setup\n.venv/bin/pip install jupyterlab\n.venv/bin/jupyter lab docs/notebooks"
+FIRST = f"This notebook is the page docs/{{page}}. To open it, in the folder of the project:\n```bash\n{OPEN}\n```"
+BEGIN = "import os\nimport sys\nimport tempfile\n\nos.chdir(tempfile.mkdtemp())  # for the files of this notebook"
+SHOW = {"own_data": "from IPython.display import Image\n\nImage('mine.png')"}
 _BLOCK = re.compile(r"(?:<!-- file: (\S+) -->\n)?```(\w+)\n(.*?)```\n", re.DOTALL)
 
 
 def main() -> int:
-    """Writes all notebooks; returns the exit code."""
+    """Writes the notebooks that the command line names, or all; returns the exit code."""
+    from nbclient import NotebookClient
+    from nbformat import from_dict
+
     (DOCS / "notebooks").mkdir(exist_ok=True)
-    for name, page in NOTEBOOKS.items():
-        write_atomically(DOCS / "notebooks" / f"{name}.ipynb", notebook(DOCS / page).encode())
+    for name in sys.argv[1:] or NOTEBOOKS:
+        content = from_dict(notebook(name))
+        with tempfile.TemporaryDirectory() as folder:
+            NotebookClient(content, timeout=None, resources={"metadata": {"path": folder}}).execute()
+        for cell in content.cells:
+            _tidy(cell)
+        text = json.dumps(content, indent=1, ensure_ascii=False) + "\n"
+        write_atomically(DOCS / "notebooks" / f"{name}.ipynb", text.encode())
     return 0
 
 
-def notebook(page: Path) -> str:
-    """Returns the notebook of a page, as JSON."""
-    text, cells, end = page.read_text(encoding="utf-8"), [], 0
+def _tidy(cell: Any) -> None:
+    """Joins what a cell prints, keeps only the end of a progress bar and one form of a picture."""
+    cell.metadata.clear()
+    printed = "".join(output.get("text", "") for output in cell.get("outputs", ()))
+    text = without_folders(re.sub(r"[^\n]*\r(?!\n)", "", printed.replace("\r\n", "\n")))
+    shown = [output for output in cell.get("outputs", ()) if "text" not in output]
+    for output in shown:
+        output.data.pop("image/jpeg", None)
+    if printed or shown:
+        stream = [{"output_type": "stream", "name": "stdout", "text": text}] if printed else []
+        cell.outputs = [*stream, *shown]
+
+
+def notebook(name: str) -> dict[str, Any]:
+    """Returns the notebook of a page, without outputs."""
+    text = (DOCS / NOTEBOOKS[name]).read_text(encoding="utf-8")
+    cells, end = [_cell("markdown", FIRST.format(page=NOTEBOOKS[name])), _cell("code", BEGIN)], 0
     for block in _BLOCK.finditer(text):
         cells.append(_cell("markdown", text[end : block.start()]))
         file, language, content = block.groups()
+        for whole, fewer in FEWER.items():
+            content = content.replace(whole, fewer)
         if file is not None:
+            folder = f"!mkdir -p {Path(file).parent}\n" if "/" in file else ""
+            cells.append(_cell("code", folder))
             content = f"%%writefile {file}\n{content}"
         elif language == "bash":
-            content = re.sub(r"^(?=\S)(?!#)", "!", content.replace("\\\n    ", ""), flags=re.MULTILINE)
+            content = re.sub(r"^python", "!{sys.executable}", content.replace("\\\n    ", ""), flags=re.MULTILINE)
+            content = "" if content.startswith("pip install") else content  # make setup has installed it
         elif language != "python":
             cells.append(_cell("markdown", block.group()))
             content = ""
         cells.append(_cell("code", content))
         end = block.end()
-    cells.append(_cell("markdown", text[end:]))
+    cells += [_cell("code", SHOW.get(name, "")), _cell("markdown", text[end:])]
     filled = [cell | {"id": f"cell-{i}"} for i, cell in enumerate(cell for cell in cells if cell["source"])]
     kernel = {"kernelspec": {"display_name": "Python 3", "language": "python", "name": "python3"}}
-    mapping = {"cells": filled, "metadata": kernel, "nbformat": 4, "nbformat_minor": 5}
-    return json.dumps(mapping, indent=1, ensure_ascii=False) + "\n"
+    return {"cells": filled, "metadata": kernel, "nbformat": 4, "nbformat_minor": 5}
 
 
 def _cell(kind: str, source: str) -> dict[str, Any]:
-    lines = source.strip().splitlines(keepends=True)
-    return {"cell_type": kind, "metadata": {}, "source": lines} | (
-        {"execution_count": None, "outputs": []} if kind == "code" else {}
-    )
+    code = {"execution_count": None, "outputs": []} if kind == "code" else {}
+    return {"cell_type": kind, "metadata": {}, "source": source.strip()} | code
 
 
 if __name__ == "__main__":
