@@ -2,7 +2,8 @@
 
 Trains as FOLDER/mapping.json says. FOLDER/faults.json holds [restart, rank, update, fault, target] rows: in that start,
 that rank sends a signal (its number) at that update to itself (target self) or to torchrun (launcher), meets an error
-of its own ("error"), misses its data ("storage"), or gets other weights ("weights").
+of its own ("error"), misses its data ("storage"), or gets other weights ("weights"). FOLDER/stopped_RANK is the process
+that a SIGSTOP stops. FOLDER/watch.json, where it is, has constants of hgn.training.watch.
 Keeps what this rank saw: FOLDER/gradients_RANK.pt of the first update, FOLDER/end_RANK.pt with the weights, the update
 and the exit code, FOLDER/starts_RANK with the update of each start, FOLDER/talk_RANK.json with the updates at which
 ranks talked of anything but gradients.
@@ -10,12 +11,14 @@ ranks talked of anything but gradients.
 
 import json
 import os
+import signal
 import sys
 from pathlib import Path
 from typing import Any
 
 import torch
 
+import hgn.training.watch
 from hgn import train
 from hgn.data.storage import StorageError
 from hgn.schema import ConfigError
@@ -27,6 +30,9 @@ def main(folder):
     mapping: dict[str, Any] = json.loads((folder / "mapping.json").read_text())
     rank = int(os.environ.get("RANK", os.environ.get("LOCAL_RANK", "0")))
     restart = int(os.environ.get("TORCHELASTIC_RESTART_COUNT", "0"))
+    if (folder / "watch.json").exists():
+        for name, seconds in ({"BEAT_S": 0.2} | json.loads((folder / "watch.json").read_text())).items():
+            setattr(hgn.training.watch, name, seconds)
     rows = json.loads((folder / "faults.json").read_text())
     faults = {update: rest for in_start, of_rank, update, *rest in rows if (in_start, of_rank) == (restart, rank)}
     end: dict[str, Any] = {}
@@ -67,6 +73,8 @@ def main(folder):
             with torch.no_grad():
                 next(iter(parameters.values())).view(-1)[0] += 1e-3
         elif fault is not None:
+            if fault == signal.SIGSTOP:
+                (folder / f"stopped_{rank}").write_text(str(os.getpid()))
             launcher = int(os.environ.get("WARM_PARENT", os.getppid()))
             os.kill(launcher if target == "launcher" else os.getpid(), fault)
         step(updates, number)

@@ -214,119 +214,85 @@ def no_launcher(monkeypatch):
     return monkeypatch
 
 
+TORCHRUN = {"RANK": "0", "LOCAL_RANK": "0", "WORLD_SIZE": "4"}
 SLURM = {"SLURM_STEP_ID": "0", "SLURM_PROCID": "0", "SLURM_NTASKS": "8", "SLURM_NNODES": "2"}
 JOB = {"SLURM_JOB_ID": "4711"}
 BOTH = {"SLURM_PROCID": "1", "SLURM_NTASKS": "2", "RANK": "3", "LOCAL_RANK": "1", "WORLD_SIZE": "4"}
 RANDOM_ID = "5bd6a8f0-93a5-4c5b-9b8c-0a52b6cf3d11"
+RESTARTS = {"TORCHELASTIC_USE_AGENT_STORE": "True", "TORCHELASTIC_MAX_RESTARTS": "3"}
 
 
 @pytest.mark.parametrize(
     ("variables", "first", "started", "folder"),
     [  # whether it leads, devices and nodes that the launcher started, the folder's name
         ({}, True, (1, 1), "runs/small"),
-        ({"RANK": "0", "LOCAL_RANK": "0", "WORLD_SIZE": "4"}, True, (4, 1), "runs/small"),
-        ({"RANK": "0", "LOCAL_RANK": "0", "WORLD_SIZE": "3"}, True, (3, 1), "runs/small"),
+        (TORCHRUN, True, (4, 1), "runs/small"),
+        (TORCHRUN | {"WORLD_SIZE": "3"}, True, (3, 1), "runs/small"),
         ({"RANK": "5", "LOCAL_RANK": "0", "WORLD_SIZE": "6", "LOCAL_WORLD_SIZE": "2"}, False, (2, 3), "runs/small"),
-        ({"RANK": "0", "LOCAL_RANK": "0", "WORLD_SIZE": "4", "LOCAL_WORLD_SIZE": "4"}, True, (4, 1), "runs/small"),
+        ({"RANK": "0", "WORLD_SIZE": "1"}, True, (1, 1), "runs/small"),  # of a container
         ({"SLURM_STEP_ID": "0", "SLURM_PROCID": "0", "SLURM_NTASKS": "4"}, True, (4, 1), "runs/small"),
         (SLURM | JOB, True, (4, 2), "runs/small-4711"),
         (SLURM | JOB | {"SLURM_PROCID": "7"}, False, (4, 2), "runs/small-4711"),
         (SLURM | {"SLURM_JOB_NAME": "bash"}, True, (1, 1), "runs/small"),
         (SLURM | {"SLURM_JOB_NAME": "interactive"}, True, (1, 1), "runs/small"),
-        (JOB, True, (1, 1), "runs/small"),  # a shell or a script inside a job, without srun
+        (JOB | {"SLURM_NTASKS": "4"}, True, (1, 1), "runs/small"),  # a shell or a script inside a job, without srun
+        ({"SLURM_PROCID": "0", "SLURM_NTASKS": "1"}, True, (1, 1), "runs/small"),  # a batch job of one task
         (BOTH | JOB | {"LOCAL_WORLD_SIZE": "2"}, False, (2, 2), "runs/small"),  # torchrun inside srun
         (BOTH | {"RANK": "0", "TORCHELASTIC_RUN_ID": "a", "SLURM_JOB_ID": "1"}, True, (4, 1), "runs/a"),
         ({"LOCAL_RANK": "1"}, False, (1, 1), "runs/small"),
         ({"LOCAL_RANK": "0", "NODE_RANK": "1"}, False, (1, 1), "runs/small"),
-        (
-            {"TORCHELASTIC_RUN_ID": "none", "RANK": "1", "LOCAL_RANK": "1", "WORLD_SIZE": "2"},
-            False,
-            (2, 1),
-            "runs/small",
-        ),
+        (TORCHRUN | {"TORCHELASTIC_RUN_ID": "none"}, True, (4, 1), "runs/small"),
         ({"TORCHELASTIC_RUN_ID": "night/one two"}, True, (1, 1), "runs/night-one-two"),
         ({"TORCHELASTIC_RUN_ID": RANDOM_ID}, True, (1, 1), "runs/small"),
         (SLURM | JOB | {"HGN_RUN": "mine", "TORCHELASTIC_RUN_ID": "a"}, True, (4, 2), "runs/mine"),
         ({"HGN_RUN": "/shared/mine"}, True, (1, 1), "/shared/mine"),
+        (RESTARTS | {"TORCHELASTIC_MAX_RESTARTS": "0"}, True, (1, 1), "runs/small"),
+        (RESTARTS | {"TORCHELASTIC_USE_AGENT_STORE": "False"}, True, (1, 1), "runs/small"),
     ],
 )
 def test_what_a_launcher_says(no_launcher, variables, first, started, folder):
     """Exactly the process of global rank 0 leads. Devices and nodes that the configuration leaves open are those that
-    the launcher started, and others than it started are refused: each would train alone. All processes of a job, and
-    its restarts, agree on the folder, and two jobs get two: our own variable comes first, then torchrun's id (unless it
-    is random, as --standalone makes it), then Slurm's."""
+    the launcher started. All processes of a job, and its restarts, agree on the folder, and two jobs get two: our own
+    variable comes first, then torchrun's id (unless it is random, as --standalone makes it), then Slurm's."""
     for name, value in variables.items():
         no_launcher.setenv(name, value)
     assert (first_rank(), layout(TrainingConfig(device="cpu")), str(default_run("small"))) == (first, started, folder)
 
 
+OTHERS = "devices must be the {} processes that the launcher started on each of {} machines"
+
+
 @pytest.mark.parametrize(
-    ("variables", "started"),
+    ("variables", "expected"),
     [
         ({}, (2, 1)),
-        ({"RANK": "0", "LOCAL_RANK": "0", "WORLD_SIZE": "4"}, (2, 2)),
-        ({"RANK": "0", "LOCAL_RANK": "0", "WORLD_SIZE": "3"}, (3, 1)),
-        ({"RANK": "0", "LOCAL_RANK": "0", "WORLD_SIZE": "4", "LOCAL_WORLD_SIZE": "4"}, (4, 1)),
+        (TORCHRUN, (2, 2)),
+        (TORCHRUN | {"WORLD_SIZE": "3"}, OTHERS.format(3, 1)),
+        (TORCHRUN | {"LOCAL_WORLD_SIZE": "4"}, OTHERS.format(4, 1)),
         ({"SLURM_STEP_ID": "0", "SLURM_PROCID": "0", "SLURM_NTASKS": "4"}, (2, 2)),
-        (SLURM, (4, 2)),
+        (SLURM, OTHERS.format(4, 2)),
         (SLURM | {"SLURM_JOB_NAME": "bash"}, (2, 1)),
         (BOTH, (2, 2)),
-    ],
-)
-def test_launcher_and_configuration_agree(no_launcher, variables, started):
-    """A launcher that started another number of processes on a machine than devices is refused."""
-    for name, value in variables.items():
-        no_launcher.setenv(name, value)
-    training = TrainingConfig(device="cpu", devices=2)
-    if started[0] == 2:
-        assert layout(training) == started
-        return
-    message = rf"devices must be the {started[0]} processes that the launcher started on each of {started[1]} machines"
-    with pytest.raises(ConfigError, match=message):
-        layout(training)
-
-
-@pytest.mark.parametrize(
-    ("variables", "message"),
-    [
         ({"RANK": "0", "WORLD_SIZE": "2"}, "LOCAL_RANK must be set where RANK is, got RANK=0 without"),
         ({"RANK": "3", "WORLD_SIZE": "4", "LOCAL_WORLD_SIZE": "2"}, "LOCAL_RANK must be set where RANK is"),
         ({"RANK": "1"}, "WORLD_SIZE and LOCAL_RANK must be set where RANK is"),
         ({"RANK": "1", "LOCAL_RANK": "1"}, "WORLD_SIZE must be set where RANK is"),
         ({"SLURM_PROCID": "0", "SLURM_NTASKS": "4"}, "must be started with srun in a job of 4 tasks"),
         ({**SLURM, "SLURM_STEP_NUM_TASKS": "1"}, "must be started with srun in a job of 8 tasks"),
+        (RESTARTS, r"STORE must be 1 in torchrun's environment .*--max-restarts 3\), got nothing"),
     ],
 )
-def test_variables_without_their_launcher(no_launcher, variables, message):
-    """A process that would wait for others, which nothing has started, is refused with the launcher's name."""
+def test_launcher_and_configuration_agree(no_launcher, variables, expected):
+    """With two devices asked for, a launcher that started another number on a machine is refused, and so are variables
+    without their launcher, for whose other processes it would wait, and restarts that would hang."""
     for name, value in variables.items():
         no_launcher.setenv(name, value)
-    with pytest.raises(ConfigError, match=message):
-        layout(TrainingConfig(device="cpu"))
-
-
-@pytest.mark.parametrize(
-    "variables",
-    [{"SLURM_NTASKS": "4"}, {"SLURM_PROCID": "0", "SLURM_NTASKS": "1"}, {"RANK": "0", "WORLD_SIZE": "1"}],
-)
-def test_one_process_among_variables(no_launcher, variables):
-    """A shell of Slurm, a batch job of one task and a container's RANK of one process train with one."""
-    for name, value in variables.items():
-        no_launcher.setenv(name, value)
-    assert layout(TrainingConfig(device="cpu")) == (1, 1)
-
-
-def test_restarts_that_would_hang_are_refused(no_launcher):
-    """Where torchrun may restart processes that share its store, the missing variable is named at the start."""
-    no_launcher.setenv("TORCHELASTIC_USE_AGENT_STORE", "True")
-    no_launcher.setenv("TORCHELASTIC_MAX_RESTARTS", "0")
-    assert layout(TrainingConfig(device="cpu")) == (1, 1)
-    no_launcher.setenv("TORCHELASTIC_MAX_RESTARTS", "3")
-    message = r"STORE must be 1 in torchrun's environment .*--max-restarts 3\), got nothing"
-    with pytest.raises(ConfigError, match=message):
-        layout(TrainingConfig(device="cpu"))
-    no_launcher.setenv("TORCHELASTIC_USE_AGENT_STORE", "False")
-    assert layout(TrainingConfig(device="cpu")) == (1, 1)
+    training = TrainingConfig(device="cpu", devices=2)
+    if isinstance(expected, tuple):
+        assert layout(training) == expected
+        return
+    with pytest.raises(ConfigError, match=expected):
+        layout(training)
 
 
 def test_devices_that_are_not_there(no_launcher):
@@ -362,32 +328,51 @@ def test_checksum():
 GPUS = (pytest.mark.multigpu, pytest.mark.skipif(torch.cuda.device_count() < 2, reason="needs two CUDA devices"))
 
 
+DIFFERENT = "weights must be the same on all ranks, got others at"
+
+
 @pytest.mark.parametrize(
-    ("device", "fault", "failing"),
+    ("device", "faults", "watch", "code", "message"),
     [
-        *(("cpu", fault, rank) for fault, rank in (("weights", 1), ("storage", 0), ("storage", 1))),
-        *(pytest.param("cuda", fault, rank, marks=GPUS) for fault in ("error", "weights") for rank in (0, 1)),
+        ("cpu", [(0, 1, 3, "weights", "self")], {}, None, DIFFERENT),
+        *(("cpu", [(0, rank, 3, "storage", "self")], {}, None, "the data stay away") for rank in (0, 1)),
+        ("cpu", [(0, 1, 3, signal.SIGSTOP, "self")], {"SILENCE_S": 3.0}, 1, "ranks [1] must answer within 3 s"),
+        (
+            "cpu",
+            [(0, 1, 3, signal.SIGTERM, "launcher"), (0, 1, 4, signal.SIGSTOP, "self")],
+            {"GRACE_S": 3.0},
+            128 + signal.SIGTERM,
+            "the other ranks must answer after SIGTERM",
+        ),
+        *(
+            pytest.param("cuda", [(0, rank, 3, fault, "self")], {}, None, message, marks=GPUS)
+            for fault, message in (("error", "this rank fails"), ("weights", DIFFERENT))
+            for rank in (0, 1)
+        ),
     ],
 )
-def test_no_rank_waits_for_one_that_fails(data, no_launcher, warm_python, tmp_path, device, fault, failing):
-    """Two ranks of Lightning's own launcher end where one of them meets an error of its own, where one has other
-    weights, which the next log line finds, and where one misses its data, which saves first."""
+def test_no_rank_waits_for_one_that_fails(
+    data, no_launcher, warm_python, tmp_path, device, faults, watch, code, message
+):
+    """Two ranks of Lightning's own launcher end where one of them meets an error of its own; where one has other
+    weights, which the next log line finds; where one misses its data, which saves first; and where one was stopped,
+    after a while, or after SIGTERM to the other."""
     options: dict[str, Any] = {"device": device, "backend": "torch", "devices": 2, "maximum_updates": 10**6}
     (tmp_path / "mapping.json").write_text(json.dumps(train_mapping(data, tmp_path / "run", **options)))
-    (tmp_path / "faults.json").write_text(json.dumps([(0, failing, 3, fault, "self")]))
+    (tmp_path / "faults.json").write_text(json.dumps(faults))
+    (tmp_path / "watch.json").write_text(json.dumps(watch))
     python = str(warm_python) if device == "cpu" else sys.executable
-    process = subprocess.Popen(
-        [python, str(PROGRAM), str(tmp_path)],
-        env=os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1", "PYTHON_EXEC": python},
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-    )
-    text = output(process)
-    assert process.returncode != 0
-    texts = {"error": "this rank fails", "storage": "the data stay away"}
-    assert texts.get(fault, "weights must be the same on all ranks, got others at") in text
-    if fault == "storage":
+    environment = os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1", "PYTHON_EXEC": python}
+    with (tmp_path / "log").open("w") as log:  # which a rank that was stopped keeps open
+        process = subprocess.Popen([python, PROGRAM, tmp_path], env=environment, stdout=log, stderr=log)
+    try:
+        process.wait(PATIENCE_S)
+    finally:
+        for stopped in tmp_path.glob("stopped_*"):
+            os.kill(int(stopped.read_text()), signal.SIGKILL)
+    text = (tmp_path / "log").read_text()
+    assert message in text and (process.returncode == code if code is not None else process.returncode != 0)
+    if "data" in message:
         assert read_checkpoint(tmp_path / "run/checkpoints/last.ckpt")["hgn"]["updates"] == 3
 
 
