@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import io
 import json
 import mmap
 import os
@@ -77,7 +78,7 @@ def read_replaced(path: Path) -> bytes:
     raise AssertionError
 
 
-def open_at_once(path: Path) -> BinaryIO:
+def open_at_once(path: Path) -> io.BufferedReader:
     """Opens a file for reading. A pipe counts as empty, because reading it would wait for ever."""
     return open(path, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK))
 

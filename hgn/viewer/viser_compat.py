@@ -41,8 +41,8 @@ SENT = (
 )  # messages that viewers may send, in addition to values of controls
 Process = Callable[[Any, Request], Response | None]
 # Viser keeps each broadcast under its key. It had a key for each part of each upload, and would keep them all.
-messages.FileTransferPartAck.redundancy_key = (  # type: ignore[assignment, method-assign]
-    lambda ack: f"{type(ack).__name__}-{zlib.crc32(ack.transfer_uuid.encode()) % 64}"
+messages.FileTransferPartAck.redundancy_key = (  # type: ignore[method-assign]
+    lambda ack: f"{type(ack).__name__}-{zlib.crc32(ack.transfer_uuid.encode()) % 64}"  # type: ignore[assignment]
 )
 
 
