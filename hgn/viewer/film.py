@@ -9,6 +9,7 @@ import contextlib
 import threading
 import time
 from collections.abc import Iterator
+from functools import partial
 from typing import Any
 
 import viser
@@ -19,7 +20,7 @@ from hgn.schema import require
 from hgn.system.files import WRITTEN_BY_HGN
 from hgn.viewer.placed import plain
 from hgn.viewer.stage import StageView, quaternion
-from hgn.viewer.viser_compat import start_server, stop_server
+from hgn.viewer.viser_compat import clamped, start_server, stop_server, updates
 
 REST = ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
 
@@ -100,7 +101,7 @@ class FilmPage:
         @self.slider.on_update
         def _(event: Any) -> None:
             if event.client is not None:
-                self.film.show(min(self.slider.value, rollout.frame_count - 1))
+                self.film.show(min(int(clamped(self.slider)), rollout.frame_count - 1))
 
     def run(self) -> None:
         """Plays until a call of `close`."""
@@ -110,12 +111,12 @@ class FilmPage:
             now = time.monotonic()
             passed, shown = now - shown, now
             if not self.playing.value:
-                frame = self.slider.value
+                frame = clamped(self.slider)
                 continue
-            if abs(self.slider.value - int(frame)) > 1:  # a viewer moved the slider
-                frame = self.slider.value
-            frame = (frame + passed * self.speed.value * self.rollout.frame_rate_hz) % self.rollout.frame_count
-            self.film.show(int(frame))
+            if abs(clamped(self.slider) - int(frame)) > 1:  # a viewer moved the slider
+                frame = clamped(self.slider)
+            frame = (frame + passed * clamped(self.speed) * self.rollout.frame_rate_hz) % self.rollout.frame_count
+            updates(partial(self.film.show, int(frame)))
             self.slider.value = int(frame)
 
     def close(self) -> None:

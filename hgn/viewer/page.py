@@ -10,7 +10,6 @@ must be in the list, and every error of an action becomes a message to its viewe
 from __future__ import annotations
 
 import itertools
-import math
 import sys
 import tempfile
 import threading
@@ -35,7 +34,7 @@ from hgn.schema import ConfigError, require
 from hgn.viewer.placed import PlacedObstacle, plain
 from hgn.viewer.session import PlaySession, Spout
 from hgn.viewer.stage import StageView, quaternion
-from hgn.viewer.viser_compat import start_server, stop_server
+from hgn.viewer.viser_compat import clamped, start_server, stop_server, updates
 
 STATUS_S = 0.25  # seconds between two updates of frame and speed
 BACK_S = {"a frame": 0.0, "1 s": 1.0, "5 s": 5.0}
@@ -117,7 +116,7 @@ class PlayPage:
 
     def _notify(self, message: str, client: viser.ClientHandle | None = None) -> None:
         for one in [client] if client is not None else list(self.server.get_clients().values()):
-            self._updates(partial(one.add_notification, "HGN", message, auto_close_seconds=10))
+            updates(partial(one.add_notification, "HGN", message, auto_close_seconds=10))
 
     def run(self) -> None:
         """Simulates, at most in real time, from the first viewer's arrival until `close`."""
@@ -139,26 +138,14 @@ class PlayPage:
                     self.session.spout = None
                     self._notify(self._limit())
             if changed:
-                shown = self._updates(self._show)
+                shown = updates(self._show)
             now = time.monotonic()
             if now - updated >= STATUS_S:
                 self.frames_a_second = frames / (now - updated)
                 updated, frames = now, 0
-                self._updates(self._show_status)
+                updates(self._show_status)
             due = max(due + 1 / self.rate, now)
             self.ended.wait(max(0.0, due - now) if due > now else 0)
-
-    def _updates(self, show: Callable[[], Any]) -> bool:
-        """Changes the view of all viewers. Returns False after a failure, and the caller tries again.
-
-        viser wakes its event loop from this thread without a lock. This fails at times while a viewer comes or goes.
-        """
-        try:
-            show()
-        except Exception as error:  # noqa: BLE001 - one viewer's connection must not end the session
-            traceback.print_exception(error, file=sys.stderr)
-            return False
-        return True
 
     def close(self) -> None:
         """Ends the server after the end of `run`. `ended.set()` ends `run` from another thread."""
@@ -418,9 +405,3 @@ class PlayPage:
                 return replace(before.turned(degrees), position=self.shown[number].position)
 
             drag(event, turned)
-
-
-def clamped(slider: Any) -> float:
-    """Returns the value of a slider within its range, or its lower limit for NaN."""
-    value = float(slider.value)
-    return float(slider.min) if math.isnan(value) else min(max(value, float(slider.min)), float(slider.max))

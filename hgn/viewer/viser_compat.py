@@ -11,8 +11,11 @@ import contextlib
 import hmac
 import http
 import io
+import math
 import secrets
 import socket
+import sys
+import traceback
 import zlib
 from collections import Counter
 from collections.abc import Callable
@@ -134,3 +137,22 @@ def guarded(process: Process, token: str) -> Process:
         return response
 
     return answer
+
+
+def updates(show: Callable[[], Any]) -> bool:
+    """Changes the view of all viewers. Returns False after a failure, and the caller tries again.
+
+    viser wakes its event loop from this thread without a lock. This fails at times while a viewer comes or goes.
+    """
+    try:
+        show()
+    except Exception as error:  # noqa: BLE001 - one viewer's connection must not end the session of all
+        traceback.print_exception(error, file=sys.stderr)
+        return False
+    return True
+
+
+def clamped(slider: Any) -> float:
+    """Returns the value of a slider within its range, or its lower limit for NaN."""
+    value = float(slider.value)
+    return float(slider.min) if math.isnan(value) else min(max(value, float(slider.min)), float(slider.max))

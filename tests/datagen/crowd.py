@@ -14,9 +14,10 @@ import sys
 import tempfile
 import time
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
-from processes import free_port, start_module, wait_until
+from processes import TESTS, free_port, start_module, wait_until
 
 from hgn.data.manifest import Manifest
 from hgn.system.machine import allow_open_files
@@ -96,8 +97,7 @@ def largest_mb(process):
 
 def main(seconds, readers, file):
     allow_open_files(65_536)
-    with tempfile.TemporaryDirectory() as folder:
-        os.environ["BALLISTIC_FOLDER"] = folder
+    with tempfile.TemporaryDirectory() as folder, mock.patch.dict(os.environ, BALLISTIC_FOLDER=folder):
         port, health_port = free_port(), free_port()
         values = {"folder": f"{folder}/data", "port": port, "health_port": health_port}
         options = [option.format(**values) for option in OPTIONS]
@@ -105,7 +105,8 @@ def main(seconds, readers, file):
         try:
             wait_until(lambda: Path(folder, "data/manifest.json").exists() and Manifest.load(f"{folder}/data").revision)
             command = [sys.executable, __file__, "probe", str(health_port), str(seconds)]
-            asking = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+            environment = os.environ | {"PYTHONPATH": os.pathsep.join(map(str, (TESTS.parent, TESTS)))}
+            asking = subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True)
             figures = asyncio.run(crowd(port, readers, seconds))
             health_s = json.loads(asking.communicate()[0])
             memory = largest_mb(service.pid)

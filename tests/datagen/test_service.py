@@ -15,6 +15,7 @@ from collections import Counter
 from typing import Any
 from urllib.parse import unquote
 
+import crowd
 import pytest
 from processes import exit_code, processes_of_session, start_module, wait_until
 from written_files import Recorder
@@ -346,3 +347,12 @@ def test_stopping_leaves_a_resumable_folder(backend, control, tmp_path):
     os.close(unread), os.close(log)
     assert not list(folder.rglob("*.partial"))
     assert Manifest.load(folder).revision >= 1 and not Manifest.load(folder).complete
+
+
+@pytest.mark.slow
+def test_a_crowd_of_readers(tmp_path):
+    """Three hundred readers get every shard whole while it is generated, and /healthz answers at its own port."""
+    crowd.main(20.0, 300, tmp_path / "crowd.json")
+    figures = json.loads((tmp_path / "crowd.json").read_text())["figures"]
+    assert figures["errors"] == [] and max(figures["memory_mb"]) < 150
+    assert figures["answers"] > 300 * 32 and figures["healthz_s"]["samples"] > 0

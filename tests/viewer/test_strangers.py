@@ -3,6 +3,7 @@
 import asyncio
 import gc
 import http
+import json
 import pickle
 import re
 import weakref
@@ -21,7 +22,10 @@ from hgn.scene.scene import Scene
 from hgn.scene.shapes import shape_obstacle
 
 pytest.importorskip("viser", reason="viser is not installed: pip install 'hgn[play]'")
+from viewer import soak
+
 from hgn.viewer import viser_compat
+from hgn.viewer.film import FilmPage
 from hgn.viewer.page import MAXIMUM_UPLOAD_BYTES, PlayPage
 from hgn.viewer.session import PlaySession
 from hgn.viewer.viser_compat import COOKIE, guarded
@@ -299,6 +303,26 @@ def test_a_frame_that_fails_pauses(page, messages, monkeypatch, capsys):
     page.playing = False
 
 
+@pytest.mark.parametrize("value", [INFINITE, NAN, -5.0, 1e300])
+def test_a_film_goes_on_at_any_value(page, value):
+    """Values that its sliders do not give, and an update that fails, do not end the page of a rollout."""
+    film = FilmPage(page.session.rollout(), port=0)
+    shown, failures = [], [RuntimeError("deque mutated during iteration")]
+
+    def show(frame):
+        shown.append(frame)
+        film.speed._impl.value = film.slider._impl.value = value
+        if len(shown) > 3:
+            film.ended.set()
+        if failures:
+            raise failures.pop()
+
+    film.film.show = show
+    film.run()
+    film.close()
+    assert len(shown) == 4 and all(0 <= frame < film.rollout.frame_count for frame in shown)
+
+
 def test_meshes_are_bounded(page, messages, monkeypatch):
     """Files of all obstacles count together, also of those that only past frames show; so does their number."""
     monkeypatch.setattr("hgn.viewer.session.MAXIMUM_MESH_BYTES", 4 * len(TRIANGLES))
@@ -332,3 +356,12 @@ def test_unfinished_uploads_are_bounded(page, monkeypatch, uploads, count, size)
     assert states["small"]["transferred_bytes"] == 100
     for client in (1, 2):
         page.server.gui._drop_uploads_from_client(client)
+
+
+@pytest.mark.slow
+def test_two_viewers_for_two_minutes(tmp_path):
+    """Memory stays within 50 MB of what it is after a minute, and no unexpected error is printed."""
+    text = soak.main(120, tmp_path / "soak.json")
+    report = json.loads((tmp_path / "soak.json").read_text())
+    assert report["growth_mb"] < 50 and report["errors"] == 0 and report["ended"] is None, text
+    assert report["rows"][-1]["frames"] > 0 and report["rows"][-1]["answers"] > 0
