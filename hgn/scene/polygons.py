@@ -144,9 +144,8 @@ def concave_cut(vertex_V3: np.ndarray, faces: list[np.ndarray]) -> np.ndarray | 
     if not concave:
         return None
     if sum(len(faces[number]) ** 2 for number in concave) > MAXIMUM_CORNERS**2:
-        largest = max(concave, key=lambda number: len(faces[number]))
-        text = f"face {largest} is concave and has {len(faces[largest])} corners"
-        raise ValueError(f"{text}, as one of {len(concave)} concave ones; cut them into triangles")
+        largest = max(len(faces[number]) for number in concave)
+        raise ValueError(f"it has {len(concave)} concave faces, of up to {largest} corners; cut them into triangles")
     pieces = []
     for number, face in enumerate(faces):
         if number in concave:

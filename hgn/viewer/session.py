@@ -251,8 +251,8 @@ class PlaySession:
 
     def add_obstacle(self, entry: ObstacleEntry, folder: Path = Path()) -> PlacedObstacle:
         """Adds an obstacle of a shape, or of a mesh file in a folder. Raises ConfigError as a scene file does."""
-        count = len(self.obstacles) + 1
-        require(count <= MAXIMUM_OBSTACLES, "obstacles", f"at most {MAXIMUM_OBSTACLES}", count, "remove one")
+        rule, count = f"at most {MAXIMUM_OBSTACLES}", len(self.obstacles) + 1
+        require(count <= MAXIMUM_OBSTACLES, "obstacles", rule, count, "remove one")
         placed = placed_by(entry, folder, self.cell_size)
         size = sum(len(body.mesh_file or b"") for body in {*self._bodies, placed.body})
         require(size <= MAXIMUM_MESH_BYTES, "mesh files", f"at most {MAXIMUM_MESH_BYTES} bytes", size, "restart")
@@ -284,10 +284,7 @@ class PlaySession:
         raise ConfigError(f"size must leave room among particles and obstacles, got {size:g}; take a smaller one")
 
     def move_obstacle(self, moved: PlacedObstacle) -> None:
-        """Replaces the obstacle of the same body by `moved`. Does nothing if the obstacle was removed.
-
-        Raises ConfigError for a place or an angle that is not finite, or far outside the domain.
-        """
+        """Replaces the obstacle of the same body, if it is still there. Raises ConfigError for a place far outside."""
         reach, angles = 10 * max(self.domain_size), moved.rotation
         inside = all(abs(value) <= reach for value in moved.position) and all(map(math.isfinite, angles))
         require(inside, "obstacle", f"within {reach:g} of the origin, at finite angles", [*moved.position, *angles])

@@ -82,10 +82,9 @@ def admitting(handle: Callable[..., Any]) -> Callable[..., Any]:
     """Drops messages that the controls do not send. Viser would set any attribute of a control for all viewers."""
 
     async def answer(client: int, message: Any) -> None:
+        passes = isinstance(message, SENT)
         if isinstance(message, messages.GuiUpdateMessage):
             passes = message.updates.keys() == {"value"} and len(repr(message.updates)) <= LONGEST_VALUE
-        else:
-            passes = isinstance(message, SENT)
         if passes:
             await handle(client, message)
 
