@@ -77,7 +77,7 @@ def test_help_and_config_print(tmp_path, monkeypatch, capfd):
         assert run_module("datagen", arguments) == 0
         return capfd.readouterr().out
 
-    assert "makes a data set, or completes one" in printed("--help")
+    assert "generates or completes a data set" in printed("--help")
     output = printed("--cfg", "job", *SMALL)
     assert "training_scenes: 800" in output and yaml.safe_load(output)["scenes"] == 3
     experiment = printed("--cfg", "job", "experiment=demo")
