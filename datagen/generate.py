@@ -17,7 +17,6 @@ from datagen.pool.worker_plan import plan_workers, visible_gpus
 from datagen.pool.writer import DatasetWriter
 from hgn.config import DatagenConfig
 from hgn.data.fresh import draw_fresh
-from hgn.renamed import removed_remedy
 from hgn.schema import ConfigError, from_mapping, known_keys, require
 from hgn.system.machine import available_cpus, available_memory
 
@@ -68,8 +67,7 @@ def datagen_config(mapping: Mapping[str, Any], others: Sequence[str] = ()) -> Da
     names = (*_SECTIONS, *_OF_DATASET, *_OTHERS, *others)
     for key in mapping:
         if key not in names:
-            remedy = removed_remedy("service", key, mapping[key]) or known_keys(key, names)
-            raise ConfigError(f"{key} is not a known key; {remedy}")
+            raise ConfigError(f"{key} is not a known key; {known_keys(key, names)}")
     sections = {name: mapping[name] for name in _SECTIONS if name in mapping}
     dataset = {name: mapping[key] for key, name in _OF_DATASET.items() if key in mapping}
     config = from_mapping(DatagenConfig, sections | {"dataset": {**mapping.get("dataset", {}), **dataset}})

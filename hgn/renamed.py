@@ -96,7 +96,6 @@ REMOVED: dict[str, Removed] = {
     "error_vs_time.times_last": Removed(False),
     "scaling.rounds": Removed(20, "set seconds for a shorter measurement"),
     "render.gif": Removed(True, "give a file that ends in .png as out for a picture without animation"),
-    "service.health_port": Removed(remedy="leave it out: /healthz is at the service's port"),
     "stability_network.picture": Removed(remedy="leave it out: python -m tools.render draws scenes"),
     "stability_solver.grid_cells": Removed(remedy=GRIDS),
     "stability_solver.picture": Removed(remedy="leave it out: make docs draws it from the JSON"),

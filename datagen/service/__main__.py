@@ -17,6 +17,7 @@ from typing import Any
 from datagen.generate import StopSignal, datagen_config, require_local_folder
 from datagen.pool.progress import PROGRESS_KINDS, make_progress
 from datagen.pool.worker import Backend
+from datagen.service.health import HealthPage
 from datagen.service.log import UnhurriedLog
 from datagen.service.supervisor import Supervisor
 from hgn.command import run_command
@@ -27,7 +28,7 @@ from hgn.schema import ConfigError, Port, Positive, from_mapping, require, requi
 from hgn.system.machine import allow_open_files
 
 _OPEN_FILES = 65536
-_SERVICE_KEYS = ("host", "port", "connections")
+_SERVICE_KEYS = ("host", "port", "health_port", "connections")
 
 
 @dataclass(frozen=True)
@@ -36,6 +37,7 @@ class ServiceConfig:
 
     host: str = "127.0.0.1"  # address to listen on; any other needs a token in $HGN_DATASET_TOKEN
     port: Port = 8000  # 0: any free port
+    health_port: Port | None = None  # also answers /healthz at this port, for the probes of a busy service; null: no
     connections: Positive[int] = 1024  # simultaneous connections; others are answered with 503
 
     def __post_init__(self) -> None:
@@ -56,15 +58,19 @@ def main(mapping: dict[str, Any], backend: Backend | None = None) -> int:
     with ExitStack() as stack, StopSignal() as stop:
         listener = stack.enter_context(_listen(service.host, service.port, token))
         log = stack.enter_context(UnhurriedLog())
+        page = None
+        if service.health_port is not None:
+            page = stack.enter_context(HealthPage(_listen(service.host, service.health_port, token)))
         # this import takes a second, and the pool's processes, which import this file, do not need it
-        from datagen.service.server import make_app, make_server
+        from datagen.service.server import make_app, make_server, telling
 
         progress = make_progress(kind)
         with Supervisor(config, progress, backend) as supervisor:
             app = make_app(
                 folder, token, lambda: replace(supervisor.state, log_error=log.error or supervisor.state.log_error)
             )
-            server = make_server(app, service.connections, allow_open_files(_OPEN_FILES))
+            every_second = None if page is None else telling(page, app)
+            server = make_server(app, service.connections, allow_open_files(_OPEN_FILES), every_second=every_second)
 
             def end() -> None:
                 server.should_exit = True

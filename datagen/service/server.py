@@ -7,7 +7,7 @@
 | /<shard>.tar | a published shard | ETag: its sha256; Range, If-Range |
 | /progress | counts and the pool's state, JSON | |
 | /metrics | the same for Prometheus | |
-| /healthz | 200 while the service works; needs no token; a busy service may take seconds | |
+| /healthz | 200 while the service works; needs no token; see `datagen.service.health` for a busy service | |
 
 No other file of the folder can be read, nor a shard whose bytes differ from the manifest. With a token each request
 must contain `Authorization: Bearer <token>`.
@@ -20,7 +20,7 @@ import hashlib
 import hmac
 import re
 from collections import Counter, defaultdict
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -33,6 +33,7 @@ from starlette.responses import JSONResponse, PlainTextResponse, Response
 from starlette.routing import Route
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from datagen.service.health import HealthPage
 from datagen.service.sendfile import FileRange
 from datagen.service.supervisor import PoolState
 from datagen.service.uvicorn_compat import SendfileProtocol
@@ -216,9 +217,12 @@ def make_app(folder: Path, token: str | None, pool: Callable[[], PoolState]) -> 
         text = _metrics((await published.snapshot()).manifest, pool(), counters)
         return PlainTextResponse(text, media_type="text/plain; version=0.0.4; charset=utf-8")
 
-    async def healthz(request: Request) -> Response:
+    async def health() -> dict[str, str]:
         await published.snapshot()
-        return JSONResponse({"status": "ok", "generator": pool().status})
+        return {"status": "ok", "generator": pool().status}
+
+    async def healthz(request: Request) -> Response:
+        return JSONResponse(await health())
 
     async def unreadable(request: Request, error: Exception) -> Response:
         return PlainTextResponse(f"{error}\n", 503, {"retry-after": "1"})
@@ -236,7 +240,26 @@ def make_app(folder: Path, token: str | None, pool: Callable[[], PoolState]) -> 
         exception_handlers={ConfigError: unreadable},
     )
     app.router.redirect_slashes = False
+    app.state.health = health
     return app
+
+
+def telling(page: HealthPage, app: Starlette) -> Callable[[], Awaitable[None]]:
+    """Returns a function that reports the state of an app to `page`. It does not wait for a folder that hangs."""
+    looks: set[asyncio.Task[None]] = set()
+
+    async def look() -> None:
+        try:
+            page.tell(200, await app.state.health())
+        except (ConfigError, OSError) as error:
+            page.tell(503, {"status": str(error)})
+
+    async def tell() -> None:
+        if not looks:
+            looks.add(task := asyncio.create_task(look()))
+            task.add_done_callback(looks.discard)
+
+    return tell
 
 
 def make_server(
@@ -244,6 +267,7 @@ def make_server(
     connections: int,
     open_files: int = OPEN_FILES,
     patience_s: float = SendfileProtocol.patience_s,
+    every_second: Callable[[], Awaitable[None]] | None = None,
 ) -> uvicorn.Server:
     """Returns a server for `connections`, or fewer if `open_files` are too few. Others are asked to retry later."""
     most = max(1, min(connections, (open_files - _BACKLOG - _OTHER_FILES) // 2))  # a socket and a shard each
@@ -261,6 +285,8 @@ def make_server(
             server_header=False,
             limit_concurrency=most + 1,
             timeout_graceful_shutdown=_GRACE_S,
+            callback_notify=every_second,
+            timeout_notify=0,  # seconds; it is called every second
         )
     )
 

@@ -25,7 +25,7 @@ from hgn.schema import from_mapping
 
 K8S = Path(__file__).resolve().parents[2] / "jobs" / "k8s"
 OLDEST, NEWEST = "1.31", "1.37"
-SERVICE_KEYS = ("host", "port", "connections")
+SERVICE_KEYS = ("host", "port", "health_port", "connections")
 # keys of each part of a RayJob; + stands before those that must be there
 RAY = {
     "": "+apiVersion +kind +metadata +spec",
@@ -121,7 +121,7 @@ def test_commands_take_what_the_files_give_them(composed):
     mapping = composed("service", container["args"])
     assert datagen_config(mapping, SERVICE_KEYS).dataset.folder == "/shared/data/obstacles"
     service = from_mapping(ServiceConfig, {key: mapping[key] for key in SERVICE_KEYS})
-    assert [port["containerPort"] for port in container["ports"]] == [service.port]
+    assert [port["containerPort"] for port in container["ports"]] == [service.port, service.health_port]
     trainer = documents("train.yaml")[0]["spec"]["trainer"]
     assert container["env"][0]["name"] == TOKEN_VARIABLE == trainer["env"][-1]["name"]
 

@@ -1,0 +1,90 @@
+"""/healthz at a port of its own."""
+
+import asyncio
+import http.client
+import json
+import os
+import signal
+import socket
+from contextlib import ExitStack, closing
+
+import pytest
+from processes import wait_until
+
+from datagen.service import health
+from datagen.service.health import HealthPage, Page
+from datagen.service.server import make_app, telling
+from datagen.service.supervisor import PoolState
+
+
+@pytest.fixture
+def page():
+    listener = socket.create_server(("127.0.0.1", 0))
+    port = listener.getsockname()[1]
+    with HealthPage(listener) as page:
+        yield page, port
+
+
+def ask(port):
+    with closing(http.client.HTTPConnection("127.0.0.1", port, timeout=60)) as connection:
+        connection.request("GET", "/healthz")
+        answer = connection.getresponse()
+        return answer.status, json.loads(answer.read())
+
+
+def test_the_last_report_is_answered(page):
+    """Another process answers, beside 100 connections that send nothing, too."""
+    told, port = page
+    assert told.process.pid != os.getpid()
+    assert ask(port) == (503, {"status": "the service has not begun"})
+    told.tell(200, {"status": "ok"})
+    wait_until(lambda: ask(port) == (200, {"status": "ok"}))
+    with ExitStack() as stack:
+        for _ in range(100):
+            stack.enter_context(socket.create_connection(("127.0.0.1", port)))
+        assert ask(port) == (200, {"status": "ok"})
+
+
+def test_silence_is_told(monkeypatch):
+    """A service that reports nothing for long is not well, whatever it reported last."""
+    with Page(socket.create_server(("127.0.0.1", 0))) as page:
+        page.read('[200, {"status": "ok"}]')
+        assert page.answer() == (200, b'{"status": "ok"}')
+        monkeypatch.setattr(health, "SILENCE_S", -1.0)
+        assert page.answer() == (503, b'{"status": "the service has not reported for 0 s"}')
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
+def test_a_process_that_is_gone_is_replaced(page, number):
+    """Reports wait for nobody; a process that was killed or stopped is replaced, and the new one answers."""
+    told, port = page
+    assert ask(port)[0] == 503
+    first = told.process
+    os.kill(first.pid, number)
+
+    def replaced():
+        told.tell(200, {"status": 500 * "x"})
+        return told.process is not first
+
+    wait_until(replaced)
+    told.tell(200, {"status": "ok"})
+    wait_until(lambda: ask(port) == (200, {"status": "ok"}))
+    assert first.returncode == -signal.SIGKILL
+
+
+def test_what_is_told(tmp_path, folder):
+    """A service whose manifest can be read is well, one without is not."""
+
+    class Told(list[int]):
+        def tell(self, status, content):
+            self.append(status)
+
+    async def tell(place, told):
+        await telling(told, make_app(place, None, PoolState))()
+        while not told:
+            await asyncio.sleep(0.01)
+
+    for place, status in ((folder, 200), (tmp_path / "none", 503)):
+        told = Told()
+        asyncio.run(tell(place, told))
+        assert told == [status]
