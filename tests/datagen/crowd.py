@@ -1,6 +1,6 @@
 """`python tests/datagen/crowd.py SECONDS READERS FILE.json`: readers of a data set that the service still generates.
 
-Each looks at the manifest once a second and reads every shard; /healthz is asked ten times a second.
+Each looks at the manifest once a second and reads every shard; /healthz is asked ten times a second at its own port.
 The stand-in for the solver generates, so that the service is what is measured. Linux only.
 """
 
@@ -25,7 +25,7 @@ from hgn.system.provenance import provenance
 
 ASK_S, SCENES = 0.1, 32
 OPTIONS = (
-    *("out={folder}", "port={port}", f"scenes={SCENES}", "dataset.frames=5"),
+    *("out={folder}", "port={port}", "health_port={health_port}", f"scenes={SCENES}", "dataset.frames=5"),
     *("dataset.validation_scenes=0", "dataset.test_scenes=0", "dataset.workers=1", "dataset.episodes_per_shard=1"),
 )
 
@@ -98,13 +98,13 @@ def largest_mb(process):
 def main(seconds, readers, file):
     allow_open_files(65_536)
     with tempfile.TemporaryDirectory() as folder, mock.patch.dict(os.environ, BALLISTIC_FOLDER=folder):
-        port = free_port()
-        values = {"folder": f"{folder}/data", "port": port}
+        port, health_port = free_port(), free_port()
+        values = {"folder": f"{folder}/data", "port": port, "health_port": health_port}
         options = [option.format(**values) for option in OPTIONS]
         service = start_module("ballistic_service", *options, stderr=subprocess.DEVNULL)
         try:
             wait_until(lambda: Path(folder, "data/manifest.json").exists() and Manifest.load(f"{folder}/data").revision)
-            command = [sys.executable, __file__, "probe", str(port), str(seconds)]
+            command = [sys.executable, __file__, "probe", str(health_port), str(seconds)]
             environment = os.environ | {"PYTHONPATH": os.pathsep.join(map(str, (TESTS.parent, TESTS)))}
             asking = subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True)
             figures = asyncio.run(crowd(port, readers, seconds))

@@ -351,7 +351,7 @@ def test_stopping_leaves_a_resumable_folder(backend, control, tmp_path):
 
 @pytest.mark.slow
 def test_a_crowd_of_readers(tmp_path):
-    """Three hundred readers get every shard whole while it is generated, and /healthz answers."""
+    """Three hundred readers get every shard whole while it is generated, and /healthz answers at its own port."""
     crowd.main(20.0, 300, tmp_path / "crowd.json")
     figures = json.loads((tmp_path / "crowd.json").read_text())["figures"]
     assert figures["errors"] == [] and max(figures["memory_mb"]) < 150
