@@ -107,7 +107,8 @@ def rollout(config: RolloutConfig) -> tuple[Path, Rollout]:
     require_place(out)
     simulator = Simulator.load(config.weights, config.device, config.backend, config.precision)
     weights = find_weights(config.weights)
-    source = {"weights": weights.name, "weights_sha256": hashlib.sha256(weights.read_bytes()).hexdigest()}
+    digest = hashlib.sha256(weights.read_bytes()).hexdigest()
+    source: dict[str, str | int] = {"weights": weights.name, "weights_sha256": digest}
     frames = config.frames
     reference_TN3 = scene = None
     if config.data is None:

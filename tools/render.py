@@ -130,7 +130,7 @@ def _load(config: RenderConfig) -> Versions:
         other = read_rollout(file) if scene is None else weights_rollout(rollout, scene, file)
         if not np.array_equal(other.position_TN3[0], rollout.position_TN3[0], equal_nan=True):
             raise ConfigError(f"others[{i}] must begin with the same particles as {first}, got {file}")
-        if not np.array_equal(*map(_corners, (rollout, other))) or other.gravity != rollout.gravity:
+        if not np.array_equal(_corners(rollout), _corners(other)) or other.gravity != rollout.gravity:
             raise ConfigError(f"others[{i}] must have the obstacles and the gravity of {first}, got {file}")
         rule = f"{rollout.frame_rate_hz:g} frames a second"
         if other.frame_rate_hz != rollout.frame_rate_hz:
