@@ -126,7 +126,7 @@ def rollout(config: RolloutConfig) -> tuple[Path, Rollout]:
         initial = InitialState.of_episode(episode)
         obstacles = obstacles_of_episode(episode)
         reference_TN3 = episode.position_TN3[:frames]
-        source |= {"data": Path(config.data).name, "episode": config.episode}
+        source |= {"data": Path(config.data).name, "episode": str(config.episode)}
     limit, fastest = simulator.info.maximum_initial_speed, _fastest(initial)
     if limit is not None and fastest > limit * (1 + SAME_SPEED):
         print(
