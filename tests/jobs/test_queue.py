@@ -269,7 +269,7 @@ def trained_and_scored(name, configs, data):
     """A line that trains a network on data made before, exports it and scores it."""
     assert list(configs) == ["hgn.train", "hgn.export", "hgn.evaluate"]
     config, export, score = configs.values()
-    precision = "fp16" if config.network.kind == "hgn" else "auto"
+    precision = "fp16" if config.network.kind == "hgn" else "tf32"
     assert config.run == f"runs/{name}" and config.training.precision == precision
     made = data[config.dataset.folder]
     assert config.dataset.training_scenes == made.dataset.training_scenes
