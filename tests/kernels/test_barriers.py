@@ -14,10 +14,12 @@ from hgn.kernels.scene_tables import BARRIER_COLUMNS, SceneHash, SceneTable
 from hgn.kernels.step.op import DeviceStep
 from hgn.network.features import ParticleState
 from hgn.scene.barrier import build_barrier
+from hgn.scene.rotation import euler_rotation
 from hgn.step.reference import advanced, first_stop
 from hgn.step_config import StepConfig
 
 NO_CORNERS = np.zeros((0, 3, 3))
+SLOPE = square((0.0,) * 3, 1, 0.2) @ euler_rotation((0, 0, 30)).T + np.array((0.32, 0.42, 0.5))
 
 
 def both(before_N3, after_N3, scene_N, barriers, table, walls=None):
@@ -76,7 +78,8 @@ def met(seed):
 
 
 def within(count=8):
-    """Ways in a gutter of 60 degrees, and in a ball of many triangles, of which one passes more than stop it."""
+    """Ways in a gutter of 60 degrees, and in a ball of many triangles, of which one passes more than stop it; and one
+    that a slope leads into a wall."""
     generator = np.random.default_rng(0)
     begin_N3 = generator.uniform((0.498, 0.404, 0.45), (0.502, 0.406, 0.55), (count, 3))
     angle_N = generator.uniform(0, 2 * np.pi, count)
@@ -84,6 +87,7 @@ def within(count=8):
     return (
         (gutter(60), begin_N3, begin_N3 + generator.normal((0, -0.01, 0.01), 0.002, (count, 3))),
         (ball(12, 0.3) + 0.5, 0.5 + 0.29 * around_N3, 0.5 + 0.32 * np.roll(around_N3, 1, 0)),
+        (SLOPE, np.array([(0.33, 0.5, 0.5)]), np.array([(0.301, 0.38, 0.5)])),
     )
 
 
@@ -95,11 +99,11 @@ def test_ways_end_where_the_reference_ends_them():
     corners[1] = NO_CORNERS
     befores[1][0], afters[1][0] = (0.5, 0.3, 0.5), (0.5, 0.1, 0.5)
     afters[0][-2:] = [[np.nan] * 3, [2.5] * 3]
-    scene_N = np.repeat(np.arange(4), [len(before_N3) for before_N3 in befores])
+    scene_N = np.repeat(np.arange(5), [len(before_N3) for before_N3 in befores])
     before_N3, after_N3 = (np.concatenate(x).astype(np.float32) for x in (befores, afters))
     after_N3 = before_N3 + (after_N3 - before_N3)  # as the integration rounds it
     barriers = on_device(barriers_of(*corners))
-    table = SceneTable.of_barriers(barriers, 4, device())
+    table = SceneTable.of_barriers(barriers, 5, device())
     for found, expected in zip(table._hashes, table_of(*corners)._hashes, strict=True):
         assert_same(found and vars(found), expected and vars(expected))
     expected_N3, found_N3 = both(before_N3, after_N3, scene_N, barriers, table, (0.3, 0.3))
@@ -111,10 +115,11 @@ def test_ways_end_where_the_reference_ends_them():
         own_N = (scene_N == scene) & (np.abs(found_N3) < 1).all(1)
         stopped.append((~same_N & own_N).sum())
         passed.append(crossings(before_N3[own_N].astype(float), found_N3[own_N].astype(float), corner_F33))
-    assert min(stopped) > 0 and stopped[0] > 3 and passed == [0] * 4 and same_N[scene_N == 0].sum() > 4
+    assert min(stopped) > 0 and stopped[0] > 3 and passed == [0] * 5 and same_N[scene_N == 0].sum() > 4
     in_gutter, in_ball = (found_N3[scene_N == scene] for scene in (2, 3))
     assert in_gutter[:, 2] - afters[2][:, 2] == pytest.approx(0, abs=1e-6) and (in_gutter[:, 1] > 0.4).all()
     assert (np.linalg.norm(in_ball - 0.5, axis=1) < 0.3).all()
+    assert 0.3 <= found_N3[scene_N == 4][0, 0] < 0.301  # the wall acts on what the slope shifts
 
 
 def test_a_table_takes_the_rows_of_another():
