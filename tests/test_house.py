@@ -17,9 +17,9 @@ PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
     "hgn": 29_309,
-    "datagen": 8_531,
-    "tools": 7_198,
-    "tests": 28_700,
+    "datagen": 8_526,
+    "tools": 6_602,
+    "tests": 28_382,
 }
 SETTINGS = 239  # fields of the dataclasses behind the commands, *Config
 
