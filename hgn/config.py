@@ -306,7 +306,7 @@ class NetworkConfig:
     message_passing_steps: FewLayers = 4  # M: message-passing steps in each of the 2 L - 1 blocks
     width: LayerSize = 128  # number of values in latent vectors and hidden layers
     velocity_history: FewLayers = 5  # m: number of past velocities in the input
-    obstacle_features: bool = True  # inputs from the nearest obstacle; false is only for scenes without obstacles
+    obstacle_features: bool = True  # normals of obstacle cells as inputs; false is only for scenes without obstacles
     # absolute: the paper's velocities and wall distances; relative: hgn.network.relative, exact in free motion
     inputs: Annotated[str, one_of("absolute", "relative")] = "absolute"
     materials: tuple[MaterialName, ...] = PAPER_MATERIALS  # each of the materials has its own embedding

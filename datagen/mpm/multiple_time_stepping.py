@@ -7,8 +7,8 @@ strain and stress once a step.
 The stress of a step acts evenly over its substeps, because particles with shorter steps read the velocities of the same
 nodes in each substep. The whole impulse in one substep would give these particles wrong velocities, even at rest.
 
-If all particles in a block of nodes take the same steps, no particle reads its nodes within a step. Then the block
-receives the impulses of stress and gravity of the whole step in the first substep. It is not updated until the next.
+If all particles in a block of nodes take the same steps, no particle reads the block's nodes within a step. Then the
+block receives the impulses of stress and gravity of a whole step in its first substep, and no update in the others.
 """
 
 import taichi as ti
@@ -51,8 +51,8 @@ def _raise_marks(base, least: ti.i32, scene: ti.i32, arrays: ti.template(), begi
 def mark_changed(x, scene: ti.i32, now: ti.i32, many: ti.f32, inverse_dx: ti.f32, arrays: ti.template(), begin: ti.i32):
     """Marks the blocks of a particle's nodes: in the substep `now` they receive the impulse of `many` substeps.
 
-    A block's mark is block[begin + its index], the maximum of now MANY + MANY - many over all changes. So it stores the
-    latest substep with a change and the smallest number of substeps among this substep's changes (see change_of).
+    A block's mark is block[begin + its index]. It is the maximum of `now * MANY + (MANY - many)` over all changes. So
+    it stores the latest substep with a change and the smallest `many` among this substep's changes (see change_of).
     """
     base = base_node(x, inverse_dx)
     change = now * MANY + MANY - ti.cast(many, ti.i32)
@@ -132,7 +132,7 @@ def own_step(
     strained   end of the strain of the steps before; negative before the first step
     covered    end of the stress of the steps before
     spread     1 if that stress acts evenly over its substeps
-    marks      block[marks] is the first mark of mark_changed, one a block; the marks of _alike_around follow
+    marks      index in `block` of the first mark of mark_changed, one mark for each block; _alike_around's follow
 
     Returns six values:
     1. the time by which the step strains the particle
@@ -140,13 +140,13 @@ def own_step(
     3. the new `covered`
     4. the number of substeps in which the stress acts
     5. the new `spread`
-    6. the time of stress in this substep: the substep, if spread evenly; else the part that is not yet covered
+    6. the time of stress in this substep: the substep, if spread evenly; else the acting time without its covered part
 
     In a synchronised interval a stress computed at time t acts from half a step before t to half a step after t. The
     stresses of the interval's begin and end act for half a step. The remaining time of strain is divided into equal
-    steps. They are as long as the particle's stiffness allows, rounded down to substeps. `alike` is their number of
-    substeps; particles with the same `alike` have the same steps. In other intervals, and in the last substep of each,
-    a step is a substep.
+    steps. They are as long as the particle's stiffness allows, rounded down to substeps. `alike` is the number of
+    substeps in each of these steps; particles with the same `alike` have the same steps. In intervals that are not
+    synchronised, and in the last substep of every interval, a step is one substep.
     """
     elapsed = arrays.scene_value[scene, VALUE.interval_elapsed]
     left = arrays.scene_value[scene, VALUE.interval_remaining]

@@ -5,9 +5,9 @@ import taichi as ti
 from datagen.mpm.layout import COUNT, SETTING, STATUS, VALUE
 from hgn.solver_method import SPEED_FRACTION
 
-# number of steps of stress in an interval from which it is synchronised (see mls_mpm). With fewer no material at rest
-# gained energy, but material that hit the ground at 10 m/s ended 6 % from the result with half the step. So intervals
-# of fast particles are synchronised too.
+# An interval with at least this number of stress steps is synchronised (see mls_mpm). With fewer steps resting material
+# gained no energy, but the result of an impact on the ground at 10 m/s changed by 6 % if the steps were halved. So an
+# interval that a fast particle shortens is synchronised too.
 SYNCHRONISED_FROM = 3.0
 SPEED_MARGIN = 1.25  # a particle that gains speed may move this much farther than planned for an interval
 
@@ -71,7 +71,7 @@ def choose_time_step(
         limit = fraction * dx / ti.sqrt(stiffness * ti.min(growth, 2.0))
         begins = left == 0.0
         catch_up = 0.0
-        shift = 0.0  # difference of the time between the middles of two intervals and the present interval
+        shift = 0.0  # (time between the middles of the last and the present interval) - (the present interval)
         if begins:
             last_interval = elapsed
             elapsed = 0.0
@@ -105,7 +105,7 @@ def choose_time_step(
                 step = 0.5 * whole
                 ahead += 1.0
             else:
-                full = ti.max(ti.ceil(ti.min(left / limit, 1e9) - 0.5 - 1e-4), 0.0)  # steps before the last, half one
+                full = ti.max(ti.ceil(ti.min(left / limit, 1e9) - 0.5 - 1e-4), 0.0)  # whole steps; a half one follows
                 ahead = full + 1.0
                 whole = left / (full + 0.5)
                 step = whole if full > 0.0 else left

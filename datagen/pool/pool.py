@@ -31,7 +31,7 @@ class Stopped(Exception):  # noqa: N818 - a request, not an error
 
 
 class Pool:
-    """Generates the unclaimed episodes of the shards that this generator makes, and publishes the shards."""
+    """Claims shards, generates their missing episodes, and publishes the shards."""
 
     def __init__(
         self,
@@ -123,7 +123,7 @@ class Pool:
         return shard is not None
 
     def _hand_out(self) -> None:
-        # a solver on a GPU reports idle once it has received scenes, so solvers without scenes come first
+        # a GPU solver asks for its next scenes as soon as it has received some, so solvers without scenes come first
         for solver in sorted(self._solvers, key=lambda solver: (bool(solver.tasks), solver.given)):
             others_first = solver.tasks and any(other.idle and not other.tasks for other in self._solvers)
             if solver.idle and not others_first and (batch := self._next_batch(solver)):
@@ -162,7 +162,7 @@ class Pool:
         for made in self._ready:
             group = self._group.get(made.task.key)
             if group is not None:
-                if solver.tasks:  # being staged; next to other scenes the cause of a death would be unclear
+                if solver.tasks:  # these are still being staged; the group runs alone to show which scenes end a worker
                     return []
                 batch = [other for other in self._ready if self._group.get(other.task.key) == group]
                 self._ready = [other for other in self._ready if self._group.get(other.task.key) != group]

@@ -84,8 +84,8 @@ class EpisodeSampler:
 
     `published(epoch)` is called when an epoch begins. It returns the number of frames of each published episode, in
     publication order. It must return the same list on every rank, and continue the list of the epoch before. Episodes
-    published after a resumed epoch began wait for the next epoch. `digest(count)` identifies the first `count` episodes
-    (`hgn.data.index`). `particles(episodes)` returns particle counts. They balance the ranks.
+    that are published after an epoch began are used from the next epoch on, also after a resume. `digest(count)`
+    identifies the first `count` episodes (`hgn.data.index`). `particles(episodes)` returns counts to balance the ranks.
     """
 
     def __init__(

@@ -13,8 +13,8 @@ cube. The columns are, in this order:
 | 6 | walls within CONTACT_REACH_CELLS R, lower x, y, z, then upper |
 | 3 + 3 | obstacle normals at the particle and ahead of it; only with obstacle_features |
 
-G = sum_C w_pC t_C uses t_C of `disturbance`. It is at least the particle's own `surface_gate`. In a pile it is above 0
-even for particles out of reach. Particles in the same coarsest cell, or in one across a face, are then in reach.
+G = sum_C w_pC t_C, with t_C of `disturbance`, is at least the particle's own `surface_gate`. G is above 0 if some
+particle in the same coarsest cells, or in cells across their faces, is within reach of a surface, as in a pile.
 
 The decoder returns an acceleration r and a stress sigma for each particle. `balanced` computes the acceleration from
 them. These properties hold for any parameters:
@@ -38,17 +38,17 @@ from hgn.network.grid import CORNER_83, DIRECTION_63, GridHierarchy
 from hgn.network.obstacles import ObstacleCells
 
 CONTACT_REACH_CELLS = 3.0  # distance from a wall, in R, at which the network begins to see it
-WALL_LIMIT = 2.0  # largest wall_nearness: the particle is behind the plane by the reach
+WALL_LIMIT = 2.0  # largest wall_nearness, reached one `reach` behind the plane
 STEPS_AHEAD = 4  # number of places on the path of the next frame that are searched for an obstacle
-QUIET = 0.01  # changes and differences of velocity that count as full disturbance, in s_a; rounding is 1e-5 to 1e-4
+QUIET = 0.01  # change or difference of velocity that is full disturbance, in units of s_a; rounding is 1e-5 to 1e-4
 OUTPUTS = 9  # numbers of the decoder per particle: an acceleration, and a stress xx, yy, zz, yz, xz, xy
 STRESS_33 = ((3, 8, 7), (8, 4, 6), (7, 6, 5))  # columns of the stress in the decoder's output
 SMALLEST_MASS = 1e-30  # lower bound of a cell's mass; a cell without weight gets velocity 0
-# A surface's effect fades below FEW particles in contact, and below the fraction RARE of contacts in its direction.
+# A surface's effect fades if its contacts weigh less than FEW particles, or less than RARE of the cell's contacts.
 FEW, RARE = 0.1, 1e-3
-# Particles on a line define no rotation about it. A rotation fades out if the product of the principal moments is below
-# (THIN times their mean)^3, or if their mean is below POINT. POINT is in squared edges of a coarsest cell, as moments
-# are; a cube with edges of a thirteenth of the cell's edge has this moment.
+# Particles on a line define no rotation about it. So a rotation fades out if the product of the three principal moments
+# is below (THIN * mean moment)^3, or if the mean moment is below POINT. Unit: squared edges of a coarsest cell. A cube
+# with 1/13 of that edge has the moment POINT.
 THIN = 0.2
 POINT = 1e-3
 
@@ -155,7 +155,7 @@ def surface_normals(wall_N6: torch.Tensor, normal_N6: torch.Tensor | None) -> to
     """Returns the sum of n n^T of the surfaces within reach, [N, 3, 3].
 
     Walls count with the gate of `surface_gate`. The obstacle's normal at the particle counts; if it is 0, the one ahead
-    counts. n n^T has no sign, so the sum does not jump between surfaces that face each other.
+    counts. n and -n give the same n n^T, so two surfaces that face each other do not cancel.
     """
     near_N6 = (2 * wall_N6).clamp(max=1)
     normal_N33 = torch.diag_embed(near_N6[:, :3] + near_N6[:, 3:])
@@ -177,7 +177,7 @@ def slip(normal_C33: torch.Tensor) -> torch.Tensor:
     """Returns Q = (1 + S / (FEW + RARE tr S))^-1 [C, 3, 3] of the `touched_normals` S.
 
     Q projects on directions that surfaces leave free. Away from surfaces it is 1. Near a plane it is 1 along the plane
-    and almost 0 along its normal. In a corner it is 1 only along the corner.
+    and almost 0 along its normal. Between two planes it is 1 only along their common edge.
     """
     ratio_C33 = normal_C33 / (FEW + RARE * trace(normal_C33))[:, None, None]
     determinant_C, adjugate_C33 = adjugate(ratio_C33 + torch.eye(3, dtype=ratio_C33.dtype, device=ratio_C33.device))
@@ -202,8 +202,8 @@ def disturbance(
 
     `disturbed` is 0 if all particles in the surroundings fly freely as one rigid body. A particle is disturbed by a
     surface within reach (`surface_gate`), or if a column of history or surroundings is not small against QUIET. A
-    coarsest cell is as disturbed as the most disturbed particle in it and in the cells across its faces. An impact acts
-    through a body within a frame. `touched` is computed in the same way, from surfaces only.
+    coarsest cell is as disturbed as the most disturbed particle in it and in the cells across its faces. These cells
+    count because an impact crosses a body within one frame. `touched` is computed in the same way, from surfaces only.
     """
     own_N = (touch_N + (motion_NK / QUIET).square().sum(-1)).clamp(max=1)
     cell_N8, coarsest = coarsest_cells(grid), grid.levels[-1]
@@ -236,15 +236,15 @@ def balanced(output_N9: torch.Tensor, contacts: Contacts, grid: GridHierarchy) -
         e              unit vector from the cell to its neighbour C'
         f, f'          M_C / (M_C + M_C') and 1 - f
 
-    Times M_C d_C the term A_C is antisymmetric, and there is no division by a small mass. So sum_p a_p is
+    Each term of M_C d_C A_C is antisymmetric in C and C', and no term is divided by a small mass. So sum_p a_p is
     sum_C d_C t_C M_C R_C, which is 0 without a surface in reach. Cells exchange momentum across faces as in finite
-    volumes. A symmetric stress causes no rotation.
+    volumes. A symmetric stress has no torque at a point, but the forces T and -T on a pair of cells have one.
 
-    Rotation is subtracted so that sum_p x_p x a_p is 0 there too. y_p is the particle's place relative to the cell's
-    centre of mass X. I and L are the cell's means of inertia and of y x r. With (q, W) = `rotation`(I, L), r_p - R
-    becomes q (r_p - R) - W x y_p. T on one cell and -T on the other, at the distance D = X' - X, turn the pair. Its
-    rotation about the common centre is subtracted: with (q, W) of I f + I' f' + f f' (D^2 - D D^T) and of -f f' D x T
-    a cell gets f' (q T + W x D) - W x y_p. This is a projection, so small and thin bodies do not amplify anything.
+    Rotation is subtracted so that sum_p x_p x a_p is 0 too without a surface in reach. Let y_p be the particle's place
+    relative to the cell's centre of mass X, and I and L the cell's means of inertia and of y x r. r_p - R becomes
+    q (r_p - R) - W x y_p with (q, W) = rotation(I, L). Let D = X' - X. The cell gets f' (q T + W x D) - W x y_p instead
+    of f' T, with (q, W) = rotation(I f + I' f' + f f' (D^2 - D D^T), -f f' D x T) of the pair about its common centre.
+    Each of these is a projection times q, so it never enlarges mean squares, even for small or thin bodies.
 
     t_C Q_C R_C is subtracted too, where Q is `slip` of the `touched_normals`. Then the mean force of surfaces on a cell
     is along their normals. Bodies slide on a plane without friction or propulsion, for any parameters.
@@ -290,7 +290,7 @@ def balanced(output_N9: torch.Tensor, contacts: Contacts, grid: GridHierarchy) -
 
 
 def coarsest_places(grid: GridHierarchy) -> torch.Tensor:
-    """Returns the places of particles in the ancestors of `coarsest_cells`, [N, 8, 3]: from the centre, in edges."""
+    """Returns the particles' places relative to the centres of their `coarsest_cells`, in cell edges, [N, 8, 3]."""
     corner_83 = CORNER_83.to(grid.fraction_N3)
     place_N83, cell_N8 = grid.fraction_N3[:, None] - corner_83, grid.cell_N8
     for level in grid.levels[:-1]:
@@ -310,7 +310,7 @@ def rotation(inertia_K33: torch.Tensor, moment_K3: torch.Tensor) -> tuple[torch.
     """Returns q [K], from 0 (a line or a point) to 1 (a determined rotation), and W [K, 3] with I W = q L.
 
     q = det I / (det I + m) and W = adj(I) L / (det I + m), with m = (THIN (tr I / 3 + POINT))^3. The denominator is
-    positive, so neither jumps. A field times q, minus W, has no angular momentum.
+    positive, so q and W do not jump. If a field u has the angular momentum L, the field q u - W x y has none.
     """
     determinant_K, adjugate_K33 = adjugate(inertia_K33)
     determinant_K = determinant_K.clamp(min=0)

@@ -40,7 +40,7 @@ LEAST = 1e-30  # lower bound of a squared limit; avoids a division by zero
 REST_SIZES, LEVEL_SHIFT = 2, 2  # number of cell sizes; each size is 2^LEVEL_SHIFT times the size before
 FRICTIONLESS = ("water",)  # materials without rest on the larger cells
 # Contact is tested at (1 - SLACK) clearance. End points lie at the clearance, so rounding triggers no second contact.
-# A particle that starts nearer than the test distance and approaches ends farther away by SLACK clearance.
+# If a particle starts nearer than that and approaches, it ends SLACK * clearance farther away than it started.
 SLACK = 0.02
 SURFACES = 3  # largest number of triangles that shift the end of one path; at the next triangle the path ends
 LEAST_CREASE = 1e-4  # squared sine of the angle between two planes; planes at a smaller angle count as one
@@ -265,7 +265,7 @@ def _outside_obstacles(
 def _direction(normal_N3: torch.Tensor, last_N3: torch.Tensor) -> torch.Tensor:
     """Returns the unit normals, or directions along the previous planes if the normals lead back across these.
 
-    Such a direction is longer than 1, so that the end moves by the same distance from the new plane.
+    Such a direction has the component 1 along the normal, so that the end moves as far from the new plane as with it.
     """
     cosine_N1 = (normal_N3 * last_N3).sum(-1, keepdim=True)
     along_N3 = normal_N3 - cosine_N1 * last_N3

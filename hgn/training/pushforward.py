@@ -61,8 +61,8 @@ def simulated_frames(training: TrainingConfig, frame_count: int) -> int:
 def drawn_starts(training: TrainingConfig, update: int, rank: int, frame_counts: Sequence[int]) -> Starts:
     """Draws the episode and the start frame of each simulation before `update`.
 
-    Every episode is drawn once before one is drawn twice. The start leaves frames for the whole simulation and one
-    target, or for half of the episode if that is less. `frame_counts` are the numbers of frames of the episodes.
+    Every episode is drawn once before one is drawn twice. The latest start leaves min(simulated frames, half of the
+    episode) frames to simulate and one target. `frame_counts` are the numbers of frames of the episodes.
     Raises: ConfigError if all episodes are too short.
     """
     last = {
