@@ -13,7 +13,7 @@ WallClearance = tuple[NonNegative[float], NonNegative[float]]
 class StepConfig:
     """The constraints of simulated frames (hgn.step). They need no training. Lengths are in domain units."""
 
-    # deformation of particles in contact stops if it is slower than this times |g| per frame; 0: none stops
+    # deformation of particles in contact stops if its speed is below rest_threshold * |g| * (one frame); 0: never
     rest_threshold: NonNegative[float] = 0.0
     # smallest distance from the domain's planes at the near sides (0) and at the far sides; null: no walls
     wall_clearance: WallClearance | None = None
@@ -30,7 +30,7 @@ class StepConfig:
 
     @property
     def in_training(self) -> StepConfig:
-        """Returns the constraints of pushforward simulations: only obstacles. Errors at rest and walls stay visible."""
+        """Returns the constraints of pushforward simulations: obstacles only, so errors at rest and walls remain."""
         return StepConfig(obstacle_clearance=self.obstacle_clearance)
 
     def require_fits(self, relative: bool, dimensions: int) -> None:

@@ -7,8 +7,8 @@ a particle with the config's density.
 Each transfer smooths velocities, so transfers have their own rate. The interval between two transfers contains as many
 substeps as the stiffest particle needs. With adaptive steps an interval is synchronised if it needs three or more
 substeps, or if a fast particle shortens it. Then it has one more substep, and its first and last are half as long as
-the others. Stress acts from half a step before to half a step after its time (velocity Verlet). Velocities half a step
-ahead of the stresses would feed oscillations of two periods an interval. Their energy could double in each interval.
+the others. Stress acts from half a step before to half a step after its time (velocity Verlet). If velocities were half
+a step ahead of stresses, oscillations with two periods in an interval could double their energy in each interval.
 
 At the end of an interval that is not synchronised, strain is one step behind, and velocity half a step. The first
 substep of a following synchronised interval compensates both (VALUE.catch_up). In the opposite case the first substep

@@ -26,11 +26,11 @@ from hgn.scene.scene import Scene, whole_cells
 from hgn.scene.shapes import shape_obstacle
 from hgn.schema import ConfigError, require
 
-# Thread blocks that run on a processor concurrently. Taichi compiles kernels for two of any size: a thread has 64
-# registers with 512 threads a block, 128 with 256, and 255 with 128.
+# Number of thread blocks that run on a processor concurrently. Taichi compiles kernels for two blocks of any size: a
+# thread has 64 registers with 512 threads a block, 128 with 256, and 255 with 128.
 GPU_BLOCKS = 2
 TEAM_THREADS, TEAM_BLOCKS, TEAM_RUN = 256, 3, 4  # for many scenes, which teams compute in turn
-EVEN = 0.95  # with one block a scene, the smallest ratio of the mean scene's time to the launch's
+EVEN = 0.95  # smallest (mean time of a scene) / (time of the launch) for which each scene gets only one block
 SHARED_THREADS, SHARED_BLOCKS = 128, 8  # threads a block, and fewest blocks of each of a few scenes
 SHARED_PARTICLES = 8  # fewest particles of such a block
 LARGE_PARTICLES = 4096  # particles per processor above which a scene's blocks are as large as those of many scenes
@@ -66,9 +66,9 @@ def simulate(
     Scenes may differ in particles, materials, obstacles and gravity. They share domain and cell size.
     With adaptive time steps particles and grid exchange velocities every dx / transfer_speed_m_s, or every step of
     stress if that is longer. The interval is at most SPEED_FRACTION dx / |v|max. Intervals are equal up to the end of
-    the frame. Each scene takes its own steps of stress between, of at most stability_fraction dx sqrt(rho / (3 lambda_h
-    + 2 mu_h)). A fixed time step has a transfer in each step. It is taken ceil(frame / step) times a frame, as in
-    Taichi Elements: 54 times at 60 Hz and 3.125e-4 s, which is 1.25 % more than the frame.
+    the frame. Within them each scene takes its own steps of stress, of at most stability_fraction dx sqrt(rho /
+    (3 lambda_h + 2 mu_h)). With a fixed time step each step has a transfer. A frame has ceil(frame / step) steps, as in
+    Taichi Elements: 54 steps at 60 Hz and 3.125e-4 s, which are 1.25 % longer than the frame.
 
     `on_frame(t)` is called when frame t of all scenes is complete, from 0. `cpu_threads` applies to the process's first
     simulation (see `initialise`). `colliders` are results of `build_collider` for the scenes; None: they are built.

@@ -244,8 +244,8 @@ def advance(
     the next, until all are done. With `several` blocks, all blocks of the launch must run concurrently. Particles are
     sorted at the begin of each frame. P and G are the numbers of particles and nodes of all scenes.
 
-    At addresses (see device_memory): state [2 * fields * P]; node [2, G, 4], first changes of momentum in a step and
-    of mass in an interval (zero between them), then velocities, and at an interval's end the mass.
+    At addresses (see device_memory): state [2 * fields * P]; node [2, G, 4]. node[0] has changes of momentum in a step
+    and of mass in an interval (zero between them); node[1] has velocities, and at an interval's end the mass.
     Arrays: tag [2 * 3 * P]; work space rank, spread, response [6 * P], hidden (see grid_kernel.substep) and column_list
     [P]; zero at first are cell_count [G], column_count [G / 4], the flags in block [8 * G / 64], columns
     [6 * blocks * teams] and meeting [MEETING * (teams + 1) + scenes]; turn [scenes] is the order of the scenes, long

@@ -263,7 +263,7 @@ class DatasetWriter:
         return entry
 
     def _winner(self, shard: ShardRange) -> ShardEntry | None:
-        """Returns another generator's shard with these episodes, or None. It protects against locks without effect."""
+        """Returns another generator's shard with these episodes, or None. On some file systems locks have no effect."""
         self.refresh()
         if missing_ranges([shard], self._published) == [shard]:
             return None

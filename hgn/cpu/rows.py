@@ -1,6 +1,6 @@
 """Computes rows of an MLP in PyTorch without gradients: gathers from a table, multiplies, normalises, sums by segment.
 
-This is the reference for hgn.cpu.compiled. Where only sums are needed, gain and shift of the norm are applied to them.
+This is the reference for hgn.cpu.compiled. If only sums are needed, gain and shift of the norm are applied to the sums.
 Shape legend: R rows, K rows of a table, S segments, W width.
 """
 

@@ -66,7 +66,7 @@ class FrameImportance:
     def draw(self, slot: int, seed: int) -> tuple[int, float]:
         """Returns the frame for sample number `slot` of F, and its loss weight.
 
-        Draws are stratified: each slot has its own F-th of the distribution, in which `seed` chooses.
+        Draws are stratified: each slot has its own 1 / F of the distribution, and `seed` chooses the place in it.
         """
         return self.draws.at((slot + _fraction(seed)) / len(self.acceleration_F))
 

@@ -31,16 +31,16 @@ from hgn.scene.episode import POSITION_MEMBER, Episode, decode_episode
 from hgn.schema import ConfigError, printable, require
 from hgn.system.patience import UnreachableError, standard_patience_s
 
-AGAIN_S, FORGOTTEN_S = 1.0, 60.0  # interval of reads after a fault of the manifest; time after which it is forgotten
+AGAIN_S, FORGOTTEN_S = 1.0, 60.0  # interval of reads after a fault of the manifest; time until the fault is forgotten
 MAPPED_SHARDS = 256  # largest number of mapped shards; also at most a quarter of the files that a process may open
 
 
 class Episodes(Sequence[Episode], ABC):
     """A sequence of episodes.
 
-    An episode is opened, and its shard verified, on first use. In another folder the positions are a copy, because
-    truncation of a mapped file would end the process. In this machine's cache, and with `open`, they are a read-only
-    `np.memmap`. Raises on access: ConfigError if a shard is missing or altered.
+    An episode is opened, and its shard verified, on first use. In this machine's cache, and with `open`, positions are
+    a read-only `np.memmap`. In other folders they are a copy, because truncation of a mapped file would end the
+    process. Raises on access: ConfigError if a shard is missing or altered.
     """
 
     @abstractmethod
@@ -180,7 +180,7 @@ class EpisodeStore(Episodes):
     def fetch_ahead(self, episodes: Sequence[int] | None = None) -> None:
         """Starts to fetch shards in the background, one after the other. It does nothing for a folder.
 
-        It fetches all published shards, or those of `episodes` in order. Only then a full cache drops older shards.
+        It fetches all published shards, or those of `episodes` in order. A full cache drops older ones for these only.
         """
         if not is_remote(self.folder):
             return
@@ -223,7 +223,7 @@ class EpisodeStore(Episodes):
         return (entry for shard in self.manifest.shards_of(self.split) for entry in shard.episodes)
 
     def frames(self, count: int | None = None) -> list[int]:
-        """Returns the frame counts of the first `count` episodes (None: all). Reads the index only if they differ."""
+        """Returns the frame counts of the first `count` episodes (None: all). Reads the index unless all are equal."""
         count, config = len(self) if count is None else count, self.manifest.config
         if "frames" in config and "long_fraction" not in config:
             return [config["frames"]] * count

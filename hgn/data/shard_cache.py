@@ -72,7 +72,7 @@ Fill = Callable[[BufferedRandom], None]
 def cached_shard(shard: CachedShard, patience_s: float, spared: Collection[str] | None, fill: Fill) -> Path:
     """Returns the verified file of a shard. If it is missing, `fill` completes a file that may contain its beginning.
 
-    A full cache removes shards for it, except those with a sha256 in `spared`; with None it removes none.
+    A full cache removes other shards, except those with a sha256 in `spared`; with None it removes none.
     Raises: ConfigError; UnreachableError while another process fetches the file without progress; OSError (full disk or
     cache); exceptions of `fill`.
     """

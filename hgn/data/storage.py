@@ -55,7 +55,7 @@ def outliving() -> bool:
 
 
 def ask(folder: Path | str, read: Callable[[Storage], T]) -> T:
-    """Returns `read` of a data set's storage. Raises: as `read`; UnreachableError inside `faults_outlived`."""
+    """Returns the result of `read` for a data set. Raises: as `read`; UnreachableError inside `faults_outlived`."""
     storage, place = open_storage(folder), str(folder)
     if not outliving():
         return read(storage)
@@ -84,7 +84,7 @@ class Storage(ABC):
     ) -> Path:
         """Returns the path of a verified shard on this machine.
 
-        A full cache removes shards for it, except those with a sha256 in `spared`; with None it removes none.
+        A full cache removes other shards, except those with a sha256 in `spared`; with None it removes none.
         Raises: ConfigError; UnreachableError; OSError (full disk or cache).
         """
 

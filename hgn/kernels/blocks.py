@@ -1,8 +1,8 @@
 """Holds functions that several kernels use: matrix products at a chosen precision, layer normalisation, its gradient.
 
 The precision is a compile-time name. With tf32 operands have 10 bits of mantissa and float32's range; the host rounds
-weights before (see nearest_tf32). With fp16 they have 10 bits and float16's range. With fp32, which is for tests,
-nothing is rounded. Sums are always float32.
+weights beforehand (see nearest_tf32). With fp16 operands have 10 bits and float16's range. With fp32, which is for
+tests, nothing is rounded. Sums are always float32.
 """
 
 from __future__ import annotations
@@ -147,8 +147,8 @@ def nothing_to_do(count, BLOCK: tl.constexpr):
 
 @triton.jit
 def inside(vector, tile):
-    """Returns `vector` as a value inside the loop over tiles, which are numbered from 0.
-    Before the loop each thread would hold a quarter of it in the layout of the matrix units, and registers spill."""
+    """Returns `vector` as a value inside the loop over tiles, which are numbered from 0. With a value from before the
+    loop each thread would keep a quarter of it in the layout of the matrix units, and registers would spill."""
     return tl.where(tile >= 0, vector, 0.0)
 
 
@@ -195,7 +195,7 @@ def normalise(z, WIDTH: tl.constexpr):
 @triton.jit
 def normalise_once(z, WIDTH: tl.constexpr, PRECISION: tl.constexpr):
     """Returns the same as `normalise`, and at lower precisions computes both sums in one pass.
-    Cancellation costs less than rounded operands if a row's mean is within about ten standard deviations."""
+    Cancellation costs less than rounded operands if a row's |mean| is below about ten standard deviations."""
     if PRECISION == "fp16":
         mean = tl.sum(z, 1) / WIDTH
         variance = tl.maximum(tl.sum(z * z, 1) / WIDTH - mean * mean, 0.0)

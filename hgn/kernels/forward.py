@@ -66,7 +66,7 @@ class FusedNetwork(Buffers):
         self.device = values.device
         rounded = precision in ("fp16", "tf32")
         self.weights = torch.empty_like(values, dtype=self.operand) if rounded else values
-        # Simulations use a finer encoder: falling particles repeat their features, and rounding would push all one way.
+        # Simulations use a finer encoder: falling particles have equal features, so rounding would move all alike.
         self.fine = rounded and not training
         self.encode_weights = torch.zeros(self.width, grid.features, device=self.device)
         self.tuning = tuning or Tuning.of(precision)

@@ -25,7 +25,7 @@ from hgn.scene.material import MATERIALS
 from hgn.schema import ConfigError
 
 WALL_DISTANCE_CELLS = 8.0  # d_max / R of the paper
-# Standard deviation of accelerations along an axis without motion: as a factor it changes no position, and it is not 0.
+# Standard deviation of accelerations along an unused axis: as a factor too small to move particles, as a divisor not 0.
 STILL = 1e-30
 
 

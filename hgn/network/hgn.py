@@ -57,8 +57,8 @@ class MessagePassing(nn.Module):
 class HierarchicalGraphNetwork(ParticleNetwork):
     """Predicts the acceleration of every particle, in frame units.
 
-    Without obstacle features the input has no normals (the paper's second data set). With them, a scene without
-    obstacles skips the product with their columns. This is exact, because the normals are zero.
+    Without obstacle features the input has no normals (the paper's second data set). With obstacle features, scenes
+    without obstacles skip the product with the normals' columns. This is exact, because their normals are zero.
     """
 
     def __init__(self, config: NetworkConfig) -> None:
@@ -108,7 +108,7 @@ class HierarchicalGraphNetwork(ParticleNetwork):
     def propagate(self, particle_NW: torch.Tensor, grid: GridHierarchy) -> torch.Tensor:
         """Returns the decoder's output for latent particles (steps 1 to 12).
 
-        It is [N, 3] normalised accelerations, or [N, 9] with relative inputs, the input of `relative.balanced`.
+        Normalised accelerations [N, 3]; with relative inputs the values [N, 9] that `relative.balanced` takes.
         """
         corner_83 = CORNER_83.to(particle_NW)
         # Offset from a fine cell in octant o to its parent's centre, in fine cells: 1/2 - o.

@@ -1,4 +1,4 @@
-"""Simulation with gradients by the initial state and by the poses of obstacles.
+"""Simulation with gradients with respect to the initial state and the poses of obstacles.
 
 docs/how_to/gradients.md lists which gradients are exact, which are valid only within a cell, and for how many frames.
 Shape legend: T frames, N particles, H velocities, F triangles.
@@ -53,7 +53,7 @@ def simulate(
 ) -> torch.Tensor:
     """Returns positions [T, N, 3]. `start` is the scene's state at frame 0 from `Simulator.start`.
 
-    The backward pass computes each frame again. So memory contains one frame and the states between frames.
+    The backward pass computes each frame again. So memory holds the states between frames and one frame's results.
     The network's parameters get no gradients. Raises: ConfigError, DivergedError.
     """
     require(frames >= 1, "frames", "at least 1", frames)
@@ -85,7 +85,7 @@ def simulate(
 class _Frame(torch.autograd.Function):
     """A frame without its intermediate results. The backward pass computes them again.
 
-    torch.utils.checkpoint calls Python for each result. On a GPU these calls take as long as the results.
+    torch.utils.checkpoint does the same, but calls Python for each result. On a GPU a call takes as long as the result.
     """
 
     @staticmethod
@@ -103,7 +103,7 @@ class _Frame(torch.autograd.Function):
         with torch.enable_grad():
             outputs = context.step(*variables)
         wanted = [tensor for tensor in variables if tensor.requires_grad]
-        # outputs without a gradient are left out, e.g. by poses when no obstacle stops a particle
+        # outputs without a gradient are left out; for example, none depends on poses if no obstacle stops a particle
         reached = [pair for pair in zip(outputs, gradients, strict=True) if pair[0].requires_grad]
         ends, slopes = [output for output, _ in reached], [gradient for _, gradient in reached]
         computed = iter(torch.autograd.grad(ends, wanted, slopes, allow_unused=True))
@@ -203,7 +203,7 @@ def _obstacles(
 def _barriers(
     scene: Scene, placements: Mapping[int, Placement], clearance: float, device: torch.device, dtype: torch.dtype
 ) -> Barriers | None:
-    """Returns barriers of the placed obstacles. Rows have gradients by the poses; lists of cells have none."""
+    """Returns barriers of the placed obstacles. Rows are differentiable by the poses; lists of cells are not."""
     cell_size, parts = scene.cell_size, []
     for i, obstacle in enumerate(scene.obstacles):
         staying = i not in placements

@@ -93,7 +93,7 @@ class Simulation:
 
     @property
     def static_state(self) -> ParticleState:
-        """`state`, but with the positions and velocities of the last edit. It needs no copy from the device."""
+        """Returns `state`, but with positions and velocities of the last edit, so it needs no copy from the device."""
         return self._state
 
     @property

@@ -55,7 +55,7 @@ class InitialState:
     # obstacles' cells are known, and the obstacle constraint does not act
     corners: Callable[[], np.ndarray] | None = None
     materials: tuple[str, ...] = MATERIALS
-    past_HN3: np.ndarray | None = None  # frames before this one, oldest first; None: free flight before it
+    past_HN3: np.ndarray | None = None  # frames before frame 0, oldest first; None: free flight before frame 0
     dimensions: int = 3
     emitting: Scene | None = None  # the scene, if particles enter later; they follow the others
 
@@ -205,7 +205,7 @@ class Simulator:
         """Simulates `frames` frames including frame 0. Returns float32 [frames, N, 3] for each scene.
 
         A particle that enters later is NaN until its frame. `on_frame(t)` is called after frame t.
-        Raises: ConfigError as `start`; DivergedError with the frame, after which only more training helps.
+        Raises: ConfigError as `start`; DivergedError with the frame of divergence; only more training prevents it.
         """
         return self.paths(scenes, frames, on_frame)[0]
 
@@ -289,8 +289,8 @@ class Simulator:
 
         Arguments replace the scene's own values: positions and velocities [N, 3], gravity [3] (relative inputs only),
         the domain's size [3]. Units are domain units and seconds. `poses` rotates and shifts obstacles by number.
-        `smoothing`, 0 to 1 obstacle cells, makes normals continuous (hgn.network.posed_obstacles). PyTorch computes it
-        with one frame's intermediate results in memory. docs/how_to/gradients.md lists all quantities with gradients.
+        `smoothing`, 0 to 1 obstacle cells, makes normals continuous (hgn.network.posed_obstacles). PyTorch computes all
+        and keeps one frame's intermediate results in memory. docs/how_to/gradients.md lists quantities with gradients.
         Raises: ConfigError and DivergedError as `rollout`.
         """
         inputs = Inputs(position_N3, velocity_N3, gravity_3, domain_size_3, poses=poses, smoothing=smoothing)

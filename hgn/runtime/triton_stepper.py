@@ -31,13 +31,13 @@ from hgn.step.reference import rested
 from hgn.step_config import StepConfig
 
 LOOK_FRAMES, FEWEST_FRAMES = 32, 4  # largest and smallest number of frames in a block
-CROWDED = 140  # particles in a finest cell above which it is crowded; 1.5 times the density of bodies in the data
+CROWDED = 140  # number of particles above which a finest cell is crowded; 1.5 times the density of bodies in the data
 PATH_BYTES = 1 << 27  # memory of positions on their way to the host; with many particles it shortens blocks
-GROWTH = 2.0  # factor from the needed cells to the new capacity when buffers grow
-# The same factors above ROOMY_CELLS cells: for the first capacity, and when buffers grow.
+GROWTH = 2.0  # (new capacity) / (needed cells) when buffers grow
+# Smallest values of HEADROOM and GROWTH, used by scenes with many more than ROOMY_CELLS cells.
 TIGHT_START, TIGHT_GROWTH = 1.25, 1.5
-HEADROOM = 8.0  # first capacity over the cells of a scene's start; groups that fall and spread need up to six times
-SPREAD_CELLS = (0.6, 0.1, 0.035, 0.02)  # largest number of cells per particle, by level; coarser ones as the last
+HEADROOM = 8.0  # (first capacity) / (cells at a scene's start); groups that fall and spread need a factor of up to six
+SPREAD_CELLS = (0.6, 0.1, 0.035, 0.02)  # largest number of cells per particle, by level; coarser levels have the last
 ROOMY_CELLS = 65_536  # finest cells up to which a first capacity has HEADROOM; above it memory is scarce
 CHECKED_PARTICLES = 50_000  # largest number of particles in the comparison with PyTorch, which needs memory
 
@@ -215,7 +215,7 @@ class TritonStepper:
     def _build(self, capacities: tuple[int, ...]) -> None:
         config, window = self.config, self._window()
         self.graph = None
-        # limits: the cells of the window, and eight cells a particle
+        # no level can have more cells than the window contains, or more than eight for each particle
         limits = [self.scenes * math.prod(n >> i for n in window.cells) for i in range(config.levels)]
         limits = [min(limit, 8 * self.particles) for limit in limits]
         rounded = tuple(16 * math.ceil(max(1, min(c, m)) / 16) for c, m in zip(capacities, limits, strict=True))

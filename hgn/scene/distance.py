@@ -18,7 +18,7 @@ POINTS_PER_CHUNK = 1 << 14  # limit for which temporary arrays fit into a core's
 PAIRS_PER_CHUNK = 1 << 14  # the same limit for dense sums of solid angles
 DIRECT_TRIANGLES = 1024  # number of triangles above which the tree is faster than the dense sum
 LEAF_TRIANGLES = 16  # largest number of triangles in a leaf of the tree
-FAR_FIELD_RATIO = 2.5  # distance over a cluster's radius at which it counts as a dipole
+FAR_FIELD_RATIO = 2.5  # distance / (radius of a cluster of triangles) from which a dipole replaces the cluster
 
 
 def closest_points(point_P3: np.ndarray, triangle_P33: np.ndarray) -> np.ndarray:
@@ -43,7 +43,7 @@ def winding_numbers(point_P3: np.ndarray, triangle_F33: np.ndarray) -> np.ndarra
 
     It is +1 or -1 inside a closed mesh (by its orientation), 0 outside, and between for meshes with holes. Zero-area
     triangles add nothing. Up to DIRECT_TRIANGLES solid angles are summed exactly (van Oosterom and Strackee 1983;
-    Jacobson et al. 2013) in bounded memory. Larger ones use distant dipoles (Barill et al. 2018; error 0.01).
+    Jacobson et al. 2013) in bounded memory. Above, dipoles replace distant ones (Barill et al. 2018; error 0.01).
     """
     point = np.asarray(point_P3, np.float64).reshape(-1, 3)
     triangle = np.asarray(triangle_F33, np.float64).reshape(-1, 3, 3)
@@ -117,7 +117,7 @@ def _closest_on_segment(from_start: np.ndarray, start: np.ndarray, edge: np.ndar
 def _solid_angles(point: np.ndarray, triangle: np.ndarray) -> np.ndarray:
     """Returns the signed solid angle of triangles, corners [3, 3, ...], from points [3, ...]; trailing axes broadcast.
 
-    Seen from a point in its own plane, a triangle has solid angle 0 outside it. Inside it the angle is undefined.
+    From a point in the triangle's plane the angle is 0 if the point is outside the triangle, else undefined.
     """
     a, b, c = (corner - point for corner in triangle)
     la, lb, lc = (np.sqrt(square(side)) for side in (a, b, c))

@@ -16,7 +16,7 @@ from hgn.scene.scene import Obstacle, all_corners
 from hgn.scene.surface import area_vectors, sample_surface, split_long_edges
 from hgn.schema import ConfigError, Vector, require
 
-CANCELLED = 0.25  # mean length of the normals below which they cancel; three faces of a corner give 0.58
+CANCELLED = 0.25  # length of a cell's mean normal below which its normals cancel; three faces of a corner give 0.58
 NORMAL_SPACING_CELLS = 0.25  # distance of the samples, in cells
 SPLIT_CELLS = 16.0  # longest edge of pieces before they are cut at the domain, in cells
 

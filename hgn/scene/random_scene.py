@@ -246,7 +246,7 @@ def _fill_group(config: SceneConfig, shape: str, region: Region, rng: np.random.
 
 
 def _draw_gravity(config: SceneConfig, rng: np.random.Generator) -> Vector:
-    """Draws the config's, zero or tilted gravity. Tilted gravity is uniform in direction and in size."""
+    """Draws the gravity: the config's, zero, or a tilted one, which is uniform in direction and in size."""
     kind, size = rng.random(2).tolist()
     direction_3 = random_direction(rng)
     if kind < config.zero_gravity_fraction:

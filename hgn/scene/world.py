@@ -327,7 +327,7 @@ def _paper(new: Layout) -> SceneConfig:
 
 
 def draw_kind(kinds: Mapping[str, float], rng: np.random.Generator) -> str:
-    """Returns one of the kinds, with the probability of its fraction."""
+    """Draws one of the kinds. Their probabilities are in proportion to the numbers in `kinds`."""
     rest = rng.random() * sum(kinds.values())
     for kind, share in kinds.items():
         rest -= share
@@ -340,7 +340,7 @@ def draw_layout(config: SceneConfig, seed: int) -> tuple[str, Layout | SceneConf
     """Draws a scene of a kind in `config.kinds`.
 
     Returns the kind and a Layout. For the kinds of `_paper` it returns settings for `hgn.scene.random_scene` instead.
-    Raises: ConfigError if a kind does not fit into `config.domain_size`. Those of the shipped experiments fit.
+    Raises: ConfigError if a kind does not fit into `config.domain_size`. Kinds of the shipped experiments fit.
     """
     rng = np.random.Generator(np.random.PCG64([seed, 5]))
     kind = draw_kind(config.kinds, rng)

@@ -162,7 +162,7 @@ def network_of_weights(config: TrainConfig) -> ParticleNetwork:
 
 
 def network_of_checkpoint(checkpoint: dict[str, Any], path: Path) -> ParticleNetwork:
-    """Returns a checkpoint's network with its normaliser in evaluation mode; the moving average if there is one.
+    """Returns a checkpoint's network, or its moving average if there is one, with normaliser, in evaluation mode.
 
     Raises: ConfigError for a network that this version cannot build.
     """

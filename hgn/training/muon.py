@@ -1,4 +1,4 @@
-"""Muon (Jordan 2024): hidden matrices step along their orthogonalised momentum; all others step as in Adam."""
+"""Muon (Jordan 2024): hidden matrices step along their orthogonalised momentum; other parameters step as in Adam."""
 
 from __future__ import annotations
 

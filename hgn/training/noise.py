@@ -16,7 +16,7 @@ from hgn.config import CORRELATED_WAVELENGTHS, CORRELATED_WAVES, TrainingConfig
 from hgn.data.batch import Batch
 from hgn.system.splitmix import splitmix64
 
-# Keys of random streams other than the particles' noise. With the seed of that noise they would repeat its numbers.
+# Keys of the other random streams. Without a key these would repeat the numbers of the particles' noise.
 JITTER_STREAM, WAVE_STREAM, SCALE_STREAM = 0x5DEECE66D, 0x2545F4914F, 0x9E6D62D06F6A9A9B
 
 SMALLEST_ACCELERATION = 1e-30  # avoids a division by 0
@@ -30,8 +30,8 @@ def noise_scale(training: TrainingConfig, acceleration: float, seed: int) -> tup
     `noise_std`. If r < 1, the scale is log-uniform between max(r, training.noise_min_scale) and 1. It is drawn from the
     sample's seed, and the loss weight is 1 / scale^2. Otherwise both are 1. `quiet_weight` multiplies the loss weight.
 
-    A network does not learn errors that are small compared with the noise. At rest its bias stays at a twentieth of the
-    noise, and resting bodies creep over thousands of frames. So frames with small accelerations get noise of many
+    A network does not learn to avoid errors that are small compared with the noise. At rest its bias stays at 1/20 of
+    the noise, and resting bodies creep over thousands of frames. So frames with small accelerations get noise of many
     scales, like the noise levels of a denoiser (Song & Ermon 2019). All scales have equal weight in the loss.
     """
     quiet = quiet_weight(training, acceleration)
@@ -47,8 +47,8 @@ def noise_scale(training: TrainingConfig, acceleration: float, seed: int) -> tup
 def quiet_weight(training: TrainingConfig, acceleration: float) -> float:
     """Returns the loss weight of a sample whose target has this root mean square.
 
-    Errors at rest are much smaller than those of impacts, so they hardly change the mean. But they are equal in every
-    frame, so resting bodies creep over thousands of frames.
+    Errors at rest are much smaller than errors of impacts, so they hardly change the mean loss. But they are the same
+    in every frame, so resting bodies creep over thousands of frames.
     """
     if not acceleration < training.quiet_acceleration:
         return 1.0
@@ -95,7 +95,7 @@ def perturbed_window(
     last one, so the target becomes v_true^{n+1} - v_noisy^n. The network learns to undo the velocity error, as in GNS
     (Sanchez-Gonzalez et al. 2020). `correlated` is the fraction of the variance that neighbours have in common. In a
     rollout the errors of a body's particles are correlated; independent noise averages out over a body. Each scene's
-    noise is multiplied by `batch.noise_scale_S`. Axes with numbers from `dimensions` have no noise.
+    noise is multiplied by `batch.noise_scale_S`. Unused axes (`dimensions` and above) have no noise.
     """
     window_WN3 = batch.window_WN3
     if std_last == 0:
@@ -120,7 +120,7 @@ def perturbed_window(
 
 
 def jittered_origin(batch: Batch, cell_size: float, dimensions: int = 3) -> torch.Tensor:
-    """Returns grid origins uniform in [-cell_size, 0]^3, [S, 3]; 0 on axes with numbers from `dimensions`."""
+    """Returns grid origins uniform in [-cell_size, 0]^3, [S, 3]; 0 on unused axes (`dimensions` and above)."""
     origins = []
     for seed in batch.seeds_S:
         generator = torch.Generator().manual_seed(seed ^ JITTER_STREAM)

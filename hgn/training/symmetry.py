@@ -32,7 +32,7 @@ def under_symmetries(batch: Batch, symmetries: Sequence[Symmetry]) -> Batch:
 
 
 def obstacles_under(obstacles: ObstacleCells, symmetries: Sequence[Symmetry]) -> ObstacleCells:
-    """Returns cells and normals of the images. With n nodes of the solver a mirrored cell k becomes n - 2 - k.
+    """Returns cells and normals of the images. Cell k becomes n - 2 - k on a mirrored axis with n nodes of the solver.
 
     A particle exactly on a face belongs to the cell above it, also in the image.
     """

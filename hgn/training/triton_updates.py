@@ -1,7 +1,7 @@
 """Training updates in Triton kernels (hgn.kernels.update), captured as CUDA graphs.
 
-While a chunk of updates runs, parameters and Adam's moments are in the kernels' layout. They are copied back after it,
-so checkpoints do not depend on the backend.
+While a chunk of updates runs, parameters and Adam's moments are in the kernels' layout. They are copied back after the
+chunk, so checkpoints do not depend on the backend.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ class TritonUpdates:
         ranks: Ranks,
         precisions: tuple[str, ...] = ("fp32",),
     ) -> None:
-        """`precisions` are tried in order: the first whose kernels agree with PyTorch's trains."""
+        """`precisions` are tried in order. Training uses the first one whose kernels agree with PyTorch."""
         self._start_s, self._made, self._jit_misses = time.monotonic(), 0, JitMisses()
         self._seconds: dict[str, float] = defaultdict(float)
         self.training, self._ranks = training, ranks
@@ -63,7 +63,7 @@ class TritonUpdates:
         self.parity: tuple[float, float] | None = None  # with PyTorch, see hgn.training.parity
 
     def _build(self, precision: str) -> None:
-        """Makes the kernels' updates and simulations of this precision, from the network as it is."""
+        """Builds the updates and simulations of this precision from the network's present parameters."""
         trained, training, ranks = self._trained, self.training, self._ranks
         self.precision = precision
         self.updates = Updates(
@@ -90,7 +90,7 @@ class TritonUpdates:
         return {} if self._pool is None else self._pool.figures
 
     def run(self, chunk: EpisodeChunk, first_update: int) -> None:
-        """Raises: ConfigError for positions that are not finite, and at first for kernels unlike PyTorch."""
+        """Raises: ConfigError for positions that are not finite; in the first chunk, if kernels differ from PyTorch."""
         for index in chunk.dropped:
             del self._episodes[index]
         with self._timed("placing episodes"):
