@@ -326,7 +326,7 @@ def _closed_contacts(
     )
 
     deep = np.flatnonzero(inside.ravel() & ~near.ravel())
-    if len(deep):  # the direction out is that to the surface nearest to the nearest node of the band
+    if len(deep):  # the direction out leads to the surface point that is closest to the nearest node of the band
         feet = np.zeros((box.count, 3))
         feet[np.flatnonzero(near.ravel())] = foot
         nearest = ndimage.distance_transform_edt(~near, return_distances=False, return_indices=True)

@@ -75,10 +75,10 @@ def settled(volume: ti.f32, density: ti.f32, share: ti.f32) -> ti.f32:
 def _project_sand(log_strain, volume: ti.f32, law: ti.template(), row: ti.i32, step: ti.f32, variant: ti.template()):
     """Returns the principal log strains after the return mapping, and the new volume correction.
 
-    Stress yields if |s| > alpha (-tr tau), where s is its deviator. With this alpha the largest and smallest principal
-    stress differ by sin phi of their sum (Mohr-Coulomb). In Taichi Elements alpha is constant (Drucker-Prager). The
-    deviator shrinks and keeps its direction, so plastic flow does not change the volume. With grains alpha grows with
-    the inertial number I = rate d sqrt(rho_grain / p) of the step's plastic shear (Jop, Forterre, Pouliquen 2006).
+    Stress tau yields if |s| > alpha (-tr tau), where s is its deviator. Then |tau_1 - tau_3| = |tau_1 + tau_3| sin phi
+    for the largest and smallest principal stress (Mohr-Coulomb). In Taichi Elements alpha is constant (Drucker-Prager).
+    The deviator shrinks in its direction, so plastic flow does not change the volume. With grains alpha grows with the
+    inertial number I = rate d sqrt(rho_grain / p) of the step's plastic shear (Jop, Forterre, Pouliquen 2006).
 
     Volume correction (Tampubolon et al. 2017): v_c / 3 is added to each log strain first, and
     v_c += log det F_trial - log det F_new. In Taichi Elements v_c enters the trace but not the strains.

@@ -347,7 +347,7 @@ def enter(
 ):
     """Adds particles to their scenes between two intervals.
 
-    Their velocities are the present ones; those of the solver belong to the middle of the last interval.
+    Their velocities are given for the present time, and converted to the middle of the last interval (leapfrog).
     """
     for i in range(which.shape[0]):
         p = which[i]

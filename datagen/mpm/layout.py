@@ -31,7 +31,7 @@ class Constant(NamedTuple):
     snow_smallest: int = 5  # smallest and largest singular value that snow bears elastically
     snow_largest: int = 6
     maximum_hardening: int = 7
-    mass: int = 8  # mass of a particle over that with the config's density
+    mass: int = 8  # (mass of a particle) / (its mass with the config's density)
     sand_sine: int = 9  # sine of the friction angle
     water_tension: int = 10  # fraction of the tension that stretched water bears
     viscosity: int = 11  # viscosity of water, Pa s

@@ -7,7 +7,7 @@ from datagen.mpm.sweep import ON_TRIANGLE
 
 CLEARANCE = 1e-3  # smallest distance of a particle from a triangle, in cells; rounding is 1e-5
 STOP = 1.5 * CLEARANCE  # distance at which a particle is placed, so that rounding brings it no nearer
-EDGE = 1e-4  # distance beyond an edge, relative to it, at which a crossing counts; closes gaps between triangles
+EDGE = 1e-4  # crossings count up to this barycentric coordinate beyond an edge; closes gaps between triangles
 # Vectors of a node's contact: the free direction for particles that see the node, and for those from which a sheet
 # hides it (zero if all motion is free); the friction of each; the smallest mass with which the node stops each
 NODE_VECTORS = 4

@@ -92,8 +92,8 @@ def _strain(
 ):
     """Computes the materials' response of particles that act in this substep, and writes it over C.
 
-    It uses the gradient of the nodes' velocities. In the first step of an interval it uses C, and also marks the blocks
-    that a particle touches. If particles take their own steps, those listed by list_acting act; otherwise all do.
+    It uses the gradient of the nodes' velocities, but C in the first step of an interval. In this step it also marks
+    the blocks that a particle touches. If particles take their own steps, those in list_acting's lists act, else all.
     """
     solid = ti.static(has_solid(arrays.variant))
     intervals = ti.static(not arrays.variant & VARIANT.each_step)

@@ -21,7 +21,7 @@ from datagen.mpm.host_copy import HostCopy  # isort: skip
 from datagen.mpm.team_meeting import APART, MEETING, SEGMENT  # isort: skip
 from datagen.mpm.team_transfers import LANES  # isort: skip
 
-LAUNCH_SECONDS = 6.0  # target time of a launch, which determines its frames; scenes wait for each other at its end
+LAUNCH_SECONDS = 6.0  # target time of a launch; determines its number of frames. At its end scenes wait for each other
 MAXIMUM_OUTPUT_BYTES = 2**30  # largest size of a launch's positions
 MAXIMUM_PARTICLES = (2**31 - 1) // (2 * FIELD.solid)  # largest number of particles whose fields int32 can count
 PAUSE = 0.8  # fraction of a launch's expected time in which the host sleeps
@@ -122,7 +122,7 @@ class TeamLaunch(Launch):
             woken = time.perf_counter()
             position = self.host_copy.read(output).reshape(size, self.particles, 3)
             taken = time.perf_counter() - begin
-            if pause > SHORT_SECONDS and taken < 1.05 * (woken - begin):  # it ended at an unknown time before
+            if pause > SHORT_SECONDS and taken < 1.05 * (woken - begin):  # the launch ended during the sleep
                 taken *= 0.5
             self._require_together()
             total = self.counter.to_numpy()[:, COUNT.substeps]

@@ -72,7 +72,7 @@ def take_turn(at: ti.i32, meeting: ti.template()):
 
 @ti.func
 def leave_scene(entry: ti.i32, lane: ti.i32, arrays: ti.template()):
-    """Counts at `entry`, the scene's, that this block has finished a turn with it."""
+    """Adds 1 to meeting[entry], the number of blocks that have finished a turn with the scene."""
     wait(arrays.threads)
     if lane == 0:
         fence(arrays.threads)

@@ -28,7 +28,7 @@ Share = namedtuple("Share", ["scene", "first", "chunk", "owned"])
 
 @ti.func
 def dealt(own: ti.i32, thread: ti.template(), chunk: ti.i32) -> ti.i32:
-    """Returns the index in the scene of a block's particle `own`. Chunks are dealt out in turn, to share slow ones."""
+    """Returns the index in the scene of a block's particle `own`. Blocks get chunks in turn, to spread slow ones."""
     return (own // chunk * thread.blocks + thread.part) * chunk + own % chunk
 
 

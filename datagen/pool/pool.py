@@ -23,7 +23,7 @@ MAXIMUM_ATTEMPTS = 3  # deaths of workers with a single scene, before this scene
 _WAIT_SECONDS = 0.2  # longest time until a stop request is noticed
 _PACKING_SECONDS = 0.02  # maximum delay between packing and publishing a shard
 _LOOK_SECONDS = 1.0  # interval of checks for shards of other generators
-_LAUNCH_GROWTH = 32  # factor between the sizes of two launches, up to the full size
+_LAUNCH_GROWTH = 32  # factor between the sizes of successive launches, up to the full size
 
 
 class Stopped(Exception):  # noqa: N818 - a request, not an error
@@ -230,7 +230,7 @@ class Pool:
             raise RuntimeError(f"a worker failed:\n{values[0]}")
 
     def _grid_built(self, built: BuiltGrid) -> None:
-        """Adds a grid to its scene. The scene waits for a launch, or a solver has it."""
+        """Adds a grid to its scene, which waits for a launch or is already with a solver."""
         key, grid = built.task.key, built.grid
         for place, made in enumerate(self._ready):
             if made.task == built.task:

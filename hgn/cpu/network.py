@@ -27,7 +27,7 @@ from hgn.network.hgn import HierarchicalGraphNetwork
 # into faster caches. But each operation takes some microseconds of Python, during which all other threads wait, and
 # compiled rows transpose their matrices for each block.
 ROWS_AT_ONCE = 4096
-FEWEST_ROWS = 256  # rows of a block; for fewer rows, waking a thread takes longer than the work
+FEWEST_ROWS = 256  # smallest number of rows in a block; for fewer, waking a thread takes longer than the work
 
 
 def prediction(

@@ -242,7 +242,7 @@ class _Remote(Storage):
         def fill(file: BufferedRandom) -> None:
             self._require_not_away(name, patience_s)
             try:
-                # the second time from the start, because the disk may have lost bytes that another process fetched
+                # the second attempt fetches all bytes, because the disk may have lost bytes from another process
                 if self._fill(file, name, size, patience_s) == sha256:
                     return
                 file.truncate(0)

@@ -270,7 +270,7 @@ def listed(table, row, count, capacity, SUM: tl.constexpr, EDGES: tl.constexpr):
         where = tl.load(table + i * capacity + row, mask=row < count, other=-1)
         if EDGES:
             where = where * SUM + (i ^ 1)
-        summands = summands + (where,)  # noqa: RUF005 - Triton knows no unpacking here
+        summands = summands + (where,)  # noqa: RUF005 - Triton does not support unpacking here
     return summands
 
 

@@ -138,8 +138,8 @@ class Buffers:
         """Allocates the buffers of inference. All edges share one buffer, and hidden rows are not stored.
 
         While there are no edges, this buffer holds other data: the particles' products until the first pairs read them;
-        a block's message to the parents, or its product for the next block, until the next block's edges; and beside
-        the last of these the decoder's input. `output` takes the place of the features, which only the encoder reads.
+        a block's message to the parents, or its product for the next block, until the next block's edges; and next to
+        the last product the decoder's input. `output` takes the place of the features, which only the encoder reads.
         """
         width, steps = self.width, self.config.message_passing_steps
         particles, capacities = self.grid.particles, self.grid.capacities

@@ -1,7 +1,7 @@
 """Relative inputs: features that do not change with a motion common to all particles (`network.inputs: relative`).
 
-The paper (sec. 3.1) has absolute velocities and wall distances instead. Away from surfaces these features do not depend
-on a common velocity. In free flight they do not depend on gravity either. The acceleration is g plus the output.
+The paper (sec. 3.1) has absolute velocities and wall distances instead. Away from surfaces relative inputs do not
+depend on a common velocity. In free flight they do not depend on gravity either. The acceleration is g + output.
 f(x) = asinh(x / s_a), where s_a is the normaliser's scale. f is odd, so features transform with the symmetries of the
 cube. The columns are, in this order:
 
@@ -21,7 +21,7 @@ them. These properties hold for any parameters:
 - Without relative motion the output is 0, so a body that flies freely without deforming has exactly acceleration g.
 - Without a surface in reach momentum is conserved. The mean of r over a coarsest cell is subtracted, and cells exchange
   only antisymmetric impulses across their faces.
-- Angular momentum is conserved there too. The rotation of a cell, and of each pair of neighbours, is subtracted.
+- Angular momentum is then conserved too. The rotation of a cell, and of each pair of neighbours, is subtracted.
 - Surfaces push along their normals only.
 Shape legend: N particles, H velocities, L levels, C cells of a level, E directed edges, S scenes.
 """

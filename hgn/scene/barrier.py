@@ -20,7 +20,7 @@ from hgn.scene.surface import area_vectors, split_long_edges
 from hgn.schema import Vector, require
 
 ROW = 24  # numbers of a triangle: four planes of four, then the box's two corners, padded with zeros
-CELLS = 2  # obstacle cells per cell; narrower cells would have lists of the same length, and more of them
+CELLS = 2  # (cell size) / (obstacle cell size); smaller cells would have more lists, and no shorter ones
 # fraction of the clearance, enough for rounding at shared edges; a margin as wide as the clearance would form a lip at
 # convex edges, and stop sliding particles
 MARGIN = 0.1

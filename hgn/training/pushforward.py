@@ -47,14 +47,14 @@ class Sample(Protocol):
 T = TypeVar("T", bound=Sample)
 Starts = tuple[tuple[int, int], ...]  # (episode, frame) of each simulation's start
 START_STREAM, SAMPLE_STREAM = 0x57A7, 0xE217
-# Root mean square distance from the data over a scene, in finest cells. Frames beyond it are dropped: the data's motion
-# is no target for them, and they would dominate the loss. Most frames of an untrained network are dropped.
+# Largest root mean square distance of a scene's frame from the data, in finest cells. Others are dropped: the
+# data's motion is no target for them, and they would dominate the loss. An untrained network loses most frames.
 DROPPED_BEYOND = 0.5
 PULLED_WITHIN = 1.0  # largest position error on each axis that a target corrects, in finest cells
 
 
 def simulated_frames(training: TrainingConfig, frame_count: int) -> int:
-    """Returns the number of frames to simulate in an episode of `frame_count` frames, if the episode is long enough."""
+    """Returns the number of frames to simulate in an episode of `frame_count` frames. The episode may end earlier."""
     return max(training.pushforward_frames, int(training.pushforward_episode_fraction * frame_count))
 
 
@@ -82,7 +82,7 @@ def drawn_starts(training: TrainingConfig, update: int, rank: int, frame_counts:
 
 
 class PoolDraws:
-    """Draws windows of a pool: `training.pushforward_importance` of them by target acceleration, the others evenly."""
+    """Draws windows of a pool: the fraction `training.pushforward_importance` by target acceleration, others evenly."""
 
     def __init__(self, training: TrainingConfig, rank: int, accelerations: Sequence[float]) -> None:
         self._training, self._rank = training, rank
@@ -113,7 +113,7 @@ def pushforward_windows(
 
     true_TN3 contains the frames n - H to n + F + 1 of the data, simulated_FN3 the frames n + 1 to n + F. The last frame
     of the window of frame k is x_k + (true_{k+1} - true_k) + pull (true_k - x_k). With this target the network corrects
-    its velocity error and a fraction of its position error. The second part also brings back particles behind a wall.
+    its velocity error and, by the last term, a part of its position error. This also returns particles behind a wall.
     """
     frames = len(simulated_FN3)
     history = len(true_TN3) - frames - 2

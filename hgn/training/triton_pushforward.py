@@ -24,7 +24,7 @@ from hgn.network.obstacles import ObstacleCells
 from hgn.runtime.simulation import Simulation
 from hgn.runtime.triton_stepper import CHECKED_PARTICLES, TritonStepper
 
-SPARE = 1.1  # capacity for particles over the number in the first simulation
+SPARE = 1.1  # (capacity for particles) / (particles in the first simulation)
 
 
 class TritonScenes:
