@@ -83,7 +83,7 @@ def particle_bounds(scene: Scene, config: MpmConfig) -> tuple[np.ndarray, np.nda
 
 
 def cell_mass(scene: Scene) -> float:
-    """Returns the scene's particles per cell; if unknown, the median over particles of the number in their cell."""
+    """Returns the scene's particles per cell; if unknown, the median over particles of the count in their own cell."""
     if scene.particles_per_cell is not None:
         return scene.particles_per_cell
     cell = np.floor(np.asarray(scene.position_N3, np.float64) / scene.cell_size).astype(np.int64)

@@ -2,8 +2,8 @@
 
 Sanchez-Gonzalez et al. 2020 (GNS), with the paper's choices (sec. 4): connectivity radius R, wall distances clamped
 at 8 R, 10 message-passing steps, one hidden layer in every MLP. As in GNS each particle is also its own neighbour.
-Obstacles are normal features, as in the HGN. First layers are split over their concatenated inputs. Then a particle's
-part is multiplied once instead of once an edge. The function is the same.
+Obstacles are given by normals in the features, as in the HGN. First layers are split over their concatenated inputs.
+So a particle's part is multiplied once instead of once for each edge. The function is the same.
 Shape legend: N particles, E directed edges, W width, H hidden.
 """
 
@@ -24,7 +24,7 @@ RELU = 0.0  # slope below zero
 
 
 class InteractionStep(nn.Module):
-    """One message-passing step: edges from both ends, particles from the sum of their edges, residuals on both."""
+    """One message-passing step, with residuals: edges from both ends, then particles from the sum of their edges."""
 
     def __init__(self, width: int) -> None:
         super().__init__()

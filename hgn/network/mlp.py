@@ -1,7 +1,7 @@
 """The building block of the paper's network (sec. 3.2, fig. 4): one hidden layer, LeakyReLU, LayerNorm.
 
 The first layer acts on a concatenation of parts. It is linear, so each part can be multiplied before it is gathered:
-once a particle or a cell, not once a pair or an edge. The function is exactly the same, with less arithmetic.
+once for each particle or cell, not for each pair or edge. The function is exactly the same, with less arithmetic.
 `forward` is the plain definition; `project` and `finish` are its two halves.
 """
 

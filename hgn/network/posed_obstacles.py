@@ -2,7 +2,7 @@
 
 An obstacle's cells are computed once, at its place in the scene. A particle is expressed in that frame by
 x' = R^T (x - t - c) + c with pivot c. The normal n found there becomes R n, so its direction follows the rotation
-exactly. The cell of a particle is piecewise constant: shifts have no gradient, and distance from the surface has none.
+exactly. The cell of a particle is piecewise constant, so n has no gradient by shifts or by distance from the surface.
 With `smoothing` s the normal is the mean over a cube of s cells around the particle. The mean is continuous, and
 piecewise polynomial in position and pose. Networks were trained with s = 0.
 Shape legend: N particles, K obstacle cells.

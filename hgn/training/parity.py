@@ -1,6 +1,6 @@
 """Compares training kernels with PyTorch on the first batch, before the first update (bounds: hgn.runtime.parity).
 
-Compared are the outputs, and the gradients of a random weighted sum of the outputs.
+It compares the outputs, and the gradients of a random weighted sum of the outputs.
 
 Shape legend: N particles of all scenes, S scenes.
 """

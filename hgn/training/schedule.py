@@ -17,7 +17,7 @@ def learning_rate(training: TrainingConfig, update: int) -> float:
 def average_weight(training: TrainingConfig, update: int) -> float:
     """Returns the weight of the new parameters in their moving average, after update number `update`, from 0.
 
-    Early parameters lose weight soon: after few updates, the average is over about the last tenth of them.
+    Early parameters lose weight soon: at first the average extends over about the last tenth of the updates.
     """
     return 1.0 - min(training.ema_decay, (1 + update) / (10 + update))
 

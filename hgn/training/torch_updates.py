@@ -77,7 +77,7 @@ class TorchUpdates:
 
 
 def batch_loss(network: ParticleNetwork, batch: Batch, training: TrainingConfig, jitter: bool = True) -> torch.Tensor:
-    """Returns the mean squared error of the normalised acceleration: over axes, over particles, over scenes.
+    """Returns the squared error of the normalised acceleration, averaged over axes, then particles, then scenes.
 
     This function draws noise, jitter and symmetry for backend torch. hgn.kernels.update draws them for triton.
     """
