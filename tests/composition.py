@@ -15,12 +15,14 @@ PARSER: Any = OverridesParser.create()
 def compose(folder, name, overrides):
     """The configuration of a file in a folder with these overrides; Hydra's parser reads each setting."""
     kinds = {path.name for path in folder.iterdir() if path.is_dir()}
-    choices = [text for text in overrides if text[0] in "+~" or text.partition("=")[0] in kinds]
+    added = [text for text in overrides if text[0] in "+~" and not text.startswith("++")]
+    choices = [text for text in overrides if text in added or text.partition("=")[0] in kinds]
     groups = (name, *choices)
     if groups not in BASES:
         with registered_dataclasses(folder, name):
             BASES[groups] = compose_files(name, choices)
     config = BASES[groups].copy()
     for override in PARSER.parse_overrides([text for text in overrides if text not in choices]):
-        OmegaConf.update(config, override.key_or_group, override.value(), merge=True)
+        key, new = override.key_or_group, override.is_force_add()
+        OmegaConf.update(config, key, override.value(), merge=True, force_add=new)
     return config
