@@ -57,8 +57,8 @@ def main(mapping: dict[str, Any]) -> int:
         (result,) = simulate(
             [scene], config.mpm, config.frames, config.frame_rate_hz, on_frame=lambda _: progress.update()
         )
-    if isinstance(result, SceneFailure):
-        raise ConfigError(f"{file} must be a scene that the solver keeps together, got {result.cause}")
+        if isinstance(result, SceneFailure):
+            raise ConfigError(f"{file} must be a scene that the solver keeps together, got {result.cause}")
     rollout = Rollout(
         position_TN3=result.position_TN3,
         material_N=scene.material_N,

@@ -120,13 +120,20 @@ def is_replaceable(path: Path) -> bool:
 def space_reserved(path: Path, size: int) -> Iterator[None]:
     """Reserves `size` bytes beside `path` during long work, so that the disk is not full at its end.
 
-    Raises: OSError, before the work, where the disk has less.
+    Failed work leaves no new folder. Raises: OSError, before the work, where the disk has less.
     """
+    missing = [folder for folder in path.parents if not folder.exists()]
     make_folder(path.parent)
-    with temporary_file(path) as reservation:
-        with reservation.open("wb") as file:
-            os.posix_fallocate(file.fileno(), 0, size)
-        yield
+    try:
+        with temporary_file(path) as reservation:
+            with reservation.open("wb") as file:
+                os.posix_fallocate(file.fileno(), 0, size)
+            yield
+    except BaseException:
+        for folder in missing:
+            with contextlib.suppress(OSError):  # others may have written into it
+                folder.rmdir()
+        raise
 
 
 def make_folder(path: Path) -> None:

@@ -71,16 +71,16 @@ def one_turn():
         yield
 
 
-@pytest.fixture(scope="module")
-def as_onnx(tmp_path_factory):
-    """A network of relative inputs with all constraints, as the default weights are, as ONNX."""
-    return exported(tmp_path_factory.mktemp("onnx"), "onnx")
+@pytest.fixture(scope="module", params=["walled", pytest.param("whole", marks=pytest.mark.slow)])
+def as_onnx(request, tmp_path_factory):
+    """A network as ONNX: of absolute inputs with walls, or of relative ones with all constraints, as by default."""
+    return exported(tmp_path_factory.mktemp("onnx"), "onnx", WALLED if request.param == "walled" else WHOLE)
 
 
 @pytest.fixture(scope="module")
 def as_package(tmp_path_factory):
-    """The same compiled."""
-    return exported(tmp_path_factory.mktemp("package"), "package")
+    """The latter compiled."""
+    return exported(tmp_path_factory.mktemp("package"), "package", WHOLE)
 
 
 def test_the_graph_is_the_step():
@@ -177,9 +177,9 @@ def test_a_package_that_is_cut_off_leaves_nothing(tmp_path, monkeypatch):
     assert not list(tmp_path.iterdir())
 
 
-def exported(folder, kind):
+def exported(folder, kind, constraints):
     """What the command writes of a small network, and a scene and its arrays."""
-    network = network_of(torch.float32, message_passing_steps=1, **WHOLE)
+    network = network_of(torch.float32, message_passing_steps=1, **{"levels": 1} | constraints)
     save_weights(folder / "w.safetensors", network, WeightsInfo(network.config, 60.0, CELL, step=network.step))
     shutil.copy(config_directory() / "example/ramp.obj", folder)
     (folder / "scene.yaml").write_text(SCENE)
@@ -210,10 +210,12 @@ def compare(network, step):
 
 
 def assert_rollout(written, found_TN3):
-    """The frames of backend torch, in some of which obstacles hold particles."""
+    """The frames of backend torch, in some of which obstacles stop particles if they can."""
     simulator, scene = Simulator(written.network, 60.0, "torch"), load_scene(written.folder / "scene.yaml")
     (expected_TN3,) = simulator.rollout([scene], FRAMES)
     np.testing.assert_allclose(found_TN3, expected_TN3, rtol=0, atol=FRAMES * TOLERANCE)
+    if written.network.step.obstacle_clearance is None:
+        return
     state = replace(simulator.start([scene]), barriers=None)
     for _ in range(FRAMES - 1):
         state = simulator.step(state)
