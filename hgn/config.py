@@ -361,8 +361,8 @@ class TrainingConfig:
     noise_std: NonNegative[float] = 0.000848528  # input noise of the last velocity, domain units per frame
     # fraction of the noise's variance in waves of 4 to 64 cells, which neighbours have in common; the paper's is 0
     noise_correlated_fraction: Fraction[float] = 0.1
-    # smallest scale of the noise in a frame whose rms acceleration a is below noise_std; the scale is drawn between
-    # max(a / noise_std, this) and 1; 1: equal noise in all frames
+    # smallest scale of the noise in a frame whose rms acceleration a is below noise_std; the scale is log-uniform from
+    # max(a / noise_std, this) to 1, and the loss weight is 1 / scale^2; 1: equal noise in all frames
     noise_min_scale: AtMostOne[Positive[float]] = 1.0
     # acceleration, domain units per frame squared; squared errors of a frame with smaller rms acceleration a are
     # multiplied by this / a, at most by 4; 0: all frames have equal loss weights
@@ -370,8 +370,8 @@ class TrainingConfig:
     # fraction of an episode's samples drawn in proportion to their frames' acceleration, with loss weights that keep
     # the expected loss; 0: all frames are equally likely
     frame_importance: BelowOne[float] = 0.0
-    # folders of additional data sets; their episodes published at the start of the run are used; they need the same
-    # physics, frame rate and solver cells
+    # folders of additional data sets, as published at the start of the run. They need the same physics, frame rate,
+    # solver cells and reference grid, known materials, and with absolute inputs the same gravity.
     more_data: tuple[str, ...] = ()
     # number of episodes whose samples are shuffled together, for data larger than the cache or the GPU's memory; 0: all
     shuffle_episodes: NonNegative[int] = 0

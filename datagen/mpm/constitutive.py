@@ -2,7 +2,7 @@
 
 Every law maps the trial deformation of a step to the new state and the Kirchhoff stress (stress times J, per initial
 volume, in pascals). `law` contains rows of constants (layout.Constant), and `row` is the begin of the particle's row.
-The state of a particle is F (sand, snow) and one scalar, `volume`: J for water, the volume correction v_c for sand
+The state of a particle is F (not of water) and one scalar, `volume`: J for water, the volume correction v_c for sand
 (Tampubolon et al. 2017), the plastic volume ratio Jp for snow (Stomakhin et al. 2013).
 """
 
@@ -17,7 +17,7 @@ from hgn.solver_method import MINIMUM_SINGULAR_VALUE, WATER_MINIMUM_VOLUME_RATIO
 SMALLEST_PLASTIC_VOLUME, LARGEST_PLASTIC_VOLUME = 1e-3, 1e3
 LARGEST_VOLUME = 1e12  # bound of an elastic solid's J; the stress contains its square
 # factor of an elastic solid's stiffness for the time step: a single particle that hits the floor at 10 m/s gains energy
-# with steps of 0.8 of the limit, and none with 0.65
+# with steps of 0.8 of the limit, and none with 0.65. With 1.6 steps are 0.875 / sqrt(1.6) = 0.69 of the limit
 ELASTIC_MARGIN = 1.6
 # mu(I) = mu_s (1 + RATE_FRICTION / (1 + RATE_NUMBER / I)). The values are those of Jop, Forterre and Pouliquen 2006 for
 # glass beads: mu_s = tan 20.9, mu_2 = tan 32.76 degrees
@@ -40,7 +40,7 @@ def hardening(plastic_volume: ti.f32, law: ti.template(), row: ti.i32) -> ti.f32
 
 @ti.func
 def water(volume: ti.f32, expansion: ti.f32, law: ti.template(), row: ti.i32, counter: ti.template(), scene: ti.i32):
-    """Returns J (1 + expansion), bounded below, the Kirchhoff pressure lambda J (J - 1), and the present stiffness, Pa.
+    """Returns J (1 + expansion), bounded below, the Kirchhoff stress lambda J (J - 1), and the present stiffness, Pa.
 
     The expansion of a step is dt tr C. Taichi Elements' det(1 + dt C) - 1 expands rotating water and compresses sheared
     water, to second order in the step. Stretched water bears the law's fraction of its tension. With 0 it has no
@@ -61,10 +61,10 @@ def water(volume: ti.f32, expansion: ti.f32, law: ti.template(), row: ti.i32, co
 
 @ti.func
 def settled(volume: ti.f32, density: ti.f32, share: ti.f32) -> ti.f32:
-    """Returns water's J, moved by the fraction `share` towards the volume that its density implies (1 at rest).
+    """Returns water's J, moved by the fraction `share` towards 1 / `density` (bounded).
 
-    J is integrated along the path of each particle. Particles sample the flow at few points, so J and density drift
-    apart. Only water below a free surface is changed, because near the surface the kernel extends out of the water.
+    `density` is relative to that at rest. J is integrated along each particle's path. Few particles sample the flow,
+    so J and density drift apart. Near a free surface the kernel extends out of the water, so J is not changed there.
     """
     inside = ti.min(ti.max(10.0 * (density - 0.85), 0.0), 1.0)
     told = 1.0 / ti.min(ti.max(density, 0.8), 1.25)
@@ -77,8 +77,8 @@ def _project_sand(log_strain, volume: ti.f32, law: ti.template(), row: ti.i32, s
 
     Stress tau yields if |s| > alpha (-tr tau), where s is its deviator. Then |tau_1 - tau_3| = |tau_1 + tau_3| sin phi
     for the largest and smallest principal stress (Mohr-Coulomb). In Taichi Elements alpha is constant (Drucker-Prager).
-    The deviator shrinks in its direction, so plastic flow does not change the volume. With grains alpha grows with the
-    inertial number I = rate d sqrt(rho_grain / p) of the step's plastic shear (Jop, Forterre, Pouliquen 2006).
+    The deviator is shortened and keeps its direction, so the volume stays. With grains alpha grows with the inertial
+    number I = rate d sqrt(rho_grain / p) of the step's plastic shear (Jop, Forterre, Pouliquen 2006).
 
     Volume correction (Tampubolon et al. 2017): v_c / 3 is added to each log strain first, and
     v_c += log det F_trial - log det F_new. In Taichi Elements v_c enters the trace but not the strains.
@@ -99,7 +99,7 @@ def _project_sand(log_strain, volume: ti.f32, law: ti.template(), row: ti.i32, s
         alpha = law[row + CONSTANT.sand_alpha]
         if ti.static(not variant & VARIANT.taichi_elements):
             sine = law[row + CONSTANT.sand_sine]
-            # principal stresses are |s| n - p: |s| (n1 - n3) = (2 p + |s| n2) sin phi, n1 the largest, n3 the smallest
+            # n1 > n2 > n3, the unit deviator, sum to 0; stress |s| n - p: |s| (n1 - n3) = (2 p + |s| n2) sin phi
             direction = deviator / size
             largest, least = direction.max(), direction.min()
             # only rounding errors have a denominator below 0.8
@@ -107,7 +107,7 @@ def _project_sand(log_strain, volume: ti.f32, law: ti.template(), row: ti.i32, s
         bearing = -(3.0 * bulk + 2.0 * shear) / (2.0 * shear) * trace * alpha
         excess = ti.max(size - bearing, 0.0)
         if ti.static(bool(variant & VARIANT.rate_of_sand)):
-            # x, the plastic excess, solves (excess - x) (k x + RATE_NUMBER) = bearing RATE_FRICTION k x; k x is I
+            # `excess` becomes its plastic part x: (excess - x) (k x + RATE_NUMBER) = bearing RATE_FRICTION k x, k x = I
             pressure = ti.max(-(3.0 * bulk + 2.0 * shear) / 3.0 * trace, 1e-3)
             k = law[row + CONSTANT.grain] / (step * ti.sqrt(pressure))
             half = 0.5 * (RATE_NUMBER + k * (bearing * RATE_FRICTION - excess))
@@ -116,7 +116,7 @@ def _project_sand(log_strain, volume: ti.f32, law: ti.template(), row: ti.i32, s
                 excess = excess * RATE_NUMBER / (half + root)
             else:
                 excess = (root - half) / k
-        # the mapping keeps the trace, so log det F contains all of v_c, which becomes 0
+        # v_c was added to the strains and the mapping keeps their trace. So F now contains v_c, and v_c is set to 0.
         new_strain = strain - deviator * (excess / size)
     return new_strain, new_volume
 
@@ -134,8 +134,8 @@ def foreseen_stiffness(
 ) -> ti.f32:
     """Returns (3 lambda + 2 mu) / density of a particle after `time` with the velocity gradient C.
 
-    For elastic solids it returns 1e30, because only a decomposition would give their stretch. So they never take longer
-    steps of their own.
+    For elastic solids it returns 1e30 / density, because only a decomposition would give their stretch. So they never
+    take longer steps of their own.
     """
     density = law[row + CONSTANT.density]
     bulk = 3.0 * law[row + CONSTANT.bulk]
@@ -171,7 +171,7 @@ def solid(
     """Returns new F, new volume, Kirchhoff stress and present stiffness of sand, snow and elastic solids from trial F.
 
     At rest shape the stiffness is 3 lambda + 2 mu. Elastic solids are fixed corotated (Stomakhin et al. 2012), tau =
-    2 mu (F - R) Fᵀ + lambda J (J - 1), as snow is until it yields. Stretch makes them stiffer by d(tau) / d(log sigma).
+    2 mu (F - R) Fᵀ + lambda J (J - 1), as snow until it yields. Stretch raises their stiffness d(tau) / d(log sigma).
     """
     sand = ti.static(bool(variant & VARIANT.sand))
     snow = ti.static(bool(variant & VARIANT.snow))

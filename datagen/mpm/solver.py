@@ -30,7 +30,7 @@ from hgn.schema import ConfigError, require
 # thread has 64 registers with 512 threads a block, 128 with 256, and 255 with 128.
 GPU_BLOCKS = 2
 TEAM_THREADS, TEAM_BLOCKS, TEAM_RUN = 256, 3, 4  # for many scenes, which teams compute in turn
-EVEN = 0.95  # smallest (mean time of a scene) / (time of the launch) for which each scene gets only one block
+EVEN = 0.95  # one block a scene above this fraction of filled turns and this mean / largest particle count
 SHARED_THREADS, SHARED_BLOCKS = 128, 8  # threads a block, and fewest blocks of each of a few scenes
 SHARED_PARTICLES = 8  # fewest particles of such a block
 LARGE_PARTICLES = 4096  # particles per processor above which a scene's blocks are as large as those of many scenes
@@ -74,9 +74,9 @@ def simulate(
     simulation (see `initialise`). `colliders` are results of `build_collider` for the scenes; None: they are built.
     `team` computes a scene; None: chosen by device and scenes. `stability_fractions` replace the config's.
 
-    On a CPU a scene's result does not depend on its batch, bitwise. It depends on `cpu_threads` only by the number of
-    parts in which particles are summed, min(cpu_threads, 4). If obstacles move, frames of all scenes are divided into
-    parts (see grid_launch.motion_parts). On a GPU sums have no fixed order.
+    On a CPU a scene's result does not depend on its batch, bitwise. `cpu_threads` changes it only through the number of
+    partial sums, min(cpu_threads, 4). If obstacles move, frames of all scenes are divided into parts (see
+    grid_launch.motion_parts). On a GPU sums have no fixed order.
 
     A particle with an entry time is NaN before it; it enters in free flight from its given place. A scene that is not
     finite, leaves the domain or needs more than MAXIMUM_SUBSTEPS a frame ends as a SceneFailure with cause and frame. A

@@ -5,9 +5,9 @@ import taichi as ti
 from datagen.mpm.layout import COUNT, SETTING, STATUS, VALUE
 from hgn.solver_method import SPEED_FRACTION
 
-# An interval with at least this number of stress steps is synchronised (see mls_mpm). With fewer steps resting material
-# gained no energy, but the result of an impact on the ground at 10 m/s changed by 6 % if the steps were halved. So an
-# interval that a fast particle shortens is synchronised too.
+# An interval with at least this number of stress steps is synchronised (see mls_mpm). Without synchronisation intervals
+# of fewer steps are stable at rest. But the result of an impact on the ground at 10 m/s changed by 6 % when the steps
+# were halved. So an interval that a fast particle shortens is synchronised too.
 SYNCHRONISED_FROM = 3.0
 SPEED_MARGIN = 1.25  # a particle that gains speed may move this much farther than planned for an interval
 

@@ -1,4 +1,4 @@
-"""The work of the pool's makers and solvers on any machine, and the pool's view of a worker."""
+"""The work of makers (draw scenes, build obstacles) and solvers (simulate); the pool's interface to a worker."""
 
 from __future__ import annotations
 
@@ -88,9 +88,9 @@ class BuiltGrid:
 
 
 class Worker(ABC):
-    """The pool's view of a worker."""
+    """The interface by which the pool uses a worker."""
 
-    speaks = False  # whether a working worker reports more often than dataset.worker_silence_s
+    speaks = False  # whether a busy worker sends messages at shorter intervals than dataset.worker_silence_s
 
     def __init__(self) -> None:
         self.idle = False
@@ -103,7 +103,7 @@ class Worker(ABC):
         """Sends work. The next `receive` notices a dead worker."""
 
     def tell(self, message: object) -> None:
-        """Sends the missing part of a task that the worker already has."""
+        """Sends the part that a task of the worker lacks."""
         raise NotImplementedError
 
     def dismiss(self) -> None:  # noqa: B027 - Ray ends its actors itself
@@ -141,7 +141,7 @@ def make_scene(task: SceneTask, config: DatagenConfig, backend: Backend, with_gr
     build_collider = pkgutil.resolve_name(backend.build_collider)
     try:
         scene = generate_scene(config.scene, task.seed)
-        # built by makers, because in a solver the device would wait for one scene after the other
+        # Makers build it. If a solver did, its GPU would idle while colliders are built one by one.
         finer = replace(scene, cell_size=config.reference_cell_size)
         collider = build_collider(finer, config.mpm.choices.collider_band_cells)
     except ConfigError as error:  # e.g. an obstacle does not fit; another seed may work
@@ -241,7 +241,7 @@ def make_episode(made: MadeScene, result: Any, config: DatagenConfig, config_has
 
 
 def error_message(error: Exception) -> tuple[Any, ...]:
-    """Returns a worker's message about an error without a scene as its cause."""
+    """Returns a worker's message about an error that no scene has caused."""
     if isinstance(error, ConfigError):
         return "config_error", str(error)
     if isinstance(error, ModuleNotFoundError) and (missing := missing_extra(error)):

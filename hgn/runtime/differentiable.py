@@ -1,7 +1,7 @@
 """Simulation with gradients with respect to the initial state and the poses of obstacles.
 
 docs/how_to/gradients.md lists which gradients are exact, which are valid only within a cell, and for how many frames.
-Shape legend: T frames, N particles, H velocities, F triangles.
+Shape legend: T frames, S scenes, N particles, M or H velocities, F triangles.
 """
 
 from __future__ import annotations
@@ -85,7 +85,8 @@ def simulate(
 class _Frame(torch.autograd.Function):
     """A frame without its intermediate results. The backward pass computes them again.
 
-    torch.utils.checkpoint does the same, but calls Python for each result. On a GPU a call takes as long as the result.
+    torch.utils.checkpoint does the same, but calls Python for each intermediate tensor. On a GPU such a call takes as
+    long as computing the tensor.
     """
 
     @staticmethod
@@ -103,7 +104,7 @@ class _Frame(torch.autograd.Function):
         with torch.enable_grad():
             outputs = context.step(*variables)
         wanted = [tensor for tensor in variables if tensor.requires_grad]
-        # outputs without a gradient are left out; for example, none depends on poses if no obstacle stops a particle
+        # grad refuses outputs that depend on no wanted tensor, for example on a pose whose obstacle stops no particle
         reached = [pair for pair in zip(outputs, gradients, strict=True) if pair[0].requires_grad]
         ends, slopes = [output for output, _ in reached], [gradient for _, gradient in reached]
         computed = iter(torch.autograd.grad(ends, wanted, slopes, allow_unused=True))

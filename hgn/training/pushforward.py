@@ -61,8 +61,8 @@ def simulated_frames(training: TrainingConfig, frame_count: int) -> int:
 def drawn_starts(training: TrainingConfig, update: int, rank: int, frame_counts: Sequence[int]) -> Starts:
     """Draws the episode and the start frame of each simulation before `update`.
 
-    Every episode is drawn once before one is drawn twice. The latest start leaves min(simulated frames, half of the
-    episode) frames to simulate and one target. `frame_counts` are the numbers of frames of the episodes.
+    Every episode is drawn once before one is drawn twice. After the latest start there are min(simulated frames, half
+    the episode) frames to simulate, then the last one's target. `frame_counts` are the episodes' numbers of frames.
     Raises: ConfigError if all episodes are too short.
     """
     last = {
@@ -113,7 +113,7 @@ def pushforward_windows(
 
     true_TN3 contains the frames n - H to n + F + 1 of the data, simulated_FN3 the frames n + 1 to n + F. The last frame
     of the window of frame k is x_k + (true_{k+1} - true_k) + pull (true_k - x_k). With this target the network corrects
-    its velocity error and, by the last term, a part of its position error. This also returns particles behind a wall.
+    its velocity error and, by the last term, part of its position error, also that of particles that passed a wall.
     """
     frames = len(simulated_FN3)
     history = len(true_TN3) - frames - 2
@@ -128,7 +128,7 @@ def pushforward_windows(
 def usable_frames(
     true_TN3: torch.Tensor, simulated_FN3: torch.Tensor, domain_3: torch.Tensor, cell_size: float
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Returns the number of leading frames usable for training, and the last one's error. Both are [] on the device.
+    """Returns the number of leading frames usable for training, and the last one's error, as scalars on the device.
 
     The error is the mean squared distance from the data in the last usable frame.
     """
@@ -211,8 +211,7 @@ class PushforwardPool(Generic[E, T]):
         self.figures = {f"pushforward/{name}": value for name, value in values.items()}
 
     def replaced(self, samples: Sequence[T], update: int) -> list[T]:
-        """Returns an update's samples with a fraction from the pool. Slots keep seeds; noise scales are recomputed."""
-
+        """Returns the samples, some replaced by ones from the pool with the same seeds and new noise scales."""
         samples, scenes = list(samples), self._scenes
         for slot, (number, rarity) in enumerate(self._draws.drawn(update)):
             own, acceleration = self._samples[number]
