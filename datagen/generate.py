@@ -34,8 +34,7 @@ _OTHERS = ("frozen", "name", "network", "step", "training", "progress")
 
 
 class StopSignal:
-    """Notes Ctrl-C or SIGTERM while it is entered, so that current writes are finished. A second signal ends the
-    process."""
+    """Notes the first Ctrl-C or SIGTERM, so that current writes are finished. A second one ends the process."""
 
     def __init__(self) -> None:
         self.signal: int | None = None

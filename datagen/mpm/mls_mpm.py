@@ -1,8 +1,8 @@
 """Computes the parts of a substep of explicit MLS-MPM, for the Taichi kernels grid_kernel and team_kernel.
 
 Transfers are APIC with quadratic B-splines (Jiang et al. 2015; Hu et al. 2018). Only blocks of nodes near particles are
-updated. Contributions of particles are summed separately from the nodes' velocities. Masses are in units of the mass of
-a particle with the config's density.
+updated. Particles' contributions have their own array; the old node velocity is added later (`node_velocity`). Masses
+are in units of the mass of a particle with the config's density.
 
 Each transfer smooths velocities, so transfers have their own rate. The interval between two transfers contains as many
 substeps as the stiffest particle needs. With adaptive steps an interval is synchronised if it needs three or more
@@ -11,8 +11,8 @@ the others. Stress acts from half a step before to half a step after its time (v
 a step ahead of stresses, oscillations with two periods in an interval could double their energy in each interval.
 
 At the end of an interval that is not synchronised, strain is one step behind, and velocity half a step. The first
-substep of a following synchronised interval compensates both (VALUE.catch_up). In the opposite case the first substep
-does not strain, and its stress acts for half of it.
+substep of a following synchronised interval compensates both (VALUE.catch_up). If a synchronised interval precedes one
+that is not, the first substep of the second interval skips strain, and its stress acts for half a substep.
 
 In the first substep of an interval particles transfer mass, momentum and force to the nodes. In the other substeps they
 keep their place on the grid. They compute strain and stress from the gradient of the nodes' velocities. They transfer
@@ -56,11 +56,11 @@ def respond(
 ):
     """Computes a material's response to a step of `step` seconds with the velocity gradient C, 1/s.
 
-    Particles keep the place that they had when the interval began, so C is a gradient by those positions. By present
-    positions it is C - (C + Cᵀ) / 2 stretch, to first order in `stretch`, the sum of dt (C + Cᵀ) / 2 over the steps so
-    far. With it the steps of an interval together stretch F as one step would.
+    Particles keep the place that they had when the interval began, so C is a gradient by those positions. `stretch`
+    is the sum of dt (C + Cᵀ) / 2 so far. By present positions the gradient is C - ((C + Cᵀ) / 2) @ stretch, to first
+    order. With it the steps of an interval together stretch F as one step would.
 
-    Returns the response - V0 (4 / dx²) stress / mass, the rate at which stress changes APIC's C; the new stretch and F
+    Returns the response, -(V0 4 / dx²) stress / mass: the rate at which stress changes APIC's C; the new stretch and F
     (unchanged for water); the new volume (see constitutive); and the present (3 lambda + 2 mu) / density, m²/s².
     """
     has_water = ti.static(bool(arrays.variant & VARIANT.water))
@@ -168,7 +168,7 @@ def node_velocity(
 
 @ti.func
 def _room(fx, base: ti.i32, axis: ti.template(), shape: ti.template()) -> ti.f32:
-    """Returns the weighted fraction of a particle's nodes, and of their splines, between the walls of an axis."""
+    """Returns which part of the splines of a particle's nodes is between an axis's walls, averaged with its weights."""
     w0, w1, w2 = weights(fx)
     wall = shape[SHAPE.wall_cells]
     room = 0.0
@@ -224,7 +224,8 @@ def _triangle_list(x, scene: ti.i32, arrays: ti.template()) -> ti.i32:
 def find_hidden(x, scene: ti.i32, elapsed: ti.f32, arrays: ti.template()) -> ti.i32:
     """Returns in bits which of a particle's nodes are hidden from it by sheets (see surface_kernel.hidden_nodes).
 
-    All particles on the hidden side of a node share its second field. Moving contacts are `elapsed` seconds old.
+    A node near a sheet has two velocity fields, one per side; particles on the hidden side use the second.
+    Moving contacts are `elapsed` seconds old.
     """
     bits = 0
     list_at = _triangle_list(x, scene, arrays)
@@ -237,7 +238,7 @@ def find_hidden(x, scene: ti.i32, elapsed: ti.f32, arrays: ti.template()) -> ti.
 
 @ti.func
 def move(x, v, C, scene: ti.i32, arrays: ti.template()):
-    """Returns a particle's position and velocity after an interval, constrained by triangles and bounds, and v².
+    """Returns position (changed by triangles and bounds) and velocity (by triangles only) after an interval, and v².
 
     A particle that is not finite or leaves the domain stops its scene; v² is then 0.
     """

@@ -51,7 +51,7 @@ class Pool:
         self._grid_deaths: dict[SceneTask, int] = {}
 
     def run(self) -> None:
-        """Runs until all shards of this generator are published, then ends all workers.
+        """Runs until this generator's share is published, by it or by other generators, then ends all workers.
 
         Raises: Stopped; ConfigError, OSError or RuntimeError from a worker.
         """
@@ -136,9 +136,9 @@ class Pool:
                 maker.give(task)
 
     def _next_task(self) -> SceneTask | GridTask | None:
-        """Returns a maker's next task, or None. Scenes for the next launch come first.
+        """Returns a maker's next task, or None: a scene of the next launch, else of later launches, else a grid.
 
-        Grids come second, because a launch needs them only at its end.
+        Later launches: two per solver at most, and none while the first waiting grid's scene is with a solver.
         """
         coming = len(self._ready) + len(self._being_made())
         short = coming < self._launch_size
@@ -150,7 +150,7 @@ class Pool:
             return self._todo.pop(0)
         if self._gridless:
             made = self._gridless.pop(0)
-            return GridTask(made.task, made.scene)
+            return GridTask(made.task, made.scene)  # a launch needs it only at its end
         return None
 
     def _being_made(self) -> list[SceneTask]:

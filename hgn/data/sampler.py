@@ -1,4 +1,4 @@
-"""The order of training samples: a pure function of seed, epoch, episodes, batch and world size.
+"""The order of training samples: a pure function of seed, epoch, episodes, window, batch and world size.
 
 A sample is one frame of one episode. An epoch is a permutation of all samples of the episodes that were published when
 it began. Epochs follow each other without a gap. Every sample comes exactly once an epoch on any number of ranks.
@@ -25,7 +25,7 @@ class SamplerState:
     position: int = 0  # number of samples of this epoch that were taken
     episodes: int = 0  # number of episodes in this epoch; 0: not yet fixed
     digest: str = ""  # digest of the shards with these episodes; empty: unknown (checkpoints of 0.1.0)
-    window: int = 0  # number of episodes whose samples are shuffled together; 0: all
+    window: int = 0  # episodes whose samples are shuffled together (training.shuffle_episodes); 0: all
     seed: int | None = None  # seed of the order; None: unknown (checkpoints of 0.1.0)
 
 

@@ -18,7 +18,7 @@ particle in the same coarsest cells, or in cells across their faces, is within r
 
 The decoder returns an acceleration r and a stress sigma for each particle. `balanced` computes the acceleration from
 them. These properties hold for any parameters:
-- Without relative motion the output is 0, so a body that flies freely without deforming has exactly acceleration g.
+- Without relative motion the output is 0: a free body that neither rotates nor deforms has exactly acceleration g.
 - Without a surface in reach momentum is conserved. The mean of r over a coarsest cell is subtracted, and cells exchange
   only antisymmetric impulses across their faces.
 - Angular momentum is then conserved too. The rotation of a cell, and of each pair of neighbours, is subtracted.
@@ -47,10 +47,9 @@ SMALLEST_MASS = 1e-30  # lower bound of a cell's mass; a cell without weight get
 # A surface's effect fades if its contacts weigh less than FEW particles, or less than RARE of the cell's contacts.
 FEW, RARE = 0.1, 1e-3
 # Particles on a line define no rotation about it. So a rotation fades out if the product of the three principal moments
-# is below (THIN * mean moment)^3, or if the mean moment is below POINT. Unit: squared edges of a coarsest cell. A cube
-# with 1/13 of that edge has the moment POINT.
+# is below (THIN * mean moment)^3, or if the mean moment is below POINT. Moments: in squared edges of a coarsest cell.
 THIN = 0.2
-POINT = 1e-3
+POINT = 1e-3  # moment of a cube with 1/13 of the edge of a coarsest cell
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,8 +120,8 @@ def wall_nearness(
 ) -> torch.Tensor:
     """Returns the nearness of the domain's six planes, lower planes first, [N, 6].
 
-    It is 0 at distances of `reach` and more, 1 at the plane, and at most 2. For a particle that approaches a plane it
-    is the nearness after the next frame.
+    It is 0 at distances of `reach` and more, 1 at the plane, and at most 2. For a particle that approaches a plane, the
+    distance one frame later is used, at the present velocity.
     """
     distance_N6 = torch.cat([position_N3, domain_N3 - position_N3], dim=-1)
     away_N6 = torch.cat([velocity_N3, -velocity_N3], dim=-1)
@@ -167,14 +166,14 @@ def surface_normals(wall_N6: torch.Tensor, normal_N6: torch.Tensor | None) -> to
 
 
 def touched_normals(normal_N33: torch.Tensor, grid: GridHierarchy) -> torch.Tensor:
-    """Returns S [C, 3, 3]: sums of w_pC times `surface_normals` in a coarsest cell."""
+    """Returns P [C, 3, 3]: sums of w_pC times `surface_normals` in a coarsest cell."""
     normal_N89 = grid.weight_N8[..., None] * normal_N33.flatten(1)[:, None]
     sum_C9 = normal_N89.new_zeros(grid.levels[-1].cell_count, 9)
     return sum_C9.index_add(0, coarsest_cells(grid).flatten(), normal_N89.flatten(0, 1)).unflatten(1, (3, 3))
 
 
 def slip(normal_C33: torch.Tensor) -> torch.Tensor:
-    """Returns Q = (1 + S / (FEW + RARE tr S))^-1 [C, 3, 3] of the `touched_normals` S.
+    """Returns Q = (1 + P / (FEW + RARE tr P))^-1 [C, 3, 3] of the `touched_normals` P.
 
     Q projects on directions that surfaces leave free. Away from surfaces it is 1. Near a plane it is 1 along the plane
     and almost 0 along its normal. Between two planes it is 1 only along their common edge.
@@ -200,7 +199,7 @@ def disturbance(
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Returns `disturbed` and `touched` of each coarsest cell, [C] each, from 0 to 1.
 
-    `disturbed` is 0 if all particles in the surroundings fly freely as one rigid body. A particle is disturbed by a
+    `disturbed` is 0 if all particles around fly freely as one body without rotation. A particle is disturbed by a
     surface within reach (`surface_gate`), or if a column of history or surroundings is not small against QUIET. A
     coarsest cell is as disturbed as the most disturbed particle in it and in the cells across its faces. These cells
     count because an impact crosses a body within one frame. `touched` is computed in the same way, from surfaces only.
@@ -228,23 +227,24 @@ def coarsest_cells(grid: GridHierarchy) -> torch.Tensor:
 def balanced(output_N9: torch.Tensor, contacts: Contacts, grid: GridHierarchy) -> torch.Tensor:
     """Returns normalised accelerations without gravity, [N, 3], from the decoder's output and the contacts.
 
-        a_p = sum_C w_pC d_C (r_p - (1 - t_C) R_C + A_C),    A_C = sum_C' d_C' f' T,    T = (S_C + S_C') e / 2
+        a_p = sum_C w_pC d_C (r_p - (1 - t_C) R_C + A_C),    A_C = sum_C' d_C' f' T,    T = (sigma_C + sigma_C') e / 2
 
-        w_pC           weight of particle p in coarsest cell C
-        M_C, R_C, S_C  mass of the cell, its mean acceleration and its mean stress, with these weights
-        d_C, t_C       disturbed and touched (see `disturbance`)
-        e              unit vector from the cell to its neighbour C'
-        f, f'          M_C / (M_C + M_C') and 1 - f
+        w_pC               weight of particle p in coarsest cell C
+        M_C, R_C, sigma_C  mass of the cell, its mean acceleration and its mean stress, with these weights
+        d_C, t_C           disturbed and touched (see `disturbance`)
+        e                  unit vector from the cell to its neighbour C'
+        f, f'              M_C / (M_C + M_C') and 1 - f
 
     Each term of M_C d_C A_C is antisymmetric in C and C', and no term is divided by a small mass. So sum_p a_p is
     sum_C d_C t_C M_C R_C, which is 0 without a surface in reach. Cells exchange momentum across faces as in finite
     volumes. A symmetric stress has no torque at a point, but the forces T and -T on a pair of cells have one.
 
     Rotation is subtracted so that sum_p x_p x a_p is 0 too without a surface in reach. Let y_p be the particle's place
-    relative to the cell's centre of mass X, and I and L the cell's means of inertia and of y x r. r_p - R becomes
-    q (r_p - R) - W x y_p with (q, W) = rotation(I, L). Let D = X' - X. The cell gets f' (q T + W x D) - W x y_p instead
-    of f' T, with (q, W) = rotation(I f + I' f' + f f' (D^2 - D D^T), -f f' D x T) of the pair about its common centre.
-    Each of these is a projection times q, so it never enlarges mean squares, even for small or thin bodies.
+    relative to the cell's centre of mass X, and I and J the cell's means of inertia and of y x r. r_p - R becomes
+    q (r_p - R) - W x y_p with (q, W) = rotation(I, J). Let D = X' - X. Instead of f' T, the cell gets
+    f' (q' T + W' x D) - W' x y_p. For the pair, about its common centre, (q', W') is
+    rotation(I f + I' f' + f f' (D^2 - D D^T), -f f' D x T). Both subtractions (cell and pair) are a projection times
+    q or q', so they never enlarge mean squares, even for small or thin bodies.
 
     t_C Q_C R_C is subtracted too, where Q is `slip` of the `touched_normals`. Then the mean force of surfaces on a cell
     is along their normals. Bodies slide on a plane without friction or propulsion, for any parameters.
@@ -307,10 +307,10 @@ def inertia(spread_K33: torch.Tensor) -> torch.Tensor:
 
 
 def rotation(inertia_K33: torch.Tensor, moment_K3: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Returns q [K], from 0 (a line or a point) to 1 (a determined rotation), and W [K, 3] with I W = q L.
+    """Returns q [K], from 0 (a line or a point) to 1 (a determined rotation), and W [K, 3] with I W = q J.
 
-    q = det I / (det I + m) and W = adj(I) L / (det I + m), with m = (THIN (tr I / 3 + POINT))^3. The denominator is
-    positive, so q and W do not jump. If a field u has the angular momentum L, the field q u - W x y has none.
+    q = det I / (det I + m) and W = adj(I) J / (det I + m), with m = (THIN (tr I / 3 + POINT))^3. The denominator is
+    positive, so q and W do not jump. If a field u has the angular momentum J, the field q u - W x y has none.
     """
     determinant_K, adjugate_K33 = adjugate(inertia_K33)
     determinant_K = determinant_K.clamp(min=0)

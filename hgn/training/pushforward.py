@@ -47,8 +47,8 @@ class Sample(Protocol):
 T = TypeVar("T", bound=Sample)
 Starts = tuple[tuple[int, int], ...]  # (episode, frame) of each simulation's start
 START_STREAM, SAMPLE_STREAM = 0x57A7, 0xE217
-# Largest root mean square distance of a scene's frame from the data, in finest cells. Others are dropped: the
-# data's motion is no target for them, and they would dominate the loss. An untrained network loses most frames.
+# Largest RMS distance of a frame from the data, in finest cells. Frames farther away are dropped, with all later ones:
+# the data's motion is no target for them, and they would dominate the loss. An untrained network loses most frames.
 DROPPED_BEYOND = 0.5
 PULLED_WITHIN = 1.0  # largest position error on each axis that a target corrects, in finest cells
 
@@ -61,8 +61,8 @@ def simulated_frames(training: TrainingConfig, frame_count: int) -> int:
 def drawn_starts(training: TrainingConfig, update: int, rank: int, frame_counts: Sequence[int]) -> Starts:
     """Draws the episode and the start frame of each simulation before `update`.
 
-    Every episode is drawn once before one is drawn twice. After the latest start there are min(simulated frames, half
-    the episode) frames to simulate, then the last one's target. `frame_counts` are the episodes' numbers of frames.
+    Every episode is drawn once before one is drawn twice. The latest possible start leaves min(simulated frames, half
+    the episode) frames to simulate and one more, the target of the last. `frame_counts`: frames of each episode.
     Raises: ConfigError if all episodes are too short.
     """
     last = {
