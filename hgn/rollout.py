@@ -75,7 +75,7 @@ def main(mapping: dict[str, Any]) -> int:
 
     config = from_mapping(RolloutConfig, mapping)
     drawn = config.render if config.render is not None else config.out is None
-    out = Path(config.out or f"rollout/{_name(config)}.vtkhdf")
+    out = _out(config)
     still, moving = pictures = out.with_suffix(".png"), out.with_suffix(".gif")
     require_replaceable("out", out, *(pictures if drawn else ()))
     path, result = rollout(config)
@@ -102,7 +102,7 @@ def rollout(config: RolloutConfig) -> tuple[Path, Rollout]:
     from hgn.runtime.weights import find_weights, require_frame_rate
     from hgn.scene.rollout_file import Rollout, obstacles_of_episode, rollout_bytes
 
-    out = Path(config.out or f"rollout/{_name(config)}.vtkhdf")
+    out = _out(config)
     require_exchange(out, config.surface)
     require_place(out)
     simulator = Simulator.load(config.weights, config.device, config.backend, config.precision)
@@ -171,11 +171,12 @@ def _fastest(initial: InitialState) -> float:
     return float(np.linalg.norm(initial.velocity_N3, axis=-1).max(initial=0.0))
 
 
-def _name(config: RolloutConfig) -> str:
-    """Returns the name of the scene or the episode."""
-    return str(config.episode or "") or (
-        find_scene(config.scene).stem if config.scene is not None else f"random_{config.seed}"
-    )
+def _out(config: RolloutConfig) -> Path:
+    """Returns the file to write: `out`, or one with the name of the episode, the scene or the seed."""
+    if config.out is not None:
+        return Path(config.out)
+    scene = find_scene(config.scene).stem if config.scene is not None else f"random_{config.seed}"
+    return Path(f"rollout/{scene if config.episode is None else config.episode}.vtkhdf")
 
 
 def _scene(config: RolloutConfig, info: WeightsInfo) -> Scene:

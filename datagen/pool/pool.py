@@ -27,7 +27,7 @@ _LAUNCH_GROWTH = 32  # factor between the sizes of successive launches, up to th
 
 
 class Stopped(Exception):  # noqa: N818 - a request, not an error
-    """The run was asked to stop; staged episodes are kept."""
+    """A stop was requested; staged episodes are kept."""
 
 
 class Pool:

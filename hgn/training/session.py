@@ -143,9 +143,8 @@ def _module(config: TrainConfig, start: Start, backend: str, precisions: tuple[s
 
 
 def _backend(config: TrainConfig, resume: Resume | None) -> tuple[str, tuple[str, ...], str]:
-    """Returns `torch` or `triton`, the precisions to try in order, and a line that reports both.
-
-    A training with precision `auto` goes on in the precision of its checkpoint.
+    """Returns `torch` or `triton`, the precisions to try in order, and a line that reports both. A training with
+    precision `auto` resumes in the precision of its checkpoint.
     """
     training = config.training
     on_gpu = training.device != "cpu" and torch.cuda.is_available()

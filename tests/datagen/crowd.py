@@ -1,6 +1,6 @@
 """`python tests/datagen/crowd.py SECONDS READERS FILE.json`: readers of a data set that the service still generates.
 
-Each looks at the manifest once a second and reads every shard; /healthz is asked ten times a second at its own port.
+Each looks at the manifest once a second and reads every shard; ten requests a second go to /healthz at its own port.
 The stand-in for the solver generates, so that the service is what is measured. Linux only.
 """
 

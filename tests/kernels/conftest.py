@@ -44,3 +44,16 @@ def large_tiles(monkeypatch):
     of = Tuning.of
     if not NATIVE:
         monkeypatch.setattr(Tuning, "of", staticmethod(lambda precision: in_large_tiles(of(precision))))
+
+
+@pytest.fixture
+def half_fails(monkeypatch):
+    """Makes fp16 fail the check of kernels in a module, and `auto` try fp16, then fp32, where another one chooses."""
+
+    def fail(checking, choosing):
+        check, scale = checking.require_parity, {"fp16": 0.5}
+        halved = lambda x, y, quantity, kind, **named: check(scale.get(kind, 1.0) * x, y, quantity, kind, **named)  # noqa: E731
+        monkeypatch.setattr(checking, "require_parity", halved)
+        monkeypatch.setattr(f"{choosing}.precisions_to_try", lambda p, *_: ("fp16", "fp32") if p == "auto" else (p,))
+
+    return fail

@@ -211,17 +211,10 @@ def test_free_flight_is_not_refused():
         rollout.require_parity(other, stirred)
 
 
-def test_automatic_precision_is_lowered_where_refused(monkeypatch):
+def test_automatic_precision_is_lowered_where_refused(half_fails):
     """With precision auto a backend whose fp16 fails the check warns once and simulates in the next precision; a named
     precision is refused."""
-    check = triton_stepper.require_parity
-    wrong = lambda computed, expected, quantity, precision, section="": check(  # noqa: E731
-        computed * (0.5 if precision == "fp16" else 1.0), expected, quantity, precision, section
-    )
-    monkeypatch.setattr(triton_stepper, "require_parity", wrong)
-    monkeypatch.setattr(
-        "hgn.runtime.torch_backend.precisions_to_try", lambda p, *_: ("fp16", "fp32") if p == "auto" else (p,)
-    )
+    half_fails(triton_stepper, "hgn.runtime.torch_backend")
     (expected,) = Simulator(network(), 60.0, "triton", "fp32").rollout([scene(3)], 2)
     simulator = Simulator(network(), 60.0, "triton")
     with pytest.warns(UserWarning, match="got fp16: its outputs differ.*precision=auto computes in fp32 from here on"):
@@ -236,7 +229,7 @@ def test_automatic_precision_is_lowered_where_refused(monkeypatch):
 def test_later_simulations_begin_anew(monkeypatch):
     """What a simulator has captured it uses again, for a scene of fewer particles, other obstacles and other gravity
     too; the frames are bitwise those of a new simulator, after one that diverged as well, which gives its good frames
-    first. So are frames that are asked for one by one, beside another simulation; the one that ends last is kept."""
+    first. So are frames computed one by one while another simulation runs; the one that ends last is kept."""
     monkeypatch.setattr(triton_stepper, "LOOK_FRAMES", 2)
     first, second = scene(3), scene(2, 1, gravity=(0.0, 2.0, 0.0))
     again, other = (Simulator(network(inputs="relative"), 60.0, "triton", "fp32") for _ in range(2))

@@ -104,19 +104,12 @@ def test_fast_training_is_the_plain_one(data, tmp_path, monkeypatch, capsys):
     assert found == pytest.approx(wanted, rel=1e-3)
 
 
-def test_automatic_precision_of_a_training(data, tmp_path, monkeypatch, capsys):
+def test_automatic_precision_of_a_training(data, tmp_path, monkeypatch, capsys, half_fails):
     """With precision auto a training whose fp16 fails the check is bitwise one in the next precision, pushforward and
     average included; it resumes in that precision without trying fp16. A named precision is refused. No graph outlives
     a training."""
-    check = parity.require_parity
-    wrong = lambda computed, expected, quantity, precision, section="": check(  # noqa: E731
-        computed * (0.5 if precision == "fp16" else 1.0), expected, quantity, precision, section
-    )
-    monkeypatch.setattr(parity, "require_parity", wrong)
+    half_fails(parity, "hgn.training.session")
     monkeypatch.setattr("hgn.training.session.triton_unsupported_reason", lambda *_: None)
-    monkeypatch.setattr(
-        "hgn.training.session.precisions_to_try", lambda p, *_: ("fp16", "fp32") if p == "auto" else (p,)
-    )
     made, build = [], TritonUpdates._build
     monkeypatch.setattr(
         TritonUpdates, "_build", lambda self, precision: (made.append(weakref.ref(self)), build(self, precision))

@@ -173,7 +173,7 @@ def test_frames_and_rates_that_are_refused(tmp_path):
 
 @pytest.mark.parametrize(("lowest", "wall"), [(0.3, 3 / 64), (0.05, 0.05), (3 / 64, 3 / 64), (0.02, 0.02), (-0.1, 0.0)])
 def test_the_floor_is_where_particles_rest(lowest, wall):
-    """The box is drawn without the walls, at most three cells thick, that no particle enters: what rests lies on it."""
+    """The box is drawn without the walls, at most three cells thick, that no particle enters; material lies on it."""
     rollout = falling_blobs()
     at_N3 = np.clip(rollout.position_TN3, 0.3, 0.7)
     at_N3[-1, 0, 1] = lowest

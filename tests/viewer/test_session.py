@@ -188,7 +188,7 @@ def test_changes_are_undone_one_by_one(session):
 
 
 def test_free_places(session):
-    """What is added stands free of particles and obstacles, in the middle where that is free; a full scene says so."""
+    """A free place is clear of particles and obstacles, in the middle if that is free; a full scene is refused."""
     for _ in range(4):
         place = np.array(session.free_place(0.15))
         inside = np.abs(session.newest.position_N3 - place) < 0.075
