@@ -180,3 +180,10 @@ def test_large_files():
     """No tracked file exceeds 500 kB, except the listed weights and results."""
     large = {name for name in tracked() if (ROOT / name).stat().st_size > BYTES_OF_A_FILE}
     assert large <= LARGE_FILES, "draw it from its data, keep it out of the repository, or list it here"
+
+
+def test_conflicts_are_resolved():
+    """No tracked text file has a line that git writes where a merge failed."""
+    marks = re.compile(r"^(<<<<<<<|>>>>>>>) ", re.MULTILINE)
+    names = tracked("*.md", "*.py", "*.yaml", "*.toml", "*.c", "Makefile")
+    assert [name for name in names if marks.search((ROOT / name).read_text(encoding="utf-8"))] == []
