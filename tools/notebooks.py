@@ -1,7 +1,8 @@
 """python -m tools.notebooks [NAME …]: writes docs/notebooks from pages of the documentation, and runs them.
 
-Text becomes Markdown cells, Python blocks code cells, commands `!` lines and files `%%writefile`. Outputs are kept. The
-pages are the only source; FEWER lists what is smaller, so that each notebook takes minutes on two CPU cores.
+Text becomes Markdown cells, Python blocks code cells, commands `!` lines and files `%%writefile`. Outputs are kept. A
+notebook whose code has not changed gets the page's new text and is not run again. The pages are the only source; FEWER
+lists what is smaller, so that each notebook takes minutes on two CPU cores.
 """
 
 from __future__ import annotations
@@ -42,14 +43,22 @@ def main() -> int:
 
     (DOCS / "notebooks").mkdir(exist_ok=True)
     for name in sys.argv[1:] or NOTEBOOKS:
-        content = from_dict(notebook(name))
-        with tempfile.TemporaryDirectory() as folder:
-            NotebookClient(content, timeout=None, resources={"metadata": {"path": folder}}).execute()
-        for cell in content.cells:
-            _tidy(cell)
-        text = json.dumps(content, indent=1, ensure_ascii=False) + "\n"
-        write_atomically(DOCS / "notebooks" / f"{name}.ipynb", text.encode())
+        content, path = from_dict(notebook(name)), DOCS / "notebooks" / f"{name}.ipynb"
+        code, kept = _code(content), _code(json.loads(path.read_bytes())) if path.exists() else []
+        if [cell["source"] for cell in code] == [cell["source"] for cell in kept]:
+            for cell, stored in zip(code, kept, strict=True):
+                cell.update(stored | {"id": cell["id"]})
+        else:
+            with tempfile.TemporaryDirectory() as folder:
+                NotebookClient(content, timeout=None, resources={"metadata": {"path": folder}}).execute()
+            for cell in content.cells:
+                _tidy(cell)
+        write_atomically(path, (json.dumps(content, indent=1, ensure_ascii=False) + "\n").encode())
     return 0
+
+
+def _code(content: Any) -> list[Any]:
+    return [cell for cell in content["cells"] if cell["cell_type"] == "code"]
 
 
 def _tidy(cell: Any) -> None:
