@@ -370,7 +370,7 @@ class TrainingConfig:
     # fraction of an episode's samples drawn in proportion to their frames' acceleration, with loss weights that keep
     # the expected loss; 0: all frames are equally likely
     frame_importance: BelowOne[float] = 0.0
-    # folders of additional data sets, as published at the start of the run. They need the same physics, frame rate,
+    # folders of additional data sets, as published when the command starts. They need the same physics, frame rate,
     # solver cells and reference grid, known materials, and with absolute inputs the same gravity.
     more_data: tuple[str, ...] = ()
     # number of episodes whose samples are shuffled together, for data larger than the cache or the GPU's memory; 0: all

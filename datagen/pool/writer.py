@@ -149,7 +149,7 @@ class DatasetWriter:
 
     @property
     def holds(self) -> bool:
-        """Returns whether claimed shards are not yet published."""
+        """Returns whether this writer has claimed shards that are not yet published."""
         return bool(self._claimed)
 
     @property
@@ -236,7 +236,7 @@ class DatasetWriter:
             done.result()
 
     def _pack(self, shard: ShardRange) -> _Packed:
-        """Writes a shard to a temporary file. Returns the stack that deletes it, the file and the checked entry."""
+        """Writes and checks a temporary shard file. Returns a stack that deletes it, its path and its entry."""
         with ExitStack() as stack:
             temporary = stack.enter_context(temporary_file(self.folder / STAGING_NAME / shard.name))
             with temporary.open("wb") as file:

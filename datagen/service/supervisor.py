@@ -1,8 +1,8 @@
-"""Runs the pool in a process of its own and keeps it alive. The service serves published episodes in every case.
+"""Runs the pool in a process of its own and keeps it alive. Meanwhile the service serves published episodes.
 
 A pool that dies, reports nothing, or ends because the disk is full is started again after a pause. The pause grows
-until another episode is finished. A pool with a wrong configuration is not started again; the service reports the error
-and continues to serve. An unwritable log ends nothing. An error of the supervisor itself ends the service.
+until another episode is finished. A pool that ends with a ConfigError is not started again. The service then continues
+to serve, unless no pool has begun its work. An error of the supervisor ends the service; one of the log does not.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _EVENTS = ("start", "frame", "episode", "found", "shard", "message", "close")
 
 @dataclass(frozen=True)
 class PoolState:
-    """The last state of the pool. `status`: starting, running, complete, waiting (to start), failed or stopped."""
+    """The last state of the pool. `status`: starting, running, complete, waiting (to restart), failed or stopped."""
 
     status: str = "starting"
     starts: int = 0
@@ -113,7 +113,7 @@ class Supervisor:
                     asked = True
                 if not connection.poll(_LOOK_S):
                     patience -= _LOOK_S * asked
-                    silent_s += _LOOK_S  # counted in checks, because this process may have been stopped too
+                    silent_s += _LOOK_S  # without a clock, which would count the time in which this process is stopped
                     if patience < 0 or silent_s > silence:
                         process.kill()
                     continue

@@ -33,7 +33,7 @@ TOKEN_VARIABLE = "HGN_DATASET_TOKEN"
 TOKEN_HOST_VARIABLE = "HGN_DATASET_HOST"
 _CHUNK_BYTES = 16 * 2**20  # bytes of a shard per request; a lost connection costs at most one request
 _CONNECT_S, _SILENCE_S, _ANSWER_S = 10.0, 60.0, 1800.0  # time limits of a connection, of silence, and of a whole file
-_AWAY_S = 10.0  # seconds after a failed request in which callers without patience send no request
+_AWAY_S = 10.0  # for this time after a failed request, calls with patience_s=0 fail without a request
 _NETWORK_PACKAGES = {"aiohttp", "botocore", "aiobotocore", "gcsfs", "google", "azure"}
 
 T = TypeVar("T")
@@ -45,7 +45,7 @@ class StorageError(ConfigError):
 
 
 def faults_outlived() -> contextlib.AbstractContextManager[None]:
-    """Lets `ask` repeat failed reads for the standard patience, because the data of a training existed before."""
+    """Lets `ask` repeat failed reads for the standard patience: a running training has read its data before."""
     return inside(_outliving)
 
 
@@ -210,7 +210,7 @@ class _Remote(Storage):
             ) from None
         self._manifest: tuple[bytes, str] | None = None  # the last manifest, and its ETag at a dataset service
         self._lock = threading.Lock()
-        self._away = (0.0, "")  # earliest time for callers without patience to ask again, and the cause
+        self._away = (0.0, "")  # time until which calls with patience_s=0 fail without a request, and the cause
 
     def manifest(self, name: str, patience_s: float | None = None) -> bytes:
         with self._lock:
@@ -242,7 +242,7 @@ class _Remote(Storage):
         def fill(file: BufferedRandom) -> None:
             self._require_not_away(name, patience_s)
             try:
-                # the second attempt fetches all bytes, because the disk may have lost bytes from another process
+                # the second attempt fetches every byte: the disk may have lost bytes that an earlier process wrote
                 if self._fill(file, name, size, patience_s) == sha256:
                     return
                 file.truncate(0)
@@ -337,9 +337,9 @@ def _transient(error: Exception, url: str) -> str | None:
     status = getattr(error, "status", None)
     if status in (401, 403) or isinstance(error, PermissionError):
         raise StorageError(
-            f"{url} must be open to this program, got refused; set {TOKEN_VARIABLE} to the service's token, which "
-            f"only {TOKEN_HOST_VARIABLE} receives where that is set (object stores need their own credentials, the "
-            "Hugging Face Hub HF_TOKEN)"
+            f"{url} must be open to this program, got refused; set {TOKEN_VARIABLE} to the service's token (if "
+            f"{TOKEN_HOST_VARIABLE} is set, only that host receives it; object stores need their own credentials, "
+            "the Hugging Face Hub needs HF_TOKEN)"
         ) from None
     if status == 410:
         raise ConfigError(f"{url} is damaged at its service; delete it there and run the generator again") from None

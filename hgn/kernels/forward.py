@@ -66,7 +66,7 @@ class FusedNetwork(Buffers):
         self.device = values.device
         rounded = precision in ("fp16", "tf32")
         self.weights = torch.empty_like(values, dtype=self.operand) if rounded else values
-        # Simulations use a finer encoder: falling particles have equal features, so rounding would move all alike.
+        # Falling particles have equal features, so rounding in the encoder would move a whole body. See FINE.
         self.fine = rounded and not training
         self.encode_weights = torch.zeros(self.width, grid.features, device=self.device)
         self.tuning = tuning or Tuning.of(precision)
@@ -243,7 +243,7 @@ class FusedNetwork(Buffers):
         )  # fmt: skip
 
     def _begin(self, block: Block, from_children: bool) -> None:
-        """Computes the block's input and the products of it that the first iteration reads."""
+        """Computes the input of the block's cells, and its two products that the first message passing step reads."""
         grid, level, edge = self.grid, block.level, block.packed.edge[0]
         rows = grid.capacities[level]
         size, warps = self.tuning.row_tile(rows)

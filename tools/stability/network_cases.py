@@ -30,7 +30,7 @@ DIRECTIONS = {
     "up": (0.0, 1.0, 0.0), "down": (0.0, -1.0, 0.0), "diagonal": (ROOT, ROOT, ROOT),
 }  # fmt: skip
 AT_REST = (0.0, 0.0, 0.0)
-GRAVITIES = {  # domain units per second squared, named in the earth's
+GRAVITIES = {  # domain units per second squared; names give the size in multiples of the earth's
     "none": (0.0, 0.0, 0.0),
     "half, sideways": (0.5 * EARTH, 0.0, 0.0),
     "one, upwards": (0.0, EARTH, 0.0),
@@ -38,26 +38,26 @@ GRAVITIES = {  # domain units per second squared, named in the earth's
     "two, downwards": (0.0, -2 * EARTH, 0.0),
     "two, oblique": (1.2 * EARTH, 0.0, -1.6 * EARTH),
 }
-FLIGHT_FRAMES = 60  # at most
-TURNED_FRAMES, TURNED_CUBES = 90, 8  # the error of a single cube varies by a factor of two
-TURNED_SPREAD = 0.1  # of the domain's sides, about its middle: where the cubes start
-MEETING = (1.5, -0.5)  # domain units per second along x, of the two cubes
+FLIGHT_FRAMES = 60  # largest number of frames of a flight
+TURNED_FRAMES, TURNED_CUBES = 90, 8  # several cubes, because the error of one varies by a factor of two
+TURNED_SPREAD = 0.1  # cubes start within this fraction of each domain side from the middle
+MEETING = (1.5, -0.5)  # velocities of the two cubes along x, domain units per second
 MEETING_FRAMES = 40
-COLLAPSE_CELLS = (5.0, 20.0)  # of the solver, from the lower plane to cubes that fall
+COLLAPSE_CELLS = (5.0, 20.0)  # heights of falling cubes above the lower plane, in cells of the solver
 COLLAPSE_FRAMES = (30, 60, 150)  # while spreading, when walls are reached, and at rest
 SLOPES_DEG = (15.0, 30.0, 45.0)
-SLOPE_SIDE, SLOPE_WAY = 0.6, 0.35  # of the domain's smallest side: the slope, and the distance slid
-FALL_FRAMES = 12  # in which a falling particle meets nothing
-ATTEMPTS = 20  # at scenes without enough space
-PARTICLE_FACTOR = 10.0
+SLOPE_SIDE, SLOPE_WAY = 0.6, 0.35  # side of the slope and distance slid, as fractions of the domain's smallest side
+FALL_FRAMES = 12  # number of frames in which a falling particle meets nothing
+ATTEMPTS = 20  # largest number of seeds to try if scenes have too little space
+PARTICLE_FACTOR = 10.0  # factor of the volume of groups, and so of the number of particles
 DOMAIN_SIDES = (2, 3, 4)  # factors of length and depth; obstacles and groups grow with the floor
-SPEED_FACTOR = 3.0  # times the speed of a fall through the domain
-FAR_CELLS = 64_000  # length of the domain at whose far end particles lie, in obstacle cells
+SPEED_FACTOR = 3.0  # largest initial speed, in multiples of the speed after a fall through the domain
+FAR_CELLS = 64_000  # length in obstacle cells of a domain with a scene at its far end
 
 FLIES = (Limit("gravity_error", high=0.02),)
 KEEPS = Limit("kept", low=0.99)
-# The solver's own angular momentum is not exact: positions do not show the spin within a cell. Its error is 0.04 for
-# cubes of snow of side 0.08, 0.06 for water, 0.07 for sand.
+# The solver's angular momentum has an error, because positions do not show the spin within a cell. For cubes of side
+# 0.08 this error is 0.04 (snow), 0.06 (water) or 0.07 (sand).
 MEETS = (
     Limit("momentum", high=0.01), Limit("angular", high=0.05, above=1.0), Limit("met", low=0.0, below=0.5),
 )  # fmt: skip
@@ -65,7 +65,7 @@ MEETS_ALONE = (Limit("momentum", high=0.01), Limit("angular", high=0.05), Limit(
 ENERGY, INSIDE = STANDARD
 RISE = Limit("energy_rise", high=0.02, above=1.5)
 WAY = (ENERGY, Limit("share_of_way", 0.8, 1.2), INSIDE)
-# The solver's own spread and height vary by 2 % and 0.1 cells over three fillings, the late spread of water by 9 %.
+# Over three random fillings the solver's spread varies by 2 % (late spread of water: 9 %), its height by 0.1 cells.
 SPREADS = (
     ENERGY,
     RISE,
@@ -74,8 +74,8 @@ SPREADS = (
     Limit("collapse.neighbours", 0.0, 0.0, below=0.7, above=1.4),
     INSIDE,
 )
-# The floor of the squared speed is twice its standard deviation over five fillings of 135 particles of water or sand.
-# Mixed water drifts by 0.6 of the space between the walls; 1.3 times as much is less than the space.
+# 5e-4 is twice the standard deviation of the squared speed over five fillings of 135 particles of water or sand.
+# Mixed water drifts by 0.6 of the distance between the walls. So particles can exceed 1.3 times this drift.
 RESTS = (
     ENERGY,
     RISE,
@@ -208,7 +208,7 @@ def body(config: SceneConfig, material: str, position_N3: np.ndarray, velocity_3
 
 
 def cube_places(config: SceneConfig, seed: int = 0) -> np.ndarray:
-    """Fills a cube of a group's size about 0 as densely as a group, float64 [N, 3]."""
+    """Returns random positions in a cube about the origin, with size and density of a group, float64 [N, 3]."""
     count = int(config.particles_per_cell * (config.group_size / config.cell_size) ** 3) + 1
     return config.group_size * (np.random.default_rng(seed).random((count, 3)) - 0.5)
 
@@ -247,7 +247,7 @@ def _flight(
 
 
 def flight_frames(scene: Scene, rate_hz: float, reach: float) -> int:
-    """Returns the frames of free flight until a particle, one frame ahead, is within `reach` of a wall; at least 1."""
+    """Returns the number of frames before a particle's next position can be within `reach` of a wall; at least 1."""
     gravity_3, velocity_3 = np.array(scene.gravity) / rate_hz**2, scene.velocity_N3[0] / rate_hz
     low_3 = scene.position_N3.min(axis=0) - reach - np.abs(gravity_3)
     high_3 = np.array(scene.domain_size) - scene.position_N3.max(axis=0) - reach - np.abs(gravity_3)
@@ -259,7 +259,7 @@ def flight_frames(scene: Scene, rate_hz: float, reach: float) -> int:
 
 
 def _turned(context: Context, material: str) -> Iterator[Case]:
-    """Turns falling cubes and gravity; their errors to the solver should not grow."""
+    """Exchanges axes of falling cubes and of gravity. The network's errors should not grow."""
     start_K3 = 0.5 + TURNED_SPREAD * (2 * np.random.default_rng(0).random((TURNED_CUBES, 3)) - 1)
     places_K3 = start_K3 * np.array(context.scene.domain_size)
     places = enumerate(places_K3)
@@ -281,7 +281,7 @@ def _above_floor(config: SceneConfig, material: str, cells: float) -> Scene:
 
 
 def _slope(context: Context, material: str, degrees: float) -> Case:
-    """Puts a block just above the upper end of a tilted square; without friction it accelerates as along the slope."""
+    """Puts a block just above the upper end of a tilted square. Its acceleration is that of gravity along the slope."""
     config, length = context.scene, min(context.scene.domain_size)
     turn = euler_rotation((degrees, 0.0, 0.0))
     up_3, down_3 = turn @ np.array([0.0, 1.0, 0.0]), turn @ np.array([0.0, 0.0, 1.0])
