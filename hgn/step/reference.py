@@ -240,8 +240,8 @@ def _outside_obstacles(
 ) -> torch.Tensor:
     """Stops the straight path of a frame at up to SURFACES triangles in turn, with walls again after each shift.
 
-    Each triangle shifts the end along its normal. If that shift leads back across the plane of the previous shift, the
-    end moves along both planes instead. Otherwise a path in a gutter would alternate between the two planes.
+    Each triangle shifts the end along its normal. If that normal points back across the plane of the previous shift,
+    the end moves along that plane instead. Otherwise a path in a gutter would alternate between the two planes.
     """
     before_N3, domain_N3 = state.position_N3, state.domain_S3[state.scene_N]
     lost_N1 = ~within_range(position_N3, domain_N3).all(-1, keepdim=True)
