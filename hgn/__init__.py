@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from hgn.runtime.divergence import DivergedError as DivergedError
     from hgn.runtime.live import LiveSimulation as LiveSimulation
+    from hgn.runtime.simulator import InitialState as InitialState
     from hgn.runtime.simulator import Simulator as Simulator
     from hgn.scene.mesh import load_mesh as load_mesh
     from hgn.scene.rollout_file import Rollout as Rollout
@@ -30,6 +31,7 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 _MODULES = {
     "ConfigError": "hgn.schema",
     "DivergedError": "hgn.runtime.divergence",
+    "InitialState": "hgn.runtime.simulator",
     "LiveSimulation": "hgn.runtime.live",
     "Obstacle": "hgn.scene.scene",
     "Rollout": "hgn.scene.rollout_file",

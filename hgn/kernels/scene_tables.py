@@ -88,7 +88,7 @@ class SceneTable:
         rows = [entry.row() if entry is not None else [0] * columns for entry in self._hashes]
         self.row_SC = torch.tensor(rows, dtype=torch.int64, device=device)
         self.cell_size = cell_size
-        self._barriers: Barriers | None = None  # the barriers of which the table was made, if of any
+        self._source: ObstacleCells | Barriers | None = None  # the object of which the table was made
 
     @staticmethod
     def of_obstacles(cells: ObstacleCells, scenes: int) -> SceneTable:
@@ -97,7 +97,9 @@ class SceneTable:
         counts = torch.bincount(scene_K, minlength=scenes).tolist()
         parts = zip(cell_K3.split(counts), cells.normal_K3.split(counts), strict=True)
         hashes = [SceneHash.of_obstacles(cell, normal) if len(cell) else None for cell, normal in parts]
-        return SceneTable(hashes, OBSTACLE_COLUMNS, cells.key_K.device, cells.cell_size)
+        table = SceneTable(hashes, OBSTACLE_COLUMNS, cells.key_K.device, cells.cell_size)
+        table._source = cells
+        return table
 
     @staticmethod
     def of_barriers(barriers: Barriers | None, scenes: int, device: torch.device) -> SceneTable:
@@ -118,14 +120,14 @@ class SceneTable:
             lists = cell_K3[k:k_end], start_K, triangle_E, barriers.row_F24[f:f_end]
             hashes.append(SceneHash._of_lists(lists, barriers.cell_size) if triangles[scene] else None)
         table = SceneTable(hashes, BARRIER_COLUMNS, barriers.key_Q.device)
-        table._barriers = barriers
+        table._source = barriers
         return table
 
-    def is_of(self, barriers: Barriers | None) -> bool:
+    def is_of(self, source: ObstacleCells | Barriers | None) -> bool:
         """Returns whether the table was made of this very object; False for None, whose table takes no time to make."""
-        return barriers is not None and self._barriers is barriers
+        return source is not None and self._source is source
 
     def take(self, other: SceneTable) -> None:
         """Copies the rows of another table into its own rows."""
         self.row_SC.copy_(other.row_SC)
-        self._hashes, self._barriers = other._hashes, other._barriers
+        self._hashes, self._source = other._hashes, other._source

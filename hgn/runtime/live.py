@@ -5,6 +5,7 @@ Shape legend: N particles, A particles that enter, M velocities of a history.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from types import TracebackType
 from typing import Any
@@ -12,29 +13,43 @@ from typing import Any
 import numpy as np
 import torch
 
+from hgn.network.barriers import Barriers
 from hgn.network.features import ParticleState
+from hgn.runtime.divergence import DivergedError, diverged
+from hgn.runtime.simulation import OF_PARTICLES, selected
 from hgn.runtime.simulator import InitialState, Simulator
+from hgn.scene.barrier import Barrier
 from hgn.scene.scene import Scene
 from hgn.schema import require
 
 
 class LiveSimulation:
-    """One scene, a frame at a time, on the simulator's backend. Use it as a context manager, or close it.
+    """One scene or several, a frame at a time, on the simulator's backend. Use it as a context manager, or close it.
 
-    A change between two frames acts from the next frame. Positions and velocity histories of the particles stay
-    bitwise equal. Particles keep their order; new particles follow them.
+    A change between two frames acts from the next frame, in scene `index`. Positions and velocity histories of other
+    particles stay bitwise equal. Particles are sorted by scene. Within a scene, new particles follow the others.
     """
 
-    def __init__(self, simulator: Simulator, scene: InitialState | Scene, capacity: int = 0) -> None:
-        """`capacity` is the number of particles for which backend triton allocates buffers.
+    def __init__(
+        self, simulator: Simulator, scenes: InitialState | Scene | Sequence[InitialState | Scene], capacity: int = 0
+    ) -> None:
+        """With a list, a scene that diverges ends: `ended` has its error by index, and its particles are removed.
 
-        With more particles it captures its frame again, which takes about a second.
+        `capacity` is the number of particles of all scenes for which backend triton allocates buffers. With more
+        particles it captures its frame again, which takes about a second.
         Raises: ConfigError as `Simulator.start`.
         """
-        self.simulator, self.scene = simulator, InitialState.of(scene)
-        emits = self.scene.emitting is not None
-        require(not emits, "emitters", "left out here", "some", remedy="take Simulator.frames, or add_particles")
-        self.simulation = simulator.simulation(simulator.start([self.scene]), capacity)
+        alone = isinstance(scenes, (InitialState, Scene))
+        self.simulator = simulator
+        self.scenes = [InitialState.of(scene) for scene in ([scenes] if alone else scenes)]
+        self.ended: dict[int, DivergedError] = {}
+        require(len(self.scenes) > 0, "scenes", "at least one", 0)
+        state = replace(self._started(self.scenes), obstacles=simulator.obstacles(self.scenes))
+        clearance = simulator.network.step.obstacle_clearance
+        self._barriers = [] if clearance is None else [scene.barrier(clearance) for scene in self.scenes]
+        state = replace(state, barriers=self._joined(self._barriers))
+        self.simulation = simulator.simulation(state, capacity, isolate=not alone)
+        self._changed: ParticleState | None = None  # what the next frame continues from, after changes
 
     def __enter__(self) -> LiveSimulation:
         return self
@@ -58,25 +73,50 @@ class LiveSimulation:
     @property
     def state(self) -> ParticleState:
         """Returns the input of the network for the next frame, on the simulator's device; read-only."""
-        return self.simulation.state
+        return self.simulation.state if self._changed is None else self._changed
 
     @property
     def particle_count(self) -> int:
-        return self.simulation.particle_count
+        return self.simulation.particle_count if self._changed is None else len(self._changed.material_N)
+
+    def advance(self) -> ParticleState:
+        """Simulates one frame of all scenes. Returns `state`, whose tensors stay on the device.
+
+        Raises: DivergedError with a single scene. It can then only be restored, or closed.
+        """
+        if self._changed is not None:
+            self.simulation.continue_from(self._changed)
+            self._changed = None
+        for _ in self.simulation.blocks(1):
+            pass
+        self.ended |= self.simulation.ended
+        return self.state
 
     def step(self) -> np.ndarray:
-        """Returns positions one frame later, float32 [N, 3] in domain units.
+        """Simulates one frame. Returns positions on the host, float32 [N, 3] in domain units. Raises as `advance`."""
+        return self.advance().position_N3.numpy(force=True).copy()
 
-        Raises: DivergedError. The simulation can then only be restored, or closed.
+    def reset(self, index: int, scene: InitialState | Scene) -> None:
+        """Starts a scene anew, or another one in its place, with any number of particles.
+
+        Obstacles are prepared again unless the scene has the same `obstacle_grid` and `corners` as before. Backend
+        triton captures its frame again for a domain of another size. Raises: ConfigError as `Simulator.start`.
         """
-        return np.asarray(self.simulation.run(1)[0])
+        self._require_scene(index)
+        start, state = InitialState.of(scene), self.state
+        self._put(index, start, selected(state, state.scene_N != index), self._started([start]))
+        self.ended.pop(index, None)
 
-    def add_particles(self, position_A3: np.ndarray, velocity_A3: np.ndarray, material_A: np.ndarray) -> np.ndarray:
+    def add_particles(
+        self, position_A3: np.ndarray, velocity_A3: np.ndarray, material_A: np.ndarray, index: int = 0
+    ) -> np.ndarray:
         """Adds particles that come from free flight: domain units, domain units per second, indices into MATERIALS.
 
         Returns their velocity histories, float32 [A, M, 3] in domain units per frame, newest first.
         Raises: ConfigError for a material that the network was not trained with, and for arrays of different lengths.
         """
+        self._require_scene(index)
+        require(index not in self.ended, "index", "of a scene in progress", index, remedy="reset it")
         count = len(position_A3)
         for name, value, shape in (
             ("position_A3", position_A3, (count, 3)),
@@ -88,59 +128,107 @@ class LiveSimulation:
             unusable = np.asarray(value)[~np.isfinite(value)]
             require(not len(unusable), name, "finite", float(unusable[0]) if len(unusable) else 0.0)
         require(material_A.dtype.kind in "iu", "material_A", "whole numbers", str(material_A.dtype))
-        entering = replace(self.scene, position_N3=position_A3, velocity_N3=velocity_A3, material_N=material_A)
-        new = self.simulator.start([replace(entering, corners=None)])  # barriers stay; building them takes time
+        arrays = {"position_N3": position_A3, "velocity_N3": velocity_A3, "material_N": material_A}
+        new = self._started([replace(self.scenes[index], **arrays, past_HN3=None)])
         if count:
-            self.simulation.add(new)
+            self._put(index, self.scenes[index], self.state, new)
         return new.velocity_NM3.cpu().numpy()
 
-    def replace_obstacles(self, scene: InitialState | Scene) -> None:
+    def replace_obstacles(self, scene: InitialState | Scene, index: int = 0) -> None:
         """Replaces the obstacles by those of another scene, at rest. Its particles are ignored.
 
         Raises: ConfigError as `Simulator.start`.
         """
         other = InitialState.of(scene)
-        of_obstacles = ("obstacle_grid", "corners")
-        obstacles: dict[str, Any] = {name: getattr(other, name) for name in of_obstacles}
-        self._change_scene(replace(self.scene, **obstacles), ("obstacles", "barriers"))
+        self._change_scene(index, obstacle_grid=other.obstacle_grid, corners=other.corners)
 
-    def set_gravity(self, gravity: tuple[float, float, float]) -> None:
+    def set_gravity(self, gravity: tuple[float, float, float], index: int = 0) -> None:
         """Replaces gravity, in domain units per second squared.
 
         Raises: ConfigError for weights with absolute inputs, which support only the gravity of their data.
         """
-        self._change_scene(replace(self.scene, gravity=gravity), ("gravity_S3",))
+        self._change_scene(index, gravity=gravity)
 
-    def restore(self, position_N3: np.ndarray, velocity_NM3: np.ndarray, frame: int) -> None:
-        """Restores an earlier frame of the first particles. Particles that entered later are removed.
+    def restore(self, position_N3: np.ndarray, velocity_NM3: np.ndarray, frame: int, index: int = 0) -> None:
+        """Restores an earlier frame of a scene's first particles. Particles that entered later are removed.
 
-        Obstacles and gravity stay.
+        Obstacles and gravity stay. `frame` becomes the number of the last frame.
 
         position_N3: float32, domain units. velocity_NM3: float32, domain units per frame, newest first.
         """
-        state = self.simulation.static_state
+        self._require_scene(index)
+        state = self.state
+        mine_N = state.scene_N == index
         count, expected = len(position_N3), (len(position_N3), *state.velocity_NM3.shape[1:])
         require(np.shape(velocity_NM3) == expected, "velocity_NM3", f"of shape {expected}", np.shape(velocity_NM3))
-        require(count <= self.particle_count, "position_N3", f"at most {self.particle_count} particles", count)
+        most = int(mine_N.sum())
+        require(count <= most, "position_N3", f"at most {most} particles", count)
         device = self.simulator.device
-        self.simulation.frame = frame
-        self.simulation.continue_from(
-            replace(
-                state,
-                position_N3=torch.tensor(position_N3, dtype=torch.float32).to(device),
-                velocity_NM3=torch.tensor(velocity_NM3, dtype=torch.float32).to(device),
-                material_N=state.material_N[:count],
-                scene_N=state.scene_N[:count],
-            )
+        start = replace(
+            selected(state, torch.nonzero(mine_N)[:count, 0]),
+            position_N3=torch.tensor(position_N3, dtype=torch.float32).to(device),
+            velocity_NM3=torch.tensor(velocity_NM3, dtype=torch.float32).to(device),
         )
+        self.simulation.frame = frame
+        self._continue(selected(state, ~mine_N), start)
 
-    def _change_scene(self, scene: InitialState, names: tuple[str, ...]) -> None:
-        """Replaces the named parts of the state by those of another scene."""
-        of_particles = ("position_N3", "velocity_N3", "material_N")
-        started: dict[str, Any] = {name: getattr(scene, name)[:0] for name in of_particles}
-        if "barriers" not in names:
-            started["corners"] = None  # barriers stay; building them takes time
-        new = self.simulator.start([replace(scene, **started)])
-        self.scene = scene
-        changed: dict[str, Any] = {name: getattr(new, name) for name in names}
-        self.simulation.continue_from(replace(self.state, **changed))
+    def _require_scene(self, index: int) -> None:
+        last = len(self.scenes) - 1
+        require(0 <= index <= last, "index", f"0 to {last}, a scene of the batch", index)
+
+    def _started(self, scenes: Sequence[InitialState]) -> ParticleState:
+        """Returns the start of scenes without obstacles, which take time and often stay."""
+        bare = []
+        for scene in scenes:
+            remedy = "take Simulator.frames, or add_particles"
+            require(scene.emitting is None, "emitters", "left out here", "some", remedy=remedy)
+            grid = scene.obstacle_grid
+            no_cells = replace(grid, cell_K3=grid.cell_K3[:0], normal_K3=grid.normal_K3[:0])
+            bare.append(replace(scene, obstacle_grid=no_cells, corners=None))
+        new = self.simulator.start(bare)
+        lost_N = diverged(new.position_N3, new.domain_S3[new.scene_N])
+        rule = "finite and within a domain's size of the domain"
+        require(not bool(lost_N.any()), "position_N3", rule, new.position_N3[lost_N][:1].flatten().tolist())
+        return new
+
+    def _change_scene(self, index: int, **changes: Any) -> None:
+        """Changes a scene, but not its particles."""
+        self._require_scene(index)
+        scene = replace(self.scenes[index], **changes)
+        nothing: dict[str, Any] = {
+            name: getattr(scene, name)[:0] for name in ("position_N3", "velocity_N3", "material_N")
+        }
+        self._put(index, scene, self.state, self._started([replace(scene, **nothing, past_HN3=None)]))
+
+    def _put(self, index: int, scene: InitialState, kept: ParticleState, new: ParticleState) -> None:
+        """Continues with a scene in place of another: with kept particles, and those of `new`, the scene's start."""
+        before, scenes, barriers = self.scenes[index], [*self.scenes], [*self._barriers]
+        scenes[index] = scene
+        changed: dict[str, Any] = {}
+        if scene.obstacle_grid is not before.obstacle_grid:
+            changed["obstacles"] = self.simulator.obstacles(scenes)
+        if barriers and _solid(scene) != _solid(before):
+            barriers[index] = scene.barrier(barriers[index].clearance)
+            changed["barriers"] = self._joined(barriers)
+        for name in ("domain_S3", "gravity_S3"):
+            changed[name] = getattr(kept, name).clone()
+            changed[name][index] = getattr(new, name)[0]
+        self._continue(replace(kept, **changed), replace(new, scene_N=new.scene_N + index))
+        self.scenes, self._barriers = scenes, barriers
+
+    def _continue(self, kept: ParticleState, new: ParticleState) -> None:
+        """Takes kept and new particles, sorted by scene, for the next frame."""
+        order_N = torch.argsort(torch.cat([kept.scene_N, new.scene_N]), stable=True)
+        both: dict[str, Any] = {
+            name: torch.cat([getattr(kept, name), getattr(new, name)])[order_N] for name in OF_PARTICLES
+        }
+        self._changed = replace(kept, **both)
+
+    def _joined(self, barriers: Sequence[Barrier]) -> Barriers | None:
+        joined = Barriers.of(barriers)
+        return joined and joined.to(self.simulator.device)
+
+
+def _solid(scene: InitialState) -> tuple[Any, ...]:
+    """Returns the values on which a scene's barrier depends."""
+    return scene.corners, scene.domain_size, scene.obstacle_grid.cell_size

@@ -92,11 +92,6 @@ class Simulation:
         return replace(self._state, position_N3=position_N3, velocity_NM3=velocity_NM3)
 
     @property
-    def static_state(self) -> ParticleState:
-        """Returns `state`, but with positions and velocities of the last edit, so it needs no copy from the device."""
-        return self._state
-
-    @property
     def particle_count(self) -> int:
         return len(self._state.material_N)
 

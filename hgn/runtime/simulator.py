@@ -179,7 +179,6 @@ class Simulator:
         material_N = torch.cat([material_rows(s.material_N, config.materials, s.materials) for s in states])
         counts = [len(state.position_N3) for state in states]
         position_N3 = np.concatenate([state.position_N3 for state in states]).astype(np.float32)
-        obstacles = ObstacleCells.of([state.obstacle_grid for state in states]) if config.obstacle_features else None
         barriers = None
         clearance = self.network.step.obstacle_clearance
         if clearance is not None:
@@ -191,9 +190,16 @@ class Simulator:
             scene_N=torch.from_numpy(np.repeat(np.arange(len(states)), counts)).to(self.device),
             domain_S3=torch.tensor([state.domain_size for state in states], dtype=torch.float32).to(self.device),
             gravity_S3=torch.from_numpy(gravity_S3.astype(np.float32)).to(self.device),
-            obstacles=obstacles and obstacles.to(self.device),
+            obstacles=self.obstacles(states),
             barriers=barriers and barriers.to(self.device),
         )
+
+    def obstacles(self, scenes: Sequence[InitialState]) -> ObstacleCells | None:
+        """Returns the obstacle cells of scenes on the device, or None for a network without obstacle features."""
+        if not self.network.config.obstacle_features:
+            return None
+        obstacles = ObstacleCells.of([scene.obstacle_grid for scene in scenes])
+        return obstacles and obstacles.to(self.device)
 
     def step(self, state: ParticleState) -> ParticleState:
         """Returns the state one frame later."""

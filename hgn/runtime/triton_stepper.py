@@ -146,8 +146,8 @@ class TritonStepper:
         """
         if new_obstacles and self.barriers is not None and not self.barriers.is_of(state.barriers):
             self.barriers.take(SceneTable.of_barriers(state.barriers, self.scenes, self.device))
-        if new_obstacles and state.obstacles is not None:
-            assert self.obstacles is not None
+        if new_obstacles and self.obstacles is not None and not self.obstacles.is_of(state.obstacles):
+            assert state.obstacles is not None
             self.obstacles.take(SceneTable.of_obstacles(state.obstacles, state.scene_count))
         self._fill(state)
         self.lost.zero_()

@@ -118,15 +118,15 @@ class PlaySession:
 
     @property
     def domain_size(self) -> Vector:
-        return self.live.scene.domain_size
+        return self.live.scenes[0].domain_size
 
     @property
     def cell_size(self) -> float:
-        return self.live.scene.obstacle_grid.cell_size
+        return self.live.scenes[0].obstacle_grid.cell_size
 
     @property
     def gravity(self) -> Vector:
-        return self.live.scene.gravity
+        return self.live.scenes[0].gravity
 
     def step(self) -> None:
         """Simulates one frame, after the particles of the spout have entered.
@@ -295,7 +295,7 @@ class PlaySession:
         self._set_obstacles(tuple(o for o in self.obstacles if o.body.number != number))
 
     def _set_obstacles(self, obstacles: tuple[PlacedObstacle, ...]) -> None:
-        self.live.replace_obstacles(with_obstacles(self.live.scene, obstacles))
+        self.live.replace_obstacles(with_obstacles(self.live.scenes[0], obstacles))
         self.obstacles = obstacles
 
     # gravity and weights
@@ -318,7 +318,7 @@ class PlaySession:
         require(simulator.frame_rate_hz == rate, "weights", f"of {rate} frames a second", simulator.frame_rate_hz)
         newest, history_NM3 = self.newest, self.recording.history(self.frame)
         velocity_N3 = newest.velocity_N3 * np.float32(rate)
-        now = replace(self.live.scene, position_N3=newest.position_N3, velocity_N3=velocity_N3)
+        now = replace(self.live.scenes[0], position_N3=newest.position_N3, velocity_N3=velocity_N3)
         live = LiveSimulation(simulator, replace(now, material_N=self.materials()), self.maximum_particles)
         if live.state.velocity_NM3.shape[1] == history_NM3.shape[1]:
             live.restore(newest.position_N3, history_NM3, self.frame)

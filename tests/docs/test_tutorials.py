@@ -6,6 +6,7 @@ import signal
 from pathlib import Path
 
 import pytest
+import torch
 from docs.pages import FEWER, ROOT, Runner, blocks_of, run_module, shell_lines
 from processes import PATIENCE_S, free_port
 
@@ -99,6 +100,15 @@ def test_program(here):
     runner.run(TUTORIALS / "program.md")
     assert runner.names["frame"] == 1 and (here / "my_scene.vtkhdf").is_file()
     assert len(runner.names["position_N3"]) == 2 * len(runner.names["block"])
+
+
+def test_live(here):
+    """Many live scenes: each ends after two frames and begins anew, with its own number of particles."""
+    runner = Runner(SETTINGS, {"range(300)": "range(3)", "episode_frames=120": "episode_frames=2"})
+    runner.run(ROOT / "docs/how_to/live.md")
+    names = runner.names
+    assert names["glasses"].age_S.tolist() == [1] * 4 and bool(torch.isfinite(names["reward_S"]).all())
+    assert len(names["glasses"].live.state.scene_N.bincount().unique()) > 1
 
 
 def test_serve(here, monkeypatch):

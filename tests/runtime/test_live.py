@@ -117,6 +117,8 @@ def test_barriers_stay_where_obstacles_do(monkeypatch):
         assert live.state.barriers is barriers and sum(built) == 2
         assert frames(live, 14)[-1, :, 1] == pytest.approx(0.451, rel=0, abs=2e-5)
         live.replace_obstacles(under)
+        assert live.state.barriers is barriers and sum(built) == 2
+        live.replace_obstacles(replace(under, corners=lambda: square((0.6, 0.45, 0.6), 1, 0.6)))
         assert live.state.barriers is not barriers and sum(built) == 4
 
 

@@ -126,10 +126,10 @@ def test_obstacles_act_where_they_are_put(session):
     the vertical through the obstacle's position."""
     for obstacle in session.obstacles:
         session.remove_obstacle(obstacle.body.number)
-    assert len(session.live.scene.obstacle_grid.cell_K3) == 0
+    assert len(session.live.scenes[0].obstacle_grid.cell_K3) == 0
     plate = session.add_obstacle(ObstacleEntry(shape="square", size=0.2, position=(0.5, 0.31, 0.5)))
     session.move_obstacle(replace(plate.turned(45), position=(0.5, 0.72, 0.5)))
-    grid = session.live.scene.obstacle_grid
+    grid = session.live.scenes[0].obstacle_grid
     assert set(grid.cell_K3[:, 1]) == {int(0.72 / session.cell_size)}
     np.testing.assert_allclose(np.abs(grid.normal_K3[:, 1]), 1, atol=1e-5)
     reach = 0.2 / np.sqrt(2)
@@ -232,7 +232,7 @@ def test_the_scene_is_saved(session, tmp_path):
     for found, expected in zip(saved.obstacles, session.obstacles, strict=True):
         np.testing.assert_allclose(found.vertex_V3, expected.mesh().vertex_V3, rtol=0, atol=1e-6)
     again = PlaySession(simulator(), saved, tmp_path / "saved")
-    assert len(again.live.scene.obstacle_grid.cell_K3) == len(session.live.scene.obstacle_grid.cell_K3)
+    assert len(again.live.scenes[0].obstacle_grid.cell_K3) == len(session.live.scenes[0].obstacle_grid.cell_K3)
 
 
 def test_the_rollout_is_saved(session, tmp_path):
