@@ -42,6 +42,7 @@ GROUP_SHAPES = ("cube", "sphere")
 NETWORK_KINDS = ("hgn", "gns")
 BACKENDS = ("auto", "torch", "triton", "cpu")
 PRECISIONS = ("fp32", "tf32", "fp16")
+LOGGERS = ("tensorboard", "wandb", "mlflow")
 SIMULATED_FRAMES = 3  # frames that pushforward needs of an episode: start, one simulated frame, its target
 DEFAULT_WEIGHTS = "mechanics"  # shipped weights that commands and `Simulator.load` use
 Material = Annotated[str, one_of(*MATERIALS)]
@@ -397,6 +398,8 @@ class TrainingConfig:
     backend: Annotated[str, one_of("auto", "torch", "triton")] = "auto"
     minimum_episodes: Positive[int] = 1  # number of published training episodes at which training starts
     generate: bool = True  # whether to start the generator if the data set is missing or incomplete
+    # what logs beside metrics.jsonl: tensorboard, wandb, mlflow; their environment variables name servers and projects
+    loggers: tuple[Annotated[str, one_of(*LOGGERS)], ...] = ("tensorboard",)
     log_every: Positive[int] = 50  # number of updates between log lines
     checkpoint_every: Positive[int] = 1_000  # number of updates between checkpoints
     # number of updates between measurements of one-step and rollout errors; the first interval is halved down to 2,000

@@ -17,8 +17,8 @@ from hgn.data.identity import dataset_identity, identity_hash, require_same_data
 from hgn.data.manifest import Manifest
 from hgn.data.reader import EpisodeStore
 from hgn.data.storage import is_remote
-from hgn.schema import from_mapping, require_replaceable
-from hgn.system.extras import require_installed
+from hgn.schema import ConfigError, from_mapping, require_replaceable
+from hgn.system.extras import missing_extra, require_installed
 from hgn.system.locks import locked
 from hgn.system.processes import die_with_parent
 from hgn.training.stop import StopRequest
@@ -46,6 +46,11 @@ def main(mapping: dict[str, Any]) -> int:
         # This ends the rank at the end of the process that started it, without a time-out.
         die_with_parent(signal.SIGKILL)
     layout(config.training)
+    for i, logger in enumerate(config.training.loggers):
+        try:
+            require_installed(logger)
+        except ModuleNotFoundError as error:
+            raise ConfigError(f"training.loggers[{i}] must be installed, got {logger}; {missing_extra(error)}") from None
     folder, run = config.dataset.folder, Path(config.run)
     if config.imported:
         require_network_fits(config, Manifest.load(folder))

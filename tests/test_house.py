@@ -21,7 +21,7 @@ LINES = {  # of Python, in tracked files
     "tools": 6_602,
     "tests": 28_387,
 }
-SETTINGS = 239  # fields of the dataclasses behind the commands, *Config
+SETTINGS = 240  # fields of the dataclasses behind the commands, *Config
 
 LINES_OF_A_FILE = 450
 LONG_FILES: dict[str, int] = {}

@@ -26,6 +26,8 @@ EXTRA_OF = {
     "viser": "play",
     "ray": "ray",
     "s3fs": "s3",
+    "wandb": "wandb",
+    "mlflow": "mlflow",
 }
 
 
@@ -41,5 +43,6 @@ def missing_extra(error: ModuleNotFoundError) -> str | None:
 
 def require_installed(package: str) -> None:
     """Checks for a package that a command imports hours after its start. Raises ModuleNotFoundError."""
-    if importlib.util.find_spec(package) is None:
+    spec = importlib.util.find_spec(package)
+    if spec is None or spec.origin is None:  # any folder of that name is a package without an origin
         raise ModuleNotFoundError(f"No module named {package!r}", name=package)

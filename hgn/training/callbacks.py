@@ -131,7 +131,7 @@ class Checkpoints(Callback):
 
 
 class LogLines(Callback):
-    """Writes loss, learning rate and speed to TensorBoard, metrics.jsonl and a progress bar.
+    """Writes loss, learning rate and speed to the loggers, metrics.jsonl and a progress bar.
 
     The loss is the mean over all ranks. Speed, waiting time and GPU memory are those of rank 0.
     """
@@ -248,7 +248,7 @@ def _update(module: LightningModule) -> int:
 
 
 def log(trainer: Trainer, run: Path, update: int, values: dict[str, float]) -> None:
-    """Writes to TensorBoard and to metrics.jsonl, on rank 0 only."""
+    """Writes to the loggers and to metrics.jsonl, on rank 0 only."""
     if not trainer.is_global_zero:
         return
     for logger in trainer.loggers:

@@ -141,7 +141,7 @@ class Monitor(Callback):
             values["rollout/mse" if name == "all" else f"rollout/mse_{name}"] = float(np.nanmean(mse_T))
         shown = rollout_of_episode(episodes[0], trials[0].position_TN3)
         paths = write_pictures(self.run / "pictures", module.update, shown, error_T)
-        show_pictures(trainer.logger, module.update, paths)
+        show_pictures(trainer.loggers, module.update, paths)
         return values
 
     def _interrupted(self, trainer: Trainer) -> bool:

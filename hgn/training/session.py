@@ -52,12 +52,12 @@ def train_network(config: TrainConfig, start: Start, stop: StopRequest, publishe
     """
     # Importing Lightning takes seconds. It is imported after the wait for data, and by no other command.
     from lightning.pytorch import Trainer, seed_everything
-    from lightning.pytorch.loggers import TensorBoardLogger
 
     from hgn.training import lightning_compat
     from hgn.training.callbacks import Checkpoints, LogLines, SameWeights, Stopper
     from hgn.training.checkpoint_writer import CheckpointWriter
     from hgn.training.data_module import EpisodeDataModule
+    from hgn.training.loggers import build_loggers
     from hgn.training.monitor import Monitor
     from hgn.training.readers import ChunkReader, EpisodeReader, WindowReader
     from hgn.training.tensorboard import FinalMetrics
@@ -99,7 +99,7 @@ def train_network(config: TrainConfig, start: Start, stop: StopRequest, publishe
         max_epochs=-1,  # the feed ends after the last update
         callbacks=[RankWatch(run), SameWeights(feed), lines, monitor, checkpoints, Stopper(stop, checkpoints), final],
         plugins=[writer, *lightning_compat.own_launcher()],
-        logger=TensorBoardLogger(run, name="", version="tensorboard"),
+        logger=build_loggers(training.loggers, run, _public(config)),
         default_root_dir=run,
         enable_checkpointing=False,
         enable_progress_bar=False,

@@ -1,4 +1,4 @@
-"""Pictures, animations and hyper-parameters for TensorBoard."""
+"""Pictures and animations for loggers, and hyper-parameters for TensorBoard."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 from lightning.pytorch import Callback, LightningModule, Trainer
-from lightning.pytorch.loggers import TensorBoardLogger
+from lightning.pytorch.loggers import MLFlowLogger, TensorBoardLogger, WandbLogger
 from PIL import Image
 
 from hgn.render.error_curve import error_curve
@@ -38,14 +38,22 @@ def write_pictures(folder: Path, update: int, rollout: Rollout, error_T: dict[st
     return paths
 
 
-def show_pictures(logger: Any, update: int, paths: dict[str, Path]) -> None:
-    """Adds pictures and animations to TensorBoard."""
-    if not isinstance(logger, TensorBoardLogger):
-        return
+def show_pictures(loggers: list[Any], update: int, paths: dict[str, Path]) -> None:
+    """Adds pictures and animations to the ThreadedLoggers of a training."""
+    for threaded in loggers:
+        threaded.call(lambda logger: _show(logger, update, paths))
+
+
+def _show(logger: Any, update: int, paths: dict[str, Path]) -> None:
     for tag, path in paths.items():
-        if path.suffix == ".gif":
+        if isinstance(logger, WandbLogger):
+            animated = path.suffix == ".gif"
+            (logger.log_video if animated else logger.log_image)(tag, [str(path)], update)
+        elif isinstance(logger, MLFlowLogger):
+            logger.experiment.log_artifact(logger.run_id, path, "pictures")
+        elif isinstance(logger, TensorBoardLogger) and path.suffix == ".gif":
             add_animation(logger, tag, path, update)
-        else:
+        elif isinstance(logger, TensorBoardLogger):
             with Image.open(path) as image:
                 logger.experiment.add_image(tag, np.asarray(image.convert("RGB")), update, dataformats="HWC")
 
@@ -69,7 +77,8 @@ class FinalMetrics(Callback):
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         metrics = {f"final/{name}": value for name, value in self.last.items() if name.startswith(FINAL_PREFIXES)}
-        logger = trainer.logger
-        if self.stop.signal is None and metrics and isinstance(logger, TensorBoardLogger):
-            assert isinstance(pl_module, TrainingModule)
-            logger.log_hyperparams(self.settings, metrics, pl_module.update)
+        assert isinstance(pl_module, TrainingModule)
+        update = pl_module.update
+        for threaded in trainer.loggers if self.stop.signal is None and metrics else []:
+            if threaded.name == "tensorboard":
+                threaded.log_hyperparams(self.settings, metrics, update)
