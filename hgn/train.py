@@ -50,7 +50,9 @@ def main(mapping: dict[str, Any]) -> int:
         try:
             require_installed(logger)
         except ModuleNotFoundError as error:
-            raise ConfigError(f"training.loggers[{i}] must be installed, got {logger}; {missing_extra(error)}") from None
+            raise ConfigError(
+                f"training.loggers[{i}] must be installed, got {logger}; {missing_extra(error)}"
+            ) from None
     folder, run = config.dataset.folder, Path(config.run)
     if config.imported:
         require_network_fits(config, Manifest.load(folder))

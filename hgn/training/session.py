@@ -61,7 +61,7 @@ def train_network(config: TrainConfig, start: Start, stop: StopRequest, publishe
     from hgn.training.monitor import Monitor
     from hgn.training.readers import ChunkReader, EpisodeReader, WindowReader
     from hgn.training.tensorboard import FinalMetrics
-    from hgn.training.watch import RankWatch
+    from hgn.training.watch import RankWatch, record_collectives
 
     training, run, store, resume = config.training, Path(config.run), start.store, start.resume
     lightning_compat.quieten()
@@ -106,6 +106,8 @@ def train_network(config: TrainConfig, start: Start, stop: StopRequest, publishe
         enable_model_summary=False,
         use_distributed_sampler=False,
     )
+    if devices * nodes > 1:
+        record_collectives(run)
     if start.precompilation is not None:
         print(start.precompilation.wait(lambda: stop.requested), file=sys.stderr)
     if devices * nodes > 1:

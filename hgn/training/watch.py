@@ -1,6 +1,8 @@
 """Ends a rank that waits for a stopped rank. Inside a collective, neither time-outs nor signals would end it.
 
-Each rank writes a count to the run's folder every BEAT_S, and reads the counts of the others.
+Each rank writes a count to the run's folder every BEAT_S, and reads the counts of the others. PyTorch's flight recorder
+keeps the last collectives of each rank. A rank that ends because others do not answer writes them to
+`hang_rank_<rank>` in the run's folder, and so does PyTorch when a collective takes longer than its time-out.
 """
 
 from __future__ import annotations
@@ -15,15 +17,41 @@ import time
 from pathlib import Path
 from typing import NoReturn
 
+import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
 
 from hgn.command import EXIT_MACHINE
+from hgn.system.files import write_atomically
 from hgn.training.module import TrainingModule
 from hgn.training.stop import BY_WEIGHT
 
 BEAT_S = 5.0  # interval between counts
 SILENCE_S = 300.0  # longest time without a new count of a rank; network file systems may delay files by a minute
+TRACE = "hang_rank_"  # with the rank's number, the file with its last collectives
+TRACE_S = 10.0  # longest time for writing it
+# variables of PyTorch's flight recorder; a name beside the first is an earlier one with the same meaning
+_BUFFER = ("TORCH_FR_BUFFER_SIZE", "TORCH_NCCL_TRACE_BUFFER_SIZE")
+_FILE = ("TORCH_FR_DUMP_TEMP_FILE", "TORCH_NCCL_DEBUG_INFO_TEMP_FILE")
 GRACE_S = 45.0  # longest time without an update after a signal; schedulers grant more
+
+
+def record_collectives(run: Path) -> None:
+    """Sets the variables of PyTorch's flight recorder that the user has not set. Call it before ranks meet."""
+    for names, value in (
+        (_BUFFER, "2000"),
+        (_FILE, str((run / TRACE).absolute())),
+        (("TORCH_NCCL_DUMP_ON_TIMEOUT",), "1"),
+    ):
+        if not any(name in os.environ for name in names):
+            os.environ[names[0]] = value
+
+
+def _write_trace(rank: int) -> None:
+    prefix = next((os.environ[name] for name in _FILE if name in os.environ), None)
+    recorder = torch._C._distributed_c10d
+    dump = getattr(recorder, "_dump_nccl_trace", None) or getattr(recorder, "_dump_fr_trace", None)
+    if prefix is not None and dump is not None:
+        write_atomically(Path(f"{prefix}{rank}"), dump())
 
 
 class RankWatch(Callback):
@@ -95,7 +123,10 @@ class RankWatch(Callback):
         except FileNotFoundError:
             return ""
 
-    @staticmethod
-    def _end(text: str, code: int) -> NoReturn:
+    def _end(self, text: str, code: int) -> NoReturn:
+        # the recorder takes Python's lock, which the waiting thread may have
+        writer = threading.Thread(target=_write_trace, args=(int(self._own.name),), daemon=True)
+        writer.start()
+        writer.join(TRACE_S)
         print(f"error: {text}", file=sys.stderr, flush=True)
         os._exit(code)

@@ -6,7 +6,7 @@ of its own ("error"), misses its data ("storage"), or gets other weights ("weigh
 that a SIGSTOP stops. FOLDER/watch.json, where it is, has constants of hgn.training.watch.
 Keeps what this rank saw: FOLDER/gradients_RANK.pt of the first update, FOLDER/end_RANK.pt with the weights, the update
 and the exit code, FOLDER/starts_RANK with the update of each start, FOLDER/talk_RANK.json with the updates at which
-ranks talked of anything but gradients.
+ranks talked of anything but gradients, FOLDER/recorder_RANK.json with the flight recorder's variables as ranks met.
 """
 
 import json
@@ -47,6 +47,15 @@ def main(folder):
 
     for name in ("all_gather", "all_reduce", "barrier", "broadcast", "broadcast_object_list"):
         setattr(torch.distributed, name, counted(getattr(torch.distributed, name)))
+
+    meet = torch.distributed.init_process_group
+
+    def met(*arguments, **options):
+        recorder = {name: value for name, value in os.environ.items() if name.startswith(("TORCH_FR", "TORCH_NCCL"))}
+        (folder / f"recorder_{rank}.json").write_text(json.dumps(recorder))
+        meet(*arguments, **options)
+
+    torch.distributed.init_process_group = met
 
     step, start = TorchUpdates.step, TrainingModule.on_train_start
 

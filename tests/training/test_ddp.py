@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import os
+import pickle
 import shutil
 import signal
 import subprocess
@@ -20,6 +21,7 @@ from hgn import train
 from hgn.config import TrainingConfig
 from hgn.data.sampler import EpisodeSampler
 from hgn.schema import ConfigError
+from hgn.training import watch as watch_ranks
 from hgn.training.checkpoint import read_checkpoint
 from hgn.training.distributed import checksum, default_run, first_rank, layout
 from hgn.training.torch_updates import TorchUpdates
@@ -372,8 +374,29 @@ def test_no_rank_waits_for_one_that_fails(
             os.kill(int(stopped.read_text()), signal.SIGKILL)
     text = (tmp_path / "log").read_text()
     assert message in text and (process.returncode == code if code is not None else process.returncode != 0)
+    prefix = str(tmp_path / "run" / watch_ranks.TRACE)
+    for rank in (0, 1):
+        recorder = json.loads((tmp_path / f"recorder_{rank}.json").read_text())
+        assert recorder["TORCH_FR_DUMP_TEMP_FILE"] == prefix and recorder["TORCH_NCCL_DUMP_ON_TIMEOUT"] == "1"
+    traces = [path.name for path in (tmp_path / "run").glob(f"{watch_ranks.TRACE}*")]
+    assert traces == (["hang_rank_0"] if watch else [])
+    for name in traces:
+        names = [entry["profiling_name"] for entry in pickle.loads((tmp_path / "run" / name).read_bytes())["entries"]]
+        assert len(names) > 3 and names[-1].startswith("gloo:")
     if "data" in message:
         assert read_checkpoint(tmp_path / "run/checkpoints/last.ckpt")["hgn"]["updates"] == 3
+
+
+def test_variables_of_the_recorder_that_the_user_set_stay(monkeypatch, tmp_path):
+    """Under their earlier names too."""
+    names = ("TORCH_FR_BUFFER_SIZE", "TORCH_FR_DUMP_TEMP_FILE", "TORCH_NCCL_DUMP_ON_TIMEOUT")
+    set_by_user = {"TORCH_NCCL_TRACE_BUFFER_SIZE": "7", "TORCH_NCCL_DEBUG_INFO_TEMP_FILE": "mine_"}
+    monkeypatch.setattr(os, "environ", set_by_user | {"TORCH_NCCL_DUMP_ON_TIMEOUT": "0"})
+    watch_ranks.record_collectives(tmp_path)
+    assert os.environ == set_by_user | {"TORCH_NCCL_DUMP_ON_TIMEOUT": "0"}
+    monkeypatch.setattr(os, "environ", {})
+    watch_ranks.record_collectives(tmp_path)
+    assert os.environ == dict(zip(names, ("2000", str(tmp_path / "hang_rank_"), "1"), strict=True))
 
 
 def test_signals_before_ranks_have_met(data, no_launcher, warm_python, tmp_path):

@@ -74,7 +74,7 @@ def test_loggers_get_what_metrics_jsonl_gets(data, tmp_path, stand_in, capsys):
     logged = [values for method, values in logger.calls if method == "metrics"]
     records = [{key: value for key, value in record.items() if key != "time"} for record in metrics(run)]
     assert [{"update": step} | values for step, values in logged] == records
-    assert [values for method, values in logger.calls if method == "end"][0] == ("success",)
+    assert next(values for method, values in logger.calls if method == "end") == ("success",)
     assert list((run / "tensorboard").glob("events.*"))
     assert not [thread for thread in threading.enumerate() if thread.name in loggers.BUILDERS]
     assert train.main(train_mapping(data, tmp_path / "none", loggers=[])) == 0
