@@ -24,9 +24,9 @@ NOTEBOOKS = {
     "inverse_problem": "how_to/gradients.md",
 }
 FEWER = {
-    "training_scenes: 200\n": "training_scenes: 4 # 200\n  frames: 40 # 300\n",
+    "training_scenes: 200\n": "training_scenes: 2 # 200\n  frames: 24 # 300\n",
     "validation_scenes: 5\n": "validation_scenes: 1\n  test_scenes: 0\n",
-    "maximum_updates: 20000\n": "maximum_updates: 100 # 20000\n  batch_scenes: 1 # 8\n  monitor_every: 50\n",
+    "maximum_updates: 20000\n": "maximum_updates: 60 # 20000\n  batch_scenes: 1 # 8\n  monitor_every: 30\n",
     "training.maximum_updates=5000": "training.maximum_updates=20",
 }
 OPEN = "make setup\n.venv/bin/pip install jupyterlab\n.venv/bin/jupyter lab docs/notebooks"
