@@ -91,8 +91,8 @@ def test_files_are_valid():
     checked = subprocess.run([*shellcheck, *map(str, SCRIPTS)], capture_output=True, text=True)
     assert checked.returncode == 0, checked.stdout
     assert all(os.access(script, os.X_OK) for script in SCRIPTS)
-    named = set(re.findall(r"`(?:\w+ )?(?:kubectl apply -f )?(jobs/[\w/]+\.\w+)", (JOBS / "README.md").read_text()))
-    there = [*SCRIPTS, *JOBS.glob("*/*.yaml"), *JOBS.glob("*.txt")]
+    named = set(re.findall(r"`(?:[\w. -]+ )?(jobs/[\w/]+\.\w+)", (JOBS / "README.md").read_text()))
+    there = [*SCRIPTS, *JOBS.glob("*/*.yaml"), *JOBS.glob("*/*.def"), *JOBS.glob("*.txt")]
     assert named == {str(path.relative_to(ROOT)) for path in there}
     for script in SCRIPTS:
         lines = script.read_text().splitlines()
@@ -104,6 +104,31 @@ def test_files_are_valid():
         values = dict(option.removeprefix("--").partition("=")[::2] for option in options)
         tasks = values.get("gpus-per-node", "1") if script.name == "train.sbatch" else "1"
         assert values.get("ntasks-per-node", "1") == tasks
+
+
+def test_skypilot_and_apptainer():
+    """SkyPilot's task has keys of its schema (sky/utils/schemas.py in skypilot-org/skypilot), and starts torchrun.sh
+    with variables that it reads; Apptainer's definition has sections of the user guide, and copies what docker does."""
+    task = yaml.safe_load((JOBS / "skypilot/train.yaml").read_text())
+    assert list(task) == ["name", "workdir", "num_nodes", "resources", "envs", "file_mounts", "setup", "run"]
+    assert set(task["resources"]) <= {"accelerators", "cpus", "memory", "use_spot", "job_recovery"}
+    assert task["file_mounts"] == {"/shared": {"name": "hgn-shared", "mode": "MOUNT_CACHED"}}
+    variables = set(re.findall(r"\$(\w+)", task["run"])) - set(task["envs"])
+    assert variables == {"SKYPILOT_NUM_NODES", "SKYPILOT_NUM_GPUS_PER_NODE", "SKYPILOT_NODE_IPS"}
+    read = set(re.findall(r"^# ([A-Z_]+) ", (JOBS / "torchrun.sh").read_text(), re.MULTILINE))
+    assert {*re.findall(r"([A-Z]+)=", task["run"]), *task["envs"]} <= read
+
+    header, *parts = re.split(r"^%(\w+)\n", (JOBS / "slurm/hgn.def").read_text(), flags=re.MULTILINE)
+    docker, copied = (JOBS / "k8s/Dockerfile").read_text(), (JOBS / "k8s/Dockerfile.dockerignore").read_text()
+    base = re.findall(r"^FROM (.*)", docker, re.MULTILINE)
+    assert re.findall(r"^[^#\s].*", header, re.MULTILINE) == ["Bootstrap: docker", *(f"From: {name}" for name in base)]
+    sections = dict(zip(parts[::2], parts[1::2], strict=True))
+    files = [line.split()[0] for line in sections.pop("files").strip().splitlines()]
+    assert files == re.findall(r"^!(\S+)", copied, re.MULTILINE)
+    assert list(sections) == ["post", "environment", "runscript", "test"]
+    for text in (task["setup"], task["run"], *sections.values()):
+        shellcheck = [str(Path(sysconfig.get_path("scripts")) / "shellcheck"), "--shell", "sh", "-"]
+        assert subprocess.run(shellcheck, input=text, text=True).returncode == 0
 
 
 @pytest.mark.parametrize(

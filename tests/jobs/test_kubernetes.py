@@ -1,8 +1,9 @@
 """The Kubernetes files: valid by published schemas, and what they start is what the commands accept.
 
-Schemas: Kubernetes' own objects by the OpenAPI schemas in kubernetes-validate; TrainJob by Kubeflow's published
-types (kubeflow-trainer-api). KubeRay publishes no Python types: the keys below are those of the custom resource
-definition ray.io_rayjobs.yaml (version v1) in ray-project/kuberay, and the pods in it are Kubernetes' own.
+Schemas: Kubernetes' own objects by the OpenAPI schemas in kubernetes-validate; TrainJob and its runtime by Kubeflow's
+published types (kubeflow-trainer-api). KubeRay and Kueue publish no Python types: the keys below are those of the
+definitions ray.io_rayjobs.yaml (version v1) in ray-project/kuberay and kueue.x-k8s.io_*.yaml (v1beta2) in
+kubernetes-sigs/kueue, and the pods in them are Kubernetes' own.
 """
 
 import re
@@ -13,7 +14,7 @@ from pathlib import Path
 import kubernetes_validate
 import pytest
 import yaml
-from kubeflow_trainer_api.models import TrainerV1alpha1TrainJob
+from kubeflow_trainer_api.models import TrainerV1alpha1ClusterTrainingRuntime, TrainerV1alpha1TrainJob
 
 from datagen.generate import datagen_config
 from datagen.service.__main__ import ServiceConfig
@@ -72,17 +73,19 @@ def test_objects_of_kubernetes(name, version):
 
 
 def test_train_job():
-    """The TrainJob is one by Kubeflow's types, and they know each of its keys: it comes back as it went in."""
-    (job,) = documents("train.yaml")
-    typed = TrainerV1alpha1TrainJob.from_dict(job)
-    assert typed is not None and typed.to_dict() == job
-    trainer = job["spec"]["trainer"]
+    """TrainJob and runtime are such by Kubeflow's types, which know each of their keys: they come back unchanged."""
+    (job,), (runtime,) = documents("train.yaml"), documents("runtime.yaml")
+    for kind, document in ((TrainerV1alpha1TrainJob, job), (TrainerV1alpha1ClusterTrainingRuntime, runtime)):
+        typed = kind.from_dict(document)
+        assert typed is not None and typed.to_dict() == document
+    trainer, reference = job["spec"]["trainer"], job["spec"]["runtimeRef"]
+    assert (reference["kind"], reference["name"]) == (runtime["kind"], runtime["metadata"]["name"])
     assert trainer["resourcesPerNode"]["limits"]["nvidia.com/gpu"] == str(trainer["numProcPerNode"])
-    (patch,) = job["spec"]["runtimePatches"]
-    (node,) = patch["trainingRuntimeSpec"]["template"]["spec"]["replicatedJobs"]
+    (node,) = runtime["spec"]["template"]["spec"]["replicatedJobs"]
+    assert node["template"]["metadata"]["labels"] == {"trainer.kubeflow.org/trainjob-ancestor-step": "trainer"}
     pod = node["template"]["spec"]["template"]
     (container,) = pod["spec"]["containers"]
-    assert container["name"] == node["name"] == "node"  # the runtime torch-distributed calls both so
+    assert container["name"] == "node" and container["image"] == trainer["image"]  # Trainer finds it by this name
     whole = container | {"image": trainer["image"], "env": trainer["env"], "args": trainer["args"]}
     validate_pod({"spec": pod["spec"] | {"containers": [whole | {"resources": trainer["resourcesPerNode"]}]}})
     timeout = next(e["value"] for e in trainer["env"] if e["name"] == "TORCH_ELASTIC_SHUTDOWN_TIMEOUT")
@@ -102,6 +105,25 @@ def test_ray_job():
         validate_pod(group["template"])
         assert all(isinstance(value, str) for value in group.get("rayStartParams", {}).values())
         assert part == "head" or group["minReplicas"] <= group["replicas"] <= group["maxReplicas"]
+
+
+def test_queue():
+    """Kueue's objects name each other and cover what the jobs request, which wait in the queue; a RayJob that can be
+    suspended ends its cluster (a rule of Kueue)."""
+    flavor, cluster, local = documents("queue.yaml")
+    kinds = [(each["apiVersion"].partition("/")[2], each["kind"]) for each in (flavor, cluster, local)]
+    assert kinds == [("v1beta2", kind) for kind in ("ResourceFlavor", "ClusterQueue", "LocalQueue")]
+    assert local["spec"] == {"clusterQueue": cluster["metadata"]["name"]} and "spec" not in flavor
+    (group,) = cluster["spec"].pop("resourceGroups")
+    assert cluster["spec"] == {"namespaceSelector": {}, "preemption": {"withinClusterQueue": "LowerPriority"}}
+    (quota,) = group["flavors"]
+    assert quota["name"] == flavor["metadata"]["name"] and all(
+        set(q) == {"name", "nominalQuota"} for q in quota["resources"]
+    )
+    assert [q["name"] for q in quota["resources"]] == group["coveredResources"] == ["cpu", "memory", "nvidia.com/gpu"]
+    for job in (*documents("train.yaml"), *documents("generate.yaml")):
+        assert job["metadata"]["labels"] == {"kueue.x-k8s.io/queue-name": local["metadata"]["name"]}
+        assert job["kind"] != "RayJob" or job["spec"]["shutdownAfterJobFinishes"]
 
 
 def test_commands_take_what_the_files_give_them(composed):
