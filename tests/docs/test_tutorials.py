@@ -5,6 +5,7 @@ import shutil
 import signal
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from docs.pages import FEWER, ROOT, Runner, blocks_of, run_module, shell_lines
@@ -107,6 +108,7 @@ def test_live(here):
     runner = Runner(SETTINGS, {"range(300)": "range(3)", "episode_frames=120": "episode_frames=2"})
     runner.run(ROOT / "docs/how_to/live.md")
     names = runner.names
+    assert np.shares_memory(names["shared_N3"], names["position_N3"].numpy())
     assert names["glasses"].age_S.tolist() == [1] * 4 and bool(torch.isfinite(names["reward_S"]).all())
     assert len(names["glasses"].live.state.scene_N.bincount().unique()) > 1
 

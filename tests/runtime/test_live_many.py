@@ -87,6 +87,18 @@ def test_changes_of_one_scene():
         np.testing.assert_allclose(fall_TN, fallen_T1.repeat(20, axis=1), rtol=0, atol=1e-5)
 
 
+@pytest.mark.parametrize("backend", ["torch", "cpu"])
+def test_tensors_are_shared_without_a_copy(backend):
+    """DLPack gives other libraries the state's own memory, which later frames leave alone; `step` gives a copy."""
+    with LiveSimulation(Simulator(network_of(torch.float32, **RELATIVE), 60.0, backend), [scene(20), scene(5)]) as live:
+        for tensor in (live.advance().position_N3, live.state.velocity_NM3):
+            array = np.from_dlpack(tensor)
+            assert array.ctypes.data == tensor.data_ptr() and np.array_equal(array, tensor)
+            before = array.copy()
+            live.step()[:] = np.nan
+            assert np.array_equal(array, before) and bool(live.state.position_N3.isfinite().all())
+
+
 def test_what_is_refused_changes_nothing():
     """Scenes that are not there, emit or lie out of reach are refused by name, and all go on as if nothing had been."""
     simulator, first = Simulator(network_of(torch.float32, **RELATIVE), 60.0), scene(10)
