@@ -1,6 +1,7 @@
 """Triton's interpreter without what it does again and again, or for nothing; kernels compute the same in it."""
 
 import functools
+import inspect
 from dataclasses import replace
 from types import ModuleType
 from typing import Any
@@ -24,13 +25,69 @@ def spare_repeated_work():
         return found[dtype.name]
 
     interpreter._get_np_dtype = np_dtype
+    _remember_builtins(interpreter, language.core)
     _remember_shapes(language.core, language.semantic.TritonSemantic)
+    _remember_constants(language.core, language.semantic.TritonSemantic)
+
+
+def _remember_builtins(interpreter, core):
+    """Of the language, which the interpreter looks for and wraps again at each launch."""
+
+    def wrapped(function):
+        def builtin(*args, **kwargs):
+            kwargs["_semantic"] = interpreter.interpreter_semantic
+            return function(*args, **kwargs)
+
+        return builtin
+
+    @functools.cache
+    def builtins_of(package):
+        members = inspect.getmembers(package)
+        return [(name, wrapped(member)) for name, member in members if core.is_builtin(member)]
+
+    def patch_builtin(package, builder, scope):
+        for name, member in builtins_of(package):
+            scope.set_attr(package, name, member)
+
+    interpreter._patch_builtin = patch_builtin
+
+
+def _remember_constants(core, semantic):
+    """Numbers beside a tensor, which the language makes blocks of for each operation. Operands of one type need no
+    conversion, nor have a pointer and a whole number; all other operands go the language's own way."""
+    check, integers = semantic.binary_op_type_checking_impl, (core.int32, core.int64)
+    constants: dict[tuple[Any, ...], Any] = {}
+
+    def constant(self, value, beside):
+        key = value, type(value), beside.type.name
+        if key not in constants:
+            scalar = self.scalar_constant(value, beside.type.scalar)
+            constants[key] = self.broadcast_impl_value(beside, scalar)[1]
+        return constants[key]
+
+    def operands(self, lhs, rhs, allow_lhs_ptr=False, allow_rhs_ptr=False, arithmetic_check=True, div_or_mod=False):
+        if type(lhs) is core.tensor and arithmetic_check and not div_or_mod:
+            left = lhs.type.scalar
+            if type(rhs) is core.tensor:
+                right = rhs.type.scalar
+                pointer = left.is_ptr()
+                if (left is right and not pointer) or (pointer and allow_lhs_ptr and right.is_int()):
+                    return self.broadcast_impl_value(lhs, rhs)
+            elif type(rhs) is float:
+                if left.is_floating():
+                    return lhs, constant(self, rhs, lhs)
+            elif type(rhs) is int and -(2**31) <= rhs < 2**31 and (left.is_floating() or left in integers):
+                return lhs, constant(self, rhs, lhs)
+        return check(self, lhs, rhs, allow_lhs_ptr, allow_rhs_ptr, arithmetic_check, div_or_mod)
+
+    semantic.binary_op_type_checking_impl = operands
 
 
 def _remember_shapes(core, semantic):
     """Of tensors and their types, which the language wraps number by number for each result; of two tensors of one
     shape none is broadcast."""
     block_init, tensor_init, broadcast = core.block_type.__init__, core.tensor.__init__, semantic.broadcast_impl_value
+    with_element_ty, block_types = core.block_type.with_element_ty, {}
     blocks: dict[tuple[int, ...], tuple[Any, int, str]] = {}
     tensors: dict[tuple[int, ...], tuple[Any, Any]] = {}
 
@@ -53,12 +110,19 @@ def _remember_shapes(core, semantic):
             tensor_init(self, handle, type)
             tensors[key] = self.shape, self.numel
 
+    def block_of(self, scalar_ty):
+        key = self.name, scalar_ty.name
+        if key not in block_types:
+            block_types[key] = with_element_ty(self, scalar_ty)
+        return block_types[key]
+
     def broadcast_unlike(self, lhs, rhs):
         if lhs.type.is_block() and rhs.type.is_block() and lhs.type.shape is rhs.type.shape:
             return lhs, rhs
         return broadcast(self, lhs, rhs)
 
     core.block_type.__init__, core.tensor.__init__ = init_block, init_tensor
+    core.block_type.with_element_ty = block_of
     semantic.broadcast_impl_value = broadcast_unlike
 
 

@@ -78,12 +78,11 @@ def test_free_motion_is_exact(precision):
     origin_S3, _ = drawn(network, state)
     engine = inference_of(engine_of(network, state, precision), network)
     outputs = []
-    for boost in ((0.0, 0.0, 0.0), (5e-2, 0.0, 0.0), (-1e-2, 3e-2, 2e-2)):
+    for boost in ((0.0, 0.0, 0.0), (5e-2, -3e-2, 2e-2)):
         faster = replace(state, velocity_NM3=state.velocity_NM3 + torch.tensor(boost, dtype=torch.float64))
         outputs.append(run_forward(engine, network, faster, origin_S3).double())
     assert float(outputs[0].abs().max()) > 1e-2
-    for output in outputs[1:]:
-        assert relative_error(output, outputs[0]) < {"fp32": 1e-4, "tf32": 2e-3, "fp16": 2e-3}[precision]
+    assert relative_error(outputs[1], outputs[0]) < {"fp32": 1e-4, "tf32": 2e-3, "fp16": 2e-3}[precision]
     for scene in range(2):
         here_N = state.scene_N == scene
         for kept_N3 in (outputs[0], torch.linalg.cross(state.position_N3 - 0.55, outputs[0])):

@@ -38,7 +38,7 @@ def test_an_update_under_symmetries_is_the_plain_one(monkeypatch):
     obstacles, one without gravity: positions, velocities, targets, normals, loss and gradients are those of backend
     torch in float64, and the check passes."""
     network = network_of(width=16, levels=1, message_passing_steps=1, cell_size=0.1, inputs="relative")
-    episodes = [scene_with_obstacles(i, 2 + i) for i in range(8)]
+    episodes = [scene_with_obstacles(i, 2 + i % 3, 20_000) for i in range(8)]
     bare = ObstacleGrid(CELL_SIZE, np.zeros((0, 3), np.int32), np.zeros((0, 3), np.float32))
     episodes[2] = replace(episodes[2], obstacle_grid=bare)
     episodes[0] = replace(episodes[0], gravity=(0.0, 0.0, 0.0))

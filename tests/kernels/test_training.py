@@ -114,8 +114,8 @@ def test_automatic_precision_of_a_training(data, tmp_path, monkeypatch, capsys, 
     monkeypatch.setattr(
         TritonUpdates, "_build", lambda self, precision: (made.append(weakref.ref(self)), build(self, precision))
     )
-    values = {"ema_decay": 0.7, "pushforward_fraction": 0.5, "pushforward_every": 1, "pushforward_frames": 2}
-    values["pushforward_scenes"] = 2
+    values = {"ema_decay": 0.7, "pushforward_fraction": 0.5, "pushforward_every": 1, "pushforward_frames": 1}
+    values["pushforward_scenes"] = 1
     ends = []
     for precision in ("fp32", "auto"):
         for updates in (1, 2) if precision == "auto" else (2,):

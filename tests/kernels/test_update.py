@@ -101,21 +101,22 @@ def parameters_of(updates):
 
 
 @pytest.mark.parametrize(
-    ("optimizer", "directions"), [("adam", torch.float32), ("muon", torch.float32), ("muon", torch.bfloat16)]
+    ("optimizer", "directions", "levels"),
+    [("adam", torch.float32, 2), ("muon", torch.float32, 1), ("muon", torch.bfloat16, 1)],
 )
-def test_updates_are_those_of_torch(optimizer, directions, monkeypatch):
+def test_updates_are_those_of_torch(optimizer, directions, levels, monkeypatch):
     """Two updates of two scenes, with and without obstacles, at different rates, weighted:
     losses and parameters are those of autograd in float64 with torch's Adam or with Muon; an update that needs more
     room than there is gets it, and is repeated. With Muon's directions in bfloat16, as a GPU makes them, parameters are
     at most twice as far away as bfloat16 alone takes autograd's."""
     monkeypatch.setattr("hgn.kernels.muon.op.direction_dtype", lambda _: directions)
-    network = network_of(width=16, levels=2, message_passing_steps=1, cell_size=0.1)
+    network = network_of(width=16, levels=levels, message_passing_steps=1, cell_size=0.1)
     small, grid = episode(1, 5, True)
     open_space, none = episode(2, 3, False)
     wide, other = episode(3, 5, True, spread=0.6)
     chunk = [[(small, 0, 1, 0.3), (open_space, 1, 2)], [(wide, 2, 3), (open_space, 0, 4, 1.7)]]
     rates = [1e-3, 3e-4]
-    updates = updates_of(network, 2, capacities=(32, 16), optimizer=optimizer)
+    updates = updates_of(network, 2, capacities=(32, 16)[:levels], optimizer=optimizer)
     updates.run(chunk, rates)
     assert updates.growths >= 1
     reference = copy.deepcopy(network)

@@ -156,7 +156,7 @@ def test_resume_equals_no_interruption(data, tmp_path, monkeypatch):
             assert stored["hgn"]["updates"] == stop
         return stored, [line for line in metrics(tmp_path / name) if "loss" in line]
 
-    (whole, lines), (again, _), (elsewhere, resumed) = trained("whole"), trained("cut", 4, 12), trained("pool", 1, 6)
+    (whole, lines), (again, _), (elsewhere, resumed) = trained("whole"), trained("cut", 4, 12), trained("pool", 6)
     digest = EpisodeStore(data.dataset.folder, "train").digest(5)
     expected = SamplerState(1, 7, 5, digest, seed=TrainingConfig(**TRAINING).seed)
     assert dataclasses.asdict(expected) == whole["hgn"]["sampler_state"]

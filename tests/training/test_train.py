@@ -321,8 +321,8 @@ def test_training_learns(make_config, make_dataset, run):
     """On free fall with strong velocity noise, 240 updates learn to undo a good part of the noise."""
     config = make_config(training_scenes=6, frames=30)
     make_dataset(config)
-    changes = {"maximum_updates": 240, "log_every": 10, "monitor_every": 240, "learning_rate": 1e-2, "noise_std": 0.02}
-    train.main(train_mapping(config, run, **changes))
+    changes = {"maximum_updates": 240, "log_every": 10, "learning_rate": 1e-2, "noise_std": 0.02}
+    train.main(train_mapping(config, run, **changes, monitor_every=1000, checkpoint_every=1000))
     losses = [record["loss"] for record in metrics(run) if "loss" in record]
     assert sum(losses[-4:]) < 0.8 * sum(losses[:4])
 
