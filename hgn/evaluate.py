@@ -149,7 +149,7 @@ def _at_frames(mse_T: np.ndarray, frames: list[int]) -> dict[str, float]:
 def end_of_rollout(trial: RolloutResult, episode: Episode) -> dict[str, Any]:
     """Returns properties of a rollout's last frame, and the cause of an early end.
     They are the shares of particles in closed obstacles, also in the data, and of particles outside the domain."""
-    from hgn.scene.rollout_file import obstacles_of_episode
+    from hgn.scene.episode_obstacles import obstacles_of_episode
 
     obstacles, last = obstacles_of_episode(episode), trial.frame_count - 1
     position_N3 = trial.position_TN3[last]

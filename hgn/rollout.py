@@ -8,7 +8,8 @@ from __future__ import annotations
 import hashlib
 import math
 import sys
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
+from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -25,7 +26,7 @@ from hgn.scene.random_scene import generate_scene
 from hgn.scene.scene import Scene
 from hgn.scene.scene_file import find_scene, load_scene, notes_on_files
 from hgn.schema import ConfigError, FrameCount, NonNegative, from_mapping, require, require_bounds, require_replaceable
-from hgn.system.files import require_place, space_reserved
+from hgn.system.files import require_place
 from hgn.system.progress import bar
 
 if TYPE_CHECKING:
@@ -93,14 +94,15 @@ def main(mapping: dict[str, Any]) -> int:
 def rollout(config: RolloutConfig) -> tuple[Path, Rollout]:
     """Simulates a scene or an episode, writes the file, and returns its path and content.
 
-    The file of an episode also has the episode's true positions. Raises ConfigError for bad input or a simulation that
-    diverges, and then writes nothing.
+    The file of an episode also has the episode's true positions. Ctrl-C keeps the frames so far. Raises ConfigError for
+    bad input or a simulation that diverges, and then writes nothing.
     """
-    from hgn.render.exchange import require_exchange, save_rollout
+    from hgn.render.exchange import require_exchange, save_frames
     from hgn.runtime.divergence import DivergedError
     from hgn.runtime.simulator import InitialState, Simulator
     from hgn.runtime.weights import find_weights, require_frame_rate
-    from hgn.scene.rollout_file import Rollout, obstacles_of_episode, rollout_bytes
+    from hgn.scene.episode_obstacles import obstacles_of_episode
+    from hgn.scene.rollout_file import Rollout
 
     out = _out(config)
     require_exchange(out, config.surface)
@@ -135,15 +137,11 @@ def rollout(config: RolloutConfig) -> tuple[Path, Rollout]:
             file=sys.stderr,
         )
     print(simulator.backend.note, file=sys.stderr)
-    space = space_reserved(out, rollout_bytes(frames, len(initial.material_N), reference_TN3 is not None))
-    with space, bar("simulating", total=frames - 1, unit="frame") as progress:
-        try:
-            (position_TN3,) = simulator.rollout([initial], frames, lambda _: progress.update())
-        except DivergedError as error:
-            raise ConfigError(f"weights must keep the simulation together, got {weights}: {error}") from error
+    material_N = initial.material_N if scene is None else scene.material_N
+    path_TN3 = np.full((frames, len(material_N), 3), np.nan, np.float32)
     result = Rollout(
-        position_TN3=position_TN3,
-        material_N=initial.material_N if scene is None else scene.material_N,
+        position_TN3=path_TN3,
+        material_N=material_N,
         obstacles=obstacles,
         domain_size=initial.domain_size,
         frame_rate_hz=simulator.frame_rate_hz,
@@ -155,7 +153,20 @@ def rollout(config: RolloutConfig) -> tuple[Path, Rollout]:
         materials=initial.materials,
         dimensions=initial.dimensions,
     )
-    return save_rollout(out, result, config.surface), result
+    try:
+        with closing(_shown(simulator.frames(initial, frames), frames)) as simulated:
+            written = save_frames(out, result, simulated, config.surface)
+    except DivergedError as error:
+        raise ConfigError(f"weights must keep the simulation together, got {weights}: {error}") from error
+    return written, result
+
+
+def _shown(simulated: Iterator[np.ndarray], count: int) -> Generator[np.ndarray]:
+    """Yields frames, and shows their number."""
+    with bar("simulating", total=count, unit="frame") as progress:
+        for position_N3 in simulated:
+            yield position_N3
+            progress.update()
 
 
 def _not_used(scene: Scene, weights: str) -> Iterator[str]:

@@ -30,7 +30,9 @@ if TYPE_CHECKING:
 
 def main(mapping: dict[str, Any]) -> int:
     """Trains with the resolved configuration. Returns the exit code."""
-    from hgn.training.dataset import PublishedEpisodes, is_complete, more_data, wait_for_episodes
+    import torch
+
+    from hgn.training.dataset import PublishedEpisodes, is_complete, more_data, wait_for_episodes, warning_on_a_cpu
     from hgn.training.distributed import default_run, first_on_machine, first_rank, layout
     from hgn.training.generator import Generator
     from hgn.training.imported import require_network_fits, settings_of_imported
@@ -69,6 +71,9 @@ def main(mapping: dict[str, Any]) -> int:
         generator = None
         # A URL is a service that generates missing episodes itself.
         if first_rank() and config.training.generate and not is_remote(folder) and not is_complete(config):
+            on_gpu = config.training.device != "cpu" and torch.cuda.is_available()
+            if not on_gpu and (warning := warning_on_a_cpu(config)):
+                print(warning, file=sys.stderr)
             generator = Generator(config.datagen, run / "datagen")
             stack.callback(generator.stop)
         precompilation = precompile_kernels(config, resume, stack)

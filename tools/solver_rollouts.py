@@ -13,7 +13,7 @@ from datagen.fine import fine_scene, visible_positions, wall_thickness
 from hgn.config import MpmConfig
 from hgn.runtime.rollouts import RolloutResult
 from hgn.scene.episode import Episode
-from hgn.scene.rollout_file import obstacles_of_episode
+from hgn.scene.episode_obstacles import obstacles_of_episode
 from hgn.scene.scene import Scene
 from hgn.system.machine import available_cpus
 from hgn.system.progress import bar

@@ -7,8 +7,10 @@ Shape legend: T frames, N particles, V vertices, F triangles.
 
 from __future__ import annotations
 
+import sys
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,11 +21,11 @@ from hgn.render.pictures import rollout_spacing
 from hgn.render.renderer import MATERIAL_COLORS, OBSTACLE_COLOR, PARTICLE_COLORS
 from hgn.scene.material import FLUIDS
 from hgn.scene.motion import Motion
-from hgn.scene.rollout_file import Rollout, rollout_velocity, write_rollout
+from hgn.scene.rollout_file import Rollout, rollout_bytes, rollout_velocity, write_frames, write_rollout
 from hgn.scene.scene import Obstacle
 from hgn.schema import ConfigError, require_replaceable
 from hgn.system.extras import require_installed
-from hgn.system.files import WRITTEN_BY_HGN, sync_folder, sync_written
+from hgn.system.files import WRITTEN_BY_HGN, space_reserved, sync_folder, sync_written
 
 # The values of the surface are in particle radii (half the spacing). With them the volume of a block of 8 particles a
 # cell is correct within 4 %, for a lattice and for a random filling.
@@ -57,6 +59,31 @@ def save_rollout(
         written = [file.replace(path.parent / file.name) for file in sorted(Path(folder).iterdir())]
     sync_folder(path.parent)
     return written[0]
+
+
+def save_frames(path: Path, rollout: Rollout, frames: Iterable[np.ndarray], surface: bool = False) -> Path:
+    """Does `save_rollout` with frames as they come, and puts them into `rollout.position_TN3`; see `write_frames`.
+
+    USD and PLY are written at the end, or with the frames so far after Ctrl-C.
+    """
+    if path.suffix not in (*USD_ENDINGS, PLY_ENDING):
+        write_frames(path, rollout, frames)
+        return path
+    interruption, count = None, 0
+    with space_reserved(path, rollout_bytes(rollout.frame_count, rollout.particle_count)):
+        try:
+            for position_N3 in frames:
+                rollout.position_TN3[count, : len(position_N3)] = position_N3
+                count += 1
+        except KeyboardInterrupt as error:
+            if not count:
+                raise
+            interruption = error
+    written = save_rollout(path, replace(rollout, position_TN3=rollout.position_TN3[:count]), surface)
+    if interruption is not None:
+        print(f"{count} of {rollout.frame_count} frames are in {written}", file=sys.stderr)
+        raise interruption
+    return written
 
 
 def require_exchange(path: Path, surface: bool) -> None:

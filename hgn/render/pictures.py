@@ -21,8 +21,9 @@ from PIL import Image, ImageDraw, ImageFont, PngImagePlugin
 from hgn.render.flat import FlatStage
 from hgn.render.renderer import BACKGROUND_COLOR, MATERIAL_COLORS, OBSTACLE_COLOR, PARTICLE_COLORS, Stage, to_bytes
 from hgn.scene.episode import Episode
+from hgn.scene.episode_obstacles import obstacles_of_episode
 from hgn.scene.group import WALL_CELLS
-from hgn.scene.rollout_file import Rollout, obstacles_of_episode
+from hgn.scene.rollout_file import Rollout
 from hgn.schema import ConfigError
 from hgn.system.files import WRITTEN_BY_HGN, write_atomically
 

@@ -29,10 +29,10 @@ from hgn.runtime.weights import WeightsInfo, find_weights, load_weights
 from hgn.scene.barrier import Barrier, build_barrier
 from hgn.scene.emission import at_entry, at_start, entry_frames, require_free_entries
 from hgn.scene.episode import Episode
+from hgn.scene.episode_obstacles import known_obstacles
 from hgn.scene.history import ballistic_velocities, require_past
 from hgn.scene.material import MATERIALS
 from hgn.scene.obstacle_grid import ObstacleGrid, build_obstacle_grid
-from hgn.scene.rollout_file import known_obstacles
 from hgn.scene.scene import Scene, all_corners, whole_cells
 from hgn.schema import require
 from hgn.system.device import choose_device
@@ -240,8 +240,8 @@ class Simulator:
         ends = np.cumsum(np.bincount(scene_N, minlength=len(states)))[:-1]
         return np.split(position_TN3, ends, axis=1), simulation.ended
 
-    def frames(self, scene: InitialState | Scene) -> Iterator[np.ndarray]:
-        """Yields positions float32 [N, 3] of every frame without end, starting with the initial positions.
+    def frames(self, scene: InitialState | Scene, count: int = sys.maxsize) -> Iterator[np.ndarray]:
+        """Yields positions float32 [N, 3] of `count` frames, without end by default, starting with the initial ones.
 
         Backend triton computes some frames ahead. Several scenes may be simulated at the same time by separate calls.
         Raises: ConfigError with the first frame; DivergedError after the last good frame.
@@ -252,7 +252,7 @@ class Simulator:
         yield state.position_N3.cpu().numpy()
         capacity = len(state.position_N3) + sum(len(entry.state.position_N3) for entry in entries)
         with self.simulation(state, capacity, entries=entries) as simulation:
-            for block_TN3 in simulation.blocks(sys.maxsize):
+            for block_TN3 in simulation.blocks(count - 1):
                 yield from on_host(block_TN3)
 
     def simulation(

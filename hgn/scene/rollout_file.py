@@ -15,25 +15,24 @@ Shape legend: T frames, N particles, R frames of ground truth, V vertices, F tri
 
 from __future__ import annotations
 
+import contextlib
 import json
+import sys
+import time
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 
-from hgn.config import is_mesh_file
-from hgn.scene.episode import Episode
 from hgn.scene.hdf5 import damage_named, open_hdf5
 from hgn.scene.material import MATERIALS, require_materials
 from hgn.scene.motion import Motion
-from hgn.scene.obstacle_grid import ObstacleGrid
-from hgn.scene.rotation import quaternion_rotation
 from hgn.scene.scene import Obstacle
-from hgn.scene.shapes import mesh_sha256, shape_obstacle
 from hgn.schema import Bound, BoxSize, ConfigError, Positive, Vector, require, require_bounds
 from hgn.system.claims import Claims
-from hgn.system.files import make_folder, sync_file, sync_folder, temporary_file
+from hgn.system.files import make_folder, space_reserved, sync_folder, sync_written, temporary_file
 
 if TYPE_CHECKING:
     import h5py
@@ -43,7 +42,10 @@ FORMAT_VERSION = 2  # version 1 had no obstacles in /VTKHDF
 OBSTACLE_MATERIAL = 255
 MOTION_FIELDS = ("time_T", "translation_T3", "rotation_T33")
 VTKHDF_VERSION = (2, 0)  # the oldest version with temporal PolyData, for older ParaViews
-CELL_CATEGORIES = ("Vertices", "Lines", "Polygons", "Strips")  # in the order of Steps/CellOffsets
+# corners of each kind of cells, in the order of Steps/CellOffsets
+CELL_CATEGORIES = {"Vertices": 1, "Lines": 1, "Polygons": 3, "Strips": 1}
+WRITE_EVERY_S = 1.0  # interval between writes of a growing file
+FRAMES_OF_A_CHUNK = 64  # of datasets with one row for each frame
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,75 +119,18 @@ def frame_velocity(position_TN3: np.ndarray, frame_rate_hz: float) -> np.ndarray
 
 def rollout_velocity(rollout: Rollout) -> np.ndarray:
     """Returns `frame_velocity`; entering particles get the velocity of their second frame, or zero without one."""
-    velocity_TN3 = frame_velocity(rollout.position_TN3, rollout.frame_rate_hz)
-    if rollout.entry_frame_N is not None:
-        last = rollout.frame_count - 1
-        late = np.flatnonzero((rollout.entry_frame_N > 0) & (rollout.entry_frame_N <= last))
-        entry = rollout.entry_frame_N[late]
+    return _velocity(rollout.position_TN3, rollout.frame_rate_hz, rollout.entry_frame_N)
+
+
+def _velocity(position_TN3: np.ndarray, frame_rate_hz: float, entry_N: np.ndarray | None) -> np.ndarray:
+    velocity_TN3 = frame_velocity(position_TN3, frame_rate_hz)
+    if entry_N is not None:
+        last = len(position_TN3) - 1
+        late = np.flatnonzero((entry_N > 0) & (entry_N <= last))
+        entry = entry_N[late]
         velocity_TN3[entry, late] = velocity_TN3[np.minimum(entry + 1, last), late]
         velocity_TN3[last, late[entry == last]] = 0.0
     return velocity_TN3
-
-
-def obstacles_of_episode(episode: Episode) -> tuple[Obstacle, ...]:
-    """Returns the meshes of an episode's obstacles. If only cells are known, returns a square for each cell."""
-    meshes = known_obstacles(episode)
-    if meshes is None:
-        return cell_obstacles(episode.obstacle_grid, episode.domain_size[2] / 2 if episode.dimensions == 2 else None)
-    return meshes
-
-
-def known_obstacles(episode: Episode) -> tuple[Obstacle, ...] | None:
-    """Returns the meshes of an episode's obstacles or None. Shards do not contain them.
-
-    A random scene's meshes are rebuilt from its specification. Other scenes, or a missing mesh file, give none.
-    """
-    records = episode.specification.get("obstacles", ())
-    if episode.specification.get("kind") != "random" or not all(_is_here(record) for record in records):
-        return None
-    return tuple(
-        shape_obstacle(
-            record["shape"],
-            record["size"],
-            tuple(record["position"]),
-            quaternion_rotation(tuple(record["quaternion"])),
-            f"obstacle_{index}_{Path(record['shape']).stem}",
-        )
-        for index, record in enumerate(records)
-    )
-
-
-def _is_here(record: dict[str, Any]) -> bool:
-    shape = record["shape"]
-    if not is_mesh_file(shape):
-        return True
-    return Path(shape).is_file() and mesh_sha256(shape) == record.get("sha256")
-
-
-def cell_obstacles(grid: ObstacleGrid, plane_z: float | None = None) -> tuple[Obstacle, ...]:
-    """Returns one square in each obstacle cell, for episodes without meshes.
-
-    The square is perpendicular to the cell's normal. In a 2D set it is the cell's section with the plane at `plane_z`.
-    """
-    if not len(grid.cell_K3):
-        return ()
-    center_K3 = (grid.cell_K3 + 0.5) * grid.cell_size
-    if plane_z is None:
-        normal_K3 = grid.normal_K3.astype(np.float64)
-        least_K3 = np.eye(3)[np.abs(normal_K3).argmin(axis=1)]
-        side_K3 = np.cross(normal_K3, least_K3)
-        side_K3 /= np.maximum(np.linalg.norm(side_K3, axis=1, keepdims=True), 1e-12)
-        other_K3 = np.cross(normal_K3, side_K3)
-    else:
-        center_K3[:, 2] = plane_z
-        side_K3, other_K3 = np.eye(3)[:2, None]
-    half = 0.5 * grid.cell_size
-    corner_K43 = np.stack(
-        [center_K3 + half * (a * side_K3 + b * other_K3) for a, b in ((-1, -1), (1, -1), (1, 1), (-1, 1))], axis=1
-    )
-    first_K = 4 * np.arange(len(center_K3))
-    triangle_F3 = np.concatenate([np.stack((first_K, first_K + i, first_K + i + 1), axis=1) for i in (1, 2)])
-    return (Obstacle("cells", corner_K43.reshape(-1, 3), triangle_F3.astype(np.int32), closed=False),)
 
 
 def rollout_bytes(frames: int, particles: int, reference: bool = False) -> int:
@@ -195,16 +140,48 @@ def rollout_bytes(frames: int, particles: int, reference: bool = False) -> int:
 
 def write_rollout(path: str | Path, rollout: Rollout) -> None:
     """Writes `rollout` to `path` atomically. Creates missing folders."""
+    make_folder(Path(path).parent)
+    with _growing_file(Path(path), rollout) as frames:
+        frames.write(rollout.frame_count)
+
+
+def write_frames(path: Path, rollout: Rollout, frames: Iterable[np.ndarray]) -> None:
+    """Writes frames as they come, float32 [present particles, 3], and puts them into `rollout.position_TN3`.
+
+    They are written once a second to a temporary name; the file has the frames so far at any time. It gets its own name
+    at the end, also after Ctrl-C or an error of the disk. Other errors leave no file. The space for all frames is
+    reserved. Raises: OSError, before the first frame, where the disk has less.
+    """
+    size = rollout_bytes(rollout.frame_count, rollout.particle_count, rollout.reference_TN3 is not None)
+    interruption, count = None, 0
+    with space_reserved(path, size) as release, _growing_file(path, rollout) as file:
+        try:
+            for position_N3 in frames:
+                rollout.position_TN3[count, : len(position_N3)] = position_N3
+                count += 1
+                if time.monotonic() - file.written_s > WRITE_EVERY_S:
+                    release(size * (count - file.count) // rollout.frame_count)
+                    file.write(count)
+        except (KeyboardInterrupt, OSError) as error:
+            if not count:
+                raise
+            interruption = error
+        release(size)
+        file.write(count)
+    if interruption is not None:
+        print(f"{count} of {rollout.frame_count} frames are in {path}", file=sys.stderr)
+        raise interruption
+
+
+@contextlib.contextmanager
+def _growing_file(path: Path, rollout: Rollout) -> Iterator[_GrowingFile]:
+    """Yields a temporary file without frames. It gets its name at the end, unless there was an error."""
     import h5py
 
-    path = Path(path)
-    make_folder(path.parent)
     with temporary_file(path) as temporary:
-        with temporary.open("x+b") as raw:
-            with h5py.File(raw, "w") as file:
-                _write_vtkhdf(file.create_group("VTKHDF"), rollout)
-                _write_own(file.create_group("hgn"), rollout)
-            sync_file(raw)
+        with h5py.File(temporary, "x", locking=False) as file:
+            yield _GrowingFile(file, rollout)
+        sync_written(temporary)
         temporary.replace(path)
     sync_folder(path.parent)
 
@@ -226,49 +203,90 @@ def read_rollout(path: str | Path) -> Rollout:
             raise ConfigError(f"{path}: rollout must be consistent, got {error}; {remedy}") from error
 
 
-def _write_vtkhdf(group: h5py.Group, rollout: Rollout) -> None:
-    frames, particles = rollout.frame_count, rollout.particle_count
+class _GrowingFile:
+    """A file with the first frames of a rollout. Each dataset with a row or rows for each frame grows."""
+
+    def __init__(self, file: h5py.File, rollout: Rollout) -> None:
+        self._file, self._group, self._rollout = file, file.create_group("VTKHDF"), rollout
+        self.count, self.written_s = 0, time.monotonic()
+        _write_topology(self._group, rollout)
+        _write_own(file.create_group("hgn"), rollout)
+
+    def write(self, end: int) -> None:
+        """Writes the frames before `end` that are not in the file. A repeated call completes an interrupted one."""
+        rollout, begin = self._rollout, self.count
+        start, again = max(begin - 2, 0), max(begin - 1, 0)  # velocities of frame `again` follow from more frames now
+        position_TN3 = rollout.position_TN3[start:end]
+        vertex_TV3, triangle_F3, _ = _triangles(rollout.obstacles, np.arange(start, end) / rollout.frame_rate_hz)
+        entry_N = None if rollout.entry_frame_N is None else rollout.entry_frame_N - start
+        velocity_TN3 = _velocity(position_TN3, rollout.frame_rate_hz, entry_N)
+        velocity_TV3 = frame_velocity(vertex_TV3, rollout.frame_rate_hz)
+        present_T = np.array([rollout.present(frame) for frame in range(end)], np.int64)
+        points_T = present_T + vertex_TV3.shape[1]
+        before_T = np.cumsum([0, *points_T])
+        for name, frame, value_TV3, value_TN3 in (
+            ("Points", begin, vertex_TV3, position_TN3),
+            ("PointData/velocity", again, velocity_TV3, velocity_TN3),
+        ):
+            row_R3 = _stacked(value_TV3[frame - start :], value_TN3[frame - start :], present_T[frame:])
+            _extend(self._group, name, row_R3, int(before_T[frame]), int(points_T.max()))
+        for name, value_T in _numbers(present_T, points_T, len(triangle_F3), rollout).items():
+            _extend(self._group, name, value_T[begin:], begin, FRAMES_OF_A_CHUNK)
+        self._group["Steps"].attrs["NSteps"] = np.int64(end)
+        self._file.flush()
+        self.count, self.written_s = end, time.monotonic()
+
+
+def _extend(group: h5py.Group, name: str, value: np.ndarray, at: int, chunk: int) -> None:
+    """Writes rows from row `at` to the end of a dataset, which grows."""
+    if name not in group:
+        shape = (0, *value.shape[1:])
+        chunks = (min(max(chunk, 1), 1 << 16), *value.shape[1:])
+        group.create_dataset(name, shape, value.dtype, maxshape=(None, *shape[1:]), chunks=chunks)
+    group[name].resize(at + len(value), 0)
+    group[name][at:] = value
+
+
+def _numbers(present_T: np.ndarray, points_T: np.ndarray, triangles: int, rollout: Rollout) -> dict[str, np.ndarray]:
+    """Returns the datasets with one row for each frame."""
+    frame_T = np.arange(len(present_T), dtype=np.int64)
+    none_T, before_T = 0 * frame_T, np.cumsum(points_T) - points_T
+    cells_T = {"Vertices": present_T, "Polygons": none_T + triangles}
+    numbers: dict[str, np.ndarray] = {}
+    for name, corners in CELL_CATEGORIES.items():
+        number_T = cells_T.get(name, none_T)
+        numbers |= {f"{name}/NumberOfCells": number_T, f"{name}/NumberOfConnectivityIds": number_T * corners}
+    return numbers | {
+        "NumberOfPoints": points_T,
+        "Steps/Values": frame_T / rollout.frame_rate_hz,  # seconds
+        "Steps/PartOffsets": frame_T,
+        "Steps/NumberOfParts": none_T + 1,
+        "Steps/PointOffsets": before_T,
+        "Steps/CellOffsets": np.zeros((len(frame_T), len(CELL_CATEGORIES)), np.int64),
+        "Steps/ConnectivityIdOffsets": np.zeros((len(frame_T), len(CELL_CATEGORIES)), np.int64),
+        "Steps/PointDataOffsets/material": none_T,
+        "Steps/PointDataOffsets/velocity": before_T,
+        "Steps/CellDataOffsets/obstacle": rollout.particle_count - present_T,
+    }
+
+
+def _write_topology(group: h5py.Group, rollout: Rollout) -> None:
+    """Writes the parts of /VTKHDF that are stored once."""
     group.attrs["Version"] = np.array(VTKHDF_VERSION, np.int64)
     # VTK requires a fixed-length ASCII string; h5py would write one of variable length
     group.attrs.create("Type", np.bytes_("PolyData"))
-    time_T = np.arange(frames) / rollout.frame_rate_hz  # seconds
-    vertex_TV3, triangle_F3, obstacle_F = _triangles(rollout.obstacles, time_T)
-    vertices, triangles = vertex_TV3.shape[1], len(triangle_F3)
-    present_T = np.array([rollout.present(frame) for frame in range(frames)], np.int64)
-    points_T = present_T + vertices
-    before_T = np.cumsum(points_T) - points_T
-
-    group["NumberOfPoints"] = points_T
-    group["Points"] = _stacked(vertex_TV3, rollout.position_TN3, present_T)
+    vertex_TV3, triangle_F3, obstacle_F = _triangles(rollout.obstacles, np.zeros(1))
+    vertices, particles = vertex_TV3.shape[1], rollout.particle_count
     cells = {"Vertices": vertices + np.arange(particles)[:, None], "Polygons": triangle_F3}
-    cells_T = {"Vertices": present_T, "Polygons": np.full(frames, triangles)}
-    for name in CELL_CATEGORIES:
-        cell_C = cells.get(name, np.zeros((0, 1)))
-        number_T = cells_T.get(name, np.zeros(frames, np.int64))
+    for name, corners in CELL_CATEGORIES.items():
+        cell_C = cells.get(name, np.zeros((0, corners)))
         category = group.create_group(name)
-        category["NumberOfCells"] = number_T
-        category["NumberOfConnectivityIds"] = number_T * cell_C.shape[1]
         category["Connectivity"] = cell_C.reshape(-1).astype(np.int64)
-        category["Offsets"] = np.arange(len(cell_C) + 1, dtype=np.int64) * cell_C.shape[1]
-
-    data = group.create_group("PointData")
+        category["Offsets"] = np.arange(len(cell_C) + 1, dtype=np.int64) * corners
+    group.create_group("Steps")
     material_V = np.full(vertices, OBSTACLE_MATERIAL, np.uint8)
-    data["material"] = np.concatenate([material_V, rollout.material_N.astype(np.uint8, copy=False)])
-    velocity_TV3 = frame_velocity(vertex_TV3, rollout.frame_rate_hz)
-    data["velocity"] = _stacked(velocity_TV3, rollout_velocity(rollout), present_T)
+    group["PointData/material"] = np.concatenate([material_V, rollout.material_N.astype(np.uint8, copy=False)])
     group["CellData/obstacle"] = np.concatenate([np.full(particles, -1, np.int32), obstacle_F])
-
-    steps = group.create_group("Steps")
-    steps.attrs["NSteps"] = np.int64(frames)
-    steps["Values"] = time_T
-    steps["PartOffsets"] = np.arange(frames, dtype=np.int64)
-    steps["NumberOfParts"] = np.ones(frames, np.int64)
-    steps["PointOffsets"] = before_T
-    steps["CellOffsets"] = np.zeros((frames, len(CELL_CATEGORIES)), np.int64)
-    steps["ConnectivityIdOffsets"] = np.zeros((frames, len(CELL_CATEGORIES)), np.int64)
-    steps["PointDataOffsets/material"] = np.zeros(frames, np.int64)
-    steps["PointDataOffsets/velocity"] = before_T
-    steps["CellDataOffsets/obstacle"] = particles - present_T
 
 
 def _triangles(obstacles: tuple[Obstacle, ...], time_T: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -292,7 +310,7 @@ def _stacked(value_TV3: np.ndarray, value_TN3: np.ndarray, present_T: np.ndarray
         return value_TN3.reshape(-1, 3).astype(np.float32, copy=False)
     parts = zip(value_TV3, value_TN3, present_T, strict=True)
     rows = [part for row_V3, row_N3, count in parts for part in (row_V3, row_N3[:count])]
-    return np.concatenate(rows).astype(np.float32, copy=False)
+    return np.concatenate(rows or [value_TN3[:0].reshape(0, 3)]).astype(np.float32, copy=False)
 
 
 def _write_own(group: h5py.Group, rollout: Rollout) -> None:

@@ -10,7 +10,7 @@ import mmap
 import os
 import re
 import secrets
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -117,18 +117,22 @@ def is_replaceable(path: Path) -> bool:
 
 
 @contextlib.contextmanager
-def space_reserved(path: Path, size: int) -> Iterator[None]:
+def space_reserved(path: Path, size: int) -> Iterator[Callable[[int], None]]:
     """Reserves `size` bytes beside `path` during long work, so that the disk is not full at its end.
 
-    Failed work leaves no new folder. Raises: OSError, before the work, where the disk has less.
+    Yields a function that releases some of these bytes, before they are written elsewhere. Failed work leaves no new
+    folder. Raises: OSError, before the work, where the disk has less.
     """
     missing = [folder for folder in path.parents if not folder.exists()]
     make_folder(path.parent)
     try:
-        with temporary_file(path) as reservation:
-            with reservation.open("wb") as file:
-                os.posix_fallocate(file.fileno(), 0, size)
-            yield
+        with temporary_file(path) as reservation, reservation.open("wb") as file:
+            os.posix_fallocate(file.fileno(), 0, size)
+
+            def release(count: int) -> None:
+                os.ftruncate(file.fileno(), max(0, os.fstat(file.fileno()).st_size - count))
+
+            yield release
     except BaseException:
         for folder in missing:
             with contextlib.suppress(OSError):  # others may have written into it

@@ -27,6 +27,7 @@ from hgn.training import lightning_compat
 from hgn.training.checkpoint import BEST_NAME, LAST_NAMES
 from hgn.training.checkpoint_writer import CheckpointWriter
 from hgn.training.data_module import EpisodeDataModule
+from hgn.training.dataset import LONG_ON_A_CPU_S, WAY_OUT
 from hgn.training.distributed import checksum, same_on_all_ranks
 from hgn.training.errors import format_ratio
 from hgn.training.gradients import take_counters
@@ -35,8 +36,6 @@ from hgn.training.stop import BY_WEIGHT, StopRequest
 
 METRICS = "metrics.jsonl"
 ESTIMATE_AFTER_S = 10.0  # of updates
-LONG_ON_A_CPU_S = 12 * 3600.0
-WAY_OUT = "on a CPU: +experiment=demo (minutes), training.maximum_updates=N, or a GPU (a hundred times faster)"
 
 
 class SameWeights(Callback):

@@ -16,12 +16,21 @@ from hgn.data.pooled import AnyStore, PooledStore
 from hgn.data.reader import EpisodeStore
 from hgn.data.storage import is_remote
 from hgn.schema import ConfigError, from_stored, require
+from hgn.system.machine import available_cpus
 from hgn.system.patience import UnreachableError
 from hgn.system.progress import bar, duration
 from hgn.training.distributed import first_rank
 from hgn.training.generator import Generator
 from hgn.training.stop import StopRequest
 
+LONG_ON_A_CPU_S = 3600.0
+WAY_OUT = (
+    "on a CPU: +experiment=demo (minutes), dataset.training_scenes=N and training.maximum_updates=N, or a GPU "
+    "(a hundred times faster)"
+)
+# of a particle in a frame: CPU seconds of the solver on 64^3 cells (results/start/frame_cpu.json), bytes in a shard
+SOLVER_CPU_S, SHARD_BYTES = 2.2e-4, 14
+MEAN_FILLING = 0.7  # particles of a group, as a fraction of those of a cube
 BETWEEN_LOOKS_S = 10.0  # interval between reads of the manifest for the progress line
 
 
@@ -117,6 +126,22 @@ def wait_for_episodes(
             progress.update(min(max(frames, progress.n), progress.total) - progress.n)
         time.sleep(0.5)
     return None
+
+
+def warning_on_a_cpu(config: TrainConfig) -> str | None:
+    """Returns time and space of the missing episodes on a CPU, before any is simulated; None: less than an hour."""
+    folder, scene = config.dataset.folder, config.scene
+    scenes = sum(config.dataset.scenes(split) for split in SPLITS)
+    if EpisodeStore.available(folder):
+        scenes -= sum(Manifest.load(folder).published(split) for split in SPLITS)
+    of_group = MEAN_FILLING * scene.particles_per_cell * (scene.group_size / scene.cell_size) ** 3
+    particle_frames = scenes * config.dataset.frames * scene.group_count * of_group
+    seconds = particle_frames * SOLVER_CPU_S / available_cpus()
+    if seconds < LONG_ON_A_CPU_S:
+        return None
+    space = f"{particle_frames * SHARD_BYTES / 1e9:.2g} GB"
+    updates = f"before most of {config.training.maximum_updates:,} updates"
+    return f"no GPU: {scenes} scenes take roughly {duration(seconds)} and {space} here, {updates}; {WAY_OUT}"
 
 
 def estimate(config: TrainConfig, frames: int, seconds: float) -> str:

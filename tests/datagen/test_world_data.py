@@ -9,7 +9,7 @@ from datagen.pool.worker import Backend, make_episode, make_scene, simulate_batc
 from hgn.card import data_card
 from hgn.config import DatagenConfig, DatasetConfig, MpmConfig, SceneConfig
 from hgn.data.manifest import Manifest
-from hgn.scene.rollout_file import known_obstacles
+from hgn.scene.episode_obstacles import known_obstacles
 
 KINDS = {"edge": 1.0, "pool": 3.0, "jet": 0.0}
 

@@ -1,6 +1,7 @@
 """What commands write: never over files of other programs, and only where there is space for it."""
 
 import errno
+import itertools
 import os
 
 import pytest
@@ -15,8 +16,9 @@ from end_to_end.places import (
 from processes import exit_code
 
 from hgn import rollout
-from hgn.command import EXIT_INPUT, EXIT_MACHINE
+from hgn.command import EXIT_INPUT, EXIT_INTERRUPTED, EXIT_MACHINE
 from hgn.runtime.simulator import Simulator
+from hgn.scene.rollout_file import read_rollout
 
 
 @pytest.mark.parametrize("command", ["rollout", "solve"])
@@ -96,3 +98,22 @@ def test_own_files_are_replaced(place, monkeypatch):
     others = [["evaluate", EVALUATE], ["play", [of_it, "html=made/r.html"]], ["curves", ["runs=[run]", "out=made/c"]]]
     for command, arguments in [exported, *rollouts, *drawn, *others] * 2:
         assert exit_code(COMMANDS[command], command, arguments, monkeypatch) == 0, (command, arguments)
+
+
+@pytest.mark.parametrize("name", ["a.vtkhdf", "a.ply"])
+def test_an_interrupted_simulation_keeps_its_frames(place, name, capsys, monkeypatch):
+    """After Ctrl-C the file has the frames so far, and a line says how many; nothing else lies beside it."""
+    frames = Simulator.frames
+
+    def interrupted(self, scene, count):
+        yield from itertools.islice(frames(self, scene, count), 3)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Simulator, "frames", interrupted)
+    code, line = refused("rollout", ["scene=scene.yaml", f"out=made/{name}", "frames=50"], capsys, monkeypatch)
+    assert code == EXIT_INTERRUPTED and line == "error: interrupted"
+    names = sorted(path.name for path in place.path("made").iterdir())
+    if name == "a.vtkhdf":
+        assert names == [name] and read_rollout(place.path("made") / name).frame_count == 3
+    else:
+        assert names == [*(f"a_{frame:04d}.ply" for frame in range(3)), "a_obstacle_0.ply"]

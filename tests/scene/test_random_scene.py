@@ -14,11 +14,11 @@ from scipy.spatial import cKDTree
 from hgn.config import DatagenConfig, DatasetConfig, SceneConfig
 from hgn.data.identity import _LATER_OPTIONS, dataset_identity, identity_hash
 from hgn.scene.distance import closest_points, contains
+from hgn.scene.episode_obstacles import obstacles_of_episode
 from hgn.scene.group import WALL_CELLS, fill, particle_count, points_in_ball, region_of
 from hgn.scene.material import MATERIALS, PAPER_MATERIALS
 from hgn.scene.obstacle_grid import build_obstacle_grid
 from hgn.scene.random_scene import CLEARANCE_CELLS, generate_scene
-from hgn.scene.rollout_file import obstacles_of_episode
 from hgn.scene.surface import split_long_edges
 from hgn.schema import ConfigError
 

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import math
+import shutil
 from pathlib import Path
 
 import h5py
@@ -12,16 +13,17 @@ from equality import assert_same
 from scene.test_episode import make_episode
 
 from hgn.config import SceneConfig
+from hgn.scene import rollout_file
+from hgn.scene.episode_obstacles import cell_obstacles, obstacles_of_episode
 from hgn.scene.motion import Motion
 from hgn.scene.obstacle_grid import ObstacleGrid
 from hgn.scene.random_scene import generate_scene
 from hgn.scene.rollout_file import (
     Rollout,
-    cell_obstacles,
     frame_velocity,
-    obstacles_of_episode,
     read_rollout,
     rollout_velocity,
+    write_frames,
     write_rollout,
 )
 from hgn.scene.rotation import euler_rotation
@@ -351,3 +353,81 @@ def test_obstacles_of_random_scenes_are_exact():
     """The rebuilt meshes of a random scene are those it was simulated with, bit for bit, in the same order."""
     scene = generate_scene(SceneConfig(), 4)
     assert_same(obstacles_of_episode(episode(scene.specification)), scene.obstacles)
+
+
+def growing():
+    """A rollout whose particles enter in four frames, with an obstacle that moves."""
+    turn = Motion(np.array([0.0, 0.05]), np.array([[0.0, 0, 0], [0.1, 0, 0]]), np.stack([np.eye(3)] * 2), (0.0, 0, 0))
+    still, moving = make_rollout().obstacles
+    entry_N = np.array([0, 0, 1, 1, 2, 3, 5])
+    position_TN3 = np.random.default_rng(1).random((6, PARTICLES, 3), np.float32)
+    position_TN3[np.arange(6)[:, None] < entry_N] = np.nan
+    obstacles = (still, dataclasses.replace(moving, motion=turn))
+    return dataclasses.replace(make_rollout(), position_TN3=position_TN3, obstacles=obstacles, entry_frame_N=entry_N)
+
+
+def contents(path):
+    """All datasets and attributes of a file."""
+    values = {}
+    with h5py.File(path) as file:
+        file.visititems(lambda name, item: values.update({(name, key): item.attrs[key] for key in item.attrs}))
+        file.visititems(lambda name, item: values.update({name: item[()]} if isinstance(item, h5py.Dataset) else {}))
+    return values
+
+
+def test_files_grow(tmp_path, monkeypatch):
+    """A file that is written frame by frame equals one that is written whole, and so does each file on the way."""
+    monkeypatch.setattr("hgn.scene.rollout_file.WRITE_EVERY_S", -1.0)
+    whole, path = growing(), tmp_path / "new" / "grown.vtkhdf"
+    empty = dataclasses.replace(whole, position_TN3=np.full_like(whole.position_TN3, np.nan))
+
+    def frames():
+        for count, frame_N3 in enumerate(whole.position_TN3):
+            if count:
+                (temporary,) = filter(h5py.is_hdf5, path.parent.iterdir())
+                shutil.copy(temporary, tmp_path / "copy")
+                write_rollout(tmp_path / "part", dataclasses.replace(whole, position_TN3=whole.position_TN3[:count]))
+                np.testing.assert_equal(contents(tmp_path / "copy"), contents(tmp_path / "part"))
+            assert not path.exists()
+            yield frame_N3[: whole.present(count)]
+
+    write_frames(path, empty, frames())
+    write_rollout(tmp_path / "whole", whole)
+    np.testing.assert_equal(contents(path), contents(tmp_path / "whole"))
+    np.testing.assert_array_equal(empty.position_TN3, whole.position_TN3)
+    assert [each.name for each in path.parent.iterdir()] == ["grown.vtkhdf"]
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt(), OSError(28, "No space left"), ConfigError("it diverged")])
+def test_interrupted_files(tmp_path, error, monkeypatch, capsys):
+    """Ctrl-C and errors of a disk keep the frames so far, other errors and those before the first frame the file of
+    before; a write that was interrupted is done again."""
+    whole, path = growing(), tmp_path / "a.vtkhdf"
+    write_rollout(path, make_rollout())
+
+    def frames(count):
+        yield from (frame_N3[: whole.present(i)] for i, frame_N3 in enumerate(whole.position_TN3[:count]))
+        raise error
+
+    for count in (0, 4):
+        with pytest.raises(type(error)):
+            write_frames(path, dataclasses.replace(whole, position_TN3=whole.position_TN3.copy()), frames(count))
+        kept = count and not isinstance(error, ConfigError)
+        assert read_rollout(path).frame_count == (count if kept else FRAMES)
+        assert capsys.readouterr().err == (f"4 of 6 frames are in {path}\n" if kept else "")
+    if isinstance(error, OSError):
+        monkeypatch.setattr("hgn.scene.rollout_file.WRITE_EVERY_S", -1.0)
+        extend, errors = rollout_file._extend, [error]
+        monkeypatch.setattr(
+            rollout_file, "_extend", lambda group, name, *rest: _fails(errors, name) or extend(group, name, *rest)
+        )
+        with pytest.raises(OSError, match="No space"):
+            write_frames(path, whole, iter(whole.position_TN3))
+        np.testing.assert_array_equal(read_rollout(path).position_TN3, whole.position_TN3[:3])
+    assert [each.name for each in tmp_path.iterdir()] == ["a.vtkhdf"]
+
+
+def _fails(errors, name, calls=[]):  # noqa: B006 - counts the calls
+    calls.append(name)
+    if calls.count("Steps/Values") == 3 and errors:
+        raise errors.pop()

@@ -16,7 +16,7 @@ from tensorboard.plugins.hparams.plugin_data_pb2 import HParamsPluginData
 from training.runs import NETWORK, TRAINING, metrics, train_mapping
 
 from hgn import train
-from hgn.config import NetworkConfig, TrainConfig, TrainingConfig
+from hgn.config import DatasetConfig, NetworkConfig, TrainConfig, TrainingConfig
 from hgn.data.manifest import Manifest
 from hgn.data.pooled import PooledStore
 from hgn.data.reader import EpisodeStore
@@ -30,7 +30,7 @@ from hgn.training import callbacks, gradients, monitor, session
 from hgn.training.callbacks import LogLines
 from hgn.training.checkpoint import LAST_NAMES, Progress, read_checkpoint
 from hgn.training.data_module import EpisodeDataModule
-from hgn.training.dataset import PublishedEpisodes, estimate
+from hgn.training.dataset import PublishedEpisodes, estimate, warning_on_a_cpu
 from hgn.training.readers import WindowReader
 from hgn.training.stop import StopRequest
 from hgn.training.torch_updates import TorchUpdates
@@ -266,6 +266,24 @@ def test_what_a_training_takes_is_said(make_config, make_dataset, tmp_path, monk
     bars[0].close()
     (line,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("about ")]
     assert "for the other updates, at" in line and "on a CPU: +experiment=demo (minutes), " in line
+
+
+def test_long_data_sets_are_announced_before_they_are_made(make_config, tmp_path, monkeypatch, capsys):
+    """On a CPU, a data set of more than an hour is announced with time, space and the way out, before its generator
+    starts. A finished one is not."""
+    monkeypatch.setattr("hgn.training.dataset.available_cpus", lambda: 2)
+    line = warning_on_a_cpu(TrainConfig(dataset=DatasetConfig(folder=str(tmp_path))))
+    assert line.startswith(
+        "no GPU: 825 scenes take roughly 23 hours and 10 GB here, before most of 20,000,000 updates;"
+    )
+    assert warning_on_a_cpu(make_config()) is None
+    monkeypatch.setattr("hgn.training.dataset.LONG_ON_A_CPU_S", 0.0)
+    monkeypatch.setattr(
+        "hgn.training.generator.Generator.__init__", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt)
+    )
+    with pytest.raises(KeyboardInterrupt):
+        train.main(train_mapping(make_config(), tmp_path / "run", generate=True))
+    assert capsys.readouterr().err.startswith("no GPU: ")
 
 
 def test_without_validation_scenes_there_is_no_best(make_config, make_dataset, tmp_path, capsys):

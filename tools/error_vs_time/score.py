@@ -17,8 +17,8 @@ import torch
 from hgn.runtime.rollouts import RolloutResult
 from hgn.scene.distance import fraction_inside
 from hgn.scene.episode import Episode
+from hgn.scene.episode_obstacles import obstacles_of_episode
 from hgn.scene.material import MATERIALS
-from hgn.scene.rollout_file import obstacles_of_episode
 from hgn.training.errors import REPORTED_FRAMES, mean_so_far, position_mse
 from tools import report
 from tools.error_vs_time.contenders import Contender, OneStep
