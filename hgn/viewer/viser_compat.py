@@ -21,12 +21,13 @@ from collections import Counter
 from collections.abc import Callable
 from typing import Any
 from unittest import mock
-from urllib.parse import parse_qs, urlsplit
+from urllib.parse import parse_qs
 
 import viser
 import websockets.asyncio.server
 from viser import _messages as messages
 from viser._gui_api import GuiApi
+from viser._gui_handles import GuiUploadButtonHandle
 from websockets import Headers
 from websockets.http11 import Request, Response
 
@@ -35,8 +36,8 @@ from hgn.schema import require
 COOKIE = "hgn_play"
 MAXIMUM_UNFINISHED_BYTES = 128 << 20  # bytes of the incomplete uploads of all viewers
 UPLOAD_BYTES, PART_BYTES = 1 << 20, 200  # least bytes by which an upload and each of its parts count
-MAXIMUM_MESSAGE_BYTES = 4 << 20  # bytes of a message from a viewer; parts of uploads have 512 KiB
-LONGEST_VALUE = 1000  # characters of a control's value
+MAXIMUM_MESSAGE_BYTES = 1 << 20  # bytes of a message from a viewer; parts of uploads have 512 KiB
+LONGEST_TEXT, LARGEST_NUMBER = 1000, 2**53  # characters of a text in a message; largest integer of a browser
 REFUSAL = b"open the address that hgn.play printed, with its token\n"
 SENT = (
     *(messages.SceneNodeClickMessage, messages.SceneNodeDragMessage, messages.ScenePointerMessage),
@@ -72,23 +73,54 @@ def start_server(host: str, port: int, label: str) -> tuple[viser.ViserServer, s
     with unsaid, limits, mock.patch.object(websockets.asyncio.server, "serve", guarded_serve):
         server = viser.ViserServer(host, port, label, verbose=False)
     server._websock_server._handle_incoming_message = admitting(  # type: ignore[method-assign]
-        server._websock_server._handle_incoming_message
+        server._websock_server._handle_incoming_message, server.gui
     )
     shown = "127.0.0.1" if host in ("0.0.0.0", "localhost") else host
     return server, f"http://{shown}:{server.get_port()}/?token={token}"
 
 
-def admitting(handle: Callable[..., Any]) -> Callable[..., Any]:
+def admitting(handle: Callable[..., Any], gui: GuiApi) -> Callable[..., Any]:
     """Drops messages that the controls do not send. Viser would set any attribute of a control for all viewers."""
 
     async def answer(client: int, message: Any) -> None:
-        passes = isinstance(message, SENT)
-        if isinstance(message, messages.GuiUpdateMessage):
-            passes = message.updates.keys() == {"value"} and len(repr(message.updates)) <= LONGEST_VALUE
-        if passes:
+        if is_sent(message, gui._gui_input_handle_from_uuid):
             await handle(client, message)
 
     return answer
+
+
+def is_sent(message: Any, controls: dict[str, Any]) -> bool:
+    """Returns whether a control of the page can have sent a message.
+
+    Viser converts values to any type, and stores an uploaded file as the value of any control that is named with it.
+    """
+    updates, fields = isinstance(message, messages.GuiUpdateMessage), vars(message)
+    if not (updates or (isinstance(message, SENT) and all(map(is_short, fields.values())))):
+        return False
+    name = fields.get("uuid", fields.get("source_component_uuid"))
+    control = controls.get(name) if isinstance(name, str) else None
+    if updates:
+        given = message.updates if isinstance(message.updates, dict) else {}
+        return control is not None and given.keys() == {"value"} and replaces(given["value"], control._impl.value)
+    return "source_component_uuid" not in fields or isinstance(control, GuiUploadButtonHandle)
+
+
+def is_short(value: Any) -> bool:
+    """Returns whether a field of a message is bounded. The size of bytes is bounded by `bounded`."""
+    if isinstance(value, tuple):
+        return len(value) <= 3 and all(map(is_short, value))
+    if isinstance(value, int):  # larger ones cannot be sent to the other viewers
+        return abs(value) <= LARGEST_NUMBER
+    return value is None or isinstance(value, (float, bytes)) or (isinstance(value, str) and len(value) <= LONGEST_TEXT)
+
+
+def replaces(value: Any, present: Any) -> bool:
+    """Returns whether a value has the type of a control's present value."""
+    if isinstance(present, tuple):
+        return isinstance(value, (list, tuple)) and len(value) == len(present) and all(map(replaces, value, present))
+    if isinstance(value, int):
+        return isinstance(present, (int, float)) and is_short(value)
+    return isinstance(value, (float, str)) and type(value) is type(present) and is_short(value)
 
 
 def bounded(handle: Callable[..., None]) -> Callable[..., None]:
@@ -123,10 +155,11 @@ def guarded(process: Process, token: str) -> Process:
         # Other programs on this host have cookies with any names and values. A strict parser would refuse some.
         cookies = [part.strip() for header in request.headers.get_all("Cookie") for part in header.split(";")]
         tokens = [cookie.removeprefix(f"{name}=") for cookie in cookies if cookie.startswith(f"{name}=")]
-        tokens += parse_qs(urlsplit(request.path).query).get("token", [])
-        origins, hosts = request.headers.get_all("Origin"), request.headers.get_all("Host")
-        foreign = any(urlsplit(origin).netloc not in hosts for origin in origins)
-        if foreign or not any(hmac.compare_digest(value.encode(), token.encode()) for value in tokens):
+        tokens += parse_qs(request.path.partition("#")[0].partition("?")[2]).get("token", [])
+        own = {f"{scheme}://{host}".lower() for host in request.headers.get_all("Host") for scheme in ("http", "https")}
+        foreign = any(origin.lower() not in own for origin in request.headers.get_all("Origin"))
+        # bytes that are no text are lone surrogates here
+        if foreign or not any(hmac.compare_digest(value.encode(errors="replace"), token.encode()) for value in tokens):
             headers = Headers({"Content-Type": "text/plain", "Content-Length": str(len(REFUSAL))})
             return Response(http.HTTPStatus.FORBIDDEN, "Forbidden", headers, REFUSAL)
         response = process(connection, request)

@@ -200,15 +200,31 @@ def test_a_moved_obstacle_leaves_no_earlier_scene_behind(page, monkeypatch):
 
 def test_requests_of_other_pages_are_refused():
     """A page of another origin is refused though the browser sends this page's cookie with its request."""
+    own = ("http://127.0.0.1:8080", "HTTP://127.0.0.1:8080", "https://127.0.0.1:8080")  # the last by a tunnel with TLS
+    others = ("http://127.0.0.1:9999", "http://evil.example", "null", "", "http://[::1", "http://a]b", "file://")
+    others += ("http://127.0.0.1:8080@evil.example", "http://u@127.0.0.1:8080", "javascript://127.0.0.1:8080")
     for origin, refused in (
-        *((None, False), ("http://127.0.0.1:8080", False), ("http://127.0.0.1:9999", True)),
-        *(("http://evil.example", True), ("null", True), ("", True)),
+        (None, False),
+        *((origin, False) for origin in own),
+        *((origin, True) for origin in others),
     ):
         given = {} if origin is None else {"Origin": origin}
         headers = Headers({"Host": "127.0.0.1:8080", "Cookie": f"{COOKIE}_8080=secret"} | given)
-        connection = SimpleNamespace(local_address=("127.0.0.1", 8080))
-        response = guarded(lambda connection, request: None, "secret")(connection, Request("/", headers))
-        assert (response is not None and response.status_code == http.HTTPStatus.FORBIDDEN) == refused
+        assert answered_with_403("/", headers) == refused, origin
+
+
+@pytest.mark.parametrize(
+    "path", ["/?token=\udcff", "//[", "http://[/", "/?token=secret%00", "/#?token=secret", "*", "/?a"]
+)
+def test_tokens_that_no_browser_sends(path):
+    """They are refused as others are, also bytes that are no text and addresses that are none."""
+    assert answered_with_403(path, Headers({"Host": "127.0.0.1:8080"}))
+
+
+def answered_with_403(path, headers):
+    connection = SimpleNamespace(local_address=("127.0.0.1", 8080))
+    response = guarded(lambda connection, request: None, "secret")(connection, Request(path, headers))
+    return response is not None and response.status_code == http.HTTPStatus.FORBIDDEN
 
 
 def updated(label, **values):
@@ -218,6 +234,26 @@ def updated(label, **values):
 
 def controls(page):
     return {handle.label: handle._impl for handle in page.server.gui._gui_input_handle_from_uuid.values()}
+
+
+def upload(label, **other):
+    """The beginning of an upload by a control."""
+
+    def message(page):
+        values = {"transfer_uuid": "t", "filename": "a.obj", "mime_type": "", "part_count": 0, "size_bytes": 0} | other
+        return viser_compat.messages.FileTransferStartUpload(controls(page)[label].uuid, **values)
+
+    return message
+
+
+def part(label, content):
+    """The only part of an upload that "Own mesh" has begun; it names another control."""
+
+    def message(page):
+        received(page, 0, [upload("Own mesh", part_count=1, size_bytes=1)(page)])
+        return viser_compat.messages.FileTransferPart(controls(page)[label].uuid, "t", 0, content)
+
+    return message
 
 
 def received(page, client, messages):
@@ -249,19 +285,37 @@ def parts(page, name, count, size):
         (updated("Size", sync_cb=None), False),
         (updated("Weights", value=10**6 * "x"), False),
         (updated("Gravity", value=10**5 * (0.0,)), False),
+        (updated("Gravity", value=[0, 0, 1.5]), True),
+        *((updated("Gravity", value=value), False) for value in ([], [1.0, 2.0], "123", ["1", "2", "3"], 3 * [2**63])),
+        *((updated("Size", value=value), False) for value in ("0.2", None, [0.2], {"a": 1}, 2**63)),
+        (updated("Own mesh", value="a.obj"), False),
+        (lambda page: viser_compat.messages.GuiUpdateMessage(["x"], {"value": 1}), False),
+        (lambda page: viser_compat.messages.GuiUpdateMessage(controls(page)["Size"].uuid, ["value"]), False),
+        (upload("Own mesh"), True),
+        *((upload(label), False) for label in ("Gravity", "Size", "Weights", "Step")),
+        *((upload("Own mesh", **{name: 10**300}), False) for name in ("part_count", "size_bytes")),
+        *((upload("Own mesh", **{name: 2000 * "x"}), False) for name in ("transfer_uuid", "filename", "mime_type")),
+        *((upload("Own mesh", transfer_uuid=value), False) for value in (["t"], {"t": 1}, 5**30)),
+        (part("Own mesh", b"x"), True),
+        (part("Size", b"x"), False),
+        (part("Own mesh", [[]]), False),
         (lambda page: viser_compat.messages.ShareUrlRequest(), False),
         (lambda page: viser_compat.messages.ResetGuiMessage(), False),
     ],
 )
 def test_messages_that_are_not_of_the_page(page, monkeypatch, message, passes):
-    """A viewer sets the values of controls, and nothing else of them; the server asks nobody for an address."""
+    """A viewer sets the values of controls, of the types that they have, and nothing else of them; only the button for
+    uploads takes files, with texts that are counted and numbers that other viewers can be sent; the server asks nobody
+    for an address."""
     asked, handled = [], page.server._websock_server._incoming_handlers
     monkeypatch.setitem(handled, viser_compat.messages.ShareUrlRequest, [lambda *_: asked.append("address")])
-    before = {name: dict(vars(state)) for name, state in controls(page).items()}
-    received(page, 0, [message(page)])
-    after = {name: dict(vars(state)) for name, state in controls(page).items()}
+    sent, uploads = message(page), page.server.gui._current_file_upload_states
+    before = {name: dict(vars(state)) for name, state in controls(page).items()} | {"uploads": {*uploads}}
+    received(page, 0, [sent])
+    after = {name: dict(vars(state)) for name, state in controls(page).items()} | {"uploads": {*uploads}}
     for name, state in controls(page).items():
         vars(state).update(before[name])
+    page.server.gui._drop_uploads_from_client(0)
     assert (after != before) == passes and not asked
 
 
@@ -303,10 +357,12 @@ def test_a_frame_that_fails_pauses(page, messages, monkeypatch, capsys):
     page.playing = False
 
 
-@pytest.mark.parametrize("value", [INFINITE, NAN, -5.0, 1e300])
+@pytest.mark.parametrize("value", [INFINITE, NAN, -5.0, 1e300, 900 * "9"])
 def test_a_film_goes_on_at_any_value(page, value):
     """Values that its sliders do not give, and an update that fails, do not end the page of a rollout."""
     film = FilmPage(page.session.rollout(), port=0)
+    received(film, 0, [updated("Frame", value=value)(film), upload("Frame")(film)])
+    assert film.slider.value == 0
     shown, failures = [], [RuntimeError("deque mutated during iteration")]
 
     def show(frame):
