@@ -12,7 +12,7 @@ import time
 import aiohttp
 from aiohttp.connector import Connection
 
-from hgn.schema import ConfigError
+from hgn.data.verification import StorageError
 
 LARGEST_BYTES = 2**29  # limit for whole files: manifests of the first release, and shards of servers without ranges
 LEAST_BYTES_S, SLOW_S = 4096, 20.0  # smallest speed of an answer, and the time after which it is checked
@@ -28,7 +28,7 @@ class BoundedResponse(aiohttp.ClientResponse):
         return await asyncio.wait_for(super().start(connection), HEAD_S)
 
     async def read(self) -> bytes:
-        """Returns the body. Raises: ConfigError if it is too long; ConnectionError if it is too slow."""
+        """Returns the body. Raises: StorageError if it is too long; ConnectionError if it is too slow."""
         if self._body is None:
             requested = _RANGE.fullmatch(self.request_info.headers.get("Range", ""))
             partial = requested is not None and self.status == 206
@@ -38,7 +38,7 @@ class BoundedResponse(aiohttp.ClientResponse):
                 size += len(piece)
                 if size > limit:
                     self.close()
-                    raise ConfigError(
+                    raise StorageError(
                         f"{self.url} must answer with at most {limit} bytes, got more; check dataset.folder"
                     )
                 if size < LEAST_BYTES_S * (time.monotonic() - start - SLOW_S):

@@ -13,12 +13,12 @@ import threading
 import time
 from abc import ABC, abstractmethod
 from collections import OrderedDict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from heapq import nsmallest
 from itertools import islice
 from pathlib import Path
-from typing import Any, overload
+from typing import Any, TypeVar, overload
 
 import numpy as np
 
@@ -31,6 +31,7 @@ from hgn.scene.episode import POSITION_MEMBER, Episode, decode_episode
 from hgn.schema import ConfigError, printable, require
 from hgn.system.patience import UnreachableError, standard_patience_s
 
+T = TypeVar("T")
 AGAIN_S, FORGOTTEN_S = 1.0, 60.0  # interval of reads after a fault of the manifest; time until the fault is forgotten
 MAPPED_SHARDS = 256  # largest number of mapped shards; also at most a quarter of the files that a process may open
 
@@ -172,7 +173,7 @@ class EpisodeStore(Episodes):
         """
         for shard in self._shards(indices):
             try:
-                self._bring(shard, patience_s=patience_s)
+                self._bring(shard, Path, patience_s=patience_s)
             except UnreachableError:
                 return False
         return True
@@ -201,7 +202,7 @@ class EpisodeStore(Episodes):
         with contextlib.suppress(ConfigError, OSError):
             for shard in self.manifest.shards.since(self._fetched):
                 if shard.split == self.split:
-                    self._bring(shard, spared=None)
+                    self._bring(shard, Path, spared=None)
                 self._fetched += 1
 
     def _fetch_wanted(self) -> None:
@@ -212,7 +213,7 @@ class EpisodeStore(Episodes):
                         self._fetcher = None
                         return
                     shard, spared = self._wanted.pop(0), self._spared
-                self._bring(shard, spared=spared)
+                self._bring(shard, Path, spared=spared)
 
     def digest(self, count: int) -> str | None:
         """Returns a digest of the first `count` episodes, or None if no shard ends with the last of them."""
@@ -262,9 +263,9 @@ class EpisodeStore(Episodes):
         self._lock = threading.Lock()
         holders.add(self)
 
-    def _bring(self, shard: ShardEntry, **options: Any) -> Path:
-        """Returns a shard's verified file on this machine. Options and errors as for `Storage.shard`."""
-        return ask(self.folder, lambda files: files.shard(shard.name, shard.sha256, shard.bytes, **options))
+    def _bring(self, shard: ShardEntry, use: Callable[[Path], T], **options: Any) -> T:
+        """Returns `use` of a shard's verified file on this machine. Options and errors as for `Storage.shard`."""
+        return ask(self.folder, lambda files: use(files.shard(shard.name, shard.sha256, shard.bytes, **options)))
 
     def _locate(self, index: int) -> tuple[ShardEntry, EpisodeEntry]:
         return self.manifest.shards.locate(self.split, index)
@@ -278,7 +279,7 @@ class EpisodeStore(Episodes):
         while True:
             opened = self._open_shards.get(shard.name)
             if opened is None:  # outside the lock, because a server may answer late
-                opened = _OpenShard(self._bring(shard))
+                opened = self._bring(shard, _OpenShard)
             with self._lock:
                 opened = self._open_shards.setdefault(shard.name, opened)
                 self._open_shards.move_to_end(shard.name)
@@ -286,13 +287,10 @@ class EpisodeStore(Episodes):
                 if len(self._open_shards) > min(MAPPED_SHARDS, resource.getrlimit(resource.RLIMIT_NOFILE)[0] // 4):
                     self._open_shards.popitem(last=False)
                 size = opened.size()
-                if size is None and is_remote(self.folder):  # removed from a full cache; it is fetched again
+                # removed from a full cache, or cut: reading after a file's end would kill the process
+                if (size is None and is_remote(self.folder)) or (size is not None and size < shard.bytes):
                     del self._open_shards[shard.name]
                     continue
-                if size is not None and size < shard.bytes:  # reading after the file's end would kill the process
-                    raise ConfigError(
-                        f"{opened.path} must have {shard.bytes} bytes, got {size}: it was cut while it was open"
-                    )
                 if entry.key not in opened.episodes:
                     opened.episodes[entry.key] = self._read(opened.content, shard, entry)
                 return opened.episodes[entry.key]

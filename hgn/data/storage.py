@@ -22,7 +22,7 @@ from typing import Any, TypeVar
 from urllib.parse import urlsplit
 
 from hgn.data.shard_cache import CachedShard, cached_shard
-from hgn.data.verification import verify_file
+from hgn.data.verification import StorageError, verify_file
 from hgn.schema import ConfigError, require
 from hgn.system.extras import missing_extra
 from hgn.system.files import open_at_once, read_replaced
@@ -38,10 +38,6 @@ _NETWORK_PACKAGES = {"aiohttp", "botocore", "aiobotocore", "gcsfs", "google", "a
 
 T = TypeVar("T")
 _outliving = threading.Event()
-
-
-class StorageError(ConfigError):
-    """A file of a data set is missing, refused, cut or not JSON, perhaps temporarily."""
 
 
 def faults_outlived() -> contextlib.AbstractContextManager[None]:
@@ -250,7 +246,7 @@ class _Remote(Storage):
                     return
             except FileNotFoundError:
                 raise _missing(f"{self._url}/{name}") from None
-            raise ConfigError(
+            raise StorageError(
                 f"{self._url}/{name} must have sha256 {sha256}, got other bytes: it was altered; generate it again"
             )
 
@@ -342,7 +338,7 @@ def _transient(error: Exception, url: str) -> str | None:
             "the Hugging Face Hub needs HF_TOKEN)"
         ) from None
     if status == 410:
-        raise ConfigError(f"{url} is damaged at its service; delete it there and run the generator again") from None
+        raise StorageError(f"{url} is damaged at its service; delete it there and run the generator again") from None
     # 416: a proxy has an older, shorter index file
     if isinstance(status, int) and 400 <= status < 500 and status not in (408, 416, 425, 429):
         raise StorageError(

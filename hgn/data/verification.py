@@ -8,6 +8,11 @@ from pathlib import Path
 from hgn.schema import ConfigError
 from hgn.system.files import open_at_once
 
+
+class StorageError(ConfigError):
+    """A file of a data set is missing, refused, cut, altered or not JSON, perhaps temporarily."""
+
+
 _verified: set[tuple[str | int, ...]] = set()  # identities of the files that this process has verified
 
 
@@ -20,17 +25,17 @@ def file_sha256(path: Path) -> str:
 def verify_file(path: Path, sha256: str, size: int, remedy: str) -> None:
     """Checks size and sha256 of a file. In a process it does so once, unless the file changes.
 
-    Raises: ConfigError naming file, expected and actual value, and remedy; FileNotFoundError.
+    Raises: StorageError naming file, expected and actual value, and remedy; FileNotFoundError.
     """
     status = path.stat()
     if status.st_size != size:
-        raise ConfigError(f"{path} must have {size} bytes, got {status.st_size}; {remedy}")
+        raise StorageError(f"{path} must have {size} bytes, got {status.st_size}; {remedy}")
     identity = _identity(path, sha256)
     if identity in _verified:
         return
     actual = file_sha256(path)
     if actual != sha256:
-        raise ConfigError(f"{path} must have sha256 {sha256}, got {actual}: it was altered; {remedy}")
+        raise StorageError(f"{path} must have sha256 {sha256}, got {actual}: it was altered; {remedy}")
     _verified.add(identity)
 
 

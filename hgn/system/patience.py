@@ -14,6 +14,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import TypeVar
 
 from hgn.schema import printable, require
@@ -54,6 +55,19 @@ def inside(event: threading.Event) -> Iterator[None]:
 def without_patience() -> contextlib.AbstractContextManager[None]:
     """Returns a context in which no thread of this process waits for a server that does not answer."""
     return inside(without)
+
+
+def outlived(write: Callable[[], T], path: Path) -> T:
+    """Returns `write()`, and retries it for the standard patience if a file of a run cannot be written.
+
+    Raises UnreachableError with `path`; at once IsADirectoryError and NotADirectoryError.
+    """
+
+    def cause(error: Exception) -> str | None:
+        passing = isinstance(error, OSError) and not isinstance(error, (IsADirectoryError, NotADirectoryError))
+        return str(error) if passing else None
+
+    return patiently(write, cause, str(path), str(path.parent), standard_patience_s())
 
 
 def patiently(

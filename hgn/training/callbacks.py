@@ -22,6 +22,7 @@ from tqdm import tqdm
 from hgn.data.storage import StorageError
 from hgn.schema import ConfigError, to_mapping
 from hgn.system.files import TEMPORARY_SUFFIX
+from hgn.system.patience import outlived
 from hgn.system.progress import bar, duration
 from hgn.training import lightning_compat
 from hgn.training.checkpoint import BEST_NAME, LAST_NAMES
@@ -148,7 +149,6 @@ class LogLines(Callback):
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         self._time, self._update, self._waited_s = time.monotonic(), _update(pl_module), self.feed.waited_s
         if trainer.is_global_zero:
-            _drop_cut_line(self.run / METRICS)
             total = self.feed.training.maximum_updates
             self._bar = bar("training", total=total, initial=self._update, unit="update")
 
@@ -253,8 +253,13 @@ def log(trainer: Trainer, run: Path, update: int, values: dict[str, float]) -> N
     for logger in trainer.loggers:
         logger.log_metrics(values, update)
     record = {"update": update, "time": time.time()} | values
-    with (run / METRICS).open("a", encoding="utf-8") as file:
-        file.write(json.dumps(record) + "\n")
+
+    def append() -> None:
+        _drop_cut_line(run / METRICS)
+        with (run / METRICS).open("a", encoding="utf-8") as file:
+            file.write(json.dumps(record) + "\n")
+
+    outlived(append, run / METRICS)
 
 
 def _drop_cut_line(path: Path) -> None:

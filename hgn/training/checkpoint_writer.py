@@ -17,6 +17,7 @@ from lightning.fabric.plugins import TorchCheckpointIO
 from lightning_utilities.core.apply_func import apply_to_collection
 
 from hgn.system.files import make_folder, temporary_file, write_atomically
+from hgn.system.patience import outlived
 from hgn.training.checkpoint import LAST_NAMES
 
 TURN_S = 1e-4  # Python's switch interval during pickling of a checkpoint; the default is 5e-3
@@ -25,8 +26,9 @@ TURN_S = 1e-4  # Python's switch interval during pickling of a checkpoint; the d
 class CheckpointWriter(TorchCheckpointIO):
     """Copies a checkpoint, and writes the copy atomically in a thread.
 
-    At most one write is in progress; the next one waits for it. The next write, `wait`, or the end of the training
-    raises the error of a write. (Lightning's AsyncCheckpointIO queues any number of copies.)
+    A failed write is retried for the standard patience. At most one write is in progress; the next one waits for it.
+    The next write, `wait`, or the end of the training raises the error of a write. (Lightning's AsyncCheckpointIO
+    queues any number of copies.)
     """
 
     def __init__(self) -> None:
@@ -36,7 +38,8 @@ class CheckpointWriter(TorchCheckpointIO):
     def save_checkpoint(self, checkpoint: dict[str, Any], path: str | Path, storage_options: Any = None) -> None:
         """Returns when the checkpoint is copied. Raises: OSError if the previous write failed."""
         self.wait()
-        self._writing = self._thread.submit(_write, snapshot(checkpoint), Path(path))
+        copy, place = snapshot(checkpoint), Path(path)
+        self._writing = self._thread.submit(outlived, lambda: _write(copy, place), place)
 
     def wait(self) -> None:
         """Returns when the last checkpoint is on disk. Raises: OSError if it could not be written."""

@@ -18,7 +18,7 @@ from hgn.runtime.backend import fastest_stepped
 from hgn.runtime.rollouts import simulate_scenes
 from hgn.runtime.simulator import InitialState, Simulator
 from hgn.scene.episode import Episode
-from hgn.system.patience import standard_patience_s
+from hgn.system.patience import outlived, standard_patience_s
 from hgn.training.callbacks import Checkpoints, log
 from hgn.training.data_module import agreed_count
 from hgn.training.errors import (
@@ -140,7 +140,8 @@ class Monitor(Callback):
         for name, mse_T in error_T.items():
             values["rollout/mse" if name == "all" else f"rollout/mse_{name}"] = float(np.nanmean(mse_T))
         shown = rollout_of_episode(episodes[0], trials[0].position_TN3)
-        paths = write_pictures(self.run / "pictures", module.update, shown, error_T)
+        folder = self.run / "pictures"
+        paths = outlived(lambda: write_pictures(folder, module.update, shown, error_T), folder)
         show_pictures(trainer.loggers, module.update, paths)
         return values
 

@@ -296,14 +296,24 @@ def test_nothing_is_lost(tmp_path, backend, name, every):
 
 def test_a_mapped_shard_never_shrinks(tmp_path, backend):
     """A shard, cached or not, gets its name when it is complete and is never written to or truncated afterwards, so
-    that mapping it is safe (a truncated map would end the reader with SIGBUS)."""
-    (tmp_path / "disk").mkdir()
-    for name in ("generation", "cache"):
-        disk = Disk(tmp_path / "disk")
+    that mapping it is safe (a truncated map would end the reader with SIGBUS). Its name is on the disk when a manifest
+    lists it, even for a moment."""
+    data, counts = tmp_path / "disk" / "data", set()
+
+    def before():
+        if (data / "manifest.json").exists():
+            listed = {shard.name for shard in Manifest.load(data).shards if (data / shard.name).exists()}
+            assert listed <= disk._names[data.stat().st_ino].keys()
+            counts.add(len(listed))
+
+    data.parent.mkdir()
+    for name, look in (("generation", before), ("cache", lambda: None)):
+        disk = Disk(tmp_path / "disk", look)
         with disk.followed():
             SCENARIOS[name].write(tmp_path / "disk", {})
         written = {path for path in disk.written if not path.endswith(files.TEMPORARY_SUFFIX)}
         assert disk.written - written and all(path.endswith(".jsonl") for path in written)
+        assert counts == {0, 1, 2, 3, 4}
 
 
 @pytest.mark.parametrize("skipped", ["sync_file", "sync_folder"])

@@ -9,6 +9,7 @@ from training.runs import train_mapping
 
 from hgn import train
 from hgn.system.files import write_atomically
+from hgn.system.patience import VARIABLE
 from hgn.training import checkpoint_writer
 from hgn.training.checkpoint import read_checkpoint
 from hgn.training.checkpoint_writer import CheckpointWriter
@@ -108,6 +109,7 @@ def test_a_training_ends_when_it_cannot_write(finished, monkeypatch, failing):
             raise OSError(28, "No space left on device", str(path))
         write_atomically(path, content)
 
+    monkeypatch.setenv(VARIABLE, "0")
     monkeypatch.setattr(checkpoint_writer, "write_atomically", write)
     with pytest.raises(OSError, match=rf"No space left on device.*{failing}"):
         train.main(train_mapping(data, run, maximum_updates=18))

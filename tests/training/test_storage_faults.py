@@ -1,12 +1,17 @@
 """Momentary faults of the storage of a data set: readers of a training keep what they know, and ask again."""
 
 import contextlib
+import errno
 import functools
+import gzip
 import http.server
 import json
+import os
 import threading
 from pathlib import Path
+from unittest import mock
 
+import numpy as np
 import pytest
 from data.test_http import Quiet, answering
 from training.runs import metrics, train_mapping
@@ -18,6 +23,7 @@ from hgn.data.shard_cache import CACHE_VARIABLE
 from hgn.data.storage import faults_outlived
 from hgn.schema import ConfigError
 from hgn.system.patience import VARIABLE
+from hgn.training import callbacks, checkpoint_writer, monitor
 from hgn.training.checkpoint import read_checkpoint
 
 HTML = b"<html><body>502 Bad Gateway</body></html>"
@@ -32,12 +38,12 @@ def _quick(tmp_path, monkeypatch):
     monkeypatch.setattr("hgn.data.storage._AWAY_S", 0.0)
 
 
-def written(content):
-    """The manifest has another content for a while."""
+def written(content, name="manifest.json"):
+    """A file has another content for a while."""
 
     @contextlib.contextmanager
     def fault(folder):
-        path = Path(folder) / "manifest.json"
+        path = Path(folder) / name
         before = path.read_bytes()
         path.write_bytes(content(before) if callable(content) else content)
         try:
@@ -114,13 +120,36 @@ def test_a_manifest_that_is_away_for_a_moment(data, name, capsys, monkeypatch):
     assert not store.refresh()
 
 
-@pytest.mark.parametrize("away", ["shard", "index", "."])
-def test_files_that_are_away_for_a_moment(data, away):
-    """Reading an episode, or lines of the index, waits for what is renamed."""
+def failing_at_first(real):
+    """Calls `real` after an error of each of these kinds."""
+    numbers = [errno.ESTALE, errno.EIO, errno.EROFS, errno.EACCES, errno.ENOENT]
+
+    def call(*given, **options):
+        if numbers:
+            raise OSError(number := numbers.pop(), os.strerror(number))
+        return real(*given, **options)
+
+    return call
+
+
+AWAY = {
+    "shard": renamed,
+    "index": lambda _: renamed("index"),
+    "folder": lambda _: renamed("."),
+    "cut": lambda shard: written(lambda before: before[:700], shard),
+    "altered": lambda shard: written(lambda before: before[:-1] + b"?", shard),
+    "map": lambda _: lambda folder: mock.patch("numpy.memmap", failing_at_first(np.memmap)),
+}
+
+
+@pytest.mark.parametrize("opened", [False, True])
+@pytest.mark.parametrize("away", AWAY)
+def test_files_that_are_away_for_a_moment(data, away, opened):
+    """Reading an episode, or lines of the index, waits for what is renamed, cut or altered, or cannot be mapped."""
     folder = Path(data.dataset.folder).resolve()
-    name = {"shard": next(folder.glob("train*.tar")).name}.get(away, away)
     store = EpisodeStore(folder, "train")
-    fault = renamed(name)(folder)
+    _ = opened and store[0]
+    fault = AWAY[away](store.manifest.shards[0].name)(folder)
     fault.__enter__()
     timer = threading.Timer(0.3, fault.__exit__, (None, None, None))
     with faults_outlived():
@@ -132,30 +161,58 @@ def test_files_that_are_away_for_a_moment(data, away):
 class Server(Quiet, http.server.SimpleHTTPRequestHandler):
     """A file server that answers each request with the next of `answers` first."""
 
-    answers: list[tuple[int, bytes]] = []  # noqa: RUF012 - one list for all requests
+    answers: list[tuple[int, bytes, dict[str, str]]] = []  # noqa: RUF012 - one list for all requests
 
     def do_GET(self):
         if not self.answers:
             super().do_GET()
             return
-        status, body = self.answers.pop(0)
+        status, body, headers = self.answers.pop(0)
+        if status == 206:
+            first, last = map(int, self.headers.get("Range", "bytes=0-9")[6:].split("-"))
+            body = (1 + last - first) * body
         self.send_response(status)
-        self.send_header("Content-Length", str(len(body)))
+        for name, value in ({"Content-Length": str(len(body))} | headers).items():
+            self.send_header(name, value)
         self.end_headers()
         self.wfile.write(body)
 
 
-@pytest.mark.parametrize(("status", "body"), [(404, HTML), (401, HTML), (503, HTML), (200, HTML), (200, b"[]")])
-def test_answers_that_pass(data, status, body):
-    """Any refusal of a server is outlived, of the manifest and of a shard; so is a page instead of the manifest."""
+ANSWERS = [
+    *((status, HTML, {}) for status in (404, 401, 503, 200, 410, 429, 500, 407)),
+    *((200, body, {}) for body in (b"[]", b"{}", b"null", HTML.ljust(10**5))),
+    *((200, HTML, headers) for headers in ({"Content-Length": "9999"}, {"Content-Length": "9"})),
+    (200, gzip.compress(HTML), {"Content-Encoding": "gzip"}),
+    (302, b"", {"Location": "/login.html"}),
+    *((206, body, {"Content-Range": "bytes 0-9/99"}) for body in (b"\0", b"?", b"??")),
+]
+
+
+@pytest.mark.parametrize(("status", "body", "headers"), ANSWERS)
+def test_answers_that_pass(data, status, body, headers):
+    """Any refusal of a server is outlived, of the manifest and of a shard; so are a page and other bytes instead."""
     with answering(functools.partial(Server, directory=data.dataset.folder)) as url, faults_outlived():
         store = EpisodeStore(url, "train")
-        Server.answers += [(status, body)]
+        Server.answers += [(status, body, headers)]
         assert not store.refresh() and len(store) == 5
         store.ask_again()
-        Server.answers += 3 * [(status, body)] if status != 200 else []
+        list(store.entries)
+        Server.answers += 3 * [(status, body, headers)]
         assert store[0].frame_count == 6
+        store = EpisodeStore(f"{url}/.", "train")
+        Server.answers += 3 * [(status, body, headers)]
+        assert len(list(store.entries)) == 5
     assert not Server.answers
+
+
+def test_a_folder_of_a_run_that_fails_for_a_moment(data, tmp_path, monkeypatch):
+    """Checkpoints, pictures and log lines that cannot be written are written later, each once."""
+    for place, name in ((checkpoint_writer, "_write"), (callbacks, "_drop_cut_line"), (monitor, "write_pictures")):
+        monkeypatch.setattr(place, name, failing_at_first(getattr(place, name)))
+    assert train.main(train_mapping(data, tmp_path / "run", monitor_every=5, monitor_rollout_frames=2)) == 0
+    lines = [line["update"] for line in metrics(tmp_path / "run") if "loss" in line]
+    assert lines == sorted(set(lines)) and list((tmp_path / "run" / "pictures").iterdir())
+    assert read_checkpoint(tmp_path / "run" / "checkpoints" / "last.ckpt")["hgn"]["updates"] == lines[-1]
 
 
 def test_a_training_outlives_a_fault(data, tmp_path, monkeypatch):
