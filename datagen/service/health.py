@@ -6,6 +6,7 @@ that hangs.
 
 from __future__ import annotations
 
+import contextlib
 import fcntl
 import json
 import os
@@ -14,12 +15,14 @@ import subprocess
 import sys
 import threading
 import time
+from collections import deque
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
 SILENCE_S = 30.0
-_PATIENCE_S = 2.0  # longest time for a request
+_PATIENCE_S = 2.0  # longest silence within a request
+MOST_OPEN = 64  # connections; further ones close the oldest, because whole requests are answered without delay
 _PIPE_BYTES = 4096  # size of the pipe for reports; it contains those of a minute
 
 
@@ -72,11 +75,20 @@ class Page(ThreadingHTTPServer):
         self.socket.close()
         self.socket = listener
         self.report = time.monotonic(), 503, {"status": "the service has not begun"}
+        self._open: deque[Any] = deque()
 
     def read(self, line: str) -> None:
         """Stores a report."""
         status, content = json.loads(line)
         self.report = time.monotonic(), status, content
+
+    def process_request(self, request: Any, client_address: Any) -> None:
+        """Answers in a thread. A connection that drips would stay open for hours."""
+        self._open.append(request)
+        if len(self._open) > MOST_OPEN:
+            with contextlib.suppress(OSError):  # it is closed already
+                self._open.popleft().shutdown(socket.SHUT_RDWR)
+        super().process_request(request, client_address)
 
     def answer(self) -> tuple[int, bytes]:
         """Returns the present status code and JSON body."""

@@ -6,13 +6,14 @@ import json
 import os
 import signal
 import socket
+import threading
 from contextlib import ExitStack, closing
 
 import pytest
 from processes import wait_until
 
 from datagen.service import health
-from datagen.service.health import HealthPage, Page
+from datagen.service.health import MOST_OPEN, HealthPage, Page
 from datagen.service.server import make_app, telling
 from datagen.service.supervisor import PoolState
 
@@ -52,6 +53,21 @@ def test_silence_is_told(monkeypatch):
         assert page.answer() == (200, b'{"status": "ok"}')
         monkeypatch.setattr(health, "SILENCE_S", -1.0)
         assert page.answer() == (503, b'{"status": "the service has not reported for 0 s"}')
+
+
+def test_who_never_ends_a_request_keeps_nobody_out(monkeypatch):
+    """Of too many connections that only begin a request the oldest are closed, however long they may wait."""
+    monkeypatch.setattr(health._Handler, "timeout", None)
+    listener = socket.create_server(("127.0.0.1", 0))
+    with Page(listener) as page, ExitStack() as stack:
+        threading.Thread(target=page.serve_forever, daemon=True).start()
+        stack.callback(page.shutdown)
+        waiting = [stack.enter_context(socket.create_connection(listener.getsockname())) for _ in range(MOST_OPEN + 5)]
+        for connection in waiting:
+            connection.sendall(b"GET /heal")
+            connection.settimeout(10)
+        assert ask(listener.getsockname()[1])[0] == 503
+        assert [connection.recv(1) for connection in waiting[:6]] == 6 * [b""]
 
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
