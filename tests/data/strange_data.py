@@ -78,7 +78,7 @@ def soft(file):
 
 
 def attributes(file):
-    for number in range(3000):
+    for number in range(600):
         file["hgn"].attrs[f"a{number}"] = "x" * 100
 
 
@@ -223,9 +223,9 @@ def tfrecords(folder):
 
 
 def crowded(file):
-    """A wall of 80,000 particles at one place."""
+    """A wall of 20,000 particles at one place."""
     del file["boundary"]
-    file["boundary"] = np.full((9, 80_000 // 9, 3), 0.25, np.float32)
+    file["boundary"] = np.full((9, 20_000 // 9, 3), 0.25, np.float32)
 
 
 cases(

@@ -141,7 +141,7 @@ cases(
         "memo": pickled(b"\x80\x02}r\xff\xff\xff\x7f."),
         "called storage": pickled(b"\x80\x02ctorch\nFloatStorage\n\x8a\x05\x00\xe8vH\x17\x85R."),
         "empty section": checkpoint({"hgn": {}, "state_dict": {}}),
-        "nested lists": pickled(b"\x80\x02" + 400_000 * b"]" + 399_999 * b"a" + b"."),
+        "nested lists": pickled(b"\x80\x02" + 100_000 * b"]" + 99_999 * b"a" + b"."),
         "many records": lambda folder: deflated_many(folder / "c.ckpt"),
         "long text": pickled(b"\x80\x04\x8d" + struct.pack("<Q", 10**11) + b"x."),
     },
@@ -246,7 +246,7 @@ cases(
         "accessor beyond its view": glb(accessor(count=120_000_000)),
         "sparse accessor": glb(sparse),
         "accessor of floats": glb(accessor(count=1e300)),
-        "instances": glb(instances(5_000)),
+        "instances": glb(instances(1_500)),
         "instances by paths": glb(branching),
         "primitives": glb(repeated_primitives),
         "stride 0": glb(stride_0),
@@ -287,7 +287,7 @@ cases(
         ),
         "obj of lines": saved("m.obj", b"v 0 0 0\n" + 100_000 * b"l 1\n"),
         "obj of polygons": saved("m.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\n" + 25_000 * b"f 1 2 3 1\n"),
-        "obj of one polygon": saved("m.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf" + 50_000 * b" 1 2 3"),
+        "obj of one polygon": saved("m.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf" + 20_000 * b" 1 2 3"),
         "obj of a star": saved("m.obj", star(30_000)),
         "obj of stars": saved(
             "m.obj", star(300) + 700 * (b"f " + b" ".join(b"%d" % (i + 1) for i in range(300)) + b"\n")
@@ -333,8 +333,8 @@ cases(
         ),
         "long file": scene("groups: " + 990_000 * "a"),
         "long text": scene("groups: " + 240_000 * "a"),
-        "deep flow": scene("groups: " + 20_000 * "["),
-        "short lists": scene("groups: [" + 8_000 * "[]," + "]"),
+        "deep flow": scene("groups: " + 4_000 * "["),
+        "short lists": scene("groups: [" + 3_000 * "[]," + "]"),
         "anchors": scene("a: &a " + 100_000 * "[1]\n"),
         "ten megabytes": scene("groups: [" + 2_500_000 * "[], " + "]"),
         "merges": scene(

@@ -2,6 +2,7 @@
 seconds of a core, and prints how that ended.
 """
 
+import gc
 import json
 import os
 import resource
@@ -47,6 +48,7 @@ def outcome(name, folder):
 
 
 def main(wanted):
+    gc.freeze()  # else each child's collections copy all that was loaded
     for name in CASES:
         if wanted in name:
             with tempfile.TemporaryDirectory() as folder:

@@ -14,9 +14,6 @@ from typing import Any
 
 ROOT = Path(__file__).resolve().parents[2]
 FOLDERS = ("conf", "datagen", "docs", "hgn", "jobs", "results", "tests", "tools")
-# what makes a program of a page short
-FEWER = {"frames=300": "frames=2", "frame == 300": "frame == 1", "range(120)": "range(2)", "frame == 60": "frame == 0"}
-FEWER |= {"arange(12)": "arange(4)"}
 _FENCE = re.compile(r"^( *)(`{3,})([^`\n]*)$")
 _FILE_MARK = re.compile(r"<!-- file: (\S+) -->")
 
@@ -126,15 +123,6 @@ class Runner:
             else:
                 assert block.language == "yaml" and block.file is not None, f"{block}: {block.language} is not run"
         assert replaced == set(self.smaller), set(self.smaller) - replaced
-
-    def run_first(self, page, module):
-        """Writes the files of a page and runs its first command of a module, no other."""
-        for block in blocks_of(page):
-            self._write(block)
-            for line in shell_lines(block) if block.language == "bash" else ():
-                if line.startswith(f"python -m {module} "):
-                    self._shell(line, block)
-                    return
 
     @staticmethod
     def _write(block):

@@ -1,5 +1,6 @@
 """What holds of every Markdown page: width, links, paths; and of README and CHANGELOG, whose form is fixed."""
 
+import ast
 import dataclasses
 import functools
 import importlib.util
@@ -151,6 +152,18 @@ def test_commands_compose():
             arguments[at : at + 2] = [f"json={arguments[at + 1]}"]
         with initialize_config_dir(str(folder), version_base="1.3"):
             compose(folder, name, arguments)
+
+
+def test_programs_parse():
+    """Each Python block of README and docs/ parses, and has the names that it takes from the project."""
+    checked = 0
+    for block in (block for page in OWN_PAGES for block in blocks_of(page) if block.language == "python"):
+        for line in ast.walk(ast.parse(block.content, str(block))):
+            if isinstance(line, ast.ImportFrom) and str(line.module).split(".")[0] in ("hgn", "datagen", "tools"):
+                module = importlib.import_module(str(line.module))
+                assert all(hasattr(module, name.name) for name in line.names), f"{block}: {line.module}"
+                checked += 1
+    assert checked > 20
 
 
 def test_readme_is_short():

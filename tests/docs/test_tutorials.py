@@ -1,6 +1,8 @@
-"""Every block of the README, of getting started and of the tutorials runs as it stands, with small settings."""
+"""Every block of the README, of getting started and of the tutorials runs as it stands, with small settings.
 
-import json
+Pages that are notebooks run in test_notebooks.py.
+"""
+
 import shutil
 import signal
 from pathlib import Path
@@ -8,13 +10,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from docs.pages import FEWER, ROOT, Runner, blocks_of, run_module, shell_lines
+from ballistic_dataset import make_dataset
+from ballistic_solver import FOLDER_VARIABLE
+from composition import compose
+from docs.pages import ROOT, Runner, blocks_of, shell_lines
+from hydra import initialize_config_dir
+from omegaconf import OmegaConf
 from processes import PATIENCE_S, free_port
 
+from datagen.generate import datagen_config
 from hgn.scene.scene_file import load_scene
 
 TUTORIALS = ROOT / "docs" / "tutorials"
-# a data set, made by the solver once for all pages, of which every training here is told
+# a data set, made once for all pages, of which every training here is told
 SCENE = ("obstacle_count=1", "obstacle_shapes=[rock.obj]", "obstacle_size=[0.2,0.2]", "group_count=1")
 SCENE += ("group_size=0.04", "materials=[water]", "lone_particles=0")
 DATASET = ("training_scenes=2", "validation_scenes=1", "test_scenes=0", "frames=6", "folder=data/mine")
@@ -44,13 +52,15 @@ def lines_of(page):
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """A folder with a mesh and a data set of three scenes, made as the command makes it."""
+    """A folder with a mesh and a data set of three scenes that the stand-in for the solver made."""
     path = tmp_path_factory.mktemp("tutorials")
     (mesh,) = [block for block in blocks_of(TUTORIALS / "train.md") if block.file == "rock.obj"]
     (path / "rock.obj").write_text(mesh.content)
-    with pytest.MonkeyPatch.context() as patch:
+    with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"), pytest.MonkeyPatch.context() as patch:
         patch.chdir(path)
-        assert run_module("datagen", ["+experiment=obstacles", *SCENES, "dataset.workers=1", "progress=off"]) == 0
+        patch.setenv(FOLDER_VARIABLE, str(path))
+        config = compose(ROOT / "conf", "datagen", ["+experiment=obstacles", *SCENES])
+        make_dataset(datagen_config(OmegaConf.to_container(config, resolve=True)))
     return path
 
 
@@ -81,26 +91,6 @@ def test_scene(here):
     runner.run(TUTORIALS / "scene.md")
     assert runner.names["distance_T"].shape == (2,) and runner.names["distance_T"][0] == 0
     assert list((here / "pictures").glob("*.png"))
-
-
-def test_train(here):
-    """Training on scenes of one's own: an experiment file, a run that goes on, export, errors, other weights."""
-    shorter = {"hgn.train": [*SETTINGS["hgn.train"], "training.maximum_updates=2"]}
-    Runner(SETTINGS | shorter).run_first(TUTORIALS / "train.md", "hgn.train")
-    Runner(SETTINGS).run(TUTORIALS / "train.md")
-    updates = [json.loads(line)["update"] for line in (here / "runs/mine/metrics.jsonl").read_text().splitlines()]
-    assert sorted(set(updates)) == [1, 2, 3, 4]
-    assert (here / "runs/mine_2/checkpoints/last.ckpt").is_file() and (here / "mine.safetensors").is_file()
-    files = {"config.yaml", "metrics.jsonl", "tensorboard", "checkpoints/last.ckpt", "checkpoints/best.ckpt"}
-    assert all((here / "runs/mine" / name).exists() for name in files)
-
-
-def test_program(here):
-    """Weights in a program: a scene file as a whole, frame by frame from particles and a mesh, one that changes."""
-    runner = Runner(SETTINGS, FEWER, INSTALLS)
-    runner.run(TUTORIALS / "program.md")
-    assert runner.names["frame"] == 1 and (here / "my_scene.vtkhdf").is_file()
-    assert len(runner.names["position_N3"]) == 2 * len(runner.names["block"])
 
 
 def test_live(here):
@@ -148,28 +138,14 @@ def test_how_to(here):
     """How-to pages: the check of a data set's shards, which sees a flipped bit, and the scene file's example."""
     (check,) = [block for block in blocks_of(ROOT / "docs/how_to/verify_shards.md") if block.language == "python"]
     code = check.content.replace("data/obstacles", "data/mine")
-    exec(code)
+    exec(code, {})
     shutil.copytree("data/mine", "data/damaged")
     shard = sorted(Path("data/damaged").glob("train-*.tar"))[0]
     content = bytearray(shard.read_bytes())
     content[len(content) // 2] ^= 1
     shard.write_bytes(content)
     with pytest.raises(AssertionError, match=shard.name):
-        exec(code.replace("data/mine", "data/damaged"))
+        exec(code.replace("data/mine", "data/damaged"), {})
     (example,) = [block for block in blocks_of(ROOT / "docs/how_to/scene_files.md") if block.language == "yaml"]
     Path("funnel.yaml").write_text(example.content)
     assert len(load_scene("funnel.yaml").obstacles) == 5
-
-
-def test_gradients():
-    """Gradients: of velocities and of a turned obstacle; the launch that hits a target is the closed form's; the
-    bucket is filled to 90 % of what a tilt by 16 degrees reaches, near the best of the search."""
-    shorter = {"(scene, 21, velocity": "(scene, 4, velocity", "20 / 60": "3 / 60", "1.5e-4": "2e-6"}  # a flight
-    shorter |= {"range(-60, 61, 4)": "(-16,)", "(100, 101, 102)": "(100,)"}
-    runner = Runner(SETTINGS, shorter)
-    runner.run(ROOT / "docs/how_to/gradients.md")
-    names = runner.names
-    assert bool(names["turn_3"].grad.any()) and bool(names["velocity_N3"].grad.any())
-    assert (names["velocity_3"] - names["launch_3"]).abs().max() < 1e-4
-    assert names["filled"](names["degrees"]) >= 0.9 * max(names["search"].values()) > 0.5
-    assert names["angles"][0] == 20 and len(names["angles"]) < 10
