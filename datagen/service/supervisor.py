@@ -1,8 +1,8 @@
 """Runs the pool in a process of its own and keeps it alive. Meanwhile the service serves published episodes.
 
-A pool that dies, reports nothing, or ends because the disk is full is started again after a pause. The pause grows
+A pool that dies, stops reporting, or ends with an error (a full disk, ...) is started again after a pause, which grows
 until another episode is finished. A pool that ends with a ConfigError is not started again. The service then continues
-to serve, unless no pool has begun its work. An error of the supervisor ends the service; one of the log does not.
+to serve, but ends if no pool has started its work. It ends with the supervisor's errors, but not with the log's.
 """
 
 from __future__ import annotations
@@ -24,26 +24,26 @@ from hgn.system.processes import cause_of_exit, start_child
 
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 1.0, 60.0
 _STOP_PATIENCE_S = 60.0
-_LOOK_S, _BEAT_S = 0.2, 1.0  # interval of checks, and of the pool's reports
+_LOOK_S, _BEAT_S = 0.2, 1.0  # interval of the supervisor's checks; shortest interval of the pool's reports
 _EVENTS = ("start", "frame", "episode", "found", "shard", "message", "close")
 
 
 @dataclass(frozen=True)
 class PoolState:
-    """The last state of the pool. `status`: starting, running, complete, waiting (to restart), failed or stopped."""
+    """Holds the pool's last state. `status`: starting, running, complete, waiting (to restart), failed or stopped."""
 
     status: str = "starting"
     starts: int = 0
     done: int = 0  # number of episodes published or staged
     total: int = 0
     frames: int = 0  # number of frames of an episode
-    running: dict[int, tuple[int, int]] = field(default_factory=dict)  # worker -> frame, number of scenes
+    running: dict[int, tuple[int, int]] = field(default_factory=dict)  # frame and number of scenes by worker
     error: str = ""  # the last error
     log_error: str = ""  # why the last line of the log could not be written
 
 
 class Supervisor:
-    """Runs the pool while it is entered; a context manager."""
+    """Runs the pool inside a `with` block."""
 
     def __init__(self, config: DatagenConfig, progress: Progress, backend: Backend | None = None) -> None:
         self._config, self._progress, self._backend = config, progress, backend
@@ -60,7 +60,7 @@ class Supervisor:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Ends the pool as Ctrl-C does. Finished episodes are kept."""
+        """Ends the pool in the way in which Ctrl-C ends it. Finished episodes are kept."""
         self._stopping.set()
         self._thread.join()
 
@@ -99,7 +99,7 @@ class Supervisor:
 
     def _run_once(self) -> tuple[str, str]:
         """Runs a pool to its end. Returns complete, stopped, config_error, os_error, error or died, and the reason."""
-        # if the service is killed, the pool ends as after Ctrl-C
+        # if the service is killed, the pool gets SIGTERM and ends as after Ctrl-C
         process, connection = start_child(
             _generate, self._config, self._backend, number=signal.SIGTERM, duplex=False, daemon=False
         )
@@ -113,7 +113,7 @@ class Supervisor:
                     asked = True
                 if not connection.poll(_LOOK_S):
                     patience -= _LOOK_S * asked
-                    silent_s += _LOOK_S  # without a clock, which would count the time in which this process is stopped
+                    silent_s += _LOOK_S  # a clock would also count the time in which this process is suspended
                     if patience < 0 or silent_s > silence:
                         process.kill()
                     continue
@@ -173,7 +173,7 @@ def _generate(connection: Connection, config: DatagenConfig, backend: Backend | 
 
             def should_stop() -> bool:
                 nonlocal spoke_at
-                if time.monotonic() - spoke_at > _BEAT_S:  # reports, so that a stopped pool is noticed
+                if time.monotonic() - spoke_at > _BEAT_S:  # the supervisor notices a suspended pool by missing reports
                     spoke_at = time.monotonic()
                     connection.send(("alive",))
                 return stop.requested()

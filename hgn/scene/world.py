@@ -24,7 +24,7 @@ DRAWS = 500  # attempts to place one scene
 FALLING = (0.0, -9.8, 0.0)
 UNTURNED = (1.0, 0.0, 0.0, 0.0)
 
-# Edges in solver cells of 1/64. There are few domains, because only scenes with equal domains share a launch.
+# Edge lengths in cells of 1/64. There are few domains, because only scenes with equal domains share a launch.
 DOMAINS: dict[str, tuple[int, int, int]] = {
     "small": (24, 40, 24),
     "box": (20, 32, 20),
@@ -38,12 +38,12 @@ DOMAINS: dict[str, tuple[int, int, int]] = {
 
 
 class _DrawAgainError(Exception):
-    """The drawn numbers do not fit."""
+    """Reports that the drawn numbers do not fit together."""
 
 
 @dataclass
 class Layout:
-    """An unfinished scene. For example, layout('size') draws a number from RANGES[kind]['size']."""
+    """Holds an unfinished scene. For example, layout('size') draws a number from RANGES[kind]['size']."""
 
     config: SceneConfig
     kind: str
@@ -56,13 +56,13 @@ class Layout:
     particles: int = 0
 
     def __call__(self, name: str, small: bool = False) -> float:
-        """Returns a uniform number of the range. With `small` low numbers are likelier: the uniform part is squared."""
+        """Draws from a range: low + fraction * (high - low). The fraction is uniform; with `small` it is squared."""
         low, high = RANGES[self.kind][name]
         part = self.rng.random()
         return low + (high - low) * (part * part if small else part)
 
     def count(self, name: str) -> int:
-        """Returns a whole number of the range, limits included."""
+        """Draws an integer from a range, both limits included."""
         low, high = RANGES[self.kind][name]
         return int(low + int(self.rng.random() * (high - low + 1)))
 
@@ -89,7 +89,7 @@ class Layout:
         return self.domain[axis] - self.low
 
     def along(self, axis: int, half: float) -> float:
-        """Returns a random coordinate at which a body with this half width does not touch the walls."""
+        """Draws a coordinate at which a body of half width `half` does not touch the walls. Raises: _DrawAgainError."""
         first = self.low + half + ROUNDING
         span = self.high(axis) - half - ROUNDING - first
         if span < 0:
@@ -234,7 +234,7 @@ def _stack(new: Layout) -> None:
 
 
 def _apart(new: Layout) -> None:
-    """Places bodies on the floor without contact. Some slide slowly. A tilted gravity moves all of them."""
+    """Places bodies on the floor without contact. Some slide slowly. In 30 % of the scenes tilted gravity moves all."""
     new.take_domain("room", "hall", "long")
     for _ in range(new.count("bodies")):
         size, velocity = new("size"), (0.0, 0.0, 0.0)
@@ -305,7 +305,7 @@ _PLACED: dict[str, Callable[[Layout], None]] = {
 
 
 def _paper(new: Layout) -> SceneConfig:
-    """Returns settings for random_scene, for a kind whose items have random places as in the paper."""
+    """Returns settings for random_scene, for a kind whose groups and obstacles have random places as in the paper."""
     new.take_domain("room", "hall")
     config = replace(new.config, kinds={}, domain_size=new.domain, group_size=new("size"))
     volume = (config.group_size / config.cell_size) * (config.group_size / config.cell_size)

@@ -1,6 +1,6 @@
 """Holds a scene that viewers change, and the actions of the page's buttons without the page.
 
-Shape legend: N particles, A particles of a place, C candidates to enter.
+Shape legend: N particles, A particles in a box, C candidates to enter.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ from hgn.schema import ConfigError, Vector, from_mapping, require, to_mapping
 from hgn.viewer.placed import Body, PlacedObstacle, placed_at_rest, placed_by, with_obstacles
 from hgn.viewer.recording import Frame, Recording
 
-CLEARANCE = 1.25  # in spacings of particles at rest; no drop enters within this distance of another particle
+CLEARANCE = 1.25  # in spacings of particles at rest; no particle of a ball enters nearer to another particle
 MAXIMUM_GRAVITY = 1000.0  # domain units per second squared
 MAXIMUM_OBSTACLES, MAXIMUM_MESH_BYTES = 64, 128 << 20  # bytes of files, including those of obstacles in past frames
 CHANGES = 100  # largest number of changes that can be undone
-FULL_SHARE = 0.5  # largest share of a frame's particles that may still be at the spout; above it the spout waits
+FULL_SHARE = 0.5  # the spout waits while more than this fraction of the particles of one frame are still at it
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ class PlaySession:
         self.particles_per_cell = scene.particles_per_cell or 8.0
         self.random = np.random.default_rng(scene.seed)
         self.spout: Spout | None = None
-        self._owed = 0.0  # fraction of a particle that the spout has not given yet
+        self._owed = 0.0  # fraction of a particle that the spout has yet to release
         self._bodies: WeakSet[Body] = WeakSet()  # bodies that viewers have added
         initial = InitialState.of_scene(replace(scene, obstacles=()))
         require(not scene.moves, "obstacles", "at rest for a network", "keyframes", "leave keyframes out")
@@ -147,7 +147,7 @@ class PlaySession:
         self.recording.append(Frame(position_N3.copy(), velocity_N3.copy(), self.obstacles, self.gravity))
 
     def rewind(self, frame: int) -> None:
-        """Goes back to a frame, and forgets all later ones. The future repeats itself until a viewer changes the scene.
+        """Goes back to a frame and deletes later ones. Without changes the simulation then repeats the same frames.
 
         Raises ConfigError for a frame that is not kept.
         """
@@ -161,11 +161,11 @@ class PlaySession:
         self.recording.back_to(frame)
 
     def remember(self) -> None:
-        """Notes frame, obstacles and gravity before a change, for `undo`."""
+        """Stores frame, obstacles and gravity before a change, for `undo`."""
         self._before = [*self._before[1 - CHANGES :], (self.frame, self.obstacles, self.gravity)]
 
     def undo(self) -> None:
-        """Goes back to the time before the last change, as far as frames are kept. Raises: ConfigError without one."""
+        """Goes back to the time before the last change, or to the earliest frame kept. Raises: ConfigError if none."""
         self._before = [before for before in self._before if before[0] <= self.frame]
         require(bool(self._before), "undo", "used after a change", "none")
         frame, obstacles, gravity = self._before.pop()
@@ -177,7 +177,7 @@ class PlaySession:
     # particles that enter
 
     def drop(self, material: str, position: Vector, diameter: float, speed: float = 0.0) -> int:
-        """Adds a ball of a material that moves down, in free places. Returns the number of particles that entered.
+        """Adds a ball that moves down, without particles near others. Returns the number of particles that entered.
 
         Raises ConfigError for a material that the weights do not know.
         """
@@ -206,7 +206,7 @@ class PlaySession:
         self._enter((np.array(centre) + offset_C3).astype(np.float32), spout)
 
     def _inside(self, position: Vector, radius: float, half_height: float | None = None) -> Vector:
-        """Returns the nearest place at which a ball or a disc lies between the walls."""
+        """Returns the nearest centre at which a ball, or a disc with a half height, lies between the walls."""
         wall = WALL_CELLS * self.cell_size
         reach = np.array([radius, radius if half_height is None else half_height, radius]) + wall
         high = np.maximum(np.array(self.domain_size) - reach, reach)
@@ -268,7 +268,7 @@ class PlaySession:
         return self.add_obstacle(ObstacleEntry(mesh=path.name, scale=scale, position=(x, y, z)), path.parent)
 
     def free_place(self, size: float) -> Vector:
-        """Returns the place nearest to the middle, at 0.3 of the height, for a cube without particles and obstacles.
+        """Returns the centre of a free cube, as near as possible to the middle of the domain at 0.3 of its height.
 
         Raises: ConfigError where there is none.
         """

@@ -32,27 +32,27 @@ if TYPE_CHECKING:
 
 Row = dict[str, Any]
 PARTICLES_PER_BATCH = 32_768
-PARTICLES_AT_ONCE = 150_000  # of backend triton's one-step errors
-REST_SPEED = 1e-4  # domain units a frame; slower particles are at rest
-# Order of measurements: those that come last may be left out when the time is over.
+PARTICLES_AT_ONCE = 150_000  # particles per batch of one-step errors with backend triton
+REST_SPEED = 1e-4  # domain units per frame; slower particles are at rest
+# The order of measurements. The last ones are left out if the time limit is reached.
 HGN_FIRST, SAME_GRID, GNS_FIRST, COARSE_GRIDS, OTHER_PRECISIONS = range(5)
 
 
 @dataclass
 class OneStep:
-    """One-step errors of a scene, and accelerations predicted for its particles at rest."""
+    """Holds one-step errors of a scene, and accelerations predicted for its particles at rest."""
 
     error: SquaredError = field(default_factory=SquaredError)
-    rest_sum: float = 0.0  # sum of the lengths of these accelerations, domain units a frame squared
+    rest_sum: float = 0.0  # sum of the lengths of these accelerations, domain units per frame squared
     rest_count: int = 0
 
 
 class Contender:
-    """A row of the report."""
+    """Describes a row of the report, and computes its errors."""
 
     row: Row  # system and settings
     importance = SAME_GRID  # 0 is scored first
-    all_at_once = False  # simulates all scenes side by side, instead of BATCH_SCENES
+    all_at_once = False  # simulates all scenes side by side, instead of score.BATCH_SCENES
     stepped = True  # computes frames one by one, without captured or compiled programs
 
     def one_step(self, episode: Episode, stride: int) -> OneStep | None:
@@ -68,12 +68,12 @@ class Contender:
 
 
 class NetworkContender(Contender):
-    """A weights file at one precision of its matrix products, on the fastest backend."""
+    """Runs a weights file at one precision of its matrix products, on the fastest backend."""
 
     def __init__(
         self, file: Path, precision: str, device: torch.device, frame_rate_hz: float, first: bool = True
     ) -> None:
-        """`first`: this precision of the weights is measured before the others.
+        """Takes with `first` the precision of these weights that is measured before the other precisions.
 
         Raises: ConfigError if no backend supports the precision.
         """
@@ -116,17 +116,17 @@ class NetworkContender(Contender):
 
 
 class SolverContender(Contender):
-    """The solver that generated the data, on a grid and with a step.
+    """Runs the solver that generated the data, on a grid and with a step.
 
-    It has no one-step error: a step starts from stresses and volumes, which are not in the data.
+    It has no one-step error, because a step would need stresses and volumes, which are not in the data.
     """
 
-    all_at_once = True  # a scene uses a few of a GPU's processors
+    all_at_once = True  # a single scene uses only a few of a GPU's processors
 
     def __init__(
         self, launches: SolverLaunches, setting: Setting, frames: int, importance: int, named: Row | None = None
     ) -> None:
-        """`frames`: length of rollouts that are not timed. `named`: the row, instead of one from the settings."""
+        """Takes the length `frames` of rollouts that are not timed; `named` replaces the row made from the settings."""
         self.launches, self.setting, self.frames, self.importance = launches, setting, frames, importance
         grid = round(1 / launches.cell_size)
         self.row = named or {"system": "mpm", "grid": grid, "step": setting.step, "precision": "fp32"}
@@ -139,7 +139,7 @@ class SolverContender(Contender):
 
 
 class BaselineContender(Contender):
-    """The same acceleration for every particle of a scene."""
+    """Gives every particle of a scene the same acceleration."""
 
     def __init__(self, name: str, acceleration: Callable[[Episode], np.ndarray], device: torch.device) -> None:
         self.row = {"system": "baseline", "predictor": name}
@@ -155,7 +155,7 @@ class BaselineContender(Contender):
 
         def trial(episode: Episode) -> RolloutResult:
             velocity_N3 = episode.initial_velocity_N3 / episode.frame_rate_hz
-            # integrated like the networks: velocity first; the history before frame 0 is free fall
+            # as for networks: velocities are integrated first, and the history before frame 0 is free fall
             velocity_N3 = velocity_N3 - 0.5 * np.asarray(episode.gravity) / episode.frame_rate_hz**2
             path_TN3 = velocity_N3 * time_T11 + self.acceleration(episode) * (0.5 * time_T11 * (time_T11 + 1))
             return RolloutResult((episode.position_TN3[0] + path_TN3).astype(np.float32))
@@ -165,10 +165,10 @@ class BaselineContender(Contender):
 
 
 class FallingContender(Contender):
-    """Free flight from the first frame until a particle meets a wall of the domain, where it stays."""
+    """Lets each particle fly freely from the first frame until it meets a wall of the domain, where it stays."""
 
     def __init__(self, wall: float) -> None:
-        """`wall`: thickness of the domain's walls."""
+        """Takes the thickness of the domain's walls, in domain units."""
         self.row, self.wall = {"system": "baseline", "predictor": "fall and stop at the floor"}, wall
 
     def trials(self, episodes: Sequence[Episode], frames: int, on_frame: OnFrame) -> list[RolloutResult]:
@@ -186,7 +186,7 @@ class FallingContender(Contender):
 
 
 class TritonPredictor:
-    """Accelerations of backend triton: simulates one frame from each state."""
+    """Predicts accelerations with backend triton: simulates one frame from each state."""
 
     def __init__(self, backend: TritonBackend) -> None:
         self.backend = backend
@@ -196,7 +196,7 @@ class TritonPredictor:
         with self.backend.stepper(state) as stepper:
             for _ in stepper.blocks(1):
                 pass
-            output_N3 = stepper.fused.output[: len(state.position_N3), :3]  # before walls act on positions
+            output_N3 = stepper.fused.output[: len(state.position_N3), :3]  # before the constraints of the frame
             return self.backend.network.restored_acceleration(output_N3, state)
 
 

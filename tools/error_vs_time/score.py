@@ -25,9 +25,9 @@ from tools.error_vs_time.contenders import Contender, OneStep
 from tools.error_vs_time.sinkhorn import sinkhorn_divergences
 from tools.measures import momentum_error, outside_domain
 
-FRAME_STRIDE = 10  # of the one-step errors
-BATCH_SCENES = 8  # of rollouts, side by side
-SINKHORN_SCENES, SINKHORN_POINTS, SINKHORN_BLUR = 20, 1024, 0.01  # points of each material at most; domain units
+FRAME_STRIDE = 10  # one-step errors are measured on every tenth frame
+BATCH_SCENES = 8  # number of rollouts that are simulated side by side
+SINKHORN_SCENES, SINKHORN_POINTS, SINKHORN_BLUR = 20, 1024, 0.01  # largest number of a material's points; domain units
 OfMaterial = tuple[int, str, str, float]  # a scene's number, material and frame, and a value
 
 

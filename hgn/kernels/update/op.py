@@ -1,8 +1,8 @@
 """Makes training updates on the device: batch, grid, forward pass, backward pass and optimiser in one CUDA graph.
 
 The host uploads a table with the samples of many updates and replays the graph once for each update. It reads the
-results only after the last replay. An update whose grid lacks room changes nothing; the host makes room and repeats it.
-Shape legend: K updates, S scenes, N particles of all scenes.
+results only after the last replay. If a grid is too small, its update and later ones change nothing. The host enlarges
+the buffers and continues there. Shape legend: K updates, S scenes, N particles of all scenes.
 """
 
 from __future__ import annotations
@@ -32,10 +32,10 @@ from hgn.schema import ConfigError
 
 SAMPLE_COLUMNS = kernel.SAMPLE_COLUMNS.value
 GROWTH = 1.25
-TABLE_UPDATES = 64  # least capacity of the tables in updates; a larger table needs a new capture of the graph
+TABLE_UPDATES = 64  # smallest capacity of the tables, in updates; a larger table needs a new capture of the graph
 BLOCK = 128
 FLAT_BLOCK = 1024
-TAIL = 16  # number of elements behind the gradient; the first one reports an overflow to the other ranks
+TAIL = 16  # number of extra elements after the gradient; the first one reports an overflow to the other ranks
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +70,7 @@ class DeviceEpisode:
 
     @cached_property
     def row(self) -> np.ndarray:
-        """Returns frame 0 as a row of the sample table, int64 [SAMPLE_COLUMNS], without seed, weight and noise."""
+        """Returns the row of the sample table for frame 0, int64 [SAMPLE_COLUMNS], without seed, weight and noise."""
         obstacles = self.obstacles.row() if self.obstacles is not None else [0] * OBSTACLE_COLUMNS
         return np.array(
             [self.position_TN3.data_ptr(), self.particles, 0, 0, self.material_N.data_ptr(), 0, 0, *obstacles], np.int64
@@ -143,14 +143,14 @@ class Updates:
         self.packed = pack_network(network)
         self.values = self.packed.gather(list(network.parameters()))
         self.first_moment, self.second_moment = torch.zeros_like(self.values), torch.zeros_like(self.values)
-        self.average: torch.Tensor | None = None  # average of the values over the updates; set before the first one
+        self.average: torch.Tensor | None = None  # moving average of the values; assigned before the first update
         muon = settings.optimizer == "muon"
         self.blocks = SquareBlocks(network, self.packed.index, device) if muon else None
         self.step = torch.zeros(1, dtype=torch.float64, device=device)
         self.update = torch.zeros(1, dtype=torch.int32, device=device)
         self.loss, self.norm = torch.zeros(1, device=device), torch.zeros(1, device=device)
         scenes, normaliser = settings.scenes, network.normaliser
-        columns = 4 + 3 * self.config.velocity_history  # number and phase of a wave, and its amplitude in each velocity
+        columns = 4 + 3 * self.config.velocity_history  # wave vector, phase, and a change of amplitude per velocity
         self.waves_SKC = torch.zeros(scenes, CORRELATED_WAVES, columns, device=device)
         sees = self.config.obstacle_features
         table = SceneTable([None] * scenes, OBSTACLE_COLUMNS, device, settings.obstacle_cell_size)
@@ -171,9 +171,9 @@ class Updates:
     def run(
         self, chunk: Sequence[Sequence[AnySample]], rates: Sequence[float], shares: Sequence[float] | None = None
     ) -> None:
-        """Makes one update for each entry of `chunk`, which lists the samples of all scenes.
+        """Makes one update for each entry of `chunk`. An entry lists one sample per scene.
 
-        `shares` are the weights of the new values in `average`. Raises ConfigError when positions are not finite.
+        `shares` are the EMA weights of the new values in `average`. Raises ConfigError when positions are not finite.
         """
         assert (shares is None) == (self.average is None)
         self._prepare(chunk, rates)
@@ -189,7 +189,7 @@ class Updates:
             self._make_room(status, needed)
 
     def predict(self, samples: Sequence[AnySample]) -> None:
-        """Assembles the batch of one update and leaves the network's output of it in `fused.output`."""
+        """Assembles the batch of one update and writes the network's output to `fused.output`."""
         self._prepare([samples], [0.0])
         while True:
             self._assemble()
@@ -269,7 +269,7 @@ class Updates:
         self._build()
 
     def launches(self) -> None:
-        """Makes all launches of one update, but no communication with other ranks."""
+        """Makes all launches of one update, without communication with other ranks."""
         self.launches_before_reduction()
         self.launches_after_reduction()
 
@@ -355,7 +355,7 @@ class Updates:
         self.grid.build(self.buffers)
         self.grid.prepare(self.buffers, self.scale, self.obstacles, self.settings.symmetry)
 
-    # room
+    # window and buffers
 
     def _window(self) -> Window:
         config, (lower, upper) = self.config, self._reach
