@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 import math
-import os
 import sys
 import time
 from collections.abc import Callable
@@ -21,7 +20,7 @@ from tqdm import tqdm
 
 from hgn.data.storage import StorageError
 from hgn.schema import ConfigError, to_mapping
-from hgn.system.files import TEMPORARY_SUFFIX
+from hgn.system.files import TEMPORARY_SUFFIX, write_atomically
 from hgn.system.patience import outlived
 from hgn.system.progress import bar, duration
 from hgn.training import lightning_compat
@@ -107,7 +106,8 @@ class Checkpoints(Callback):
         """Saves before a training ends because its data stay unreachable.
 
         Each rank without data saves, because it is between two updates. The other ranks wait inside an update."""
-        if isinstance(exception, (StorageError, OSError)) and self._saved_update != _update(pl_module) > 0:
+        unsaved = hasattr(pl_module, "updates") and self._saved_update != _update(pl_module) > 0
+        if unsaved and isinstance(exception, (StorageError, OSError)):
             lightning_compat.save_alone(trainer, self.folder / LAST_NAMES[0])
 
     def save_last(self, trainer: Trainer, update: int) -> None:
@@ -264,5 +264,7 @@ def log(trainer: Trainer, run: Path, update: int, values: dict[str, float]) -> N
 
 def _drop_cut_line(path: Path) -> None:
     """Removes an incomplete last record, left by a full disk or a loss of power."""
-    if path.exists():
-        os.truncate(path, path.read_bytes().rfind(b"\n") + 1)
+    content = path.read_bytes() if path.exists() else b""
+    whole = content[: content.rfind(b"\n") + 1]
+    if whole != content:  # some mounted object stores do not truncate files
+        write_atomically(path, whole)
