@@ -1,4 +1,4 @@
-"""Workers in processes of this machine.
+"""Runs workers in processes of this machine.
 
 A worker ends with its parent, and ignores signals from the terminal. Its errors are sent to the parent.
 """
@@ -44,11 +44,11 @@ from hgn.system.processes import cause_of_exit, start_child
 
 _FRAME_REPORT_SECONDS = 1.0  # interval between a worker's reports; each is a line with progress=json
 _STAGING_THREADS = 8
-_END_SECONDS = 10.0  # time that a dismissed worker has to end
+_END_SECONDS = 10.0  # time in which a dismissed worker must end
 
 
 class LocalWorker(Worker):
-    """A worker in a process of this machine."""
+    """Runs a worker in a process of this machine."""
 
     speaks = True
 

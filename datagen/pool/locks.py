@@ -1,8 +1,8 @@
-"""Locks on episodes, so that several generators share one folder without a coordinator.
+"""Locks episodes, so that several generators share one folder without a coordinator.
 
-A byte of a data set's `.lock` file represents each state. A process that changes the manifest locks the first byte.
-Every generator shares a lock of the second. A generator locks the bytes of the episodes that it makes. The kernel frees
-the locks of an ended process in every case. So no claim becomes stale, and no clock is needed.
+Locks are on bytes of the data set's file `.lock`. A process that changes the manifest locks byte 0. All generators
+share a lock on byte 1. Each episode has a byte of its own, locked by the generator that makes the episode. The kernel
+frees the locks of a process however it ends. So no claim becomes stale, and no clock is needed.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from hgn.system.locks import NO_LOCKS, lock_bytes
 LOCK_NAME = ".lock"
 _MANIFEST_BYTE, _GENERATORS_BYTE, _FIRST_EPISODE_BYTE = 0, 1, 2
 _REMEDY = "mount it with them (NFS with its lock service, Lustre with -o flock) or choose another out=..."
-_EPISODES_OF_A_SPLIT = 1 << 40  # bytes between two splits; a locked byte need not exist
+_EPISODES_OF_A_SPLIT = 1 << 40  # bytes between the first episodes of two splits; a locked byte need not exist
 
 
 class ShardLocks:
-    """One generator's locks on a folder; a context manager."""
+    """Holds one generator's locks on a folder. It is a context manager."""
 
     def __init__(self, folder: Path) -> None:
         """Raises: ConfigError if the file system has no locks, or grants them to everybody."""
@@ -39,7 +39,7 @@ class ShardLocks:
             raise
 
     def _require_exclusion(self) -> None:
-        """Raises ConfigError if locks are granted to everybody, because generators would overwrite other's files."""
+        """Raises ConfigError if a lock does not exclude others. Generators would overwrite each other's files."""
         if not hasattr(fcntl, "F_OFD_SETLK"):
             return  # locks belong to the process and do not exclude it
         other = os.open(self._path, os.O_RDWR | os.O_CLOEXEC)
@@ -75,7 +75,7 @@ class ShardLocks:
 
     @contextlib.contextmanager
     def alone(self) -> Iterator[bool]:
-        """Yields whether this is the only generator. If it is, others wait before they begin."""
+        """Yields whether this is the only generator. If it is, generators that start wait until the block ends."""
         alone = self._lock(fcntl.F_WRLCK, _GENERATORS_BYTE)
         try:
             yield alone

@@ -1,4 +1,4 @@
-"""The plan of a data set: keys, seeds, shard ranges and the order of work. All functions are pure.
+"""Plans a data set: keys, seeds, shard ranges and the order of work. All functions are pure.
 
 An episode is the unit of simulation, a shard the unit of publication. Training may start after the first shard, so
 the first shards are small and the first validation episode comes early.
@@ -19,7 +19,7 @@ _SINGLE_EPISODE_SHARDS = 5  # number of leading shards of validation and test wi
 
 @dataclass(frozen=True)
 class SceneTask:
-    """One scene to make and simulate."""
+    """Names a scene to make and simulate."""
 
     split: str
     index: int
@@ -37,7 +37,7 @@ class SceneTask:
 
 @dataclass(frozen=True)
 class ShardRange:
-    """Episodes [first, stop) of a split."""
+    """Names the episodes [first, stop) of a split."""
 
     split: str
     first: int
@@ -53,7 +53,7 @@ class ShardRange:
 
 
 def episode_key(split: str, index: int) -> str:
-    """Returns the sample name of an episode. It has no dot, because WebDataset would cut it there."""
+    """Returns the WebDataset key of an episode. It has no dot, because WebDataset would end it there."""
     return f"{split}-{index:06d}"
 
 
@@ -105,7 +105,7 @@ def work_order(requested: Mapping[str, int], episodes_per_shard: int) -> list[Sh
 
 
 def missing_ranges(planned: Iterable[ShardRange], published: Mapping[str, Sequence[int]]) -> list[ShardRange]:
-    """Returns the planned shards without published episodes. A shard with a gap becomes several.
+    """Returns the unpublished episodes of the planned shards. Published ones in the middle divide a shard into several.
 
     `published` contains a flag for each episode of a split. Episodes after its end are not published.
     """

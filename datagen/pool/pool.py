@@ -1,8 +1,8 @@
-"""The pool of workers that generate the missing episodes of a data set: makers build scenes, solvers simulate them.
+"""Generates the missing episodes of a data set with a pool of workers: makers build scenes, solvers simulate them.
 
 The pool distributes work, publishes shards and replaces dead workers. The scenes of a dead worker are simulated again
-in halves, then quarters, down to single scenes. A scene that was alone in MAXIMUM_ATTEMPTS dead workers is quarantined,
-and the next seed replaces it. Workers run on this machine (local_workers.py) or on a Ray cluster (ray_workers.py).
+in halves, then quarters, down to single scenes. If MAXIMUM_ATTEMPTS workers die with only one and the same scene, it is
+quarantined, and the next seed replaces it. Workers run on this machine (local_workers.py) or on Ray (ray_workers.py).
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ MAXIMUM_ATTEMPTS = 3  # deaths of workers with a single scene, before this scene
 _WAIT_SECONDS = 0.2  # longest time until a stop request is noticed
 _PACKING_SECONDS = 0.02  # maximum delay between packing and publishing a shard
 _LOOK_SECONDS = 1.0  # interval of checks for shards of other generators
-_LAUNCH_GROWTH = 32  # factor between the sizes of successive launches, up to the full size
+_LAUNCH_GROWTH = 32  # factor by which launches grow from the first one to the full size
 
 
 class Stopped(Exception):  # noqa: N818 - a request, not an error
-    """A stop was requested; staged episodes are kept."""
+    """Reports that a stop was requested. Staged episodes are kept."""
 
 
 class Pool:
@@ -45,7 +45,7 @@ class Pool:
         self._launch_size = self._largest_launch = self._plan.first_launch
         self._launches = 0
         self._deaths_in_a_row = 0
-        # deaths of workers that had only this scene, and the group in which a scene is tried again; both by key
+        # by key: deaths of workers that had only this scene, and the group of scenes with which a scene is tried again
         self._alone: dict[str, int] = {}
         self._group: dict[str, int] = {}
         self._grid_deaths: dict[SceneTask, int] = {}
@@ -90,7 +90,7 @@ class Pool:
         self._launch_size = min(self._largest_launch, self._even_launch(0))
 
     def _even_launch(self, taken: int) -> int:
-        """Returns the launch size that divides the remaining scenes evenly. `taken` ones do not count as remaining."""
+        """Returns the launch size that divides the remaining scenes evenly. `taken` scenes are not among them."""
         left = self._writer.total - self._writer.done - sum(len(solver.tasks) for solver in self._solvers) - taken
         share = max(1, math.ceil(left / len(self._solvers)))
         return math.ceil(share / math.ceil(share / self._plan.scenes_per_launch))
@@ -138,7 +138,7 @@ class Pool:
     def _next_task(self) -> SceneTask | GridTask | None:
         """Returns a maker's next task, or None: a scene of the next launch, else of later launches, else a grid.
 
-        Later launches: two per solver at most, and none while the first waiting grid's scene is with a solver.
+        At most two full launches per solver are made ahead. A grid comes first once a solver simulates its scene.
         """
         coming = len(self._ready) + len(self._being_made())
         short = coming < self._launch_size
@@ -157,7 +157,7 @@ class Pool:
         return [task for maker in self._makers for task in maker.tasks.values() if isinstance(task, SceneTask)]
 
     def _next_batch(self, solver: Worker) -> list[MadeScene]:
-        """Returns the next scenes to simulate; none, if it is better to wait for more."""
+        """Returns the next scenes to simulate, or none if it is better to wait for more."""
         self._ready.sort(key=lambda made: made.task.place)
         for made in self._ready:
             group = self._group.get(made.task.key)

@@ -1,4 +1,4 @@
-"""Reports of a running generator to a person or a program."""
+"""Reports the progress of a generator to a person or a program."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ class Progress:
     """Reports nothing. It is the base of the other classes."""
 
     def start(self, done: int, total: int, frames: int) -> None:
-        """Starts with `total` episodes of `frames` frames, of which `done` are finished."""
+        """Starts the report: `total` episodes of `frames` frames, of which `done` are finished."""
 
     def frame(self, worker: int, frame: int, scenes: int) -> None:
-        """Notes that a worker reached `frame` in a launch of `scenes` scenes; 0 scenes: the worker has none."""
+        """Notes that a worker reached `frame` in a launch of `scenes` scenes; with 0 scenes it has no launch."""
 
     def episode(self, key: str) -> None:
         """Notes that an episode was simulated and staged."""
@@ -35,11 +35,11 @@ class Progress:
         """Reports an event to a person: a quarantined scene, a worker that died."""
 
     def close(self) -> None:
-        """Ends the report for any cause."""
+        """Ends the report, also after an error."""
 
 
 class BarProgress(Progress):
-    """Shows a bar that counts simulated frames, so that it moves within a long episode; without terminal few lines."""
+    """Shows a bar of simulated frames, which moves within a long episode. Without a terminal it prints a few lines."""
 
     def __init__(self, stream: TextIO | None = None) -> None:
         self._stream = stream or sys.stderr
@@ -85,7 +85,7 @@ class BarProgress(Progress):
         frames = min(self._done * self._frames + sum(self._running.values()), self._total * self._frames)
         text = f"episodes {self._done}/{self._total}"
         if self._bar is not None:
-            # a failed launch takes its frames back; tqdm allows this only by assignment
+            # the frames of a failed launch are subtracted, which tqdm allows only by assignment
             self._bar.n = frames
             self._bar.set_description(text, refresh=False)
             self._bar.update(0)
@@ -97,7 +97,7 @@ class BarProgress(Progress):
 
 
 class JsonProgress(Progress):
-    """Writes one JSON object a line to standard output, each with an `event`."""
+    """Writes one JSON object per line to standard output, each with an `event`."""
 
     def __init__(self, stream: TextIO | None = None) -> None:
         self._stream = stream or sys.stdout

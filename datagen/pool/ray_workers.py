@@ -1,8 +1,8 @@
-"""Workers on a Ray cluster: `ray start --head` on one machine, `ray start --address=...` on others, then `pool=ray`.
+"""Runs workers on a Ray cluster: `ray start --head` on one machine, `ray start --address=...` on others, `pool=ray`.
 
 Makers and solvers are Ray actors. The pool schedules, retries and publishes as with local processes. Episodes travel
 through Ray's object store, so only the pool's machine needs the data set's folder. All machines need this project in
-the same Python. An actor waits until a machine has capacity, so machines may leave and join at any time.
+the same version of Python. An actor waits until a machine has capacity, so machines may leave and join at any time.
 """
 
 from __future__ import annotations
@@ -109,7 +109,7 @@ class RayWorkerFactory:
 
 
 class RayWorker(Worker):
-    """The pool's view of an actor. It is idle once the cluster has placed it."""
+    """Represents an actor in the pool. It is idle once the cluster has placed it on a machine."""
 
     def __init__(self, ray: Any, actor: Any) -> None:
         super().__init__()
@@ -137,7 +137,7 @@ class RayWorker(Worker):
 
 
 class _Maker:
-    """An actor that builds scenes."""
+    """Builds scenes in an actor."""
 
     def __init__(self, config: DatagenConfig, backend: Backend) -> None:
         self._config, self._backend = config, backend
@@ -153,7 +153,7 @@ class _Maker:
 
 
 class _Solver:
-    """An actor that simulates scenes, with one answer for each."""
+    """Simulates scenes in an actor, and yields one answer for each."""
 
     def __init__(self, config: DatagenConfig, backend: Backend, threads: int | None) -> None:
         self._config, self._backend, self._threads = config, backend, threads

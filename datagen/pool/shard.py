@@ -1,4 +1,4 @@
-"""Tar files of episodes: they are staged one by one, and verified completely before use."""
+"""Stages tar files of episodes one by one, joins them to shards, and verifies shards completely."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The work of makers (draw scenes, build obstacles) and solvers (simulate); the pool's interface to a worker."""
+"""Does the work of makers (draw scenes, build obstacles) and solvers (simulate); defines the interface of a worker."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from hgn.system.extras import missing_extra
 
 @dataclass(frozen=True)
 class Backend:
-    """The functions that do the work, as `module:function`. Only workers import them; the pool imports no solver."""
+    """Names the functions that do the work, as `module:function`. Only workers import them, the pool does not."""
 
     generate_scene: str = "hgn.scene.random_scene:generate_scene"
     build_obstacle_grid: str = "hgn.scene.obstacle_grid:build_obstacle_grid"
@@ -40,7 +40,7 @@ _Value = TypeVar("_Value")
 
 
 class Parcel(Generic[_Value]):
-    """A value that is passed on as pickled bytes and unpickled only when it is opened."""
+    """Carries a value between processes as pickled bytes, which are unpickled only by `open`."""
 
     def __init__(self, value: _Value) -> None:
         self._value: _Value | None = value
@@ -63,7 +63,7 @@ class Parcel(Generic[_Value]):
 
 @dataclass(frozen=True)
 class MadeScene:
-    """A scene ready for the solver."""
+    """Holds a scene that is ready for the solver."""
 
     task: SceneTask
     scene: Parcel[Scene]
@@ -73,7 +73,7 @@ class MadeScene:
 
 @dataclass(frozen=True)
 class GridTask:
-    """A scene whose obstacle grid is to be built."""
+    """Asks for the obstacle grid of a scene."""
 
     task: SceneTask
     scene: Parcel[Scene]
@@ -81,14 +81,14 @@ class GridTask:
 
 @dataclass(frozen=True)
 class BuiltGrid:
-    """The result of a GridTask: the grid, or why it could not be built."""
+    """Holds the result of a GridTask: the grid, or why it could not be built."""
 
     task: SceneTask
     grid: ObstacleGrid | str
 
 
 class Worker(ABC):
-    """The interface by which the pool uses a worker."""
+    """Defines the interface by which the pool uses a worker."""
 
     speaks = False  # whether a busy worker sends messages at shorter intervals than dataset.worker_silence_s
 
@@ -103,7 +103,7 @@ class Worker(ABC):
         """Sends work. The next `receive` notices a dead worker."""
 
     def tell(self, message: object) -> None:
-        """Sends the part that a task of the worker lacks."""
+        """Sends a part that a task of the worker needs later, for example an obstacle grid."""
         raise NotImplementedError
 
     def dismiss(self) -> None:  # noqa: B027 - Ray ends its actors itself
@@ -118,7 +118,7 @@ class Worker(ABC):
         """Returns why a worker that does not answer has ended."""
 
     def blamable(self) -> bool:
-        """Returns whether its task may have caused its death; False if its machine is gone."""
+        """Returns whether the worker's task may have ended it; False if its machine has left the cluster."""
         return True
 
 

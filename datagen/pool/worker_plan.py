@@ -1,4 +1,4 @@
-"""The number of workers and their batch sizes, for one machine or a Ray cluster."""
+"""Plans the number of workers and their batch sizes, for one machine or a Ray cluster."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from hgn.config import DatagenConfig
 from hgn.scene.kinds import MAXIMUM_PARTICLES
 from hgn.schema import require
 
-GPU_SCENES_PER_LAUNCH = 416  # several scenes for each thread-block team
+GPU_SCENES_PER_LAUNCH = 416  # largest number of scenes; each team of thread blocks simulates several
 GPU_NODES_PER_LAUNCH = 832 * 64**3  # grid nodes of all scenes, about 50 bytes each
 GPU_EARLY_LAUNCH = 2  # number of scenes in the first launch if episodes are needed early
 MAXIMUM_MAKERS = 32  # largest number of makers
@@ -21,7 +21,7 @@ _CLUSTER_THREADS = 2  # threads of a solver without a GPU
 
 @dataclass(frozen=True)
 class WorkerPlan:
-    """Numbers of workers and batch sizes."""
+    """Holds numbers of workers and batch sizes."""
 
     solvers: int
     threads: int | None  # threads of each solver; None on a GPU
@@ -34,7 +34,7 @@ class WorkerPlan:
 def plan_workers(
     config: DatagenConfig, gpus: tuple[str, ...], cpu_count: int, memory_bytes: float, early: bool = False
 ) -> WorkerPlan:
-    """Plans one solver for each GPU, with makers on the cores; without a GPU one solver for two cores."""
+    """Plans one solver per GPU, with makers on the cores. Without a GPU it plans one solver per two cores."""
     workers, launch = config.dataset.workers, config.mpm.scenes_per_launch
     if config.mpm.device == "cuda" or (config.mpm.device == "auto" and gpus):
         solvers = workers or max(1, len(gpus))
@@ -47,7 +47,7 @@ def plan_workers(
 
 
 def plan_cluster(config: DatagenConfig, nodes: Sequence[Mapping[str, float]], early: bool = False) -> WorkerPlan:
-    """Plans one solver for each GPU of the cluster; without GPUs one solver for two cores of a node."""
+    """Plans one solver per GPU of the cluster. Without GPUs it plans one solver per two cores of a node."""
     workers, launch = config.dataset.workers, config.mpm.scenes_per_launch
     gpus = int(sum(node.get("GPU", 0) for node in nodes))
     if config.mpm.device == "cuda" or (config.mpm.device == "auto" and gpus):

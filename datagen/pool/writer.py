@@ -1,4 +1,4 @@
-"""Episodes to shards: each finished episode is staged, and a shard is published when its range is complete.
+"""Writes episodes to shards: a finished episode is staged, and a shard is published when its range is complete.
 
 Files are created atomically in the order `.staging/<key>.tar`, shard, manifest. Staged files are deleted last. So after
 a crash the folder shows the remaining work, and no finished episode is simulated again. Published shards are synced. A
@@ -58,12 +58,12 @@ _Packed = tuple[ExitStack, Path, ShardEntry]
 
 
 class DatasetWriter:
-    """Writes one generator's shards to a data set folder; a context manager.
+    """Writes one generator's shards to a data set folder, inside a `with` block.
 
-    Entering recovers the folder after earlier runs: shards missing in the index are checked and listed, and abandoned
-    partial files are removed. Raises: ConfigError if the folder contains another data set or an altered file.
+    At its start the folder is recovered after earlier runs: shards missing in the index are checked and listed, and
+    abandoned partial files are removed. Raises: ConfigError if the folder contains another data set or an altered file.
 
-    With `dataset.array_tasks` a writer makes only its part of the shards, its share. Otherwise the share is all shards.
+    A writer's *share* is the shards that it may make: with `dataset.array_tasks` a part of them, otherwise all.
     """
 
     def __init__(self, config: DatagenConfig, report: Callable[[str], None] = lambda message: None) -> None:
@@ -80,7 +80,7 @@ class DatasetWriter:
         self._in_share = {split: bytearray(count) for split, count in self.requested.items()}  # a byte per episode
         for shard in self._share:
             self._in_share[shard.split][shard.first : shard.stop] = b"\1" * len(shard.indices)
-        self._begun = 0  # number of leading shards of the share that are all published
+        self._begun = 0  # number of shards at the beginning of the share that are all published
         self._claimed: list[ShardRange] = []  # shards that this writer makes
         # staged episodes of these shards: the time of staging, or inf after the request to sync them
         self._staged: dict[tuple[str, int], float] = {}
@@ -263,7 +263,7 @@ class DatasetWriter:
         return entry
 
     def _winner(self, shard: ShardRange) -> ShardEntry | None:
-        """Returns another generator's shard with these episodes, or None. On some file systems locks have no effect."""
+        """Returns another generator's shard with these episodes, or None: locks have no effect on some file systems."""
         self.refresh()
         if missing_ranges([shard], self._published) == [shard]:
             return None
@@ -308,7 +308,7 @@ class DatasetWriter:
         return {name for name, other in ranges.items() if other is not None and _overlap(shard, other)}
 
     def _list_unlisted(self, names: set[str]) -> None:
-        """Lists the given shards if a generator published them and ended before listing them."""
+        """Lists those of the given shards that a generator named, but did not list before it ended."""
         for name in sorted(names):
             shard, path = parse_shard_name(name), self.folder / name
             if shard is None or not path.exists():

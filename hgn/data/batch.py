@@ -1,4 +1,4 @@
-"""Batches: position windows around frames of episodes, concatenated over their particles.
+"""Builds batches: position windows around frames of episodes, concatenated over their particles.
 
 Shape legend: H velocity history, W = H + 2 frames, N particles of all scenes, S scenes.
 """
@@ -23,7 +23,7 @@ from hgn.scene.symmetry import Symmetry
 
 @dataclass(frozen=True, eq=False)
 class Batch:
-    """Windows x^{n-H} … x^{n+1}. The last frame is the target, the others are the input."""
+    """Holds windows x^{n-H} … x^{n+1}. The last frame is the target, the others are the input."""
 
     window_WN3: torch.Tensor  # float32, domain units
     material_N: torch.Tensor  # int64, index into the network's materials
@@ -65,7 +65,7 @@ class Batch:
         return (window_WN3[-1] - window_WN3[-2]) - (window_WN3[-2] - window_WN3[-3])
 
     def mean_over_scenes(self, value_N: torch.Tensor) -> torch.Tensor:
-        """Returns the mean over scenes of each scene's loss weight times its mean over particles: a scalar."""
+        """Returns a scalar: the mean over scenes of (loss weight of a scene) * (mean over its particles)."""
         weight_S = self.weight_S or (1.0,) * len(self.particles_S)
         pairs = zip(weight_S, self.particles_S, strict=True)
         factor_S = torch.tensor([weight / (len(weight_S) * max(count, 1)) for weight, count in pairs])
@@ -74,7 +74,7 @@ class Batch:
 
 @dataclass(frozen=True, eq=False)
 class BatchSample:
-    """A frame of an episode to train on. In backend triton it is a hgn.kernels.update.op.DeviceSample."""
+    """Holds a frame of an episode to train on. With backend triton it is a hgn.kernels.update.op.DeviceSample."""
 
     episode: Episode
     frame: int
@@ -86,10 +86,10 @@ class BatchSample:
 
 @dataclass(frozen=True, eq=False)
 class WindowChunk:
-    """The samples of one update on backend torch. For triton it is a hgn.data.episode_tensors.EpisodeChunk."""
+    """Holds the samples of one update on backend torch. For triton see hgn.data.episode_tensors.EpisodeChunk."""
 
-    samples: tuple[tuple[BatchSample, ...], ...]  # samples of each update; here one update
-    sampler_state: SamplerState  # state of the order after this update
+    samples: tuple[tuple[BatchSample, ...], ...]  # samples of each update; here of one update
+    sampler_state: SamplerState  # position in the order of samples after this update
     starts: tuple[tuple[Episode, int], ...] = ()  # starts of the simulations before this update
     batch: Batch | None = None  # the samples as tensors; None if the pushforward pool may replace some of them
 

@@ -1,4 +1,4 @@
-"""HTTP answers of bounded size: at most the requested range, or the size of a data set's largest file.
+"""Bounds HTTP answers: to the requested range, or for whole files to LARGEST_BYTES.
 
 It is imported only for data sets at HTTP URLs.
 """
@@ -15,16 +15,16 @@ from aiohttp.connector import Connection
 from hgn.data.verification import StorageError
 
 LARGEST_BYTES = 2**29  # limit for whole files: manifests of the first release, and shards of servers without ranges
-LEAST_BYTES_S, SLOW_S = 4096, 20.0  # smallest speed of an answer, and the time after which it is checked
-HEAD_S = 150.0  # limit for the head of an answer: a service may hash a shard first
+LEAST_BYTES_S, SLOW_S = 4096, 20.0  # smallest mean speed of a body, bytes/s, apart from a grace of SLOW_S seconds
+HEAD_S = 150.0  # limit for the head of an answer, seconds: a service may hash a shard first
 _RANGE = re.compile(r"bytes=(\d+)-(\d+)")
 
 
 class BoundedResponse(aiohttp.ClientResponse):
-    """An answer whose body is read in pieces up to its limit, at LEAST_BYTES_S or faster."""
+    """Reads the body of an answer in pieces, up to its limit, at LEAST_BYTES_S or faster."""
 
     async def start(self, connection: Connection) -> aiohttp.ClientResponse:
-        """Reads the head. Raises: TimeoutError for one that drips."""
+        """Reads the head. Raises: TimeoutError if it takes longer than HEAD_S."""
         return await asyncio.wait_for(super().start(connection), HEAD_S)
 
     async def read(self) -> bytes:

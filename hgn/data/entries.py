@@ -1,4 +1,4 @@
-"""Entries of a data set's index: episodes, shards and their totals."""
+"""Defines the entries of a data set's index: episodes, shards and their totals."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _SHA256 = re.compile(r"[0-9a-f]{64}")
 
 @dataclass(frozen=True)
 class EpisodeEntry:
-    """An episode in a shard."""
+    """Describes an episode in a shard."""
 
     key: str
     index: int  # number of the episode in its split
@@ -36,7 +36,7 @@ class EpisodeEntry:
 
 @dataclass(frozen=True)
 class ShardEntry:
-    """A published tar file with the episodes [first, stop) of a split."""
+    """Describes a published tar file with the episodes [first, stop) of a split."""
 
     name: str
     split: Split
@@ -60,7 +60,7 @@ class ShardEntry:
 
 @dataclass(frozen=True)
 class QuarantinedScene:
-    """A scene that could not be simulated. The next attempt's seed replaced it."""
+    """Describes a scene that could not be simulated. The scene of the next seed replaced it."""
 
     key: str
     attempt: int
@@ -70,13 +70,13 @@ class QuarantinedScene:
 
 @dataclass(frozen=True)
 class SplitTotals:
-    """The published part of a split."""
+    """Counts the published part of a split."""
 
     shards: Count = 0
     episodes: Count = 0
     bytes: NonNegative[int] = 0
     digest: str = ""  # digest of the shards' sha256 in publication order; identifies the order of samples
-    statistics: Statistics | None = None  # only in the head
+    statistics: Statistics | None = None  # stored in `manifest.json` only, not with segments
 
     def __post_init__(self) -> None:
         require_bounds(self)

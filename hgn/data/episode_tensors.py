@@ -1,4 +1,4 @@
-"""Inputs of training with backend triton: the samples of many updates, and whole episodes instead of windows.
+"""Holds inputs of training with backend triton: samples of many updates, and whole episodes instead of windows.
 
 Shape legend: H velocity history, T frames, N particles.
 """
@@ -22,7 +22,7 @@ from hgn.scene.symmetry import Symmetry, Vector, scene_symmetries
 
 @dataclass(frozen=True, eq=False)
 class EpisodeTensors:
-    """An episode as tensors. The first H of the H + T frames are the ballistic past."""
+    """Holds an episode as tensors. The first H of its H + T frames are ballistic motion before frame 0."""
 
     position_TN3: torch.Tensor  # float32, domain units
     material_N: torch.Tensor  # int32, index into the network's materials
@@ -35,12 +35,12 @@ class EpisodeTensors:
 
 @dataclass(frozen=True, eq=False)
 class EpisodeChunk:
-    """The samples of successive updates, and those of their episodes that are not yet on the device."""
+    """Holds the samples of successive updates, and the episodes of these samples that are not yet on the device."""
 
     samples: tuple[tuple[Sample, ...], ...]
     episodes: dict[int, EpisodeTensors]
     sampler_state: SamplerState  # the sampler's state after these updates
-    dropped: tuple[int, ...] = ()  # that leave the device before the new ones are placed
+    dropped: tuple[int, ...] = ()  # episodes that leave the device before the new ones are placed
     starts: tuple[tuple[int, int], ...] = ()  # episodes and frames to start simulations from
 
 

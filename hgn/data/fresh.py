@@ -1,6 +1,6 @@
-"""A test set that no choice has seen. Its seed is drawn when the weights are frozen, and stored with their hashes.
+"""Draws the seed of a fresh test set, which no choice has used, after the weights are frozen.
 
-`fresh.json` in the data set's folder is written once, before the first scene is generated.
+`fresh.json` in the data set's folder stores it with their hashes. It is written once, before the first scene is made.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ FRESH_NAME = "fresh.json"
 
 @dataclass(frozen=True)
 class FreshSeed:
-    """A seed, its time (UTC, ISO 8601), and the sha256 of the weights frozen at that time, by file name."""
+    """Holds a seed, the time of its draw (UTC, ISO 8601), and the sha256 of the frozen weights by file name."""
 
     seed: int
     drawn: str

@@ -1,4 +1,4 @@
-"""The identity of a data set: all settings that its trajectories depend on, and no others.
+"""Computes the identity of a data set: all settings that its trajectories depend on, and no others.
 
 Counts, folder, workers, device and launch size are not part of it. A data set can therefore grow on other machines.
 """

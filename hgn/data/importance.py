@@ -1,4 +1,4 @@
-"""Importance sampling of frames by acceleration, with loss weights that keep the expected loss unchanged.
+"""Samples frames by importance, their acceleration, with loss weights that keep the expected loss unchanged.
 
 Most of the error arises in the few frames with collisions. Importance sampling (Kahn & Marshall 1953; for gradients
 Katharopoulos & Fleuret 2018) draws those frames more often, with smaller loss weights.
@@ -16,26 +16,26 @@ import numpy as np
 from hgn.scene.episode import Episode
 from hgn.scene.history import frames_before
 
-PARTICLES = 512  # approximate number of an episode's particles from which accelerations are computed
+PARTICLES = 512  # accelerations are computed from about this number of an episode's particles
 
 
 @dataclass(frozen=True, eq=False)
 class DrawnBySize:
-    """A distribution over F items by size, and weights that keep the mean over draws unbiased."""
+    """Draws from F items by size, with weights that keep the mean over draws unbiased."""
 
     cumulative_F: np.ndarray  # float64, ends with 1
     weight_F: np.ndarray  # inverse of the relative frequency; 1 for uniform draws
 
     @staticmethod
     def of(size_F: np.ndarray, fraction: float) -> DrawnBySize:
-        """Draws a `fraction` in proportion to size, and the others uniformly."""
+        """Returns a distribution that draws a `fraction` in proportion to size, and the rest uniformly."""
         total = size_F.sum()
         often_F = (1 - fraction) + fraction * (size_F * len(size_F) / total if total > 0 else np.ones(len(size_F)))
         cumulative_F = often_F.cumsum()
         return DrawnBySize(cumulative_F / cumulative_F[-1:], 1 / often_F)
 
     def at(self, place: float) -> tuple[int, float]:
-        """Returns the item at a place in [0, 1) of the distribution, and its weight."""
+        """Returns the item at the quantile `place` in [0, 1), and its weight."""
         cumulative, weights = self._lists
         number = min(bisect_right(cumulative, place), len(cumulative) - 1)
         return number, weights[number]
@@ -48,14 +48,14 @@ class DrawnBySize:
 
 @dataclass(frozen=True, eq=False)
 class FrameImportance:
-    """A distribution over the F frames of an episode."""
+    """Draws from the F frames of an episode."""
 
     draws: DrawnBySize
     acceleration_F: np.ndarray  # root mean square over axes and particles
 
     @staticmethod
     def of(episode: Episode, fraction: float) -> FrameImportance:
-        """Draws a `fraction` in proportion to root mean square acceleration, and the others uniformly."""
+        """Returns a distribution that draws a `fraction` in proportion to rms acceleration, and the rest uniformly."""
         step = max(1, episode.particle_count // PARTICLES)
         past_1N3 = frames_before(episode, -1)[:, ::step]
         position_TN3 = np.concatenate([past_1N3, episode.position_TN3[:, ::step]], dtype=np.float64)
@@ -66,7 +66,7 @@ class FrameImportance:
     def draw(self, slot: int, seed: int) -> tuple[int, float]:
         """Returns the frame for sample number `slot` of F, and its loss weight.
 
-        Draws are stratified: each slot has its own 1 / F of the distribution, and `seed` chooses the place in it.
+        Draws are stratified: each slot has its own 1 / F of the quantiles, and `seed` chooses the quantile in it.
         """
         return self.draws.at((slot + _fraction(seed)) / len(self.acceleration_F))
 

@@ -1,4 +1,4 @@
-"""The index of a data set: a line of JSON for each shard, in publication order, in append-only files.
+"""Reads and writes the index of a data set: a line of JSON for each shard in publication order, in append-only files.
 
 | file in `index/` | content |
 |---|---|
@@ -6,9 +6,9 @@
 | `G-segments.jsonl` | the totals up to the end of each full segment |
 | `G-quarantined.jsonl` | scenes that could not be simulated |
 
-The head, `manifest.json`, contains the valid sizes of the last segment and of the other two files. Bytes after them are
-not published and are overwritten. The cost of a publication does not depend on the number of shards, and a reader reads
-only new shards. A list that loses a shard is written again as the next generation.
+The *head*, `manifest.json`, contains the valid sizes of the last segment and of the other two files. Bytes after them
+are not published and are overwritten. The cost of a publication does not depend on the number of shards, and a reader
+reads only new shards. If a shard is removed from the list, the whole index is written again as the next generation.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class IndexState:
-    """The valid sizes of the index's files."""
+    """Holds the valid sizes of the index's files."""
 
     generation: NonNegative[int] = 1
     shards: Count = 0
@@ -70,7 +70,7 @@ class IndexState:
 
 @dataclass(frozen=True)
 class _SegmentEnd:
-    """A line of `segments.jsonl`."""
+    """Holds a line of `G-segments.jsonl`."""
 
     bytes: int  # size of the segment
     totals: dict[str, SplitTotals]  # totals up to its end, without statistics
@@ -78,7 +78,7 @@ class _SegmentEnd:
 
 @dataclass(frozen=True)
 class _Segment:
-    """The lines of a segment that have been read."""
+    """Holds the lines of a segment that have been read."""
 
     shards: list[ShardEntry]
     bytes: int
@@ -86,7 +86,7 @@ class _Segment:
 
 
 class _Read:
-    """The cache of an index, shared by the later states of the same index."""
+    """Caches what was read of an index. The later states of the same index share it."""
 
     def __init__(self) -> None:
         self.lock = threading.RLock()
@@ -111,7 +111,7 @@ class _Read:
 
 
 class Index(Sequence[ShardEntry]):
-    """The published shards of a data set, in publication order. Segments are read when needed.
+    """Lists the published shards of a data set in publication order. Segments are read when needed.
 
     Raises on access: ConfigError if a line is invalid or the lines contradict the head; UnreachableError.
     """
@@ -121,7 +121,7 @@ class Index(Sequence[ShardEntry]):
         self._read = _Read()
 
     def continued(self, later: Index) -> Index:
-        """Passes the cache to a later state of the same index. Returns the later state."""
+        """Passes the cache to `later`, a later state of the same index, and returns it."""
         if later.state.generation == self.state.generation != _IN_MEMORY and len(later) >= len(self):
             later._read = self._read
         return later
@@ -288,7 +288,7 @@ class Index(Sequence[ShardEntry]):
 
 
 class ListedIndex(Index):
-    """An index in memory, for example that of a manifest of the first release."""
+    """Holds an index in memory, for example that of a manifest of the first release."""
 
     def __init__(self, shards: Sequence[ShardEntry], quarantined: Sequence[QuarantinedScene] = ()) -> None:
         state = IndexState(_IN_MEMORY, len(shards), quarantined=len(quarantined))

@@ -1,4 +1,4 @@
-"""The manifest of a data set: its published shards, their content, and the settings that made them.
+"""Reads and writes the manifest of a data set: published shards, their content, and the settings that made them.
 
 `manifest.json` is written last and atomically, so all listed shards are complete. Its size does not depend on the
 number of shards, which are in the append-only files of `hgn.data.index`. Manifests of the first release contain the
@@ -39,7 +39,7 @@ MOST_BYTES = 32 << 20  # enough for 8,000 shards in a manifest of the first rele
 
 @dataclass(frozen=True)
 class _Identity:
-    """The fields of manifests of every release."""
+    """Holds the fields that manifests of every release have."""
 
     config_hash: str  # hash of `config`
     config: dict[str, Any]  # `hgn.data.identity.dataset_identity`
@@ -50,7 +50,7 @@ class _Identity:
 
 @dataclass(frozen=True)
 class _Head(_Identity):
-    """The file `manifest.json`."""
+    """Holds the content of `manifest.json`."""
 
     index: IndexState = field(kw_only=True)
     totals: dict[str, SplitTotals] = field(kw_only=True)
@@ -58,7 +58,7 @@ class _Head(_Identity):
 
 @dataclass(frozen=True)
 class _Listing(_Identity):
-    """The file `manifest.json` of the first release."""
+    """Holds the content of a `manifest.json` of the first release."""
 
     shards: tuple[ShardEntry, ...] = ()
     quarantined: tuple[QuarantinedScene, ...] = ()
@@ -66,15 +66,15 @@ class _Listing(_Identity):
 
 @dataclass(frozen=True)
 class Manifest(_Identity):
-    """The published part of a data set."""
+    """Describes the published part of a data set."""
 
     shards: Index = field(default_factory=lambda: ListedIndex(()))  # in publication order
 
     @staticmethod
     def load(folder: Path | str, patience_s: float | None = None) -> Manifest:
-        """Reads `<folder>/manifest.json`. A server may be silent for `patience_s`.
+        """Reads `<folder>/manifest.json`. Waits for a server that does not answer for up to `patience_s`.
 
-        Raises: ConfigError if it is missing, not JSON, has another schema version, or any wrong field;
+        Raises: ConfigError if it is missing, not JSON, of another schema version, or has a wrong field;
         UnreachableError if the server does not answer.
         """
 
@@ -94,7 +94,7 @@ class Manifest(_Identity):
     def parse(content: bytes, folder: Path | str) -> Manifest:
         """Parses the bytes of a manifest whose index is in `folder`.
 
-        Raises: ConfigError if they are not JSON, have another schema version, or any wrong field.
+        Raises: ConfigError if they are not JSON, of another schema version, or have a wrong field.
         """
         path = f"{folder}/{MANIFEST_NAME}"
         require(len(content) <= MOST_BYTES, path, f"at most {MOST_BYTES} bytes", len(content))
@@ -134,7 +134,7 @@ class Manifest(_Identity):
         quarantined: Sequence[QuarantinedScene] = (),
         **changes: Any,
     ) -> Manifest:
-        """Publishes more in this manifest's folder, at a cost independent of its size. `changes` are other fields.
+        """Publishes more entries in this folder at a constant cost. `changes` are new values of other fields.
 
         Raises: OSError; ConfigError if another program changed the index.
         """

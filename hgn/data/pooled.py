@@ -1,4 +1,4 @@
-"""Several data sets as one: fixed data sets first, then one that may grow."""
+"""Reads several data sets as one: fixed data sets first, then one that may grow."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from hgn.scene.episode import Episode
 
 
 class PooledStore(Episodes):
-    """One split of `own` after the same split of `others`, which stay as they were opened.
+    """Joins one split of several data sets: first `others`, which stay as they were opened, then `own`, which may grow.
 
-    It is used like an EpisodeStore. Places count over all data sets, and only `own` grows.
+    It is used like an EpisodeStore. The place of an episode counts over all data sets.
     """
 
     def __init__(self, own: EpisodeStore, others: Sequence[EpisodeStore]) -> None:

@@ -1,4 +1,4 @@
-"""Published episodes of a data set. Positions are memory-mapped, so a window of frames reads only its own pages.
+"""Reads published episodes of a data set. Positions are memory-mapped: a window of frames reads only its own pages.
 
 Each shard is checked against the index (size, then sha256) before use. Otherwise a tar cut at a member boundary would
 read as fewer samples without an error. Remote shards are read from a cache (`hgn.data.shard_cache`).
@@ -37,10 +37,10 @@ MAPPED_SHARDS = 256  # largest number of mapped shards; also at most a quarter o
 
 
 class Episodes(Sequence[Episode], ABC):
-    """A sequence of episodes.
+    """Defines a sequence of episodes.
 
-    An episode is opened, and its shard verified, on first use. In this machine's cache, and with `open`, positions are
-    a read-only `np.memmap`. In other folders they are a copy, because truncation of a mapped file would end the
+    An episode is opened, and its shard verified, on first use. Positions are a read-only `np.memmap` if the shard is in
+    this machine's cache, or with `open`. Otherwise they are a copy, because truncation of a mapped file would end the
     process. Raises on access: ConfigError if a shard is missing or altered.
     """
 
@@ -75,9 +75,9 @@ class Episodes(Sequence[Episode], ABC):
 
 
 class EpisodeStore(Episodes):
-    """The published episodes of one split of a data set, in publication order. Their number only grows.
+    """Reads the published episodes of one split of a data set, in publication order. Their number only grows.
 
-    It can be pickled for spawned workers with folder, split and manifest, but without open files and maps.
+    For spawned workers it is pickled with folder, split and manifest, but without open files and maps.
     """
 
     _fetcher: threading.Thread | None = None
@@ -117,8 +117,8 @@ class EpisodeStore(Episodes):
     def refresh(self) -> bool:
         """Reads the manifest again. Returns whether this split has more episodes than before.
 
-        If a server does not answer, the known episodes stay. Inside `faults_outlived` they stay after any fault that
-        lasts no longer than the patience, and `ask_again` reads the manifest once a second.
+        If a server does not answer, the episodes that were read before stay. Inside `faults_outlived` they also stay
+        after any fault that lasts no longer than the patience, and `ask_again` reads the manifest once a second.
         Raises: ConfigError if the folder contains another data set, or published shards were removed.
         """
         previous_s, self._looked_s = self._looked_s, time.monotonic()
@@ -181,7 +181,7 @@ class EpisodeStore(Episodes):
     def fetch_ahead(self, episodes: Sequence[int] | None = None) -> None:
         """Starts to fetch shards in the background, one after the other. It does nothing for a folder.
 
-        It fetches all published shards, or those of `episodes` in order. A full cache drops older ones for these only.
+        It fetches all published shards, or those of `episodes` in order. Only these replace older ones in a full cache.
         """
         if not is_remote(self.folder):
             return
@@ -332,7 +332,7 @@ class EpisodeStore(Episodes):
 
 
 class _OpenShard:
-    """A mapped shard and the episodes that were read from it."""
+    """Holds a mapped shard and the episodes that were read from it."""
 
     def __init__(self, path: Path) -> None:
         self.path = path

@@ -1,4 +1,4 @@
-"""The order of training samples: a pure function of seed, epoch, episodes, window, batch and world size.
+"""Computes the order of training samples: a pure function of seed, epoch, episodes, window, batch and world size.
 
 A sample is one frame of one episode. An epoch is a permutation of all samples of the episodes that were published when
 it began. Epochs follow each other without a gap. Every sample comes exactly once an epoch on any number of ranks.
@@ -19,7 +19,7 @@ from hgn.system.splitmix import splitmix64
 
 @dataclass(frozen=True)
 class SamplerState:
-    """The position in the order, over all ranks."""
+    """Holds the position in the order of samples, over all ranks."""
 
     epoch: int = 0
     position: int = 0  # number of samples of this epoch that were taken
@@ -30,7 +30,7 @@ class SamplerState:
 
 
 class Sample(NamedTuple):  # faster to construct than a dataclass; a thousand are drawn a second
-    """Frame n of an episode. The network sees frames up to n and predicts n + 1."""
+    """Names frame n of an episode. The network sees frames up to n and predicts the acceleration to frame n + 1."""
 
     episode: int
     frame: int
@@ -45,9 +45,9 @@ BLOCK_EPISODES = 8  # consecutive episodes in publication order; most shards hav
 def epoch_order(seed: int, epoch: int, first_sample: np.ndarray, window: int = 0) -> np.ndarray:
     """Returns the order of an epoch, int64 [samples]. `first_sample` is each episode's first sample, then the total.
 
-    Without a `window` all samples are shuffled together. With one, blocks of BLOCK_EPISODES are shuffled, then the
-    samples of the blocks in a window. A rank then needs the shards of at most two windows at a time, and each shard
-    once an epoch (twice if it is in two blocks).
+    Without a `window` all samples are shuffled together. With one, the blocks of BLOCK_EPISODES are shuffled, and then
+    the samples within each window of blocks. A rank then needs the shards of at most two windows at a time, and each
+    shard once per epoch (twice if it is in two blocks).
     """
     generator = np.random.Generator(np.random.PCG64([seed, epoch]))
     episodes = len(first_sample) - 1
@@ -68,8 +68,8 @@ def epoch_order(seed: int, epoch: int, first_sample: np.ndarray, window: int = 0
 def balanced_parts(size_K: np.ndarray, ranks: int) -> np.ndarray:
     """Assigns K samples to ranks, int64 [ranks, K / ranks], with equal counts and about equal total sizes.
 
-    In each round the largest remaining samples, one per rank, go to the ranks with the smallest sums (longest
-    processing time first, Graham 1969, with equal counts). Equal sizes keep their order, so all ranks agree.
+    In each round every rank gets one of the largest remaining samples: the rank with the smallest sum gets the largest
+    (longest processing time first, Graham 1969, with equal counts). Equal sizes keep their order, so all ranks agree.
     """
     row_order = np.argsort(-size_K, kind="stable").reshape(-1, ranks)
     load, parts = np.zeros(ranks), np.empty_like(row_order)
@@ -147,7 +147,7 @@ class EpisodeSampler:
 
     @property
     def window_samples(self) -> int:
-        """Returns the mean number of samples that are shuffled together; 0: all."""
+        """Returns the mean number of samples that are shuffled together, or 0 if these are all samples."""
         blocks = max(1, self._window // BLOCK_EPISODES) * BLOCK_EPISODES
         windowed = 0 < self._window < self.state.episodes
         return -(-len(self._order) * blocks // self.state.episodes) if windowed else 0

@@ -1,4 +1,4 @@
-"""Shards as tar files: deterministic bytes of an episode, and the offsets of members."""
+"""Writes shards as tar files, with the same bytes for the same episode, and finds the offsets of their members."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from hgn.schema import ConfigError
 
 
 def episode_tar(episode: Episode) -> Iterator[bytes]:
-    """Yields the parts of an episode's tar. It has no times and owners, so an episode always gives the same bytes."""
+    """Yields the parts of an episode's tar. It has no times and owners, so its bytes depend on the episode only."""
     written = 0
     for name, data in encode_episode(episode).items():
         info = tarfile.TarInfo(f"{episode.key}.{name}")

@@ -1,7 +1,7 @@
-"""A cache of remote shards. They are named by their sha256, so data sets do not collide.
+"""Caches remote shards. They are named by their sha256, so data sets do not collide.
 
 One process fetches a shard, and the others of this machine wait for it. `HGN_CACHE` is the cache's folder (default
-`~/.cache/hgn`). `HGN_CACHE_GB` limits its size (default: only the disk). A full cache removes the oldest shards.
+`~/.cache/hgn`). `HGN_CACHE_GB` limits its size (default: the disk's size). A full cache removes the oldest shards.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _FULL = (errno.ENOSPC, errno.EDQUOT)
 
 
 class Holder(Protocol):
-    """A reader with open files of the cache. They occupy the disk until they are closed."""
+    """Describes a reader with open files of the cache. They occupy the disk until they are closed."""
 
     def release(self, path: Path) -> None:
         """Closes a file that is about to be removed."""
@@ -59,7 +59,7 @@ def cache_folder() -> Path:
 
 @dataclass(frozen=True)
 class CachedShard:
-    """A shard at a URL."""
+    """Describes a shard at a URL."""
 
     url: str
     sha256: str
@@ -210,7 +210,7 @@ def _locked_partial(path: Path, url: str, patience_s: float) -> Iterator[Buffere
 
 
 def _lock(file: BufferedRandom, folder: Path, url: str, patience_s: float) -> None:
-    """Locks a file. It waits while the file grows; a process that stopped writing may itself have been stopped."""
+    """Locks a file. It waits while the file grows; a process that does not write may be suspended."""
     size, start = -1, time.monotonic()
     try:
         while not lock_file(file):

@@ -1,6 +1,6 @@
-"""Mean and spread of velocity and acceleration, merged over episodes and shards.
+"""Computes mean and spread of velocity and acceleration, merged over episodes and shards.
 
-In frame units, as in the network: v^n = x^n - x^(n-1), a^n = v^(n+1) - v^n.
+Units are frame units, as in the network: v^n = x^n - x^(n-1), a^n = v^(n+1) - v^n.
 Shape legend: T frames, N particles.
 """
 
@@ -13,13 +13,13 @@ import numpy as np
 
 from hgn.schema import Vector
 
-_BLOCK_PARTICLES = 1 << 18  # particles times frames in a pass
-_ROWS_ABREAST = 512  # rows of three that are summed side by side
+_BLOCK_PARTICLES = 1 << 18  # number of particles times number of frames of a block
+_ROWS_ABREAST = 512  # number of rows [3] that are summed side by side
 
 
 @dataclass(frozen=True)
 class Moments:
-    """Count, mean and sum of squared deviations of 3-vectors, per axis, in float64.
+    """Holds count, mean and sum of squared deviations of 3-vectors, per axis, in float64.
 
     Merging follows Chan, Golub, LeVeque (1979), which loses no digits if the mean is far from zero.
     """
@@ -59,7 +59,7 @@ class Moments:
 
 @dataclass(frozen=True)
 class Statistics:
-    """Moments of velocity and acceleration in frame units (domain units per frame, per frame squared)."""
+    """Holds moments of velocity (domain units per frame) and acceleration (domain units per frame squared)."""
 
     velocity: Moments = Moments()
     acceleration: Moments = Moments()

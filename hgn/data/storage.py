@@ -1,4 +1,4 @@
-"""The place of a data set: a folder of this machine, or a URL (a dataset service, a file server, an object store).
+"""Reads the files of a data set from a folder of this machine, or a URL (dataset service, file server, object store).
 
 Shards of a URL are cached on this machine (`hgn.data.shard_cache`). `HGN_DATASET_TOKEN` is the token of a dataset
 service. With `HGN_DATASET_HOST` only that host (or host:port) receives it.
@@ -32,7 +32,7 @@ from hgn.system.patience import UnreachableError, inside, patiently, standard_pa
 TOKEN_VARIABLE = "HGN_DATASET_TOKEN"
 TOKEN_HOST_VARIABLE = "HGN_DATASET_HOST"
 _CHUNK_BYTES = 16 * 2**20  # bytes of a shard per request; a lost connection costs at most one request
-_CONNECT_S, _SILENCE_S, _ANSWER_S = 10.0, 60.0, 1800.0  # time limits of a connection, of silence, and of a whole file
+_CONNECT_S, _SILENCE_S, _ANSWER_S = 10.0, 60.0, 1800.0  # limits: to connect, between two pieces, for a whole file
 _AWAY_S = 10.0  # for this time after a failed request, calls with patience_s=0 fail without a request
 _NETWORK_PACKAGES = {"aiohttp", "botocore", "aiobotocore", "gcsfs", "google", "azure"}
 
@@ -41,7 +41,7 @@ _outliving = threading.Event()
 
 
 def faults_outlived() -> contextlib.AbstractContextManager[None]:
-    """Lets `ask` repeat failed reads for the standard patience: a running training has read its data before."""
+    """Lets `ask` repeat failed reads for the standard patience. A running training needs it: it has read these data."""
     return inside(_outliving)
 
 
@@ -64,7 +64,7 @@ def _may_pass(error: Exception) -> str | None:
 
 
 class Storage(ABC):
-    """The files of a data set at any place."""
+    """Reads the files of a data set at any place."""
 
     @abstractmethod
     def manifest(self, name: str, patience_s: float | None = None) -> bytes:
@@ -136,7 +136,7 @@ def _is_loopback(url: str) -> bool:
 
 
 class _Folder(Storage):
-    """A folder of this machine."""
+    """Reads a folder of this machine."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
@@ -168,7 +168,7 @@ def _remote(url: str) -> _Remote:
 
 
 class _Remote(Storage):
-    """A data set at a URL, read by fsspec."""
+    """Reads a data set at a URL through fsspec."""
 
     def __init__(self, url: str) -> None:
         import fsspec  # importing it is slow, and local data sets do not need it

@@ -1,4 +1,4 @@
-"""Verification of files by size and sha256, once in a process."""
+"""Verifies files by size and sha256, once in a process."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def verify_file(path: Path, sha256: str, size: int, remedy: str) -> None:
 
 
 def note_verified(path: Path, sha256: str) -> None:
-    """Records a file as verified. Its bytes were hashed while they were written."""
+    """Records a file as verified, whose bytes the caller hashed while it wrote them."""
     _verified.add(_identity(path, sha256))
 
 

@@ -87,9 +87,9 @@ class FusedTrainingNetwork(FusedNetwork):
         tuning: Tuning | None = None,
         tail: int = 0,
     ) -> None:
-        """Takes `output_gradient` multiplied by `loss_scale`, which float16 gradients need; `totals` are without it.
+        """Expects `output_gradient` times `loss_scale`, which float16 gradients need. `totals` are divided by it.
 
-        Behind the gradients `totals` holds the encoder's combined first layer, and `tail` elements for other use.
+        After these gradients `totals` has that of the encoder's combined first layer, and `tail` elements for callers.
         """
         super().__init__(packed, values, grid, particle_count, precision, True, tuning)
         self.unscale, self.copy_precision = 1.0 / loss_scale, precision
@@ -121,7 +121,7 @@ class FusedTrainingNetwork(FusedNetwork):
         self._plan_weight_gradients()
 
     def _gradients(self, take: Callable[..., torch.Tensor]) -> Gradients:
-        """Returns all gradients that the weight gradients read. `take` makes a tensor of each shape."""
+        """Returns all gradients from which weight gradients are computed. `take` makes a tensor of a shape."""
         width, grid, steps = self.width, self.grid, self.config.message_passing_steps
         particles, capacities = grid.particles, grid.capacities
 
@@ -291,7 +291,7 @@ class FusedTrainingNetwork(FusedNetwork):
         return 64 if self.precision == "fp16" else 32
 
     def _gradient_of(self, block: Block) -> torch.Tensor:
-        """Returns the buffer of a block: first it receives the output's gradient, then it holds that of the input."""
+        """Returns the buffer of a block. It first contains the gradient of the block's output, then of its input."""
         down = any(block is other for other in self.down)
         return (self.cell_gradient_down if down else self.cell_gradient_up)[block.level]
 
@@ -383,7 +383,7 @@ class FusedTrainingNetwork(FusedNetwork):
         add: bool = False,
         received: tuple[torch.Tensor, int] | None = None,
     ) -> None:
-        """Launches gather_project_backward. With `received`, x are edges' gradients; receivers' parts are added too."""
+        """Launches gather_project_backward. With `received`, x are gradients of edges; parts of receivers are added."""
         rows = self.grid.capacities[level]
         size, warps = self.tuning.row_tile(rows)
         other, other_at = received or (summed, at)

@@ -121,7 +121,7 @@ def vectors(pointer, at_0, at_1, at_2, at_3, at_4, WIDTH: tl.constexpr):
 @triton.jit
 def optional_vector(pointer, at, WIDTH: tl.constexpr):
     """Loads the vector [WIDTH] at place `at`, or zeros if `at` is below zero."""
-    place = at + tl.zeros((WIDTH,), tl.int32)  # Triton 3.9's interpreter does not take a mask of one number
+    place = at + tl.zeros((WIDTH,), tl.int32)  # Triton 3.9's interpreter does not accept a scalar mask
     return tl.load(pointer + place + tl.arange(0, WIDTH), mask=place >= 0, other=0.0)
 
 
@@ -132,16 +132,16 @@ def vector(matrix, number: tl.constexpr):
 
 @triton.jit
 def once_both(x, y, never):
-    """Returns x, but only after the loads of x and y. `never` is false, which the compiler does not know.
+    """Returns x once both x and y are loaded. `never` is always false, but the compiler cannot know this.
 
-    The compiler otherwise moves the first values to shared memory, and waits for them, before it begins the next load.
+    Otherwise the compiler waits for x, and moves it to shared memory, before it begins the load of y.
     """
     return added(x, tl.where(never, y.to(x.dtype), 0.0))
 
 
 @triton.jit
 def nothing_to_do(count, BLOCK: tl.constexpr):
-    """Returns whether a program has no rows. The first program always stays, and waits for the previous kernel."""
+    """Returns whether a program without rows may end. The first one may not, as it waits for the previous kernel."""
     return (tl.program_id(0) * BLOCK >= count) & (tl.program_id(0) > 0)
 
 
@@ -154,7 +154,7 @@ def inside(vector, tile):
 
 @triton.jit
 def next_tile(tile, ONCE: tl.constexpr):
-    """Returns the program's next tile. ONCE: there is none, and the compiler drops the loop and its addresses."""
+    """Returns the program's next tile. With ONCE there is none, and the compiler removes the loop and its addresses."""
     if ONCE:
         tile = tile * 0 + LAST_TILE
     else:
@@ -169,7 +169,7 @@ def leaky(h):
 
 @triton.jit
 def leaky_operand(h, PRECISION: tl.constexpr):
-    """Returns leaky(h) as a product's operand. In fp16 it computes in float16, two numbers in an instruction."""
+    """Returns leaky(h) as a product's operand. In fp16 it computes in float16, two numbers per instruction."""
     if PRECISION == "fp16":
         h = h.to(tl.float16)
         a = leaky(h)
@@ -195,7 +195,7 @@ def normalise(z, WIDTH: tl.constexpr):
 @triton.jit
 def normalise_once(z, WIDTH: tl.constexpr, PRECISION: tl.constexpr):
     """Returns the same as `normalise`, and at lower precisions computes both sums in one pass.
-    Cancellation costs less than rounded operands if a row's |mean| is below about ten standard deviations."""
+    Cancellation costs less precision than rounded operands if |mean| of a row is below about ten deviations."""
     if PRECISION == "fp16":
         mean = tl.sum(z, 1) / WIDTH
         variance = tl.maximum(tl.sum(z * z, 1) / WIDTH - mean * mean, 0.0)
@@ -224,8 +224,8 @@ def chosen_rows(ROWS: tl.constexpr, EACH: tl.constexpr, CHOICES: tl.constexpr):
 
 @triton.jit
 def high_and_low(pointer, FIRST: tl.constexpr, SUMS: tl.constexpr, WIDTH: tl.constexpr, PRECISION: tl.constexpr):
-    """Returns rows [SUMS, W] for the matrix [3, W] at `pointer`: from row FIRST the rounded rows as operands.
-    The parts that rounding removes follow. Other rows are zero."""
+    """Returns rows [SUMS, W] for the matrix [3, W] at `pointer`. Rows FIRST to FIRST + 2 are its rows as operands.
+    The next three rows are the parts that rounding removes. Other rows are zero."""
     row = tl.arange(0, SUMS)
     place = row - FIRST
     inside = (place >= 0) & (place < 6)
@@ -261,9 +261,9 @@ def column_sums(x, ROWS: tl.constexpr, WIDTH: tl.constexpr, APART: tl.constexpr)
 
 @triton.jit
 def listed(table, row, count, capacity, SUM: tl.constexpr, EDGES: tl.constexpr):
-    """Returns the rows that the table [SUM, capacity] lists for each element of `row`, as a tuple; below zero: none.
+    """Returns SUM listed rows for each element of `row`, as a tuple, from the table [SUM, capacity]; negative: no row.
 
-    With EDGES they are rows of [capacity, SUM, W]: the part for the opposite direction of the listed row.
+    With EDGES they are rows of [capacity, SUM, W]: edges of the listed rows in the opposite direction.
     """
     summands = ()
     for i in tl.static_range(SUM):

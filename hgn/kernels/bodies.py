@@ -34,7 +34,7 @@ def adjugate(matrix, x, y, z):
 
 @triton.jit
 def rotation(inertia, x, y, z):
-    """Returns how well moments about a centre determine a rotation, and its rate, by hgn.network.relative.rotation.
+    """Returns how well moments about a centre determine a rotation, and its rate (hgn.network.relative.rotation).
 
     The inertia is in the order xx, yy, zz, yz, xz, xy.
     """
@@ -54,7 +54,7 @@ def inertia_of(xx, yy, zz, yz, xz, xy):
 
 @triton.jit
 def body_of(moments, cell, mask, inverse, OUT: tl.constexpr):
-    """Returns centres of mass in coarsest cells from their middles, and the inertia over the mass, in cell edges."""
+    """Returns centres of mass relative to centres of coarsest cells, and inertia over mass, in cell edges."""
     at = moments + cell * OUT
     x = tl.load(at, mask=mask, other=0.0) * inverse
     y = tl.load(at + 1, mask=mask, other=0.0) * inverse

@@ -46,8 +46,8 @@ class Block:
 class Buffers:
     """Holds the buffers of a network. `down` and `up` are the blocks.
     Messages to parents and hidden layers of the steps between levels are lists over the finer level. Inference may
-    share buffers, because no kernel accesses them before the end of all earlier kernels: a kernel without OVERLAP
-    starts then, and a kernel that begins early waits for it."""
+    share buffers, because no kernel accesses them before all earlier kernels have ended: a kernel without OVERLAP
+    starts after them, and a kernel that starts early waits for them."""
 
     config: NetworkConfig
     packed: PackedNetwork

@@ -43,7 +43,7 @@ class FusedNetwork(Buffers):
     """Runs a packed network on a DeviceGrid.
 
     `values` float32 [packed.size] are the parameters. In fp16 and TF32 the matrix products read `weights`, a rounded
-    copy of `values`. Call `refresh` after every change of `values`. `training` keeps the inputs of a backward pass.
+    copy of `values`. Call `refresh` after every change of `values`. `training` adds buffers for a backward pass.
     """
 
     def __init__(

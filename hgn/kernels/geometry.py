@@ -1,8 +1,8 @@
 """Computes levels, slots and middles of the grid, for the kernels of cells.
 
 The geometry table has a row for each level: first slot, number of slots, window cells in y and z with borders, slots of
-a scene, capacity, first cell in tables, window cells in x with borders.
-"""
+a scene, capacity, first cell in tables, window cells in x with borders. *Middles* are the centres of every 2^SHIFT-th
+coarsest cell along each axis. A *spot* is a particle's place relative to the lowest of the eight middles around it."""
 
 import triton
 import triton.language as tl
@@ -22,8 +22,8 @@ def split_slot(local, ny, nz, stride):
 
 @triton.jit
 def most_around(disturbed, felt, part: tl.constexpr, neighbour, cell, there, capacity):
-    """Writes the maximum over a coarsest cell and those across its faces to a column of `felt` [C, 2], from 0 to 1.
-    The inputs are the same column of `disturbed` [C, 2], in units of FULLY."""
+    """Writes a maximum from 0 to 1 to a column of `felt` [C, 2]: over a coarsest cell and the cells across its faces.
+    It is of the same column of `disturbed` [C, 2], in units of FULLY."""
     most = tl.load(disturbed + cell * 2 + part, mask=there, other=0)
     for slot in tl.static_range(6):
         other = tl.load(neighbour + slot * capacity + cell, mask=there, other=-1)
@@ -33,9 +33,8 @@ def most_around(disturbed, felt, part: tl.constexpr, neighbour, cell, there, cap
 
 @triton.jit
 def lowest_middle(k, axis: tl.constexpr, low, place_of, row, live, LEVELS: tl.constexpr, SHIFT: tl.constexpr):
-    """Returns along one axis the number of the lowest middle around a particle, and the place from it in cell edges.
-    The middles count from 0. They lie between cells 2^SHIFT times as large as the coarsest ones. `k` is the number of
-    the particle's own coarsest cell in the window."""
+    """Returns the lowest middle around a particle along one axis, counted from 0, and the particle's spot, in
+    distances of two middles. `k` is the number of the particle's coarsest cell in the window."""
     first = tl.load(low + axis) >> LEVELS - 1
     place = tl.load(place_of + row * 3 + axis, mask=live, other=0.0)
     lowest = tl.floor(place)
@@ -46,8 +45,8 @@ def lowest_middle(k, axis: tl.constexpr, low, place_of, row, live, LEVELS: tl.co
 
 @triton.jit
 def middles_around(base, gate, spot, geometry, LEVELS: tl.constexpr):
-    """Returns the slots [N, 8] of all middles around particles, the places from them, and the weights.
-    The inputs are the lowest slots, the gates and the spots."""
+    """Returns the slots [N, 8] of the middles around particles, places relative to these, and trilinear weights.
+    `base` are the slots of the lowest middles, `gate` and `spot` those of the particles."""
     line = geometry + (LEVELS - 1) * GEOMETRY_COLUMNS
     corner = tl.arange(0, 8)[None, :]
     axes, weight = (), gate[:, None]

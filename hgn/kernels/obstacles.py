@@ -34,7 +34,7 @@ def _from_axis(x, y, z, symmetry, axis: tl.constexpr):
 
 @triton.jit
 def obstacle_normals(x, y, z, line, live, obstacle_cell_size, SYMMETRY: tl.constexpr):
-    """Returns the three parts of obstacle normals at positions of any shape, zeros without an obstacle.
+    """Returns x, y and z of the obstacle normals at positions of any shape, zeros without an obstacle.
     `line` is the scenes' row of the obstacle table. With SYMMETRY positions and normals are those of an image of the
     scene. The function looks the positions up in the scene itself."""
     x = tl.floor(tl.div_rn(x, obstacle_cell_size))

@@ -14,7 +14,7 @@ import torch
 from hgn.network.hgn import HierarchicalGraphNetwork, MessagePassing
 from hgn.network.mlp import MLP
 
-NARROW = 8  # parts with fewer columns are offsets
+NARROW = 8  # parts of a first layer with fewer columns are narrow; they multiply offsets
 PADDED_OUT = 16
 
 

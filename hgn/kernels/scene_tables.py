@@ -29,7 +29,7 @@ class SceneHash:
     key_K: torch.Tensor  # int64
     # An obstacle cell has its normal, float32 [K, 3]. A barrier cell has the range of its list of triangles, int32.
     value_K: torch.Tensor
-    lists: tuple[torch.Tensor, ...] = ()  # of a barrier: the lists int32 [E], and the triangles float32 [F, 24]
+    lists: tuple[torch.Tensor, ...] = ()  # a barrier's lists, int32 [E], and triangles, float32 [F, 24]
     last: int = 0  # last column of the row: bits of a barrier's cell size, or the obstacles' symmetry, set later
 
     @staticmethod
@@ -124,7 +124,7 @@ class SceneTable:
         return table
 
     def is_of(self, source: ObstacleCells | Barriers | None) -> bool:
-        """Returns whether the table was made of this very object; False for None, whose table takes no time to make."""
+        """Returns whether the table was made of this same object, or False for None, whose table is cheap to make."""
         return source is not None and self._source is source
 
     def take(self, other: SceneTable) -> None:

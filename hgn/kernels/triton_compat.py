@@ -64,7 +64,7 @@ def settle_keys(names: dict[str, Any]) -> None:
 
 @contextmanager
 def noted_launches() -> Iterator[Launches]:
-    """Yields a dictionary that notes launches. The launches are neither compiled nor made."""
+    """Yields a dictionary to which launches are added instead of being compiled and made."""
     launches: Launches = {}
 
     def note(*, fn: Any, compile: dict[str, Any], **_: Any) -> bool:
@@ -82,7 +82,7 @@ def noted_launches() -> Iterator[Launches]:
 def preload(function: Any, specialization: str) -> Any:
     """Compiles a kernel for a noted specialisation.
 
-    Triton's own function takes a constant for a type if it has a type's name, for example the precision fp16.
+    Triton's own function mistakes a constant for a type if it has a type's name, as the precision "fp16" has.
     """
     with mock.patch.object(tl.dtype, "is_dtype", lambda name: False):
         return function.preload(specialization)
@@ -94,7 +94,7 @@ def build_launcher(kernel: Any) -> None:
 
 
 def use_target(capability: int) -> None:
-    """Lets Triton compile for a GPU without a CUDA context, whose memory the training ranks need."""
+    """Lets Triton compile for a GPU without a CUDA context, which would take memory that the training ranks need."""
     driver = triton.runtime.driver.active
     driver.get_current_device = lambda: 0
     driver.get_current_stream = lambda device: 0

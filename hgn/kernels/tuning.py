@@ -26,7 +26,7 @@ class Tuning:
 
     cell_block: int  # cells of a tile of edges, with eight rows each
     cell_warps: int
-    few_cell_block: int  # as cell_block, on a level of few cells
+    few_cell_block: int  # as cell_block, on a level with few cells
     few_cell_warps: int
     row_block: int
     row_warps: int
@@ -38,7 +38,7 @@ class Tuning:
     small_warps: int = 8
     dense: bool = False  # tiles of edges have six rows a cell instead of eight
     overlap: bool = False  # kernels of a message step read their weights before the previous kernel ends
-    loops: bool = False  # with many rows a program keeps all weights and takes many blocks in turn
+    loops: bool = False  # with many rows a program keeps all its weights and computes many blocks in turn
     gather_block: int = 0  # rows of a kernel that sums neighbours of many rows; 0: no such kernel
     cell_backward_block: int = 0  # rows of a backward tile with many rows; 0: as for few rows
     cell_backward_warps: int = 8
@@ -46,8 +46,8 @@ class Tuning:
     # Sums of particles in cells are rounded, which halves L2 traffic; in training only the pairs' gradients are.
     half_sums: bool = False
     light_programs: int = 2  # programs on a processor of kernels with one weight: pairs forward, first edges
-    light_registers: int | None = None  # registers of a thread that let these programs fit
-    weight_registers: int | None = None  # registers of a thread in weight gradients; with 128 two programs fit
+    light_registers: int | None = None  # largest number of registers per thread with which these programs fit
+    weight_registers: int | None = None  # largest number per thread in weight gradients; with 128 two programs fit
 
     @staticmethod
     def of(precision: str) -> Tuning:

@@ -18,7 +18,7 @@ DECODED = tl.constexpr(OUTPUTS)
 
 @triton.jit
 def _coarsest_places(place_of, row, live):
-    """Returns the particles' places in these cells, three [N, 8], from the cells' middles in edges."""
+    """Returns the particles' places relative to the centres of these cells, three [N, 8], in cell edges."""
     corner = tl.arange(0, 8)[None, :]
     at = place_of + row * 3
     x = tl.load(at, mask=live, other=0.0)[:, None] - (corner >> 2 & 1).to(tl.float32)

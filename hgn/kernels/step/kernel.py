@@ -89,9 +89,9 @@ def sum_displacements(
 ):  # fmt: skip
     """Adds the particles' bodies, next displacements and their moments to the sums [K, COLUMNS] of the middles around.
 
-    The middles lie between cells 2^SHIFT times as large as the coarsest ones. Writes the slot of the lowest middle to
-    `base_of` [N], the place relative to it to `spot_of` [N, 3], and the gate to `gate_of` [N]. The gate is 0 for
-    materials whose bit is not in RESTING; -1 has all bits.
+    hgn.kernels.geometry defines middles and spots. Writes the slot of the lowest middle to `base_of` [N], the spot to
+    `spot_of` [N, 3], and the gate to `gate_of` [N]. The gate is 0 for materials whose bit is not in RESTING; -1 has
+    all bits.
 
     Rule: hgn.step.reference.Deformation; test: tests/kernels/test_relative.py.
     """
