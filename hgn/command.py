@@ -96,7 +96,8 @@ def _exit_code(main: Main | str, config_name: str) -> int:
             raise
         code = _fail(missing, EXIT_MACHINE)
     except OSError as error:
-        if isinstance(error, (BrokenPipeError, FileNotFoundError)):  # an error of this program, not of the user
+        missing_file = isinstance(error, FileNotFoundError) and error.filename is not None
+        if missing_file or isinstance(error, BrokenPipeError):  # an error of this program, not of the user
             raise
         place = f": {error.filename}" if error.filename else ""
         remedy = _MACHINE_ERRORS.get(error.errno or 0, "check the disk and its network")

@@ -90,6 +90,11 @@ class Page(ThreadingHTTPServer):
                 self._open.popleft().shutdown(socket.SHUT_RDWR)
         super().process_request(request, client_address)
 
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """Prints an error, unless a connection has ended."""
+        if not isinstance(sys.exception(), OSError):
+            super().handle_error(request, client_address)
+
     def answer(self) -> tuple[int, bytes]:
         """Returns the present status code and JSON body."""
         since, status, content = self.report

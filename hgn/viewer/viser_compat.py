@@ -7,6 +7,7 @@ the token (`/?token=…`) and stores it as a cookie, which the browser sends wit
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import hmac
 import http
@@ -17,7 +18,7 @@ import socket
 import sys
 import traceback
 import zlib
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable
 from typing import Any
 from unittest import mock
@@ -28,7 +29,8 @@ import websockets.asyncio.server
 from viser import _messages as messages
 from viser._gui_api import GuiApi
 from viser._gui_handles import GuiUploadButtonHandle
-from websockets import Headers
+from websockets import Headers, State
+from websockets.asyncio.server import ServerConnection
 from websockets.http11 import Request, Response
 
 from hgn.schema import require
@@ -36,6 +38,7 @@ from hgn.schema import require
 COOKIE = "hgn_play"
 MAXIMUM_UNFINISHED_BYTES = 128 << 20  # bytes of the incomplete uploads of all viewers
 UPLOAD_BYTES, PART_BYTES = 1 << 20, 200  # least bytes by which an upload and each of its parts count
+MOST_OPENING = 64  # connections that have not shown the token; further ones close the oldest
 MAXIMUM_MESSAGE_BYTES = 1 << 20  # bytes of a message from a viewer; parts of uploads have 512 KiB
 LONGEST_TEXT, LARGEST_NUMBER = 1000, 2**53  # characters of a text in a message; largest integer of a browser
 REFUSAL = b"open the address that hgn.play printed, with its token\n"
@@ -64,6 +67,7 @@ def start_server(host: str, port: int, label: str) -> tuple[viser.ViserServer, s
 
     def guarded_serve(*args: Any, process_request: Process, **options: Any) -> Any:
         options["max_size"] = MAXIMUM_MESSAGE_BYTES
+        options["create_connection"] = shedding()
         return serve(*args, process_request=guarded(process_request, token), **options)
 
     handlers = ("_handle_file_transfer_start", "_handle_file_transfer_part")
@@ -77,6 +81,20 @@ def start_server(host: str, port: int, label: str) -> tuple[viser.ViserServer, s
     )
     shown = "127.0.0.1" if host in ("0.0.0.0", "localhost") else host
     return server, f"http://{shown}:{server.get_port()}/?token={token}"
+
+
+def shedding() -> type[ServerConnection]:
+    """Returns a class of connections. Strangers who only open some would take all files of the process."""
+    opening: deque[ServerConnection] = deque()
+
+    class Shedding(ServerConnection):
+        def connection_made(self, transport: asyncio.BaseTransport) -> None:
+            super().connection_made(transport)
+            opening.append(self)
+            if len(opening) > MOST_OPENING and (oldest := opening.popleft()).state is State.CONNECTING:
+                oldest.transport.abort()
+
+    return Shedding
 
 
 def admitting(handle: Callable[..., Any], gui: GuiApi) -> Callable[..., Any]:

@@ -40,6 +40,7 @@ def test_no_key_is_taken_for_a_config_group():
         (ConfigError("frames must be 2"), 2, "error: frames must be 2\n"),
         (ConfigError("http://user:secret@host must be"), 2, "error: http://host must be\n"),
         (OSError(errno.ENOSPC, "No space left on device", "b/a.tar"), 1, "error: No space left on device: b/a.tar;"),
+        (FileNotFoundError(errno.ENOENT, "No usable temporary directory"), 1, "error: No usable temporary directory; "),
         (PermissionError(errno.EACCES, "Permission denied", "made"), 1, "error: Permission denied: made; check the"),
         (OSError(errno.EMFILE, "Too many open files"), 1, "error: Too many open files; raise the limit of open files"),
         (OSError(errno.ENFILE, "Too many here"), 1, "error: Too many here; close other programs"),

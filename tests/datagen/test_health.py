@@ -55,7 +55,7 @@ def test_silence_is_told(monkeypatch):
         assert page.answer() == (503, b'{"status": "the service has not reported for 0 s"}')
 
 
-def test_who_never_ends_a_request_keeps_nobody_out(monkeypatch):
+def test_who_never_ends_a_request_keeps_nobody_out(monkeypatch, capsys):
     """Of too many connections that only begin a request the oldest are closed, however long they may wait."""
     monkeypatch.setattr(health._Handler, "timeout", None)
     listener = socket.create_server(("127.0.0.1", 0))
@@ -68,6 +68,7 @@ def test_who_never_ends_a_request_keeps_nobody_out(monkeypatch):
             connection.settimeout(10)
         assert ask(listener.getsockname()[1])[0] == 503
         assert [connection.recv(1) for connection in waiting[:6]] == 6 * [b""]
+    assert not capsys.readouterr().err
 
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])

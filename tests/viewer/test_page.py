@@ -196,7 +196,7 @@ def test_an_obstacle_that_is_dragged_moves(viewer, play):
 
     until(lambda: shown() == pytest.approx((begin[0] + 80, begin[1]), abs=8))
     (after,), there = play.session.obstacles, shown()
-    grid = play.session.live.scene.obstacle_grid
+    grid = play.session.live.scenes[0].obstacle_grid
     middle_3 = (grid.cell_K3 + 0.5).mean(axis=0) * grid.cell_size - np.subtract(after.position, (0, 0.03, 0))
     assert np.abs(middle_3).max() < 0.06
     drag(viewer, there, (there[0] - 90, there[1]), "Control")

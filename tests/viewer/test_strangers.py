@@ -6,7 +6,10 @@ import http
 import json
 import pickle
 import re
+import socket
+import urllib.request
 import weakref
+from contextlib import ExitStack
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -28,7 +31,7 @@ from hgn.viewer import viser_compat
 from hgn.viewer.film import FilmPage
 from hgn.viewer.page import MAXIMUM_UPLOAD_BYTES, PlayPage
 from hgn.viewer.session import PlaySession
-from hgn.viewer.viser_compat import COOKIE, guarded
+from hgn.viewer.viser_compat import COOKIE, MOST_OPENING, guarded
 
 # viser keeps its event loop's threads and sockets until the garbage collector comes
 pytestmark = pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::pytest.PytestUnraisableExceptionWarning")
@@ -199,7 +202,8 @@ def test_a_moved_obstacle_leaves_no_earlier_scene_behind(page, monkeypatch):
 
 
 def test_requests_of_other_pages_are_refused():
-    """A page of another origin is refused though the browser sends this page's cookie with its request."""
+    """A page of another origin is refused though the browser sends this page's cookie with its request; so are tokens
+    that no browser sends."""
     own = ("http://127.0.0.1:8080", "HTTP://127.0.0.1:8080", "https://127.0.0.1:8080")  # the last by a tunnel with TLS
     others = ("http://127.0.0.1:9999", "http://evil.example", "null", "", "http://[::1", "http://a]b", "file://")
     others += ("http://127.0.0.1:8080@evil.example", "http://u@127.0.0.1:8080", "javascript://127.0.0.1:8080")
@@ -211,14 +215,18 @@ def test_requests_of_other_pages_are_refused():
         given = {} if origin is None else {"Origin": origin}
         headers = Headers({"Host": "127.0.0.1:8080", "Cookie": f"{COOKIE}_8080=secret"} | given)
         assert answered_with_403("/", headers) == refused, origin
+    for path in ("/?token=\udcff", "//[", "http://[/", "/?token=secret%00", "/#?token=secret", "*", "/?a"):
+        assert answered_with_403(path, Headers({"Host": "127.0.0.1:8080"})), path
 
 
-@pytest.mark.parametrize(
-    "path", ["/?token=\udcff", "//[", "http://[/", "/?token=secret%00", "/#?token=secret", "*", "/?a"]
-)
-def test_tokens_that_no_browser_sends(path):
-    """They are refused as others are, also bytes that are no text and addresses that are none."""
-    assert answered_with_403(path, Headers({"Host": "127.0.0.1:8080"}))
+def test_who_never_asks_keeps_nobody_out(page):
+    """Of too many connections that have not shown the token the oldest are closed, however long they may wait."""
+    place = ("127.0.0.1", page.server.get_port())
+    with ExitStack() as stack:
+        waiting = [stack.enter_context(socket.create_connection(place, 8)) for _ in range(MOST_OPENING + 5)]
+        assert [connection.recv(1) for connection in waiting[:5]] == 5 * [b""]
+        with urllib.request.urlopen(page.address) as answer:
+            assert answer.status == http.HTTPStatus.OK
 
 
 def answered_with_403(path, headers):
