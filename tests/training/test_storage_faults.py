@@ -2,6 +2,7 @@
 
 import contextlib
 import errno
+import fcntl
 import functools
 import gzip
 import http.server
@@ -24,7 +25,7 @@ from hgn.data.storage import faults_outlived
 from hgn.schema import ConfigError
 from hgn.system.patience import VARIABLE
 from hgn.training import callbacks, checkpoint_writer, monitor
-from hgn.training.checkpoint import read_checkpoint
+from hgn.training.checkpoint import LAST_NAMES, read_checkpoint
 
 HTML = b"<html><body>502 Bad Gateway</body></html>"
 
@@ -241,3 +242,24 @@ def test_a_training_outlives_a_fault(data, tmp_path, monkeypatch):
     monkeypatch.setattr(hgn.training.session, "train_network", started)
     assert train.main(train_mapping(data, run, **options)) == 0
     assert metrics(run)[-1]["update"] == 20
+
+
+def test_a_run_in_a_mounted_bucket(data, tmp_path, monkeypatch):
+    """Mounted object stores may have no hard links, no locks and no truncation. A run does without, and a line of
+    metrics that was cut is removed as ever."""
+    run, refused = tmp_path / "run", mock.Mock(side_effect=OSError(errno.EIO, os.strerror(errno.EIO)))
+    monkeypatch.setattr(os, "link", refused)
+    monkeypatch.setattr(os, "truncate", refused)
+    monkeypatch.setattr(fcntl, "flock", mock.Mock(side_effect=OSError(errno.ENOSYS, "no locks")))
+    assert train.main(train_mapping(data, run, maximum_updates=6)) == 0
+    whole = (run / "metrics.jsonl").read_bytes()
+    (run / "metrics.jsonl").write_bytes(whole + b'{"update": 8, "lo')
+    assert train.main(train_mapping(data, run)) == 0
+    assert (run / "metrics.jsonl").read_bytes().startswith(whole)
+    assert [record["update"] for record in metrics(run) if "loss" in record] == [4, 8, 12]
+    assert {path.name for path in (run / "checkpoints").iterdir()} == {*LAST_NAMES, "best.ckpt"}
+    updates = [read_checkpoint(run / "checkpoints" / name)["hgn"]["updates"] for name in LAST_NAMES]
+    assert updates == sorted(updates, reverse=True) and updates[0] == 12
+    monkeypatch.setattr(callbacks, "_drop_cut_line", refused)
+    with pytest.raises(OSError, match="Input/output error"):  # before the first update there is nothing to save
+        train.main(train_mapping(data, run, maximum_updates=16))

@@ -1,7 +1,5 @@
 """The training command: from shards to checkpoints, resume, stop, and every refusal."""
 
-import errno
-import fcntl
 import math
 import os
 import signal
@@ -238,33 +236,6 @@ def test_a_finished_run_stays_finished(finished):
     assert train.main(train_mapping(data, run)) == 0
     assert {path.name for path in (run / "checkpoints").iterdir()} == {*LAST_NAMES, "best.ckpt"}
     assert [path.read_bytes() for path in kept] == before
-
-
-def test_a_run_in_a_mounted_bucket(data, run, monkeypatch):
-    """Mounted object stores may have no hard links, no locks and no truncation. A run does without, and a line of
-    metrics that was cut is removed as ever."""
-
-    def lacks(number):
-        def refuse(*_):
-            raise OSError(number, os.strerror(number))
-
-        return refuse
-
-    monkeypatch.setattr(os, "link", lacks(errno.EIO))
-    monkeypatch.setattr(os, "truncate", lacks(errno.EIO))
-    monkeypatch.setattr(fcntl, "flock", lacks(errno.ENOSYS))
-    assert train.main(train_mapping(data, run, maximum_updates=6)) == 0
-    whole = (run / "metrics.jsonl").read_bytes()
-    (run / "metrics.jsonl").write_bytes(whole + b'{"update": 8, "lo')
-    assert train.main(train_mapping(data, run)) == 0
-    assert (run / "metrics.jsonl").read_bytes().startswith(whole)
-    assert [record["update"] for record in metrics(run) if "loss" in record] == [4, 8, 12]
-    assert {path.name for path in (run / "checkpoints").iterdir()} == {*LAST_NAMES, "best.ckpt"}
-    updates = [read_checkpoint(run / "checkpoints" / name)["hgn"]["updates"] for name in LAST_NAMES]
-    assert updates == sorted(updates, reverse=True) and updates[0] == 12
-    monkeypatch.setattr(callbacks, "_drop_cut_line", lacks(errno.EIO))
-    with pytest.raises(OSError, match="Input/output error"):  # before the first update there is nothing to save
-        train.main(train_mapping(data, run, maximum_updates=16))
 
 
 def test_the_best_network_is_remembered(data, run, monkeypatch):
