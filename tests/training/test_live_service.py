@@ -4,6 +4,7 @@ import os
 import signal
 import subprocess
 import threading
+import time
 
 import fsspec
 import pytest
@@ -19,6 +20,7 @@ from hgn.data.reader import EpisodeStore
 from hgn.data.shard_cache import CACHE_VARIABLE
 from hgn.data.storage import TOKEN_VARIABLE
 from hgn.training.checkpoint import read_checkpoint
+from hgn.training.torch_updates import TorchUpdates
 
 SCENES = 5
 
@@ -56,7 +58,7 @@ def service(control, tmp_path, monkeypatch):
     service.kill()
 
 
-def test_service_restarted_midway(make_config, service, control, tmp_path):
+def test_service_restarted_midway(make_config, service, control, tmp_path, monkeypatch):
     """A trainer reads over HTTP what a service makes meanwhile. The service is killed with all its processes and
     started again: training goes on through it, with the scenes it has and then with those that come."""
     config = make_config(folder=service.url, training_scenes=SCENES, validation_scenes=1, test_scenes=0)
@@ -65,6 +67,8 @@ def test_service_restarted_midway(make_config, service, control, tmp_path):
     held = control / f"hold-{scene_seed(0, 'train', 2, 0)}"
     held.touch()
     service.start()
+    step = TorchUpdates.step
+    monkeypatch.setattr(TorchUpdates, "step", lambda *given: (time.sleep(0.05), step(*given)))  # it mostly waits
 
     ended = threading.Event()
 
