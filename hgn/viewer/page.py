@@ -34,7 +34,7 @@ from hgn.schema import ConfigError, require
 from hgn.viewer.placed import PlacedObstacle, plain
 from hgn.viewer.session import PlaySession, Spout
 from hgn.viewer.stage import StageView, quaternion
-from hgn.viewer.viser_compat import clamped, start_server, stop_server, updates
+from hgn.viewer.viser_compat import clamped, require_taken, start_server, stop_server, updates
 
 STATUS_S = 0.25  # seconds between two updates of frame and speed
 BACK_S = {"a frame": 0.0, "1 s": 1.0, "5 s": 5.0}
@@ -313,9 +313,11 @@ class PlayPage:
             self.session.remove_obstacle(self.chosen)
 
     def _send_scene(self, event: Any) -> None:
+        require_taken(event.client)
         event.client.send_file_download("scene.zip", self.session.scene_archive(), save_immediately=True)
 
     def _send_rollout(self, event: Any) -> None:
+        require_taken(event.client)
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "rollout.vtkhdf"
             write_rollout(path, self.session.rollout())

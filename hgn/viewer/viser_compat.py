@@ -155,6 +155,13 @@ def bounded(handle: Callable[..., None]) -> Callable[..., None]:
     return answer
 
 
+def require_taken(client: viser.ClientHandle) -> None:
+    """Raises ConfigError if an earlier file still waits to be sent to a viewer."""
+    waiting = list(client._websock_connection.get_message_buffer().message_from_id.values())
+    count = sum(isinstance(message, messages.FileTransferPart) for message in waiting)
+    require(count == 0, "download", "complete before the next", f"{count} parts that wait")
+
+
 def stop_server(server: viser.ViserServer) -> None:
     """Ends a server and its thread."""
     with contextlib.redirect_stdout(io.StringIO()):

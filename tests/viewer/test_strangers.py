@@ -406,6 +406,22 @@ def test_meshes_are_bounded(page, messages, monkeypatch):
     page.restart()
 
 
+def test_who_takes_no_file_gets_no_other(page, messages):
+    """Files for a viewer who does not read them do not pile up."""
+    sent, waiting = [], {}
+
+    def send(name, content, **_):
+        sent.append(name)
+        waiting[len(sent)] = viser_compat.messages.FileTransferPart(None, "t", 0, content)
+
+    connection = SimpleNamespace(get_message_buffer=lambda: SimpleNamespace(message_from_id=waiting))
+    event = SimpleNamespace(client=SimpleNamespace(_websock_connection=connection, send_file_download=send))
+    for action in 2 * (page._send_scene, page._send_rollout):
+        page.do(lambda action=action: action(event))
+    page._do_all()
+    assert sent == ["scene.zip"] and len(messages) == 3 and "download must be complete" in messages[0]
+
+
 @pytest.mark.parametrize(("uploads", "count", "size"), [(40, 2, 1 << 20), (3, 30_000, 1), (300, 0, 0)])
 def test_unfinished_uploads_are_bounded(page, monkeypatch, uploads, count, size):
     """Uploads that never become whole are dropped, those of the viewer with the most first: large parts, many parts,
