@@ -39,7 +39,7 @@ _INTERNAL = (
 _INTERNAL += (
     "step_config.StepConfig",
     "runtime.torch_backend.Backend",
-    "runtime.simulator.InitialState",
+    "scene.obstacle_grid.ObstacleGrid",
     "scene.episode.Episode",
 )
 nitpick_ignore = [("py:class", f"hgn.{name}") for name in _INTERNAL]

@@ -39,16 +39,16 @@ class LiveSimulation:
         particles it captures its frame again, which takes about a second.
         Raises: ConfigError as `Simulator.start`.
         """
-        alone = isinstance(scenes, (InitialState, Scene))
         self.simulator = simulator
-        self.scenes = [InitialState.of(scene) for scene in ([scenes] if alone else scenes)]
+        given = [scenes] if isinstance(scenes, (InitialState, Scene)) else scenes
+        self.scenes = [InitialState.of(scene) for scene in given]
         self.ended: dict[int, DivergedError] = {}
         require(len(self.scenes) > 0, "scenes", "at least one", 0)
         state = replace(self._started(self.scenes), obstacles=simulator.obstacles(self.scenes))
         clearance = simulator.network.step.obstacle_clearance
         self._barriers = [] if clearance is None else [scene.barrier(clearance) for scene in self.scenes]
         state = replace(state, barriers=self._joined(self._barriers))
-        self.simulation = simulator.simulation(state, capacity, isolate=not alone)
+        self.simulation = simulator.simulation(state, capacity, isolate=given is scenes)
         self._changed: ParticleState | None = None  # what the next frame continues from, after changes
 
     def __enter__(self) -> LiveSimulation:
@@ -128,7 +128,7 @@ class LiveSimulation:
             unusable = np.asarray(value)[~np.isfinite(value)]
             require(not len(unusable), name, "finite", float(unusable[0]) if len(unusable) else 0.0)
         require(material_A.dtype.kind in "iu", "material_A", "whole numbers", str(material_A.dtype))
-        arrays = {"position_N3": position_A3, "velocity_N3": velocity_A3, "material_N": material_A}
+        arrays: dict[str, Any] = {"position_N3": position_A3, "velocity_N3": velocity_A3, "material_N": material_A}
         new = self._started([replace(self.scenes[index], **arrays, past_HN3=None)])
         if count:
             self._put(index, self.scenes[index], self.state, new)
