@@ -124,7 +124,7 @@ def momentum():
         ("fixed", scene, dataclasses.replace(CONFIG, fixed_time_step_s=STEP_S)),
         ("stiff", dataclasses.replace(scene, material_parameters=stiff), CONFIG),
     ):
-        (path,) = paths([own], config, 7)
+        (path,) = paths([own], config, 5)
         moved = np.diff(path, axis=0).sum(axis=1)
         yield name, np.abs(moved - moved[0]).max(), 0, 1e-5 * np.abs(scene.velocity_N3).sum() / 60
 
@@ -186,19 +186,18 @@ def elastic_bar():
 
 
 def water_without_tension():
-    """A sheet and a jet of water that expand at 1 / s keep expanding without tension: 1.5 times as long after 0.5 s,
-    and no thinner. With tension they keep their volume.
+    """A jet of water that expands at 1 / s keeps expanding without tension: 1.5 times as long after 0.5 s, and no
+    thinner. With tension it keeps its volume.
     """
-    for name, cells in (("sheet", (10, 1, 10)), ("jet", (12, 2, 2))):
-        place = lattice(cells) - np.array(cells) / 2
-        scene = free_body(place + 16, place * CELL, WATER, (32, 32, 32))
-        size = {}
-        for tension in (0.0, 1.0):
-            x = states(scene, dataclasses.replace(CONFIG, water_tension=tension), 31, "position")[0][-1]
-            size[tension] = x.std(axis=0) / (place * CELL).std(axis=0)
-        yield f"length of a {name}", size[0.0][0], 1.5, 0.03
-        yield f"a {name} as thick as before", float(size[0.0][1] > 1.05), 1, 0
-        yield f"a {name} with tension is thinner", float(size[1.0][1] < 0.95), 1, 0
+    place = lattice((12, 2, 2)) - (6, 1, 1)
+    scene = free_body(place + np.array([12, 4, 4]), place * CELL, WATER, (24, 10, 10))
+    size = {}
+    for tension in (0.0, 1.0):
+        x = states(scene, dataclasses.replace(CONFIG, water_tension=tension), 31, "position")[0][-1]
+        size[tension] = x.std(axis=0) / (place * CELL).std(axis=0)
+    yield "length", size[0.0][0], 1.5, 0.03
+    yield "as thick as before", float(size[0.0][1] > 1.05), 1, 0
+    yield "thinner with tension", float(size[1.0][1] < 0.95), 1, 0
 
 
 def viscous_vortex():
@@ -226,7 +225,7 @@ def hydrostatic_pressure():
     _, bulk = lame_parameters(CONFIG)
     place = (lattice((5, 6, 5)) + WALL) * CELL
     scene = particles(place, WATER, domain_size=(10 * CELL, 14 * CELL, 10 * CELL))
-    x, J = states(scene, CONFIG, 181, "position", "volume")
+    x, J = states(scene, CONFIG, 121, "position", "volume")
     depth = 6 * CELL
     yield "level", np.abs(x[:, :, 1].mean(axis=1) - place[:, 1].mean()).max(), 0, 0.02 * depth
     height, pressure = x[60:, :, 1] - WALL * CELL, bulk * (1 - J[60:])
@@ -277,8 +276,8 @@ CASES = (
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.__name__)
 def test_closed_form(case, monkeypatch):
     """The measured value is the expected one within its tolerance."""
-    monkeypatch.setattr(solver_validation, "REST_S", 4.0)
-    monkeypatch.setattr(solver_validation, "REPOSE_TIMES", 12.0)
+    monkeypatch.setattr(solver_validation, "REST_S", 3.0)
+    monkeypatch.setattr(solver_validation, "REPOSE_TIMES", 8.0)
     rows = list(case())
     wrong = [(what, found, expected) for what, found, expected, tolerance in rows if abs(found - expected) > tolerance]
     assert rows and not wrong
