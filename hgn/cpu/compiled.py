@@ -15,7 +15,9 @@ import platform
 import shlex
 import shutil
 import subprocess
+from collections.abc import Callable
 from pathlib import Path
+from weakref import WeakKeyDictionary
 
 import torch
 
@@ -28,6 +30,7 @@ FLAGS = ("-std=gnu11", "-O3", "-march=native", "-fno-math-errno", "-ffp-contract
 LANES = 16  # float32 numbers in a vector of AVX-512
 WIDEST = 512  # largest width whose two matrices fit on a thread's stack
 COMPILERS = ("cc", "gcc", "clang")
+_KNOWN: WeakKeyDictionary[torch.nn.Module, tuple[tuple[int, ...], CompiledRows]] = WeakKeyDictionary()
 
 
 def unsupported_reason(width: int, dtype: torch.dtype) -> str | None:
@@ -39,9 +42,9 @@ def unsupported_reason(width: int, dtype: torch.dtype) -> str | None:
     return _library(width)[1]
 
 
-def rows_class(width: int, dtype: torch.dtype) -> type[Rows]:
-    """Returns the class that computes rows of an MLP."""
-    return Rows if unsupported_reason(width, dtype) else CompiledRows
+def rows_class(width: int, dtype: torch.dtype) -> Callable[[torch.nn.Module], Rows]:
+    """Returns the function that returns the rows of an MLP."""
+    return Rows if unsupported_reason(width, dtype) else compiled_rows
 
 
 def describe(width: int) -> str:
@@ -50,8 +53,20 @@ def describe(width: int) -> str:
     return "rows compiled for this CPU" if reason is None else f"rows in PyTorch ({reason})"
 
 
+def compiled_rows(network: torch.nn.Module) -> CompiledRows:
+    """Returns the rows of an MLP, those of the last frame if its parameters are where they were."""
+    places = tuple(parameter.data_ptr() for parameter in network.parameters())
+    known = _KNOWN.get(network)
+    if known is None or known[0] != places:
+        known = _KNOWN[network] = (places, CompiledRows(network))
+    return known[1]
+
+
 class CompiledRows(Rows):
-    """Computes rows of an MLP whose layers have equal widths. For other MLPs it computes only projections."""
+    """Computes rows of an MLP whose layers have equal widths. For other MLPs it computes only projections.
+
+    It holds places of parameters, not values, so that an update of a training changes its results.
+    """
 
     def __init__(self, network: torch.nn.Module) -> None:
         super().__init__(network)

@@ -10,6 +10,7 @@ Shape legend: N particles, P pairs of particles and cells, C cells, E directed e
 from __future__ import annotations
 
 import itertools
+from collections.abc import Callable
 from functools import partial
 
 import torch
@@ -79,7 +80,7 @@ class _Cells:
 
 
 def _passed(
-    rows_of: type[Rows], passing: nn.Module, cell_CW: torch.Tensor, cells: _Cells, threads: int
+    rows_of: Callable[[nn.Module], Rows], passing: nn.Module, cell_CW: torch.Tensor, cells: _Cells, threads: int
 ) -> torch.Tensor:
     """Returns the cells after the message passing of one level; the reference is MessagePassing.forward."""
     assert isinstance(passing.edge, nn.ModuleList) and isinstance(passing.cell, nn.ModuleList)

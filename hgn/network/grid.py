@@ -9,6 +9,7 @@ Shape legend: N particles, C cells of a level, E directed edges of a level, S sc
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from torch.compiler import is_exporting
@@ -49,6 +50,26 @@ class GridHierarchy:
     cell_N8: torch.Tensor  # int64, index into the finest level; corner order of CORNER_83
     weight_N8: torch.Tensor  # trilinear, sums to 1; some are zero if the particle lies on a plane of cell centres
     fraction_N3: torch.Tensor  # particle minus the centre of its first corner's cell, in cells, [0, 1)
+
+    @cached_property
+    def coarsest_cells(self) -> torch.Tensor:
+        """Returns the coarsest ancestors of each particle's eight cells, [N, 8]. Some may be equal."""
+        cell_N8 = self.cell_N8
+        for level in self.levels[:-1]:
+            assert level.parent_C is not None
+            cell_N8 = level.parent_C[cell_N8]
+        return cell_N8
+
+    @cached_property
+    def coarsest_places(self) -> torch.Tensor:
+        """Returns the particles' places relative to the centres of `coarsest_cells`, in cell edges, [N, 8, 3]."""
+        corner_83 = CORNER_83.to(self.fraction_N3)
+        place_N83, cell_N8 = self.fraction_N3[:, None] - corner_83, self.cell_N8
+        for level in self.levels[:-1]:
+            assert level.parent_C is not None and level.octant_C is not None
+            place_N83 = 0.5 * (place_N83 + corner_83[level.octant_C[cell_N8]] - 0.5)
+            cell_N8 = level.parent_C[cell_N8]
+        return place_N83
 
 
 def build_hierarchy(

@@ -34,7 +34,7 @@ import torch
 
 from hgn.config import NetworkConfig
 from hgn.network.features import ParticleState
-from hgn.network.grid import CORNER_83, DIRECTION_63, GridHierarchy
+from hgn.network.grid import DIRECTION_63, GridHierarchy
 from hgn.network.obstacles import ObstacleCells
 
 CONTACT_REACH_CELLS = 3.0  # distance from a wall, in R, at which the network begins to see it
@@ -84,7 +84,7 @@ def relative_features(
     )
     normal_C33 = touched_normals(surface_normals(wall_N6, normal_N6), grid)
     contacts = Contacts(*disturbance(motion_NK, surface_gate(wall_N6, normal_N6), grid), normal_C33)
-    gate_N = (grid.weight_N8 * contacts.touched_C[coarsest_cells(grid)]).sum(1)
+    gate_N = (grid.weight_N8 * contacts.touched_C[grid.coarsest_cells]).sum(1)
     parts = [motion_NK, gate_N[:, None] * torch.asinh(velocity_N3 / scale), wall_N6]
     return torch.cat(parts if normal_N6 is None else [*parts, normal_N6], dim=-1), contacts
 
@@ -169,7 +169,7 @@ def touched_normals(normal_N33: torch.Tensor, grid: GridHierarchy) -> torch.Tens
     """Returns P [C, 3, 3]: sums of w_pC times `surface_normals` in a coarsest cell."""
     normal_N89 = grid.weight_N8[..., None] * normal_N33.flatten(1)[:, None]
     sum_C9 = normal_N89.new_zeros(grid.levels[-1].cell_count, 9)
-    return sum_C9.index_add(0, coarsest_cells(grid).flatten(), normal_N89.flatten(0, 1)).unflatten(1, (3, 3))
+    return sum_C9.index_add(0, grid.coarsest_cells.flatten(), normal_N89.flatten(0, 1)).unflatten(1, (3, 3))
 
 
 def slip(normal_C33: torch.Tensor) -> torch.Tensor:
@@ -205,7 +205,7 @@ def disturbance(
     count because an impact crosses a body within one frame. `touched` is computed in the same way, from surfaces only.
     """
     own_N = (touch_N + (motion_NK / QUIET).square().sum(-1)).clamp(max=1)
-    cell_N8, coarsest = coarsest_cells(grid), grid.levels[-1]
+    cell_N8, coarsest = grid.coarsest_cells, grid.levels[-1]
 
     def felt(value_N: torch.Tensor) -> torch.Tensor:
         own_C, value_N8 = value_N.new_zeros(coarsest.cell_count), torch.where(grid.weight_N8 > 0, value_N[:, None], 0)
@@ -213,15 +213,6 @@ def disturbance(
         return own_C.scatter_reduce(0, coarsest.receiver_E, own_C[coarsest.sender_E], "amax")
 
     return felt(own_N), felt(touch_N)
-
-
-def coarsest_cells(grid: GridHierarchy) -> torch.Tensor:
-    """Returns the coarsest ancestors of each particle's eight cells, [N, 8]. Some may be equal."""
-    cell_N8 = grid.cell_N8
-    for level in grid.levels[:-1]:
-        assert level.parent_C is not None
-        cell_N8 = level.parent_C[cell_N8]
-    return cell_N8
 
 
 def balanced(output_N9: torch.Tensor, contacts: Contacts, grid: GridHierarchy) -> torch.Tensor:
@@ -250,8 +241,8 @@ def balanced(output_N9: torch.Tensor, contacts: Contacts, grid: GridHierarchy) -
     is along their normals. Bodies slide on a plane without friction or propulsion, for any parameters.
     """
     disturbed_C, touched_C = contacts.disturbed_C, contacts.touched_C
-    level, cell_N8, weight_N8 = grid.levels[-1], coarsest_cells(grid), grid.weight_N8
-    place_N83 = coarsest_places(grid)
+    level, cell_N8, weight_N8 = grid.levels[-1], grid.coarsest_cells, grid.weight_N8
+    place_N83 = grid.coarsest_places
     moment_N83 = torch.linalg.cross(place_N83, output_N9[:, None, :3].expand_as(place_N83))
     square_N89 = (place_N83[..., :, None] * place_N83[..., None, :]).flatten(2)
     value_N8K = torch.cat([output_N9, torch.ones_like(output_N9[:, :1])], dim=-1)[:, None].expand(-1, 8, -1)
@@ -287,17 +278,6 @@ def balanced(output_N9: torch.Tensor, contacts: Contacts, grid: GridHierarchy) -
     own_N3 = (weight_N8 * own_C[cell_N8]).sum(1)[:, None] * output_N9[:, :3]
     change_N83 = change_C3[cell_N8] - torch.linalg.cross(turn_C3[cell_N8], place_N83 - centre_C3[cell_N8])
     return own_N3 + (weight_N8[..., None] * change_N83).sum(1)
-
-
-def coarsest_places(grid: GridHierarchy) -> torch.Tensor:
-    """Returns the particles' places relative to the centres of their `coarsest_cells`, in cell edges, [N, 8, 3]."""
-    corner_83 = CORNER_83.to(grid.fraction_N3)
-    place_N83, cell_N8 = grid.fraction_N3[:, None] - corner_83, grid.cell_N8
-    for level in grid.levels[:-1]:
-        assert level.parent_C is not None and level.octant_C is not None
-        place_N83 = 0.5 * (place_N83 + corner_83[level.octant_C[cell_N8]] - 0.5)
-        cell_N8 = level.parent_C[cell_N8]
-    return place_N83
 
 
 def inertia(spread_K33: torch.Tensor) -> torch.Tensor:

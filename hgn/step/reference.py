@@ -32,7 +32,7 @@ from hgn.network.base import ParticleNetwork, Prediction
 from hgn.network.cell_keys import COORDINATE_LIMIT, LARGEST_EXPORTED, find, pack, unique, unpack
 from hgn.network.features import ParticleState
 from hgn.network.grid import CORNER_83, GridHierarchy
-from hgn.network.relative import SMALLEST_MASS, coarsest_cells, coarsest_places, inertia, rotation
+from hgn.network.relative import SMALLEST_MASS, inertia, rotation
 from hgn.step_config import StepConfig
 
 SURE = 0.5  # smallest q at which rotation is removed in full
@@ -145,12 +145,12 @@ class Deformation:
     def __init__(
         self, touched_C: torch.Tensor, grid: GridHierarchy, shift: int = 0, share_N: torch.Tensor | None = None
     ) -> None:
-        cell_N8, corner_83 = coarsest_cells(grid), CORNER_83.to(grid.cell_N8)
+        cell_N8, corner_83 = grid.coarsest_cells, CORNER_83.to(grid.cell_N8)
         gate_N = (grid.weight_N8 * touched_C[cell_N8]).sum(1)
         if share_N is not None:
             gate_N = share_N * gate_N
         scene_N, coordinate_N3 = unpack(grid.levels[-1].key_C[cell_N8[:, 0]])
-        place_N3 = coarsest_places(grid)[:, 0]
+        place_N3 = grid.coarsest_places[:, 0]
         low_N3 = torch.floor(place_N3)
         low_N3, place_N3 = coordinate_N3 + low_N3.long(), place_N3 - low_N3
         wide_N3 = low_N3 >> shift

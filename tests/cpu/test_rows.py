@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from hgn.cpu import compiled
-from hgn.cpu.compiled import CompiledRows, describe, rows_class, unsupported_reason
+from hgn.cpu.compiled import CompiledRows, compiled_rows, describe, rows_class, unsupported_reason
 from hgn.cpu.rows import Hidden, Rows, Segments
 from hgn.network.mlp import MLP
 
@@ -168,4 +168,25 @@ def test_compiled_once(monkeypatch, tmp_path):
         raise AssertionError("compiled again")
 
     monkeypatch.setattr(subprocess, "run", run)
-    assert rows_class(16, torch.float32) is CompiledRows
+    assert rows_class(16, torch.float32) is compiled_rows
+
+
+@pytest.mark.skipif(NO_COMPILER is not None, reason=str(NO_COMPILER))
+def test_compiled_rows_follow_their_parameters():
+    """The rows of a network are made once, and compute with its present parameters: after updates in place, after
+    other parameters took their places."""
+    network = fcn_of(16)
+    hidden = hidden_of(7, 16, 2, value=True)
+    rows = compiled_rows(network)
+    for change in (
+        lambda: network.second.weight.mul_(1.5),
+        lambda: network.first.bias.add_(0.3),
+        lambda: setattr(network.norm, "weight", torch.nn.Parameter(torch.rand(16), requires_grad=False)),
+    ):
+        change()
+        out_RW = torch.empty(7, 16)
+        compiled_rows(network).output(out_RW, hidden)
+        assert_close(out_RW, expected_outputs(network, hidden))
+    assert compiled_rows(network) is not rows
+    network.second.bias.zero_()
+    assert compiled_rows(network) is compiled_rows(network)
