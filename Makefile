@@ -37,20 +37,19 @@ $(VENV)/.demo: pyproject.toml constraints.txt | $(VENV)/.created
 	@touch $@
 
 demo: $(VENV)/.demo
-	@echo "== 1 of 4: generating MPM episodes and training on them"
+	@echo "== 1 of 4: generating MPM episodes, and training the shipped network obstacles_small further on them"
 	$(RUN) -m hgn.train +experiment=demo
 	@echo "== 2 of 4: exporting inference weights"
 	$(RUN) -m hgn.export checkpoint=$(DEMO)/checkpoints/best.ckpt out=$(DEMO)/weights.safetensors
 	@echo "== 3 of 4: simulating a validation scene beside its ground truth"
-	$(RUN) -m hgn.rollout weights=$(DEMO)/weights.safetensors data=data/demo episode=validation-000000 frames=31 out=$(DEMO)/rollout.vtkhdf
+	$(RUN) -m hgn.rollout weights=$(DEMO)/weights.safetensors data=data/demo episode=validation-000000 frames=40 out=$(DEMO)/rollout.vtkhdf
 	$(RUN) -m tools.render rollout=$(DEMO)/rollout.vtkhdf out=$(DEMO)/pictures every=2
 	@echo "== 4 of 4: errors"
 	$(RUN) -m hgn.evaluate weights=$(DEMO)/weights.safetensors data=data/demo json=$(DEMO)/errors.json
 	@echo "weights: $(DEMO)/weights.safetensors"
 	@echo "rollout: $(DEMO)/rollout.vtkhdf (HDF5; ParaView opens it)"
-	@echo "picture: $(DEMO)/pictures/rollout.png, moving: $(DEMO)/pictures/rollout.gif: half a second of a scene that the"
-	@echo "network was not trained on. Above what it predicts, below what the solver computed: bodies should fall, meet"
-	@echo "and spread alike. It has seen 16 scenes; the shipped weights have seen thousands (python -m hgn.rollout)."
+	@echo "picture: $(DEMO)/pictures/rollout.png, moving: $(DEMO)/pictures/rollout.gif: a scene that the network was not"
+	@echo "trained on; above its prediction, below the solver: bodies fall, meet on the obstacle, and spread over the floor alike."
 
 test: setup
 	@echo "about 12 minutes on two free cores; at the end: which tests were skipped, and why (no GPU, no namespaces, ...)"
