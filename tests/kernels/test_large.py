@@ -13,7 +13,7 @@ from hgn.kernels import forward
 from hgn.kernels.blocks import elements
 from hgn.network.features import ParticleState
 from hgn.runtime.parity import relative_error
-from hgn.runtime.triton_stepper import TritonStepper
+from hgn.runtime.triton_stepper import TritonStepper, first_capacities
 from hgn.schema import ConfigError
 from tools.bench.contenders import BOUNDS, bench_network
 from tools.bench.states import Workload, state_of
@@ -64,6 +64,16 @@ def test_too_many_are_refused(scene, message, monkeypatch):
     monkeypatch.setattr(forward, "ADDRESSED", 16 * 24)
     with pytest.raises(ConfigError, match=message + "; take fewer at once"):
         TritonStepper(bench_network(NETWORK, CPU), states()[scene], "fp32")
+
+
+def test_first_room():
+    """Groups that fall have room to spread at once, up to what their particles can fill; where cells are many already
+    there is twice the room, and where they are so many that memory counts, a quarter more."""
+    assert first_capacities((246, 53, 18, 5), 2_763) == (1_657, 276, 96, 40)
+    assert first_capacities((1_398, 214, 56, 8), 4_296)[:2] == (2_796, 429)
+    assert first_capacities((128_529, 23_263, 4_373, 612), 400_000) == (160_661, 32_768, 8_192, 1_224)
+    assert first_capacities((65_536, 16_385), 400_000) == (131_072, 32_768)
+    assert first_capacities((8,) * 5, 1) == (256, 128, 64, 32, 16)
 
 
 @triton.jit

@@ -305,16 +305,6 @@ def test_scenes_that_are_reset():
     assert paths[0][-1].scene_N.tolist() == [0, 0, 1, 2, 2, 2, 2]
 
 
-def test_first_room():
-    """Groups that fall have room to spread at once, up to what their particles can fill; where cells are many already
-    there is twice the room, and where they are so many that memory counts, a quarter more."""
-    assert first_capacities((246, 53, 18, 5), 2_763) == (1_657, 276, 96, 40)
-    assert first_capacities((1_398, 214, 56, 8), 4_296)[:2] == (2_796, 429)
-    assert first_capacities((128_529, 23_263, 4_373, 612), 400_000) == (160_661, 32_768, 8_192, 1_224)
-    assert first_capacities((65_536, 16_385), 400_000) == (131_072, 32_768)
-    assert first_capacities((8,) * 5, 1) == (256, 128, 64, 32, 16)
-
-
 @pytest.mark.parametrize(("particles", "side", "most"), [(1_000_000, 128, 2.35e9), (4_296, 48, 0.055e9)])
 def test_memory_of_a_simulation(particles, side, most, monkeypatch):
     """In fp16 the network of the paper's size simulates a million particles, of which a cell has three as on

@@ -12,6 +12,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -45,19 +46,25 @@ class Viewer:
     async def act(self, address, until):
         """Connects, acts for a while and leaves, until the time is over."""
         while time.monotonic() < until:
-            url, protocol = address.replace("http", "ws"), f"viser-v{viser.__version__}"
-            async with connect(url, subprotocols=[protocol], max_size=None, compression=None) as self.socket:
-                listening = asyncio.create_task(self.listen())
-                await self.send(messages.ViewerCameraMessage(
-                    (1.0, 0.0, 0.0, 0.0), (0.5, 0.9, 2.0), 1.0, 0.01, 100.0, 600, 900, (0.5, 0.4, 0.5), (0.0, 1.0, 0.0)
-                ))  # fmt: skip
+            async with self.connected(address):
                 leave = min(until, time.monotonic() + self.random.uniform(20, 60))
                 while time.monotonic() < leave:
                     if self.paused:
                         await self.press("Pause")  # which goes on
                     await self.random.choice((self.drag, self.drag, self.turn, self.pour, self.drop, self.upload,
                                               self.upload, self.press, self.set_gravity))()  # fmt: skip
-                listening.cancel()
+
+    @asynccontextmanager
+    async def connected(self, address):
+        """Listens, after it has told of its camera."""
+        url, protocol = address.replace("http", "ws"), f"viser-v{viser.__version__}"
+        async with connect(url, subprotocols=[protocol], max_size=None, compression=None) as self.socket:
+            listening = asyncio.create_task(self.listen())
+            await self.send(messages.ViewerCameraMessage(
+                (1.0, 0.0, 0.0, 0.0), (0.5, 0.9, 2.0), 1.0, 0.01, 100.0, 600, 900, (0.5, 0.4, 0.5), (0.0, 1.0, 0.0)
+            ))  # fmt: skip
+            yield
+            listening.cancel()
 
     async def send(self, message):
         self.sent += 1

@@ -1,7 +1,9 @@
 """The page in a real browser, headless, one session of it for all tests; skipped where there is none."""
 
+import asyncio
 import errno
 import io
+import random
 import re
 import shutil
 import threading
@@ -9,6 +11,7 @@ import time
 import urllib.error
 import urllib.request
 import zipfile
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
@@ -19,6 +22,7 @@ import torch
 import yaml
 from network.states import network_of, silent
 from PIL import Image
+from processes import PATIENCE_S
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
@@ -31,6 +35,8 @@ from hgn.scene.scene_file import load_scene
 from hgn.scene.shapes import shape_obstacle
 
 pytest.importorskip("viser", reason="viser is not installed: pip install 'hgn[play]'")
+from viewer import soak
+
 from hgn.schema import ConfigError
 from hgn.viewer.film import film_html
 from hgn.viewer.page import PlayPage
@@ -47,7 +53,8 @@ pytestmark = pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::pyte
 
 def floating():
     """Relative inputs and an output of zero: particles without gravity stay where they are."""
-    return Simulator(silent(network_of(torch.float32, width=16, levels=2, inputs="relative")), 60.0, "cpu")
+    small = {"width": 16, "levels": 1, "message_passing_steps": 1}
+    return Simulator(silent(network_of(torch.float32, **small, inputs="relative")), 60.0, "cpu")
 
 
 @pytest.fixture(scope="module")
@@ -58,7 +65,7 @@ def play():
     scene = Scene(block_N3, 0 * block_N3, np.zeros(600, np.uint8), (cone,), cell_size=1 / 32, gravity=still)
     session = PlaySession(floating(), scene, weights="floating")
     page = PlayPage(session, ("floating", "other"), lambda name: floating(), port=0)
-    page.rate = 20.0  # frames a second: simulation and browser share a core
+    page.rate = 8.0  # frames a second: simulation and browser share a core
     thread = threading.Thread(target=page.run)
     thread.start()
     yield page
@@ -92,7 +99,7 @@ def opened(browser, address):
     page.set_default_timeout(300_000)
     page.goto(address)
     page.wait_for_selector("canvas")
-    until(lambda: len(np.unique(pixels(page) @ (65536, 256, 1))) > 50)
+    until(lambda: len(np.unique(pixels(page) @ (65536, 256, 1))) > 50, every=0.5)
     return page
 
 
@@ -100,19 +107,30 @@ def pixels(page):
     return np.asarray(Image.open(io.BytesIO(page.screenshot(scale="css"))).convert("RGB")).astype(int)
 
 
-def until(condition, seconds=300.0):
+def until(condition, every=0.05):
     """Waits for a condition, patiently: the browser draws on a shared core."""
-    end = time.monotonic() + seconds
-    while not (met := condition()):
+    end = time.monotonic() + PATIENCE_S
+    while not condition():
         assert time.monotonic() < end, "it did not come"
-        time.sleep(0.1)
-    return met
+        time.sleep(every)
 
 
-def blue(page):
-    """Pixels of water."""
-    red, green, blue = np.moveaxis(pixels(page), -1, 0)
-    return int(((blue > red + 60) & (blue > green + 25)).sum())
+def done(page, action):
+    """Done between two frames, and the frame behind it, too."""
+    for each in (action, lambda: None):
+        over = threading.Event()
+        page.do(lambda each=each, over=over: (each(), over.set()))
+        assert over.wait(PATIENCE_S)
+
+
+def until_blue(page):
+    """Waits until more than 300 pixels are water's."""
+
+    def drawn():
+        red, green, blue = np.moveaxis(pixels(page), -1, 0)
+        return ((blue > red + 60) & (blue > green + 25)).sum() > 300
+
+    until(drawn, every=0.5)
 
 
 def on_screen(play, point):
@@ -128,26 +146,19 @@ def on_screen(play, point):
     return SIZE[0] / 2 + scale * (offset @ right), SIZE[1] / 2 - scale * (offset @ np.cross(right, forward))
 
 
-def drag(page, begin, end, key=None):
-    """A mouse's way in steps that the page cannot miss, with the button held."""
+def drag(page, begin, end, key=None, held_until=lambda: True):
+    """A mouse's way in steps that the page cannot miss, with the button held until a condition is met."""
     if key:
         page.keyboard.down(key)
     page.mouse.move(*begin)
     page.mouse.down()
-    for share in np.linspace(0, 1, 12):
+    for share in np.linspace(0, 1, 6):
         page.mouse.move(*(a + share * (b - a) for a, b in zip(begin, end, strict=True)))
         page.wait_for_timeout(50)
+    until(held_until)
     page.mouse.up()
     if key:
         page.keyboard.up(key)
-
-
-def after_actions(play, value):
-    """Returns a value as it is once the loop has done what viewers have asked so far."""
-    values = []
-    play.do(lambda: values.append(value()))
-    until(lambda: values)
-    return values[0]
 
 
 def press(page, name):
@@ -156,7 +167,7 @@ def press(page, name):
 
 def test_points_are_drawn(viewer, play):
     """The page shows the water where the camera sees it, the numbers of particles and frames a second."""
-    until(lambda: blue(viewer) > 300)
+    until_blue(viewer)
     x, y = (int(value) for value in on_screen(play, (0.5, 0.56, 0.5)))
     around = pixels(viewer)[y - 60 : y + 60, x - 60 : x + 60]
     assert ((around[..., 2] > around[..., 0] + 60).mean()) > 0.02
@@ -168,12 +179,12 @@ def test_a_drag_with_shift_pours(viewer, play):
     sliders: Any = play
     sliders.speed.value, sliders.diameter.value = 0.2, 0.2  # slow: nothing stops it before it is out of the domain
     begin, end = on_screen(play, (0.28, 0.0, 0.3)), on_screen(play, (0.32, 0.0, 0.3))
-    drag(viewer, begin, end, "Shift")
-    until(lambda: play.session.spout is None and len(play.session.newest.position_N3) > 610)
+    drag(viewer, begin, end, "Shift", lambda: len(play.session.newest.position_N3) > 610)
+    until(lambda: play.session.spout is None)
+    done(play, lambda: None)
     count, frame = len(play.session.newest.position_N3), play.session.frame
-    until(lambda: play.session.frame > frame + 10)
-    play.do(lambda: setattr(play, "playing", False))
-    until(lambda: not play.playing)
+    until(lambda: play.session.frame > frame + 3)
+    done(play, lambda: play.play(False))
     assert len(play.session.newest.position_N3) == count
     poured_A3 = play.session.newest.position_N3[600:]
     assert (np.abs(poured_A3[:, [0, 2]] - (0.3, 0.3)) < 0.15).all()
@@ -209,18 +220,21 @@ def test_pause_step_and_back(viewer, play):
     until(lambda: not play.playing)
     frame = play.session.frame
     press(viewer, "Step")
-    until(lambda: play.session.frame == frame + 1)
-    viewer.wait_for_timeout(300)
-    assert play.session.frame == frame + 1  # and no more
+    until(lambda: play.session.frame > frame)
+    done(play, lambda: None)
+    assert play.session.frame == frame + 1
     press(viewer, "a frame")
     until(lambda: play.session.frame == frame)
     press(viewer, "Play")
-    until(lambda: play.session.frame > max(frame + 3, 45))
+    until(lambda: play.session.frame > 2 * play.rate + 1)
     press(viewer, "1 s")
     until(lambda: not play.playing)
-    frame = after_actions(play, lambda: play.session.frame)
+    done(play, lambda: None)
+    frame = play.session.frame
     press(viewer, "1 s")
-    until(lambda: play.session.frame == frame - 20)
+    until(lambda: play.session.frame == frame - play.rate)
+    done(play, lambda: None)
+    assert play.session.frame == frame - play.rate
     press(viewer, "Play")
     until(lambda: play.playing)
 
@@ -260,19 +274,30 @@ def test_own_meshes(viewer, play):
     until(lambda: len(play.session.obstacles) == count)
 
 
-def test_two_viewers_and_a_lost_connection(browser, viewer, play):
-    """A second viewer sees the same scene; when all connections break the scene goes on, and both come back to it."""
-    second = opened(browser, play.address)
-    until(lambda: len(play.server.get_clients()) == 2 and blue(second) > 300)
-    frame, lost = play.session.frame, set(play.server.get_clients())
-    play.server._websock_server.disconnect_all_clients()
-    until(lambda: len(play.server.get_clients()) == 2 and not lost & set(play.server.get_clients()))
-    until(lambda: play.session.frame > frame)
-    press(second, "Pause")
+def test_two_viewers_and_a_lost_connection(viewer, play):
+    """A second viewer, without a browser, is sent the same scene and pauses for both; when all connections break the
+    scene goes on, and the page comes back to it."""
+    second = soak.Viewer(random.Random(0))
+
+    async def pause():
+        async with second.connected(play.address):
+            while not second.frames:
+                await asyncio.sleep(0.05)
+            await second.press("Pause")
+
+    with ThreadPoolExecutor(1) as pool:
+        pool.submit(asyncio.run, pause()).result()
     until(lambda: not play.playing)
     until(lambda: "Play" in viewer.inner_text("body").splitlines())
-    until(lambda: blue(viewer) > 300 and blue(second) > 300)
-    second.context.close()
+    press(viewer, "Play")
+    until(lambda: play.playing)
+    frame, lost = play.session.frame, set(play.server.get_clients())
+    play.server._websock_server.disconnect_all_clients()
+    until(lambda: play.server.get_clients().keys() - lost)
+    until(lambda: play.session.frame > frame)
+    press(viewer, "Pause")
+    until(lambda: not play.playing)
+    until_blue(viewer)
 
 
 def test_who_may_read_the_page(play):
@@ -315,12 +340,10 @@ def test_stage():
 
 def test_a_film_plays_by_itself(browser, play, tmp_path):
     """The static page draws the rollout's particles without any server."""
-    play.do(lambda: setattr(play, "playing", False))
-    until(lambda: not play.playing)
     path = tmp_path / "film.html"
     path.write_text(film_html(play.session.rollout(), every=10))
     page = opened(browser, path.as_uri())
-    until(lambda: blue(page) > 300)
+    until_blue(page)
     page.context.close()
 
 
@@ -335,31 +358,24 @@ def test_it_begins_when_somebody_looks_and_restarts_as_it_was():
     def full():
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    def done(action):
-        """Done between two frames, and the frame behind it, too."""
-        for each in (action, lambda: None):
-            over = threading.Event()
-            page.do(lambda each=each, over=over: (each(), over.set()))
-            assert over.wait(300)
-
     try:
-        done(lambda: None)
+        done(page, lambda: None)
         assert session.frame == 0 and page.playing
         page.viewed.set()
         until(lambda: session.frame > 0)
-        done(lambda: session.drop("water", (0.3, 0.8, 0.3), 0.1, speed=600.0))
+        done(page, lambda: session.drop("water", (0.3, 0.8, 0.3), 0.1, speed=600.0))
         until(lambda: page.diverged)
         assert not page.playing
-        done(page.restart)
+        done(page, page.restart)
         assert page.playing and not page.diverged
         until(lambda: session.frame > 1)
-        done(lambda: page.play(False))
-        done(page.restart)
+        done(page, lambda: page.play(False))
+        done(page, page.restart)
         assert not page.playing and session.frame == 0
         notes: list[str] = []
         page._notify = lambda message, client=None: notes.append(message)  # type: ignore[method-assign]
         page.do(full)
-        done(lambda: None)
+        done(page, lambda: None)
         assert notes == ["[Errno 28] No space left on device"] and thread.is_alive()
     finally:
         page.ended.set()
