@@ -33,6 +33,10 @@ class EpisodeEntry:
     frames: int
     members: dict[str, tuple[int, int]]  # offset in the tar and size, by the name after `<key>.`
 
+    def __post_init__(self) -> None:
+        counts = [self.particles, self.frames]
+        require(min(counts) >= 0 and max(counts) < 2**31, "particles, frames", "from 0 to 2147483647", counts)
+
 
 @dataclass(frozen=True)
 class ShardEntry:

@@ -34,11 +34,15 @@ def locate_members(path: Path) -> dict[str, dict[str, tuple[int, int]]]:
     Raises: ConfigError if the file is not a complete tar.
     """
     located: dict[str, dict[str, tuple[int, int]]] = {}
+    size = path.stat().st_size
     try:
         with tarfile.open(path, mode="r:") as tar:
             for info in tar:
+                if not 0 <= info.size <= size:
+                    raise tarfile.ReadError(f"{info.name} of {info.size} bytes")
                 key, _, name = info.name.partition(".")
                 located.setdefault(key, {})[name] = (info.offset_data, info.size)
-    except (tarfile.TarError, RecursionError, MemoryError) as error:  # long names in a row raise MemoryError
+    # numbers in headers raise any of these, and long names in a row MemoryError
+    except (tarfile.TarError, ValueError, LookupError, ArithmeticError, RecursionError, MemoryError) as error:
         raise ConfigError(f"{path} must be a whole tar, got {error}; delete it and run the generator again") from None
     return located

@@ -19,7 +19,7 @@ from hgn.config import NetworkConfig
 from hgn.network.base import ParticleNetwork
 from hgn.network.build import build_network
 from hgn.renamed import REMOVED_CHOICES, current_names, with_step
-from hgn.schema import ConfigError, OrdinarySize, from_mapping, require, require_bounds, to_mapping
+from hgn.schema import ConfigError, NonNegative, OrdinarySize, Vector, from_mapping, require, require_bounds, to_mapping
 from hgn.step_config import StepConfig
 from hgn.system.claims import Claims
 from hgn.system.files import make_folder, write_atomically
@@ -37,9 +37,9 @@ class WeightsInfo:
     network: NetworkConfig
     frame_rate_hz: OrdinarySize  # frame rate of the data; a step of the network is one frame
     obstacle_cell_size: OrdinarySize
-    gravity: tuple[float, float, float] = (0.0, -9.8, 0.0)  # gravity of the data; absolute inputs support no other
+    gravity: Vector = (0.0, -9.8, 0.0)  # gravity of the data; absolute inputs support no other
     # largest initial speed of the data's groups, domain units per second; null: unknown
-    maximum_initial_speed: float | None = None
+    maximum_initial_speed: NonNegative[float] | None = None
     format_version: int = FORMAT_VERSION
     step: StepConfig = field(default_factory=StepConfig)  # constraints of each frame
     updates: int = 0  # number of updates of the training

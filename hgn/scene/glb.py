@@ -9,6 +9,7 @@ import base64
 import json
 import re
 import struct
+from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -23,6 +24,8 @@ INSTANCES = "EXT_mesh_gpu_instancing"
 READ = (INSTANCES, "KHR_mesh_quantization")  # extensions that change geometry
 NEUTRAL = re.compile(r"[A-Z]+_(materials|texture|lights|xmp|animation|audio)\w*")  # extensions that do not
 TRIANGLES, STRIP, FAN = 4, 5, 6  # modes of primitives; the other modes are points and lines
+COPIES = 3  # of vertices and triangles, that the search for closed bodies makes
+LEAST_BYTES = 1024  # claim of a primitive without content, because each takes time
 _TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 
@@ -41,7 +44,7 @@ def read_glb(path: Path) -> tuple[np.ndarray, np.ndarray]:
     vertices, triangles, vertex_count = [np.zeros((0, 3))], [np.zeros((0, 3), np.int64)], 0
     for mesh, weights, place_M44 in file.placed():
         for position_V3, triangle_F3 in file.surfaces(mesh, weights):
-            claims.add("its nodes", len(place_M44), position_V3.nbytes + triangle_F3.nbytes)
+            claims.add("its nodes", COPIES, len(place_M44), LEAST_BYTES + position_V3.nbytes + triangle_F3.nbytes)
             for place_44 in place_M44:
                 vertices.append(position_V3 @ place_44[:3, :3].T + place_44[:3, 3])
                 triangles.append(triangle_F3 + vertex_count)
@@ -102,17 +105,17 @@ class _File:
             result.append((mesh, node.get("weights", mesh.get("weights", [])), place_M44))
         return result
 
-    def surfaces(self, mesh: dict[str, Any], weights: list[float]) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Returns positions [V, 3] and triangles [F, 3] of the primitives with triangles."""
-        result = []
+    def surfaces(self, mesh: dict[str, Any], weights: list[float]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        """Yields positions [V, 3] and triangles [F, 3] of the primitives with triangles."""
         for primitive in mesh["primitives"]:
+            self.claims.add("primitives", LEAST_BYTES)
             mode = primitive.get("mode", TRIANGLES)
             if mode not in (TRIANGLES, STRIP, FAN):
                 continue
             position_V3 = self.accessor(primitive["attributes"]["POSITION"]).astype(np.float64)
             for target, weight in zip(primitive.get("targets", ()), weights, strict=False):
                 if weight and "POSITION" in target:
-                    self.claims.add("morph targets", position_V3.nbytes)
+                    self.claims.add("morph targets", LEAST_BYTES + position_V3.nbytes)
                     position_V3 = position_V3 + weight * self.accessor(target["POSITION"])
             if "indices" in primitive:
                 index = self.accessor(primitive["indices"])[:, 0].astype(np.int64)
@@ -127,8 +130,7 @@ class _File:
                 triangle_F3[1::2] = triangle_F3[1::2, ::-1]
             else:
                 triangle_F3 = np.stack([np.full_like(index[2:], index[0]), index[1:-1], index[2:]], axis=1)
-            result.append((position_V3, triangle_F3))
-        return result
+            yield position_V3, triangle_F3
 
     def accessor(self, index: int) -> np.ndarray:
         """Returns the values of an accessor, [count, width]. Normalised integers become fractions."""
@@ -155,7 +157,7 @@ class _File:
     def _values(self, entry: dict[str, Any], dtype: np.dtype[Any], shape: tuple[int, int]) -> np.ndarray:
         view = self.tree["bufferViews"][entry["bufferView"]]
         start, offset = view.get("byteOffset", 0), entry.get("byteOffset", 0)
-        stride = view.get("byteStride") or shape[1] * dtype.itemsize
+        stride = max(view.get("byteStride", 0), shape[1] * dtype.itemsize)  # values never overlap
         data = self.buffer(view["buffer"])[start : start + view["byteLength"]]
         last = offset + (shape[0] - 1) * stride + shape[1] * dtype.itemsize
         if min(start, offset, stride, *shape) < 0 or (shape[0] and last > len(data)):

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     import h5py
 
 _DEPTH = 8  # largest depth of groups
+_CHUNK_BYTES = 512  # of HDF5's memory for a chunk of a few numbers
 # exceptions of h5py for damage, and of NumPy for a size in a damaged file
 _DAMAGE = (LookupError, OSError, ValueError, RuntimeError, TypeError, AttributeError, ArithmeticError, MemoryError)
 
@@ -67,4 +68,13 @@ def _require_own_data(group: h5py.Group, path: Path, claims: Claims, visited: se
                 raise ConfigError(f"{path}: {item.name} must lie in the file itself, got data of another file")
             if item.dtype.hasobject and item.size != 1:
                 raise ConfigError(f"{path}: {item.name} must be numbers, got texts of variable length")
-            claims.add(item.name, max(item.size or 0, math.prod(item.chunks or ())), item.dtype.itemsize)
+            chunk, shape = item.chunks or (), item.shape or ()
+            count = math.prod(-(-length // own) for length, own in zip(shape, chunk, strict=False)) if chunk else 1
+            size = item.dtype.itemsize * (math.prod(chunk) if chunk else item.size or 0)
+            claims.add(item.name, max(count, 1), max(size, _CHUNK_BYTES) if chunk else size)
+            plan, plain = item.id.get_create_plist(), (h5py.h5z.FILTER_SHUFFLE, h5py.h5z.FILTER_FLETCHER32)
+            packed = sum(plan.get_filter(i)[0] not in plain for i in range(plan.get_nfilters()))
+            stored = item.id.get_storage_size()  # HDF5 expands it without a limit
+            if packed > 1 or (packed and stored > 2 * count * size + (1 << 16)):
+                rule = f"compressed once, to fewer than its {count * size} bytes"
+                raise ConfigError(f"{path}: {item.name} must be {rule}, got {packed} filters, {stored} bytes")

@@ -24,6 +24,10 @@ from hgn.scene.surface import area_vectors
 from hgn.schema import ConfigError, Vector, require
 
 _ASCII_STL = re.compile(rb"\s*solid.*\n\s*(facet|endsolid)", re.IGNORECASE)
+# trimesh takes a millisecond for each solid and material
+_SOLIDS = re.compile(rb"^[ \t]*endsolid.*\n\s*solid.*\n", re.IGNORECASE | re.MULTILINE)
+_MATERIAL = re.compile(rb"^[ \t]*usemtl[ \t].*$", re.MULTILINE)
+MOST_MATERIALS = 10_000  # of a file whose triangles keep the order of its materials
 
 
 def load_mesh(path: str | Path, field: str = "mesh", **placing: Any) -> Obstacle:
@@ -88,6 +92,7 @@ def load_bodies(
     return tuple(parts)
 
 
+@np.errstate(all="ignore")  # numbers that are not finite are refused
 def _read(path: Path, field: str) -> tuple[np.ndarray, np.ndarray]:
     if not is_mesh_file(path):
         raise ConfigError(f"{field} must end in one of {', '.join(MESH_SUFFIXES)}, got {path}; convert the mesh")
@@ -120,11 +125,15 @@ def _read_polygons(path: Path) -> tuple[np.ndarray, np.ndarray]:
         return vertex_V3, trimesh.geometry.triangulate_quads(faces).reshape(-1, 3) if cut_F3 is None else cut_F3
     if kind == "stl" and not _ASCII_STL.match(data):
         data = data[: 84 + 50 * int.from_bytes(data[80:84], "little")]  # some programs append bytes to the triangles
+    elif kind == "stl":
+        data = _SOLIDS.sub(b"", data)
     if kind == "obj":
         data = plain_obj(data)
         vertex_V3, faces = polygons_of_obj(data)
         if (cut_F3 := concave_cut(vertex_V3, faces)) is not None:
             return vertex_V3, cut_F3
+        if len(set(_MATERIAL.findall(data))) > MOST_MATERIALS:
+            data = _MATERIAL.sub(b"", data)
     # trimesh's processing would silently remove vertices that are not finite
     mesh = trimesh.load_scene(io.BytesIO(data), file_type=kind, process=False, skip_materials=True).to_mesh()
     return np.array(mesh.vertices, np.float64).reshape(-1, 3), np.array(mesh.faces, np.int64).reshape(-1, 3)

@@ -6,6 +6,8 @@ Shape legend: V vertices, K corners of a polygon, M polygons with the same numbe
 from __future__ import annotations
 
 import re
+import struct
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -17,11 +19,15 @@ _JOINED = re.compile(rb"\\\r?\n")
 _COMMENT = re.compile(rb"[ \t]#.*")
 _INDICES = ("vertex_indices", "vertex_index")  # usual names of the property with a face's vertices
 _TYPES = {
-    **dict.fromkeys(("char", "int8"), "i1"), **dict.fromkeys(("uchar", "uint8"), "u1"),
-    **dict.fromkeys(("short", "int16"), "i2"), **dict.fromkeys(("ushort", "uint16"), "u2"),
-    **dict.fromkeys(("int", "int32"), "i4"), **dict.fromkeys(("uint", "uint32"), "u4"),
-    **dict.fromkeys(("float", "float32"), "f4"), **dict.fromkeys(("double", "float64"), "f8"),
-}  # fmt: skip
+    **dict.fromkeys(("char", "int8"), "b"),
+    **dict.fromkeys(("uchar", "uint8"), "B"),
+    **dict.fromkeys(("short", "int16"), "h"),
+    **dict.fromkeys(("ushort", "uint16"), "H"),
+    **dict.fromkeys(("int", "int32"), "i"),
+    **dict.fromkeys(("uint", "uint32"), "I"),
+    **dict.fromkeys(("float", "float32"), "f"),
+    **dict.fromkeys(("double", "float64"), "d"),
+}  # fmt: skip; of struct and NumPy
 
 
 def plain_obj(data: bytes) -> bytes:
@@ -63,7 +69,7 @@ def polygons_of_ply(data: bytes) -> tuple[np.ndarray, list[np.ndarray]]:
         names = [entry[-1] for entry in properties]
         columns = numbers.columns(count, properties)
         if name == "vertex":
-            vertex_V3 = np.stack([columns[names.index(axis)] for axis in "xyz"], axis=1)
+            vertex_V3 = np.stack([columns[names.index(axis)] for axis in "xyz"], axis=1, dtype=np.float64)
         elif name == "face":
             lists = [entry[-1] for entry in properties if entry[0] == "list"]
             given = next((name for name in (*_INDICES, *lists) if name in names), "vertex_indices")
@@ -112,11 +118,20 @@ class _Numbers:
         row: list[Any] = []
         for *kind, _ in properties:
             if len(kind) == 1:
-                row.append(self._take(1, kind)[0, 0])
+                row += self._few(1, kind[0])
             else:
-                length = int(self._take(1, kind[1:2])[0, 0])
-                row.append(self._take(length, kind[2:])[:, 0])
+                row.append(self._few(int(*self._few(1, kind[1])), kind[2]))
         return row
+
+    def _few(self, count: int, kind: str) -> Sequence[float]:
+        """Returns the next numbers of one kind. Raises: ValueError at the file's end; struct.error for a bad count."""
+        if not self.order:
+            return self._take(count, [kind])[:, 0].tolist()
+        start, form = self.place, f"{self.order}{count}{_TYPES[kind]}"
+        self.place += struct.calcsize(form)
+        if self.place > len(self.bytes):
+            raise ValueError("it is cut")
+        return struct.unpack_from(form, self.bytes, start)
 
     def _take(self, count: int, kinds: list[str]) -> np.ndarray:
         """Returns the next numbers, float64 [count, kinds]. Raises: ValueError at the end of the file."""
@@ -143,77 +158,107 @@ def concave_cut(vertex_V3: np.ndarray, faces: list[np.ndarray]) -> np.ndarray | 
     concave = _concave(vertex_V3, faces)
     if not concave:
         return None
-    if sum(len(faces[number]) ** 2 for number in concave) > MAXIMUM_CORNERS**2:
-        largest = max(len(faces[number]) for number in concave)
-        raise ValueError(f"it has {len(concave)} concave faces, of up to {largest} corners; cut them into triangles")
+    if sum(face_MK.size * face_MK.shape[1] for _, face_MK in concave) > MAXIMUM_CORNERS**2:
+        count, largest = sum(len(face_MK) for _, face_MK in concave), max(face_MK.shape[1] for _, face_MK in concave)
+        raise ValueError(f"it has {count} concave faces, of up to {largest} corners; cut them into triangles")
+    cut: dict[int, np.ndarray] = {}
+    for number_M, face_MK in concave:
+        corner_MF3 = _ears(_flattened(vertex_V3[face_MK]), number_M)
+        cut |= zip(number_M.tolist(), np.take_along_axis(face_MK[:, None], corner_MF3, axis=2), strict=True)
     pieces = []
     for number, face in enumerate(faces):
-        if number in concave:
-            pieces.append(face[_ears(_flattened(vertex_V3[face]), number)])
+        if number in cut:
+            pieces.append(cut[number])
         elif len(face) > 2:
             pieces.append(np.stack([np.full(len(face) - 2, face[0]), face[1:-1], face[2:]], axis=1))
     return np.concatenate(pieces)
 
 
-def _concave(vertex_V3: np.ndarray, faces: list[np.ndarray]) -> set[int]:
-    """Returns the numbers of the concave faces."""
-    sizes, result = np.array([len(face) for face in faces], np.int64), set()
+def _concave(vertex_V3: np.ndarray, faces: list[np.ndarray]) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Returns numbers [M] and vertices [M, K] of the concave faces, for each number of corners that occurs."""
+    sizes, result = np.array([len(face) for face in faces], np.int64), []
     for size in np.unique(sizes[sizes > 3]):
         number_M = np.flatnonzero(sizes == size)
         face_MK = np.stack([faces[number] for number in number_M])
         if face_MK.min() < 0 or face_MK.max() >= len(vertex_V3):
-            return set()  # other code refuses such a file
+            return []  # other code refuses such a file
         point_MK3 = vertex_V3[face_MK]
         edge_MK3 = np.roll(point_MK3, -1, axis=1) - point_MK3
         turn_MK3 = np.cross(np.roll(edge_MK3, 1, axis=1), edge_MK3)
-        # Newell's normal relative to the first corner, which keeps it exact far from the origin
-        local_MK3 = point_MK3 - point_MK3[:, :1]
-        normal_M3 = np.cross(local_MK3, np.roll(local_MK3, -1, axis=1)).sum(axis=1)
+        normal_M3 = _normals(point_MK3)
         inward_MK = np.einsum("mka,ma->mk", turn_MK3, normal_M3)
         bad_M = (inward_MK < -FLAT * (normal_M3**2).sum(axis=1)[:, None]).any(axis=1)
-        result |= set(number_M[bad_M].tolist())
+        if bad_M.any():
+            result.append((number_M[bad_M], face_MK[bad_M]))
     return result
 
 
-def _flattened(point_K3: np.ndarray) -> np.ndarray:
-    """Returns a polygon projected along its normal, counterclockwise, float64 [K, 2]."""
-    local_K3 = point_K3 - point_K3[0]
-    normal_3 = np.cross(local_K3, np.roll(local_K3, -1, axis=0)).sum(axis=0)
-    normal_3 = normal_3 / max(float(np.linalg.norm(normal_3)), 1e-300)
-    first_3 = np.cross(np.eye(3)[np.argmin(np.abs(normal_3))], normal_3)
-    first_3 /= max(float(np.linalg.norm(first_3)), 1e-300)
-    return np.stack([local_K3 @ first_3, local_K3 @ np.cross(normal_3, first_3)], axis=1)
+def _normals(point_MK3: np.ndarray) -> np.ndarray:
+    """Returns Newell's normals relative to the first corner, which keeps them exact far from the origin."""
+    local_MK3 = point_MK3 - point_MK3[:, :1]
+    return np.asarray(np.cross(local_MK3, np.roll(local_MK3, -1, axis=1)).sum(axis=1))
 
 
-def _ears(point_K2: np.ndarray, number: int) -> np.ndarray:
-    """Returns the triangles of a polygon, corners int [K - 2, 3]. Repeatedly cuts off a corner that contains no other.
+def _flattened(point_MK3: np.ndarray) -> np.ndarray:
+    """Returns polygons projected along their normals, counterclockwise, float64 [M, K, 2]."""
+    normal_M3 = _unit(_normals(point_MK3))
+    first_M3 = _unit(np.cross(np.eye(3)[np.argmin(np.abs(normal_M3), axis=1)], normal_M3))
+    local_MK3 = point_MK3 - point_MK3[:, :1]
+    axes = (first_M3, np.cross(normal_M3, first_M3))
+    return np.concatenate([local_MK3 @ axis_M3[:, :, None] for axis_M3 in axes], axis=2)
+
+
+def _unit(vector_M3: np.ndarray) -> np.ndarray:
+    length_M1 = np.sqrt(vector_M3[:, None] @ vector_M3[:, :, None])[:, 0]
+    return np.asarray(vector_M3 / np.maximum(length_M1, 1e-300))
+
+
+def _ears(point_MK2: np.ndarray, number_M: np.ndarray) -> np.ndarray:
+    """Returns the triangles of polygons, corners int [M, K - 2, 3]. Cuts off corners that contain no other, one by one.
 
     Corners on a straight line become triangles without area, so that neighbouring faces still share their edges.
     """
-    rest, ears = list(range(len(point_K2))), []
-    area = float(_cross(point_K2, np.roll(point_K2, -1, axis=0)).sum())
-    edge_K2 = np.roll(point_K2, -1, axis=0) - point_K2
-    side_KK = _cross(edge_K2[:, None], point_K2[None] - point_K2[:, None])  # side of edge i, at corner j
-    apart_KK = side_KK * np.roll(side_KK, -1, axis=1) < 0
-    if area <= 0 or (apart_KK & apart_KK.T).any():
-        raise ValueError(f"face {number} cannot be cut into triangles, because its edges cross")
-    while len(rest) > 3:
-        point_K2_left = point_K2[rest]
-        before, after = np.roll(point_K2_left, 1, axis=0), np.roll(point_K2_left, -1, axis=0)
-        turn_K = _cross(point_K2_left - before, after - point_K2_left)
+    count, size = point_MK2.shape[:2]
+    area_M = _cross(point_MK2, np.roll(point_MK2, -1, axis=1)).sum(axis=1)
+    edge_MK2 = np.roll(point_MK2, -1, axis=1) - point_MK2
+    side_MKK = _cross(edge_MK2[:, :, None], point_MK2[:, None] - point_MK2[:, :, None])  # side of edge i, at corner j
+    apart_MKK = side_MKK * np.roll(side_MKK, -1, axis=2) < 0
+    crossing_M = ~(area_M > 0) | (apart_MKK & apart_MKK.transpose(0, 2, 1)).any(axis=(1, 2))
+    _require_none(number_M[crossing_M], "cross")
+    rest_ML, ears = np.tile(np.arange(size), (count, 1)), []
+    row_M, blocker_MK = np.arange(count), np.full((count, size), -1)  # a corner inside each corner's triangle, if known
+    for left in range(size, 3, -1):
+        point_ML2 = np.take_along_axis(point_MK2, rest_ML[:, :, None], axis=1)
+        corner_3ML2 = np.stack([np.roll(point_ML2, 1, axis=1), point_ML2, np.roll(point_ML2, -1, axis=1)])
+        turn_ML = _cross(corner_3ML2[1] - corner_3ML2[0], corner_3ML2[2] - corner_3ML2[1])
         # widest ears first; triangles without area come last
-        for k in np.argsort(-turn_K, kind="stable"):
-            if turn_K[k] < -FLAT * area:
-                raise ValueError(f"face {number} cannot be cut into triangles, because its edges touch")
-            a, b, c = before[k], point_K2_left[k], after[k]
-            same_K = (point_K2_left[:, None] == np.stack([a, b, c])).all(axis=2).any(axis=1)
-            others = point_K2_left[~same_K]
-            sides = [_cross(end - start, others - start) for start, end in ((a, b), (b, c), (c, a))]
-            if turn_K[k] <= FLAT * area or not (np.minimum.reduce(sides) >= 0).any():
-                ears.append([rest[k - 1], rest[k], rest[(k + 1) % len(rest)]])
-                del rest[k]
-                break
-    return np.array([*ears, rest])
+        order_ML = np.argsort(-turn_ML, axis=1, kind="stable")
+        blocked_ML = blocker_MK[row_M[:, None], np.take_along_axis(rest_ML, order_ML, axis=1)] >= 0
+        waiting, ear_M = row_M, np.zeros(count, np.int64)
+        while len(waiting):
+            rank = blocked_ML[waiting].argmin(axis=1)
+            k = order_ML[waiting, rank]
+            turn, flat, corner_3W2 = turn_ML[waiting, k], FLAT * area_M[waiting], corner_3ML2[:, waiting, k]
+            _require_none(number_M[waiting[blocked_ML[waiting, rank] | (turn < -flat)]], "touch")
+            others_WL2 = point_ML2[waiting]
+            inside_WL = np.ones(others_WL2.shape[:2], bool)
+            for start_W2, end_W2 in zip(corner_3W2, np.roll(corner_3W2, -1, axis=0), strict=True):
+                inside_WL &= _cross((end_W2 - start_W2)[:, None], others_WL2 - start_W2[:, None]) >= 0
+                inside_WL &= (others_WL2 != start_W2[:, None]).any(axis=2)
+            shut = (turn > flat) & inside_WL.any(axis=1)
+            ear_M[waiting[~shut]], waiting = k[~shut], waiting[shut]
+            blocked_ML[waiting, rank[shut]] = True
+            blocker_MK[waiting, rest_ML[waiting, k[shut]]] = rest_ML[waiting, inside_WL[shut].argmax(axis=1)]
+        ears.append(np.take_along_axis(rest_ML, (ear_M[:, None] + (-1, 0, 1)) % left, axis=1))
+        blocker_MK[row_M[:, None], ears[-1]] = -1  # whose triangles are others now
+        blocker_MK[blocker_MK == ears[-1][:, 1:2]] = -1
+        rest_ML = rest_ML[np.arange(left) != ear_M[:, None]].reshape(count, left - 1)
+    return np.stack([*ears, rest_ML], axis=1)
+
+
+def _require_none(number_M: np.ndarray, cause: str) -> None:
+    if len(number_M):
+        raise ValueError(f"face {number_M[0]} cannot be cut into triangles, because its edges {cause}")
 
 
 def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:

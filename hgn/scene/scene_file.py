@@ -253,6 +253,7 @@ def read_mapping(path: str | Path) -> dict[str, Any]:
     return dict(mapping)
 
 
+@np.errstate(all="ignore")  # numbers that are not finite are refused
 def scene_of(mapping: Mapping[str, Any], path: str | Path) -> Scene:
     """Returns the scene of a file's content. Meshes are relative to `path`. Raises: ConfigError as load_scene."""
     content = {key: value for key, value in mapping.items() if key != MEASURE}

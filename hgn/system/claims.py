@@ -41,13 +41,28 @@ class Claims:
 def require_plain_pickle(data: bytes, names: re.Pattern[str] = re.compile(".*")) -> None:
     """Checks the sizes in a pickle, for which Python allocates memory at once, and its calls (`module name`).
 
-    Raises ValueError for a pickle that is cut, has a memo larger than itself, or calls other names than `names`.
+    Raises ValueError or LookupError for a pickle that is cut, has a memo larger than itself, calls other names than
+    `names`, or contains a tuple of more than MOST_ITEMS, references resolved: the hash of a key visits all of them.
     """
+    stack: list[int | None] = []  # number of items of each object; None: a mark
+    memo: dict[int, int | None] = {}
     for operation, argument, _ in pickletools.genops(data):
         if "PUT" in operation.name and int(argument or 0) > len(data):
             raise ValueError(f"a memo of {argument} objects in a pickle of {len(data)} bytes")
-        if operation.name == "GLOBAL" and names.fullmatch(str(argument)) is None:
+        if operation.name in ("GLOBAL", "STACK_GLOBAL", "INST") and names.fullmatch(str(argument)) is None:
             raise ValueError(f"{argument}, which is no part of it")
+        if "GET" in operation.name:
+            stack.append(memo[int(argument or 0)])
+        elif "PUT" in operation.name or operation.name == "MEMOIZE":
+            memo[int(argument) if argument is not None else len(memo)] = stack[-1]
+        else:
+            before, size = operation.stack_before, 0
+            if pickletools.markobject in before:
+                size, before = sum(iter(stack.pop, None)), before[:-2]
+            size += sum(stack.pop() or 0 for _ in before)
+            if size > MOST_ITEMS:
+                raise ValueError(f"references that stand for {size} items")
+            stack += [None if kind is pickletools.markobject else 1 + size for kind in operation.stack_after]
 
 
 def require_few_items(value: Any) -> None:

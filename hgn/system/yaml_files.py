@@ -20,6 +20,8 @@ from hgn.system.claims import count_items
 
 MAXIMUM_NODES = 100_000  # nodes of a file
 LINES_BYTES = 250_000  # bytes of a JSON file for this search, because YAML takes a CPU second for 50 kB
+# of PyYAML, of thousands of digits, of deep nesting, and of tags such as `!!bool 5`
+_ERRORS = (yaml.YAMLError, ValueError, RecursionError, LookupError, TypeError, AttributeError, ArithmeticError)
 _OCTAL = re.compile(r"[-+]?0[0-7_]*[1-7][0-7_]*")
 _SEXAGESIMAL = re.compile(r"[-+]?[0-9][0-9_]*(:[0-5]?[0-9])+(\.[0-9_]*)?")
 
@@ -32,7 +34,7 @@ def read_yaml(path: Path) -> Any:
     """
     try:
         return _load(path.read_text(encoding="utf-8"))
-    except (yaml.YAMLError, ValueError, RecursionError) as error:  # for example thousands of digits, or deep nesting
+    except _ERRORS as error:
         mark = getattr(error, "problem_mark", None)
         place = f"line {mark.line + 1}, column {mark.column + 1}: " if mark else ""
         cause = str(getattr(error, "problem", None) or error).splitlines()

@@ -5,6 +5,7 @@ This module needs no Lightning, because checkpoints consist of plain containers 
 
 from __future__ import annotations
 
+import os
 import re
 import zipfile
 import zlib
@@ -20,14 +21,16 @@ from hgn.network.base import ParticleNetwork
 from hgn.network.build import build_network
 from hgn.renamed import current_names, with_step
 from hgn.runtime.weights import find_weights, load_weights, network_with
-from hgn.schema import ConfigError, OrdinarySize, from_stored, require, require_bounds, to_mapping
+from hgn.schema import ConfigError, NonNegative, OrdinarySize, Vector, from_stored, require, require_bounds, to_mapping
 from hgn.step_config import StepConfig
 from hgn.system.claims import Claims, require_few_items, require_plain_pickle
 
 SECTION = "hgn"  # key of this project's entries in a checkpoint
 LAST_NAMES = ("last.ckpt", "last-1.ckpt", "last-2.ckpt")  # newest first
 BEST_NAME = "best.ckpt"  # network with the lowest one-step validation error; missing without measured validation scenes
-_CALLED = re.compile(r"collections OrderedDict|torch \w+|torch\._utils _rebuild_(tensor_v2|parameter)")
+_CALLED = re.compile(
+    r"collections OrderedDict|torch (\w+Storage|[a-z]\w+|Size)|torch\._utils _rebuild_(tensor_v2|parameter)"
+)
 NETWORK, AVERAGED = "network.", "averaged."  # prefixes of the names of trained tensors, and of their moving average
 
 
@@ -42,8 +45,8 @@ class DataInfo:
     config_hash: str
     frame_rate_hz: OrdinarySize
     obstacle_cell_size: OrdinarySize
-    gravity: tuple[float, float, float] = (0.0, -9.8, 0.0)
-    maximum_initial_speed: float | None = None  # largest of the groups, domain units per second; None: unknown
+    gravity: Vector = (0.0, -9.8, 0.0)
+    maximum_initial_speed: NonNegative[float] | None = None  # of the groups, domain units per second; None: unknown
 
     def __post_init__(self) -> None:
         require_bounds(self)
@@ -61,10 +64,13 @@ class Progress:
     @staticmethod
     def of(checkpoint: dict[str, Any]) -> Progress:
         section = current_names(checkpoint[SECTION])
-        guard = (checkpoint.get("callbacks") or {}).get("GradientGuard", {})  # in checkpoints of 0.1.0
+        guard: Any = checkpoint.get("callbacks")  # in checkpoints of 0.1.0
+        for key in ("GradientGuard", "skipped"):
+            guard = guard.get(key, 0) if isinstance(guard, dict) else 0
         state = from_stored(SamplerState, section.get("sampler_state"), "sampler_state")
-        counts = section.get("updates"), section.get("skipped", guard.get("skipped", 0))
-        require(all(type(count) is int for count in counts), "checkpoint updates, skipped", "whole numbers", counts)
+        counts = section.get("updates"), section.get("skipped", guard)
+        whole = all(type(count) is int and 0 <= count < 2**63 for count in counts)
+        require(whole, "checkpoint updates, skipped", "whole numbers", counts)
         precision = section.get("precision")
         require(precision in (None, *PRECISIONS), "checkpoint precision", f"one of {', '.join(PRECISIONS)}", precision)
         return Progress(*counts, state, precision)  # type: ignore[arg-type]
@@ -87,9 +93,12 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
     try:
         with zipfile.ZipFile(path) as records:
             claims = Claims(path)
+            _require_one_reading(path, records.start_dir)
             for record in records.infolist():
                 claims.add(record.filename, record.file_size)
-                if record.filename.endswith("/data.pkl"):
+                if record.compress_type != zipfile.ZIP_STORED:
+                    raise ValueError(f"{record.filename} is compressed")
+                if record.filename.lower().endswith("/data.pkl"):  # torch ignores the case of names
                     require_plain_pickle(records.read(record), _CALLED)
             if (damaged := records.testzip()) is not None:
                 raise zlib.error(f"{damaged} has another CRC")
@@ -104,10 +113,23 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
         reason = str(error).strip().split("\n")[0]
         raise DamagedError(f"checkpoint must be a whole checkpoint file, got {path}: {reason}") from error
     state = checkpoint.get("state_dict") if isinstance(checkpoint, dict) else None
-    plain = isinstance(state, dict) and all(isinstance(tensor, torch.Tensor) for tensor in state.values())
+    plain = isinstance(state, dict) and all(
+        isinstance(name, str) and isinstance(tensor, torch.Tensor) for name, tensor in state.items()
+    )
     if not plain or not isinstance(checkpoint.get(SECTION), dict):
         raise ConfigError(f"checkpoint must be one of python -m hgn.train, got {path}")
     return checkpoint
+
+
+def _require_one_reading(path: Path, directory: int) -> None:
+    """Raises ValueError if torch would read another directory than zipfile, after other bytes or by a second end."""
+    with path.open("rb") as file:
+        begin, tail_at, tail = file.read(4), file.seek(-98, os.SEEK_END), file.read()  # two ends, and a place between
+    wide = tail[56:60] == b"PK\6\7"
+    named = int.from_bytes(tail[48:56] if wide else tail[92:96], "little")
+    fits = begin == b"PK\3\4" and tail[76:80] == b"PK\5\6" and named == directory
+    if not fits or (wide and int.from_bytes(tail[64:72], "little") != tail_at):
+        raise ValueError("more than one archive")
 
 
 def check_checkpoint(checkpoint: dict[str, Any], config: TrainConfig, config_hash: str, path: Path) -> None:

@@ -4,12 +4,14 @@ import io
 import json
 import os
 import struct
+import tarfile
 import zipfile
+import zlib
 
 import h5py
 import numpy as np
 from data.foreign_writers import metadata, write
-from data.strange_files import cases, laughing, saved
+from data.strange_files import cases, key_of_tuples, laughing, saved
 from data.test_index import shard
 from scene.test_rollout_file import make_rollout
 
@@ -62,6 +64,31 @@ def chunked(file):
     del file["00000/position"]
     options = {"maxshape": (None,), "chunks": (500_000_000,), "compression": "gzip"}
     file.create_dataset("00000/position", (1,), "f4", **options)
+
+
+def packed(content, filters):
+    """A dataset of 64 numbers, in one chunk that expands to others."""
+
+    def change(file):
+        plan = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+        plan.set_chunk((64,))
+        for _ in range(filters):
+            plan.set_deflate(9)
+        h5py.h5d.create(file["00000"].id, b"x", h5py.h5t.NATIVE_INT8, h5py.h5s.create_simple((64,)), plan)
+        file["00000/x"].id.write_direct_chunk((0,), content)
+
+    return change
+
+
+def zeros(megabytes):
+    """Zeros, compressed a thousandfold."""
+    packer = zlib.compressobj(9)
+    return b"".join(packer.compress(bytes(2**20)) for _ in range(megabytes)) + packer.flush()
+
+
+def crumbs(file):
+    """A dataset of 60 million chunks of one number, none of which was written."""
+    file.create_dataset("00000/x", (60_000_000,), "u1", chunks=(1,))
 
 
 def external(file):
@@ -233,6 +260,11 @@ cases(
     {
         "position": imported("lagrangebench", h5("train.h5", claimed("00000/position", (10**4, 10**6, 3), "f4"))),
         "large chunks": imported("lagrangebench", h5("train.h5", chunked)),
+        "compressed twice": imported("lagrangebench", h5("train.h5", packed(zlib.compress(zeros(4000)), 2))),
+        "compressed to more": imported("lagrangebench", h5("train.h5", packed(zeros(900), 1))),
+        "small chunks": imported("lagrangebench", h5("train.h5", crumbs)),
+        "a key of tuples": imported("geoelements", raw_pickle(key_of_tuples())),
+        "wide cells": imported("lagrangebench", obstacle_cell_size=1e300),
         "types": imported("lagrangebench", h5("train.h5", claimed("00001/particle_type", (10**11,), "i4"))),
         "links": imported("lagrangebench", h5("train.h5", links)),
         "particles": imported("neuralmpm", h5("train/sim_0.h5", claimed("particles", (10**4, 10**6, 6), "f4"))),
@@ -268,6 +300,19 @@ def tar_headers(kind, count, size=b"00000000001"):
     return saved("a.tar", count * (head[:148] + f"{sum(head):06o}\0 ".encode() + head[156:] + bytes(512)) + bytes(1024))
 
 
+def pax(name, value):
+    """One file, whose head has a number that is none."""
+
+    def make(folder):
+        with tarfile.open(folder / "a.tar", "w", format=tarfile.PAX_FORMAT) as tar:
+            info = tarfile.TarInfo("a.json")
+            info.pax_headers = {name: value}
+            tar.addfile(info)
+        return folder / "a.tar"
+
+    return make
+
+
 cases(
     "tar",
     {
@@ -275,6 +320,11 @@ cases(
         "a long name": tar_headers(b"L", 1, b"77777777777"),
         "pax heads": tar_headers(b"x", 900),
         "a large head": tar_headers(b"x", 1, b"77777777777"),
+        **{
+            f"{name} of a head": pax(name, value)
+            for name, value in {"size": str(2**62), "GNU.sparse.map": "0,x", "GNU.sparse.size": "x"}.items()
+        },
+        "a large number": tar_headers(b"0", 1, b"\x80" + b"\x7f" * 10),
         "sparse files": tar_headers(b"S", 900, b"77777777777"),
         "links": tar_headers(b"2", 900),
     },
@@ -324,6 +374,9 @@ def listing(**values):
     return make
 
 
+EPISODE = {"key": "a", "index": 0, "seed": 0, "attempt": 0, "frames": 6, "members": {}}
+
+
 def used(folder):
     """What a training does first."""
     from hgn.data.reader import EpisodeStore
@@ -358,6 +411,9 @@ cases(
         "bytes of the table": manifest(lambda head: (totals(shards=1000)(head), state(table_bytes=10**12)(head))),
         "bytes of the quarantine": manifest(state(quarantine_bytes=10**12, quarantined=10**12)),
         "range": listing(stop=10**11),
+        **{
+            f"{count} particles": listing(episodes=[EPISODE | {"particles": count}]) for count in (2**40, -(2**40))
+        },
         "negative range": listing(first=2**62, stop=-(2**62)),
         "control characters": listing(name="\x1b[31m.tar"),
         "a name elsewhere": listing(name="../../etc/passwd"),

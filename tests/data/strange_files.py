@@ -114,6 +114,12 @@ def called(function, *arguments):
     return pickle.dumps({"hgn": Call()}, protocol=2)
 
 
+def key_of_tuples(value=b"K\1"):
+    """A pickle of a dict with a key of 2^60 items, by references: its hash visits each of them."""
+    pairs = b"".join(b"h%c\x86q%c" % (depth, depth + 1) for depth in range(60))
+    return b"\x80\x02}(K\1\x85q\0" + pairs + value + b"u."
+
+
 def section(**network):
     config = to_mapping(NetworkConfig(width=8, levels=1, message_passing_steps=1)) | network
     return {"hgn": {"network": config, "step": {}}, "state_dict": {}}
@@ -138,6 +144,7 @@ cases(
             lambda: section() | {"state_dict": {"network.x": torch.zeros(1).expand(10**6, 10**6)}}
         ),
         "bytearray": pickled(called(bytearray, 10**11)),
+        "a key of tuples": pickled(key_of_tuples()),
         "memo": pickled(b"\x80\x02}r\xff\xff\xff\x7f."),
         "called storage": pickled(b"\x80\x02ctorch\nFloatStorage\n\x8a\x05\x00\xe8vH\x17\x85R."),
         "empty section": checkpoint({"hgn": {}, "state_dict": {}}),
@@ -213,6 +220,21 @@ def star(count):
     return f"{points}f {' '.join(map(str, range(1, count + 1)))}\n".encode()
 
 
+def empty_primitives(header):
+    """Primitives without vertices: 3 * 10^8 of them, by nodes."""
+    header["accessors"].append({"bufferView": 0, "componentType": 5126, "count": 0, "type": "VEC3"})
+    header["meshes"] = [{"primitives": [{"attributes": {"POSITION": len(header["accessors"]) - 1}}] * 8000}]
+    instances(30_000)(header)
+
+
+def spiral(count):
+    """The lines of one polygon, most of whose ears contain another corner."""
+    turns = [(index, 1.0) for index in range(count)] + [(index, 1.1) for index in reversed(range(count))]
+    places = [((first + 0.02 * index) * np.exp(0.06j * index)) for index, first in turns]
+    lines = "".join(f"v {place.real} {place.imag} 0\n" for place in places)
+    return f"{lines}f {' '.join(map(str, range(1, 2 * count + 1)))}\n".encode()
+
+
 def instances(count):
     def change(header):
         header["nodes"] += [{"mesh": 0, "name": str(number)} for number in range(count)]
@@ -239,6 +261,13 @@ def ply(count, kind="ascii", body=b""):
     return saved("m.ply", head.encode() + body)
 
 
+CORNERS = b"vertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\nendloop\nendfacet\n"
+SHORT_LISTS = (
+    b"ply\nformat binary_little_endian 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
+    b"element face 20000\n" + 50 * b"property list uchar uchar vertex_indices\n" + b"end_header\n"
+    + np.eye(3, dtype=np.float32).tobytes() + 50 * b"\3\0\1\2" + 19_999 * (b"\1\0" + bytes(49))
+)  # fmt: skip
+
 cases(
     "mesh",
     {
@@ -249,6 +278,8 @@ cases(
         "instances": glb(instances(1_500)),
         "instances by paths": glb(branching),
         "primitives": glb(repeated_primitives),
+        "empty primitives": glb(empty_primitives),
+        "weights": glb(lambda header: (targets(header), header["meshes"][0].update(weights=[1e308] * 2))),
         "stride 0": glb(stride_0),
         "targets": glb(targets),
         "sparse instances": glb(sparse_instances),
@@ -261,7 +292,9 @@ cases(
         "a tree that is a list": saved("m.glb", b"glTF\2\0\0\0\x18\0\0\0\4\0\0\0JSON[  ]"),
         "stl": saved("m.stl", bytes(80) + struct.pack("<I", 2**32 - 1) + bytes(1000)),
         "text stl": saved("m.stl", b"solid a\n" + 15_000 * b"facet normal 0 0 1\nouter loop\nvertex 0 0 1\n"),
+        "stl of solids": saved("m.stl", 9000 * (b"solid\nfacet normal 0 0 1\nouter loop\n" + CORNERS + b"endsolid\n")),
         "ply": ply(10**11),
+        "ply of short lists": saved("m.ply", SHORT_LISTS),
         "binary ply": ply(10**11, "binary_little_endian", bytes(1000)),
         "ply with long lists": ply(3, "binary_little_endian", bytes(36) + b"\xff" + bytes(1000)),
         "ply of a star": saved(
@@ -287,6 +320,14 @@ cases(
         ),
         "obj of lines": saved("m.obj", b"v 0 0 0\n" + 100_000 * b"l 1\n"),
         "obj of polygons": saved("m.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\n" + 25_000 * b"f 1 2 3 1\n"),
+        "obj of darts": saved("m.obj", b"v 0 0 0\nv 9 0 0\nv 1 1 0\nv 0 9 0\n" + 99_000 * b"f 1 2 3 4\n"),
+        "obj of pentagons": saved(
+            "m.obj", b"v 0 0 0\nv 9 0 0\nv 1 1 0\nv 0 9 0\nv -9 5 0\n" + 82_000 * b"f 1 2 3 4 5\n"
+        ),
+        "obj of a spiral": saved("m.obj", spiral(990)),
+        "obj of materials": saved(
+            "m.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\n" + b"".join(b"usemtl %d\nf 1 2 3\n" % n for n in range(45_000))
+        ),
         "obj of one polygon": saved("m.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf" + 20_000 * b" 1 2 3"),
         "obj of a star": saved("m.obj", star(30_000)),
         "obj of stars": saved(
@@ -346,6 +387,8 @@ cases(
         "digits": scene("cell_size: " + 200_000 * "9" + "\n" + GROUP),
         "hexadecimal digits": scene("seed: 0x" + 200_000 * "f" + "\n" + GROUP),
         "base 60": scene("cell_size: 1" + 80_000 * ":10" + "\n" + GROUP),
+        **{f"tag {tag}": scene(f"{GROUP}seed: !!{tag}\n") for tag in ("bool 5", "timestamp a", "int ''", "float ''")},
+        "velocity": scene(GROUP[:-2] + ", velocity: [1.0e+300, 0, 0]}\n"),
         "objects": scene("a: !!python/object/apply:os.system [true]\n"),
     },
     cells,

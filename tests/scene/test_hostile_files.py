@@ -40,7 +40,7 @@ from hgn.scene.npz import read_npz
 from hgn.scene.rollout_file import read_rollout, write_rollout
 from hgn.scene.scene_file import load_scene
 from hgn.schema import ConfigError, from_mapping
-from hgn.training.checkpoint import read_checkpoint
+from hgn.training.checkpoint import Progress, read_checkpoint
 from hgn.training.imported import settings_of_imported
 
 
@@ -142,6 +142,35 @@ def checkpoint():
         torch.save({"hgn": {"network": {"width": 8}}, "state_dict": {"weight": torch.arange(100.0)}}, path)
         assert not zipfile.ZipFile(path).testzip()
         return "last.ckpt", path.read_bytes(), read_checkpoint
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda path, _: path.write_bytes(b"\x80\x02." + path.read_bytes()), "more than one archive"),
+        (
+            lambda _, archive: archive.writestr("a/DATA.PKL", b"\x80\x02cbuiltins\nbytearray\n."),
+            "bytearray, which is no",
+        ),
+        (lambda _, archive: archive.writestr("a/DATA.PKL", b"\x80\x02ctorch\nTensor\n."), "torch Tensor, which is no"),
+        (lambda _, archive: archive.writestr("a/b", b"x", zipfile.ZIP_BZIP2), "a/b is compressed"),
+        (lambda path, _: torch.save({"hgn": {}, "state_dict": {5: torch.zeros(1)}}, path), "must be one of python -m"),
+    ],
+)
+def test_archives_that_torch_reads_otherwise(tmp_path, change, message):
+    """A checkpoint has one archive, as torch writes it, in which all that torch reads was checked."""
+    path = tmp_path / "c.ckpt"
+    path.write_bytes(checkpoint()[1])
+    with zipfile.ZipFile(path, "a") as archive:
+        change(path, archive)
+    with pytest.raises(ConfigError, match=message):
+        read_checkpoint(path)
+
+
+@pytest.mark.parametrize("callbacks", [[1], {"GradientGuard": 3}, None])
+def test_sections_of_0_1_0(callbacks):
+    section = {"updates": 3, "sampler_state": {}}
+    assert Progress.of({"hgn": section, "callbacks": callbacks}).skipped == 0
 
 
 def tar():

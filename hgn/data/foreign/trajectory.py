@@ -65,7 +65,8 @@ class SetInfo:
         rule = f"{longest / MOST_RADII:.3g} or more, the box being {longest:g} wide"
         require(self.radius * MOST_RADII >= longest, "metadata.json: default_connectivity_radius", rule, self.radius)
         cell_size = self.obstacle_cell_size
-        require(cell_size is None or cell_size > 0, "metadata.json: obstacle_cell_size", "> 0", cell_size)
+        fits = cell_size is None or 0 < cell_size <= longest
+        require(fits, "metadata.json: obstacle_cell_size", f"> 0, and at most the box's {longest:g}", cell_size)
         require(len(set(self.materials.values())) <= 256, "materials", "at most 256", len(set(self.materials.values())))
         if self.gravity is not None:
             rule = f"{self.dimensions} finite numbers, length per second squared"
@@ -81,7 +82,7 @@ def checked(name: str, position: Any, types: Any, dimensions: int) -> tuple[np.n
     position_TND = floats(f"{name}: position", position, (None, None, dimensions))
     type_N = as_array(f"{name}: particle_type", types)
     if type_N.dtype.kind not in "iu":
-        whole = type_N.dtype.kind == "f" and bool((np.isfinite(type_N) & (type_N == np.round(type_N))).all())
+        whole = type_N.dtype.kind == "f" and bool(((np.abs(type_N) < 2**63) & (type_N == np.round(type_N))).all())
         if not whole:  # some of geoelements' writers store float64
             raise ConfigError(f"{name}: particle_type must be whole numbers, got {type_N.dtype}")
     count = position_TND.shape[1]
