@@ -301,7 +301,7 @@ def test_decoders_bear_any_bytes(kind, request):
     places = st.lists(st.tuples(st.integers(0, len(content) - 1), st.integers(0, 255)), max_size=4)
     soak = request.config.getoption("soak")
 
-    @settings(max_examples=soak or 200, deadline=None, derandomize=not soak, database=None)
+    @settings(max_examples=soak or 120, deadline=None, derandomize=not soak, database=None)
     @given(places, st.integers(0, len(content)), st.integers(0, 3))
     def damaged(changes, cut, kind_of_cut):
         data = bytearray(content)
