@@ -94,9 +94,10 @@ class PlaySession:
     def _record_first(self) -> None:
         state = self.live.state
         self._before: list[tuple[int, tuple[PlacedObstacle, ...], Vector]] = []  # frame, obstacles, gravity: for undo
-        self.recording = Recording(self.keep_bytes)
-        self.recording.enter(self._begin.material_N, state.velocity_NM3.cpu().numpy())
-        self._record(state.position_N3.cpu().numpy())
+        recording = Recording(self.keep_bytes)
+        recording.enter(self._begin.material_N, state.velocity_NM3.cpu().numpy())
+        recording.append(self._frame_at(state.position_N3.cpu().numpy()))
+        self.recording = recording  # other threads read the newest frame, which is always there
 
     @property
     def frame(self) -> int:
@@ -140,11 +141,11 @@ class PlaySession:
         except DivergedError:
             self.rewind(self.frame)
             raise
-        self._record(position_N3)
+        self.recording.append(self._frame_at(position_N3))
 
-    def _record(self, position_N3: np.ndarray) -> None:
+    def _frame_at(self, position_N3: np.ndarray) -> Frame:
         velocity_N3 = self.live.state.velocity_NM3[:, 0].cpu().numpy()
-        self.recording.append(Frame(position_N3.copy(), velocity_N3.copy(), self.obstacles, self.gravity))
+        return Frame(position_N3.copy(), velocity_N3.copy(), self.obstacles, self.gravity)
 
     def rewind(self, frame: int) -> None:
         """Goes back to a frame and deletes later ones. Without changes the simulation then repeats the same frames.
