@@ -37,6 +37,7 @@ from hgn.step_config import StepConfig
 
 OBSTACLE_SHAPES = ("half_box", "square", "half_sphere", "cone", "pyramid")
 MESH_SUFFIXES = (".stl", ".obj", ".ply", ".glb")
+USD_ENDINGS = (".usdc", ".usda", ".usd")
 ROLLOUT_ENDINGS = (".vtkhdf", ".hdf", ".hdf5", ".h5")
 GROUP_SHAPES = ("cube", "sphere")
 NETWORK_KINDS = ("hgn", "gns")
@@ -69,7 +70,7 @@ def config_directory() -> Path:
 
 def is_mesh_file(name: str | Path) -> bool:
     """Returns whether a name has the suffix of a mesh file."""
-    return Path(name).suffix.lower() in MESH_SUFFIXES
+    return Path(name).suffix.lower() in (*MESH_SUFFIXES, *USD_ENDINGS)
 
 
 def require_rollout_name(field: str, name: str | None, *more: str) -> None:
@@ -142,7 +143,7 @@ class SceneConfig:
             rule = f"at most {1 / sum(FUNNEL_HEIGHT):.3g} of the domain's smallest side ({height:.3g}) {where}"
             require(self.group_size <= height, "group_size", rule, self.group_size, remedy)
         for i, name in enumerate(self.obstacle_shapes):
-            rule = f"one of {', '.join(OBSTACLE_SHAPES)}, or a mesh file ({', '.join(MESH_SUFFIXES)})"
+            rule = f"one of {', '.join(OBSTACLE_SHAPES)}, or a mesh file ({', '.join(MESH_SUFFIXES)}, USD)"
             require(name in OBSTACLE_SHAPES or is_mesh_file(name), f"obstacle_shapes[{i}]", rule, name)
         require_kinds(self)
         require(len(self.materials) > 0, "materials", "a list with at least one material", list(self.materials))

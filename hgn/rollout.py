@@ -17,9 +17,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from hgn.command import run_command
-from hgn.config import DEFAULT_WEIGHTS, SceneConfig, SimulatorConfig, require_rollout_name
+from hgn.config import DEFAULT_WEIGHTS, USD_ENDINGS, SceneConfig, SimulatorConfig, require_rollout_name
 from hgn.data.reader import find_episode
-from hgn.render import PLY_ENDING, USD_ENDINGS
+from hgn.render import PLY_ENDING
 from hgn.scene.emission import entry_frames
 from hgn.scene.material import MATERIALS
 from hgn.scene.random_scene import generate_scene

@@ -19,9 +19,9 @@ from typing import Any
 import numpy as np
 
 from hgn.command import run_command
-from hgn.config import MpmConfig
+from hgn.config import USD_ENDINGS, MpmConfig
 from hgn.data.reader import find_episode
-from hgn.render import PLY_ENDING, USD_ENDINGS, pictures
+from hgn.render import PLY_ENDING, pictures
 from hgn.render.error_curve import error_curve, position_error
 from hgn.render.exchange import save_rollout
 from hgn.scene.emission import entry_frames

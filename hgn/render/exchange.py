@@ -16,7 +16,8 @@ from typing import Any
 
 import numpy as np
 
-from hgn.render import PLY_ENDING, USD_ENDINGS
+from hgn.config import USD_ENDINGS
+from hgn.render import PLY_ENDING
 from hgn.render.pictures import rollout_spacing
 from hgn.render.renderer import MATERIAL_COLORS, OBSTACLE_COLOR, PARTICLE_COLORS
 from hgn.scene.material import FLUIDS

@@ -1,4 +1,4 @@
-"""Mesh files as obstacles: STL, OBJ, PLY and GLB.
+"""Mesh files as obstacles: STL, OBJ, PLY, GLB and USD.
 
 Shape legend: V vertices, F triangles, E directed triangle edges (3 F).
 """
@@ -15,12 +15,13 @@ import trimesh
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from hgn.config import MESH_SUFFIXES, is_mesh_file
+from hgn.config import MESH_SUFFIXES, USD_ENDINGS, is_mesh_file
 from hgn.scene.glb import read_glb
 from hgn.scene.polygons import concave_cut, plain_obj, polygons_of_obj, polygons_of_ply
 from hgn.scene.rotation import euler_rotation, rotate, round_to_float32
 from hgn.scene.scene import Obstacle
 from hgn.scene.surface import area_vectors
+from hgn.scene.usd import read_usd_polygons
 from hgn.schema import ConfigError, Vector, require
 
 _ASCII_STL = re.compile(rb"\s*solid.*\n\s*(facet|endsolid)", re.IGNORECASE)
@@ -95,12 +96,14 @@ def load_bodies(
 @np.errstate(all="ignore")  # numbers that are not finite are refused
 def _read(path: Path, field: str) -> tuple[np.ndarray, np.ndarray]:
     if not is_mesh_file(path):
-        raise ConfigError(f"{field} must end in one of {', '.join(MESH_SUFFIXES)}, got {path}; convert the mesh")
+        raise ConfigError(
+            f"{field} must end in one of {', '.join((*MESH_SUFFIXES, *USD_ENDINGS))}, got {path}; convert the mesh"
+        )
     if not path.is_file():
         raise ConfigError(f"{field} must be an existing file, got {path}; in a scene file paths are relative to it")
     try:
         vertex, triangle = read_glb(path) if path.suffix.lower() == ".glb" else _read_polygons(path)
-    except ConfigError:
+    except (ConfigError, ModuleNotFoundError):
         raise
     except Exception as error:  # damaged files raise any kind of error
         raise ConfigError(
@@ -117,10 +120,11 @@ def _read(path: Path, field: str) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _read_polygons(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Reads STL, OBJ and PLY. trimesh reads STL and OBJ, but would cut concave polygons into fans."""
-    data, kind = path.read_bytes(), path.suffix[1:].lower()
-    if kind == "ply":
-        vertex_V3, faces = polygons_of_ply(data)
+    """Reads STL, OBJ, PLY and USD. trimesh reads STL and OBJ, but would cut concave polygons into fans."""
+    kind = path.suffix[1:].lower()
+    data = b"" if f".{kind}" in USD_ENDINGS else path.read_bytes()
+    if kind == "ply" or f".{kind}" in USD_ENDINGS:
+        vertex_V3, faces = polygons_of_ply(data) if kind == "ply" else read_usd_polygons(path)
         cut_F3 = concave_cut(vertex_V3, faces)
         return vertex_V3, trimesh.geometry.triangulate_quads(faces).reshape(-1, 3) if cut_F3 is None else cut_F3
     if kind == "stl" and not _ASCII_STL.match(data):

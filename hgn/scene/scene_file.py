@@ -22,7 +22,7 @@ from hgn.scene.emission import Face
 from hgn.scene.group import WALL_CELLS, Region, fill, particle_count, region_of
 from hgn.scene.material import MATERIAL_PARAMETERS, MATERIALS, material_index
 from hgn.scene.motion import Motion
-from hgn.scene.npz import read_npz
+from hgn.scene.particle_file import read_particles
 from hgn.scene.rotation import euler_rotation
 from hgn.scene.scene import Obstacle, Scene, whole_cells
 from hgn.scene.shapes import shape_obstacle
@@ -132,7 +132,7 @@ class GroupEntry(MaterialEntry):
     shape: str | None = None  # cube, sphere or box
     size: float | tuple[float, float, float] | None = None  # side, diameter, or the three edges of a box
     position: Vector | None = None  # place of the centre
-    particles: str | None = None  # .npz with position and optionally velocity [N, 3], relative to the scene file
+    particles: str | None = None  # .npz with position and optionally velocity [N, 3], or USD; relative to the file
     velocity: Vector = (0.0, 0.0, 0.0)  # domain units per second
 
     def __post_init__(self) -> None:
@@ -310,7 +310,11 @@ def _build(file: SceneFile, folder: Path) -> Scene:
     bodies = [_obstacle(entry, index, folder) for index, entry in enumerate(file.obstacles)]
     # sheets of partly watertight meshes come last, so that entry i has obstacle i
     obstacles = (*(first for first, *_ in bodies), *(sheet for _, *others in bodies for sheet in others))
-    stored = {i: _read_particles(entry, i, folder, file) for i, entry in enumerate(file.groups) if entry.particles}
+    stored = {
+        i: read_particles(folder / entry.particles, f"groups[{i}].particles", entry.material, file.domain_size)
+        for i, entry in enumerate(file.groups)
+        if entry.particles
+    }
     filling = file.particles_per_cell, file.cell_size
     total: float
     try:
@@ -374,32 +378,6 @@ def _build(file: SceneFile, folder: Path) -> Scene:
         specification={"kind": "file", **to_mapping(file), "particle_counts": sizes},
         entry_s_N=entry_s_N[order] if file.emitters else None,
     )
-
-
-def _read_particles(entry: GroupEntry, index: int, folder: Path, file: SceneFile) -> tuple[np.ndarray, np.ndarray]:
-    """Reads positions and velocities, float32 [N, 3]."""
-    assert entry.particles is not None
-    path, field = folder / entry.particles, f"groups[{index}].particles"
-    require(
-        path.suffix == ".npz" and path.is_file(), field, "an existing .npz file", path, "relative to the scene file"
-    )
-    try:
-        arrays = {name: array for name, array in read_npz(path) if name in ("position", "velocity")}
-    except ConfigError as error:
-        raise ConfigError(f"{field} must be a readable .npz file, got {error}") from error
-    require("position" in arrays, field, "a file with an array named position", path)
-    for name, value in arrays.items():
-        require(value.dtype.kind in "fiu", f"{field}: {name}", "of numbers", value.dtype.name)
-        arrays[name] = value.astype(np.float32)
-    shape = (arrays["position"].size // 3, 3)
-    for name, value in arrays.items():
-        require(value.shape == shape, f"{field}: {name}", f"of shape {shape}", value.shape)
-        require(bool(np.isfinite(value).all()), f"{field}: {name}", "finite", float("nan"))
-    position_N3 = arrays["position"]
-    outside = int(((position_N3 < 0) | (position_N3 > np.array(file.domain_size))).any(axis=1).sum())
-    require(len(position_N3) > 0, f"{field}: position", "of one particle or more", "none")
-    require(outside == 0, f"{field}: position", "inside the domain", f"{outside} outside")
-    return position_N3, arrays.get("velocity", np.zeros_like(position_N3))
 
 
 def _material_parameters(groups: Sequence[MaterialEntry], counts: list[int]) -> dict[str, np.ndarray]:

@@ -113,7 +113,12 @@ FACE = b"f 1 2 3\n"
 GOOD = TRIANGLE.encode() + FACE
 READABLE = "ramp must be a readable {} file"
 REFUSED = [
-    ("a.fbx", b"", {}, r"ramp must end in one of \.stl, \.obj, \.ply, \.glb, got .*a\.fbx; convert"),
+    (
+        "a.fbx",
+        b"",
+        {},
+        r"ramp must end in one of \.stl, \.obj, \.ply, \.glb, \.usdc, \.usda, \.usd, got .*a\.fbx; convert",
+    ),
     ("a.obj", b"", {}, "ramp must contain triangles, got none"),
     ("a.obj", b"v 0 0 0\nv 1 0 0\n", {}, "ramp must contain triangles"),
     ("a.stl", b"solid\nendsolid\n", {}, "ramp must contain triangles"),

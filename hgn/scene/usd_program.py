@@ -1,0 +1,119 @@
+"""Reads a USD file in a process of its own, which hgn.scene.usd starts, because pxr trusts the sizes in a file.
+
+`usd_program.py meshes FILE BYTES` or `particles FILE BYTES MATERIAL` writes arrays as npz to the standard output. It
+ends with code 3 and one line about content that is not read. It needs only NumPy and pxr.
+Shape legend: V vertices, K polygons, I corners of polygons, N particles.
+"""
+
+import io
+import resource
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NoReturn
+
+import numpy as np
+from pxr import Sdf, Usd, UsdGeom
+
+SECONDS = 60  # largest CPU time; a few references of references can stand for billions of prims
+ROOM = 512 << 20  # bytes for pxr's own tables
+FIRST = Usd.TimeCode.EarliestTime()  # first sample, or the value without samples
+Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])  # (x, y, z) @ Z_UP = (x, z, -y)
+NO_SURFACE = ("Points", "Camera")
+
+
+def refuse(text: str) -> NoReturn:
+    print(text, file=sys.stderr)
+    sys.exit(3)
+
+
+def opened(file: str) -> Usd.Stage:
+    """Returns the stage of a file that refers to no other files."""
+    layer, others = Sdf.Layer.FindOrOpen(file), list[str]()
+
+    def find_clips(path: Any) -> None:
+        spec = layer.GetPrimAtPath(path) if path.IsPrimPath() or path.IsPrimVariantSelectionPath() else None
+        if spec is not None and spec.HasInfo("clips"):
+            others.append(f"clips of {path}")
+
+    others += layer.GetCompositionAssetDependencies()
+    layer.Traverse(Sdf.Path.absoluteRootPath, find_clips)
+    if others:
+        refuse(f"refers to {others[0]!r}, and other files are not read; write one file (usdcat --flatten)")
+    return Usd.Stage.Open(layer)
+
+
+def placed(stage: Usd.Stage) -> Iterator[tuple[Any, np.ndarray]]:
+    """Yields visible geometry with its matrix to domain units, float64 [4, 4] for row vectors."""
+    unit, transforms = UsdGeom.GetStageMetersPerUnit(stage), UsdGeom.XformCache(FIRST)
+    if not 0 < unit < np.inf:
+        refuse(f"must have metersPerUnit > 0, got {unit}")
+    turn = Z_UP if UsdGeom.GetStageUpAxis(stage) == "Z" else np.eye(3)
+    for prim in stage.Traverse(Usd.TraverseInstanceProxies()):
+        if not (prim.IsA(UsdGeom.Gprim) or prim.IsA(UsdGeom.PointInstancer)):
+            continue
+        shown = UsdGeom.Imageable(prim)
+        if shown.ComputeVisibility(FIRST) != "invisible" and shown.ComputePurpose() not in ("guide", "proxy"):
+            matrix_44 = np.array(transforms.GetLocalToWorldTransform(prim), np.float64)
+            matrix_44[:, :3] = unit * matrix_44[:, :3] @ turn
+            yield prim, matrix_44
+
+
+def points(prim: Any) -> np.ndarray:
+    value = prim.GetAttribute("points").Get(FIRST)
+    return np.zeros((0, 3)) if value is None else np.array(value, np.float64).reshape(-1, 3)
+
+
+def read_meshes(stage: Usd.Stage) -> dict[str, np.ndarray]:
+    """Returns `vertex` [V, 3], `count` [K] corners of each polygon, and `corner` [I]: their vertices."""
+    vertices, counts, corners, total = [np.zeros((0, 3))], [np.zeros(0, np.int64)], [np.zeros(0, np.int64)], 0
+    for prim, matrix_44 in placed(stage):
+        kind, path = prim.GetTypeName(), prim.GetPath()
+        if kind in NO_SURFACE:
+            continue
+        if kind != "Mesh" or prim.HasRelationship("skel:skeleton"):
+            refuse(f"contains {'a skinned mesh' if kind == 'Mesh' else kind} at {path}, which is not read; bake it")
+        vertex_V3 = points(prim)
+        count_K, corner_I, hole_H = (
+            np.array(prim.GetAttribute(name).Get(FIRST) or (), np.int64)
+            for name in ("faceVertexCounts", "faceVertexIndices", "holeIndices")
+        )
+        fits = len(corner_I) == count_K.sum() and count_K.min(initial=3) >= 3
+        if not fits or corner_I.min(initial=0) < 0 or corner_I.max(initial=-1) >= len(vertex_V3):
+            refuse(f"has polygons at {path} that are not of its {len(vertex_V3)} points; export it again")
+        kept_K = ~np.isin(np.arange(len(count_K)), hole_H)
+        vertices.append(vertex_V3 @ matrix_44[:3, :3] + matrix_44[3, :3])
+        counts.append(count_K[kept_K])
+        corners.append(corner_I[np.repeat(kept_K, count_K)] + total)
+        total += len(vertex_V3)
+    return {"vertex": np.concatenate(vertices), "count": np.concatenate(counts), "corner": np.concatenate(corners)}
+
+
+def read_particles(stage: Usd.Stage, material: str) -> dict[str, np.ndarray]:
+    """Returns `position` and `velocity` [N, 3] of Points without `primvars:material`, or of this one."""
+    positions, velocities = [np.zeros((0, 3))], [np.zeros((0, 3))]
+    for prim, matrix_44 in placed(stage):
+        if prim.GetTypeName() == "PointInstancer":
+            refuse(f"contains PointInstancer at {prim.GetPath()}, which is not read; write Points")
+        own = prim.GetAttribute("primvars:material").Get() if prim.HasAttribute("primvars:material") else material
+        if prim.GetTypeName() != "Points" or own != material:
+            continue
+        position_N3, velocity = points(prim), prim.GetAttribute("velocities").Get(FIRST)
+        velocity_N3 = np.zeros_like(position_N3) if velocity is None else np.array(velocity, np.float64).reshape(-1, 3)
+        if velocity_N3.shape != position_N3.shape:
+            refuse(f"has {len(velocity_N3)} velocities of {len(position_N3)} points at {prim.GetPath()}")
+        positions.append(position_N3 @ matrix_44[:3, :3] + matrix_44[3, :3])
+        velocities.append(velocity_N3 @ matrix_44[:3, :3])
+    return {"position": np.concatenate(positions), "velocity": np.concatenate(velocities)}
+
+
+if __name__ == "__main__":
+    content, name, most, *rest = sys.argv[1:]
+    pages = int(Path("/proc/self/statm").read_text().split()[0])
+    resource.setrlimit(resource.RLIMIT_AS, 2 * (pages * resource.getpagesize() + ROOM + int(most),))
+    resource.setrlimit(resource.RLIMIT_CPU, (SECONDS, SECONDS))
+    stage = opened(name)
+    arrays = read_meshes(stage) if content == "meshes" else read_particles(stage, *rest)
+    buffer = io.BytesIO()
+    np.savez(buffer, **arrays)  # type: ignore[arg-type]
+    sys.stdout.buffer.write(buffer.getvalue())

@@ -1,0 +1,78 @@
+"""USD files as particles and obstacles: what is read, and what is refused by name."""
+
+import struct
+
+import numpy as np
+import pytest
+
+from hgn.render.exchange import save_rollout
+from hgn.scene.mesh import load_mesh
+from hgn.scene.rollout_file import Rollout
+from hgn.scene.scene import Obstacle
+from hgn.scene.scene_file import load_scene
+from hgn.schema import ConfigError
+
+pytest.importorskip("pxr")
+CORNERS = ", ".join(f"({x}, {y}, {z})" for x in (0, 1) for y in (0, 1) for z in (0, 1))
+BOX = f"""def Mesh "box" {{\npoint3f[] points = [{CORNERS}]\nint[] faceVertexCounts = [4, 4, 4, 4, 4, 4]
+int[] faceVertexIndices = [0, 1, 3, 2, 4, 6, 7, 5, 0, 4, 5, 1, 2, 3, 7, 6, 0, 2, 6, 4, 1, 5, 7, 3]\n}}\n"""
+PLACED = f"""def Xform "a" {{\ndouble3 xformOp:translate = (10, 0, 5)\nfloat3 xformOp:scale = (2, 4, 6)
+uniform token[] xformOpOrder = ["xformOp:translate", "xformOp:scale"]\n{BOX}}}\n"""
+L_SHAPE = """def Mesh "l" {\npoint3f[] points = [(0, 0, 0), (2, 0, 0), (2, 1, 0), (1, 1, 0), (1, 2, 0), (0, 2, 0)]
+int[] faceVertexCounts = [6]\nint[] faceVertexIndices = [3, 4, 5, 0, 1, 2]\n}\n"""
+
+
+def mesh_of(folder, text, metadata=""):
+    (folder / "mesh.usda").write_text(f"#usda 1.0\n({metadata})\n{text}")
+    return load_mesh(folder / "mesh.usda")
+
+
+def test_meshes(tmp_path):
+    """Polygons are placed by their transforms, in metres with y up; concave ones are cut; hidden ones are left out."""
+    hidden = L_SHAPE.replace("{", '{\ntoken visibility = "invisible"', 1)
+    box = mesh_of(tmp_path, PLACED + hidden, 'metersPerUnit = 0.1\nupAxis = "Z"')
+    assert box.closed and len(box.triangle_F3) == 12  # z, up to 1.1, becomes y, and y becomes -z
+    np.testing.assert_allclose([box.vertex_V3.min(0), box.vertex_V3.max(0)], [[1, 0.5, -0.4], [1.2, 1.1, 0]], atol=1e-9)
+    flat = mesh_of(tmp_path, L_SHAPE)  # without units: USD's default of a centimetre
+    a, b, c = flat.vertex_V3[flat.triangle_F3].transpose(1, 0, 2)
+    assert np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2 == pytest.approx(3e-4)
+
+
+def test_particles(tmp_path):
+    """A rollout's first frame comes back as groups, with velocities and obstacles; a claimed size is no memory."""
+    start_N3 = (0.3 + 0.4 * np.random.default_rng(0).random((30, 3))).astype(np.float32)
+    path_TN3 = start_N3 + np.arange(3, dtype=np.float32)[:, None, None] * np.float32((0.01, 0, 0))
+    sheet = Obstacle("sheet", 0.2 + np.eye(3), np.array([[0, 1, 2]], np.int32), False)
+    file = save_rollout(tmp_path / "a.usdc", Rollout(path_TN3, np.arange(30) % 2, (sheet,), (1.0, 1.0, 1.0), 60.0))
+    text = "groups: [{particles: a.usdc, material: sand}, {particles: a.usdc, material: water}]\n"
+    (tmp_path / "a.yaml").write_text(text + "obstacles: [{mesh: a.usdc}]")
+    scene = load_scene(tmp_path / "a.yaml")
+    np.testing.assert_array_equal(scene.position_N3, np.concatenate([start_N3[1::2], start_N3[::2]]))
+    np.testing.assert_allclose(scene.velocity_N3, np.tile([0.6, 0, 0], (30, 1)), atol=1e-5)
+    np.testing.assert_allclose(sorted(scene.obstacles[0].vertex_V3.tolist()), sorted((0.2 + np.eye(3)).tolist()))
+    data = file.read_bytes()
+    count = data.index(start_N3[1].tobytes()) - 8
+    assert struct.unpack_from("<Q", data, count) == (15,)
+    file.write_bytes(data[:count] + struct.pack("<Q", 1 << 36) + data[count + 8 :])
+    with pytest.raises(
+        ConfigError, match=r"groups\[0\].particles must be a readable USD file, .*it is damaged, or needs"
+    ):
+        load_scene(tmp_path / "a.yaml")
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ('def Sphere "ball" {}', "contains Sphere at /ball, which is not read"),
+        ('def Mesh "m" (payload = @/etc/hostname@) {}', "refers to '/etc/hostname', and other files are not read"),
+        ('def Xform "x" (clips = {dictionary a = {asset[] assetPaths = [@b@]\n}\n}) {}', "refers to 'clips of /x'"),
+        (BOX.replace("7, 3]", "7, 8]"), "has polygons at /box that are not of its 8 points"),
+        (BOX.replace("}", "", 1), "must be a readable USDA file, .*it is damaged"),
+        ('def Points "p" {\npoint3f[] points = [(0, 0, 0)]\n}', "must contain triangles, got none"),
+    ],
+)
+def test_what_is_not_read(tmp_path, text, message):
+    """Content of other kinds, of other files and damaged content end in one line that names it."""
+    with pytest.raises(ConfigError, match=message) as raised:
+        mesh_of(tmp_path, text)
+    assert "\n" not in str(raised.value)
