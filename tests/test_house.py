@@ -16,10 +16,10 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 29_316,
-    "datagen": 8_526,
-    "tools": 6_602,
-    "tests": 28_387,
+    "hgn": 30_189,
+    "datagen": 8_543,
+    "tools": 6_611,
+    "tests": 29_416,
 }
 SETTINGS = 240  # fields of the dataclasses behind the commands, *Config
 

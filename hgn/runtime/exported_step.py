@@ -173,7 +173,8 @@ def _added_in_order(sums: Any, dim: int, index: Any, source: Any) -> Any:
     from onnxscript import opset18
 
     others = [axis for axis in range(len(source.shape)) if axis != dim]
-    index = opset18.Unsqueeze(index, opset18.Constant(value_ints=others)) if others else index
+    axes: Any = opset18.Constant(value_ints=others) if others else None
+    index = opset18.Unsqueeze(index, axes) if others else index
     index = opset18.Expand(index, opset18.Shape(source))
     return opset18.ScatterElements(sums, index, source, axis=dim, reduction="add")
 
