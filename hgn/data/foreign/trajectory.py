@@ -66,7 +66,7 @@ class SetInfo:
         require(self.radius * MOST_RADII >= longest, "metadata.json: default_connectivity_radius", rule, self.radius)
         cell_size = self.obstacle_cell_size
         fits = cell_size is None or 0 < cell_size <= longest
-        require(fits, "metadata.json: obstacle_cell_size", f"> 0, and at most the box's {longest:g}", cell_size)
+        require(fits, "metadata.json: obstacle_cell_size", "> 0", cell_size, f"and at most the box, {longest:g}")
         require(len(set(self.materials.values())) <= 256, "materials", "at most 256", len(set(self.materials.values())))
         if self.gravity is not None:
             rule = f"{self.dimensions} finite numbers, length per second squared"
