@@ -192,5 +192,5 @@ def test_maps_are_bounded(folder, monkeypatch):
     assert [episode.key for _ in range(2) for episode in store] == [f"train-{i:06d}" for i in range(5)] * 2
     assert len(store._open_shards) == 2
     os.truncate(folder / "train-000004-000005.tar", 1000)
-    with pytest.raises(ConfigError, match=r"000005\.tar must have 10240 bytes, got 1000: it was cut while it was open"):
+    with pytest.raises(ConfigError, match=r"000005\.tar must have 10240 bytes, got 1000; delete it and run"):
         store[4]

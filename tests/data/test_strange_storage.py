@@ -195,5 +195,5 @@ def test_a_shard_that_is_cut_under_an_episode(data, size):
     for path in Path(data.dataset.folder).glob("train*.tar"):
         os.truncate(path, min(size, path.stat().st_size - 1))
     assert episode.position_TN3.tobytes() == before
-    with pytest.raises(ConfigError, match=r"it was cut while it was open|must have"):
+    with pytest.raises(ConfigError, match=r"must have \d+ bytes, got"):
         store[0]

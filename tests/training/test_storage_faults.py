@@ -189,7 +189,9 @@ ANSWERS = [
 ]
 
 
-@pytest.mark.parametrize(("status", "body", "headers"), ANSWERS)
+@pytest.mark.parametrize(
+    ("status", "body", "headers"), ANSWERS, ids=[f"{i}: {row[0]}" for i, row in enumerate(ANSWERS)]
+)
 def test_answers_that_pass(data, status, body, headers):
     """Any refusal of a server is outlived, of the manifest and of a shard; so are a page and other bytes instead."""
     with answering(functools.partial(Server, directory=data.dataset.folder)) as url, faults_outlived():
