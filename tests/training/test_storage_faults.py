@@ -263,5 +263,6 @@ def test_a_run_in_a_mounted_bucket(data, tmp_path, monkeypatch):
     updates = [read_checkpoint(run / "checkpoints" / name)["hgn"]["updates"] for name in LAST_NAMES]
     assert updates == sorted(updates, reverse=True) and updates[0] == 12
     monkeypatch.setattr(callbacks, "_drop_cut_line", refused)
+    monkeypatch.setenv("HGN_PATIENCE_S", "1")
     with pytest.raises(OSError, match="Input/output error"):  # before the first update there is nothing to save
         train.main(train_mapping(data, run, maximum_updates=16))
