@@ -16,10 +16,10 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 30_189,
+    "hgn": 30_194,
     "datagen": 8_543,
     "tools": 6_611,
-    "tests": 29_416,
+    "tests": 29_420,
 }
 SETTINGS = 240  # fields of the dataclasses behind the commands, *Config
 

@@ -55,7 +55,12 @@ def ask(folder: Path | str, read: Callable[[Storage], T]) -> T:
     storage, place = open_storage(folder), str(folder)
     if not outliving():
         return read(storage)
-    return patiently(lambda: read(storage), _may_pass, place, place, standard_patience_s())
+    try:
+        return patiently(lambda: read(storage), _may_pass, place, place, standard_patience_s())
+    except UnreachableError as error:
+        if isinstance(error.__cause__, StorageError):  # the storage answers, and the file stays damaged
+            raise error.__cause__ from None
+        raise
 
 
 def _may_pass(error: Exception) -> str | None:

@@ -142,6 +142,7 @@ FILES = [
 def test_files(place, command, arguments, fault, message, capsys, monkeypatch):
     """Scenes that cannot be simulated, damaged shards and checkpoints, and weights of other data are refused; earlier
     outputs stay."""
+    monkeypatch.setenv("HGN_PATIENCE_S", "1")
     place.path("points.obj").write_text("v 0 0 0\nv 1 0 0\n")
     fault(place)
     check(place, command, place.train(run=arguments) if command == "train" else arguments, message, capsys, monkeypatch)
