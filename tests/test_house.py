@@ -16,7 +16,7 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 30_194,
+    "hgn": 30_198,
     "datagen": 8_543,
     "tools": 6_611,
     "tests": 29_420,

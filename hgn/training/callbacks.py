@@ -6,8 +6,10 @@ pictures/ and checkpoints/best.ckpt, the network with the lowest one-step valida
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
+import os
 import sys
 import time
 from collections.abc import Callable
@@ -264,7 +266,9 @@ def log(trainer: Trainer, run: Path, update: int, values: dict[str, float]) -> N
 
 def _drop_cut_line(path: Path) -> None:
     """Removes an incomplete last record, left by a full disk or a loss of power."""
-    content = path.read_bytes() if path.exists() else b""
-    whole = content[: content.rfind(b"\n") + 1]
-    if whole != content:  # some mounted object stores do not truncate files
-        write_atomically(path, whole)
+    with contextlib.suppress(FileNotFoundError), path.open("rb") as file:
+        file.seek(max(0, file.seek(0, os.SEEK_END) - 1))
+        if file.read() not in (b"", b"\n"):
+            file.seek(0)
+            content = file.read()
+            write_atomically(path, content[: content.rfind(b"\n") + 1])  # some mounted object stores do not truncate
