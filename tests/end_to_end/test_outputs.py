@@ -102,7 +102,7 @@ def test_own_files_are_replaced(place, monkeypatch):
 
 @pytest.mark.parametrize("name", ["a.vtkhdf", "a.ply"])
 def test_an_interrupted_simulation_keeps_its_frames(place, name, capsys, monkeypatch):
-    """After Ctrl-C the file has the frames so far, and a line says how many; nothing else lies beside it."""
+    """After Ctrl-C the file has the frames so far, and a line says how many; the folder has no other file."""
     frames = Simulator.frames
 
     def interrupted(self, scene, count):

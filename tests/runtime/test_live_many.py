@@ -33,9 +33,9 @@ def assert_alone(simulator, start, path_TN3):
 
 @pytest.mark.parametrize("backend", ["torch", "cpu"])
 def test_scenes_equal_each_alone(backend):
-    """Of scenes of different sizes, obstacles and gravity one diverges at once, and others begin anew beside it with
-    more, fewer and no particles: each equals its own rollout, and a reset leaves the others as they are, to the bit.
-    Those that have ended have no particles until they are reset, also when all have."""
+    """Scenes have different sizes, obstacles and gravity. One diverges at once, others are reset with more, fewer and
+    no particles. Each equals its own rollout, and a reset leaves the other scenes bitwise as they are. A scene that
+    has ended has no particles until its reset, also if all scenes have ended."""
     simulator = Simulator(network_of(torch.float32, **RELATIVE), 60.0, backend)
     first, second, third = scene(30), scene(12, 4, domain_size=(0.75, 1.0, 1.0)), scene(9, 5, gravity=(0.0, 5.0, 0.0))
     away = replace(scene(15, 1), velocity_N3=np.full((15, 3), 600.0, np.float32))
