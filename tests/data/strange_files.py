@@ -48,7 +48,9 @@ def saved(name, content):
 def weights(text=None, tensors=None, **network):
     info = to_mapping(WeightsInfo(NetworkConfig(width=8, levels=1, message_passing_steps=1), 60.0, 1 / 64))
     info["network"] |= network
-    return saved("w.safetensors", save(tensors or {}, metadata={"hgn": text or json.dumps(info)}))
+    return saved(
+        "w.safetensors", lambda: save(tensors() if tensors else {}, metadata={"hgn": text or json.dumps(info)})
+    )
 
 
 cases(
@@ -56,7 +58,9 @@ cases(
     {
         "wide": weights(width=65_536),
         "deep with tensors": weights(
-            tensors={f"t{number}": torch.zeros(1) for number in range(10_000)}, levels=1000, message_passing_steps=1000
+            tensors=lambda: {f"t{number}": torch.zeros(1) for number in range(10_000)},
+            levels=1000,
+            message_passing_steps=1000,
         ),
         "gns": weights(kind="gns", levels=1, message_passing_steps=1000, width=65_536),
         "nested": weights(text=100_000 * "["),
@@ -324,14 +328,15 @@ cases(
         "obj of pentagons": saved(
             "m.obj", b"v 0 0 0\nv 9 0 0\nv 1 1 0\nv 0 9 0\nv -9 5 0\n" + 82_000 * b"f 1 2 3 4 5\n"
         ),
-        "obj of a spiral": saved("m.obj", spiral(990)),
+        "obj of a spiral": saved("m.obj", lambda: spiral(990)),
         "obj of materials": saved(
-            "m.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\n" + b"".join(b"usemtl %d\nf 1 2 3\n" % n for n in range(45_000))
+            "m.obj",
+            lambda: b"v 0 0 0\nv 1 0 0\nv 0 1 0\n" + b"".join(b"usemtl %d\nf 1 2 3\n" % n for n in range(45_000)),
         ),
         "obj of one polygon": saved("m.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf" + 20_000 * b" 1 2 3"),
-        "obj of a star": saved("m.obj", star(30_000)),
+        "obj of a star": saved("m.obj", lambda: star(30_000)),
         "obj of stars": saved(
-            "m.obj", star(300) + 700 * (b"f " + b" ".join(b"%d" % (i + 1) for i in range(300)) + b"\n")
+            "m.obj", lambda: star(300) + 700 * (b"f " + b" ".join(b"%d" % (i + 1) for i in range(300)) + b"\n")
         ),
         "obj of large numbers": saved("m.obj", b"v " + 900_000 * b"1" + b" 0 0\nf 1 1 1\n"),
         "obj of groups": saved("m.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\n" + 20_000 * b"o a\nf 1 2 3\n"),

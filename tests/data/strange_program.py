@@ -10,6 +10,7 @@ import signal
 import sys
 import tempfile
 import traceback
+import warnings
 from pathlib import Path
 
 from data import strange_data
@@ -30,6 +31,7 @@ def outcome(name, folder):
         resource.setrlimit(resource.RLIMIT_CPU, (CPU_S, CPU_S))
         signal.alarm(60)  # for what waits instead
         resource.setrlimit(resource.RLIMIT_DATA, (MEMORY_BYTES, MEMORY_BYTES))
+        warnings.simplefilter("error", RuntimeWarning)
         try:
             CASES[name](folder)
             text = "read"

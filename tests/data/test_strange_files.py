@@ -3,7 +3,6 @@
 import json
 import os
 import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -21,10 +20,10 @@ READ = {  # files that hold what they claim
 
 
 @pytest.fixture(scope="module")
-def outcomes():
+def outcomes(warm_python):
     """What became of each file, in processes with 2 GB of memory and 20 s of a core."""
     paths = os.pathsep.join(map(str, (TESTS.parent, TESTS, TESTS / "datagen")))
-    command = [sys.executable, "-W", "error::RuntimeWarning", str(TESTS / "data" / "strange_program.py")]
+    command = [str(warm_python), str(TESTS / "data" / "strange_program.py")]
     run = subprocess.run(command, env=os.environ | {"PYTHONPATH": paths}, capture_output=True, text=True, check=True)
     return {(line := json.loads(text))["name"]: line for text in run.stdout.splitlines()}
 
