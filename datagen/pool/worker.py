@@ -73,7 +73,7 @@ class MadeScene:
 
 @dataclass(frozen=True)
 class GridTask:
-    """Asks for the obstacle grid of a scene."""
+    """Asks a maker for the obstacle grid of a scene. `build_grid` answers it."""
 
     task: SceneTask
     scene: Parcel[Scene]
@@ -103,7 +103,7 @@ class Worker(ABC):
         """Sends work. The next `receive` notices a dead worker."""
 
     def tell(self, message: object) -> None:
-        """Sends a part that a task of the worker needs later, for example an obstacle grid."""
+        """Sends a worker one part of its task, for example the obstacle grid of a scene that it simulates."""
         raise NotImplementedError
 
     def dismiss(self) -> None:  # noqa: B027 - Ray ends its actors itself
@@ -141,7 +141,7 @@ def make_scene(task: SceneTask, config: DatagenConfig, backend: Backend, with_gr
     build_collider = pkgutil.resolve_name(backend.build_collider)
     try:
         scene = generate_scene(config.scene, task.seed)
-        # Makers build it. If a solver did, its GPU would idle while colliders are built one by one.
+        # Makers build the collider. In a solver the GPU would idle while colliders are built one by one.
         finer = replace(scene, cell_size=config.reference_cell_size)
         collider = build_collider(finer, config.mpm.choices.collider_band_cells)
     except ConfigError as error:  # e.g. an obstacle does not fit; another seed may work
@@ -197,7 +197,7 @@ def simulate_batch(
 
 
 def _visible(scene: Scene, result: Any) -> Any:
-    """Returns a result of the solver with the positions of a scene's own particles."""
+    """Returns a result of the solver with the positions of the visible particles (see datagen.fine) only."""
     if not hasattr(result, "position_TN3"):
         return result
     return replace(result, position_TN3=visible_positions(result.position_TN3, scene.particle_count))

@@ -39,18 +39,19 @@ MAPPED_SHARDS = 256  # largest number of mapped shards; also at most a quarter o
 class Episodes(Sequence[Episode], ABC):
     """Defines a sequence of episodes.
 
-    An episode is opened, and its shard verified, on first use. Positions are a read-only `np.memmap` if the shard is in
-    this machine's cache, or with `open`. Otherwise they are a copy, because truncation of a mapped file would end the
-    process. Raises on access: ConfigError if a shard is missing or altered.
+    An episode is opened, and its shard verified, on first use. Positions are read-only. `open` maps them into memory.
+    `read` and indexing map them too for a data set at a URL (its shards are in the cache). For a folder they copy them:
+    somebody could cut a file of the folder, and an access behind the end of a mapped file ends the process.
+    Raises on access: ConfigError if a shard is missing or altered.
     """
 
     @abstractmethod
     def open(self, index: int) -> Episode:
-        """Returns the episode at a place from 0. Read it soon, because its positions are mapped."""
+        """Returns the episode at a place from 0, with mapped positions. Use them soon, before the file changes."""
 
     @abstractmethod
     def read(self, index: int) -> Episode:
-        """Returns the episode at a place from 0."""
+        """Returns the episode at a place from 0. Its positions stay readable."""
 
     @property
     @abstractmethod
@@ -117,8 +118,8 @@ class EpisodeStore(Episodes):
     def refresh(self) -> bool:
         """Reads the manifest again. Returns whether this split has more episodes than before.
 
-        If a server does not answer, the episodes that were read before stay. Inside `faults_outlived` they also stay
-        after any fault that lasts no longer than the patience, and `ask_again` reads the manifest once a second.
+        If a server does not answer, the known episodes stay. Inside `faults_outlived` they stay after any other fault
+        too, until it has lasted for the patience; `ask_again` then reads the manifest once a second.
         Raises: ConfigError if the folder contains another data set, or published shards were removed.
         """
         previous_s, self._looked_s = self._looked_s, time.monotonic()
@@ -196,17 +197,15 @@ class EpisodeStore(Episodes):
                 self._fetcher = threading.Thread(target=target, name="shards", daemon=True)
                 self._fetcher.start()
 
-    # errors are ignored here; the reader that needs the shard raises them
-
     def _fetch_all(self) -> None:
-        with contextlib.suppress(ConfigError, OSError):
+        with contextlib.suppress(ConfigError, OSError):  # the reader that needs the shard raises them
             for shard in self.manifest.shards.since(self._fetched):
                 if shard.split == self.split:
                     self._bring(shard, Path, spared=None)
                 self._fetched += 1
 
     def _fetch_wanted(self) -> None:
-        with contextlib.suppress(ConfigError, OSError):
+        with contextlib.suppress(ConfigError, OSError):  # as in _fetch_all
             while True:
                 with self._lock:
                     if not self._wanted:

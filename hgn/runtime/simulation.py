@@ -1,7 +1,7 @@
 """A simulation in progress: the one loop of frames, for every backend and every caller.
 
 A backend contributes a `Stepper`, which computes frames. This module handles divergence, particles that enter, and
-other changes between frames.
+other changes between frames. An output has a *row* per particle. Scenes that ended keep their rows, filled with NaN.
 Shape legend: T frames, N particles of all scenes, A particles that enter, M velocities of a history, S scenes.
 """
 
@@ -103,13 +103,13 @@ class Simulation:
         self._begin(state)
 
     def add(self, new: ParticleState) -> None:
-        """Appends particles to the existing ones. Particles of ended scenes get an output row of NaN."""
+        """Appends particles to the existing ones. Those of ended scenes only get rows of NaN."""
         old, rows_N = self.state, self._rows()
-        going_A = torch.tensor([i not in self.ended for i in range(old.scene_count)], device=old.scene_N.device)
-        going_A = going_A[new.scene_N]
-        entering = selected(new, going_A)
+        running_S = torch.tensor([i not in self.ended for i in range(old.scene_count)], device=old.scene_N.device)
+        running_A = running_S[new.scene_N]
+        entering = selected(new, running_A)
         if self.ended:
-            self._row_N = torch.cat([rows_N, self._row_count + torch.nonzero(going_A).flatten()])
+            self._row_N = torch.cat([rows_N, self._row_count + torch.nonzero(running_A).flatten()])
         self._row_count += len(new.position_N3)
         both: dict[str, Any] = {name: torch.cat([getattr(old, name), getattr(entering, name)]) for name in OF_PARTICLES}
         self._begin(replace(old, **both))
@@ -141,7 +141,7 @@ class Simulation:
             frame = self.entries[0].frame
             yield from self._blocks(frame - 1)
             entering = [entry.state for entry in self.entries if entry.frame == frame]
-            for block_TN3 in self._blocks(frame):
+            for block_TN3 in self._blocks(frame):  # in their first frame they are at their initial places
                 new = [state.position_N3.expand(len(block_TN3), -1, -1) for state in entering]
                 yield _finished(torch.cat([block_TN3, *new], dim=1))
             del self.entries[: len(entering)]
@@ -152,8 +152,8 @@ class Simulation:
     def _blocks(self, end: int) -> Iterator[torch.Tensor]:
         while self.frame < end:
             if len(self.ended) == self._state.scene_count:
-                rest, self.frame = end - self.frame, end
-                yield self._whole(self._state.position_N3[None].expand(rest, -1, -1))
+                count, self.frame = end - self.frame, end
+                yield self._whole(self._state.position_N3[None].expand(count, -1, -1))
             elif self.stepper is None:  # no particles yet
                 self.frame += 1
                 yield self._whole(self._state.position_N3[None])

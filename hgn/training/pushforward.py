@@ -9,7 +9,7 @@ The idea is that of Brandstetter et al. 2022. Samples are collected as in DAgger
 
 Noise shows the network random errors. The network's own errors are biased, and common to a body.
 Seed, update and rank determine all draws. The pool is not part of a checkpoint; a resumed training simulates again.
-Its result is the same if the checkpoint is at a multiple of `pushforward_every`.
+It continues exactly if the checkpoint is at a multiple of `pushforward_every`.
 
 This module contains the rule and the pool; torch_pushforward and triton_pushforward simulate.
 Shape legend: H velocity history, F simulated frames, W = H + 2 frames of a window, N particles, S scenes.
@@ -50,7 +50,7 @@ START_STREAM, SAMPLE_STREAM = 0x57A7, 0xE217
 # Largest RMS distance of a frame from the data, in finest cells. Frames farther away are dropped, with all later ones:
 # the data's motion is no target for them, and they would dominate the loss. An untrained network loses most frames.
 DROPPED_BEYOND = 0.5
-PULLED_WITHIN = 1.0  # largest position error on each axis that a target corrects, in finest cells
+PULLED_WITHIN = 1.0  # in a target a larger position error counts as this, on each axis, in finest cells
 
 
 def simulated_frames(training: TrainingConfig, frame_count: int) -> int:
@@ -61,9 +61,9 @@ def simulated_frames(training: TrainingConfig, frame_count: int) -> int:
 def drawn_starts(training: TrainingConfig, update: int, rank: int, frame_counts: Sequence[int]) -> Starts:
     """Draws the episode and the start frame of each simulation before `update`.
 
-    Every episode is drawn once before one is drawn twice. The latest possible start leaves min(simulated frames, half
-    the episode) frames to simulate and one more, the target of the last. `frame_counts`: frames of each episode.
-    Raises: ConfigError if all episodes are too short.
+    Every episode is drawn once before one is drawn twice. The frames after a start suffice for a whole simulation, or
+    for half of the episode if that is shorter. One more frame is the target of the last. `frame_counts`: frames of each
+    episode. Raises: ConfigError if all episodes are too short.
     """
     last = {
         i: count - 2 - min(simulated_frames(training, count), (count - 1) // 2) for i, count in enumerate(frame_counts)
@@ -101,7 +101,7 @@ class PoolDraws:
         return [self._by_size.at(place) for place in generator.random(count)]
 
 
-def known_frames(simulated: int, frame_count: int, frame: int) -> int:
+def target_count(simulated: int, frame_count: int, frame: int) -> int:
     """Returns how many of the frames simulated after `frame` have a target in an episode of `frame_count` frames."""
     return min(simulated, frame_count - 2 - frame)
 
@@ -111,18 +111,18 @@ def pushforward_windows(
 ) -> torch.Tensor:
     """Returns the windows of one scene's simulation, [F, W, N, 3].
 
-    true_TN3 contains the frames n - H to n + F + 1 of the data, simulated_FN3 the frames n + 1 to n + F. The last frame
-    of the window of frame k is x_k + (true_{k+1} - true_k) + pull (true_k - x_k). With this target the network corrects
-    its velocity error and, by the last term, part of its position error, also that of particles that passed a wall.
+    true_TN3 contains the frames n - H to n + F + 1 of the data, simulated_FN3 the frames x_k with k = n + 1 to n + F. A
+    window ends with x_k and its target x_k + (true_{k+1} - true_k) + pull (true_k - x_k). The second term corrects the
+    velocity error. The third corrects part of the position error, up to PULLED_WITHIN on each axis, also behind walls.
     """
     frames = len(simulated_FN3)
     history = len(true_TN3) - frames - 2
     positions_TN3 = torch.cat([true_TN3[: history + 1], simulated_FN3])
-    question = positions_TN3.unfold(0, history + 1, 1)[1:].permute(0, 3, 1, 2)
+    inputs = positions_TN3.unfold(0, history + 1, 1)[1:].permute(0, 3, 1, 2)  # [F, H + 1, N, 3]
     now_FN3, next_FN3 = true_TN3[history + 1 : -1], true_TN3[history + 2 :]
     limit = PULLED_WITHIN * cell_size
-    answer = simulated_FN3 + (next_FN3 - now_FN3) + pull * (now_FN3 - simulated_FN3).clamp(-limit, limit)
-    return torch.cat([question, answer[:, None]], dim=1)
+    target_FN3 = simulated_FN3 + (next_FN3 - now_FN3) + pull * (now_FN3 - simulated_FN3).clamp(-limit, limit)
+    return torch.cat([inputs, target_FN3[:, None]], dim=1)
 
 
 def usable_frames(
@@ -134,10 +134,9 @@ def usable_frames(
     """
     now_FN3 = true_TN3[len(true_TN3) - len(simulated_FN3) - 1 : -1]
     square_F = (simulated_FN3 - now_FN3).square().sum(-1).mean(-1)
-    good_F = (square_F <= (DROPPED_BEYOND * cell_size) ** 2) & ~diverged(simulated_FN3, domain_3).any(
-        -1
-    )  # NaN counts as diverged
-    count = good_F.int().cumprod(0).sum()
+    # NaN counts as diverged
+    usable_F = (square_F <= (DROPPED_BEYOND * cell_size) ** 2) & ~diverged(simulated_FN3, domain_3).any(-1)
+    count = usable_F.int().cumprod(0).sum()
     return count, square_F[(count - 1).clamp(min=0)]
 
 
@@ -170,8 +169,8 @@ class SimulatedScenes(Protocol[E, T]):
     def simulate(self, starts: Sequence[tuple[E, int]], frames: int) -> list[torch.Tensor]:
         """Returns simulated positions [F, N, 3] of each scene of a group. Values after a divergence are undefined."""
 
-    def true_frames(self, episode: E, frame: int, known: int) -> torch.Tensor:
-        """Returns the frames of the data from `frame` - H to `frame` + `known` + 1, [T, N, 3]."""
+    def true_frames(self, episode: E, frame: int, simulated: int) -> torch.Tensor:
+        """Returns the frames of the data from `frame` - H to `frame` + `simulated` + 1, [T, N, 3]."""
 
     def sample(self, episode: E, frame: int, window_WN3: torch.Tensor) -> T:
         """Returns the sample of a window around a frame."""
@@ -196,16 +195,16 @@ class PushforwardPool(Generic[E, T]):
         """
         begin_s = time.monotonic()
         self._samples = []  # frees memory before the simulations
-        squares, known = [], 0
-        for frames, alike in self._by_frames(starts):
-            for group in self._scenes.groups(alike):
-                counts = [known_frames(frames, self._scenes.frame_count(episode), frame) for episode, frame in group]
+        squares, total = [], 0
+        for frames, equally_long in self._by_frames(starts):
+            for group in self._scenes.groups(equally_long):
+                counts = [target_count(frames, self._scenes.frame_count(episode), frame) for episode, frame in group]
                 simulated = self._scenes.simulate(group, frames)
                 squares += self._add(group, [path_FN3[:n] for path_FN3, n in zip(simulated, counts, strict=True)])
-                known += sum(counts)
+                total += sum(counts)
         self._draws = PoolDraws(self.training, self._rank, [acceleration for _, acceleration in self._samples])
         windows = len(self._samples)
-        values = {"windows": float(windows), "dropped": float(known - windows), "seconds": time.monotonic() - begin_s}
+        values = {"windows": float(windows), "dropped": float(total - windows), "seconds": time.monotonic() - begin_s}
         if squares:
             values["mse"] = float(np.mean(squares))
         self.figures = {f"pushforward/{name}": value for name, value in values.items()}
@@ -213,11 +212,11 @@ class PushforwardPool(Generic[E, T]):
     def replaced(self, samples: Sequence[T], update: int) -> list[T]:
         """Returns the samples, some replaced by ones from the pool with the same seeds and new noise scales."""
         samples, scenes = list(samples), self._scenes
-        for slot, (number, rarity) in enumerate(self._draws.drawn(update)):
-            own, acceleration = self._samples[number]
+        for slot, (number, draw_weight) in enumerate(self._draws.drawn(update)):
+            simulated, acceleration = self._samples[number]
             seed = samples[slot].seed
             scale, weight = noise_scale(self.training, acceleration, seed)
-            samples[slot] = scenes.drawn(own, seed, rarity * weight, scale)
+            samples[slot] = scenes.drawn(simulated, seed, draw_weight * weight, scale)
         return samples
 
     def _by_frames(self, starts: Sequence[tuple[E, int]]) -> list[tuple[int, list[tuple[E, int]]]]:

@@ -57,8 +57,8 @@ class TorchScenes:
             path_FN3 = torch.from_numpy(simulation.run(frames))
         return list(path_FN3.split(list(batch.particles_S), dim=1))
 
-    def true_frames(self, episode: Episode, frame: int, known: int) -> torch.Tensor:
-        return torch.from_numpy(window(episode, frame, self._network.config.velocity_history, known + 1))
+    def true_frames(self, episode: Episode, frame: int, simulated: int) -> torch.Tensor:
+        return torch.from_numpy(window(episode, frame, self._network.config.velocity_history, simulated + 1))
 
     def sample(self, episode: Episode, frame: int, window_WN3: torch.Tensor) -> BatchSample:
         return BatchSample(episode, frame, window_WN3.numpy())

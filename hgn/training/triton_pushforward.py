@@ -54,8 +54,8 @@ class TritonScenes:
     def groups(self, starts: Sequence[tuple[DeviceEpisode, int]]) -> list[Sequence[tuple[DeviceEpisode, int]]]:
         return [starts]
 
-    def true_frames(self, episode: DeviceEpisode, frame: int, known: int) -> torch.Tensor:
-        return episode.position_TN3[frame : frame + self._history + known + 2].to(self.values.device)
+    def true_frames(self, episode: DeviceEpisode, frame: int, simulated: int) -> torch.Tensor:
+        return episode.position_TN3[frame : frame + self._history + simulated + 2].to(self.values.device)
 
     def sample(self, episode: DeviceEpisode, frame: int, window_WN3: torch.Tensor) -> DeviceSample:
         return DeviceSample(replace(episode, position_TN3=window_WN3), 0, 0)

@@ -47,7 +47,7 @@ def _base_cell(position, origin, scene, row, live, low, geometry, cell_size):
 
 @triton.jit
 def _slots_of(geometry, level: tl.constexpr):
-    """Returns a level's numbers that `_slot` needs. Otherwise the compiler reads them again for each slot."""
+    """Reads the numbers of a level that `_slot` needs, once. In `_slot` the compiler would read them for each slot."""
     line = geometry + level * GEOMETRY_COLUMNS
     return tl.load(line), tl.load(line + 2), tl.load(line + 3), tl.load(line + 4)
 
@@ -81,14 +81,14 @@ def mark_cells(
     levels = ()
     for level in tl.static_range(LEVELS):
         levels = levels + (_slots_of(geometry, level),)  # noqa: RUF005 - Triton knows no unpacking here
-        # This loop reads all levels before the first store: the compiler keeps the order and would wait at each.
+        # All levels are read before the first store, because the compiler would wait for each read after a store.
     for level in tl.static_range(LEVELS):
         slots = levels[level]
         for corner in tl.static_range(8):
             cx = (upper_x if corner >> 2 & 1 else x) >> level
             cy = (upper_y if corner >> 1 & 1 else y) >> level
             cz = (upper_z if corner & 1 else z) >> level
-            # Corners with the same ancestor leave the store to the lowest of them: each store loads the L2 cache.
+            # Of the corners with the same ancestor only the lowest stores: each store uses bandwidth of the L2 cache.
             first = inside
             if corner >> 2 & 1:
                 first = first & (cx != x >> level)
@@ -120,9 +120,9 @@ def _cell(occupied, prefix_sum, slot, first, capacity, ask):
 
 @triton.jit
 def _write_cells(table, cell, live, occupied, prefix_sum, slots, first, capacity, own_capacity, COUNT: tl.constexpr):
-    """Writes the numbers of the cells in slots i of the tuple `slots` to row i of the table [COUNT, own_capacity].
+    """Writes the numbers of COUNT neighbours of each cell: those in `slots[i]` to row i of the table.
 
-    It reads all numbers before the first store: the compiler keeps the order of accesses and would wait at each.
+    The table is [COUNT, own_capacity]. All numbers are read before the first store, as in `mark_cells`.
     """
     there = ()
     for i in tl.static_range(COUNT):
@@ -211,8 +211,8 @@ def _surfaces(
     position, velocity, domain, row, live, scene, obstacle_table, obstacle_cell_size, reach,
     HISTORY: tl.constexpr, OBSTACLES: tl.constexpr, SYMMETRY: tl.constexpr,
 ):  # fmt: skip
-    """Returns the nearness of walls and the normals here and ahead, columns 0 to 11 of [N, 16].
-    Returns also the nearness of the nearest surface [N], from 0 beyond its reach to 1."""
+    """Returns two results. The first is [N, 16]: six nearnesses of walls, the normal at the particle, the normal ahead,
+    and zeros. The second is the contact of the particle [N]: 0 if no surface is within reach, at most 1."""
     column = tl.arange(0, 16)
     axis, upper, walls = column % 3, (column >= 3)[None, :], live[:, None] & (column < 6)[None, :]
     v = tl.load(velocity + row[:, None] * (3 * HISTORY) + axis[None, :], mask=walls, other=0.0)
@@ -261,9 +261,11 @@ def _surface_normals(surfaces):
 
 @triton.jit
 def _coarsest_part(x, fraction, high, LEVELS: tl.constexpr):
-    """Returns along one axis where a corner's coarsest cell differs from that of the corner below [N, 8].
-    Returns also the weight of a particle in it, and the place [N] from the middle of the lower corners' cell, in edges.
-    x is the coordinate of the lower corners."""
+    """Returns three results for one axis. x is the coordinate of the lower corners, `high` marks the upper ones.
+
+    [N, 8], bool: false for an upper corner in the same coarsest cell as the lower one, which counts once.
+    [N, 8]: the weight of the particle in the corner's coarsest cell.
+    [N]: the particle's place relative to the middle of the lower corner's coarsest cell, in edges of this cell."""
     ABOVE: tl.constexpr = LEVELS - 1
     EDGE: tl.constexpr = 1 << ABOVE
     split = ((x + (fraction > 0).to(tl.int32)) >> ABOVE) != x >> ABOVE
@@ -281,14 +283,14 @@ def prepare_particles(
     NORMALS: tl.constexpr, OBSTACLES: tl.constexpr, SYMMETRY: tl.constexpr, FEATURES: tl.constexpr,
     OVERLAP: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Writes each particle's 8 cells, their weights, and its fraction.
+    """Writes the 8 finest cells of each particle, its weights in them, and its fraction within the lowest cell.
 
-    With MOTION it adds the particle's parts of the finest cells' mass and momentum to `motion` [.., 4]. It writes its
-    coarsest cells `coarsest_of` [N, 8], each once and -1 elsewhere. It writes its weights in them, and its place [N, 3]
-    from the middle of the lowest one, in edges. It writes the features of surfaces, and `touch_of` [N], the nearness of
-    the nearest surface. It raises column 1 of the coarsest cells' `disturbed` [C, 2] to this nearness times FULLY. It
-    adds places and their products xx, yy, zz, yz, xz, xy to the coarsest cells' `moments` [C, COLUMNS]. The products of
-    the normals of near surfaces follow. OBSTACLES and SYMMETRY mean the same as in prepare_features.
+    With MOTION (relative inputs) it writes for each particle too: the features of surfaces; its contact `touch_of` [N];
+    its coarsest cells `coarsest_of` [N, 8], where repeated cells are -1; its weights in them, `share_of`; and its place
+    [N, 3] from the middle of the lowest coarsest cell, in edges. It adds to cells: mass and momentum to the finest
+    (`motion` [.., 4]); places, their products xx, yy, zz, yz, xz, xy, and such products of normals to the coarsest
+    (`moments` [C, COLUMNS]). It raises column 1 of their `disturbed` [C, 2] to at least the contact times FULLY.
+    OBSTACLES and SYMMETRY mean the same as in prepare_features.
 
     Rule: hgn.network.grid.build_hierarchy and hgn.network.relative; test: tests/kernels/test_network.py.
     """
