@@ -107,7 +107,7 @@ class SceneConfig:
     maximum_initial_speed: NonNegative[float] = 0.0  # domain units per second; moving groups draw a velocity
     # fraction of groups with an initial velocity, if maximum_initial_speed is above 0
     moving_group_fraction: Fraction[float] = 1.0
-    lone_particles: NonNegative[int] = 0  # number of single particles far from all others; networks learn their rest
+    lone_particles: NonNegative[int] = 0  # single particles far from all others; without them such particles hang
     # fraction of moving groups whose velocity is exactly along gravity, against it or perpendicular to it
     pure_direction_fraction: Fraction[float] = 0.0
     colliding_scene_fraction: Fraction[float] = 0.0  # fraction of scenes with colliding groups and without obstacles

@@ -22,7 +22,7 @@ from hgn.system.files import write_atomically
 if TYPE_CHECKING:
     from hgn.runtime.simulator import Simulator
 
-CPU_WEIGHTS = "obstacles_small"  # two iterations a block (M = 2), because a viewer waits for each frame
+CPU_WEIGHTS = "obstacles_small"  # two steps in a block (M = 2), because a viewer waits for each frame
 
 
 @dataclass(frozen=True)

@@ -50,7 +50,7 @@ class PairGradients:
 
 @dataclass(frozen=True)
 class StepGradients:
-    """Holds the gradients of one iteration: edge MLP [C, 6, W], cell MLP, and cell products for edges [C, W]."""
+    """Holds gradients of a message passing step: edge MLP [C, 6, W], cell MLP, and cells' products for edges [C, W]."""
 
     edge: MLPGradients
     cell: MLPGradients

@@ -28,7 +28,7 @@ class Stored(NamedTuple):
 
 @dataclass
 class Block:
-    """Holds a message-passing block: its level, its weights, and its buffers as lists over iterations."""
+    """Holds a message-passing block: its level, its weights, and its buffers as lists over its steps."""
 
     level: int
     packed: PackedMessagePassing
@@ -153,8 +153,8 @@ class Buffers:
         self.transfer_hidden_down = self.transfer_hidden_up = self.message
         for level, capacity in enumerate(capacities):
             send, receive, total = (self._operand(capacity, width) for _ in range(3))
-            # A block's iterations write these in turn. The last iteration on the way down writes one, which is read
-            # again when the way up begins with the other.
+            # The steps of a block write these in turn. The block on the way down ends with one of them, which is read
+            # again on the way up. So the block on the way up begins with the other.
             cells = [self._cell(capacity, width) for _ in range(2)]
             blocks = [(self.down[level], cells)]
             if level < self.config.levels - 1:

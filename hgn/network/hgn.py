@@ -24,7 +24,7 @@ from hgn.network.relative import OUTPUTS, balanced
 
 
 class MessagePassing(nn.Module):
-    """Steps 2, 4, …: M iterations on the cells of one level (paper fig. 5). Each has its own parameters."""
+    """Paper's steps 2, 4, …: M message passing steps on one level (fig. 5). Each has its own parameters."""
 
     def __init__(self, steps: int, width: int) -> None:
         super().__init__()

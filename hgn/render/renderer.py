@@ -254,7 +254,7 @@ class Stage:
         obstacle_shadow = self.map_obstacle.ravel()[self.floor_cell_P]
         self.background_P3[self.floor_P] *= (1 - 0.20 * obstacle_shadow)[:, None]
         self.empty_P3 = to_bytes(gathered_P3 + through_P[:, None] * self.background_P3)
-        # This is the loss of a floor pixel if the floor turns black there.
+        # The amount by which a pixel of the floor darkens if the floor becomes black.
         self.floor_share_P3 = 255 * through_P[self.floor_P, None] * self.background_P3[self.floor_P]
 
     def _prepare_box(self, domain_size: Vector) -> None:
@@ -266,7 +266,7 @@ class Stage:
         back = Image.fromarray(self.empty_P3.reshape(camera.height, camera.width, 3), "RGB")
         over, under = ImageDraw.Draw(front), ImageDraw.Draw(back)
         for a, b in BOX_EDGES:
-            # The eye is nearest to the corner at all far ends. Other edges are silhouettes or bound hidden faces.
+            # The nearest corner to the eye is number 7. Only its three edges lie in front of all particles.
             near = a.bit_count() == 2
             target, color = (over, (*BOX_COLOR, 120)) if near else (under, BOX_COLOR)
             target.line([tuple(xy[a]), tuple(xy[b])], fill=color, width=SUPERSAMPLING)
@@ -276,7 +276,7 @@ class Stage:
     # the parts that change with every frame
 
     def _cast_shadows(self, picture_P3: np.ndarray, position_N3: np.ndarray) -> np.ndarray:
-        """Darkens the floor below particles. Returns each particle's share of light in [0, 1]."""
+        """Darkens the floor below particles. Returns the fraction of light that each particle gets."""
         cell_N = self._map_index(position_N3)
         inside_N = cell_N >= 0
         count = np.bincount(cell_N[inside_N], minlength=len(self.map_top)).reshape(self.map_shape)
@@ -384,7 +384,7 @@ def smooth_normals(corner_F33: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     start = np.flatnonzero(np.diff(place.ravel()[order], prepend=-1))
     size = np.diff(np.append(start, len(order)))
     smooth = np.zeros((len(order), 3))
-    # Each step compares the corners with the corners at the same place one distance further in the sorted order.
+    # Each pass pairs every corner with another one at the same place, until all pairs at a place are compared.
     largest = int(size.max())
     first_of = np.repeat(start, size)
     size_of = np.repeat(size, size)

@@ -148,9 +148,9 @@ def write_rollout(path: str | Path, rollout: Rollout) -> None:
 def write_frames(path: Path, rollout: Rollout, frames: Iterable[np.ndarray]) -> None:
     """Writes frames as they come, float32 [present particles, 3], and puts them into `rollout.position_TN3`.
 
-    They are written once a second to a temporary name; the file has the frames so far at any time. It gets its own name
-    at the end, also after Ctrl-C or an error of the disk. Other errors leave no file. The space for all frames is
-    reserved. Raises: OSError, before the first frame, where the disk has less.
+    Once a second the new frames are appended to a temporary file. It gets the name `path` at the end, also after Ctrl-C
+    or an error of the disk. Other errors leave no file. The space for all frames is reserved first.
+    Raises: OSError before the first frame if the disk has less space.
     """
     size = rollout_bytes(rollout.frame_count, rollout.particle_count, rollout.reference_TN3 is not None)
     interruption, count = None, 0
@@ -215,7 +215,7 @@ class _GrowingFile:
     def write(self, end: int) -> None:
         """Writes the frames before `end` that are not in the file. A repeated call completes an interrupted one."""
         rollout, begin = self._rollout, self.count
-        start, again = max(begin - 2, 0), max(begin - 1, 0)  # velocities of frame `again` follow from more frames now
+        start, again = max(begin - 2, 0), max(begin - 1, 0)  # velocities in `again` may follow from the next frame
         position_TN3 = rollout.position_TN3[start:end]
         vertex_TV3, triangle_F3, _ = _triangles(rollout.obstacles, np.arange(start, end) / rollout.frame_rate_hz)
         entry_N = None if rollout.entry_frame_N is None else rollout.entry_frame_N - start

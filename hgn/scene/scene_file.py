@@ -127,7 +127,7 @@ class MaterialEntry:
 
 @dataclass(frozen=True, kw_only=True)
 class GroupEntry(MaterialEntry):
-    """A solid of one material, filled with random particles; or `particles`, a file that contains them."""
+    """A volume of one material that is filled with random particles, or `particles`, a file that contains them."""
 
     shape: str | None = None  # cube, sphere or box
     size: float | tuple[float, float, float] | None = None  # side, diameter, or the three edges of a box

@@ -30,7 +30,7 @@ Row = dict[str, Any]
 
 
 def main(mapping: dict[str, Any]) -> int:
-    """Prints a table, and writes JSON if asked to; the exit code is 1 if a check fails."""
+    """Prints a table, and writes JSON if `json` is given; the exit code is 1 if a check fails."""
     config = from_mapping(BenchConfig, mapping)
     device = choose_device(config.device)
     rows: list[Row] = []

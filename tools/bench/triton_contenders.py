@@ -83,7 +83,7 @@ def device_samples(batch: Batch) -> list[tuple[DeviceEpisode, int, int]]:
 def triton_updates(
     network: ParticleNetwork, scenes: int, precision: str, device: torch.device, noise_std: float | None = None
 ) -> Callable[..., Any]:
-    """Makes training updates of so many scenes, each of a copy of the network; without jitter if `noise_std` is 0."""
+    """Returns a maker of updates of `scenes` scenes, each with its own network; without jitter if `noise_std` is 0."""
     from hgn.kernels.update.op import Updates, UpdateSettings  # loads Triton
 
     assert isinstance(network, HierarchicalGraphNetwork)

@@ -87,7 +87,7 @@ class Run:
         self.write()
 
     def write(self, drawn: bool = False) -> None:
-        """Writes the JSON, and the figures if asked to. NaN becomes null."""
+        """Writes the JSON, and with `drawn` the figures. NaN becomes null."""
         self.meta["not_timed"] = [label(row) for row in self.rows if is_untimed(row)]
         self.meta["seconds"] = time.monotonic() - self.started
         rows = _without_nan(self.rows)

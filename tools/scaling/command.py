@@ -25,7 +25,7 @@ CELL_FRACTION = 0.3  # cells of the finest level per particle of tools.bench.sta
 
 
 def main(mapping: dict[str, Any]) -> int:
-    """Prints a table, and writes JSON if asked to; the exit code is 1 if a check fails."""
+    """Prints a table, and writes JSON if `json` is given; the exit code is 1 if a check fails."""
     config = from_mapping(ScalingConfig, mapping)
     device_type, count = devices(config)
     _compile_ahead(config, device_type, count)

@@ -64,7 +64,7 @@ class StabilityNetworkConfig(SimulatorConfig):
 
 
 def main(mapping: dict[str, Any]) -> int:
-    """Prints a table, and writes JSON if asked to. A case that fails is a finding: exit code 0."""
+    """Prints a table, and writes JSON if `json` is given. A case that fails is a finding: exit code 0."""
     started = time.monotonic()
     config = from_mapping(StabilityNetworkConfig, mapping)
     simulator = Simulator.load(config.weights, config.device, config.backend, config.precision)

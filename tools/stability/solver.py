@@ -44,7 +44,7 @@ class StabilitySolverConfig(ReportConfig):
 
 
 def main(mapping: dict[str, Any]) -> int:
-    """Prints a table, and writes JSON if asked to. A case that fails is a finding: exit code 0."""
+    """Prints a table, and writes JSON if `json` is given. A case that fails is a finding: exit code 0."""
     from datagen.mpm.device import initialise
 
     config = from_mapping(StabilitySolverConfig, mapping)

@@ -1,4 +1,4 @@
-"""Computes the cells of one message-passing iteration on a level (paper fig. 5), after its edges; forward and backward.
+"""Computes the cells of one message passing step on a level (paper fig. 5), after its edges; forward and backward.
 
 OVERLAP means the same as in hgn.kernels.edges.kernel. Shape legend: C cells, W width.
 """
@@ -133,8 +133,8 @@ def cell_mlp_backward(
 ):  # fmt: skip
     """Replaces the gradient of cell_out in `gradient` [C, W] by that of `cell`.
 
-    The incoming gradient lacks the parts through `send` and `receive` of the following iteration. The kernel adds them
-    unless LAST. The outgoing gradient lacks the parts through this iteration's products. send_gradient receives the
+    The incoming gradient lacks the parts through `send` and `receive` of the next step. The kernel adds them unless
+    LAST. The outgoing gradient lacks the parts through the products of its own step. send_gradient receives the
     gradient through edges that start in a cell; without GATHER an earlier kernel has computed it. sum_gradient [C, W]
     is the gradient of the edges' sums. RESIDENT means the same as in cell_mlp_forward.
 

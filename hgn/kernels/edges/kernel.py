@@ -1,4 +1,4 @@
-"""Computes the edges of one message-passing iteration on a level (paper fig. 5), forward and backward.
+"""Computes the edges of one message passing step on a level (paper fig. 5), forward and backward.
 
 A tile has ROWS rows. Each cell has eight rows, and up to six of them are edges that end in it. With DENSE each cell has
 six rows, so that 64 rows hold ten cells instead of eight. A program takes many tiles in turn and reads its weights
@@ -90,7 +90,7 @@ def edge_forward(
     """Computes paper steps 2, 4, … (fig. 5): the edges' new features [C, 6, W] and their sums by receiver [C, W].
 
     send and receive [C, W] are the products of the cells with the first two parts of the edge MLP; receive includes the
-    bias. FIRST: edges have no features yet, and their unit offset replaces them. The last iteration stores no edges.
+    bias. FIRST: edges have no features yet, and their unit offset replaces them. The last step stores no edges.
     SAVE stores the inputs of edge_backward: hidden layer and normalised output [C, 6, W], and `rstd` [C, 6] (1 / std).
 
     Rule: hgn.network.hgn.MessagePassing; reference and test: tests/kernels/references.py, test_kernels_alone.py.

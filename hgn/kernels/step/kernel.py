@@ -37,8 +37,8 @@ def _lowest(base_of, gate_of, spot_of, row, live):
 
 @triton.jit
 def _add_bodies(sums, slot, place, weight, value, BODIES: tl.constexpr, COLUMNS: tl.constexpr):
-    """Adds values of particles and their moments to the sums of middles [K, COLUMNS].
-    With BODIES it adds after the mass also the places and their products xx, yy, zz, yz, xz, xy."""
+    """Adds to the sums of middles [K, COLUMNS] the particles' values and the moments place x value.
+    With BODIES their mass, places and products of places xx, yy, zz, yz, xz, xy come first."""
     at: tl.constexpr = 10 * BODIES
     moment = cross(place, (value[0][:, None], value[1][:, None], value[2][:, None]))
     column = tl.arange(0, COLUMNS)[None, None, :]
@@ -87,11 +87,11 @@ def sum_displacements(
     OUT: tl.constexpr, HISTORY: tl.constexpr, LEVELS: tl.constexpr, SHIFT: tl.constexpr, RESTING: tl.constexpr,
     COLUMNS: tl.constexpr, OVERLAP: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Adds the particles' bodies, next displacements and their moments to the sums [K, COLUMNS] of the middles around.
+    """Adds each particle to the sums [K, COLUMNS] of the middles around it, with its next displacement as value.
 
-    hgn.kernels.geometry defines middles and spots. Writes the slot of the lowest middle to `base_of` [N], the spot to
-    `spot_of` [N, 3], and the gate to `gate_of` [N]. The gate is 0 for materials whose bit is not in RESTING; -1 has
-    all bits.
+    `_add_bodies` defines the columns, hgn.kernels.geometry middles and spots. Writes the slot of the lowest middle to
+    `base_of` [N], the spot to `spot_of` [N, 3], and the gate to `gate_of` [N]. The gate is 0 for materials whose bit is
+    not in RESTING; -1 has all bits.
 
     Rule: hgn.step.reference.Deformation; test: tests/kernels/test_relative.py.
     """
@@ -128,7 +128,7 @@ def find_deformation(
     bodies, sums, table, count,
     AT: tl.constexpr, COLUMNS: tl.constexpr, BODIES: tl.constexpr, OVERLAP: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Computes the table [K, RATES] of the middles from the sums [K, COLUMNS] of a field and `bodies` [K, BODIES].
+    """Computes the table [K, RATES] of the middles from the sums [K, COLUMNS] of a field, and of `bodies` [K, BODIES].
 
     The field begins at column AT. The table holds the subtracted motion (columns 0 to 2), the factor of a particle's
     own motion (3), and the subtracted rate of rotation (4 to 6).
@@ -316,7 +316,7 @@ def _stopped_by_obstacles(
     """Returns the ends of paths from (bx, by, bz) to (x, y, z) between the walls and outside obstacles.
 
     The domains have this width, height and depth. Up to SURFACES triangles stop a path one after the other. With
-    WALLED the walls apply after each triangle. Where one more triangle would stop the path, it ends at its first one.
+    WALLED the walls apply after each triangle. If the path then meets another triangle, it ends at this triangle.
     `line` is the scenes' row of the barrier table. All arguments are vectors of particles. Particles out of range are
     not constrained. Triangles stop particles within the distance `within`, and move them away by `slack`. Planes whose
     squared sine is at most `least_crease` count as one.
@@ -406,7 +406,7 @@ def integrate(
     if outside > 0:
         tl.atomic_add(lost, outside)
     if SURFACES > 0:
-        tl.debug_barrier()  # reads back other threads' stores: as columns, 16 threads would hold each number
+        tl.debug_barrier()  # positions are read again, a row a thread; in the layout above 16 threads would copy each
         x, y, z = three_columns(position, row, 0, row < count, 1.0, 3)
         width, height, depth = three_columns(domain, scene, 0, row < count, 1.0, 3)
         line = barrier_table + scene * BARRIER_COLUMNS
