@@ -5,13 +5,13 @@
 #   CUDA_VISIBLE_DEVICES=0,1 jobs/queue.sh mine.txt runs/my_queue   # on two of them, with logs in runs/my_queue
 #
 # LIST, the first argument, has a line `NAME: COMMAND` for each command, which bash runs in the present folder;
-# variables of the environment may be used, as in ${SCENES:-800}. A line `wait` is a barrier: what follows begins when
-# all before it is done. Empty lines and those that begin with # are skipped.
+# variables of the environment may be used, as in ${SCENES:-800}. A line `wait` is a barrier: later commands begin
+# when all earlier ones are done. Empty lines and those that begin with # are skipped.
 # FOLDER, the second (runs/queue), gets NAME.log, and NAME.done once the command has ended with exit code 0.
 #
 # Each GPU (those of CUDA_VISIBLE_DEVICES where it is set, else all that nvidia-smi lists; without any, the CPU) takes
-# the first command that is left, which sees that GPU alone. The same call again goes on with what is not done. A
-# command that fails stops no other before the next barrier, but nothing behind it begins, and the exit code is 1.
+# the next command, which sees only that GPU. The same call again runs the commands that are not done. If a command
+# fails, the others before the next barrier still run, none after it begins, and the exit code is 1.
 # Ctrl-C, SIGTERM and SIGHUP reach the commands as SIGTERM and are waited for, so that they can write checkpoints; the
 # exit code is then 128 + the signal's number.
 set -euo pipefail

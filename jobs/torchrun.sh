@@ -4,11 +4,11 @@
 #   GPUS=8 EXPERIMENT=obstacles jobs/torchrun.sh                                        # one machine
 #   NODES=2 GPUS=8 RENDEZVOUS=first-machine:29500 EXPERIMENT=obstacles jobs/torchrun.sh   # on each of two machines
 #
-# NODES       machines (1); 1:4 trains on one to four, and begins anew from the last checkpoint when one joins or leaves
+# NODES       machines (1); 1:4 trains on one to four, and restarts from the last checkpoint when one joins or leaves
 # GPUS        processes on each machine, one for each GPU (1)
 # EXPERIMENT  a file of conf/experiment (obstacles)
 # RENDEZVOUS  host:port of one of the machines, reachable from all; needed where NODES is not 1
-# HGN_RUN     the run's name (EXPERIMENT): its folder is runs/HGN_RUN unless run= says otherwise
+# HGN_RUN     name of the run (EXPERIMENT): its folder is runs/HGN_RUN, or the folder of run=
 # RESTARTS    how often all processes are started again when one has failed (3)
 # PYTHON      the interpreter (python)
 #
