@@ -122,6 +122,14 @@ def make_dataset(backend):
 
 
 @pytest.fixture(scope="session")
+def solver_kernels():
+    """The solver in this process, with kernels that tests share."""
+    import shared_kernels
+
+    shared_kernels.start()
+
+
+@pytest.fixture(scope="session")
 def small_dataset(tmp_path_factory):
     """What tests that do not make one themselves get a copy of."""
     with pytest.MonkeyPatch.context() as patch:

@@ -6,7 +6,7 @@ A file's fixtures are made once then, and the solver's kernels compiled once.
 from xdist.scheduler import LoadScopeScheduling
 
 LONGEST_FILES = (  # five seconds and more of one core; begun last, one of them would run alone
-    *("solver", "datagen/mpm/test_team", "generator", "viewer/test_page", "training/test_ddp", "jobs/test_jobs"),
+    *("solver", "generator", "viewer/test_page", "training/test_ddp", "jobs/test_jobs"),
     *("kernels/test_triton_compat", "network/test_network", "datagen/test_command", "datagen/test_pool"),
     *("runtime/test_exported_step", "runtime/test_differentiable", "kernels/test_rollout"),
     *("tools/test_bench", "end_to_end/test_bad_input", "kernels/test_training", "kernels/test_kernels_alone"),
@@ -18,15 +18,15 @@ LONGEST_FILES = (  # five seconds and more of one core; begun last, one of them 
     *("test_defaults", "data/test_import", "cpu/test_rows", "kernels/test_pushforward", "docs/test_notebooks"),
     *("docs/test_pages", "data/test_index"),
 )
+SIMULATING = ("datagen/test_fine_reference", "datagen/test_world_data", "tools/test_gallery")
 GENERATING = ("training/test_generator", "docs/test_tutorials")  # water around a solid
 PLACES = {name: number for number, name in enumerate(LONGEST_FILES)}
 
 
 def group_of(nodeid):
-    """What runs in one process: a file, all that simulate, or all that generate the same kind of scene; teams apart,
-    whose kernels nothing else takes."""
+    """What runs in one process: a file, all that simulate, or all that generate the same kind of scene."""
     path = nodeid.split("::", 1)[0].removeprefix("tests/").removesuffix(".py")
-    if path.startswith(("datagen/mpm/", "tools/test_stability")) and path != "datagen/mpm/test_team":
+    if path.startswith(("datagen/mpm/", "tools/test_stability")) or path in SIMULATING:
         return "solver"
     return "generator" if path in GENERATING else path
 

@@ -159,7 +159,6 @@ class Launch(ABC):
             + VARIANT.moving * self.moving
             + VARIANT.taichi_elements * (config.method == "taichi_elements")
             + VARIANT.rate_of_sand * bool(config.sand_grain_diameter_m > 0 and SAND in label & MATERIAL_MASK)
-            + VARIANT.each_step * (config.fixed_time_step_s is not None or config.choices.transfer_speed_m_s is None)
             + VARIANT.several_laws * (len(laws) > 1)
             + VARIANT.parts * self.copies
         )

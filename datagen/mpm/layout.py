@@ -144,7 +144,7 @@ class Variant(NamedTuple):
     moving: int = 512  # obstacles move
     elastic: int = 1024
     rate_of_sand: int = 2048  # friction grows with the rate of flow
-    each_step: int = 4096  # each step is an interval of its own
+    each_step: int = 4096  # of the team kernel: each step is an interval of its own
     parts: int = 8192  # factor of the number of parts; must be the last
 
 

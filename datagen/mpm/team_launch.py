@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from datagen.mpm.launch import Launch, device_array
-from datagen.mpm.layout import BLOCK, BLOCK_NODES, COUNT, FIELD, LIVE, TAG, has_solid
+from datagen.mpm.layout import BLOCK, BLOCK_NODES, COUNT, FIELD, LIVE, TAG, VARIANT, has_solid
 from hgn.schema import ConfigError
 
 import taichi as ti  # isort: skip
@@ -48,6 +48,8 @@ class TeamLaunch(Launch):
 
     def __init__(self, team: Team, teams: int, *batch: Any) -> None:
         super().__init__(*batch)
+        transfers_each_step = self.config.choices.transfer_speed_m_s is None
+        self.variant += VARIANT.each_step * (self.config.fixed_time_step_s is not None or transfers_each_step)
         self.team, self.teams = team, min(teams, len(self.scenes))
         if self.particles > MAXIMUM_PARTICLES:
             raise ConfigError(

@@ -22,6 +22,8 @@ from hgn.data.manifest import Manifest
 from hgn.data.reader import EpisodeStore
 from hgn.schema import ConfigError
 
+pytestmark = pytest.mark.usefixtures("solver_kernels")
+
 WALL = (CONFIG.wall_cells - 1) * CELL  # where walls end
 
 

@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from datagen.pool.plan import SceneTask
 from datagen.pool.worker import Backend, make_episode, make_scene, simulate_batch
@@ -10,6 +11,8 @@ from hgn.card import data_card
 from hgn.config import DatagenConfig, DatasetConfig, MpmConfig, SceneConfig
 from hgn.data.manifest import Manifest
 from hgn.scene.episode_obstacles import known_obstacles
+
+pytestmark = pytest.mark.usefixtures("solver_kernels")
 
 KINDS = {"edge": 1.0, "pool": 3.0, "jet": 0.0}
 

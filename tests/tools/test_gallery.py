@@ -19,6 +19,8 @@ from tools.stability.case import gallery_cases
 from tools.stability.gallery import load_case, load_gallery
 from tools.stability.observables import OBSERVABLES, BoundEntry, Film, period, series
 
+pytestmark = pytest.mark.usefixtures("solver_kernels")
+
 TINY = """
 domain_size: [0.25, 0.25, 0.25]
 particles_per_cell: 1

@@ -19,6 +19,8 @@ from tools.stability.measures import conserved, share_of_way
 from tools.stability.network import Runner, guard_row, main
 from tools.stability.network_cases import DIRECTIONS, GRAVITIES, WAY, cube, flight_frames, meeting
 
+pytestmark = pytest.mark.usefixtures("solver_kernels")
+
 SCENE = {"obstacle_count": 1, "obstacle_size": [0.1, 0.2]}
 SCENE |= {"group_shapes": ["cube"], "group_count": 2, "group_size": 0.04}
 GRAVITY = (0.0, -9.8, 0.0)

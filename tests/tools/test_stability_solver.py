@@ -12,6 +12,8 @@ from tools.stability import solver_validation as validation
 from tools.stability.solver import main
 from tools.stability.solver_leak import crossing_paths, leaks
 
+pytestmark = pytest.mark.usefixtures("solver_kernels")
+
 CPU = MpmConfig(device="cpu")
 
 

@@ -1,10 +1,8 @@
-"""Taichi on two CPU threads for all tests of this folder."""
+"""All tests of this folder use the same kernels."""
 
 import pytest
 
-from datagen.mpm.device import initialise
-
 
 @pytest.fixture(scope="session", autouse=True)
-def taichi_on_cpu():
-    initialise("cpu", 2)
+def taichi_on_cpu(solver_kernels):
+    pass

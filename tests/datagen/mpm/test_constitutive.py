@@ -9,7 +9,16 @@ import taichi as ti
 
 from datagen.mpm import layout
 from datagen.mpm.constitutive import solid
-from datagen.mpm.layout import COUNT, SETTING, SOLID_VARIANTS, VARIANT, constants, is_only_solid, lame_parameters
+from datagen.mpm.layout import (
+    COUNT,
+    MATERIAL_VARIANTS,
+    SETTING,
+    SOLID_VARIANTS,
+    VARIANT,
+    constants,
+    is_only_solid,
+    lame_parameters,
+)
 from datagen.mpm.mls_mpm import respond
 from hgn.config import MpmConfig
 from hgn.scene.material import ELASTIC, SAND, SNOW, WATER
@@ -53,14 +62,19 @@ def move_water(
 
 
 def run(material, F_N33, volume_N, config):
-    """F, volumes, stresses, stiffness and counters of particles of a solid behind a step."""
-    F, stress = np.float32(F_N33), np.zeros_like(F_N33, np.float32)
-    volume, stiffness = np.float32(volume_N), np.zeros_like(volume_N, np.float32)
-    variant, counter = SOLID_VARIANTS, np.zeros((1, COUNT.length), np.int64)
-    variant += VARIANT.taichi_elements * (config.method == "taichi_elements")
-    variant += VARIANT.rate_of_sand * (config.sand_grain_diameter_m > 0)
-    update_solids(F, volume, stress, stiffness, material, constants(config), counter, variant)
-    return F, volume, stress, stiffness, counter[0]
+    """F, volumes, stresses, stiffness and counters of particles of a solid behind a step: bitwise the same in a kernel
+    of this solid only."""
+    outcomes = []
+    for variant in (SOLID_VARIANTS, MATERIAL_VARIANTS[material]):
+        F, stress = np.float32(F_N33), np.zeros_like(F_N33, np.float32)
+        volume, stiffness = np.float32(volume_N), np.zeros_like(volume_N, np.float32)
+        counter = np.zeros((1, COUNT.length), np.int64)
+        variant += VARIANT.taichi_elements * (config.method == "taichi_elements")
+        variant += VARIANT.rate_of_sand * (config.sand_grain_diameter_m > 0)
+        update_solids(F, volume, stress, stiffness, material, constants(config), counter, variant)
+        outcomes.append((F, volume, stress, stiffness, counter[0]))
+    assert all(np.array_equal(shared, own) for shared, own in zip(*outcomes, strict=True))
+    return outcomes[0]
 
 
 def moved_water(C_N33, volume_N, step, variant=0, config=None, dx=1.0):

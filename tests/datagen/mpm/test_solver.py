@@ -1,11 +1,13 @@
 """The solver's promises about steps, batches, failures and bad input; test_closed_forms has its physics."""
 
+import contextlib
 import dataclasses
 import os
 from pathlib import Path
 
 import numpy as np
 import pytest
+import shared_kernels
 from mpm_scenes import CELL, CONFIG, assert_inside, beside, block, joined, particles, sheet, simulated
 
 from datagen.mpm import launch
@@ -84,18 +86,20 @@ def test_materials_a_thousand_times_as_stiff_beside_each_other():
 
 
 def test_scenes_of_a_batch_equal_scenes_alone():
-    """A scene's trajectory is bitwise the same alone and beside scenes of other size, material, obstacles and steps."""
-    scenes = [
-        block(WATER, (0.4, 0.2, 0.4), (0.5, 0.3, 0.5), (1, -3, 0)),
-        joined(block(SNOW, (0.4, 0.45, 0.4), (0.55, 0.6, 0.5), (0, -4, 0), seed=1, obstacles=(sheet(0.3),)), BESIDE),
-        joined(block(SAND, (0.3, 0.2, 0.3), (0.4, 0.3, 0.4)), block(WATER, (0.5, 0.2, 0.3), (0.6, 0.3, 0.4)), BESIDE),
-    ]
+    """A scene's trajectory is bitwise the same alone and beside scenes of other size, material, obstacles and steps;
+    water's also with a kernel for water only, on two threads.
+    """
+    water = block(WATER, (0.4, 0.2, 0.4), (0.5, 0.3, 0.5), (1, -3, 0))
+    snow = block(SNOW, (0.4, 0.45, 0.4), (0.55, 0.6, 0.5), (0, -4, 0), seed=1, obstacles=(sheet(0.3),))
+    scenes = [water, snow, joined(block(SAND, (0.3, 0.2, 0.3), (0.4, 0.3, 0.4)), water)]
     steps = (0.5, 1.0, 0.25)
     together = simulate(scenes, ADAPTIVE, 7, 60.0, stability_fractions=steps)
-    for scene, step, outcome in zip(scenes, steps, together, strict=True):
-        (alone,) = simulate([scene], dataclasses.replace(ADAPTIVE, stability_fraction=step), 7, 60.0)
-        assert np.array_equal(alone.position_TN3, outcome.position_TN3)
-        assert alone.counters == outcome.counters
+    for own_kernel, index in ((False, 0), (False, 1), (False, 2), (True, 0)):
+        config = dataclasses.replace(ADAPTIVE, stability_fraction=steps[index])
+        with shared_kernels.kernels_of_their_own() if own_kernel else contextlib.nullcontext():
+            (alone,) = simulate([scenes[index]], config, 7, 60.0)
+        assert np.array_equal(alone.position_TN3, together[index].position_TN3)
+        assert alone.counters == together[index].counters
 
 
 @pytest.mark.parametrize(

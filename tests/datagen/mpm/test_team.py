@@ -5,6 +5,7 @@ A GPU runs it with hundreds of threads a block; here a block has one, and two bl
 
 import numpy as np
 import pytest
+import shared_kernels
 from mpm_scenes import CELL, CONFIG, assert_inside, block, particles, sheet, simulated
 
 from datagen.mpm import solver, team_launch
@@ -19,7 +20,13 @@ def mixed(count, seed, velocity, **scene):
     return block(kinds, low, high, velocity, seed, count, obstacles=(sheet(0.3),), **scene)
 
 
-# particles of many densities beside: with them all tests of this file share a kernel of each launch
+@pytest.fixture(scope="module", autouse=True)
+def two_threads():
+    shared_kernels.use_threads(2)
+    yield
+    shared_kernels.use_threads(1)
+
+
 HEAVY = mixed(90, 1, (1, -1, 0), material_parameters={"density_kg_m3": np.linspace(500, 2000, 90, dtype=np.float32)})
 
 
