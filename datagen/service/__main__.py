@@ -38,7 +38,7 @@ class ServiceConfig:
     host: str = "127.0.0.1"  # address to listen on; any other needs a token in $HGN_DATASET_TOKEN
     port: Port = 8000  # 0: any free port
     health_port: Port | None = None  # also answers /healthz at this port, for the probes of a busy service; null: no
-    connections: Positive[int] = 1024  # simultaneous connections; others are answered with 503
+    connections: Positive[int] = 1024  # connections; one more closes the oldest without a request, else it gets a 503
 
     def __post_init__(self) -> None:
         require_bounds(self)

@@ -269,7 +269,7 @@ def make_server(
     patience_s: float = SendfileProtocol.patience_s,
     every_second: Callable[[], Awaitable[None]] | None = None,
 ) -> uvicorn.Server:
-    """Returns a server for `connections`, or fewer if `open_files` are too few. Others get the status 503."""
+    """Returns a server for `connections`, or fewer if `open_files` are too few; see SendfileProtocol."""
     most = max(1, min(connections, (open_files - _BACKLOG - _OTHER_FILES) // 2))  # a socket and a shard each
     limits = {"most_connections": most, "patience_s": patience_s}
     return uvicorn.Server(

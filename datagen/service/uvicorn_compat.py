@@ -32,8 +32,8 @@ class SendfileProtocol(H11Protocol):
     """Adds `http.response.zerocopysend` and time limits to Uvicorn's HTTP on asyncio's own loop.
 
     A connection is closed if no whole request arrives for `patience_s`, or if its answer is accepted too slowly. With
-    more than `most_connections`, the one that has been without a request for longest is closed. Uvicorn's own limits
-    act only after a first answer, and count connections without a request as load.
+    more than `most_connections` the oldest one without a request is closed. If all have requests, the new one gets 503.
+    Uvicorn's own limits act only after a first answer, and count connections without a request as load.
     """
 
     patience_s = 30.0

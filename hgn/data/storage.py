@@ -41,7 +41,7 @@ _outliving = threading.Event()
 
 
 def faults_outlived() -> contextlib.AbstractContextManager[None]:
-    """Lets `ask` repeat failed reads for the standard patience. A running training needs it: it has read these data."""
+    """Lets `ask` repeat failed reads for the standard patience. A running training uses it: faults may be temporary."""
     return inside(_outliving)
 
 
