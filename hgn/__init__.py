@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from hgn.schema import ConfigError as ConfigError
 
 # OpenMP reads this when torch loads it. Otherwise its idle threads spin, and take cores from the thread for which they
-# wait. A training beside another program then makes at most a sixth of the updates.
+# wait. While another program runs, a training then makes at most a sixth of the updates.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 _MODULES = {

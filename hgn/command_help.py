@@ -43,7 +43,7 @@ def _nested(cls: type | None, key: str) -> type | None:
 
 
 def _comments_in(file: Path) -> dict[str, str]:
-    """Returns the comments beside the keys of a YAML file."""
+    """Returns the comment of each key of a YAML file."""
     return dict(re.findall(r"^(\w+):[^#\n]*# (.*)$", file.read_text(encoding="utf-8"), re.MULTILINE))
 
 

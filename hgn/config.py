@@ -399,7 +399,7 @@ class TrainingConfig:
     backend: Annotated[str, one_of("auto", "torch", "triton")] = "auto"
     minimum_episodes: Positive[int] = 1  # number of published training episodes at which training starts
     generate: bool = True  # whether to start the generator if the data set is missing or incomplete
-    # what logs beside metrics.jsonl: tensorboard, wandb, mlflow; their environment variables name servers and projects
+    # loggers in addition to metrics.jsonl: tensorboard, wandb, mlflow; their variables name servers and projects
     loggers: tuple[Annotated[str, one_of(*LOGGERS)], ...] = ("tensorboard",)
     log_every: Positive[int] = 50  # number of updates between log lines
     checkpoint_every: Positive[int] = 1_000  # number of updates between checkpoints

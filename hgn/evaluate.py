@@ -1,4 +1,4 @@
-"""python -m hgn.evaluate weights=… data=…: measures one-step and rollout errors beside those of baselines."""
+"""python -m hgn.evaluate weights=… data=…: measures one-step and rollout errors, and those of baselines."""
 
 from __future__ import annotations
 
@@ -148,7 +148,7 @@ def _at_frames(mse_T: np.ndarray, frames: list[int]) -> dict[str, float]:
 
 def end_of_rollout(trial: RolloutResult, episode: Episode) -> dict[str, Any]:
     """Returns properties of a rollout's last frame, and the cause of an early end.
-    They are the shares of particles in closed obstacles, also in the data, and of particles outside the domain."""
+    They are the fractions of particles in closed obstacles, also in the data, and outside of the domain."""
     from hgn.scene.episode_obstacles import obstacles_of_episode
 
     obstacles, last = obstacles_of_episode(episode), trial.frame_count - 1

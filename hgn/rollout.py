@@ -42,13 +42,13 @@ SAME_SPEED = 1e-5  # relative difference of equal speeds, because velocities are
 
 @dataclass(frozen=True)
 class RolloutConfig(SimulatorConfig):
-    """`python -m hgn.rollout`: simulates a random scene, a scene file, or an episode of a data set beside its truth."""
+    """`python -m hgn.rollout`: simulates a random scene, a scene file, or an episode of a data set with its truth."""
 
     weights: str = DEFAULT_WEIGHTS  # a file of python -m hgn.export, or the name of shipped weights
     # the file to write: .vtkhdf, .usdc, .usda, .usd (one stage) or .ply (one a frame); null: rollout/NAME.vtkhdf
     out: str | None = None
     surface: bool = False  # also write water as a closed surface, in USD and PLY
-    render: bool | None = None  # also draw a PNG and a GIF beside the file; null: if out is null
+    render: bool | None = None  # also draw a PNG and a GIF in the folder of the file; null: if out is null
     # a scene file, or the name of one in conf/example, for example funnel; null: a random scene, or an episode
     scene: str | None = None
     # seed of a random scene, drawn from the distribution of the training scenes; 13: all materials fall on obstacles

@@ -1,4 +1,4 @@
-"""python -m tools.tables [check=true]: writes the tables and figures of Markdown pages from the JSON beside them.
+"""python -m tools.tables [check=true]: writes the tables and figures of Markdown pages from JSON files.
 
 A folder of pages has a `tables.yaml`, for its own pages or for those that its `pages` names. A page holds
 `<!-- table: NAME -->` … `<!-- end -->` for a table and `<!--=NAME-->0.302<!--/-->` for a figure within a sentence. What

@@ -165,7 +165,7 @@ class Stopwatch:
         return best, least
 
     def round(self) -> dict[str, Any]:
-        """Simulates each scene once more; returns `ms` of a frame and `ms_batched` of a frame and scene."""
+        """Simulates each scene again. Returns `ms` of a frame and `ms_batched` of a frame and scene."""
         rollouts = [(scenes, self.single_frames, self.single_ms) for scenes in self.singles]
         if not (self.solver and self.batched_ms):  # a whole rollout of many scenes is timed once
             rollouts.append((self.batch, self.batch_frames, self.batched_ms))

@@ -65,7 +65,7 @@ def compiled_rows(network: torch.nn.Module) -> CompiledRows:
 class CompiledRows(Rows):
     """Computes rows of an MLP whose layers have equal widths. For other MLPs it computes only projections.
 
-    It holds places of parameters, not values, so that an update of a training changes its results.
+    It stores addresses of parameters, not values, so that an update of a training changes its results.
     """
 
     def __init__(self, network: torch.nn.Module) -> None:

@@ -39,7 +39,7 @@ class Sample(NamedTuple):  # faster to construct than a dataclass; a thousand ar
     noise_scale: float = 1.0  # scale of its noise in units of training.noise_std (see hgn.training.noise)
 
 
-BLOCK_EPISODES = 8  # consecutive episodes in publication order; most shards have as many
+BLOCK_EPISODES = 8  # consecutive episodes in publication order; this is the size of most shards
 
 
 def epoch_order(seed: int, epoch: int, first_sample: np.ndarray, window: int = 0) -> np.ndarray:

@@ -124,7 +124,7 @@ def animate(
 def animation_rate(rollout: Rollout, path: str | Path, every: int) -> float:
     """Returns the pictures per second of an animation in real time.
 
-    Raises: ConfigError if viewers do not play as many (GIF 50, WebP 60), or if every is below 1.
+    Raises: ConfigError if viewers play fewer per second (GIF 50, WebP 60), or if every is below 1.
     """
     kind, fastest = ("WebP", 60) if Path(path).suffix == ".webp" else ("GIF", 50)
     if not every >= 1:
@@ -137,7 +137,7 @@ def animation_rate(rollout: Rollout, path: str | Path, every: int) -> float:
 
 
 def write_picture(path: str | Path, picture: Image.Image | bytes, source: Mapping[str, object] | None = None) -> None:
-    """Writes a PNG, or the given bytes, atomically. The PNG's Description holds `source` as JSON."""
+    """Writes a PNG, or the given bytes, atomically. The PNG's Description contains `source` as JSON."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     if isinstance(picture, Image.Image):

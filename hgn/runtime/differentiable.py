@@ -53,7 +53,7 @@ def simulate(
 ) -> torch.Tensor:
     """Returns positions [T, N, 3]. `start` is the scene's state at frame 0 from `Simulator.start`.
 
-    The backward pass computes each frame again. So memory holds the states between frames and one frame's results.
+    The backward pass computes each frame again. Memory contains all states, and the intermediate results of one frame.
     The network's parameters get no gradients. Raises: ConfigError, DivergedError.
     """
     require(frames >= 1, "frames", "at least 1", frames)

@@ -55,7 +55,7 @@ def frames_before(episode: Episode, first: int) -> np.ndarray:
 
 
 def require_past(past_HN3: np.ndarray, history: int) -> None:
-    """Raises ConfigError unless an imported episode has as many frames before frame 0 as the network's history."""
+    """Raises ConfigError if an imported episode has fewer frames before frame 0 than the network's history."""
     remedy = "import the trajectories again with a larger history=…"
     rule = f"at most the {len(past_HN3)} frames that the imported episodes have before their first"
     require(history <= len(past_HN3), "network.velocity_history", rule, history, remedy)

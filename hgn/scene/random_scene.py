@@ -278,7 +278,7 @@ def _purify(config: SceneConfig, bodies: list[Body], gravity: Vector, rng: np.ra
 
 
 def _collide(config: SceneConfig, bodies: list[Body], rng: np.random.Generator) -> list[Body]:
-    """Throws groups at each other, in pairs or all together. A group without a partner rests.
+    """Throws groups at each other, in pairs or all together. A group without a partner starts at rest.
 
     They meet off centre by up to half a group's size. The fastest one has at least half the maximum speed.
     """

@@ -24,7 +24,7 @@ _WRITTEN_BY_HGN = re.compile(
 
 
 def temporary_path(path: Path) -> Path:
-    """Returns a unique name beside `path` for writing it. A crash leaves only a file that ends in `.partial`.
+    """Returns a unique name in the folder of `path` for writing it. A crash leaves only a file that ends in `.partial`.
 
     Names are random, because containers on several machines may have equal process numbers.
     """
@@ -38,7 +38,7 @@ def temporary_target(path: Path) -> str:
 
 @contextlib.contextmanager
 def temporary_file(path: Path) -> Iterator[Path]:
-    """Yields a temporary name beside `path` for writing it, and removes the file unless the caller renamed it.
+    """Yields a temporary name in the folder of `path` for writing it. Removes the file unless the caller renamed it.
 
     An OSError that names no file (a full disk) names `path`.
     """
@@ -118,7 +118,7 @@ def is_replaceable(path: Path) -> bool:
 
 @contextlib.contextmanager
 def space_reserved(path: Path, size: int) -> Iterator[Callable[[int], None]]:
-    """Reserves `size` bytes beside `path` during long work, so that the disk is not full at its end.
+    """Reserves `size` bytes in the folder of `path` during long work, so that the disk is not full at its end.
 
     Yields a function that releases some of these bytes, before they are written elsewhere. Failed work leaves no new
     folder. Raises: OSError, before the work, where the disk has less.

@@ -1,4 +1,4 @@
-"""Loggers beside metrics.jsonl: TensorBoard, Weights & Biases and MLflow, each in a thread of its own.
+"""Logs to TensorBoard, Weights & Biases and MLflow, in addition to metrics.jsonl. Each logger has its own thread.
 
 `training.loggers` lists them. Servers and credentials come from the environment, as in WANDB_MODE and
 MLFLOW_TRACKING_URI. A logger that fails, or waits for its server, neither ends nor delays a training.

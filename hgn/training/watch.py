@@ -29,7 +29,7 @@ BEAT_S = 5.0  # interval between counts
 SILENCE_S = 300.0  # longest time without a new count of a rank; network file systems may delay files by a minute
 TRACE = "hang_rank_"  # with the rank's number, the file with its last collectives
 TRACE_S = 10.0  # longest time for writing it
-# variables of PyTorch's flight recorder; a name beside the first is an earlier one with the same meaning
+# variables of PyTorch's flight recorder: the present name, and an earlier one with the same meaning
 _BUFFER = ("TORCH_FR_BUFFER_SIZE", "TORCH_NCCL_TRACE_BUFFER_SIZE")
 _FILE = ("TORCH_FR_DUMP_TEMP_FILE", "TORCH_NCCL_DEBUG_INFO_TEMP_FILE")
 GRACE_S = 45.0  # longest time without an update after a signal; schedulers grant more

@@ -1,4 +1,4 @@
-"""python -m tools.stability PART …: what holds, up to where, and what happens beyond.
+"""python -m tools.stability PART …: checks a network or the solver, and finds limits.
 
 Parts are modules of this package with a `main`, each with its options in conf/command/stability_PART.yaml.
 """

@@ -146,7 +146,7 @@ def conserved(outcome: Outcome) -> tuple[float, float, float]:
 
 
 def wall_distance(config: Any) -> float:
-    """Returns the distance from walls, in domain units, within which motion is not judged.
+    """Returns the distance from walls, in domain units, within which motion is not checked.
 
     The solver's walls act up to two finest cells away, relative inputs up to their reach and half a cell.
     """

@@ -47,7 +47,7 @@ class StabilityNetworkConfig(SimulatorConfig):
 
     weights: str = DEFAULT_WEIGHTS  # a file of python -m hgn.export, or the name of shipped weights
     # throw, gravity, collision, collapse, rest, particles, domain, speed, single, slope, far, guard; null: all of
-    # these. gallery: the scenes of conf/gallery beside the solver's figures; gallery_1: the draw for
+    # these. gallery: the scenes of conf/gallery against the solver's figures; gallery_1: the draw for
     # choices; gallery_2: the draw for reports; gallery_NUMBER: another draw
     cases: tuple[CaseName, ...] | None = None
     frames: FrameCount = 300  # of each rollout

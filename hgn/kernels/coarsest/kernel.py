@@ -125,7 +125,7 @@ def balance(
     other, beside, axis, sign, part, both, _, apart, whole = _pairs(
         moments, neighbour, motion, geometry, cell, there, mass, centre, inertia, capacity, LEVELS, OUT
     )
-    # The code above depends on places alone.
+    # The code above depends only on places.
     if OVERLAP:
         gdc_wait()
         gdc_launch_dependents()
@@ -186,7 +186,7 @@ def balance_backward(
     disturbed, touched = _felt(felt, cell, there)
     free = 1 - touched
     half = 0.5 * tl.load(felt + other * 2, mask=other >= 0, other=0.0)
-    # The code above depends on places alone.
+    # The code above depends only on places.
     if OVERLAP:
         gdc_wait()
         gdc_launch_dependents()

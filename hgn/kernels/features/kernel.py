@@ -32,7 +32,7 @@ def sum_motion(
     if tl.program_id(0) * BLOCK >= count:
         return
     cell = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    if tl.program_id(1) == 1:  # these programs run beside those of the sums
+    if tl.program_id(1) == 1:  # these programs run at the same time as those of the sums
         most_around(disturbed, felt, 1, neighbour, cell, cell < tl.load(counts + LEVELS - 1), coarsest_capacity)
         return
     there = cell < count
