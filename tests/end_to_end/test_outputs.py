@@ -4,6 +4,7 @@ import errno
 import itertools
 import os
 
+import ballistic_solver
 import pytest
 from end_to_end.places import (
     COMMANDS,
@@ -22,8 +23,9 @@ from hgn.scene.rollout_file import read_rollout
 
 
 @pytest.mark.parametrize("command", ["rollout", "solve"])
-def test_full_disks_are_met_before_the_work(place, command, capsys, monkeypatch):
+def test_full_disks_are_met_before_the_work(place, backend, command, capsys, monkeypatch):
     """Space for the file is reserved during the simulation; a disk without it is named before."""
+    monkeypatch.setattr("datagen.mpm.solver.simulate", ballistic_solver.simulate)
     arguments, sizes, reserve = ["scene=scene.yaml", "out=made/r.vtkhdf", "frames=3"], [], os.posix_fallocate
     monkeypatch.setattr(os, "posix_fallocate", lambda *given: sizes.append(given[-1]) or reserve(*given))
     assert exit_code(COMMANDS[command], command, arguments, monkeypatch) == 0
@@ -94,7 +96,7 @@ def test_own_files_are_replaced(place, monkeypatch):
         ["rollout", [*ROLLOUT[:2], f"out=made/r.{end}", "frames=3"]] for end in ("vtkhdf", "ply", "usdc", "usda")
     ]
     of_it = "rollout=made/r.vtkhdf"
-    drawn = [["render", [of_it, f"out=made/r.{end}", "every=2"]] for end in ("png", "gif", "webp")]
+    drawn = [["render", [of_it, f"out=made/r.{end}", "every=2", "size=64"]] for end in ("png", "gif", "webp")]
     others = [["evaluate", EVALUATE], ["play", [of_it, "html=made/r.html"]], ["curves", ["runs=[run]", "out=made/c"]]]
     for command, arguments in [exported, *rollouts, *drawn, *others] * 2:
         assert exit_code(COMMANDS[command], command, arguments, monkeypatch) == 0, (command, arguments)

@@ -1,5 +1,6 @@
 """python -m hgn.rollout where little is said: shipped weights, random scenes, examples by name, pictures."""
 
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -8,11 +9,18 @@ from network.states import silent
 from hgn import rollout
 from hgn.config import DEFAULT_WEIGHTS, NetworkConfig
 from hgn.network.build import build_network
+from hgn.render import pictures
 from hgn.runtime.weights import WeightsInfo, find_weights, load_weights, save_weights, shipped_weights
 from hgn.scene.rollout_file import read_rollout
 from hgn.schema import ConfigError
 
 MAXIMUM_BYTES = 8_000_000
+
+
+@pytest.fixture
+def small_pictures(monkeypatch):
+    for name in ("compare_picture", "animate"):
+        monkeypatch.setattr(pictures, name, partial(getattr(pictures, name), size=64))
 
 
 @pytest.fixture
@@ -44,7 +52,7 @@ def test_names_and_paths(tmp_path, monkeypatch):
         find_weights("sand")
 
 
-def test_nothing_said(tmp_path, monkeypatch, capsys):
+def test_nothing_said(tmp_path, small_pictures, monkeypatch, capsys):
     """Without out, it draws: three files in rollout/, named by the scene, a random one with the default network."""
     monkeypatch.chdir(tmp_path)
     assert rollout.main({"frames": 2}) == 0
@@ -66,7 +74,7 @@ def test_a_network_without_obstacles_gets_none(tmp_path):
     assert not made.obstacles and made.position_TN3.shape[1] == 4296
 
 
-def test_scenes(tmp_path, weights, monkeypatch):
+def test_scenes(tmp_path, weights, small_pictures, monkeypatch):
     """Seeds draw different scenes, an example has its name, a file of that name wins and a folder does not; with out
     nothing is drawn unless asked."""
     monkeypatch.chdir(tmp_path)

@@ -336,10 +336,10 @@ def test_a_checkpoint_of_the_first_release(finished):
 
 
 def test_training_learns(make_config, make_dataset, run):
-    """On free fall with strong velocity noise, 240 updates learn to undo a good part of the noise."""
+    """On free fall with strong velocity noise, 80 updates learn to undo a good part of the noise."""
     config = make_config(training_scenes=6, frames=30)
     make_dataset(config)
-    changes = {"maximum_updates": 240, "log_every": 10, "learning_rate": 1e-2, "noise_std": 0.02}
+    changes = {"maximum_updates": 80, "batch_scenes": 16, "learning_rate": 2e-2, "noise_std": 0.02}
     train.main(train_mapping(config, run, **changes, monitor_every=1000, checkpoint_every=1000))
     losses = [record["loss"] for record in metrics(run) if "loss" in record]
     assert sum(losses[-4:]) < 0.8 * sum(losses[:4])
