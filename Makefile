@@ -55,13 +55,13 @@ test: setup
 	@echo "about 12 minutes on two free cores; at the end: which tests were skipped, and why (no GPU, no namespaces, ...)"
 	$(RUN) -m pytest -n $(TEST_PROCESSES) -rs
 
-# exported packages and all kernels for an H100 are compiled; CI runs these tests after the others
+# exported packages and all kernels for an H100 are compiled, notebooks run; CI runs these tests after the others
 slow: setup
 	$(RUN) -m pytest -n $(TEST_PROCESSES) -m slow
 
-# each decoder reads 5,000 damaged files, other ones each time; for a maintainer to start, not in CI
+# each decoder reads 5,000 damaged files, other ones each time, and two viewers act for two minutes; not in CI
 soak: setup
-	$(RUN) -m pytest tests/scene/test_hostile_files.py -k any_bytes --soak 5000
+	$(RUN) -m pytest tests/scene/test_hostile_files.py tests/viewer/test_strangers.py -m "" -k "any_bytes or two_viewers" --soak 5000
 
 check: setup format lint types layers docs test slow
 

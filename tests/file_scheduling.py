@@ -7,15 +7,16 @@ from xdist.scheduler import LoadScopeScheduling
 
 LONGEST_FILES = (  # five seconds and more of one core; begun last, one of them would run alone
     *("solver", "generator", "viewer/test_page", "training/test_ddp", "jobs/test_jobs"),
-    *("kernels/test_triton_compat", "network/test_network", "datagen/test_command", "datagen/test_pool"),
-    *("runtime/test_exported_step", "runtime/test_differentiable", "kernels/test_rollout"),
+    *("runtime/test_exported_step", "docs/test_notebooks", "kernels/test_triton_compat"),
+    *("network/test_network", "datagen/test_command", "datagen/test_pool"),
+    *("runtime/test_differentiable", "kernels/test_rollout"),
     *("tools/test_bench", "end_to_end/test_bad_input", "kernels/test_training", "kernels/test_kernels_alone"),
     *("datagen/test_kills", "training/test_train", "scene/test_hostile_files", "scene/test_random_scene"),
     *("end_to_end/test_wheel", "tools/test_scaling"),
     *("tools/test_error_vs_time", "kernels/test_update", "jobs/test_queue"),
     *("datagen/test_service", "training/test_resume", "training/test_live_service", "kernels/test_memory"),
     *("test_command", "kernels/test_symmetry", "kernels/test_network", "training/test_precompile"),
-    *("test_defaults", "data/test_import", "cpu/test_rows", "kernels/test_pushforward", "docs/test_notebooks"),
+    *("test_defaults", "data/test_import", "cpu/test_rows", "kernels/test_pushforward"),
     *("docs/test_pages", "data/test_index"),
 )
 SIMULATING = ("datagen/test_fine_reference", "datagen/test_world_data", "tools/test_gallery")

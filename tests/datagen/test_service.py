@@ -351,8 +351,8 @@ def test_stopping_leaves_a_resumable_folder(backend, control, tmp_path):
 
 @pytest.mark.slow
 def test_a_crowd_of_readers(tmp_path):
-    """Three hundred readers get every shard whole while it is generated, and /healthz answers at its own port."""
-    crowd.main(20.0, 300, tmp_path / "crowd.json")
+    """A hundred readers get every shard whole while it is generated, and /healthz answers at its own port."""
+    crowd.main(10.0, 100, tmp_path / "crowd.json")
     figures = json.loads((tmp_path / "crowd.json").read_text())["figures"]
     assert figures["errors"] == [] and max(figures["memory_mb"]) < 150
-    assert figures["answers"] > 300 * 32 and figures["healthz_s"]["samples"] > 0
+    assert figures["answers"] > 100 * 32 and figures["healthz_s"]["samples"] > 0

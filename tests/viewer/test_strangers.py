@@ -439,9 +439,12 @@ def test_unfinished_uploads_are_bounded(page, monkeypatch, uploads, count, size)
 
 
 @pytest.mark.slow
-def test_two_viewers_for_two_minutes(tmp_path):
-    """Memory stays within 50 MB of what it is after a minute, and no unexpected error is printed."""
-    text = soak.main(120, tmp_path / "soak.json")
+def test_two_viewers(tmp_path, request):
+    """No unexpected error is printed in ten seconds. `make soak` takes two minutes, and memory stays within 50 MB of
+    what it is after one."""
+    seconds = 120 if request.config.getoption("soak") else 10
+    text = soak.main(seconds, tmp_path / "soak.json")
     report = json.loads((tmp_path / "soak.json").read_text())
-    assert report["growth_mb"] < 50 and report["errors"] == 0 and report["ended"] is None, text
+    assert report["errors"] == 0 and report["ended"] is None, text
     assert report["rows"][-1]["frames"] > 0 and report["rows"][-1]["answers"] > 0
+    assert seconds == 10 or report["growth_mb"] < 50, report["rows"]

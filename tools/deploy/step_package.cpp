@@ -1,6 +1,6 @@
 // step_package PACKAGE ARRAYS FRAMES OUT: simulates a scene with a package of hgn.export, compiled for the CPU.
+#include <ATen/ATen.h>
 #include <torch/csrc/inductor/aoti_package/model_package_loader.h>
-#include <torch/torch.h>
 
 #include <chrono>
 #include <iostream>
@@ -16,7 +16,7 @@ int main(int count, char** words) try {
     auto arrays = read_arrays(words[2]);
     std::vector<at::Tensor> inputs;
     for (auto& array : arrays)
-        inputs.push_back(torch::from_blob(array.bytes.data(), array.shape, array.type == "<f4" ? torch::kFloat : torch::kLong));
+        inputs.push_back(at::from_blob(array.bytes.data(), array.shape, array.type == "<f4" ? at::kFloat : at::kLong));
     const int64_t particles = inputs[0].size(0);
     std::vector<float> positions;
     const auto start = std::chrono::steady_clock::now();
