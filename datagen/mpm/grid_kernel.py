@@ -1,8 +1,8 @@
 """One substep of explicit MLS-MPM for a batch of scenes, as a single Taichi kernel.
 
 The method is that of datagen.mpm.mls_mpm. On a CPU each part of a scene's particles is scattered into its own copy of
-the grid, and the copies are summed in order. So the result does not depend on the number of threads. On a GPU all
-particles are scattered into one copy with atomics.
+the grid, and the copies are summed in order. So threads change the result only by the number of copies, at most
+MAXIMUM_PARTS. On a GPU all particles are scattered into one copy with atomics.
 """
 
 from collections import namedtuple
