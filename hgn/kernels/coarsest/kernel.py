@@ -80,9 +80,9 @@ def _pairs(
     moments, neighbour, motion, geometry, cell, there, mass, centre, inertia, capacity,
     LEVELS: tl.constexpr, OUT: tl.constexpr,
 ):  # fmt: skip
-    """Returns properties of the cells across the faces [C, 8], of which the last two do not exist: number, one over the
-    mass, axis and sign of the direction, this cell's share of both masses, product of the shares, centre of mass from
-    the cell's middle, distance of the centres, and inertia of both about their common centre."""
+    """Returns properties of the cells across the six faces, [C, 8] with two unused columns, in this order: number; one
+    over the mass; axis and sign of the direction; the own cell's fraction of both masses; product of both fractions;
+    centre of mass from the cell's middle; vector between the centres; inertia of both about their common centre."""
     slot = tl.arange(0, 8)[None, :]
     other = tl.load(neighbour + slot * capacity + cell[:, None], mask=there[:, None] & (slot < 6), other=-1)
     found = other >= 0

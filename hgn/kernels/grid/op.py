@@ -98,9 +98,9 @@ class DeviceGrid:
     fraction_N3, and the encoder's input feature_NF. Relative inputs need more. motion_C4 is mass and momentum of the
     cells of all levels, one level after the other. The coarsest cells have disturbed_C2 (disturbed and touched by their
     own particles, in units of FULLY) and felt_C2 (the maximum with those across their faces). sum_C and table_C are the
-    sums and the table of `balance`. moment_C holds the first and second moments of their contents, and sums of products
-    of normals. Each particle has its coarsest cells coarsest_N8, each once and -1 elsewhere, its shares share_N8 of
-    them, its place place_N3 in the lowest one, and touch_N, the nearness of a surface.
+    sums and the table of `balance`. moment_C contains first and second moments of places, and sums of products of
+    normals. A particle has its coarsest cells coarsest_N8 (repeated cells are -1), its weights share_N8 in them, its
+    place place_N3 in the lowest one, and its contact touch_N.
     """
 
     def __init__(
