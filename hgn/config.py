@@ -309,8 +309,9 @@ class NetworkConfig:
     width: LayerSize = 128  # number of values in latent vectors and hidden layers
     velocity_history: FewLayers = 5  # m: number of past velocities in the input
     obstacle_features: bool = True  # normals of obstacle cells as inputs; false is only for scenes without obstacles
-    # absolute: the paper's velocities and wall distances; relative: hgn.network.relative, exact in free motion
-    inputs: Annotated[str, one_of("absolute", "relative")] = "absolute"
+    # absolute: the paper's velocities and wall distances; relative: hgn.network.relative, exact in free motion; local:
+    # relative, and cells of coarser levels exchange messages only where cells of the finest level touch
+    inputs: Annotated[str, one_of("absolute", "relative", "local")] = "absolute"
     materials: tuple[MaterialName, ...] = PAPER_MATERIALS  # each of the materials has its own embedding
     # number of dimensions; with 2, which only imported data have, z is constant
     dimensions: Annotated[int, Bound("2 or 3", lambda count: count in (2, 3))] = 3
@@ -320,7 +321,7 @@ class NetworkConfig:
         require(len(self.materials) > 0, "materials", "a list with at least one material", [])
         if self.relative:
             require(self.kind == "hgn", "inputs", f"absolute for {self.kind}", self.inputs)
-            rule = "at least 2 with inputs=relative, which are of differences"
+            rule = f"at least 2 with inputs={self.inputs}, which are of differences"
             require(self.velocity_history >= 2, "velocity_history", rule, self.velocity_history)
         if self.kind == "gns":
             require(self.levels == 1, "levels", "1 for gns: the particles themselves", self.levels)
@@ -328,7 +329,7 @@ class NetworkConfig:
     @property
     def relative(self) -> bool:
         """Returns whether inputs are relative. Then they do not depend on a motion common to all particles."""
-        return self.inputs == "relative"
+        return self.inputs != "absolute"
 
     @property
     def feature_width(self) -> int:

@@ -40,7 +40,7 @@ class Removed:
 
 
 def _relative(network: Mapping[str, Any]) -> bool:
-    return network.get("inputs") == "relative"
+    return network.get("inputs", "absolute") != "absolute"
 
 
 def _rests(network: Mapping[str, Any]) -> bool:

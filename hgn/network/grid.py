@@ -2,7 +2,8 @@
 
 Cell k of the finest level spans [k, k + 1) * cell_size + origin. A cell is active if its centre has a non-zero
 trilinear weight for some particle. The parent of cell k is floor(k / 2). It is active if one of its children is.
-Edges join active cells of one level that share a face, in both directions.
+Edges join active cells of one level that share a face, in both directions. With `connected`, an edge of a coarser level
+must in addition have an edge of the finest level across its face. So bodies apart exchange nothing through edges.
 Shape legend: N particles, C cells of a level, E directed edges of a level, S scenes.
 """
 
@@ -73,11 +74,17 @@ class GridHierarchy:
 
 
 def build_hierarchy(
-    position_N3: torch.Tensor, scene_N: torch.Tensor, origin_S3: torch.Tensor, cell_size: float, levels: int
+    position_N3: torch.Tensor,
+    scene_N: torch.Tensor,
+    origin_S3: torch.Tensor,
+    cell_size: float,
+    levels: int,
+    connected: bool = False,
 ) -> GridHierarchy:
     """Builds the grids of all scenes. Cells of different scenes are never neighbours.
 
-    position_N3 is in domain units. scene_N contains int64 indices into origin_S3, the finest grid's origins.
+    position_N3 is in domain units. scene_N contains int64 indices into origin_S3, the finest grid's origins. With
+    `connected`, cells of coarser levels are neighbours only where finest cells on both sides of their face are active.
     Raises: GridRangeError if a particle is not finite or beyond ±65,536 cells.
     """
     grid_N3 = (position_N3 - origin_S3[scene_N]) / cell_size - 0.5
@@ -99,7 +106,8 @@ def build_hierarchy(
 
     built = []
     for level in range(levels):
-        sender_E, receiver_E, direction_E = _edges(key_C)
+        edges = _edges_of_parents(built[-1], key_C.shape[0]) if connected and level > 0 else _edges(key_C)
+        sender_E, receiver_E, direction_E = edges
         if level == levels - 1:
             built.append(Level(key_C, sender_E, receiver_E, direction_E))
             break
@@ -116,3 +124,14 @@ def _edges(key_C: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tenso
     neighbour_C6, found_C6 = find(key_C, key_C[:, None] + stride_6)
     receiver_E, direction_E = torch.nonzero(found_C6, as_tuple=True)
     return neighbour_C6[receiver_E, direction_E], receiver_E, direction_E
+
+
+def _edges_of_parents(level: Level, count: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Returns the edges between different parents of cells that an edge of this level joins. `count`: parents."""
+    assert level.parent_C is not None
+    sender_E, receiver_E = level.parent_C[level.sender_E], level.parent_C[level.receiver_E]
+    (crossing_E,) = torch.nonzero(sender_E != receiver_E, as_tuple=True)
+    edge_E = (receiver_E * 6 + level.direction_E) * count + sender_E
+    edge_E, _ = unique(edge_E[crossing_E])
+    receiver_E = torch.div(edge_E, count, rounding_mode="floor")
+    return edge_E - receiver_E * count, torch.div(receiver_E, 6, rounding_mode="floor"), receiver_E % 6

@@ -166,14 +166,17 @@ def _require_equal(pairs: list[tuple[str, Any, Any]], why: str, remedy: str) -> 
 def network_of_weights(config: TrainConfig) -> ParticleNetwork:
     """Returns the network of training.init_weights with its normaliser, as the initial state of a new run.
 
-    The rest constraint and the clearances of walls and obstacles may differ from those of the weights, because they do
-    not change tensors. Raises: ConfigError for a file without weights, another network, or other data.
+    The rest constraint, the clearances of walls and obstacles, and inputs relative and local may differ from those of
+    the weights, because they do not change tensors. Raises: ConfigError for a file without weights, another network,
+    or other data.
     """
     assert config.training.init_weights is not None
     path = find_weights(config.training.init_weights, "training.init_weights")
     weights, info = load_weights(path, field="training.init_weights")
     remedy = "set it so, or take other training.init_weights"
     pairs = _pairs("network", info.network, config.network)
+    if info.network.relative and config.network.relative:
+        pairs = [pair for pair in pairs if pair[0] != "network.inputs"]
     pairs.append(("dataset.frame_rate_hz", info.frame_rate_hz, config.dataset.frame_rate_hz))
     if info.network.obstacle_features:
         pairs.append(("scene.cell_size", info.obstacle_cell_size, config.scene.cell_size))

@@ -80,9 +80,9 @@ CASES = {
     ),
     "relative, one particle": Case(lambda: moving_state((1,), False), 4e-5, RELATIVE),
     "relative, four levels": Case(
-        lambda: moving_state((7, 2), False, 0.6),
+        lambda: moving_state((23, 2), False, 0.4),
         4e-5,
-        RELATIVE | {"obstacle_features": False, "levels": 4, "materials": SHUFFLED},
+        {"inputs": "local", "obstacle_features": False, "levels": 4, "materials": SHUFFLED},
     ),
     "relative, free flight": Case(flying_state, 2e-4, RELATIVE),
 }

@@ -12,12 +12,12 @@ from hgn.network.grid import CORNER_83, DIRECTION_63, build_hierarchy
 SIZE = 0.25  # a power of two: centres and halves are exact
 
 
-def build(position, scene=None, origin=None, levels=2, size=SIZE):
+def build(position, scene=None, origin=None, levels=2, size=SIZE, connected=False):
     position = torch.as_tensor(position, dtype=torch.float64)
     scene = torch.zeros(len(position), dtype=torch.long) if scene is None else torch.as_tensor(scene)
     if origin is None:
         origin = torch.zeros(int(scene.max()) + 1 if len(scene) else 1, 3, dtype=torch.float64)
-    return build_hierarchy(position, scene, origin, size, levels)
+    return build_hierarchy(position, scene, origin, size, levels, connected)
 
 
 def cells(level):
@@ -72,6 +72,26 @@ def test_hierarchy_is_what_the_definition_says(particles, scenes):
         coordinate_C3 = unpack(level.key_C)[1]
         away_E3 = coordinate_C3[level.sender_E] - coordinate_C3[level.receiver_E]
         assert torch.equal(away_E3, DIRECTION_63[level.direction_E].to(away_E3))
+
+
+@settings(max_examples=40, deadline=None)
+@given(positions)
+@example([(0.4, 0.1, 0.1), (0.6, 0.1, 0.1), (-0.6, 0.1, 0.1)])  # of two neighbours of a coarse cell one is joined
+def test_connected_cells(particles):
+    """With `connected` a coarse edge exists iff active finest cells touch across its face; cells do not change."""
+    plain, joined = (build(particles, levels=3, connected=connected) for connected in (False, True))
+    finest = {cell[1:] for cell in cells(plain.levels[0])}
+    touching = [
+        (cell, direction, tuple(k + step for k, step in zip(cell, steps, strict=True)))
+        for cell, (direction, steps) in itertools.product(finest, enumerate(DIRECTION_63.tolist()))
+    ]
+    for depth, (level, before) in enumerate(zip(joined.levels, plain.levels, strict=True)):
+        assert torch.equal(level.key_C, before.key_C)
+        above = [(tuple(k >> depth for k in a), d, tuple(k >> depth for k in b)) for a, d, b in touching if b in finest]
+        listed = [cell[1:] for cell in cells(level)]
+        rows = zip(level.receiver_E.tolist(), level.direction_E.tolist(), level.sender_E.tolist(), strict=True)
+        edges = [(listed[receiver], direction, listed[sender]) for receiver, direction, sender in rows]
+        assert edges == sorted({edge for edge in above if edge[0] != edge[2]})
 
 
 @given(st.integers(0, SCENE_LIMIT - 1), st.tuples(*[st.integers(-COORDINATE_LIMIT, COORDINATE_LIMIT - 1)] * 3))

@@ -135,11 +135,41 @@ def _write_cells(table, cell, live, occupied, prefix_sum, slots, first, capacity
 
 
 @triton.jit
+def _join_ancestors(
+    neighbour, occupied, prefix_sum, geometry, scene, x, y, z, joins, DIRECTION: tl.constexpr, LEVELS: tl.constexpr
+):
+    """Writes the neighbours in one direction of ancestors of finest cells where `joins`: both cells at a face exist."""
+    along = z
+    if DIRECTION // 2 == 0:
+        along = x
+    elif DIRECTION // 2 == 1:
+        along = y
+    for level in tl.static_range(1, LEVELS):
+        line = geometry + level * GEOMETRY_COLUMNS
+        slots, capacity, at = _slots_of(geometry, level), tl.load(line + 5), tl.load(line + 6)
+        step = slots[1] * 0 + 1
+        if DIRECTION // 2 == 0:
+            step = slots[1] * slots[2]
+        elif DIRECTION // 2 == 1:
+            step = slots[2]
+        last: tl.constexpr = (1 << level) - 1
+        outer = (along & last) == (0 if DIRECTION % 2 == 1 else last)
+        slot = _slot(x >> level, y >> level, z >> level, scene, slots)
+        beside = slot - step if DIRECTION % 2 == 1 else slot + step
+        first = tl.load(prefix_sum + slots[0] - 1)
+        own = _number(prefix_sum, slot, first, capacity, joins & outer)
+        other = _number(prefix_sum, beside, first, capacity, joins & outer)
+        tl.store(neighbour + 6 * at + DIRECTION * capacity + own, other, mask=own >= 0)
+
+
+@triton.jit
 def fill_tables(
     occupied, prefix_sum, geometry, slot_of_cell, neighbour, parent, octant, children, counts, needed, status,
-    LEVELS: tl.constexpr, OVERLAP: tl.constexpr, BLOCK: tl.constexpr,
+    LEVELS: tl.constexpr, CONNECTED: tl.constexpr, OVERLAP: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Writes the neighbours, parent and children of each active slot's cell, int32, -1 for none.
+
+    With CONNECTED the cells of the finest level write the neighbours of their ancestors, which are -1 before.
 
     Rule: hgn.network.grid.build_hierarchy; test: tests/kernels/test_network.py.
     """
@@ -181,8 +211,15 @@ def fill_tables(
         if direction % 2 == 1:
             step = -step
         slots_of = slots_of + (slot + step,)  # noqa: RUF005
-    _write_cells(neighbour + 6 * at, cell, live, occupied, prefix_sum, slots_of, first, capacity, capacity, 6)
     scene, x, y, z = split_slot(local, ny, nz, stride)
+    if CONNECTED:
+        if level == 0:
+            _write_cells(neighbour, cell, live, occupied, prefix_sum, slots_of, first, capacity, capacity, 6)
+            for direction in tl.static_range(6):
+                joins = _marked(occupied, slots_of[direction], live)
+                _join_ancestors(neighbour, occupied, prefix_sum, geometry, scene, x, y, z, joins, direction, LEVELS)
+    else:
+        _write_cells(neighbour + 6 * at, cell, live, occupied, prefix_sum, slots_of, first, capacity, capacity, 6)
     tl.store(octant + at + cell, ((x & 1) * 2 + (y & 1)) * 2 + (z & 1), mask=live)
     if level < LEVELS - 1:
         above = line + GEOMETRY_COLUMNS

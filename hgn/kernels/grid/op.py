@@ -186,11 +186,14 @@ class DeviceGrid:
             status=self.status, cell_size=self.cell_size, LEVELS=self.levels, BLOCK=MARK_BLOCK,
         )  # fmt: skip
         torch.cumsum(self.occupied, 0, dtype=torch.int32, out=self.prefix_sum)
+        connected = self.config.inputs == "local"
+        if connected:
+            self._neighbour[6 * self.capacities[0] :].fill_(-1)
         kernel.fill_tables[(triton.cdiv(self.largest, FILL_BLOCK), self.levels)](
             occupied=self.occupied, prefix_sum=self.prefix_sum, geometry=self.geometry,
             slot_of_cell=self.slot_of_cell, neighbour=self._neighbour, parent=self._parent, octant=self._octant,
             children=self._children, counts=self.counts_L, needed=self.needed_L, status=self.status,
-            LEVELS=self.levels, OVERLAP=overlaps(), BLOCK=FILL_BLOCK,
+            LEVELS=self.levels, CONNECTED=connected, OVERLAP=overlaps(), BLOCK=FILL_BLOCK,
         )  # fmt: skip
 
     def prepare(
