@@ -20,6 +20,7 @@ from typing import Any, NoReturn, cast
 from hgn.config import config_directory
 from hgn.schema import ConfigError, printable, require
 from hgn.system.extras import missing_extra
+from hgn.system.machine import memory_is_full
 
 EXIT_MACHINE, EXIT_INPUT, EXIT_INTERRUPTED, EXIT_UNREAD = 1, 2, 130, 141
 
@@ -37,6 +38,8 @@ _MACHINE_ERRORS = {
     errno.ETIMEDOUT: "check its server or disk",
     errno.EMFILE: "raise the limit of open files (ulimit -n)",
     errno.ENFILE: "close other programs",
+    errno.ENOMEM: "close other programs, take smaller input or another machine",
+    errno.ECHILD: "free some memory, or check the device,",
 }
 
 
@@ -102,7 +105,9 @@ def _exit_code(main: Main | str, config_name: str) -> int:
         place = f": {error.filename}" if error.filename else ""
         remedy = _MACHINE_ERRORS.get(error.errno or 0, "check the disk and its network")
         code = _fail(f"{error.strerror or error}{place}; {remedy} and run the same command again", EXIT_MACHINE)
-    except MemoryError as error:
+    except (MemoryError, RuntimeError, ImportError) as error:
+        if not memory_is_full(error):
+            raise
         code = _fail(f"memory is full ({error}); take smaller input or another machine", EXIT_MACHINE)
     except KeyboardInterrupt:
         code = _fail("interrupted", EXIT_INTERRUPTED)

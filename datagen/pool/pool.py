@@ -7,6 +7,7 @@ quarantined, and the next seed replaces it. Workers run on this machine (local_w
 
 from __future__ import annotations
 
+import errno
 import math
 import time
 from collections.abc import Callable
@@ -268,7 +269,8 @@ class Pool:
         self._deaths_in_a_row += blamable
         halvings = self._plan.scenes_per_launch.bit_length()
         if self._deaths_in_a_row > 3 * MAXIMUM_ATTEMPTS + self._plan.solvers + halvings:
-            raise RuntimeError(f"workers keep dying before they finish any scene, the last because {cause}")
+            text = f"workers keep dying before they finish any scene, the last because {cause}"
+            raise ChildProcessError(errno.ECHILD, text)
         self._progress.message(f"a worker died ({cause}); it is replaced and its scenes are tried again")
         lost = list(worker.tasks.values())
         worker.kill()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import pickle
 import pkgutil
 import time
@@ -23,6 +24,7 @@ from hgn.scene.obstacle_grid import ObstacleGrid
 from hgn.scene.scene import Scene
 from hgn.schema import ConfigError, Vector
 from hgn.system.extras import missing_extra
+from hgn.system.machine import memory_is_full
 
 
 @dataclass(frozen=True)
@@ -248,4 +250,6 @@ def error_message(error: Exception) -> tuple[Any, ...]:
         return "config_error", missing
     if isinstance(error, OSError):
         return "os_error", error.errno, error.strerror, None if error.filename is None else str(error.filename)
+    if memory_is_full(error):
+        return "os_error", errno.ENOMEM, f"memory is full ({error})", None
     return "error", "".join(traceback.format_exception(error))

@@ -8,12 +8,18 @@ from __future__ import annotations
 
 import math
 import os
+import re
 import resource
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
 ROOT = Path("/")  # root of the file system
+_FULL_MEMORY = re.compile(  # messages of torch, Taichi, CUDA, C++, the loader and Python's threads
+    "out of memory|(can't|cannot) allocate memory|memory allocation .*failed|bad_alloc"
+    "|failed to map segment|can't start new thread",
+    re.IGNORECASE,
+)
 
 
 def available_cpus() -> int:
@@ -28,6 +34,12 @@ def available_memory() -> int:
     machine = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     limits = [_read(group / name) for group in _groups("memory") for name in ("memory.max", "memory.limit_in_bytes")]
     return min([machine, *(int(limit) for limit in limits if limit not in (None, "max"))])
+
+
+def memory_is_full(error: Exception) -> bool:
+    """Returns whether an error reports full memory. Libraries report it by errors of other types than MemoryError."""
+    by_message = isinstance(error, (RuntimeError, ImportError)) and _FULL_MEMORY.search(str(error))
+    return isinstance(error, MemoryError) or bool(by_message)
 
 
 def writable_folder(usual: Path, name: str) -> Path:

@@ -20,17 +20,20 @@ import traceback
 import zlib
 from collections import Counter, deque
 from collections.abc import Callable
+from types import SimpleNamespace
 from typing import Any
 from unittest import mock
 from urllib.parse import parse_qs
 
 import viser
 import websockets.asyncio.server
+from viser import _gui_api, infra
 from viser import _messages as messages
 from viser._gui_api import GuiApi
 from viser._gui_handles import GuiUploadButtonHandle
 from websockets import Headers, State
 from websockets.asyncio.server import ServerConnection
+from websockets.exceptions import ConnectionClosedError
 from websockets.http11 import Request, Response
 
 from hgn.schema import require
@@ -44,13 +47,28 @@ LONGEST_TEXT, LARGEST_NUMBER = 1000, 2**53  # characters of a text in a message;
 REFUSAL = b"open the address that hgn.play printed, with its token\n"
 SENT = (
     *(messages.SceneNodeClickMessage, messages.SceneNodeDragMessage, messages.ScenePointerMessage),
-    *(messages.FileTransferStartUpload, messages.FileTransferPart),
+    *(messages.FileTransferStartUpload, messages.FileTransferPart, messages.ViewerCameraMessage),
 )  # messages that viewers may send, in addition to values of controls
 Process = Callable[[Any, Request], Response | None]
 # Viser keeps each broadcast under its key. It had a key for each part of each upload, and would keep them all.
 messages.FileTransferPartAck.redundancy_key = (  # type: ignore[method-assign]
     lambda ack: f"{type(ack).__name__}-{zlib.crc32(ack.transfer_uuid.encode()) % 64}"  # type: ignore[assignment]
 )
+# Viser warns of values with a wrong length, and Python keeps each text for ever. `is_sent` drops such messages.
+for module in (infra._messages, _gui_api):
+    module.warnings = SimpleNamespace(warn=lambda *_, **__: None)  # type: ignore[attr-defined]
+_consume = infra._infra._message_consumer
+
+
+async def _message_consumer(*arguments: Any) -> None:
+    """Handles a viewer's messages. Bytes that are none close the connection, without a trace in the log."""
+    try:
+        await _consume(*arguments)
+    except Exception:  # noqa: BLE001 - they may contain any value
+        raise ConnectionClosedError(None, None) from None
+
+
+infra._infra._message_consumer = _message_consumer  # type: ignore[assignment]
 
 
 def start_server(host: str, port: int, label: str) -> tuple[viser.ViserServer, str]:
@@ -76,9 +94,14 @@ def start_server(host: str, port: int, label: str) -> tuple[viser.ViserServer, s
     unsaid = contextlib.redirect_stdout(io.StringIO())  # Viser prints an address without the token
     with unsaid, limits, mock.patch.object(websockets.asyncio.server, "serve", guarded_serve):
         server = viser.ViserServer(host, port, label, verbose=False)
-    server._websock_server._handle_incoming_message = admitting(  # type: ignore[method-assign]
-        server._websock_server._handle_incoming_message, server.gui
-    )
+
+    def admit(handler: infra.WebsockMessageHandler) -> None:
+        handler._handle_incoming_message = admitting(  # type: ignore[method-assign]
+            handler._handle_incoming_message, server.gui
+        )
+
+    admit(server._websock_server)
+    server._websock_server.on_client_connect(admit)
     shown = "127.0.0.1" if host in ("0.0.0.0", "localhost") else host
     return server, f"http://{shown}:{server.get_port()}/?token={token}"
 
@@ -119,17 +142,26 @@ def is_sent(message: Any, controls: dict[str, Any]) -> bool:
     control = controls.get(name) if isinstance(name, str) else None
     if updates:
         given = message.updates if isinstance(message.updates, dict) else {}
-        return control is not None and given.keys() == {"value"} and replaces(given["value"], control._impl.value)
-    return "source_component_uuid" not in fields or isinstance(control, GuiUploadButtonHandle)
+        if control is None or given.keys() != {"value"}:
+            return False
+        value = given["value"]
+        return replaces(value, control._impl.value) and value in getattr(control, "options", [value])
+    if isinstance(message, messages.ScenePointerMessage):
+        rays = message.ray_origin and message.ray_direction
+        return bool(message.event_type == "click" and rays and message.screen_pos)
+    upload = "source_component_uuid" not in fields or isinstance(control, GuiUploadButtonHandle)
+    return upload and isinstance(fields.get("content", b""), bytes)
 
 
 def is_short(value: Any) -> bool:
-    """Returns whether a field of a message is bounded. The size of bytes is bounded by `bounded`."""
+    """Returns whether a field of a message is bounded and finite. The size of bytes is bounded by `bounded`."""
     if isinstance(value, tuple):
-        return len(value) <= 3 and all(map(is_short, value))
+        return len(value) <= 4 and all(map(is_short, value))
     if isinstance(value, int):  # larger ones cannot be sent to the other viewers
         return abs(value) <= LARGEST_NUMBER
-    return value is None or isinstance(value, (float, bytes)) or (isinstance(value, str) and len(value) <= LONGEST_TEXT)
+    if isinstance(value, float):
+        return math.isfinite(value)
+    return value is None or isinstance(value, bytes) or (isinstance(value, str) and len(value) <= LONGEST_TEXT)
 
 
 def replaces(value: Any, present: Any) -> bool:

@@ -105,7 +105,7 @@ def simulate(scenes, config, frames, frame_rate_hz, on_frame=None, cpu_threads=N
         if control("ending").exists():
             atexit.register((control("ending") / str(os.getpid())).touch)
         if control("raise").exists():
-            raise RuntimeError("a fault in the solver")
+            raise RuntimeError(control("raise").read_text())
         kill = control(f"kill-{scene.seed}")
         if kill.exists():
             lives = int(kill.read_text())

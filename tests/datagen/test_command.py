@@ -34,6 +34,15 @@ def test_no_key_is_taken_for_a_config_group():
         assert not plain & groups, path
 
 
+FULL = [  # as libraries report it
+    RuntimeError("[host_memory_pool.cpp:allocate_raw_memory@62] Virtual memory allocation (1073741824 B) failed.\n"),
+    RuntimeError("[enforce fail at alloc_cpu.cpp:127] err == 0. DefaultCPUAllocator: can't allocate memory: 64 bytes"),
+    RuntimeError("CUDA out of memory. Tried to allocate 2.00 GiB"),
+    RuntimeError("can't start new thread"),
+    ImportError("/a/taichi_python.so: failed to map segment from shared object"),
+]
+
+
 @pytest.mark.parametrize(
     ("error", "code", "message"),
     [
@@ -49,7 +58,12 @@ def test_no_key_is_taken_for_a_config_group():
         (ConfigError("name must be a\u202eb"), 2, r"error: name must be a\u202eb"),
         (OSError("no number"), 1, "error: no number; check the disk"),
         (MemoryError("Unable to allocate 5 TiB"), 1, "error: memory is full (Unable to allocate 5 TiB)"),
+        *((error, 1, "error: memory is full (") for error in FULL),
+        (OSError(errno.ENOMEM, "Cannot allocate memory"), 1, "error: Cannot allocate memory; close other programs"),
+        (ChildProcessError(errno.ECHILD, "workers keep dying"), 1, "error: workers keep dying; free some memory, or"),
         (KeyboardInterrupt(), 130, "error: interrupted\n"),
+        (RuntimeError("a fault"), None, None),
+        (ImportError("no name x in y"), None, None),
         (FileNotFoundError(errno.ENOENT, "No such file", "x"), None, None),
     ],
 )

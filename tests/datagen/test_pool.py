@@ -1,6 +1,7 @@
 """The pool: whatever happens to its workers, the data set comes out whole, and no process is left behind."""
 
 import dataclasses
+import errno
 import multiprocessing
 import pickle
 import shutil
@@ -208,8 +209,12 @@ def test_two_generators_at_once(make_config, small_dataset, backend, control, th
 
 def test_fault_in_the_solver_ends_the_run(make_config, backend, control, threads):
     """An exception that no scene is to blame for is not retried: it ends the run with the worker's traceback; so does a
-    solver that cannot be imported."""
-    (control / "raise").touch()
+    solver that cannot be imported. Full memory is a fault of the machine."""
+    (control / "raise").write_text("Virtual memory allocation (1073741824 B) failed.")
+    with pytest.raises(OSError, match="memory is full") as full:
+        generate(make_config(), backend)
+    assert full.value.errno == errno.ENOMEM
+    (control / "raise").write_text("a fault in the solver")
     with pytest.raises(RuntimeError, match=r"(?s)a worker failed:\nTraceback .*a fault in the solver"):
         generate(make_config(), backend)
     with pytest.raises(RuntimeError, match="ModuleNotFoundError"):

@@ -15,54 +15,21 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-import torch
-from network.states import network_of, silent
 from websockets import Headers
 from websockets.http11 import Request
 
-from hgn.runtime.simulator import InitialState, Simulator
-from hgn.scene.scene import Scene
-from hgn.scene.shapes import shape_obstacle
+from hgn.runtime.simulator import InitialState
 
 pytest.importorskip("viser", reason="viser is not installed: pip install 'hgn[play]'")
 from viewer import soak
 
 from hgn.viewer import viser_compat
-from hgn.viewer.film import FilmPage
-from hgn.viewer.page import MAXIMUM_UPLOAD_BYTES, PlayPage
-from hgn.viewer.session import PlaySession
+from hgn.viewer.page import MAXIMUM_UPLOAD_BYTES
 from hgn.viewer.viser_compat import COOKIE, MOST_OPENING, guarded
 
 # viser keeps its event loop's threads and sockets until the garbage collector comes
 pytestmark = pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::pytest.PytestUnraisableExceptionWarning")
 TRIANGLES = b"v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
-
-
-@pytest.fixture(scope="module")
-def page():
-    network = silent(network_of(torch.float32, width=16, levels=2, inputs="relative"))
-    block_N3 = 0.4 + 0.2 * np.random.default_rng(0).random((100, 3)).astype(np.float32)
-    cone = shape_obstacle("cone", 0.3, (0.5, 0.5, 0.5))
-    scene = Scene(block_N3, 0 * block_N3, np.zeros(100, np.uint8), (cone,), cell_size=1 / 32, gravity=(0.0, 0.0, 0.0))
-    session = PlaySession(Simulator(network, 60.0, "cpu"), scene, weights="floating")
-    loaded = []
-
-    def load(name):
-        loaded.append(name)
-        return session.simulator
-
-    page = PlayPage(session, ("floating", "other"), load, port=0)
-    page.loaded = loaded
-    yield page
-    page.close()
-
-
-@pytest.fixture
-def messages(page, monkeypatch):
-    """The messages that viewers have seen."""
-    seen = []
-    monkeypatch.setattr(page, "_notify", lambda message, client=None: seen.append(message))
-    return seen
 
 
 def sent(page, action):
@@ -235,108 +202,6 @@ def answered_with_403(path, headers):
     return response is not None and response.status_code == http.HTTPStatus.FORBIDDEN
 
 
-def updated(label, **values):
-    """A control's message."""
-    return lambda page: viser_compat.messages.GuiUpdateMessage(controls(page)[label].uuid, values)
-
-
-def controls(page):
-    return {handle.label: handle._impl for handle in page.server.gui._gui_input_handle_from_uuid.values()}
-
-
-def upload(label, **other):
-    """The beginning of an upload by a control."""
-
-    def message(page):
-        values = {"transfer_uuid": "t", "filename": "a.obj", "mime_type": "", "part_count": 0, "size_bytes": 0} | other
-        return viser_compat.messages.FileTransferStartUpload(controls(page)[label].uuid, **values)
-
-    return message
-
-
-def part(label, content):
-    """The only part of an upload that "Own mesh" has begun; it names another control."""
-
-    def message(page):
-        received(page, 0, [upload("Own mesh", part_count=1, size_bytes=1)(page)])
-        return viser_compat.messages.FileTransferPart(controls(page)[label].uuid, "t", 0, content)
-
-    return message
-
-
-def received(page, client, messages):
-    """Gives messages to the server, as a viewer's connection would."""
-
-    async def give():
-        for message in messages:
-            await page.server._websock_server._handle_incoming_message(client, message)
-
-    asyncio.run(give())
-
-
-def parts(page, name, count, size):
-    """The beginning of an upload of 10^9 bytes, and parts of it."""
-    button = controls(page)["Own mesh"].uuid
-    yield viser_compat.messages.FileTransferStartUpload(button, name, "a.obj", "", 10**9, 10**9)
-    for number in range(count):
-        yield viser_compat.messages.FileTransferPart(button, name, number, bytes(size))
-
-
-@pytest.mark.parametrize(
-    ("message", "passes"),
-    [
-        (updated("Diameter", value=0.2), True),
-        (updated("Weights", value="other"), True),
-        (updated("Weights", props={"options": ("/etc/passwd",)}), False),
-        (updated("Weights", value="other", props={}), False),
-        *((updated("Step", **{name: value}), False) for name, value in (("removed", True), ("update_cb", []))),
-        (updated("Size", sync_cb=None), False),
-        (updated("Weights", value=10**6 * "x"), False),
-        (updated("Gravity", value=10**5 * (0.0,)), False),
-        (updated("Gravity", value=[0, 0, 1.5]), True),
-        *((updated("Gravity", value=value), False) for value in ([], [1.0, 2.0], "123", ["1", "2", "3"], 3 * [2**63])),
-        *((updated("Size", value=value), False) for value in ("0.2", None, [0.2], {"a": 1}, 2**63)),
-        (updated("Own mesh", value="a.obj"), False),
-        (lambda page: viser_compat.messages.GuiUpdateMessage(["x"], {"value": 1}), False),
-        (lambda page: viser_compat.messages.GuiUpdateMessage(controls(page)["Size"].uuid, ["value"]), False),
-        (upload("Own mesh"), True),
-        *((upload(label), False) for label in ("Gravity", "Size", "Weights", "Step")),
-        *((upload("Own mesh", **{name: 10**300}), False) for name in ("part_count", "size_bytes")),
-        *((upload("Own mesh", **{name: 2000 * "x"}), False) for name in ("transfer_uuid", "filename", "mime_type")),
-        *((upload("Own mesh", transfer_uuid=value), False) for value in (["t"], {"t": 1}, 5**30)),
-        (part("Own mesh", b"x"), True),
-        (part("Size", b"x"), False),
-        (part("Own mesh", [[]]), False),
-        (lambda page: viser_compat.messages.ShareUrlRequest(), False),
-        (lambda page: viser_compat.messages.ResetGuiMessage(), False),
-    ],
-)
-def test_messages_that_are_not_of_the_page(page, monkeypatch, message, passes):
-    """A viewer sets the values of controls, of the types that they have, and nothing else of them; only the button for
-    uploads takes files, with texts that are counted and numbers that other viewers can be sent; the server asks nobody
-    for an address."""
-    asked, handled = [], page.server._websock_server._incoming_handlers
-    monkeypatch.setitem(handled, viser_compat.messages.ShareUrlRequest, [lambda *_: asked.append("address")])
-    sent, uploads = message(page), page.server.gui._current_file_upload_states
-    before = {name: dict(vars(state)) for name, state in controls(page).items()} | {"uploads": {*uploads}}
-    received(page, 0, [sent])
-    after = {name: dict(vars(state)) for name, state in controls(page).items()} | {"uploads": {*uploads}}
-    for name, state in controls(page).items():
-        vars(state).update(before[name])
-    page.server.gui._drop_uploads_from_client(0)
-    assert (after != before) == passes and not asked
-
-
-def test_acknowledgements_of_parts_are_not_kept(page):
-    """Meshes that come in thousands of parts leave few messages for the viewers who come later."""
-    kept = page.server._websock_server._broadcast_buffer.message_from_id
-    before = len(kept)
-    for number in range(100):
-        received(page, 1, parts(page, str(number), 20, 1))
-    assert len(kept) - before <= 64
-    page.server.gui._drop_uploads_from_client(1)
-
-
 def test_actions_that_wait_are_bounded(page, messages):
     """Of a flood of actions before one frame the first are done; one mesh waits to be read at a time."""
     done = []
@@ -363,28 +228,6 @@ def test_a_frame_that_fails_pauses(page, messages, monkeypatch, capsys):
     page.restart()
     assert page.playing
     page.playing = False
-
-
-@pytest.mark.parametrize("value", [INFINITE, NAN, -5.0, 1e300, 900 * "9"])
-def test_a_film_goes_on_at_any_value(page, value):
-    """Values that its sliders do not give, and an update that fails, do not end the page of a rollout."""
-    film = FilmPage(page.session.rollout(), port=0)
-    received(film, 0, [updated("Frame", value=value)(film), upload("Frame")(film)])
-    assert film.slider.value == 0
-    shown, failures = [], [RuntimeError("deque mutated during iteration")]
-
-    def show(frame):
-        shown.append(frame)
-        film.speed._impl.value = film.slider._impl.value = value
-        if len(shown) > 3:
-            film.ended.set()
-        if failures:
-            raise failures.pop()
-
-    film.film.show = show
-    film.run()
-    film.close()
-    assert len(shown) == 4 and all(0 <= frame < film.rollout.frame_count for frame in shown)
 
 
 def test_meshes_are_bounded(page, messages, monkeypatch):
@@ -420,22 +263,6 @@ def test_who_takes_no_file_gets_no_other(page, messages):
         page.do(lambda action=action: action(event))
     page._do_all()
     assert sent == ["scene.zip"] and len(messages) == 3 and "download must be complete" in messages[0]
-
-
-@pytest.mark.parametrize(("uploads", "count", "size"), [(40, 2, 1 << 20), (3, 30_000, 1), (300, 0, 0)])
-def test_unfinished_uploads_are_bounded(page, monkeypatch, uploads, count, size):
-    """Uploads that never become whole are dropped, those of the viewer with the most first: large parts, many parts,
-    none at all."""
-    monkeypatch.setattr(viser_compat, "MAXIMUM_UNFINISHED_BYTES", 10 << 20)
-    states = page.server.gui._current_file_upload_states
-    received(page, 1, parts(page, "small", 1, 100))
-    for number in range(uploads):
-        received(page, 2, parts(page, str(number), count, size))
-        assert sum(state["transferred_bytes"] for state in states.values()) <= 10 << 20
-        assert len(states) <= 11 and sum(len(state["parts"]) for state in states.values()) <= 53_000
-    assert states["small"]["transferred_bytes"] == 100
-    for client in (1, 2):
-        page.server.gui._drop_uploads_from_client(client)
 
 
 @pytest.mark.slow
