@@ -16,10 +16,10 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 30_198,
-    "datagen": 8_543,
+    "hgn": 30_290,
+    "datagen": 8_580,
     "tools": 6_611,
-    "tests": 29_420,
+    "tests": 29_720,
 }
 SETTINGS = 240  # fields of the dataclasses behind the commands, *Config
 
