@@ -52,10 +52,10 @@ def no_ptx(self, source, metadata, *_):
 
 
 settings = UpdateSettings(2, 1e-3, True, 1 / 64)
-relative = NetworkConfig(inputs="relative", width=16, levels=2, message_passing_steps=1)
+relative = NetworkConfig(inputs="local", width=16, levels=3, message_passing_steps=1)
 of_relative = {}  # before any is compiled: what is would be launched
 for step in (StepConfig(), StepConfig(0.3, (0.02, 0.04), 1e-3)):
-    job = PrecompileJob(relative, settings, "fp16", False, False, 9000, (9000, 3000), 90, (2,), step)
+    job = PrecompileJob(relative, settings, "fp16", False, False, 9000, (9000, 3000, 900), 90, (2,), step)
     of_relative |= launches_of(job)
 
 network = NetworkConfig(levels=1, message_passing_steps=1)

@@ -152,7 +152,7 @@ def _join_ancestors(
             step = slots[1] * slots[2]
         elif DIRECTION // 2 == 1:
             step = slots[2]
-        last: tl.constexpr = (1 << level) - 1
+        last = (1 << level) - 1
         outer = (along & last) == (0 if DIRECTION % 2 == 1 else last)
         slot = _slot(x >> level, y >> level, z >> level, scene, slots)
         beside = slot - step if DIRECTION % 2 == 1 else slot + step
