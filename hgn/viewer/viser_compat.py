@@ -86,6 +86,9 @@ def start_server(host: str, port: int, label: str) -> tuple[viser.ViserServer, s
     def guarded_serve(*args: Any, process_request: Process, **options: Any) -> Any:
         options["max_size"] = MAXIMUM_MESSAGE_BYTES
         options["create_connection"] = shedding()
+        select = options["select_subprotocol"]
+        # the name is part of the close frame of another version, which has at most 125 bytes
+        options["select_subprotocol"] = lambda place, names: select(place, [name for name in names if len(name) <= 40])
         return serve(*args, process_request=guarded(process_request, token), **options)
 
     handlers = ("_handle_file_transfer_start", "_handle_file_transfer_part")

@@ -156,6 +156,14 @@ def test_malformed_messages_are_dropped(page, capfd, caplog, recwarn, closes):
     assert printed.out + printed.err + caplog.text == "" and not len(recwarn)
 
 
+@pytest.mark.parametrize("version", ["viser-v0", "viser-v" + 7000 * "x", "x"])
+def test_viewers_of_another_version(page, caplog, version):
+    """A viewer that names another version, however long, is closed without a trace."""
+    with connect(page.address.replace("http", "ws"), subprotocols=[version]) as viewer, pytest.raises(ConnectionClosed):
+        viewer.recv(60)
+    assert caplog.text == ""
+
+
 def test_acknowledgements_of_parts_are_not_kept(page):
     """Meshes that come in thousands of parts leave few messages for the viewers who come later."""
     kept = page.server._websock_server._broadcast_buffer.message_from_id
