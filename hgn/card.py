@@ -18,6 +18,7 @@ from hgn.command import run_command
 from hgn.data.manifest import SPLITS, Manifest, errors_in_config
 from hgn.data.storage import is_remote
 from hgn.scene.kinds import RANGES
+from hgn.scene.own_physics import own_ranges
 from hgn.schema import from_mapping, require
 from hgn.system.files import write_atomically
 
@@ -89,6 +90,7 @@ def weights_card(info: WeightsInfo, name: str, file: str, licence: str) -> str:
         "frames a second": f"{info.frame_rate_hz:g}",
         "gravity": "any" if network.relative else _vector(info.gravity),
         "updates": str(info.updates),
+        **_range_rows(info.own_ranges),
     }
     use = f"python -m hgn.rollout weights=hf://USER/NAME/{quote(file)}"
     return _page(metadata, name, "Weights of a particle simulator, for HGN.", rows, use)
@@ -119,6 +121,7 @@ def data_card(manifest: Manifest, name: str, licence: str) -> str:
         "configuration": manifest.config_hash[:12],
     }
     rows |= _kind_rows(scene.get("kinds") or {})
+    rows |= _range_rows(own_ranges(scene.get("own_physics") or ()))
     kind = "imported" if own else "EXPERIMENT"
     use = f"python -m hgn.train +experiment={kind} dataset.folder=hf://datasets/USER/NAME"
     return _page(metadata, name, "Trajectories of particles: WebDataset shards, a manifest and an index.", rows, use)
@@ -140,6 +143,10 @@ def _kind_rows(kinds: Mapping[str, float]) -> dict[str, str]:
         for kind, share in kinds.items()
         if share > 0
     }
+
+
+def _range_rows(ranges: Mapping[str, tuple[float, float]]) -> dict[str, str]:
+    return {f"{name} of scenes": f"{low:g} to {high:g}" for name, (low, high) in ranges.items()}
 
 
 def _plain(text: str) -> str:

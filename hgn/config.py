@@ -11,8 +11,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
-from hgn.scene.kinds import require_kinds
-from hgn.scene.material import MATERIAL_NAME, MATERIALS, PAPER_MATERIALS
+from hgn.scene.kinds import require_funnel, require_kinds
+from hgn.scene.material import MATERIAL_NAME, MATERIALS, OWN_PHYSICS, PAPER_MATERIALS
 from hgn.schema import (
     AtMostOne,
     BelowOne,
@@ -47,6 +47,7 @@ LOGGERS = ("tensorboard", "wandb", "mlflow")
 SIMULATED_FRAMES = 3  # frames that pushforward needs of an episode: start, one simulated frame, its target
 DEFAULT_WEIGHTS = "mechanics"  # shipped weights that commands and `Simulator.load` use
 Material = Annotated[str, one_of(*MATERIALS)]
+OwnPhysics = tuple[Annotated[str, one_of(*OWN_PHYSICS)], ...]
 MaterialName = Annotated[
     str, Bound("a name of lower-case letters, digits and _", lambda name: MATERIAL_NAME.fullmatch(name) is not None)
 ]
@@ -85,10 +86,6 @@ def require_rollout_name(field: str, name: str | None, *more: str) -> None:
     require(ends, field, rule, name, f"tools.render makes {made} of a rollout file")
 
 
-FUNNEL_SQUARES = (0.5, 0.8)  # smallest and largest side of a funnel's squares, relative to the largest obstacle
-FUNNEL_HEIGHT = (2.0, 5.0)  # free height below and above a funnel's hole, in group sizes
-
-
 @dataclass(frozen=True)
 class SceneConfig:
     """The distribution of random scenes (paper sec. 3.3). Lengths are in domain units."""
@@ -121,6 +118,9 @@ class SceneConfig:
     # fraction of each kind of hgn.scene.world, as in conf/scene/world.yaml; kinds draw all settings but domain_size
     # (the largest), cell_size, materials and particles_per_cell; empty: scenes follow the settings above
     kinds: dict[str, float] = field(default_factory=dict)
+    # friction: a third of the scenes has none, others draw it for each obstacle, the floor and the walls; parameters:
+    # half of the scenes has the solver's, others draw those of hgn.scene.material for each group
+    own_physics: OwnPhysics = ()
 
     def __post_init__(self) -> None:
         require_bounds(self)
@@ -133,15 +133,7 @@ class SceneConfig:
         for name in ("obstacle_size", "funnel_hole"):
             low, high = getattr(self, name)
             require(0 < low <= high < math.inf, name, "0 < smallest <= largest", [low, high])
-        if self.funnel_scene_fraction > 0:
-            remedy = "or set funnel_scene_fraction=0"
-            where = "where funnel_scene_fraction is above 0"
-            require(self.obstacle_count >= 4, "obstacle_count", f"at least 4 {where}", self.obstacle_count, remedy)
-            widest, height = FUNNEL_SQUARES[0] * self.obstacle_size[1], min(self.domain_size) / sum(FUNNEL_HEIGHT)
-            rule = f"at most {FUNNEL_SQUARES[0]:g} of the largest obstacle_size ({widest:g}) {where}"
-            require(self.funnel_hole[1] <= widest, "funnel_hole", rule, list(self.funnel_hole), remedy)
-            rule = f"at most {1 / sum(FUNNEL_HEIGHT):.3g} of the domain's smallest side ({height:.3g}) {where}"
-            require(self.group_size <= height, "group_size", rule, self.group_size, remedy)
+        require_funnel(self)
         for i, name in enumerate(self.obstacle_shapes):
             rule = f"one of {', '.join(OBSTACLE_SHAPES)}, or a mesh file ({', '.join(MESH_SUFFIXES)}, USD)"
             require(name in OBSTACLE_SHAPES or is_mesh_file(name), f"obstacle_shapes[{i}]", rule, name)
@@ -315,10 +307,14 @@ class NetworkConfig:
     materials: tuple[MaterialName, ...] = PAPER_MATERIALS  # each of the materials has its own embedding
     # number of dimensions; with 2, which only imported data have, z is constant
     dimensions: Annotated[int, Bound("2 or 3", lambda count: count in (2, 3))] = 3
+    # additional inputs (hgn.network.own_physics): friction of surfaces, and parameters of the materials
+    own_physics: OwnPhysics = ()
 
     def __post_init__(self) -> None:
         require_bounds(self)
         require(len(self.materials) > 0, "materials", "a list with at least one material", [])
+        rule = "an empty list with inputs=absolute"
+        require(self.relative or not self.own_physics, "own_physics", rule, list(self.own_physics))
         if self.relative:
             require(self.kind == "hgn", "inputs", f"absolute for {self.kind}", self.inputs)
             rule = f"at least 2 with inputs={self.inputs}, which are of differences"

@@ -127,6 +127,7 @@ def export(checkpoint_path: Path, out: Path, stored_precision: str = "fp32", **s
         obstacle_cell_size=data.obstacle_cell_size,
         gravity=data.gravity,
         maximum_initial_speed=data.maximum_initial_speed,
+        own_ranges=data.own_ranges,
         updates=Progress.of(checkpoint).updates,
         provenance=provenance() | {"checkpoint": checkpoint_path.name, "data_config_hash": data.config_hash},
     )

@@ -21,7 +21,7 @@ from hgn.config import DEFAULT_WEIGHTS, USD_ENDINGS, SceneConfig, SimulatorConfi
 from hgn.data.reader import find_episode
 from hgn.render import PLY_ENDING
 from hgn.scene.emission import entry_frames
-from hgn.scene.material import MATERIALS
+from hgn.scene.material import INPUT_PARAMETERS, MATERIALS
 from hgn.scene.random_scene import generate_scene
 from hgn.scene.scene import Scene
 from hgn.scene.scene_file import find_scene, load_scene, notes_on_files
@@ -117,7 +117,7 @@ def rollout(config: RolloutConfig) -> tuple[Path, Rollout]:
         scene = _scene(config, simulator.info)
         initial = InitialState.of_scene(scene)
         obstacles = scene.obstacles
-        for note in (*notes_on_files(scene), *_not_used(scene, weights.stem)):
+        for note in (*notes_on_files(scene), *_notes_on_physics(scene, simulator.info, weights.stem)):
             print(note, file=sys.stderr)
         source["scene"] = config.scene or f"random, seed {config.seed}"
     else:
@@ -169,13 +169,20 @@ def _shown(simulated: Iterator[np.ndarray], count: int) -> Generator[np.ndarray]
             progress.update()
 
 
-def _not_used(scene: Scene, weights: str) -> Iterator[str]:
-    """Yields a line for each setting of the scene that only the solver uses."""
-    if scene.material_parameters:
-        names = ", ".join(scene.material_parameters)
-        yield f"not used: {names} of groups, which are the solver's; {weights} knows one of each material"
-    if any(scene.wall_friction) or any(obstacle.friction for obstacle in scene.obstacles):
+def _notes_on_physics(scene: Scene, info: WeightsInfo, weights: str) -> Iterator[str]:
+    """Yields a line for settings of the scene that only the solver uses, and for values outside those of the data."""
+    inputs = info.network.own_physics
+    used = INPUT_PARAMETERS if "parameters" in inputs else ()
+    if unused := ", ".join(name for name in scene.material_parameters if name not in used):
+        yield f"not used: {unused} of groups, which are the solver's; {weights} knows one of each material"
+    frictions = np.array([*scene.wall_friction, *(obstacle.friction or 0.0 for obstacle in scene.obstacles)])
+    if frictions.any() and "friction" not in inputs:
         yield f"not used: friction of surfaces, which is the solver's; {weights} knows that of its data alone"
+    for name, (low, high) in info.own_ranges.items():
+        values = frictions if name == "friction" else scene.material_parameters.get(name, np.zeros(0))
+        far = values[(values < low * (1 - SAME_SPEED)) | (values > high * (1 + SAME_SPEED))]
+        if len(far) and name in (*used, *inputs):
+            yield f"{name}: {far[0]:.4g}, those of the data of {weights} are {low:g} to {high:g}; motion is a guess"
 
 
 def _fastest(initial: InitialState) -> float:

@@ -16,10 +16,10 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 30_290,
-    "datagen": 8_580,
+    "hgn": 30_740,
+    "datagen": 8_590,
     "tools": 6_611,
-    "tests": 29_720,
+    "tests": 30_070,
 }
 SETTINGS = 240  # fields of the dataclasses behind the commands, *Config
 

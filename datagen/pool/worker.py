@@ -143,6 +143,8 @@ def make_scene(task: SceneTask, config: DatagenConfig, backend: Backend, with_gr
     build_collider = pkgutil.resolve_name(backend.build_collider)
     try:
         scene = generate_scene(config.scene, task.seed)
+        if any(obstacle.friction is not None for obstacle in scene.obstacles):
+            scene = _with_known_friction(scene, config.mpm.collider_friction)
         # Makers build the collider. In a solver the GPU would idle while colliders are built one by one.
         finer = replace(scene, cell_size=config.reference_cell_size)
         collider = build_collider(finer, config.mpm.choices.collider_band_cells)
@@ -155,6 +157,13 @@ def make_scene(task: SceneTask, config: DatagenConfig, backend: Backend, with_gr
             return "failed", task.key, grid
         made = replace(made, obstacle_grid=grid)
     return "made", made
+
+
+def _with_known_friction(scene: Scene, default: float) -> Scene:
+    """Returns the scene with the solver's `default` for obstacles without friction, as its cells will have it."""
+    frictions = (default if obstacle.friction is None else obstacle.friction for obstacle in scene.obstacles)
+    obstacles = (replace(o, friction=friction) for o, friction in zip(scene.obstacles, frictions, strict=True))
+    return replace(scene, obstacles=tuple(obstacles))
 
 
 def build_grid(task: GridTask, backend: Backend) -> BuiltGrid:
@@ -232,6 +241,7 @@ def make_episode(made: MadeScene, result: Any, config: DatagenConfig, config_has
             for name, value in scene.material_parameters.items()
         },
         specification=scene.specification,
+        wall_friction=scene.wall_friction,
         solver={
             "settings": physics_settings(config),
             "particles_per_cell": scene.particles_per_cell,

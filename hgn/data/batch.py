@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -16,6 +17,7 @@ from hgn.data.episode_tensors import frame_gravity, shown_symmetries
 from hgn.data.sampler import SamplerState
 from hgn.network.features import ParticleState, material_rows
 from hgn.network.obstacles import ObstacleCells
+from hgn.network.own_physics import physics_fields
 from hgn.scene.episode import Episode
 from hgn.scene.history import window
 from hgn.scene.symmetry import Symmetry
@@ -36,10 +38,13 @@ class Batch:
     symmetries_S: tuple[tuple[Symmetry, ...], ...] = ()  # symmetries of each scene that training may apply
     weight_S: tuple[float, ...] = ()  # loss weight of each scene; empty: 1
     noise_scale_S: tuple[float, ...] = ()  # noise scale of each scene in units of training.noise_std; empty: 1
+    wall_friction_S3: torch.Tensor | None = None  # as in ParticleState
+    parameter_NP: torch.Tensor | None = None  # as in ParticleState
 
     def to(self, device: torch.device, non_blocking: bool = False) -> Batch:
-        names = ("window_WN3", "material_N", "scene_N", "domain_S3", "gravity_S3")
-        moved = {name: getattr(self, name).to(device, non_blocking=non_blocking) for name in names}
+        names = ("window_WN3", "material_N", "scene_N", "domain_S3", "gravity_S3", "wall_friction_S3", "parameter_NP")
+        own = {name: getattr(self, name) for name in names if getattr(self, name) is not None}
+        moved: dict[str, Any] = {name: tensor.to(device, non_blocking=non_blocking) for name, tensor in own.items()}
         obstacles = self.obstacles and self.obstacles.to(device, non_blocking)
         return replace(self, obstacles=obstacles, **moved)
 
@@ -56,6 +61,8 @@ class Batch:
             domain_S3=self.domain_S3,
             gravity_S3=self.gravity_S3,
             obstacles=self.obstacles,
+            wall_friction_S3=self.wall_friction_S3,
+            parameter_NP=self.parameter_NP,
         )
 
     def acceleration(self, window_WN3: torch.Tensor | None = None) -> torch.Tensor:
@@ -107,9 +114,10 @@ def join(samples: Sequence[BatchSample], network: NetworkConfig) -> Batch:
     """Returns the samples as the tensors of one batch."""
     episodes = [sample.episode for sample in samples]
     particles = tuple(len(episode.material_N) for episode in episodes)
+    material_N = torch.cat([material_rows(e.material_N, network.materials, e.materials) for e in episodes])
     return Batch(
         window_WN3=torch.from_numpy(np.concatenate([sample.window_WN3 for sample in samples], axis=1)),
-        material_N=torch.cat([material_rows(e.material_N, network.materials, e.materials) for e in episodes]),
+        material_N=material_N,
         scene_N=torch.from_numpy(np.repeat(np.arange(len(episodes)), particles)),
         particles_S=particles,
         domain_S3=torch.tensor([episode.domain_size for episode in episodes], dtype=torch.float32),
@@ -119,4 +127,5 @@ def join(samples: Sequence[BatchSample], network: NetworkConfig) -> Batch:
         weight_S=tuple(sample.weight for sample in samples),
         noise_scale_S=tuple(sample.noise_scale for sample in samples),
         symmetries_S=tuple(shown_symmetries(e, network) for e in episodes),
+        **physics_fields(network, episodes, material_N),
     )

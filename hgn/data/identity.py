@@ -23,6 +23,7 @@ _NOT_PHYSICS = ("device", "scenes_per_launch")
 _LATER_OPTIONS = (
     "pure_direction_fraction", "colliding_scene_fraction", "zero_gravity_fraction", "tilted_gravity_fraction",
     "maximum_tilted_gravity", "funnel_scene_fraction", "funnel_hole", "kinds",
+    "own_physics",
 )  # fmt: skip
 
 

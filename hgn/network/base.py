@@ -15,6 +15,7 @@ from hgn.config import MATERIAL_EMBEDDING, NetworkConfig
 from hgn.network.features import WALL_DISTANCE_CELLS, Normaliser, ParticleState, wall_distances
 from hgn.network.grid import GridHierarchy
 from hgn.network.mlp import LEAKY_SLOPE, MLP
+from hgn.network.own_physics import physics_columns, physics_widths
 from hgn.network.relative import Contacts, relative_features
 from hgn.step_config import UNCONSTRAINED, StepConfig
 
@@ -46,7 +47,8 @@ class ParticleNetwork(nn.Module, ABC):
         normal_width = 3 if config.obstacle_features else 0
         parts: tuple[int, ...] = (3 * config.velocity_history, normal_width, 6, MATERIAL_EMBEDDING)
         if config.relative:
-            parts = (config.feature_width - MATERIAL_EMBEDDING, MATERIAL_EMBEDDING)
+            own = (sum(physics_widths(config)),) if config.own_physics else ()
+            parts = (config.feature_width - MATERIAL_EMBEDDING, MATERIAL_EMBEDDING, *own)
         self.encode = MLP(parts, config.width, config.width, slope=slope)
 
     @property
@@ -80,13 +82,16 @@ class ParticleNetwork(nn.Module, ABC):
         return Prediction(self.normalised_acceleration(state, origin_S3))
 
     def relative_features(self, state: ParticleState, grid: GridHierarchy) -> tuple[torch.Tensor, Contacts]:
-        """Returns all columns except the material's, [N, F], and the contacts of the coarsest cells."""
+        """Returns all columns except those of the material and of own physics, and the contacts of coarsest cells."""
         return relative_features(state, grid, self.config, self.normaliser.acceleration_std[0])
 
-    def encode_features(self, feature_NF: torch.Tensor, material_N: torch.Tensor) -> torch.Tensor:
-        """Returns latent vectors [N, W] of relative features."""
+    def encode_features(self, feature_NF: torch.Tensor, state: ParticleState, contacts: Contacts) -> torch.Tensor:
+        """Returns latent vectors [N, W] of relative features and own physics. Columns that are all 0 are skipped."""
         material_MH = self.encode.project(1, self.embedding.weight) + self.encode.first.bias
-        return self.encode.finish(self.encode.add_projection(material_MH.index_select(0, material_N), 0, feature_NF))
+        hidden_NH = self.encode.add_projection(material_MH.index_select(0, state.material_N), 0, feature_NF)
+        for physics_NK in physics_columns(state, self.config, contacts.friction):
+            hidden_NH = self.encode.add_projection(hidden_NH, 2, physics_NK)
+        return self.encode.finish(hidden_NH)
 
     def encode_particles(self, state: ParticleState, grid: GridHierarchy | None = None) -> torch.Tensor:
         """Returns latent vectors [N, W] of the particles (sec. 3.2, step 0). Relative inputs require the grid.
@@ -95,7 +100,8 @@ class ParticleNetwork(nn.Module, ABC):
         """
         if self.config.relative:
             assert grid is not None
-            return self.encode_features(self.relative_features(state, grid)[0], state.material_N)
+            feature_NF, contacts = self.relative_features(state, grid)
+            return self.encode_features(feature_NF, state, contacts)
         velocity_NV = self.normaliser.normalise_velocity(state.velocity_NM3).flatten(1)
         maximum = WALL_DISTANCE_CELLS * self.config.cell_size
         wall_N6 = wall_distances(state.position_N3, state.domain_S3[state.scene_N], maximum)

@@ -41,6 +41,8 @@ class ParticleState:
     gravity_S3: torch.Tensor  # gravity of each scene, domain units per frame squared
     obstacles: ObstacleCells | None
     barriers: Barriers | None = None  # triangles of obstacles; only with step.obstacle_clearance
+    wall_friction_S3: torch.Tensor | None = None  # friction of the walls across x, y, z; None: 0, or no input
+    parameter_NP: torch.Tensor | None = None  # columns of hgn.network.own_physics; None: 0, or no inputs
 
     @property
     def scene_count(self) -> int:

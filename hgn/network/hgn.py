@@ -96,7 +96,7 @@ class HierarchicalGraphNetwork(ParticleNetwork):
         if not self.config.relative:
             return Prediction(propagate(self.encode_particles(state, grid), grid))
         feature_NF, contacts = self.relative_features(state, grid)
-        output_N9 = propagate(self.encode_features(feature_NF, state.material_N), grid)
+        output_N9 = propagate(self.encode_features(feature_NF, state, contacts), grid)
         return Prediction(balanced(output_N9, contacts, grid), contacts, grid)
 
     def grid(self, state: ParticleState, origin_S3: torch.Tensor | None = None) -> GridHierarchy:

@@ -7,8 +7,8 @@ Shape legend: K obstacle cells of all scenes, N particles.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import lru_cache
+from dataclasses import dataclass, field
+from functools import cached_property, lru_cache
 
 import numpy as np
 import torch
@@ -21,11 +21,12 @@ REMEMBERED_SCENES = 32  # number of scenes whose keys are cached; batches often 
 
 @dataclass(frozen=True, eq=False)
 class ObstacleCells:
-    """Sorted cell keys int64 [K] and unit normals float32 [K, 3]."""
+    """Sorted cell keys int64 [K], unit normals float32 [K, 3] and friction coefficients float32 [K] (None: 0)."""
 
     key_K: torch.Tensor
     normal_K3: torch.Tensor
     cell_size: float
+    friction_K: torch.Tensor | None = field(default=None, kw_only=True)
 
     @staticmethod
     def of(grids: Sequence[ObstacleGrid]) -> ObstacleCells | None:
@@ -36,20 +37,35 @@ class ObstacleCells:
         assert all(grid.cell_size == cell_size for grid in grids), "scenes of one batch share the cell size"
         key_K = torch.cat([of_scene(_keys(grid), scene) for scene, grid in enumerate(grids)])
         normal_K3 = np.concatenate([grid.normal_K3 for grid in grids]).astype(np.float32, copy=False)
-        return ObstacleCells(key_K, torch.from_numpy(normal_K3), cell_size)
+        friction_K = None
+        if any(grid.friction_K is not None and grid.friction_K.any() for grid in grids):
+            parts = (np.zeros(len(g.cell_K3)) if g.friction_K is None else g.friction_K for g in grids)
+            friction_K = torch.from_numpy(np.concatenate([*parts]).astype(np.float32, copy=False))
+        return ObstacleCells(key_K, torch.from_numpy(normal_K3), cell_size, friction_K=friction_K)
 
     def to(self, device: torch.device, non_blocking: bool = False) -> ObstacleCells:
         return ObstacleCells(
             self.key_K.to(device, non_blocking=non_blocking),
             self.normal_K3.to(device, non_blocking=non_blocking),
             self.cell_size,
+            friction_K=self.friction_K if self.friction_K is None else self.friction_K.to(device),
         )
+
+    @cached_property
+    def surface_rows(self) -> torch.Tensor:
+        """Returns normals and friction [K, 4]."""
+        friction_K = torch.zeros_like(self.normal_K3[:, 0]) if self.friction_K is None else self.friction_K
+        return torch.cat([self.normal_K3.to(friction_K), friction_K[:, None]], dim=-1)
 
     def normals(self, position_N3: torch.Tensor, scene_N: torch.Tensor) -> torch.Tensor:
         """Returns n_o of each particle, [N, 3] in the positions' dtype; zero in cells without obstacles."""
+        return self.surfaces(position_N3, scene_N)[:, :3]
+
+    def surfaces(self, position_N3: torch.Tensor, scene_N: torch.Tensor) -> torch.Tensor:
+        """Returns `normals`, followed by the friction of the cell, [N, 4]."""
         cell_N3 = torch.floor(position_N3 / self.cell_size).long()
         index_N, found_N = find(self.key_K, pack(scene_N, cell_N3))
-        return (self.normal_K3[index_N] * found_N[:, None]).to(position_N3.dtype)
+        return (self.surface_rows[index_N] * found_N[:, None]).to(position_N3.dtype)
 
 
 @lru_cache(REMEMBERED_SCENES)

@@ -46,29 +46,29 @@ class PosedObstacleCells(ObstacleCells):
     placed: tuple[tuple[ObstacleCells, Placement], ...] = ()
     smoothing: float = 0.0  # side of the cube for mean normals, in cells, 0 to 1
 
-    def normals(self, position_N3: torch.Tensor, scene_N: torch.Tensor) -> torch.Tensor:
-        """Returns n_o of each particle, [N, 3]: the sum over obstacles, shortened to length 1."""
-        normal_N3 = smoothed_normals(self, position_N3, scene_N, self.smoothing)
+    def surfaces(self, position_N3: torch.Tensor, scene_N: torch.Tensor) -> torch.Tensor:
+        """Returns n_o of each particle, the sum over obstacles shortened to length 1, and friction likewise, [N, 4]."""
+        surface_N4 = smoothed_surfaces(self, position_N3, scene_N, self.smoothing)
         for cells, placement in self.placed:
-            own_N3 = smoothed_normals(cells, placement.undo(position_N3), scene_N, self.smoothing)
-            normal_N3 = normal_N3 + own_N3 @ placement.rotation_33.T
-        square_N1 = normal_N3.square().sum(-1, keepdim=True)
-        return torch.where(square_N1 > 1, normal_N3 * square_N1.clamp(min=1).rsqrt(), normal_N3)
+            own_N4 = smoothed_surfaces(cells, placement.undo(position_N3), scene_N, self.smoothing)
+            surface_N4 = surface_N4 + torch.cat([own_N4[:, :3] @ placement.rotation_33.T, own_N4[:, 3:]], dim=-1)
+        square_N1 = surface_N4[:, :3].square().sum(-1, keepdim=True)
+        return torch.where(square_N1 > 1, surface_N4 * square_N1.clamp(min=1).rsqrt(), surface_N4)
 
 
-def smoothed_normals(
+def smoothed_surfaces(
     cells: ObstacleCells, position_N3: torch.Tensor, scene_N: torch.Tensor, smoothing: float
 ) -> torch.Tensor:
-    """Returns the mean of the cells' normals over a cube of `smoothing` cells around each particle, [N, 3]."""
+    """Returns means of normals and friction over a cube of `smoothing` cells around each particle, [N, 4]."""
     if len(cells.key_K) == 0:
-        return torch.zeros_like(position_N3)
+        return position_N3.new_zeros(len(position_N3), 4)
     if smoothing == 0:
-        return ObstacleCells.normals(cells, position_N3, scene_N)
+        return ObstacleCells.surfaces(cells, position_N3, scene_N)
     grid_N3 = position_N3 / cells.cell_size
     low_N3 = torch.floor(grid_N3 - 0.5 * smoothing).detach()
     upper_N3 = ((grid_N3 + 0.5 * smoothing - low_N3 - 1) / smoothing).clamp(0, 1)  # fraction in the next cell
     corner_83 = CORNER_83.to(position_N3.device)
     weight_N8 = torch.where(corner_83.bool(), upper_N3[:, None], 1 - upper_N3[:, None]).prod(-1)
     index_N8, found_N8 = find(cells.key_K, pack(scene_N[:, None], low_N3.long()[:, None] + corner_83))
-    normal_N83 = cells.normal_K3.to(position_N3.dtype)[index_N8]
-    return ((weight_N8 * found_N8)[..., None] * normal_N83).sum(1)
+    surface_N84 = cells.surface_rows.to(position_N3.dtype)[index_N8]
+    return ((weight_N8 * found_N8)[..., None] * surface_N84).sum(1)

@@ -22,7 +22,7 @@ them. These properties hold for any parameters:
 - Without a surface in reach momentum is conserved. The mean of r over a coarsest cell is subtracted, and cells exchange
   only antisymmetric impulses across their faces.
 - Angular momentum is then conserved too. The rotation of a cell, and of each pair of neighbours, is subtracted.
-- Surfaces push along their normals only.
+- Surfaces without friction push along their normals only; others as in hgn.network.own_physics.
 Shape legend: N particles, H velocities, L levels, C cells of a level, E directed edges, S scenes.
 """
 
@@ -36,6 +36,7 @@ from hgn.config import NetworkConfig
 from hgn.network.features import ParticleState
 from hgn.network.grid import DIRECTION_63, GridHierarchy
 from hgn.network.obstacles import ObstacleCells
+from hgn.network.own_physics import SurfaceFriction, kept, surface_friction
 
 CONTACT_REACH_CELLS = 3.0  # distance from a wall, in R, at which the network begins to see it
 WALL_LIMIT = 2.0  # largest wall_nearness, reached one `reach` behind the plane
@@ -59,6 +60,7 @@ class Contacts:
     disturbed_C: torch.Tensor
     touched_C: torch.Tensor
     normal_C33: torch.Tensor
+    friction: SurfaceFriction | None = None  # None: no surface has friction
 
 
 def relative_features(
@@ -72,9 +74,10 @@ def relative_features(
     wall_N6 = wall_nearness(
         state.position_N3, velocity_N3, state.domain_S3[state.scene_N], CONTACT_REACH_CELLS * config.cell_size
     )
-    normal_N6 = None
+    normal_N6 = cell_N8 = None
     if config.obstacle_features:
-        normal_N6 = obstacle_normals(state.position_N3, velocity_N3, state.scene_N, state.obstacles)
+        cell_N8 = obstacle_surfaces(state.position_N3, velocity_N3, state.scene_N, state.obstacles)
+        normal_N6 = torch.cat([cell_N8[:, :3], cell_N8[:, 4:7]], dim=-1)
     motion_NK = torch.cat(
         [
             torch.asinh(history(state.velocity_NM3, state.gravity_S3[state.scene_N]) / scale),
@@ -83,7 +86,10 @@ def relative_features(
         dim=-1,
     )
     normal_C33 = touched_normals(surface_normals(wall_N6, normal_N6), grid)
-    contacts = Contacts(*disturbance(motion_NK, surface_gate(wall_N6, normal_N6), grid), normal_C33)
+    rough = state.wall_friction_S3 is not None or (state.obstacles and state.obstacles.friction_K) is not None
+    rough = rough and "friction" in config.own_physics
+    friction = surface_friction(state, grid, wall_N6, cell_N8, scale) if rough else None
+    contacts = Contacts(*disturbance(motion_NK, surface_gate(wall_N6, normal_N6), grid), normal_C33, friction)
     gate_N = (grid.weight_N8 * contacts.touched_C[grid.coarsest_cells]).sum(1)
     parts = [motion_NK, gate_N[:, None] * torch.asinh(velocity_N3 / scale), wall_N6]
     return torch.cat(parts if normal_N6 is None else [*parts, normal_N6], dim=-1), contacts
@@ -128,20 +134,20 @@ def wall_nearness(
     return (1 - (distance_N6 + away_N6.clamp(max=0)) / reach).clamp(0.0, WALL_LIMIT)
 
 
-def obstacle_normals(
+def obstacle_surfaces(
     position_N3: torch.Tensor, velocity_N3: torch.Tensor, scene_N: torch.Tensor, obstacles: ObstacleCells | None
 ) -> torch.Tensor:
-    """Returns the normal at the particle and the first normal on its path to the next frame, [N, 6].
+    """Returns normal and friction at the particle, then those first met on its path to the next frame, [N, 8].
 
     STEPS_AHEAD evenly spaced places of the path are tested. Without an obstacle a normal is 0.
     """
-    here_N3, ahead_N3 = torch.zeros_like(position_N3), torch.zeros_like(position_N3)
+    here_N4 = ahead_N4 = torch.zeros_like(position_N3[:, :1]).expand(-1, 4)
     if obstacles is not None:
-        here_N3 = obstacles.normals(position_N3, scene_N)
+        here_N4 = obstacles.surfaces(position_N3, scene_N)
         for step in range(STEPS_AHEAD, 0, -1):
-            normal_N3 = obstacles.normals(position_N3 + velocity_N3 * (step / STEPS_AHEAD), scene_N)
-            ahead_N3 = torch.where(normal_N3.any(-1, keepdim=True), normal_N3, ahead_N3)
-    return torch.cat([here_N3, ahead_N3], dim=-1)
+            surface_N4 = obstacles.surfaces(position_N3 + velocity_N3 * (step / STEPS_AHEAD), scene_N)
+            ahead_N4 = torch.where(surface_N4[:, :3].any(-1, keepdim=True), surface_N4, ahead_N4)
+    return torch.cat([here_N4, ahead_N4], dim=-1)
 
 
 def surface_gate(wall_N6: torch.Tensor, normal_N6: torch.Tensor | None) -> torch.Tensor:
@@ -238,7 +244,8 @@ def balanced(output_N9: torch.Tensor, contacts: Contacts, grid: GridHierarchy) -
     q or q', so they never enlarge mean squares, even for small or thin bodies.
 
     t_C Q_C R_C is subtracted too, where Q is `slip` of the `touched_normals`. Then the mean force of surfaces on a cell
-    is along their normals. Bodies slide on a plane without friction or propulsion, for any parameters.
+    is along their normals. Bodies slide on a plane without friction or propulsion, for any parameters. With friction a
+    part of Q_C R_C is kept (`own_physics.kept`).
     """
     disturbed_C, touched_C = contacts.disturbed_C, contacts.touched_C
     level, cell_N8, weight_N8 = grid.levels[-1], grid.coarsest_cells, grid.weight_N8
@@ -270,7 +277,16 @@ def balanced(output_N9: torch.Tensor, contacts: Contacts, grid: GridHierarchy) -
     known_E, turn_E3 = rotation(inertia_E33, -both_E[:, None] * torch.linalg.cross(apart_E3, traction_E3))
     push_E3 = known_E[:, None] * traction_E3 + torch.linalg.cross(turn_E3, apart_E3)
     change_C3 = (free_C * known_C)[:, None] * -mean_C3
-    change_C3 = change_C3 - touched_C[:, None] * (slip(contacts.normal_C33) @ mean_C3[..., None]).squeeze(-1)
+    slip_C33 = slip(contacts.normal_C33)
+    along_C3 = (slip_C33 @ mean_C3[..., None]).squeeze(-1)
+    if contacts.friction is not None:
+        pushed_C3 = torch.zeros_like(along_C3).index_add(0, receiver_E, share_E[:, None] * push_E3)
+        free_C3 = (slip_C33 @ (contacts.friction.velocity_C3 + disturbed_C[:, None] * pushed_C3)[..., None]).squeeze(-1)
+        force_C3 = (disturbed_C * touched_C)[:, None] * along_C3
+        push_C3 = force_C3 / (FEW + RARE * trace(contacts.normal_C33))[:, None]
+        part_C = kept(contacts.friction, force_C3, push_C3, free_C3, slip_C33)
+        along_C3 = along_C3 - part_C[:, None] * along_C3
+    change_C3 = change_C3 - touched_C[:, None] * along_C3
     change_C3 = disturbed_C[:, None] * change_C3.index_add(0, receiver_E, share_E[:, None] * push_E3)
     felt_E = 0.5 * disturbed_C[sender_E]
     turn_C3 = (free_C[:, None] * turn_C3).index_add(0, receiver_E, felt_E[:, None] * turn_E3)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -18,10 +19,13 @@ from hgn.network.base import ParticleNetwork
 from hgn.network.features import ParticleState
 from hgn.network.grid import GridRangeError
 from hgn.network.obstacles import ObstacleCells
+from hgn.network.own_physics import scaled_parameters
 from hgn.network.posed_obstacles import Placement, PosedObstacleCells
 from hgn.runtime.divergence import DivergedError, describe_diverged, diverged
 from hgn.scene.barrier import barrier_of_pieces, barrier_pieces
+from hgn.scene.material import INPUT_PARAMETERS
 from hgn.scene.obstacle_grid import ObstacleGrid, build_obstacle_grid
+from hgn.scene.own_physics import NOMINAL_P, input_parameters
 from hgn.scene.scene import Obstacle, Scene
 from hgn.schema import ConfigError, require
 from hgn.step.reference import Accelerations, advanced
@@ -45,6 +49,7 @@ class Inputs:
     gravity_3: torch.Tensor | None = None
     domain_size_3: torch.Tensor | None = None
     poses: Mapping[int, Pose] | None = None  # by the obstacle's number in the scene
+    physics: Mapping[str, torch.Tensor] | None = None  # wall_friction [3], or INPUT_PARAMETERS by name [N]
     smoothing: float = 0.0  # see hgn.network.posed_obstacles
 
 
@@ -117,6 +122,7 @@ def _variables(state: ParticleState) -> list[torch.Tensor]:
     if isinstance(state.obstacles, PosedObstacleCells):
         for _, placement in state.obstacles.placed:
             tensors += [placement.rotation_33, placement.translation_3]
+    tensors += [x for x in (state.wall_friction_S3, state.parameter_NP) if x is not None]
     return tensors if state.barriers is None else [*tensors, state.barriers.row_F24]
 
 
@@ -137,6 +143,8 @@ def _with_variables(state: ParticleState, variables: Sequence[torch.Tensor]) -> 
         domain_S3=domain_S3,
         gravity_S3=gravity_S3,
         obstacles=obstacles,
+        wall_friction_S3=None if state.wall_friction_S3 is None else next(rest),
+        parameter_NP=None if state.parameter_NP is None else next(rest),
         barriers=state.barriers and replace(state.barriers, row_F24=next(rest)),
     )
 
@@ -175,7 +183,30 @@ def _started(
         gravity_S3=gravity_3[None].to(dtype),
         obstacles=obstacles,
         barriers=barriers,
+        **_physics(network, start, scene, inputs.physics or {}),
     )
+
+
+def _physics(
+    network: ParticleNetwork, start: ParticleState, scene: Scene, given: Mapping[str, torch.Tensor]
+) -> dict[str, Any]:
+    """Returns the fields of a state for friction of walls and for parameters. `given` replaces those of the scene."""
+    fields: dict[str, Any] = {"wall_friction_S3": start.wall_friction_S3, "parameter_NP": start.parameter_NP}
+    count, dtype, inputs = scene.particle_count, next(network.parameters()).dtype, network.config.own_physics
+    known: dict[str, tuple[int, ...]] = {"wall_friction": (3,)} if "friction" in inputs else {}
+    known |= dict.fromkeys(INPUT_PARAMETERS, (count,)) if "parameters" in inputs else {}
+    for name, tensor in given.items():
+        require(name in known, "physics", f"of the network's inputs ({', '.join(known) or 'none'})", name)
+        require(tensor.shape == known[name], f"physics {name}", f"of shape {known[name]}", tuple(tensor.shape))
+    if "wall_friction" in given:
+        fields["wall_friction_S3"] = given["wall_friction"][None].to(start.domain_S3.device)
+    if given.keys() - {"wall_friction"}:
+        own_NP = input_parameters(scene.material_parameters, {}, count)
+        value_NP = torch.tensor(np.tile(NOMINAL_P, (count, 1)) if own_NP is None else own_NP, dtype=torch.float64)
+        columns = zip(INPUT_PARAMETERS, value_NP.to(start.domain_S3.device).unbind(-1), strict=True)
+        value_NP = torch.stack([given.get(name, value_N).to(value_N) for name, value_N in columns], -1)
+        fields["parameter_NP"] = scaled_parameters(value_NP, start.material_N, network.config.materials)
+    return {name: None if tensor is None else tensor.to(dtype) for name, tensor in fields.items()}
 
 
 def _obstacles(
@@ -194,7 +225,9 @@ def _obstacles(
     if config.obstacle_features:
         rest = _cells(scene, staying, device)
         placed = tuple((_cells(scene, [scene.obstacles[i]], device), placement) for i, placement in placements.items())
-        obstacles = PosedObstacleCells(rest.key_K, rest.normal_K3, rest.cell_size, placed, smoothing=inputs.smoothing)
+        friction_K = rest.surface_rows[:, 3] if any(o.friction for o in scene.obstacles) else None
+        own = rest.key_K, rest.normal_K3, rest.cell_size, placed, inputs.smoothing
+        obstacles = PosedObstacleCells(*own, friction_K=friction_K)
     clearance = network.step.obstacle_clearance
     if clearance is not None and placements:
         barriers = _barriers(scene, placements, clearance, device, dtype=dtype)

@@ -112,9 +112,11 @@ def initial_arrays(state: ParticleState, corner_F33: np.ndarray | None = None) -
 
 
 def traced_step(network: ParticleNetwork, info: WeightsInfo) -> torch.export.ExportedProgram:
-    """Returns the graph. Raises: ConfigError for a GNS, because neighbour lists cannot be exported."""
+    """Returns the graph. Raises: ConfigError for a GNS (neighbour lists cannot be exported) and for own physics."""
     require(isinstance(network, HierarchicalGraphNetwork), "weights", "an hgn network", network.config.kind)
     assert isinstance(network, HierarchicalGraphNetwork)
+    own = list(network.config.own_physics)
+    require(not own, "weights", "a network without own_physics, which a graph has no inputs for yet", own)
     device, config = next(network.parameters()).device, network.config
     generator = torch.Generator().manual_seed(0)
     example = (

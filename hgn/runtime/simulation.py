@@ -20,6 +20,7 @@ import torch
 from hgn.network.features import ParticleState
 from hgn.network.grid import GridRangeError
 from hgn.runtime.divergence import DivergedError, describe_diverged, diverged
+from hgn.scene.material import INPUT_PARAMETERS
 
 OF_PARTICLES = ("position_N3", "velocity_NM3", "material_N", "scene_N")
 
@@ -112,6 +113,12 @@ class Simulation:
             self._row_N = torch.cat([rows_N, self._row_count + torch.nonzero(running_A).flatten()])
         self._row_count += len(new.position_N3)
         both: dict[str, Any] = {name: torch.cat([getattr(old, name), getattr(entering, name)]) for name in OF_PARTICLES}
+        if any(state.parameter_NP is not None for state in (old, entering)):
+            zeros = (
+                state.position_N3.new_zeros(len(state.scene_N), len(INPUT_PARAMETERS)) for state in (old, entering)
+            )
+            parts = zip((old.parameter_NP, entering.parameter_NP), zeros, strict=True)
+            both["parameter_NP"] = torch.cat([zero if own is None else own for own, zero in parts])
         self._begin(replace(old, **both))
 
     def run(self, frames: int, on_frame: Callable[[int], Any] | None = None) -> np.ndarray:
@@ -225,6 +232,8 @@ class Simulation:
 def selected(state: ParticleState, selected_N: torch.Tensor) -> ParticleState:
     """Returns a state with the selected particles. Scenes keep their numbers."""
     some: dict[str, Any] = {name: getattr(state, name)[selected_N] for name in OF_PARTICLES}
+    if state.parameter_NP is not None:
+        some["parameter_NP"] = state.parameter_NP[selected_N]
     return replace(state, **some)
 
 

@@ -19,6 +19,7 @@ from hgn.network.barriers import Barriers
 from hgn.network.base import ParticleNetwork
 from hgn.network.features import ParticleState, material_rows
 from hgn.network.obstacles import ObstacleCells
+from hgn.network.own_physics import physics_fields
 from hgn.runtime.backend import build, choose, set_matmul_precision
 from hgn.runtime.differentiable import Inputs, Pose, simulate
 from hgn.runtime.divergence import DivergedError
@@ -33,6 +34,7 @@ from hgn.scene.episode_obstacles import known_obstacles
 from hgn.scene.history import ballistic_velocities, require_past
 from hgn.scene.material import MATERIALS
 from hgn.scene.obstacle_grid import ObstacleGrid, build_obstacle_grid
+from hgn.scene.own_physics import input_parameters
 from hgn.scene.scene import Scene, all_corners, whole_cells
 from hgn.schema import require
 from hgn.system.device import choose_device
@@ -58,6 +60,8 @@ class InitialState:
     past_HN3: np.ndarray | None = None  # frames before frame 0, oldest first; None: free flight before frame 0
     dimensions: int = 3
     emitting: Scene | None = None  # the scene, if particles enter later; they follow the others
+    wall_friction: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    parameters: np.ndarray | None = None  # float32 [N, P], hgn.scene.own_physics.input_parameters
 
     @staticmethod
     def of_episode(episode: Episode) -> InitialState:
@@ -73,6 +77,8 @@ class InitialState:
             materials=episode.materials,
             past_HN3=episode.past_HN3,
             dimensions=episode.dimensions,
+            wall_friction=episode.wall_friction,
+            parameters=episode.parameters,
         )
 
     @staticmethod
@@ -95,6 +101,8 @@ class InitialState:
             gravity=scene.gravity,
             corners=lambda: all_corners(scene.obstacles),
             emitting=scene if scene.emits else None,
+            wall_friction=scene.wall_friction,
+            parameters=input_parameters(first.material_parameters, {}, first.particle_count),
         )
 
     @staticmethod
@@ -183,6 +191,7 @@ class Simulator:
         clearance = self.network.step.obstacle_clearance
         if clearance is not None:
             barriers = Barriers.of([state.barrier(clearance) for state in states])
+        physics = physics_fields(config, states, material_N)
         return ParticleState(
             position_N3=torch.from_numpy(position_N3).to(self.device),
             velocity_NM3=torch.from_numpy(np.concatenate(velocities)).to(self.device),
@@ -192,6 +201,7 @@ class Simulator:
             gravity_S3=torch.from_numpy(gravity_S3.astype(np.float32)).to(self.device),
             obstacles=self.obstacles(states),
             barriers=barriers and barriers.to(self.device),
+            **{name: tensor.to(self.device) for name, tensor in physics.items()},
         )
 
     def obstacles(self, scenes: Sequence[InitialState]) -> ObstacleCells | None:
@@ -275,6 +285,8 @@ class Simulator:
                 particles = {
                     name: getattr(entered, name)[new_N] for name in ("position_N3", "velocity_N3", "material_N")
                 }
+                given = {name: value_N[new_N] for name, value_N in entered.material_parameters.items()}
+                particles["parameters"] = input_parameters(given, {}, int(new_N.sum()))
                 new = self.start([replace(state, corners=None, **particles)])  # barriers take long and are not needed
                 entries.append(Entry(frame, replace(new, scene_N=new.scene_N + number)))
         return sorted(entries, key=lambda entry: entry.frame)
@@ -290,16 +302,19 @@ class Simulator:
         domain_size_3: torch.Tensor | None = None,
         poses: Mapping[int, Pose] | None = None,
         smoothing: float = 0.0,
+        **physics: torch.Tensor,
     ) -> torch.Tensor:
         """Computes `rollout` of a scene with gradients: positions [frames, N, 3], a tensor in the network's precision.
 
         Arguments replace the scene's own values: positions and velocities [N, 3], gravity [3] (relative inputs only),
-        the domain's size [3]. Units are domain units and seconds. `poses` rotates and shifts obstacles by number.
-        `smoothing`, 0 to 1 obstacle cells, makes normals continuous (hgn.network.posed_obstacles). PyTorch computes all
-        and keeps one frame's intermediate results in memory. docs/how_to/gradients.md lists quantities with gradients.
+        the domain's size [3], and by name wall_friction [3] and parameters [N] that are inputs of the network. Units
+        are domain units and seconds. `poses` rotates and shifts obstacles by number. `smoothing`, 0 to 1 obstacle
+        cells, makes normals continuous (hgn.network.posed_obstacles). PyTorch computes all and keeps one frame's
+        intermediate results in memory. docs/how_to/gradients.md lists quantities with gradients.
         Raises: ConfigError and DivergedError as `rollout`.
         """
         inputs = Inputs(position_N3, velocity_N3, gravity_3, domain_size_3, poses=poses, smoothing=smoothing)
+        inputs = replace(inputs, physics=physics)
         return simulate(self.network, self.start([scene]), scene, self.frame_rate_hz, frames=frames, inputs=inputs)
 
     def require_fits(self, scene: InitialState) -> None:

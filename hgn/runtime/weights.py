@@ -40,6 +40,8 @@ class WeightsInfo:
     gravity: Vector = (0.0, -9.8, 0.0)  # gravity of the data; absolute inputs support no other
     # largest initial speed of the data's groups, domain units per second; null: unknown
     maximum_initial_speed: NonNegative[float] | None = None
+    # ranges of friction and of materials' parameters in the data (hgn.scene.own_physics.own_ranges)
+    own_ranges: dict[str, tuple[float, float]] = field(default_factory=dict)
     format_version: int = FORMAT_VERSION
     step: StepConfig = field(default_factory=StepConfig)  # constraints of each frame
     updates: int = 0  # number of updates of the training

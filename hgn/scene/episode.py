@@ -20,6 +20,7 @@ import numpy as np
 from hgn.scene.material import MATERIALS, require_materials
 from hgn.scene.npz import read_header
 from hgn.scene.obstacle_grid import ObstacleGrid
+from hgn.scene.own_physics import input_parameters
 from hgn.schema import BoxSize, ConfigError, Positive, Vector, from_mapping, require, require_bounds
 
 SCHEMA_VERSION = 1
@@ -34,11 +35,12 @@ _ARRAYS = {
     "material": ("|u1", "N"),
     "obstacle_cell": ("<i4", "K3"),
     "obstacle_normal": ("<f4", "K3"),
+    "obstacle_friction": ("<f4", "K"),
     "past": ("<f4", "HN3"),
     "boundary": ("<f4", "P3"),
 }
 _PARAMETER = ("<f4", "N")
-_OPTIONAL = ("past", "boundary")  # only in imported episodes
+_OPTIONAL = ("obstacle_friction", "past", "boundary")  # the last two only in imported episodes
 
 _NAME = re.compile(r"[A-Za-z0-9_-]+")
 
@@ -67,6 +69,7 @@ class Episode:
     materials: tuple[str, ...] = MATERIALS  # imported sets append their own names
     past_HN3: np.ndarray | None = None  # float32, the frames before frame 0, oldest first; None: free flight
     boundary_P3: np.ndarray | None = None  # float32, particles at rest that represent obstacles
+    wall_friction: Vector = (0.0, 0.0, 0.0)  # Coulomb coefficients of the domain's walls across x, y and z
 
     def __post_init__(self) -> None:
         if not _NAME.fullmatch(self.key):
@@ -96,11 +99,18 @@ class Episode:
             raise ConfigError(f"{self.key}: {error}") from None
         cell_size = self.obstacle_grid.cell_size
         require(0 < cell_size < math.inf, f"{self.key}: cell_size", "a finite number > 0", cell_size)
+        least = min((*self.wall_friction, *arrays.get("obstacle_friction", ())))
+        require(least >= 0, f"{self.key}: friction", "at least 0", least)
 
     @property
     def imported(self) -> bool:
         """Returns whether the episode was imported (hgn.import_trajectories)."""
         return self.specification.get("kind") == "imported"
+
+    @property
+    def parameters(self) -> np.ndarray | None:
+        """Returns the parameters that networks may have as inputs, float32 [N, P]; None: all have their defaults."""
+        return input_parameters(self.material_parameters, self.solver.get("settings", {}), self.particle_count)
 
     @property
     def dimensions(self) -> int:
@@ -123,6 +133,7 @@ class Episode:
             "material": self.material_N,
             "obstacle_cell": self.obstacle_grid.cell_K3,
             "obstacle_normal": self.obstacle_grid.normal_K3,
+            "obstacle_friction": self.obstacle_grid.friction_K,
             "past": self.past_HN3,
             "boundary": self.boundary_P3,
         }
@@ -143,6 +154,7 @@ class _Description:
     frame_rate_hz: float
     cell_size: float
     materials: tuple[str, ...] = MATERIALS
+    wall_friction: Vector = (0.0, 0.0, 0.0)
 
 
 def encode_episode(episode: Episode) -> dict[str, bytes]:
@@ -169,6 +181,8 @@ def encode_episode(episode: Episode) -> dict[str, bytes]:
     }
     if episode.materials != MATERIALS:
         description["materials"] = list(episode.materials)
+    if any(episode.wall_friction):
+        description["wall_friction"] = list(episode.wall_friction)
     try:
         text = json.dumps(description, sort_keys=True, allow_nan=False, separators=(",", ":"))
     except (TypeError, ValueError) as error:
@@ -202,12 +216,16 @@ def decode_episode(key: str, members: Mapping[str, bytes | np.ndarray], scan_pos
     for name in _ARRAYS:
         if name not in arrays and name not in _OPTIONAL:
             raise ConfigError(f"{key}: member {name}.npy is missing; generate the data set again")
+    normal_K3, friction_K = arrays["obstacle_normal"], arrays.get("obstacle_friction")
+    settings = description.solver.get("settings", {})
+    if friction_K is None and settings.get("collider_friction", 0.0) > 0:
+        friction_K = np.full(len(normal_K3), settings["collider_friction"], np.float32)
     episode = Episode(
         key=key,
         position_TN3=arrays["position"],
         initial_velocity_N3=arrays["velocity"],
         material_N=arrays["material"],
-        obstacle_grid=ObstacleGrid(description.cell_size, arrays["obstacle_cell"], arrays["obstacle_normal"]),
+        obstacle_grid=ObstacleGrid(description.cell_size, arrays["obstacle_cell"], normal_K3, friction_K),
         domain_size=description.domain_size,
         gravity=description.gravity,
         frame_rate_hz=description.frame_rate_hz,
@@ -220,6 +238,7 @@ def decode_episode(key: str, members: Mapping[str, bytes | np.ndarray], scan_pos
         materials=description.materials,
         past_HN3=arrays.get("past"),
         boundary_P3=arrays.get("boundary"),
+        wall_friction=description.wall_friction,
     )
     if scan_positions:
         _require_finite_positions(episode)

@@ -5,6 +5,7 @@ Shape legend: K obstacle cells, F triangles.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +35,7 @@ def known_obstacles(episode: Episode) -> tuple[Obstacle, ...] | None:
     records = episode.specification.get("obstacles", ())
     if episode.specification.get("kind") != "random" or not all(_is_here(record) for record in records):
         return None
-    return tuple(
+    placed = (
         shape_obstacle(
             record["shape"],
             record["size"],
@@ -44,6 +45,7 @@ def known_obstacles(episode: Episode) -> tuple[Obstacle, ...] | None:
         )
         for index, record in enumerate(records)
     )
+    return tuple(replace(body, friction=own.get("friction")) for body, own in zip(placed, records, strict=True))
 
 
 def _is_here(record: dict[str, Any]) -> bool:

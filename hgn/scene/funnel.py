@@ -10,8 +10,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hgn.config import FUNNEL_HEIGHT, FUNNEL_SQUARES, SceneConfig
+from hgn.config import SceneConfig
 from hgn.scene.group import random_direction
+from hgn.scene.kinds import FUNNEL_HEIGHT, FUNNEL_SQUARES
 from hgn.scene.rotation import quaternion_product, quaternion_rotation
 from hgn.schema import Vector
 

@@ -8,6 +8,8 @@ from typing import Any
 
 from hgn.schema import require
 
+FUNNEL_SQUARES = (0.5, 0.8)  # smallest and largest side of a funnel's squares, relative to the largest obstacle
+FUNNEL_HEIGHT = (2.0, 5.0)  # free height below and above a funnel's hole, in group sizes
 MAXIMUM_PARTICLES = 16_000  # largest number in a scene; larger scenes are drawn again
 
 # Smallest and largest value of each number that a kind draws.
@@ -32,7 +34,14 @@ RANGES: dict[str, dict[str, tuple[float, float]]] = {
     "jet": {"length": (0.08, 0.3), "width": (0.05, 0.12), "speed": (1.5, 6.0)},
 }  # fmt: skip
 SCENE_KINDS = tuple(RANGES)
-FREE = ("domain_size", "cell_size", "materials", "particles_per_cell", "kinds")  # settings that kinds do not draw
+FREE = (
+    "domain_size",
+    "cell_size",
+    "materials",
+    "particles_per_cell",
+    "kinds",
+    "own_physics",
+)  # settings that kinds do not draw
 
 
 def require_kinds(scene: Any) -> None:
@@ -47,3 +56,15 @@ def require_kinds(scene: Any) -> None:
         value = getattr(scene, item.name)
         rule = f"its default ({item.default}) where kinds are given"
         require(item.name in FREE or value == item.default, item.name, rule, value, "kinds draw it")
+
+
+def require_funnel(scene: Any) -> None:
+    """Checks that funnels of a SceneConfig fit into its domain. Raises: ConfigError."""
+    if scene.funnel_scene_fraction > 0:
+        remedy, where = "or set funnel_scene_fraction=0", "where funnel_scene_fraction is above 0"
+        require(scene.obstacle_count >= 4, "obstacle_count", f"at least 4 {where}", scene.obstacle_count, remedy)
+        widest, height = FUNNEL_SQUARES[0] * scene.obstacle_size[1], min(scene.domain_size) / sum(FUNNEL_HEIGHT)
+        rule = f"at most {FUNNEL_SQUARES[0]:g} of the largest obstacle_size ({widest:g}) {where}"
+        require(scene.funnel_hole[1] <= widest, "funnel_hole", rule, list(scene.funnel_hole), remedy)
+        rule = f"at most {1 / sum(FUNNEL_HEIGHT):.3g} of the domain's smallest side ({height:.3g}) {where}"
+        require(scene.group_size <= height, "group_size", rule, scene.group_size, remedy)

@@ -31,6 +31,21 @@ MATERIAL_PARAMETERS: tuple[str, ...] = (
     "water_tension",
     "water_viscosity_pa_s",
 )
+OWN_PHYSICS = ("friction", "parameters")  # what scenes draw and networks have as inputs: of surfaces, of materials
+# Parameters that networks have as inputs, in the order of their columns, and the ranges that random scenes draw.
+INPUT_PARAMETERS: dict[str, tuple[float, float]] = {
+    "youngs_modulus_pa": (1.25e5, 2e6), "density_kg_m3": (500.0, 2000.0), "sand_friction_angle_deg": (15.0, 45.0),
+    "snow_hardening": (5.0, 15.0), "snow_critical_compression": (0.01, 0.05), "snow_critical_stretch": (0.002, 0.01),
+    "water_viscosity_pa_s": (0.25, 64.0),
+}  # fmt: skip
+# The ranges of these are powers of two wide; the network sees their logarithms.
+LOGARITHMIC = ("youngs_modulus_pa", "density_kg_m3", "water_viscosity_pa_s")
+
+
+def acts_on(parameter: str, material: str) -> bool:
+    """Returns whether a parameter acts on a material. The others of a name such as sand_… act on all materials."""
+    owner = parameter.partition("_")[0]
+    return owner == material or owner not in MATERIALS
 
 
 def material_index(name: str) -> int:

@@ -8,7 +8,7 @@ Shape legend: K obstacle cells, S surface samples, F triangles.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -28,6 +28,7 @@ class ObstacleGrid:
     cell_size: float
     cell_K3: np.ndarray  # int32, unique rows, lexicographically sorted
     normal_K3: np.ndarray  # float32, unit length
+    friction_K: np.ndarray | None = None  # float32, Coulomb coefficients; None: no obstacle has its own
 
 
 def build_obstacle_grid(
@@ -39,10 +40,12 @@ def build_obstacle_grid(
     points away from the cell's centre. The sum of a cell is normalised. The sum may cancel (two sheets on both sides of
     the centre). The cell then gets the normal of the sample nearest to its centre. Zero would mean "no obstacle".
     Zero-area triangles are skipped. With `domain_size`, cells more than a cell outside the domain are omitted, which
-    limits the cost of large meshes. The result is deterministic. Raises: ConfigError for a bad cell size, or for a
-    surface that is too large to sample.
+    limits the cost of large meshes. A cell has the mean friction of its samples. The result is deterministic.
+    Raises: ConfigError for a bad cell size, or for a surface that is too large to sample.
     """
-    return grid_of_samples(*surface_samples(obstacles, cell_size, seed, domain_size), cell_size)
+    point_S3, normal_S3, friction_S = _samples(obstacles, cell_size, seed, domain_size)
+    known = any(obstacle.friction is not None for obstacle in obstacles)
+    return grid_of_samples(point_S3, normal_S3, cell_size, friction_S if known else None)
 
 
 def surface_samples(
@@ -53,12 +56,12 @@ def surface_samples(
     They can be moved with an obstacle to compute its cells elsewhere without sampling it again.
     Raises: ConfigError as `build_obstacle_grid`.
     """
-    corner_F33, point_S3, owner_S = _samples(obstacles, cell_size, seed, domain_size)
-    normal_S3 = area_vectors(corner_F33[owner_S])
-    return point_S3, normal_S3 / np.sqrt((normal_S3 * normal_S3).sum(axis=1, keepdims=True))
+    return _samples(obstacles, cell_size, seed, domain_size)[:2]
 
 
-def grid_of_samples(point_S3: np.ndarray, normal_S3: np.ndarray, cell_size: float) -> ObstacleGrid:
+def grid_of_samples(
+    point_S3: np.ndarray, normal_S3: np.ndarray, cell_size: float, friction_S: np.ndarray | None = None
+) -> ObstacleGrid:
     """Returns the mean normal of every cell with a sample, from points and normals of `surface_samples`."""
     if len(point_S3) == 0:
         return ObstacleGrid(cell_size, np.zeros((0, 3), np.int32), np.zeros((0, 3), np.float32))
@@ -78,24 +81,34 @@ def grid_of_samples(point_S3: np.ndarray, normal_S3: np.ndarray, cell_size: floa
     sum_K3[cancelled_K] = normal_S3[nearest_K[cancelled_K]]
     length_K[cancelled_K] = 1.0
     cell_K3 = np.stack(np.unravel_index(key_K, extent), axis=1) + low
-    return ObstacleGrid(cell_size, cell_K3.astype(np.int32), (sum_K3 / length_K[:, None]).astype(np.float32))
+    grid = ObstacleGrid(cell_size, cell_K3.astype(np.int32), (sum_K3 / length_K[:, None]).astype(np.float32))
+    if friction_S is None:
+        return grid
+    return replace(grid, friction_K=(np.bincount(cell_S, friction_S, len(key_K)) / count_K).astype(np.float32))
 
 
 def _samples(
     obstacles: Sequence[Obstacle], cell_size: float, seed: int, domain_size: Vector | None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Returns triangle corners, surface points at least NORMAL_SPACING_CELLS apart, and the triangle of each point."""
+    """Returns surface points at least NORMAL_SPACING_CELLS apart, and normals and friction of their triangles."""
     require(0 < cell_size < np.inf, "cell_size", "a finite number > 0", cell_size, "the paper uses 1/64")
-    corner_F33 = all_corners(obstacles)
+    sizes = np.array([len(obstacle.triangle_F3) for obstacle in obstacles], np.int64)
+    friction_F = np.repeat(np.array([obstacle.friction or 0.0 for obstacle in obstacles]), sizes)
+    # friction is a fourth coordinate, which pieces of a triangle inherit
+    corner_F34 = np.concatenate([all_corners(obstacles), np.tile(friction_F[:, None, None], (1, 3, 1))], axis=2)
     if domain_size is not None:
         box = (np.full(3, -cell_size), np.array(domain_size, np.float64) + cell_size)
-        corner_F33 = split_long_edges(corner_F33, SPLIT_CELLS * cell_size, box)
+        unbounded = (np.append(box[0], -np.inf), np.append(box[1], np.inf))
+        corner_F34 = split_long_edges(corner_F34, SPLIT_CELLS * cell_size, unbounded)
+    corner_F33 = np.ascontiguousarray(corner_F34[..., :3])
     rng = np.random.Generator(np.random.PCG64(seed))
     point_S3, owner_S = sample_surface(corner_F33, NORMAL_SPACING_CELLS * cell_size, rng)
     if domain_size is not None:
         near = ((point_S3 >= box[0]) & (point_S3 < box[1])).all(axis=1)
         point_S3, owner_S = point_S3[near], owner_S[near]
-    return corner_F33, point_S3, owner_S
+    normal_S3 = area_vectors(corner_F33[owner_S])
+    normal_S3 /= np.sqrt((normal_S3 * normal_S3).sum(axis=1, keepdims=True))
+    return point_S3, normal_S3, corner_F34[owner_S, 0, 3]
 
 
 def _lexicographic_keys(floor_S3: np.ndarray) -> tuple[np.ndarray, np.ndarray, tuple[int, ...]]:

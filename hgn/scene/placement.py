@@ -17,6 +17,7 @@ from hgn.scene.distance import contains
 from hgn.scene.funnel import Quaternion
 from hgn.scene.group import Region, fill, particle_count
 from hgn.scene.material import material_index
+from hgn.scene.own_physics import with_drawn_physics
 from hgn.scene.rotation import quaternion_rotation, rotate
 from hgn.scene.scene import Obstacle, Scene
 from hgn.scene.shapes import shape_obstacle, unit_shape
@@ -126,7 +127,7 @@ def assemble(
     counts = [len(body.position_N3) for body in bodies]
     materials = np.array([material_index(body.material) for body in bodies], np.uint8)
     velocities = np.array([body.velocity_3 for body in bodies], np.float32).reshape(-1, 3)
-    return Scene(
+    scene = Scene(
         position_N3=np.concatenate([none, *(body.position_N3 for body in bodies)]),
         velocity_N3=np.repeat(velocities, counts, axis=0),
         material_N=np.repeat(materials, counts),
@@ -144,6 +145,7 @@ def assemble(
             **({} if layout is None else {"layout": layout}),
         },
     )
+    return with_drawn_physics(scene, config.own_physics, seed) if config.own_physics else scene
 
 
 @functools.cache

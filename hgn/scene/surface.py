@@ -63,7 +63,7 @@ def split_long_edges(
 ) -> np.ndarray:
     """Bisects triangles at their longest edge until no edge exceeds `longest`. Returns corners, float64 [F', 3, 3].
 
-    Pieces whose bounding box is outside `box` (lowest and highest corner) are dropped.
+    Pieces whose bounding box is outside `box` (lowest and highest corner) are dropped. They inherit more coordinates.
     Raises: ConfigError for more than MAXIMUM_PIECES.
     """
     corner = np.asarray(corner_F33, np.float64)

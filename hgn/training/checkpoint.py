@@ -9,16 +9,18 @@ import os
 import re
 import zipfile
 import zlib
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import torch
+from torch.nn import functional
 
 from hgn.config import PRECISIONS, NetworkConfig, TrainConfig
 from hgn.data.sampler import SamplerState
 from hgn.network.base import ParticleNetwork
 from hgn.network.build import build_network
+from hgn.network.own_physics import physics_widths
 from hgn.renamed import current_names, with_step
 from hgn.runtime.weights import find_weights, load_weights, network_with
 from hgn.schema import ConfigError, NonNegative, OrdinarySize, Vector, from_stored, require, require_bounds, to_mapping
@@ -47,6 +49,8 @@ class DataInfo:
     obstacle_cell_size: OrdinarySize
     gravity: Vector = (0.0, -9.8, 0.0)
     maximum_initial_speed: NonNegative[float] | None = None  # of the groups, domain units per second; None: unknown
+    # ranges of friction and of materials' parameters in the data (hgn.scene.own_physics.own_ranges)
+    own_ranges: dict[str, tuple[float, float]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         require_bounds(self)
@@ -167,22 +171,26 @@ def network_of_weights(config: TrainConfig) -> ParticleNetwork:
     """Returns the network of training.init_weights with its normaliser, as the initial state of a new run.
 
     The rest constraint, the clearances of walls and obstacles, and inputs relative and local may differ from those of
-    the weights, because they do not change tensors. Raises: ConfigError for a file without weights, another network,
-    or other data.
+    the weights, because they do not change tensors. Inputs for own physics that the weights lack begin with weights of
+    0, so outputs are the same. Raises: ConfigError for a file without weights, another network, or other data.
     """
     assert config.training.init_weights is not None
     path = find_weights(config.training.init_weights, "training.init_weights")
     weights, info = load_weights(path, field="training.init_weights")
     remedy = "set it so, or take other training.init_weights"
-    pairs = _pairs("network", info.network, config.network)
+    own = info.network.own_physics or config.network.own_physics * info.network.relative
+    pairs = _pairs("network", replace(info.network, own_physics=own), config.network)
     if info.network.relative and config.network.relative:
         pairs = [pair for pair in pairs if pair[0] != "network.inputs"]
     pairs.append(("dataset.frame_rate_hz", info.frame_rate_hz, config.dataset.frame_rate_hz))
     if info.network.obstacle_features:
         pairs.append(("scene.cell_size", info.obstacle_cell_size, config.scene.cell_size))
     _require_equal(pairs, f", as in training.init_weights {path}", remedy)
-    network = build_network(config.network, config.step)
-    network.load_state_dict(weights.state_dict())
+    network, tensors = build_network(config.network, config.step), weights.state_dict()
+    if not info.network.own_physics:
+        added = (0, sum(physics_widths(config.network)))
+        tensors["encode.first.weight"] = functional.pad(tensors["encode.first.weight"], added)
+    network.load_state_dict(tensors)
     return network
 
 

@@ -23,11 +23,13 @@ def drawn_symmetries(batch: Batch) -> list[Symmetry]:
 
 def under_symmetries(batch: Batch, symmetries: Sequence[Symmetry]) -> Batch:
     """Returns a copy of the batch with the images of its scenes. Domains do not change."""
+    scene_S, friction_S3 = torch.arange(len(symmetries), device=batch.scene_N.device), batch.wall_friction_S3
     return replace(
         batch,
         window_WN3=_points(batch.window_WN3, batch.scene_N, symmetries),
-        gravity_S3=_vectors(batch.gravity_S3, torch.arange(len(symmetries), device=batch.scene_N.device), symmetries),
+        gravity_S3=_vectors(batch.gravity_S3, scene_S, symmetries),
         obstacles=batch.obstacles and obstacles_under(batch.obstacles, symmetries),
+        wall_friction_S3=None if friction_S3 is None else friction_S3.gather(-1, _axes(symmetries, scene_S)[0]),
     )
 
 
@@ -43,7 +45,8 @@ def obstacles_under(obstacles: ObstacleCells, symmetries: Sequence[Symmetry]) ->
     key_K = pack(scene_K, torch.where(mirrored_K3, last_S3[scene_K] - cell_K3, cell_K3))
     normal_K3 = _vectors(obstacles.normal_K3, scene_K, symmetries)
     order_K = torch.argsort(key_K)
-    return ObstacleCells(key_K[order_K], normal_K3[order_K], obstacles.cell_size)
+    friction_K = None if obstacles.friction_K is None else obstacles.friction_K[order_K]
+    return ObstacleCells(key_K[order_K], normal_K3[order_K], obstacles.cell_size, friction_K=friction_K)
 
 
 def _points(point_N3: torch.Tensor, scene_N: torch.Tensor, symmetries: Sequence[Symmetry]) -> torch.Tensor:

@@ -100,10 +100,11 @@ def placed_by(entry: ObstacleEntry, folder: Path, cell_size: float) -> PlacedObs
     if entry.mesh is not None:
         path = folder / entry.mesh
         mesh = load_mesh(path, scale=1.0 if entry.scale is None else entry.scale)
-        body = Body(entry, mesh, cell_size, path.read_bytes())
+        body = Body(entry, dataclasses.replace(mesh, friction=entry.friction), cell_size, path.read_bytes())
     else:
         assert entry.shape is not None and entry.size is not None
-        body = Body(entry, shape_obstacle(entry.shape, entry.size), cell_size)
+        mesh = shape_obstacle(entry.shape, entry.size)
+        body = Body(entry, dataclasses.replace(mesh, friction=entry.friction), cell_size)
     placed = PlacedObstacle(body, entry.position or (0.0, 0.0, 0.0), entry.rotation)
     _ = placed.samples
     return placed
@@ -115,7 +116,8 @@ def placed_at_rest(obstacle: Obstacle, cell_size: float) -> PlacedObstacle:
     x, y, z = (0.5 * (vertex_V3.min(axis=0) + vertex_V3.max(axis=0))).tolist()
     mesh = dataclasses.replace(obstacle, vertex_V3=vertex_V3 - (x, y, z))
     file = trimesh.exchange.obj.export_obj(trimesh.Trimesh(mesh.vertex_V3, mesh.triangle_F3, process=False))
-    return PlacedObstacle(Body(ObstacleEntry(mesh=f"{obstacle.name}.obj"), mesh, cell_size, file.encode()), (x, y, z))
+    entry = ObstacleEntry(mesh=f"{obstacle.name}.obj", friction=obstacle.friction)
+    return PlacedObstacle(Body(entry, mesh, cell_size, file.encode()), (x, y, z))
 
 
 def with_obstacles(scene: InitialState, obstacles: Sequence[PlacedObstacle]) -> InitialState:
@@ -123,10 +125,12 @@ def with_obstacles(scene: InitialState, obstacles: Sequence[PlacedObstacle]) -> 
     cell_size = scene.obstacle_grid.cell_size
     empty = (np.zeros((0, 3)), np.zeros((0, 3)))
     parts = [empty, *(obstacle.samples for obstacle in obstacles)]
+    frictions = [0.0, *(obstacle.body.mesh.friction or 0.0 for obstacle in obstacles)]
+    friction_S = np.repeat(frictions, [len(points) for points, _ in parts])
     point_S3, normal_S3 = (np.concatenate(part) for part in zip(*parts, strict=True))
     near = ((point_S3 >= -cell_size) & (point_S3 < np.array(scene.domain_size) + cell_size)).all(axis=1)
     return dataclasses.replace(
         scene,
-        obstacle_grid=grid_of_samples(point_S3[near], normal_S3[near], cell_size),
+        obstacle_grid=grid_of_samples(point_S3[near], normal_S3[near], cell_size, friction_S[near]),
         corners=lambda: all_corners([obstacle.mesh() for obstacle in obstacles]),
     )

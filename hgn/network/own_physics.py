@@ -1,0 +1,150 @@
+"""Friction of surfaces and parameters of the materials as inputs of a network with relative inputs.
+
+`network.own_physics` names them. They are the last columns of the encoder, and 0 without friction and for the solver's
+default parameters. A batch in which all are 0 skips them, with equal results. docs/concepts/method.md derives all.
+
+| columns | value |
+|---|---|
+| 2 | friction of the obstacle cells of `relative.obstacle_surfaces`; with friction and obstacle_features |
+| 3 | friction of the walls across x, y, z, times the nearness of the nearer one; with friction |
+| P | INPUT_PARAMETERS that act on the particle's material (`scaled_parameters`); with parameters |
+
+In `relative.balanced` surfaces without friction remove T = Q R from a cell's mean acceleration. Friction keeps k T:
+
+    k = min(1, |B| / |T|, b),    B = sum_s mu_s a_s (n_s . y) n_s,    y = T / (FEW + RARE tr P)
+
+Here s are the surfaces of `relative.surface_normals`, a_s is the sum of their weights in the cell, and mu_s their
+friction. b is the largest number with |b c Q T + Q u / 2|^2 <= (|Q u|^2 + V) / 4, with c = d_C t_C. u is the velocity
+along surfaces after a frame without friction, Q (v + g + d_C A_C), and V the variance of v in the cell; units of s_a.
+Shape legend: N particles, C coarsest cells, S scenes, P parameters, K columns.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+
+from hgn.config import NetworkConfig
+from hgn.network.features import ParticleState
+from hgn.network.grid import GridHierarchy
+from hgn.scene.material import INPUT_PARAMETERS, LOGARITHMIC, acts_on
+from hgn.scene.own_physics import NOMINAL_P
+
+TINY = 1e-30  # lower bound of squares and divisors; avoids a division by zero
+VISCOSITY_PA_S = 1.0  # unit of the viscosity input log(1 + viscosity / unit)
+
+
+@dataclass(frozen=True, eq=False)
+class SurfaceFriction:
+    """The friction of surfaces within reach: columns of the encoder, and sums over coarsest cells."""
+
+    column_NK: torch.Tensor
+    obstacle_C33: torch.Tensor  # sum of w_pC mu n n^T over obstacles
+    wall_C6: torch.Tensor  # sum of w_pC mu near over walls: lower x, y, z, then upper
+    velocity_C3: torch.Tensor  # mean of v + g in units of s_a
+    variance_C: torch.Tensor  # mean of |v - mean|^2, in these units
+
+
+def physics_widths(config: NetworkConfig) -> tuple[int, int]:
+    """Returns the numbers of columns for friction and for parameters."""
+    friction = (3 + 2 * config.obstacle_features) * ("friction" in config.own_physics)
+    return friction, len(INPUT_PARAMETERS) * ("parameters" in config.own_physics)
+
+
+def physics_columns(
+    state: ParticleState, config: NetworkConfig, friction: SurfaceFriction | None
+) -> list[torch.Tensor]:
+    """Returns all columns [N, K] as a list of one tensor, or of none if all are 0."""
+    parameter_NP = state.parameter_NP if "parameters" in config.own_physics else None
+    parts = (None if friction is None else friction.column_NK, parameter_NP)
+    zero_N1 = torch.zeros_like(state.position_N3[:, :1])
+    whole = (zero_N1.expand(-1, n) if p is None else p for p, n in zip(parts, physics_widths(config), strict=True))
+    return [torch.cat([*whole], -1)] if any(part is not None for part in parts) else []
+
+
+def scaled_parameters(value_NP: torch.Tensor, material_N: torch.Tensor, materials: Sequence[str]) -> torch.Tensor:
+    """Returns the columns of parameters in their units: log(p / default) for LOGARITHMIC, p / default - 1 for others.
+
+    Viscosity, which is 0 by default, is log(1 + p / VISCOSITY_PA_S). Parameters of other materials are 0.
+    """
+    columns = []
+    for value_N, (name, nominal) in zip(
+        value_NP.unbind(-1), zip(INPUT_PARAMETERS, NOMINAL_P, strict=True), strict=True
+    ):
+        change_N = (value_N - nominal) / (nominal or VISCOSITY_PA_S)  # exactly 0 for the default
+        columns.append(torch.log1p(change_N) if name in LOGARITHMIC else change_N)
+    acts_MP = torch.tensor([[acts_on(name, material) for name in INPUT_PARAMETERS] for material in materials])
+    return torch.stack(columns, -1) * acts_MP.to(value_NP)[material_N]
+
+
+def physics_fields(config: NetworkConfig, scenes: Sequence[Any], material_N: torch.Tensor) -> dict[str, torch.Tensor]:
+    """Returns the fields of a ParticleState for several episodes or initial states, without those that are 0."""
+    fields, frictions = {}, [scene.wall_friction for scene in scenes]
+    if "friction" in config.own_physics and any(map(any, frictions)):
+        fields["wall_friction_S3"] = torch.tensor(frictions, dtype=torch.float32)
+    own = [scene.parameters for scene in scenes] if "parameters" in config.own_physics else []
+    if any(value_NP is not None for value_NP in own):
+        default_1P, counts = np.array([NOMINAL_P], np.float32), (len(scene.material_N) for scene in scenes)
+        whole = [default_1P.repeat(n, 0) if value is None else value for value, n in zip(own, counts, strict=True)]
+        column_NP = scaled_parameters(torch.from_numpy(np.concatenate(whole)), material_N, config.materials)
+        fields |= {"parameter_NP": column_NP} if bool(column_NP.any()) else {}
+    return fields
+
+
+def surface_friction(
+    state: ParticleState, grid: GridHierarchy, wall_N6: torch.Tensor, cell_N8: torch.Tensor | None, scale: torch.Tensor
+) -> SurfaceFriction:
+    """Returns the friction within reach, from `relative.wall_nearness`, `relative.obstacle_surfaces` and s_a."""
+    wall_N3 = torch.zeros_like(state.position_N3)
+    if state.wall_friction_S3 is not None:
+        wall_N3 = state.wall_friction_S3[state.scene_N]
+    columns, rough_N33 = [], wall_N6.new_zeros(len(wall_N6), 3, 3)
+    if cell_N8 is not None:
+        here_N4, ahead_N4 = cell_N8[:, :4], cell_N8[:, 4:]
+        first_N4 = torch.where(here_N4[:, :3].any(-1, keepdim=True), here_N4, ahead_N4)
+        rough_N33 = first_N4[:, 3, None, None] * first_N4[:, :3, None] * first_N4[:, None, :3]
+        columns = [here_N4[:, 3:], ahead_N4[:, 3:]]
+    columns.append(torch.maximum(wall_N6[:, :3], wall_N6[:, 3:]) * wall_N3)
+    near_N6 = (2 * wall_N6).clamp(max=1) * torch.cat([wall_N3, wall_N3], -1)
+    next_N3 = (state.velocity_NM3[:, 0] + state.gravity_S3[state.scene_N]) / scale
+    square_N1 = next_N3.square().sum(-1, keepdim=True)
+    value_NK = torch.cat([rough_N33.flatten(1), near_N6, next_N3, square_N1, torch.ones_like(square_N1)], dim=-1)
+    value_N8K = grid.weight_N8[..., None] * value_NK[:, None]
+    sum_CK = value_NK.new_zeros(grid.levels[-1].cell_count, value_NK.shape[1])
+    sum_CK = sum_CK.index_add(0, grid.coarsest_cells.flatten(), value_N8K.flatten(0, 1))
+    mean_C4 = sum_CK[:, 15:19] / sum_CK[:, 19:].clamp(min=TINY)
+    variance_C = (mean_C4[:, 3] - mean_C4[:, :3].square().sum(-1)).clamp(min=0)
+    obstacle_C33, wall_C6 = sum_CK[:, :9].unflatten(1, (3, 3)), sum_CK[:, 9:15]
+    return SurfaceFriction(torch.cat(columns, -1), obstacle_C33, wall_C6, mean_C4[:, :3], variance_C)
+
+
+def kept(
+    friction: SurfaceFriction,
+    force_C3: torch.Tensor,
+    push_C3: torch.Tensor,
+    free_C3: torch.Tensor,
+    slip_C33: torch.Tensor,
+) -> torch.Tensor:
+    """Returns k of the module's docstring [C] for c T, c y, u and Q."""
+    lower_C3, upper_C3 = friction.wall_C6[:, :3], friction.wall_C6[:, 3:]
+    bound_C3 = lower_C3 * push_C3.clamp(min=0) + upper_C3 * push_C3.clamp(max=0)
+    bound_C3 = bound_C3 + (friction.obstacle_C33 @ push_C3[..., None]).squeeze(-1)
+    limit_C, length_C = _length(bound_C3), _length(force_C3)
+    cone_C = limit_C / torch.maximum(limit_C, length_C).clamp(min=TINY)
+    # b solves square b^2 + slope b = variance / 4; the two forms of the solution avoid cancellation
+    force_C3, free_C3 = ((slip_C33 @ vector_C3[..., None]).squeeze(-1) for vector_C3 in (force_C3, free_C3))
+    square_C, slope_C = force_C3.square().sum(-1), (force_C3 * free_C3).sum(-1)
+    root_C = (slope_C.square() + square_C * friction.variance_C).clamp(min=TINY).sqrt()
+    slowed_C = 0.5 * (root_C - slope_C) / square_C.clamp(min=TINY)
+    turned_C = 0.5 * friction.variance_C / torch.where(slope_C > 0, root_C + slope_C, 1)
+    return torch.minimum(cone_C, torch.where(slope_C > 0, turned_C, slowed_C))
+
+
+def _length(vector_C3: torch.Tensor) -> torch.Tensor:
+    """Returns lengths [C]. The gradient at 0 is 0."""
+    square_C = vector_C3.square().sum(-1)
+    return torch.where(square_C > 0, square_C.clamp(min=TINY).sqrt(), 0)
