@@ -11,6 +11,7 @@ import importlib
 import io
 import itertools
 import os
+import re
 import select
 import sys
 from collections.abc import Callable
@@ -18,7 +19,7 @@ from pathlib import Path
 from typing import Any, NoReturn, cast
 
 from hgn.config import config_directory
-from hgn.schema import ConfigError, printable, require
+from hgn.schema import PATH_RULE, ConfigError, is_path, printable, require
 from hgn.system.extras import missing_extra
 from hgn.system.machine import memory_is_full
 
@@ -104,7 +105,9 @@ def _exit_code(main: Main | str, config_name: str) -> int:
             raise
         place = f": {error.filename}" if error.filename else ""
         remedy = _MACHINE_ERRORS.get(error.errno or 0, "check the disk and its network")
-        code = _fail(f"{error.strerror or error}{place}; {remedy} and run the same command again", EXIT_MACHINE)
+        code = EXIT_INPUT if error.errno == errno.ENAMETOOLONG else EXIT_MACHINE
+        text = f"{error.strerror or error}{place}; {remedy} and run the same command again"
+        code = _fail(str(ConfigError(text)), code)  # which is short
     except (MemoryError, RuntimeError, ImportError) as error:
         if not memory_is_full(error):
             raise
@@ -145,7 +148,7 @@ def _print_help(config_name: str) -> None:
 
 
 def _require_options(arguments: list[str]) -> None:
-    """Refuses options after which Hydra would print pages, and words without `=`."""
+    """Refuses options after which Hydra would print pages, words without `=`, and paths that are too long."""
     from hgn.hydra_compat import OPTIONS
 
     for before, argument in itertools.pairwise(arguments):
@@ -155,6 +158,8 @@ def _require_options(arguments: list[str]) -> None:
             raise ConfigError(f"{argument} is not an option; settings are given as {key}={value or 'VALUE'}")
         if "=" not in argument and not argument.startswith(("-", "~")) and before not in OPTIONS:
             raise ConfigError(f"settings are given as KEY=VALUE, got {argument!r}; --help shows the keys")
+        for item in re.split(r"[\[\]{},]", value if "://" not in value else ""):
+            require(is_path(item), name.lstrip("+~"), PATH_RULE, item, "choose a shorter one")
 
 
 def _with_json_as_override(arguments: list[str]) -> list[str]:

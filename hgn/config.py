@@ -26,6 +26,7 @@ from hgn.schema import (
     LayerSize,
     NonNegative,
     OneOrMore,
+    OrdinarySize,
     Positive,
     Vector,
     one_of,
@@ -295,7 +296,7 @@ class NetworkConfig:
     """The hierarchical graph network (paper sec. 3.1, 3.2), or one to compare with it. Lengths are in domain units."""
 
     kind: Annotated[str, one_of(*NETWORK_KINDS)] = "hgn"  # hgn, or gns: Sanchez-Gonzalez et al. 2020, on backend torch
-    cell_size: Positive[float] = 0.035  # R: edge of the finest cells; the connectivity radius of GNS
+    cell_size: OrdinarySize = 0.035  # R: edge of the finest cells; the connectivity radius of GNS
     levels: FewLayers = 4  # L: number of levels; GNS has one, the particles
     message_passing_steps: FewLayers = 4  # M: message-passing steps in each of the 2 L - 1 blocks
     width: LayerSize = 128  # number of values in latent vectors and hidden layers

@@ -203,7 +203,8 @@ def current_names(mapping: Mapping[str, Any], section: str = "") -> dict[str, An
         mapping = before | dict(mapping)
     result = {}
     for old, value in mapping.items():
-        key = KEYS.get(_join(section, old), _join(section, old))
+        key = _join(section, str(old))  # keys of a checkpoint may be numbers
+        key = KEYS.get(key, key)
         removed = REMOVED.get(key)
         if removed is None or not removed.allows(value, mapping):
             inner = current_names(value, key) if isinstance(value, Mapping) else current_value(key, value)

@@ -23,7 +23,8 @@ from hgn.renamed import KEYS, current_names, removed_remedy, renamed_remedy, val
 from hgn.system.files import is_replaceable
 
 T = TypeVar("T")
-_CONTROL = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069]")  # of terminals and text direction
+# of terminals and text direction, and halves of characters, except those that stand for bytes of file names
+_CONTROL = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069\ud800-\udc7f\udd00-\udfff]")
 # the owner's path, and the value's own name or index; joined for messages
 _Path = str | tuple[Any, str | int]
 
@@ -56,6 +57,16 @@ Port = Annotated[int, Bound("0 to 65535", lambda value: 0 <= value < 65536)]
 FolderName = Annotated[str, Bound("a folder name", bool)]
 _REPLACEABLE = Bound("a new file, or one that HGN wrote", lambda name: is_replaceable(Path(name)))
 FileName = Annotated[str, Bound("a file name", lambda name: Path(name).name != ""), _REPLACEABLE]  # of an output
+PATH_RULE = "a path of at most 4,095 bytes, 255 in each name"  # of file systems
+
+
+def is_path(text: str) -> bool:
+    """Returns whether a text follows PATH_RULE. A URL may be longer."""
+    data = text.encode(errors="surrogatepass")
+    return "://" in text or (len(data) < 4096 and max(map(len, data.split(b"/"))) < 256)
+
+
+PathName = Annotated[str, Bound(PATH_RULE, is_path)]
 FrameCount = Annotated[
     int, Bound("at least 2", lambda value: value >= 2), Bound("at most 1,000,000", lambda value: value <= 1_000_000)
 ]

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
-from hgn.schema import NonNegative, Positive, require, require_bounds
+from hgn.schema import Bound, NonNegative, Positive, require, require_bounds
 
-WallClearance = tuple[NonNegative[float], NonNegative[float]]
+Clearance = Annotated[float, Bound("from 0 to 1e9", lambda value: 0 <= value <= 1e9)]
+WallClearance = tuple[Clearance, Clearance]
 
 
 @dataclass(frozen=True)

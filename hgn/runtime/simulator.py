@@ -6,6 +6,7 @@ Shape legend: T frames, N particles of all scenes, S scenes.
 from __future__ import annotations
 
 import functools
+import math
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -328,12 +329,11 @@ class Simulator:
             return
         if info.network.relative:
             rule = f"at most {LARGEST_GRAVITY:g} in size, ten times the earth's"
-            require(float(np.linalg.norm(scene.gravity)) <= LARGEST_GRAVITY, "gravity", rule, scene.gravity)
+            require(math.hypot(*scene.gravity) <= LARGEST_GRAVITY, "gravity", rule, scene.gravity)
         else:
             rule = f"the weights' {info.gravity}, which a network of absolute inputs cannot take from a scene"
             remedy = "take weights of relative inputs, as mechanics, or train some on scenes with this gravity"
-            difference = np.linalg.norm(np.subtract(scene.gravity, info.gravity))
-            same = bool(difference <= SAME_GRAVITY * np.linalg.norm(info.gravity))
+            same = math.dist(scene.gravity, info.gravity) <= SAME_GRAVITY * math.hypot(*info.gravity)
             require(same, "gravity", rule, scene.gravity, remedy=remedy)
         if info.network.obstacle_features:
             rule = f"the weights' {info.obstacle_cell_size}, the size of the cells that they know obstacles by"

@@ -104,9 +104,11 @@ def load_weights(
         with safe_open(path, framework="pt", device="cpu") as file:
             metadata = file.metadata() or {}
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a mapping
-    except SafetensorError as error:
+    except (SafetensorError, TypeError, ValueError, RuntimeError, OverflowError) as error:
         remedy = f"python -m hgn.export checkpoint={path} out=…" if path.suffix == ".ckpt" else "export it again"
-        raise ConfigError(f"{field} must be a safetensors file, got {path}: {error}; {remedy}") from None
+        raise ConfigError(
+            f"{field} must be a safetensors file, got {path}: {str(error).splitlines()[0]}; {remedy}"
+        ) from None
     if "hgn" not in metadata:
         raise ConfigError(f"{field} must be a file of python -m hgn.export, got {path} without its structure")
     try:
@@ -130,6 +132,7 @@ def network_with(
     claims, numbers = Claims(path), 0
     for name, tensor in tensors.items():
         claims.add(f"{field} tensor {name}", tensor.numel(), 4)
+        require(tensor.is_floating_point(), f"{field} tensor {name}", "of floating point numbers", str(tensor.dtype))
         numbers += tensor.numel()
     # message passing has two square matrices a step; a network is not much larger than these
     count = 2 * config.message_passing_steps * (2 * config.levels - 1)

@@ -65,11 +65,21 @@ def _chunks(data: bytes) -> tuple[dict[str, Any], bytes]:
     return json.loads(chunks[b"JSON"]), chunks.get(b"BIN\0", b"")
 
 
+class _Entries(list[Any]):
+    """A list without the negative indices of Python: some programs write -1 for no entry."""
+
+    def __getitem__(self, index: Any) -> Any:
+        if index < 0:
+            raise IndexError(f"an entry has the number {index}")
+        return super().__getitem__(index)
+
+
 class _File:
     """The JSON tree of a file, and its buffers."""
 
     def __init__(self, tree: dict[str, Any], binary: bytes, folder: Path, claims: Claims) -> None:
-        self.tree, self.binary, self.folder, self.claims = tree, binary, folder.resolve(), claims
+        self.tree = {key: _Entries(value) if isinstance(value, list) else value for key, value in tree.items()}
+        self.binary, self.folder, self.claims = binary, folder.resolve(), claims
         self.buffer = cache(self._buffer)
 
     def placed(self) -> list[tuple[dict[str, Any], list[float], np.ndarray]]:

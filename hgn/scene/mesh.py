@@ -17,7 +17,7 @@ from scipy.sparse.csgraph import connected_components
 
 from hgn.config import MESH_SUFFIXES, USD_ENDINGS, is_mesh_file
 from hgn.scene.glb import read_glb
-from hgn.scene.polygons import concave_cut, plain_obj, polygons_of_obj, polygons_of_ply
+from hgn.scene.polygons import concave_cut, fans, polygons_of_obj, polygons_of_ply
 from hgn.scene.rotation import euler_rotation, rotate, round_to_float32
 from hgn.scene.scene import Obstacle
 from hgn.scene.surface import area_vectors
@@ -25,10 +25,8 @@ from hgn.scene.usd import read_usd_polygons
 from hgn.schema import ConfigError, Vector, require
 
 _ASCII_STL = re.compile(rb"\s*solid.*\n\s*(facet|endsolid)", re.IGNORECASE)
-# trimesh takes a millisecond for each solid and material
+# trimesh takes a millisecond for each solid
 _SOLIDS = re.compile(rb"^[ \t]*endsolid.*\n\s*solid.*\n", re.IGNORECASE | re.MULTILINE)
-_MATERIAL = re.compile(rb"^[ \t]*usemtl[ \t].*$", re.MULTILINE)
-MOST_MATERIALS = 10_000  # of a file whose triangles keep the order of its materials
 
 
 def load_mesh(path: str | Path, field: str = "mesh", **placing: Any) -> Obstacle:
@@ -120,24 +118,21 @@ def _read(path: Path, field: str) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _read_polygons(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Reads STL, OBJ, PLY and USD. trimesh reads STL and OBJ, but would cut concave polygons into fans."""
+    """Reads STL, OBJ, PLY and USD. trimesh reads STL only: it would shift or drop vertices of many OBJ files."""
     kind = path.suffix[1:].lower()
     data = b"" if f".{kind}" in USD_ENDINGS else path.read_bytes()
-    if kind == "ply" or f".{kind}" in USD_ENDINGS:
-        vertex_V3, faces = polygons_of_ply(data) if kind == "ply" else read_usd_polygons(path)
-        cut_F3 = concave_cut(vertex_V3, faces)
-        return vertex_V3, trimesh.geometry.triangulate_quads(faces).reshape(-1, 3) if cut_F3 is None else cut_F3
-    if kind == "stl" and not _ASCII_STL.match(data):
-        data = data[: 84 + 50 * int.from_bytes(data[80:84], "little")]  # some programs append bytes to the triangles
-    elif kind == "stl":
-        data = _SOLIDS.sub(b"", data)
-    if kind == "obj":
-        data = plain_obj(data)
-        vertex_V3, faces = polygons_of_obj(data)
+    if kind != "stl":
+        readers = {"obj": polygons_of_obj, "ply": polygons_of_ply}
+        vertex_V3, faces = readers[kind](data) if kind in readers else read_usd_polygons(path)
         if (cut_F3 := concave_cut(vertex_V3, faces)) is not None:
             return vertex_V3, cut_F3
-        if len(set(_MATERIAL.findall(data))) > MOST_MATERIALS:
-            data = _MATERIAL.sub(b"", data)
+        if kind == "obj" and len({len(face) for face in faces}) > 1:
+            return vertex_V3, fans(faces)
+        return vertex_V3, trimesh.geometry.triangulate_quads(faces).reshape(-1, 3)
+    if not _ASCII_STL.match(data):
+        data = data[: 84 + 50 * int.from_bytes(data[80:84], "little")]  # some programs append bytes to the triangles
+    else:
+        data = _SOLIDS.sub(b"", data)
     # trimesh's processing would silently remove vertices that are not finite
     mesh = trimesh.load_scene(io.BytesIO(data), file_type=kind, process=False, skip_materials=True).to_mesh()
     return np.array(mesh.vertices, np.float64).reshape(-1, 3), np.array(mesh.faces, np.int64).reshape(-1, 3)

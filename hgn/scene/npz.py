@@ -117,7 +117,7 @@ def read_header(
         if any(type(length) is not int or length < 0 for length in shape):
             raise ValueError(f"the shape {shape}")
     except _ERRORS as error:
-        raise ConfigError(f"{name} must be a plain .npy file, got {error}") from None
+        raise ConfigError(f"{name} must be a plain .npy file, got {str(error).partition(chr(10))[0]}") from None
     return shape, fortran_order, dtype
 
 

@@ -5,6 +5,7 @@ Shape legend: V vertices, K corners of a polygon, M polygons with the same numbe
 
 from __future__ import annotations
 
+import codecs
 import re
 import struct
 from collections.abc import Sequence
@@ -14,9 +15,9 @@ import numpy as np
 
 FLAT = 1e-9  # smallest turn at a corner that counts as concave, as a fraction of the polygon's area
 MAXIMUM_CORNERS = 2_000  # of one concave face; cutting takes the square, which is limited for the sum of all faces
-_LINE = re.compile(rb"^[ \t]*([vf])[ \t]+(.*)$", re.MULTILINE)
-_JOINED = re.compile(rb"\\\r?\n")
-_COMMENT = re.compile(rb"[ \t]#.*")
+_LINE = re.compile(rb"^[ \t]*([vf])[ \t]+(.*)$", re.MULTILINE | re.IGNORECASE)
+_COMMENT = re.compile(rb"(?:^|[ \t])#.*", re.MULTILINE)
+_UNREAD = re.compile(rb"^[ \t]*(surf|bzp|bsp|cdp|fo|call)[ \t]", re.MULTILINE)  # surfaces and files
 _INDICES = ("vertex_indices", "vertex_index")  # usual names of the property with a face's vertices
 _TYPES = {
     **dict.fromkeys(("char", "int8"), "b"),
@@ -30,22 +31,25 @@ _TYPES = {
 }  # fmt: skip; of struct and NumPy
 
 
-def plain_obj(data: bytes) -> bytes:
-    """Returns an OBJ file without comments after numbers and without continued lines, which trimesh cannot read."""
-    return _COMMENT.sub(b"", _JOINED.sub(b" ", data))
-
-
 def polygons_of_obj(data: bytes) -> tuple[np.ndarray, list[np.ndarray]]:
-    """Returns vertices, float64 [V, 3], and the vertices of each face of a plain OBJ file."""
+    """Returns vertices, float64 [V, 3], and the vertices of each face of an OBJ file.
+
+    Raises: ValueError for a face of other vertices than those before it, and for free-form surfaces.
+    """
+    text = _COMMENT.sub(b"", data.removeprefix(codecs.BOM_UTF8).replace(b"\r\n", b"\n").replace(b"\r", b"\n"))
+    if unread := _UNREAD.search(text):
+        raise ValueError(f"it contains {unread[1].decode()}, which is not read; write polygons")
     vertices: list[list[bytes]] = []
     faces = []
-    for keyword, text in _LINE.findall(data):
-        words = text.split()
-        if keyword == b"v":
+    for keyword, line in _LINE.findall(text.replace(b"\\\n", b" ")):
+        words = line.split()
+        if keyword in b"vV":
             vertices.append(words[:3])
-            continue
-        index = np.array([int(word.partition(b"/")[0]) for word in words])
-        faces.append(np.where(index > 0, index - 1, index + len(vertices)))  # negative indices count backwards
+        elif len(words) > 2:
+            index = np.array([int(word.partition(b"/")[0]) for word in words])
+            if not index.all():
+                raise ValueError("a face has vertex 0, but OBJ counts from 1")
+            faces.append(np.where(index > 0, index - 1, index + len(vertices)))  # negative indices count backwards
     return np.array(vertices, np.float64).reshape(-1, 3), faces
 
 
@@ -67,6 +71,8 @@ def polygons_of_ply(data: bytes) -> tuple[np.ndarray, list[np.ndarray]]:
     vertex_V3, faces = np.zeros((0, 3)), list[np.ndarray]()
     for name, count, properties in elements:
         names = [entry[-1] for entry in properties]
+        if name == "tristrips" and count:
+            raise ValueError("it contains tristrips, which are not read; write polygons")
         columns = numbers.columns(count, properties)
         if name == "vertex":
             vertex_V3 = np.stack([columns[names.index(axis)] for axis in "xyz"], axis=1, dtype=np.float64)
@@ -74,6 +80,8 @@ def polygons_of_ply(data: bytes) -> tuple[np.ndarray, list[np.ndarray]]:
             lists = [entry[-1] for entry in properties if entry[0] == "list"]
             given = next((name for name in (*_INDICES, *lists) if name in names), "vertex_indices")
             faces = [np.asarray(face).astype(np.int64) for face in columns[names.index(given)]]
+            if properties[names.index(given)][2][0] in "fd":
+                raise ValueError("its faces name vertices by numbers that are not whole")
     return vertex_V3, faces
 
 
@@ -172,6 +180,15 @@ def concave_cut(vertex_V3: np.ndarray, faces: list[np.ndarray]) -> np.ndarray | 
         elif len(face) > 2:
             pieces.append(np.stack([np.full(len(face) - 2, face[0]), face[1:-1], face[2:]], axis=1))
     return np.concatenate(pieces)
+
+
+def fans(faces: list[np.ndarray]) -> np.ndarray:
+    """Returns the triangles of convex faces in the order of the faces, int64 [F, 3]."""
+    corners = {
+        size: np.array([(0, 1, 2), (2, 3, 0)] if size == 4 else [(0, k, k + 1) for k in range(1, size - 1)])
+        for size in {len(face) for face in faces}
+    }
+    return np.concatenate([face[corners[len(face)]] for face in faces])
 
 
 def _concave(vertex_V3: np.ndarray, faces: list[np.ndarray]) -> list[tuple[np.ndarray, np.ndarray]]:

@@ -30,6 +30,7 @@ from hgn.schema import (
     BoxSize,
     ConfigError,
     NonNegative,
+    PathName,
     Positive,
     Vector,
     from_mapping,
@@ -41,7 +42,9 @@ from hgn.system.yaml_files import read_yaml
 
 GROUP_SHAPES, EMITTER_SHAPES = ("cube", "sphere", "box"), ("disc", "rectangle")
 MAXIMUM_BYTES = 250_000  # largest size of a scene file
-MAXIMUM_PARTICLES, MAXIMUM_ENTRIES = 50_000_000, 256  # entries are obstacles, or groups and emitters
+MAXIMUM_PARTICLES, MAXIMUM_ENTRIES = 10_000_000, 256  # entries are obstacles, or groups and emitters
+# bytes of files, each counted as often as it is named; for large files the second number times their bytes
+FILES_BYTES, REPEATS = 12 << 20, 8
 MEASURE = "measure"  # section of files in conf/gallery that tools.stability reads
 MILLIMETRES = "a file in millimetres needs scale: 0.001"
 EMITTER_STREAM = 2**31  # key of the emitters' random streams, which are separate from those of groups
@@ -63,7 +66,7 @@ class KeyframeEntry:
 class ObstacleEntry:
     """An obstacle: either `mesh` (a file, with `scale`) or `shape` (a built-in one, with `size`)."""
 
-    mesh: str | None = None  # path relative to the scene file
+    mesh: PathName | None = None  # path relative to the scene file
     scale: Positive[float] | None = None  # factor for the mesh; null: 1
     shape: str | None = None
     size: Positive[float] | None = None  # side, diameter, or base width and height
@@ -132,7 +135,7 @@ class GroupEntry(MaterialEntry):
     shape: str | None = None  # cube, sphere or box
     size: float | tuple[float, float, float] | None = None  # side, diameter, or the three edges of a box
     position: Vector | None = None  # place of the centre
-    particles: str | None = None  # .npz with position and optionally velocity [N, 3], or USD; relative to the file
+    particles: PathName | None = None  # .npz with position and optionally velocity [N, 3], or USD; relative to the file
     velocity: Vector = (0.0, 0.0, 0.0)  # domain units per second
 
     def __post_init__(self) -> None:
@@ -307,16 +310,20 @@ def _reaches(obstacle: Obstacle, domain_size: Vector, cell_size: float) -> bool:
 
 def _build(file: SceneFile, folder: Path) -> Scene:
     whole_cells(file.domain_size, file.cell_size)
+    _require_few_repeats(file, folder)
     bodies = [_obstacle(entry, index, folder) for index, entry in enumerate(file.obstacles)]
     # sheets of partly watertight meshes come last, so that entry i has obstacle i
     obstacles = (*(first for first, *_ in bodies), *(sheet for _, *others in bodies for sheet in others))
-    stored = {
-        i: read_particles(folder / entry.particles, f"groups[{i}].particles", entry.material, file.domain_size)
-        for i, entry in enumerate(file.groups)
-        if entry.particles
-    }
+    rule = f"at most {MAXIMUM_PARTICLES} particles together, with those of emitters"
+    total: float = 0
+    stored: dict[int, tuple[np.ndarray, np.ndarray]] = {}
+    for i, entry in enumerate(file.groups):
+        if entry.particles is not None:
+            name = f"groups[{i}].particles"
+            stored[i] = read_particles(folder / entry.particles, name, entry.material, file.domain_size)
+            total += len(stored[i][0])
+            require(total <= MAXIMUM_PARTICLES, "groups", rule, total, "leave some files out")
     filling = file.particles_per_cell, file.cell_size
-    total: float
     try:
         counts = [
             len(stored[i][0]) if i in stored else particle_count(entry.region, *filling)
@@ -326,7 +333,6 @@ def _build(file: SceneFile, folder: Path) -> Scene:
         total = sum(counts) + sum(entering)
     except ArithmeticError:  # sizes or cells beyond the range of floats
         total = math.inf
-    rule = f"at most {MAXIMUM_PARTICLES} particles together, with those of emitters"
     require(total <= MAXIMUM_PARTICLES, "groups", rule, total, "lower size or particles_per_cell")
     positions, times = [], [np.zeros(sum(counts))]
     for index, (entry, count) in enumerate(zip(file.groups, counts, strict=True)):
@@ -387,6 +393,16 @@ def _material_parameters(groups: Sequence[MaterialEntry], counts: list[int]) -> 
         name: np.repeat(np.array([group.parameters.get(name, np.nan) for group in groups], np.float32), counts)
         for name in names
     }
+
+
+def _require_few_repeats(file: SceneFile, folder: Path) -> None:
+    """Raises ConfigError for files that together would take minutes and gigabytes, because they are named often."""
+    named = [entry.mesh for entry in file.obstacles] + [entry.particles for entry in file.groups]
+    paths = [folder / name for name in named if name and (folder / name).is_file()]
+    size = sum(path.stat().st_size for path in paths)
+    most = max(FILES_BYTES, REPEATS * sum(path.stat().st_size for path in {*paths}))
+    rule = f"of at most {most} bytes together, each counted as often as it is named"
+    require(size <= most, "mesh and particles", rule, size, "join entries of one file, or simplify the file")
 
 
 def _obstacle(entry: ObstacleEntry, index: int, folder: Path) -> tuple[Obstacle, ...]:

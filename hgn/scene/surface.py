@@ -19,6 +19,7 @@ MINIMUM_ROUNDS, MAXIMUM_ROUNDS = 4, 12
 SETTLED = 0.02  # rounds end after one that adds less than this fraction
 MINIMUM_CANDIDATES = 64  # added to the number of candidates of a round
 MAXIMUM_SAMPLES, MAXIMUM_PIECES = 5_000_000, 2_000_000
+MOST_PAIRS = 5e6  # about the largest number of near pairs in memory; surfaces may lie on one another
 
 
 def sample_surface(corner_F33: np.ndarray, spacing: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
@@ -116,6 +117,14 @@ def _spread_out(point: np.ndarray, spacing: float) -> np.ndarray:
     """Returns the points of a loop that drops each point too close to an earlier point that it kept."""
     if len(point) == 0:
         return np.zeros(0, np.int64)
+    cell = np.floor(point / spacing) @ (1.0, 1e5 + 3, 1e10 + 19)
+    crowd = np.unique(cell, return_counts=True)[1]
+    if (crowd.astype(np.float64) ** 2).sum() > MOST_PAIRS:  # the first half, and what of the second is free of it
+        half = len(point) // 2
+        first = _spread_out(point[:half], spacing)
+        near = point_tree(point[first]).query(point[half:], distance_upper_bound=np.nextafter(spacing, np.inf))[0]
+        free = half + np.flatnonzero(np.isinf(near))
+        return np.concatenate([first, free[_spread_out(point[free], spacing)]])
     pair = point_tree(point).query_pairs(spacing, output_type="ndarray").astype(np.int64)
     earlier, later = pair.min(axis=1), pair.max(axis=1)
     undecided = np.ones(len(point), bool)

@@ -110,8 +110,13 @@ def read_particles(stage: Usd.Stage, material: str) -> dict[str, np.ndarray]:
 if __name__ == "__main__":
     content, name, most, *rest = sys.argv[1:]
     pages = int(Path("/proc/self/statm").read_text().split()[0])
-    resource.setrlimit(resource.RLIMIT_AS, 2 * (pages * resource.getpagesize() + ROOM + int(most),))
-    resource.setrlimit(resource.RLIMIT_CPU, (SECONDS, SECONDS))
+    for kind, limit in (
+        (resource.RLIMIT_AS, pages * resource.getpagesize() + ROOM + int(most)),
+        (resource.RLIMIT_CPU, SECONDS),
+    ):
+        given = resource.getrlimit(kind)[1]  # by ulimit, which only root may raise
+        least = limit if given == resource.RLIM_INFINITY else min(limit, given)
+        resource.setrlimit(kind, (least, least))
     stage = opened(name)
     arrays = read_meshes(stage) if content == "meshes" else read_particles(stage, *rest)
     buffer = io.BytesIO()

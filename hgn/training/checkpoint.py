@@ -95,6 +95,8 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
     is missing, or is no checkpoint of this project.
     """
     try:
+        if not path.is_file():  # reading a pipe would wait for ever
+            raise FileNotFoundError
         with zipfile.ZipFile(path) as records:
             claims = Claims(path)
             _require_one_reading(path, records.start_dir)

@@ -2,6 +2,7 @@
 
 import json
 import math
+import os
 import pickle
 import struct
 import zipfile
@@ -53,6 +54,7 @@ def weights(text=None, tensors=None, **network):
     )
 
 
+ENDLESS = b'{"a": {"dtype": "F32", "shape": [0, 18446744073709551615, 2], "data_offsets": [0, 0]}}'
 cases(
     "weights",
     {
@@ -63,6 +65,7 @@ cases(
             message_passing_steps=1000,
         ),
         "gns": weights(kind="gns", levels=1, message_passing_steps=1000, width=65_536),
+        "a shape of 2^64": saved("w.safetensors", struct.pack("<Q", len(ENDLESS)) + ENDLESS),
         "nested": weights(text=100_000 * "["),
         "digits": weights(text='{"format_version": ' + 100_000 * "9" + "}"),
         "a long head": saved("w.safetensors", struct.pack("<Q", 2**62) + b"{}" + bytes(1000)),
@@ -151,6 +154,7 @@ cases(
         "a key of tuples": pickled(key_of_tuples()),
         "memo": pickled(b"\x80\x02}r\xff\xff\xff\x7f."),
         "called storage": pickled(b"\x80\x02ctorch\nFloatStorage\n\x8a\x05\x00\xe8vH\x17\x85R."),
+        "pipe": lambda folder: (os.mkfifo(folder / "c.ckpt"), folder / "c.ckpt")[1],
         "empty section": checkpoint({"hgn": {}, "state_dict": {}}),
         "nested lists": pickled(b"\x80\x02" + 100_000 * b"]" + 99_999 * b"a" + b"."),
         "many records": lambda folder: deflated_many(folder / "c.ckpt"),
@@ -356,6 +360,22 @@ def scene(text):
 GROUP = "groups:\n- {shape: cube, size: 0.1, position: [0.5, 0.5, 0.5], material: sand}\n"
 
 
+TRI = b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf -1 -2 -3\n"
+
+
+def stored_zeros(folder):
+    """Five million particles in a small file."""
+    np.savez_compressed(folder / "p.npz", position=np.zeros((5_000_000, 3), np.float32))
+    return folder / "p.npz"
+
+
+def named_often(make, key, folder):
+    """A scene that names a file 256 times."""
+    name, group = make(folder).name, GROUP if key == "mesh" else ""
+    section = "obstacles" if key == "mesh" else "groups"
+    return scene(group + f"{section}:\n" + 256 * f"- {{{key}: {name}}}\n")(folder)
+
+
 def cells(path):
     """The obstacle cells of a scene, as all commands compute them."""
     loaded = load_scene(path)
@@ -373,6 +393,16 @@ cases(
         ),
         "obstacles": scene(GROUP + "obstacles:\n" + 300 * "- {shape: cone, size: 0.01, position: [0.1,0.1,0.1]}\n"),
         "groups": scene("groups:\n" + 300 * "- {shape: cube, size: 0.001, position: [0.5,0.5,0.5], material: sand}\n"),
+        "sheets on one another": scene(
+            GROUP + "obstacles:\n" + 256 * "- {shape: square, size: 0.1, position: [0.2, 0.2, 0.2]}\n"
+        ),
+        "a mesh named often": lambda folder: named_often(saved("m.obj", 60_000 * b"v 1 2 3\n" + TRI), "mesh", folder),
+        "particles named often": lambda folder: named_often(stored_zeros, "material: sand, particles", folder),
+        "particles without a name": scene("groups: [{particles: '', material: sand}]\n"),
+        **{
+            f"a name of {len(name)}": scene(f"{GROUP}obstacles:\n- mesh: {name}\n")
+            for name in (300 * "a" + ".obj", 5000 * "a" + ".obj", 2500 * "a/" + "m.obj")
+        },
         "keyframes": scene(
             GROUP + "obstacles:\n- shape: cone\n  size: 0.1\n  position: [0.1, 0.1, 0.1]\n  keyframes:\n"
             + "".join(f"  - {{time: {number}}}\n" for number in range(800))

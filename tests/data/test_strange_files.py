@@ -16,6 +16,7 @@ READ = {  # files that hold what they claim
     "mesh: obj of groups", "mesh: obj of darts", "mesh: obj of pentagons", "mesh: obj of a spiral",
     "mesh: obj of materials", "mesh: stl of solids", "mesh: ply of short lists", "rollout: attributes", "tar: links",
     "scene: sheet of 9000", "scene: larger obstacle", "scene: keyframes",
+    "scene: sheets on one another",
 }  # fmt: skip
 
 

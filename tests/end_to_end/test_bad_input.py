@@ -72,6 +72,16 @@ VALUES = [
     ("rollout", ["--frames", "3"], "--frames is not an option; settings are given as frames=VALUE"),
     ("rollout", ["--weights=obstacles"], "--weights=obstacles is not an option; settings are given as weights=obs"),
     ("rollout", ["scene.yaml"], "settings are given as KEY=VALUE, got 'scene.yaml'; --help shows the keys"),
+    *(
+        (command, [f"{key}={value}"], f"{key} must be a path of at most 4,095 bytes, 255 in each name, got '")
+        for command, key in (("rollout", "scene"), ("rollout", "weights"), ("render", "rollout"), ("train", "run"))
+        for value in (5000 * "a", 300 * "é", 2500 * "a/", f"[a,{256 * 'b'}]")
+    ),
+    (
+        "train",
+        [f"+experiment={5000 * 'a'}"],
+        "experiment must be a path of at most 4,095 bytes, 255 in each name, got 'a",
+    ),
     ("rollout", ["frame=3"], "frame is not a known key; did you mean frames?"),
     ("rollout", [*ROLLOUT, "scene=none.yaml"], "scene must be an existing YAML file, got none.yaml"),
     ("rollout", [*ROLLOUT, "data=data"], "data must be given together with episode, got 'data'; for example"),
@@ -177,7 +187,7 @@ def test_diverging_scenes_are_told(place, capsys):
         ("rollout", [*ROLLOUT, "out=folder.vtkhdf"], "Is a directory: folder.vtkhdf"),
         ("rollout", [*ROLLOUT, "out=closed/new/rollout.vtkhdf"], "Permission denied: "),
         ("rollout", [*ROLLOUT, "out=data"], "out must be a name that ends in"),
-        ("rollout", [*ROLLOUT, f"out={'data' * 80}.vtkhdf"], "File name too long: "),
+        ("rollout", [*ROLLOUT, f"out={'data' * 80}.vtkhdf"], "out must be a path of at most 4,095 bytes, 255 in each"),
         ("evaluate", [*EVALUATE, "json=scene.yaml/errors.json"], "Not a directory: "),
         ("export", [OF_THE_RUN, "out=data"], "data"),
         ("train", ["run=scene.yaml"], "scene.yaml"),

@@ -111,6 +111,8 @@ def cut(kept):
           for data in (b"", b"no weights at all", b"PK\x03\x04" + bytes(64))),
         *((cut(kept), "weights must be a safetensors file, got") for kept in (0.01, 0.5, 0.999)),
         (lambda file: save_file(content(file)[0], file), r"file of python -m hgn\.export, got .* without its struct"),
+        (lambda file: rewrite(file, lambda tensors, _: tensors.update(a=torch.zeros(1, dtype=torch.complex64))),
+         "weights tensor a must be of floating point numbers, got 'torch.complex64'"),
         (structure("{not json"), "weights must declare their structure as JSON"),
         (structure("[1, 2]"), "weights format_version must be 1, got None"),
         (structure('{"format_version": 1}'), r"weights\.network is missing"),

@@ -40,6 +40,7 @@ from hgn.scene.npz import read_npz
 from hgn.scene.rollout_file import read_rollout, write_rollout
 from hgn.scene.scene_file import load_scene
 from hgn.schema import ConfigError, from_mapping
+from hgn.step_config import StepConfig
 from hgn.training.checkpoint import Progress, read_checkpoint
 from hgn.training.imported import settings_of_imported
 
@@ -52,7 +53,10 @@ from hgn.training.imported import settings_of_imported
         (NetworkConfig, {"width": 10**9}, "width must be at most 65,536"),
         (NetworkConfig, {"levels": 10**400}, "levels must be a number of at most 63 bits"),
         (NetworkConfig, {"cell_size": 10**400}, "cell_size must be a number of at most 63 bits"),
+        (NetworkConfig, {"cell_size": 1e300}, "cell_size must be from 1e-9 to 1e9"),
+        (StepConfig, {"wall_clearance": [0, 1e300]}, r"wall_clearance\[1\] must be from 0 to 1e9"),
         (SolveConfig, {"scene": "a\x1b[31m"}, r"scene must be text without control characters, got 'a\\x1b\[31m'"),
+        (SolveConfig, {"scene": "a\ud800"}, "scene must be text without control characters"),
         (NetworkConfig, {"kind": "hgn\u202e"}, "kind must be text without control characters"),
     ],
 )
@@ -169,7 +173,7 @@ def test_archives_that_torch_reads_otherwise(tmp_path, change, message):
 
 @pytest.mark.parametrize("callbacks", [[1], {"GradientGuard": 3}, None])
 def test_sections_of_0_1_0(callbacks):
-    section = {"updates": 3, "sampler_state": {}}
+    section = {"updates": 3, "sampler_state": {}, 5: 1, (1, 2): 3}
     assert Progress.of({"hgn": section, "callbacks": callbacks}).skipped == 0
 
 

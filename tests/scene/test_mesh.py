@@ -110,6 +110,8 @@ def test_one_sided_and_branching_surfaces_are_sheets(tmp_path):
 
 
 FACE = b"f 1 2 3\n"
+PLY = b"ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\nelement face 1\n"
+PLY += b"property list uchar int vertex_indices\nend_header\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n"
 GOOD = TRIANGLE.encode() + FACE
 READABLE = "ramp must be a readable {} file"
 REFUSED = [
@@ -125,7 +127,14 @@ REFUSED = [
     ("a.ply", b"bad", {}, READABLE.format("PLY")),
     ("a.glb", b"", {}, READABLE.format("GLB")),
     ("a.glb", b"glTFxxxxxx", {}, READABLE.format("GLB")),
-    ("a.obj", TRIANGLE.encode() + b"f 1 2 9\n", {}, READABLE.format("OBJ")),
+    ("a.obj", TRIANGLE.encode() + b"f 1 2 9\n", {}, "ramp must have triangles of its 3 vertices, got vertices 0 to 8"),
+    ("a.obj", GOOD + b"f 0 1 2\n", {}, "a face has vertex 0, but OBJ counts from 1"),
+    *(
+        ("a.obj", GOOD + word + b" 1 2 3\n", {}, f"contains {word.decode()}, which is not read")
+        for word in (b"surf", b"call", b"fo", b"bzp")
+    ),
+    ("a.ply", PLY.replace(b"face 1", b"tristrips 1"), {}, "it contains tristrips, which are not read"),
+    ("a.ply", PLY.replace(b"uchar int", b"uchar float"), {}, "by numbers that are not whole"),
     ("a.obj", b"v 0 0 nan\nv 1 0 0\nv 0 1 0\n" + FACE, {}, "ramp must have finite vertices, got .*nan"),
     ("a.obj", b"v 0 0 inf\nv 1 0 0\nv 0 1 0\n" + FACE, {}, "ramp must have finite vertices, got .*inf"),
     ("a.obj", b"v 0 0 1e39\nv 1 0 0\nv 0 1 0\n" + FACE, {}, "ramp must stay within .*lower scale"),
@@ -147,6 +156,31 @@ def test_bad_files_and_numbers_are_refused_by_name(tmp_path, name, content, opti
         (tmp_path / name).write_bytes(content)
     with pytest.raises(ConfigError, match=message):
         load_mesh(tmp_path / name, "ramp", **options)
+
+
+STEPS = "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\nv 0 0 1\nf 1 2 4\n"
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        *("\ufeff" + STEPS, STEPS.replace(" ", "\t"), STEPS.replace("v 1", " \tv 1"), STEPS.upper()),
+        *(
+            STEPS.replace("\n", "\r\n"),
+            STEPS.replace("\n", "\r"),
+            "# c:\\a\\\n" + STEPS,
+            STEPS.replace("1 2", "1 \\\n2"),
+        ),
+        *(STEPS.replace("1 2 3", "-3 -2 -1").replace("1 2 4", "-4 -3 -1"), STEPS.replace("2 4", "2 -1")),
+        *("usemtl a\n" + STEPS.replace("f 1 2 4", "usemtl b\nf 1 2 4"), STEPS + "f 1\nf 1 2\n#f 2 3 4\n"),
+    ],
+)
+def test_spellings_of_obj(tmp_path, text):
+    """Each program's spelling gives the same triangles: marks, tabs, capitals, line ends, comments, indices."""
+    write(tmp_path, text)
+    write(tmp_path, STEPS, "usual.obj")
+    assert load_mesh(tmp_path / "mesh.obj").corners.tolist() == load_mesh(tmp_path / "usual.obj").corners.tolist()
+    assert len(load_mesh(tmp_path / "mesh.obj").triangle_F3) == 2
 
 
 # outlines, counterclockwise; the area of each

@@ -1,6 +1,8 @@
 """USD files as particles and obstacles: what is read, and what is refused by name."""
 
 import struct
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -53,6 +55,9 @@ def test_particles(tmp_path):
     data = file.read_bytes()
     count = data.index(start_N3[1].tobytes()) - 8
     assert struct.unpack_from("<Q", data, count) == (15,)
+    limit = ["bash", "-c", 'ulimit -t 40 -v 8000000 && exec "$0" -c "$1"', sys.executable]
+    program = f"from hgn.scene.mesh import load_mesh; load_mesh({str(file)!r})"  # where a shell limits its programs
+    subprocess.run([*limit, program], check=True)
     file.write_bytes(data[:count] + struct.pack("<Q", 1 << 36) + data[count + 8 :])
     with pytest.raises(
         ConfigError, match=r"groups\[0\].particles must be a readable USD file, .*it is damaged, or needs"

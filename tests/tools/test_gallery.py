@@ -135,7 +135,17 @@ OUTSIDE = {"shape": "cube", "size": 0.03, "position": [0.2, 0.12, 0.2], "materia
     [
         (None, "measure must be a section with frames and bounds"),
         ({"far": OUTSIDE}, "measure.far: groups[0] (cube of water) must lie between"),
-        ({"vary": [{"range": [0, 1], "add": {"groups.7.size": 1}}]}, "measure.vary[0].add must be places "),
+        *(
+            ({"vary": [{"range": [0, 1], "add": {place: 1}}]}, "measure.vary[0].add must be places ")
+            for place in ("groups.7.size", "groups.².size")
+        ),
+        *(
+            (
+                {"vary": [{"range": ends, "add": {"seed": 1}}]},
+                "measure.vary[0].range must be in order, from -1e9 to 1e9",
+            )
+            for ends in ([-1e308, 1e308], [0, float("inf")])
+        ),
         ([], "measure.bounds must be at least one, got []"),
         ([{"of": "hight"}], "measure.bounds[0].of must be one of height, "),
         ([{"of": "energy_gain", "group": 2}], "measure.bounds[0].group must be one of the 2 groups"),

@@ -40,7 +40,7 @@ class VaryEntry:
     add: dict[str, float]  # factors by place in the file, as in groups.0.position.1
 
     def __post_init__(self) -> None:
-        require(self.range[0] <= self.range[1], "range", "in order", list(self.range))
+        require(-1e9 <= self.range[0] <= self.range[1] <= 1e9, "range", "in order, from -1e9 to 1e9", [*self.range])
         require(len(self.add) > 0, "add", "at least one place in the file", self.add)
 
 
@@ -170,7 +170,7 @@ def _case(name: str, file: Path, content: Mapping[str, Any]) -> GalleryCase:
 
 def _add(content: Any, place: str, change: float, field: str) -> None:
     """Adds to a number in nested mappings and lists."""
-    *parents, last = [int(part) if part.isdigit() else part for part in place.split(".")]
+    *parents, last = [int(part) if part.isdecimal() else part for part in place.split(".")]
     try:
         for part in parents:
             content = content[part]
