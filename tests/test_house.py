@@ -16,10 +16,10 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 30_764,
+    "hgn": 30_890,
     "datagen": 8_590,
     "tools": 6_611,
-    "tests": 30_070,
+    "tests": 30_170,
 }
 SETTINGS = 240  # fields of the dataclasses behind the commands, *Config
 
