@@ -66,6 +66,9 @@ def play():
     session = PlaySession(floating(), scene, weights="floating")
     page = PlayPage(session, ("floating", "other"), lambda name: floating(), port=0)
     page.rate = 8.0  # frames a second: simulation and browser share a core
+    # without shadows and reflections, on which a browser without a GPU spends most of its time
+    page.server.scene.configure_default_lights(cast_shadow=False)
+    page.server.scene.configure_environment_map(hdri=None)
     thread = threading.Thread(target=page.run)
     thread.start()
     yield page
@@ -89,15 +92,11 @@ def browser():
 
 @pytest.fixture(scope="module")
 def viewer(browser, play):
-    return opened(browser, play.address)
-
-
-def opened(browser, address):
     """A viewer's page, once its canvas shows more than one colour."""
     size = {"width": SIZE[0], "height": SIZE[1]}
-    page = browser.new_context(viewport=size, device_scale_factor=0.5).new_page()  # it draws without a GPU
+    page = browser.new_context(viewport=size, device_scale_factor=0.25).new_page()
     page.set_default_timeout(300_000)
-    page.goto(address)
+    page.goto(play.address)
     page.wait_for_selector("canvas")
     until(lambda: len(np.unique(pixels(page) @ (65536, 256, 1))) > 50, every=0.5)
     return page
@@ -338,13 +337,13 @@ def test_stage():
         stop_server(server)
 
 
-def test_a_film_plays_by_itself(browser, play, tmp_path):
+def test_a_film_plays_by_itself(viewer, play, tmp_path):
     """The static page draws the rollout's particles without any server."""
     path = tmp_path / "film.html"
     path.write_text(film_html(play.session.rollout(), every=10))
-    page = opened(browser, path.as_uri())
-    until_blue(page)
-    page.context.close()
+    viewer.goto(path.as_uri())
+    viewer.wait_for_selector("canvas")
+    until_blue(viewer)
 
 
 def test_it_begins_when_somebody_looks_and_restarts_as_it_was():
