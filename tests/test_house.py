@@ -16,10 +16,10 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 30_890,
-    "datagen": 8_590,
+    "hgn": 30_848,
+    "datagen": 8_560,
     "tools": 6_611,
-    "tests": 30_170,
+    "tests": 30_092,
 }
 SETTINGS = 240  # fields of the dataclasses behind the commands, *Config
 
@@ -42,6 +42,7 @@ LARGE_FILES = {  # shipped weights, and results that pages show
     "hgn/weights/mechanics.safetensors",
     "hgn/weights/obstacles.safetensors",
     "hgn/weights/obstacles_small.safetensors",
+    "hgn/weights/world.safetensors",
     "results/stability/network_h100.json",
     "results/stability/thrown.webp",
 }

@@ -44,6 +44,12 @@ FREE = (
 )  # settings that kinds do not draw
 
 
+def fastest(scene: Any) -> float:
+    """Returns the largest initial speed that a SceneConfig draws, in domain units per second."""
+    drawn = (RANGES[kind].get("speed", (0.0, 0.0))[1] for kind, share in scene.kinds.items() if share > 0)
+    return max((scene.maximum_initial_speed, *drawn))
+
+
 def require_kinds(scene: Any) -> None:
     """Checks the kinds of a SceneConfig, and that the settings which kinds draw are defaults. Raises: ConfigError."""
     for kind, share in scene.kinds.items():

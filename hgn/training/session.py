@@ -21,6 +21,7 @@ from hgn.network.base import ParticleNetwork
 from hgn.network.build import build_network
 from hgn.runtime.backend import pick, set_matmul_precision, torch_unsupported_reason, triton_unsupported_reason
 from hgn.runtime.torch_backend import precisions_to_try
+from hgn.scene.kinds import fastest
 from hgn.scene.own_physics import own_ranges
 from hgn.schema import printable, to_mapping
 from hgn.system.device import keep_to_quota
@@ -134,7 +135,7 @@ def _module(config: TrainConfig, start: Start, backend: str, precisions: tuple[s
         config.dataset.frame_rate_hz,
         config.scene.cell_size,
         config.scene.gravity,
-        maximum_initial_speed=config.scene.maximum_initial_speed,
+        maximum_initial_speed=fastest(config.scene),
         own_ranges=own_ranges(config.scene.own_physics),
     )
     network = build_network(config.network, config.step)

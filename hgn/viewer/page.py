@@ -44,6 +44,7 @@ MAXIMUM_ACTIONS = 64  # actions that may wait for the next frame; further ones a
 ABOUT = {
     "mechanics": "any motion and gravity, exact flight; slower on a CPU",
     "obstacles": "scenes that start at rest, gravity 9.8 downwards",
+    "world": "pools, dams, slopes, small and large bodies; creeps over thousands of frames",
     "obstacles_small": "as obstacles, in two thirds of the time, with larger errors",
 }
 HELP = """

@@ -14,7 +14,7 @@ from hgn.config import DatagenConfig, SceneConfig
 from hgn.data.identity import dataset_identity
 from hgn.scene.distance import contains
 from hgn.scene.group import WALL_CELLS
-from hgn.scene.kinds import SCENE_KINDS
+from hgn.scene.kinds import SCENE_KINDS, fastest
 from hgn.scene.placement import CLEARANCE_CELLS
 from hgn.scene.random_scene import generate_scene
 from hgn.scene.rotation import quaternion_rotation
@@ -129,6 +129,13 @@ def test_kinds_are_drawn_by_their_shares():
     for kind, share in shares.items():
         expected = share / 8
         assert abs(count[kind] / 4000 - expected) <= 4 * np.sqrt(expected * (1 - expected) / 4000)
+
+
+def test_the_fastest_scene():
+    """The largest initial speed is that of the fastest kind that is drawn; without kinds it is the setting."""
+    assert fastest(SceneConfig(kinds={"pool": 1.0, "drop": 0.5, "jet": 0.0})) == RANGES["drop"]["speed"][1]
+    assert fastest(SceneConfig(kinds={"pool": 1.0})) == 0.0
+    assert fastest(SceneConfig(maximum_initial_speed=2.0)) == 2.0
 
 
 def test_a_kind_that_fits_into_no_domain_is_refused():
