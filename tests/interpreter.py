@@ -25,6 +25,9 @@ def spare_repeated_work():
         return found[dtype.name]
 
     interpreter._get_np_dtype = np_dtype
+    interpreter.TensorHandle.__post_init__ = lambda _: None  # compares sizes of types
+    unwrap, plain = language.core._unwrap_if_constexpr, {language.tensor, int, float, bool, str, type(None)}
+    language.core._unwrap_if_constexpr = lambda value: value if type(value) in plain else unwrap(value)
     _remember_builtins(interpreter, language.core)
     _remember_shapes(language.core, language.semantic.TritonSemantic)
     _remember_constants(language.core, language.semantic.TritonSemantic)
@@ -34,6 +37,8 @@ def _remember_builtins(interpreter, core):
     """Of the language, which the interpreter looks for and wraps again at each launch."""
 
     def wrapped(function):
+        function = getattr(function, "__wrapped__", function)  # which looks for _semantic among the arguments first
+
         def builtin(*args, **kwargs):
             kwargs["_semantic"] = interpreter.interpreter_semantic
             return function(*args, **kwargs)
@@ -57,6 +62,7 @@ def _remember_constants(core, semantic):
     conversion, nor have a pointer and a whole number; all other operands go the language's own way."""
     check, integers = semantic.binary_op_type_checking_impl, (core.int32, core.int64)
     constants: dict[tuple[Any, ...], Any] = {}
+    covered: dict[tuple[int, int], bool] = {}
 
     def constant(self, value, beside):
         key = value, type(value), beside.type.name
@@ -65,6 +71,14 @@ def _remember_constants(core, semantic):
             constants[key] = self.broadcast_impl_value(beside, scalar)[1]
         return constants[key]
 
+    def covers(left, right):
+        """Whether a shape is that of a result of both. Shapes live on in `_remember_shapes`."""
+        key = id(left), id(right)
+        if key not in covered:
+            sides = zip(reversed(tuple(left)), reversed(tuple(right)), strict=False)
+            covered[key] = len(right) <= len(left) and all(one in (1, other) for other, one in sides)
+        return covered[key]
+
     def operands(self, lhs, rhs, allow_lhs_ptr=False, allow_rhs_ptr=False, arithmetic_check=True, div_or_mod=False):
         if type(lhs) is core.tensor and arithmetic_check and not div_or_mod:
             left = lhs.type.scalar
@@ -72,7 +86,9 @@ def _remember_constants(core, semantic):
                 right = rhs.type.scalar
                 pointer = left.is_ptr()
                 if (left is right and not pointer) or (pointer and allow_lhs_ptr and right.is_int()):
-                    return self.broadcast_impl_value(lhs, rhs)
+                    # NumPy broadcasts the second operand, and the result has the first one's type
+                    wide = lhs.type.is_block() and (not rhs.type.is_block() or covers(lhs.type.shape, rhs.type.shape))
+                    return (lhs, rhs) if wide else self.broadcast_impl_value(lhs, rhs)
             elif type(rhs) is float:
                 if left.is_floating():
                     return lhs, constant(self, rhs, lhs)
@@ -89,7 +105,7 @@ def _remember_shapes(core, semantic):
     block_init, tensor_init, broadcast = core.block_type.__init__, core.tensor.__init__, semantic.broadcast_impl_value
     with_element_ty, block_types = core.block_type.with_element_ty, {}
     blocks: dict[tuple[int, ...], tuple[Any, int, str]] = {}
-    tensors: dict[tuple[int, ...], tuple[Any, Any]] = {}
+    tensors: dict[int, tuple[Any, Any, Any]] = {}  # by the identity of a type's shape
 
     def init_block(self, element_ty, shape):
         key = tuple(one.value if isinstance(one, core.constexpr) else one for one in shape)
@@ -102,13 +118,13 @@ def _remember_shapes(core, semantic):
             blocks[key] = self.shape, self.numel, self.name.removesuffix(f"{element_ty}>")
 
     def init_tensor(self, handle, type):
-        key = tuple(type.shape) if type.is_block() else ()
+        key = id(type.shape) if type.is_block() else 0
         if key in tensors:
             self.handle, self.type, self.dtype = handle, type, type.scalar
-            self.shape, self.numel = tensors[key]
+            self.shape, self.numel, _ = tensors[key]
         else:
             tensor_init(self, handle, type)
-            tensors[key] = self.shape, self.numel
+            tensors[key] = self.shape, self.numel, type
 
     def block_of(self, scalar_ty):
         key = self.name, scalar_ty.name

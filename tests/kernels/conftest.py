@@ -11,10 +11,19 @@ from hgn.kernels.tuning import Tuning
 NATIVE = device().type == "cuda"
 
 
-def in_large_tiles(tuning):
-    return replace(
-        tuning, cell_block=16, few_cell_block=16, few_cells=0, row_block=64, small_block=64, pair_particles=8
-    )
+def use_large_tiles(monkeypatch):
+    """For tests of what is around the kernels; a GPU's sizes are those of test_network's first case."""
+
+    def in_large_tiles(tuning):
+        return replace(
+            tuning, cell_block=16, few_cell_block=16, few_cells=0, row_block=64, small_block=64, pair_particles=8
+        )
+
+    of = Tuning.of
+    if not NATIVE:
+        monkeypatch.setattr(Tuning, "of", staticmethod(lambda precision: in_large_tiles(of(precision))))
+        for module in ("grid", "step"):
+            monkeypatch.setattr(f"hgn.kernels.{module}.op.PARTICLE_BLOCK", 128)
 
 
 @pytest.fixture(autouse=True)
@@ -40,10 +49,7 @@ def constants_are_numbers(monkeypatch):
 
 @pytest.fixture
 def large_tiles(monkeypatch):
-    """For tests of what is around the kernels; the kernels' own sizes are those of test_network."""
-    of = Tuning.of
-    if not NATIVE:
-        monkeypatch.setattr(Tuning, "of", staticmethod(lambda precision: in_large_tiles(of(precision))))
+    use_large_tiles(monkeypatch)
 
 
 @pytest.fixture

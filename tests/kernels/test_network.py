@@ -5,11 +5,10 @@ from dataclasses import replace
 import pytest
 import torch
 from kernels.cases import CASES, compare, drawn, flat, float32_state, moving_state, reference
-from kernels.conftest import in_large_tiles
+from kernels.conftest import use_large_tiles
 from kernels.engines import device, engine_of, gradients, inference_of, run_forward
 from network.states import network_of
 
-from hgn.kernels.tuning import Tuning
 from hgn.network.cell_keys import unpack
 from hgn.runtime.parity import OUTPUTS, relative_error
 
@@ -25,9 +24,8 @@ def test_outputs_and_gradients(name, monkeypatch):
     if case.many_rows:
         monkeypatch.setattr("hgn.kernels.tuning.PROCESSORS", 2)
         monkeypatch.setattr("hgn.kernels.tuning.FEW_ROWS", 0)
-    elif device().type != "cuda":
-        of = Tuning.of
-        monkeypatch.setattr(Tuning, "of", staticmethod(lambda precision: in_large_tiles(of(precision))))
+    else:
+        use_large_tiles(monkeypatch)
     network, state = case.network(), case.state()
     state = replace(state, velocity_NM3=state.velocity_NM3[:, : network.config.velocity_history])
     found = compare(network, state, "fp32", 1.0, 512 if network.config.relative else 128)

@@ -87,7 +87,6 @@ SHEETS = crossed((0.1, 0.1, 0.1))
 FRAMES = {  # of the network
     "absolute": {"levels": 2},
     "relative, resting": {"levels": 3, "inputs": "relative", "rest_threshold": 2.0},
-    "walls": {"wall_clearance": (0.06, 0.26)},
     "walls of a plane": {"wall_clearance": (0.06, 0.2), "dimensions": 2},
     "obstacles and walls": {"obstacle_clearance": 2e-3, "wall_clearance": (0.06, 0.2)},
 }

@@ -115,7 +115,7 @@ def test_automatic_precision_of_a_training(data, tmp_path, monkeypatch, capsys, 
         TritonUpdates, "_build", lambda self, precision: (made.append(weakref.ref(self)), build(self, precision))
     )
     values = {"ema_decay": 0.7, "pushforward_fraction": 0.5, "pushforward_every": 1, "pushforward_frames": 1}
-    values["pushforward_scenes"] = 1
+    values |= {"pushforward_scenes": 1, "noise_correlated_fraction": 0.0}
     ends = []
     for precision in ("fp32", "auto"):
         for updates in (1, 2) if precision == "auto" else (2,):
