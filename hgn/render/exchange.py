@@ -7,7 +7,6 @@ Shape legend: T frames, N particles, V vertices, F triangles.
 
 from __future__ import annotations
 
-import sys
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
@@ -22,7 +21,15 @@ from hgn.render.pictures import rollout_spacing
 from hgn.render.renderer import MATERIAL_COLORS, OBSTACLE_COLOR, PARTICLE_COLORS
 from hgn.scene.material import FLUIDS
 from hgn.scene.motion import Motion
-from hgn.scene.rollout_file import Rollout, rollout_bytes, rollout_velocity, write_frames, write_rollout
+from hgn.scene.rollout_file import (
+    Rollout,
+    raise_interruption,
+    rollout_bytes,
+    rollout_velocity,
+    take_frames,
+    write_frames,
+    write_rollout,
+)
 from hgn.scene.scene import Obstacle
 from hgn.schema import ConfigError, require_replaceable
 from hgn.system.extras import require_installed
@@ -70,20 +77,10 @@ def save_frames(path: Path, rollout: Rollout, frames: Iterable[np.ndarray], surf
     if path.suffix not in (*USD_ENDINGS, PLY_ENDING):
         write_frames(path, rollout, frames)
         return path
-    interruption, count = None, 0
     with space_reserved(path, rollout_bytes(rollout.frame_count, rollout.particle_count)):
-        try:
-            for position_N3 in frames:
-                rollout.position_TN3[count, : len(position_N3)] = position_N3
-                count += 1
-        except KeyboardInterrupt as error:
-            if not count:
-                raise
-            interruption = error
+        count, interruption = take_frames(rollout, frames)
     written = save_rollout(path, replace(rollout, position_TN3=rollout.position_TN3[:count]), surface)
-    if interruption is not None:
-        print(f"{count} of {rollout.frame_count} frames are in {written}", file=sys.stderr)
-        raise interruption
+    raise_interruption(interruption, f"{count} of {rollout.frame_count} frames are in {written}")
     return written
 
 

@@ -19,7 +19,7 @@ import contextlib
 import json
 import sys
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -153,23 +153,44 @@ def write_frames(path: Path, rollout: Rollout, frames: Iterable[np.ndarray]) -> 
     Raises: OSError before the first frame if the disk has less space.
     """
     size = rollout_bytes(rollout.frame_count, rollout.particle_count, rollout.reference_TN3 is not None)
-    interruption, count = None, 0
     with space_reserved(path, size) as release, _growing_file(path, rollout) as file:
-        try:
-            for position_N3 in frames:
-                rollout.position_TN3[count, : len(position_N3)] = position_N3
-                count += 1
-                if time.monotonic() - file.written_s > WRITE_EVERY_S:
-                    release(size * (count - file.count) // rollout.frame_count)
-                    file.write(count)
-        except (KeyboardInterrupt, OSError) as error:
-            if not count:
-                raise
-            interruption = error
+
+        def append(count: int) -> None:
+            if time.monotonic() - file.written_s > WRITE_EVERY_S:
+                release(size * (count - file.count) // rollout.frame_count)
+                file.write(count)
+
+        count, interruption = take_frames(rollout, frames, append)
         release(size)
         file.write(count)
+    raise_interruption(interruption, f"{count} of {rollout.frame_count} frames are in {path}")
+
+
+def take_frames(
+    rollout: Rollout, frames: Iterable[np.ndarray], each: Callable[[int], None] | None = None
+) -> tuple[int, BaseException | None]:
+    """Puts frames into `rollout.position_TN3`, and calls `each` with their number so far.
+
+    Returns the number of frames, and Ctrl-C or the error of the disk that ended them. Raises it without any frame.
+    """
+    count = 0
+    try:
+        for position_N3 in frames:
+            rollout.position_TN3[count, : len(position_N3)] = position_N3
+            count += 1
+            if each is not None:
+                each(count)
+    except (KeyboardInterrupt, OSError) as error:
+        if not count:
+            raise
+        return count, error
+    return count, None
+
+
+def raise_interruption(interruption: BaseException | None, kept: str) -> None:
+    """Prints what was kept and raises the interruption, if there was one."""
     if interruption is not None:
-        print(f"{count} of {rollout.frame_count} frames are in {path}", file=sys.stderr)
+        print(kept, file=sys.stderr)
         raise interruption
 
 
