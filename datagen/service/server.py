@@ -237,7 +237,7 @@ def make_app(folder: Path, token: str | None, pool: Callable[[], PoolState]) -> 
             Route("/{name}", shard),
         ],
         middleware=[Middleware(Guard, token=token, counters=counters)],
-        exception_handlers={ConfigError: unreadable},
+        exception_handlers={ConfigError: unreadable, OSError: unreadable},
     )
     app.router.redirect_slashes = False
     app.state.health = health

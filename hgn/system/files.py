@@ -10,6 +10,7 @@ import mmap
 import os
 import re
 import secrets
+import stat
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -79,8 +80,12 @@ def read_replaced(path: Path) -> bytes:
 
 
 def open_at_once(path: Path) -> io.BufferedReader:
-    """Opens a file for reading. A pipe counts as empty, because reading it would wait for ever."""
-    return open(path, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK))
+    """Opens a file for reading. A pipe or a device counts as empty, because reading it might not end."""
+    file = open(path, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK))  # noqa: SIM115 - returned
+    if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+        file.close()
+        file = Path(os.devnull).open("rb")  # noqa: SIM115
+    return file
 
 
 def write_json(path: Path | str, value: Any, allow_nan: bool = True) -> None:

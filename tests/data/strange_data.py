@@ -391,14 +391,14 @@ def used(folder):
     return list(store.entries), store.manifest.quarantined
 
 
-def piped(name):
-    """A pipe in the place of a file."""
+def piped(name, device=None):
+    """A pipe in the place of a file, or a device without an end."""
 
     def make(folder):
         Manifest(identity_hash({}), {}, {"train": 1}, 1, ListedIndex([shard(0)])).save(folder)
         (path,) = folder.rglob(name)
         path.unlink()
-        os.mkfifo(path)
+        path.symlink_to(device) if device else os.mkfifo(path)
         return folder
 
     return make
@@ -409,6 +409,8 @@ cases(
     {
         "pipe": piped("manifest.json"),
         "pipe of the index": piped("*-000000.jsonl"),
+        "device": piped("manifest.json", "/dev/zero"),
+        "device of the index": piped("*-000000.jsonl", "/dev/zero"),
         "episodes": manifest(totals(episodes=10**12), config={"frames": 6}, config_hash=identity_hash({"frames": 6})),
         "shards": manifest(totals(episodes=10**12, shards=10**12)),
         "bytes of a segment": manifest(state(segment_bytes=10**12)),

@@ -189,7 +189,8 @@ def test_a_page_elsewhere_cannot_ask(ask):
 
 
 def test_damage_is_not_served(ask, folder):
-    """A shard that was altered, cut or taken away, and a manifest of another version, are answered with an error."""
+    """A shard that was altered, cut or taken away, and a manifest of another version, are answered with an error. So
+    is storage that fails; readers wait for it."""
     shard = folder / SHARD[1:]
     content = bytearray(shard.read_bytes())
     content[5000] ^= 1
@@ -199,6 +200,8 @@ def test_damage_is_not_served(ask, folder):
         assert status == 410 and body.startswith(b"train-000002-000004.tar is damaged here; delete it and run")
     shard.unlink()
     assert ask(SHARD)[::2] == (404, b"train-000002-000004.tar is missing here; it must be generated again\n")
+    shard.symlink_to(shard)
+    assert ask(SHARD)[0] == 503
     manifest = json.loads((folder / "manifest.json").read_text())
     (folder / "manifest.json").write_text(json.dumps(manifest | {"schema_version": 99}))
     for path in ("/manifest.json", SHARD, "/healthz", "/progress"):
@@ -206,6 +209,8 @@ def test_damage_is_not_served(ask, folder):
         assert status == 503 and b"schema_version must be 1, got 99" in body
     (folder / "manifest.json").unlink()
     assert ask("/manifest.json")[::2] == (503, b"the data set has no manifest yet; ask again in a moment\n")
+    (folder / "manifest.json").mkdir()
+    assert ask("/healthz")[0] == ask("/progress")[0] == 503
 
 
 def test_progress_and_metrics(ask):
