@@ -20,7 +20,7 @@ os.environ.setdefault("TI_SKIP_VERSION_CHECK", "ON")  # a simulation makes no ne
 
 import taichi as ti
 
-from datagen.mpm.taichi_compat import name_lines_alone
+from datagen.mpm.taichi_compat import remove_useless_work
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ def initialise(device: str = "auto", cpu_threads: int | None = None) -> Device:
                 "use another process"
             )
         return _started
-    name_lines_alone()
+    remove_useless_work()
     ti.set_logging_level(ti.ERROR)  # without a GPU the search for CUDA warns
     has_gpu = device != "cpu" and ti.lang.misc.is_arch_supported(ti.cuda)
     if device == "cuda" and not has_gpu:

@@ -29,12 +29,6 @@ def block(material, low, high, velocity=(0, 0, 0), seed=0, count=0, **scene):
     return particles(np.random.default_rng(seed).uniform(low, high, (count, 3)), material, velocity, **scene)
 
 
-def beside(*obstacles, **scene):
-    """A particle of each material: with it beside, tests share one compiled kernel."""
-    places = [[x, 0.5, 0.5] for x in (0.3, 0.45, 0.6, 0.75)]
-    return particles(places, range(4), obstacles=obstacles, **scene)
-
-
 def joined(*scenes, **changes):
     """The particles of all, and what else the first one has."""
     names = ("position_N3", "velocity_N3", "material_N")

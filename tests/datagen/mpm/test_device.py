@@ -1,12 +1,15 @@
 """datagen.mpm.device: Taichi starts, works and ends in any environment."""
 
+import inspect
 import os
 import subprocess
 import sys
+import traceback
 from pathlib import Path
 
 import pytest
 import taichi as ti
+from taichi.lang import kernel_impl
 
 from datagen.mpm.device import initialise
 
@@ -24,6 +27,15 @@ def test_a_fault_in_a_kernel_names_its_line():
     line = faulty._primal.func.__code__.co_firstlineno + 2
     told = str(fault.value)
     assert f'File "{__file__}", line {line}, in faulty:\n' in told and "no_such_function()" not in told
+
+
+def test_arrays_and_kernels_cause_no_useless_work(monkeypatch):
+    """No array walks the stack of the calls that allocated it; a function is read from its file once."""
+    kernel_impl.getsourcelines(faulty)
+    monkeypatch.setattr(traceback, "extract_stack", None)
+    monkeypatch.setattr(inspect, "getsourcelines", None)
+    ti.ndarray(ti.f32, 1), ti.Vector.ndarray(3, ti.f32, 1), ti.Matrix.ndarray(3, 3, ti.f32, 1)
+    kernel_impl.getsourcelines(faulty)
 
 
 PROGRAM = """

@@ -49,11 +49,10 @@ def block(material, low, size, rotation, obstacle, gravity):
 
 
 def paths(scenes, seconds):
-    """In cells from the middle; with a moving sheet and all materials beside, tests share one compiled kernel."""
-    still = moving(wide_sheet(2.5), [0.0, 1.0], [np.zeros(3)] * 2)
-    place = CELL * np.array([[4.5, height, 4.5] for height in (5, 6, 7, 8)])
-    beside = particles(place, range(4), obstacles=(still,), domain_size=scenes[0].domain_size)
-    outcomes = simulated([*scenes, beside], frames=1 + round(seconds * RATE_HZ))[: len(scenes)]
+    """In cells from the middle. A sheet that does not move lets tests share one compiled kernel."""
+    place = np.full(3, 4.5 * CELL)
+    beside = particles(place, obstacles=(wide_sheet(2.5),), domain_size=scenes[0].domain_size)
+    outcomes = simulated([*scenes, beside], frames=1 + round(seconds * RATE_HZ))[:-1]
     return [(outcome.position_TN3.astype(np.float64) - MIDDLE) / CELL for outcome in outcomes]
 
 
@@ -96,9 +95,9 @@ def test_paddle():
     w (R² + d² + k²) - d R', k its radius of gyration, is that within 5 %. Sand, which spreads over the blade, is swept
     along as well: less than one particle in a thousand comes through.
     """
-    seconds, faster, middle = 0.4, 10.0, np.full(3, 12 * CELL)
+    seconds, faster, middle = 0.3, 18.0, np.full(3, 12 * CELL)
     time = np.linspace(0, seconds, 21)
-    corner = np.array([[0, -8, 0], [10, -8, 0], [10, 8, 0], [0, 8, 0]], float) * CELL + middle
+    corner = np.array([[0, -5, 0], [7, -5, 0], [7, 5, 0], [0, 5, 0]], float) * CELL + middle
     turns = np.stack([euler_rotation((0, np.degrees(faster * t * t / 2), 0)) for t in time])
     blade = Obstacle("blade", corner, QUAD, False, motion=Motion(time, np.zeros((21, 3)), turns, tuple(middle)))
     place = np.random.default_rng(0).uniform(0, 1, (192, 3)) * [2, 4, 3] + [1.5, -2, -3.1]
@@ -121,7 +120,7 @@ def test_paddle():
             continue
         v, x = np.diff(path, axis=0) * RATE_HZ, 0.5 * (path[1:] + path[:-1])
         found = (x[:, :, 2] * v[:, :, 0] - x[:, :, 0] * v[:, :, 2]).mean(axis=1)
-        for frame in (10, 15, len(v) - 1):
+        for frame in (10, len(v) - 1):
             assert found[frame] == pytest.approx(closed[round((frame + 0.5) / RATE_HZ / step)], rel=0.05)
 
 
