@@ -16,7 +16,7 @@ def use_large_tiles(monkeypatch):
 
     def in_large_tiles(tuning):
         return replace(
-            tuning, cell_block=16, few_cell_block=16, few_cells=0, row_block=64, small_block=64, pair_particles=8
+            tuning, cell_block=64, few_cell_block=64, few_cells=0, row_block=256, small_block=256, pair_particles=8
         )
 
     of = Tuning.of
