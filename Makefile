@@ -1,5 +1,5 @@
 # make demo: makes scenes, trains a shipped network further on them, exports and simulates it, in minutes on two CPU cores
-# make test: the tests        make slow: those of them that compile for minutes        make check: all that CI runs
+# make test: the tests        make slow: those that compile, and the notebooks        make check: all that CI runs
 PYTHON ?= $(shell command -v python3.12 >/dev/null 2>&1 && python3.12 --version >/dev/null 2>&1 && echo python3.12 \
 	|| (command -v python3.11 >/dev/null 2>&1 && python3.11 --version >/dev/null 2>&1 && echo python3.11) || echo python3)
 VENV := .venv

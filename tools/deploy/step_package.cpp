@@ -1,5 +1,6 @@
 // step_package PACKAGE ARRAYS FRAMES OUT: simulates a scene with a package of hgn.export, compiled for the CPU.
-#include <ATen/ATen.h>
+#include <ATen/core/Tensor.h>
+#include <ATen/ops/from_blob.h>
 #include <torch/csrc/inductor/aoti_package/model_package_loader.h>
 
 #include <chrono>
