@@ -151,7 +151,7 @@ def test_first_launch_waits_for_the_first_scenes(make_config, backend, control, 
 SECOND = scene_seed(0, "train", 1, 0)
 DIVERGED, NO_ROOM, NO_GRID = "diverged in frame 3", "no room for the obstacles", "a surface too large"
 FAULTS = [  # a file that steers the stand-in and its content, scenes a launch, the cause, how often it was simulated
-    (f"kill-{SECOND}", "1", 1, None, 2),  # in processes
+    (f"kill-{SECOND}", "1", 1, None, 2),
     (f"kill-{SECOND}", "99", 4, "ended by SIGKILL", 4),  # with the others, with a half of them, twice alone
     (f"fail-{SECOND}", "", 1, DIVERGED, 1),
     (f"refuse-{SECOND}", "", 1, NO_ROOM, 0),
@@ -161,13 +161,11 @@ FAULTS = [  # a file that steers the stand-in and its content, scenes a launch, 
 
 
 @pytest.mark.parametrize(("sign", "content", "scenes", "cause", "count"), FAULTS)
-def test_a_scene_at_fault(make_config, backend, control, monkeypatch, request, sign, content, scenes, cause, count):
+def test_a_scene_at_fault(make_config, backend, control, threads, monkeypatch, sign, content, scenes, cause, count):
     """A worker that is killed once costs a retry of the same seed. A scene that kills its worker MAXIMUM_ATTEMPTS times
     alone, found by halves of its batch, is quarantined; one that cannot be made or simulated, or whose grid cannot be
     built, is at once, for trying the same seed again would not help. The next seed replaces it."""
     monkeypatch.setattr(pool, "MAXIMUM_ATTEMPTS", 2)
-    if (sign, content) != FAULTS[0][:2]:
-        request.getfixturevalue("threads")
     config = make_config(training_scenes=4, validation_scenes=0, test_scenes=0)
     (control / sign).write_text(content)
     recorder = generate(config, backend, WorkerPlan(1, None, 1, scenes, scenes))

@@ -22,9 +22,9 @@ def test_one_batch_has_scenes_of_several_domains():
     config = DatagenConfig(
         SceneConfig(domain_size=(2.0, 1.5, 1.5), kinds=KINDS, particles_per_cell=1.0),
         MpmConfig(device="cpu"),
-        DatasetConfig(frames=3),
+        DatasetConfig(frames=2),
     )
-    tasks = [SceneTask("train", index, 0, seed) for index, seed in enumerate((5, 1, 9, 2, 7))]
+    tasks = [SceneTask("train", index, 0, seed) for index, seed in enumerate((5, 1, 9))]
     made = [make_scene(task, config, Backend())[1] for task in tasks]
     results = simulate_batch(made, config, Backend(), 2)
     episodes = [make_episode(one, result, config, "0") for one, result in zip(made, results, strict=True)]
