@@ -2,8 +2,11 @@
 
 import pytest
 
+from datagen.solve import SolveConfig
 from hgn.average import AverageConfig
 from hgn.config import DatasetConfig, NetworkConfig, SceneConfig, TrainConfig, TrainingConfig
+from hgn.evaluate import EvaluateConfig
+from hgn.rollout import RolloutConfig
 from hgn.schema import ConfigError, from_mapping
 from hgn.step_config import StepConfig
 from tools.bench.config import BenchConfig
@@ -63,6 +66,32 @@ RULES = {
         ({"rest_threshold": 0.3}, "step.rest_threshold must be 0 with inputs=absolute, got 0.3"),
         (RELATIVE | {"rest_threshold": 0.3, "dimensions": 2}, "step.rest_threshold must be 0 with dimensions=2"),
         ({"obstacle_clearance": 1e-3, "dimensions": 2}, "step.obstacle_clearance must be null with dimensions=2"),
+    ],
+    command(SceneConfig): [
+        ({"group_size": float("nan")}, "group_size must be a finite number > 0, got nan"),
+        ({"materials": ["water", "lava"]}, r"materials\[1\] must be one of water, sand, snow, elastic, got"),
+        ({"gravity": -9.8}, "gravity must be a list of 3 values, got -9.8"),
+    ],
+    command(DatasetConfig): [({"frames": 1}, "frames must be at least 2, got 1")],
+    command(SolveConfig, scene="s"): [
+        ({"frames": 1}, "frames must be at least 2, got 1"),
+        ({"out": "a.png"}, "out must be a name that ends in .vtkhdf, .hdf, .hdf5 or .h5, got 'a.png'"),
+        ({"out": "a.usdc"}, "got 'a.usdc'; tools.render makes pictures, USD and PLY of a rollout"),
+    ],
+    command(RolloutConfig): [
+        ({"frames": 1}, "frames must be at least 2, got 1"),
+        ({"seed": -1}, "seed must be a finite number >= 0, got -1"),
+        ({"data": "data"}, "data must be given together with episode, got 'data'; for example"),
+        ({"scene": "funnel", "data": "d", "episode": "e"}, "scene must be left out where data is given, got 'funnel'"),
+    ],
+    command(EvaluateConfig, weights="w", data="d"): [
+        ({"scenes": 0}, "scenes must be a finite number > 0, got 0"),
+        ({"json": ""}, "json must be a file name, got ''"),
+        ({"split": "moon"}, "split must be one of train, validation, test, got 'moon'"),
+    ],
+    command(TrainingConfig): [
+        ({"learning_rate": -1.0}, "learning_rate must be a finite number > 0, got -1.0"),
+        ({"noise_std": float("nan")}, "noise_std must be a finite number >= 0, got nan"),
     ],
     SceneConfig: [
         ({"obstacle_shapes": ("torus",)}, r"obstacle_shapes\[0\] must be one of half_box, .*, or a mesh file"),
