@@ -145,7 +145,7 @@ class Launch(ABC):
         )
         self.entry_frame = np.concatenate([entry_frames(scene, frame_rate_hz) for scene in scenes])
         self.own_label = label.astype(np.int32)
-        # one scene more for particles that enter later; it never runs
+        # particles that enter later wait in an additional scene that is never simulated
         self.rows = len(scenes) + bool(self.entry_frame.any())
         label = np.where(self.entry_frame > 0, (len(scenes) << MATERIAL_BITS) + (label & MATERIAL_MASK), label)
         laws, row = material_laws(scenes, config)
@@ -178,7 +178,7 @@ class Launch(ABC):
         return any(not obstacle.closed for scene in self.scenes for obstacle in scene.obstacles)
 
     def _place_contacts(self, begin: float, end: float) -> None:
-        """Writes the colliders' contacts into device arrays. Moving obstacles get their mean velocities of the time."""
+        """Writes contacts into device arrays. Moving obstacles get their mean velocities from `begin` to `end`."""
         self.shape = device_array(self._shape())
         of_node = MOVING_NODE_VECTORS if self.moving else NODE_VECTORS
         of_triangle = MOVING_TRIANGLE_VECTORS if self.moving else TRIANGLE_VECTORS
@@ -222,7 +222,7 @@ class Launch(ABC):
         value[:, VALUE.smallest_time_step] = np.inf
         value[: len(self.scenes), VALUE.stability_fraction] = stability_fractions or self.config.stability_fraction
         shear, bulk = laws[:, CONSTANT.shear], laws[:, CONSTANT.bulk]
-        # by material and row; hardening may take all stiffness from snow
+        # rows: materials; columns: rows of `laws`. The least stiffness of snow is 0, because it can soften completely.
         density = laws[:, CONSTANT.density]
         viscous = 4 * laws[:, CONSTANT.viscosity] / (density * self.scenes[0].cell_size)
         solid = (3 * bulk + 2 * shear) / density
@@ -232,7 +232,7 @@ class Launch(ABC):
             own = slice(self.particle_begin[index], self.particle_begin[index + 1])
             value[index, VALUE.gravity : VALUE.gravity + 3] = scene.gravity
             value[index, VALUE.wall_friction : VALUE.wall_friction + 3] = scene.wall_friction
-            # heavier particles next to water would look like compressed water
+            # water's density comes from mass on the grid; heavier particles nearby would look like compressed water
             alike = (laws[row[own], CONSTANT.mass] == 1).all()
             value[index, VALUE.water_density] = (scene.particles_per_cell or 0.0) if alike else 0.0
             value[index, VALUE.least_stiffness] = least[scene.material_N, row[own]].max()

@@ -41,7 +41,7 @@ from hgn.network.own_physics import SurfaceFriction, kept, surface_friction
 CONTACT_REACH_CELLS = 3.0  # distance from a wall, in R, at which the network begins to see it
 WALL_LIMIT = 2.0  # largest wall_nearness, reached one `reach` behind the plane
 STEPS_AHEAD = 4  # number of places on the path of the next frame that are searched for an obstacle
-QUIET = 0.01  # change or difference of velocity that is full disturbance, in units of s_a; rounding is 1e-5 to 1e-4
+QUIET = 0.01  # the disturbance is 1 at this difference of velocities, in units of s_a; rounding gives 1e-5 to 1e-4
 OUTPUTS = 9  # numbers of the decoder per particle: an acceleration, and a stress xx, yy, zz, yz, xz, xy
 STRESS_33 = ((3, 8, 7), (8, 4, 6), (7, 6, 5))  # columns of the stress in the decoder's output
 SMALLEST_MASS = 1e-30  # lower bound of a cell's mass; a cell without weight gets velocity 0
@@ -236,12 +236,11 @@ def balanced(output_N9: torch.Tensor, contacts: Contacts, grid: GridHierarchy) -
     sum_C d_C t_C M_C R_C, which is 0 without a surface in reach. Cells exchange momentum across faces as in finite
     volumes. A symmetric stress has no torque at a point, but the forces T and -T on a pair of cells have one.
 
-    Rotation is subtracted so that sum_p x_p x a_p is 0 too without a surface in reach. Let y_p be the particle's place
-    relative to the cell's centre of mass X, and I and J the cell's means of inertia and of y x r. r_p - R becomes
-    q (r_p - R) - W x y_p with (q, W) = rotation(I, J). Let D = X' - X. Instead of f' T, the cell gets
-    f' (q' T + W' x D) - W' x y_p. For the pair, about its common centre, (q', W') is
-    rotation(I f + I' f' + f f' (D^2 - D D^T), -f f' D x T). Both subtractions (cell and pair) are a projection times
-    q or q', so they never enlarge mean squares, even for small or thin bodies.
+    Rotation is subtracted so that sum_p x_p x a_p is 0 too without a surface in reach. Both subtractions are a projection
+    times q or q', so they never enlarge mean squares. Let y_p be the particle's place from the cell's centre of mass X.
+    - Of a cell with means I of inertia and J of y x r: r_p - R becomes q (r_p - R) - W x y_p, (q, W) = rotation(I, J).
+    - Of a pair with D = X' - X: f' T becomes f' (q' T + W' x D) - W' x y_p. (q', W') is `rotation` of the pair's inertia
+      about its centre, I f + I' f' + f f' (D^2 - D D^T), and of the moment -f f' D x T of T and -T.
 
     t_C Q_C R_C is subtracted too, where Q is `slip` of the `touched_normals`. Then the mean force of surfaces on a cell
     is along their normals. Bodies slide on a plane without friction or propulsion, for any parameters. With friction a

@@ -41,10 +41,9 @@ ESTIMATE_AFTER_S = 10.0  # of updates
 
 
 class SameWeights(Callback):
-    """Requires equal updates, next samples, parameters and normalisers on all ranks at the start. At each log line it
-    requires bitwise equal parameters.
+    """At the start requires the same update and next sample on all ranks, and copies rank 0's tensors to the others.
 
-    Most updates exchange only gradients. Ranks exchange more when they log, save, measure or agree to stop.
+    At each log line it requires bitwise equal parameters. Most updates exchange only gradients.
     """
 
     def __init__(self, feed: EpisodeDataModule) -> None:
@@ -107,7 +106,8 @@ class Checkpoints(Callback):
     def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
         """Saves before a training ends because its data stay unreachable.
 
-        Each rank without data saves, because it is between two updates. The other ranks wait inside an update."""
+        A rank without data saves by itself. The other ranks cannot take part, because they wait inside an update.
+        """
         unsaved = hasattr(pl_module, "updates") and self._saved_update != _update(pl_module) > 0
         if unsaved and isinstance(exception, (StorageError, OSError)):
             lightning_compat.save_alone(trainer, self.folder / LAST_NAMES[0])

@@ -174,7 +174,7 @@ def network_of_weights(config: TrainConfig) -> ParticleNetwork:
 
     The rest constraint, the clearances of walls and obstacles, and inputs relative and local may differ from those of
     the weights, because they do not change tensors. Inputs for own physics that the weights lack begin with weights of
-    0, so outputs are the same. Raises: ConfigError for a file without weights, another network, or other data.
+    0, so outputs without friction are the same. Raises: ConfigError for a file without weights, another network, or other data.
     """
     assert config.training.init_weights is not None
     path = find_weights(config.training.init_weights, "training.init_weights")
