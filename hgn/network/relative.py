@@ -236,11 +236,11 @@ def balanced(output_N9: torch.Tensor, contacts: Contacts, grid: GridHierarchy) -
     sum_C d_C t_C M_C R_C, which is 0 without a surface in reach. Cells exchange momentum across faces as in finite
     volumes. A symmetric stress has no torque at a point, but the forces T and -T on a pair of cells have one.
 
-    Rotation is subtracted so that sum_p x_p x a_p is 0 too without a surface in reach. Both subtractions are a projection
-    times q or q', so they never enlarge mean squares. Let y_p be the particle's place from the cell's centre of mass X.
-    - Of a cell with means I of inertia and J of y x r: r_p - R becomes q (r_p - R) - W x y_p, (q, W) = rotation(I, J).
-    - Of a pair with D = X' - X: f' T becomes f' (q' T + W' x D) - W' x y_p. (q', W') is `rotation` of the pair's inertia
-      about its centre, I f + I' f' + f f' (D^2 - D D^T), and of the moment -f f' D x T of T and -T.
+    Rotation is subtracted so that sum_p x_p x a_p is 0 too without a surface in reach. Both steps are projections
+    times q or q', so they never enlarge mean squares. y_p is a particle's place relative to its cell's centre of mass X.
+    - Of a cell with means I of inertia and J of y x r: r_p - R becomes q (r_p - R) - W x y_p. (q, W) = rotation(I, J).
+    - Of a pair with D = X' - X: f' T becomes f' (q' T + W' x D) - W' x y_p. (q', W') is `rotation` of its inertia about
+      its centre, I f + I' f' + f f' (D^2 - D D^T), and of the moment -f f' D x T of T and -T.
 
     t_C Q_C R_C is subtracted too, where Q is `slip` of the `touched_normals`. Then the mean force of surfaces on a cell
     is along their normals. Bodies slide on a plane without friction or propulsion, for any parameters. With friction a

@@ -173,8 +173,8 @@ def network_of_weights(config: TrainConfig) -> ParticleNetwork:
     """Returns the network of training.init_weights with its normaliser, as the initial state of a new run.
 
     The rest constraint, the clearances of walls and obstacles, and inputs relative and local may differ from those of
-    the weights, because they do not change tensors. Inputs for own physics that the weights lack begin with weights of
-    0, so outputs without friction are the same. Raises: ConfigError for a file without weights, another network, or other data.
+    the weights, because they do not change tensors. Inputs for own physics that the weights lack begin at 0, so
+    outputs without friction are the same. Raises: ConfigError for a file without weights, another network or data.
     """
     assert config.training.init_weights is not None
     path = find_weights(config.training.init_weights, "training.init_weights")
