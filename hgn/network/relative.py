@@ -237,7 +237,7 @@ def balanced(output_N9: torch.Tensor, contacts: Contacts, grid: GridHierarchy) -
     volumes. A symmetric stress has no torque at a point, but the forces T and -T on a pair of cells have one.
 
     Rotation is subtracted so that sum_p x_p x a_p is 0 too without a surface in reach. Both steps are projections
-    times q or q', so they never enlarge mean squares. y_p is a particle's place relative to its cell's centre of mass X.
+    times q or q', so they never enlarge mean squares. y_p is a particle's place about its cell's centre of mass X.
     - Of a cell with means I of inertia and J of y x r: r_p - R becomes q (r_p - R) - W x y_p. (q, W) = rotation(I, J).
     - Of a pair with D = X' - X: f' T becomes f' (q' T + W' x D) - W' x y_p. (q', W') is `rotation` of its inertia about
       its centre, I f + I' f' + f f' (D^2 - D D^T), and of the moment -f f' D x T of T and -T.
