@@ -33,6 +33,7 @@ _MACHINE_ERRORS = {
     errno.EROFS: "choose a folder that can be written to",
     # A given path leads through a file, or names an object of another kind.
     errno.EEXIST: "choose another path",
+    errno.ENOENT: "check its folder or link",
     errno.ENOTDIR: "choose another path",
     errno.EISDIR: "choose another path",
     errno.ENAMETOOLONG: "choose another path",
@@ -100,8 +101,7 @@ def _exit_code(main: Main | str, config_name: str) -> int:
             raise
         code = _fail(missing, EXIT_MACHINE)
     except OSError as error:
-        missing_file = isinstance(error, FileNotFoundError) and error.filename is not None
-        if missing_file or isinstance(error, BrokenPipeError):  # an error of this program, not of the user
+        if _is_own_fault(error):
             raise
         place = f": {error.filename}" if error.filename else ""
         remedy = _MACHINE_ERRORS.get(error.errno or 0, "check the disk and its network")
@@ -115,6 +115,14 @@ def _exit_code(main: Main | str, config_name: str) -> int:
     except KeyboardInterrupt:
         code = _fail("interrupted", EXIT_INTERRUPTED)
     return code
+
+
+def _is_own_fault(error: OSError) -> bool:
+    """Returns whether this program caused an error: a missing file in a folder that is there, and is no link."""
+    if isinstance(error, FileNotFoundError) and error.filename is not None:
+        path = Path(os.fsdecode(error.filename))
+        return path.parent.is_dir() and not path.is_symlink()
+    return isinstance(error, BrokenPipeError)
 
 
 def _unread() -> bool:

@@ -22,7 +22,7 @@ from hgn.data.statistics import episode_statistics, merge_statistics
 from hgn.data.verification import file_sha256
 from hgn.scene.episode import Episode
 from hgn.schema import ConfigError
-from hgn.system.files import errors_name, sync_file, temporary_file
+from hgn.system.files import errors_name, open_at_once, sync_file, temporary_file
 
 STAGING_NAME = ".staging"
 _COPY_BYTES = 1 << 22
@@ -74,7 +74,7 @@ def sync_staged(path: Path) -> None:
 def require_sealed(path: Path) -> None:
     """Raises ConfigError if a staged file has changed: a disk failed, or the machine lost its power."""
     digest, seal = hashlib.sha256(), len(_seal(hashlib.sha256()))
-    with path.open("rb") as file:
+    with open_at_once(path) as file:
         size = max(os.fstat(file.fileno()).st_size - seal, 0)
         for start in range(0, size, _COPY_BYTES):
             digest.update(file.read(min(_COPY_BYTES, size - start)))

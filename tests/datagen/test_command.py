@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 from functools import partial
+from pathlib import Path
 
 import pytest
 import yaml
@@ -65,15 +66,19 @@ FULL = [  # as libraries report it
         (RuntimeError("a fault"), None, None),
         (ImportError("no name x in y"), None, None),
         (FileNotFoundError(errno.ENOENT, "No such file", "x"), None, None),
+        (FileNotFoundError(errno.ENOENT, "No file", "dangling"), 1, "error: No file: dangling; check its folder or"),
+        (FileNotFoundError(errno.ENOENT, "No file", "gone/x"), 1, "error: No file: gone/x; check its folder or link"),
     ],
 )
-def test_faults_end_in_one_line(error, code, message, monkeypatch, capsys):
+def test_faults_end_in_one_line(error, code, message, monkeypatch, capsys, tmp_path):
     """Faults that a person can mend print one line and no traceback; the exit code tells whose fault it is. Ours keep
     their traceback."""
 
     def fail(mapping):
         raise error
 
+    monkeypatch.chdir(tmp_path)
+    Path("dangling").symlink_to("nowhere")
     if code is None:
         monkeypatch.setattr(sys, "argv", ["datagen"])
         with pytest.raises(type(error)):

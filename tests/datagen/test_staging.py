@@ -194,10 +194,11 @@ def test_no_clock_is_asked(make_config, make_dataset, small_dataset, stage, seco
     assert not list(writer.folder.rglob("*.partial"))
 
 
-@pytest.mark.parametrize("damage", ["cut", "zeroed", "a bit", "no seal"])
+@pytest.mark.parametrize("damage", ["cut", "zeroed", "a bit", "no seal", "device", "pipe"])
 def test_broken_staged_file_is_made_again(make_config, make_dataset, small_dataset, stage, damage):
     """A staged file that is not what was written (positions that are zeros read like any others) is dropped and its
     episode made again; so the shards are those of a run in peace. One that changes after it was checked is not packed.
+    Nor is a device or a pipe read, of which reading would not end.
     """
     with DatasetWriter(make_config()) as writer:
         stage(writer, "train", 1)
@@ -208,6 +209,9 @@ def test_broken_staged_file_is_made_again(make_config, make_dataset, small_datas
             content[place + 128 : place + size] = bytes(size - 128)
         content[place + 200] ^= damage == "a bit"
         staged.write_bytes({"cut": content[:2000], "no seal": content[:-72]}.get(damage, content))
+        if damage in ("device", "pipe"):
+            staged.unlink()
+            staged.symlink_to("/dev/zero") if damage == "device" else os.mkfifo(staged)
         with pytest.raises(ConfigError, match=r"train-000001\.tar must end with the sha256"):
             while writer.publish_next():
                 pass

@@ -83,6 +83,15 @@ def test_lost_manifest(make_config, folder):
         DatasetWriter(make_config()).__enter__()
 
 
+def test_pipe_in_the_place_of_a_shard(make_config, tmp_path):
+    """A pipe that has a shard's name is refused; opening it would wait for ever."""
+    folder = tmp_path / "piped"
+    folder.mkdir()
+    os.mkfifo(folder / "train-000000-000001.tar")
+    with pytest.raises(ConfigError, match="must be a whole tar"), DatasetWriter(make_config(folder=str(folder))):
+        pass
+
+
 def test_missing_shard_is_made_again(make_config, make_dataset, folder):
     """A shard that was deleted, the remedy for an altered one, is made again and listed."""
     before = hashes(folder)
