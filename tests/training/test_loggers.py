@@ -59,7 +59,7 @@ def test_loggers_get_what_metrics_jsonl_gets(data, tmp_path, stand_in, capsys):
     """Each record at its update, the settings once, and the end; TensorBoard as ever. The default is
     TensorBoard, and without loggers a run has metrics.jsonl only."""
     made, run = stand_in(), tmp_path / "run"
-    mapping = train_mapping(data, run, loggers=["tensorboard", "wandb"], monitor_rollout_frames=3)
+    mapping = train_mapping(data, run, loggers=["tensorboard", "wandb"], monitor_rollout_frames=3, monitor_every=12)
     assert train.main(mapping) == 0
     (logger,) = made
     settings = [values[0] for method, values in logger.calls if method == "settings"]
