@@ -16,10 +16,10 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 30_880,
+    "hgn": 30_888,
     "datagen": 8_570,
     "tools": 6_611,
-    "tests": 30_196,
+    "tests": 30_230,
 }
 SETTINGS = 240  # fields of the dataclasses behind the commands, *Config
 

@@ -16,6 +16,7 @@ from hgn.data.verification import StorageError
 
 LARGEST_BYTES = 2**29  # limit for whole files: manifests of the first release, and shards of servers without ranges
 LEAST_BYTES_S, SLOW_S = 4096, 20.0  # smallest mean speed of a body, bytes/s, apart from a grace of SLOW_S seconds
+SILENCE_S = 60.0  # limit between two pieces, seconds: aiohttp reports no error of a malformed body
 HEAD_S = 150.0  # limit for the head of an answer, seconds: a service may hash a shard first
 _RANGE = re.compile(r"bytes=(\d+)-(\d+)")
 
@@ -28,13 +29,13 @@ class BoundedResponse(aiohttp.ClientResponse):
         return await asyncio.wait_for(super().start(connection), HEAD_S)
 
     async def read(self) -> bytes:
-        """Returns the body. Raises: StorageError if it is too long; ConnectionError if it is too slow."""
+        """Returns the body. Raises: StorageError if it is too long; ConnectionError or TimeoutError if too slow."""
         if self._body is None:
             requested = _RANGE.fullmatch(self.request_info.headers.get("Range", ""))
             partial = requested is not None and self.status == 206
             limit = int(requested[2]) - int(requested[1]) + 1 if requested is not None and partial else LARGEST_BYTES
             pieces, size, start = [], 0, time.monotonic()
-            async for piece in self.content.iter_any():
+            while piece := await self._piece():
                 size += len(piece)
                 if size > limit:
                     self.close()
@@ -48,3 +49,9 @@ class BoundedResponse(aiohttp.ClientResponse):
             self._body = b"".join(pieces)
             self.release()
         return self._body
+
+    async def _piece(self) -> bytes:
+        try:
+            return await asyncio.wait_for(self.content.readany(), SILENCE_S)
+        except RuntimeError as error:  # aiohttp closed the connection after a malformed chunk
+            raise ConnectionError(str(error)) from error

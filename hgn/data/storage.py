@@ -335,7 +335,8 @@ def _transient(error: Exception, url: str) -> str | None:
     """Returns the cause of a temporary error, or None for another error. Raises: ConfigError (access refused)."""
     if isinstance(error, FileNotFoundError):
         return None
-    status = getattr(error, "status", None)
+    malformed = type(error.__cause__).__module__ == "aiohttp.http_exceptions"  # its status is 400, from nobody
+    status = None if malformed else getattr(error, "status", None)
     if status in (401, 403) or isinstance(error, PermissionError):
         raise StorageError(
             f"{url} must be open to this program, got refused; set {TOKEN_VARIABLE} to the service's token (if "

@@ -40,7 +40,8 @@ def _read(content: str, path: Path, *more: str) -> dict[str, np.ndarray]:
     one_thread = dict(os.environ, PXR_WORK_THREAD_LIMIT="1", OPENBLAS_NUM_THREADS="1")  # each thread takes memory
     arguments = [content, str(path.resolve()), str(COPIES * most), *more]
     done = subprocess.run([*program, *arguments], capture_output=True, env=one_thread, check=False)
-    last = "".join(filter(str.isprintable, done.stderr.decode(errors="replace").strip().rpartition("\n")[2]))
+    lines = [line for line in done.stderr.decode(errors="replace").splitlines() if len(line) > 3] or [""]
+    last = "".join(filter(str.isprintable, lines[-1]))
     if done.returncode == 3:
         raise ValueError(f"it {last}")
     if done.returncode:

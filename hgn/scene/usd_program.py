@@ -36,7 +36,7 @@ def opened(file: str) -> Usd.Stage:
         if spec is not None and spec.HasInfo("clips"):
             others.append(f"clips of {path}")
 
-    others += layer.GetCompositionAssetDependencies()
+    others += filter(None, layer.GetCompositionAssetDependencies())  # empty: a reference within the file
     layer.Traverse(Sdf.Path.absoluteRootPath, find_clips)
     if others:
         refuse(f"refers to {others[0]!r}, and other files are not read; write one file (usdcat --flatten)")

@@ -97,6 +97,26 @@ def test_a_server_that_drips_does_not_answer(data, monkeypatch, dripping):
         assert dripping in ("head", error.value.filename[-len(dripping) :])
 
 
+@pytest.mark.parametrize("content", [b"zz\r\nabc", b"ffffffffffffffffff\r\nabc", b""])
+@pytest.mark.parametrize("pause_s", [0, 0.1])
+def test_malformed_bodies_end(data, monkeypatch, content, pause_s):
+    """An answer whose chunk has no size, with its head or after it, ends like a server that does not answer."""
+    monkeypatch.setenv(VARIABLE, "0")
+    monkeypatch.setattr("hgn.data.bounded_http.SILENCE_S", 0.2)
+
+    class Malformed(PlainFiles):
+        def do_GET(self):  # noqa: N802
+            self.send_response(200)
+            self.send_header("Transfer-Encoding", "chunked")
+            self.end_headers()
+            time.sleep(pause_s)
+            self.wfile.write(content)
+
+    server = answering(functools.partial(Malformed, directory=data.dataset.folder))
+    with server as url, pytest.raises(UnreachableError, match="no answer"):
+        EpisodeStore(url, "train")
+
+
 @pytest.mark.parametrize(
     ("text", "shown"),
     [

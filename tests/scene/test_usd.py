@@ -35,6 +35,9 @@ def test_meshes(tmp_path):
     box = mesh_of(tmp_path, PLACED + hidden, 'metersPerUnit = 0.1\nupAxis = "Z"')
     assert box.closed and len(box.triangle_F3) == 12  # z, up to 1.1, becomes y, and y becomes -z
     np.testing.assert_allclose([box.vertex_V3.min(0), box.vertex_V3.max(0)], [[1, 0.5, -0.4], [1.2, 1.1, 0]], atol=1e-9)
+    twice = mesh_of(tmp_path, BOX + 'def "copy" (references = </box>) {\ndouble3 xformOp:translate = (9, 0, 0)\n'
+                    'uniform token[] xformOpOrder = ["xformOp:translate"]\n}\n')  # fmt: skip
+    assert len(twice.triangle_F3) == 24
     flat = mesh_of(tmp_path, L_SHAPE)  # without units: USD's default of a centimetre
     a, b, c = flat.vertex_V3[flat.triangle_F3].transpose(1, 0, 2)
     assert np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2 == pytest.approx(3e-4)
