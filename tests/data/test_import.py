@@ -343,7 +343,7 @@ def test_a_flat_set_goes_the_whole_way(flat, tmp_path, make_config):
     """Training with noise, mirrors, pushforward and pictures of its rollouts, evaluation in both conventions, a rollout
     file with the set's names, and a picture of it."""
     symmetric = {"symmetry": "gravity", "noise_correlated_fraction": 0.3, "pushforward_fraction": 0.5}
-    monitored = {"pushforward_frames": 4, "monitor_rollout_frames": 4}
+    monitored = {"pushforward_frames": 4, "monitor_rollout_frames": 4, "monitor_every": 12}
     mapping = train_mapping(make_config(folder=str(flat)), tmp_path / "run", **symmetric, **monitored)
     assert train.main(mapping | {"imported": True}) == 0
     with Image.open(tmp_path / "run" / "pictures" / "rollout_000000012.png") as drawn:
