@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from functools import cached_property, lru_cache
+from functools import lru_cache
 
 import numpy as np
 import torch
@@ -51,7 +51,7 @@ class ObstacleCells:
             friction_K=self.friction_K if self.friction_K is None else self.friction_K.to(device),
         )
 
-    @cached_property
+    @property
     def surface_rows(self) -> torch.Tensor:
         """Returns normals and friction [K, 4]."""
         friction_K = torch.zeros_like(self.normal_K3[:, 0]) if self.friction_K is None else self.friction_K
@@ -62,10 +62,13 @@ class ObstacleCells:
         return self.surfaces(position_N3, scene_N)[:, :3]
 
     def surfaces(self, position_N3: torch.Tensor, scene_N: torch.Tensor) -> torch.Tensor:
-        """Returns `normals`, followed by the friction of the cell, [N, 4]."""
+        """Returns `normals`, followed by the friction of the cell if any cell has friction, [N, 3 or 4]."""
+        return self.rows_at(self.normal_K3 if self.friction_K is None else self.surface_rows, position_N3, scene_N)
+
+    def rows_at(self, row_KV: torch.Tensor, position_N3: torch.Tensor, scene_N: torch.Tensor) -> torch.Tensor:
         cell_N3 = torch.floor(position_N3 / self.cell_size).long()
         index_N, found_N = find(self.key_K, pack(scene_N, cell_N3))
-        return (self.surface_rows[index_N] * found_N[:, None]).to(position_N3.dtype)
+        return (row_KV[index_N] * found_N[:, None]).to(position_N3.dtype)
 
 
 @lru_cache(REMEMBERED_SCENES)

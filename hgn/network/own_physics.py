@@ -27,6 +27,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch.nn.functional import pad
 
 from hgn.config import NetworkConfig
 from hgn.network.features import ParticleState
@@ -104,7 +105,7 @@ def surface_friction(
         wall_N3 = state.wall_friction_S3[state.scene_N]
     columns, rough_N33 = [], wall_N6.new_zeros(len(wall_N6), 3, 3)
     if cell_N8 is not None:
-        here_N4, ahead_N4 = cell_N8[:, :4], cell_N8[:, 4:]
+        here_N4, ahead_N4 = (pad(surface, (0, 4 - surface.shape[1])) for surface in cell_N8.chunk(2, dim=1))
         first_N4 = torch.where(here_N4[:, :3].any(-1, keepdim=True), here_N4, ahead_N4)
         rough_N33 = first_N4[:, 3, None, None] * first_N4[:, :3, None] * first_N4[:, None, :3]
         columns = [here_N4[:, 3:], ahead_N4[:, 3:]]

@@ -63,7 +63,7 @@ def smoothed_surfaces(
     if len(cells.key_K) == 0:
         return position_N3.new_zeros(len(position_N3), 4)
     if smoothing == 0:
-        return ObstacleCells.surfaces(cells, position_N3, scene_N)
+        return cells.rows_at(cells.surface_rows, position_N3, scene_N)
     grid_N3 = position_N3 / cells.cell_size
     low_N3 = torch.floor(grid_N3 - 0.5 * smoothing).detach()
     upper_N3 = ((grid_N3 + 0.5 * smoothing - low_N3 - 1) / smoothing).clamp(0, 1)  # fraction in the next cell

@@ -77,7 +77,7 @@ def relative_features(
     normal_N6 = cell_N8 = None
     if config.obstacle_features:
         cell_N8 = obstacle_surfaces(state.position_N3, velocity_N3, state.scene_N, state.obstacles)
-        normal_N6 = torch.cat([cell_N8[:, :3], cell_N8[:, 4:7]], dim=-1)
+        normal_N6 = cell_N8 if cell_N8.shape[1] == 6 else torch.cat([cell_N8[:, :3], cell_N8[:, 4:7]], dim=-1)
     motion_NK = torch.cat(
         [
             torch.asinh(history(state.velocity_NM3, state.gravity_S3[state.scene_N]) / scale),
@@ -137,17 +137,18 @@ def wall_nearness(
 def obstacle_surfaces(
     position_N3: torch.Tensor, velocity_N3: torch.Tensor, scene_N: torch.Tensor, obstacles: ObstacleCells | None
 ) -> torch.Tensor:
-    """Returns normal and friction at the particle, then those first met on its path to the next frame, [N, 8].
+    """Returns `ObstacleCells.surfaces` at the particle, and those first met on its path to the next frame, [N, 6 or 8].
 
     STEPS_AHEAD evenly spaced places of the path are tested. Without an obstacle a normal is 0.
     """
-    here_N4 = ahead_N4 = torch.zeros_like(position_N3[:, :1]).expand(-1, 4)
-    if obstacles is not None:
-        here_N4 = obstacles.surfaces(position_N3, scene_N)
-        for step in range(STEPS_AHEAD, 0, -1):
-            surface_N4 = obstacles.surfaces(position_N3 + velocity_N3 * (step / STEPS_AHEAD), scene_N)
-            ahead_N4 = torch.where(surface_N4[:, :3].any(-1, keepdim=True), surface_N4, ahead_N4)
-    return torch.cat([here_N4, ahead_N4], dim=-1)
+    if obstacles is None:
+        return torch.zeros_like(position_N3).repeat(1, 2)
+    here_NV = obstacles.surfaces(position_N3, scene_N)
+    ahead_NV = torch.zeros_like(here_NV)
+    for step in range(STEPS_AHEAD, 0, -1):
+        surface_NV = obstacles.surfaces(position_N3 + velocity_N3 * (step / STEPS_AHEAD), scene_N)
+        ahead_NV = torch.where(surface_NV[:, :3].any(-1, keepdim=True), surface_NV, ahead_NV)
+    return torch.cat([here_NV, ahead_NV], dim=-1)
 
 
 def surface_gate(wall_N6: torch.Tensor, normal_N6: torch.Tensor | None) -> torch.Tensor:
