@@ -152,11 +152,11 @@ def from_stored(cls: type[T], mapping: object, section: str) -> T:
     return from_mapping(cls, current_names(mapping, section) if isinstance(mapping, Mapping) else mapping, section)
 
 
-def known_keys(key: str, names: Iterable[str]) -> str:
-    """Returns the remedy for an unknown key: a similar key, or else all keys."""
+def known_keys(key: str, names: Iterable[str], what: str = "known keys") -> str:
+    """Returns the remedy for an unknown key: a similar key, or else all keys. `what` is the name of other names."""
     names = list(names)
     close = difflib.get_close_matches(key, names, n=1)
-    return f"did you mean {close[0]}?" if close else f"known keys: {', '.join(names)}"
+    return f"did you mean {close[0]}?" if close else f"{what}: {', '.join(names)}"
 
 
 def to_mapping(value: Any) -> Any:

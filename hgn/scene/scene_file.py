@@ -34,6 +34,7 @@ from hgn.schema import (
     Positive,
     Vector,
     from_mapping,
+    known_keys,
     require,
     require_bounds,
     to_mapping,
@@ -225,7 +226,7 @@ def find_scene(name: str) -> Path:
     if Path(name).is_file() or not re.fullmatch(r"\w+", name):
         return Path(name)
     files = scene_files("example") | scene_files("gallery")
-    require(name in files, "scene", f"a YAML file or the name of an example ({', '.join(files)})", name)
+    require(name in files, "scene", "a YAML file or the name of an example", name, known_keys(name, files, "examples"))
     return files[name]
 
 

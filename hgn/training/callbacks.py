@@ -188,7 +188,7 @@ class LogLines(Callback):
         if self._bar is not None:
             notes = f"loss {values.get('loss', math.nan):.3f}"
             if "baseline_ratio/validation" in self.measured:
-                notes += f", {format_ratio(self.measured['baseline_ratio/validation'])} the best baseline"
+                notes += f", {format_ratio(self.measured['baseline_ratio/validation'], 1, 'x')} baseline"
             self._bar.set_postfix_str(f"{notes}, {self.published()}", refresh=False)
 
     def _estimate(self, module: TrainingModule, progress: tqdm[Any]) -> None:

@@ -25,11 +25,11 @@ PARTICLES_PER_BATCH = 32_768  # limits the memory of frames that are computed to
 Predictor = Callable[[Batch], torch.Tensor]  # accelerations [N, 3] in frame units
 
 
-def format_ratio(gain: float) -> str:
+def format_ratio(gain: float, digits: int = 2, unit: str = " times") -> str:
     """Describes an error by the gain over another one: 2 gives "2.00 times below", 0.5 "2.00 times above" it."""
     if not 0 < gain < 1:
-        return f"{gain:.2f} times below"
-    return f"{1 / gain:.2f} times above"
+        return f"{gain:.{digits}f}{unit} below"
+    return f"{1 / gain:.{digits}f}{unit} above"
 
 
 @dataclass

@@ -77,7 +77,7 @@ VALUES = [
     ("rollout", [*ROLLOUT, "scene=none.yaml"], "scene must be an existing YAML file, got none.yaml"),
     ("rollout", ["out=a.png"], "must be a name that ends in .vtkhdf, .hdf, .hdf5, .h5, .usdc, .usda, .usd or .ply, go"),
     ("rollout", ["data=data", "episode=99"], "episode must begin with one of train, validation, test, got '99'; e.g. "),
-    ("rollout", ["scene=funnle"], "scene must be a YAML file or the name of an example (funnel, "),
+    ("rollout", ["scene=funnle"], "a YAML file or the name of an example, got 'funnle'; did you mean funnel?"),
     ("rollout", [*ROLLOUT, "device=abacus"], "device must be auto, cpu or cuda[:index], got 'abacus'"),
     ("rollout", [*ROLLOUT, "device=cuda:77"], "device must exist, got 'cuda:77' with"),
     ("rollout", [*ROLLOUT, "weights=none.safetensors"], "weights must be an existing file, got none.safetensors; wri"),

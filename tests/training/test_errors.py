@@ -10,8 +10,8 @@ from hgn.training.errors import format_ratio, mean_so_far
     ("gain", "text"), [(18.5, "18.50 times below"), (1.0, "1.00 times below"), (0.1, "10.00 times above")]
 )
 def test_gain_in_words(gain, text):
-    """An error that is larger than the other is not said to be below it."""
-    assert format_ratio(gain) == text
+    """An error that is larger than the other is not said to be below it. A bar shows it shorter."""
+    assert (format_ratio(gain), format_ratio(gain, 1, "x")) == (text, text.replace("0 times", "x"))
 
 
 def test_mean_over_the_scenes_that_came_so_far():
