@@ -27,6 +27,7 @@ from hgn.scene.scene import Scene
 from hgn.scene.scene_file import find_scene, load_scene, notes_on_files
 from hgn.schema import ConfigError, FrameCount, NonNegative, from_mapping, require, require_bounds, require_replaceable
 from hgn.system.files import require_place
+from hgn.system.processes import ended_as_by_ctrl_c
 from hgn.system.progress import bar
 
 if TYPE_CHECKING:
@@ -79,7 +80,8 @@ def main(mapping: dict[str, Any]) -> int:
     out = _out(config)
     still, moving = pictures = out.with_suffix(".png"), out.with_suffix(".gif")
     require_replaceable("out", out, *(pictures if drawn else ()))
-    path, result = rollout(config)
+    with ended_as_by_ctrl_c():
+        path, result = rollout(config)
     print(path)
     if drawn:
         write_picture(still, compare_picture(result, spread(result.frame_count, PICTURES)), result.source)

@@ -104,7 +104,7 @@ def build_hierarchy(
     key_N8 = pack(scene_N[:, None], base_N3.long()[:, None] + reached_N83)
     key_C, cell_N8 = unique(key_N8)
 
-    built = []
+    built: list[Level] = []
     for level in range(levels):
         edges = _edges_of_parents(built[-1], key_C.shape[0]) if connected and level > 0 else _edges(key_C)
         sender_E, receiver_E, direction_E = edges

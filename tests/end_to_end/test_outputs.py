@@ -3,6 +3,7 @@
 import errno
 import itertools
 import os
+import signal
 
 import ballistic_solver
 import pytest
@@ -102,14 +103,18 @@ def test_own_files_are_replaced(place, monkeypatch):
         assert exit_code(COMMANDS[command], command, arguments, monkeypatch) == 0, (command, arguments)
 
 
-@pytest.mark.parametrize("name", ["a.vtkhdf", "a.ply"])
-def test_an_interrupted_simulation_keeps_its_frames(place, name, capsys, monkeypatch):
-    """After Ctrl-C the file has the frames so far, and a line says how many; the folder has no other file."""
+@pytest.mark.parametrize(
+    ("name", "number"), [("a.vtkhdf", signal.SIGINT), ("a.vtkhdf", signal.SIGTERM), ("a.ply", signal.SIGHUP)]
+)
+def test_an_interrupted_simulation_keeps_its_frames(place, name, number, capsys, monkeypatch):
+    """After Ctrl-C, SIGTERM or SIGHUP the file has the frames so far; a line says how many. No other file is left."""
     frames = Simulator.frames
 
     def interrupted(self, scene, count):
         yield from itertools.islice(frames(self, scene, count), 3)
-        raise KeyboardInterrupt
+        if number == signal.SIGINT:  # which shells ignore in the background
+            raise KeyboardInterrupt
+        signal.raise_signal(number)
 
     monkeypatch.setattr(Simulator, "frames", interrupted)
     code, line = refused("rollout", ["scene=scene.yaml", f"out=made/{name}", "frames=50"], capsys, monkeypatch)
