@@ -111,7 +111,7 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
         checkpoint = torch.load(path, map_location="cpu", weights_only=True)
         require_few_items(checkpoint)
     except FileNotFoundError:
-        last, remedy = path.with_name(LAST_NAMES[0]), "hgn.train writes one"
+        last, remedy = path.parent / LAST_NAMES[0], "hgn.train writes one"
         if path.name == BEST_NAME and last.is_file():
             remedy = f"no validation scene was measured, so take {last}"
         raise ConfigError(f"checkpoint must be an existing file, got {path}; {remedy}") from None

@@ -58,6 +58,7 @@ VALUES = [
     ("train", ["scene.tilted_gravity_fraction=0.1"], "network.inputs must be relative where scene.kinds are given, or"),
     ("train", ["+experiment=moon"], "Could not find 'experiment/moon'"),
     ("export", ["checkpoint=none.ckpt", "out=x"], "checkpoint must be an existing file, got none.ckpt; hgn.train"),
+    ("export", ["checkpoint=.", "out=x"], "checkpoint must be an existing file, got .; hgn.train"),
     ("export", ["checkpoint=none.ckpt", "out="], "out must be a file name, got ''"),
     ("export", ["out=x"], "checkpoint must be given, or else weights, got None"),
     ("rollout", ["--frames", "3"], "--frames is not an option; settings are given as frames=VALUE"),

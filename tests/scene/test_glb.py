@@ -207,7 +207,7 @@ def test_glb_that_lies(tmp_path):
         (lambda tree: tree["accessors"][0].update(count=4), "vertex 7 of a primitive with 4"),
         (lambda tree: tree["accessors"][0].update(byteOffset=-4), "readable GLB"),
         (lambda tree: tree["nodes"][0].update(mesh=-1), "an entry has the number -1"),
-        (lambda tree: tree["scenes"][0].update(nodes=[-1]), "an entry has the number -1"),
+        (lambda tree: tree["nodes"].append({"children": [-1]}), "an entry has the number -1"),
         (lambda tree: tree["bufferViews"][0].update(byteOffset=10**12), "readable GLB"),
         (lambda tree: tree["nodes"][0].update(skin=0), "node 0 has a skin"),
         (loop, "node 0 has two parents"),
