@@ -16,10 +16,10 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 30_907,
+    "hgn": 30_921,
     "datagen": 8_570,
     "tools": 6_611,
-    "tests": 30_235,
+    "tests": 30_247,
 }
 SETTINGS = 240  # fields of the dataclasses behind the commands, *Config
 

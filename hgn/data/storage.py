@@ -106,8 +106,21 @@ def open_storage(folder: Path | str) -> Storage:
     Raises: ConfigError for a URL with an unknown protocol, or whose package is not installed.
     """
     if is_remote(folder):
+        _require_address(str(folder))
         return _remote(str(folder).rstrip("/"))
     return _Folder(local_folder(folder))
+
+
+def _require_address(url: str) -> None:
+    """Refuses a URL without a host or path, or whose host or port is malformed. Raises: ConfigError."""
+    try:
+        address = urlsplit(url)
+        _ = address.port  # computed here, and may be malformed
+    except ValueError as error:
+        raise ConfigError(f"dataset.folder must be a folder or a URL, got {url!r} ({error})") from None
+    place = (address.netloc + address.path).strip("/")
+    rule = "a folder or a URL with a host or path"  # a data: URL is its own content
+    require(bool(place) and address.scheme != "data", "dataset.folder", rule, url)
 
 
 def write_remote(url: str, name: str, source: Path | bytes) -> None:
@@ -203,7 +216,7 @@ class _Remote(Storage):
             options = {"client_kwargs": client, "use_listings_cache": False}
         try:
             self._files, self._root = fsspec.core.url_to_fs(address, **options)
-        except (ValueError, ImportError) as error:
+        except (ValueError, TypeError, ImportError) as error:
             cause = error.__cause__  # the missing package's error caused fsspec's ImportError
             reason = (isinstance(cause, ModuleNotFoundError) and missing_extra(cause)) or error
             raise ConfigError(

@@ -5,6 +5,7 @@ import dataclasses
 import errno
 import fcntl
 import os
+import re
 import threading
 import urllib.request
 from pathlib import Path
@@ -72,8 +73,18 @@ def test_url_or_folder():
     """URLs are told from folders by their protocol; file:// is a folder."""
     assert is_remote("http://host:1") and is_remote("s3://bucket/data") and is_remote("memory://x")
     assert not is_remote("data/obstacles") and not is_remote(Path("/data")) and not is_remote("file:///data")
-    with pytest.raises(ConfigError, match="must be a folder or a URL that fsspec can read, got 'gopher://host'"):
-        open_storage("gopher://host")
+    for url in (
+        "gopher://host",
+        "http://[::1",
+        "http://h:99999/x",
+        "http://h:x/",
+        "http://",
+        "s3://",
+        "data://x",
+        "jupyter://x",
+    ):
+        with pytest.raises(ConfigError, match=f"dataset.folder must be a folder or a URL.*, got '{re.escape(url)}'"):
+            open_storage(url)
 
 
 def test_service_gives_what_the_folder_holds(folder, serve, cache):
