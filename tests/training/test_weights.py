@@ -163,7 +163,7 @@ def test_an_export_sets_rest_walls_and_obstacles(finished, tmp_path):
     for options, message in (
         ({"checkpoint": checkpoint, "out": out, "rest_threshold": 0.1}, absolute),
         ({"weights": kept, "out": kept, "rest_threshold": 0.1}, absolute),
-        ({"checkpoint": checkpoint, "out": out, "wall_clearance": [0.1, -0.1]}, r"wall_clearance\[1\] must be a fin"),
+        ({"checkpoint": checkpoint, "out": out, "wall_clearance": [0.1, -0.1]}, r"wall_clearance\[1\] must be from 0"),
         *(({"weights": str(file), "onnx": step, name: value}, f"{name} must be null without out, the file that it is")
           for name, value in given),
     ):  # fmt: skip

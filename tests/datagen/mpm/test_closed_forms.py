@@ -128,7 +128,7 @@ def spinning_cube():
     place -= place.mean(axis=0)
     spin, flight = np.array([3.0, 4, 2]), np.array([0.03, 0.02, -0.01])
     scene = particles(place + 0.5, ELASTIC, np.cross(spin, place) + flight, gravity=NO_GRAVITY)
-    x, v, C = states(scene, CONFIG, 91, "position", "velocity", "affine")
+    x, v, C = states(scene, CONFIG, 61, "position", "velocity", "affine")
     inertia = CELL**2 / 4  # of a quadratic B-spline, per mass
     turning = np.stack([C[..., 2, 1] - C[..., 1, 2], C[..., 0, 2] - C[..., 2, 0], C[..., 1, 0] - C[..., 0, 1]], axis=-1)
     angular = (np.cross(x - 0.5, v) + inertia * turning).mean(axis=1)
