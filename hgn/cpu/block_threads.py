@@ -9,7 +9,7 @@ from __future__ import annotations
 import functools
 import os
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from typing import TypeVar
 
@@ -47,8 +47,9 @@ def for_each(work: Callable[[Block], None], blocks: Sequence[Block], threads: in
     try:
         drain()
     finally:
-        for future in futures:
-            future.result()
+        wait(futures)  # after an error too no thread works on
+    for future in futures:
+        future.result()
 
 
 @functools.lru_cache(1)
