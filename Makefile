@@ -52,7 +52,7 @@ demo: $(VENV)/.demo
 	@echo "trained on; above its prediction, below the solver: bodies fall, meet on the obstacle, and spread over the floor alike."
 
 test: setup
-	@echo "about 12 minutes on two free cores; at the end: which tests were skipped, and why (no GPU, no namespaces, ...)"
+	@echo "about 7 minutes on two free cores; at the end: which tests were skipped, and why (no GPU, no namespaces, ...)"
 	$(RUN) -m pytest -n $(TEST_PROCESSES) -rs
 
 # exported packages and all kernels for an H100 are compiled, notebooks run; CI runs these tests after the others
