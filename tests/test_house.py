@@ -16,7 +16,7 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 30_922,
+    "hgn": 30_928,
     "datagen": 8_570,
     "tools": 6_611,
     "tests": 30_247,

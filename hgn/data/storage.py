@@ -106,8 +106,7 @@ def open_storage(folder: Path | str) -> Storage:
     Raises: ConfigError for a URL with an unknown protocol, or whose package is not installed.
     """
     if is_remote(folder):
-        _require_address(str(folder))
-        return _remote(str(folder).rstrip("/"))
+        return _at_url(str(folder))
     return _Folder(local_folder(folder))
 
 
@@ -125,7 +124,7 @@ def _require_address(url: str) -> None:
 
 def write_remote(url: str, name: str, source: Path | bytes) -> None:
     """Writes a file, or bytes, to a data set's URL. Raises: ConfigError if writing fails; UnreachableError."""
-    _remote(url.rstrip("/")).write(name, source)
+    _at_url(url).write(name, source)
 
 
 def dataset_token() -> str | None:
@@ -178,6 +177,11 @@ class _Folder(Storage):
         except FileNotFoundError:
             raise _missing(path) from None
         return path
+
+
+def _at_url(url: str) -> _Remote:
+    _require_address(url)
+    return _remote(url.rstrip("/"))
 
 
 @functools.lru_cache(maxsize=16)

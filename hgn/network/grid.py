@@ -61,6 +61,12 @@ class GridHierarchy:
             cell_N8 = level.parent_C[cell_N8]
         return cell_N8
 
+    def coarsest_sums(self, value_NK: torch.Tensor) -> torch.Tensor:
+        """Returns sums [C, K] of w_pC times the particles' values in the coarsest cells."""
+        value_N8K = self.weight_N8[..., None] * value_NK[:, None]
+        sum_CK = value_NK.new_zeros(self.levels[-1].cell_count, value_NK.shape[1])
+        return sum_CK.index_add(0, self.coarsest_cells.flatten(), value_N8K.flatten(0, 1))
+
     @cached_property
     def coarsest_places(self) -> torch.Tensor:
         """Returns the particles' places relative to the centres of `coarsest_cells`, in cell edges, [N, 8, 3]."""

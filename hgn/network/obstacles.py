@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import numpy as np
 import torch
@@ -51,7 +51,7 @@ class ObstacleCells:
             friction_K=self.friction_K if self.friction_K is None else self.friction_K.to(device),
         )
 
-    @property
+    @cached_property
     def surface_rows(self) -> torch.Tensor:
         """Returns normals and friction [K, 4]."""
         friction_K = torch.zeros_like(self.normal_K3[:, 0]) if self.friction_K is None else self.friction_K

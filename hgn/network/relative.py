@@ -174,9 +174,7 @@ def surface_normals(wall_N6: torch.Tensor, normal_N6: torch.Tensor | None) -> to
 
 def touched_normals(normal_N33: torch.Tensor, grid: GridHierarchy) -> torch.Tensor:
     """Returns P [C, 3, 3]: sums of w_pC times `surface_normals` in a coarsest cell."""
-    normal_N89 = grid.weight_N8[..., None] * normal_N33.flatten(1)[:, None]
-    sum_C9 = normal_N89.new_zeros(grid.levels[-1].cell_count, 9)
-    return sum_C9.index_add(0, grid.coarsest_cells.flatten(), normal_N89.flatten(0, 1)).unflatten(1, (3, 3))
+    return grid.coarsest_sums(normal_N33.flatten(1)).unflatten(1, (3, 3))
 
 
 def slip(normal_C33: torch.Tensor) -> torch.Tensor:

@@ -84,7 +84,7 @@ def packed(megabytes, filters):
 
 
 def zeros(megabytes):
-    """Zeros, compressed a thousandfold: one megabyte's block so many times, and the Adler-32 sum of zeros."""
+    """Zeros, compressed a thousandfold: the block of one megabyte, repeated, and the Adler-32 sum of zeros."""
     packer = zlib.compressobj(9, wbits=-15)
     block = packer.compress(bytes(2**20)) + packer.flush(zlib.Z_FULL_FLUSH)
     return b"\x78\xda" + megabytes * block + b"\3\0" + struct.pack(">HH", megabytes * 2**20 % 65521, 1)

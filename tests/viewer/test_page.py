@@ -123,7 +123,7 @@ def done(page, action):
 
 
 def until_blue(page):
-    """Waits until more than 300 pixels are water's, where the domain is; sliders and buttons beside it are blue too."""
+    """Waits until more than 300 pixels are water's, where the domain is; sliders and buttons are blue too."""
 
     def drawn():
         red, green, blue = np.moveaxis(pixels(page)[100:400, 100:550], -1, 0)
