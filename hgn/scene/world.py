@@ -21,6 +21,7 @@ from hgn.scene.placement import CLEARANCE_CELLS, ROUNDING, Body, Placed, blocked
 from hgn.schema import ConfigError, Vector
 
 DRAWS = 500  # attempts to place one scene
+NEAR_WALL = 0.08  # largest gap between a wall and a body that is placed next to it
 FALLING = (0.0, -9.8, 0.0)
 UNTURNED = (1.0, 0.0, 0.0, 0.0)
 
@@ -30,6 +31,7 @@ DOMAINS: dict[str, tuple[int, int, int]] = {
     "box": (20, 32, 20),
     "tray": (36, 32, 28),
     "flume": (64, 40, 16),
+    "slit": (64, 24, 9),
     "long": (128, 40, 24),
     "tall": (40, 96, 40),
     "room": (64, 64, 64),
@@ -89,12 +91,19 @@ class Layout:
         return self.domain[axis] - self.low
 
     def along(self, axis: int, half: float) -> float:
-        """Draws a coordinate at which a body of half width `half` does not touch the walls. Raises: _DrawAgainError."""
+        """Draws a coordinate at which a body of half width `half` does not touch the walls. Raises: _DrawAgainError.
+
+        A quarter of the coordinates are less than NEAR_WALL from touching a wall.
+        """
         first = self.low + half + ROUNDING
         span = self.high(axis) - half - ROUNDING - first
         if span < 0:
             raise _DrawAgainError
-        return first + span * self.rng.random()
+        part = self.rng.random()
+        if part >= 0.25:
+            return first + span * (part - 0.25) / 0.75
+        gap = min(span, NEAR_WALL * abs(8 * part - 1))
+        return first + gap if part < 0.125 else first + span - gap
 
     def place(self, shape: str, size: float, position: Vector, quaternion: Quaternion = UNTURNED) -> None:
         """Adds an obstacle. Raises: _DrawAgainError if a part of it is outside the domain."""
@@ -125,9 +134,13 @@ class Layout:
         self.regions.append(region)
         self.bodies.append(filled(self.config, shape, region, chosen, np.array(velocity), rng=self.rng))
 
-    def body(self, size: float, centre: Vector, velocity: Vector = (0.0, 0.0, 0.0)) -> None:
+    def body(self, size: float, centre: Vector, velocity: Vector = (0.0, 0.0, 0.0), material: str = "") -> None:
         """Adds a cube or a ball."""
-        self.add(self.one_of("cube", "sphere"), (size, size, size), centre, velocity)
+        self.add(self.one_of("cube", "sphere"), (size, size, size), centre, velocity, material)
+
+    def cube(self, size: float, centre: Vector, material: str) -> None:
+        """Adds a cube at rest."""
+        self.add("cube", (size, size, size), centre, material=material)
 
     def box(self, low: Vector, high: Vector, velocity: Vector = (0.0, 0.0, 0.0), material: str = "") -> None:
         """Adds a box between two corners."""
@@ -156,23 +169,26 @@ def _about_z(tangent: float) -> Quaternion:
 
 def _pool(new: Layout) -> None:
     """Fills the floor from wall to wall, often with water at rest. Gravity may be tilted, or a body falls in."""
-    new.take_domain("small", "box", "tray", "flume")
+    new.take_domain("small", "box", "tray", "flume", "slit")
     top = new.low + new("depth")
     material = "water" if new.chance(0.6) else ""
     new.box((new.low,) * 3, (new.high(0), top, new.high(2)), material=material)
-    if new.chance(0.35):
+    if new.chance(0.5):
         new.tilt_gravity(new("tilt"))
-    if new.chance(0.35):
+    if new.chance(0.3):
         size = new("size")
         height = top + CLEARANCE_CELLS * new.config.cell_size + 0.5 * size + new("height")
         new.body(size, (new.along(0, 0.5 * size), height, new.along(2, 0.5 * size)))
 
 
 def _dam(new: Layout) -> None:
-    """Places a block, mostly of water, at one end of a channel, over its whole width."""
-    new.take_domain("flume", "long", "tray", "small")
+    """Places a block, mostly of water, at one end of a channel, over its whole width. The floor may be wet."""
+    new.take_domain("flume", "slit", "long", "tray", "small")
     far = (new.low + new("length"), new.low + new("height"), new.high(2))
     new.box((new.low,) * 3, far, material="water" if new.chance(0.75) else "")
+    if new.chance(0.25):
+        begin = far[0] + (CLEARANCE_CELLS + 0.5) * new.config.cell_size
+        new.box((begin, new.low, new.low), (new.high(0), new.low + new("wet"), new.high(2)), material="water")
 
 
 def _column(new: Layout) -> None:
@@ -212,7 +228,7 @@ def _slope(new: Layout) -> None:
 
 
 def _edge(new: Layout) -> None:
-    """Drops a body onto the edge of a plate, or past it."""
+    """Drops a body onto the edge of a plate, or past it. Half of the bodies are cubes of snow."""
     new.take_domain("room", "tall")
     plate, size = new("plate"), new("size")
     x, y, z = new.along(0, 0.5 * plate), new.low + new("height"), new.along(2, 0.5 * plate)
@@ -220,16 +236,24 @@ def _edge(new: Layout) -> None:
     side = 1.0 if new.chance(0.5) else -1.0
     edge = x + side * (0.5 * plate + new("beyond"))
     offset = (new.rng.random() - 0.5) * (plate - size)
-    new.body(size, (edge, y + 0.5 * size + new("drop") + ROUNDING, z + offset))
+    centre = (edge, y + 0.5 * size + new("drop", small=True) + ROUNDING, z + offset)
+    if new.chance(0.5):
+        new.cube(size, centre, "snow")
+    else:
+        new.body(size, centre)
 
 
 def _stack(new: Layout) -> None:
-    """Places bodies above one another."""
-    new.take_domain("room", "tall")
-    size = new("size")
+    """Places bodies above one another. Half of the stacks are of cubes of one material, often snow."""
+    new.take_domain("room", "tall", "tray")
+    size, cubes, material = new("size"), new.chance(0.5), "snow" if new.chance(0.6) else new.one_of("snow", "sand")
     x, z, y = new.along(0, size), new.along(2, size), new.low + ROUNDING
     for _ in range(new.count("bodies")):
-        new.body(size, (x + new("shift"), y + 0.5 * size, z + new("shift")))
+        centre = (x + new("shift"), y + 0.5 * size, z + new("shift"))
+        if cubes:
+            new.cube(size, centre, material)
+        else:
+            new.body(size, centre)
         y += size + (CLEARANCE_CELLS + 0.5) * new.config.cell_size
 
 
