@@ -19,7 +19,7 @@ LINES = {  # of Python, in tracked files
     "hgn": 30_961,
     "datagen": 8_570,
     "tools": 6_611,
-    "tests": 30_282,
+    "tests": 30_284,
 }
 SETTINGS = 240  # fields of the dataclasses behind the commands, *Config
 

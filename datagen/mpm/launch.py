@@ -31,7 +31,7 @@ from datagen.mpm.layout import (
 from hgn.config import MpmConfig
 from hgn.scene.emission import entry_frames
 from hgn.scene.material import MATERIAL_BITS, MATERIAL_MASK, MATERIALS, SAND
-from hgn.scene.scene import Scene
+from hgn.scene.scene import Scene, whole_cells
 from hgn.schema import ConfigError
 from hgn.solver_method import MAXIMUM_SUBSTEPS
 
@@ -232,6 +232,9 @@ class Launch(ABC):
             own = slice(self.particle_begin[index], self.particle_begin[index + 1])
             value[index, VALUE.gravity : VALUE.gravity + 3] = scene.gravity
             value[index, VALUE.wall_friction : VALUE.wall_friction + 3] = scene.wall_friction
+            value[index, VALUE.nodes : VALUE.nodes + 3] = whole_cells(scene.domain_size, scene.cell_size)
+            value[index, VALUE.high : VALUE.high + 3] = particle_bounds(scene, self.config)[1]
+            value[index, VALUE.size : VALUE.size + 3] = scene.domain_size
             # water's density comes from mass on the grid; heavier particles nearby would look like compressed water
             alike = (laws[row[own], CONSTANT.mass] == 1).all()
             value[index, VALUE.water_density] = (scene.particles_per_cell or 0.0) if alike else 0.0
@@ -246,7 +249,6 @@ class Launch(ABC):
             for part in range(self.parts)
         ]
         shape = np.zeros(SHAPE.part_begin, np.int32)
-        shape[SHAPE.nodes : SHAPE.nodes + 3] = self.node_counts
         shape[SHAPE.blocks : SHAPE.blocks + 3] = self.blocks
         shape[SHAPE.scene_blocks] = math.prod(self.blocks)
         shape[SHAPE.all_blocks] = self.all_blocks
@@ -258,7 +260,6 @@ class Launch(ABC):
 
     def _settings(self, frame_rate_hz: float) -> np.ndarray:
         config, choices, cell_size = self.config, self.config.choices, self.scenes[0].cell_size
-        low, high = particle_bounds(self.scenes[0], config)
         setting = np.zeros(SETTING.length, np.float32)
         setting[SETTING.cell_size] = cell_size
         setting[SETTING.inverse_cell_size] = 1 / cell_size
@@ -270,9 +271,7 @@ class Launch(ABC):
         setting[SETTING.leapfrog] = choices.time_integration == "leapfrog"
         if choices.water_density_relaxation_s is not None:
             setting[SETTING.density_relaxation] = 1 / choices.water_density_relaxation_s
-        setting[SETTING.low : SETTING.low + 3] = low
-        setting[SETTING.high : SETTING.high + 3] = high
-        setting[SETTING.size : SETTING.size + 3] = self.scenes[0].domain_size
+        setting[SETTING.low] = particle_bounds(self.scenes[0], config)[0][0]
         return setting
 
     def _rates(self, begin: float, end: float) -> list[np.ndarray]:

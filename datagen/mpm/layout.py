@@ -88,7 +88,10 @@ class SceneValue(NamedTuple):
     synchronised: int = 23  # 1 if the interval's first and last substep are half as long as the others, else 0
     whole_step: int = 24  # length of the other substeps, s
     catch_up: int = 25  # time by which strain is behind when an interval begins, s; negative if ahead
-    length: int = 26
+    nodes: int = 26  # 26, 27, 28: numbers of nodes along the axes
+    high: int = 29  # 29, 30, 31: largest coordinates of a particle
+    size: int = 32  # 32, 33, 34: size of the domain
+    length: int = 35
 
 
 class Status(NamedTuple):
@@ -107,26 +110,23 @@ class Setting(NamedTuple):
     fixed_time_step: int = 2  # s; 0 for the adaptive rule
     fixed_substeps: int = 3  # number of substeps a frame, with a fixed time step
     density_relaxation: int = 4  # rate of relaxation of water's J to its density, 1/s
-    low: int = 5  # 5, 6, 7: smallest coordinates of a particle
-    high: int = 8  # 8, 9, 10: largest coordinates
-    size: int = 11  # 11, 12, 13: size of the domain
-    transfer_interval: int = 14  # s; 0 if every substep is a transfer
-    leapfrog: int = 15  # 1 if velocities belong to the middle of an interval, 0 if to its end
-    length: int = 16
+    low: int = 5  # smallest coordinate of a particle on each axis
+    transfer_interval: int = 6  # s; 0 if every substep is a transfer
+    leapfrog: int = 7  # 1 if velocities belong to the middle of an interval, 0 if to its end
+    length: int = 8
 
 
 class Shape(NamedTuple):
     """Positions in the int32 shape of a launch."""
 
-    nodes: int = 0  # 0, 1, 2: along each axis
-    blocks: int = 3  # 3, 4, 5: along each axis
-    scene_blocks: int = 6
-    all_blocks: int = 7  # number of blocks of all scenes
-    wall_cells: int = 8
-    maximum_substeps: int = 9
-    ghosts: int = 10  # nodes of all scenes that sheets hide from particles near them: see collider
-    ghost_begin: int = 11  # first of their second fields in the array of nodes
-    part_begin: int = 12  # first of the following: first particle of each (scene, part), and the end
+    blocks: int = 0  # 0, 1, 2: along each axis, of the largest domain of the launch
+    scene_blocks: int = 3
+    all_blocks: int = 4  # number of blocks of all scenes
+    wall_cells: int = 5
+    maximum_substeps: int = 6
+    ghosts: int = 7  # nodes of all scenes that sheets hide from particles near them: see collider
+    ghost_begin: int = 8  # first of their second fields in the array of nodes
+    part_begin: int = 9  # first of the following: first particle of each (scene, part), and the end
 
 
 class Variant(NamedTuple):

@@ -157,7 +157,7 @@ def node_velocity(
             outward = 0.0
             if index[axis] < wall_cells:
                 outward = -1.0
-            if index[axis] >= arrays.shape[SHAPE.nodes + axis] - wall_cells:
+            if index[axis] >= ti.cast(arrays.scene_value[scene, VALUE.nodes + axis], ti.i32) - wall_cells:
                 outward = 1.0
             if outward != 0.0:
                 normal = ti.Vector([0.0, 0.0, 0.0])
@@ -167,14 +167,15 @@ def node_velocity(
 
 
 @ti.func
-def _room(fx, base: ti.i32, axis: ti.template(), shape: ti.template()) -> ti.f32:
+def _room(fx, base: ti.i32, axis: ti.template(), scene: ti.i32, arrays: ti.template()) -> ti.f32:
     """Returns which part of the splines of a particle's nodes is between an axis's walls, averaged with its weights."""
     w0, w1, w2 = weights(fx)
-    wall = shape[SHAPE.wall_cells]
+    wall = arrays.shape[SHAPE.wall_cells]
+    nodes = ti.cast(arrays.scene_value[scene, VALUE.nodes + axis], ti.i32)
     room = 0.0
     for offset, w in ti.static(((0, w0), (1, w1), (2, w2))):
         # depth in cells within the wall; a node's own spline reaches 1.5 cells
-        depth = ti.min(base + offset - (wall - 1), shape[SHAPE.nodes + axis] - wall - base - offset)
+        depth = ti.min(base + offset - (wall - 1), nodes - wall - base - offset)
         share = 1.0
         if depth == 1:
             share = 47.0 / 48.0
@@ -204,9 +205,9 @@ def settle(x, volume: ti.f32, mass: ti.f32, scene: ti.i32, arrays: ti.template()
     base = ti.floor(scaled - 0.5, ti.i32)
     fx = scaled - ti.cast(base, ti.f32)
     room = (
-        _room(fx[0], base[0], 0, arrays.shape)
-        * _room(fx[1], base[1], 1, arrays.shape)
-        * _room(fx[2], base[2], 2, arrays.shape)
+        _room(fx[0], base[0], 0, scene, arrays)
+        * _room(fx[1], base[1], 1, scene, arrays)
+        * _room(fx[2], base[2], 2, scene, arrays)
     )
     share = arrays.scene_value[scene, VALUE.interval_elapsed] * arrays.setting[SETTING.density_relaxation]
     density = mass / (arrays.scene_value[scene, VALUE.water_density] * ti.max(room, 0.1))
@@ -258,9 +259,9 @@ def move(x, v, C, scene: ti.i32, arrays: ti.template()):
     outside = 0
     clamps = 0
     for axis in ti.static(range(3)):
-        low = arrays.setting[SETTING.low + axis]
-        high = arrays.setting[SETTING.high + axis]
-        if not (out[axis] >= 0.0 and out[axis] <= arrays.setting[SETTING.size + axis]):
+        low = arrays.setting[SETTING.low]
+        high = arrays.scene_value[scene, VALUE.high + axis]
+        if not (out[axis] >= 0.0 and out[axis] <= arrays.scene_value[scene, VALUE.size + axis]):
             outside = 1
         if not out[axis] >= low:
             out[axis] = low

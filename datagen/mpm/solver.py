@@ -63,7 +63,7 @@ def simulate(
 ) -> list[Simulated | SceneFailure]:
     """Simulates `scenes` together, and returns `frames` frames of each, the initial state included.
 
-    Scenes may differ in particles, materials, obstacles and gravity. They share domain and cell size.
+    Scenes may differ in everything but their cell size. The largest domain determines each scene's memory.
     With adaptive time steps particles and grid exchange velocities every dx / transfer_speed_m_s, or every step of
     stress if that is longer. The interval is at most SPEED_FRACTION dx / |v|max. Intervals are equal up to the end of
     the frame. Within them each scene takes its own steps of stress, of at most stability_fraction dx sqrt(rho /
@@ -89,12 +89,11 @@ def simulate(
     require(frame_rate_hz > 0 and math.isfinite(frame_rate_hz), "frame_rate_hz", "a finite number > 0", frame_rate_hz)
     if not scenes:
         return []
-    node_counts = _shared_grid(scenes, config)
-    low, high = particle_bounds(scenes[0], config)
+    node_counts = _largest_grid(scenes, config)
     given, scenes = scenes, [at_entry(scene, frame_rate_hz) for scene in scenes]
     for index, (scene, entered) in enumerate(zip(given, scenes, strict=True)):
         require_free_entries(scene, entered)
-        _require_sound(entered, index, low, high)
+        _require_sound(entered, index, *particle_bounds(scene, config))
     if colliders is None:
         colliders = [build_collider(scene, config.choices.collider_band_cells) for scene in scenes]
     require(len(colliders) == len(scenes), "colliders", f"one for each of {len(scenes)} scenes", len(colliders))
@@ -227,21 +226,23 @@ def _teams_at_once(device: Device, team: Team) -> int:
     return room // team.blocks
 
 
-def _shared_grid(scenes: Sequence[Scene], config: MpmConfig) -> tuple[int, int, int]:
-    first = scenes[0]
-    for index, scene in enumerate(scenes):
-        for name in ("domain_size", "cell_size"):
-            if getattr(scene, name) != getattr(first, name):
-                raise ConfigError(
-                    f"{name} must be the same in all scenes of a batch, got {getattr(scene, name)} in scene {index} "
-                    f"and {getattr(first, name)} in scene 0; simulate them apart"
-                )
-    counts = whole_cells(first.domain_size, first.cell_size)
+def _largest_grid(scenes: Sequence[Scene], config: MpmConfig) -> tuple[int, int, int]:
+    """Returns the largest number of cells along each axis. Raises: ConfigError for other cells, or a small domain."""
+    first, largest = scenes[0], (0, 0, 0)
     smallest = 2 * config.wall_cells + 2
-    for axis, length, cells in zip("xyz", first.domain_size, counts, strict=True):
-        rule = f"at least {smallest} cells: the walls, and two between them"
-        require(cells >= smallest, f"domain_size ({axis})", rule, length)
-    return counts
+    for index, scene in enumerate(scenes):
+        if scene.cell_size != first.cell_size:
+            raise ConfigError(
+                f"cell_size must be the same in all scenes of a batch, got {scene.cell_size} in scene {index} and "
+                f"{first.cell_size} in scene 0; simulate them apart"
+            )
+        counts = whole_cells(scene.domain_size, scene.cell_size)
+        for axis, length, cells in zip("xyz", scene.domain_size, counts, strict=True):
+            rule = f"at least {smallest} cells: the walls, and two between them"
+            require(cells >= smallest, f"domain_size ({axis})", rule, length)
+        x, y, z = (max(pair) for pair in zip(largest, counts, strict=True))
+        largest = (x, y, z)
+    return largest
 
 
 def _require_memory(device: Device, scenes: Sequence[Scene], node_counts: tuple[int, int, int]) -> None:

@@ -22,7 +22,7 @@ from hgn.data.identity import physics_settings
 from hgn.scene.episode import Episode
 from hgn.scene.obstacle_grid import ObstacleGrid
 from hgn.scene.scene import Scene
-from hgn.schema import ConfigError, Vector
+from hgn.schema import ConfigError
 from hgn.system.extras import missing_extra
 from hgn.system.machine import memory_is_full
 
@@ -183,17 +183,16 @@ def simulate_batch(
     threads: int | None,
     reporter: Callable[[int], Callable[[int], None]] | None = None,
 ) -> list[Any]:
-    """Simulates a batch in one launch per episode length and domain. Returns the solver's results.
+    """Simulates a batch in one launch per episode length. Returns the solver's results.
 
     `reporter` maps the number of scenes in a launch to a function that is called with each frame.
     """
     simulate = pkgutil.resolve_name(backend.simulate)
-    launches: dict[tuple[int, Vector], list[MadeScene]] = {}
+    launches: dict[int, list[MadeScene]] = {}
     for made in batch:
-        key = config.dataset.frames_of(made.task.index), made.scene.open().domain_size
-        launches.setdefault(key, []).append(made)
+        launches.setdefault(config.dataset.frames_of(made.task.index), []).append(made)
     results: dict[SceneTask, Any] = {}
-    for (frames, _), launch in sorted(launches.items(), key=lambda item: item[0]):
+    for frames, launch in sorted(launches.items()):
         of_launch = simulate(
             [scene_to_simulate(made.scene.open(), config) for made in launch],
             solver_on_grid(config.mpm, config.reference_cell_size, config.scene.cell_size),

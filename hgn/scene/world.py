@@ -25,7 +25,7 @@ NEAR_WALL = 0.08  # largest gap between a wall and a body that is placed next to
 FALLING = (0.0, -9.8, 0.0)
 UNTURNED = (1.0, 0.0, 0.0, 0.0)
 
-# Edge lengths in cells of 1/64. There are few domains, because only scenes with equal domains share a launch.
+# Edge lengths in cells of 1/64.
 DOMAINS: dict[str, tuple[int, int, int]] = {
     "small": (24, 40, 24),
     "box": (20, 32, 20),

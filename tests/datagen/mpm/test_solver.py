@@ -85,10 +85,11 @@ def test_materials_a_thousand_times_as_stiff_beside_each_other():
 
 
 def test_scenes_of_a_batch_equal_scenes_alone():
-    """A scene's trajectory is bitwise the same alone and beside scenes of other size, material, obstacles and steps;
-    water's also with a kernel for water only, on two threads.
+    """A scene's trajectory is bitwise the same alone and beside scenes of other size, material, obstacles, domain and
+    steps; water's also with a kernel for water only, on two threads. In its small domain it meets the far wall.
     """
-    water = block(WATER, (0.4, 0.2, 0.4), (0.5, 0.3, 0.5), (1, -3, 0))
+    water = block(WATER, (0.4, 0.2, 0.4), (0.5, 0.3, 0.5), (4, -3, 0))
+    water = dataclasses.replace(water, domain_size=(14 * CELL, 26 * CELL, 20 * CELL))
     snow = block(SNOW, (0.4, 0.45, 0.4), (0.55, 0.6, 0.5), (0, -4, 0), seed=1, obstacles=(sheet(0.3),))
     scenes = [water, snow, joined(block(SAND, (0.3, 0.2, 0.3), (0.4, 0.3, 0.4)), water)]
     steps = (0.5, 1.0, 0.25)
@@ -99,6 +100,7 @@ def test_scenes_of_a_batch_equal_scenes_alone():
             (alone,) = simulate([scenes[index]], config, 7, 60.0)
         assert np.array_equal(alone.position_TN3, together[index].position_TN3)
         assert alone.counters == together[index].counters
+    assert 0.65 < together[0].position_TN3[..., 0].max() < 11 * CELL
 
 
 @pytest.mark.parametrize(
