@@ -123,15 +123,9 @@ def _project_sand(log_strain, volume: ti.f32, law: ti.template(), row: ti.i32, s
 
 @ti.func
 def foreseen_stiffness(
-    C,
-    volume: ti.f32,
-    material: ti.i32,
-    time: ti.f32,
-    inverse_dx: ti.f32,
-    law: ti.template(),
-    row: ti.i32,
+    C, volume: ti.f32, material: ti.i32, time: ti.f32, inverse_dx: ti.f32, law: ti.template(), row: ti.i32,
     variant: ti.template(),
-) -> ti.f32:
+) -> ti.f32:  # fmt: skip
     """Returns (3 lambda + 2 mu) / density of a particle after `time` with the velocity gradient C.
 
     For elastic solids it returns 1e30 / density, because only a decomposition would give their stretch. So they never
@@ -158,16 +152,9 @@ def foreseen_stiffness(
 
 @ti.func
 def solid(
-    F,
-    volume: ti.f32,
-    material: ti.i32,
-    law: ti.template(),
-    row: ti.i32,
-    counter: ti.template(),
-    scene: ti.i32,
-    variant: ti.template(),
-    step: ti.f32,
-):
+    F, volume: ti.f32, material: ti.i32, law: ti.template(), row: ti.i32, counter: ti.template(), scene: ti.i32,
+    variant: ti.template(), step: ti.f32,
+):  # fmt: skip
     """Returns new F, new volume, Kirchhoff stress and present stiffness of sand, snow and elastic solids from trial F.
 
     At rest shape the stiffness is 3 lambda + 2 mu. Elastic solids are fixed corotated (Stomakhin et al. 2012), tau =

@@ -175,31 +175,13 @@ def _grid_to_particle(p: ti.i32, scene: ti.i32, arrays: ti.template(), is_water:
 
 @ti.kernel
 def substep(
-    position: Vectors,
-    velocity: Vectors,
-    affine: Matrices,
-    deformation: Matrices,
-    volume: Scalars,
-    strained: Scalars,
-    covered: Scalars,
-    spread: Integers,
-    response: Matrices,
-    label: Integers,
-    law_row: Integers,
-    hidden: Integers,
-    scene_value: ti.types.ndarray(dtype=ti.f32, ndim=2),
-    counter: ti.types.ndarray(dtype=ti.i64, ndim=2),
-    setting: Scalars,
-    law: Scalars,
-    shape: Integers,
-    node: Nodes,
-    gain: Nodes,
-    fallen: Scalars,
-    block: Integers,
-    contact: Integers,
-    contact_normal: Vectors,
+    position: Vectors, velocity: Vectors, affine: Matrices, deformation: Matrices, volume: Scalars,
+    strained: Scalars, covered: Scalars, spread: Integers, response: Matrices, label: Integers, law_row: Integers,
+    hidden: Integers, scene_value: ti.types.ndarray(dtype=ti.f32, ndim=2),
+    counter: ti.types.ndarray(dtype=ti.i64, ndim=2), setting: Scalars, law: Scalars, shape: Integers, node: Nodes,
+    gain: Nodes, fallen: Scalars, block: Integers, contact: Integers, contact_normal: Vectors,
     variant: ti.template(),
-):
+):  # fmt: skip
     """Advances every scene with remaining time by one substep of its own length.
 
     Particles that enter later belong to an additional row of scene_value, which never has time.
@@ -311,15 +293,9 @@ def substep(
 
 @ti.kernel
 def start(
-    velocity: Vectors,
-    affine: Matrices,
-    deformation: Matrices,
-    volume: Scalars,
-    label: Integers,
-    law_row: Integers,
-    counter: ti.types.ndarray(dtype=ti.i64, ndim=2),
-    law: Scalars,
-):
+    velocity: Vectors, affine: Matrices, deformation: Matrices, volume: Scalars, label: Integers, law_row: Integers,
+    counter: ti.types.ndarray(dtype=ti.i64, ndim=2), law: Scalars,
+):  # fmt: skip
     """Writes undeformed particles, and the maxima for the first time step."""
     for p in range(velocity.shape[0]):
         scene = label[p] >> MATERIAL_BITS
@@ -335,16 +311,10 @@ def start(
 
 @ti.kernel
 def enter(
-    which: Integers,
-    own_label: Integers,
-    velocity: Vectors,
-    label: Integers,
-    law_row: Integers,
-    scene_value: ti.types.ndarray(dtype=ti.f32, ndim=2),
-    counter: ti.types.ndarray(dtype=ti.i64, ndim=2),
-    setting: Scalars,
-    law: Scalars,
-):
+    which: Integers, own_label: Integers, velocity: Vectors, label: Integers, law_row: Integers,
+    scene_value: ti.types.ndarray(dtype=ti.f32, ndim=2), counter: ti.types.ndarray(dtype=ti.i64, ndim=2),
+    setting: Scalars, law: Scalars,
+):  # fmt: skip
     """Adds particles to their scenes between two intervals.
 
     Their velocities are given for the present time, and converted to the middle of the last interval (leapfrog).

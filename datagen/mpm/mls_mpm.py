@@ -108,16 +108,9 @@ def respond(
 
 @ti.func
 def node_velocity(
-    before,
-    momentum,
-    mass: ti.f32,
-    local: ti.i32,
-    facing: ti.i32,
-    corner: ti.i32,
-    fall,
-    scene: ti.i32,
+    before, momentum, mass: ti.f32, local: ti.i32, facing: ti.i32, corner: ti.i32, fall, scene: ti.i32,
     arrays: ti.template(),
-):
+):  # fmt: skip
     """Returns the new velocity of a node's field: `before` + `momentum` / `mass` + `fall` after colliders and walls.
 
     `momentum` is the sum of contributions, and `fall` the change by gravity. The result is 0 for a mass that is only

@@ -113,20 +113,9 @@ def acts(covered: ti.f32, begins: ti.f32, step: ti.f32, scene: ti.i32, scene_val
 
 @ti.func
 def own_step(
-    strained: ti.f32,
-    covered: ti.f32,
-    spread: ti.i32,
-    x,
-    C,
-    volume: ti.f32,
-    material: ti.i32,
-    row: ti.i32,
-    begins: ti.f32,
-    step: ti.f32,
-    scene: ti.i32,
-    arrays: ti.template(),
-    marks: ti.i32,
-):
+    strained: ti.f32, covered: ti.f32, spread: ti.i32, x, C, volume: ti.f32, material: ti.i32, row: ti.i32,
+    begins: ti.f32, step: ti.f32, scene: ti.i32, arrays: ti.template(), marks: ti.i32,
+):  # fmt: skip
     """Computes the particle's own step that begins in this substep (see acts). Times are in s since the interval began.
 
     strained   end of the strain of the steps before; negative before the first step

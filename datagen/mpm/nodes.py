@@ -36,14 +36,9 @@ def base_node(x, inverse_dx: ti.f32):
 
 @ti.func
 def mark(
-    x,
-    scene: ti.i32,
-    inverse_dx: ti.f32,
-    arrays: ti.template(),
-    list_begin: ti.i32,
-    length: ti.template(),
+    x, scene: ti.i32, inverse_dx: ti.f32, arrays: ti.template(), list_begin: ti.i32, length: ti.template(),
     length_at: ti.i32,
-):
+):  # fmt: skip
     """Adds the blocks of a particle's nodes, up to eight, to a list.
 
     `block` begins with a flag for each of the all_blocks blocks of all scenes. The list of touched blocks' indices

@@ -125,16 +125,9 @@ def _first_crossing(
 
 @ti.func
 def stop_at_surface(
-    x,
-    out,
-    v,
-    list_at: ti.i32,
-    elapsed: ti.f32,
-    interval: ti.f32,
-    scene: ti.i32,
-    arrays: ti.template(),
+    x, out, v, list_at: ti.i32, elapsed: ti.f32, interval: ti.f32, scene: ti.i32, arrays: ti.template(),
     moving: ti.template(),
-):
+):  # fmt: skip
     """Returns the end of a particle's path from x to out, and its velocity there.
 
     A triangle in the path stops motion through it. The particle slides along it with the velocity that friction leaves.

@@ -80,16 +80,9 @@ TeamArrays = namedtuple(
 
 @ti.func
 def _strain(
-    share: ti.template(),
-    thread: ti.template(),
-    particles: ti.i32,
-    tags: ti.i32,
-    step: ti.f32,
-    begins: ti.f32,
-    own_steps: ti.i32,
-    some_wait: ti.i32,
-    arrays: ti.template(),
-):
+    share: ti.template(), thread: ti.template(), particles: ti.i32, tags: ti.i32, step: ti.f32, begins: ti.f32,
+    own_steps: ti.i32, some_wait: ti.i32, arrays: ti.template(),
+):  # fmt: skip
     """Computes the materials' response of particles that act in this substep, and writes it over C.
 
     It uses the gradient of the nodes' velocities, but C in the first step of an interval. In this step it also marks
@@ -201,43 +194,15 @@ def _move(share: ti.template(), thread: ti.template(), particles: ti.i32, tags: 
 
 @ti.kernel
 def advance(
-    frames: ti.i32,
-    stretch: ti.i32,
-    teams: ti.i32,
-    blocks: ti.i32,
-    patience: ti.i32,
-    frame_s: ti.f32,
-    state_address: ti.u64,
-    node_address: ti.u64,
-    node_entries: ti.i32,
-    tag: Integers,
-    rank: Integers,
-    strained: Scalars,
-    covered: Scalars,
-    spread: Integers,
-    response: Scalars,
-    hidden: Integers,
-    cell_count: Integers,
-    column_count: Integers,
-    column_list: Integers,
-    block: Integers,
-    live: Integers,
-    columns: Integers,
-    meeting: Integers,
-    turn: Integers,
-    scene_value: ti.types.ndarray(dtype=ti.f32, ndim=2),
-    counter: ti.types.ndarray(dtype=ti.i64, ndim=2),
-    setting: Scalars,
-    law: Scalars,
-    shape: Integers,
-    contact: Integers,
-    contact_normal: Vectors,
-    output: Scalars,
-    variant: ti.template(),
-    threads: ti.template(),
-    several: ti.template(),
-    run: ti.template(),
-):
+    frames: ti.i32, stretch: ti.i32, teams: ti.i32, blocks: ti.i32, patience: ti.i32, frame_s: ti.f32,
+    state_address: ti.u64, node_address: ti.u64, node_entries: ti.i32, tag: Integers, rank: Integers,
+    strained: Scalars, covered: Scalars, spread: Integers, response: Scalars, hidden: Integers,
+    cell_count: Integers, column_count: Integers, column_list: Integers, block: Integers, live: Integers,
+    columns: Integers, meeting: Integers, turn: Integers, scene_value: ti.types.ndarray(dtype=ti.f32, ndim=2),
+    counter: ti.types.ndarray(dtype=ti.i64, ndim=2), setting: Scalars, law: Scalars, shape: Integers,
+    contact: Integers, contact_normal: Vectors, output: Scalars, variant: ti.template(), threads: ti.template(),
+    several: ti.template(), run: ti.template(),
+):  # fmt: skip
     """Advances every scene by `frames` frames, and writes each frame's positions to output[frame, particle, axis].
 
     Each of `teams` teams has `blocks` blocks of `threads` threads. It computes `stretch` frames of one scene, then of
@@ -382,17 +347,9 @@ def advance(
 
 @ti.kernel
 def start_team(
-    state: Scalars,
-    tag: Integers,
-    position: Scalars,
-    velocity: Scalars,
-    label: Integers,
-    law_row: Integers,
-    order: Integers,
-    counter: ti.types.ndarray(dtype=ti.i64, ndim=2),
-    law: Scalars,
-    fields: ti.template(),
-):
+    state: Scalars, tag: Integers, position: Scalars, velocity: Scalars, label: Integers, law_row: Integers,
+    order: Integers, counter: ti.types.ndarray(dtype=ti.i64, ndim=2), law: Scalars, fields: ti.template(),
+):  # fmt: skip
     """Writes undeformed particles into the first copy, order[p] at p, and the maxima for the first time step."""
     for p in range(label.shape[0]):
         stride = label.shape[0]

@@ -97,14 +97,9 @@ def start_lists(thread: ti.template(), columns: ti.template()):
 
 @ti.func
 def gives_now(
-    p: ti.i32,
-    share: ti.template(),
-    step: ti.f32,
-    particles: ti.i32,
-    stride: ti.i32,
-    some_wait: ti.i32,
+    p: ti.i32, share: ti.template(), step: ti.f32, particles: ti.i32, stride: ti.i32, some_wait: ti.i32,
     arrays: ti.template(),
-) -> ti.i32:
+) -> ti.i32:  # fmt: skip
     """Returns whether a particle begins its own step. It writes the particle's entry in `giving`.
 
     It also marks a particle that continues its step. The block's particles keep their order.

@@ -81,13 +81,9 @@ def _cell(x, scene: ti.i32, arrays: ti.template()) -> ti.i32:
 
 @ti.func
 def sort(
-    share: ti.template(),
-    thread: ti.template(),
-    copy: ti.i32,
-    meetings: ti.template(),
-    arrays: ti.template(),
+    share: ti.template(), thread: ti.template(), copy: ti.i32, meetings: ti.template(), arrays: ti.template(),
     fields: ti.template(),
-):
+):  # fmt: skip
     """Copies all particles to the other copy in the order of their columns. It ends with a meeting of the team."""
     own = thread.lane
     while own < share.owned:

@@ -94,15 +94,9 @@ def _particle(entry: ti.i32) -> ti.i32:
 
 @ti.func
 def scatter(
-    share: ti.template(),
-    thread: ti.template(),
-    particles: ti.i32,
-    tags: ti.i32,
-    begins: ti.f32,
-    own_steps: ti.i32,
-    step: ti.f32,
-    arrays: ti.template(),
-):
+    share: ti.template(), thread: ti.template(), particles: ti.i32, tags: ti.i32, begins: ti.f32, own_steps: ti.i32,
+    step: ti.f32, arrays: ti.template(),
+):  # fmt: skip
     """Adds the contributions of particles to their 27 nodes: momentum and mass.
 
     In later steps of an interval only particles in team_lists contribute, and only the impulse of forces. A thread sums
@@ -226,22 +220,10 @@ def _write_node(place: ti.i32, velocities: ti.i32, v, mass: ti.f32, ends: ti.i32
 
 @ti.func
 def _update(
-    place: ti.i32,
-    facing: ti.i32,
-    gain,
-    mass: ti.f32,
-    before,
-    velocities: ti.i32,
-    local: ti.i32,
-    corner: ti.i32,
-    scene: ti.i32,
-    begins: ti.f32,
-    ends: ti.i32,
-    gravity_time: ti.f32,
-    lead: ti.f32,
-    fallen: ti.f32,
+    place: ti.i32, facing: ti.i32, gain, mass: ti.f32, before, velocities: ti.i32, local: ti.i32, corner: ti.i32,
+    scene: ti.i32, begins: ti.f32, ends: ti.i32, gravity_time: ti.f32, lead: ti.f32, fallen: ti.f32,
     arrays: ti.template(),
-):
+):  # fmt: skip
     ahead = before[MASS] - fallen if begins == 0.0 else 0.0
     fall = falls(gravity_time + lead - ahead, scene, arrays.scene_value)
     v = node_velocity(_vector(before), gain, mass, local, facing, corner, fall, scene, arrays)
@@ -250,18 +232,9 @@ def _update(
 
 @ti.func
 def update_nodes(
-    thread: ti.template(),
-    scene: ti.i32,
-    begins: ti.f32,
-    ends: ti.i32,
-    some_wait: ti.i32,
-    now: ti.i32,
-    whole_step: ti.f32,
-    left: ti.f32,
-    gravity_time: ti.f32,
-    fallen: ti.f32,
-    arrays: ti.template(),
-):
+    thread: ti.template(), scene: ti.i32, begins: ti.f32, ends: ti.i32, some_wait: ti.i32, now: ti.i32,
+    whole_step: ti.f32, left: ti.f32, gravity_time: ti.f32, fallen: ti.f32, arrays: ti.template(),
+):  # fmt: skip
     """Computes new velocities of the nodes of all touched blocks; within an interval only of blocks with changes."""
     block_list = arrays.shape[SHAPE.all_blocks] + scene * arrays.shape[SHAPE.scene_blocks]
     count = arrays.live[scene * LIVE.length + LIVE.blocks] * BLOCK_NODES
