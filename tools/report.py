@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from hgn.schema import FileName, to_mapping
-from hgn.system.files import WRITTEN_BY_HGN
+from hgn.system.files import WRITTEN_BY_HGN, write_json
 from hgn.system.provenance import provenance, without_folders
 
 if TYPE_CHECKING:
@@ -34,6 +34,20 @@ class ReportConfig:
 def meta_of(config: Any, device: torch.device | str = "cpu") -> dict[str, Any]:
     """Returns the provenance and the options of the command."""
     return provenance(device) | {"config": without_folders(to_mapping(config))}
+
+
+def write_report(file: str, content: Any) -> None:
+    """Writes a report's JSON atomically, and makes a missing folder. NaN and infinity become null."""
+    write_json(file, finite(content), allow_nan=False)
+
+
+def finite(value: Any) -> Any:
+    """Returns mappings, lists and numbers with None in place of NaN and infinity."""
+    if isinstance(value, dict):
+        return {key: finite(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [finite(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[Any]], width: int = 100) -> str:

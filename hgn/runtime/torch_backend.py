@@ -36,7 +36,6 @@ class Backend:
         self.device = next(network.parameters()).device
         self.precisions = precisions_to_try(precision, self.device, self.name)
         self.precision = self.precisions[0]
-        self.growths = 0  # number of times that buffers grew, in all rollouts
         if self.device.type == "cpu":
             keep_freed_memory()
 

@@ -33,11 +33,9 @@ class TritonBackend(Backend):
         stepper = self._idle_stepper(state, capacity)
         if stepper is None:
             stepper = self._new_stepper(state, capacity)
-        before = stepper.growths
         try:
             yield stepper
         finally:
-            self.growths += stepper.growths - before
             self.idle.pop(state.scene_count, None)
             if len(self.idle) == IDLE_STEPPERS:
                 del self.idle[next(iter(self.idle))]

@@ -5,7 +5,6 @@ An interrupted run leaves a valid file with all that was measured.
 
 from __future__ import annotations
 
-import math
 import sys
 import time
 import traceback
@@ -17,13 +16,14 @@ import torch
 
 from hgn.scene.episode import Episode
 from hgn.schema import ConfigError
-from hgn.system.files import write_atomically, write_json
+from hgn.system.files import write_atomically
 from hgn.system.progress import bar
 from tools.error_vs_time.contenders import Contender
 from tools.error_vs_time.paired import paired_rows
 from tools.error_vs_time.plot import draw_frames, draw_pareto
 from tools.error_vs_time.score import label, score
 from tools.error_vs_time.settings import UNTIMED, ErrorVsTimeConfig
+from tools.report import finite, write_report
 from tools.timing import Stopwatch
 
 START_FRACTION, ROUND_FRACTION = 0.85, 0.95  # of the seconds given, until which contenders and rounds may start
@@ -90,9 +90,9 @@ class Run:
         """Writes the JSON, and with `drawn` the figures. NaN becomes null."""
         self.meta["not_timed"] = [label(row) for row in self.rows if is_untimed(row)]
         self.meta["seconds"] = time.monotonic() - self.started
-        rows = _without_nan(self.rows)
+        rows = finite(self.rows)
         paired = paired_rows(self.rows) if drawn else []
-        write_json(self.file, {"meta": self.meta, "rows": rows, "paired": paired}, allow_nan=False)
+        write_report(self.file, {"meta": self.meta, "rows": rows, "paired": paired})
         if drawn:
             draw(self.out, rows, self.meta)
             self._drawn = time.monotonic()
@@ -147,11 +147,3 @@ def draw(out: str, rows: Sequence[Row], meta: dict[str, Any]) -> list[str]:
     for file, picture in files.items():
         write_atomically(Path(file), picture)
     return list(files)
-
-
-def _without_nan(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _without_nan(item) for key, item in value.items()}
-    if isinstance(value, list):
-        return [_without_nan(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from tools.report import finite
 from tools.stability.case import Case, Limit, Outcome
 from tools.stability.measures import MEASURES
 from tools.stability.observables import series
@@ -18,27 +19,26 @@ def row_of(outcome: Outcome, more: dict[str, Any]) -> Row:
     """Measures an outcome and compares the figures with the case's limits."""
     case, solver = outcome.case, outcome.solver
     causes = [trial.cause for trial in outcome.trials if trial.cause is not None]
-    finite = all(bool(np.isfinite(trial.position_TN3).all()) for trial in outcome.trials)
+    all_finite = all(bool(np.isfinite(trial.position_TN3).all()) for trial in outcome.trials)
     names = dict.fromkeys([limit.measure.partition(".")[0] for limit in case.limits] + list(case.also))
     if case.reported is not None and causes:  # closed forms need complete trajectories
         names = {}
     figures = {name: MEASURES[name](outcome) for name in names}
     references = {name: MEASURES[name](solver) for name in names} if solver is not None else {}
     failure = causes[0] if causes else None
-    if failure is None and not finite:
+    if failure is None and not all_finite:
         failure = "positions are not finite, and the runtime did not report it"
     for limit in case.limits if failure is None else ():
         failure = failure or violation(limit, figures, references, solver is not None)
     count = sum(len(scene.position_N3) for scene in outcome.scenes)
     row: dict[str, Any] = {"particles": count, "scenes": len(outcome.scenes)}
     row |= {"domain_size": list(outcome.scenes[0].domain_size), "failed_scenes": len(causes)}
-    row["guard"] = "missed" if not finite else "raised" if causes else "not needed"
-    row |= {name: _finite(value) for name, value in figures.items()}
-    row |= {f"solver_{name}": _finite(value) for name, value in references.items()} | more
+    row["guard"] = "missed" if not all_finite else "raised" if causes else "not needed"
+    row |= figures | {f"solver_{name}": value for name, value in references.items()} | more
     predicted, measured = case.frames, min(trial.frame_count for trial in outcome.trials)
     if case.reported is None:
         return Row(case.name, predicted, measured, failure is None, failure or "nothing seen", row)
-    value = "diverged" if causes else _finite(figures[case.reported])
+    value = "diverged" if causes else finite(figures[case.reported])
     value = "not finite" if value is None else value
     return Row(case.name, _bound(case), value, failure is None, failure or "within all limits", row)
 
@@ -62,7 +62,7 @@ def gallery_rows(outcome: Outcome, more: dict[str, Any]) -> list[Row]:
     for bound, solver in zip(gallery.measure.bounds, case.references, strict=True):
         low, high = bound.interval(solver)
         about: dict[str, Any] = {"scene": case.name, "kind": gallery.measure.kind, "observable": bound.of}
-        about |= {"low": _finite(low), "high": _finite(high), "solver": _finite(solver)} | more
+        about |= {"low": low, "high": high, "solver": solver} | more
         name, predicted = f"{case.name}: {bound.label}", interval_text(low, high)
         if cause is not None:
             rows.append(Row(name, predicted, "diverged", False, cause, about))
@@ -116,7 +116,3 @@ def interval_text(low: float, high: float) -> str:
     if low == -math.inf:
         return f"at most {high:.3g}"
     return f"at least {low:.3g}" if high == math.inf else f"{low:.3g} to {high:.3g}"
-
-
-def _finite(value: Any) -> Any:
-    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -9,7 +9,7 @@ from __future__ import annotations
 import copy
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -128,7 +128,6 @@ class Runner:
 
     def __init__(self, simulator: Simulator, cases: Sequence[Case], mpm: MpmConfig | None) -> None:
         self.simulator, self.mpm = simulator, mpm
-        self.compiled = _compiled_kernels(simulator.backend.name)
         self._upright: dict[int, list[RolloutResult]] = {}
         self._solved: dict[int, RolloutResult] = {}  # by the scene's id
         self._to_solve: dict[tuple[int, Vector], dict[int, Scene]] = {}  # by frames and domain, then id
@@ -138,8 +137,7 @@ class Runner:
 
     def rows(self, case: Case) -> list[Row]:
         """Returns a case's rows, one but for gallery scenes."""
-        backend, clock = self.simulator.backend, FrameClock()
-        started, growths, compiled = time.monotonic(), backend.growths, self.compiled()
+        started, clock = time.monotonic(), FrameClock()
         try:
             initial = [InitialState.of_scene(scene) for scene in case.scenes]
             trials = simulate_scenes(self.simulator, initial, case.frames, clock)
@@ -152,9 +150,8 @@ class Runner:
             solver = Outcome(case, initial, self._solver(case.scenes, case.frames), self.simulator)
         if case.upright:
             upright = self._straight(case), self._solver(case.upright, case.frames)
-        more: dict[str, Any] = {"growths": backend.growths - growths, "kernels_compiled": self.compiled() - compiled}
+        more: dict[str, Any] = {"seconds": time.monotonic() - started}
         more |= {"ms": clock.milliseconds()} if case.reported is None else {}
-        more["seconds"] = time.monotonic() - started
         outcome = Outcome(case, initial, trials, self.simulator, solver, upright)
         return gallery_rows(outcome, more) if case.gallery else [row_of(outcome, more)]
 
@@ -172,16 +169,6 @@ class Runner:
                 trials = solver_trials(list(pending.values()), self.mpm, frames, self.simulator.frame_rate_hz)
                 self._solved |= dict(zip(pending, trials, strict=True))
         return [self._solved[id(scene)] for scene in scenes]
-
-
-def _compiled_kernels(backend: str) -> Callable[[], int]:
-    """Returns a counter of kernels that were compiled in this process; each delays a simulation by about a second."""
-    if backend != "triton":
-        return lambda: 0
-    from hgn.kernels.triton_compat import JitMisses
-
-    misses = JitMisses()
-    return lambda: misses.count
 
 
 def guard_row(simulator: Simulator, config: SceneConfig) -> Row:

@@ -7,7 +7,6 @@ from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
-from hgn.system.files import write_json
 from tools import report
 
 
@@ -48,7 +47,7 @@ class Report:
         """Writes the JSON, if a file was given."""
         if self.file is not None:
             rows = [{"part": self.part} | _mapping(row) for row in self.rows]
-            write_json(self.file, {"meta": self.meta, "rows": rows} | self.more, allow_nan=False)
+            report.write_report(self.file, {"meta": self.meta, "rows": rows} | self.more)
 
 
 def table(rows: Sequence[Row]) -> str:
