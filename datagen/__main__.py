@@ -5,20 +5,19 @@ from __future__ import annotations
 from typing import Any
 
 from datagen.generate import StopSignal, datagen_config, generate
-from datagen.pool.progress import PROGRESS_KINDS, make_progress
+from datagen.pool.progress import make_progress
 from datagen.pool.worker import Backend
 from hgn.command import run_command
-from hgn.schema import require
 
 
 def main(mapping: dict[str, Any], backend: Backend | None = None) -> int:
     """Runs the generator on a composed config. The exit code is 0, or 128 + the signal that stopped it."""
     kind = mapping.get("progress", "bar")
-    require(kind in PROGRESS_KINDS, "progress", f"one of {', '.join(PROGRESS_KINDS)}", kind)
+    progress = make_progress(kind)
     config = datagen_config(mapping)
     with StopSignal() as stop:
         # a training that waits for the first episodes reads progress=json
-        finished = generate(config, make_progress(kind), stop.requested, backend, early=kind == "json")
+        finished = generate(config, progress, stop.requested, backend, early=kind == "json")
     return 0 if finished else 128 + (stop.signal or 0)
 
 

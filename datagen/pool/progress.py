@@ -9,7 +9,8 @@ from typing import Any, TextIO
 
 from tqdm import tqdm
 
-PROGRESS_KINDS = ("bar", "json", "off")
+from hgn.schema import require
+
 _SPARSE_SECONDS = 30.0  # interval between lines if stderr is not a terminal
 
 
@@ -99,10 +100,6 @@ class BarProgress(Progress):
 class JsonProgress(Progress):
     """Writes one JSON object per line to standard output, each with an `event`."""
 
-    def __init__(self, stream: TextIO | None = None) -> None:
-        self._stream = stream or sys.stdout
-        self._done = self._total = 0
-
     def start(self, done: int, total: int, frames: int) -> None:
         self._done, self._total = done, total
         self._write("start", done=done, total=total, frames=frames)
@@ -125,9 +122,11 @@ class JsonProgress(Progress):
         self._write("message", text=text)
 
     def _write(self, event: str, **values: Any) -> None:
-        print(json.dumps({"event": event, "time_s": round(time.time(), 3), **values}), file=self._stream, flush=True)
+        print(json.dumps({"event": event, "time_s": round(time.time(), 3), **values}), flush=True)
 
 
 def make_progress(kind: str) -> Progress:
-    """Returns the reporter for `progress=bar|json|off`."""
-    return {"bar": BarProgress, "json": JsonProgress, "off": Progress}[kind]()
+    """Returns the reporter for `progress=bar|json|off`. Raises: ConfigError for another one."""
+    kinds = {"bar": BarProgress, "json": JsonProgress, "off": Progress}
+    require(kind in kinds, "progress", f"one of {', '.join(kinds)}", kind)
+    return kinds[kind]()

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from datagen.generate import StopSignal, datagen_config, require_local_folder
-from datagen.pool.progress import PROGRESS_KINDS, make_progress
+from datagen.pool.progress import make_progress
 from datagen.pool.worker import Backend
 from datagen.service.health import HealthPage
 from datagen.service.log import UnhurriedLog
@@ -24,7 +24,7 @@ from hgn.command import run_command
 from hgn.data.identity import require_same_dataset
 from hgn.data.manifest import MANIFEST_NAME, Manifest
 from hgn.data.storage import TOKEN_VARIABLE, dataset_token
-from hgn.schema import ConfigError, Port, Positive, from_mapping, require, require_bounds
+from hgn.schema import ConfigError, Port, Positive, from_mapping, require_bounds
 from hgn.system.machine import allow_open_files
 
 _OPEN_FILES = 65536
@@ -46,8 +46,7 @@ class ServiceConfig:
 
 def main(mapping: dict[str, Any], backend: Backend | None = None) -> int:
     """Serves until it is stopped. The exit code is 128 + the signal."""
-    kind = mapping.get("progress", "bar")
-    require(kind in PROGRESS_KINDS, "progress", f"one of {', '.join(PROGRESS_KINDS)}", kind)
+    progress = make_progress(mapping.get("progress", "bar"))
     config = datagen_config(mapping, _SERVICE_KEYS)
     service = from_mapping(ServiceConfig, {key: mapping[key] for key in _SERVICE_KEYS if key in mapping})
     require_local_folder(config)
@@ -64,7 +63,6 @@ def main(mapping: dict[str, Any], backend: Backend | None = None) -> int:
         # this import takes a second, and the pool's processes, which import this file, do not need it
         from datagen.service.server import make_app, make_server, telling
 
-        progress = make_progress(kind)
         with Supervisor(config, progress, backend) as supervisor:
             app = make_app(
                 folder, token, lambda: replace(supervisor.state, log_error=log.error or supervisor.state.log_error)
