@@ -16,10 +16,10 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 30_961,
-    "datagen": 8_570,
-    "tools": 6_611,
-    "tests": 30_284,
+    "hgn": 30_958,
+    "datagen": 8_414,
+    "tools": 6_510,
+    "tests": 30_291,
 }
 SETTINGS = 240  # fields of the dataclasses behind the commands, *Config
 
