@@ -118,10 +118,13 @@ def _exit_code(main: Main | str, config_name: str) -> int:
 
 
 def _is_own_fault(error: OSError) -> bool:
-    """Returns whether this program caused an error: a missing file in a folder that is there, and is no link."""
+    """Returns whether this program caused an error: a missing file in a folder that is there, and is no link.
+
+    Folders without blocks, such as /proc, take no new files.
+    """
     if isinstance(error, FileNotFoundError) and error.filename is not None:
         path = Path(os.fsdecode(error.filename))
-        return path.parent.is_dir() and not path.is_symlink()
+        return path.parent.is_dir() and not path.is_symlink() and os.statvfs(path.parent).f_blocks > 0
     return isinstance(error, BrokenPipeError)
 
 

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import argparse
 import codecs
 import importlib
 import itertools
@@ -49,6 +50,7 @@ def compose(folder: Path, config_name: str, arguments: list[str], complete: bool
     from omegaconf import OmegaConf
     from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
+    _check_options(arguments[1:])
     _check_chosen_files(folder, arguments[1:])
     arguments = [arguments[0], *(_override(argument, folder) for argument in arguments[1:])]
     given, full_error = sys.argv, os.environ.get("HYDRA_FULL_ERROR")
@@ -63,6 +65,8 @@ def compose(folder: Path, config_name: str, arguments: list[str], complete: bool
             with registered_dataclasses(folder, config_name), initialize_config_dir(str(folder), version_base="1.3"):
                 composed.append(compose_once(config_name, arguments[1:]))
         plain = [OmegaConf.to_container(config, resolve=True, throw_on_missing=complete) for config in composed]
+    except SystemExit as end:  # Hydra ends with 1 after a line about a package that is missing
+        sys.exit(2 if end.code else 0)
     except MissingMandatoryValue as error:
         raise ConfigError(f"{error.full_key} is missing; it must be given, as in {error.full_key}=…") from error
     except (HydraException, OmegaConfBaseException, ValueError, yaml.YAMLError) as error:  # some by Hydra
@@ -93,6 +97,21 @@ def _check_chosen_files(folder: Path, arguments: list[str]) -> None:
                 if file.read_bytes().startswith(codecs.BOM_UTF8):
                     raise ConfigError(f"{file} must be UTF-8 without a byte order mark; save it so")
                 read_yaml(file)
+
+
+def _check_options(arguments: list[str]) -> None:
+    """Refuses wrong values of Hydra's options, about which Hydra would print a page. Raises ConfigError."""
+    from hydra._internal.utils import get_args_parser
+
+    parser = get_args_parser()
+    parser.exit_on_error = False
+    try:
+        _, apart = parser.parse_known_args(arguments)
+    except argparse.ArgumentError as error:
+        raise ConfigError(f"Hydra's options must be as in --cfg job, got {error}") from None
+    if apart:
+        rule = "settings must stand together"
+        raise ConfigError(f"{rule}, got {' '.join(apart)} apart from them; put all before or after Hydra's options")
 
 
 def dataclass_of(file: Path) -> type | None:

@@ -102,6 +102,27 @@ def test_groups_and_included_files(tmp_path, command):
         assert code == 0 and error == ""
 
 
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        *(
+            (arguments, "Hydra's options must be as in --cfg job, got argument --cfg/-c: ")
+            for arguments in (["--cfg", "foo"], ["--cfg=foo"], ["-c", ""], ["--cfg"], ["--cfg", "job", "--cfg"])
+        ),
+        (["--info", "foo"], "got argument --info/-i: invalid choice: 'foo'"),
+        (["--cfg", "job", "--package"], "got argument --package/-p: expected one argument"),
+        (["--config-name"], "got argument --config-name/-cn: expected one argument"),
+        (["--resolve=3"], "got argument --resolve: ignored explicit argument '3'"),
+        (["frames=3", "--cfg", "job", "seed=4"], "settings must stand together, got seed=4 apart from them"),
+        (["--cfg", "job", "--package", "none"], "package 'none' not found in config"),
+    ],
+)
+def test_wrong_values_of_hydras_options(command, arguments, message):
+    """One line without Hydra's page about its options."""
+    code, given, error = command("rollout", *arguments)
+    assert code == 2 and not given and message in error and error.count("\n") == 1
+
+
 @pytest.mark.parametrize(("encoding", "shown"), [("ascii", b"64? ?"), ("latin-1", b"64\xb3 ?"), ("utf-8", None)])
 def test_outputs_without_unicode(command, monkeypatch, encoding, shown):
     """What an output cannot show is replaced."""

@@ -68,6 +68,11 @@ FULL = [  # as libraries report it
         (FileNotFoundError(errno.ENOENT, "No such file", "x"), None, None),
         (FileNotFoundError(errno.ENOENT, "No file", "dangling"), 1, "error: No file: dangling; check its folder or"),
         (FileNotFoundError(errno.ENOENT, "No file", "gone/x"), 1, "error: No file: gone/x; check its folder or link"),
+        # the kernel's own folders take no files
+        *(
+            (FileNotFoundError(errno.ENOENT, "No file", path), 1, f"error: No file: {path}; check its folder or link")
+            for path in ("/proc/x", "/proc/sys/x.partial")
+        ),
     ],
 )
 def test_faults_end_in_one_line(error, code, message, monkeypatch, capsys, tmp_path):
