@@ -113,7 +113,7 @@ class Pool:
         of_others, self._counted = self._writer.done - self._counted, self._writer.done
         if of_others > 0:
             self._progress.found(of_others)
-        if not self._writer.holds and not self._writer.complete and not self._said_waiting:
+        if not self._writer.has_claims and not self._writer.complete and not self._said_waiting:
             self._said_waiting = True
             self._progress.message("other generators make the rest; waiting for them")
 

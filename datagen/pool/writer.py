@@ -2,9 +2,9 @@
 
 Files are created atomically in the order `.staging/<key>.tar`, shard, manifest. Staged files are deleted last. So after
 a crash the folder shows the remaining work, and no finished episode is simulated again. Published shards are synced. A
-staged episode is synced by itself only if its shard is still incomplete after 2 s, so most episodes are written once. A
-power loss may lose other staged episodes. Several generators may write to one folder: each claims the shards that it
-makes, the first to publish an episode wins, and the manifest changes only under its lock.
+staged episode is synced only if its shard is still incomplete after 2 s; most are packed sooner. A power loss may lose
+staged episodes that are not synced. Several generators may write to one folder: each claims the shards that it makes,
+the first to publish an episode wins, and the manifest changes only under its lock.
 """
 
 from __future__ import annotations
@@ -148,7 +148,7 @@ class DatasetWriter:
         return sorted(wanted, key=lambda item: generation_place(*item))
 
     @property
-    def holds(self) -> bool:
+    def has_claims(self) -> bool:
         """Returns whether this writer has claimed shards that are not yet published."""
         return bool(self._claimed)
 
@@ -263,7 +263,7 @@ class DatasetWriter:
         return entry
 
     def _winner(self, shard: ShardRange) -> ShardEntry | None:
-        """Returns another generator's shard with these episodes, or None: locks have no effect on some file systems."""
+        """Returns another generator's shard with these episodes, or None. Some file systems ignore locks."""
         self.refresh()
         if missing_ranges([shard], self._published) == [shard]:
             return None
@@ -308,7 +308,7 @@ class DatasetWriter:
         return {name for name, other in ranges.items() if other is not None and _overlap(shard, other)}
 
     def _list_unlisted(self, names: set[str]) -> None:
-        """Lists those of the given shards that a generator named, but did not list before it ended."""
+        """Lists those of these shards that are complete, but not in the index: their generator ended before that."""
         for name in sorted(names):
             shard, path = parse_shard_name(name), self.folder / name
             if shard is None or not path.exists():

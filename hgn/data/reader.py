@@ -40,8 +40,8 @@ class Episodes(Sequence[Episode], ABC):
     """Defines a sequence of episodes.
 
     An episode is opened, and its shard verified, on first use. Positions are read-only. `open` maps them into memory.
-    `read` and indexing map them too for a data set at a URL (its shards are in the cache). For a folder they copy them:
-    somebody could cut a file of the folder, and an access behind the end of a mapped file ends the process.
+    An access behind the end of a mapped file ends the process. In the cache of a URL no file is cut, but somebody may
+    cut a file of a folder. So `read` and indexing copy the positions of a folder, and map those of a URL.
     Raises on access: ConfigError if a shard is missing or altered.
     """
 
@@ -118,8 +118,8 @@ class EpisodeStore(Episodes):
     def refresh(self) -> bool:
         """Reads the manifest again. Returns whether this split has more episodes than before.
 
-        If a server does not answer, the known episodes stay. Inside `faults_outlived` they stay after any other fault
-        too, until it has lasted for the patience; `ask_again` then reads the manifest once a second.
+        If a server does not answer, the known episodes stay. Any other fault raises, but inside `faults_outlived` only
+        if it has lasted for the patience. Until then the known episodes stay, and `ask_again` repeats this each second.
         Raises: ConfigError if the folder contains another data set, or published shards were removed.
         """
         previous_s, self._looked_s = self._looked_s, time.monotonic()
@@ -182,7 +182,7 @@ class EpisodeStore(Episodes):
     def fetch_ahead(self, episodes: Sequence[int] | None = None) -> None:
         """Starts to fetch shards in the background, one after the other. It does nothing for a folder.
 
-        It fetches all published shards, or those of `episodes` in order. Only these replace older ones in a full cache.
+        It fetches all published shards, or those of `episodes` in order. Only the latter replace shards of a full cache.
         """
         if not is_remote(self.folder):
             return

@@ -1,13 +1,13 @@
 """Friction of surfaces and parameters of the materials as inputs of a network with relative inputs.
 
 `network.own_physics` names them. They are the last columns of the encoder, and 0 without friction and for the solver's
-default parameters. A batch in which all are 0 skips them, with equal results. docs/concepts/method.md derives all.
+default parameters. If all are 0, they are not computed; the result is the same. docs/concepts/method.md derives all.
 
-| columns | value |
-|---|---|
-| 2 | friction of the obstacle cells of `relative.obstacle_surfaces`; with friction and obstacle_features |
-| 3 | friction of the walls across x, y, z, times the nearness of the nearer one; with friction |
-| P | INPUT_PARAMETERS that act on the particle's material (`scaled_parameters`); with parameters |
+| columns | value | only with |
+|---|---|---|
+| 2 | friction of the particle's obstacle cell, and of the first one on its path | friction, obstacle_features |
+| 3 | friction of the walls across x, y, z, times the nearness of the nearer wall | friction |
+| P | INPUT_PARAMETERS of the particle's material, 0 for those of others (`scaled_parameters`) | parameters |
 
 In `relative.balanced` surfaces without friction remove T = Q R from a cell's mean acceleration. Friction keeps k T:
 
@@ -45,7 +45,7 @@ class SurfaceFriction:
 
     column_NK: torch.Tensor
     obstacle_C33: torch.Tensor  # sum of w_pC mu n n^T over obstacles
-    wall_C6: torch.Tensor  # sum of w_pC mu near over walls: lower x, y, z, then upper
+    wall_C6: torch.Tensor  # sum of w_pC mu min(1, 2 nearness) for each wall: lower x, y, z, then upper
     velocity_C3: torch.Tensor  # mean of v + g in units of s_a
     variance_C: torch.Tensor  # mean of |v - mean|^2, in these units
 
@@ -59,7 +59,7 @@ def physics_widths(config: NetworkConfig) -> tuple[int, int]:
 def physics_columns(
     state: ParticleState, config: NetworkConfig, friction: SurfaceFriction | None
 ) -> list[torch.Tensor]:
-    """Returns all columns [N, K] as a list of one tensor, or of none if all are 0."""
+    """Returns the columns in a list: one tensor [N, K], or no tensor if all columns are 0."""
     parameter_NP = state.parameter_NP if "parameters" in config.own_physics else None
     parts = (None if friction is None else friction.column_NK, parameter_NP)
     zero_N1 = torch.zeros_like(state.position_N3[:, :1])
@@ -121,14 +121,14 @@ def surface_friction(
     return SurfaceFriction(torch.cat(columns, -1), obstacle_C33, wall_C6, mean_C4[:, :3], variance_C)
 
 
-def kept(
+def friction_fraction(
     friction: SurfaceFriction,
     force_C3: torch.Tensor,
     push_C3: torch.Tensor,
     free_C3: torch.Tensor,
     slip_C33: torch.Tensor,
 ) -> torch.Tensor:
-    """Returns k of the module's docstring [C] for c T, c y, u and Q."""
+    """Returns k [C], the fraction of T that friction leaves. Arguments, in the module's symbols: c T, c y, u and Q."""
     lower_C3, upper_C3 = friction.wall_C6[:, :3], friction.wall_C6[:, 3:]
     bound_C3 = lower_C3 * push_C3.clamp(min=0) + upper_C3 * push_C3.clamp(max=0)
     bound_C3 = bound_C3 + (friction.obstacle_C33 @ push_C3[..., None]).squeeze(-1)

@@ -36,7 +36,7 @@ from hgn.config import NetworkConfig
 from hgn.network.features import ParticleState
 from hgn.network.grid import DIRECTION_63, GridHierarchy
 from hgn.network.obstacles import ObstacleCells
-from hgn.network.own_physics import SurfaceFriction, kept, surface_friction
+from hgn.network.own_physics import SurfaceFriction, friction_fraction, surface_friction
 
 CONTACT_REACH_CELLS = 3.0  # distance from a wall, in R, at which the network begins to see it
 WALL_LIMIT = 2.0  # largest wall_nearness, reached one `reach` behind the plane
@@ -282,7 +282,7 @@ def balanced(output_N9: torch.Tensor, contacts: Contacts, grid: GridHierarchy) -
         free_C3 = (slip_C33 @ (contacts.friction.velocity_C3 + disturbed_C[:, None] * pushed_C3)[..., None]).squeeze(-1)
         force_C3 = (disturbed_C * touched_C)[:, None] * along_C3
         push_C3 = force_C3 / (FEW + RARE * trace(contacts.normal_C33))[:, None]
-        part_C = kept(contacts.friction, force_C3, push_C3, free_C3, slip_C33)
+        part_C = friction_fraction(contacts.friction, force_C3, push_C3, free_C3, slip_C33)
         along_C3 = along_C3 - part_C[:, None] * along_C3
     change_C3 = change_C3 - touched_C[:, None] * along_C3
     change_C3 = disturbed_C[:, None] * change_C3.index_add(0, receiver_E, share_E[:, None] * push_E3)

@@ -177,7 +177,7 @@ class LiveSimulation:
         require(0 <= index <= last, "index", f"0 to {last}, a scene of the batch", index)
 
     def _started(self, scenes: Sequence[InitialState]) -> ParticleState:
-        """Returns the start of scenes without obstacles, which take time and often stay."""
+        """Returns the start of scenes without their obstacles, which often do not change and are slow to prepare."""
         bare = []
         for scene in scenes:
             remedy = "take Simulator.frames, or add_particles"
@@ -201,7 +201,7 @@ class LiveSimulation:
         self._put(index, scene, self.state, self._started([replace(scene, **nothing, past_HN3=None)]))
 
     def _put(self, index: int, scene: InitialState, kept: ParticleState, new: ParticleState) -> None:
-        """Continues with a scene in place of another: with kept particles, and those of `new`, the scene's start."""
+        """Replaces scene `index` by `scene`. The next frame has the particles of `kept` and of `new`, its start."""
         before, scenes, barriers = self.scenes[index], [*self.scenes], [*self._barriers]
         scenes[index] = scene
         changed: dict[str, Any] = {}

@@ -133,7 +133,7 @@ class PlayPage:
                     if not isinstance(error, DivergedError):
                         traceback.print_exception(error, file=sys.stderr)
                     self.playing, self.diverged = False, True
-                    self._notify(f"{error}; paused a frame before. Back by or Restart")
+                    self._notify(f"{error}; paused a frame before. Press Back by or Restart")
                 frames, changed = frames + 1, True
                 if self.session.spout is not None and self.session.full:
                     self.session.spout = None
