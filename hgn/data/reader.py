@@ -182,7 +182,7 @@ class EpisodeStore(Episodes):
     def fetch_ahead(self, episodes: Sequence[int] | None = None) -> None:
         """Starts to fetch shards in the background, one after the other. It does nothing for a folder.
 
-        It fetches all published shards, or those of `episodes` in order. Only the latter replace shards of a full cache.
+        It fetches all published shards, or those of `episodes` in order. A full cache makes room only for the latter.
         """
         if not is_remote(self.folder):
             return
