@@ -20,7 +20,7 @@ from hgn.kernels.buffers import OUT, Block, Stored
 from hgn.kernels.cell_mlp.kernel import cell_mlp_backward
 from hgn.kernels.edges.kernel import edge_backward
 from hgn.kernels.forward import FusedNetwork
-from hgn.kernels.grid.op import DeviceGrid
+from hgn.kernels.grid.op import DeviceGrid, own_physics_column
 from hgn.kernels.mlp.kernel import gather_project_backward, mlp_backward
 from hgn.kernels.packing import PackedMLP, PackedNetwork
 from hgn.kernels.particle_cell.kernel import particle_cell_backward, particle_cell_weight_gradient
@@ -297,16 +297,18 @@ class FusedTrainingNetwork(FusedNetwork):
 
     def _encode_gradients(self) -> None:
         """Splits the gradient of the encoder's combined first layer into features, embedding and bias."""
-        config = self.config
-        used, materials = config.feature_width - MATERIAL_EMBEDDING, len(config.materials)
+        config, width, own = self.config, self.config.feature_width, own_physics_column(self.config)
+        used = width - MATERIAL_EMBEDDING
         size = self.width * self.grid.features
         combined = self.totals[self.packed.size : self.packed.size + size].view(self.width, self.grid.features)
-        table = combined[:, used : used + materials]
+        table = combined[:, used:own]
         first, embedding, bias = self._encode_views(self.totals)
         value, rows, _ = self._encode_views(self.values)
         first[:, :used].copy_(combined[:, :used])
-        first[:, used:].copy_(table @ rows)
-        embedding.copy_(table.T @ value[:, used:])
+        first[:, used:width].copy_(table @ rows)
+        if config.own_physics:
+            first[:, width:].copy_(combined[:, own : own + first.shape[1] - width])
+        embedding.copy_(table.T @ value[:, used:width])
         bias.copy_(table.sum(1))
 
     def _mlp_backward(

@@ -15,12 +15,13 @@ from hgn.config import MATERIAL_EMBEDDING
 from hgn.kernels.buffers import Block, Buffers, Stored
 from hgn.kernels.cell_mlp.kernel import cell_mlp_forward
 from hgn.kernels.edges.kernel import edge_forward
-from hgn.kernels.grid.op import DeviceGrid
+from hgn.kernels.grid.op import DeviceGrid, own_physics_column
 from hgn.kernels.mlp.kernel import clear_rows, gather_project, gather_sums, mlp_forward
 from hgn.kernels.packing import PackedMLP, PackedNetwork, rounded_to_tf32
 from hgn.kernels.particle_cell.kernel import particle_cell_forward
 from hgn.kernels.triton_compat import overlaps
 from hgn.kernels.tuning import LIGHT_BLOCK, Tuning, many
+from hgn.network.own_physics import physics_widths
 from hgn.schema import require
 
 PRECISIONS = ("fp32", "tf32", "fp16")
@@ -82,12 +83,17 @@ class FusedNetwork(Buffers):
         self.refresh_encoder()
 
     def refresh_encoder(self) -> None:
-        """Folds embedding and bias into the encoder's first layer, which then takes one-hot materials."""
+        """Folds embedding and bias into the encoder's first layer, which then takes one-hot materials.
+
+        The columns of own physics, last in the network, follow the materials.
+        """
         first, embedding, bias = self._encode_views(self.values)
-        used = self.config.feature_width - MATERIAL_EMBEDDING
-        materials = len(self.config.materials)
+        width, own = self.config.feature_width, own_physics_column(self.config)
+        used = width - MATERIAL_EMBEDDING
         self.encode_weights[:, :used].copy_(first[:, :used])
-        torch.addmm(bias[:, None], first[:, used:], embedding.T, out=self.encode_weights[:, used : used + materials])
+        torch.addmm(bias[:, None], first[:, used:width], embedding.T, out=self.encode_weights[:, used:own])
+        if self.config.own_physics:
+            self.encode_weights[:, own : own + first.shape[1] - width].copy_(first[:, width:])
         if self.precision == "tf32" and not self.fine:
             self.encode_weights.copy_(self._rounded(self.encode_weights))
 
@@ -99,7 +105,7 @@ class FusedNetwork(Buffers):
 
     def _encode_views(self, flat: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         config, packed, width = self.config, self.packed, self.width
-        at, columns = packed.encode.parts[0], config.feature_width
+        at, columns = packed.encode.parts[0], config.feature_width + sum(physics_widths(config))
         first = flat[at : at + width * columns].view(width, columns)
         rows, embedding = len(config.materials), MATERIAL_EMBEDDING
         table = flat[packed.embedding : packed.embedding + rows * embedding].view(rows, embedding)

@@ -1,7 +1,7 @@
-"""Computes obstacle normals at a place from a scene's hash table on the device.
+"""Computes obstacle normals and friction at a place from a scene's hash table on the device.
 
 The obstacle table has a row of int64 numbers for each scene: addresses of its hash buckets (0: no obstacle), keys and
-normals, the mask of the buckets, and the symmetry under which it is seen (hgn.scene.symmetry.Symmetry.code).
+cell values, the mask of the buckets, and the symmetry under which it is seen (hgn.scene.symmetry.Symmetry.code).
 """
 
 import triton
@@ -33,8 +33,9 @@ def _from_axis(x, y, z, symmetry, axis: tl.constexpr):
 
 
 @triton.jit
-def obstacle_normals(x, y, z, line, live, obstacle_cell_size, SYMMETRY: tl.constexpr):
-    """Returns x, y and z of the obstacle normals at positions of any shape, zeros without an obstacle.
+def obstacle_normals(x, y, z, line, live, obstacle_cell_size, SYMMETRY: tl.constexpr, ROW: tl.constexpr):
+    """Returns x, y and z of the obstacle normals at positions of any shape, and friction if ROW is 4; zeros without an
+    obstacle. ROW is the number of values of a cell in the table.
     `line` is the scenes' row of the obstacle table. With SYMMETRY positions and normals are those of an image of the
     scene. The function looks the positions up in the scene itself."""
     x = tl.floor(tl.div_rn(x, obstacle_cell_size))
@@ -47,7 +48,7 @@ def obstacle_normals(x, y, z, line, live, obstacle_cell_size, SYMMETRY: tl.const
         y = _from_axis(ix, iy, iz, symmetry, 1)
         z = _from_axis(ix, iy, iz, symmetry, 2)
     entry = find_cell(x, y, z, line, live)
-    at = tl.load(line + 2, mask=entry >= 0, other=0).to(tl.pointer_type(tl.float32)) + entry * 3
+    at = tl.load(line + 2, mask=entry >= 0, other=0).to(tl.pointer_type(tl.float32)) + entry * ROW
     found = ()
     for axis in tl.static_range(3):
         if SYMMETRY:
@@ -57,6 +58,8 @@ def obstacle_normals(x, y, z, line, live, obstacle_cell_size, SYMMETRY: tl.const
         else:
             normal = tl.load(at + axis, mask=entry >= 0, other=0.0)
         found = found + (normal,)  # noqa: RUF005 - Triton knows no unpacking here
+    for column in tl.static_range(3, ROW):
+        found = found + (tl.load(at + column, mask=entry >= 0, other=0.0),)  # noqa: RUF005
     return found
 
 

@@ -27,21 +27,25 @@ class SceneHash:
 
     bucket_B: torch.Tensor  # int32
     key_K: torch.Tensor  # int64
-    # An obstacle cell has its normal, float32 [K, 3]. A barrier cell has the range of its list of triangles, int32.
+    # An obstacle cell has its normal, float32 [K, 3], or normal and friction [K, 4]. A barrier cell has the range of
+    # its list of triangles, int32.
     value_K: torch.Tensor
     lists: tuple[torch.Tensor, ...] = ()  # a barrier's lists, int32 [E], and triangles, float32 [F, 24]
     last: int = 0  # last column of the row: bits of a barrier's cell size, or the obstacles' symmetry, set later
 
     @staticmethod
-    def of_obstacles(cell_K3: torch.Tensor, normal_K3: torch.Tensor) -> SceneHash:
-        """Returns the hash of cells int [K, 3] with normals [K, 3], on their device."""
+    def of_obstacles(cell_K3: torch.Tensor, value_KV: torch.Tensor) -> SceneHash:
+        """Returns the hash of cells int [K, 3] with normals, or also friction, [K, 3 or 4], on their device."""
         bucket_B, key_K, order_K = in_buckets(cell_K3)
-        return SceneHash(bucket_B, key_K, normal_K3[order_K].float().contiguous())
+        return SceneHash(bucket_B, key_K, value_KV[order_K].float().contiguous())
 
     @staticmethod
-    def of_grid(grid: ObstacleGrid) -> SceneHash | None:
-        """Returns the hash of a scene's obstacle cells, or None without cells."""
-        tensors = torch.from_numpy(grid.cell_K3), torch.from_numpy(grid.normal_K3)
+    def of_grid(grid: ObstacleGrid, friction: bool = False) -> SceneHash | None:
+        """Returns the hash of a scene's obstacle cells, or None without cells. With `friction` cells have theirs."""
+        values = [grid.normal_K3]
+        if friction:
+            values.append(np.zeros((len(grid.cell_K3), 1)) if grid.friction_K is None else grid.friction_K[:, None])
+        tensors = torch.from_numpy(grid.cell_K3), torch.from_numpy(np.concatenate(values, axis=1))
         return SceneHash.of_obstacles(*tensors) if len(grid.cell_K3) else None
 
     @staticmethod
@@ -91,12 +95,12 @@ class SceneTable:
         self._source: ObstacleCells | Barriers | None = None  # the object of which the table was made
 
     @staticmethod
-    def of_obstacles(cells: ObstacleCells, scenes: int) -> SceneTable:
-        """Returns the table of a batch's obstacle cells, on their device."""
+    def of_obstacles(cells: ObstacleCells, scenes: int, friction: bool = False) -> SceneTable:
+        """Returns the table of a batch's obstacle cells, on their device. With `friction` cells have theirs."""
         scene_K, cell_K3 = unpack(cells.key_K)
         counts = torch.bincount(scene_K, minlength=scenes).tolist()
-        parts = zip(cell_K3.split(counts), cells.normal_K3.split(counts), strict=True)
-        hashes = [SceneHash.of_obstacles(cell, normal) if len(cell) else None for cell, normal in parts]
+        parts = zip(cell_K3.split(counts), cells.values(friction).split(counts), strict=True)
+        hashes = [SceneHash.of_obstacles(cell, value) if len(cell) else None for cell, value in parts]
         table = SceneTable(hashes, OBSTACLE_COLUMNS, cells.key_K.device, cells.cell_size)
         table._source = cells
         return table

@@ -63,7 +63,11 @@ class ObstacleCells:
 
     def surfaces(self, position_N3: torch.Tensor, scene_N: torch.Tensor) -> torch.Tensor:
         """Returns `normals`, followed by the friction of the cell if any cell has friction, [N, 3 or 4]."""
-        return self.rows_at(self.normal_K3 if self.friction_K is None else self.surface_rows, position_N3, scene_N)
+        return self.rows_at(self.values(self.friction_K is not None), position_N3, scene_N)
+
+    def values(self, friction: bool) -> torch.Tensor:
+        """Returns normals, with `friction` also friction, [K, 3 or 4]."""
+        return self.surface_rows if friction else self.normal_K3
 
     def rows_at(self, row_KV: torch.Tensor, position_N3: torch.Tensor, scene_N: torch.Tensor) -> torch.Tensor:
         cell_N3 = torch.floor(position_N3 / self.cell_size).long()

@@ -22,6 +22,7 @@ from hgn.kernels.update.op import Updates, UpdateSettings
 from hgn.network.features import ParticleState
 from hgn.network.hgn import HierarchicalGraphNetwork
 from hgn.runtime.triton_stepper import TritonStepper, first_capacities
+from hgn.scene.material import INPUT_PARAMETERS
 from hgn.schema import from_mapping, to_mapping
 from hgn.step_config import UNCONSTRAINED, StepConfig
 
@@ -121,6 +122,10 @@ def _simulation_launches(
         domain_S3=torch.zeros(scenes, 3, device=device),
         gravity_S3=torch.zeros(scenes, 3, device=device),
         obstacles=None,
+        wall_friction_S3=torch.zeros(scenes, 3, device=device) if "friction" in config.own_physics else None,
+        parameter_NP=torch.zeros(particles, len(INPUT_PARAMETERS), device=device)
+        if "parameters" in config.own_physics
+        else None,
     )
     _Unplaced(network, state, precision, capacities, obstacles=obstacles, step=step).frame_launches()
 

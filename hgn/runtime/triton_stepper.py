@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 
 import torch
 
+from hgn.config import NetworkConfig
 from hgn.kernels.capture import captured
 from hgn.kernels.forward import FusedNetwork
 from hgn.kernels.grid.op import OUT_OF_WINDOW, OVERFLOW, DeviceGrid, DeviceParticles, Window
@@ -66,6 +67,13 @@ def _room(count: int, level: int, tight: float) -> int:
     return max(int(tight * count), int(GROWTH * min(count, ROOMY_CELLS >> 2 * level)))
 
 
+def _own_physics(config: NetworkConfig, state: ParticleState) -> tuple[str, ...]:
+    """Returns the parts of own physics that a state has: friction of any surface, and parameters of any particle."""
+    rough = state.wall_friction_S3 is not None or (state.obstacles and state.obstacles.friction_K) is not None
+    there = {"friction": rough, "parameters": state.parameter_NP is not None}
+    return tuple(name for name in config.own_physics if there[name])
+
+
 @dataclass(frozen=True, eq=False)
 class _Look:
     """Launched frames: their number, the place of the first one, and `frame` and `status` after the last one."""
@@ -104,11 +112,14 @@ class TritonStepper:
         self.particles = max(capacity, len(state.position_N3))
         self.scenes = state.scene_count
 
-        self.buffers = DeviceParticles.empty(self.particles, self.scenes, self.config.velocity_history, self.device)
+        self.own_physics = _own_physics(self.config, state)
+        self.buffers = DeviceParticles.empty(
+            self.particles, self.scenes, self.config.velocity_history, self.device, self.own_physics
+        )
         self.lost, self.frame = (torch.zeros(1, dtype=torch.int32, device=self.device) for _ in range(2))
         self.obstacles = obstacles
         if obstacles is None and state.obstacles is not None:
-            self.obstacles = SceneTable.of_obstacles(state.obstacles, state.scene_count)
+            self.obstacles = self._obstacle_table(state)
         self.barriers = None
         if self.step_config.obstacle_clearance is not None:
             self.barriers = barriers or SceneTable.of_barriers(state.barriers, self.scenes, self.device)
@@ -128,11 +139,12 @@ class TritonStepper:
     def fits(self, state: ParticleState) -> bool:
         """Returns whether `begin` can continue from a state.
 
-        The state needs the same domains and obstacle cell size, a row for each particle, and no need of float32 sums.
+        The state needs the same domains, obstacle cell size and own physics, a row for each particle, and no need of
+        float32 sums.
         """
         if state.scene_count != self.scenes or len(state.position_N3) > self.particles:
             return False
-        if not self._careful and self._crowded(state):
+        if self.own_physics != _own_physics(self.config, state) or (not self._careful and self._crowded(state)):
             return False
         new, old = state.obstacles, self.obstacles
         same = new is old is None or (new is not None and old is not None and new.cell_size == old.cell_size)
@@ -147,8 +159,7 @@ class TritonStepper:
         if new_obstacles and self.barriers is not None and not self.barriers.is_of(state.barriers):
             self.barriers.take(SceneTable.of_barriers(state.barriers, self.scenes, self.device))
         if new_obstacles and self.obstacles is not None and not self.obstacles.is_of(state.obstacles):
-            assert state.obstacles is not None
-            self.obstacles.take(SceneTable.of_obstacles(state.obstacles, state.scene_count))
+            self.obstacles.take(self._obstacle_table(state))
         self._fill(state)
         self.lost.zero_()
         self.grid.status.zero_()
@@ -162,7 +173,8 @@ class TritonStepper:
 
     def keep(self, kept_N: torch.Tensor) -> None:
         """Removes particles after a divergence. Cells, obstacles and launches stay."""
-        buffers = (self.buffers.position_N3, self.buffers.velocity_NV, self.buffers.scene_N, self.buffers.material_N)
+        names = ("position_N3", "velocity_NV", "scene_N", "material_N", "parameter_NP")
+        buffers = [buffer for name in names if (buffer := getattr(self.buffers, name)) is not None]
         remaining = [buffer[: self.live][kept_N] for buffer in buffers]
         self.live = len(remaining[0])
         for buffer, value in zip(buffers, remaining, strict=True):
@@ -188,6 +200,15 @@ class TritonStepper:
         buffers.domain_S3.copy_(state.domain_S3)
         if self.config.relative:
             buffers.gravity_S3.copy_(state.gravity_S3)
+        if buffers.wall_friction_S3 is not None:
+            friction_S3 = state.wall_friction_S3
+            buffers.wall_friction_S3.copy_(torch.zeros_like(state.domain_S3) if friction_S3 is None else friction_S3)
+        if buffers.parameter_NP is not None and state.parameter_NP is not None:
+            buffers.parameter_NP[:count].copy_(state.parameter_NP)
+
+    def _obstacle_table(self, state: ParticleState) -> SceneTable:
+        assert state.obstacles is not None
+        return SceneTable.of_obstacles(state.obstacles, state.scene_count, "friction" in self.own_physics)
 
     def _crowded(self, state: ParticleState) -> bool:
         nowhere = state.position_N3.device.type == "meta"  # kernels are compiled ahead with empty tensors

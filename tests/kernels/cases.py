@@ -9,6 +9,7 @@ from kernels.engines import engine_of, gradients, run_forward
 from network.states import network_of, random_state
 
 from hgn.runtime.parity import relative_error
+from hgn.scene.material import INPUT_PARAMETERS
 
 SEVERAL, CROWD = (5, 1, 3), (17, 1, 6)  # particles of three scenes
 
@@ -50,6 +51,23 @@ def flying_state():
     return replace(state, position_N3=state.position_N3 + 0.4, velocity_NM3=velocity_NH3)
 
 
+def rough_state(counts, walls=1.0, obstacles=1.0, parameters=True, spread=0.3):
+    """The same with friction, up to these numbers, of walls and obstacle cells, and columns of parameters."""
+    state, generator = moving_state(counts, obstacles is not None, spread), torch.Generator().manual_seed(4)
+    draw = lambda *shape: torch.rand(*shape, generator=generator)  # noqa: E731
+    if obstacles is not None:
+        cells = state.obstacles
+        state = replace(state, obstacles=replace(cells, friction_K=obstacles * draw(len(cells.key_K))))
+    if parameters:
+        state = replace(state, parameter_NP=draw(len(state.scene_N), len(INPUT_PARAMETERS)).double())
+    return replace(state, wall_friction_S3=walls * draw(len(counts), 3).double())
+
+
+def slow(state):
+    """The state without fast particles, so that the bound of friction by motion counts."""
+    return replace(state, velocity_NM3=state.velocity_NM3.clamp(-3e-3, 3e-3))
+
+
 @dataclass(frozen=True)
 class Case:
     """A network, a state, and the largest relative error of outputs, of all gradients, and of each gradient."""
@@ -67,6 +85,7 @@ class Case:
 
 
 RELATIVE = {"inputs": "relative"}
+OWN = {"inputs": "local", "own_physics": ("friction", "parameters")}
 SHUFFLED = ("water", "snow", "sand")
 # Relative inputs: in the weights of normals the rounding of distances counts tenfold (FEW).
 CASES = {
@@ -85,6 +104,14 @@ CASES = {
         {"inputs": "local", "obstacle_features": False, "levels": 4, "materials": SHUFFLED},
     ),
     "relative, free flight": Case(flying_state, 2e-4, RELATIVE),
+    "friction and parameters": Case(lambda: rough_state(CROWD), 1e-4, OWN),
+    "friction of walls": Case(
+        lambda: rough_state((23, 9), 0.5, None, False, 0.15), 1e-4, OWN | {"obstacle_features": False, "levels": 1}
+    ),
+    "friction that stops": Case(lambda: slow(rough_state((61, 20), 30.0, 30.0)), 1e-4, OWN),
+    "parameters": Case(
+        lambda: replace(rough_state(SEVERAL), wall_friction_S3=None), 4e-5, RELATIVE | {"own_physics": ("parameters",)}
+    ),
 }
 
 

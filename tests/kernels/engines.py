@@ -58,7 +58,9 @@ def prepare(engine, network, state, origin_S3):
 
     scale = tuple(x.float().to(where) for x in network.normaliser.feature_scale(network.config.relative))
     obstacles = (
-        SceneTable.of_obstacles(state.obstacles.to(where), state.scene_count) if state.obstacles is not None else None
+        SceneTable.of_obstacles(state.obstacles.to(where), state.scene_count, state.wall_friction_S3 is not None)
+        if state.obstacles is not None
+        else None
     )
     particles = DeviceParticles(
         position_N3=padded(state.position_N3.float()),
@@ -69,6 +71,8 @@ def prepare(engine, network, state, origin_S3):
         domain_S3=state.domain_S3.float().to(where),
         gravity_S3=state.gravity_S3.float().to(where),
         count=engine.particle_count,
+        wall_friction_S3=None if state.wall_friction_S3 is None else state.wall_friction_S3.float().to(where),
+        parameter_NP=None if state.parameter_NP is None else padded(state.parameter_NP.float()),
     )
     grid.build(particles)
     grid.prepare(particles, scale, obstacles)

@@ -10,6 +10,7 @@ from kernels.engines import device, engine_of, gradients, inference_of, run_forw
 from network.states import network_of
 
 from hgn.network.cell_keys import unpack
+from hgn.network.own_physics import physics_columns, physics_widths
 from hgn.runtime.parity import OUTPUTS, relative_error
 
 gpu = pytest.mark.skipif(device().type != "cuda", reason="needs a CUDA device")
@@ -35,16 +36,22 @@ def test_outputs_and_gradients(name, monkeypatch):
 
 
 def assert_features(network, state, found):
-    """Each column is that of hgn.network.relative, the material one-hot behind them, zeros behind that; and coarsest
-    cells are disturbed and in contact as there."""
+    """Each column is that of hgn.network.relative, behind them the material one-hot, columns of own physics, and zeros;
+    and coarsest cells are disturbed and in contact as there."""
     grid = network.grid(state, found.origin_S3)
     expected, contacts = network.relative_features(state, grid)
     feature_NF = found.engine.grid.feature_NF[: len(state.position_N3)].cpu().double()
     width, materials = expected.shape[1], len(network.config.materials)
     assert float((feature_NF[:, :width] - expected.double()).abs().max()) < 2e-5
     assert torch.equal(feature_NF[:, width : width + materials].argmax(-1), state.material_N)
-    assert torch.equal(feature_NF[:, width:].sum(-1), torch.ones(len(feature_NF)).double())
-    assert feature_NF.shape[1] == (32 if width + materials <= 32 else 64)
+    own = width + materials
+    assert torch.equal(feature_NF[:, width:own].sum(-1), torch.ones(len(feature_NF)).double())
+    for physics_NK in physics_columns(state, network.config, contacts.friction):
+        assert float((feature_NF[:, own : own + physics_NK.shape[1]] - physics_NK).abs().max()) < 2e-5
+        assert physics_NK.any()
+        own += physics_NK.shape[1]
+    assert not feature_NF[:, own:].any()
+    assert feature_NF.shape[1] == (32 if width + materials + sum(physics_widths(network.config)) <= 32 else 64)
     expected_C2 = torch.stack([contacts.disturbed_C, contacts.touched_C], 1)
     felt_C2 = found.engine.grid.felt_C2[: len(expected_C2)].cpu().double()
     torch.testing.assert_close(felt_C2, expected_C2, rtol=0, atol=1e-3)

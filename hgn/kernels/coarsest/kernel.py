@@ -8,7 +8,8 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
-from hgn.kernels.bodies import adjugate, body_of, coarsest_cells, cross, inertia_of, one_over, rotation, three_columns
+from hgn.kernels.bodies import body_of, coarsest_cells, cross, inertia_of, one_over, rotation, three_columns
+from hgn.kernels.coarsest.friction import along_surfaces, dot, keep_friction, slip_of, with_friction
 from hgn.kernels.geometry import GEOMETRY_COLUMNS, most_around
 from hgn.kernels.triton_compat import gdc_launch_dependents, gdc_wait, settle_keys
 from hgn.network.relative import OUTPUTS
@@ -63,19 +64,6 @@ def sum_coarsest(
 
 
 @triton.jit
-def _slip(moments, cell, there, few, rare, mean, OUT: tl.constexpr):
-    """Returns the cells' means without the part that surfaces forbid, by the rule hgn.network.relative.slip.
-    The products of normals follow the second moments."""
-    xx, yy, zz = three_columns(moments, cell, 9, there, 1.0, OUT)
-    yz, xz, xy = three_columns(moments, cell, 12, there, 1.0, OUT)
-    ratio = 1 / (few + rare * (xx + yy + zz))
-    matrix = 1 + xx * ratio, 1 + yy * ratio, 1 + zz * ratio, yz * ratio, xz * ratio, xy * ratio
-    determinant, free = adjugate(matrix, mean[0], mean[1], mean[2])
-    inverse = 1 / determinant
-    return free[0] * inverse, free[1] * inverse, free[2] * inverse
-
-
-@triton.jit
 def _pairs(
     moments, neighbour, motion, geometry, cell, there, mass, centre, inertia, capacity,
     LEVELS: tl.constexpr, OUT: tl.constexpr,
@@ -106,13 +94,13 @@ def _pairs(
 
 @triton.jit
 def balance(
-    sums, moments, felt, motion, neighbour, geometry, counts, table, capacity, few, rare,
-    LEVELS: tl.constexpr, OUT: tl.constexpr, OVERLAP: tl.constexpr, BLOCK: tl.constexpr,
+    sums, moments, felt, motion, neighbour, geometry, counts, table, friction, kept, capacity, few, rare,
+    LEVELS: tl.constexpr, OUT: tl.constexpr, FRICTION: tl.constexpr, OVERLAP: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Computes the table [C, OUT] of the coarsest cells from sums of particles' outputs.
 
     Columns 0 to 2 are the acceleration that a cell adds to its particles at its middle. Column 3 is the factor of the
-    particles' own output. Columns 4 to 6 are the rate of rotation that the cell adds.
+    particles' own output. Columns 4 to 6 are the rate of rotation that the cell adds. FRICTION: see keep_friction.
 
     Rule: hgn.network.relative.balanced; test: tests/kernels/test_relative.py.
     """
@@ -153,7 +141,15 @@ def balance(
     )
     lever = cross(turn, centre)
     line = table + cell * OUT
-    along = _slip(moments, cell, there, few, rare, mean, OUT)
+    ratio, matrix = slip_of(moments, cell, there, few, rare, OUT)
+    along = along_surfaces(matrix, mean)
+    if FRICTION:
+        impulse = ()
+        for i in tl.static_range(3):
+            impulse = impulse + (tl.sum(share * (felt_by * traction[i] + swing[i]), 1),)  # noqa: RUF005
+        along = keep_friction(
+            friction, kept, cell, there, inverse, ratio, matrix, disturbed, touched, along, impulse, OUT
+        )  # fmt: skip
     for i in tl.static_range(3):
         pushed = tl.sum(share * (felt_by * traction[i] + swing[i]), 1) - free * known * mean[i]
         pushed -= touched * along[i]
@@ -164,8 +160,8 @@ def balance(
 
 @triton.jit
 def balance_backward(
-    sums, moments, felt, motion, neighbour, geometry, counts, table, capacity, few, rare,
-    LEVELS: tl.constexpr, OUT: tl.constexpr, OVERLAP: tl.constexpr, BLOCK: tl.constexpr,
+    sums, moments, felt, motion, neighbour, geometry, counts, table, friction, kept, capacity, few, rare,
+    LEVELS: tl.constexpr, OUT: tl.constexpr, FRICTION: tl.constexpr, OVERLAP: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Computes the table [C, OUT] from sums of gradients of the result of `balance` and of their moments.
 
@@ -199,16 +195,26 @@ def balance_backward(
     turn = (factor * wx, factor * wy, factor * wz)
     lever = cross(turn, centre)
     line = table + cell * OUT
-    along = _slip(moments, cell, there, few, rare, mean, OUT)
+    _, matrix = slip_of(moments, cell, there, few, rare, OUT)
+    along = along_surfaces(matrix, mean)
+    if FRICTION:
+        slope = dot(mean, three_columns(kept, cell, 0, there, 1.0, OUT))
+        part_kept = tl.load(kept + cell * OUT + 3, mask=there, other=0.0)
+        by_mean = three_columns(kept, cell, 4, there, 1.0, OUT)
     for i in tl.static_range(3):
         own = factor * known * mean[i] - lever[i]
         own -= disturbed * touched * along[i]
+        if FRICTION:
+            own += part_kept * disturbed * touched * along[i] + slope * by_mean[i]
         tl.store(line + i, own, mask=there)
         tl.store(line + 10 + i, turn[i], mask=there)
     tl.store(line + 9, disturbed * (touched + free * known), mask=there)
     their_mean = three_columns(sums, other, 0, other >= 0, beside, OUT)
     their_moment = three_columns(sums, other, 3, other >= 0, beside, OUT)
     lever = cross(middle, their_mean)
+    if FRICTION:
+        mean = with_friction(kept, cell, there, mean, OUT)
+        their_mean = with_friction(kept, other, other >= 0, their_mean, OUT)
     gap = (mean[0][:, None] - their_mean[0], mean[1][:, None] - their_mean[1], mean[2][:, None] - their_mean[2])
     swing = cross(apart, gap)
     turned = ()

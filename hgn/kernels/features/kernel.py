@@ -82,7 +82,7 @@ def prepare_features(
         y = tl.load(position + row * 3 + 1, mask=live, other=0.0)
         z = tl.load(position + row * 3 + 2, mask=live, other=0.0)
         line = obstacle_table + scene * OBSTACLE_COLUMNS
-        normal = obstacle_normals(x, y, z, line, live, obstacle_cell_size, SYMMETRY)
+        normal = obstacle_normals(x, y, z, line, live, obstacle_cell_size, SYMMETRY, 3)
         for i in tl.static_range(3):
             value = with_column(value, 3 * HISTORY + i, normal[i])
     is_wall = (column >= WALLS) & (column < WALLS + 6)
@@ -110,15 +110,17 @@ def _asinh(x):
 @triton.jit
 def prepare_relative_features(
     velocity, scene_of, material_of, gravity, particle_count, scale, cell_of, weight_of, coarsest_of, share_of, motion,
-    parent, geometry, features, touch_of, disturbed, felt, quiet,
-    HISTORY: tl.constexpr, LEVELS: tl.constexpr, NORMALS: tl.constexpr,
+    parent, geometry, features, touch_of, disturbed, felt, parameter_of, quiet,
+    HISTORY: tl.constexpr, LEVELS: tl.constexpr, NORMALS: tl.constexpr, FRICTION: tl.constexpr,
+    FRICTION_AT: tl.constexpr, PARAMETERS: tl.constexpr, PARAMETERS_AT: tl.constexpr,
     FEATURES: tl.constexpr, OVERLAP: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Writes the features [N, FEATURES] of each particle that no boost and no shift changes.
 
     They are: changes of velocity minus gravity; the velocity relative to the cells around on each level, whose mass and
     momentum are in `motion`; near a surface the velocity, weighted by `felt` of the coarsest cells; the columns of
-    surfaces, which prepare_particles wrote; and the one-hot material. Differences of velocity are asinh of multiples of
+    surfaces and the FRICTION columns from FRICTION_AT on, which prepare_particles wrote; the one-hot material; and the
+    PARAMETERS columns of `parameter_of` from PARAMETERS_AT on. Differences of velocity are asinh of multiples of
     `scale`. Raises column 0 of the coarsest cells' `disturbed` [C, 2] to their particles' disturbance, times FULLY.
 
     Rule: hgn.network.relative; test: tests/kernels/test_network.py.
@@ -174,6 +176,12 @@ def prepare_relative_features(
     material = tl.load(material_of + row, mask=live, other=0)
     value = tl.where((column[None, :] - MATERIAL) == material[:, None], 1.0, value)
     own = (column < WALLS) | (column >= MATERIAL)
+    if FRICTION > 0:
+        own = own & ((column < FRICTION_AT) | (column >= FRICTION_AT + FRICTION))
+    if PARAMETERS > 0:
+        is_parameter = here & ((column >= PARAMETERS_AT) & (column < PARAMETERS_AT + PARAMETERS))[None, :]
+        at = parameter_of + row[:, None] * PARAMETERS + (column - PARAMETERS_AT)[None, :]
+        value = tl.where(is_parameter, tl.load(at, mask=is_parameter, other=0.0), value)
     tl.store(features + row[:, None] * FEATURES + column[None, :], value, mask=here & own[None, :])
 
 

@@ -9,13 +9,10 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
-from hgn.kernels.blocks import with_column
 from hgn.kernels.geometry import GEOMETRY_COLUMNS, raise_disturbed, split_slot
-from hgn.kernels.obstacles import OBSTACLE_COLUMNS, obstacle_normals
+from hgn.kernels.grid.surfaces import add_friction, surface_normals, surfaces_of
 from hgn.kernels.triton_compat import gdc_launch_dependents, gdc_wait, settle_keys
-from hgn.network.relative import STEPS_AHEAD, WALL_LIMIT
 
-NEAREST, STEPS = tl.constexpr(WALL_LIMIT), tl.constexpr(STEPS_AHEAD)  # constants of relative inputs
 OVERFLOW = tl.constexpr(1)  # status bit: a level has more active cells than its capacity
 OUT_OF_WINDOW = tl.constexpr(2)  # status bit: a particle is not finite or outside the window
 
@@ -244,59 +241,6 @@ def fill_tables(
 
 
 @triton.jit
-def _surfaces(
-    position, velocity, domain, row, live, scene, obstacle_table, obstacle_cell_size, reach,
-    HISTORY: tl.constexpr, OBSTACLES: tl.constexpr, SYMMETRY: tl.constexpr,
-):  # fmt: skip
-    """Returns two results. The first is [N, 16]: six nearnesses of walls, the normal at the particle, the normal ahead,
-    and zeros. The second is the contact of the particle [N]: 0 if no surface is within reach, at most 1."""
-    column = tl.arange(0, 16)
-    axis, upper, walls = column % 3, (column >= 3)[None, :], live[:, None] & (column < 6)[None, :]
-    v = tl.load(velocity + row[:, None] * (3 * HISTORY) + axis[None, :], mask=walls, other=0.0)
-    place = tl.load(position + row[:, None] * 3 + axis[None, :], mask=walls, other=0.0)
-    size = tl.load(domain + scene[:, None] * 3 + axis[None, :], mask=walls, other=0.0)
-    distance = tl.where(upper, size - place, place) + tl.minimum(tl.where(upper, -v, v), 0.0)
-    value = tl.where(walls, tl.minimum(tl.maximum(1 - distance / reach, 0.0), NEAREST), 0.0)
-    touch = tl.minimum(2 * tl.max(value, 1), 1.0)
-    if OBSTACLES:
-        # The probes are the present position, and steps along the path to the next frame.
-        quarters = tl.arange(0, 8)[None, :]
-        asked = live[:, None] & (quarters <= STEPS)
-        at = position + row[:, None] * 3 + 0 * quarters
-        v_at = velocity + row[:, None] * (3 * HISTORY) + 0 * quarters
-        time = quarters.to(tl.float32) / STEPS
-        x = tl.load(at, mask=asked, other=0.0) + tl.load(v_at, mask=asked, other=0.0) * time
-        y = tl.load(at + 1, mask=asked, other=0.0) + tl.load(v_at + 1, mask=asked, other=0.0) * time
-        z = tl.load(at + 2, mask=asked, other=0.0) + tl.load(v_at + 2, mask=asked, other=0.0) * time
-        line = obstacle_table + scene[:, None] * OBSTACLE_COLUMNS + 0 * quarters
-        normal = obstacle_normals(x, y, z, line, asked, obstacle_cell_size, SYMMETRY)
-        found = (normal[0] != 0) | (normal[1] != 0) | (normal[2] != 0)
-        ahead = tl.min(tl.where(found & (quarters > 0), quarters, 8), 1)
-        for i in tl.static_range(3):
-            value = with_column(value, 6 + i, tl.sum(tl.where(quarters == 0, normal[i], 0.0), 1))
-            there = tl.sum(tl.where(quarters == ahead[:, None], normal[i], 0.0), 1)
-            value = with_column(value, 9 + i, there)
-        touch = tl.where(tl.max(found.to(tl.int32), 1) > 0, 1.0, touch)
-    return value, touch
-
-
-@triton.jit
-def _surface_normals(surfaces):
-    """Returns the products xx, yy, zz, yz, xz, xy of the normals of `_surfaces`, summed over a particle's surfaces."""
-    column = tl.arange(0, 16)[None, :]
-    near, first = (), ()
-    for i in tl.static_range(3):
-        sides = tl.where((column == i) | (column == i + 3), tl.minimum(2 * surfaces, 1.0), 0.0)
-        near = near + (tl.sum(sides, 1),)  # noqa: RUF005 - Triton knows no unpacking here
-    here = tl.sum(tl.where((column >= 6) & (column < 9), tl.abs(surfaces), 0.0), 1) > 0
-    for i in tl.static_range(3):
-        at = tl.where(here, 6 + i, 9 + i)[:, None]
-        first = first + (tl.sum(tl.where(column == at, surfaces, 0.0), 1),)  # noqa: RUF005
-    x, y, z = first
-    return near[0] + x * x, near[1] + y * y, near[2] + z * z, y * z, x * z, x * y
-
-
-@triton.jit
 def _coarsest_part(x, fraction, high, LEVELS: tl.constexpr):
     """Returns three results for one axis. x is the coordinate of the lower corners, `high` marks the upper ones.
 
@@ -315,10 +259,11 @@ def _coarsest_part(x, fraction, high, LEVELS: tl.constexpr):
 def prepare_particles(
     position, velocity, scene_of, origin, particle_count, low, geometry, occupied, prefix_sum, cell_of,
     weight_of, fraction_of, motion, coarsest_of, share_of, place_of, moments, domain, obstacle_table,
-    obstacle_cell_size, features, touch_of, disturbed, cell_size, reach, capacity,
+    obstacle_cell_size, features, touch_of, disturbed, wall_friction, gravity, scale, friction, cell_size,
+    reach, capacity,
     HISTORY: tl.constexpr, LEVELS: tl.constexpr, MOTION: tl.constexpr, COLUMNS: tl.constexpr,
     NORMALS: tl.constexpr, OBSTACLES: tl.constexpr, SYMMETRY: tl.constexpr, FEATURES: tl.constexpr,
-    OVERLAP: tl.constexpr, BLOCK: tl.constexpr,
+    FRICTION: tl.constexpr, FRICTION_AT: tl.constexpr, OVERLAP: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Writes the 8 finest cells of each particle, its weights in them, and its fraction within the lowest cell.
 
@@ -327,7 +272,8 @@ def prepare_particles(
     [N, 3] from the middle of the lowest coarsest cell, in edges. It adds to cells: mass and momentum to the finest
     (`motion` [.., 4]); places, their products xx, yy, zz, yz, xz, xy, and such products of normals to the coarsest
     (`moments` [C, COLUMNS]). It raises column 1 of their `disturbed` [C, 2] to at least the contact times FULLY.
-    OBSTACLES and SYMMETRY mean the same as in prepare_features.
+    With FRICTION, the number of its columns, it writes these from FRICTION_AT on and adds to `friction` [C, COLUMNS]
+    (`add_friction`). OBSTACLES and SYMMETRY mean the same as in prepare_features.
 
     Rule: hgn.network.grid.build_hierarchy and hgn.network.relative; test: tests/kernels/test_network.py.
     """
@@ -340,9 +286,9 @@ def prepare_particles(
     live = row < count
     scene = tl.load(scene_of + row, mask=live, other=0)
     if MOTION:
-        surfaces, touch = _surfaces(
+        surfaces, touch = surfaces_of(
             position, velocity, domain, row, live, scene, obstacle_table, obstacle_cell_size, reach,
-            HISTORY, OBSTACLES, SYMMETRY,
+            HISTORY, OBSTACLES, SYMMETRY, 4 if FRICTION > 0 else 3,
         )  # fmt: skip
         tl.store(touch_of + row, touch, mask=live)
         column = tl.arange(0, 16)[None, :]
@@ -395,13 +341,18 @@ def prepare_particles(
         one = tl.where((part == 1) | (part == 4) | (part == 6), py, tl.where((part == 2) | (part == 5), pz, px))
         other = tl.where(part == 3, px, tl.where((part == 4) | (part == 8), py, tl.where(part < 3, 1.0, pz)))
         added = tl.where(part < 9, share[:, :, None] * one * other, 0.0)
-        product = _surface_normals(surfaces)
+        product = surface_normals(surfaces)
         for i in tl.static_range(6):
             added = tl.where(part == 9 + i, share[:, :, None] * product[i][:, None, None], added)
         # The added columns are a multiple of four, because the hardware adds four at once.
         adds = (coarsest >= 0)[:, :, None] & ((part < 12) | (touch > 0)[:, None, None])
         tl.atomic_add(moments + coarsest[:, :, None] * COLUMNS + part, added, mask=adds, sem="relaxed")
         raise_disturbed(disturbed + 1, coarsest, touch)
+        if FRICTION > 0:
+            add_friction(
+                surfaces, velocity, wall_friction, gravity, scale, scene, row, live, coarsest, share, friction,
+                features + row * FEATURES + FRICTION_AT, HISTORY, FRICTION > 3, COLUMNS,
+            )  # fmt: skip
     if OVERLAP:
         gdc_wait()  # only the next kernels read the tables that earlier kernels are filling
     # With cells past the capacity the frame is void, but no access may be out of bounds.

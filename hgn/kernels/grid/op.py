@@ -21,7 +21,9 @@ from hgn.kernels.scene_tables import SceneTable
 from hgn.kernels.triton_compat import interpreting, overlaps
 from hgn.network.cell_keys import SCENE_LIMIT
 from hgn.network.features import WALL_DISTANCE_CELLS
+from hgn.network.own_physics import physics_widths
 from hgn.network.relative import CONTACT_REACH_CELLS, FEW, OUTPUTS, QUIET, RARE
+from hgn.scene.material import INPUT_PARAMETERS
 
 MARK_BLOCK = 128
 PARTICLE_BLOCK = 32
@@ -60,9 +62,17 @@ class Window:
         return math.prod(n + 2 for n in self.cells)
 
 
+def own_physics_column(config: NetworkConfig) -> int:
+    """Returns the first column of own physics in the encoder's input."""
+    return config.feature_width - MATERIAL_EMBEDDING + len(config.materials)
+
+
 def feature_columns(config: NetworkConfig) -> int:
-    """Returns the number of columns of the encoder's input: features, one-hot material, padding to a power of two."""
-    used = config.feature_width - MATERIAL_EMBEDDING + len(config.materials)
+    """Returns the number of columns of the encoder's input, padded to a power of two.
+
+    They are: features, one-hot material, and the two parts of own physics (hgn.network.own_physics).
+    """
+    used = own_physics_column(config) + sum(physics_widths(config))
     return max(16, triton.next_power_of_2(used))
 
 
@@ -78,16 +88,27 @@ class DeviceParticles:
     domain_S3: torch.Tensor
     gravity_S3: torch.Tensor  # zero with absolute inputs, whose network has learned gravity
     count: torch.Tensor  # number of particles, int32 [1]
+    wall_friction_S3: torch.Tensor | None = None  # None: no surface has friction
+    parameter_NP: torch.Tensor | None = None  # columns of hgn.network.own_physics; None: all are 0
 
     @staticmethod
-    def empty(particles: int, scenes: int, history: int, device: torch.device) -> DeviceParticles:
-        """Returns buffers of zeros."""
+    def empty(
+        particles: int, scenes: int, history: int, device: torch.device, own_physics: Sequence[str] = ()
+    ) -> DeviceParticles:
+        """Returns buffers of zeros, of own physics those that `own_physics` names."""
         position_N3, velocity_NV = (torch.zeros(particles, columns, device=device) for columns in (3, 3 * history))
         scene_N, material_N, count = (
             torch.zeros(size, dtype=torch.int32, device=device) for size in (particles, particles, 1)
         )
         origin_S3, domain_S3, gravity_S3 = (torch.zeros(scenes, 3, device=device) for _ in range(3))
-        return DeviceParticles(position_N3, velocity_NV, scene_N, material_N, origin_S3, domain_S3, gravity_S3, count)
+        friction_S3 = torch.zeros(scenes, 3, device=device) if "friction" in own_physics else None
+        parameter_NP = None
+        if "parameters" in own_physics:
+            parameter_NP = torch.zeros(particles, len(INPUT_PARAMETERS), device=device)
+        return DeviceParticles(
+            position_N3, velocity_NV, scene_N, material_N, origin_S3, domain_S3, gravity_S3, count, friction_S3,
+            parameter_NP,
+        )  # fmt: skip
 
 
 class DeviceGrid:
@@ -100,7 +121,9 @@ class DeviceGrid:
     own particles, in units of FULLY) and felt_C2 (the maximum with those across their faces). sum_C and table_C are the
     sums and the table of `balance`. moment_C contains first and second moments of places, and sums of products of
     normals. A particle has its coarsest cells coarsest_N8 (repeated cells are -1), its weights share_N8 in them, its
-    place place_N3 in the lowest one, and its contact touch_N.
+    place place_N3 in the lowest one, and its contact touch_N. With friction as an input, friction_C are
+    sums of friction, and kept_C has derivatives for the backward pass. `friction` is the number of columns of friction
+    of the particles that were prepared last, 0 if no surface has friction.
     """
 
     def __init__(
@@ -133,10 +156,11 @@ class DeviceGrid:
         self.geometry = torch.tensor(rows, dtype=torch.int32, device=device)
         self.low = torch.tensor(window.low, dtype=torch.int32, device=device)
         coarsest = self.capacities[-1] if relative else 0
-        parts = [4 * at if relative else 4, *[SUMS * coarsest] * 3, 2 * coarsest, start, *more]
+        self._widths, self.friction, rough = physics_widths(config), 0, coarsest * ("friction" in config.own_physics)
+        parts = [4 * at if relative else 4, *[SUMS * coarsest] * 3, SUMS * rough, 2 * coarsest, start, *more]
         self._cleared = integers(sum(parts))  # one launch clears all parts
-        motion, *sums, moments, disturbed, self.occupied = self._cleared.split(parts)[:6]
-        self.more_cleared = self._cleared.split(parts)[6:]
+        motion, *sums, moments, friction, disturbed, self.occupied = self._cleared.split(parts)[:7]
+        self.more_cleared = self._cleared.split(parts)[7:]
         self.prefix_sum = integers(start)
         self.slot_of_cell, self._parent, self._octant = integers(at), integers(at), integers(at)
         self._neighbour, self._children = integers(6 * at), integers(8 * at)
@@ -151,10 +175,12 @@ class DeviceGrid:
         self.place_N3 = torch.zeros(particles * relative, 3, device=device)
         self.touch_N = torch.zeros(particles * relative, device=device)
         self.motion_C4, self.moment_C = motion.view(torch.float32).view(-1, 4), moments.view(torch.float32)
-        self.sum_C, self.gradient_sum_C = (x.view(torch.float32).view(-1, SUMS) for x in sums)
+        self.sum_C, self.gradient_sum_C, self.friction_C = (
+            x.view(torch.float32).view(-1, SUMS) for x in (*sums, friction)
+        )
         self.disturbed_C2 = disturbed.view(-1, 2)
         self.felt_C2 = torch.zeros(coarsest, 2, device=device)
-        self.table_C = torch.zeros(coarsest, SUMS, device=device)
+        self.table_C, self.kept_C = (torch.zeros(rows, SUMS, device=device) for rows in (coarsest, rough))
         self._at = [row[6] for row in rows]
 
     def neighbour(self, level: int) -> torch.Tensor:
@@ -208,6 +234,9 @@ class DeviceGrid:
         `scale` is Normaliser.feature_scale. With `symmetry` the kernel applies the symmetries in the obstacles' rows.
         """
         config, blocks, overlap = self.config, (triton.cdiv(self.particles, PARTICLE_BLOCK),), overlaps()
+        walls, parameter_NP, column = particles.wall_friction_S3, particles.parameter_NP, own_physics_column(config)
+        self.friction = self._widths[0] if walls is not None else 0
+        own_physics = {"FRICTION": self.friction, "FRICTION_AT": column}
         surfaces: dict[str, Any] = {
             "position": particles.position_N3, "velocity": particles.velocity_NV, "scene_of": particles.scene_N,
             "domain": particles.domain_S3, "particle_count": particles.count,
@@ -222,9 +251,10 @@ class DeviceGrid:
             prefix_sum=self.prefix_sum, cell_of=self.cell_N8, weight_of=self.weight_N8,
             fraction_of=self.fraction_N3, motion=self.motion_C4, coarsest_of=self.coarsest_N8,
             share_of=self.share_N8, place_of=self.place_N3, moments=self.moment_C, touch_of=self.touch_N,
-            disturbed=self.disturbed_C2, cell_size=self.cell_size,
+            disturbed=self.disturbed_C2, wall_friction=particles.domain_S3 if walls is None else walls,
+            gravity=particles.gravity_S3, scale=scale[1], friction=self.friction_C, cell_size=self.cell_size,
             reach=CONTACT_REACH_CELLS * config.cell_size, capacity=self.capacities[0], LEVELS=self.levels,
-            MOTION=config.relative, COLUMNS=SUMS, OVERLAP=overlap, launch_pdl=overlap,
+            MOTION=config.relative, COLUMNS=SUMS, **own_physics, OVERLAP=overlap, launch_pdl=overlap,
         )  # fmt: skip
         if not config.relative:
             feature_kernel.prepare_features[blocks](
@@ -243,9 +273,12 @@ class DeviceGrid:
             gravity=particles.gravity_S3, particle_count=particles.count, scale=scale[1], cell_of=self.cell_N8,
             weight_of=self.weight_N8, coarsest_of=self.coarsest_N8, share_of=self.share_N8, motion=self.motion_C4,
             parent=self._parent, geometry=self.geometry, features=self.feature_NF, touch_of=self.touch_N,
-            disturbed=self.disturbed_C2, felt=self.felt_C2, quiet=QUIET, HISTORY=config.velocity_history,
-            LEVELS=self.levels, NORMALS=int(config.obstacle_features), FEATURES=self.features, OVERLAP=overlap,
-            BLOCK=PARTICLE_BLOCK, launch_pdl=overlap,
+            disturbed=self.disturbed_C2, felt=self.felt_C2,
+            parameter_of=self.touch_N if parameter_NP is None else parameter_NP, quiet=QUIET,
+            HISTORY=config.velocity_history,
+            LEVELS=self.levels, NORMALS=int(config.obstacle_features), **own_physics,
+            PARAMETERS=0 if parameter_NP is None else self._widths[1], PARAMETERS_AT=column + self._widths[0],
+            FEATURES=self.features, OVERLAP=overlap, BLOCK=PARTICLE_BLOCK, launch_pdl=overlap,
         )  # fmt: skip
 
     def balance(self, output: torch.Tensor, count: torch.Tensor) -> None:
@@ -274,7 +307,8 @@ class DeviceGrid:
         )  # fmt: skip
         between[(triton.cdiv(capacity, PARTICLE_BLOCK),)](
             sums=sums, felt=self.felt_C2, motion=self.motion_C4, geometry=self.geometry, moments=self.moment_C, **cells,
-            table=self.table_C, few=FEW, rare=RARE, **sizes, launch_pdl=overlap,
+            table=self.table_C, friction=self.friction_C, kept=self.kept_C, few=FEW, rare=RARE,
+            FRICTION=self.friction > 0, **sizes, launch_pdl=overlap,
         )  # fmt: skip
         coarsest_kernel.add_coarsest[(triton.cdiv(particles, PARTICLE_BLOCK),)](
             x=x, table=self.table_C, **pairs, USED=left, COLUMNS=triton.next_power_of_2(left + 1), **sizes,
