@@ -13,6 +13,7 @@ import torch
 from hgn.config import NetworkConfig
 from hgn.data.sampler import Sample, SamplerState
 from hgn.network.features import material_rows
+from hgn.network.own_physics import physics_fields
 from hgn.scene.barrier import Barrier
 from hgn.scene.episode import Episode
 from hgn.scene.history import frames_before
@@ -31,6 +32,8 @@ class EpisodeTensors:
     gravity: Vector  # domain units per frame squared
     symmetries: tuple[Symmetry, ...] = ()  # symmetries that training may apply to the scene
     barrier: Barrier | None = None  # barrier of the scene's obstacles, if simulations respect them
+    wall_friction: Vector = (0.0, 0.0, 0.0)  # friction of the walls across x, y, z
+    parameter_NP: torch.Tensor | None = None  # as in ParticleState
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,14 +52,18 @@ def whole_episode(episode: Episode, network: NetworkConfig, barrier: Barrier | N
     past = frames_before(episode, -network.velocity_history)
     grid, seen = episode.obstacle_grid, len(episode.obstacle_grid.cell_K3) if network.obstacle_features else 0
     cell_K3, normal_K3 = grid.cell_K3[:seen], grid.normal_K3[:seen]
+    friction_K = None if grid.friction_K is None else grid.friction_K[:seen].astype(np.float32)
+    material_N = material_rows(episode.material_N, network.materials, episode.materials)
     return EpisodeTensors(
         torch.from_numpy(np.concatenate([past, episode.position_TN3], dtype=np.float32)),
-        material_rows(episode.material_N, network.materials, episode.materials).int(),
-        ObstacleGrid(grid.cell_size, cell_K3.astype(np.int32), normal_K3.astype(np.float32)),
+        material_N.int(),
+        ObstacleGrid(grid.cell_size, cell_K3.astype(np.int32), normal_K3.astype(np.float32), friction_K),
         episode.domain_size,
         frame_gravity(episode),
         shown_symmetries(episode, network),
         barrier,
+        episode.wall_friction,
+        physics_fields(network, [episode], material_N).get("parameter_NP"),
     )
 
 

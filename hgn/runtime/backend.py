@@ -128,8 +128,6 @@ def triton_unsupported_reason(device: torch.device, config: NetworkConfig, preci
         return reason
     if config.kind != "hgn":
         return f"it computes hgn networks, not {config.kind}"
-    if config.own_physics:
-        return f"it does not compute network.own_physics={','.join(config.own_physics)} yet"
     if config.width not in TRITON_WIDTHS:
         return f"network.width must be one of {', '.join(map(str, TRITON_WIDTHS))} for it, not {config.width}"
     if precision == "fp32":

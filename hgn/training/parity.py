@@ -73,5 +73,7 @@ def _state(
         domain_S3=particles.domain_S3,
         gravity_S3=particles.gravity_S3,
         obstacles=obstacles and obstacles.to(updates.device),
+        wall_friction_S3=particles.wall_friction_S3,
+        parameter_NP=None if particles.parameter_NP is None else particles.parameter_NP[:count],
     )
     return state, particles.origin_S3

@@ -23,6 +23,7 @@ from hgn.network.hgn import HierarchicalGraphNetwork
 from hgn.network.obstacles import ObstacleCells
 from hgn.runtime.simulation import Simulation
 from hgn.runtime.triton_stepper import CHECKED_PARTICLES, TritonStepper
+from hgn.scene.material import INPUT_PARAMETERS
 
 SPARE = 1.1  # (capacity for particles) / (particles in the first simulation)
 
@@ -82,6 +83,13 @@ class TritonScenes:
         counts = torch.tensor([episode.particles for episode in episodes], device=device)
         empty = max(0, self._training.pushforward_scenes - len(episodes))
         placed = [*episodes, *[episodes[0]] * empty]  # an empty scene has any domain
+        own: dict[str, torch.Tensor] = {}
+        if "friction" in self._network.config.own_physics:
+            own["wall_friction_S3"] = torch.tensor([episode.wall_friction for episode in placed], device=device)
+        if "parameters" in self._network.config.own_physics:
+            zeros = (torch.zeros(episode.particles, len(INPUT_PARAMETERS), device=device) for episode in episodes)
+            pairs = zip(episodes, zeros, strict=True)
+            own["parameter_NP"] = torch.cat([zero if e.parameter_NP is None else e.parameter_NP for e, zero in pairs])
         return ParticleState(
             position_N3=past_TN3[-1],
             velocity_NM3=past_TN3.diff(dim=0).flip(0).transpose(0, 1),
@@ -90,6 +98,7 @@ class TritonScenes:
             domain_S3=torch.tensor([episode.domain_size for episode in placed], device=device),
             gravity_S3=torch.tensor([episode.gravity for episode in placed], device=device),
             obstacles=None,
+            **own,
         )
 
     def _begun(self, episodes: Sequence[DeviceEpisode], state: ParticleState) -> TritonStepper:
@@ -153,8 +162,10 @@ class TritonScenes:
             # the keys of a hash are those of scene 0
             key_K = torch.cat([cells.key_K + (scene << 3 * COORDINATE_BITS) for scene, cells in seen])
             order_K = torch.argsort(key_K)
-            normal_K3 = torch.cat([cells.value_K for _, cells in seen])[order_K]
-            obstacles = ObstacleCells(key_K[order_K], normal_K3, self._obstacle_cell_size)
+            value_KV = torch.cat([cells.value_K for _, cells in seen])[order_K]
+            friction_K = value_KV[:, 3] if value_KV.shape[1] > 3 else None
+            normal_K3, size = value_KV[:, :3], self._obstacle_cell_size
+            obstacles = ObstacleCells(key_K[order_K], normal_K3, size, friction_K=friction_K)
         return replace(
             state,
             position_N3=state.position_N3[:count],
@@ -164,4 +175,6 @@ class TritonScenes:
             domain_S3=state.domain_S3[:scenes],
             gravity_S3=state.gravity_S3[:scenes],
             obstacles=obstacles,
+            wall_friction_S3=None if state.wall_friction_S3 is None else state.wall_friction_S3[:scenes],
+            parameter_NP=None if state.parameter_NP is None else state.parameter_NP[:count],
         )

@@ -175,7 +175,7 @@ class TritonUpdates:
             free, total = torch.cuda.mem_get_info(self.device)
             fits = free - position_TN3.nbytes > (1 - DATA_FRACTION) * total
             position_TN3 = position_TN3.to(self.device) if fits else position_TN3.pin_memory()
-        obstacles = SceneHash.of_grid(episode.obstacle_grid)
+        obstacles = SceneHash.of_grid(episode.obstacle_grid, "friction" in self.network.config.own_physics)
         barrier = SceneHash.of_barrier(episode.barrier) if episode.barrier is not None else None
         return DeviceEpisode(
             position_TN3,
@@ -185,6 +185,8 @@ class TritonUpdates:
             gravity=episode.gravity,
             symmetries=episode.symmetries,
             barrier=barrier and barrier.to(self.device),
+            wall_friction=episode.wall_friction,
+            parameter_NP=None if episode.parameter_NP is None else episode.parameter_NP.to(self.device),
         )
 
     def _take_over(self) -> None:

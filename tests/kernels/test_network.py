@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from kernels.cases import CASES, compare, drawn, flat, float32_state, moving_state, reference
+from kernels.cases import CASES, CROWD, Case, compare, drawn, flat, float32_state, moving_state, reference, rough_state
 from kernels.conftest import use_large_tiles
 from kernels.engines import device, engine_of, gradients, inference_of, run_forward
 from network.states import network_of
@@ -55,6 +55,23 @@ def assert_features(network, state, found):
     expected_C2 = torch.stack([contacts.disturbed_C, contacts.touched_C], 1)
     felt_C2 = found.engine.grid.felt_C2[: len(expected_C2)].cpu().double()
     torch.testing.assert_close(felt_C2, expected_C2, rtol=0, atol=1e-3)
+
+
+def test_without_friction_no_bit_changes():
+    """In a scene without friction and parameters a network with these inputs computes what it does without them: with
+    the kernels of other networks, and with those of friction of 0; on a GPU to the order of sums."""
+    state, network, outputs = moving_state(CROWD), CASES["friction and parameters"].network(), []
+    origin_S3, zero = drawn(network, state)[0], rough_state(CROWD, 0.0, 0.0)
+    bare = Case(lambda: state, 0.0, {"inputs": "local"}).network()
+    parameters = {
+        name: p[: len(b), : b.shape[-1]] if p.dim() == 2 else p
+        for (name, p), b in zip(network.state_dict().items(), bare.state_dict().values(), strict=True)
+    }
+    bare.load_state_dict(parameters)
+    for same, shown in ((bare, state), (network, state), (network, replace(zero, parameter_NP=0 * zero.parameter_NP))):
+        outputs.append(run_forward(engine_of(same, shown), same, shown, origin_S3))
+    for found in outputs[1:]:
+        assert relative_error(found, outputs[0]) < 1e-5 if device().type == "cuda" else torch.equal(found, outputs[0])
 
 
 def test_cases_are_what_they_say():

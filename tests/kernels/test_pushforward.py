@@ -1,5 +1,7 @@
 """The pushforward pool on backend triton against that on torch."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -29,11 +31,19 @@ def placed(made, network):
     clearance = network.step.obstacle_clearance
     barrier = None if clearance is None else simulated_barrier(made, clearance)
     whole, where = whole_episode(made, network.config, barrier), device()
-    cells = SceneHash.of_grid(whole.obstacle_grid)
+    cells = SceneHash.of_grid(whole.obstacle_grid, "friction" in network.config.own_physics)
+    parameter_NP = None if whole.parameter_NP is None else whole.parameter_NP.to(where)
     hashed = SceneHash.of_barrier(whole.barrier) if whole.barrier is not None else None
     position_TN3, material_N = whole.position_TN3.to(where), whole.material_N.to(where)
-    scene = whole.domain_size, whole.gravity, whole.symmetries
-    return DeviceEpisode(position_TN3, material_N, cells and cells.to(where), *scene, hashed and hashed.to(where))
+    scene = whole.domain_size, whole.gravity, whole.symmetries, hashed and hashed.to(where), whole.wall_friction
+    return DeviceEpisode(position_TN3, material_N, cells and cells.to(where), *scene, parameter_NP)
+
+
+def with_parameters(made):
+    """The episode with other elastic moduli and densities."""
+    values_2N = np.random.default_rng(2).random((2, made.particle_count)).astype(np.float32) + 0.5
+    given = {"youngs_modulus_pa": 1e6 * values_2N[0], "density_kg_m3": 1e3 * values_2N[1]}
+    return replace(made, material_parameters=given)
 
 
 def pools_of(network, training):
@@ -64,13 +74,19 @@ def assert_same_pools(fast, plain):
 
 
 @pytest.mark.parametrize(
-    "changes", [{"inputs": "relative", "wall_clearance": (0.45, 0.45)}, {"obstacle_clearance": 5e-3}]
+    "changes",
+    [
+        {"inputs": "relative", "wall_clearance": (0.45, 0.45)},
+        {"inputs": "local", "own_physics": ("friction", "parameters"), "wall_clearance": (0.45, 0.45)},
+        {"obstacle_clearance": 5e-3},
+    ],
 )
 def test_the_pool_is_that_of_the_plain_path(changes):
     """Scenes with and without obstacles, first and later frames, one simulation after the other with other weights and
     other numbers of particles, in the same buffers where they suffice: both pools hold the same windows."""
     network = network_of(torch.float32, width=16, levels=1, message_passing_steps=1, **changes).to(device())
     scenes = [scene_with_obstacles(0, 7), episode(5, seed=1), scene_with_obstacles(2, 6), scene_with_obstacles(3, 12)]
+    scenes[2] = with_parameters(scenes[2])
     drawn = {"noise_std": 0.5, "noise_min_scale": 0.1, "pushforward_importance": 0.5}
     training = training_of(precision="fp32", pushforward_frames=2, **drawn)
     fast, plain = pools_of(network, training)

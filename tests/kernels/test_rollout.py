@@ -14,7 +14,7 @@ from kernels.engines import device
 from kernels.memory import living_tensors
 from network.barrier_scenes import crossings, square
 from network.states import network_of, on_device, random_state
-from runtime.scenes import random_scene
+from runtime.scenes import random_scene, rough
 
 from hgn.config import NetworkConfig
 from hgn.kernels.grid.op import DeviceGrid, Window
@@ -87,6 +87,7 @@ SHEETS = crossed((0.1, 0.1, 0.1))
 FRAMES = {  # of the network
     "absolute": {"levels": 2},
     "relative, resting": {"levels": 3, "inputs": "relative", "rest_threshold": 2.0},
+    "friction and parameters": {"levels": 2, "inputs": "local", "own_physics": ("friction", "parameters")},
     "walls of a plane": {"wall_clearance": (0.06, 0.2), "dimensions": 2},
     "obstacles and walls": {"obstacle_clearance": 2e-3, "wall_clearance": (0.06, 0.2)},
 }
@@ -115,6 +116,8 @@ def test_frames_are_those_of_the_plain_loop(name):
     simulator = partial(thrown, deviation=0.02 if held or walls else 1e-3)
     scenes = [scene(count, seed, gravity=(3.0 * seed, -9.8, 2.0 * seed)) for seed, count in enumerate(counts)]
     scenes = [replace(each, dimensions=changes.get("dimensions", 3)) for each in scenes]
+    if "own_physics" in changes:
+        scenes = [scenes[0], rough(scenes[1])]
     if held:
         scenes = [each if i == 1 else replace(each, corners=lambda: SHEETS) for i, each in enumerate(scenes)]
     frames = 3 if held or walls else 2

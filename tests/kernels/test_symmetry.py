@@ -8,7 +8,7 @@ import pytest
 import torch
 from kernels.cases import flat
 from kernels.engines import device
-from kernels.test_pushforward import placed
+from kernels.test_pushforward import placed, with_parameters
 from kernels.test_training import without_jitter
 from kernels.test_update import HISTORY, parameters_of, updates_of
 from network.states import network_of
@@ -33,15 +33,19 @@ def small_network():
     return network_of(width=16, levels=1, message_passing_steps=1, cell_size=0.1)
 
 
-def test_an_update_under_symmetries_is_the_plain_one(monkeypatch):
-    """An update of eight scenes, each under another of the cube's symmetries, which turn gravity, one without
-    obstacles, one without gravity: positions, velocities, targets, normals, loss and gradients are those of backend
-    torch in float64, and the check passes."""
-    network = network_of(width=16, levels=1, message_passing_steps=1, cell_size=0.1, inputs="relative")
+@pytest.mark.parametrize("own_physics", [(), ("friction", "parameters")])
+def test_an_update_under_symmetries_is_the_plain_one(own_physics, monkeypatch):
+    """An update of eight scenes, each under another of the cube's symmetries, which turn gravity and the walls'
+    friction, one without obstacles, one without gravity, two with parameters of their own: positions, velocities,
+    targets, normals, loss and gradients are those of backend torch in float64, and the check passes."""
+    network = network_of(
+        width=16, levels=1, message_passing_steps=1, cell_size=0.1, inputs="relative", own_physics=own_physics
+    )
     episodes = [scene_with_obstacles(i, 2 + i % 3, 20_000) for i in range(8)]
     bare = ObstacleGrid(CELL_SIZE, np.zeros((0, 3), np.int32), np.zeros((0, 3), np.float32))
     episodes[2] = replace(episodes[2], obstacle_grid=bare)
     episodes[0] = replace(episodes[0], gravity=(0.0, 0.0, 0.0))
+    episodes[3:5] = [with_parameters(made) for made in episodes[3:5]]
     shown = [*ALL_48[1::6]]
     seeds = seeds_of(shown, ALL_48)
     batch = under_symmetries(doubled(make_batch([(e, FRAME) for e in episodes], network.config, seeds)), shown)
@@ -62,6 +66,9 @@ def test_an_update_under_symmetries_is_the_plain_one(monkeypatch):
     updates, count = fast.updates, len(state.position_N3)
     width = 3 * HISTORY + 9
     assert fast.parity is not None and max(fast.parity) < 1e-3
+    if own_physics:
+        assert torch.equal(updates.buffers.wall_friction_S3.cpu(), state.wall_friction_S3.float())
+        assert torch.equal(updates.buffers.parameter_NP[:count].cpu(), state.parameter_NP)
     near = {"rtol": 0, "atol": 1e-7}
     torch.testing.assert_close(updates.buffers.position_N3[:count].cpu().double(), state.position_N3, **near)
     torch.testing.assert_close(

@@ -2,8 +2,8 @@
 
 The sample table has a row of int64 numbers for each scene of each update. A row holds: the address of the window's
 first frame of positions, number of particles, first row in the batch, seed, address of the materials (int32), weight of
-the loss, scale of the noise (each as the bits of a float64), and the scene's row of the obstacle table. The last column
-of that row is the symmetry of the sample.
+the loss, scale of the noise (each as the bits of a float64), address of the columns of parameters (float32; 0: all are
+0), and the scene's row of the obstacle table. The last column of that row is the symmetry of the sample.
 Shape legend: N particles of all scenes, S scenes, H velocity history.
 """
 
@@ -16,7 +16,7 @@ from hgn.kernels.blocks import nearest_tf32
 from hgn.kernels.obstacles import CODE_BITS, CODE_MASK, OBSTACLE_COLUMNS
 from hgn.kernels.triton_compat import settle_keys
 
-SAMPLE_COLUMNS = tl.constexpr(12)
+SAMPLE_COLUMNS = tl.constexpr(13)
 JITTER_OFFSET = tl.constexpr(0x7FFFFFF0)  # offset of the jitter in the seed's stream, far from the noise
 WAVES_OFFSET = tl.constexpr(0x7FFFF000)  # offset of the smooth noise in the seed's stream
 REPEAT = tl.constexpr(8)  # status bit: another rank must repeat the update
@@ -61,23 +61,25 @@ def draw_waves(
 def assemble_batch(
     samples, sample_vectors, update, position, velocity, scene_of, material_of, target, share_of, origin,
     domain, gravity, obstacle_table, particle_count, mean, std, noise_step, waves, jitter, scenes,
-    obstacle_cell_size,
+    wall_friction, parameter_of, obstacle_cell_size,
     HISTORY: tl.constexpr, SYMMETRY: tl.constexpr, NOISE: tl.constexpr, WAVES: tl.constexpr,
-    DIMENSIONS: tl.constexpr, SCENES: tl.constexpr, BLOCK: tl.constexpr,
+    FRICTION: tl.constexpr, PARAMETERS: tl.constexpr, DIMENSIONS: tl.constexpr, SCENES: tl.constexpr,
+    BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Writes windows with noise in the inputs (paper sec. 3.3): a random walk of velocity noise that positions follow.
 
     With NOISE each particle has its own noise. With WAVES a part of it comes from its scene's waves, see draw_waves.
-    The target is v_true^{n+1} - v_noisy^n minus gravity, normalised. sample_vectors [updates, S, 2, 3] are the domain's
-    size and gravity under the sample's symmetry; gravity is zero with absolute inputs. Grid origins are uniform in
-    [-jitter, 0]. Noise and jitter are Philox numbers that depend only on the sample's seed. With SYMMETRY the window is
-    the image of the stored one. Velocities come from stored positions, because mirrored positions are rounded.
+    The target is v_true^{n+1} - v_noisy^n minus gravity, normalised. sample_vectors [updates, S, 3, 3] are the domain's
+    size, and gravity and the walls' friction under the sample's symmetry; gravity is zero with absolute inputs. With
+    FRICTION and PARAMETERS (a number of columns) own physics is copied. Grid origins are uniform in [-jitter, 0].
+    Noise and jitter are Philox numbers that depend only on the sample's seed. With SYMMETRY the window is the image of
+    the stored one. Velocities come from stored positions, because mirrored positions are rounded.
     SCENES is a power of two, at least `scenes`. Axes from DIMENSIONS on have neither noise nor jitter.
 
     Rule: hgn.training.noise; test: tests/kernels/test_update.py.
     """
     table = samples + tl.load(update).to(tl.int64) * scenes * SAMPLE_COLUMNS
-    vectors = sample_vectors + tl.load(update) * scenes * 6
+    vectors = sample_vectors + tl.load(update) * scenes * 9
     last = table + (scenes - 1) * SAMPLE_COLUMNS
     count = (tl.load(last + 1) + tl.load(last + 2)).to(tl.int32)
     scene = tl.arange(0, SCENES)
@@ -89,10 +91,13 @@ def assemble_batch(
         for axis in tl.static_range(3):
             draw = tl.rand(seed, scene * 0 + JITTER_OFFSET + axis)
             tl.store(origin + scene * 3 + axis, -jitter * draw if axis < DIMENSIONS else 0.0 * draw, mask=there)
-            size = tl.load(vectors + scene * 6 + axis, mask=there, other=0.0)
+            size = tl.load(vectors + scene * 9 + axis, mask=there, other=0.0)
             tl.store(domain + scene * 3 + axis, size, mask=there)
-            pull = tl.load(vectors + scene * 6 + 3 + axis, mask=there, other=0.0)
+            pull = tl.load(vectors + scene * 9 + 3 + axis, mask=there, other=0.0)
             tl.store(gravity + scene * 3 + axis, pull, mask=there)
+            if FRICTION:
+                rough = tl.load(vectors + scene * 9 + 6 + axis, mask=there, other=0.0)
+                tl.store(wall_friction + scene * 3 + axis, rough, mask=there)
         for i in tl.static_range(OBSTACLE_COLUMNS):
             at = table + scene * SAMPLE_COLUMNS + SAMPLE_COLUMNS - OBSTACLE_COLUMNS + i
             value = tl.load(at, mask=there, other=0)
@@ -112,6 +117,13 @@ def assemble_batch(
     tl.store(scene_of + row, scene_row, mask=live)
     materials = tl.load(line + 4, mask=live, other=0).to(tl.pointer_type(tl.int32))
     tl.store(material_of + row, tl.load(materials + own, mask=live, other=0), mask=live)
+    if PARAMETERS > 0:
+        number = tl.arange(0, 8)[None, :]
+        values = tl.load(line + 7, mask=live, other=0)[:, None]
+        at = values.to(tl.pointer_type(tl.float32)) + own[:, None] * PARAMETERS + number
+        written = live[:, None] & (number < PARAMETERS)
+        value = tl.load(at, mask=written & (values != 0), other=0.0)
+        tl.store(parameter_of + row[:, None] * PARAMETERS + number, value, mask=written)
     weight = tl.load(line + 5, mask=live, other=0).to(tl.float64, bitcast=True).to(tl.float32)
     tl.store(share_of + row, weight / (scenes * particles.to(tl.float32)), mask=live)
     if NOISE:
@@ -158,7 +170,7 @@ def assemble_batch(
             mirror_sum = (part >> 3 & CODE_MASK).to(tl.float32) * obstacle_cell_size
             before = tl.where(mirrored, mirror_sum - before, before)
         tl.store(position + row * 3 + axis, before + moved, mask=live)
-        acceleration = step - v - tl.load(vectors + scene_row * 6 + 3 + axis, mask=live, other=0.0)
+        acceleration = step - v - tl.load(vectors + scene_row * 9 + 3 + axis, mask=live, other=0.0)
         scaled = (acceleration - tl.load(mean + axis)) / tl.load(std + axis)
         tl.store(target + row * 3 + axis, scaled, mask=live)
 

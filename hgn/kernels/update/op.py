@@ -52,6 +52,8 @@ class DeviceEpisode:
     gravity: Vector = (0.0, 0.0, 0.0)  # domain units per frame squared; only relative inputs use it
     symmetries: tuple[Symmetry, ...] = ()  # if settings.symmetry is set, one of them is drawn for each sample
     barrier: SceneHash | None = None  # the barrier of the episode's simulations
+    wall_friction: Vector = (0.0, 0.0, 0.0)  # friction of the walls across x, y, z
+    parameter_NP: torch.Tensor | None = None  # float32, columns of hgn.network.own_physics; None: all are 0
 
     def __post_init__(self) -> None:
         position_TN3, material_N = self.position_TN3, self.material_N
@@ -72,9 +74,9 @@ class DeviceEpisode:
     def row(self) -> np.ndarray:
         """Returns the row of the sample table for frame 0, int64 [SAMPLE_COLUMNS], without seed, weight and noise."""
         obstacles = self.obstacles.row() if self.obstacles is not None else [0] * OBSTACLE_COLUMNS
-        return np.array(
-            [self.position_TN3.data_ptr(), self.particles, 0, 0, self.material_N.data_ptr(), 0, 0, *obstacles], np.int64
-        )
+        parameters = 0 if self.parameter_NP is None else self.parameter_NP.data_ptr()
+        first = [self.position_TN3.data_ptr(), self.particles, 0, 0, self.material_N.data_ptr(), 0, 0, parameters]
+        return np.array([*first, *obstacles], np.int64)
 
 
 class DeviceSample(NamedTuple):
@@ -227,15 +229,17 @@ class Updates:
         if self.settings.symmetry:
             shown = [drawn_symmetry(sample.episode.symmetries, sample.seed) for sample in flat]
             table[..., -1] = np.array([symmetry.code for symmetry in shown]).reshape(count.shape)
-        vectors = np.zeros((len(flat), 2, 3), np.float32)
+        vectors = np.zeros((len(flat), 3, 3), np.float32)
         vectors[:, 0] = [sample.episode.domain_size for sample in flat]
         if self.config.relative:
             vectors[:, 1] = [s.direction(sample.episode.gravity) for s, sample in zip(shown, flat, strict=True)]
+        frictions = [sample.episode.wall_friction for sample in flat]
+        vectors[:, 2] = [[friction[axis] for axis in s.source] for s, friction in zip(shown, frictions, strict=True)]
         most = int(count.sum(1).max())
         if len(chunk) > len(self._rates):
             self._allocate_tables(max(len(chunk), TABLE_UPDATES))
         self._samples[: len(chunk)].copy_(torch.from_numpy(table))
-        self._vectors[: len(chunk)].copy_(torch.from_numpy(vectors).view(*count.shape, 2, 3))
+        self._vectors[: len(chunk)].copy_(torch.from_numpy(vectors).view(*count.shape, 3, 3))
         self._rates[: len(chunk)].copy_(torch.tensor(rates, dtype=torch.float64))
         self.update.zero_()
         largest = torch.from_numpy(vectors[:, 0]).amax(0)
@@ -246,7 +250,7 @@ class Updates:
         self._graphs = []  # the graphs read the old tables
         shape = (length, self.settings.scenes)
         self._samples = torch.zeros(*shape, SAMPLE_COLUMNS, dtype=torch.int64, device=self.device)
-        self._vectors = torch.zeros(*shape, 2, 3, device=self.device)
+        self._vectors = torch.zeros(*shape, 3, 3, device=self.device)
         self._rates = torch.zeros(length, device=self.device)
         self._shares = torch.zeros(length, device=self.device)
 
@@ -338,6 +342,7 @@ class Updates:
                 largest_number=2 * math.pi / shortest, log_range=math.log(longest / shortest),
                 scenes=settings.scenes, HISTORY=config.velocity_history, WAVES=CORRELATED_WAVES,
             )  # fmt: skip
+        walls, parameter_NP = self.buffers.wall_friction_S3, self.buffers.parameter_NP
         kernel.assemble_batch[(triton.cdiv(self.particles, BLOCK),)](
             samples=self._samples, sample_vectors=self._vectors, update=self.update, position=self.buffers.position_N3,
             velocity=self.buffers.velocity_NV, scene_of=self.buffers.scene_N, material_of=self.buffers.material_N,
@@ -345,8 +350,11 @@ class Updates:
             gravity=self.buffers.gravity_S3, obstacle_table=self._obstacle_row, particle_count=self.buffers.count,
             mean=self.mean, std=self.std, noise_step=own_step, waves=self.waves_SKC,
             jitter=config.cell_size if settings.grid_jitter else 0.0, scenes=settings.scenes,
+            wall_friction=self.buffers.domain_S3 if walls is None else walls,
+            parameter_of=self.share_N if parameter_NP is None else parameter_NP,
             obstacle_cell_size=settings.obstacle_cell_size, HISTORY=config.velocity_history,
             SYMMETRY=settings.symmetry, NOISE=own_step > 0, WAVES=CORRELATED_WAVES if wave_step > 0 else 0,
+            FRICTION=walls is not None, PARAMETERS=0 if parameter_NP is None else parameter_NP.shape[1],
             DIMENSIONS=config.dimensions, SCENES=triton.next_power_of_2(settings.scenes), BLOCK=BLOCK,
         )  # fmt: skip
 
@@ -371,7 +379,9 @@ class Updates:
         if hasattr(self, "fused"):
             del self.fused, self.grid  # frees the old buffers before the allocation of the new ones
         self._built_reach = self._reach
-        self.buffers = DeviceParticles.empty(particles, self.settings.scenes, config.velocity_history, device)
+        self.buffers = DeviceParticles.empty(
+            particles, self.settings.scenes, config.velocity_history, device, config.own_physics
+        )
         self.target_N3 = torch.zeros(particles, 3, device=device)
         self.share_N = torch.zeros(particles, device=device)
         if not self.capacities:
