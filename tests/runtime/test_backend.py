@@ -83,6 +83,7 @@ def test_automatic_precision(precision, device, backend, expected):
     ("device", "network", "precision", "reason"),
     [
         (GPU, {}, "tf32", ""),
+        (GPU, {"inputs": "relative", "own_physics": ("friction",)}, "tf32", ""),
         (CPU, {}, "tf32", "not cpu"),
         (GPU, {"kind": "gns", "levels": 1}, "tf32", "hgn networks, not gns"),
         (GPU, {"width": 48}, "tf32", "not 48"),
