@@ -11,6 +11,7 @@ import math
 from collections.abc import Sequence
 from contextlib import nullcontext
 from dataclasses import replace
+from typing import Any
 
 import torch
 
@@ -83,7 +84,7 @@ class TritonScenes:
         counts = torch.tensor([episode.particles for episode in episodes], device=device)
         empty = max(0, self._training.pushforward_scenes - len(episodes))
         placed = [*episodes, *[episodes[0]] * empty]  # an empty scene has any domain
-        own: dict[str, torch.Tensor] = {}
+        own: dict[str, Any] = {}
         if "friction" in self._network.config.own_physics:
             own["wall_friction_S3"] = torch.tensor([episode.wall_friction for episode in placed], device=device)
         if "parameters" in self._network.config.own_physics:
