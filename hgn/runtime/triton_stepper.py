@@ -114,7 +114,7 @@ class TritonStepper:
 
         self.own_physics = _own_physics(self.config, state)
         self.buffers = DeviceParticles.empty(
-            self.particles, self.scenes, self.config.velocity_history, self.device, self.own_physics
+            self.particles, self.scenes, self.config.velocity_history, self.device, own_physics=self.own_physics
         )
         self.lost, self.frame = (torch.zeros(1, dtype=torch.int32, device=self.device) for _ in range(2))
         self.obstacles = obstacles
