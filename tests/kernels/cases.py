@@ -51,21 +51,16 @@ def flying_state():
     return replace(state, position_N3=state.position_N3 + 0.4, velocity_NM3=velocity_NH3)
 
 
-def rough_state(counts, walls=1.0, obstacles=1.0, parameters=True, spread=0.3):
+def rough_state(counts, walls=1.0, obstacles=1.0, fastest=1.0):
     """The same with friction, up to these numbers, of walls and obstacle cells, and columns of parameters."""
-    state, generator = moving_state(counts, obstacles is not None, spread), torch.Generator().manual_seed(4)
+    state, generator = moving_state(counts, obstacles is not None), torch.Generator().manual_seed(4)
     draw = lambda *shape: torch.rand(*shape, generator=generator)  # noqa: E731
     if obstacles is not None:
         cells = state.obstacles
         state = replace(state, obstacles=replace(cells, friction_K=obstacles * draw(len(cells.key_K))))
-    if parameters:
-        state = replace(state, parameter_NP=draw(len(state.scene_N), len(INPUT_PARAMETERS)).double())
-    return replace(state, wall_friction_S3=walls * draw(len(counts), 3).double())
-
-
-def slow(state):
-    """The state without fast particles, so that the bound of friction by motion counts."""
-    return replace(state, velocity_NM3=state.velocity_NM3.clamp(-3e-3, 3e-3))
+    columns = {"parameter_NP": draw(len(state.scene_N), len(INPUT_PARAMETERS)).double()}
+    velocity_NM3, walls_S3 = state.velocity_NM3.clamp(-fastest, fastest), walls * draw(len(counts), 3).double()
+    return replace(state, velocity_NM3=velocity_NM3, wall_friction_S3=walls_S3, **columns)
 
 
 @dataclass(frozen=True)
@@ -106,12 +101,10 @@ CASES = {
     "relative, free flight": Case(flying_state, 2e-4, RELATIVE),
     "friction and parameters": Case(lambda: rough_state(CROWD), 1e-4, OWN),
     "friction of walls": Case(
-        lambda: rough_state((23, 9), 0.5, None, False, 0.15), 1e-4, OWN | {"obstacle_features": False, "levels": 1}
+        lambda: rough_state((23, 9), 0.5, None), 1e-4, OWN | {"own_physics": ("friction",), "obstacle_features": False}
     ),
-    "friction that stops": Case(lambda: slow(rough_state((61, 20), 30.0, 30.0)), 1e-4, OWN),
-    "parameters": Case(
-        lambda: replace(rough_state(SEVERAL), wall_friction_S3=None), 4e-5, RELATIVE | {"own_physics": ("parameters",)}
-    ),
+    "friction that stops": Case(lambda: rough_state((61, 20), 30.0, 30.0, 3e-3), 1e-4, OWN),
+    "parameters": Case(lambda: rough_state(SEVERAL), 4e-5, RELATIVE | {"own_physics": ("parameters",)}),
 }
 
 

@@ -57,11 +57,9 @@ def prepare(engine, network, state, origin_S3):
         return full.to(where)
 
     scale = tuple(x.float().to(where) for x in network.normaliser.feature_scale(network.config.relative))
-    obstacles = (
-        SceneTable.of_obstacles(state.obstacles.to(where), state.scene_count, state.wall_friction_S3 is not None)
-        if state.obstacles is not None
-        else None
-    )
+    walls_S3 = state.wall_friction_S3 if "friction" in network.config.own_physics else None
+    obstacles = state.obstacles and state.obstacles.to(where)
+    obstacles = obstacles and SceneTable.of_obstacles(obstacles, state.scene_count, walls_S3 is not None)
     particles = DeviceParticles(
         position_N3=padded(state.position_N3.float()),
         velocity_NV=padded(state.velocity_NM3.float().flatten(1)),
@@ -71,7 +69,7 @@ def prepare(engine, network, state, origin_S3):
         domain_S3=state.domain_S3.float().to(where),
         gravity_S3=state.gravity_S3.float().to(where),
         count=engine.particle_count,
-        wall_friction_S3=None if state.wall_friction_S3 is None else state.wall_friction_S3.float().to(where),
+        wall_friction_S3=None if walls_S3 is None else walls_S3.float().to(where),
         parameter_NP=None if state.parameter_NP is None else padded(state.parameter_NP.float()),
     )
     grid.build(particles)

@@ -41,9 +41,8 @@ def placed(made, network):
 
 def with_parameters(made):
     """The episode with other elastic moduli and densities."""
-    values_2N = np.random.default_rng(2).random((2, made.particle_count)).astype(np.float32) + 0.5
-    given = {"youngs_modulus_pa": 1e6 * values_2N[0], "density_kg_m3": 1e3 * values_2N[1]}
-    return replace(made, material_parameters=given)
+    factor_N = np.linspace(0.5, 2.0, made.particle_count, dtype=np.float32)
+    return replace(made, material_parameters={"youngs_modulus_pa": 1e6 * factor_N, "density_kg_m3": 1e3 * factor_N})
 
 
 def pools_of(network, training):

@@ -1,6 +1,6 @@
-"""Computes the force along surfaces in coarsest cells: what surfaces without friction remove, and what friction keeps.
+"""Computes the force along surfaces in coarsest cells: what surfaces without friction remove, and what friction leaves.
 
-The rule is hgn.network.own_physics.kept, whose letters are used here. Shape legend: C coarsest cells.
+The rule is hgn.network.own_physics.friction_fraction, whose letters are used here. Shape legend: C coarsest cells.
 """
 
 from __future__ import annotations
@@ -61,12 +61,12 @@ def _product(matrix, vector):
 
 
 @triton.jit
-def keep_friction(
-    friction, kept, cell, there, inverse, ratio, matrix, disturbed, touched, along, impulse, OUT: tl.constexpr
+def removed_along(
+    friction, fraction, cell, there, inverse, ratio, matrix, disturbed, touched, along, impulse, OUT: tl.constexpr
 ):
     """Returns the part of T = Q R that surfaces remove, (1 - k) T. `along` is T, and `impulse` A without the factor d.
 
-    Writes to kept [C, OUT] what the backward pass reads: T, k, and the derivatives of k by R and by A, both times c.
+    Writes to `fraction` [C, OUT] for the backward pass: T, k, and the derivatives of k by R and by A, both times c.
     """
     c = disturbed * touched
     force = c * along[0], c * along[1], c * along[2]
@@ -103,7 +103,7 @@ def keep_friction(
         by_mean = by_mean + (c * c * total,)  # noqa: RUF005
     by_mean = along_surfaces(matrix, by_mean)
     by_impulse = along_surfaces(matrix, along_surfaces(matrix, by_free))
-    line = kept + cell * OUT
+    line = fraction + cell * OUT
     tl.store(line + 3, part, mask=there)
     for i in tl.static_range(3):
         tl.store(line + i, along[i], mask=there)
@@ -113,11 +113,11 @@ def keep_friction(
 
 
 @triton.jit
-def with_friction(kept, cell, there, mean, OUT: tl.constexpr):
+def with_friction(fraction, cell, there, mean, OUT: tl.constexpr):
     """Returns the gradient by A of cells from that of their accelerations, both without the factor d.
     Cells [C] or cells across faces [C, 8]."""
-    slope = dot(mean, three_columns(kept, cell, 0, there, 1.0, OUT))
-    x, y, z = three_columns(kept, cell, 7, there, slope, OUT)
+    slope = dot(mean, three_columns(fraction, cell, 0, there, 1.0, OUT))
+    x, y, z = three_columns(fraction, cell, 7, there, slope, OUT)
     return mean[0] + x, mean[1] + y, mean[2] + z
 
 

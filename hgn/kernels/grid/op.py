@@ -122,8 +122,8 @@ class DeviceGrid:
     sums and the table of `balance`. moment_C contains first and second moments of places, and sums of products of
     normals. A particle has its coarsest cells coarsest_N8 (repeated cells are -1), its weights share_N8 in them, its
     place place_N3 in the lowest one, and its contact touch_N. With friction as an input, friction_C are
-    sums of friction, and kept_C has derivatives for the backward pass. `friction` is the number of columns of friction
-    of the particles that were prepared last, 0 if no surface has friction.
+    sums of friction, and friction_fraction_C has its fraction k with derivatives. `friction` is the number of columns
+    of friction of the particles that were prepared last, 0 if no surface has friction.
     """
 
     def __init__(
@@ -180,7 +180,7 @@ class DeviceGrid:
         )
         self.disturbed_C2 = disturbed.view(-1, 2)
         self.felt_C2 = torch.zeros(coarsest, 2, device=device)
-        self.table_C, self.kept_C = (torch.zeros(rows, SUMS, device=device) for rows in (coarsest, rough))
+        self.table_C, self.friction_fraction_C = (torch.zeros(rows, SUMS, device=device) for rows in (coarsest, rough))
         self._at = [row[6] for row in rows]
 
     def neighbour(self, level: int) -> torch.Tensor:
@@ -307,7 +307,7 @@ class DeviceGrid:
         )  # fmt: skip
         between[(triton.cdiv(capacity, PARTICLE_BLOCK),)](
             sums=sums, felt=self.felt_C2, motion=self.motion_C4, geometry=self.geometry, moments=self.moment_C, **cells,
-            table=self.table_C, friction=self.friction_C, kept=self.kept_C, few=FEW, rare=RARE,
+            table=self.table_C, friction=self.friction_C, fraction=self.friction_fraction_C, few=FEW, rare=RARE,
             FRICTION=self.friction > 0, **sizes, launch_pdl=overlap,
         )  # fmt: skip
         coarsest_kernel.add_coarsest[(triton.cdiv(particles, PARTICLE_BLOCK),)](
