@@ -24,7 +24,8 @@ RANGES: dict[str, dict[str, tuple[float, float]]] = {
     "drop": {"size": (0.04, 0.25), "height": (0.0, 0.8), "speed": (0.0, 5.0)},
     "slope": {"plate": (0.45, 0.75), "tilt": (0.03, 0.36), "size": (0.05, 0.12)},
     "edge": {
-        "plate": (0.2, 0.45), "height": (0.1, 0.35), "beyond": (-0.04, 0.06), "size": (0.05, 0.12), "drop": (0.03, 0.2),
+        "plate": (0.2, 0.45), "height": (0.1, 0.35), "beyond": (-0.04, 0.06), "size": (0.05, 0.12),
+        "drop": (0.016, 0.2),
     },
     "stack": {"bodies": (2, 4), "size": (0.06, 0.12), "shift": (-0.03, 0.03)},
     "apart": {"bodies": (2, 4), "size": (0.05, 0.12), "speed": (0.01, 0.4), "tilt": (0.0, 0.1)},

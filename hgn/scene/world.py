@@ -17,10 +17,11 @@ from hgn.config import SceneConfig
 from hgn.scene.funnel import Quaternion
 from hgn.scene.group import WALL_CELLS, Region, particle_count, points_in_ball, random_direction, region_of
 from hgn.scene.kinds import MAXIMUM_PARTICLES, RANGES
-from hgn.scene.placement import CLEARANCE_CELLS, ROUNDING, Body, Placed, blocked, choice, filled, place_shape, triple
+from hgn.scene.placement import ROUNDING, Body, Placed, blocked, choice, filled, place_shape, triple
 from hgn.schema import ConfigError, Vector
 
 DRAWS = 500  # attempts to place one scene
+NEAREST_CELLS = 1.0  # smallest distance between obstacles and bodies, in solver cells
 NEAR_WALL = 0.08  # largest gap between a wall and a body that is placed next to it
 FALLING = (0.0, -9.8, 0.0)
 UNTURNED = (1.0, 0.0, 0.0, 0.0)
@@ -119,7 +120,7 @@ class Layout:
 
         Raises: _DrawAgainError if it is too large, or too near to walls, obstacles or other bodies.
         """
-        region, clearance = region_of(shape, size, centre), CLEARANCE_CELLS * self.config.cell_size
+        region, clearance = region_of(shape, size, centre), NEAREST_CELLS * self.config.cell_size
         inside = (region.reach > 0).all() and (np.array(centre) - region.reach >= self.low - ROUNDING).all()
         inside = inside and all(centre[i] + region.reach[i] <= self.high(i) + ROUNDING for i in range(3))
         if not inside or any(region.distance(other) < clearance for other in self.regions):
@@ -177,7 +178,7 @@ def _pool(new: Layout) -> None:
         new.tilt_gravity(new("tilt"))
     if new.chance(0.3):
         size = new("size")
-        height = top + CLEARANCE_CELLS * new.config.cell_size + 0.5 * size + new("height")
+        height = top + NEAREST_CELLS * new.config.cell_size + 0.5 * size + new("height")
         new.body(size, (new.along(0, 0.5 * size), height, new.along(2, 0.5 * size)))
 
 
@@ -187,7 +188,7 @@ def _dam(new: Layout) -> None:
     far = (new.low + new("length"), new.low + new("height"), new.high(2))
     new.box((new.low,) * 3, far, material="water" if new.chance(0.75) else "")
     if new.chance(0.25):
-        begin = far[0] + (CLEARANCE_CELLS + 0.5) * new.config.cell_size
+        begin = far[0] + (NEAREST_CELLS + 0.5) * new.config.cell_size
         new.box((begin, new.low, new.low), (new.high(0), new.low + new("wet"), new.high(2)), material="water")
 
 
@@ -222,7 +223,7 @@ def _slope(new: Layout) -> None:
     for _ in range(1 + new.chance(0.5)):
         size, along, across = new("size"), new.rng.random() - 0.3, new.rng.random() - 0.5
         room = 0.5 * (plate - size)
-        gap = 0.5 * size * (cosine + sine) + (CLEARANCE_CELLS + 1) * new.config.cell_size
+        gap = 0.5 * size * (cosine + sine) + (NEAREST_CELLS + 1) * new.config.cell_size
         up = np.array((cosine, sine, 0.0)) * along * room + np.array((-sine, cosine, 0.0)) * gap
         new.body(size, triple(middle + up + np.array((0.0, 0.0, 2 * across * room))))
 
@@ -254,7 +255,7 @@ def _stack(new: Layout) -> None:
             new.cube(size, centre, material)
         else:
             new.body(size, centre)
-        y += size + (CLEARANCE_CELLS + 0.5) * new.config.cell_size
+        y += size + (NEAREST_CELLS + 0.5) * new.config.cell_size
 
 
 def _apart(new: Layout) -> None:
@@ -283,7 +284,7 @@ def _bowl(new: Layout) -> None:
     for _ in range(1 + new.chance(0.4)):
         shift_x, shift_z = (0.3 * width * (new.rng.random() - 0.5) for _ in range(2))
         new.body(size, (x + shift_x, y, z + shift_z))
-        y += size + (CLEARANCE_CELLS + 0.5) * new.config.cell_size
+        y += size + (NEAREST_CELLS + 0.5) * new.config.cell_size
 
 
 def _channel(new: Layout) -> None:
@@ -294,7 +295,7 @@ def _channel(new: Layout) -> None:
     quarter = (float(np.sqrt(0.5)), float(np.sqrt(0.5)), 0.0, 0.0)
     for side in (-0.5, 0.5):
         new.place("square", plate, (x, y + ROUNDING, z + side * width), quarter)
-    half = 0.5 * width - (CLEARANCE_CELLS + 1.5) * new.config.cell_size
+    half = 0.5 * width - (NEAREST_CELLS + 1.5) * new.config.cell_size
     begin = x - 0.5 * plate + 0.3 * plate * new.rng.random()
     low = (begin, new.low, z - half)
     new.box(low, (begin + length, new.low + new("height"), z + half), material="water" if new.chance(0.6) else "")
@@ -308,7 +309,7 @@ def _stairs(new: Layout) -> None:
     x, z = new.along(0, 0.5 * plate), new.along(2, 0.5 * plate)
     for step in range(steps):
         new.place("square", plate, (x + step * tread, new.low + (steps - step) * rise, z))
-    height = new.low + steps * rise + 0.5 * size + (CLEARANCE_CELLS + 1) * new.config.cell_size
+    height = new.low + steps * rise + 0.5 * size + (NEAREST_CELLS + 1) * new.config.cell_size
     new.add(new.one_of("cube", "sphere"), (size,) * 3, (x, height, z), material="water" if new.chance(0.5) else "")
 
 

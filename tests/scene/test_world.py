@@ -15,10 +15,9 @@ from hgn.data.identity import dataset_identity
 from hgn.scene.distance import contains
 from hgn.scene.group import WALL_CELLS
 from hgn.scene.kinds import SCENE_KINDS, fastest
-from hgn.scene.placement import CLEARANCE_CELLS
 from hgn.scene.random_scene import generate_scene
 from hgn.scene.rotation import quaternion_rotation
-from hgn.scene.world import DOMAINS, MAXIMUM_PARTICLES, NEAR_WALL, RANGES, draw_kind
+from hgn.scene.world import DOMAINS, MAXIMUM_PARTICLES, NEAR_WALL, NEAREST_CELLS, RANGES, draw_kind
 from hgn.schema import ConfigError
 
 LARGEST = (2.0, 1.5, 1.5)
@@ -50,17 +49,17 @@ def test_scenes_of_a_kind_are_sound(kind):
         assert (position_N3 > WALL_CELLS * CELL).all() and (position_N3 < size_3 - WALL_CELLS * CELL).all()
         for obstacle in scene.obstacles:
             assert (obstacle.vertex_V3 >= 0).all() and (obstacle.vertex_V3 <= size_3).all()
-            assert surface_distances(position_N3[::5], obstacle).min() > CLEARANCE_CELLS * CELL
+            assert surface_distances(position_N3[::5], obstacle).min() > NEAREST_CELLS * CELL
             assert not contains(position_N3, obstacle).any()
         parts = [part for _, part in bodies(scene)]
         for i, one in enumerate(parts):
             for other in parts[:i]:
-                assert np.sqrt(((one[::3, None] - other[None, ::5]) ** 2).sum(axis=2)).min() > CLEARANCE_CELLS * CELL
+                assert np.sqrt(((one[::3, None] - other[None, ::5]) ** 2).sum(axis=2)).min() > NEAREST_CELLS * CELL
         digests.add(digest(scene))
     assert len(digests) == 4 and digest(scene_of.__wrapped__(kind, 0)) in digests
 
 
-GOLDEN = "94b5372b"  # of one scene of each kind
+GOLDEN = "7cf0503f"  # of one scene of each kind
 
 
 def test_a_kind_is_bitwise_the_same_everywhere():
