@@ -18,7 +18,7 @@ from datagen.mpm.collider import Collider, build_collider
 from datagen.mpm.device import Device, initialise, memory_bytes
 from datagen.mpm.grid_launch import GridLaunch
 from datagen.mpm.launch import Launch, SceneFailure, Simulated, fixed_substeps, no_counters, particle_bounds
-from datagen.mpm.team_launch import MAXIMUM_PARTICLES, BlocksApartError, Team, TeamLaunch
+from datagen.mpm.team_launch import MAXIMUM_PARTICLES, SHARED_BLOCKS, BlocksApartError, Team, TeamLaunch
 from hgn.config import MpmConfig, SceneConfig
 from hgn.scene.emission import at_entry, require_free_entries
 from hgn.scene.material import material_index
@@ -31,7 +31,7 @@ from hgn.schema import ConfigError, require
 GPU_BLOCKS = 2
 TEAM_THREADS, TEAM_BLOCKS, TEAM_RUN = 256, 3, 4  # for many scenes, which teams compute in turn
 EVEN = 0.95  # one block a scene above this fraction of filled turns and this mean / largest particle count
-SHARED_THREADS, SHARED_BLOCKS = 128, 8  # threads a block, and fewest blocks of each of a few scenes
+SHARED_THREADS = 128  # threads of a block of a few scenes
 SHARED_PARTICLES = 8  # fewest particles of such a block
 LARGE_PARTICLES = 4096  # particles per processor above which a scene's blocks are as large as those of many scenes
 WARM_SCENES = 16  # largest number of scenes in a warm-up

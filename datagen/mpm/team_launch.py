@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import math
 import time
 from collections.abc import Iterator
 from typing import Any, NamedTuple
@@ -24,6 +25,8 @@ from datagen.mpm.team_transfers import LANES  # isort: skip
 LAUNCH_SECONDS = 6.0  # target time of a launch; determines its number of frames. At its end scenes wait for each other
 MAXIMUM_OUTPUT_BYTES = 2**30  # largest size of a launch's positions
 MAXIMUM_PARTICLES = (2**31 - 1) // (2 * FIELD.solid)  # largest number of particles whose fields int32 can count
+SHARED_BLOCKS = 8  # fewest blocks of each of a few scenes
+LATENCY = 0.5  # time of a substep without particles, relative to that of one particle per thread (30 and 50 µs)
 PAUSE = 0.8  # fraction of a launch's expected time in which the host sleeps
 SHORT_SECONDS = 0.1  # launches that are expected to be shorter are awaited without sleep
 PATIENCE = (2**31 - 1, 2**22)  # largest number of reads of a counter on a CPU and on a GPU, where they take seconds
@@ -35,6 +38,23 @@ class Team(NamedTuple):
     threads: int  # threads a block: a multiple of 32 on a GPU, 1 on a CPU; 0: no team, one launch a substep
     blocks: int = 1
     run: int = 8  # number of particles that a thread sums, in the order of their cells, before it adds to nodes
+
+
+def divided(count_B: np.ndarray, substeps_B: np.ndarray, room: int, team: Team) -> tuple[int, int]:
+    """Returns the numbers of teams and of blocks per team that are expected to end a launch first.
+
+    A scene takes substeps * (particles per thread + LATENCY). A launch takes as long as its longest scene, or as all
+    scenes divided by the number of teams. With one block a scene, or SHARED_BLOCKS and more, the division is `team`'s.
+    Otherwise all `room` blocks that run concurrently are divided, at least `team.blocks` for each team.
+    """
+    most = min(room // team.blocks, len(count_B))
+    if team.blocks == 1 or team.blocks >= SHARED_BLOCKS:
+        return most, team.blocks
+    teams_T = np.arange(most, 0, -1)
+    blocks_T = room // teams_T
+    time_TB = substeps_B * (count_B / (team.threads * blocks_T[:, None]) + LATENCY)
+    best = int(np.maximum(time_TB.max(1), time_TB.sum(1) / teams_T).argmin())
+    return int(teams_T[best]), int(blocks_T[best])
 
 
 class BlocksApartError(Exception):
@@ -50,7 +70,7 @@ class TeamLaunch(Launch):
         super().__init__(*batch)
         transfers_each_step = self.config.choices.transfer_speed_m_s is None
         self.variant += VARIANT.each_step * (self.config.fixed_time_step_s is not None or transfers_each_step)
-        self.team, self.teams = team, min(teams, len(self.scenes))
+        self.team, self.teams, self.room = team, min(teams, len(self.scenes)), teams * team.blocks
         if self.particles > MAXIMUM_PARTICLES:
             raise ConfigError(
                 f"a batch must hold at most {MAXIMUM_PARTICLES} particles, got {self.particles} of {len(self.scenes)} "
@@ -72,7 +92,7 @@ class TeamLaunch(Launch):
         self.block = ti.ndarray(ti.i32, 8 * self.all_blocks)
         self.turn = ti.ndarray(ti.i32, len(self.scenes))
         self.meeting = ti.ndarray(ti.i32, (self.teams + 1) * MEETING + len(self.scenes))
-        self.columns = ti.ndarray(ti.i32, SEGMENT * self.teams * team.blocks)
+        self.columns = ti.ndarray(ti.i32, SEGMENT * self.room)
         self.host_copy = HostCopy()
         for array in (
             self.cell_count,
@@ -112,10 +132,10 @@ class TeamLaunch(Launch):
     def _advance(self, frames: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         most = max(1, MAXIMUM_OUTPUT_BYTES // (12 * self.particles))
         done, size, substeps, expected = 0, min(1, frames), np.zeros(len(self.scenes), np.int64), 0.0
-        work = np.array([scene.particle_count for scene in self.scenes])
-        self._launch(0, work)  # compiles the kernel
+        ran = np.ones(len(self.scenes), np.int64)  # substeps in the last launch
+        self._launch(0, ran)  # compiles the kernel
         self._require_together()
-        begin, output = time.perf_counter(), self._launch(size, work)
+        begin, output = time.perf_counter(), self._launch(size, ran)
         while size:
             # Taichi keeps the interpreter's lock while it waits for the device; this sleep lets other threads run
             pause = PAUSE * min(expected * size, LAUNCH_SECONDS)
@@ -129,32 +149,34 @@ class TeamLaunch(Launch):
             self._require_together()
             total = self.counter.to_numpy()[:, COUNT.substeps]
             completed = self.live.to_numpy().reshape(-1, LIVE.length)[:, LIVE.frames].astype(np.int64)
-            work, substeps = (total - substeps) * np.diff(self.particle_begin), total
+            ran, substeps = total - substeps, total
             done += size
             expected = taken / size
             size = min(max(1, min(2 * size, int(LAUNCH_SECONDS / expected))), most, frames - done)
             del output  # before the next launch: memory may be freed only while the device is idle
             gc.collect(0)  # frees its reference cycle; see solver: collection is not automatic
             # the device computes while the caller processes these frames
-            begin, output = time.perf_counter(), self._launch(size, work)
+            begin, output = time.perf_counter(), self._launch(size, ran)
             yield position, completed
 
     def _require_together(self) -> None:
         if self.team.blocks > 1 and self.meeting.to_numpy()[APART]:
             raise BlocksApartError
 
-    def _launch(self, frames: int, work: np.ndarray) -> ti.ScalarNdarray:
+    def _launch(self, frames: int, substeps: np.ndarray) -> ti.ScalarNdarray:
         """Starts `frames` frames of the scenes. Returns the array of their positions, valid when the device is done.
 
-        Scenes with much work come first, so that none runs by itself at the end.
+        `substeps` are those of the last launch. Scenes with much work come first, so that none runs alone at the end.
         """
         output = ti.ndarray(ti.f32, 3 * max(frames, 1) * self.particles)
-        self.turn.from_numpy(np.argsort(-work, kind="stable").astype(np.int32))
+        count = np.diff(self.particle_begin)
+        self.turn.from_numpy(np.argsort(-substeps * count, kind="stable").astype(np.int32))
         self.meeting.fill(0)
+        teams, blocks = divided(count, substeps, self.room, self.team)
         # one frame a turn, because otherwise most teams would be without a scene during the last ones
-        stretch = 1 if self.teams < len(self.scenes) else max(frames, 1)
+        stretch = 1 if teams < len(self.scenes) else max(frames, 1)
         team_kernel.advance(
-            frames, stretch, self.teams, self.team.blocks, PATIENCE[self.team.threads > 1], self.frame_s,
+            frames, stretch, teams, blocks, PATIENCE[self.team.threads > 1], self.frame_s,
             address(self.state), address(self.node), self.node.shape[0], self.tag, self.rank, self.strained,
             self.covered, self.spread, self.response, self.hidden, self.cell_count, self.column_count,
             self.column_list, self.block, self.live, self.columns, self.meeting, self.turn, self.scene_value,

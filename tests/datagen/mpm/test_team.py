@@ -11,6 +11,7 @@ from mpm_scenes import CELL, CONFIG, assert_inside, block, particles, sheet, sim
 from datagen.mpm import solver, team_launch
 from datagen.mpm.device import Device
 from datagen.mpm.solver import SceneFailure, Simulated, Team, _team, _teams_at_once, simulate
+from datagen.mpm.team_launch import divided
 from hgn.config import MpmConfig
 from hgn.schema import ConfigError
 
@@ -101,6 +102,20 @@ def test_blocks_that_wait_for_each_other_all_run_at_once(scenes, most):
     assert team.threads % 32 == 0
     assert team.blocks * _teams_at_once(Device("cuda", 1, 132), team) <= 132 * 2
     assert _team(Device("cpu", 2), [most] * scenes) == _team(Device("cuda", 1, 132), [50_000_000]) == Team(0)
+
+
+def test_teams_are_larger_where_few_scenes_have_most_of_the_work():
+    """Even scenes have many small teams. One long scene gets a large team, and the others take turns."""
+    team, even, step = Team(256, 3, 4), np.full(145, 4_000), np.ones(145)
+    assert divided(even, step, 264, team) == (88, 3)
+    large = np.where(np.arange(145) < 6, 16_000, 3_000)
+    teams, blocks = divided(large, step, 264, team)
+    assert 20 <= teams <= 60 and blocks == 264 // teams
+    longer, more = divided(large, np.where(np.arange(145) < 6, 5.0, 1.0), 264, team)
+    assert longer < teams and more == 264 // longer
+    assert divided(even, step * 0, 264, team) == (88, 3)
+    assert divided(large, step, 264, Team(256)) == (145, 1)
+    assert divided(large[:9], step[:9], 264, Team(128, 29)) == (9, 29)
 
 
 def test_blocks_that_are_not_at_work_at_once(monkeypatch):
