@@ -16,12 +16,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from hgn.command import run_command
 from hgn.renamed import current_metrics
-from hgn.schema import ConfigError, from_mapping, require, require_replaceable
+from hgn.scene.hdf5 import damage_named
+from hgn.schema import from_mapping, require, require_replaceable
 from hgn.system.files import write_atomically, write_json
+from hgn.system.yaml_files import read_yaml
 
 # prefixes of the figures in the JSON
 BEGINNINGS = (
@@ -76,17 +76,17 @@ def main(mapping: dict[str, Any]) -> int:
 
 def read_run(folder: Path) -> Run:
     """Reads metrics.jsonl and the resolved configuration. Raises: ConfigError if the folder is no run of hgn.train."""
-    try:
+    with damage_named(f"{folder}: runs must be folders of python -m hgn.train", "take another folder"):
         lines = (folder / "metrics.jsonl").read_text(encoding="utf-8").splitlines()
-        settings = yaml.safe_load((folder / "config.yaml").read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
-        rule = "runs must be folders of python -m hgn.train"
-        raise ConfigError(f"{rule}, got {folder} without {error.filename}") from None
-    records = [current_metrics(json.loads(line)) for line in lines]
-    _add_minutes(records)
-    _add_scenes(records, settings["training"]["batch_scenes"])
-    # a resumed run repeats some updates: the later record counts
-    latest = {(record["update"], "loss" in record): record for record in records}
+        settings = read_yaml(folder / "config.yaml")
+        json.dumps(settings), settings["dataset"]["folder"], dict(settings.get("provenance", {}))  # which others read
+        records = [current_metrics(json.loads(line)) for line in lines]
+        for name, value in (item for record in records for item in record.items()):
+            require(isinstance(value, int | float), f"{folder}: {name}", "a number", value)
+        _add_minutes(records)
+        _add_scenes(records, settings["training"]["batch_scenes"])
+        # a resumed run repeats some updates: the later record counts
+        latest = {(record["update"], "loss" in record): record for record in records}
     return Run(folder.name, settings, [latest[key] for key in sorted(latest)])
 
 

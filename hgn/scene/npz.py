@@ -88,6 +88,8 @@ def read_npz(path: Path | BinaryIO, objects: bool = False) -> Iterator[tuple[str
         with zipfile.ZipFile(path) as archive:
             claims, folders = Claims(str(path), _size(archive)), dict[str, int]()
             for info in archive.infolist():
+                if archive.getinfo(info.filename) is not info:
+                    raise ConfigError(f"{path}: {info.filename.removesuffix('.npy')} must be there once, got two of it")
                 claims.add(info.filename, info.file_size)
                 folders.setdefault(info.filename.rpartition("/")[0] or info.filename, len(folders))
             # sorted, so that the members of a folder follow one another

@@ -30,7 +30,7 @@ from hgn.scene.hdf5 import damage_named, open_hdf5
 from hgn.scene.material import MATERIALS, require_materials
 from hgn.scene.motion import Motion
 from hgn.scene.scene import Obstacle
-from hgn.schema import Bound, BoxSize, ConfigError, Positive, Vector, require, require_bounds
+from hgn.schema import Bound, ConfigError, Positive, Vector, require, require_bounds
 from hgn.system.claims import Claims
 from hgn.system.files import make_folder, space_reserved, sync_folder, sync_written, temporary_file
 
@@ -45,6 +45,10 @@ VTKHDF_VERSION = (2, 0)  # the oldest version with temporal PolyData, for older 
 # corners of each kind of cells, in the order of Steps/CellOffsets
 CELL_CATEGORIES = {"Vertices": 1, "Lines": 1, "Polygons": 3, "Strips": 1}
 WRITE_EVERY_S = 1.0  # interval between writes of a growing file
+LARGEST = 1e15  # largest size of a number, so that float32 stores its square
+Ordinary = Annotated[Positive[float], Bound("from 1e-15 to 1e15", lambda value: 1 / LARGEST <= value <= LARGEST)]
+# kinds of the numbers in datasets, as NumPy calls them
+KINDS = {"VTKHDF/Points": "f", "VTKHDF/NumberOfPoints": "iu", "hgn/reference": "f", "hgn/entry_frame": "iu"}
 FRAMES_OF_A_CHUNK = 64  # of datasets with one row for each frame
 
 
@@ -59,10 +63,10 @@ class Rollout:
     position_TN3: np.ndarray  # float32, domain units
     material_N: np.ndarray  # uint8, index into `materials`
     obstacles: tuple[Obstacle, ...]
-    domain_size: BoxSize
-    frame_rate_hz: Positive[float]
+    domain_size: tuple[Ordinary, Ordinary, Ordinary]
+    frame_rate_hz: Ordinary
     gravity: Vector = (0.0, -9.8, 0.0)  # domain units per second squared
-    cell_size: Positive[float] = 1 / 64  # edge of obstacle cells
+    cell_size: Ordinary = 1 / 64  # edge of obstacle cells
     # plain JSON types: weights and their sha256, the scene's specification, settings
     source: dict[str, Any] = field(default_factory=dict)
     reference_TN3: np.ndarray | None = None  # float32 [R, N, 3], ground truth at the same frame rate
@@ -380,6 +384,9 @@ def _check_format(file: h5py.File, path: Path) -> None:
 
 
 def _read(file: h5py.File, claims: Claims) -> Rollout:
+    for name, kinds in KINDS.items():
+        if name in file:
+            require(file[name].dtype.kind in kinds, name, f"of kind {kinds}", str(file[name].dtype))
     own, vtk = file["hgn"], file["VTKHDF"]
     count_T = vtk["NumberOfPoints"][()]
     points, material_P = vtk["Points"], vtk["PointData/material"][()]
@@ -416,7 +423,8 @@ def _read_obstacle(entry: h5py.Group) -> Obstacle:
     for name, array, kinds in (("vertices", vertex_V3, "f"), ("triangles", triangle_F3, "iu")):
         if array.dtype.kind not in kinds or array.ndim != 2 or array.shape[1] != 3:
             raise ConfigError(f"{entry.name}: {name} must be numbers [any, 3], got {array.dtype} {array.shape}")
-    require(bool(np.isfinite(vertex_V3).all()), f"{entry.name}: vertices", "finite", float("nan"))
+    rule, size = "finite and at most 1e15", float(np.abs(vertex_V3).max(initial=0))
+    require(size <= LARGEST, f"{entry.name}: vertices", rule, size)
     low, high = triangle_F3.min(initial=0), triangle_F3.max(initial=-1)
     if low < 0 or high >= len(vertex_V3):
         raise ConfigError(f"{entry.name}: triangles must be of {len(vertex_V3)} vertices, got vertices {low} to {high}")
@@ -435,5 +443,5 @@ def _read_motion(entry: h5py.Group) -> Motion:
 
 
 def _triple(values: Any) -> Vector:
-    x, y, z = (float(value) for value in values)
+    x, y, z = (float(value) for value in values.tolist())
     return x, y, z

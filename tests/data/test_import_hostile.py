@@ -2,14 +2,18 @@
 
 import json
 import os
+import warnings
+import zipfile
 
 import h5py
 import numpy as np
 import pytest
 from data.foreign_writers import Hostile, metadata, pickled_npz, sequence_example, write
 from data.test_import import TYPES, options
+from tensorboard.summary.writer.record_writer import RecordWriter
 
 from hgn import import_trajectories
+from hgn.data.foreign.tfrecord import read_records
 from hgn.schema import ConfigError
 
 
@@ -91,6 +95,20 @@ def cells(cell, length=1.0):
     return change
 
 
+def with_step_context(folder):
+    """Appends an empty list of this name to each record."""
+    records = list(read_records(folder / "train.tfrecord"))
+    with (folder / "train.tfrecord").open("wb") as file:
+        for data in records:
+            RecordWriter(file).write(data + b"\x12\x12\x0a\x10\x0a\x0cstep_context\x12\0")
+
+
+def twice(folder):
+    """An archive with two arrays of one name."""
+    with zipfile.ZipFile(folder / "train.npz", "a") as archive, warnings.catch_warnings(action="ignore"):
+        archive.writestr("00000/position.npy", archive.read("00001/position.npy"))
+
+
 def at_the_side(folder):
     meta(periodic_boundary_conditions=[True] * 3)(folder)
     hdf5("train.h5", "00000/position", lambda a: a - np.array([0.48, 0, 0], np.float32))(folder)
@@ -157,6 +175,20 @@ def pickled(content):
         ("plain", other_objects({"a": (WALK, [5, 5]), "b": 3}), r"train\.npz: arr_0.* must "),
         ("plain", other_objects([{"position": WALK}]), r"train\.npz: arr_0.* must "),
         ("plain", other_objects({"a": {"particle_type": [5], "material_property": 1}}), r"train\.npz: arr_0.* must "),
+        ("deepmind", with_step_context, r"record 0: step_context must be absent"),
+        ("plain", twice, r"train.npz: 00000/position must be there once"),
+        *(("plain", meta(dt=dt), rf"metadata.json: dt must be a finite number, got {dt!r}") for dt in (True, "0.01")),
+        ("plain", meta(bounds=[["0", "1"]] * 3), r"metadata.json: bounds must be finite numbers in pairs"),
+        ("plain", meta(default_connectivity_radius=50.0), r"connectivity_radius must be at most the box, 1, got 50"),
+        *(("plain", meta(materials={n: "clay"}), f"materials must be names by .*got '{n}'") for n in ("07", "\u0667")),
+        *(("plain", npz("00000/position", lambda a, t=t: a.astype(t)), "position must be flo") for t in ("f2", "g")),
+        ("plain", npz("00000/position", lambda a: np.full(a.shape, 1e300)), "position must be at most 1e15, got 1e"),
+        ("plain", npz("00000/material_property", np.float64(1e300)), "material_property must be at most 1e15, got 1e"),
+        ("plain", npz("00000/gravity", np.full(3, 1e300)), "00000: gravity must be at most 1e15, got 1e"),
+        *(
+            ("plain", npz("00000/particle_type", lambda a, n=n: np.full(len(a), n)), "00000: particle_type must be wh")
+            for n in (np.uint64(2**64 - 1), np.float16(0.5), np.longdouble(5))
+        ),
         ("plain", other_objects(None), r"train\.npz: arr_0.* must "),
         ("lagrangebench", cut("train.h5", 2000), r"train.h5 must be a whole HDF5 file"),
         ("lagrangebench", hdf5("train.h5", "00001/position"), r"train.h5: 00001: position is missing"),

@@ -62,3 +62,23 @@ def test_a_folder_that_is_no_run(tmp_path):
     """The error names the folder."""
     with pytest.raises(ConfigError, match=r"runs must be folders of python -m hgn.train, got .*empty"):
         read_run(tmp_path / "empty")
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        *(("metrics.jsonl", text) for text in ("x", "[]", "{", "5", '{"loss": 1}', '{"update": [1], "time": 1}')),
+        *(("metrics.jsonl", f'{{"update": 1, "time": 1, "loss": {text}}}') for text in ('"x"', "null", "[1]")),
+        ("metrics.jsonl", '{"update": 1, "time": 1, "updates_per_second": 1e-300, "scenes_per_second": 1e308}'),
+        *(("config.yaml", text) for text in ("[", "[]", "a: 1", "training:", "!!python/name:os.system", "[" * 5000)),
+        ("config.yaml", yaml.safe_dump(SETTINGS | {"provenance": [1]})),
+        ("config.yaml", yaml.safe_dump(SETTINGS) + "day: 2026-01-01\n"),
+        ("config.yaml", "a: &a [1, 1]\n" + "".join(f"b{i}: &a [{','.join(9 * ['*a'])}]\n" for i in range(9))),
+    ],
+)
+def test_damaged_runs(tmp_path, name, text):
+    """One line names the folder."""
+    make_run(tmp_path / "run")
+    (tmp_path / "run" / name).write_text(text)
+    with pytest.raises(ConfigError, match=r"run: runs must be folders of .*, got|must be a (number, got|YAML file)"):
+        main({"runs": [str(tmp_path / "run")], "out": str(tmp_path / "curves")})

@@ -8,9 +8,10 @@ import pytest
 import yaml
 from runtime.stability import still_weights
 
+from hgn.config import MpmConfig
 from hgn.runtime.rollouts import RolloutResult
 from hgn.scene.scene_file import find_scene, load_scene, scene_files
-from hgn.schema import ConfigError
+from hgn.schema import ConfigError, from_mapping
 from tools import render
 from tools.scenes import filled
 from tools.stability import gallery, network, solver, solver_gallery
@@ -251,6 +252,29 @@ def test_the_stored_figures_pass():
             name, wrong = f"{case.name}: {bound.label}", rows[f"{case.name}: {bound.label}"]["broken"].values()
             assert set(own) == {"64", "96"} and all(low <= figure <= high for figure in own.values()), name
             assert any(figure is None or not low <= figure <= high for figure in wrong), name
+
+
+@pytest.mark.parametrize("value", ["", "[", 9000 * "[", None, [], 5])
+@pytest.mark.parametrize("depth", range(6))
+def test_damaged_figures(tmp_path, monkeypatch, depth, value):
+    """The solver's figures in another form end in one line with the command that writes them, in both commands."""
+    case = gallery_cases("gallery")[0]
+    report = json.loads((gallery.REFERENCE / "gallery_solver.json").read_text())
+    mpm = from_mapping(MpmConfig, report["meta"]["solver"])
+    place, *names = report, "scenes", case.name, "series", "64", case.gallery.measure.bounds[0].key
+    for name in names[: depth - 1]:
+        place = place[name]
+    if depth:
+        place[names[depth - 1]] = value
+    text = json.dumps(report) if depth else value if isinstance(value, str) else json.dumps(value)
+    (tmp_path / "gallery_solver.json").write_text(text)
+    for module in ("tools.stability.case", "tools.stability.solver_gallery"):
+        monkeypatch.setattr(f"{module}.REFERENCE", tmp_path)
+        monkeypatch.setattr(f"{module}.load_gallery", lambda _: [case.gallery])
+    monkeypatch.setattr(solver_gallery, "solver_trials", lambda *_: pytest.fail("simulated"))
+    for read in (lambda: gallery_cases("gallery"), lambda: next(solver_gallery.gallery_rows("gallery", mpm, {}, {}))):
+        with pytest.raises(ConfigError, match=r"solver.json must be a report of .*run python -m tools.stab"):
+            read()
 
 
 def test_a_scene_is_drawn_beside_the_solver(tmp_path, monkeypatch, capsys):

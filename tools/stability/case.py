@@ -6,15 +6,16 @@ figure of the solver where the case is simulated by the solver too. A new case n
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 from hgn.runtime.rollouts import RolloutResult
 from hgn.runtime.simulator import InitialState, Simulator
+from hgn.scene.hdf5 import damage_named
 from hgn.scene.scene import Scene
 from hgn.schema import require
+from hgn.system.yaml_files import read_json
 from tools.stability.gallery import GRID_CELLS, REFERENCE, GalleryCase, load_gallery
 
 
@@ -88,17 +89,16 @@ def gallery_cases(case: str) -> list[Case]:
     file = REFERENCE / f"{case}_solver.json"
     command = f"run python -m tools.stability solver 'cases=[{case}]' --json {file}"
     require(file.is_file(), "cases", f"{case} only where {file} has the solver's figures", case, command)
-    stored = json.loads(file.read_text(encoding="utf-8"))["scenes"]
     cases = []
-    for each in loaded:
-        own = stored.get(each.name, {})
-        rule = f"as it was when {file.name} was measured"
-        require(own.get("digest") == each.digest, str(each.file), rule, "a change of scene", command)
-        grid = own["series"][str(GRID_CELLS[0])]
-        lacking = [bound.key for bound in each.measure.bounds if bound.key not in grid]
-        require(not lacking, str(each.file), rule, f"a new row: {', '.join(lacking)}", command)
-        figures = tuple(
-            bound.reduced([float(value) for value in grid[bound.key].split()]) for bound in each.measure.bounds
-        )
-        cases.append(Case(each.name, each.scenes, each.measure.frames, (), gallery=each, references=figures))
+    with damage_named(f"{file} must be a report of tools.stability solver", command):
+        stored = read_json(file)["scenes"]
+        for each in loaded:
+            own = stored.get(each.name, {})
+            rule = f"as it was when {file.name} was measured"
+            require(own.get("digest") == each.digest, str(each.file), rule, "a change of scene", command)
+            grid = {**own["series"][str(GRID_CELLS[0])]}
+            lacking = [bound.key for bound in each.measure.bounds if bound.key not in grid]
+            require(not lacking, str(each.file), rule, f"a new row: {', '.join(lacking)}", command)
+            figures = tuple(bound.reduced_line(grid[bound.key]) for bound in each.measure.bounds)
+            cases.append(Case(each.name, each.scenes, each.measure.frames, (), gallery=each, references=figures))
     return cases

@@ -90,6 +90,13 @@ class BoundEntry:
         first, last = (frame // SAMPLED_EVERY for frame in self.frames)
         return float(TAKES[self.take](np.asarray(series_S[first - 1 : last], np.float64)))
 
+    def reduced_line(self, line: str) -> float:
+        """Returns the figure of a series as reports store it. Raises ValueError if it is too short."""
+        numbers = [float(number) for number in line.split()]
+        if len(numbers) < (frames := self.frames[1] // SAMPLED_EVERY):
+            raise ValueError(f"{len(numbers)} numbers instead of {frames}")
+        return self.reduced(numbers)
+
 
 @dataclass(frozen=True, eq=False)
 class Film:

@@ -7,20 +7,22 @@ results/stability are not simulated again: their rows are compared with today's 
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from itertools import groupby
+from pathlib import Path
 from typing import Any
 
 from datagen.fine import solver_on_grid
 from hgn.config import MpmConfig
 from hgn.runtime.rollouts import RolloutResult
+from hgn.scene.hdf5 import damage_named
 from hgn.scene.scene import Scene
 from hgn.schema import to_mapping
 from hgn.system.machine import available_cpus
+from hgn.system.yaml_files import read_json
 from tools.report import table
 from tools.solver_rollouts import solver_trials
 from tools.stability.broken import BROKEN, FRICTIONLESS
@@ -36,29 +38,31 @@ SIMULATED = ("device", "commit", "date")  # of the report's meta, in the entry o
 
 def gallery_rows(case: str, mpm: MpmConfig, meta: dict[str, Any], scenes: dict[str, Any]) -> Iterator[Row]:
     """Adds the series of each scene of a draw to `scenes`, and yields a row for each bound; `meta` is the report's."""
-    loaded, earlier = load_gallery(case), _earlier(case, mpm)
-    again = []
-    for each in loaded:
-        entry = earlier["scenes"].get(each.name, {"digest": None})
-        figures = [earlier["figures"].get(_name(each, bound)) for bound in each.measure.bounds]
-        if entry["digest"] != each.digest or None in figures:
-            again.append(each)
-            continue
-        scenes[each.name] = {"simulated": earlier["simulated"]} | entry
-        own = {cells: [_numbers(one[b.key]) for b in each.measure.bounds] for cells, one in entry["series"].items()}
-        for index, bound in enumerate(each.measure.bounds):
-            solver = {cells: bound.reduced(series[index]) for cells, series in own.items()}
-            yield _row(each, bound, solver, {k: math.nan if v is None else v for k, v in figures[index].items()})
+    loaded, again = load_gallery(case), []
+    file = REFERENCE / f"{case}_solver.json"
+    remedy = "move it, and run python -m tools.stability solver again"
+    with damage_named(f"{file} must be a report of tools.stability solver", remedy):
+        earlier = _earlier(file, mpm)
+        for each in loaded:
+            entry = earlier["scenes"].get(each.name, {"digest": None})
+            figures = [earlier["figures"].get(_name(each, bound)) for bound in each.measure.bounds]
+            if entry["digest"] != each.digest or None in figures:
+                again.append(each)
+                continue
+            scenes[each.name] = {"simulated": earlier["simulated"]} | entry
+            series_of = {cells: {**one} for cells, one in {**entry["series"]}.items()}
+            for index, bound in enumerate(each.measure.bounds):
+                solver = {cells: bound.reduced_line(one[bound.key]) for cells, one in series_of.items()}
+                yield _row(each, bound, solver, {k: math.nan if v is None else v for k, v in figures[index].items()})
     for measured in _simulated(again, mpm):
         entry, rows = measure(*measured)
         scenes[measured[0].name] = {"simulated": {name: meta[name] for name in SIMULATED}} | entry
         yield from rows
 
 
-def _earlier(case: str, mpm: MpmConfig) -> dict[str, Any]:
+def _earlier(file: Path, mpm: MpmConfig) -> dict[str, Any]:
     """Reads the scenes of an earlier report, and the figures of broken trajectories by row; none of another solver."""
-    file = REFERENCE / f"{case}_solver.json"
-    report = json.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}
+    report = read_json(file) if file.is_file() else {}
     meta = report.get("meta", {})
     if without_device(meta.get("solver", {})) != without_device(to_mapping(mpm)):
         return {"scenes": {}, "figures": {}}
@@ -118,10 +122,6 @@ def _row(case: GalleryCase, bound: BoundEntry, solver: dict[str, float], broken:
 
 def _name(case: GalleryCase, bound: BoundEntry) -> str:
     return f"{case.name}: {bound.label}"
-
-
-def _numbers(line: str) -> list[float]:
-    return [float(number) for number in line.split()]
 
 
 def broken_table(rows: Sequence[Row]) -> str:

@@ -11,7 +11,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
+import re
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -122,10 +124,10 @@ def set_info(folder: Path, name: str, config: ImportConfig) -> SetInfo:
 
 def _numbers(name: str, value: Any, shape: tuple[int | None, ...]) -> Any:
     """Returns a float, or nested lists of floats, of this shape. None in the shape means any length."""
-    try:
-        array = np.asarray(value, np.float64)
-    except (TypeError, ValueError, OverflowError):
-        array = np.full((), np.nan)
+    array: Any = np.full((), np.nan)
+    with contextlib.suppress(TypeError, ValueError, OverflowError):
+        if (given := np.asarray(value)).dtype.kind in ("biufO" if shape else "iufO"):  # O: whole numbers of many bits
+            array = given.astype(np.float64)
     fits = array.ndim == len(shape) and all(m in (n, None) for n, m in zip(array.shape, shape, strict=True))
     rule = "a finite number" if not shape else "finite numbers" + (" in pairs" if len(shape) == 2 else " in a list")
     require(fits and bool(np.isfinite(array).all()), name, rule, value)
@@ -151,6 +153,8 @@ def _read_deepmind(folder: Path, split: str, info: SetInfo) -> Iterator[Trajecto
     for number, record in enumerate(read_records(path) if path else ()):
         name = f"{path}: record {number}"
         context, lists = parse_sequence_example(record, name)
+        if "step_context" in lists:
+            raise ConfigError(f"{name}: step_context must be absent, as no network takes forces that change with time")
         types = _joined(f"{name}: particle_type", context.get("particle_type"), "<i8")
         flat = _joined(f"{name}: position", lists.get("position"), "<f4")
         frames: Any = info.raw.get("sequence_length")
@@ -277,10 +281,11 @@ def _properties(name: str, given: Any, count: int) -> np.ndarray | None:
         return None
     array = as_array(f"{name}: material_property", given)
     rule = f"numbers of one or {count} particles"
-    fits = array.dtype.kind in "iuf" and array.ndim <= 2 and (array.ndim == 0 or len(array) in (1, count))
+    plain = array.dtype.kind in "iuf" and array.dtype.itemsize <= 8
+    fits = plain and array.ndim <= 2 and (array.ndim == 0 or len(array) in (1, count))
     require(fits, f"{name}: material_property", rule, f"{array.dtype} {list(array.shape)}")
-    columns = array.astype(np.float32).reshape(1 if array.ndim == 0 else len(array), -1)
-    floats(f"{name}: material_property", columns, (None, None))
+    columns = array.astype(np.float64).reshape(1 if array.ndim == 0 else len(array), -1)
+    columns = floats(f"{name}: material_property", columns, (None, None)).astype(np.float32)
     return np.broadcast_to(columns, (count, columns.shape[1]))
 
 
@@ -354,8 +359,7 @@ def _metadata(folder: Path) -> dict[str, Any]:
 
 
 def _number(key: object, folder: Path) -> int:
-    try:
-        return int(str(key))
-    except ValueError:
+    if re.fullmatch(r"0|-?[1-9][0-9]{0,17}", str(key)) is None:
         rule = "names by the number of a particle type"
-        raise ConfigError(f"materials must be {rule}, got {key!r} of {folder}; as in materials={{7: goop}}") from None
+        raise ConfigError(f"materials must be {rule}, got {key!r:.60} of {folder}; as in materials={{7: goop}}")
+    return int(str(key))

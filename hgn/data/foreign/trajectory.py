@@ -16,6 +16,7 @@ from hgn.system.claims import require_few_items
 
 COARSEST = 1e-3  # largest spacing of stored numbers, in radii; gravity moves a particle by a few of these in a frame
 MOST_RADII = 1 << 14  # largest size of the box in radii, because cells are indexed by integers
+LARGEST = 1e15  # largest size of a number, so that float32 stores its square
 FLUID = 1  # the type of particles in files without types
 
 
@@ -62,8 +63,10 @@ class SetInfo:
         ordered = all(-1e9 <= low < high <= 1e9 for low, high in self.bounds)
         require(ordered, "metadata.json: bounds", "low < high, from -1e9 to 1e9", self.bounds)
         longest = max(high - low for low, high in self.bounds)
+        key = "metadata.json: default_connectivity_radius"
         rule = f"{longest / MOST_RADII:.3g} or more, the box being {longest:g} wide"
-        require(self.radius * MOST_RADII >= longest, "metadata.json: default_connectivity_radius", rule, self.radius)
+        require(self.radius * MOST_RADII >= longest, key, rule, self.radius)
+        require(self.radius <= longest, key, f"at most the box, {longest:g}", self.radius)
         cell_size = self.obstacle_cell_size
         fits = cell_size is None or 0 < cell_size <= longest
         require(fits, "metadata.json: obstacle_cell_size", "> 0", cell_size, f"and at most the box, {longest:g}")
@@ -81,10 +84,10 @@ def checked(name: str, position: Any, types: Any, dimensions: int) -> tuple[np.n
     """
     position_TND = floats(f"{name}: position", position, (None, None, dimensions))
     type_N = as_array(f"{name}: particle_type", types)
-    if type_N.dtype.kind not in "iu":
-        whole = type_N.dtype.kind == "f" and bool(((np.abs(type_N) < 2**63) & (type_N == np.round(type_N))).all())
-        if not whole:  # some of geoelements' writers store float64
-            raise ConfigError(f"{name}: particle_type must be whole numbers, got {type_N.dtype}")
+    plain = type_N.dtype.kind in "iuf" and type_N.dtype.itemsize <= 8  # some of geoelements' writers store float64
+    number_N = type_N.astype(np.float64) if plain else np.full((), np.nan)
+    if not ((np.abs(number_N) <= LARGEST) & (number_N == np.round(number_N))).all():
+        raise ConfigError(f"{name}: particle_type must be whole numbers, at most 1e15, got {type_N.dtype}")
     count = position_TND.shape[1]
     if type_N.ndim == 0 or (type_N.shape == (1,) and count != 1):
         type_N = np.full(count, type_N.reshape(())[()])
@@ -103,12 +106,12 @@ def as_array(name: str, value: Any) -> np.ndarray:
 
 
 def floats(name: str, array: Any, shape: tuple[int | None, ...]) -> np.ndarray:
-    """Returns a finite array of float32 or float64 of this shape. None in the shape means any length above 0.
+    """Returns float32 or float64 of this shape, at most LARGEST. None in the shape means any length above 0.
 
     Raises: ConfigError naming the file and the field.
     """
     array = as_array(name, array)
-    if array.dtype.kind != "f" or array.dtype.itemsize < 4:
+    if array.dtype.kind != "f" or array.dtype.itemsize not in (4, 8):
         raise ConfigError(f"{name} must be float32 or float64, got {array.dtype}")
     fits = array.ndim == len(shape) and all(
         n == m or (m is None and n) for n, m in zip(array.shape, shape, strict=True)
@@ -116,9 +119,11 @@ def floats(name: str, array: Any, shape: tuple[int | None, ...]) -> np.ndarray:
     if not fits:
         wanted = ", ".join("any" if length is None else str(length) for length in shape)
         raise ConfigError(f"{name} must have shape [{wanted}], got {list(array.shape)}")
-    bad = np.argwhere(~np.isfinite(array))
+    bad = np.argwhere(~(np.abs(array) <= LARGEST))
     if len(bad):
-        raise ConfigError(f"{name} must be finite, got {array[tuple(bad[0])]} at {bad[0].tolist()}")
+        value = array[tuple(bad[0])]
+        rule = "at most 1e15" if np.isfinite(value) else "finite"
+        raise ConfigError(f"{name} must be {rule}, got {value} at {bad[0].tolist()}")
     return array.astype(array.dtype.newbyteorder("="), copy=False)
 
 
