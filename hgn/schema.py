@@ -112,6 +112,8 @@ def from_mapping(cls: type[T], mapping: object, path: _Path = "") -> T:
             remedy = removed_remedy(section_of(cls), str(key), value) or (
                 renamed_remedy(name, value) if renamed else None
             )
+            if value is None and isinstance(key, (int, float)):
+                remedy = "a list needs brackets, as in [0.1, 0.2, 0.3]"
             remedy = remedy or known_keys(str(key), fields)
             raise ConfigError(f"{name} is not a known key; {remedy}")
         values[key] = _convert(hints[key], value, (path, key))
@@ -278,7 +280,7 @@ def _convert(hint: Any, value: Any, path: _Path) -> Any:
         more = len(arguments) == 2 and arguments[1] is Ellipsis
         if not isinstance(value, (list, tuple)):
             count = "" if more else f" of {len(arguments)} values"
-            raise ConfigError(f"{_text(path)} must be a list{count}, got {_shown.repr(value)}")
+            raise ConfigError(f"{_text(path)} must be a list{count}, got {_shown.repr(value)}; write it in brackets")
         if more:
             return tuple([_convert(arguments[0], item, (path, i)) for i, item in enumerate(value)])
         if len(value) != len(arguments):

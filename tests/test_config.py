@@ -70,7 +70,7 @@ RULES = {
     command(SceneConfig): [
         ({"group_size": float("nan")}, "group_size must be a finite number > 0, got nan"),
         ({"materials": ["water", "lava"]}, r"materials\[1\] must be one of water, sand, snow, elastic, got"),
-        ({"gravity": -9.8}, "gravity must be a list of 3 values, got -9.8"),
+        ({"gravity": -9.8}, "gravity must be a list of 3 values, got -9.8; write it in brackets"),
     ],
     command(DatasetConfig): [({"frames": 1}, "frames must be at least 2, got 1")],
     command(SolveConfig, scene="s"): [

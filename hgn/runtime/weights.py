@@ -99,7 +99,9 @@ def load_weights(
     that do not fit its declared structure.
     """
     if not path.is_file():
-        raise ConfigError(f"{field} must be an existing file, got {path}; write one with python -m hgn.export")
+        remedy = f"write one with python -m hgn.export checkpoint={path / 'checkpoints' / 'best.ckpt'}"
+        remedy = remedy if path.is_dir() else "write one with python -m hgn.export"
+        raise ConfigError(f"{field} must be an existing file, got {path}; {remedy}")
     try:
         with safe_open(path, framework="pt", device="cpu") as file:
             metadata = file.metadata() or {}

@@ -226,7 +226,8 @@ def find_scene(name: str) -> Path:
     if Path(name).is_file() or not re.fullmatch(r"\w+", name):
         return Path(name)
     files = scene_files("example") | scene_files("gallery")
-    require(name in files, "scene", "a YAML file or the name of an example", name, known_keys(name, files, "examples"))
+    own = f"did you mean {name}.yaml?" if Path(f"{name}.yaml").is_file() else known_keys(name, files, "examples")
+    require(name in files, "scene", "a YAML file or the name of an example", name, own)
     return files[name]
 
 

@@ -112,8 +112,11 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
         require_few_items(checkpoint)
     except FileNotFoundError:
         last, remedy = path.parent / LAST_NAMES[0], "hgn.train writes one"
+        of_run = [file for name in (BEST_NAME, *LAST_NAMES) if (file := path / "checkpoints" / name).is_file()]
         if path.name == BEST_NAME and last.is_file():
             remedy = f"no validation scene was measured, so take {last}"
+        elif of_run:
+            remedy = f"take {of_run[0]}"
         raise ConfigError(f"checkpoint must be an existing file, got {path}; {remedy}") from None
     except Exception as error:  # torch raises any kind of error for damaged files
         reason = str(error).strip().split("\n")[0]
