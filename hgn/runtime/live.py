@@ -16,7 +16,7 @@ import torch
 from hgn.network.barriers import Barriers
 from hgn.network.features import ParticleState
 from hgn.runtime.divergence import DivergedError, diverged
-from hgn.runtime.simulation import OF_PARTICLES, selected
+from hgn.runtime.simulation import joined, selected
 from hgn.runtime.simulator import InitialState, Simulator
 from hgn.scene.barrier import Barrier
 from hgn.scene.scene import Scene
@@ -112,8 +112,9 @@ class LiveSimulation:
     ) -> np.ndarray:
         """Adds particles that come from free flight: domain units, domain units per second, indices into MATERIALS.
 
-        Returns their velocity histories, float32 [A, M, 3] in domain units per frame, newest first.
-        Raises: ConfigError for a material that the network was not trained with, and for arrays of different lengths.
+        They have the solver's parameters. Returns their velocity histories, float32 [A, M, 3] in domain units per
+        frame, newest first. Raises: ConfigError for a material that the network was not trained with, and for arrays of
+        different lengths.
         """
         self._require_scene(index)
         require(index not in self.ended, "index", "of a scene in progress", index, remedy="reset it")
@@ -129,7 +130,7 @@ class LiveSimulation:
             require(not len(unusable), name, "finite", float(unusable[0]) if len(unusable) else 0.0)
         require(material_A.dtype.kind in "iu", "material_A", "whole numbers", str(material_A.dtype))
         arrays: dict[str, Any] = {"position_N3": position_A3, "velocity_N3": velocity_A3, "material_N": material_A}
-        new = self._started([replace(self.scenes[index], **arrays, past_HN3=None)])
+        new = self._started([replace(self.scenes[index], **arrays, past_HN3=None, parameters=None)])
         if count:
             self._put(index, self.scenes[index], self.state, new)
         return new.velocity_NM3.cpu().numpy()
@@ -210,18 +211,18 @@ class LiveSimulation:
         if barriers and _solid(scene) != _solid(before):
             barriers[index] = scene.barrier(barriers[index].clearance)
             changed["barriers"] = self._joined(barriers)
-        for name in ("domain_S3", "gravity_S3"):
-            changed[name] = getattr(kept, name).clone()
-            changed[name][index] = getattr(new, name)[0]
+        for name in ("domain_S3", "gravity_S3", "wall_friction_S3"):
+            values_S3, own_S3 = getattr(kept, name), getattr(new, name)  # no friction of walls: None
+            if values_S3 is not None or own_S3 is not None:
+                changed[name] = torch.zeros_like(kept.domain_S3) if values_S3 is None else values_S3.clone()
+                changed[name][index] = 0 if own_S3 is None else own_S3[0]
         self._continue(replace(kept, **changed), replace(new, scene_N=new.scene_N + index))
         self.scenes, self._barriers = scenes, barriers
 
     def _continue(self, kept: ParticleState, new: ParticleState) -> None:
         """Takes kept and new particles, sorted by scene, for the next frame."""
         order_N = torch.argsort(torch.cat([kept.scene_N, new.scene_N]), stable=True)
-        both: dict[str, Any] = {
-            name: torch.cat([getattr(kept, name), getattr(new, name)])[order_N] for name in OF_PARTICLES
-        }
+        both: dict[str, Any] = {name: value[order_N] for name, value in joined(kept, new).items()}
         self._changed = replace(kept, **both)
 
     def _joined(self, barriers: Sequence[Barrier]) -> Barriers | None:

@@ -112,14 +112,7 @@ class Simulation:
         if self.ended:
             self._row_N = torch.cat([rows_N, self._row_count + torch.nonzero(running_A).flatten()])
         self._row_count += len(new.position_N3)
-        both: dict[str, Any] = {name: torch.cat([getattr(old, name), getattr(entering, name)]) for name in OF_PARTICLES}
-        if any(state.parameter_NP is not None for state in (old, entering)):
-            zeros = (
-                state.position_N3.new_zeros(len(state.scene_N), len(INPUT_PARAMETERS)) for state in (old, entering)
-            )
-            parts = zip((old.parameter_NP, entering.parameter_NP), zeros, strict=True)
-            both["parameter_NP"] = torch.cat([zero if own is None else own for own, zero in parts])
-        self._begin(replace(old, **both))
+        self._begin(replace(old, **joined(old, entering)))
 
     def run(self, frames: int, on_frame: Callable[[int], Any] | None = None) -> np.ndarray:
         """Returns positions of the next `frames` frames, float32 [T, N, 3]; calls `on_frame(number)` after each.
@@ -235,6 +228,17 @@ def selected(state: ParticleState, selected_N: torch.Tensor) -> ParticleState:
     if state.parameter_NP is not None:
         some["parameter_NP"] = state.parameter_NP[selected_N]
     return replace(state, **some)
+
+
+def joined(first: ParticleState, second: ParticleState) -> dict[str, torch.Tensor]:
+    """Returns the values of the first state's particles and then of the second's. Parameters are 0 if nominal."""
+    both = {name: torch.cat([getattr(first, name), getattr(second, name)]) for name in OF_PARTICLES}
+    parameters = (first.parameter_NP, second.parameter_NP)
+    if any(own_NP is not None for own_NP in parameters):
+        zeros = (state.position_N3.new_zeros(len(state.scene_N), len(INPUT_PARAMETERS)) for state in (first, second))
+        pairs = zip(parameters, zeros, strict=True)
+        both["parameter_NP"] = torch.cat([zero_NP if own_NP is None else own_NP for own_NP, zero_NP in pairs])
+    return both
 
 
 def _finished(block_TN3: torch.Tensor) -> torch.Tensor:

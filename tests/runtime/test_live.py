@@ -7,7 +7,7 @@ import pytest
 import torch
 from network.states import network_of, silent
 from network.test_barriers import square
-from runtime.scenes import EMPTY_GRID
+from runtime.scenes import EMPTY_GRID, rough
 from runtime.scenes import random_scene as scene
 
 from hgn.runtime import simulator as simulator_module
@@ -15,6 +15,7 @@ from hgn.runtime.divergence import DivergedError
 from hgn.runtime.live import LiveSimulation
 from hgn.runtime.simulator import Simulator
 from hgn.runtime.weights import WeightsInfo
+from hgn.scene.own_physics import NOMINAL_P
 from hgn.scene.scene import Scene
 from hgn.schema import ConfigError
 
@@ -62,6 +63,30 @@ def test_a_scene_that_changes_is_one_that_began_so(backend):
     live.restore(position_N3, velocity_NM3, 3)
     assert (live.frame, live.particle_count) == (3, 50)
     np.testing.assert_array_equal(frames(live, 3), expected_TN3[4:])
+
+
+def test_friction_and_parameters_belong_to_scenes_and_particles():
+    """A scene with its own physics that replaces a plain one moves as if it had begun so, and a plain one after it as
+    without friction; particles that are added have the solver's parameters."""
+    own = small(inputs="local", own_physics=("friction", "parameters"))
+    torch.nn.init.normal_(own.encode.first.weight)
+    simulator, plain, other = Simulator(own, 60.0), scene(30), rough(scene(20, 1))
+    expected = [frames_TN3[1:] for frames_TN3 in simulator.rollout([plain, other], 5)]
+    assert np.abs(expected[1] - simulator.rollout([scene(20, 1)], 5)[0][1:]).max() > 1e-5
+    live = LiveSimulation(simulator, [plain, plain])
+    live.reset(1, other)
+    np.testing.assert_array_equal(frames(live, 4), np.concatenate(expected, 1))
+    live.reset(1, plain)
+    live.reset(0, plain)
+    np.testing.assert_array_equal(frames(live, 4), np.concatenate([expected[0]] * 2, 1))
+    added = LiveSimulation(simulator, other)
+    entering(added, scene(10, 2))
+    whole = joined(other, scene(10, 2)) | {"parameters": np.concatenate([other.parameters, nominal(10)])}
+    np.testing.assert_array_equal(frames(added, 4), simulator.rollout([replace(other, **whole)], 5)[0][1:])
+
+
+def nominal(count):
+    return np.tile(np.array(NOMINAL_P, np.float32), (count, 1))
 
 
 def test_empty_scenes_and_other_obstacles():
