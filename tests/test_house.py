@@ -16,10 +16,10 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 31_346,
+    "hgn": 31_352,
     "datagen": 8_435,
     "tools": 6_517,
-    "tests": 30_516,
+    "tests": 30_519,
 }
 SETTINGS = 240  # fields of the dataclasses behind the commands, *Config
 

@@ -230,7 +230,7 @@ def selected(state: ParticleState, selected_N: torch.Tensor) -> ParticleState:
     return replace(state, **some)
 
 
-def joined(first: ParticleState, second: ParticleState) -> dict[str, torch.Tensor]:
+def joined(first: ParticleState, second: ParticleState) -> dict[str, Any]:
     """Returns the values of the first state's particles and then of the second's. Parameters are 0 if nominal."""
     both = {name: torch.cat([getattr(first, name), getattr(second, name)]) for name in OF_PARTICLES}
     parameters = (first.parameter_NP, second.parameter_NP)

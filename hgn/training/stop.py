@@ -5,13 +5,17 @@ A signal sets a flag. The loop ends at the next update, after a checkpoint. A se
 
 from __future__ import annotations
 
+import os
 import signal
 import time
 from types import FrameType
 
+from hgn.training.distributed import first_rank
+
 # After several signals the last one in this order determines the exit code. A scheduler that sent SIGUSR1 queues the
 # job again, and may send SIGTERM too.
 BY_WEIGHT = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1)
+STOPPING = b"\nstopping: the training ends with the next update and a checkpoint; Ctrl-C again ends it at once\n"
 
 
 class StopRequest:
@@ -48,4 +52,6 @@ class StopRequest:
     def _on_signal(self, number: int, frame: FrameType | None) -> None:
         if self.signal is not None and number == signal.SIGINT:
             raise KeyboardInterrupt
+        if self.signal is None and first_rank():
+            os.write(2, STOPPING)  # a handler may interrupt a write to sys.stderr, which must not be entered again
         self.signal = max(self.signal or number, number, key=BY_WEIGHT.index)

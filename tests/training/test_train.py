@@ -373,12 +373,15 @@ def test_damaged_checkpoints_are_refused(finished, capsys):
 
 
 @pytest.mark.parametrize("order", list(permutations((signal.SIGTERM, signal.SIGUSR1))))
-def test_signals_of_a_scheduler(order):
-    """SIGUSR1, by which a job is queued again, counts, whatever comes before or after it."""
-    stop = StopRequest()
-    for number in order:
-        stop._on_signal(number, None)
-    assert stop.exit_code == 138
+def test_signals_of_a_scheduler(order, capfd, monkeypatch):
+    """SIGUSR1, by which a job is queued again, counts, whatever comes before or after it. The first rank says once that
+    the training ends."""
+    for rank, lines in (("0", 1), ("1", 0)):
+        monkeypatch.setenv("RANK", rank)
+        stop = StopRequest()
+        for number in order:
+            stop._on_signal(number, None)
+        assert stop.exit_code == 138 and capfd.readouterr().err.count("Ctrl-C again ends it at once") == lines
 
 
 def test_missing_data_without_generator(make_config, run):
