@@ -48,12 +48,9 @@ T = TypeVar("T", bound=Sample)
 Starts = tuple[tuple[int, int], ...]  # (episode, frame) of each simulation's start
 START_STREAM, SAMPLE_STREAM = 0x57A7, 0xE217
 # Largest RMS distance of a frame from the data, in finest cells. Frames farther away are dropped, with all later ones:
-# the data's motion is no target for them. An untrained network loses most frames. With a limit of 0.5 a trained network
-# lost 35 to 50 % of its frames, all of them from the scenes that it simulates worst.
-DROPPED_BEYOND = 1.5
-# In a target larger errors count as these, on each axis, so that frames far from the data do not dominate the loss.
-PULLED_WITHIN = 0.3  # position error, in finest cells
-TURNED_WITHIN = 0.1  # velocity error, in finest cells per frame
+# the data's motion is no target for them, and they would dominate the loss. An untrained network loses most frames.
+DROPPED_BEYOND = 0.5
+PULLED_WITHIN = 1.0  # in a target a larger position error counts as this, on each axis, in finest cells
 
 
 def simulated_frames(training: TrainingConfig, frame_count: int) -> int:
@@ -115,22 +112,16 @@ def pushforward_windows(
     """Returns the windows of one scene's simulation, [F, W, N, 3].
 
     true_TN3 contains the frames n - H to n + F + 1 of the data, simulated_FN3 the frames x_k with k = n + 1 to n + F. A
-    window ends with x_k and its target
-
-        x_k + (x_k - x_{k-1}) + true acceleration + velocity error + pull * position error,
-
-    where an error is the data's value minus the simulation's, with the limits PULLED_WITHIN and TURNED_WITHIN.
+    window ends with x_k and its target x_k + (true_{k+1} - true_k) + pull (true_k - x_k). The second term corrects the
+    velocity error. The third corrects part of the position error, up to PULLED_WITHIN on each axis, also behind walls.
     """
     frames = len(simulated_FN3)
     history = len(true_TN3) - frames - 2
     positions_TN3 = torch.cat([true_TN3[: history + 1], simulated_FN3])
     inputs = positions_TN3.unfold(0, history + 1, 1)[1:].permute(0, 3, 1, 2)  # [F, H + 1, N, 3]
-    before_FN3, now_FN3, next_FN3 = true_TN3[history:-2], true_TN3[history + 1 : -1], true_TN3[history + 2 :]
-    far, fast = PULLED_WITHIN * cell_size, TURNED_WITHIN * cell_size
-    error_FN3 = (now_FN3 - before_FN3) - (inputs[:, -1] - inputs[:, -2])
-    excess_FN3 = error_FN3 - error_FN3.clamp(-fast, fast)
-    pulled_FN3 = pull * (now_FN3 - simulated_FN3).clamp(-far, far)
-    target_FN3 = simulated_FN3 + (next_FN3 - now_FN3) - excess_FN3 + pulled_FN3
+    now_FN3, next_FN3 = true_TN3[history + 1 : -1], true_TN3[history + 2 :]
+    limit = PULLED_WITHIN * cell_size
+    target_FN3 = simulated_FN3 + (next_FN3 - now_FN3) + pull * (now_FN3 - simulated_FN3).clamp(-limit, limit)
     return torch.cat([inputs, target_FN3[:, None]], dim=1)
 
 
