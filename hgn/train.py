@@ -21,6 +21,7 @@ from hgn.schema import ConfigError, from_mapping, require_replaceable
 from hgn.system.extras import missing_extra, require_installed
 from hgn.system.locks import locked
 from hgn.system.processes import die_with_parent
+from hgn.system.ranks import first_on_machine, first_rank
 from hgn.training.stop import StopRequest
 
 if TYPE_CHECKING:
@@ -33,7 +34,7 @@ def main(mapping: dict[str, Any]) -> int:
     import torch
 
     from hgn.training.dataset import PublishedEpisodes, is_complete, more_data, wait_for_episodes, warning_on_a_cpu
-    from hgn.training.distributed import default_run, first_on_machine, first_rank, layout
+    from hgn.training.distributed import default_run, layout
     from hgn.training.generator import Generator
     from hgn.training.imported import require_network_fits, settings_of_imported
     from hgn.training.session import Start, precompile_kernels, train_network
@@ -117,7 +118,6 @@ def _checkpoint_to_resume(config: TrainConfig, folder: Path) -> Resume | None:
 def _initial_network(config: TrainConfig, resume: Resume | None) -> ParticleNetwork | None:
     """Returns the network of training.init_weights for a new run. A resumed run takes the network of its checkpoint."""
     from hgn.training.checkpoint import network_of_weights
-    from hgn.training.distributed import first_rank
 
     weights = config.training.init_weights
     if weights is None:

@@ -16,10 +16,10 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 31_343,
+    "hgn": 31_349,
     "datagen": 8_435,
     "tools": 6_517,
-    "tests": 30_504,
+    "tests": 30_505,
 }
 SETTINGS = 240  # fields of the dataclasses behind the commands, *Config
 

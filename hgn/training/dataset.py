@@ -19,7 +19,7 @@ from hgn.schema import ConfigError, from_stored, require
 from hgn.system.machine import available_cpus
 from hgn.system.patience import UnreachableError
 from hgn.system.progress import bar, duration
-from hgn.training.distributed import first_rank
+from hgn.system.ranks import first_rank
 from hgn.training.generator import Generator
 from hgn.training.stop import StopRequest
 

@@ -23,21 +23,6 @@ MESSAGE_MB = 4  # size of a message: gradients of the last layers are sent while
 _RANDOM_ID = re.compile(r"[0-9a-f]{8}(-[0-9a-f]{4}){3}-[0-9a-f]{12}")
 
 
-def first_rank() -> bool:
-    """Returns whether this process starts the generator and writes the run's files."""
-    if "RANK" in os.environ:
-        # torchrun's variable comes first: inside Slurm, torchrun's rank 0 may be on any of the nodes
-        return os.environ["RANK"] == "0"
-    return all(os.environ.get(name, "0") == "0" for name in ("SLURM_PROCID", "NODE_RANK", "LOCAL_RANK"))
-
-
-def first_on_machine() -> bool:
-    """Returns whether this process is the first on its machine."""
-    if "RANK" in os.environ:
-        return os.environ.get("LOCAL_RANK", "0") == "0"
-    return all(os.environ.get(name, "0") == "0" for name in ("SLURM_LOCALID", "LOCAL_RANK"))
-
-
 def default_run(name: str) -> Path:
     """Returns the run's default folder. It is the same in all processes and after every restart.
 

@@ -20,7 +20,7 @@ from lightning.pytorch.loggers.logger import Logger
 from hgn.schema import printable
 from hgn.system.files import write_atomically
 from hgn.system.patience import standard_patience_s
-from hgn.training.distributed import first_rank
+from hgn.system.ranks import first_rank
 
 PROJECT = "hgn"  # of W&B, and experiment of MLflow, unless the environment names another
 MOST_WAITING = 10_000  # calls that wait for a logger; later ones are dropped

@@ -27,8 +27,9 @@ from hgn.schema import printable, to_mapping
 from hgn.system.device import keep_to_quota
 from hgn.system.files import make_folder, write_atomically
 from hgn.system.provenance import provenance
+from hgn.system.ranks import first_on_machine, first_rank
 from hgn.training.checkpoint import BEST_NAME, LAST_NAMES, DataInfo, Resume
-from hgn.training.distributed import first_on_machine, first_rank, layout
+from hgn.training.distributed import layout
 from hgn.training.errors import format_ratio
 from hgn.training.stop import StopRequest
 

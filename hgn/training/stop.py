@@ -10,7 +10,7 @@ import signal
 import time
 from types import FrameType
 
-from hgn.training.distributed import first_rank
+from hgn.system.ranks import first_rank
 
 # After several signals the last one in this order determines the exit code. A scheduler that sent SIGUSR1 queues the
 # job again, and may send SIGTERM too.

@@ -21,9 +21,10 @@ from hgn import train
 from hgn.config import TrainingConfig
 from hgn.data.sampler import EpisodeSampler
 from hgn.schema import ConfigError
+from hgn.system.ranks import first_rank
 from hgn.training import watch as watch_ranks
 from hgn.training.checkpoint import read_checkpoint
-from hgn.training.distributed import checksum, default_run, first_rank, layout
+from hgn.training.distributed import checksum, default_run, layout
 from hgn.training.torch_updates import TorchUpdates
 
 ROOT = Path(__file__).resolve().parents[2]
