@@ -18,7 +18,7 @@ PACKAGES = ("hgn", "datagen", "tools")
 LINES = {  # of Python, in tracked files
     "hgn": 31_349,
     "datagen": 8_435,
-    "tools": 6_517,
+    "tools": 6_606,
     "tests": 30_505,
 }
 SETTINGS = 240  # fields of the dataclasses behind the commands, *Config
