@@ -43,23 +43,29 @@ async def read(delay_s, port, until, figures):
     """One reader: all shards that are published until the time is over, each once, with its sha256."""
     await asyncio.sleep(delay_s)
     stream, etag, known = await asyncio.open_connection("127.0.0.1", port), "", set()
-    while (start := time.monotonic()) < until:
+
+    async def answer(path, headers="", statuses=(200,)):
         figures["answers"] += 1
-        status, head, body = await get(stream, "/manifest.json", f"If-None-Match: {etag}\r\n" if etag else "")
-        assert status in (200, 304), status
-        if status == 200:
-            etag = re.search(r"(?im)^etag: (\S+)", head)[1]
-            shards = json.loads(body)["index"]["shards"]
-            for name in [f"train-{place:06d}-{place + 1:06d}.tar" for place in range(shards)]:
-                if name not in known and time.monotonic() < until:
-                    figures["answers"] += 1
-                    status, head, body = await get(stream, f"/{name}")
-                    sha256 = re.search(r'(?im)^etag: "(\w+)"', head)[1]
-                    assert status == 200 and hashlib.sha256(body).hexdigest() == sha256
-                    figures["bytes"] += len(body)
-                    known.add(name)
-        await asyncio.sleep(max(0.0, 1 - (time.monotonic() - start)))
-    stream[1].close()
+        status, head, body = await get(stream, path, headers)
+        assert status in statuses, f"{path}: {status} {body[:200]!r}"
+        return status, re.search(r"(?im)^etag: (\S+)", head)[1], body
+
+    try:
+        while (start := time.monotonic()) < until:
+            unchanged = f"If-None-Match: {etag}\r\n" if etag else ""
+            status, etag, body = await answer("/manifest.json", unchanged, (200, 304))
+            if status == 200 and json.loads(body)["index"]["shards"]:
+                # several processes pack shards, so their order in the index is not that of their episodes
+                _, _, lines = await answer("/index/1-000000.jsonl")
+                for name in [json.loads(line)["name"] for line in lines.splitlines()]:
+                    if name not in known and time.monotonic() < until:
+                        _, sha256, body = await answer(f"/{name}")
+                        assert f'"{hashlib.sha256(body).hexdigest()}"' == sha256
+                        figures["bytes"] += len(body)
+                        known.add(name)
+            await asyncio.sleep(max(0.0, 1 - (time.monotonic() - start)))
+    finally:
+        stream[1].close()
 
 
 async def probe(port, until):
