@@ -1,4 +1,4 @@
-"""Obstacle triangles near each cell, for the step constraint that keeps particles outside obstacles.
+"""Obstacle triangles near each cell, for the obstacle constraint: particles stay outside obstacles.
 
 A triangle covers the points within `clearance` of its plane and at most MARGIN * clearance beyond its edges. Its row
 contains four planes (unit normal and offset) and a box. The first plane is its own; the others are those of the edges,
