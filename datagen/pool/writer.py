@@ -60,8 +60,8 @@ _Packed = tuple[ExitStack, Path, ShardEntry]
 class DatasetWriter:
     """Writes one generator's shards to a data set folder, inside a `with` block.
 
-    At its start the folder is recovered after earlier runs: shards missing in the index are checked and listed, and
-    abandoned partial files are removed. Raises: ConfigError if the folder contains another data set or an altered file.
+    At its start the writer repairs the folder after a crash: it checks and lists complete shards that the index lacks,
+    and removes partial files of ended writers. Raises: ConfigError for another data set or an altered file.
 
     A writer's *share* is the shards that it may make: with `dataset.array_tasks` a part of them, otherwise all.
     """
@@ -263,7 +263,7 @@ class DatasetWriter:
         return entry
 
     def _winner(self, shard: ShardRange) -> ShardEntry | None:
-        """Returns another generator's shard with these episodes, or None. Some file systems ignore locks."""
+        """Returns another generator's shard with these episodes (the file system then ignores locks), or None."""
         self.refresh()
         if missing_ranges([shard], self._published) == [shard]:
             return None
@@ -308,7 +308,7 @@ class DatasetWriter:
         return {name for name, other in ranges.items() if other is not None and _overlap(shard, other)}
 
     def _list_unlisted(self, names: set[str]) -> None:
-        """Lists those of these shards that are complete, but not in the index: their generator ended before that."""
+        """Adds complete shards with these names to the index if it lacks them: their generator ended too early."""
         for name in sorted(names):
             shard, path = parse_shard_name(name), self.folder / name
             if shard is None or not path.exists():

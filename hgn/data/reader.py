@@ -1,7 +1,7 @@
 """Reads published episodes of a data set. Positions are memory-mapped: a window of frames reads only its own pages.
 
-Each shard is checked against the index (size, then sha256) before use. Otherwise a tar cut at a member boundary would
-read as fewer samples without an error. Remote shards are read from a cache (`hgn.data.shard_cache`).
+Each shard is checked against the index (size, then sha256) before use. Without this check a tar file that ends too
+early, between two members, would be read as fewer samples. Remote shards come from a cache (`hgn.data.shard_cache`).
 """
 
 from __future__ import annotations
@@ -40,8 +40,8 @@ class Episodes(Sequence[Episode], ABC):
     """Defines a sequence of episodes.
 
     An episode is opened, and its shard verified, on first use. Positions are read-only. `open` maps them into memory.
-    An access behind the end of a mapped file ends the process. In the cache of a URL no file is cut, but somebody may
-    cut a file of a folder. So `read` and indexing copy the positions of a folder, and map those of a URL.
+    If a mapped file becomes shorter, an access behind its end kills the process. Users may shorten a file in a local
+    folder, so `read` and indexing copy its positions. Files in the cache of a URL keep their length and are mapped.
     Raises on access: ConfigError if a shard is missing or altered.
     """
 
@@ -118,8 +118,8 @@ class EpisodeStore(Episodes):
     def refresh(self) -> bool:
         """Reads the manifest again. Returns whether this split has more episodes than before.
 
-        If a server does not answer, the known episodes stay. Any other fault raises, but inside `faults_outlived` only
-        if it has lasted for the patience. Until then the known episodes stay, and `ask_again` repeats this each second.
+        If a server does not answer, the store keeps its present episodes. Any other fault raises an error. Inside
+        `faults_outlived` it raises only after the patience. Until then `ask_again` refreshes at most once a second.
         Raises: ConfigError if the folder contains another data set, or published shards were removed.
         """
         previous_s, self._looked_s = self._looked_s, time.monotonic()
@@ -156,7 +156,7 @@ class EpisodeStore(Episodes):
         manifest = Manifest.load(self.folder, patience_s=0.0)
         if manifest.config_hash != self.manifest.config_hash:
             raise ConfigError(
-                f"{self.folder} must keep holding the same data set, got config hash {manifest.config_hash[:12]} "
+                f"{self.folder} must contain the same data set as before, got config hash {manifest.config_hash[:12]} "
                 f"where {self.manifest.config_hash[:12]} was opened; start again"
             )
         manifest = replace(manifest, shards=self.manifest.shards.continued(manifest.shards))
@@ -286,7 +286,7 @@ class EpisodeStore(Episodes):
                 if len(self._open_shards) > min(MAPPED_SHARDS, resource.getrlimit(resource.RLIMIT_NOFILE)[0] // 4):
                     self._open_shards.popitem(last=False)
                 size = opened.size()
-                # removed from a full cache, or cut: reading after a file's end would kill the process
+                # removed from a full cache, or shortened: reading after a file's end would kill the process
                 if (size is None and is_remote(self.folder)) or (size is not None and size < shard.bytes):
                     del self._open_shards[shard.name]
                     continue
@@ -324,8 +324,8 @@ class EpisodeStore(Episodes):
         lengths = {frames, config.get("long_frames", frames)}
         if actual != expected or entry.frames not in lengths:
             raise ConfigError(
-                f"{self.folder}/{shard.name}: {entry.key} must have seed, particles, frames {expected}, and as many "
-                f"frames as the data set's ({lengths}), got {actual}; {REMEDY}"
+                f"{self.folder}/{shard.name}: {entry.key} must have seed, particles, frames {expected}, and frames "
+                f"must be one of the data set's ({lengths}), got {actual}; {REMEDY}"
             )
         return episode
 
@@ -375,7 +375,7 @@ def first_episodes(store: EpisodeStore, count: int) -> list[Episode]:
     if not len(store):
         others = ", ".join(f"split={split}" for split in SPLITS if len(store.of_split(split)))
         remedy = f"; it has others: {others}" if others else ""
-        raise ConfigError(f"data must hold episodes of the split {store.split}, got none in {store.folder}{remedy}")
+        raise ConfigError(f"data must contain episodes of the split {store.split}, got none in {store.folder}{remedy}")
     return [store.open(i) for i in store.first_indices(count)]
 
 

@@ -86,7 +86,7 @@ class ParticleNetwork(nn.Module, ABC):
         return relative_features(state, grid, self.config, self.normaliser.acceleration_std[0])
 
     def encode_features(self, feature_NF: torch.Tensor, state: ParticleState, contacts: Contacts) -> torch.Tensor:
-        """Returns latent vectors [N, W] of relative features and own physics. Columns that are all 0 are skipped."""
+        """Returns latent vectors [N, W] of relative features and own physics. Own physics that is all 0 is skipped."""
         material_MH = self.encode.project(1, self.embedding.weight) + self.encode.first.bias
         hidden_NH = self.encode.add_projection(material_MH.index_select(0, state.material_N), 0, feature_NF)
         for physics_NK in physics_columns(state, self.config, contacts.friction):

@@ -1,9 +1,9 @@
 """The hierarchical graph network (paper sec. 3.2, fig. 2) in plain torch: the reference of every faster backend.
 
-Steps in the paper's numbers, with four levels:
+Steps have the numbers of the paper's figure, which has three levels:
 0: encode particles. 1: particles to cells.
-2, 4, …: message passing on each level, from the finest to the coarsest. 3, 5, …: fine to coarse, between these.
-7, 9, …: coarse to fine. 8, 10, …: message passing on each level but the coarsest, up to the finest.
+2, 4, 6: message passing on each level, from the finest to the coarsest. 3, 5: fine to coarse, between these.
+7, 9: coarse to fine. 8, 10: message passing on each level except the coarsest, up to the finest.
 11: cells to particles. 12: decode the acceleration. With L levels there are 2 L - 1 message-passing blocks.
 Shape legend: N particles, C cells, E directed edges, W width, S scenes.
 """
@@ -24,7 +24,7 @@ from hgn.network.relative import OUTPUTS, balanced
 
 
 class MessagePassing(nn.Module):
-    """Paper's steps 2, 4, …: M message passing steps on one level (fig. 5). Each has its own parameters."""
+    """M message passing steps on one level (fig. 5; paper's steps 2, 4, 6, 8, 10). Each has its own parameters."""
 
     def __init__(self, steps: int, width: int) -> None:
         super().__init__()
@@ -57,8 +57,8 @@ class MessagePassing(nn.Module):
 class HierarchicalGraphNetwork(ParticleNetwork):
     """Predicts the acceleration of every particle, in frame units.
 
-    Without obstacle features the input has no normals (the paper's second data set). With obstacle features, scenes
-    without obstacles skip the product with the normals' columns. This is exact, because their normals are zero.
+    With `obstacle_features=False` the input has no normals, as in the paper's data set without obstacles. With absolute
+    inputs, a batch without any obstacle skips the product with the normals. This is exact: these normals are zero.
     """
 
     def __init__(self, config: NetworkConfig) -> None:

@@ -104,7 +104,7 @@ class Simulation:
         self._begin(state)
 
     def add(self, new: ParticleState) -> None:
-        """Appends particles to the existing ones. Those of ended scenes only get rows of NaN."""
+        """Appends particles. In a scene that has ended, new particles are not simulated: their rows are NaN."""
         old, rows_N = self.state, self._rows()
         running_S = torch.tensor([i not in self.ended for i in range(old.scene_count)], device=old.scene_N.device)
         running_A = running_S[new.scene_N]
@@ -231,7 +231,7 @@ def selected(state: ParticleState, selected_N: torch.Tensor) -> ParticleState:
 
 
 def joined(first: ParticleState, second: ParticleState) -> dict[str, Any]:
-    """Returns the values of the first state's particles and then of the second's. Parameters are 0 if nominal."""
+    """Returns the first state's values, then the second's. If only one has parameters, the other's are 0 (defaults)."""
     both = {name: torch.cat([getattr(first, name), getattr(second, name)]) for name in OF_PARTICLES}
     parameters = (first.parameter_NP, second.parameter_NP)
     if any(own_NP is not None for own_NP in parameters):

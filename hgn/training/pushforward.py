@@ -61,9 +61,9 @@ def simulated_frames(training: TrainingConfig, frame_count: int) -> int:
 def drawn_starts(training: TrainingConfig, update: int, rank: int, frame_counts: Sequence[int]) -> Starts:
     """Draws the episode and the start frame of each simulation before `update`.
 
-    Every episode is drawn once before one is drawn twice. The frames after a start suffice for a whole simulation, or
-    for half of the episode if that is shorter. One more frame is the target of the last. `frame_counts`: frames of each
-    episode. Raises: ConfigError if all episodes are too short.
+    Every episode is drawn once before one is drawn twice. After a start the episode has enough frames for a whole
+    simulation (or for half of the episode, if that is shorter), and one more as the last target. `frame_counts` are the
+    episodes' numbers of frames. Raises: ConfigError if all episodes are too short.
     """
     last = {
         i: count - 2 - min(simulated_frames(training, count), (count - 1) // 2) for i, count in enumerate(frame_counts)
@@ -113,7 +113,7 @@ def pushforward_windows(
 
     true_TN3 contains the frames n - H to n + F + 1 of the data, simulated_FN3 the frames x_k with k = n + 1 to n + F. A
     window ends with x_k and its target x_k + (true_{k+1} - true_k) + pull (true_k - x_k). The second term corrects the
-    velocity error. The third corrects part of the position error, up to PULLED_WITHIN on each axis, also behind walls.
+    velocity error. The third corrects part of the position error, up to PULLED_WITHIN on each axis. Walls are ignored.
     """
     frames = len(simulated_FN3)
     history = len(true_TN3) - frames - 2

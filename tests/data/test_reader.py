@@ -107,7 +107,7 @@ def test_refresh_refuses_another_dataset(folder, make_config, make_dataset, tmp_
     other = make_config(folder=str(tmp_path / "other"))
     made = make_dataset(dataclasses.replace(other, scene=SceneConfig(obstacle_count=1)))
     Manifest.load(made).save(folder)
-    with pytest.raises(ConfigError, match="must keep holding the same data set"):
+    with pytest.raises(ConfigError, match="must contain the same data set as before"):
         store.refresh()
 
 
