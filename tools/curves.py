@@ -31,6 +31,7 @@ BEGINNINGS = (
 BASELINE_STYLES = {"constant_velocity": ":", "ballistic_motion": "--", "mean_acceleration": "-."}
 LOSS = "MSE of normalised acceleration"
 ONE_STEP = "one-step MSE (sum over axes, frame units)"
+LOSS_POINTS = 60  # of a curve of the loss, each a mean of neighbouring records
 LINES = 200  # records of the loss in the JSON
 BREAKS = 10  # a gap of this many usual gaps between two records is a stop of the training
 
@@ -185,9 +186,9 @@ def _plot_baselines(panel: Any, last: Mapping[str, float]) -> None:
             panel.axhline(last[f"baseline/validation_{name}"], color="0.3", linestyle=style, label=label)
 
 
-def _means(records: list[dict[str, float]], key: str, lines: int = 60) -> list[dict[str, float]]:
+def _means(records: list[dict[str, float]], key: str) -> list[dict[str, float]]:
     """Averages neighbouring records."""
-    step = max(1, len(records) // lines)
+    step = max(1, len(records) // LOSS_POINTS)
     parts = [records[i : i + step] for i in range(0, len(records), step)]
     return [{"scenes": part[-1]["scenes"], key: sum(r[key] for r in part) / len(part)} for part in parts]
 

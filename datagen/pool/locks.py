@@ -40,8 +40,6 @@ class ShardLocks:
 
     def _require_exclusion(self) -> None:
         """Raises ConfigError if a lock does not exclude others. Generators would overwrite each other's files."""
-        if not hasattr(fcntl, "F_OFD_SETLK"):
-            return  # locks belong to the process and do not exclude it
         other = os.open(self._path, os.O_RDWR | os.O_CLOEXEC)
         try:
             if self._lock(fcntl.F_WRLCK, _GENERATORS_BYTE, file=other):

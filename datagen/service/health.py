@@ -59,8 +59,7 @@ class HealthPage:
         assert self.process.stdin is not None
         self._reports = self.process.stdin.fileno()
         os.set_blocking(self._reports, False)
-        if sys.platform == "linux":
-            fcntl.fcntl(self._reports, fcntl.F_SETPIPE_SZ, _PIPE_BYTES)
+        fcntl.fcntl(self._reports, fcntl.F_SETPIPE_SZ, _PIPE_BYTES)
 
     def _end(self) -> None:
         self.process.kill()

@@ -24,8 +24,8 @@ class PooledStore(Episodes):
 
     def __init__(self, own: EpisodeStore, others: Sequence[EpisodeStore]) -> None:
         self.own, self.others = own, tuple(others)
-        self._ends = np.cumsum([len(store) for store in self.others])
-        self._still = int(self._ends[-1]) if self.others else 0
+        self._starts = np.cumsum([0, *map(len, self.others)])  # place of the first episode of each data set
+        self._still = int(self._starts[-1])
 
     @property
     def folder(self) -> Path | str:
@@ -54,12 +54,9 @@ class PooledStore(Episodes):
 
     def fetch_ahead(self, episodes: Sequence[int] | None = None) -> None:
         """Starts to fetch shards in the background; see EpisodeStore.fetch_ahead."""
-        if episodes is None:
-            for store in (*self.others, self.own):
-                store.fetch_ahead()
-        else:
-            for store, places in self._by_store(episodes):
-                store.fetch_ahead(places)
+        every = ((store, None) for store in (*self.others, self.own))
+        for store, places in every if episodes is None else self._by_store(episodes):
+            store.fetch_ahead(places)
 
     def digest(self, count: int) -> str | None:
         """Combines the digests of all data sets."""
@@ -98,10 +95,8 @@ class PooledStore(Episodes):
 
     def _place(self, index: int) -> tuple[EpisodeStore, int]:
         """Returns the store of an episode, and the episode's place in it."""
-        number = int(np.searchsorted(self._ends, index, side="right"))
-        if number == len(self.others):
-            return self.own, index - self._still
-        return self.others[number], index - int(self._ends[number]) + len(self.others[number])
+        number = int(np.searchsorted(self._starts, index, side="right")) - 1
+        return (*self.others, self.own)[number], index - int(self._starts[number])
 
     def _by_store(self, indices: Sequence[int]) -> Iterable[tuple[EpisodeStore, list[int]]]:
         places: dict[EpisodeStore, list[int]] = defaultdict(list)

@@ -23,9 +23,9 @@ from hgn.scene.material import FLUIDS
 from hgn.scene.motion import Motion
 from hgn.scene.rollout_file import (
     Rollout,
+    frame_velocity,
     raise_interruption,
     rollout_bytes,
-    rollout_velocity,
     take_frames,
     write_frames,
     write_rollout,
@@ -166,7 +166,7 @@ def _write_usd(path: Path, rollout: Rollout, surface: bool, progress: Callable[[
         fill(prim, obstacle.vertex_V3, obstacle.triangle_F3, Usd.TimeCode.Default())
         if obstacle.motion is not None:
             moving.append((prim.AddTransformOp(), obstacle.motion))
-    velocity_TN3 = rollout_velocity(rollout)
+    velocity_TN3 = frame_velocity(rollout.position_TN3, rollout.frame_rate_hz, rollout.entry_frame_N)
     width = rollout_spacing(rollout)
     of_material = {}
     for index, name in enumerate(rollout.materials):
@@ -218,7 +218,7 @@ def _identifiers(obstacles: Sequence[Obstacle]) -> list[str]:
 
 
 def _write_ply(path: Path, rollout: Rollout, surface: bool, progress: Callable[[], Any]) -> None:
-    velocity_TN3 = rollout_velocity(rollout)
+    velocity_TN3 = frame_velocity(rollout.position_TN3, rollout.frame_rate_hz, rollout.entry_frame_N)
     fields = [(name, "<f4") for name in ("x", "y", "z", "vx", "vy", "vz")]
     fields += [(name, "u1") for name in ("material", "red", "green", "blue")]
     row_N = np.zeros(rollout.particle_count, fields)

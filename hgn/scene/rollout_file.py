@@ -109,29 +109,22 @@ class Rollout:
         return int(np.searchsorted(self.entry_frame_N, frame, side="right"))
 
 
-def frame_velocity(position_TN3: np.ndarray, frame_rate_hz: float) -> np.ndarray:
+def frame_velocity(
+    position_TN3: np.ndarray, frame_rate_hz: float, entry_frame_N: np.ndarray | None = None
+) -> np.ndarray:
     """Returns the velocity into each frame, float32 [T, N, 3] in domain units per second.
 
-    It is the backward difference, as in the network (paper sec. 3.1). Frame 0 repeats the velocity of frame 1.
+    It is the backward difference, as in the network (paper sec. 3.1). Frame 0 repeats the velocity of frame 1. Entering
+    particles get the velocity of their second frame, or zero without one.
     """
     velocity_TN3 = np.zeros(position_TN3.shape, np.float32)
     velocity_TN3[1:] = np.diff(position_TN3, axis=0) * np.float32(frame_rate_hz)
     if len(velocity_TN3) > 1:
         velocity_TN3[0] = velocity_TN3[1]
-    return velocity_TN3
-
-
-def rollout_velocity(rollout: Rollout) -> np.ndarray:
-    """Returns `frame_velocity`; entering particles get the velocity of their second frame, or zero without one."""
-    return _velocity(rollout.position_TN3, rollout.frame_rate_hz, rollout.entry_frame_N)
-
-
-def _velocity(position_TN3: np.ndarray, frame_rate_hz: float, entry_N: np.ndarray | None) -> np.ndarray:
-    velocity_TN3 = frame_velocity(position_TN3, frame_rate_hz)
-    if entry_N is not None:
+    if entry_frame_N is not None:
         last = len(position_TN3) - 1
-        late = np.flatnonzero((entry_N > 0) & (entry_N <= last))
-        entry = entry_N[late]
+        late = np.flatnonzero((entry_frame_N > 0) & (entry_frame_N <= last))
+        entry = entry_frame_N[late]
         velocity_TN3[entry, late] = velocity_TN3[np.minimum(entry + 1, last), late]
         velocity_TN3[last, late[entry == last]] = 0.0
     return velocity_TN3
@@ -244,7 +237,7 @@ class _GrowingFile:
         position_TN3 = rollout.position_TN3[start:end]
         vertex_TV3, triangle_F3, _ = _triangles(rollout.obstacles, np.arange(start, end) / rollout.frame_rate_hz)
         entry_N = None if rollout.entry_frame_N is None else rollout.entry_frame_N - start
-        velocity_TN3 = _velocity(position_TN3, rollout.frame_rate_hz, entry_N)
+        velocity_TN3 = frame_velocity(position_TN3, rollout.frame_rate_hz, entry_N)
         velocity_TV3 = frame_velocity(vertex_TV3, rollout.frame_rate_hz)
         present_T = np.array([rollout.present(frame) for frame in range(end)], np.int64)
         points_T = present_T + vertex_TV3.shape[1]

@@ -32,13 +32,9 @@ def lock_bytes(file: int, kind: int, start: int, length: int = 1, wait: bool = F
     kind is fcntl.F_RDLCK (shared), F_WRLCK (exclusive) or F_UNLCK. Raises OSError with one of NO_LOCKS.
     """
     try:
-        if hasattr(fcntl, "F_OFD_SETLK"):
-            # The lock belongs to the open file, so that two generators in one process exclude each other too.
-            request = struct.pack("hhqqi4x", kind, os.SEEK_SET, start, length, 0)
-            fcntl.fcntl(file, fcntl.F_OFD_SETLKW if wait else fcntl.F_OFD_SETLK, request)
-        else:
-            flags = {fcntl.F_RDLCK: fcntl.LOCK_SH, fcntl.F_WRLCK: fcntl.LOCK_EX, fcntl.F_UNLCK: fcntl.LOCK_UN}
-            fcntl.lockf(file, flags[kind] | (0 if wait else fcntl.LOCK_NB), length, start)
+        # The lock belongs to the open file, so that two generators in one process exclude each other too.
+        request = struct.pack("hhqqi4x", kind, os.SEEK_SET, start, length, 0)
+        fcntl.fcntl(file, fcntl.F_OFD_SETLKW if wait else fcntl.F_OFD_SETLK, request)
     except OSError as error:
         if error.errno in (errno.EAGAIN, errno.EACCES) and not wait:
             return False

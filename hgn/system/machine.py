@@ -24,7 +24,7 @@ _FULL_MEMORY = re.compile(  # messages of torch, Taichi, CUDA, C++, the loader a
 
 def available_cpus() -> int:
     """Returns the number of usable cores: the CPU affinity, but at most the groups' quota, rounded up."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    cores = len(os.sched_getaffinity(0))
     quotas = [quota for group in _groups("cpu") if (quota := _quota(group)) is not None]
     return max(1, min([cores, *(math.ceil(quota) for quota in quotas)]))
 

@@ -8,7 +8,6 @@ import multiprocessing
 import os
 import signal
 import subprocess
-import sys
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from multiprocessing.connection import Connection
@@ -20,8 +19,7 @@ PR_SET_PDEATHSIG = 1  # from linux/prctl.h
 
 def die_with_parent(number: int) -> None:
     """Asks Linux, in a child process, to send it the signal `number` when its parent ends for any reason."""
-    if sys.platform == "linux":
-        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, number)
+    ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, number)
 
 
 @contextlib.contextmanager
@@ -98,8 +96,8 @@ def cause_of_exit(process: SpawnProcess) -> str:
 
 
 def _run(target: Callable[..., None], number: int, connection: Connection, *arguments: Any) -> None:
-    die_with_parent(number)  # on other systems a child ends when it next uses its closed pipe
+    die_with_parent(number)
     parent = multiprocessing.parent_process()
-    if sys.platform == "linux" and (parent is None or os.getppid() != parent.pid):
+    if parent is None or os.getppid() != parent.pid:
         os._exit(0)
     target(connection, *arguments)

@@ -14,7 +14,6 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-import trimesh
 from scipy.spatial.transform import Rotation
 
 from hgn.runtime.simulator import InitialState
@@ -108,16 +107,6 @@ def placed_by(entry: ObstacleEntry, folder: Path, cell_size: float) -> PlacedObs
     placed = PlacedObstacle(body, entry.position or (0.0, 0.0, 0.0), entry.rotation)
     _ = placed.samples
     return placed
-
-
-def placed_at_rest(obstacle: Obstacle, cell_size: float) -> PlacedObstacle:
-    """Returns an obstacle at its present place, which can be moved about the middle of its bounding box."""
-    vertex_V3 = obstacle.vertex_V3
-    x, y, z = (0.5 * (vertex_V3.min(axis=0) + vertex_V3.max(axis=0))).tolist()
-    mesh = dataclasses.replace(obstacle, vertex_V3=vertex_V3 - (x, y, z))
-    file = trimesh.exchange.obj.export_obj(trimesh.Trimesh(mesh.vertex_V3, mesh.triangle_F3, process=False))
-    entry = ObstacleEntry(mesh=f"{obstacle.name}.obj", friction=obstacle.friction)
-    return PlacedObstacle(Body(entry, mesh, cell_size, file.encode()), (x, y, z))
 
 
 def with_obstacles(scene: InitialState, obstacles: Sequence[PlacedObstacle]) -> InitialState:

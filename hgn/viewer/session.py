@@ -27,7 +27,7 @@ from hgn.scene.rollout_file import Rollout
 from hgn.scene.scene import Scene
 from hgn.scene.scene_file import ObstacleEntry
 from hgn.schema import ConfigError, Vector, from_mapping, require, to_mapping
-from hgn.viewer.placed import Body, PlacedObstacle, placed_at_rest, placed_by, with_obstacles
+from hgn.viewer.placed import Body, PlacedObstacle, placed_by, with_obstacles
 from hgn.viewer.recording import Frame, Recording
 
 CLEARANCE = 1.25  # in spacings of particles at rest; no particle of a ball enters nearer to another particle
@@ -64,7 +64,7 @@ class PlaySession:
         keep_bytes: int = 1 << 30,
         weights: str = "",
     ) -> None:
-        """Takes the `folder` of the scene's meshes. Keeps `keep_bytes` of past frames for going back.
+        """Takes a scene file's scene and the `folder` of its meshes. Keeps `keep_bytes` of past frames for going back.
 
         Raises ConfigError for a scene that the weights do not support, or for more than `maximum_particles`.
         """
@@ -245,10 +245,8 @@ class PlaySession:
     # obstacles
 
     def _placed_by(self, scene: Scene, folder: Path) -> list[PlacedObstacle]:
-        if scene.specification.get("kind") != "file":  # the obstacles of a random scene have no entries
-            return [placed_at_rest(obstacle, scene.cell_size) for obstacle in scene.obstacles]
-        entries = (from_mapping(ObstacleEntry, entry) for entry in scene.specification["obstacles"])
-        return [placed_by(entry, folder, scene.cell_size) for entry in entries]
+        entries = scene.specification.get("obstacles", ())
+        return [placed_by(from_mapping(ObstacleEntry, entry), folder, scene.cell_size) for entry in entries]
 
     def add_obstacle(self, entry: ObstacleEntry, folder: Path = Path()) -> PlacedObstacle:
         """Adds an obstacle of a shape, or of a mesh file in a folder. Raises ConfigError as a scene file does."""

@@ -22,7 +22,6 @@ from hgn.scene.rollout_file import (
     Rollout,
     frame_velocity,
     read_rollout,
-    rollout_velocity,
     write_frames,
     write_rollout,
 )
@@ -197,7 +196,7 @@ def test_vtk_reads_it(tmp_path):
     reader.SetFileName(str(tmp_path / "a.vtkhdf"))
     reader.Update()
     assert reader.GetNumberOfSteps() == FRAMES
-    velocity_TN3, before_V3 = rollout_velocity(rollout), None
+    velocity_TN3, before_V3 = frame_velocity(rollout.position_TN3, rollout.frame_rate_hz, rollout.entry_frame_N), None
     for frame in range(FRAMES):
         reader.UpdateTimeStep(frame / 60)
         data = reader.GetOutputDataObject(0)
@@ -231,7 +230,7 @@ def test_velocities():
     rollout = make_rollout(None)
     position_TN3, entry_N = rollout.position_TN3.copy(), np.array([0] * 5 + [2, 3])
     position_TN3[:2, 5] = position_TN3[:3, 6] = np.nan
-    velocity_TN3 = rollout_velocity(dataclasses.replace(rollout, position_TN3=position_TN3, entry_frame_N=entry_N))
+    velocity_TN3 = frame_velocity(position_TN3, rollout.frame_rate_hz, entry_N)
     np.testing.assert_array_equal(velocity_TN3[2, 5], velocity_TN3[3, 5])
     assert np.isfinite(velocity_TN3[2:, 5]).all() and not velocity_TN3[3, 6].any()
 

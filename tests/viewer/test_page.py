@@ -32,7 +32,6 @@ from hgn.scene.material import MATERIALS
 from hgn.scene.rollout_file import read_rollout
 from hgn.scene.scene import Scene
 from hgn.scene.scene_file import load_scene
-from hgn.scene.shapes import shape_obstacle
 
 pytest.importorskip("viser", reason="viser is not installed: pip install 'hgn[play]'")
 from viewer import soak
@@ -60,9 +59,9 @@ def floating():
 @pytest.fixture(scope="module")
 def play():
     block_N3 = 0.4 + 0.2 * np.random.default_rng(0).random((600, 3)).astype(np.float32)
-    cone = shape_obstacle("cone", 0.3, (0.5, 0.5, 0.5))
+    cone = {"shape": "cone", "size": 0.3, "position": (0.5, 0.5, 0.5)}
     still = (0.0, 0.0, 0.0)
-    scene = Scene(block_N3, 0 * block_N3, np.zeros(600, np.uint8), (cone,), cell_size=1 / 32, gravity=still)
+    scene = Scene(block_N3, 0 * block_N3, np.zeros(600, np.uint8), cell_size=1 / 32, gravity=still, specification={"obstacles": [cone]})
     session = PlaySession(floating(), scene, weights="floating")
     page = PlayPage(session, ("floating", "other"), lambda name: floating(), port=0)
     page.rate = 8.0  # frames a second: simulation and browser share a core

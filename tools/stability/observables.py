@@ -265,8 +265,7 @@ TAKES: Mapping[str, Callable[[np.ndarray], float]] = {
 }  # fmt: skip
 
 
-def series(film: Film, bound: BoundEntry, last: int | None = None) -> list[float]:
-    """Measures an observable every SAMPLED_EVERY frames, to the last frame or the film's end."""
-    end = min(len(film.position_TN3) - 1, len(film.position_TN3) if last is None else last)
+def series(film: Film, bound: BoundEntry) -> list[float]:
+    """Measures an observable every SAMPLED_EVERY frames."""
     own, measure = film.of_group(bound.group), OBSERVABLES[bound.of].measure
-    return [measure(own, frame, bound) for frame in range(SAMPLED_EVERY, end + 1, SAMPLED_EVERY)]
+    return [measure(own, frame, bound) for frame in range(SAMPLED_EVERY, len(film.position_TN3), SAMPLED_EVERY)]

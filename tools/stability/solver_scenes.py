@@ -15,7 +15,6 @@ from hgn.scene.scene import Scene
 from tools.scenes import filled, random_places
 
 CELL = 1 / 64
-FLOOR_CELLS = 3  # nodes below it belong to the walls
 # of obstacles, degrees about x, y and z
 ORIENTATIONS = {"aligned": (0.0, 0.0, 0.0), "tilted": (27.0, 0.0, 13.0), "turned over": (180.0, 40.0, 0.0)}
 
@@ -42,13 +41,3 @@ def positions(outcome: Simulated | SceneFailure) -> np.ndarray:
 def rms_speed(path_TN3: np.ndarray, rate_hz: float) -> float:
     """Returns the root mean square speed over particles and frames, domain units per second."""
     return float(np.sqrt((np.diff(path_TN3.astype(np.float64), axis=0) ** 2).sum(axis=2).mean())) * rate_hz
-
-
-def height_cells(position_N3: np.ndarray) -> float:
-    """Returns the 0.95 quantile of heights above the last node of the floor."""
-    return float(np.quantile(position_N3[:, 1], 0.95)) / CELL - (FLOOR_CELLS - 1)
-
-
-def centre_cells(position_N3: np.ndarray) -> float:
-    """Returns the mean height above the last node of the floor."""
-    return float(position_N3[:, 1].mean()) / CELL - (FLOOR_CELLS - 1)

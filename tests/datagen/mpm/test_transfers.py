@@ -9,7 +9,17 @@ from mpm_scenes import CONFIG, joined, particles, simulated
 from datagen.mpm import grid_kernel
 from hgn.scene.material import ELASTIC, SAND, SNOW, WATER
 from hgn.solver_method import METHODS
-from tools.stability.solver_scenes import block, centre_cells, height_cells
+from tools.stability.solver_scenes import CELL, block
+
+
+def height_cells(position_N3):
+    """The 0.95 quantile of heights above the last node of the floor."""
+    return float(np.quantile(position_N3[:, 1], 0.95)) / CELL - 2
+
+
+def centre_cells(position_N3):
+    """The mean height above the last node of the floor."""
+    return float(position_N3[:, 1].mean()) / CELL - 2
 
 
 @pytest.fixture
