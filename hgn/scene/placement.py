@@ -8,11 +8,12 @@ from __future__ import annotations
 import functools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from hgn.config import SceneConfig
+from hgn.config import SceneConfig, is_mesh_file
 from hgn.scene.distance import contains
 from hgn.scene.funnel import Quaternion
 from hgn.scene.group import Region, fill, particle_count
@@ -20,7 +21,7 @@ from hgn.scene.material import material_index
 from hgn.scene.own_physics import with_drawn_physics
 from hgn.scene.rotation import quaternion_rotation, rotate
 from hgn.scene.scene import Obstacle, Scene
-from hgn.scene.shapes import shape_obstacle, unit_shape
+from hgn.scene.shapes import mesh_sha256, shape_obstacle, unit_shape
 from hgn.scene.surface import point_tree, split_long_edges
 from hgn.schema import Vector
 
@@ -40,29 +41,33 @@ class Placed:
     obstacle: Obstacle
     point_P3: np.ndarray
     gap: float
-    tree: cKDTree
     low: np.ndarray
     high: np.ndarray
     record: dict[str, Any]
 
+    @functools.cached_property
+    def tree(self) -> cKDTree:
+        return point_tree(self.point_P3)
+
 
 def place_shape(shape: str, size: float, position: Vector, quaternion: Quaternion, index: int) -> Placed:
-    """Returns obstacle number `index` of a scene: a built-in shape with its size and place."""
+    """Returns obstacle number `index` of a scene: a built-in shape or a mesh file with its size and place."""
     rotation_33 = quaternion_rotation(quaternion)
-    obstacle = shape_obstacle(shape, size, position, rotation_33, f"obstacle_{index}_{shape}")
+    obstacle = shape_obstacle(shape, size, position, rotation_33, f"obstacle_{index}_{Path(shape).stem}")
     unit_surface_P3, unit_gap = unit_surface_points(shape)
     point_P3 = rotate(size * unit_surface_P3, rotation_33) + np.array(position)
     low_3, high_3 = obstacle.vertex_V3.min(axis=0), obstacle.vertex_V3.max(axis=0)
     record: dict[str, Any] = {"shape": shape, "size": size}
     record |= {"position": list(position), "quaternion": list(quaternion)}
-    return Placed(obstacle, point_P3, size * unit_gap, point_tree(point_P3), low_3, high_3, record)
+    record |= {"sha256": mesh_sha256(shape)} if is_mesh_file(shape) else {}
+    return Placed(obstacle, point_P3, size * unit_gap, low_3, high_3, record)
 
 
-def too_near(obstacle: Obstacle, point: np.ndarray, gap: float, other: Placed, clearance: float) -> bool:
-    low, high = obstacle.vertex_V3.min(axis=0), obstacle.vertex_V3.max(axis=0)
-    bound = clearance + gap + other.gap  # if all points are this far apart, the surfaces keep the clearance
-    if (low > other.high + bound).any() or (high < other.low - bound).any():
+def too_near(item: Placed, other: Placed, clearance: float) -> bool:
+    bound = clearance + item.gap + other.gap  # if all points are this far apart, the surfaces keep the clearance
+    if (item.low > other.high + bound).any() or (item.high < other.low - bound).any():
         return False
+    point, obstacle = item.point_P3, item.obstacle
     point = point[((point >= other.low - bound) & (point <= other.high + bound)).all(axis=1)]
     for subset in (point[::FEW], point):  # most overlaps already show at a few points
         if np.isfinite(other.tree.query(subset, distance_upper_bound=bound)[0]).any():

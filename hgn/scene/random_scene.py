@@ -7,12 +7,10 @@ Coordinates are sums, products, quotients and square roots. Only unit shapes use
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from hgn.config import SceneConfig, is_mesh_file
+from hgn.config import SceneConfig
 from hgn.scene.funnel import Funnel, draw_funnel
 from hgn.scene.group import WALL_CELLS, Region, points_in_ball, random_direction, region_of
 from hgn.scene.placement import (
@@ -28,12 +26,10 @@ from hgn.scene.placement import (
     thrown,
     too_near,
     triple,
-    unit_surface_points,
 )
 from hgn.scene.rotation import quaternion_rotation, rotate
 from hgn.scene.scene import Scene
-from hgn.scene.shapes import mesh_sha256, shape_obstacle
-from hgn.scene.surface import point_tree
+from hgn.scene.shapes import shape_obstacle
 from hgn.scene.world import Layout, draw_layout
 from hgn.schema import ConfigError, Vector, require
 
@@ -79,14 +75,18 @@ def generate_scene(config: SceneConfig, seed: int) -> Scene:
     failure = ""
     for _ in range(LAYOUTS):
         try:
-            funnel, sheets = _place_funnel(config, gravity, funnel_rng) if funnelled else (None, [])
-            obstacles = _place_obstacles(config, sheets, rng)
-            groups = _place_groups(config, obstacles, funnel, rng)
-            lone = _place_lone_particles(config, obstacles, [region for _, region in groups], lone_rng)
+            funnel, obstacles = _place_funnel(config, gravity, funnel_rng) if funnelled else (None, [])
+            for index in range(len(obstacles), config.obstacle_count):
+                obstacles.append(_place_obstacle(config, obstacles, index, rng))
+            shapes, regions = list[str](), list[Region]()
+            for index in range(config.group_count):
+                shape, region = _place_group(config, obstacles, regions, funnel, index, rng)
+                shapes, regions = [*shapes, shape], [*regions, region]
+            lone = _place_lone_particles(config, obstacles, regions, lone_rng)
         except _NoRoomError as error:
             failure = str(error)
             continue
-        bodies = [_fill_group(config, shape, region, rng) for shape, region in groups]
+        bodies = [_fill_group(config, *group, rng) for group in zip(shapes, regions, strict=True)]
         bodies = _collide(config, bodies, motion_rng) if colliding else _purify(config, bodies, gravity, motion_rng)
         bodies += [_fill_group(config, "cube", region, lone_rng) for region in lone]
         return assemble(config, seed, gravity, obstacles, bodies, kind)
@@ -128,14 +128,6 @@ def _squares(funnel: Funnel, hole_3: np.ndarray) -> list[Placed]:
     return [place_shape("square", funnel.size, triple(centre_3), turn, index) for index, (centre_3, turn) in parts]
 
 
-def _place_obstacles(config: SceneConfig, sheets: list[Placed], rng: np.random.Generator) -> list[Placed]:
-    """Returns all obstacles. `sheets` are already placed and count as obstacles."""
-    placed = list(sheets)
-    for index in range(len(sheets), config.obstacle_count):
-        placed.append(_place_obstacle(config, placed, index, rng))
-    return placed
-
-
 def _place_obstacle(config: SceneConfig, placed: list[Placed], index: int, rng: np.random.Generator) -> Placed:
     clearance = CLEARANCE_CELLS * config.cell_size
     domain = np.array(config.domain_size)
@@ -144,40 +136,20 @@ def _place_obstacle(config: SceneConfig, placed: list[Placed], index: int, rng: 
         shape = choice(config.obstacle_shapes, rng)
         size = smallest + (largest - smallest) * rng.random()
         quaternion = random_direction(rng, 4).tolist()
-        rotation = quaternion_rotation(quaternion)
-        turned = shape_obstacle(shape, size, rotation_33=rotation)
+        turned = shape_obstacle(shape, size, rotation_33=quaternion_rotation(quaternion))
         low, high = turned.vertex_V3.min(axis=0), turned.vertex_V3.max(axis=0)
         first = -low + ROUNDING * domain
         span = domain - ROUNDING * domain - high - first
         if (span < 0).any():
             continue
-        unit_surface, unit_gap = unit_surface_points(shape)
-        surface, gap = rotate(size * unit_surface, rotation), size * unit_gap
         for _ in range(PLACES_PER_SHAPE):
-            centre = first + span * rng.random(3)
-            position = triple(centre)
-            obstacle = shape_obstacle(shape, size, position, rotation, f"obstacle_{index}_{Path(shape).stem}")
-            point = surface + centre
-            if any(too_near(obstacle, point, gap, other, clearance) for other in placed):
-                continue
-            record: dict[str, Any] = {"shape": shape, "size": size}
-            record |= {"position": list(position), "quaternion": quaternion}
-            if is_mesh_file(shape):
-                record["sha256"] = mesh_sha256(shape)
-            return Placed(obstacle, point, gap, point_tree(point), low + centre, high + centre, record)
+            item = place_shape(shape, size, triple(first + span * rng.random(3)), quaternion, index)
+            if not any(too_near(item, other, clearance) for other in placed):
+                return item
     raise _NoRoomError(
         f"obstacle_count must leave room for each obstacle, got no place for number {index + 1} of "
         f"{config.obstacle_count}; lower obstacle_count or obstacle_size, or raise domain_size"
     )
-
-
-def _place_groups(
-    config: SceneConfig, obstacles: list[Placed], funnel: _PlacedFunnel | None, rng: np.random.Generator
-) -> list[tuple[str, Region]]:
-    placed: list[tuple[str, Region]] = []
-    for index in range(config.group_count):
-        placed.append(_place_group(config, obstacles, [region for _, region in placed], funnel, index, rng))
-    return placed
 
 
 def _place_group(
