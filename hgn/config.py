@@ -17,6 +17,7 @@ from hgn.schema import (
     AtMostOne,
     BelowOne,
     Bound,
+    Bounded,
     BoxSize,
     ConfigError,
     FewLayers,
@@ -151,7 +152,7 @@ class SceneConfig:
 
 
 @dataclass(frozen=True)
-class MpmConfig:
+class MpmConfig(Bounded):
     """The MLS-MPM solver. The defaults correct Taichi Elements; conf/mpm/taichi_elements.yaml reproduces it."""
 
     youngs_modulus_pa: Positive[float] = 1e6  # Young's modulus of all materials; stiffer ones need shorter steps
@@ -182,18 +183,10 @@ class MpmConfig:
     device: DeviceName = "auto"  # cpu, cuda, or auto: cuda if there is a GPU
     scenes_per_launch: OneOrMore | None = None  # number of scenes in a launch; null: 1 on a CPU, up to 416 on a GPU
 
-    def __post_init__(self) -> None:
-        require_bounds(self)
-
     @property
     def choices(self) -> SolverMethod:
         """Returns the numerical choices of the method."""
         return METHODS[self.method]
-
-
-def _spread(number: int, fraction: float) -> bool:
-    """Returns whether item `number`, from 1, belongs to an evenly distributed fraction of all items."""
-    return math.floor(number * fraction + 1e-9) > math.floor((number - 1) * fraction + 1e-9)
 
 
 @dataclass(frozen=True)
@@ -234,7 +227,8 @@ class DatasetConfig:
 
     def frames_of(self, index: int) -> int:
         """Returns the number of frames of an episode by its index in its split."""
-        return self.long_frames if _spread(index + 1, self.long_fraction) else self.frames
+        long_before, long_with_it = (math.floor(count * self.long_fraction + 1e-9) for count in (index, index + 1))
+        return self.long_frames if long_with_it > long_before else self.frames
 
     def scenes(self, split: str) -> int:
         return {"train": self.training_scenes, "validation": self.validation_scenes, "test": self.test_scenes}[split]

@@ -16,7 +16,7 @@ from hgn.data.fresh import set_record
 from hgn.data.reader import EpisodeStore, first_episodes
 from hgn.scene.distance import fraction_inside
 from hgn.scene.episode import Episode
-from hgn.schema import FileName, NonNegative, Positive, from_mapping, require_bounds
+from hgn.schema import Bounded, FileName, NonNegative, Positive, from_mapping
 from hgn.system.files import require_place, write_json
 from hgn.system.progress import bar
 
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class EvaluateConfig(SimulatorConfig):
+class EvaluateConfig(SimulatorConfig, Bounded):
     """`python -m hgn.evaluate`: one-step and rollout errors on a split of a data set."""
 
     data: str  # folder or URL of a data set
@@ -37,9 +37,6 @@ class EvaluateConfig(SimulatorConfig):
     frame_stride: Positive[int] = 1  # distance between two frames whose one-step errors are measured
     rollout_frames: NonNegative[int] = 300  # length of each rollout in frames; 0: no rollouts
     json: FileName | None = None  # file for the figures; null: none
-
-    def __post_init__(self) -> None:
-        require_bounds(self)
 
 
 def main(mapping: dict[str, Any]) -> int:

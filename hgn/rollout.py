@@ -31,7 +31,6 @@ from hgn.system.processes import ended_as_by_ctrl_c
 from hgn.system.progress import bar
 
 if TYPE_CHECKING:
-    from hgn.runtime.simulator import InitialState
     from hgn.runtime.weights import WeightsInfo
     from hgn.scene.rollout_file import Rollout
 
@@ -131,7 +130,8 @@ def rollout(config: RolloutConfig) -> tuple[Path, Rollout]:
         obstacles = obstacles_of_episode(episode)
         reference_TN3 = episode.position_TN3[:frames]
         source |= {"data": Path(config.data).name, "episode": str(config.episode)}
-    limit, fastest = simulator.info.maximum_initial_speed, _fastest(initial)
+    limit = simulator.info.maximum_initial_speed
+    fastest = float(np.linalg.norm(initial.velocity_N3, axis=-1).max(initial=0.0))
     if limit is not None and fastest > limit * (1 + SAME_SPEED):
         print(
             f"velocity: groups begin with up to {fastest:.3g} domain units per second, those of the data of "
@@ -185,10 +185,6 @@ def _notes_on_physics(scene: Scene, info: WeightsInfo, weights: str) -> Iterator
         far = values[(values < low * (1 - SAME_SPEED)) | (values > high * (1 + SAME_SPEED))]
         if len(far) and name in (*used, *inputs):
             yield f"{name}: {far[0]:.4g}, those of the data of {weights} are {low:g} to {high:g}; motion is a guess"
-
-
-def _fastest(initial: InitialState) -> float:
-    return float(np.linalg.norm(initial.velocity_N3, axis=-1).max(initial=0.0))
 
 
 def _out(config: RolloutConfig) -> Path:

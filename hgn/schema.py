@@ -224,6 +224,13 @@ def require_bounds(owner: object) -> None:
         _require_bound(hint, getattr(owner, name), name)
 
 
+class Bounded:
+    """A dataclass whose fields are checked by `require_bounds`, and by nothing else."""
+
+    def __post_init__(self) -> None:
+        require_bounds(self)
+
+
 @functools.cache
 def _bounded_hints(cls: type) -> dict[str, Any]:
     hints = typing.get_type_hints(cls, include_extras=True)

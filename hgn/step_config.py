@@ -5,14 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated
 
-from hgn.schema import Bound, NonNegative, Positive, require, require_bounds
+from hgn.schema import Bound, Bounded, NonNegative, Positive, require
 
 Clearance = Annotated[float, Bound("from 0 to 1e9", lambda value: 0 <= value <= 1e9)]
 WallClearance = tuple[Clearance, Clearance]
 
 
 @dataclass(frozen=True)
-class StepConfig:
+class StepConfig(Bounded):
     """The constraints of simulated frames (hgn.step). They need no training. Lengths are in domain units."""
 
     # deformation of particles in contact stops if its speed is below rest_threshold * |g| * (one frame); 0: never
@@ -21,9 +21,6 @@ class StepConfig:
     wall_clearance: WallClearance | None = None
     # smallest distance from an obstacle's triangles, which no particle passes; null: particles may pass
     obstacle_clearance: Positive[float] | None = None
-
-    def __post_init__(self) -> None:
-        require_bounds(self)
 
     @property
     def rests(self) -> bool:

@@ -24,7 +24,7 @@ from hgn.command import run_command
 from hgn.data.identity import require_same_dataset
 from hgn.data.manifest import MANIFEST_NAME, Manifest
 from hgn.data.storage import TOKEN_VARIABLE, dataset_token
-from hgn.schema import ConfigError, Port, Positive, from_mapping, require_bounds
+from hgn.schema import Bounded, ConfigError, Port, Positive, from_mapping
 from hgn.system.machine import allow_open_files
 
 _OPEN_FILES = 65536
@@ -32,16 +32,13 @@ _SERVICE_KEYS = ("host", "port", "health_port", "connections")
 
 
 @dataclass(frozen=True)
-class ServiceConfig:
+class ServiceConfig(Bounded):
     """`python -m datagen.service`: the server, in addition to the settings of `python -m datagen`."""
 
     host: str = "127.0.0.1"  # address to listen on; any other needs a token in $HGN_DATASET_TOKEN
     port: Port = 8000  # 0: any free port
     health_port: Port | None = None  # also answers /healthz at this port, for the probes of a busy service; null: no
     connections: Positive[int] = 1024  # connections; one more closes the oldest without a request, else it gets a 503
-
-    def __post_init__(self) -> None:
-        require_bounds(self)
 
 
 def main(mapping: dict[str, Any], backend: Backend | None = None) -> int:

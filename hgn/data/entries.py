@@ -11,7 +11,7 @@ from typing import Annotated
 
 from hgn.config import Split
 from hgn.data.statistics import Moments, Statistics
-from hgn.schema import Bound, ConfigError, NonNegative, require, require_bounds
+from hgn.schema import Bound, Bounded, ConfigError, NonNegative, require, require_bounds
 
 SPLITS = ("train", "validation", "test")
 REMEDY = "if it stays so, run the generator again without manifest.json: published shards are found and kept"
@@ -73,7 +73,7 @@ class QuarantinedScene:
 
 
 @dataclass(frozen=True)
-class SplitTotals:
+class SplitTotals(Bounded):
     """Counts the published part of a split."""
 
     shards: Count = 0
@@ -81,9 +81,6 @@ class SplitTotals:
     bytes: NonNegative[int] = 0
     digest: str = ""  # digest of the shards' sha256 in publication order; identifies the order of samples
     statistics: Statistics | None = None  # stored in `manifest.json` only, not with segments
-
-    def __post_init__(self) -> None:
-        require_bounds(self)
 
     def plus(self, shard: ShardEntry) -> SplitTotals:
         """Returns the totals with one more shard."""

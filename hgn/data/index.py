@@ -38,7 +38,7 @@ from hgn.data.entries import (
     totals_of,
 )
 from hgn.data.storage import Storage, StorageError, ask
-from hgn.schema import ConfigError, NonNegative, from_mapping, require_bounds, to_mapping
+from hgn.schema import Bounded, ConfigError, NonNegative, from_mapping, to_mapping
 from hgn.system.files import errors_name, make_folder, sync_file, sync_folder
 
 INDEX_NAME = "index"
@@ -50,7 +50,7 @@ T = TypeVar("T")
 
 
 @dataclass(frozen=True)
-class IndexState:
+class IndexState(Bounded):
     """Holds the valid sizes of the index's files."""
 
     generation: NonNegative[int] = 1
@@ -59,9 +59,6 @@ class IndexState:
     table_bytes: NonNegative[int] = 0
     quarantined: NonNegative[int] = 0
     quarantine_bytes: NonNegative[int] = 0
-
-    def __post_init__(self) -> None:
-        require_bounds(self)
 
     def path(self, kind: int | str) -> str:
         """Returns the name of segment number `kind`, or of another file."""

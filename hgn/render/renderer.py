@@ -130,11 +130,6 @@ class Stage:
 
     # the parts that stay the same in every frame without moving obstacles
 
-    def _prepare_shadow_map(self, domain_size: Vector) -> None:
-        self.map_cell = max(domain_size[0], domain_size[2]) / SHADOW_CELLS
-        # The light is slanted, so that shadows of high particles fall beside the floor. The map omits them.
-        self.map_shape = tuple(math.ceil(domain_size[axis] / self.map_cell) for axis in (2, 0))
-
     def _to_map(self, point_N3: np.ndarray) -> np.ndarray:
         """Returns the place of each point's shadow on the floor, in map cells: [N, 2] as (x, z)."""
         fall_N1 = point_N3[:, 1:2] / LIGHT[1]
@@ -213,7 +208,9 @@ class Stage:
 
     def _prepare_room(self, domain_size: Vector) -> None:
         """Draws floor and walls, without obstacles and shadows."""
-        self._prepare_shadow_map(domain_size)
+        self.map_cell = max(domain_size[0], domain_size[2]) / SHADOW_CELLS
+        # The light is slanted, so that shadows of high particles fall beside the floor. The map omits them.
+        self.map_shape = tuple(math.ceil(domain_size[axis] / self.map_cell) for axis in (2, 0))
         camera = self.camera
         ray_P3 = camera.rays()
         color_P3 = np.tile(BACKGROUND_COLOR, (len(ray_P3), 1))

@@ -43,20 +43,9 @@ def build_obstacle_grid(
     limits the cost of large meshes. A cell has the mean friction of its samples. The result is deterministic.
     Raises: ConfigError for a bad cell size, or for a surface that is too large to sample.
     """
-    point_S3, normal_S3, friction_S = _samples(obstacles, cell_size, seed, domain_size)
+    point_S3, normal_S3, friction_S = surface_samples(obstacles, cell_size, seed, domain_size)
     known = any(obstacle.friction is not None for obstacle in obstacles)
     return grid_of_samples(point_S3, normal_S3, cell_size, friction_S if known else None)
-
-
-def surface_samples(
-    obstacles: Sequence[Obstacle], cell_size: float, seed: int, domain_size: Vector | None = None
-) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the samples of `build_obstacle_grid`, float64 [S, 3], and the unit normals of their triangles.
-
-    They can be moved with an obstacle to compute its cells elsewhere without sampling it again.
-    Raises: ConfigError as `build_obstacle_grid`.
-    """
-    return _samples(obstacles, cell_size, seed, domain_size)[:2]
 
 
 def grid_of_samples(
@@ -87,10 +76,14 @@ def grid_of_samples(
     return replace(grid, friction_K=(np.bincount(cell_S, friction_S, len(key_K)) / count_K).astype(np.float32))
 
 
-def _samples(
-    obstacles: Sequence[Obstacle], cell_size: float, seed: int, domain_size: Vector | None
+def surface_samples(
+    obstacles: Sequence[Obstacle], cell_size: float, seed: int, domain_size: Vector | None = None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Returns surface points at least NORMAL_SPACING_CELLS apart, and normals and friction of their triangles."""
+    """Returns the samples of `build_obstacle_grid`, float64 [S, 3], and unit normals and friction of their triangles.
+
+    They can be moved with an obstacle to compute its cells elsewhere without sampling it again.
+    Raises: ConfigError as `build_obstacle_grid`.
+    """
     require(0 < cell_size < np.inf, "cell_size", "a finite number > 0", cell_size, "the paper uses 1/64")
     sizes = np.array([len(obstacle.triangle_F3) for obstacle in obstacles], np.int64)
     friction_F = np.repeat(np.array([obstacle.friction or 0.0 for obstacle in obstacles]), sizes)

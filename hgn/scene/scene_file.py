@@ -27,6 +27,7 @@ from hgn.scene.rotation import euler_rotation
 from hgn.scene.scene import Obstacle, Scene, whole_cells
 from hgn.scene.shapes import shape_obstacle
 from hgn.schema import (
+    Bounded,
     BoxSize,
     ConfigError,
     NonNegative,
@@ -52,15 +53,12 @@ EMITTER_STREAM = 2**31  # key of the emitters' random streams, which are separat
 
 
 @dataclass(frozen=True)
-class KeyframeEntry:
+class KeyframeEntry(Bounded):
     """A pose of an obstacle relative to its initial place."""
 
     time: NonNegative[float]  # seconds
     translation: Vector = (0.0, 0.0, 0.0)
     rotation: Vector = (0.0, 0.0, 0.0)  # degrees about the fixed x axis, then y, then z, through its position
-
-    def __post_init__(self) -> None:
-        require_bounds(self)
 
 
 @dataclass(frozen=True)

@@ -24,16 +24,8 @@ _WRITTEN_BY_HGN = re.compile(
 )
 
 
-def temporary_path(path: Path) -> Path:
-    """Returns a unique name in the folder of `path` for writing it. A crash leaves only a file that ends in `.partial`.
-
-    Names are random, because containers on several machines may have equal process numbers.
-    """
-    return path.with_name(f".{path.name}.{secrets.token_hex(6)}{TEMPORARY_SUFFIX}")
-
-
 def temporary_target(path: Path) -> str:
-    """Returns the final name of a file of `temporary_path`."""
+    """Returns the final name of a file of `temporary_file`."""
     return path.name.removeprefix(".").removesuffix(TEMPORARY_SUFFIX).rpartition(".")[0]
 
 
@@ -41,9 +33,10 @@ def temporary_target(path: Path) -> str:
 def temporary_file(path: Path) -> Iterator[Path]:
     """Yields a temporary name in the folder of `path` for writing it. Removes the file unless the caller renamed it.
 
-    An OSError that names no file (a full disk) names `path`.
+    A crash leaves only a file that ends in `.partial`. An OSError that names no file (a full disk) names `path`.
     """
-    temporary = temporary_path(path)
+    # random, because containers on several machines may have equal process numbers
+    temporary = path.with_name(f".{path.name}.{secrets.token_hex(6)}{TEMPORARY_SUFFIX}")
     try:
         with errors_name(path):
             yield temporary

@@ -24,11 +24,9 @@ _ABSOLUTE_PATH = re.compile(r"(?<![\w.:/~-])/(?:[^/\s,='\"\[\](){}]+/)*([^/\s,='
 def commit() -> str:
     """Returns $HGN_COMMIT (for copies without history), or else the checkout's commit.
     The commit has the suffix `+changes` if files differ from it. Without a commit the result is `unknown`."""
-    return os.environ.get("HGN_COMMIT") or commit_of(Path(__file__).resolve().parents[2])
-
-
-def commit_of(folder: Path) -> str:
-    """Returns the commit of a checkout, with `+changes` if files differ from it, or `unknown` for another folder."""
+    folder = Path(__file__).resolve().parents[2]
+    if given := os.environ.get("HGN_COMMIT"):
+        return given
     if not (folder / ".git").exists():
         return "unknown"
     try:

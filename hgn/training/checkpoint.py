@@ -23,7 +23,7 @@ from hgn.network.build import build_network
 from hgn.network.own_physics import physics_widths
 from hgn.renamed import current_names, with_step
 from hgn.runtime.weights import find_weights, load_weights, network_with
-from hgn.schema import ConfigError, NonNegative, OrdinarySize, Vector, from_stored, require, require_bounds, to_mapping
+from hgn.schema import Bounded, ConfigError, NonNegative, OrdinarySize, Vector, from_stored, require, to_mapping
 from hgn.step_config import StepConfig
 from hgn.system.claims import Claims, require_few_items, require_plain_pickle
 
@@ -41,7 +41,7 @@ class DamagedError(ConfigError):
 
 
 @dataclass(frozen=True)
-class DataInfo:
+class DataInfo(Bounded):
     """Facts about the training data. They are stored with the network."""
 
     config_hash: str
@@ -51,9 +51,6 @@ class DataInfo:
     maximum_initial_speed: NonNegative[float] | None = None  # of the groups, domain units per second; None: unknown
     # ranges of friction and of materials' parameters in the data (hgn.scene.own_physics.own_ranges)
     own_ranges: dict[str, tuple[float, float]] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        require_bounds(self)
 
 
 @dataclass(frozen=True)

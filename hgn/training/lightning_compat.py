@@ -57,7 +57,7 @@ def interrupts_passed_on() -> Iterator[None]:
 def skip_sigterm_broadcast(trainer: Trainer) -> None:
     """Removes a broadcast before each training step. With it Lightning shares a SIGTERM of rank 0, and the host waits
     for the device (its issue 21487). hgn.training.callbacks.Stopper shares signals every few updates instead."""
-    trainer.fit_loop.epoch_loop._broadcast_sigterm_tensor = _nothing  # type: ignore[method-assign]
+    trainer.fit_loop.epoch_loop._broadcast_sigterm_tensor = lambda: None  # type: ignore[method-assign]
 
 
 def forget_sigterm(trainer: Trainer) -> None:
@@ -69,7 +69,3 @@ def forget_sigterm(trainer: Trainer) -> None:
 def save_alone(trainer: Trainer, path: Path) -> None:
     """Saves a checkpoint on this rank, whichever it is, without the others."""
     trainer.strategy.checkpoint_io.save_checkpoint(trainer._checkpoint_connector.dump_checkpoint(), path)
-
-
-def _nothing() -> None:
-    pass

@@ -101,11 +101,6 @@ class PoolDraws:
         return [self._by_size.at(place) for place in generator.random(count)]
 
 
-def target_count(simulated: int, frame_count: int, frame: int) -> int:
-    """Returns how many of the frames simulated after `frame` have a target in an episode of `frame_count` frames."""
-    return min(simulated, frame_count - 2 - frame)
-
-
 def pushforward_windows(
     true_TN3: torch.Tensor, simulated_FN3: torch.Tensor, pull: float, cell_size: float
 ) -> torch.Tensor:
@@ -198,7 +193,8 @@ class PushforwardPool(Generic[E, T]):
         squares, total = [], 0
         for frames, equally_long in self._by_frames(starts):
             for group in self._scenes.groups(equally_long):
-                counts = [target_count(frames, self._scenes.frame_count(episode), frame) for episode, frame in group]
+                # later frames have no target in the episode
+                counts = [min(frames, self._scenes.frame_count(episode) - 2 - frame) for episode, frame in group]
                 simulated = self._scenes.simulate(group, frames)
                 squares += self._add(group, [path_FN3[:n] for path_FN3, n in zip(simulated, counts, strict=True)])
                 total += sum(counts)

@@ -43,7 +43,7 @@ class Body:
     @cached_property
     def samples(self) -> tuple[np.ndarray, np.ndarray]:
         """Returns points on the surface and their normals, float64 [S, 3]."""
-        return surface_samples((self.mesh,), self.cell_size, seed=0)
+        return surface_samples((self.mesh,), self.cell_size, seed=0)[:2]
 
     @property
     def name(self) -> str:

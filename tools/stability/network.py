@@ -22,7 +22,7 @@ from hgn.config import DEFAULT_WEIGHTS, MpmConfig, SceneConfig, SimulatorConfig
 from hgn.runtime.rollouts import RolloutResult, simulate_scenes
 from hgn.runtime.simulator import InitialState, Simulator
 from hgn.scene.scene import Scene
-from hgn.schema import Bound, ConfigError, FileName, FrameCount, Vector, from_mapping, require_bounds, to_mapping
+from hgn.schema import Bound, Bounded, ConfigError, FileName, FrameCount, Vector, from_mapping, to_mapping
 from tools.report import meta_of
 from tools.solver_rollouts import solver_trials
 from tools.stability.case import Case, Outcome, cut, gallery_cases
@@ -42,7 +42,7 @@ ON_THE_FLOOR = 0.04  # times the height of a particle in the middle: 0.02 domain
 
 
 @dataclass(frozen=True)
-class StabilityNetworkConfig(SimulatorConfig):
+class StabilityNetworkConfig(SimulatorConfig, Bounded):
     """The options of `python -m tools.stability network`."""
 
     weights: str = DEFAULT_WEIGHTS  # a file of python -m hgn.export, or the name of shipped weights
@@ -58,9 +58,6 @@ class StabilityNetworkConfig(SimulatorConfig):
     mpm: MpmConfig = field(default_factory=MpmConfig)  # the solver; its sand must be that of the network's data
     scene: SceneConfig = field(default_factory=SceneConfig)  # the scenes of the training
     json: FileName | None = None  # file for the rows; --json FILE does the same
-
-    def __post_init__(self) -> None:
-        require_bounds(self)
 
 
 def main(mapping: dict[str, Any]) -> int:

@@ -14,7 +14,7 @@ from functools import partial
 from typing import Annotated, Any
 
 from hgn.config import MpmConfig
-from hgn.schema import Bound, from_mapping, require_bounds, to_mapping
+from hgn.schema import Bound, Bounded, from_mapping, to_mapping
 from tools.report import ReportConfig, meta_of
 from tools.stability.gallery import is_gallery
 from tools.stability.row import Report, Row, table
@@ -32,15 +32,12 @@ CaseName = Annotated[
 
 
 @dataclass(frozen=True)
-class StabilitySolverConfig(ReportConfig):
+class StabilitySolverConfig(ReportConfig, Bounded):
     """The options of `python -m tools.stability solver`."""
 
     # steps, stiffness, impact, contact, leak, long, rest, dam, column, repose; null: all of these. gallery: the scenes
     # of conf/gallery, which networks are compared with; gallery_NUMBER: a draw of them
     cases: tuple[CaseName, ...] | None = None
-
-    def __post_init__(self) -> None:
-        require_bounds(self)
 
 
 def main(mapping: dict[str, Any]) -> int:

@@ -12,6 +12,7 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import math
 import re
 from collections.abc import Callable, Iterator, Mapping
@@ -30,6 +31,7 @@ from hgn.scene.npz import read_npz
 from hgn.schema import ConfigError, require
 from hgn.system.yaml_files import read_json
 
+_Named = tuple[str, Mapping[str, Any]]  # name of a trajectory for messages, and its fields
 SPLIT_NAMES = {"train": ("train",), "validation": ("valid", "validation"), "test": ("test",)}
 # particle types of DeepMind's sets, which geoelements and NeuralMPM use too, and of LagrangeBench's
 _DEEPMIND = {0: "rigid", FLUID: "fluid", 5: "water", 6: "sand", 7: "goop"}
@@ -145,10 +147,10 @@ def read_split(folder: Path, split: str, info: SetInfo) -> Iterator[Trajectory]:
 
     Raises: ConfigError naming file, trajectory and field that is missing, cut, altered or of a wrong type.
     """
-    return _READERS[info.format](folder, split, info)
+    return (_of_members(name, members, info) for name, members in _READERS[info.format](folder, split, info))
 
 
-def _read_deepmind(folder: Path, split: str, info: SetInfo) -> Iterator[Trajectory]:
+def _read_deepmind(folder: Path, split: str, info: SetInfo) -> Iterator[_Named]:
     path = _file(folder, split, ".tfrecord")
     for number, record in enumerate(read_records(path) if path else ()):
         name = f"{path}: record {number}"
@@ -163,8 +165,7 @@ def _read_deepmind(folder: Path, split: str, info: SetInfo) -> Iterator[Trajecto
         if flat.size != math.prod(shape):
             rule = f"{math.prod(shape)} numbers for sequence_length + 1, particles and dim {shape}"
             raise ConfigError(f"{name}: position must have {rule}, got {flat.size}")
-        position_TND, type_N = checked(name, flat.reshape(shape), types, info.dimensions)
-        yield Trajectory(name, position_TND, type_N)
+        yield name, {"position": flat.reshape(shape), "particle_type": types}
 
 
 def _joined(name: str, parts: list[bytes] | None, dtype: str) -> np.ndarray:
@@ -176,21 +177,20 @@ def _joined(name: str, parts: list[bytes] | None, dtype: str) -> np.ndarray:
     return np.frombuffer(data, dtype)
 
 
-def _read_geoelements(folder: Path, split: str, info: SetInfo) -> Iterator[Trajectory]:
+def _read_geoelements(folder: Path, split: str, info: SetInfo) -> Iterator[_Named]:
     path = _file(folder, split, ".npz")
+    fields = ("position", "particle_type", "material_property")
     for member, array in read_npz(path, objects=True) if path else ():
         for key, entry in _entries(member, array):
             name, parts = f"{path}: {key}", entry
             if isinstance(entry, Mapping):
-                parts = [entry[field] for field in ("position", "particle_type", "material_property") if field in entry]
+                parts = [entry[field] for field in fields if field in entry]
             parts = list(parts) if isinstance(parts, (tuple, list, np.ndarray)) else []
             if len(parts) not in (2, 3):
                 raise ConfigError(
                     f"{name} must be (position, particle_type) or these and material_property, got {entry!r:.60}"
                 )
-            position_TND, type_N = checked(name, parts[0], parts[1], info.dimensions)
-            own = parts[2] if len(parts) == 3 else None
-            yield Trajectory(name, position_TND, type_N, property_NK=_properties(name, own, len(type_N)))
+            yield name, dict(zip(fields, parts, strict=False))
 
 
 def _entries(member: str, array: np.ndarray) -> Iterator[tuple[str, Any]]:
@@ -204,11 +204,11 @@ def _entries(member: str, array: np.ndarray) -> Iterator[tuple[str, Any]]:
         yield member, content
 
 
-def _read_hdf5(folder: Path, split: str, info: SetInfo) -> Iterator[Trajectory]:
+def _read_hdf5(folder: Path, split: str, info: SetInfo) -> Iterator[_Named]:
     path = _file(folder, split, ".h5")
     if path is None:
-        if info.format == "plain" and (archive := _file(folder, split, ".npz")):
-            yield from _read_plain_npz(archive, info)
+        archive = _file(folder, split, ".npz") if info.format == "plain" else None
+        yield from _read_plain_npz(archive) if archive else ()
         return
     with _opened(path) as file:
         for key in sorted(file):
@@ -216,24 +216,21 @@ def _read_hdf5(folder: Path, split: str, info: SetInfo) -> Iterator[Trajectory]:
                 group = file[key]
                 require(isinstance(group, h5py.Group), f"{path}: {key}", "a group with position", str(group))
                 members = {name: _dataset(f"{path}: {key}", group, name) for name in group}
-            yield _of_members(f"{path}: {key}", members, info)
+            yield f"{path}: {key}", members
 
 
-def _read_plain_npz(path: Path, info: SetInfo) -> Iterator[Trajectory]:
-    key, members = "", dict[str, np.ndarray]()
-    for member, array in read_npz(path):
-        trajectory, _, name = member.rpartition("/")
-        require(bool(trajectory), f"{path}: {member}", "named TRAJECTORY/FIELD", member)
-        require(not array.dtype.hasobject, f"{path}: {member}", "an array of numbers", str(array.dtype))
-        if members and trajectory != key:
-            yield _of_members(f"{path}: {key}", members, info)
-            members = {}
-        key, members[name] = trajectory, array
-    if members:
-        yield _of_members(f"{path}: {key}", members, info)
+def _read_plain_npz(path: Path) -> Iterator[_Named]:
+    def trajectory(item: tuple[str, np.ndarray]) -> str:
+        key = item[0].rpartition("/")[0]
+        require(bool(key), f"{path}: {item[0]}", "named TRAJECTORY/FIELD", item[0])
+        return key
+
+    for key, arrays in itertools.groupby(read_npz(path), trajectory):
+        yield f"{path}: {key}", {member.rpartition("/")[2]: array for member, array in arrays}
 
 
-def _of_members(name: str, members: Mapping[str, np.ndarray], info: SetInfo) -> Trajectory:
+def _of_members(name: str, members: Mapping[str, Any], info: SetInfo) -> Trajectory:
+    """Checks the fields of a trajectory, which all formats have by the names of the plain one."""
     position = members.get("position", members.get("positions"))  # the name in geoelements' HDF5
     if position is None:
         raise ConfigError(f"{name}: position is missing; it has {', '.join(members) or 'nothing'}")
@@ -289,7 +286,7 @@ def _properties(name: str, given: Any, count: int) -> np.ndarray | None:
     return np.broadcast_to(columns, (count, columns.shape[1]))
 
 
-def _read_neuralmpm(folder: Path, split: str, info: SetInfo) -> Iterator[Trajectory]:
+def _read_neuralmpm(folder: Path, split: str, info: SetInfo) -> Iterator[_Named]:
     files = [path for name in SPLIT_NAMES[split] for path in (folder / name).glob("sim_*.h5")]
     for path in sorted(files, key=lambda path: (len(path.stem), path.stem)):
         with _opened(path) as file:
@@ -299,15 +296,13 @@ def _read_neuralmpm(folder: Path, split: str, info: SetInfo) -> Iterator[Traject
             own = next((_dataset(str(path), file, key) for key in ("grav", "gravity") if key in file), None)
         if types.ndim == 1 and len(types) == particles.shape[1] + boundary.shape[1]:  # the boundary's types come first
             types = types[boundary.shape[1] :]
-        position_TND, type_N = checked(str(path), particles, types, axes)
         moved = np.abs(boundary - boundary[:1]).max(initial=0)
         require(moved <= 1e-3 * info.radius, f"{path}: boundary", "at rest", f"a motion by {moved:.3g}")
-        gravity = None
+        members = {"position": particles, "particle_type": types}
+        members |= {"boundary": boundary[0]} if boundary.size else {}
         if own is not None and info.gravity is None:  # these sets have a gravity for each simulation
-            gravity = tuple(floats(f"{path}: grav", own, (axes,)).tolist())
-        yield Trajectory(
-            str(path), position_TND, type_N, boundary[0] if boundary.size else None, gravity=gravity
-        )  # fmt: skip
+            members |= {"gravity": floats(f"{path}: grav", own, (axes,))}
+        yield str(path), members
 
 
 def _wide(path: Path, file: h5py.File, key: str, axes: int) -> np.ndarray:
@@ -318,7 +313,7 @@ def _wide(path: Path, file: h5py.File, key: str, axes: int) -> np.ndarray:
     return floats(f"{path}: {key}", array[..., :axes], (*array.shape[:2], axes))
 
 
-_READERS: dict[str, Callable[[Path, str, SetInfo], Iterator[Trajectory]]] = {
+_READERS: dict[str, Callable[[Path, str, SetInfo], Iterator[_Named]]] = {
     "deepmind": _read_deepmind,
     "geoelements": _read_geoelements,
     "lagrangebench": _read_hdf5,
