@@ -16,10 +16,10 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 31_349,
-    "datagen": 8_435,
-    "tools": 6_606,
-    "tests": 30_505,
+    "hgn": 31_243,
+    "datagen": 8_429,
+    "tools": 6_589,
+    "tests": 30_518,
 }
 SETTINGS = 240  # fields of the dataclasses behind the commands, *Config
 
