@@ -19,7 +19,14 @@ def page():
     network = silent(network_of(torch.float32, width=16, levels=2, inputs="relative"))
     block_N3 = 0.4 + 0.2 * np.random.default_rng(0).random((100, 3)).astype(np.float32)
     cone = {"shape": "cone", "size": 0.3, "position": (0.5, 0.5, 0.5)}
-    scene = Scene(block_N3, 0 * block_N3, np.zeros(100, np.uint8), cell_size=1 / 32, gravity=(0.0, 0.0, 0.0), specification={"obstacles": [cone]})
+    scene = Scene(
+        block_N3,
+        0 * block_N3,
+        np.zeros(100, np.uint8),
+        cell_size=1 / 32,
+        gravity=(0.0, 0.0, 0.0),
+        specification={"obstacles": [cone]},
+    )
     session = PlaySession(Simulator(network, 60.0, "cpu"), scene, weights="floating")
     loaded = []
 

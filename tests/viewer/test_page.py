@@ -61,7 +61,14 @@ def play():
     block_N3 = 0.4 + 0.2 * np.random.default_rng(0).random((600, 3)).astype(np.float32)
     cone = {"shape": "cone", "size": 0.3, "position": (0.5, 0.5, 0.5)}
     still = (0.0, 0.0, 0.0)
-    scene = Scene(block_N3, 0 * block_N3, np.zeros(600, np.uint8), cell_size=1 / 32, gravity=still, specification={"obstacles": [cone]})
+    scene = Scene(
+        block_N3,
+        0 * block_N3,
+        np.zeros(600, np.uint8),
+        cell_size=1 / 32,
+        gravity=still,
+        specification={"obstacles": [cone]},
+    )
     session = PlaySession(floating(), scene, weights="floating")
     page = PlayPage(session, ("floating", "other"), lambda name: floating(), port=0)
     page.rate = 8.0  # frames a second: simulation and browser share a core
