@@ -302,7 +302,8 @@ class NetworkConfig:
     materials: tuple[MaterialName, ...] = PAPER_MATERIALS  # each of the materials has its own embedding
     # number of dimensions; with 2, which only imported data have, z is constant
     dimensions: Annotated[int, Bound("2 or 3", lambda count: count in (2, 3))] = 3
-    # additional inputs (hgn.network.own_physics): friction of surfaces, and parameters of the materials
+    # additional inputs (hgn.network.own_physics): friction of surfaces, parameters of the materials, and the
+    # deformation of elastic bodies
     own_physics: OwnPhysics = ()
 
     def __post_init__(self) -> None:
@@ -310,6 +311,8 @@ class NetworkConfig:
         require(len(self.materials) > 0, "materials", "a list with at least one material", [])
         rule = "an empty list with inputs=absolute"
         require(self.relative or not self.own_physics, "own_physics", rule, list(self.own_physics))
+        whole = "elastic" in self.materials or "elastic" not in self.own_physics
+        require(whole, "materials", "with elastic where own_physics has it", list(self.materials))
         if self.relative:
             require(self.kind == "hgn", "inputs", f"absolute for {self.kind}", self.inputs)
             rule = f"at least 2 with inputs={self.inputs}, which are of differences"

@@ -16,10 +16,10 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 31_243,
+    "hgn": 31_510,
     "datagen": 8_429,
     "tools": 6_589,
-    "tests": 30_532,
+    "tests": 30_708,
 }
 SETTINGS = 240  # fields of the dataclasses behind the commands, *Config
 

@@ -15,6 +15,7 @@ import torch
 from hgn.config import NetworkConfig
 from hgn.data.episode_tensors import frame_gravity, shown_symmetries
 from hgn.data.sampler import SamplerState
+from hgn.network.elastic import RestShape
 from hgn.network.features import ParticleState, material_rows
 from hgn.network.obstacles import ObstacleCells
 from hgn.network.own_physics import physics_fields
@@ -40,9 +41,11 @@ class Batch:
     noise_scale_S: tuple[float, ...] = ()  # noise scale of each scene in units of training.noise_std; empty: 1
     wall_friction_S3: torch.Tensor | None = None  # as in ParticleState
     parameter_NP: torch.Tensor | None = None  # as in ParticleState
+    rest: RestShape | None = None  # as in ParticleState
 
     def to(self, device: torch.device, non_blocking: bool = False) -> Batch:
-        names = ("window_WN3", "material_N", "scene_N", "domain_S3", "gravity_S3", "wall_friction_S3", "parameter_NP")
+        names = ["window_WN3", "material_N", "scene_N", "domain_S3", "gravity_S3", "wall_friction_S3", "parameter_NP"]
+        names.append("rest")
         own = {name: getattr(self, name) for name in names if getattr(self, name) is not None}
         moved: dict[str, Any] = {name: tensor.to(device, non_blocking=non_blocking) for name, tensor in own.items()}
         obstacles = self.obstacles and self.obstacles.to(device, non_blocking)
@@ -63,6 +66,7 @@ class Batch:
             obstacles=self.obstacles,
             wall_friction_S3=self.wall_friction_S3,
             parameter_NP=self.parameter_NP,
+            rest=self.rest,
         )
 
     def acceleration(self, window_WN3: torch.Tensor | None = None) -> torch.Tensor:

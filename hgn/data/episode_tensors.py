@@ -12,6 +12,7 @@ import torch
 
 from hgn.config import NetworkConfig
 from hgn.data.sampler import Sample, SamplerState
+from hgn.network.elastic import RestShape
 from hgn.network.features import material_rows
 from hgn.network.own_physics import physics_fields
 from hgn.scene.barrier import Barrier
@@ -34,6 +35,7 @@ class EpisodeTensors:
     barrier: Barrier | None = None  # barrier of the scene's obstacles, if simulations respect them
     wall_friction: Vector = (0.0, 0.0, 0.0)  # friction of the walls across x, y, z
     parameter_NP: torch.Tensor | None = None  # as in ParticleState
+    rest: RestShape | None = None  # as in ParticleState
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,6 +56,7 @@ def whole_episode(episode: Episode, network: NetworkConfig, barrier: Barrier | N
     cell_K3, normal_K3 = grid.cell_K3[:seen], grid.normal_K3[:seen]
     friction_K = None if grid.friction_K is None else grid.friction_K[:seen].astype(np.float32)
     material_N = material_rows(episode.material_N, network.materials, episode.materials)
+    physics = physics_fields(network, [episode], material_N)
     return EpisodeTensors(
         torch.from_numpy(np.concatenate([past, episode.position_TN3], dtype=np.float32)),
         material_N.int(),
@@ -63,7 +66,8 @@ def whole_episode(episode: Episode, network: NetworkConfig, barrier: Barrier | N
         shown_symmetries(episode, network),
         barrier,
         episode.wall_friction,
-        physics_fields(network, [episode], material_N).get("parameter_NP"),
+        physics.get("parameter_NP"),
+        physics.get("rest"),
     )
 
 

@@ -89,7 +89,8 @@ class ParticleNetwork(nn.Module, ABC):
         """Returns latent vectors [N, W] of relative features and own physics. Own physics that is all 0 is skipped."""
         material_MH = self.encode.project(1, self.embedding.weight) + self.encode.first.bias
         hidden_NH = self.encode.add_projection(material_MH.index_select(0, state.material_N), 0, feature_NF)
-        for physics_NK in physics_columns(state, self.config, contacts.friction):
+        scale = self.normaliser.acceleration_std[0]
+        for physics_NK in physics_columns(state, self.config, contacts.friction, scale):
             hidden_NH = self.encode.add_projection(hidden_NH, 2, physics_NK)
         return self.encode.finish(hidden_NH)
 

@@ -20,6 +20,7 @@ import torch
 from torch import nn
 
 from hgn.network.barriers import Barriers
+from hgn.network.elastic import RestShape
 from hgn.network.obstacles import ObstacleCells
 from hgn.scene.material import MATERIALS
 from hgn.schema import ConfigError
@@ -43,6 +44,7 @@ class ParticleState:
     barriers: Barriers | None = None  # triangles of obstacles; only with step.obstacle_clearance
     wall_friction_S3: torch.Tensor | None = None  # friction of the walls across x, y, z; None: 0, or no input
     parameter_NP: torch.Tensor | None = None  # columns of hgn.network.own_physics; None: 0, or no inputs
+    rest: RestShape | None = None  # of elastic bodies; None: there are none, or no inputs
 
     @property
     def scene_count(self) -> int:

@@ -1,4 +1,4 @@
-"""Friction of surfaces and parameters of the materials as inputs of a network with relative inputs.
+"""Friction of surfaces, parameters and elastic bodies as inputs of a network with relative inputs.
 
 `network.own_physics` names them. They are the last columns of the encoder, and 0 without friction and for the solver's
 default parameters. If all are 0, they are not computed; the result is the same. docs/concepts/method.md derives all.
@@ -8,6 +8,7 @@ default parameters. If all are 0, they are not computed; the result is the same.
 | 2 | friction of the particle's obstacle cell, and of the first one on its path | friction, obstacle_features |
 | 3 | friction of the walls across x, y, z, times the nearness of the nearer wall | friction |
 | P | INPUT_PARAMETERS of the particle's material, 0 for those of others (`scaled_parameters`) | parameters |
+| 9 | deformation of elastic bodies (hgn.network.elastic) | elastic |
 
 In `relative.balanced` surfaces without friction remove T = Q R from a cell's mean acceleration. Friction keeps k T:
 
@@ -30,6 +31,7 @@ import torch
 from torch.nn.functional import pad
 
 from hgn.config import NetworkConfig
+from hgn.network import elastic
 from hgn.network.features import ParticleState
 from hgn.network.grid import GridHierarchy
 from hgn.scene.material import INPUT_PARAMETERS, LOGARITHMIC, acts_on
@@ -50,18 +52,23 @@ class SurfaceFriction:
     variance_C: torch.Tensor  # mean of |v - mean|^2, in these units
 
 
-def physics_widths(config: NetworkConfig) -> tuple[int, int]:
-    """Returns the numbers of columns for friction and for parameters."""
-    friction = (3 + 2 * config.obstacle_features) * ("friction" in config.own_physics)
-    return friction, len(INPUT_PARAMETERS) * ("parameters" in config.own_physics)
+def physics_widths(config: NetworkConfig) -> tuple[int, int, int]:
+    """Returns the numbers of columns for friction, for parameters and for elastic bodies."""
+    widths = {"friction": 3 + 2 * config.obstacle_features, "parameters": len(INPUT_PARAMETERS)}
+    widths["elastic"] = elastic.COLUMNS
+    friction, parameters, deformation = (n * (name in config.own_physics) for name, n in widths.items())
+    return friction, parameters, deformation
 
 
 def physics_columns(
-    state: ParticleState, config: NetworkConfig, friction: SurfaceFriction | None
+    state: ParticleState, config: NetworkConfig, friction: SurfaceFriction | None, scale: torch.Tensor
 ) -> list[torch.Tensor]:
-    """Returns the columns in a list: one tensor [N, K], or no tensor if all columns are 0."""
+    """Returns the columns in a list: one tensor [N, K], or no tensor if all columns are 0. `scale` is s_a."""
     parameter_NP = state.parameter_NP if "parameters" in config.own_physics else None
-    parts = (None if friction is None else friction.column_NK, parameter_NP)
+    deformation_NK = None
+    if state.rest is not None and "elastic" in config.own_physics:
+        deformation_NK = elastic.elastic_columns(state.position_N3, state.rest, scale)
+    parts = (None if friction is None else friction.column_NK, parameter_NP, deformation_NK)
     zero_N1 = torch.zeros_like(state.position_N3[:, :1])
     whole = (zero_N1.expand(-1, n) if p is None else p for p, n in zip(parts, physics_widths(config), strict=True))
     return [torch.cat([*whole], -1)] if any(part is not None for part in parts) else []
@@ -82,9 +89,10 @@ def scaled_parameters(value_NP: torch.Tensor, material_N: torch.Tensor, material
     return torch.stack(columns, -1) * acts_MP.to(value_NP)[material_N]
 
 
-def physics_fields(config: NetworkConfig, scenes: Sequence[Any], material_N: torch.Tensor) -> dict[str, torch.Tensor]:
+def physics_fields(config: NetworkConfig, scenes: Sequence[Any], material_N: torch.Tensor) -> dict[str, Any]:
     """Returns the fields of a ParticleState for several episodes or initial states, without those that are 0."""
-    fields, frictions = {}, [scene.wall_friction for scene in scenes]
+    fields: dict[str, Any] = {}
+    frictions = [scene.wall_friction for scene in scenes]
     if "friction" in config.own_physics and any(map(any, frictions)):
         fields["wall_friction_S3"] = torch.tensor(frictions, dtype=torch.float32)
     own = [scene.parameters for scene in scenes] if "parameters" in config.own_physics else []
@@ -93,7 +101,8 @@ def physics_fields(config: NetworkConfig, scenes: Sequence[Any], material_N: tor
         whole = [default_1P.repeat(n, 0) if value is None else value for value, n in zip(own, counts, strict=True)]
         column_NP = scaled_parameters(torch.from_numpy(np.concatenate(whole)), material_N, config.materials)
         fields |= {"parameter_NP": column_NP} if bool(column_NP.any()) else {}
-    return fields
+    rest = elastic.rest_shape(scenes) if "elastic" in config.own_physics else None
+    return fields if rest is None else fields | {"rest": rest}
 
 
 def surface_friction(

@@ -130,7 +130,7 @@ class LiveSimulation:
             require(not len(unusable), name, "finite", float(unusable[0]) if len(unusable) else 0.0)
         require(material_A.dtype.kind in "iu", "material_A", "whole numbers", str(material_A.dtype))
         arrays: dict[str, Any] = {"position_N3": position_A3, "velocity_N3": velocity_A3, "material_N": material_A}
-        new = self._started([replace(self.scenes[index], **arrays, past_HN3=None, parameters=None)])
+        new = self._started([replace(self.scenes[index], **arrays, past_HN3=None, parameters=None, body_N=None)])
         if count:
             self._put(index, self.scenes[index], self.state, new)
         return new.velocity_NM3.cpu().numpy()
@@ -199,7 +199,7 @@ class LiveSimulation:
         nothing: dict[str, Any] = {
             name: getattr(scene, name)[:0] for name in ("position_N3", "velocity_N3", "material_N")
         }
-        self._put(index, scene, self.state, self._started([replace(scene, **nothing, past_HN3=None)]))
+        self._put(index, scene, self.state, self._started([replace(scene, **nothing, past_HN3=None, body_N=None)]))
 
     def _put(self, index: int, scene: InitialState, kept: ParticleState, new: ParticleState) -> None:
         """Replaces scene `index` by `scene`. The next frame has the particles of `kept` and of `new`, its start."""

@@ -17,6 +17,7 @@ from typing import Any, Protocol
 import numpy as np
 import torch
 
+from hgn.network.elastic import RestShape
 from hgn.network.features import ParticleState
 from hgn.network.grid import GridRangeError
 from hgn.runtime.divergence import DivergedError, describe_diverged, diverged
@@ -225,20 +226,23 @@ class Simulation:
 def selected(state: ParticleState, selected_N: torch.Tensor) -> ParticleState:
     """Returns a state with the selected particles. Scenes keep their numbers."""
     some: dict[str, Any] = {name: getattr(state, name)[selected_N] for name in OF_PARTICLES}
-    if state.parameter_NP is not None:
-        some["parameter_NP"] = state.parameter_NP[selected_N]
+    for name in ("parameter_NP", "rest"):
+        if (value := getattr(state, name)) is not None:
+            some[name] = value[selected_N]
     return replace(state, **some)
 
 
 def joined(first: ParticleState, second: ParticleState) -> dict[str, Any]:
     """Returns the first state's values, then the second's. If only one has parameters, the other's are 0 (defaults)."""
+    both: dict[str, Any]
     both = {name: torch.cat([getattr(first, name), getattr(second, name)]) for name in OF_PARTICLES}
     parameters = (first.parameter_NP, second.parameter_NP)
     if any(own_NP is not None for own_NP in parameters):
         zeros = (state.position_N3.new_zeros(len(state.scene_N), len(INPUT_PARAMETERS)) for state in (first, second))
         pairs = zip(parameters, zeros, strict=True)
         both["parameter_NP"] = torch.cat([zero_NP if own_NP is None else own_NP for own_NP, zero_NP in pairs])
-    return both
+    rest = RestShape.joined([first.rest, second.rest], [len(first.scene_N), len(second.scene_N)])
+    return both if rest is None else both | {"rest": rest}
 
 
 def _finished(block_TN3: torch.Tensor) -> torch.Tensor:

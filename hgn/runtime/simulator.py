@@ -11,6 +11,7 @@ import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -33,9 +34,10 @@ from hgn.scene.emission import at_entry, at_start, entry_frames, require_free_en
 from hgn.scene.episode import Episode
 from hgn.scene.episode_obstacles import known_obstacles
 from hgn.scene.history import ballistic_velocities, require_past
-from hgn.scene.material import MATERIALS
+from hgn.scene.material import MATERIALS, elastic_particles
 from hgn.scene.obstacle_grid import ObstacleGrid, build_obstacle_grid
 from hgn.scene.own_physics import input_parameters
+from hgn.scene.rest_shape import body_numbers, rest_neighbours
 from hgn.scene.scene import Scene, all_corners, whole_cells
 from hgn.schema import require
 from hgn.system.device import choose_device
@@ -63,6 +65,7 @@ class InitialState:
     emitting: Scene | None = None  # the scene, if particles enter later; they follow the others
     wall_friction: tuple[float, float, float] = (0.0, 0.0, 0.0)
     parameters: np.ndarray | None = None  # float32 [N, P], hgn.scene.own_physics.input_parameters
+    body_N: np.ndarray | None = None  # number of each particle's body; None: elastic particles near each other are one
 
     @staticmethod
     def of_episode(episode: Episode) -> InitialState:
@@ -80,6 +83,7 @@ class InitialState:
             dimensions=episode.dimensions,
             wall_friction=episode.wall_friction,
             parameters=episode.parameters,
+            body_N=body_numbers(episode),
         )
 
     @staticmethod
@@ -104,12 +108,18 @@ class InitialState:
             emitting=scene if scene.emits else None,
             wall_friction=scene.wall_friction,
             parameters=input_parameters(first.material_parameters, {}, first.particle_count),
+            body_N=body_numbers(first),
         )
 
     @staticmethod
     def of(scene: InitialState | Scene) -> InitialState:
         """Returns the initial state of a scene, or the given one."""
         return InitialState.of_scene(scene) if isinstance(scene, Scene) else scene
+
+    @functools.cached_property
+    def rest_neighbours(self) -> tuple[np.ndarray, np.ndarray] | None:
+        """Returns hgn.scene.rest_shape.rest_neighbours of this state, in which elastic bodies have their rest shape."""
+        return rest_neighbours(self.position_N3, elastic_particles(self.material_N, self.materials), self.body_N)
 
     def velocities(self, history: int, frame_rate_hz: float) -> np.ndarray:
         """Returns displacements in the last frames, newest first, float32 [N, history, 3], domain units per frame.
@@ -283,12 +293,13 @@ class Simulator:
             require_free_entries(state.emitting, entered)
             for frame in sorted({*entry_N[len(state.position_N3) :].tolist()}):
                 new_N = entry_N == frame
-                particles = {
+                particles: dict[str, Any] = {
                     name: getattr(entered, name)[new_N] for name in ("position_N3", "velocity_N3", "material_N")
                 }
                 given = {name: value_N[new_N] for name, value_N in entered.material_parameters.items()}
                 particles["parameters"] = input_parameters(given, {}, int(new_N.sum()))
-                new = self.start([replace(state, corners=None, **particles)])  # barriers take long and are not needed
+                particles |= {"corners": None, "body_N": None}  # barriers take long and are not needed
+                new = self.start([replace(state, **particles)])
                 entries.append(Entry(frame, replace(new, scene_N=new.scene_N + number)))
         return sorted(entries, key=lambda entry: entry.frame)
 

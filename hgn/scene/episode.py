@@ -13,14 +13,16 @@ import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 
-from hgn.scene.material import MATERIALS, require_materials
+from hgn.scene.material import MATERIALS, elastic_particles, require_materials
 from hgn.scene.npz import read_header
 from hgn.scene.obstacle_grid import ObstacleGrid
 from hgn.scene.own_physics import input_parameters
+from hgn.scene.rest_shape import body_numbers, rest_neighbours
 from hgn.schema import BoxSize, ConfigError, Positive, Vector, from_mapping, require, require_bounds
 
 SCHEMA_VERSION = 1
@@ -111,6 +113,12 @@ class Episode:
     def parameters(self) -> np.ndarray | None:
         """Returns the parameters that networks may have as inputs, float32 [N, P]; None: all have their defaults."""
         return input_parameters(self.material_parameters, self.solver.get("settings", {}), self.particle_count)
+
+    @cached_property
+    def rest_neighbours(self) -> tuple[np.ndarray, np.ndarray] | None:
+        """Returns hgn.scene.rest_shape.rest_neighbours of frame 0, in which elastic bodies have their rest shape."""
+        body_N, elastic_N = body_numbers(self), elastic_particles(self.material_N, self.materials)
+        return rest_neighbours(np.array(self.position_TN3[0]), elastic_N, body_N)
 
     @property
     def dimensions(self) -> int:

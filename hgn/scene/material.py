@@ -31,7 +31,8 @@ MATERIAL_PARAMETERS: tuple[str, ...] = (
     "water_tension",
     "water_viscosity_pa_s",
 )
-OWN_PHYSICS = ("friction", "parameters")  # what scenes draw and networks have as inputs: of surfaces, of materials
+# what scenes draw and networks have as inputs: friction of surfaces, parameters of materials, elastic bodies
+OWN_PHYSICS = ("friction", "parameters", "elastic")
 # Parameters that networks have as inputs, in the order of their columns, and the ranges that random scenes draw.
 INPUT_PARAMETERS: dict[str, tuple[float, float]] = {
     "youngs_modulus_pa": (1.25e5, 2e6), "density_kg_m3": (500.0, 2000.0), "sand_friction_angle_deg": (15.0, 45.0),
@@ -57,6 +58,11 @@ def material_index(name: str) -> int:
         solved = f"; {', '.join(MATERIALS[len(PAPER_MATERIALS) :])} only for the solver"
         raise ConfigError(f"material must be one of {', '.join(PAPER_MATERIALS)}{solved}, got {name!r}")
     return MATERIALS.index(name)
+
+
+def elastic_particles(material_N: np.ndarray, materials: Sequence[str]) -> np.ndarray:
+    """Returns for indices into `materials` whether a particle is of an elastic body, bool [N]."""
+    return np.array([name == MATERIALS[ELASTIC] for name in materials])[material_N]
 
 
 MATERIAL_NAME = re.compile(r"[a-z][a-z0-9_]{0,31}")  # names of an imported set's materials

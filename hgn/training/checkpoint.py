@@ -174,14 +174,21 @@ def network_of_weights(config: TrainConfig) -> ParticleNetwork:
 
     The rest constraint, the clearances of walls and obstacles, and inputs relative and local may differ from those of
     the weights, because they do not change tensors. Inputs for own physics that the weights lack begin at 0, so
-    outputs without friction are the same. Raises: ConfigError for a file without weights, another network or data.
+    outputs without friction are the same. A material `elastic` that they lack begins as the mean of theirs.
+    Raises: ConfigError for a file without weights, another network or data.
     """
     assert config.training.init_weights is not None
     path = find_weights(config.training.init_weights, "training.init_weights")
     weights, info = load_weights(path, field="training.init_weights")
     remedy = "set it so, or take other training.init_weights"
-    own = info.network.own_physics or config.network.own_physics * info.network.relative
-    pairs = _pairs("network", replace(info.network, own_physics=own), config.network)
+    theirs, ours = info.network, config.network
+    same: dict[str, Any] = {}
+    if theirs.relative and set(theirs.own_physics) <= set(ours.own_physics) and _begin(theirs, ours):
+        same["own_physics"] = ours.own_physics
+        if "elastic" in ours.own_physics and (*theirs.materials, "elastic") == ours.materials:
+            same["materials"] = ours.materials
+    theirs = replace(theirs, **same)
+    pairs = _pairs("network", theirs, ours)
     if info.network.relative and config.network.relative:
         pairs = [pair for pair in pairs if pair[0] != "network.inputs"]
     pairs.append(("dataset.frame_rate_hz", info.frame_rate_hz, config.dataset.frame_rate_hz))
@@ -189,11 +196,20 @@ def network_of_weights(config: TrainConfig) -> ParticleNetwork:
         pairs.append(("scene.cell_size", info.obstacle_cell_size, config.scene.cell_size))
     _require_equal(pairs, f", as in training.init_weights {path}", remedy)
     network, tensors = build_network(config.network, config.step), weights.state_dict()
-    if not info.network.own_physics:
-        added = (0, sum(physics_widths(config.network)))
-        tensors["encode.first.weight"] = functional.pad(tensors["encode.first.weight"], added)
+    added = (0, sum(physics_widths(ours)) - sum(physics_widths(info.network)))
+    tensors["encode.first.weight"] = functional.pad(tensors["encode.first.weight"], added)
+    row_MH = tensors["embedding.weight"]
+    mean_1H = row_MH.mean(0, keepdim=True).expand(len(ours.materials) - len(row_MH), -1)
+    tensors["embedding.weight"] = torch.cat([row_MH, mean_1H])
     network.load_state_dict(tensors)
     return network
+
+
+def _begin(theirs: NetworkConfig, ours: NetworkConfig) -> bool:
+    """Returns whether the columns of own physics of a network are the first ones of another."""
+    pairs = [pair for pair in zip(physics_widths(theirs), physics_widths(ours), strict=True) if any(pair)]
+    used = [width for width, _ in pairs if width]
+    return used == [width for _, width in pairs][: len(used)]
 
 
 def network_of_checkpoint(checkpoint: dict[str, Any], path: Path) -> ParticleNetwork:

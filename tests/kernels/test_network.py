@@ -46,7 +46,7 @@ def assert_features(network, state, found):
     assert torch.equal(feature_NF[:, width : width + materials].argmax(-1), state.material_N)
     own = width + materials
     assert torch.equal(feature_NF[:, width:own].sum(-1), torch.ones(len(feature_NF)).double())
-    for physics_NK in physics_columns(state, network.config, contacts.friction):
+    for physics_NK in physics_columns(state, network.config, contacts.friction, network.normaliser.acceleration_std[0]):
         assert float((feature_NF[:, own : own + physics_NK.shape[1]] - physics_NK).abs().max()) < 2e-5
         own += physics_NK.shape[1]
     assert not feature_NF[:, own:].any()
