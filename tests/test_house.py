@@ -19,7 +19,7 @@ LINES = {  # of Python, in tracked files
     "hgn": 31_510,
     "datagen": 8_429,
     "tools": 6_589,
-    "tests": 30_708,
+    "tests": 30_701,
 }
 SETTINGS = 240  # fields of the dataclasses behind the commands, *Config
 
