@@ -121,7 +121,8 @@ class SceneConfig:
     # (the largest), cell_size, materials and particles_per_cell; empty: scenes follow the settings above
     kinds: dict[str, float] = field(default_factory=dict)
     # friction: a third of the scenes has none, others draw it for each obstacle, the floor and the walls; parameters:
-    # half of the scenes has the solver's, others draw those of hgn.scene.material for each group
+    # half of the scenes has the solver's, others draw those of hgn.scene.material for each group; moving: a third of
+    # the scenes with kinds has a moving obstacle
     own_physics: OwnPhysics = ()
 
     def __post_init__(self) -> None:
@@ -302,8 +303,8 @@ class NetworkConfig:
     materials: tuple[MaterialName, ...] = PAPER_MATERIALS  # each of the materials has its own embedding
     # number of dimensions; with 2, which only imported data have, z is constant
     dimensions: Annotated[int, Bound("2 or 3", lambda count: count in (2, 3))] = 3
-    # additional inputs (hgn.network.own_physics): friction of surfaces, parameters of the materials, and the
-    # deformation of elastic bodies
+    # additional inputs (hgn.network.own_physics): friction of surfaces, parameters of the materials, the deformation of
+    # elastic bodies, and the motion of obstacles
     own_physics: OwnPhysics = ()
 
     def __post_init__(self) -> None:

@@ -180,8 +180,10 @@ def _notes_on_physics(scene: Scene, info: WeightsInfo, weights: str) -> Iterator
     frictions = np.array([*scene.wall_friction, *(obstacle.friction or 0.0 for obstacle in scene.obstacles)])
     if frictions.any() and "friction" not in inputs:
         yield f"not used: friction of surfaces, which is the solver's; {weights} knows that of its data alone"
+    speeds = np.array([obstacle.motion.fastest(obstacle.vertex_V3) for obstacle in scene.obstacles if obstacle.motion])
     for name, (low, high) in info.own_ranges.items():
-        values = frictions if name == "friction" else scene.material_parameters.get(name, np.zeros(0))
+        own = {"friction": frictions, "moving": speeds}
+        values = own.get(name, scene.material_parameters.get(name, np.zeros(0)))
         far = values[(values < low * (1 - SAME_SPEED)) | (values > high * (1 + SAME_SPEED))]
         if len(far) and name in (*used, *inputs):
             yield f"{name}: {far[0]:.4g}, those of the data of {weights} are {low:g} to {high:g}; motion is a guess"

@@ -16,10 +16,10 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 31_510,
-    "datagen": 8_429,
+    "hgn": 32_080,
+    "datagen": 8_430,
     "tools": 6_589,
-    "tests": 30_701,
+    "tests": 30_813,
 }
 SETTINGS = 240  # fields of the dataclasses behind the commands, *Config
 

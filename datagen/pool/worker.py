@@ -20,6 +20,7 @@ from datagen.pool.worker_plan import WorkerPlan
 from hgn.config import DatagenConfig
 from hgn.data.identity import physics_settings
 from hgn.scene.episode import Episode
+from hgn.scene.moving import at_rest
 from hgn.scene.obstacle_grid import ObstacleGrid
 from hgn.scene.scene import Scene
 from hgn.schema import ConfigError
@@ -170,7 +171,7 @@ def build_grid(task: GridTask, backend: Backend) -> BuiltGrid:
     build_obstacle_grid = pkgutil.resolve_name(backend.build_obstacle_grid)
     scene = task.scene.open()
     try:
-        grid = build_obstacle_grid(scene.obstacles, scene.cell_size, scene.seed, scene.domain_size)
+        grid = build_obstacle_grid(at_rest(scene.obstacles), scene.cell_size, scene.seed, scene.domain_size)
     except ConfigError as error:
         return BuiltGrid(task.task, str(error))
     return BuiltGrid(task.task, grid)

@@ -17,10 +17,12 @@ from hgn.data.episode_tensors import frame_gravity, shown_symmetries
 from hgn.data.sampler import SamplerState
 from hgn.network.elastic import RestShape
 from hgn.network.features import ParticleState, material_rows
+from hgn.network.moving import MovingObstacles
 from hgn.network.obstacles import ObstacleCells
 from hgn.network.own_physics import physics_fields
 from hgn.scene.episode import Episode
 from hgn.scene.history import window
+from hgn.scene.moving import moving_of_episode
 from hgn.scene.symmetry import Symmetry
 
 
@@ -42,10 +44,11 @@ class Batch:
     wall_friction_S3: torch.Tensor | None = None  # as in ParticleState
     parameter_NP: torch.Tensor | None = None  # as in ParticleState
     rest: RestShape | None = None  # as in ParticleState
+    moving: MovingObstacles | None = None  # as in ParticleState
 
     def to(self, device: torch.device, non_blocking: bool = False) -> Batch:
         names = ["window_WN3", "material_N", "scene_N", "domain_S3", "gravity_S3", "wall_friction_S3", "parameter_NP"]
-        names.append("rest")
+        names += ["rest", "moving"]
         own = {name: getattr(self, name) for name in names if getattr(self, name) is not None}
         moved: dict[str, Any] = {name: tensor.to(device, non_blocking=non_blocking) for name, tensor in own.items()}
         obstacles = self.obstacles and self.obstacles.to(device, non_blocking)
@@ -67,6 +70,7 @@ class Batch:
             wall_friction_S3=self.wall_friction_S3,
             parameter_NP=self.parameter_NP,
             rest=self.rest,
+            moving=self.moving,
         )
 
     def acceleration(self, window_WN3: torch.Tensor | None = None) -> torch.Tensor:
@@ -114,6 +118,14 @@ def make_batch(
     return join([BatchSample(e, frame, window(e, frame, history), seed) for (e, frame), seed in pairs], network)
 
 
+def moving_in(samples: Sequence[BatchSample], network: NetworkConfig) -> MovingObstacles | None:
+    """Returns the moving obstacles of samples in their frames, for a network that has them as inputs."""
+    if "moving" not in network.own_physics:
+        return None
+    scenes, frames = [moving_of_episode(s.episode) for s in samples], [s.frame for s in samples]
+    return MovingObstacles.of(scenes, frames, 1 / samples[0].episode.frame_rate_hz, network.obstacle_features)
+
+
 def join(samples: Sequence[BatchSample], network: NetworkConfig) -> Batch:
     """Returns the samples as the tensors of one batch."""
     episodes = [sample.episode for sample in samples]
@@ -131,5 +143,6 @@ def join(samples: Sequence[BatchSample], network: NetworkConfig) -> Batch:
         weight_S=tuple(sample.weight for sample in samples),
         noise_scale_S=tuple(sample.noise_scale for sample in samples),
         symmetries_S=tuple(shown_symmetries(e, network) for e in episodes),
+        moving=moving_in(samples, network),
         **physics_fields(network, episodes, material_N),
     )

@@ -47,7 +47,7 @@ class ParticleNetwork(nn.Module, ABC):
         normal_width = 3 if config.obstacle_features else 0
         parts: tuple[int, ...] = (3 * config.velocity_history, normal_width, 6, MATERIAL_EMBEDDING)
         if config.relative:
-            own = (sum(physics_widths(config)),) if config.own_physics else ()
+            own = (sum(physics_widths(config)),) if any(physics_widths(config)) else ()
             parts = (config.feature_width - MATERIAL_EMBEDDING, MATERIAL_EMBEDDING, *own)
         self.encode = MLP(parts, config.width, config.width, slope=slope)
 

@@ -21,6 +21,7 @@ from torch import nn
 
 from hgn.network.barriers import Barriers
 from hgn.network.elastic import RestShape
+from hgn.network.moving import MovingObstacles
 from hgn.network.obstacles import ObstacleCells
 from hgn.scene.material import MATERIALS
 from hgn.schema import ConfigError
@@ -45,6 +46,7 @@ class ParticleState:
     wall_friction_S3: torch.Tensor | None = None  # friction of the walls across x, y, z; None: 0, or no input
     parameter_NP: torch.Tensor | None = None  # columns of hgn.network.own_physics; None: 0, or no inputs
     rest: RestShape | None = None  # of elastic bodies; None: there are none, or no inputs
+    moving: MovingObstacles | None = None  # obstacles in motion; `obstacles` and `barriers` are those at rest
 
     @property
     def scene_count(self) -> int:

@@ -17,6 +17,7 @@ In `relative.balanced` surfaces without friction remove T = Q R from a cell's me
 Here s are the surfaces of `relative.surface_normals`, a_s is the sum of their weights in the cell, and mu_s their
 friction. b is the largest number with |b c Q T + Q u / 2|^2 <= (|Q u|^2 + V) / 4, with c = d_C t_C. u is the velocity
 along surfaces after a frame without friction, Q (v + g + d_C A_C), and V the variance of v in the cell; units of s_a.
+With `moving` v is the velocity relative to the surfaces (hgn.network.moving). It adds no columns.
 Shape legend: N particles, C coarsest cells, S scenes, P parameters, K columns.
 """
 
@@ -48,8 +49,8 @@ class SurfaceFriction:
     column_NK: torch.Tensor
     obstacle_C33: torch.Tensor  # sum of w_pC mu n n^T over obstacles
     wall_C6: torch.Tensor  # sum of w_pC mu min(1, 2 nearness) for each wall: lower x, y, z, then upper
-    velocity_C3: torch.Tensor  # mean of v + g in units of s_a
-    variance_C: torch.Tensor  # mean of |v - mean|^2, in these units
+    velocity_C3: torch.Tensor  # mean of v - V + g in units of s_a
+    variance_C: torch.Tensor  # mean square of the differences of v - V from its mean, in these units
 
 
 def physics_widths(config: NetworkConfig) -> tuple[int, int, int]:
@@ -105,10 +106,22 @@ def physics_fields(config: NetworkConfig, scenes: Sequence[Any], material_N: tor
     return fields if rest is None else fields | {"rest": rest}
 
 
+def has_friction(state: ParticleState) -> bool:
+    """Returns whether any surface of a state has friction."""
+    cells = (state.obstacles, state.moving and state.moving.cells)
+    return state.wall_friction_S3 is not None or any(own and own.friction_K is not None for own in cells)
+
+
 def surface_friction(
-    state: ParticleState, grid: GridHierarchy, wall_N6: torch.Tensor, cell_N8: torch.Tensor | None, scale: torch.Tensor
+    state: ParticleState,
+    grid: GridHierarchy,
+    wall_N6: torch.Tensor,
+    cell_N8: torch.Tensor | None,
+    *,
+    velocity_N3: torch.Tensor,
+    scale: torch.Tensor,
 ) -> SurfaceFriction:
-    """Returns the friction within reach, from `relative.wall_nearness`, `relative.obstacle_surfaces` and s_a."""
+    """Returns the friction within reach, from `relative.wall_nearness`, `relative.obstacle_surfaces`, v - V and s_a."""
     wall_N3 = torch.zeros_like(state.position_N3)
     if state.wall_friction_S3 is not None:
         wall_N3 = state.wall_friction_S3[state.scene_N]
@@ -120,7 +133,7 @@ def surface_friction(
         columns = [here_N4[:, 3:], ahead_N4[:, 3:]]
     columns.append(torch.maximum(wall_N6[:, :3], wall_N6[:, 3:]) * wall_N3)
     near_N6 = (2 * wall_N6).clamp(max=1) * torch.cat([wall_N3, wall_N3], -1)
-    next_N3 = (state.velocity_NM3[:, 0] + state.gravity_S3[state.scene_N]) / scale
+    next_N3 = (velocity_N3 + state.gravity_S3[state.scene_N]) / scale
     square_N1 = next_N3.square().sum(-1, keepdim=True)
     value_NK = torch.cat([rough_N33.flatten(1), near_N6, next_N3, square_N1, torch.ones_like(square_N1)], dim=-1)
     sum_CK = grid.coarsest_sums(value_NK)

@@ -9,7 +9,7 @@ cube. The columns are, in this order:
 |---|---|
 | 3 (H - 1) | f(v^{n-k} - v^{n-k-1} - g), k = 0 … H - 2: zero in free flight |
 | 3 L | f(v_p - U_l(x_p)) on each level, finest first; U_l is momentum over mass of the surrounding cells |
-| 3 | G f(v^n): the velocity relative to surfaces, if one is near |
+| 3 | G f(v^n - V): the velocity relative to surfaces, if one is near; V as in hgn.network.moving |
 | 6 | walls within CONTACT_REACH_CELLS R, lower x, y, z, then upper |
 | 3 + 3 | obstacle normals at the particle and ahead of it; only with obstacle_features |
 
@@ -35,8 +35,9 @@ import torch
 from hgn.config import NetworkConfig
 from hgn.network.features import ParticleState
 from hgn.network.grid import DIRECTION_63, GridHierarchy
+from hgn.network.moving import surface_velocity
 from hgn.network.obstacles import ObstacleCells
-from hgn.network.own_physics import SurfaceFriction, friction_fraction, surface_friction
+from hgn.network.own_physics import SurfaceFriction, friction_fraction, has_friction, surface_friction
 
 CONTACT_REACH_CELLS = 3.0  # distance from a wall, in R, at which the network begins to see it
 WALL_LIMIT = 2.0  # largest wall_nearness, reached one `reach` behind the plane
@@ -74,9 +75,13 @@ def relative_features(
     wall_N6 = wall_nearness(
         state.position_N3, velocity_N3, state.domain_S3[state.scene_N], CONTACT_REACH_CELLS * config.cell_size
     )
-    normal_N6 = cell_N8 = None
+    normal_N6 = cell_N8 = surface_N3 = None
     if config.obstacle_features:
-        cell_N8 = obstacle_surfaces(state.position_N3, velocity_N3, state.scene_N, state.obstacles)
+        place = state.position_N3, velocity_N3, state.scene_N
+        if state.moving is None:
+            cell_N8 = obstacle_surfaces(*place, state.obstacles)
+        else:
+            cell_N8, surface_N3 = state.moving.met(state.obstacles, *place, steps=STEPS_AHEAD)
         normal_N6 = cell_N8 if cell_N8.shape[1] == 6 else torch.cat([cell_N8[:, :3], cell_N8[:, 4:7]], dim=-1)
     motion_NK = torch.cat(
         [
@@ -85,12 +90,15 @@ def relative_features(
         ],
         dim=-1,
     )
-    normal_C33 = touched_normals(surface_normals(wall_N6, normal_N6), grid)
-    rough = state.wall_friction_S3 is not None or (state.obstacles and state.obstacles.friction_K) is not None
-    rough = rough and "friction" in config.own_physics
-    friction = surface_friction(state, grid, wall_N6, cell_N8, scale) if rough else None
-    contacts = Contacts(*disturbance(motion_NK, surface_gate(wall_N6, normal_N6), grid), normal_C33, friction)
-    gate_N = (grid.weight_N8 * contacts.touched_C[grid.coarsest_cells]).sum(1)
+    normal_C33, touch_N = touched_normals(surface_normals(wall_N6, normal_N6), grid), surface_gate(wall_N6, normal_N6)
+    disturbed_C, touched_C = disturbance(motion_NK, touch_N, grid)
+    if surface_N3 is not None:
+        velocity_N3 = velocity_N3 - surface_velocity(touch_N, surface_N3, touched_C, grid)
+    friction = None
+    if has_friction(state) and "friction" in config.own_physics:
+        friction = surface_friction(state, grid, wall_N6, cell_N8, velocity_N3=velocity_N3, scale=scale)
+    contacts = Contacts(disturbed_C, touched_C, normal_C33, friction)
+    gate_N = (grid.weight_N8 * touched_C[grid.coarsest_cells]).sum(1)
     parts = [motion_NK, gate_N[:, None] * torch.asinh(velocity_N3 / scale), wall_N6]
     return torch.cat(parts if normal_N6 is None else [*parts, normal_N6], dim=-1), contacts
 

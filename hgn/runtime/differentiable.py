@@ -6,6 +6,7 @@ Shape legend: T frames, S scenes, N particles, M or H velocities, F triangles.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -18,12 +19,14 @@ from hgn.network.barriers import Barriers, barrier_rows
 from hgn.network.base import ParticleNetwork
 from hgn.network.features import ParticleState
 from hgn.network.grid import GridRangeError
+from hgn.network.moving import Poses
 from hgn.network.obstacles import ObstacleCells
 from hgn.network.own_physics import scaled_parameters
 from hgn.network.posed_obstacles import Placement, PosedObstacleCells
 from hgn.runtime.divergence import DivergedError, describe_diverged, diverged
 from hgn.scene.barrier import barrier_of_pieces, barrier_pieces
 from hgn.scene.material import INPUT_PARAMETERS
+from hgn.scene.motion import Motion
 from hgn.scene.obstacle_grid import ObstacleGrid, build_obstacle_grid
 from hgn.scene.own_physics import NOMINAL_P, input_parameters
 from hgn.scene.scene import Obstacle, Scene
@@ -38,6 +41,7 @@ class Pose:
     rotation_3: torch.Tensor | None = None  # axis times angle, radians
     translation_3: torch.Tensor | None = None  # domain units
     pivot_3: tuple[float, float, float] | None = None  # domain units; None: the centre of the bounding box
+    velocity_3: torch.Tensor | None = None  # domain units per second, in addition to the motion of its keyframes
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,6 +68,8 @@ def simulate(
     require(frames >= 1, "frames", "at least 1", frames)
     require(0 <= inputs.smoothing <= 1, "smoothing", "0 to 1 cells", inputs.smoothing)
     state = _started(network, start, scene, frame_rate_hz, inputs=inputs)
+    moved = functools.partial(_in_motion, state, scene, inputs.poses or {}, frame_rate_hz=frame_rate_hz)
+    state = moved(frame=0)
     predicted = Accelerations(network)
     weights = {name: tensor.detach() for name, tensor in predicted.state_dict(keep_vars=True).items()}
 
@@ -84,6 +90,7 @@ def simulate(
         if lost:
             raise DivergedError(frame, describe_diverged(lost, len(variables[0])))
         positions.append(variables[0])
+        variables[2:] = _variables(moved(frame=frame))[2:]
     return torch.stack(positions)
 
 
@@ -123,6 +130,7 @@ def _variables(state: ParticleState) -> list[torch.Tensor]:
         for _, placement in state.obstacles.placed:
             tensors += [placement.rotation_33, placement.translation_3]
     tensors += [x for x in (state.wall_friction_S3, state.parameter_NP) if x is not None]
+    tensors += [] if state.moving is None else state.moving.poses.tensors
     return tensors if state.barriers is None else [*tensors, state.barriers.row_F24]
 
 
@@ -145,6 +153,7 @@ def _with_variables(state: ParticleState, variables: Sequence[torch.Tensor]) -> 
         obstacles=obstacles,
         wall_friction_S3=None if state.wall_friction_S3 is None else next(rest),
         parameter_NP=None if state.parameter_NP is None else next(rest),
+        moving=state.moving and replace(state.moving, poses=state.moving.poses.map(lambda _: next(rest))),
         barriers=state.barriers and replace(state.barriers, row_F24=next(rest)),
     )
 
@@ -219,8 +228,9 @@ def _obstacles(
         require(number in range(len(scene.obstacles)), "poses", rule, number)
     if not poses and inputs.smoothing == 0:
         return start.obstacles, start.barriers
-    staying = [obstacle for i, obstacle in enumerate(scene.obstacles) if i not in poses]
-    placements = {i: _placement(scene.obstacles[i], pose, device, dtype) for i, pose in poses.items()}
+    staying = [obstacle for i, obstacle in enumerate(scene.obstacles) if i not in poses and obstacle.motion is None]
+    own_poses = ((i, pose) for i, pose in poses.items() if scene.obstacles[i].motion is None)
+    placements = {i: _placement(scene.obstacles[i], pose, device, dtype) for i, pose in own_poses}
     obstacles, barriers = None, start.barriers
     if config.obstacle_features:
         rest = _cells(scene, staying, device)
@@ -234,12 +244,49 @@ def _obstacles(
     return obstacles, barriers
 
 
+def with_velocities(scene: Scene, poses: Mapping[int, Pose]) -> Scene:
+    """Returns the scene with a motion for each obstacle that has a velocity, if it had none."""
+    moving = {number for number, pose in poses.items() if pose.velocity_3 is not None}
+    still = Motion.of_frames([(0.0, (0.0, 0.0, 0.0))], (0.0, 0.0, 0.0))
+    own = (replace(o, motion=o.motion or still) if i in moving else o for i, o in enumerate(scene.obstacles))
+    return replace(scene, obstacles=tuple(own))
+
+
+def _in_motion(
+    state: ParticleState, scene: Scene, poses: Mapping[int, Pose], *, frame_rate_hz: float, frame: int
+) -> ParticleState:
+    """Returns the state with its moving obstacles as in a frame. `poses` act before the motion of the keyframes."""
+    if state.moving is None:
+        return state
+    moving, device = state.moving.at([frame]), state.position_N3.device
+    rows = [Poses(*tensors) for tensors in zip(*moving.poses.tensors, strict=True)]
+    numbers = [number for number, obstacle in enumerate(scene.obstacles) if obstacle.motion is not None]
+    for row, number in enumerate(numbers):
+        if number not in poses:
+            continue
+        own, velocity_3 = rows[row], poses[number].velocity_3
+        placement = _placement(scene.obstacles[number], poses[number], device, torch.float64)
+        shift_3 = torch.zeros_like(own.shift_V3) if velocity_3 is None else velocity_3.to(own.shift_V3) / frame_rate_hz
+        place_3 = own.put(placement.pivot_3 + placement.translation_3)
+        rows[row] = replace(
+            own,
+            rotation_V33=own.rotation_V33 @ placement.rotation_33,
+            pivot_V3=placement.pivot_3,
+            place_V3=place_3 + frame * shift_3,
+            shift_V3=own.velocity(place_3) + shift_3,
+        )
+    tensors = map(torch.stack, zip(*(row.tensors for row in rows), strict=True))
+    return replace(state, moving=replace(moving, poses=Poses(*tensors)))
+
+
 def _barriers(
     scene: Scene, placements: Mapping[int, Placement], clearance: float, device: torch.device, dtype: torch.dtype
 ) -> Barriers | None:
     """Returns barriers of the placed obstacles. Rows are differentiable by the poses; lists of cells are not."""
     cell_size, parts = scene.cell_size, []
     for i, obstacle in enumerate(scene.obstacles):
+        if obstacle.motion is not None:
+            continue
         staying = i not in placements
         # not cut at the domain: an obstacle may be moved into it
         piece_F33 = barrier_pieces(obstacle.corners, cell_size, scene.domain_size if staying else None)

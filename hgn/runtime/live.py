@@ -44,7 +44,8 @@ class LiveSimulation:
         self.scenes = [InitialState.of(scene) for scene in given]
         self.ended: dict[int, DivergedError] = {}
         require(len(self.scenes) > 0, "scenes", "at least one", 0)
-        state = replace(self._started(self.scenes), obstacles=simulator.obstacles(self.scenes))
+        moving = simulator.moving(self.scenes, [0] * len(self.scenes))
+        state = replace(self._started(self.scenes), obstacles=simulator.obstacles(self.scenes), moving=moving)
         clearance = simulator.network.step.obstacle_clearance
         self._barriers = [] if clearance is None else [scene.barrier(clearance) for scene in self.scenes]
         state = replace(state, barriers=self._joined(self._barriers))
@@ -104,7 +105,7 @@ class LiveSimulation:
         """
         self._require_scene(index)
         start, state = InitialState.of(scene), self.state
-        self._put(index, start, selected(state, state.scene_N != index), self._started([start]))
+        self._put(index, start, selected(state, state.scene_N != index), self._started([start]), restart=True)
         self.ended.pop(index, None)
 
     def add_particles(
@@ -136,12 +137,13 @@ class LiveSimulation:
         return new.velocity_NM3.cpu().numpy()
 
     def replace_obstacles(self, scene: InitialState | Scene, index: int = 0) -> None:
-        """Replaces the obstacles by those of another scene, at rest. Its particles are ignored.
+        """Replaces the obstacles by those of another scene. Times of their keyframes count from now.
 
-        Raises: ConfigError as `Simulator.start`.
+        Particles of the other scene are ignored. Raises: ConfigError as `Simulator.start`.
         """
         other = InitialState.of(scene)
-        self._change_scene(index, obstacle_grid=other.obstacle_grid, corners=other.corners)
+        own = {"obstacle_grid": other.obstacle_grid, "corners": other.corners, "moving": other.moving}
+        self._change_scene(index, **own)
 
     def set_gravity(self, gravity: tuple[float, float, float], index: int = 0) -> None:
         """Replaces gravity, in domain units per second squared.
@@ -153,7 +155,7 @@ class LiveSimulation:
     def restore(self, position_N3: np.ndarray, velocity_NM3: np.ndarray, frame: int, index: int = 0) -> None:
         """Restores an earlier frame of a scene's first particles. Particles that entered later are removed.
 
-        Obstacles and gravity stay. `frame` becomes the number of the last frame.
+        Obstacles and gravity stay; keyframes continue from that frame. `frame` becomes the number of the last frame.
 
         position_N3: float32, domain units. velocity_NM3: float32, domain units per frame, newest first.
         """
@@ -170,6 +172,10 @@ class LiveSimulation:
             position_N3=torch.tensor(position_N3, dtype=torch.float32).to(device),
             velocity_NM3=torch.tensor(velocity_NM3, dtype=torch.float32).to(device),
         )
+        if state.moving is not None:
+            frames = [*state.moving.frames]
+            frames[index] = max(0, frames[index] + frame - self.frame)
+            state = replace(state, moving=state.moving.at(frames))
         self.simulation.frame = frame
         self._continue(selected(state, ~mine_N), start)
 
@@ -185,7 +191,8 @@ class LiveSimulation:
             require(scene.emitting is None, "emitters", "left out here", "some", remedy=remedy)
             grid = scene.obstacle_grid
             no_cells = replace(grid, cell_K3=grid.cell_K3[:0], normal_K3=grid.normal_K3[:0])
-            bare.append(replace(scene, obstacle_grid=no_cells, corners=None))
+            self.simulator.require_fits(scene)
+            bare.append(replace(scene, obstacle_grid=no_cells, corners=None, moving=()))
         new = self.simulator.start(bare)
         lost_N = diverged(new.position_N3, new.domain_S3[new.scene_N])
         rule = "finite and within a domain's size of the domain"
@@ -201,13 +208,22 @@ class LiveSimulation:
         }
         self._put(index, scene, self.state, self._started([replace(scene, **nothing, past_HN3=None, body_N=None)]))
 
-    def _put(self, index: int, scene: InitialState, kept: ParticleState, new: ParticleState) -> None:
-        """Replaces scene `index` by `scene`. The next frame has the particles of `kept` and of `new`, its start."""
+    def _put(
+        self, index: int, scene: InitialState, kept: ParticleState, new: ParticleState, restart: bool = False
+    ) -> None:
+        """Replaces scene `index` by `scene`. The next frame has the particles of `kept` and of `new`, its start.
+
+        The motion of its obstacles starts again with `restart`, and if it has others.
+        """
         before, scenes, barriers = self.scenes[index], [*self.scenes], [*self._barriers]
         scenes[index] = scene
         changed: dict[str, Any] = {}
         if scene.obstacle_grid is not before.obstacle_grid:
             changed["obstacles"] = self.simulator.obstacles(scenes)
+        if restart or scene.moving is not before.moving:
+            frames = [0] * len(scenes) if kept.moving is None else [*kept.moving.frames]
+            frames[index] = 0
+            changed["moving"] = self.simulator.moving(scenes, frames)
         if barriers and _solid(scene) != _solid(before):
             barriers[index] = scene.barrier(barriers[index].clearance)
             changed["barriers"] = self._joined(barriers)

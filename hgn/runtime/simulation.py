@@ -91,7 +91,8 @@ class Simulation:
         if self.stepper is None:
             return self._state
         position_N3, velocity_NM3 = self.stepper.motion()
-        return replace(self._state, position_N3=position_N3, velocity_NM3=velocity_NM3)
+        moving = self._state.moving and self._state.moving.later(self._passed)
+        return replace(self._state, position_N3=position_N3, velocity_NM3=velocity_NM3, moving=moving)
 
     @property
     def particle_count(self) -> int:
@@ -165,6 +166,7 @@ class Simulation:
         try:
             for block_TN3, lost in stepper.blocks(frames):
                 self.frame += len(block_TN3)
+                self._passed += len(block_TN3)
                 if not lost:
                     yield self._whole(block_TN3)
                 elif self.isolate:
@@ -178,7 +180,7 @@ class Simulation:
             raise DivergedError(self.frame, str(error)) from None
 
     def _begin(self, state: ParticleState) -> None:
-        self._state = state
+        self._state, self._passed = state, 0  # _passed: number of frames since `state`
         if not len(state.position_N3):
             self.close()
         elif self.stepper is None or not self.stepper.take(state):

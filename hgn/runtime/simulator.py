@@ -20,10 +20,11 @@ from hgn.config import DEFAULT_WEIGHTS
 from hgn.network.barriers import Barriers
 from hgn.network.base import ParticleNetwork
 from hgn.network.features import ParticleState, material_rows
+from hgn.network.moving import MovingObstacles
 from hgn.network.obstacles import ObstacleCells
 from hgn.network.own_physics import physics_fields
 from hgn.runtime.backend import build, choose, set_matmul_precision
-from hgn.runtime.differentiable import Inputs, Pose, simulate
+from hgn.runtime.differentiable import Inputs, Pose, simulate, with_velocities
 from hgn.runtime.divergence import DivergedError
 from hgn.runtime.simulation import Entry, Simulation, on_host
 from hgn.runtime.torch_backend import Backend
@@ -35,6 +36,7 @@ from hgn.scene.episode import Episode
 from hgn.scene.episode_obstacles import known_obstacles
 from hgn.scene.history import ballistic_velocities, require_past
 from hgn.scene.material import MATERIALS, elastic_particles
+from hgn.scene.moving import MovingObstacle, at_rest, moving_obstacles, moving_of_episode
 from hgn.scene.obstacle_grid import ObstacleGrid, build_obstacle_grid
 from hgn.scene.own_physics import input_parameters
 from hgn.scene.rest_shape import body_numbers, rest_neighbours
@@ -66,6 +68,7 @@ class InitialState:
     wall_friction: tuple[float, float, float] = (0.0, 0.0, 0.0)
     parameters: np.ndarray | None = None  # float32 [N, P], hgn.scene.own_physics.input_parameters
     body_N: np.ndarray | None = None  # number of each particle's body; None: elastic particles near each other are one
+    moving: tuple[MovingObstacle, ...] = ()  # obstacles in motion; `obstacle_grid` and `corners` are of those at rest
 
     @staticmethod
     def of_episode(episode: Episode) -> InitialState:
@@ -77,38 +80,37 @@ class InitialState:
             obstacle_grid=episode.obstacle_grid,
             domain_size=episode.domain_size,
             gravity=episode.gravity,
-            corners=lambda: all_corners(known_obstacles(episode) or ()),
+            corners=lambda: all_corners(at_rest(known_obstacles(episode) or ())),
             materials=episode.materials,
             past_HN3=episode.past_HN3,
             dimensions=episode.dimensions,
             wall_friction=episode.wall_friction,
             parameters=episode.parameters,
             body_N=body_numbers(episode),
+            moving=moving_of_episode(episode),
         )
 
     @staticmethod
     def of_scene(scene: Scene) -> InitialState:
         """Returns a scene's initial particles. Obstacles become cells.
 
-        Raises: ConfigError if obstacles move (a network sees obstacles at rest), or if the domain is not a whole number
-        of solver cells, which the solver refuses too.
+        Raises: ConfigError if the domain is not a whole number of solver cells, which the solver refuses too.
         """
         whole_cells(scene.domain_size, scene.cell_size)
-        remedy = "leave keyframes out, or run datagen.solve"
-        require(not scene.moves, "obstacles", "at rest for a network", "keyframes", remedy=remedy)
-        first = at_start(scene)
+        first, still = at_start(scene), at_rest(scene.obstacles)
         return InitialState(
             position_N3=first.position_N3,
             velocity_N3=first.velocity_N3,
             material_N=first.material_N,
-            obstacle_grid=build_obstacle_grid(scene.obstacles, scene.cell_size, scene.seed, scene.domain_size),
+            obstacle_grid=build_obstacle_grid(still, scene.cell_size, scene.seed, scene.domain_size),
             domain_size=scene.domain_size,
             gravity=scene.gravity,
-            corners=lambda: all_corners(scene.obstacles),
+            corners=lambda: all_corners(still),
             emitting=scene if scene.emits else None,
             wall_friction=scene.wall_friction,
             parameters=input_parameters(first.material_parameters, {}, first.particle_count),
             body_N=body_numbers(first),
+            moving=moving_obstacles(scene.obstacles, scene.cell_size),
         )
 
     @staticmethod
@@ -212,6 +214,7 @@ class Simulator:
             gravity_S3=torch.from_numpy(gravity_S3.astype(np.float32)).to(self.device),
             obstacles=self.obstacles(states),
             barriers=barriers and barriers.to(self.device),
+            moving=self.moving(states, [0] * len(states)),
             **{name: tensor.to(self.device) for name, tensor in physics.items()},
         )
 
@@ -221,6 +224,13 @@ class Simulator:
             return None
         obstacles = ObstacleCells.of([scene.obstacle_grid for scene in scenes])
         return obstacles and obstacles.to(self.device)
+
+    def moving(self, scenes: Sequence[InitialState], frames: Sequence[int]) -> MovingObstacles | None:
+        """Returns the moving obstacles of scenes on the device, scene s at frames[s] after its start."""
+        config, clearance = self.network.config, self.network.step.obstacle_clearance
+        own = [scene.moving for scene in scenes]
+        moving = MovingObstacles.of(own, frames, 1 / self.frame_rate_hz, config.obstacle_features, clearance=clearance)
+        return moving and moving.to(self.device)
 
     def step(self, state: ParticleState) -> ParticleState:
         """Returns the state one frame later."""
@@ -298,7 +308,7 @@ class Simulator:
                 }
                 given = {name: value_N[new_N] for name, value_N in entered.material_parameters.items()}
                 particles["parameters"] = input_parameters(given, {}, int(new_N.sum()))
-                particles |= {"corners": None, "body_N": None}  # barriers take long and are not needed
+                particles |= {"corners": None, "body_N": None, "moving": ()}  # barriers take long and are not needed
                 new = self.start([replace(state, **particles)])
                 entries.append(Entry(frame, replace(new, scene_N=new.scene_N + number)))
         return sorted(entries, key=lambda entry: entry.frame)
@@ -327,6 +337,7 @@ class Simulator:
         """
         inputs = Inputs(position_N3, velocity_N3, gravity_3, domain_size_3, poses=poses, smoothing=smoothing)
         inputs = replace(inputs, physics=physics)
+        scene = with_velocities(scene, poses or {})
         return simulate(self.network, self.start([scene]), scene, self.frame_rate_hz, frames=frames, inputs=inputs)
 
     def require_fits(self, scene: InitialState) -> None:
@@ -336,6 +347,9 @@ class Simulator:
         rule = f"the network's {dimensions}"
         remedy = f"take weights of {scene.dimensions}D data, or an episode of {dimensions}D data"
         require(scene.dimensions == dimensions, "dimensions", rule, scene.dimensions, remedy=remedy)
+        known, remedy = "moving" in self.network.config.own_physics, "leave keyframes out, or run datagen.solve"
+        rule = "at rest for a network without `moving` in network.own_physics"
+        require(known or not scene.moving, "obstacles", rule, "keyframes", remedy=remedy)
         if info is None:
             return
         if info.network.relative:

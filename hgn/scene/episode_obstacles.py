@@ -5,6 +5,7 @@ Shape legend: K obstacle cells, F triangles.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ import numpy as np
 
 from hgn.config import is_mesh_file
 from hgn.scene.episode import Episode
+from hgn.scene.motion import Motion
 from hgn.scene.obstacle_grid import ObstacleGrid
 from hgn.scene.rotation import quaternion_rotation
 from hgn.scene.scene import Obstacle
@@ -35,17 +37,18 @@ def known_obstacles(episode: Episode) -> tuple[Obstacle, ...] | None:
     records = episode.specification.get("obstacles", ())
     if episode.specification.get("kind") != "random" or not all(_is_here(record) for record in records):
         return None
-    placed = (
-        shape_obstacle(
-            record["shape"],
-            record["size"],
-            tuple(record["position"]),
-            quaternion_rotation(tuple(record["quaternion"])),
-            f"obstacle_{index}_{Path(record['shape']).stem}",
-        )
+    return tuple(
+        obstacle_of_record(record, f"obstacle_{index}_{Path(record['shape']).stem}")
         for index, record in enumerate(records)
     )
-    return tuple(replace(body, friction=own.get("friction")) for body, own in zip(placed, records, strict=True))
+
+
+def obstacle_of_record(record: Mapping[str, Any], name: str) -> Obstacle:
+    """Returns the obstacle that a random scene's specification describes."""
+    position, rotation_33 = tuple(record["position"]), quaternion_rotation(tuple(record["quaternion"]))
+    body = shape_obstacle(record["shape"], record["size"], position, rotation_33, name)
+    motion = Motion.of_frames(record["keyframes"], position) if "keyframes" in record else None
+    return replace(body, friction=record.get("friction"), motion=motion)
 
 
 def _is_here(record: dict[str, Any]) -> bool:

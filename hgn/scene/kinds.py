@@ -35,6 +35,15 @@ RANGES: dict[str, dict[str, tuple[float, float]]] = {
     "jet": {"length": (0.08, 0.3), "width": (0.05, 0.12), "speed": (1.5, 6.0)},
 }  # fmt: skip
 SCENE_KINDS = tuple(RANGES)
+# Kinds with a moving obstacle. With `moving` in scene.own_physics a fraction of the scenes is of one of them.
+MOVING_FRACTION = 1 / 3
+FASTEST = 1.0  # largest speed of their obstacles, domain units per second
+MOVING_RANGES: dict[str, dict[str, tuple[float, float]]] = {
+    "paddle": {"gap": (0.02, 0.1), "depth": (0.03, 0.12), "length": (0.2, 0.7), "speed": (0.1, FASTEST)},
+    "piston": {"size": (0.08, 0.2), "gap": (0.01, 0.1), "way": (0.2, 0.9), "speed": (0.05, FASTEST)},
+    "conveyor": {"size": (0.06, 0.12), "plate": (0.35, 0.6), "height": (0.06, 0.2), "speed": (0.1, FASTEST)},
+    "falling": {"size": (0.08, 0.2), "height": (0.1, 0.4), "speed": (0.3, FASTEST)},
+}
 FREE = (
     "domain_size",
     "cell_size",

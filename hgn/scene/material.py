@@ -31,8 +31,9 @@ MATERIAL_PARAMETERS: tuple[str, ...] = (
     "water_tension",
     "water_viscosity_pa_s",
 )
-# what scenes draw and networks have as inputs: friction of surfaces, parameters of materials, elastic bodies
-OWN_PHYSICS = ("friction", "parameters", "elastic")
+# what scenes draw and networks have as inputs: friction of surfaces, parameters of materials, elastic bodies, motion of
+# obstacles
+OWN_PHYSICS = ("friction", "parameters", "elastic", "moving")
 # Parameters that networks have as inputs, in the order of their columns, and the ranges that random scenes draw.
 INPUT_PARAMETERS: dict[str, tuple[float, float]] = {
     "youngs_modulus_pa": (1.25e5, 2e6), "density_kg_m3": (500.0, 2000.0), "sand_friction_angle_deg": (15.0, 45.0),

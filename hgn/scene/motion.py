@@ -6,12 +6,15 @@ Shape legend: T keyframes, P points.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from hgn.scene.rotation import rotate
 from hgn.schema import Vector, require
+
+Keyframes = Sequence[tuple[float, Vector]]  # times in seconds and translations in domain units
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,6 +39,13 @@ class Motion:
             bool(np.isfinite(self.translation_T3).all()), "keyframes", "of finite translations and rotations", "nan"
         )
 
+    @staticmethod
+    def of_frames(keyframes: Keyframes, pivot: Vector) -> Motion:
+        """Returns a motion without rotation."""
+        times, translations = zip(*keyframes, strict=True)
+        rotation_T33 = np.tile(np.eye(3), (len(times), 1, 1))
+        return Motion(np.array(times, np.float64), np.array(translations, np.float64), rotation_T33, pivot)
+
     def pose(self, time: float) -> tuple[np.ndarray, np.ndarray]:
         """Returns rotation, float64 [3, 3], and translation, float64 [3], at a time in seconds."""
         last = len(self.time_T) - 1
@@ -56,6 +66,12 @@ class Motion:
     def transform(self, time: float) -> tuple[np.ndarray, np.ndarray]:
         """Returns R, float64 [3, 3], and t, float64 [3], that map a point x of the obstacle to R x + t at a time."""
         return self.pose(time)[0], self.place(np.zeros((1, 3)), time)[0]
+
+    def fastest(self, point_P3: np.ndarray) -> float:
+        """Returns the largest mean speed of points of the obstacle between two keyframes, domain units per second."""
+        place_TP3 = np.stack([self.place(point_P3, time) for time in self.time_T])
+        speed_TP = np.linalg.norm(np.diff(place_TP3, axis=0), axis=2) / np.diff(self.time_T)[:, None]
+        return float(speed_TP.max(initial=0.0))
 
     def rates(self, begin: float, end: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Returns mean angular velocity, rad/s [3], and mean velocity [3] of the pivot between two times.

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from hgn.config import MpmConfig
+from hgn.scene.kinds import FASTEST
 from hgn.scene.material import INPUT_PARAMETERS, LOGARITHMIC, acts_on
 from hgn.scene.scene import Scene
 
@@ -37,6 +38,7 @@ def input_parameters(given: Mapping[str, np.ndarray], settings: Mapping[str, Any
 def own_ranges(drawn: Sequence[str]) -> dict[str, tuple[float, float]]:
     """Returns the ranges of the numbers that random scenes draw with `scene.own_physics`."""
     ranges = {"friction": (0.0, 1.0)} if "friction" in drawn else {}
+    ranges |= {"moving": (0.0, FASTEST)} if "moving" in drawn else {}
     defaults = zip(INPUT_PARAMETERS.items(), NOMINAL_P, strict=True) if "parameters" in drawn else ()
     return ranges | {name: (min(low, nominal), high) for (name, (low, high)), nominal in defaults}
 

@@ -16,7 +16,8 @@ import numpy as np
 from hgn.config import SceneConfig
 from hgn.scene.funnel import Quaternion
 from hgn.scene.group import WALL_CELLS, Region, particle_count, points_in_ball, random_direction, region_of
-from hgn.scene.kinds import MAXIMUM_PARTICLES, RANGES
+from hgn.scene.kinds import MAXIMUM_PARTICLES, MOVING_FRACTION, MOVING_RANGES, RANGES
+from hgn.scene.motion import Keyframes, Motion
 from hgn.scene.placement import ROUNDING, Body, Placed, blocked, choice, filled, place_shape, triple
 from hgn.schema import ConfigError, Vector
 
@@ -60,13 +61,13 @@ class Layout:
 
     def __call__(self, name: str, small: bool = False) -> float:
         """Draws from a range: low + fraction * (high - low). The fraction is uniform; with `small` it is squared."""
-        low, high = RANGES[self.kind][name]
+        low, high = (RANGES | MOVING_RANGES)[self.kind][name]
         part = self.rng.random()
         return low + (high - low) * (part * part if small else part)
 
     def count(self, name: str) -> int:
         """Draws an integer from a range, both limits included."""
-        low, high = RANGES[self.kind][name]
+        low, high = (RANGES | MOVING_RANGES)[self.kind][name]
         return int(low + int(self.rng.random() * (high - low + 1)))
 
     def chance(self, probability: float) -> bool:
@@ -106,10 +107,17 @@ class Layout:
         gap = min(span, NEAR_WALL * abs(8 * part - 1))
         return first + gap if part < 0.125 else first + span - gap
 
-    def place(self, shape: str, size: float, position: Vector, quaternion: Quaternion = UNTURNED) -> None:
-        """Adds an obstacle. Raises: _DrawAgainError if a part of it is outside the domain."""
+    def place(
+        self, shape: str, size: float, position: Vector, quaternion: Quaternion = UNTURNED, keyframes: Keyframes = ()
+    ) -> None:
+        """Adds an obstacle. Raises: _DrawAgainError if a part of it is outside the domain, unless it moves."""
         item = place_shape(shape, size, position, quaternion, len(self.obstacles))
-        if (item.low < 0).any() or (item.high > np.array(self.domain)).any():
+        if keyframes:
+            obstacle = replace(item.obstacle, motion=Motion.of_frames(keyframes, position))
+            item = replace(
+                item, obstacle=obstacle, record=item.record | {"keyframes": [[t, [*x]] for t, x in keyframes]}
+            )
+        elif (item.low < 0).any() or (item.high > np.array(self.domain)).any():
             raise _DrawAgainError
         self.obstacles.append(item)
 
@@ -323,9 +331,60 @@ def _jet(new: Layout) -> None:
     new.add("box", (length, width, width), centre, (speed, 0.0, 0.0), "water" if new.chance(0.6) else "")
 
 
+def _motion(new: Layout, way: Vector) -> Keyframes:
+    """Returns keyframes of a motion with constant speed, which begins after up to half a second."""
+    wait, length = 0.5 * new.rng.random(), float(np.sqrt(sum(x * x for x in way)))
+    return [(wait, (0.0, 0.0, 0.0)), (wait + length / new("speed"), way)]
+
+
+def _paddle(new: Layout) -> None:
+    """Pushes a pool along a channel with an upright sheet that is wider than the channel."""
+    new.take_domain("flume", "slit", "long")
+    size, begin, length = 2 * max(new.domain[2], 0.15), new.low + 0.2 * new.rng.random(), new("length")
+    far = min(begin + new("gap") + length, new.high(0))
+    way = (0.2 + 0.6 * new.rng.random()) * (new.high(0) - begin)
+    middle = (begin, 0.5 * size, 0.5 * new.domain[2])
+    new.place("square", size, middle, _about_z(1.0), _motion(new, (way, 0.0, 0.0)))
+    high = (far, new.low + new("depth"), new.high(2))
+    new.box((far - length, new.low, new.low), high, material="water" if new.chance(0.6) else "")
+
+
+def _piston(new: Layout) -> None:
+    """Presses a body on the floor together with a plate from above."""
+    new.take_domain("room", "small", "tray")
+    size, gap = new("size"), new("gap")
+    x, z, top = new.along(0, 0.5 * size), new.along(2, 0.5 * size), new.low + size
+    way = gap + new("way") * size
+    middle = (x, top + NEAREST_CELLS * new.config.cell_size + gap, z)
+    new.place("square", 1.5 * size + 0.15, middle, UNTURNED, _motion(new, (0.0, -way, 0.0)))
+    new.body(size, (x, new.low + 0.5 * size + ROUNDING, z), material="snow" if new.chance(0.4) else "")
+
+
+def _conveyor(new: Layout) -> None:
+    """Carries a body on a plate that moves horizontally."""
+    new.take_domain("room", "hall", "tray")
+    plate, size, (across_x, across_z) = new("plate"), new("size"), random_direction(new.rng, 2).tolist()
+    x, y, z = new.along(0, 0.4 * plate), new.low + new("height"), new.along(2, 0.4 * plate)
+    way = 0.2 + 0.3 * new.rng.random()
+    new.place("square", plate, (x, y, z), UNTURNED, _motion(new, (way * across_x, 0.0, way * across_z)))
+    new.body(size, (x, y + 0.5 * size + (NEAREST_CELLS + 0.5) * new.config.cell_size, z))
+
+
+def _falling(new: Layout) -> None:
+    """Drops a plate onto a body, in four pieces of a parabola. It stops at half of the body's height."""
+    new.take_domain("room", "hall")
+    size, height = new("size"), new("height")
+    way, x, z = height + 0.5 * size, new.along(0, 0.5 * size), new.along(2, 0.5 * size)
+    step_s = 7 / 16 * way / new("speed")  # the speed is that of the last piece
+    keyframes = [(piece * step_s, (0.0, -way * piece * piece / 16, 0.0)) for piece in range(5)]
+    new.place("square", 1.2 * size + 0.1, (x, new.low + size + height, z), UNTURNED, keyframes)
+    new.body(size, (x, new.low + 0.5 * size + ROUNDING, z))
+
+
 _PLACED: dict[str, Callable[[Layout], None]] = {
     "pool": _pool, "dam": _dam, "column": _column, "drop": _drop, "slope": _slope, "edge": _edge, "stack": _stack,
     "apart": _apart, "bowl": _bowl, "channel": _channel, "stairs": _stairs, "jet": _jet,
+    "paddle": _paddle, "piston": _piston, "conveyor": _conveyor, "falling": _falling,
 }  # fmt: skip
 
 
@@ -369,6 +428,9 @@ def draw_layout(config: SceneConfig, seed: int) -> tuple[str, Layout | SceneConf
     """
     rng = np.random.Generator(np.random.PCG64([seed, 5]))
     kind = draw_kind(config.kinds, rng)
+    if "moving" in config.own_physics:
+        own = np.random.Generator(np.random.PCG64([seed, 7]))
+        kind, rng = (choice(tuple(MOVING_RANGES), own), own) if own.random() < MOVING_FRACTION else (kind, rng)
     for _ in range(DRAWS):
         new = Layout(config, kind, rng)
         try:

@@ -106,13 +106,16 @@ def moved(state: ParticleState, acceleration_N3: torch.Tensor) -> FreeMotion:
 
 
 def constrained(state: ParticleState, motion: FreeMotion, step: StepConfig, dimensions: int) -> Motion:
-    """Applies walls, then obstacles. `state` is the state before the frame. A shifted end changes the velocity.
+    """Applies moving obstacles, walls, then obstacles at rest. `state` is that before the frame.
 
-    Particles that are not `within_range` keep their positions, so that divergence stays visible.
+    A shifted end changes the velocity. Particles that are not `within_range` keep their positions, so that divergence
+    stays visible.
     """
     position_N3 = motion.position_N3
     if step.wall_clearance is None and step.obstacle_clearance is None:
         return Motion(position_N3, motion.velocity_N3)
+    if state.moving is not None and state.moving.barriers is not None:
+        position_N3 = _outside_moving(state, position_N3, step, dimensions, state.moving.barriers)
     if step.wall_clearance is not None:
         position_N3 = _walled(state, position_N3, step.wall_clearance, dimensions)
     if step.obstacle_clearance is not None and state.barriers is not None:
@@ -124,7 +127,8 @@ def constrained(state: ParticleState, motion: FreeMotion, step: StepConfig, dime
 def next_state(state: ParticleState, motion: Motion) -> ParticleState:
     """Returns the state after a motion. It stores the velocity itself, not a difference of positions."""
     history_NM3 = torch.cat([motion.velocity_N3[:, None], state.velocity_NM3[:, :-1]], dim=1)
-    return replace(state, position_N3=motion.position_N3, velocity_NM3=history_NM3)
+    moving = state.moving and state.moving.later()
+    return replace(state, position_N3=motion.position_N3, velocity_NM3=history_NM3, moving=moving)
 
 
 def within_range(position_N3: torch.Tensor, domain_N3: torch.Tensor) -> torch.Tensor:
@@ -259,6 +263,22 @@ def _outside_obstacles(
                 moved_N3 = _walled(state, moved_N3, step.wall_clearance, dimensions)
         end_N3 = torch.where(hit_N[:, None], moved_N3, end_N3)
         last_N3 = torch.where(hit_N[:, None], normal_N3, last_N3)
+    return torch.where(lost_N1, position_N3, end_N3)
+
+
+def _outside_moving(
+    state: ParticleState, position_N3: torch.Tensor, step: StepConfig, dimensions: int, barriers: Barriers
+) -> torch.Tensor:
+    """Stops the paths of a frame relative to each moving obstacle: from its pose in the frame to that of the next."""
+    assert state.moving is not None
+    lost_N1 = ~within_range(position_N3, state.domain_S3[state.scene_N]).all(-1, keepdim=True)
+    end_N3, step = torch.where(lost_N1, state.position_N3, position_N3), replace(step, wall_clearance=None)
+    endless_V3 = torch.full_like(state.moving.poses.place_V3, torch.inf)
+    for row_N, pose in state.moving.rows(state.scene_N, end_N3.dtype):
+        own_N3, place_N3 = pose.later.undo(end_N3), pose.undo(state.position_N3)
+        own = replace(state, position_N3=place_N3, scene_N=row_N, domain_S3=endless_V3)
+        stopped_N3 = _outside_obstacles(own, own_N3, step, dimensions, barriers)
+        end_N3 = torch.where((stopped_N3 != own_N3).any(-1, keepdim=True), pose.later.put(stopped_N3), end_N3)
     return torch.where(lost_N1, position_N3, end_N3)
 
 

@@ -53,6 +53,9 @@ class TorchScenes:
     def simulate(self, starts: Sequence[tuple[Episode, int]], frames: int) -> list[torch.Tensor]:
         batch = make_batch(starts, self._network.config).to(self._backend.device)
         begin = replace(batch.state(), barriers=self._barriers([episode for episode, _ in starts]))
+        clearance = self._backend.step.obstacle_clearance
+        if begin.moving is not None and clearance is not None:
+            begin = replace(begin, moving=begin.moving.with_barriers(clearance))
         with Simulation(self._backend.stepper, begin, isolate=True) as simulation:
             path_FN3 = torch.from_numpy(simulation.run(frames))
         return list(path_FN3.split(list(batch.particles_S), dim=1))

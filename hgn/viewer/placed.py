@@ -19,6 +19,7 @@ from scipy.spatial.transform import Rotation
 from hgn.runtime.simulator import InitialState
 from hgn.scene.mesh import load_mesh
 from hgn.scene.motion import Motion
+from hgn.scene.moving import MovingObstacle
 from hgn.scene.obstacle_grid import grid_of_samples, surface_samples
 from hgn.scene.rotation import euler_rotation, rotate, round_to_float32
 from hgn.scene.scene import Obstacle, all_corners
@@ -26,6 +27,7 @@ from hgn.scene.scene_file import ObstacleEntry
 from hgn.scene.shapes import shape_obstacle
 from hgn.schema import Vector
 
+JUMP = 0.1  # longest displacement of an obstacle in a frame that moves particles along, domain units
 LONGEST_STEM = 32  # characters of a file's name that a page shows
 _numbers = itertools.count()
 
@@ -109,8 +111,27 @@ def placed_by(entry: ObstacleEntry, folder: Path, cell_size: float) -> PlacedObs
     return placed
 
 
-def with_obstacles(scene: InitialState, obstacles: Sequence[PlacedObstacle]) -> InitialState:
-    """Returns the scene with only these obstacles. Omits cells more than one cell outside the domain."""
+def moved_from(before: PlacedObstacle, after: PlacedObstacle, frame_s: float) -> MovingObstacle | None:
+    """Returns the obstacle in motion between two places within one frame, at rest afterwards.
+
+    Returns None at one place, and for a jump: a displacement of more than JUMP.
+    """
+    mesh, turn_33 = before.mesh(), after.rotation_33 @ before.rotation_33.T
+    way_T3 = np.array([(0.0, 0.0, 0.0), np.subtract(after.position, before.position)])
+    motion = Motion(np.array([0.0, frame_s]), way_T3, np.stack([np.eye(3), turn_33]), before.position)
+    grid = grid_of_samples(*before.samples, before.body.cell_size)
+    friction_K = np.full(len(grid.cell_K3), mesh.friction or 0.0, np.float32)
+    moving = MovingObstacle(dataclasses.replace(grid, friction_K=friction_K), mesh.corners, motion)
+    return moving if 0 < moving.distance(0.0, frame_s) <= JUMP else None
+
+
+def with_obstacles(
+    scene: InitialState, obstacles: Sequence[PlacedObstacle], moving: Sequence[MovingObstacle] = ()
+) -> InitialState:
+    """Returns the scene with these obstacles at rest, and `moving` ones.
+
+    Omits cells at rest that are more than one cell outside the domain.
+    """
     cell_size = scene.obstacle_grid.cell_size
     empty = (np.zeros((0, 3)), np.zeros((0, 3)))
     parts = [empty, *(obstacle.samples for obstacle in obstacles)]
@@ -122,4 +143,5 @@ def with_obstacles(scene: InitialState, obstacles: Sequence[PlacedObstacle]) -> 
         scene,
         obstacle_grid=grid_of_samples(point_S3[near], normal_S3[near], cell_size, friction_S[near]),
         corners=lambda: all_corners([obstacle.mesh() for obstacle in obstacles]),
+        moving=tuple(moving),
     )

@@ -27,7 +27,7 @@ from hgn.scene.rollout_file import Rollout
 from hgn.scene.scene import Scene
 from hgn.scene.scene_file import ObstacleEntry
 from hgn.schema import ConfigError, Vector, from_mapping, require, to_mapping
-from hgn.viewer.placed import Body, PlacedObstacle, placed_by, with_obstacles
+from hgn.viewer.placed import Body, PlacedObstacle, moved_from, placed_by, with_obstacles
 from hgn.viewer.recording import Frame, Recording
 
 CLEARANCE = 1.25  # in spacings of particles at rest; no particle of a ball enters nearer to another particle
@@ -287,14 +287,23 @@ class PlaySession:
         reach, angles = 10 * max(self.domain_size), moved.rotation
         inside = all(abs(value) <= reach for value in moved.position) and all(map(math.isfinite, angles))
         require(inside, "obstacle", f"within {reach:g} of the origin, at finite angles", [*moved.position, *angles])
-        self._set_obstacles(tuple(moved if o.body is moved.body else o for o in self.obstacles))
+        moved_too = tuple(moved if o.body is moved.body else o for o in self.obstacles)
+        self._set_obstacles(moved_too, before=self.newest.obstacles)
 
     def remove_obstacle(self, number: int) -> None:
         """Removes the obstacle whose body has this number."""
         self._set_obstacles(tuple(o for o in self.obstacles if o.body.number != number))
 
-    def _set_obstacles(self, obstacles: tuple[PlacedObstacle, ...]) -> None:
-        self.live.replace_obstacles(with_obstacles(self.live.scenes[0], obstacles))
+    def _set_obstacles(self, obstacles: tuple[PlacedObstacle, ...], before: tuple[PlacedObstacle, ...] = ()) -> None:
+        """Replaces the obstacles. With weights that see motion, those at other places than in `before` move there."""
+        moving = {}
+        if before and "moving" in self.simulator.network.config.own_physics:
+            places = {obstacle.body.number: obstacle for obstacle in before}
+            pairs = ((places.get(after.body.number, after), after) for after in obstacles)
+            own = ((after, moved_from(place, after, 1 / self.simulator.frame_rate_hz)) for place, after in pairs)
+            moving = {after: motion for after, motion in own if motion is not None}
+        still = [obstacle for obstacle in obstacles if obstacle not in moving]
+        self.live.replace_obstacles(with_obstacles(self.live.scenes[0], still, [*moving.values()]))
         self.obstacles = obstacles
 
     # gravity and weights

@@ -1,0 +1,214 @@
+"""Obstacles in motion as inputs of a network with `moving` in `network.own_physics`.
+
+The cells of a moving obstacle are computed once, at its place in the scene. Particles are looked up in the obstacle's
+own frame, so its cells move with it exactly. Its points move over the coming frame by
+
+    V(x) = A (x - p) + b,    A = R' R^T - 1,    b = p' - p
+
+R and p are its rotation and the place of its pivot in this frame, R' and p' those one frame later; b is in domain units
+per frame. The path of a particle relative to the obstacle leads from x by v - V(x). docs/concepts/method.md derives
+where the network uses v - V. Each obstacle has a row j S + s: number j of the moving obstacles of scene s. The keys of
+its cells and triangles have this row as their scene.
+Shape legend: N particles, S scenes, J most moving obstacles of a scene, V = J S rows, C coarsest cells.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+import torch
+from torch.nn.functional import pad
+
+from hgn.network.barriers import Barriers
+from hgn.network.grid import GridHierarchy
+from hgn.network.obstacles import ObstacleCells
+from hgn.scene.barrier import barrier_of_pieces
+from hgn.scene.moving import MovingObstacle
+from hgn.scene.obstacle_grid import ObstacleGrid
+
+TINY = 1e-30  # lower bound of divisors
+
+
+@dataclass(frozen=True, eq=False)
+class Poses:
+    """Poses x -> R (x - c) + p of rows of moving obstacles in a frame, and their motion until the next; float64."""
+
+    rotation_V33: torch.Tensor  # R
+    pivot_V3: torch.Tensor  # c, domain units
+    place_V3: torch.Tensor  # p, domain units
+    change_V33: torch.Tensor  # A
+    shift_V3: torch.Tensor  # b, domain units per frame
+
+    @property
+    def tensors(self) -> list[torch.Tensor]:
+        return [getattr(self, item.name) for item in fields(self)]
+
+    def map(self, function: Callable[[torch.Tensor], torch.Tensor]) -> Poses:
+        return Poses(*map(function, self.tensors))
+
+    @property
+    def later(self) -> Poses:
+        """Returns the poses one frame later, without motion."""
+        rotation_V33 = self.rotation_V33 + self.change_V33 @ self.rotation_V33
+        still = torch.zeros_like(self.change_V33), torch.zeros_like(self.shift_V3)
+        return Poses(rotation_V33, self.pivot_V3, self.place_V3 + self.shift_V3, *still)
+
+    def undo(self, position_V3: torch.Tensor) -> torch.Tensor:
+        """Moves a point of each row to the frame of its cells."""
+        return turned_back(position_V3 - self.place_V3, self.rotation_V33) + self.pivot_V3
+
+    def put(self, position_V3: torch.Tensor) -> torch.Tensor:
+        """Moves a point of each row from the frame of its cells to its pose. Inverts `undo`."""
+        return turned(position_V3 - self.pivot_V3, self.rotation_V33) + self.place_V3
+
+    def velocity(self, position_V3: torch.Tensor) -> torch.Tensor:
+        """Returns the displacement V of the obstacle's points at these places until the next frame."""
+        return turned(position_V3 - self.place_V3, self.change_V33) + self.shift_V3
+
+
+def turned(vector_V3: torch.Tensor, matrix_V33: torch.Tensor) -> torch.Tensor:
+    return (matrix_V33 @ vector_V3[..., None]).squeeze(-1)
+
+
+def turned_back(vector_V3: torch.Tensor, matrix_V33: torch.Tensor) -> torch.Tensor:
+    return (vector_V3[..., None, :] @ matrix_V33).squeeze(-2)
+
+
+@dataclass(frozen=True, eq=False)
+class MovingObstacles:
+    """The moving obstacles of a batch of scenes, each scene at a frame of its own."""
+
+    scenes: tuple[tuple[MovingObstacle, ...], ...]
+    frames: tuple[int, ...]
+    frame_s: float
+    cells: ObstacleCells | None  # in their places in the scenes; None for a network without obstacle features
+    barriers: Barriers | None  # likewise; only with step.obstacle_clearance
+    poses: Poses
+
+    @staticmethod
+    def of(
+        scenes: Sequence[tuple[MovingObstacle, ...]],
+        frames: Sequence[int],
+        frame_s: float,
+        features: bool = True,
+        clearance: float | None = None,
+    ) -> MovingObstacles | None:
+        """Returns the moving obstacles of scenes, scene s at frames[s]; None if none moves."""
+        layers = max(map(len, scenes), default=0)
+        if layers == 0:
+            return None
+        rows = [scene[j] if j < len(scene) else None for j in range(layers) for scene in scenes]
+        size = next(row.grid.cell_size for row in rows if row is not None)
+        nothing = ObstacleGrid(size, np.zeros((0, 3), np.int32), np.zeros((0, 3), np.float32))
+        cells = ObstacleCells.of([nothing if row is None else row.grid for row in rows]) if features else None
+        own = tuple(map(tuple, scenes))
+        moving = MovingObstacles(own, tuple(frames), frame_s, cells, None, poses_of(own, frames, frame_s))
+        return moving if clearance is None else moving.with_barriers(clearance)
+
+    def with_barriers(self, clearance: float) -> MovingObstacles:
+        """Returns the obstacles with barriers. Raises: ConfigError for an invalid clearance."""
+        size = next(scene[0].grid.cell_size for scene in self.scenes if scene)
+        empty = barrier_of_pieces(np.zeros((0, 3, 3)), size, clearance)
+        count = len(self.poses.place_V3) // len(self.scenes)
+        rows = [scene[j].barrier(clearance) if j < len(scene) else empty for j in range(count) for scene in self.scenes]
+        barriers = Barriers.of(rows)
+        return replace(self, barriers=barriers and barriers.to(self.poses.place_V3.device))
+
+    def at(self, frames: Sequence[int]) -> MovingObstacles:
+        """Returns the obstacles with each scene at another frame."""
+        poses, device = poses_of(self.scenes, frames, self.frame_s), self.poses.place_V3.device
+        return replace(self, frames=tuple(frames), poses=poses.map(lambda tensor: tensor.to(device)))
+
+    def later(self, frames: int = 1) -> MovingObstacles:
+        return self.at([frame + frames for frame in self.frames])
+
+    def to(self, device: torch.device, non_blocking: bool = False) -> MovingObstacles:
+        move = {"cells": self.cells, "barriers": self.barriers}
+        own = {name: part and part.to(device, non_blocking) for name, part in move.items()}
+        return replace(self, **own, poses=self.poses.map(lambda tensor: tensor.to(device)))  # type: ignore[arg-type]
+
+    def rows(self, scene_N: torch.Tensor, dtype: torch.dtype) -> Iterator[tuple[torch.Tensor, Poses]]:
+        """Yields for each number j the rows of the particles' scenes, [N], and the poses of these rows."""
+        for layer in range(len(self.poses.place_V3) // len(self.scenes)):
+            row_N = scene_N.long() + layer * len(self.scenes)
+            yield row_N, Poses(*(tensor.to(dtype)[row_N] for tensor in self.poses.tensors))
+
+    def met(
+        self,
+        still: ObstacleCells | None,
+        position_N3: torch.Tensor,
+        velocity_N3: torch.Tensor,
+        scene_N: torch.Tensor,
+        steps: int,
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Returns `relative.obstacle_surfaces` of moving and `still` obstacles, [N, 8], and velocities V [N, 3].
+
+        V is that of the surface at the particle, or else of the first one on its path; 0 without a surface. Where a
+        particle is in cells of several obstacles, normals are summed and shortened to 1; friction and V are means.
+        """
+        total = [position_N3.new_zeros(len(position_N3), 8) for _ in range(steps + 1)]  # n, mu, V, number of surfaces
+        if still is not None:
+            for step in range(steps + 1):
+                row_NV = still.surfaces(position_N3 + velocity_N3 * (step / steps), scene_N)
+                total[step] = _counted(pad(row_NV, (0, 7 - row_NV.shape[1])))
+        assert self.cells is not None
+        for row_N, pose in self.rows(scene_N, position_N3.dtype):
+            own_N3, surface_N3 = pose.undo(position_N3), pose.velocity(position_N3)
+            way_N3 = turned_back(velocity_N3 - surface_N3, pose.later.rotation_V33)
+            for step in range(steps + 1):
+                row_N4 = self.cells.rows_at(self.cells.surface_rows, own_N3 + way_N3 * (step / steps), row_N)
+                normal_N3 = turned(row_N4[:, :3], pose.rotation_V33)
+                total[step] = total[step] + _counted(torch.cat([normal_N3, row_N4[:, 3:], surface_N3], -1))
+        mean = [_mean(total_N8) for total_N8 in total]
+        ahead_N7 = mean[-1]
+        for mean_N7 in mean[-2:0:-1]:
+            ahead_N7 = torch.where(mean_N7[:, :3].any(-1, keepdim=True), mean_N7, ahead_N7)
+        first_N7 = torch.where(mean[0][:, :3].any(-1, keepdim=True), mean[0], ahead_N7)
+        return torch.cat([mean[0][:, :4], ahead_N7[:, :4]], dim=-1), first_N7[:, 4:]
+
+
+def _counted(row_N7: torch.Tensor) -> torch.Tensor:
+    """Appends 1 to rows with a normal, and sets all others to 0."""
+    there_N1 = row_N7[:, :3].any(-1, keepdim=True).to(row_N7.dtype)
+    return torch.cat([there_N1 * row_N7, there_N1], -1)
+
+
+def _mean(total_N8: torch.Tensor) -> torch.Tensor:
+    normal_N3, count_N1 = total_N8[:, :3], total_N8[:, 7:]
+    square_N1 = torch.where(count_N1 > 1, normal_N3.square().sum(-1, keepdim=True).clamp(min=1), 1)
+    return torch.cat([normal_N3 * square_N1.rsqrt(), total_N8[:, 3:7] / count_N1.clamp(min=1)], -1)
+
+
+def poses_of(scenes: Sequence[Sequence[MovingObstacle]], frames: Sequence[int], frame_s: float) -> Poses:
+    """Returns the poses of the rows of scenes, scene s in frame frames[s]."""
+    layers, rows = max(map(len, scenes)), []
+    for layer in range(layers):
+        for scene, frame in zip(scenes, frames, strict=True):
+            if layer >= len(scene):
+                rows.append((np.eye(3), np.zeros(3), np.zeros(3), np.zeros((3, 3)), np.zeros(3)))
+                continue
+            motion = scene[layer].motion
+            (turn_33, shift_3), (later_33, later_3) = (motion.pose((frame + i) * frame_s) for i in range(2))
+            pivot_3 = np.array(motion.pivot)
+            change_33 = later_33 @ turn_33.T - np.eye(3) if later_33 is not turn_33 else np.zeros((3, 3))
+            rows.append((turn_33, pivot_3, pivot_3 + shift_3, change_33, later_3 - shift_3))
+    return Poses(*(torch.from_numpy(np.stack(part).astype(np.float64)) for part in zip(*rows, strict=True)))
+
+
+def surface_velocity(
+    touch_N: torch.Tensor, surface_N3: torch.Tensor, touched_C: torch.Tensor, grid: GridHierarchy
+) -> torch.Tensor:
+    """Returns V of each particle, [N, 3]: its own surfaces' where `touch_N` is 1, else that of its neighbours.
+
+    Neighbours are the particles of the same coarsest cells and of cells across their faces, weighted by their contacts,
+    as in the gate G. Walls are at rest.
+    """
+    level, weight_N8 = grid.levels[-1], grid.weight_N8
+    sum_C4 = grid.coarsest_sums(touch_N[:, None] * torch.cat([surface_N3, torch.ones_like(surface_N3[:, :1])], -1))
+    sum_C4 = sum_C4.index_add(0, level.receiver_E, sum_C4[level.sender_E])
+    mean_C3 = sum_C4[:, :3] / sum_C4[:, 3:].clamp(min=TINY)
+    weight_N8 = weight_N8 * touched_C[grid.coarsest_cells]
+    near_N3 = (weight_N8[..., None] * mean_C3[grid.coarsest_cells]).sum(1) / weight_N8.sum(1)[:, None].clamp(min=TINY)
+    return touch_N[:, None] * surface_N3 + (1 - touch_N)[:, None] * near_N3

@@ -1,0 +1,68 @@
+"""Obstacles in motion: the cells of each are computed once, at its place in the scene, and then move with it.
+
+Shape legend: F triangles.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+
+from hgn.scene.barrier import Barrier, barrier_of_pieces, barrier_pieces
+from hgn.scene.episode import Episode
+from hgn.scene.episode_obstacles import obstacle_of_record
+from hgn.scene.motion import Motion
+from hgn.scene.obstacle_grid import ObstacleGrid, build_obstacle_grid
+from hgn.scene.scene import Obstacle
+
+
+@dataclass(frozen=True, eq=False)
+class MovingObstacle:
+    """An obstacle at its place in the scene, and its motion from there."""
+
+    grid: ObstacleGrid
+    corner_F33: np.ndarray  # float64, domain units
+    motion: Motion
+
+    def barrier(self, clearance: float) -> Barrier:
+        """Returns the barrier of its triangles. Raises: ConfigError for an invalid clearance."""
+        cell_size = self.grid.cell_size
+        return barrier_of_pieces(barrier_pieces(self.corner_F33, cell_size), cell_size, clearance)
+
+    def distance(self, begin: float, end: float) -> float:
+        """Returns the largest displacement of its corners between two times in seconds, domain units."""
+        corner_P3 = self.corner_F33.reshape(-1, 3)
+        way_P3 = self.motion.place(corner_P3, end) - self.motion.place(corner_P3, begin)
+        return float(np.linalg.norm(way_P3, axis=1).max(initial=0.0))
+
+
+def at_rest(obstacles: Sequence[Obstacle]) -> tuple[Obstacle, ...]:
+    """Returns those obstacles that do not move."""
+    return tuple(obstacle for obstacle in obstacles if obstacle.motion is None)
+
+
+def moving_obstacles(obstacles: Sequence[Obstacle], cell_size: float) -> tuple[MovingObstacle, ...]:
+    """Returns those obstacles that move. Raises: ConfigError as `build_obstacle_grid`."""
+    return tuple(
+        MovingObstacle(build_obstacle_grid((body,), cell_size, seed=0), body.corners, body.motion)
+        for body in obstacles
+        if body.motion is not None
+    )
+
+
+def moving_of_episode(episode: Episode) -> tuple[MovingObstacle, ...]:
+    """Returns the moving obstacles of a random scene's episode, from its specification. The last ones are cached."""
+    if episode.specification.get("kind") != "random":
+        return ()
+    other = {"friction": episode.solver.get("settings", {}).get("collider_friction")}  # where a record has none
+    records = [json.dumps(other | record) for record in episode.specification["obstacles"] if "keyframes" in record]
+    return tuple(_moving_of_record(record, episode.obstacle_grid.cell_size) for record in records)
+
+
+@lru_cache(maxsize=1024)
+def _moving_of_record(record: str, cell_size: float) -> MovingObstacle:
+    return moving_obstacles([obstacle_of_record(json.loads(record), "moving")], cell_size)[0]
