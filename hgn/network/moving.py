@@ -21,9 +21,10 @@ import numpy as np
 import torch
 from torch.nn.functional import pad
 
+from hgn.config import NetworkConfig
 from hgn.network.barriers import Barriers
 from hgn.network.grid import GridHierarchy
-from hgn.network.obstacles import ObstacleCells
+from hgn.network.obstacles import ObstacleCells, nearest
 from hgn.scene.barrier import barrier_of_pieces
 from hgn.scene.moving import MovingObstacle
 from hgn.scene.obstacle_grid import ObstacleGrid
@@ -92,17 +93,20 @@ class MovingObstacles:
         scenes: Sequence[tuple[MovingObstacle, ...]],
         frames: Sequence[int],
         frame_s: float,
-        features: bool = True,
+        network: NetworkConfig | None = None,
         clearance: float | None = None,
     ) -> MovingObstacles | None:
-        """Returns the moving obstacles of scenes, scene s at frames[s]; None if none moves."""
+        """Returns the moving obstacles of scenes as `network` sees them, scene s at frames[s]; None if none moves."""
+        network = NetworkConfig() if network is None else network
         layers = max(map(len, scenes), default=0)
         if layers == 0:
             return None
         rows = [scene[j] if j < len(scene) else None for j in range(layers) for scene in scenes]
         size = next(row.grid.cell_size for row in rows if row is not None)
         nothing = ObstacleGrid(size, np.zeros((0, 3), np.int32), np.zeros((0, 3), np.float32))
-        cells = ObstacleCells.of([nothing if row is None else row.grid for row in rows]) if features else None
+        grids, cells = [nothing if row is None else row.grid for row in rows], None
+        if network.obstacle_features:
+            cells = ObstacleCells.of(grids, network.obstacle_distances)
         own = tuple(map(tuple, scenes))
         moving = MovingObstacles(own, tuple(frames), frame_s, cells, None, poses_of(own, frames, frame_s))
         return moving if clearance is None else moving.with_barriers(clearance)
@@ -167,6 +171,36 @@ class MovingObstacles:
             ahead_N7 = torch.where(mean_N7[:, :3].any(-1, keepdim=True), mean_N7, ahead_N7)
         first_N7 = torch.where(mean[0][:, :3].any(-1, keepdim=True), mean[0], ahead_N7)
         return torch.cat([mean[0][:, :4], ahead_N7[:, :4]], dim=-1), first_N7[:, 4:]
+
+    def nearest(
+        self,
+        still: ObstacleCells | None,
+        position_N3: torch.Tensor,
+        velocity_N3: torch.Tensor,
+        scene_N: torch.Tensor,
+        steps: int,
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Returns `relative.near_obstacles` of moving and `still` obstacles, [N, 8], and velocities V as `met`, [N, 3].
+
+        Of several obstacles the nearest counts.
+        """
+        assert self.cells is not None
+        rows: list[list[torch.Tensor]] = [[] for _ in range(steps + 1)]
+        for step in range(steps + 1):
+            if still is not None:
+                rows[step].append(pad(still.near(position_N3, velocity_N3, scene_N, step / steps), (0, 3)))
+        for row_N, pose in self.rows(scene_N, position_N3.dtype):
+            own_N3, surface_N3 = pose.undo(position_N3), pose.velocity(position_N3)
+            way_N3 = turned_back(velocity_N3 - surface_N3, pose.later.rotation_V33)
+            for step in range(steps + 1):
+                near_N4 = self.cells.near(own_N3, way_N3, row_N, step / steps)
+                normal_N3 = turned(near_N4[:, :3], pose.rotation_V33)
+                rows[step].append(torch.cat([normal_N3, near_N4[:, 3:], surface_N3], -1))
+        here_N7, *ahead = map(nearest, rows)
+        ahead_N7 = nearest(ahead)
+        first_N7 = torch.where(here_N7[:, :3].any(-1, keepdim=True), here_N7, ahead_N7)
+        there_N1 = first_N7[:, :3].any(-1, keepdim=True)
+        return torch.cat([here_N7[:, :4], ahead_N7[:, :4]], dim=-1), there_N1 * first_N7[:, 4:]
 
 
 def _counted(row_N7: torch.Tensor) -> torch.Tensor:

@@ -2,13 +2,14 @@
 
 Paper sec. 3: sample the surface with points at least cell_size / 4 apart. Flip a sample's normal if it points away from
 the centre of its cell. Sum the normals of a cell, and normalise. Cells are stored sparsely.
-Shape legend: K obstacle cells, S surface samples, F triangles.
+`surface_planes` describes the surface near these cells too, for networks that see distances to obstacles.
+Shape legend: K obstacle cells, B cells near a surface, S surface samples, F triangles.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -19,6 +20,9 @@ from hgn.schema import ConfigError, Vector, require
 CANCELLED = 0.25  # length of a cell's mean normal below which its normals cancel; three faces of a corner give 0.58
 NORMAL_SPACING_CELLS = 0.25  # distance of the samples, in cells
 SPLIT_CELLS = 16.0  # longest edge of pieces before they are cut at the domain, in cells
+REACH_CELLS = 2  # distance from an obstacle at which a network with distances begins to see it, in obstacle cells
+# A cell's piece of surface is a disk of this radius, in cells: a circle with the area of a cell's face, and a bit more.
+DISK_CELLS = 0.6
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,6 +33,7 @@ class ObstacleGrid:
     cell_K3: np.ndarray  # int32, unique rows, lexicographically sorted
     normal_K3: np.ndarray  # float32, unit length
     friction_K: np.ndarray | None = None  # float32, Coulomb coefficients; None: no obstacle has its own
+    point_K3: np.ndarray | None = None  # float32, mean surface point from the cell's centre, in cells; None: the centre
 
 
 def build_obstacle_grid(
@@ -70,10 +75,50 @@ def grid_of_samples(
     sum_K3[cancelled_K] = normal_S3[nearest_K[cancelled_K]]
     length_K[cancelled_K] = 1.0
     cell_K3 = np.stack(np.unravel_index(key_K, extent), axis=1) + low
-    grid = ObstacleGrid(cell_size, cell_K3.astype(np.int32), (sum_K3 / length_K[:, None]).astype(np.float32))
-    if friction_S is None:
-        return grid
-    return replace(grid, friction_K=(np.bincount(cell_S, friction_S, len(key_K)) / count_K).astype(np.float32))
+    normal_K3 = (sum_K3 / length_K[:, None]).astype(np.float32)
+
+    def mean(value_S: np.ndarray) -> np.ndarray:
+        return (np.bincount(cell_S, value_S, len(key_K)) / count_K).astype(np.float32)
+
+    point_K3 = np.stack([mean(-to_centre_S3[:, axis] / cell_size) for axis in range(3)], axis=1)
+    friction_K = None if friction_S is None else mean(friction_S)
+    return ObstacleGrid(cell_size, cell_K3.astype(np.int32), normal_K3, friction_K, point_K3)
+
+
+def surface_planes(grid: ObstacleGrid) -> tuple[ObstacleGrid, np.ndarray]:
+    """Returns the cells within REACH_CELLS of a surface, and the offsets of their planes, float32 [B], domain units.
+
+    The points x of a cell's plane fulfil n . (x - centre of the cell) = offset. A cell with surface has the plane of
+    its mean normal and point. Any other cell has the plane through the nearest point of the nearest cell's surface, a
+    disk, perpendicular to the line to the centre; its normal points to the centre, its friction is that cell's.
+    """
+    own_K3 = np.zeros_like(grid.normal_K3) if grid.point_K3 is None else grid.point_K3
+    step_D3 = np.mgrid[-REACH_CELLS : REACH_CELLS + 1, -REACH_CELLS : REACH_CELLS + 1, -REACH_CELLS : REACH_CELLS + 1]
+    step_D13 = step_D3.reshape(3, -1).T[:, None]
+    away_DK3 = step_D13.astype(np.float32) - own_K3  # from the mean point to the centre of each cell around
+    height_DK = (away_DK3 * grid.normal_K3).sum(-1)
+    along_DK3 = away_DK3 - height_DK[..., None] * grid.normal_K3
+    length_DK = np.sqrt((along_DK3 * along_DK3).sum(-1))
+    inside_DK = np.minimum(1, DISK_CELLS / np.maximum(length_DK, DISK_CELLS))
+    away_DK3 -= inside_DK[..., None] * along_DK3
+    distance_DK = np.sqrt((away_DK3 * away_DK3).sum(-1))
+    here_DK = np.broadcast_to(~step_D13.any(-1), distance_DK.shape)
+    near_DK = here_DK | (distance_DK <= REACH_CELLS + 0.5)
+    d_P, k_P = np.nonzero(near_DK)
+    cell_P3 = grid.cell_K3[k_P].astype(np.int64) + step_D13[d_P, 0]
+    distance_P, here_P = distance_DK[d_P, k_P], here_DK[d_P, k_P]
+    order_P = np.lexsort((k_P, np.where(here_P, -1, distance_P), *cell_P3.T[::-1]))
+    first_P = np.ones(len(order_P), bool)
+    first_P[1:] = (np.diff(cell_P3[order_P], axis=0) != 0).any(axis=1)
+    chosen_B = order_P[first_P]
+    d_B, k_B, here_B, distance_B = d_P[chosen_B], k_P[chosen_B], here_P[chosen_B], distance_P[chosen_B]
+    towards_B3 = away_DK3[d_B, k_B] / np.maximum(distance_B, 1e-6)[:, None]
+    normal_B3 = np.where(here_B[:, None], grid.normal_K3[k_B], towards_B3).astype(np.float32)
+    own_B = (grid.normal_K3 * own_K3).sum(-1)[k_B]
+    offset_B = grid.cell_size * np.where(here_B, own_B, -distance_B)
+    friction_B = None if grid.friction_K is None else grid.friction_K[k_B]
+    near = ObstacleGrid(grid.cell_size, cell_P3[chosen_B].astype(np.int32), normal_B3, friction_B)
+    return near, offset_B.astype(np.float32)
 
 
 def surface_samples(

@@ -36,8 +36,8 @@ def plates(velocities, turns=None, friction=0.4):
     return found
 
 
-def moving_of(obstacles, frame=0):
-    return MovingObstacles.of([moving_obstacles(obstacles, CELL)], [frame], FRAME_S, clearance=CLEARANCE)
+def moving_of(obstacles, frame=0, network=None):
+    return MovingObstacles.of([moving_obstacles(obstacles, CELL)], [frame], FRAME_S, network, clearance=CLEARANCE)
 
 
 def struck(velocity=(0.0, 0.0, 0.0), count=60):
@@ -52,10 +52,10 @@ def struck(velocity=(0.0, 0.0, 0.0), count=60):
     return replace(state, position_N3=place_N3, velocity_NM3=history_NM3, domain_S3=torch.full((1, 3), 4.0).double())
 
 
-def at_rest(state, obstacles):
+def at_rest(state, obstacles, distances=False):
     """The state with the obstacles at rest as a network without `moving` gets them."""
     still = [moving_obstacles([obstacle], CELL)[0] for obstacle in obstacles]
-    cells = ObstacleCells.of([still[0].grid])
+    cells = ObstacleCells.of([still[0].grid], distances)
     return replace(state, obstacles=cells, barriers=Barriers.of([still[0].barrier(CLEARANCE)]))
 
 
@@ -75,18 +75,18 @@ def rolled(network, state, frames):
     return torch.stack(positions)
 
 
-@pytest.mark.parametrize("frames", [1, 10])
-def test_a_common_velocity_changes_nothing(frames):
+@pytest.mark.parametrize(("frames", "distances"), [(1, False), (10, False), (1, True), (10, True)])
+def test_a_common_velocity_changes_nothing(frames, distances):
     """Particles and an obstacle with one velocity move as they do about the obstacle at rest, which is a scene without
     moving obstacles: ten frames with contacts and friction."""
-    network, obstacles = network_for(), plates([COMMON])
-    still = rolled(network, at_rest(struck(), obstacles), frames)
-    moved = rolled(network, replace(struck(COMMON), moving=moving_of(obstacles)), frames)
+    network, obstacles = network_for(obstacle_distances=distances), plates([COMMON])
+    still = rolled(network, at_rest(struck(), obstacles, distances), frames)
+    moved = rolled(network, replace(struck(COMMON), moving=moving_of(obstacles, 0, network.config)), frames)
     shift_T13 = torch.arange(1, frames + 1)[:, None, None] * torch.tensor(COMMON, dtype=torch.float64)
     torch.testing.assert_close(moved - shift_T13, still, rtol=0, atol=1e-11)
     free = rolled(network, struck(), frames)
     assert float((still - free).abs().max()) > 1e-4 and torch.unique((still - free)[-1].norm(dim=-1) > 1e-9).sum() > 0
-    blind = rolled(network, replace(at_rest(struck(COMMON), obstacles)), 1)
+    blind = rolled(network, at_rest(struck(COMMON), obstacles, distances), 1)
     assert float((blind[0] - shift_T13[0] - still[0]).abs().max()) > 1e-4
 
 

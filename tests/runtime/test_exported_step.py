@@ -159,11 +159,22 @@ def test_what_is_refused(options, message):
         export.main(options)
 
 
-def test_a_gns_is_refused(tmp_path):
-    """Neighbour lists are not exported."""
-    network, path = gns_of(torch.float32), tmp_path / "gns.safetensors"
+@pytest.mark.parametrize(
+    ("made", "values", "message"),
+    [
+        (gns_of, {}, "weights must be an hgn network, got 'gns'"),
+        (network_of, {"own_physics": ("friction",)}, r"without own_physics and .* got \['friction'\]"),
+        (network_of, {"obstacle_distances": True}, r"and obstacle_distances, .* got \['obstacle_distances'\]"),
+    ],
+)
+def test_networks_that_are_not_exported(made, values, message, tmp_path):
+    """Neighbour lists, and inputs of scenes that graphs lack, are refused."""
+    network, path = (
+        made(torch.float32, **values | ({"inputs": "local"} if values else {})),
+        tmp_path / "own.safetensors",
+    )
     save_weights(path, network, WeightsInfo(network.config, 60.0, CELL))
-    with pytest.raises(ConfigError, match="weights must be an hgn network, got 'gns'"):
+    with pytest.raises(ConfigError, match=message):
         export.main({"weights": str(path), "onnx": str(tmp_path / "a.onnx")})
     assert not (tmp_path / "a.onnx").exists()
 
