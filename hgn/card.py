@@ -114,7 +114,9 @@ def data_card(manifest: Manifest, name: str, licence: str) -> str:
     rows = {split: f"{number} episode{'s' * (number > 1)}" for split, number in episodes.items()}
     rows |= {
         "frames a second": f"{manifest.config['frame_rate_hz']:g}",
-        "materials": ", ".join(scene["materials"]),
+        "materials": ", ".join(
+            dict.fromkeys([*scene["materials"], *({"elastic"} & {*(scene.get("own_physics") or ())})])
+        ),
         "gravity": "of each scene" if scene.get("kinds") else _vector(scene["gravity"]),
         "made by": f"an import of {own['format']} files" if own else "HGN's solver",
         **_reference_row(manifest.config.get("reference")),

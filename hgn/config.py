@@ -122,7 +122,7 @@ class SceneConfig:
     kinds: dict[str, float] = field(default_factory=dict)
     # friction: a third of the scenes has none, others draw it for each obstacle, the floor and the walls; parameters:
     # half of the scenes has the solver's, others draw those of hgn.scene.material for each group; moving: a third of
-    # the scenes with kinds has a moving obstacle
+    # the scenes with kinds has a moving obstacle; elastic: a sixth of the scenes has elastic bodies
     own_physics: OwnPhysics = ()
 
     def __post_init__(self) -> None:
@@ -441,7 +441,7 @@ class TrainConfig:
         simulates, frames = self.training.pushforward_fraction > 0, self.dataset.frames
         rule = f"at least {SIMULATED_FRAMES} where training.pushforward_fraction > 0"
         require(not simulates or frames >= SIMULATED_FRAMES, "dataset.frames", rule, frames)
-        names = () if self.imported else self.scene.materials
+        names = () if self.imported else (*self.scene.materials, *({"elastic"} & {*self.scene.own_physics}))
         unknown = [name for name in names if name not in self.network.materials]
         require(not unknown, "network.materials", "all of scene.materials", list(self.network.materials))
 

@@ -16,10 +16,10 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 32_360,
+    "hgn": 32_378,
     "datagen": 8_430,
     "tools": 6_589,
-    "tests": 30_935,
+    "tests": 30_939,
 }
 SETTINGS = 240  # fields of the dataclasses behind the commands, *Config
 

@@ -1,4 +1,4 @@
-"""A scene's own physics: friction of surfaces and parameters of materials, drawn for random scenes.
+"""A scene's own physics: friction of surfaces, parameters of materials and elastic bodies of random scenes.
 
 Shape legend: N particles, P parameters in the order of `INPUT_PARAMETERS`.
 """
@@ -12,13 +12,15 @@ from typing import Any
 
 import numpy as np
 
-from hgn.config import MpmConfig
+from hgn.config import MpmConfig, SceneConfig
 from hgn.scene.kinds import FASTEST
 from hgn.scene.material import INPUT_PARAMETERS, LOGARITHMIC, acts_on
 from hgn.scene.scene import Scene
 
 SMOOTH, NOMINAL = 1 / 3, 1 / 2  # fractions of scenes without friction, and with the defaults of all parameters
-_STREAM = 6  # key of the random stream; the scene's other numbers do not depend on it
+ELASTIC = 1 / 6  # fraction of scenes with elastic bodies, half of them without other materials
+ELASTIC_KINDS = ("obstacles", "motion", "collision", "drop", "slope", "edge", "stack", "apart", "bowl", "stairs", "jet")
+_STREAM, _ELASTIC_STREAM = 6, 7  # keys of random streams; the scene's other numbers do not depend on them
 NOMINAL_P = tuple(float(getattr(MpmConfig(), name)) for name in INPUT_PARAMETERS)
 
 
@@ -41,6 +43,16 @@ def own_ranges(drawn: Sequence[str]) -> dict[str, tuple[float, float]]:
     ranges |= {"moving": (0.0, FASTEST)} if "moving" in drawn else {}
     defaults = zip(INPUT_PARAMETERS.items(), NOMINAL_P, strict=True) if "parameters" in drawn else ()
     return ranges | {name: (min(low, nominal), high) for (name, (low, high)), nominal in defaults}
+
+
+def with_elastic_bodies(config: SceneConfig, seed: int) -> SceneConfig:
+    """Returns the settings of a random scene. A fraction ELASTIC of the scenes draws from elastic bodies too."""
+    drawn, alone = np.random.Generator(np.random.PCG64([seed, _ELASTIC_STREAM])).random(2).tolist()
+    if "elastic" not in config.own_physics or drawn >= ELASTIC:
+        return config
+    materials = ("elastic",) if alone < 0.5 else (*dict.fromkeys(("elastic", *config.materials)),)
+    kinds = {kind: share for kind, share in config.kinds.items() if kind in ELASTIC_KINDS and share > 0}
+    return replace(config, materials=materials, kinds=kinds or config.kinds)
 
 
 def with_drawn_physics(scene: Scene, drawn: Sequence[str], seed: int) -> Scene:

@@ -13,6 +13,7 @@ import numpy as np
 from hgn.config import SceneConfig
 from hgn.scene.funnel import Funnel, draw_funnel
 from hgn.scene.group import WALL_CELLS, Region, points_in_ball, random_direction, region_of
+from hgn.scene.own_physics import with_elastic_bodies
 from hgn.scene.placement import (
     CLEARANCE_CELLS,
     ROUNDING,
@@ -58,7 +59,7 @@ def generate_scene(config: SceneConfig, seed: int) -> Scene:
     Raises: ConfigError if an item does not fit. The message names the setting to change.
     """
     require(isinstance(seed, int) and seed >= 0, "seed", "a whole number >= 0", seed)
-    kind = None
+    kind, config = None, with_elastic_bodies(config, seed)
     if config.kinds:
         kind, drawn = draw_layout(config, seed)
         if isinstance(drawn, Layout):

@@ -144,8 +144,11 @@ class Layout:
         self.bodies.append(filled(self.config, shape, region, chosen, np.array(velocity), rng=self.rng))
 
     def body(self, size: float, centre: Vector, velocity: Vector = (0.0, 0.0, 0.0), material: str = "") -> None:
-        """Adds a cube or a ball."""
-        self.add(self.one_of("cube", "sphere"), (size, size, size), centre, velocity, material)
+        """Adds a cube or a ball; where all bodies are elastic, also a beam."""
+        shapes = ("cube", "sphere", "box") if self.config.materials == ("elastic",) else ("cube", "sphere")
+        shape = self.one_of(*shapes)
+        sides = (1.6 * size, 0.4 * size, 0.4 * size) if shape == "box" else (size, size, size)
+        self.add(shape, sides, centre, velocity, material)
 
     def cube(self, size: float, centre: Vector, material: str) -> None:
         """Adds a cube at rest."""

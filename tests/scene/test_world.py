@@ -15,6 +15,7 @@ from hgn.data.identity import dataset_identity
 from hgn.scene.distance import contains
 from hgn.scene.group import WALL_CELLS
 from hgn.scene.kinds import SCENE_KINDS, fastest
+from hgn.scene.own_physics import with_elastic_bodies
 from hgn.scene.random_scene import generate_scene
 from hgn.scene.rotation import quaternion_rotation
 from hgn.scene.world import DOMAINS, MAXIMUM_PARTICLES, NEAR_WALL, NEAREST_CELLS, RANGES, draw_kind
@@ -161,6 +162,22 @@ def test_a_kind_that_fits_into_no_domain_is_refused():
     """The kind is named, and what to change."""
     with pytest.raises(ConfigError, match=r"kinds must be of scenes that fit .* got jet; raise domain_size or leave"):
         generate_scene(SceneConfig(domain_size=(0.4, 1.0, 0.4), kinds={"jet": 1.0}), 0)
+
+
+def test_a_sixth_of_the_scenes_draws_elastic_bodies():
+    """Only kinds of solid bodies, half of them of no other material, beams too; other scenes stay as they are."""
+    plain = SceneConfig(domain_size=LARGEST, kinds={"pool": 9.0, "drop": 1.0}, particles_per_cell=0.1)
+    config = replace(plain, own_physics=("elastic",))
+    drawn = {seed: own for seed in range(600) if (own := with_elastic_bodies(config, seed)) is not config}
+    assert 70 < len(drawn) < 130 and all(own.kinds == {"drop": 1.0} for own in drawn.values())
+    alone = [seed for seed, own in drawn.items() if own.materials == ("elastic",)]
+    assert 0.35 < len(alone) / len(drawn) < 0.65
+    groups = [generate_scene(config, seed).specification["groups"][0] for seed in alone[:20]]
+    assert {(group["material"], group["shape"]) for group in groups} == {
+        ("elastic", s) for s in ("cube", "sphere", "box")
+    }
+    seed = next(seed for seed in range(600) if seed not in drawn)
+    assert digest(generate_scene(config, seed)) == digest(generate_scene(plain, seed))
 
 
 def test_kinds_belong_to_the_identity_of_a_data_set():
