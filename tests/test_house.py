@@ -19,7 +19,7 @@ LINES = {  # of Python, in tracked files
     "hgn": 32_378,
     "datagen": 8_430,
     "tools": 6_589,
-    "tests": 30_939,
+    "tests": 30_932,
 }
 SETTINGS = 240  # fields of the dataclasses behind the commands, *Config
 
