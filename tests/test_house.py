@@ -16,7 +16,7 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 32_378,
+    "hgn": 32_383,
     "datagen": 8_430,
     "tools": 6_589,
     "tests": 30_932,

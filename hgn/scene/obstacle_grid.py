@@ -93,31 +93,36 @@ def surface_planes(grid: ObstacleGrid) -> tuple[ObstacleGrid, np.ndarray]:
     disk, perpendicular to the line to the centre; its normal points to the centre, its friction is that cell's.
     """
     own_K3 = np.zeros_like(grid.normal_K3) if grid.point_K3 is None else grid.point_K3
-    step_D3 = np.mgrid[-REACH_CELLS : REACH_CELLS + 1, -REACH_CELLS : REACH_CELLS + 1, -REACH_CELLS : REACH_CELLS + 1]
-    step_D13 = step_D3.reshape(3, -1).T[:, None]
-    away_DK3 = step_D13.astype(np.float32) - own_K3  # from the mean point to the centre of each cell around
-    height_DK = (away_DK3 * grid.normal_K3).sum(-1)
-    along_DK3 = away_DK3 - height_DK[..., None] * grid.normal_K3
-    length_DK = np.sqrt((along_DK3 * along_DK3).sum(-1))
-    inside_DK = np.minimum(1, DISK_CELLS / np.maximum(length_DK, DISK_CELLS))
-    away_DK3 -= inside_DK[..., None] * along_DK3
-    distance_DK = np.sqrt((away_DK3 * away_DK3).sum(-1))
-    here_DK = np.broadcast_to(~step_D13.any(-1), distance_DK.shape)
-    near_DK = here_DK | (distance_DK <= REACH_CELLS + 0.5)
-    d_P, k_P = np.nonzero(near_DK)
-    cell_P3 = grid.cell_K3[k_P].astype(np.int64) + step_D13[d_P, 0]
-    distance_P, here_P = distance_DK[d_P, k_P], here_DK[d_P, k_P]
-    order_P = np.lexsort((k_P, np.where(here_P, -1, distance_P), *cell_P3.T[::-1]))
-    first_P = np.ones(len(order_P), bool)
-    first_P[1:] = (np.diff(cell_P3[order_P], axis=0) != 0).any(axis=1)
-    chosen_B = order_P[first_P]
-    d_B, k_B, here_B, distance_B = d_P[chosen_B], k_P[chosen_B], here_P[chosen_B], distance_P[chosen_B]
-    towards_B3 = away_DK3[d_B, k_B] / np.maximum(distance_B, 1e-6)[:, None]
-    normal_B3 = np.where(here_B[:, None], grid.normal_K3[k_B], towards_B3).astype(np.float32)
-    own_B = (grid.normal_K3 * own_K3).sum(-1)[k_B]
-    offset_B = grid.cell_size * np.where(here_B, own_B, -distance_B)
+    normal_K3, own_K3 = grid.normal_K3.astype(np.float64), own_K3.astype(np.float64)
+    around = slice(-REACH_CELLS, REACH_CELLS + 1)
+    step_D3 = np.mgrid[around, around, around].reshape(3, -1).T
+    # from a cell's mean point to the centre of each cell around: its square, its parts across and along the disk
+    own_K = (normal_K3 * own_K3).sum(axis=1)
+    height_DK = step_D3 @ normal_K3.T - own_K
+    square_DK = (step_D3 * step_D3).sum(axis=1)[:, None] - 2 * step_D3 @ own_K3.T + (own_K3 * own_K3).sum(axis=1)
+    along_DK = np.sqrt(np.maximum(square_DK - height_DK * height_DK, 0))
+    distance_DK = np.hypot(height_DK, np.maximum(along_DK - DISK_CELLS, 0))
+    distance_DK[len(step_D3) // 2] = -1.0  # the cell itself, which comes first
+    d_P, k_P = np.nonzero(distance_DK <= REACH_CELLS + 0.5)
+    # a number for each cell, in the order of its coordinates
+    low_3 = grid.cell_K3.min(axis=0, initial=0).astype(np.int64) - REACH_CELLS
+    extent_3 = grid.cell_K3.max(axis=0, initial=0) - low_3 + REACH_CELLS + 1
+    stride_3 = np.array([extent_3[1] * extent_3[2], extent_3[2], 1])
+    number_P = ((grid.cell_K3 - low_3) @ stride_3)[k_P] + (step_D3 @ stride_3)[d_P]
+    order_P = np.lexsort((distance_DK[d_P, k_P], number_P))
+    chosen_B = order_P[np.diff(number_P[order_P], prepend=-1) != 0]
+    d_B, k_B = d_P[chosen_B], k_P[chosen_B]
+    distance_B, along_B, height_B = (value_DK[d_B, k_B] for value_DK in (distance_DK, along_DK, height_DK))
+    across_B3 = height_B[:, None] * normal_K3[k_B]
+    beyond_B = np.maximum(1 - DISK_CELLS / np.maximum(along_B, DISK_CELLS), 0)
+    away_B3 = across_B3 + beyond_B[:, None] * (step_D3[d_B] - own_K3[k_B] - across_B3)
+    here_B = distance_B < 0
+    away_B3 /= np.maximum(distance_B, 1e-6)[:, None]
+    normal_B3 = np.where(here_B[:, None], normal_K3[k_B], away_B3).astype(np.float32)
+    offset_B = grid.cell_size * np.where(here_B, own_K[k_B], -distance_B)
     friction_B = None if grid.friction_K is None else grid.friction_K[k_B]
-    near = ObstacleGrid(grid.cell_size, cell_P3[chosen_B].astype(np.int32), normal_B3, friction_B)
+    cell_B3 = grid.cell_K3[k_B] + step_D3[d_B].astype(np.int32)
+    near = ObstacleGrid(grid.cell_size, cell_B3, normal_B3, friction_B)
     return near, offset_B.astype(np.float32)
 
 
