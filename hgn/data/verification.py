@@ -10,7 +10,7 @@ from hgn.system.files import open_at_once
 
 
 class StorageError(ConfigError):
-    """A file of a data set is missing, refused, cut, altered or not JSON, perhaps temporarily."""
+    """A file of a data set is missing, refused, incomplete, altered or not JSON, perhaps temporarily."""
 
 
 _verified: set[tuple[str | int, ...]] = set()  # identities of the files that this process has verified

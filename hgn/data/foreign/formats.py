@@ -145,7 +145,7 @@ def _material(value: object, folder: Path) -> str:
 def read_split(folder: Path, split: str, info: SetInfo) -> Iterator[Trajectory]:
     """Yields the trajectories of a split in the order of their names; none if there is no file.
 
-    Raises: ConfigError naming file, trajectory and field that is missing, cut, altered or of a wrong type.
+    Raises: ConfigError naming file, trajectory and field that is missing, incomplete, altered or of a wrong type.
     """
     return (_of_members(name, members, info) for name, members in _READERS[info.format](folder, split, info))
 
