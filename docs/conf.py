@@ -39,6 +39,7 @@ _INTERNAL = (
 _INTERNAL += (
     "step_config.StepConfig",
     "runtime.torch_backend.Backend",
+    "scene.moving.MovingObstacle",
     "scene.obstacle_grid.ObstacleGrid",
     "scene.episode.Episode",
 )
