@@ -93,6 +93,7 @@ REMOVED: dict[str, Removed] = {
     "bench.public_gns": Removed(remedy=REPORTS_COMMIT),
     "bench.rounds": Removed(50, "set seconds for a shorter measurement"),
     "error_vs_time.earlier": Removed(remedy="leave it out: make docs draws the figures from the JSON"),
+    "error_vs_time.seconds": Removed(None, "take fewer scenes; after Ctrl-C the file has what was measured"),
     "error_vs_time.times_last": Removed(False),
     "scaling.rounds": Removed(20, "set seconds for a shorter measurement"),
     "render.gif": Removed(True, "give a file that ends in .png as out for a picture without animation"),

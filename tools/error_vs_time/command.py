@@ -27,9 +27,7 @@ from hgn.schema import ConfigError, from_mapping, from_stored, require, require_
 from hgn.system.device import choose_device
 from hgn.system.machine import available_cpus
 from tools.error_vs_time.contenders import (
-    COARSE_GRIDS,
     PARTICLES_AT_ONCE,
-    SAME_GRID,
     BaselineContender,
     Contender,
     FallingContender,
@@ -46,8 +44,6 @@ from tools.solver_rollouts import Setting, SolverLaunches
 
 REFERENCE_STEP = 0.25  # of the limit of stability, on the data's own grid
 STEPS = (1.0, 0.5)  # of the solver, fractions of the limit of stability
-COMPILING_FRACTION = 0.4  # of the seconds given, until when compilation is waited for
-ORDER = ("tf32", "fp16", "fp32")  # the most informative precision first
 
 
 def main(mapping: dict[str, Any]) -> int:
@@ -80,8 +76,7 @@ def main(mapping: dict[str, Any]) -> int:
     contenders = [*networks, *baseline_contenders(store, device, wall_thickness(mpm, own_cell)), *solvers]
     for solver in solvers:
         solver.launches.add(solver.setting)
-    limit = None if config.seconds is None else started + COMPILING_FRACTION * config.seconds
-    with _precompilation(networks, episodes, device, limit):
+    with _precompilation(networks, episodes, device):
         references: Sequence[Episode] = episodes
         left_out: dict[str, str] = {}
         if resimulate:
@@ -122,11 +117,9 @@ def network_contenders(
     for file in files:
         hgn = load_weights(file)[1].network.kind == "hgn"
         precisions = config.precisions or (("fp32",) if device.type != "cuda" else PRECISIONS if hgn else ("tf32",))
-        first = min(precisions, key=ORDER.index)
         for precision in precisions:
             try:
-                named = file, precision, device, episodes[0].frame_rate_hz
-                contenders.append(NetworkContender(*named, first=precision == first))
+                contenders.append(NetworkContender(file, precision, device, episodes[0].frame_rate_hz))
             except ConfigError as error:
                 if precision != "fp16":
                     raise
@@ -173,9 +166,9 @@ def require_fits(file: Path, episodes: Sequence[Episode], field: str) -> None:
 
 @contextmanager
 def _precompilation(
-    networks: Sequence[NetworkContender], episodes: Sequence[Episode], device: torch.device, limit: float | None
+    networks: Sequence[NetworkContender], episodes: Sequence[Episode], device: torch.device
 ) -> Iterator[None]:
-    """Compiles kernels of whole frames in other processes meanwhile, and waits for them until a time at most."""
+    """Compiles kernels of whole frames in other processes meanwhile, and then waits for them."""
     whole = [contender for contender in networks if not contender.stepped]
     ahead = None
     if whole:
@@ -187,7 +180,7 @@ def _precompilation(
     with ahead if ahead is not None else nullcontext():
         yield
         if ahead is not None:
-            print(ahead.wait(lambda: limit is not None and time.monotonic() > limit), file=sys.stderr)
+            print(ahead.wait(), file=sys.stderr)
 
 
 def baseline_contenders(store: EpisodeStore, device: torch.device, wall: float) -> list[Contender]:
@@ -215,8 +208,7 @@ def solver_contenders(
     step = REFERENCE_STEP if resimulate else mpm.stability_fraction
 
     def solver(grid: int, step: float, perturbation: float = 0.0, **named: Any) -> SolverContender:
-        importance = SAME_GRID if grid == own_grid else COARSE_GRIDS
-        return SolverContender(launches(grid), Setting(step, perturbation), config.mpm_frames, importance, named)
+        return SolverContender(launches(grid), Setting(step, perturbation), config.mpm_frames, named)
 
     contenders = [solver(grid, step) for grid in config.mpm_grids for step in STEPS]
     if config.perturbation:

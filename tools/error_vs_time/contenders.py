@@ -34,8 +34,6 @@ Row = dict[str, Any]
 PARTICLES_PER_BATCH = 32_768
 PARTICLES_AT_ONCE = 150_000  # particles per batch of one-step errors with backend triton
 REST_SPEED = 1e-4  # domain units per frame; slower particles are at rest
-# The order of measurements. The last ones are left out if the time limit is reached.
-HGN_FIRST, SAME_GRID, GNS_FIRST, COARSE_GRIDS, OTHER_PRECISIONS = range(5)
 
 
 @dataclass
@@ -51,7 +49,6 @@ class Contender:
     """Describes a row of the report, and computes its errors."""
 
     row: Row  # system and settings
-    importance = SAME_GRID  # 0 is scored first
     all_at_once = False  # simulates all scenes side by side, instead of score.BATCH_SCENES
     stepped = True  # computes frames one by one, without captured or compiled programs
 
@@ -70,13 +67,8 @@ class Contender:
 class NetworkContender(Contender):
     """Runs a weights file at one precision of its matrix products, on the fastest backend."""
 
-    def __init__(
-        self, file: Path, precision: str, device: torch.device, frame_rate_hz: float, first: bool = True
-    ) -> None:
-        """Takes with `first` the precision of these weights that is measured before the other precisions.
-
-        Raises: ConfigError if no backend supports the precision.
-        """
+    def __init__(self, file: Path, precision: str, device: torch.device, frame_rate_hz: float) -> None:
+        """Raises: ConfigError if no backend supports the precision."""
         self.file, self.device, self.precision = file, device, precision
         self.network, info = load_weights(file, device)
         require_frame_rate(info, frame_rate_hz)
@@ -85,7 +77,6 @@ class NetworkContender(Contender):
             chosen = choose(device, self.network, precision, "auto")
             self.simulator = Simulator(self.network, info.frame_rate_hz, chosen)
         self.stepped = chosen.stepped
-        self.importance = OTHER_PRECISIONS if not first else HGN_FIRST if config.kind == "hgn" else GNS_FIRST
         self.row = {
             "system": config.kind,
             "weights": file.name,
@@ -123,11 +114,9 @@ class SolverContender(Contender):
 
     all_at_once = True  # a single scene uses only a few of a GPU's processors
 
-    def __init__(
-        self, launches: SolverLaunches, setting: Setting, frames: int, importance: int, named: Row | None = None
-    ) -> None:
+    def __init__(self, launches: SolverLaunches, setting: Setting, frames: int, named: Row | None = None) -> None:
         """Takes the length `frames` of rollouts that are not timed; `named` replaces the row made from the settings."""
-        self.launches, self.setting, self.frames, self.importance = launches, setting, frames, importance
+        self.launches, self.setting, self.frames = launches, setting, frames
         grid = round(1 / launches.cell_size)
         self.row = named or {"system": "mpm", "grid": grid, "step": setting.step, "precision": "fp32"}
 

@@ -26,7 +26,6 @@ from tools.error_vs_time.settings import UNTIMED, ErrorVsTimeConfig
 from tools.report import finite, write_report
 from tools.timing import Stopwatch
 
-START_FRACTION, ROUND_FRACTION = 0.85, 0.95  # of the seconds given, until which contenders and rounds may start
 ROUNDS = 2  # of each timed scene
 DRAWN_EVERY_S = 60.0  # figures take some seconds
 Row = dict[str, Any]
@@ -63,27 +62,17 @@ class Run:
     def rows(self) -> list[Row]:
         return [self._rows[i] for i in sorted(self._rows)]
 
-    def is_past(self, fraction: float) -> bool:
-        """Says whether this fraction of the given time is over."""
-        return self.config.seconds is not None and time.monotonic() - self.started > fraction * self.config.seconds
-
     def measure(self) -> None:
-        """Scores and times every contender in order of importance, then repeats the timing in turns."""
-        order = sorted(range(len(self.contenders)), key=lambda i: self.contenders[i].importance)
-        with bar("contenders", total=len(order), unit="contender") as progress:
-            for i in order:
-                # the baselines, which take no time, are in every report
-                if not self.is_past(START_FRACTION) or self.contenders[i].row["system"] == "baseline":
-                    self._attempt(i, self._errors)
-                    self._attempt(i, self._times)
-                else:
-                    self._leave_out(i, "the time was over")
+        """Scores and times every contender, then repeats the timing in turns."""
+        with bar("contenders", total=len(self.contenders), unit="contender") as progress:
+            for i in range(len(self.contenders)):
+                self._attempt(i, self._errors)
+                self._attempt(i, self._times)
                 self.write(drawn=time.monotonic() - self._drawn > DRAWN_EVERY_S)
                 progress.update()
         for _ in range(1, ROUNDS):
             for i in sorted(self.watches):
-                if not self.is_past(ROUND_FRACTION):
-                    self._attempt(i, self._time)
+                self._attempt(i, self._time)
         self.write()
 
     def write(self, drawn: bool = False) -> None:

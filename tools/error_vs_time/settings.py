@@ -36,7 +36,6 @@ class ErrorVsTimeConfig(ReportConfig):
     resimulate: bool = True  # false: the data is the reference; with mpm_grids=[] perturbation=0 no solver runs
     # initial displacement, domain units, by which the solver is compared with itself (chaos floor); 0: no such row
     perturbation: NonNegative[float] = 1e-6
-    seconds: Positive[float] | None = None  # time limit, after which no measurement starts; null: none
 
     def __post_init__(self) -> None:
         require_bounds(self)
