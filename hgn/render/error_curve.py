@@ -68,10 +68,7 @@ def position_error(rollout: Rollout) -> dict[str, np.ndarray]:
 
     def mean(of_material_N: np.ndarray) -> np.ndarray:
         counted_TN = shown_TN & of_material_N
-        total_T = np.where(counted_TN, square_TN, 0.0).sum(axis=1)
-        return np.asarray(
-            np.divide(total_T, counted_TN.sum(axis=1), out=np.full(frames, np.nan), where=counted_TN.any(axis=1))
-        )
+        return np.asarray(np.ma.array(square_TN, mask=~counted_TN).mean(axis=1).filled(np.nan))
 
     error = {"all": mean(rollout.material_N == rollout.material_N)}
     materials = np.unique(rollout.material_N)

@@ -85,16 +85,22 @@ def frame_batches(
     rank: int = 0,
     world_size: int = 1,
 ) -> Iterator[Batch]:
-    """Yields batches of every stride-th frame of every episode. Each rank takes an equal part of the frames."""
+    """Returns batches of every stride-th frame of every episode. Each rank takes an equal part of the frames."""
     config = network.config
     pairs = [(e, n) for e in episodes for n in range(0, len(e.position_TN3) - 1, stride)][rank::world_size]
-    while pairs:
-        taken, particles = 0, 0
-        while taken < len(pairs) and (taken == 0 or particles < particles_per_batch):
-            particles += len(pairs[taken][0].material_N)
-            taken += 1
-        yield make_batch(pairs[:taken], config)
-        pairs = pairs[taken:]
+    return (make_batch(group, config) for group in groups_of_frames(pairs, particles_per_batch))
+
+
+def groups_of_frames(
+    pairs: Sequence[tuple[Episode, int]], most: int = PARTICLES_PER_BATCH
+) -> Iterator[Sequence[tuple[Episode, int]]]:
+    """Divides episodes with their frames into groups. A group ends when it has `most` particles or more."""
+    before_P = np.cumsum([0, *(episode.particle_count for episode, _ in pairs)])
+    first = 0
+    while first < len(pairs):
+        stop = max(first + 1, int(np.searchsorted(before_P, before_P[first] + most)))
+        yield pairs[first:stop]
+        first = stop
 
 
 def one_step_errors(

@@ -17,7 +17,7 @@ from hgn.runtime.backend import fastest_stepped
 from hgn.runtime.simulation import Simulation
 from hgn.scene.episode import Episode
 from hgn.scene.history import window
-from hgn.training.errors import PARTICLES_PER_BATCH
+from hgn.training.errors import groups_of_frames
 from hgn.training.pushforward import simulated_barrier
 
 
@@ -40,15 +40,7 @@ class TorchScenes:
         return torch.tensor(episode.domain_size)
 
     def groups(self, starts: Sequence[tuple[Episode, int]]) -> list[Sequence[tuple[Episode, int]]]:
-        groups: list[list[tuple[Episode, int]]] = []
-        capacity = 0  # remaining capacity of the last group, in particles
-        for start in starts:
-            if capacity <= 0:
-                groups.append([])
-                capacity = PARTICLES_PER_BATCH
-            groups[-1].append(start)
-            capacity -= len(start[0].material_N)
-        return [*groups]
+        return list(groups_of_frames(starts))
 
     def simulate(self, starts: Sequence[tuple[Episode, int]], frames: int) -> list[torch.Tensor]:
         batch = make_batch(starts, self._network.config).to(self._backend.device)

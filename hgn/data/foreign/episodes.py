@@ -25,17 +25,6 @@ AT_REST = 1e-3  # largest motion of a boundary's particles, in radii
 OUTSIDE = 0.01  # largest fraction of particles that may start more than a radius outside the box
 
 
-@dataclass(frozen=True)
-class Outside:
-    """The particle of a trajectory that goes farthest out of the bounds."""
-
-    trajectory: str
-    excess: float  # distance from the bound, in the set's unit of length
-    axis: int
-    frame: int  # number of the frame in the file
-    coordinate: float
-
-
 @dataclass(eq=False)
 class Converter:
     """Converts the trajectories of a set, and records their content."""
@@ -48,8 +37,8 @@ class Converter:
     gravities: set[Vector] = field(default_factory=set)
     maximum_initial_speed: float = 0.0  # length per second
     with_obstacles: bool = False
-    # one entry for each trajectory that leaves the bounds by more than a radius
-    outside: list[Outside] = field(default_factory=list)
+    # for each trajectory that leaves the bounds by more than a radius: how far, and where
+    outside: list[tuple[float, str]] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         names = self.info.materials.values()
@@ -160,21 +149,20 @@ class Converter:
         above, axis = (int(index) for index in np.unravel_index(excess_2D.argmax(), excess_2D.shape))
         excess, path_TN = float(excess_2D[above, axis]), position_TND[..., axis]
         if excess > self.info.radius:
-            place = path_TN.argmax() if above else path_TN.argmin()
-            frame = int(place) // path_TN.shape[1]
-            self.outside.append(Outside(name, excess, axis, frame, float(path_TN.flat[place])))
+            place = int(path_TN.argmax() if above else path_TN.argmin())
+            low, high = self.info.bounds[axis]
+            where = f"those of {name} to {'xyz'[axis]} = {float(path_TN.flat[place]):.4g} in frame "
+            where += f"{place // path_TN.shape[1]}, where bounds are [{low}, {high}]"
+            self.outside.append((excess, where))
 
     def note_on_bounds(self, converted: int) -> str | None:
         """Returns a warning about the trajectories that left their bounds, or None."""
         if not self.outside:
             return None
-        farthest = max(self.outside, key=lambda outside: outside.excess)
-        low, high = self.info.bounds[farthest.axis]
         return (
             f"bounds: particles of {len(self.outside)} of {converted} trajectories go farther out of them than a "
-            f"radius ({self.info.radius:g}), those of {farthest.trajectory} to {'xyz'[farthest.axis]} = "
-            f"{farthest.coordinate:.4g} in frame {farthest.frame}, where bounds are [{low}, {high}]; networks take "
-            "them for walls: give bounds=… around all particles, or leave these trajectories out"
+            f"radius ({self.info.radius:g}), {max(self.outside)[1]}; networks take them for walls: give bounds=… "
+            "around all particles, or leave these trajectories out"
         )
 
     def _require_not_across(self, name: str, free_TN3: np.ndarray) -> None:
