@@ -16,10 +16,10 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 32_367,
+    "hgn": 32_361,
     "datagen": 8_430,
     "tools": 6_558,
-    "tests": 30_923,
+    "tests": 31_069,
 }
 SETTINGS = 240  # fields of the dataclasses behind the commands, *Config
 

@@ -33,12 +33,6 @@ class MovingObstacle:
         cell_size = self.grid.cell_size
         return barrier_of_pieces(barrier_pieces(self.corner_F33, cell_size), cell_size, clearance)
 
-    def distance(self, begin: float, end: float) -> float:
-        """Returns the largest displacement of its corners between two times in seconds, domain units."""
-        corner_P3 = self.corner_F33.reshape(-1, 3)
-        way_P3 = self.motion.place(corner_P3, end) - self.motion.place(corner_P3, begin)
-        return float(np.linalg.norm(way_P3, axis=1).max(initial=0.0))
-
 
 def at_rest(obstacles: Sequence[Obstacle]) -> tuple[Obstacle, ...]:
     """Returns those obstacles that do not move."""

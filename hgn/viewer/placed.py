@@ -122,7 +122,7 @@ def moved_from(before: PlacedObstacle, after: PlacedObstacle, frame_s: float) ->
     grid = grid_of_samples(*before.samples, before.body.cell_size)
     friction_K = np.full(len(grid.cell_K3), mesh.friction or 0.0, np.float32)
     moving = MovingObstacle(dataclasses.replace(grid, friction_K=friction_K), mesh.corners, motion)
-    return moving if 0 < moving.distance(0.0, frame_s) <= JUMP else None
+    return moving if 0 < motion.fastest(mesh.vertex_V3) * frame_s <= JUMP else None
 
 
 def with_obstacles(

@@ -89,6 +89,7 @@ def test_automatic_precision(precision, device, backend, expected):
         (GPU, {"width": 48}, "tf32", "not 48"),
         (GPU, {}, "fp32", "in tf32 or fp16, not fp32"),
         (GPU, {"levels": 9}, "tf32", "at most 8"),
+        (GPU, {"inputs": "relative", "own_physics": ("moving",)}, "tf32", "obstacles at rest"),
     ],
 )
 def test_why_backend_triton_does_not_run(device, network, precision, reason):

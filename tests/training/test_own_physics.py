@@ -1,4 +1,4 @@
-"""Friction and parameters on their way from drawn scenes through shards, batches, training and export to a rollout."""
+"""Friction, parameters and moving obstacles from drawn scenes through shards, batches and training to a rollout."""
 
 from dataclasses import replace
 
@@ -9,13 +9,14 @@ from equality import assert_same
 from training.runs import train_mapping
 
 from hgn import rollout, train
-from hgn.config import SceneConfig
+from hgn.config import NetworkConfig, SceneConfig
 from hgn.data.batch import make_batch
 from hgn.data.reader import EpisodeStore
 from hgn.export import export
 from hgn.runtime.simulator import Simulator
 from hgn.runtime.weights import load_weights
 from hgn.scene.episode import decode_episode, encode_episode
+from hgn.scene.moving import at_rest
 from hgn.scene.obstacle_grid import build_obstacle_grid
 from hgn.scene.own_physics import own_ranges
 from hgn.scene.random_scene import generate_scene
@@ -23,7 +24,7 @@ from hgn.training.checkpoint import network_of_checkpoint, read_checkpoint
 from hgn.training.module import TrainingModule
 from hgn.training.stop import StopRequest
 
-OWN = ("friction", "parameters")
+OWN = ("friction", "parameters", "moving")
 MORE = {"symmetry": "gravity", "ema_decay": 0.8, "pushforward_fraction": 0.5, "pushforward_every": 4}
 MORE |= {"pushforward_scenes": 2, "pushforward_frames": 2, "maximum_updates": 8, "monitor_every": 1000}
 
@@ -35,7 +36,7 @@ def test_from_shards_to_a_rollout(make_config, make_dataset, tmp_path, monkeypat
     scenes = []
     generate = lambda config, seed: scenes.append(generate_scene(config, seed)) or scenes[-1]  # noqa: E731
     monkeypatch.setattr(ballistic_solver, "generate_scene", generate)
-    grid = lambda *_: build_obstacle_grid(scenes[-1].obstacles, 1 / 64, 0, scenes[-1].domain_size)  # noqa: E731
+    grid = lambda *_: build_obstacle_grid(at_rest(scenes[-1].obstacles), 1 / 64, 0, scenes[-1].domain_size)  # noqa: E731
     monkeypatch.setattr(ballistic_solver, "build_obstacle_grid", grid)
     kinds = {"slope": 2.0, "column": 1.0}
     scene = SceneConfig(domain_size=(2.0, 1.5, 1.5), kinds=kinds, own_physics=OWN, particles_per_cell=0.2)
@@ -45,11 +46,15 @@ def test_from_shards_to_a_rollout(make_config, make_dataset, tmp_path, monkeypat
     rough = [any(episode.wall_friction) for episode in episodes]
     assert 3 < sum(rough) < 12 and 2 < sum(episode.parameters is not None for episode in episodes) < 10
     drawn = {scene.seed: scene for scene in scenes}
+    inputs = NetworkConfig(inputs="local", own_physics=OWN)
+    assert sum(make_batch([(episode, 3)], inputs).moving is not None for episode in episodes) > 1
     for episode in episodes:
         scene, members = drawn[episode.seed], encode_episode(episode)
         assert encode_episode(decode_episode(episode.key, members)) == members
         assert episode.wall_friction == scene.wall_friction
-        frictions = {np.float32(obstacle.friction) for obstacle in scene.obstacles if obstacle.friction is not None}
+        frictions = {
+            np.float32(obstacle.friction) for obstacle in at_rest(scene.obstacles) if obstacle.friction is not None
+        }
         assert frictions == set(() if episode.obstacle_grid.friction_K is None else episode.obstacle_grid.friction_K)
 
     # without members of their own, obstacle cells and particles have what the solver was set to

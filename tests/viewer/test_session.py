@@ -106,6 +106,23 @@ def test_obstacles_that_are_moved_hold(session):
     assert (steps(session, 2)[:, 1] < 0.3).all()
 
 
+def test_a_dragged_obstacle_carries_particles_along(session):
+    """With weights that see motion a plate that is dragged up lifts particles by its displacement in a frame, and rests
+    afterwards; a jump has no velocity."""
+    session.use_weights(free_flight(obstacle_clearance=1e-3, own_physics=("moving",)))
+    for obstacle in session.obstacles:
+        session.remove_obstacle(obstacle.body.number)
+    plate = session.add_obstacle(ObstacleEntry(shape="square", size=0.6, position=(0.5, 0.3, 0.5)), Path())
+    steps(session, 30)
+    for height in (0.31, 0.34, 0.41):
+        session.move_obstacle(replace(plate, position=(0.5, height - 5e-3, 0.5)))
+        session.move_obstacle(replace(plate, position=(0.5, height, 0.5)))
+        assert session.live.state.moving.poses.shift_V3[0, 1] > 0.005
+        assert (steps(session, 1)[:, 1] > height).all() and not session.live.state.moving.poses.shift_V3.any()
+    session.move_obstacle(replace(plate, position=(0.5, 0.6, 0.5)))
+    assert session.live.state.moving is None
+
+
 def test_nothing_enters_where_there_is_no_place(session):
     """Not among particles, not in closed obstacles, not beyond the limit, not in the walls."""
     assert session.drop("water", (0.5, 0.5, 0.5), 0.06) == 0
