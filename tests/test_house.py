@@ -19,7 +19,7 @@ LINES = {  # of Python, in tracked files
     "hgn": 32_361,
     "datagen": 8_430,
     "tools": 6_558,
-    "tests": 31_067,
+    "tests": 31_062,
 }
 SETTINGS = 240  # fields of the dataclasses behind the commands, *Config
 
