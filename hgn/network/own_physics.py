@@ -91,6 +91,12 @@ def scaled_parameters(value_NP: torch.Tensor, material_N: torch.Tensor, material
     return torch.stack(columns, -1) * acts_MP.to(value_NP)[material_N]
 
 
+def joined_parameters(parameters: Sequence[torch.Tensor | None], positions: Sequence[torch.Tensor]) -> torch.Tensor:
+    """Returns the columns of several states or episodes one after another, 0 for those with the defaults (None)."""
+    pairs = zip(parameters, positions, strict=True)
+    return torch.cat([x.new_zeros(len(x), len(INPUT_PARAMETERS)) if own is None else own for own, x in pairs])
+
+
 def physics_fields(config: NetworkConfig, scenes: Sequence[Any], material_N: torch.Tensor) -> dict[str, Any]:
     """Returns the fields of a ParticleState for several episodes or initial states, without those that are 0."""
     fields: dict[str, Any] = {}

@@ -20,8 +20,8 @@ import torch
 from hgn.network.elastic import RestShape
 from hgn.network.features import ParticleState
 from hgn.network.grid import GridRangeError
+from hgn.network.own_physics import joined_parameters
 from hgn.runtime.divergence import DivergedError, describe_diverged, diverged
-from hgn.scene.material import INPUT_PARAMETERS
 
 OF_PARTICLES = ("position_N3", "velocity_NM3", "material_N", "scene_N")
 
@@ -240,9 +240,7 @@ def joined(first: ParticleState, second: ParticleState) -> dict[str, Any]:
     both = {name: torch.cat([getattr(first, name), getattr(second, name)]) for name in OF_PARTICLES}
     parameters = (first.parameter_NP, second.parameter_NP)
     if any(own_NP is not None for own_NP in parameters):
-        zeros = (state.position_N3.new_zeros(len(state.scene_N), len(INPUT_PARAMETERS)) for state in (first, second))
-        pairs = zip(parameters, zeros, strict=True)
-        both["parameter_NP"] = torch.cat([zero_NP if own_NP is None else own_NP for own_NP, zero_NP in pairs])
+        both["parameter_NP"] = joined_parameters(parameters, [first.position_N3, second.position_N3])
     rest = RestShape.joined([first.rest, second.rest], [len(first.scene_N), len(second.scene_N)])
     return both if rest is None else both | {"rest": rest}
 

@@ -22,9 +22,9 @@ from hgn.network.cell_keys import COORDINATE_BITS
 from hgn.network.features import ParticleState
 from hgn.network.hgn import HierarchicalGraphNetwork
 from hgn.network.obstacles import ObstacleCells
+from hgn.network.own_physics import joined_parameters
 from hgn.runtime.simulation import Simulation
 from hgn.runtime.triton_stepper import CHECKED_PARTICLES, TritonStepper
-from hgn.scene.material import INPUT_PARAMETERS
 
 SPARE = 1.1  # (capacity for particles) / (particles in the first simulation)
 
@@ -88,9 +88,8 @@ class TritonScenes:
         if "friction" in self._network.config.own_physics:
             own["wall_friction_S3"] = torch.tensor([episode.wall_friction for episode in placed], device=device)
         if "parameters" in self._network.config.own_physics:
-            zeros = (torch.zeros(episode.particles, len(INPUT_PARAMETERS), device=device) for episode in episodes)
-            pairs = zip(episodes, zeros, strict=True)
-            own["parameter_NP"] = torch.cat([zero if e.parameter_NP is None else e.parameter_NP for e, zero in pairs])
+            parameters = [episode.parameter_NP for episode in episodes]
+            own["parameter_NP"] = joined_parameters(parameters, [past_TN3[-1] for past_TN3 in pasts])
         return ParticleState(
             position_N3=past_TN3[-1],
             velocity_NM3=past_TN3.diff(dim=0).flip(0).transpose(0, 1),
