@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
+from itertools import zip_longest
 
 import numpy as np
 import torch
@@ -26,6 +27,7 @@ from hgn.network.barriers import Barriers
 from hgn.network.grid import GridHierarchy
 from hgn.network.obstacles import ObstacleCells, nearest
 from hgn.scene.barrier import barrier_of_pieces
+from hgn.scene.motion import AT_REST
 from hgn.scene.moving import MovingObstacle
 from hgn.scene.obstacle_grid import ObstacleGrid
 
@@ -58,7 +60,7 @@ class Poses:
 
     def undo(self, position_V3: torch.Tensor) -> torch.Tensor:
         """Moves a point of each row to the frame of its cells."""
-        return turned_back(position_V3 - self.place_V3, self.rotation_V33) + self.pivot_V3
+        return turned(position_V3 - self.place_V3, self.rotation_V33.mT) + self.pivot_V3
 
     def put(self, position_V3: torch.Tensor) -> torch.Tensor:
         """Moves a point of each row from the frame of its cells to its pose. Inverts `undo`."""
@@ -71,10 +73,6 @@ class Poses:
 
 def turned(vector_V3: torch.Tensor, matrix_V33: torch.Tensor) -> torch.Tensor:
     return (matrix_V33 @ vector_V3[..., None]).squeeze(-1)
-
-
-def turned_back(vector_V3: torch.Tensor, matrix_V33: torch.Tensor) -> torch.Tensor:
-    return (vector_V3[..., None, :] @ matrix_V33).squeeze(-2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,14 +96,13 @@ class MovingObstacles:
     ) -> MovingObstacles | None:
         """Returns the moving obstacles of scenes as `network` sees them, scene s at frames[s]; None if none moves."""
         network = NetworkConfig() if network is None else network
-        layers = max(map(len, scenes), default=0)
-        if layers == 0:
+        if not any(scenes):
             return None
-        rows = [scene[j] if j < len(scene) else None for j in range(layers) for scene in scenes]
+        rows, cells = [row for layer in zip_longest(*scenes) for row in layer], None
         size = next(row.grid.cell_size for row in rows if row is not None)
         nothing = ObstacleGrid(size, np.zeros((0, 3), np.int32), np.zeros((0, 3), np.float32))
-        grids, cells = [nothing if row is None else row.grid for row in rows], None
         if network.obstacle_features:
+            grids = [nothing if row is None else row.grid for row in rows]
             cells = ObstacleCells.of(grids, network.obstacle_distances)
         own = tuple(map(tuple, scenes))
         moving = MovingObstacles(own, tuple(frames), frame_s, cells, None, poses_of(own, frames, frame_s))
@@ -115,9 +112,8 @@ class MovingObstacles:
         """Returns the obstacles with barriers. Raises: ConfigError for an invalid clearance."""
         size = next(scene[0].grid.cell_size for scene in self.scenes if scene)
         empty = barrier_of_pieces(np.zeros((0, 3, 3)), size, clearance)
-        count = len(self.poses.place_V3) // len(self.scenes)
-        rows = [scene[j].barrier(clearance) if j < len(scene) else empty for j in range(count) for scene in self.scenes]
-        barriers = Barriers.of(rows)
+        rows = (row for layer in zip_longest(*self.scenes) for row in layer)
+        barriers = Barriers.of([empty if row is None else row.barrier(clearance) for row in rows])
         return replace(self, barriers=barriers and barriers.to(self.poses.place_V3.device))
 
     def at(self, frames: Sequence[int]) -> MovingObstacles:
@@ -142,91 +138,71 @@ class MovingObstacles:
     def met(
         self,
         still: ObstacleCells | None,
-        position_N3: torch.Tensor,
-        velocity_N3: torch.Tensor,
-        scene_N: torch.Tensor,
+        place: tuple[torch.Tensor, torch.Tensor, torch.Tensor],
         steps: int,
+        distances: bool = False,
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Returns `relative.obstacle_surfaces` of moving and `still` obstacles, [N, 8], and velocities V [N, 3].
 
-        V is that of the surface at the particle, or else of the first one on its path; 0 without a surface. Where a
-        particle is in cells of several obstacles, normals are summed and shortened to 1; friction and V are means.
+        V is that of the surface at the particle, or else of the one on its path; 0 without a surface. Where a particle
+        is in cells of several obstacles, normals are summed and shortened to 1; friction and V are means. The result
+        with `distances` is `relative.near_obstacles`, and of several obstacles the nearest counts.
         """
-        total = [position_N3.new_zeros(len(position_N3), 8) for _ in range(steps + 1)]  # n, mu, V, number of surfaces
-        if still is not None:
-            for step in range(steps + 1):
-                row_NV = still.surfaces(position_N3 + velocity_N3 * (step / steps), scene_N)
-                total[step] = _counted(pad(row_NV, (0, 7 - row_NV.shape[1])))
-        assert self.cells is not None
-        for row_N, pose in self.rows(scene_N, position_N3.dtype):
-            own_N3, surface_N3 = pose.undo(position_N3), pose.velocity(position_N3)
-            way_N3 = turned_back(velocity_N3 - surface_N3, pose.later.rotation_V33)
-            for step in range(steps + 1):
-                row_N4 = self.cells.rows_at(self.cells.surface_rows, own_N3 + way_N3 * (step / steps), row_N)
-                normal_N3 = turned(row_N4[:, :3], pose.rotation_V33)
-                total[step] = total[step] + _counted(torch.cat([normal_N3, row_N4[:, 3:], surface_N3], -1))
-        mean = [_mean(total_N8) for total_N8 in total]
-        ahead_N7 = mean[-1]
-        for mean_N7 in mean[-2:0:-1]:
-            ahead_N7 = torch.where(mean_N7[:, :3].any(-1, keepdim=True), mean_N7, ahead_N7)
-        first_N7 = torch.where(mean[0][:, :3].any(-1, keepdim=True), mean[0], ahead_N7)
-        return torch.cat([mean[0][:, :4], ahead_N7[:, :4]], dim=-1), first_N7[:, 4:]
-
-    def nearest(
-        self,
-        still: ObstacleCells | None,
-        position_N3: torch.Tensor,
-        velocity_N3: torch.Tensor,
-        scene_N: torch.Tensor,
-        steps: int,
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Returns `relative.near_obstacles` of moving and `still` obstacles, [N, 8], and velocities V as `met`, [N, 3].
-
-        Of several obstacles the nearest counts.
-        """
-        assert self.cells is not None
+        (position_N3, velocity_N3, scene_N), cells = place, self.cells
+        assert cells is not None
         rows: list[list[torch.Tensor]] = [[] for _ in range(steps + 1)]
-        for step in range(steps + 1):
-            if still is not None:
-                rows[step].append(pad(still.near(position_N3, velocity_N3, scene_N, step / steps), (0, 3)))
+        if still is not None:
+            for step, row in enumerate(rows):
+                row.append(pad(_seen(still, position_N3, velocity_N3, scene_N, step / steps, distances), (0, 3)))
         for row_N, pose in self.rows(scene_N, position_N3.dtype):
             own_N3, surface_N3 = pose.undo(position_N3), pose.velocity(position_N3)
-            way_N3 = turned_back(velocity_N3 - surface_N3, pose.later.rotation_V33)
-            for step in range(steps + 1):
-                near_N4 = self.cells.near(own_N3, way_N3, row_N, step / steps)
-                normal_N3 = turned(near_N4[:, :3], pose.rotation_V33)
-                rows[step].append(torch.cat([normal_N3, near_N4[:, 3:], surface_N3], -1))
-        here_N7, *ahead = map(nearest, rows)
-        ahead_N7 = nearest(ahead)
-        first_N7 = torch.where(here_N7[:, :3].any(-1, keepdim=True), here_N7, ahead_N7)
+            way_N3 = turned(velocity_N3 - surface_N3, pose.later.rotation_V33.mT)
+            for step, row in enumerate(rows):
+                own_N4 = _seen(cells, own_N3, way_N3, row_N, step / steps, distances)
+                row.append(torch.cat([turned(own_N4[:, :3], pose.rotation_V33), own_N4[:, 3:], surface_N3], -1))
+        here_N7, *ahead = map(nearest if distances else _merged, rows)
+        ahead_N7 = nearest(ahead) if distances else first(ahead)
+        first_N7 = first([here_N7, ahead_N7])
         there_N1 = first_N7[:, :3].any(-1, keepdim=True)
         return torch.cat([here_N7[:, :4], ahead_N7[:, :4]], dim=-1), there_N1 * first_N7[:, 4:]
 
 
-def _counted(row_N7: torch.Tensor) -> torch.Tensor:
-    """Appends 1 to rows with a normal, and sets all others to 0."""
-    there_N1 = row_N7[:, :3].any(-1, keepdim=True).to(row_N7.dtype)
-    return torch.cat([there_N1 * row_N7, there_N1], -1)
+def _seen(
+    cells: ObstacleCells, place_N3: torch.Tensor, way_N3: torch.Tensor, scene_N: torch.Tensor, part: float, near: bool
+) -> torch.Tensor:
+    """Returns normals, or with `near` their nearness, and friction at a part of particles' ways, [N, 4]."""
+    if near:
+        return cells.near(place_N3, way_N3, scene_N, part)
+    row_NV = cells.surfaces(place_N3 + way_N3 * part, scene_N)
+    return pad(row_NV, (0, 4 - row_NV.shape[1]))
 
 
-def _mean(total_N8: torch.Tensor) -> torch.Tensor:
-    normal_N3, count_N1 = total_N8[:, :3], total_N8[:, 7:]
+def _merged(rows: Sequence[torch.Tensor]) -> torch.Tensor:
+    """Returns the sums of normals, shortened to 1, and the means of friction and V over rows with a normal, [N, 7]."""
+    there = [row_N7[:, :3].any(-1, keepdim=True).to(row_N7) for row_N7 in rows]
+    count_N1, total_N7 = sum(there), sum(there_N1 * row_N7 for there_N1, row_N7 in zip(there, rows, strict=True))
+    assert isinstance(count_N1, torch.Tensor) and isinstance(total_N7, torch.Tensor)
+    normal_N3 = total_N7[:, :3]
     square_N1 = torch.where(count_N1 > 1, normal_N3.square().sum(-1, keepdim=True).clamp(min=1), 1)
-    return torch.cat([normal_N3 * square_N1.rsqrt(), total_N8[:, 3:7] / count_N1.clamp(min=1)], -1)
+    return torch.cat([normal_N3 * square_N1.rsqrt(), total_N7[:, 3:] / count_N1.clamp(min=1)], -1)
+
+
+def first(rows: Sequence[torch.Tensor]) -> torch.Tensor:
+    """Returns of several rows [N, V] the first one with a normal, or the last one."""
+    result_NV = rows[-1]
+    for row_NV in rows[-2::-1]:
+        result_NV = torch.where(row_NV[:, :3].any(-1, keepdim=True), row_NV, result_NV)
+    return result_NV
 
 
 def poses_of(scenes: Sequence[Sequence[MovingObstacle]], frames: Sequence[int], frame_s: float) -> Poses:
     """Returns the poses of the rows of scenes, scene s in frame frames[s]."""
-    layers, rows = max(map(len, scenes)), []
-    for layer in range(layers):
-        for scene, frame in zip(scenes, frames, strict=True):
-            if layer >= len(scene):
-                rows.append((np.eye(3), np.zeros(3), np.zeros(3), np.zeros((3, 3)), np.zeros(3)))
-                continue
-            motion = scene[layer].motion
+    rows = []
+    for layer in zip_longest(*scenes):
+        for obstacle, frame in zip(layer, frames, strict=True):
+            motion = AT_REST if obstacle is None else obstacle.motion
             (turn_33, shift_3), (later_33, later_3) = (motion.pose((frame + i) * frame_s) for i in range(2))
-            pivot_3 = np.array(motion.pivot)
-            change_33 = later_33 @ turn_33.T - np.eye(3) if later_33 is not turn_33 else np.zeros((3, 3))
+            pivot_3, change_33 = np.array(motion.pivot), later_33 @ turn_33.T - np.eye(3)
             rows.append((turn_33, pivot_3, pivot_3 + shift_3, change_33, later_3 - shift_3))
     return Poses(*(torch.from_numpy(np.stack(part).astype(np.float64)) for part in zip(*rows, strict=True)))
 

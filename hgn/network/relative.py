@@ -81,8 +81,7 @@ def relative_features(
     if config.obstacle_features:
         place, distances = (state.position_N3, velocity_N3, state.scene_N), config.obstacle_distances
         if state.moving is not None:
-            met = state.moving.nearest if distances else state.moving.met
-            cell_N8, surface_N3 = met(state.obstacles, *place, steps=STEPS_AHEAD)
+            cell_N8, surface_N3 = state.moving.met(state.obstacles, place, STEPS_AHEAD, distances)
         else:
             cell_N8 = (near_obstacles if distances else obstacle_surfaces)(*place, state.obstacles)
         normal_N6 = cell_N8 if cell_N8.shape[1] == 6 else torch.cat([cell_N8[:, :3], cell_N8[:, 4:7]], dim=-1)

@@ -26,7 +26,7 @@ from hgn.network.posed_obstacles import Placement, PosedObstacleCells
 from hgn.runtime.divergence import DivergedError, describe_diverged, diverged
 from hgn.scene.barrier import barrier_of_pieces, barrier_pieces
 from hgn.scene.material import INPUT_PARAMETERS
-from hgn.scene.motion import Motion
+from hgn.scene.motion import AT_REST
 from hgn.scene.obstacle_grid import ObstacleGrid, build_obstacle_grid
 from hgn.scene.own_physics import NOMINAL_P, input_parameters
 from hgn.scene.scene import Obstacle, Scene
@@ -248,8 +248,7 @@ def _obstacles(
 def with_velocities(scene: Scene, poses: Mapping[int, Pose]) -> Scene:
     """Returns the scene with a motion for each obstacle that has a velocity, if it had none."""
     moving = {number for number, pose in poses.items() if pose.velocity_3 is not None}
-    still = Motion.of_frames([(0.0, (0.0, 0.0, 0.0))], (0.0, 0.0, 0.0))
-    own = (replace(o, motion=o.motion or still) if i in moving else o for i, o in enumerate(scene.obstacles))
+    own = (replace(o, motion=o.motion or AT_REST) if i in moving else o for i, o in enumerate(scene.obstacles))
     return replace(scene, obstacles=tuple(own))
 
 

@@ -28,6 +28,7 @@ from hgn.network.grid import build_hierarchy
 from hgn.network.hgn import HierarchicalGraphNetwork
 from hgn.runtime.parity import OUTPUTS, require_parity
 from hgn.runtime.triton_host import kernel_precision
+from hgn.schema import require
 from hgn.step.reference import rested
 from hgn.step_config import StepConfig
 
@@ -69,6 +70,7 @@ def _room(count: int, level: int, tight: float) -> int:
 
 def _own_physics(config: NetworkConfig, state: ParticleState) -> tuple[str, ...]:
     """Returns the parts of own physics that a state has: friction of any surface, and parameters of any particle."""
+    require(state.moving is None, "backend", "torch or cpu for moving obstacles", "triton")
     rough = state.wall_friction_S3 is not None or (state.obstacles and state.obstacles.friction_K) is not None
     there = {"friction": rough, "parameters": state.parameter_NP is not None}
     return tuple(name for name in config.own_physics if there[name])

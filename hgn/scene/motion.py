@@ -85,6 +85,9 @@ class Motion:
         return turn, (later_translation - translation) / span, np.asarray(self.pivot) + translation
 
 
+AT_REST = Motion.of_frames([(0.0, (0.0, 0.0, 0.0))], (0.0, 0.0, 0.0))
+
+
 def turning(rotation_33: np.ndarray) -> np.ndarray:
     """Returns the axis of a rotation times its angle in radians, at most pi, float64 [3]."""
     axis = np.array(

@@ -122,13 +122,13 @@ def test_symmetries_of_the_cube():
     moving = moving_of(plates([(2e-3, 5e-3, 1e-3), (0.0, -4e-3, 1e-3)], [(0.0, 90.0, 30.0), (-60.0, 0.0, 0.0)]), 3)
     state = struck(count=400)
     place_N3, velocity_N3, scene_N = state.position_N3, state.velocity_NM3[:, 0], state.scene_N
-    seen_N8, surface_N3 = moving.met(None, place_N3, velocity_N3, scene_N, 4)
+    seen_N8, surface_N3 = moving.met(None, (place_N3, velocity_N3, scene_N), 4)
     here, ahead = (int(part_N4[:, :3].any(-1).sum()) for part_N4 in seen_N8.chunk(2, dim=1))
     assert 20 < here < ahead < 400
     for symmetry in ALL_48:
         image = lambda vector_N3, own=symmetry: _vectors(vector_N3, scene_N, [own])  # noqa: E731
-        placed_N3 = _points(place_N3, scene_N, [symmetry])
-        found_N8, velocity = moving_under(moving, [symmetry]).met(None, placed_N3, image(velocity_N3), scene_N, 4)
+        placed = _points(place_N3, scene_N, [symmetry]), image(velocity_N3), scene_N
+        found_N8, velocity = moving_under(moving, [symmetry]).met(None, placed, 4)
         torch.testing.assert_close(velocity, image(surface_N3), rtol=0, atol=1e-14)
         for part in (slice(0, 3), slice(4, 7)):
             torch.testing.assert_close(found_N8[:, part], image(seen_N8[:, part]), rtol=0, atol=1e-14)
