@@ -16,7 +16,7 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 32_364,
+    "hgn": 32_343,
     "datagen": 8_430,
     "tools": 6_558,
     "tests": 31_062,
