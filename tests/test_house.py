@@ -16,10 +16,10 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 32_343,
+    "hgn": 32_459,
     "datagen": 8_430,
     "tools": 6_558,
-    "tests": 31_062,
+    "tests": 31_104,
 }
 SETTINGS = 240  # fields of the dataclasses behind the commands, *Config
 

@@ -18,11 +18,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import torch
 
+from hgn.scene.rest_shape import NEIGHBOURS
+
 COLUMNS = 9
+PACKED = 5 * NEIGHBOURS  # numbers of a particle in `RestShape.packed`
 STRETCH = 0.01  # unit of the stretch; between impacts bodies of the data stretch by 0.002, at impacts by up to 0.03
 FLAT = 0.01  # smallest det A / (tr A / 3)^3, which is 1 for neighbours in all directions and 0 for those in a plane
 _ROWS, _ROW_COLUMNS = (0, 1, 2, 1, 0, 0), (0, 1, 2, 2, 2, 1)
@@ -55,6 +59,24 @@ class RestShape:
         neighbour_NK = torch.where(solid_N[:, None], neighbour_NK, -1)
         return RestShape(neighbour_NK, position_N3, coefficient_NK4.float())
 
+    @cached_property
+    def packed(self) -> torch.Tensor:
+        """Returns neighbours and then coefficients of each particle, as the bits of float32, int32 [N, PACKED]."""
+        bits_NR = self.coefficient_NK4.flatten(1).contiguous().view(torch.int32)
+        return torch.cat([self.neighbour_NK.int(), bits_NR], 1).contiguous()
+
+    @staticmethod
+    def unpacked(packed_NR: torch.Tensor, position_N3: torch.Tensor) -> RestShape:
+        """Returns the shape of `packed`. The places are only for fits of remaining neighbours."""
+        coefficient_NR = packed_NR[:, NEIGHBOURS:].contiguous().view(torch.float32)
+        return RestShape(packed_NR[:, :NEIGHBOURS].long(), position_N3, coefficient_NR.unflatten(1, (NEIGHBOURS, 4)))
+
+    @staticmethod
+    def none(position_N3: torch.Tensor) -> RestShape:
+        """Returns the shape of particles without neighbours."""
+        zero_NK4 = position_N3.new_zeros(len(position_N3), NEIGHBOURS, 4, dtype=torch.float32)
+        return RestShape(zero_NK4[..., 0].long() - 1, position_N3.float(), zero_NK4)
+
     @staticmethod
     def joined(shapes: Sequence[RestShape | None], counts: Sequence[int]) -> RestShape | None:
         """Returns one shape for several scenes, or states, of `counts` particles. None stands for one without."""
@@ -63,7 +85,8 @@ class RestShape:
             return None
         parts, first = [], 0
         for shape, count in zip(shapes, counts, strict=True):
-            parts.append(known[0]._without(count) if shape is None else shape._from(first))
+            place_N3 = known[0].position_N3.new_zeros(count, 3)
+            parts.append(RestShape.none(place_N3) if shape is None else shape._from(first))
             first += count
         return RestShape(*(torch.cat([getattr(part, name) for part in parts]) for name in _TENSORS))
 
@@ -88,14 +111,6 @@ class RestShape:
         """Returns the shape with row numbers that begin at `first`."""
         neighbour_NK = torch.where(self.neighbour_NK < 0, -1, self.neighbour_NK + first)
         return RestShape(neighbour_NK, self.position_N3, self.coefficient_NK4)
-
-    def _without(self, count: int) -> RestShape:
-        """Returns the shape of `count` particles without neighbours."""
-        shapes = ((count, *getattr(self, name).shape[1:]) for name in _TENSORS)
-        neighbour_NK, position_N3, coefficient_NK4 = (
-            getattr(self, name).new_zeros(shape) for name, shape in zip(_TENSORS, shapes, strict=True)
-        )
-        return RestShape(neighbour_NK - 1, position_N3, coefficient_NK4)
 
 
 _TENSORS = ("neighbour_NK", "position_N3", "coefficient_NK4")

@@ -134,8 +134,6 @@ def triton_unsupported_reason(device: torch.device, config: NetworkConfig, preci
         return f"network.width must be one of {', '.join(map(str, TRITON_WIDTHS))} for it, not {config.width}"
     if precision == "fp32":
         return "it computes in tf32 or fp16, not fp32"
-    if "elastic" in config.own_physics:
-        return "it has no own_physics=elastic yet"
     if config.levels > TRITON_LEVELS:
         return f"network.levels must be at most {TRITON_LEVELS} for it, not {config.levels}"
     return None

@@ -19,6 +19,7 @@ from hgn.kernels.grid.op import Window
 from hgn.kernels.scene_tables import OBSTACLE_COLUMNS, SceneTable
 from hgn.kernels.triton_compat import Launches, build_launcher, noted_launches, preload, use_target
 from hgn.kernels.update.op import Updates, UpdateSettings
+from hgn.network.elastic import RestShape
 from hgn.network.features import ParticleState
 from hgn.network.hgn import HierarchicalGraphNetwork
 from hgn.runtime.triton_stepper import TritonStepper, first_capacities
@@ -126,6 +127,7 @@ def _simulation_launches(
         parameter_NP=torch.zeros(particles, len(INPUT_PARAMETERS), device=device)
         if "parameters" in config.own_physics
         else None,
+        rest=RestShape.none(torch.zeros(particles, 3, device=device)) if "elastic" in config.own_physics else None,
     )
     _Unplaced(network, state, precision, capacities, obstacles=obstacles, step=step).frame_launches()
 

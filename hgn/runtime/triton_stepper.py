@@ -23,11 +23,13 @@ from hgn.kernels.scene_tables import SceneTable
 from hgn.kernels.step.op import DIVERGED, DeviceStep, rest_numbers
 from hgn.kernels.tuning import Tuning
 from hgn.network.cell_keys import COORDINATE_LIMIT, pack
+from hgn.network.elastic import RestShape
 from hgn.network.features import ParticleState
 from hgn.network.grid import build_hierarchy
 from hgn.network.hgn import HierarchicalGraphNetwork
 from hgn.runtime.parity import OUTPUTS, require_parity
 from hgn.runtime.triton_host import kernel_precision
+from hgn.scene.material import INPUT_PARAMETERS
 from hgn.schema import require
 from hgn.step.reference import rested
 from hgn.step_config import StepConfig
@@ -69,11 +71,13 @@ def _room(count: int, level: int, tight: float) -> int:
 
 
 def _own_physics(config: NetworkConfig, state: ParticleState) -> tuple[str, ...]:
-    """Returns the parts of own physics that a state has: friction of any surface, and parameters of any particle."""
+    """Returns the parts of own physics that a state has: friction of any surface, parameters of any particle, elastic
+    bodies. Columns of elastic bodies follow those of parameters, so they need both."""
     require(state.moving is None, "backend", "torch or cpu for moving obstacles", "triton")
     rough = state.wall_friction_S3 is not None or (state.obstacles and state.obstacles.friction_K) is not None
-    there = {"friction": rough, "parameters": state.parameter_NP is not None}
-    return tuple(name for name in config.own_physics if there[name])
+    there = {"friction": rough, "elastic": state.rest is not None}
+    there["parameters"] = there["elastic"] or state.parameter_NP is not None
+    return tuple(name for name in config.own_physics if there.get(name))
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,6 +182,9 @@ class TritonStepper:
         names = ("position_N3", "velocity_NV", "scene_N", "material_N", "parameter_NP")
         buffers = [buffer for name in names if (buffer := getattr(self.buffers, name)) is not None]
         remaining = [buffer[: self.live][kept_N] for buffer in buffers]
+        if (rest_NR := self.buffers.rest_NR) is not None:
+            shape = RestShape.unpacked(rest_NR[: self.live], self.buffers.position_N3[: self.live])[kept_N]
+            rest_NR[: len(shape.packed)].copy_(shape.packed)
         self.live = len(remaining[0])
         for buffer, value in zip(buffers, remaining, strict=True):
             buffer[: self.live].copy_(value)
@@ -205,8 +212,11 @@ class TritonStepper:
         if buffers.wall_friction_S3 is not None:
             friction_S3 = state.wall_friction_S3
             buffers.wall_friction_S3.copy_(torch.zeros_like(state.domain_S3) if friction_S3 is None else friction_S3)
-        if buffers.parameter_NP is not None and state.parameter_NP is not None:
-            buffers.parameter_NP[:count].copy_(state.parameter_NP)
+        if buffers.parameter_NP is not None and "parameters" in self.own_physics:
+            columns_NP = buffers.parameter_NP[:count, : len(INPUT_PARAMETERS)]
+            columns_NP.zero_() if state.parameter_NP is None else columns_NP.copy_(state.parameter_NP)
+        if buffers.rest_NR is not None and state.rest is not None:
+            buffers.rest_NR[:count].copy_(state.rest.packed)
 
     def _obstacle_table(self, state: ParticleState) -> SceneTable:
         assert state.obstacles is not None

@@ -14,9 +14,11 @@ import torch
 
 from hgn.data.episode_tensors import EpisodeTensors
 from hgn.kernels.update.op import Updates
+from hgn.network.elastic import RestShape
 from hgn.network.features import ParticleState
 from hgn.network.obstacles import ObstacleCells
 from hgn.runtime.parity import GRADIENTS, OUTPUTS, require_parity
+from hgn.scene.material import INPUT_PARAMETERS
 from hgn.scene.symmetry import Symmetry
 from hgn.training.symmetry import obstacles_under
 
@@ -65,6 +67,7 @@ def _state(
     if obstacles is not None and symmetries is not None:
         obstacles = obstacles_under(obstacles, symmetries)
     particles = updates.buffers
+    columns_NP, rest_NR = particles.parameter_NP, particles.rest_NR
     state = ParticleState(
         position_N3=particles.position_N3[:count],
         velocity_NM3=particles.velocity_NV[:count].view(count, config.velocity_history, 3),
@@ -74,6 +77,7 @@ def _state(
         gravity_S3=particles.gravity_S3,
         obstacles=obstacles and obstacles.to(updates.device),
         wall_friction_S3=particles.wall_friction_S3,
-        parameter_NP=None if particles.parameter_NP is None else particles.parameter_NP[:count],
+        parameter_NP=columns_NP if columns_NP is None else columns_NP[:count, : len(INPUT_PARAMETERS)],
+        rest=None if rest_NR is None else RestShape.unpacked(rest_NR[:count], particles.position_N3[:count]),
     )
     return state, particles.origin_S3

@@ -19,6 +19,7 @@ from hgn.config import TrainingConfig
 from hgn.kernels.scene_tables import BARRIER_COLUMNS, OBSTACLE_COLUMNS, SceneTable
 from hgn.kernels.update.op import DeviceEpisode, DeviceSample
 from hgn.network.cell_keys import COORDINATE_BITS
+from hgn.network.elastic import RestShape
 from hgn.network.features import ParticleState
 from hgn.network.hgn import HierarchicalGraphNetwork
 from hgn.network.obstacles import ObstacleCells
@@ -90,6 +91,9 @@ class TritonScenes:
         if "parameters" in self._network.config.own_physics:
             parameters = [episode.parameter_NP for episode in episodes]
             own["parameter_NP"] = joined_parameters(parameters, [past_TN3[-1] for past_TN3 in pasts])
+        if "elastic" in self._network.config.own_physics:
+            shapes = [e.rest or RestShape.none(e.position_TN3[0].to(device)) for e in episodes]
+            own["rest"] = RestShape.joined(shapes, [e.particles for e in episodes])
         return ParticleState(
             position_N3=past_TN3[-1],
             velocity_NM3=past_TN3.diff(dim=0).flip(0).transpose(0, 1),
@@ -177,4 +181,5 @@ class TritonScenes:
             obstacles=obstacles,
             wall_friction_S3=None if state.wall_friction_S3 is None else state.wall_friction_S3[:scenes],
             parameter_NP=None if state.parameter_NP is None else state.parameter_NP[:count],
+            rest=state.rest and state.rest[:count],
         )

@@ -187,6 +187,7 @@ class TritonUpdates:
             barrier=barrier and barrier.to(self.device),
             wall_friction=episode.wall_friction,
             parameter_NP=None if episode.parameter_NP is None else episode.parameter_NP.to(self.device),
+            rest=episode.rest and episode.rest.to(self.device),
         )
 
     def _take_over(self) -> None:

@@ -8,8 +8,10 @@ import torch
 from kernels.engines import engine_of, gradients, run_forward
 from network.states import network_of, random_state
 
+from hgn.network.elastic import RestShape
 from hgn.runtime.parity import relative_error
-from hgn.scene.material import INPUT_PARAMETERS
+from hgn.scene.material import INPUT_PARAMETERS, MATERIALS
+from hgn.scene.rest_shape import NEIGHBOURS
 
 SEVERAL, CROWD = (5, 1, 3), (17, 1, 6)  # particles of three scenes
 
@@ -70,6 +72,17 @@ def plane_state(state):
     return replace(state, obstacles=replace(cells, offset_K=offset_K))
 
 
+def elastic_state(counts):
+    """The same with deformed and turned elastic bodies, and one particle without neighbours."""
+    state, generator = rough_state(counts), torch.Generator().manual_seed(5)
+    total, at = len(state.scene_N), torch.arange(len(state.scene_N))
+    neighbour_NK = torch.randint(0, total, (total, NEIGHBOURS), generator=generator)
+    alike_NK = (state.scene_N[neighbour_NK] == state.scene_N[:, None]) & (neighbour_NK != at[:, None])
+    neighbour_NK = torch.where(alike_NK & (at[:, None] > 0), neighbour_NK, -1)
+    place_N3 = state.position_N3.float() + 0.02 * torch.rand(total, 3, generator=generator)
+    return replace(state, rest=RestShape.of(place_N3, neighbour_NK))
+
+
 @dataclass(frozen=True)
 class Case:
     """A network, a state, and the largest relative error of outputs, of all gradients, and of each gradient."""
@@ -89,6 +102,7 @@ class Case:
 RELATIVE = {"inputs": "relative"}
 DISTANCES = {"inputs": "local", "obstacle_distances": True}
 OWN = {"inputs": "local", "own_physics": ("friction", "parameters")}
+ELASTIC = {"own_physics": ("friction", "parameters", "elastic"), "materials": MATERIALS}
 SHUFFLED = ("water", "snow", "sand")
 # Relative inputs: in the weights of normals the rounding of distances counts tenfold (FEW).
 CASES = {
@@ -115,6 +129,7 @@ CASES = {
     "distances": Case(lambda: plane_state(moving_state(CROWD)), 4e-5, DISTANCES),
     "distances and friction": Case(lambda: plane_state(rough_state(CROWD)), 1e-4, OWN | DISTANCES),
     "parameters": Case(lambda: rough_state(SEVERAL), 4e-5, RELATIVE | {"own_physics": ("parameters",)}),
+    "elastic bodies": Case(lambda: elastic_state((40, 17)), 1e-4, OWN | ELASTIC),
 }
 
 

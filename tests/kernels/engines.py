@@ -11,6 +11,7 @@ from hgn.kernels.packing import pack_network
 from hgn.kernels.scene_tables import SceneTable
 from hgn.kernels.step.op import rest_numbers
 from hgn.kernels.tuning import Tuning
+from hgn.network.elastic import COLUMNS
 
 
 def device():
@@ -58,6 +59,9 @@ def prepare(engine, network, state, origin_S3):
 
     scale = tuple(x.float().to(where) for x in network.normaliser.feature_scale(network.config.relative))
     walls_S3 = state.wall_friction_S3 if "friction" in network.config.own_physics else None
+    columns_NP = state.parameter_NP
+    if state.rest is not None:
+        columns_NP = torch.cat([columns_NP, torch.zeros(len(columns_NP), COLUMNS)], 1)
     obstacles = state.obstacles and state.obstacles.to(where)
     obstacles = obstacles and SceneTable.of_obstacles(obstacles, state.scene_count, walls_S3 is not None)
     particles = DeviceParticles(
@@ -70,7 +74,8 @@ def prepare(engine, network, state, origin_S3):
         gravity_S3=state.gravity_S3.float().to(where),
         count=engine.particle_count,
         wall_friction_S3=None if walls_S3 is None else walls_S3.float().to(where),
-        parameter_NP=None if state.parameter_NP is None else padded(state.parameter_NP.float()),
+        parameter_NP=None if state.parameter_NP is None else padded(columns_NP.float()),
+        rest_NR=state.rest and padded(state.rest.packed),
     )
     grid.build(particles)
     grid.prepare(particles, scale, obstacles)

@@ -16,6 +16,7 @@ from hgn.data.episode_tensors import whole_episode
 from hgn.kernels.packing import pack_network
 from hgn.kernels.scene_tables import SceneHash
 from hgn.kernels.update.op import DeviceEpisode, DeviceSample
+from hgn.scene.material import ELASTIC, MATERIALS
 from hgn.schema import ConfigError
 from hgn.training.noise import noise_scale
 from hgn.training.pushforward import PushforwardPool, simulated_barrier
@@ -36,7 +37,8 @@ def placed(made, network):
     hashed = SceneHash.of_barrier(whole.barrier) if whole.barrier is not None else None
     position_TN3, material_N = whole.position_TN3.to(where), whole.material_N.to(where)
     scene = whole.domain_size, whole.gravity, whole.symmetries, hashed and hashed.to(where), whole.wall_friction
-    return DeviceEpisode(position_TN3, material_N, cells and cells.to(where), *scene, parameter_NP)
+    rest = whole.rest and whole.rest.to(where)
+    return DeviceEpisode(position_TN3, material_N, cells and cells.to(where), *scene, parameter_NP, rest)
 
 
 def with_parameters(made):
@@ -77,6 +79,7 @@ def assert_same_pools(fast, plain):
     [
         {"inputs": "relative", "wall_clearance": (0.45, 0.45)},
         {"inputs": "local", "own_physics": ("friction", "parameters"), "wall_clearance": (0.45, 0.45)},
+        {"inputs": "local", "own_physics": ("parameters", "elastic"), "materials": MATERIALS},
         {"obstacle_clearance": 5e-3},
     ],
 )
@@ -86,6 +89,8 @@ def test_the_pool_is_that_of_the_plain_path(changes):
     network = network_of(torch.float32, width=16, levels=1, message_passing_steps=1, **changes).to(device())
     scenes = [scene_with_obstacles(0, 7), episode(5, seed=1), scene_with_obstacles(2, 6), scene_with_obstacles(3, 12)]
     scenes[2] = with_parameters(scenes[2])
+    if "materials" in changes:
+        scenes[::2] = [replace(made, material_N=np.full_like(made.material_N, ELASTIC)) for made in scenes[::2]]
     drawn = {"noise_std": 0.5, "noise_min_scale": 0.1, "pushforward_importance": 0.5}
     training = training_of(precision="fp32", pushforward_frames=2, **drawn)
     fast, plain = pools_of(network, training)

@@ -30,6 +30,7 @@ from hgn.runtime.simulation import Simulation, on_host
 from hgn.runtime.simulator import Simulator
 from hgn.runtime.triton_stepper import TritonStepper, first_capacities
 from hgn.runtime.weights import find_weights, load_weights
+from hgn.scene.material import ELASTIC, MATERIALS
 from hgn.schema import ConfigError
 
 pytestmark = pytest.mark.usefixtures("large_tiles")
@@ -88,6 +89,7 @@ FRAMES = {  # of the network
     "absolute": {"levels": 2},
     "relative, resting": {"levels": 3, "inputs": "relative", "rest_threshold": 2.0},
     "friction and parameters": {"levels": 2, "inputs": "local", "own_physics": ("friction", "parameters")},
+    "elastic bodies": {"levels": 2, "inputs": "local", "own_physics": ("friction", "parameters", "elastic")},
     "walls of a plane": {"wall_clearance": (0.06, 0.2), "dimensions": 2},
     "obstacles and walls": {"obstacle_clearance": 2e-3, "wall_clearance": (0.06, 0.2)},
 }
@@ -112,12 +114,16 @@ def test_frames_are_those_of_the_plain_loop(name):
     none in two dimensions, and come no nearer where they begin beyond; they pass their own scene's obstacles never."""
     changes = FRAMES[name]
     held, walls = "obstacle_clearance" in changes, changes.get("wall_clearance")
-    counts = (12, 12, 6) if held else (5, 3) if walls else (4, 2)
+    elastic = "elastic" in changes.get("own_physics", ())
+    counts = (9, 6) if elastic else (12, 12, 6) if held else (5, 3) if walls else (4, 2)
     simulator = partial(thrown, deviation=0.02 if held or walls else 1e-3)
     scenes = [scene(count, seed, gravity=(3.0 * seed, -9.8, 2.0 * seed)) for seed, count in enumerate(counts)]
     scenes = [replace(each, dimensions=changes.get("dimensions", 3)) for each in scenes]
     if "own_physics" in changes:
         scenes = [scenes[0], rough(scenes[1])]
+    if elastic:
+        changes = changes | {"materials": MATERIALS}
+        scenes = [replace(each, material_N=np.full_like(each.material_N, ELASTIC)) for each in scenes]
     if held:
         scenes = [each if i == 1 else replace(each, corners=lambda: SHEETS) for i, each in enumerate(scenes)]
     frames = 3 if held or walls else 2

@@ -20,6 +20,7 @@ from hgn.data.episode_tensors import EpisodeChunk, whole_episode
 from hgn.data.sampler import Sample, SamplerState
 from hgn.network.relative import near_obstacles, obstacle_surfaces
 from hgn.runtime.parity import relative_error
+from hgn.scene.material import ELASTIC, MATERIALS
 from hgn.scene.obstacle_grid import ObstacleGrid
 from hgn.training.symmetry import under_symmetries
 from hgn.training.triton_updates import TritonUpdates
@@ -34,11 +35,11 @@ def small_network():
     return network_of(width=16, levels=1, message_passing_steps=1, cell_size=0.1)
 
 
-@pytest.mark.parametrize(("own_physics", "distances"), [((), False), (("friction", "parameters"), True)])
+@pytest.mark.parametrize(("own_physics", "distances"), [((), False), (("friction", "parameters", "elastic"), True)])
 def test_an_update_under_symmetries_is_the_plain_one(own_physics, distances, monkeypatch):
     """An update of eight scenes, each under another of the cube's symmetries, which turn gravity and the walls'
-    friction, one without obstacles, one without gravity, two with parameters of their own: positions, velocities,
-    targets, normals, loss and gradients are those of backend torch in float64, and the check passes."""
+    friction, one without obstacles, one without gravity, two with parameters of their own, four elastic: positions,
+    velocities, targets, normals, loss and gradients are those of backend torch in float64, and the check passes."""
     network = network_of(
         width=16,
         levels=1,
@@ -47,8 +48,11 @@ def test_an_update_under_symmetries_is_the_plain_one(own_physics, distances, mon
         inputs="relative",
         own_physics=own_physics,
         obstacle_distances=distances,
+        materials=MATERIALS,
     )
-    episodes = [scene_with_obstacles(i, 2 + i % 3, 20_000) for i in range(8)]
+    episodes = [scene_with_obstacles(i, 2 + i % 3 + 4 * distances, 20_000) for i in range(8)]
+    if own_physics:
+        episodes[::2] = [replace(made, material_N=np.full_like(made.material_N, ELASTIC)) for made in episodes[::2]]
     bare = ObstacleGrid(CELL_SIZE, np.zeros((0, 3), np.int32), np.zeros((0, 3), np.float32))
     episodes[2] = replace(episodes[2], obstacle_grid=bare)
     episodes[0] = replace(episodes[0], gravity=(0.0, 0.0, 0.0))
@@ -75,7 +79,7 @@ def test_an_update_under_symmetries_is_the_plain_one(own_physics, distances, mon
     assert fast.parity is not None and max(fast.parity) < 1e-3
     if own_physics:
         assert torch.equal(updates.buffers.wall_friction_S3.cpu(), state.wall_friction_S3.float())
-        assert torch.equal(updates.buffers.parameter_NP[:count].cpu(), state.parameter_NP)
+        assert torch.equal(updates.buffers.parameter_NP[:count, :7].cpu(), state.parameter_NP)
     near = {"rtol": 0, "atol": 1e-7}
     torch.testing.assert_close(updates.buffers.position_N3[:count].cpu().double(), state.position_N3, **near)
     torch.testing.assert_close(

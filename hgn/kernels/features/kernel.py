@@ -12,6 +12,10 @@ from hgn.kernels.blocks import with_column
 from hgn.kernels.geometry import GEOMETRY_COLUMNS, most_around, raise_disturbed
 from hgn.kernels.obstacles import OBSTACLE_COLUMNS, obstacle_normals
 from hgn.kernels.triton_compat import gdc_launch_dependents, gdc_wait, settle_keys
+from hgn.network import elastic
+from hgn.scene import rest_shape
+
+STRETCH, NEIGHBOURS = tl.constexpr(elastic.STRETCH), tl.constexpr(rest_shape.NEIGHBOURS)
 
 
 @triton.jit
@@ -105,6 +109,50 @@ def _asinh(x):
     rounded = one - 1
     result = tl.where(rounded == 0, y, tl.log(one) * (y / tl.where(rounded == 0, 1.0, rounded)))
     return tl.where(x < 0, -result, result)
+
+
+@triton.jit
+def deform(position, rest, particle_count, scale, columns, WIDTH: tl.constexpr, AT: tl.constexpr, BLOCK: tl.constexpr):
+    """Writes the columns of elastic bodies to `columns` [N, WIDTH] from AT on. `rest` is RestShape.packed.
+
+    Rule: hgn.network.elastic; test: tests/kernels/test_network.py.
+    """
+    count = tl.load(particle_count)
+    if tl.program_id(0) * BLOCK >= count:
+        return
+    row = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    live = row < count
+    part = tl.arange(0, 4)[None, :]
+    numbers = rest + row * (5 * NEIGHBOURS)
+    x = tl.load(position + row * 3, mask=live, other=0.0)
+    y = tl.load(position + row * 3 + 1, mask=live, other=0.0)
+    z = tl.load(position + row * 3 + 2, mask=live, other=0.0)
+    sum_x = tl.zeros((BLOCK, 4), tl.float32)  # the rows of F, and e behind them
+    sum_y, sum_z, most = sum_x, sum_x, row * 0 - 1
+    for k in tl.static_range(NEIGHBOURS):
+        other = tl.load(numbers + k, mask=live, other=-1)
+        there = other >= 0
+        most = tl.maximum(most, other)
+        bits = tl.load(numbers[:, None] + NEIGHBOURS + 4 * k + part, mask=there[:, None], other=0)
+        weight = bits.to(tl.float32, bitcast=True)
+        sum_x += weight * tl.where(there, tl.load(position + other * 3, mask=there, other=0.0) - x, 0.0)[:, None]
+        sum_y += weight * tl.where(there, tl.load(position + other * 3 + 1, mask=there, other=0.0) - y, 0.0)[:, None]
+        sum_z += weight * tl.where(there, tl.load(position + other * 3 + 2, mask=there, other=0.0) - z, 0.0)[:, None]
+    factor = tl.where(most >= 0, 0.5 / STRETCH, 0.0)
+    fx = tl.where(part < 3, sum_x, 0.0)
+    fy = tl.where(part < 3, sum_y, 0.0)
+    fz = tl.where(part < 3, sum_z, 0.0)
+    unit = tl.load(scale)
+    store = columns + row * WIDTH + AT
+    tl.store(store, _asinh((tl.sum(fx * fx, 1) - 1) * factor), mask=live)
+    tl.store(store + 1, _asinh((tl.sum(fy * fy, 1) - 1) * factor), mask=live)
+    tl.store(store + 2, _asinh((tl.sum(fz * fz, 1) - 1) * factor), mask=live)
+    tl.store(store + 3, _asinh(tl.sum(fy * fz, 1) * factor), mask=live)
+    tl.store(store + 4, _asinh(tl.sum(fx * fz, 1) * factor), mask=live)
+    tl.store(store + 5, _asinh(tl.sum(fx * fy, 1) * factor), mask=live)
+    tl.store(store + 6, _asinh(tl.sum(sum_x - fx, 1) / unit), mask=live)
+    tl.store(store + 7, _asinh(tl.sum(sum_y - fy, 1) / unit), mask=live)
+    tl.store(store + 8, _asinh(tl.sum(sum_z - fz, 1) / unit), mask=live)
 
 
 @triton.jit

@@ -19,6 +19,7 @@ from hgn.kernels.features import kernel as feature_kernel
 from hgn.kernels.grid import kernel
 from hgn.kernels.scene_tables import SceneTable
 from hgn.kernels.triton_compat import interpreting, overlaps
+from hgn.network import elastic
 from hgn.network.cell_keys import SCENE_LIMIT
 from hgn.network.features import WALL_DISTANCE_CELLS
 from hgn.network.own_physics import physics_widths
@@ -89,25 +90,30 @@ class DeviceParticles:
     gravity_S3: torch.Tensor  # zero with absolute inputs, whose network has learned gravity
     count: torch.Tensor  # number of particles, int32 [1]
     wall_friction_S3: torch.Tensor | None = None  # None: no surface has friction
-    parameter_NP: torch.Tensor | None = None  # columns of hgn.network.own_physics; None: all are 0
+    # columns of hgn.network.own_physics; None: all are 0. With `rest_NR` those of elastic bodies follow.
+    parameter_NP: torch.Tensor | None = None
+    rest_NR: torch.Tensor | None = None  # RestShape.packed with rows of the buffers; None: no body is elastic
 
     @staticmethod
     def empty(
         particles: int, scenes: int, history: int, device: torch.device, own_physics: Sequence[str] = ()
     ) -> DeviceParticles:
-        """Returns buffers of zeros, of own physics those that `own_physics` names."""
+        """Returns buffers of zeros, of own physics those that `own_physics` names. No particle has neighbours."""
         position_N3, velocity_NV = (torch.zeros(particles, columns, device=device) for columns in (3, 3 * history))
         scene_N, material_N, count = (
             torch.zeros(size, dtype=torch.int32, device=device) for size in (particles, particles, 1)
         )
         origin_S3, domain_S3, gravity_S3 = (torch.zeros(scenes, 3, device=device) for _ in range(3))
         friction_S3 = torch.zeros(scenes, 3, device=device) if "friction" in own_physics else None
-        parameter_NP = None
-        if "parameters" in own_physics:
-            parameter_NP = torch.zeros(particles, len(INPUT_PARAMETERS), device=device)
+        parameter_NP = rest_NR = None
+        width = len(INPUT_PARAMETERS) * ("parameters" in own_physics) + elastic.COLUMNS * ("elastic" in own_physics)
+        if width:
+            parameter_NP = torch.zeros(particles, width, device=device)
+        if "elastic" in own_physics:
+            rest_NR = torch.full((particles, elastic.PACKED), -1, dtype=torch.int32, device=device)
         return DeviceParticles(
             position_N3, velocity_NV, scene_N, material_N, origin_S3, domain_S3, gravity_S3, count, friction_S3,
-            parameter_NP,
+            parameter_NP, rest_NR,
         )  # fmt: skip
 
 
@@ -246,6 +252,13 @@ class DeviceGrid:
             "OBSTACLES": config.obstacle_features and obstacles is not None, "SYMMETRY": symmetry,
             "FEATURES": self.features, "BLOCK": PARTICLE_BLOCK,
         }  # fmt: skip
+        if particles.rest_NR is not None:
+            assert parameter_NP is not None
+            feature_kernel.deform[blocks](
+                position=particles.position_N3, rest=particles.rest_NR, particle_count=particles.count, scale=scale[1],
+                columns=parameter_NP, WIDTH=parameter_NP.shape[1], AT=parameter_NP.shape[1] - elastic.COLUMNS,
+                BLOCK=PARTICLE_BLOCK,
+            )  # fmt: skip
         kernel.prepare_particles[blocks](
             **surfaces, origin=particles.origin_S3, low=self.low, geometry=self.geometry, occupied=self.occupied,
             prefix_sum=self.prefix_sum, cell_of=self.cell_N8, weight_of=self.weight_N8,
@@ -278,7 +291,7 @@ class DeviceGrid:
             parameter_of=self.touch_N if parameter_NP is None else parameter_NP, quiet=QUIET,
             HISTORY=config.velocity_history,
             LEVELS=self.levels, NORMALS=int(config.obstacle_features), **own_physics,
-            PARAMETERS=0 if parameter_NP is None else self._widths[1], PARAMETERS_AT=column + self._widths[0],
+            PARAMETERS=0 if parameter_NP is None else parameter_NP.shape[1], PARAMETERS_AT=column + self._widths[0],
             FEATURES=self.features, OVERLAP=overlap, BLOCK=PARTICLE_BLOCK, launch_pdl=overlap,
         )  # fmt: skip
 

@@ -3,7 +3,8 @@
 The sample table has a row of int64 numbers for each scene of each update. A row holds: the address of the window's
 first frame of positions, number of particles, first row in the batch, seed, address of the materials (int32), weight of
 the loss, scale of the noise (each as the bits of a float64), address of the columns of parameters (float32; 0: all are
-0), and the scene's row of the obstacle table. The last column of that row is the symmetry of the sample.
+0), address of RestShape.packed (0: no elastic bodies), and the scene's row of the obstacle table. The last column of
+that row is the symmetry of the sample.
 Shape legend: N particles of all scenes, S scenes, H velocity history.
 """
 
@@ -15,8 +16,11 @@ import triton.language as tl
 from hgn.kernels.blocks import nearest_tf32
 from hgn.kernels.obstacles import CODE_BITS, CODE_MASK, OBSTACLE_COLUMNS
 from hgn.kernels.triton_compat import settle_keys
+from hgn.network import elastic
+from hgn.scene import rest_shape
 
-SAMPLE_COLUMNS = tl.constexpr(13)
+SAMPLE_COLUMNS = tl.constexpr(14)
+PACKED, NEIGHBOURS = tl.constexpr(elastic.PACKED), tl.constexpr(rest_shape.NEIGHBOURS)
 JITTER_OFFSET = tl.constexpr(0x7FFFFFF0)  # offset of the jitter in the seed's stream, far from the noise
 WAVES_OFFSET = tl.constexpr(0x7FFFF000)  # offset of the smooth noise in the seed's stream
 REPEAT = tl.constexpr(8)  # status bit: another rank must repeat the update
@@ -61,17 +65,18 @@ def draw_waves(
 def assemble_batch(
     samples, sample_vectors, update, position, velocity, scene_of, material_of, target, share_of, origin,
     domain, gravity, obstacle_table, particle_count, mean, std, noise_step, waves, jitter, scenes,
-    wall_friction, parameter_of, obstacle_cell_size,
+    wall_friction, parameter_of, rest_of, obstacle_cell_size,
     HISTORY: tl.constexpr, SYMMETRY: tl.constexpr, NOISE: tl.constexpr, WAVES: tl.constexpr,
-    FRICTION: tl.constexpr, PARAMETERS: tl.constexpr, DIMENSIONS: tl.constexpr, SCENES: tl.constexpr,
-    BLOCK: tl.constexpr,
+    FRICTION: tl.constexpr, PARAMETERS: tl.constexpr, WIDTH: tl.constexpr, REST: tl.constexpr,
+    DIMENSIONS: tl.constexpr, SCENES: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Writes windows with noise in the inputs (paper sec. 3.3): a random walk of velocity noise that positions follow.
 
     With NOISE each particle has its own noise. With WAVES a part of it comes from its scene's waves, see draw_waves.
     The target is v_true^{n+1} - v_noisy^n minus gravity, normalised. sample_vectors [updates, S, 3, 3] are the domain's
     size, and gravity and the walls' friction under the sample's symmetry; gravity is zero with absolute inputs. With
-    FRICTION and PARAMETERS (a number of columns) own physics is copied. Grid origins are uniform in [-jitter, 0].
+    FRICTION, PARAMETERS (a number of columns of WIDTH) and REST own physics is copied. Grid origins are uniform in
+    [-jitter, 0].
     Noise and jitter are Philox numbers that depend only on the sample's seed. With SYMMETRY the window is the image of
     the stored one. Velocities come from stored positions, because mirrored positions are rounded.
     SCENES is a power of two, at least `scenes`. Axes from DIMENSIONS on have neither noise nor jitter.
@@ -123,7 +128,16 @@ def assemble_batch(
         at = values.to(tl.pointer_type(tl.float32)) + own[:, None] * PARAMETERS + number
         written = live[:, None] & (number < PARAMETERS)
         value = tl.load(at, mask=written & (values != 0), other=0.0)
-        tl.store(parameter_of + row[:, None] * PARAMETERS + number, value, mask=written)
+        tl.store(parameter_of + row[:, None] * WIDTH + number, value, mask=written)
+    if REST:
+        number = tl.arange(0, 64)[None, :]
+        shape = tl.load(line + 8, mask=live, other=0)[:, None]
+        written = live[:, None] & (number < PACKED)
+        at = shape.to(tl.pointer_type(tl.int32)) + own[:, None] * PACKED + number
+        value = tl.load(at, mask=written & (shape != 0), other=0)
+        value = tl.where((number < NEIGHBOURS) & (shape == 0), -1, value)
+        value = tl.where((number < NEIGHBOURS) & (value >= 0), value + (row - own)[:, None].to(tl.int32), value)
+        tl.store(rest_of + row[:, None] * PACKED + number, value, mask=written)
     weight = tl.load(line + 5, mask=live, other=0).to(tl.float64, bitcast=True).to(tl.float32)
     tl.store(share_of + row, weight / (scenes * particles.to(tl.float32)), mask=live)
     if NOISE:

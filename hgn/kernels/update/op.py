@@ -26,7 +26,9 @@ from hgn.kernels.muon.op import SquareBlocks
 from hgn.kernels.packing import pack_network
 from hgn.kernels.scene_tables import OBSTACLE_COLUMNS, SceneHash, SceneTable
 from hgn.kernels.update import kernel
+from hgn.network.elastic import RestShape
 from hgn.network.hgn import HierarchicalGraphNetwork
+from hgn.network.own_physics import physics_widths
 from hgn.scene.symmetry import Symmetry, Vector, drawn_symmetry
 from hgn.schema import ConfigError
 
@@ -54,6 +56,7 @@ class DeviceEpisode:
     barrier: SceneHash | None = None  # the barrier of the episode's simulations
     wall_friction: Vector = (0.0, 0.0, 0.0)  # friction of the walls across x, y, z
     parameter_NP: torch.Tensor | None = None  # float32, columns of hgn.network.own_physics; None: all are 0
+    rest: RestShape | None = None  # None: no elastic bodies
 
     def __post_init__(self) -> None:
         position_TN3, material_N = self.position_TN3, self.material_N
@@ -76,6 +79,7 @@ class DeviceEpisode:
         obstacles = self.obstacles.row() if self.obstacles is not None else [0] * OBSTACLE_COLUMNS
         parameters = 0 if self.parameter_NP is None else self.parameter_NP.data_ptr()
         first = [self.position_TN3.data_ptr(), self.particles, 0, 0, self.material_N.data_ptr(), 0, 0, parameters]
+        first.append(0 if self.rest is None else self.rest.packed.data_ptr())
         return np.array([*first, *obstacles], np.int64)
 
 
@@ -342,7 +346,7 @@ class Updates:
                 largest_number=2 * math.pi / shortest, log_range=math.log(longest / shortest),
                 scenes=settings.scenes, HISTORY=config.velocity_history, WAVES=CORRELATED_WAVES,
             )  # fmt: skip
-        walls, parameter_NP = self.buffers.wall_friction_S3, self.buffers.parameter_NP
+        walls, parameter_NP, rest_NR = self.buffers.wall_friction_S3, self.buffers.parameter_NP, self.buffers.rest_NR
         kernel.assemble_batch[(triton.cdiv(self.particles, BLOCK),)](
             samples=self._samples, sample_vectors=self._vectors, update=self.update, position=self.buffers.position_N3,
             velocity=self.buffers.velocity_NV, scene_of=self.buffers.scene_N, material_of=self.buffers.material_N,
@@ -352,9 +356,11 @@ class Updates:
             jitter=config.cell_size if settings.grid_jitter else 0.0, scenes=settings.scenes,
             wall_friction=self.buffers.domain_S3 if walls is None else walls,
             parameter_of=self.share_N if parameter_NP is None else parameter_NP,
+            rest_of=self.buffers.scene_N if rest_NR is None else rest_NR,
             obstacle_cell_size=settings.obstacle_cell_size, HISTORY=config.velocity_history,
             SYMMETRY=settings.symmetry, NOISE=own_step > 0, WAVES=CORRELATED_WAVES if wave_step > 0 else 0,
-            FRICTION=walls is not None, PARAMETERS=0 if parameter_NP is None else parameter_NP.shape[1],
+            FRICTION=walls is not None, PARAMETERS=physics_widths(config)[1],
+            WIDTH=0 if parameter_NP is None else parameter_NP.shape[1], REST=rest_NR is not None,
             DIMENSIONS=config.dimensions, SCENES=triton.next_power_of_2(settings.scenes), BLOCK=BLOCK,
         )  # fmt: skip
 
