@@ -37,7 +37,7 @@ ROOM = 2048 if NATIVE else 64  # for cells on each level
 # frames. Compared in test_network, test_update, test_training and test_rollout.
 ELSEWHERE = {
     *("mark_cells", "fill_tables", "prepare_particles", "prepare_features"),
-    *("sum_motion", "prepare_relative_features"),
+    *("sum_motion", "deform", "prepare_relative_features"),
     *("sum_coarsest", "balance", "balance_backward", "add_coarsest"),
     *("sum_displacements", "find_deformation", "slow_displacements", "stop_slow"),
     *("draw_waves", "assemble_batch", "loss_gradient", "tell_overflow", "square_norm", "average_values"),

@@ -92,7 +92,7 @@ def test_pushforward_stays_within_memory():
         updates._upload(mixed, [0.0] * 3)
         alive = Alive()
         for row in updates._samples[:3].flatten(0, 1).tolist():
-            address, count, _, _, materials, _, _, _, buckets, keys, normals, mask, _ = row
+            address, count, _, _, materials, *_, buckets, keys, normals, mask, _ = row
             assert alive.holds(address, (HISTORY + 2) * count * 12) and alive.holds(materials, 4 * count)
             if buckets:
                 assert alive.holds(buckets, 4 * (mask + 2)) and alive.holds(keys, 8) and alive.holds(normals, 12)
