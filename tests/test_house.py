@@ -19,7 +19,7 @@ LINES = {  # of Python, in tracked files
     "hgn": 32_459,
     "datagen": 8_430,
     "tools": 6_558,
-    "tests": 31_104,
+    "tests": 31_097,
 }
 SETTINGS = 240  # fields of the dataclasses behind the commands, *Config
 
