@@ -233,7 +233,10 @@ class Index(Sequence[ShardEntry]):
                 content = storage.read(name, start, stop) if stop > start else b""
             except FileNotFoundError:
                 raise StorageError(f"{self.folder}/{name} must be there, got no such file; {REMEDY}") from None
-            rows = [from_mapping(cls, parse_json(line, name), name) for line in content.splitlines()]
+            try:
+                rows = [from_mapping(cls, parse_json(line, name), name) for line in content.splitlines()]
+            except ConfigError as error:  # other bytes than were published, perhaps temporarily
+                raise StorageError(f"{self.folder}/{error}") from None
             if len(rows) != count:
                 raise StorageError(
                     f"{self.folder}/{name} must have {count} lines from byte {start}, got {len(rows)}; {REMEDY}"
@@ -268,14 +271,19 @@ class Index(Sequence[ShardEntry]):
             if len(segment.shards) < count:
                 end = self._ends()[number] if count == SEGMENT_SHARDS else None
                 stop = end.bytes if end else self.state.segment_bytes
-                new = self._rows(ShardEntry, number, segment.bytes, stop, count - len(segment.shards))
-                segment = _Segment(segment.shards + new, stop, totals_of(new, segment.totals))
-                for split, expected in (end.totals if end else self.totals).items():
-                    if replace(expected, statistics=None) != segment.totals[split]:
-                        raise ConfigError(
-                            f"{self.folder}/{self.state.path(number)} must hold the {split} shards that were "
-                            f"published, got others; {REMEDY}"
-                        )
+
+                def extended(_: Storage, earlier: _Segment = segment) -> _Segment:
+                    new = self._rows(ShardEntry, number, earlier.bytes, stop, count - len(earlier.shards))
+                    later = _Segment(earlier.shards + new, stop, totals_of(new, earlier.totals))
+                    for split, expected in (end.totals if end else self.totals).items():
+                        if replace(expected, statistics=None) != later.totals[split]:
+                            raise StorageError(
+                                f"{self.folder}/{self.state.path(number)} must hold the {split} shards that were "
+                                f"published, got others; {REMEDY}"
+                            )
+                    return later
+
+                segment = ask(self.folder, extended)
                 read.see(number, segment.shards)
                 read.segments[number] = segment
             read.segments.move_to_end(number)

@@ -15,9 +15,9 @@ from hgn.data.manifest import SPLITS, Manifest
 from hgn.data.pooled import AnyStore, PooledStore
 from hgn.data.reader import EpisodeStore
 from hgn.data.storage import is_remote
-from hgn.schema import ConfigError, from_stored, require
+from hgn.schema import ConfigError, from_stored, printable, require
 from hgn.system.machine import available_cpus
-from hgn.system.patience import UnreachableError
+from hgn.system.patience import UnreachableError, standard_patience_s
 from hgn.system.progress import bar, duration
 from hgn.system.ranks import first_rank
 from hgn.training.generator import Generator
@@ -85,7 +85,7 @@ def wait_for_episodes(
 ) -> AnyStore | None:
     """Waits until enough training episodes are published, those of `others` included. Shows the progress.
 
-    Returns None after a stop request.
+    Returns None after a stop request. After the first reading of the manifest, faults may last for the patience.
     Raises: ConfigError if the generator failed, or if no process generates the missing episodes.
     """
     folder = config.dataset.folder
@@ -96,9 +96,16 @@ def wait_for_episodes(
             f"dataset.folder must hold a data set, got {folder} without one; generate it with python -m datagen "
             f"out={folder}, or set training.generate=true"
         )
-    progress, started = None, time.monotonic()
+    progress, started, seen_s = None, time.monotonic(), -math.inf
     while not stop.requested:
-        store = EpisodeStore(folder, "train") if EpisodeStore.available(folder) else None
+        try:
+            store = EpisodeStore(folder, "train") if EpisodeStore.available(folder) else None
+            seen_s = time.monotonic()
+        except (ConfigError, OSError):
+            if time.monotonic() - seen_s > standard_patience_s():
+                raise
+            time.sleep(0.5)
+            continue
         if store is not None and len(store) >= needed:
             if progress is not None:
                 progress.close()
@@ -119,7 +126,7 @@ def wait_for_episodes(
                 "generate them, or set training.generate=true"
             )
         if progress is None and first_rank():
-            print(f"waiting for training episode {needed} in {folder}", file=sys.stderr)
+            print(printable(f"waiting for training episode {needed} in {folder}"), file=sys.stderr)
             progress = bar("generating", total=needed * config.dataset.frames, unit="frame")
         if progress is not None and generator is not None:
             frames = generator.frames_done()

@@ -8,6 +8,8 @@ import gzip
 import http.server
 import json
 import os
+import re
+import signal
 import threading
 from pathlib import Path
 from unittest import mock
@@ -19,13 +21,16 @@ from training.runs import metrics, train_mapping
 
 import hgn.training.session
 from hgn import train
+from hgn.config import TrainConfig
 from hgn.data.reader import EpisodeStore
 from hgn.data.shard_cache import CACHE_VARIABLE
 from hgn.data.storage import faults_outlived
-from hgn.schema import ConfigError
+from hgn.schema import ConfigError, from_mapping
 from hgn.system.patience import VARIABLE
 from hgn.training import callbacks, checkpoint_writer, monitor
 from hgn.training.checkpoint import LAST_NAMES, read_checkpoint
+from hgn.training.dataset import wait_for_episodes
+from hgn.training.stop import StopRequest
 
 HTML = b"<html><body>502 Bad Gateway</body></html>"
 
@@ -133,6 +138,15 @@ def failing_at_first(real):
     return call
 
 
+def of_the_index(content):
+    return lambda folder: written(content, next(folder.glob("index/*-000000.jsonl")).relative_to(folder))(folder)
+
+
+def lines_of(line):
+    """As many lines of as many bytes as before."""
+    return lambda before: b"".join(line.ljust(len(row) - 1) + b"\n" for row in before.splitlines(True))
+
+
 AWAY = {
     "shard": renamed,
     "index": lambda _: renamed("index"),
@@ -140,6 +154,10 @@ AWAY = {
     "cut": lambda shard: written(lambda before: before[:700], shard),
     "altered": lambda shard: written(lambda before: before[:-1] + b"?", shard),
     "map": lambda _: lambda folder: mock.patch("numpy.memmap", failing_at_first(np.memmap)),
+    **{f"index of {line!r}": lambda _, line=line: of_the_index(lines_of(line)) for line in (b"{}", b"5", b"null")},
+    "index of others": lambda _: of_the_index(functools.partial(re.sub, rb"[0-9a-f]{64}", 64 * b"0")),
+    "index in another order": lambda _: of_the_index(lambda before: b"".join(before.splitlines(True)[::-1])),
+    "another split": lambda _: of_the_index(lambda before: before.replace(b'"split":"train"', b'"split":"other"')),
 }
 
 
@@ -206,6 +224,25 @@ def test_answers_that_pass(data, status, body, headers):
         Server.answers += 3 * [(status, body, headers)]
         assert len(list(store.entries)) == 5
     assert not Server.answers
+
+
+@pytest.mark.parametrize("name", ["brace", "empty", "html", "no text", "other set"])
+def test_faults_while_a_training_waits_for_episodes(data, tmp_path, monkeypatch, name):
+    """A manifest that breaks after the first look is asked for again; without patience it ends the wait."""
+    mapping = train_mapping(data, tmp_path, minimum_episodes=9)
+    mapping["dataset"]["training_scenes"] = 9
+    config = from_mapping(TrainConfig, {key: value for key, value in mapping.items() if key != "name"})
+    stop, (fault, again) = StopRequest(), (faulty(data.dataset.folder, name) for _ in range(2))
+    ends = (lambda: None, lambda: fault.__exit__(None, None, None), lambda: setattr(stop, "signal", signal.SIGTERM))
+    steps = iter((fault.__enter__, *ends, again.__enter__))
+    monkeypatch.setattr("hgn.training.dataset.time.sleep", lambda _: next(steps)())
+    generator = mock.Mock(running=True, frames_done=lambda: 0)
+    assert wait_for_episodes(config, generator, stop) is None
+    monkeypatch.setenv(VARIABLE, "0")
+    stop.signal = None
+    with pytest.raises(ConfigError):
+        wait_for_episodes(config, generator, stop)
+    assert not list(steps)
 
 
 def test_a_folder_of_a_run_that_fails_for_a_moment(data, tmp_path, monkeypatch):
