@@ -15,7 +15,7 @@ from datagen.generate import StopSignal
 from hgn.command import run_command
 from hgn.data.manifest import MANIFEST_NAME, SPLITS, Manifest
 from hgn.data.storage import is_remote, open_storage, write_remote
-from hgn.schema import ConfigError, from_mapping, require
+from hgn.schema import ConfigError, from_mapping, printable, require
 from hgn.system.progress import bar
 
 
@@ -35,7 +35,7 @@ def main(mapping: dict[str, Any]) -> int:
     with StopSignal() as stop:
         target = Target(config.to)
         target.copy(Path(config.data), stop)
-    print(f"{config.to} holds {target.shards} shards" + (", the whole data set" if target.complete else ""))
+    print(printable(f"{config.to} holds {target.shards} shards") + (", the whole data set" if target.complete else ""))
     return 0 if stop.signal is None else 128 + stop.signal
 
 

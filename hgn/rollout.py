@@ -25,7 +25,16 @@ from hgn.scene.material import INPUT_PARAMETERS, MATERIALS
 from hgn.scene.random_scene import generate_scene
 from hgn.scene.scene import Scene
 from hgn.scene.scene_file import find_scene, load_scene, notes_on_files
-from hgn.schema import ConfigError, FrameCount, NonNegative, from_mapping, require, require_bounds, require_replaceable
+from hgn.schema import (
+    ConfigError,
+    FrameCount,
+    NonNegative,
+    from_mapping,
+    printable,
+    require,
+    require_bounds,
+    require_replaceable,
+)
 from hgn.system.files import require_place
 from hgn.system.processes import ended_as_by_ctrl_c
 from hgn.system.progress import bar
@@ -129,7 +138,7 @@ def rollout(config: RolloutConfig) -> tuple[Path, Rollout]:
         initial = InitialState.of_episode(episode)
         obstacles = obstacles_of_episode(episode)
         reference_TN3 = episode.position_TN3[:frames]
-        source |= {"data": Path(config.data).name, "episode": str(config.episode)}
+        source |= {"data": Path(printable(config.data)).name, "episode": str(config.episode)}
     limit = simulator.info.maximum_initial_speed
     fastest = float(np.linalg.norm(initial.velocity_N3, axis=-1).max(initial=0.0))
     if limit is not None and fastest > limit * (1 + SAME_SPEED):

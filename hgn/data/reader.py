@@ -323,7 +323,7 @@ class EpisodeStore(Episodes):
         frames = config.get("frames", entry.frames)
         lengths = {frames, config.get("long_frames", frames)}
         if actual != expected or entry.frames not in lengths:
-            raise ConfigError(
+            raise StorageError(
                 f"{self.folder}/{shard.name}: {entry.key} must have seed, particles, frames {expected}, and frames "
                 f"must be one of the data set's ({lengths}), got {actual}; {REMEDY}"
             )
@@ -376,7 +376,7 @@ def first_episodes(store: EpisodeStore, count: int) -> list[Episode]:
         others = ", ".join(f"split={split}" for split in SPLITS if len(store.of_split(split)))
         remedy = f"; it has others: {others}" if others else ""
         raise ConfigError(f"data must contain episodes of the split {store.split}, got none in {store.folder}{remedy}")
-    return [store.open(i) for i in store.first_indices(count)]
+    return [store.read(i) for i in store.first_indices(count)]
 
 
 def find_episode(folder: Path | str, key: str) -> Episode:
@@ -387,5 +387,5 @@ def find_episode(folder: Path | str, key: str) -> Episode:
     store = EpisodeStore(folder, split)
     for place, entry in enumerate(store.entries):
         if entry.key == key:
-            return store.open(place)
+            return store.read(place)
     raise ConfigError(f"episode must be one of the {len(store)} {split} episodes in {folder}, got {key!r}")

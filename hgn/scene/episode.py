@@ -47,6 +47,7 @@ _PARAMETER = ("<f4", "N")
 _OPTIONAL = ("obstacle_friction", "obstacle_point", "past", "boundary")
 
 _NAME = re.compile(r"[A-Za-z0-9_-]+")
+_FARTHEST = 1000.0  # largest coordinate, speed and gravity, in sizes of the domain; a network's grid has about twice it
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,7 +85,11 @@ class Episode:
         for name in self.material_parameters:
             if not _NAME.fullmatch(name):
                 raise ConfigError(f"{self.key}: parameter names must be letters, digits, - and _, got {name!r}")
-        arrays = self.arrays()
+        try:
+            require_bounds(self)
+        except ConfigError as error:
+            raise ConfigError(f"{self.key}: {error}") from None
+        arrays, farthest = self.arrays(), _FARTHEST * max(self.domain_size)
         lengths = dict(zip("TN3", position.shape, strict=True)) | {"K": len(self.obstacle_grid.cell_K3)}
         lengths |= {"H": len(arrays.get("past", ())), "P": len(arrays.get("boundary", ()))}
         for name, array in arrays.items():
@@ -94,13 +99,11 @@ class Episode:
                 raise ConfigError(f"{self.key}: {name} must be of type {dtype.name}, got {array.dtype}")
             if array.shape != shape:
                 raise ConfigError(f"{self.key}: {name} must have shape {shape}, got {array.shape}")
-            if name != "position" and not np.isfinite(array).all():
-                raise ConfigError(f"{self.key}: {name} must be finite, got {_first_not_finite(array)}")
+            if name != "position":
+                far = name in ("velocity", "past", "boundary")
+                _require_within(f"{self.key}: {name}", array, farthest if far else 3e38)
+        _require_within(f"{self.key}: gravity", np.array(self.gravity), farthest)
         require_materials(f"{self.key}: material", self.material_N, self.materials)
-        try:
-            require_bounds(self)
-        except ConfigError as error:
-            raise ConfigError(f"{self.key}: {error}") from None
         cell_size = self.obstacle_grid.cell_size
         require(0 < cell_size < math.inf, f"{self.key}: cell_size", "a finite number > 0", cell_size)
         least = min((*self.wall_friction, *arrays.get("obstacle_friction", ())))
@@ -175,7 +178,7 @@ def encode_episode(episode: Episode) -> dict[str, bytes]:
     with sorted keys.
     Raises: ConfigError if positions are not finite, or if specification or solver cannot be written as JSON.
     """
-    _require_finite_positions(episode)
+    _require_sound_positions(episode)
     members = {
         f"{name}.npy": _encode_array(array, _ARRAYS.get(name, _PARAMETER)[0])
         for name, array in episode.arrays().items()
@@ -253,7 +256,7 @@ def decode_episode(key: str, members: Mapping[str, bytes | np.ndarray], scan_pos
         wall_friction=description.wall_friction,
     )
     if scan_positions:
-        _require_finite_positions(episode)
+        _require_sound_positions(episode)
     return episode
 
 
@@ -299,18 +302,19 @@ def require_schema_version(mapping: object, name: str) -> None:
         )
 
 
-def _require_finite_positions(episode: Episode) -> None:
+def _require_sound_positions(episode: Episode) -> None:
     # frame by frame, so that a memory map is not loaded completely
     for frame, position_N3 in enumerate(np.asarray(episode.position_TN3)):
-        if not np.isfinite(position_N3).all():
-            raise ConfigError(
-                f"{episode.key}: position must be finite, got {_first_not_finite(position_N3)} in frame {frame}"
-            )
+        farthest = _FARTHEST * max(episode.domain_size)
+        _require_within(f"{episode.key}: position", position_N3, farthest, f" in frame {frame}")
 
 
-def _first_not_finite(array: np.ndarray) -> str:
-    at = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])
-    return f"{array[at]} at {list(at)}"
+def _require_within(name: str, array: np.ndarray, farthest: float, place: str = "") -> None:
+    """Raises ConfigError for a value that is not finite, or farther from 0 than `farthest`."""
+    if not np.abs(array).max(initial=0) <= farthest:
+        at = tuple(int(i) for i in np.argwhere(~(np.abs(array) <= farthest))[0])
+        rule = f"at most {farthest:g} in size" if np.isfinite(array[at]) else "finite"
+        raise ConfigError(f"{name} must be {rule}, got {array[at]} at {list(at)}{place}")
 
 
 def _encode_array(array: np.ndarray, dtype: str) -> bytes:

@@ -13,6 +13,8 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from hgn.schema import printable
+
 if TYPE_CHECKING:
     import torch
 
@@ -64,8 +66,8 @@ def provenance(device: torch.device | str = "cpu") -> dict[str, Any]:
 
 
 def command_line() -> str:
-    """Returns the command line of this process, without folders of this machine."""
-    return shlex.join(without_folders(sys.orig_argv))
+    """Returns the command line of this process, without passwords and without folders of this machine."""
+    return printable(shlex.join(without_folders(sys.orig_argv)))
 
 
 def without_folders(value: Any) -> Any:

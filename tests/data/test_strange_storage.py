@@ -14,11 +14,12 @@ import pytest
 from data.test_http import PlainFiles, answering
 from training.runs import train_mapping
 
-from hgn import train
+from datagen import upload
+from hgn import evaluate, export, rollout, train
 from hgn.data import shard_cache
 from hgn.data.index import ListedIndex
 from hgn.data.manifest import Manifest
-from hgn.data.reader import EpisodeStore
+from hgn.data.reader import EpisodeStore, find_episode, first_episodes
 from hgn.data.shard_cache import CACHE_VARIABLE, LIMIT_VARIABLE, CachedShard, cached_shard
 from hgn.scene.npz import read_npz
 from hgn.schema import ConfigError, printable
@@ -133,15 +134,23 @@ def test_passwords_and_control_characters(text, shown):
     assert printable(text) == shown == str(ConfigError(text))
 
 
-def test_no_file_of_a_run_has_the_password(data, tmp_path, capsys):
-    """A training from a URL with a password writes and prints the URL without it."""
+def test_no_file_of_a_run_has_the_password(data, tmp_path, capsys, monkeypatch):
+    """Commands with a URL with a password write and print the URL, and their command line, without it."""
     run = tmp_path / "run"
     with answering(functools.partial(PlainFiles, directory=data.dataset.folder)) as url:
         mapping = train_mapping(data, run, monitor_every=100)
-        mapping["dataset"]["folder"] = url.replace("://", "://user:secret-word@")
+        mapping["dataset"]["folder"] = secret = url.replace("://", "://user:secret-word@")
+        monkeypatch.setattr("sys.orig_argv", ["python", "-m", "hgn.train", f"dataset.folder={secret}"])
         assert train.main(mapping) == 0
+        weights, options = run / "weights.safetensors", {"data": secret, "device": "cpu", "backend": "torch"}
+        export.export(run / "checkpoints" / "last.ckpt", weights)
+        options["weights"] = str(weights)
+        evaluate.main(options | {"json": str(run / "errors.json"), "scenes": 1, "rollout_frames": 0})
+        out = str(run / "rollout.vtkhdf")
+        rollout.main(options | {"episode": "validation-000000", "frames": 2, "out": out, "render": True})
+    upload.main({"data": data.dataset.folder, "to": "memory://user:secret-word@there"})
     shown = capsys.readouterr()
-    assert "secret-word" not in shown.out + shown.err
+    assert "secret-word" not in shown.out + shown.err and (run / "rollout.png").is_file()
     assert not [path for path in run.rglob("*") if path.is_file() and b"secret-word" in path.read_bytes()]
 
 
@@ -162,15 +171,15 @@ def test_few_open_files(data, monkeypatch):
     assert after - before <= 2
 
 
-def with_nan(folder, split="train"):
-    """The name of a shard whose last position is NaN, and whose checksum in the index is right."""
+def with_value(folder, split="train", value=np.nan, member="position.npy"):
+    """The name of a shard whose last position is `value`, NaN for example, and whose checksum in the index is right."""
     manifest = Manifest.load(folder)
     shards = list(manifest.shards)
     place = next(place for place, shard in enumerate(shards) if shard.split == split)
     path = Path(folder) / shards[place].name
     content = bytearray(path.read_bytes())
-    offset, size = shards[place].episodes[0].members["position.npy"]
-    content[offset + size - 4 : offset + size] = np.float32("nan").tobytes()
+    offset, size = shards[place].episodes[0].members[member]
+    content[offset + size - 4 : offset + size] = np.float32(value).tobytes()
     path.write_bytes(content)
     shards[place] = replace(shards[place], sha256=hashlib.sha256(content).hexdigest())
     replace(manifest, shards=ListedIndex(shards)).save(folder)
@@ -180,10 +189,19 @@ def with_nan(folder, split="train"):
 @pytest.mark.parametrize("split", ["train", "validation"])
 def test_a_shard_that_is_not_finite_is_named(data, tmp_path, split):
     """A training on it ends with an error that names the shard and the frame, instead of skipping updates."""
-    name = with_nan(data.dataset.folder, split)
+    name = with_value(data.dataset.folder, split)
     with pytest.raises(ConfigError, match=rf"{name} must be a sound shard, got {split}-.*: position must be finite"):
         list(EpisodeStore(data.dataset.folder, split))
     with pytest.raises(ConfigError, match=name):
+        train.main(train_mapping(data, tmp_path / "run"))
+
+
+@pytest.mark.parametrize("value", [3e38, -1e19, 1e6, np.inf])
+@pytest.mark.parametrize("member", ["position.npy", "velocity.npy"])
+def test_numbers_that_no_network_can_compute_with_are_named(data, tmp_path, member, value):
+    """Positions and speeds far outside the domain end a training as NaN does."""
+    name, rule = with_value(data.dataset.folder, "train", value, member), "at most 1000 in size"
+    with pytest.raises(ConfigError, match=f"{name}.*{member[:8]} must be {rule if value < np.inf else 'finite'}, got"):
         train.main(train_mapping(data, tmp_path / "run"))
 
 
@@ -206,11 +224,19 @@ def test_interleaved_members_of_an_archive(tmp_path):
     assert read == ["b/position", "b/particle_type", "a/position", "a/particle_type", "c"]
 
 
+READS = {
+    "index": lambda store: store[0],
+    "first_episodes": lambda store: first_episodes(store, 1)[0],
+    "find_episode": lambda store: find_episode(store.folder, "train-000000"),
+}
+
+
+@pytest.mark.parametrize("read", READS)
 @pytest.mark.parametrize("size", [0, 1000, 100_000])
-def test_a_shard_that_is_cut_under_an_episode(data, size):
+def test_a_shard_that_is_cut_under_an_episode(data, size, read):
     """An episode that was handed out stays readable; the next one is refused."""
     store = EpisodeStore(data.dataset.folder, "train")
-    episode = store[0]
+    episode = READS[read](store)
     before = episode.position_TN3.tobytes()
     for path in Path(data.dataset.folder).glob("train*.tar"):
         os.truncate(path, min(size, path.stat().st_size - 1))

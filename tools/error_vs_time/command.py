@@ -23,7 +23,7 @@ from hgn.data.reader import EpisodeStore, first_episodes
 from hgn.runtime.simulator import InitialState, Simulator
 from hgn.runtime.weights import find_weights, load_weights, require_frame_rate, shipped_weights
 from hgn.scene.episode import Episode
-from hgn.schema import ConfigError, from_mapping, from_stored, require, require_replaceable
+from hgn.schema import ConfigError, from_mapping, from_stored, printable, require, require_replaceable
 from hgn.system.device import choose_device
 from hgn.system.machine import available_cpus
 from tools.error_vs_time.contenders import (
@@ -87,7 +87,8 @@ def main(mapping: dict[str, Any]) -> int:
             for solver in solvers:
                 solver.launches.collide(references, threads)
     meta = meta_of(config, device) | same
-    meta |= {"data": Path(config.data).name, "split": config.split, "scenes": len(references), "left_out": left_out}
+    data = Path(printable(config.data)).name
+    meta |= {"data": data, "split": config.split, "scenes": len(references), "left_out": left_out}
     meta["set"] = set_record(config.data, store.manifest.config["seed"], {c.file for c in networks})
     meta |= {"convention": CONVENTION, "seconds_before_scoring": time.monotonic() - started}
     run = Run(config, contenders, references, device, meta, started)
