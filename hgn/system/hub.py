@@ -9,7 +9,9 @@ from __future__ import annotations
 import functools
 import os
 import re
+import threading
 from collections.abc import Callable
+from concurrent.futures import Future
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -22,6 +24,7 @@ PREFIX = "hf://"
 _NAME = r"[\w.-]+"
 _PATTERN = re.compile(rf"hf://(datasets/)?({_NAME}/{_NAME})(?:@([^/]+))?(?:/(.*))?")
 _PATIENCE_S = 60.0
+_DOWNLOAD_S = 600.0  # longest time of an answer; huggingface_hub limits only the time between two pieces of it
 _PACKAGES = ("httpx", "httpx2", "httpcore", "httpcore2")
 _PASSING = (408, 425, 429)
 
@@ -91,8 +94,21 @@ def hub_weights(url: str, field: str = "weights", patience_s: float = _PATIENCE_
 
 def _patiently(ask: Callable[[], T], url: str, field: str, patience_s: float) -> T:
     """Retries while the server is away. The errors of huggingface_hub and httpx are not OSErrors."""
+
+    def answered() -> T:
+        answer: Future[T] = Future()
+
+        def fill() -> None:
+            try:
+                answer.set_result(ask())
+            except BaseException as error:  # noqa: BLE001 - raised in the waiting thread
+                answer.set_exception(error)
+
+        threading.Thread(target=fill, name="hub", daemon=True).start()
+        return answer.result(_DOWNLOAD_S)
+
     try:
-        return patiently(ask, lambda error: _passing(error, url, field), url, endpoint(), patience_s)
+        return patiently(answered, lambda error: _passing(error, url, field), url, endpoint(), patience_s)
     except UnreachableError as error:
         raise ConfigError(
             f"{field} must be within reach, got no answer from {endpoint()} for {url} in {patience_s:.0f} s "

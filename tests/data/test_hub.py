@@ -1,10 +1,12 @@
 """Weights and data sets of the Hugging Face Hub, from a stand-in that speaks its protocol."""
 
 import shutil
+import time
 
 import numpy as np
 import pytest
 import torch
+from data import hub_server
 from data.hub_server import TOKEN, served
 from network.states import network_of
 
@@ -77,6 +79,15 @@ def test_a_server_that_fails_is_asked_again(hub, monkeypatch):
     hub.failures = 1_000_000
     with pytest.raises(ConfigError, match=r"weights must be within reach, got no answer from .* for hf://one/two/a"):
         hub_weights("hf://one/two/a.safetensors", patience_s=0.05)
+
+
+def test_a_repository_that_answers_too_slowly(hub, monkeypatch):
+    """huggingface_hub itself would wait for a server that drips as long as it sends anything."""
+    answer = hub_server._Handler._answer
+    monkeypatch.setattr(hub_server._Handler, "_answer", lambda *given: time.sleep(0.5) or answer(*given))
+    monkeypatch.setattr("hgn.system.hub._DOWNLOAD_S", 0.1)
+    with pytest.raises(ConfigError, match=r"weights must be within reach.*TimeoutError"):
+        hub_weights("hf://one/two/b.safetensors", patience_s=0.0)
 
 
 def test_a_data_set_is_read_from_a_repository(hub, folder, monkeypatch):
