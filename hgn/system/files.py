@@ -107,9 +107,9 @@ def require_place(path: Path) -> None:
 
 
 def is_replaceable(path: Path) -> bool:
-    """Returns whether no file of another program is lost when `path` is written."""
+    """Returns whether no file of another program is lost when `path` is written. Renaming would replace a device."""
     if not path.is_file() or not path.stat().st_size:
-        return True
+        return path.is_file() or path.is_dir() or not path.exists()
     with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
         return _WRITTEN_BY_HGN.search(content) is not None
 

@@ -83,6 +83,13 @@ def test_files_of_other_programs_stay(place, command, arguments, name, capsys, m
     assert content(place.folder) == before
 
 
+def test_pipes_stay(place, capsys, monkeypatch):
+    """A pipe, a socket or a device is not replaced by a file either."""
+    os.mkfifo("pipe.safetensors")
+    code, line = refused("export", [OF_THE_RUN, "out=pipe.safetensors"], capsys, monkeypatch)
+    assert code == EXIT_INPUT and "that HGN wrote, got" in line and place.path("pipe.safetensors").is_fifo()
+
+
 def test_pictures_refused_before_a_bar(place, capsys, monkeypatch):
     """An animation that viewers would not play is refused before its drawing begins."""
     assert exit_code(rollout.main, "rollout", [*ROLLOUT, "out=r.vtkhdf"], monkeypatch) == 0
