@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from numbers import Integral
 from types import TracebackType
 from typing import Any
 
@@ -119,13 +120,14 @@ class LiveSimulation:
         """
         self._require_scene(index)
         require(index not in self.ended, "index", "of a scene in progress", index, remedy="reset it")
-        count = len(position_A3)
+        count = len(position_A3) if np.ndim(position_A3) else 0
         for name, value, shape in (
             ("position_A3", position_A3, (count, 3)),
             ("velocity_A3", velocity_A3, (count, 3)),
             ("material_A", material_A, (count,)),
         ):
             require(isinstance(value, np.ndarray), name, "a NumPy array", type(value).__name__)
+            require(value.dtype.kind in "iuf", name, "of real numbers", str(value.dtype))
             require(value.shape == shape, name, f"of shape {shape}", value.shape)
             unusable = np.asarray(value)[~np.isfinite(value)]
             require(not len(unusable), name, "finite", float(unusable[0]) if len(unusable) else 0.0)
@@ -162,6 +164,8 @@ class LiveSimulation:
         self._require_scene(index)
         state = self.state
         mine_N = state.scene_N == index
+        shape = np.shape(position_N3)
+        require(len(shape) == 2 and shape[1] == 3, "position_N3", "of shape (any, 3)", shape)
         count, expected = len(position_N3), (len(position_N3), *state.velocity_NM3.shape[1:])
         require(np.shape(velocity_NM3) == expected, "velocity_NM3", f"of shape {expected}", np.shape(velocity_NM3))
         most = int(mine_N.sum())
@@ -181,7 +185,8 @@ class LiveSimulation:
 
     def _require_scene(self, index: int) -> None:
         last = len(self.scenes) - 1
-        require(0 <= index <= last, "index", f"0 to {last}, a scene of the batch", index)
+        valid = isinstance(index, Integral) and 0 <= index <= last
+        require(valid, "index", f"0 to {last}, a scene of the batch", index)
 
     def _started(self, scenes: Sequence[InitialState]) -> ParticleState:
         """Returns the start of scenes without their obstacles, which often do not change and are slow to prepare."""

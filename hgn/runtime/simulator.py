@@ -10,6 +10,7 @@ import math
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from numbers import Real
 from pathlib import Path
 from typing import Any
 
@@ -40,7 +41,7 @@ from hgn.scene.moving import MovingObstacle, at_rest, moving_obstacles, moving_o
 from hgn.scene.obstacle_grid import ObstacleGrid, build_obstacle_grid
 from hgn.scene.own_physics import input_parameters
 from hgn.scene.rest_shape import body_numbers, rest_neighbours
-from hgn.scene.scene import Scene, all_corners, whole_cells
+from hgn.scene.scene import Scene, all_corners, require_particles, whole_cells
 from hgn.schema import require
 from hgn.system.device import choose_device
 
@@ -69,6 +70,12 @@ class InitialState:
     parameters: np.ndarray | None = None  # float32 [N, P], hgn.scene.own_physics.input_parameters
     body_N: np.ndarray | None = None  # number of each particle's body; None: elastic particles near each other are one
     moving: tuple[MovingObstacle, ...] = ()  # obstacles in motion; `obstacle_grid` and `corners` are of those at rest
+
+    def __post_init__(self) -> None:
+        require_particles(self.position_N3, self.velocity_N3, self.material_N, self.materials)
+        for name in ("gravity", "domain_size"):
+            value = getattr(self, name)
+            require(np.shape(value) == (3,) and all(isinstance(x, Real) for x in value), name, "three numbers", value)
 
     @staticmethod
     def of_episode(episode: Episode) -> InitialState:
@@ -116,6 +123,7 @@ class InitialState:
     @staticmethod
     def of(scene: InitialState | Scene) -> InitialState:
         """Returns the initial state of a scene, or the given one."""
+        require(isinstance(scene, (Scene, InitialState)), "scene", "a Scene or an InitialState", type(scene).__name__)
         return InitialState.of_scene(scene) if isinstance(scene, Scene) else scene
 
     @functools.cached_property
@@ -336,6 +344,7 @@ class Simulator:
         intermediate results in memory. docs/how_to/gradients.md lists quantities with gradients.
         Raises: ConfigError and DivergedError as `rollout`.
         """
+        require(isinstance(scene, Scene), "scene", "a Scene", type(scene).__name__)
         inputs = Inputs(position_N3, velocity_N3, gravity_3, domain_size_3, poses=poses, smoothing=smoothing)
         inputs = replace(inputs, physics=physics)
         scene = with_velocities(scene, poses or {})

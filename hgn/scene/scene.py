@@ -61,6 +61,23 @@ def all_corners(obstacles: Sequence[Obstacle]) -> np.ndarray:
     return np.concatenate([np.zeros((0, 3, 3)), *(obstacle.corners for obstacle in obstacles)])
 
 
+def require_particles(
+    position_N3: np.ndarray, velocity_N3: np.ndarray, material_N: np.ndarray, materials: Sequence[str] = MATERIALS
+) -> None:
+    """Checks arrays of particles. Raises: ConfigError for a wrong type, shape or material."""
+    count = len(position_N3) if isinstance(position_N3, np.ndarray) and position_N3.ndim else 0
+    for name, array, shape in (
+        ("position_N3", position_N3, (count, 3)),
+        ("velocity_N3", velocity_N3, (count, 3)),
+        ("material_N", material_N, (count,)),
+    ):
+        require(isinstance(array, np.ndarray), name, "a NumPy array", type(array).__name__)
+        require(array.dtype.kind in "iuf", name, "of real numbers", str(array.dtype))
+        if array.shape != shape:
+            raise ConfigError(f"{name} must have shape {shape}, got {array.shape}")
+    require_materials("material_N", material_N, materials)
+
+
 @dataclass(frozen=True, eq=False)
 class Scene:
     """A scene: the input of the solver and of a network's rollout."""
@@ -85,15 +102,12 @@ class Scene:
     entry_s_N: np.ndarray | None = None
 
     def __post_init__(self) -> None:
+        require_particles(self.position_N3, self.velocity_N3, self.material_N)
         count = len(self.position_N3)
-        for name, shape in (("position_N3", (count, 3)), ("velocity_N3", (count, 3)), ("material_N", (count,))):
-            array = getattr(self, name)
-            require(isinstance(array, np.ndarray), name, "a NumPy array", type(array).__name__)
-            if array.shape != shape:
-                raise ConfigError(f"{name} must have shape {shape}, got {array.shape}")
-            bad = np.flatnonzero(~np.isfinite(array).all(axis=tuple(range(1, array.ndim))))
+        for name in ("position_N3", "velocity_N3"):
+            bad = np.flatnonzero(~np.isfinite(getattr(self, name)).all(axis=1))
             if len(bad):
-                raise ConfigError(f"{name} must be finite, got {array[bad[0]]} for particle {bad[0]}")
+                raise ConfigError(f"{name} must be finite, got {getattr(self, name)[bad[0]]} for particle {bad[0]}")
         frictions = {f"obstacles[{i}].friction": o.friction for i, o in enumerate(self.obstacles)}
         frictions |= {f"wall_friction[{i}]": friction for i, friction in enumerate(self.wall_friction)}
         for name, friction in frictions.items():
@@ -107,7 +121,6 @@ class Scene:
             require(self.entry_s_N.shape == (count,), "entry_s_N", f"of shape {(count,)}", self.entry_s_N.shape)
             ordered = bool((np.diff(self.entry_s_N, prepend=0.0) >= 0).all()) and np.isfinite(self.entry_s_N).all()
             require(bool(ordered), "entry_s_N", "finite, >= 0 and in order", self.entry_s_N)
-        require_materials("material_N", self.material_N, MATERIALS)
 
     @property
     def moves(self) -> bool:

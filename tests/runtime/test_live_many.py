@@ -111,6 +111,14 @@ def test_what_is_refused_changes_nothing():
             (lambda: live.reset(1, far), "position_N3 must be finite and"),
             (lambda: live.reset(1, emitting), "emitters must be left out here"),
             (lambda: LiveSimulation(simulator, []), "scenes must be at least one, got 0"),
+            (lambda: LiveSimulation(simulator, [None]), "scene must be a Scene or an InitialState, got 'NoneType'"),
+            (lambda: live.set_gravity((0.0, 1.0)), r"gravity must be three numbers, got \(0.0, 1.0\)"),
+            (lambda: live.reset(0, replace(first, velocity_N3=first.velocity_N3[:5])), "velocity_N3 must have shape"),
+            (lambda: live.reset(0, replace(first, material_N=np.full(10, 99))), "material_N must be 0 to 3"),
+            (lambda: live.reset(0, replace(first, position_N3=[[0.5] * 3] * 10)), "position_N3 must be a NumPy array"),
+            (lambda: live.restore(first.position_N3[:, :2], first.velocity_N3, 0), "position_N3 must be of shape"),
+            (lambda: live.add_particles(None, None, None), "position_A3 must be a NumPy array, got 'NoneType'"),
+            (lambda: live.set_gravity((0.0, 0.0, 0.0), index=0.5), "index must be 0 to 1, a scene of the batch, got 0"),
         ):  # fmt: skip
             with pytest.raises(ConfigError, match=message):
                 call()
