@@ -65,6 +65,8 @@ def main(mapping: dict[str, Any]) -> int:
 
 def play_page(config: PlayConfig) -> Any:
     """Returns a `hgn.viewer.page.PlayPage` of a scene. Raises ConfigError as loading and simulating the scene do."""
+    path = find_scene(config.scene)
+    scene = load_scene(path)  # before PyTorch and the weights, so that a mistake in it is answered early
     from hgn.runtime.simulator import Simulator
     from hgn.runtime.weights import shipped_weights
     from hgn.system.device import choose_device
@@ -77,9 +79,8 @@ def play_page(config: PlayConfig) -> Any:
     def load(weights: str) -> Simulator:
         return Simulator.load(weights, config.device, config.backend, config.precision)
 
-    simulator, path = load(name), find_scene(config.scene)
+    simulator = load(name)
     print(simulator.backend.note, file=sys.stderr)
-    scene = load_scene(path)
     for note in notes_on_files(scene):
         print(note, file=sys.stderr)
     most = config.particles or max(8_000 if place.type == "cpu" else 40_000, scene.particle_count)

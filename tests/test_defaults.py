@@ -1,6 +1,7 @@
 """What the commands compose to: defaults stand once, in the dataclasses, and experiments say what differs."""
 
 import inspect
+import sys
 from collections.abc import Mapping
 from pathlib import Path
 from types import SimpleNamespace
@@ -15,7 +16,7 @@ from hgn.command_help import help_lines
 from hgn.config import DEFAULT_WEIGHTS, TrainingConfig, config_directory
 from hgn.runtime.simulator import Simulator
 from hgn.runtime.weights import shipped_weights
-from hgn.schema import field_comments
+from hgn.schema import ConfigError, field_comments
 
 # of train every key, of the other command lines those with other values
 RESOLVED = yaml.safe_load((Path(__file__).parent / "resolved.yaml").read_text())
@@ -89,6 +90,14 @@ def test_weights_of_play(monkeypatch, device, expected):
         with pytest.raises(LookupError, match=f"^{taken}$"):
             play.play_page(play.PlayConfig(weights=given))
     assert expected in field_comments(play.PlayConfig)["weights"]
+
+
+@pytest.mark.parametrize(("scene", "message"), [("funel", "did you mean funnel"), ("my.yaml", "existing YAML file")])
+def test_play_answers_a_mistyped_scene_before_it_loads_weights(monkeypatch, scene, message):
+    """Neither PyTorch nor the weights are loaded first, which takes long on a busy machine."""
+    monkeypatch.setitem(sys.modules, "hgn.runtime.simulator", None)
+    with pytest.raises(ConfigError, match=message):
+        play.play_page(play.PlayConfig(scene=scene))
 
 
 def test_help_shows_comments(monkeypatch):

@@ -16,10 +16,10 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 32_532,
+    "hgn": 32_557,
     "datagen": 8_430,
     "tools": 6_559,
-    "tests": 31_186,
+    "tests": 31_244,
 }
 SETTINGS = 240  # fields of the dataclasses behind the commands, *Config
 

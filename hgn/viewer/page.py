@@ -77,6 +77,7 @@ class PlayPage:
         self.stage = StageView(self.server, session.domain_size, spacing)
         self.ended, self.playing, self.steps = threading.Event(), True, 0
         self.diverged = False  # whether the page paused because the simulation diverged
+        self.limited = False  # whether the viewers know that this drag pours no more
         self.viewed = threading.Event()  # set by the first viewer; the simulation waits for it
         self.actions: dict[object, tuple[Callable[[], Any], Any]] = {}
         self._queueing = threading.Lock()
@@ -136,8 +137,7 @@ class PlayPage:
                     self._notify(f"{error}; paused a frame before. Press Back by or Restart")
                 frames, changed = frames + 1, True
                 if self.session.spout is not None and self.session.full:
-                    self.session.spout = None
-                    self._notify(self._limit())
+                    self._end_pouring()
             if changed:
                 shown = updates(self._show)
             now = time.monotonic()
@@ -340,16 +340,34 @@ class PlayPage:
             self.do(lambda: self._drop(np.array(event.ray_origin), np.array(event.ray_direction)), event.client)
 
     def _pour(self, origin_3: np.ndarray, direction_3: np.ndarray | None) -> None:
-        """Opens the spout at the target of the ray, or closes it without a ray."""
-        if direction_3 is not None and self.session.spout is None:
-            self.session.remember()
-        self.session.spout = None if direction_3 is None else self._spout(origin_3, direction_3)
+        """Opens the spout at the target of the ray, or closes it without a ray.
+
+        At the limit it stays closed until the next drag. Otherwise each motion of the mouse would be one more message,
+        and one more step of Undo.
+        """
+        if direction_3 is None:
+            self.session.spout, self.limited = None, False
+        elif self.session.full:
+            if not self.limited:
+                self._end_pouring()
+        else:
+            spout = self._spout(origin_3, direction_3)
+            if self.session.spout is None:
+                self.session.remember()
+            self.session.spout = spout
+
+    def _end_pouring(self) -> None:
+        self.session.spout, self.limited = None, True
+        self._notify(self._limit())
 
     def _drop(self, origin_3: np.ndarray, direction_3: np.ndarray) -> None:
         spout = self._spout(origin_3, direction_3)
+        if self.session.full:
+            self._notify(self._limit())
+            return
         self.session.remember()
         if not self.session.drop(spout.material, spout.position, spout.diameter, spout.speed):
-            self._notify(self._limit() if self.session.full else "there is no room for a ball here")
+            self._notify("there is no room for a ball here")
 
     def _limit(self) -> str:
         most = self.session.maximum_particles

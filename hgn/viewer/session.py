@@ -267,7 +267,7 @@ class PlaySession:
         return self.add_obstacle(ObstacleEntry(mesh=path.name, scale=scale, position=(x, y, z)), path.parent)
 
     def free_place(self, size: float) -> Vector:
-        """Returns the centre of a free cube, as near as possible to the middle of the domain at 0.3 of its height.
+        """Returns the centre of a free cube in the domain, as near as possible to its middle at 0.3 of its height.
 
         Raises: ConfigError where there is none.
         """
@@ -277,6 +277,8 @@ class PlaySession:
         share_C3 = np.stack(np.meshgrid(*[np.linspace(0.1, 0.9, 9)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
         for share_3 in (middle, *share_C3[np.linalg.norm(share_C3 - middle, axis=1).argsort(kind="stable")]):
             centre = share_3 * domain
+            if (np.abs(centre - 0.5 * domain) + 0.5 * size > 0.5 * domain + 1e-9).any():
+                continue  # a part of it would be beyond a wall
             if not (np.abs(taken_A3 - centre) < 0.5 * size + self.cell_size).all(axis=1).any():
                 x, y, z = centre.tolist()
                 return x, y, z

@@ -159,7 +159,8 @@ YAML, ALIASES = "must be a YAML file", "its aliases expand to more than 100000 v
 ONE_CUBE = "groups:\n  - {shape: cube, size: 0.05, position: [0.5, 0.8, 0.5], material: water}\n"
 MISTAKES = [
     ("groups: [", YAML),
-    (b"\xff\xfe\xfa", YAML),
+    (b"\xff\xfe\xfa", YAML + ": it is not UTF-8 text"),
+    (b"PK\x03\x04\xff", YAML + ": it is a zip file; unpack it, and give the YAML file in it"),
     ("groups: " + 1000 * "[", YAML),
     ("cell_size: " + 5000 * "9", YAML + ": Exceeds the limit"),
     ("cell_size: " + 400 * "9", "cell_size must be a number of at most 63 bits, got one of 1329"),

@@ -209,13 +209,30 @@ def test_free_places(session):
     for _ in range(4):
         place = np.array(session.free_place(0.15))
         inside = np.abs(session.newest.position_N3 - place) < 0.075
-        assert not inside.all(axis=1).any() and place.min() >= 0.1 - 1e-9 and place.max() <= 0.9 + 1e-9
+        assert not inside.all(axis=1).any() and place.min() >= 0.075 - 1e-9 and place.max() <= 0.925 + 1e-9
         for obstacle in session.obstacles:
             assert not (np.abs(obstacle.samples[0] - place) < 0.075).all(axis=1).any()
         session.add_obstacle(ObstacleEntry(shape="half_box", size=0.15, position=tuple(place.tolist())))
     with pytest.raises(ConfigError, match=r"size must leave room among particles and obstacles, got 0\.9"):
         session.free_place(0.9)
     assert not session.full
+
+
+@pytest.mark.parametrize(("middle", "size"), [(0.5, 0.3), (0.3, 0.6)])
+def test_free_places_are_inside_the_domain(middle, size):
+    """No part of an obstacle at a free place is beyond a wall, although places near walls are free too."""
+    block_N3 = middle + 0.2 * np.random.default_rng(0).random((500, 3)).astype(np.float32)
+    scene = Scene(block_N3, 0 * block_N3, np.zeros(500, np.uint8), cell_size=1 / 32, domain_size=(1.0, 1.0, 1.0))
+    session = PlaySession(simulator(), scene)
+    for _ in range(40):
+        try:
+            place = np.array(session.free_place(size))
+        except ConfigError:
+            break
+        assert (place - size / 2 >= -1e-9).all() and (place + size / 2 <= 1 + 1e-9).all()
+        session.add_obstacle(ObstacleEntry(shape="half_box", size=size, position=tuple(place.tolist())))
+    else:
+        raise AssertionError("the domain is never full")
 
 
 def test_what_is_kept_is_bounded(session):

@@ -106,6 +106,30 @@ def test_bad_input_is_answered(page, messages, action, message):
     assert len(messages) == 1 and message in messages[0] and state() == before and not page.loaded
 
 
+def test_a_drag_that_reaches_the_limit_is_told_once(page, messages, monkeypatch):
+    """Pouring ends at the limit until the mouse is pressed again. Each press is one message, and Undo one step."""
+    ray = np.array([0.5, 2.0, 0.5]), np.array([0.01, -1.0, 0.0])
+    steps = []
+    monkeypatch.setattr(page.session, "remember", lambda: steps.append(1))
+    sent(page, lambda: page._pour(*ray))
+    assert page.session.spout is not None and len(steps) == 1
+    monkeypatch.setattr(page.session, "maximum_particles", page.session.live.particle_count)
+    page._end_pouring()
+    for _ in range(5):  # the mouse moves on
+        sent(page, lambda: page._pour(*ray))
+    assert page.session.spout is None and len(steps) == len(messages) == 1 and "Undo takes some away" in messages[0]
+    sent(page, lambda: page._pour(ray[0], None))  # the mouse is released, pressed again, and moves
+    for _ in range(5):
+        sent(page, lambda: page._pour(*ray))
+    sent(page, lambda: click(0.01, -1.0, 0.0)(page))
+    assert page.session.spout is None and len(steps) == 1 and len(messages) == 3
+    monkeypatch.undo()
+    sent(page, lambda: page._pour(ray[0], None))
+    sent(page, lambda: page._pour(*ray))
+    assert page.session.spout is not None
+    sent(page, lambda: page._pour(ray[0], None))
+
+
 @pytest.mark.parametrize("error", [KeyError("x"), ZeroDivisionError("x"), RuntimeError("x"), MemoryError("x")])
 def test_any_error_of_one_viewer_is_a_message_to_that_viewer(page, messages, capsys, error):
     """An unexpected error is told to its viewer and printed with its trace; no other action is lost."""
