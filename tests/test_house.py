@@ -19,7 +19,7 @@ LINES = {  # of Python, in tracked files
     "hgn": 32_557,
     "datagen": 8_430,
     "tools": 6_559,
-    "tests": 31_244,
+    "tests": 31_237,
 }
 SETTINGS = 240  # fields of the dataclasses behind the commands, *Config
 
