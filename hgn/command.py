@@ -71,13 +71,14 @@ def run_command(main: Main | str, config_name: str) -> NoReturn:
         except SystemExit as end:  # Hydra ends the process after --help
             code = end.code
         sys.stdout.flush()
-    except BrokenPipeError:
-        if not _unread():
+    except OSError as error:
+        full = error.errno == errno.ENOSPC
+        if not full and not _unread():
             raise
+        code = _fail("no space left on the device of the standard output", EXIT_MACHINE) if full else EXIT_UNREAD
         for stream in (sys.stdout, sys.stderr):  # the buffers cannot be flushed at exit
             with Path(os.devnull).open("wb") as nowhere:
                 os.dup2(nowhere.fileno(), stream.fileno())
-        code = EXIT_UNREAD
     sys.exit(code)
 
 

@@ -29,8 +29,6 @@ OPTIONS = (
     *("-cd", "--experimental-rerun", "--info", "-i"),
 )
 
-_FOLDERS = ("--config-dir", "-cd", "--config-path", "-cp")  # options with a folder of configs
-
 # Hydra creates no folder and no log file. Each command chooses where it writes.
 _QUIET = ("hydra.run.dir=.", "hydra.output_subdir=null", "hydra/job_logging=none", "hydra/hydra_logging=none")
 _DATACLASS = re.compile(r"(?:hgn|datagen|tools)(?:\.\w+)+\.[A-Z]\w*Config")
@@ -51,7 +49,6 @@ def compose(folder: Path, config_name: str, arguments: list[str], complete: bool
     from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
     _check_options(arguments[1:])
-    _check_chosen_files(folder, arguments[1:])
     arguments = [arguments[0], *(_override(argument, folder) for argument in arguments[1:])]
     given, full_error = sys.argv, os.environ.get("HYDRA_FULL_ERROR")
     composed: list[Any] = []
@@ -59,10 +56,11 @@ def compose(folder: Path, config_name: str, arguments: list[str], complete: bool
         if any(argument.lstrip("+~").startswith(("-", "hydra")) for argument in arguments[1:]):
             sys.argv = _with_quiet(arguments)
             os.environ["HYDRA_FULL_ERROR"] = "1"  # otherwise Hydra would print the error and exit
-            with registered_dataclasses(folder, config_name):
+            with _strict_files(), registered_dataclasses(folder, config_name):
                 hydra_main(version_base="1.3", config_path=str(folder), config_name=config_name)(composed.append)()
         else:
-            with registered_dataclasses(folder, config_name), initialize_config_dir(str(folder), version_base="1.3"):
+            here = initialize_config_dir(str(folder), version_base="1.3")
+            with _strict_files(), registered_dataclasses(folder, config_name), here:
                 composed.append(compose_once(config_name, arguments[1:]))
         plain = [OmegaConf.to_container(config, resolve=True, throw_on_missing=complete) for config in composed]
     except SystemExit as end:  # Hydra ends with 1 after a line about a package that is missing
@@ -70,7 +68,12 @@ def compose(folder: Path, config_name: str, arguments: list[str], complete: bool
     except MissingMandatoryValue as error:
         raise ConfigError(f"{error.full_key} is missing; it must be given, as in {error.full_key}=…") from error
     except (HydraException, OmegaConfBaseException, ValueError, yaml.YAMLError) as error:  # some by Hydra
-        raise ConfigError(" ".join(str(error).split("Config search path:")[0].split())) from error
+        text = " ".join(str(error).split("Config search path:")[0].split())
+        raise ConfigError(
+            text or f"a value must be as Hydra reads it, got {type(error).__name__}; check ${{…}}"
+        ) from error
+    except RecursionError:
+        raise ConfigError("defaults must not lead back to the same file, got a loop of them") from None
     finally:
         sys.argv = given
         os.environ.pop("HYDRA_FULL_ERROR", None)
@@ -79,24 +82,30 @@ def compose(folder: Path, config_name: str, arguments: list[str], complete: bool
     return [{str(key): value for key, value in dict(mapping).items()} for mapping in plain]  # type: ignore[arg-type]
 
 
-def _check_chosen_files(folder: Path, arguments: list[str]) -> None:
-    """Reads the files that arguments such as experiment=NAME choose, with strict rules. Raises ConfigError.
+@contextmanager
+def _strict_files() -> Iterator[None]:
+    """Lets Hydra read files as `read_yaml` does. It would ignore lists and byte order marks, and misread numbers."""
+    from hydra._internal.sources_registry import SourcesRegistry
+    from hydra.core.plugins import Plugins
 
-    Hydra would print pages about bad YAML, ignore keys, or misread numbers.
-    """
-    folders = [folder]
-    for option, (name, _, value) in itertools.pairwise([("", "", ""), *(a.partition("=") for a in arguments)]):
-        if name in _FOLDERS and value:
-            folders.append(Path(value))
-        elif option[0] in _FOLDERS and not option[2]:
-            folders.append(Path(name))
-    for argument in arguments:
-        group, _, choice = argument.lstrip("+").partition("=")
-        for file in (each / group / f"{choice}.yaml" for each in folders if re.fullmatch(r"\w+", group)):
-            if file.is_file():
-                if file.read_bytes().startswith(codecs.BOM_UTF8):
-                    raise ConfigError(f"{file} must be UTF-8 without a byte order mark; save it so")
-                read_yaml(file)
+    Plugins.instance()  # which fills the registry
+    files: Any = SourcesRegistry.instance().resolve("file")
+    load = files.load_config
+
+    def load_strictly(source: Any, config_path: str) -> Any:
+        file = Path(source.path, source._normalize_file_name(config_path))
+        if file.is_file():
+            if file.read_bytes().startswith(codecs.BOM_UTF8):
+                raise ConfigError(f"{file} must be UTF-8 without a byte order mark; save it so")
+            if not isinstance(content := read_yaml(file), dict | None):
+                raise ConfigError(f"{file} must be a mapping of keys to values, got {content!r:.60}")
+        return load(source, config_path)
+
+    files.load_config = load_strictly
+    try:
+        yield
+    finally:
+        files.load_config = load
 
 
 def _check_options(arguments: list[str]) -> None:
@@ -164,8 +173,8 @@ def _override(argument: str, folder: Path) -> str:
         raise ConfigError(f"{argument} is called {new} now")
     if remedy := REMOVED_CHOICES.get(key.lstrip("+"), {}).get(value):
         raise ConfigError(f"{argument} was removed; {remedy}")
-    if re.search(r"[\[{$]", value) and Path(value).is_file():  # Hydra would parse the file's name
-        value = "'" + value.replace("'", "\\'").replace("$", "\\$") + "'"
+    if re.search(r"^ |[\[{$,'\"(]", value) and Path(value).is_file():  # Hydra would parse the file's name
+        value = "'" + value.replace("'", "\\'").replace("${", "\\${") + "'"
     elif value and not _understood(value):
         value = _in_quotes(value)
     if re.fullmatch(r"[A-Za-z][\w.]*", key) and not key.startswith("hydra"):
@@ -202,6 +211,6 @@ def _with_quiet(arguments: list[str]) -> list[str]:
     # These go directly before the user's overrides: later ones win, and argparse accepts only one sequence.
     for place, (before, argument) in enumerate(itertools.pairwise(arguments), 1):
         override = argument.startswith("~") or ("=" in argument and not argument.startswith("-"))
-        if override and not before.startswith("--conf"):
+        if override and ("=" in before or not before.startswith("--conf")):
             return [*arguments[:place], *_QUIET, *arguments[place:]]
     return [*arguments, *_QUIET]

@@ -60,8 +60,8 @@ class RolloutConfig(SimulatorConfig):
     render: bool | None = None  # also draw a PNG and a GIF in the folder of the file; null: if out is null
     # a scene file, or the name of one in conf/example, for example funnel; null: a random scene, or an episode
     scene: str | None = None
-    # seed of a random scene, drawn from the distribution of the training scenes; 13: all materials fall on obstacles
-    seed: NonNegative[int] = 13
+    # seed of a random scene, drawn as the training scenes; null: 13, where all materials fall on obstacles
+    seed: NonNegative[int] | None = None
     data: str | None = None  # folder or URL of the data set of episode
     episode: str | int | None = None  # an episode of data to simulate, for example validation-000000
     frames: FrameCount = 300  # number of frames; frame 0 is the initial state
@@ -76,7 +76,13 @@ class RolloutConfig(SimulatorConfig):
             "for example data=data/obstacles episode=validation-000000",
         )
         require(self.scene is None or self.data is None, "scene", "left out where data is given", self.scene)
+        rule, remedy = "left out where scene or data is given", "a scene file has its own"
+        require(self.seed is None or self.scene is self.data is None, "seed", rule, self.seed, remedy)
         require_rollout_name("out", self.out, *USD_ENDINGS, PLY_ENDING)
+
+    @property
+    def random_seed(self) -> int:
+        return 13 if self.seed is None else self.seed
 
 
 def main(mapping: dict[str, Any]) -> int:
@@ -129,7 +135,7 @@ def rollout(config: RolloutConfig) -> tuple[Path, Rollout]:
         obstacles = scene.obstacles
         for note in (*notes_on_files(scene), *_notes_on_physics(scene, simulator.info, weights.stem)):
             print(note, file=sys.stderr)
-        source["scene"] = config.scene or f"random, seed {config.seed}"
+        source["scene"] = config.scene or f"random, seed {config.random_seed}"
     else:
         assert config.episode is not None  # RolloutConfig checks this
         episode = find_episode(config.data, str(config.episode))
@@ -202,7 +208,7 @@ def _out(config: RolloutConfig) -> Path:
     """Returns the file to write: `out`, or one with the name of the episode, the scene or the seed."""
     if config.out is not None:
         return Path(config.out)
-    scene = find_scene(config.scene).stem if config.scene is not None else f"random_{config.seed}"
+    scene = find_scene(config.scene).stem if config.scene is not None else f"random_{config.random_seed}"
     return Path(f"rollout/{scene if config.episode is None else config.episode}.vtkhdf")
 
 
@@ -217,7 +223,7 @@ def _scene(config: RolloutConfig, info: WeightsInfo) -> Scene:
     drawn = SceneConfig(gravity=info.gravity, cell_size=info.obstacle_cell_size, materials=info.network.materials)
     if not info.network.obstacle_features:
         drawn = replace(drawn, obstacle_count=0, group_shapes=("cube",))  # as in conf/scene/no_obstacles.yaml
-    return generate_scene(drawn, config.seed)
+    return generate_scene(drawn, config.random_seed)
 
 
 if __name__ == "__main__":

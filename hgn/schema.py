@@ -90,7 +90,7 @@ class ConfigError(ValueError):
 
 def printable(text: str) -> str:
     """Returns a text for terminals and pages: without users and passwords in its URLs, control characters escaped."""
-    text = re.sub(r"(\w://)[^/\s?#]*@", r"\1", text)
+    text = re.sub(r"(\w://)([^/\s?#]*|[^\s/:@]+:(?!\d+[/?#])[^\s@]*)@", r"\1", text)
     return "".join(c if c.isprintable() or c == "\n" else repr(c)[1:-1] for c in text)
 
 

@@ -54,13 +54,56 @@ def test_names_in_lists(monkeypatch):
         _compose("average")
 
 
-@pytest.mark.parametrize("name", ["[x].yaml", "a${b}.yaml", "{y}.yaml", "it's [1].yaml", "plain.yaml"])
+@pytest.mark.parametrize(
+    "name", ["[x].yaml", "a${b}.yaml", "{y}.yaml", "it's [1].yaml", "plain.yaml", "a$b.yaml", "a,b.yaml", "'a'.yaml"]
+)
 def test_names_that_are_syntax(tmp_path, command, monkeypatch, name):
     """Files are found under names that Hydra takes for lists and references."""
     (tmp_path / name).touch()
     monkeypatch.chdir(tmp_path)
     code, given, error = command("rollout", f"scene={name}")
     assert (code, error) == (0, "") and given[0]["scene"] == name
+
+
+WAYS = [
+    ("mine", ["experiment=mine.yaml"]), ("mine", ["+experiment=[mine]"]), ("mine", ["+experiment='mine'"]),
+    ("mine", ["hydra.searchpath=[file://{}]", "+experiment=mine"]), ("../own", ["--config-name=own"]),
+    ("../scene/own", ["+experiment=outer"]),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("file", "arguments"), WAYS)
+@pytest.mark.parametrize("content", ["training: {seed: 010}\n", "- 1\n", "training: {seed: 1, seed: 2}\n"])
+def test_other_ways_to_choose_files(tmp_path, command, file, arguments, content):
+    """Files are read as strictly however they are chosen: in lists, by defaults, from other folders."""
+    for folder in ("experiment", "scene"):
+        (tmp_path / folder).mkdir()
+    (tmp_path / "experiment" / "outer.yaml").write_text(HEAD + "defaults:\n  - override /scene: own\n")
+    (tmp_path / "experiment" / f"{file}.yaml").write_text(content)
+    given = [argument.format(tmp_path) for argument in arguments]
+    code, _, error = command("train", *([] if "searchpath" in given[0] else [f"--config-dir={tmp_path}"]), *given)
+    assert code == 2 and error.count("\n") == 1 and f"{file[-4:].strip('/')}.yaml must be a" in error
+
+
+def test_loops_of_defaults(tmp_path, command):
+    (tmp_path / "experiment").mkdir()
+    (tmp_path / "experiment" / "mine.yaml").write_text(HEAD + "defaults: [mine]\n")
+    code, _, error = command("train", f"--config-dir={tmp_path}", "experiment=mine")
+    assert (code, error) == (2, "error: defaults must not lead back to the same file, got a loop of them\n")
+
+
+def test_full_disk_of_the_output():
+    """The end of a command whose output cannot be written is a line too."""
+    program = "from hgn.command import run_command; run_command(lambda _: print(1) or 0, 'rollout')"
+    with Path("/dev/full").open("w") as full:
+        environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[1])}
+        command = [sys.executable, "-c", program]
+        done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, env=environment, check=False)
+    assert (
+        done.returncode == 1
+        and done.stderr.lower().startswith("error: no space left on")
+        and done.stderr.count("\n") == 1
+    )
 
 
 @pytest.mark.parametrize(

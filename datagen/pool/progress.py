@@ -53,8 +53,9 @@ class BarProgress(Progress):
         self._done, self._total, self._frames = done, total, frames
         if self._stream.isatty():
             self._bar = tqdm(
-                total=total * frames, initial=done * frames, unit="frame", file=self._stream, dynamic_ncols=True
-            )
+                desc=f"episodes {done}/{total}", total=total * frames, initial=done * frames, unit="frame",
+                file=self._stream, dynamic_ncols=True,
+            )  # fmt: skip
         self._show(force=True)
 
     def frame(self, worker: int, frame: int, scenes: int) -> None:

@@ -12,6 +12,7 @@ import functools
 import hashlib
 import ipaddress
 import os
+import re
 import threading
 import time
 from abc import ABC, abstractmethod
@@ -20,6 +21,7 @@ from io import BufferedRandom
 from pathlib import Path
 from typing import Any, TypeVar
 from urllib.parse import urlsplit
+from urllib.request import getproxies, proxy_bypass
 
 from hgn.data.shard_cache import CachedShard, cached_shard
 from hgn.data.verification import StorageError, verify_file
@@ -34,6 +36,7 @@ TOKEN_HOST_VARIABLE = "HGN_DATASET_HOST"
 _CHUNK_BYTES = 16 * 2**20  # bytes of a shard per request; a lost connection costs at most one request
 _CONNECT_S, _SILENCE_S, _ANSWER_S = 10.0, 60.0, 1800.0  # limits: to connect, between two pieces, for a whole file
 _AWAY_S = 10.0  # for this time after a failed request, calls with patience_s=0 fail without a request
+_PROXY = re.compile(r"http://(\S+@)?([\w.-]+|\[[\w.:]+\])(:\d{1,5})?/?")
 _NETWORK_PACKAGES = {"aiohttp", "botocore", "aiobotocore", "gcsfs", "google", "azure"}
 
 T = TypeVar("T")
@@ -108,6 +111,16 @@ def open_storage(folder: Path | str) -> Storage:
     if is_remote(folder):
         return _at_url(str(folder))
     return _Folder(local_folder(folder))
+
+
+def _use_proxies(host: str) -> None:
+    """Adds the scheme that aiohttp requires to proxies of the environment. Raises: ConfigError for other proxies."""
+    for kind, given in () if proxy_bypass(host) else getproxies().items():
+        proxy = given.strip() if "://" in given else f"http://{given.strip()}"
+        if kind in ("http", "https") and given.strip():
+            fits = _PROXY.fullmatch(proxy) is not None
+            require(fits, f"{kind}_proxy", "as http://host:port", proxy, "or set no_proxy")
+            os.environ[f"{kind}_proxy"] = proxy
 
 
 def _require_address(url: str) -> None:
@@ -217,6 +230,8 @@ class _Remote(Storage):
                 "response_class": BoundedResponse,
                 "trust_env": not _is_loopback(address),  # http_proxy, https_proxy, no_proxy
             }
+            if client["trust_env"]:
+                _use_proxies(urlsplit(address).netloc)
             options = {"client_kwargs": client, "use_listings_cache": False}
         try:
             self._files, self._root = fsspec.core.url_to_fs(address, **options)

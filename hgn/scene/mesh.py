@@ -130,7 +130,12 @@ def _read_polygons(path: Path) -> tuple[np.ndarray, np.ndarray]:
             return vertex_V3, fans(faces)
         return vertex_V3, trimesh.geometry.triangulate_quads(faces).reshape(-1, 3)
     if not _ASCII_STL.match(data):
-        data = data[: 84 + 50 * int.from_bytes(data[80:84], "little")]  # some programs append bytes to the triangles
+        size = 84 + 50 * int.from_bytes(data[80:84], "little")
+        if len(data) < size:
+            raise ValueError(f"it has {len(data)} of {size} bytes")
+        data = data[:size]  # some programs append bytes to the triangles
+    elif b"endsolid" not in data.lower():
+        raise ValueError("it ends before endsolid")
     else:
         data = _SOLIDS.sub(b"", data)
     # trimesh's processing would silently remove vertices that are not finite
@@ -146,12 +151,12 @@ def _bodies(vertex_V3: np.ndarray, triangle_F3: np.ndarray) -> tuple[np.ndarray,
     _, index = np.unique(vertex_V3 + 0.0, axis=0, return_inverse=True)
     triangle = index.reshape(-1)[triangle_F3]
     different_F = (triangle != np.roll(triangle, 1, axis=1)).all(axis=1)
-    _, first = np.unique(np.sort(triangle, axis=1), axis=0, return_index=True)
+    _, first, alike_F = np.unique(np.sort(triangle, axis=1), axis=0, return_index=True, return_inverse=True)
     counted = np.sort(first[different_F[first]])
     closed_F, flip_F = np.zeros((2, len(triangle)), bool)
     if len(counted):
         closed_F[counted], flip_F[counted] = _orientation(triangle[counted])
-    return closed_F, flip_F
+    return closed_F[first][alike_F.reshape(-1)], flip_F  # repeated triangles belong to the body of the first one
 
 
 def _weld(vertex_V3: np.ndarray, triangle_F3: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -192,7 +192,7 @@ def fans(faces: list[np.ndarray]) -> np.ndarray:
 
 
 def _concave(vertex_V3: np.ndarray, faces: list[np.ndarray]) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Returns numbers [M] and vertices [M, K] of the concave faces, for each number of corners that occurs."""
+    """Returns numbers [M] and vertices [M, K] of faces that are concave or cross, for each number of corners."""
     sizes, result = np.array([len(face) for face in faces], np.int64), []
     for size in np.unique(sizes[sizes > 3]):
         number_M = np.flatnonzero(sizes == size)
@@ -204,7 +204,12 @@ def _concave(vertex_V3: np.ndarray, faces: list[np.ndarray]) -> list[tuple[np.nd
         turn_MK3 = np.cross(np.roll(edge_MK3, 1, axis=1), edge_MK3)
         normal_M3 = _normals(point_MK3)
         inward_MK = np.einsum("mka,ma->mk", turn_MK3, normal_M3)
-        bad_M = (inward_MK < -FLAT * (normal_M3**2).sum(axis=1)[:, None]).any(axis=1)
+        size_M = (normal_M3**2).sum(axis=1)
+        bad_M = (inward_MK < -FLAT * size_M[:, None]).any(axis=1)
+        bad_M |= size_M < FLAT**2 * (turn_MK3**2).sum(axis=2).max(axis=1)  # equal loops of both orientations
+        if size > 4:  # more than one loop of the same orientation: exterior angles of more than 360 degrees
+            ahead_MK = (np.roll(edge_MK3, 1, axis=1) * edge_MK3).sum(axis=2) * np.sqrt(size_M)[:, None]
+            bad_M |= np.arctan2(inward_MK, ahead_MK).sum(axis=1) > 3 * np.pi
         if bad_M.any():
             result.append((number_M[bad_M], face_MK[bad_M]))
     return result

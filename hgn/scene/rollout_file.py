@@ -79,6 +79,7 @@ class Rollout:
 
     def __post_init__(self) -> None:
         require_bounds(self)
+        require(max(map(abs, self.gravity)) <= LARGEST, "gravity", "at most 1e15", list(self.gravity))
         shape = self.position_TN3.shape
         if len(shape) != 3 or shape[0] < 1 or shape[2] != 3:
             raise ConfigError(f"position_TN3 must have shape (frames >= 1, particles, 3), got {shape}")
@@ -407,7 +408,7 @@ def _read(file: h5py.File, claims: Claims) -> Rollout:
         reference_TN3=own["reference"][()] if "reference" in own else None,
         entry_frame_N=entry_N if "entry_frame" in own else None,
         materials=tuple(json.loads(own.attrs["materials"])),
-        dimensions=int(own.attrs.get("dimensions", 3)),  # missing in older files
+        dimensions=np.asarray(own.attrs.get("dimensions", 3)).item(),  # missing in older files
     )
 
 

@@ -282,7 +282,7 @@ def notes_on_files(scene: Scene) -> list[str]:
     for group, count in zip(scene.specification["groups"], scene.specification["particle_counts"], strict=False):
         position_N3, first = scene.position_N3[first : first + count], first + count
         if group.get("particles") is not None:
-            for obstacle in scene.obstacles:
+            for obstacle in map(_at_start, scene.obstacles):
                 if inside := int(contains(position_N3, obstacle).sum()):
                     notes.append(f"{inside} of {count} particles of {group['particles']} lie inside {obstacle.name}")
     for entry, obstacle in zip(entries, scene.obstacles, strict=False):
@@ -291,16 +291,23 @@ def notes_on_files(scene: Scene) -> list[str]:
             continue
         if not obstacle.closed:
             notes.append(f"a sheet, not a solid, because it is not watertight: {name}")
-        low_3, high_3 = obstacle.vertex_V3.min(axis=0), obstacle.vertex_V3.max(axis=0)
-        place = f"x {low_3[0]:.3g} to {high_3[0]:.3g}, y {low_3[1]:.3g} to {high_3[1]:.3g}, "
-        place += f"z {low_3[2]:.3g} to {high_3[2]:.3g}"
+        begin = _at_start(obstacle)
+        low_3, high_3 = begin.vertex_V3.min(axis=0), begin.vertex_V3.max(axis=0)
+        around = (low_3 <= 0).all() and (high_3 >= scene.domain_size).all()  # such a body may move, and stays around
+        place = ", ".join(f"{'xyz'[i]} {low_3[i]:.3g} to {high_3[i]:.3g}" for i in range(3))
         if obstacle.motion is None and ((low_3 > scene.domain_size) | (high_3 < 0)).any():
             notes.append(f"outside the domain, out of reach of particles: {name} ({place}); see scale and position")
-        elif obstacle.motion is None and not _reaches(obstacle, scene.domain_size, scene.cell_size):
+        elif (obstacle.motion is None or around) and not _reaches(begin, scene.domain_size, scene.cell_size):
             notes.append(f"no surface in the domain: {name} ({place}); see scale and position ({MILLIMETRES})")
         elif (high_3 - low_3).max() < scene.cell_size:
             notes.append(f"smaller than a cell of {scene.cell_size:.3g}: {name} ({place}); see scale")
     return notes
+
+
+def _at_start(obstacle: Obstacle) -> Obstacle:
+    """Returns the obstacle at its place in frame 0."""
+    move = obstacle.motion
+    return obstacle if move is None else dataclasses.replace(obstacle, vertex_V3=move.place(obstacle.vertex_V3, 0.0))
 
 
 def _reaches(obstacle: Obstacle, domain_size: Vector, cell_size: float) -> bool:
@@ -342,7 +349,7 @@ def _build(file: SceneFile, folder: Path) -> Scene:
         region, name = entry.region, f"groups[{index}] ({entry.shape} of {entry.material})"
         position_N3 = fill(region, count, np.random.Generator(np.random.PCG64([file.seed, index])))
         _require_inside_walls(name, np.array(region.centre), region.reach, position_N3, file)
-        for obstacle in obstacles:
+        for obstacle in map(_at_start, obstacles):
             inside = int(contains(position_N3, obstacle).sum())
             if inside:
                 unit = "" if _reaches(obstacle, file.domain_size, file.cell_size) else f", or its scale ({MILLIMETRES})"
@@ -356,7 +363,7 @@ def _build(file: SceneFile, folder: Path) -> Scene:
         rng = np.random.Generator(np.random.PCG64([file.seed, EMITTER_STREAM, index]))
         position_N3, time_N = emitter.face.draw(emitter.start, emitter.stop, count, rng)
         _require_inside_walls(name, np.array(emitter.position), emitter.face.reach, position_N3, file)
-        for obstacle in obstacles:
+        for obstacle in map(_at_start, obstacles):
             if contains(np.concatenate([position_N3, np.array([emitter.position], np.float32)]), obstacle).any():
                 raise ConfigError(f"{name} must be clear of closed obstacles, got it inside {obstacle.name}; move it")
         positions.append(position_N3)
@@ -389,10 +396,8 @@ def _build(file: SceneFile, folder: Path) -> Scene:
 def _material_parameters(groups: Sequence[MaterialEntry], counts: list[int]) -> dict[str, np.ndarray]:
     """Returns the constants of the groups by name, float32 [N]; NaN for groups without the constant."""
     names = [name for name in MATERIAL_PARAMETERS if any(name in group.parameters for group in groups)]
-    return {
-        name: np.repeat(np.array([group.parameters.get(name, np.nan) for group in groups], np.float32), counts)
-        for name in names
-    }
+    columns = {name: [group.parameters.get(name, np.nan) for group in groups] for name in names}
+    return {name: np.repeat(np.array(column, np.float32), counts) for name, column in columns.items()}
 
 
 def _require_few_repeats(file: SceneFile, folder: Path) -> None:

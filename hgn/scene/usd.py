@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import io
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -40,11 +41,11 @@ def _read(content: str, path: Path, *more: str) -> dict[str, np.ndarray]:
     one_thread = dict(os.environ, PXR_WORK_THREAD_LIMIT="1", OPENBLAS_NUM_THREADS="1")  # each thread takes memory
     arguments = [content, str(path.resolve()), str(COPIES * most), *more]
     done = subprocess.run([*program, *arguments], capture_output=True, env=one_thread, check=False)
-    lines = [line for line in done.stderr.decode(errors="replace").splitlines() if len(line) > 3] or [""]
+    lines = [line for line in done.stderr.decode(errors="replace").splitlines() if re.search("[a-z]{3}", line)] or [""]
     last = "".join(filter(str.isprintable, lines[-1]))
     if done.returncode == 3:
         raise ValueError(f"it {last}")
     if done.returncode:
-        rule = f"it is damaged, or needs more than {most} bytes or a minute, as no file of its size does"
+        rule = "it is damaged, or needs more memory or time than a file of its size does"
         raise ValueError(f"{rule}: {last[:200]}" if last else rule)
     return dict(read_npz(io.BytesIO(done.stdout)))

@@ -15,8 +15,9 @@ from typing import Any, NoReturn
 import numpy as np
 from pxr import Sdf, Usd, UsdGeom
 
-SECONDS = 60  # largest CPU time; a few references of references can stand for billions of prims
+SECONDS = 5  # of CPU for a small file; a few references of references can stand for billions of prims
 ROOM = 512 << 20  # bytes for pxr's own tables
+COPIES = 12  # of its arrays, in this program and in the search for closed bodies
 FIRST = Usd.TimeCode.EarliestTime()  # first sample, or the value without samples
 Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])  # (x, y, z) @ Z_UP = (x, z, -y)
 NO_SURFACE = ("Points", "Camera")
@@ -59,12 +60,17 @@ def placed(stage: Usd.Stage) -> Iterator[tuple[Any, np.ndarray]]:
             yield prim, matrix_44
 
 
-def points(prim: Any) -> np.ndarray:
-    value = prim.GetAttribute("points").Get(FIRST)
-    return np.zeros((0, 3)) if value is None else np.array(value, np.float64).reshape(-1, 3)
+def array(prim: Any, name: str, dtype: Any, room: list[int]) -> np.ndarray:
+    """Returns an attribute's numbers, and takes their bytes from the first item of `room`."""
+    value = prim.GetAttribute(name).Get(FIRST)
+    result = np.array(() if value is None else value, dtype)
+    room[0] -= result.nbytes
+    if room[0] < 0:
+        refuse("needs more memory than a file of its size does; export less, or write it without instances")
+    return result
 
 
-def read_meshes(stage: Usd.Stage) -> dict[str, np.ndarray]:
+def read_meshes(stage: Usd.Stage, room: list[int]) -> dict[str, np.ndarray]:
     """Returns `vertex` [V, 3], `count` [K] corners of each polygon, and `corner` [I]: their vertices."""
     vertices, counts, corners, total = [np.zeros((0, 3))], [np.zeros(0, np.int64)], [np.zeros(0, np.int64)], 0
     for prim, matrix_44 in placed(stage):
@@ -73,11 +79,9 @@ def read_meshes(stage: Usd.Stage) -> dict[str, np.ndarray]:
             continue
         if kind != "Mesh" or prim.HasRelationship("skel:skeleton"):
             refuse(f"contains {'a skinned mesh' if kind == 'Mesh' else kind} at {path}, which is not read; bake it")
-        vertex_V3 = points(prim)
-        count_K, corner_I, hole_H = (
-            np.array(prim.GetAttribute(name).Get(FIRST) or (), np.int64)
-            for name in ("faceVertexCounts", "faceVertexIndices", "holeIndices")
-        )
+        vertex_V3 = array(prim, "points", np.float64, room).reshape(-1, 3)
+        names = ("faceVertexCounts", "faceVertexIndices", "holeIndices")
+        count_K, corner_I, hole_H = (array(prim, name, np.int64, room) for name in names)
         fits = len(corner_I) == count_K.sum() and count_K.min(initial=3) >= 3
         if not fits or corner_I.min(initial=0) < 0 or corner_I.max(initial=-1) >= len(vertex_V3):
             refuse(f"has polygons at {path} that are not of its {len(vertex_V3)} points; export it again")
@@ -89,7 +93,7 @@ def read_meshes(stage: Usd.Stage) -> dict[str, np.ndarray]:
     return {"vertex": np.concatenate(vertices), "count": np.concatenate(counts), "corner": np.concatenate(corners)}
 
 
-def read_particles(stage: Usd.Stage, material: str) -> dict[str, np.ndarray]:
+def read_particles(stage: Usd.Stage, room: list[int], material: str) -> dict[str, np.ndarray]:
     """Returns `position` and `velocity` [N, 3] of Points without `primvars:material`, or of this one."""
     positions, velocities = [np.zeros((0, 3))], [np.zeros((0, 3))]
     for prim, matrix_44 in placed(stage):
@@ -98,8 +102,9 @@ def read_particles(stage: Usd.Stage, material: str) -> dict[str, np.ndarray]:
         own = prim.GetAttribute("primvars:material").Get() if prim.HasAttribute("primvars:material") else material
         if prim.GetTypeName() != "Points" or own != material:
             continue
-        position_N3, velocity = points(prim), prim.GetAttribute("velocities").Get(FIRST)
-        velocity_N3 = np.zeros_like(position_N3) if velocity is None else np.array(velocity, np.float64).reshape(-1, 3)
+        position_N3 = array(prim, "points", np.float64, room).reshape(-1, 3)
+        given_N3 = array(prim, "velocities", np.float64, room).reshape(-1, 3)
+        velocity_N3 = given_N3 if prim.GetAttribute("velocities").HasValue() else np.zeros_like(position_N3)
         if velocity_N3.shape != position_N3.shape:
             refuse(f"has {len(velocity_N3)} velocities of {len(position_N3)} points at {prim.GetPath()}")
         positions.append(position_N3 @ matrix_44[:3, :3] + matrix_44[3, :3])
@@ -112,13 +117,14 @@ if __name__ == "__main__":
     pages = int(Path("/proc/self/statm").read_text().split()[0])
     for kind, limit in (
         (resource.RLIMIT_AS, pages * resource.getpagesize() + ROOM + int(most)),
-        (resource.RLIMIT_CPU, SECONDS),
+        (resource.RLIMIT_CPU, SECONDS + Path(name).stat().st_size // 2**20),
     ):
         given = resource.getrlimit(kind)[1]  # by ulimit, which only root may raise
         least = limit if given == resource.RLIM_INFINITY else min(limit, given)
         resource.setrlimit(kind, (least, least))
     stage = opened(name)
-    arrays = read_meshes(stage) if content == "meshes" else read_particles(stage, *rest)
+    room = [int(most) // COPIES]
+    arrays = read_meshes(stage, room) if content == "meshes" else read_particles(stage, room, *rest)
     buffer = io.BytesIO()
     np.savez(buffer, **arrays)  # type: ignore[arg-type]
     sys.stdout.buffer.write(buffer.getvalue())

@@ -19,7 +19,8 @@ from hgn.schema import ConfigError
 from hgn.system.claims import count_items
 
 MAXIMUM_NODES = 100_000  # nodes of a file
-LINES_BYTES = 250_000  # bytes of a JSON file for this search, because YAML takes a CPU second for 50 kB
+# bytes of a JSON file for the search of a line: it has fewer nodes then, and YAML takes a CPU second for 50 kB
+LINES_BYTES = 2 * MAXIMUM_NODES
 # of PyYAML, of thousands of digits, of deep nesting, and of tags such as `!!bool 5`
 _ERRORS = (yaml.YAMLError, ValueError, RecursionError, LookupError, TypeError, AttributeError, ArithmeticError)
 _OCTAL = re.compile(r"[-+]?0[0-7_]*[1-7][0-7_]*")
@@ -33,7 +34,7 @@ def read_yaml(path: Path) -> Any:
     sexagesimal numbers, and aliases that expand to more than MAXIMUM_NODES values.
     """
     try:
-        return _load(path.read_text(encoding="utf-8"))
+        return yaml.load(path.read_text(encoding="utf-8"), _Loader)
     except UnicodeDecodeError as error:
         zipped = error.object.startswith(b"PK\x03\x04")
         cause = "a zip file; unpack it, and give the YAML file in it" if zipped else "not UTF-8 text"
@@ -52,7 +53,7 @@ def read_json(path: Path) -> Any:
     def unique(pairs: Sequence[tuple[str, Any]]) -> dict[str, Any]:
         if len(dict(pairs)) < len(pairs):
             if len(text) < LINES_BYTES:
-                _load(text.replace("\t", " "))  # raises an error with key and line
+                yaml.load(text.replace("\t", " "), _Loader)  # raises an error with key and line
             raise ValueError(f"a key is given twice, one of {', '.join(dict(pairs))[:100]}")
         return dict(pairs)
 
@@ -60,10 +61,6 @@ def read_json(path: Path) -> Any:
         return json.loads(text, object_pairs_hook=unique)
     except RecursionError as error:
         raise ValueError("it is nested too deeply") from error
-
-
-def _load(text: str) -> Any:
-    return yaml.load(text, _Loader)
 
 
 class _Loader(yaml.SafeLoader):
@@ -94,6 +91,7 @@ def _check(node: yaml.Node, name: str, visited: set[int]) -> None:
         lines: dict[str, int] = {}
         for key, value in node.value:
             word = str(key.value)
+            _check(key, word, visited)
             if word in lines:
                 raise ValueError(
                     f"line {key.start_mark.line + 1}: the key {word} is given twice, first in line {lines[word]}"

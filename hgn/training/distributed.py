@@ -20,6 +20,8 @@ from hgn.schema import ConfigError, require
 
 RUN_VARIABLE = "HGN_RUN"  # environment variable with the run's name or folder
 MESSAGE_MB = 4  # size of a message: gradients of the last layers are sent while those of the first layers are computed
+_RANKS = {"RANK": "WORLD_SIZE", "LOCAL_RANK": "LOCAL_WORLD_SIZE", "SLURM_PROCID": "SLURM_NTASKS"}
+_COUNTS = (*_RANKS.values(), "SLURM_NNODES")
 _RANDOM_ID = re.compile(r"[0-9a-f]{8}(-[0-9a-f]{4}){3}-[0-9a-f]{12}")
 
 
@@ -46,6 +48,7 @@ def layout(training: TrainingConfig) -> tuple[int, int]:
 
     Raises: ConfigError if there are fewer GPUs, or if the launcher started another number of processes.
     """
+    _check_numbers()
     _check_restarts()
     _check_launcher()
     launched = _launched(training.devices)
@@ -95,15 +98,22 @@ def same_on_all_ranks(number: torch.Tensor) -> bool:
     return bool(low == ~high)
 
 
+def _check_numbers() -> None:
+    """Refuses launchers' variables that are no numbers, and ranks that do not exist."""
+    for name in (*_RANKS, *_COUNTS):
+        given, count = os.environ.get(name, "0" if name in _RANKS else "1"), os.environ.get(_RANKS.get(name, ""), "")
+        least, most = int(name in _COUNTS), int(count) - 1 if count.isdecimal() else 1 << 30
+        fits = given.isdecimal() and least <= int(given) <= most
+        require(fits, name, f"a whole number from {least} to {most}", given, remedy="start with torchrun or srun")
+
+
 def _check_restarts() -> None:
     shared = os.environ.get("TORCHELASTIC_USE_AGENT_STORE") == "True"
     if shared and int(os.environ.get("TORCHELASTIC_MAX_RESTARTS", "0")) > 0:
         # Restarted processes would read the addresses of ended ones, and wait for half an hour.
-        raise ConfigError(
-            "TORCH_DISABLE_SHARE_RDZV_TCP_STORE must be 1 in torchrun's environment where it may restart processes "
-            f"(--max-restarts {os.environ['TORCHELASTIC_MAX_RESTARTS']}), got "
-            f"{os.environ.get('TORCH_DISABLE_SHARE_RDZV_TCP_STORE', 'nothing')}; see pytorch issue 135712"
-        )
+        name, restarts = "TORCH_DISABLE_SHARE_RDZV_TCP_STORE", os.environ["TORCHELASTIC_MAX_RESTARTS"]
+        rule = f"1 in torchrun's environment where it may restart processes (--max-restarts {restarts})"
+        raise ConfigError(f"{name} must be {rule}, got {os.environ.get(name, 'nothing')}; see pytorch issue 135712")
 
 
 def _devices(device: str, wanted: int | None) -> int:
@@ -138,10 +148,11 @@ def _launched(devices: int | None) -> tuple[int, int] | None:
 def _check_launcher() -> None:
     """Refuses variables of a launcher that did not start this process, which would wait for the others forever."""
     if "RANK" in os.environ:
-        missing = [name for name in ("WORLD_SIZE", "LOCAL_RANK") if name not in os.environ]
+        needed = ("WORLD_SIZE", "LOCAL_RANK", "MASTER_ADDR", "MASTER_PORT")
+        missing = [name for name in needed if not os.environ.get(name)]
         if missing and os.environ.get("WORLD_SIZE") != "1":
             raise ConfigError(
-                f"{' and '.join(missing)} must be set where RANK is, got RANK={os.environ['RANK']} without; "
+                f"{' and '.join(missing[:2])} must be set where RANK is, got RANK={os.environ['RANK']} without; "
                 "start with torchrun, or unset RANK for one process"
             )
     elif _inside_slurm_step() and not started_by_srun() and os.environ["SLURM_NTASKS"] != "1":

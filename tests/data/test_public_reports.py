@@ -75,3 +75,23 @@ def test_coarse_positions(offset, stored, radius):
     else:
         require_fine("set", position_TND, radius)
     require_fine("set", POSITIONS[0].astype(np.float64) * radius + np.pi * offset, radius)
+
+
+ROUNDED = {
+    "float16": lambda a: a.astype(np.float16),
+    "bfloat16": lambda a: (a.view(np.uint32) & np.uint32(0xFFFF0000)).view(np.float32),
+    "3 decimals": lambda a: np.round(a, 3),
+    "8 bits": lambda a: np.round(a * 255) / 255,
+    "far away": lambda a: (a + np.float32(1e5)) - np.float32(1e5),
+}
+
+
+@pytest.mark.parametrize("stored", [np.float32, np.float64])
+@pytest.mark.parametrize("name", ROUNDED)
+def test_positions_rounded_before(name, stored):
+    """Numbers that were rounded, and then stored in a finer type, are as coarse as before; a lattice is not."""
+    walk_TN3 = RNG.random((1, 60, 3), np.float32) + np.cumsum(0.01 * RNG.random((20, 60, 3), np.float32), 0)
+    require_fine("set", walk_TN3.astype(stored), 0.035)
+    with pytest.raises(ConfigError, match=r"set: position must have numbers at most 3.5e-05 apart"):
+        require_fine("set", ROUNDED[name](walk_TN3).astype(stored), 0.035)
+    require_fine("set", np.tile((np.arange(180.0) % 17 / 16).reshape(60, 3).astype(stored), (20, 1, 1)), 0.035)

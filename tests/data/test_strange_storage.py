@@ -124,6 +124,7 @@ def test_malformed_bodies_end(data, monkeypatch, content, pause_s):
         ("http://user:secret@host:80/a b", "http://host:80/a b"),
         ("https://user:p@ss:w@rd@host/a http://h?x=a@b", "https://host/a http://h?x=a@b"),
         ("got s3://key:se%40cret@bucket, ftp://u@h", "got s3://bucket, ftp://h"),
+        ("https://me:pa/ss#w@host/x s3://KEY:se/cret@b/x http://h:80/a@b", "https://host/x s3://b/x http://h:80/a@b"),
         ("hf://datasets/a@main/b", "hf://datasets/a@main/b"),
         ("a@b.c file:///x@y http://h/p@q", "a@b.c file:///x@y http://h/p@q"),
         ("\x1b]0;title\x07\x9b31m\u202egpj.\r\udc80", r"\x1b]0;title\x07\x9b31m\u202egpj.\r\udc80"),

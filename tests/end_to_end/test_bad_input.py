@@ -75,6 +75,10 @@ VALUES = [
         [f"+experiment={5000 * 'a'}"],
         "experiment must be a path of at most 4,095 bytes, 255 in each name, got 'a",
     ),
+    *(
+        ("rollout", [*given, "seed=5"], "seed must be left out where scene or data is given, got 5; a scene file has i")
+        for given in (["scene=scene.yaml"], ["data=data", "episode=validation-000000"])
+    ),
     ("rollout", ["frame=3"], "frame is not a known key; did you mean frames?"),
     ("rollout", [*ROLLOUT, "scene=none.yaml"], "scene must be an existing YAML file, got none.yaml"),
     ("rollout", ["out=a.png"], "must be a name that ends in .vtkhdf, .hdf, .hdf5, .h5, .usdc, .usda, .usd or .ply, go"),

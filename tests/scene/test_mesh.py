@@ -125,6 +125,8 @@ REFUSED = [
     ("a.obj", b"v 0 0 0\nv 1 0 0\n", {}, "ramp must contain triangles"),
     ("a.stl", b"solid\nendsolid\n", {}, "ramp must contain triangles"),
     ("a.ply", b"bad", {}, READABLE.format("PLY")),
+    ("a.stl", bytes(80) + struct.pack("<I", 3) + bytes(149), {}, "it has 233 of 234 bytes"),
+    ("a.stl", b"solid\nfacet normal 0 0 1\nouter loop\nvertex 0 0 0\n", {}, "it ends before endsolid"),
     ("a.glb", b"", {}, READABLE.format("GLB")),
     ("a.glb", b"glTFxxxxxx", {}, READABLE.format("GLB")),
     ("a.obj", TRIANGLE.encode() + b"f 1 2 9\n", {}, "ramp must have triangles of its 3 vertices, got vertices 0 to 8"),
@@ -255,10 +257,16 @@ def perimeter(outline):
     return np.linalg.norm(edge, axis=1).sum()
 
 
-def test_faces_whose_edges_cross_are_refused(tmp_path):
+@pytest.mark.parametrize(
+    "face", [[0, 2, 1, 4, 3], [0, 2, 1, 3], [5, 7, 9, 6, 8]],
+    ids=["one loop inwards", "two equal loops", "pentagram"],
+)  # fmt: skip
+def test_faces_whose_edges_cross_are_refused(tmp_path, face):
     """There is no right cut: the face is named."""
-    vertices, _ = prism([(0, 0), (2, 0), (2, 2), (0, 2), (3, 1)])
-    write_obj(tmp_path / "crossing.obj", vertices, [[0, 1, 2], [0, 2, 1, 4, 3]])
+    angle = np.arange(5) * 2 * np.pi / 5
+    ring = np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
+    vertices = np.concatenate([[(0, 0, 0), (2, 0, 0), (2, 2, 0), (0, 2, 0), (3, 1, 0)], ring])
+    write_obj(tmp_path / "crossing.obj", vertices, [[0, 1, 2], face])
     with pytest.raises(ConfigError, match="face 1 cannot be cut into triangles, because its edges cross"):
         load_mesh(tmp_path / "crossing.obj")
 
@@ -294,6 +302,14 @@ def test_needles_do_not_open_a_body(tmp_path, form, split):
     write_obj(path, vertices, faces) if form == "obj" else write_ply(path, vertices, faces, "binary" in form)
     obstacle, points = load_mesh(path), np.array([(0.5, 0.4, 0.6), (1.5, 0.4, 0.6)])
     assert obstacle.closed and contains(points, obstacle).tolist() == [True, False]
+
+
+@pytest.mark.parametrize("more", [CUBE.faces[:1], CUBE.faces[:1, ::-1], CUBE.faces, [(0, 0, 1)]])
+def test_repeated_faces_are_no_sheet(tmp_path, more):
+    """A body with some faces given twice is the body."""
+    write_obj(tmp_path / "a.obj", CUBE.vertices, [*CUBE.faces, *more])
+    (body,) = load_bodies(tmp_path / "a.obj")
+    assert body.closed and len(body.triangle_F3) == 12
 
 
 def test_small_bodies_stay_closed(tmp_path):

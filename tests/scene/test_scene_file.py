@@ -100,6 +100,20 @@ def test_keyframes_are_poses_about_the_position(tmp_path):
     assert np.allclose(cone.motion.place(np.array([[0.6, 0.2, 0.5]]), 2.0), [[0.6, 0.2, 0.4]])
 
 
+def test_moving_obstacles_begin_at_their_first_pose(tmp_path):
+    """Groups are clear of obstacles where these are in frame 0, which may be another place than the entry's; a mesh in
+    millimetres around the domain is reported if it moves, too."""
+    away = [{"time": 0, "translation": [5, 0, 0]}, {"time": 1, "translation": [5.1, 0, 0]}]
+    with pytest.raises(ConfigError, match="must be clear of closed obstacles, got 1074 of 1074 particles inside"):
+        load(tmp_path, obstacles=[{**CONE, "size": 0.8, "position": [-4.5, 0.6, 0.5], "keyframes": away}])
+    load(tmp_path, obstacles=[{**CONE, "size": 0.8, "position": [0.5, 0.6, 0.5], "keyframes": away}])
+    sphere = trimesh.creation.icosphere(radius=500)
+    trimesh.Trimesh(sphere.vertices, sphere.faces[:-1], process=False).export(tmp_path / "a.obj")
+    keyframes = [{"time": 0}, {"time": 1, "translation": [0.1, 0, 0]}]
+    notes = notes_on_files(load(tmp_path, obstacles=[{"mesh": "a.obj", "keyframes": keyframes}]))
+    assert any("no surface in the domain: a.obj" in note for note in notes)
+
+
 def test_editing_one_group_leaves_the_others(tmp_path):
     """Each group has a random stream of its own."""
     other = {**CUBE, "position": [0.2, 0.5, 0.5]}

@@ -15,6 +15,8 @@ from hgn.scene.scene_file import load_scene
 from hgn.schema import ConfigError
 
 pytest.importorskip("pxr")
+from pxr import Usd, UsdGeom, Vt
+
 CORNERS = ", ".join(f"({x}, {y}, {z})" for x in (0, 1) for y in (0, 1) for z in (0, 1))
 BOX = f"""def Mesh "box" {{\npoint3f[] points = [{CORNERS}]\nint[] faceVertexCounts = [4, 4, 4, 4, 4, 4]
 int[] faceVertexIndices = [0, 1, 3, 2, 4, 6, 7, 5, 0, 4, 5, 1, 2, 3, 7, 6, 0, 2, 6, 4, 1, 5, 7, 3]\n}}\n"""
@@ -22,6 +24,16 @@ PLACED = f"""def Xform "a" {{\ndouble3 xformOp:translate = (10, 0, 5)\nfloat3 xf
 uniform token[] xformOpOrder = ["xformOp:translate", "xformOp:scale"]\n{BOX}}}\n"""
 L_SHAPE = """def Mesh "l" {\npoint3f[] points = [(0, 0, 0), (2, 0, 0), (2, 1, 0), (1, 1, 0), (1, 2, 0), (0, 2, 0)]
 int[] faceVertexCounts = [6]\nint[] faceVertexIndices = [3, 4, 5, 0, 1, 2]\n}\n"""
+
+
+def copies(depth, width, name):
+    """Prims that each stand for many instances of the ones before."""
+    text = ""
+    for level in range(depth):
+        refers = f"(instanceable = true\nreferences = </{name}>)"
+        name = f"level{level}"
+        text += f'def "{name}" {{\n' + "".join(f'def "c{i}" {refers} {{}}\n' for i in range(width)) + "}\n"
+    return text
 
 
 def mesh_of(folder, text, metadata=""):
@@ -68,6 +80,18 @@ def test_particles(tmp_path):
         load_scene(tmp_path / "a.yaml")
 
 
+def test_content_that_compresses_well(tmp_path):
+    """A million triangles in a few kilobytes are refused."""
+    stage = Usd.Stage.CreateNew(str(tmp_path / "a.usdc"))
+    mesh = UsdGeom.Mesh.Define(stage, "/m")
+    mesh.CreatePointsAttr([(0, 0, 0)])
+    mesh.CreateFaceVertexCountsAttr(Vt.IntArray([3] * 10**6))
+    mesh.CreateFaceVertexIndicesAttr(Vt.IntArray(3 * 10**6))
+    stage.Save()
+    with pytest.raises(ConfigError, match="needs more memory than a file of its size does"):
+        load_mesh(tmp_path / "a.usdc")
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
@@ -77,6 +101,7 @@ def test_particles(tmp_path):
         (BOX.replace("7, 3]", "7, 8]"), "has polygons at /box that are not of its 8 points"),
         (BOX.replace("}", "", 1), "must be a readable USDA file, .*it is damaged"),
         ('def Points "p" {\npoint3f[] points = [(0, 0, 0)]\n}', "must contain triangles, got none"),
+        (BOX + copies(8, 10, "box"), "it is damaged, or needs more memory or time than"),
     ],
 )
 def test_what_is_not_read(tmp_path, text, message):

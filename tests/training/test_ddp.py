@@ -214,12 +214,15 @@ def test_two_machines_train_as_one(reference, two_machines, warm_python, tmp_pat
 def no_launcher(monkeypatch):
     for name in LAUNCHER_VARIABLES:
         monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("MASTER_ADDR", "a")
+    monkeypatch.setenv("MASTER_PORT", "1")
     return monkeypatch
 
 
 TORCHRUN = {"RANK": "0", "LOCAL_RANK": "0", "WORLD_SIZE": "4"}
 SLURM = {"SLURM_STEP_ID": "0", "SLURM_PROCID": "0", "SLURM_NTASKS": "8", "SLURM_NNODES": "2"}
 JOB = {"SLURM_JOB_ID": "4711"}
+COUNTS = ("RANK", "LOCAL_RANK", "WORLD_SIZE", "LOCAL_WORLD_SIZE", "SLURM_NTASKS", "SLURM_NNODES")
 BOTH = {"SLURM_PROCID": "1", "SLURM_NTASKS": "2", "RANK": "3", "LOCAL_RANK": "1", "WORLD_SIZE": "4"}
 RANDOM_ID = "5bd6a8f0-93a5-4c5b-9b8c-0a52b6cf3d11"
 RESTARTS = {"TORCHELASTIC_USE_AGENT_STORE": "True", "TORCHELASTIC_MAX_RESTARTS": "3"}
@@ -279,6 +282,8 @@ OTHERS = "devices must be the {} processes that the launcher started on each of 
         ({"RANK": "0", "WORLD_SIZE": "2"}, "LOCAL_RANK must be set where RANK is, got RANK=0 without"),
         ({"RANK": "3", "WORLD_SIZE": "4", "LOCAL_WORLD_SIZE": "2"}, "LOCAL_RANK must be set where RANK is"),
         ({"RANK": "1"}, "WORLD_SIZE and LOCAL_RANK must be set where RANK is"),
+        (TORCHRUN | {"MASTER_PORT": ""}, "MASTER_PORT must be set where RANK is"),
+        *((SLURM | {name: text}, f"{name} must be a whole number") for name in COUNTS for text in ("", "-1", "x")),
         ({"RANK": "1", "LOCAL_RANK": "1"}, "WORLD_SIZE must be set where RANK is"),
         ({"SLURM_PROCID": "0", "SLURM_NTASKS": "4"}, "must be started with srun in a job of 4 tasks"),
         ({**SLURM, "SLURM_STEP_NUM_TASKS": "1"}, "must be started with srun in a job of 8 tasks"),

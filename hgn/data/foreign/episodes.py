@@ -80,9 +80,13 @@ class Converter:
         self._note_outside(name, trajectory.position_TND[:, ~fixed_N])
         boundary_P3 = still_TP3[0]
         if trajectory.boundary_PD is not None:
+            require_fine(f"{name}: boundary", trajectory.boundary_PD[None], info.radius)
             boundary_P3 = np.concatenate([boundary_P3, self._placed(trajectory.boundary_PD)])
         grid = self._grid(trajectory, boundary_P3)
         gravity = trajectory.gravity or self.gravity
+        most = max(self.domain_size) / info.frame_dt_s**2
+        rule, largest = f"at most {most:.3g}, the box in a frame", max(map(abs, (*gravity, *self.gravity)))
+        require(largest <= most, f"{name}: gravity", rule, largest, "check dt")
         x, y, z = (*gravity, 0.0)[:3]
         # the velocity with which free flight leads from frame -1 to frame 0
         velocity_N3 = (free_TN3[first].astype(np.float64) - free_TN3[first - 1]) / info.frame_dt_s

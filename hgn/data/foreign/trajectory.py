@@ -15,6 +15,7 @@ from hgn.schema import ConfigError, require
 from hgn.system.claims import require_few_items
 
 COARSEST = 1e-3  # largest spacing of stored numbers, in radii; gravity moves a particle by a few of these in a frame
+SAMPLED = 100_000  # coordinates of a trajectory that are searched for rounding
 MOST_RADII = 1 << 14  # largest size of the box in radii, because cells are indexed by integers
 LARGEST = 1e15  # largest size of a number, so that float32 stores its square
 FLUID = 1  # the type of particles in files without types
@@ -54,9 +55,10 @@ class SetInfo:
 
     def __post_init__(self) -> None:
         require(self.dimensions in (2, 3), "metadata.json: dim", "2 or 3", self.dimensions)
-        positive = {"dt": self.frame_dt_s, "default_connectivity_radius": self.radius}
-        for name, value in positive.items():
-            require(1e-15 <= value <= 1e15, f"metadata.json: {name}", "a finite number > 0", value)
+        positive = {"dt": (self.frame_dt_s, 1e-9), "default_connectivity_radius": (self.radius, 1e-15)}
+        for name, (value, least) in positive.items():
+            rule = f"a finite number > 0, from {least:g} to {1 / least:g}"
+            require(least <= value <= 1 / least, f"metadata.json: {name}", rule, value)
         shape = np.shape(self.bounds)
         rule = f"[low, high] for each of {self.dimensions} axes"
         require(shape == (self.dimensions, 2), "metadata.json: bounds", rule, self.bounds)
@@ -127,12 +129,24 @@ def floats(name: str, array: Any, shape: tuple[int | None, ...]) -> np.ndarray:
     return array.astype(array.dtype.newbyteorder("="), copy=False)
 
 
+def _step(position_TND: np.ndarray, radius: float) -> float:
+    """Returns the smallest difference of coordinates that move, or 0 if they are too few to tell their rounding."""
+    path_TnD = position_TND[:, :: max(1, position_TND.size // SAMPLED)].astype(np.float64)
+    moves_TnD = np.diff(path_TnD, axis=0) != 0
+    moved = path_TnD[1:][moves_TnD]
+    moved = np.unique(moved[np.abs(moved) > 0.5 * np.abs(moved).max(initial=0)])  # floats have coarser digits there
+    count = len(np.unique(path_TnD[0][moves_TnD.any(axis=0)])) * len(path_TnD) / 2  # particles side by side count once
+    # so many numbers that were not rounded almost surely contain a smaller difference than COARSEST
+    few = len(moved) < 2 or count**2 * COARSEST * radius < 20 * np.ptp(moved)
+    return 0.0 if few else float(np.diff(moved).min())
+
+
 def require_fine(name: str, position_TND: np.ndarray, radius: float) -> None:
-    """Refuses positions that are stored too coarsely, possibly in float32 before they were stored as float64."""
+    """Refuses positions that are stored too coarsely, possibly in fewer digits before they were stored so."""
     single = position_TND.astype(np.float32)
     stored = single if np.array_equal(single, position_TND) else position_TND
     largest = np.abs(stored).max(initial=0)
-    spacing = float(np.spacing(largest))
+    spacing = max(float(np.spacing(largest)), _step(position_TND, radius))
     if not spacing <= COARSEST * radius:
         raise ConfigError(
             f"{name}: position must have numbers at most {COARSEST * radius:.2g} apart, 0.001 radii, got "
