@@ -37,8 +37,8 @@ def read_yaml(path: Path) -> Any:
         return yaml.load(path.read_text(encoding="utf-8"), _Loader)
     except UnicodeDecodeError as error:
         zipped = error.object.startswith(b"PK\x03\x04")
-        cause = "a zip file; unpack it, and give the YAML file in it" if zipped else "not UTF-8 text"
-        raise ConfigError(f"{path} must be a YAML file: it is {cause}") from error
+        reason = "a zip file; unpack it, and give the YAML file in it" if zipped else "not UTF-8 text"
+        raise ConfigError(f"{path} must be a YAML file: it is {reason}") from error
     except _ERRORS as error:
         mark = getattr(error, "problem_mark", None)
         place = f"line {mark.line + 1}, column {mark.column + 1}: " if mark else ""
