@@ -34,7 +34,7 @@ _ROWS, _ROW_COLUMNS = (0, 1, 2, 1, 0, 0), (0, 1, 2, 2, 2, 1)
 
 @dataclass(frozen=True, eq=False)
 class RestShape:
-    """The neighbours of particles at rest. Particles without neighbours, as those of other materials, have zeros."""
+    """The neighbours of elastic particles in the rest shape. Other particles have no neighbours and coefficients 0."""
 
     neighbour_NK: torch.Tensor  # int64, row of the neighbour; -1: none
     position_N3: torch.Tensor  # float32, place at rest
@@ -91,7 +91,7 @@ class RestShape:
         return RestShape(*(torch.cat([getattr(part, name) for part in parts]) for name in _TENSORS))
 
     def __getitem__(self, rows_N: torch.Tensor | slice) -> RestShape:
-        """Returns the shape of some particles. Without removed neighbours, the fit is that of the remaining ones."""
+        """Returns the shape of some particles. A particle that loses neighbours is fitted to its remaining ones."""
         index_N = torch.arange(len(self.neighbour_NK), device=self.neighbour_NK.device)[rows_N]
         place_N = self.neighbour_NK.new_full((len(self.neighbour_NK) + 1,), -1)  # the last is that of no neighbour
         place_N[index_N] = torch.arange(len(index_N), device=index_N.device)

@@ -6,10 +6,13 @@ own frame, so its cells move with it exactly. Its points move over the coming fr
     V(x) = A (x - p) + b,    A = R' R^T - 1,    b = p' - p
 
 R and p are its rotation and the place of its pivot in this frame, R' and p' those one frame later; b is in domain units
-per frame. The path of a particle relative to the obstacle leads from x by v - V(x). docs/concepts/method.md derives
-where the network uses v - V. Each obstacle has a row j S + s: number j of the moving obstacles of scene s. The keys of
-its cells and triangles have this row as their scene.
-Shape legend: N particles, S scenes, J most moving obstacles of a scene, V = J S rows, C coarsest cells.
+per frame. The path of a particle relative to the obstacle leads from x by v - V(x). docs/concepts/method.md lists
+where the network uses v - V.
+
+Tensors have one row for each obstacle. Obstacle j of scene s has the row j S + s. Scenes with fewer than J moving
+obstacles have rows without cells. Cells and triangles are found by keys of a scene and a place; for moving obstacles
+the keys contain the row in place of the scene.
+Shape legend: N particles, S scenes, J largest number of moving obstacles in a scene, V = J S rows, C coarsest cells.
 """
 
 from __future__ import annotations
@@ -36,7 +39,7 @@ TINY = 1e-30  # lower bound of divisors
 
 @dataclass(frozen=True, eq=False)
 class Poses:
-    """Poses x -> R (x - c) + p of rows of moving obstacles in a frame, and their motion until the next; float64."""
+    """The poses x -> R (x - c) + p of moving obstacles in a frame, and their motion until the next frame; float64."""
 
     rotation_V33: torch.Tensor  # R
     pivot_V3: torch.Tensor  # c, domain units
@@ -210,10 +213,10 @@ def poses_of(scenes: Sequence[Sequence[MovingObstacle]], frames: Sequence[int], 
 def surface_velocity(
     touch_N: torch.Tensor, surface_N3: torch.Tensor, touched_C: torch.Tensor, grid: GridHierarchy
 ) -> torch.Tensor:
-    """Returns V of each particle, [N, 3]: its own surfaces' where `touch_N` is 1, else that of its neighbours.
+    """Returns V of each particle, [N, 3]: t times its own `surface_N3`, plus 1 - t times the mean around it.
 
-    Neighbours are the particles of the same coarsest cells and of cells across their faces, weighted by their contacts,
-    as in the gate G. Walls are at rest.
+    t is the particle's contact `touch_N`. The mean is over the particles in the same coarsest cells and in cells across
+    their faces, weighted by their contacts. Walls are at rest.
     """
     level, weight_N8 = grid.levels[-1], grid.weight_N8
     sum_C4 = grid.coarsest_sums(touch_N[:, None] * torch.cat([surface_N3, torch.ones_like(surface_N3[:, :1])], -1))

@@ -19,7 +19,7 @@ from hgn.schema import ConfigError, Vector, require
 
 CANCELLED = 0.25  # length of a cell's mean normal below which its normals cancel; three faces of a corner give 0.58
 NORMAL_SPACING_CELLS = 0.25  # distance of the samples, in cells
-SPLIT_CELLS = 16.0  # longest edge of pieces before they are cut at the domain, in cells
+SPLIT_CELLS = 16.0  # longest edge, in cells; longer triangles are divided, and pieces outside the domain are omitted
 REACH_CELLS = 2  # distance from an obstacle at which a network with distances begins to see it, in obstacle cells
 # A cell's piece of surface is a disk of this radius, in cells: a circle with the area of a cell's face, and a bit more.
 DISK_CELLS = 0.6
@@ -86,17 +86,19 @@ def grid_of_samples(
 
 
 def surface_planes(grid: ObstacleGrid) -> tuple[ObstacleGrid, np.ndarray]:
-    """Returns the cells within REACH_CELLS of a surface, and the offsets of their planes, float32 [B], domain units.
+    """Returns the cells near a surface, and the offsets of their planes, float32 [B], domain units.
 
-    The points x of a cell's plane fulfil n . (x - centre of the cell) = offset. A cell with surface has the plane of
-    its mean normal and point. Any other cell has the plane through the nearest point of the nearest cell's surface, a
-    disk, perpendicular to the line to the centre; its normal points to the centre, its friction is that cell's.
+    The points x of a cell's plane fulfil n . (x - centre of the cell) = offset. An obstacle cell has the plane through
+    its mean point with its mean normal n; its surface counts as a disk about this point. Another cell has a plane if
+    the nearest disk is at most REACH_CELLS + 0.5 cells from its centre. This plane goes through the nearest point of
+    the disk, n points from there to the centre, and the friction is that of the disk.
     """
     own_K3 = np.zeros_like(grid.normal_K3) if grid.point_K3 is None else grid.point_K3
     normal_K3, own_K3 = grid.normal_K3.astype(np.float64), own_K3.astype(np.float64)
     around = slice(-REACH_CELLS, REACH_CELLS + 1)
     step_D3 = np.mgrid[around, around, around].reshape(3, -1).T
-    # from a cell's mean point to the centre of each cell around: its square, its parts across and along the disk
+    # the vector from the mean point of cell K to the centre of the cell D steps away, in cells: its part across the
+    # disk, its squared length, its part along the disk
     own_K = (normal_K3 * own_K3).sum(axis=1)
     height_DK = step_D3 @ normal_K3.T - own_K
     square_DK = (step_D3 * step_D3).sum(axis=1)[:, None] - 2 * step_D3 @ own_K3.T + (own_K3 * own_K3).sum(axis=1)

@@ -44,7 +44,8 @@ class Start:
 
     store: AnyStore
     resume: Resume | None  # the checkpoint to resume from
-    initial: ParticleNetwork | None  # source of parameters and normaliser; None: random, and from the data
+    # network whose parameters and normaliser the training starts from; None: random parameters, normaliser of the data
+    initial: ParticleNetwork | None
     precompilation: Precompilation | None
 
 
@@ -215,6 +216,6 @@ def _report(config: TrainConfig, updates: int, last: dict[str, float], stop: Sto
         )
     folder = Path(config.run) / "checkpoints"
     if not (folder / BEST_NAME).exists():
-        print(f"no {BEST_NAME}, for no validation scene was measured; export {folder / LAST_NAMES[0]}")
+        print(f"no {BEST_NAME}, because no validation scene was measured; export {folder / LAST_NAMES[0]}")
     if stop.requested:
         print("stopped; the same command resumes it")

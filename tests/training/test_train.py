@@ -293,7 +293,7 @@ def test_without_validation_scenes_there_is_no_best(make_config, make_dataset, t
     assert train.main(train_mapping(config, run, maximum_updates=2)) == 0
     said, last = capsys.readouterr(), run / "checkpoints" / "last.ckpt"
     assert "no validation scenes: there will be no best.ckpt, nor errors and pictures of them" in said.err
-    assert f"no best.ckpt, for no validation scene was measured; export {last}" in said.out
+    assert f"no best.ckpt, because no validation scene was measured; export {last}" in said.out
     missing = run / "checkpoints" / "best.ckpt"
     assert last.is_file() and not missing.exists()
     with pytest.raises(ConfigError, match=rf"got {missing}; no validation scene was measured, so take {last}"):

@@ -24,7 +24,7 @@ TURNS = {"-x": (1, 0, 2), "-z": (0, 2, 1)}  # exchanges of axes that turn uprigh
 
 
 def energy_growth(outcome: Outcome) -> float:
-    """Returns the largest increase of kinetic and potential energy, as a fraction of a fall through the domain."""
+    """Returns the largest increase of kinetic and potential energy since the start; 1 is a fall through the domain."""
     growths = [0.0]
     for trial, scene in zip(outcome.trials, outcome.scenes, strict=True):
         if trial.frame_count > 1:
@@ -37,9 +37,9 @@ def energy_growth(outcome: Outcome) -> float:
 
 
 def energy_rise(outcome: Outcome) -> float:
-    """Returns the largest increase of kinetic and potential energy from any earlier frame, scaled as `energy_growth`.
+    """Returns the largest increase of the energy of `energy_growth` since any earlier frame.
 
-    Elastic energy is not included, so that a body that bounces has a rise of its own; limits add the solver's.
+    Elastic energy is not included. So a body that bounces correctly has a rise too, and limits add the solver's rise.
     """
     rises = [0.0]
     for trial, scene in zip(outcome.trials, outcome.scenes, strict=True):
@@ -72,11 +72,13 @@ def share_of_way(outcome: Outcome) -> float:
 
 
 def flight(trial: RolloutResult, scene: InitialState, frame_rate_hz: float) -> dict[str, Any]:
-    """Compares the mean motion of a body with free flight.
+    """Compares the mean motion of a body with free flight. Returns these figures:
 
-    Returns `kept`, the smallest fraction of the velocity across gravity that remains (None for a drop); `error`, the
-    largest error of the acceleration along gravity, in gravities (in the earth's without gravity), and its frame;
-    and `across`, the mean acceleration across gravity, in the earth's, which slows the body down.
+    - `kept`: smallest fraction of the velocity across gravity that remains (None for a drop); `kept_frame`: its frame
+    - `error`: largest error of the acceleration along gravity, as a fraction of gravity; `error_frame`: its frame. In a
+      scene without gravity it is the error in all directions, as a fraction of the earth's gravity.
+    - `across`: mean acceleration across gravity that slows the body down, as a fraction of the earth's gravity
+    - `frames`: number of simulated frames
     """
     gravity_3, frames = np.array(scene.gravity) / frame_rate_hz**2, trial.frame_count - 1
     thrown_3 = scene.velocity_N3[0].astype(np.float64) / frame_rate_hz
@@ -186,11 +188,13 @@ def collapse(outcome: Outcome) -> list[dict[str, float]] | None:
 
 
 def rest(outcome: Outcome) -> dict[str, float] | None:
-    """Measures the particles of all scenes from frame `settled` to the end, lengths in obstacle cells.
+    """Measures the particles of all scenes in frame `settled` and at the end. Lengths are in obstacle cells.
 
-    Returns the root mean square displacement, the mean heights at both frames, the neighbours within a cell at the end
-    and their ratio to those before, the spread at the end along x and z, and the mean squared speed about each scene's
-    mean in the last STIR_FRAMES, (domain units per second)².
+    - `drift`: root mean square displacement between the two frames
+    - `height_before`, `height`: mean height at the two frames
+    - `neighbours`: number of neighbours within a cell at the end; `density`: its ratio to the number at `settled`
+    - `spread`: root mean square distance from the mean along x and z, at the end
+    - `squared_speed`: mean squared speed about the scene's mean velocity in the last STIR_FRAMES, (domain units/s)²
     """
     if not outcome.complete:
         return None
