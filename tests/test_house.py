@@ -19,7 +19,7 @@ LINES = {  # of Python, in tracked files
     "hgn": 32_644,
     "datagen": 8_431,
     "tools": 6_563,
-    "tests": 31_376,
+    "tests": 31_369,
 }
 SETTINGS = 240  # fields of the dataclasses behind the commands, *Config
 
