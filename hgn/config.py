@@ -297,9 +297,6 @@ class NetworkConfig:
     width: LayerSize = 128  # number of values in latent vectors and hidden layers
     velocity_history: FewLayers = 5  # m: number of past velocities in the input
     obstacle_features: bool = True  # normals of obstacle cells as inputs; false is only for scenes without obstacles
-    obstacle_distances: bool = (
-        False  # distances to obstacles within two of their cells, instead of cells' normals alone
-    )
     # absolute: the paper's velocities and wall distances; relative: hgn.network.relative, exact in free motion; local:
     # relative, and cells of coarser levels exchange messages only where cells of the finest level touch
     inputs: Annotated[str, one_of("absolute", "relative", "local")] = "absolute"
@@ -317,8 +314,6 @@ class NetworkConfig:
         require(self.relative or not self.own_physics, "own_physics", rule, list(self.own_physics))
         whole = "elastic" in self.materials or "elastic" not in self.own_physics
         require(whole, "materials", "with elastic where own_physics has it", list(self.materials))
-        seen, rule = self.relative and self.obstacle_features, "false with inputs=absolute or obstacle_features=false"
-        require(seen or not self.obstacle_distances, "obstacle_distances", rule, self.obstacle_distances)
         if self.relative:
             require(self.kind == "hgn", "inputs", f"absolute for {self.kind}", self.inputs)
             rule = f"at least 2 with inputs={self.inputs}, which are of differences"

@@ -123,7 +123,7 @@ def moving_in(samples: Sequence[BatchSample], network: NetworkConfig) -> MovingO
     if "moving" not in network.own_physics:
         return None
     scenes, frames = [moving_of_episode(s.episode) for s in samples], [s.frame for s in samples]
-    return MovingObstacles.of(scenes, frames, 1 / samples[0].episode.frame_rate_hz, network)
+    return MovingObstacles.of(scenes, frames, 1 / samples[0].episode.frame_rate_hz, network.obstacle_features)
 
 
 def join(samples: Sequence[BatchSample], network: NetworkConfig) -> Batch:
@@ -138,9 +138,7 @@ def join(samples: Sequence[BatchSample], network: NetworkConfig) -> Batch:
         particles_S=particles,
         domain_S3=torch.tensor([episode.domain_size for episode in episodes], dtype=torch.float32),
         gravity_S3=torch.tensor([frame_gravity(episode) for episode in episodes], dtype=torch.float32),
-        obstacles=ObstacleCells.of([e.obstacle_grid for e in episodes], network.obstacle_distances)
-        if network.obstacle_features
-        else None,
+        obstacles=ObstacleCells.of([e.obstacle_grid for e in episodes]) if network.obstacle_features else None,
         seeds_S=tuple(sample.seed for sample in samples),
         weight_S=tuple(sample.weight for sample in samples),
         noise_scale_S=tuple(sample.noise_scale for sample in samples),

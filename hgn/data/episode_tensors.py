@@ -5,7 +5,7 @@ Shape legend: H velocity history, T frames, N particles.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -53,15 +53,14 @@ def whole_episode(episode: Episode, network: NetworkConfig, barrier: Barrier | N
     """Reads an episode; its windows are those of `hgn.scene.history.window`. `barrier` is that of its obstacles."""
     past = frames_before(episode, -network.velocity_history)
     grid, seen = episode.obstacle_grid, len(episode.obstacle_grid.cell_K3) if network.obstacle_features else 0
-    # copies, because the episode may be a memory map
-    own = {name: getattr(grid, name) for name in ("cell_K3", "normal_K3", "friction_K", "point_K3")}
-    own = {name: value if value is None else np.array(value[:seen]) for name, value in own.items()}
+    cell_K3, normal_K3 = grid.cell_K3[:seen], grid.normal_K3[:seen]
+    friction_K = None if grid.friction_K is None else grid.friction_K[:seen].astype(np.float32)
     material_N = material_rows(episode.material_N, network.materials, episode.materials)
     physics = physics_fields(network, [episode], material_N)
     return EpisodeTensors(
         torch.from_numpy(np.concatenate([past, episode.position_TN3], dtype=np.float32)),
         material_N.int(),
-        replace(grid, **own),
+        ObstacleGrid(grid.cell_size, cell_K3.astype(np.int32), normal_K3.astype(np.float32), friction_K),
         episode.domain_size,
         frame_gravity(episode),
         shown_symmetries(episode, network),

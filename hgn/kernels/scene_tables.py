@@ -11,7 +11,6 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from hgn.config import NetworkConfig
 from hgn.kernels import obstacles
 from hgn.network.barriers import Barriers
 from hgn.network.cell_keys import in_buckets, unpack
@@ -28,25 +27,26 @@ class SceneHash:
 
     bucket_B: torch.Tensor  # int32
     key_K: torch.Tensor  # int64
-    # An obstacle cell has the values of ObstacleCells.values, float32 [K, 3 to 5]. A barrier cell has the range of its
-    # list of triangles, int32.
+    # An obstacle cell has its normal, float32 [K, 3], or normal and friction [K, 4]. A barrier cell has the range of
+    # its list of triangles, int32.
     value_K: torch.Tensor
     lists: tuple[torch.Tensor, ...] = ()  # a barrier's lists, int32 [E], and triangles, float32 [F, 24]
     last: int = 0  # last column of the row: bits of a barrier's cell size, or the obstacles' symmetry, set later
 
     @staticmethod
     def of_obstacles(cell_K3: torch.Tensor, value_KV: torch.Tensor) -> SceneHash:
-        """Returns the hash of cells int [K, 3] with ObstacleCells.values [K, 3 to 5], on their device."""
+        """Returns the hash of cells int [K, 3] with normals, or also friction, [K, 3 or 4], on their device."""
         bucket_B, key_K, order_K = in_buckets(cell_K3)
         return SceneHash(bucket_B, key_K, value_KV[order_K].float().contiguous())
 
     @staticmethod
-    def of_grid(grid: ObstacleGrid, network: NetworkConfig) -> SceneHash | None:
-        """Returns the hash of a scene's obstacle cells with the values that the network sees, or None without cells."""
-        cells = ObstacleCells.of([grid], network.obstacle_distances)
-        if cells is None:
-            return None
-        return SceneHash.of_obstacles(unpack(cells.key_K)[1], cells.values("friction" in network.own_physics))
+    def of_grid(grid: ObstacleGrid, friction: bool = False) -> SceneHash | None:
+        """Returns the hash of a scene's obstacle cells, or None without cells. With `friction` cells have theirs."""
+        values = [grid.normal_K3]
+        if friction:
+            values.append(np.zeros((len(grid.cell_K3), 1)) if grid.friction_K is None else grid.friction_K[:, None])
+        tensors = torch.from_numpy(grid.cell_K3), torch.from_numpy(np.concatenate(values, axis=1))
+        return SceneHash.of_obstacles(*tensors) if len(grid.cell_K3) else None
 
     @staticmethod
     def of_barrier(barrier: Barrier) -> SceneHash | None:

@@ -25,10 +25,9 @@ import numpy as np
 import torch
 from torch.nn.functional import pad
 
-from hgn.config import NetworkConfig
 from hgn.network.barriers import Barriers
 from hgn.network.grid import GridHierarchy
-from hgn.network.obstacles import ObstacleCells, nearest
+from hgn.network.obstacles import ObstacleCells
 from hgn.scene.barrier import barrier_of_pieces
 from hgn.scene.motion import AT_REST
 from hgn.scene.moving import MovingObstacle
@@ -94,19 +93,17 @@ class MovingObstacles:
         scenes: Sequence[tuple[MovingObstacle, ...]],
         frames: Sequence[int],
         frame_s: float,
-        network: NetworkConfig | None = None,
+        features: bool = True,
         clearance: float | None = None,
     ) -> MovingObstacles | None:
-        """Returns the moving obstacles of scenes as `network` sees them, scene s at frames[s]; None if none moves."""
-        network = NetworkConfig() if network is None else network
+        """Returns the moving obstacles of scenes, scene s at frames[s]; None if none moves."""
         if not any(scenes):
             return None
         rows, cells = [row for layer in zip_longest(*scenes) for row in layer], None
         size = next(row.grid.cell_size for row in rows if row is not None)
         nothing = ObstacleGrid(size, np.zeros((0, 3), np.int32), np.zeros((0, 3), np.float32))
-        if network.obstacle_features:
-            grids = [nothing if row is None else row.grid for row in rows]
-            cells = ObstacleCells.of(grids, network.obstacle_distances)
+        if features:
+            cells = ObstacleCells.of([nothing if row is None else row.grid for row in rows])
         own = tuple(map(tuple, scenes))
         moving = MovingObstacles(own, tuple(frames), frame_s, cells, None, poses_of(own, frames, frame_s))
         return moving if clearance is None else moving.with_barriers(clearance)
@@ -143,39 +140,35 @@ class MovingObstacles:
         still: ObstacleCells | None,
         place: tuple[torch.Tensor, torch.Tensor, torch.Tensor],
         steps: int,
-        distances: bool = False,
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Returns `relative.obstacle_surfaces` of moving and `still` obstacles, [N, 8], and velocities V [N, 3].
 
-        V is that of the surface at the particle, or else of the one on its path; 0 without a surface. Where a particle
-        is in cells of several obstacles, normals are summed and shortened to 1; friction and V are means. The result
-        with `distances` is `relative.near_obstacles`, and of several obstacles the nearest counts.
+        V is that of the surface at the particle, or else of the first one on its path; 0 without a surface. Where a
+        particle is in cells of several obstacles, normals are summed and shortened to 1; friction and V are means.
         """
         (position_N3, velocity_N3, scene_N), cells = place, self.cells
         assert cells is not None
         rows: list[list[torch.Tensor]] = [[] for _ in range(steps + 1)]
         if still is not None:
             for step, row in enumerate(rows):
-                row.append(pad(_seen(still, position_N3, velocity_N3, scene_N, step / steps, distances), (0, 3)))
+                row.append(pad(_seen(still, position_N3, velocity_N3, scene_N, step / steps), (0, 3)))
         for row_N, pose in self.rows(scene_N, position_N3.dtype):
             own_N3, surface_N3 = pose.undo(position_N3), pose.velocity(position_N3)
             way_N3 = turned(velocity_N3 - surface_N3, pose.later.rotation_V33.mT)
             for step, row in enumerate(rows):
-                own_N4 = _seen(cells, own_N3, way_N3, row_N, step / steps, distances)
+                own_N4 = _seen(cells, own_N3, way_N3, row_N, step / steps)
                 row.append(torch.cat([turned(own_N4[:, :3], pose.rotation_V33), own_N4[:, 3:], surface_N3], -1))
-        here_N7, *ahead = map(nearest if distances else _merged, rows)
-        ahead_N7 = nearest(ahead) if distances else first(ahead)
+        here_N7, *ahead = map(_merged, rows)
+        ahead_N7 = first(ahead)
         first_N7 = first([here_N7, ahead_N7])
         there_N1 = first_N7[:, :3].any(-1, keepdim=True)
         return torch.cat([here_N7[:, :4], ahead_N7[:, :4]], dim=-1), there_N1 * first_N7[:, 4:]
 
 
 def _seen(
-    cells: ObstacleCells, place_N3: torch.Tensor, way_N3: torch.Tensor, scene_N: torch.Tensor, part: float, near: bool
+    cells: ObstacleCells, place_N3: torch.Tensor, way_N3: torch.Tensor, scene_N: torch.Tensor, part: float
 ) -> torch.Tensor:
-    """Returns normals, or with `near` their nearness, and friction at a part of particles' ways, [N, 4]."""
-    if near:
-        return cells.near(place_N3, way_N3, scene_N, part)
+    """Returns normals and friction at a part of particles' ways, [N, 4]."""
     row_NV = cells.surfaces(place_N3 + way_N3 * part, scene_N)
     return pad(row_NV, (0, 4 - row_NV.shape[1]))
 

@@ -5,7 +5,7 @@ default parameters. If all are 0, they are not computed; the result is the same.
 
 | columns | value | only with |
 |---|---|---|
-| 2 | friction of the obstacle at the particle and ahead of it (times its nearness) | friction, obstacle_features |
+| 2 | friction of the particle's obstacle cell, and of the first one on its path | friction, obstacle_features |
 | 3 | friction of the walls across x, y, z, times the nearness of the nearer wall | friction |
 | P | INPUT_PARAMETERS of the particle's material, 0 for those of others (`scaled_parameters`) | parameters |
 | 9 | deformation of elastic bodies (hgn.network.elastic) | elastic |
@@ -35,7 +35,6 @@ from hgn.config import NetworkConfig
 from hgn.network import elastic
 from hgn.network.features import ParticleState
 from hgn.network.grid import GridHierarchy
-from hgn.network.obstacles import first_normal
 from hgn.scene.material import INPUT_PARAMETERS, LOGARITHMIC, acts_on
 from hgn.scene.own_physics import NOMINAL_P
 
@@ -122,32 +121,22 @@ def has_friction(state: ParticleState) -> bool:
 def surface_friction(
     state: ParticleState,
     grid: GridHierarchy,
-    near: tuple[torch.Tensor, torch.Tensor | None, bool],
+    wall_N6: torch.Tensor,
+    cell_N8: torch.Tensor | None,
     *,
     velocity_N3: torch.Tensor,
     scale: torch.Tensor,
 ) -> SurfaceFriction:
-    """Returns the friction within reach, from the surfaces within reach, v - V and s_a.
-
-    The surfaces are `relative.wall_nearness`, `relative.obstacle_surfaces` (None: not seen), and whether the second are
-    `relative.near_obstacles` instead.
-    """
-    wall_N6, cell_N8, distances = near
+    """Returns the friction within reach, from `relative.wall_nearness`, `relative.obstacle_surfaces`, v - V and s_a."""
     wall_N3 = torch.zeros_like(state.position_N3)
     if state.wall_friction_S3 is not None:
         wall_N3 = state.wall_friction_S3[state.scene_N]
     columns, rough_N33 = [], wall_N6.new_zeros(len(wall_N6), 3, 3)
     if cell_N8 is not None:
         here_N4, ahead_N4 = (pad(surface, (0, 4 - surface.shape[1])) for surface in cell_N8.chunk(2, dim=1))
-        friction_N = torch.where(here_N4[:, :3].any(-1), here_N4[:, 3], ahead_N4[:, 3])
-        first_N3 = first_normal(here_N4[:, :3], ahead_N4[:, :3], distances)
-        rough_N33 = friction_N[:, None, None] * first_N3[:, :, None] * first_N3[:, None]
+        first_N4 = torch.where(here_N4[:, :3].any(-1, keepdim=True), here_N4, ahead_N4)
+        rough_N33 = first_N4[:, 3, None, None] * first_N4[:, :3, None] * first_N4[:, None, :3]
         columns = [here_N4[:, 3:], ahead_N4[:, 3:]]
-        if distances:
-            surfaces = (here_N4, ahead_N4)
-            columns = [
-                own[:, 3:] * own[:, :3].square().sum(-1, keepdim=True).clamp(min=TINY).sqrt() for own in surfaces
-            ]
     columns.append(torch.maximum(wall_N6[:, :3], wall_N6[:, 3:]) * wall_N3)
     near_N6 = (2 * wall_N6).clamp(max=1) * torch.cat([wall_N3, wall_N3], -1)
     next_N3 = (velocity_N3 + state.gravity_S3[state.scene_N]) / scale

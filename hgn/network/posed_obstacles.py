@@ -5,7 +5,6 @@ x' = R^T (x - t - c) + c with pivot c. The normal n found there becomes R n, so 
 exactly. The cell of a particle is piecewise constant, so n has no gradient by shifts or by distance from the surface.
 With `smoothing` s the normal is the mean over a cube of s cells around the particle. The mean is continuous, and
 piecewise polynomial in position and pose. Networks were trained with s = 0.
-A network with distances sees the nearest plane of all obstacles, and its distance has gradients by shifts too.
 Shape legend: N particles, K obstacle cells.
 """
 
@@ -56,35 +55,11 @@ class PosedObstacleCells(ObstacleCells):
         square_N1 = surface_N4[:, :3].square().sum(-1, keepdim=True)
         return torch.where(square_N1 > 1, surface_N4 * square_N1.clamp(min=1).rsqrt(), surface_N4)
 
-    def planes(self, position_N3: torch.Tensor, scene_N: torch.Tensor) -> torch.Tensor:
-        """Returns as `ObstacleCells.planes` the plane that is nearest to each particle, [N, 5]."""
-        plane_N5 = smoothed_planes(self, position_N3, scene_N, self.smoothing)
-        for cells, placement in self.placed:
-            own_N5 = smoothed_planes(cells, placement.undo(position_N3), scene_N, self.smoothing)
-            own_N5 = torch.cat([own_N5[:, :3] @ placement.rotation_33.T, own_N5[:, 3:]], dim=-1)
-            there_N, own_there_N = (plane[:, :3].any(-1) for plane in (plane_N5, own_N5))
-            nearer_N = own_there_N & (~there_N | (own_N5[:, 3].abs() < plane_N5[:, 3].abs()))
-            plane_N5 = torch.where(nearer_N[:, None], own_N5, plane_N5)
-        return plane_N5
-
-
-def smoothed_planes(
-    cells: ObstacleCells, position_N3: torch.Tensor, scene_N: torch.Tensor, smoothing: float
-) -> torch.Tensor:
-    """Returns `ObstacleCells.planes`, with means over a cube of `smoothing` cells around each particle, [N, 5]."""
-    if len(cells.key_K) == 0:
-        return position_N3.new_zeros(len(position_N3), 5)
-    if smoothing == 0:
-        return cells.planes(position_N3, scene_N)
-    mean_N5 = smoothed_surfaces(cells.about_origin(), position_N3, scene_N, smoothing)
-    distance_N1 = (mean_N5[:, :3] * position_N3).sum(-1, keepdim=True) - mean_N5[:, 3:4]
-    return torch.cat([mean_N5[:, :3], distance_N1, mean_N5[:, 4:]], dim=-1)
-
 
 def smoothed_surfaces(
     cells: ObstacleCells, position_N3: torch.Tensor, scene_N: torch.Tensor, smoothing: float
 ) -> torch.Tensor:
-    """Returns means of a cell's `surface_rows` over a cube of `smoothing` cells around each particle, [N, 4 or 5]."""
+    """Returns means of normals and friction over a cube of `smoothing` cells around each particle, [N, 4]."""
     if len(cells.key_K) == 0:
         return position_N3.new_zeros(len(position_N3), 4)
     if smoothing == 0:

@@ -13,9 +13,6 @@ cube. The columns are, in this order:
 | 6 | walls within CONTACT_REACH_CELLS R, lower x, y, z, then upper |
 | 3 + 3 | obstacle normals at the particle and ahead of it; only with obstacle_features |
 
-With `network.obstacle_distances` the obstacle normals are multiplied by the nearness of the surface (`nearness`), as
-walls have it, and point to the particle's side. Ahead of the particle the surface with the largest nearness counts.
-
 G = sum_C w_pC t_C, with t_C of `disturbance`, is at least the particle's own `surface_gate`. G is above 0 if some
 particle in the same coarsest cells, or in cells across their faces, is within reach of a surface, as in a pile.
 
@@ -39,10 +36,11 @@ from hgn.config import NetworkConfig
 from hgn.network.features import ParticleState
 from hgn.network.grid import DIRECTION_63, GridHierarchy
 from hgn.network.moving import surface_velocity
-from hgn.network.obstacles import WALL_LIMIT, ObstacleCells, first_normal, nearest
+from hgn.network.obstacles import ObstacleCells
 from hgn.network.own_physics import SurfaceFriction, friction_fraction, has_friction, surface_friction
 
 CONTACT_REACH_CELLS = 3.0  # distance from a wall, in R, at which the network begins to see it
+WALL_LIMIT = 2.0  # largest wall_nearness, reached one `reach` behind the plane
 STEPS_AHEAD = 4  # number of places on the path of the next frame that are searched for an obstacle
 QUIET = 0.01  # the disturbance is 1 at this difference of velocities, in units of s_a; rounding gives 1e-5 to 1e-4
 OUTPUTS = 9  # numbers of the decoder per particle: an acceleration, and a stress xx, yy, zz, yz, xz, xy
@@ -79,11 +77,11 @@ def relative_features(
     )
     normal_N6 = cell_N8 = surface_N3 = None
     if config.obstacle_features:
-        place, distances = (state.position_N3, velocity_N3, state.scene_N), config.obstacle_distances
-        if state.moving is not None:
-            cell_N8, surface_N3 = state.moving.met(state.obstacles, place, STEPS_AHEAD, distances)
+        place = state.position_N3, velocity_N3, state.scene_N
+        if state.moving is None:
+            cell_N8 = obstacle_surfaces(*place, state.obstacles)
         else:
-            cell_N8 = (near_obstacles if distances else obstacle_surfaces)(*place, state.obstacles)
+            cell_N8, surface_N3 = state.moving.met(state.obstacles, place, STEPS_AHEAD)
         normal_N6 = cell_N8 if cell_N8.shape[1] == 6 else torch.cat([cell_N8[:, :3], cell_N8[:, 4:7]], dim=-1)
     motion_NK = torch.cat(
         [
@@ -92,15 +90,13 @@ def relative_features(
         ],
         dim=-1,
     )
-    normal_C33 = touched_normals(surface_normals(wall_N6, normal_N6, config.obstacle_distances), grid)
-    touch_N = surface_gate(wall_N6, normal_N6, config.obstacle_distances)
+    normal_C33, touch_N = touched_normals(surface_normals(wall_N6, normal_N6), grid), surface_gate(wall_N6, normal_N6)
     disturbed_C, touched_C = disturbance(motion_NK, touch_N, grid)
     if surface_N3 is not None:
         velocity_N3 = velocity_N3 - surface_velocity(touch_N, surface_N3, touched_C, grid)
     friction = None
     if has_friction(state) and "friction" in config.own_physics:
-        near = wall_N6, cell_N8, config.obstacle_distances
-        friction = surface_friction(state, grid, near, velocity_N3=velocity_N3, scale=scale)
+        friction = surface_friction(state, grid, wall_N6, cell_N8, velocity_N3=velocity_N3, scale=scale)
     contacts = Contacts(disturbed_C, touched_C, normal_C33, friction)
     gate_N = (grid.weight_N8 * touched_C[grid.coarsest_cells]).sum(1)
     parts = [motion_NK, gate_N[:, None] * torch.asinh(velocity_N3 / scale), wall_N6]
@@ -163,45 +159,24 @@ def obstacle_surfaces(
     return torch.cat([here_NV, ahead_NV], dim=-1)
 
 
-def near_obstacles(
-    position_N3: torch.Tensor, velocity_N3: torch.Tensor, scene_N: torch.Tensor, obstacles: ObstacleCells | None
-) -> torch.Tensor:
-    """Returns `ObstacleCells.near` at the particle, and the nearest one on its path to the next frame, [N, 8].
-
-    STEPS_AHEAD evenly spaced places of the path are tested.
-    """
-    if obstacles is None:
-        return torch.zeros_like(position_N3).repeat(1, 2)
-    steps = (step / STEPS_AHEAD for step in range(STEPS_AHEAD + 1))
-    here_N4, *ahead = (obstacles.near(position_N3, velocity_N3, scene_N, part) for part in steps)
-    return torch.cat([here_N4, nearest(ahead)], dim=-1)
-
-
-def surface_gate(wall_N6: torch.Tensor, normal_N6: torch.Tensor | None, distances: bool = False) -> torch.Tensor:
-    """Returns the nearness of surfaces, [N]: 0 beyond reach, 1 within half the reach of a wall.
-
-    Obstacles count like walls with `distances`, that is with results of `near_obstacles`; otherwise a normal is 1.
-    """
+def surface_gate(wall_N6: torch.Tensor, normal_N6: torch.Tensor | None) -> torch.Tensor:
+    """Returns the nearness of surfaces, [N]: 0 beyond reach, 1 at a normal and within half the reach of a wall."""
     gate_N = (2 * wall_N6.amax(-1)).clamp(max=1)
-    if normal_N6 is None:
-        return gate_N
-    if distances:
-        square_N = normal_N6.unflatten(1, (2, 3)).square().sum(-1).amax(-1)
-        return torch.maximum(gate_N, (2 * square_N.sqrt()).clamp(max=1))
-    return torch.where(normal_N6.any(-1), 1, gate_N)
+    return gate_N if normal_N6 is None else torch.where(normal_N6.any(-1), 1, gate_N)
 
 
-def surface_normals(wall_N6: torch.Tensor, normal_N6: torch.Tensor | None, distances: bool = False) -> torch.Tensor:
+def surface_normals(wall_N6: torch.Tensor, normal_N6: torch.Tensor | None) -> torch.Tensor:
     """Returns the sum of n n^T of the surfaces within reach, [N, 3, 3].
 
-    Walls count with the gate of `surface_gate`, obstacles as in `first_normal`. n and -n give the same n n^T, so two
-    surfaces that face each other do not cancel.
+    Walls count with the gate of `surface_gate`. The obstacle's normal at the particle counts; if it is 0, the one ahead
+    counts. n and -n give the same n n^T, so two surfaces that face each other do not cancel.
     """
     near_N6 = (2 * wall_N6).clamp(max=1)
     normal_N33 = torch.diag_embed(near_N6[:, :3] + near_N6[:, 3:])
     if normal_N6 is None:
         return normal_N33
-    first_N3 = first_normal(normal_N6[:, :3], normal_N6[:, 3:], distances)
+    here_N3, ahead_N3 = normal_N6[:, :3], normal_N6[:, 3:]
+    first_N3 = torch.where(here_N3.any(-1, keepdim=True), here_N3, ahead_N3)
     return normal_N33 + first_N3[:, :, None] * first_N3[:, None, :]
 
 

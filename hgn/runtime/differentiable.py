@@ -233,12 +233,11 @@ def _obstacles(
     placements = {i: _placement(scene.obstacles[i], pose, device, dtype) for i, pose in own_poses}
     obstacles, barriers = None, start.barriers
     if config.obstacle_features:
-        distances = config.obstacle_distances
-        rest = _cells(scene, staying, device, distances)
-        moving = ((_cells(scene, [scene.obstacles[i]], device, distances), pose) for i, pose in placements.items())
-        friction_K = rest.surface_rows[:, -1] if any(o.friction for o in scene.obstacles) else None
-        own = rest.key_K, rest.normal_K3, rest.cell_size, tuple(moving), inputs.smoothing
-        obstacles = PosedObstacleCells(*own, friction_K=friction_K, offset_K=rest.offset_K)
+        rest = _cells(scene, staying, device)
+        placed = tuple((_cells(scene, [scene.obstacles[i]], device), placement) for i, placement in placements.items())
+        friction_K = rest.surface_rows[:, 3] if any(o.friction for o in scene.obstacles) else None
+        own = rest.key_K, rest.normal_K3, rest.cell_size, placed, inputs.smoothing
+        obstacles = PosedObstacleCells(*own, friction_K=friction_K)
     clearance = network.step.obstacle_clearance
     if clearance is not None and placements:
         barriers = _barriers(scene, placements, clearance, device, dtype=dtype)
@@ -297,13 +296,12 @@ def _barriers(
     return barriers and replace(barriers.to(device), row_F24=barrier_rows(corner_F33, clearance).to(dtype))
 
 
-def _cells(scene: Scene, obstacles: list[Obstacle], device: torch.device, distances: bool) -> ObstacleCells:
+def _cells(scene: Scene, obstacles: list[Obstacle], device: torch.device) -> ObstacleCells:
     # not cut at the domain: an obstacle may be moved into it
     grid: ObstacleGrid = build_obstacle_grid(obstacles, scene.cell_size, scene.seed)
-    cells = ObstacleCells.of([grid], distances)
+    cells = ObstacleCells.of([grid])
     if cells is None:
-        offset_K = torch.zeros(0) if distances else None
-        cells = ObstacleCells(torch.zeros(0, dtype=torch.int64), torch.zeros(0, 3), scene.cell_size, offset_K=offset_K)
+        cells = ObstacleCells(torch.zeros(0, dtype=torch.int64), torch.zeros(0, 3), scene.cell_size)
     return cells.to(device)
 
 

@@ -112,14 +112,12 @@ def initial_arrays(state: ParticleState, corner_F33: np.ndarray | None = None) -
 
 
 def traced_step(network: ParticleNetwork, info: WeightsInfo) -> torch.export.ExportedProgram:
-    """Returns the graph. Raises: ConfigError for a GNS (neighbour lists cannot be exported) and for inputs of scenes
-    that graphs lack."""
+    """Returns the graph. Raises: ConfigError for a GNS (neighbour lists cannot be exported) and for own physics."""
     require(isinstance(network, HierarchicalGraphNetwork), "weights", "an hgn network", network.config.kind)
     assert isinstance(network, HierarchicalGraphNetwork)
+    own = list(network.config.own_physics)
+    require(not own, "weights", "a network without own_physics, which a graph has no inputs for yet", own)
     device, config = next(network.parameters()).device, network.config
-    own = [*config.own_physics, *["obstacle_distances"] * config.obstacle_distances]
-    rule = "a network without own_physics and obstacle_distances, which a graph has no inputs for yet"
-    require(not own, "weights", rule, own)
     generator = torch.Generator().manual_seed(0)
     example = (
         torch.rand(EXAMPLE_PARTICLES, 3, generator=generator) * 0.1 + 0.3,

@@ -228,17 +228,16 @@ class Simulator:
 
     def obstacles(self, scenes: Sequence[InitialState]) -> ObstacleCells | None:
         """Returns the obstacle cells of scenes on the device, or None for a network without obstacle features."""
-        config = self.network.config
-        if not config.obstacle_features:
+        if not self.network.config.obstacle_features:
             return None
-        obstacles = ObstacleCells.of([scene.obstacle_grid for scene in scenes], config.obstacle_distances)
+        obstacles = ObstacleCells.of([scene.obstacle_grid for scene in scenes])
         return obstacles and obstacles.to(self.device)
 
     def moving(self, scenes: Sequence[InitialState], frames: Sequence[int]) -> MovingObstacles | None:
         """Returns the moving obstacles of scenes on the device, scene s at frames[s] after its start."""
         config, clearance = self.network.config, self.network.step.obstacle_clearance
         own = [scene.moving for scene in scenes]
-        moving = MovingObstacles.of(own, frames, 1 / self.frame_rate_hz, config, clearance=clearance)
+        moving = MovingObstacles.of(own, frames, 1 / self.frame_rate_hz, config.obstacle_features, clearance=clearance)
         return moving and moving.to(self.device)
 
     def step(self, state: ParticleState) -> ParticleState:

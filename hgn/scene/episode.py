@@ -38,13 +38,11 @@ _ARRAYS = {
     "obstacle_cell": ("<i4", "K3"),
     "obstacle_normal": ("<f4", "K3"),
     "obstacle_friction": ("<f4", "K"),
-    "obstacle_point": ("<f4", "K3"),
     "past": ("<f4", "HN3"),
     "boundary": ("<f4", "P3"),
 }
 _PARAMETER = ("<f4", "N")
-# data of 0.2.0 have no obstacle_point; the last two are only in imported episodes
-_OPTIONAL = ("obstacle_friction", "obstacle_point", "past", "boundary")
+_OPTIONAL = ("obstacle_friction", "past", "boundary")  # the last two only in imported episodes
 
 _NAME = re.compile(r"[A-Za-z0-9_-]+")
 _FARTHEST = 1000.0  # largest coordinate, speed and gravity, in sizes of the domain; a network's grid has about twice it
@@ -147,7 +145,6 @@ class Episode:
             "obstacle_cell": self.obstacle_grid.cell_K3,
             "obstacle_normal": self.obstacle_grid.normal_K3,
             "obstacle_friction": self.obstacle_grid.friction_K,
-            "obstacle_point": self.obstacle_grid.point_K3,
             "past": self.past_HN3,
             "boundary": self.boundary_P3,
         }
@@ -231,7 +228,6 @@ def decode_episode(key: str, members: Mapping[str, bytes | np.ndarray], scan_pos
         if name not in arrays and name not in _OPTIONAL:
             raise ConfigError(f"{key}: member {name}.npy is missing; generate the data set again")
     normal_K3, friction_K = arrays["obstacle_normal"], arrays.get("obstacle_friction")
-    point_K3 = arrays.get("obstacle_point")
     settings = description.solver.get("settings", {})
     if friction_K is None and settings.get("collider_friction", 0.0) > 0:
         friction_K = np.full(len(normal_K3), settings["collider_friction"], np.float32)
@@ -240,7 +236,7 @@ def decode_episode(key: str, members: Mapping[str, bytes | np.ndarray], scan_pos
         position_TN3=arrays["position"],
         initial_velocity_N3=arrays["velocity"],
         material_N=arrays["material"],
-        obstacle_grid=ObstacleGrid(description.cell_size, arrays["obstacle_cell"], normal_K3, friction_K, point_K3),
+        obstacle_grid=ObstacleGrid(description.cell_size, arrays["obstacle_cell"], normal_K3, friction_K),
         domain_size=description.domain_size,
         gravity=description.gravity,
         frame_rate_hz=description.frame_rate_hz,

@@ -172,9 +172,9 @@ def _require_equal(pairs: list[tuple[str, Any, Any]], why: str, remedy: str) -> 
 def network_of_weights(config: TrainConfig) -> ParticleNetwork:
     """Returns the network of training.init_weights with its normaliser, as the initial state of a new run.
 
-    The rest constraint, clearances, inputs relative and local, and obstacle_distances may differ from those of the
-    weights, because they do not change tensors. Inputs for own physics that the weights lack begin at 0, so outputs
-    without friction are the same. A material `elastic` that they lack begins as the mean of theirs.
+    The rest constraint, the clearances of walls and obstacles, and inputs relative and local may differ from those of
+    the weights, because they do not change tensors. Inputs for own physics that the weights lack begin at 0, so
+    outputs without friction are the same. A material `elastic` that they lack begins as the mean of theirs.
     Raises: ConfigError for a file without weights, another network or data.
     """
     assert config.training.init_weights is not None
@@ -190,7 +190,7 @@ def network_of_weights(config: TrainConfig) -> ParticleNetwork:
     theirs = replace(theirs, **same)
     pairs = _pairs("network", theirs, ours)
     if info.network.relative and config.network.relative:
-        pairs = [pair for pair in pairs if pair[0] not in ("network.inputs", "network.obstacle_distances")]
+        pairs = [pair for pair in pairs if pair[0] != "network.inputs"]
     pairs.append(("dataset.frame_rate_hz", info.frame_rate_hz, config.dataset.frame_rate_hz))
     if info.network.obstacle_features:
         pairs.append(("scene.cell_size", info.obstacle_cell_size, config.scene.cell_size))

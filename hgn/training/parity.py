@@ -63,7 +63,7 @@ def _state(
 ) -> tuple[ParticleState, torch.Tensor]:
     """Returns the batch as PyTorch's input, noise and jitter included."""
     config = updates.config
-    obstacles = ObstacleCells.of([episode.obstacle_grid for episode in episodes], config.obstacle_distances)
+    obstacles = ObstacleCells.of([episode.obstacle_grid for episode in episodes])
     if obstacles is not None and symmetries is not None:
         obstacles = obstacles_under(obstacles, symmetries)
     particles = updates.buffers

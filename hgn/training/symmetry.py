@@ -47,9 +47,8 @@ def obstacles_under(obstacles: ObstacleCells, symmetries: Sequence[Symmetry]) ->
     key_K = pack(scene_K, torch.where(mirrored_K3, last_S3[scene_K] - cell_K3, cell_K3))
     normal_K3 = _vectors(obstacles.normal_K3, scene_K, symmetries)
     order_K = torch.argsort(key_K)
-    own = {"friction_K": obstacles.friction_K, "offset_K": obstacles.offset_K}
-    ordered = {name: value if value is None else value[order_K] for name, value in own.items()}
-    return ObstacleCells(key_K[order_K], normal_K3[order_K], obstacles.cell_size, **ordered)
+    friction_K = None if obstacles.friction_K is None else obstacles.friction_K[order_K]
+    return ObstacleCells(key_K[order_K], normal_K3[order_K], obstacles.cell_size, friction_K=friction_K)
 
 
 def moving_under(moving: MovingObstacles, symmetries: Sequence[Symmetry]) -> MovingObstacles:

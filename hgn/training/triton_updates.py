@@ -175,7 +175,7 @@ class TritonUpdates:
             free, total = torch.cuda.mem_get_info(self.device)
             fits = free - position_TN3.nbytes > (1 - DATA_FRACTION) * total
             position_TN3 = position_TN3.to(self.device) if fits else position_TN3.pin_memory()
-        obstacles = SceneHash.of_grid(episode.obstacle_grid, self.network.config)
+        obstacles = SceneHash.of_grid(episode.obstacle_grid, "friction" in self.network.config.own_physics)
         barrier = SceneHash.of_barrier(episode.barrier) if episode.barrier is not None else None
         return DeviceEpisode(
             position_TN3,

@@ -65,13 +65,6 @@ def rough_state(counts, walls=1.0, obstacles=1.0, fastest=1.0):
     return replace(state, velocity_NM3=velocity_NM3, wall_friction_S3=walls_S3, **columns)
 
 
-def plane_state(state):
-    """The same with planes in the obstacle cells, anywhere in them."""
-    generator, cells = torch.Generator().manual_seed(5), state.obstacles
-    offset_K = cells.cell_size * (torch.rand(len(cells.key_K), generator=generator) - 0.5)
-    return replace(state, obstacles=replace(cells, offset_K=offset_K))
-
-
 def elastic_state(counts):
     """The same with deformed and turned elastic bodies, and one particle without neighbours."""
     state, generator = rough_state(counts), torch.Generator().manual_seed(5)
@@ -100,7 +93,6 @@ class Case:
 
 
 RELATIVE = {"inputs": "relative"}
-DISTANCES = {"inputs": "local", "obstacle_distances": True}
 OWN = {"inputs": "local", "own_physics": ("friction", "parameters")}
 ELASTIC = {"own_physics": ("friction", "parameters", "elastic"), "materials": MATERIALS}
 SHUFFLED = ("water", "snow", "sand")
@@ -126,8 +118,6 @@ CASES = {
         lambda: rough_state((23, 9), 0.5, None), 1e-4, OWN | {"own_physics": ("friction",), "obstacle_features": False}
     ),
     "friction that stops": Case(lambda: rough_state((61, 20), 30.0, 30.0, 3e-3), 1e-4, OWN),
-    "distances": Case(lambda: plane_state(moving_state(CROWD)), 4e-5, DISTANCES),
-    "distances and friction": Case(lambda: plane_state(rough_state(CROWD)), 1e-4, OWN | DISTANCES),
     "parameters": Case(lambda: rough_state(SEVERAL), 4e-5, RELATIVE | {"own_physics": ("parameters",)}),
     "elastic bodies": Case(lambda: elastic_state((40, 17)), 1e-4, OWN | ELASTIC),
 }

@@ -32,7 +32,7 @@ def placed(made, network):
     clearance = network.step.obstacle_clearance
     barrier = None if clearance is None else simulated_barrier(made, clearance)
     whole, where = whole_episode(made, network.config, barrier), device()
-    cells = SceneHash.of_grid(whole.obstacle_grid, network.config)
+    cells = SceneHash.of_grid(whole.obstacle_grid, "friction" in network.config.own_physics)
     parameter_NP = None if whole.parameter_NP is None else whole.parameter_NP.to(where)
     hashed = SceneHash.of_barrier(whole.barrier) if whole.barrier is not None else None
     position_TN3, material_N = whole.position_TN3.to(where), whole.material_N.to(where)

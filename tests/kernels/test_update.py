@@ -9,7 +9,6 @@ import torch
 from kernels.engines import device
 from network.states import network_of, random_grid
 
-from hgn.config import NetworkConfig
 from hgn.data.episode_tensors import EpisodeTensors
 from hgn.kernels.scene_tables import SceneHash
 from hgn.kernels.update.op import DeviceEpisode, DeviceSample, Updates, UpdateSettings
@@ -35,7 +34,7 @@ def episode(seed, particles, obstacles, spread=0.12):
     made = DeviceEpisode(
         position.to(device()),
         torch.randint(0, 3, (particles,), generator=generator, dtype=torch.int32).to(device()),
-        SceneHash.of_grid(grid, NetworkConfig()).to(device()) if obstacles else None,
+        SceneHash.of_grid(grid).to(device()) if obstacles else None,
         (1.0, 1.0, 1.0),
     )
     return made, [grid] if obstacles else []

@@ -3,16 +3,12 @@
 from dataclasses import replace
 from functools import partial
 
-import numpy as np
 import pytest
 import torch
 from network.states import ODD_BODIES, airborne, chosen, gns_of, in_flight, network_of, scene_of
 
 from hgn.network.features import Normaliser
-from hgn.network.obstacles import ObstacleCells
-from hgn.network.relative import balanced, near_obstacles
-from hgn.scene.obstacle_grid import build_obstacle_grid
-from hgn.scene.shapes import shape_obstacle
+from hgn.network.relative import balanced
 
 KINDS = {
     "absolute": network_of,
@@ -155,38 +151,3 @@ def test_one_scale_for_all_axes():
     raw = network.normalised_acceleration(state)
     back = network.target(network.restored_acceleration(raw, state), state.gravity_S3[state.scene_N])
     torch.testing.assert_close(back, raw, rtol=1e-9, atol=1e-9)
-
-
-def on_a_plate(height, gap, velocity=(0.0, -2e-3, 0.0)):
-    """A cube of 4 x 4 x 4 particles whose lowest ones lie `gap` above a plate."""
-    side = torch.arange(4, dtype=torch.float64) / 128
-    place_N3 = torch.cartesian_prod(side, side, side) + torch.tensor([0.4, height + gap, 0.4])
-    plate = shape_obstacle("square", 0.5, (0.45, height, 0.45), np.eye(3), "plate")
-    state = chosen(airborne((64,)), slice(None))
-    cells = ObstacleCells.of([build_obstacle_grid([plate], 1 / 64, 0)], distances=True)
-    velocity_NM3 = torch.tensor(velocity, dtype=torch.float64).expand(64, 5, 3).clone()
-    return replace(state, position_N3=place_N3, velocity_NM3=velocity_NM3, obstacles=cells)
-
-
-def test_a_plate_acts_wherever_it_lies_in_its_cells():
-    """With distances a plate and the body above it may be shifted by parts of an obstacle cell, and act by their
-    distance: more on a nearer body, less on one that leaves, not at all beyond the reach."""
-    network = network_of(inputs="local", obstacle_distances=True)
-
-    def seen(height, gap, velocity=(0.0, -2e-3, 0.0)):
-        state = on_a_plate(height, gap, velocity)
-        origin_S3 = torch.tensor([[0.0, height, 0.0]], dtype=torch.float64)
-        near_N8 = near_obstacles(state.position_N3, state.velocity_NM3[:, 0], state.scene_N, state.obstacles)
-        return near_N8[:, 1], network(state, origin_S3).detach()
-
-    nearness_N, expected_N3 = seen(0.25, 0.012)
-    assert 0.6 < float(nearness_N.max()) < 0.9 and (nearness_N >= 0).all()
-    for height in (0.2539, 0.2578, 0.2617):
-        other_N, moved_N3 = seen(height, 0.012)
-        torch.testing.assert_close(other_N, nearness_N, rtol=0, atol=1e-5)
-        torch.testing.assert_close(moved_N3, expected_N3, rtol=0, atol=1e-4 * float(expected_N3.abs().max()))
-    assert seen(0.25, 0.006)[0].max() > nearness_N.max() > seen(0.25, 0.012, (0, 2e-3, 0))[0].max() > 0
-    assert seen(0.25, 0.04)[0].max() == 0 and 0.3 < seen(0.25, 0.04, (0, -0.02, 0))[0].max() < 0.4
-    state = on_a_plate(0.25, 0.055, (0, -0.04, 0))
-    ahead_N8 = near_obstacles(state.position_N3, state.velocity_NM3[:, 0], state.scene_N, state.obstacles)
-    assert ahead_N8[:, :4].abs().max() == 0 and ahead_N8[:, 5].max() > 0.4

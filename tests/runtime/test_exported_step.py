@@ -163,16 +163,12 @@ def test_what_is_refused(options, message):
     ("made", "values", "message"),
     [
         (gns_of, {}, "weights must be an hgn network, got 'gns'"),
-        (network_of, {"own_physics": ("friction",)}, r"without own_physics and .* got \['friction'\]"),
-        (network_of, {"obstacle_distances": True}, r"and obstacle_distances, .* got \['obstacle_distances'\]"),
+        (network_of, {"inputs": "local", "own_physics": ("friction",)}, r"without own_physics, .* got \['friction'\]"),
     ],
 )
 def test_networks_that_are_not_exported(made, values, message, tmp_path):
     """Neighbour lists, and inputs of scenes that graphs lack, are refused."""
-    network, path = (
-        made(torch.float32, **values | ({"inputs": "local"} if values else {})),
-        tmp_path / "own.safetensors",
-    )
+    network, path = made(torch.float32, **values), tmp_path / "own.safetensors"
     save_weights(path, network, WeightsInfo(network.config, 60.0, CELL))
     with pytest.raises(ConfigError, match=message):
         export.main({"weights": str(path), "onnx": str(tmp_path / "a.onnx")})

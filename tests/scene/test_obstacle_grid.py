@@ -1,14 +1,12 @@
 """Obstacle cells: samples of surfaces, normals, and grids of any mesh."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
 from hgn.config import OBSTACLE_SHAPES
 from hgn.scene.distance import closest_points
-from hgn.scene.obstacle_grid import build_obstacle_grid, surface_planes
+from hgn.scene.obstacle_grid import build_obstacle_grid
 from hgn.scene.rotation import euler_rotation
 from hgn.scene.scene import Obstacle, all_corners
 from hgn.scene.shapes import shape_obstacle
@@ -76,56 +74,6 @@ def test_grid_is_sorted_unique_unit_and_near_the_surface():
     closest = closest_points(pairs, np.tile(corner, (len(centre), 1, 1)))
     distance = np.linalg.norm(closest - pairs, axis=1).reshape(len(centre), -1).min(axis=1)
     assert distance.max() <= np.sqrt(3) / 2 * CELL + 1e-12
-
-
-def seen_planes(grid, point_P3):
-    """Distances from the planes of the cells that contain points, their normals, and whether there is a plane."""
-    near, offset_B = surface_planes(grid)
-    rows = {tuple(cell): row for row, cell in enumerate(near.cell_K3.tolist())}
-    cell_P3 = np.floor(point_P3 / grid.cell_size).astype(int)
-    row_P = np.array([rows.get(tuple(cell), -1) for cell in cell_P3.tolist()])
-    normal_P3 = near.normal_K3[row_P]
-    distance_P = ((point_P3 - (cell_P3 + 0.5) * grid.cell_size) * normal_P3).sum(1) - offset_B[row_P]
-    return np.abs(distance_P), np.sign(distance_P)[:, None] * normal_P3, row_P >= 0
-
-
-@pytest.mark.parametrize("shape", OBSTACLE_SHAPES)
-def test_planes_give_distances(shape):
-    """Points within two cells of a tilted obstacle have a plane. Its distance from them and its direction are those of
-    the nearest point of the surface: exact on flat parts, and within a third of a cell on nearly all others."""
-    obstacle = shape_obstacle(shape, 0.3, (0.5, 0.5, 0.5), TILT)
-    point, _ = sample_surface(obstacle.corners, CELL, rng())
-    point = (point + rng(1).uniform(-2, 2, point.shape) * CELL)[:400]
-    pairs = np.repeat(point, len(obstacle.corners), axis=0)
-    closest = closest_points(pairs, np.tile(obstacle.corners, (len(point), 1, 1)))
-    away = (pairs - closest).reshape(len(point), -1, 3)
-    exact = np.linalg.norm(away, axis=2)
-    away, exact = away[np.arange(len(point)), exact.argmin(axis=1)], exact.min(axis=1)
-    distance, normal, found = seen_planes(build_obstacle_grid([obstacle], CELL, 0), point)
-    within = exact < 2 * CELL
-    assert within.sum() > 100 and found[within].mean() > 0.98
-    error = np.abs(distance - exact)[within & found] / CELL
-    assert np.median(error) < 0.1 and np.quantile(error, 0.9) < 0.35
-    far = within & found & (exact > 0.3 * CELL)
-    assert np.median((normal * away).sum(1)[far] / exact[far]) > 0.98
-
-
-def test_planes_of_a_sheet_are_exact_wherever_it_lies_in_its_cells():
-    """So are both sides; beyond two cells and a half there is no plane; data without points take the cells' centres."""
-    for height in np.linspace(0.5, 0.5 + CELL, 7)[:-1]:
-        grid = build_obstacle_grid([quarter(sheet(4 * height - 1))], CELL, 0)
-        heights = np.linspace(-1.9, 1.9, 20)
-        point = np.stack([np.full(20, 0.377), height + heights * CELL, np.full(20, 0.371)], axis=1)
-        distance, normal, found = seen_planes(grid, point)
-        assert found.all()
-        np.testing.assert_allclose(distance, np.abs(heights) * CELL, atol=2e-7)
-        np.testing.assert_allclose(normal, [[0, side, 0] for side in np.sign(heights)], atol=1e-3)
-        far = seen_planes(grid, np.array([[0.377, height + side * 3.6 * CELL, 0.371] for side in (-1, 1)]))[2]
-        assert not far.any()
-        middle = np.array([[0.377, (grid.cell_K3[0, 1] + 0.5) * CELL, 0.371]])
-        assert seen_planes(replace(grid, point_K3=None), middle)[0] == pytest.approx(0, abs=1e-7)
-    grid = build_obstacle_grid([], CELL, 0)
-    assert len(surface_planes(grid)[0].cell_K3) == 0
 
 
 def test_sheet_normals_point_towards_the_cell_centres():

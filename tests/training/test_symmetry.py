@@ -29,8 +29,7 @@ def scene_with_obstacles(seed, particles=12, cells=4_000):
     made, grid = episode(particles, seed=seed), random_grid(seed, cells)
     middle = 0.25 + 0.02 * np.random.default_rng(seed).normal(size=(1, particles, 3))
     position = (made.position_TN3 - made.position_TN3[:1] + middle).astype(np.float32)
-    drawn_K4 = np.random.default_rng(seed).random((len(grid.cell_K3), 4)).astype(np.float32)
-    grid = replace(grid, friction_K=drawn_K4[:, 3], point_K3=drawn_K4[:, :3] - np.float32(0.5))
+    grid = replace(grid, friction_K=np.random.default_rng(seed).random(len(grid.cell_K3)).astype(np.float32))
     return replace(made, position_TN3=position, obstacle_grid=grid, wall_friction=(0.75, 0.25, 0.5))
 
 
@@ -61,16 +60,14 @@ def by_hand(batch, episodes, symmetries):
         cell = np.floor(((centre - CENTRE) @ matrix.T + CENTRE) / CELL_SIZE).astype(np.int32)
         order = np.lexsort(cell.T[::-1])
         normal = (made.obstacle_grid.normal_K3 @ matrix.T).astype(np.float32)
-        own = made.obstacle_grid.friction_K, (made.obstacle_grid.point_K3 @ matrix.T).astype(np.float32)
-        grids.append(ObstacleGrid(CELL_SIZE, cell[order], normal[order], *(value[order] for value in own)))
-    distances = batch.obstacles is not None and batch.obstacles.offset_K is not None
+        grids.append(ObstacleGrid(CELL_SIZE, cell[order], normal[order], made.obstacle_grid.friction_K[order]))
     pairs = zip(symmetries, batch.gravity_S3, strict=True)
     walls = [np.abs(matrix_of(s)) @ made.wall_friction for s, made in zip(symmetries, episodes, strict=True)]
     return replace(
         batch,
         window_WN3=torch.from_numpy(np.concatenate(windows, axis=1)),
         gravity_S3=torch.stack([torch.tensor(matrix_of(symmetry)) @ gravity_3 for symmetry, gravity_3 in pairs]),
-        obstacles=ObstacleCells.of(grids, distances) if batch.obstacles is not None else None,
+        obstacles=ObstacleCells.of(grids) if batch.obstacles is not None else None,
         wall_friction_S3=None if batch.wall_friction_S3 is None else torch.tensor(np.array(walls)),
     )
 
@@ -87,10 +84,9 @@ def loss_and_gradients(network, batch, symmetry):
         (network_of(levels=2, message_passing_steps=1), EIGHT),
         (network_of(levels=2, message_passing_steps=1, inputs="relative"), ALL_48[::6]),
         (network_of(levels=2, message_passing_steps=1, inputs="relative", own_physics=("friction",)), ALL_48[1::6]),
-        (network_of(levels=2, message_passing_steps=1, inputs="local", obstacle_distances=True), ALL_48[2::6]),
         (gns_of(message_passing_steps=1, cell_size=0.05), EIGHT[5:7]),
     ],
-    ids=["hgn", "relative", "friction", "distances", "gns"],
+    ids=["hgn", "relative", "friction", "gns"],
 )
 def test_training_sees_the_image(network, shown):
     """With noise and grid jitter, loss and gradients of a batch whose samples draw each of the symmetries are those of
@@ -103,7 +99,7 @@ def test_training_sees_the_image(network, shown):
     image = by_hand(batch, episodes, shown)
     assert_same(under_symmetries(batch, shown).wall_friction_S3, image.wall_friction_S3, "walls")
     expected_loss, expected = loss_and_gradients(network, image, "none")
-    bound = 1e-7 if network.config.obstacle_distances else 1e-10  # planes are made in float32, in another order of axes
+    bound = 1e-10
     assert loss == pytest.approx(expected_loss, rel=bound)
     assert float((gradient - expected).norm() / expected.norm()) < bound
     other_loss, other = loss_and_gradients(network, batch, "none")

@@ -102,10 +102,7 @@ def test_other_constraints_are_taken(tmp_path):
     """Weights of relative inputs without rest, walls and obstacles' clearance begin a network of local inputs with
     these: the same tensors."""
     path = weights_file(tmp_path / "own.safetensors", "fp32", inputs="relative")
-    wanted, step = (
-        NetworkConfig(**NETWORK | {"inputs": "local", "obstacle_distances": True}),
-        StepConfig(0.1, (0.02, 0.04), 1e-3),
-    )
+    wanted, step = NetworkConfig(**NETWORK | {"inputs": "local"}), StepConfig(0.1, (0.02, 0.04), 1e-3)
     config = TrainConfig(network=wanted, step=step, training=TrainingConfig(init_weights=str(path)))
     network, (own, info) = network_of_weights(config), load_weights(path)
     assert (network.config, network.step, info.step) == (wanted, step, StepConfig())

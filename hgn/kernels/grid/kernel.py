@@ -262,9 +262,8 @@ def prepare_particles(
     obstacle_cell_size, features, touch_of, disturbed, wall_friction, gravity, scale, friction, cell_size,
     reach, capacity,
     HISTORY: tl.constexpr, LEVELS: tl.constexpr, MOTION: tl.constexpr, COLUMNS: tl.constexpr,
-    NORMALS: tl.constexpr, DISTANCES: tl.constexpr, OBSTACLES: tl.constexpr, SYMMETRY: tl.constexpr,
-    FEATURES: tl.constexpr, FRICTION: tl.constexpr, FRICTION_AT: tl.constexpr, OVERLAP: tl.constexpr,
-    BLOCK: tl.constexpr,
+    NORMALS: tl.constexpr, OBSTACLES: tl.constexpr, SYMMETRY: tl.constexpr, FEATURES: tl.constexpr,
+    FRICTION: tl.constexpr, FRICTION_AT: tl.constexpr, OVERLAP: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Writes the 8 finest cells of each particle, its weights in them, and its fraction within the lowest cell.
 
@@ -274,7 +273,7 @@ def prepare_particles(
     (`motion` [.., 4]); places, their products xx, yy, zz, yz, xz, xy, and such products of normals to the coarsest
     (`moments` [C, COLUMNS]). It raises column 1 of their `disturbed` [C, 2] to at least the contact times FULLY.
     With FRICTION, the number of its columns, it writes these from FRICTION_AT on and adds to `friction` [C, COLUMNS]
-    (`add_friction`). OBSTACLES and SYMMETRY mean the same as in prepare_features, DISTANCES as in `surfaces_of`.
+    (`add_friction`). OBSTACLES and SYMMETRY mean the same as in prepare_features.
 
     Rule: hgn.network.grid.build_hierarchy and hgn.network.relative; test: tests/kernels/test_network.py.
     """
@@ -289,7 +288,7 @@ def prepare_particles(
     if MOTION:
         surfaces, touch = surfaces_of(
             position, velocity, domain, row, live, scene, obstacle_table, obstacle_cell_size, reach,
-            HISTORY, OBSTACLES, SYMMETRY, DISTANCES, FRICTION > 0,
+            HISTORY, OBSTACLES, SYMMETRY, 4 if FRICTION > 0 else 3,
         )  # fmt: skip
         tl.store(touch_of + row, touch, mask=live)
         column = tl.arange(0, 16)[None, :]
@@ -342,7 +341,7 @@ def prepare_particles(
         one = tl.where((part == 1) | (part == 4) | (part == 6), py, tl.where((part == 2) | (part == 5), pz, px))
         other = tl.where(part == 3, px, tl.where((part == 4) | (part == 8), py, tl.where(part < 3, 1.0, pz)))
         added = tl.where(part < 9, share[:, :, None] * one * other, 0.0)
-        product = surface_normals(surfaces, DISTANCES)
+        product = surface_normals(surfaces)
         for i in tl.static_range(6):
             added = tl.where(part == 9 + i, share[:, :, None] * product[i][:, None, None], added)
         # The added columns are a multiple of four, because the hardware adds four at once.
@@ -352,7 +351,7 @@ def prepare_particles(
         if FRICTION > 0:
             add_friction(
                 surfaces, velocity, wall_friction, gravity, scale, scene, row, live, coarsest, share, friction,
-                features + row * FEATURES + FRICTION_AT, HISTORY, FRICTION > 3, DISTANCES, COLUMNS,
+                features + row * FEATURES + FRICTION_AT, HISTORY, FRICTION > 3, COLUMNS,
             )  # fmt: skip
     if OVERLAP:
         gdc_wait()  # only the next kernels read the tables that earlier kernels are filling

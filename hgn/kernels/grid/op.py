@@ -267,8 +267,7 @@ class DeviceGrid:
             disturbed=self.disturbed_C2, wall_friction=particles.domain_S3 if walls is None else walls,
             gravity=particles.gravity_S3, scale=scale[1], friction=self.friction_C, cell_size=self.cell_size,
             reach=CONTACT_REACH_CELLS * config.cell_size, capacity=self.capacities[0], LEVELS=self.levels,
-            MOTION=config.relative, DISTANCES=int(config.obstacle_distances), COLUMNS=SUMS, **own_physics,
-            OVERLAP=overlap, launch_pdl=overlap,
+            MOTION=config.relative, COLUMNS=SUMS, **own_physics, OVERLAP=overlap, launch_pdl=overlap,
         )  # fmt: skip
         if not config.relative:
             feature_kernel.prepare_features[blocks](

@@ -11,42 +11,19 @@ import triton.language as tl
 from hgn.kernels.blocks import with_column
 from hgn.kernels.obstacles import OBSTACLE_COLUMNS, obstacle_normals
 from hgn.kernels.triton_compat import settle_keys
-from hgn.network.obstacles import WALL_LIMIT
-from hgn.network.relative import STEPS_AHEAD
-from hgn.scene.obstacle_grid import REACH_CELLS
+from hgn.network.relative import STEPS_AHEAD, WALL_LIMIT
 
-NEAREST, STEPS, REACH = tl.constexpr(WALL_LIMIT), tl.constexpr(STEPS_AHEAD), tl.constexpr(REACH_CELLS)
-
-
-@triton.jit
-def _from_middle(x, cell_size):
-    """Returns the distance from the middle of the cell that contains the coordinate."""
-    place = tl.div_rn(x, cell_size)
-    return (place - tl.floor(place) - 0.5) * cell_size
-
-
-@triton.jit
-def _nearness(row, place, way, v, reach):
-    """Returns ObstacleCells.near of the planes `row`: `place` is from the cell's middle, `way` from the particle."""
-    distance = -row[3]
-    for i in tl.static_range(3):
-        distance += row[i] * (place[i] - way[i])
-    side = tl.where(distance < 0, -1.0, 1.0)
-    approach = tl.minimum(side * (row[0] * v[0] + row[1] * v[1] + row[2] * v[2]), 0.0)
-    near = side * tl.minimum(tl.maximum(1 - (tl.abs(distance) + approach) / reach, 0.0), NEAREST)
-    return near * row[0], near * row[1], near * row[2]
+NEAREST, STEPS = tl.constexpr(WALL_LIMIT), tl.constexpr(STEPS_AHEAD)
 
 
 @triton.jit
 def surfaces_of(
     position, velocity, domain, row, live, scene, obstacle_table, obstacle_cell_size, reach,
-    HISTORY: tl.constexpr, OBSTACLES: tl.constexpr, SYMMETRY: tl.constexpr, DISTANCES: tl.constexpr,
-    ROUGH: tl.constexpr,
+    HISTORY: tl.constexpr, OBSTACLES: tl.constexpr, SYMMETRY: tl.constexpr, ROW: tl.constexpr,
 ):  # fmt: skip
     """Returns two results. The first is [N, 16]: six nearnesses of walls, the normal at the particle, the normal ahead,
-    with ROUGH friction at the particle and ahead, and zeros. The second is the contact of the particle [N]: 0 if no
-    surface is within reach, at most 1. With DISTANCES normals have the length of their nearness."""
-    ROW: tl.constexpr = 3 + DISTANCES + ROUGH
+    friction at the particle and ahead with ROW = 4, and zeros. The second is the contact of the particle [N]: 0 if no
+    surface is within reach, at most 1."""
     column = tl.arange(0, 16)
     axis, upper, walls = column % 3, (column >= 3)[None, :], live[:, None] & (column < 6)[None, :]
     v = tl.load(velocity + row[:, None] * (3 * HISTORY) + axis[None, :], mask=walls, other=0.0)
@@ -67,67 +44,44 @@ def surfaces_of(
         z = tl.load(at + 2, mask=asked, other=0.0) + tl.load(v_at + 2, mask=asked, other=0.0) * time
         line = obstacle_table + scene[:, None] * OBSTACLE_COLUMNS + 0 * quarters
         normal = obstacle_normals(x, y, z, line, asked, obstacle_cell_size, SYMMETRY, ROW)
-        if DISTANCES:
-            middle = _from_middle(x, obstacle_cell_size), _from_middle(y, obstacle_cell_size)
-            middle = middle + (_from_middle(z, obstacle_cell_size),)  # noqa: RUF005 - Triton knows no unpacking here
-            v = tl.load(v_at, mask=asked, other=0.0), tl.load(v_at + 1, mask=asked, other=0.0)
-            v = v + (tl.load(v_at + 2, mask=asked, other=0.0),)  # noqa: RUF005
-            way = v[0] * time, v[1] * time, v[2] * time
-            near = _nearness(normal, middle, way, v, REACH * obstacle_cell_size)
-            if ROUGH:
-                normal = near + (normal[4],)  # noqa: RUF005
-            else:
-                normal = near
-            square = near[0] * near[0] + near[1] * near[1] + near[2] * near[2]
-            most = tl.max(tl.where(asked & (quarters > 0), square, -1.0), 1)[:, None]
-            ahead = tl.min(tl.where(asked & (quarters > 0) & (square == most), quarters, 8), 1)
-            touch = tl.maximum(touch, tl.minimum(2 * tl.sqrt(tl.max(square, 1)), 1.0))
-        else:
-            found = (normal[0] != 0) | (normal[1] != 0) | (normal[2] != 0)
-            ahead = tl.min(tl.where(found & (quarters > 0), quarters, 8), 1)
-            touch = tl.where(tl.max(found.to(tl.int32), 1) > 0, 1.0, touch)
-        for i in tl.static_range(3 + ROUGH):
+        found = (normal[0] != 0) | (normal[1] != 0) | (normal[2] != 0)
+        ahead = tl.min(tl.where(found & (quarters > 0), quarters, 8), 1)
+        for i in tl.static_range(ROW):
             value = with_column(value, 6 + i if i < 3 else 12, tl.sum(tl.where(quarters == 0, normal[i], 0.0), 1))
             there = tl.sum(tl.where(quarters == ahead[:, None], normal[i], 0.0), 1)
             value = with_column(value, 9 + i if i < 3 else 13, there)
+        touch = tl.where(tl.max(found.to(tl.int32), 1) > 0, 1.0, touch)
     return value, touch
 
 
 @triton.jit
-def _first(surfaces, COUNT: tl.constexpr, DISTANCES: tl.constexpr):
-    """Returns obstacles.first_normal of `surfaces_of`, with COUNT = 4 also the friction."""
+def _first(surfaces, COUNT: tl.constexpr):
+    """Returns the normal of `surfaces_of` at the particle, or ahead if it is 0; with COUNT = 4 also the friction."""
     column = tl.arange(0, 16)[None, :]
     here = tl.sum(tl.where((column >= 6) & (column < 9), tl.abs(surfaces), 0.0), 1) > 0
     first = ()
     for i in tl.static_range(COUNT):
         at = tl.where(here, 6 + i if i < 3 else 12, 9 + i if i < 3 else 13)[:, None]
         first = first + (tl.sum(tl.where(column == at, surfaces, 0.0), 1),)  # noqa: RUF005
-    if DISTANCES:
-        near = tl.sqrt(first[0] * first[0] + first[1] * first[1] + first[2] * first[2])
-        scale = tl.where(near > 0, tl.sqrt(tl.minimum(2 * near, 1.0)) / tl.where(near > 0, near, 1.0), 0.0)
-        scaled = first[0] * scale, first[1] * scale, first[2] * scale
-        if COUNT > 3:
-            scaled = scaled + (first[3],)  # noqa: RUF005
-        first = scaled
     return first
 
 
 @triton.jit
-def surface_normals(surfaces, DISTANCES: tl.constexpr):
+def surface_normals(surfaces):
     """Returns products xx, yy, zz, yz, xz, xy of the normals of `surfaces_of`, summed over a particle's surfaces."""
     column = tl.arange(0, 16)[None, :]
     near = ()
     for i in tl.static_range(3):
         sides = tl.where((column == i) | (column == i + 3), tl.minimum(2 * surfaces, 1.0), 0.0)
         near = near + (tl.sum(sides, 1),)  # noqa: RUF005 - Triton knows no unpacking here
-    x, y, z = _first(surfaces, 3, DISTANCES)
+    x, y, z = _first(surfaces, 3)
     return near[0] + x * x, near[1] + y * y, near[2] + z * z, y * z, x * z, x * y
 
 
 @triton.jit
 def add_friction(
     surfaces, velocity, wall_friction, gravity, scale, scene, row, live, cell, share, sums, features,
-    HISTORY: tl.constexpr, NORMALS: tl.constexpr, DISTANCES: tl.constexpr, COLUMNS: tl.constexpr,
+    HISTORY: tl.constexpr, NORMALS: tl.constexpr, COLUMNS: tl.constexpr,
 ):  # fmt: skip
     """Writes the columns of friction to `features` [N]: the obstacle cells' with NORMALS, then the walls'.
 
@@ -136,7 +90,7 @@ def add_friction(
     square. Rule: hgn.network.own_physics.surface_friction; test: tests/kernels/test_network.py.
     """
     column = tl.arange(0, COLUMNS)[None, :]
-    x, y, z, rough = _first(surfaces, 4, DISTANCES)
+    x, y, z, rough = _first(surfaces, 4)
     value = 0.0 * surfaces
     square = 0.0 * x
     product = x * x, y * y, z * z, y * z, x * z, x * y
@@ -144,11 +98,7 @@ def add_friction(
         value = with_column(value, i, rough * product[i])
     if NORMALS:
         for i in tl.static_range(2):
-            own = tl.sum(tl.where(column == 12 + i, surfaces, 0.0), 1)
-            if DISTANCES:
-                normal = tl.where((column >= 6 + 3 * i) & (column < 9 + 3 * i), surfaces, 0.0)
-                own *= tl.sqrt(tl.sum(normal * normal, 1))
-            tl.store(features + i, own, mask=live)
+            tl.store(features + i, tl.sum(tl.where(column == 12 + i, surfaces, 0.0), 1), mask=live)
     for i in tl.static_range(3):
         wall = tl.load(wall_friction + scene * 3 + i, mask=live, other=0.0)
         lower = tl.sum(tl.where(column == i, surfaces, 0.0), 1)
