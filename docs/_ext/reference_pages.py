@@ -44,7 +44,7 @@ def _rows(path: Path, name: str) -> list[str]:
     (node,) = [n for n in ast.parse(source).body if isinstance(n, ast.ClassDef) and n.name == name]
     fields = [item for item in node.body if isinstance(item, ast.AnnAssign) and isinstance(item.target, ast.Name)]
     rows = [_row(item, _comment_of(item, lines, comments)) for item in fields]
-    for base in map(ast.unparse, node.bases):
+    for base in {"SimulatorConfig", "ReportConfig"}.intersection(map(ast.unparse, node.bases)):
         rows += _rows(CONFIG if base == "SimulatorConfig" else ROOT / "tools" / "report.py", base)
     return rows
 

@@ -290,7 +290,8 @@ class DeviceGrid:
             parameter_of=self.touch_N if parameter_NP is None else parameter_NP, quiet=QUIET,
             HISTORY=config.velocity_history,
             LEVELS=self.levels, NORMALS=int(config.obstacle_features), **own_physics,
-            PARAMETERS=0 if parameter_NP is None else parameter_NP.shape[1], PARAMETERS_AT=column + self._widths[0],
+            PARAMETERS=0 if parameter_NP is None else min(parameter_NP.shape[1], sum(self._widths[1:])),
+            PARAMETERS_AT=column + self._widths[0],
             FEATURES=self.features, OVERLAP=overlap, BLOCK=PARTICLE_BLOCK, launch_pdl=overlap,
         )  # fmt: skip
 
