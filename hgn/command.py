@@ -15,6 +15,7 @@ import re
 import select
 import sys
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, NoReturn, cast
 
@@ -133,7 +134,8 @@ def _unread() -> bool:
     """Returns whether standard output or standard error is a pipe without a reader."""
     poll = select.poll()
     for stream in (sys.stdout, sys.stderr):
-        poll.register(stream.fileno(), 0)
+        with suppress(io.UnsupportedOperation):  # a stream in memory
+            poll.register(stream.fileno(), 0)
     return any(event & select.POLLERR for _, event in poll.poll(0))
 
 

@@ -16,10 +16,10 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 32_386,
+    "hgn": 32_388,
     "datagen": 8_431,
     "tools": 6_563,
-    "tests": 31_252,
+    "tests": 31_258,
 }
 SETTINGS = 240  # fields of the dataclasses behind the commands, *Config
 
