@@ -19,7 +19,7 @@ LINES = {  # of Python, in tracked files
     "hgn": 32_388,
     "datagen": 8_431,
     "tools": 6_563,
-    "tests": 31_258,
+    "tests": 31_251,
 }
 SETTINGS = 240  # fields of the dataclasses behind the commands, *Config
 

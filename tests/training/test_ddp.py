@@ -217,14 +217,7 @@ def no_launcher(monkeypatch):
     return monkeypatch
 
 
-@pytest.fixture
-def launcher(no_launcher):
-    """Sets an address where nobody listens, for tests in which no rank meets another."""
-    no_launcher.setenv("MASTER_ADDR", "a")
-    no_launcher.setenv("MASTER_PORT", "1")
-    return no_launcher
-
-
+ADDRESS = {"MASTER_ADDR": "a", "MASTER_PORT": "1"}  # where nobody listens: no rank meets another
 TORCHRUN = {"RANK": "0", "LOCAL_RANK": "0", "WORLD_SIZE": "4"}
 SLURM = {"SLURM_STEP_ID": "0", "SLURM_PROCID": "0", "SLURM_NTASKS": "8", "SLURM_NNODES": "2"}
 JOB = {"SLURM_JOB_ID": "4711"}
@@ -262,12 +255,12 @@ RESTARTS = {"TORCHELASTIC_USE_AGENT_STORE": "True", "TORCHELASTIC_MAX_RESTARTS":
         (RESTARTS | {"TORCHELASTIC_USE_AGENT_STORE": "False"}, True, (1, 1), "runs/small"),
     ],
 )
-def test_what_a_launcher_says(launcher, variables, first, started, folder):
+def test_what_a_launcher_says(no_launcher, variables, first, started, folder):
     """Exactly the process of global rank 0 leads. Devices and nodes that the configuration leaves open are those that
     the launcher started. All processes of a job, and its restarts, agree on the folder, and two jobs get two: our own
     variable comes first, then torchrun's id (unless it is random, as --standalone makes it), then Slurm's."""
-    for name, value in variables.items():
-        launcher.setenv(name, value)
+    for name, value in (ADDRESS | variables).items():
+        no_launcher.setenv(name, value)
     assert (first_rank(), layout(TrainingConfig(device="cpu")), str(default_run("small"))) == (first, started, folder)
 
 
@@ -296,11 +289,11 @@ OTHERS = "devices must be the {} processes that the launcher started on each of 
         (RESTARTS, r"STORE must be 1 in torchrun's environment .*--max-restarts 3\), got nothing"),
     ],
 )
-def test_launcher_and_configuration_agree(launcher, variables, expected):
+def test_launcher_and_configuration_agree(no_launcher, variables, expected):
     """With two devices asked for, a launcher that started another number on a machine is refused, and so are variables
     without their launcher, for whose other processes it would wait, and restarts that would hang."""
-    for name, value in variables.items():
-        launcher.setenv(name, value)
+    for name, value in (ADDRESS | variables).items():
+        no_launcher.setenv(name, value)
     training = TrainingConfig(device="cpu", devices=2)
     if isinstance(expected, tuple):
         assert layout(training) == expected
@@ -309,17 +302,17 @@ def test_launcher_and_configuration_agree(launcher, variables, expected):
         layout(training)
 
 
-def test_devices_that_are_not_there(launcher):
+def test_devices_that_are_not_there(no_launcher):
     """All GPUs are taken unless fewer are asked for; more than there are, or a GPU where there is none, is refused."""
     for gpus in (0, 4):
-        launcher.setattr(torch.cuda, "is_available", lambda gpus=gpus: gpus > 0)
-        launcher.setattr(torch.cuda, "device_count", lambda gpus=gpus: gpus)
+        no_launcher.setattr(torch.cuda, "is_available", lambda gpus=gpus: gpus > 0)
+        no_launcher.setattr(torch.cuda, "device_count", lambda gpus=gpus: gpus)
         assert layout(TrainingConfig()) == (max(gpus, 1), 1)
         assert layout(TrainingConfig(devices=3)) == (3, 1)
         assert layout(TrainingConfig(device="cpu")) == (1, 1)
     with pytest.raises(ConfigError, match=r"training\.devices must be at most the 4 GPUs of this machine, got 5"):
         layout(TrainingConfig(devices=5))
-    launcher.setattr(torch.cuda, "is_available", lambda: False)
+    no_launcher.setattr(torch.cuda, "is_available", lambda: False)
     with pytest.raises(ConfigError, match=r"training\.device must be auto or cpu without a GPU, got 'cuda'"):
         layout(TrainingConfig(device="cuda"))
 
