@@ -16,7 +16,7 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 32_388,
+    "hgn": 32_387,
     "datagen": 8_431,
     "tools": 6_563,
     "tests": 31_251,

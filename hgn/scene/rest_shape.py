@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-NEIGHBOURS = 12  # as many as a close packing has; in a body of random points they are within about 1.4 spacings
+NEIGHBOURS = 12  # those of a close packing; in a body of random points they are within about 1.4 spacings
 CONNECTED_SPACINGS = 1.5  # particles of unknown bodies that are nearer than this are of one body
 # Candidates for the neighbours. More than NEIGHBOURS, because particles of a lattice have up to 19 at equal distances.
 CANDIDATES = 32

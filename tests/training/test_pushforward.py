@@ -29,7 +29,7 @@ def training_of(**changes):
 
 def test_windows_are_those_of_the_simulation():
     """Each simulated frame k gives the positions of the six frames up to it, the first of them true, and as the answer
-    its own place moved as the truth moves, plus a share of its distance from the truth: none of it with pull 0, all of
+    its own place moved as the truth moves, plus a share of its distance from the truth: nothing with pull 0, all of
     it with pull 1, where the answer is the truth; farther than a cell no particle is pulled harder."""
     generator = torch.Generator().manual_seed(0)
     true = torch.rand(HISTORY + 4 + 2, 7, 3, generator=generator, dtype=torch.float64)

@@ -228,7 +228,7 @@ def test_answers_that_pass(data, status, body, headers):
 
 @pytest.mark.parametrize("name", ["brace", "empty", "html", "no text", "other set"])
 def test_faults_while_a_training_waits_for_episodes(data, tmp_path, monkeypatch, name):
-    """A manifest that breaks after the first look is asked for again; without patience it ends the wait."""
+    """A manifest that breaks after the first look is read again; without patience it ends the wait."""
     mapping = train_mapping(data, tmp_path, minimum_episodes=9)
     mapping["dataset"]["training_scenes"] = 9
     config = from_mapping(TrainConfig, {key: value for key, value in mapping.items() if key != "name"})

@@ -136,7 +136,7 @@ def _step(position_TND: np.ndarray, radius: float) -> float:
     moved = path_TnD[1:][moves_TnD]
     moved = np.unique(moved[np.abs(moved) > 0.5 * np.abs(moved).max(initial=0)])  # floats have coarser digits there
     count = len(np.unique(path_TnD[0][moves_TnD.any(axis=0)])) * len(path_TnD) / 2  # particles side by side count once
-    # so many numbers that were not rounded almost surely contain a smaller difference than COARSEST
+    # with this count, numbers that were not rounded almost surely contain a smaller difference than COARSEST
     few = len(moved) < 2 or count**2 * COARSEST * radius < 20 * np.ptp(moved)
     return 0.0 if few else float(np.diff(moved).min())
 

@@ -9,6 +9,7 @@ import triton
 import triton.language as tl
 
 from hgn.kernels.blocks import with_column
+from hgn.kernels.bodies import three_columns
 from hgn.kernels.geometry import GEOMETRY_COLUMNS, most_around, raise_disturbed
 from hgn.kernels.obstacles import OBSTACLE_COLUMNS, obstacle_normals
 from hgn.kernels.triton_compat import gdc_launch_dependents, gdc_wait, settle_keys
@@ -124,9 +125,7 @@ def deform(position, rest, particle_count, scale, columns, WIDTH: tl.constexpr, 
     live = row < count
     part = tl.arange(0, 4)[None, :]
     numbers = rest + row * (5 * NEIGHBOURS)
-    x = tl.load(position + row * 3, mask=live, other=0.0)
-    y = tl.load(position + row * 3 + 1, mask=live, other=0.0)
-    z = tl.load(position + row * 3 + 2, mask=live, other=0.0)
+    x, y, z = three_columns(position, row, 0, live, 1.0, 3)
     sum_x = tl.zeros((BLOCK, 4), tl.float32)  # the rows of F, and e behind them
     sum_y, sum_z, most = sum_x, sum_x, row * 0 - 1
     for k in tl.static_range(NEIGHBOURS):
