@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from datagen.generate import StopSignal, datagen_config, generate
-from datagen.pool.progress import make_progress
-from datagen.pool.worker import Backend
 from hgn.command import run_command
+
+if TYPE_CHECKING:
+    from datagen.pool.worker import Backend
 
 
 def main(mapping: dict[str, Any], backend: Backend | None = None) -> int:
     """Runs the generator on a composed config. The exit code is 0, or 128 + the signal that stopped it."""
+    from datagen.generate import StopSignal, datagen_config, generate
+    from datagen.pool.progress import make_progress
+
     kind = mapping.get("progress", "bar")
     progress = make_progress(kind)
     config = datagen_config(mapping)

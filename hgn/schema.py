@@ -10,6 +10,7 @@ import dataclasses
 import difflib
 import functools
 import inspect
+import linecache
 import math
 import re
 import reprlib
@@ -192,8 +193,10 @@ def field_comments(cls: type) -> dict[str, str]:
     comments: dict[str, str] = {}
     for base in filter(dataclasses.is_dataclass, cls.__bases__):
         comments |= field_comments(base)
+    source = "".join(linecache.getlines(inspect.getfile(cls)))  # inspect.getsource parses the file: 15 ms a class
+    body = re.search(rf"^class {cls.__name__}\b.*((?:\n(?: .*)?)+)", source, re.MULTILINE)
     above: list[str] = []
-    for line in inspect.getsource(cls).splitlines():
+    for line in body[1].splitlines() if body else ():
         text = line.strip()
         if text.startswith("def "):
             break

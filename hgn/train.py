@@ -13,16 +13,11 @@ from typing import TYPE_CHECKING, Any
 
 from hgn.command import run_command
 from hgn.config import TrainConfig
-from hgn.data.identity import dataset_identity, identity_hash, require_same_dataset
-from hgn.data.manifest import Manifest
-from hgn.data.reader import EpisodeStore
-from hgn.data.storage import is_remote
 from hgn.schema import ConfigError, from_mapping, require_replaceable
 from hgn.system.extras import missing_extra, require_installed
 from hgn.system.locks import locked
 from hgn.system.processes import die_with_parent
 from hgn.system.ranks import first_on_machine, first_rank
-from hgn.training.stop import StopRequest
 
 if TYPE_CHECKING:
     from hgn.network.base import ParticleNetwork
@@ -33,11 +28,16 @@ def main(mapping: dict[str, Any]) -> int:
     """Trains with the resolved configuration. Returns the exit code."""
     import torch
 
+    from hgn.data.identity import require_same_dataset
+    from hgn.data.manifest import Manifest
+    from hgn.data.reader import EpisodeStore
+    from hgn.data.storage import is_remote
     from hgn.training.dataset import PublishedEpisodes, is_complete, more_data, wait_for_episodes, warning_on_a_cpu
     from hgn.training.distributed import default_run, layout
     from hgn.training.generator import Generator
     from hgn.training.imported import require_network_fits, settings_of_imported
     from hgn.training.session import Start, precompile_kernels, train_network
+    from hgn.training.stop import StopRequest
 
     require_installed("lightning")
     name = mapping.pop("name", "unnamed")
@@ -93,6 +93,8 @@ def _checkpoint_to_resume(config: TrainConfig, folder: Path) -> Resume | None:
 
     Raises DamagedError if there are checkpoints and none is whole.
     """
+    from hgn.data.identity import dataset_identity, identity_hash
+    from hgn.data.manifest import Manifest
     from hgn.training.checkpoint import LAST_NAMES, DamagedError, Progress, Resume, check_checkpoint, read_checkpoint
 
     damaged: DamagedError | None = None

@@ -12,20 +12,14 @@ import socket
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from datagen.generate import StopSignal, datagen_config, require_local_folder
-from datagen.pool.progress import make_progress
-from datagen.pool.worker import Backend
-from datagen.service.health import HealthPage
-from datagen.service.log import UnhurriedLog
-from datagen.service.supervisor import Supervisor
 from hgn.command import run_command
-from hgn.data.identity import require_same_dataset
-from hgn.data.manifest import MANIFEST_NAME, Manifest
-from hgn.data.storage import TOKEN_VARIABLE, dataset_token
 from hgn.schema import Bounded, ConfigError, Port, Positive, from_mapping
 from hgn.system.machine import allow_open_files
+
+if TYPE_CHECKING:
+    from datagen.pool.worker import Backend
 
 _OPEN_FILES = 65536
 _SERVICE_KEYS = ("host", "port", "health_port", "connections")
@@ -43,6 +37,15 @@ class ServiceConfig(Bounded):
 
 def main(mapping: dict[str, Any], backend: Backend | None = None) -> int:
     """Serves until it is stopped. The exit code is 128 + the signal."""
+    from datagen.generate import StopSignal, datagen_config, require_local_folder
+    from datagen.pool.progress import make_progress
+    from datagen.service.health import HealthPage
+    from datagen.service.log import UnhurriedLog
+    from datagen.service.supervisor import Supervisor
+    from hgn.data.identity import require_same_dataset
+    from hgn.data.manifest import MANIFEST_NAME, Manifest
+    from hgn.data.storage import dataset_token
+
     progress = make_progress(mapping.get("progress", "bar"))
     config = datagen_config(mapping, _SERVICE_KEYS)
     service = from_mapping(ServiceConfig, {key: mapping[key] for key in _SERVICE_KEYS if key in mapping})
@@ -88,6 +91,8 @@ def _listen(host: str, port: int, token: str | None) -> socket.socket:
 
     Raises: ConfigError if the port is taken, the host is not an address of this machine, or everybody could read.
     """
+    from hgn.data.storage import TOKEN_VARIABLE
+
     try:
         family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
         if token is None and not ipaddress.ip_address(address[0]).is_loopback:

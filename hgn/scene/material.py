@@ -7,10 +7,12 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-
-import numpy as np
+from typing import TYPE_CHECKING
 
 from hgn.schema import ConfigError, require
+
+if TYPE_CHECKING:
+    import numpy as np
 
 MATERIALS: tuple[str, ...] = ("water", "sand", "snow", "elastic")
 WATER, SAND, SNOW, ELASTIC = range(4)
@@ -63,6 +65,8 @@ def material_index(name: str) -> int:
 
 def elastic_particles(material_N: np.ndarray, materials: Sequence[str]) -> np.ndarray:
     """Returns for indices into `materials` whether a particle is of an elastic body, bool [N]."""
+    import numpy as np  # here, because all commands read this file for --help
+
     return np.array([name == MATERIALS[ELASTIC] for name in materials])[material_N]
 
 
