@@ -161,7 +161,7 @@ def make_scene(task: SceneTask, config: DatagenConfig, backend: Backend, with_gr
 
 
 def _with_known_friction(scene: Scene, default: float) -> Scene:
-    """Returns the scene with the solver's `default` for obstacles without friction, as its cells will have it."""
+    """Returns the scene with the friction `default` of the solver in place of None, for its obstacle cells to store."""
     frictions = (default if obstacle.friction is None else obstacle.friction for obstacle in scene.obstacles)
     obstacles = (replace(o, friction=friction) for o, friction in zip(scene.obstacles, frictions, strict=True))
     return replace(scene, obstacles=tuple(obstacles))

@@ -24,7 +24,7 @@ from hgn.scene.symmetry import Symmetry, Vector, scene_symmetries
 
 @dataclass(frozen=True, eq=False)
 class EpisodeTensors:
-    """Holds an episode as tensors. The first H of its H + T frames are ballistic motion before frame 0."""
+    """Holds an episode as tensors. The first H of its H + T frames are those before frame 0 (`frames_before`)."""
 
     position_TN3: torch.Tensor  # float32, domain units
     material_N: torch.Tensor  # int32, index into the network's materials
@@ -50,7 +50,7 @@ class EpisodeChunk:
 
 
 def whole_episode(episode: Episode, network: NetworkConfig, barrier: Barrier | None = None) -> EpisodeTensors:
-    """Reads an episode; its windows are those of `hgn.scene.history.window`. `barrier` is that of its obstacles."""
+    """Returns an episode as tensors. Rows n to n + H + 1 are `hgn.scene.history.window` of frame n."""
     past = frames_before(episode, -network.velocity_history)
     grid, seen = episode.obstacle_grid, len(episode.obstacle_grid.cell_K3) if network.obstacle_features else 0
     cell_K3, normal_K3 = grid.cell_K3[:seen], grid.normal_K3[:seen]

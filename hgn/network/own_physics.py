@@ -15,9 +15,9 @@ In `relative.balanced` surfaces without friction remove T = Q R from a cell's me
     k = min(1, |B| / |T|, b),    B = sum_s mu_s a_s (n_s . y) n_s,    y = T / (FEW + RARE tr P)
 
 Here s are the surfaces of `relative.surface_normals`, a_s is the sum of their weights in the cell, and mu_s their
-friction. b is the largest number with |b c Q T + Q u / 2|^2 <= (|Q u|^2 + V) / 4, with c = d_C t_C. u is the velocity
-along surfaces after a frame without friction, Q (v + g + d_C A_C), and V the variance of v in the cell; units of s_a.
-With `moving` v is the velocity relative to the surfaces (hgn.network.moving). It adds no columns.
+friction. b is the largest number with |b c Q T + Q u / 2|^2 <= (|Q u|^2 + D) / 4, with c = d_C t_C. u is the velocity
+along surfaces after a frame without friction, Q (v + g + d_C A_C), and D the variance of v in the cell; units of s_a.
+With `moving` v is the velocity relative to the surfaces, v - V of hgn.network.moving. It adds no columns.
 Shape legend: N particles, C coarsest cells, S scenes, P parameters, K columns.
 """
 

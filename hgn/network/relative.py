@@ -8,7 +8,7 @@ cube. The columns are, in this order:
 | columns | value |
 |---|---|
 | 3 (H - 1) | f(v^{n-k} - v^{n-k-1} - g), k = 0 … H - 2: zero in free flight |
-| 3 L | f(v_p - U_l(x_p)) on each level, finest first; U_l is momentum over mass of the surrounding cells |
+| 3 L | f(v^n - U_l) on each level, finest first; U_l is the mean velocity of the cells around (`surroundings`) |
 | 3 | G f(v^n - V): the velocity relative to surfaces, if one is near; V as in hgn.network.moving |
 | 6 | walls within CONTACT_REACH_CELLS R, lower x, y, z, then upper |
 | 3 + 3 | obstacle normals at the particle and ahead of it; only with obstacle_features |
@@ -46,7 +46,8 @@ QUIET = 0.01  # the disturbance is 1 at this difference of velocities, in units 
 OUTPUTS = 9  # numbers of the decoder per particle: an acceleration, and a stress xx, yy, zz, yz, xz, xy
 STRESS_33 = ((3, 8, 7), (8, 4, 6), (7, 6, 5))  # columns of the stress in the decoder's output
 SMALLEST_MASS = 1e-30  # lower bound of a cell's mass; a cell without weight gets velocity 0
-# A surface's effect fades if its contacts weigh less than FEW particles, or less than RARE of the cell's contacts.
+# The effect of a surface on a cell fades if its weight in the cell (`touched_normals`) is less than FEW particles, or
+# less than a fraction RARE of the weight of all surfaces in the cell.
 FEW, RARE = 0.1, 1e-3
 # Particles on a line define no rotation about it. So a rotation fades out if the product of the three principal moments
 # is below (THIN * mean moment)^3, or if the mean moment is below POINT. Moments: in squared edges of a coarsest cell.
@@ -241,17 +242,19 @@ def balanced(output_N9: torch.Tensor, contacts: Contacts, grid: GridHierarchy) -
 
     Each term of M_C d_C A_C is antisymmetric in C and C', and no term is divided by a small mass. So sum_p a_p is
     sum_C d_C t_C M_C R_C, which is 0 without a surface in reach. Cells exchange momentum across faces as in finite
-    volumes. A symmetric stress has no torque at a point, but the forces T and -T on a pair of cells have one.
+    volumes.
 
-    Rotation is subtracted so that sum_p x_p x a_p is 0 too without a surface in reach. Both steps are projections
-    times q or q', so they never enlarge mean squares. y_p is a particle's place about its cell's centre of mass X.
-    - Of a cell with means I of inertia and J of y x r: r_p - R becomes q (r_p - R) - W x y_p. (q, W) = rotation(I, J).
-    - Of a pair with D = X' - X: f' T becomes f' (q' T + W' x D) - W' x y_p. (q', W') is `rotation` of its inertia about
-      its centre, I f + I' f' + f f' (D^2 - D D^T), and of the moment -f f' D x T of T and -T.
+    Rotation is subtracted in two places, so that sum_p x_p x a_p is 0 too without a surface in reach. Both are
+    projections times a factor q from 0 to 1, so they never enlarge mean squares. X is a cell's centre of mass, and
+    y_p = x_p - X. (q, W) = rotation(I, J) is computed from an inertia I and an angular momentum J.
+    - In a cell r_p - R becomes q (r_p - R) - W x y_p. I and J are the cell's means of inertia and of y x r.
+    - In a pair of cells the forces T and -T have a torque, because they do not act along D = X' - X. The field of both
+      forces is f' T in the cell and -f T in C'. It becomes q times this field minus the rotation W about the pair's
+      centre: f' (q T + W x D) - W x y_p in the cell. I = I_C f + I_C' f' + f f' (D^2 - D D^T), J = -f f' D x T.
 
     t_C Q_C R_C is subtracted too, where Q is `slip` of the `touched_normals`. Then the mean force of surfaces on a cell
     is along their normals. Bodies slide on a plane without friction or propulsion, for any parameters. With friction a
-    part of Q_C R_C is kept (`own_physics.kept`).
+    part of Q_C R_C is kept (`own_physics.friction_fraction`).
     """
     disturbed_C, touched_C = contacts.disturbed_C, contacts.touched_C
     level, cell_N8, weight_N8 = grid.levels[-1], grid.coarsest_cells, grid.weight_N8

@@ -1,7 +1,7 @@
-"""The frames before the start of a simulation: ballistic motion into the initial state.
+"""The frames before the start of a simulation, in training and in rollouts.
 
-The history before frame 0 is the ballistic back-extrapolation of the initial state, in training and in rollouts. So a
-network can start from any scene.
+Imported episodes store them. Otherwise they are ballistic motion into the initial state, so a network can start from
+any scene.
 Shape legend: H history steps, N particles, W = H + 2 window frames.
 """
 

@@ -37,8 +37,9 @@ CASES = (*FAMILIES, GUARD)
 CaseName = Annotated[
     str, Bound(f"one of {', '.join(CASES)}, gallery, gallery_NUMBER", lambda n: n in CASES or is_gallery(n))
 ]
-FAR_DOMAINS, GUARD_FRAMES = 100.0, 4  # distance that the broken network throws particles, and in how many frames
-ON_THE_FLOOR = 0.04  # times the height of a particle in the middle: 0.02 domain heights
+FAR_DOMAINS = 100.0  # distance in domains by which the broken network moves particles in one frame
+GUARD_FRAMES = 4  # length of its rollouts
+FLOOR_HEIGHT = 0.02  # height of their particles above the lower plane, as a fraction of the domain's height
 
 
 @dataclass(frozen=True)
@@ -133,7 +134,7 @@ class Runner:
                 self._to_solve.setdefault((case.frames, scene.domain_size), {})[id(scene)] = scene
 
     def rows(self, case: Case) -> list[Row]:
-        """Returns a case's rows, one but for gallery scenes."""
+        """Returns one row, or for a scene of the gallery one row for each of its figures."""
         started, clock = time.monotonic(), FrameClock()
         try:
             initial = [InitialState.of_scene(scene) for scene in case.scenes]
@@ -159,7 +160,7 @@ class Runner:
         return self._upright[id(case.upright)]
 
     def _solver(self, scenes: Sequence[Scene], frames: int) -> list[RolloutResult]:
-        """Returns the solver's trajectories; a launch has the scenes of all cases with these frames and a domain."""
+        """Returns the solver's trajectories. Scenes of all cases with equal lengths and domains are one launch."""
         for domain_size in dict.fromkeys(scene.domain_size for scene in scenes):
             if pending := self._to_solve.pop((frames, domain_size), {}):
                 assert self.mpm is not None
@@ -171,15 +172,15 @@ class Runner:
 def guard_row(simulator: Simulator, config: SceneConfig) -> Row:
     """Checks that the runtime stops a network with an exploding parameter at the first frame.
 
-    The particles lie on the floor: relative inputs make free flight exact whatever the parameters.
+    The particles lie on the floor, because with relative inputs no parameter changes free flight.
     """
     broken = copy.deepcopy(simulator.network)
     with torch.no_grad():
-        # Not NaN: backends could not agree on it when they are compared before they run. Upwards: forces along the
-        # floor's normal must remain.
+        # The parameter is not NaN, because backends are compared before they run, and NaN differs from NaN. It throws
+        # upwards, because forces along the floor are subtracted.
         thrown = FAR_DOMAINS * max(config.domain_size) / broken.normaliser.acceleration_std[1]
         dict(broken.named_parameters())["decode.second.bias"][1] = thrown
-    floor_13 = 0.5 * np.array([config.domain_size]) * (1.0, ON_THE_FLOOR, 1.0)
+    floor_13 = np.array([config.domain_size]) * (0.5, FLOOR_HEIGHT, 0.5)
     materials = [name for name in config.materials if name in broken.config.materials]
     scenes = [InitialState.of_scene(body(config, material, floor_13, np.zeros(3))) for material in materials]
     sabotaged = Simulator(broken, simulator.frame_rate_hz, simulator.backend.name, simulator.backend.precision)
