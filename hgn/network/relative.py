@@ -46,8 +46,7 @@ QUIET = 0.01  # the disturbance is 1 at this difference of velocities, in units 
 OUTPUTS = 9  # numbers of the decoder per particle: an acceleration, and a stress xx, yy, zz, yz, xz, xy
 STRESS_33 = ((3, 8, 7), (8, 4, 6), (7, 6, 5))  # columns of the stress in the decoder's output
 SMALLEST_MASS = 1e-30  # lower bound of a cell's mass; a cell without weight gets velocity 0
-# The effect of a surface on a cell fades if its weight in the cell (`touched_normals`) is less than FEW particles, or
-# less than a fraction RARE of the weight of all surfaces in the cell.
+# A surface's effect on a cell fades if its weight in P (see `slip`) is less than FEW, or than RARE times P's trace.
 FEW, RARE = 0.1, 1e-3
 # Particles on a line define no rotation about it. So a rotation fades out if the product of the three principal moments
 # is below (THIN * mean moment)^3, or if the mean moment is below POINT. Moments: in squared edges of a coarsest cell.
@@ -240,17 +239,16 @@ def balanced(output_N9: torch.Tensor, contacts: Contacts, grid: GridHierarchy) -
         e                  unit vector from the cell to its neighbour C'
         f, f'              M_C / (M_C + M_C') and 1 - f
 
-    Each term of M_C d_C A_C is antisymmetric in C and C', and no term is divided by a small mass. So sum_p a_p is
-    sum_C d_C t_C M_C R_C, which is 0 without a surface in reach. Cells exchange momentum across faces as in finite
-    volumes.
+    Each term of M_C d_C A_C is antisymmetric in C and C', as in finite volumes, and no term is divided by a small mass.
+    So sum_p a_p is sum_C d_C t_C M_C R_C, which is 0 without a surface in reach.
 
     Rotation is subtracted in two places, so that sum_p x_p x a_p is 0 too without a surface in reach. Both are
     projections times a factor q from 0 to 1, so they never enlarge mean squares. X is a cell's centre of mass, and
     y_p = x_p - X. (q, W) = rotation(I, J) is computed from an inertia I and an angular momentum J.
     - In a cell r_p - R becomes q (r_p - R) - W x y_p. I and J are the cell's means of inertia and of y x r.
-    - In a pair of cells the forces T and -T have a torque, because they do not act along D = X' - X. The field of both
-      forces is f' T in the cell and -f T in C'. It becomes q times this field minus the rotation W about the pair's
-      centre: f' (q T + W x D) - W x y_p in the cell. I = I_C f + I_C' f' + f f' (D^2 - D D^T), J = -f f' D x T.
+    - A pair's forces T and -T have a torque, because they do not act along D = X' - X. Their field is f' T in the cell
+      and -f T in C'. It is multiplied by q, and the rotation W about the pair's centre is subtracted. In the cell this
+      gives f' (q T + W x D) - W x y_p. Here I = I_C f + I_C' f' + f f' (D^2 - D D^T) and J = -f f' D x T.
 
     t_C Q_C R_C is subtracted too, where Q is `slip` of the `touched_normals`. Then the mean force of surfaces on a cell
     is along their normals. Bodies slide on a plane without friction or propulsion, for any parameters. With friction a

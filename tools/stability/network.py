@@ -176,8 +176,7 @@ def guard_row(simulator: Simulator, config: SceneConfig) -> Row:
     """
     broken = copy.deepcopy(simulator.network)
     with torch.no_grad():
-        # The parameter is not NaN, because backends are compared before they run, and NaN differs from NaN. It throws
-        # upwards, because forces along the floor are subtracted.
+        # not NaN, which a comparison of backends would refuse; upwards, as forces along the floor are subtracted
         thrown = FAR_DOMAINS * max(config.domain_size) / broken.normaliser.acceleration_std[1]
         dict(broken.named_parameters())["decode.second.bias"][1] = thrown
     floor_13 = np.array([config.domain_size]) * (0.5, FLOOR_HEIGHT, 0.5)
