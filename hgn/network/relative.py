@@ -251,8 +251,7 @@ def balanced(output_N9: torch.Tensor, contacts: Contacts, grid: GridHierarchy) -
       gives f' (q T + W x D) - W x y_p. Here I = I_C f + I_C' f' + f f' (D^2 - D D^T) and J = -f f' D x T.
 
     t_C Q_C R_C is subtracted too, where Q is `slip` of the `touched_normals`. Then the mean force of surfaces on a cell
-    is along their normals. Bodies slide on a plane without friction or propulsion, for any parameters. With friction a
-    part of Q_C R_C is kept (`own_physics.friction_fraction`).
+    is along their normals, for any parameters. Friction keeps a part of Q_C R_C (`own_physics.friction_fraction`).
     """
     disturbed_C, touched_C = contacts.disturbed_C, contacts.touched_C
     level, cell_N8, weight_N8 = grid.levels[-1], grid.coarsest_cells, grid.weight_N8
