@@ -65,6 +65,9 @@ def run_command(main: Main | str, config_name: str) -> NoReturn:
             setattr(sys, name, Path(os.devnull).open("w"))  # noqa: SIM115 - open as long as the process runs
         elif isinstance(stream := getattr(sys, name), io.TextIOWrapper) and stream.encoding.lower() != "utf-8":
             stream.reconfigure(errors="replace")  # the encoding may be latin-1 or ASCII
+    if isinstance(stream := sys.stderr, io.TextIOWrapper) and stream is sys.__stderr__:
+        messages = io.BufferedWriter(_Messages(stream.fileno(), "wb", closefd=False))
+        sys.stderr = io.TextIOWrapper(messages, stream.encoding, stream.errors, line_buffering=True)
     code: int | str | None
     try:
         try:
@@ -81,6 +84,18 @@ def run_command(main: Main | str, config_name: str) -> NoReturn:
             with Path(os.devnull).open("wb") as nowhere:
                 os.dup2(nowhere.fileno(), stream.fileno())
     sys.exit(code)
+
+
+class _Messages(io.FileIO):
+    """Writes standard error. Messages that a full disk or a closed terminal does not take are lost, and end no work."""
+
+    def write(self, data: Any) -> int:
+        try:
+            return super().write(data) or 0
+        except BrokenPipeError:  # nobody reads: see `_unread`
+            raise
+        except OSError:
+            return len(data)
 
 
 def _exit_code(main: Main | str, config_name: str) -> int:

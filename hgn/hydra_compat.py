@@ -12,6 +12,7 @@ import itertools
 import os
 import re
 import sys
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -56,7 +57,8 @@ def compose(folder: Path, config_name: str, arguments: list[str], complete: bool
         if any(argument.lstrip("+~").startswith(("-", "hydra")) for argument in arguments[1:]):
             sys.argv = _with_quiet(arguments)
             os.environ["HYDRA_FULL_ERROR"] = "1"  # otherwise Hydra would print the error and exit
-            with _strict_files(), registered_dataclasses(folder, config_name):
+            with _strict_files(), registered_dataclasses(folder, config_name), warnings.catch_warnings():
+                warnings.simplefilter("error", UserWarning)  # of folders that do not exist
                 hydra_main(version_base="1.3", config_path=str(folder), config_name=config_name)(composed.append)()
         else:
             here = initialize_config_dir(str(folder), version_base="1.3")
@@ -67,11 +69,11 @@ def compose(folder: Path, config_name: str, arguments: list[str], complete: bool
         sys.exit(2 if end.code else 0)
     except MissingMandatoryValue as error:
         raise ConfigError(f"{error.full_key} is missing; it must be given, as in {error.full_key}=…") from error
-    except (HydraException, OmegaConfBaseException, ValueError, yaml.YAMLError) as error:  # some by Hydra
+    except (HydraException, OmegaConfBaseException, ValueError, UserWarning, yaml.YAMLError) as error:  # some by Hydra
         text = " ".join(str(error).split("Config search path:")[0].split())
-        raise ConfigError(
-            text or f"a value must be as Hydra reads it, got {type(error).__name__}; check ${{…}}"
-        ) from error
+        raise ConfigError(text or _unread(arguments, error)) from error
+    except (TypeError, LookupError, AttributeError, AssertionError) as error:  # Hydra's own, of lists and their places
+        raise ConfigError(_unread(arguments, error)) from error
     except RecursionError:
         raise ConfigError("defaults must not lead back to the same file, got a loop of them") from None
     finally:
@@ -80,6 +82,11 @@ def compose(folder: Path, config_name: str, arguments: list[str], complete: bool
         if full_error is not None:
             os.environ["HYDRA_FULL_ERROR"] = full_error
     return [{str(key): value for key, value in dict(mapping).items()} for mapping in plain]  # type: ignore[arg-type]
+
+
+def _unread(arguments: list[str], error: Exception) -> str:
+    given = f"{' '.join(arguments[1:])} ({type(error).__name__}: {error})"
+    return f"settings must be as Hydra reads them, got {given}; check lists, their numbers, and ${{…}}"
 
 
 @contextmanager
@@ -177,11 +184,13 @@ def _override(argument: str, folder: Path) -> str:
         value = "'" + value.replace("'", "\\'").replace("${", "\\${") + "'"
     elif value and not _understood(value):
         value = _in_quotes(value)
-    if re.fullmatch(r"[A-Za-z][\w.]*", key) and not key.startswith("hydra"):
-        if key == "experiment":
-            key = "+experiment"
-        elif not (folder / key).is_dir():  # the key is not a group
-            key = f"++{key}"
+    name = key.lstrip("+")
+    if value == "[]" and (name == "experiment" or (folder / name).is_dir()):
+        raise ConfigError(f"{name} must be a file of conf/{name}, or several, got []; leave it out for none")
+    if name == "experiment":
+        key = "+experiment"
+    elif re.fullmatch(r"(?!hydra)[A-Za-z][\w.]*", key) and not (folder / key).is_dir():  # the key is not a group
+        key = f"++{key}"
     return f"{key}={value}"
 
 

@@ -26,6 +26,16 @@ from hgn.system.files import is_replaceable
 T = TypeVar("T")
 # of terminals and text direction, and halves of characters, except those that stand for bytes of file names
 _CONTROL = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069\ud800-\udc7f\udd00-\udfff]")
+# digits after the colon of an address are a port, and a space begins words; passwords may have spaces, slashes and @
+_COLON, _MOST = r":(?=\S)(?!\d+(?:[\s/?#,;)'\"]|$))", "{1,2000}"
+_USER = rf"[^/\s?#]{_MOST}|[^/:@'\"]{_MOST}{_COLON}(?:(?!://)[^@]){_MOST}|[^\s/:@]{_MOST}{_COLON}[^\s@]{_MOST}"
+_SECRET = r"(?:sig|token|secret|pass|pwd|cred|auth|jwt)[\w.-]*|key(?:_?id)?|code"
+_SECRETS = (  # patterns, and what stays of each: users of URLs and of addresses without a scheme, and signatures
+    (rf"(\w://)(?:{_USER})?@", r"\1"),
+    (rf"((?:^|['\"=])(?![\w+]+://))[^\s'\"/:@]{_MOST}:(?![\s/])[^'\"@]{_MOST}@(?=[\w\[])", r"\1"),
+    (rf"(?<![\w@.])[\w.+-]{_MOST}:[^\s@/:]{_MOST}@(?=[\w\[])", ""),
+    (rf"(?i)([?&;#][\w.-]{{0,99}}?(?:{_SECRET}))=[^&\s'\"#;]*", r"\1=…"),
+)
 # the owner's path, and the value's own name or index; joined for messages
 _Path = str | tuple[Any, str | int]
 
@@ -90,8 +100,9 @@ class ConfigError(ValueError):
 
 
 def printable(text: str) -> str:
-    """Returns a text for terminals and pages: without users and passwords in its URLs, control characters escaped."""
-    text = re.sub(r"(\w://)([^/\s?#]*|[^\s/:@]+:(?!\d+[/?#])[^\s@]*)@", r"\1", text)
+    """Returns a text for terminals and pages: no users, passwords and signatures of URLs, no control characters."""
+    for pattern, kept in _SECRETS:
+        text = re.sub(pattern, kept, text)
     return "".join(c if c.isprintable() or c == "\n" else repr(c)[1:-1] for c in text)
 
 

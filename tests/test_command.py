@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -92,18 +93,31 @@ def test_loops_of_defaults(tmp_path, command):
     assert (code, error) == (2, "error: defaults must not lead back to the same file, got a loop of them\n")
 
 
-def test_full_disk_of_the_output():
-    """The end of a command whose output cannot be written is a line too."""
-    program = "from hgn.command import run_command; run_command(lambda _: print(1) or 0, 'rollout')"
+@pytest.mark.parametrize(
+    ("streams", "main", "code"),
+    [
+        (["stdout"], "print(1)", 1),
+        (["stderr"], "print(1, file=sys.stderr, flush=True)", 0),
+        (["stderr"], "print(1, file=sys.stderr) or 3", 3),
+        (["stderr"], "require(False, 'a', 'b', 1)", 2),
+        (["stderr"], "bar('x', total=1, unit='y').close()", 0),
+        (["stderr"], "warnings.warn('x')", 0),
+        (["stdout", "stderr"], "print(1)", 1),
+    ],
+)
+def test_full_disk_of_the_output(streams, main, code):
+    """The end of a command whose output cannot be written is a line too; lost messages change no exit code."""
+    program = (
+        "import sys, warnings; from hgn.command import run_command, require; from hgn.system.progress import bar\n"
+    )
+    program += f"run_command(lambda _: {main}, 'rollout')"
     with Path("/dev/full").open("w") as full:
         environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[1])}
-        command = [sys.executable, "-c", program]
-        done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, env=environment, check=False)
-    assert (
-        done.returncode == 1
-        and done.stderr.lower().startswith("error: no space left on")
-        and done.stderr.count("\n") == 1
-    )
+        given: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE} | dict.fromkeys(streams, full)
+        done = subprocess.run([sys.executable, "-c", program], text=True, env=environment, check=False, **given)
+    assert done.returncode == code and not done.stdout
+    if "stderr" not in streams:
+        assert done.stderr.lower().startswith("error: no space left on") and done.stderr.count("\n") == 1
 
 
 @pytest.mark.parametrize(
@@ -157,6 +171,9 @@ def test_groups_and_included_files(tmp_path, command):
         (["--config-name"], "got argument --config-name/-cn: expected one argument"),
         (["--resolve=3"], "got argument --resolve: ignored explicit argument '3'"),
         (["frames=3", "--cfg", "job", "seed=4"], "settings must stand together, got seed=4 apart from them"),
+        (["hydra.job.env_copy=[NONE]"], "as Hydra reads them, got hydra.job.env_copy=[NONE] (KeyError: 'NONE')"),
+        (["hydra.searchpath=[file:///none]"], "path=/none is not available"),
+        (["--experimental-rerun=x"], "Experimental rerun CLI option, other command line args are ignored"),
         (["--cfg", "job", "--package", "none"], "package 'none' not found in config"),
     ],
 )

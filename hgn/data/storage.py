@@ -21,7 +21,7 @@ from io import BufferedRandom
 from pathlib import Path
 from typing import Any, TypeVar
 from urllib.parse import urlsplit
-from urllib.request import getproxies, proxy_bypass
+from urllib.request import getproxies, proxy_bypass_environment
 
 from hgn.data.shard_cache import CachedShard, cached_shard
 from hgn.data.verification import StorageError, verify_file
@@ -113,14 +113,33 @@ def open_storage(folder: Path | str) -> Storage:
     return _Folder(local_folder(folder))
 
 
-def _use_proxies(host: str) -> None:
-    """Adds the scheme that aiohttp requires to proxies of the environment. Raises: ConfigError for other proxies."""
-    for kind, given in () if proxy_bypass(host) else getproxies().items():
-        proxy = given.strip() if "://" in given else f"http://{given.strip()}"
-        if kind in ("http", "https") and given.strip():
-            fits = _PROXY.fullmatch(proxy) is not None
-            require(fits, f"{kind}_proxy", "as http://host:port", proxy, "or set no_proxy")
+def _uses_proxies(url: str) -> bool:
+    """Returns whether a URL is read through a proxy of the environment, if there is one, and prepares it for aiohttp.
+
+    aiohttp requires a scheme, and knows neither all_proxy nor networks in no_proxy. Raises: ConfigError.
+    """
+    address, given = urlsplit(url), getproxies()
+    others = re.split(r"[\s,;]+", given.get("no", ""))
+    names = ",".join(name.removeprefix("*") or name for name in others)
+    direct = proxy_bypass_environment(address.netloc.rpartition("@")[2], {"no": names})
+    if _is_loopback(url) or direct or any(_lies_in(address.hostname or "", name) for name in others):
+        return False
+    for kind in ("http", "https"):
+        proxy = (given.get(kind) or given.get("all", "")).strip()
+        if proxy:
+            proxy = proxy if "://" in proxy else f"http://{proxy}"
+            fits, name = _PROXY.fullmatch(proxy) is not None, f"{kind if given.get(kind) else 'all'}_proxy"
+            require(fits, name, "as http://host:port", proxy, "or set no_proxy")
             os.environ[f"{kind}_proxy"] = proxy
+    return True
+
+
+def _lies_in(host: str, network: str) -> bool:
+    """Returns whether an address lies in a network such as 10.0.0.0/8."""
+    try:
+        return ipaddress.ip_address(host) in ipaddress.ip_network(network, strict=False)
+    except ValueError:  # a name
+        return False
 
 
 def _require_address(url: str) -> None:
@@ -228,10 +247,8 @@ class _Remote(Storage):
                 "timeout": timeout,
                 "auto_decompress": False,
                 "response_class": BoundedResponse,
-                "trust_env": not _is_loopback(address),  # http_proxy, https_proxy, no_proxy
+                "trust_env": _uses_proxies(address),
             }
-            if client["trust_env"]:
-                _use_proxies(urlsplit(address).netloc)
             options = {"client_kwargs": client, "use_listings_cache": False}
         try:
             self._files, self._root = fsspec.core.url_to_fs(address, **options)

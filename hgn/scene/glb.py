@@ -21,7 +21,8 @@ from scipy.spatial.transform import Rotation
 from hgn.system.claims import Claims
 
 INSTANCES = "EXT_mesh_gpu_instancing"
-READ = (INSTANCES, "KHR_mesh_quantization")  # extensions that change geometry
+VISIBILITY = "KHR_node_visibility"
+READ = (INSTANCES, VISIBILITY, "KHR_mesh_quantization")  # extensions that change geometry
 NEUTRAL = re.compile(r"[A-Z]+_(materials|texture|lights|xmp|animation|audio)\w*")  # extensions that do not
 TRIANGLES, STRIP, FAN = 4, 5, 6  # modes of primitives; the other modes are points and lines
 COPIES = 3  # of vertices and triangles, that the search for closed bodies makes
@@ -96,6 +97,8 @@ class _File:
             if index in visited:
                 raise ValueError(f"node {index} has two parents")
             visited.add(index)
+            if not node.get("extensions", {}).get(VISIBILITY, {}).get("visible", True):
+                continue  # its children are invisible too
             if "matrix" in node:
                 own_44 = np.reshape(np.array(node["matrix"], np.float64), (4, 4)).T
             else:

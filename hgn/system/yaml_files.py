@@ -71,7 +71,7 @@ class _Loader(yaml.SafeLoader):
         if count_items(node, _parts) > MAXIMUM_NODES:
             raise ValueError(f"its aliases expand to more than {MAXIMUM_NODES} values")
         if node is not None:
-            _check(node, "", set())
+            _check(node, "", set(), self)
         return node
 
 
@@ -81,26 +81,26 @@ def _parts(node: Any) -> Any:
     return node.value if isinstance(node, yaml.SequenceNode) else None
 
 
-def _check(node: yaml.Node, name: str, visited: set[int]) -> None:
-    """Refuses repeated keys, and numbers that YAML 1.1 reads in other bases. Raises ValueError."""
+def _check(node: yaml.Node, name: str, visited: set[int], loader: _Loader) -> None:
+    """Refuses keys repeated in any spelling, and numbers that YAML 1.1 reads in other bases. Raises ValueError."""
     if id(node) in visited:
         return
     visited.add(id(node))
     line = node.start_mark.line + 1
     if isinstance(node, yaml.MappingNode):
-        lines: dict[str, int] = {}
-        for key, value in node.value:
-            word = str(key.value)
-            _check(key, word, visited)
-            if word in lines:
-                raise ValueError(
-                    f"line {key.start_mark.line + 1}: the key {word} is given twice, first in line {lines[word]}"
-                )
-            lines[word] = key.start_mark.line + 1
-            _check(value, word, visited)
+        lines: dict[Any, int] = {}
+        for key, item in node.value:
+            word, at = str(key.value), key.start_mark.line + 1
+            _check(key, word, visited, loader)
+            plain = isinstance(key, yaml.ScalarNode) and not key.tag.endswith(":merge")
+            value = loader.construct_object(key) if plain else key.tag
+            if first := lines.get(word, lines.get(value)):
+                raise ValueError(f"line {at}: the key {word} is given twice, first in line {first}")
+            lines[word] = lines[value] = at
+            _check(item, word, visited, loader)
     elif isinstance(node, yaml.SequenceNode):
         for item in node.value:
-            _check(item, name, visited)
+            _check(item, name, visited, loader)
     elif node.tag.endswith((":int", ":float")):
         if _OCTAL.fullmatch(node.value):
             remedy = f"write {node.value.replace('0', '', 1)[:40]}, or {int(node.value.replace('_', '')[:20], 8)}"

@@ -22,6 +22,7 @@ RUN_VARIABLE = "HGN_RUN"  # environment variable with the run's name or folder
 MESSAGE_MB = 4  # size of a message: gradients of the last layers are sent while those of the first layers are computed
 _RANKS = {"RANK": "WORLD_SIZE", "LOCAL_RANK": "LOCAL_WORLD_SIZE", "SLURM_PROCID": "SLURM_NTASKS"}
 _COUNTS = (*_RANKS.values(), "SLURM_NNODES")
+_MPI_COUNTS = ("OMPI_COMM_WORLD_SIZE", "PMI_SIZE", "MV2_COMM_WORLD_SIZE", "MPI_LOCALNRANKS")  # of mpirun
 _RANDOM_ID = re.compile(r"[0-9a-f]{8}(-[0-9a-f]{4}){3}-[0-9a-f]{12}")
 
 
@@ -160,6 +161,11 @@ def _check_launcher() -> None:
             f"training must be started with srun in a job of {os.environ['SLURM_NTASKS']} tasks, got one "
             "process without; as in srun python -m hgn.train, or sbatch --ntasks=1"
         )
+    elif not started_by_srun():
+        for name in _MPI_COUNTS:
+            rule = "1 without torchrun's variables: each process would train on its own in one folder"
+            count = os.environ.get(name, "1")
+            require(count == "1", name, rule, count, "start with torchrun or srun instead of mpirun")
 
 
 def started_by_srun() -> bool:

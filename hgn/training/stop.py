@@ -5,6 +5,7 @@ A signal sets a flag. The loop ends at the next update, after a checkpoint. A se
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 import time
@@ -53,5 +54,6 @@ class StopRequest:
         if self.signal is not None and number == signal.SIGINT:
             raise KeyboardInterrupt
         if self.signal is None and first_rank():
-            os.write(2, STOPPING)  # a handler may interrupt a write to sys.stderr, which must not be entered again
+            with contextlib.suppress(OSError):  # the disk is full, or the terminal is closed
+                os.write(2, STOPPING)  # a handler may interrupt a write to sys.stderr, which must not be entered again
         self.signal = max(self.signal or number, number, key=BY_WEIGHT.index)

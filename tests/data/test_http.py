@@ -89,8 +89,9 @@ def test_proxy_that_remembers():
         assert open_storage(url).read("index", 5, 9) == b"5678"
 
 
-def test_proxies_are_honoured(monkeypatch):
-    """http_proxy serves data of other machines, but not of this one or of hosts in no_proxy."""
+@pytest.mark.parametrize("variable", ["http_proxy", "ALL_PROXY"])
+def test_proxies_are_honoured(monkeypatch, variable):
+    """http_proxy serves data of other machines, but not of this one or of hosts and networks in no_proxy."""
     asked = []
 
     class Proxy(Quiet, http.server.BaseHTTPRequestHandler):
@@ -102,13 +103,22 @@ def test_proxies_are_honoured(monkeypatch):
             self.wfile.write(b"hello")
 
     with answering(Proxy) as address:
-        for name in ("http_proxy", "HTTP_PROXY"):
-            monkeypatch.setenv(name, address)
-        monkeypatch.setenv("no_proxy", "excepted.example")
+        for name in ("http_proxy", "HTTP_PROXY", "https_proxy"):
+            monkeypatch.delenv(name, raising=False)
+        monkeypatch.setenv(variable, address.removeprefix("http://"))
+        monkeypatch.setenv("no_proxy", "excepted.example, 10.0.0.0/8 *.own.example,fd00::/8")
+        for host in ("u:p@excepted.example:80", "10.200.3.4:80", "a.b.own.example", "[fd00:1::2]:80"):
+            assert not hgn.data.storage._uses_proxies(f"http://{host}/set")
         hgn.data.storage._remote.cache_clear()
         for url in ("http://data.example:9", address):
             assert open_storage(f"{url}/set").read("manifest.json", 0, 5) == b"hello"
     assert asked == ["http://data.example:9/set/manifest.json", "/set/manifest.json"]
+    monkeypatch.delenv("http_proxy")
+    monkeypatch.setenv(variable, "socks5://127.0.0.1:1")
+    with pytest.raises(
+        ConfigError, match=f"{variable.lower()} must be as http://host:port, got 'socks5://127.0.0.1:1'"
+    ):
+        hgn.data.storage._uses_proxies("http://11.0.0.1/set")
 
 
 def test_server_without_ranges(folder, monkeypatch):

@@ -5,6 +5,7 @@ import errno
 import functools
 import hashlib
 import os
+import stat
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -15,6 +16,7 @@ from data.test_http import PlainFiles, answering
 from training.runs import train_mapping
 
 from datagen import upload
+from datagen.pool.locks import ShardLocks
 from hgn import evaluate, export, rollout, train
 from hgn.data import shard_cache
 from hgn.data.index import ListedIndex
@@ -127,6 +129,20 @@ def test_malformed_bodies_end(data, monkeypatch, content, pause_s):
         ("https://me:pa/ss#w@host/x s3://KEY:se/cret@b/x http://h:80/a@b", "https://host/x s3://b/x http://h:80/a@b"),
         ("hf://datasets/a@main/b", "hf://datasets/a@main/b"),
         ("a@b.c file:///x@y http://h/p@q", "a@b.c file:///x@y http://h/p@q"),
+        (
+            "http://user:se cret@h/a, 'http://u r:se\ncret@h:80/a', http://u:12a b@h",
+            "http://h/a, 'http://h:80/a', http://h",
+        ),
+        ("user:secret@h/a //u:secret@h http:/u:secret@h 'me:se cret@h'", "h/a //h http:/h 'h'"),
+        (
+            "http://h:80 fails: a@b (x@y), keys: a, b@c; x.yaml: a@b",
+            "http://h:80 fails: a@b (x@y), keys: a, b@c; x.yaml: a@b",
+        ),
+        (
+            "http://h/a?X-Amz-Signature=s&n=1&sig=s 'http://h?AWSAccessKeyId=s#token=s'",
+            "http://h/a?X-Amz-Signature=…&n=1&sig=… 'http://h?AWSAccessKeyId=…#token=…'",
+        ),
+        ("http://h/a?frames=3&keyframes=4", "http://h/a?frames=3&keyframes=4"),
         ("\x1b]0;title\x07\x9b31m\u202egpj.\r\udc80", r"\x1b]0;title\x07\x9b31m\u202egpj.\r\udc80"),
         ("two\nlines of ü 日本 🙂", "two\nlines of ü 日本 🙂"),
     ],
@@ -215,6 +231,16 @@ def test_a_deleted_lock_file_locks(tmp_path):
             pass
     with locked(path, "run", "no;"):
         pass
+
+
+@pytest.mark.parametrize("make", [os.mkfifo, Path.mkdir, lambda path: os.mknod(path, stat.S_IFSOCK)])
+def test_locks_that_are_no_files(tmp_path, monkeypatch, make):
+    """A pipe, a folder or a socket in the place of a lock is refused, where opening it would wait for ever."""
+    monkeypatch.chdir(tmp_path)
+    make(Path(".lock"))
+    for lock in (lambda: locked(Path(".lock"), "run", "no;").__enter__(), lambda: ShardLocks(Path())):
+        with pytest.raises(ConfigError, match=r"\.lock must be a file, got 'another object'; delete it"):
+            lock()
 
 
 def test_interleaved_members_of_an_archive(tmp_path):

@@ -107,6 +107,18 @@ def test_nodes_in_nodes(tmp_path):
     assert body.vertex_V3.min(0).tolist() == [12, 0, 0] and body.vertex_V3.max(0).tolist() == [14, 2, 2]
 
 
+@pytest.mark.parametrize(("visible", "shown"), [(True, 3), (False, 1), (None, 3)])
+@pytest.mark.parametrize("required", [True, False])
+def test_invisible_nodes(tmp_path, visible, shown, required):
+    """Nodes that are not visible are no obstacles, and neither are their children and instances."""
+    file, name = Glb(), "KHR_node_visibility"
+    file.cube()
+    file.cube(translation=[5, 0, 0], extensions={name: {} if visible is None else {"visible": visible}}, children=[2])
+    file.cube(translation=[0, 5, 0])
+    path = file.save(tmp_path / "a.glb", extensionsUsed=[name], extensionsRequired=[name] * required)
+    assert volume_of(load_bodies(path)) == pytest.approx(shown)
+
+
 @pytest.mark.parametrize("dtype", [np.int8, np.uint8, np.int16, np.uint16])
 def test_quantised_positions(tmp_path, dtype):
     """Integers that stand for fractions, and integers that are what they are."""

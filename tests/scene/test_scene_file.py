@@ -184,6 +184,11 @@ MISTAKES = [
     (ONE_CUBE.replace("size: 0.05", "size: 0.05, size: 0.1"), "line 2: the key size is given twice, first in line 2"),
     ("\ufeff" + ONE_CUBE.replace("\n", "\r\n") + "seed: 1\r\nseed: 2\r\n", "line 4: the key seed is given twice"),
     ("gravity: [0, 0, 0]\n'gravity': [0, -9.8, 0]\n" + ONE_CUBE, "line 2: the key gravity is given twice"),
+    *(
+        (ONE_CUBE + f"{one}: 1\n{other}: 1\n", f"line 4: the key {other} is given twice, first in line 3")
+        for one, other in (("~", "null"), ("1", "0x1"), ("yes", "true"), ("1e1", "10"), ("0", "-0"), (".nan", ".NaN"))
+    ),
+    (ONE_CUBE + "<<: {seed: 1}\n!!merge x: {seed: 2}\n", "line 4: the key x is given twice, first in line 3"),
     (ONE_CUBE + "seed: 010\n", "line 3: seed: 010 is an octal number in YAML; write 10, or 8"),
     (ONE_CUBE + "cell_size: 00_17\n", "line 3: cell_size: 00_17 is an octal number"),
     (ONE_CUBE + "gravity:\n- 0\n- -9:30\n- 0\n", "line 5: gravity: -9:30 is a number of base 60 in YAML"),

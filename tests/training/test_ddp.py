@@ -34,7 +34,7 @@ LAUNCHER_VARIABLES = (
     *("HGN_RUN", "RANK", "WORLD_SIZE", "LOCAL_RANK", "LOCAL_WORLD_SIZE", "NODE_RANK", "TORCHELASTIC_RUN_ID"),
     *("TORCHELASTIC_USE_AGENT_STORE", "TORCHELASTIC_MAX_RESTARTS", "TORCH_DISABLE_SHARE_RDZV_TCP_STORE"),
     *("SLURM_PROCID", "SLURM_NTASKS", "SLURM_NNODES", "SLURM_JOB_NAME", "SLURM_JOB_ID"),
-    *("SLURM_STEP_ID", "SLURM_STEP_NUM_TASKS"),
+    *("SLURM_STEP_ID", "SLURM_STEP_NUM_TASKS", "OMPI_COMM_WORLD_SIZE", "PMI_SIZE"),
 )
 
 
@@ -264,6 +264,7 @@ def test_what_a_launcher_says(no_launcher, variables, first, started, folder):
     assert (first_rank(), layout(TrainingConfig(device="cpu")), str(default_run("small"))) == (first, started, folder)
 
 
+MPI = ("OMPI_COMM_WORLD_SIZE", "PMI_SIZE")
 OTHERS = "devices must be the {} processes that the launcher started on each of {} machines"
 
 
@@ -286,6 +287,10 @@ OTHERS = "devices must be the {} processes that the launcher started on each of 
         ({"RANK": "1", "LOCAL_RANK": "1"}, "WORLD_SIZE must be set where RANK is"),
         ({"SLURM_PROCID": "0", "SLURM_NTASKS": "4"}, "must be started with srun in a job of 4 tasks"),
         ({**SLURM, "SLURM_STEP_NUM_TASKS": "1"}, "must be started with srun in a job of 8 tasks"),
+        *(({name: "4"}, rf"{name} must be 1 .*, got '4'; start with torchrun") for name in MPI),
+        *(({name: "1"}, (2, 1)) for name in MPI),
+        *((TORCHRUN | {name: "4"}, (2, 2)) for name in MPI),
+        ({"SLURM_STEP_ID": "0", "SLURM_PROCID": "0", "SLURM_NTASKS": "4", "PMI_SIZE": "4"}, (2, 2)),
         (RESTARTS, r"STORE must be 1 in torchrun's environment .*--max-restarts 3\), got nothing"),
     ],
 )
