@@ -21,7 +21,7 @@ from io import BufferedRandom
 from pathlib import Path
 from typing import Any, TypeVar
 from urllib.parse import urlsplit
-from urllib.request import getproxies, proxy_bypass_environment
+from urllib.request import getproxies, proxy_bypass_environment  # type: ignore[attr-defined]
 
 from hgn.data.shard_cache import CachedShard, cached_shard
 from hgn.data.verification import StorageError, verify_file
