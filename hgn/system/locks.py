@@ -6,7 +6,6 @@ import contextlib
 import errno
 import fcntl
 import os
-import stat
 import struct
 from collections.abc import Iterator
 from pathlib import Path
@@ -43,25 +42,6 @@ def lock_bytes(file: int, kind: int, start: int, length: int = 1, wait: bool = F
     return True
 
 
-def open_lock(path: Path, access: int = os.O_RDWR) -> int:
-    """Opens a file for its locks, and creates it. Returns the descriptor. Opening a pipe to write might not end.
-
-    Raises: OSError; ConfigError for an object that is no file.
-    """
-    with contextlib.ExitStack() as stack:
-        try:
-            file = os.open(path, access | os.O_CREAT | os.O_CLOEXEC | os.O_NONBLOCK, 0o644)
-            stack.callback(os.close, file)
-            regular = stat.S_ISREG(os.fstat(file).st_mode)
-        except OSError as error:
-            if error.errno not in (errno.EISDIR, errno.ENXIO):  # of folders; of pipes without a reader, and sockets
-                raise
-            regular = False
-        require(regular, str(path), "a file", "another object", "delete it")
-        stack.pop_all()
-        return file
-
-
 @contextlib.contextmanager
 def locked(path: Path, field: str, refusal: str) -> Iterator[None]:
     """Locks a file for this process, and its folder too, because another user may delete the file.
@@ -71,9 +51,13 @@ def locked(path: Path, field: str, refusal: str) -> Iterator[None]:
     """
     make_folder(path.parent)
     with contextlib.ExitStack() as stack:
-        stack.callback(os.close, file := open_lock(path, os.O_WRONLY | os.O_APPEND))
-        stack.callback(os.close, folder := os.open(path.parent, os.O_RDONLY))
-        for opened in (file, folder):
+        for name, access in ((path, os.O_WRONLY | os.O_APPEND | os.O_CREAT), (path.parent, os.O_RDONLY)):
+            try:
+                opened = os.open(name, access | os.O_NONBLOCK, 0o644)  # a pipe without a reader would not open
+            except OSError as error:
+                require(error.errno not in (errno.EISDIR, errno.ENXIO), str(path), "a file", "no file", "delete it")
+                raise
+            stack.callback(os.close, opened)
             try:
                 free = lock_file(opened)
             except OSError as error:
