@@ -17,6 +17,7 @@ import reprlib
 import types
 import typing
 from collections.abc import Callable, Iterable, Mapping
+from numbers import Integral
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
@@ -223,6 +224,13 @@ def require(rule_holds: bool, field: str, rule: str, value: object, remedy: str 
     if not rule_holds:
         remedy = remedy or value_remedy(field, value)
         raise ConfigError(f"{field} must be {rule}, got {_shown.repr(value)}" + (f"; {remedy}" if remedy else ""))
+
+
+def require_count(field: str, value: object, least: int) -> None:
+    """Raises ConfigError unless an argument is a whole number of at least `least`."""
+    whole = isinstance(value, Integral) and not isinstance(value, bool) and value < 2**63
+    require(whole, field, "a whole number", value)
+    require(value >= least, field, f"at least {least}", value)  # type: ignore[operator]
 
 
 def require_replaceable(field: str, *files: Path) -> None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from numbers import Real
 from typing import Any
 
 import numpy as np
@@ -30,7 +31,7 @@ from hgn.scene.motion import AT_REST
 from hgn.scene.obstacle_grid import ObstacleGrid, build_obstacle_grid
 from hgn.scene.own_physics import NOMINAL_P, input_parameters
 from hgn.scene.scene import Obstacle, Scene
-from hgn.schema import ConfigError, require
+from hgn.schema import require, require_count
 from hgn.step.reference import Accelerations, advanced
 
 
@@ -65,8 +66,9 @@ def simulate(
     The backward pass computes each frame again. Memory contains all states, and the intermediate results of one frame.
     The network's parameters get no gradients. Raises: ConfigError, DivergedError.
     """
-    require(frames >= 1, "frames", "at least 1", frames)
-    require(0 <= inputs.smoothing <= 1, "smoothing", "0 to 1 cells", inputs.smoothing)
+    require_count("frames", frames, 1)
+    smooth = isinstance(inputs.smoothing, Real) and 0 <= inputs.smoothing <= 1
+    require(smooth, "smoothing", "0 to 1 cells", inputs.smoothing)
     state = _started(network, start, scene, frame_rate_hz, inputs=inputs)
     moved = functools.partial(_in_motion, state, scene, inputs.poses or {}, frame_rate_hz=frame_rate_hz)
     state = moved(frame=0)
@@ -166,8 +168,7 @@ def _started(
     dtype = next(network.parameters()).dtype
 
     def given(name: str, value: torch.Tensor | None, default: np.ndarray, shape: tuple[int, ...]) -> torch.Tensor:
-        tensor = torch.as_tensor(default) if value is None else value
-        require(tuple(tensor.shape) == shape, name, f"of shape {shape}", tuple(tensor.shape))
+        tensor = torch.as_tensor(default) if value is None else _tensor(name, value, shape)
         return tensor.to(device, torch.float64)  # the simulator computes its history in float64 too
 
     require(
@@ -206,7 +207,7 @@ def _physics(
     known |= dict.fromkeys(INPUT_PARAMETERS, (count,)) if "parameters" in inputs else {}
     for name, tensor in given.items():
         require(name in known, "physics", f"of the network's inputs ({', '.join(known) or 'none'})", name)
-        require(tensor.shape == known[name], f"physics {name}", f"of shape {known[name]}", tuple(tensor.shape))
+        _tensor(f"physics {name}", tensor, known[name])
     if "wall_friction" in given:
         fields["wall_friction_S3"] = given["wall_friction"][None].to(start.domain_S3.device)
     if given.keys() - {"wall_friction"}:
@@ -225,7 +226,7 @@ def _obstacles(
     dtype = next(network.parameters()).dtype
     for number in poses:
         rule = f"0 to {len(scene.obstacles) - 1}" if scene.obstacles else "left out: the scene has no obstacles"
-        require(number in range(len(scene.obstacles)), "poses", rule, number)
+        require(isinstance(number, int) and 0 <= number < len(scene.obstacles), "poses", rule, number)
     if not poses and inputs.smoothing == 0:
         return start.obstacles, start.barriers
     staying = [obstacle for i, obstacle in enumerate(scene.obstacles) if i not in poses and obstacle.motion is None]
@@ -307,15 +308,23 @@ def _cells(scene: Scene, obstacles: list[Obstacle], device: torch.device) -> Obs
 
 def _placement(obstacle: Obstacle, pose: Pose, device: torch.device, dtype: torch.dtype) -> Placement:
     middle_3 = 0.5 * (obstacle.vertex_V3.min(axis=0) + obstacle.vertex_V3.max(axis=0))
-    pivot_3 = torch.as_tensor(middle_3 if pose.pivot_3 is None else pose.pivot_3)
+    pivot_3 = _tensor("poses pivot_3", torch.as_tensor(middle_3 if pose.pivot_3 is None else pose.pivot_3), (3,))
     parts = {}
-    for name in ("rotation_3", "translation_3"):
+    for name in ("rotation_3", "translation_3", "velocity_3"):
         value = getattr(pose, name)
-        parts[name] = torch.zeros(3, dtype=torch.float64) if value is None else value
-        if tuple(parts[name].shape) != (3,):
-            raise ConfigError(f"poses {name} must be of shape (3,), got {tuple(parts[name].shape)}")
+        parts[name] = torch.zeros(3, dtype=torch.float64) if value is None else _tensor(f"poses {name}", value, (3,))
     x, y, z = parts["rotation_3"].to(device, torch.float64).unbind()
     zero = torch.zeros_like(x)
     cross_33 = torch.stack([torch.stack(row) for row in ((zero, -z, y), (z, zero, -x), (-y, x, zero))])
     rotation_33 = torch.linalg.matrix_exp(cross_33)  # differentiable at angle 0 too
     return Placement(rotation_33.to(dtype), pivot_3.to(device, dtype), parts["translation_3"].to(device, dtype))
+
+
+def _tensor(name: str, value: Any, shape: tuple[int, ...]) -> torch.Tensor:
+    """Returns a tensor of a caller. Raises: ConfigError unless it has this shape and finite real numbers in memory."""
+    usable = isinstance(value, torch.Tensor) and value.layout == torch.strided
+    usable = usable and not (value.is_meta or value.is_complex())
+    require(usable, name, "a dense tensor of real numbers", type(value).__name__)
+    require(tuple(value.shape) == shape, name, f"of shape {shape}", tuple(value.shape))
+    require(bool(torch.isfinite(value).all()), name, "finite", "nan or inf")
+    return torch.as_tensor(value)

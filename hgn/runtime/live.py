@@ -18,10 +18,10 @@ from hgn.network.barriers import Barriers
 from hgn.network.features import ParticleState
 from hgn.runtime.divergence import DivergedError, diverged
 from hgn.runtime.simulation import joined, selected
-from hgn.runtime.simulator import InitialState, Simulator
+from hgn.runtime.simulator import InitialState, Simulator, initial_states
 from hgn.scene.barrier import Barrier
 from hgn.scene.scene import Scene
-from hgn.schema import require
+from hgn.schema import require, require_count
 
 
 class LiveSimulation:
@@ -40,11 +40,12 @@ class LiveSimulation:
         particles it captures its frame again, which takes about a second.
         Raises: ConfigError as `Simulator.start`.
         """
+        require(isinstance(simulator, Simulator), "simulator", "a Simulator", type(simulator).__name__)
+        require_count("capacity", capacity, 0)
         self.simulator = simulator
         given = [scenes] if isinstance(scenes, (InitialState, Scene)) else scenes
-        self.scenes = [InitialState.of(scene) for scene in given]
+        self.scenes = initial_states(given)
         self.ended: dict[int, DivergedError] = {}
-        require(len(self.scenes) > 0, "scenes", "at least one", 0)
         moving = simulator.moving(self.scenes, [0] * len(self.scenes))
         state = replace(self._started(self.scenes), obstacles=simulator.obstacles(self.scenes), moving=moving)
         clearance = simulator.network.step.obstacle_clearance
@@ -70,6 +71,7 @@ class LiveSimulation:
 
     @frame.setter
     def frame(self, frame: int) -> None:
+        require_count("frame", frame, 0)
         self.simulation.frame = frame
 
     @property
@@ -120,17 +122,9 @@ class LiveSimulation:
         """
         self._require_scene(index)
         require(index not in self.ended, "index", "of a scene in progress", index, remedy="reset it")
-        count = len(position_A3) if np.ndim(position_A3) else 0
-        for name, value, shape in (
-            ("position_A3", position_A3, (count, 3)),
-            ("velocity_A3", velocity_A3, (count, 3)),
-            ("material_A", material_A, (count,)),
-        ):
-            require(isinstance(value, np.ndarray), name, "a NumPy array", type(value).__name__)
-            require(value.dtype.kind in "iuf", name, "of real numbers", str(value.dtype))
-            require(value.shape == shape, name, f"of shape {shape}", value.shape)
-            unusable = np.asarray(value)[~np.isfinite(value)]
-            require(not len(unusable), name, "finite", float(unusable[0]) if len(unusable) else 0.0)
+        count = len(_array("position_A3", position_A3, (None, 3)))
+        _array("velocity_A3", velocity_A3, (count, 3))
+        _array("material_A", material_A, (count,))
         require(material_A.dtype.kind in "iu", "material_A", "whole numbers", str(material_A.dtype))
         arrays: dict[str, Any] = {"position_N3": position_A3, "velocity_N3": velocity_A3, "material_N": material_A}
         new = self._started([replace(self.scenes[index], **arrays, past_HN3=None, parameters=None, body_N=None)])
@@ -164,10 +158,9 @@ class LiveSimulation:
         self._require_scene(index)
         state = self.state
         mine_N = state.scene_N == index
-        shape = np.shape(position_N3)
-        require(len(shape) == 2 and shape[1] == 3, "position_N3", "of shape (any, 3)", shape)
-        count, expected = len(position_N3), (len(position_N3), *state.velocity_NM3.shape[1:])
-        require(np.shape(velocity_NM3) == expected, "velocity_NM3", f"of shape {expected}", np.shape(velocity_NM3))
+        require_count("frame", frame, 0)
+        count = len(_array("position_N3", position_N3, (None, 3)))
+        _array("velocity_NM3", velocity_NM3, (count, *state.velocity_NM3.shape[1:]))
         most = int(mine_N.sum())
         require(count <= most, "position_N3", f"at most {most} particles", count)
         device = self.simulator.device
@@ -249,6 +242,17 @@ class LiveSimulation:
     def _joined(self, barriers: Sequence[Barrier]) -> Barriers | None:
         joined = Barriers.of(barriers)
         return joined and joined.to(self.simulator.device)
+
+
+def _array(name: str, value: Any, shape: tuple[int | None, ...]) -> np.ndarray:
+    """Returns an array of a caller. Raises: ConfigError unless it has finite real numbers and the shape."""
+    require(isinstance(value, np.ndarray), name, "a NumPy array", type(value).__name__)
+    require(value.dtype.kind in "iuf", name, "of real numbers", str(value.dtype))
+    fits = value.ndim == len(shape) and all(n in (None, own) for n, own in zip(shape, value.shape, strict=True))
+    require(fits, name, f"of shape {shape}".replace("None", "any"), value.shape)
+    unusable = value[~np.isfinite(value)]
+    require(not len(unusable), name, "finite", float(unusable[0]) if len(unusable) else 0.0)
+    return np.asarray(value)
 
 
 def _solid(scene: InitialState) -> tuple[Any, ...]:

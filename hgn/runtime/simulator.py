@@ -8,7 +8,7 @@ from __future__ import annotations
 import functools
 import math
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from numbers import Real
 from pathlib import Path
@@ -42,7 +42,7 @@ from hgn.scene.obstacle_grid import ObstacleGrid, build_obstacle_grid
 from hgn.scene.own_physics import input_parameters
 from hgn.scene.rest_shape import body_numbers, rest_neighbours
 from hgn.scene.scene import Scene, all_corners, require_particles, whole_cells
-from hgn.schema import require
+from hgn.schema import require, require_count
 from hgn.system.device import choose_device
 
 LARGEST_GRAVITY = 98.0  # largest supported gravity, domain units per second squared
@@ -73,9 +73,10 @@ class InitialState:
 
     def __post_init__(self) -> None:
         require_particles(self.position_N3, self.velocity_N3, self.material_N, self.materials)
-        for name in ("gravity", "domain_size"):
+        for name, least in (("gravity", -1e9), ("domain_size", 0)):
             value = getattr(self, name)
-            require(np.shape(value) == (3,) and all(isinstance(x, Real) for x in value), name, "three numbers", value)
+            fits = np.shape(value) == (3,) and all(isinstance(x, Real) and least <= x <= 1e9 for x in value)
+            require(fits, name, "three numbers of at most 1e9", value)
 
     @staticmethod
     def of_episode(episode: Episode) -> InitialState:
@@ -200,7 +201,7 @@ class Simulator:
         also raised for obstacle cells of another size and for an unsupported gravity. Absolute inputs support only the
         gravity of their data; relative inputs support up to LARGEST_GRAVITY.
         """
-        config, states = self.network.config, _initial(scenes)
+        config, states = self.network.config, initial_states(scenes)
         for state in states:
             self.require_fits(state)
         gravity_S3 = np.array([state.gravity for state in states], np.float64).reshape(-1, 3) / self.frame_rate_hz**2
@@ -265,8 +266,8 @@ class Simulator:
 
         With `isolate` a diverged scene is NaN from that frame, and the others continue.
         """
-        require(frames >= 1, "frames", "at least 1", frames)
-        states = _initial(scenes)
+        require_count("frames", frames, 1)
+        states = initial_states(scenes)
         entries = [entry for entry in self._entries(states) if entry.frame < frames]
         state = self.start(states)
         scene_N = torch.cat([state.scene_N, *(entry.state.scene_N for entry in entries)]).cpu().numpy()
@@ -285,7 +286,8 @@ class Simulator:
         Backend triton computes some frames ahead. Several scenes may be simulated at the same time by separate calls.
         Raises: ConfigError with the first frame; DivergedError after the last good frame.
         """
-        states = _initial([scene])
+        require_count("count", count, 1)
+        states = initial_states([scene])
         entries = self._entries(states)
         state = self.start(states)
         yield state.position_N3.cpu().numpy()
@@ -344,6 +346,8 @@ class Simulator:
         Raises: ConfigError and DivergedError as `rollout`.
         """
         require(isinstance(scene, Scene), "scene", "a Scene", type(scene).__name__)
+        posed = isinstance(poses, Mapping | None) and all(isinstance(pose, Pose) for pose in (poses or {}).values())
+        require(posed, "poses", "a Pose by the number of its obstacle", poses)
         inputs = Inputs(position_N3, velocity_N3, gravity_3, domain_size_3, poses=poses, smoothing=smoothing)
         inputs = replace(inputs, physics=physics)
         scene = with_velocities(scene, poses or {})
@@ -374,8 +378,10 @@ class Simulator:
             require(cell_size == info.obstacle_cell_size, "cell_size", rule, cell_size)
 
 
-def _initial(scenes: Sequence[InitialState | Scene]) -> list[InitialState]:
-    alone = isinstance(scenes, (InitialState, Scene))
+def initial_states(scenes: Sequence[InitialState | Scene]) -> list[InitialState]:
+    """Returns the initial states of a list of scenes. Raises: ConfigError for another type, and for none."""
     example = "as in rollout([scene], frames)"
-    require(not alone, "scenes", "a list of them", type(scenes).__name__, remedy=example)
-    return [InitialState.of(scene) for scene in scenes]
+    require(isinstance(scenes, Iterable), "scenes", "a list of them", type(scenes).__name__, remedy=example)
+    states = [InitialState.of(scene) for scene in scenes]
+    require(len(states) > 0, "scenes", "at least one", 0)
+    return states

@@ -198,6 +198,20 @@ def test_normals_turn_with_their_obstacle():
     ("options", "message"),
     [
         ({"frames": 0}, "frames must be at least 1, got 0"),
+        *(({"frames": frames}, "frames must be a whole number, got") for frames in ("2", 2.0, None, torch.tensor(2))),
+        ({"smoothing": "x"}, "smoothing must be 0 to 1 cells, got 'x'"),
+        *(
+            (
+                {"position_N3": value},
+                f"position_N3 must be a dense tensor of real numbers, got '{type(value).__name__}'",
+            )
+            for value in ("x", np.zeros((12, 3)), [], torch.zeros((12, 3), device="meta"), torch.zeros((12, 3)) * 1j)
+        ),
+        ({"velocity_N3": torch.full((12, 3), torch.nan)}, "velocity_N3 must be finite, got 'nan or inf'"),
+        ({"poses": {0: Pose(pivot_3=(0.0, 0.0, torch.inf))}}, "poses pivot_3 must be finite"),
+        ({"poses": {0: Pose(translation_3=(0, 0, 1))}}, "poses translation_3 must be a dense tensor of real numbers"),
+        *(({"poses": poses}, "poses must be a Pose by the number") for poses in ("x", [Pose()], {0: None})),
+        ({"poses": {0.0: Pose()}}, "poses must be 0 to 1, got 0.0"),
         ({"smoothing": 1.5}, "smoothing must be 0 to 1 cells, got 1.5"),
         ({"gravity_3": torch.zeros(3)}, "gravity_3 must be left out for a network of absolute inputs"),
         ({"position_N3": torch.zeros(3)}, r"position_N3 must be of shape \(12, 3\), got \(3,\)"),
