@@ -16,7 +16,7 @@ from hgn.config import MpmConfig, require_rollout_name
 from hgn.scene.emission import entry_frames
 from hgn.scene.rollout_file import Rollout, rollout_bytes, write_rollout
 from hgn.scene.scene_file import find_scene, load_scene, notes_on_files
-from hgn.schema import ConfigError, FrameCount, Positive, from_mapping, require_bounds, require_replaceable, to_mapping
+from hgn.schema import ConfigError, FrameCount, FrameRate, from_mapping, require_bounds, require_replaceable, to_mapping
 from hgn.system.files import require_place, space_reserved
 from hgn.system.progress import bar
 
@@ -28,7 +28,7 @@ class SolveConfig:
     scene: str  # a scene file, or the name of one in conf/example, for example funnel
     out: str | None = None  # the file to write; null: rollout/NAME_solver.vtkhdf
     frames: FrameCount = 300  # frame 0 is the initial state
-    frame_rate_hz: Positive[float] = 60.0  # frames per simulated second
+    frame_rate_hz: FrameRate = 60.0  # frames per simulated second
     mpm: MpmConfig = field(default_factory=MpmConfig)
 
     def __post_init__(self) -> None:

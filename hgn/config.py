@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
-from hgn.scene.kinds import require_funnel, require_kinds
+from hgn.scene.kinds import require_few_cells, require_funnel, require_kinds
 from hgn.scene.material import MATERIAL_NAME, MATERIALS, OWN_PHYSICS, PAPER_MATERIALS
 from hgn.schema import (
     AtMostOne,
@@ -24,6 +24,7 @@ from hgn.schema import (
     FolderName,
     Fraction,
     FrameCount,
+    FrameRate,
     LayerSize,
     NonNegative,
     OneOrMore,
@@ -201,7 +202,7 @@ class DatasetConfig:
     frames: FrameCount = 300  # number of frames of an episode; frame 0 is the initial state
     long_fraction: Fraction[float] = 0.0  # fraction of each split's episodes, evenly distributed, with long_frames
     long_frames: FrameCount = 300  # number of frames of a long episode
-    frame_rate_hz: Positive[float] = 60.0  # frames per simulated second
+    frame_rate_hz: FrameRate = 60.0  # frames per simulated second
     # cells per domain unit of a finer grid for simulation, with more particles; episodes contain only particles of the
     # grid of scene.cell_size; null: no finer grid
     reference_cells: OneOrMore | None = None
@@ -254,6 +255,7 @@ class DatagenConfig:
     dataset: DatasetConfig = field(default_factory=DatasetConfig)
 
     def __post_init__(self) -> None:
+        require_few_cells(self.scene.domain_size, self.reference_cell_size)
         if self.reference_ratio == 1:
             return
         cells, visible, name = 1 / self.reference_cell_size, 1 / self.scene.cell_size, "dataset.reference_cells"

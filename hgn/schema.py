@@ -59,7 +59,6 @@ Positive = Annotated[N, Bound("a finite number > 0", lambda value: 0 < value < m
 NonNegative = Annotated[N, Bound("a finite number >= 0", lambda value: 0 <= value < math.inf)]
 Finite = Annotated[float, Bound("finite", math.isfinite)]
 Vector = tuple[Finite, Finite, Finite]
-BoxSize = tuple[Positive[float], Positive[float], Positive[float]]
 Fraction = Annotated[N, Bound("from 0 to 1", lambda value: 0 <= value <= 1)]
 AtMostOne = Annotated[N, Bound("at most 1", lambda value: value <= 1)]
 BelowOne = Annotated[N, Bound("0 or more and below 1", lambda value: 0 <= value < 1)]
@@ -84,6 +83,8 @@ FrameCount = Annotated[
 ]
 LayerSize = Annotated[Positive[int], Bound("at most 65,536", lambda value: value <= 65_536)]
 OrdinarySize = Annotated[float, Bound("from 1e-9 to 1e9", lambda value: 1e-9 <= value <= 1e9)]
+BoxSize = tuple[OrdinarySize, OrdinarySize, OrdinarySize]
+FrameRate = Annotated[float, Bound("from 0.001 to 1e6", lambda value: 1e-3 <= value <= 1e6)]
 FewLayers = Annotated[Positive[int], Bound("at most 1,000", lambda value: value <= 1_000)]
 
 

@@ -23,7 +23,7 @@ from hgn.scene.npz import read_header
 from hgn.scene.obstacle_grid import ObstacleGrid
 from hgn.scene.own_physics import input_parameters
 from hgn.scene.rest_shape import body_numbers, rest_neighbours
-from hgn.schema import BoxSize, ConfigError, Positive, Vector, from_mapping, require, require_bounds
+from hgn.schema import BoxSize, ConfigError, OrdinarySize, Vector, from_mapping, require, require_bounds
 
 SCHEMA_VERSION = 1
 
@@ -63,7 +63,7 @@ class Episode:
     obstacle_grid: ObstacleGrid
     domain_size: BoxSize
     gravity: Vector  # domain units per second squared
-    frame_rate_hz: Positive[float]
+    frame_rate_hz: OrdinarySize
     seed: int
     specification: dict[str, Any]  # all choices that made the scene
     solver: dict[str, Any]  # settings and counters: substeps, projections, floors hit

@@ -6,11 +6,12 @@ import math
 from dataclasses import fields
 from typing import Any
 
-from hgn.schema import require
+from hgn.schema import Vector, require
 
 FUNNEL_SQUARES = (0.5, 0.8)  # smallest and largest side of a funnel's squares, relative to the largest obstacle
 FUNNEL_HEIGHT = (2.0, 5.0)  # free height below and above a funnel's hole, in group sizes
 MAXIMUM_PARTICLES = 16_000  # largest number in a scene; larger scenes are drawn again
+MOST_CELLS = 2**31 - 1  # of a domain: the solver numbers them by int32
 
 # Smallest and largest value of each number that a kind draws.
 RANGES: dict[str, dict[str, tuple[float, float]]] = {
@@ -84,3 +85,10 @@ def require_funnel(scene: Any) -> None:
         require(scene.funnel_hole[1] <= widest, "funnel_hole", rule, list(scene.funnel_hole), remedy)
         rule = f"at most {1 / sum(FUNNEL_HEIGHT):.3g} of the domain's smallest side ({height:.3g}) {where}"
         require(scene.group_size <= height, "group_size", rule, scene.group_size, remedy)
+
+
+def require_few_cells(domain_size: Vector, cell_size: float) -> None:
+    """Raises ConfigError for a domain of more cells than the solver can number."""
+    few = math.prod(length / cell_size for length in domain_size) <= MOST_CELLS
+    rule, remedy = f"at most {MOST_CELLS} cells of {cell_size:.6g}", "lower it or raise cell_size"
+    require(few, "domain_size", rule, list(domain_size), remedy)

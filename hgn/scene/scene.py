@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from hgn.scene.kinds import require_few_cells
 from hgn.scene.material import MATERIAL_PARAMETERS, MATERIALS, require_materials
 from hgn.scene.motion import Motion
 from hgn.schema import ConfigError, Vector, require
@@ -32,6 +33,7 @@ def whole_cells(domain_size: Vector, cell_size: float) -> tuple[int, int, int]:
         near = round(cells) * cell_size if math.isfinite(cells) else 1.0
         remedy = f"for example {near:.6g}"
         require(whole, f"domain_size ({axis})", f"a whole number of cells of {cell_size:.6g}", length, remedy)
+    require_few_cells(domain_size, cell_size)
     x, y, z = (round(cells) for cells in counts)
     return x, y, z
 

@@ -24,7 +24,7 @@ from scene.test_rollout_file import make_rollout
 from datagen.solve import SolveConfig
 from hgn import card
 from hgn.card import weights_card
-from hgn.config import NetworkConfig
+from hgn.config import DatagenConfig, DatasetConfig, NetworkConfig, SceneConfig
 from hgn.data.entries import SPLITS, QuarantinedScene
 from hgn.data.foreign.formats import read_split, set_info
 from hgn.data.foreign.settings import ImportConfig
@@ -54,6 +54,22 @@ from hgn.training.imported import settings_of_imported
         (NetworkConfig, {"levels": 10**400}, "levels must be a number of at most 63 bits"),
         (NetworkConfig, {"cell_size": 10**400}, "cell_size must be a number of at most 63 bits"),
         (NetworkConfig, {"cell_size": 1e300}, "cell_size must be from 1e-9 to 1e9"),
+        (
+            DatagenConfig,
+            {"scene": {"domain_size": [1e6] * 3}},
+            "domain_size must be at most 2147483647 cells of 0.0156",
+        ),
+        (DatagenConfig, {"scene": {"cell_size": 1e-9}}, "domain_size must be at most 2147483647 cells of 1e-09"),
+        (SceneConfig, {"domain_size": [1e300, 1, 1]}, r"domain_size\[0\] must be from 1e-9 to 1e9"),
+        *(
+            (
+                cls,
+                {"scene": "s"} | {"frame_rate_hz": rate} if cls is SolveConfig else {"frame_rate_hz": rate},
+                "frame_rate_hz must be from 0.001 to 1e6, got",
+            )
+            for cls in (SolveConfig, DatasetConfig)
+            for rate in (1e300, 1e-9, float("nan"))
+        ),
         (StepConfig, {"wall_clearance": [0, 1e300]}, r"wall_clearance\[1\] must be from 0 to 1e9"),
         (SolveConfig, {"scene": "a\x1b[31m"}, r"scene must be text without control characters, got 'a\\x1b\[31m'"),
         (SolveConfig, {"scene": "a\ud800"}, "scene must be text without control characters"),
