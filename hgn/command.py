@@ -39,6 +39,7 @@ _MACHINE_ERRORS = {
     errno.EISDIR: "choose another path",
     errno.ENAMETOOLONG: "choose another path",
     errno.ETIMEDOUT: "check its server or disk",
+    errno.ECONNABORTED: "free memory if the system ended them,",
     errno.EMFILE: "raise the limit of open files (ulimit -n)",
     errno.ENFILE: "close other programs",
     errno.ENOMEM: "close other programs, take smaller input or another machine",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import math
 import sys
 from collections.abc import Callable
@@ -95,13 +96,14 @@ def train_network(config: TrainConfig, start: Start, stop: StopRequest, publishe
     monitor = Monitor(run, store, stop, checkpoints)
     lines = LogLines(run, monitor.last, feed, published)
     final = FinalMetrics(_public(config), monitor.last, stop)
+    watch = RankWatch(run)
     trainer = Trainer(
         accelerator=training.device,
         devices=devices,
         num_nodes=nodes,
         strategy=lightning_compat.gradient_averaging(backend) if devices * nodes > 1 else "auto",
         max_epochs=-1,  # the feed ends after the last update
-        callbacks=[RankWatch(run), SameWeights(feed), lines, monitor, checkpoints, Stopper(stop, checkpoints), final],
+        callbacks=[watch, SameWeights(feed), lines, monitor, checkpoints, Stopper(stop, checkpoints), final],
         plugins=[writer, *lightning_compat.own_launcher()],
         logger=build_loggers(training.loggers, run, _public(config)),
         default_root_dir=run,
@@ -121,6 +123,10 @@ def train_network(config: TrainConfig, start: Start, stop: StopRequest, publishe
     try:
         with lightning_compat.interrupts_passed_on(), faults_outlived():
             trainer.fit(module, feed, ckpt_path=resume.path if resume else None, weights_only=True)
+    except RuntimeError as error:
+        if watch.lost is None:
+            raise
+        raise ConnectionAbortedError(errno.ECONNABORTED, watch.lost) from error
     finally:
         module.release()
     if trainer.is_global_zero:

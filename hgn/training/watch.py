@@ -60,6 +60,7 @@ class RankWatch(Callback):
     def __init__(self, run: Path) -> None:
         self._folder = run / ".ranks"
         self._ended = threading.Event()
+        self.lost: str | None = None  # description of the ranks that closed their connections
         self._counts: dict[int, tuple[str, float]] = {}  # last count of each other rank, and the time of its change
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
@@ -84,6 +85,10 @@ class RankWatch(Callback):
                 self._folder.rmdir()
 
     def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
+        if self._counts and ("gloo" in str(exception) or isinstance(exception, torch.distributed.DistError)):
+            time.sleep(2.5 * BEAT_S)  # others that run write their counts meanwhile, and others that end remove them
+            lost = [rank for rank, (_, changed) in self._counts.items() if time.monotonic() - changed > 2 * BEAT_S]
+            self.lost = f"ranks {lost} ended without a message" if lost else "another rank ended, see its message"
         self.on_train_end(trainer, pl_module)
 
     def _watch(self, module: TrainingModule) -> None:

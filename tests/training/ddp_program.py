@@ -97,9 +97,9 @@ def main(folder):
     TrainingModule.on_train_end = at_end
     try:
         end["exit_code"] = train.main(mapping)
-    except ConfigError as error:
+    except (ConfigError, ConnectionAbortedError) as error:
         print(error, file=sys.stderr)
-        return 2
+        return 2 if isinstance(error, ConfigError) else 1
     torch.save(end, folder / f"end_{rank}.pt")
     (folder / f"talk_{rank}.json").write_text(json.dumps(sorted(talked)))
     return end["exit_code"]

@@ -348,6 +348,7 @@ DIFFERENT = "weights must be the same on all ranks, got others at"
     [
         ("cpu", [(0, 1, 3, "weights", "self")], {}, None, DIFFERENT),
         *(("cpu", [(0, rank, 3, "storage", "self")], {}, None, "the data stay away") for rank in (0, 1)),
+        ("cpu", [(0, 1, 3, signal.SIGKILL, "self")], {}, 1, "ranks [1] ended without a message"),
         ("cpu", [(0, 1, 3, signal.SIGSTOP, "self")], {"SILENCE_S": 3.0}, 1, "ranks [1] must answer within 3 s"),
         (
             "cpu",
@@ -383,6 +384,7 @@ def test_no_rank_waits_for_one_that_fails(
         for stopped in tmp_path.glob("stopped_*"):
             os.kill(int(stopped.read_text()), signal.SIGKILL)
     text = (tmp_path / "log").read_text()
+    assert "Traceback" not in text or "SIGKILL" not in str(faults)
     assert message in text and (process.returncode == code if code is not None else process.returncode != 0)
     prefix = str(tmp_path / "run" / watch_ranks.TRACE)
     for rank in (0, 1):
