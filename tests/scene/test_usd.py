@@ -1,13 +1,15 @@
 """USD files as particles and obstacles: what is read, and what is refused by name."""
 
 import struct
-import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
+from processes import write_program
 
 from hgn.render.exchange import save_rollout
+from hgn.scene import usd
 from hgn.scene.mesh import load_mesh
 from hgn.scene.rollout_file import Rollout
 from hgn.scene.scene import Obstacle
@@ -15,7 +17,6 @@ from hgn.scene.scene_file import load_scene
 from hgn.schema import ConfigError
 
 pytest.importorskip("pxr")
-from pxr import Usd, UsdGeom, Vt
 
 CORNERS = ", ".join(f"({x}, {y}, {z})" for x in (0, 1) for y in (0, 1) for z in (0, 1))
 BOX = f"""def Mesh "box" {{\npoint3f[] points = [{CORNERS}]\nint[] faceVertexCounts = [4, 4, 4, 4, 4, 4]
@@ -55,8 +56,12 @@ def test_meshes(tmp_path):
     assert np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2 == pytest.approx(3e-4)
 
 
-def test_particles(tmp_path):
-    """A rollout's first frame comes back as groups, with velocities and obstacles; a claimed size is no memory."""
+def test_particles(tmp_path, monkeypatch):
+    """A rollout's first frame comes back as groups, with velocities and obstacles, also where a shell limits programs; a
+    claimed size is no memory."""
+    limited = f'#!/bin/bash\nulimit -t 40 -v 8000000 && exec {sys.executable} "$@"\n'
+    write_program(tmp_path / "limited", limited)
+    monkeypatch.setattr(sys, "executable", str(tmp_path / "limited"))
     start_N3 = (0.3 + 0.4 * np.random.default_rng(0).random((30, 3))).astype(np.float32)
     path_TN3 = start_N3 + np.arange(3, dtype=np.float32)[:, None, None] * np.float32((0.01, 0, 0))
     sheet = Obstacle("sheet", 0.2 + np.eye(3), np.array([[0, 1, 2]], np.int32), False)
@@ -70,9 +75,6 @@ def test_particles(tmp_path):
     data = file.read_bytes()
     count = data.index(start_N3[1].tobytes()) - 8
     assert struct.unpack_from("<Q", data, count) == (15,)
-    limit = ["bash", "-c", 'ulimit -t 40 -v 8000000 && exec "$0" -c "$1"', sys.executable]
-    program = f"from hgn.scene.mesh import load_mesh; load_mesh({str(file)!r})"  # where a shell limits its programs
-    subprocess.run([*limit, program], check=True)
     file.write_bytes(data[:count] + struct.pack("<Q", 1 << 36) + data[count + 8 :])
     with pytest.raises(
         ConfigError, match=r"groups\[0\].particles must be a readable USD file, .*it is damaged, or needs"
@@ -82,6 +84,8 @@ def test_particles(tmp_path):
 
 def test_content_that_compresses_well(tmp_path):
     """A million triangles in a few kilobytes are refused."""
+    from pxr import Usd, UsdGeom, Vt
+
     stage = Usd.Stage.CreateNew(str(tmp_path / "a.usdc"))
     mesh = UsdGeom.Mesh.Define(stage, "/m")
     mesh.CreatePointsAttr([(0, 0, 0)])
@@ -104,8 +108,11 @@ def test_content_that_compresses_well(tmp_path):
         (BOX + copies(8, 10, "box"), "it is damaged, or needs more memory or time than"),
     ],
 )
-def test_what_is_not_read(tmp_path, text, message):
-    """Content of other kinds, of other files and damaged content end in one line that names it."""
+def test_what_is_not_read(tmp_path, monkeypatch, text, message):
+    """Content of other kinds, of other files, damaged or endless content end in one line that names it."""
+    program = Path(usd.__file__).with_name("usd_program.py").read_text()
+    (tmp_path / "usd_program.py").write_text(program.replace("\nSECONDS = 5 ", "\nSECONDS = 1 "))
+    monkeypatch.setattr(usd, "__file__", str(tmp_path / "usd.py"))
     with pytest.raises(ConfigError, match=message) as raised:
         mesh_of(tmp_path, text)
     assert "\n" not in str(raised.value)
