@@ -68,6 +68,10 @@ def pytest_collection_modifyitems(items):
 
 def pytest_collection_finish():
     """What is loaded by now stays: garbage collections need not look at it, half a second each."""
+    if "hydra" in sys.modules:
+        import composition
+
+        composition.read_once()
     gc.freeze()
     gc.enable()
 

@@ -14,7 +14,6 @@ from pathlib import Path
 import kubernetes_validate
 import pytest
 import yaml
-from kubeflow_trainer_api.models import TrainerV1alpha1ClusterTrainingRuntime, TrainerV1alpha1TrainJob
 
 from datagen.generate import datagen_config
 from datagen.service.__main__ import ServiceConfig
@@ -74,8 +73,11 @@ def test_objects_of_kubernetes(name, version):
 
 def test_train_job():
     """TrainJob and runtime are such by Kubeflow's types, which know each of their keys: they come back unchanged."""
+    from kubeflow_trainer_api import models  # a second of one core in each process that only collects tests
+
     (job,), (runtime,) = documents("train.yaml"), documents("runtime.yaml")
-    for kind, document in ((TrainerV1alpha1TrainJob, job), (TrainerV1alpha1ClusterTrainingRuntime, runtime)):
+    kinds = (models.TrainerV1alpha1TrainJob, models.TrainerV1alpha1ClusterTrainingRuntime)
+    for kind, document in zip(kinds, (job, runtime), strict=True):
         typed = kind.from_dict(document)
         assert typed is not None and typed.to_dict() == document
     trainer, reference = job["spec"]["trainer"], job["spec"]["runtimeRef"]

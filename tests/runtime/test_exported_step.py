@@ -11,14 +11,10 @@ from typing import NamedTuple
 from unittest import mock
 
 import numpy as np
-import onnxruntime
 import pytest
 import torch
 from network.states import gns_of, network_of, random_state
 from network.test_barriers import scattered
-from onnxscript.rewriter._basics import MatchResult
-from onnxscript.rewriter._matcher import SimplePatternMatcher
-from torch._inductor import cpu_vec_isa
 
 from hgn import export
 from hgn.config import config_directory
@@ -80,6 +76,9 @@ def one_turn():
 def rules_by_operator():
     """The optimiser of ONNX tries each of its rules at each node, some on the whole graph: half the export's time. Here
     it leaves out those for another operator, which end without a match all the same."""
+    from onnxscript.rewriter._basics import MatchResult
+    from onnxscript.rewriter._matcher import SimplePatternMatcher
+
     match = SimplePatternMatcher.match
 
     def matched(self, model, graph, node, **options):
@@ -110,6 +109,8 @@ def as_onnx(request, tmp_path_factory):
 def test_onnx_is_the_step(as_onnx):
     """ONNX Runtime computes the step to 1e-6 at any number of particles, with and without obstacles, which hold some of
     them; the file says what its weights say of themselves; the example in Python simulates a scene's arrays."""
+    import onnxruntime
+
     network, folder = as_onnx
     session = onnxruntime.InferenceSession(folder / "new/step.onnx")
     assert [item.name for item in session.get_inputs()] == list(INPUTS)
@@ -203,6 +204,8 @@ def test_a_package_that_is_cut_off_leaves_nothing(tmp_path, monkeypatch):
 
 def exported(folder, kinds, constraints):
     """What the command writes of a small network, and a scene and its arrays."""
+    from torch._inductor import cpu_vec_isa
+
     network = network_of(torch.float32, message_passing_steps=1, **{"levels": 1} | constraints)
     save_weights(folder / "w.safetensors", network, WeightsInfo(network.config, 60.0, CELL, step=network.step))
     shutil.copy(config_directory() / "example/ramp.obj", folder)
