@@ -61,5 +61,9 @@ def read_once():
             merged[id(defaults)] = merge(self, defaults, repo)
         return copy.deepcopy(merged[id(defaults)])
 
+    def share_sources(self, delegate):
+        self.delegate, self.cache = copy.copy(delegate), {}  # whose list of sources is replaced, not changed
+
     loader.create_defaults_list = lists_once
+    loader.CachingConfigRepository.__init__ = share_sources
     loader.ConfigLoaderImpl._compose_config_from_defaults_list = merge_once
