@@ -57,10 +57,9 @@ def test_meshes(tmp_path):
 
 
 def test_particles(tmp_path, monkeypatch):
-    """A rollout's first frame comes back as groups, with velocities and obstacles, also where a shell limits programs; a
+    """A rollout's first frame comes back as groups, with velocities and obstacles, also under the limits of a shell. A
     claimed size is no memory."""
-    limited = f'#!/bin/bash\nulimit -t 40 -v 8000000 && exec {sys.executable} "$@"\n'
-    write_program(tmp_path / "limited", limited)
+    write_program(tmp_path / "limited", f'#!/bin/bash\nulimit -t 40 -v 8000000 && exec {sys.executable} "$@"\n')
     monkeypatch.setattr(sys, "executable", str(tmp_path / "limited"))
     start_N3 = (0.3 + 0.4 * np.random.default_rng(0).random((30, 3))).astype(np.float32)
     path_TN3 = start_N3 + np.arange(3, dtype=np.float32)[:, None, None] * np.float32((0.01, 0, 0))
