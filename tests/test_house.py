@@ -19,7 +19,7 @@ LINES = {  # of Python, in tracked files
     "hgn": 32_515,
     "datagen": 8_439,
     "tools": 6_563,
-    "tests": 31_382,
+    "tests": 31_446,
 }
 SETTINGS = 240  # fields of the dataclasses behind the commands, *Config
 
