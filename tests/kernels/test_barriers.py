@@ -84,9 +84,10 @@ def within(count=8):
     begin_N3 = generator.uniform((0.498, 0.404, 0.45), (0.502, 0.406, 0.55), (count, 3))
     angle_N = generator.uniform(0, 2 * np.pi, count)
     around_N3 = np.stack([np.cos(angle_N), 0 * angle_N, np.sin(angle_N)], 1)
+    middle = np.array([0.5, 0.503, 0.5])  # ways in the equator would meet two triangles in one moment
     return (
         (gutter(60), begin_N3, begin_N3 + generator.normal((0, -0.01, 0.01), 0.002, (count, 3))),
-        (ball(12, 0.3) + 0.5, 0.5 + 0.29 * around_N3, 0.5 + 0.32 * np.roll(around_N3, 1, 0)),
+        (ball(12, 0.3) + 0.5, middle + 0.29 * around_N3, middle + 0.32 * np.roll(around_N3, 1, 0)),
         (SLOPE, np.array([(0.33, 0.5, 0.5)]), np.array([(0.301, 0.38, 0.5)])),
     )
 
