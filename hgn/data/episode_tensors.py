@@ -18,6 +18,7 @@ from hgn.network.own_physics import physics_fields
 from hgn.scene.barrier import Barrier
 from hgn.scene.episode import Episode
 from hgn.scene.history import frames_before
+from hgn.scene.moving import MovingObstacle, moving_of_episode
 from hgn.scene.obstacle_grid import ObstacleGrid
 from hgn.scene.symmetry import Symmetry, Vector, scene_symmetries
 
@@ -36,6 +37,8 @@ class EpisodeTensors:
     wall_friction: Vector = (0.0, 0.0, 0.0)  # friction of the walls across x, y, z
     parameter_NP: torch.Tensor | None = None  # as in ParticleState
     rest: RestShape | None = None  # as in ParticleState
+    moving: tuple[MovingObstacle, ...] = ()  # for networks that have them as inputs
+    frame_s: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,6 +71,8 @@ def whole_episode(episode: Episode, network: NetworkConfig, barrier: Barrier | N
         episode.wall_friction,
         physics.get("parameter_NP"),
         physics.get("rest"),
+        moving_of_episode(episode) if "moving" in network.own_physics else (),
+        1 / episode.frame_rate_hz,
     )
 
 

@@ -19,6 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
+from functools import cache
 from itertools import zip_longest
 
 import numpy as np
@@ -32,6 +33,7 @@ from hgn.scene.barrier import barrier_of_pieces
 from hgn.scene.motion import AT_REST
 from hgn.scene.moving import MovingObstacle
 from hgn.scene.obstacle_grid import ObstacleGrid
+from hgn.scene.symmetry import Symmetry
 
 TINY = 1e-30  # lower bound of divisors
 
@@ -59,6 +61,16 @@ class Poses:
         rotation_V33 = self.rotation_V33 + self.change_V33 @ self.rotation_V33
         still = torch.zeros_like(self.change_V33), torch.zeros_like(self.shift_V3)
         return Poses(rotation_V33, self.pivot_V3, self.place_V3 + self.shift_V3, *still)
+
+    def under(self, symmetries: Sequence[Symmetry]) -> Poses:
+        """Returns the images of the poses, each under the symmetry of its row."""
+        source_V3, mirrored_V3 = (np.array([getattr(s, name) for s in symmetries]) for name in ("source", "mirrored"))
+        turn_V33 = np.where(mirrored_V3, -1.0, 1.0)[..., None] * np.eye(3)[source_V3]
+        sum_V3 = mirrored_V3 * np.array([s.mirror_sum for s in symmetries])
+        map_V33, shift_V3 = (torch.from_numpy(x).to(self.place_V3) for x in (turn_V33, sum_V3))
+        rotation_V33, change_V33 = (map_V33 @ x @ map_V33.mT for x in (self.rotation_V33, self.change_V33))
+        pivot_V3, place_V3 = (turned(x, map_V33) + shift_V3 for x in (self.pivot_V3, self.place_V3))
+        return Poses(rotation_V33, pivot_V3, place_V3, change_V33, turned(self.shift_V3, map_V33))
 
     def undo(self, position_V3: torch.Tensor) -> torch.Tensor:
         """Moves a point of each row to the frame of its cells."""
@@ -110,11 +122,19 @@ class MovingObstacles:
 
     def with_barriers(self, clearance: float) -> MovingObstacles:
         """Returns the obstacles with barriers. Raises: ConfigError for an invalid clearance."""
-        size = next(scene[0].grid.cell_size for scene in self.scenes if scene)
-        empty = barrier_of_pieces(np.zeros((0, 3, 3)), size, clearance)
+        empty = barrier_of_pieces(np.zeros((0, 3, 3)), self.cell_size, clearance)
         rows = (row for layer in zip_longest(*self.scenes) for row in layer)
         barriers = Barriers.of([empty if row is None else row.barrier(clearance) for row in rows])
         return replace(self, barriers=barriers and barriers.to(self.poses.place_V3.device))
+
+    @property
+    def layers(self) -> int:
+        """Returns J, the largest number of moving obstacles of a scene."""
+        return len(self.poses.place_V3) // len(self.scenes)
+
+    @property
+    def cell_size(self) -> float:
+        return next(scene[0].grid.cell_size for scene in self.scenes if scene)
 
     def at(self, frames: Sequence[int]) -> MovingObstacles:
         """Returns the obstacles with each scene at another frame."""
@@ -131,7 +151,7 @@ class MovingObstacles:
 
     def rows(self, scene_N: torch.Tensor, dtype: torch.dtype) -> Iterator[tuple[torch.Tensor, Poses]]:
         """Yields for each number j the rows of the particles' scenes, [N], and the poses of these rows."""
-        for layer in range(len(self.poses.place_V3) // len(self.scenes)):
+        for layer in range(self.layers):
             row_N = scene_N.long() + layer * len(self.scenes)
             yield row_N, Poses(*(tensor.to(dtype)[row_N] for tensor in self.poses.tensors))
 
@@ -193,11 +213,11 @@ def first(rows: Sequence[torch.Tensor]) -> torch.Tensor:
 
 def poses_of(scenes: Sequence[Sequence[MovingObstacle]], frames: Sequence[int], frame_s: float) -> Poses:
     """Returns the poses of the rows of scenes, scene s in frame frames[s]."""
-    rows = []
+    rows, pose = [], cache(lambda motion, frame: motion.pose(frame * frame_s))
     for layer in zip_longest(*scenes):
         for obstacle, frame in zip(layer, frames, strict=True):
             motion = AT_REST if obstacle is None else obstacle.motion
-            (turn_33, shift_3), (later_33, later_3) = (motion.pose((frame + i) * frame_s) for i in range(2))
+            (turn_33, shift_3), (later_33, later_3) = pose(motion, frame), pose(motion, frame + 1)
             pivot_3, change_33 = np.array(motion.pivot), later_33 @ turn_33.T - np.eye(3)
             rows.append((turn_33, pivot_3, pivot_3 + shift_3, change_33, later_3 - shift_3))
     return Poses(*(torch.from_numpy(np.stack(part).astype(np.float64)) for part in zip(*rows, strict=True)))

@@ -16,6 +16,7 @@ import torch
 
 from hgn.config import NetworkConfig
 from hgn.kernels.grid.op import Window
+from hgn.kernels.moving import MovingTable
 from hgn.kernels.scene_tables import OBSTACLE_COLUMNS, SceneTable
 from hgn.kernels.triton_compat import Launches, build_launcher, noted_launches, preload, use_target
 from hgn.kernels.update.op import Updates, UpdateSettings
@@ -75,6 +76,9 @@ def _update_launches(job: PrecompileJob, device: str) -> None:
     updates.average = torch.zeros_like(updates.values) if job.averages else None
     updates.allocate(job.particles, job.cells)
     updates.launches()
+    if "moving" in job.network.own_physics:
+        updates.allocate_moving(1)
+        updates.launches()
     for scenes in job.pushforward_scenes:  # simulations of hgn.training.triton_pushforward and of monitored rollouts
         fraction = scenes / job.settings.scenes
         particles = round(fraction * job.particles)
@@ -129,7 +133,11 @@ def _simulation_launches(
         else None,
         rest=RestShape.none(torch.zeros(particles, 3, device=device)) if "elastic" in config.own_physics else None,
     )
-    _Unplaced(network, state, precision, capacities, obstacles=obstacles, step=step).frame_launches()
+    stepper = _Unplaced(network, state, precision, capacities, obstacles=obstacles, step=step)
+    stepper.frame_launches()
+    if "moving" in config.own_physics:
+        stepper.moving = MovingTable(stepper.frame, 1, scenes, layers=1, cell_size=1.0)
+        stepper.frame_launches()
 
 
 def compile_part(job: PrecompileJob | FrameJob, part: int, parts: int) -> int:

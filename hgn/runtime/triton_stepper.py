@@ -18,6 +18,7 @@ from hgn.config import NetworkConfig
 from hgn.kernels.capture import captured
 from hgn.kernels.forward import FusedNetwork
 from hgn.kernels.grid.op import OUT_OF_WINDOW, OVERFLOW, DeviceGrid, DeviceParticles, Window
+from hgn.kernels.moving import MovingTable
 from hgn.kernels.packing import pack_network
 from hgn.kernels.scene_tables import SceneTable
 from hgn.kernels.step.op import DIVERGED, DeviceStep, rest_numbers
@@ -27,10 +28,11 @@ from hgn.network.elastic import RestShape
 from hgn.network.features import ParticleState
 from hgn.network.grid import build_hierarchy
 from hgn.network.hgn import HierarchicalGraphNetwork
+from hgn.network.moving import MovingObstacles
+from hgn.network.own_physics import has_friction
 from hgn.runtime.parity import OUTPUTS, require_parity
 from hgn.runtime.triton_host import kernel_precision
 from hgn.scene.material import INPUT_PARAMETERS
-from hgn.schema import require
 from hgn.step.reference import rested
 from hgn.step_config import StepConfig
 
@@ -73,9 +75,7 @@ def _room(count: int, level: int, tight: float) -> int:
 def _own_physics(config: NetworkConfig, state: ParticleState) -> tuple[str, ...]:
     """Returns the parts of own physics that a state has: friction of any surface, parameters of any particle, elastic
     bodies. Columns of elastic bodies follow those of parameters, so they need both."""
-    require(state.moving is None, "backend", "torch or cpu for moving obstacles", "triton")
-    rough = state.wall_friction_S3 is not None or (state.obstacles and state.obstacles.friction_K) is not None
-    there = {"friction": rough, "elastic": state.rest is not None}
+    there = {"friction": has_friction(state), "elastic": state.rest is not None}
     there["parameters"] = there["elastic"] or state.parameter_NP is not None
     return tuple(name for name in config.own_physics if there.get(name))
 
@@ -129,6 +129,7 @@ class TritonStepper:
         self.barriers = None
         if self.step_config.obstacle_clearance is not None:
             self.barriers = barriers or SceneTable.of_barriers(state.barriers, self.scenes, self.device)
+        self.moving: MovingTable | None = None
         affordable = PATH_BYTES // (2 * 3 * 4 * max(1, self.particles))
         self.look_frames = max(FEWEST_FRAMES, min(LOOK_FRAMES, affordable))
         self.path_TN3 = torch.zeros(2 * self.look_frames, self.particles, 3, device=self.device)
@@ -139,6 +140,10 @@ class TritonStepper:
         self.mean, self.std = normaliser.acceleration_mean.float(), normaliser.acceleration_std.float()
         self.growths = 0
         self._careful = self._crowded(state)
+        if state.moving is not None:
+            turns = len(self.path_TN3) + 1  # a turn for each row of the path, and one for the frame after it
+            layers, size = state.moving.layers, state.moving.cell_size
+            self.moving = MovingTable(self.frame, turns, self.scenes, layers=layers, cell_size=size)
         self._fill(state)
         self._build(capacities or self._first_capacities())
 
@@ -151,6 +156,8 @@ class TritonStepper:
         if state.scene_count != self.scenes or len(state.position_N3) > self.particles:
             return False
         if self.own_physics != _own_physics(self.config, state) or (not self._careful and self._crowded(state)):
+            return False
+        if not self.fits_moving(state.moving):
             return False
         new, old = state.obstacles, self.obstacles
         same = new is old is None or (new is not None and old is not None and new.cell_size == old.cell_size)
@@ -217,6 +224,22 @@ class TritonStepper:
             columns_NP.zero_() if state.parameter_NP is None else columns_NP.copy_(state.parameter_NP)
         if buffers.rest_NR is not None and state.rest is not None:
             buffers.rest_NR[:count].copy_(state.rest.packed)
+        self._moving, self._passed = state.moving, 0  # _passed: number of frames since `_moving`
+        if self.moving is not None:
+            self.moving.take(state.moving, "friction" in self.own_physics)
+            self.frame.zero_()  # the turn of the present frame
+            self._set_poses(0, 1)
+
+    def fits_moving(self, moving: MovingObstacles | None) -> bool:
+        """Returns whether there are records for moving obstacles."""
+        return moving is None or (self.moving is not None and self.moving.fits(moving))
+
+    def _set_poses(self, first: int, frames: int, ahead: int = 0) -> None:
+        """Writes the poses of the next frames, or of those after `ahead` frames, to turns from `first` on."""
+        if self.moving is not None and self._moving is not None:
+            own, begin = self._moving, self._passed + ahead
+            at = [frame + begin + i for i in range(frames) for frame in own.frames]
+            self.moving.set_poses(first, own.scenes * frames, at, own.frame_s)
 
     def _obstacle_table(self, state: ParticleState) -> SceneTable:
         assert state.obstacles is not None
@@ -295,14 +318,14 @@ class TritonStepper:
 
     def _network_pass(self) -> None:
         self.grid.build(self.buffers)
-        self.grid.prepare(self.buffers, self.scale, self.obstacles)
+        self.grid.prepare(self.buffers, self.scale, self.obstacles, moving=self.moving)
         self.fused.forward()
         self.step.rest(self.fused.output, self.buffers, self.scale[1])
 
     def _integrate(self) -> None:
         self.step.integrate(
             self.fused.output, self.buffers, (self.mean, self.std), lost=self.lost, frame=self.frame,
-            path_TN3=self.path_TN3,
+            path_TN3=self.path_TN3, moving=self.moving,
         )  # fmt: skip
 
     def blocks(self, frames: int) -> Iterator[tuple[torch.Tensor, bool]]:
@@ -316,9 +339,12 @@ class TritonStepper:
             look = ahead or self._launch(min(self.look_frames, frames - done), half)
             remaining, half = frames - done - look.frames, 1 - half
             # If this block ends with a non-zero status, these launches change nothing.
-            ahead = self._launch(min(self.look_frames, remaining), half) if self.overlap and remaining else None
+            ahead = None
+            if self.overlap and remaining:
+                ahead = self._launch(min(self.look_frames, remaining), half, look.frames)
             path_TN3, status = self._settle(look)
             done += len(path_TN3)
+            self._passed += len(path_TN3)
             if status and ahead is not None:
                 self._settle(ahead)  # its launches use the buffers that may grow now
                 ahead = None
@@ -329,9 +355,10 @@ class TritonStepper:
             if status & (OVERFLOW | OUT_OF_WINDOW):
                 self._grow()
 
-    def _launch(self, frames: int, half: int) -> _Look:
-        """Starts some frames. Their positions are written to one half of the path."""
+    def _launch(self, frames: int, half: int, ahead: int = 0) -> _Look:
+        """Starts some frames, after `ahead` frames in progress. Their positions are written to one half of the path."""
         first = half * self.look_frames
+        self._set_poses(first, frames, ahead)
         self.frame.fill_(first)
         for _ in range(frames):
             if self.graph is None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import torch
 
@@ -16,26 +17,36 @@ from hgn.data.episode_tensors import EpisodeTensors
 from hgn.kernels.update.op import Updates
 from hgn.network.elastic import RestShape
 from hgn.network.features import ParticleState
+from hgn.network.moving import MovingObstacles
 from hgn.network.obstacles import ObstacleCells
 from hgn.runtime.parity import GRADIENTS, OUTPUTS, require_parity
 from hgn.scene.material import INPUT_PARAMETERS
 from hgn.scene.symmetry import Symmetry
-from hgn.training.symmetry import obstacles_under
+from hgn.training.symmetry import moving_under, obstacles_under
 
 CHECKED_PARTICLES = 200_000  # largest number of particles to check; autograd needs memory
 
 
 def require_update_parity(
-    updates: Updates, episodes: Sequence[EpisodeTensors], symmetries: Sequence[Symmetry] | None = None
+    updates: Updates,
+    episodes: Sequence[EpisodeTensors],
+    symmetries: Sequence[Symmetry] | None = None,
+    frames: Sequence[int] = (),
 ) -> tuple[float, float]:
-    """Returns the relative errors of outputs and gradients on the batch of `updates`, which has images of `episodes`.
+    """Returns the relative errors of outputs and gradients on the batch of `updates`, which has images of `episodes`
+    in `frames`.
 
-    They are NaN for a batch of more than CHECKED_PARTICLES. Raises: ParityError if an error exceeds its bound.
+    The errors are NaN for a batch of more than CHECKED_PARTICLES. Raises: ParityError if an error exceeds its bound.
     """
     network, fused, count = updates.network, updates.fused, int(updates.buffers.count)
     if count > CHECKED_PARTICLES:
         return math.nan, math.nan
     state, origin_S3 = _state(updates, episodes, symmetries, count)
+    own, seen = [episode.moving for episode in episodes], updates.config.obstacle_features
+    moving = MovingObstacles.of(own, frames, episodes[0].frame_s, seen)
+    if moving is not None:
+        moving = moving if symmetries is None else moving_under(moving, symmetries)
+        state = replace(state, moving=moving.to(updates.device))
     generator = torch.Generator().manual_seed(0)
     weight_N3 = torch.randn(count, 3, generator=generator).to(updates.device) * updates.share_N[:count, None]
     parameters = list(network.parameters())

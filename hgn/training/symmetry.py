@@ -12,7 +12,7 @@ import torch
 
 from hgn.data.batch import Batch
 from hgn.network.cell_keys import pack, unpack
-from hgn.network.moving import MovingObstacles, Poses
+from hgn.network.moving import MovingObstacles
 from hgn.network.obstacles import ObstacleCells
 from hgn.scene.symmetry import Symmetry, drawn_symmetry
 
@@ -53,21 +53,8 @@ def obstacles_under(obstacles: ObstacleCells, symmetries: Sequence[Symmetry]) ->
 
 def moving_under(moving: MovingObstacles, symmetries: Sequence[Symmetry]) -> MovingObstacles:
     """Returns the images of moving obstacles in their frame. Later frames are not images."""
-    poses, row_V = moving.poses, torch.arange(len(moving.poses.place_V3), device=moving.poses.place_V3.device)
-    rows = [*symmetries] * (len(row_V) // len(symmetries))
-
-    def matrices(matrix_V33: torch.Tensor) -> torch.Tensor:
-        column_V33 = torch.stack([_vectors(column_V3, row_V, rows) for column_V3 in matrix_V33.unbind(-1)], -1)
-        return torch.stack([_vectors(vector_V3, row_V, rows) for vector_V3 in column_V33.unbind(-2)], -2)
-
-    images = Poses(
-        rotation_V33=matrices(poses.rotation_V33),
-        pivot_V3=_points(poses.pivot_V3, row_V, rows),
-        place_V3=_points(poses.place_V3, row_V, rows),
-        change_V33=matrices(poses.change_V33),
-        shift_V3=_vectors(poses.shift_V3, row_V, rows),
-    )
-    return replace(moving, cells=moving.cells and obstacles_under(moving.cells, rows), poses=images)
+    rows = [*symmetries] * moving.layers
+    return replace(moving, cells=moving.cells and obstacles_under(moving.cells, rows), poses=moving.poses.under(rows))
 
 
 def _points(point_N3: torch.Tensor, scene_N: torch.Tensor, symmetries: Sequence[Symmetry]) -> torch.Tensor:

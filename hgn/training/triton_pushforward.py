@@ -22,6 +22,7 @@ from hgn.network.cell_keys import COORDINATE_BITS
 from hgn.network.elastic import RestShape
 from hgn.network.features import ParticleState
 from hgn.network.hgn import HierarchicalGraphNetwork
+from hgn.network.moving import MovingObstacles
 from hgn.network.obstacles import ObstacleCells
 from hgn.network.own_physics import joined_parameters
 from hgn.runtime.simulation import Simulation
@@ -61,7 +62,8 @@ class TritonScenes:
         return episode.position_TN3[frame : frame + self._history + simulated + 2].to(self.values.device)
 
     def sample(self, episode: DeviceEpisode, frame: int, window_WN3: torch.Tensor) -> DeviceSample:
-        return DeviceSample(replace(episode, position_TN3=window_WN3), 0, 0)
+        first = episode.first_frame + frame
+        return DeviceSample(replace(episode, position_TN3=window_WN3, first_frame=first), 0, 0)
 
     def drawn(self, sample: DeviceSample, seed: int, weight: float, scale: float) -> DeviceSample:
         return sample._replace(seed=seed, weight=weight, noise_scale=scale)
@@ -94,6 +96,12 @@ class TritonScenes:
         if "elastic" in self._network.config.own_physics:
             shapes = [e.rest or RestShape.none(e.position_TN3[0].to(device)) for e in episodes]
             own["rest"] = RestShape.joined(shapes, [e.particles for e in episodes])
+        if "moving" in self._network.config.own_physics:
+            bodies = [episode.moving.obstacles for episode in episodes] + [()] * empty
+            frames = [episode.first_frame + frame for episode, frame in starts] + [0] * empty
+            clearance, seen = self._network.step.in_training.obstacle_clearance, self._network.config.obstacle_features
+            moving = MovingObstacles.of(bodies, frames, episodes[0].moving.frame_s, seen, clearance=clearance)
+            own["moving"] = moving and moving.to(device)
         return ParticleState(
             position_N3=past_TN3[-1],
             velocity_NM3=past_TN3.diff(dim=0).flip(0).transpose(0, 1),
@@ -117,7 +125,7 @@ class TritonScenes:
         if step.obstacle_clearance is not None:
             barriers = SceneTable([*(e.barrier for e in episodes), *empty], BARRIER_COLUMNS, device)
         stepper = self._stepper
-        if stepper is not None and len(state.position_N3) <= stepper.particles:
+        if stepper is not None and len(state.position_N3) <= stepper.particles and stepper.fits_moving(state.moving):
             if table is not None:
                 assert stepper.obstacles is not None
                 stepper.obstacles.take(table)

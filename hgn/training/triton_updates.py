@@ -17,6 +17,7 @@ import torch
 
 from hgn.config import TrainingConfig
 from hgn.data.episode_tensors import EpisodeChunk, EpisodeTensors
+from hgn.kernels.moving import EpisodeMoving
 from hgn.kernels.scene_tables import SceneHash
 from hgn.kernels.triton_compat import JitMisses
 from hgn.kernels.update.op import DeviceEpisode, DeviceSample, Updates, UpdateSettings
@@ -125,7 +126,7 @@ class TritonUpdates:
             shown = [drawn_symmetry(e.symmetries, s.seed) for e, s in zip(episodes, first, strict=True)]
         failure = ""
         try:
-            self.parity = require_update_parity(self.updates, episodes, shown)
+            self.parity = require_update_parity(self.updates, episodes, shown, [s.frame for s in first])
         except ParityError as error:
             failure = str(error)  # the error itself would keep the graphs
         failures = torch.tensor(float(failure != ""), device=self.device)
@@ -188,6 +189,7 @@ class TritonUpdates:
             wall_friction=episode.wall_friction,
             parameter_NP=None if episode.parameter_NP is None else episode.parameter_NP.to(self.device),
             rest=episode.rest and episode.rest.to(self.device),
+            moving=EpisodeMoving.of(episode.moving, episode.frame_s, self.network.config, self.device),
         )
 
     def _take_over(self) -> None:

@@ -4,15 +4,21 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+import numpy as np
 import torch
 from kernels.engines import engine_of, gradients, run_forward
-from network.states import network_of, random_state
+from network.states import network_of, random_grid, random_state
 
 from hgn.network.elastic import RestShape
+from hgn.network.moving import MovingObstacles
 from hgn.runtime.parity import relative_error
 from hgn.scene.material import INPUT_PARAMETERS, MATERIALS
+from hgn.scene.motion import Motion
+from hgn.scene.moving import MovingObstacle
 from hgn.scene.rest_shape import NEIGHBOURS
+from hgn.scene.rotation import euler_rotation
 
+SQUARE_F33 = np.array([[[0, 0, 0], [1, 0, 0], [0, 0, 1]], [[1, 0, 1], [1, 0, 0], [0, 0, 1]]]) * 0.3 + [0, 0.1, 0]
 SEVERAL, CROWD = (5, 1, 3), (17, 1, 6)  # particles of three scenes
 
 
@@ -76,6 +82,26 @@ def elastic_state(counts):
     return replace(state, rest=RestShape.of(place_N3, neighbour_NK))
 
 
+def swept(seed, friction=0.4, cells=4_000):
+    """A moving obstacle: cells and a square that move and turn."""
+    grid, rng = random_grid(seed, cells), np.random.default_rng(seed)
+    rough_K = friction * rng.random(len(grid.cell_K3)) if friction else None
+    shift_T3 = np.array([[0.01, 0.02, -0.01], [0.3, -0.2, 0.1 * seed]])
+    turn_T33 = np.stack([euler_rotation((5.0 * seed, 20.0, 0.0)), euler_rotation((0.0, 170.0, -90.0))])
+    motion = Motion(np.array([0.0, 0.5]), shift_T3, turn_T33, (0.19, 0.19 + 0.002 * seed, 0.18))
+    return MovingObstacle(replace(grid, friction_K=rough_K), SQUARE_F33, motion)
+
+
+def swept_state(counts, friction=0.4, still=True):
+    """The same with moving obstacles, of which scene s has 2 - s."""
+    state = rough_state(counts, friction, friction, 0.02)
+    scenes = [
+        tuple(swept(7 + 2 * scene + number, friction) for number in range(2 - scene)) for scene in range(len(counts))
+    ]
+    moving = MovingObstacles.of(scenes, [3, 8, 1][: len(counts)], 1 / 60)
+    return replace(state, moving=moving, obstacles=state.obstacles if still else None)
+
+
 @dataclass(frozen=True)
 class Case:
     """A network, a state, and the largest relative error of outputs, of all gradients, and of each gradient."""
@@ -95,6 +121,7 @@ class Case:
 RELATIVE = {"inputs": "relative"}
 OWN = {"inputs": "local", "own_physics": ("friction", "parameters")}
 ELASTIC = {"own_physics": ("friction", "parameters", "elastic"), "materials": MATERIALS}
+MOVING = OWN | {"own_physics": ("friction", "parameters", "moving")}
 SHUFFLED = ("water", "snow", "sand")
 # Relative inputs: in the weights of normals the rounding of distances counts tenfold (FEW).
 CASES = {
@@ -119,6 +146,12 @@ CASES = {
     ),
     "friction that stops": Case(lambda: rough_state((61, 20), 30.0, 30.0, 3e-3), 1e-4, OWN),
     "parameters": Case(lambda: rough_state(SEVERAL), 4e-5, RELATIVE | {"own_physics": ("parameters",)}),
+    "moving obstacles": Case(lambda: swept_state(CROWD), 1e-4, MOVING),
+    "moving obstacles alone": Case(
+        lambda: replace(swept_state(CROWD, 0.0, False), wall_friction_S3=None, parameter_NP=None),
+        1e-4,
+        MOVING | {"levels": 1},
+    ),
     "elastic bodies": Case(lambda: elastic_state((40, 17)), 1e-4, OWN | ELASTIC),
 }
 

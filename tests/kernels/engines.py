@@ -7,6 +7,7 @@ import torch
 from hgn.kernels.backward import FusedTrainingNetwork
 from hgn.kernels.forward import FusedNetwork
 from hgn.kernels.grid.op import DeviceGrid, DeviceParticles, Window
+from hgn.kernels.moving import MovingTable
 from hgn.kernels.packing import pack_network
 from hgn.kernels.scene_tables import SceneTable
 from hgn.kernels.step.op import rest_numbers
@@ -78,8 +79,17 @@ def prepare(engine, network, state, origin_S3):
         rest_NR=state.rest and padded(state.rest.packed),
     )
     grid.build(particles)
-    grid.prepare(particles, scale, obstacles)
+    grid.prepare(particles, scale, obstacles, moving=state.moving and table_of(state.moving, walls_S3 is not None))
     return particles
+
+
+def table_of(moving, friction):
+    """The records of a frame, the second of three turns."""
+    turn = torch.ones(1, dtype=torch.int32, device=device())
+    table = MovingTable(turn, 3, len(moving.scenes), moving.layers, moving.cell_size)
+    table.take(moving.to(device()), friction)
+    table.set_poses(1, moving.scenes, moving.frames, moving.frame_s)
+    return table
 
 
 def gradients(engine, network):

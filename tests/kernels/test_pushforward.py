@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from kernels.cases import swept
 from kernels.engines import device
 from kernels.test_training import data as data
 from network.states import network_of
@@ -13,6 +14,7 @@ from training.test_pushforward import falling, training_of, wild_network, with_s
 from training.test_symmetry import scene_with_obstacles
 
 from hgn.data.episode_tensors import whole_episode
+from hgn.kernels.moving import EpisodeMoving
 from hgn.kernels.packing import pack_network
 from hgn.kernels.scene_tables import SceneHash
 from hgn.kernels.update.op import DeviceEpisode, DeviceSample
@@ -38,7 +40,19 @@ def placed(made, network):
     position_TN3, material_N = whole.position_TN3.to(where), whole.material_N.to(where)
     scene = whole.domain_size, whole.gravity, whole.symmetries, hashed and hashed.to(where), whole.wall_friction
     rest = whole.rest and whole.rest.to(where)
-    return DeviceEpisode(position_TN3, material_N, cells and cells.to(where), *scene, parameter_NP, rest)
+    moving = EpisodeMoving.of(whole.moving, whole.frame_s, network.config, where)
+    return DeviceEpisode(position_TN3, material_N, cells and cells.to(where), *scene, parameter_NP, rest, moving)
+
+
+def let_move(monkeypatch, episodes, counts):
+    """Gives episodes these numbers of moving obstacles."""
+    pairs = enumerate(zip(episodes, counts, strict=True))
+    known = {
+        id(made): tuple(swept(8 + 2 * i + number, cells=20_000) for number in range(count))
+        for i, (made, count) in pairs
+    }
+    for module in ("batch", "episode_tensors"):
+        monkeypatch.setattr(f"hgn.data.{module}.moving_of_episode", lambda made: known.get(id(made), ()))
 
 
 def with_parameters(made):
@@ -71,7 +85,7 @@ def assert_same_pools(fast, plain):
         position_TN3 = found.episode.position_TN3
         np.testing.assert_allclose(position_TN3.cpu().numpy(), sample.window_WN3, rtol=0, atol=1e-6)
         assert found.episode.particles == sample.episode.particle_count and position_TN3.is_contiguous()
-        assert asked == pytest.approx(acceleration, abs=1e-6)
+        assert asked == pytest.approx(acceleration, abs=1e-6) and found.episode.first_frame == sample.frame
 
 
 @pytest.mark.parametrize(
@@ -81,9 +95,10 @@ def assert_same_pools(fast, plain):
         {"inputs": "local", "own_physics": ("friction", "parameters"), "wall_clearance": (0.45, 0.45)},
         {"inputs": "local", "own_physics": ("parameters", "elastic"), "materials": MATERIALS},
         {"obstacle_clearance": 5e-3},
+        {"inputs": "local", "own_physics": ("friction", "moving"), "obstacle_clearance": 5e-3},
     ],
 )
-def test_the_pool_is_that_of_the_plain_path(changes):
+def test_the_pool_is_that_of_the_plain_path(changes, monkeypatch):
     """Scenes with and without obstacles, first and later frames, one simulation after the other with other weights and
     other numbers of particles, in the same buffers where they suffice: both pools hold the same windows."""
     network = network_of(torch.float32, width=16, levels=1, message_passing_steps=1, **changes).to(device())
@@ -96,6 +111,9 @@ def test_the_pool_is_that_of_the_plain_path(changes):
     fast, plain = pools_of(network, training)
     if "obstacle_clearance" in changes:
         scenes = [with_square(made, (0.25, 0.25, 0.25)) if made is not scenes[1] else made for made in scenes]
+    if "inputs" in changes and "obstacle_clearance" in changes:
+        let_move(monkeypatch, scenes, [2, 1, 0, 1])
+    elif "obstacle_clearance" in changes:
         free_network = network_of(torch.float32, width=16, levels=1, message_passing_steps=1).to(device())
         plain.refresh([(scenes[0], 0)])
         free = PushforwardPool(TorchScenes(free_network), training, 0)

@@ -8,7 +8,7 @@ import pytest
 import torch
 from kernels.cases import flat
 from kernels.engines import device
-from kernels.test_pushforward import placed, with_parameters
+from kernels.test_pushforward import let_move, placed, with_parameters
 from kernels.test_training import without_jitter
 from kernels.test_update import HISTORY, parameters_of, updates_of
 from network.states import network_of
@@ -18,6 +18,7 @@ from hgn.config import TrainingConfig
 from hgn.data.batch import make_batch
 from hgn.data.episode_tensors import EpisodeChunk, whole_episode
 from hgn.data.sampler import Sample, SamplerState
+from hgn.network.relative import STEPS_AHEAD
 from hgn.runtime.parity import relative_error
 from hgn.scene.material import ELASTIC, MATERIALS
 from hgn.scene.obstacle_grid import ObstacleGrid
@@ -27,14 +28,14 @@ from hgn.training.updates import Ranks, TrainedNetwork
 
 pytestmark = pytest.mark.usefixtures("large_tiles")
 
-FRAME = 6
+FRAME, OWN = 6, ("friction", "parameters", "elastic")
 
 
 def small_network():
     return network_of(width=16, levels=1, message_passing_steps=1, cell_size=0.1)
 
 
-@pytest.mark.parametrize("own_physics", [(), ("friction", "parameters", "elastic")])
+@pytest.mark.parametrize("own_physics", [(), OWN, ("friction", "moving")])
 def test_an_update_under_symmetries_is_the_plain_one(own_physics, monkeypatch):
     """An update of eight scenes, each under another of the cube's symmetries, which turn gravity and the walls'
     friction, one without obstacles, one without gravity, two with parameters of their own, four elastic: positions,
@@ -49,12 +50,14 @@ def test_an_update_under_symmetries_is_the_plain_one(own_physics, monkeypatch):
         materials=MATERIALS,
     )
     episodes = [scene_with_obstacles(i, 2 + i % 3 + 4 * bool(own_physics), 20_000) for i in range(8)]
-    if own_physics:
+    if "elastic" in own_physics:
         episodes[::2] = [replace(made, material_N=np.full_like(made.material_N, ELASTIC)) for made in episodes[::2]]
     bare = ObstacleGrid(CELL_SIZE, np.zeros((0, 3), np.int32), np.zeros((0, 3), np.float32))
     episodes[2] = replace(episodes[2], obstacle_grid=bare)
     episodes[0] = replace(episodes[0], gravity=(0.0, 0.0, 0.0))
     episodes[3:5] = [with_parameters(made) for made in episodes[3:5]]
+    if "moving" in own_physics:
+        let_move(monkeypatch, episodes, [1, 2, 0, 0, 1, 2, 0, 1])
     shown = [*ALL_48[1::6]]
     seeds = seeds_of(shown, ALL_48)
     batch = under_symmetries(doubled(make_batch([(e, FRAME) for e in episodes], network.config, seeds)), shown)
@@ -75,7 +78,7 @@ def test_an_update_under_symmetries_is_the_plain_one(own_physics, monkeypatch):
     updates, count = fast.updates, len(state.position_N3)
     width = 3 * HISTORY + 9
     assert fast.parity is not None and max(fast.parity) < 1e-3
-    if own_physics:
+    if "elastic" in own_physics:
         assert torch.equal(updates.buffers.wall_friction_S3.cpu(), state.wall_friction_S3.float())
         assert torch.equal(updates.buffers.parameter_NP[:count, :7].cpu(), state.parameter_NP)
     near = {"rtol": 0, "atol": 1e-7}
@@ -87,12 +90,20 @@ def test_an_update_under_symmetries_is_the_plain_one(own_physics, monkeypatch):
     assert state.obstacles is not None
     normal = state.obstacles.normals(state.position_N3, state.scene_N)
     assert normal.abs().sum(-1).gt(0).sum() > 10
-    assert torch.equal(updates.grid.feature_NF[:count, width : width + 3].cpu().double(), normal)
+    if state.moving is not None:
+        at_rest_N3, place = normal, (state.position_N3, state.velocity_NM3[:, 0], state.scene_N)
+        normal = state.moving.met(state.obstacles, place, STEPS_AHEAD)[0][:, :3]
+        assert float((at_rest_N3 - normal).abs().amax(-1).gt(0.01).float().mean()) > 0.1
+    seen_N3 = updates.grid.feature_NF[:count, width : width + 3].cpu().double()
+    torch.testing.assert_close(seen_N3, normal, rtol=0, atol=0.0 if state.moving is None else 1e-6)
     assert float(loss_sum[0]) == pytest.approx(float(loss.detach()), rel=1e-5)
     found = [torch.zeros_like(parameter) for parameter in network.parameters()]
     updates.packed.scatter(updates.fused.totals[: updates.packed.size].cpu(), found)
     # differences of velocities have the rounding of positions in float32
     assert relative_error(flat(found), expected) < 1e-3
+    fast.run(EpisodeChunk((samples[1:] + samples[:1], samples), wholes, SamplerState()), 1)  # another update before it
+    again_N3 = updates.grid.feature_NF[:count, width : width + 3].cpu().double()
+    torch.testing.assert_close(again_N3, seen_N3, rtol=0, atol=0.0 if state.moving is None else 1e-6)
 
 
 def test_without_symmetry_nothing_changes():

@@ -9,7 +9,7 @@ import triton
 import triton.language as tl
 
 from hgn.kernels.blocks import with_column
-from hgn.kernels.bodies import three_columns
+from hgn.kernels.bodies import one_over, three_columns
 from hgn.kernels.geometry import GEOMETRY_COLUMNS, most_around, raise_disturbed
 from hgn.kernels.obstacles import OBSTACLE_COLUMNS, obstacle_normals
 from hgn.kernels.triton_compat import gdc_launch_dependents, gdc_wait, settle_keys
@@ -21,12 +21,13 @@ STRETCH, NEIGHBOURS = tl.constexpr(elastic.STRETCH), tl.constexpr(rest_shape.NEI
 
 @triton.jit
 def sum_motion(
-    motion, parent, geometry, counts, disturbed, felt, neighbour, coarsest_capacity,
-    LEVELS: tl.constexpr, OVERLAP: tl.constexpr, BLOCK: tl.constexpr,
+    motion, parent, geometry, counts, disturbed, felt, neighbour, drift, coarsest_capacity,
+    LEVELS: tl.constexpr, MOVING: tl.constexpr, OVERLAP: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Adds mass and momentum of the finest cells to all cells above them, in `motion` [.., 4] of all levels.
 
-    A second set of programs writes the nearness of surfaces to the coarsest cells' `felt` [C, 2] (`most_around`).
+    A second set of programs writes the nearness of surfaces to the coarsest cells' `felt` [C, 2] (`most_around`), and
+    with MOVING the mean V of a coarsest cell and those across its faces to columns 4 to 6 of `drift` [C, 8].
 
     Rule: hgn.network.relative; test: tests/kernels/test_network.py.
     """
@@ -38,7 +39,20 @@ def sum_motion(
         return
     cell = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     if tl.program_id(1) == 1:  # these programs run at the same time as those of the sums
-        most_around(disturbed, felt, 1, neighbour, cell, cell < tl.load(counts + LEVELS - 1), coarsest_capacity)
+        there = cell < tl.load(counts + LEVELS - 1)
+        most_around(disturbed, felt, 1, neighbour, cell, there, coarsest_capacity)
+        if MOVING > 0:
+            x, y, z = three_columns(drift, cell, 0, there, 1.0, 8)
+            contacts = tl.load(drift + cell * 8 + 3, mask=there, other=0.0)
+            for slot in tl.static_range(6):
+                other = tl.load(neighbour + slot * coarsest_capacity + cell, mask=there, other=-1)
+                more = three_columns(drift, other, 0, other >= 0, 1.0, 8)
+                x, y, z = x + more[0], y + more[1], z + more[2]
+                contacts += tl.load(drift + other * 8 + 3, mask=other >= 0, other=0.0)
+            inverse = one_over(contacts)
+            tl.store(drift + cell * 8 + 4, x * inverse, mask=there)
+            tl.store(drift + cell * 8 + 5, y * inverse, mask=there)
+            tl.store(drift + cell * 8 + 6, z * inverse, mask=there)
         return
     there = cell < count
     part = tl.arange(0, 4)[None, :]
@@ -155,12 +169,28 @@ def deform(position, rest, particle_count, scale, columns, WIDTH: tl.constexpr, 
 
 
 @triton.jit
+def _add_slip(v, gravity, scale, scene, live, cell, share, sums, COLUMNS: tl.constexpr):
+    """Adds to the sums [C, COLUMNS] the friction columns (`add_friction`) of velocities v - V, which are `v`."""
+    column = tl.arange(0, 4)[None, :]
+    value = 0.0 * v[0][:, None] + 0.0 * column
+    square = 0.0 * v[0]
+    for i in tl.static_range(3):
+        w = (v[i] + tl.load(gravity + scene * 3 + i, mask=live, other=0.0)) / tl.load(scale)
+        value = with_column(value, i, w)
+        square += w * w
+    value = with_column(value, 3, square)
+    at = sums + cell[:, :, None] * COLUMNS + 12 + column[:, None, :]
+    there = (cell >= 0)[:, :, None] & (column >= 0)[:, None, :]
+    tl.atomic_add(at, share[:, :, None] * value[:, None, :], mask=there, sem="relaxed")
+
+
+@triton.jit
 def prepare_relative_features(
     velocity, scene_of, material_of, gravity, particle_count, scale, cell_of, weight_of, coarsest_of, share_of, motion,
-    parent, geometry, features, touch_of, disturbed, felt, parameter_of, quiet,
+    parent, geometry, features, touch_of, disturbed, felt, parameter_of, surface_of, drift, friction, quiet,
     HISTORY: tl.constexpr, LEVELS: tl.constexpr, NORMALS: tl.constexpr, FRICTION: tl.constexpr,
-    FRICTION_AT: tl.constexpr, PARAMETERS: tl.constexpr, PARAMETERS_AT: tl.constexpr,
-    FEATURES: tl.constexpr, OVERLAP: tl.constexpr, BLOCK: tl.constexpr,
+    FRICTION_AT: tl.constexpr, PARAMETERS: tl.constexpr, PARAMETERS_AT: tl.constexpr, MOVING: tl.constexpr,
+    COLUMNS: tl.constexpr, FEATURES: tl.constexpr, OVERLAP: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Writes the features [N, FEATURES] of each particle that no boost and no shift changes.
 
@@ -169,6 +199,7 @@ def prepare_relative_features(
     surfaces and the FRICTION columns from FRICTION_AT on, which prepare_particles wrote; the one-hot material; and the
     PARAMETERS columns of `parameter_of` from PARAMETERS_AT on. Differences of velocity are asinh of multiples of
     `scale`. Raises column 0 of the coarsest cells' `disturbed` [C, 2] to their particles' disturbance, times FULLY.
+    With MOVING the velocity near a surface is relative to it, and is added to `friction` [C, COLUMNS] (`_add_slip`).
 
     Rule: hgn.network.relative; test: tests/kernels/test_network.py.
     """
@@ -211,12 +242,24 @@ def prepare_relative_features(
             cell = tl.maximum(tl.load(parent + first + cell, mask=corners, other=0), 0)
     is_contact = here & ((column >= CONTACT) & (column < WALLS))[None, :]
     v = tl.load(velocity + row[:, None] * (3 * HISTORY) + axis[None, :], mask=is_contact, other=0.0)
-    value = tl.where(is_contact, v, value)
-    value = _asinh(tl.div_rn(value, tl.load(scale) + tl.zeros_like(value)))
     touch = tl.load(touch_of + row, mask=live, other=0.0)
     coarsest = tl.load(coarsest_of + row[:, None] * 8 + corner, mask=corners, other=-1)
     share = tl.load(share_of + row[:, None] * 8 + corner, mask=coarsest >= 0, other=0.0)
-    gate = tl.sum(share * tl.load(felt + coarsest * 2 + 1, mask=coarsest >= 0, other=0.0), 1)
+    share_felt = share * tl.load(felt + coarsest * 2 + 1, mask=coarsest >= 0, other=0.0)
+    gate = tl.sum(share_felt, 1)
+    if MOVING > 0:
+        around = three_columns(drift, coarsest, 4, coarsest >= 0, one_over(gate)[:, None] * share_felt, 8)
+        surface = three_columns(surface_of, row, 0, live, touch, 3)
+        slip = three_columns(velocity, row, 0, live, 1.0, 3 * HISTORY)
+        relative = ()
+        for i in tl.static_range(3):
+            own = slip[i] - (surface[i] + (1 - touch) * tl.sum(around[i], 1))
+            relative = relative + (own,)  # noqa: RUF005 - Triton knows no unpacking here
+            v = with_column(v, CONTACT + i, own)
+        if FRICTION > 0:
+            _add_slip(relative, gravity, scale, scene, live, coarsest, share, friction, COLUMNS)
+    value = tl.where(is_contact, v, value)
+    value = _asinh(tl.div_rn(value, tl.load(scale) + tl.zeros_like(value)))
     value = tl.where(is_contact, value * gate[:, None], value)
     moved = tl.where((column < CONTACT)[None, :], value / quiet, 0.0)
     raise_disturbed(disturbed, coarsest, tl.minimum(touch + tl.sum(moved * moved, 1), 1.0))

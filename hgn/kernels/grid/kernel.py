@@ -10,7 +10,7 @@ import triton
 import triton.language as tl
 
 from hgn.kernels.geometry import GEOMETRY_COLUMNS, raise_disturbed, split_slot
-from hgn.kernels.grid.surfaces import add_friction, surface_normals, surfaces_of
+from hgn.kernels.grid.surfaces import add_drift, add_friction, surface_normals, surfaces_of
 from hgn.kernels.triton_compat import gdc_launch_dependents, gdc_wait, settle_keys
 
 OVERFLOW = tl.constexpr(1)  # status bit: a level has more active cells than its capacity
@@ -259,11 +259,12 @@ def _coarsest_part(x, fraction, high, LEVELS: tl.constexpr):
 def prepare_particles(
     position, velocity, scene_of, origin, particle_count, low, geometry, occupied, prefix_sum, cell_of,
     weight_of, fraction_of, motion, coarsest_of, share_of, place_of, moments, domain, obstacle_table,
-    obstacle_cell_size, features, touch_of, disturbed, wall_friction, gravity, scale, friction, cell_size,
-    reach, capacity,
+    obstacle_cell_size, features, touch_of, disturbed, wall_friction, gravity, scale, friction, moving, poses, turn,
+    surface_of, drift, scenes, cell_size, reach, capacity,
     HISTORY: tl.constexpr, LEVELS: tl.constexpr, MOTION: tl.constexpr, COLUMNS: tl.constexpr,
     NORMALS: tl.constexpr, OBSTACLES: tl.constexpr, SYMMETRY: tl.constexpr, FEATURES: tl.constexpr,
-    FRICTION: tl.constexpr, FRICTION_AT: tl.constexpr, OVERLAP: tl.constexpr, BLOCK: tl.constexpr,
+    FRICTION: tl.constexpr, FRICTION_AT: tl.constexpr, MOVING: tl.constexpr, OVERLAP: tl.constexpr,
+    BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Writes the 8 finest cells of each particle, its weights in them, and its fraction within the lowest cell.
 
@@ -273,7 +274,8 @@ def prepare_particles(
     (`motion` [.., 4]); places, their products xx, yy, zz, yz, xz, xy, and such products of normals to the coarsest
     (`moments` [C, COLUMNS]). It raises column 1 of their `disturbed` [C, 2] to at least the contact times FULLY.
     With FRICTION, the number of its columns, it writes these from FRICTION_AT on and adds to `friction` [C, COLUMNS]
-    (`add_friction`). OBSTACLES and SYMMETRY mean the same as in prepare_features.
+    (`add_friction`). With MOVING (`surfaces_of`) it writes V to `surface_of` [N, 3], and sums of V to `drift` [C, 8]
+    (`add_drift`). OBSTACLES and SYMMETRY mean the same as in prepare_features.
 
     Rule: hgn.network.grid.build_hierarchy and hgn.network.relative; test: tests/kernels/test_network.py.
     """
@@ -286,9 +288,9 @@ def prepare_particles(
     live = row < count
     scene = tl.load(scene_of + row, mask=live, other=0)
     if MOTION:
-        surfaces, touch = surfaces_of(
-            position, velocity, domain, row, live, scene, obstacle_table, obstacle_cell_size, reach,
-            HISTORY, OBSTACLES, SYMMETRY, 4 if FRICTION > 0 else 3,
+        surfaces, touch, surface = surfaces_of(
+            position, velocity, domain, row, live, scene, obstacle_table, obstacle_cell_size, reach, moving, poses,
+            turn, scenes, HISTORY, OBSTACLES, SYMMETRY, 4 if FRICTION > 0 else 3, MOVING,
         )  # fmt: skip
         tl.store(touch_of + row, touch, mask=live)
         column = tl.arange(0, 16)[None, :]
@@ -351,8 +353,12 @@ def prepare_particles(
         if FRICTION > 0:
             add_friction(
                 surfaces, velocity, wall_friction, gravity, scale, scene, row, live, coarsest, share, friction,
-                features + row * FEATURES + FRICTION_AT, HISTORY, FRICTION > 3, COLUMNS,
+                features + row * FEATURES + FRICTION_AT, HISTORY, FRICTION > 3, MOVING, COLUMNS,
             )  # fmt: skip
+        if MOVING > 0:
+            add_drift(touch, surface, coarsest, share, drift)
+            for i in tl.static_range(3):
+                tl.store(surface_of + row * 3 + i, surface[i], mask=live)
     if OVERLAP:
         gdc_wait()  # only the next kernels read the tables that earlier kernels are filling
     # With cells past the capacity the frame is void, but no access may be out of bounds.

@@ -17,6 +17,7 @@ from hgn.config import MATERIAL_EMBEDDING, NetworkConfig
 from hgn.kernels.coarsest import kernel as coarsest_kernel
 from hgn.kernels.features import kernel as feature_kernel
 from hgn.kernels.grid import kernel
+from hgn.kernels.moving import MovingTable, arguments_of
 from hgn.kernels.scene_tables import SceneTable
 from hgn.kernels.triton_compat import interpreting, overlaps
 from hgn.network import elastic
@@ -163,10 +164,12 @@ class DeviceGrid:
         self.low = torch.tensor(window.low, dtype=torch.int32, device=device)
         coarsest = self.capacities[-1] if relative else 0
         self._widths, self.friction, rough = physics_widths(config), 0, coarsest * ("friction" in config.own_physics)
-        parts = [4 * at if relative else 4, *[SUMS * coarsest] * 3, SUMS * rough, 2 * coarsest, start, *more]
-        self._cleared = integers(sum(parts))  # one launch clears all parts
-        motion, *sums, moments, friction, disturbed, self.occupied = self._cleared.split(parts)[:7]
-        self.more_cleared = self._cleared.split(parts)[7:]
+        drifting = coarsest * ("moving" in config.own_physics)
+        parts = [4 * at if relative else 4, *[SUMS * coarsest] * 3, SUMS * rough, 2 * coarsest, start, 8 * drifting]
+        self._cleared = integers(sum(parts) + sum(more))  # one launch clears all parts
+        cleared = self._cleared.split([*parts, *more])
+        motion, *sums, moments, friction, disturbed, self.occupied, drift = cleared[: len(parts)]
+        self.more_cleared = cleared[len(parts) :]
         self.prefix_sum = integers(start)
         self.slot_of_cell, self._parent, self._octant = integers(at), integers(at), integers(at)
         self._neighbour, self._children = integers(6 * at), integers(8 * at)
@@ -180,6 +183,8 @@ class DeviceGrid:
         self.share_N8 = torch.zeros(particles * relative, 8, device=device)
         self.place_N3 = torch.zeros(particles * relative, 3, device=device)
         self.touch_N = torch.zeros(particles * relative, device=device)
+        self.surface_N3 = torch.zeros(particles * (drifting > 0), 3, device=device)
+        self.drift_C8 = drift.view(torch.float32).view(-1, 8)
         self.motion_C4, self.moment_C = motion.view(torch.float32).view(-1, 4), moments.view(torch.float32)
         self.sum_C, self.gradient_sum_C, self.friction_C = (
             x.view(torch.float32).view(-1, SUMS) for x in (*sums, friction)
@@ -234,8 +239,9 @@ class DeviceGrid:
         scale: tuple[torch.Tensor, torch.Tensor],
         obstacles: SceneTable | None,
         symmetry: bool = False,
+        moving: MovingTable | None = None,
     ) -> None:
-        """Computes the cells and the features of every particle. Without `obstacles` normals are zero.
+        """Computes the cells and the features of every particle. Without `obstacles` and `moving` normals are zero.
 
         `scale` is Normaliser.feature_scale. With `symmetry` the kernel applies the symmetries in the obstacles' rows.
         """
@@ -243,11 +249,14 @@ class DeviceGrid:
         walls, parameter_NP, column = particles.wall_friction_S3, particles.parameter_NP, own_physics_column(config)
         self.friction = self._widths[0] if walls is not None else 0
         own_physics = {"FRICTION": self.friction, "FRICTION_AT": column}
+        drift: dict[str, Any] = {"surface_of": self.surface_N3, "drift": self.drift_C8}
+        drift["MOVING"] = moving.layers if moving is not None and config.obstacle_features else 0
         surfaces: dict[str, Any] = {
             "position": particles.position_N3, "velocity": particles.velocity_NV, "scene_of": particles.scene_N,
             "domain": particles.domain_S3, "particle_count": particles.count,
             "obstacle_table": obstacles.row_SC if obstacles else particles.count,
-            "obstacle_cell_size": obstacles.cell_size if obstacles else 1.0, "features": self.feature_NF,
+            "obstacle_cell_size": next((table.cell_size for table in (obstacles, moving) if table), 1.0),
+            "features": self.feature_NF,
             "HISTORY": config.velocity_history, "NORMALS": int(config.obstacle_features),
             "OBSTACLES": config.obstacle_features and obstacles is not None, "SYMMETRY": symmetry,
             "FEATURES": self.features, "BLOCK": PARTICLE_BLOCK,
@@ -267,7 +276,8 @@ class DeviceGrid:
             disturbed=self.disturbed_C2, wall_friction=particles.domain_S3 if walls is None else walls,
             gravity=particles.gravity_S3, scale=scale[1], friction=self.friction_C, cell_size=self.cell_size,
             reach=CONTACT_REACH_CELLS * config.cell_size, capacity=self.capacities[0], LEVELS=self.levels,
-            MOTION=config.relative, COLUMNS=SUMS, **own_physics, OVERLAP=overlap, launch_pdl=overlap,
+            MOTION=config.relative, COLUMNS=SUMS, **own_physics, **drift, **arguments_of(moving, particles.count),
+            OVERLAP=overlap, launch_pdl=overlap,
         )  # fmt: skip
         if not config.relative:
             feature_kernel.prepare_features[blocks](
@@ -278,8 +288,8 @@ class DeviceGrid:
         feature_kernel.sum_motion[(triton.cdiv(self.capacities[0], MARK_BLOCK), 2)](
             motion=self.motion_C4, parent=self._parent, geometry=self.geometry, counts=self.counts_L,
             disturbed=self.disturbed_C2, felt=self.felt_C2, neighbour=self.neighbour(self.levels - 1),
-            coarsest_capacity=self.capacities[-1], LEVELS=self.levels, OVERLAP=overlap, BLOCK=MARK_BLOCK,
-            launch_pdl=overlap,
+            drift=self.drift_C8, coarsest_capacity=self.capacities[-1], LEVELS=self.levels, MOVING=drift["MOVING"],
+            OVERLAP=overlap, BLOCK=MARK_BLOCK, launch_pdl=overlap,
         )  # fmt: skip
         feature_kernel.prepare_relative_features[blocks](
             velocity=particles.velocity_NV, scene_of=particles.scene_N, material_of=particles.material_N,
@@ -291,7 +301,7 @@ class DeviceGrid:
             HISTORY=config.velocity_history,
             LEVELS=self.levels, NORMALS=int(config.obstacle_features), **own_physics,
             PARAMETERS=0 if parameter_NP is None else min(parameter_NP.shape[1], sum(self._widths[1:])),
-            PARAMETERS_AT=column + self._widths[0],
+            PARAMETERS_AT=column + self._widths[0], friction=self.friction_C, COLUMNS=SUMS, **drift,
             FEATURES=self.features, OVERLAP=overlap, BLOCK=PARTICLE_BLOCK, launch_pdl=overlap,
         )  # fmt: skip
 

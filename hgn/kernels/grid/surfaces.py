@@ -9,7 +9,9 @@ import triton
 import triton.language as tl
 
 from hgn.kernels.blocks import with_column
+from hgn.kernels.bodies import three_columns
 from hgn.kernels.obstacles import OBSTACLE_COLUMNS, obstacle_normals
+from hgn.kernels.poses import LATER, PLACE, POSES, RECORD, surface_motion, turned, undone
 from hgn.kernels.triton_compat import settle_keys
 from hgn.network.relative import STEPS_AHEAD, WALL_LIMIT
 
@@ -17,13 +19,54 @@ NEAREST, STEPS = tl.constexpr(WALL_LIMIT), tl.constexpr(STEPS_AHEAD)
 
 
 @triton.jit
-def surfaces_of(
-    position, velocity, domain, row, live, scene, obstacle_table, obstacle_cell_size, reach,
-    HISTORY: tl.constexpr, OBSTACLES: tl.constexpr, SYMMETRY: tl.constexpr, ROW: tl.constexpr,
+def _with_moving(
+    normal, position, velocity, row, live, scene, moving, poses, turn, scenes, time, asked, obstacle_cell_size,
+    HISTORY: tl.constexpr, SYMMETRY: tl.constexpr, ROW: tl.constexpr, LAYERS: tl.constexpr,
 ):  # fmt: skip
-    """Returns two results. The first is [N, 16]: six nearnesses of walls, the normal at the particle, the normal ahead,
-    friction at the particle and ahead with ROW = 4, and zeros. The second is the contact of the particle [N]: 0 if no
-    surface is within reach, at most 1."""
+    """Returns `normal`, the columns of obstacles at rest at fractions `time` of paths [N, 8], merged with those of
+    LAYERS moving obstacles (MovingObstacles.met): the normal, friction, and V."""
+    place = three_columns(position, row, 0, live, 1.0, 3)
+    v = three_columns(velocity, row, 0, live, 1.0, 3 * HISTORY)
+    nx, ny, nz, none = normal[0], normal[1], normal[2], 0.0 * time
+    rough = normal[3] if ROW > 3 else none
+    ux, uy, uz = none, none, none
+    count = ((nx != 0) | (ny != 0) | (nz != 0)).to(tl.float32)
+    first = tl.load(turn) * scenes * LAYERS
+    for layer in range(LAYERS):
+        number = (first + layer * scenes + scene).to(tl.int64)
+        pose = poses + number * (2 * RECORD) + POSES
+        own, surface = undone(pose, place, live, 0, PLACE), surface_motion(pose, place, live)
+        way = turned(pose + LATER, (v[0] - surface[0], v[1] - surface[1], v[2] - surface[2]), live, True)
+        x = own[0][:, None] + way[0][:, None] * time
+        y = own[1][:, None] + way[1][:, None] * time
+        z = own[2][:, None] + way[2][:, None] * time
+        line = moving + (number * RECORD)[:, None] + 0 * time.to(tl.int32)
+        seen = obstacle_normals(x, y, z, line, asked, obstacle_cell_size, SYMMETRY, ROW)
+        there = ((seen[0] != 0) | (seen[1] != 0) | (seen[2] != 0)).to(tl.float32)
+        own = turned(pose[:, None] + 0 * time.to(tl.int32), seen, asked, False)
+        count += there
+        nx, ny, nz = nx + there * own[0], ny + there * own[1], nz + there * own[2]
+        if ROW > 3:
+            rough += there * seen[3]
+        ux += there * surface[0][:, None]
+        uy += there * surface[1][:, None]
+        uz += there * surface[2][:, None]
+    # Several normals are shortened to 1, the others are means.
+    longer = tl.where(count > 1, tl.maximum(nx * nx + ny * ny + nz * nz, 1.0), 1.0)
+    scale, part = 1 / tl.sqrt_rn(longer), 1 / tl.maximum(count, 1.0)
+    return nx * scale, ny * scale, nz * scale, rough * part, ux * part, uy * part, uz * part
+
+
+@triton.jit
+def surfaces_of(
+    position, velocity, domain, row, live, scene, obstacle_table, obstacle_cell_size, reach, moving, poses, turn,
+    scenes, HISTORY: tl.constexpr, OBSTACLES: tl.constexpr, SYMMETRY: tl.constexpr, ROW: tl.constexpr,
+    MOVING: tl.constexpr,
+):  # fmt: skip
+    """Returns three results. The first is [N, 16]: six nearnesses of walls, the normal at the particle, the normal
+    ahead, friction at the particle and ahead with ROW = 4, and zeros. The second is the contact of the particle [N]: 0
+    if no surface is within reach, at most 1. The third are three components of V [N] (hgn.network.moving), with MOVING,
+    the largest number of moving obstacles of a scene."""
     column = tl.arange(0, 16)
     axis, upper, walls = column % 3, (column >= 3)[None, :], live[:, None] & (column < 6)[None, :]
     v = tl.load(velocity + row[:, None] * (3 * HISTORY) + axis[None, :], mask=walls, other=0.0)
@@ -32,18 +75,28 @@ def surfaces_of(
     distance = tl.where(upper, size - place, place) + tl.minimum(tl.where(upper, -v, v), 0.0)
     value = tl.where(walls, tl.minimum(tl.maximum(1 - distance / reach, 0.0), NEAREST), 0.0)
     touch = tl.minimum(2 * tl.max(value, 1), 1.0)
-    if OBSTACLES:
+    surface = touch, touch, touch
+    if OBSTACLES or MOVING > 0:
         # The probes are the present position, and steps along the path to the next frame.
         quarters = tl.arange(0, 8)[None, :]
         asked = live[:, None] & (quarters <= STEPS)
-        at = position + row[:, None] * 3 + 0 * quarters
-        v_at = velocity + row[:, None] * (3 * HISTORY) + 0 * quarters
         time = quarters.to(tl.float32) / STEPS
-        x = tl.load(at, mask=asked, other=0.0) + tl.load(v_at, mask=asked, other=0.0) * time
-        y = tl.load(at + 1, mask=asked, other=0.0) + tl.load(v_at + 1, mask=asked, other=0.0) * time
-        z = tl.load(at + 2, mask=asked, other=0.0) + tl.load(v_at + 2, mask=asked, other=0.0) * time
-        line = obstacle_table + scene[:, None] * OBSTACLE_COLUMNS + 0 * quarters
-        normal = obstacle_normals(x, y, z, line, asked, obstacle_cell_size, SYMMETRY, ROW)
+        if OBSTACLES:
+            at = position + row[:, None] * 3 + 0 * quarters
+            v_at = velocity + row[:, None] * (3 * HISTORY) + 0 * quarters
+            x = tl.load(at, mask=asked, other=0.0) + tl.load(v_at, mask=asked, other=0.0) * time
+            y = tl.load(at + 1, mask=asked, other=0.0) + tl.load(v_at + 1, mask=asked, other=0.0) * time
+            z = tl.load(at + 2, mask=asked, other=0.0) + tl.load(v_at + 2, mask=asked, other=0.0) * time
+            line = obstacle_table + scene[:, None] * OBSTACLE_COLUMNS + 0 * quarters
+            normal = obstacle_normals(x, y, z, line, asked, obstacle_cell_size, SYMMETRY, ROW)
+        else:
+            none = 0.0 * time + 0.0 * touch[:, None]
+            normal = none, none, none, none
+        if MOVING > 0:
+            normal = _with_moving(
+                normal, position, velocity, row, live, scene, moving, poses, turn, scenes, time + 0.0 * touch[:, None],
+                asked, obstacle_cell_size, HISTORY, SYMMETRY, ROW, MOVING,
+            )  # fmt: skip
         found = (normal[0] != 0) | (normal[1] != 0) | (normal[2] != 0)
         ahead = tl.min(tl.where(found & (quarters > 0), quarters, 8), 1)
         for i in tl.static_range(ROW):
@@ -51,7 +104,12 @@ def surfaces_of(
             there = tl.sum(tl.where(quarters == ahead[:, None], normal[i], 0.0), 1)
             value = with_column(value, 9 + i if i < 3 else 13, there)
         touch = tl.where(tl.max(found.to(tl.int32), 1) > 0, 1.0, touch)
-    return value, touch
+        if MOVING > 0:
+            here = tl.max((found & (quarters == 0)).to(tl.int32), 1) > 0
+            met = found & (quarters == tl.where(here, 0, ahead)[:, None])
+            surface = tl.sum(tl.where(met, normal[4], 0.0), 1), tl.sum(tl.where(met, normal[5], 0.0), 1)
+            surface = surface + (tl.sum(tl.where(met, normal[6], 0.0), 1),)  # noqa: RUF005 - Triton knows no unpacking
+    return value, touch, surface
 
 
 @triton.jit
@@ -81,13 +139,14 @@ def surface_normals(surfaces):
 @triton.jit
 def add_friction(
     surfaces, velocity, wall_friction, gravity, scale, scene, row, live, cell, share, sums, features,
-    HISTORY: tl.constexpr, NORMALS: tl.constexpr, COLUMNS: tl.constexpr,
+    HISTORY: tl.constexpr, NORMALS: tl.constexpr, MOVING: tl.constexpr, COLUMNS: tl.constexpr,
 ):  # fmt: skip
     """Writes the columns of friction to `features` [N]: the obstacle cells' with NORMALS, then the walls'.
 
     Adds to the sums [C, COLUMNS], with the particles' weights `share` in their coarsest cells: products xx, yy, zz, yz,
     xz, xy of obstacle normals times friction; nearness of the six walls times friction; velocity plus gravity; and its
-    square. Rule: hgn.network.own_physics.surface_friction; test: tests/kernels/test_network.py.
+    square. With MOVING prepare_relative_features adds the last two, because V of particles of a pile is not known yet.
+    Rule: hgn.network.own_physics.surface_friction; test: tests/kernels/test_network.py.
     """
     column = tl.arange(0, COLUMNS)[None, :]
     x, y, z, rough = _first(surfaces, 4)
@@ -106,14 +165,27 @@ def add_friction(
         tl.store(features + 2 * NORMALS + i, tl.maximum(lower, upper) * wall, mask=live)
         value = with_column(value, 6 + i, tl.minimum(2 * lower, 1.0) * wall)
         value = with_column(value, 9 + i, tl.minimum(2 * upper, 1.0) * wall)
-        v = tl.load(velocity + row * (3 * HISTORY) + i, mask=live, other=0.0)
-        v = (v + tl.load(gravity + scene * 3 + i, mask=live, other=0.0)) / tl.load(scale)
-        value = with_column(value, 12 + i, v)
-        square += v * v
+        if MOVING == 0:
+            v = tl.load(velocity + row * (3 * HISTORY) + i, mask=live, other=0.0)
+            v = (v + tl.load(gravity + scene * 3 + i, mask=live, other=0.0)) / tl.load(scale)
+            value = with_column(value, 12 + i, v)
+            square += v * v
     value = with_column(value, 15, square)
     at = sums + cell[:, :, None] * COLUMNS + column[:, None, :]
     added = share[:, :, None] * value[:, None, :]
     tl.atomic_add(at, added, mask=(cell >= 0)[:, :, None] & (column >= 0)[:, None, :], sem="relaxed")
+
+
+@triton.jit
+def add_drift(touch, surface, cell, share, drift):
+    """Adds to columns 0 to 3 of the coarsest cells' `drift` [C, 8] contacts of particles times V, and contacts."""
+    column = tl.arange(0, 4)[None, :]
+    value = tl.where(column == 3, touch[:, None], 0.0)
+    for i in tl.static_range(3):
+        value = with_column(value, i, touch * surface[i])
+    there = ((cell >= 0) & (touch > 0)[:, None])[:, :, None] & (column >= 0)[:, None, :]
+    at = drift + cell[:, :, None] * 8 + column[:, None, :]
+    tl.atomic_add(at, share[:, :, None] * value[:, None, :], mask=there, sem="relaxed")
 
 
 settle_keys(globals())

@@ -15,6 +15,7 @@ import triton
 
 from hgn.kernels.buffers import OUT
 from hgn.kernels.grid.op import PARTICLE_BLOCK, SUMS, DeviceGrid, DeviceParticles, Window
+from hgn.kernels.moving import MovingTable, arguments_of
 from hgn.kernels.scene_tables import SceneTable
 from hgn.kernels.step import kernel
 from hgn.kernels.triton_compat import overlaps
@@ -104,6 +105,7 @@ class DeviceStep:
         lost: torch.Tensor,
         frame: torch.Tensor,
         path_TN3: torch.Tensor,
+        moving: MovingTable | None = None,
     ) -> None:
         """Moves the particles by a rested output between walls and outside obstacles, and counts the frame.
         `normaliser` is the mean and standard deviation of accelerations."""
@@ -119,7 +121,8 @@ class DeviceStep:
             within=(1 - SLACK) * clearance, slack=SLACK * clearance, least_crease=LEAST_CREASE, OUT=OUT,
             HISTORY=config.velocity_history, COLUMNS=1 << (3 * config.velocity_history - 1).bit_length(),
             WALLED_AXES=0 if step.wall_clearance is None else config.dimensions,
-            SURFACES=0 if self.barriers is None else SURFACES, OVERLAP=overlap, BLOCK=INTEGRATE_BLOCK,
-            launch_pdl=overlap,
+            SURFACES=0 if self.barriers is None else SURFACES, **arguments_of(moving, particles.count),
+            MOVING=0 if moving is None or self.barriers is None else moving.layers, OVERLAP=overlap,
+            BLOCK=INTEGRATE_BLOCK, launch_pdl=overlap,
         )  # fmt: skip
         kernel.advance[(1,)](status=status, lost=lost, frame=frame, OVERLAP=overlap, num_warps=1, launch_pdl=overlap)

@@ -22,6 +22,7 @@ from hgn.config import CORRELATED_WAVELENGTHS, CORRELATED_WAVES, TrainingConfig
 from hgn.kernels.backward import FusedTrainingNetwork
 from hgn.kernels.capture import captured
 from hgn.kernels.grid.op import OUT_OF_WINDOW, DeviceGrid, DeviceParticles, Window
+from hgn.kernels.moving import NONE_MOVES, EpisodeMoving, MovingTable
 from hgn.kernels.muon.op import SquareBlocks
 from hgn.kernels.packing import pack_network
 from hgn.kernels.scene_tables import OBSTACLE_COLUMNS, SceneHash, SceneTable
@@ -35,8 +36,7 @@ from hgn.schema import ConfigError
 SAMPLE_COLUMNS = kernel.SAMPLE_COLUMNS.value
 GROWTH = 1.25
 TABLE_UPDATES = 64  # smallest capacity of the tables, in updates; a larger table needs a new capture of the graph
-BLOCK = 128
-FLAT_BLOCK = 1024
+BLOCK, FLAT_BLOCK = 128, 1024
 TAIL = 16  # number of extra elements after the gradient; the first one reports an overflow to the other ranks
 
 
@@ -57,6 +57,8 @@ class DeviceEpisode:
     wall_friction: Vector = (0.0, 0.0, 0.0)  # friction of the walls across x, y, z
     parameter_NP: torch.Tensor | None = None  # float32, columns of hgn.network.own_physics; None: all are 0
     rest: RestShape | None = None  # None: no elastic bodies
+    moving: EpisodeMoving = NONE_MOVES
+    first_frame: int = 0  # number of the episode's frame that follows the frames before frame 0
 
     def __post_init__(self) -> None:
         position_TN3, material_N = self.position_TN3, self.material_N
@@ -161,6 +163,7 @@ class Updates:
         sees = self.config.obstacle_features
         table = SceneTable([None] * scenes, OBSTACLE_COLUMNS, device, settings.obstacle_cell_size)
         self.obstacles, self._obstacle_row = table if sees else None, table.row_SC
+        self.moving: MovingTable | None = None
         mean_3, std_3 = normaliser.feature_scale(self.config.relative)
         self.scale = (mean_3.float(), std_3.float())
         self.mean, self.std = normaliser.acceleration_mean.float(), normaliser.acceleration_std.float()
@@ -245,18 +248,29 @@ class Updates:
         self._samples[: len(chunk)].copy_(torch.from_numpy(table))
         self._vectors[: len(chunk)].copy_(torch.from_numpy(vectors).view(*count.shape, 3, 3))
         self._rates[: len(chunk)].copy_(torch.tensor(rates, dtype=torch.float64))
+        moving = [(s.episode.moving, s.episode.first_frame + s.frame) for s in flat]
+        self.allocate_moving(max(len(own.obstacles) for own, _ in moving))
+        if self.moving is not None:
+            self.moving.write(moving, shown)
         self.update.zero_()
         largest = torch.from_numpy(vectors[:, 0]).amax(0)
         self._reach = (self._reach[0], torch.maximum(self._reach[1], largest))
         return most
+
+    def allocate_moving(self, layers: int) -> None:
+        """Allocates records for `layers` moving obstacles of a scene, if there are not enough, for each update."""
+        table, updates = self.moving, len(self._rates)
+        layers = layers if table is None else max(layers, table.layers)
+        if layers and (table is None or layers > table.layers or updates > len(table.record_TVR)):
+            self._graphs, size = [], self.settings.obstacle_cell_size  # the graphs read the old records
+            self.moving = MovingTable(self.update, updates, self.settings.scenes, layers, size)
 
     def _allocate_tables(self, length: int) -> None:
         self._graphs = []  # the graphs read the old tables
         shape = (length, self.settings.scenes)
         self._samples = torch.zeros(*shape, SAMPLE_COLUMNS, dtype=torch.int64, device=self.device)
         self._vectors = torch.zeros(*shape, 3, 3, device=self.device)
-        self._rates = torch.zeros(length, device=self.device)
-        self._shares = torch.zeros(length, device=self.device)
+        self._rates, self._shares = (torch.zeros(length, device=self.device) for _ in range(2))
 
     def _replay(self) -> None:
         if self.device.type == "cuda" and not self._graphs:
@@ -367,13 +381,9 @@ class Updates:
     def _grid(self) -> None:
         """Builds the grid, and computes the cells and the features of the particles."""
         self.grid.build(self.buffers)
-        self.grid.prepare(self.buffers, self.scale, self.obstacles, self.settings.symmetry)
+        self.grid.prepare(self.buffers, self.scale, self.obstacles, self.settings.symmetry, self.moving)
 
     # window and buffers
-
-    def _window(self) -> Window:
-        config, (lower, upper) = self.config, self._reach
-        return Window.around(lower.tolist(), upper.tolist(), config.cell_size, config.levels)
 
     def _inside(self, reach: tuple[torch.Tensor, torch.Tensor]) -> bool:
         return bool((self._built_reach[0] <= reach[0]).all() and (self._built_reach[1] >= reach[1]).all())
@@ -396,17 +406,16 @@ class Updates:
             self.grid.build(self.buffers)
             self.capacities = self._rounded(self.grid.needed_L.tolist())
         self.grid = self._device_grid(self.capacities)
-        self.fused = self._fused_network()
-
-    def _fused_network(self) -> FusedTrainingNetwork:
         # The gradients of a mean over particles are small. float16 would round them to zero without a scale.
         scale = 2.0 ** round(math.log2(max(self.particles, 2))) if self.precision == "fp16" else 1.0
-        return FusedTrainingNetwork(
+        self.fused = FusedTrainingNetwork(
             self.packed, self.values, self.grid, self.buffers.count, self.precision, scale, tail=TAIL
         )
 
     def _device_grid(self, capacities: tuple[int, ...]) -> DeviceGrid:
-        return DeviceGrid(self.config, self._window(), capacities, self.settings.scenes, self.particles, self.device)
+        config, (lower, upper) = self.config, self._reach
+        window = Window.around(lower.tolist(), upper.tolist(), config.cell_size, config.levels)
+        return DeviceGrid(config, window, capacities, self.settings.scenes, self.particles, self.device)
 
     def _make_room(self, status: int, needed: list[int]) -> None:
         if status & OUT_OF_WINDOW:
