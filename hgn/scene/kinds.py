@@ -37,7 +37,7 @@ RANGES: dict[str, dict[str, tuple[float, float]]] = {
 }  # fmt: skip
 SCENE_KINDS = tuple(RANGES)
 # Kinds with a moving obstacle. With `moving` in scene.own_physics a fraction of the scenes is of one of them.
-MOVING_FRACTION = 1 / 3
+MOVING_FRACTION = 1 / 6
 FASTEST = 1.0  # largest speed of their obstacles, domain units per second
 MOVING_RANGES: dict[str, dict[str, tuple[float, float]]] = {
     "paddle": {"gap": (0.02, 0.1), "depth": (0.03, 0.12), "length": (0.2, 0.7), "speed": (0.1, FASTEST)},

@@ -17,7 +17,8 @@ from hgn.scene.kinds import FASTEST
 from hgn.scene.material import INPUT_PARAMETERS, LOGARITHMIC, acts_on
 from hgn.scene.scene import Scene
 
-SMOOTH, NOMINAL = 1 / 3, 1 / 2  # fractions of scenes without friction, and with the defaults of all parameters
+ORDINARY = 1 / 2  # fraction of scenes without friction and with the defaults of all parameters
+ALONE = 1 / 3  # of the others: fraction with friction only, and with parameters only
 ELASTIC = 1 / 6  # fraction of scenes with elastic bodies, half of them without other materials
 ELASTIC_KINDS = ("obstacles", "motion", "collision", "drop", "slope", "edge", "stack", "apart", "bowl", "stairs", "jet")
 _STREAM, _ELASTIC_STREAM = 6, 7  # keys of random streams; the scene's other numbers do not depend on them
@@ -56,12 +57,17 @@ def with_elastic_bodies(config: SceneConfig, seed: int) -> SceneConfig:
 
 
 def with_drawn_physics(scene: Scene, drawn: Sequence[str], seed: int) -> Scene:
-    """Returns a random scene with its own friction and parameters, which are also added to its specification."""
+    """Returns a random scene with its own friction and parameters, which are also added to its specification.
+
+    A fraction ORDINARY of the scenes has neither. With less, networks forget scenes without friction.
+    """
     rng = np.random.Generator(np.random.PCG64([seed, _STREAM]))
-    smooth, nominal = rng.random(2).tolist()
-    if "friction" in drawn and smooth >= SMOOTH:
+    ordinary, which = rng.random(2).tolist()
+    if ordinary < ORDINARY:
+        return scene
+    if "friction" in drawn and which < 1 - ALONE:
         scene = _rough(scene, rng)
-    if "parameters" in drawn and nominal >= NOMINAL:
+    if "parameters" in drawn and which >= ALONE:
         scene = _varied(scene, rng)
     return scene
 

@@ -180,6 +180,16 @@ def test_a_sixth_of_the_scenes_draws_elastic_bodies():
     assert digest(generate_scene(config, seed)) == digest(generate_scene(plain, seed))
 
 
+def test_half_of_the_scenes_draws_friction_or_parameters():
+    """A third each, a sixth both. Scenes with neither are the ones of a data set without own physics, bit by bit."""
+    plain = SceneConfig(domain_size=LARGEST, kinds={"drop": 1.0}, particles_per_cell=0.1)
+    scenes = [generate_scene(replace(plain, own_physics=("friction", "parameters")), seed) for seed in range(300)]
+    rough, varied = [any(s.wall_friction) for s in scenes], [bool(s.material_parameters) for s in scenes]
+    assert 75 < sum(rough) < 125 and 75 < sum(varied) < 125 and 30 < sum(map(min, rough, varied)) < 70
+    seed = next(seed for seed in range(300) if not (rough[seed] or varied[seed]))
+    assert digest(scenes[seed]) == digest(generate_scene(plain, seed))
+
+
 def test_kinds_belong_to_the_identity_of_a_data_set():
     plain, world = DatagenConfig(), DatagenConfig(scene=SceneConfig(kinds={"pool": 1.0}))
     assert "kinds" not in dataset_identity(plain)["scene"]

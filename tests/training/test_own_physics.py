@@ -44,10 +44,10 @@ def test_from_shards_to_a_rollout(make_config, make_dataset, tmp_path, monkeypat
     store = EpisodeStore(make_dataset(config), "train")
     episodes = [store[i] for i in range(12)]
     rough = [any(episode.wall_friction) for episode in episodes]
-    assert 3 < sum(rough) < 12 and 2 < sum(episode.parameters is not None for episode in episodes) < 10
+    assert 1 < sum(rough) < 10 and 1 < sum(episode.parameters is not None for episode in episodes) < 10
     drawn = {scene.seed: scene for scene in scenes}
     inputs = NetworkConfig(inputs="local", own_physics=OWN)
-    assert sum(make_batch([(episode, 3)], inputs).moving is not None for episode in episodes) > 1
+    assert sum(make_batch([(episode, 3)], inputs).moving is not None for episode in episodes) > 0
     for episode in episodes:
         scene, members = drawn[episode.seed], encode_episode(episode)
         assert encode_episode(decode_episode(episode.key, members)) == members
