@@ -16,10 +16,10 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 32_947,
+    "hgn": 32_953,
     "datagen": 8_439,
     "tools": 6_563,
-    "tests": 31_561,
+    "tests": 31_571,
 }
 SETTINGS = 240  # fields of the dataclasses behind the commands, *Config
 
