@@ -9,10 +9,13 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from data.foreign_writers import metadata, write
 from network.states import gns_of, network_of, random_grid
 
 import datagen.mpm.solver
 from datagen.mpm.solver import SceneFailure, Simulated
+from hgn.data.foreign.dataset import import_set
+from hgn.data.foreign.settings import ImportConfig
 from hgn.data.reader import EpisodeStore
 from hgn.runtime.weights import WeightsInfo, save_weights
 from hgn.schema import ConfigError
@@ -336,3 +339,13 @@ def test_weights_that_do_not_fit(compare, tmp_path, monkeypatch):
     ):
         with pytest.raises(ConfigError, match=message):
             compare(weights=[name])
+
+
+def test_imported_sets_are_refused(compare, tmp_path):
+    """An imported set has no solver that could simulate it again; the message names the command that measures it."""
+    path = np.full((9, 4, 3), 0.5, np.float32)
+    scenes = [(path, np.full(4, 5), np.zeros((0, 3), np.float32))]
+    source = write(tmp_path / "foreign", "plain", {"train": scenes, "valid": scenes}, metadata())
+    import_set(source, ImportConfig(out=str(tmp_path / "mine"), materials={"5": "water"}, gravity=(0.0, -9.8, 0.0)))
+    with pytest.raises(ConfigError, match="data must be a set of python -m datagen, .*mine.*; .*hgn.evaluate"):
+        compare(data=str(tmp_path / "mine"))

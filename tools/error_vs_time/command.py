@@ -54,6 +54,8 @@ def main(mapping: dict[str, Any]) -> int:
     Path(config.out).parent.mkdir(parents=True, exist_ok=True)
     device = choose_device(config.device)
     store = EpisodeStore(config.data, config.split)
+    remedy = "take python -m hgn.evaluate for imported sets"
+    require("mpm" in store.manifest.config, "data", "a set of python -m datagen", config.data, remedy)
     episodes = first_episodes(store, config.scenes)
     frames = min(config.frames, *(len(episode.position_TN3) for episode in episodes))
     finer = store.manifest.config.get("reference")
