@@ -1,8 +1,8 @@
-"""Computes the order of training samples: a pure function of seed, epoch, episodes, window, batch and world size.
+"""Computes the order of training samples: a pure function of seed, epoch, episodes and window.
 
 A sample is one frame of one episode. An epoch is a permutation of all samples of the episodes that were published when
-it began. Epochs follow each other without a gap. Every sample comes exactly once an epoch on any number of ranks.
-All batches have one size. A `SamplerState` is the whole state of the order.
+it began. Batch size and number of ranks only divide the order: every sample is used exactly once per epoch. All batches
+have the same size, so a batch may span two epochs. A `SamplerState` is the whole state of the order.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ class SamplerState:
     seed: int | None = None  # seed of the order; None: unknown (checkpoints of 0.1.0)
 
 
-class Sample(NamedTuple):  # faster to construct than a dataclass; a thousand are drawn a second
+class Sample(NamedTuple):  # faster to construct than a dataclass; a thousand are drawn per second
     """Names frame n of an episode. The network sees frames up to n and predicts the acceleration to frame n + 1."""
 
     episode: int
@@ -43,8 +43,9 @@ BLOCK_EPISODES = 8  # consecutive episodes in publication order; this is the siz
 
 
 def epoch_order(seed: int, epoch: int, first_sample: np.ndarray, window: int = 0) -> np.ndarray:
-    """Returns the order of an epoch, int64 [samples]. `first_sample` is each episode's first sample, then the total.
+    """Returns the order of an epoch, int64 [samples].
 
+    `first_sample` [episodes + 1] is the index of each episode's first sample; its last entry is the number of samples.
     Without a `window` all samples are shuffled together. With one, the blocks of BLOCK_EPISODES are shuffled, and then
     the samples within each window of blocks. A rank then needs the shards of at most two windows at a time, and each
     shard once per epoch (twice if it is in two blocks).

@@ -1,7 +1,7 @@
 """Friction of surfaces, parameters and elastic bodies as inputs of a network with relative inputs.
 
 `network.own_physics` names them. They are the last columns of the encoder, and 0 without friction and for the solver's
-default parameters. If all are 0, they are not computed; the result is the same. docs/concepts/method.md derives all.
+default parameters. If all are 0, they are not computed; the result is the same. See docs/concepts/method.md.
 
 | columns | value | only with |
 |---|---|---|
@@ -10,13 +10,16 @@ default parameters. If all are 0, they are not computed; the result is the same.
 | P | INPUT_PARAMETERS of the particle's material, 0 for those of others (`scaled_parameters`) | parameters |
 | 9 | deformation of elastic bodies (hgn.network.elastic) | elastic |
 
-In `relative.balanced` surfaces without friction remove T = Q R from a cell's mean acceleration. Friction keeps k T:
+A cell's matrix P (`relative.touched_normals`) is the sum of a_s n_s n_s^T over surfaces s with normals n_s and weights
+a_s. With Q = (1 + P / e)^-1, e = FEW + RARE tr P, surfaces without friction remove T = Q R from the mean acceleration R
+(`relative.balanced`). R - T = P y with y = T / e, so surface s pushes with a_s (n_s . y) n_s. Friction mu_s keeps k T:
 
-    k = min(1, |B| / |T|, b),    B = sum_s mu_s a_s (n_s . y) n_s,    y = T / (FEW + RARE tr P)
+    k = min(1, |B| / |T|, b),    B = sum_s mu_s a_s (n_s . y) n_s
 
-Here s are the surfaces of `relative.surface_normals`, a_s is the sum of their weights in the cell, and mu_s their
-friction. b is the largest number with |b c Q T + Q u / 2|^2 <= (|Q u|^2 + D) / 4, with c = d_C t_C. u is the velocity
-along surfaces after a frame without friction, Q (v + g + d_C A_C), and D the variance of v in the cell; units of s_a.
+b is the largest number with |b c Q T + Q u / 2|^2 <= (|Q u|^2 + D) / 4, with c = d_C t_C. u is the velocity along
+surfaces after a frame without friction, Q (v + g + d_C A_C), and D the variance of v in the cell; units of s_a. Reason:
+friction changes the velocity of each particle by -l u_p, 0 <= l <= 1, so by a vector in the ball around -u_p / 2 with
+the radius |u_p| / 2. So the mean change lies in a ball around -u / 2 with a radius of at most sqrt(|u|^2 + D) / 2.
 With `moving` v is the velocity relative to the surfaces, v - V of hgn.network.moving. It adds no columns.
 Shape legend: N particles, C coarsest cells, S scenes, P parameters, K columns.
 """
@@ -81,9 +84,7 @@ def scaled_parameters(value_NP: torch.Tensor, material_N: torch.Tensor, material
     Viscosity, which is 0 by default, is log(1 + p / VISCOSITY_PA_S). Parameters of other materials are 0.
     """
     columns = []
-    for value_N, (name, nominal) in zip(
-        value_NP.unbind(-1), zip(INPUT_PARAMETERS, NOMINAL_P, strict=True), strict=True
-    ):
+    for value_N, name, nominal in zip(value_NP.unbind(-1), INPUT_PARAMETERS, NOMINAL_P, strict=True):
         change_N = (value_N - nominal) / (nominal or VISCOSITY_PA_S)  # exactly 0 for the default
         columns.append(torch.log1p(change_N) if name in LOGARITHMIC else change_N)
     acts_MP = torch.tensor([[acts_on(name, material) for name in INPUT_PARAMETERS] for material in materials])
@@ -97,7 +98,7 @@ def joined_parameters(parameters: Sequence[torch.Tensor | None], positions: Sequ
 
 
 def physics_fields(config: NetworkConfig, scenes: Sequence[Any], material_N: torch.Tensor) -> dict[str, Any]:
-    """Returns the fields of a ParticleState for several episodes or initial states, without those that are 0."""
+    """Returns the fields of a ParticleState for episodes or initial states. Fields that would be 0 are left out."""
     fields: dict[str, Any] = {}
     frictions = [scene.wall_friction for scene in scenes]
     if "friction" in config.own_physics and any(map(any, frictions)):

@@ -34,7 +34,7 @@ class LiveSimulation:
     def __init__(
         self, simulator: Simulator, scenes: InitialState | Scene | Sequence[InitialState | Scene], capacity: int = 0
     ) -> None:
-        """With a list, a scene that diverges ends: `ended` has its error by index, and its particles are removed.
+        """In a list only the scene that diverges ends. It loses its particles, and `ended[index]` is the error.
 
         `capacity` is the number of particles of all scenes for which backend triton allocates buffers. With more
         particles it captures its frame again, which takes about a second.
@@ -52,7 +52,7 @@ class LiveSimulation:
         self._barriers = [] if clearance is None else [scene.barrier(clearance) for scene in self.scenes]
         state = replace(state, barriers=self._joined(self._barriers))
         self.simulation = simulator.simulation(state, capacity, isolate=given is scenes)
-        self._changed: ParticleState | None = None  # what the next frame continues from, after changes
+        self._changed: ParticleState | None = None  # state from which the next frame starts; None without changes
 
     def __enter__(self) -> LiveSimulation:
         return self
@@ -149,7 +149,7 @@ class LiveSimulation:
         self._change_scene(index, gravity=gravity)
 
     def restore(self, position_N3: np.ndarray, velocity_NM3: np.ndarray, frame: int, index: int = 0) -> None:
-        """Restores an earlier frame of a scene's first particles. Particles that entered later are removed.
+        """Restores an earlier frame of a scene and the N particles that it had then. It loses those that entered later.
 
         Obstacles and gravity stay; keyframes continue from that frame. `frame` becomes the number of the last frame.
 
@@ -201,17 +201,16 @@ class LiveSimulation:
         """Changes a scene, but not its particles."""
         self._require_scene(index)
         scene = replace(self.scenes[index], **changes)
-        nothing: dict[str, Any] = {
-            name: getattr(scene, name)[:0] for name in ("position_N3", "velocity_N3", "material_N")
-        }
-        self._put(index, scene, self.state, self._started([replace(scene, **nothing, past_HN3=None, body_N=None)]))
+        arrays = ("position_N3", "velocity_N3", "material_N")
+        empty: dict[str, Any] = {name: getattr(scene, name)[:0] for name in arrays}
+        self._put(index, scene, self.state, self._started([replace(scene, **empty, past_HN3=None, body_N=None)]))
 
     def _put(
         self, index: int, scene: InitialState, kept: ParticleState, new: ParticleState, restart: bool = False
     ) -> None:
         """Replaces scene `index` by `scene`. The next frame has the particles of `kept` and of `new`, its start.
 
-        The motion of its obstacles starts again with `restart`, and if it has others.
+        Keyframes count from this frame with `restart`, and if `scene` has other moving obstacles than before.
         """
         before, scenes, barriers = self.scenes[index], [*self.scenes], [*self._barriers]
         scenes[index] = scene
@@ -226,7 +225,7 @@ class LiveSimulation:
             barriers[index] = scene.barrier(barriers[index].clearance)
             changed["barriers"] = self._joined(barriers)
         for name in ("domain_S3", "gravity_S3", "wall_friction_S3"):
-            values_S3, own_S3 = getattr(kept, name), getattr(new, name)  # no friction of walls: None
+            values_S3, own_S3 = getattr(kept, name), getattr(new, name)  # None without friction of walls
             if values_S3 is not None or own_S3 is not None:
                 changed[name] = torch.zeros_like(kept.domain_S3) if values_S3 is None else values_S3.clone()
                 changed[name][index] = 0 if own_S3 is None else own_S3[0]

@@ -33,6 +33,7 @@ def row_of(outcome: Outcome, more: dict[str, Any]) -> Row:
     count = sum(len(scene.position_N3) for scene in outcome.scenes)
     row: dict[str, Any] = {"particles": count, "scenes": len(outcome.scenes)}
     row |= {"domain_size": list(outcome.scenes[0].domain_size), "failed_scenes": len(causes)}
+    # whether the runtime reported positions that are not finite
     row["guard"] = "missed" if not all_finite else "raised" if causes else "not needed"
     row |= figures | {f"solver_{name}": value for name, value in references.items()} | more
     predicted, measured = case.frames, min(trial.frame_count for trial in outcome.trials)
@@ -44,7 +45,7 @@ def row_of(outcome: Outcome, more: dict[str, Any]) -> Row:
 
 
 def refused(case: Case, cause: str) -> list[Row]:
-    """Returns the rows of a case whose scenes the weights do not take."""
+    """Returns the rows of a case with scenes that the weights refuse."""
     if case.gallery is None:
         return [Row(case.name, _bound(case), "refused", False, cause)]
     bounds = case.gallery.measure.bounds
@@ -61,18 +62,18 @@ def gallery_rows(outcome: Outcome, more: dict[str, Any]) -> list[Row]:
     rows = []
     for bound, solver in zip(gallery.measure.bounds, case.references, strict=True):
         low, high = bound.interval(solver)
-        about: dict[str, Any] = {"scene": case.name, "kind": gallery.measure.kind, "observable": bound.of}
-        about |= {"low": low, "high": high, "solver": solver} | more
+        details: dict[str, Any] = {"scene": case.name, "kind": gallery.measure.kind, "observable": bound.of}
+        details |= {"low": low, "high": high, "solver": solver} | more
         name, predicted = f"{case.name}: {bound.label}", interval_text(low, high)
         if cause is not None:
-            rows.append(Row(name, predicted, "diverged", False, cause, about))
+            rows.append(Row(name, predicted, "diverged", False, cause, details))
             continue
         if bound.key not in measured:
             measured[bound.key] = series(film, bound)
         figure = bound.reduced(measured[bound.key])
-        held = low <= figure <= high
-        beyond = f"{'within' if held else 'outside of'} its bounds; solver {solver:.3g}"
-        rows.append(Row(name, predicted, figure if math.isfinite(figure) else "none", held, beyond, about))
+        passes = low <= figure <= high
+        note = f"{'within' if passes else 'outside of'} its bounds; solver {solver:.3g}"
+        rows.append(Row(name, predicted, figure if math.isfinite(figure) else "none", passes, note, details))
     return rows
 
 
@@ -102,7 +103,7 @@ def violation(limit: Limit, figures: dict[str, Any], references: dict[str, Any],
 
 
 def _values(figure: Any, field: str) -> Iterator[tuple[str, float]]:
-    """Yields a place and a value of each record."""
+    """Yields each record's scene and frame in words, such as " (scene 0, frame 9)", and its value."""
     for record in figure if isinstance(figure, list) else [figure]:
         if not isinstance(record, dict):
             yield "", record
