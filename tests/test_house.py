@@ -16,10 +16,10 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 32_953,
+    "hgn": 32_954,
     "datagen": 8_439,
-    "tools": 6_563,
-    "tests": 31_571,
+    "tools": 6_566,
+    "tests": 31_584,
 }
 SETTINGS = 240  # fields of the dataclasses behind the commands, *Config
 
