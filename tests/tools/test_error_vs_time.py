@@ -347,5 +347,5 @@ def test_imported_sets_are_refused(compare, tmp_path):
     scenes = [(path, np.full(4, 5), np.zeros((0, 3), np.float32))]
     source = write(tmp_path / "foreign", "plain", {"train": scenes, "valid": scenes}, metadata())
     import_set(source, ImportConfig(out=str(tmp_path / "mine"), materials={"5": "water"}, gravity=(0.0, -9.8, 0.0)))
-    with pytest.raises(ConfigError, match="data must be a set of python -m datagen, .*mine.*; .*hgn.evaluate"):
+    with pytest.raises(ConfigError, match=r"data must be a set of python -m datagen, .*mine.*; .*hgn.evaluate"):
         compare(data=str(tmp_path / "mine"))
