@@ -1,5 +1,6 @@
 """Data sets made with the ballistic stand-in for the solver, and the process put right after every test."""
 
+import atexit
 import gc
 import importlib.util
 import io
@@ -74,10 +75,7 @@ def pytest_collection_finish():
         composition.read_once()
     gc.freeze()
     gc.enable()
-
-
-def pytest_unconfigure():
-    gc.unfreeze()  # else Triton tells of all that it still holds
+    atexit.register(gc.unfreeze)  # else Triton tells of all that it still holds
 
 
 @pytest.fixture(autouse=True)

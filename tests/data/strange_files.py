@@ -328,7 +328,6 @@ cases(
         ),
         "obj of lines": saved("m.obj", b"v 0 0 0\n" + 100_000 * b"l 1\n"),
         "obj of polygons": saved("m.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\n" + 25_000 * b"f 1 2 3 1\n"),
-        "obj of darts": saved("m.obj", b"v 0 0 0\nv 9 0 0\nv 1 1 0\nv 0 9 0\n" + 99_000 * b"f 1 2 3 4\n"),
         "obj of pentagons": saved(
             "m.obj", b"v 0 0 0\nv 9 0 0\nv 1 1 0\nv 0 9 0\nv -9 5 0\n" + 82_000 * b"f 1 2 3 4 5\n"
         ),

@@ -37,7 +37,7 @@ class PlainFiles(Quiet, http.server.SimpleHTTPRequestHandler):
 def answering(handler):
     """The URL of a server of its own."""
     with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
-        threading.Thread(target=server.serve_forever).start()
+        threading.Thread(target=server.serve_forever, args=(0.01,)).start()
         try:
             yield f"http://127.0.0.1:{server.server_port}"
         finally:

@@ -60,7 +60,7 @@ def test_who_never_ends_a_request_keeps_nobody_out(monkeypatch, capsys):
     monkeypatch.setattr(health._Handler, "timeout", None)
     listener = socket.create_server(("127.0.0.1", 0))
     with Page(listener) as page, ExitStack() as stack:
-        threading.Thread(target=page.serve_forever, daemon=True).start()
+        threading.Thread(target=page.serve_forever, args=(0.01,), daemon=True).start()
         stack.callback(page.shutdown)
         waiting = [stack.enter_context(socket.create_connection(listener.getsockname())) for _ in range(MOST_OPEN + 5)]
         for connection in waiting:

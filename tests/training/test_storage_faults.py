@@ -170,7 +170,7 @@ def test_files_that_are_away_for_a_moment(data, away, opened):
     _ = opened and store[0]
     fault = AWAY[away](store.manifest.shards[0].name)(folder)
     fault.__enter__()
-    timer = threading.Timer(0.3, fault.__exit__, (None, None, None))
+    timer = threading.Timer(0.15, fault.__exit__, (None, None, None))
     with faults_outlived():
         timer.start()
         assert [store[place].frame_count for place in range(5)] == 5 * [6]
