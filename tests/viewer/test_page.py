@@ -37,6 +37,7 @@ pytest.importorskip("viser", reason="viser is not installed: pip install 'hgn[pl
 from viewer import soak
 
 from hgn.schema import ConfigError
+from hgn.viewer import film
 from hgn.viewer.film import film_html
 from hgn.viewer.page import PlayPage
 from hgn.viewer.session import PlaySession
@@ -56,6 +57,13 @@ def floating():
     return Simulator(silent(network_of(torch.float32, **small, inputs="relative")), 60.0, "cpu")
 
 
+def without_shadows(server):
+    """Nor reflections: a browser without a GPU spends most of its time on them. Returns the server."""
+    server.scene.configure_default_lights(cast_shadow=False)
+    server.scene.configure_environment_map(hdri=None)
+    return server
+
+
 @pytest.fixture(scope="module")
 def play():
     block_N3 = 0.4 + 0.2 * np.random.default_rng(0).random((600, 3)).astype(np.float32)
@@ -72,9 +80,7 @@ def play():
     session = PlaySession(floating(), scene, weights="floating")
     page = PlayPage(session, ("floating", "other"), lambda name: floating(), port=0)
     page.rate = 8.0  # frames a second: simulation and browser share a core
-    # without shadows and reflections, on which a browser without a GPU spends most of its time
-    page.server.scene.configure_default_lights(cast_shadow=False)
-    page.server.scene.configure_environment_map(hdri=None)
+    without_shadows(page.server)
     thread = threading.Thread(target=page.run)
     thread.start()
     yield page
@@ -343,8 +349,14 @@ def test_stage():
         stop_server(server)
 
 
-def test_a_film_plays_by_itself(viewer, play, tmp_path):
+def test_a_film_plays_by_itself(viewer, play, tmp_path, monkeypatch):
     """The static page draws the rollout's particles without any server."""
+
+    def start_plain(*given):
+        server, address = start_server(*given)
+        return without_shadows(server), address
+
+    monkeypatch.setattr(film, "start_server", start_plain)
     path = tmp_path / "film.html"
     path.write_text(film_html(play.session.rollout(), every=10))
     viewer.goto("about:blank")  # else the page's last picture stays until the film draws
