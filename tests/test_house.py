@@ -19,7 +19,7 @@ LINES = {  # of Python, in tracked files
     "hgn": 32_954,
     "datagen": 8_439,
     "tools": 6_566,
-    "tests": 31_581,
+    "tests": 31_593,
 }
 SETTINGS = 240  # fields of the dataclasses behind the commands, *Config
 
