@@ -26,7 +26,7 @@ from hgn.data.entries import REMEDY
 from hgn.data.manifest import MANIFEST_NAME, SPLITS, EpisodeEntry, Manifest, ShardEntry
 from hgn.data.shard_cache import holders
 from hgn.data.statistics import Statistics
-from hgn.data.storage import StorageError, ask, is_remote, open_storage, outliving
+from hgn.data.storage import StorageError, ask, faults_outlived, is_remote, open_storage, outliving
 from hgn.scene.episode import POSITION_MEMBER, Episode, decode_episode
 from hgn.schema import ConfigError, printable, require
 from hgn.system.patience import UnreachableError, standard_patience_s
@@ -376,7 +376,8 @@ def first_episodes(store: EpisodeStore, count: int) -> list[Episode]:
         others = ", ".join(f"split={split}" for split in SPLITS if len(store.of_split(split)))
         remedy = f"; it has others: {others}" if others else ""
         raise ConfigError(f"data must contain episodes of the split {store.split}, got none in {store.folder}{remedy}")
-    return [store.read(i) for i in store.first_indices(count)]
+    with faults_outlived():
+        return [store.read(i) for i in store.first_indices(count)]
 
 
 def find_episode(folder: Path | str, key: str) -> Episode:
@@ -385,7 +386,8 @@ def find_episode(folder: Path | str, key: str) -> Episode:
     if split not in SPLITS:
         raise ConfigError(f"episode must begin with one of {', '.join(SPLITS)}, got {key!r}; e.g. validation-000000")
     store = EpisodeStore(folder, split)
-    for place, entry in enumerate(store.entries):
-        if entry.key == key:
-            return store.read(place)
+    with faults_outlived():
+        for place, entry in enumerate(store.entries):
+            if entry.key == key:
+                return store.read(place)
     raise ConfigError(f"episode must be one of the {len(store)} {split} episodes in {folder}, got {key!r}")

@@ -44,12 +44,14 @@ def standard_patience_s() -> float:
 
 @contextlib.contextmanager
 def inside(event: threading.Event) -> Iterator[None]:
-    """Sets an event until the block ends."""
+    """Sets an event until the outermost such block ends."""
+    outermost = not event.is_set()
     event.set()
     try:
         yield
     finally:
-        event.clear()
+        if outermost:
+            event.clear()
 
 
 def without_patience() -> contextlib.AbstractContextManager[None]:

@@ -217,7 +217,7 @@ def test_as_a_process(place, warm_python):
     before = content(place.folder)
     done = subprocess.run(
         [str(warm_python), "-m", "hgn.evaluate", *EVALUATE],
-        env=os.environ | {"PYTHONPATH": str(ROOT)},
+        env=os.environ | {"PYTHONPATH": str(ROOT), "HGN_PATIENCE_S": "1"},
         capture_output=True,
         text=True,
         timeout=PATIENCE_S,

@@ -22,7 +22,7 @@ from training.runs import metrics, train_mapping
 import hgn.training.session
 from hgn import train
 from hgn.config import TrainConfig
-from hgn.data.reader import EpisodeStore
+from hgn.data.reader import EpisodeStore, find_episode, first_episodes
 from hgn.data.shard_cache import CACHE_VARIABLE
 from hgn.data.storage import faults_outlived
 from hgn.schema import ConfigError, from_mapping
@@ -161,19 +161,25 @@ AWAY = {
 }
 
 
-@pytest.mark.parametrize("opened", [False, True])
+@pytest.mark.parametrize("opened", [False, True, "evaluate", "rollout"])
 @pytest.mark.parametrize("away", AWAY)
-def test_files_that_are_away_for_a_moment(data, away, opened):
-    """Reading an episode, or lines of the index, waits for what is renamed, cut or altered, or cannot be mapped."""
+def test_files_that_are_away_for_a_moment(data, away, opened, monkeypatch):
+    """Reading an episode, or lines of the index, waits for what is renamed, cut or altered, or cannot be mapped: in a
+    training, and as evaluations and rollouts read."""
     folder = Path(data.dataset.folder).resolve()
     store = EpisodeStore(folder, "train")
-    _ = opened and store[0]
+    _ = opened is True and store[0]
+    monkeypatch.setattr("hgn.data.reader.EpisodeStore", lambda *_: store)  # whose manifest was read before
     fault = AWAY[away](store.manifest.shards[0].name)(folder)
     fault.__enter__()
     timer = threading.Timer(0.15, fault.__exit__, (None, None, None))
-    with faults_outlived():
-        timer.start()
-        assert [store[place].frame_count for place in range(5)] == 5 * [6]
+    timer.start()
+    with faults_outlived() if isinstance(opened, bool) else contextlib.nullcontext():
+        episodes = {
+            "evaluate": lambda: first_episodes(store, 5),
+            "rollout": lambda: [find_episode(folder, f"train-00000{place}") for place in range(5)],
+        }.get(opened, lambda: [store[place] for place in range(5)])()
+    assert [episode.frame_count for episode in episodes] == 5 * [6]
     timer.join()
 
 
