@@ -20,13 +20,17 @@ from hgn.scene.glb import read_glb
 from hgn.scene.polygons import concave_cut, fans, polygons_of_obj, polygons_of_ply
 from hgn.scene.rotation import euler_rotation, rotate, round_to_float32
 from hgn.scene.scene import Obstacle
-from hgn.scene.surface import area_vectors
+from hgn.scene.surface import area_vectors, point_tree
 from hgn.scene.usd import read_usd_polygons
 from hgn.schema import ConfigError, Vector, require
 
 _ASCII_STL = re.compile(rb"\s*solid.*\n\s*(facet|endsolid)", re.IGNORECASE)
 # trimesh takes a millisecond for each solid
 _SOLIDS = re.compile(rb"^[ \t]*endsolid.*\n\s*solid.*\n", re.IGNORECASE | re.MULTILINE)
+
+
+SEAM = 1e-5  # largest distance of vertices that exporters mean to be one, relative to the mesh's longest side
+MOST_NEAR = 100  # largest mean number of neighbours within that distance: more would take memory
 
 
 def load_mesh(path: str | Path, field: str = "mesh", **placing: Any) -> Obstacle:
@@ -51,8 +55,8 @@ def load_bodies(
 
     The mesh is scaled, then turned about the fixed x, y and z axes (degrees, in this order), then moved. It may extend
     beyond the domain. A body is watertight if it is orientable and exactly two triangles meet at each of its edges; its
-    triangles get a consistent orientation. After this check corners with equal float32 coordinates are merged, and
-    zero-area and repeated triangles are removed.
+    triangles get a consistent orientation. Open edges within SEAM of each other are joined for this check. After it
+    corners with equal float32 coordinates are merged, and zero-area and repeated triangles are removed.
 
     Raises: ConfigError naming `field` for a missing or unreadable file, an unknown suffix, no triangles, coordinates
     that are not finite, only zero-area triangles, or a bad scale, translation or rotation.
@@ -75,7 +79,10 @@ def load_bodies(
     closed_F, flip_F = _bodies(vertex_V3, triangle_F3)
     rounded_V3 = round_to_float32(placed)
     if not closed_F.all():  # for corners that differ in their last digits
-        also_F, other_F = _bodies(rounded_V3, triangle_F3)
+        joined_V3 = _joined(rounded_V3, triangle_F3[~closed_F])
+        also_F, other_F = _bodies(joined_V3, triangle_F3)
+        used = triangle_F3[also_F & ~closed_F]
+        rounded_V3[used] = joined_V3[used]
         closed_F, flip_F = closed_F | also_F, np.where(closed_F, flip_F, other_F)
     triangle_F3[flip_F] = triangle_F3[flip_F][:, ::-1]
     parts = []
@@ -157,6 +164,21 @@ def _bodies(vertex_V3: np.ndarray, triangle_F3: np.ndarray) -> tuple[np.ndarray,
     if len(counted):
         closed_F[counted], flip_F[counted] = _orientation(triangle[counted])
     return closed_F[first][alike_F.reshape(-1)], flip_F  # repeated triangles belong to the body of the first one
+
+
+def _joined(vertex_V3: np.ndarray, triangle_F3: np.ndarray) -> np.ndarray:
+    """Returns the vertices; those at open edges of the triangles are moved onto others within SEAM, float64 [V, 3]."""
+    unique_U3, index = np.unique(vertex_V3 + 0.0, axis=0, return_inverse=True)
+    triangle = index.reshape(-1)[triangle_F3]
+    edge_E2 = np.sort(np.stack([triangle, np.roll(triangle, -1, axis=1)], -1).reshape(-1, 2), axis=1)
+    edge_E2, uses_E = np.unique(edge_E2, axis=0, return_counts=True)
+    border = np.unique(edge_E2[uses_E != 2])
+    tree, reach = point_tree(unique_U3[border]), SEAM * np.ptp(unique_U3[triangle].reshape(-1, 3), axis=0).max()
+    if tree.count_neighbors(tree, reach) < MOST_NEAR * len(border):
+        row, column = tree.query_pairs(reach, output_type="ndarray").T
+        _, label = _components(row, column, len(border))
+        unique_U3[border] = unique_U3[border[np.unique(label, return_index=True)[1][label]]]
+    return np.asarray(unique_U3[index.reshape(-1)])
 
 
 def _weld(vertex_V3: np.ndarray, triangle_F3: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

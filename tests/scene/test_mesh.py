@@ -319,6 +319,20 @@ def test_small_bodies_stay_closed(tmp_path):
     assert load_mesh(tmp_path / "a.obj", scale=2e-5, translation=(100.0, 100.0, 100.0)).closed
 
 
+@pytest.mark.parametrize("size", [1, 500])
+@pytest.mark.parametrize(("seam", "closed"), [(1e-9, True), (1e-7, True), (1e-6, True), (1e-3, False)])
+def test_seams(tmp_path, seam, closed, size):
+    """Corners that an exporter writes once for each triangle, with an error, are one, and larger gaps stay open."""
+    corners = trimesh.creation.icosphere(subdivisions=3).triangles.reshape(-1, 3)
+    corners = size * (corners + seam * np.random.default_rng(0).uniform(-1, 1, corners.shape))
+    write_obj(tmp_path / "a.obj", corners, np.arange(len(corners)).reshape(-1, 3).tolist())
+    body = load_mesh(tmp_path / "a.obj")
+    assert body.closed == closed and contains(size * np.array([(0, 0, 0.9), (0, 0, 1.1)]), body).tolist() == [
+        closed,
+        False,
+    ]
+
+
 def test_each_body_is_judged_by_itself(tmp_path):
     """A ball, a torus and a lone triangle: two solids and a sheet; the group inside the ball is refused."""
     ball = trimesh.creation.icosphere(radius=0.2)
