@@ -14,6 +14,7 @@ import numpy as np
 from hgn.scene.rotation import rotate
 from hgn.schema import Vector, require
 
+FARTHEST = 1000.0  # largest translation of a keyframe, domain units: networks follow the cells on its way
 Keyframes = Sequence[tuple[float, Vector]]  # times in seconds and translations in domain units
 
 
@@ -35,9 +36,8 @@ class Motion:
         ordered = len(times) > 0 and bool(np.isfinite(times).all() and (np.diff(times) > 0).all())
         require(ordered, "keyframes", "in order of time, at least one, no two at one time", times.tolist())
         require(times[0] >= 0, "keyframes", "at times >= 0", times.tolist())
-        require(
-            bool(np.isfinite(self.translation_T3).all()), "keyframes", "of finite translations and rotations", "nan"
-        )
+        farthest = float(np.abs(self.translation_T3).max())
+        require(farthest <= FARTHEST, "keyframes", f"of translations of at most {FARTHEST:g} units", farthest)
 
     @staticmethod
     def of_frames(keyframes: Keyframes, pivot: Vector) -> Motion:

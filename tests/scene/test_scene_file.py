@@ -233,6 +233,13 @@ MISTAKES = [
     (obstacle_with(keyframes=[{"time": 1}, {"time": 1}]), OBSTACLE + r"\.keyframes must be in order of time"),
     (obstacle_with(keyframes=[{"time": -1}]), OBSTACLE + r"\.keyframes\[0\]\.time must be .* >= 0"),
     (obstacle_with(keyframes=[{"time": 0, "rotation": [0, float("inf"), 0]}]), r"\.rotation\[1\] must be finite"),
+    *(
+        (
+            obstacle_with(keyframes=[{"time": 0, "translation": [0, far, 0]}]),
+            "keyframes must be of translations of at most 1000",
+        )
+        for far in (1001.0, -1e12, 1e300)
+    ),
     (obstacle_with(friction=-1), OBSTACLE + r"\.friction must be a finite number >= 0, got -1"),
     (scene_with(seed=-1), "seed must be a whole number >= 0"),
     (scene_with(seed=0.5), "seed must be a whole number"),
