@@ -16,10 +16,10 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 32_954,
+    "hgn": 32_979,
     "datagen": 8_439,
     "tools": 6_566,
-    "tests": 31_593,
+    "tests": 31_616,
 }
 SETTINGS = 240  # fields of the dataclasses behind the commands, *Config
 

@@ -75,7 +75,7 @@ class InitialState:
         require_particles(self.position_N3, self.velocity_N3, self.material_N, self.materials)
         for name, least in (("gravity", -1e9), ("domain_size", 0)):
             value = getattr(self, name)
-            fits = np.shape(value) == (3,) and all(isinstance(x, Real) and least <= x <= 1e9 for x in value)
+            fits = np.shape(value) == (3,) and all(isinstance(x, Real) and least <= x <= 1e9 for x in value)  # type: ignore[operator]
             require(fits, name, "three numbers of at most 1e9", value)
 
     @staticmethod

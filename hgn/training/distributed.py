@@ -163,9 +163,8 @@ def _check_launcher() -> None:
         )
     elif not started_by_srun():
         for name in _MPI_COUNTS:
-            rule = "1 without torchrun's variables: each process would train on its own in one folder"
-            count = os.environ.get(name, "1")
-            require(count == "1", name, rule, count, "start with torchrun or srun instead of mpirun")
+            rule, count = "1 without torchrun's variables", os.environ.get(name, "1")  # each process would train alone
+            require(count == "1", name, rule, count, remedy="start with torchrun or srun instead of mpirun")
 
 
 def started_by_srun() -> bool:
