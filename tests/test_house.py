@@ -16,7 +16,7 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 32_979,
+    "hgn": 32_985,
     "datagen": 8_439,
     "tools": 6_566,
     "tests": 31_616,
