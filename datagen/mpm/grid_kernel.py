@@ -333,14 +333,18 @@ def enter(
 @ti.kernel
 def begin_part(
     part_s: ti.f32,
+    age_s: Scalars,
     first: ti.i32,
     scene_value: ti.types.ndarray(dtype=ti.f32, ndim=2),
     counter: ti.types.ndarray(dtype=ti.i64, ndim=2),
 ):
-    """Gives every running scene the time of a part of a frame. The first part resets the frame's count of substeps."""
+    """Gives every running scene the time of a part of a frame. The first part resets the frame's count of substeps.
+
+    age_s    time from each scene's last build of its contacts to the part's begin
+    """
     for scene in range(scene_value.shape[0]):
         if first == 1:
             counter[scene, COUNT.frame_substeps] = ti.cast(0, ti.i64)
         if counter[scene, COUNT.status] == STATUS.running:
             scene_value[scene, VALUE.remaining] = part_s
-            scene_value[scene, VALUE.part] = part_s
+            scene_value[scene, VALUE.part] = part_s + age_s[scene]

@@ -1,4 +1,7 @@
-"""Runs one substep of all scenes in a launch: on a CPU, and for a scene that is large enough for a whole GPU."""
+"""Runs one substep of all scenes in a launch: on a CPU, and for a scene that is large enough for a whole GPU.
+
+Shape legend: B scenes.
+"""
 
 from __future__ import annotations
 
@@ -22,15 +25,16 @@ from datagen.mpm import grid_kernel  # isort: skip
 
 MAXIMUM_PARTS = 4  # largest number of copies of the grid on a CPU, one for each thread
 SUBSTEPS_PER_CHECK = 64  # largest number of substeps between two checks; on a GPU each check waits for the device
+AT_REST = 1e-6  # fraction of MOVE_CELLS that is rounding
 MAXIMUM_MOVE_CELLS = 100.0  # largest motion of an obstacle in a frame
 
 
-def motion_parts(scenes: Sequence[Scene], begin: float, end: float) -> int:
-    """Returns the number of parts of a frame in which no obstacle moves more than MOVE_CELLS; 0 if none moves.
+def motion_cells(scenes: Sequence[Scene], begin: float, end: float) -> np.ndarray:
+    """Returns how far the obstacles of each scene move in a frame at their largest speed, in cells, float64 [B].
 
     Raises: ConfigError if one moves more than MAXIMUM_MOVE_CELLS in the frame.
     """
-    most = 0.0
+    most = np.zeros(len(scenes))
     for index, scene in enumerate(scenes):
         for number, obstacle in enumerate(scene.obstacles):
             if obstacle.motion is None:
@@ -50,8 +54,13 @@ def motion_parts(scenes: Sequence[Scene], begin: float, end: float) -> int:
                 f"{way:.4g} from {begin:.4g} s on",
                 "give it more time",
             )
-            most = max(most, way)
-    return math.ceil(most / MOVE_CELLS - 1e-6)
+            most[index] = max(most[index], way)
+    return most
+
+
+def motion_parts(cells_B: np.ndarray) -> int:
+    """Returns the number of parts of a frame in which no obstacle moves more than MOVE_CELLS; 0 if none moves."""
+    return math.ceil(cells_B.max(initial=0.0) / MOVE_CELLS - AT_REST)
 
 
 class GridLaunch(Launch):
@@ -88,16 +97,27 @@ class GridLaunch(Launch):
 
     def _advance(self, frames: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         completed = np.zeros(len(self.scenes), np.int64)
-        moved = False
+        moved_B = np.zeros(len(self.scenes), bool)
         for frame in range(frames):
-            motion = motion_parts(self.scenes, frame * self.frame_s, (frame + 1) * self.frame_s) if self.moving else 0
-            parts = max(motion, 1)
+            cells_B = motion_cells(self.scenes, frame * self.frame_s, (frame + 1) * self.frame_s)
+            parts, moves_B = max(motion_parts(cells_B), 1), cells_B > AT_REST * MOVE_CELLS
+            built_B = np.zeros(len(self.scenes), np.int64)  # the part in which contacts were built
             for part in range(parts):
-                if motion or moved:
-                    self._move((frame + part / parts) * self.frame_s, (frame + (part + 1) / parts) * self.frame_s)
-                grid_kernel.begin_part(self.frame_s / parts, int(part == 0), self.scene_value, self.counter)
+                time_s, end_s = ((frame + number / parts) * self.frame_s for number in (part, part + 1))
+                old_B = self._outdated((frame + built_B / parts) * self.frame_s, end_s)
+                old_B |= cells_B * (part + 1 - built_B) > MOVE_CELLS * parts
+                old_B = moves_B & (old_B | (part == 0)) | moved_B
+                if old_B.any():
+                    self._move(old_B, time_s, end_s)
+                moved_B[:] = False
+                built_B = np.where(old_B | ~moves_B, part, built_B)
+                age_s = np.zeros(self.rows, np.float32)
+                age_s[: len(self.scenes)] = (part - built_B) * (self.frame_s / parts)
+                grid_kernel.begin_part(
+                    self.frame_s / parts, device_array(age_s), int(part == 0), self.scene_value, self.counter
+                )
                 self._run_part()
-                moved = motion > 0
+            moved_B = moves_B
             self._enter(frame + 1)
             completed += self.counter.to_numpy()[: len(self.scenes), COUNT.status] == STATUS.running
             yield self.position.to_numpy()[None], completed
@@ -111,15 +131,29 @@ class GridLaunch(Launch):
                 self.law_row, self.scene_value, self.counter, self.setting, self.law,
             )  # fmt: skip
 
-    def _move(self, begin: float, end: float) -> None:
-        """Rebuilds the contacts of scenes with moving obstacles in their poses at `begin`."""
-        self.colliders = [
-            build_collider(scene, self.config.choices.collider_band_cells, begin) if scene.moves else collider
-            for scene, collider in zip(self.scenes, self.colliders, strict=True)
-        ]
+    def _outdated(self, begin_s_B: np.ndarray, end_s: float) -> np.ndarray:
+        """Returns the scenes with a keyframe between two times, bool [B]: contacts move with constant velocity."""
+        return np.array(
+            [
+                any(
+                    ((obstacle.motion.time_T > begin_s) & (obstacle.motion.time_T < end_s)).any()
+                    for obstacle in scene.obstacles
+                    if obstacle.motion is not None
+                )
+                for scene, begin_s in zip(self.scenes, begin_s_B, strict=True)
+            ]
+        )
+
+    def _move(self, which_B: np.ndarray, begin: float, end: float) -> None:
+        """Rebuilds the contacts of scenes in their poses at `begin`. They move as between the two times."""
+        band_cells = self.config.choices.collider_band_cells
+        self.colliders = list(self.colliders)
+        for index in np.flatnonzero(which_B).tolist():
+            self.colliders[index] = build_collider(self.scenes[index], band_cells, begin)
+            self.spans[index] = begin, end
         self.ghosts = sum(int(collider.doubled_K.sum()) for collider in self.colliders)
         ti.lang.impl.get_runtime().prog.delete_ndarray(self.contact_normal.arr)
-        self._place_contacts(begin, end)
+        self._place_contacts()
 
     def _run_part(self) -> None:
         """Runs substeps until no scene has time left. The host checks only after the last estimate of their number."""

@@ -172,13 +172,15 @@ class Launch(ABC):
         self.counter = device_array(counter)
         self.node = self._node_array(nodes)
         self.hidden = ti.ndarray(ti.i32, self.particles if ghost_room else 1)
-        self._place_contacts(0.0, self.frame_s)
+        self.spans = [(0.0, self.frame_s)] * len(scenes)  # times between which each scene's contacts move
+        self.cell_masses = [cell_mass(scene) for scene in scenes]
+        self._place_contacts()
 
     def _has_sheets(self) -> bool:
         return any(not obstacle.closed for scene in self.scenes for obstacle in scene.obstacles)
 
-    def _place_contacts(self, begin: float, end: float) -> None:
-        """Writes contacts into device arrays. Moving obstacles get their mean velocities from `begin` to `end`."""
+    def _place_contacts(self) -> None:
+        """Writes contacts into device arrays. Moving obstacles get their mean velocities in the scene's span."""
         self.shape = device_array(self._shape())
         of_node = MOVING_NODE_VECTORS if self.moving else NODE_VECTORS
         of_triangle = MOVING_TRIANGLE_VECTORS if self.moving else TRIANGLE_VECTORS
@@ -190,10 +192,10 @@ class Launch(ABC):
         entries, length = [], 1
         if has_contacts:
             length = self.all_blocks * BLOCK_NODES
-            entries.append(self._contacts(begin, end, vector[:nodes].reshape(-1, of_node, 3)))
+            entries.append(self._contacts(vector[:nodes].reshape(-1, of_node, 3)))
         if has_triangles:
             of_triangles = vector[nodes : nodes + triangles].reshape(-1, of_triangle, 3)
-            place, value, length = self._sweeps(nodes, begin, end, of_triangles)
+            place, value, length = self._sweeps(nodes, of_triangles)
             entries.append((place, value))
         self.contact = ti.ndarray(ti.i32, length)
         self.contact.fill(-1)
@@ -274,23 +276,23 @@ class Launch(ABC):
         setting[SETTING.low] = particle_bounds(self.scenes[0], config)[0][0]
         return setting
 
-    def _rates(self, begin: float, end: float) -> list[np.ndarray]:
-        """Returns the motion of each scene's obstacles between two times, float64 [obstacles, 3, 3]. The rows of an
+    def _rates(self) -> list[np.ndarray]:
+        """Returns the motion of each scene's obstacles in its span, float64 [obstacles, 3, 3]. The rows of an
         obstacle are angular velocity, velocity of a point, and this point."""
         rates = [np.zeros((max(len(scene.obstacles), 1), 3, 3)) for scene in self.scenes]
-        for own, scene in zip(rates, self.scenes, strict=True):
+        for own, scene, span in zip(rates, self.scenes, self.spans, strict=True):
             for index, obstacle in enumerate(scene.obstacles):
                 if obstacle.motion is not None:
-                    own[index] = obstacle.motion.rates(begin, end)
+                    own[index] = obstacle.motion.rates(*span)
         return rates
 
-    def _contacts(self, begin: float, end: float, vector: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _contacts(self, vector: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Returns the places and entries of contact nodes (see grid_kernel.substep). Writes the entries' vectors."""
         # scene after scene, so that arrays stay in a core's cache; nodes with two fields get the first entries
         places, entries = np.empty(len(vector), np.int32), np.empty(len(vector), np.int32)
         filled, doubled, single = 0, 0, self.ghosts
         for index, (scene, own, friction, rates) in enumerate(
-            zip(self.scenes, self.colliders, self._frictions(), self._rates(begin, end), strict=True)
+            zip(self.scenes, self.colliders, self._frictions(), self._rates(), strict=True)
         ):
             count, ghosts = len(own.node_K3), int(own.doubled_K.sum())
             entry = np.empty(count, np.int32)
@@ -299,7 +301,7 @@ class Launch(ABC):
             value = np.zeros((count, *vector.shape[1:]), np.float32)
             value[:, :2] = own.normal_K23
             value[:, 2, :2] = friction[own.obstacle_K2]
-            value[:, 3, :2] = cell_mass(scene) * own.least_K2
+            value[:, 3, :2] = self.cell_masses[index] * own.least_K2
             if self.moving:
                 turn, velocity, place = np.moveaxis(rates[own.obstacle_K2], 2, 0)
                 value[:, 4:] = velocity + np.cross(turn, own.node_K3[:, None] * scene.cell_size - place)
@@ -323,9 +325,7 @@ class Launch(ABC):
         place = ((x // BLOCK) * np.int32(self.blocks[1]) + y // BLOCK) * np.int32(self.blocks[2]) + z // BLOCK
         return place * np.int32(BLOCK_NODES) + ((x % BLOCK) * BLOCK + y % BLOCK) * BLOCK + z % BLOCK
 
-    def _sweeps(
-        self, first_vector: int, begin: float, end_s: float, vector: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, int]:
+    def _sweeps(self, first_vector: int, vector: np.ndarray) -> tuple[np.ndarray, np.ndarray, int]:
         """Returns places and values of the contact array for the swept test (see grid_kernel.substep), and its length.
         Writes the triangles' vectors."""
 
@@ -362,7 +362,7 @@ class Launch(ABC):
             [friction[sweep.obstacle_F] for friction, sweep in zip(self._frictions(), sweeps, strict=True)]
         )
         if self.moving:
-            rates = [own[sweep.obstacle_F] for own, sweep in zip(self._rates(begin, end_s), sweeps, strict=True)]
+            rates = [own[sweep.obstacle_F] for own, sweep in zip(self._rates(), sweeps, strict=True)]
             turn, velocity, place = np.moveaxis(np.concatenate(rates), 1, 0)
             cell_size = self.scenes[0].cell_size
             vector[:, 5] = velocity / cell_size + np.cross(turn, vector[:, 0] - place / cell_size)

@@ -81,7 +81,7 @@ class SceneValue(NamedTuple):
     gravity_time: int = 14  # time of gravity in the present substep, s: see mls_mpm
     water_density: int = 15  # number of particles a cell at rest; 0 if unknown
     wall_friction: int = 16  # 16, 17, 18: friction of the domain's walls across x, y, z
-    part: int = 19  # length of the present part of a frame, s; without moving obstacles the whole frame
+    part: int = 19  # time from the last build of contacts to the end of the present part of a frame, s
     stiffness: int = 20  # largest stiffness in the step before, m²/s²
     last_interval: int = 21  # length of the interval before, s
     fallen: int = 22  # time of gravity in this interval before the present substep, s

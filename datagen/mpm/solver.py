@@ -11,6 +11,7 @@ import gc
 import math
 import warnings
 from collections.abc import Callable, Iterator, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -70,13 +71,15 @@ def simulate(
     (3 lambda_h + 2 mu_h)). With a fixed time step each step has a transfer. A frame has ceil(frame / step) steps, as in
     Taichi Elements: 54 steps at 60 Hz and 3.125e-4 s, which are 1.25 % longer than the frame.
 
-    `on_frame(t)` is called when frame t of all scenes is complete, from 0. `cpu_threads` applies to the process's first
-    simulation (see `initialise`). `colliders` are results of `build_collider` for the scenes; None: they are built.
-    `team` computes a scene; None: chosen by device and scenes. `stability_fractions` replace the config's.
+    Scenes with moving obstacles or emitters are simulated after the others, in a launch of their own. `on_frame(t)` is
+    called from 0 on when the scenes have completed frame t, on average over the scenes if there are two launches.
+    `cpu_threads` applies to the process's first simulation (see `initialise`). `colliders` are results of
+    `build_collider` for the scenes; None: they are built. `team` computes a scene of the first launch; None: chosen by
+    device and scenes. `stability_fractions` replace the config's.
 
     On a CPU a scene's result does not depend on its batch, bitwise. `cpu_threads` changes it only through the number of
-    partial sums, min(cpu_threads, 4). If obstacles move, frames of all scenes are divided into parts (see
-    grid_launch.motion_parts). On a GPU sums have no fixed order.
+    partial sums, min(cpu_threads, 4). If obstacles move, frames of the scenes in their launch are divided into parts
+    (see grid_launch.motion_parts), so that these scenes depend on each other. On a GPU sums have no fixed order.
 
     A particle with an entry time is NaN before it; it enters in free flight from its given place. A scene that is not
     finite, leaves the domain or needs more than MAXIMUM_SUBSTEPS a frame ends as a SceneFailure with cause and frame. A
@@ -107,45 +110,54 @@ def simulate(
     results: list[Simulated | SceneFailure] = [
         Simulated(np.empty((frames, 0, 3), np.float32), no_counters()) for _ in scenes
     ]
-    if occupied:
-        own_fractions = [fractions[i] for i in occupied]
+    step_s = config.fixed_time_step_s
+    moving = any(scenes[i].moves for i in occupied)
+    require(not moving or step_s is None, "fixed_time_step_s", "null where obstacles move", step_s)
+    _require_memory(device, [scenes[i] for i in occupied], node_counts)
+    # moving contacts are placed, and particles enter, between launches of single substeps
+    single = [i for i in occupied if scenes[i].moves or scenes[i].emits]
+    groups = [group for group in ([i for i in occupied if i not in single], single) if group]
+    before = reported = 0  # frames of all scenes of earlier launches together; calls of on_frame
+
+    def report(frame: int) -> None:
+        nonlocal reported
+        while on_frame is not None and (reported + 1) * len(occupied) <= before + (frame + 1) * len(group):
+            on_frame(reported)
+            reported += 1
+
+    for group in groups:
         batch = (
-            [scenes[i] for i in occupied], [colliders[i] for i in occupied], config, node_counts, frame_rate_hz,
-            own_fractions,
+            [scenes[i] for i in group], [colliders[i] for i in group], config, node_counts, frame_rate_hz,
+            [fractions[i] for i in group],
         )  # fmt: skip
-        moving = any(scene.moves for scene in batch[0])
-        step_s = config.fixed_time_step_s
-        require(not moving or step_s is None, "fixed_time_step_s", "null where obstacles move", step_s)
-        _require_memory(device, batch[0], node_counts)
-        if moving or any(scene.emits for scene in batch[0]):
-            team = Team(0)  # moving contacts are placed, and particles enter, between launches
-        elif team is None:
-            team = _team(device, [scene.particle_count for scene in batch[0]])
-        with _arrays_freed_here():
-            try:
-                outcomes = _launched(
-                    TeamLaunch(team, _teams_at_once(device, team), *batch)
-                    if team.threads
-                    else GridLaunch(device, *batch),
-                    frames,
-                    on_frame,
-                )
-            except BlocksApartError:
-                warnings.warn(
-                    f"the {device.kind} does not run {team.blocks} blocks of {team.threads} threads at once, which "
-                    "share a scene: scenes take one launch a substep, which is slower; leave the device to this "
-                    "process alone", RuntimeWarning, stacklevel=2,
-                )  # fmt: skip
-                outcomes = _launched(GridLaunch(device, *batch), frames, on_frame)
-        for index, outcome in zip(occupied, outcomes, strict=True):
+        own_team = Team(0) if group is single else team or _team(device, [scene.particle_count for scene in batch[0]])
+        outcomes = _launched(device, own_team, batch, frames, report)
+        for index, outcome in zip(group, outcomes, strict=True):
             results[index] = outcome
-    elif on_frame is not None:
+        before += frames * len(group)
+    if on_frame is not None and not groups:
         for frame in range(frames):
             on_frame(frame)
     return results
 
 
-def _launched(launch: Launch, frames: int, on_frame: Callable[[int], None] | None) -> list[Simulated | SceneFailure]:
+def _launched(
+    device: Device, team: Team, batch: tuple[Any, ...], frames: int, on_frame: Callable[[int], None]
+) -> list[Simulated | SceneFailure]:
+    with _arrays_freed_here():
+        if team.threads:
+            try:
+                return _run(TeamLaunch(team, _teams_at_once(device, team), *batch), frames, on_frame)
+            except BlocksApartError:
+                warnings.warn(
+                    f"the {device.kind} does not run {team.blocks} blocks of {team.threads} threads at once, which "
+                    "share a scene: scenes take one launch a substep, which is slower; leave the device to this "
+                    "process alone", RuntimeWarning, stacklevel=3,
+                )  # fmt: skip
+        return _run(GridLaunch(device, *batch), frames, on_frame)
+
+
+def _run(launch: Launch, frames: int, on_frame: Callable[[int], None]) -> list[Simulated | SceneFailure]:
     try:
         return launch.run(frames, on_frame)
     finally:

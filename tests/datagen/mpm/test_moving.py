@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from mpm_scenes import BOX, CELL, CONFIG, QUAD, box_corners, particles, sheet, simulated
 
-from datagen.mpm import launch
-from datagen.mpm.grid_launch import motion_parts
+from datagen.mpm import grid_launch, launch
+from datagen.mpm.grid_launch import motion_cells, motion_parts
 from datagen.mpm.solver import SceneFailure, simulate
 from hgn.config import MpmConfig
 from hgn.scene.material import MATERIALS, SAND, SNOW
@@ -144,7 +144,7 @@ def test_parts_of_a_frame_share_its_maximum_of_substeps(monkeypatch):
     lift = moving(wide_sheet(2.5), [0.0, 1.0], [np.zeros(3), np.array([0.0, 3.0, 0.0])])
     place = CELL * np.array([[4.5, height, 4.5] for height in (5, 6, 7, 8)])
     scene = particles(place, range(4), obstacles=(lift,), domain_size=(CELLS * CELL,) * 3)
-    assert motion_parts([scene], 0.0, 1 / RATE_HZ) == 8
+    assert motion_parts(motion_cells([scene], 0.0, 1 / RATE_HZ)) == 8
     (whole,) = simulated([scene])
     needed = whole.counters["substeps"]
     monkeypatch.setattr(launch, "MAXIMUM_SUBSTEPS", needed)
@@ -163,8 +163,46 @@ def test_bad_motion_is_refused():
     scene = block(SNOW, (-1, 0, -1), (2, 1, 2), np.eye(3), shot, 9.8)
     message = r"obstacles\[0\].keyframes of scene 0 must be no faster than 100 cells a frame"
     with pytest.raises(ConfigError, match=message):
-        motion_parts([scene], 0.0, 1 / RATE_HZ)
+        motion_cells([scene], 0.0, 1 / RATE_HZ)
     slow = moving(still, [0.0, 0.1], [(0, 0, 0), (0, 0.01, 0)])
     scene = dataclasses.replace(scene, obstacles=(slow,))
     with pytest.raises(ConfigError, match="fixed_time_step_s must be null where obstacles move"):
         simulate([scene], MpmConfig(device="cpu", fixed_time_step_s=1e-3), 2, RATE_HZ)
+
+
+def test_scenes_at_rest_do_not_depend_on_moving_ones():
+    """Beside a scene that moves, scenes at rest have the bits that they have without it, and each frame is reported."""
+    lift = moving(wide_sheet(2.5), [0.0, 1.0], [np.zeros(3), np.array([0.0, 3.0, 0.0])])
+    place = CELL * np.array([[4.5, height, 4.5] for height in (5, 6, 7, 8)])
+    own = {"domain_size": (CELLS * CELL,) * 3}
+    still = [particles(place + shift * CELL, range(4), obstacles=(wide_sheet(2.5),), **own) for shift in (0, 1)]
+    moved = particles(place, range(4), obstacles=(lift,), **own)
+    frames = []
+    mixed = simulated([still[0], moved, still[1]], frames=4, on_frame=frames.append)
+    assert frames == list(range(4))
+    first, second = simulated(still, frames=4)
+    for outcome, alone in zip(mixed, (first, *simulated([moved], frames=4), second), strict=True):
+        assert np.array_equal(outcome.position_TN3, alone.position_TN3) and outcome.counters == alone.counters
+
+
+def test_contacts_are_built_as_often_as_their_obstacles_move(monkeypatch):
+    """In a batch with a fast scene a slow one is built once for each tenth of a cell and where it sets off, and never
+    before. Particles above it move as alone within a hundredth of a cell.
+    """
+    built = []
+    build = grid_launch.build_collider
+    monkeypatch.setattr(grid_launch, "build_collider", lambda s, *rest: built.append(s.seed) or build(s, *rest))
+    place = CELL * np.array([[4.5, 2.502, 4.5], [4.5, 12, 4.5]])
+
+    def lifted(seed, begin_s, speed):
+        lift = moving(wide_sheet(2.5), [begin_s, begin_s + 1.0], [np.zeros(3), np.array([0.0, speed, 0.0])])
+        own = {"domain_size": (CELLS * CELL,) * 3, "gravity": (0.0, -200.0, 0.0), "seed": seed}
+        return particles(place, obstacles=(lift,), **own)
+
+    fast, slow = lifted(0, 0.0, 3.0), lifted(1, 4 / 3 / RATE_HZ, 0.9)
+    (alone,) = simulated([slow], frames=4)
+    assert built == [1] * 6
+    built.clear()
+    together = simulated([fast, slow], frames=4)[1]
+    assert [built.count(seed) for seed in (0, 1)] == [24, 7]
+    assert np.abs(together.position_TN3 - alone.position_TN3).max() < 0.01 * CELL
