@@ -30,7 +30,7 @@ import numpy as np
 from scipy import ndimage
 
 from datagen.mpm.sweep import ON_TRIANGLE, Sweep, build_sweep, near_pairs, near_slabs
-from hgn.scene.distance import closest_points, contains, dot, square
+from hgn.scene.distance import closest_points, contains, cross, dot, square
 from hgn.scene.scene import Obstacle, Scene
 from hgn.schema import ConfigError
 
@@ -38,6 +38,7 @@ SEEN, HIDDEN = 0, 1  # the two fields of a node
 ON_SURFACE_CELLS = 0.05  # distance below which the direction to the surface is rounding
 MOVE_CELLS = 0.1  # largest motion of an obstacle until its contacts are built again
 BEARING_CELLS = 0.25  # height above a surface up to which nodes stop motion
+LARGE_RADIUS = 2.0  # radius of a large triangle, as a multiple of the reach
 SIDE_CELLS = 0.51  # a little more than half the distance of two nodes
 GAP_CELLS = 0.75  # distance of material from a surface at which nodes begin to stop it
 STENCIL_CELLS = 1.501  # largest distance of a particle's nodes along each axis, with rounding
@@ -234,7 +235,8 @@ def _rasterise(triangle_F33: np.ndarray, box: _Box) -> tuple[np.ndarray, ...]:
     slab = np.full(len(triangle_F33), box.reach)
     # a triangle can be nearest only if its sphere comes nearer than the nearest centre of any triangle
     bound = np.full(box.count, box.reach)
-    for node_3P, triangle in near_pairs(triangle_F33, normal, box.reach, slab, box.grid):
+    dense = (radius < LARGE_RADIUS * box.reach).any()  # few nodes are near the centres of large triangles
+    for node_3P, triangle in near_pairs(triangle_F33, normal, box.reach, slab, box.grid) if dense else ():
         np.minimum.at(bound, box.flat(node_3P), np.sqrt(square(node_3P - centre_3F.take(triangle, axis=1))))
     bound += 1e-9
     for node_3P, triangle in near_pairs(triangle_F33, normal, box.reach, slab, box.grid):
@@ -267,7 +269,7 @@ def _sheet_contacts(triangle_F33: np.ndarray, rim_F6: np.ndarray, box: _Box) -> 
     height = (offset * face).sum(axis=1)
     away = offset / np.where(distance < ON_SURFACE_CELLS, 1.0, distance)[:, None]
     # at the rim the direction to the foot is along the sheet, not through it
-    on_rim = _on_rim(foot, triangle_F33[owner], rim_F6[owner])
+    on_rim = _on_rim(foot, triangle_F33, rim_F6, owner)
     across = (distance < ON_SURFACE_CELLS) | on_rim
     away[across] = face[across] * np.where(height[across] < -ON_TRIANGLE, -1.0, 1.0)[:, None]
     depth = np.where(across, np.abs(height), distance)
@@ -275,18 +277,22 @@ def _sheet_contacts(triangle_F33: np.ndarray, rim_F6: np.ndarray, box: _Box) -> 
     return (node[own], distance[own], away[own], reached(distance[own])), (node, -distance, -away, reached(-depth))
 
 
-def _on_rim(foot_P3: np.ndarray, triangle_P33: np.ndarray, rim_P6: np.ndarray) -> np.ndarray:
-    """Returns whether points of triangles lie on their parts `rim_P6` (see _triangles), bool [P]."""
-    edge_1, edge_2 = triangle_P33[:, 1] - triangle_P33[:, 0], triangle_P33[:, 2] - triangle_P33[:, 0]
-    normal = np.cross(edge_1, edge_2)
-    square = (normal**2).sum(axis=1)
-    from_corner = foot_P3 - triangle_P33[:, 0]
-    share_1 = (np.cross(from_corner, edge_2) * normal).sum(axis=1) / square
-    share_2 = (np.cross(edge_1, from_corner) * normal).sum(axis=1) / square
+def _on_rim(foot_P3: np.ndarray, triangle_F33: np.ndarray, rim_F6: np.ndarray, owner_P: np.ndarray) -> np.ndarray:
+    """Returns whether points of triangles lie on their parts `rim_F6` (see _triangles), bool [P]."""
+    corner, edge_1, edge_2 = triangle_F33[:, 0].T, *(triangle_F33[:, end].T - triangle_F33[:, 0].T for end in (1, 2))
+    normal = cross(edge_1, edge_2)
+    normal_square = square(normal).take(owner_P)
+    normal, edge_1, edge_2, corner = (of_F.take(owner_P, axis=1) for of_F in (normal, edge_1, edge_2, corner))
+    from_corner = foot_P3.T - corner
+    share_1 = dot(cross(from_corner, edge_2), normal) / normal_square
+    share_2 = dot(cross(edge_1, from_corner), normal) / normal_square
     # on the edge opposite to a corner this corner's weight is 0; at the corner it is 1
-    share_P3 = np.stack([1 - share_1 - share_2, share_1, share_2], axis=1)
-    on_edge, at_corner = share_P3 < ON_EDGE, share_P3 > 1 - ON_EDGE
-    return np.asarray((np.concatenate([on_edge, at_corner], axis=1) & rim_P6).any(axis=1))
+    shares = (1 - share_1 - share_2, share_1, share_2)
+    parts = [share < ON_EDGE for share in shares] + [share > 1 - ON_EDGE for share in shares]
+    on_rim = np.zeros(len(owner_P), bool)
+    for part, on_part in enumerate(parts):
+        on_rim |= on_part & rim_F6[:, part].take(owner_P)
+    return on_rim
 
 
 def _closed_contacts(

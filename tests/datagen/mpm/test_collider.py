@@ -199,3 +199,15 @@ def test_swept_test_alone_holds():
         path = outcome.position_TN3.reshape(-1, 3)
         passed = contains(path, cone) if scene.obstacles[0].closed else path[:, 1] < 5.3 * CELL
         assert passed.sum() == 0 and outcome.counters["surface_projections"] > 0
+
+
+@pytest.mark.parametrize("shape", ["square", "half_sphere"])
+def test_bound_of_centres_changes_no_bit(shape, monkeypatch):
+    """The pass over the centres of triangles saves work only: contacts are the same with it and without it."""
+    scene = scene_of(shape_obstacle(shape, 0.6, (0.5, 0.47, 0.5)))
+    colliders = []
+    for radius in (0.0, np.inf):  # never, always
+        monkeypatch.setattr("datagen.mpm.collider.LARGE_RADIUS", radius)
+        colliders.append(build_collider(scene, 1.0))
+    for name in NO_NODES:
+        assert np.array_equal(*(getattr(one, name) for one in colliders)), name
