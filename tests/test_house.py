@@ -17,9 +17,9 @@ PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
     "hgn": 32_985,
-    "datagen": 8_489,
+    "datagen": 8_495,
     "tools": 6_566,
-    "tests": 31_654,
+    "tests": 31_666,
 }
 SETTINGS = 240  # fields of the dataclasses behind the commands, *Config
 
