@@ -7,10 +7,9 @@ import pytest
 
 from hgn.config import MpmConfig
 from hgn.scene.material import ELASTIC, WATER
-from tools.stability import solver_leak, solver_steps
+from tools.stability import solver_steps
 from tools.stability import solver_validation as validation
 from tools.stability.solver import main
-from tools.stability.solver_leak import crossing_paths, leaks
 
 pytestmark = pytest.mark.usefixtures("solver_kernels")
 
@@ -40,28 +39,6 @@ def test_report(tmp_path, monkeypatch, capsys):
 def test_formula():
     """dx sqrt(rho / (3 lambda + 2 mu)): 5.41e-4 s for water and 3.83e-4 s for solids at the default settings."""
     assert [round(solver_steps.formula(CPU, kind), 6) for kind in range(3)] == [5.41e-4, 3.83e-4, 3.83e-4]
-
-
-def test_crossing_paths():
-    """Only a step through the triangle counts, not one beside it or one that turns back before it. A step that cuts a
-    ridge twice does not cross it; long and short steps are counted alike."""
-    triangle = np.array([[[0.0, 0, 0], [1, 0, 0], [0, 0, 1]]])
-    path = np.array([[[0.2, 1, 0.2], [0.9, 1, 0.9], [0.2, 1, 0.2]], [[0.2, -1, 0.2], [0.9, -1, 0.9], [0.2, 0.1, 0.2]]])
-    assert crossing_paths(path / 64, triangle / 64) == pytest.approx(1 / 3)
-    ridge = np.array([[[0.0, 0, -9], [0, 0, 9], [3, 3, 0]], [[6.0, 0, -9], [3, 3, 0], [6, 0, 9]]])
-    for scale in (1.0, 0.05):
-        way = scale * np.array([[[0.0, 1, 0.1], [3, 1, 0.1]], [[6, 1, 0.1], [6, 1, 0.1]]])
-        assert [crossing_paths(way[:, [k]] / 64, scale * ridge / 64) for k in (0, 1)] == [0.0, 1.0]
-
-
-def test_leaks(monkeypatch):
-    """Small blocks do not leak through a sheet, a cone and a bowl."""
-    monkeypatch.setattr(solver_leak, "OFFSETS", solver_leak.OFFSETS[3:4])
-    monkeypatch.setattr(solver_leak, "ORIENTATIONS", {"tilted": solver_leak.ORIENTATIONS["tilted"]})
-    monkeypatch.setattr(solver_leak, "SECONDS", 0.03)
-    monkeypatch.setattr(solver_leak, "BLOCK_CELLS", 2.0)
-    rows = list(leaks(CPU))
-    assert len(rows) == 3 * 3 * 2 and all(row.held and row.measured == 0 for row in rows)
 
 
 def test_validation_rows(monkeypatch):

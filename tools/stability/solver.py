@@ -1,8 +1,8 @@
 """python -m tools.stability solver [--json FILE]: checks the solver against formulas and experiments.
 
-Rows: the largest stable step, stiffness, speed of impact, free flight from obstacles and friction on them, leaks, a
-long run, and published experiments (water at rest, dams, columns and slopes of sand). On two CPU cores most cases take
-minutes; leaks and columns need a GPU.
+Rows: the largest stable step, stiffness, speed of impact, free flight from obstacles and friction on them, a long run,
+and published experiments (water at rest, dams, columns and slopes of sand). On two CPU cores most cases take minutes;
+columns need a GPU.
 """
 
 from __future__ import annotations
@@ -20,12 +20,11 @@ from tools.stability.gallery import is_gallery
 from tools.stability.row import Report, Row, table
 from tools.stability.solver_contact import contacts
 from tools.stability.solver_gallery import broken_table, gallery_rows
-from tools.stability.solver_leak import leaks
 from tools.stability.solver_loads import impacts, long_run, stiffnesses
 from tools.stability.solver_steps import Point, largest_steps
 from tools.stability.solver_validation import columns, dam_breaks, reposes, rest
 
-NAMES = ("steps", "stiffness", "impact", "contact", "leak", "long", "rest", "dam", "column", "repose")
+NAMES = ("steps", "stiffness", "impact", "contact", "long", "rest", "dam", "column", "repose")
 CaseName = Annotated[
     str, Bound(f"one of {', '.join(NAMES)}, gallery, gallery_NUMBER", lambda n: n in NAMES or is_gallery(n))
 ]
@@ -35,7 +34,7 @@ CaseName = Annotated[
 class StabilitySolverConfig(ReportConfig, Bounded):
     """The options of `python -m tools.stability solver`."""
 
-    # steps, stiffness, impact, contact, leak, long, rest, dam, column, repose; null: all of these. gallery: the scenes
+    # steps, stiffness, impact, contact, long, rest, dam, column, repose; null: all of these. gallery: the scenes
     # of conf/gallery, which networks are compared with; gallery_NUMBER: a draw of them
     cases: tuple[CaseName, ...] | None = None
 
@@ -50,8 +49,7 @@ def main(mapping: dict[str, Any]) -> int:
     points: list[Point] = []
     cases: dict[str, Callable[[MpmConfig], Iterable[Row]]] = {
         "steps": partial(largest_steps, points=points), "stiffness": stiffnesses, "impact": impacts,
-        "contact": contacts, "leak": leaks, "long": long_run, "rest": rest, "dam": dam_breaks, "column": columns,
-        "repose": reposes,
+        "contact": contacts, "long": long_run, "rest": rest, "dam": dam_breaks, "column": columns, "repose": reposes,
     }  # fmt: skip
     scenes: dict[str, Any] = {}
     report = Report("solver", meta, config.json, steps=points, scenes=scenes)

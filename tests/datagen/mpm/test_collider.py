@@ -9,6 +9,7 @@ from mpm_scenes import BOX, CELL, QUAD, box_corners, particles, sheet, simulated
 from datagen.mpm.collider import HIDDEN, SEEN, build_collider
 from hgn.scene.distance import closest_points, contains
 from hgn.scene.material import MATERIALS, SAND, WATER
+from hgn.scene.rotation import euler_rotation
 from hgn.scene.scene import Obstacle
 from hgn.scene.shapes import shape_obstacle
 from hgn.schema import ConfigError
@@ -167,6 +168,24 @@ def test_sheets_do_not_leak():
     scenes = [dropped(material, y + 2.5 * CELL, speed, wide_sheet(y)) for material, y, speed in cases]
     for case, outcome in zip(cases, simulated(scenes, frames=8), strict=True):
         assert outcome.position_TN3[:, :, 1].min() > case[1], case
+
+
+def test_tilted_sheets_and_bowls_do_not_leak():
+    """Nothing passes a tilted sheet from wall to wall, nor the wall of a bowl, at 10 m/s."""
+    turn, middle = euler_rotation((27.0, 0.0, 13.0)), np.array([0.5, 0.35, 0.5])
+    tilted, bowl = (shape_obstacle(name, size, tuple(middle), of) for name, size, of in (
+        ("square", 3.0, turn), ("half_sphere", 0.5, np.eye(3)),
+    ))  # fmt: skip
+    cases = [(kind, obstacle) for kind in range(3) for obstacle in (tilted, bowl)]
+    outcomes = simulated([dropped(kind, 0.6, 10.0, obstacle) for kind, obstacle in cases], frames=6)
+    rim = bowl.vertex_V3[:, 1].max()
+    for (kind, obstacle), outcome in zip(cases, outcomes, strict=True):
+        path = outcome.position_TN3.reshape(-1, 3)
+        if obstacle is tilted:
+            assert ((path - middle) @ turn[:, 1]).min() > 0, kind
+        else:
+            low = path[path[:, 1] < rim]
+            assert len(low) and np.linalg.norm(low - (0.5, rim, 0.5), axis=1).max() < 0.25, kind
 
 
 def test_bodies_keep_particles_out():
