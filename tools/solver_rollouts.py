@@ -24,7 +24,7 @@ OnFrame = Callable[[int], None] | None
 def solver_scene(episode: Episode, cell_size: float | None = None, wall: float = 0.0) -> Scene:
     """Returns an episode's initial state for the solver, on its own grid or another.
 
-    A finer grid has more particles, which begin inside walls of thickness `wall`.
+    A finer grid has more particles. They start at least `wall` from the domain's planes.
     """
     own = episode.obstacle_grid.cell_size
     density = episode.solver.get("particles_per_cell")  # not stored in older data
@@ -57,7 +57,7 @@ def solver_trials(
     colliders: Sequence[Any] | None = None,
     stability_fractions: Sequence[float] | None = None,
 ) -> list[RolloutResult]:
-    """Returns the solver's trajectories, of a scene that it stops the initial state; shows a bar without on_frame."""
+    """Returns the solver's trajectories; of a failed scene its initial state. Shows a bar if `on_frame` is None."""
     if on_frame is None:
         with bar("solver", total=frames, unit="frame") as progress:
             shown = lambda _: progress.update()  # noqa: E731
@@ -80,7 +80,8 @@ class Setting:
     """A setting of the solver on a grid."""
 
     step: float  # fraction of the limit of stability
-    # largest initial displacement, domain units; on a finer grid all but the visible particles are drawn anew instead
+    # Largest initial displacement of a particle along each axis, domain units. If the grid is finer than the episode's,
+    # visible particles keep their places, and a value above 0 places their other children at new random places.
     perturbation: float = 0.0
 
 
@@ -128,9 +129,7 @@ class SolverLaunches:
         scenes = [self._scene(episode, setting.perturbation) for setting, episode in pairs]
         colliders = [self._colliders[episode.key].result() for _, episode in pairs]
         steps = [setting.step for setting, _ in pairs]
-        # scenes have their own steps; the step of the config is used if all are equal
-        alike = replace(self.config, stability_fraction=steps[0])
-        trials = solver_trials(scenes, alike, frames, self.frame_rate_hz, on_frame, colliders, steps)
+        trials = solver_trials(scenes, self.config, frames, self.frame_rate_hz, on_frame, colliders, steps)
         return [
             replace(trial, position_TN3=visible_positions(trial.position_TN3, len(episode.material_N)))
             for trial, (_, episode) in zip(trials, pairs, strict=True)

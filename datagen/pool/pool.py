@@ -1,8 +1,8 @@
 """Generates the missing episodes of a data set with a pool of workers: makers build scenes, solvers simulate them.
 
 The pool distributes work, publishes shards and replaces dead workers. The scenes of a dead worker are simulated again
-in halves, then quarters, down to single scenes. If MAXIMUM_ATTEMPTS workers die with only one and the same scene, it is
-quarantined, and the next seed replaces it. Workers run on this machine (local_workers.py) or on Ray (ray_workers.py).
+in halves, then quarters, down to single scenes. A single scene is quarantined after the deaths of MAXIMUM_ATTEMPTS
+workers, and the next seed replaces it. Workers run on this machine (local_workers.py) or on Ray (ray_workers.py).
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from datagen.pool.worker import BuiltGrid, GridTask, MadeScene, Worker, WorkerFa
 from datagen.pool.writer import DatasetWriter
 from hgn.schema import ConfigError
 
-MAXIMUM_ATTEMPTS = 3  # deaths of workers with a single scene, before this scene is quarantined
+MAXIMUM_ATTEMPTS = 3  # deaths of workers that had only one scene, after which this scene is quarantined
 _WAIT_SECONDS = 0.2  # longest time until a stop request is noticed
 _PACKING_SECONDS = 0.02  # maximum delay between packing and publishing a shard
 _LOOK_SECONDS = 1.0  # interval of checks for shards of other generators
@@ -46,13 +46,12 @@ class Pool:
         self._launch_size = self._largest_launch = self._plan.first_launch
         self._launches = 0
         self._deaths_in_a_row = 0
-        # by key: deaths of workers that had only this scene, and the group of scenes with which a scene is tried again
-        self._alone: dict[str, int] = {}
-        self._group: dict[str, int] = {}
-        self._grid_deaths: dict[SceneTask, int] = {}
+        self._alone: dict[str, int] = {}  # key of a scene: deaths of workers that had only this scene
+        self._group: dict[str, int] = {}  # key of a scene: number of the group in which it is tried again
+        self._grid_deaths: dict[SceneTask, int] = {}  # deaths of makers that computed the obstacle grid of this scene
 
     def run(self) -> None:
-        """Runs until this generator's share is published, by it or by other generators, then ends all workers.
+        """Runs until the writer's share of the shards is published, by it or by others, then ends all workers.
 
         Raises: Stopped; ConfigError, OSError or RuntimeError from a worker.
         """
@@ -91,7 +90,7 @@ class Pool:
         self._launch_size = min(self._largest_launch, self._even_launch(0))
 
     def _even_launch(self, taken: int) -> int:
-        """Returns the launch size that divides the remaining scenes evenly. `taken` scenes are not among them."""
+        """Returns the launch size that divides the remaining scenes evenly, without `taken` scenes of a new launch."""
         left = self._writer.total - self._writer.done - sum(len(solver.tasks) for solver in self._solvers) - taken
         share = max(1, math.ceil(left / len(self._solvers)))
         return math.ceil(share / math.ceil(share / self._plan.scenes_per_launch))

@@ -10,9 +10,10 @@ per frame. The path of a particle relative to the obstacle leads from x by v - V
 where the network uses v - V.
 
 Tensors have one row for each obstacle. Obstacle j of scene s has the row j S + s. Scenes with fewer than J moving
-obstacles have rows without cells. Cells and triangles are found by keys of a scene and a place; for moving obstacles
-the keys contain the row in place of the scene.
+obstacles have rows without cells. A key of a cell or triangle consists of its place and, for obstacles at rest, the
+number of its scene. For moving obstacles the number is that of the row.
 Shape legend: N particles, S scenes, J largest number of moving obstacles in a scene, V = J S rows, C coarsest cells.
+K columns: three of the normal, one of friction, and after these, where there are 7, three of the velocity V.
 """
 
 from __future__ import annotations
@@ -150,7 +151,7 @@ class MovingObstacles:
         return replace(self, **own, poses=self.poses.map(lambda tensor: tensor.to(device)))  # type: ignore[arg-type]
 
     def rows(self, scene_N: torch.Tensor, dtype: torch.dtype) -> Iterator[tuple[torch.Tensor, Poses]]:
-        """Yields for each number j the rows of the particles' scenes, [N], and the poses of these rows."""
+        """Yields for each j the row of obstacle j of the particle's scene, [N], and the poses of these rows."""
         for layer in range(self.layers):
             row_N = scene_N.long() + layer * len(self.scenes)
             yield row_N, Poses(*(tensor.to(dtype)[row_N] for tensor in self.poses.tensors))
@@ -163,8 +164,8 @@ class MovingObstacles:
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Returns `relative.obstacle_surfaces` of moving and `still` obstacles, [N, 8], and velocities V [N, 3].
 
-        V is that of the surface at the particle, or else of the first one on its path; 0 without a surface. Where a
-        particle is in cells of several obstacles, normals are summed and shortened to 1; friction and V are means.
+        V is the velocity of the surface at the particle, or else of the first one on its path; 0 without a surface. In
+        cells of several obstacles, normals are summed, to a length of at most 1; friction and V are means.
         """
         (position_N3, velocity_N3, scene_N), cells = place, self.cells
         assert cells is not None
@@ -188,13 +189,13 @@ class MovingObstacles:
 def _seen(
     cells: ObstacleCells, place_N3: torch.Tensor, way_N3: torch.Tensor, scene_N: torch.Tensor, part: float
 ) -> torch.Tensor:
-    """Returns normals and friction at a part of particles' ways, [N, 4]."""
-    row_NV = cells.surfaces(place_N3 + way_N3 * part, scene_N)
-    return pad(row_NV, (0, 4 - row_NV.shape[1]))
+    """Returns normals and friction at the fraction `part` of the particles' ways, [N, 4]."""
+    row_NK = cells.surfaces(place_N3 + way_N3 * part, scene_N)
+    return pad(row_NK, (0, 4 - row_NK.shape[1]))
 
 
 def _merged(rows: Sequence[torch.Tensor]) -> torch.Tensor:
-    """Returns the sums of normals, shortened to 1, and the means of friction and V over rows with a normal, [N, 7]."""
+    """Returns sums of normals, at most 1 long, and means of friction and V over rows with a normal, [N, 7]."""
     there = [row_N7[:, :3].any(-1, keepdim=True).to(row_N7) for row_N7 in rows]
     count_N1, total_N7 = sum(there), sum(there_N1 * row_N7 for there_N1, row_N7 in zip(there, rows, strict=True))
     assert isinstance(count_N1, torch.Tensor) and isinstance(total_N7, torch.Tensor)
@@ -204,11 +205,11 @@ def _merged(rows: Sequence[torch.Tensor]) -> torch.Tensor:
 
 
 def first(rows: Sequence[torch.Tensor]) -> torch.Tensor:
-    """Returns of several rows [N, V] the first one with a normal, or the last one."""
-    result_NV = rows[-1]
-    for row_NV in rows[-2::-1]:
-        result_NV = torch.where(row_NV[:, :3].any(-1, keepdim=True), row_NV, result_NV)
-    return result_NV
+    """Returns for each particle the first of several rows [N, K] that has a normal; without one, the last row."""
+    result_NK = rows[-1]
+    for row_NK in rows[-2::-1]:
+        result_NK = torch.where(row_NK[:, :3].any(-1, keepdim=True), row_NK, result_NK)
+    return result_NK
 
 
 def poses_of(scenes: Sequence[Sequence[MovingObstacle]], frames: Sequence[int], frame_s: float) -> Poses:
@@ -226,10 +227,10 @@ def poses_of(scenes: Sequence[Sequence[MovingObstacle]], frames: Sequence[int], 
 def surface_velocity(
     touch_N: torch.Tensor, surface_N3: torch.Tensor, touched_C: torch.Tensor, grid: GridHierarchy
 ) -> torch.Tensor:
-    """Returns V of each particle, [N, 3]: t times its own `surface_N3`, plus 1 - t times the mean around it.
+    """Returns the velocity V of the surface for each particle, t V_own + (1 - t) V_mean, [N, 3].
 
-    t is the particle's contact `touch_N`. The mean is over the particles in the same coarsest cells and in cells across
-    their faces, weighted by their contacts. Walls are at rest.
+    t is the particle's contact, `touch_N`. V_own is its row of `surface_N3`, 0 at walls. V_mean is the mean of V_own,
+    weighted by t, over the particles in the same coarsest cells and in cells across their faces.
     """
     level, weight_N8 = grid.levels[-1], grid.weight_N8
     sum_C4 = grid.coarsest_sums(touch_N[:, None] * torch.cat([surface_N3, torch.ones_like(surface_N3[:, :1])], -1))

@@ -16,10 +16,10 @@ a_s. With Q = (1 + P / e)^-1, e = FEW + RARE tr P, surfaces without friction rem
 
     k = min(1, |B| / |T|, b),    B = sum_s mu_s a_s (n_s . y) n_s
 
-b is the largest number with |b c Q T + Q u / 2|^2 <= (|Q u|^2 + D) / 4, with c = d_C t_C. u is the velocity along
-surfaces after a frame without friction, Q (v + g + d_C A_C), and D the variance of v in the cell; units of s_a. Reason:
-friction changes the velocity of each particle by -l u_p, 0 <= l <= 1, so by a vector in the ball around -u_p / 2 with
-the radius |u_p| / 2. So the mean change lies in a ball around -u / 2 with a radius of at most sqrt(|u|^2 + D) / 2.
+b is the largest number for which f = b c Q T, with c = d_C t_C, satisfies f . (Q u + f) <= D / 4. u is the velocity
+along surfaces after a frame without friction, Q (v + g + d_C A_C), and D the variance of v in the cell, in units of
+s_a. Reason: friction changes the velocity of each particle by -l u_p, 0 <= l <= 1, so by a vector in the ball around
+-u_p / 2 with the radius |u_p| / 2. So the mean change f satisfies |f + u / 2|^2 <= (|u|^2 + D) / 4, which is the rule.
 With `moving` v is the velocity relative to the surfaces, v - V of hgn.network.moving. It adds no columns.
 Shape legend: N particles, C coarsest cells, S scenes, P parameters, K columns.
 """

@@ -36,7 +36,7 @@ from hgn.schema import ConfigError, Vector, require
 
 REPORT_SEED = 1_000_000  # first seed of scenes that reports draw; seeds of data sets are hashes
 MAXIMUM_TILTED_GRAVITY = 19.6  # domain units per second squared
-LAYOUTS = 5  # largest number of layouts that are started for a scene
+LAYOUTS = 5  # attempts to place all items of a scene
 SHAPES_PER_ITEM = 20  # attempts for an obstacle (each draws shape, size, orientation) or a group (shape)
 PLACES_PER_SHAPE = 50
 FUNNELS = 300  # attempts to draw a funnel that fits into the domain
@@ -51,9 +51,9 @@ def generate_scene(config: SceneConfig, seed: int) -> Scene:
     """Returns a random scene of particle groups at rest or in motion. A lone particle is a group of size 0.
 
     The scene's gravity is the config's, zero, or drawn. If the config names `kinds`, the scene is of one of them
-    (hgn.scene.world). Obstacles lie inside the domain, CLEARANCE_CELLS solver cells from each other. No obstacle lies
-    inside another. Only the four squares of a funnel cross. Groups keep the same distance from obstacles, from each
-    other and from the solver's walls. An item that does not fit gets a new place, then a new shape, then a new layout.
+    (hgn.scene.world). Obstacles lie in the domain, at least CLEARANCE_CELLS solver cells apart and none inside another,
+    except for the four squares of a funnel, which cross. Groups keep the same distance from obstacles, from each other
+    and from the solver's walls. An item that does not fit gets a new place, then a new shape, then a new layout.
     `Scene.specification` records every choice in plain JSON types.
 
     Raises: ConfigError if an item does not fit. The message names the setting to change.

@@ -28,7 +28,7 @@ from hgn.network.own_physics import joined_parameters
 from hgn.runtime.simulation import Simulation
 from hgn.runtime.triton_stepper import CHECKED_PARTICLES, TritonStepper
 
-SPARE = 1.1  # (capacity for particles) / (particles in the first simulation)
+SPARE = 1.1  # (capacity of a new stepper for particles) / (particles in its first simulation)
 
 
 class TritonScenes:
@@ -37,8 +37,7 @@ class TritonScenes:
     def __init__(
         self, network: HierarchicalGraphNetwork, training: TrainingConfig, obstacle_cell_size: float, precision: str
     ) -> None:
-        """`network` simulates with the parameters in `values`. Its own outputs check the kernels in the first call."""
-
+        """Parameters of simulations are in `values`. The first call checks the kernels with those of `network`."""
         self._network, self._training, self._precision = network, training, precision
         self._obstacle_cell_size = obstacle_cell_size
         self._history = network.config.velocity_history
@@ -161,7 +160,7 @@ class TritonScenes:
         return stepper
 
     def _first_scenes(self, episodes: Sequence[DeviceEpisode], state: ParticleState) -> ParticleState | None:
-        """Returns the first scenes, with obstacles, up to the size that PyTorch can check; None if one is too large."""
+        """Returns as many of the first scenes, with obstacles, as PyTorch can check; None if the first is too large."""
         scenes, count = 0, 0
         while scenes < len(episodes) and count + episodes[scenes].particles <= CHECKED_PARTICLES:
             count += episodes[scenes].particles
@@ -171,7 +170,7 @@ class TritonScenes:
         seen = [(scene, e.obstacles) for scene, e in enumerate(episodes[:scenes]) if e.obstacles is not None]
         obstacles = None
         if seen:
-            # the keys of a hash are those of scene 0
+            # an episode's keys have the scene number 0
             key_K = torch.cat([cells.key_K + (scene << 3 * COORDINATE_BITS) for scene, cells in seen])
             order_K = torch.argsort(key_K)
             value_KV = torch.cat([cells.value_K for _, cells in seen])[order_K]
