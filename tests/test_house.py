@@ -17,8 +17,8 @@ PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
     "hgn": 32_985,
-    "datagen": 8_495,
-    "tools": 6_383,
+    "datagen": 8_494,
+    "tools": 6_382,
     "tests": 31_662,
 }
 SETTINGS = 240  # fields of the dataclasses behind the commands, *Config
