@@ -123,7 +123,7 @@ def measurements(records: list[dict[str, float]]) -> list[dict[str, float]]:
 
 def draw(runs: Sequence[Run]) -> bytes:
     """Draws the curves of one run or of several; returns PNG bytes."""
-    from tools.report import as_png, new_figure
+    from tools.report import as_png, new_figure, shared_legend
 
     figure, (panels,) = new_figure(1, 3, (15, 5 if len(runs) > 1 else 4.5))
     last = {name: value for record in runs[0].records for name, value in record.items()}
@@ -143,10 +143,7 @@ def draw(runs: Sequence[Run]) -> bytes:
             if len(runs) == 1:
                 panel.legend(fontsize=8)
     if len(runs) > 1:
-        # one legend below all panels: within a panel it would cover curves
-        named = {line.get_label(): line for panel in panels for line in panel.lines}
-        shown = {label: line for label, line in named.items() if label and not label.startswith("_")}
-        figure.legend(shown.values(), shown.keys(), fontsize=8, loc="outside lower center", ncols=5)
+        shared_legend(figure, fontsize=8, loc="outside lower center", ncols=5)
     figure.suptitle(title, fontsize=10)
     return as_png(figure)
 

@@ -85,6 +85,14 @@ def new_figure(lines: int, columns: int, size: tuple[float, float], share_y: boo
     return figure, figure.subplots(lines, columns, sharey=share_y, squeeze=False)
 
 
+def shared_legend(figure: Any, **style: Any) -> None:
+    """Adds one legend of all panels: within a panel it would cover curves."""
+    pairs = [pair for panel in figure.axes for pair in zip(*panel.get_legend_handles_labels(), strict=True)]
+    shown = {label: handle for handle, label in pairs}
+    if shown:
+        figure.legend(shown.values(), shown.keys(), **style)
+
+
 def as_png(figure: Any, dpi: int = 110) -> bytes:
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=dpi, metadata={"Software": WRITTEN_BY_HGN})
