@@ -1,21 +1,16 @@
 """python -m tools.stability network weights=…: checks a network's motion against closed forms, the solver and limits.
 
-The cases are in network_cases.py, the measures in measures.py. If a rollout fails, the runtime must report it; the
-last case breaks a parameter of the network to see that it does.
+The cases are in network_cases.py, the measures in measures.py. If a rollout fails, the runtime must report it.
 """
 
 from __future__ import annotations
 
-import copy
 import sys
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any
-
-import numpy as np
-import torch
 
 from hgn.command import run_command
 from hgn.config import DEFAULT_WEIGHTS, MpmConfig, SceneConfig, SimulatorConfig
@@ -28,18 +23,13 @@ from tools.solver_rollouts import solver_trials
 from tools.stability.case import Case, Outcome, cut, gallery_cases
 from tools.stability.checks import gallery_rows, refused, row_of
 from tools.stability.gallery import is_gallery
-from tools.stability.network_cases import FAMILIES, Context, body
+from tools.stability.network_cases import FAMILIES, Context
 from tools.stability.row import Report, Row, table
 from tools.timing import FrameClock
 
-GUARD = "guard"
-CASES = (*FAMILIES, GUARD)
 CaseName = Annotated[
-    str, Bound(f"one of {', '.join(CASES)}, gallery, gallery_NUMBER", lambda n: n in CASES or is_gallery(n))
+    str, Bound(f"one of {', '.join(FAMILIES)}, gallery, gallery_NUMBER", lambda n: n in FAMILIES or is_gallery(n))
 ]
-FAR_DOMAINS = 100.0  # distance in domains by which the broken network moves particles in one frame
-GUARD_FRAMES = 4  # length of its rollouts
-FLOOR_HEIGHT = 0.02  # height of their particles above the lower plane, as a fraction of the domain's height
 
 
 @dataclass(frozen=True)
@@ -47,8 +37,8 @@ class StabilityNetworkConfig(SimulatorConfig, Bounded):
     """The options of `python -m tools.stability network`."""
 
     weights: str = DEFAULT_WEIGHTS  # a file of python -m hgn.export, or the name of shipped weights
-    # throw, gravity, collision, collapse, rest, particles, domain, speed, single, slope, far, guard; null: all of
-    # these. gallery: the scenes of conf/gallery against the solver's figures; gallery_1: the draw for
+    # throw, gravity, collision, collapse, rest, particles, domain, speed, single, slope, far; null: all of these.
+    # gallery: the scenes of conf/gallery against the solver's figures; gallery_1: the draw for
     # choices; gallery_2: the draw for reports; gallery_NUMBER: another draw
     cases: tuple[CaseName, ...] | None = None
     frames: FrameCount = 300  # of each rollout
@@ -68,7 +58,6 @@ def main(mapping: dict[str, Any]) -> int:
     simulator = Simulator.load(config.weights, config.device, config.backend, config.precision)
     print(simulator.backend.note, file=sys.stderr)
     report = Report("network", _meta(config, simulator), config.json)
-    wanted = config.cases or CASES
     cases = cases_of(config, simulator)
     mpm = replace(config.mpm, device=simulator.device.type) if config.solver else None
     runner = Runner(simulator, cases, mpm)
@@ -78,8 +67,6 @@ def main(mapping: dict[str, Any]) -> int:
     for number, case in enumerate(cases, start=1):
         print(f"case {number} of {len(cases)}: {case.name}", file=sys.stderr, flush=True)
         report.add(runner.rows(case))
-    if GUARD in wanted:
-        report.add([guard_row(simulator, config.scene)])
     report.meta["seconds"] = time.monotonic() - started
     report.write()
     print(table(report.rows))
@@ -92,7 +79,7 @@ def cases_of(config: StabilityNetworkConfig, simulator: Simulator) -> list[Case]
         config.scene, simulator.network.config, simulator.frame_rate_hz, config.frames, config.long_frames,
         config.solver,
     )  # fmt: skip
-    wanted = config.cases or CASES
+    wanted = config.cases or tuple(FAMILIES)
     cases = [case for name, family in FAMILIES.items() if name in wanted for case in family(context)]
     return cases + [case for name in wanted if is_gallery(name) for case in gallery_cases(name)]
 
@@ -167,27 +154,6 @@ class Runner:
                 trials = solver_trials(list(pending.values()), self.mpm, frames, self.simulator.frame_rate_hz)
                 self._solved |= dict(zip(pending, trials, strict=True))
         return [self._solved[id(scene)] for scene in scenes]
-
-
-def guard_row(simulator: Simulator, config: SceneConfig) -> Row:
-    """Checks that the runtime stops a network with an exploding parameter at the first frame.
-
-    The particles lie on the floor, because with relative inputs no parameter changes free flight.
-    """
-    broken = copy.deepcopy(simulator.network)
-    with torch.no_grad():
-        # not NaN, which a comparison of backends would refuse; upwards, as forces along the floor are subtracted
-        thrown = FAR_DOMAINS * max(config.domain_size) / broken.normaliser.acceleration_std[1]
-        dict(broken.named_parameters())["decode.second.bias"][1] = thrown
-    floor_13 = np.array([config.domain_size]) * (0.5, FLOOR_HEIGHT, 0.5)
-    materials = [name for name in config.materials if name in broken.config.materials]
-    scenes = [InitialState.of_scene(body(config, material, floor_13, np.zeros(3))) for material in materials]
-    sabotaged = Simulator(broken, simulator.frame_rate_hz, simulator.backend.name, simulator.backend.precision)
-    trials = simulate_scenes(sabotaged, scenes, GUARD_FRAMES)
-    caught = all(trial.cause is not None and trial.frame_count == 1 for trial in trials)
-    beyond = next((trial.cause for trial in trials if trial.cause is not None), "the runtime did not report it")
-    frames = max(trial.frame_count for trial in trials)
-    return Row("a weight that explodes", 1, frames, caught, beyond, {"guard": "raised" if caught else "missed"})
 
 
 if __name__ == "__main__":
