@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -95,22 +95,11 @@ class SolverLaunches:
         self.config, self.cell_size, self.frame_rate_hz, self.frames = config, cell_size, frame_rate_hz, frames
         self._settings: list[Setting] = []
         self._known: dict[tuple[Setting, str], RolloutResult] = {}
-        self._colliders: dict[str, Future[Any]] = {}
+        self._colliders: dict[str, Any] = {}  # by the episode's key
 
     def add(self, setting: Setting) -> None:
         if setting not in self._settings:
             self._settings.append(setting)
-
-    def collide(self, episodes: Sequence[Episode], threads: Executor) -> None:
-        """Builds the colliders of the scenes."""
-        from datagen.mpm.collider import build_collider
-
-        for episode in episodes:
-            if episode.key not in self._colliders:
-                scene = self._scene(episode)
-                self._colliders[episode.key] = threads.submit(
-                    build_collider, scene, self.config.choices.collider_band_cells
-                )
 
     def trials(self, setting: Setting, episodes: Sequence[Episode]) -> list[RolloutResult]:
         """Returns trajectories from the episodes' first frames."""
@@ -124,10 +113,15 @@ class SolverLaunches:
 
     def simulate(self, pairs: Sequence[tuple[Setting, Episode]], frames: int, on_frame: OnFrame) -> list[RolloutResult]:
         """Simulates these settings and episodes, also if they were simulated before."""
+        from datagen.mpm.collider import build_collider
+
+        new = {episode.key: self._scene(episode) for _, episode in pairs if episode.key not in self._colliders}
+        band = self.config.choices.collider_band_cells
         with ThreadPoolExecutor(available_cpus()) as threads:
-            self.collide([episode for _, episode in pairs], threads)
+            built = threads.map(lambda scene: build_collider(scene, band), new.values())
+            self._colliders |= dict(zip(new, built, strict=True))
         scenes = [self._scene(episode, setting.perturbation) for setting, episode in pairs]
-        colliders = [self._colliders[episode.key].result() for _, episode in pairs]
+        colliders = [self._colliders[episode.key] for _, episode in pairs]
         steps = [setting.step for setting, _ in pairs]
         trials = solver_trials(scenes, self.config, frames, self.frame_rate_hz, on_frame, colliders, steps)
         return [

@@ -6,7 +6,6 @@ import functools
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from pathlib import Path
@@ -25,7 +24,6 @@ from hgn.runtime.weights import find_weights, load_weights, require_frame_rate, 
 from hgn.scene.episode import Episode
 from hgn.schema import ConfigError, from_mapping, from_stored, printable, require, require_replaceable
 from hgn.system.device import choose_device
-from hgn.system.machine import available_cpus
 from tools.error_vs_time.contenders import (
     PARTICLES_AT_ONCE,
     BaselineContender,
@@ -85,9 +83,6 @@ def main(mapping: dict[str, Any]) -> int:
             references, left_out = resimulated(episodes, launches(own_grid), REFERENCE_STEP)
         references = [replace(e, position_TN3=np.asarray(e.position_TN3[:frames])) for e in references]
         require(bool(references), "data", "scenes that the solver simulates to the end", left_out)
-        with ThreadPoolExecutor(available_cpus()) as threads:
-            for solver in solvers:
-                solver.launches.collide(references, threads)
     meta = meta_of(config, device) | same
     data = Path(printable(config.data)).name
     meta |= {"data": data, "split": config.split, "scenes": len(references), "left_out": left_out}

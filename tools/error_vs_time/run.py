@@ -27,7 +27,6 @@ from tools.report import finite, write_report
 from tools.timing import Stopwatch
 
 ROUNDS = 2  # of each timed scene
-DRAWN_EVERY_S = 60.0  # figures take some seconds
 Row = dict[str, Any]
 
 
@@ -55,7 +54,6 @@ class Run:
         self.watches: dict[int, Stopwatch] = {}
         self._rows: dict[int, Row] = {}
         self._given_up: set[int] = set()
-        self._drawn = time.monotonic()
         self.out, self.file = config.out, config.json or f"{config.out}.json"
 
     @property
@@ -68,7 +66,7 @@ class Run:
             for i in range(len(self.contenders)):
                 self._attempt(i, self._errors)
                 self._attempt(i, self._times)
-                self.write(drawn=time.monotonic() - self._drawn > DRAWN_EVERY_S)
+                self.write()
                 progress.update()
         for _ in range(1, ROUNDS):
             for i in sorted(self.watches):
@@ -84,7 +82,6 @@ class Run:
         write_report(self.file, {"meta": self.meta, "rows": rows, "paired": paired})
         if drawn:
             draw(self.out, rows, self.meta)
-            self._drawn = time.monotonic()
 
     def _errors(self, i: int) -> None:
         started = time.monotonic()
