@@ -40,8 +40,6 @@ def test_rows_of_every_case(warm_python, tmp_path):
         (base,) = (r for r in rows if r["devices"] == 1 and r["spread"] == row["spread"])
         rates = [r["particles_per_update"] / r["ms"] for r in (row, base)]
         assert row["efficiency"] == pytest.approx(rates[0] / rates[1])
-    parameters = rows[3]["messages"][0]
-    assert parameters % 4 == 0 and parameters > 1000  # one message of all gradients
     cells = [[cell.strip() for cell in line.split("|")] for line in done.stdout.splitlines()]  # long ones wrap
     assert [row[1:6] for row in cells if row[1:2] == ["torch"]][-1] == ["torch", "fp32", "2", "2", "0.17"]
 
@@ -77,7 +75,7 @@ def test_no_time_where_a_check_is_red(alone, monkeypatch):
     """Averages that are wrong, and weights that differ between ranks, are found, and get a reason instead of a time."""
     config = from_mapping(ScalingConfig, SMALL)
     contender = averaged(alone, measure.TorchUpdates, config)
-    assert contender.check == "pass" and len(contender.messages) == 1
+    assert contender.check == "pass"
     right = dist.all_reduce
 
     def wrong_sum(tensor, group, async_op=False):
@@ -100,7 +98,6 @@ def test_triton_is_timed_alike(alone):
     config = from_mapping(ScalingConfig, SMALL | small | {"scenes": 1, "batches": 1})
     plain, fast = (averaged(alone, make, config) for make in (measure.TorchUpdates, measure.TritonUpdates))
     assert plain.check == fast.check == "pass"
-    assert plain.messages[0] <= fast.messages[0] < 2 * plain.messages[0]  # the kernels' layout has spare places
     assert plain.update is not None and fast.update is not None
     for contender in (plain, fast):
         contender.update.run()

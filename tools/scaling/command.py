@@ -85,9 +85,10 @@ def table(rows: list[dict[str, Any]]) -> str:
     work = ("backend", "precision", "devices", "scenes", "particle_spread")
     lines = []
     for row in rows:
-        sent = f"{len(row['messages'])}, up to {max(row['messages']) / 1e6:.1f} MB" if row["averaged"] else "none"
-        sent += ", in the graph" if row["one_graph"] else ""
+        averaged = "no" if not row["averaged"] else "in the graph" if row["one_graph"] else "yes"
         times = report.number(row["ms"], ".2f"), report.spread(row.get("ms_quartiles"), ".2f")
-        lines.append((*(row[key] for key in work), sent, *times, report.number(row["efficiency"], ".3f"), row["check"]))
-    head = ("backend", "precision", "devices", "scenes", "spread", "messages", "update, ms", "quartiles", "efficiency")
+        lines.append(
+            (*(row[key] for key in work), averaged, *times, report.number(row["efficiency"], ".3f"), row["check"])
+        )
+    head = ("backend", "precision", "devices", "scenes", "spread", "averaged", "update, ms", "quartiles", "efficiency")
     return report.table((*head, "check"), lines)

@@ -6,7 +6,6 @@ logging and reading of data are not included.
 
 from __future__ import annotations
 
-import copy
 import datetime
 import gc
 import itertools
@@ -14,6 +13,7 @@ import json
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,6 @@ import numpy as np
 import torch
 import torch.distributed as dist
 from torch import nn
-from torch.distributed.algorithms.ddp_comm_hooks.default_hooks import allreduce_hook
 from torch.nn.parallel import DistributedDataParallel
 
 from hgn.config import TrainingConfig
@@ -63,7 +62,6 @@ class Contender(Timed):
     one_graph: bool = False  # the gradients' average is in the CUDA graph of the update
     update: TorchUpdates | TritonUpdates | None = None  # None in processes that only wait
     check: str = PASS
-    messages: list[int] = field(default_factory=list)
     milliseconds: list[float] = field(default_factory=list)  # of one update
     batches: int = 1  # updates of one sample
 
@@ -92,23 +90,10 @@ class TorchUpdates:
         self.loss: nn.Module = _Loss(network, training)
         self.parameters = list(network.parameters())
 
-    def average(self, group: dist.ProcessGroup, one_graph: bool = False) -> list[int]:
-        """Averages gradients over the ranks of `group` from now on; returns the bytes of the messages."""
-        messages: list[int] = []
-
-        # no annotations: torch would read them, and refuse strings
-        def hook(state, bucket):  # type: ignore[no-untyped-def]
-            messages.append(bucket.buffer().nbytes)
-            return allreduce_hook(group, bucket)
-
-        probe = _averaged(copy.deepcopy(self.loss), group, self.device)
-        probe.register_comm_hook(None, hook)
-        for _ in range(2):  # after the first pass messages follow the order of gradients
-            messages.clear()
-            probe.zero_grad()
-            probe(self.batches[0]).backward()
-        self.loss = _averaged(self.loss, group, self.device)
-        return messages
+    def average(self, group: dist.ProcessGroup, one_graph: bool = False) -> None:
+        """Averages gradients over the ranks of `group` from now on."""
+        devices = [self.device] if self.device.type == "cuda" else None
+        self.loss = DistributedDataParallel(self.loss, devices, process_group=group, **averaging_options())
 
     def run(self) -> None:
         """One update on each batch."""
@@ -138,17 +123,11 @@ class TritonUpdates:
         self.chunk = [device_samples(batch) for batch in batches]
         self.rates = [TrainingConfig.learning_rate] * len(self.chunk)
 
-    def average(self, group: dist.ProcessGroup, one_graph: bool = False) -> list[int]:
-        """Averages gradients over the ranks of `group` from now on; returns the bytes of the messages."""
-        messages: list[int] = []
-
-        def reduce(tensor: torch.Tensor) -> None:
-            messages[:] = [tensor.nbytes]
-            dist.all_reduce(tensor, group=group)
-
+    def average(self, group: dist.ProcessGroup, one_graph: bool = False) -> None:
+        """Averages gradients over the ranks of `group` from now on."""
+        reduce = partial(dist.all_reduce, group=group)
         self.ours = self.make(reduce, dist.get_world_size(group), one_graph=one_graph)
         self.gradients()
-        return messages
 
     def run(self) -> None:
         """One update on each batch."""
@@ -261,18 +240,13 @@ def _prepare(
     _agree(contender)
 
 
-def _averaged(loss: nn.Module, group: dist.ProcessGroup, device: torch.device) -> DistributedDataParallel:
-    devices = [device] if device.type == "cuda" else None
-    return DistributedDataParallel(loss, device_ids=devices, process_group=group, **averaging_options())
-
-
 def _average(contender: Contender, group: dist.ProcessGroup) -> None:
     """Starts averaging gradients, and compares them with the mean of the ranks' own."""
     assert contender.update is not None
     expected = contender.update.gradients().clone()
     dist.all_reduce(expected, group=group)
     expected /= dist.get_world_size(group)
-    contender.messages = contender.update.average(group, contender.one_graph)
+    contender.update.average(group, contender.one_graph)
     error = relative_error(contender.update.gradients(), expected)
     if not error <= GRADIENT_BOUND:
         contender.check = f"relative error of averaged gradients {error:.1e} exceeds {GRADIENT_BOUND:.0e}"
@@ -321,7 +295,6 @@ def _row(contender: Contender, config: ScalingConfig, device: torch.device) -> d
         "particles_per_update": contender.particles,
         "averaged": contender.averaged,
         "one_graph": contender.one_graph,
-        "messages": contender.messages,
         "check": contender.check,
         "ms": None,
     }
