@@ -18,8 +18,8 @@ PACKAGES = ("hgn", "datagen", "tools")
 LINES = {  # of Python, in tracked files
     "hgn": 32_985,
     "datagen": 8_494,
-    "tools": 6_284,
-    "tests": 31_651,
+    "tools": 6_244,
+    "tests": 31_648,
 }
 SETTINGS = 240  # fields of the dataclasses behind the commands, *Config
 
