@@ -113,6 +113,7 @@ REMOVED |= {f"network.{key}": Removed(remedy=f"write step.{key}") for key in STE
 _GNS_PARTICLES = {"gns_particles": LAST_COMMIT}
 REMOVED_CHOICES: dict[str, dict[Any, str]] = {
     "cases": dict.fromkeys(("apart", "hole"), "cases=[gallery] has such scenes")
+    | dict.fromkeys(("leak", "guard"), "leave it out: tests check the same")
     | {"convergence": REPORTS_COMMIT, "grid": GRIDS},
     "kind": _GNS_PARTICLES,
     "network": _GNS_PARTICLES,

@@ -16,9 +16,9 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 32_985,
+    "hgn": 32_986,
     "datagen": 8_494,
-    "tools": 6_244,
+    "tools": 6_214,
     "tests": 31_648,
 }
 SETTINGS = 240  # fields of the dataclasses behind the commands, *Config

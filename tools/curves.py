@@ -125,7 +125,7 @@ def draw(runs: Sequence[Run]) -> bytes:
     """Draws the curves of one run or of several; returns PNG bytes."""
     from tools.report import as_png, new_figure, shared_legend
 
-    figure, (panels,) = new_figure(1, 3, (15, 5 if len(runs) > 1 else 4.5))
+    figure, (panels,) = new_figure(1, 3, (15, 5))
     last = {name: value for record in runs[0].records for name, value in record.items()}
     title = "; ".join(sorted({_origin(run) for run in runs}))
     if len(runs) == 1:
@@ -140,10 +140,7 @@ def draw(runs: Sequence[Run]) -> bytes:
         panel.grid(alpha=0.3, which="both")
         if panel.lines:
             panel.set_yscale("log")
-            if len(runs) == 1:
-                panel.legend(fontsize=8)
-    if len(runs) > 1:
-        shared_legend(figure, fontsize=8, loc="outside lower center", ncols=5)
+    shared_legend(figure, fontsize=8, loc="outside lower center", ncols=5)
     figure.suptitle(title, fontsize=10)
     return as_png(figure)
 
@@ -153,8 +150,8 @@ def _draw_one(panels: Any, run: Run, last: Mapping[str, float]) -> None:
     _plot(left, run.records, "loss", "training loss (noisy input)", "0.4")
     for split, color in (("training", "tab:blue"), ("validation", "tab:orange")):
         _plot(middle, run.records, f"one_step/{split}", f"network, {split}", color, marker="o")
-    for frame in (10, 50, 150, 299):
-        _plot(right, run.records, f"rollout/mse_frame_{frame}", f"frame {frame}", None, marker="o")
+    for frame, color in ((10, "tab:green"), (50, "tab:red"), (150, "tab:purple"), (299, "tab:brown")):
+        _plot(right, run.records, f"rollout/mse_frame_{frame}", f"rollout, frame {frame}", color, marker="o")
     _plot_baselines(middle, last)
     middle.set_ylabel(ONE_STEP)
     right.set_ylabel("rollout position MSE (domain units²)")
@@ -196,7 +193,7 @@ def _origin(run: Run) -> str:
 
 
 def _plot(
-    panel: Any, records: list[dict[str, float]], key: str, label: str, color: str | None, marker: str = "",
+    panel: Any, records: list[dict[str, float]], key: str, label: str, color: str, marker: str = "",
     against: str = "update",
 ) -> None:  # fmt: skip
     points = [(record[against], record[key]) for record in records if key in record]

@@ -5,8 +5,7 @@ from __future__ import annotations
 import functools
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, nullcontext
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -39,6 +38,7 @@ from tools.error_vs_time.score import table
 from tools.error_vs_time.settings import ENDINGS, ErrorVsTimeConfig
 from tools.report import meta_of
 from tools.solver_rollouts import Setting, SolverLaunches
+from tools.timing import compile_frames
 
 REFERENCE_STEP = 0.25  # of the limit of stability, on the data's own grid
 STEPS = (1.0, 0.5)  # of the solver, fractions of the limit of stability
@@ -76,13 +76,16 @@ def main(mapping: dict[str, Any]) -> int:
     contenders = [*networks, *baseline_contenders(store, device, wall_thickness(mpm, own_cell)), *solvers]
     for solver in solvers:
         solver.launches.add(solver.setting)
-    with _precompilation(networks, episodes, device):
-        references: Sequence[Episode] = episodes
-        left_out: dict[str, str] = {}
-        if resimulate:
-            references, left_out = resimulated(episodes, launches(own_grid), REFERENCE_STEP)
-        references = [replace(e, position_TN3=np.asarray(e.position_TN3[:frames])) for e in references]
-        require(bool(references), "data", "scenes that the solver simulates to the end", left_out)
+    if whole := [contender for contender in networks if not contender.stepped]:
+        most = max(len(episode.material_N) for episode in episodes)
+        sizes = [most, 8 * most, PARTICLES_AT_ONCE]
+        compile_frames([each.network for each in whole], [each.precision for each in whole], device, sizes)
+    references: Sequence[Episode] = episodes
+    left_out: dict[str, str] = {}
+    if resimulate:
+        references, left_out = resimulated(episodes, launches(own_grid), REFERENCE_STEP)
+    references = [replace(e, position_TN3=np.asarray(e.position_TN3[:frames])) for e in references]
+    require(bool(references), "data", "scenes that the solver simulates to the end", left_out)
     meta = meta_of(config, device) | same
     data = Path(printable(config.data)).name
     meta |= {"data": data, "split": config.split, "scenes": len(references), "left_out": left_out}
@@ -90,7 +93,6 @@ def main(mapping: dict[str, Any]) -> int:
     meta |= {"convention": CONVENTION, "seconds_before_scoring": time.monotonic() - started}
     run = Run(config, contenders, references, device, meta, started)
     run.measure()
-    run.write(drawn=True)
     print(table(run.rows), paired_table(paired_rows(run.rows)), f"{run.out}.png {run.file}", sep="\n\n")
     if run.failed:
         print(f"error: {run.failed} of the measurements failed; see above, and not_run in {run.file}", file=sys.stderr)
@@ -160,25 +162,6 @@ def require_fits(file: Path, episodes: Sequence[Episode], field: str) -> None:
     network, info = load_weights(file, field=field)
     require_frame_rate(info, episodes[0].frame_rate_hz)
     Simulator(network, info.frame_rate_hz, "torch", info=info).start([InitialState.of_episode(e) for e in episodes])
-
-
-@contextmanager
-def _precompilation(
-    networks: Sequence[NetworkContender], episodes: Sequence[Episode], device: torch.device
-) -> Iterator[None]:
-    """Compiles kernels of whole frames in other processes meanwhile, and then waits for them."""
-    whole = [contender for contender in networks if not contender.stepped]
-    ahead = None
-    if whole:
-        from hgn.runtime.precompile import precompile_frames  # loads Triton
-
-        particles = max(len(episode.material_N) for episode in episodes)
-        configs, precisions = [(c.network.config, c.network.step) for c in whole], [c.precision for c in whole]
-        ahead = precompile_frames(configs, precisions, device, [particles, 8 * particles, PARTICLES_AT_ONCE])
-    with ahead if ahead is not None else nullcontext():
-        yield
-        if ahead is not None:
-            print(ahead.wait(), file=sys.stderr)
 
 
 def baseline_contenders(store: EpisodeStore, device: torch.device, wall: float) -> list[Contender]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import sys
 import time
 import traceback
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -28,11 +28,6 @@ from tools.timing import Stopwatch
 
 ROUNDS = 2  # of each timed scene
 Row = dict[str, Any]
-
-
-def is_untimed(row: Mapping[str, Any]) -> bool:
-    """Says whether a row lacks its run times."""
-    return row["system"] not in UNTIMED and row.get("ms") is None
 
 
 class Run:
@@ -61,7 +56,7 @@ class Run:
         return [self._rows[i] for i in sorted(self._rows)]
 
     def measure(self) -> None:
-        """Scores and times every contender, then repeats the timing in turns."""
+        """Scores and times every contender, repeats the timing in turns, and draws the figures."""
         with bar("contenders", total=len(self.contenders), unit="contender") as progress:
             for i in range(len(self.contenders)):
                 self._attempt(i, self._errors)
@@ -71,11 +66,12 @@ class Run:
         for _ in range(1, ROUNDS):
             for i in sorted(self.watches):
                 self._attempt(i, self._time)
-        self.write()
+        self.write(drawn=True)
 
     def write(self, drawn: bool = False) -> None:
         """Writes the JSON, and with `drawn` the figures. NaN becomes null."""
-        self.meta["not_timed"] = [label(row) for row in self.rows if is_untimed(row)]
+        timed = [row for row in self.rows if row["system"] not in UNTIMED]
+        self.meta["not_timed"] = [label(row) for row in timed if row.get("ms") is None]
         self.meta["seconds"] = time.monotonic() - self.started
         rows = finite(self.rows)
         paired = paired_rows(self.rows) if drawn else []

@@ -25,7 +25,7 @@ from tools.stability.checks import gallery_rows, refused, row_of
 from tools.stability.gallery import is_gallery
 from tools.stability.network_cases import FAMILIES, Context
 from tools.stability.row import Report, Row, table
-from tools.timing import FrameClock
+from tools.timing import FrameClock, compile_frames
 
 CaseName = Annotated[
     str, Bound(f"one of {', '.join(FAMILIES)}, gallery, gallery_NUMBER", lambda n: n in FAMILIES or is_gallery(n))
@@ -56,13 +56,17 @@ def main(mapping: dict[str, Any]) -> int:
     started = time.monotonic()
     config = from_mapping(StabilityNetworkConfig, mapping)
     simulator = Simulator.load(config.weights, config.device, config.backend, config.precision)
-    print(simulator.backend.note, file=sys.stderr)
-    report = Report("network", _meta(config, simulator), config.json)
+    backend, info = simulator.backend, simulator.info
+    print(backend.note, file=sys.stderr)
+    meta = meta_of(config, simulator.device) | {"weights": Path(config.weights).name, "updates": info.updates}
+    meta |= {"backend": backend.name, "precision": backend.precision, "network": to_mapping(info.network)}
+    report = Report("network", meta, config.json)
     cases = cases_of(config, simulator)
     mpm = replace(config.mpm, device=simulator.device.type) if config.solver else None
     runner = Runner(simulator, cases, mpm)
-    if cases:
-        compile_kernels(simulator, cases)
+    if cases and not backend.stepped:
+        particles = [sum(scene.particle_count for scene in case.scenes) for case in cases]
+        compile_frames([simulator.network], [backend.precision], simulator.device, particles)
     report.meta["seconds_before_cases"] = time.monotonic() - started
     for number, case in enumerate(cases, start=1):
         print(f"case {number} of {len(cases)}: {case.name}", file=sys.stderr, flush=True)
@@ -82,30 +86,6 @@ def cases_of(config: StabilityNetworkConfig, simulator: Simulator) -> list[Case]
     wanted = config.cases or tuple(FAMILIES)
     cases = [case for name, family in FAMILIES.items() if name in wanted for case in family(context)]
     return cases + [case for name in wanted if is_gallery(name) for case in gallery_cases(name)]
-
-
-def _meta(config: StabilityNetworkConfig, simulator: Simulator) -> dict[str, Any]:
-    meta = meta_of(config, simulator.device) | {"weights": Path(config.weights).name}
-    meta |= {
-        "updates": simulator.info.updates,
-        "backend": simulator.backend.name,
-        "precision": simulator.backend.precision,
-    }
-    return meta | {"network": to_mapping(simulator.info.network)}
-
-
-def compile_kernels(simulator: Simulator, cases: Sequence[Case]) -> None:
-    """Compiles the kernels of backend triton in several processes."""
-    if simulator.backend.stepped:
-        return
-    from hgn.runtime.precompile import precompile_frames  # loads Triton
-
-    particles = [sum(scene.particle_count for scene in case.scenes) for case in cases]
-    network, precision = simulator.network, simulator.backend.precision
-    ahead = precompile_frames([(network.config, network.step)], [precision], simulator.device, particles)
-    if ahead is not None:
-        with ahead:
-            print(ahead.wait(), file=sys.stderr)
 
 
 class Runner:
