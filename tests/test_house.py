@@ -16,10 +16,10 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 32_986,
+    "hgn": 33_000,
     "datagen": 8_494,
     "tools": 6_214,
-    "tests": 31_648,
+    "tests": 31_688,
 }
 SETTINGS = 240  # fields of the dataclasses behind the commands, *Config
 

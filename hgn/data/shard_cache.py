@@ -20,7 +20,7 @@ from io import BufferedRandom
 from pathlib import Path
 from typing import Protocol
 
-from hgn.data.verification import note_verified, verify_file
+from hgn.data.verification import StorageError, note_verified, verify_file
 from hgn.schema import ConfigError, require
 from hgn.system import patience
 from hgn.system.files import TEMPORARY_SUFFIX, sync_folder
@@ -63,7 +63,8 @@ class CachedShard:
 
     url: str
     sha256: str
-    size: int  # bytes
+    size: int  # bytes, as an index claims it
+    size_there: Callable[[], int | None]  # asks the server, which may not know it
 
 
 Fill = Callable[[BufferedRandom], None]
@@ -107,6 +108,8 @@ def _fetch(path: Path, shard: CachedShard, patience_s: float, spared: Collection
             except OSError as error:
                 if error.errno not in _FULL or spared is None:
                     raise
+                if (there := shard.size_there()) not in (None, shard.size):  # it would remove other shards for nothing
+                    raise StorageError(f"{shard.url} must have {shard.size} bytes, got {there}") from None
                 if not _free_space(path.parent, over, max(over, shard.size), spared):
                     raise
         os.fsync(file.fileno())

@@ -304,8 +304,15 @@ class _Remote(Storage):
                 f"{self._url}/{name} must have sha256 {sha256}, got other bytes: it was altered; generate it again"
             )
 
+        def size_there() -> int | None:
+            try:
+                size: int | None = self._patiently(name, patience_s, lambda path: self._files.info(path)["size"])
+            except FileNotFoundError:
+                raise _missing(f"{self._url}/{name}") from None
+            return size
+
         wait_s = standard_patience_s() if patience_s is None else patience_s
-        return cached_shard(CachedShard(f"{self._url}/{name}", sha256, size), wait_s, spared, fill)
+        return cached_shard(CachedShard(f"{self._url}/{name}", sha256, size, size_there), wait_s, spared, fill)
 
     def write(self, name: str, source: Path | bytes) -> None:
         def put(path: str) -> None:

@@ -26,6 +26,7 @@ READ = (INSTANCES, VISIBILITY, "KHR_mesh_quantization")  # extensions that chang
 NEUTRAL = re.compile(r"[A-Z]+_(materials|texture|lights|xmp|animation|audio)\w*")  # extensions that do not
 TRIANGLES, STRIP, FAN = 4, 5, 6  # modes of primitives; the other modes are points and lines
 COPIES = 3  # of vertices and triangles, that the search for closed bodies makes
+MOST_JSON_BYTES = 16 << 20  # of the JSON tree: Python takes up to 33 bytes for each
 LEAST_BYTES = 1024  # claim of a primitive without content, because each takes time
 _TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
@@ -63,6 +64,8 @@ def _chunks(data: bytes) -> tuple[dict[str, Any], bytes]:
         size, kind = struct.unpack_from("<I4s", data, place)
         chunks.setdefault(kind, data[place + 8 : place + 8 + size])
         place += 8 + size
+    if len(chunks[b"JSON"]) > MOST_JSON_BYTES:
+        raise ValueError(f"its JSON must have at most {MOST_JSON_BYTES} bytes, got {len(chunks[b'JSON'])}")
     return json.loads(chunks[b"JSON"]), chunks.get(b"BIN\0", b"")
 
 
@@ -171,7 +174,8 @@ class _File:
         view = self.tree["bufferViews"][entry["bufferView"]]
         start, offset = view.get("byteOffset", 0), entry.get("byteOffset", 0)
         stride = max(view.get("byteStride", 0), shape[1] * dtype.itemsize)  # values never overlap
-        data = self.buffer(view["buffer"])[start : start + view["byteLength"]]
+        # without a copy: thousands of accessors may have one large view
+        data = memoryview(self.buffer(view["buffer"]))[start : start + view["byteLength"]]
         last = offset + (shape[0] - 1) * stride + shape[1] * dtype.itemsize
         if min(start, offset, stride, *shape) < 0 or (shape[0] and last > len(data)):
             raise ValueError(f"bufferView {entry['bufferView']} has fewer bytes than its values need")

@@ -43,7 +43,6 @@ from hgn.schema import (
 from hgn.system.yaml_files import read_yaml
 
 GROUP_SHAPES, EMITTER_SHAPES = ("cube", "sphere", "box"), ("disc", "rectangle")
-MAXIMUM_BYTES = 250_000  # largest size of a scene file
 MAXIMUM_PARTICLES, MAXIMUM_ENTRIES = 10_000_000, 256  # entries are obstacles, or groups and emitters
 # bytes of files, each counted as often as it is named; for large files the second number times their bytes
 FILES_BYTES, REPEATS = 12 << 20, 8
@@ -249,8 +248,6 @@ def read_mapping(path: str | Path) -> dict[str, Any]:
     path = Path(path)
     if not path.is_file():
         raise ConfigError(f"scene must be an existing YAML file, got {path}")
-    rule, size = f"a file of at most {MAXIMUM_BYTES} bytes", path.stat().st_size
-    require(size <= MAXIMUM_BYTES, f"scene {path}", rule, size, "store particles in .npz files")
     mapping = read_yaml(path)
     require(isinstance(mapping, dict), f"{path}: the file", "a mapping of keys to values, such as groups", mapping)
     return dict(mapping)

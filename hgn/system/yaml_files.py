@@ -15,9 +15,10 @@ from typing import Any
 
 import yaml
 
-from hgn.schema import ConfigError
+from hgn.schema import ConfigError, require
 from hgn.system.claims import count_items
 
+MAXIMUM_BYTES = 250_000  # largest size of a YAML file: PyYAML takes a CPU second for 50 kB
 MAXIMUM_NODES = 100_000  # nodes of a file
 # bytes of a JSON file for the search of a line: it has fewer nodes then, and YAML takes a CPU second for 50 kB
 LINES_BYTES = 2 * MAXIMUM_NODES
@@ -30,9 +31,11 @@ _SEXAGESIMAL = re.compile(r"[-+]?[0-9][0-9_]*(:[0-5]?[0-9])+(\.[0-9_]*)?")
 def read_yaml(path: Path) -> Any:
     """Returns the content of a YAML file as plain containers.
 
-    Raises ConfigError, one line that starts with the path, for: a file that cannot be read, a repeated key, octal or
-    sexagesimal numbers, and aliases that expand to more than MAXIMUM_NODES values.
+    Raises ConfigError, one line that starts with the path, for: a file that cannot be read, more than MAXIMUM_BYTES, a
+    repeated key, octal or sexagesimal numbers, and aliases that expand to more than MAXIMUM_NODES values.
     """
+    rule, size = f"a YAML file of at most {MAXIMUM_BYTES} bytes", path.stat().st_size
+    require(size <= MAXIMUM_BYTES, str(path), rule, size, "particles belong in .npz files")
     try:
         return yaml.load(path.read_text(encoding="utf-8"), _Loader)
     except UnicodeDecodeError as error:

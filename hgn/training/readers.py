@@ -132,13 +132,13 @@ class EpisodeReader:
     def _whole(self, indices: Sequence[int]) -> dict[int, EpisodeTensors]:
         """Reads several episodes together. The first pass over a data set copies gigabytes without Python's lock."""
 
-        def read(episode: Episode) -> tuple[EpisodeTensors, FrameImportance | None]:
+        def read(index: int) -> tuple[EpisodeTensors, FrameImportance | None]:
+            episode = self._store.open(index)  # here, because a mapped file may become shorter while it waits
             barrier = None if self._clearance is None else simulated_barrier(episode, self._clearance)
             return whole_episode(episode, self._network, barrier), self._draws.measured(episode)
 
-        opened = [self._store.open(index) for index in indices]
         with ThreadPoolExecutor(READERS) as readers:
-            results = dict(zip(indices, readers.map(read, opened), strict=True))
+            results = dict(zip(indices, readers.map(read, indices), strict=True))
         for index, (_, importance) in results.items():
             self._draws.add(index, importance)
         return {index: whole for index, (whole, _) in results.items()}

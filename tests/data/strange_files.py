@@ -18,6 +18,7 @@ from hgn.scene.mesh import load_mesh
 from hgn.scene.obstacle_grid import build_obstacle_grid
 from hgn.scene.scene_file import load_scene
 from hgn.schema import to_mapping
+from hgn.system.yaml_files import read_yaml
 from hgn.training.checkpoint import network_of_checkpoint, read_checkpoint
 
 CASES = {}
@@ -228,6 +229,14 @@ def star(count):
     return f"{points}f {' '.join(map(str, range(1, count + 1)))}\n".encode()
 
 
+def large_view(header):
+    """Five thousand primitives, all of them in one view of 60 MB."""
+    position = header["meshes"][0]["primitives"][0]["attributes"]["POSITION"]
+    header["meshes"][0]["primitives"] = 5000 * [{"mode": 5, "attributes": {"POSITION": position}}]
+    view = {"buffer": 0, "byteOffset": 4, "byteLength": 60 << 20}
+    header |= {"buffers": [{"uri": "m.bin"}], "bufferViews": len(header["bufferViews"]) * [view]}
+
+
 def empty_primitives(header):
     """Primitives without vertices: 3 * 10^8 of them, by nodes."""
     header["accessors"].append({"bufferView": 0, "componentType": 5126, "count": 0, "type": "VEC3"})
@@ -289,6 +298,8 @@ cases(
         "empty primitives": glb(empty_primitives),
         "weights": glb(lambda header: (targets(header), header["meshes"][0].update(weights=[1e308] * 2))),
         "stride 0": glb(stride_0),
+        "large view": lambda folder: saved("m.bin", bytes(64 << 20))(folder) and glb(large_view)(folder),
+        "long tree": glb(lambda header: header.update(x=6_000_000 * [[]])),
         "targets": glb(targets),
         "sparse instances": glb(sparse_instances),
         "long names": glb(lambda header: header.update(extensionsRequired=[f"x{n}" for n in range(100_000)])),
@@ -381,6 +392,7 @@ def cells(path):
     return build_obstacle_grid(loaded.obstacles, loaded.cell_size, loaded.seed, loaded.domain_size)
 
 
+cases("experiment", {"ten megabytes": saved("e.yaml", b"a: [" + 2_500_000 * b"[], " + b"]")}, read_yaml)
 cases(
     "scene",
     {

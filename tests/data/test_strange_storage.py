@@ -17,6 +17,7 @@ from training.runs import train_mapping
 
 from datagen import upload
 from hgn import evaluate, export, rollout, train
+from hgn.config import NetworkConfig, TrainingConfig
 from hgn.data import shard_cache
 from hgn.data.index import ListedIndex
 from hgn.data.manifest import Manifest
@@ -26,6 +27,7 @@ from hgn.scene.npz import read_npz
 from hgn.schema import ConfigError, printable
 from hgn.system.locks import locked
 from hgn.system.patience import VARIABLE, UnreachableError, standard_patience_s
+from hgn.training import readers
 
 
 @pytest.fixture(autouse=True)
@@ -45,12 +47,13 @@ def test_a_claimed_size_empties_no_cache(tmp_path, monkeypatch, limit, size):
         path.write_bytes(bytes(1000))
     fetched: list[object] = []
     with pytest.raises(OSError) as error:
-        cached_shard(CachedShard("http://x/a.tar", "f" * 64, size), 0.0, (), fetched.append)
+        cached_shard(CachedShard("http://x/a.tar", "f" * 64, size, lambda: size), 0.0, (), fetched.append)
     assert error.value.errno == errno.ENOSPC
     assert all(path.exists() for path in others) and not fetched
 
 
-def test_a_full_cache_makes_room(tmp_path, monkeypatch):
+@pytest.mark.parametrize("there", [2000, None])
+def test_a_full_cache_makes_room(tmp_path, monkeypatch, there):
     """One that fits after the removal of older shards still is fetched."""
     monkeypatch.setenv(LIMIT_VARIABLE, "0.000005")
     monkeypatch.setattr(shard_cache, "verify_file", lambda *_: None)
@@ -59,8 +62,22 @@ def test_a_full_cache_makes_room(tmp_path, monkeypatch):
     others = [folder / f"{number:064x}.tar" for number in range(5)]
     for path in others:
         path.write_bytes(bytes(1000))
-    path = cached_shard(CachedShard("u", "f" * 64, 2000), 0.0, (), lambda file: file.write(bytes(2000)))
+    path = cached_shard(CachedShard("u", "f" * 64, 2000, lambda: there), 0.0, (), lambda file: file.write(bytes(2000)))
     assert path.stat().st_size == 2000 and sum(other.exists() for other in others) == 3
+
+
+def test_a_claim_that_its_server_denies_empties_no_cache(data, tmp_path, monkeypatch):
+    """A cache could make room for what an index claims, but the server's file is shorter."""
+    monkeypatch.setenv(LIMIT_VARIABLE, "0.000007")
+    other, manifest = tmp_path / "cache" / "shards" / "a.tar", Manifest.load(data.dataset.folder)
+    other.parent.mkdir(parents=True)
+    for path in (other, *Path(data.dataset.folder).glob("*.tar")):
+        path.write_bytes(bytes(5000))
+    replace(manifest, shards=ListedIndex([replace(s, bytes=6000) for s in manifest.shards])).save(data.dataset.folder)
+    server = answering(functools.partial(PlainFiles, directory=data.dataset.folder))
+    with server as url, pytest.raises(ConfigError, match="must have 6000 bytes, got 5000"):
+        EpisodeStore(url, "train")[0]
+    assert other.exists()
 
 
 @pytest.mark.parametrize("dripping", ["manifest.json", ".tar", "head"])
@@ -268,3 +285,14 @@ def test_a_shard_that_is_cut_under_an_episode(data, size, read):
     assert episode.position_TN3.tobytes() == before
     with pytest.raises(ConfigError, match=r"must have \d+ bytes, got"):
         store[0]
+
+
+def test_no_mapped_episode_waits_for_others(data, monkeypatch):
+    """A training on a GPU reads each episode when it opens it: shards may shrink while it reads the ones before."""
+    store, order = EpisodeStore(data.dataset.folder, "train"), []
+    opened, whole = store.open, readers.whole_episode
+    monkeypatch.setattr(readers, "READERS", 1)
+    monkeypatch.setattr(store, "open", lambda index: order.append("open") or opened(index))
+    monkeypatch.setattr(readers, "whole_episode", lambda *given: order.append("read") or whole(*given))
+    readers.EpisodeReader(store, NetworkConfig(), TrainingConfig())._whole([0, 1, 2])
+    assert order == 3 * ["open", "read"]
