@@ -19,7 +19,7 @@ LINES = {  # of Python, in tracked files
     "hgn": 33_000,
     "datagen": 8_494,
     "tools": 6_214,
-    "tests": 31_688,
+    "tests": 31_716,
 }
 SETTINGS = 240  # fields of the dataclasses behind the commands, *Config
 
