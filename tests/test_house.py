@@ -16,10 +16,10 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 33_000,
+    "hgn": 33_003,
     "datagen": 8_494,
     "tools": 6_214,
-    "tests": 31_716,
+    "tests": 31_726,
 }
 SETTINGS = 240  # fields of the dataclasses behind the commands, *Config
 

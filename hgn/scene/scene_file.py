@@ -6,6 +6,7 @@ See conf/example/ for examples. Lengths are in domain units, angles in degrees, 
 from __future__ import annotations
 
 import dataclasses
+import difflib
 import math
 import re
 from collections.abc import Mapping, Sequence
@@ -247,7 +248,9 @@ def read_mapping(path: str | Path) -> dict[str, Any]:
     """Reads the YAML of a scene file. Raises: ConfigError, starting with the path."""
     path = Path(path)
     if not path.is_file():
-        raise ConfigError(f"scene must be an existing YAML file, got {path}")
+        names = [each.name for each in path.parent.glob("*.y*ml")]
+        close = [f"; did you mean {name}?" for name in difflib.get_close_matches(path.name, names, n=1, cutoff=0.8)]
+        raise ConfigError(f"scene must be an existing YAML file, got {path}" + "".join(close))
     mapping = read_yaml(path)
     require(isinstance(mapping, dict), f"{path}: the file", "a mapping of keys to values, such as groups", mapping)
     return dict(mapping)

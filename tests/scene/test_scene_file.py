@@ -403,3 +403,13 @@ def test_stored_particles_inside_an_obstacle(tmp_path, inside):
     np.savez(tmp_path / "stored.npz", position=position_N3[:0])
     with pytest.raises(ConfigError, match="position must be of one particle or more"):
         load_scene(tmp_path / "scene.yaml")
+
+
+def test_a_mistyped_file_name_is_answered_with_the_file(tmp_path):
+    """The nearest YAML file of the folder; nothing where none is near, or where there is no folder."""
+    (tmp_path / "my_scene.yaml").write_text("groups: []")
+    with pytest.raises(ConfigError, match=r"got .*my_sceen\.yaml; did you mean my_scene\.yaml\?$"):
+        load_scene(tmp_path / "my_sceen.yaml")
+    for absent in (tmp_path / "funnel.yaml", tmp_path / "nowhere" / "my_scene.yaml"):
+        with pytest.raises(ConfigError, match=rf"got {absent}$"):
+            load_scene(absent)
