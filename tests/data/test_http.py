@@ -104,7 +104,8 @@ def test_proxies_are_honoured(monkeypatch, variable):
 
     with answering(Proxy) as address:
         for name in ("http_proxy", "HTTP_PROXY", "https_proxy"):
-            monkeypatch.delenv(name, raising=False)
+            monkeypatch.setenv(name, "")  # so that it is as before after the test, though reading sets it
+            monkeypatch.delenv(name)
         monkeypatch.setenv(variable, address.removeprefix("http://"))
         monkeypatch.setenv("no_proxy", "excepted.example, 10.0.0.0/8 *.own.example,fd00::/8")
         for host in ("u:p@excepted.example:80", "10.200.3.4:80", "a.b.own.example", "[fd00:1::2]:80"):
