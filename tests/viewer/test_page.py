@@ -225,8 +225,10 @@ def test_an_obstacle_that_is_dragged_moves(viewer, play):
     until(lambda: play.session.obstacles[0].rotation[1] == pytest.approx(-36, abs=4))
 
 
-def test_pause_step_and_back(viewer, play):
+def test_pause_step_and_back(viewer, play, monkeypatch):
     """Pause holds the scene, Step makes one frame, Back takes frames away and holds it, Play goes on."""
+    ways, rewind = [], play.session.rewind  # of each Back: a browser under load may send a click twice
+    monkeypatch.setattr(play.session, "rewind", lambda to: (ways.append(play.session.frame - to), rewind(to)))
     press(viewer, "Pause")
     until(lambda: not play.playing)
     frame = play.session.frame
@@ -235,17 +237,18 @@ def test_pause_step_and_back(viewer, play):
     done(play, lambda: None)
     assert play.session.frame == frame + 1
     press(viewer, "a frame")
-    until(lambda: play.session.frame == frame)
+    until(lambda: play.session.frame <= frame)
     press(viewer, "Play")
     until(lambda: play.session.frame > 2 * play.rate + 1)
+    single = len(ways)
     press(viewer, "1 s")
     until(lambda: not play.playing)
     done(play, lambda: None)
     frame = play.session.frame
     press(viewer, "1 s")
-    until(lambda: play.session.frame == frame - play.rate)
+    until(lambda: play.session.frame <= frame - play.rate)
     done(play, lambda: None)
-    assert play.session.frame == frame - play.rate
+    assert set(ways[:single]) == {1} and set(ways[single:]) == {play.rate} and len(ways) >= single + 2
     press(viewer, "Play")
     until(lambda: play.playing)
 
