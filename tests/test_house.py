@@ -19,7 +19,7 @@ LINES = {  # of Python, in tracked files
     "hgn": 33_003,
     "datagen": 8_494,
     "tools": 6_214,
-    "tests": 31_727,
+    "tests": 31_730,
 }
 SETTINGS = 240  # fields of the dataclasses behind the commands, *Config
 
