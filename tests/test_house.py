@@ -16,8 +16,8 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 33_003,
-    "datagen": 8_494,
+    "hgn": 33_007,
+    "datagen": 8_495,
     "tools": 6_214,
     "tests": 31_730,
 }

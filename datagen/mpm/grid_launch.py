@@ -40,7 +40,7 @@ def motion_cells(scenes: Sequence[Scene], begin: float, end: float) -> np.ndarra
             if obstacle.motion is None:
                 continue
             # keyframes within the frame count, because an obstacle may move and return
-            stops = obstacle.motion.time_T[(obstacle.motion.time_T > begin) & (obstacle.motion.time_T < end)]
+            stops = obstacle.motion.keyframes_between(begin, end)
             way = 0.0
             for first, last in itertools.pairwise([begin, *stops, end]):
                 turn, velocity, pivot = obstacle.motion.rates(first, last)
@@ -81,6 +81,7 @@ class GridLaunch(Launch):
         self.spread = device_array(np.zeros(self.particles, np.int32))
         self.response = ti.Matrix.ndarray(3, 3, ti.f32, self.particles)
         self.block = device_array(np.zeros(8 * self.all_blocks + 2, np.int32))
+        self.age = device_array(np.zeros(self.rows, np.float32))
         grid_kernel.start(
             self.velocity, self.affine, self.deformation, self.volume, self.label, self.law_row, self.counter, self.law
         )
@@ -111,11 +112,11 @@ class GridLaunch(Launch):
                     self._move(old_B, time_s, end_s)
                 moved_B[:] = False
                 built_B = np.where(old_B | ~moves_B, part, built_B)
-                age_s = np.zeros(self.rows, np.float32)
-                age_s[: len(self.scenes)] = (part - built_B) * (self.frame_s / parts)
-                grid_kernel.begin_part(
-                    self.frame_s / parts, device_array(age_s), int(part == 0), self.scene_value, self.counter
-                )
+                if self.moving:
+                    age_s = np.zeros(self.rows, np.float32)
+                    age_s[: len(self.scenes)] = (part - built_B) * (self.frame_s / parts)
+                    self.age.from_numpy(age_s)
+                grid_kernel.begin_part(self.frame_s / parts, self.age, int(part == 0), self.scene_value, self.counter)
                 self._run_part()
             moved_B = moves_B
             self._enter(frame + 1)
@@ -136,7 +137,7 @@ class GridLaunch(Launch):
         return np.array(
             [
                 any(
-                    ((obstacle.motion.time_T > begin_s) & (obstacle.motion.time_T < end_s)).any()
+                    len(obstacle.motion.keyframes_between(begin_s, end_s))
                     for obstacle in scene.obstacles
                     if obstacle.motion is not None
                 )

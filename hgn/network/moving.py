@@ -29,7 +29,7 @@ from torch.nn.functional import pad
 
 from hgn.network.barriers import Barriers
 from hgn.network.grid import GridHierarchy
-from hgn.network.obstacles import ObstacleCells
+from hgn.network.obstacles import ObstacleCells, first_surface
 from hgn.scene.barrier import barrier_of_pieces
 from hgn.scene.motion import AT_REST
 from hgn.scene.moving import MovingObstacle
@@ -180,8 +180,8 @@ class MovingObstacles:
                 own_N4 = _seen(cells, own_N3, way_N3, row_N, step / steps)
                 row.append(torch.cat([turned(own_N4[:, :3], pose.rotation_V33), own_N4[:, 3:], surface_N3], -1))
         here_N7, *ahead = map(_merged, rows)
-        ahead_N7 = first(ahead)
-        first_N7 = first([here_N7, ahead_N7])
+        ahead_N7 = first_surface(ahead)
+        first_N7 = first_surface([here_N7, ahead_N7])
         there_N1 = first_N7[:, :3].any(-1, keepdim=True)
         return torch.cat([here_N7[:, :4], ahead_N7[:, :4]], dim=-1), there_N1 * first_N7[:, 4:]
 
@@ -202,14 +202,6 @@ def _merged(rows: Sequence[torch.Tensor]) -> torch.Tensor:
     normal_N3 = total_N7[:, :3]
     square_N1 = torch.where(count_N1 > 1, normal_N3.square().sum(-1, keepdim=True).clamp(min=1), 1)
     return torch.cat([normal_N3 * square_N1.rsqrt(), total_N7[:, 3:] / count_N1.clamp(min=1)], -1)
-
-
-def first(rows: Sequence[torch.Tensor]) -> torch.Tensor:
-    """Returns for each particle the first of several rows [N, K] that has a normal; without one, the last row."""
-    result_NK = rows[-1]
-    for row_NK in rows[-2::-1]:
-        result_NK = torch.where(row_NK[:, :3].any(-1, keepdim=True), row_NK, result_NK)
-    return result_NK
 
 
 def poses_of(scenes: Sequence[Sequence[MovingObstacle]], frames: Sequence[int], frame_s: float) -> Poses:

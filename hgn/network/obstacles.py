@@ -1,7 +1,7 @@
 """Obstacles on the device: the normals of sparse cells, found by key.
 
 Paper sec. 3: n_o is the normal of the obstacle cell that contains the particle. Without such a cell it is zero.
-Shape legend: K obstacle cells of all scenes, N particles.
+Shape legend: K obstacle cells of all scenes, N particles, V values of a surface, its normal first.
 """
 
 from __future__ import annotations
@@ -82,3 +82,11 @@ def _keys(grid: ObstacleGrid) -> torch.Tensor:
     key_K = pack(torch.zeros(len(cell_K3), dtype=torch.int64), cell_K3)
     assert bool((key_K[1:] > key_K[:-1]).all()), "obstacle cells come sorted and unique"
     return key_K
+
+
+def first_surface(rows: Sequence[torch.Tensor]) -> torch.Tensor:
+    """Returns for each particle the first of several rows [N, V] that has a normal; without one, the last row."""
+    result_NV = rows[-1]
+    for row_NV in rows[-2::-1]:
+        result_NV = torch.where(row_NV[:, :3].any(-1, keepdim=True), row_NV, result_NV)
+    return result_NV

@@ -38,6 +38,7 @@ from hgn.config import NetworkConfig
 from hgn.network import elastic
 from hgn.network.features import ParticleState
 from hgn.network.grid import GridHierarchy
+from hgn.network.obstacles import first_surface
 from hgn.scene.material import INPUT_PARAMETERS, LOGARITHMIC, acts_on
 from hgn.scene.own_physics import NOMINAL_P
 
@@ -135,7 +136,7 @@ def surface_friction(
     columns, rough_N33 = [], wall_N6.new_zeros(len(wall_N6), 3, 3)
     if cell_N8 is not None:
         here_N4, ahead_N4 = (pad(surface, (0, 4 - surface.shape[1])) for surface in cell_N8.chunk(2, dim=1))
-        first_N4 = torch.where(here_N4[:, :3].any(-1, keepdim=True), here_N4, ahead_N4)
+        first_N4 = first_surface([here_N4, ahead_N4])
         rough_N33 = first_N4[:, 3, None, None] * first_N4[:, :3, None] * first_N4[:, None, :3]
         columns = [here_N4[:, 3:], ahead_N4[:, 3:]]
     columns.append(torch.maximum(wall_N6[:, :3], wall_N6[:, 3:]) * wall_N3)

@@ -36,7 +36,7 @@ from hgn.config import NetworkConfig
 from hgn.network.features import ParticleState
 from hgn.network.grid import DIRECTION_63, GridHierarchy
 from hgn.network.moving import surface_velocity
-from hgn.network.obstacles import ObstacleCells
+from hgn.network.obstacles import ObstacleCells, first_surface
 from hgn.network.own_physics import SurfaceFriction, friction_fraction, has_friction, surface_friction
 
 CONTACT_REACH_CELLS = 3.0  # distance from a wall, in R, at which the network begins to see it
@@ -175,8 +175,7 @@ def surface_normals(wall_N6: torch.Tensor, normal_N6: torch.Tensor | None) -> to
     normal_N33 = torch.diag_embed(near_N6[:, :3] + near_N6[:, 3:])
     if normal_N6 is None:
         return normal_N33
-    here_N3, ahead_N3 = normal_N6[:, :3], normal_N6[:, 3:]
-    first_N3 = torch.where(here_N3.any(-1, keepdim=True), here_N3, ahead_N3)
+    first_N3 = first_surface(normal_N6.split(3, dim=1))
     return normal_N33 + first_N3[:, :, None] * first_N3[:, None, :]
 
 
