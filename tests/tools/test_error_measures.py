@@ -1,6 +1,7 @@
 """Measures, paired intervals and figures of tools.error_vs_time, against closed forms."""
 
 import io
+import json
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -19,7 +20,7 @@ from hgn.runtime.simulator import InitialState, Simulator
 from hgn.scene.distance import fraction_inside
 from hgn.scene.shapes import shape_obstacle
 from hgn.training.errors import ballistic, frame_batches, one_step_errors
-from tools.error_vs_time import score
+from tools.error_vs_time import plot, score
 from tools.error_vs_time.contenders import BaselineContender, TritonPredictor
 from tools.error_vs_time.paired import paired_difference, paired_rows, paired_table
 from tools.error_vs_time.plot import draw_frames, draw_pareto
@@ -234,6 +235,14 @@ def test_paired_rows():
     assert max(map(len, told)) <= 100
     assert {row["mean_says"] for row in made} == {"nearer", "no difference shown"}
     assert "nearer" not in "".join(told) and any("-1 (-1 to" in line and "GNS" in line for line in told)
+
+
+def test_networks_of_a_figure_differ_in_colour():
+    """Those of older reports too, which have systems that this version no longer measures."""
+    report = Path(__file__).resolve().parents[2] / "results" / "error_vs_time" / "chosen.json"
+    rows = [row for row in json.loads(report.read_text())["rows"] if "precision" in row and row["system"] != "mpm"]
+    styles = plot._styles([row for row in rows if row["system"] not in plot.UNTIMED])
+    assert len(styles) > 4 and len({style["color"] for style in styles.values()}) == len(styles)
 
 
 def test_the_figures_show_what_diverged(tmp_path):

@@ -16,8 +16,8 @@ from tools.report import as_png, new_figure, shared_legend
 
 CONVENTION = "squared errors: sum over axes, mean over particles and scenes, frame units"
 SHOWN_FRAME = 50  # in a panel of its own, next to the last frame
-GNS_COLORS = ("#d9480f", "#a61e4d", "#f08c00", "#862e9c")
 COLORS = {
+    "gns": ("#d9480f", "#a61e4d", "#f08c00", "#862e9c"),  # of other systems too: older reports have several of GNS
     "hgn": ("#0b3c8c", "#2f7fd6", "#12a3a8", "#7b5cd6", "#5aa9e6", "#2b2f77"),
     "mpm": ("#b5b5b5", "#7d7d7d", "#111111", "#4d4d4d"),  # coarse grids come first
     "baseline": ("#868e96",),
@@ -148,9 +148,9 @@ def _marker(row: Row) -> str:
 
 def _styles(rows: Sequence[Row]) -> dict[str, dict[str, Any]]:
     """Returns colours and lines by name."""
-    systems = {label(row, setting=False): row["system"] for row in rows}
-    colors = {system: cycle(COLORS.get(system, GNS_COLORS)) for system in systems.values()}
-    lines = {system: cycle(LINES.get(system, "-")) for system in systems.values()}
+    systems = {label(row, setting=False): row["system"] if row["system"] in COLORS else "gns" for row in rows}
+    colors = {system: cycle(own) for system, own in COLORS.items()}
+    lines = {system: cycle(LINES.get(system, "-")) for system in COLORS}
     return {name: {"color": next(colors[of]), "linestyle": next(lines[of])} for name, of in systems.items()}
 
 
