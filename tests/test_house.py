@@ -19,7 +19,7 @@ LINES = {  # of Python, in tracked files
     "hgn": 33_007,
     "datagen": 8_495,
     "tools": 6_214,
-    "tests": 31_730,
+    "tests": 31_739,
 }
 SETTINGS = 240  # fields of the dataclasses behind the commands, *Config
 
