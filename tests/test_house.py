@@ -16,10 +16,10 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 33_007,
+    "hgn": 33_031,
     "datagen": 8_495,
     "tools": 6_214,
-    "tests": 31_739,
+    "tests": 31_834,
 }
 SETTINGS = 240  # fields of the dataclasses behind the commands, *Config
 

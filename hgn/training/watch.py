@@ -1,8 +1,9 @@
 """Ends a rank that waits for a stopped rank. Inside a collective, neither time-outs nor signals would end it.
 
-Each rank writes a count to the run's folder every BEAT_S, and reads the counts of the others. PyTorch's flight recorder
-keeps the last collectives of each rank. A rank that ends because others do not answer writes them to
-`hang_rank_<rank>` in the run's folder, and so does PyTorch when a collective takes longer than its time-out.
+Each rank writes a count to the run's folder every BEAT_S, and reads the counts of the others. A rank that ends with an
+error of its own writes ENDED instead. PyTorch's flight recorder keeps the last collectives of each rank. A rank that
+ends because others do not answer writes them to `hang_rank_<rank>` in the run's folder, and so does PyTorch when a
+collective takes longer than its time-out.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ from hgn.training.module import TrainingModule
 from hgn.training.stop import BY_WEIGHT
 
 BEAT_S = 5.0  # interval between counts
+ENDED = "ended"
 SILENCE_S = 300.0  # longest time without a new count of a rank; network file systems may delay files by a minute
 TRACE = "hang_rank_"  # with the rank's number, the file with its last collectives
 TRACE_S = 10.0  # longest time for writing it
@@ -60,6 +62,7 @@ class RankWatch(Callback):
     def __init__(self, run: Path) -> None:
         self._folder = run / ".ranks"
         self._ended = threading.Event()
+        self._writing = threading.Lock()
         self.lost: str | None = None  # description of the ranks that closed their connections
         self._counts: dict[int, tuple[str, float]] = {}  # last count of each other rank, and the time of its change
 
@@ -69,6 +72,7 @@ class RankWatch(Callback):
         assert isinstance(pl_module, TrainingModule)
         self._folder.mkdir(exist_ok=True)
         self._own = self._folder / str(trainer.global_rank)
+        self._own.write_text("0")
         now = time.monotonic()
         self._counts = {rank: ("", now) for rank in range(trainer.world_size) if rank != trainer.global_rank}
         self._woken, wake = os.pipe()
@@ -78,18 +82,36 @@ class RankWatch(Callback):
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         if self._counts and not self._ended.is_set():
-            self._ended.set()
-            signal.set_wakeup_fd(-1)
+            self._stop()
             with contextlib.suppress(OSError):
                 self._own.unlink()
                 self._folder.rmdir()
 
     def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
-        if self._counts and ("gloo" in str(exception) or isinstance(exception, torch.distributed.DistError)):
-            time.sleep(2.5 * BEAT_S)  # others that run write their counts meanwhile, and others that end remove them
-            lost = [rank for rank, (_, changed) in self._counts.items() if time.monotonic() - changed > 2 * BEAT_S]
+        if not self._counts or self._ended.is_set():
+            return
+        if "gloo" in str(exception) or isinstance(exception, torch.distributed.DistError):
+            lost = self._lost_ranks()
             self.lost = f"ranks {lost} ended without a message" if lost else "another rank ended, see its message"
-        self.on_train_end(trainer, pl_module)
+        self._stop()
+        with contextlib.suppress(OSError):
+            self._own.write_text(ENDED)
+
+    def _stop(self) -> None:
+        """No count is written afterwards."""
+        with self._writing:
+            self._ended.set()
+        signal.set_wakeup_fd(-1)
+
+    def _lost_ranks(self) -> list[int]:
+        """Returns the ranks that write no further count within three intervals, nor that they ended."""
+        before = {rank: self._read(rank) for rank in self._counts}
+        lost = [rank for rank, text in before.items() if text != ENDED]
+        deadline = time.monotonic() + 3 * BEAT_S
+        while lost and time.monotonic() < deadline:
+            time.sleep(BEAT_S / 10)
+            lost = [rank for rank in lost if self._read(rank) == before[rank]]
+        return lost
 
     def _watch(self, module: TrainingModule) -> None:
         number, deadline, update, beats = 0, 0.0, 0, 0
@@ -111,10 +133,12 @@ class RankWatch(Callback):
                 deadline, update = time.monotonic() + GRACE_S, module.update
 
     def _silent_ranks(self, count: str) -> list[int]:
-        """Writes this rank's count. Returns the ranks whose count did not change for SILENCE_S."""
+        """Writes this rank's count, unless it has ended. Returns the ranks whose count did not change for SILENCE_S."""
         now = time.monotonic()
         try:
-            self._own.write_text(count)
+            with self._writing:
+                if not self._ended.is_set():
+                    self._own.write_text(count)
             for rank, (before, _) in self._counts.items():
                 if (text := self._read(rank)) != before:
                     self._counts[rank] = text, now

@@ -1,0 +1,95 @@
+"""Tests of the description of a rank that ended, as the other ranks give it."""
+
+import threading
+import time
+from types import SimpleNamespace
+
+import pytest
+
+from hgn.training import watch
+
+BEAT_S = 0.2
+LOST = RuntimeError("gloo: connection closed by peer")
+
+
+class Rank(watch.RankWatch):
+    """One of two ranks in this process, which can be killed after any of its counts."""
+
+    def __init__(self, run, rank):
+        super().__init__(run)
+        self.trainer = SimpleNamespace(world_size=2, global_rank=rank)
+        self.beaten = threading.Semaphore(0)
+        self.killed = False
+
+    def _silent_ranks(self, count):
+        if self.killed:
+            return []
+        silent = super()._silent_ranks(count)
+        self.beaten.release()
+        return silent
+
+    def start(self, module):
+        self.on_train_start(self.trainer, module)
+
+
+@pytest.fixture
+def ranks(monkeypatch, tmp_path):
+    monkeypatch.setattr(watch, "BEAT_S", BEAT_S)
+    monkeypatch.setattr(watch, "TrainingModule", object)
+    monkeypatch.setattr(watch.signal, "set_wakeup_fd", lambda *_, **__: -1)
+    both = [Rank(tmp_path, rank) for rank in (0, 1)]
+    yield both
+    for rank in both:
+        rank._ended.set()
+
+
+@pytest.mark.parametrize("counts", [0, 1, 3])
+@pytest.mark.parametrize("delay", [0.0, 0.7])
+def test_a_killed_rank_is_named(ranks, tmp_path, counts, delay):
+    """At any time between two counts of the other rank, before its first count too, where an earlier run has failed."""
+    module = SimpleNamespace(update=0)
+    (tmp_path / ".ranks").mkdir()
+    (tmp_path / ".ranks/1").write_text(watch.ENDED)
+    for rank in ranks:
+        rank.start(module)
+    for _ in range(counts):
+        ranks[1].beaten.acquire()
+    ranks[1].killed = True  # it writes no further count and leaves its file
+    time.sleep(delay * BEAT_S)
+    ranks[0].on_exception(ranks[0].trainer, module, LOST)
+    assert ranks[0].lost == "ranks [1] ended without a message"
+
+
+@pytest.mark.parametrize("counts", [0, 1, 3])
+def test_a_rank_that_reports_its_own_error_is_not_named(ranks, counts):
+    """Even if the other rank has never read a count of it."""
+    module = SimpleNamespace(update=0)
+    for rank in ranks:
+        rank.start(module)
+    for _ in range(counts):
+        ranks[1].beaten.acquire()
+    ranks[1].on_exception(ranks[1].trainer, module, ValueError("its own error"))
+    time.sleep(1.5 * BEAT_S)  # its thread writes nothing more
+    ranks[0].on_exception(ranks[0].trainer, module, LOST)
+    assert ranks[0].lost == "another rank ended, see its message"
+    assert ranks[1].lost is None
+
+
+def test_a_rank_that_runs_is_not_named(ranks):
+    module = SimpleNamespace(update=0)
+    for rank in ranks:
+        rank.start(module)
+    ranks[0].on_exception(ranks[0].trainer, module, LOST)
+    assert ranks[0].lost == "another rank ended, see its message"
+
+
+def test_no_file_remains_after_the_training(ranks, tmp_path):
+    """Where all ranks reach the end, after an earlier training that failed too."""
+    module = SimpleNamespace(update=0)
+    (tmp_path / ".ranks").mkdir()
+    (tmp_path / ".ranks/1").write_text(watch.ENDED)
+    for rank in ranks:
+        rank.start(module)
+    for rank in ranks:
+        rank.on_train_end(rank.trainer, module)
+    assert not list(tmp_path.iterdir())
