@@ -1,7 +1,7 @@
 """Callbacks between chunks of updates: the same parameters on all ranks, checkpoints, log lines, stopping.
 
-A run's folder contains checkpoints/last.ckpt, metrics.jsonl and tensorboard/. With validation scenes it also contains
-pictures/ and checkpoints/best.ckpt, the network with the lowest one-step validation error.
+A run's folder contains checkpoints/last.ckpt, metrics.jsonl and tensorboard/. With validation scenes the folder also
+contains pictures/ and checkpoints/best.ckpt, the network with the lowest one-step validation error.
 """
 
 from __future__ import annotations
@@ -37,13 +37,14 @@ from hgn.training.module import TrainingModule
 from hgn.training.stop import BY_WEIGHT, StopRequest
 
 METRICS = "metrics.jsonl"
-ESTIMATE_AFTER_S = 10.0  # of updates
+ESTIMATE_AFTER_S = 10.0  # duration of the updates from which the remaining time is estimated
 
 
 class SameWeights(Callback):
-    """At the start requires the same update and next sample on all ranks, and copies rank 0's tensors to the others.
+    """Ensures that all ranks train the same network.
 
-    At each log line it requires bitwise equal parameters. Most updates exchange only gradients.
+    At the start it requires the same update and next sample on all ranks, and copies rank 0's parameters and buffers to
+    the other ranks. At each log line it requires bitwise equal parameters.
     """
 
     def __init__(self, feed: EpisodeDataModule) -> None:
@@ -61,7 +62,7 @@ class SameWeights(Callback):
                 f"run must be a folder that all machines share, got another checkpoint on some of them (rank "
                 f"{trainer.global_rank}: {mine}, rank 0: {first}); give them one run=FOLDER"
             )
-        # If a data set grows, a rank that read its statistics later may have other values.
+        # A rank that read the statistics of a growing data set later than rank 0 may have other values.
         for tensor in (*pl_module.parameters(), *pl_module.buffers()):
             torch.distributed.broadcast(tensor.detach(), 0)
 
@@ -97,16 +98,16 @@ class Checkpoints(Callback):
                 left_by_a_crash.unlink()
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        self._saved_update = _update(pl_module) or -1  # a resumed run starts with this checkpoint
+        self._saved_update = _update(pl_module) or -1  # the checkpoint of a resumed run; -1: none
 
     def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
         if _update(pl_module) % self.every == 0:
             self.save_last(trainer, _update(pl_module))
 
     def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
-        """Saves before a training ends because its data stay unreachable.
+        """Saves a checkpoint if unreachable data end the training.
 
-        A rank without data saves by itself. The other ranks cannot take part, because they wait inside an update.
+        The rank that lacks data saves without the other ranks, because they wait inside an update.
         """
         unsaved = hasattr(pl_module, "updates") and self._saved_update != _update(pl_module) > 0
         if unsaved and isinstance(exception, (StorageError, OSError)):
@@ -145,7 +146,7 @@ class LogLines(Callback):
         self.run, self.measured, self.feed, self.published = run, measured, feed, published
         self._bar: tqdm[Any] | None = None
         self._time, self._update, self._waited_s = time.monotonic(), 0, 0.0
-        self._first: tuple[float, int] | None = None  # time and number of an update
+        self._first: tuple[float, int] | None = None  # time and number of the first update
         self._estimated = False
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
@@ -192,9 +193,9 @@ class LogLines(Callback):
             self._bar.set_postfix_str(f"{notes}, {self.published()}", refresh=False)
 
     def _estimate(self, module: TrainingModule, progress: tqdm[Any]) -> None:
-        """Prints once how long the training takes, after the first seconds of it."""
+        """Prints once, after the first seconds of updates, how long the other updates will take."""
         now, update = time.monotonic(), module.update
-        self._first = self._first or (now, update)  # the first update compiles
+        self._first = self._first or (now, update)  # not timed, because it compiles kernels
         seconds, updates = now - self._first[0], update - self._first[1]
         if self._estimated or updates < 2 or seconds < ESTIMATE_AFTER_S:
             return
@@ -213,7 +214,7 @@ class LogLines(Callback):
 class Stopper(Callback):
     """Ends the loop on every rank between two chunks, after a checkpoint."""
 
-    AGREE_EVERY = 10  # number of updates between agreements of several ranks
+    AGREE_EVERY = 10  # number of updates between two exchanges of stop requests among ranks
 
     def __init__(self, stop: StopRequest, checkpoints: Checkpoints) -> None:
         self.stop, self.checkpoints = stop, checkpoints
@@ -221,8 +222,8 @@ class Stopper(Callback):
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         self._agreed_update = _update(pl_module)
-        # Lightning has just installed a handler before ours. On SIGTERM it would communicate with the other ranks
-        # inside the handler, and leave the loop by an exception without a checkpoint.
+        # Lightning has just replaced our SIGTERM handler by one that would communicate with the other ranks, and leave
+        # the loop by an exception without a checkpoint.
         self.stop.listen()
         lightning_compat.forget_sigterm(trainer)
 
@@ -233,7 +234,7 @@ class Stopper(Callback):
         self._agreed_update = update
         if trainer.strategy.reduce_boolean_decision(self.stop.requested, all=False):
             trainer.should_stop = True
-            # A signal may have reached only one rank. All ranks end with its exit code.
+            # Ranks may have received different signals or none. All ranks end with the same exit code.
             mine = 0 if self.stop.signal is None else 1 + BY_WEIGHT.index(self.stop.signal)
             heaviest = int(trainer.strategy.reduce(torch.tensor(mine, device=pl_module.device), reduce_op="max"))
             self.stop.signal = int(BY_WEIGHT[heaviest - 1]) if heaviest else None

@@ -25,11 +25,11 @@ from hgn.training.readers import ChunkReader, DrawnChunk
 from hgn.training.schedule import next_measurement
 
 CHUNKS_AHEAD = 2  # number of chunks that are read while another one is trained on
-LOOK_S = 1.0  # interval of checks for a signal while there is no chunk
+LOOK_S = 1.0  # interval of checks for a stop request while no chunk is ready
 
 
 class EpisodeDataModule(LightningDataModule):
-    """Yields chunks of updates in the deterministic order, until the last update.
+    """Yields chunks of updates in a deterministic order, until the last update.
 
     An epoch contains the episodes that were published when it began.
     """
@@ -42,13 +42,14 @@ class EpisodeDataModule(LightningDataModule):
         chunks_ahead: int = CHUNKS_AHEAD,
         interrupted: Callable[[], bool] = lambda: False,
     ) -> None:
-        """Takes `interrupted`; when it returns True, the chunks end instead of waiting for data."""
+        """If `interrupted` returns True, a training on one rank ends instead of waiting for data."""
         super().__init__()
         assert chunks_ahead >= 0
         self.store, self.training, self.reader = store, training, reader
         self.chunks_ahead = chunks_ahead  # number of chunks read ahead; 0: a chunk is read when it is needed
         self.interrupted = interrupted
-        self.sampler_state, self.first_update = SamplerState(), 0  # where to begin; in the checkpoint of a resumed run
+        # where to begin; a resumed run takes both from its checkpoint
+        self.sampler_state, self.first_update = SamplerState(), 0
         self._fetched_from = (-1, -1)  # epoch and quarter of a window at the last request for shards
         self.waited_s = 0.0  # time that the training has waited for a chunk
 
@@ -60,9 +61,9 @@ class EpisodeDataModule(LightningDataModule):
         return batch  # the updates copy it themselves
 
     def chunks(self) -> Iterator[WindowChunk | EpisodeChunk]:
-        """Yields this rank's chunks. A chunk ends at every update after which something is due."""
+        """Yields this rank's chunks. See `chunk_length` for their lengths."""
         drawn = self._drawn()
-        # The order may communicate with other ranks, so it stays in this thread. Another thread reads ahead.
+        # Drawing samples may communicate with other ranks, so this thread draws. Another thread reads chunks ahead.
         executor = ThreadPoolExecutor(1)
         try:
             waiting: deque[Future[WindowChunk | EpisodeChunk]] = deque()
@@ -103,7 +104,7 @@ class EpisodeDataModule(LightningDataModule):
             self.store.fetch_ahead(order.upcoming(order.window_samples + quarter))
 
     def _starts(self, order: EpisodeSampler, update: int) -> Starts:
-        """Returns the episodes and frames from which the network simulates before this update; empty if not due."""
+        """Returns the episodes and frames from which the network simulates before this update; none if not due."""
         due = update == self.first_update or update % self.training.pushforward_every == 0
         if self.training.pushforward_fraction == 0 or not due:
             return ()
@@ -125,7 +126,7 @@ class EpisodeDataModule(LightningDataModule):
         )
 
     def _ends(self) -> bool:
-        """Ends a training that waits for data after a stop request. With several ranks others need its gradients."""
+        """Returns whether to end instead of waiting for data. Never with several ranks: others need its gradients."""
         trainer = self.trainer
         if trainer is None:
             return self.interrupted()
@@ -149,7 +150,8 @@ class EpisodeDataModule(LightningDataModule):
 def chunk_length(training: TrainingConfig, first_update: int, update: int, most: int) -> int:
     """Returns the number of updates in the chunk that begins at `update`, at most `most`. It is equal on all ranks.
 
-    The first chunks after `first_update`, the start of the training, are short: most of their episodes must be loaded.
+    A chunk ends where a log line, checkpoint, measurement or simulation is due. The first chunks after `first_update`,
+    the start of the training, are short: most of their episodes must be loaded.
     """
     due = [training.log_every, training.checkpoint_every]
     if training.pushforward_fraction > 0:
@@ -164,7 +166,7 @@ def agreed_count(store: AnyStore, trainer: Trainer, order: Mapping[str, int] | N
 
     Episodes are in the order of their publication, so the first ones are the same on all ranks. `order` contains the
     settings of `training` that determine the order of samples.
-    Raises: ConfigError if a node does not see them within the standard patience; on every rank if one of them sees
+    Raises: ConfigError if a node does not see them within the standard patience, and on every rank if any rank sees
     other episodes or has other settings.
     """
     if trainer.world_size == 1:

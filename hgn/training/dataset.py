@@ -28,9 +28,9 @@ WAY_OUT = (
     "on a CPU: +experiment=demo (minutes), dataset.training_scenes=N and training.maximum_updates=N, or a GPU "
     "(a hundred times faster)"
 )
-# of a particle in a frame: CPU seconds of the solver on 64^3 cells (results/start/frame_cpu.json), bytes in a shard
+# per particle and frame: CPU seconds of the solver on 64^3 cells (results/start/frame_cpu.json), and bytes in a shard
 SOLVER_CPU_S, SHARD_BYTES = 2.2e-4, 14
-MEAN_FILLING = 0.7  # particles of a group, as a fraction of those of a cube
+MEAN_FILLING = 0.7  # mean number of particles of a group, divided by that of a full cube of the group's size
 BETWEEN_LOOKS_S = 10.0  # interval between reads of the manifest for the progress line
 
 
@@ -85,7 +85,7 @@ def wait_for_episodes(
 ) -> AnyStore | None:
     """Waits until enough training episodes are published, those of `others` included. Shows the progress.
 
-    Returns None after a stop request. After the first reading of the manifest, faults may last for the patience.
+    Returns None after a stop request. Once the manifest has been read, later reads may fail for the standard patience.
     Raises: ConfigError if the generator failed, or if no process generates the missing episodes.
     """
     folder = config.dataset.folder
@@ -136,7 +136,7 @@ def wait_for_episodes(
 
 
 def warning_on_a_cpu(config: TrainConfig) -> str | None:
-    """Returns time and space of the missing episodes on a CPU, before any is simulated; None: less than an hour."""
+    """Returns a warning with the time and space that missing episodes need on a CPU; None if less than an hour."""
     folder, scene = config.dataset.folder, config.scene
     scenes = sum(config.dataset.scenes(split) for split in SPLITS)
     if EpisodeStore.available(folder):
@@ -152,7 +152,7 @@ def warning_on_a_cpu(config: TrainConfig) -> str | None:
 
 
 def estimate(config: TrainConfig, frames: int, seconds: float) -> str:
-    """Returns time and space of the data set, of which `frames` were simulated in `seconds`."""
+    """Returns the remaining time and the size of the data set, of which `frames` were simulated in `seconds`."""
     folder = Path(config.dataset.folder)
     scenes = sum(config.dataset.scenes(split) for split in SPLITS)
     present = sum(Manifest.load(folder).published(split) for split in SPLITS)
@@ -165,7 +165,8 @@ def estimate(config: TrainConfig, frames: int, seconds: float) -> str:
 class PublishedEpisodes:
     """Returns the progress of the data set when called: `5/800 episodes`.
 
-    It is read at most every BETWEEN_LOOKS_S, because a reading takes 0.1 s, and not after the data set is complete.
+    The manifest is read at most every BETWEEN_LOOKS_S, because a read takes 0.1 s, and not after all training episodes
+    are published.
     """
 
     def __init__(self, config: TrainConfig, generator: Generator | None) -> None:

@@ -22,7 +22,7 @@ RUN_VARIABLE = "HGN_RUN"  # environment variable with the run's name or folder
 MESSAGE_MB = 4  # size of a message: gradients of the last layers are sent while those of the first layers are computed
 _RANKS = {"RANK": "WORLD_SIZE", "LOCAL_RANK": "LOCAL_WORLD_SIZE", "SLURM_PROCID": "SLURM_NTASKS"}
 _COUNTS = (*_RANKS.values(), "SLURM_NNODES")
-_MPI_COUNTS = ("OMPI_COMM_WORLD_SIZE", "PMI_SIZE", "MV2_COMM_WORLD_SIZE", "MPI_LOCALNRANKS")  # of mpirun
+_MPI_COUNTS = ("OMPI_COMM_WORLD_SIZE", "PMI_SIZE", "MV2_COMM_WORLD_SIZE", "MPI_LOCALNRANKS")  # set by mpirun
 _RANDOM_ID = re.compile(r"[0-9a-f]{8}(-[0-9a-f]{4}){3}-[0-9a-f]{12}")
 
 
@@ -47,7 +47,7 @@ def default_run(name: str) -> Path:
 def layout(training: TrainingConfig) -> tuple[int, int]:
     """Returns (processes on each machine, machines): as launched, else as configured, else all GPUs of this machine.
 
-    Raises: ConfigError if there are fewer GPUs, or if the launcher started another number of processes.
+    Raises: ConfigError if this machine has fewer GPUs, or if the launcher started another number of processes.
     """
     _check_numbers()
     _check_restarts()
@@ -66,7 +66,7 @@ def layout(training: TrainingConfig) -> tuple[int, int]:
 
 
 def averaging_options() -> dict[str, Any]:
-    """Returns the arguments of DistributedDataParallel, with which backend torch averages gradients.
+    """Returns the arguments of DistributedDataParallel, which averages the gradients of backend torch.
 
     Gradients are sent in buckets while the backward pass still runs. Buffers are not sent, because the normaliser is
     constant and each rank has its own sum of losses.
@@ -111,7 +111,7 @@ def _check_numbers() -> None:
 def _check_restarts() -> None:
     shared = os.environ.get("TORCHELASTIC_USE_AGENT_STORE") == "True"
     if shared and int(os.environ.get("TORCHELASTIC_MAX_RESTARTS", "0")) > 0:
-        # Restarted processes would read the addresses of ended ones, and wait for half an hour.
+        # Restarted processes would read the addresses of processes that have ended, and wait for half an hour.
         name, restarts = "TORCH_DISABLE_SHARE_RDZV_TCP_STORE", os.environ["TORCHELASTIC_MAX_RESTARTS"]
         rule = f"1 in torchrun's environment where it may restart processes (--max-restarts {restarts})"
         raise ConfigError(f"{name} must be {rule}, got {os.environ.get(name, 'nothing')}; see pytorch issue 135712")
@@ -130,7 +130,8 @@ def _devices(device: str, wanted: int | None) -> int:
 def _launched(devices: int | None) -> tuple[int, int] | None:
     """Returns (processes on each machine, machines) of a launcher; None without a launcher.
 
-    If the launcher reports only the total, each machine has `devices` processes if `devices` divides the total.
+    If the launcher reports only the total, each machine has `devices` processes; one machine has all of them if
+    `devices` is None or does not divide the total.
     """
     here: int | None = None
     if "RANK" in os.environ and "WORLD_SIZE" in os.environ:
@@ -147,7 +148,7 @@ def _launched(devices: int | None) -> tuple[int, int] | None:
 
 
 def _check_launcher() -> None:
-    """Refuses variables of a launcher that did not start this process, which would wait for the others forever."""
+    """Refuses variables of a launcher that did not start this process. It would wait for other processes forever."""
     if "RANK" in os.environ:
         needed = ("WORLD_SIZE", "LOCAL_RANK", "MASTER_ADDR", "MASTER_PORT")
         missing = [name for name in needed if not os.environ.get(name)]

@@ -26,7 +26,7 @@ Predictor = Callable[[Batch], torch.Tensor]  # accelerations [N, 3] in frame uni
 
 
 def format_ratio(gain: float, digits: int = 2, unit: str = " times") -> str:
-    """Describes an error by the gain over another one: 2 gives "2.00 times below", 0.5 "2.00 times above" it."""
+    """Describes an error by gain = (other error) / (this error): 2 gives "2.00 times below", 0.5 "2.00 times above"."""
     if not 0 < gain < 1:
         return f"{gain:.{digits}f}{unit} below"
     return f"{1 / gain:.{digits}f}{unit} above"
@@ -153,11 +153,11 @@ def rollout_errors(predicted: Sequence[np.ndarray], episodes: Sequence[Episode])
 
 
 def set_convention(one_step_mse: float, predicted: Sequence[np.ndarray], episodes: Sequence[Episode]) -> dict[str, Any]:
-    """Returns errors as papers on imported sets report them: means also over axes, of free and of all particles.
+    """Returns errors as papers on imported sets report them: averaged also over axes, over free and over all particles.
 
-    Boundary particles do not move, so they have no error; GNS includes them in its averages. Positions are compared
-    scene by scene. GNS compares all predicted frames (Sanchez-Gonzalez et al. 2020), and LagrangeBench the first 20 for
-    MSE20 (Toshev et al. 2023). Units: the set's unit of length, squared.
+    Boundary particles do not move, so they have no error; GNS includes them in its averages. Rollout errors are
+    averaged over each scene, then over scenes. GNS compares all predicted frames (Sanchez-Gonzalez et al. 2020), and
+    LagrangeBench the first 20 for MSE20 (Toshev et al. 2023). Units: the set's unit of length, squared.
     """
     dimensions = episodes[0].dimensions
     still = [0 if episode.boundary_P3 is None else len(episode.boundary_P3) for episode in episodes]

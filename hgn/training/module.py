@@ -39,7 +39,7 @@ class TrainingModule(LightningModule):
         backend: str = "torch",
         precisions: tuple[str, ...] = ("fp32",),
     ) -> None:
-        """`backend` is torch or triton. `precisions` are those that its updates may have, the preferred one first."""
+        """`backend` is torch or triton. `precisions` lists those that the updates may use, the preferred one first."""
         super().__init__()
         self.automatic_optimization = False
         self.network = network
@@ -69,7 +69,7 @@ class TrainingModule(LightningModule):
         self._begin_average()
 
     def load_weights(self, network: ParticleNetwork) -> None:
-        """Copies parameters and normaliser when a run begins. It replaces `set_statistics`."""
+        """Copies the parameters and normaliser of `network` when a run begins, instead of `set_statistics`."""
         self.network.load_state_dict(network.state_dict())
         self._begin_average()
 
@@ -88,7 +88,7 @@ class TrainingModule(LightningModule):
         return learning_rate(self.training_config, self.update)
 
     def simulating_backend(self) -> Backend:
-        """Returns the backend that simulates `result`: the training's, else the fastest that steps by frames."""
+        """Returns the backend that simulates `result`: triton if it trains, else the fastest that steps by frames."""
         precision = self.updates.precision
         if self.backend == "triton":
             return build("triton", self.result, precision)

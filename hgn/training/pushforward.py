@@ -7,12 +7,13 @@ The idea is that of Brandstetter et al. 2022. Samples are collected as in DAgger
    `pushforward_episode_fraction` of the episode's frames if that is more; it stops at the end of the episode.
 2. Each simulated frame becomes a window in a pool. A fraction of the samples of later updates comes from the pool.
 
-Noise shows the network random errors. The network's own errors are biased, and common to a body.
-Seed, update and rank determine all draws. The pool is not part of a checkpoint; a resumed training simulates again.
-It continues exactly if the checkpoint is at a multiple of `pushforward_every`.
+Noise shows the network random errors. The network's own errors are biased, and similar for all particles of a body.
+Seed, update and rank determine all draws. The pool is not part of a checkpoint, so a resumed training simulates again.
+Its updates are those of an uninterrupted training if the checkpoint is at a multiple of `pushforward_every`.
 
 This module contains the rule and the pool; torch_pushforward and triton_pushforward simulate.
-Shape legend: H velocity history, F simulated frames, W = H + 2 frames of a window, N particles, S scenes.
+Shape legend: H velocity history, F simulated frames, T = H + F + 2 frames of the data, W = H + 2 frames of a window,
+N particles, S scenes.
 """
 
 from __future__ import annotations
@@ -50,7 +51,7 @@ START_STREAM, SAMPLE_STREAM = 0x57A7, 0xE217
 # Largest RMS distance of a frame from the data, in finest cells. Frames farther away are dropped, with all later ones:
 # the data's motion is no target for them, and they would dominate the loss. An untrained network loses most frames.
 DROPPED_BEYOND = 0.5
-PULLED_WITHIN = 1.0  # in a target a larger position error counts as this, on each axis, in finest cells
+PULLED_WITHIN = 1.0  # targets clamp the position error to this on each axis, in finest cells
 
 
 def simulated_frames(training: TrainingConfig, frame_count: int) -> int:
@@ -82,7 +83,7 @@ def drawn_starts(training: TrainingConfig, update: int, rank: int, frame_counts:
 
 
 class PoolDraws:
-    """Draws windows of a pool: the fraction `training.pushforward_importance` by target acceleration, others evenly."""
+    """Draws pool windows: a fraction `training.pushforward_importance` by target acceleration, the others uniformly."""
 
     def __init__(self, training: TrainingConfig, rank: int, accelerations: Sequence[float]) -> None:
         self._training, self._rank = training, rank
@@ -106,9 +107,10 @@ def pushforward_windows(
 ) -> torch.Tensor:
     """Returns the windows of one scene's simulation, [F, W, N, 3].
 
-    true_TN3 contains the frames n - H to n + F + 1 of the data, simulated_FN3 the frames x_k with k = n + 1 to n + F. A
-    window ends with x_k and its target x_k + (true_{k+1} - true_k) + pull (true_k - x_k). The second term corrects the
-    velocity error. The third corrects part of the position error, up to PULLED_WITHIN on each axis. Walls are ignored.
+    true_TN3 contains the frames of the data from H before the simulation's start to F + 1 after it, simulated_FN3 the F
+    frames after the start. A window ends with a simulated frame x_k and its target
+    x_k + (true_{k+1} - true_k) + pull (true_k - x_k). The second term corrects the velocity error. The third corrects
+    the fraction `pull` of the position error, which is clamped to PULLED_WITHIN on each axis. Walls are ignored.
     """
     frames = len(simulated_FN3)
     history = len(true_TN3) - frames - 2
@@ -206,7 +208,7 @@ class PushforwardPool(Generic[E, T]):
         self.figures = {f"pushforward/{name}": value for name, value in values.items()}
 
     def replaced(self, samples: Sequence[T], update: int) -> list[T]:
-        """Returns the samples, some replaced by ones from the pool with the same seeds and new noise scales."""
+        """Returns the samples, some of them replaced by samples of the pool with their seeds and new noise scales."""
         samples, scenes = list(samples), self._scenes
         for slot, (number, draw_weight) in enumerate(self._draws.drawn(update)):
             simulated, acceleration = self._samples[number]

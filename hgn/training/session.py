@@ -53,7 +53,7 @@ class Start:
 def train_network(config: TrainConfig, start: Start, stop: StopRequest, published: Callable[[], str]) -> int:
     """Trains until `training.maximum_updates` or a stop request. Returns the exit code.
 
-    `published` reports how many episodes are published. Every rank calls this.
+    `published` reports how many episodes are published. Every rank calls this function.
     """
     # Importing Lightning takes seconds. It is imported after the wait for data, and by no other command.
     from lightning.pytorch import Trainer, seed_everything
@@ -156,8 +156,9 @@ def _module(config: TrainConfig, start: Start, backend: str, precisions: tuple[s
 
 
 def _backend(config: TrainConfig, resume: Resume | None) -> tuple[str, tuple[str, ...], str]:
-    """Returns `torch` or `triton`, the precisions to try in order, and a line that reports both. A training with
-    precision `auto` resumes in the precision of its checkpoint.
+    """Returns `torch` or `triton`, the precisions to try in order, and a line for the user with backend and precision.
+
+    A training with precision `auto` resumes in the precision of its checkpoint.
     """
     training = config.training
     on_gpu = training.device != "cpu" and torch.cuda.is_available()

@@ -37,7 +37,7 @@ class TritonScenes:
     def __init__(
         self, network: HierarchicalGraphNetwork, training: TrainingConfig, obstacle_cell_size: float, precision: str
     ) -> None:
-        """Parameters of simulations are in `values`. The first call checks the kernels with those of `network`."""
+        """Simulations use the parameters in `values`; before the first, those of `network` check the kernels."""
         self._network, self._training, self._precision = network, training, precision
         self._obstacle_cell_size = obstacle_cell_size
         self._history = network.config.velocity_history
@@ -77,7 +77,7 @@ class TritonScenes:
     def _state(self, starts: Sequence[tuple[DeviceEpisode, int]]) -> ParticleState:
         """Returns the true state at the start of the simulation, without obstacles, which have their own tables.
 
-        Empty scenes fill it up to `pushforward_scenes`, so that the same buffers fit simulations of fewer scenes.
+        Empty scenes pad the state to `pushforward_scenes`, so that the same buffers fit simulations of fewer scenes.
         """
         device, episodes = self.values.device, [episode for episode, _ in starts]
         last = self._history + 1
@@ -85,7 +85,7 @@ class TritonScenes:
         past_TN3 = torch.cat(pasts, dim=1)
         counts = torch.tensor([episode.particles for episode in episodes], device=device)
         empty = max(0, self._training.pushforward_scenes - len(episodes))
-        placed = [*episodes, *[episodes[0]] * empty]  # an empty scene has any domain
+        placed = [*episodes, *[episodes[0]] * empty]  # the domain of an empty scene is arbitrary
         own: dict[str, Any] = {}
         if "friction" in self._network.config.own_physics:
             own["wall_friction_S3"] = torch.tensor([episode.wall_friction for episode in placed], device=device)
@@ -113,7 +113,7 @@ class TritonScenes:
         )
 
     def _begun(self, episodes: Sequence[DeviceEpisode], state: ParticleState) -> TritonStepper:
-        """Returns a stepper at its start. It is the previous stepper if its buffers are large enough."""
+        """Returns a stepper at `state`: the previous one if its buffers are large enough, else a new one."""
         config, values = self._network.config, self.values
         device = values.device
         table, barriers, empty = None, None, [None] * (state.scene_count - len(episodes))

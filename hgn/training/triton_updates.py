@@ -128,7 +128,7 @@ class TritonUpdates:
         try:
             self.parity = require_update_parity(self.updates, episodes, shown, [s.frame for s in first])
         except ParityError as error:
-            failure = str(error)  # the error itself would keep the graphs
+            failure = str(error)  # a stored error would keep the graphs in memory
         failures = torch.tensor(float(failure != ""), device=self.device)
         if self._ranks.count > 1:
             sum_over_ranks(failures)
@@ -170,7 +170,7 @@ class TritonUpdates:
         )
 
     def _placed(self, episode: EpisodeTensors) -> DeviceEpisode:
-        """Copies an episode to the device if it fits. Otherwise pins its memory; kernels read it over the bus."""
+        """Copies an episode to the device. If its positions do not fit, kernels read them from pinned host memory."""
         position_TN3 = episode.position_TN3
         if self.device.type == "cuda":
             free, total = torch.cuda.mem_get_info(self.device)
@@ -193,7 +193,7 @@ class TritonUpdates:
         )
 
     def _take_over(self) -> None:
-        """Makes parameters and moments views of flat buffers, so that one launch copies them all."""
+        """Makes parameters and moments views of flat buffers, so that one launch copies a whole buffer."""
         parameters = list(self.network.parameters())
         self._flat = _flattened(self.network)
         self._moments = torch.zeros(2, len(self._flat), device=self.device)
