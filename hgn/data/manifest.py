@@ -1,8 +1,8 @@
-"""Reads and writes the manifest of a data set: published shards, their content, and the settings that made them.
+"""Reads and writes the manifest of a data set: published shards, their content, and the settings of their generation.
 
-`manifest.json` is written last and atomically, so all listed shards are complete. Its size does not depend on the
-number of shards, which are in the append-only files of `hgn.data.index`. Manifests of the first release contain the
-shards themselves.
+`manifest.json` is written last and atomically, so all listed shards are complete. The append-only files of
+`hgn.data.index` list the shards, so the manifest's size does not depend on their number. Manifests of the first release
+list the shards themselves.
 """
 
 from __future__ import annotations
@@ -118,7 +118,7 @@ class Manifest(_Identity):
         return Manifest(head.config_hash, head.config, head.requested, head.revision, shards)
 
     def save(self, folder: Path | str) -> Manifest:
-        """Replaces the folder's list by this one, as a new generation. Returns the manifest as it is read there."""
+        """Replaces the folder's manifest and, by a new generation, its index. Returns the manifest in the folder."""
         try:
             current = json.loads((Path(folder) / MANIFEST_NAME).read_bytes())["index"]["generation"]
         except (FileNotFoundError, ValueError, LookupError, TypeError):  # no manifest, or one of the first release
@@ -155,7 +155,7 @@ class Manifest(_Identity):
 
     @property
     def quarantined(self) -> list[QuarantinedScene]:
-        """Returns the scenes that could not be simulated, in order. Each access reads them."""
+        """Returns the scenes that could not be simulated, in order. Each access reads the index."""
         return self.shards.quarantined()
 
     def statistics(self, split: str = "train") -> Statistics:
@@ -178,7 +178,7 @@ class Manifest(_Identity):
 
 @contextlib.contextmanager
 def errors_in_config(folder: Path | str) -> Iterator[None]:
-    """Turns errors of code that reads a manifest's config into a ConfigError, because any file may contain another."""
+    """Turns errors of code that reads a manifest's config into a ConfigError, because a file may have any config."""
     try:
         yield
     except ConfigError:

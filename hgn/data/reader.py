@@ -119,7 +119,7 @@ class EpisodeStore(Episodes):
         """Reads the manifest again. Returns whether this split has more episodes than before.
 
         If a server does not answer, the store keeps its present episodes. Any other fault raises an error. Inside
-        `faults_outlived` it raises only after the patience. Until then `ask_again` refreshes at most once a second.
+        `faults_outlived`, a fault raises only if it lasts longer than the patience; until then `ask_again` refreshes.
         Raises: ConfigError if the folder contains another data set, or published shards were removed.
         """
         previous_s, self._looked_s = self._looked_s, time.monotonic()
@@ -180,9 +180,10 @@ class EpisodeStore(Episodes):
         return True
 
     def fetch_ahead(self, episodes: Sequence[int] | None = None) -> None:
-        """Starts to fetch shards in the background, one after the other. It does nothing for a folder.
+        """Starts to fetch shards in the background, one after the other. A folder needs no fetching.
 
-        It fetches all published shards, or those of `episodes` in order. A full cache makes room only for the latter.
+        It fetches all published shards, or those of `episodes` in order. Only for the latter does a full cache remove
+        shards.
         """
         if not is_remote(self.folder):
             return
@@ -198,7 +199,7 @@ class EpisodeStore(Episodes):
                 self._fetcher.start()
 
     def _fetch_all(self) -> None:
-        with contextlib.suppress(ConfigError, OSError):  # the reader that needs the shard raises them
+        with contextlib.suppress(ConfigError, OSError):  # a reader that needs the shard raises the same error
             for shard in self.manifest.shards.since(self._fetched):
                 if shard.split == self.split:
                     self._bring(shard, Path, spared=None)
@@ -252,18 +253,18 @@ class EpisodeStore(Episodes):
 
     def _reset(self) -> None:
         self._open_shards: OrderedDict[str, _OpenShard] = OrderedDict()
-        self._scanned: set[str] = set()  # keys of episodes whose positions are finite
+        self._scanned: set[str] = set()  # keys of episodes whose positions were checked to be finite
         self._fetcher = None
         self._faulty_since = None
         self._frames: list[int] = []  # frame counts of the episodes in the first shards, if they differ
-        self._measured = 0  # number of these shards
-        self._fetched = 0  # number of shards that were fetched ahead
+        self._measured = 0  # number of these shards, with those of other splits
+        self._fetched = 0  # number of shards that _fetch_all has finished with
         self._wanted, self._spared = [], frozenset()
         self._lock = threading.Lock()
         holders.add(self)
 
     def _bring(self, shard: ShardEntry, use: Callable[[Path], T], **options: Any) -> T:
-        """Returns `use` of a shard's verified file on this machine. Options and errors as for `Storage.shard`."""
+        """Returns the result of `use` for a shard's verified file. Options and errors as for `Storage.shard`."""
         return ask(self.folder, lambda files: use(files.shard(shard.name, shard.sha256, shard.bytes, **options)))
 
     def _locate(self, index: int) -> tuple[ShardEntry, EpisodeEntry]:

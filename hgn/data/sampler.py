@@ -39,7 +39,7 @@ class Sample(NamedTuple):  # faster to construct than a dataclass; a thousand ar
     noise_scale: float = 1.0  # scale of its noise in units of training.noise_std (see hgn.training.noise)
 
 
-BLOCK_EPISODES = 8  # consecutive episodes in publication order; this is the size of most shards
+BLOCK_EPISODES = 8  # number of consecutive episodes in a block of the shuffle; most shards have this size
 
 
 def epoch_order(seed: int, epoch: int, first_sample: np.ndarray, window: int = 0) -> np.ndarray:
@@ -86,7 +86,8 @@ class EpisodeSampler:
     `published(epoch)` is called when an epoch begins. It returns the number of frames of each published episode, in
     publication order. It must return the same list on every rank, and continue the list of the epoch before. Episodes
     that are published after an epoch began are used from the next epoch on, also after a resume. `digest(count)`
-    identifies the first `count` episodes (`hgn.data.index`). `particles(episodes)` returns counts to balance the ranks.
+    identifies the first `count` episodes (`hgn.data.index`). `particles(episodes)` returns their particle counts, by
+    which samples are divided evenly among the ranks.
     """
 
     def __init__(
@@ -119,7 +120,7 @@ class EpisodeSampler:
             )
         self._order = np.zeros(0, np.int64)
         self._first_sample = np.zeros(1, np.int64)
-        self._first_seed = np.uint64(0)  # seed of an epoch's first sample; the seeds of the others follow
+        self._first_seed = np.uint64(0)  # added to a sample's index, before splitmix64 derives its seed
         self._begin_epoch(self.state.epoch, self.state.position, self.state.episodes, self.state.digest)
 
     def next_batch(self) -> list[Sample]:

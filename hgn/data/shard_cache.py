@@ -34,7 +34,7 @@ _FULL = (errno.ENOSPC, errno.EDQUOT)
 
 
 class Holder(Protocol):
-    """Describes a reader with open files of the cache. They occupy the disk until they are closed."""
+    """Describes a reader with open files of the cache. Removed files occupy the disk until readers close them."""
 
     def release(self, path: Path) -> None:
         """Closes a file that is about to be removed."""
@@ -64,7 +64,7 @@ class CachedShard:
     url: str
     sha256: str
     size: int  # bytes, as an index claims it
-    size_there: Callable[[], int | None]  # asks the server, which may not know it
+    size_there: Callable[[], int | None]  # asks the server for the size; None: the server does not report it
 
 
 Fill = Callable[[BufferedRandom], None]
@@ -108,7 +108,7 @@ def _fetch(path: Path, shard: CachedShard, patience_s: float, spared: Collection
             except OSError as error:
                 if error.errno not in _FULL or spared is None:
                     raise
-                if (there := shard.size_there()) not in (None, shard.size):  # it would remove other shards for nothing
+                if (there := shard.size_there()) not in (None, shard.size):  # do not remove others for a wrong size
                     raise StorageError(f"{shard.url} must have {shard.size} bytes, got {there}") from None
                 if not _free_space(path.parent, over, max(over, shard.size), spared):
                     raise
@@ -159,9 +159,9 @@ def _bytes_over(folder: Path, size: int) -> float:
 
 
 def _free_space(folder: Path, least: float, size: float, spared: Collection[str]) -> bool:
-    """Removes the oldest shards that are not spared, up to `size` bytes. Returns whether it removed any.
+    """Removes the oldest shards that are not spared until it has freed `size` bytes. Returns whether it removed any.
 
-    It removes none if all of them are smaller than `least` in total, because a size in an index may be wrong.
+    It removes none if these shards have fewer than `least` bytes in total, because a size in an index may be wrong.
     """
     removable = [(cached, path) for _, cached, path in _cached(folder) if path.stem not in spared]
     if sum(cached for cached, _ in removable) < least:
@@ -179,7 +179,7 @@ def _free_space(folder: Path, least: float, size: float, spared: Collection[str]
 
 @contextlib.contextmanager
 def _locked_partial(path: Path, url: str, patience_s: float) -> Iterator[BufferedRandom | None]:
-    """Yields the locked partial file of `path` with the bytes from other processes; None once `path` exists.
+    """Yields the locked partial file of `path` with the bytes that earlier processes wrote; None once `path` exists.
 
     The kernel frees the lock of a process that ends, so the next process continues the file.
     Raises: UnreachableError if another process has the lock and writes nothing for `patience_s`.
@@ -213,7 +213,7 @@ def _locked_partial(path: Path, url: str, patience_s: float) -> Iterator[Buffere
 
 
 def _lock(file: BufferedRandom, folder: Path, url: str, patience_s: float) -> None:
-    """Locks a file. It waits while the file grows; a process that does not write may be suspended."""
+    """Locks a file. Waits for another process as long as the file grows; one that does not write may be suspended."""
     size, start = -1, time.monotonic()
     try:
         while not lock_file(file):

@@ -34,7 +34,7 @@ from hgn.system.patience import UnreachableError, inside, patiently, standard_pa
 TOKEN_VARIABLE = "HGN_DATASET_TOKEN"
 TOKEN_HOST_VARIABLE = "HGN_DATASET_HOST"
 _CHUNK_BYTES = 16 * 2**20  # bytes of a shard per request; a lost connection costs at most one request
-_CONNECT_S, _SILENCE_S, _ANSWER_S = 10.0, 60.0, 1800.0  # limits: to connect, between two pieces, for a whole file
+_CONNECT_S, _SILENCE_S, _ANSWER_S = 10.0, 60.0, 1800.0  # limits: to connect, between two pieces, for a whole answer
 _AWAY_S = 10.0  # for this time after a failed request, calls with patience_s=0 fail without a request
 _PROXY = re.compile(r"http://(\S+@)?([\w.-]+|\[[\w.:]+\])(:\d{1,5})?/?")
 _NETWORK_PACKAGES = {"aiohttp", "botocore", "aiobotocore", "gcsfs", "google", "azure"}
@@ -54,7 +54,7 @@ def outliving() -> bool:
 
 
 def ask(folder: Path | str, read: Callable[[Storage], T]) -> T:
-    """Returns the result of `read` for a data set. Raises: as `read`; UnreachableError inside `faults_outlived`."""
+    """Returns the result of `read` for a data set. Raises: as `read`; inside `faults_outlived` UnreachableError too."""
     storage, place = open_storage(folder), str(folder)
     if not outliving():
         return read(storage)
@@ -72,7 +72,7 @@ def _may_pass(error: Exception) -> str | None:
 
 
 class Storage(ABC):
-    """Reads the files of a data set at any place."""
+    """Reads the files of a data set in a folder or at a URL."""
 
     @abstractmethod
     def manifest(self, name: str, patience_s: float | None = None) -> bytes:
@@ -114,9 +114,10 @@ def open_storage(folder: Path | str) -> Storage:
 
 
 def _uses_proxies(url: str) -> bool:
-    """Returns whether a URL is read through a proxy of the environment, if there is one, and prepares it for aiohttp.
+    """Returns whether a URL is read through a proxy of the environment, if there is one. Raises: ConfigError.
 
-    aiohttp requires a scheme, and knows neither all_proxy nor networks in no_proxy. Raises: ConfigError.
+    Rewrites http_proxy and https_proxy for aiohttp, which requires a scheme in them and ignores all_proxy. Networks in
+    no_proxy, which it ignores too, are handled here.
     """
     address, given = urlsplit(url), getproxies()
     others = re.split(r"[\s,;]+", given.get("no", ""))
@@ -146,7 +147,7 @@ def _require_address(url: str) -> None:
     """Refuses a URL without a host or path, or whose host or port is malformed. Raises: ConfigError."""
     try:
         address = urlsplit(url)
-        _ = address.port  # computed here, and may be malformed
+        _ = address.port  # raises ValueError for a malformed port
     except ValueError as error:
         raise ConfigError(f"dataset.folder must be a folder or a URL, got {url!r} ({error})") from None
     place = (address.netloc + address.path).strip("/")
@@ -391,7 +392,7 @@ def _transient(error: Exception, url: str) -> str | None:
     """Returns the cause of a temporary error, or None for another error. Raises: ConfigError (access refused)."""
     if isinstance(error, FileNotFoundError):
         return None
-    malformed = type(error.__cause__).__module__ == "aiohttp.http_exceptions"  # its status is 400, from nobody
+    malformed = type(error.__cause__).__module__ == "aiohttp.http_exceptions"  # aiohttp invents status 400
     status = None if malformed else getattr(error, "status", None)
     if status in (401, 403) or isinstance(error, PermissionError):
         raise StorageError(

@@ -1,4 +1,4 @@
-"""Writes an imported set as a data set: first shards, then the index, and last the manifest."""
+"""Imports a set of trajectories as a data set: shards are written first, then the index, and the manifest last."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ from hgn.scene.episode import SCHEMA_VERSION, Episode
 from hgn.schema import ConfigError, require
 from hgn.system.files import make_folder, sync_file, sync_folder, temporary_file
 
-SHARD_BYTES = 128 << 20  # size of a shard after which another one begins
-LOOKED_AT = 4  # number of trajectories for estimates of gravity and of the spacing of boundaries
+SHARD_BYTES = 128 << 20  # a shard ends with the episode that reaches this size
+LOOKED_AT = 4  # number of trajectories that give estimates of gravity and of the boundary particles' spacing
 
 
 def import_set(
@@ -36,8 +36,9 @@ def import_set(
 ) -> tuple[Manifest, str | None]:
     """Reads the trajectories of a folder and writes them as a data set. Calls `progress` for each episode.
 
-    Returns the manifest, and a warning about trajectories that leave their bounds, or None. Raises: ConfigError naming
-    an unreadable file and field; OSError. The manifest is written last, so an interrupted import starts again.
+    Returns the manifest, and a warning about trajectories that leave their bounds, or None. The manifest is written
+    last, so an interrupted import can be started again.
+    Raises: ConfigError naming the file and field that cannot be read; OSError.
     """
     out = Path(config.out)
     require(not (out / MANIFEST_NAME).exists(), "out", "a new folder", config.out, "this holds a data set")
@@ -81,7 +82,7 @@ def import_set(
 
 
 def _gravity(first: list[Trajectory], info: SetInfo) -> tuple[float, ...]:
-    """Returns the gravity of trajectories without their own, or else that of the first one."""
+    """Returns the gravity estimated from trajectories that do not store theirs, else that of the first trajectory."""
     without = [trajectory for trajectory in first if trajectory.gravity is None]
     if without:
         return _estimated(without, info)

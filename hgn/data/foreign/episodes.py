@@ -88,7 +88,7 @@ class Converter:
         rule, largest = f"at most {most:.3g}, the box in a frame", max(map(abs, (*gravity, *self.gravity)))
         require(largest <= most, f"{name}: gravity", rule, largest, "check dt")
         x, y, z = (*gravity, 0.0)[:3]
-        # the velocity with which free flight leads from frame -1 to frame 0
+        # the velocity at frame 0 of a free flight from frame -1
         velocity_N3 = (free_TN3[first].astype(np.float64) - free_TN3[first - 1]) / info.frame_dt_s
         velocity_N3 += 0.5 * info.frame_dt_s * np.array((x, y, z))
         material_N = self._materials(name, trajectory.type_N[~fixed_N])
@@ -170,7 +170,7 @@ class Converter:
         )
 
     def _require_not_across(self, name: str, free_TN3: np.ndarray) -> None:
-        """Refuses particles near a periodic side. Others do not see it (LagrangeBench's dam break has walls there)."""
+        """Refuses particles near a periodic side. It has no effect farther away (as in LagrangeBench's dam break)."""
         for axis, periodic in enumerate(self.info.periodic):
             path_TN, high = free_TN3[..., axis], self.domain_size[axis]
             if periodic and path_TN.size and min(path_TN.min(), high - path_TN.max()) < self.info.radius:
@@ -203,9 +203,9 @@ class Converter:
 
 
 def obstacle_cell_size(info: SetInfo, boundaries: list[np.ndarray]) -> float:
-    """Returns the width of obstacle cells. It is in proportion to the radius, and at least a boundary's spacing.
+    """Returns the width of obstacle cells: in proportion to the radius, and at least the boundary particles' spacing.
 
-    It divides the box along x into a whole number of cells, so that mirrors map cells to cells.
+    The box along x is a whole number of these cells wide, so that mirrors map cells to cells.
     """
     if info.obstacle_cell_size is not None:
         return float(info.obstacle_cell_size)
@@ -216,10 +216,10 @@ def obstacle_cell_size(info: SetInfo, boundaries: list[np.ndarray]) -> float:
 
 
 def flat_plane(radius: float, obstacle_cell: float) -> float:
-    """Returns a z in the middle between cell faces of both sizes, for which float32 computes the cell exactly.
+    """Returns a z at the centre of a network cell and not near a face of an obstacle cell.
 
-    (z / radius - 1/2) is a whole number in float32 for a division and for a product with the reciprocal, with and
-    without rounding before the subtraction. z is at least 16 radii, so walls are out of reach.
+    In float32 (z / radius - 1/2) is exactly a whole number for a division and for a product with the reciprocal, with
+    and without rounding before the subtraction. z is at least 16 radii, so walls are out of reach.
     """
     cell = np.float32(radius)
     inverse = np.float32(1) / cell

@@ -39,7 +39,7 @@ _LAGRANGEBENCH = {0: "fluid", 3: "rigid", 5: "water", 6: "sand", 7: "goop"}  # 5
 
 
 def find_format(folder: Path, required: str) -> str:
-    """Returns the format of a folder's files. Raises: ConfigError without such files, or for another format."""
+    """Returns the format of a folder's files. Raises: ConfigError if none of them has the `required` format."""
     require(folder.is_dir(), "from", "a folder with trajectories", str(folder))
     formats = []
     if _file(folder, "train", ".tfrecord"):
@@ -65,7 +65,7 @@ def find_format(folder: Path, required: str) -> str:
 
 
 def set_info(folder: Path, name: str, config: ImportConfig) -> SetInfo:
-    """Reads the metadata of a set. Settings of the command line replace its values.
+    """Reads the metadata of a set. Settings of the command line replace values of the metadata.
 
     Raises: ConfigError naming the missing or wrong value, and for forces that change with time.
     """
@@ -143,9 +143,10 @@ def _material(value: object, folder: Path) -> str:
 
 
 def read_split(folder: Path, split: str, info: SetInfo) -> Iterator[Trajectory]:
-    """Yields the trajectories of a split in the order of their names; none if there is no file.
+    """Yields the trajectories of a split in a fixed order; none if there is no file.
 
-    Raises: ConfigError naming file, trajectory and field that is missing, incomplete, altered or of a wrong type.
+    Raises: ConfigError naming file, trajectory and field, if the field is missing, incomplete, altered or of a wrong
+    type.
     """
     return (_of_members(name, members, info) for name, members in _READERS[info.format](folder, split, info))
 
@@ -194,7 +195,7 @@ def _read_geoelements(folder: Path, split: str, info: SetInfo) -> Iterator[_Name
 
 
 def _entries(member: str, array: np.ndarray) -> Iterator[tuple[str, Any]]:
-    """Yields names and contents of the trajectories in an array of an archive: one, a dict or a list of them."""
+    """Yields name and content of each trajectory in an archive's array: one trajectory, or a dict or list of them."""
     content = array.item() if array.shape == () else array
     if isinstance(content, Mapping) and "position" not in content:
         yield from ((f"{member}[{key!r}]", entry) for key, entry in content.items())
@@ -230,8 +231,8 @@ def _read_plain_npz(path: Path) -> Iterator[_Named]:
 
 
 def _of_members(name: str, members: Mapping[str, Any], info: SetInfo) -> Trajectory:
-    """Checks the fields of a trajectory, which all formats have by the names of the plain one."""
-    position = members.get("position", members.get("positions"))  # the name in geoelements' HDF5
+    """Checks the fields of a trajectory, which readers of all formats name as in the plain format."""
+    position = members.get("position", members.get("positions"))  # the second name is that in geoelements' HDF5
     if position is None:
         raise ConfigError(f"{name}: position is missing; it has {', '.join(members) or 'nothing'}")
     types = members.get("particle_type")
@@ -273,7 +274,7 @@ def _require_cells(name: str, cell_K3: np.ndarray, normal_K3: np.ndarray) -> Non
 
 
 def _properties(name: str, given: Any, count: int) -> np.ndarray | None:
-    """Returns numbers of each particle, float32 [N, K], from one number for all, or one or several for each."""
+    """Returns K properties of each particle, float32 [N, K], where the file may have a row for each or one for all."""
     if given is None:
         return None
     array = as_array(f"{name}: material_property", given)

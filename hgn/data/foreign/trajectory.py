@@ -1,6 +1,7 @@
 """The common form of trajectories of all formats, with its checks.
 
-Shape legend: T frames, N particles of all kinds, P particles of the boundary, D dimensions, 2 or 3.
+Shape legend: T frames, N particles of all kinds, n sampled coordinates, P particles of the boundary, D dimensions, 2 or
+3. K is the number of obstacle cells, or in property_NK of properties.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from hgn.schema import ConfigError, require
 from hgn.system.claims import require_few_items
 
 COARSEST = 1e-3  # largest spacing of stored numbers, in radii; gravity moves a particle by a few of these in a frame
-SAMPLED = 100_000  # coordinates of a trajectory that are searched for rounding
+SAMPLED = 100_000  # number of coordinates of a trajectory that are searched for rounding
 MOST_RADII = 1 << 14  # largest size of the box in radii, because cells are indexed by integers
 LARGEST = 1e15  # largest size of a number, so that float32 stores its square
 FLUID = 1  # the type of particles in files without types
@@ -29,8 +30,8 @@ class Trajectory:
     position_TND: np.ndarray  # float32 or float64
     type_N: np.ndarray  # int64, the set's own numbers
     boundary_PD: np.ndarray | None = None  # particles at rest; None: they are among the other particles
-    property_NK: np.ndarray | None = None  # float32, geoelements' material_property
-    obstacle_cell_K3: np.ndarray | None = None  # obstacle cells of the plain format; their normals follow
+    property_NK: np.ndarray | None = None  # float32, the field material_property
+    obstacle_cell_K3: np.ndarray | None = None  # obstacle cells of the plain format, with these normals:
     obstacle_normal_K3: np.ndarray | None = None
     gravity: tuple[float, ...] | None = None  # gravity of this trajectory, length per second squared
 
@@ -46,7 +47,7 @@ class SetInfo:
     radius: float  # largest distance of neighbours, in the set's unit of length
     materials: Mapping[int, str]  # names by type
     boundary_types: frozenset[int]
-    ignored_types: frozenset[int] = frozenset()  # padding
+    ignored_types: frozenset[int] = frozenset()  # types of padding
     gravity: tuple[float, ...] | None = None  # length per second squared; None: estimated
     gravity_size: float | None = None  # size of gravity, if only that is known
     obstacle_cell_size: float | None = None
@@ -130,19 +131,19 @@ def floats(name: str, array: Any, shape: tuple[int | None, ...]) -> np.ndarray:
 
 
 def _step(position_TND: np.ndarray, radius: float) -> float:
-    """Returns the smallest difference of coordinates that move, or 0 if they are too few to tell their rounding."""
+    """Returns the smallest difference between coordinates that change, or 0 if too few change to detect rounding."""
     path_TnD = position_TND[:, :: max(1, position_TND.size // SAMPLED)].astype(np.float64)
     moves_TnD = np.diff(path_TnD, axis=0) != 0
     moved = path_TnD[1:][moves_TnD]
-    moved = np.unique(moved[np.abs(moved) > 0.5 * np.abs(moved).max(initial=0)])  # floats have coarser digits there
-    count = len(np.unique(path_TnD[0][moves_TnD.any(axis=0)])) * len(path_TnD) / 2  # particles side by side count once
-    # with this count, numbers that were not rounded almost surely contain a smaller difference than COARSEST
+    moved = np.unique(moved[np.abs(moved) > 0.5 * np.abs(moved).max(initial=0)])  # floats are coarsest there
+    count = len(np.unique(path_TnD[0][moves_TnD.any(axis=0)])) * len(path_TnD) / 2  # equal coordinates count once
+    # unrounded numbers, if they are not few, almost surely contain a difference below COARSEST
     few = len(moved) < 2 or count**2 * COARSEST * radius < 20 * np.ptp(moved)
     return 0.0 if few else float(np.diff(moved).min())
 
 
 def require_fine(name: str, position_TND: np.ndarray, radius: float) -> None:
-    """Refuses positions that are stored too coarsely, possibly in fewer digits before they were stored so."""
+    """Refuses positions that are stored too coarsely, or that were rounded too coarsely before they were stored."""
     single = position_TND.astype(np.float32)
     stored = single if np.array_equal(single, position_TND) else position_TND
     largest = np.abs(stored).max(initial=0)
