@@ -91,7 +91,7 @@ def build_hierarchy(
 
     position_N3 is in domain units. scene_N contains int64 indices into origin_S3, the finest grid's origins. With
     `connected`, cells of coarser levels are neighbours only where finest cells on both sides of their face are active.
-    Raises: GridRangeError if a particle is not finite or beyond ±65,536 cells.
+    Raises: GridRangeError if a particle is not finite, or 65,534 cells or more from the origin on an axis.
     """
     grid_N3 = (position_N3 - origin_S3[scene_N]) / cell_size - 0.5
     # an exported graph cannot raise

@@ -1,8 +1,8 @@
 """python -m tools.error_vs_time data=… weights=[…] out=results/error_vs_time: error against run time.
 
 Compares networks (by default the shipped ones), the solver on coarser grids and with larger steps, and baselines on
-the same test scenes; a converged simulation is the reference. Writes a table, OUT.json, OUT.png, OUT_batched.png and
-OUT_frames.png.
+the same test scenes. docs/concepts/judging.md states what the reference is. Writes a table, OUT.json, OUT.png,
+OUT_batched.png and OUT_frames.png.
 """
 
 from __future__ import annotations

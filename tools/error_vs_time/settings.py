@@ -21,8 +21,8 @@ class ErrorVsTimeConfig(ReportConfig):
     # writes OUT.json (or the file `json`), OUT.png (error against run time), OUT_batched.png (side by side) and
     # OUT_frames.png (over frames)
     out: str
-    # data set whose scenes the solver simulates again with a finer step, as the reference; make one with
-    # python -m datagen
+    # data set of python -m datagen. Reference: the solver on its grid at a quarter of the largest stable step
+    # (`resimulate`), or the data itself if its grid is finer than the networks'
     data: str
     # files of python -m hgn.export or names of shipped weights; null: all shipped weights that fit the data
     weights: tuple[str, ...] | None = None
@@ -33,7 +33,7 @@ class ErrorVsTimeConfig(ReportConfig):
     precisions: tuple[Precision, ...] | None = None
     mpm_grids: tuple[Annotated[int, Bound("at least 8", lambda value: value >= 8)], ...] = (32, 48, 64)  # cells a unit
     mpm_frames: FrameCount = 300  # of the solver's rollouts, which take most of the time
-    resimulate: bool = True  # false: the data is the reference; with mpm_grids=[] perturbation=0 no solver runs
+    resimulate: bool = True  # false: the reference is the data; with mpm_grids=[] perturbation=0 no solver runs
     # initial displacement, domain units, by which the solver is compared with itself (chaos floor); 0: no such row
     perturbation: NonNegative[float] = 1e-6
 
