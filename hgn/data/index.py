@@ -83,7 +83,7 @@ class _Segment:
 
 
 class _Read:
-    """Caches what was read of an index. The later states of the same index share it."""
+    """Caches the parts of an index that were read. Later states of the same index share the cache."""
 
     def __init__(self) -> None:
         self.lock = threading.RLock()
@@ -118,7 +118,7 @@ class Index(Sequence[ShardEntry]):
         self._read = _Read()
 
     def continued(self, later: Index) -> Index:
-        """Passes the cache to `later`, a later state of the same index, and returns it."""
+        """Returns `later`. If it is a later state of the same index, it shares the cache of this one."""
         if later.state.generation == self.state.generation != _IN_MEMORY and len(later) >= len(self):
             later._read = self._read
         return later
@@ -154,7 +154,7 @@ class Index(Sequence[ShardEntry]):
             count += len(rest)
 
     def locate(self, split: str, episode: int) -> tuple[ShardEntry, EpisodeEntry]:
-        """Returns shard and episode at a place of the split. Raises: IndexError."""
+        """Returns the shard and the entry of an episode, by the episode's place in the split. Raises: IndexError."""
         if not 0 <= episode < self.totals[split].episodes:
             raise IndexError(episode)
         segment = self._first_beyond(split, episode)
@@ -167,7 +167,7 @@ class Index(Sequence[ShardEntry]):
         return shard, shard.episodes[episode - before]
 
     def particles(self, split: str, episodes: Sequence[int]) -> list[int]:
-        """Returns particle counts by place in the split. Each segment is read once."""
+        """Returns the particle counts of episodes, by their places in the split. Each segment is read once."""
         particles = self._read.particles[split]
         with self._read.lock:
             particles.extend([-1] * (self.totals[split].episodes - len(particles)))
@@ -180,7 +180,7 @@ class Index(Sequence[ShardEntry]):
         return [particles[episode] for episode in episodes]
 
     def digest(self, split: str, episodes: int) -> str | None:
-        """Returns the digest of the shards with the first `episodes`, or None if no shard ends there."""
+        """Returns the digest of the shards with the first `episodes`, or None if these do not fill whole shards."""
         totals = self.totals[split]
         if episodes < totals.episodes:
             segment = self._first_beyond(split, episodes)
@@ -246,7 +246,7 @@ class Index(Sequence[ShardEntry]):
         return ask(self.folder, read)
 
     def _ends(self) -> list[_SegmentEnd]:
-        """Returns the ends of the full segments, and of later segments that have been read."""
+        """Returns the ends of the full segments, and those that later states of the index have read."""
         read, full = self._read, len(self) // SEGMENT_SHARDS
         with read.lock:
             if len(read.ends) < full:
@@ -264,7 +264,7 @@ class Index(Sequence[ShardEntry]):
         return bisect_right(self._ends(), episode, key=lambda end: end.totals[split].episodes)
 
     def _segment(self, number: int) -> list[ShardEntry]:
-        """Returns the shards of a segment, possibly with later ones."""
+        """Returns the shards of a segment, and further shards if later states of the index have read them."""
         read, count = self._read, min(SEGMENT_SHARDS, len(self) - number * SEGMENT_SHARDS)
         with read.lock:
             segment = read.segments.get(number) or _Segment([], 0, self._before(number))
@@ -321,7 +321,7 @@ class ListedIndex(Index):
 def extend(
     folder: Path, index: Index, shards: Iterable[ShardEntry], quarantined: Sequence[QuarantinedScene] = ()
 ) -> Index:
-    """Appends to the files of an index. The lines are valid after a head with the returned state is written.
+    """Appends lines to the files of an index. They become valid when a head with the returned state is written.
 
     Raises: OSError; ConfigError if the files are shorter than the index states.
     """
@@ -345,8 +345,11 @@ def extend(
 
 
 def begin(folder: Path, current: int = 0) -> Index:
-    """Returns an empty index of a new generation. Removes generations before the head's (`current`), which have no
-    reader. Keeps later ones, whose heads were not written."""
+    """Returns an empty index of a new generation, with a number above those of all files.
+
+    Removes files of generations before `current`, that of the head, because nobody reads them. Files of later
+    generations, left by an interrupted publication, stay.
+    """
     files = {path: int(path.name.partition("-")[0]) for path in (folder / INDEX_NAME).glob("[0-9]*-*.jsonl")}
     for path, generation in files.items():
         if generation < current:

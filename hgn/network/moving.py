@@ -12,8 +12,8 @@ where the network uses v - V.
 Tensors have one row for each obstacle. Obstacle j of scene s has the row j S + s. Scenes with fewer than J moving
 obstacles have rows without cells. A key of a cell or triangle consists of its place and, for obstacles at rest, the
 number of its scene. For moving obstacles the number is that of the row.
-Shape legend: N particles, S scenes, J largest number of moving obstacles in a scene, V = J S rows, C coarsest cells.
-K columns: three of the normal, one of friction, and after these, where there are 7, three of the velocity V.
+Shape legend: N particles, S scenes, J largest number of moving obstacles in a scene, C coarsest cells, V (in names of
+tensors) J S rows. K columns: three of the normal, one of friction; if there are 7, also three of the velocity V(x).
 """
 
 from __future__ import annotations

@@ -6,7 +6,7 @@ default parameters. If all are 0, they are not computed; the result is the same.
 | columns | value | only with |
 |---|---|---|
 | 2 | friction of the particle's obstacle cell, and of the first one on its path | friction, obstacle_features |
-| 3 | friction of the walls across x, y, z, times the nearness of the nearer wall | friction |
+| 3 | for each axis: friction of the two walls perpendicular to it, times the nearness of the nearer one | friction |
 | P | INPUT_PARAMETERS of the particle's material, 0 for those of others (`scaled_parameters`) | parameters |
 | 9 | deformation of elastic bodies (hgn.network.elastic) | elastic |
 

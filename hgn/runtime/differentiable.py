@@ -42,7 +42,7 @@ class Pose:
     rotation_3: torch.Tensor | None = None  # axis times angle, radians
     translation_3: torch.Tensor | None = None  # domain units
     pivot_3: tuple[float, float, float] | None = None  # domain units; None: the centre of the bounding box
-    velocity_3: torch.Tensor | None = None  # domain units per second, in addition to the motion of its keyframes
+    velocity_3: torch.Tensor | None = None  # domain units per second, added to the motion of keyframes
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,8 +54,8 @@ class Inputs:
     gravity_3: torch.Tensor | None = None
     domain_size_3: torch.Tensor | None = None
     poses: Mapping[int, Pose] | None = None  # by the obstacle's number in the scene
-    physics: Mapping[str, torch.Tensor] | None = None  # wall_friction [3], or INPUT_PARAMETERS by name [N]
-    smoothing: float = 0.0  # see hgn.network.posed_obstacles
+    physics: Mapping[str, torch.Tensor] | None = None  # by name: wall_friction [3], each of INPUT_PARAMETERS [N]
+    smoothing: float = 0.0  # 0 to 1 obstacle cells; see hgn.network.posed_obstacles
 
 
 def simulate(
@@ -118,7 +118,8 @@ class _Frame(torch.autograd.Function):
         with torch.enable_grad():
             outputs = context.step(*variables)
         wanted = [tensor for tensor in variables if tensor.requires_grad]
-        # grad refuses outputs that depend on no wanted tensor, for example on a pose whose obstacle stops no particle
+        # grad refuses outputs that depend on no wanted tensor: for example, only a pose is wanted, and its obstacle
+        # stops no particle
         reached = [pair for pair in zip(outputs, gradients, strict=True) if pair[0].requires_grad]
         ends, slopes = [output for output, _ in reached], [gradient for _, gradient in reached]
         computed = iter(torch.autograd.grad(ends, wanted, slopes, allow_unused=True))
@@ -246,7 +247,7 @@ def _obstacles(
 
 
 def with_velocities(scene: Scene, poses: Mapping[int, Pose]) -> Scene:
-    """Returns the scene with a motion for each obstacle that has a velocity, if it had none."""
+    """Returns the scene in which each obstacle with a velocity in `poses` has a motion: AT_REST if it had none."""
     moving = {number for number, pose in poses.items() if pose.velocity_3 is not None}
     own = (replace(o, motion=o.motion or AT_REST) if i in moving else o for i, o in enumerate(scene.obstacles))
     return replace(scene, obstacles=tuple(own))
@@ -255,7 +256,7 @@ def with_velocities(scene: Scene, poses: Mapping[int, Pose]) -> Scene:
 def _in_motion(
     state: ParticleState, scene: Scene, poses: Mapping[int, Pose], *, frame_rate_hz: float, frame: int
 ) -> ParticleState:
-    """Returns the state with its moving obstacles as in a frame. `poses` act before the motion of the keyframes."""
+    """Returns the state with its moving obstacles as in frame `frame`. `poses` act before the motion of keyframes."""
     if state.moving is None:
         return state
     moving, device = state.moving.at([frame]), state.position_N3.device
@@ -282,7 +283,7 @@ def _in_motion(
 def _barriers(
     scene: Scene, placements: Mapping[int, Placement], clearance: float, device: torch.device, dtype: torch.dtype
 ) -> Barriers | None:
-    """Returns barriers of the placed obstacles. Rows are differentiable by the poses; lists of cells are not."""
+    """Returns barriers of the placed obstacles. Rows have gradients by the poses, lists of cells do not."""
     cell_size, parts = scene.cell_size, []
     for i, obstacle in enumerate(scene.obstacles):
         if obstacle.motion is not None:

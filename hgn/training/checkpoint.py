@@ -29,7 +29,7 @@ from hgn.system.claims import Claims, require_few_items, require_plain_pickle
 
 SECTION = "hgn"  # key of this project's entries in a checkpoint
 LAST_NAMES = ("last.ckpt", "last-1.ckpt", "last-2.ckpt")  # newest first
-BEST_NAME = "best.ckpt"  # network with the lowest one-step validation error; missing without measured validation scenes
+BEST_NAME = "best.ckpt"  # network with the lowest one-step validation error; no such file before a measurement
 _CALLED = re.compile(
     r"collections OrderedDict|torch (\w+Storage|[a-z]\w+|Size)|torch\._utils _rebuild_(tensor_v2|parameter)"
 )
@@ -37,7 +37,7 @@ NETWORK, AVERAGED = "network.", "averaged."  # prefixes of the names of trained 
 
 
 class DamagedError(ConfigError):
-    """A checkpoint's bytes changed after it was written."""
+    """A file is not a whole checkpoint: it was cut or altered, cannot be read, or never was a checkpoint."""
 
 
 @dataclass(frozen=True)
@@ -88,8 +88,8 @@ class Resume:
 def read_checkpoint(path: Path) -> dict[str, Any]:
     """Returns the content of a checkpoint. Only plain containers and tensors are loaded.
 
-    Raises: DamagedError if the file is incomplete or has changed bits, which torch does not detect; ConfigError if it
-    is missing, or is no checkpoint of this project.
+    CRCs are compared, because torch does not detect changed bits. Raises: ConfigError if there is no file, or if its
+    content is not that of a checkpoint of this project; DamagedError if it cannot be read as one whole, plain archive.
     """
     try:
         if not path.is_file():  # reading a pipe would wait for ever
@@ -128,9 +128,13 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
 
 
 def _require_one_reading(path: Path, directory: int) -> None:
-    """Raises ValueError if torch would read another directory than zipfile, after other bytes or by a second end."""
+    """Raises ValueError if torch could read another directory of the archive than zipfile did.
+
+    It could if bytes precede the archive, or if the file has a second end record.
+    """
     with path.open("rb") as file:
-        begin, tail_at, tail = file.read(4), file.seek(-98, os.SEEK_END), file.read()  # two ends, and a place between
+        # the zip64 end record (56 bytes), its locator (20) and the end record (22)
+        begin, tail_at, tail = file.read(4), file.seek(-98, os.SEEK_END), file.read()
     wide = tail[56:60] == b"PK\6\7"
     named = int.from_bytes(tail[48:56] if wide else tail[92:96], "little")
     fits = begin == b"PK\3\4" and tail[76:80] == b"PK\5\6" and named == directory
@@ -172,9 +176,9 @@ def _require_equal(pairs: list[tuple[str, Any, Any]], why: str, remedy: str) -> 
 def network_of_weights(config: TrainConfig) -> ParticleNetwork:
     """Returns the network of training.init_weights with its normaliser, as the initial state of a new run.
 
-    The rest constraint, the clearances of walls and obstacles, and inputs relative and local may differ from those of
-    the weights, because they do not change tensors. Inputs for own physics that the weights lack begin at 0, so
-    outputs without friction are the same. A material `elastic` that they lack begins as the mean of theirs.
+    Constraints may differ from those of the weights, and so may relative and local inputs, because they do not change
+    tensors. If the weights lack inputs of own physics, the parameters of these inputs begin at 0: outputs without
+    friction stay the same. If they lack the material `elastic`, its embedding begins as the mean of the others.
     Raises: ConfigError for a file without weights, another network or data.
     """
     assert config.training.init_weights is not None
@@ -206,14 +210,14 @@ def network_of_weights(config: TrainConfig) -> ParticleNetwork:
 
 
 def _begin(theirs: NetworkConfig, ours: NetworkConfig) -> bool:
-    """Returns whether the columns of own physics of a network are the first ones of another."""
+    """Returns whether the columns of own physics of `ours` begin with those of `theirs`. More can then be appended."""
     pairs = [pair for pair in zip(physics_widths(theirs), physics_widths(ours), strict=True) if any(pair)]
     used = [width for width, _ in pairs if width]
     return used == [width for _, width in pairs][: len(used)]
 
 
 def network_of_checkpoint(checkpoint: dict[str, Any], path: Path) -> ParticleNetwork:
-    """Returns a checkpoint's network, or its moving average if there is one, with normaliser, in evaluation mode.
+    """Returns a checkpoint's network with its normaliser, in evaluation mode. A moving average replaces the parameters.
 
     Raises: ConfigError for a network that this version cannot build.
     """
