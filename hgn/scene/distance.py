@@ -22,11 +22,11 @@ FAR_FIELD_RATIO = 2.5  # distance / (radius of a cluster of triangles) from whic
 
 
 def closest_points(point_P3: np.ndarray, triangle_P33: np.ndarray) -> np.ndarray:
-    """Returns the point of each triangle that is closest to its partner point, float64 [P, 3].
+    """Returns, for each pair of a point and a triangle, the closest point of the triangle, float64 [P, 3].
 
     `triangle_P33` contains corners, [pair, corner, axis]. The closest point is the nearest of four: the foot of the
-    perpendicular, if it lies inside, and the closest points of the three edges. The result equals the region walk of
-    Ericson, Real-Time Collision Detection, sec. 5.1.5. Triangles without area, segments or points, are valid.
+    perpendicular, if it lies inside, and the closest points of the three edges. The result equals that of the region
+    walk of Ericson, Real-Time Collision Detection, sec. 5.1.5. Triangles may be segments or points.
     """
     point, corner = np.asarray(point_P3, np.float64), np.asarray(triangle_P33, np.float64)
     closest = np.empty(point.shape)
@@ -42,8 +42,9 @@ def winding_numbers(point_P3: np.ndarray, triangle_F33: np.ndarray) -> np.ndarra
     """Returns the generalised winding number of the triangles about each point, float64 [P].
 
     It is +1 or -1 inside a closed mesh (by its orientation), 0 outside, and between for meshes with holes. Zero-area
-    triangles add nothing. Up to DIRECT_TRIANGLES solid angles are summed exactly (van Oosterom and Strackee 1983;
-    Jacobson et al. 2013) in bounded memory. Above, dipoles replace distant ones (Barill et al. 2018; error 0.01).
+    triangles add nothing. The solid angles of up to DIRECT_TRIANGLES triangles are summed exactly (van Oosterom and
+    Strackee 1983; Jacobson et al. 2013). With more triangles, dipoles replace distant clusters (Barill et al. 2018;
+    error 0.01).
     """
     point = np.asarray(point_P3, np.float64).reshape(-1, 3)
     triangle = np.asarray(triangle_F33, np.float64).reshape(-1, 3, 3)
@@ -128,7 +129,7 @@ def _solid_angles(point: np.ndarray, triangle: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class _Tree:
-    """A binary tree over sorted triangles. A node contains the slice [first, last)."""
+    """A binary tree over sorted triangles. A node contains the triangles from `first` to before `last`."""
 
     first_T: np.ndarray
     last_T: np.ndarray
@@ -168,7 +169,7 @@ def _build_tree(triangle_F33: np.ndarray) -> _Tree:
     dipole = _slice_sums(area_vector, first_T, last_T)
     weight = _slice_sums(area[:, None], first_T, last_T)
     centre = _slice_sums(area[:, None] * sorted_F33.mean(axis=1), first_T, last_T) / weight
-    # the box of the corners bounds the sphere
+    # the spheres enclose the boxes of the corners
     low, high = np.empty_like(centre), np.empty_like(centre)
     for node in range(len(first_T) - 1, -1, -1):  # children come after their parent
         if children[node][0] < 0:

@@ -45,7 +45,7 @@ _PARAMETER = ("<f4", "N")
 _OPTIONAL = ("obstacle_friction", "past", "boundary")  # the last two only in imported episodes
 
 _NAME = re.compile(r"[A-Za-z0-9_-]+")
-_FARTHEST = 1000.0  # largest coordinate, speed and gravity, in sizes of the domain; a network's grid has about twice it
+_FARTHEST = 1000.0  # largest coordinate, speed and gravity, in domain sizes; a network's grid reaches twice as far
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,7 +114,7 @@ class Episode:
 
     @property
     def parameters(self) -> np.ndarray | None:
-        """Returns the parameters that networks may have as inputs, float32 [N, P]; None: all have their defaults."""
+        """Returns the parameters that may be network inputs, float32 [N, parameters]; None: all have their defaults."""
         return input_parameters(self.material_parameters, self.solver.get("settings", {}), self.particle_count)
 
     @cached_property

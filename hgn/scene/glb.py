@@ -23,11 +23,11 @@ from hgn.system.claims import Claims
 INSTANCES = "EXT_mesh_gpu_instancing"
 VISIBILITY = "KHR_node_visibility"
 READ = (INSTANCES, VISIBILITY, "KHR_mesh_quantization")  # extensions that change geometry
-NEUTRAL = re.compile(r"[A-Z]+_(materials|texture|lights|xmp|animation|audio)\w*")  # extensions that do not
+NEUTRAL = re.compile(r"[A-Z]+_(materials|texture|lights|xmp|animation|audio)\w*")  # extensions that do not change it
 TRIANGLES, STRIP, FAN = 4, 5, 6  # modes of primitives; the other modes are points and lines
-COPIES = 3  # of vertices and triangles, that the search for closed bodies makes
-MOST_JSON_BYTES = 16 << 20  # of the JSON tree: Python takes up to 33 bytes for each
-LEAST_BYTES = 1024  # claim of a primitive without content, because each takes time
+COPIES = 3  # number of copies of vertices and triangles in the search for closed bodies
+MOST_JSON_BYTES = 16 << 20  # largest JSON tree; Python takes up to 33 bytes of memory for each of its bytes
+LEAST_BYTES = 1024  # memory claimed even for a primitive without content, because each takes time
 _TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 
@@ -197,7 +197,7 @@ class _File:
 
 
 def _places(translation: Any, rotation: Any, scale: Any) -> np.ndarray:
-    """Returns matrices [M, 4, 4] of translations [M, 3], quaternions x y z w [M, 4], scales [M, 3], or of one each."""
+    """Returns matrices [M, 4, 4] from M or one of each: translation [3], quaternion x y z w [4] and scale [3]."""
     given = [
         np.atleast_2d(np.array(value, np.float64)) for value in (translation, rotation, scale) if value is not None
     ]

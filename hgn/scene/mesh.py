@@ -1,6 +1,6 @@
 """Mesh files as obstacles: STL, OBJ, PLY, GLB and USD.
 
-Shape legend: V vertices, F triangles, E directed triangle edges (3 F).
+Shape legend: V vertices, U distinct vertices, F triangles, E directed triangle edges (3 F), B bodies.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ from hgn.scene.usd import read_usd_polygons
 from hgn.schema import ConfigError, Vector, require
 
 _ASCII_STL = re.compile(rb"\s*solid.*\n\s*(facet|endsolid)", re.IGNORECASE)
-# trimesh takes a millisecond for each solid
+# ends of solids within an STL file; they are removed, because trimesh takes a millisecond for each solid
 _SOLIDS = re.compile(rb"^[ \t]*endsolid.*\n\s*solid.*\n", re.IGNORECASE | re.MULTILINE)
 
 
-SEAM = 1e-5  # largest distance of vertices that exporters mean to be one, relative to the mesh's longest side
-MOST_NEAR = 100  # largest mean number of neighbours within that distance: more would take memory
+SEAM = 1e-5  # largest distance of vertices at open edges that are joined, relative to the mesh's longest side
+MOST_NEAR = 100  # mean number of neighbours within SEAM above which none are joined, because pairs take memory
 
 
 def load_mesh(path: str | Path, field: str = "mesh", **placing: Any) -> Obstacle:
@@ -55,8 +55,8 @@ def load_bodies(
 
     The mesh is scaled, then turned about the fixed x, y and z axes (degrees, in this order), then moved. It may extend
     beyond the domain. A body is watertight if it is orientable and exactly two triangles meet at each of its edges; its
-    triangles get a consistent orientation. Open edges within SEAM of each other are joined for this check. After it
-    corners with equal float32 coordinates are merged, and zero-area and repeated triangles are removed.
+    triangles get a consistent orientation. Open edges within SEAM of each other are joined for this check. After the
+    check corners with equal float32 coordinates are merged, and zero-area and repeated triangles are removed.
 
     Raises: ConfigError naming `field` for a missing or unreadable file, an unknown suffix, no triangles, coordinates
     that are not finite, only zero-area triangles, or a bad scale, translation or rotation.
@@ -78,7 +78,7 @@ def load_bodies(
         raise ConfigError(f"{field} must stay within {limit:.1e} after scaling, got more for {path}; lower scale")
     closed_F, flip_F = _bodies(vertex_V3, triangle_F3)
     rounded_V3 = round_to_float32(placed)
-    if not closed_F.all():  # for corners that differ in their last digits
+    if not closed_F.all():  # check again: corners that should be equal may differ in their last digits
         joined_V3 = _joined(rounded_V3, triangle_F3[~closed_F])
         also_F, other_F = _bodies(joined_V3, triangle_F3)
         used = triangle_F3[also_F & ~closed_F]
@@ -125,7 +125,7 @@ def _read(path: Path, field: str) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _read_polygons(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Reads STL, OBJ, PLY and USD. trimesh reads STL only: it would shift or drop vertices of many OBJ files."""
+    """Reads STL by trimesh, which would shift or drop vertices of many OBJ files, and OBJ, PLY and USD without it."""
     kind = path.suffix[1:].lower()
     data = b"" if f".{kind}" in USD_ENDINGS else path.read_bytes()
     if kind != "stl":
@@ -153,7 +153,8 @@ def _read_polygons(path: Path) -> tuple[np.ndarray, np.ndarray]:
 def _bodies(vertex_V3: np.ndarray, triangle_F3: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Returns whether each triangle belongs to a watertight body, and whether it must be flipped, both bool [F].
 
-    Vertices at equal positions count as one. Triangles with fewer than three vertices, and repeated ones, do not count.
+    Vertices at equal positions count as one. Triangles with fewer than three distinct vertices do not count, and equal
+    triangles count once.
     """
     _, index = np.unique(vertex_V3 + 0.0, axis=0, return_inverse=True)
     triangle = index.reshape(-1)[triangle_F3]
@@ -167,7 +168,7 @@ def _bodies(vertex_V3: np.ndarray, triangle_F3: np.ndarray) -> tuple[np.ndarray,
 
 
 def _joined(vertex_V3: np.ndarray, triangle_F3: np.ndarray) -> np.ndarray:
-    """Returns the vertices; those at open edges of the triangles are moved onto others within SEAM, float64 [V, 3]."""
+    """Returns the vertices, float64 [V, 3]. Vertices at open edges within SEAM of each other get the same position."""
     unique_U3, index = np.unique(vertex_V3 + 0.0, axis=0, return_inverse=True)
     triangle = index.reshape(-1)[triangle_F3]
     edge_E2 = np.sort(np.stack([triangle, np.roll(triangle, -1, axis=1)], -1).reshape(-1, 2), axis=1)

@@ -29,9 +29,9 @@ if TYPE_CHECKING:
     from scipy.spatial import cKDTree
 
 CLEARANCE_CELLS = 2.0  # smallest distance between obstacles, groups and walls, in solver cells
-SURFACE_DETAIL = 0.045  # longest edge, relative to the size, of the surface pieces for distances
+SURFACE_DETAIL = 0.045  # longest edge of the pieces of a surface for distances, relative to the obstacle's size
 FEW = 32  # the first test of an overlap uses every FEW-th point
-ROUNDING = 1e-6  # relative margin that keeps float32 rounding within every bound
+ROUNDING = 1e-6  # relative margin that keeps values within their bounds when they are rounded to float32
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,7 @@ def too_near(item: Placed, other: Placed, clearance: float) -> bool:
     for subset in (point[::FEW], point):  # most overlaps already show at a few points
         if np.isfinite(other.tree.query(subset, distance_upper_bound=bound)[0]).any():
             return True
-    # the surfaces do not meet, so one vertex tells whether one body contains the other
+    # the surfaces do not meet, so a body contains the other body exactly if it contains its first vertex
     holds = contains(obstacle.vertex_V3[:1], other.obstacle) | contains(other.obstacle.vertex_V3[:1], obstacle)
     return bool(holds.any())
 
@@ -127,7 +127,7 @@ def assemble(
     bodies: list[Body],
     layout: str | None = None,
 ) -> Scene:
-    """Returns the scene of placed items. `layout` is its kind, if the config has several."""
+    """Returns the scene of placed items. `layout` is the scene's kind; None if the config names no kinds."""
     none = np.zeros((0, 3), np.float32)
     counts = [len(body.position_N3) for body in bodies]
     materials = np.array([material_index(body.material) for body in bodies], np.uint8)

@@ -1,6 +1,7 @@
-"""Cuts polygons of OBJ and PLY files into triangles. Concave ones are cut by ears; mesh readers would cut fans.
+"""Cuts polygons of OBJ and PLY files into triangles, concave polygons by ear clipping.
 
-Shape legend: V vertices, K corners of a polygon, M polygons with the same number of corners, F triangles.
+Shape legend: V vertices, K corners of a polygon, M polygons with the same number of corners, F triangles. In `_ears`: L
+corners that are left, W polygons whose next ear is not yet found.
 """
 
 from __future__ import annotations
@@ -14,10 +15,11 @@ from typing import Any
 import numpy as np
 
 FLAT = 1e-9  # smallest turn at a corner that counts as concave, as a fraction of the polygon's area
-MAXIMUM_CORNERS = 2_000  # of one concave face; cutting takes the square, which is limited for the sum of all faces
+# Largest number of corners of a concave face. The time of a cut grows with its square; the sum of squares is limited.
+MAXIMUM_CORNERS = 2_000
 _LINE = re.compile(rb"^[ \t]*([vf])[ \t]+(.*)$", re.MULTILINE | re.IGNORECASE)
 _COMMENT = re.compile(rb"(?:^|[ \t])#.*", re.MULTILINE)
-_UNREAD = re.compile(rb"^[ \t]*(surf|bzp|bsp|cdp|fo|call)[ \t]", re.MULTILINE)  # surfaces and files
+_UNREAD = re.compile(rb"^[ \t]*(surf|bzp|bsp|cdp|fo|call)[ \t]", re.MULTILINE)  # free-form surfaces, and other files
 _INDICES = ("vertex_indices", "vertex_index")  # usual names of the property with a face's vertices
 _TYPES = {
     **dict.fromkeys(("char", "int8"), "b"),
@@ -28,13 +30,13 @@ _TYPES = {
     **dict.fromkeys(("uint", "uint32"), "I"),
     **dict.fromkeys(("float", "float32"), "f"),
     **dict.fromkeys(("double", "float64"), "d"),
-}  # fmt: skip; of struct and NumPy
+}  # fmt: skip; format characters of struct and NumPy
 
 
 def polygons_of_obj(data: bytes) -> tuple[np.ndarray, list[np.ndarray]]:
     """Returns vertices, float64 [V, 3], and the vertices of each face of an OBJ file.
 
-    Raises: ValueError for a face of other vertices than those before it, and for free-form surfaces.
+    Raises: ValueError for vertex 0, numbers that cannot be read, and free-form surfaces.
     """
     text = _COMMENT.sub(b"", data.removeprefix(codecs.BOM_UTF8).replace(b"\r\n", b"\n").replace(b"\r", b"\n"))
     if unread := _UNREAD.search(text):
@@ -161,7 +163,7 @@ class _Numbers:
 def concave_cut(vertex_V3: np.ndarray, faces: list[np.ndarray]) -> np.ndarray | None:
     """Returns the triangles of all faces, int64 [F, 3], or None if no face is concave.
 
-    Raises: ValueError naming a face whose edges cross, or which has a vertex that does not exist.
+    Raises: ValueError naming a face whose edges cross or touch, or if concave faces have too many corners.
     """
     concave = _concave(vertex_V3, faces)
     if not concave:
@@ -192,13 +194,13 @@ def fans(faces: list[np.ndarray]) -> np.ndarray:
 
 
 def _concave(vertex_V3: np.ndarray, faces: list[np.ndarray]) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Returns numbers [M] and vertices [M, K] of faces that are concave or cross, for each number of corners."""
+    """Returns numbers [M] and vertices [M, K] of faces that are concave or cross themselves, for each K."""
     sizes, result = np.array([len(face) for face in faces], np.int64), []
     for size in np.unique(sizes[sizes > 3]):
         number_M = np.flatnonzero(sizes == size)
         face_MK = np.stack([faces[number] for number in number_M])
         if face_MK.min() < 0 or face_MK.max() >= len(vertex_V3):
-            return []  # other code refuses such a file
+            return []  # hgn.scene.mesh refuses the file
         point_MK3 = vertex_V3[face_MK]
         edge_MK3 = np.roll(point_MK3, -1, axis=1) - point_MK3
         turn_MK3 = np.cross(np.roll(edge_MK3, 1, axis=1), edge_MK3)
@@ -216,7 +218,7 @@ def _concave(vertex_V3: np.ndarray, faces: list[np.ndarray]) -> list[tuple[np.nd
 
 
 def _normals(point_MK3: np.ndarray) -> np.ndarray:
-    """Returns Newell's normals relative to the first corner, which keeps them exact far from the origin."""
+    """Returns Newell's normals. Positions relative to the first corner keep them accurate far from the origin."""
     local_MK3 = point_MK3 - point_MK3[:, :1]
     return np.asarray(np.cross(local_MK3, np.roll(local_MK3, -1, axis=1)).sum(axis=1))
 
@@ -236,8 +238,9 @@ def _unit(vector_M3: np.ndarray) -> np.ndarray:
 
 
 def _ears(point_MK2: np.ndarray, number_M: np.ndarray) -> np.ndarray:
-    """Returns the triangles of polygons, corners int [M, K - 2, 3]. Cuts off corners that contain no other, one by one.
+    """Returns the triangles of polygons, corners int [M, K - 2, 3].
 
+    Cuts off one corner after the other whose triangle (an ear) contains no other corner.
     Corners on a straight line become triangles without area, so that neighbouring faces still share their edges.
     """
     count, size = point_MK2.shape[:2]
@@ -248,7 +251,7 @@ def _ears(point_MK2: np.ndarray, number_M: np.ndarray) -> np.ndarray:
     crossing_M = ~(area_M > 0) | (apart_MKK & apart_MKK.transpose(0, 2, 1)).any(axis=(1, 2))
     _require_none(number_M[crossing_M], "cross")
     rest_ML, ears = np.tile(np.arange(size), (count, 1)), []
-    row_M, blocker_MK = np.arange(count), np.full((count, size), -1)  # a corner inside each corner's triangle, if known
+    row_M, blocker_MK = np.arange(count), np.full((count, size), -1)  # a corner in each corner's triangle; -1: unknown
     for left in range(size, 3, -1):
         point_ML2 = np.take_along_axis(point_MK2, rest_ML[:, :, None], axis=1)
         corner_3ML2 = np.stack([np.roll(point_ML2, 1, axis=1), point_ML2, np.roll(point_ML2, -1, axis=1)])
@@ -272,7 +275,7 @@ def _ears(point_MK2: np.ndarray, number_M: np.ndarray) -> np.ndarray:
             blocked_ML[waiting, rank[shut]] = True
             blocker_MK[waiting, rest_ML[waiting, k[shut]]] = rest_ML[waiting, inside_WL[shut].argmax(axis=1)]
         ears.append(np.take_along_axis(rest_ML, (ear_M[:, None] + (-1, 0, 1)) % left, axis=1))
-        blocker_MK[row_M[:, None], ears[-1]] = -1  # whose triangles are others now
+        blocker_MK[row_M[:, None], ears[-1]] = -1  # the triangles of the ear's neighbours have changed
         blocker_MK[blocker_MK == ears[-1][:, 1:2]] = -1
         rest_ML = rest_ML[np.arange(left) != ear_M[:, None]].reshape(count, left - 1)
     return np.stack([*ears, rest_ML], axis=1)

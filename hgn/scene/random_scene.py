@@ -40,7 +40,7 @@ LAYOUTS = 5  # attempts to place all items of a scene
 SHAPES_PER_ITEM = 20  # attempts for an obstacle (each draws shape, size, orientation) or a group (shape)
 PLACES_PER_SHAPE = 50
 FUNNELS = 300  # attempts to draw a funnel that fits into the domain
-LONE_CELLS = 6  # solver cells from a lone particle to any other; 2.7 finest cells of a network (0.035)
+LONE_CELLS = 6  # smallest distance of a lone particle from others, in solver cells; 2.7 network cells of 0.035
 
 
 class _NoRoomError(Exception):
@@ -253,7 +253,7 @@ def _purify(config: SceneConfig, bodies: list[Body], gravity: Vector, rng: np.ra
 def _collide(config: SceneConfig, bodies: list[Body], rng: np.random.Generator) -> list[Body]:
     """Throws groups at each other, in pairs or all together. A group without a partner starts at rest.
 
-    They meet off centre by up to half a group's size. The fastest one has at least half the maximum speed.
+    The groups meet off centre by up to half a group's size. The fastest group has at least half the maximum speed.
     """
     pairs, changed = rng.random() < 0.5, [thrown(body, np.zeros(3)) for body in bodies]
     size = 2 if pairs else max(len(bodies), 1)

@@ -2,15 +2,16 @@
 
 Two top-level groups:
 
-/VTKHDF  a temporal PolyData of the VTKHDF specification (version 2). A step contains the obstacles' triangles, whose
-         vertices come first, and a vertex cell for each particle. PointData has `material` (255 on obstacles) and
-         `velocity`. CellData has `obstacle`, its number, or -1 for particles. Topology and materials are stored once;
-         each step refers to those of the particles that are present.
+/VTKHDF  a temporal PolyData of the VTKHDF specification (version 2). A step contains the obstacles' triangles and a
+         vertex cell for each particle; the obstacles' points come first. PointData has `material` (255 on obstacles)
+         and `velocity`. CellData has `obstacle`: the obstacle's number, or -1 for particles. Topology and materials
+         are stored once; each step refers to those of the particles that are present.
 /hgn     data without a place in VTK: domain, gravity, obstacles, source, ground truth. The specification allows other
          groups outside /VTKHDF.
 
 ParaView selects its VTKHDF reader by the suffixes .vtkhdf and .hdf. For other suffixes choose it in the dialogue.
-Shape legend: T frames, N particles, R frames of ground truth, V vertices, F triangles.
+Shape legend: T frames, N particles, R frames of ground truth (in row_R3: rows), V vertices, P points (vertices and
+particles), F triangles, C cells.
 """
 
 from __future__ import annotations
@@ -113,10 +114,10 @@ class Rollout:
 def frame_velocity(
     position_TN3: np.ndarray, frame_rate_hz: float, entry_frame_N: np.ndarray | None = None
 ) -> np.ndarray:
-    """Returns the velocity into each frame, float32 [T, N, 3] in domain units per second.
+    """Returns the velocity in each frame, float32 [T, N, 3] in domain units per second.
 
-    It is the backward difference, as in the network (paper sec. 3.1). Frame 0 repeats the velocity of frame 1. Entering
-    particles get the velocity of their second frame, or zero without one.
+    It is the backward difference, as in the network (paper sec. 3.1). Frame 0 repeats the velocity of frame 1. In its
+    first frame an entering particle has the velocity of its second frame, or zero without a second frame.
     """
     velocity_TN3 = np.zeros(position_TN3.shape, np.float32)
     velocity_TN3[1:] = np.diff(position_TN3, axis=0) * np.float32(frame_rate_hz)
@@ -146,8 +147,8 @@ def write_rollout(path: str | Path, rollout: Rollout) -> None:
 def write_frames(path: Path, rollout: Rollout, frames: Iterable[np.ndarray]) -> None:
     """Writes frames as they come, float32 [present particles, 3], and puts them into `rollout.position_TN3`.
 
-    Once a second the new frames are appended to a temporary file. It gets the name `path` at the end, also after Ctrl-C
-    or an error of the disk. Other errors leave no file. The space for all frames is reserved first.
+    Once a second the new frames are appended to a temporary file. The file is renamed to `path` at the end, also after
+    Ctrl-C or an error of the disk. Other errors leave no file. The space for all frames is reserved first.
     Raises: OSError before the first frame if the disk has less space.
     """
     size = rollout_bytes(rollout.frame_count, rollout.particle_count, rollout.reference_TN3 is not None)
@@ -169,7 +170,8 @@ def take_frames(
 ) -> tuple[int, BaseException | None]:
     """Puts frames into `rollout.position_TN3`, and calls `each` with their number so far.
 
-    Returns the number of frames, and Ctrl-C or the error of the disk that ended them. Raises it without any frame.
+    Returns the number of frames, and the interruption (Ctrl-C or an error of the disk) or None. An interruption before
+    the first frame is raised.
     """
     count = 0
     try:
@@ -234,7 +236,7 @@ class _GrowingFile:
     def write(self, end: int) -> None:
         """Writes the frames before `end` that are not in the file. A repeated call completes an interrupted one."""
         rollout, begin = self._rollout, self.count
-        start, again = max(begin - 2, 0), max(begin - 1, 0)  # velocities in `again` may follow from the next frame
+        start, again = max(begin - 2, 0), max(begin - 1, 0)  # a velocity in frame `again` may depend on the next frame
         position_TN3 = rollout.position_TN3[start:end]
         vertex_TV3, triangle_F3, _ = _triangles(rollout.obstacles, np.arange(start, end) / rollout.frame_rate_hz)
         entry_N = None if rollout.entry_frame_N is None else rollout.entry_frame_N - start

@@ -45,7 +45,8 @@ from hgn.system.yaml_files import read_yaml
 
 GROUP_SHAPES, EMITTER_SHAPES = ("cube", "sphere", "box"), ("disc", "rectangle")
 MAXIMUM_PARTICLES, MAXIMUM_ENTRIES = 10_000_000, 256  # entries are obstacles, or groups and emitters
-# bytes of files, each counted as often as it is named; for large files the second number times their bytes
+# limit of the bytes of files, each counted as often as a scene names it: FILES_BYTES, or REPEATS times the bytes of the
+# files counted once, if that is more
 FILES_BYTES, REPEATS = 12 << 20, 8
 MEASURE = "measure"  # section of files in conf/gallery that tools.stability reads
 MILLIMETRES = "a file in millimetres needs scale: 0.001"
@@ -58,7 +59,7 @@ class KeyframeEntry(Bounded):
 
     time: NonNegative[float]  # seconds
     translation: Vector = (0.0, 0.0, 0.0)
-    rotation: Vector = (0.0, 0.0, 0.0)  # degrees about the fixed x axis, then y, then z, through its position
+    rotation: Vector = (0.0, 0.0, 0.0)  # degrees about fixed axes (x, then y, then z) through the obstacle's position
 
 
 @dataclass(frozen=True)
@@ -293,7 +294,7 @@ def notes_on_files(scene: Scene) -> list[str]:
             notes.append(f"a sheet, not a solid, because it is not watertight: {name}")
         begin = _at_start(obstacle)
         low_3, high_3 = begin.vertex_V3.min(axis=0), begin.vertex_V3.max(axis=0)
-        around = (low_3 <= 0).all() and (high_3 >= scene.domain_size).all()  # such a body may move, and stays around
+        around = (low_3 <= 0).all() and (high_3 >= scene.domain_size).all()  # if it moves, it stays around
         place = ", ".join(f"{'xyz'[i]} {low_3[i]:.3g} to {high_3[i]:.3g}" for i in range(3))
         if obstacle.motion is None and ((low_3 > scene.domain_size) | (high_3 < 0)).any():
             notes.append(f"outside the domain, out of reach of particles: {name} ({place}); see scale and position")

@@ -374,7 +374,7 @@ def _conveyor(new: Layout) -> None:
 
 
 def _falling(new: Layout) -> None:
-    """Drops a plate onto a body, in four pieces of a parabola. It stops at half of the body's height."""
+    """Drops a plate onto a body, on four segments that approximate a parabola, to half of the body's height."""
     new.take_domain("room", "hall")
     size, height = new("size"), new("height")
     way, x, z = height + 0.5 * size, new.along(0, 0.5 * size), new.along(2, 0.5 * size)
