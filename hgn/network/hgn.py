@@ -2,10 +2,10 @@
 
 Steps have the numbers of the paper's figure, which has three levels:
 0: encode particles. 1: particles to cells.
-2, 4, 6: message passing on each level, from the finest to the coarsest. 3, 5: fine to coarse, between these.
+2, 4, 6: message passing on each level, from the finest to the coarsest. 3, 5: fine to coarse, between these steps.
 7, 9: coarse to fine. 8, 10: message passing on each level except the coarsest, up to the finest.
 11: cells to particles. 12: decode the acceleration. With L levels there are 2 L - 1 message-passing blocks.
-Shape legend: N particles, C cells, E directed edges, W width, S scenes.
+Shape legend: N particles, C cells, E directed edges, W width, H hidden width of an MLP, F input features, S scenes.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from hgn.network.relative import OUTPUTS, balanced
 
 
 class MessagePassing(nn.Module):
-    """M message passing steps on one level (fig. 5; paper's steps 2, 4, 6, 8, 10). Each has its own parameters."""
+    """Message passing on one level (fig. 5; paper's steps 2, 4, 6, 8, 10). Each of `steps` has its own parameters."""
 
     def __init__(self, steps: int, width: int) -> None:
         super().__init__()
@@ -58,7 +58,7 @@ class HierarchicalGraphNetwork(ParticleNetwork):
     """Predicts the acceleration of every particle, in frame units.
 
     With `obstacle_features=False` the input has no normals, as in the paper's data set without obstacles. With absolute
-    inputs, a batch without any obstacle skips the product with the normals. This is exact: these normals are zero.
+    inputs, a batch without any obstacle skips the product with the normals. This is exact, as all normals are zero.
     """
 
     def __init__(self, config: NetworkConfig) -> None:

@@ -1,17 +1,17 @@
 """Obstacles in motion as inputs of a network with `moving` in `network.own_physics`.
 
-The cells of a moving obstacle are computed once, at its place in the scene. Particles are looked up in the obstacle's
-own frame, so its cells move with it exactly. Its points move over the coming frame by
+The cells of a moving obstacle are computed once, at its place in the scene. Particles are looked up in coordinates that
+move with the obstacle, so its cells move exactly. Until the next frame the obstacle's points move by
 
     V(x) = A (x - p) + b,    A = R' R^T - 1,    b = p' - p
 
-R and p are its rotation and the place of its pivot in this frame, R' and p' those one frame later; b is in domain units
-per frame. The path of a particle relative to the obstacle leads from x by v - V(x). docs/concepts/method.md lists
-where the network uses v - V.
+R and p are the obstacle's rotation and the place of its pivot in this frame, R' and p' those one frame later; b is in
+domain units per frame. A particle at x moves relative to the obstacle by v - V(x). docs/concepts/method.md lists where
+the network uses v - V.
 
 Tensors have one row for each obstacle. Obstacle j of scene s has the row j S + s. Scenes with fewer than J moving
-obstacles have rows without cells. A key of a cell or triangle consists of its place and, for obstacles at rest, the
-number of its scene. For moving obstacles the number is that of the row.
+obstacles have rows without cells. The key of a cell or triangle contains its place and a number: its scene's for
+obstacles at rest, its row's for moving obstacles.
 Shape legend: N particles, S scenes, J largest number of moving obstacles in a scene, C coarsest cells, V (in names of
 tensors) J S rows. K columns: three of the normal, one of friction; if there are 7, also three of the velocity V(x).
 """
@@ -58,7 +58,7 @@ class Poses:
 
     @property
     def later(self) -> Poses:
-        """Returns the poses one frame later, without motion."""
+        """Returns the poses one frame later, with A and b set to 0."""
         rotation_V33 = self.rotation_V33 + self.change_V33 @ self.rotation_V33
         still = torch.zeros_like(self.change_V33), torch.zeros_like(self.shift_V3)
         return Poses(rotation_V33, self.pivot_V3, self.place_V3 + self.shift_V3, *still)
@@ -74,11 +74,11 @@ class Poses:
         return Poses(rotation_V33, pivot_V3, place_V3, change_V33, turned(self.shift_V3, map_V33))
 
     def undo(self, position_V3: torch.Tensor) -> torch.Tensor:
-        """Moves a point of each row to the frame of its cells."""
+        """Moves a point of each row to the coordinates of the row's cells."""
         return turned(position_V3 - self.place_V3, self.rotation_V33.mT) + self.pivot_V3
 
     def put(self, position_V3: torch.Tensor) -> torch.Tensor:
-        """Moves a point of each row from the frame of its cells to its pose. Inverts `undo`."""
+        """Moves a point of each row from the coordinates of the row's cells to the pose. Inverts `undo`."""
         return turned(position_V3 - self.pivot_V3, self.rotation_V33) + self.place_V3
 
     def velocity(self, position_V3: torch.Tensor) -> torch.Tensor:
@@ -97,7 +97,7 @@ class MovingObstacles:
     scenes: tuple[tuple[MovingObstacle, ...], ...]
     frames: tuple[int, ...]
     frame_s: float
-    cells: ObstacleCells | None  # in their places in the scenes; None for a network without obstacle features
+    cells: ObstacleCells | None  # at the obstacles' places in the scenes; None for a network without obstacle features
     barriers: Barriers | None  # likewise; only with step.obstacle_clearance
     poses: Poses
 
@@ -165,7 +165,7 @@ class MovingObstacles:
         """Returns `relative.obstacle_surfaces` of moving and `still` obstacles, [N, 8], and velocities V [N, 3].
 
         V is the velocity of the surface at the particle, or else of the first one on its path; 0 without a surface. In
-        cells of several obstacles, normals are summed, to a length of at most 1; friction and V are means.
+        cells of several obstacles, normals are summed, and the sum is shortened to at most 1; friction and V are means.
         """
         (position_N3, velocity_N3, scene_N), cells = place, self.cells
         assert cells is not None
@@ -189,7 +189,7 @@ class MovingObstacles:
 def _seen(
     cells: ObstacleCells, place_N3: torch.Tensor, way_N3: torch.Tensor, scene_N: torch.Tensor, part: float
 ) -> torch.Tensor:
-    """Returns normals and friction at the fraction `part` of the particles' ways, [N, 4]."""
+    """Returns normals and friction at the fraction `part` of the particles' paths, [N, 4]."""
     row_NK = cells.surfaces(place_N3 + way_N3 * part, scene_N)
     return pad(row_NK, (0, 4 - row_NK.shape[1]))
 

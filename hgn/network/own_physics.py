@@ -7,7 +7,7 @@ default parameters. If all are 0, they are not computed; the result is the same.
 |---|---|---|
 | 2 | friction of the particle's obstacle cell, and of the first one on its path | friction, obstacle_features |
 | 3 | for each axis: friction of the two walls perpendicular to it, times the nearness of the nearer one | friction |
-| P | INPUT_PARAMETERS of the particle's material, 0 for those of others (`scaled_parameters`) | parameters |
+| 1 for each of INPUT_PARAMETERS | `scaled_parameters`, 0 for parameters of other materials | parameters |
 | 9 | deformation of elastic bodies (hgn.network.elastic) | elastic |
 
 A cell's matrix P (`relative.touched_normals`) is the sum of a_s n_s n_s^T over surfaces s with normals n_s and weights
@@ -21,7 +21,7 @@ along surfaces after a frame without friction, Q (v + g + d_C A_C), and D the va
 s_a. Reason: friction changes the velocity of each particle by -l u_p, 0 <= l <= 1, so by a vector in the ball around
 -u_p / 2 with the radius |u_p| / 2. So the mean change f satisfies |f + u / 2|^2 <= (|u|^2 + D) / 4, which is the rule.
 With `moving` v is the velocity relative to the surfaces, v - V of hgn.network.moving. It adds no columns.
-Shape legend: N particles, C coarsest cells, S scenes, P parameters, K columns.
+Shape legend: N particles, C coarsest cells, S scenes, P parameters (in names of tensors only), K columns.
 """
 
 from __future__ import annotations

@@ -10,7 +10,7 @@ cube. The columns are, in this order:
 | 3 (H - 1) | f(v^{n-k} - v^{n-k-1} - g), k = 0 … H - 2: zero in free flight |
 | 3 L | f(v^n - U_l) on each level, finest first; U_l is the mean velocity of the cells around (`surroundings`) |
 | 3 | G f(v^n - V): the velocity relative to surfaces, if one is near; V as in hgn.network.moving |
-| 6 | walls within CONTACT_REACH_CELLS R, lower x, y, z, then upper |
+| 6 | `wall_nearness`, lower x, y, z, then upper |
 | 3 + 3 | obstacle normals at the particle and ahead of it; only with obstacle_features |
 
 G = sum_C w_pC t_C, with t_C of `disturbance`, is at least the particle's own `surface_gate`. G is above 0 if some
@@ -22,7 +22,7 @@ them. These properties hold for any parameters:
 - Without a surface in reach momentum is conserved. The mean of r over a coarsest cell is subtracted, and cells exchange
   only antisymmetric impulses across their faces.
 - Angular momentum is then conserved too. The rotation of a cell, and of each pair of neighbours, is subtracted.
-- Surfaces without friction push along their normals only; others as in hgn.network.own_physics.
+- Surfaces without friction push along their normals only, and surfaces with friction as in hgn.network.own_physics.
 Shape legend: N particles, H velocities, L levels, C cells of a level, E directed edges, S scenes.
 """
 
@@ -39,7 +39,7 @@ from hgn.network.moving import surface_velocity
 from hgn.network.obstacles import ObstacleCells, first_surface
 from hgn.network.own_physics import SurfaceFriction, friction_fraction, has_friction, surface_friction
 
-CONTACT_REACH_CELLS = 3.0  # distance from a wall, in R, at which the network begins to see it
+CONTACT_REACH_CELLS = 3.0  # distance from a wall within which the network sees it, in finest cells
 WALL_LIMIT = 2.0  # largest wall_nearness, reached one `reach` behind the plane
 STEPS_AHEAD = 4  # number of places on the path of the next frame that are searched for an obstacle
 QUIET = 0.01  # the disturbance is 1 at this difference of velocities, in units of s_a; rounding gives 1e-5 to 1e-4
