@@ -4,9 +4,9 @@
 |---|---|---|---|
 | torch | PyTorch, the reference | all | yes |
 | triton | Triton kernels, frames and updates in CUDA graphs | hgn | of its own kernels |
-| cpu | compiled C in blocks of rows, a core each | hgn | no |
+| cpu | compiled C, each core a block of rows | hgn | no |
 
-All have the same signature. `choose` returns the fastest supported backend and reports why.
+All have the same interface. `choose` returns the fastest supported backend and reports why.
 """
 
 from __future__ import annotations

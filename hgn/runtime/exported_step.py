@@ -56,13 +56,13 @@ class Step(nn.Module):
         obstacle_normal: torch.Tensor,
         obstacle_triangle: torch.Tensor,
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Returns positions [N, 3] and velocities [N, H, 3], newest first, a frame later; units: domain units, frames.
+        """Returns positions [N, 3] and velocities [N, H, 3], newest first, one frame later, in domain units and frames.
 
         `material`, int64 [N], indexes the network's materials. `domain_size` and `gravity` are [3]. `obstacle_cell` is
-        int64 [K, 3] without repetition, `obstacle_normal` [K, 3]. `obstacle_triangle` [F, 3, 3] has corners. Networks
+        int64 [K, 3] without repetition, `obstacle_normal` [K, 3]. `obstacle_triangle` [F, 3, 3] are corners. Networks
         with absolute inputs ignore gravity; networks without `obstacle_clearance` ignore triangles.
         """
-        # The lists are never empty: this cell is out of reach of every particle.
+        # Another cell, out of reach of every particle, so that the lists are never empty.
         far_13 = torch.full_like(domain_size[None], COORDINATE_LIMIT - 1).to(torch.int64)
         cell_K3 = torch.cat([obstacle_cell, far_13])
         normal_K3 = torch.cat([obstacle_normal, torch.zeros_like(domain_size[None])])
@@ -86,7 +86,7 @@ class Step(nn.Module):
         clearance = self.network.step.obstacle_clearance
         if clearance is None:
             return None
-        # The list is never empty: this triangle has no area.
+        # Another triangle, without area, so that the list is never empty.
         corner_F33 = torch.cat([corner_F33, corner_F33.new_zeros(1, 3, 3)])
         row_F24 = barrier_rows(corner_F33, clearance).to(corner_F33.dtype)
         none = torch.zeros(0, dtype=torch.int64, device=corner_F33.device)

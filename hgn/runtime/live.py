@@ -27,14 +27,14 @@ from hgn.schema import require, require_count
 class LiveSimulation:
     """One scene or several, a frame at a time, on the simulator's backend. Use it as a context manager, or close it.
 
-    A change between two frames acts from the next frame, in scene `index`. Positions and velocity histories of other
+    A change between two frames affects scene `index` from the next frame on. Positions and velocity histories of other
     particles stay bitwise equal. Particles are sorted by scene. Within a scene, new particles follow the others.
     """
 
     def __init__(
         self, simulator: Simulator, scenes: InitialState | Scene | Sequence[InitialState | Scene], capacity: int = 0
     ) -> None:
-        """In a list only the scene that diverges ends. It loses its particles, and `ended[index]` is the error.
+        """In a list only scenes that diverge end: they lose their particles, and `ended[index]` is the error.
 
         `capacity` is the number of particles of all scenes for which backend triton allocates buffers. With more
         particles it captures its frame again, which takes about a second.
@@ -86,7 +86,7 @@ class LiveSimulation:
     def advance(self) -> ParticleState:
         """Simulates one frame of all scenes. Returns `state`, whose tensors stay on the device.
 
-        Raises: DivergedError with a single scene. It can then only be restored, or closed.
+        Raises: DivergedError for a scene that is not in a list. The simulation can then only be restored or closed.
         """
         if self._changed is not None:
             self.simulation.continue_from(self._changed)
@@ -116,7 +116,7 @@ class LiveSimulation:
     ) -> np.ndarray:
         """Adds particles that come from free flight: domain units, domain units per second, indices into MATERIALS.
 
-        They have the solver's parameters. Returns their velocity histories, float32 [A, M, 3] in domain units per
+        They have default material parameters. Returns their velocity histories, float32 [A, M, 3] in domain units per
         frame, newest first. Raises: ConfigError for a material that the network was not trained with, and for arrays of
         different lengths.
         """
@@ -149,7 +149,7 @@ class LiveSimulation:
         self._change_scene(index, gravity=gravity)
 
     def restore(self, position_N3: np.ndarray, velocity_NM3: np.ndarray, frame: int, index: int = 0) -> None:
-        """Restores an earlier frame of a scene and the N particles that it had then. It loses those that entered later.
+        """Restores an earlier frame of a scene with its N particles of that time. Those that entered later are removed.
 
         Obstacles and gravity stay; keyframes continue from that frame. `frame` becomes the number of the last frame.
 
@@ -208,9 +208,9 @@ class LiveSimulation:
     def _put(
         self, index: int, scene: InitialState, kept: ParticleState, new: ParticleState, restart: bool = False
     ) -> None:
-        """Replaces scene `index` by `scene`. The next frame has the particles of `kept` and of `new`, its start.
+        """Replaces scene `index` by `scene`. The next frame starts from the particles of `kept` and `new`.
 
-        Keyframes count from this frame with `restart`, and if `scene` has other moving obstacles than before.
+        Keyframes count from this frame if `restart`, or if `scene` has other moving obstacles than before.
         """
         before, scenes, barriers = self.scenes[index], [*self.scenes], [*self._barriers]
         scenes[index] = scene
@@ -244,7 +244,7 @@ class LiveSimulation:
 
 
 def _array(name: str, value: Any, shape: tuple[int | None, ...]) -> np.ndarray:
-    """Returns an array of a caller. Raises: ConfigError unless it has finite real numbers and the shape."""
+    """Returns a caller's argument. Raises: ConfigError unless it is an array of finite real numbers with the shape."""
     require(isinstance(value, np.ndarray), name, "a NumPy array", type(value).__name__)
     require(value.dtype.kind in "iuf", name, "of real numbers", str(value.dtype))
     fits = value.ndim == len(shape) and all(n in (None, own) for n, own in zip(shape, value.shape, strict=True))

@@ -1,7 +1,7 @@
 """python -m hgn.runtime.precompile_program: compiles kernels into Triton's cache on disk.
 
-The launches are those of Updates and TritonStepper on tensors without memory, so the list of kernels and variants
-exists only once. Sizes are guesses; they choose between few variants. Other variants are compiled at first use.
+Updates and TritonStepper make their launches on tensors without memory, so no second list of kernels and variants
+exists. The tensors' sizes are guesses, on which few variants depend. Other variants are compiled at first use.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ class FrameJob:
 
 
 def launches_of(job: PrecompileJob | FrameJob, device: str = "meta") -> Launches:
-    """Returns every kernel of a job with its specialisation, by a key of both. Triton's driver needs a target."""
+    """Returns every kernel of a job with its specialisation, by a key of both. Needs a GPU, or `use_target`."""
     with noted_launches() as launches:
         if isinstance(job, PrecompileJob):
             _update_launches(job, device)

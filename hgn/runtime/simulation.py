@@ -235,7 +235,7 @@ def selected(state: ParticleState, selected_N: torch.Tensor) -> ParticleState:
 
 
 def joined(first: ParticleState, second: ParticleState) -> dict[str, Any]:
-    """Returns the fields of a state with the particles of both. Without parameters a state's are 0 (the defaults)."""
+    """Returns the fields of a state with the particles of both states. Parameters that one of them lacks are 0."""
     both: dict[str, Any]
     both = {name: torch.cat([getattr(first, name), getattr(second, name)]) for name in OF_PARTICLES}
     parameters = (first.parameter_NP, second.parameter_NP)

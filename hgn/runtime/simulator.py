@@ -1,6 +1,6 @@
 """Simulates scenes with a trained network (paper algorithm 1) on one device.
 
-Shape legend: T frames, N particles of all scenes, S scenes.
+Shape legend: T frames, N particles of all scenes, S scenes, H frames before frame 0, F triangles, P parameters.
 """
 
 from __future__ import annotations
@@ -68,8 +68,8 @@ class InitialState:
     emitting: Scene | None = None  # the scene, if particles enter later; they follow the others
     wall_friction: tuple[float, float, float] = (0.0, 0.0, 0.0)
     parameters: np.ndarray | None = None  # float32 [N, P], hgn.scene.own_physics.input_parameters
-    body_N: np.ndarray | None = None  # number of each particle's body; None: elastic particles near each other are one
-    moving: tuple[MovingObstacle, ...] = ()  # obstacles in motion; `obstacle_grid` and `corners` are of those at rest
+    body_N: np.ndarray | None = None  # number of each particle's body; None: found from distances of elastic particles
+    moving: tuple[MovingObstacle, ...] = ()  # in motion; `obstacle_grid` and `corners` contain obstacles at rest
 
     def __post_init__(self) -> None:
         require_particles(self.position_N3, self.velocity_N3, self.material_N, self.materials)
@@ -190,12 +190,12 @@ class Simulator:
 
     @property
     def info(self) -> WeightsInfo:
-        """Returns the metadata of the weights file. Only a simulator of `load` has it."""
+        """Returns the metadata of the weights file. Only simulators from `load`, or with `info`, have it."""
         assert self._info is not None
         return self._info
 
     def start(self, scenes: Sequence[InitialState | Scene]) -> ParticleState:
-        """Returns the state at frame 0, with a ballistic history.
+        """Returns the state at frame 0, with the scenes' past frames or a ballistic history.
 
         Raises: ConfigError if a scene has a material that the network was not trained with. For loaded weights it is
         also raised for obstacle cells of another size and for an unsupported gravity. Absolute inputs support only the
@@ -250,7 +250,7 @@ class Simulator:
     ) -> list[np.ndarray]:
         """Simulates `frames` frames including frame 0. Returns float32 [frames, N, 3] for each scene.
 
-        A particle that enters later is NaN until its frame. `on_frame(t)` is called after frame t.
+        A particle that enters later is NaN until it enters. `on_frame(t)` is called after frame t.
         Raises: ConfigError as `start`; DivergedError with the frame of divergence; only more training prevents it.
         """
         return self.paths(scenes, frames, on_frame)[0]

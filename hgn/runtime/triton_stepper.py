@@ -3,7 +3,7 @@
 The host reads the status after each block of `look_frames` frames, while the device computes the next block. If the
 grid needed more memory than it had, the completed frames are kept and the buffers grow. The simulation continues from
 the last good frame, so no frame is computed twice.
-Shape legend: N particles of all scenes, S scenes, T frames.
+Shape legend: N particles of all scenes, M velocities of a history, S scenes, T frames.
 """
 
 from __future__ import annotations
@@ -150,8 +150,8 @@ class TritonStepper:
     def fits(self, state: ParticleState) -> bool:
         """Returns whether `begin` can continue from a state.
 
-        The state needs the same domains, obstacle cell size and own physics, a row for each particle, and no need of
-        float32 sums.
+        The state must have the same domains, obstacle cell size and own physics, and at most as many particles as the
+        buffers have rows. A crowded state also needs a stepper that was built for float32 sums.
         """
         if state.scene_count != self.scenes or len(state.position_N3) > self.particles:
             return False
@@ -331,7 +331,7 @@ class TritonStepper:
     def blocks(self, frames: int) -> Iterator[tuple[torch.Tensor, bool]]:
         """Yields blocks of up to `look_frames` frames. While a block is processed, the device computes the next one.
 
-        Raises: torch.OutOfMemoryError if buffers cannot grow. A later call continues from that frame.
+        Raises: torch.OutOfMemoryError if buffers cannot grow. A later call continues from the last completed frame.
         """
         done, half = 0, 0
         ahead: _Look | None = None
@@ -383,7 +383,7 @@ class TritonStepper:
         return self.path_TN3.view(-1)[start : start + 3 * taken * self.live].view(taken, self.live, 3), status
 
     def _grow(self) -> None:
-        # all levels grow, because the others are nearly full and would soon require another capture
+        # all levels grow, because levels that did not overflow are nearly full and would soon require another capture
         before, needed = self.grid.capacities, self.grid.needed_L.tolist()
         pairs = zip(before, needed, strict=True)
         capacities = tuple(max(c, _room(n, i, TIGHT_GROWTH)) for i, (c, n) in enumerate(pairs))

@@ -72,7 +72,7 @@ def shipped_weights() -> dict[str, Path]:
 
 
 def find_weights(name: str, field: str = "weights") -> Path:
-    """Returns the file of shipped weights by name, of a repository (hf://), or at a path.
+    """Returns the weights file for a shipped name, a repository (hf://) or a path.
 
     Raises: ConfigError for a name that is neither shipped nor looks like a path.
     """
@@ -127,7 +127,9 @@ def load_weights(
 def network_with(
     config: NetworkConfig, step: StepConfig, tensors: Mapping[str, torch.Tensor], *, path: Path, field: str
 ) -> ParticleNetwork:
-    """Returns the declared network with the tensors of a file in float32. It allocates nothing before they fit.
+    """Returns the declared network with the tensors of a file in float32.
+
+    Before it allocates the network, it checks that the file has enough tensors and numbers for the declared structure.
 
     Raises: ConfigError naming the tensor that does not fit.
     """
