@@ -16,8 +16,8 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 33_053,
-    "datagen": 8_495,
+    "hgn": 33_063,
+    "datagen": 8_497,
     "tools": 6_214,
     "tests": 31_834,
 }

@@ -98,9 +98,9 @@ class LocalWorkerFactory:
         return LocalWorker(_make_scenes, self._config, self._backend)
 
     def start_solver(self, number: int) -> Worker:
-        """Starts a process that simulates batches: MadeScene one by one, then None. It accepts BuiltGrid at any time.
+        """Starts a process that simulates batches. With several solvers on GPUs each uses one CUDA device.
 
-        With several solvers each uses one CUDA device.
+        It receives a batch as one MadeScene after another, and None at the end, and BuiltGrid at any time.
         """
         plan = self.plan
         gpu = plan.gpus[number % len(plan.gpus)] if plan.solvers > 1 and plan.gpus else None
@@ -200,7 +200,7 @@ class _Inbox:
                 for grid in self._grids.values():
                     grid.cancel()
             return
-        os._exit(1)  # otherwise the parent could wait forever for its message to be read
+        os._exit(1)  # otherwise the parent could wait forever for this process to read
 
 
 def _solve(

@@ -51,13 +51,13 @@ class Pool:
         self._grid_deaths: dict[SceneTask, int] = {}  # deaths of makers that computed the obstacle grid of this scene
 
     def run(self) -> None:
-        """Runs until the writer's share of the shards is published, by it or by others, then ends all workers.
+        """Runs until the writer's share of the shards is published, by any generator, then ends all workers.
 
         Raises: Stopped; ConfigError, OSError or RuntimeError from a worker.
         """
         self._todo: list[SceneTask] = []
         self._ready: list[MadeScene] = []
-        self._gridless: list[MadeScene] = []  # scenes whose obstacle grid is not yet given to a maker
+        self._gridless: list[MadeScene] = []  # scenes whose obstacle grid no maker has been given yet
         self._makers: list[Worker] = []
         self._solvers: list[Worker] = []
         self._counted, self._next_look, self._said_waiting = self._writer.done, 0.0, False
@@ -90,7 +90,7 @@ class Pool:
         self._launch_size = min(self._largest_launch, self._even_launch(0))
 
     def _even_launch(self, taken: int) -> int:
-        """Returns the launch size that divides the remaining scenes evenly, without `taken` scenes of a new launch."""
+        """Returns an even launch size for the scenes that no solver has, except `taken` scenes of a new launch."""
         left = self._writer.total - self._writer.done - sum(len(solver.tasks) for solver in self._solvers) - taken
         share = max(1, math.ceil(left / len(self._solvers)))
         return math.ceil(share / math.ceil(share / self._plan.scenes_per_launch))
@@ -138,7 +138,8 @@ class Pool:
     def _next_task(self) -> SceneTask | GridTask | None:
         """Returns a maker's next task, or None: a scene of the next launch, else of later launches, else a grid.
 
-        At most two full launches per solver are made ahead. A grid comes first once a solver simulates its scene.
+        At most two full launches per solver are made ahead. Once a solver simulates a scene, its grid precedes scenes
+        of later launches.
         """
         coming = len(self._ready) + len(self._being_made())
         short = coming < self._launch_size
@@ -150,7 +151,7 @@ class Pool:
             return self._todo.pop(0)
         if self._gridless:
             made = self._gridless.pop(0)
-            return GridTask(made.task, made.scene)  # a launch needs it only at its end
+            return GridTask(made.task, made.scene)  # a launch needs grids only at its end
         return None
 
     def _being_made(self) -> list[SceneTask]:

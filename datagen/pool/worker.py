@@ -161,7 +161,7 @@ def make_scene(task: SceneTask, config: DatagenConfig, backend: Backend, with_gr
 
 
 def _with_known_friction(scene: Scene, default: float) -> Scene:
-    """Returns the scene with the friction `default` of the solver in place of None, for its obstacle cells to store."""
+    """Returns the scene with the solver's `default` in place of unset friction, so that obstacle cells can store it."""
     frictions = (default if obstacle.friction is None else obstacle.friction for obstacle in scene.obstacles)
     obstacles = (replace(o, friction=friction) for o, friction in zip(scene.obstacles, frictions, strict=True))
     return replace(scene, obstacles=tuple(obstacles))
@@ -208,7 +208,7 @@ def simulate_batch(
 
 
 def _visible(scene: Scene, result: Any) -> Any:
-    """Returns a result of the solver with the positions of the visible particles (see datagen.fine) only."""
+    """Returns a result of the solver with only the positions of the visible particles (see datagen.fine)."""
     if not hasattr(result, "position_TN3"):
         return result
     return replace(result, position_TN3=visible_positions(result.position_TN3, scene.particle_count))

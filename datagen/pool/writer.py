@@ -80,9 +80,9 @@ class DatasetWriter:
         self._in_share = {split: bytearray(count) for split, count in self.requested.items()}  # a byte per episode
         for shard in self._share:
             self._in_share[shard.split][shard.first : shard.stop] = b"\1" * len(shard.indices)
-        self._begun = 0  # number of shards at the beginning of the share that are all published
+        self._begun = 0  # number of the share's first shards that are all published
         self._claimed: list[ShardRange] = []  # shards that this writer makes
-        # staged episodes of these shards: the time of staging, or inf after the request to sync them
+        # for each staged episode of the claimed shards: the time of staging, or inf after the request to sync it
         self._staged: dict[tuple[str, int], float] = {}
         self._syncing: list[Future[None]] = []
         self._packers = ThreadPoolExecutor(PACKED_AT_ONCE, "packer")
@@ -263,7 +263,7 @@ class DatasetWriter:
         return entry
 
     def _winner(self, shard: ShardRange) -> ShardEntry | None:
-        """Returns another generator's shard with these episodes (the file system then ignores locks), or None."""
+        """Returns another generator's shard with these episodes, or None. There is none where locks work."""
         self.refresh()
         if missing_ranges([shard], self._published) == [shard]:
             return None
@@ -427,5 +427,5 @@ def _link(temporary: Path, target: Path) -> bool:
             raise
         if target.exists():
             return False
-        shutil.move(temporary, target)  # without hard links; the manifest's lock excludes other writers
+        shutil.move(temporary, target)  # there are no hard links; the manifest's lock excludes other writers
     return True

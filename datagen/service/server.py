@@ -64,8 +64,8 @@ class Snapshot:
 class Published:
     """The manifest of a folder, and the places of its shards.
 
-    A changed file is read once, and index lines are read once when needed, for any number of requests. A snapshot of a
-    request does not change.
+    For any number of requests, a changed manifest is read once, and each line of the index is read once when needed. A
+    snapshot never changes, so a request sees one manifest.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -144,7 +144,7 @@ class Guard:
         ):
             await PlainTextResponse("nothing can be sent here\n", 413, {"connection": "close"})(scope, receive, counted)
             return
-        if self._expected is None and not _is_own_name(scope):  # a page elsewhere may give this machine its own name
+        if self._expected is None and not _is_own_name(scope):  # a web page may let its host name point here
             await PlainTextResponse("ask by the address of this machine, or set a token\n", 421)(
                 scope, receive, counted
             )

@@ -2,7 +2,8 @@
 
 A pool that dies, stops reporting, or ends with an error (a full disk, ...) is started again after a pause, which grows
 until another episode is finished. A pool that ends with a ConfigError is not started again. The service then continues
-to serve, but ends if no pool has started its work. It ends with the supervisor's errors, but not with the log's.
+to serve, but ends if no pool has started its work. The service also ends if the supervisor fails, but not if the log
+cannot be written.
 """
 
 from __future__ import annotations
@@ -60,7 +61,7 @@ class Supervisor:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Ends the pool in the way in which Ctrl-C ends it. Finished episodes are kept."""
+        """Ends the pool as Ctrl-C does. Finished episodes are kept."""
         self._stopping.set()
         self._thread.join()
 
