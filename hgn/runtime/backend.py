@@ -3,7 +3,7 @@
 | backend | what it is | networks | gradients |
 |---|---|---|---|
 | torch | PyTorch, the reference | all | yes |
-| triton | Triton kernels, frames and updates in CUDA graphs | hgn | of its own kernels |
+| triton | Triton kernels, frames and updates in CUDA graphs | hgn | in training updates |
 | cpu | compiled C, each core a block of rows | hgn | no |
 
 All have the same interface. `choose` returns the fastest supported backend and reports why.

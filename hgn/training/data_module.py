@@ -126,7 +126,7 @@ class EpisodeDataModule(LightningDataModule):
         )
 
     def _ends(self) -> bool:
-        """Returns whether to end instead of waiting for data. Never with several ranks: others need its gradients."""
+        """Returns whether to end instead of waiting for data. False with several ranks, which share gradients."""
         trainer = self.trainer
         if trainer is None:
             return self.interrupted()
