@@ -128,8 +128,6 @@ def triton_unsupported_reason(device: torch.device, config: NetworkConfig, preci
         return reason
     if config.kind != "hgn":
         return f"it computes hgn networks, not {config.kind}"
-    if "moving" in config.own_physics:
-        return "it computes obstacles at rest, not network.own_physics with moving"
     if config.width not in TRITON_WIDTHS:
         return f"network.width must be one of {', '.join(map(str, TRITON_WIDTHS))} for it, not {config.width}"
     if precision == "fp32":

@@ -30,6 +30,7 @@ from hgn.network.grid import build_hierarchy
 from hgn.network.hgn import HierarchicalGraphNetwork
 from hgn.network.moving import MovingObstacles
 from hgn.network.own_physics import has_friction
+from hgn.runtime.moving_parity import require_moving_parity
 from hgn.runtime.parity import OUTPUTS, require_parity
 from hgn.runtime.triton_host import kernel_precision
 from hgn.scene.material import INPUT_PARAMETERS
@@ -300,7 +301,7 @@ class TritonStepper:
         self.grid.status.zero_()
 
     def require_parity(self, network: HierarchicalGraphNetwork, state: ParticleState, section: str = "") -> None:
-        """Compares the first output with PyTorch's. Call it before the first frame.
+        """Compares the first output, and the constraint at moving obstacles, with PyTorch's, before the first frame.
 
         `state` is the initial state, or its first scenes. `section` contains the precision. Raises: ParityError.
         """
@@ -310,6 +311,11 @@ class TritonStepper:
         with torch.no_grad():
             expected_N3 = rested(network, state, network.prediction(state), self.step_config)
             require_parity(output_N3, expected_N3, OUTPUTS, self.precision, section=section)
+            if self.moving is not None and self._moving is not None and self._moving.barriers is not None:
+                require_moving_parity(
+                    self._moving, self.moving, self.buffers.domain_S3, grid=self.grid, step=self.step_config,
+                    precision=self.precision, section=section,
+                )  # fmt: skip
 
     def frame_launches(self) -> None:
         """Makes all launches of one frame. The CUDA graph records them."""

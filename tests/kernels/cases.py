@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import torch
 from kernels.engines import engine_of, gradients, run_forward
+from network.barrier_scenes import square
 from network.states import network_of, random_grid, random_state
 
 from hgn.network.elastic import RestShape
@@ -100,6 +101,25 @@ def swept_state(counts, friction=0.4, still=True):
     ]
     moving = MovingObstacles.of(scenes, [3, 8, 1][: len(counts)], 1 / 60)
     return replace(state, moving=moving, obstacles=state.obstacles if still else None)
+
+
+def pushing(place, shift, turn=(0.0, 0.0, 0.0), axis=1, size=0.2):
+    """A square obstacle whose barrier moves and turns by so much, domain units and degrees, in each of 20 frames."""
+    rotation_T33 = np.stack([np.eye(3), euler_rotation(tuple(20 * np.asarray(turn)))])
+    motion = Motion(np.array([0.0, 20 / 60]), np.array([np.zeros(3), 20 * np.asarray(shift)]), rotation_T33, place)
+    return MovingObstacle(random_grid(5, 4_000), square(place, axis, size), motion)
+
+
+# Moving obstacles of scenes of one batch, around particles from 0.05 to 0.15
+PUSHING = {
+    "translating": (pushing((0.1, 0.04, 0.1), (1e-3, 8e-3, -2e-3)),),
+    "at rest": (),
+    "rotating": (pushing((0.1, 0.1, 0.1), (0.0, 0.0, 0.0), (1.0, 0.0, 7.0)),),
+    "two": (
+        pushing((0.04, 0.1, 0.1), (6e-3, 1e-3, 0.0), (0.0, 2.0, 1.0), axis=0),
+        pushing((0.1, 0.16, 0.1), (0.0, -7e-3, 1e-3), (2.0, 0.0, 0.0)),
+    ),
+}
 
 
 @dataclass(frozen=True)

@@ -97,6 +97,7 @@ def assert_same_pools(fast, plain):
         {"obstacle_clearance": 5e-3},
         {"inputs": "local", "own_physics": ("friction", "moving"), "obstacle_clearance": 5e-3},
     ],
+    ids=("relative", "friction and parameters", "elastic bodies", "obstacles", "moving obstacles"),
 )
 def test_the_pool_is_that_of_the_plain_path(changes, monkeypatch):
     """Scenes with and without obstacles, first and later frames, one simulation after the other with other weights and

@@ -13,6 +13,7 @@ from hgn.network.build import build_network
 from hgn.runtime.backend import choose, pick, triton_unsupported_reason
 from hgn.runtime.torch_backend import precisions_to_try
 from hgn.runtime.triton_host import host_unsupported_reason
+from hgn.scene.material import MATERIALS, OWN_PHYSICS
 from hgn.schema import ConfigError
 
 GOLD, HALF = "it needs gold", "it has no fp16"
@@ -83,13 +84,12 @@ def test_automatic_precision(precision, device, backend, expected):
     ("device", "network", "precision", "reason"),
     [
         (GPU, {}, "tf32", ""),
-        (GPU, {"inputs": "relative", "own_physics": ("friction",)}, "tf32", ""),
+        (GPU, {"inputs": "relative", "own_physics": OWN_PHYSICS, "materials": MATERIALS}, "tf32", ""),
         (CPU, {}, "tf32", "not cpu"),
         (GPU, {"kind": "gns", "levels": 1}, "tf32", "hgn networks, not gns"),
         (GPU, {"width": 48}, "tf32", "not 48"),
         (GPU, {}, "fp32", "in tf32 or fp16, not fp32"),
         (GPU, {"levels": 9}, "tf32", "at most 8"),
-        (GPU, {"inputs": "relative", "own_physics": ("moving",)}, "tf32", "obstacles at rest"),
     ],
 )
 def test_why_backend_triton_does_not_run(device, network, precision, reason):
