@@ -16,10 +16,10 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 33_063,
+    "hgn": 33_154,
     "datagen": 8_497,
     "tools": 6_214,
-    "tests": 31_834,
+    "tests": 31_988,
 }
 SETTINGS = 240  # fields of the dataclasses behind the commands, *Config
 
