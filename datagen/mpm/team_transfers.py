@@ -1,7 +1,7 @@
 """Transfers between the particles of a team's scene and its nodes.
 
-Nodes are read whole. In the transfer to nodes four threads share a particle, one for each component of a node (momentum
-along x, y, z, and mass). So they write whole sectors of memory.
+A thread reads whole nodes. In the transfer to nodes several threads share a particle, one for each component of a node:
+momentum along x, y, z, and in the first substep of an interval mass. Together they write sectors of memory.
 """
 
 import taichi as ti
@@ -16,8 +16,8 @@ from datagen.mpm.team_meeting import GIVING
 from datagen.mpm.team_particles import dealt, get_vector
 from datagen.mpm.time_step import falls
 
-LANES = 4  # components of a node, and threads that share a particle in the transfer to nodes
-MASS = 3  # number of this component
+LANES = 4  # number of components of a node
+MASS = 3  # number of the component mass
 
 
 @ti.func
@@ -27,7 +27,7 @@ def _vector(entries):
 
 @ti.func
 def gather(x, bits: ti.i32, scene: ti.i32, velocities: ti.i32, arrays: ti.template()):
-    """Returns velocity, its gradient and mass at x from the surrounding nodes; sheets hide the nodes in `bits`."""
+    """Returns velocity, its gradient and mass at x from the surrounding nodes. A sheet hides those in `bits`."""
     inverse_dx = arrays.setting[SETTING.inverse_cell_size]
     scaled = x * inverse_dx
     base = ti.floor(scaled - 0.5, ti.i32)
@@ -79,7 +79,7 @@ def gather(x, bits: ti.i32, scene: ti.i32, velocities: ti.i32, arrays: ti.templa
 
 @ti.func
 def _entry(at: ti.i32, first: ti.i32, own_steps: ti.i32, arrays: ti.template()) -> ti.i32:
-    """Returns a contributing particle's entry: its entry in team_lists if particles take their own steps, else `at`."""
+    """Returns entry `at` of `giving` (team_lists) if particles take their own steps, else `at`."""
     entry = at
     if ti.static(not arrays.variant & VARIANT.each_step):  # noqa: SIM102 (this one is the compiler's)
         if own_steps:
@@ -99,9 +99,9 @@ def scatter(
 ):  # fmt: skip
     """Adds the contributions of particles to their 27 nodes: momentum and mass.
 
-    In later steps of an interval only particles in team_lists contribute, and only the impulse of forces. A thread sums
-    over `run` particles in their order, in a window of nodes that moves up a column with them. Nodes that leave the
-    window are written.
+    After the first substep of an interval particles add only the impulse of forces. With `own_steps` only the particles
+    of `giving` (team_lists) contribute. A thread sums over `run` particles in their order, in a window of 27 nodes that
+    moves up a column of nodes with them. It writes the nodes that leave the window.
     """
     dx = arrays.setting[SETTING.cell_size]
     inverse_dx = arrays.setting[SETTING.inverse_cell_size]
@@ -201,9 +201,9 @@ def scatter(
 
 @ti.func
 def _read_node(place: ti.i32, velocities: ti.i32, begins: ti.f32, node: ti.template()):
-    """Returns a node's gain of momentum, its mass, and its earlier velocity with its time of fall in this interval.
+    """Returns a node's gain of momentum, its mass, and its earlier velocity, zero at the start of an interval.
 
-    At the begin of an interval the earlier velocity is zero.
+    Component MASS of the latter is the time in this interval for which the node has already received gravity.
     """
     before = ti.Vector([0.0, 0.0, 0.0, 0.0])
     if begins == 0.0:
@@ -235,7 +235,7 @@ def update_nodes(
     thread: ti.template(), scene: ti.i32, begins: ti.f32, ends: ti.i32, some_wait: ti.i32, now: ti.i32,
     whole_step: ti.f32, left: ti.f32, gravity_time: ti.f32, fallen: ti.f32, arrays: ti.template(),
 ):  # fmt: skip
-    """Computes new velocities of the nodes of all touched blocks; within an interval only of blocks with changes."""
+    """Computes the nodes' new velocities in all touched blocks, with `some_wait` only in those that change now."""
     block_list = arrays.shape[SHAPE.all_blocks] + scene * arrays.shape[SHAPE.scene_blocks]
     count = arrays.live[scene * LIVE.length + LIVE.blocks] * BLOCK_NODES
     n = thread.member

@@ -1,8 +1,7 @@
-"""Holds functions that several kernels use: matrix products at a chosen precision, layer normalisation, its gradient.
+"""Holds functions that several kernels use, such as matrix products at a chosen precision and layer normalisation.
 
-The precision is a compile-time name. With tf32 operands have 10 bits of mantissa and float32's range; the host rounds
-weights beforehand (see nearest_tf32). With fp16 operands have 10 bits and float16's range. With fp32, which is for
-tests, nothing is rounded. Sums are always float32.
+With tf32 operands have 10 bits of mantissa and float32's range; the host rounds weights beforehand (nearest_tf32). With
+fp16 operands have 10 bits and float16's range. With fp32, only for tests, nothing is rounded. Sums are always float32.
 """
 
 from __future__ import annotations
@@ -15,7 +14,7 @@ from hgn.kernels.triton_compat import interpreting, settle_keys
 # Only tests use fp32. Triton takes minutes to compile float32's native product, or fails.
 FP32_PRODUCT = tl.constexpr("ieee" if interpreting() else "tf32x3")
 LEAKY = tl.constexpr(0.01)  # hgn.network.mlp.LEAKY_SLOPE
-LAST_TILE = tl.constexpr(1 << 20)  # larger than any tile number, because int32 addresses the elements
+LAST_TILE = tl.constexpr(1 << 20)  # above all tile numbers if BLOCK * WIDTH >= 2048: int32 addresses 2^31 elements
 EPSILON = tl.constexpr(1e-5)  # torch.nn.LayerNorm's
 
 
@@ -32,7 +31,7 @@ def elements(row, WIDTH: tl.constexpr, WIDE: tl.constexpr):
 def nearest_tf32(x):
     """Returns float32 rounded to 10 bits of mantissa, ties away from zero, as the instruction cvt.rna does.
 
-    The matrix units only drop the other bits. Without rounding every operand would be too small by 2^-12 on average.
+    The matrix units only drop the other bits. Without rounding, operands would be too small by 2^-11.5 on average.
     """
     bits = x.to(tl.int32, bitcast=True)
     rounded = ((bits + 0x1000) & -0x2000).to(tl.float32, bitcast=True)
@@ -53,9 +52,9 @@ def product(x, w, PRECISION: tl.constexpr, total=None):
 
 @triton.jit
 def finer_product(x, w, PRECISION: tl.constexpr):
-    """Returns x @ w for float32 operands of moderate size, to 20 bits instead of 10, by three products in float16.
+    """Returns x @ w for float32 operands in float16's range, to 20 bits instead of 10, by three products in float16.
 
-    The code splits an operand into a float16 number and the remainder in float16.
+    Each operand is split into a float16 number and the remainder in float16.
     """
     if PRECISION == "fp16" or PRECISION == "tf32":
         x_high, w_high = x.to(tl.float16), w.to(tl.float16)
@@ -71,7 +70,7 @@ def finer_product(x, w, PRECISION: tl.constexpr):
 
 @triton.jit
 def weighted_sums(w, x, PRECISION: tl.constexpr):
-    """Returns w [S, R] @ x [R, W]: S sums of x's rows in float32. Operands are rounded as those of `product`.
+    """Returns w [S, R] @ x [R, W]: S weighted sums of x's rows in float32. Operands are rounded as those of `product`.
 
     The matrix units compute sums inside a tile. Reductions would pass the rows from thread to thread.
     """
@@ -86,7 +85,7 @@ def weighted_sums(w, x, PRECISION: tl.constexpr):
 
 @triton.jit
 def members(SUMS: tl.constexpr, ROWS: tl.constexpr, EACH: tl.constexpr):
-    """Returns a matrix [SUMS, ROWS]: one where a row belongs to a sum, which has EACH successive rows, else zero."""
+    """Returns a matrix [SUMS, ROWS] of zeros and ones. Its product with rows [ROWS, W] sums up EACH rows at a time."""
     return tl.where(tl.arange(0, ROWS)[None, :] // EACH == tl.arange(0, SUMS)[:, None], 1.0, 0.0)
 
 
@@ -108,10 +107,10 @@ def transposed(pointer, ROWS: tl.constexpr, COLUMNS: tl.constexpr):
 
 @triton.jit
 def vectors(pointer, at_0, at_1, at_2, at_3, at_4, WIDTH: tl.constexpr):
-    """Loads up to five vectors [WIDTH] as rows of a matrix [8, WIDTH], which `vector` reads in a loop over tiles.
+    """Loads up to five vectors [WIDTH] as rows of a matrix [8, WIDTH], for kernels with a loop over tiles.
 
-    A row is zero if its place is below zero. The compiler repeats a plain load with fewer elements than threads in each
-    layout that uses it. Each copy takes registers, which are scarce. It does not repeat a load of this size.
+    A row is zero if its place is below zero. If a plain load has fewer elements than the program has threads, the
+    compiler repeats the load for each layout that uses it, and each copy takes registers. It repeats no larger load.
     """
     row = tl.arange(0, 8)
     at = tl.where(row == 0, at_0, tl.where(row == 1, at_1, tl.where(row == 2, at_2, tl.where(row == 3, at_3, at_4))))
@@ -132,29 +131,30 @@ def vector(matrix, number: tl.constexpr):
 
 @triton.jit
 def once_both(x, y, never):
-    """Returns x once both x and y are loaded. `never` is always false, but the compiler cannot know this.
+    """Returns x unchanged. `never` is always false, but the compiler cannot know this, and waits for both x and y.
 
-    Otherwise the compiler waits for x, and moves it to shared memory, before it begins the load of y.
+    Otherwise it waits for x, and moves x to shared memory, before it begins the load of y.
     """
     return added(x, tl.where(never, y.to(x.dtype), 0.0))
 
 
 @triton.jit
 def nothing_to_do(count, BLOCK: tl.constexpr):
-    """Returns whether a program without rows may end. The first one may not, as it waits for the previous kernel."""
+    """Returns whether a program has no rows and may end. The first program has to wait for the previous kernel."""
     return (tl.program_id(0) * BLOCK >= count) & (tl.program_id(0) > 0)
 
 
 @triton.jit
 def inside(vector, tile):
-    """Returns `vector` as a value inside the loop over tiles, which are numbered from 0. With a value from before the
-    loop each thread would keep a quarter of it in the layout of the matrix units, and registers would spill."""
+    """Returns `vector` unchanged. The condition is always true, because tiles are numbered from 0. The compiler cannot
+    know this, and computes the result in each round of the loop over tiles. Otherwise each thread would keep a quarter
+    of the vector in the layout of the matrix units from before the loop, and registers would spill."""
     return tl.where(tile >= 0, vector, 0.0)
 
 
 @triton.jit
 def next_tile(tile, ONCE: tl.constexpr):
-    """Returns the program's next tile. With ONCE there is none, and the compiler removes the loop and its addresses."""
+    """Returns the program's next tile. With ONCE a program has one tile, and the compiler removes the loop."""
     if ONCE:
         tile = tile * 0 + LAST_TILE
     else:
@@ -194,8 +194,8 @@ def normalise(z, WIDTH: tl.constexpr):
 
 @triton.jit
 def normalise_once(z, WIDTH: tl.constexpr, PRECISION: tl.constexpr):
-    """Returns the same as `normalise`, and at lower precisions computes both sums in one pass.
-    Cancellation costs less precision than rounded operands if |mean| of a row is below about ten deviations."""
+    """Returns the same as `normalise`, and in fp16 computes both sums in one pass. The cancellation then costs less
+    precision than the rounding of operands if the |mean| of a row is below about ten standard deviations."""
     if PRECISION == "fp16":
         mean = tl.sum(z, 1) / WIDTH
         variance = tl.maximum(tl.sum(z * z, 1) / WIDTH - mean * mean, 0.0)
@@ -215,17 +215,17 @@ def with_column(value, number, x):
 
 @triton.jit
 def chosen_rows(ROWS: tl.constexpr, EACH: tl.constexpr, CHOICES: tl.constexpr):
-    """Returns a matrix [ROWS, CHOICES]: one at a row's choice, else zero. EACH successive rows have the same choice.
+    """Returns a matrix [ROWS, CHOICES] of zeros and ones. Its product with [CHOICES, W] repeats each row EACH times.
 
-    A product with this matrix is exact, and reads each row only once.
+    The product is exact for rows that its precision does not round, and loads each row only once.
     """
     return tl.where(tl.arange(0, ROWS)[:, None] // EACH == tl.arange(0, CHOICES)[None, :], 1.0, 0.0)
 
 
 @triton.jit
 def high_and_low(pointer, FIRST: tl.constexpr, SUMS: tl.constexpr, WIDTH: tl.constexpr, PRECISION: tl.constexpr):
-    """Returns rows [SUMS, W] for the matrix [3, W] at `pointer`. Rows FIRST to FIRST + 2 are its rows as operands.
-    The next three rows are the parts that rounding removes. Other rows are zero."""
+    """Returns rows [SUMS, W] for the matrix [3, W] at `pointer`. Rows FIRST to FIRST + 2 are its rows, in fp16 rounded.
+    In fp16 the next three rows are the parts that the rounding removes. All other rows are zero."""
     row = tl.arange(0, SUMS)
     place = row - FIRST
     inside = (place >= 0) & (place < 6)
@@ -253,8 +253,8 @@ def normalise_backward(gradient, normalised, rstd, gamma, WIDTH: tl.constexpr):
 def column_sums(x, ROWS: tl.constexpr, WIDTH: tl.constexpr, APART: tl.constexpr):
     """Returns sums [APART, W] over every APART-th row of x [ROWS, W], which the caller adds up over many tiles.
 
-    With two rows a warp (16-byte loads of 128 float16) a thread adds only its own rows. A whole sum would pass rows
-    from thread to thread, with barriers, in each tile.
+    If a warp loads two rows at a time (16 bytes a thread, 128 float16 a row), a thread adds only rows that it has
+    loaded. A sum over all rows would pass them from thread to thread, with barriers, in each tile.
     """
     return tl.sum(tl.reshape(x, (ROWS // APART, APART, WIDTH)), 0)
 
@@ -263,7 +263,8 @@ def column_sums(x, ROWS: tl.constexpr, WIDTH: tl.constexpr, APART: tl.constexpr)
 def listed(table, row, count, capacity, SUM: tl.constexpr, EDGES: tl.constexpr):
     """Returns SUM listed rows for each element of `row`, as a tuple, from the table [SUM, capacity]; negative: no row.
 
-    With EDGES they are rows of [capacity, SUM, W]: edges of the listed rows in the opposite direction.
+    With EDGES the table lists cells, and the results are rows of the edges [capacity, SUM, W]: for entry i of the table
+    edge i ^ 1 of the listed cell, which has the opposite direction.
     """
     summands = ()
     for i in tl.static_range(SUM):
@@ -299,18 +300,18 @@ def gathered_sum(x, summands, SUM: tl.constexpr, WIDTH: tl.constexpr, BLOCK: tl.
 def settled(total):
     """Returns a product unchanged, without an instruction, in a loop whose next tiles are copied to shared memory.
 
-    If nothing in the loop reads the product, the compiler waits for it one round later. For a tile that the product and
-    others read, it then has one buffer too few (Triton 3.6 and 3.9): the tile after the next would be copied over the
-    one that is being multiplied. The interpreter does not need it.
+    If nothing in the loop reads the product, the compiler waits for it one round later. If another operation, such as
+    column_sums, reads the same tile, the compiler then has one buffer too few (Triton 3.6 and 3.9): it would copy the
+    tile after the next over the tile that is being multiplied. The interpreter does not need this function.
     """
     return tl.inline_asm_elementwise("", "=f,0", [total], dtype=tl.float32, is_pure=True, pack=1)
 
 
 @triton.jit
 def added(x, y):
-    """Returns x + y in their type as a reduction, which adds them in their layout, after both loads began.
+    """Returns x + y in their type by a reduction, which adds them in the layout of their loads, after both loads began.
 
-    For a plain sum the compiler converts each part to the matrix units' layout, one after the other.
+    For a plain sum the compiler would first convert x and y, one after the other, to the matrix units' layout.
     """
     return tl.sum(tl.join(x, y), 2)
 
