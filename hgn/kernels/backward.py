@@ -1,6 +1,6 @@
 """Launches the backward pass of the fused network in the reverse order of the forward pass.
 
-At the end one launch for each type of operand computes all weight gradients.
+At the end one launch for each type of operand and size of chunk computes weight gradients.
 
 Shape legend: N particles, C cells, W width.
 """
@@ -89,7 +89,7 @@ class FusedTrainingNetwork(FusedNetwork):
     ) -> None:
         """Expects `output_gradient` times `loss_scale`, which float16 gradients need. `totals` are divided by it.
 
-        After these gradients `totals` has that of the encoder's combined first layer, and `tail` elements for callers.
+        At its end `totals` has the gradient of the encoder's combined first layer, and `tail` elements for callers.
         """
         super().__init__(packed, values, grid, particle_count, precision, True, tuning)
         self.unscale, self.copy_precision = 1.0 / loss_scale, precision
@@ -149,7 +149,7 @@ class FusedTrainingNetwork(FusedNetwork):
 
     def _plan_weight_gradients(self) -> None:
         packed, grid = self.packed, self.grid
-        particles = grid.levels  # row of the counts table for the particles
+        particles = grid.levels  # index of the number of particles in `counts`
         self.counts = torch.zeros(grid.levels + 1, dtype=torch.int32, device=self.device)
         jobs: list[tuple[torch.Tensor, torch.Tensor, int, int, int, int]] = []
 
@@ -385,7 +385,7 @@ class FusedTrainingNetwork(FusedNetwork):
         add: bool = False,
         received: tuple[torch.Tensor, int] | None = None,
     ) -> None:
-        """Launches gather_project_backward. With `received`, x are gradients of edges; parts of receivers are added."""
+        """Launches gather_project_backward. With `received` x contains gradients of edges, see EDGES there."""
         rows = self.grid.capacities[level]
         size, warps = self.tuning.row_tile(rows)
         other, other_at = received or (summed, at)

@@ -1,4 +1,4 @@
-"""Allocates the buffers of the network's launches. In inference results of different times share a buffer.
+"""Allocates the buffers of the network's launches. In inference, results that are never needed together share buffers.
 
 Shape legend: N particles, C cells, W width.
 """
@@ -19,7 +19,7 @@ OUT = SUMS  # three outputs of the decoder, or nine with relative inputs, padded
 
 
 class Stored(NamedTuple):
-    """Holds a kernel's buffers for the backward pass, by the kernel's names; one row each if it stores nothing."""
+    """Holds buffers for the backward pass under the kernel's argument names. One that is not written has any shape."""
 
     hidden: torch.Tensor  # [R, W]; the rows R are pairs [8 N], edges [C, 6] or cells [C]
     normalised: torch.Tensor  # [R, W]
@@ -37,17 +37,16 @@ class Block:
     edge_stored: list[Stored] = field(default_factory=list)
     sum: list[torch.Tensor] = field(default_factory=list)
     cell_stored: list[Stored] = field(default_factory=list)
-    send: list[torch.Tensor] = field(default_factory=list)  # two in turn; in inference one, read before it is written
+    send: list[torch.Tensor] = field(default_factory=list)  # two that alternate; in inference twice the same one
     receive: list[torch.Tensor] = field(default_factory=list)
     product: torch.Tensor | None = None  # product of the block's output, for the next step
     next_at: int = 0  # place of the weights of that product
 
 
 class Buffers:
-    """Holds the buffers of a network. `down` and `up` are the blocks.
+    """Holds the buffers of a network. `down` and `up` are the message-passing blocks, finest level first.
     Messages to parents and hidden layers of the steps between levels are lists over the finer level. Inference may
-    share buffers, because no kernel accesses them before all earlier kernels have ended: a kernel without OVERLAP
-    starts after them, and a kernel that starts early waits for them."""
+    share buffers, because no kernel accesses them before all earlier kernels have ended."""
 
     config: NetworkConfig
     packed: PackedNetwork
@@ -137,9 +136,9 @@ class Buffers:
     def _allocate_inference(self) -> None:
         """Allocates the buffers of inference. All edges share one buffer, and hidden rows are not stored.
 
-        While there are no edges, this buffer holds other data: the particles' products until the first pairs read them;
-        a block's message to the parents, or its product for the next block, until the next block's edges; and next to
-        the last product the decoder's input. `output` takes the place of the features, which only the encoder reads.
+        While there are no edges, this buffer contains other data: the particles' products until the first pairs read
+        them; a block's message to the parents, or its product for the next block, until the next block's edges; and the
+        decoder's input, behind the last product. `output` takes the memory of the features, which the encoder has read.
         """
         width, steps = self.width, self.config.message_passing_steps
         particles, capacities = self.grid.particles, self.grid.capacities
@@ -153,8 +152,8 @@ class Buffers:
         self.transfer_hidden_down = self.transfer_hidden_up = self.message
         for level, capacity in enumerate(capacities):
             send, receive, total = (self._operand(capacity, width) for _ in range(3))
-            # The steps of a block write these in turn. The block on the way down ends with one of them, which is read
-            # again on the way up. So the block on the way up begins with the other.
+            # The steps of a block write these two in turn. `coarse_to_fine` reads again the last one that the block on
+            # the way down wrote. So the block on the way up begins with the other one.
             cells = [self._cell(capacity, width) for _ in range(2)]
             blocks = [(self.down[level], cells)]
             if level < self.config.levels - 1:
@@ -164,7 +163,6 @@ class Buffers:
                 block.sum = [total] * steps
                 block.cell = [turns[m % 2] for m in range(steps + 1)]
                 block.edge = [shared[: 6 * capacity].view(capacity, 6, width)] * (steps - 1)
-                # nothing is kept for a backward pass
                 block.edge_stored = block.cell_stored = [Stored(send, send, total)] * steps
             self._last(level).product = shared[:capacity]
         if self.tuning.half_cells and not self.tuning.half_sums:

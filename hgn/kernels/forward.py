@@ -32,7 +32,7 @@ NONE = -1  # bias offset of a product without a bias
 
 
 def _require_room(grid: DeviceGrid, width: int, training: bool) -> None:
-    """Raises ConfigError if a tensor exceeds the limit of int32 indices, except edge tensors in simulations."""
+    """Raises ConfigError if a tensor, other than the edges of a simulation, exceeds the limit of int32 indices."""
     pairs, edges = (8, 6) if training else (1, 1)
     for what, count, each in (("particles", grid.particles, pairs), ("cells", grid.capacities[0], edges)):
         most = (ADDRESSED - 1) // (each * width)
@@ -85,7 +85,7 @@ class FusedNetwork(Buffers):
     def refresh_encoder(self) -> None:
         """Folds embedding and bias into the encoder's first layer, which then takes one-hot materials.
 
-        The columns of own physics, last in the network, follow the materials.
+        The columns of own physics, which are the network's last ones, follow those of the materials.
         """
         first, embedding, bias = self._encode_views(self.values)
         width, own = self.config.feature_width, own_physics_column(self.config)
@@ -249,7 +249,7 @@ class FusedNetwork(Buffers):
         )  # fmt: skip
 
     def _begin(self, block: Block, from_children: bool) -> None:
-        """Computes the input of the block's cells, and its two products that the first message passing step reads."""
+        """Computes the input of a block, and the input's two products that the first message passing step reads."""
         grid, level, edge = self.grid, block.level, block.packed.edge[0]
         rows = grid.capacities[level]
         size, warps = self.tuning.row_tile(rows)

@@ -53,7 +53,7 @@ def middles_around(base, gate, spot, geometry, LEVELS: tl.constexpr):
     for i in tl.static_range(3):
         place = spot[i][:, None] - (corner >> 2 - i & 1).to(tl.float32)
         weight = weight * (1 - tl.abs(place))
-        axes = axes + (place,)  # noqa: RUF005 - Triton knows no unpacking here
+        axes = axes + (place,)  # noqa: RUF005 - Triton does not support unpacking here
     across = (corner >> 2 & 1) * tl.load(line + 2) + (corner >> 1 & 1)
     slot = base[:, None] + across * tl.load(line + 3) + (corner & 1)
     return slot, axes, weight

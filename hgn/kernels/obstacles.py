@@ -57,7 +57,7 @@ def obstacle_normals(x, y, z, line, live, obstacle_cell_size, SYMMETRY: tl.const
             normal = tl.where((part >> 2 & 1) == 1, -normal, normal)
         else:
             normal = tl.load(at + axis, mask=entry >= 0, other=0.0)
-        found = found + (normal,)  # noqa: RUF005 - Triton knows no unpacking here
+        found = found + (normal,)  # noqa: RUF005 - Triton does not support unpacking here
     for column in tl.static_range(3, ROW):
         found = found + (tl.load(at + column, mask=entry >= 0, other=0.0),)  # noqa: RUF005
     return found

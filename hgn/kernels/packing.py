@@ -14,7 +14,7 @@ import torch
 from hgn.network.hgn import HierarchicalGraphNetwork, MessagePassing
 from hgn.network.mlp import MLP
 
-NARROW = 8  # parts of a first layer with fewer columns are narrow; they multiply offsets
+NARROW = 8  # parts of a first layer with fewer columns than this are narrow; they multiply offsets
 PADDED_OUT = 16
 
 

@@ -29,7 +29,7 @@ def turned(matrix, vector, live, BACK: tl.constexpr):
         total = tl.load(matrix + (i if BACK else 3 * i), mask=live, other=0.0) * vector[0]
         total += tl.load(matrix + (3 + i if BACK else 3 * i + 1), mask=live, other=0.0) * vector[1]
         total += tl.load(matrix + (6 + i if BACK else 3 * i + 2), mask=live, other=0.0) * vector[2]
-        result = result + (total,)  # noqa: RUF005 - Triton knows no unpacking here
+        result = result + (total,)  # noqa: RUF005 - Triton does not support unpacking here
     return result
 
 

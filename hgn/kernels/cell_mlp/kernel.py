@@ -51,7 +51,7 @@ def cell_mlp_forward(
     if nothing_to_do(count, BLOCK):
         return
     column = tl.arange(0, WIDTH)
-    IN_PLACE: tl.constexpr = BLOCK > 16 and not LOOP  # for tiles whose vectors do not all fit into registers
+    IN_PLACE: tl.constexpr = BLOCK > 16 and not LOOP  # loads vectors at their use: registers do not hold all of them
     if LOOP:
         lines = vectors(values, bias_at, second_bias_at, norm_weight_at, norm_bias_at, next_bias_at, WIDTH)
         bias, second_bias, norm_weight, norm_bias = (
@@ -134,9 +134,9 @@ def cell_mlp_backward(
     """Replaces the gradient of cell_out in `gradient` [C, W] by that of `cell`.
 
     The incoming gradient lacks the parts through `send` and `receive` of the next step. The kernel adds them unless
-    LAST. The outgoing gradient lacks the parts through the products of its own step. send_gradient receives the
-    gradient through edges that start in a cell; without GATHER an earlier kernel has computed it. sum_gradient [C, W]
-    is the gradient of the edges' sums. RESIDENT means the same as in cell_mlp_forward.
+    LAST. The outgoing gradient lacks the parts through `send` and `receive` of this step. send_gradient is the gradient
+    through edges that start in a cell; without GATHER an earlier kernel has computed it. sum_gradient [C, W] is the
+    gradient of the edges' sums. RESIDENT means the same as in cell_mlp_forward.
 
     Rule: hgn.network.hgn.MessagePassing; reference and test: tests/kernels/references.py, test_kernels_alone.py.
     """
@@ -176,7 +176,7 @@ def cell_mlp_backward(
                 received = tl.load(later_receive_gradient + at, mask=here, other=0.0)
         if not LAST:
             if GATHER:
-                # Edges that start here are in their receivers' rows, in the opposite direction.
+                # Edges that start in a cell are stored with their receivers, under the opposite direction.
                 sent = gathered_sum(later_hidden_gradient, summands, 6, WIDTH, BLOCK)
                 tl.store(send_gradient + at, sent, mask=here)
             else:

@@ -1,4 +1,4 @@
-"""Computes the force along surfaces in coarsest cells: what surfaces without friction remove, and what friction leaves.
+"""Computes the part of a force along surfaces in coarsest cells, and how much of it remains with friction.
 
 The rule is hgn.network.own_physics.friction_fraction, whose letters are used here. Shape legend: C coarsest cells.
 """
@@ -18,7 +18,7 @@ TINY = tl.constexpr(own_physics.TINY)
 @triton.jit
 def slip_of(moments, cell, there, few, rare, OUT: tl.constexpr):
     """Returns 1 / (FEW + RARE tr P) of cells, and the inverse of Q (hgn.network.relative.slip): xx, yy, zz, yz, xz, xy.
-    The products of normals follow the second moments."""
+    In `moments` the products of normals follow the second moments."""
     xx, yy, zz = three_columns(moments, cell, 9, there, 1.0, OUT)
     yz, xz, xy = three_columns(moments, cell, 12, there, 1.0, OUT)
     ratio = 1 / (few + rare * (xx + yy + zz))
@@ -27,7 +27,7 @@ def slip_of(moments, cell, there, few, rare, OUT: tl.constexpr):
 
 @triton.jit
 def along_surfaces(matrix, vector):
-    """Returns Q times vectors: their part that surfaces leave free. `matrix` is the inverse of Q."""
+    """Returns Q times vectors: the part of them that surfaces do not remove. `matrix` is the inverse of Q."""
     determinant, free = adjugate(matrix, vector[0], vector[1], vector[2])
     inverse = 1 / determinant
     return free[0] * inverse, free[1] * inverse, free[2] * inverse
@@ -46,9 +46,9 @@ def _rough(friction, cell, there, ratio, force, OUT: tl.constexpr):
     lower = three_columns(friction, cell, 6, there, ratio, OUT)
     upper = three_columns(friction, cell, 9, there, ratio, OUT)
     wall = ()
-    for i in tl.static_range(3):  # a wall that pulls has no friction
+    for i in tl.static_range(3):  # only the wall from which the force points away has friction
         pushes = tl.where(force[i] >= 0, lower[i], 0.0) + tl.where(force[i] <= 0, upper[i], 0.0)
-        wall = wall + (pushes,)  # noqa: RUF005 - Triton knows no unpacking here
+        wall = wall + (pushes,)  # noqa: RUF005 - Triton does not support unpacking here
     matrix = xx + wall[0], yy + wall[1], zz + wall[2], yz, xz, xy
     return _product(matrix, force), matrix
 
@@ -114,8 +114,8 @@ def removed_along(
 
 @triton.jit
 def with_friction(fraction, cell, there, mean, OUT: tl.constexpr):
-    """Returns the gradient by A of cells from that of their accelerations, both without the factor d.
-    Cells [C] or cells across faces [C, 8]."""
+    """Returns the gradient by A of cells, [C] or across faces [C, 8], from the gradient of their accelerations.
+    Both are without the factor d."""
     slope = dot(mean, three_columns(fraction, cell, 0, there, 1.0, OUT))
     x, y, z = three_columns(fraction, cell, 7, there, slope, OUT)
     return mean[0] + x, mean[1] + y, mean[2] + z

@@ -1,4 +1,4 @@
-"""Computes the coarsest cells' part of the accelerations of relative inputs, which conserves momentum; and gradients.
+"""Computes the part of the accelerations that coarsest cells add so that momentum is conserved, and its gradients.
 
 Shape legend: N particles, C coarsest cells. The geometry table is that of hgn.kernels.geometry.
 """
@@ -19,7 +19,7 @@ DECODED = tl.constexpr(OUTPUTS)
 
 @triton.jit
 def _coarsest_places(place_of, row, live):
-    """Returns the particles' places relative to the centres of these cells, three [N, 8], in cell edges."""
+    """Returns the particles' places relative to the middles of their coarsest cells, three [N, 8], in cell edges."""
     corner = tl.arange(0, 8)[None, :]
     at = place_of + row * 3
     x = tl.load(at, mask=live, other=0.0)[:, None] - (corner >> 2 & 1).to(tl.float32)
@@ -35,8 +35,8 @@ def sum_coarsest(
 ):  # fmt: skip
     """Adds the first USED columns of the rows of x [N, OUT], with their weights, to the coarsest cells' sums [C, OUT].
 
-    The next three columns are the moments of columns 0 to 2 about the cells' middles. With FEEL it writes the
-    disturbance of coarsest cells to felt [C, 2] (`most_around`). Programs cover particles and coarsest cells.
+    The next three columns are the moments of columns 0 to 2 about the cells' middles. With FEEL the kernel also writes
+    the disturbance of coarsest cells to felt [C, 2] (`most_around`). Programs cover particles and coarsest cells.
 
     Rule: hgn.network.relative.balanced and disturbance; test: tests/kernels/test_relative.py.
     """
@@ -69,8 +69,8 @@ def _pairs(
     LEVELS: tl.constexpr, OUT: tl.constexpr,
 ):  # fmt: skip
     """Returns properties of the cells across the six faces, [C, 8] with two unused columns, in this order: number; one
-    over the mass; axis and sign of the direction; the own cell's fraction of both masses; product of both fractions;
-    centre of mass from the cell's middle; vector between the centres; inertia of both about their common centre."""
+    over its mass; axis and sign of the direction; the own cell's fraction of both masses; product of both fractions;
+    centre of mass from its middle; and from the own centre of mass; inertia of both about their common centre."""
     slot = tl.arange(0, 8)[None, :]
     other = tl.load(neighbour + slot * capacity + cell[:, None], mask=there[:, None] & (slot < 6), other=-1)
     found = other >= 0
@@ -88,7 +88,7 @@ def _pairs(
     total = ()
     for i in tl.static_range(6):
         whole = both * apart[i] + part * inertia[i][:, None] + (1 - part) * theirs[i]
-        total = total + (whole,)  # noqa: RUF005 - Triton knows no unpacking here
+        total = total + (whole,)  # noqa: RUF005 - Triton does not support unpacking here
     return other, inverse, axis, sign, part, both, middle, (x, y, z), total
 
 
@@ -165,8 +165,8 @@ def balance_backward(
 ):  # fmt: skip
     """Computes the table [C, OUT] from sums of gradients of the result of `balance` and of their moments.
 
-    Columns 0 to 8 are the gradients that cells add to their particles' outputs at their middles. Column 9 is the factor
-    of the accelerations' own gradient. Columns 10 to 12 are the rate of rotation.
+    Columns 0 to 8 are the gradients that cells add to their particles' outputs at the cells' middles. Column 9 is the
+    factor of the accelerations' own gradient. Columns 10 to 12 are the rate of rotation of the added gradient.
 
     Rule: hgn.network.relative.balanced; test: tests/kernels/test_relative.py.
     """
@@ -229,7 +229,7 @@ def balance_backward(
         push = push + (share * (felt_by * gap[i] - swing[i]),)  # noqa: RUF005
     for i in tl.static_range(3):
         tl.store(line + 3 + i, disturbed * tl.sum(tl.where(axis == i, push[i], 0.0), 1), mask=there)
-        # A shear has parts from two faces.
+        # A shear has parts from the faces on two axes.
         shear = tl.where(axis == (i + 2) % 3, push[(i + 1) % 3], 0.0)
         shear = tl.where(axis == (i + 1) % 3, push[(i + 2) % 3], shear)
         tl.store(line + 6 + i, disturbed * tl.sum(shear, 1), mask=there)
@@ -246,7 +246,7 @@ def _coarsest_of(motion, geometry, count, LEVELS: tl.constexpr, BLOCK: tl.conste
 
 @triton.jit
 def _felt(felt, cell, there):
-    """Returns the disturbance of cells, and the disturbance of cells by surfaces."""
+    """Returns the disturbance of cells (column 0 of `felt`), and their disturbance by surfaces (column 1)."""
     return tl.load(felt + cell * 2, mask=there, other=0.0), tl.load(felt + cell * 2 + 1, mask=there, other=0.0)
 
 
@@ -263,8 +263,8 @@ def add_coarsest(
 ):  # fmt: skip
     """Applies the coarsest cells' table [C, OUT] to the particles' rows of x [N, OUT].
 
-    Multiplies columns 0 to 2 by the table's column USED. Adds the table's earlier columns with the particles' shares,
-    and the rotation in the three later columns about the cells' middles. COLUMNS: a power of two above USED.
+    Multiplies columns 0 to 2 by the table's column USED. Adds the table's columns before USED, weighted by `share_of`,
+    and the rotation about the cells' middles in the three columns after it. COLUMNS: a power of two above USED.
 
     Rule: hgn.network.relative.balanced; test: tests/kernels/test_relative.py.
     """

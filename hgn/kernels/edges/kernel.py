@@ -9,7 +9,7 @@ OVERLAP: a program starts while the previous kernel runs. It reads its weights a
 OVERLAP runs after those of the grid. Every program with rows waits, and the first program always waits. A kernel
 therefore ends only after all earlier ones. The wait is inside the loop over tiles, because the compiler then lays out
 the weights for the matrix units before the wait. AHEAD: a program loads the next tile's rows when the registers of this
-tile's rows are free. It then waits and reads the first tile's rows before the loop. Shape legend: C cells, W width.
+tile's rows are free. The wait and the loads of the first tile are then before the loop. Shape legend: C cells, W width.
 """
 
 from __future__ import annotations
@@ -111,7 +111,7 @@ def edge_forward(
     # The vectors are loaded once. In the loop each load would be waited for again.
     second_bias = tl.load(values + second_bias_at + column)
     norm_weight, norm_bias = tl.load(values + norm_weight_at + column), tl.load(values + norm_bias_at + column)
-    # Where a product is exact, it copies a cell's row to its edges. Its spare places hold the sides' rows.
+    # If a product with it is exact, a matrix copies a cell's row to its edges. Spare columns add the sides' rows.
     BY_PRODUCT: tl.constexpr = PRECISION != "tf32"
     if BY_PRODUCT:
         receiver = chosen_rows(ROWS, SLOTS, SUMS)
@@ -138,7 +138,7 @@ def edge_forward(
         if OVERLAP and not AHEAD:
             gdc_wait()
         holds = used & (owner < count)
-        # These say where a later tile's features are. TF32 has no registers to load the features early.
+        # The senders of a later tile, which its loads need as addresses. In tf32 no registers are free for them.
         later_owner = owner + tl.num_programs(0) * BLOCK
         if AHEAD:
             last = _senders(neighbour, slot, later_owner + tl.num_programs(0) * BLOCK, used, count, capacity)
@@ -219,8 +219,8 @@ def edge_backward(
 ):  # fmt: skip
     """Replaces the gradient of edge_out in edge_gradient [C, 6, W] by that of edge_in (unless FIRST).
 
-    The incoming gradient lacks the part of the sums; with LAST it is absent. receive_gradient [C, W] is the gradient of
-    `receive`. `rstd` is zero where there is no edge. It is read a tile ahead, because the other reads depend on it.
+    The incoming gradient lacks the part through the sums; with LAST there is none. receive_gradient [C, W] is the
+    gradient of `receive`. `rstd` is zero where there is no edge. It is read a tile ahead, because other reads need it.
 
     Rule: hgn.network.hgn.MessagePassing; reference and test: tests/kernels/references.py, test_kernels_alone.py.
     """

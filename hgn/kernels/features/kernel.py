@@ -27,7 +27,7 @@ def sum_motion(
     """Adds mass and momentum of the finest cells to all cells above them, in `motion` [.., 4] of all levels.
 
     A second set of programs writes the nearness of surfaces to the coarsest cells' `felt` [C, 2] (`most_around`), and
-    with MOVING the mean V of a coarsest cell and those across its faces to columns 4 to 6 of `drift` [C, 8].
+    with MOVING the mean V (hgn.network.moving) of a cell and those across its faces to columns 4 to 6 of `drift`.
 
     Rule: hgn.network.relative; test: tests/kernels/test_network.py.
     """
@@ -140,7 +140,7 @@ def deform(position, rest, particle_count, scale, columns, WIDTH: tl.constexpr, 
     part = tl.arange(0, 4)[None, :]
     numbers = rest + row * (5 * NEIGHBOURS)
     x, y, z = three_columns(position, row, 0, live, 1.0, 3)
-    sum_x = tl.zeros((BLOCK, 4), tl.float32)  # the rows of F, and e behind them
+    sum_x = tl.zeros((BLOCK, 4), tl.float32)  # a row of F and a component of e (hgn.network.elastic)
     sum_y, sum_z, most = sum_x, sum_x, row * 0 - 1
     for k in tl.static_range(NEIGHBOURS):
         other = tl.load(numbers + k, mask=live, other=-1)
@@ -170,7 +170,7 @@ def deform(position, rest, particle_count, scale, columns, WIDTH: tl.constexpr, 
 
 @triton.jit
 def _add_slip(v, gravity, scale, scene, live, cell, share, sums, COLUMNS: tl.constexpr):
-    """Adds to the sums [C, COLUMNS] the friction columns (`add_friction`) of velocities v - V, which are `v`."""
+    """Adds to the sums [C, COLUMNS] the columns of `add_friction` that depend on velocity, for the velocity `v`."""
     column = tl.arange(0, 4)[None, :]
     value = 0.0 * v[0][:, None] + 0.0 * column
     square = 0.0 * v[0]
@@ -192,14 +192,14 @@ def prepare_relative_features(
     FRICTION_AT: tl.constexpr, PARAMETERS: tl.constexpr, PARAMETERS_AT: tl.constexpr, MOVING: tl.constexpr,
     COLUMNS: tl.constexpr, FEATURES: tl.constexpr, OVERLAP: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Writes the features [N, FEATURES] of each particle that no boost and no shift changes.
+    """Writes each particle's relative features [N, FEATURES], which neither a boost nor a shift changes.
 
     They are: changes of velocity minus gravity; the velocity relative to the cells around on each level, whose mass and
     momentum are in `motion`; near a surface the velocity, weighted by `felt` of the coarsest cells; the columns of
     surfaces and the FRICTION columns from FRICTION_AT on, which prepare_particles wrote; the one-hot material; and the
-    PARAMETERS columns of `parameter_of` from PARAMETERS_AT on. Differences of velocity are asinh of multiples of
-    `scale`. Raises column 0 of the coarsest cells' `disturbed` [C, 2] to their particles' disturbance, times FULLY.
-    With MOVING the velocity near a surface is relative to it, and is added to `friction` [C, COLUMNS] (`_add_slip`).
+    PARAMETERS columns of `parameter_of` from PARAMETERS_AT on. Velocities are written as asinh(velocity / `scale`).
+    The kernel raises column 0 of the coarsest cells' `disturbed` [C, 2] to their particles' disturbance, times FULLY.
+    With MOVING the velocity near a surface is relative to the surface, and `_add_slip` adds it to `friction`.
 
     Rule: hgn.network.relative; test: tests/kernels/test_network.py.
     """
@@ -254,7 +254,7 @@ def prepare_relative_features(
         relative = ()
         for i in tl.static_range(3):
             own = slip[i] - (surface[i] + (1 - touch) * tl.sum(around[i], 1))
-            relative = relative + (own,)  # noqa: RUF005 - Triton knows no unpacking here
+            relative = relative + (own,)  # noqa: RUF005 - Triton does not support unpacking here
             v = with_column(v, CONTACT + i, own)
         if FRICTION > 0:
             _add_slip(relative, gravity, scale, scene, live, coarsest, share, friction, COLUMNS)

@@ -27,12 +27,12 @@ def _base(position, origin, scene, row, live, axis: tl.constexpr, cell_size):
 
 @triton.jit
 def _base_cell(position, origin, scene, row, live, low, geometry, cell_size):
-    """Returns the lowest of each particle's 8 cells, its fractions, and whether the window contains all 8 cells.
-    Cells are counted from the window's first one. The lowest cell is 0 if the window does not contain all."""
+    """Returns the lowest of each particle's 8 cells, the particle's fractions in it, and whether the window contains
+    all 8. Cells are counted from the window's first one. The lowest cell is 0 if the window does not contain all 8."""
     x, fx = _base(position, origin, scene, row, live, 0, cell_size)
     y, fy = _base(position, origin, scene, row, live, 1, cell_size)
     z, fz = _base(position, origin, scene, row, live, 2, cell_size)
-    # The subtraction is in floats, because a position far outside has no integer.
+    # The subtraction is in float32, because the cell of a position far outside may exceed int32.
     x, y, z = x - tl.load(low), y - tl.load(low + 1), z - tl.load(low + 2)
     nx, ny, nz = tl.load(geometry + 7) - 3, tl.load(geometry + 2) - 3, tl.load(geometry + 3) - 3
     inside = live & (x >= 0) & (y >= 0) & (z >= 0) & (x < nx) & (y < ny) & (z < nz)
@@ -44,7 +44,7 @@ def _base_cell(position, origin, scene, row, live, low, geometry, cell_size):
 
 @triton.jit
 def _slots_of(geometry, level: tl.constexpr):
-    """Reads the numbers of a level that `_slot` needs, once. In `_slot` the compiler would read them for each slot."""
+    """Reads once the numbers of a level that `_slot` needs. In `_slot` the compiler would read them for each slot."""
     line = geometry + level * GEOMETRY_COLUMNS
     return tl.load(line), tl.load(line + 2), tl.load(line + 3), tl.load(line + 4)
 
@@ -77,7 +77,7 @@ def mark_cells(
     upper_x, upper_y, upper_z = x + (fx > 0).to(tl.int32), y + (fy > 0).to(tl.int32), z + (fz > 0).to(tl.int32)
     levels = ()
     for level in tl.static_range(LEVELS):
-        levels = levels + (_slots_of(geometry, level),)  # noqa: RUF005 - Triton knows no unpacking here
+        levels = levels + (_slots_of(geometry, level),)  # noqa: RUF005 - Triton does not support unpacking here
         # All levels are read before the first store, because the compiler would wait for each read after a store.
     for level in tl.static_range(LEVELS):
         slots = levels[level]
@@ -123,7 +123,7 @@ def _write_cells(table, cell, live, occupied, prefix_sum, slots, first, capacity
     """
     there = ()
     for i in tl.static_range(COUNT):
-        there = there + (_marked(occupied, slots[i], live),)  # noqa: RUF005 - Triton knows no unpacking here
+        there = there + (_marked(occupied, slots[i], live),)  # noqa: RUF005 - Triton does not support unpacking here
     numbers = ()
     for i in tl.static_range(COUNT):
         numbers = numbers + (_number(prefix_sum, slots[i], first, capacity, there[i]),)  # noqa: RUF005
@@ -135,7 +135,7 @@ def _write_cells(table, cell, live, occupied, prefix_sum, slots, first, capacity
 def _join_ancestors(
     neighbour, occupied, prefix_sum, geometry, scene, x, y, z, joins, DIRECTION: tl.constexpr, LEVELS: tl.constexpr
 ):
-    """Writes the neighbours in one direction of ancestors of finest cells where `joins`: both cells at a face exist."""
+    """Writes, for one direction, the neighbours of the ancestors of those finest cells that have a neighbour there."""
     along = z
     if DIRECTION // 2 == 0:
         along = x
@@ -166,7 +166,7 @@ def fill_tables(
 ):  # fmt: skip
     """Writes the neighbours, parent and children of each active slot's cell, int32, -1 for none.
 
-    With CONNECTED the cells of the finest level write the neighbours of their ancestors, which are -1 before.
+    With CONNECTED the cells of the finest level write the neighbours of their ancestors, which must be -1 before.
 
     Rule: hgn.network.grid.build_hierarchy; test: tests/kernels/test_network.py.
     """
@@ -272,10 +272,10 @@ def prepare_particles(
     its coarsest cells `coarsest_of` [N, 8], where repeated cells are -1; its weights in them, `share_of`; and its place
     [N, 3] from the middle of the lowest coarsest cell, in edges. It adds to cells: mass and momentum to the finest
     (`motion` [.., 4]); places, their products xx, yy, zz, yz, xz, xy, and such products of normals to the coarsest
-    (`moments` [C, COLUMNS]). It raises column 1 of their `disturbed` [C, 2] to at least the contact times FULLY.
-    With FRICTION, the number of its columns, it writes these from FRICTION_AT on and adds to `friction` [C, COLUMNS]
-    (`add_friction`). With MOVING (`surfaces_of`) it writes V to `surface_of` [N, 3], and sums of V to `drift` [C, 8]
-    (`add_drift`). OBSTACLES and SYMMETRY mean the same as in prepare_features.
+    (`moments` [C, COLUMNS]). It raises column 1 of the coarsest cells' `disturbed` [C, 2] to at least the contact times
+    FULLY. With FRICTION, a number of columns, `add_friction` writes these from FRICTION_AT on and adds to `friction`
+    [C, COLUMNS]. With MOVING it writes V (`surfaces_of`) to `surface_of` [N, 3], and `add_drift` adds V to `drift`
+    [C, 8]. OBSTACLES and SYMMETRY mean the same as in prepare_features.
 
     Rule: hgn.network.grid.build_hierarchy and hgn.network.relative; test: tests/kernels/test_network.py.
     """
@@ -298,7 +298,7 @@ def prepare_particles(
         tl.store(at, surfaces, mask=live[:, None] & (column < 6 + 6 * NORMALS))
     x, y, z, fx, fy, fz, inside = _base_cell(position, origin, scene, row, live, low, geometry, cell_size)
     slots = _slots_of(geometry, 0)
-    # [BLOCK, 8] holds all corners at once, so that a thread stores neighbouring elements.
+    # All corners are in one tensor [BLOCK, 8], so that a thread stores neighbouring elements.
     corner = tl.arange(0, 8)[None, :]
     high_x, high_y, high_z = (corner >> 2 & 1) == 1, (corner >> 1 & 1) == 1, (corner & 1) == 1
     cx = x[:, None] + (high_x & (fx > 0)[:, None]).to(tl.int32)
@@ -360,7 +360,7 @@ def prepare_particles(
             for i in tl.static_range(3):
                 tl.store(surface_of + row * 3 + i, surface[i], mask=live)
     if OVERLAP:
-        gdc_wait()  # only the next kernels read the tables that earlier kernels are filling
+        gdc_wait()  # needed by the next kernels, which read the tables that earlier kernels fill
     # With cells past the capacity the frame is void, but no access may be out of bounds.
     tl.store(cell_of + row[:, None] * 8 + corner, tl.maximum(cell, 0), mask=here)
     tl.store(weight_of + row[:, None] * 8 + corner, weight, mask=here)

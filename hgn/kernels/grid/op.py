@@ -30,7 +30,7 @@ from hgn.scene.material import INPUT_PARAMETERS
 MARK_BLOCK = 128
 PARTICLE_BLOCK = 32
 FILL_BLOCK = 4096 if interpreting() else 512  # slots of a program; the interpreter needs few programs
-SUMS = 16  # columns of the sums of coarsest cells, equal to those of the decoder's padded output
+SUMS = 16  # number of columns of the coarsest cells' sums, and of the decoder's padded output
 MARGIN_CELLS = 4  # margin of a window around the box that it must contain
 OVERFLOW, OUT_OF_WINDOW = kernel.OVERFLOW.value, kernel.OUT_OF_WINDOW.value
 
@@ -99,7 +99,7 @@ class DeviceParticles:
     def empty(
         particles: int, scenes: int, history: int, device: torch.device, own_physics: Sequence[str] = ()
     ) -> DeviceParticles:
-        """Returns buffers of zeros, of own physics those that `own_physics` names. No particle has neighbours."""
+        """Returns buffers of zeros, for own physics only those that `own_physics` needs. No body is elastic."""
         position_N3, velocity_NV = (torch.zeros(particles, columns, device=device) for columns in (3, 3 * history))
         scene_N, material_N, count = (
             torch.zeros(size, dtype=torch.int32, device=device) for size in (particles, particles, 1)
@@ -121,16 +121,16 @@ class DeviceParticles:
 class DeviceGrid:
     """Holds the tables of all levels at fixed capacities. Counts stay on the device.
 
-    Buffers (int32): counts_L are the counts after clipping, needed_L those before, and status has sticky flags.
-    Methods return neighbour, parent, octant and children of a level as views. Each particle has cell_N8, weight_N8,
-    fraction_N3, and the encoder's input feature_NF. Relative inputs need more. motion_C4 is mass and momentum of the
-    cells of all levels, one level after the other. The coarsest cells have disturbed_C2 (disturbed and touched by their
-    own particles, in units of FULLY) and felt_C2 (the maximum with those across their faces). sum_C and table_C are the
-    sums and the table of `balance`. moment_C contains first and second moments of places, and sums of products of
-    normals. A particle has its coarsest cells coarsest_N8 (repeated cells are -1), its weights share_N8 in them, its
-    place place_N3 in the lowest one, and its contact touch_N. With friction as an input, friction_C are
-    sums of friction, and friction_fraction_C has its fraction k with derivatives. `friction` is the number of columns
-    of friction of the particles that were prepared last, 0 if no surface has friction.
+    Buffers (int32): counts_L are numbers of cells, at most the capacities, needed_L the numbers without this limit, and
+    status has sticky flags. Methods return neighbour, parent, octant and children of a level as views. Each particle
+    has cell_N8, weight_N8, fraction_N3, and the encoder's input feature_NF. Relative inputs need more. motion_C4 is
+    mass and momentum of the cells of all levels, one level after the other. The coarsest cells have disturbed_C2
+    (disturbed and touched by their own particles, in units of FULLY) and felt_C2 (its maximum over a cell and the cells
+    across its faces). sum_C and table_C are the sums and the table of `balance`. moment_C contains first and second
+    moments of places, and sums of products of normals. A particle has its coarsest cells coarsest_N8 (repeated cells
+    are -1), its weights share_N8 in them, its place place_N3 in the lowest one, and its contact touch_N. With friction
+    as an input, friction_C are the sums of `add_friction`, and friction_fraction_C is k of `removed_along` with
+    derivatives. `friction` is the number of friction columns of the particles that were prepared last, 0 without any.
     """
 
     def __init__(
@@ -143,7 +143,7 @@ class DeviceGrid:
         device: torch.device,
         more: tuple[int, ...] = (),
     ) -> None:
-        """Adds int32 tensors `more_cleared` with `more` numbers for other users. `build` clears them too."""
+        """Allocates for callers also int32 tensors `more_cleared` of sizes `more`, which `build` clears too."""
         assert scenes < SCENE_LIMIT
         relative, features = config.relative, feature_columns(config)
         self.window, self.scenes, self.capacities, self.particles = window, scenes, tuple(capacities), particles
@@ -316,7 +316,7 @@ class DeviceGrid:
     def _through_coarsest(
         self, x: torch.Tensor, count: torch.Tensor, sums: torch.Tensor, between: Any, taken: int, left: int
     ) -> None:
-        """Sums the first columns over coarsest cells, launches `between`, and adds the result to particles."""
+        """Sums x's first `taken` columns by coarsest cell, launches `between`, and adds `left` columns to particles."""
         particles, capacity, coarsest = self.particles, self.capacities[-1], self.neighbour(self.levels - 1)
         forward, overlap = taken == OUTPUTS, overlaps()
         pairs: dict[str, Any] = {"coarsest_of": self.coarsest_N8, "share_of": self.share_N8, "place_of": self.place_N3}
@@ -324,7 +324,7 @@ class DeviceGrid:
         cells = {"neighbour": coarsest, "counts": self.counts_L, "capacity": capacity, "LEVELS": self.levels}
         sizes = {"OUT": x.shape[1], "OVERLAP": overlap, "BLOCK": PARTICLE_BLOCK}
         cells_too = max(particles, capacity) if forward else particles
-        # In a backward pass the previous operation is no kernel of this package.
+        # In a backward pass a kernel of another package comes before, so this launch does not overlap with it.
         coarsest_kernel.sum_coarsest[(triton.cdiv(cells_too, PARTICLE_BLOCK),)](
             x=x, **pairs, **cells, disturbed=self.disturbed_C2, felt=self.felt_C2, sums=sums, USED=taken,
             FEEL=forward, **sizes, launch_pdl=overlap and forward,

@@ -23,8 +23,8 @@ def _with_moving(
     normal, position, velocity, row, live, scene, moving, poses, turn, scenes, time, asked, obstacle_cell_size,
     HISTORY: tl.constexpr, SYMMETRY: tl.constexpr, ROW: tl.constexpr, LAYERS: tl.constexpr,
 ):  # fmt: skip
-    """Returns `normal`, the columns of obstacles at rest at fractions `time` of paths [N, 8], merged with those of
-    LAYERS moving obstacles (MovingObstacles.met): the normal, friction, and V."""
+    """Returns the normal, friction, and V (hgn.network.moving) at fractions `time` of paths [N, 8]. `normal` has those
+    of obstacles at rest. LAYERS moving obstacles are added (MovingObstacles.met)."""
     place = three_columns(position, row, 0, live, 1.0, 3)
     v = three_columns(velocity, row, 0, live, 1.0, 3 * HISTORY)
     nx, ny, nz, none = normal[0], normal[1], normal[2], 0.0 * time
@@ -51,7 +51,7 @@ def _with_moving(
         ux += there * surface[0][:, None]
         uy += there * surface[1][:, None]
         uz += there * surface[2][:, None]
-    # Several normals are shortened to 1, the others are means.
+    # A sum of several normals longer than 1 is shortened to 1. Friction and V are means.
     longer = tl.where(count > 1, tl.maximum(nx * nx + ny * ny + nz * nz, 1.0), 1.0)
     scale, part = 1 / tl.sqrt_rn(longer), 1 / tl.maximum(count, 1.0)
     return nx * scale, ny * scale, nz * scale, rough * part, ux * part, uy * part, uz * part
@@ -65,8 +65,8 @@ def surfaces_of(
 ):  # fmt: skip
     """Returns three results. The first is [N, 16]: six nearnesses of walls, the normal at the particle, the normal
     ahead, friction at the particle and ahead with ROW = 4, and zeros. The second is the contact of the particle [N]: 0
-    if no surface is within reach, at most 1. The third are three components of V [N] (hgn.network.moving), with MOVING,
-    the largest number of moving obstacles of a scene."""
+    if no surface is within reach, at most 1. The third is V (hgn.network.moving), three components [N], if MOVING, the
+    largest number of moving obstacles of a scene, is not 0."""
     column = tl.arange(0, 16)
     axis, upper, walls = column % 3, (column >= 3)[None, :], live[:, None] & (column < 6)[None, :]
     v = tl.load(velocity + row[:, None] * (3 * HISTORY) + axis[None, :], mask=walls, other=0.0)
@@ -108,7 +108,7 @@ def surfaces_of(
             here = tl.max((found & (quarters == 0)).to(tl.int32), 1) > 0
             met = found & (quarters == tl.where(here, 0, ahead)[:, None])
             surface = tl.sum(tl.where(met, normal[4], 0.0), 1), tl.sum(tl.where(met, normal[5], 0.0), 1)
-            surface = surface + (tl.sum(tl.where(met, normal[6], 0.0), 1),)  # noqa: RUF005 - Triton knows no unpacking
+            surface = surface + (tl.sum(tl.where(met, normal[6], 0.0), 1),)  # noqa: RUF005
     return value, touch, surface
 
 
@@ -131,7 +131,7 @@ def surface_normals(surfaces):
     near = ()
     for i in tl.static_range(3):
         sides = tl.where((column == i) | (column == i + 3), tl.minimum(2 * surfaces, 1.0), 0.0)
-        near = near + (tl.sum(sides, 1),)  # noqa: RUF005 - Triton knows no unpacking here
+        near = near + (tl.sum(sides, 1),)  # noqa: RUF005 - Triton does not support unpacking here
     x, y, z = _first(surfaces, 3)
     return near[0] + x * x, near[1] + y * y, near[2] + z * z, y * z, x * z, x * y
 
@@ -178,7 +178,7 @@ def add_friction(
 
 @triton.jit
 def add_drift(touch, surface, cell, share, drift):
-    """Adds to columns 0 to 3 of the coarsest cells' `drift` [C, 8] contacts of particles times V, and contacts."""
+    """Adds contact times V to columns 0 to 2 of the coarsest cells' `drift` [C, 8], and the contact to column 3."""
     column = tl.arange(0, 4)[None, :]
     value = tl.where(column == 3, touch[:, None], 0.0)
     for i in tl.static_range(3):

@@ -1,6 +1,6 @@
 """Computes an MLP on rows, forward and backward: the encoder, the decoder, and the steps between levels.
 
-Forward of row r: h = x W + gathered[index_r] + offset_octant + b; a = leaky(h); y = norm(a W2 + b2) (+ x).
+Forward of row r: h = x A + gathered[index_r] + offset_octant + b; a = leaky(h); y = norm(a A2 + b2) (+ x).
 Up to two products of y follow for the next kernels, with or without biases. Shape legend: R rows, W width.
 """
 
@@ -33,7 +33,7 @@ from hgn.kernels.triton_compat import gdc_launch_dependents, gdc_wait, settle_ke
 
 @triton.jit
 def _shift(values, offset_at, octant, SIGN: tl.constexpr, WIDTH: tl.constexpr):
-    """Returns the sum over axes of (1/2 - bit) times the offset weights [3, W]. SIGN = 1 points to the parent."""
+    """Returns SIGN times the sum over axes of (1/2 - bit) times the offset weights [3, W]. SIGN = 1: to the parent."""
     column = tl.arange(0, WIDTH)
     result = tl.zeros((octant.shape[0], WIDTH), tl.float32)
     for axis in tl.static_range(3):
@@ -70,12 +70,11 @@ def mlp_forward(
     """Computes y [R, OUT] of x [R, INPUT] by the formula of the module.
 
     This is the encoder (paper step 0, with the products for steps 1 and 11), the messages to parents (3, 5, …) and from
-    them (7, 9, …; GATHER), and the decoder (12). With FINE the MLP's own products are finer than PRECISION, and read
-    the unrounded weights.
-    FRACTION: the following products are a particle's part of its pairs. The product of its fraction [R, 3] with the
-    offsets' weights [3, W] is subtracted from the first one and added to the second one.
-    LOOP: a program takes many tiles in turn, and reads its weights once. OVERLAP: it starts before the previous launch
-    has ended, and reads weights meanwhile.
+    them (7, 9, …; GATHER), and the decoder (12). FINE: the MLP's own products are finer than PRECISION, and read the
+    unrounded weights. FRACTION: the products of y are the particles' parts of pairs; the particles' fractions [R, 3]
+    times the offsets' weights [3, W] are subtracted from the first product and added to the second one.
+    LOOP: a program takes many tiles in turn, and reads its weights once. OVERLAP: a program starts before the previous
+    launch has ended, and reads weights meanwhile.
 
     Rule: hgn.network.mlp.MLP; reference and test: tests/kernels/references.py, test_kernels_alone.py.
     """
@@ -86,7 +85,7 @@ def mlp_forward(
     if FRACTION:
         offsets_0 = _three_rows(values + fraction_at_0, WIDTH)
         offsets_1 = _three_rows(values + fraction_at_1, WIDTH)
-    IN_PLACE: tl.constexpr = BLOCK > 16 and not LOOP  # for tiles whose vectors do not all fit into registers
+    IN_PLACE: tl.constexpr = BLOCK > 16 and not LOOP  # loads vectors at their use: registers do not hold all of them
     if LOOP:
         lines = vectors(values, bias_at, next_bias_at_0, next_bias_at_1, bias_at, bias_at, WIDTH)
         bias, next_bias_0, next_bias_1 = vector(lines, 0), vector(lines, 1), vector(lines, 2)
@@ -192,10 +191,10 @@ def mlp_backward(
 ):  # fmt: skip
     """Computes the gradients of all inputs of mlp_forward.
 
-    The gradient of y is `gradient` (row gradient_index_r if GATHER). With NEXT it is added to from_0 and from_1 times
-    the weights of their products. INTO: 0 no gradient of x, 1 write it, 2 add it. The gradients of norm and offset
-    weights are multiplied by `unscale` and added to `totals`. The kernel stores hidden_gradient and second_gradient,
-    from which other kernels compute the gradients of the weights.
+    The gradient of y is `gradient` (row gradient_index_r if GATHER). With NEXT the part through the products of y is
+    added, from their gradients from_0 and from_1. INTO: 0 no gradient of x, 1 write it, 2 add it. The gradients of norm
+    and offset weights are multiplied by `unscale` and added to `totals`. The kernel stores hidden_gradient and
+    second_gradient, from which other kernels compute the gradients of the weights.
 
     Rule: hgn.network.mlp.MLP; reference and test: tests/kernels/references.py, test_kernels_alone.py.
     """
@@ -275,7 +274,7 @@ def gather_sums(
     """Computes y: each row is the sum of the rows of x that the table [SUM, capacity] lists (-1: none).
 
     This kernel is for many rows. Its programs are small, so that many of them wait for memory at the same time. A
-    kernel with products has registers for only two rows.
+    kernel with products has registers for only two summands at a time.
 
     Rule: hgn.network.mlp.MLP; reference and test: tests/kernels/references.py, test_kernels_alone.py.
     """
@@ -342,10 +341,10 @@ def gather_project_backward(
     SUM: tl.constexpr, EDGES: tl.constexpr, ADD: tl.constexpr, WIDTH: tl.constexpr, BLOCK: tl.constexpr,
     PRECISION: tl.constexpr,
 ):  # fmt: skip
-    """Computes summed = x, or the sum of x's rows that the table [SUM, capacity] lists; and gradient (+)= summed W.
+    """Computes summed = x, or the sum of x's rows that the table [SUM, capacity] lists; and gradient (+)= summed A.
 
-    With EDGES, x is [capacity, SUM, W]. The sum then takes the part for the opposite direction of each listed row, and
-    the product of `other` [capacity, W] with its own weights is added to the gradient.
+    A are weights. With EDGES x is [capacity, SUM, W], and each listed row gives its entry of the opposite direction
+    (`listed`). The product of `other` [capacity, W] with its own weights is then added to the gradient.
 
     Rule: hgn.network.mlp.MLP; reference and test: tests/kernels/references.py, test_kernels_alone.py.
     """

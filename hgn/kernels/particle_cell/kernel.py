@@ -108,7 +108,7 @@ def particle_cell_forward(
     # The vectors are loaded once. In the loop each load would be waited for again.
     second_bias = tl.load(values + second_bias_at + column)
     norm_weight, norm_bias = tl.load(values + norm_weight_at + column), tl.load(values + norm_bias_at + column)
-    # Where a product is exact, it copies a particle's row to its pairs. Its spare places hold the bits' rows.
+    # If a product with it is exact, a matrix copies a particle's row to its pairs. Spare columns add the bits' rows.
     BY_PRODUCT: tl.constexpr = PRECISION != "tf32"
     SIGN: tl.constexpr = 1 if TO_CELL else -1
     if BY_PRODUCT:
@@ -123,7 +123,7 @@ def particle_cell_forward(
         gdc_wait()
         gdc_launch_dependents()
     tile = tl.program_id(0)
-    # These are loaded a tile ahead, because they are few or because other loads need them as addresses.
+    # Loaded a tile ahead: the weights because they are few, the cells because other loads need them as addresses.
     cell, weight = _cells_of(tile, count, cell_of, weight_of, ROWS)
     if BY_PRODUCT:
         rows = _particles(by_particle, tile, count, PARTICLES, SUMS, WIDTH)
@@ -162,7 +162,7 @@ def particle_cell_forward(
         z = z * inside(norm_weight, tile)[None, :] + inside(norm_bias, tile)[None, :]
         if TO_CELL:
             z = z * weight[:, None]
-            # A weight of zero comes with an index that may be another cell's. The pair then adds nothing.
+            # A pair of weight zero may have the index of another cell. It adds nothing.
             touched = (live & (weight != 0))[:, None]
             tl.atomic_add(out + cell[:, None] * WIDTH + column[None, :], z, mask=touched, sem="relaxed")
         else:
@@ -204,7 +204,7 @@ def particle_cell_backward(
     """Computes the gradients of by_particle and by_cell from that of `out` ([C, W] if TO_CELL, else [N, W]).
 
     Atomic additions sum up the gradients of by_cell. The kernel stores second_gradient [8 N, W] for the weight
-    gradients. It computes a hidden layer that was not stored again, to the same bits.
+    gradients. If the hidden layer was not stored, the kernel computes it again, to the same bits.
 
     Rule: hgn.network.hgn; reference and test: tests/kernels/references.py, test_kernels_alone.py.
     """
@@ -224,7 +224,7 @@ def particle_cell_backward(
         SIGN: tl.constexpr = 1 if TO_CELL else -1
         choice = _choice(PARTICLES, SUMS, SIGN)
     tile = tl.program_id(0)
-    # These are loaded a tile ahead: other loads need them as addresses, and in a loop each thread keeps only one.
+    # Loaded a tile ahead, because other loads need cells as addresses. As loop variables they take few registers.
     cell, weight, side_0, side_1, side_2 = _pairs_of(tile, count, cell_of, weight_of, fraction, ROWS)
     while tile * PARTICLES < count:
         row = tl.arange(0, ROWS)
@@ -263,7 +263,7 @@ def particle_cell_backward(
         if not TO_CELL:
             touched = (live & (weight != 0))[:, None]
             tl.atomic_add(by_cell_gradient + cell[:, None] * WIDTH + column[None, :], dh, mask=touched, sem="relaxed")
-        # The last rows of these sums over a particle's pairs hold the sums of the offsets' weights.
+        # The last three of these sums are the gradients of the offsets' weights. The others are by particle.
         chosen = members(SUMS, ROWS, 8)
         chosen = tl.where((sums == SUMS - 3)[:, None], side_0[None, :], chosen)
         chosen = tl.where((sums == SUMS - 2)[:, None], side_1[None, :], chosen)
@@ -299,7 +299,7 @@ def _weight_tile(
     of_cells = rows
     if not TO_CELL:
         of_cells = tl.load(by_cell + cell[:, None] * WIDTH + column[None, :], mask=here, other=0.0)
-        # These are loaded a tile ahead, because other loads need them as addresses.
+        # The cells are loaded a tile ahead, because other loads need them as addresses.
         cell = _cell_of(tile - tl.num_programs(0), count, cell_of, ROWS)
     a = leaky_operand(_first_layer(choice, rows.to(tl.float32) + offsets, of_cells, TO_CELL, PRECISION), PRECISION)
     lines += column_sums(dz.to(tl.float32), ROWS, WIDTH, 8)
@@ -315,8 +315,8 @@ def particle_cell_weight_gradient(
 ):  # fmt: skip
     """Computes the gradients of the second layer and its bias, as weight_gradient does.
 
-    This kernel is for a hidden layer that was not stored. It computes the layer again to the same bits, and reads an
-    eighth of the bytes. It begins with the last tile, whose data from particle_cell_backward are still in the L2 cache.
+    It computes a hidden layer that was not stored, to the same bits, from the particles' rows, an eighth of the layer's
+    bytes. It begins with the last tile, whose data from particle_cell_backward are still in the L2 cache.
     PIPELINED: a counted loop copies tiles to shared memory two ahead. Triton 3.6's interpreter has no such loops.
 
     Rule: hgn.network.hgn; reference and test: tests/kernels/references.py, test_kernels_alone.py.

@@ -23,7 +23,7 @@ NO_TRIANGLE = tl.constexpr(0x7FFFFFFF)
 
 @triton.jit
 def wall_limit(x, before, size, near, far):
-    """Returns whether a wall stops the path from `before` to x on an axis, and the coordinate of the path's end."""
+    """Returns whether a wall stops the path from `before` to x on an axis, and the coordinate at which it stops it."""
     low, high = tl.where(before < near, before, near), tl.where(before > size - far, before, size - far)
     inside = (x > -size) & (x < 2 * size)  # NaN is outside
     return inside & ((x < low) | (x > high)), tl.where(x < low, low, high)
@@ -58,9 +58,8 @@ def _covers(row, x, y, z, live):
 
 @triton.jit
 def _first_stop(bx, by, bz, x, y, z, line, live, within, slack):
-    """Returns which paths from (bx, by, bz) to (x, y, z) a triangle stops.
-    Returns also the shifts of their ends along unit normals, and the fraction of each path before the first triangle.
-    The rule is hgn.step.reference.first_stop."""
+    """Returns which paths from (bx, by, bz) to (x, y, z) a triangle stops, the shifts of their ends along unit normals,
+    and the fraction of each path before the first triangle. The rule is hgn.step.reference.first_stop."""
     bits = tl.load(line + 6, mask=live, other=ONE)
     cell_size = bits.to(tl.int32).to(tl.float32, bitcast=True)
     span = tl.load(line + 2, mask=live, other=0).to(tl.pointer_type(tl.int32))
@@ -121,7 +120,7 @@ def stopped_by_obstacles(
     """Returns the ends of paths from (bx, by, bz) to (x, y, z) between the walls and outside obstacles.
 
     The domains have this width, height and depth. Up to SURFACES triangles stop a path one after the other. With
-    WALLED the walls apply after each triangle. If the path then meets another triangle, it ends at this triangle.
+    WALLED the walls apply after each shift. After SURFACES shifts the path ends at the next triangle that it meets.
     `line` is the scenes' row of the barrier table. All arguments are vectors of particles. Particles out of range are
     not constrained. Triangles stop particles within the distance `within`, and move them away by `slack`. Planes whose
     squared sine is at most `least_crease` count as one.
@@ -132,12 +131,12 @@ def stopped_by_obstacles(
     bx, by, bz = tl.where(live, bx, 0.0), tl.where(live, by, 0.0), tl.where(live, bz, 0.0)
     ex, ey, ez = tl.where(live, x, 0.0), tl.where(live, y, 0.0), tl.where(live, z, 0.0)
     ask, surface = live, tl.zeros_like(ex)
-    lx, ly, lz = tl.zeros_like(ex), tl.zeros_like(ex), tl.zeros_like(ex)  # normals of the earlier shifts
+    lx, ly, lz = tl.zeros_like(ex), tl.zeros_like(ex), tl.zeros_like(ex)  # normals of the last shifts
     while tl.max(ask.to(tl.int32)) > 0:
         hit, shift, nx, ny, nz, free = _first_stop(bx, by, bz, ex, ey, ez, line, ask, within, slack)
         ask = ask & hit
         cosine = nx * lx + ny * ly + nz * lz
-        ax, ay, az = nx - cosine * lx, ny - cosine * ly, nz - cosine * lz  # along the planes of the earlier shifts
+        ax, ay, az = nx - cosine * lx, ny - cosine * ly, nz - cosine * lz  # along the planes of the last shifts
         square = ax * ax + ay * ay + az * az
         crease = (cosine < 0) & (square > least_crease)
         farther = tl.div_rn(shift, tl.maximum(square, least_crease))

@@ -23,7 +23,7 @@ DIVERGED = tl.constexpr(4)
 
 @triton.jit
 def _lowest(base_of, gate_of, spot_of, row, live):
-    """Returns the slots of the lowest middles around particles, the gates, and the places relative to them in edges."""
+    """Returns the slots of the lowest middles around particles, the gates, and the places from the middles in edges."""
     spot = three_columns(spot_of, row, 0, live, 1.0, 3)
     return tl.load(base_of + row, mask=live, other=0), tl.load(gate_of + row, mask=live, other=0.0), spot
 
@@ -31,7 +31,7 @@ def _lowest(base_of, gate_of, spot_of, row, live):
 @triton.jit
 def _add_bodies(sums, slot, place, weight, value, BODIES: tl.constexpr, COLUMNS: tl.constexpr):
     """Adds to the sums of middles [K, COLUMNS] the particles' values and the moments place x value.
-    With BODIES their mass, places and products of places xx, yy, zz, yz, xz, xy come first."""
+    With BODIES the particles' masses, places and products of places xx, yy, zz, yz, xz, xy come first."""
     at: tl.constexpr = 10 * BODIES
     moment = cross(place, (value[0][:, None], value[1][:, None], value[2][:, None]))
     column = tl.arange(0, COLUMNS)[None, None, :]
@@ -61,7 +61,7 @@ def _deforming(table, slot, place, weight, value):
     result = ()
     for i in tl.static_range(3):
         part = factor * value[i] - tl.sum(base[i] + swing[i], 1)
-        result = result + (part,)  # noqa: RUF005 - Triton knows no unpacking here
+        result = result + (part,)  # noqa: RUF005 - Triton does not support unpacking here
     return result
 
 
@@ -82,9 +82,9 @@ def sum_displacements(
 ):  # fmt: skip
     """Adds each particle to the sums [K, COLUMNS] of the middles around it, with its next displacement as value.
 
-    `_add_bodies` defines the columns, hgn.kernels.geometry middles and spots. Writes the slot of the lowest middle to
-    `base_of` [N], the spot to `spot_of` [N, 3], and the gate to `gate_of` [N]. The gate is 0 for materials whose bit is
-    not in RESTING; -1 has all bits.
+    `_add_bodies` defines the columns; hgn.kernels.geometry defines middles and spots. The kernel writes the slot of the
+    lowest middle to `base_of` [N], the spot to `spot_of` [N, 3], and the gate to `gate_of` [N]. The gate is 0 for
+    materials whose bit is not set in RESTING; -1 has all bits.
 
     Rule: hgn.step.reference.Deformation; test: tests/kernels/test_relative.py.
     """
@@ -178,7 +178,7 @@ def slow_displacements(
     phi = tl.where(limit > 0, tl.minimum(tl.maximum(2 - ratio, 0.0), 1.0), 0.0)
     stopped = ()
     for i in tl.static_range(3):
-        stopped = stopped + (phi * d[i],)  # noqa: RUF005 - Triton knows no unpacking here
+        stopped = stopped + (phi * d[i],)  # noqa: RUF005 - Triton does not support unpacking here
         tl.store(slow + row * 3 + i, stopped[i], mask=live)
     _add_bodies(sums, slot, place, weight, stopped, False, RATES)
 
@@ -218,11 +218,11 @@ def integrate(
 ):  # fmt: skip
     """Computes v += a, x += v, and writes the new positions into path [T, N, 3] at `frame`.
 
-    The acceleration a is gravity plus the restored output. If the status is not zero, nothing changes. `lost` counts
-    particles, once an axis, that are not finite or farther from the domain than its own size. `advance` then ends the
-    simulation. All others stay between the walls of the first WALLED_AXES axes, `near` and `far` from the planes. With
-    SURFACES they also stay outside the obstacles of `barrier_table`, see `stopped_by_obstacles`. With MOVING, which
-    needs SURFACES, the moving obstacles come first, before the walls (`stopped_by_moving`).
+    The acceleration a is gravity plus std times the output plus mean. If the status is not zero, nothing changes.
+    `lost` counts the coordinates of particles that are not finite or farther from the domain than its own size. If
+    there are any, `advance` ends the simulation. All others stay between the walls of the first WALLED_AXES axes,
+    `near` and `far` from the planes. With SURFACES particles also stay outside the obstacles of `barrier_table`
+    (`stopped_by_obstacles`). With MOVING, which needs SURFACES, moving obstacles act before the walls.
 
     Rule: hgn.step.reference.advanced; test: tests/kernels/test_rollout.py, tests/kernels/test_barriers.py.
     """
@@ -267,7 +267,7 @@ def integrate(
     if outside > 0:
         tl.atomic_add(lost, outside)
     if SURFACES > 0:
-        tl.debug_barrier()  # positions are read again, a row a thread; in the layout above 16 threads would copy each
+        tl.debug_barrier()  # positions are read again, a particle a thread; above, several threads share a particle
         x, y, z = three_columns(position, row, 0, row < count, 1.0, 3)
         width, height, depth = three_columns(domain, scene, 0, row < count, 1.0, 3)
         line = barrier_table + scene * BARRIER_COLUMNS
@@ -294,7 +294,7 @@ def integrate(
 
 @triton.jit
 def advance(status, lost, frame, OVERLAP: tl.constexpr):
-    """Increments the frame if it was integrated.
+    """Increments the frame if it was integrated, and sets the status to DIVERGED if coordinates were lost.
 
     Rule: hgn.runtime.torch_stepper; test: tests/kernels/test_rollout.py.
     """

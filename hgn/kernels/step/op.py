@@ -30,9 +30,9 @@ INTEGRATE_BLOCK = 64  # particles of a program
 
 @dataclass(frozen=True, eq=False)
 class RestLevel:
-    """Holds the buffers of rest between cells of one size.
-    The sums [K, columns] are those of bodies and displacements, and those of slow ones. The table has the subtracted
-    motions. Each particle has the lowest of its middles, the place from it, the gate and its slow deformation."""
+    """Holds the buffers of rest on cells of one size. `bodies` are the sums of bodies and displacements, `sums` those
+    of slow deformations, both [K, columns]. The table has the subtracted motions. Each particle has the lowest of its
+    middles, its place from that middle, its gate and its slow deformation."""
 
     bodies: torch.Tensor
     sums: torch.Tensor
@@ -54,7 +54,7 @@ class RestLevel:
 
 
 def rest_numbers(step: StepConfig, window: Window, scenes: int, levels: int) -> tuple[int, ...]:
-    """Returns the sizes of the sums of rest, which the grid clears. Each cell size has one slot a coarsest cell."""
+    """Returns the sizes of the sums of rest, which the grid clears. All cell sizes have the coarsest cells' slots."""
     middles = scenes * math.prod((n >> levels - 1) + 2 for n in window.cells)
     return tuple(columns * middles for columns in REST_SUMS * REST_SIZES * step.rests)
 
@@ -69,7 +69,7 @@ class DeviceStep:
         parts = [grid.more_cleared[each * level :][:each] for level in range(REST_SIZES * step.rests)]
         self._levels = [RestLevel.of(grid, cleared) for cleared in parts]
         widely = rests_widely(grid.config.materials)
-        # These are bits of the materials that rest between larger cells; -1 has all bits.
+        # These are bits of the materials that rest on the larger cells too; -1 has all bits.
         self._widely = -1 if all(widely) else sum(rests << material for material, rests in enumerate(widely))
 
     def rest(self, output: torch.Tensor, particles: DeviceParticles, std_3: torch.Tensor) -> None:
@@ -107,7 +107,7 @@ class DeviceStep:
         path_TN3: torch.Tensor,
         moving: MovingTable | None = None,
     ) -> None:
-        """Moves the particles by a rested output between walls and outside obstacles, and counts the frame.
+        """Moves particles by the result of `rest`, stops them at walls and obstacles, and increments the frame.
         `normaliser` is the mean and standard deviation of accelerations."""
         step, config, status, overlap = self.step, self.config, self.grid.status, overlaps()
         near, far = step.wall_clearance or (0.0, 0.0)

@@ -74,11 +74,11 @@ def assemble_batch(
 
     With NOISE each particle has its own noise. With WAVES a part of it comes from its scene's waves, see draw_waves.
     The target is v_true^{n+1} - v_noisy^n minus gravity, normalised. sample_vectors [updates, S, 3, 3] are the domain's
-    size, and gravity and the walls' friction under the sample's symmetry; gravity is zero with absolute inputs. With
-    FRICTION, PARAMETERS (a number of columns of WIDTH) and REST own physics is copied. Grid origins are uniform in
-    [-jitter, 0].
-    Noise and jitter are Philox numbers that depend only on the sample's seed. With SYMMETRY the window is the image of
-    the stored one. Velocities come from stored positions, because mirrored positions are rounded.
+    size, and gravity and the walls' friction under the sample's symmetry; gravity is zero with absolute inputs. The
+    kernel copies with FRICTION the walls' friction, the first PARAMETERS of WIDTH columns of parameter_of, and with
+    REST the rest shapes. Grid origins are uniform in [-jitter, 0]. Noise and jitter are Philox numbers that depend only
+    on the sample's seed. With SYMMETRY the window is the image of the stored one. Velocities come from stored
+    positions, because mirrored positions are rounded.
     SCENES is a power of two, at least `scenes`. Axes from DIMENSIONS on have neither noise nor jitter.
 
     Rule: hgn.training.noise; test: tests/kernels/test_update.py.
@@ -111,7 +111,7 @@ def assemble_batch(
         return
     row = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     live = row < count
-    # This counts the scenes that begin at or before the row, without the first scene.
+    # The scene of a row is the number of scenes, without the first one, that begin at or before the row.
     begins = tl.load(table + scene * SAMPLE_COLUMNS + 2, mask=there & (scene > 0), other=1 << 40)
     scene_row = tl.sum((row[:, None] >= begins[None, :]).to(tl.int32), 1)
     line = table + scene_row * SAMPLE_COLUMNS
@@ -193,9 +193,9 @@ def assemble_batch(
 def loss_gradient(
     output, target, share_of, particle_count, gradient, loss, scale, OUT: tl.constexpr, BLOCK: tl.constexpr
 ):
-    """Computes the mean squared error of the normalised acceleration over axes, particles and scenes.
+    """Computes the mean squared error of normalised accelerations over axes, particles and scenes, and its gradient.
 
-    Writes also its gradient times `scale`.
+    The gradient is multiplied by `scale`.
 
     Rule: torch's autograd; test: tests/kernels/test_update.py.
     """

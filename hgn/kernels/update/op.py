@@ -2,7 +2,7 @@
 
 The host uploads a table with the samples of many updates and replays the graph once for each update. It reads the
 results only after the last replay. If a grid is too small, its update and later ones change nothing. The host enlarges
-the buffers and continues there. Shape legend: K updates, S scenes, N particles of all scenes.
+the buffers and continues with this update. Shape legend: K updates, S scenes, N particles of all scenes.
 """
 
 from __future__ import annotations
@@ -258,7 +258,7 @@ class Updates:
         return most
 
     def allocate_moving(self, layers: int) -> None:
-        """Allocates records for `layers` moving obstacles of a scene, if there are not enough, for each update."""
+        """Allocates, for each update, records for `layers` moving obstacles of a scene, if there are not enough."""
         table, updates = self.moving, len(self._rates)
         layers = layers if table is None else max(layers, table.layers)
         if layers and (table is None or layers > table.layers or updates > len(table.record_TVR)):
@@ -438,7 +438,7 @@ class Updates:
             parts = [self.launches if self.reduce is None else self._launches_together]
 
         def warm_up() -> None:
-            self.grid.status.fill_(kernel.REPEAT.value)  # with this status the launches compile and change nothing
+            self.grid.status.fill_(kernel.REPEAT.value)  # with this status launches are compiled but change nothing
             self.launches()
             self.grid.status.zero_()
 
