@@ -16,7 +16,7 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 33_154,
+    "hgn": 33_151,
     "datagen": 8_497,
     "tools": 6_214,
     "tests": 31_988,

@@ -15,8 +15,8 @@ docs/concepts/constraints.md derives the constraints. `Deformation` computes the
     phi      2 - |d|^2 / (threshold |g|)^2, clamped to 0 to 1, for d = P (v + a)
 
 The remaining deformation is reduced in the same way on cells four times as large, except for FRICTIONLESS materials.
-**Obstacles** act on both sides of a triangle. A particle exactly on a plane counts as on the normal's side.
-Shape legend: N particles, C coarsest cells, K centres of cells, F triangles, P pairs of particles and triangles.
+**Obstacles** stop particles on both sides of a triangle. A particle exactly on a plane counts as on the normal's side.
+Suffixes of names: N particles, C coarsest cells, K centres of cells, F triangles, P pairs of particles and triangles.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ LEAST = 1e-30  # lower bound of a squared limit; avoids a division by zero
 REST_SIZES, LEVEL_SHIFT = 2, 2  # number of cell sizes; each size is 2^LEVEL_SHIFT times the size before
 FRICTIONLESS = ("water",)  # materials without rest on the larger cells
 # Contact is tested at (1 - SLACK) clearance. End points lie at the clearance, so rounding triggers no second contact.
-# If a particle starts nearer than that and approaches, it ends SLACK * clearance farther away than it started.
+# A particle that starts nearer than this and approaches ends SLACK * clearance farther away than it started.
 SLACK = 0.02
 SURFACES = 3  # largest number of triangles that shift the end of one path; at the next triangle the path ends
 LEAST_CREASE = 1e-4  # squared sine of the angle between two planes; planes at a smaller angle count as one
@@ -106,7 +106,7 @@ def moved(state: ParticleState, acceleration_N3: torch.Tensor) -> FreeMotion:
 
 
 def constrained(state: ParticleState, motion: FreeMotion, step: StepConfig, dimensions: int) -> Motion:
-    """Applies moving obstacles, walls, then obstacles at rest. `state` is that before the frame.
+    """Applies moving obstacles, walls, then obstacles at rest. `state` is the state before the frame.
 
     A shifted end changes the velocity. Particles that are not `within_range` keep their positions, so that divergence
     stays visible.
@@ -269,7 +269,7 @@ def _outside_obstacles(
 def _outside_moving(
     state: ParticleState, position_N3: torch.Tensor, step: StepConfig, dimensions: int, barriers: Barriers
 ) -> torch.Tensor:
-    """Stops the paths of a frame relative to each moving obstacle: from its pose in the frame to that of the next."""
+    """Stops the paths of a frame at moving obstacles, in each one's own frame: its poses at both ends of the path."""
     assert state.moving is not None
     lost_N1 = ~within_range(position_N3, state.domain_S3[state.scene_N]).all(-1, keepdim=True)
     end_N3, step = torch.where(lost_N1, state.position_N3, position_N3), replace(step, wall_clearance=None)
@@ -285,7 +285,7 @@ def _outside_moving(
 def _direction(normal_N3: torch.Tensor, last_N3: torch.Tensor) -> torch.Tensor:
     """Returns the unit normals, or directions along the previous planes if the normals lead back across these.
 
-    Such a direction has the component 1 along the normal, so that the end moves as far from the new plane as with it.
+    Such a direction has the component 1 along the normal, so that the end moves as far from the new plane as along it.
     """
     cosine_N1 = (normal_N3 * last_N3).sum(-1, keepdim=True)
     along_N3 = normal_N3 - cosine_N1 * last_N3
@@ -364,7 +364,7 @@ def _pairs(
 def pairs_of_boxes(
     barriers: Barriers, before_N3: torch.Tensor, after_N3: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Returns the pairs of particles and triangles whose boxes meet. It has no loops, for the exported step."""
+    """Returns the pairs of triangles and particles' paths whose boxes meet, without a loop over the pieces of paths."""
     low_N3, high_N3 = torch.minimum(before_N3, after_N3), torch.maximum(before_N3, after_N3)
     low_F3, high_F3 = barriers.row_F24[:, 16:19], barriers.row_F24[:, 20:23]
     meets_NF = (low_N3[:, None, 0] <= high_F3[None, :, 0]) & (high_N3[:, None, 0] >= low_F3[None, :, 0])
