@@ -25,7 +25,7 @@ from hgn.cpu.rows import Hidden, Rows, Segments
 from hgn.system.files import sync_written, temporary_file
 
 SOURCE = Path(__file__).with_name("rows.c")
-# No flag changes the order of sums. The result of a row therefore does not depend on the rows around it.
+# No flag lets the compiler reorder sums, so the result of a row does not depend on the rows around it.
 FLAGS = ("-std=gnu11", "-O3", "-march=native", "-fno-math-errno", "-ffp-contract=fast", "-shared", "-fPIC")
 LANES = 16  # float32 numbers in a vector of AVX-512
 WIDEST = 512  # largest width whose two matrices fit on a thread's stack
@@ -48,13 +48,13 @@ def rows_class(width: int, dtype: torch.dtype) -> Callable[[torch.nn.Module], Ro
 
 
 def describe(width: int) -> str:
-    """Returns a message about the computation of float32 rows, with the reason."""
+    """Returns how float32 rows are computed, and why, as text."""
     reason = unsupported_reason(width, torch.float32)
     return "rows compiled for this CPU" if reason is None else f"rows in PyTorch ({reason})"
 
 
 def compiled_rows(network: torch.nn.Module) -> CompiledRows:
-    """Returns the rows of an MLP, those of the last frame if its parameters are where they were."""
+    """Returns the rows of an MLP, cached while its parameters keep their addresses."""
     known = _KNOWN.get(network)
     if known is None or known.places != known.places_now():
         known = _KNOWN[network] = CompiledRows(network)
@@ -64,7 +64,7 @@ def compiled_rows(network: torch.nn.Module) -> CompiledRows:
 class CompiledRows(Rows):
     """Computes rows of an MLP whose layers have equal widths. For other MLPs it computes only projections.
 
-    It stores addresses of parameters, not values, so that an update of a training changes its results.
+    It stores the parameters' addresses, not their values, so that results follow updates of the parameters in place.
     """
 
     def __init__(self, network: torch.nn.Module) -> None:
@@ -75,7 +75,7 @@ class CompiledRows(Rows):
         if self.norm is not None:
             gain, shift, epsilon = self.norm
             self._second = *map(_place, (self.second.T, self.second_bias, gain, shift)), epsilon
-        # Module.parameters() of all MLPs would take 2 ms of a frame
+        # Module.parameters() of all MLPs would take 2 ms in each frame
         self._owned = [module._parameters for module in network.modules()]
         self.places = self.places_now()
 

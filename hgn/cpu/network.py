@@ -24,9 +24,9 @@ from hgn.network.features import ParticleState
 from hgn.network.grid import CORNER_83, DIRECTION_63, GridHierarchy, Level
 from hgn.network.hgn import HierarchicalGraphNetwork
 
-# The number of rows of edges or pairs in a block. At width 128 an intermediate result takes 2 MB. Smaller blocks fit
-# into faster caches. But each operation takes some microseconds of Python, during which all other threads wait, and
-# compiled rows transpose their matrices for each block.
+# The number of rows of edges or pairs in a block. At width 128 an intermediate result of a block takes 2 MB. Smaller
+# blocks would fit into faster caches, but each operation takes some microseconds of Python, during which all other
+# threads wait, and compiled rows transpose their matrices for each block.
 ROWS_AT_ONCE = 4096
 FEWEST_ROWS = 256  # smallest number of rows in a block; for fewer, waking a thread takes longer than the work
 
@@ -72,7 +72,7 @@ class _Cells:
     def __init__(self, level: Level, threads: int) -> None:
         count = level.cell_count
         self.blocks = _Blocks(level.receiver_E, count, threads)
-        # An edge sums rows of a table: all cells as senders, all as receivers, and directions for the first step.
+        # An edge is a sum of table rows: of its sender, its receiver, and in the first step its direction.
         ends_E3 = torch.stack([level.sender_E, level.receiver_E + count, level.direction_E + 2 * count], -1)
         self.ends_of_first, self.ends_of_others = self.blocks.indices(ends_E3), self.blocks.indices(ends_E3[:, :2])
         self.segments = self.blocks.segments()
@@ -89,7 +89,7 @@ def _passed(
     result_CW, hidden_CW, sum_CW = cell_CW.clone(), torch.empty_like(cell_CW), torch.zeros_like(cell_CW)
     own, hidden, sums = map(blocks.split, (result_CW, hidden_CW, sum_CW))
     edges: list[torch.Tensor | None] = [None] * len(blocks)
-    # A step reads the values that the cells of other blocks had before it. Steps therefore use two tables in turn.
+    # A step reads the values that other blocks' cells had before the step. Steps therefore use two tables in turn.
     tables = cell_CW.new_empty(2, 2 * count + len(DIRECTION_63), cell_CW.shape[1])
     tables[1, 2 * count :] = networks[0][0].project(2, -DIRECTION_63.to(cell_CW))
     ends = [(blocks.split(table[:count]), blocks.split(table[count : 2 * count])) for table in tables]
@@ -139,7 +139,7 @@ def _to_parents(
 def _to_children(
     rows: Rows, coarse_CW: torch.Tensor, down_CW: torch.Tensor, cells: _Cells, offset_83: torch.Tensor, threads: int
 ) -> torch.Tensor:
-    """Returns the cells on the way up, from their parents and their values on the way down."""
+    """Returns the cells on the way up from their parents' features and their own features on the way down."""
     assert cells.level.parent_C is not None and cells.level.octant_C is not None
     count = len(coarse_CW)
     table_CW = coarse_CW.new_empty(count + len(offset_83), coarse_CW.shape[1])

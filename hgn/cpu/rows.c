@@ -1,15 +1,15 @@
-/* Rows through a hidden layer, a norm, a residual and sums of runs of rows, a few rows at a time.
+/* Computes rows of an MLP: a hidden layer, a norm, a residual, and sums of runs of rows.
 
-hgn/cpu/compiled.py compiles this once for each width and CPU, and says what is computed. What a few rows need on
-the way stays in the fastest cache: tables are read, and results written, once. Each row is computed alike, however many
-there are: where some lack to a whole tile, there is room for them.
+hgn/cpu/compiled.py compiles this file once for each width and CPU; hgn/cpu/rows.py is the reference. CHUNK rows at a
+time pass all layers, so intermediate results stay in the fastest cache. Incomplete tiles are padded with zero rows. The
+result of a row therefore does not depend on the number of rows.
 */
 #include <stdint.h>
 #include <string.h>
 
 #if defined(__AVX512F__)
 #define LANES 16
-#define WIDEST 4 /* vectors beside each other in a tile: half of all registers, with its rows, hold sums */
+#define WIDEST 4 /* vectors per row of a tile, at most; the sums of TILE_ROWS rows take most of the registers */
 #elif defined(__AVX__)
 #define LANES 8
 #define WIDEST 2
@@ -31,14 +31,14 @@ typedef float unaligned __attribute__((vector_size(4 * LANES), aligned(4), may_a
 #define IN(pointer) ((vector) * (const unaligned *)(pointer))
 #define INLINE static inline __attribute__((always_inline))
 
-/* LeakyReLU. */
+/* Returns LeakyReLU of a vector. */
 INLINE vector activated(vector value, float slope) {
     typedef __typeof__(value > 0) mask;
     vector scaled = value * slope;
     return (vector)(((value > 0) & (mask)value) | (~(value > 0) & (mask)scaled));
 }
 
-/* The sum of a vector's numbers. */
+/* Returns the sum of a vector's numbers. */
 INLINE float summed(vector value) {
     float number[LANES];
     memcpy(number, &value, sizeof number);
@@ -47,7 +47,7 @@ INLINE float summed(vector value) {
     return number[0];
 }
 
-/* Each row less its mean. */
+/* Subtracts from each row its mean. */
 INLINE void centre(int64_t rows, float *matrix) {
     for (float *row = matrix; row < matrix + rows * WIDTH; row += WIDTH) {
         vector total = {0};
@@ -57,7 +57,7 @@ INLINE void centre(int64_t rows, float *matrix) {
     }
 }
 
-/* Adds rows times a matrix [depth, WIDTH] to a start: `bias` for each row, or what stands in `out` where it is null. */
+/* Writes to `out` value [rows, depth] times a matrix [depth, WIDTH] plus `bias`, or plus `out` itself if it is null. */
 INLINE void multiply(int64_t rows, const float *value, int64_t depth, const float *matrix, const float *bias,
                      float *out, int activate, float slope) {
     for (int64_t column = 0; column < WIDTH; column += TILE_VECTORS * LANES)
@@ -77,8 +77,8 @@ INLINE void multiply(int64_t rows, const float *value, int64_t depth, const floa
         }
 }
 
-/* out [depth, WIDTH]: some columns of a layer's weight [WIDTH, stride], transposed. From the second cache a matrix takes
-as long as a dozen rows through it, so nobody keeps it. */
+/* Writes to out [depth, WIDTH] the first columns of a layer's weight [WIDTH, stride], transposed. It takes only as long
+as the products of a dozen rows, so the result is not kept between calls. */
 INLINE void transpose(int64_t depth, const float *weight, int64_t stride, float *out) {
     for (int64_t first = 0; first < depth; first += LANES) {
         int64_t count = depth - first < LANES ? depth - first : LANES;
@@ -87,7 +87,7 @@ INLINE void transpose(int64_t depth, const float *weight, int64_t stride, float 
     }
 }
 
-/* `value` itself, or a copy in `room` where rows lack to a whole tile. */
+/* Returns `value`, or its copy in `room` with zero rows up to a multiple of TILE_ROWS. */
 INLINE const float *whole_tiles(int64_t rows, const float *value, int64_t depth, float *room) {
     if (rows % TILE_ROWS == 0) return value;
     memcpy(room, value, rows * depth * sizeof(float));
@@ -95,8 +95,8 @@ INLINE const float *whole_tiles(int64_t rows, const float *value, int64_t depth,
     return room;
 }
 
-/* out [rows, WIDTH] = value [rows, depth <= WIDTH] times a part of a layer's weight [WIDTH, stride], transposed, plus a
-bias [WIDTH] unless null. */
+/* Writes to out [rows, WIDTH] value [rows, depth <= WIDTH] times the transpose of a part of a layer's weight
+[WIDTH, stride], plus a bias [WIDTH] unless null. */
 void project(int64_t rows, const float *value, int64_t depth, const float *weight, int64_t stride, const float *bias,
              float *out) {
     static const float zeros[WIDTH];
@@ -111,7 +111,7 @@ void project(int64_t rows, const float *value, int64_t depth, const float *weigh
     }
 }
 
-/* The hidden layer of `rows` rows from `first` on, before products: the sum of `each` rows of a table. */
+/* Writes sums of `each` table rows to the hidden layer of `rows` rows from `first` on. */
 INLINE void gather(int64_t first, int64_t rows, const float *table, const int64_t *index, int64_t each, float *hidden,
                    int activate, float slope) {
     for (int64_t row = 0; row < rows; row++) {
@@ -125,8 +125,8 @@ INLINE void gather(int64_t first, int64_t rows, const float *table, const int64_
     }
 }
 
-/* See compiled.py. `index`, `value`, `residual`, `out`, `weight`, `offset` may be null; `out` may be `residual` or
-`value`. Sums are added to what stands in `sums`. */
+/* Computes outputs of the MLP, and adds their sums over runs to `sums` (see rows.py). `index`, `value`, `residual`,
+`out`, `weight` and `offset` may be null; `out` may be the same array as `residual` or `value`. */
 void outputs(int64_t rows, const float *table, const int64_t *index, int64_t each, const float *value, int64_t depth,
              const float *part, int64_t stride, float slope, const float *second, const float *second_bias,
              const float *gain, const float *shift, float epsilon, const float *residual, float *out,
@@ -137,7 +137,7 @@ void outputs(int64_t rows, const float *table, const int64_t *index, int64_t eac
     if (value) transpose(depth, part, stride, first_matrix);
     transpose(WIDTH, second, WIDTH, second_matrix);
     memcpy(bias, second_bias, sizeof bias);
-    centre(WIDTH, second_matrix), centre(1, bias); /* so outputs have a mean of 0, which the norm would subtract */
+    centre(WIDTH, second_matrix), centre(1, bias); /* outputs then have mean 0, as the norm requires */
     for (int64_t first = 0; first < rows; first += CHUNK) {
         int64_t count = rows - first < CHUNK ? rows - first : CHUNK;
         if (count % TILE_ROWS) memset(hidden, 0, sizeof hidden);

@@ -19,7 +19,7 @@ class Hidden(NamedTuple):
     """Holds a hidden layer before its activation: sums of `each` rows of a table, plus a product with a value."""
 
     table_KW: torch.Tensor
-    chosen: torch.Tensor | None  # int64 [R * each]; None: all rows of the table, which may be overwritten
+    chosen: torch.Tensor | None  # int64 [R * each]; None: all rows of the table, and the table may be overwritten
     each: int
     part: int = 0
     value_RW: torch.Tensor | None = None  # the factor of part `part` of the first layer; None: no product
@@ -34,7 +34,7 @@ class Segments(NamedTuple):
 
 
 class Rows:
-    """Computes an MLP of rows [R, W]. It reads its matrices once a frame, because attributes of a module are slow."""
+    """Computes an MLP of rows [R, W]. It reads the parameters once per frame, because module attributes are slow."""
 
     def __init__(self, network: nn.Module) -> None:
         assert isinstance(network, MLP)
@@ -140,6 +140,6 @@ def _summed(
 
 @lru_cache(64)
 def _steps(end: int, step: int = 1) -> torch.Tensor:
-    """Returns the numbers from 0 to `end`, exclusive. They are cached, because blocks of the same size recur."""
+    """Returns the multiples of `step` below `end`, cached because blocks of the same size recur."""
     with torch.inference_mode(False):
         return torch.arange(0, end, step)

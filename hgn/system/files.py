@@ -18,7 +18,7 @@ from typing import Any, BinaryIO
 TEMPORARY_SUFFIX = ".partial"
 _LOST_AT_MOST = 10  # number of retries
 WRITTEN_BY_HGN = "written by HGN"  # the mark of files without other metadata
-# of all files that the commands write; reports begin with their provenance, binary files have metadata of this name
+# matches all files that the commands write: reports begin with their provenance, binary files have metadata named hgn
 _WRITTEN_BY_HGN = re.compile(
     rb'written by HGN|hgn rollout|"hgn"|\x03hgn\x12|\A\{\s*"meta": \{|^provenance:$', re.MULTILINE
 )
@@ -31,11 +31,11 @@ def temporary_target(path: Path) -> str:
 
 @contextlib.contextmanager
 def temporary_file(path: Path) -> Iterator[Path]:
-    """Yields a temporary name in the folder of `path` for writing it. Removes the file unless the caller renamed it.
+    """Yields a temporary name in the folder of `path`. At the end removes this file unless the caller renamed it.
 
     A crash leaves only a file that ends in `.partial`. An OSError that names no file (a full disk) names `path`.
     """
-    # random, because containers on several machines may have equal process numbers
+    # a random part, because containers on several machines may have equal process numbers
     temporary = path.with_name(f".{path.name}.{secrets.token_hex(6)}{TEMPORARY_SUFFIX}")
     try:
         with errors_name(path):
@@ -107,7 +107,7 @@ def require_place(path: Path) -> None:
 
 
 def is_replaceable(path: Path) -> bool:
-    """Returns whether no file of another program is lost when `path` is written. Renaming would replace a device."""
+    """Returns whether writing `path` loses no file of another program, and no device, which a rename would replace."""
     if not path.is_file() or not path.stat().st_size:
         return path.is_file() or path.is_dir() or not path.exists()
     with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
@@ -118,8 +118,8 @@ def is_replaceable(path: Path) -> bool:
 def space_reserved(path: Path, size: int) -> Iterator[Callable[[int], None]]:
     """Reserves `size` bytes in the folder of `path` during long work, so that the disk is not full at its end.
 
-    Yields a function that releases some of these bytes, before they are written elsewhere. Failed work leaves no new
-    folder. Raises: OSError, before the work, where the disk has less.
+    Yields a function that releases some of these bytes; the caller then writes as many elsewhere. If the work fails, no
+    new folder remains. Raises OSError before the work if the disk has less space.
     """
     missing = [folder for folder in path.parents if not folder.exists()]
     make_folder(path.parent)
@@ -133,7 +133,7 @@ def space_reserved(path: Path, size: int) -> Iterator[Callable[[int], None]]:
             yield release
     except BaseException:
         for folder in missing:
-            with contextlib.suppress(OSError):  # others may have written into it
+            with contextlib.suppress(OSError):  # another process may have written into the folder
                 folder.rmdir()
         raise
 

@@ -24,7 +24,7 @@ PREFIX = "hf://"
 _NAME = r"[\w.-]+"
 _PATTERN = re.compile(rf"hf://(datasets/)?({_NAME}/{_NAME})(?:@([^/]+))?(?:/(.*))?")
 _PATIENCE_S = 60.0
-_DOWNLOAD_S = 600.0  # longest time of an answer; huggingface_hub limits only the time between two pieces of it
+_DOWNLOAD_S = 600.0  # longest time of a whole answer; huggingface_hub limits only the time between two pieces
 _PACKAGES = ("httpx", "httpx2", "httpcore", "httpcore2")
 _PASSING = (408, 425, 429)
 
@@ -70,7 +70,7 @@ def hub_token() -> str | None:
 def hub_weights(url: str, field: str = "weights", patience_s: float = _PATIENCE_S) -> Path:
     """Downloads a weights file of a repository, the named or the only one, to huggingface_hub's cache.
 
-    Raises ConfigError if there is no file, or several, if access is refused, or if the server stays away.
+    Raises ConfigError without such a file, for several, if access is refused, or if the server does not answer.
     """
     import huggingface_hub  # slow to import, and optional
 
@@ -93,7 +93,7 @@ def hub_weights(url: str, field: str = "weights", patience_s: float = _PATIENCE_
 
 
 def _patiently(ask: Callable[[], T], url: str, field: str, patience_s: float) -> T:
-    """Retries while the server is away. The errors of huggingface_hub and httpx are not OSErrors."""
+    """Repeats `ask` while the server does not answer. The errors of huggingface_hub and httpx are not OSErrors."""
 
     def answered() -> T:
         answer: Future[T] = Future()
@@ -117,7 +117,7 @@ def _patiently(ask: Callable[[], T], url: str, field: str, patience_s: float) ->
 
 
 def _passing(error: Exception, url: str, field: str) -> str | None:
-    """Returns the cause of an error that may pass, or None for any other. Raises ConfigError for a permanent one."""
+    """Returns the cause of a temporary error, or None. Raises ConfigError for an error that repeating cannot mend."""
     from huggingface_hub import errors
 
     status = getattr(getattr(error, "response", None), "status_code", None)
