@@ -1,7 +1,7 @@
 """Writes rollouts for other programs: USD for Blender, Houdini and Omniverse, PLY sequences for any tool.
 
-Both formats hold particles by material with velocities, and the obstacles as meshes. On request they hold water as a
-closed surface. USD and surfaces need the extra `files` (usd-core, pysplashsurf).
+Both formats contain particles by material with velocities, and the obstacles as meshes. On request they also contain
+water as a closed surface. USD and surfaces need the extra `files` (usd-core, pysplashsurf).
 Shape legend: T frames, N particles, V vertices, F triangles.
 """
 
@@ -35,8 +35,8 @@ from hgn.schema import ConfigError, require_replaceable
 from hgn.system.extras import require_installed
 from hgn.system.files import WRITTEN_BY_HGN, space_reserved, sync_folder, sync_written
 
-# The values of the surface are in particle radii (half the spacing). With them the volume of a block of 8 particles a
-# cell is correct within 4 %, for a lattice and for a random filling.
+# Parameters of the surface, the lengths in particle radii (half the spacing). With them the volume of a block of 8
+# particles per cell is correct within 4 %, for a lattice and for a random filling.
 SMOOTHING_LENGTH, CUBE_SIZE, THRESHOLD = 3.0, 1.0, 0.6
 
 
@@ -47,7 +47,7 @@ def save_rollout(
 
     `.usdc`, `.usda`, `.usd`: one USD stage. `.ply`: NAME_0000.ply, NAME_0001.ply, …, NAME_obstacle_0.ply, …, and
     NAME_obstacle_0_0000.ply, … for an obstacle that moves. Any other suffix: VTKHDF. With `surface` USD and PLY also
-    hold the fluid's surface. `progress` is called once a frame.
+    contain the water's surface. `progress` is called once per frame.
     Raises ConfigError for a surface in VTKHDF, and ModuleNotFoundError without the extra `files`.
     """
     path = Path(path)
@@ -70,9 +70,9 @@ def save_rollout(
 
 
 def save_frames(path: Path, rollout: Rollout, frames: Iterable[np.ndarray], surface: bool = False) -> Path:
-    """Does `save_rollout` with frames as they come, and puts them into `rollout.position_TN3`; see `write_frames`.
+    """Writes `frames` as they are simulated, and stores them in `rollout.position_TN3`. Formats: see `save_rollout`.
 
-    USD and PLY are written at the end, or with the frames so far after Ctrl-C.
+    USD and PLY are written after the last frame; after Ctrl-C they contain the frames so far.
     """
     if path.suffix not in (*USD_ENDINGS, PLY_ENDING):
         write_frames(path, rollout, frames)
@@ -99,7 +99,7 @@ def require_exchange(path: Path, surface: bool) -> None:
 def fluid_surface(position_N3: np.ndarray, spacing: float) -> tuple[np.ndarray, np.ndarray]:
     """Returns the closed surface around a fluid's particles with this spacing: float64 [V, 3], int32 [F, 3].
 
-    splashsurf computes it by marching cubes on SPH's density field. Without particles it is empty.
+    splashsurf computes it by marching cubes on the density field of SPH. Without particles the surface is empty.
     """
     if not len(position_N3):
         return np.zeros((0, 3)), np.zeros((0, 3), np.int32)

@@ -44,8 +44,8 @@ def compare_picture(
 ) -> Image.Image:
     """Draws a grid with one column for each frame: the prediction in the first row, the ground truth in the last.
 
-    size is the width of a panel in pixels. label names the first row. others holds positions float32 [T, N, 3] of the
-    same particles from other simulations, by name. Each of them is a row between the two.
+    size is the width of a panel in pixels. label names the first row. others contains positions float32 [T, N, 3] of
+    the same particles from other simulations, by name. Each simulation is a row between the first and the last.
 
     Raises ConfigError if a frame lies outside the rollout or an entry of `others` has other particles.
     """
@@ -86,12 +86,12 @@ def animate(
 ) -> None:
     """Writes an animation of every `every`-th frame, with the prediction and the ground truth in adjacent panels.
 
-    path: a .gif or .webp file; WebP is half as large and keeps all colours. It plays in real time; GIF rounds the
-    duration of a picture to 1/100 s, WebP to 1/1000 s. size: width of a panel in pixels, None for 720 of one panel and
-    360 of several. progress: called with the number of pictures drawn and their total. label, others: as in
+    path: a .gif or .webp file; WebP is half as large and keeps all colours. The animation plays in real time; GIF
+    rounds the duration of a picture to 1/100 s, WebP to 1/1000 s. size: width of a panel in pixels; None: 720 for one
+    panel, 360 for several. progress: called with the number of pictures drawn and their total. label, others: as in
     `compare_picture`.
 
-    Raises: ConfigError as `animation_rate`, and if an entry of `others` has other particles.
+    Raises ConfigError as `animation_rate` does, and if an entry of `others` has other particles.
     """
     webp = Path(path).suffix == ".webp"
     rate = animation_rate(rollout, path, every)
@@ -294,7 +294,7 @@ class _Palette:
         chosen = Image.fromarray(np.concatenate(samples)[None], "RGB").quantize(free_colors).getpalette() or []
         exact = np.concatenate((flat, [TEXT_COLOR])).astype(np.uint8)
         self.colors = np.concatenate((exact, np.reshape(chosen, (-1, 3))[:free_colors].astype(np.uint8)))
-        # This table has the nearest colour for the upper six bits of each channel. The search of Pillow is coarser.
+        # This table contains the nearest colour for the upper six bits of each channel. Pillow's own search is coarser.
         center = np.stack(np.meshgrid(*[np.arange(64) * 4 + 1.5] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
         from scipy.spatial import KDTree
 
@@ -348,7 +348,7 @@ def _legend(picture: Image.Image, y: float, rollout: Rollout, text_size: int) ->
 def _write(
     picture: Image.Image, place: tuple[float, float], text: str, size: int, anchor: str = "mm", halo: int = 0
 ) -> None:
-    """Draws text. halo is the width in pixels of a border in the background colour, for text over obstacles."""
+    """Draws text. halo is the width in pixels of an outline in the background colour, for text over obstacles."""
     ImageDraw.Draw(picture).text(
         place,
         text,

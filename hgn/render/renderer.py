@@ -2,7 +2,7 @@
 
 A `Stage` is set up once for a domain and its obstacles (camera, floor, layers and shadows of obstacles) and then draws
 frame after frame. Particles are shaded sphere impostors, drawn from far to near. Each pixel keeps up to LAYERS obstacle
-surfaces by depth, and blends them with the particle before, between or behind them. It draws at twice the size.
+surfaces by depth, and blends them with its particle at the particle's depth. Pictures are drawn at twice their size.
 
 Shape legend: N particles, P pixels, S fragments (pixels of one triangle or sphere), F triangles, L layers.
 """
@@ -25,7 +25,7 @@ MATERIAL_COLORS = np.array([(0.13, 0.45, 0.86), (0.87, 0.60, 0.20), (0.70, 0.81,
 # These colours repeat for the other materials of imported sets.
 _FURTHER = np.array([(0.80, 0.29, 0.53), (0.93, 0.83, 0.30), (0.56, 0.42, 0.75), (0.45, 0.45, 0.48)], np.float32)
 _GLOSS = np.array((0.30, 0.06, 0.12, 0.20))
-PARTICLE_COLORS = np.concatenate([MATERIAL_COLORS, np.tile(_FURTHER, (64, 1))])[:256]  # by a rollout's material indices
+PARTICLE_COLORS = np.concatenate([MATERIAL_COLORS, np.tile(_FURTHER, (64, 1))])[:256]  # index: material of a rollout
 PARTICLE_GLOSS = np.concatenate([_GLOSS, np.full(256, 0.12)])[:256]
 OBSTACLE_COLOR = np.array((0.60, 0.58, 0.62), np.float32)
 BACKGROUND_COLOR = np.array((1.0, 1.0, 1.0), np.float32)
@@ -37,18 +37,18 @@ BOX_COLOR = (150, 156, 166)
 SUPERSAMPLING = 2
 LAYERS = 4
 OBSTACLE_OPACITY = 0.34
-CREASE_DEG = 35.0  # angle between faces below which a surface is shaded smoothly
+CREASE_DEG = 35.0  # an edge between two faces is a crease above this angle, and is shaded smoothly below it
 AZIMUTH_DEG, ELEVATION_DEG = 28.0, 20.0
 CAMERA_DISTANCE = 3.4  # in domain diagonals; a large distance gives a weak perspective
 LIGHT = np.array((-0.30, 1.0, 0.28)) / np.linalg.norm((-0.30, 1.0, 0.28))  # points towards the light
-SHADOW_CELLS = 160  # cells of the map on the floor along its longer side
+SHADOW_CELLS = 160  # number of cells of the floor's shadow map along the longer side
 FRAGMENTS_AT_ONCE = 2_000_000
 
 
 class Camera:
-    """Looks in perspective at the box [0, domain_size], y up, and fits it into a width of `size` pixels.
+    """Looks in perspective at the box [0, domain_size], y up, and fits the box into a width of `size` pixels.
 
-    `width` and `height` are those of the supersampled picture.
+    `width` and `height` are the sizes of the supersampled picture.
     """
 
     def __init__(self, domain_size: Vector, size: int) -> None:
@@ -116,7 +116,7 @@ class Stage:
         return self.camera.width // SUPERSAMPLING, self.camera.height // SUPERSAMPLING
 
     def draw(self, position_N3: np.ndarray, material_N: np.ndarray) -> Image.Image:
-        """Returns one frame as an RGB picture. Omits particles that are not finite or ten domains away."""
+        """Returns one frame as an RGB picture. Omits particles that are not finite or farther than ten domains away."""
         camera, position_N3 = self.camera, position_N3 - self.wall
         near = (np.abs(position_N3) < 10 * max(self.domain_size)).all(axis=1)
         position_N3, material_N = position_N3[near].astype(np.float64), material_N[near]
@@ -181,7 +181,7 @@ class Stage:
 
     def _obstacle_shade(self, normal_S3: np.ndarray) -> np.ndarray:
         facing_S3 = normal_S3 / np.maximum(np.linalg.norm(normal_S3, axis=1, keepdims=True), 1e-12)
-        # Sheets and unoriented meshes have no outer side. The side that is seen is lit.
+        # Sheets and unoriented meshes have no outer side, so the side towards the camera is lit.
         away_S = facing_S3 @ self.camera.axes[2] < 0
         facing_S3 = np.where(away_S[:, None], -facing_S3, facing_S3)
         return (0.62 + 0.55 * np.clip(facing_S3 @ LIGHT, -0.35, 1.0)).astype(np.float32)
@@ -201,7 +201,7 @@ class Stage:
             )
             crease = np.abs((normal[first] * normal[second]).sum(axis=-1)) < math.cos(math.radians(CREASE_DEG))
             edge[first] |= crease
-            # This is a second difference, because a steep plane has large first differences everywhere.
+            # A jump has a large second difference. First differences are large everywhere on a steep plane.
             inner = tuple(slice(1, -1) if a == axis else slice(None) for a in (0, 1))
             edge[inner] |= np.abs(np.diff(depth, 2, axis=axis)) > 6.0 / self.camera.scale * depth.min()
         self.layer_shade_LP[0, edge.ravel() & (triangle_P >= 0)] *= 0.45
@@ -209,7 +209,7 @@ class Stage:
     def _prepare_room(self, domain_size: Vector) -> None:
         """Draws floor and walls, without obstacles and shadows."""
         self.map_cell = max(domain_size[0], domain_size[2]) / SHADOW_CELLS
-        # The light is slanted, so that shadows of high particles fall beside the floor. The map omits them.
+        # The light is slanted, so shadows of high particles may fall beside the floor. The map omits these.
         self.map_shape = tuple(math.ceil(domain_size[axis] / self.map_cell) for axis in (2, 0))
         camera = self.camera
         ray_P3 = camera.rays()
@@ -263,7 +263,7 @@ class Stage:
         back = Image.fromarray(self.empty_P3.reshape(camera.height, camera.width, 3), "RGB")
         over, under = ImageDraw.Draw(front), ImageDraw.Draw(back)
         for a, b in BOX_EDGES:
-            # The nearest corner to the eye is number 7. Only its three edges lie in front of all particles.
+            # Corner 7 is nearest to the eye. Only its three edges lie in front of all particles.
             near = a.bit_count() == 2
             target, color = (over, (*BOX_COLOR, 120)) if near else (under, BOX_COLOR)
             target.line([tuple(xy[a]), tuple(xy[b])], fill=color, width=SUPERSAMPLING)

@@ -65,7 +65,7 @@ def _recorded(rollout: Rollout, every: int) -> Iterator[Any]:
 
 
 def film_html(rollout: Rollout, every: int = 2) -> str:
-    """Returns a page that plays every `every`-th frame without a server or a network: a megabyte plus the positions.
+    """Returns a page that plays every `every`-th frame without a server. Its size is 1 MB plus the positions.
 
     Raises ConfigError for `every` below 1, and ModuleNotFoundError without the extra `play`.
     """

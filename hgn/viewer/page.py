@@ -1,7 +1,7 @@
 """Serves the page of `hgn.play`: one session with its buttons, shared by any number of viewers.
 
 The page queues the actions of viewers and runs them between two frames, so that the server's event loop never waits for
-a frame. Of several moves of one obstacle only the last runs. The page holds the state for viewers who reconnect.
+a frame. Of several moves of one obstacle only the last runs. Viewers who reconnect see the present state.
 
 Viewers are not trusted: a raw message may contain any value. Values are clamped to the range of their sliders, weights
 must be in the list, and every error of an action becomes a message to its viewer.
@@ -65,7 +65,7 @@ class PlayPage:
         host: str = "127.0.0.1",
         port: int = 8080,
     ) -> None:
-        """Takes the names of `weights` to choose from. `load` makes a simulator of a name.
+        """Takes the names of `weights` that viewers can choose. `load` makes a simulator from such a name.
 
         Raises ConfigError for a host that is not an address of this machine.
         """
@@ -77,7 +77,7 @@ class PlayPage:
         self.stage = StageView(self.server, session.domain_size, spacing)
         self.ended, self.playing, self.steps = threading.Event(), True, 0
         self.diverged = False  # whether the page paused because the simulation diverged
-        self.limited = False  # whether the viewers know that this drag pours no more
+        self.limited = False  # whether viewers were told that this drag has reached the limit of particles
         self.viewed = threading.Event()  # set by the first viewer; the simulation waits for it
         self.actions: dict[object, tuple[Callable[[], Any], Any]] = {}
         self._queueing = threading.Lock()
@@ -304,7 +304,7 @@ class PlayPage:
                 place = self.session.free_place(size)
                 self.session.remember()
                 added = self.session.add_mesh(path, size, place)
-            except ConfigError as error:  # the viewer knows the file without its folder
+            except ConfigError as error:  # the message must not name the server's folder
                 raise ConfigError(str(error).replace(str(path), file)) from None
         self.chosen = added.body.number
 
@@ -342,8 +342,8 @@ class PlayPage:
     def _pour(self, origin_3: np.ndarray, direction_3: np.ndarray | None) -> None:
         """Opens the spout at the target of the ray, or closes it without a ray.
 
-        At the limit it stays closed until the next drag. Otherwise each motion of the mouse would be one more message,
-        and one more step of Undo.
+        At the limit of particles it stays closed until the next drag. Otherwise each motion of the mouse would cause
+        one more message, and one more step of Undo.
         """
         if direction_3 is None:
             self.session.spout, self.limited = None, False

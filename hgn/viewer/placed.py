@@ -34,7 +34,7 @@ _numbers = itertools.count()
 
 @dataclass(frozen=True, eq=False)
 class Body:
-    """Holds an obstacle about its own origin, not rotated or moved: the common part of all its places."""
+    """Holds an obstacle about its own origin, neither rotated nor moved, which all its places have in common."""
 
     entry: ObstacleEntry  # the position and the rotation of the entry are not used
     mesh: Obstacle
@@ -112,9 +112,9 @@ def placed_by(entry: ObstacleEntry, folder: Path, cell_size: float) -> PlacedObs
 
 
 def moved_from(before: PlacedObstacle, after: PlacedObstacle, frame_s: float) -> MovingObstacle | None:
-    """Returns the obstacle in motion between two places within one frame, at rest afterwards.
+    """Returns an obstacle that moves between two places within one frame, and is at rest afterwards.
 
-    Returns None at one place, and for a jump: a displacement of more than JUMP.
+    Returns None if the places are equal, and for a jump: a displacement of more than JUMP.
     """
     mesh, turn_33 = before.mesh(), after.rotation_33 @ before.rotation_33.T
     way_T3 = np.array([(0.0, 0.0, 0.0), np.subtract(after.position, before.position)])

@@ -19,7 +19,7 @@ from hgn.viewer.placed import PlacedObstacle
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """Holds the content of a frame. Particles keep their order, and later ones follow earlier ones."""
+    """Holds the content of a frame. Particles keep their order; those that enter later come after the earlier ones."""
 
     position_N3: np.ndarray  # float32, domain units
     velocity_N3: np.ndarray  # float32, domain units per frame
@@ -92,7 +92,7 @@ class Recording:
         return history_NM3
 
     def back_to(self, frame: int) -> None:
-        """Forgets all frames after one, and the particles that entered in them."""
+        """Deletes all frames after `frame`, and the particles that entered in them."""
         while self.last > frame:
             self.bytes -= self.frames.pop().bytes
         count = len(self[frame].position_N3)
@@ -127,7 +127,7 @@ class Recording:
 
 
 def _motion(path: list[tuple[int, PlacedObstacle]], frame_rate_hz: float) -> Motion | None:
-    """Returns the motion through the places of an obstacle in some frames, or None if all places are equal."""
+    """Returns an obstacle's motion through its places by frame, or None if all places are equal."""
     keys = {0: path[0][1]}
     for (_, before), (index, after) in pairwise(path):
         if (before.position, before.rotation) != (after.position, after.rotation):

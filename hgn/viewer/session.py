@@ -30,11 +30,11 @@ from hgn.schema import ConfigError, Vector, from_mapping, require, to_mapping
 from hgn.viewer.placed import Body, PlacedObstacle, moved_from, placed_by, with_obstacles
 from hgn.viewer.recording import Frame, Recording
 
-CLEARANCE = 1.25  # in spacings of particles at rest; no particle of a ball enters nearer to another particle
+CLEARANCE = 1.25  # least distance of an entering particle from all others, in spacings of particles at rest
 MAXIMUM_GRAVITY = 1000.0  # domain units per second squared
 MAXIMUM_OBSTACLES, MAXIMUM_MESH_BYTES = 64, 128 << 20  # bytes of files, including those of obstacles in past frames
 CHANGES = 100  # largest number of changes that can be undone
-FULL_SHARE = 0.5  # the spout waits while more than this fraction of the particles of one frame are still at it
+FULL_SHARE = 0.5  # the spout waits while more than this fraction of the particles of one frame are still near it
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,7 @@ class PlaySession:
         keep_bytes: int = 1 << 30,
         weights: str = "",
     ) -> None:
-        """Takes a scene file's scene and the `folder` of its meshes. Keeps `keep_bytes` of past frames for going back.
+        """Takes a scene file's scene and the `folder` of its meshes. Keeps past frames of at most `keep_bytes`.
 
         Raises ConfigError for a scene that the weights do not support, or for more than `maximum_particles`.
         """
@@ -166,7 +166,7 @@ class PlaySession:
         self._before = [*self._before[1 - CHANGES :], (self.frame, self.obstacles, self.gravity)]
 
     def undo(self) -> None:
-        """Goes back to the time before the last change, or to the earliest frame kept. Raises: ConfigError if none."""
+        """Goes back to before the last change, or to the earliest frame kept. Raises ConfigError without a change."""
         self._before = [before for before in self._before if before[0] <= self.frame]
         require(bool(self._before), "undo", "used after a change", "none")
         frame, obstacles, gravity = self._before.pop()
@@ -178,9 +178,9 @@ class PlaySession:
     # particles that enter
 
     def drop(self, material: str, position: Vector, diameter: float, speed: float = 0.0) -> int:
-        """Adds a ball that moves down, without particles near others. Returns the number of particles that entered.
+        """Adds a ball that moves down, without those of its particles that would be near others. Returns their number.
 
-        Raises ConfigError for a material that the weights do not know.
+        Raises ConfigError for a material that the weights do not support.
         """
         spout = Spout(position, material, diameter, speed)
         region = Region(self._inside(position, 0.5 * diameter), radius=0.5 * diameter)
@@ -189,7 +189,7 @@ class PlaySession:
         return self._enter(position_C3[self._free(position_C3)], spout)
 
     def _pour(self, spout: Spout) -> None:
-        """Adds the particles that leave a spout in one frame, as dense as the material at rest."""
+        """Adds the particles that leave a spout in one frame, with the density of the material at rest."""
         length = spout.speed / self.simulator.frame_rate_hz
         radius = 0.5 * spout.diameter
         centre = self._inside(spout.position, radius, 0.5 * length)
@@ -269,7 +269,7 @@ class PlaySession:
     def free_place(self, size: float) -> Vector:
         """Returns the centre of a free cube in the domain, as near as possible to its middle at 0.3 of its height.
 
-        Raises: ConfigError where there is none.
+        Raises ConfigError if there is none.
         """
         surfaces = (obstacle.samples[0] for obstacle in self.obstacles)
         taken_A3 = np.concatenate([self.newest.position_N3, *surfaces])
@@ -297,7 +297,7 @@ class PlaySession:
         self._set_obstacles(tuple(o for o in self.obstacles if o.body.number != number))
 
     def _set_obstacles(self, obstacles: tuple[PlacedObstacle, ...], before: tuple[PlacedObstacle, ...] = ()) -> None:
-        """Replaces the obstacles. With weights that see motion, those at other places than in `before` move there."""
+        """Replaces the obstacles. With weights that use `moving`, obstacles move from their places in `before`."""
         moving = {}
         if before and "moving" in self.simulator.network.config.own_physics:
             places = {obstacle.body.number: obstacle for obstacle in before}

@@ -40,8 +40,8 @@ from hgn.schema import require
 
 COOKIE = "hgn_play"
 MAXIMUM_UNFINISHED_BYTES = 128 << 20  # bytes of the incomplete uploads of all viewers
-UPLOAD_BYTES, PART_BYTES = 1 << 20, 200  # least bytes by which an upload and each of its parts count
-MOST_OPENING = 64  # connections that have not shown the token; further ones close the oldest
+UPLOAD_BYTES, PART_BYTES = 1 << 20, 200  # bytes that are added for each upload and each of its parts
+MOST_OPENING = 64  # number of connections without the token; a further one closes the oldest
 MAXIMUM_MESSAGE_BYTES = 1 << 20  # bytes of a message from a viewer; parts of uploads have 512 KiB
 LONGEST_TEXT, LARGEST_NUMBER = 1000, 2**53  # characters of a text in a message; largest integer of a browser
 REFUSAL = b"open the address that hgn.play printed, with its token\n"
@@ -50,18 +50,18 @@ SENT = (
     *(messages.FileTransferStartUpload, messages.FileTransferPart, messages.ViewerCameraMessage),
 )  # messages that viewers may send, in addition to values of controls
 Process = Callable[[Any, Request], Response | None]
-# Viser keeps each broadcast under its key. It had a key for each part of each upload, and would keep them all.
+# Viser stores each broadcast under a key. Each part of an upload has its own key, so Viser would store all of them.
 messages.FileTransferPartAck.redundancy_key = (  # type: ignore[method-assign]
     lambda ack: f"{type(ack).__name__}-{zlib.crc32(ack.transfer_uuid.encode()) % 64}"  # type: ignore[assignment]
 )
-# Viser warns of values with a wrong length, and Python keeps each text for ever. `is_sent` drops such messages.
+# Viser warns of values with a wrong length, and Python stores the text of each warning. `is_sent` drops such messages.
 for module in (infra._messages, _gui_api):
     module.warnings = SimpleNamespace(warn=lambda *_, **__: None)  # type: ignore[attr-defined]
 _consume = infra._infra._message_consumer
 
 
 async def _message_consumer(*arguments: Any) -> None:
-    """Handles a viewer's messages. Bytes that are none close the connection, without a trace in the log."""
+    """Handles a viewer's messages. Invalid bytes close the connection without a traceback in the log."""
     try:
         await _consume(*arguments)
     except Exception:  # noqa: BLE001 - they may contain any value
@@ -110,7 +110,7 @@ def start_server(host: str, port: int, label: str) -> tuple[viser.ViserServer, s
 
 
 def shedding() -> type[ServerConnection]:
-    """Returns a class of connections. Strangers who only open some would take all files of the process."""
+    """Returns a class of connections that limits those without a token: they could use up the process's open files."""
     opening: deque[ServerConnection] = deque()
 
     class Shedding(ServerConnection):
@@ -124,7 +124,7 @@ def shedding() -> type[ServerConnection]:
 
 
 def admitting(handle: Callable[..., Any], gui: GuiApi) -> Callable[..., Any]:
-    """Drops messages that the controls do not send. Viser would set any attribute of a control for all viewers."""
+    """Drops messages that the page's controls cannot send. Viser would set any attribute of a control they name."""
 
     async def answer(client: int, message: Any) -> None:
         if is_sent(message, gui._gui_input_handle_from_uuid):
@@ -160,7 +160,7 @@ def is_short(value: Any) -> bool:
     """Returns whether a field of a message is bounded and finite. The size of bytes is bounded by `bounded`."""
     if isinstance(value, tuple):
         return len(value) <= 4 and all(map(is_short, value))
-    if isinstance(value, int):  # larger ones cannot be sent to the other viewers
+    if isinstance(value, int):  # larger integers cannot be sent to the other viewers
         return abs(value) <= LARGEST_NUMBER
     if isinstance(value, float):
         return math.isfinite(value)
@@ -218,7 +218,7 @@ def guarded(process: Process, token: str) -> Process:
         tokens += parse_qs(request.path.partition("#")[0].partition("?")[2]).get("token", [])
         own = {f"{scheme}://{host}".lower() for host in request.headers.get_all("Host") for scheme in ("http", "https")}
         foreign = any(origin.lower() not in own for origin in request.headers.get_all("Origin"))
-        # bytes that are no text are lone surrogates here
+        # bytes that are not valid text have become lone surrogates here
         if foreign or not any(hmac.compare_digest(value.encode(errors="replace"), token.encode()) for value in tokens):
             headers = Headers({"Content-Type": "text/plain", "Content-Length": str(len(REFUSAL))})
             return Response(http.HTTPStatus.FORBIDDEN, "Forbidden", headers, REFUSAL)
