@@ -137,7 +137,7 @@ def _reference_row(reference: dict[str, Any] | None) -> dict[str, str]:
 
 
 def _kind_rows(kinds: Mapping[str, float]) -> dict[str, str]:
-    """Returns a row for each kind of scene: its share, and the range of each number that it draws."""
+    """Returns a row for each kind of scene: its fraction of the scenes, and the range of each number that it draws."""
     total = sum(kinds.values())
     return {
         f"kind {kind}": f"{share / total:.1%}; "

@@ -53,9 +53,8 @@ Main = Callable[[dict[str, Any]], int | None]
 def run_command(main: Main | str, config_name: str) -> NoReturn:
     """Composes `conf/<config_name>.yaml` with the command line, calls `main` with the plain mapping, and exits.
 
-    `main` may be the name of the module with this function, which is then loaded after the configuration.
-
-    The file of a command without config groups lies in `conf/command/`. Otherwise Hydra would take its keys
+    `main` may be the name of the module that contains it, which is then loaded after the configuration. The file of a
+    command without config groups lies in `conf/command/`. Elsewhere Hydra would take the command's keys
     (`scene=my_scene.yaml`) for choices of a group.
 
     Hydra's options (--cfg, --config-path, --config-name, --multirun) work. --help prints keys, values and comments.
@@ -88,12 +87,12 @@ def run_command(main: Main | str, config_name: str) -> NoReturn:
 
 
 class _Messages(io.FileIO):
-    """Writes standard error. Messages that a full disk or a closed terminal does not take are lost, and end no work."""
+    """Writes standard error. Messages that a full disk or a closed terminal refuses are lost without an error."""
 
     def write(self, data: Any) -> int:
         try:
             return super().write(data) or 0
-        except BrokenPipeError:  # nobody reads: see `_unread`
+        except BrokenPipeError:  # no reader: see `_unread`
             raise
         except OSError:
             return len(data)
@@ -125,7 +124,7 @@ def _exit_code(main: Main | str, config_name: str) -> int:
         remedy = _MACHINE_ERRORS.get(error.errno or 0, "check the disk and its network")
         code = EXIT_INPUT if error.errno == errno.ENAMETOOLONG else EXIT_MACHINE
         text = f"{error.strerror or error}{place}; {remedy} and run the same command again"
-        code = _fail(str(ConfigError(text)), code)  # which is short
+        code = _fail(str(ConfigError(text)), code)  # ConfigError shortens the text
     except (MemoryError, RuntimeError, ImportError) as error:
         if not memory_is_full(error):
             raise
@@ -136,7 +135,7 @@ def _exit_code(main: Main | str, config_name: str) -> int:
 
 
 def _is_own_fault(error: OSError) -> bool:
-    """Returns whether this program caused an error: a missing file in a folder that is there, and is no link.
+    """Returns whether this program caused an error: a missing file, not a broken link, in an existing folder.
 
     Folders without blocks, such as /proc, take no new files.
     """

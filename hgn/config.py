@@ -1,5 +1,5 @@
 """Settings shared by the commands, as dataclasses. Hydra composes YAML; the dataclasses validate it once per command.
-Settings of one command are at the top of its file.
+Settings that only one command has are at the top of that command's file.
 
 Other code sees only dataclasses, never a DictConfig. Numbers that follow from settings are properties.
 """
@@ -325,7 +325,7 @@ class NetworkConfig:
 
     @property
     def relative(self) -> bool:
-        """Returns whether inputs are relative. Then they do not depend on a motion common to all particles."""
+        """Returns whether inputs do not depend on a motion that all particles have in common."""
         return self.inputs != "absolute"
 
     @property

@@ -144,8 +144,8 @@ def _at_frames(mse_T: np.ndarray, frames: list[int]) -> dict[str, float]:
 
 
 def end_of_rollout(trial: RolloutResult, episode: Episode) -> dict[str, Any]:
-    """Returns properties of a rollout's last frame, and the cause of an early end.
-    They are the fractions of particles in closed obstacles, also in the data, and outside of the domain."""
+    """Returns the fractions of particles in closed obstacles and outside of the domain in a rollout's last frame, the
+    former also in the data, and the cause of an early end."""
     from hgn.scene.episode_obstacles import obstacles_of_episode
 
     obstacles, last = obstacles_of_episode(episode), trial.frame_count - 1

@@ -97,7 +97,7 @@ def main(mapping: dict[str, Any]) -> int:
         print(config.arrays)
     if config.onnx is not None or config.package is not None:
         program = traced_step(network, info)
-    if config.package is not None:  # first: the ONNX export leaves symbols in the graph that the compiler refuses
+    if config.package is not None:  # before the ONNX export, whose symbols in the graph the compiler refuses
         write_package(Path(config.package), program, info)
         print(config.package)
     if config.onnx is not None:
@@ -109,7 +109,7 @@ def main(mapping: dict[str, Any]) -> int:
 def export(checkpoint_path: Path, out: Path, stored_precision: str = "fp32", **step_changes: Any) -> None:
     """Writes a checkpoint's network as weights. `step_changes`, fields of StepConfig, replace the network's own.
 
-    Raises ConfigError if the checkpoint is missing or of another program, or if its network refuses the changes.
+    Raises ConfigError if the checkpoint is missing or of another program, or if its network does not allow the changes.
     """
     from hgn.runtime.weights import WeightsInfo, save_weights
     from hgn.system.provenance import provenance

@@ -39,7 +39,7 @@ def compose(folder: Path, config_name: str, arguments: list[str], complete: bool
     """Returns the composed configurations as plain containers, several with --multirun. `arguments` are as `sys.argv`.
 
     A file whose `defaults` name a dataclass, as hgn.config.NetworkConfig, starts with the defaults of this class.
-    Hydra's own entry point composes twice and reads its callers' sources. It is used only for Hydra's options.
+    Hydra's own entry point is slow: it composes twice and reads its callers' sources. Only Hydra's options need it.
     Raises ConfigError, also for a missing key if the configuration must be `complete`.
     """
     from hydra import compose as compose_once
@@ -58,21 +58,21 @@ def compose(folder: Path, config_name: str, arguments: list[str], complete: bool
             sys.argv = _with_quiet(arguments)
             os.environ["HYDRA_FULL_ERROR"] = "1"  # otherwise Hydra would print the error and exit
             with _strict_files(), registered_dataclasses(folder, config_name), warnings.catch_warnings():
-                warnings.simplefilter("error", UserWarning)  # of folders that do not exist
+                warnings.simplefilter("error", UserWarning)  # Hydra warns of folders that do not exist
                 hydra_main(version_base="1.3", config_path=str(folder), config_name=config_name)(composed.append)()
         else:
             here = initialize_config_dir(str(folder), version_base="1.3")
             with _strict_files(), registered_dataclasses(folder, config_name), here:
                 composed.append(compose_once(config_name, arguments[1:]))
         plain = [OmegaConf.to_container(config, resolve=True, throw_on_missing=complete) for config in composed]
-    except SystemExit as end:  # Hydra ends with 1 after a line about a package that is missing
+    except SystemExit as end:  # Hydra ends with 1 after a message about a missing package
         sys.exit(2 if end.code else 0)
     except MissingMandatoryValue as error:
         raise ConfigError(f"{error.full_key} is missing; it must be given, as in {error.full_key}=…") from error
-    except (HydraException, OmegaConfBaseException, ValueError, UserWarning, yaml.YAMLError) as error:  # some by Hydra
+    except (HydraException, OmegaConfBaseException, ValueError, UserWarning, yaml.YAMLError) as error:  # by Hydra
         text = " ".join(str(error).split("Config search path:")[0].split())
         raise ConfigError(text or _unread(arguments, error)) from error
-    except (TypeError, LookupError, AttributeError, AssertionError) as error:  # Hydra's own, of lists and their places
+    except (TypeError, LookupError, AttributeError, AssertionError) as error:  # Hydra's faults with lists' items
         raise ConfigError(_unread(arguments, error)) from error
     except RecursionError:
         raise ConfigError("defaults must not lead back to the same file, got a loop of them") from None
@@ -95,7 +95,7 @@ def _strict_files() -> Iterator[None]:
     from hydra._internal.sources_registry import SourcesRegistry
     from hydra.core.plugins import Plugins
 
-    Plugins.instance()  # which fills the registry
+    Plugins.instance()  # fills the registry
     files: Any = SourcesRegistry.instance().resolve("file")
     load = files.load_config
 
@@ -116,7 +116,7 @@ def _strict_files() -> Iterator[None]:
 
 
 def _check_options(arguments: list[str]) -> None:
-    """Refuses wrong values of Hydra's options, about which Hydra would print a page. Raises ConfigError."""
+    """Raises ConfigError for wrong values of Hydra's options, for which Hydra would print a whole page."""
     from hydra._internal.utils import get_args_parser
 
     parser = get_args_parser()
@@ -152,7 +152,7 @@ def _load(name: str) -> type:
 def registered_dataclasses(folder: Path, config_name: str) -> Iterator[None]:
     """Registers the dataclasses that config files name with Hydra, under these names.
 
-    Hydra's store is global. Without a change the groups of another command would be groups of this one.
+    Hydra's store is global, so it is restored at the end. Otherwise the next command would have these groups too.
     """
     from hydra.core.config_store import ConfigStore
 

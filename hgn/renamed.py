@@ -1,4 +1,4 @@
-"""Settings of earlier releases. This table answers their names on command lines, and lets old files load.
+"""Settings of earlier releases: errors for their names on command lines, and conversion of old files.
 
 | what changed | table | on a command line | in checkpoints, weights and manifests |
 |---|---|---|---|
@@ -26,8 +26,8 @@ ANY = object()
 class Removed:
     """The value that a removed setting always has now, and the remedy for its use.
 
-    With ANY a setting has no fixed value, and stored files load with any value. So do files with a section in which the
-    setting has no effect.
+    With ANY a setting has no fixed value, and stored files load with any value. Files also load if other settings of
+    the section make the setting ineffective.
     """
 
     value: Any = ANY
@@ -48,7 +48,7 @@ def _rests(network: Mapping[str, Any]) -> bool:
 
 
 def _rests_otherwise(network: Mapping[str, Any]) -> bool:
-    """Returns whether the materials that rest on larger cells are not exactly those with friction."""
+    """Returns whether the materials that rest on larger cells are other than all except water."""
     materials = set(network.get("materials", ()))
     large = network.get("rest_large_materials")
     return _rests(network) and (materials if large is None else set(large)) != materials - {"water"}

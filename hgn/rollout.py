@@ -1,6 +1,6 @@
 """python -m hgn.rollout: simulates a random scene, or the scene of scene=…, and draws pictures.
 
-The weights are shipped ones, or those of weights=…. The result is a VTKHDF file with pictures beside it.
+The weights are shipped ones, or those of weights=…. The result is a VTKHDF file, with pictures in the same folder.
 """
 
 from __future__ import annotations
@@ -44,9 +44,9 @@ if TYPE_CHECKING:
     from hgn.scene.rollout_file import Rollout
 
 PICTURES = 4  # number of pictures in the PNG
-EVERY = 3  # frames of the rollout for one picture of the GIF, or more
-FASTEST = 50  # pictures a second that viewers of GIFs keep
-SAME_SPEED = 1e-5  # relative difference of equal speeds, because velocities are stored in float32
+EVERY = 3  # smallest number of frames of the rollout for one picture of the GIF
+FASTEST = 50  # largest number of pictures per second that viewers of GIFs show
+SAME_SPEED = 1e-5  # largest relative difference of speeds that count as equal; velocities are stored in float32
 
 
 @dataclass(frozen=True)
@@ -179,7 +179,7 @@ def rollout(config: RolloutConfig) -> tuple[Path, Rollout]:
 
 
 def _shown(simulated: Iterator[np.ndarray], count: int) -> Generator[np.ndarray]:
-    """Yields frames, and shows their number."""
+    """Yields the frames, and shows a progress bar."""
     with bar("simulating", total=count, unit="frame") as progress:
         for position_N3 in simulated:
             yield position_N3

@@ -25,13 +25,14 @@ from hgn.renamed import KEYS, current_names, removed_remedy, renamed_remedy, val
 from hgn.system.files import is_replaceable
 
 T = TypeVar("T")
-# of terminals and text direction, and halves of characters, except those that stand for bytes of file names
+# control characters of terminals and text direction, and surrogates, except those that stand for bytes of file names
 _CONTROL = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069\ud800-\udc7f\udd00-\udfff]")
-# digits after the colon of an address are a port, and a space begins words; passwords may have spaces, slashes and @
+# After a colon, digits are a port and a space begins a sentence; anything else is a password, which may contain spaces,
+# slashes and @.
 _COLON, _MOST = r":(?=\S)(?!\d+(?:[\s/?#,;)'\"]|$))", "{1,2000}"
 _USER = rf"[^/\s?#]{_MOST}|[^/:@'\"]{_MOST}{_COLON}(?:(?!://)[^@]){_MOST}|[^\s/:@]{_MOST}{_COLON}[^\s@]{_MOST}"
 _SECRET = r"(?:sig|token|secret|pass|pwd|cred|auth|jwt)[\w.-]*|key(?:_?id)?|code"
-_SECRETS = (  # patterns, and what stays of each: users of URLs and of addresses without a scheme, and signatures
+_SECRETS = (  # pattern and replacement: for users of URLs and of addresses without a scheme, and for signatures
     (rf"(\w://)(?:{_USER})?@", r"\1"),
     (rf"((?:^|['\"=])(?![\w+]+://))[^\s'\"/:@]{_MOST}:(?![\s/])[^'\"@]{_MOST}@(?=[\w\[])", r"\1"),
     (rf"(?<![\w@.])[\w.+-]{_MOST}:[^\s@/:]{_MOST}@(?=[\w\[])", ""),
@@ -67,8 +68,8 @@ OneOrMore = AtLeastOne[int]
 Port = Annotated[int, Bound("0 to 65535", lambda value: 0 <= value < 65536)]
 FolderName = Annotated[str, Bound("a folder name", bool)]
 _REPLACEABLE = Bound("a new file, or one that HGN wrote", lambda name: is_replaceable(Path(name)))
-FileName = Annotated[str, Bound("a file name", lambda name: Path(name).name != ""), _REPLACEABLE]  # of an output
-PATH_RULE = "a path of at most 4,095 bytes, 255 in each name"  # of file systems
+FileName = Annotated[str, Bound("a file name", lambda name: Path(name).name != ""), _REPLACEABLE]  # an output file
+PATH_RULE = "a path of at most 4,095 bytes, 255 in each name"  # limits of file systems
 
 
 def is_path(text: str) -> bool:
@@ -88,13 +89,13 @@ FrameRate = Annotated[float, Bound("from 0.001 to 1e6", lambda value: 1e-3 <= va
 FewLayers = Annotated[Positive[int], Bound("at most 1,000", lambda value: value <= 1_000)]
 
 
-_shown = reprlib.Repr()  # a file's value may have millions of items, and by references 10^12
+_shown = reprlib.Repr()  # a file's value may have millions of items, and with YAML's references 10^12
 _shown.maxlevel, _shown.maxstring, _shown.maxlong, _shown.maxother = 4, 300, 60, 300
 _shown.maxlist = _shown.maxtuple = _shown.maxdict = _shown.maxset = 12
 
 
 class ConfigError(ValueError):
-    """An invalid value: the message names field, rule, value and remedy, as `printable`; long ones without a middle."""
+    """An invalid value. The message names field, rule, value and remedy; it is `printable`, and shortened if long."""
 
     def __init__(self, message: str) -> None:
         message = printable(message)
@@ -102,7 +103,7 @@ class ConfigError(ValueError):
 
 
 def printable(text: str) -> str:
-    """Returns a text for terminals and pages: no users, passwords and signatures of URLs, no control characters."""
+    """Returns a text for terminals and pages, without URLs' users, passwords and signatures, and control characters."""
     for pattern, kept in _SECRETS:
         text = re.sub(pattern, kept, text)
     return "".join(c if c.isprintable() or c == "\n" else repr(c)[1:-1] for c in text)
@@ -144,7 +145,7 @@ def from_mapping(cls: type[T], mapping: object, path: _Path = "") -> T:
 
 @functools.cache
 def _fields(cls: type) -> tuple[dict[str, Any], dict[str, bool]]:
-    """Returns the types of a dataclass's fields, and whether each is required. Cached, because it is slow."""
+    """Returns the types of a dataclass's fields, and whether each is required. It is slow, so results are cached."""
     given = {field.name: field for field in dataclasses.fields(cls) if field.init}
     missing = dataclasses.MISSING
     return typing.get_type_hints(cls), {
@@ -169,7 +170,7 @@ def from_stored(cls: type[T], mapping: object, section: str) -> T:
 
 
 def known_keys(key: str, names: Iterable[str], what: str = "known keys") -> str:
-    """Returns the remedy for an unknown key: a similar key, or else all keys. `what` is the name of other names."""
+    """Returns the remedy for an unknown key: a similar key, or else all keys. `what` is what a message calls them."""
     names = list(names)
     close = difflib.get_close_matches(key, names, n=1)
     return f"did you mean {close[0]}?" if close else f"{what}: {', '.join(names)}"

@@ -46,7 +46,7 @@ def main(mapping: dict[str, Any]) -> int:
     config = from_mapping(TrainConfig, settings_of_imported(mapping))
     require_replaceable("run", Path(config.run) / "config.yaml")
     if not first_on_machine():
-        # This ends the rank at the end of the process that started it, without a time-out.
+        # If the process that started this rank ends, the rank ends at the same time, not only after a time-out.
         die_with_parent(signal.SIGKILL)
     layout(config.training)
     for i, logger in enumerate(config.training.loggers):
@@ -89,9 +89,9 @@ def main(mapping: dict[str, Any]) -> int:
 
 
 def _checkpoint_to_resume(config: TrainConfig, folder: Path) -> Resume | None:
-    """Returns the run's last whole checkpoint, or None without any checkpoint. Call it before anything is started.
+    """Returns the run's last undamaged checkpoint, or None without any. Call it before other processes start.
 
-    Raises DamagedError if there are checkpoints and none is whole.
+    Raises DamagedError if all checkpoints are damaged.
     """
     from hgn.data.identity import dataset_identity, identity_hash
     from hgn.data.manifest import Manifest
