@@ -17,9 +17,9 @@ PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
     "hgn": 33_151,
-    "datagen": 8_497,
+    "datagen": 9_041,
     "tools": 6_214,
-    "tests": 31_988,
+    "tests": 32_146,
 }
 SETTINGS = 240  # fields of the dataclasses behind the commands, *Config
 

@@ -9,6 +9,7 @@ from collections import namedtuple
 
 import taichi as ti
 
+from datagen.mpm.body_kernel import move_bodies
 from datagen.mpm.layout import BLOCK_NODES, CONSTANT, COUNT, SETTING, SHAPE, STATUS, VALUE, VARIANT, has_solid
 from datagen.mpm.mls_mpm import (
     Integers,
@@ -26,7 +27,7 @@ from datagen.mpm.mls_mpm import (
     settles,
 )
 from datagen.mpm.multiple_time_stepping import acts, change_of, mark_changed, own_step
-from datagen.mpm.nodes import ghost_place, interpolate, interpolate_hidden, mark, node_places, weights
+from datagen.mpm.nodes import ghost_place, interpolate, interpolate_hidden, mark, node_places, second_field, weights
 from datagen.mpm.time_step import choose_time_step, falls, raise_maximum
 from hgn.scene.material import MATERIAL_BITS, MATERIAL_MASK, SAND, WATER
 
@@ -36,7 +37,7 @@ GridArrays = namedtuple(
     [
         "position", "velocity", "affine", "deformation", "volume", "strained", "covered", "spread",
         "response", "label", "law_row", "hidden", "scene_value", "counter", "setting", "law", "shape", "node",
-        "gain", "fallen", "block", "contact", "contact_normal", "variant",
+        "gain", "fallen", "block", "contact", "contact_normal", "pose", "variant",
     ],
 )  # fmt: skip
 
@@ -57,8 +58,7 @@ def _particle_to_grid(p: ti.i32, copy: ti.i32, scene: ti.i32, step: ti.f32, arra
     hidden_here = 0
     if ti.static(bool(arrays.variant & VARIANT.sheets)):
         if begins == 1.0:
-            elapsed = arrays.scene_value[scene, VALUE.part] - arrays.scene_value[scene, VALUE.remaining] - step
-            arrays.hidden[p] = find_hidden(arrays.position[p], scene, elapsed, arrays)
+            arrays.hidden[p] = find_hidden(arrays.position[p], scene, arrays)
         hidden_here = arrays.hidden[p]
     marks = 3 * arrays.shape[SHAPE.all_blocks] + 2
     A = ti.Matrix.zero(ti.f32, 3, 3)
@@ -179,7 +179,7 @@ def substep(
     strained: Scalars, covered: Scalars, spread: Integers, response: Matrices, label: Integers, law_row: Integers,
     hidden: Integers, scene_value: ti.types.ndarray(dtype=ti.f32, ndim=2),
     counter: ti.types.ndarray(dtype=ti.i64, ndim=2), setting: Scalars, law: Scalars, shape: Integers, node: Nodes,
-    gain: Nodes, fallen: Scalars, block: Integers, contact: Integers, contact_normal: Vectors,
+    gain: Nodes, fallen: Scalars, block: Integers, contact: Integers, contact_normal: Vectors, pose: Scalars,
     variant: ti.template(),
 ):  # fmt: skip
     """Advances every scene with remaining time by one substep of its own length.
@@ -198,15 +198,19 @@ def substep(
     contact  entry of each node or -1: the place of its vectors in `contact_normal` (see surface_kernel.NODE_VECTORS),
              and if below SHAPE.ghosts the place of its second field after SHAPE.ghost_begin. Then for each base node
              the begin of its list of triangles in `contact`, or -1; then these lists with their heads (see
-             surface_kernel.LIST_HEAD), which contain places of triangles' vectors in `contact_normal`
+             surface_kernel.LIST_HEAD), which contain places of triangles' vectors in `contact_normal`. Then the
+             moving obstacles (see body_arrays)
+    pose     numbers of moving obstacles (see layout.BodyState)
     """
     arrays = ti.static(GridArrays(
         position, velocity, affine, deformation, volume, strained, covered, spread, response, label, law_row,
         hidden, scene_value, counter, setting, law, shape, node, gain, fallen, block, contact, contact_normal,
-        variant,
+        pose, variant,
     ))  # fmt: skip
     for scene in range(scene_value.shape[0]):
         choose_time_step(scene, scene_value, counter, setting, shape[SHAPE.maximum_substeps])
+        if ti.static(bool(variant & VARIANT.moving)):
+            move_bodies(scene, arrays)
         if scene_value[scene, VALUE.time_step] > 0.0 and scene_value[scene, VALUE.begins] == 1.0:
             block[3 * shape[SHAPE.all_blocks]] = 0
             block[3 * shape[SHAPE.all_blocks] + 1] = 1
@@ -257,15 +261,17 @@ def substep(
             gravity_time = scene_value[scene, VALUE.gravity_time]
             fallen_before = scene_value[scene, VALUE.fallen]
             entry = -1
+            second = -1
             node_fields = 1
             if ti.static(bool(variant & VARIANT.contact)):
                 entry = contact[place]
-                if entry >= 0 and entry < shape[SHAPE.ghosts]:
+                second = second_field(place, scene, arrays)
+                if second >= 0:
                     node_fields = 2
             for field in range(node_fields):
                 own = place
                 if field == 1:
-                    own = shape[SHAPE.ghost_begin] + entry
+                    own = shape[SHAPE.ghost_begin] + second
                 before = ti.Vector([0.0, 0.0, 0.0, 0.0])
                 ahead = 0.0
                 if not begins:
@@ -331,20 +337,15 @@ def enter(
 
 
 @ti.kernel
-def begin_part(
-    part_s: ti.f32,
-    age_s: Scalars,
-    first: ti.i32,
+def begin_frame(
+    frame_s: ti.f32,
+    end_s: ti.f32,
     scene_value: ti.types.ndarray(dtype=ti.f32, ndim=2),
     counter: ti.types.ndarray(dtype=ti.i64, ndim=2),
 ):
-    """Gives every running scene the time of a part of a frame. The first part resets the frame's count of substeps.
-
-    age_s    time from each scene's last build of its contacts to the part's begin
-    """
+    """Gives every running scene the time of a frame that ends at `end_s`."""
     for scene in range(scene_value.shape[0]):
-        if first == 1:
-            counter[scene, COUNT.frame_substeps] = ti.cast(0, ti.i64)
+        counter[scene, COUNT.frame_substeps] = ti.cast(0, ti.i64)
         if counter[scene, COUNT.status] == STATUS.running:
-            scene_value[scene, VALUE.remaining] = part_s
-            scene_value[scene, VALUE.part] = part_s + age_s[scene]
+            scene_value[scene, VALUE.remaining] = frame_s
+            scene_value[scene, VALUE.frame_end] = end_s

@@ -19,6 +19,7 @@ from datagen.mpm.layout import (
     BLOCK_NODES,
     CONSTANT,
     COUNT,
+    KEY,
     MATERIAL_VARIANTS,
     REPORTED,
     SETTING,
@@ -40,12 +41,11 @@ import taichi as ti  # isort: skip
 
 from datagen.mpm.surface_kernel import (  # isort: skip
     LIST_HEAD,
-    MOVING_NODE_VECTORS,
-    MOVING_TRIANGLE_VECTORS,
     NODE_VECTORS,
     TRIANGLE_VECTORS,
     place_contacts,
 )
+from datagen.mpm.body_arrays import body_arrays, list_begins, triangle_lists, triangle_vectors  # isort: skip
 
 MAXIMUM_BLOCKS = 1024  # blocks along an axis; kernels store the number in ten bits
 
@@ -126,8 +126,13 @@ class Launch(ABC):
         self.scene_nodes = math.prod(self.blocks) * BLOCK_NODES
         # second fields of nodes come last, in separate blocks
         self.ghosts = sum(int(collider.doubled_K.sum()) for collider in colliders)
-        self.moving = any(scene.moves for scene in scenes)
-        ghost_room = self.scene_nodes * len(scenes) if self.moving and self._has_sheets() else self.ghosts
+        bodies = [body for collider in colliders for body in collider.bodies]
+        ghost_room = self.ghosts
+        self.second_fields = np.full(len(scenes), -1, np.int32)  # first one of each scene with moving sheets
+        for index, collider in enumerate(colliders):
+            if not all(body.closed for body in collider.bodies):
+                self.second_fields[index] = ghost_room
+                ghost_room += self.scene_nodes
         self.all_blocks = len(scenes) * math.prod(self.blocks) + -(-ghost_room // BLOCK_NODES)
         if max(self.blocks) > MAXIMUM_BLOCKS:
             raise ConfigError(
@@ -149,14 +154,15 @@ class Launch(ABC):
         self.rows = len(scenes) + bool(self.entry_frame.any())
         label = np.where(self.entry_frame > 0, (len(scenes) << MATERIAL_BITS) + (label & MATERIAL_MASK), label)
         laws, row = material_laws(scenes, config)
-        has_contact = self.moving or any(len(collider.node_K3) for collider in colliders)
-        has_sweep = self.moving or any(len(collider.sweep.base_K3) for collider in colliders)
+        has_contact = bool(bodies) or any(len(collider.node_K3) for collider in colliders)
+        has_sweep = bool(bodies) or any(len(collider.sweep.base_K3) for collider in colliders)
         self.variant = (
             sum(MATERIAL_VARIANTS[material] for material in np.unique(label & MATERIAL_MASK))
             + VARIANT.contact * has_contact
             + VARIANT.sweep * has_sweep
             + VARIANT.sheets * (ghost_room > 0)
-            + VARIANT.moving * self.moving
+            + VARIANT.moving * bool(bodies)
+            + VARIANT.moving_sheets * (ghost_room > self.ghosts)
             + VARIANT.taichi_elements * (config.method == "taichi_elements")
             + VARIANT.rate_of_sand * bool(config.sand_grain_diameter_m > 0 and SAND in label & MATERIAL_MASK)
             + VARIANT.several_laws * (len(laws) > 1)
@@ -172,31 +178,34 @@ class Launch(ABC):
         self.counter = device_array(counter)
         self.node = self._node_array(nodes)
         self.hidden = ti.ndarray(ti.i32, self.particles if ghost_room else 1)
-        self.spans = [(0.0, self.frame_s)] * len(scenes)  # times between which each scene's contacts move
-        self.cell_masses = [cell_mass(scene) for scene in scenes]
         self._place_contacts()
 
-    def _has_sheets(self) -> bool:
-        return any(not obstacle.closed for scene in self.scenes for obstacle in scene.obstacles)
-
     def _place_contacts(self) -> None:
-        """Writes contacts into device arrays. Moving obstacles get their mean velocities in the scene's span."""
-        self.shape = device_array(self._shape())
-        of_node = MOVING_NODE_VECTORS if self.moving else NODE_VECTORS
-        of_triangle = MOVING_TRIANGLE_VECTORS if self.moving else TRIANGLE_VECTORS
-        nodes = of_node * sum(len(collider.node_K3) for collider in self.colliders)
-        triangles = of_triangle * sum(len(collider.sweep.triangle_F43) for collider in self.colliders)
+        """Writes contacts into device arrays."""
+        masses = [cell_mass(scene) for scene in self.scenes]
+        nodes = NODE_VECTORS * sum(len(collider.node_K3) for collider in self.colliders)
+        triangles = TRIANGLE_VECTORS * sum(len(collider.sweep.triangle_F43) for collider in self.colliders)
         has_contacts = self.variant & (VARIANT.contact | VARIANT.sweep)
         has_triangles = self.variant & (VARIANT.sweep | VARIANT.sheets)
         vector = np.zeros((max(1, nodes + triangles), 3), np.float32)
         entries, length = [], 1
         if has_contacts:
             length = self.all_blocks * BLOCK_NODES
-            entries.append(self._contacts(vector[:nodes].reshape(-1, of_node, 3)))
+            entries.append(self._contacts(vector[:nodes].reshape(-1, NODE_VECTORS, 3), masses))
         if has_triangles:
-            of_triangles = vector[nodes : nodes + triangles].reshape(-1, of_triangle, 3)
+            of_triangles = vector[nodes : nodes + triangles].reshape(-1, TRIANGLE_VECTORS, 3)
             place, value, length = self._sweeps(nodes, of_triangles)
             entries.append((place, value))
+        bodies, pose = length, np.zeros(1, np.float32)
+        if self.variant & VARIANT.moving:
+            of_scenes = [collider.bodies for collider in self.colliders]
+            value, more, pose = body_arrays(
+                of_scenes, self.second_fields, self._frictions(), masses, length, len(vector)
+            )
+            entries.append((np.arange(length, length + len(value), dtype=np.int32), value))
+            vector, length = np.concatenate([vector, more]), length + len(value)
+        self.shape = device_array(self._shape(bodies))
+        self.pose = device_array(pose)
         self.contact = ti.ndarray(ti.i32, length)
         self.contact.fill(-1)
         for place, value in entries:
@@ -241,9 +250,11 @@ class Launch(ABC):
             alike = (laws[row[own], CONSTANT.mass] == 1).all()
             value[index, VALUE.water_density] = (scene.particles_per_cell or 0.0) if alike else 0.0
             value[index, VALUE.least_stiffness] = least[scene.material_N, row[own]].max()
+            speeds = [body.key_TK[:, KEY.speed].max() for body in self.colliders[index].bodies]
+            value[index, VALUE.obstacle_speed] = max(speeds, default=0.0)
         return value
 
-    def _shape(self) -> np.ndarray:
+    def _shape(self, bodies: int) -> np.ndarray:
         """Returns the int32 shape for kernels, and the first particle of each part of each scene."""
         begin = [
             start + (stop - start) * part // self.parts
@@ -255,6 +266,7 @@ class Launch(ABC):
         shape[SHAPE.scene_blocks] = math.prod(self.blocks)
         shape[SHAPE.all_blocks] = self.all_blocks
         shape[SHAPE.ghosts] = self.ghosts
+        shape[SHAPE.second_fields], shape[SHAPE.bodies] = bodies, bodies + len(self.scenes)
         shape[SHAPE.ghost_begin] = len(self.scenes) * self.scene_nodes
         shape[SHAPE.wall_cells] = self.config.wall_cells
         shape[SHAPE.maximum_substeps] = MAXIMUM_SUBSTEPS
@@ -276,24 +288,12 @@ class Launch(ABC):
         setting[SETTING.low] = particle_bounds(self.scenes[0], config)[0][0]
         return setting
 
-    def _rates(self) -> list[np.ndarray]:
-        """Returns the motion of each scene's obstacles in its span, float64 [obstacles, 3, 3]. The rows of an
-        obstacle are angular velocity, velocity of a point, and this point."""
-        rates = [np.zeros((max(len(scene.obstacles), 1), 3, 3)) for scene in self.scenes]
-        for own, scene, span in zip(rates, self.scenes, self.spans, strict=True):
-            for index, obstacle in enumerate(scene.obstacles):
-                if obstacle.motion is not None:
-                    own[index] = obstacle.motion.rates(*span)
-        return rates
-
-    def _contacts(self, vector: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _contacts(self, vector: np.ndarray, cell_masses: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
         """Returns the places and entries of contact nodes (see grid_kernel.substep). Writes the entries' vectors."""
         # scene after scene, so that arrays stay in a core's cache; nodes with two fields get the first entries
         places, entries = np.empty(len(vector), np.int32), np.empty(len(vector), np.int32)
         filled, doubled, single = 0, 0, self.ghosts
-        for index, (scene, own, friction, rates) in enumerate(
-            zip(self.scenes, self.colliders, self._frictions(), self._rates(), strict=True)
-        ):
+        for index, (own, friction) in enumerate(zip(self.colliders, self._frictions(), strict=True)):
             count, ghosts = len(own.node_K3), int(own.doubled_K.sum())
             entry = np.empty(count, np.int32)
             entry[own.doubled_K] = np.arange(doubled, doubled + ghosts)
@@ -301,10 +301,8 @@ class Launch(ABC):
             value = np.zeros((count, *vector.shape[1:]), np.float32)
             value[:, :2] = own.normal_K23
             value[:, 2, :2] = friction[own.obstacle_K2]
-            value[:, 3, :2] = self.cell_masses[index] * own.least_K2
-            if self.moving:
-                turn, velocity, place = np.moveaxis(rates[own.obstacle_K2], 2, 0)
-                value[:, 4:] = velocity + np.cross(turn, own.node_K3[:, None] * scene.cell_size - place)
+            value[:, 3, :2] = cell_masses[index] * own.least_K2
+            value[:, 2:, 2] = own.distance_K2
             vector[entry] = value
             places[filled : filled + count] = self._places(own.node_K3) + np.int32(index * self.scene_nodes)
             entries[filled : filled + count] = entry
@@ -328,46 +326,24 @@ class Launch(ABC):
     def _sweeps(self, first_vector: int, vector: np.ndarray) -> tuple[np.ndarray, np.ndarray, int]:
         """Returns places and values of the contact array for the swept test (see grid_kernel.substep), and its length.
         Writes the triangles' vectors."""
-
         all_nodes = self.all_blocks * BLOCK_NODES
         sweeps = [collider.sweep for collider in self.colliders]
-        length = vector.shape[1]
-        lists = sum(len(sweep.begin_K) for sweep in sweeps)
-        end = 2 * all_nodes + LIST_HEAD * lists + sum(len(sweep.triangle_L) for sweep in sweeps)
+        end = 2 * all_nodes + sum(LIST_HEAD * len(sweep.begin_K) + len(sweep.triangle_L) for sweep in sweeps)
         if end >= 2**31:
             raise ConfigError(
                 f"a batch must hold less than 2^31 nodes, cells and lists of triangles, got {end}; lower "
                 "scenes_per_launch"
             )
-        places = np.empty(end - 2 * all_nodes + lists, np.int32)
-        values = np.empty_like(places)
-        filled, end = 0, 2 * all_nodes
-        for index, sweep in enumerate(sweeps):
-            count = np.diff(np.append(sweep.begin_K, len(sweep.triangle_L))).astype(np.int32)
-            order = np.arange(len(count), dtype=np.int32)
-            head = end + sweep.begin_K.astype(np.int32) + LIST_HEAD * order
-            body = np.arange(len(sweep.triangle_L), dtype=np.int32) + np.repeat(LIST_HEAD * (order + 1), count)
-            for place, value in (
-                (self._places(sweep.base_K3) + np.int32(all_nodes + index * self.scene_nodes), head),
-                (head, count),
-                (head + 1, sweep.sheets_K),
-                (end + body, first_vector + length * sweep.triangle_L),
-            ):
-                places[filled : filled + len(place)], values[filled : filled + len(place)] = place, value
-                filled += len(place)
-            first_vector += length * len(sweep.triangle_F43)
-            end += LIST_HEAD * len(count) + len(sweep.triangle_L)
-        vector[:, :4] = np.concatenate([sweep.triangle_F43 for sweep in sweeps])
-        vector[:, 4, 0] = np.concatenate(
-            [friction[sweep.obstacle_F] for friction, sweep in zip(self._frictions(), sweeps, strict=True)]
-        )
-        if self.moving:
-            rates = [own[sweep.obstacle_F] for own, sweep in zip(self._rates(), sweeps, strict=True)]
-            turn, velocity, place = np.moveaxis(np.concatenate(rates), 1, 0)
-            cell_size = self.scenes[0].cell_size
-            vector[:, 5] = velocity / cell_size + np.cross(turn, vector[:, 0] - place / cell_size)
-            vector[:, 6] = turn
-        return places, values, end
+        places, values, end, triangle = list[np.ndarray](), list[np.ndarray](), 2 * all_nodes, 0
+        for index, (sweep, friction) in enumerate(zip(sweeps, self._frictions(), strict=True)):
+            lists = triangle_lists(sweep, first_vector + TRIANGLE_VECTORS * triangle)
+            base = self._places(sweep.base_K3) + np.int32(all_nodes + index * self.scene_nodes)
+            places += [base, np.arange(end, end + len(lists), dtype=np.int32)]
+            values += [np.int32(end) + list_begins(sweep), lists]
+            vector[triangle : triangle + len(sweep.triangle_F43)] = triangle_vectors(sweep, friction)
+            triangle += len(sweep.triangle_F43)
+            end += len(lists)
+        return np.concatenate(places), np.concatenate(values), end
 
     @abstractmethod
     def _advance(self, frames: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
@@ -404,7 +380,8 @@ class Launch(ABC):
             for when, frame in (("start", 0), ("end", -1)):
                 if status[index] == STATUS.running:
                     present = trajectory[index][frame][~absent[index][frame]]
-                    own[f"particles_inside_obstacles_at_{when}"] = collider.count_inside(present)
+                    time = (frames - 1) * self.frame_s if when == "end" else 0.0
+                    own[f"particles_inside_obstacles_at_{when}"] = collider.count_inside(present, time)
         return [
             Simulated(trajectory[index], counters[index])
             if status[index] == STATUS.running

@@ -81,7 +81,7 @@ class SceneValue(NamedTuple):
     gravity_time: int = 14  # time of gravity in the present substep, s: see mls_mpm
     water_density: int = 15  # number of particles a cell at rest; 0 if unknown
     wall_friction: int = 16  # 16, 17, 18: friction of the domain's walls across x, y, z
-    part: int = 19  # time from the last build of contacts to the end of the present part of a frame, s
+    frame_end: int = 19  # time of the end of the present frame, s
     stiffness: int = 20  # largest stiffness in the step before, m²/s²
     last_interval: int = 21  # length of the interval before, s
     fallen: int = 22  # time of gravity in this interval before the present substep, s
@@ -91,7 +91,8 @@ class SceneValue(NamedTuple):
     nodes: int = 26  # 26, 27, 28: numbers of nodes along the axes
     high: int = 29  # 29, 30, 31: largest coordinates of a particle
     size: int = 32  # 32, 33, 34: size of the domain
-    length: int = 35
+    obstacle_speed: int = 35  # largest speed of obstacles, domain units a second
+    length: int = 36
 
 
 class Status(NamedTuple):
@@ -126,7 +127,9 @@ class Shape(NamedTuple):
     maximum_substeps: int = 6
     ghosts: int = 7  # nodes of all scenes that sheets hide from particles near them: see collider
     ghost_begin: int = 8  # first of their second fields in the array of nodes
-    part_begin: int = 9  # first of the following: first particle of each (scene, part), and the end
+    bodies: int = 9  # places in `contact` of the moving obstacles: see body_arrays
+    second_fields: int = 10
+    part_begin: int = 11  # first of the following: first particle of each (scene, part), and the end
 
 
 class Variant(NamedTuple):
@@ -145,7 +148,48 @@ class Variant(NamedTuple):
     elastic: int = 1024
     rate_of_sand: int = 2048  # friction grows with the rate of flow
     each_step: int = 4096  # of the team kernel: each step is an interval of its own
-    parts: int = 8192  # factor of the number of parts; must be the last
+    moving_sheets: int = 8192  # sheets move, so that all nodes of their scenes have two fields
+    parts: int = 16384  # factor of the number of parts; must be the last
+
+
+class BodyHead(NamedTuple):
+    """Positions in the integers of a moving obstacle."""
+
+    closed: int = 0
+    state: int = 1  # begin of its numbers in the array `pose`: see BodyState
+    keys: int = 2  # number of keyframes
+    samples: int = 3  # place of the first sample in `contact_normal`
+    shape: int = 4  # 4, 5, 6: number of samples along the axes
+    lists: int = 7  # place in `contact` of the table of lists of triangles
+    cells: int = 8  # 8, 9, 10: shape of this table
+    length: int = 11
+
+
+class BodyState(NamedTuple):
+    """Positions in the float32 numbers of a moving obstacle. Lengths are in cells."""
+
+    begin: int = 0  # pose when the present interval began: place of the pivot, then the axes of the frame
+    end: int = 12  # pose after the present substep
+    turn: int = 24  # 24, 25, 26: angular velocity in the present interval, rad/s
+    velocity: int = 27  # 27, 28, 29: of the pivot
+    origin: int = 30  # 30, 31, 32: from the frame's origin to the pivot
+    friction: int = 33
+    cell_mass: int = 34  # mass of a full cell
+    bearing: int = 35  # height above a thin closed body up to which nodes stop motion
+    key: int = 36  # index of the last keyframe before the end pose
+    first_key: int = 37
+
+
+class Key(NamedTuple):
+    """Positions in the float32 numbers of a keyframe. Turn, velocity and speed are those until the next one."""
+
+    time: int = 0
+    place: int = 1
+    axes: int = 4
+    turn: int = 13
+    velocity: int = 16
+    speed: int = 19  # largest speed of the obstacle's points, domain units a second
+    length: int = 20
 
 
 class Field(NamedTuple):
@@ -183,6 +227,7 @@ class Live(NamedTuple):
 CONSTANT, COUNT, VALUE, STATUS = Constant(), Count(), SceneValue(), Status()
 SETTING, SHAPE, VARIANT = Setting(), Shape(), Variant()
 FIELD, TAG, LIVE = Field(), Tag(), Live()
+HEAD, STATE, KEY = BodyHead(), BodyState(), Key()
 MATERIAL_VARIANTS: tuple[int, ...] = tuple(getattr(VARIANT, name) for name in MATERIALS)
 SOLID_VARIANTS = sum(bit for material, bit in enumerate(MATERIAL_VARIANTS) if material not in FLUIDS)
 

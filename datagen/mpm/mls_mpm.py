@@ -30,10 +30,11 @@ Time step, interval, remaining time, state and counters are per scene. Finished 
 
 import taichi as ti
 
+from datagen.mpm.body_kernel import first_body, nearest_surface
 from datagen.mpm.constitutive import count_event, hardening, settled, solid, water
 from datagen.mpm.layout import BLOCK, BLOCK_NODES, CONSTANT, COUNT, SETTING, SHAPE, STATUS, VALUE, VARIANT, has_solid
 from datagen.mpm.nodes import base_node, node_place, weights
-from datagen.mpm.surface_kernel import MOVING_NODE_VECTORS, NODE_VECTORS, hidden_nodes, meet, stop_at_surface
+from datagen.mpm.surface_kernel import NODE_VECTORS, hidden_by_moving, hidden_nodes, meet, stop_at_surface
 from hgn.scene.material import FLUIDS, SNOW
 
 SMALLEST_MASS = 1e-10  # smallest mass of a node with a velocity, in particles; smaller ones are rounding of the weights
@@ -115,29 +116,12 @@ def node_velocity(
 
     `momentum` is the sum of contributions, and `fall` the change by gravity. The result is 0 for a mass that is only
     rounding of the weights. The node has number `local` in a block whose place along x, y, z is `corner`, in ten bits
-    each. `facing` is twice the node's entry in `contact_normal`, plus 1 for its second field; negative: no collider.
+    each. `facing` is twice the node's entry in `contact_normal`, plus 1 for its second field; the entry is -1 without
+    an obstacle at rest.
     """
     v = ti.Vector([0.0, 0.0, 0.0])
     if mass > SMALLEST_MASS:
         v = before + momentum / mass + fall
-        if ti.static(bool(arrays.variant & VARIANT.contact)):
-            if facing >= 0:
-                entry = facing // 2
-                field = facing - 2 * entry
-                moving = ti.static(bool(arrays.variant & VARIANT.moving))
-                at = ti.static(MOVING_NODE_VECTORS if moving else NODE_VECTORS) * entry
-                friction = arrays.contact_normal[at + 2][0]
-                least = arrays.contact_normal[at + 3][0]
-                if field == 1:
-                    friction = arrays.contact_normal[at + 2][1]
-                    least = arrays.contact_normal[at + 3][1]
-                if mass >= least:
-                    if ti.static(moving):
-                        surface = arrays.contact_normal[at + 4 + field]
-                        v = meet(v - surface, arrays.contact_normal[at + field], friction) + surface
-                    else:
-                        v = meet(v, arrays.contact_normal[at + field], friction)
-        # walls act last, so that a collider cannot push material out of the domain
         index = ti.Vector(
             [
                 (corner >> 20) * BLOCK + (local >> 4),
@@ -145,6 +129,27 @@ def node_velocity(
                 (corner & 1023) * BLOCK + (local & 3),
             ]
         )
+        if ti.static(bool(arrays.variant & VARIANT.contact)):
+            field = facing & 1
+            normal = ti.Vector([0.0, 0.0, 0.0])
+            friction, least, distance = 0.0, 0.0, ti.math.inf
+            if facing >= 0:
+                at = NODE_VECTORS * (facing >> 1)
+                normal = arrays.contact_normal[at + field]
+                frictions = arrays.contact_normal[at + 2]
+                leasts = arrays.contact_normal[at + 3]
+                friction, least, distance = frictions[0], leasts[0], frictions[2]
+                if field == 1:
+                    friction, least, distance = frictions[1], leasts[1], leasts[2]
+            if ti.static(bool(arrays.variant & VARIANT.moving)):
+                normal, friction, least, surface = nearest_surface(
+                    index, field, normal, friction, least, distance, scene, arrays
+                )
+                if mass >= least:
+                    v = meet(v - surface, normal, friction) + surface
+            elif facing >= 0 and mass >= least:
+                v = meet(v, normal, friction)
+        # walls act last, so that a collider cannot push material out of the domain
         wall_cells = arrays.shape[SHAPE.wall_cells]
         for axis in ti.static(range(3)):
             outward = 0.0
@@ -215,18 +220,18 @@ def _triangle_list(x, scene: ti.i32, arrays: ti.template()) -> ti.i32:
 
 
 @ti.func
-def find_hidden(x, scene: ti.i32, elapsed: ti.f32, arrays: ti.template()) -> ti.i32:
+def find_hidden(x, scene: ti.i32, arrays: ti.template()) -> ti.i32:
     """Returns in bits which of a particle's nodes are hidden from it by sheets (see surface_kernel.hidden_nodes).
 
     A node near a sheet has two velocity fields, one per side; particles on the hidden side use the second.
-    Moving contacts are `elapsed` seconds old.
     """
     bits = 0
     list_at = _triangle_list(x, scene, arrays)
+    scaled = x * arrays.setting[SETTING.inverse_cell_size]
     if list_at >= 0:
-        moving = ti.static(bool(arrays.variant & VARIANT.moving))
-        scaled = x * arrays.setting[SETTING.inverse_cell_size]
-        bits = hidden_nodes(scaled, list_at, elapsed, arrays, moving)
+        bits = hidden_nodes(scaled, ti.floor(scaled - 0.5) - scaled, list_at, 0, arrays, False)
+    if ti.static(bool(arrays.variant & VARIANT.moving_sheets)):
+        bits |= hidden_by_moving(scaled, scene, arrays)
     return bits
 
 
@@ -240,13 +245,12 @@ def move(x, v, C, scene: ti.i32, arrays: ti.template()):
     speed = v
     if ti.static(bool(arrays.variant & VARIANT.sweep)):
         list_at = _triangle_list(x, scene, arrays)
-        if list_at >= 0:
-            moving = ti.static(bool(arrays.variant & VARIANT.moving))
-            interval = arrays.scene_value[scene, VALUE.interval_elapsed]
-            elapsed = 0.0
-            if ti.static(moving):
-                elapsed = arrays.scene_value[scene, VALUE.part] - arrays.scene_value[scene, VALUE.remaining] - interval
-            out, speed = stop_at_surface(x, out, v, list_at, elapsed, interval, scene, arrays, moving)
+        moving = ti.static(bool(arrays.variant & VARIANT.moving))
+        near = list_at >= 0
+        if ti.static(moving):
+            near = near or first_body(scene, arrays) < first_body(scene + 1, arrays)
+        if near:
+            out, speed = stop_at_surface(x, out, v, list_at, scene, arrays, moving)
     speed_square = speed.dot(speed)
     bad = _not_finite(speed_square) | _not_finite(out.sum()) | _not_finite(C.sum())
     outside = 0

@@ -6,7 +6,7 @@ stored by blocks of 4 x 4 x 4, [scene, block, node in block].
 
 import taichi as ti
 
-from datagen.mpm.layout import BLOCK, BLOCK_NODES, SHAPE
+from datagen.mpm.layout import BLOCK, BLOCK_NODES, SHAPE, VARIANT
 
 
 @ti.func
@@ -100,9 +100,23 @@ def node_place(index, scene: ti.i32, shape: ti.template()) -> ti.i32:
 
 
 @ti.func
+def second_field(place: ti.i32, scene: ti.i32, arrays: ti.template()) -> ti.i32:
+    """Returns the place of a node's second field among second fields, or -1. If sheets of the scene move, each of its
+    nodes has one (see body_arrays)."""
+    field = arrays.contact[place]
+    if field >= arrays.shape[SHAPE.ghosts]:
+        field = -1
+    if ti.static(bool(arrays.variant & VARIANT.moving_sheets)):
+        begin = arrays.contact[arrays.shape[SHAPE.second_fields] + scene]
+        if begin >= 0:
+            field = begin + place - scene * arrays.shape[SHAPE.scene_blocks] * BLOCK_NODES
+    return field
+
+
+@ti.func
 def ghost_place(index, scene: ti.i32, arrays: ti.template()) -> ti.i32:
     """Returns the index of a node's second field, counted in nodes."""
-    return arrays.shape[SHAPE.ghost_begin] + arrays.contact[node_place(index, scene, arrays.shape)]
+    return arrays.shape[SHAPE.ghost_begin] + second_field(node_place(index, scene, arrays.shape), scene, arrays)
 
 
 @ti.func
@@ -154,7 +168,8 @@ def interpolate_hidden(x, v, C, hidden: ti.i32, scene: ti.i32, arrays: ti.templa
             index = base + ti.Vector([n // 9, n // 3 % 3, n % 3])
             offset = ti.cast(index, ti.f32) - scaled
             place = node_place(index, scene, arrays.shape)
-            difference = arrays.node[arrays.shape[SHAPE.ghost_begin] + arrays.contact[place]] - arrays.node[place]
+            ghost = arrays.shape[SHAPE.ghost_begin] + second_field(place, scene, arrays)
+            difference = arrays.node[ghost] - arrays.node[place]
             change = ti.Vector([difference[0], difference[1], difference[2]])
             change *= spline(offset[0]) * spline(offset[1]) * spline(offset[2])
             new_v += change

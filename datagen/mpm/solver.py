@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from datagen.mpm.body import require_slow
 from datagen.mpm.collider import Collider, build_collider
 from datagen.mpm.device import Device, initialise, memory_bytes
 from datagen.mpm.grid_launch import GridLaunch
@@ -71,15 +72,14 @@ def simulate(
     (3 lambda_h + 2 mu_h)). With a fixed time step each step has a transfer. A frame has ceil(frame / step) steps, as in
     Taichi Elements: 54 steps at 60 Hz and 3.125e-4 s, which are 1.25 % longer than the frame.
 
-    Scenes with moving obstacles or emitters are simulated after the others, in a launch of their own. `on_frame(t)` is
+    Scenes with emitters are simulated after the others, in a launch of their own. `on_frame(t)` is
     called from 0 on when the scenes have completed frame t, on average over the scenes if there are two launches.
     `cpu_threads` applies to the process's first simulation (see `initialise`). `colliders` are results of
     `build_collider` for the scenes; None: they are built. `team` computes a scene of the first launch; None: chosen by
     device and scenes. `stability_fractions` replace the config's.
 
     On a CPU a scene's result does not depend on its batch, bitwise. `cpu_threads` changes it only through the number of
-    partial sums, min(cpu_threads, 4). If obstacles move, frames of the scenes in their launch are divided into parts
-    (see grid_launch.motion_parts), so that these scenes depend on each other. On a GPU sums have no fixed order.
+    partial sums, min(cpu_threads, 4). On a GPU sums have no fixed order.
 
     A particle with an entry time is NaN before it; it enters in free flight from its given place. A scene that is not
     finite, leaves the domain or needs more than MAXIMUM_SUBSTEPS a frame ends as a SceneFailure with cause and frame. A
@@ -112,10 +112,10 @@ def simulate(
     ]
     step_s = config.fixed_time_step_s
     moving = any(scenes[i].moves for i in occupied)
+    require_slow(scenes, frame_rate_hz)
     require(not moving or step_s is None, "fixed_time_step_s", "null where obstacles move", step_s)
     _require_memory(device, [scenes[i] for i in occupied], node_counts)
-    # moving contacts are placed, and particles enter, between launches of single substeps
-    single = [i for i in occupied if scenes[i].moves or scenes[i].emits]
+    single = [i for i in occupied if scenes[i].emits]  # particles enter between launches of single substeps
     groups = [group for group in ([i for i in occupied if i not in single], single) if group]
     before = reported = 0  # frames of all scenes of earlier launches together; calls of on_frame
 

@@ -2,18 +2,18 @@
 
 import taichi as ti
 
-from datagen.mpm.layout import COUNT, SETTING
+from datagen.mpm.body_kernel import body_list, body_velocity, first_body, into_frame, out_of_frame
+from datagen.mpm.layout import COUNT, HEAD, SETTING, STATE
 from datagen.mpm.sweep import ON_TRIANGLE
 
 CLEARANCE = 1e-3  # smallest distance of a particle from a triangle, in cells; rounding is 1e-5
 STOP = 1.5 * CLEARANCE  # distance at which a particle is placed, so that rounding brings it no nearer
 EDGE = 1e-4  # crossings count up to this barycentric coordinate beyond an edge; closes gaps between triangles
 # Vectors of a node's contact: the free direction for particles that see the node, and for those from which a sheet
-# hides it (zero if all motion is free); the friction of each; the smallest mass with which the node stops each
+# hides it (zero if all motion is free); the friction of each, and the distance of the first from its surface in cells;
+# the smallest mass with which the node stops each, and the distance of the second
 NODE_VECTORS = 4
-MOVING_NODE_VECTORS = 6  # in addition the surface's velocity in each field, domain units a second
 TRIANGLE_VECTORS = 5  # the vectors of datagen.mpm.sweep.Sweep, and the friction
-MOVING_TRIANGLE_VECTORS = 7  # in addition the first corner's velocity, cells a second, and the angular velocity
 LIST_HEAD = 2  # head of a list: number of triangles, and number of sheets' triangles, which come first
 STENCIL = 27  # number of nodes of a particle
 ATTEMPTS = 3  # number of triangles that may stop a path; the third stops the particle
@@ -34,31 +34,27 @@ def meet(v, normal, friction: ti.f32):
 
 
 @ti.func
-def _drift(scaled, triangle: ti.i32, contact_normal: ti.template()):
-    """Returns the velocity of a moving triangle at a particle, cells a second."""
-    return contact_normal[triangle + 5] + contact_normal[triangle + 6].cross(scaled - contact_normal[triangle])
-
-
-@ti.func
-def hidden_nodes(scaled, list_at: ti.i32, elapsed: ti.f32, arrays: ti.template(), moving: ti.template()) -> ti.i32:
+def hidden_nodes(scaled, to_base, list_at: ti.i32, pose: ti.i32, arrays: ti.template(), moves: ti.template()) -> ti.i32:
     """Returns which of a particle's nodes sheets hide from it.
 
     Bit 9 i + 3 j + k is 1 if the line to node base + (i, j, k) crosses a triangle of a sheet. The particle is at
-    `scaled`, in cells; its base node's list begins at list_at. Triangles have moved for `elapsed` seconds since the
-    list was built. The sides of nodes are those of that time.
+    `scaled`, in cells; the vector to its base node is to_base; its list begins at list_at. If the sheet `moves`,
+    `scaled` is in the sheet's frame, and `pose` is the begin of its pose.
     """
     bits = 0
-    to_base = ti.floor(scaled - 0.5) - scaled
     for s in range(list_at + LIST_HEAD, list_at + LIST_HEAD + arrays.contact[list_at + 1]):
         triangle = arrays.contact[s]
         normal = arrays.contact_normal[triangle + 1]
         across_1 = arrays.contact_normal[triangle + 2]
         across_2 = arrays.contact_normal[triangle + 3]
         offset = scaled - arrays.contact_normal[triangle]
+        if ti.static(moves):
+            normal = out_of_frame(normal, pose, arrays)
+            across_1 = out_of_frame(across_1, pose, arrays)
+            across_2 = out_of_frame(across_2, pose, arrays)
+            offset = out_of_frame(offset, pose, arrays)
         height = normal.dot(offset)
         height_base = height + normal.dot(to_base)
-        if ti.static(moving):
-            height -= elapsed * normal.dot(_drift(scaled, triangle, arrays.contact_normal))
         lowest = height_base + 2.0 * ti.min(normal, 0.0).sum()
         highest = height_base + 2.0 * ti.max(normal, 0.0).sum()
         if (height >= 0.0 and lowest < 0.0) or (height < 0.0 and highest >= -ON_TRIANGLE):
@@ -77,31 +73,39 @@ def hidden_nodes(scaled, list_at: ti.i32, elapsed: ti.f32, arrays: ti.template()
 
 
 @ti.func
-def _first_crossing(
-    start, end, list_at: ti.i32, elapsed: ti.f32, interval: ti.f32, arrays: ti.template(), moving: ti.template()
-):
+def hidden_by_moving(scaled, scene: ti.i32, arrays: ti.template()) -> ti.i32:
+    """Returns which of a particle's nodes moving sheets hide from it, as `hidden_nodes`."""
+    bits = 0
+    to_base = ti.floor(scaled - 0.5) - scaled
+    head = first_body(scene, arrays)
+    while head < first_body(scene + 1, arrays):
+        if arrays.contact[head + HEAD.closed] == 0:
+            state = arrays.contact[head + HEAD.state]
+            own = into_frame(scaled, state, state, arrays)
+            list_at = body_list(own, head, arrays)
+            if list_at >= 0:
+                bits |= hidden_nodes(own, to_base, list_at, state, arrays, True)
+        head += HEAD.length
+    return bits
+
+
+@ti.func
+def _first_crossing(start, end, list_at: ti.i32, arrays: ti.template()):
     """Returns the first triangle of the list at list_at that the path from start to end (in cells) meets.
 
     Results: the fraction of the path (2 without a triangle); the end, moved back in front of the triangle; the free
-    direction (the triangle's normal on the side of the start); the friction; the triangle's velocity in cells a second.
-    Triangles have moved for `elapsed` seconds when the particle starts.
+    direction (the triangle's normal on the side of the start); the friction.
     """
     first = 2.0
     stop = end
     free = ti.Vector([0.0, 0.0, 0.0])
     friction = 0.0
-    velocity = ti.Vector([0.0, 0.0, 0.0])
     for s in range(list_at + LIST_HEAD, list_at + LIST_HEAD + arrays.contact[list_at]):
         triangle = arrays.contact[s]
         corner = arrays.contact_normal[triangle]
         normal = arrays.contact_normal[triangle + 1]
         begin = start - corner
         finish = end - corner
-        drift = ti.Vector([0.0, 0.0, 0.0])
-        if ti.static(moving):  # in the frame of the triangle at the time of the list
-            drift = _drift(start, triangle, arrays.contact_normal)
-            begin -= elapsed * drift
-            finish -= (elapsed + interval) * drift
         before = normal.dot(begin)
         if before < 0.0:
             normal = -normal
@@ -119,19 +123,51 @@ def _first_crossing(
                 stop = end + normal * (STOP - after)
                 free = normal
                 friction = arrays.contact_normal[triangle + 4][0]
-                velocity = drift
-    return first, stop, free, friction, velocity
+    return first, stop, free, friction
+
+
+@ti.func
+def _first_moving(start, end, fraction_at_rest: ti.f32, scene: ti.i32, arrays: ti.template()):
+    """Returns the first triangle of a moving obstacle that the path meets before the given fraction.
+
+    The path is that in the obstacle's frame, from its pose at the interval's begin to that at its end. Results: those
+    of _first_crossing; the velocity of the surface, in cells a second; and where it takes the start.
+    """
+    first = fraction_at_rest
+    stop = end
+    free = ti.Vector([0.0, 0.0, 0.0])
+    friction = 0.0
+    velocity = ti.Vector([0.0, 0.0, 0.0])
+    carried = start
+    head = first_body(scene, arrays)
+    while head < first_body(scene + 1, arrays):
+        state = arrays.contact[head + HEAD.state]
+        pose_end = state + STATE.end
+        begin = into_frame(start, state, state, arrays)
+        finish = into_frame(end, pose_end, state, arrays)
+        list_at = body_list(begin, head, arrays)
+        if list_at >= 0:
+            fraction, own_stop, own_free, own_friction = _first_crossing(begin, finish, list_at, arrays)
+            if fraction <= 1.0 and fraction < first:
+                first = fraction
+                stop = end + out_of_frame(own_stop - finish, pose_end, arrays)
+                free = out_of_frame(own_free, pose_end, arrays)
+                friction = own_friction
+                velocity = body_velocity(start, state, state, arrays)
+                carried = end + out_of_frame(begin - finish, pose_end, arrays)
+        head += HEAD.length
+    return first, stop, free, friction, velocity, carried
 
 
 @ti.func
 def stop_at_surface(
-    x, out, v, list_at: ti.i32, elapsed: ti.f32, interval: ti.f32, scene: ti.i32, arrays: ti.template(),
-    moving: ti.template(),
+    x, out, v, list_at: ti.i32, scene: ti.i32, arrays: ti.template(), moving: ti.template(),
 ):  # fmt: skip
     """Returns the end of a particle's path from x to out, and its velocity there.
 
     A triangle in the path stops motion through it. The particle slides along it with the velocity that friction leaves.
-    If a third triangle is in the path (in a corner), the particle stays at x.
+    If a third triangle is in the path (in a corner), the particle stays at x, or moves with a moving third triangle.
+    The list of triangles at rest begins at list_at; -1: no list.
     """
     dx = arrays.setting[SETTING.cell_size]
     start = x * arrays.setting[SETTING.inverse_cell_size]
@@ -140,12 +176,21 @@ def stop_at_surface(
     speed = v
     attempt = 0
     while attempt < ATTEMPTS:
-        fraction, stop, free, friction, velocity = _first_crossing(
-            start, end, list_at, elapsed, interval, arrays, moving
-        )
+        fraction, stop, free, friction = 2.0, end, ti.Vector([0.0, 0.0, 0.0]), 0.0
+        if list_at >= 0:
+            fraction, stop, free, friction = _first_crossing(start, end, list_at, arrays)
+        velocity = ti.Vector([0.0, 0.0, 0.0])
+        carried = start
+        if ti.static(moving):
+            first, own_stop, own_free, own_friction, own_velocity, own_carried = _first_moving(
+                start, end, fraction, scene, arrays
+            )
+            if first < fraction:
+                fraction, stop, free, friction = first, own_stop, own_free, own_friction
+                velocity, carried = dx * own_velocity, own_carried
         if fraction <= 1.0:
             if ti.static(moving):
-                speed = meet(speed - dx * velocity, free, friction) + dx * velocity
+                speed = meet(speed - velocity, free, friction) + velocity
             else:
                 speed = meet(speed, free, friction)
             end = stop
@@ -156,7 +201,7 @@ def stop_at_surface(
             if attempt == ATTEMPTS:
                 moved = x
                 if ti.static(moving):
-                    moved += interval * dx * velocity
+                    moved = carried * dx
         else:
             attempt = ATTEMPTS
     return moved, speed

@@ -35,10 +35,13 @@ class Sweep:
     triangle_L: np.ndarray  # int32
 
 
-def build_sweep(triangle_F33: np.ndarray, obstacle_F: np.ndarray, sheets: int, shape: tuple[int, ...]) -> Sweep:
+def build_sweep(
+    triangle_F33: np.ndarray, obstacle_F: np.ndarray, sheets: int, shape: tuple[int, ...], reach: float = 1.0
+) -> Sweep:
     """Returns the lists for triangles with an area, corners in cells, in a grid of `shape` nodes.
 
-    The first `sheets` triangles are those of sheets.
+    The first `sheets` triangles are those of sheets. Triangles of a list come within `reach` cells of base node + 1
+    along each axis.
     """
     edge_1, edge_2 = triangle_F33[:, 1] - triangle_F33[:, 0], triangle_F33[:, 2] - triangle_F33[:, 0]
     normal = np.cross(edge_1, edge_2)
@@ -49,7 +52,7 @@ def build_sweep(triangle_F33: np.ndarray, obstacle_F: np.ndarray, sheets: int, s
     packed = np.stack([triangle_F33[:, 0], normal, across_1, across_2], axis=1).astype(np.float32)
 
     flats, owners = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)]
-    for base, owner in near_slabs(triangle_F33 - 1, 1.0, shape):
+    for base, owner in near_slabs(triangle_F33 - 1, reach, shape):
         flats.append(np.ravel_multi_index(tuple(base), shape))
         owners.append(owner)
     flat, owner = np.concatenate(flats), np.concatenate(owners)

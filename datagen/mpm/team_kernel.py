@@ -72,8 +72,8 @@ TeamArrays = namedtuple(
     [
         "state", "node", "tag", "rank", "strained", "covered", "spread", "response", "hidden", "cell_count",
         "column_count", "column_list", "block", "live", "columns", "meeting", "turn", "scene_value",
-        "counter", "setting", "law", "shape", "contact", "contact_normal", "output", "variant", "threads",
-        "several", "run", "giving",
+        "counter", "setting", "law", "shape", "contact", "contact_normal", "pose", "output", "variant",
+        "threads", "several", "run", "giving",
     ],
 )  # fmt: skip
 
@@ -114,7 +114,7 @@ def _strain(
         if begins == 1.0:
             C = get_matrix(arrays.state, place, thread.stride, FIELD.affine)
             if ti.static(bool(arrays.variant & VARIANT.sheets)):
-                arrays.hidden[share.first + p] = find_hidden(x, share.scene, 0.0, arrays)
+                arrays.hidden[share.first + p] = find_hidden(x, share.scene, arrays)
             mark(
                 x, share.scene, arrays.setting[SETTING.inverse_cell_size], arrays,
                 arrays.shape[SHAPE.all_blocks] + share.scene * arrays.shape[SHAPE.scene_blocks], arrays.live,
@@ -200,8 +200,8 @@ def advance(
     cell_count: Integers, column_count: Integers, column_list: Integers, block: Integers, live: Integers,
     columns: Integers, meeting: Integers, turn: Integers, scene_value: ti.types.ndarray(dtype=ti.f32, ndim=2),
     counter: ti.types.ndarray(dtype=ti.i64, ndim=2), setting: Scalars, law: Scalars, shape: Integers,
-    contact: Integers, contact_normal: Vectors, output: Scalars, variant: ti.template(), threads: ti.template(),
-    several: ti.template(), run: ti.template(),
+    contact: Integers, contact_normal: Vectors, pose: Scalars, output: Scalars, variant: ti.template(),
+    threads: ti.template(), several: ti.template(), run: ti.template(),
 ):  # fmt: skip
     """Advances every scene by `frames` frames, and writes each frame's positions to output[frame, particle, axis].
 
@@ -233,7 +233,7 @@ def advance(
         arrays = ti.static(TeamArrays(
             state, node, tag, rank, strained, covered, spread, response, hidden, cell_count, column_count,
             column_list, block, live, columns, meeting, turn, scene_value, counter, setting, law, shape, contact,
-            contact_normal, output, variant, threads, several, run, rank,
+            contact_normal, pose, output, variant, threads, several, run, rank,
         ))  # fmt: skip
         meetings = 0
         choices = 0
@@ -272,6 +272,7 @@ def advance(
                     if member == 0:
                         counter[scene, COUNT.frame_substeps] = ti.cast(0, ti.i64)
                         scene_value[scene, VALUE.remaining] = frame_s
+                        scene_value[scene, VALUE.frame_end] = (live[live_at + LIVE.frames] + 1) * frame_s
                     meet_and_choose(thread, scene, meetings, choices, arrays)
                 particles = copy * fields * stride + first
                 tags = copy * TAG.length * stride + first

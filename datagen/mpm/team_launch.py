@@ -179,7 +179,7 @@ class TeamLaunch(Launch):
             address(self.state), address(self.node), self.node.shape[0], self.tag, self.rank, self.strained,
             self.covered, self.spread, self.response, self.hidden, self.cell_count, self.column_count,
             self.column_list, self.block, self.live, self.columns, self.meeting, self.turn, self.scene_value,
-            self.counter, self.setting, self.law, self.shape, self.contact, self.contact_normal, output, self.variant,
-            self.team.threads, self.team.blocks > 1, self.team.run,
+            self.counter, self.setting, self.law, self.shape, self.contact, self.contact_normal, self.pose, output,
+            self.variant, self.team.threads, self.team.blocks > 1, self.team.run,
         )  # fmt: skip
         return output

@@ -7,7 +7,8 @@ leave the launch, and its results are discarded.
 
 import taichi as ti
 
-from datagen.mpm.layout import LIVE, SHAPE, VALUE
+from datagen.mpm.body_kernel import move_bodies
+from datagen.mpm.layout import LIVE, SHAPE, VALUE, VARIANT
 from datagen.mpm.time_step import choose_time_step, raise_maximum
 
 WARP = 32
@@ -92,6 +93,8 @@ def choose(scene: ti.i32, arrays: ti.template()):
     choose_time_step(scene, arrays.scene_value, arrays.counter, arrays.setting, arrays.shape[SHAPE.maximum_substeps])
     if arrays.scene_value[scene, VALUE.begins] == 1.0:
         arrays.live[scene * LIVE.length + LIVE.blocks] = 0
+    if ti.static(bool(arrays.variant & VARIANT.moving)):
+        move_bodies(scene, arrays)
 
 
 @ti.func

@@ -10,7 +10,7 @@ from datagen.mpm.device_memory import add, load, load4, store4
 from datagen.mpm.layout import BLOCK_NODES, CONSTANT, FIELD, LIVE, SETTING, SHAPE, TAG, VARIANT
 from datagen.mpm.mls_mpm import node_velocity
 from datagen.mpm.multiple_time_stepping import change_of
-from datagen.mpm.nodes import base_node, ghost_place, node_place, node_places, spline, weights
+from datagen.mpm.nodes import base_node, ghost_place, node_place, node_places, second_field, spline, weights
 from datagen.mpm.team_lists import IDLE
 from datagen.mpm.team_meeting import GIVING
 from datagen.mpm.team_particles import dealt, get_vector
@@ -263,9 +263,10 @@ def update_nodes(
                 place, 2 * entry, gain, mass, before, thread.velocities, local, corner, scene, begins, ends,
                 gravity_time, lead, fallen, arrays,
             )  # fmt: skip
-        if ti.static(bool(arrays.variant & VARIANT.sheets)):  # noqa: SIM102 (this one is the compiler's)
-            if entry >= 0 and entry < arrays.shape[SHAPE.ghosts]:
-                ghost = LANES * (arrays.shape[SHAPE.ghost_begin] + entry)
+        if ti.static(bool(arrays.variant & VARIANT.sheets)):
+            second = second_field(touched * BLOCK_NODES + local, scene, arrays)
+            if second >= 0:
+                ghost = LANES * (arrays.shape[SHAPE.ghost_begin] + second)
                 gain_there, mass_there, before_there = _read_node(ghost, thread.velocities, begins, arrays.node)
                 _update(
                     ghost, 2 * entry + 1, gain_there, mass_there, before_there, thread.velocities, local, corner, scene,

@@ -79,6 +79,7 @@ def choose_time_step(
             longest = ti.max(limit, transfer_interval)
             # the fall within the interval counts too
             speed = ti.sqrt(speed_square) + gravity.norm() * ti.min(longest, remaining)
+            speed = ti.max(speed, scene_value[scene, VALUE.obstacle_speed])
             bound = speed_fraction * dx / ti.max(speed, 1e-20)
             fast = bound < ti.min(longest, remaining)
             longest = ti.min(longest, bound)

@@ -1,11 +1,16 @@
 """On a GPU: teams of one block and of several give what one launch a substep gives, also where not all fit."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 import torch
 from mpm_scenes import block, sheet
 
 from hgn.config import MpmConfig
+from hgn.scene.motion import Motion
+from hgn.scene.rotation import euler_rotation
+from hgn.scene.shapes import shape_obstacle
 
 
 def _scene():
@@ -27,6 +32,22 @@ def test_teams_agree_with_one_launch_a_substep(threads, blocks, run):
     config = MpmConfig(device="cuda")
     expected = simulate([_scene()], config, 11, 60.0, team=Team(0))
     _require_alike(expected * 3, simulate([_scene()] * 3, config, 11, 60.0, team=Team(threads, blocks, run)))
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+@pytest.mark.parametrize(("threads", "blocks", "run"), [(256, 1, 8), (128, 40, 1), (256, 4, 4)])
+def test_teams_agree_where_obstacles_move(threads, blocks, run):
+    """The same with a sheet and a body that rise and turn, in a launch with a scene at rest."""
+    from datagen.mpm.solver import Team, simulate
+
+    turns = np.stack([euler_rotation((0.0, angle, angle / 5)) for angle in (0.0, 90.0)])
+    motion = Motion(np.array([0.0, 1.0]), np.array([[0.0, 0.0, 0.0], [0.0, 0.3, 0.0]]), turns, (0.4, 0.3, 0.4))
+    obstacles = (sheet(0.3), shape_obstacle("cone", 0.1, (0.6, 0.45, 0.4)))
+    moving = tuple(dataclasses.replace(obstacle, motion=motion) for obstacle in obstacles)
+    scenes, config = [_scene(), dataclasses.replace(_scene(), obstacles=moving)], MpmConfig(device="cuda")
+    expected = simulate(scenes, config, 11, 60.0, team=Team(0))
+    _require_alike(expected, simulate(scenes, config, 11, 60.0, team=Team(threads, blocks, run)))
 
 
 @pytest.mark.gpu

@@ -19,6 +19,7 @@ NO_NODES = {
     "normal_K23": np.zeros((0, 2, 3), np.float32),
     "obstacle_K2": np.zeros((0, 2), np.int32),
     "least_K2": np.zeros((0, 2), np.float32),
+    "distance_K2": np.zeros((0, 2), np.float32),
     "doubled_K": np.zeros(0, bool),
 }
 
@@ -226,7 +227,7 @@ def test_bound_of_centres_changes_no_bit(shape, monkeypatch):
     scene = scene_of(shape_obstacle(shape, 0.6, (0.5, 0.47, 0.5)))
     colliders = []
     for radius in (0.0, np.inf):  # never, always
-        monkeypatch.setattr("datagen.mpm.collider.LARGE_RADIUS", radius)
+        monkeypatch.setattr("datagen.mpm.surface_samples.LARGE_RADIUS", radius)
         colliders.append(build_collider(scene, 1.0))
     for name in NO_NODES:
         assert np.array_equal(*(getattr(one, name) for one in colliders)), name

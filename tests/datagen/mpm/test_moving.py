@@ -6,15 +6,14 @@ import numpy as np
 import pytest
 from mpm_scenes import BOX, CELL, CONFIG, QUAD, box_corners, particles, sheet, simulated
 
-from datagen.mpm import grid_launch, launch
-from datagen.mpm.grid_launch import motion_cells, motion_parts
-from datagen.mpm.solver import SceneFailure, simulate
+from datagen.mpm.solver import simulate
 from hgn.config import MpmConfig
-from hgn.scene.material import MATERIALS, SAND, SNOW
+from hgn.scene.material import MATERIALS, SAND, SNOW, WATER
 from hgn.scene.motion import Motion, turned, turning
 from hgn.scene.rotation import euler_rotation, rotate
 from hgn.scene.scene import Obstacle
 from hgn.schema import ConfigError
+from hgn.solver_method import SPEED_FRACTION
 
 CELLS = 18
 MIDDLE = np.full(3, CELL * CELLS / 2)
@@ -139,21 +138,6 @@ def test_poses_between_keyframes():
         assert np.allclose(turning(turned(np.array(turn))), turn, atol=1e-8)
 
 
-def test_parts_of_a_frame_share_its_maximum_of_substeps(monkeypatch):
-    """Where motion cuts a frame into parts, MAXIMUM_SUBSTEPS counts the substeps of all of them."""
-    lift = moving(wide_sheet(2.5), [0.0, 1.0], [np.zeros(3), np.array([0.0, 3.0, 0.0])])
-    place = CELL * np.array([[4.5, height, 4.5] for height in (5, 6, 7, 8)])
-    scene = particles(place, range(4), obstacles=(lift,), domain_size=(CELLS * CELL,) * 3)
-    assert motion_parts(motion_cells([scene], 0.0, 1 / RATE_HZ)) == 8
-    (whole,) = simulated([scene])
-    needed = whole.counters["substeps"]
-    monkeypatch.setattr(launch, "MAXIMUM_SUBSTEPS", needed)
-    simulated([scene])
-    monkeypatch.setattr(launch, "MAXIMUM_SUBSTEPS", needed - 1)
-    (failed,) = simulate([scene], CONFIG, 2, RATE_HZ)
-    assert isinstance(failed, SceneFailure) and failed.cause.startswith("frame 1: the frame needs more than")
-
-
 def test_bad_motion_is_refused():
     """Keyframes out of order, obstacles that fly, and a fixed time step: one line each."""
     still = plate(-4.0, np.eye(3), False)
@@ -163,7 +147,7 @@ def test_bad_motion_is_refused():
     scene = block(SNOW, (-1, 0, -1), (2, 1, 2), np.eye(3), shot, 9.8)
     message = r"obstacles\[0\].keyframes of scene 0 must be no faster than 100 cells a frame"
     with pytest.raises(ConfigError, match=message):
-        motion_cells([scene], 0.0, 1 / RATE_HZ)
+        simulate([scene], CONFIG, 2, RATE_HZ)
     slow = moving(still, [0.0, 0.1], [(0, 0, 0), (0, 0.01, 0)])
     scene = dataclasses.replace(scene, obstacles=(slow,))
     with pytest.raises(ConfigError, match="fixed_time_step_s must be null where obstacles move"):
@@ -171,7 +155,7 @@ def test_bad_motion_is_refused():
 
 
 def test_scenes_at_rest_do_not_depend_on_moving_ones():
-    """Beside a scene that moves, scenes at rest have the bits that they have without it, and each frame is reported."""
+    """In a launch with a scene that moves, scenes at rest have the bits that they have without it."""
     lift = moving(wide_sheet(2.5), [0.0, 1.0], [np.zeros(3), np.array([0.0, 3.0, 0.0])])
     place = CELL * np.array([[4.5, height, 4.5] for height in (5, 6, 7, 8)])
     own = {"domain_size": (CELLS * CELL,) * 3}
@@ -185,24 +169,21 @@ def test_scenes_at_rest_do_not_depend_on_moving_ones():
         assert np.array_equal(outcome.position_TN3, alone.position_TN3) and outcome.counters == alone.counters
 
 
-def test_contacts_are_built_as_often_as_their_obstacles_move(monkeypatch):
-    """In a batch with a fast scene a slow one is built once for each tenth of a cell and where it sets off, and never
-    before. Particles above it move as alone within a hundredth of a cell.
-    """
-    built = []
-    build = grid_launch.build_collider
-    monkeypatch.setattr(grid_launch, "build_collider", lambda s, *rest: built.append(s.seed) or build(s, *rest))
-    place = CELL * np.array([[4.5, 2.502, 4.5], [4.5, 12, 4.5]])
-
-    def lifted(seed, begin_s, speed):
-        lift = moving(wide_sheet(2.5), [begin_s, begin_s + 1.0], [np.zeros(3), np.array([0.0, speed, 0.0])])
-        own = {"domain_size": (CELLS * CELL,) * 3, "gravity": (0.0, -200.0, 0.0), "seed": seed}
-        return particles(place, obstacles=(lift,), **own)
-
-    fast, slow = lifted(0, 0.0, 3.0), lifted(1, 4 / 3 / RATE_HZ, 0.9)
-    (alone,) = simulated([slow], frames=4)
-    assert built == [1] * 6
-    built.clear()
-    together = simulated([fast, slow], frames=4)[1]
-    assert [built.count(seed) for seed in (0, 1)] == [24, 7]
-    assert np.abs(together.position_TN3 - alone.position_TN3).max() < 0.01 * CELL
+def test_fast_obstacles_shorten_intervals():
+    """Between two transfers an obstacle moves at most SPEED_FRACTION of a cell. Before, after and in a pause of the
+    motion intervals are as long as without it. No particle before the obstacle comes through."""
+    speed, time = 18.0, np.array([0.05, 0.07, 0.15, 0.17])
+    way = speed * np.array([0.0, 0.02, 0.02, 0.04])
+    lift = moving(wide_sheet(2.5), time, np.outer(way, [0.0, 1.0, 0.0]))
+    room = {"domain_size": (CELLS * CELL, 4.0, CELLS * CELL), "gravity": (0.0, 0.0, 0.0)}
+    far, near = CELL * np.array([[4.5, 30, 4.5]]), CELL * np.array([[4.5, 4, 4.5], [6.5, 9, 6.5]])
+    slow, fast, struck = simulated(
+        [
+            particles(place, WATER, obstacles=(plate,), **room)
+            for place, plate in ((far, wide_sheet(2.5)), (far, lift), (near, lift))
+        ],
+        frames=1 + round(0.25 * RATE_HZ),
+    )
+    least = way[-1] / CELL / SPEED_FRACTION - 0.04 * 30 / CELL
+    assert least <= fast.counters["transfers"] - slow.counters["transfers"] <= 2 * least
+    assert (struck.position_TN3[-1, :, 1] > 2.5 * CELL + way[-1]).all()

@@ -3,6 +3,8 @@
 A GPU runs it with hundreds of threads a block; here a block has one, and two blocks run on the two threads.
 """
 
+import dataclasses
+
 import numpy as np
 import pytest
 import shared_kernels
@@ -13,6 +15,9 @@ from datagen.mpm.device import Device
 from datagen.mpm.solver import SceneFailure, Simulated, Team, _team, _teams_at_once, simulate
 from datagen.mpm.team_launch import divided
 from hgn.config import MpmConfig
+from hgn.scene.motion import Motion
+from hgn.scene.rotation import euler_rotation
+from hgn.scene.shapes import shape_obstacle
 from hgn.schema import ConfigError
 
 
@@ -56,13 +61,26 @@ def test_teams_agree_with_the_other_launch():
 FAILING = mixed(40, 3, (0, 1e6, 0))
 
 
+def lifted(*obstacles):
+    """The obstacles rise and turn, also within a frame."""
+    turns = np.stack([euler_rotation((0.0, angle, 5 * angle)) for angle in (0.0, 2.0, 3.0)])
+    rise = np.array([[0.0, 0.0, 0.0], [0.0, 0.02, 0.0], [0.0, 0.03, 0.0]])
+    motion = Motion(np.array([0.0, 0.02, 0.04]), rise, turns, (0.4, 0.3, 0.4))
+    own = tuple(dataclasses.replace(obstacle, motion=motion) for obstacle in obstacles)
+    return dataclasses.replace(mixed(120, 0, (0, -3, 0)), obstacles=own)
+
+
+MOVING = lifted(sheet(0.3), shape_obstacle("pyramid", 0.2, (0.4, 0.15, 0.4)))
+
+
 @pytest.mark.parametrize(
     ("config", "scenes", "team", "tolerance"),
     [
         (MpmConfig(device="cpu", fixed_time_step_s=1e-3), [HEAVY], Team(1), 1e-3),
         (CONFIG, [mixed(120, 0, (0, -3, 0)), HEAVY, FAILING], Team(1, 2, 1), 1e-5),
+        (CONFIG, [MOVING, HEAVY], Team(1, 2, 1), 1e-5),
     ],
-    ids=["each step is an interval", "two blocks"],
+    ids=["each step is an interval", "two blocks", "moving obstacles"],
 )
 def test_other_kernels_agree(config, scenes, team, tolerance):
     """Kernels without steps of particles' own, and scenes of two blocks that wait for each other, beside one that
