@@ -1,7 +1,7 @@
 """The constitutive laws of one particle, for Taichi kernels: water, sand, snow (Taichi Elements' materials), elastic.
 
 Every law maps the trial deformation of a step to the new state and the Kirchhoff stress (stress times J, per initial
-volume, in pascals). `law` contains rows of constants (layout.Constant), and `row` is the begin of the particle's row.
+volume, in pascals). `law` contains rows of constants (layout.Constant), and the particle's row begins at `row`.
 The state of a particle is F (not of water) and one scalar, `volume`: J for water, the volume correction v_c for sand
 (Tampubolon et al. 2017), the plastic volume ratio Jp for snow (Stomakhin et al. 2013).
 """
@@ -13,11 +13,11 @@ from datagen.mpm.svd import svd3
 from hgn.scene.material import ELASTIC, SAND, SNOW, WATER
 from hgn.solver_method import MINIMUM_SINGULAR_VALUE, WATER_MINIMUM_VOLUME_RATIO
 
-# bounds of Jp; beyond them hardening is capped or has vanished
+# bounds of Jp: below the first one hardening is capped, above the second one the stiffness vanishes
 SMALLEST_PLASTIC_VOLUME, LARGEST_PLASTIC_VOLUME = 1e-3, 1e3
 LARGEST_VOLUME = 1e12  # bound of an elastic solid's J; the stress contains its square
-# factor of an elastic solid's stiffness for the time step: a single particle that hits the floor at 10 m/s gains energy
-# with steps of 0.8 of the limit, and none with 0.65. With 1.6 steps are 0.875 / sqrt(1.6) = 0.69 of the limit
+# Factor of an elastic solid's stiffness for the time step. A single particle that hits the floor at 10 m/s gains energy
+# with steps of 0.8 of the limit, but not with 0.65. With a factor of 1.6 they are 0.875 / sqrt(1.6) = 0.69 of it.
 ELASTIC_MARGIN = 1.6
 # mu(I) = mu_s (1 + RATE_FRICTION / (1 + RATE_NUMBER / I)). The values are those of Jop, Forterre and Pouliquen 2006 for
 # glass beads: mu_s = tan 20.9, mu_2 = tan 32.76 degrees
@@ -43,8 +43,8 @@ def water(volume: ti.f32, expansion: ti.f32, law: ti.template(), row: ti.i32, co
     """Returns J (1 + expansion), bounded below, the Kirchhoff stress lambda J (J - 1), and the present stiffness, Pa.
 
     The expansion of a step is dt tr C. Taichi Elements' det(1 + dt C) - 1 expands rotating water and compresses sheared
-    water, to second order in the step. Stretched water bears the law's fraction of its tension. With 0 it has no
-    pressure until it is compressed again.
+    water, to second order in the step. Stretched water bears a fraction of its tension, a constant of the law. With 0
+    it has no pressure until it is compressed again.
     """
     bulk = law[row + CONSTANT.bulk]
     J = volume * (1.0 + expansion)
@@ -63,8 +63,8 @@ def water(volume: ti.f32, expansion: ti.f32, law: ti.template(), row: ti.i32, co
 def settled(volume: ti.f32, density: ti.f32, share: ti.f32) -> ti.f32:
     """Returns water's J, moved by the fraction `share` towards 1 / `density` (bounded).
 
-    `density` is relative to that at rest. J is integrated along each particle's path. Few particles sample the flow,
-    so J and density drift apart. Near a free surface the kernel extends out of the water, so J is not changed there.
+    `density` is relative to that at rest. J is integrated along each particle's path, and drifts from the density,
+    because few particles sample the flow. Near a free surface J is kept, because the spline extends out of the water.
     """
     inside = ti.min(ti.max(10.0 * (density - 0.85), 0.0), 1.0)
     told = 1.0 / ti.min(ti.max(density, 0.8), 1.25)
@@ -75,10 +75,10 @@ def settled(volume: ti.f32, density: ti.f32, share: ti.f32) -> ti.f32:
 def _project_sand(log_strain, volume: ti.f32, law: ti.template(), row: ti.i32, step: ti.f32, variant: ti.template()):
     """Returns the principal log strains after the return mapping, and the new volume correction.
 
-    Stress tau yields if |s| > alpha (-tr tau), where s is its deviator. Then |tau_1 - tau_3| = |tau_1 + tau_3| sin phi
-    for the largest and smallest principal stress (Mohr-Coulomb). In Taichi Elements alpha is constant (Drucker-Prager).
-    The deviator is shortened and keeps its direction, so the volume stays. With grains alpha grows with the inertial
-    number I = rate d sqrt(rho_grain / p) of the step's plastic shear (Jop, Forterre, Pouliquen 2006).
+    Stress tau with the deviator s yields if |s| > alpha (-tr tau). At |s| = alpha (-tr tau) the largest and smallest
+    principal stress satisfy |tau_1 - tau_3| = |tau_1 + tau_3| sin phi (Mohr-Coulomb). In Taichi Elements alpha is
+    constant (Drucker-Prager). The mapping shortens s and keeps its direction, so the volume stays. With grains alpha
+    grows with the inertial number I = rate d sqrt(rho_grain / p) of the step's plastic shear (Jop et al. 2006).
 
     Volume correction (Tampubolon et al. 2017): v_c / 3 is added to each log strain first, and
     v_c += log det F_trial - log det F_new. In Taichi Elements v_c enters the trace but not the strains.
@@ -102,7 +102,7 @@ def _project_sand(log_strain, volume: ti.f32, law: ti.template(), row: ti.i32, s
             # n1 > n2 > n3, the unit deviator, sum to 0; stress |s| n - p: |s| (n1 - n3) = (2 p + |s| n2) sin phi
             direction = deviator / size
             largest, least = direction.max(), direction.min()
-            # only rounding errors have a denominator below 0.8
+            # except for rounding errors the denominator is at least 0.8
             alpha = 2.0 / 3.0 * sine / ti.max(largest - least + sine * (largest + least), 0.5)
         bearing = -(3.0 * bulk + 2.0 * shear) / (2.0 * shear) * trace * alpha
         excess = ti.max(size - bearing, 0.0)
@@ -116,7 +116,7 @@ def _project_sand(log_strain, volume: ti.f32, law: ti.template(), row: ti.i32, s
                 excess = excess * RATE_NUMBER / (half + root)
             else:
                 excess = (root - half) / k
-        # v_c was added to the strains and the mapping keeps their trace. So F now contains v_c, and v_c is set to 0.
+        # v_c was added to the strains, and the mapping keeps their trace. F then contains v_c, so v_c is set to 0.
         new_strain = strain - deviator * (excess / size)
     return new_strain, new_volume
 
@@ -128,8 +128,8 @@ def foreseen_stiffness(
 ) -> ti.f32:  # fmt: skip
     """Returns (3 lambda + 2 mu) / density of a particle after `time` with the velocity gradient C.
 
-    For elastic solids it returns 1e30 / density, because only a decomposition would give their stretch. So they never
-    take longer steps of their own.
+    For elastic solids it returns 1e30 / density, so that they take no longer steps of their own: only a decomposition
+    would give their stretch.
     """
     density = law[row + CONSTANT.density]
     bulk = 3.0 * law[row + CONSTANT.bulk]
@@ -157,8 +157,8 @@ def solid(
 ):  # fmt: skip
     """Returns new F, new volume, Kirchhoff stress and present stiffness of sand, snow and elastic solids from trial F.
 
-    At rest shape the stiffness is 3 lambda + 2 mu. Elastic solids are fixed corotated (Stomakhin et al. 2012), tau =
-    2 mu (F - R) Fᵀ + lambda J (J - 1), as snow until it yields. Stretch raises their stiffness d(tau) / d(log sigma).
+    Undeformed, the stiffness is 3 lambda + 2 mu. Elastic solids, and snow until it yields, are fixed corotated
+    (Stomakhin et al. 2012), tau = 2 mu (F - R) Fᵀ + lambda J (J - 1). Stretch raises their d(tau) / d(log sigma).
     """
     sand = ti.static(bool(variant & VARIANT.sand))
     snow = ti.static(bool(variant & VARIANT.snow))
@@ -218,7 +218,7 @@ def solid(
             stiffness += 2.0 * shear * ti.max(1.0, widest * (2.0 * widest - 1.0))
             stiffness *= ELASTIC_MARGIN
     new_F = F
-    if plastic > 0:  # only then, because a decomposition and composition round det F
+    if plastic > 0:  # otherwise F stays, because a decomposition and composition would round det F
         new_F = _compose(U, new_sigma, V)
     return new_F, new_volume, _compose(U, stress, U), stiffness
 

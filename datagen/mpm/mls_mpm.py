@@ -4,26 +4,26 @@ Transfers are APIC with quadratic B-splines (Jiang et al. 2015; Hu et al. 2018).
 updated. Particles' contributions have their own array; the old node velocity is added later (`node_velocity`). Masses
 are in units of the mass of a particle with the config's density.
 
-Each transfer smooths velocities, so transfers have their own rate. The interval between two transfers contains as many
-substeps as the stiffest particle needs. With adaptive steps an interval is synchronised if it needs three or more
-substeps, or if a fast particle shortens it. Then it has one more substep, and its first and last are half as long as
-the others. Stress acts from half a step before to half a step after its time (velocity Verlet). If velocities were half
-a step ahead of stresses, oscillations with two periods in an interval could double their energy in each interval.
+Each transfer smooths velocities, so transfers have a rate of their own. The interval between two transfers contains as
+many substeps as the stiffest particle needs. With adaptive steps an interval is synchronised if it needs three or more
+substeps, or if a fast particle shortens it. Then it has one more substep, and its first and last substep are half as
+long as the others. Stress acts from half a step before to half a step after its time (velocity Verlet). If velocities
+were half a step ahead of stresses, oscillations with two periods in an interval could double their energy in it.
 
-At the end of an interval that is not synchronised, strain is one step behind, and velocity half a step. The first
-substep of a following synchronised interval compensates both (VALUE.catch_up). If a synchronised interval precedes one
-that is not, the first substep of the second interval skips strain, and its stress acts for half a substep.
+At the end of an interval that is not synchronised, strain is one step behind, and velocity half a step. If the next
+interval is synchronised, its first substep compensates both (VALUE.catch_up). If an interval that is not synchronised
+follows a synchronised one, its first substep skips strain, and the stress of this substep acts for half of it.
 
 In the first substep of an interval particles transfer mass, momentum and force to the nodes. In the other substeps they
-keep their place on the grid. They compute strain and stress from the gradient of the nodes' velocities. They transfer
-only force, as in the Lagrangian phase of the classical method (Sulsky et al. 1994). After the last substep they take
+keep their places on the grid, compute strain and stress from the gradient of the nodes' velocities, and transfer only
+force, as in the Lagrangian phase of the classical method (Sulsky et al. 1994). After the last substep particles take
 velocity and gradient from the grid, and move by the interval times the velocity. Momentum and angular momentum are
 conserved, because stresses are symmetric and each particle moves along its velocity. multiple_time_stepping chooses the
 particles that compute a new stress in a substep.
 
 Positions belong to the ends of intervals, velocities to their middles (leapfrog). Gravity acts for half of the last and
 half of the present interval, so free fall is exactly v t + g t² / 2 at the end of each interval. Stresses and contacts
-act as in the symplectic Euler scheme. Taichi Elements uses this scheme for gravity too.
+act as in the symplectic Euler scheme, which Taichi Elements uses for gravity too.
 
 Time step, interval, remaining time, state and counters are per scene. Finished and failed scenes idle.
 """
@@ -57,9 +57,9 @@ def respond(
 ):
     """Computes a material's response to a step of `step` seconds with the velocity gradient C, 1/s.
 
-    Particles keep the place that they had when the interval began, so C is a gradient by those positions. `stretch`
-    is the sum of dt (C + Cᵀ) / 2 so far. By present positions the gradient is C - ((C + Cᵀ) / 2) @ stretch, to first
-    order. With it the steps of an interval together stretch F as one step would.
+    Particles keep the places that they had when the interval began, so C is the gradient by those places. `stretch` is
+    the sum of dt (C + Cᵀ) / 2 in the interval so far. The gradient by the present places is, to first order,
+    C - ((C + Cᵀ) / 2) @ stretch. With this gradient the steps of an interval together stretch F as one step would.
 
     Returns the response, -(V0 4 / dx²) stress / mass: the rate at which stress changes APIC's C; the new stretch and F
     (unchanged for water); the new volume (see constitutive); and the present (3 lambda + 2 mu) / density, m²/s².
@@ -166,7 +166,7 @@ def node_velocity(
 
 @ti.func
 def _room(fx, base: ti.i32, axis: ti.template(), scene: ti.i32, arrays: ti.template()) -> ti.f32:
-    """Returns which part of the splines of a particle's nodes is between an axis's walls, averaged with its weights."""
+    """Returns the fraction of the splines of a particle's nodes that lies between an axis's walls, a weighted mean."""
     w0, w1, w2 = weights(fx)
     wall = arrays.shape[SHAPE.wall_cells]
     nodes = ti.cast(arrays.scene_value[scene, VALUE.nodes + axis], ti.i32)
@@ -189,7 +189,7 @@ def _room(fx, base: ti.i32, axis: ti.template(), scene: ti.i32, arrays: ti.templ
 
 @ti.func
 def settles(scene: ti.i32, arrays: ti.template()) -> ti.i32:
-    """Returns whether the water of a scene relaxes to its density."""
+    """Returns whether the scene's water is moved towards its density after each interval (see settle)."""
     return arrays.scene_value[scene, VALUE.water_density] > 0.0 and arrays.setting[SETTING.density_relaxation] > 0.0
 
 

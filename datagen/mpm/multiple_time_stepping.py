@@ -1,14 +1,14 @@
 """Multiple time stepping (Streett et al. 1978) for Taichi kernels: soft particles take longer steps.
 
 The stiffest particle of a scene determines the substep of an interval between two transfers. In a synchronised interval
-(see mls_mpm) softer particles take steps of several substeps. Their own wave speed limits these steps. They compute
-strain and stress once a step.
+(see mls_mpm) softer particles take steps of several substeps, limited by their own wave speed, and compute strain and
+stress once per step.
 
 The stress of a step acts evenly over its substeps, because particles with shorter steps read the velocities of the same
 nodes in each substep. The whole impulse in one substep would give these particles wrong velocities, even at rest.
 
-If all particles in a block of nodes take the same steps, no particle reads the block's nodes within a step. Then the
-block receives the impulses of stress and gravity of a whole step in its first substep, and no update in the others.
+If all particles in a block of nodes take the same steps, no particle reads the block's nodes within a step. The block
+then receives the impulses of stress and gravity of a whole step in the step's first substep, and no later update in it.
 """
 
 import taichi as ti
@@ -51,8 +51,8 @@ def _raise_marks(base, least: ti.i32, scene: ti.i32, arrays: ti.template(), begi
 def mark_changed(x, scene: ti.i32, now: ti.i32, many: ti.f32, inverse_dx: ti.f32, arrays: ti.template(), begin: ti.i32):
     """Marks the blocks of a particle's nodes: in the substep `now` they receive the impulse of `many` substeps.
 
-    A block's mark is block[begin + its index]. It is the maximum of `now * MANY + (MANY - many)` over all changes. So
-    it stores the latest substep with a change and the smallest `many` among this substep's changes (see change_of).
+    A block's mark is block[begin + index of the block]: the maximum of `now * MANY + (MANY - many)` over all changes.
+    It thus stores the latest substep with a change, and the smallest `many` of that substep's changes (see change_of).
     """
     base = base_node(x, inverse_dx)
     change = now * MANY + MANY - ti.cast(many, ti.i32)
@@ -65,13 +65,13 @@ def _alike_around(
 ) -> ti.i32:
     """Returns whether all particles around a particle began the previous interval with steps of `own` substeps.
 
-    "Around" means in the blocks of its nodes. It also marks the particle's own step for the next interval.
+    "Around" means in the blocks of its nodes. The function also marks the particle's own step for the next interval.
     A block has four marks, each in its own array of all blocks; the first array starts at block[begin]:
 
         smallest number of substeps in even intervals    the largest in even intervals
         smallest number of substeps in odd intervals     the largest in odd intervals
 
-    A mark contains the number of its interval, so a mark from an earlier interval does not match.
+    A mark contains the number of its interval, so marks of other intervals do not match.
     """
     base = base_node(x, inverse_dx)
     blocks = arrays.shape[SHAPE.all_blocks]
@@ -105,8 +105,8 @@ def change_of(mark: ti.i32, now: ti.i32) -> ti.f32:
 def acts(covered: ti.f32, begins: ti.f32, step: ti.f32, scene: ti.i32, scene_value: ti.template()) -> ti.i32:
     """Returns whether a particle begins its own step in this substep.
 
-    It does in an interval's first substep, and if its last stress ends before the substep does. `covered` is the end of
-    that stress in s from the start of the interval.
+    It does in an interval's first substep, and if its last stress ends before the end of this substep. `covered` is the
+    end of that stress in s from the start of the interval.
     """
     return begins == 1.0 or covered < scene_value[scene, VALUE.interval_elapsed] - SLACK * step
 
@@ -118,9 +118,9 @@ def own_step(
 ):  # fmt: skip
     """Computes the particle's own step that begins in this substep (see acts). Times are in s since the interval began.
 
-    strained   end of the strain of the steps before; negative before the first step
+    strained   end of the strain of the steps before; negative before the particle's first step
     covered    end of the stress of the steps before
-    spread     1 if that stress acts evenly over its substeps
+    spread     1 if the stress of the step before acts evenly over its substeps
     marks      index in `block` of the first mark of mark_changed, one mark for each block; _alike_around's follow
 
     Returns six values:
@@ -129,7 +129,7 @@ def own_step(
     3. the new `covered`
     4. the number of substeps in which the stress acts
     5. the new `spread`
-    6. the time of stress in this substep: the substep, if spread evenly; else the acting time without its covered part
+    6. the time of stress in this substep: the substep if the new `spread` is 1, else the acting time after `covered`
 
     In a synchronised interval a stress computed at time t acts from half a step before t to half a step after t. The
     stresses of the interval's begin and end act for half a step. The remaining time of strain is divided into equal

@@ -11,7 +11,7 @@ from datagen.mpm.layout import BLOCK, BLOCK_NODES, SHAPE, VARIANT
 
 @ti.func
 def weights(fx):
-    """Returns the quadratic B-spline weights of nodes 0, 1, 2 for an offset fx in [0.5, 1.5) cells, per axis."""
+    """Returns, per axis, the quadratic B-spline weights of nodes 0, 1, 2 for an offset fx in [0.5, 1.5) cells."""
     return (0.5 * (1.5 - fx) ** 2, 0.75 - (fx - 1.0) ** 2, 0.5 * (fx - 0.5) ** 2)
 
 
@@ -41,9 +41,9 @@ def mark(
 ):  # fmt: skip
     """Adds the blocks of a particle's nodes, up to eight, to a list.
 
-    `block` begins with a flag for each of the all_blocks blocks of all scenes. The list of touched blocks' indices
-    begins at `list_begin` and has length[length_at] entries. The place of an entry's block along x, y, z, in ten bits
-    each, is stored all_blocks after the entry.
+    `block` begins with a flag for each of the all_blocks blocks of all scenes. The list of the indices of touched
+    blocks begins at `list_begin` and has length[length_at] entries. The coordinates of an entry's block along x, y, z,
+    in ten bits each, are stored all_blocks after the entry.
     """
     base = base_node(x, inverse_dx)
     first = base >> 2
@@ -101,8 +101,8 @@ def node_place(index, scene: ti.i32, shape: ti.template()) -> ti.i32:
 
 @ti.func
 def second_field(place: ti.i32, scene: ti.i32, arrays: ti.template()) -> ti.i32:
-    """Returns the place of a node's second field among second fields, or -1. If sheets of the scene move, each of its
-    nodes has one (see body_arrays)."""
+    """Returns the index of a node's second field among second fields, or -1. In a scene with moving sheets all nodes
+    have one (see body_arrays)."""
     field = arrays.contact[place]
     if field >= arrays.shape[SHAPE.ghosts]:
         field = -1
@@ -115,13 +115,13 @@ def second_field(place: ti.i32, scene: ti.i32, arrays: ti.template()) -> ti.i32:
 
 @ti.func
 def ghost_place(index, scene: ti.i32, arrays: ti.template()) -> ti.i32:
-    """Returns the index of a node's second field, counted in nodes."""
+    """Returns the index of a node's second field in `node`, in nodes."""
     return arrays.shape[SHAPE.ghost_begin] + second_field(node_place(index, scene, arrays.shape), scene, arrays)
 
 
 @ti.func
 def interpolate(x, first_node: ti.i32, arrays: ti.template(), inverse_dx: ti.f32):
-    """Returns the velocity at x and its gradient, APIC's C, 1/s, from nodes. `first_node` is the scene's first one."""
+    """Returns the velocity at x and its gradient, APIC's C in 1/s. `first_node` is the scene's first node."""
     scaled = x * inverse_dx
     base = ti.floor(scaled - 0.5, ti.i32)
     fx = scaled - ti.cast(base, ti.f32)
@@ -156,7 +156,7 @@ def interpolate(x, first_node: ti.i32, arrays: ti.template(), inverse_dx: ti.f32
 
 @ti.func
 def interpolate_hidden(x, v, C, hidden: ti.i32, scene: ti.i32, arrays: ti.template(), inverse_dx: ti.f32):
-    """Returns v and C of `interpolate` with the second fields of hidden nodes instead of their first."""
+    """Returns v and C of `interpolate`, corrected to use the second fields of hidden nodes instead of the first."""
     scaled = x * inverse_dx
     base = ti.floor(scaled - 0.5, ti.i32)
     new_v = v

@@ -8,13 +8,13 @@ and V are rotations. An inverted A gives its smallest singular value a minus sig
 import taichi as ti
 
 SWEEPS = 6
-# relative to sqrt(a_pp a_qq); a smaller off-diagonal term is rounding
+# square of an off-diagonal term relative to a_pp a_qq; smaller terms are rounding errors
 OFF_DIAGONAL_SQUARE = 1e-14
 
 
 @ti.func
 def _inverse_root(x: ti.f32) -> ti.f32:
-    """Returns 1 / sqrt(x) to rounding. A GPU's own function is less accurate."""
+    """Returns 1 / sqrt(x) correct to rounding. A GPU's own function is less accurate."""
     y = ti.rsqrt(x)
     return y * (1.5 - 0.5 * x * y * y)
 
@@ -57,7 +57,7 @@ def _significant(S: ti.template(), p: ti.template(), q: ti.template()) -> ti.i32
 
 @ti.func
 def _swap_columns(B: ti.template(), V: ti.template(), square: ti.template(), p: ti.template(), q: ti.template()):
-    """Orders columns p < q by length, descending. One of the two changes its sign, so V stays a rotation."""
+    """Orders columns p < q by descending length. If it swaps them, one changes its sign, so that V stays a rotation."""
     if square[p] < square[q]:
         square[p], square[q] = square[q], square[p]
         for i in ti.static(range(3)):
@@ -81,7 +81,7 @@ def _perpendicular(u: ti.template()) -> ti.math.vec3:
 
 @ti.func
 def svd3(A: ti.template()):
-    """Returns U, sigma, V of a finite matrix. sigma descends in size; only its last can be negative beyond rounding."""
+    """Returns U, sigma, V of a finite matrix. sigma descends in size; except for rounding only its last is negative."""
     scale = 0.0
     for i, j in ti.static(ti.ndrange(3, 3)):
         scale = ti.max(scale, ti.abs(A[i, j]))
@@ -118,7 +118,7 @@ def svd3(A: ti.template()):
         b1 -= u0 * u0.dot(b1)
         length_square = b1.dot(b1)
         u1 = _perpendicular(u0)
-        if length_square > 1e-14:  # relative to the largest entry's square; below it the direction is rounding
+        if length_square > 1e-14:  # relative to the largest entry's square; a shorter column's direction is rounding
             u1 = b1 * _inverse_root(length_square)
             u1 -= u0 * u0.dot(u1)
             u1 *= _inverse_root(u1.dot(u1))

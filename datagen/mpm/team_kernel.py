@@ -1,9 +1,9 @@
 """Frames of explicit MLS-MPM in one launch, with a team of threads for each scene: the fastest way on a GPU.
 
-The method and its parts are those of datagen.mpm.mls_mpm. A scene of a few thousand particles needs hundreds of steps a
-frame, each of a few microseconds. So a team computes step after step of a scene within one launch, independently of
-other scenes. A team is one or several thread blocks that share a scene's particles and wait for each other
-(datagen.mpm.team_meeting). All blocks of a launch must run concurrently. A team computes one scene after another.
+The method and its parts are those of datagen.mpm.mls_mpm. A scene of a few thousand particles needs hundreds of short
+substeps per frame. So a team computes all substeps of a scene in one launch, independently of other scenes. A team is
+one or several thread blocks that share a scene's particles and wait for each other (datagen.mpm.team_meeting). If it
+has several, all blocks of a launch must run concurrently. A team computes one scene after another.
 
 One thread for each particle computes strain, stress and contact with triangles. Each frame sorts the particles by
 their cells into the other copy of the state. Neighbours in space are then neighbours in memory.
@@ -83,10 +83,10 @@ def _strain(
     share: ti.template(), thread: ti.template(), particles: ti.i32, tags: ti.i32, step: ti.f32, begins: ti.f32,
     own_steps: ti.i32, some_wait: ti.i32, arrays: ti.template(),
 ):  # fmt: skip
-    """Computes the materials' response of particles that act in this substep, and writes it over C.
+    """Computes the materials' response for the particles that act in this substep, and writes it over their C.
 
-    It uses the gradient of the nodes' velocities, but C in the first step of an interval. In this step it also marks
-    the blocks that a particle touches. If particles take their own steps, those in list_acting's lists act, else all.
+    In the first substep of an interval it uses C, and marks the blocks of the particles' nodes. In later substeps it
+    uses the gradient of the nodes' velocities. With `own_steps` the particles that begin a step act, otherwise all.
     """
     solid = ti.static(has_solid(arrays.variant))
     intervals = ti.static(not arrays.variant & VARIANT.each_step)
@@ -205,9 +205,9 @@ def advance(
 ):  # fmt: skip
     """Advances every scene by `frames` frames, and writes each frame's positions to output[frame, particle, axis].
 
-    Each of `teams` teams has `blocks` blocks of `threads` threads. It computes `stretch` frames of one scene, then of
-    the next, until all are done. With `several` blocks, all blocks of the launch must run concurrently. Particles are
-    sorted at the begin of each frame. P and G are the numbers of particles and nodes of all scenes.
+    Each of `teams` teams has `blocks` blocks of `threads` threads. A team computes `stretch` frames of one scene, then
+    of another, until all are done. `several`: a team has more than one block. Particles are sorted at the start of each
+    frame. P and G are the numbers of particles and nodes of all scenes.
 
     At addresses (see device_memory): state [2 * fields * P]; node [2, G, 4]. node[0] has changes of momentum in a step
     and of mass in an interval (zero between them); node[1] has velocities, and at an interval's end the mass.
@@ -221,7 +221,7 @@ def advance(
         fields = ti.static(FIELD.solid if has_solid(variant) else FIELD.fluid)
         items = ti.static(threads if threads > 1 else CPU_ITEMS)
         members = blocks * threads
-        # a CPU thread gets consecutive items, so blocks that wait for each other must not be among the same items
+        # a CPU thread gets consecutive items, so blocks that wait for each other must not have the same CPU thread
         team = item // items % teams
         part = item // items // teams
         lane = item % items
@@ -246,7 +246,7 @@ def advance(
         if lane < threads:
             if member == 0:
                 take_turn(at, meeting)
-            # this meeting shows before the simulation whether all blocks run concurrently
+            # this meeting detects, before the simulation, blocks that do not run concurrently
             meet_team(thread, meetings, arrays)
             if frames > 0 and columns[segment + LEAVES] == 0:
                 turns = scenes * ((frames + stretch - 1) // stretch)
@@ -311,7 +311,7 @@ def advance(
                         meet_team(thread, meetings, arrays)
                         if ti.static(listed):
                             start_lists(thread, columns)
-                        # the last thread has few nodes of its own, so it chooses while the others update theirs
+                        # the last thread has the fewest nodes, so it chooses the next step while others update theirs
                         if not ends and member == members - 1:
                             choose(scene, arrays)
                         update_nodes(
@@ -351,7 +351,7 @@ def start_team(
     state: Scalars, tag: Integers, position: Scalars, velocity: Scalars, label: Integers, law_row: Integers,
     order: Integers, counter: ti.types.ndarray(dtype=ti.i64, ndim=2), law: Scalars, fields: ti.template(),
 ):  # fmt: skip
-    """Writes undeformed particles into the first copy, order[p] at p, and the maxima for the first time step."""
+    """Writes undeformed particles into the first copy, particle order[p] at p, and the maxima for the first step."""
     for p in range(label.shape[0]):
         stride = label.shape[0]
         source = order[p]

@@ -21,14 +21,14 @@ from datagen.mpm.host_copy import HostCopy  # isort: skip
 from datagen.mpm.team_meeting import APART, MEETING, SEGMENT  # isort: skip
 from datagen.mpm.team_transfers import LANES  # isort: skip
 
-LAUNCH_SECONDS = 6.0  # target time of a launch; determines its number of frames. At its end scenes wait for each other
+LAUNCH_SECONDS = 6.0  # target time of a launch; determines its frames. Scenes wait for each other at the launch's end
 MAXIMUM_OUTPUT_BYTES = 2**30  # largest size of a launch's positions
 MAXIMUM_PARTICLES = (2**31 - 1) // (2 * FIELD.solid)  # largest number of particles whose fields int32 can count
-SHARED_BLOCKS = 8  # fewest blocks of each of a few scenes
-LATENCY = 0.5  # time of a substep without particles, relative to that of one particle per thread (30 and 50 µs)
+SHARED_BLOCKS = 8  # smallest number of blocks with which `divided` keeps the team's number
+LATENCY = 0.5  # time of a substep without particles (30 µs) in units of the time that a particle per thread adds
 PAUSE = 0.8  # fraction of a launch's expected time in which the host sleeps
 SHORT_SECONDS = 0.1  # launches that are expected to be shorter are awaited without sleep
-PATIENCE = (2**31 - 1, 2**22)  # largest number of reads of a counter on a CPU and on a GPU, where they take seconds
+PATIENCE = (2**31 - 1, 2**22)  # largest number of reads of a counter on a CPU, and on a GPU, where so many take seconds
 
 
 class Team(NamedTuple):
@@ -43,8 +43,8 @@ def divided(count_B: np.ndarray, substeps_B: np.ndarray, room: int, team: Team) 
     """Returns the numbers of teams and of blocks per team that are expected to end a launch first.
 
     A scene takes substeps * (particles per thread + LATENCY). A launch takes as long as its longest scene, or as all
-    scenes divided by the number of teams. With one block a scene, or SHARED_BLOCKS and more, the division is `team`'s.
-    Otherwise all `room` blocks that run concurrently are divided, at least `team.blocks` for each team.
+    scenes divided by the number of teams. If `team` has one block, or SHARED_BLOCKS or more, its number is used.
+    Otherwise the `room` blocks that can run concurrently are divided, with at least `team.blocks` for each team.
     """
     most = min(room // team.blocks, len(count_B))
     if team.blocks == 1 or team.blocks >= SHARED_BLOCKS:
@@ -143,7 +143,7 @@ class TeamLaunch(Launch):
             woken = time.perf_counter()
             position = self.host_copy.read(output).reshape(size, self.particles, 3)
             taken = time.perf_counter() - begin
-            if pause > SHORT_SECONDS and taken < 1.05 * (woken - begin):  # the launch ended during the sleep
+            if pause > SHORT_SECONDS and taken < 1.05 * (woken - begin):  # the launch may have ended during the sleep
                 taken *= 0.5
             self._require_together()
             total = self.counter.to_numpy()[:, COUNT.substeps]
@@ -165,14 +165,14 @@ class TeamLaunch(Launch):
     def _launch(self, frames: int, substeps: np.ndarray) -> ti.ScalarNdarray:
         """Starts `frames` frames of the scenes. Returns the array of their positions, valid when the device is done.
 
-        `substeps` are those of the last launch. Scenes with much work come first, so that none runs alone at the end.
+        `substeps` are those of the last launch. Scenes with much work come first, so that few teams idle at the end.
         """
         output = ti.ndarray(ti.f32, 3 * max(frames, 1) * self.particles)
         count = np.diff(self.particle_begin)
         self.turn.from_numpy(np.argsort(-substeps * count, kind="stable").astype(np.int32))
         self.meeting.fill(0)
         teams, blocks = divided(count, substeps, self.room, self.team)
-        # one frame a turn, because otherwise most teams would be without a scene during the last ones
+        # one frame per turn: with longer turns many teams would have no scene during the last turns
         stretch = 1 if teams < len(self.scenes) else max(frames, 1)
         team_kernel.advance(
             frames, stretch, teams, blocks, PATIENCE[self.team.threads > 1], self.frame_s,

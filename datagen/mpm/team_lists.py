@@ -1,13 +1,13 @@
 """Lists of the particles of a thread block that act in a substep within an interval.
 
-If particles take their own steps, about a third of them act in a substep. With one thread for each particle half of a
-warp would wait, so threads process lists. If a thread has at most one particle (`run` 1), there are no lists, and
+If particles take their own steps, about a third of them act in a substep. With one thread per particle half of a warp
+would wait, so threads process lists. If a thread has at most one particle (`run` is 1), there are no lists, and
 `giving` contains IDLE for inactive particles. In an interval that is not synchronised all particles act.
 
 A block lists its own particles, counted from the scene's first. `column_list` has particles that begin a step and,
 backwards from its end, particles that continue a step whose stress acts evenly. `giving` has both in order, with -1 - p
-for a continuing particle p. Entries lie at the places of the block's own particles (see team_particles.dealt). Their
-numbers are in columns[segment + ACTING], + GOING_ON and + GIVING.
+for a continuing particle p. Lists lie at the places of the block's own particles (see team_particles.dealt). Their
+lengths are columns[segment + ACTING], columns[segment + GOING_ON] and columns[segment + GIVING].
 """
 
 import taichi as ti
@@ -23,13 +23,13 @@ IDLE = -(2**31)
 
 @ti.func
 def _places(entry, arrays: ti.template(), thread: ti.template()):
-    """Returns the positions of this thread's new entries in three lists. An entry is new if `entry` is 1.
+    """Returns the positions of this thread's new entries in the three lists. entry[i] is 1 if list i gets an entry.
 
-    All threads of a warp get their positions together, in thread order.
+    All threads of a warp get their positions at the same time, in thread order.
     """
     before = ti.Vector([0, 0, 0])
     if ti.static(arrays.threads > 1):
-        # three counts of at most 32 in one number
+        # one number contains three counts of at most 32
         own = entry[0] | entry[1] << 8 | entry[2] << 16
         total = own
         for step in ti.static((1, 2, 4, 8, 16)):
@@ -54,7 +54,7 @@ def _places(entry, arrays: ti.template(), thread: ti.template()):
 
 @ti.func
 def list_acting(share: ti.template(), thread: ti.template(), step: ti.f32, arrays: ti.template()):
-    """Makes the block's lists for a substep within an interval. Their counts must be 0."""
+    """Makes the block's lists for a substep after the first of an interval. Their lengths must be 0."""
     rounds = (share.owned + arrays.threads - 1) // arrays.threads
     for around in range(rounds):
         own = around * arrays.threads + thread.lane
@@ -78,7 +78,7 @@ def list_acting(share: ti.template(), thread: ti.template(), step: ti.f32, array
 
 @ti.func
 def mark_going_on(share: ti.template(), thread: ti.template(), particles: ti.i32, arrays: ti.template()):
-    """Marks the blocks of the nodes of columns that continue a step whose stress acts evenly (see mark_changed)."""
+    """Marks the blocks of nodes of particles that continue a step whose stress acts evenly (see mark_changed)."""
     count = arrays.columns[thread.segment + GOING_ON]
     own = thread.lane
     while own < count:
@@ -89,7 +89,7 @@ def mark_going_on(share: ti.template(), thread: ti.template(), particles: ti.i32
 
 @ti.func
 def start_lists(thread: ti.template(), columns: ti.template()):
-    """Sets the counts to 0. The block sees this after its next meeting."""
+    """Sets the lists' lengths to 0. All threads of the block see this after the next meeting."""
     if thread.lane == 0:
         for i in ti.static(range(3)):
             columns[thread.segment + ACTING + i] = 0
@@ -100,9 +100,9 @@ def gives_now(
     p: ti.i32, share: ti.template(), step: ti.f32, particles: ti.i32, stride: ti.i32, some_wait: ti.i32,
     arrays: ti.template(),
 ) -> ti.i32:  # fmt: skip
-    """Returns whether a particle begins its own step. It writes the particle's entry in `giving`.
+    """Returns whether a particle begins its own step, and writes the particle's entry in `giving`.
 
-    It also marks a particle that continues its step. The block's particles keep their order.
+    With `some_wait` it also marks the blocks of a particle that continues its step. Here entry p is that of particle p.
     """
     begins_own = acts(arrays.covered[share.first + p], 0.0, step, share.scene, arrays.scene_value)
     if begins_own:

@@ -1,8 +1,8 @@
 """Barriers between the thread blocks of a team: counters in global memory.
 
 On a CPU a block has one thread. A block reads a counter at most `patience` times, because blocks that do not run
-concurrently would wait for each other forever. Then it sets meeting[APART] and columns[segment + LEAVES]. All blocks
-leave the launch, and its results are discarded.
+concurrently would wait for each other forever. Then the block sets meeting[APART] and columns[segment + LEAVES]. All
+blocks leave the launch, and the launch's results are discarded.
 """
 
 import taichi as ti
@@ -12,18 +12,18 @@ from datagen.mpm.layout import LIVE, SHAPE, VALUE, VARIANT
 from datagen.mpm.time_step import choose_time_step, raise_maximum
 
 WARP = 32
-MEETING = 96  # integers of a team, in thirds: number of blocks that arrived, number of releases, its next turn
+MEETING = 96  # number of a team's integers; each third begins with one: arrived blocks, releases, the next turn
 TURN = 2 * MEETING // 3
 QUEUE, APART = 0, 1  # before the teams' integers: number of turns taken, and 1 if blocks do not run concurrently
-SEGMENT, LEAVES = 6, 2  # integers of a block, and the index of the one that is set when it leaves
-ACTING, GOING_ON, GIVING = 3, 4, 5  # indices of the counts of its lists (see team_lists)
+SEGMENT, LEAVES = 6, 2  # number of a block's integers in `columns`, and the index of its flag to leave the launch
+ACTING, GOING_ON, GIVING = 3, 4, 5  # indices of the lengths of the block's lists (see team_lists)
 EVER = 2**31 - 1  # number of reads of a counter without a limit
 LOOKS = 64  # number of reads of a counter between two checks whether all leave
 
 
 @ti.func
 def wait(threads: ti.template()):
-    """Waits until all threads of the block are here. Each thread then sees the writes of all others."""
+    """Waits until all threads of the block have called it. Each thread then sees the writes of all others."""
     if ti.static(threads > 1):
         ti.simt.block.sync()
 
@@ -54,7 +54,7 @@ def await_count(arrays: ti.template(), entry: ti.i32, target: ti.i32, segment: t
 
 @ti.func
 def meet_team(thread: ti.template(), meetings: ti.template(), arrays: ti.template()):
-    """Waits until the whole team is here. Each thread then sees all writes. `meetings` counts the meetings."""
+    """Waits until the whole team has called it. Each thread then sees all writes. `meetings` counts the meetings."""
     wait(arrays.threads)
     if ti.static(arrays.several):
         if thread.lane == 0:
@@ -67,7 +67,7 @@ def meet_team(thread: ti.template(), meetings: ti.template(), arrays: ti.templat
 
 @ti.func
 def take_turn(at: ti.i32, meeting: ti.template()):
-    """Writes the next turn for the team whose integers begin at `at`. Running teams take turns in their order."""
+    """Gives the team whose integers begin at `at` the next turn. Teams get turns in the order in which they ask."""
     meeting[at + TURN] = ti.atomic_add(meeting[QUEUE], 1)
 
 
@@ -82,8 +82,8 @@ def leave_scene(entry: ti.i32, lane: ti.i32, arrays: ti.template()):
 
 @ti.func
 def await_scene(entry: ti.i32, count: ti.i32, thread: ti.template(), arrays: ti.template()):
-    """Waits until `count` blocks have left the scene, without a time limit. The team that has it is running, because
-    its turn came earlier."""
+    """Waits until `count` blocks have left the scene, without a limit: the team that computes the scene is running,
+    because it took its turn earlier."""
     if thread.lane == 0:
         await_count(arrays, entry, count, thread.segment, EVER)
 
@@ -125,7 +125,7 @@ def meet_and_choose(
 
 @ti.func
 def raise_by_warps(lane: ti.i32, arrays: ti.template(), scene: ti.i32, entry: ti.template(), value: ti.f32):
-    """Computes raise_maximum for all threads of a block, once for each warp."""
+    """Computes raise_maximum for the values of all threads of a block, with one atomic operation per warp."""
     if ti.static(arrays.threads > 1):
         bits = ti.bit_cast(ti.max(value, 0.0), ti.i32)
         for step in ti.static((16, 8, 4, 2, 1)):

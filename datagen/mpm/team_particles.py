@@ -14,10 +14,10 @@ from datagen.mpm.team_meeting import meet_team, wait
 
 COPIED = 16  # number of fields that are copied together
 
-# Variables of a kernel that its functions take as one.
-# Thread: the thread's number in its block, the block's number in the team, the number of blocks; the thread's number in
-# the team, and the team's number of threads; the number of all particles; the begin of velocities in `node`, of the
-# team's integers in `meeting`, and of the block's in `columns`; and the largest number of reads of a counter.
+# Variables that the kernel's functions take as one argument.
+# Thread: the thread's number in its block, the block's number in the team, the team's number of blocks; the thread's
+# number in the team, and the team's number of threads; the number of all particles; the indices at which velocities
+# begin in `node`, the team's integers in `meeting`, the block's in `columns`; the most reads of a counter.
 Thread = namedtuple(
     "Thread", ["lane", "part", "blocks", "member", "members", "stride", "velocities", "at", "segment", "patience"]
 )
@@ -28,7 +28,7 @@ Share = namedtuple("Share", ["scene", "first", "chunk", "owned"])
 
 @ti.func
 def dealt(own: ti.i32, thread: ti.template(), chunk: ti.i32) -> ti.i32:
-    """Returns the index in the scene of a block's particle `own`. Blocks get chunks in turn, to spread slow ones."""
+    """Returns the index in the scene of a block's particle `own`. Chunks go to the blocks in turn, to balance work."""
     return (own // chunk * thread.blocks + thread.part) * chunk + own % chunk
 
 
@@ -69,9 +69,9 @@ def put_symmetric(state: ti.template(), place: ti.i32, stride: ti.i32, field: ti
 
 @ti.func
 def _cell(x, scene: ti.i32, arrays: ti.template()) -> ti.i32:
-    """Returns the number of a particle's cell in the order. BLOCK cells above each other form a column.
+    """Returns the number of a particle's cell in the sorted order. BLOCK cells above each other form a column.
 
-    Material falls, so consecutive particles of a column stay neighbours for longest.
+    Most material falls, so particles of a column stay neighbours longest.
     """
     base = base_node(x, arrays.setting[SETTING.inverse_cell_size])
     place = node_place(base, scene, arrays.shape)
@@ -99,7 +99,7 @@ def sort(
             arrays.column_list[share.first + dealt(listed, thread, share.chunk)] = cell // BLOCK
         own += arrays.threads
     meet_team(thread, meetings, arrays)
-    # the columns that a block found first stay together
+    # columns that the same block was the first to find stay together
     c = thread.lane
     while c < arrays.columns[thread.segment]:
         ti.atomic_add(
@@ -128,7 +128,7 @@ def sort(
         p = dealt(own, thread, share.chunk)
         source = copy * fields * thread.stride + share.first + p
         cell = _cell(get_vector(arrays.state, source, thread.stride, FIELD.position), share.scene, arrays)
-        # bounded, because counts are incomplete after blocks have left
+        # bounded, because counts are incomplete if blocks have left the launch
         place = ti.min(share.first + arrays.cell_count[cell] + arrays.rank[share.first + p], thread.stride - 1)
         target = (1 - copy) * fields * thread.stride + place
         for group in ti.static(range(0, fields, COPIED)):

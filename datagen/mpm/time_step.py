@@ -5,11 +5,11 @@ import taichi as ti
 from datagen.mpm.layout import COUNT, SETTING, STATUS, VALUE
 from hgn.solver_method import SPEED_FRACTION
 
-# An interval with at least this number of stress steps is synchronised (see mls_mpm). Without synchronisation intervals
-# of fewer steps are stable at rest. But the result of an impact on the ground at 10 m/s changed by 6 % when the steps
-# were halved. So an interval that a fast particle shortens is synchronised too.
+# An interval with at least this number of stress steps is synchronised (see mls_mpm). Intervals of fewer steps are
+# stable at rest without synchronisation. But the result of an impact on the ground at 10 m/s changed by 6 % when the
+# steps were halved, so an interval that a fast particle shortens is synchronised too.
 SYNCHRONISED_FROM = 3.0
-SPEED_MARGIN = 1.25  # a particle that gains speed may move this much farther than planned for an interval
+SPEED_MARGIN = 1.25  # a particle that gains speed may move this many times the distance planned for an interval
 
 
 @ti.func
@@ -28,7 +28,7 @@ def _maximum(counter: ti.template(), scene: ti.i32, entry: ti.template()) -> ti.
 
 @ti.func
 def _parts(whole: ti.f32, longest: ti.f32) -> ti.f32:
-    """Returns the number of equal parts of a time, none longer than `longest`."""
+    """Returns the smallest number of equal parts of a time that are not longer than `longest`."""
     return ti.max(ti.ceil(ti.min(whole / longest, 1e9) - 1e-4), 1.0)
 
 
@@ -83,7 +83,7 @@ def choose_time_step(
             bound = speed_fraction * dx / ti.max(speed, 1e-20)
             fast = bound < ti.min(longest, remaining)
             longest = ti.min(longest, bound)
-            # equal intervals to the end of the frame, so that no short one remains
+            # intervals are equal up to the end of the frame, so that no short one remains
             last = interval
             interval = remaining / _parts(remaining, longest)
             left = interval
@@ -106,7 +106,7 @@ def choose_time_step(
                 step = 0.5 * whole
                 ahead += 1.0
             else:
-                full = ti.max(ti.ceil(ti.min(left / limit, 1e9) - 0.5 - 1e-4), 0.0)  # whole steps; a half one follows
+                full = ti.max(ti.ceil(ti.min(left / limit, 1e9) - 0.5 - 1e-4), 0.0)  # whole steps before the half one
                 ahead = full + 1.0
                 whole = left / (full + 0.5)
                 step = whole if full > 0.0 else left
@@ -128,7 +128,7 @@ def choose_time_step(
             remaining -= step
             left -= step
             elapsed += step
-            # an interval also ends if material has become much faster in it
+            # an interval also ends if material has become much faster since its start
             reach = SPEED_MARGIN * speed_fraction * dx
             if ahead <= 1.0 or (not begins and elapsed * ti.sqrt(speed_square) > reach):
                 left = 0.0
@@ -150,7 +150,7 @@ def choose_time_step(
             counter[scene, COUNT.transfers] = transfers + ti.cast(begins, ti.i64)
             counter[scene, COUNT.frame_substeps] = ti.cast(done + 1, ti.i64)
             counter[scene, COUNT.substeps] = substeps + ti.cast(1, ti.i64)
-            # maxima are computed again in each step; held_stiffness_bits in each interval
+            # maxima are reset in each step, held_stiffness_bits only in each interval
             if begins:
                 counter[scene, COUNT.held_stiffness_bits] = ti.cast(0, ti.i64)
             counter[scene, COUNT.stiffness_bits] = ti.cast(0, ti.i64)
@@ -160,6 +160,6 @@ def choose_time_step(
 
 @ti.func
 def falls(time: ti.f32, scene: ti.i32, scene_value: ti.template()):
-    """Returns the change of velocity by gravity in a time."""
+    """Returns the change of velocity that gravity causes in `time` s."""
     gravity = ti.Vector([scene_value[scene, VALUE.gravity + i] for i in range(3)])
     return time * gravity
