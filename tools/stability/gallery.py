@@ -1,7 +1,7 @@
 """The scenes of conf/gallery as cases of the stability reports.
 
-A gallery file is a scene file with a section `measure`: frames, bounds (observables.BoundEntry), and what draws vary.
-Draw 0 is the file itself. Draw 1 is for choices between networks, draw 2 for reports, others are free.
+A gallery file is a scene file with a section `measure`: frames, bounds (observables.BoundEntry), and numbers that draws
+vary. Draw 0 is the file itself. Draw 1 is for choices between networks, draw 2 for reports, the others are free.
 """
 
 from __future__ import annotations
@@ -26,15 +26,15 @@ from tools.scenes import joined
 from tools.stability.observables import LACKS, BoundEntry, Film
 
 GALLERY = "gallery"
-NAME = re.compile(rf"{GALLERY}(?:_(\d+))?")  # of a case: with the number of a draw
+NAME = re.compile(rf"{GALLERY}(?:_(\d+))?")  # name of a case, with the number of a draw
 GRID_CELLS = (64, 96)  # solver cells per unit of length
 REFERENCE = Path(__file__).parents[2] / "results" / "stability"
-ATTEMPTS = 20  # at draws that have too little space
+ATTEMPTS = 20  # largest number of attempts at a draw, if its groups have too little space
 
 
 @dataclass(frozen=True, kw_only=True)
 class VaryEntry:
-    """A number that each draw takes from a range, times a factor for each of the values that it is added to."""
+    """A number that each draw takes from a range, and adds to values of the file, times a factor for each value."""
 
     range: tuple[float, float]
     add: dict[str, float]  # factors by place in the file, as in groups.0.position.1
@@ -48,8 +48,8 @@ class VaryEntry:
 class MeasureEntry:
     """The section `measure` of a gallery file."""
 
-    kind: str  # of scene: the column of tables
-    frames: FrameCount  # that are simulated, at 60 a second
+    kind: str  # kind of scene, for a column of tables
+    frames: FrameCount  # number of simulated frames, at 60 per second
     bounds: tuple[BoundEntry, ...]
     vary: tuple[VaryEntry, ...] = ()
     far: GroupEntry | None = None  # a body that is added far away, in a second simulation
@@ -87,7 +87,7 @@ class GalleryCase:
 
     @functools.cached_property
     def digest(self) -> str:
-        """Identifies what is simulated; bounds and windows of frames may change without a new simulation."""
+        """Identifies the simulated scene. Bounds and their frames are not part of it: they need no new simulation."""
         scene = self.scenes[0]
         meshes = [mesh.vertex_V3.tobytes() + mesh.triangle_F3.tobytes() for mesh in scene.obstacles]
         given = {
@@ -97,7 +97,7 @@ class GalleryCase:
         return hashlib.sha256(json.dumps(given, sort_keys=True).encode()).hexdigest()[:16]
 
     def film(self, scene: Scene, trials: Sequence[np.ndarray], rate_hz: float) -> Film:
-        """Returns the film of a trajectory, and of the one with the far body where there are two."""
+        """Returns the film of a trajectory, and of the one with the far body if there is one."""
         beside = trials[1][:, : scene.particle_count] if len(trials) > 1 else None
         density = self.content.get("particles_per_cell", SceneFile.particles_per_cell)
         return Film(scene, trials[0], rate_hz, 1 / GRID_CELLS[0], density, beside)
@@ -135,7 +135,7 @@ def load_case(name: str, file: Path, draw: int = 0) -> GalleryCase:
 
 
 def _drawn(given: Mapping[str, Any], name: str, draw: int, attempt: int) -> dict[str, Any]:
-    """Returns the file's content with a draw's changes; draws without enough space are repeated."""
+    """Returns the file's content with the changes of a draw. `attempt` counts repetitions for lack of space."""
     content: dict[str, Any] = copy.deepcopy(dict(given))
     rng = np.random.default_rng([draw, zlib.crc32(name.encode()), attempt])
     for index, vary in enumerate(from_mapping(MeasureEntry, content[MEASURE], MEASURE).vary):
@@ -146,7 +146,7 @@ def _drawn(given: Mapping[str, Any], name: str, draw: int, attempt: int) -> dict
 
 
 def _case(name: str, file: Path, content: Mapping[str, Any]) -> GalleryCase:
-    """Returns a scene. Raises: ConfigError where it lacks what a bound measures."""
+    """Returns a scene. Raises: ConfigError if a bound cannot be measured in it."""
     case = GalleryCase(name, file, content, from_mapping(MeasureEntry, content[MEASURE], MEASURE))
     scene, far = case.scene(), case.measure.far
     plain = not scene.emits and not scene.material_parameters

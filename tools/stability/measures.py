@@ -19,12 +19,12 @@ from tools.measures import energies, energy_scale, neighbours, outside_domain
 from tools.stability.case import Outcome
 
 EARTH = 9.8  # domain units per second squared
-STIR_FRAMES = 60  # at the end, over which the squared speed at rest is averaged
-TURNS = {"-x": (1, 0, 2), "-z": (0, 2, 1)}  # exchanges of axes that turn upright gravity
+STIR_FRAMES = 60  # number of last frames over which the squared speed at rest is averaged
+TURNS = {"-x": (1, 0, 2), "-z": (0, 2, 1)}  # exchanges of axes that turn upright gravity in this direction
 
 
 def energy_growth(outcome: Outcome) -> float:
-    """Returns the largest increase of kinetic and potential energy since the start; 1 is a fall through the domain."""
+    """Returns the largest increase of kinetic and potential energy since the start, in falls through the domain."""
     growths = [0.0]
     for trial, scene in zip(outcome.trials, outcome.scenes, strict=True):
         if trial.frame_count > 1:
@@ -39,7 +39,7 @@ def energy_growth(outcome: Outcome) -> float:
 def energy_rise(outcome: Outcome) -> float:
     """Returns the largest increase of the energy of `energy_growth` since any earlier frame.
 
-    Elastic energy is not included. So a body that bounces correctly has a rise too, and limits add the solver's rise.
+    Elastic energy is not included, so even a correct bounce has a rise. Limits therefore add the solver's rise.
     """
     rises = [0.0]
     for trial, scene in zip(outcome.trials, outcome.scenes, strict=True):

@@ -94,8 +94,8 @@ class Runner:
     def __init__(self, simulator: Simulator, cases: Sequence[Case], mpm: MpmConfig | None) -> None:
         self.simulator, self.mpm = simulator, mpm
         self._upright: dict[int, list[RolloutResult]] = {}
-        self._solved: dict[int, RolloutResult] = {}  # by the scene's id
-        self._to_solve: dict[tuple[int, Vector], dict[int, Scene]] = {}  # by frames and domain, then id
+        self._solved: dict[int, RolloutResult] = {}  # key: id of the scene
+        self._to_solve: dict[tuple[int, Vector], dict[int, Scene]] = {}  # keys: frames and domain, then id
         for case in cases:
             for scene in (*(case.scenes if case.solver else ()), *case.upright):
                 self._to_solve.setdefault((case.frames, scene.domain_size), {})[id(scene)] = scene
@@ -127,7 +127,7 @@ class Runner:
         return self._upright[id(case.upright)]
 
     def _solver(self, scenes: Sequence[Scene], frames: int) -> list[RolloutResult]:
-        """Returns the solver's trajectories. Scenes of all cases with equal lengths and domains are one launch."""
+        """Returns the solver's trajectories. All cases' scenes with the same length and domain are in one launch."""
         for domain_size in dict.fromkeys(scene.domain_size for scene in scenes):
             if pending := self._to_solve.pop((frames, domain_size), {}):
                 assert self.mpm is not None

@@ -44,7 +44,7 @@ TURNED_SPREAD = 0.1  # cubes start within this fraction of each domain side from
 MEETING = (1.5, -0.5)  # velocities of the two cubes along x, domain units per second
 MEETING_FRAMES = 40
 COLLAPSE_CELLS = (5.0, 20.0)  # heights of falling cubes above the lower plane, in cells of the solver
-COLLAPSE_FRAMES = (30, 60, 150)  # while spreading, when walls are reached, and at rest
+COLLAPSE_FRAMES = (30, 60, 150)  # material spreads, reaches the walls, and is at rest
 SLOPES_DEG = (15.0, 30.0, 45.0)
 SLOPE_SIDE, SLOPE_WAY = 0.6, 0.35  # side of the slope and distance slid, as fractions of the domain's smallest side
 FALL_FRAMES = 12  # number of frames in which a falling particle meets nothing
@@ -65,7 +65,7 @@ MEETS_ALONE = (Limit("momentum", high=0.01), Limit("angular", high=0.05), Limit(
 ENERGY, INSIDE = STANDARD
 RISE = Limit("energy_rise", high=0.02, above=1.5)
 WAY = (ENERGY, Limit("share_of_way", 0.8, 1.2), INSIDE)
-# Over three random fillings the solver's spread varies by 2 % (late spread of water: 9 %), its height by 0.1 cells.
+# Over three random fillings the solver's spread varies by 2 % (water's late spread by 9 %), its height by 0.1 cells.
 SPREADS = (
     ENERGY,
     RISE,
@@ -75,7 +75,7 @@ SPREADS = (
     INSIDE,
 )
 # 5e-4 is twice the standard deviation of the squared speed over five fillings of 135 particles of water or sand.
-# Mixed water drifts by 0.6 of the distance between the walls. So particles can exceed 1.3 times this drift.
+# Mixed water drifts by 0.6 of the distance between the walls, so particles can exceed 1.3 times the solver's drift.
 RESTS = (
     ENERGY,
     RISE,
@@ -92,7 +92,7 @@ RESTS = (
 class Context:
     """Scenes, network and lengths of a report's cases."""
 
-    scene: SceneConfig  # as in training; obstacles and materials that the network does not take are left out
+    scene: SceneConfig  # as in training, without obstacles and materials that the network does not support
     network: NetworkConfig
     frame_rate_hz: float
     frames: int
@@ -181,7 +181,7 @@ def slopes(context: Context) -> Iterator[Case]:
 
 
 def far_end(context: Context) -> Iterator[Case]:
-    """Moves a scene to the far end of a long domain, where coordinates are coarse."""
+    """Moves a scene to the far end of a long domain, where float32 coordinates are coarse."""
     scene = _scene(context.scene)
     length = FAR_CELLS * scene.cell_size
     shift_3 = np.array([length - scene.domain_size[0], 0.0, 0.0])
@@ -274,7 +274,7 @@ def _turned(context: Context, material: str) -> Iterator[Case]:
 
 
 def _above_floor(config: SceneConfig, material: str, cells: float) -> Scene:
-    """Returns a cube at rest in the middle of an empty domain, at a height above the lower plane in solver cells."""
+    """Returns a cube at rest in the middle of an empty domain, `cells` solver cells above the lower plane."""
     middle_3 = 0.5 * np.array(config.domain_size)
     middle_3[1] = cells * config.cell_size - cube_places(config)[:, 1].min()
     return cube(config, material, middle_3, np.zeros(3))
@@ -297,7 +297,7 @@ def _slope(context: Context, material: str, degrees: float) -> Case:
 
 
 def _changed(name: str, context: Context, **change: Any) -> Case:
-    """Returns a changed scene; without the solver only energy and walls are checked."""
+    """Returns a case of one changed scene. Without the solver only energy and walls are checked."""
     scene = (_scene(replace(context.scene, **change)),)
     if not context.solver:
         return Case(name, scene, context.frames)

@@ -1,7 +1,7 @@
 """Observables of gallery scenes (gallery.py): figures of a trajectory by name, with units.
 
-A length is in domain units, or in cells where the table lists cells: those of the scene file, 1/64 by default, also on
-a finer grid. Shape legend: T frames, N particles, S sampled frames.
+The unit of a length is in OBSERVABLES: domain units, or cells of the scene file (1/64 by default), also on a finer
+grid. Shape legend: T frames, N particles, S sampled frames.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ from scipy.spatial import cKDTree
 from hgn.scene.scene import Scene
 from hgn.schema import NonNegative, Vector, require, require_bounds
 
-SAMPLED_EVERY = 5  # frames; speeds need the frame before, so that frame 0 is not sampled
-COUNTED = 2000  # particles whose neighbours are counted, evenly spaced among all
-HIGH, FRONT = 0.98, 0.99  # quantiles of particles that are the top and the front of a material
+SAMPLED_EVERY = 5  # stride of sampled frames; frame 0 is not sampled, because speeds need the frame before
+COUNTED = 2000  # largest number of particles whose neighbours are counted, evenly spaced among all
+HIGH, FRONT = 0.98, 0.99  # quantiles of places that count as the top and the front of a material
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,9 +105,9 @@ class Film:
     scene: Scene
     position_TN3: np.ndarray  # domain units; NaN before a particle enters
     rate_hz: float
-    cell_size: float  # of the scene file
-    particles_per_cell: float  # of the scene file, in cells of that size
-    beside_far_TN3: np.ndarray | None = None  # of the scene's own particles
+    cell_size: float  # cell size of the scene file
+    particles_per_cell: float  # number of particles in a cell of that size
+    beside_far_TN3: np.ndarray | None = None  # places of the scene's own particles if the far body is present
 
     def of_group(self, group: int | None) -> Film:
         """Returns the film of one group's particles."""
@@ -255,7 +255,7 @@ OBSERVABLES: Mapping[str, Observable] = {
 }
 SINCE = ("moved", "displacement")
 DIRECTED = ("centre", "front", "beyond")  # along x, or `along`
-LACKS = {  # observables that a scene may lack: whether it does, and why
+LACKS = {  # observables that some scenes do not have: whether one does not, and what it would need
     "energy_gain": (lambda scene, _: scene.emits, "particles that are all present from the start"),
     "momentum": (lambda scene, _: scene.emits, "particles that are all present from the start"),
     "far_effect": (lambda _, far: not far, "a body in measure.far"),

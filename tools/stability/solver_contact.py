@@ -1,6 +1,6 @@
 """Contact with obstacles against closed forms: free flight from a surface, and Coulomb friction on it.
 
-Each case is a block of particles at a wide sheet or a flat face of a closed body, at some offset from the grid's nodes.
+Each case is a block of particles at a surface, a wide sheet or a flat face of a closed body, at an offset from nodes.
 Block, surface and gravity are turned together. Lengths are in cells, times in seconds.
 Shape legend: T frames, N particles.
 """
@@ -31,7 +31,7 @@ FRAME_RATE_HZ = 120.0
 OFFSETS = (0.0, 0.1, 0.2, 0.3, 0.36, 0.41, 0.5, 0.7, 0.8, 0.9)  # of a surface from a node, in cells
 GAPS = (0.25, 0.5, 0.85, 1.2)  # between a sheet and the block below it
 LEAVING_SPEEDS = (0.3, 1.0, 3.0)  # m/s
-LEAVING_CELLS = 8  # distance of the fastest blocks, at most
+LEAVING_CELLS = 8  # largest distance that the fastest blocks move
 FRICTIONS = (0.1, 0.3, 0.5)
 SLOPE_DEG = 35.0
 FLIGHT_ERROR = 0.02  # fraction of the distance of free flight
@@ -39,11 +39,11 @@ FRICTION_ERRORS = {SAND: 0.05, SNOW: 0.10}
 FLYING_CELLS, SLIDING_CELLS, FALLING_CELLS = (3.0, 2.0, 3.0), (5.0, 2.0, 5.0), (7.0, 3.0, 7.0)  # of blocks
 START_CELLS = -9.0  # start of sliding blocks: up the slope from the middle
 SETTLING_S, SLIDING_S = 0.3, 0.2  # until a block slides steadily, and how long it is then measured
-# Initial speed down the slope, m/s. Friction opposes each particle's own motion: without this speed particles that
-# spread across the slope would not be braked along it.
+# Initial speed down the slope, m/s. Friction opposes each particle's own motion. Without this speed, friction on
+# particles that spread across the slope would not act along it.
 SLIDING_SPEED = 0.5
 FALLING_S = 0.6
-HANGING_S = 0.2  # in which free particles fall three cells
+HANGING_S = 0.2  # time in which free particles fall three cells
 BELOW_CELLS = 2.0  # distance below a sheet within which particles hang on it
 RIM_CELLS = 0.5  # width of the rim of a sheet, over which snow hangs down
 QUAD = np.array([[0, 1, 2], [0, 2, 3]], np.int32)
@@ -107,7 +107,7 @@ def flight_errors(
 ) -> list[dict[str, float]]:
     """Returns the largest relative error of the distance flown, for each setting and material.
 
-    `below`: blocks that fall from GAPS below a sheet. `leaving`: blocks that leave it at LEAVING_SPEEDS, no gravity.
+    `below`: blocks fall from GAPS below a sheet. `leaving`: blocks leave it at LEAVING_SPEEDS without gravity.
     """
     frames = 1 + round(seconds * FRAME_RATE_HZ)
     scenes, ways = [], []
@@ -134,7 +134,7 @@ def flight_errors(
 def glued_below(cases: Sequence[tuple[Setting, int]], config: MpmConfig) -> list[float]:
     """Lets blocks fall onto a smaller sheet; returns the fraction of particles that hang below it.
 
-    Particles hang if they are just below the sheet after FALLING_S and HANGING_S later; others fall on.
+    Particles hang if they are just below the sheet after FALLING_S, and still are HANGING_S later.
     """
     width, _, depth = FALLING_CELLS
     low, half, down = (-width / 2, 1.5, -depth / 2), width / 3, (0.0, -GRAVITY, 0.0)
@@ -179,7 +179,7 @@ def acting_frictions(cases: Sequence[tuple[Setting, str, int]], friction: float,
 
 
 def contacts(config: MpmConfig) -> Iterator[Row]:
-    """Yields rows of free flight, adhesion and friction: the worst of all OFFSETS, by orientation and material."""
+    """Yields rows of free flight, adhesion and friction, each the worst of all OFFSETS, by orientation and material."""
     settings = [Setting(offset, turn) for turn in ORIENTATIONS for offset in OFFSETS]
     places = [(setting, material) for setting in settings for material in range(len(PAPER_MATERIALS))]
     for (turn, kind), errors in _grouped(places, flight_errors(places, config)).items():

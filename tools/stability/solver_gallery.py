@@ -1,8 +1,8 @@
-"""The solver's side of the gallery: figures on two grids, and of broken trajectories.
+"""The solver's figures for the gallery, on two grids, and figures of trajectories that were broken on purpose.
 
-Rows pass if the solver passes on both grids and at least one broken trajectory fails. The series of all observables
-are returned for the JSON, which networks are compared with (gallery.py). Scenes that did not change since the JSON in
-results/stability are not simulated again: their rows are compared with today's bounds.
+A row passes if the solver passes on both grids and at least one broken trajectory fails. The series of all observables
+are returned for the JSON, with which networks are compared (gallery.py). Scenes that did not change since the JSON in
+results/stability was written are not simulated again: their stored series are compared with the present bounds.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ from tools.stability.gallery import GRID_CELLS, REFERENCE, GalleryCase, load_gal
 from tools.stability.observables import BoundEntry, Film, series
 from tools.stability.row import Row
 
-RATE_HZ = 60.0  # of the shipped weights
-DIGITS = 5  # of figures in the JSON
-SIMULATED = ("device", "commit", "date")  # of the report's meta, in the entry of each scene
+RATE_HZ = 60.0  # frame rate of the shipped weights
+DIGITS = 5  # significant digits of figures in the JSON
+SIMULATED = ("device", "commit", "date")  # keys of the report's meta that each scene's entry repeats
 
 
 def gallery_rows(case: str, mpm: MpmConfig, meta: dict[str, Any], scenes: dict[str, Any]) -> Iterator[Row]:
@@ -61,7 +61,7 @@ def gallery_rows(case: str, mpm: MpmConfig, meta: dict[str, Any], scenes: dict[s
 
 
 def _earlier(file: Path, mpm: MpmConfig) -> dict[str, Any]:
-    """Reads the scenes of an earlier report, and the figures of broken trajectories by row; none of another solver."""
+    """Reads scenes of an earlier report, and figures of broken trajectories by row; empty if the solver's differ."""
     report = read_json(file) if file.is_file() else {}
     meta = report.get("meta", {})
     if without_device(meta.get("solver", {})) != without_device(to_mapping(mpm)):
@@ -71,14 +71,14 @@ def _earlier(file: Path, mpm: MpmConfig) -> dict[str, Any]:
 
 
 def without_device(solver: Mapping[str, Any]) -> dict[str, Any]:
-    """Returns the solver's settings without where it runs."""
+    """Returns the solver's settings without those of the device."""
     return {name: value for name, value in solver.items() if name not in ("device", "scenes_per_launch")}
 
 
 def measure(
     case: GalleryCase, films: dict[int, Film], causes: Sequence[str], frictionless: Film | None
 ) -> tuple[dict[str, Any], list[Row]]:
-    """Returns a scene's entry of the JSON and its rows, from its films by cells per unit."""
+    """Returns a scene's entry of the JSON, and its rows. The keys of `films` are cells per unit of length."""
     entry: dict[str, Any] = {"kind": case.measure.kind, "digest": case.digest, "series": {}}
     entry["particles"] = case.scenes[0].particle_count
     if causes:
@@ -106,7 +106,7 @@ def measure(
 
 
 def _row(case: GalleryCase, bound: BoundEntry, solver: dict[str, float], broken: dict[str, float]) -> Row:
-    """Compares the figures of both grids, by cells per unit, and of broken trajectories with a bound."""
+    """Compares figures of both grids (keys: cells per unit of length) and of broken trajectories with a bound."""
     low, high = bound.interval(solver[str(GRID_CELLS[0])])
     failed = [name for name, figure in broken.items() if not low <= figure <= high]
     beyond = ", ".join(f"{figure:.4g} at {cells}" for cells, figure in solver.items()) + "; fails: "
@@ -147,7 +147,7 @@ def _cell(wrong: dict[str, float | None], caught: Sequence[str], name: str) -> s
 def _simulated(
     cases: Sequence[GalleryCase], mpm: MpmConfig
 ) -> Iterator[tuple[GalleryCase, dict[int, Film], list[str], Film | None]]:
-    """Yields films by grid, the solver's causes of failure, and the film without friction; a launch has one domain."""
+    """Yields films by grid, causes of failure, and the film without friction. Cases of a launch share their domain."""
 
     def kind(case: GalleryCase) -> tuple[Any, ...]:
         scene = case.scenes[0]
@@ -201,7 +201,7 @@ def _smooth(scene: Scene) -> Scene:
 
 
 def _short(values: Sequence[float]) -> str:
-    """Returns the numbers in a line: a list would take one for each."""
+    """Returns the numbers in one line of text; in a JSON list each would take a line."""
     return " ".join(f"{value:.{DIGITS}g}" for value in values)
 
 

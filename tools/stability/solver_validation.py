@@ -1,8 +1,8 @@
 """Published experiments: dam breaks, collapsing columns of sand, and the angle of repose.
 
-Walls stand at the last node that stops motion, number 2 (and three from the other end). Material fills its basin up to
-them, because it would creep into a gap. Sand lies on sheets. The friction of a column's floor is what sand bears in
-simple shear: a rougher floor would brake the lowest cells by more than sand can bear.
+A wall is at its innermost node that stops motion: node 2, and at the other end the third before the last. Material
+fills its basin up to the walls, because it would creep into a gap. Sand lies on sheets. The friction of a column's
+floor is what sand bears in simple shear: a rougher floor would brake the lowest cells by more than sand can bear.
 Shape legend: T frames, N particles.
 """
 
@@ -24,54 +24,54 @@ from tools.stability.row import Row, within
 from tools.stability.solver_scenes import positions, rms_speed
 
 GRAVITY = 9.8
-WALL = 2.0  # cells: the last wall node, beyond which nothing moves
-FAR_WALL = 3.0  # from the end of the domain
-SLAB = 3  # cells, the thinnest that fits between walls
+WALL = 2.0  # cells from the near end of the domain to the wall
+FAR_WALL = 3.0  # cells from the far end of the domain to the wall
+SLAB = 3  # cells; the thinnest slab that fits between walls
 
 # Martin and Moyce 1952, n² = 2, a = 2.25 in: time sqrt(2 g / a) t, front x / a
 DAM = np.array(
     [(0.832, 1.217), (1.219, 1.474), (1.997, 2.292), (2.547, 2.995), (3.345, 4.134), (4.034, 4.944), (4.418, 5.881)]
 )
-DAM_WIDTH = 0.2  # m: slow flow at a speed of sound of 17 m/s
+DAM_WIDTH = 0.2  # m; so small that the flow is slow compared with the speed of sound, 17 m/s
 DAM_CELLS = (8, 16)
-DAM_SPACE = 8  # width of the basin, in widths
-DAM_DEPTH = 1 / 16  # depth of water at the front, in widths
+DAM_SPACE = 8  # width of the basin, in widths of the column
+DAM_DEPTH = 1 / 16  # depth of water that defines the front, in widths of the column
 DAM_LEADS, DAM_RESOLVED = 0.18, 0.05
 DAM_RATE_HZ = 200.0
 
 # water at rest between walls
 REST_CELLS, REST_DEPTH = 6, 0.375  # m
 REST_S, REST_RATE_HZ, REST_WITHIN = 20.0, 4.0, 0.005
-SETTLED_S = 2.5  # until its first waves are gone
+SETTLED_S = 2.5  # time until the first waves are gone
 
-# Quarters of round columns on a rough floor. Lube et al. 2004 and Lajeunesse et al. 2004 differ by up to a third; a
-# column between them agrees with the experiments.
-COLUMN_RADIUS = 0.5  # m, 200 default grains; the tallest column is compressed by 2 % by its weight
-COLUMN_CELLS = 24  # in radius: fronts lack their last 2 to 2.5 cells
-LOW_COLUMN_CELLS = 72  # in radius of columns that are wider than high, which run out less
-COLUMN_DEPTH = 1 / 64  # depth of sand at its edge, in radii
+# Quarters of round columns on a rough floor. Run-outs of Lube et al. 2004 and Lajeunesse et al. 2004 differ by up to a
+# third; a run-out between them agrees with the experiments.
+COLUMN_RADIUS = 0.5  # m, 200 default grains; the weight of the tallest column compresses it by 2 %
+COLUMN_CELLS = 24  # cells per radius; fronts lack their last 2 to 2.5 cells
+LOW_COLUMN_CELLS = 72  # cells per radius of columns that are wider than high, which run out less
+COLUMN_DEPTH = 1 / 64  # depth of sand that defines its edge, in radii
 COLUMN_WITHIN = 0.1
 COLUMN_ASPECTS = (0.5, 1.0, 1.5, 2.5, 4.0)
-COLUMN_SPACE = 1.6  # width of the basin, times the expected radius
-COLUMN_TOP_CELLS = 2.5  # around the axis, where the height is taken
-LUBE_ANGLE_DEG = 31.0  # at which the quartz sand of Lube et al. 2004 rests
-TIMES = 4.0  # of sqrt(height / g) until all stands; the experiments took about 3
+COLUMN_SPACE = 1.6  # width of the basin, in expected final radii
+COLUMN_TOP_CELLS = 2.5  # distance from the axis within which the height is measured
+LUBE_ANGLE_DEG = 31.0  # angle of repose of the quartz sand of Lube et al. 2004
+TIMES = 4.0  # time until all material is at rest, in sqrt(height / g); the experiments took about 3
 STRAY = 1e-3  # fraction of the particles that may reach the walls of the basin
 
 # a slope of sand on a rough platform, from which sand may run off
 REPOSE_OTHERS_DEG = (20.0, 40.0)  # further friction angles
-REPOSE_WITHIN_DEG = 3.0  # a slope stands this far below the friction angle; steeper ones come to rest as close to it
-REPOSE_STEEPER_DEG = 4.0  # sand that runs off a much steeper slope would carry more sand with it
-STANDS_DEG = 1.0  # change of a slope that stands
-REPOSE_LENGTH = 0.5  # m, of the platform
-REPOSE_CELLS = 24  # along it
-REPOSE_TIMES = 24.0  # of sqrt(length / g)
-PIT = 0.4  # of the platform's length, below it
-AT_REST = 1e-2  # m/s, root mean square
+REPOSE_WITHIN_DEG = 3.0  # a slope this far below the friction angle stands; steeper ones come to rest this close to it
+REPOSE_STEEPER_DEG = 4.0  # steeper slopes start this far above it; if more, running sand would carry more with it
+STANDS_DEG = 1.0  # largest change of a slope that counts as standing
+REPOSE_LENGTH = 0.5  # length of the platform, m
+REPOSE_CELLS = 24  # number of cells along the platform
+REPOSE_TIMES = 24.0  # simulated time in sqrt(length / g)
+PIT = 0.4  # depth of the pit below the platform, as a fraction of the platform's length
+AT_REST = 1e-2  # largest root mean square speed that counts as rest, m/s
 
 
 def dam_breaks(base: MpmConfig) -> Iterator[Row]:
-    """Compares the front of a collapsing column of water with the experiment, and at two resolutions."""
+    """Compares the front of a collapsing column of water with the experiment, at two resolutions."""
     fronts = []
     for cells in DAM_CELLS:
         path = _path(dam(cells), base, 2 + math.ceil(DAM[-1, 0] * math.sqrt(DAM_WIDTH / (2 * GRAVITY)) * DAM_RATE_HZ))
@@ -234,8 +234,8 @@ def surface_slope(place_N3: np.ndarray, cells: int) -> float:
 def basin(
     material: int, size_cells: Sequence[float], space_cells: Sequence[float], cell: float, floor: int | None = None
 ) -> Scene:
-    """Fills a box in the corner of a basin with particles at random places, on a sheet `floor` cells above its floor
-    if given."""
+    """Fills a box in the corner of a basin with particles at random places. With `floor` they lie on a sheet, `floor`
+    cells above the basin's floor."""
     place = random_places(size_cells) + WALL
     nodes = [math.ceil(space + WALL + FAR_WALL) for space in space_cells]
     obstacles: tuple[Obstacle, ...] = ()
@@ -252,15 +252,14 @@ def basin(
 
 
 def edge(depth: np.ndarray, least: float) -> float:
-    """Returns where mean depths of cells finally fall below `least`, in cells from the first.
+    """Returns the place from which on mean depths of cells are below `least`, in cells from the first.
 
-    Depths are interpolated between centres of cells. A cliff fills its last cells partly; it ends where the slope
-    behind it would have filled them.
+    Depths are interpolated between centres of cells. A cliff fills its last cells partly. Its end is the place at which
+    the slope behind it, continued, would contain the volume of the last two cells.
     """
     depth = np.concatenate([depth[:1], depth[:1], depth, [0.0, 0.0]])
     last = int(np.flatnonzero(depth[2:] >= least).max(initial=0)) + 2
     linear = 0.5 + float((depth[last] - least) / max(depth[last] - depth[last + 1], 1e-9))
-    # the cliff is where the extrapolated depth contains the volume of the last two cells
     slope = max(float(depth[last - 2] - depth[last - 1]), 0.0)
     mass, begin = float(depth[last] + depth[last + 1]), max(float(depth[last - 1]) - 0.5 * slope, least)
     square = begin * begin - 2 * slope * mass
