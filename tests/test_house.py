@@ -18,7 +18,7 @@ PACKAGES = ("hgn", "datagen", "tools")
 LINES = {  # of Python, in tracked files
     "hgn": 33_151,
     "datagen": 9_041,
-    "tools": 6_214,
+    "tools": 6_213,
     "tests": 32_146,
 }
 SETTINGS = 240  # fields of the dataclasses behind the commands, *Config

@@ -1,7 +1,7 @@
 """python -m tools.curves runs=[runs/obstacles] out=results/NAME: learning curves of runs as PNG and JSON.
 
 One run: loss, one-step errors with the baselines, and rollout errors, over updates. Several runs: loss and one-step
-validation error over the scenes of all updates, and the latter also over minutes of training.
+validation error over the number of scenes seen so far, and this error also over minutes of training.
 
 The JSON contains {"meta": provenance of the figure, "runs": [{"name", "meta": provenance and settings of the run,
 "rows"}, ...]}, with a row for each record. Minutes do not include the time between a stop and the next start.
@@ -31,9 +31,9 @@ BEGINNINGS = (
 BASELINE_STYLES = {"constant_velocity": ":", "ballistic_motion": "--", "mean_acceleration": "-."}
 LOSS = "MSE of normalised acceleration"
 ONE_STEP = "one-step MSE (sum over axes, frame units)"
-LOSS_POINTS = 60  # of a curve of the loss, each a mean of neighbouring records
-LINES = 200  # records of the loss in the JSON
-BREAKS = 10  # a gap of this many usual gaps between two records is a stop of the training
+LOSS_POINTS = 60  # largest number of points of a loss curve, each a mean of neighbouring records
+LINES = 200  # largest number of records of the loss in the JSON
+BREAKS = 10  # a gap between two records that is longer than this many usual gaps is a stop of the training
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ class Run:
 
     name: str
     settings: Mapping[str, Any]
-    records: list[dict[str, float]]  # of metrics.jsonl, the last of each update, with `minutes` and `scenes`
+    records: list[dict[str, float]]  # the last record of each update in metrics.jsonl, plus `minutes` and `scenes`
 
 
 def main(mapping: dict[str, Any]) -> int:
@@ -80,7 +80,7 @@ def read_run(folder: Path) -> Run:
     with damage_named(f"{folder}: runs must be folders of python -m hgn.train", "take another folder"):
         lines = (folder / "metrics.jsonl").read_text(encoding="utf-8").splitlines()
         settings = read_yaml(folder / "config.yaml")
-        json.dumps(settings), settings["dataset"]["folder"], dict(settings.get("provenance", {}))  # which others read
+        json.dumps(settings), settings["dataset"]["folder"], dict(settings.get("provenance", {}))  # read below
         records = [current_metrics(json.loads(line)) for line in lines]
         for name, value in (item for record in records for item in record.items()):
             require(isinstance(value, int | float), f"{folder}: {name}", "a number", value)
@@ -103,7 +103,7 @@ def _add_minutes(records: list[dict[str, float]]) -> None:
 
 
 def _add_scenes(records: list[dict[str, float]], of_a_device: int) -> None:
-    """Adds the scenes so far; rates give the scenes of an update over all devices."""
+    """Adds the number of scenes so far. The ratio of the rates is the number of scenes of an update on all devices."""
     rated = [record for record in records if record.get("updates_per_second")]
     an_update = round(rated[0]["scenes_per_second"] / rated[0]["updates_per_second"]) if rated else of_a_device
     for record in records:
@@ -111,7 +111,7 @@ def _add_scenes(records: list[dict[str, float]], of_a_device: int) -> None:
 
 
 def measurements(records: list[dict[str, float]]) -> list[dict[str, float]]:
-    """Returns all records with errors, and at most LINES of the loss."""
+    """Returns all records with errors, and at most LINES records of the loss."""
     losses = [i for i, record in enumerate(records) if "loss" in record]
     kept = set(losses[:: max(1, -(-len(losses) // LINES))])
     return [

@@ -1,12 +1,12 @@
 """python -m tools.render rollout=FILE out=FOLDER_OR_FILE: pictures of a rollout, or of an episode of a data set.
 
 A folder gets NAME.png (some frames), NAME.gif (an animation) and, with ground truth, NAME_error.png (error over time).
-A file that ends in .png, .gif or .webp (half the size of GIF) gets this picture only; .usdc, .usda, .usd or .ply get
-the rollout for other programs (`surface=true`: also water as a closed surface). Further rollouts of the same scene
-(`others=[FILE,...]`) are drawn next to it, with the labels `names`.
+With a file that ends in .png, .gif or .webp (half the size of GIF) only this picture is drawn; with .usdc, .usda, .usd
+or .ply the rollout is written for other programs (`surface=true`: also water as a closed surface). Further rollouts of
+the same scene (`others=[FILE,...]`) are drawn next to the first one, with the labels `names`.
 
-With the name of a scene in conf/gallery the solver simulates it first, and each of `others` is weights that do so too:
-`python -m tools.render rollout=pool_deep 'others=[mechanics]'`.
+If `rollout` is the name of a scene in conf/gallery, the solver simulates the scene first, and `others` are weights that
+simulate it too: `python -m tools.render rollout=pool_deep 'others=[mechanics]'`.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ from hgn.scene.scene_file import load_scene, scene_files
 from hgn.schema import ConfigError, OneOrMore, from_mapping, require, require_bounds, require_replaceable, to_mapping
 from hgn.system.progress import bar
 
-PICTURES = 4  # in the PNG by default
+PICTURES = 4  # default number of frames in the PNG
 ANIMATIONS = (".gif", ".webp")
-FRAME_RATE_HZ = 60.0  # of simulated gallery scenes
+FRAME_RATE_HZ = 60.0  # frame rate of simulated gallery scenes
 
 
 @dataclass(frozen=True)
@@ -108,7 +108,7 @@ def main(mapping: Mapping[str, Any]) -> int:
 
 
 def _load(config: RenderConfig) -> Versions:
-    """Reads the rollouts. Raises: ConfigError if one has other particles or another frame rate."""
+    """Reads the rollouts. Raises: ConfigError if their particles or frame rates differ."""
     scene = None
     if config.rollout is None:
         assert config.data is not None and config.episode is not None  # checked by RenderConfig
@@ -162,7 +162,7 @@ def solver_rollout(file: Path) -> Rollout:
 
 
 def weights_rollout(solver: Rollout, file: Path, weights: str) -> Rollout:
-    """Simulates a gallery scene with weights. Raises: ConfigError where they refuse it or diverge."""
+    """Simulates a gallery scene with weights. Raises: ConfigError if they do not support the scene, or diverge."""
     from hgn.runtime.divergence import DivergedError
     from hgn.runtime.simulator import Simulator
 

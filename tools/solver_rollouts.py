@@ -57,7 +57,7 @@ def solver_trials(
     colliders: Sequence[Any] | None = None,
     stability_fractions: Sequence[float] | None = None,
 ) -> list[RolloutResult]:
-    """Returns the solver's trajectories; of a failed scene its initial state. Shows a bar if `on_frame` is None."""
+    """Returns trajectories, for failed scenes only the initial state. Shows a progress bar if `on_frame` is None."""
     if on_frame is None:
         with bar("solver", total=frames, unit="frame") as progress:
             shown = lambda _: progress.update()  # noqa: E731
@@ -112,7 +112,7 @@ class SolverLaunches:
         return [self._known[setting, episode.key] for episode in episodes]
 
     def simulate(self, pairs: Sequence[tuple[Setting, Episode]], frames: int, on_frame: OnFrame) -> list[RolloutResult]:
-        """Simulates these settings and episodes, also if they were simulated before."""
+        """Simulates these settings and episodes, even if they were simulated before."""
         from datagen.mpm.collider import build_collider
 
         new = {episode.key: self._scene(episode) for _, episode in pairs if episode.key not in self._colliders}

@@ -1,8 +1,8 @@
 """python -m tools.tables [check=true]: writes the tables and figures of Markdown pages from JSON files.
 
-A folder of pages has a `tables.yaml`, for its own pages or for those that its `pages` names. A page holds
-`<!-- table: NAME -->` … `<!-- end -->` for a table and `<!--=NAME-->0.302<!--/-->` for a figure within a sentence. What
-stands between the markers is written by this command:
+A folder of pages has a `tables.yaml`, for its own pages or for those that its `pages` names. A page has the markers
+`<!-- table: NAME -->` … `<!-- end -->` for a table and `<!--=NAME-->0.302<!--/-->` for a figure within a sentence. This
+command writes the text between the markers:
 
     files: {bench: bench_h100.json}     # sources by name, relative to the folder: .json, or .safetensors (the header)
     values:
@@ -15,10 +15,10 @@ stands between the markers is written by this command:
           ms: "{row.ms:.3f}"
 
 Braces contain a Python expression over the sources, the names of the row and the functions of `FUNCTIONS`, then a
-format. `rows(case='frame')` is the only item of a list with these fields, `every(rows, case='frame')` are all such
-items. `held(rows)` counts rows that pass, for example 35 of 36. `let: {NAME: EXPRESSION}` in a table gives each row
-further names. A format that starts with `?` leaves the cell empty if there is no value. Lists are joined by commas, and
-`%` multiplies by 100.
+format. `rows(case='frame')` is the item of the list `rows` with these fields; there must be only one.
+`every(rows, case='frame')` is the list of all such items. `held(rows)` counts rows that pass, for example 35 of 36.
+`let: {NAME: EXPRESSION}` in a table gives each row further names. A format that starts with `?` leaves the cell empty
+if there is no value. Lists are joined by commas, and `%` multiplies by 100.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ FOLDERS = ("results", "hgn/weights", "jobs", "docs")  # of the repository, searc
 SPECIFICATION = "tables.yaml"
 REMEDY = "run python -m tools.tables"
 
-# OSError: a file that is not there
+# OSError: a missing file
 EXPRESSION_ERRORS = ArithmeticError, AttributeError, LookupError, NameError, OSError, SyntaxError, TypeError, ValueError
 
 TABLE = re.compile(r"(?P<begin><!-- table: (?P<name>[\w-]+) -->\n)(?P<text>.*?)(?P<end><!-- end -->)", re.DOTALL)
@@ -171,7 +171,7 @@ class Record(dict):
 
 
 class Records(list):
-    """A JSON list. A call with fields returns the only item that has them."""
+    """A JSON list. A call with fields returns the item that has them; there must be only one."""
 
     def __call__(self, **fields: Any) -> Any:
         chosen = every(self, **fields)

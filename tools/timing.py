@@ -1,4 +1,4 @@
-"""Times and memory of contenders in one process, after a warm-up: runs by device events, rollouts by their frames."""
+"""Measures time and memory of contenders in one process after a warm-up: runs by device events, rollouts by frames."""
 
 from __future__ import annotations
 
@@ -20,21 +20,21 @@ WARM_UP = 3
 MINIMUM_ROUNDS = 5
 TOGETHER_S = 20e-6  # frames reported closer together than this were computed together
 # rollouts
-SCENES = 3  # timed one by one
-BATCHES = (8, 64, 256)  # scenes side by side, of which each contender takes its best
-FRAMES, SECONDS = 100, 0.5  # of each timed rollout, at most; slow contenders simulate fewer frames
-SOLVER_FRAMES = 300  # the solver's frames are slowest when material has landed
-WARM_FRAMES, TRITON_WARM_FRAMES = 6, 70  # also the least number of timed frames; Triton reports 32 frames at once
+SCENES = 3  # number of scenes timed one by one
+BATCHES = (8, 64, 256)  # numbers of scenes side by side; the fastest one of each contender is reported
+FRAMES, SECONDS = 100, 0.5  # largest length of a timed rollout; slow contenders simulate fewer frames
+SOLVER_FRAMES = 300  # more, because the solver's frames are slowest when material has landed
+WARM_FRAMES, TRITON_WARM_FRAMES = 6, 70  # also the smallest number of timed frames; Triton reports 32 frames together
 SOLVER_WARM_FRAMES = 2  # the solver compiles in the first frame
-GAIN = 0.95  # of a scene's time, below which a larger batch is better
+GAIN = 0.95  # a larger batch is better if the time per scene is below this fraction
 
 
 class Timed:
     """A contender: `sample` does the work once or more and returns milliseconds."""
 
     warm_up = WARM_UP  # samples that do not count
-    rounds: int | None = None  # number of samples of a slow contender; None: one a round
-    failure: str | None = None  # why the times are invalid
+    rounds: int | None = None  # number of samples of a slow contender; None: one in each round
+    failure: str | None = None  # the reason for which the times are invalid
 
     def sample(self) -> float:
         raise NotImplementedError
@@ -56,9 +56,9 @@ def once(run: Callable[[], object], device: torch.device) -> float:
 
 
 def alternate(contenders: Sequence[Timed], rounds: int, is_over: Callable[[], bool]) -> list[list[float]]:
-    """Returns the milliseconds of each contender, after warming up; a round takes one sample of each in turn.
+    """Returns the samples of each contender in milliseconds, after a warm-up. A round takes one sample of each.
 
-    Ends after `rounds` rounds, or if `is_over` returns True after MINIMUM_ROUNDS.
+    Ends after `rounds` rounds, or when `is_over` returns True after at least MINIMUM_ROUNDS.
     """
     for timed in contenders:
         for _ in range(timed.warm_up):
@@ -74,7 +74,7 @@ def alternate(contenders: Sequence[Timed], rounds: int, is_over: Callable[[], bo
 
 
 def statistics(milliseconds: Sequence[float]) -> dict[str, Any]:
-    """Returns the columns `ms` (the median), `ms_quartiles`, `ms_range` and `samples` of a row; `ms` of no samples."""
+    """Returns the columns `ms` (the median), `ms_quartiles`, `ms_range` and `samples`; without samples only `ms`."""
     if not len(milliseconds):
         return {"ms": None}
     least, low, middle, high, most = np.percentile(milliseconds, (0, 25, 50, 75, 100)).tolist()
@@ -150,7 +150,7 @@ class Stopwatch:
     def _best_batch(
         self, references: Sequence[Episode], frames: int, compiles: bool
     ) -> tuple[list[Episode], float | None]:
-        """Returns the batch with the shortest time a scene, and the milliseconds of its frames."""
+        """Returns the batch with the shortest time per scene, and the milliseconds of its frames."""
         best, least = list(references[:1]), None
         for count in BATCHES:
             batch = [references[i % len(references)] for i in range(count)]
@@ -167,7 +167,7 @@ class Stopwatch:
         return best, least
 
     def round(self) -> dict[str, Any]:
-        """Simulates each scene again. Returns `ms` of a frame and `ms_batched` of a frame and scene."""
+        """Simulates each scene again. Returns `ms` per frame, and `ms_batched` per frame and scene of the batch."""
         rollouts = [(scenes, self.single_frames, self.single_ms) for scenes in self.singles]
         if not (self.solver and self.batched_ms):  # a whole rollout of many scenes is timed once
             rollouts.append((self.batch, self.batch_frames, self.batched_ms))
@@ -200,7 +200,7 @@ def free(device: torch.device) -> None:
 
 
 class GpuMemory:
-    """Memory of torch's tensors on a GPU from now on; unused memory is freed before."""
+    """Measures the memory of torch's tensors on a GPU from now on. Unused memory is freed before."""
 
     def __init__(self, device: torch.device) -> None:
         self.device = device

@@ -95,7 +95,7 @@ def table(rows: list[Row]) -> str:
 def _prepare(
     config: BenchConfig, device: torch.device, precision: str, case: str, work: Workload
 ) -> tuple[Row, Timed | None]:
-    """Checks a contender; returns its row, and the contender if it passes."""
+    """Checks a contender; returns its row, and the contender, or None if it fails."""
     row: Row = {"case": case, "particles": work.particles, "scenes": work.scenes}
     row |= {"precision": precision if case != "mpm_frame" else "fp32", "ms": None, "memory_gb": None}
     network = config.gns if "gns" in case else config.network
@@ -133,10 +133,10 @@ def _maker(
 
 
 def _wanted(config: BenchConfig, device: torch.device, precision: str, cases: tuple[str, ...]) -> list[str]:
-    """Returns the chosen ones of `cases` that are meaningful here; only backend triton computes in fp16."""
+    """Returns the chosen ones of `cases`, by default those that are useful here. Only backend triton computes fp16."""
     triton = triton_unsupported_reason(device, config.network, precision) is None
     if precision == "fp16":
         return [case for case in ("frame", "train") if triton and case in cases and case in (config.cases or CASES)]
-    left_out = set() if triton or device.type == "cpu" else {"torch_frame"}  # the same as frame
+    left_out = set() if triton or device.type == "cpu" else {"torch_frame"}  # here it equals frame
     left_out |= set() if triton else {"torch_train"}
     return [case for case in cases if (case in config.cases if config.cases else case not in left_out)]

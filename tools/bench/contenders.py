@@ -1,7 +1,7 @@
 """Contenders with their checks: a frame, a training step, a frame of the solver.
 
-A check compares with PyTorch in float64 on the same input. Workloads that are too large for float64 are checked on one
-tile of particles, by the same code.
+A check compares a contender with PyTorch in float64 on the same input. Workloads that are too large for float64 are
+replaced in the check by one scene of at most one tile of particles.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ from tools.bench.states import SPEED, TILE_PARTICLES, Workload, batch_of, scene_
 from tools.report import PASS
 from tools.timing import FrameClock, Timed, once
 
-BOUNDS = {"fp32": 1e-5, "tf32": 2e-3, "fp16": 2e-3}  # relative error of accelerations and loss, of the norm
-# Of all gradients together. Looser, because rounding flips activations next to their kink: a fraction of them as large
-# as the rounding, and the error of the gradient is as large as the root of this fraction.
+BOUNDS = {"fp32": 1e-5, "tf32": 2e-3, "fp16": 2e-3}  # relative error in the norm, of accelerations and of the loss
+# Relative error of all gradients together. It is larger, because rounding flips activations next to their kink. The
+# flipped fraction is about the rounding error, and the error of the gradient about the root of this fraction.
 GRADIENT_BOUNDS = {"fp32": 1e-3, "tf32": 5e-2, "fp16": 5e-2}
 FRAME_RATE_HZ = 60.0
 CHECKED_AT_MOST = {"frame": 50_000, "train": TILE_PARTICLES}  # particles of all scenes
@@ -57,7 +57,7 @@ class Contender(Timed):
     """A network that is checked, and then timed run by run."""
 
     device: torch.device
-    at_once = 1  # repetitions of the work in one run
+    at_once = 1  # number of times that a run repeats the work
 
     def run(self) -> object:
         raise NotImplementedError
@@ -76,7 +76,7 @@ class Frame(Contender):
     def __init__(
         self, config: NetworkConfig, work: Workload, device: torch.device, precision: str, backend: str | None = None
     ) -> None:
-        """`backend`: None is the fastest that computes frames one by one."""
+        """Takes the name of a `backend`; None: the fastest one that computes frames one by one."""
         self.device = device
         self.network = bench_network(config, device)
         chosen = build(backend, self.network, precision) if backend else fastest_stepped(self.network, precision)
@@ -114,17 +114,17 @@ class Train(Contender):
 
 
 class MpmFrame(Timed):
-    """One frame of the solver that generates the data, at its converged step; the same particles start at rest."""
+    """One frame of the solver that generates the data, with its default step; the particles start at rest."""
 
     def __init__(self, work: Workload, cell_size: float, device: torch.device) -> None:
         self.scenes = [scene_of(work, seed, cell_size) for seed in range(work.scenes)]
         self.config = MpmConfig(device=device.type, scenes_per_launch=work.scenes)
         self.particles = sum(scene.particle_count for scene in self.scenes) // work.scenes
         self.rounds, self.warm_up = MPM_ROUNDS, 1
-        self.substeps = 0.0  # of a frame, mean over particles
+        self.substeps = 0.0  # number of substeps of a frame, mean over particles
 
     def sample(self) -> float:
-        """Returns milliseconds a frame of a short simulation, because several frames may end together."""
+        """Returns the mean milliseconds per frame of a short simulation, because several frames may end together."""
         from datagen.mpm.solver import SceneFailure, simulate
 
         clock = FrameClock()
@@ -177,7 +177,7 @@ def reference_gradients(network: ParticleNetwork, batch: Batch) -> tuple[torch.T
 
 
 def reference_output(reference: ParticleNetwork, state: ParticleState) -> torch.Tensor:
-    """Returns the float64 network's output; GNS gets the same neighbours, for rounding at the radius."""
+    """Returns the float64 network's output. GNS gets the checked network's neighbours: rounding could change them."""
     double = replace(
         state,
         position_N3=state.position_N3.double(),

@@ -1,7 +1,7 @@
 """States that are timed: a fixed mixture of clumps and spray, with the neighbours and cells of real frames.
 
 A tile is similar to the middle of the 300 frames of the paper's obstacle-free scene: 4,296 particles, about 97
-neighbours each within R and 1,200 active cells of R (measured: 97 and 1,307). More particles are more tiles.
+neighbours of each within R, and 1,200 active cells of size R (the tile: 97 and 1,307). More particles are more tiles.
 Shape legend: N particles of all scenes, S scenes, W window frames.
 """
 
@@ -30,9 +30,9 @@ SPEED = 2e-3  # domain units a frame
 
 @dataclass(frozen=True)
 class Workload:
-    """The size of the work."""
+    """The number of scenes, and of particles in each."""
 
-    particles: int  # of each scene
+    particles: int  # number in each scene
     scenes: int
 
     @property
@@ -103,7 +103,7 @@ def batch_of_scenes(
 
 
 def state_of(workload: Workload, network: NetworkConfig, device: torch.device) -> ParticleState:
-    """Returns the state of a simulation at such a frame."""
+    """Returns the state of a simulation at the last frame of `batch_of`'s window."""
     state = batch_of(workload, network, device).state()
     return replace(state, position_N3=state.position_N3.clone(), velocity_NM3=state.velocity_NM3.contiguous())
 

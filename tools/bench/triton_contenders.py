@@ -23,9 +23,9 @@ from tools.bench.states import Workload, batch_of, state_of
 if TYPE_CHECKING:
     from hgn.kernels.update.op import DeviceEpisode
 
-FRAMES_AT_ONCE = 16  # at most, so that a frame's launch hides behind the one before, as in a simulation
+FRAMES_AT_ONCE = 16  # at most; a frame is launched while the frame before runs, as in a simulation
 UPDATES_AT_ONCE = 20
-FIRST_MOMENT_FRACTION = 0.1  # of Adam, of the gradient, after the first update
+FIRST_MOMENT_FRACTION = 0.1  # Adam's first moment after the first update, as a fraction of the gradient
 
 
 class TritonFrame(Contender):
@@ -48,7 +48,7 @@ class TritonFrame(Contender):
         self.stepper.buffers.velocity_NV.copy_(self.velocity_NV)
 
     def run(self) -> None:
-        """Frames of the same state, each in a graph where there is a GPU."""
+        """Computes frames of the same state, on a GPU with CUDA graphs."""
         self.stepper.frame.zero_()
         for _ in range(self.at_once):
             self.restore()

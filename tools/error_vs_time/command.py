@@ -40,8 +40,8 @@ from tools.report import meta_of
 from tools.solver_rollouts import Setting, SolverLaunches
 from tools.timing import compile_frames
 
-REFERENCE_STEP = 0.25  # of the limit of stability, on the data's own grid
-STEPS = (1.0, 0.5)  # of the solver, fractions of the limit of stability
+REFERENCE_STEP = 0.25  # the reference's step on the data's own grid, as a fraction of the limit of stability
+STEPS = (1.0, 0.5)  # the solver's steps, as fractions of the limit of stability
 
 
 def main(mapping: dict[str, Any]) -> int:
@@ -128,7 +128,7 @@ def network_contenders(
 
 
 def named_weights(names: Sequence[str], episodes: Sequence[Episode]) -> list[Path]:
-    """Returns the files. Raises: ConfigError for a name or file that does not exist or does not fit the data."""
+    """Returns the weights files. Raises: ConfigError for one that does not exist or does not fit the data."""
     files = [find_weights(name, f"weights[{i}]") for i, name in enumerate(names)]
     for i, (name, file) in enumerate(zip(names, files, strict=True)):
         try:
@@ -158,7 +158,7 @@ def fitting_weights(episodes: Sequence[Episode]) -> list[Path]:
 
 
 def require_fits(file: Path, episodes: Sequence[Episode], field: str) -> None:
-    """Raises: ConfigError if frame rate, materials, gravity or obstacle cells of the data are not those of weights."""
+    """Raises: ConfigError if the weights do not support the data's frame rate, materials, gravity or obstacle cells."""
     network, info = load_weights(file, field=field)
     require_frame_rate(info, episodes[0].frame_rate_hz)
     Simulator(network, info.frame_rate_hz, "torch", info=info).start([InitialState.of_episode(e) for e in episodes])
@@ -166,7 +166,7 @@ def require_fits(file: Path, episodes: Sequence[Episode], field: str) -> None:
 
 def baseline_contenders(store: EpisodeStore, device: torch.device, wall: float) -> list[Contender]:
     """Returns predictors that have learned nothing; `wall` is the thickness of the domain's walls."""
-    split = "train" if store.manifest.published("train") else store.split  # fresh test sets have no other split
+    split = "train" if store.manifest.published("train") else store.split  # some sets have only the test split
     mean_3 = np.asarray(store.manifest.statistics(split).acceleration.mean)
     predictors: dict[str, Callable[[Episode], np.ndarray]] = {
         "constant velocity": lambda episode: np.zeros(3),
@@ -185,7 +185,7 @@ def solver_contenders(
     reference_grid: int,
     resimulate: bool,
 ) -> list[SolverContender]:
-    """Returns the solver with each setting, and the chaos floor: the reference compared with itself, displaced."""
+    """Returns the solver with each setting, and the chaos floor: the reference from slightly displaced particles."""
     step = REFERENCE_STEP if resimulate else mpm.stability_fraction
 
     def solver(grid: int, step: float, perturbation: float = 0.0, **named: Any) -> SolverContender:

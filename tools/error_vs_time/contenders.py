@@ -1,6 +1,6 @@
 """Contenders: networks, the solver on several grids and with several steps, and baselines.
 
-Each computes one-step errors, if it has any, and rollouts of the same test scenes.
+Each contender computes one-step errors, if it has any, and rollouts, all of the same test scenes.
 Shape legend: T frames, N particles of a scene.
 """
 
@@ -41,7 +41,7 @@ class OneStep:
     """Holds one-step errors of a scene, and accelerations predicted for its particles at rest."""
 
     error: SquaredError = field(default_factory=SquaredError)
-    rest_sum: float = 0.0  # sum of the lengths of these accelerations, domain units per frame squared
+    rest_sum: float = 0.0  # sum of the lengths of accelerations at rest, domain units per frame squared
     rest_count: int = 0
 
 
@@ -53,7 +53,7 @@ class Contender:
     stepped = True  # computes frames one by one, without captured or compiled programs
 
     def one_step(self, episode: Episode, stride: int) -> OneStep | None:
-        """Returns errors of the accelerations of every stride-th frame; None if the contender has none."""
+        """Returns errors of the accelerations of every stride-th frame; None if the contender predicts none."""
         return None
 
     def trials(self, episodes: Sequence[Episode], frames: int, on_frame: OnFrame) -> list[RolloutResult]:
@@ -61,7 +61,7 @@ class Contender:
         raise NotImplementedError
 
     def release(self) -> None:
-        """Frees memory of the device that is kept for further rollouts."""
+        """Frees the device memory that was kept for further rollouts."""
 
 
 class NetworkContender(Contender):
@@ -115,7 +115,7 @@ class SolverContender(Contender):
     all_at_once = True  # a single scene uses only a few of a GPU's processors
 
     def __init__(self, launches: SolverLaunches, setting: Setting, frames: int, named: Row | None = None) -> None:
-        """Takes the length `frames` of rollouts that are not timed; `named` replaces the row made from the settings."""
+        """Takes the number of `frames` of scored rollouts; `named` replaces the row that the settings give."""
         self.launches, self.setting, self.frames = launches, setting, frames
         grid = round(1 / launches.cell_size)
         self.row = named or {"system": "mpm", "grid": grid, "step": setting.step, "precision": "fp32"}

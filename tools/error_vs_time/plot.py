@@ -15,9 +15,9 @@ from tools.error_vs_time.settings import UNTIMED
 from tools.report import as_png, new_figure, shared_legend
 
 CONVENTION = "squared errors: sum over axes, mean over particles and scenes, frame units"
-SHOWN_FRAME = 50  # in a panel of its own, next to the last frame
+SHOWN_FRAME = 50  # frame with a panel of its own, beside that of the last frame
 COLORS = {
-    "gns": ("#d9480f", "#a61e4d", "#f08c00", "#862e9c"),  # of other systems too: older reports have several of GNS
+    "gns": ("#d9480f", "#a61e4d", "#f08c00", "#862e9c"),  # also for other systems; older reports have several GNS
     "hgn": ("#0b3c8c", "#2f7fd6", "#12a3a8", "#7b5cd6", "#5aa9e6", "#2b2f77"),
     "mpm": ("#b5b5b5", "#7d7d7d", "#111111", "#4d4d4d"),  # coarse grids come first
     "baseline": ("#868e96",),
@@ -26,19 +26,19 @@ COLORS = {
 LINES = {"chaos": ("-", "--"), "baseline": (":", "--", "-.")}
 PRECISION_MARKERS = {"fp32": "o", "tf32": "s", "fp16": "D"}
 STEP_MARKERS = {1.0: "^", 0.5: "v"}  # by the fraction of the stable step
-NEAR_FLOOR, FAR_ABOVE = 30, 8  # limits of the axis: factor below the least error, and above the best baseline
-TICKS = (1, 2, 5)  # of each decade of the run times
-UPPER_EDGE = 0.965  # of a panel's height, where contenders are marked that diverged in all scenes
+NEAR_FLOOR, FAR_ABOVE = 30, 8  # limits of the axis: factor below the smallest error, and above the best baseline
+TICKS = (1, 2, 5)  # ticks in each decade of the run times
+UPPER_EDGE = 0.965  # fraction of a panel's height where marks of contenders that diverged in all scenes stand
 SMALL = 9.5  # points
 
 Row = Mapping[str, Any]
 
 
 def draw_pareto(rows: Sequence[Row], meta: Mapping[str, Any], batched: bool = False) -> bytes:
-    """Draws errors against milliseconds a frame, of one scene or of several side by side; returns PNG bytes.
+    """Draws errors against milliseconds per frame of one scene, or of several side by side; returns PNG bytes.
 
-    A line joins the precisions of a network, and the steps of the solver on a grid. Bars are the middle half of the
-    scenes. Crosses mark means over fewer scenes, because others failed.
+    A line joins the precisions of a network, and the steps of the solver on a grid. Bars show the middle half of the
+    scenes. A cross marks a mean over fewer scenes, because the others failed.
     """
     frames = sorted({int(frame) for row in rows for frame in row["position_mse"]})
     shown: list[int | None] = [None, *sorted({f for f in frames if f == SHOWN_FRAME} | set(frames[-1:]))]
@@ -53,7 +53,7 @@ def draw_pareto(rows: Sequence[Row], meta: Mapping[str, Any], batched: bool = Fa
 
 
 def draw_frames(rows: Sequence[Row], meta: Mapping[str, Any]) -> bytes:
-    """Draws position MSE over the frames, of each network at the precision that reached most; returns PNG bytes."""
+    """Draws position MSE over frames, for each network at the precision that reached most frames; returns PNG bytes."""
     figure, ((panel,),) = new_figure(1, 1, (11.0, 6.4))
     styles = _styles(rows)
     networks = [row for row in rows if row["system"] in NETWORK_SYSTEMS]
@@ -110,7 +110,7 @@ def _pareto(panel: Any, rows: Sequence[Row], frame: int | None, key: str) -> Non
 
 
 def _limits(rows: Sequence[Row], frame: int | None) -> tuple[float, float]:
-    """Returns limits of the axis of errors, without points far above the baselines and floors far below."""
+    """Returns limits of the axis of errors. They omit errors far above the baselines, and a floor far below all."""
     points, baselines, floors = (
         _errors(rows, frame, *systems) for systems in ((*NETWORK_SYSTEMS, "mpm"), ("baseline",), ("chaos",))
     )
@@ -122,7 +122,7 @@ def _limits(rows: Sequence[Row], frame: int | None) -> tuple[float, float]:
 
 
 def _point(panel: Any, row: Row, frame: int | None, x: float, color: str, high: float) -> None:
-    """Draws the error of a row with its bar, or a mark at the upper edge if it is larger or all scenes failed."""
+    """Draws a row's error with its bar, or a mark at the upper edge if the error is above or all scenes failed."""
     error, scenes = _error(row, frame), len(row["seeds"])
     reached = scenes if frame is None else int(row["scenes_reached"].get(str(frame), 0))
     if error is None and (reached or not row["failed_scenes"]):
@@ -164,7 +164,7 @@ def _errors(rows: Sequence[Row], frame: int | None, *systems: str) -> list[float
 
 
 def _png(figure: Any, meta: Mapping[str, Any], title: str) -> bytes:
-    """Adds a title with the provenance."""
+    """Returns the figure as PNG bytes, with a title and the provenance."""
     versions = "torch {torch}, taichi {taichi}".format(**meta["versions"])
     when = f"commit {meta['commit']}, {meta['date'][:10]}: {meta['command']}"
     text = f"{CONVENTION}; scored by {meta['reference']}. {versions}, {when}"

@@ -26,7 +26,7 @@ from tools.error_vs_time.settings import UNTIMED, ErrorVsTimeConfig
 from tools.report import finite, write_report
 from tools.timing import Stopwatch
 
-ROUNDS = 2  # of each timed scene
+ROUNDS = 2  # number of times that each scene is timed
 Row = dict[str, Any]
 
 
@@ -45,7 +45,7 @@ class Run:
         """`started` is a time of time.monotonic()."""
         self.config, self.contenders, self.references, self.device = config, contenders, references, device
         self.started, self.meta = started, meta | {"not_run": [], "not_timed": []}
-        self.failed = 0  # contenders that raised an unexpected error
+        self.failed = 0  # number of contenders that raised an unexpected error
         self.watches: dict[int, Stopwatch] = {}
         self._rows: dict[int, Row] = {}
         self._given_up: set[int] = set()
@@ -99,7 +99,7 @@ class Run:
         self._rows[i] |= self.watches[i].round()
 
     def _attempt(self, i: int, work: Callable[[int], None]) -> None:
-        """Measures a contender; if it fails, the report names it and goes on with the others."""
+        """Measures a contender. If it fails, the report names it, and the run continues with the next one."""
         if i in self._given_up:
             return
         try:

@@ -1,7 +1,7 @@
 """The row of a contender: its errors on the test scenes against the reference.
 
-Conventions: squared errors sum over axes and average over particles, in frame units; means over scenes are of those
-scenes that reached the frame. Shape legend: T frames, N particles of a scene, S scenes.
+Conventions: squared errors are sums over axes and means over particles, in frame units; a mean over scenes includes
+only scenes that reached the frame. Shape legend: T frames, N particles of a scene, S scenes.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ from tools.measures import momentum_error, outside_domain
 
 FRAME_STRIDE = 10  # one-step errors are measured on every tenth frame
 BATCH_SCENES = 8  # number of rollouts that are simulated side by side
-SINKHORN_SCENES, SINKHORN_POINTS, SINKHORN_BLUR = 20, 1024, 0.01  # largest number of a material's points; domain units
+SINKHORN_SCENES, SINKHORN_POINTS, SINKHORN_BLUR = 20, 1024, 0.01  # most scenes, most points per material; domain units
 OfMaterial = tuple[int, str, str, float]  # a scene's number, material and frame, and a value
 
 
 def score(contender: Contender, references: Sequence[Episode], device: torch.device) -> dict[str, Any]:
-    """Returns the row without run times."""
+    """Returns the contender's row without run times."""
     steps = [contender.one_step(episode, FRAME_STRIDE) for episode in references]
     frames = len(references[0].position_TN3)
     together = len(references) if contender.all_at_once else BATCH_SCENES
@@ -149,7 +149,7 @@ def _reference_penetration(reference: Episode, frame: int) -> float:
 def _of_materials(
     trials: Sequence[RolloutResult], references: Sequence[Episode], frames: Sequence[int], most: int | None = None
 ) -> Iterator[tuple[int, str, str, np.ndarray, np.ndarray]]:
-    """Yields scene, material, frame, and the positions of its particles in rollout and reference.
+    """Yields scene, material, frame, and the positions of the material's particles in rollout and reference.
 
     Frames that a scene did not reach are left out. `most` limits the particles, which are drawn at random.
     """

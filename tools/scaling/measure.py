@@ -1,7 +1,7 @@
-"""The timed processes: one for each device; different numbers of them train together in turns.
+"""The timed processes, one for each device. In turns, different numbers of them train together.
 
-An update on several ranks is timed: noise, jitter, grid, forward, backward, the gradients' average, Adam. Lightning,
-logging and reading of data are not included.
+A timed update on several ranks consists of noise, jitter, grid, forward and backward pass, the average of gradients,
+and Adam. Lightning, logging and reading of data are not included.
 """
 
 from __future__ import annotations
@@ -41,12 +41,12 @@ from tools.report import PASS
 from tools.scaling.config import ScalingConfig
 from tools.timing import Timed, alternate, statistics
 
-# Relative error of the averaged gradients. Larger than rounding: the order of sums on a GPU varies, which flips
-# activations next to their kink, and TF32 amplifies it.
+# Bound of the relative error of the averaged gradients. It is larger than rounding errors: the order of sums on a GPU
+# varies, which flips activations next to their kink, and TF32 increases this effect.
 GRADIENT_BOUND = 2e-2
 WARM_UPDATES = 3
-ROUNDS = 20  # samples of a contender
-SPREAD = 0.17  # standard deviation of a scene's particles, as a fraction of the mean, in the paper's random scenes
+ROUNDS = 20  # number of samples of a contender
+SPREAD = 0.17  # standard deviation of the number of particles over the paper's random scenes, as a fraction of the mean
 PATIENCE = datetime.timedelta(minutes=2)
 
 
@@ -57,16 +57,16 @@ class Contender(Timed):
     backend: str  # torch or triton
     devices: int
     averaged: bool
-    spread: float  # of the particles of a scene
-    particles: float  # of one update, on each device, in the mean
+    spread: float  # as SPREAD, for the timed scenes
+    particles: float  # mean number of particles of one update on each device
     one_graph: bool = False  # the gradients' average is in the CUDA graph of the update
     update: TorchUpdates | TritonUpdates | None = None  # None in processes that only wait
     check: str = PASS
-    milliseconds: list[float] = field(default_factory=list)  # of one update
-    batches: int = 1  # updates of one sample
+    milliseconds: list[float] = field(default_factory=list)  # times of one update
+    batches: int = 1  # number of updates of one sample
 
     def sample(self) -> float:
-        """Returns the milliseconds of the slowest rank; all others wait."""
+        """Returns the milliseconds of the slowest rank of this contender; all other processes wait."""
         taken = torch.zeros(1)
         dist.barrier()
         if self.update is not None:
@@ -134,7 +134,7 @@ class TritonUpdates:
         self.ours.run(self.chunk, self.rates)
 
     def gradients(self) -> torch.Tensor:
-        """Returns the gradients of the first batch, from Adam's first moment, to which a tenth of them is added."""
+        """Returns the gradients of the first batch, from Adam's first moment m: an update makes it 0.9 m + 0.1 g."""
         before = self.ours.first_moment.clone()
         self.ours.run(self.chunk[:1], [0.0])
         return (self.ours.first_moment - 0.9 * before) * 10
@@ -162,7 +162,7 @@ def measure(rank: int, count: int, config: ScalingConfig, device_type: str, fold
     else:
         torch.set_num_threads(max(1, available_cpus() // count))
     set_matmul_precision(_torch_precision(config, device))
-    # processes communicate through this group while nothing is timed, without the devices
+    # while nothing is timed, processes communicate through this group, which does not use the devices
     dist.init_process_group(
         "gloo", init_method=f"file://{folder / 'store'}", rank=rank, world_size=count, timeout=PATIENCE
     )
@@ -181,7 +181,7 @@ def measure(rank: int, count: int, config: ScalingConfig, device_type: str, fold
         (folder / "rows.json").write_text(json.dumps([_row(c, config, device) for c in contenders]))
     dist.barrier()
     # Destroying a group waits for ever while a CUDA graph contains its messages. After an error the traceback keeps the
-    # graphs, so the process then ends without it.
+    # graphs, so the process then ends without destroying the group.
     for contender in contenders:
         contender.update = None
     gc.collect()
@@ -189,7 +189,7 @@ def measure(rank: int, count: int, config: ScalingConfig, device_type: str, fold
 
 
 def _torch_precision(config: ScalingConfig, device: torch.device) -> str:
-    """Returns the precision of backend torch, which has no fp16; a CPU has no TF32."""
+    """Returns the precision for backend torch, which does not support fp16; a CPU does not support TF32."""
     return "tf32" if device.type == "cuda" and config.precision != "fp32" else "fp32"
 
 
@@ -241,7 +241,7 @@ def _prepare(
 
 
 def _average(contender: Contender, group: dist.ProcessGroup) -> None:
-    """Starts averaging gradients, and compares them with the mean of the ranks' own."""
+    """Starts averaging gradients, and compares the average with the mean of the ranks' own gradients."""
     assert contender.update is not None
     expected = contender.update.gradients().clone()
     dist.all_reduce(expected, group=group)
@@ -271,7 +271,7 @@ def _agree(contender: Contender) -> None:
 
 
 def _until(seconds: float) -> Callable[[], bool]:
-    """Returns a function that says, on all ranks alike, whether the seconds are over."""
+    """Returns a function that returns, equally on all ranks, whether the seconds are over."""
     started, over = time.monotonic(), torch.zeros(1)
 
     def is_over() -> bool:
