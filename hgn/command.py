@@ -177,7 +177,10 @@ def _print_help(config_name: str) -> None:
 
 
 def _require_options(arguments: list[str]) -> None:
-    """Refuses options after which Hydra would print pages, words without `=`, and paths that are too long."""
+    """Refuses options after which Hydra would print pages, words without `=`, deletions, and paths that are too long.
+
+    A deleted key would have the default of its dataclass, which differs from that of conf/, or be missing.
+    """
     from hgn.hydra_compat import OPTIONS
 
     for before, argument in itertools.pairwise(arguments):
@@ -185,10 +188,12 @@ def _require_options(arguments: list[str]) -> None:
         if name.startswith("-") and name not in OPTIONS:
             key = name.strip("-") or "KEY"
             raise ConfigError(f"{argument} is not an option; settings are given as {key}={value or 'VALUE'}")
-        if "=" not in argument and not argument.startswith(("-", "~")) and before not in OPTIONS:
+        if argument.startswith("~") and before not in OPTIONS:
+            require(False, name[1:], "kept", argument, f"leave it out, or write {name[1:]}=VALUE")
+        if "=" not in argument and not argument.startswith("-") and before not in OPTIONS:
             raise ConfigError(f"settings are given as KEY=VALUE, got {argument!r}; --help shows the keys")
         for item in re.split(r"[\[\]{},]", value if "://" not in value else ""):
-            require(is_path(item), name.lstrip("+~"), PATH_RULE, item, "choose a shorter one")
+            require(is_path(item), name.lstrip("+"), PATH_RULE, item, "choose a shorter one")
 
 
 def _with_json_as_override(arguments: list[str]) -> list[str]:

@@ -54,7 +54,7 @@ def compose(folder: Path, config_name: str, arguments: list[str], complete: bool
     given, full_error = sys.argv, os.environ.get("HYDRA_FULL_ERROR")
     composed: list[Any] = []
     try:
-        if any(argument.lstrip("+~").startswith(("-", "hydra")) for argument in arguments[1:]):
+        if any(argument.lstrip("+").startswith(("-", "hydra")) for argument in arguments[1:]):
             sys.argv = _with_quiet(arguments)
             os.environ["HYDRA_FULL_ERROR"] = "1"  # otherwise Hydra would print the error and exit
             with _strict_files(), registered_dataclasses(folder, config_name), warnings.catch_warnings():
@@ -185,8 +185,8 @@ def _override(argument: str, folder: Path) -> str:
     elif value and not _understood(value):
         value = _in_quotes(value)
     name = key.lstrip("+")
-    if value == "[]" and (name == "experiment" or (folder / name).is_dir()):
-        raise ConfigError(f"{name} must be a file of conf/{name}, or several, got []; leave it out for none")
+    if value in ("[]", "null") and (name == "experiment" or (folder / name).is_dir()):
+        raise ConfigError(f"{name} must be a file of conf/{name}, or several, got {value}; leave it out for none")
     if name == "experiment":
         key = "+experiment"
     elif re.fullmatch(r"(?!hydra)[A-Za-z][\w.]*", key) and not (folder / key).is_dir():  # the key is not a group
@@ -219,7 +219,7 @@ def _understood(value: str) -> list[Any]:
 def _with_quiet(arguments: list[str]) -> list[str]:
     # These go directly before the user's overrides: later ones win, and argparse accepts only one sequence.
     for place, (before, argument) in enumerate(itertools.pairwise(arguments), 1):
-        override = argument.startswith("~") or ("=" in argument and not argument.startswith("-"))
+        override = "=" in argument and not argument.startswith("-")
         if override and ("=" in before or not before.startswith("--conf")):
             return [*arguments[:place], *_QUIET, *arguments[place:]]
     return [*arguments, *_QUIET]

@@ -144,8 +144,8 @@ def test_experiments_with_bad_yaml(tmp_path, command, content, message):
 
 
 def test_groups_and_included_files(tmp_path, command):
-    """A file of a group is read as strictly; one that an experiment includes ends in one line too. `~training` is an
-    override, wherever options stand."""
+    """A file of a group is read as strictly; one that an experiment includes ends in one line too. `~training` is
+    refused, wherever options stand."""
     for folder in ("experiment", "scene"):
         (tmp_path / folder).mkdir()
     (tmp_path / "scene" / "own.yaml").write_text("group_size: 0.1\ngroup_size: 0.2\n")
@@ -156,7 +156,7 @@ def test_groups_and_included_files(tmp_path, command):
         assert code == 2 and error.count("\n") == 1 and ("own.yaml" in error or "inner.yaml" in error)
     for arguments in (("~training", "--cfg", "job"), ("--cfg", "job", "~training")):
         code, _, error = command("train", *arguments)
-        assert code == 0 and error == ""
+        assert code == 2 and error.startswith("error: training must be kept, got '~training'; ")
 
 
 @pytest.mark.parametrize(

@@ -57,9 +57,21 @@ VALUES = [
     ("train", ["network.materials=[lava]"], "network.materials must be all of scene.materials, got ['lava']"),
     ("train", ["scene.tilted_gravity_fraction=0.1"], "network.inputs must be relative where scene.kinds are given, or"),
     ("train", ["training=[1]"], "settings must be as Hydra reads them, got training=[1] (TypeError: "),
-    ("train", ["~training.loggers.0"], "settings must be as Hydra reads them, got ~training.loggers.0 (TypeError: "),
+    *(
+        (command, [f"~{key}"], f"error: {key.partition('=')[0]} must be kept, got '~{key}'; leave it out, or")
+        for command, key in (
+            *(("train", key) for key in ("dataset", "dataset.folder", "mpm", "training.loggers.0", "network=hgn", "none")),
+            *(("train", key) for key in ("training.seed", "network.width", "training", "hydra.job.name")),
+            *((command, key) for command in ("datagen", "service") for key in ("dataset", "out", "network")),
+            *(("rollout", "weights"), ("export", "checkpoint"), ("evaluate", "data"), ("render", "rollout")),
+            *(("solve", "scene"), ("solve", "mpm"), ("upload", "to")),
+        )
+    ),
     ("train", ["+experiment=[]"], "experiment must be a file of conf/experiment, or several, got []; leave it out"),
-    ("train", ["scene=[]"], "scene must be a file of conf/scene, or several, got []; leave it out for none"),
+    *(
+        ("train", [f"{key}={value}"], f"{key} must be a file of conf/{key}, or several, got {value}; leave it out for")
+        for key, value in (("scene", "[]"), ("scene", "null"), ("dataset", "null"))
+    ),
     ("train", ["++experiment=moon"], "Could not find 'experiment/moon'"),
     ("train", ["+experiment=moon"], "Could not find 'experiment/moon'"),
     ("export", ["checkpoint=none.ckpt", "out=x"], "checkpoint must be an existing file, got none.ckpt; hgn.train"),
