@@ -27,15 +27,19 @@ from hgn.system.files import is_replaceable
 T = TypeVar("T")
 # control characters of terminals and text direction, and surrogates, except those that stand for bytes of file names
 _CONTROL = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069\ud800-\udc7f\udd00-\udfff]")
-# After a colon, digits are a port and a space begins a sentence; anything else is a password, which may contain spaces,
-# slashes and @.
-_COLON, _MOST = r":(?=\S)(?!\d+(?:[\s/?#,;)'\"]|$))", "{1,2000}"
-_USER = rf"[^/\s?#]{_MOST}|[^/:@'\"]{_MOST}{_COLON}(?:(?!://)[^@]){_MOST}|[^\s/:@]{_MOST}{_COLON}[^\s@]{_MOST}"
+# Passwords may have spaces, slashes and @. They end at the last @ before a space, also where "host:80/a@b" is no
+# password. Digits before a space are a port, unless a single word with @ follows.
+_MOST = "{1,2000}"
+_PORT, _WORD = r"\d+(?:[,;)'\"]|\s(?![^\s@:]+@)|$)", rf"(?:(?!://)\S){_MOST}"
+_USER = rf"[^\s/:@]{_MOST}:{_WORD}|[^/\s?#]{_MOST}|[^/:@'\"]{_MOST}:(?=\S)(?!{_PORT})(?:(?!://)[^@]){_MOST}"
 _SECRET = r"(?:sig|token|secret|pass|pwd|cred|auth|jwt)[\w.-]*|key(?:_?id)?|code"
 _SECRETS = (  # pattern and replacement: for users of URLs and of addresses without a scheme, and for signatures
     (rf"(\w://)(?:{_USER})?@", r"\1"),
-    (rf"((?:^|['\"=])(?![\w+]+://))[^\s'\"/:@]{_MOST}:(?![\s/])[^'\"@]{_MOST}@(?=[\w\[])", r"\1"),
-    (rf"(?<![\w@.])[\w.+-]{_MOST}:[^\s@/:]{_MOST}@(?=[\w\[])", ""),
+    (
+        rf"((?:^|['\"=])(?![\w+]+://))[^\s'\"/:@]{_MOST}:(?![\s/])[^'\"@]{_MOST}@(?:(?:(?!://)[^\s'\"]){_MOST}@)?(?=[\w\[])",
+        r"\1",
+    ),
+    (r"(?<![\w@.])[\w.+-]{1,300}:(?!/)(?:(?!://)\S){1,300}@(?=[\w\[])", ""),  # short, because any word may start it
     (rf"(?i)([?&;#][\w.-]{{0,99}}?(?:{_SECRET}))=[^&\s'\"#;]*", r"\1=…"),
 )
 # the owner's path, and the value's own name or index; joined for messages

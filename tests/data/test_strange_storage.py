@@ -142,7 +142,27 @@ def test_malformed_bodies_end(data, monkeypatch, content, pause_s):
         ("http://user:secret@host:80/a b", "http://host:80/a b"),
         ("https://user:p@ss:w@rd@host/a http://h?x=a@b", "https://host/a http://h?x=a@b"),
         ("got s3://key:se%40cret@bucket, ftp://u@h", "got s3://bucket, ftp://h"),
-        ("https://me:pa/ss#w@host/x s3://KEY:se/cret@b/x http://h:80/a@b", "https://host/x s3://b/x http://h:80/a@b"),
+        ("https://me:pa/ss#w@host/x s3://KEY:se/cret@b/x http://h:80/a", "https://host/x s3://b/x http://h:80/a"),
+        *(
+            (text.format(password), text.format("").replace("user:@", ""))
+            for text in ("http://user:{}@host:80/a", "'http://user:{}@[::1]/a'", "user:{}@h/a", "got x, user:{}@h/a")
+            for password in (
+                "80",
+                "80ab",
+                "80/ab",
+                "80#ab",
+                "80?ab",
+                "80@ab",
+                "8:0ab",
+                "8/a@b",
+                "8@a/b",
+                "a/b@c/d",
+                "a@b",
+            )
+        ),
+        ("got 'http://user:80 ab@host/a'", "got 'http://host/a'"),
+        ("http://user:80%2F%40%23ab@host/a user:80%2F%40%23ab@h", "http://host/a h"),
+        ("C:/a/b@c http://h:80 fails at u/v: a@b", "C:/a/b@c http://h:80 fails at u/v: a@b"),
         ("hf://datasets/a@main/b", "hf://datasets/a@main/b"),
         ("a@b.c file:///x@y http://h/p@q", "a@b.c file:///x@y http://h/p@q"),
         (
@@ -172,7 +192,7 @@ def test_no_file_of_a_run_has_the_password(data, tmp_path, capsys, monkeypatch):
     run = tmp_path / "run"
     with answering(functools.partial(PlainFiles, directory=data.dataset.folder)) as url:
         mapping = train_mapping(data, run, monitor_every=100)
-        mapping["dataset"]["folder"] = secret = url.replace("://", "://user:secret-word@")
+        mapping["dataset"]["folder"] = secret = url.replace("://", "://user:80%2F%40%23secret-word@")
         monkeypatch.setattr("sys.orig_argv", ["python", "-m", "hgn.train", f"dataset.folder={secret}"])
         assert train.main(mapping) == 0
         weights, options = run / "weights.safetensors", {"data": secret, "device": "cpu", "backend": "torch"}

@@ -60,8 +60,8 @@ VALUES = [
     *(
         (command, [f"~{key}"], f"error: {key.partition('=')[0]} must be kept, got '~{key}'; leave it out, or")
         for command, key in (
-            *(("train", key) for key in ("dataset", "dataset.folder", "mpm", "training.loggers.0", "network=hgn", "none")),
-            *(("train", key) for key in ("training.seed", "network.width", "training", "hydra.job.name")),
+            *(("train", key) for key in ("dataset", "dataset.folder", "mpm", "network=hgn", "none")),
+            *(("train", key) for key in ("training.seed", "training", "training.loggers.0", "hydra.job.name")),
             *((command, key) for command in ("datagen", "service") for key in ("dataset", "out", "network")),
             *(("rollout", "weights"), ("export", "checkpoint"), ("evaluate", "data"), ("render", "rollout")),
             *(("solve", "scene"), ("solve", "mpm"), ("upload", "to")),
