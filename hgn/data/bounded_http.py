@@ -8,6 +8,7 @@ from __future__ import annotations
 import asyncio
 import re
 import time
+from contextvars import ContextVar
 
 import aiohttp
 from aiohttp.connector import Connection
@@ -17,7 +18,8 @@ from hgn.data.verification import StorageError
 LARGEST_BYTES = 2**29  # limit for whole files: manifests of the first release, and shards of servers without ranges
 LEAST_BYTES_S, SLOW_S = 4096, 20.0  # smallest mean speed of a body, bytes/s, apart from a grace of SLOW_S seconds
 SILENCE_S = 60.0  # limit between two pieces, seconds: aiohttp reports no error of a malformed body
-HEAD_S = 150.0  # limit for the head of an answer, seconds: a service may hash a shard first
+HEAD_S = 150.0  # limit for the heads of an answer and its redirects, seconds: a service may hash a shard first
+_deadline: ContextVar[float] = ContextVar("deadline")  # of the heads in a task; each call of fsspec is a task
 _RANGE = re.compile(r"bytes=(\d+)-(\d+)")
 
 
@@ -25,8 +27,11 @@ class BoundedResponse(aiohttp.ClientResponse):
     """Reads the body of an answer in pieces, up to its limit, at LEAST_BYTES_S or faster."""
 
     async def start(self, connection: Connection) -> aiohttp.ClientResponse:
-        """Reads the head. Raises: TimeoutError if it takes longer than HEAD_S."""
-        return await asyncio.wait_for(super().start(connection), HEAD_S)
+        """Reads the head. Raises: TimeoutError if it takes, with those of redirects to it, longer than HEAD_S."""
+        now = time.monotonic()
+        end = _deadline.get(now + HEAD_S)
+        _deadline.set(end)
+        return await asyncio.wait_for(super().start(connection), end - now)
 
     async def read(self) -> bytes:
         """Returns the body. Raises: StorageError if it is too long; ConnectionError or TimeoutError if too slow."""

@@ -80,9 +80,10 @@ def test_a_claim_that_its_server_denies_empties_no_cache(data, tmp_path, monkeyp
     assert other.exists()
 
 
-@pytest.mark.parametrize("dripping", ["manifest.json", ".tar", "head"])
+@pytest.mark.parametrize("dripping", ["manifest.json", ".tar", "head", "redirects"])
 def test_a_server_that_drips_does_not_answer(data, monkeypatch, dripping):
-    """A head or a body that comes more slowly than the least speed ends like one that does not come."""
+    """A head or a body that comes more slowly than the least speed ends like one that does not come. All heads of a
+    chain of redirects have one deadline."""
     monkeypatch.setenv(VARIABLE, "0")
 
     class Drip(PlainFiles):
@@ -91,6 +92,17 @@ def test_a_server_that_drips_does_not_answer(data, monkeypatch, dripping):
                 for byte in content:
                     self.wfile.write(bytes([byte]))
                     time.sleep(0.005)
+
+        def do_GET(self):  # noqa: N802
+            redirects = int(self.path.partition("?")[2] or 0)
+            if dripping == "redirects" and redirects < 9:
+                time.sleep(0.1)
+                self.send_response(302)
+                self.send_header("Location", f"manifest.json?{redirects + 1}")
+                self.send_header("Content-Length", "0")
+                self.end_headers()
+            else:
+                super().do_GET()
 
         def end_headers(self):
             if dripping == "head":
@@ -110,10 +122,11 @@ def test_a_server_that_drips_does_not_answer(data, monkeypatch, dripping):
         assert store is None or len(list(store.entries)) == 5
         monkeypatch.setattr("hgn.data.bounded_http.SLOW_S", 0.0)
         monkeypatch.setattr("hgn.data.bounded_http.LEAST_BYTES_S", 10**12)
-        monkeypatch.setattr("hgn.data.bounded_http.HEAD_S", 0.2 if dripping == "head" else 150.0)
-        with pytest.raises(UnreachableError, match="TimeoutError" if dripping == "head" else "bytes a second") as error:
+        heads = dripping in ("head", "redirects")
+        monkeypatch.setattr("hgn.data.bounded_http.HEAD_S", 0.2 if heads else 150.0)
+        with pytest.raises(UnreachableError, match="TimeoutError" if heads else "bytes a second") as error:
             (store or EpisodeStore(url, "train"))[0]
-        assert dripping in ("head", error.value.filename[-len(dripping) :])
+        assert heads or error.value.filename.endswith(dripping)
 
 
 @pytest.mark.parametrize("content", [b"zz\r\nabc", b"ffffffffffffffffff\r\nabc", b""])
