@@ -1,7 +1,7 @@
 """Contains all changes to Viser's private parts; pyproject.toml bounds its version.
 
-Viser serves its page and its websocket to every client of the port. Here both require a token. The page's address has
-the token (`/?token=…`) and stores it as a cookie, which the browser sends with the websocket.
+Viser serves its page and its websocket to every client of the port. Here the path of both begins with a token. The page
+opens its websocket below its own path. A cookie would be sent to the servers of all ports of the host.
 `tests/viewer/test_page.py` fails if a new version has changed these parts.
 """
 
@@ -20,10 +20,10 @@ import traceback
 import zlib
 from collections import Counter, deque
 from collections.abc import Callable
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 from unittest import mock
-from urllib.parse import parse_qs
 
 import viser
 import websockets.asyncio.server
@@ -38,7 +38,6 @@ from websockets.http11 import Request, Response
 
 from hgn.schema import require
 
-COOKIE = "hgn_play"
 MAXIMUM_UNFINISHED_BYTES = 128 << 20  # bytes of the incomplete uploads of all viewers
 UPLOAD_BYTES, PART_BYTES = 1 << 20, 200  # bytes that are added for each upload and each of its parts
 MOST_OPENING = 64  # number of connections without the token; a further one closes the oldest
@@ -106,7 +105,7 @@ def start_server(host: str, port: int, label: str) -> tuple[viser.ViserServer, s
     admit(server._websock_server)
     server._websock_server.on_client_connect(admit)
     shown = "127.0.0.1" if host in ("0.0.0.0", "localhost") else host
-    return server, f"http://{shown}:{server.get_port()}/?token={token}"
+    return server, f"http://{shown}:{server.get_port()}/{token}/"
 
 
 def shedding() -> type[ServerConnection]:
@@ -204,27 +203,19 @@ def stop_server(server: viser.ViserServer) -> None:
 
 
 def guarded(process: Process, token: str) -> Process:
-    """Passes on requests that have the token, in the address or in a cookie, and refuses all others.
-
-    Browsers send cookies to every port of a host. A request whose Origin is another page is therefore refused too.
-    """
+    """Passes on requests whose path begins with the token, without it. Refuses all others, and those of other pages."""
 
     def answer(connection: Any, request: Request) -> Response | None:
-        port = connection.local_address[1]
-        name = f"{COOKIE}_{port}"  # a cookie belongs to all ports of a host
-        # Other programs on this host have cookies with any names and values. A strict parser would refuse some.
-        cookies = [part.strip() for header in request.headers.get_all("Cookie") for part in header.split(";")]
-        tokens = [cookie.removeprefix(f"{name}=") for cookie in cookies if cookie.startswith(f"{name}=")]
-        tokens += parse_qs(request.path.partition("#")[0].partition("?")[2]).get("token", [])
+        path, mark, query = request.path.partition("?")
+        given, _, rest = path.removeprefix("/").partition("/")
         own = {f"{scheme}://{host}".lower() for host in request.headers.get_all("Host") for scheme in ("http", "https")}
         foreign = any(origin.lower() not in own for origin in request.headers.get_all("Origin"))
         # bytes that are not valid text have become lone surrogates here
-        if foreign or not any(hmac.compare_digest(value.encode(errors="replace"), token.encode()) for value in tokens):
+        if foreign or not hmac.compare_digest(given.encode(errors="replace"), token.encode()):
             headers = Headers({"Content-Type": "text/plain", "Content-Length": str(len(REFUSAL))})
             return Response(http.HTTPStatus.FORBIDDEN, "Forbidden", headers, REFUSAL)
-        response = process(connection, request)
+        response = process(connection, replace(request, path=f"/{rest}{mark}{query}"))
         if response is not None:
-            response.headers["Set-Cookie"] = f"{name}={token}; Path=/; HttpOnly; SameSite=Strict"
             response.headers["Referrer-Policy"] = "no-referrer"
         return response
 

@@ -25,7 +25,7 @@ from viewer import soak
 
 from hgn.viewer import viser_compat
 from hgn.viewer.page import MAXIMUM_UPLOAD_BYTES
-from hgn.viewer.viser_compat import COOKIE, MOST_OPENING, guarded
+from hgn.viewer.viser_compat import MOST_OPENING, guarded
 
 # viser keeps its event loop's threads and sockets until the garbage collector comes
 pytestmark = pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::pytest.PytestUnraisableExceptionWarning")
@@ -193,8 +193,8 @@ def test_a_moved_obstacle_leaves_no_earlier_scene_behind(page, monkeypatch):
 
 
 def test_requests_of_other_pages_are_refused():
-    """A page of another origin is refused though the browser sends this page's cookie with its request; so are tokens
-    that no browser sends."""
+    """A page of another origin is refused even with the token, and so are tokens that no browser sends. Nothing that a
+    browser sends to other ports of the host opens the page."""
     own = ("http://127.0.0.1:8080", "HTTP://127.0.0.1:8080", "https://127.0.0.1:8080")  # the last by a tunnel with TLS
     others = ("http://127.0.0.1:9999", "http://evil.example", "null", "", "http://[::1", "http://a]b", "file://")
     others += ("http://127.0.0.1:8080@evil.example", "http://u@127.0.0.1:8080", "javascript://127.0.0.1:8080")
@@ -204,10 +204,19 @@ def test_requests_of_other_pages_are_refused():
         *((origin, True) for origin in others),
     ):
         given = {} if origin is None else {"Origin": origin}
-        headers = Headers({"Host": "127.0.0.1:8080", "Cookie": f"{COOKIE}_8080=secret"} | given)
-        assert answered_with_403("/", headers) == refused, origin
-    for path in ("/?token=\udcff", "//[", "http://[/", "/?token=secret%00", "/#?token=secret", "*", "/?a"):
-        assert answered_with_403(path, Headers({"Host": "127.0.0.1:8080"})), path
+        for path in ("/secret", "/secret/", "/secret/?darkMode"):
+            assert answered_with_403(path, Headers({"Host": "127.0.0.1:8080"} | given)) == refused, origin
+    others = ("/\udcff", "//[", "http://[/", "/secret%00", "/#/secret", "*", "/?a", "/?token=secret", "//secret", "/")
+    for path in (*others, "/secrets", "/secre", "/?/secret/", ""):
+        headers = Headers({"Host": "127.0.0.1:8080", "Cookie": "hgn_play_8080=secret; token=secret"})
+        assert answered_with_403(path, headers), path
+
+
+def test_nothing_of_the_token_is_stored(page):
+    """The browser keeps no cookie, which it would send to all ports of the host, and names the address nowhere."""
+    with urllib.request.urlopen(page.address) as answer:
+        assert answer.headers["Set-Cookie"] is None and answer.headers["Referrer-Policy"] == "no-referrer"
+        assert b"<title>Viser</title>" in answer.read()
 
 
 def test_who_never_asks_keeps_nobody_out(page):
