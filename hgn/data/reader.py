@@ -26,7 +26,7 @@ from hgn.data.entries import REMEDY
 from hgn.data.manifest import MANIFEST_NAME, SPLITS, EpisodeEntry, Manifest, ShardEntry
 from hgn.data.shard_cache import holders
 from hgn.data.statistics import Statistics
-from hgn.data.storage import StorageError, ask, faults_outlived, is_remote, open_storage, outliving
+from hgn.data.storage import Storage, StorageError, ask, faults_outlived, is_remote, open_storage, outliving
 from hgn.scene.episode import POSITION_MEMBER, Episode, decode_episode
 from hgn.schema import ConfigError, printable, require
 from hgn.system.patience import UnreachableError, standard_patience_s
@@ -41,7 +41,7 @@ class Episodes(Sequence[Episode], ABC):
 
     An episode is opened, and its shard verified, on first use. Positions are read-only. `open` maps them into memory.
     If a mapped file becomes shorter, an access behind its end kills the process. Users may shorten a file in a local
-    folder, so `read` and indexing copy its positions. Files in the cache of a URL keep their length and are mapped.
+    folder, so `read` and indexing do not map it. Files in the cache of a URL keep their length and are mapped.
     Raises on access: ConfigError if a shard is missing or altered.
     """
 
@@ -296,12 +296,18 @@ class EpisodeStore(Episodes):
                 return opened.episodes[entry.key]
 
     def read(self, index: int) -> Episode:
-        episode = self.open(index)
         if is_remote(self.folder):
-            return episode
-        position_TN3 = np.array(episode.position_TN3)
-        position_TN3.flags.writeable = False
-        return replace(episode, position_TN3=position_TN3)
+            return self.open(index)
+        shard, entry = self._locate(index)
+        stop = min(max((offset + size for offset, size in entry.members.values()), default=0), shard.bytes)
+        start = max(0, min([stop, *(offset for offset, _ in entry.members.values())]))
+
+        def part(files: Storage) -> bytes:
+            files.shard(shard.name, shard.sha256, shard.bytes)
+            return files.read(shard.name, start, stop)
+
+        members = {name: (offset - start, size) for name, (offset, size) in entry.members.items()}
+        return self._read(np.frombuffer(ask(self.folder, part), np.uint8), shard, replace(entry, members=members))
 
     def release(self, path: Path) -> None:
         """Closes a shard. Its episodes in use stay readable."""

@@ -65,7 +65,7 @@ class FrameDraws:
         drawn = []
         for sample in samples:
             if sample.episode not in self._importance:
-                self.add(sample.episode, self.measured(self._store.open(sample.episode)))
+                self.add(sample.episode, self.measured(self._store.read(sample.episode)))
             importance = self._importance[sample.episode]
             frame, weight = importance.draw(sample.frame, sample.seed) if fraction > 0 else (sample.frame, 1.0)
             scale, scale_weight = noise_scale(self._training, importance.accelerations[frame], sample.seed)
@@ -133,7 +133,7 @@ class EpisodeReader:
         """Reads several episodes together. The first pass over a data set copies gigabytes without Python's lock."""
 
         def read(index: int) -> tuple[EpisodeTensors, FrameImportance | None]:
-            episode = self._store.open(index)  # here, because a mapped file may become shorter while it waits
+            episode = self._store.read(index)
             barrier = None if self._clearance is None else simulated_barrier(episode, self._clearance)
             return whole_episode(episode, self._network, barrier), self._draws.measured(episode)
 

@@ -18,7 +18,7 @@ from training.runs import train_mapping
 from datagen import upload
 from hgn import evaluate, export, rollout, train
 from hgn.config import NetworkConfig, TrainingConfig
-from hgn.data import shard_cache
+from hgn.data import shard_cache, storage
 from hgn.data.index import ListedIndex
 from hgn.data.manifest import Manifest
 from hgn.data.reader import EpisodeStore, find_episode, first_episodes
@@ -320,12 +320,23 @@ def test_a_shard_that_is_cut_under_an_episode(data, size, read):
         store[0]
 
 
-def test_no_mapped_episode_waits_for_others(data, monkeypatch):
-    """A training on a GPU reads each episode when it opens it: shards may shrink while it reads the ones before."""
-    store, order = EpisodeStore(data.dataset.folder, "train"), []
-    opened, whole = store.open, readers.whole_episode
-    monkeypatch.setattr(readers, "READERS", 1)
-    monkeypatch.setattr(store, "open", lambda index: order.append("open") or opened(index))
-    monkeypatch.setattr(readers, "whole_episode", lambda *given: order.append("read") or whole(*given))
-    readers.EpisodeReader(store, NetworkConfig(), TrainingConfig())._whole([0, 1, 2])
-    assert order == 3 * ["open", "read"]
+def whole_on_a_gpu(store):
+    readers.EpisodeReader(store, NetworkConfig(), TrainingConfig())._whole([0])
+
+
+@pytest.mark.parametrize("read", [lambda store: store[0], whole_on_a_gpu])
+def test_a_shard_that_is_cut_while_it_is_read(data, monkeypatch, read):
+    """A file of a folder that shrinks after its check is refused. A map of it would end the process, so whole episodes,
+    of evaluations and of trainings on a GPU, are read without one."""
+    store, folder, verify = EpisodeStore(data.dataset.folder, "train"), Path(data.dataset.folder), storage.verify_file
+    monkeypatch.setattr(np, "memmap", lambda *_, **__: pytest.fail("the file is mapped"))
+    read(store)
+
+    def cut_after(*given):
+        verify(*given)
+        for path in folder.glob("train*.tar"):
+            os.truncate(path, 512)
+
+    monkeypatch.setattr(storage, "verify_file", cut_after)
+    with pytest.raises(ConfigError, match=r"must have \d+ bytes, got 512"):
+        read(store)
