@@ -21,7 +21,7 @@ from typing import Any
 import yaml
 
 from hgn.renamed import CHOICES, REMOVED_CHOICES
-from hgn.schema import ConfigError, default_mapping
+from hgn.schema import ConfigError, default_mapping, known_keys
 from hgn.system.yaml_files import read_yaml
 
 OPTIONS = (
@@ -45,7 +45,7 @@ def compose(folder: Path, config_name: str, arguments: list[str], complete: bool
     from hydra import compose as compose_once
     from hydra import initialize_config_dir
     from hydra import main as hydra_main
-    from hydra.errors import HydraException
+    from hydra.errors import HydraException, MissingConfigException
     from omegaconf import OmegaConf
     from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
@@ -67,6 +67,11 @@ def compose(folder: Path, config_name: str, arguments: list[str], complete: bool
         plain = [OmegaConf.to_container(config, resolve=True, throw_on_missing=complete) for config in composed]
     except SystemExit as end:  # Hydra ends with 1 after a message about a missing package
         sys.exit(2 if end.code else 0)
+    except MissingConfigException as error:
+        group, _, name = str(error.missing_cfg_file).rpartition("/")
+        files = [each for each in error.options or () if "." not in each]  # without registered dataclasses
+        text = f"{group} must be a file of conf/{group}, got {name!r}; {known_keys(name, files, 'files')}"
+        raise ConfigError(text if files else " ".join(str(error).split())) from error
     except MissingMandatoryValue as error:
         raise ConfigError(f"{error.full_key} is missing; it must be given, as in {error.full_key}=…") from error
     except (HydraException, OmegaConfBaseException, ValueError, UserWarning, yaml.YAMLError) as error:  # by Hydra

@@ -176,8 +176,19 @@ def from_stored(cls: type[T], mapping: object, section: str) -> T:
 def known_keys(key: str, names: Iterable[str], what: str = "known keys") -> str:
     """Returns the remedy for an unknown key: a similar key, or else all keys. `what` is what a message calls them."""
     names = list(names)
-    close = difflib.get_close_matches(key, names, n=1)
-    return f"did you mean {close[0]}?" if close else f"{what}: {', '.join(names)}"
+    return near_name(key, names) or f"{what}: {', '.join(names)}"
+
+
+def near_name(name: str, names: Iterable[str], cutoff: float = 0.6) -> str:
+    """Returns `did you mean NAME?` for a similar name, or an empty text."""
+    return "".join(f"did you mean {close}?" for close in difflib.get_close_matches(name, names, 1, cutoff))
+
+
+def near_file(path: Path) -> str:
+    """Returns `did you mean NAME?` for a similar file in the folder of `path`, or an empty text."""
+    return near_name(
+        path.name, [each.name for each in path.parent.glob("*") if each.suffix[:3] == path.suffix[:3]], 0.8
+    )
 
 
 def to_mapping(value: Any) -> Any:
@@ -228,7 +239,8 @@ def field_comments(cls: type) -> dict[str, str]:
 def require(rule_holds: bool, field: str, rule: str, value: object, remedy: str = "") -> None:
     """Raises ConfigError `<field> must be <rule>, got <value>; <remedy>` unless the rule holds."""
     if not rule_holds:
-        remedy = remedy or value_remedy(field, value)
+        choices = rule.removeprefix("one of ").split(", ") if rule.startswith("one of ") else ()
+        remedy = remedy or value_remedy(field, value) or near_name(str(value), choices)
         raise ConfigError(f"{field} must be {rule}, got {_shown.repr(value)}" + (f"; {remedy}" if remedy else ""))
 
 

@@ -25,7 +25,7 @@ from urllib.request import getproxies, proxy_bypass_environment  # type: ignore[
 
 from hgn.data.shard_cache import CachedShard, cached_shard
 from hgn.data.verification import StorageError, verify_file
-from hgn.schema import ConfigError, require
+from hgn.schema import ConfigError, near_name, require
 from hgn.system.extras import missing_extra
 from hgn.system.files import open_at_once, read_replaced
 from hgn.system.hub import PREFIX, HubPlace, hub_token
@@ -110,7 +110,11 @@ def open_storage(folder: Path | str) -> Storage:
     """
     if is_remote(folder):
         return _at_url(str(folder))
-    return _Folder(local_folder(folder))
+    path, typo = local_folder(folder), re.match(r"(\w+):/(?!/)|(hf)//", str(folder))
+    if typo and not path.exists():
+        remedy = f"did you mean {typo[1] or typo[2]}://{str(folder)[typo.end() :]}?"
+        require(False, "dataset.folder", "a folder or a URL", str(folder), remedy)
+    return _Folder(path)
 
 
 def _uses_proxies(url: str) -> bool:
@@ -229,7 +233,10 @@ class _Remote(Storage):
         import fsspec  # importing it is slow, and local data sets do not need it
 
         self._url, hub = url, url.startswith(PREFIX)
-        address = HubPlace.parse(url, "dataset.folder").address if hub else url
+        place = HubPlace.parse(url, "dataset.folder") if hub else None
+        rule = "of a repository of data sets, hf://datasets/USER/NAME"
+        require(place is None or place.is_dataset, "dataset.folder", rule, url)
+        address = place.address if place else url
         self._http = address.startswith(("http://", "https://"))
         options: dict[str, Any] = {}
         if self._http:
@@ -256,9 +263,9 @@ class _Remote(Storage):
         except (ValueError, TypeError, ImportError) as error:
             cause = error.__cause__  # the missing package's error caused fsspec's ImportError
             reason = (isinstance(cause, ModuleNotFoundError) and missing_extra(cause)) or error
-            raise ConfigError(
-                f"dataset.folder must be a folder or a URL that fsspec can read, got {url!r} ({reason})"
-            ) from None
+            near = near_name(url.partition(":")[0], fsspec.available_protocols())
+            text = f"dataset.folder must be a folder or a URL that fsspec can read, got {url!r} ({reason}); {near}"
+            raise ConfigError(text.removesuffix("; ")) from None
         self._manifest: tuple[bytes, str] | None = None  # the last manifest, and its ETag at a dataset service
         self._lock = threading.Lock()
         self._away = (0.0, "")  # time until which calls with patience_s=0 fail without a request, and the cause

@@ -6,6 +6,7 @@ Reading a file neither unpickles nor executes any of its content.
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -19,11 +20,22 @@ from hgn.config import NetworkConfig
 from hgn.network.base import ParticleNetwork
 from hgn.network.build import build_network
 from hgn.renamed import REMOVED_CHOICES, current_names, with_step
-from hgn.schema import ConfigError, NonNegative, OrdinarySize, Vector, from_mapping, require, require_bounds, to_mapping
+from hgn.schema import (
+    ConfigError,
+    NonNegative,
+    OrdinarySize,
+    Vector,
+    from_mapping,
+    near_file,
+    near_name,
+    require,
+    require_bounds,
+    to_mapping,
+)
 from hgn.step_config import StepConfig
 from hgn.system.claims import Claims
 from hgn.system.files import make_folder, write_atomically
-from hgn.system.hub import PREFIX, hub_weights
+from hgn.system.hub import hub_weights
 
 FORMAT_VERSION = 1
 SUFFIX = ".safetensors"
@@ -79,15 +91,15 @@ def find_weights(name: str, field: str = "weights") -> Path:
     shipped = shipped_weights()
     if name in shipped:
         return shipped[name]
-    if name.startswith(PREFIX):
-        return hub_weights(name, field)
     path = Path(name)
+    if re.match(r"\w+://|hf(:|//)", name) and not path.exists():  # a mistyped address too, which hub_weights refuses
+        return hub_weights(name, field)
     if path.suffix or len(path.parts) > 1 or path.exists():
         return path
     names = ", ".join(shipped) or "none in this copy"
-    removed = REMOVED_CHOICES["weights"].get(name)
-    remedy = f"; {removed}" if removed else ""
-    raise ConfigError(f"{field} must be a file or the name of shipped weights ({names}), got {name!r}{remedy}")
+    remedy = REMOVED_CHOICES["weights"].get(name) or near_name(name, shipped)
+    require(False, field, f"a file or the name of shipped weights ({names})", name, remedy=remedy)
+    raise AssertionError
 
 
 def load_weights(
@@ -100,7 +112,7 @@ def load_weights(
     """
     if not path.is_file():
         remedy = f"write one with python -m hgn.export checkpoint={path / 'checkpoints' / 'best.ckpt'}"
-        remedy = remedy if path.is_dir() else "write one with python -m hgn.export"
+        remedy = remedy if path.is_dir() else near_file(path) or "write one with python -m hgn.export"
         raise ConfigError(f"{field} must be an existing file, got {path}; {remedy}")
     try:
         with safe_open(path, framework="pt", device="cpu") as file:

@@ -72,9 +72,9 @@ def hub_weights(url: str, field: str = "weights", patience_s: float = _PATIENCE_
 
     Raises ConfigError without such a file, for several, if access is refused, or if the server does not answer.
     """
+    place = HubPlace.parse(url, field)
     import huggingface_hub  # slow to import, and optional
 
-    place = HubPlace.parse(url, field)
     if place.is_dataset:
         raise ConfigError(f"{field} must be of a repository of weights, hf://USER/NAME, got {url!r}")
     api = huggingface_hub.HfApi(endpoint=endpoint(), token=hub_token())

@@ -33,7 +33,7 @@ VALUES = [
     ("datagen", ["colour=1"], "colour is not a known key; known keys: "),
     ("datagen", ["+colour=1"], "colour is not a known key; known keys: scene, mpm, dataset, scenes, out,"),
     ("datagen", ["+dataset.colour=1"], "dataset.colour is not a known key; known keys: folder,"),
-    ("datagen", ["scene=moon"], "In 'datagen': Could not find 'scene/moon' Available options in 'scene':"),
+    ("datagen", ["scene=moon"], "scene must be a file of conf/scene, got 'moon'; did you mean motion?"),
     ("datagen", ["scene=3"], "Config group override must be a string or a list. Got int"),
     ("datagen", ["progress=loud"], "progress must be one of bar, json, off, got 'loud'"),
     ("datagen", ["out=${nowhere}"], "Interpolation key 'nowhere' not found"),
@@ -72,8 +72,36 @@ VALUES = [
         ("train", [f"{key}={value}"], f"{key} must be a file of conf/{key}, or several, got {value}; leave it out for")
         for key, value in (("scene", "[]"), ("scene", "null"), ("dataset", "null"))
     ),
-    ("train", ["++experiment=moon"], "Could not find 'experiment/moon'"),
-    ("train", ["+experiment=moon"], "Could not find 'experiment/moon'"),
+    *(
+        ("train", [f"{plus}experiment=obstacle"], "experiment must be a file of conf/experiment, got 'obstacle'; did y")
+        for plus in ("", "+", "++")
+    ),
+    *(
+        ("train", [f"{key}={name}"], f"{key} must be a file of conf/{key}, got '{name}'; did you mean {meant}?")
+        for key, name, meant in (
+            *(("scene", "obstacle", "obstacles"), ("dataset", "papr", "paper"), ("network", "hgnn", "hgn")),
+            *(("mpm", "defaul", "default"), ("training", "recipes", "recipe")),
+        )
+    ),
+    (
+        "train",
+        ["network.inputs=relativ"],
+        "network.inputs must be one of absolute, relative, local, got 'relativ'; d",
+    ),
+    ("train", ["training.init_weights=mechanic"], "world), got 'mechanic'; did you mean mechanics?"),
+    (
+        "train",
+        ["dataset.folder=hf:/datasets/a/b"],
+        "dataset.folder must be a folder or a URL, got 'hf:/datasets/a/b'",
+    ),
+    ("evaluate", [*EVALUATE, "data=hf//datasets/a/b"], "did you mean hf://datasets/a/b?"),
+    ("evaluate", [*EVALUATE, "data=hf://dataset/a/b"], "must be of a repository of data sets, hf://datasets/USER/NAME"),
+    ("evaluate", [*EVALUATE, "data=htpp://host/a"], "(Protocol not known: htpp); did you mean http?"),
+    *(
+        ("rollout", [*ROLLOUT, f"weights={name}"], "weights must be an address as hf://USER/NAME or hf://datasets/USER")
+        for name in ("hf:/a/b", "hf:a/b", "hf//a/b", "hff://a/b")
+    ),
+    ("rollout", [*ROLLOUT, "weights=weight.safetensors"], "got weight.safetensors; did you mean weights.safetensors?"),
     ("export", ["checkpoint=none.ckpt", "out=x"], "checkpoint must be an existing file, got none.ckpt; hgn.train"),
     ("export", ["checkpoint=.", "out=x"], "checkpoint must be an existing file, got .; hgn.train writes one"),
     ("export", ["checkpoint=run", "out=x"], "checkpoint must be an existing file, got run; take run/checkpoints/"),
@@ -139,7 +167,12 @@ RATE, SNOW = of("weights", frame_rate_hz=30.0), of("weights", materials=("snow",
 RATES = "data frame_rate_hz must be the weights' 30.0, got 60.0; take a data set or weights of the same"
 # command, arguments, fault, message
 FILES = [
-    ("rollout", ROLLOUT, of("edit_scene", "0.8, 0.5]", "0.45, 0.5]"), "particles inside obstacle_0_cone; move or shr"),
+    (
+        "rollout",
+        ROLLOUT,
+        of("edit_scene", "0.8, 0.5]", "0.45, 0.5]"),
+        "particles inside obstacle_0_cone",
+    ),
     ("rollout", ROLLOUT, MESH, "obstacles[0].mesh must"),
     ("evaluate", EVALUATE, of("damage", "validation", truncate), " bytes, got "),
     ("evaluate", EVALUATE, of("damage", "validation", alter), ": it was altered; delete it and run the generator agai"),
