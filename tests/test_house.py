@@ -16,10 +16,10 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 33_151,
+    "hgn": 33_204,
     "datagen": 9_041,
     "tools": 6_213,
-    "tests": 32_146,
+    "tests": 32_245,
 }
 SETTINGS = 240  # fields of the dataclasses behind the commands, *Config
 

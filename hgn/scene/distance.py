@@ -77,6 +77,12 @@ def contains(point_P3: np.ndarray, obstacle: Obstacle) -> np.ndarray:
     return inside
 
 
+def extent(point_P3: np.ndarray) -> str:
+    """Returns the smallest and largest coordinate of points along each axis, as text."""
+    ends = zip("xyz", point_P3.min(axis=0), point_P3.max(axis=0), strict=True)
+    return ", ".join(f"{axis} {low:.3g} to {high:.3g}" for axis, low, high in ends)
+
+
 def fraction_inside(position_N3: np.ndarray, obstacles: Sequence[Obstacle]) -> float:
     """Returns the fraction of particles inside closed obstacles."""
     inside_N = np.zeros(len(position_N3), bool)

@@ -6,7 +6,6 @@ See conf/example/ for examples. Lengths are in domain units, angles in degrees, 
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import math
 import re
 from collections.abc import Mapping, Sequence
@@ -18,7 +17,7 @@ import numpy as np
 
 from hgn.config import OBSTACLE_SHAPES, MpmConfig, config_directory
 from hgn.scene.barrier import barrier_pieces
-from hgn.scene.distance import contains
+from hgn.scene.distance import contains, extent
 from hgn.scene.emission import Face
 from hgn.scene.group import WALL_CELLS, Region, fill, particle_count, region_of
 from hgn.scene.material import MATERIAL_PARAMETERS, MATERIALS, material_index
@@ -37,6 +36,7 @@ from hgn.schema import (
     Vector,
     from_mapping,
     known_keys,
+    near_file,
     require,
     require_bounds,
     to_mapping,
@@ -249,9 +249,7 @@ def read_mapping(path: str | Path) -> dict[str, Any]:
     """Reads the YAML of a scene file. Raises: ConfigError, starting with the path."""
     path = Path(path)
     if not path.is_file():
-        names = [each.name for each in path.parent.glob("*.y*ml")]
-        close = [f"; did you mean {name}?" for name in difflib.get_close_matches(path.name, names, n=1, cutoff=0.8)]
-        raise ConfigError(f"scene must be an existing YAML file, got {path}" + "".join(close))
+        raise ConfigError(f"scene must be an existing YAML file, got {path}; {near_file(path)}".removesuffix("; "))
     mapping = read_yaml(path)
     require(isinstance(mapping, dict), f"{path}: the file", "a mapping of keys to values, such as groups", mapping)
     return dict(mapping)
@@ -295,7 +293,7 @@ def notes_on_files(scene: Scene) -> list[str]:
         begin = _at_start(obstacle)
         low_3, high_3 = begin.vertex_V3.min(axis=0), begin.vertex_V3.max(axis=0)
         around = (low_3 <= 0).all() and (high_3 >= scene.domain_size).all()  # if it moves, it stays around
-        place = ", ".join(f"{'xyz'[i]} {low_3[i]:.3g} to {high_3[i]:.3g}" for i in range(3))
+        place = extent(begin.vertex_V3)
         if obstacle.motion is None and ((low_3 > scene.domain_size) | (high_3 < 0)).any():
             notes.append(f"outside the domain, out of reach of particles: {name} ({place}); see scale and position")
         elif (obstacle.motion is None or around) and not _reaches(begin, scene.domain_size, scene.cell_size):
@@ -350,23 +348,14 @@ def _build(file: SceneFile, folder: Path) -> Scene:
         region, name = entry.region, f"groups[{index}] ({entry.shape} of {entry.material})"
         position_N3 = fill(region, count, np.random.Generator(np.random.PCG64([file.seed, index])))
         _require_inside_walls(name, np.array(region.centre), region.reach, position_N3, file)
-        for obstacle in map(_at_start, obstacles):
-            inside = int(contains(position_N3, obstacle).sum())
-            if inside:
-                unit = "" if _reaches(obstacle, file.domain_size, file.cell_size) else f", or its scale ({MILLIMETRES})"
-                raise ConfigError(
-                    f"{name} must be clear of closed obstacles, got {inside} of {count} particles inside "
-                    f"{obstacle.name}; move or shrink the group or the obstacle{unit}"
-                )
+        _require_clear(name, position_N3, obstacles, file)
         positions.append(position_N3)
     for index, (emitter, count) in enumerate(zip(file.emitters, entering, strict=True)):
         name = f"emitters[{index}] ({emitter.shape} of {emitter.material})"
         rng = np.random.Generator(np.random.PCG64([file.seed, EMITTER_STREAM, index]))
         position_N3, time_N = emitter.face.draw(emitter.start, emitter.stop, count, rng)
         _require_inside_walls(name, np.array(emitter.position), emitter.face.reach, position_N3, file)
-        for obstacle in map(_at_start, obstacles):
-            if contains(np.concatenate([position_N3, np.array([emitter.position], np.float32)]), obstacle).any():
-                raise ConfigError(f"{name} must be clear of closed obstacles, got it inside {obstacle.name}; move it")
+        _require_clear(name, np.vstack([position_N3, np.array(emitter.position, np.float32)]), obstacles, file)
         positions.append(position_N3)
         times.append(time_N)
     entries: list[GroupEntry | EmitterEntry] = [*file.groups, *file.emitters]
@@ -434,6 +423,17 @@ def _obstacle(entry: ObstacleEntry, index: int, folder: Path) -> tuple[Obstacle,
         )
     motion = entry.motion()
     return tuple(dataclasses.replace(body, friction=entry.friction, motion=motion) for body in bodies)
+
+
+def _require_clear(name: str, position_N3: np.ndarray, obstacles: Sequence[Obstacle], file: SceneFile) -> None:
+    for obstacle in map(_at_start, obstacles):
+        if inside := int(contains(position_N3, obstacle).sum()):
+            unit = "" if _reaches(obstacle, file.domain_size, file.cell_size) else f", or its scale ({MILLIMETRES})"
+            extents = f"particles: {extent(position_N3)}; obstacle: {extent(obstacle.vertex_V3)}"
+            raise ConfigError(
+                f"{name} must be clear of closed obstacles, got {inside} of {len(position_N3)} particles inside "
+                f"{obstacle.name} ({extents}); move or shrink the particles or the obstacle{unit}"
+            )
 
 
 def _require_inside_walls(

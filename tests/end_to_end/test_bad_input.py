@@ -171,7 +171,7 @@ FILES = [
         "rollout",
         ROLLOUT,
         of("edit_scene", "0.8, 0.5]", "0.45, 0.5]"),
-        "particles inside obstacle_0_cone",
+        " inside obstacle_0_cone (particles: x 0.4",
     ),
     ("rollout", ROLLOUT, MESH, "obstacles[0].mesh must"),
     ("evaluate", EVALUATE, of("damage", "validation", truncate), " bytes, got "),
