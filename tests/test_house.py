@@ -19,7 +19,7 @@ LINES = {  # of Python, in tracked files
     "hgn": 33_204,
     "datagen": 9_041,
     "tools": 6_213,
-    "tests": 32_245,
+    "tests": 32_244,
 }
 SETTINGS = 240  # fields of the dataclasses behind the commands, *Config
 

@@ -37,13 +37,12 @@ class ThreadProcess:
         try:
             with local_workers._errors_sent(send):
                 target(connection, send, *arguments)
-            connection.close()
         except KilledError:
             self.exitcode = -signal.SIGKILL
-            with socket.socket(fileno=os.dup(connection.fileno())) as end:
-                end.shutdown(socket.SHUT_RDWR)  # also for the worker's other threads, which may be reading
         except SystemExit:
-            connection.close()  # its pool has gone
+            pass  # its pool has gone
+        with socket.socket(fileno=os.dup(connection.fileno())) as end:
+            end.shutdown(socket.SHUT_RDWR)  # not closed, because the worker's other threads may be reading
 
     def join(self, timeout=None):
         self._thread.join(timeout)
