@@ -5,8 +5,8 @@ default parameters. If all are 0, they are not computed; the result is the same.
 
 | columns | value | only with |
 |---|---|---|
-| 2 | friction of the particle's obstacle cell, and of the first one on its path | friction, obstacle_features |
-| 3 | for each axis: friction of the two walls perpendicular to it, times the nearness of the nearer one | friction |
+| 2 | friction of the obstacle cell with the particle, and of the first one on its path | friction, obstacle_features |
+| 3 | for each axis: common friction of the two walls across it, times nearness of the nearer wall | friction |
 | 1 for each of INPUT_PARAMETERS | `scaled_parameters`, 0 for parameters of other materials | parameters |
 | 9 | deformation of elastic bodies (hgn.network.elastic) | elastic |
 
