@@ -208,7 +208,7 @@ def _concave(vertex_V3: np.ndarray, faces: list[np.ndarray]) -> list[tuple[np.nd
         inward_MK = np.einsum("mka,ma->mk", turn_MK3, normal_M3)
         size_M = (normal_M3**2).sum(axis=1)
         bad_M = (inward_MK < -FLAT * size_M[:, None]).any(axis=1)
-        bad_M |= size_M < FLAT**2 * (turn_MK3**2).sum(axis=2).max(axis=1)  # equal loops of both orientations
+        bad_M |= size_M < FLAT**2 * (turn_MK3**2).sum(axis=2).max(axis=1)  # no area: opposite loops cancel
         if size > 4:  # more than one loop of the same orientation: exterior angles of more than 360 degrees
             ahead_MK = (np.roll(edge_MK3, 1, axis=1) * edge_MK3).sum(axis=2) * np.sqrt(size_M)[:, None]
             bad_M |= np.arctan2(inward_MK, ahead_MK).sum(axis=1) > 3 * np.pi
@@ -240,7 +240,7 @@ def _unit(vector_M3: np.ndarray) -> np.ndarray:
 def _ears(point_MK2: np.ndarray, number_M: np.ndarray) -> np.ndarray:
     """Returns the triangles of polygons, corners int [M, K - 2, 3].
 
-    Cuts off one corner after the other whose triangle (an ear) contains no other corner.
+    Cuts off corners one by one. The triangle of such a corner (an ear) contains no other corner.
     Corners on a straight line become triangles without area, so that neighbouring faces still share their edges.
     """
     count, size = point_MK2.shape[:2]
@@ -251,7 +251,7 @@ def _ears(point_MK2: np.ndarray, number_M: np.ndarray) -> np.ndarray:
     crossing_M = ~(area_M > 0) | (apart_MKK & apart_MKK.transpose(0, 2, 1)).any(axis=(1, 2))
     _require_none(number_M[crossing_M], "cross")
     rest_ML, ears = np.tile(np.arange(size), (count, 1)), []
-    row_M, blocker_MK = np.arange(count), np.full((count, size), -1)  # a corner in each corner's triangle; -1: unknown
+    row_M, blocker_MK = np.arange(count), np.full((count, size), -1)  # a corner in each one's triangle; -1: none known
     for left in range(size, 3, -1):
         point_ML2 = np.take_along_axis(point_MK2, rest_ML[:, :, None], axis=1)
         corner_3ML2 = np.stack([np.roll(point_ML2, 1, axis=1), point_ML2, np.roll(point_ML2, -1, axis=1)])

@@ -37,7 +37,10 @@ class TritonScenes:
     def __init__(
         self, network: HierarchicalGraphNetwork, training: TrainingConfig, obstacle_cell_size: float, precision: str
     ) -> None:
-        """Simulations use the parameters in `values`; before the first, those of `network` check the kernels."""
+        """Simulations use the parameters in `values`.
+
+        Before the first simulation the kernels are compared with PyTorch, both with the parameters of `network`.
+        """
         self._network, self._training, self._precision = network, training, precision
         self._obstacle_cell_size = obstacle_cell_size
         self._history = network.config.velocity_history
