@@ -16,7 +16,7 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 33_204,
+    "hgn": 33_207,
     "datagen": 9_041,
     "tools": 6_213,
     "tests": 32_244,
