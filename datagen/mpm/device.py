@@ -77,7 +77,7 @@ def initialise(device: str = "auto", cpu_threads: int | None = None) -> Device:
             default_fp=ti.f32,
             default_ip=ti.i32,
             fast_math=False,  # it would reorder sums depending on nearby code, and remove tests for NaN
-            # this takes nine tenths of the time to compile, and LLVM does the same again
+            # Taichi's optimisation takes nine tenths of the compile time, and LLVM repeats it
             cfg_optimization=False,
             opt_level=0,  # elimination of common subexpressions
             log_level=ti.ERROR,

@@ -70,7 +70,7 @@ def _particle_to_grid(p: ti.i32, copy: ti.i32, scene: ti.i32, step: ti.f32, arra
         C = arrays.affine[p]
         stretch = ti.Matrix.zero(ti.f32, 3, 3)
         if begins == 0.0:
-            stretch = arrays.affine[p]  # contains it until the interval ends
+            stretch = arrays.affine[p]  # until the interval ends, the array of C contains the stretch
             v_now, C_now = interpolate(
                 arrays.position[p], scene * arrays.shape[SHAPE.scene_blocks] * BLOCK_NODES, arrays, inverse_dx
             )

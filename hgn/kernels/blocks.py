@@ -140,7 +140,7 @@ def once_both(x, y, never):
 
 @triton.jit
 def nothing_to_do(count, BLOCK: tl.constexpr):
-    """Returns whether a program has no rows and may end. The first program has to wait for the previous kernel."""
+    """Returns whether a program has no rows and may end. The first one never may: it waits for the previous kernel."""
     return (tl.program_id(0) * BLOCK >= count) & (tl.program_id(0) > 0)
 
 

@@ -16,7 +16,7 @@ def captured(parts: Sequence[Launches], warm_up: Launches) -> list[torch.cuda.CU
 
     cuBLAS keeps 32 MiB for each stream in which it ran. PyTorch frees this memory of a capture's stream at the end of a
     graph captured there, even if another graph reads it. The warm-up therefore has its own stream. cuBLAS's memory in
-    the capture's stream then belongs to the graph and lives as long.
+    the capture's stream then belongs to the graph and lives as long as the graph.
     """
     device = torch.cuda.current_device()
     if device not in _streams:

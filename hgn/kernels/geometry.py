@@ -22,8 +22,8 @@ def split_slot(local, ny, nz, stride):
 
 @triton.jit
 def most_around(disturbed, felt, part: tl.constexpr, neighbour, cell, there, capacity):
-    """Writes a maximum from 0 to 1 to a column of `felt` [C, 2]: over a coarsest cell and the cells across its faces.
-    It is of the same column of `disturbed` [C, 2], in units of FULLY."""
+    """Writes to column `part` of `felt` [C, 2] the maximum of column `part` of `disturbed` [C, 2], divided by FULLY,
+    over a coarsest cell and the cells across its faces."""
     most = tl.load(disturbed + cell * 2 + part, mask=there, other=0)
     for slot in tl.static_range(6):
         other = tl.load(neighbour + slot * capacity + cell, mask=there, other=-1)
@@ -61,7 +61,7 @@ def middles_around(base, gate, spot, geometry, LEVELS: tl.constexpr):
 
 @triton.jit
 def raise_disturbed(disturbed, cell, own):
-    """Raises the first of two numbers of cells [N, 8] in `disturbed` to the maximum over the particles [N] in them."""
+    """Raises the first of two numbers of cells [N, 8] in `disturbed` to at least the particles' own [N] times FULLY."""
     own = (own * FULLY).to(tl.int32)[:, None]
     # Most cells already have this value from another particle.
     mask = (cell >= 0) & (tl.load(disturbed + cell * 2, mask=cell >= 0, other=FULLY) < own)

@@ -1,7 +1,7 @@
 """Computes obstacle normals and friction at a place from a scene's hash table on the device.
 
 The obstacle table has a row of int64 numbers for each scene: addresses of its hash buckets (0: no obstacle), keys and
-cell values, the mask of the buckets, and the symmetry under which it is seen (hgn.scene.symmetry.Symmetry.code).
+cell values, the mask of the buckets, and the symmetry of the image of the scene (hgn.scene.symmetry.Symmetry.code).
 """
 
 import triton

@@ -43,7 +43,7 @@ def plus(vector, place, live, sign: tl.constexpr):
 
 @triton.jit
 def undone(pose, place, live, ROTATION: tl.constexpr, AT: tl.constexpr):
-    """Returns places in the obstacles' frames (Poses.undo): of this frame with columns 0 and PLACE of `pose`."""
+    """Returns places in the obstacles' frames (Poses.undo), with columns 0 and PLACE of `pose` those of this frame."""
     return plus(turned(pose + ROTATION, plus(place, pose + AT, live, -1), live, True), pose + PIVOT, live, 1)
 
 

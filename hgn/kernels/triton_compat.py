@@ -82,7 +82,7 @@ def noted_launches() -> Iterator[Launches]:
 def preload(function: Any, specialization: str) -> Any:
     """Compiles a kernel for a noted specialisation.
 
-    Triton's own function mistakes a constant for a type if it has a type's name, as the precision "fp16" has.
+    Triton's own function mistakes a constant for a type if the constant is a type's name, as the precision "fp16" is.
     """
     with mock.patch.object(tl.dtype, "is_dtype", lambda name: False):
         return function.preload(specialization)

@@ -111,7 +111,7 @@ def edge_forward(
     # The vectors are loaded once. In the loop each load would be waited for again.
     second_bias = tl.load(values + second_bias_at + column)
     norm_weight, norm_bias = tl.load(values + norm_weight_at + column), tl.load(values + norm_bias_at + column)
-    # If a product with it is exact, a matrix copies a cell's row to its edges. Spare columns add the sides' rows.
+    # A matrix copies a cell's row to its edges, if the product is exact. Its spare columns add the sides' rows.
     BY_PRODUCT: tl.constexpr = PRECISION != "tf32"
     if BY_PRODUCT:
         receiver = chosen_rows(ROWS, SLOTS, SUMS)

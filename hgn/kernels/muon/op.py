@@ -13,12 +13,12 @@ WARPS = 8
 
 def direction_dtype(device: torch.device) -> torch.dtype:
     """Returns the type of the directions, bfloat16 on a GPU. Products are summed in float32.
-    The directions are orthogonal only to a hundredth in any type, because the iterations are."""
+    In any type the iterations make the directions orthogonal only to about 0.01."""
     return torch.float32 if device.type == "cpu" else torch.bfloat16
 
 
 class SquareBlocks:
-    """Holds the places of the weights that Muon steps in the packed layout. A block's rows are equally far apart."""
+    """Holds the places, in the packed layout, of the weights that Muon updates. A block's rows are equally spaced."""
 
     def __init__(self, network: ParticleNetwork, index: torch.Tensor, device: torch.device) -> None:
         """`index` maps packed elements to the concatenated parameters, -1 for padding."""
@@ -33,7 +33,7 @@ class SquareBlocks:
         assert (packed_KWW == row_KW[:, :, None] + column_W).all()
         member = torch.zeros(len(index), dtype=torch.int8)
         member[packed_KWW.flatten()] = 1
-        self.member = member.to(device)  # whether each element of the packed buffers is stepped here
+        self.member = member.to(device)  # 1 for elements of the packed buffers that Muon updates
         self._direction_KWW = torch.zeros(block_KWW.shape, dtype=direction_dtype(device), device=device)
 
     def step(

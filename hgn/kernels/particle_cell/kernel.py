@@ -108,7 +108,7 @@ def particle_cell_forward(
     # The vectors are loaded once. In the loop each load would be waited for again.
     second_bias = tl.load(values + second_bias_at + column)
     norm_weight, norm_bias = tl.load(values + norm_weight_at + column), tl.load(values + norm_bias_at + column)
-    # If a product with it is exact, a matrix copies a particle's row to its pairs. Spare columns add the bits' rows.
+    # A matrix copies a particle's row to its pairs, if the product is exact. Its spare columns add the bits' rows.
     BY_PRODUCT: tl.constexpr = PRECISION != "tf32"
     SIGN: tl.constexpr = 1 if TO_CELL else -1
     if BY_PRODUCT:

@@ -1,7 +1,7 @@
-"""Computes all weight and bias gradients: products A^T B over rows and column sums of A, cut into chunks of rows.
+"""Computes weight and bias gradients: products A^T B over rows, and column sums of A, divided into chunks of rows.
 
-The job table has a row for each product: offsets of A, B and the result, index of the row count, widths of A and B,
-rows for each counted one, offset of the column sums (-1: none). Offsets count elements.
+The job table has a row for each product: offsets of A, B and the result, index in `counts`, widths of A and B, number
+of rows per counted particle or cell, offset of the column sums (-1: none). Offsets count elements.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ def weight_gradient(
     TILE: tl.constexpr, CHUNK: tl.constexpr, STEP: tl.constexpr, PRECISION: tl.constexpr,
     PIPELINED: tl.constexpr,
 ):  # fmt: skip
-    """Adds the part of chunk i of A^T B [width A, width B] to totals in program i. Widths are at most TILE.
+    """Adds, in program i, chunk i's part of its job's A^T B [width A, width B] to `totals`. Widths are at most TILE.
 
     PIPELINED: the compiler copies tiles to shared memory two ahead. The interpreter cannot do this.
 
