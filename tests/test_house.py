@@ -16,10 +16,10 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 33_207,
+    "hgn": 33_211,
     "datagen": 9_041,
     "tools": 6_213,
-    "tests": 32_244,
+    "tests": 32_266,
 }
 SETTINGS = 240  # fields of the dataclasses behind the commands, *Config
 

@@ -63,6 +63,7 @@ class RankWatch(Callback):
         self._folder = run / ".ranks"
         self._ended = threading.Event()
         self._writing = threading.Lock()
+        self._updates_ended = False  # then the last checkpoint is written, which may take longer than GRACE_S
         self.lost: str | None = None  # description of the ranks that closed their connections
         self._counts: dict[int, tuple[str, float]] = {}  # last count of each other rank, and the time of its change
 
@@ -81,6 +82,9 @@ class RankWatch(Callback):
         threading.Thread(target=self._watch, args=(pl_module,), name="ranks", daemon=True).start()
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        self._updates_ended = True
+
+    def on_fit_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         if self._counts and not self._ended.is_set():
             self._stop()
             with contextlib.suppress(OSError):
@@ -127,7 +131,7 @@ class RankWatch(Callback):
                     f"ranks {silent} must answer within {SILENCE_S:.0f} s, got nothing; run the same command again",
                     EXIT_MACHINE,
                 )
-            if number and time.monotonic() > deadline and not self._ended.is_set():
+            if number and time.monotonic() > deadline and not self._ended.is_set() and not self._updates_ended:
                 if module.update == update:
                     self._end(f"the other ranks must answer after {signal.Signals(number).name}", 128 + number)
                 deadline, update = time.monotonic() + GRACE_S, module.update

@@ -1,7 +1,10 @@
 """Tests of the description of a rank that ended, as the other ranks give it."""
 
+import os
+import signal
 import threading
 import time
+from queue import Queue
 from types import SimpleNamespace
 
 import pytest
@@ -30,13 +33,16 @@ class Rank(watch.RankWatch):
 
     def start(self, module):
         self.on_train_start(self.trainer, module)
+        self.wake = self.wakes[-1]
 
 
 @pytest.fixture
 def ranks(monkeypatch, tmp_path):
     monkeypatch.setattr(watch, "BEAT_S", BEAT_S)
     monkeypatch.setattr(watch, "TrainingModule", object)
-    monkeypatch.setattr(watch.signal, "set_wakeup_fd", lambda *_, **__: -1)
+    wakes: list[int] = []
+    monkeypatch.setattr(watch.signal, "set_wakeup_fd", lambda wake, **__: wakes.append(wake))
+    monkeypatch.setattr(Rank, "wakes", wakes, raising=False)
     both = [Rank(tmp_path, rank) for rank in (0, 1)]
     yield both
     for rank in both:
@@ -92,4 +98,20 @@ def test_no_file_remains_after_the_training(ranks, tmp_path):
         rank.start(module)
     for rank in ranks:
         rank.on_train_end(rank.trainer, module)
+        rank.on_fit_end(rank.trainer, module)
     assert not list(tmp_path.iterdir())
+
+
+def test_a_rank_stopped_after_the_last_update_is_named(monkeypatch, ranks):
+    """While the others wait for it to write its part of the last checkpoint, which has no time limit after SIGTERM."""
+    monkeypatch.setattr(watch, "SILENCE_S", 4 * BEAT_S)
+    monkeypatch.setattr(watch, "GRACE_S", 0.0)
+    ends = Queue()
+    monkeypatch.setattr(Rank, "_end", lambda rank, text, code: (rank._ended.set(), ends.put((rank, text, code))))
+    for rank in ranks:
+        rank.start(SimpleNamespace(update=1))
+        rank.on_train_end(rank.trainer, None)
+    ranks[1].killed = True
+    os.write(ranks[0].wake, bytes([signal.SIGTERM]))
+    rank, text, code = ends.get(timeout=60)
+    assert rank is ranks[0] and text.startswith("ranks [1] must answer within") and code == watch.EXIT_MACHINE
