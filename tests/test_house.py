@@ -17,9 +17,9 @@ PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
     "hgn": 33_211,
-    "datagen": 9_041,
+    "datagen": 9_042,
     "tools": 6_213,
-    "tests": 32_266,
+    "tests": 32_270,
 }
 SETTINGS = 240  # fields of the dataclasses behind the commands, *Config
 

@@ -51,7 +51,8 @@ def plan_cluster(config: DatagenConfig, nodes: Sequence[Mapping[str, float]], ea
     workers, launch = config.dataset.workers, config.mpm.scenes_per_launch
     gpus = int(sum(node.get("GPU", 0) for node in nodes))
     if config.mpm.device == "cuda" or (config.mpm.device == "auto" and gpus):
-        memory = min((node["memory"] for node in nodes if "memory" in node), default=math.inf)
+        with_gpus = [node for node in nodes if node.get("GPU", 0) >= 1]
+        memory = min((node.get("memory", math.inf) / int(node["GPU"]) for node in with_gpus), default=math.inf)
         launch = launch or gpu_scenes_per_launch(config, memory)
         solvers, threads, first = workers or max(1, gpus), None, gpu_first_launch(launch, early)
     else:

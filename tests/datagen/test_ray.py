@@ -11,7 +11,7 @@ from processes import BALLISTIC_PATH, PATIENCE_S
 
 from datagen.pool.ray_workers import RayWorkerFactory
 from datagen.pool.worker import Backend
-from datagen.pool.worker_plan import WorkerPlan, plan_cluster
+from datagen.pool.worker_plan import WorkerPlan, plan_cluster, plan_workers
 from hgn.config import DatagenConfig, DatasetConfig, MpmConfig
 from hgn.schema import ConfigError
 
@@ -50,5 +50,9 @@ def test_cluster_plans():
     assert plan_cluster(default, [{"CPU": 4.0}, {"CPU": 3.0}, {}]) == WorkerPlan(3, 2, 3, 1, 1)
     assert plan_cluster(default, [{"CPU": 1.0}, {"CPU": 8.0}]) == WorkerPlan(9, 1, 9, 1, 1)
     assert plan_cluster(default, [{"CPU": 8.0, "GPU": 2.0}] * 2) == WorkerPlan(4, None, 4, 416, 416)
+    long = DatagenConfig(dataset=DatasetConfig(frames=3000))  # a node's solvers share its memory, as on one machine
+    node = {"CPU": 16.0, "GPU": 8.0, "memory": 64e9}
+    alone = plan_workers(long, tuple("01234567"), 16, 64e9)
+    assert plan_cluster(long, [{"CPU": 4.0, "memory": 4e9}, node]).scenes_per_launch == alone.scenes_per_launch < 416
     few = DatagenConfig(dataset=DatasetConfig(workers=1), mpm=MpmConfig(device="cpu"))
     assert plan_cluster(few, [{"CPU": 8.0, "GPU": 2.0}]) == WorkerPlan(1, 2, 1, 1, 1)
