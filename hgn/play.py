@@ -22,14 +22,12 @@ from hgn.system.files import write_atomically
 if TYPE_CHECKING:
     from hgn.runtime.simulator import Simulator
 
-CPU_WEIGHTS = "obstacles_small"  # two steps in a block (M = 2), because a viewer waits for each frame
-
 
 @dataclass(frozen=True)
 class PlayConfig(SimulatorConfig):
     """`python -m hgn.play`: a scene in the browser, live, or a rollout file."""
 
-    weights: str | None = None  # file or name of shipped weights; null: mechanics on a GPU, else obstacles_small
+    weights: str = DEFAULT_WEIGHTS  # a file of python -m hgn.export, or the name of shipped weights
     scene: str = "play"  # a scene file, or the name of one in conf/example
     rollout: str | None = None  # file of hgn.rollout, which is shown instead of a scene
     html: FileName | None = None  # with rollout: file for a page that plays it without a server
@@ -74,18 +72,17 @@ def play_page(config: PlayConfig) -> Any:
     from hgn.viewer.session import PlaySession
 
     place = choose_device(config.device)
-    name = config.weights or (CPU_WEIGHTS if place.type == "cpu" else DEFAULT_WEIGHTS)
 
     def load(weights: str) -> Simulator:
         return Simulator.load(weights, config.device, config.backend, config.precision)
 
-    simulator = load(name)
+    simulator = load(config.weights)
     print(simulator.backend.note, file=sys.stderr)
     for note in notes_on_files(scene):
         print(note, file=sys.stderr)
     most = config.particles or max(8_000 if place.type == "cpu" else 40_000, scene.particle_count)
-    session = PlaySession(simulator, scene, path.parent, most, config.keep_mb << 20, name)
-    names = [name, *(shipped for shipped in shipped_weights() if shipped != name)]
+    session = PlaySession(simulator, scene, path.parent, most, config.keep_mb << 20, config.weights)
+    names = [config.weights, *(shipped for shipped in shipped_weights() if shipped != config.weights)]
     return PlayPage(session, names, load, config.host, config.port)
 
 

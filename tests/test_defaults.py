@@ -4,7 +4,6 @@ import inspect
 import sys
 from collections.abc import Mapping
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -73,23 +72,8 @@ def test_all_take_the_same_weights():
         if isinstance(weights, str) and weights != "???":
             values[file.stem] = weights
     values["Simulator.load"] = inspect.signature(Simulator.load).parameters["weights"].default
-    names = ("evaluate", "rollout", "stability_network", "Simulator.load")
+    names = ("evaluate", "play", "rollout", "stability_network", "Simulator.load")
     assert values == dict.fromkeys(names, DEFAULT_WEIGHTS)
-
-
-@pytest.mark.parametrize(("device", "expected"), [("cuda", DEFAULT_WEIGHTS), ("cpu", "obstacles_small")])
-def test_weights_of_play(monkeypatch, device, expected):
-    """A page takes the weights of the other commands on a GPU, a smaller network on a CPU, and its help says so."""
-
-    def load(weights, *_):
-        raise LookupError(weights)
-
-    monkeypatch.setattr("hgn.system.device.choose_device", lambda _: SimpleNamespace(type=device))
-    monkeypatch.setattr("hgn.runtime.simulator.Simulator", SimpleNamespace(load=load))
-    for given, taken in ((None, expected), ("obstacles", "obstacles")):
-        with pytest.raises(LookupError, match=f"^{taken}$"):
-            play.play_page(play.PlayConfig(weights=given))
-    assert expected in field_comments(play.PlayConfig)["weights"]
 
 
 @pytest.mark.parametrize(("scene", "message"), [("funel", "did you mean funnel"), ("my.yaml", "existing YAML file")])

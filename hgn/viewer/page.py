@@ -42,10 +42,10 @@ TURN_DEGREES = 360.0  # rotation for a drag across the whole window
 MAXIMUM_UPLOAD_BYTES = 64 << 20
 MAXIMUM_ACTIONS = 64  # actions that may wait for the next frame; further ones are dropped
 ABOUT = {
-    "mechanics": "any motion and gravity, exact flight; slower on a CPU",
+    "mechanics": "any motion and gravity, exact flight",
     "obstacles": "scenes that start at rest, gravity 9.8 downwards",
     "world": "pools, dams, slopes, small and large bodies; creeps over thousands of frames",
-    "obstacles_small": "as obstacles, in two thirds of the time, with larger errors",
+    "obstacles_small": "fast on a CPU, as obstacles with larger errors: some particles float or pass obstacles",
 }
 HELP = """
 **Shift + drag** on the floor pours, **Shift + click** drops a ball.

@@ -203,7 +203,7 @@ def test_every_command_is_listed():
         section = text.split(f"## {cls.__name__}\n")[1].split("\n## ")[0]
         assert re.findall(r"^\| `(\w+)`", section, re.MULTILINE) == [field.name for field in dataclasses.fields(cls)]
     assert "| `seed` | `NonNegative[int]` | `0` |" in text and "domain units per frame |" in text
-    assert reference_pages.commands_page().count(f"| `weights` | `str` | `'{config.DEFAULT_WEIGHTS}'` |") == 3
+    assert reference_pages.commands_page().count(f"| `weights` | `str` | `'{config.DEFAULT_WEIGHTS}'` |") == 4
 
 
 def test_scene_files_are_described_whole():
