@@ -77,17 +77,6 @@ class Motion:
         speed_TP = np.linalg.norm(np.diff(place_TP3, axis=0), axis=2) / np.diff(self.time_T)[:, None]
         return float(speed_TP.max(initial=0.0))
 
-    def rates(self, begin: float, end: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Returns mean angular velocity, rad/s [3], and mean velocity [3] of the pivot between two times.
-
-        The third result is the pivot's position [3] at the first time.
-        """
-        rotation, translation = self.pose(begin)
-        later_rotation, later_translation = self.pose(end)
-        span = end - begin
-        turn = turning(later_rotation @ rotation.T) / span
-        return turn, (later_translation - translation) / span, np.asarray(self.pivot) + translation
-
 
 AT_REST = Motion.of_frames([(0.0, (0.0, 0.0, 0.0))], (0.0, 0.0, 0.0))
 

@@ -14,7 +14,7 @@ from datagen.mpm.device import initialise
 from datagen.mpm.grid_launch import GridLaunch
 from datagen.mpm.layout import BLOCK_NODES, KEY, STATE, VALUE
 from datagen.mpm.mls_mpm import Integers, Scalars, Vectors
-from hgn.scene.motion import Motion
+from hgn.scene.motion import Motion, turning
 from hgn.scene.rotation import euler_rotation
 from hgn.scene.scene import Obstacle
 from hgn.scene.shapes import shape_obstacle
@@ -113,7 +113,8 @@ def test_poses_follow_the_keyframes():
         place, axes = state[STATE.end : STATE.end + 3], state[STATE.end + 3 : STATE.turn].reshape(3, 3)
         own = (corner - 0.5) / CELL @ body.key_TK[0, KEY.axes : KEY.turn].reshape(3, 3).T  # not turned at first
         assert np.abs(place + own @ axes - motion.place(corner, frame / 60) / CELL).max() < 1e-4
-        turn, velocity, _ = motion.rates(frame / 60 - 2e-4, frame / 60 - 1e-4)
+        (before, start), (after, end) = (motion.pose(frame / 60 - span) for span in (2e-4, 1e-4))
+        turn, velocity = turning(after @ before.T) / 1e-4, (end - start) / 1e-4
         assert np.allclose(state[STATE.turn : STATE.turn + 3], turn, atol=1e-3)
         assert np.allclose(state[STATE.velocity : STATE.velocity + 3], velocity / CELL, atol=1e-3)
     assert body.obstacle == 0 and scene.moves

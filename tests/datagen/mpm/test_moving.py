@@ -124,7 +124,7 @@ def test_paddle():
 
 
 def test_poses_between_keyframes():
-    """Translation is linear, turning constant; before and after the obstacle stands. Rates are those of the poses."""
+    """Translation is linear, turning constant; before and after the obstacle stands."""
     half = euler_rotation((0, 90, 0))
     motion = Motion(np.array([1.0, 2.0]), np.array([[0.0, 0, 0], [2, 0, 0]]), np.stack([np.eye(3), half]), (1, 0, 0))
     point = np.array([[2.0, 0, 0]])
@@ -132,8 +132,6 @@ def test_poses_between_keyframes():
         moved = np.array([1 + 2 * share, 0, 0])
         expected = rotate(point - [1, 0, 0], euler_rotation((0, 90 * share, 0))) + moved
         assert np.allclose(motion.place(point, time), expected)
-    turn, velocity, pivot = motion.rates(1.25, 1.75)
-    assert np.allclose(turn, [0, np.pi / 2, 0]) and np.allclose(velocity, [2, 0, 0]) and np.allclose(pivot, [1.5, 0, 0])
     for turn in ([0, 0, 0], [1e-9, 0, 0], [0.3, -2, 1], [np.pi, 0, 0]):
         assert np.allclose(turning(turned(np.array(turn))), turn, atol=1e-8)
 
