@@ -138,8 +138,8 @@ class Pool:
     def _next_task(self) -> SceneTask | GridTask | None:
         """Returns a maker's next task, or None: a scene of the next launch, else of later launches, else a grid.
 
-        At most two full launches per solver are made ahead. Once a solver simulates a scene, its grid precedes scenes
-        of later launches.
+        At most two full launches per solver are made ahead. If a solver already has a scene whose obstacle grid is
+        missing, this grid precedes scenes of later launches.
         """
         coming = len(self._ready) + len(self._being_made())
         short = coming < self._launch_size

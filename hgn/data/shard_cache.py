@@ -71,7 +71,7 @@ Fill = Callable[[BufferedRandom], None]
 
 
 def cached_shard(shard: CachedShard, patience_s: float, spared: Collection[str] | None, fill: Fill) -> Path:
-    """Returns the verified file of a shard. If it is missing, `fill` completes a file that may contain its beginning.
+    """Returns the verified file of a shard. If it is missing, `fill` completes a partial file, perhaps an empty one.
 
     A full cache removes other shards, except those with a sha256 in `spared`; with None it removes none.
     Raises: ConfigError; UnreachableError while another process fetches the file without progress; OSError (full disk or
@@ -161,7 +161,7 @@ def _bytes_over(folder: Path, size: int) -> float:
 def _free_space(folder: Path, least: float, size: float, spared: Collection[str]) -> bool:
     """Removes the oldest shards that are not spared until it has freed `size` bytes. Returns whether it removed any.
 
-    It removes none if these shards have fewer than `least` bytes in total, because a size in an index may be wrong.
+    It removes none if all of them together have fewer than `least` bytes: this would empty the cache without success.
     """
     removable = [(cached, path) for _, cached, path in _cached(folder) if path.stem not in spared]
     if sum(cached for cached, _ in removable) < least:

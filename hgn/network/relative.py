@@ -13,14 +13,14 @@ cube. The columns are, in this order:
 | 6 | `wall_nearness`, lower x, y, z, then upper |
 | 3 + 3 | obstacle normals at the particle and ahead of it; only with obstacle_features |
 
-G = sum_C w_pC t_C, with t_C of `disturbance`, is at least the particle's own `surface_gate`. G is above 0 if some
-particle in the same coarsest cells, or in cells across their faces, is within reach of a surface, as in a pile.
+G = sum_C w_pC t_C, with t_C = `touched` of `disturbance`, is at least the particle's own `surface_gate`. G is above 0
+if a surface is within reach of some particle in the same coarsest cells, or in cells across their faces, as in a pile.
 
 The decoder returns an acceleration r and a stress sigma for each particle. `balanced` computes the acceleration from
 them. These properties hold for any parameters:
 - Without relative motion the output is 0: a free body that neither rotates nor deforms has exactly acceleration g.
-- Without a surface in reach momentum is conserved. The mean of r over a coarsest cell is subtracted, and cells exchange
-  only antisymmetric impulses across their faces.
+- Without a surface within reach momentum is conserved. The mean of r over a coarsest cell is subtracted, and cells
+  exchange only antisymmetric impulses across their faces.
 - Angular momentum is then conserved too. The rotation of a cell, and of each pair of neighbours, is subtracted.
 - Surfaces without friction push along their normals only, and surfaces with friction as in hgn.network.own_physics.
 Shape legend: N particles, H velocities, L levels, C cells of a level, E directed edges, S scenes.
@@ -111,8 +111,8 @@ def history(velocity_NH3: torch.Tensor, gravity_N3: torch.Tensor) -> torch.Tenso
 def surroundings(velocity_N3: torch.Tensor, grid: GridHierarchy) -> torch.Tensor:
     """Returns velocities minus the mean velocities of the surrounding cells on each level, [N, 3 L].
 
-    A cell's velocity is sum(m v) / sum(m). On the finest level the sums are over particles, with their trilinear
-    weights; on other levels they are over the children. A particle's weights interpolate between its cells' ancestors.
+    A cell's velocity is sum(w v) / sum(w) with the trilinear weights w of its particles; coarser levels add the sums of
+    the children. A particle's mean on a level is that of the ancestors of its eight finest cells, with the same w.
     """
     weight_N8 = grid.weight_N8
     value_N84 = weight_N8[..., None] * torch.cat([velocity_N3, torch.ones_like(velocity_N3[:, :1])], -1)[:, None]
@@ -160,7 +160,7 @@ def obstacle_surfaces(
 
 
 def surface_gate(wall_N6: torch.Tensor, normal_N6: torch.Tensor | None) -> torch.Tensor:
-    """Returns the nearness of surfaces, [N]: 0 beyond reach, 1 at a normal and within half the reach of a wall."""
+    """Returns contacts of particles [N]: 1 with an obstacle normal, else twice the largest wall nearness, at most 1."""
     gate_N = (2 * wall_N6.amax(-1)).clamp(max=1)
     return gate_N if normal_N6 is None else torch.where(normal_N6.any(-1), 1, gate_N)
 
@@ -168,8 +168,8 @@ def surface_gate(wall_N6: torch.Tensor, normal_N6: torch.Tensor | None) -> torch
 def surface_normals(wall_N6: torch.Tensor, normal_N6: torch.Tensor | None) -> torch.Tensor:
     """Returns the sum of n n^T of the surfaces within reach, [N, 3, 3].
 
-    Walls count with the gate of `surface_gate`. The obstacle's normal at the particle counts; if it is 0, the one ahead
-    counts. n and -n give the same n n^T, so two surfaces that face each other do not cancel.
+    n n^T of a wall is multiplied by twice its nearness, at most 1. The obstacle's normal at the particle counts; if it
+    is 0, the one ahead counts. n and -n give the same n n^T, so two surfaces that face each other do not cancel.
     """
     near_N6 = (2 * wall_N6).clamp(max=1)
     normal_N33 = torch.diag_embed(near_N6[:, :3] + near_N6[:, 3:])
@@ -211,7 +211,7 @@ def disturbance(
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Returns `disturbed` and `touched` of each coarsest cell, [C] each, from 0 to 1.
 
-    `disturbed` is 0 if all particles around fly freely as one body without rotation. A particle is disturbed by a
+    `disturbed` is 0 if all particles around fly freely with one velocity. A particle is disturbed by a
     surface within reach (`surface_gate`), or if a column of history or surroundings is not small against QUIET. A
     coarsest cell is as disturbed as the most disturbed particle in it and in the cells across its faces. These cells
     count because an impact crosses a body within one frame. `touched` is computed in the same way, from surfaces only.
@@ -239,9 +239,9 @@ def balanced(output_N9: torch.Tensor, contacts: Contacts, grid: GridHierarchy) -
         f, f'              M_C / (M_C + M_C') and 1 - f
 
     Each term of M_C d_C A_C is antisymmetric in C and C', as in finite volumes, and no term is divided by a small mass.
-    So sum_p a_p is sum_C d_C t_C M_C R_C, which is 0 without a surface in reach.
+    So sum_p a_p is sum_C d_C t_C M_C R_C, which is 0 without a surface within reach.
 
-    Rotation is subtracted in two places, so that sum_p x_p x a_p is 0 too without a surface in reach. Both are
+    Rotation is subtracted in two places, so that sum_p x_p x a_p is 0 too without a surface within reach. Both are
     projections times a factor q from 0 to 1, so they never enlarge mean squares. X is a cell's centre of mass, and
     y_p = x_p - X. (q, W) = rotation(I, J) is computed from an inertia I and an angular momentum J.
     - In a cell r_p - R becomes q (r_p - R) - W x y_p. I and J are the cell's means of inertia and of y x r.

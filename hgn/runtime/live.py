@@ -36,8 +36,8 @@ class LiveSimulation:
     ) -> None:
         """In a list only scenes that diverge end: they lose their particles, and `ended[index]` is the error.
 
-        `capacity` is the number of particles of all scenes for which backend triton allocates buffers. With more
-        particles it captures its frame again, which takes about a second.
+        Backend triton allocates buffers for `capacity` particles of all scenes together. With more particles it
+        captures its CUDA graph again, which takes about a second.
         Raises: ConfigError as `Simulator.start`.
         """
         require(isinstance(simulator, Simulator), "simulator", "a Simulator", type(simulator).__name__)
@@ -103,8 +103,8 @@ class LiveSimulation:
     def reset(self, index: int, scene: InitialState | Scene) -> None:
         """Starts a scene anew, or another one in its place, with any number of particles.
 
-        Obstacles are prepared again unless the scene has the same `obstacle_grid` and `corners` as before. Backend
-        triton captures its frame again for a domain of another size. Raises: ConfigError as `Simulator.start`.
+        Obstacles at rest are prepared again unless `obstacle_grid`, `corners` and the domain size are as before.
+        Backend triton captures its CUDA graph again for another domain size. Raises: ConfigError as `Simulator.start`.
         """
         self._require_scene(index)
         start, state = InitialState.of(scene), self.state

@@ -2,9 +2,9 @@
 
 The idea is that of Brandstetter et al. 2022. Samples are collected as in DAgger (Ross et al. 2011):
 
-1. Every `pushforward_every` updates the present parameters (or their moving average) simulate `pushforward_scenes`
-   scenes, each from a random frame of the data. A simulation lasts `pushforward_frames`, or
-   `pushforward_episode_fraction` of the episode's frames if that is more; it stops at the end of the episode.
+1. Before a command's first update, and before each update whose number is a multiple of `pushforward_every`, the
+   present parameters (or their moving average) simulate `pushforward_scenes` scenes, each from a random frame of the
+   data. A simulation has `simulated_frames`, or fewer if the episode ends earlier.
 2. Each simulated frame becomes a window in a pool. A fraction of the samples of later updates comes from the pool.
 
 Noise shows the network random errors. The network's own errors are biased, and similar for all particles of a body.
@@ -208,7 +208,7 @@ class PushforwardPool(Generic[E, T]):
         self.figures = {f"pushforward/{name}": value for name, value in values.items()}
 
     def replaced(self, samples: Sequence[T], update: int) -> list[T]:
-        """Returns the samples, some of them replaced by samples of the pool with their seeds and new noise scales."""
+        """Returns the samples, some replaced by samples of the pool, each with the seed of the sample it replaces."""
         samples, scenes = list(samples), self._scenes
         for slot, (number, draw_weight) in enumerate(self._draws.drawn(update)):
             simulated, acceleration = self._samples[number]
