@@ -12,6 +12,7 @@ import contextlib
 import hmac
 import http
 import io
+import logging
 import math
 import secrets
 import socket
@@ -49,6 +50,9 @@ SENT = (
     *(messages.FileTransferStartUpload, messages.FileTransferPart, messages.ViewerCameraMessage),
 )  # messages that viewers may send, in addition to values of controls
 Process = Callable[[Any, Request], Response | None]
+_LOG = logging.getLogger(__name__)
+# websockets logs it with a traceback for each connection that a browser opens and never uses
+_LOG.addFilter(lambda record: record.msg != "opening handshake failed")
 # Viser stores each broadcast under a key. Each part of an upload has its own key, so Viser would store all of them.
 messages.FileTransferPartAck.redundancy_key = (  # type: ignore[method-assign]
     lambda ack: f"{type(ack).__name__}-{zlib.crc32(ack.transfer_uuid.encode()) % 64}"  # type: ignore[assignment]
@@ -85,6 +89,7 @@ def start_server(host: str, port: int, label: str) -> tuple[viser.ViserServer, s
     def guarded_serve(*args: Any, process_request: Process, **options: Any) -> Any:
         options["max_size"] = MAXIMUM_MESSAGE_BYTES
         options["create_connection"] = shedding()
+        options["logger"] = _LOG
         select = options["select_subprotocol"]
         # the name is part of the close frame of another version, which has at most 125 bytes
         options["select_subprotocol"] = lambda place, names: select(place, [name for name in names if len(name) <= 40])

@@ -229,6 +229,19 @@ def test_who_never_asks_keeps_nobody_out(page):
             assert answer.status == http.HTTPStatus.OK
 
 
+@pytest.mark.parametrize("sent", [b"", b"GET / HT", b"\x16\x03\x01 not HTTP\r\n\r\n"])
+def test_a_connection_without_a_request_writes_no_traceback(page, caplog, sent):
+    """Browsers open connections that they may never use."""
+    with socket.create_connection(("127.0.0.1", page.server.get_port()), 8) as connection:
+        connection.sendall(sent)
+        connection.shutdown(socket.SHUT_WR)
+        while connection.recv(1024):  # until the server closes it
+            pass
+    with urllib.request.urlopen(page.address) as answer:
+        assert answer.status == http.HTTPStatus.OK
+    assert not [record.message for record in caplog.records]
+
+
 def answered_with_403(path, headers):
     connection = SimpleNamespace(local_address=("127.0.0.1", 8080))
     response = guarded(lambda connection, request: None, "secret")(connection, Request(path, headers))
