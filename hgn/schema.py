@@ -42,6 +42,7 @@ _SECRETS = (  # pattern and replacement: for users of URLs and of addresses with
     (r"(?<![\w@.])[\w.+-]{1,300}:(?!/)(?:(?!://)\S){1,300}@(?=[\w\[])", ""),  # short, because any word may start it
     (rf"(?i)([?&;#][\w.-]{{0,99}}?(?:{_SECRET}))=[^&\s'\"#;]*", r"\1=…"),
 )
+_LONG = 20_000  # characters of a message that is shortened before passwords are removed
 # the owner's path, and the value's own name or index; joined for messages
 _Path = str | tuple[Any, str | int]
 
@@ -102,6 +103,9 @@ class ConfigError(ValueError):
     """An invalid value. The message names field, rule, value and remedy; it is `printable`, and shortened if long."""
 
     def __init__(self, message: str) -> None:
+        if len(message) > _LONG:  # the patterns take seconds for a megabyte
+            # the last part begins after a space, so that it does not begin within a password
+            message = f"{message[: _LONG // 2]} … {message[-_LONG // 2 :].partition(' ')[2]}"
         message = printable(message)
         super().__init__(message if len(message) <= 1400 else f"{message[:1000]} … {message[-350:]}")
 

@@ -84,7 +84,7 @@ class _File:
     def __init__(self, tree: dict[str, Any], binary: bytes, folder: Path, claims: Claims) -> None:
         self.tree = {key: _Entries(value) if isinstance(value, list) else value for key, value in tree.items()}
         self.binary, self.folder, self.claims = binary, folder.resolve(), claims
-        self.buffer = cache(self._buffer)
+        self.buffer, self.read = cache(self._buffer), cache(Path.read_bytes)  # buffers may be the same file
 
     def placed(self) -> list[tuple[dict[str, Any], list[float], np.ndarray]]:
         """Returns the meshes of the scene, the weights of their morph targets, and their matrices [M, 4, 4]."""
@@ -193,7 +193,7 @@ class _File:
         path = (self.folder / unquote(uri)).resolve()
         if not (path.is_file() and path.is_relative_to(self.folder)):
             raise FileNotFoundError(f"it names {uri!r}, which is no file in its folder")
-        return path.read_bytes()
+        return self.read(path)
 
 
 def _places(translation: Any, rotation: Any, scale: Any) -> np.ndarray:

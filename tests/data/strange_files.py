@@ -237,6 +237,13 @@ def large_view(header):
     header |= {"buffers": [{"uri": "m.bin"}], "bufferViews": len(header["bufferViews"]) * [view]}
 
 
+def alike_buffers(header):
+    """Ninety buffers, all of them one file of 60 MB."""
+    header["meshes"][0]["primitives"] = [{"attributes": {"POSITION": i}} for i in range(90)]
+    header["accessors"] = [{"bufferView": i, "componentType": 5126, "count": 3, "type": "VEC3"} for i in range(90)]
+    header |= {"buffers": 90 * [{"uri": "m.bin"}], "bufferViews": [{"buffer": i, "byteLength": 36} for i in range(90)]}
+
+
 def empty_primitives(header):
     """Primitives without vertices: 3 * 10^8 of them, by nodes."""
     header["accessors"].append({"bufferView": 0, "componentType": 5126, "count": 0, "type": "VEC3"})
@@ -299,6 +306,8 @@ cases(
         "weights": glb(lambda header: (targets(header), header["meshes"][0].update(weights=[1e308] * 2))),
         "stride 0": glb(stride_0),
         "large view": lambda folder: saved("m.bin", bytes(64 << 20))(folder) and glb(large_view)(folder),
+        "alike buffers": lambda folder: saved("m.bin", bytes(60 << 20))(folder) and glb(alike_buffers)(folder),
+        "long name of a file": glb(lambda header: header["buffers"][0].update(uri=2_000_000 * "=a:b@")),
         "long tree": glb(lambda header: header.update(x=6_000_000 * [[]])),
         "targets": glb(targets),
         "sparse instances": glb(sparse_instances),

@@ -200,6 +200,13 @@ def test_passwords_and_control_characters(text, shown):
     assert printable(text) == shown == str(ConfigError(text))
 
 
+def test_long_messages_keep_no_end_of_a_signature():
+    """A message is cut before signatures are removed, but not within one of them."""
+    shown = str(ConfigError("got http://h?sig=" + 30_000 * "s"))
+    assert shown.startswith("got http://h?sig=…") and "s" not in shown[18:]
+    assert str(ConfigError(30_000 * "a" + "; give a shorter one")).endswith(" give a shorter one")
+
+
 def test_no_file_of_a_run_has_the_password(data, tmp_path, capsys, monkeypatch):
     """Commands with a URL with a password write and print the URL, and their command line, without it."""
     run = tmp_path / "run"
