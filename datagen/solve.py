@@ -54,9 +54,13 @@ def main(mapping: dict[str, Any]) -> int:
 
     space = space_reserved(out, rollout_bytes(config.frames, scene.particle_count))
     with space, bar("simulating", total=config.frames, unit="frame") as progress:
-        (result,) = simulate(
-            [scene], config.mpm, config.frames, config.frame_rate_hz, on_frame=lambda _: progress.update()
-        )
+
+        def show(frame: int) -> None:
+            if frame == 1:
+                progress.unpause()  # it includes compilation, so it does not count for the rate
+            progress.update()
+
+        (result,) = simulate([scene], config.mpm, config.frames, config.frame_rate_hz, on_frame=show)
         if isinstance(result, SceneFailure):
             raise ConfigError(f"{file} must be a scene that the solver keeps together, got {result.cause}")
     rollout = Rollout(

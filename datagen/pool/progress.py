@@ -87,6 +87,8 @@ class BarProgress(Progress):
         frames = min(self._done * self._frames + sum(self._running.values()), self._total * self._frames)
         text = f"episodes {self._done}/{self._total}"
         if self._bar is not None:
+            if frames > self._bar.initial == self._bar.n:
+                self._bar.unpause()  # the first frame includes compilation, so it does not count for the rate
             # the frames of a failed launch are subtracted, which tqdm allows only by assignment
             self._bar.n = frames
             self._bar.set_description(text, refresh=False)

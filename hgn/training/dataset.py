@@ -25,8 +25,8 @@ from hgn.training.stop import StopRequest
 
 LONG_ON_A_CPU_S = 3600.0
 WAY_OUT = (
-    "on a CPU: +experiment=demo (minutes), dataset.training_scenes=N and training.maximum_updates=N, or a GPU "
-    "(a hundred times faster)"
+    "on a CPU: +experiment=demo (minutes), dataset.training_scenes=N with dataset.test_scenes=0 and "
+    "training.maximum_updates=N, or a GPU (a hundred times faster)"
 )
 # per particle and frame: CPU seconds of the solver on 64^3 cells (results/start/frame_cpu.json), and bytes in a shard
 SOLVER_CPU_S, SHARD_BYTES = 2.2e-4, 14
@@ -127,9 +127,12 @@ def wait_for_episodes(
             )
         if progress is None and first_rank():
             print(printable(f"waiting for training episode {needed} in {folder}"), file=sys.stderr)
-            progress = bar("generating", total=needed * config.dataset.frames, unit="frame")
+            validation = max(0, min(needed - 1, config.dataset.validation_scenes))  # made before the last one needed
+            progress = bar("generating", total=(needed + validation) * config.dataset.frames, unit="frame")
         if progress is not None and generator is not None:
             frames = generator.frames_done()
+            if frames > progress.n == 0:
+                progress.unpause()  # the first frame includes compilation, so it does not count for the rate
             progress.update(min(max(frames, progress.n), progress.total) - progress.n)
         time.sleep(0.5)
     return None

@@ -9,6 +9,7 @@ import subprocess
 import sys
 from functools import partial
 from pathlib import Path
+from unittest import mock
 
 import pytest
 import yaml
@@ -188,10 +189,16 @@ class Terminal(io.StringIO):
 
 def test_bar():
     """On a terminal the bar counts frames of running scenes, and a failed launch takes its frames back; in a log file
-    progress is a few plain lines, whatever the number of frames."""
+    progress is a few plain lines, whatever the number of frames. The time until the first frame is left out."""
     stream = Terminal()
     bar = BarProgress(stream)
     bar.start(1, 3, 100)
+    assert bar._bar is not None
+    start_s = bar._bar.start_t
+    for frame, seconds in ((1, 60.0), (2, 62.0)):  # compilation takes 60 seconds
+        bar._bar._time = mock.Mock(return_value=start_s + seconds)
+        bar.frame(0, frame, 1)
+    assert bar._bar.format_dict["elapsed"] == pytest.approx(2.0)
     for report, frames in (((0, 50, 1), 150), ((0, 0, 0), 100)):
         bar.frame(*report)
         assert bar._bar is not None and bar._bar.n == frames

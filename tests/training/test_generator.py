@@ -1,17 +1,22 @@
 """The generator that a training starts itself: a process of its own, that makes what is missing."""
 
+import signal
 import time
 from dataclasses import replace
+from unittest import mock
 
 import pytest
 import yaml
 from processes import PATIENCE_S
 
-from hgn.config import DatagenConfig, DatasetConfig, MpmConfig, SceneConfig
+from hgn.config import DatagenConfig, DatasetConfig, MpmConfig, SceneConfig, TrainConfig, TrainingConfig
 from hgn.data.manifest import Manifest
 from hgn.data.reader import EpisodeStore
 from hgn.schema import ConfigError
+from hgn.system.progress import bar
+from hgn.training.dataset import wait_for_episodes
 from hgn.training.generator import Generator
+from hgn.training.stop import StopRequest
 
 
 def small_config(folder):
@@ -60,3 +65,28 @@ def test_makes_what_is_missing(tmp_path):
     wait(other)
     with pytest.raises(ConfigError, match=r"holds another data set: mpm.poisson_ratio .*log: .*datagen.log"):
         other.check()
+
+
+def test_the_bar_counts_the_frames_that_are_waited_for(tmp_path, monkeypatch):
+    """The bar counts the frames of validation scenes that are made before the last training scene needed. The time
+    until the first frame is left out of its rate."""
+    dataset = DatasetConfig(folder=str(tmp_path), training_scenes=4, validation_scenes=5, frames=40)
+    config = TrainConfig(dataset=dataset, training=TrainingConfig(minimum_episodes=2))
+    bars, stop = [], StopRequest()
+    monkeypatch.setattr(
+        "hgn.training.dataset.bar", lambda *given, **named: bars.append(bar(*given, **named)) or bars[0]
+    )
+
+    def pass_time(_):
+        seconds, stop.signal = next(looks)
+        bars[0]._time = lambda: start_s + seconds
+
+    looks = iter(((60.0, None), (65.0, signal.SIGTERM)))
+    start_s = time.time()
+    monkeypatch.setattr("hgn.training.dataset.time.sleep", pass_time)
+    generator = mock.Mock(running=True, frames_done=mock.Mock(side_effect=(0, 1)))
+    assert wait_for_episodes(config, generator, stop) is None
+    (progress,) = bars
+    assert progress.total == 3 * 40 and progress.n == 1
+    assert progress.format_dict["elapsed"] == pytest.approx(5.0)
+    progress.close()

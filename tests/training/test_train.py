@@ -276,6 +276,7 @@ def test_long_data_sets_are_announced_before_they_are_made(make_config, tmp_path
     assert line.startswith(
         "no GPU: 825 scenes take roughly 23 hours and 10 GB here, before most of 20,000,000 updates;"
     )
+    assert "dataset.test_scenes=0" in line
     assert warning_on_a_cpu(make_config()) is None
     monkeypatch.setattr("hgn.training.dataset.LONG_ON_A_CPU_S", 0.0)
     monkeypatch.setattr(

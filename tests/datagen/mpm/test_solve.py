@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
+from tqdm import tqdm
 
 from datagen.mpm import launch
 from datagen.solve import main
@@ -22,11 +23,15 @@ RAMP = "v -0.5 0 -0.5\nv 0.5 0 -0.5\nv -0.5 0 0.5\nv 0.5 0 0.5\nf 1 3 2\nf 2 3 4
 
 
 def test_a_scene_file_is_solved(tmp_path, monkeypatch):
-    """The file holds the scene's particles, which fall; drawn beside another simulation of it, it is the truth."""
+    """The file holds the scene's particles, which fall; drawn beside another simulation of it, it is the truth. The
+    bar's rate begins with frame 1, which includes compilation."""
+    rate_begins = []
+    monkeypatch.setattr(tqdm, "unpause", lambda bar: rate_begins.append(bar.n))
     monkeypatch.chdir(tmp_path)
     Path("ramp.obj").write_text(RAMP)
     Path("mine.yaml").write_text(SCENE)
     assert main({"scene": "mine.yaml", "frames": 3, "mpm": {"device": "cpu"}}) == 0
+    assert rate_begins == [1]
     solved, scene = read_rollout("rollout/mine_solver.vtkhdf"), load_scene("mine.yaml")
     np.testing.assert_array_equal(solved.position_TN3[0], scene.position_N3)
     fallen = (solved.position_TN3[0] - solved.position_TN3[2])[:, 1]
