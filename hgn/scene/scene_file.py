@@ -285,11 +285,11 @@ def notes_on_files(scene: Scene) -> list[str]:
                 if inside := int(contains(position_N3, obstacle).sum()):
                     notes.append(f"{inside} of {count} particles of {group['particles']} lie inside {obstacle.name}")
     for entry, obstacle in zip(entries, scene.obstacles, strict=False):
-        name = entry.get("mesh")
-        if name is None:
+        if (name := entry.get("mesh")) is None:
             continue
         if not obstacle.closed:
-            notes.append(f"a sheet, not a solid, because it is not watertight: {name}")
+            remedy = "close its holes, or write bodies that touch as two obstacles"
+            notes.append(f"a sheet, not a solid, because it is not watertight: {name}; {remedy}")
         begin = _at_start(obstacle)
         low_3, high_3 = begin.vertex_V3.min(axis=0), begin.vertex_V3.max(axis=0)
         around = (low_3 <= 0).all() and (high_3 >= scene.domain_size).all()  # if it moves, it stays around

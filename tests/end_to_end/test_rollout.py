@@ -105,7 +105,7 @@ def test_what_may_surprise_is_said(tmp_path, weights, capsys):
     assert rollout.main({"weights": weights, "frames": 2, "scene": str(tmp_path / "stiff.yaml"), "out": out}) == 0
     said = capsys.readouterr().err
     assert "not used: youngs_modulus_pa of groups" in said
-    assert "a sheet, not a solid, because it is not watertight: open.obj" in said and "square" not in said
+    assert "a sheet, not a solid, because it is not watertight: open.obj; close its" in said and "square" not in said
     assert "not used: friction of surfaces, which is the solver's; still knows that of its data alone" in said
     assert said.count("outside the domain, out of reach of particles: open.obj (x 540 to 580, y 40 to 40") == 1
     assert said.count("smaller than a cell of 0.0156: open.obj (x 0.002 to 0.004, ") == 1
