@@ -38,6 +38,9 @@ _BLOCK = re.compile(r"(?:<!-- file: (\S+) -->\n)?```(\w+)\n(.*?)```\n", re.DOTAL
 
 def main() -> int:
     """Writes the notebooks that the command line names, or all; returns the exit code."""
+    if {"--help", "-h"} & set(sys.argv[1:]):
+        print(__doc__.strip())
+        return 0
     from nbclient import NotebookClient
     from nbformat import from_dict
 

@@ -4,6 +4,7 @@ import json
 
 import nbformat
 import pytest
+from docs.pages import run_module
 
 from tools import notebooks
 from tools.notebooks import DOCS, NOTEBOOKS, notebook
@@ -73,3 +74,9 @@ def test_notebooks_run(name, warm_python, tmp_path, monkeypatch):
     ended = nbformat.read(tmp_path / "notebooks" / f"{name}.ipynb", as_version=4)
     printed = [output.get("text", "") for cell in ended.cells for output in cell.get("outputs", ())]
     assert not any("error: " in text or "Traceback" in text for text in printed), printed
+
+
+def test_help(capsys):
+    """Help prints the usage, and writes no notebook."""
+    assert run_module("tools.notebooks", ["--help"]) == 0
+    assert capsys.readouterr().out.startswith("python -m tools.notebooks [NAME")
