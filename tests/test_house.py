@@ -16,10 +16,10 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 33_206,
-    "datagen": 9_042,
-    "tools": 6_213,
-    "tests": 32_282,
+    "hgn": 33_209,
+    "datagen": 9_048,
+    "tools": 6_216,
+    "tests": 32_332,
 }
 SETTINGS = 240  # fields of the dataclasses behind the commands, *Config
 
