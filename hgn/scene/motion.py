@@ -14,6 +14,7 @@ import numpy as np
 from hgn.scene.rotation import rotate
 from hgn.schema import Vector, require
 
+LEAST_S = 1e-9  # least time between two keyframes, in seconds; in less an obstacle's speed could be infinite
 FARTHEST = 1000.0  # largest translation of a keyframe, domain units: networks follow the cells on its way
 Keyframes = Sequence[tuple[float, Vector]]  # times in seconds and translations in domain units
 
@@ -33,8 +34,8 @@ class Motion:
 
     def __post_init__(self) -> None:
         times = np.asarray(self.time_T, np.float64)
-        ordered = len(times) > 0 and bool(np.isfinite(times).all() and (np.diff(times) > 0).all())
-        require(ordered, "keyframes", "in order of time, at least one, no two at one time", times.tolist())
+        ordered = len(times) > 0 and bool(np.isfinite(times).all() and (np.diff(times) >= LEAST_S).all())
+        require(ordered, "keyframes", f"in order of time, at least one, {LEAST_S:g} s apart", times.tolist())
         require(times[0] >= 0, "keyframes", "at times >= 0", times.tolist())
         farthest = float(np.abs(self.translation_T3).max())
         require(farthest <= FARTHEST, "keyframes", f"of translations of at most {FARTHEST:g} units", farthest)

@@ -231,6 +231,7 @@ MISTAKES = [
     (scene_with(floor_friction=-0.1), "floor_friction must be a finite number >= 0, got -0.1"),
     (scene_with(wall_friction=float("nan")), "wall_friction must be a finite number >= 0, got nan"),
     (obstacle_with(keyframes=[{"time": 1}, {"time": 1}]), OBSTACLE + r"\.keyframes must be in order of time"),
+    (obstacle_with(keyframes=[{"time": 0}, {"time": 5e-324}]), r"keyframes must be in order of time.* 1e-09 s apart"),
     (obstacle_with(keyframes=[{"time": -1}]), OBSTACLE + r"\.keyframes\[0\]\.time must be .* >= 0"),
     (obstacle_with(keyframes=[{"time": 0, "rotation": [0, float("inf"), 0]}]), r"\.rotation\[1\] must be finite"),
     *(
