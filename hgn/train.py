@@ -114,7 +114,10 @@ def _checkpoint_to_resume(config: TrainConfig, folder: Path) -> Resume | None:
     else:
         config_hash = identity_hash(dataset_identity(config.datagen))
     check_checkpoint(checkpoint, config, config_hash, path)
-    return Resume(path, Progress.of(checkpoint))
+    progress = Progress.of(checkpoint)
+    if first_rank():
+        print(f"resuming at update {progress.updates} of {config.training.maximum_updates}", file=sys.stderr)
+    return Resume(path, progress)
 
 
 def _initial_network(config: TrainConfig, resume: Resume | None) -> ParticleNetwork | None:

@@ -16,10 +16,10 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 33_210,
+    "hgn": 33_226,
     "datagen": 9_048,
     "tools": 6_216,
-    "tests": 32_333,
+    "tests": 32_405,
 }
 SETTINGS = 240  # fields of the dataclasses behind the commands, *Config
 

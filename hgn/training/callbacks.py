@@ -34,6 +34,7 @@ from hgn.training.distributed import checksum, same_on_all_ranks
 from hgn.training.errors import format_ratio
 from hgn.training.gradients import take_counters
 from hgn.training.module import TrainingModule
+from hgn.training.schedule import measurement_due
 from hgn.training.stop import BY_WEIGHT, StopRequest
 
 METRICS = "metrics.jsonl"
@@ -84,13 +85,15 @@ class Checkpoints(Callback):
     def __init__(self, folder: Path, every: int, writer: CheckpointWriter) -> None:
         self.folder, self.every, self.writer = folder, every, writer
         self.best_error = math.inf
+        self.measured_update = 0  # number of updates at the last complete measurement
         self._saved_update = -1
 
     def state_dict(self) -> dict[str, Any]:
-        return {"best_error": self.best_error}
+        return {"best_error": self.best_error, "measured_update": self.measured_update}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         self.best_error = state_dict["best_error"]
+        self.measured_update = state_dict.get("measured_update", 0)  # missing in checkpoints of 0.2.0 and before
 
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
         if trainer.is_global_zero:
@@ -119,11 +122,12 @@ class Checkpoints(Callback):
             trainer.save_checkpoint(self.folder / LAST_NAMES[0])
             self._saved_update = update
 
-    def offer(self, trainer: Trainer, error: float) -> None:
+    def offer(self, trainer: Trainer, update: int, error: float) -> None:
         """Saves the network as the best one if its one-step validation error is the lowest."""
+        self.measured_update = update
+        self._saved_update = -1  # last.ckpt must contain the measured update and the best error
         if error < self.best_error:
             self.best_error = error
-            self._saved_update = -1  # last.ckpt must contain the new best error
             trainer.save_checkpoint(self.folder / BEST_NAME)
 
     def finish(self, trainer: Trainer, update: int) -> None:
@@ -228,8 +232,11 @@ class Stopper(Callback):
         lightning_compat.forget_sigterm(trainer)
 
     def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
-        update = _update(pl_module)
-        if trainer.world_size > 1 and update < self._agreed_update + self.AGREE_EVERY:
+        assert isinstance(pl_module, TrainingModule)
+        update = pl_module.update
+        # A stop request that ended a measurement must end the training before the next update.
+        due = update >= self._agreed_update + self.AGREE_EVERY or measurement_due(pl_module.training_config, update)
+        if trainer.world_size > 1 and not due:
             return
         self._agreed_update = update
         if trainer.strategy.reduce_boolean_decision(self.stop.requested, all=False):

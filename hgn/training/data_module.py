@@ -80,8 +80,6 @@ class EpisodeDataModule(LightningDataModule):
                         return
                 self.waited_s += time.monotonic() - started
                 yield item.result()
-            if self.trainer is not None:
-                self.trainer.should_stop = True
         finally:
             with without_patience():
                 executor.shutdown(cancel_futures=True)

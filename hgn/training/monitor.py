@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 import time
 from collections.abc import Callable
@@ -32,7 +33,7 @@ from hgn.training.errors import (
     rollout_errors,
 )
 from hgn.training.module import TrainingModule
-from hgn.training.schedule import next_measurement
+from hgn.training.schedule import measurement_due
 from hgn.training.stop import StopRequest
 from hgn.training.tensorboard import show_pictures, write_pictures
 
@@ -46,15 +47,14 @@ class Monitor(Callback):
         self.run, self.stop, self.checkpoints = run, stop, checkpoints
         self.stores = {"training": training, "validation": training.of_split("validation")}
         self.last: dict[str, float] = {}
-        self._measured_update = -1
 
-    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        assert isinstance(pl_module, TrainingModule)
-        self._measured_update = pl_module.update  # nothing to measure before the next update
+    def on_train_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Makes the measurement that a stop request ended before this start."""
+        self.on_train_batch_end(trainer, pl_module)
 
     def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
         assert isinstance(pl_module, TrainingModule)
-        if next_measurement(pl_module.training_config, pl_module.update - 1) == pl_module.update:
+        if measurement_due(pl_module.training_config, pl_module.update):
             self.measure(trainer, pl_module)
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
@@ -65,11 +65,11 @@ class Monitor(Callback):
     def measure(self, trainer: Trainer, module: TrainingModule, patience_s: float = 0.0) -> None:
         """Measures and logs. One-step frames are divided among the ranks; rank 0 simulates the rollouts.
 
-        A stop request ends it early. If scenes are on a server that does not answer, it only prints a message.
+        A stop request ends it without a result; the resumed run measures again. If scenes are on a server that does not
+        answer, it only prints a message.
         """
-        if self._measured_update == module.update:
+        if self.checkpoints.measured_update == module.update:
             return
-        self._measured_update = module.update
         network = module.result
         network.eval()
         started = time.monotonic()
@@ -91,11 +91,13 @@ class Monitor(Callback):
             if not episodes or self._interrupted(trainer):
                 continue
             values |= self._one_step(trainer, module, split, episodes)
-        if "one_step/validation" in values and not self._interrupted(trainer):
-            frames = module.training_config.monitor_rollout_frames
-            if frames >= 2 and trainer.is_global_zero:
-                values |= self._rollout(trainer, module, scenes["validation"], frames)
-            self.checkpoints.offer(trainer, values["one_step/validation"])
+        if self._interrupted(trainer):
+            network.train()
+            return
+        frames = module.training_config.monitor_rollout_frames
+        if "one_step/validation" in values and frames >= 2 and trainer.is_global_zero:
+            values |= self._rollout(trainer, module, scenes["validation"], frames)
+        self.checkpoints.offer(trainer, module.update, values.get("one_step/validation", math.inf))
         values["monitor/seconds"] = time.monotonic() - started
         network.train()
         self.last |= values

@@ -32,3 +32,8 @@ def next_measurement(training: TrainingConfig, update: int) -> int:
     while due // 2 > update and due // 2 >= FIRST_MEASUREMENT and due <= training.monitor_every:
         due //= 2
     return due
+
+
+def measurement_due(training: TrainingConfig, update: int) -> bool:
+    """Returns whether errors are measured after `update` updates, apart from the end of a training."""
+    return next_measurement(training, update - 1) == update

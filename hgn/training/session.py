@@ -102,7 +102,7 @@ def train_network(config: TrainConfig, start: Start, stop: StopRequest, publishe
         devices=devices,
         num_nodes=nodes,
         strategy=lightning_compat.gradient_averaging(backend) if devices * nodes > 1 else "auto",
-        max_epochs=-1,  # the feed ends after the last update
+        max_epochs=1,  # the feed ends after the last update
         callbacks=[watch, SameWeights(feed), lines, monitor, checkpoints, Stopper(stop, checkpoints), final],
         plugins=[writer, *lightning_compat.own_launcher()],
         logger=build_loggers(training.loggers, run, _public(config)),
@@ -129,10 +129,11 @@ def train_network(config: TrainConfig, start: Start, stop: StopRequest, publishe
         raise ConnectionAbortedError(errno.ECONNABORTED, watch.lost) from error
     finally:
         module.release()
+    # a signal after the last measurement has no effect
+    finished = module.update >= training.maximum_updates and checkpoints.measured_update == module.update
     if trainer.is_global_zero:
-        _report(config, module.update, monitor.last, stop)
-    # a signal after the last update has no effect
-    return 0 if module.update >= training.maximum_updates else stop.exit_code
+        _report(config, module.update, monitor.last, stopped=stop.requested and not finished)
+    return 0 if finished else stop.exit_code
 
 
 def _module(config: TrainConfig, start: Start, backend: str, precisions: tuple[str, ...]) -> TrainingModule:
@@ -214,15 +215,15 @@ def _write_run_files(config: TrainConfig, manifest: Manifest) -> None:
     write_atomically(run / "config.yaml", yaml.safe_dump(record, sort_keys=False).encode())
 
 
-def _report(config: TrainConfig, updates: int, last: dict[str, float], stop: StopRequest) -> None:
+def _report(config: TrainConfig, updates: int, last: dict[str, float], stopped: bool) -> None:
     print(f"trained {updates} of {config.training.maximum_updates} updates in {config.run}")
     if "one_step/validation" in last:
         print(
-            f"one-step validation MSE {last['one_step/validation']:.3e}, "
+            f"one-step validation MSE {last['one_step/validation']:.3e} on every fourth frame (hgn.evaluate: on all), "
             f"{format_ratio(last.get('baseline_ratio/validation', math.nan))} the best baseline's"
         )
     folder = Path(config.run) / "checkpoints"
     if not (folder / BEST_NAME).exists():
         print(f"no {BEST_NAME}, because no validation scene was measured; export {folder / LAST_NAMES[0]}")
-    if stop.requested:
+    if stopped:
         print("stopped; the same command resumes it")

@@ -1,10 +1,13 @@
 """Order and resume: each sample once an epoch, and an interruption anywhere changes nothing."""
 
 import dataclasses
+import signal
 from itertools import islice
 from typing import Any
+from unittest import mock
 
 import numpy as np
+import pytest
 import torch
 from equality import assert_same
 from hypothesis import given, settings
@@ -16,6 +19,8 @@ from hgn.config import NetworkConfig, TrainingConfig
 from hgn.data.reader import EpisodeStore
 from hgn.data.sampler import EpisodeSampler, SamplerState
 from hgn.scene.history import window
+from hgn.training import monitor
+from hgn.training.callbacks import Stopper
 from hgn.training.checkpoint import read_checkpoint
 from hgn.training.data_module import EpisodeDataModule
 from hgn.training.module import TrainingModule
@@ -166,3 +171,69 @@ def test_resume_equals_no_interruption(data, tmp_path, monkeypatch):
     assert any(not torch.equal(elsewhere["state_dict"][name], value) for name, value in whole["state_dict"].items())
     assert all(line["pushforward/windows"] > 0 for line in resumed)  # also between updates 6 and 8
     assert all(line["pushforward/windows"] == 6 and line["pushforward/dropped"] == 0 for line in lines)
+
+
+@pytest.mark.parametrize(
+    ("stopped_at", "split", "every"),
+    [(6, "training", 6), (6, "validation", 6), (12, "validation", 6), (12, "training", 7)],
+)
+def test_a_stopped_measurement_is_made_on_resume(data, tmp_path, monkeypatch, capsys, stopped_at, split, every):
+    """A signal while update 6 or the last one is measured: the resumed run measures that update before the next one,
+    and then no second time. Errors, losses, best.ckpt and parameters are those of a run without a stop, bit by bit."""
+    measured, real = [], monitor.Monitor._one_step
+
+    def trained(name):
+        return train.main(train_mapping(data, tmp_path / name, log_every=2, monitor_every=every))
+
+    def signalled(self, trainer, module, measured_split, episodes):
+        if (module.update, measured_split) == (stopped_at, split) and not measured:
+            measured.append(split)
+            signal.raise_signal(signal.SIGTERM)
+        return real(self, trainer, module, measured_split, episodes)
+
+    assert trained("whole") == 0
+    monkeypatch.setattr(monitor.Monitor, "_one_step", signalled)
+    capsys.readouterr()
+    assert trained("cut") == 128 + signal.SIGTERM
+    output = capsys.readouterr()
+    assert "resuming" not in output.err and "stopped; the same command resumes it" in output.out
+    stored = read_checkpoint(tmp_path / "cut" / "checkpoints" / "last.ckpt")
+    assert stored["hgn"]["updates"] == stopped_at
+    assert not [line for line in metrics(tmp_path / "cut") if line["update"] == stopped_at and "loss" not in line]
+    assert trained("cut") == 0
+    output = capsys.readouterr()
+    assert f"resuming at update {stopped_at} of 12\n" in output.err and "every fourth frame" in output.out
+    assert trained("cut") == 0
+    assert "stopped;" not in output.out and "no best.ckpt" not in output.out
+    names = ("update", "loss", "one_step/training", "one_step/validation")
+    whole, cut = ([[line.get(name) for name in names] for line in metrics(tmp_path / run)] for run in ("whole", "cut"))
+    assert cut == whole
+    for name in ("last.ckpt", "best.ckpt"):
+        whole, cut = (read_checkpoint(tmp_path / run / "checkpoints" / name) for run in ("whole", "cut"))
+        for part in ("state_dict", "optimizer_states", "hgn"):
+            assert_same(cut[part], whole[part], part)
+
+
+def test_ranks_stop_before_the_next_update_after_a_stopped_measurement():
+    """Otherwise the checkpoint would be of a later update, and the measurement would be lost."""
+    stop, trainer = StopRequest(), mock.Mock(world_size=2, should_stop=False)
+    trainer.strategy.reduce_boolean_decision = lambda mine, all: mine
+    trainer.strategy.reduce = lambda mine, reduce_op: mine
+    stop.signal = signal.SIGTERM
+    module = mock.Mock(spec=TrainingModule, training_config=TrainingConfig(**TRAINING), device=torch.device("cpu"))
+    for module.update in (5, 6):
+        Stopper(stop, mock.Mock()).on_train_batch_end(trainer, module)
+        assert trainer.should_stop == (module.update == TRAINING["monitor_every"])
+
+
+def test_the_end_of_a_run_is_measured_once(data, tmp_path, monkeypatch):
+    """Also if a checkpoint of the last update precedes the measurement, and if its error is not the lowest."""
+    run, real = tmp_path / "run", monitor.Monitor._one_step
+
+    def growing(self, trainer, module, split, episodes):
+        return real(self, trainer, module, split, episodes) | {f"one_step/{split}": float(module.update)}
+
+    monkeypatch.setattr(monitor.Monitor, "_one_step", growing)
+    for _ in range(2):
+        assert train.main(train_mapping(data, run, maximum_updates=5, monitor_every=3)) == 0
+    assert [line["update"] for line in metrics(run) if "one_step/training" in line] == [3, 5]

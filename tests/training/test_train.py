@@ -135,7 +135,7 @@ def test_the_end_of_a_diverged_run_is_reported(make_config, run, capsys):
     mapping = train_mapping(make_config(), run)
     mapping.pop("name")
     config = from_mapping(TrainConfig, mapping)
-    session._report(config, 3, {"one_step/validation": math.inf}, StopRequest())
+    session._report(config, 3, {"one_step/validation": math.inf}, stopped=False)
     assert "one-step validation MSE inf" in capsys.readouterr().out
 
 
@@ -244,7 +244,8 @@ def test_the_best_network_is_remembered(data, run, monkeypatch):
     monkeypatch.setattr("lightning.pytorch.trainer.setup.CUDAAccelerator.is_available", lambda: True)
     assert train.main(train_mapping(data, run, maximum_updates=5, monitor_every=1000)) == 0
     (error,) = (record["one_step/validation"] for record in metrics(run) if "one_step/validation" in record)
-    assert read_checkpoint(run / "checkpoints" / "last.ckpt")["callbacks"]["Checkpoints"] == {"best_error": error}
+    stored = read_checkpoint(run / "checkpoints" / "last.ckpt")["callbacks"]["Checkpoints"]
+    assert stored == {"best_error": error, "measured_update": 5}
 
 
 def test_what_a_training_takes_is_said(make_config, make_dataset, tmp_path, monkeypatch, capsys):
