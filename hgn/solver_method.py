@@ -56,7 +56,7 @@ METHODS = {
     ),
 }
 
-SPEED_FRACTION = 0.3  # largest fraction of a cell that the fastest particle crosses between two transfers
+SPEED_FRACTION = 0.3  # of a cell: the fastest particle's longest planned path between two transfers
 MINIMUM_SINGULAR_VALUE = 0.05  # lower bound of the singular values of F; hits are counted
 WATER_MINIMUM_VOLUME_RATIO = 0.1  # lower bound of J; hits are counted
 MAXIMUM_SUBSTEPS = 20_000  # largest number per frame; a scene that needs more is stopped and reported

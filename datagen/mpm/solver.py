@@ -67,10 +67,10 @@ def simulate(
 
     Scenes may differ in everything but their cell size. The largest domain determines each scene's memory.
     With adaptive time steps particles and grid exchange velocities every dx / transfer_speed_m_s, or every step of
-    stress if that is longer. The interval is at most SPEED_FRACTION dx / |v|max. Intervals are equal up to the end of
-    the frame. Within them each scene takes its own steps of stress, of at most stability_fraction dx sqrt(rho /
-    (3 lambda_h + 2 mu_h)). With a fixed time step each step has a transfer. A frame has ceil(frame / step) steps, as in
-    Taichi Elements: 54 steps at 60 Hz and 3.125e-4 s, which are 1.25 % longer than the frame.
+    stress if that is longer. The interval is at most SPEED_FRACTION dx / |v|max at its start. Intervals are equal up to
+    the end of the frame. Within them each scene takes its own steps of stress, of at most stability_fraction dx
+    sqrt(rho / (3 lambda_h + 2 mu_h)). With a fixed time step each step has a transfer. A frame has ceil(frame / step)
+    steps, as in Taichi Elements: 54 steps at 60 Hz and 3.125e-4 s, which are 1.25 % longer than the frame.
 
     Scenes with emitters are simulated after the others, in a launch of their own. `on_frame(t)` is
     called from 0 on when the scenes have completed frame t, on average over the scenes if there are two launches.

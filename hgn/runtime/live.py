@@ -27,14 +27,15 @@ from hgn.schema import require, require_count
 class LiveSimulation:
     """One scene or several, a frame at a time, on the simulator's backend. Use it as a context manager, or close it.
 
-    A change between two frames affects scene `index` from the next frame on. Positions and velocity histories of other
-    particles stay bitwise equal. Particles are sorted by scene. Within a scene, new particles follow the others.
+    A change between two frames affects scene `index` from the next frame on. Particles that it does not add, remove or
+    restore keep their positions and velocity histories bitwise. Particles are sorted by scene. Within a scene, new
+    particles follow the others.
     """
 
     def __init__(
         self, simulator: Simulator, scenes: InitialState | Scene | Sequence[InitialState | Scene], capacity: int = 0
     ) -> None:
-        """In a list only scenes that diverge end: they lose their particles, and `ended[index]` is the error.
+        """If `scenes` is a list, a scene that diverges loses its particles, and `ended[index]` is the error.
 
         Backend triton allocates buffers for `capacity` particles of all scenes together. With more particles it
         captures its CUDA graph again, which takes about a second.
@@ -114,11 +115,11 @@ class LiveSimulation:
     def add_particles(
         self, position_A3: np.ndarray, velocity_A3: np.ndarray, material_A: np.ndarray, index: int = 0
     ) -> np.ndarray:
-        """Adds particles that come from free flight: domain units, domain units per second, indices into MATERIALS.
+        """Adds particles with default parameters that come from free flight. `material_A` are indices into MATERIALS.
 
-        They have default material parameters. Returns their velocity histories, float32 [A, M, 3] in domain units per
-        frame, newest first. Raises: ConfigError for a material that the network was not trained with, and for arrays of
-        different lengths.
+        Positions are in domain units, velocities in domain units per second. Returns the particles' velocity histories,
+        float32 [A, M, 3] in domain units per frame, newest first. Raises: ConfigError for a material that the network
+        was not trained with, and for arrays of different lengths.
         """
         self._require_scene(index)
         require(index not in self.ended, "index", "of a scene in progress", index, remedy="reset it")

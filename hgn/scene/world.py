@@ -95,7 +95,7 @@ class Layout:
     def along(self, axis: int, half: float) -> float:
         """Draws a coordinate at which a body of half width `half` does not touch the walls. Raises: _DrawAgainError.
 
-        A quarter of the coordinates are less than NEAR_WALL from touching a wall.
+        A quarter of the draws are less than NEAR_WALL from touching a wall, the others uniform over the whole range.
         """
         first = self.low + half + ROUNDING
         span = self.high(axis) - half - ROUNDING - first

@@ -91,7 +91,7 @@ class TritonUpdates:
         return {} if self._pool is None else self._pool.figures
 
     def run(self, chunk: EpisodeChunk, first_update: int) -> None:
-        """Raises: ConfigError for positions that are not finite; in the first chunk, if kernels differ from PyTorch."""
+        """Raises: ConfigError for positions that are not finite; ParityError if no precision passes the first check."""
         for index in chunk.dropped:
             del self._episodes[index]
         with self._timed("placing episodes"):
