@@ -1,4 +1,4 @@
-"""Holds obstacles in motion on the device: cells and barriers in their own frames, and poses.
+"""Holds obstacles in motion on the device: cells and barriers in coordinates that move with them, and poses.
 
 hgn.kernels.poses defines the records. A turn is a frame of a simulation or an update of a training.
 Shape legend: T turns, S scenes, J most moving obstacles of a scene, V = J S rows.

@@ -28,8 +28,7 @@ class LiveSimulation:
     """One scene or several, a frame at a time, on the simulator's backend. Use it as a context manager, or close it.
 
     A change between two frames affects scene `index` from the next frame on. Particles that it does not add, remove or
-    restore keep their positions and velocity histories bitwise. Particles are sorted by scene. Within a scene, new
-    particles follow the others.
+    restore keep positions and velocity histories bitwise. Particles are sorted by scene, new ones last in theirs.
     """
 
     def __init__(

@@ -269,7 +269,7 @@ def _outside_obstacles(
 def _outside_moving(
     state: ParticleState, position_N3: torch.Tensor, step: StepConfig, dimensions: int, barriers: Barriers
 ) -> torch.Tensor:
-    """Stops the paths of a frame at moving obstacles, in each one's own frame: its poses at both ends of the path."""
+    """Stops the paths of a frame at moving obstacles, in coordinates that move with each, by its poses at both ends."""
     assert state.moving is not None
     lost_N1 = ~within_range(position_N3, state.domain_S3[state.scene_N]).all(-1, keepdim=True)
     end_N3, step = torch.where(lost_N1, state.position_N3, position_N3), replace(step, wall_clearance=None)
