@@ -146,7 +146,7 @@ def rollout(config: RolloutConfig) -> tuple[Path, Rollout]:
         reference_TN3 = episode.position_TN3[:frames]
         source |= {"data": Path(printable(config.data)).name, "episode": str(config.episode)}
     limit = simulator.info.maximum_initial_speed
-    fastest = float(np.linalg.norm(initial.velocity_N3, axis=-1).max(initial=0.0))
+    fastest = float(np.linalg.norm(initial.velocity_N3.astype(np.float64), axis=-1).max(initial=0.0))
     if limit is not None and fastest > limit * (1 + SAME_SPEED):
         print(
             f"velocity: groups begin with up to {fastest:.3g} domain units per second, those of the data of "

@@ -16,10 +16,10 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 33_226,
+    "hgn": 33_228,
     "datagen": 9_048,
     "tools": 6_216,
-    "tests": 32_405,
+    "tests": 32_412,
 }
 SETTINGS = 240  # fields of the dataclasses behind the commands, *Config
 

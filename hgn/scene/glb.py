@@ -27,6 +27,7 @@ NEUTRAL = re.compile(r"[A-Z]+_(materials|texture|lights|xmp|animation|audio)\w*"
 TRIANGLES, STRIP, FAN = 4, 5, 6  # modes of primitives; the other modes are points and lines
 COPIES = 3  # number of copies of vertices and triangles in the search for closed bodies
 MOST_JSON_BYTES = 16 << 20  # largest JSON tree; Python takes up to 33 bytes of memory for each of its bytes
+MOST_CHARACTERS = 4096  # of a uri that names a file
 LEAST_BYTES = 1024  # memory claimed even for a primitive without content, because each takes time
 _TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
@@ -190,6 +191,8 @@ class _File:
             return self.binary
         if uri.startswith("data:"):
             return base64.b64decode(uri.partition(",")[2], validate=True)
+        if len(uri) > MOST_CHARACTERS:  # before `resolve`, whose time grows with the square of the number of parts
+            raise ValueError(f"buffer {index} must have a uri of at most {MOST_CHARACTERS:,} characters")
         path = (self.folder / unquote(uri)).resolve()
         if not (path.is_file() and path.is_relative_to(self.folder)):
             raise FileNotFoundError(f"it names {uri!r}, which is no file in its folder")

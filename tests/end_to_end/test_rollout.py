@@ -124,3 +124,7 @@ def test_what_is_faster_than_the_data_is_said(tmp_path, capsys):
         assert rollout.main(given) == 0
         line = "velocity: groups begin with up to 5 domain units per second, those of the data of still with up to 3;"
         assert (line in capsys.readouterr().err) == wanted
+    scene.write_text(f"groups: [{group.replace('3, 0, -4', '1e38, 0, 1e38')}]\n")
+    with pytest.raises(ConfigError, match="diverged at frame 1"):  # without a warning of NumPy
+        rollout.main(given)
+    assert "groups begin with up to 1.41e+38 domain units" in capsys.readouterr().err

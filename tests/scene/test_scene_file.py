@@ -1,6 +1,7 @@
 """Scene files: what is read, and one table of what is refused."""
 
 import json
+import os
 import shutil
 from pathlib import Path
 
@@ -414,6 +415,7 @@ def test_a_mistyped_file_name_is_answered_with_the_file(tmp_path):
     (tmp_path / "my_scene.yaml").write_text("groups: []")
     with pytest.raises(ConfigError, match=r"got .*my_sceen\.yaml; did you mean my_scene\.yaml\?$"):
         load_scene(tmp_path / "my_sceen.yaml")
-    for absent in (tmp_path / "funnel.yaml", tmp_path / "nowhere" / "my_scene.yaml"):
+    os.mkfifo(tmp_path / "pipe.yaml")
+    for absent in (tmp_path / "funnel.yaml", tmp_path / "nowhere" / "my_scene.yaml", tmp_path / "pipe.yaml"):
         with pytest.raises(ConfigError, match=rf"got {absent}$"):
             load_scene(absent)
