@@ -16,7 +16,7 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 33_228,
+    "hgn": 33_229,
     "datagen": 9_048,
     "tools": 6_216,
     "tests": 32_412,

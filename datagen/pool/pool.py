@@ -51,7 +51,7 @@ class Pool:
         self._grid_deaths: dict[SceneTask, int] = {}  # deaths of makers that computed the obstacle grid of this scene
 
     def run(self) -> None:
-        """Runs until the writer's share of the shards is published, by any generator, then ends all workers.
+        """Runs until all shards that the writer may make are published, by this or another generator. Ends all workers.
 
         Raises: Stopped; ConfigError, OSError or RuntimeError from a worker.
         """

@@ -119,7 +119,8 @@ class Simulation:
     def run(self, frames: int, on_frame: Callable[[int], Any] | None = None) -> np.ndarray:
         """Returns positions of the next `frames` frames, float32 [T, N, 3]; calls `on_frame(number)` after each.
 
-        Positions are NaN in ended scenes, and before a particle enters. Raises: DivergedError without `isolate`.
+        Positions are NaN in ended scenes, but for particles in the frame in which they enter, and before a particle
+        enters. Raises: DivergedError without `isolate`.
         """
         first, done = self.frame, 0
         entering = [len(entry.state.position_N3) for entry in self.entries if entry.frame <= first + frames]
@@ -135,8 +136,8 @@ class Simulation:
     def blocks(self, frames: int) -> Iterator[torch.Tensor]:
         """Yields positions [T, N, 3] of the next `frames` frames in blocks on the device.
 
-        Positions are NaN in ended scenes. Particles that enter later have no rows yet. Raises as `run`. A block is
-        valid until the next one is requested.
+        Positions are NaN in ended scenes, as in `run`. Particles that enter later have no rows yet. A block is valid
+        until the next one is requested. Raises as `run`.
         """
         end = self.frame + frames
         while self.entries and self.entries[0].frame <= end:
