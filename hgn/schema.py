@@ -32,7 +32,7 @@ _CONTROL = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069\ud
 _MOST = "{1,2000}"
 _PORT, _WORD = r"\d+(?:[,;)'\"]|\s(?![^\s@:]+@)|$)", rf"(?:(?!://)\S){_MOST}"
 _USER = rf"[^\s/:@]{_MOST}:{_WORD}|[^/\s?#]{_MOST}|[^/:@'\"]{_MOST}:(?=\S)(?!{_PORT})(?:(?!://)[^@]){_MOST}"
-_SECRET = r"(?:sig|token|secret|pass|pwd|cred|auth|jwt)[\w.-]*|key(?:_?id)?|code"
+_SECRET = r"(?:sig|token|secret|pass|pwd|cred|auth|jwt|sas|hmac|bearer|session)[\w.-]*|key(?:_?id)?|code"
 _SECRETS = (  # pattern and replacement: for users of URLs and of addresses without a scheme, and for signatures
     (rf"(\w://)(?:{_USER})?@", r"\1"),
     (

@@ -19,7 +19,7 @@ LINES = {  # of Python, in tracked files
     "hgn": 33_229,
     "datagen": 9_048,
     "tools": 6_216,
-    "tests": 32_412,
+    "tests": 32_413,
 }
 SETTINGS = 240  # fields of the dataclasses behind the commands, *Config
 

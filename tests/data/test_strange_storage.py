@@ -191,6 +191,7 @@ def test_malformed_bodies_end(data, monkeypatch, content, pause_s):
             "http://h/a?X-Amz-Signature=s&n=1&sig=s 'http://h?AWSAccessKeyId=s#token=s'",
             "http://h/a?X-Amz-Signature=…&n=1&sig=… 'http://h?AWSAccessKeyId=…#token=…'",
         ),
+        ("h/a?sas=s&hmac=s&bearer=s&session_id=s", "h/a?sas=…&hmac=…&bearer=…&session_id=…"),
         ("http://h/a?frames=3&keyframes=4", "http://h/a?frames=3&keyframes=4"),
         ("\x1b]0;title\x07\x9b31m\u202egpj.\r\udc80", r"\x1b]0;title\x07\x9b31m\u202egpj.\r\udc80"),
         ("two\nlines of ü 日本 🙂", "two\nlines of ü 日本 🙂"),
