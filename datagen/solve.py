@@ -18,7 +18,7 @@ from hgn.scene.rollout_file import Rollout, rollout_bytes, write_rollout
 from hgn.scene.scene_file import find_scene, load_scene, notes_on_files
 from hgn.schema import ConfigError, FrameCount, FrameRate, from_mapping, require_bounds, require_replaceable, to_mapping
 from hgn.system.files import require_place, space_reserved
-from hgn.system.progress import bar
+from hgn.system.progress import advance_to, bar
 
 
 @dataclass(frozen=True)
@@ -53,14 +53,14 @@ def main(mapping: dict[str, Any]) -> int:
     from datagen.mpm.solver import SceneFailure, simulate
 
     space = space_reserved(out, rollout_bytes(config.frames, scene.particle_count))
-    with space, bar("simulating", total=config.frames, unit="frame") as progress:
-
-        def show(frame: int) -> None:
-            if frame == 1:
-                progress.unpause()  # it includes compilation, so it does not count for the rate
-            progress.update()
-
-        (result,) = simulate([scene], config.mpm, config.frames, config.frame_rate_hz, on_frame=show)
+    with space, bar("simulating", total=config.frames, initial=1, unit="frame") as progress:
+        (result,) = simulate(
+            [scene],
+            config.mpm,
+            config.frames,
+            config.frame_rate_hz,
+            on_frame=lambda frame: advance_to(progress, frame + 1),
+        )
         if isinstance(result, SceneFailure):
             raise ConfigError(f"{file} must be a scene that the solver keeps together, got {result.cause}")
     rollout = Rollout(

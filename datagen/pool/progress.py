@@ -10,6 +10,7 @@ from typing import Any, TextIO
 from tqdm import tqdm
 
 from hgn.schema import require
+from hgn.system.progress import advance_to
 
 _SPARSE_SECONDS = 30.0  # interval between lines if stderr is not a terminal
 
@@ -87,12 +88,8 @@ class BarProgress(Progress):
         frames = min(self._done * self._frames + sum(self._running.values()), self._total * self._frames)
         text = f"episodes {self._done}/{self._total}"
         if self._bar is not None:
-            if frames > self._bar.initial == self._bar.n:
-                self._bar.unpause()  # the first frame includes compilation, so it does not count for the rate
-            # the frames of a failed launch are subtracted, which tqdm allows only by assignment
-            self._bar.n = frames
             self._bar.set_description(text, refresh=False)
-            self._bar.update(0)
+            advance_to(self._bar, frames)  # fewer than before if a launch has failed
             if force:
                 self._bar.refresh()
         elif force or time.monotonic() - self._last_line > _SPARSE_SECONDS:

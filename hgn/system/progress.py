@@ -31,16 +31,16 @@ def duration(seconds: float) -> str:
 
 def bar(what: str, total: int | None, initial: int = 0, unit: str = "it") -> tqdm[Any]:
     """Returns a tqdm bar on stderr. Without a terminal it prints at most a line every 15 seconds."""
-    terminal = sys.stderr.isatty()
-    return tqdm(
-        total=total,
-        initial=initial,
-        unit=f" {unit}",
-        desc=what,
-        file=sys.stderr if terminal else _Lines(),
-        mininterval=0.5 if terminal else LINE_INTERVAL_S,
-        maxinterval=10.0 if terminal else LINE_INTERVAL_S,
-        miniters=1,
-        dynamic_ncols=terminal,
-        ncols=None if terminal else 110,
-    )
+    style: dict[str, Any] = {"file": sys.stderr, "mininterval": 0.5, "maxinterval": 10.0, "dynamic_ncols": True}
+    if not sys.stderr.isatty():
+        style = {"file": _Lines(), "mininterval": LINE_INTERVAL_S, "maxinterval": LINE_INTERVAL_S, "ncols": 110}
+    return tqdm(total=total, initial=initial, unit=f" {unit}", desc=what, miniters=1, **style)
+
+
+def advance_to(progress: tqdm[Any], count: int) -> None:
+    """Sets the count of a bar. The first items include compilation, so the rate begins after them."""
+    if count > progress.initial == progress.n:
+        progress.unpause()
+    # by assignment, because `update` cannot lower the count
+    progress.n = count
+    progress.update(0)

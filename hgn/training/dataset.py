@@ -18,7 +18,7 @@ from hgn.data.storage import is_remote
 from hgn.schema import ConfigError, from_stored, printable, require
 from hgn.system.machine import available_cpus
 from hgn.system.patience import UnreachableError, standard_patience_s
-from hgn.system.progress import bar, duration
+from hgn.system.progress import advance_to, bar, duration
 from hgn.system.ranks import first_rank
 from hgn.training.generator import Generator
 from hgn.training.stop import StopRequest
@@ -130,10 +130,7 @@ def wait_for_episodes(
             validation = max(0, min(needed - 1, config.dataset.validation_scenes))  # made before the last one needed
             progress = bar("generating", total=(needed + validation) * config.dataset.frames, unit="frame")
         if progress is not None and generator is not None:
-            frames = generator.frames_done()
-            if frames > progress.n == 0:
-                progress.unpause()  # the first frame includes compilation, so it does not count for the rate
-            progress.update(min(max(frames, progress.n), progress.total) - progress.n)
+            advance_to(progress, min(max(generator.frames_done(), progress.n), progress.total))
         time.sleep(0.5)
     return None
 
