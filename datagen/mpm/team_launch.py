@@ -28,7 +28,7 @@ SHARED_BLOCKS = 8  # smallest number of blocks with which `divided` keeps the te
 LATENCY = 0.5  # time of a substep without particles (30 µs) in units of the time that a particle per thread adds
 PAUSE = 0.8  # fraction of a launch's expected time in which the host sleeps
 SHORT_SECONDS = 0.1  # launches that are expected to be shorter are awaited without sleep
-PATIENCE = (2**31 - 1, 2**22)  # largest number of reads of a counter on a CPU, and on a GPU, where so many take seconds
+PATIENCE = (2**31 - 1, 2**22)  # largest number of reads of a counter on a CPU, and on a GPU, where 2^22 take seconds
 
 
 class Team(NamedTuple):

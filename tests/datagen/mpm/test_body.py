@@ -123,7 +123,7 @@ def test_poses_follow_the_keyframes():
 
 def test_far_and_large_obstacles_take_little_memory():
     """An obstacle that never comes near the domain has no samples, one much larger than it those within its reach; a
-    tilted sheet has at most twice as many as a level one."""
+    tilted sheet has at most twice the number of a level one."""
     up = Motion.of_frames([(0.0, (0, 0, 0)), (1.0, (0, 0.5, 0))], (0.0, 0.0, 0.0))
     for height, count in ((5.0, 0), (0.5, 1)):
         large = dataclasses.replace(sheet(height, -1e4, 1e4), motion=up)
