@@ -13,6 +13,7 @@ import numpy as np
 from hgn.command import run_command
 from hgn.config import DEFAULT_WEIGHTS, SimulatorConfig, Split
 from hgn.data.fresh import set_record
+from hgn.data.manifest import errors_in_config
 from hgn.data.reader import EpisodeStore, first_episodes
 from hgn.scene.distance import fraction_inside
 from hgn.scene.episode import Episode
@@ -69,10 +70,12 @@ def main(mapping: dict[str, Any]) -> int:
         own = set_convention(rows[0]["one_step_mse"], paths, episodes[: len(paths)] or episodes)
         print(convention_lines(own))
     if config.json is not None:
+        with errors_in_config(config.data):
+            seed = store.manifest.config["seed"]
         report = {
             "meta": provenance(simulator.device)
             | {"weights": Path(config.weights).name, "updates": info.updates, "split": config.split}
-            | {"set": set_record(config.data, store.manifest.config["seed"], [find_weights(config.weights)])},
+            | {"set": set_record(config.data, seed, [find_weights(config.weights)])},
             "rows": rows,
         }
         if own is not None:

@@ -113,6 +113,9 @@ class Manifest(_Identity):
             require_sound(totals.statistics or Statistics())
         count = sum(totals.shards for totals in shards.totals.values())
         require(count == len(shards), f"{path}.index.shards", f"{count}, as in totals", len(shards))
+        for key in ("frames", "long_frames"):
+            frames = head.config.get(key, 1)
+            require(type(frames) is int and frames > 0, f"{path}.config.{key}", "a whole number > 0", frames)
         expected = identity_hash(head.config)
         require(head.config_hash == expected, f"{path}.config_hash", f"{expected}, as config has it", head.config_hash)
         return Manifest(head.config_hash, head.config, head.requested, head.revision, shards)

@@ -323,16 +323,17 @@ class EpisodeStore(Episodes):
             text = f"{self.folder}/{shard.name} must be a sound shard, got {error}; delete it, and {REMEDY}"
             raise StorageError(text) from None
         self._scanned.add(entry.key)
-        actual = (episode.seed, episode.particle_count, episode.frame_count)
-        expected = (entry.seed, entry.particles, entry.frames)
         config = self.manifest.config
+        rate = episode.frame_rate_hz
+        actual = (episode.seed, episode.particle_count, episode.frame_count, rate)
+        expected = (entry.seed, entry.particles, entry.frames, config.get("frame_rate_hz", rate))
         # imported episodes have any length
         frames = config.get("frames", entry.frames)
         lengths = {frames, config.get("long_frames", frames)}
         if actual != expected or entry.frames not in lengths:
             raise StorageError(
-                f"{self.folder}/{shard.name}: {entry.key} must have seed, particles, frames {expected}, and frames "
-                f"must be one of the data set's ({lengths}), got {actual}; {REMEDY}"
+                f"{self.folder}/{shard.name}: {entry.key} must have seed, particles, frames, frame_rate_hz "
+                f"{expected}, and frames must be one of the data set's ({lengths}), got {actual}; {REMEDY}"
             )
         return episode
 

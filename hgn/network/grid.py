@@ -16,6 +16,7 @@ import torch
 from torch.compiler import is_exporting
 
 from hgn.network.cell_keys import AXIS_STRIDE, COORDINATE_LIMIT, find, pack, unique, unpack
+from hgn.schema import ConfigError
 
 # The 8 corners of a unit cube, z fastest: the offsets of a particle's cells, and of children in a parent.
 CORNER_83 = torch.tensor([[i >> 2 & 1, i >> 1 & 1, i & 1] for i in range(8)])
@@ -23,7 +24,7 @@ CORNER_83 = torch.tensor([[i >> 2 & 1, i >> 1 & 1, i & 1] for i in range(8)])
 DIRECTION_63 = torch.tensor([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]])
 
 
-class GridRangeError(ValueError):
+class GridRangeError(ConfigError):
     """A particle is not finite, or too far from the origin for the grid's integer coordinates."""
 
 

@@ -23,6 +23,7 @@ from hgn.scene.npz import read_header
 from hgn.scene.obstacle_grid import ObstacleGrid
 from hgn.scene.own_physics import input_parameters
 from hgn.scene.rest_shape import body_numbers, rest_neighbours
+from hgn.scene.specification import require_specification
 from hgn.schema import BoxSize, ConfigError, OrdinarySize, Vector, from_mapping, require, require_bounds
 
 SCHEMA_VERSION = 1
@@ -45,6 +46,7 @@ _PARAMETER = ("<f4", "N")
 _OPTIONAL = ("obstacle_friction", "past", "boundary")  # the last two only in imported episodes
 
 _NAME = re.compile(r"[A-Za-z0-9_-]+")
+_FARTHEST_CELL = 65_535  # largest coordinate of an obstacle cell; those of a network's grid have as many bits
 _FARTHEST = 1000.0  # largest coordinate, speed and gravity, in domain sizes; a network's grid reaches twice as far
 
 
@@ -102,8 +104,11 @@ class Episode:
                 _require_within(f"{self.key}: {name}", array, farthest if far else 3e38)
         _require_within(f"{self.key}: gravity", np.array(self.gravity), farthest)
         require_materials(f"{self.key}: material", self.material_N, self.materials)
-        cell_size = self.obstacle_grid.cell_size
-        require(0 < cell_size < math.inf, f"{self.key}: cell_size", "a finite number > 0", cell_size)
+        cell_size, cell_K3 = self.obstacle_grid.cell_size, self.obstacle_grid.cell_K3
+        require(1e-9 <= cell_size <= 1e9, f"{self.key}: cell_size", "from 1e-9 to 1e9", cell_size)
+        _require_within(f"{self.key}: obstacle_cell", cell_K3.astype(np.int64), _FARTHEST_CELL)
+        ordered = np.array_equal(np.unique(cell_K3, axis=0), cell_K3)
+        require(ordered, f"{self.key}: obstacle_cell", "sorted, each there once", f"{len(cell_K3)} cells")
         least = min((*self.wall_friction, *arrays.get("obstacle_friction", ())))
         require(least >= 0, f"{self.key}: friction", "at least 0", least)
 
@@ -285,7 +290,9 @@ def _decode_description(key: str, text: bytes) -> _Description:
     except (ValueError, RecursionError) as error:
         raise ConfigError(f"{key}.json must be JSON, got {error}") from None
     require_schema_version(mapping, f"{key}.json")
-    return from_mapping(_Description, mapping, f"{key}.json")
+    description = from_mapping(_Description, mapping, f"{key}.json")
+    require_specification(description.specification, description.solver.get("settings", {}), f"{key}.json")
+    return description
 
 
 def require_schema_version(mapping: object, name: str) -> None:

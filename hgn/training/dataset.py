@@ -11,7 +11,7 @@ from shutil import disk_usage
 
 from hgn.config import SceneConfig, TrainConfig
 from hgn.data.identity import identity_differences, physics_settings
-from hgn.data.manifest import SPLITS, Manifest
+from hgn.data.manifest import SPLITS, Manifest, errors_in_config
 from hgn.data.pooled import AnyStore, PooledStore
 from hgn.data.reader import EpisodeStore
 from hgn.data.storage import is_remote
@@ -55,7 +55,8 @@ def more_data(config: TrainConfig) -> list[EpisodeStore]:
         require(folder not in others, field, "a data set that is not among the others", folder)
         store = EpisodeStore(folder, "train")
         require(len(store) > 0, field, "a data set with training episodes", folder)
-        _require_goes_with(config, store, field)
+        with errors_in_config(folder):
+            _require_goes_with(config, store, field)
         stores.append(store)
     return stores
 

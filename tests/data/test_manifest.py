@@ -91,6 +91,11 @@ FAULTS = [  # the place in a manifest of the first release, its value or what is
     ("colour", 1, "colour is not a known key"),
     ("revision", "3", "revision must be a whole number, got '3'"),
     ("config_hash", "0" * 64, "config_hash must be"),
+    *(
+        (f"config.{key}", value, f"config.{key} must be a whole number")
+        for key in ("frames", "long_frames")
+        for value in ("x", [6], None, 6.0, 0)
+    ),
     ("requested.dev", 1, "requested must be of train, validation, test"),
     ("shards", lambda shards: shards.append(shards[0]), "must be listed once, got its episodes twice"),
     ("shards.0.bytes", None, r"shards\[0\]\.bytes must be a whole number"),

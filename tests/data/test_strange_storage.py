@@ -245,19 +245,28 @@ def test_few_open_files(data, monkeypatch):
     assert after - before <= 2
 
 
-def with_value(folder, split="train", value=np.nan, member="position.npy"):
-    """The name of a shard whose last position is `value`, NaN for example, and whose checksum in the index is right."""
+def with_change(folder, split, change):
+    """The name of a shard, changed by `change(bytes, places of the first episode's members)`, with a right checksum."""
     manifest = Manifest.load(folder)
     shards = list(manifest.shards)
     place = next(place for place, shard in enumerate(shards) if shard.split == split)
     path = Path(folder) / shards[place].name
     content = bytearray(path.read_bytes())
-    offset, size = shards[place].episodes[0].members[member]
-    content[offset + size - 4 : offset + size] = np.float32(value).tobytes()
+    change(content, shards[place].episodes[0].members)
     path.write_bytes(content)
     shards[place] = replace(shards[place], sha256=hashlib.sha256(content).hexdigest())
     replace(manifest, shards=ListedIndex(shards)).save(folder)
     return path.name
+
+
+def with_value(folder, split="train", value=np.nan, member="position.npy"):
+    """Gives a shard's last position a value, NaN for example."""
+
+    def change(content, members):
+        offset, size = members[member]
+        content[offset + size - 4 : offset + size] = np.float32(value).tobytes()
+
+    return with_change(folder, split, change)
 
 
 @pytest.mark.parametrize("split", ["train", "validation"])
@@ -276,6 +285,19 @@ def test_numbers_that_no_network_can_compute_with_are_named(data, tmp_path, memb
     """Positions and speeds far outside the domain end a training as NaN does."""
     name, rule = with_value(data.dataset.folder, "train", value, member), "at most 1000 in size"
     with pytest.raises(ConfigError, match=f"{name}.*{member[:8]} must be {rule if value < np.inf else 'finite'}, got"):
+        train.main(train_mapping(data, tmp_path / "run"))
+
+
+@pytest.mark.parametrize("rate", [b"1e-9", b"30.0"])
+def test_a_shard_of_another_frame_rate_is_named(data, tmp_path, rate):
+    """The frames before its first one, which follow from its velocity, would be wrong or infinite."""
+
+    def change(content, members):
+        at = content.index(b'"frame_rate_hz":60.0', members["json"][0]) + 16
+        content[at : at + 4] = rate
+
+    name = with_change(data.dataset.folder, "train", change)
+    with pytest.raises(ConfigError, match=rf"{name}: train-.* must have .* frame_rate_hz .*60.*, got .*{float(rate)}"):
         train.main(train_mapping(data, tmp_path / "run"))
 
 

@@ -66,14 +66,18 @@ def test_members():
     assert not decoded.position_TN3.flags.writeable
 
 
-def grid(cell_size=1 / 64, dtype=np.int32, normals=3):
-    return {"obstacle_grid": ObstacleGrid(cell_size, np.zeros((3, 3), dtype), np.zeros((normals, 3), np.float32))}
+def grid(cell_size=1 / 64, dtype=np.int32, normals=3, cells=((0, 0, 0),) * 3):
+    return {"obstacle_grid": ObstacleGrid(cell_size, np.array(cells, dtype), np.zeros((normals, 3), np.float32))}
 
 
 BROKEN_FIELDS: list[tuple[dict[str, Any], str]] = [
     (grid(normals=2), "obstacle_normal must have shape"),
     (grid(dtype=np.int64), "obstacle_cell must be of type int32"),
-    (grid(cell_size=0.0), "cell_size must be a finite number"),
+    (grid(cell_size=0.0), "cell_size must be from 1e-9 to 1e9"),
+    (grid(cell_size=5e-324), "cell_size must be from 1e-9 to 1e9"),
+    (grid(), "obstacle_cell must be sorted, each there once"),
+    (grid(cells=[[1, 0, 0], [0, 5, 5], [2, 0, 0]]), "obstacle_cell must be sorted, each there once"),
+    (grid(cells=[[-(2**31), 0, 0], [0, 0, 0], [1, 0, 0]]), "obstacle_cell must be at most 65535 in size"),
     ({"key": "train.000012"}, "key must be letters"),
     ({"key": ""}, "key must be letters"),
     ({"position_TN3": np.zeros((0, 5, 3), np.float32)}, "position must have shape"),
@@ -132,6 +136,16 @@ def headed(header):
     return b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header.encode()
 
 
+def specified(**specification):
+    return {"json": description(specification=specification)}
+
+
+def random_scene(**changes):
+    """A random scene with one obstacle."""
+    record = {"shape": "cone", "size": 0.3, "position": [0.5, 0.2, 0.5], "quaternion": [1.0, 0.0, 0.0, 0.0]} | changes
+    return specified(kind="random", obstacles=[{key: value for key, value in record.items() if value is not None}])
+
+
 SHAPED = "{'descr': '<f4', 'fortran_order': False, 'shape': %s, }"
 BROKEN_MEMBERS: list[tuple[dict[str, bytes | None], str]] = [
     ({"json": None}, "member json is missing"),
@@ -156,6 +170,28 @@ BROKEN_MEMBERS: list[tuple[dict[str, bytes | None], str]] = [
     ({"velocity.npy": headed(SHAPED % "(-2, -3)")}, "velocity.npy must be a plain .npy file"),
     ({"velocity.npy": headed(SHAPED % "(True, 0)")}, "velocity.npy must be a plain .npy file"),
     ({"velocity.npy": headed(SHAPED % f"(0, {2**63})")}, "velocity.npy must have another shape"),
+    *(({"json": description(solver={"settings": s})}, "json.solver.settings must be a map") for s in ([], None, 5)),
+    *(
+        ({"json": description(solver={"settings": {name: value}})}, f"json.solver.settings.{name} must be ")
+        for name in ("collider_friction", "youngs_modulus_pa")
+        for value in ("x", [1], float("nan"), -1.0, 1e300)
+    ),
+    *((specified(dimensions=n), "json.specification.dimensions must be ") for n in (7, "two", float("nan"), True)),
+    *((specified(particle_counts=c), "json.specification.particle_counts") for c in (["a"], [-3, 8], [2.5, 2.5], 5)),
+    *((specified(groups=g), "json.specification.groups") for g in (7, ["x"], [{"particle_count": "x"}])),
+    *((specified(kind="random", obstacles=o), "json.specification.obstacles") for o in (None, 5, [5], [[]])),
+    *(
+        (random_scene(**{name: value}), rf"json.specification.obstacles\[0\].*{name}")
+        for name, values in {
+            "shape": (None, 5, "torus"),
+            "size": (None, "x", [1.0, 2.0], float("nan"), 0.0, 1e30),
+            "position": (5.0, [1.0], [float("nan"), 0.0, 0.0]),
+            "quaternion": ("abcd", [1.0], 4 * [float("inf")]),
+            "friction": ("x", float("nan"), -1.0),
+            "keyframes": (5, [], [[0.0, [0.0, 0.0, 0.0]], ["a", [0.0, 0.0, 0.0]]], [[0.0, [float("nan"), 0.0, 0.0]]]),
+        }.items()
+        for value in values
+    ),
 ]
 
 
