@@ -16,7 +16,8 @@ from aiohttp.connector import Connection
 from hgn.data.verification import StorageError
 
 LARGEST_BYTES = 2**29  # limit for whole files: manifests of the first release, and shards of servers without ranges
-LEAST_BYTES_S, SLOW_S = 4096, 20.0  # smallest mean speed of a body, bytes/s, apart from a grace of SLOW_S seconds
+# smallest mean speed of a body, bytes/s, apart from a grace of SLOW_S seconds; later grace is up to SILENCE_S
+LEAST_BYTES_S, SLOW_S = 4096, 20.0
 SILENCE_S = 60.0  # limit between two pieces, seconds: aiohttp reports no error of a malformed body
 HEAD_S = 150.0  # limit for the heads of an answer and its redirects, seconds: a service may hash a shard first
 _deadline: ContextVar[float] = ContextVar("deadline")  # of the heads in a task; each call of fsspec is a task
@@ -39,7 +40,7 @@ class BoundedResponse(aiohttp.ClientResponse):
             requested = _RANGE.fullmatch(self.request_info.headers.get("Range", ""))
             partial = requested is not None and self.status == 206
             limit = int(requested[2]) - int(requested[1]) + 1 if requested is not None and partial else LARGEST_BYTES
-            pieces, size, start = [], 0, time.monotonic()
+            pieces, size, grace_s, before = [], 0, SLOW_S, time.monotonic()
             while piece := await self._piece():
                 size += len(piece)
                 if size > limit:
@@ -47,7 +48,10 @@ class BoundedResponse(aiohttp.ClientResponse):
                     raise StorageError(
                         f"{self.url} must answer with at most {limit} bytes, got more; check dataset.folder"
                     )
-                if size < LEAST_BYTES_S * (time.monotonic() - start - SLOW_S):
+                now = time.monotonic()
+                grace_s = min(grace_s + len(piece) / LEAST_BYTES_S, SILENCE_S) - (now - before)
+                before = now
+                if grace_s < 0:
                     self.close()
                     raise ConnectionError(f"fewer than {LEAST_BYTES_S} bytes a second")
                 pieces.append(piece)

@@ -129,6 +129,28 @@ def test_a_server_that_drips_does_not_answer(data, monkeypatch, dripping):
         assert heads or error.value.filename.endswith(dripping)
 
 
+def test_a_server_that_drips_after_a_burst(data, monkeypatch):
+    """Bytes that came early do not excuse a drip later."""
+    monkeypatch.setenv(VARIABLE, "0")
+    monkeypatch.setattr("hgn.data.bounded_http.SILENCE_S", 0.3)
+    monkeypatch.setattr("hgn.data.bounded_http.LEAST_BYTES_S", 10**6)
+    path = Path(data.dataset.folder) / "manifest.json"
+    path.write_bytes(path.read_bytes().ljust(10**7))
+
+    class Drip(PlainFiles):
+        def copyfile(self, source, outputfile):
+            with contextlib.suppress(ConnectionError):
+                outputfile.write(source.read(9 * 10**6))
+                for _ in range(200):
+                    outputfile.write(source.read(1))
+                    time.sleep(0.005)
+                outputfile.write(source.read())
+
+    server = answering(functools.partial(Drip, directory=data.dataset.folder))
+    with server as url, pytest.raises(UnreachableError, match="bytes a second"):
+        EpisodeStore(url, "train")
+
+
 @pytest.mark.parametrize("content", [b"zz\r\nabc", b"ffffffffffffffffff\r\nabc", b""])
 @pytest.mark.parametrize("pause_s", [0, 0.1])
 def test_malformed_bodies_end(data, monkeypatch, content, pause_s):
