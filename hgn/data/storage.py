@@ -37,6 +37,7 @@ _CHUNK_BYTES = 16 * 2**20  # bytes of a shard per request; a lost connection cos
 _CONNECT_S, _SILENCE_S, _ANSWER_S = 10.0, 60.0, 1800.0  # limits: to connect, between two pieces, for a whole answer
 _AWAY_S = 10.0  # for this time after a failed request, calls with patience_s=0 fail without a request
 _PROXY = re.compile(r"http://(\S+@)?([\w.-]+|\[[\w.:]+\])(:\d{1,5})?/?")
+_HTTP = ("http", "https")
 _NETWORK_PACKAGES = {"aiohttp", "botocore", "aiobotocore", "gcsfs", "google", "azure"}
 
 T = TypeVar("T")
@@ -151,7 +152,8 @@ def _require_address(url: str) -> None:
     """Refuses a URL without a host or path, or whose host or port is malformed. Raises: ConfigError."""
     try:
         address = urlsplit(url)
-        _ = address.port  # raises ValueError for a malformed port
+        _ = address.port  # raises ValueError for a malformed port, as this does for a host that DNS cannot contain
+        (address.hostname or "").encode("idna" if address.scheme in _HTTP else "utf-8")
     except ValueError as error:
         raise ConfigError(f"dataset.folder must be a folder or a URL, got {url!r} ({error})") from None
     place = (address.netloc + address.path).strip("/")
@@ -237,7 +239,7 @@ class _Remote(Storage):
         rule = "of a repository of data sets, hf://datasets/USER/NAME"
         require(place is None or place.is_dataset, "dataset.folder", rule, url)
         address = place.address if place else url
-        self._http = address.startswith(("http://", "https://"))
+        self._http = urlsplit(address).scheme in _HTTP
         options: dict[str, Any] = {}
         if self._http:
             import aiohttp
@@ -259,7 +261,10 @@ class _Remote(Storage):
             }
             options = {"client_kwargs": client, "use_listings_cache": False}
         try:
-            self._files, self._root = fsspec.core.url_to_fs(address, **options)
+            if self._http:  # url_to_fs would take :: in an IPv6 address for the end of a protocol
+                self._files, self._root = fsspec.filesystem(urlsplit(address).scheme, **options), address
+            else:
+                self._files, self._root = fsspec.core.url_to_fs(address, **options)
         except (ValueError, TypeError, ImportError) as error:
             cause = error.__cause__  # the missing package's error caused fsspec's ImportError
             reason = (isinstance(cause, ModuleNotFoundError) and missing_extra(cause)) or error

@@ -78,6 +78,8 @@ def test_url_or_folder():
         "http://[::1",
         "http://h:99999/x",
         "http://h:x/",
+        "http://a..b/x",
+        f"http://{64 * 'a'}/x",
         "http://",
         "s3://",
         "data://x",
@@ -311,6 +313,13 @@ def test_command_without_its_server(monkeypatch, capsys):
     error = capsys.readouterr().err
     assert error.startswith("error: no answer for 0 s (at last: ") and error.count("\n") == 1
     assert error.endswith(f"{url}/manifest.json; check its server or disk and run the same command again\n")
+
+
+def test_addresses_of_ipv6():
+    """fsspec would take the first :: for the end of a protocol."""
+    url = f"http://user:word@[::1]:{free_port()}/set"
+    with pytest.raises(UnreachableError, match="Cannot connect to host ::1:"):
+        Manifest.load(url, patience_s=0.01)
 
 
 def test_server_that_is_away_is_not_asked_at_once_again(folder, serve, monkeypatch):
