@@ -16,10 +16,10 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 33_229,
-    "datagen": 9_048,
+    "hgn": 33_361,
+    "datagen": 9_045,
     "tools": 6_216,
-    "tests": 32_413,
+    "tests": 32_543,
 }
 SETTINGS = 240  # fields of the dataclasses behind the commands, *Config
 

@@ -13,19 +13,19 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hgn.schema import ConfigError
+from hgn.schema import Bounded, ConfigError, NonNegative, require
 from hgn.system.splitmix import splitmix64
 
 
 @dataclass(frozen=True)
-class SamplerState:
+class SamplerState(Bounded):
     """Holds the position in the order of samples, over all ranks."""
 
-    epoch: int = 0
-    position: int = 0  # number of samples of this epoch that were taken
-    episodes: int = 0  # number of episodes in this epoch; 0: not yet fixed
+    epoch: NonNegative[int] = 0
+    position: NonNegative[int] = 0  # number of samples of this epoch that were taken
+    episodes: NonNegative[int] = 0  # number of episodes in this epoch; 0: not yet fixed
     digest: str = ""  # digest of the shards with these episodes; empty: unknown (checkpoints of 0.1.0)
-    window: int = 0  # episodes whose samples are shuffled together (training.shuffle_episodes); 0: all
+    window: NonNegative[int] = 0  # episodes whose samples are shuffled together (training.shuffle_episodes); 0: all
     seed: int | None = None  # seed of the order; None: unknown (checkpoints of 0.1.0)
 
 
@@ -178,5 +178,7 @@ class EpisodeSampler:
             )
         self._first_sample = np.concatenate([[0], np.cumsum(np.asarray(frame_counts) - 1)])
         self._order = epoch_order(self.seed, epoch, self._first_sample, self._window)
+        rule = f"at most the {len(self._order)} samples of epoch {epoch}"
+        require(position <= len(self._order), "checkpoint sampler_state.position", rule, position)
         self._first_seed = np.random.SeedSequence([self.seed, epoch]).generate_state(1, np.uint64)[0]
         self.state = SamplerState(epoch, position, len(frame_counts), stored, self._window, self.seed)

@@ -92,8 +92,8 @@ class Checkpoints(Callback):
         return {"best_error": self.best_error, "measured_update": self.measured_update}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        self.best_error = state_dict["best_error"]
-        self.measured_update = state_dict.get("measured_update", 0)  # missing in checkpoints of 0.2.0 and before
+        self.best_error = float(state_dict["best_error"])
+        self.measured_update = int(state_dict.get("measured_update", 0))  # missing in checkpoints of 0.2.0 and before
 
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
         if trainer.is_global_zero:

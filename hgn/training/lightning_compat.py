@@ -8,15 +8,21 @@ from __future__ import annotations
 import logging
 import os
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 from lightning.pytorch import Trainer
 from lightning.pytorch.plugins.environments import LightningEnvironment
 from lightning.pytorch.strategies import DDPStrategy
 
+from hgn.schema import ConfigError
+from hgn.system.machine import memory_is_full
 from hgn.training.distributed import averaging_options, started_by_srun
+
+# what Lightning and torch raise for checkpoints whose parts are not those of a trainer
+_ODD_PARTS = (LookupError, TypeError, ValueError, AttributeError, ArithmeticError, RuntimeError)
 
 
 def quieten() -> None:
@@ -69,3 +75,26 @@ def forget_sigterm(trainer: Trainer) -> None:
 def save_alone(trainer: Trainer, path: Path) -> None:
     """Saves a checkpoint on this rank, whichever it is, without the others."""
     trainer.strategy.checkpoint_io.save_checkpoint(trainer._checkpoint_connector.dump_checkpoint(), path)
+
+
+def name_odd_parts(trainer: Trainer, path: Path) -> None:
+    """Turns errors of restoring a checkpoint into a ConfigError with its path."""
+
+    def named(restore: Callable[..., None]) -> Callable[..., None]:
+        def call(*given: Any) -> None:
+            try:
+                restore(*given)
+            except _ODD_PARTS as error:
+                if isinstance(error, ConfigError) or memory_is_full(error):
+                    raise
+                cause = f"{type(error).__name__}: {' '.join(str(error).split())[:300]}"
+                raise ConfigError(
+                    f"checkpoint must hold the state of a training as this version writes it, got {path}: {cause}; "
+                    "delete it to resume from the one before"
+                ) from error
+
+        return call
+
+    connector = trainer._checkpoint_connector
+    for name in ("_restore_modules_and_callbacks", "restore_training_state"):
+        setattr(connector, name, named(getattr(connector, name)))

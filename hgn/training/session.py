@@ -112,6 +112,8 @@ def train_network(config: TrainConfig, start: Start, stop: StopRequest, publishe
         enable_model_summary=False,
         use_distributed_sampler=False,
     )
+    if resume is not None:
+        lightning_compat.name_odd_parts(trainer, resume.path)
     if devices * nodes > 1:
         record_collectives(run)
     if start.precompilation is not None:

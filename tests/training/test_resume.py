@@ -19,6 +19,7 @@ from hgn.config import NetworkConfig, TrainingConfig
 from hgn.data.reader import EpisodeStore
 from hgn.data.sampler import EpisodeSampler, SamplerState
 from hgn.scene.history import window
+from hgn.schema import ConfigError
 from hgn.training import monitor
 from hgn.training.callbacks import Stopper
 from hgn.training.checkpoint import read_checkpoint
@@ -237,3 +238,38 @@ def test_the_end_of_a_run_is_measured_once(data, tmp_path, monkeypatch):
     for _ in range(2):
         assert train.main(train_mapping(data, run, maximum_updates=5, monitor_every=3)) == 0
     assert [line["update"] for line in metrics(run) if "one_step/training" in line] == [3, 5]
+
+
+def of_state(**changes):
+    """Other values of the sampler's state."""
+    return lambda checkpoint: checkpoint["hgn"]["sampler_state"].update(changes)
+
+
+STATE = "checkpoint must hold the state of a training as this version writes it, got .*last.ckpt: "
+ODD = [
+    (lambda checkpoint: checkpoint.pop("callbacks"), STATE + "KeyError: 'callbacks'"),
+    *(
+        (lambda checkpoint, name=name, value=value: checkpoint.update({name: value}), STATE)
+        for name, values in {
+            "callbacks": ([], None, {"Checkpoints": 5}, {"Checkpoints": {"best_error": "x"}}),
+            "optimizer_states": ([5], [{"state": {}, "param_groups": []}]),
+            "pytorch-lightning_version": ("abc", 5, "0.0.1"),
+            "state_dict": ({}, {"x": torch.zeros(1)}),
+        }.items()
+        for value in values
+    ),
+    (of_state(position=10**9), "sampler_state.position must be at most the 25 samples of epoch 0, got 1000000000"),
+    *((of_state(**{key: -1}), f"{key} must be a finite number >= 0") for key in ("epoch", "position", "window")),
+]
+
+
+@pytest.mark.parametrize(("change", "message"), ODD)
+def test_checkpoints_with_other_parts_are_refused(finished, change, message):
+    """A checkpoint that is whole, but whose parts are not those of a training, is named."""
+    data, run = finished
+    path = run / "checkpoints" / "last.ckpt"
+    checkpoint = read_checkpoint(path)
+    change(checkpoint)
+    torch.save(checkpoint, path)
+    with pytest.raises(ConfigError, match=message):
+        train.main(train_mapping(data, run, maximum_updates=16))
