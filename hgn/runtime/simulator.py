@@ -360,7 +360,8 @@ class Simulator:
         rule = f"the network's {dimensions}"
         remedy = f"take weights of {scene.dimensions}D data, or an episode of {dimensions}D data"
         require(scene.dimensions == dimensions, "dimensions", rule, scene.dimensions, remedy=remedy)
-        known, remedy = "moving" in self.network.config.own_physics, "leave keyframes out, or run datagen.solve"
+        known = "moving" in self.network.config.own_physics
+        remedy = "take weights=own_physics, leave keyframes out, or run datagen.solve"
         rule = "at rest for a network without `moving` in network.own_physics"
         require(known or not scene.moving, "obstacles", rule, "keyframes", remedy=remedy)
         if info is None:

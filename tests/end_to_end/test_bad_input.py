@@ -88,7 +88,7 @@ VALUES = [
         ["network.inputs=relativ"],
         "network.inputs must be one of absolute, relative, local, got 'relativ'; d",
     ),
-    ("train", ["training.init_weights=mechanic"], "world), got 'mechanic'; did you mean mechanics?"),
+    ("train", ["training.init_weights=mechanic"], "own_physics), got 'mechanic'; did you mean mechanics?"),
     (
         "train",
         ["dataset.folder=hf:/datasets/a/b"],

@@ -300,7 +300,7 @@ def test_networks(listed):
             assert config.dataset.training_scenes == 800 and score.data == config.dataset.folder
             exported[score.weights] = score.data
     assert reported == set(exported)
-    assert set(shipped_weights()) - {"mechanics", "world"} <= {Path(file).stem for file in exported}
+    assert set(shipped_weights()) - {"mechanics", "own_physics"} <= {Path(file).stem for file in exported}
 
 
 def test_mechanics(listed):
