@@ -18,8 +18,8 @@ PACKAGES = ("hgn", "datagen", "tools")
 LINES = {  # of Python, in tracked files
     "hgn": 33_366,
     "datagen": 9_045,
-    "tools": 6_216,
-    "tests": 32_573,
+    "tools": 6_473,
+    "tests": 32_755,
 }
 SETTINGS = 240  # fields of the dataclasses behind the commands, *Config
 

@@ -7,8 +7,10 @@ figure of the solver where the case is simulated by the solver too. A new case n
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+
+import numpy as np
 
 from hgn.runtime.rollouts import RolloutResult
 from hgn.runtime.simulator import InitialState, Simulator
@@ -34,6 +36,18 @@ STANDARD = (Limit("energy_growth", high=0.02), Limit("outside_domain", high=0.0)
 
 
 @dataclass(frozen=True, eq=False)
+class Parameter:
+    """The parameter of a case of the family `parameters`, and the figure that depends on it."""
+
+    name: str
+    value: float
+    range: str  # inside, edge or outside of the range of the training data
+    figure: Callable[[np.ndarray, Scene], float]  # of positions [T, N, 3] and the scene
+    known: float | None = None  # closed form of the figure, which replaces that of the solver
+    scale: float | None = None  # length that errors are a fraction of; None: the expected figure
+
+
+@dataclass(frozen=True, eq=False)
 class Case:
     """Scenes that are simulated side by side, for how long, and the limits of their measures."""
 
@@ -51,6 +65,8 @@ class Case:
     at_frames: tuple[int, ...] = ()  # frames in which `collapse` is measured
     settled: int = 0  # frame from which on all particles rest
     upright: tuple[Scene, ...] = ()  # the scenes before they were turned
+    parameter: Parameter | None = None
+    nominal: tuple[Scene, ...] = ()  # the scenes with the default of the parameter, for the solver only
     gallery: GalleryCase | None = None  # the file of a gallery scene, which has bounds instead of limits
     references: tuple[float, ...] = ()  # the solver's figures, one for each bound of the gallery scene
 

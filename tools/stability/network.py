@@ -23,7 +23,8 @@ from tools.solver_rollouts import solver_trials
 from tools.stability.case import Case, Outcome, cut, gallery_cases
 from tools.stability.checks import gallery_rows, refused, row_of
 from tools.stability.gallery import is_gallery
-from tools.stability.network_cases import FAMILIES, Context
+from tools.stability.network_cases import FAMILIES, PARAMETERS, Context
+from tools.stability.parameters import parameter_row
 from tools.stability.row import Report, Row, table
 from tools.timing import FrameClock, compile_frames
 
@@ -38,6 +39,7 @@ class StabilityNetworkConfig(SimulatorConfig, Bounded):
 
     weights: str = DEFAULT_WEIGHTS  # a file of python -m hgn.export, or the name of shipped weights
     # throw, gravity, collision, collapse, rest, particles, domain, speed, single, slope, far; null: all of these.
+    # parameters: friction and constants of materials; a quarter of an hour on one core.
     # gallery: the scenes of conf/gallery against the solver's figures; gallery_1: the draw for
     # choices; gallery_2: the draw for reports; gallery_NUMBER: another draw
     cases: tuple[CaseName, ...] | None = None
@@ -83,7 +85,7 @@ def cases_of(config: StabilityNetworkConfig, simulator: Simulator) -> list[Case]
         config.scene, simulator.network.config, simulator.frame_rate_hz, config.frames, config.long_frames,
         config.solver,
     )  # fmt: skip
-    wanted = config.cases or tuple(FAMILIES)
+    wanted = config.cases or tuple(name for name in FAMILIES if name != PARAMETERS)
     cases = [case for name, family in FAMILIES.items() if name in wanted for case in family(context)]
     return cases + [case for name in wanted if is_gallery(name) for case in gallery_cases(name)]
 
@@ -97,7 +99,7 @@ class Runner:
         self._solved: dict[int, RolloutResult] = {}  # key: id of the scene
         self._to_solve: dict[tuple[int, Vector], dict[int, Scene]] = {}  # keys: frames and domain, then id
         for case in cases:
-            for scene in (*(case.scenes if case.solver else ()), *case.upright):
+            for scene in (*(case.scenes if case.solver else ()), *case.upright, *case.nominal):
                 self._to_solve.setdefault((case.frames, scene.domain_size), {})[id(scene)] = scene
 
     def rows(self, case: Case) -> list[Row]:
@@ -118,6 +120,9 @@ class Runner:
         more: dict[str, Any] = {"seconds": time.monotonic() - started}
         more |= {"ms": clock.milliseconds()} if case.reported is None else {}
         outcome = Outcome(case, initial, trials, self.simulator, solver, upright)
+        if case.parameter:
+            nominal = Outcome(case, initial, self._solver(case.nominal, case.frames), self.simulator)
+            return [parameter_row(outcome, nominal, more)]
         return gallery_rows(outcome, more) if case.gallery else [row_of(outcome, more)]
 
     def _straight(self, case: Case) -> list[RolloutResult]:

@@ -22,6 +22,7 @@ from hgn.schema import ConfigError
 from tools.scenes import filled, joined
 from tools.stability.case import STANDARD, Case, Limit
 from tools.stability.measures import EARTH, TURNS, wall_distance
+from tools.stability.parameters import parameters
 
 SPEEDS = (0.0, 0.1, 0.3, 1.0, 3.0, 10.0)  # domain units per second
 ROOT = 3**-0.5
@@ -53,6 +54,8 @@ PARTICLE_FACTOR = 10.0  # factor of the volume of groups, and so of the number o
 DOMAIN_SIDES = (2, 3, 4)  # factors of length and depth; obstacles and groups grow with the floor
 SPEED_FACTOR = 3.0  # largest initial speed, in multiples of the speed after a fall through the domain
 FAR_CELLS = 64_000  # length in obstacle cells of a domain with a scene at its far end
+
+PARAMETERS = "parameters"  # family that runs only if it is named, because the solver takes long
 
 FLIES = (Limit("gravity_error", high=0.02),)
 KEEPS = Limit("kept", low=0.99)
@@ -198,6 +201,7 @@ FAMILIES: dict[str, Callable[[Context], Iterator[Case]]] = {
     "throw": throws, "gravity": gravities, "collision": collisions, "collapse": collapses, "rest": rests,
     "particles": many_particles, "domain": large_domains, "speed": fast_groups,
     "single": single_particles, "slope": slopes, "far": far_end,
+    PARAMETERS: lambda context: parameters(context.frame_rate_hz, context.solver),
 }  # fmt: skip
 
 
