@@ -12,7 +12,7 @@ from typing import Any
 
 from hgn.command import run_command
 from hgn.data.foreign.settings import ImportConfig
-from hgn.schema import from_mapping, require
+from hgn.schema import from_mapping, printable, require
 from hgn.system.progress import bar
 
 
@@ -30,7 +30,7 @@ def main(mapping: dict[str, Any]) -> int:
     with bar("importing", total=None, unit="episode") as progress:
         manifest, note = import_set(Path(str(source)), config, lambda _: progress.update())
     if note is not None:
-        print(note, file=sys.stderr)
+        print(printable(note), file=sys.stderr)
     own = manifest.config["imported"]
     counts = ", ".join(f"{count} {split}" for split, count in manifest.requested.items())
     gravity = ", ".join(f"{value:.4g}" for value in own["gravity"])

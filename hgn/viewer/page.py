@@ -175,7 +175,7 @@ class PlayPage:
     def _show_status(self) -> None:
         session = self.session
         speed = f"**{self.frames_a_second:.0f}** frames a second · **{len(session.newest.position_N3):,}** particles"
-        backend = f"{session.weights} on {session.simulator.device.type}"
+        backend = f"{plain(Path(session.weights).name)} on {session.simulator.device.type}"
         self.status.content = f"{speed}\n\nframe {session.frame} · {backend}"
         self.play_button.label = "Pause" if self.playing else "Play"
         self.gravity.value = session.gravity

@@ -152,6 +152,10 @@ def test_what_leaves_the_bounds_later_is_told(tmp_path, capsys):
     assert line.startswith("bounds: particles of 2 of 3 trajectories go farther out of them than a radius (0.035)")
     assert "train.npz: 00002 to y = -0.25 in frame 6, where bounds are [0.0, 1.0]" in line
     assert line.endswith("give bounds=… around all particles, or leave these trajectories out")
+    archive = tmp_path / "of_left" / "train.npz"  # names that the file's author chose
+    np.savez(archive, **{name.replace("00002/", "\x1b[31m/"): array for name, array in np.load(archive).items()})
+    assert import_trajectories.main(options(tmp_path / "named", archive.parent)) == 0
+    assert "train.npz: \\x1b[31m to y = -0.25" in capsys.readouterr().err
 
 
 def flights(*gravities):

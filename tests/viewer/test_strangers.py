@@ -40,14 +40,22 @@ def sent(page, action):
     page._show_status()
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        *("<img src=x onerror=alert(1)>.obj", "<script>alert(1)<script>.obj", "[x](javascript:alert(1)).obj"),
-        *("![x](http:example.org).obj", "`a` **b** | c.obj", "\x1b[31mred.obj", "{{constructor}}.obj", "a\nb.obj"),
-        "ü" * 200 + ".obj",
-    ],
+NAMES = (
+    *("<img src=x onerror=alert(1)>.obj", "<script>alert(1)<script>.obj", "[x](javascript:alert(1)).obj"),
+    *("![x](http:example.org).obj", "`a` **b** | c.obj", "\x1b[31mred.obj", "{{constructor}}.obj", "a\nb.obj"),
+    "ü" * 200 + ".obj",
 )
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_names_of_weights_are_shown_as_plain_words(page, monkeypatch, name):
+    """So is the name of the file of weights, which may be from anywhere."""
+    monkeypatch.setattr(page.session, "weights", f"folder/{name}")
+    page._show_status()
+    assert re.fullmatch(r".* particles\n\nframe \d+ · [A-Za-z0-9_.-]{1,32} on cpu", page.status.content)
+
+
+@pytest.mark.parametrize("name", NAMES)
 def test_names_of_files_are_shown_as_plain_words(page, messages, name):
     """Whatever a file is called, the page shows letters, digits, dots, hyphens and underscores."""
     sent(page, lambda: page._add_file(name, TRIANGLES))
