@@ -47,7 +47,8 @@ def read_glb(path: Path) -> tuple[np.ndarray, np.ndarray]:
     vertices, triangles, vertex_count = [np.zeros((0, 3))], [np.zeros((0, 3), np.int64)], 0
     for mesh, weights, place_M44 in file.placed():
         for position_V3, triangle_F3 in file.surfaces(mesh, weights):
-            claims.add("its nodes", COPIES, len(place_M44), LEAST_BYTES + position_V3.nbytes + triangle_F3.nbytes)
+            count = max(len(place_M44), 1)  # the primitives of a node without instances are computed too
+            claims.add("its nodes", COPIES, count, LEAST_BYTES + position_V3.nbytes + triangle_F3.nbytes)
             for place_44 in place_M44:
                 vertices.append(position_V3 @ place_44[:3, :3].T + place_44[:3, 3])
                 triangles.append(triangle_F3 + vertex_count)

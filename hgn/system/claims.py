@@ -39,30 +39,40 @@ class Claims:
 
 
 def require_plain_pickle(data: bytes, names: re.Pattern[str] = re.compile(".*")) -> None:
-    """Checks the sizes in a pickle, for which Python allocates memory at once, and its calls (`module name`).
+    """Checks the sizes in a pickle, for which Python allocates memory at once, its calls (`module name`), and its keys.
 
     Raises ValueError or LookupError for a pickle that is cut, has a memo larger than itself, calls other names than
-    `names`, or contains a tuple of more than MOST_ITEMS, references resolved: the hash of a key visits all of them.
+    `names`, contains a tuple of more than MOST_ITEMS, references resolved, or a set, a key of several items, or an
+    integer of more than 64 bits: many keys could have one hash, and each would be compared with all others.
     """
-    stack: list[int | None] = []  # number of items of each object; None: a mark
+    stack: list[int | None] = []  # number of items of each object; None: a mark; 0: the class OrderedDict
     memo: dict[int, int | None] = {}
     for operation, argument, _ in pickletools.genops(data):
         if "PUT" in operation.name and int(argument or 0) > len(data):
             raise ValueError(f"a memo of {argument} objects in a pickle of {len(data)} bytes")
+        if isinstance(argument, int) and argument.bit_length() > 64:
+            raise ValueError(f"an integer of {argument.bit_length()} bits")
         if operation.name in ("GLOBAL", "STACK_GLOBAL", "INST") and names.fullmatch(str(argument)) is None:
             raise ValueError(f"{argument}, which is no part of it")
         if "GET" in operation.name:
             stack.append(memo[int(argument or 0)])
         elif "PUT" in operation.name or operation.name == "MEMOIZE":
             memo[int(argument) if argument is not None else len(memo)] = stack[-1]
+        elif operation.name == "GLOBAL" and argument == "collections OrderedDict":
+            stack.append(0)
         else:
-            before, size = operation.stack_before, 0
+            before, items = operation.stack_before, list[int | None]()  # from the top of the stack
             if pickletools.markobject in before:
-                size, before = sum(iter(stack.pop, None)), before[:-2]
-            size += sum(stack.pop() or 0 for _ in before)
-            if size > MOST_ITEMS:
-                raise ValueError(f"references that stand for {size} items")
-            stack += [None if kind is pickletools.markobject else 1 + size for kind in operation.stack_after]
+                items, before = list(iter(stack.pop, None)), before[:-2]
+            items += [stack.pop() or 0 for _ in before]
+            sizes = [size or 0 for size in items]
+            if sum(sizes) > MOST_ITEMS:
+                raise ValueError(f"references that stand for {sum(sizes)} items")
+            pairs = operation.name == "REDUCE" and sizes[1] == 0 and sizes[0] > 1
+            key = operation.name in ("SETITEM", "SETITEMS", "DICT") and max(sizes[1::2], default=1) > 1
+            if pairs or key or operation.name in ("ADDITEMS", "FROZENSET"):
+                raise ValueError("a key of several items, or a set")
+            stack += [None if kind is pickletools.markobject else 1 + sum(sizes) for kind in operation.stack_after]
 
 
 def require_few_items(value: Any) -> None:

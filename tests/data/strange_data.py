@@ -11,7 +11,8 @@ import zlib
 import h5py
 import numpy as np
 from data.foreign_writers import metadata, write
-from data.strange_files import cases, key_of_tuples, laughing, saved
+from data.strange_files import cases, saved
+from data.strange_pickles import key_of_tuples, keys_of_one_hash, laughing
 from data.test_index import shard
 from scene.test_rollout_file import make_rollout
 
@@ -226,15 +227,16 @@ def h5(name, change):
     return on
 
 
+def filled(value):
+    """An array of one object."""
+    array = np.empty(1, object)
+    array[0] = value
+    return array
+
+
 def objects(value):
     """A pickled array that refers to a value."""
-
-    def on(folder):
-        entry = np.empty(1, object)
-        entry[0] = value
-        np.savez(folder / "train.npz", gns_data=entry)
-
-    return on
+    return lambda folder: np.savez(folder / "train.npz", gns_data=filled(value))
 
 
 def raw_pickle(data):
@@ -276,6 +278,13 @@ cases(
         "npz": imported("plain", zipped({"a/position": ((9, BOMB // 108, 3), "<f4", BOMB)})),
         "object claim": imported("geoelements", zipped({"gns_data": ((10**10,), "|O", 0)})),
         "references": imported("geoelements", objects((laughing(), np.full(4, 5)))),
+        **{
+            f"{len(parts)} parts": imported("geoelements", objects(tuple(parts)))
+            for parts in ([laughing()], [laughing(), 1, 2, 3])
+        },
+        "references as a trajectory": imported("geoelements", objects(laughing())),
+        "an array of references": imported("geoelements", objects(filled(laughing()))),
+        "keys of one hash": imported("geoelements", raw_pickle(keys_of_one_hash())),
         "memo": imported("geoelements", raw_pickle(b"\x80\x02}r\xff\xff\xff\x7f.")),
         "long bytes": imported("geoelements", raw_pickle(b"\x80\x04\x8e" + struct.pack("<Q", 10**11) + b"x.")),
         "sequence length": imported("deepmind", sequence_length=10**30),

@@ -1,11 +1,8 @@
-"""Files of at most 1 MB that claim far more than they hold: weights, checkpoints, meshes and scenes."""
+"""Files of at most 1 MB that claim far more than they hold: weights, meshes and scenes."""
 
 import json
 import math
-import os
-import pickle
 import struct
-import zipfile
 
 import numpy as np
 import torch
@@ -19,7 +16,6 @@ from hgn.scene.obstacle_grid import build_obstacle_grid
 from hgn.scene.scene_file import load_scene
 from hgn.schema import to_mapping
 from hgn.system.yaml_files import read_yaml
-from hgn.training.checkpoint import network_of_checkpoint, read_checkpoint
 
 CASES = {}
 
@@ -44,7 +40,7 @@ def saved(name, content):
     return make
 
 
-# weights and checkpoints
+# weights
 
 
 def weights(text=None, tensors=None, **network):
@@ -79,90 +75,6 @@ cases(
     load_weights,
 )
 
-
-def checkpoint(content, compress=False):
-    def make(folder):
-        path = folder / "c.ckpt"
-        torch.save(content() if callable(content) else content, path)
-        return deflated(path) if compress else path
-
-    return make
-
-
-def deflated(path, pickled=None):
-    """The archive with compressed records; `pickled` replaces data.pkl."""
-    with zipfile.ZipFile(path) as archive:
-        records = {name: archive.read(name) for name in archive.namelist()}
-    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED if pickled is None else zipfile.ZIP_STORED) as archive:
-        for name, data in records.items():
-            archive.writestr(name, pickled if pickled is not None and name.endswith("data.pkl") else data)
-    return path
-
-
-def deflated_many(path):
-    """An archive of eight thousand records."""
-    with zipfile.ZipFile(path, "w") as archive:
-        for number in range(8000):
-            archive.writestr(f"c/data/{number}", b"")
-        archive.writestr("c/data.pkl", b"\x80\x02}.")
-    return path
-
-
-def pickled(data):
-    return lambda folder: deflated(checkpoint({"hgn": {}})(folder), data)
-
-
-def called(function, *arguments):
-    """A pickle that calls a function."""
-
-    class Call:
-        def __reduce__(self):
-            return function, arguments
-
-    return pickle.dumps({"hgn": Call()}, protocol=2)
-
-
-def key_of_tuples(value=b"K\1"):
-    """A pickle of a dict with a key of 2^60 items, by references: its hash visits each of them."""
-    pairs = b"".join(b"h%c\x86q%c" % (depth, depth + 1) for depth in range(60))
-    return b"\x80\x02}(K\1\x85q\0" + pairs + value + b"u."
-
-
-def section(**network):
-    config = to_mapping(NetworkConfig(width=8, levels=1, message_passing_steps=1)) | network
-    return {"hgn": {"network": config, "step": {}}, "state_dict": {}}
-
-
-def laughing(depth=12, width=10):
-    """A list of 10 to the 12 items, by references."""
-    value = [1.0]
-    for _ in range(depth):
-        value = [value] * width
-    return value
-
-
-cases(
-    "checkpoint",
-    {
-        "compressed": checkpoint({"hgn": {}, "state_dict": {"w": torch.zeros(18_000_000)}}, compress=True),
-        "wide": checkpoint(section(width=65_536)),
-        "references": checkpoint({"hgn": {"network": laughing()}, "state_dict": {}}),
-        "references in the network": checkpoint(section(materials=laughing())),
-        "expanded tensor": checkpoint(
-            lambda: section() | {"state_dict": {"network.x": torch.zeros(1).expand(10**6, 10**6)}}
-        ),
-        "bytearray": pickled(called(bytearray, 10**11)),
-        "a key of tuples": pickled(key_of_tuples()),
-        "memo": pickled(b"\x80\x02}r\xff\xff\xff\x7f."),
-        "called storage": pickled(b"\x80\x02ctorch\nFloatStorage\n\x8a\x05\x00\xe8vH\x17\x85R."),
-        "pipe": lambda folder: (os.mkfifo(folder / "c.ckpt"), folder / "c.ckpt")[1],
-        "empty section": checkpoint({"hgn": {}, "state_dict": {}}),
-        "nested lists": pickled(b"\x80\x02" + 100_000 * b"]" + 99_999 * b"a" + b"."),
-        "many records": lambda folder: deflated_many(folder / "c.ckpt"),
-        "long text": pickled(b"\x80\x04\x8d" + struct.pack("<Q", 10**11) + b"x."),
-    },
-    lambda path: network_of_checkpoint(read_checkpoint(path), path),
-)
 
 # meshes
 
@@ -251,6 +163,19 @@ def empty_primitives(header):
     instances(30_000)(header)
 
 
+def no_instances(header):
+    """Nodes with 6 * 10^4 primitives of 4 * 10^5 vertices, in no place."""
+    count, views = len(header["accessors"]), len(header["bufferViews"])
+    header["bufferViews"].append({"buffer": 1, "byteLength": 1_200_000})
+    header["buffers"].append({"uri": "m.bin"})
+    places = {"bufferView": 0, "componentType": 5126, "count": 0, "type": "VEC3"}
+    header["accessors"] += [places, {"bufferView": views, "componentType": 5121, "count": 399_999, "type": "VEC3"}]
+    header["meshes"] = [{"primitives": [{"attributes": {"POSITION": count + 1}}] * 6000}]
+    instancing = {"EXT_mesh_gpu_instancing": {"attributes": {"TRANSLATION": count}}}
+    header["nodes"] = [{"mesh": 0, "extensions": instancing}] * 10
+    header["scenes"][0]["nodes"] = list(range(10))
+
+
 def spiral(count):
     """The lines of one polygon, most of whose ears contain another corner."""
     turns = [(index, 1.0) for index in range(count)] + [(index, 1.1) for index in reversed(range(count))]
@@ -303,6 +228,7 @@ cases(
         "instances by paths": glb(branching),
         "primitives": glb(repeated_primitives),
         "empty primitives": glb(empty_primitives),
+        "no instances": lambda folder: saved("m.bin", bytes(1_200_000))(folder) and glb(no_instances)(folder),
         "weights": glb(lambda header: (targets(header), header["meshes"][0].update(weights=[1e308] * 2))),
         "stride 0": glb(stride_0),
         "large view": lambda folder: saved("m.bin", bytes(64 << 20))(folder) and glb(large_view)(folder),

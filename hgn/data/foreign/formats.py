@@ -188,9 +188,8 @@ def _read_geoelements(folder: Path, split: str, info: SetInfo) -> Iterator[_Name
                 parts = [entry[field] for field in fields if field in entry]
             parts = list(parts) if isinstance(parts, (tuple, list, np.ndarray)) else []
             if len(parts) not in (2, 3):
-                raise ConfigError(
-                    f"{name} must be (position, particle_type) or these and material_property, got {entry!r:.60}"
-                )
+                rule = "(position, particle_type) or these and material_property"
+                raise ConfigError(f"{name} must be {rule}, got {type(entry).__name__} of {len(parts)}")  # of any size
             yield name, dict(zip(fields, parts, strict=False))
 
 
