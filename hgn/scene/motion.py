@@ -16,6 +16,7 @@ from hgn.schema import Vector, require
 
 LEAST_S = 1e-9  # least time between two keyframes, in seconds; in less an obstacle's speed could be infinite
 FARTHEST = 1000.0  # largest translation of a keyframe, domain units: networks follow the cells on its way
+UNIT = 1e-6  # largest difference of a rotation's product with its transpose from the identity
 Keyframes = Sequence[tuple[float, Vector]]  # times in seconds and translations in domain units
 
 
@@ -39,6 +40,11 @@ class Motion:
         require(times[0] >= 0, "keyframes", "at times >= 0", times.tolist())
         farthest = float(np.abs(self.translation_T3).max())
         require(farthest <= FARTHEST, "keyframes", f"of translations of at most {FARTHEST:g} units", farthest)
+        rotation_T33 = np.asarray(self.rotation_T33, np.float64)
+        near = bool(np.abs(rotation_T33).max() < 2)  # products of larger numbers may overflow
+        away_T33 = rotation_T33 @ rotation_T33.transpose(0, 2, 1) - np.eye(3) if near else np.ones(1)
+        upright = np.abs(away_T33).max() < UNIT and bool((np.linalg.det(rotation_T33) > 0).all())
+        require(upright, "keyframes", "of rotations", float(rotation_T33.flat[0]))
 
     @staticmethod
     def of_frames(keyframes: Keyframes, pivot: Vector) -> Motion:

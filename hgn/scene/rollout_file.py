@@ -435,7 +435,10 @@ def _read_motion(entry: h5py.Group) -> Motion:
     for (name, value), shape in zip(arrays.items(), shapes, strict=True):
         if value.shape != shape:
             raise ConfigError(f"{entry.name}: {name} must have shape {shape}, got {value.shape}")
-    return Motion(**arrays, pivot=_triple(entry.attrs["pivot"]))
+    pivot = _triple(entry.attrs["pivot"])
+    fits = all(abs(value) <= LARGEST for value in pivot)
+    require(fits, f"{entry.name}: pivot", "finite and at most 1e15", list(pivot))
+    return Motion(**arrays, pivot=pivot)
 
 
 def _triple(values: Any) -> Vector:

@@ -249,6 +249,13 @@ def test_a_failed_write_leaves_the_old_file(tmp_path):
 SHEET = "hgn/obstacles/0000"
 
 
+def turned(rotation_T33, pivot=0.0):
+    """Keyframes of the sheet with these rotations."""
+    count, attributes = len(rotation_T33), {"pivot": np.full(3, pivot)}
+    values = {"time": np.arange(count), "translation": np.zeros((count, 3)), "rotation": rotation_T33}
+    return lambda file: (file[SHEET].update(values), file[SHEET].attrs.update(attributes))
+
+
 def external_points(file):
     """HDF5 can take data from any file that its reader may read."""
     points = file["VTKHDF/Points"]
@@ -291,6 +298,8 @@ def external_points(file):
         *((attribute("frame_rate_hz", rate), "frame_rate_hz must be from 1e-15 to 1e15") for rate in (1e300, 5e-324)),
         (attribute("domain_size", np.full(3, 1e300)), r"domain_size\[0\] must be from 1e-15 to 1e15"),
         (attribute("gravity", np.full(3, 1j)), "must be a complete HDF5 file, got .*complex"),
+        *((turned(x * np.ones((1, 3, 3))), "must be of rotations") for x in (0, np.nan, 1e300, -np.eye(3))),
+        *((turned(np.eye(3)[None], value), "pivot must be finite and at") for value in (np.nan, 1e300)),
         (external_points, "must lie in the file itself"),
         (lambda file: file.__setitem__("VTKHDF/other", h5py.ExternalLink("/", "/")), "got a link in other"),
     ],
