@@ -314,14 +314,18 @@ def test_two_viewers_and_a_lost_connection(viewer, play):
     until_blue(viewer)
 
 
-def test_who_may_read_the_page(play):
+def test_who_may_read_the_page(play, caplog):
     """Neither the page nor the websocket answers without the token, nor with another; the host is loopback's. What
-    other programs on this machine have left in the browser, in any form, does not close the page."""
+    other programs on this machine have left in the browser, in any form, does not close the page. A name that no file
+    can have is not found."""
     bare, token = urljoin(play.address, "/"), urlsplit(play.address).path.strip("/")
     assert bare.startswith("http://127.0.0.1:") and play.address == f"{bare}{token}/" and len(token) > 20
     for address in (bare, f"{bare}wrong/", f"{bare}?token={token}"):
         with pytest.raises(urllib.error.HTTPError, match="403"):
             urllib.request.urlopen(address)
+    for name in ("a" * 300, "a/" * 3000, "%FF" * 100, "%00"):
+        with pytest.raises(urllib.error.HTTPError, match="404"):
+            urllib.request.urlopen(play.address + name)
     with pytest.raises(InvalidStatus, match="403"):
         connect(bare.replace("http", "ws"))
     with pytest.raises(ConfigError, match=r"host must be an address of this machine, got '192.0.2.1'"):
@@ -329,6 +333,7 @@ def test_who_may_read_the_page(play):
     for cookies in ("user@host=1", "a/b=1", 'x={"a":1,"b":2}', "path=1", "flag"):
         with urllib.request.urlopen(urllib.request.Request(play.address, headers={"Cookie": cookies})) as answer:
             assert answer.status == 200
+    assert not [record for record in caplog.records if record.exc_info]
 
 
 def test_stage():
