@@ -198,6 +198,10 @@ work() { # GPU, stage
 
 read_list
 mkdir -p "$folder"
+if [[ -L $folder/.lock || -e $folder/.lock && ! -f $folder/.lock ]]; then
+    echo "error: $folder/.lock must be a file, got a link, pipe, device or folder; delete it" >&2
+    exit 2
+fi
 exec {lock}>"$folder/.lock" # commands keep it open: what a killed queue leaves behind holds it too
 if ! flock -n "$lock"; then
     echo "error: FOLDER must be one that no other queue works in, got '$folder'; wait for it, or take another" >&2

@@ -16,7 +16,7 @@ from pathlib import Path
 from datagen.pool.plan import ShardRange
 from hgn.data.manifest import SPLITS
 from hgn.schema import ConfigError
-from hgn.system.locks import NO_LOCKS, lock_bytes
+from hgn.system.locks import NO_LOCKS, lock_bytes, open_lock
 
 LOCK_NAME = ".lock"
 _MANIFEST_BYTE, _GENERATORS_BYTE, _FIRST_EPISODE_BYTE = 0, 1, 2
@@ -30,7 +30,7 @@ class ShardLocks:
     def __init__(self, folder: Path) -> None:
         """Raises: ConfigError if the file system has no locks, or grants them to everybody."""
         self._path = folder / LOCK_NAME
-        self._file = os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+        self._file = open_lock(self._path)
         try:
             self._lock(fcntl.F_RDLCK, _GENERATORS_BYTE, wait=True)
             self._require_exclusion()
@@ -40,7 +40,7 @@ class ShardLocks:
 
     def _require_exclusion(self) -> None:
         """Raises ConfigError if a lock does not exclude others. Generators would overwrite each other's files."""
-        other = os.open(self._path, os.O_RDWR | os.O_CLOEXEC)
+        other = open_lock(self._path)
         try:
             if self._lock(fcntl.F_WRLCK, _GENERATORS_BYTE, file=other):
                 raise ConfigError(

@@ -24,7 +24,7 @@ from hgn.data.verification import StorageError, note_verified, verify_file
 from hgn.schema import ConfigError, require
 from hgn.system import patience
 from hgn.system.files import TEMPORARY_SUFFIX, sync_folder
-from hgn.system.locks import NO_LOCKS, lock_file
+from hgn.system.locks import NO_LOCKS, lock_file, open_lock
 from hgn.system.patience import UnreachableError
 
 CACHE_VARIABLE = "HGN_CACHE"
@@ -186,13 +186,7 @@ def _locked_partial(path: Path, url: str, patience_s: float) -> Iterator[Buffere
     """
     partial = path.with_name(f".{path.name}{TEMPORARY_SUFFIX}")
     while True:
-        try:
-            opened = open(partial, "a+b", opener=_open_file)  # noqa: SIM115 - Path.open takes no opener
-        except OSError as error:
-            if error.errno != errno.ELOOP:
-                raise
-            raise ConfigError(f"{partial} must be a file, got a symbolic link to another; delete it") from None
-        with opened as file:
+        with open(partial, "a+b", opener=open_lock) as file:
             _lock(file, path.parent, url, patience_s)
             if not _is_same(file, partial):
                 continue  # another process removed it, or gave it its final name
@@ -230,10 +224,6 @@ def _lock(file: BufferedRandom, folder: Path, url: str, patience_s: float) -> No
             f"{CACHE_VARIABLE} must name a folder on a file system with file locks, got {folder} "
             f"({error.strerror}); take one of this machine's own disks"
         ) from None
-
-
-def _open_file(name: str, flags: int) -> int:
-    return os.open(name, flags | os.O_NOFOLLOW, 0o644)
 
 
 def _is_same(file: BufferedRandom, path: Path) -> bool:

@@ -6,15 +6,34 @@ import contextlib
 import errno
 import fcntl
 import os
+import stat
 import struct
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import IO, Any
 
-from hgn.schema import ConfigError, require
+from hgn.schema import ConfigError
 from hgn.system.files import make_folder
 
 NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP, errno.EINVAL)  # errors of file systems without locks
+
+
+def open_lock(path: Path | str, flags: int = 0) -> int:
+    """Opens a file that processes lock, for reading and writing, and creates a missing one.
+
+    Raises ConfigError for a link, which could lead to a file of another program, and for a pipe, device or folder.
+    """
+    try:
+        opened = os.open(path, flags | os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC, 0o644)
+        if not stat.S_ISREG(os.fstat(opened).st_mode):
+            os.close(opened)
+            raise OSError(errno.ENXIO, os.strerror(errno.ENXIO), str(path))
+    except OSError as error:
+        if error.errno not in (errno.ELOOP, errno.ENXIO, errno.EISDIR):
+            raise
+        raise ConfigError(f"{path} must be a file, got a link, pipe, device or folder; delete it") from None
+    return opened
 
 
 def lock_file(file: IO[Any] | int) -> bool:
@@ -51,12 +70,8 @@ def locked(path: Path, field: str, refusal: str) -> Iterator[None]:
     """
     make_folder(path.parent)
     with contextlib.ExitStack() as stack:
-        for name, access in ((path, os.O_WRONLY | os.O_APPEND | os.O_CREAT), (path.parent, os.O_RDONLY)):
-            try:
-                opened = os.open(name, access | os.O_NONBLOCK, 0o644)  # a pipe without a reader would not open
-            except OSError as error:
-                require(error.errno not in (errno.EISDIR, errno.ENXIO), str(path), "a file", "no file", "delete it")
-                raise
+        for opening in (partial(open_lock, path), partial(os.open, path.parent, os.O_RDONLY)):
+            opened = opening()
             stack.callback(os.close, opened)
             try:
                 free = lock_file(opened)

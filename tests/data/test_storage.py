@@ -353,7 +353,7 @@ FILE_SYSTEM = rf"{CACHE_VARIABLE} must name a folder on a file system with file 
 FAULTS = [  # of the cache: a call that fails and its error, or what lies in the way; the message
     ((os, "fsync", errno.ENOSPC), OSError, "No space left on device: .*cache/shards"),
     ((fcntl, "flock", errno.ENOSYS), ConfigError, FILE_SYSTEM),  # as on Lustre without -o flock
-    ("a link", ConfigError, "must be a file, got a symbolic link"),
+    ("a link", ConfigError, "must be a file, got a link"),
     ("a file", ConfigError, rf"{CACHE_VARIABLE} must name a folder .* got .*shards \(Not a directory\)"),
 ]
 

@@ -16,6 +16,7 @@ from data.test_http import PlainFiles, answering
 from training.runs import train_mapping
 
 from datagen import upload
+from datagen.pool.locks import ShardLocks
 from hgn import evaluate, export, rollout, train
 from hgn.config import NetworkConfig, TrainingConfig
 from hgn.data import shard_cache, storage
@@ -334,13 +335,42 @@ def test_a_deleted_lock_file_locks(tmp_path):
         pass
 
 
-@pytest.mark.parametrize("make", [os.mkfifo, Path.mkdir, lambda path: os.mknod(path, stat.S_IFSOCK)])
-def test_locks_that_are_no_files(tmp_path, make):
-    """A pipe, a folder or a socket in the place of a lock is refused, where opening it would wait for ever."""
-    make(tmp_path / ".lock")
-    refused = pytest.raises(ConfigError, match=r"\.lock must be a file, got 'no file'; delete it")
-    with refused, locked(tmp_path / ".lock", "run", "no;"):
-        pass
+STRANGE = {
+    "link": lambda path: path.symlink_to(path.with_name("target")),
+    "dangling link": lambda path: path.symlink_to(path.with_name("missing")),
+    "pipe": os.mkfifo,
+    "folder": Path.mkdir,
+    "socket": lambda path: os.mknod(path, stat.S_IFSOCK),
+    "device": lambda path: os.mknod(path, stat.S_IFCHR, os.makedev(1, 3)),
+}
+LOCKS = {  # what locks a file of a folder, and the file's name
+    "run": (".lock", lambda folder: locked(folder / ".lock", "run", "no;").__enter__()),
+    "data set": (".lock", ShardLocks),
+    "cache": (
+        f".{'f' * 64}.tar.partial",
+        lambda folder: cached_shard(CachedShard("u", "f" * 64, 1, lambda: 1), 0.0, (), lambda _: None),
+    ),
+}
+
+
+@pytest.mark.parametrize("kind", STRANGE)
+@pytest.mark.parametrize("lock", LOCKS)
+def test_locks_that_are_no_files(tmp_path, monkeypatch, lock, kind):
+    """A link, a pipe, a folder, a socket or a device in the place of a lock is refused in one line and left as it is,
+    where opening it would wait for ever or change the link's target."""
+    (name, take), folder = LOCKS[lock], tmp_path / "shards"
+    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path))
+    folder.mkdir()
+    (folder / "target").write_text("mine")
+    try:
+        STRANGE[kind](folder / name)
+    except PermissionError:
+        pytest.skip("only root creates devices")
+    before = (folder / name).lstat()
+    with pytest.raises(ConfigError, match=rf"{name} must be a file, got a link, pipe, device or folder; delete it"):
+        take(folder)
+    assert (folder / name).lstat() == before and (folder / "target").read_text() == "mine"
+    assert {path.name for path in folder.iterdir()} == {name, "target"}
 
 
 def test_interleaved_members_of_an_archive(tmp_path):

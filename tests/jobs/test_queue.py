@@ -189,6 +189,18 @@ def test_one_queue_a_folder(machine):
     assert first.returncode == 0
 
 
+@pytest.mark.parametrize("make", [os.mkfifo, Path.mkdir, lambda path: path.symlink_to("target")])
+def test_a_lock_that_is_no_file(machine, make):
+    """A pipe, a folder or a link in the place of the lock is refused in one line, and the link's target stays."""
+    (machine / "runs" / "queue").mkdir(parents=True)
+    lock, target = machine / "runs/queue/.lock", machine / "runs/queue/target"
+    target.write_text("mine")
+    make(lock)
+    done = run(machine, "one: touch began\n")
+    assert done.returncode == 2 and not (machine / "began").exists() and target.read_text() == "mine"
+    assert done.stderr == "error: runs/queue/.lock must be a file, got a link, pipe, device or folder; delete it\n"
+
+
 LINE_RULE = "list.txt:3: a line must be NAME: COMMAND (letters, digits, _ . -) or wait"
 GPUS = (
     "nvidia-smi must list the GPUs, got 'no driver'; say which there are, as in CUDA_VISIBLE_DEVICES=0,1, or that "
