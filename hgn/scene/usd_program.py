@@ -21,6 +21,8 @@ COPIES = 12  # of its arrays, in this program and in the search for closed bodie
 FIRST = Usd.TimeCode.EarliestTime()  # first sample, or the value without samples
 Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])  # (x, y, z) @ Z_UP = (x, z, -y)
 NO_SURFACE = ("Points", "Camera")
+VECTORS, INTEGERS = np.zeros((0, 3)), np.zeros(0, np.int64)
+NUMBERS = {"f": "iuf", "i": "iu"}  # kinds of a file's numbers, by the kind that they are converted to
 
 
 def refuse(text: str) -> NoReturn:
@@ -60,10 +62,14 @@ def placed(stage: Usd.Stage) -> Iterator[tuple[Any, np.ndarray]]:
             yield prim, matrix_44
 
 
-def array(prim: Any, name: str, dtype: Any, room: list[int]) -> np.ndarray:
-    """Returns an attribute's numbers, and takes their bytes from the first item of `room`."""
+def array(prim: Any, name: str, empty: np.ndarray, room: list[int]) -> np.ndarray:
+    """Returns an attribute's numbers as `empty`, its value if missing, has them. Takes their bytes from `room[0]`."""
     value = prim.GetAttribute(name).Get(FIRST)
-    result = np.array(() if value is None else value, dtype)
+    given = empty if value is None else np.asarray(value)
+    fits = given.ndim == empty.ndim and given.shape[1:] == empty.shape[1:]
+    if not fits or given.dtype.kind not in NUMBERS[empty.dtype.kind]:
+        refuse(f"has {name} of type {type(value).__name__} at {prim.GetPath()}; export it again")
+    result = given.astype(empty.dtype)
     room[0] -= result.nbytes
     if room[0] < 0:
         refuse("needs more memory than a file of its size does; export less, or write it without instances")
@@ -72,16 +78,16 @@ def array(prim: Any, name: str, dtype: Any, room: list[int]) -> np.ndarray:
 
 def read_meshes(stage: Usd.Stage, room: list[int]) -> dict[str, np.ndarray]:
     """Returns `vertex` [V, 3], `count` [K] corners of each polygon, and `corner` [I]: their vertices."""
-    vertices, counts, corners, total = [np.zeros((0, 3))], [np.zeros(0, np.int64)], [np.zeros(0, np.int64)], 0
+    vertices, counts, corners, total = [VECTORS], [INTEGERS], [INTEGERS], 0
     for prim, matrix_44 in placed(stage):
         kind, path = prim.GetTypeName(), prim.GetPath()
         if kind in NO_SURFACE:
             continue
         if kind != "Mesh" or prim.HasRelationship("skel:skeleton"):
             refuse(f"contains {'a skinned mesh' if kind == 'Mesh' else kind} at {path}, which is not read; bake it")
-        vertex_V3 = array(prim, "points", np.float64, room).reshape(-1, 3)
+        vertex_V3 = array(prim, "points", VECTORS, room)
         names = ("faceVertexCounts", "faceVertexIndices", "holeIndices")
-        count_K, corner_I, hole_H = (array(prim, name, np.int64, room) for name in names)
+        count_K, corner_I, hole_H = (array(prim, name, INTEGERS, room) for name in names)
         fits = len(corner_I) == count_K.sum() and count_K.min(initial=3) >= 3
         if not fits or corner_I.min(initial=0) < 0 or corner_I.max(initial=-1) >= len(vertex_V3):
             refuse(f"has polygons at {path} that are not of its {len(vertex_V3)} points; export it again")
@@ -95,15 +101,14 @@ def read_meshes(stage: Usd.Stage, room: list[int]) -> dict[str, np.ndarray]:
 
 def read_particles(stage: Usd.Stage, room: list[int], material: str) -> dict[str, np.ndarray]:
     """Returns `position` and `velocity` [N, 3] of Points without `primvars:material`, or of this one."""
-    positions, velocities = [np.zeros((0, 3))], [np.zeros((0, 3))]
+    positions, velocities = [VECTORS], [VECTORS]
     for prim, matrix_44 in placed(stage):
         if prim.GetTypeName() == "PointInstancer":
             refuse(f"contains PointInstancer at {prim.GetPath()}, which is not read; write Points")
         own = prim.GetAttribute("primvars:material").Get() if prim.HasAttribute("primvars:material") else material
         if prim.GetTypeName() != "Points" or own != material:
             continue
-        position_N3 = array(prim, "points", np.float64, room).reshape(-1, 3)
-        given_N3 = array(prim, "velocities", np.float64, room).reshape(-1, 3)
+        position_N3, given_N3 = (array(prim, name, VECTORS, room) for name in ("points", "velocities"))
         velocity_N3 = given_N3 if prim.GetAttribute("velocities").HasValue() else np.zeros_like(position_N3)
         if velocity_N3.shape != position_N3.shape:
             refuse(f"has {len(velocity_N3)} velocities of {len(position_N3)} points at {prim.GetPath()}")

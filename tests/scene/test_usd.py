@@ -95,6 +95,61 @@ def test_content_that_compresses_well(tmp_path):
         load_mesh(tmp_path / "a.usdc")
 
 
+TRIANGLE = {
+    "points": ("half3[]", "[(0, 0, 0), (1, 0, 0), (0, 2, 0)]"),
+    "faceVertexCounts": ("uchar[]", "[3]"),
+    "faceVertexIndices": ("uint64[]", "[0, 1, 2]"),
+    "holeIndices": ("uchar[]", "[]"),
+    "velocities": ("half3[]", "[(0, 0, 0), (1, 0, 0), (0, 2, 0)]"),
+}
+
+
+def of_types(kind, **given):
+    values = {name: value for name, value in (TRIANGLE | given).items() if kind == "Mesh" or name[:2] in ("po", "ve")}
+    return f'def {kind} "m" {{\n' + "".join(f"{of} {name} = {value}\n" for name, (of, value) in values.items()) + "}"
+
+
+def read_of(folder, text):
+    (folder / "a.usda").write_text(f"#usda 1.0\n{text}\n")
+    return usd.read_usd_particles(folder / "a.usda", "sand") if "Points" in text else load_mesh(folder / "a.usda")
+
+
+def test_numbers_of_small_types(tmp_path):
+    """Halves, and integers of any size, are read as the numbers that they are."""
+    mesh, points = (read_of(tmp_path, of_types(kind)) for kind in ("Mesh", "Points"))
+    start_N3 = np.array([[0, 0, 0], [0.01, 0, 0], [0, 0.02, 0]])
+    np.testing.assert_allclose(mesh.vertex_V3[mesh.triangle_F3[0]].sum(0), start_N3.sum(0), atol=1e-8)
+    for name in ("position", "velocity"):
+        np.testing.assert_allclose(points[name], start_N3, atol=1e-12)
+
+
+OTHER_TYPES = [
+    ("points", "bool[]", "[1, 1, 0]"),
+    ("points", "token[]", '["0", "1", "2"]'),
+    ("points", "quath[]", "[(0, 0, 0, 1)]"),
+    ("points", "float3", "(0, 1, 2)"),
+    ("points", "string", '"a"'),
+    ("velocities", "float2[]", "[(0, 1), (0, 1), (0, 1)]"),
+    ("velocities", "timecode[]", "[0, 1, 2]"),
+    ("faceVertexCounts", "bool[]", "[1]"),
+    ("faceVertexCounts", "token[]", '["3"]'),
+    ("faceVertexCounts", "uchar", "3"),
+    ("faceVertexIndices", "half[]", "[0, 1, 2]"),
+    ("faceVertexIndices", "timecode[]", "[0, 1, 2]"),
+    ("holeIndices", "asset[]", "[@a@]"),
+    ("holeIndices", "matrix3d[]", "[((1, 0, 0), (0, 1, 0), (0, 0, 1))]"),
+]
+
+
+@pytest.mark.parametrize(("name", "of", "value"), OTHER_TYPES)
+def test_values_of_other_types(tmp_path, name, of, value):
+    """Values that are not the numbers of their attribute are refused with its name and the prim's path."""
+    kind = "Points" if name == "velocities" else "Mesh"
+    with pytest.raises(ValueError, match=rf"has {name} of type \w+ at /m; ") as raised:
+        read_of(tmp_path, of_types(kind, **{name: (of, value)}))
+    assert "\n" not in str(raised.value)
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
