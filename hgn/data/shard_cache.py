@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import functools
 import math
 import os
 import shutil
@@ -20,7 +21,7 @@ from io import BufferedRandom
 from pathlib import Path
 from typing import Protocol
 
-from hgn.data.verification import StorageError, note_verified, verify_file
+from hgn.data.verification import note_verified, verify_file
 from hgn.schema import ConfigError, require
 from hgn.system import patience
 from hgn.system.files import TEMPORARY_SUFFIX, sync_folder
@@ -64,16 +65,17 @@ class CachedShard:
     url: str
     sha256: str
     size: int  # bytes, as an index claims it
-    size_there: Callable[[], int | None]  # asks the server for the size; None: the server does not report it
 
 
-Fill = Callable[[BufferedRandom], None]
+Append = Callable[[bytes], None]
+Fill = Callable[[BufferedRandom, Append], None]
 
 
 def cached_shard(shard: CachedShard, patience_s: float, spared: Collection[str] | None, fill: Fill) -> Path:
     """Returns the verified file of a shard. If it is missing, `fill` completes a partial file, perhaps an empty one.
 
-    A full cache removes other shards, except those with a sha256 in `spared`; with None it removes none.
+    `fill` appends with its second argument. A full cache removes other shards, except those with a sha256 in `spared`;
+    with None it removes none.
     Raises: ConfigError; UnreachableError while another process fetches the file without progress; OSError (full disk or
     cache); exceptions of `fill`.
     """
@@ -97,21 +99,8 @@ def _fetch(path: Path, shard: CachedShard, patience_s: float, spared: Collection
     with _locked_partial(path, shard.url, patience_s) as file:
         if file is None:
             return
-        while True:  # only the process with the lock frees space, because two would free it twice
-            lacking = shard.size - os.fstat(file.fileno()).st_size - shutil.disk_usage(path.parent).free
-            over = max(_bytes_over(path.parent, shard.size), lacking)
-            try:
-                if over > 0:
-                    raise OSError(errno.ENOSPC, f"the cache is full ({LIMIT_VARIABLE})", str(path))
-                fill(file)
-                break
-            except OSError as error:
-                if error.errno not in _FULL or spared is None:
-                    raise
-                if (there := shard.size_there()) not in (None, shard.size):  # do not remove others for a wrong size
-                    raise StorageError(f"{shard.url} must have {shard.size} bytes, got {there}") from None
-                if not _free_space(path.parent, over, max(over, shard.size), spared):
-                    raise
+        _require_space(path, shard.size, shard.size - os.fstat(file.fileno()).st_size, spared)
+        fill(file, functools.partial(_append, file, path, spared))
         os.fsync(file.fileno())
         # the newest shard must have the latest time, even after a change of this machine's clock
         latest = max((time_ns for time_ns, _, _ in _cached(path.parent)), default=0)
@@ -120,6 +109,30 @@ def _fetch(path: Path, shard: CachedShard, patience_s: float, spared: Collection
         Path(file.name).replace(path)
     sync_folder(path.parent)
     note_verified(path, shard.sha256)
+
+
+def _append(file: BufferedRandom, path: Path, spared: Collection[str] | None, data: bytes) -> None:
+    """Appends bytes that have arrived, and frees space for them only. An index, or a server, may claim any size."""
+    rest = memoryview(data)
+    while rest:
+        if (over := _require_space(path, os.fstat(file.fileno()).st_size + len(rest), len(rest), spared)) > 0:
+            _free_space(path.parent, over, spared)
+        try:
+            rest = rest[file.raw.write(rest) :]  # not buffered: a full disk would leave the rest in the buffer
+        except OSError as error:  # a quota, or other programs that fill the disk
+            if error.errno not in _FULL or not _free_space(path.parent, len(rest), spared):
+                raise
+
+
+def _require_space(path: Path, size: int, missing: int, spared: Collection[str] | None) -> float:
+    """Returns the bytes to remove before `path` can have `size` bytes, `missing` of which are not written yet.
+
+    Raises OSError if the removal of all files that are not spared would not be enough.
+    """
+    over = max(_bytes_over(path.parent, size), missing - shutil.disk_usage(path.parent).free)
+    if over > 0 and over > sum(cached for cached, _ in _removable(path.parent, spared)):
+        raise OSError(errno.ENOSPC, f"the cache is full ({LIMIT_VARIABLE})", str(path))
+    return over
 
 
 def _make_folder(folder: Path) -> None:
@@ -158,16 +171,15 @@ def _bytes_over(folder: Path, size: int) -> float:
     return sum(cached for _, cached, _ in _cached(folder)) + size - allowed
 
 
-def _free_space(folder: Path, least: float, size: float, spared: Collection[str]) -> bool:
-    """Removes the oldest shards that are not spared until it has freed `size` bytes. Returns whether it removed any.
+def _removable(folder: Path, spared: Collection[str] | None) -> list[tuple[int, Path]]:
+    """Returns bytes and path of the cached shards that are not spared, oldest first. With None all are spared."""
+    return [(cached, path) for _, cached, path in _cached(folder) if spared is not None and path.stem not in spared]
 
-    It removes none if all of them together have fewer than `least` bytes: this would empty the cache without success.
-    """
-    removable = [(cached, path) for _, cached, path in _cached(folder) if path.stem not in spared]
-    if sum(cached for cached, _ in removable) < least:
-        return False
+
+def _free_space(folder: Path, size: float, spared: Collection[str] | None) -> bool:
+    """Removes the oldest shards that are not spared until it has freed `size` bytes. Returns whether it removed any."""
     freed = 0
-    for cached, path in removable:
+    for cached, path in _removable(folder, spared):
         if freed >= size:
             break
         for holder in list(holders):

@@ -23,7 +23,7 @@ from typing import Any, TypeVar
 from urllib.parse import urlsplit
 from urllib.request import getproxies, proxy_bypass_environment  # type: ignore[attr-defined]
 
-from hgn.data.shard_cache import CachedShard, cached_shard
+from hgn.data.shard_cache import Append, CachedShard, cached_shard
 from hgn.data.verification import StorageError, verify_file
 from hgn.schema import ConfigError, near_name, require
 from hgn.system.extras import missing_extra
@@ -302,14 +302,14 @@ class _Remote(Storage):
     def shard(
         self, name: str, sha256: str, size: int, patience_s: float | None = None, spared: Collection[str] | None = ()
     ) -> Path:
-        def fill(file: BufferedRandom) -> None:
+        def fill(file: BufferedRandom, append: Append) -> None:
             self._require_not_away(name, patience_s)
             try:
                 # the second attempt fetches every byte: the disk may have lost bytes that an earlier process wrote
-                if self._fill(file, name, size, patience_s) == sha256:
+                if self._fill(file, append, name, size, patience_s) == sha256:
                     return
                 file.truncate(0)
-                if self._fill(file, name, size, patience_s) == sha256:
+                if self._fill(file, append, name, size, patience_s) == sha256:
                     return
             except FileNotFoundError:
                 raise _missing(f"{self._url}/{name}") from None
@@ -317,15 +317,8 @@ class _Remote(Storage):
                 f"{self._url}/{name} must have sha256 {sha256}, got other bytes: it was altered; generate it again"
             )
 
-        def size_there() -> int | None:
-            try:
-                size: int | None = self._patiently(name, patience_s, lambda path: self._files.info(path)["size"])
-            except FileNotFoundError:
-                raise _missing(f"{self._url}/{name}") from None
-            return size
-
         wait_s = standard_patience_s() if patience_s is None else patience_s
-        return cached_shard(CachedShard(f"{self._url}/{name}", sha256, size, size_there), wait_s, spared, fill)
+        return cached_shard(CachedShard(f"{self._url}/{name}", sha256, size), wait_s, spared, fill)
 
     def write(self, name: str, source: Path | bytes) -> None:
         def put(path: str) -> None:
@@ -347,7 +340,7 @@ class _Remote(Storage):
         if written != expected:
             raise ConfigError(f"{self._url}/{name} must have {expected} bytes, got {written}; copy it again")
 
-    def _fill(self, file: BufferedRandom, name: str, size: int, patience_s: float | None) -> str:
+    def _fill(self, file: BufferedRandom, append: Append, name: str, size: int, patience_s: float | None) -> str:
         """Appends the missing bytes. Returns the sha256 of the whole file."""
         if os.fstat(file.fileno()).st_size > size:
             file.truncate(0)
@@ -362,10 +355,9 @@ class _Remote(Storage):
                 data = data[have:]
             elif len(data) != stop - have:
                 raise _cut(f"{self._url}/{name}", size, have + len(data))
-            file.write(data)
+            append(data)
             digest.update(data)
             have += len(data)
-        file.flush()
         return digest.hexdigest()
 
     def _require_not_away(self, name: str, patience_s: float | None) -> None:

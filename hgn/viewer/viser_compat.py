@@ -219,7 +219,7 @@ def guarded(process: Process, token: str) -> Process:
         if foreign or not hmac.compare_digest(given.encode(errors="replace"), token.encode()):
             headers = Headers({"Content-Type": "text/plain", "Content-Length": str(len(REFUSAL))})
             return Response(http.HTTPStatus.FORBIDDEN, "Forbidden", headers, REFUSAL)
-        # Viser answers a name that is too long for the file system with status 500; no file of its page has 200 characters
+        # Viser answers a name that no file can have with status 500; the files of its page have shorter ones
         response = process(connection, replace(request, path=f"/{rest[:200]}{mark}{query}"))
         if response is not None:
             response.headers["Referrer-Policy"] = "no-referrer"

@@ -4,6 +4,7 @@ import contextlib
 import dataclasses
 import errno
 import fcntl
+import io
 import os
 import re
 import threading
@@ -218,14 +219,18 @@ def test_full_cache(folder, cache, monkeypatch, full):
     if full == "limit":
         monkeypatch.setenv(LIMIT_VARIABLE, str(room / 1e9))
     else:
-        real = hgn.data.storage._Remote._fill
 
-        def fill(self, file, name, size, patience_s):
-            if sum(path.stat().st_size for path in cache.glob("*.tar")) + size > room:
-                raise OSError(errno.ENOSPC, "No space left on device")
-            return real(self, file, name, size, patience_s)
+        class OnFullDisk(io.FileIO):
+            def write(self, content):
+                content = content[: room - sum(path.stat().st_size for path in cache.iterdir())]
+                if not content:
+                    raise OSError(errno.ENOSPC, "No space left on device")
+                return super().write(content)
 
-        monkeypatch.setattr(hgn.data.storage._Remote, "_fill", fill)
+        def opened(path, mode, opener):
+            return io.BufferedRandom(OnFullDisk(path, "a+", opener=opener))
+
+        monkeypatch.setattr("hgn.data.shard_cache.open", opened, raising=False)
     url = in_memory(folder, f"large-{full}")
     store, expected = EpisodeStore(url, "train"), EpisodeStore(folder, "train")
     store.fetch_ahead()
