@@ -20,6 +20,7 @@ from collections.abc import Callable, Iterable, Mapping
 from numbers import Integral
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
+from urllib.parse import unquote
 
 from hgn.renamed import KEYS, current_names, removed_remedy, renamed_remedy, value_remedy
 from hgn.system.files import is_replaceable
@@ -27,20 +28,36 @@ from hgn.system.files import is_replaceable
 T = TypeVar("T")
 # control characters of terminals and text direction, and surrogates, except those that stand for bytes of file names
 _CONTROL = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069\ud800-\udc7f\udd00-\udfff]")
-# Passwords may have spaces, slashes and @. They end at the last @ before a space, also where "host:80/a@b" is no
-# password. Digits before a space are a port, unless a single word with @ follows.
+# Passwords may have spaces, slashes and @. They end at the last @ before a space. Digits before a space are a port,
+# unless a single word with @ follows. Digits before a slash are a port, and the rest is a path.
 _MOST = "{1,2000}"
 _PORT, _WORD = r"\d+(?:[,;)'\"]|\s(?![^\s@:]+@)|$)", rf"(?:(?!://)\S){_MOST}"
+_HOST = r"(?:[^\s/:@]{1,255}:\d{1,5}|\[?[\da-fA-F:.]{2,39}\](?::\d{1,5})?)/"
 _USER = rf"[^\s/:@]{_MOST}:{_WORD}|[^/\s?#]{_MOST}|[^/:@'\"]{_MOST}:(?=\S)(?!{_PORT})(?:(?!://)[^@]){_MOST}"
 _SECRET = r"(?:sig|token|secret|pass|pwd|cred|auth|jwt|sas|hmac|bearer|session)[\w.-]*|key(?:_?id)?|code"
+
+
+def _without_value(query: re.Match[str]) -> str:
+    """Returns a key and value of a URL, without the value if the key, which may be percent-encoded, names a secret."""
+    secret = re.search(rf"(?i)(?:{_SECRET})$", unquote(query[2]))
+    return f"{query[1]}{query[2]}=…" if secret else query[0]
+
+
+# keys outside URLs, with the sign that follows, and their values: a text, a list, or a word after its scheme
+_KEY = r"[\w.-]{0,99}?(?:token|secret|passw(?:or)?d|authorization|api[_-]?key)\w*"
+_VALUE = r"b?(?:'[^']*'?|\"[^\"]*\"?)|[\[({][^\])}\n]*[\])}]?|(?:(?:bearer|basic)\s+)?[^\s'\"]*[^\s'\",;.)\]}]"
 _SECRETS = (  # pattern and replacement: for users of URLs and of addresses without a scheme, and for signatures
-    (rf"(\w://)(?:{_USER})?@", r"\1"),
+    (rf"(\w://)(?!{_HOST})(?:{_USER})?@", r"\1"),
     (
-        rf"((?:^|['\"=])(?![\w+]+://))[^\s'\"/:@]{_MOST}:(?![\s/])[^'\"@]{_MOST}@(?:(?:(?!://)[^\s'\"]){_MOST}@)?(?=[\w\[])",
+        rf"((?:^|['\"=])(?![\w+]+://|{_HOST}))[^\s'\"/:@]{_MOST}:(?![\s/])[^'\"@]{_MOST}@(?:(?:(?!://)[^\s'\"]){_MOST}@)?(?=[\w\[])",
         r"\1",
     ),
-    (r"(?<![\w@.])[\w.+-]{1,300}:(?!/)(?:(?!://)\S){1,300}@(?=[\w\[])", ""),  # short, because any word may start it
-    (rf"(?i)([?&;#][\w.-]{{0,99}}?(?:{_SECRET}))=[^&\s'\"#;]*", r"\1=…"),
+    # short, because any word may start it
+    (rf"(?<![\w@.])(?!{_HOST})[\w.+-]{{1,300}}:(?!/)(?:(?!://)\S){{1,300}}@(?=[\w\[])", ""),
+    (r"([?&;#])([\w.%-]{1,300})=[^&\s'\"#;]*", _without_value),
+    (rf"(?i)(['\"])(\+{{0,2}}(?:[\w.]+=)?{_KEY}[ \t]*[=:][ \t]*)(?!['\"])(?:'\"'\"'|(?!\1).)+", r"\1\2…"),
+    (rf"(?i)(?<![\w.?&;#%-])({_KEY}['\"]?[ \t]*[=:][ \t]*)(?:{_VALUE})", r"\1…"),
+    (r"(?i)(\bbearer\s+)(?=\S*\d)[^\s'\"]+", r"\1…"),
 )
 _LONG = 20_000  # characters of a message that is shortened before passwords are removed
 # the owner's path, and the value's own name or index; joined for messages
@@ -111,7 +128,7 @@ class ConfigError(ValueError):
 
 
 def printable(text: str) -> str:
-    """Returns a text for terminals and pages, without URLs' users, passwords and signatures, and control characters."""
+    """Returns a text for terminals and pages, without users and signatures of URLs, secrets, and control characters."""
     for pattern, kept in _SECRETS:
         text = re.sub(pattern, kept, text)
     return "".join(c if c.isprintable() or c == "\n" else repr(c)[1:-1] for c in text)

@@ -26,3 +26,5 @@ def test_the_recorded_command(monkeypatch):
     given = ["/usr/bin/python", "-m", "tools.stability", "part", "out=/any/x.json"]
     monkeypatch.setattr("sys.orig_argv", given)
     assert command_line() == "python -m tools.stability part out=x.json"
+    monkeypatch.setattr("sys.orig_argv", [*given, "a.token=it's mine", "env=HF_TOKEN=x b"])
+    assert command_line() == "python -m tools.stability part out=x.json 'a.token=…' 'env=HF_TOKEN=…'"
