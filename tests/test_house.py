@@ -19,7 +19,7 @@ LINES = {  # of Python, in tracked files
     "hgn": 33_417,
     "datagen": 9_045,
     "tools": 6_473,
-    "tests": 33_008,
+    "tests": 33_017,
 }
 SETTINGS = 240  # fields of the dataclasses behind the commands, *Config
 

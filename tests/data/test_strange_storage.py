@@ -7,7 +7,6 @@ import hashlib
 import http.server
 import os
 import re
-import stat
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -18,7 +17,6 @@ from data.test_http import PlainFiles, answering
 from training.runs import train_mapping
 
 from datagen import upload
-from datagen.pool.locks import ShardLocks
 from hgn import evaluate, export, rollout, train
 from hgn.config import NetworkConfig, TrainingConfig
 from hgn.data import shard_cache, storage
@@ -28,7 +26,6 @@ from hgn.data.reader import EpisodeStore, find_episode, first_episodes
 from hgn.data.shard_cache import CACHE_VARIABLE, LIMIT_VARIABLE, CachedShard, cached_shard
 from hgn.scene.npz import read_npz
 from hgn.schema import ConfigError, printable
-from hgn.system.locks import locked
 from hgn.system.patience import VARIABLE, UnreachableError, standard_patience_s
 from hgn.training import readers
 
@@ -378,55 +375,6 @@ def test_a_shard_of_another_frame_rate_is_named(data, tmp_path, rate):
     name = with_change(data.dataset.folder, "train", change)
     with pytest.raises(ConfigError, match=rf"{name}: train-.* must have .* frame_rate_hz .*60.*, got .*{float(rate)}"):
         train.main(train_mapping(data, tmp_path / "run"))
-
-
-def test_a_deleted_lock_file_locks(tmp_path):
-    """A run's folder stays locked where somebody deletes the lock's file."""
-    path = tmp_path / "run" / ".lock"
-    with locked(path, "run", "another training is in it; wait, or choose"):
-        path.unlink()
-        with pytest.raises(ConfigError, match="run must be a folder of its own"), locked(path, "run", "no;"):
-            pass
-    with locked(path, "run", "no;"):
-        pass
-
-
-STRANGE = {
-    "link": lambda path: path.symlink_to(path.with_name("target")),
-    "dangling link": lambda path: path.symlink_to(path.with_name("missing")),
-    "pipe": os.mkfifo,
-    "folder": Path.mkdir,
-    "socket": lambda path: os.mknod(path, stat.S_IFSOCK),
-    "device": lambda path: os.mknod(path, stat.S_IFCHR, os.makedev(1, 3)),
-}
-LOCKS = {  # what locks a file of a folder, and the file's name
-    "run": (".lock", lambda folder: locked(folder / ".lock", "run", "no;").__enter__()),
-    "data set": (".lock", ShardLocks),
-    "cache": (
-        f".{'f' * 64}.tar.partial",
-        lambda folder: cached_shard(CachedShard("u", "f" * 64, 1), 0.0, (), lambda *_: None),
-    ),
-}
-
-
-@pytest.mark.parametrize("kind", STRANGE)
-@pytest.mark.parametrize("lock", LOCKS)
-def test_locks_that_are_no_files(tmp_path, monkeypatch, lock, kind):
-    """A link, a pipe, a folder, a socket or a device in the place of a lock is refused in one line and left as it is,
-    where opening it would wait for ever or change the link's target."""
-    (name, take), folder = LOCKS[lock], tmp_path / "shards"
-    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path))
-    folder.mkdir()
-    (folder / "target").write_text("mine")
-    try:
-        STRANGE[kind](folder / name)
-    except PermissionError:
-        pytest.skip("only root creates devices")
-    before = (folder / name).lstat()
-    with pytest.raises(ConfigError, match=rf"{name} must be a file, got a link, pipe, device or folder; delete it"):
-        take(folder)
-    assert (folder / name).lstat() == before and (folder / "target").read_text() == "mine"
-    assert {path.name for path in folder.iterdir()} == {name, "target"}
 
 
 def test_interleaved_members_of_an_archive(tmp_path):

@@ -1,0 +1,61 @@
+"""Locks of runs, data sets and caches: who has one keeps it, and what is no file is refused."""
+
+import os
+import stat
+from pathlib import Path
+
+import pytest
+
+from datagen.pool.locks import ShardLocks
+from hgn.data.shard_cache import CACHE_VARIABLE, CachedShard, cached_shard
+from hgn.schema import ConfigError
+from hgn.system.locks import locked
+
+
+def test_a_deleted_lock_file_locks(tmp_path):
+    """A run's folder stays locked where somebody deletes the lock's file."""
+    path = tmp_path / "run" / ".lock"
+    with locked(path, "run", "another training is in it; wait, or choose"):
+        path.unlink()
+        with pytest.raises(ConfigError, match="run must be a folder of its own"), locked(path, "run", "no;"):
+            pass
+    with locked(path, "run", "no;"):
+        pass
+
+
+STRANGE = {
+    "link": lambda path: path.symlink_to(path.with_name("target")),
+    "dangling link": lambda path: path.symlink_to(path.with_name("missing")),
+    "pipe": os.mkfifo,
+    "folder": Path.mkdir,
+    "socket": lambda path: os.mknod(path, stat.S_IFSOCK),
+    "device": lambda path: os.mknod(path, stat.S_IFCHR, os.makedev(1, 3)),
+}
+LOCKS = {  # what locks a file of a folder, and the file's name
+    "run": (".lock", lambda folder: locked(folder / ".lock", "run", "no;").__enter__()),
+    "data set": (".lock", ShardLocks),
+    "cache": (
+        f".{'f' * 64}.tar.partial",
+        lambda folder: cached_shard(CachedShard("u", "f" * 64, 1), 0.0, (), lambda *_: None),
+    ),
+}
+
+
+@pytest.mark.parametrize("kind", STRANGE)
+@pytest.mark.parametrize("lock", LOCKS)
+def test_locks_that_are_no_files(tmp_path, monkeypatch, lock, kind):
+    """A link, a pipe, a folder, a socket or a device in the place of a lock is refused in one line and left as it is,
+    where opening it would wait for ever or change the link's target."""
+    (name, take), folder = LOCKS[lock], tmp_path / "shards"
+    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path))
+    folder.mkdir()
+    (folder / "target").write_text("mine")
+    try:
+        STRANGE[kind](folder / name)
+    except PermissionError:
+        pytest.skip("only root creates devices")
+    before = (folder / name).lstat()
+    with pytest.raises(ConfigError, match=rf"{name} must be a file, got a link, pipe, device or folder; delete it"):
+        take(folder)
+    assert (folder / name).lstat() == before and (folder / "target").read_text() == "mine"
+    assert {path.name for path in folder.iterdir()} == {name, "target"}
