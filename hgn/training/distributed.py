@@ -22,7 +22,8 @@ RUN_VARIABLE = "HGN_RUN"  # environment variable with the run's name or folder
 MESSAGE_MB = 4  # size of a message: gradients of the last layers are sent while those of the first layers are computed
 _RANKS = {"RANK": "WORLD_SIZE", "LOCAL_RANK": "LOCAL_WORLD_SIZE", "SLURM_PROCID": "SLURM_NTASKS"}
 _COUNTS = (*_RANKS.values(), "SLURM_NNODES")
-_MPI_COUNTS = ("OMPI_COMM_WORLD_SIZE", "PMI_SIZE", "MV2_COMM_WORLD_SIZE", "MPI_LOCALNRANKS")  # set by mpirun
+# set by mpirun and jsrun
+_MPI_COUNTS = ("OMPI_COMM_WORLD_SIZE", "PMI_SIZE", "MV2_COMM_WORLD_SIZE", "MPI_LOCALNRANKS", "JSM_NAMESPACE_SIZE")
 _RANDOM_ID = re.compile(r"[0-9a-f]{8}(-[0-9a-f]{4}){3}-[0-9a-f]{12}")
 
 
@@ -138,8 +139,10 @@ def _launched(devices: int | None) -> tuple[int, int] | None:
         processes = int(os.environ["WORLD_SIZE"])
         here = int(os.environ["LOCAL_WORLD_SIZE"]) if "LOCAL_WORLD_SIZE" in os.environ else devices
     elif started_by_srun():
-        processes = int(os.environ["SLURM_NTASKS"])
-        here = processes // int(os.environ["SLURM_NNODES"]) if "SLURM_NNODES" in os.environ else devices
+        processes, nodes = int(os.environ["SLURM_NTASKS"]), int(os.environ.get("SLURM_NNODES", "1"))
+        rule, remedy = f"a multiple of the {nodes} nodes", "start srun with --ntasks-per-node"
+        require(processes % nodes == 0, "SLURM_NTASKS", rule, processes, remedy=remedy)
+        here = processes // nodes if "SLURM_NNODES" in os.environ else devices
     else:
         return None
     if here is None or processes % here:
@@ -166,6 +169,9 @@ def _check_launcher() -> None:
         for name in _MPI_COUNTS:
             rule, count = "1 without torchrun's variables", os.environ.get(name, "1")  # each process would train alone
             require(count == "1", name, rule, count, remedy="start with torchrun or srun instead of mpirun")
+        for name in ("LOCAL_RANK", "NODE_RANK"):  # Lightning's launcher sets them with WORLD_SIZE
+            alone, rank = "WORLD_SIZE" not in os.environ, os.environ.get(name, "0")
+            require(not alone or rank == "0", name, "0 without WORLD_SIZE", rank, remedy="unset it for one process")
 
 
 def started_by_srun() -> bool:

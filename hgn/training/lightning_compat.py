@@ -14,7 +14,12 @@ from pathlib import Path
 from typing import Any
 
 from lightning.pytorch import Trainer
-from lightning.pytorch.plugins.environments import LightningEnvironment
+from lightning.pytorch.plugins.environments import (
+    ClusterEnvironment,
+    LightningEnvironment,
+    SLURMEnvironment,
+    TorchElasticEnvironment,
+)
 from lightning.pytorch.strategies import DDPStrategy
 
 from hgn.schema import ConfigError
@@ -33,10 +38,22 @@ def quieten() -> None:
     warnings.filterwarnings("ignore", ".*GPU available but not used.*")  # training.device=cpu was chosen on purpose
 
 
-def own_launcher() -> list[LightningEnvironment]:
-    """Returns the environment for processes without a launcher, in which Slurm's variables would mislead Lightning."""
-    mislead = "SLURM_NTASKS" in os.environ and "RANK" not in os.environ and not started_by_srun()
-    return [LightningEnvironment()] if mislead else []
+class _Srun(SLURMEnvironment):
+    """Omits checks that refuse srun without --ntasks-per-node, or with fewer tasks than the job's."""
+
+    @staticmethod
+    def _validate_srun_variables() -> None:
+        pass
+
+    def validate_settings(self, num_devices: int, num_nodes: int) -> None:
+        pass
+
+
+def own_launcher() -> list[ClusterEnvironment]:
+    """Returns the launcher that `distributed.layout` recognises. Other launchers' variables would mislead Lightning."""
+    if "RANK" in os.environ:
+        return [LightningEnvironment() if os.environ["WORLD_SIZE"] == "1" else TorchElasticEnvironment()]
+    return [_Srun() if started_by_srun() else LightningEnvironment()]
 
 
 def gradient_averaging(backend: str) -> DDPStrategy:

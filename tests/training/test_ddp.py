@@ -224,6 +224,7 @@ JOB = {"SLURM_JOB_ID": "4711"}
 COUNTS = ("RANK", "LOCAL_RANK", "WORLD_SIZE", "LOCAL_WORLD_SIZE", "SLURM_NTASKS", "SLURM_NNODES")
 BOTH = {"SLURM_PROCID": "1", "SLURM_NTASKS": "2", "RANK": "3", "LOCAL_RANK": "1", "WORLD_SIZE": "4"}
 RANDOM_ID = "5bd6a8f0-93a5-4c5b-9b8c-0a52b6cf3d11"
+NO_RESTARTS = (("MAX_RESTARTS", "0"), ("USE_AGENT_STORE", "False"))
 RESTARTS = {"TORCHELASTIC_USE_AGENT_STORE": "True", "TORCHELASTIC_MAX_RESTARTS": "3"}
 
 
@@ -231,28 +232,24 @@ RESTARTS = {"TORCHELASTIC_USE_AGENT_STORE": "True", "TORCHELASTIC_MAX_RESTARTS":
     ("variables", "first", "started", "folder"),
     [  # whether it leads, devices and nodes that the launcher started, the folder's name
         ({}, True, (1, 1), "runs/small"),
-        (TORCHRUN, True, (4, 1), "runs/small"),
-        (TORCHRUN | {"WORLD_SIZE": "3"}, True, (3, 1), "runs/small"),
+        *((TORCHRUN | {"WORLD_SIZE": f"{n}"}, True, (n, 1), "runs/small") for n in (3, 4)),
         ({"RANK": "5", "LOCAL_RANK": "0", "WORLD_SIZE": "6", "LOCAL_WORLD_SIZE": "2"}, False, (2, 3), "runs/small"),
         ({"RANK": "0", "WORLD_SIZE": "1"}, True, (1, 1), "runs/small"),  # of a container
         ({"SLURM_STEP_ID": "0", "SLURM_PROCID": "0", "SLURM_NTASKS": "4"}, True, (4, 1), "runs/small"),
         (SLURM | JOB, True, (4, 2), "runs/small-4711"),
         (SLURM | JOB | {"SLURM_PROCID": "7"}, False, (4, 2), "runs/small-4711"),
-        (SLURM | {"SLURM_JOB_NAME": "bash"}, True, (1, 1), "runs/small"),
-        (SLURM | {"SLURM_JOB_NAME": "interactive"}, True, (1, 1), "runs/small"),
+        *((SLURM | {"SLURM_JOB_NAME": name}, True, (1, 1), "runs/small") for name in ("bash", "interactive")),
         (JOB | {"SLURM_NTASKS": "4"}, True, (1, 1), "runs/small"),  # a shell or a script inside a job, without srun
         ({"SLURM_PROCID": "0", "SLURM_NTASKS": "1"}, True, (1, 1), "runs/small"),  # a batch job of one task
         (BOTH | JOB | {"LOCAL_WORLD_SIZE": "2"}, False, (2, 2), "runs/small"),  # torchrun inside srun
         (BOTH | {"RANK": "0", "TORCHELASTIC_RUN_ID": "a", "SLURM_JOB_ID": "1"}, True, (4, 1), "runs/a"),
-        ({"LOCAL_RANK": "1"}, False, (1, 1), "runs/small"),
-        ({"LOCAL_RANK": "0", "NODE_RANK": "1"}, False, (1, 1), "runs/small"),
+        *(({rank: "1", "WORLD_SIZE": "2"}, False, (1, 1), "runs/small") for rank in ("LOCAL_RANK", "NODE_RANK")),
         (TORCHRUN | {"TORCHELASTIC_RUN_ID": "none"}, True, (4, 1), "runs/small"),
         ({"TORCHELASTIC_RUN_ID": "night/one two"}, True, (1, 1), "runs/night-one-two"),
         ({"TORCHELASTIC_RUN_ID": RANDOM_ID}, True, (1, 1), "runs/small"),
         (SLURM | JOB | {"HGN_RUN": "mine", "TORCHELASTIC_RUN_ID": "a"}, True, (4, 2), "runs/mine"),
         ({"HGN_RUN": "/shared/mine"}, True, (1, 1), "/shared/mine"),
-        (RESTARTS | {"TORCHELASTIC_MAX_RESTARTS": "0"}, True, (1, 1), "runs/small"),
-        (RESTARTS | {"TORCHELASTIC_USE_AGENT_STORE": "False"}, True, (1, 1), "runs/small"),
+        *((RESTARTS | {f"TORCHELASTIC_{name}": none}, True, (1, 1), "runs/small") for name, none in NO_RESTARTS),
     ],
 )
 def test_what_a_launcher_says(no_launcher, variables, first, started, folder):
@@ -264,6 +261,7 @@ def test_what_a_launcher_says(no_launcher, variables, first, started, folder):
     assert (first_rank(), layout(TrainingConfig(device="cpu")), str(default_run("small"))) == (first, started, folder)
 
 
+OTHER_COUNTS = ("OMPI_COMM_WORLD_SIZE", "PMI_SIZE", "JSM_NAMESPACE_SIZE")
 OTHERS = "devices must be the {} processes that the launcher started on each of {} machines"
 
 
@@ -286,7 +284,9 @@ OTHERS = "devices must be the {} processes that the launcher started on each of 
         ({"RANK": "1", "LOCAL_RANK": "1"}, "WORLD_SIZE must be set where RANK is"),
         ({"SLURM_PROCID": "0", "SLURM_NTASKS": "4"}, "must be started with srun in a job of 4 tasks"),
         ({**SLURM, "SLURM_STEP_NUM_TASKS": "1"}, "must be started with srun in a job of 8 tasks"),
-        *(({n: "4"}, f"{n} must be 1 .*, got '4'; start with torchrun") for n in ("OMPI_COMM_WORLD_SIZE", "PMI_SIZE")),
+        *(({name: "4"}, f"{name} must be 1 .*, got '4'; start with torchrun") for name in OTHER_COUNTS),
+        *(({name: "1"}, f"{name} must be 0 without WORLD_SIZE, got '1'") for name in ("LOCAL_RANK", "NODE_RANK")),
+        (SLURM | {"SLURM_NNODES": "3"}, "SLURM_NTASKS must be a multiple of the 3 nodes, got 8"),
         (RESTARTS, r"STORE must be 1 in torchrun's environment .*--max-restarts 3\), got nothing"),
     ],
 )
