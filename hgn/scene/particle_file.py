@@ -23,10 +23,13 @@ def read_particles(path: Path, field: str, material: str, domain_size: Vector) -
         if kind == "USD":
             arrays = read_usd_particles(path, material)
         else:
-            arrays = {name: array for name, array in read_npz(path) if name in ("position", "velocity")}
+            names = ("position", "velocity", "velocities")
+            arrays = {name: array for name, array in read_npz(path) if name in names}
     except ValueError as error:
         text = f"{path}: {error}" if kind == "USD" else str(error)
         raise ConfigError(f"{field} must be a readable {kind} file, got {text}") from error
+    rule, remedy = "a file with arrays named position and velocity", "did you mean velocity?"
+    require("velocities" not in arrays, field, rule, "velocities", remedy)
     require("position" in arrays, field, "a file with an array named position", path)
     for name, value in arrays.items():
         require(value.dtype.kind in "fiu", f"{field}: {name}", "of numbers", value.dtype.name)

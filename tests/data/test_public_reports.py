@@ -95,3 +95,14 @@ def test_positions_rounded_before(name, stored):
     with pytest.raises(ConfigError, match=r"set: position must have numbers at most 3.5e-05 apart"):
         require_fine("set", ROUNDED[name](walk_TN3).astype(stored), 0.035)
     require_fine("set", np.tile((np.arange(180.0) % 17 / 16).reshape(60, 3).astype(stored), (20, 1, 1)), 0.035)
+
+
+@pytest.mark.parametrize("name", ["particle_types", "types", "Material"])
+def test_types_by_another_name(tmp_path, name):
+    """Types that the file has under another name are not taken for those of a fluid; other fields are ignored."""
+    fields = {"position": POSITIONS[0], "particle_id": np.arange(5), "material_property": np.ones(5)}
+    np.savez(tmp_path / "train.npz", **{f"0/{key}": value for key, value in fields.items()})
+    assert read(tmp_path)[0].type_N.tolist() == [1] * 5
+    np.savez(tmp_path / "train.npz", **{f"0/{key}": value for key, value in (fields | {name: TYPES[0]}).items()})
+    with pytest.raises(ConfigError, match=rf"train.npz: 0: {name} must be named particle_type, got '{name}'"):
+        read(tmp_path)

@@ -359,6 +359,7 @@ def test_particles_of_a_file(tmp_path):
         ({"position": np.full((2, 3), 1.5)}, "position must be inside the domain, got '2 outside'"),
         ({"position": np.full((2, 3), 0.5), "velocity": np.zeros((1, 3))}, r"velocity must be of shape \(2, 3\)"),
         ({"position": np.array([{}], object)}, "must be a readable .npz file"),
+        ({"position": np.full((2, 3), 0.5), "velocities": np.ones((2, 3))}, "arrays .*'velocities'; did you mean vel"),
     ],
 )
 def test_particles_that_cannot_be_taken(tmp_path, arrays, message):

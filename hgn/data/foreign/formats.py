@@ -237,6 +237,9 @@ def _of_members(name: str, members: Mapping[str, Any], info: SetInfo) -> Traject
     types = members.get("particle_type")
     if types is None:
         require(info.format == "plain", f"{name}: particle_type", "there", None)
+        for key in members:
+            other = key == "material_property" or not re.search("type|material", key, re.IGNORECASE)
+            require(other, f"{name}: {key}", "named particle_type", key, "rename it")
         types = np.full((), FLUID)
     position_TND, type_N = checked(name, position, types, info.dimensions)
     real_N = ~np.isin(type_N, list(info.ignored_types))
