@@ -83,6 +83,10 @@ ROUNDED = {
     "3 decimals": lambda a: np.round(a, 3),
     "8 bits": lambda a: np.round(a * 255) / 255,
     "far away": lambda a: (a + np.float32(1e5)) - np.float32(1e5),
+    "very far away": lambda a: (a + np.float32(1e6)) - np.float32(1e6),  # 17 values are left
+    "far away along one axis": lambda a: (a + np.float32([0, 4e5, 0])) - np.float32([0, 4e5, 0]),
+    "far away along two axes": lambda a: (a + np.float32([4e5, 0, 4e5])) - np.float32([4e5, 0, 4e5]),
+    "one axis in 3 decimals": lambda a: np.stack([a[..., 0], a[..., 1], np.round(a[..., 2], 3)], axis=2),
 }
 
 

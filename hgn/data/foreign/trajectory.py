@@ -1,7 +1,7 @@
 """The common form of trajectories of all formats, with its checks.
 
-Shape legend: T frames, N particles of all kinds, n sampled coordinates, P particles of the boundary, D dimensions, 2 or
-3. K is the number of obstacle cells, or in property_NK of properties.
+Shape legend: T frames, N particles of all kinds, n sampled particles or coordinates, P particles of the boundary, D
+dimensions, 2 or 3. K is the number of obstacle cells, or in property_NK of properties.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from hgn.system.claims import require_few_items
 
 COARSEST = 1e-3  # largest spacing of stored numbers, in radii; gravity moves a particle by a few of these in a frame
 SAMPLED = 100_000  # number of coordinates of a trajectory that are searched for rounding
+MOVES = 20  # number of changed coordinates above which repeated values show rounding
 MOST_RADII = 1 << 14  # largest size of the box in radii, because cells are indexed by integers
 LARGEST = 1e15  # largest size of a number, so that float32 stores its square
 FLUID = 1  # the type of particles in files without types
@@ -132,14 +133,20 @@ def floats(name: str, array: Any, shape: tuple[int | None, ...]) -> np.ndarray:
 
 def _step(position_TND: np.ndarray, radius: float) -> float:
     """Returns the smallest difference between coordinates that change, or 0 if too few change to detect rounding."""
-    path_TnD = position_TND[:, :: max(1, position_TND.size // SAMPLED)].astype(np.float64)
-    moves_TnD = np.diff(path_TnD, axis=0) != 0
-    moved = path_TnD[1:][moves_TnD]
-    moved = np.unique(moved[np.abs(moved) > 0.5 * np.abs(moved).max(initial=0)])  # floats are coarsest there
-    count = len(np.unique(path_TnD[0][moves_TnD.any(axis=0)])) * len(path_TnD) / 2  # equal coordinates count once
+    path_Tn = np.unique(position_TND.reshape(len(position_TND), -1), axis=1)  # equal paths count once
+    path_Tn = path_Tn[:, (path_Tn != path_Tn[0]).any(axis=0)]
+    if not path_Tn.size:
+        return 0.0
+    moves_Tn = np.diff(path_Tn, axis=0) != 0
+    moved = path_Tn[1:][moves_Tn]
+    moved = moved[np.abs(moved) > 0.5 * np.abs(moved).max()]  # floats are coarsest there
+    values, per_path = np.unique(moved), (np.diff(np.sort(path_Tn, axis=0), axis=0) != 0).sum(axis=0).mean()
+    count = len(np.unique(path_Tn[0])) * min(per_path, len(path_Tn) / 2)
     # unrounded numbers, if they are not few, almost surely contain a difference below COARSEST
-    few = len(moved) < 2 or count**2 * COARSEST * radius < 20 * np.ptp(moved)
-    return 0.0 if few else float(np.diff(moved).min())
+    few = count**2 * COARSEST * radius < 20 * np.ptp(values)
+    # a particle whose motion in a frame is less than the spacing rests, jumps, and rests
+    jumps = len(moved) > MOVES and 2 * len(values) < len(moved) and 2 * moves_Tn.sum() < moves_Tn.size
+    return float(np.diff(values).min()) if len(values) > 1 and (jumps or not few) else 0.0
 
 
 def require_fine(name: str, position_TND: np.ndarray, radius: float) -> None:
@@ -147,7 +154,9 @@ def require_fine(name: str, position_TND: np.ndarray, radius: float) -> None:
     single = position_TND.astype(np.float32)
     stored = single if np.array_equal(single, position_TND) else position_TND
     largest = np.abs(stored).max(initial=0)
-    spacing = max(float(np.spacing(largest)), _step(position_TND, radius))
+    path_TnD = position_TND[:, :: max(1, position_TND.size // SAMPLED)].astype(np.float64)
+    axes = np.split(path_TnD, path_TnD.shape[2], axis=2)  # rounding may differ, as that of map coordinates and heights
+    spacing = max(float(np.spacing(largest)), *(_step(part, radius) for part in (path_TnD, *axes)))
     if not spacing <= COARSEST * radius:
         raise ConfigError(
             f"{name}: position must have numbers at most {COARSEST * radius:.2g} apart, 0.001 radii, got "
