@@ -86,7 +86,10 @@ def compose(folder: Path, config_name: str, arguments: list[str], complete: bool
         os.environ.pop("HYDRA_FULL_ERROR", None)
         if full_error is not None:
             os.environ["HYDRA_FULL_ERROR"] = full_error
-    return [{str(key): value for key, value in dict(mapping).items()} for mapping in plain]  # type: ignore[arg-type]
+    result = [{str(key): value for key, value in dict(mapping).items()} for mapping in plain]  # type: ignore[arg-type]
+    if any(isinstance(mapping.get("experiment"), dict) for mapping in result):
+        raise ConfigError("files of experiments must begin with the line '# @package _global_', got one without")
+    return result
 
 
 def _unread(arguments: list[str], error: Exception) -> str:

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from hgn.command import run_command
 from hgn.config import TrainConfig
-from hgn.schema import ConfigError, from_mapping, require_replaceable
+from hgn.schema import ConfigError, from_mapping, require, require_replaceable
 from hgn.system.extras import missing_extra, require_installed
 from hgn.system.locks import locked
 from hgn.system.processes import die_with_parent
@@ -43,6 +43,7 @@ def main(mapping: dict[str, Any]) -> int:
 
     require_installed("lightning")
     name = mapping.pop("name", "unnamed")
+    require(isinstance(name, str) and name != "", "name", "text", name, "put it in quotes")
     if mapping.get("run") is None:
         mapping["run"] = str(default_run(name))
     config = from_mapping(TrainConfig, settings_of_imported(mapping))

@@ -143,6 +143,25 @@ def test_experiments_with_bad_yaml(tmp_path, command, content, message):
     assert code == 2 and message in error
 
 
+@pytest.mark.parametrize("head", ["", "# mine\n" + HEAD])
+def test_experiments_without_a_package(tmp_path, command, head):
+    """The key that Hydra puts such a file under is not the user's mistake: the line that is missing is named."""
+    (tmp_path / "experiment").mkdir()
+    (tmp_path / "experiment" / "mine.yaml").write_text(head + "training: {seed: 1}\n")
+    code, _, error = command("train", f"--config-dir={tmp_path}", "experiment=mine")
+    assert code == 2 and "must begin with the line '# @package _global_'" in error and error.count("\n") == 1
+
+
+@pytest.mark.parametrize("name", ["yes", "2024", "1e3", "null", "[a]", "{a: 1}", "''"])
+def test_names_of_trainings(tmp_path, command, name):
+    """What YAML does not read as text is no name of a folder."""
+    (tmp_path / "experiment").mkdir()
+    (tmp_path / "experiment" / "mine.yaml").write_text(f"{HEAD}name: {name}\n")
+    given = (f"--config-dir={tmp_path}", "experiment=mine", "training.devices=0")  # refused after the name
+    code, _, error = command("train", *given, main="hgn.train")
+    assert code == 2 and error.startswith("error: name must be text, got ") and error.count("\n") == 1
+
+
 def test_groups_and_included_files(tmp_path, command):
     """A file of a group is read as strictly; one that an experiment includes ends in one line too. `~training` is
     refused, wherever options stand."""
