@@ -28,7 +28,7 @@ from hgn.data.verification import StorageError, verify_file
 from hgn.schema import ConfigError, near_name, require
 from hgn.system.extras import missing_extra
 from hgn.system.files import open_at_once, read_replaced
-from hgn.system.hub import PREFIX, HubPlace, hub_token
+from hgn.system.hub import PREFIX, HubPlace, hub_token, is_loopback
 from hgn.system.patience import UnreachableError, inside, patiently, standard_patience_s
 
 TOKEN_VARIABLE = "HGN_DATASET_TOKEN"
@@ -36,7 +36,7 @@ TOKEN_HOST_VARIABLE = "HGN_DATASET_HOST"
 _CHUNK_BYTES = 16 * 2**20  # bytes of a shard per request; a lost connection costs at most one request
 _CONNECT_S, _SILENCE_S, _ANSWER_S = 10.0, 60.0, 1800.0  # limits: to connect, between two pieces, for a whole answer
 _AWAY_S = 10.0  # for this time after a failed request, calls with patience_s=0 fail without a request
-_PROXY = re.compile(r"http://(\S+@)?([\w.-]+|\[[\w.:]+\])(:\d{1,5})?/?")
+_PROXY = re.compile(r"http://([^\s/?#]+@)?([\w.-]+|\[[\w.:]+\])(?::(\d{1,5}))?/?")
 _HTTP = ("http", "https")
 _NETWORK_PACKAGES = {"aiohttp", "botocore", "aiobotocore", "gcsfs", "google", "azure"}
 
@@ -128,14 +128,15 @@ def _uses_proxies(url: str) -> bool:
     others = re.split(r"[\s,;]+", given.get("no", ""))
     names = ",".join(name.removeprefix("*") or name for name in others)
     direct = proxy_bypass_environment(address.netloc.rpartition("@")[2], {"no": names})
-    if _is_loopback(url) or direct or any(_lies_in(address.hostname or "", name) for name in others):
+    if is_loopback(url) or direct or any(_lies_in(address.hostname or "", name) for name in others):
         return False
     for kind in ("http", "https"):
         proxy = (given.get(kind) or given.get("all", "")).strip()
         if proxy:
             proxy = proxy if "://" in proxy else f"http://{proxy}"
-            fits, name = _PROXY.fullmatch(proxy) is not None, f"{kind if given.get(kind) else 'all'}_proxy"
-            require(fits, name, "as http://host:port", proxy, "or set no_proxy")
+            match, name = _PROXY.fullmatch(proxy), f"{kind if given.get(kind) else 'all'}_proxy"
+            fits = match is not None and int(match[3] or 0) < 1 << 16
+            require(fits, name, "as http://host:port", proxy, "with %23 for # in a password, or set no_proxy")
             os.environ[f"{kind}_proxy"] = proxy
     return True
 
@@ -181,14 +182,6 @@ def dataset_token() -> str | None:
 def _token_is_for(url: str) -> bool:
     named, address = os.environ.get(TOKEN_HOST_VARIABLE), urlsplit(url)
     return not named or named in (address.hostname, f"{address.hostname}:{address.port}")
-
-
-def _is_loopback(url: str) -> bool:
-    host = urlsplit(url).hostname or ""
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return host == "localhost"
 
 
 class _Folder(Storage):

@@ -7,6 +7,7 @@ $HF_ENDPOINT names another server, and $HF_TOKEN is the token for private reposi
 from __future__ import annotations
 
 import functools
+import ipaddress
 import os
 import re
 import threading
@@ -15,7 +16,8 @@ from concurrent.futures import Future
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
-from urllib.parse import quote
+from urllib.parse import quote, urlsplit
+from urllib.request import getproxies
 
 from hgn.schema import ConfigError
 from hgn.system.patience import UnreachableError, patiently
@@ -66,6 +68,15 @@ def hub_token() -> str | None:
     return os.environ.get("HF_TOKEN") or None
 
 
+def is_loopback(url: str) -> bool:
+    """Returns whether a URL names this machine."""
+    host = urlsplit(url).hostname or ""
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
+
+
 @functools.lru_cache(maxsize=64)
 def hub_weights(url: str, field: str = "weights", patience_s: float = _PATIENCE_S) -> Path:
     """Downloads a weights file of a repository, the named or the only one, to huggingface_hub's cache.
@@ -77,6 +88,15 @@ def hub_weights(url: str, field: str = "weights", patience_s: float = _PATIENCE_
 
     if place.is_dataset:
         raise ConfigError(f"{field} must be of a repository of weights, hf://USER/NAME, got {url!r}")
+    direct, host = getproxies().get("no", ""), urlsplit(endpoint()).hostname
+    if is_loopback(endpoint()) and host not in direct.split(","):
+        os.environ["no_proxy"] = f"{direct},{host}".lstrip(",")
+    try:
+        huggingface_hub.get_session()
+    except Exception as error:  # of httpx, of several kinds
+        raise ConfigError(
+            f"proxies of the environment must be as http://host:port, got {error}; or set no_proxy"
+        ) from error
     api = huggingface_hub.HfApi(endpoint=endpoint(), token=hub_token())
     name = place.path
     if not name.endswith(".safetensors"):

@@ -115,11 +115,10 @@ def test_proxies_are_honoured(monkeypatch, variable):
             assert open_storage(f"{url}/set").read("manifest.json", 0, 5) == b"hello"
     assert asked == ["http://data.example:9/set/manifest.json", "/set/manifest.json"]
     monkeypatch.delenv("http_proxy")
-    monkeypatch.setenv(variable, "socks5://127.0.0.1:1")
-    with pytest.raises(
-        ConfigError, match=f"{variable.lower()} must be as http://host:port, got 'socks5://127.0.0.1:1'"
-    ):
-        hgn.data.storage._uses_proxies("http://11.0.0.1/set")
+    for proxy in ("socks5://127.0.0.1:1", "http://me:a#b@127.0.0.1:1", "http://me:a/b@127.0.0.1:1", "127.0.0.1:99999"):
+        monkeypatch.setenv(variable, proxy)
+        with pytest.raises(ConfigError, match=f"{variable.lower()} must be as http://host:port, got "):
+            hgn.data.storage._uses_proxies("http://11.0.0.1/set")
 
 
 def test_server_without_ranges(folder, monkeypatch):

@@ -3,6 +3,7 @@
 import shutil
 import time
 
+import huggingface_hub
 import numpy as np
 import pytest
 import torch
@@ -30,6 +31,8 @@ def hub(tmp_path, monkeypatch):
     monkeypatch.setenv("HGN_CACHE", str(tmp_path / "cache"))
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path / "hub_cache"))
     monkeypatch.delenv("HF_TOKEN", raising=False)
+    for name in ("no_proxy", "NO_PROXY"):
+        monkeypatch.setenv(name, "")  # so that it is as before after the test, though reading sets it
     monkeypatch.setattr("hgn.system.patience.FIRST_PAUSE_S", 0.01)
     hub_weights.cache_clear()
     with served(tmp_path / "hub") as server:
@@ -48,6 +51,26 @@ def test_weights_come_from_a_repository(url, hub):
     assert path.read_bytes() == stored.read_bytes() and load_weights(path)[1].frame_rate_hz == 60.0
     asked = len(hub.asked)
     assert find_weights(url) == path and len(hub.asked) == asked
+
+
+@pytest.mark.parametrize(
+    ("proxy", "message"),
+    [
+        ("http://127.0.0.1:1", None),  # nobody listens there
+        *((proxy, "proxies of the environment must be") for proxy in ("socks5://127.0.0.1:1", "ftp://a", '"http://a"')),
+    ],
+)
+def test_proxies(hub, monkeypatch, proxy, message):
+    """A hub of this machine is read without a proxy, and proxies of another kind are refused in a line."""
+    monkeypatch.setenv("HTTP_PROXY", "")
+    monkeypatch.setenv("http_proxy", proxy)
+    huggingface_hub.close_session()
+    if message is None:
+        assert find_weights("hf://one/net").is_file()
+    else:
+        with pytest.raises(ConfigError, match=message):
+            find_weights("hf://one/net")
+    huggingface_hub.close_session()
 
 
 @pytest.mark.parametrize(
