@@ -23,7 +23,7 @@ VARIABLE = "HGN_PATIENCE_S"
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.25, 10.0
 
 T = TypeVar("T")
-without = threading.Event()  # while this is set, no thread waits
+without = threading.Event()  # while this is set, no thread waits to read
 
 
 class UnreachableError(OSError):
@@ -55,7 +55,7 @@ def inside(event: threading.Event) -> Iterator[None]:
 
 
 def without_patience() -> contextlib.AbstractContextManager[None]:
-    """Returns a context in which no thread of this process waits for a server that does not answer."""
+    """Returns a context in which no thread of this process waits to read from a server that does not answer."""
     return inside(without)
 
 
@@ -69,14 +69,20 @@ def outlived(write: Callable[[], T], path: Path) -> T:
         passing = isinstance(error, OSError) and not isinstance(error, (IsADirectoryError, NotADirectoryError))
         return str(error) if passing else None
 
-    return patiently(write, cause, str(path), str(path.parent), standard_patience_s())
+    return patiently(write, cause, str(path), str(path.parent), standard_patience_s(), ended=threading.Event())
 
 
 def patiently(
-    ask: Callable[[], T], passing: Callable[[Exception], str | None], url: str, server: str, patience_s: float
+    ask: Callable[[], T],
+    passing: Callable[[Exception], str | None],
+    url: str,
+    server: str,
+    patience_s: float,
+    ended: threading.Event = without,
 ) -> T:
     """Returns `ask()`, and retries it while `passing` returns the cause of its error. None marks a permanent error.
 
+    While `ended` is set it does not wait.
     Raises UnreachableError with `url`, or a permanent error.
     """
     start, pause, warned = time.monotonic(), FIRST_PAUSE_S, False
@@ -87,11 +93,11 @@ def patiently(
             cause = passing(error)
             if cause is None:
                 raise
-            if time.monotonic() - start + pause > patience_s or without.is_set():
+            if time.monotonic() - start + pause > patience_s or ended.is_set():
                 raise UnreachableError(url, patience_s, cause) from error
             if not warned and pause > 1:
                 warned = True
                 text = f"{server} does not answer ({cause}); retrying for {patience_s:.0f} s"
                 print(printable(text), file=sys.stderr)
-            without.wait(pause * random.uniform(0.5, 1.0))  # spreads the readers' retries in time
+            ended.wait(pause * random.uniform(0.5, 1.0))  # spreads the readers' retries in time
             pause = min(2 * pause, LONGEST_PAUSE_S)

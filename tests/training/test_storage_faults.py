@@ -26,7 +26,7 @@ from hgn.data.reader import EpisodeStore, find_episode, first_episodes
 from hgn.data.shard_cache import CACHE_VARIABLE
 from hgn.data.storage import faults_outlived
 from hgn.schema import ConfigError, from_mapping
-from hgn.system.patience import VARIABLE
+from hgn.system.patience import VARIABLE, outlived, without_patience
 from hgn.training import callbacks, checkpoint_writer, monitor
 from hgn.training.checkpoint import LAST_NAMES, read_checkpoint
 from hgn.training.dataset import wait_for_episodes
@@ -259,6 +259,12 @@ def test_a_folder_of_a_run_that_fails_for_a_moment(data, tmp_path, monkeypatch):
     lines = [line["update"] for line in metrics(tmp_path / "run") if "loss" in line]
     assert lines == sorted(set(lines)) and list((tmp_path / "run" / "pictures").iterdir())
     assert read_checkpoint(tmp_path / "run" / "checkpoints" / "last.ckpt")["hgn"]["updates"] == lines[-1]
+
+
+def test_writes_wait_while_readers_end(tmp_path):
+    """The end of the feed, after the last update, ends the waits of its readers, and not that for a checkpoint."""
+    with without_patience():
+        assert outlived(failing_at_first(lambda: 3), tmp_path / "last.ckpt") == 3
 
 
 def test_a_training_outlives_a_fault(data, tmp_path, monkeypatch):
