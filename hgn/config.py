@@ -353,7 +353,8 @@ class TrainingConfig:
     optimizer: Annotated[str, one_of("adam", "muon")] = "adam"
     learning_rate: Positive[float] = 1e-4  # learning rate of the first update after the warm-up
     final_learning_rate: Positive[float] = 1e-6  # learning rate at maximum_updates, after exponential decay
-    warmup_updates: NonNegative[int] = 0  # number of first updates with a linear increase of the rate
+    # number of first updates with a linear increase of the rate, at most a fifth of maximum_updates
+    warmup_updates: NonNegative[int] = 0
     # weights from which a new run starts (not a resumed one): a file of python -m hgn.export or a shipped name
     init_weights: str | None = None
     # decay per update of the parameters' average, which is monitored and exported, for example 0.9999; 0: none

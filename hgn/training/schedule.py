@@ -8,9 +8,13 @@ FIRST_MEASUREMENT = 2_000  # smallest number of updates before the first measure
 
 
 def learning_rate(training: TrainingConfig, update: int) -> float:
-    """Returns the learning rate of update number `update`, from 0: a linear warm-up, then exponential decay."""
+    """Returns the learning rate of update number `update`, from 0: a linear warm-up, then exponential decay.
+
+    The warm-up is at most a fifth of the training, so that a short trial reaches the configured rate.
+    """
     decay = (training.final_learning_rate / training.learning_rate) ** (1 / training.maximum_updates)
-    warmth = min(1.0, (update + 1) / training.warmup_updates) if training.warmup_updates else 1.0
+    warmup = min(training.warmup_updates, training.maximum_updates // 5)
+    warmth = min(1.0, (update + 1) / warmup) if warmup else 1.0
     return training.learning_rate * (decay**update * warmth)
 
 

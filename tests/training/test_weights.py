@@ -122,6 +122,17 @@ def test_warm_up():
     assert learning_rate(cold, 0) == 1e-3 and learning_rate(warm, 100) == pytest.approx(1e-5)
 
 
+@pytest.mark.parametrize("updates", [1, 4, 60, 100, 1499, 1500, 75_000])
+def test_the_warm_up_of_a_short_training_is_at_most_a_fifth_of_it(updates):
+    """A warm-up of 300 updates does not keep the rate of a training of 100 updates below a tenth of its rate."""
+    values = {"learning_rate": 1e-3, "final_learning_rate": 1e-5, "maximum_updates": updates}
+    warm, cold = (TrainingConfig(**values, warmup_updates=n) for n in (300, 0))
+    factors = [learning_rate(warm, update) / learning_rate(cold, update) for update in range(min(updates, 400))]
+    length = min(300, updates // 5)
+    assert factors[length:] == [1.0] * len(factors[length:])
+    assert factors[:length] == pytest.approx([(update + 1) / length for update in range(length)])
+
+
 @pytest.mark.parametrize(("name", "kind"), [("adam", torch.optim.Adam), ("muon", Muon)])
 def test_the_optimiser_is_the_configured_one(name, kind):
     """Both are fused, which alone can skip a step by themselves."""
