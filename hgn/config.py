@@ -400,7 +400,7 @@ class TrainingConfig:
     generate: bool = True  # whether to start the generator if the data set is missing or incomplete
     # loggers in addition to metrics.jsonl: tensorboard, wandb, mlflow; their variables name servers and projects
     loggers: tuple[Annotated[str, one_of(*LOGGERS)], ...] = ("tensorboard",)
-    log_every: Positive[int] = 50  # number of updates between log lines
+    log_every: Positive[int] = 50  # number of updates between log lines; the last update has one too
     checkpoint_every: Positive[int] = 1_000  # number of updates between checkpoints
     # number of updates between measurements of one-step and rollout errors; the first interval is halved down to 2,000
     monitor_every: Positive[int] = 100_000

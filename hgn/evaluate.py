@@ -152,14 +152,15 @@ def end_of_rollout(trial: RolloutResult, episode: Episode) -> dict[str, Any]:
     from hgn.scene.episode_obstacles import obstacles_of_episode
 
     obstacles, last = obstacles_of_episode(episode), trial.frame_count - 1
+    time_s = last / episode.frame_rate_hz
     position_N3 = trial.position_TN3[last]
     beyond_N3 = (position_N3 < 0) | (position_N3 > np.asarray(episode.domain_size))
     return {
         "episode": episode.key,
         "frames": trial.frame_count,
         "cause": trial.cause,
-        "penetration": fraction_inside(position_N3, obstacles),
-        "reference_penetration": fraction_inside(np.asarray(episode.position_TN3[last]), obstacles),
+        "penetration": fraction_inside(position_N3, obstacles, time_s),
+        "reference_penetration": fraction_inside(np.asarray(episode.position_TN3[last]), obstacles, time_s),
         "outside_domain": float(beyond_N3.any(-1).mean()),
     }
 

@@ -20,6 +20,7 @@ from hgn.command import run_command
 from hgn.config import DEFAULT_WEIGHTS, USD_ENDINGS, SceneConfig, SimulatorConfig, require_rollout_name
 from hgn.data.reader import find_episode
 from hgn.render import PLY_ENDING
+from hgn.scene.distance import fraction_inside
 from hgn.scene.emission import entry_frames
 from hgn.scene.material import INPUT_PARAMETERS, MATERIALS
 from hgn.scene.random_scene import generate_scene
@@ -46,6 +47,7 @@ if TYPE_CHECKING:
 PICTURES = 4  # number of pictures in the PNG
 EVERY = 3  # smallest number of frames of the rollout for one picture of the GIF
 FASTEST = 50  # largest number of pictures per second that viewers of GIFs show
+REPORTED_INSIDE = 0.01  # smallest fraction of particles inside obstacles that is reported
 SAME_SPEED = 1e-5  # largest relative difference of speeds that count as equal; velocities are stored in float32
 
 
@@ -96,6 +98,11 @@ def main(mapping: dict[str, Any]) -> int:
     require_replaceable("out", out, *(pictures if drawn else ()))
     with ended_as_by_ctrl_c():
         path, result = rollout(config)
+    last = result.frame_count - 1
+    present_N3 = result.position_TN3[last, : result.present(last)]
+    inside = fraction_inside(present_N3, result.obstacles, last / result.frame_rate_hz)
+    if inside > REPORTED_INSIDE:
+        print(f"inside obstacles: {inside:.1%} of the particles in the last frame", file=sys.stderr)
     print(path)
     if drawn:
         write_picture(still, compare_picture(result, spread(result.frame_count, PICTURES)), result.source)

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from hgn.command import run_command
 from hgn.config import TrainConfig
-from hgn.schema import ConfigError, from_mapping, require, require_replaceable
+from hgn.schema import ConfigError, from_mapping, printable, require, require_replaceable
 from hgn.system.extras import missing_extra, require_installed
 from hgn.system.locks import locked
 from hgn.system.processes import die_with_parent
@@ -34,7 +34,7 @@ def main(mapping: dict[str, Any]) -> int:
     from hgn.data.manifest import Manifest
     from hgn.data.reader import EpisodeStore
     from hgn.data.storage import is_remote
-    from hgn.training.dataset import PublishedEpisodes, is_complete, more_data, wait_for_episodes, warning_on_a_cpu
+    from hgn.training.dataset import PublishedEpisodes, missing_scenes, more_data, wait_for_episodes, warning_on_a_cpu
     from hgn.training.distributed import default_run, layout
     from hgn.training.generator import Generator
     from hgn.training.imported import require_network_fits, settings_of_imported
@@ -76,7 +76,7 @@ def main(mapping: dict[str, Any]) -> int:
         initial = _initial_network(config, resume)
         generator = None
         # A URL is a service that generates missing episodes itself.
-        if first_rank() and config.training.generate and not is_remote(folder) and not is_complete(config):
+        if first_rank() and config.training.generate and not is_remote(folder) and missing_scenes(config):
             on_gpu = config.training.device != "cpu" and torch.cuda.is_available()
             if not on_gpu and (warning := warning_on_a_cpu(config)):
                 print(warning, file=sys.stderr)
@@ -88,6 +88,8 @@ def main(mapping: dict[str, Any]) -> int:
             lost = "whole scenes are kept, scenes in the middle of their simulation begin anew"
             print(f"stopped before the first episode was published; {lost}; the same command resumes", file=sys.stderr)
             return stop.exit_code
+        if first_rank() and generator is None and (missing := missing_scenes(config, ("train", "validation"))):
+            print(printable(f"{folder} has {missing} scenes, and this training generates none"), file=sys.stderr)
         stop.restart_clock(config.training.maximum_minutes)
         start = Start(store, resume, initial, precompilation)
         return train_network(config, start, stop, PublishedEpisodes(config, generator))
@@ -121,7 +123,7 @@ def _checkpoint_to_resume(config: TrainConfig, folder: Path) -> Resume | None:
     check_checkpoint(checkpoint, config, config_hash, path)
     progress = Progress.of(checkpoint)
     if first_rank():
-        print(f"resuming at update {progress.updates} of {config.training.maximum_updates}", file=sys.stderr)
+        print(f"resuming at update {progress.updates}", file=sys.stderr)
     return Resume(path, progress)
 
 

@@ -7,7 +7,7 @@ Shape legend: P points (or point-triangle pairs), F triangles, T tree nodes.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -83,10 +83,12 @@ def extent(point_P3: np.ndarray) -> str:
     return ", ".join(f"{axis} {low:.3g} to {high:.3g}" for axis, low, high in ends)
 
 
-def fraction_inside(position_N3: np.ndarray, obstacles: Sequence[Obstacle]) -> float:
-    """Returns the fraction of particles inside closed obstacles."""
+def fraction_inside(position_N3: np.ndarray, obstacles: Sequence[Obstacle], time_s: float) -> float:
+    """Returns the fraction of particles inside closed obstacles, which are where their motion places them at a time."""
     inside_N = np.zeros(len(position_N3), bool)
     for obstacle in obstacles:
+        if obstacle.motion is not None:
+            obstacle = replace(obstacle, vertex_V3=obstacle.motion.place(obstacle.vertex_V3, time_s))
         inside_N |= contains(position_N3, obstacle)
     return float(inside_N.mean()) if len(inside_N) else 0.0
 

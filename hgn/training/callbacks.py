@@ -34,7 +34,7 @@ from hgn.training.distributed import checksum, same_on_all_ranks
 from hgn.training.errors import format_ratio
 from hgn.training.gradients import take_counters
 from hgn.training.module import TrainingModule
-from hgn.training.schedule import measurement_due
+from hgn.training.schedule import log_line_due, measurement_due
 from hgn.training.stop import BY_WEIGHT, StopRequest
 
 METRICS = "metrics.jsonl"
@@ -70,7 +70,7 @@ class SameWeights(Callback):
     def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
         """Raises: ConfigError on every rank if one of them has other parameters."""
         update = _update(pl_module)
-        if trainer.world_size == 1 or update % self.feed.training.log_every:
+        if trainer.world_size == 1 or not log_line_due(self.feed.training, update):
             return
         if not same_on_all_ranks(checksum(pl_module.parameters())):
             raise ConfigError(
@@ -165,7 +165,7 @@ class LogLines(Callback):
         if self._bar is not None:
             self._bar.update(update - self._bar.n)
             self._estimate(pl_module, self._bar)
-        if update % self.feed.training.log_every:
+        if not log_line_due(self.feed.training, update):
             return
         loss_sum, count = trainer.strategy.reduce(pl_module.loss_sum.clone(), reduce_op="sum").tolist()
         pl_module.loss_sum.zero_()

@@ -34,13 +34,17 @@ MEAN_FILLING = 0.7  # mean number of particles of a group, divided by that of a 
 BETWEEN_LOOKS_S = 10.0  # interval between reads of the manifest for the progress line
 
 
-def is_complete(config: TrainConfig) -> bool:
-    """Returns whether every configured episode is published."""
-    folder = config.dataset.folder
-    if not EpisodeStore.available(folder):
-        return False
-    manifest = Manifest.load(folder)
-    return all(manifest.published(split) >= config.dataset.scenes(split) for split in SPLITS)
+def missing_scenes(config: TrainConfig, splits: Sequence[str] = SPLITS) -> str:
+    """Returns the numbers of published and configured scenes of incomplete splits, as `1 of 2 validation, 0 of 3 test`.
+
+    The text is empty if every configured episode is published.
+    """
+    folder, wanted = config.dataset.folder, {split: config.dataset.scenes(split) for split in splits}
+    manifest = Manifest.load(folder) if EpisodeStore.available(folder) else None
+    published = {split: manifest.published(split) if manifest else 0 for split in splits}
+    return ", ".join(
+        f"{published[split]} of {wanted[split]} {split}" for split in splits if published[split] < wanted[split]
+    )
 
 
 def more_data(config: TrainConfig) -> list[EpisodeStore]:

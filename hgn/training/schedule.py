@@ -41,3 +41,8 @@ def next_measurement(training: TrainingConfig, update: int) -> int:
 def measurement_due(training: TrainingConfig, update: int) -> bool:
     """Returns whether errors are measured after `update` updates, apart from the end of a training."""
     return next_measurement(training, update - 1) == update
+
+
+def log_line_due(training: TrainingConfig, update: int) -> bool:
+    """Returns whether metrics are logged after `update` updates: every `log_every`, and after the last one."""
+    return update % training.log_every == 0 or update == training.maximum_updates

@@ -134,7 +134,8 @@ def train_network(config: TrainConfig, start: Start, stop: StopRequest, publishe
     # a signal after the last measurement has no effect
     finished = module.update >= training.maximum_updates and checkpoints.measured_update == module.update
     if trainer.is_global_zero:
-        _report(config, module.update, monitor.last, stopped=stop.requested and not finished)
+        trained = resume is None or resume.progress.updates < training.maximum_updates
+        _report(config, module.update, monitor.last, trained, stopped=stop.requested and not finished)
     return 0 if finished else stop.exit_code
 
 
@@ -217,12 +218,16 @@ def _write_run_files(config: TrainConfig, manifest: Manifest) -> None:
     write_atomically(run / "config.yaml", yaml.safe_dump(record, sort_keys=False).encode())
 
 
-def _report(config: TrainConfig, updates: int, last: dict[str, float], stopped: bool) -> None:
-    print(f"trained {updates} of {config.training.maximum_updates} updates in {config.run}")
+def _report(config: TrainConfig, updates: int, last: dict[str, float], trained: bool, stopped: bool) -> None:
+    if trained:
+        print(f"trained {updates} of {config.training.maximum_updates} updates in {config.run}")
+    else:
+        print(f"{config.run} is finished: {updates} updates; training.maximum_updates above {updates} continues it")
     if "one_step/validation" in last:
         print(
-            f"one-step validation MSE {last['one_step/validation']:.3e} on every fourth frame (hgn.evaluate: on all), "
-            f"{format_ratio(last.get('baseline_ratio/validation', math.nan))} the best baseline's"
+            f"one-step validation MSE {last['one_step/validation']:.3e} on every fourth frame, "
+            f"{format_ratio(last.get('baseline_ratio/validation', math.nan))} the best baseline's; few frames contain "
+            "most of the error, so hgn.evaluate, which measures all, may print another ratio"
         )
     folder = Path(config.run) / "checkpoints"
     if not (folder / BEST_NAME).exists():

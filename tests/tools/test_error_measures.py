@@ -18,6 +18,7 @@ from hgn.runtime.backend import build
 from hgn.runtime.rollouts import RolloutResult, simulate_scenes
 from hgn.runtime.simulator import InitialState, Simulator
 from hgn.scene.distance import fraction_inside
+from hgn.scene.motion import Motion
 from hgn.scene.shapes import shape_obstacle
 from hgn.training.errors import ballistic, frame_batches, one_step_errors
 from tools.error_vs_time import plot, score
@@ -126,7 +127,9 @@ def test_shares_inside_obstacles_and_outside_of_the_domain():
     cone = shape_obstacle("cone", 0.4, (0.5, 0.5, 0.5), np.eye(3), "cone")
     square = shape_obstacle("square", 0.4, (0.5, 0.5, 0.5), np.eye(3), "square")
     point = np.array([[0.5, 0.5, 0.5], [0.9, 0.9, 0.9], [1.1, 0.5, 0.5], [0.5, -0.1, 0.5]])
-    assert fraction_inside(point, [cone]) == 0.25 and fraction_inside(point, [square]) == 0
+    assert fraction_inside(point, [cone], 0.0) == 0.25 and fraction_inside(point, [square], 0.0) == 0
+    away = replace(cone, motion=Motion.of_frames([(0.0, (0, 0, 0)), (2.0, (0.8, 0, 0))], (0.5, 0.5, 0.5)))
+    assert [fraction_inside(point, [away], time) for time in (0.0, 0.8, 1.5)] == [0.25, 0.0, 0.25]
     assert outside_domain(point, (1.0, 1.0, 1.0)) == 0.5 and outside_domain(point[:0], (1.0, 1.0, 1.0)) == 0
 
 

@@ -203,7 +203,7 @@ def test_a_stopped_measurement_is_made_on_resume(data, tmp_path, monkeypatch, ca
     assert not [line for line in metrics(tmp_path / "cut") if line["update"] == stopped_at and "loss" not in line]
     assert trained("cut") == 0
     output = capsys.readouterr()
-    assert f"resuming at update {stopped_at} of 12\n" in output.err and "every fourth frame" in output.out
+    assert f"resuming at update {stopped_at}\n" in output.err and "every fourth frame" in output.out
     assert trained("cut") == 0
     assert "stopped;" not in output.out and "no best.ckpt" not in output.out
     names = ("update", "loss", "one_step/training", "one_step/validation")

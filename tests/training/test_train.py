@@ -135,7 +135,7 @@ def test_the_end_of_a_diverged_run_is_reported(make_config, run, capsys):
     mapping = train_mapping(make_config(), run)
     mapping.pop("name")
     config = from_mapping(TrainConfig, mapping)
-    session._report(config, 3, {"one_step/validation": math.inf}, stopped=False)
+    session._report(config, 3, {"one_step/validation": math.inf}, trained=True, stopped=False)
     assert "one-step validation MSE inf" in capsys.readouterr().out
 
 
@@ -224,16 +224,19 @@ def test_progress_reads_the_data_set_seldom(make_config, make_dataset, tmp_path,
         assert looks == expected
 
 
-def test_a_finished_run_stays_finished(finished):
-    """Starting a finished run again changes no file of its results; incomplete files of a crash are removed. While
-    another training is in the run it is refused."""
+@pytest.mark.parametrize("updates", [12, 5])
+def test_a_finished_run_stays_finished(finished, capsys, updates):
+    """Starting a finished run again, also with fewer updates, changes no file of its results and reports what continues
+    it; incomplete files of a crash are removed. While another training is in the run it is refused."""
     data, run = finished
     kept = [run / "metrics.jsonl", *sorted((run / "checkpoints").iterdir())]
     before = [path.read_bytes() for path in kept]
     (run / "checkpoints" / ".last.ckpt.1.partial").write_bytes(b"half")
     with locked(run / ".lock", "run", ""), pytest.raises(ConfigError, match="run must be a folder of its own, got"):
         train.main(train_mapping(data, run))
-    assert train.main(train_mapping(data, run)) == 0
+    assert train.main(train_mapping(data, run, maximum_updates=updates)) == 0
+    printed = capsys.readouterr().out
+    assert printed == f"{run} is finished: 12 updates; training.maximum_updates above 12 continues it\n"
     assert {path.name for path in (run / "checkpoints").iterdir()} == {*LAST_NAMES, "best.ckpt"}
     assert [path.read_bytes() for path in kept] == before
 
@@ -265,6 +268,7 @@ def test_what_a_training_takes_is_said(make_config, make_dataset, tmp_path, monk
     assert train.main(train_mapping(config, tmp_path / "run", maximum_updates=3, log_every=50)) == 0
     assert bars[0].n == 3
     bars[0].close()
+    assert [record["update"] for record in metrics(tmp_path / "run") if "loss" in record] == [3]
     (line,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("about ")]
     assert "for the other updates, at" in line and "on a CPU: +experiment=demo (minutes), " in line
 
@@ -384,6 +388,17 @@ def test_signals_of_a_scheduler(order, capfd, monkeypatch):
         for number in order:
             stop._on_signal(number, None)
         assert stop.exit_code == 138 and capfd.readouterr().err.count("Ctrl-C again ends it at once") == lines
+
+
+def test_missing_scenes_without_generator(data, run, capsys):
+    """A training that makes no scenes names the splits that lack some."""
+    mapping = train_mapping(data, run, maximum_updates=1)
+    mapping["dataset"] |= {"validation_scenes": 3}
+    assert train.main(mapping) == 0
+    assert (
+        f"{data.dataset.folder} has 2 of 3 validation scenes, and this training generates none\n"
+        in capsys.readouterr().err
+    )
 
 
 def test_missing_data_without_generator(make_config, run):

@@ -74,7 +74,7 @@ def rollout_figures(
         mse_T[:end] = position_mse(trial.position_TN3, reference.position_TN3[:end])
         return {
             "momentum_error": momentum_error(trial.position_TN3, reference.position_TN3),
-            "penetration": fraction_inside(trial.position_TN3[-1], obstacles_of_episode(reference)),
+            "penetration": _penetration(trial.position_TN3[-1], reference, end - 1),
             "reference_penetration": _reference_penetration(reference, end - 1),
             "outside_domain": outside_domain(trial.position_TN3[-1], reference.domain_size),
         }
@@ -143,7 +143,11 @@ def label(row: Mapping[str, Any], setting: bool = True) -> str:
 # cached: the same for every contender
 @functools.lru_cache(maxsize=1024)
 def _reference_penetration(reference: Episode, frame: int) -> float:
-    return fraction_inside(np.asarray(reference.position_TN3[frame]), obstacles_of_episode(reference))
+    return _penetration(np.asarray(reference.position_TN3[frame]), reference, frame)
+
+
+def _penetration(position_N3: np.ndarray, reference: Episode, frame: int) -> float:
+    return fraction_inside(position_N3, obstacles_of_episode(reference), frame / reference.frame_rate_hz)
 
 
 def _of_materials(
