@@ -1,4 +1,4 @@
-"""python -m tools.curves runs=[runs/obstacles] out=results/NAME: learning curves of runs as PNG and JSON.
+"""python -m tools.curves runs=[runs/obstacles]: learning curves of runs as PNG and JSON.
 
 One run: loss, one-step errors with the baselines, and rollout errors, over updates. Several runs: loss and one-step
 validation error over the number of scenes seen so far, and this error also over minutes of training.
@@ -41,7 +41,8 @@ class CurvesConfig:
     """The options of `python -m tools.curves`."""
 
     runs: tuple[str, ...]  # folders of python -m hgn.train, for example [runs/obstacles,runs/gns]
-    out: str  # name of the files without ending: OUT.png and OUT.json
+    # name of the files without ending, OUT.png and OUT.json; null: curves, in the folder of the first run
+    out: str | None = None
 
     def __post_init__(self) -> None:
         require(len(self.runs) > 0, "runs", "at least one folder of python -m hgn.train", self.runs)
@@ -59,11 +60,12 @@ class Run:
 
 
 def main(mapping: dict[str, Any]) -> int:
-    """Writes <out>.png and <out>.json; returns the exit code."""
+    """Writes the PNG and the JSON; returns the exit code."""
     from hgn.system.provenance import provenance
 
     config = from_mapping(CurvesConfig, mapping)
-    picture, report = (Path(config.out).with_suffix(ending) for ending in (".png", ".json"))
+    out = Path(config.out or f"{config.runs[0]}/curves")
+    picture, report = (out.with_suffix(ending) for ending in (".png", ".json"))
     require_replaceable("out", picture, report)
     runs = [read_run(Path(folder)) for folder in config.runs]
     metas = [dict(run.settings.get("provenance", {})) | {"config": run.settings} for run in runs]
@@ -167,7 +169,8 @@ def _draw_several(panels: Any, runs: Sequence[Run], last: Mapping[str, float]) -
             _plot(panel, run.records, "one_step/validation", "", f"C{i}", marker="o", against=against)
     for panel, label in zip(panels, ("scenes trained on", "scenes trained on", "minutes of training"), strict=True):
         panel.set_xlabel(label)
-        panel.set_xscale("log")
+        first, last_one = panel.dataLim.intervalx
+        panel.set_xscale("log" if last_one > 10 * first else "linear")  # less than a decade has long labels in between
     for panel in panels[1:]:
         _plot_baselines(panel, last)
         panel.set_ylabel(ONE_STEP + ", validation")

@@ -7,7 +7,7 @@ import yaml
 from PIL import Image
 
 from hgn.schema import ConfigError
-from tools.curves import main, read_run
+from tools.curves import draw, main, read_run
 
 SETTINGS = {
     "training": {"batch_scenes": 2},
@@ -49,6 +49,17 @@ def test_several_runs(tmp_path):
         assert picture.width > 1000 and picture.height > 300
         colours = {colour for _, colour in picture.convert("RGB").getcolors(1 << 24)}
     assert {(31, 119, 180), (255, 127, 14)} <= colours  # both lines are drawn
+
+
+def test_short_runs(tmp_path, monkeypatch):
+    """The files of a run are in its folder by default. An axis of less than a decade is linear, because the labels
+    between two powers of ten overlap."""
+    assert main({"runs": [str(make_run(tmp_path / "x"))]}) == 0
+    assert {path.name for path in (tmp_path / "x").glob("curves.*")} == {"curves.png", "curves.json"}
+    figures = []
+    monkeypatch.setattr("tools.report.as_png", lambda figure: figures.append(figure) or b"")
+    draw([read_run(make_run(tmp_path / name)) for name in ("y", "z")])
+    assert [panel.get_xscale() for panel in figures[0].axes] == ["log", "linear", "linear"]
 
 
 def test_time_of_a_stop_does_not_count(tmp_path):
