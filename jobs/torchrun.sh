@@ -46,6 +46,9 @@ fi
 export TORCH_DISABLE_SHARE_RDZV_TCP_STORE=1
 export TORCH_ELASTIC_SHUTDOWN_TIMEOUT=${TORCH_ELASTIC_SHUTDOWN_TIMEOUT:-120} # seconds between SIGTERM and SIGKILL
 
+# torchrun sets the same for several processes, and prints a warning.
+[[ $GPUS == 1 ]] || export OMP_NUM_THREADS=${OMP_NUM_THREADS:-1}
+
 exec "$PYTHON" -m torch.distributed.run --nnodes "$NODES" --nproc-per-node "$GPUS" --max-restarts "$RESTARTS" \
     --rdzv-backend c10d --rdzv-endpoint "$RENDEZVOUS" --rdzv-id "${HGN_RUN:-$EXPERIMENT}" \
     --signals-to-handle SIGTERM,SIGINT,SIGHUP,SIGQUIT,SIGUSR1 \

@@ -155,17 +155,19 @@ def test_variables_are_refused(slurm, tmp_path, script, variables, message):
 @pytest.mark.parametrize(
     ("variables", "told"),
     [
-        ({"NODES": "3", "GPUS": "4", "RENDEZVOUS": "node0:1", "EXPERIMENT": "small"}, "3 4 3 node0:1 small small"),
-        ({"HGN_RUN": "mine", "RESTARTS": "0"}, "1 1 0 localhost:0 mine obstacles"),
+        ({"NODES": "3", "GPUS": "4", "RENDEZVOUS": "node0:1", "EXPERIMENT": "small"}, "3 4 3 node0:1 small small 1"),
+        ({"HGN_RUN": "mine", "RESTARTS": "0"}, "1 1 0 localhost:0 mine obstacles "),
     ],
 )
 def test_torchrun_is_told(tmp_path, variables, told):
     """torchrun is told how many processes there are, where they meet and what the run is called, on several machines
-    or one; the training follows it."""
-    write_program(tmp_path / "shown", SHOWN)
-    nodes, gpus, restarts, place, name, experiment = told.split()
-    done = run("torchrun.sh", "run=here and there", cwd=tmp_path, PYTHON=str(tmp_path / "shown"), **variables)
+    or one; the training follows it. Several processes have a thread each, without torchrun's warning."""
+    write_program(tmp_path / "shown", SHOWN.replace("^TORCH", "-e ^TORCH -e ^OMP_NUM"))
+    nodes, gpus, restarts, place, name, experiment, threads = told.split(" ")
+    variables |= {"PYTHON": str(tmp_path / "shown"), "OMP_NUM_THREADS": ""}
+    done = run("torchrun.sh", "run=here and there", cwd=tmp_path, **variables)
     assert done.stdout.splitlines() == [
+        f"OMP_NUM_THREADS={threads}",
         "TORCH_DISABLE_SHARE_RDZV_TCP_STORE=1",
         "TORCH_ELASTIC_SHUTDOWN_TIMEOUT=120",
         *("-m", "torch.distributed.run", "--nnodes", nodes, "--nproc-per-node", gpus, "--max-restarts", restarts),
