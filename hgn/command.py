@@ -46,7 +46,7 @@ _MACHINE_ERRORS = {
     errno.ECHILD: "free some memory, or check the device,",
 }
 
-
+SHOW_KEYS = "--help shows the keys"
 Main = Callable[[dict[str, Any]], int | None]
 
 
@@ -159,8 +159,9 @@ def _compose(config_name: str, complete: bool = True) -> list[dict[str, Any]]:
     from hgn.hydra_compat import compose
 
     arguments = _with_json_as_override(sys.argv)
-    _require_options(arguments)
-    return compose(_folder(config_name), config_name, [a for a in arguments if a not in ("--help", "-h")], complete)
+    folder = _folder(config_name)
+    _require_options(arguments, lambda: compose(folder, config_name, arguments[:1], complete=False)[0])
+    return compose(folder, config_name, [a for a in arguments if a not in ("--help", "-h")], complete)
 
 
 def _folder(config_name: str) -> Path:
@@ -176,8 +177,10 @@ def _print_help(config_name: str) -> None:
     print(*help_lines(mapping, _folder(config_name), config_name), sep="\n")
 
 
-def _require_options(arguments: list[str]) -> None:
+def _require_options(arguments: list[str], settings: Callable[[], dict[str, Any]]) -> None:
     """Refuses options after which Hydra would print pages, words without `=`, deletions, and paths that are too long.
+
+    `settings` returns the default configuration of the command.
 
     A deleted key would have the default of its dataclass, which differs from that of conf/, or be missing.
     """
@@ -186,12 +189,13 @@ def _require_options(arguments: list[str]) -> None:
     for before, argument in itertools.pairwise(arguments):
         name, _, value = argument.partition("=")
         if name.startswith("-") and name not in OPTIONS:
-            key = name.strip("-") or "KEY"
-            raise ConfigError(f"{argument} is not an option; settings are given as {key}={value or 'VALUE'}")
+            key = name.strip("-")
+            example = f"{key}={value or 'VALUE'}" if key.partition(".")[0] in settings() else f"KEY=VALUE; {SHOW_KEYS}"
+            raise ConfigError(f"{argument} is not an option; settings are given as {example}")
         if argument.startswith("~") and before not in OPTIONS:
             require(False, name[1:], "kept", argument, f"leave it out, or write {name[1:]}=VALUE")
         if "=" not in argument and not argument.startswith("-") and before not in OPTIONS:
-            raise ConfigError(f"settings are given as KEY=VALUE, got {argument!r}; --help shows the keys")
+            raise ConfigError(f"settings are given as KEY=VALUE, got {argument!r}; {SHOW_KEYS}")
         for item in re.split(r"[\[\]{},]", value if "://" not in value else ""):
             require(is_path(item), name.lstrip("+"), PATH_RULE, item, "choose a shorter one")
 

@@ -188,7 +188,7 @@ def table(rows: list[dict[str, Any]], config: EvaluateConfig, scenes: int) -> st
             mean = {name: np.mean([end[name] for end in row["ends"]]) for name in fractions}
             worst = max(end["penetration"] - end["reference_penetration"] for end in row["ends"])
             lines.append(
-                f"{'at the end':<20} within obstacles {mean['penetration']:.2%}, the solver's "
+                f"{'at the end':<20} within obstacles {mean['penetration']:.2%}, the data's "
                 f"{mean['reference_penetration']:.2%} ({worst:.2%} more in the worst scene), "
                 f"beyond the domain {mean['outside_domain']:.2%}"
             )

@@ -22,7 +22,7 @@ from hgn.scene.rotation import euler_rotation, rotate, round_to_float32
 from hgn.scene.scene import Obstacle
 from hgn.scene.surface import area_vectors, point_tree
 from hgn.scene.usd import read_usd_polygons
-from hgn.schema import ConfigError, Vector, require
+from hgn.schema import ConfigError, Vector, near_file, require
 
 _ASCII_STL = re.compile(rb"\s*solid.*\n\s*(facet|endsolid)", re.IGNORECASE)
 # ends of solids within an STL file; they are removed, because trimesh takes a millisecond for each solid
@@ -105,7 +105,8 @@ def _read(path: Path, field: str) -> tuple[np.ndarray, np.ndarray]:
             f"{field} must end in one of {', '.join((*MESH_SUFFIXES, *USD_ENDINGS))}, got {path}; convert the mesh"
         )
     if not path.is_file():
-        raise ConfigError(f"{field} must be an existing file, got {path}; in a scene file paths are relative to it")
+        remedy = near_file(path) or f"there is none at {path.absolute()}"
+        raise ConfigError(f"{field} must be an existing file, got {path}; {remedy}")
     try:
         vertex, triangle = read_glb(path) if path.suffix.lower() == ".glb" else _read_polygons(path)
     except (ConfigError, ModuleNotFoundError):

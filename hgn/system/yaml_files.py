@@ -46,7 +46,8 @@ def read_yaml(path: Path) -> Any:
         mark = getattr(error, "problem_mark", None)
         place = f"line {mark.line + 1}, column {mark.column + 1}: " if mark else ""
         cause = str(getattr(error, "problem", None) or error).splitlines()
-        raise ConfigError(f"{path} must be a YAML file: {place}{' '.join(cause)}") from error
+        remedy = "; check the indentation" if "<block end>" in cause[0] else ""
+        raise ConfigError(f"{path} must be a YAML file: {place}{' '.join(cause)}{remedy}") from error
 
 
 def read_json(path: Path) -> Any:

@@ -201,7 +201,7 @@ class LogLines(Callback):
         now, update = time.monotonic(), module.update
         self._first = self._first or (now, update)  # not timed, because it compiles kernels
         seconds, updates = now - self._first[0], update - self._first[1]
-        if self._estimated or updates < 2 or seconds < ESTIMATE_AFTER_S:
+        if self._estimated or self.feed.interrupted() or updates < 2 or seconds < ESTIMATE_AFTER_S:
             return
         self._estimated = True
         left_s = (self.feed.training.maximum_updates - update) * seconds / updates

@@ -23,7 +23,17 @@ from hgn.network.build import build_network
 from hgn.network.own_physics import physics_widths
 from hgn.renamed import current_names, with_step
 from hgn.runtime.weights import find_weights, load_weights, network_with
-from hgn.schema import Bounded, ConfigError, NonNegative, OrdinarySize, Vector, from_stored, require, to_mapping
+from hgn.schema import (
+    Bounded,
+    ConfigError,
+    NonNegative,
+    OrdinarySize,
+    Vector,
+    from_stored,
+    near_file,
+    require,
+    to_mapping,
+)
 from hgn.step_config import StepConfig
 from hgn.system.claims import Claims, require_few_items, require_plain_pickle
 
@@ -108,7 +118,7 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
         checkpoint = torch.load(path, map_location="cpu", weights_only=True)
         require_few_items(checkpoint)
     except FileNotFoundError:
-        last, remedy = path.parent / LAST_NAMES[0], "hgn.train writes one"
+        last, remedy = path.parent / LAST_NAMES[0], near_file(path) or "hgn.train writes one"
         of_run = [file for name in (BEST_NAME, *LAST_NAMES) if (file := path / "checkpoints" / name).is_file()]
         if path.name == BEST_NAME and last.is_file():
             remedy = f"no validation scene was measured, so take {last}"

@@ -21,15 +21,16 @@ from hgn.scene.episode import Episode
 REPORTED_FRAMES = (10, 50, 150, 299)  # frames of a rollout whose errors are reported
 FRAMES_AT_ONCE = 16  # number of frames converted to float64 together
 MONITORED_SCENES = 5  # number of scenes of each split that a training measures
+LARGE_RATIO = 1e4  # ratios from here on are written with an exponent
 PARTICLES_PER_BATCH = 32_768  # limits the memory of frames that are computed together
 Predictor = Callable[[Batch], torch.Tensor]  # accelerations [N, 3] in frame units
 
 
 def format_ratio(gain: float, digits: int = 2, unit: str = " times") -> str:
     """Describes an error by gain = (other error) / (this error): 2 gives "2.00 times below", 0.5 "2.00 times above"."""
-    if not 0 < gain < 1:
-        return f"{gain:.{digits}f}{unit} below"
-    return f"{1 / gain:.{digits}f}{unit} above"
+    above = 0 < gain < 1
+    number = 1 / gain if above else gain
+    return f"{number:{f'.{digits}f' if number < LARGE_RATIO else '.1e'}}{unit} {'above' if above else 'below'}"
 
 
 @dataclass

@@ -105,10 +105,12 @@ VALUES = [
     ("export", ["checkpoint=none.ckpt", "out=x"], "checkpoint must be an existing file, got none.ckpt; hgn.train"),
     ("export", ["checkpoint=.", "out=x"], "checkpoint must be an existing file, got .; hgn.train writes one"),
     ("export", ["checkpoint=run", "out=x"], "checkpoint must be an existing file, got run; take run/checkpoints/"),
+    ("export", ["checkpoint=run/checkpoints/bst.ckpt", "out=x"], "bst.ckpt; did you mean best.ckpt?"),
     ("export", ["checkpoint=none.ckpt", "out="], "out must be a file name, got ''"),
     ("export", ["out=x"], "checkpoint must be given, or else weights, got None"),
     ("rollout", ["--frames", "3"], "--frames is not an option; settings are given as frames=VALUE"),
     ("rollout", ["--weights=obstacles"], "--weights=obstacles is not an option; settings are given as weights=obs"),
+    ("train", ["--resume"], "--resume is not an option; settings are given as KEY=VALUE; --help shows the keys"),
     ("rollout", ["scene.yaml"], "settings are given as KEY=VALUE, got 'scene.yaml'; --help shows the keys"),
     *(
         (command, [f"{key}={value}"], f"{key} must be a path of at most 4,095 bytes, 255 in each name, got '")

@@ -349,7 +349,9 @@ def test_own_meshes_among_the_obstacles(tmp_path):
 
     here, other, there = map(identity, sorted(tmp_path.glob("*/brick.stl")))
     assert here == there != other
-    with pytest.raises(ConfigError, match=r"obstacle_shapes must be an existing file, got none\.obj"):
+    with pytest.raises(
+        ConfigError, match=r"obstacle_shapes must be an existing file, got none\.obj; there is none at /"
+    ):
         identity("none.obj")
 
 

@@ -174,6 +174,7 @@ YAML, ALIASES = "must be a YAML file", "its aliases expand to more than 100000 v
 ONE_CUBE = "groups:\n  - {shape: cube, size: 0.05, position: [0.5, 0.8, 0.5], material: water}\n"
 MISTAKES = [
     ("groups: [", YAML),
+    (ONE_CUBE + " seed: 1\n", "line 3, column 2: expected <block end>, .*; check the indentation"),
     (b"\xff\xfe\xfa", YAML + ": it is not UTF-8 text"),
     (b"PK\x03\x04\xff", YAML + ": it is a zip file; unpack it, and give the YAML file in it"),
     ("groups: " + 1000 * "[", YAML),

@@ -175,10 +175,11 @@ def test_updates_without_a_finite_gradient_are_skipped(data, run, monkeypatch):
         (signal.SIGTERM, (LogLines, "on_train_start"), 1),  # while Lightning's own handler is in place
     ],
 )
-def test_signals_end_the_run_after_a_checkpoint(data, run, monkeypatch, number, place, updates):
+def test_signals_end_the_run_after_a_checkpoint(data, run, monkeypatch, capsys, number, place, updates):
     """A real signal in the middle of an update, or before the first, ends the run at that update, with a checkpoint and
-    128 + its number."""
+    128 + its number. The time of the other updates is not estimated then."""
     original = getattr(*place)
+    monkeypatch.setattr(callbacks, "ESTIMATE_AFTER_S", 0.0)
 
     def signalled(*arguments):
         if updates == 1 or arguments[1] == 2:
@@ -187,6 +188,7 @@ def test_signals_end_the_run_after_a_checkpoint(data, run, monkeypatch, number, 
 
     monkeypatch.setattr(*place, signalled)
     assert train.main(train_mapping(data, run)) == 128 + number
+    assert "for the other updates" not in capsys.readouterr().err
     assert read_checkpoint(run / "checkpoints" / "last.ckpt")["hgn"]["updates"] == updates
 
 
@@ -387,7 +389,9 @@ def test_signals_of_a_scheduler(order, capfd, monkeypatch):
         stop = StopRequest()
         for number in order:
             stop._on_signal(number, None)
-        assert stop.exit_code == 138 and capfd.readouterr().err.count("Ctrl-C again ends it at once") == lines
+        assert (
+            stop.exit_code == 138 and capfd.readouterr().err.count("a further Ctrl-C ends the command at once") == lines
+        )
 
 
 def test_missing_scenes_without_generator(data, run, capsys):
