@@ -13,25 +13,18 @@ import torch
 import yaml
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tensorboard.plugins.hparams.plugin_data_pb2 import HParamsPluginData
-from training.runs import NETWORK, TRAINING, metrics, train_mapping
+from training.runs import metrics, train_mapping
 
 from hgn import train
-from hgn.config import DatasetConfig, NetworkConfig, TrainConfig, TrainingConfig
+from hgn.config import TrainConfig
 from hgn.data.manifest import Manifest
-from hgn.data.pooled import PooledStore
-from hgn.data.reader import EpisodeStore
-from hgn.data.statistics import merge_statistics
 from hgn.export import export
 from hgn.runtime.rollouts import RolloutResult
 from hgn.schema import ConfigError, from_mapping
 from hgn.system.locks import locked
-from hgn.system.progress import bar, duration
 from hgn.training import callbacks, gradients, monitor, session
 from hgn.training.callbacks import LogLines
-from hgn.training.checkpoint import LAST_NAMES, Progress, read_checkpoint
-from hgn.training.data_module import EpisodeDataModule
-from hgn.training.dataset import PublishedEpisodes, estimate, warning_on_a_cpu
-from hgn.training.readers import WindowReader
+from hgn.training.checkpoint import LAST_NAMES, read_checkpoint
 from hgn.training.stop import StopRequest
 from hgn.training.torch_updates import TorchUpdates
 
@@ -206,26 +199,6 @@ def test_a_second_interrupt_does_not_wait(finished, monkeypatch):
     assert read_checkpoint(run / "checkpoints" / "last.ckpt")["hgn"]["updates"] == 12
 
 
-def test_progress_reads_the_data_set_seldom(make_config, make_dataset, tmp_path, monkeypatch):
-    """Reading a manifest of hundreds of scenes with every line cost a third of the updates: it is read once in a while,
-    and never again once all scenes are there."""
-    config = make_config(training_scenes=2)
-    make_dataset(config)
-    looks, now = [], [0.0]
-    load = Manifest.load
-    monkeypatch.setattr(Manifest, "load", lambda *a, **k: looks.append(now[0]) or load(*a, **k))
-    monkeypatch.setattr("hgn.training.dataset.time.monotonic", lambda: now[0])
-    for wanted, expected in ((3, [0.0, 12.0, 24.0]), (2, [0.0])):
-        mapping = train_mapping(config, tmp_path)
-        mapping["dataset"]["training_scenes"] = wanted
-        del mapping["name"]
-        text = PublishedEpisodes(from_mapping(TrainConfig, mapping), None)
-        looks.clear()
-        for now[0] in (0.0, 4.0, 8.0, 12.0, 16.0, 20.0, 24.0, 28.0):
-            assert text() == f"2/{wanted} episodes"
-        assert looks == expected
-
-
 @pytest.mark.parametrize("updates", [12, 5])
 def test_a_finished_run_stays_finished(finished, capsys, updates):
     """Starting a finished run again, also with fewer updates, changes no file of its results and reports what continues
@@ -251,47 +224,6 @@ def test_the_best_network_is_remembered(data, run, monkeypatch):
     (error,) = (record["one_step/validation"] for record in metrics(run) if "one_step/validation" in record)
     stored = read_checkpoint(run / "checkpoints" / "last.ckpt")["callbacks"]["Checkpoints"]
     assert stored == {"best_error": error, "measured_update": 5}
-
-
-def test_what_a_training_takes_is_said(make_config, make_dataset, tmp_path, monkeypatch, capsys):
-    """The first scenes tell time and space of all, the first updates the time of all; on a CPU there is a way out."""
-    config = make_config()
-    make_dataset(config)
-    frames = config.dataset.frames
-    scenes = sum(config.dataset.scenes(split) for split in ("train", "validation", "test"))
-    text = estimate(config, frames, 3600.0)
-    assert text.startswith(f"about {scenes - 1} hours for the rest of {scenes} scenes") and " GB are free" in text
-    assert duration(40) == "40 seconds" and duration(61.4 * 86400) == "61 days" and duration(12600) == "3.5 hours"
-    monkeypatch.setattr(callbacks, "ESTIMATE_AFTER_S", 0.0)
-    monkeypatch.setattr(callbacks, "LONG_ON_A_CPU_S", -1.0)
-    bars = []
-    monkeypatch.setattr(callbacks, "bar", lambda *given, **named: bars.append(bar(*given, **named)) or bars[-1])
-    monkeypatch.setattr(callbacks.LogLines, "on_train_end", lambda *_: None)
-    assert train.main(train_mapping(config, tmp_path / "run", maximum_updates=3, log_every=50)) == 0
-    assert bars[0].n == 3
-    bars[0].close()
-    assert [record["update"] for record in metrics(tmp_path / "run") if "loss" in record] == [3]
-    (line,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("about ")]
-    assert "for the other updates, at" in line and "on a CPU: +experiment=demo (minutes), " in line
-
-
-def test_long_data_sets_are_announced_before_they_are_made(make_config, tmp_path, monkeypatch, capsys):
-    """On a CPU, a data set of more than an hour is announced with time, space and the way out, before its generator
-    starts. A finished one is not."""
-    monkeypatch.setattr("hgn.training.dataset.available_cpus", lambda: 2)
-    line = warning_on_a_cpu(TrainConfig(dataset=DatasetConfig(folder=str(tmp_path))))
-    assert line.startswith(
-        "no GPU: 825 scenes take roughly 23 hours and 10 GB here, before most of 20,000,000 updates;"
-    )
-    assert "dataset.test_scenes=0" in line
-    assert warning_on_a_cpu(make_config()) is None
-    monkeypatch.setattr("hgn.training.dataset.LONG_ON_A_CPU_S", 0.0)
-    monkeypatch.setattr(
-        "hgn.training.generator.Generator.__init__", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt)
-    )
-    with pytest.raises(KeyboardInterrupt):
-        train.main(train_mapping(make_config(), tmp_path / "run", generate=True))
-    assert capsys.readouterr().err.startswith("no GPU: ")
 
 
 def test_without_validation_scenes_there_is_no_best(make_config, make_dataset, tmp_path, capsys):
@@ -392,51 +324,6 @@ def test_signals_of_a_scheduler(order, capfd, monkeypatch):
         assert (
             stop.exit_code == 138 and capfd.readouterr().err.count("a further Ctrl-C ends the command at once") == lines
         )
-
-
-def test_missing_scenes_without_generator(data, run, capsys):
-    """A training that makes no scenes names the splits that lack some."""
-    mapping = train_mapping(data, run, maximum_updates=1)
-    mapping["dataset"] |= {"validation_scenes": 3}
-    assert train.main(mapping) == 0
-    assert (
-        f"{data.dataset.folder} has 2 of 3 validation scenes, and this training generates none\n"
-        in capsys.readouterr().err
-    )
-
-
-def test_missing_data_without_generator(make_config, run):
-    """Without data and with generate=false the message says how to make some."""
-    with pytest.raises(ConfigError, match="generate it with python -m datagen"):
-        train.main(train_mapping(make_config(), run))
-
-
-@pytest.fixture
-def other(make_config, make_dataset, tmp_path):
-    """The configuration of a second data set, which is there: of another seed and longer episodes."""
-    config = make_config(folder=str(tmp_path / "other"), seed=1, training_scenes=3, frames=9)
-    make_dataset(config)
-    return config
-
-
-def test_more_data(data, other, run):
-    """A run on two data sets has the episodes and the statistics of both, and goes on with both; without the second it
-    is not gone on with in the middle of an epoch."""
-    more = {"more_data": [other.dataset.folder], "minimum_episodes": 8}
-    assert train.main(train_mapping(data, run, **more, maximum_updates=6)) == 0
-    assert {record["episodes"] for record in metrics(run) if "loss" in record} == {8}
-    stores = [EpisodeStore(config.dataset.folder, "train") for config in (other, data)]
-    mean = merge_statistics(store.statistics() for store in stores).velocity.mean
-    stored = weights(run / "checkpoints" / "last.ckpt")
-    assert stored["network.normaliser.velocity_mean"].tolist() == pytest.approx(mean)
-    with pytest.raises(ConfigError, match="data set must still hold the 8 training episodes"):
-        train.main(train_mapping(data, run))
-    assert train.main(train_mapping(data, run, **more)) == 0
-    network, training = NetworkConfig(**NETWORK), TrainingConfig(**TRAINING)
-    pooled = PooledStore(stores[1], stores[:1])
-    *_, last = EpisodeDataModule(pooled, training, WindowReader(pooled, network, training)).chunks()
-    progress = Progress.of(read_checkpoint(run / "checkpoints" / "last.ckpt"))
-    assert progress == Progress(12, 0, last.sampler_state, "fp32")
 
 
 @pytest.mark.parametrize(
