@@ -16,10 +16,10 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 33_526,
+    "hgn": 33_531,
     "datagen": 9_045,
     "tools": 6_480,
-    "tests": 33_201,
+    "tests": 33_220,
 }
 SETTINGS = 240  # fields of the dataclasses behind the commands, *Config
 

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from hgn.schema import FileName, to_mapping
+from hgn.schema import FileName, printable, to_mapping
 from hgn.system.files import WRITTEN_BY_HGN, write_json
-from hgn.system.provenance import provenance, without_folders
+from hgn.system.provenance import provenance, with_texts, without_folders
 
 if TYPE_CHECKING:
     import torch
@@ -33,7 +33,7 @@ class ReportConfig:
 
 def meta_of(config: Any, device: torch.device | str = "cpu") -> dict[str, Any]:
     """Returns the provenance and the options of the command."""
-    return provenance(device) | {"config": without_folders(to_mapping(config))}
+    return provenance(device) | {"config": with_texts(without_folders(to_mapping(config)), printable)}
 
 
 def write_report(file: str, content: Any) -> None:

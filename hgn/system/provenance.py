@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import datetime
+import functools
 import importlib.metadata
 import os
 import platform
@@ -10,6 +11,7 @@ import re
 import shlex
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -72,12 +74,17 @@ def command_line() -> str:
 
 def without_folders(value: Any) -> Any:
     """Reduces each absolute path in the texts of plain containers to its last part."""
+    return with_texts(value, functools.partial(_ABSOLUTE_PATH.sub, r"\1"))
+
+
+def with_texts(value: Any, change: Callable[[str], str]) -> Any:
+    """Applies a function, `printable` for example, to the texts of plain containers."""
     if isinstance(value, str):
-        return _ABSOLUTE_PATH.sub(r"\1", value)
+        return change(value)
     if isinstance(value, dict):
-        return {key: without_folders(item) for key, item in value.items()}
+        return {key: with_texts(item, change) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
-        return [without_folders(item) for item in value]
+        return [with_texts(item, change) for item in value]
     return value
 
 

@@ -27,7 +27,7 @@ from hgn.scene.own_physics import own_ranges
 from hgn.schema import printable, to_mapping
 from hgn.system.device import keep_to_quota
 from hgn.system.files import make_folder, write_atomically
-from hgn.system.provenance import provenance
+from hgn.system.provenance import provenance, with_texts
 from hgn.system.ranks import first_on_machine, first_rank
 from hgn.training.checkpoint import BEST_NAME, LAST_NAMES, DataInfo, Resume
 from hgn.training.distributed import layout
@@ -95,7 +95,7 @@ def train_network(config: TrainConfig, start: Start, stop: StopRequest, publishe
     checkpoints = Checkpoints(run / "checkpoints", training.checkpoint_every, writer)
     monitor = Monitor(run, store, stop, checkpoints)
     lines = LogLines(run, monitor.last, feed, published)
-    final = FinalMetrics(_public(config), monitor.last, stop)
+    final = FinalMetrics(settings_of_run(config), monitor.last, stop)
     watch = RankWatch(run)
     trainer = Trainer(
         accelerator=training.device,
@@ -105,7 +105,7 @@ def train_network(config: TrainConfig, start: Start, stop: StopRequest, publishe
         max_epochs=1,  # the feed ends after the last update
         callbacks=[watch, SameWeights(feed), lines, monitor, checkpoints, Stopper(stop, checkpoints), final],
         plugins=[writer, *lightning_compat.own_launcher()],
-        logger=build_loggers(training.loggers, run, _public(config)),
+        logger=build_loggers(training.loggers, run, settings_of_run(config)),
         default_root_dir=run,
         enable_checkpointing=False,
         enable_progress_bar=False,
@@ -196,11 +196,9 @@ def precompile_kernels(config: TrainConfig, resume: Resume | None, stack: ExitSt
     return precompilation
 
 
-def _public(config: TrainConfig) -> dict[str, Any]:
-    """Returns the settings, without passwords in URLs."""
-    mapping: dict[str, Any] = to_mapping(config)
-    mapping["dataset"]["folder"] = printable(config.dataset.folder)
-    mapping["training"]["more_data"] = [printable(folder) for folder in config.training.more_data]
+def settings_of_run(config: TrainConfig) -> dict[str, Any]:
+    """Returns the settings, without passwords and other secrets."""
+    mapping: dict[str, Any] = with_texts(to_mapping(config), printable)
     return mapping
 
 
@@ -210,7 +208,7 @@ def _write_run_files(config: TrainConfig, manifest: Manifest) -> None:
     make_folder(run)
     if not first_rank():
         return
-    record = _public(config)
+    record = settings_of_run(config)
     record["provenance"] = provenance("cuda" if torch.cuda.is_available() else "cpu") | {
         "data_schema_version": manifest.schema_version,
         "data_config_hash": manifest.config_hash,

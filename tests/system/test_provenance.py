@@ -1,6 +1,11 @@
 """Where a figure comes from, without the folders of the machine that it was made on."""
 
+from dataclasses import dataclass
+
+from hgn.config import DatasetConfig, TrainConfig
 from hgn.system.provenance import command_line, without_folders
+from hgn.training.session import settings_of_run
+from tools.report import meta_of
 
 
 def test_folders_are_left_out():
@@ -19,6 +24,20 @@ def test_folders_are_left_out():
         assert without_folders(text) == text
     nested = {"a": ["/x/y", 3, None], "b": {"c": ("/x/z",)}}
     assert without_folders(nested) == {"a": ["y", 3, None], "b": {"c": ["z"]}}
+
+
+def test_no_record_of_settings_has_a_secret():
+    """Reports, and the config.yaml of a run, keep settings without passwords of URLs and values of secret keys."""
+
+    @dataclass
+    class Settings:
+        data: str = "http://user:secret-word@host/set"
+        more: tuple[str, ...] = ("s3://key:secret-word@b", "HF_TOKEN=secret-word")
+
+    config = meta_of(Settings())["config"]
+    assert config == {"data": "http://host/set", "more": ["s3://b", "HF_TOKEN=…"]}
+    run = settings_of_run(TrainConfig(run="HF_TOKEN=secret-word", dataset=DatasetConfig(folder=Settings.data)))
+    assert "secret-word" not in str(run) and run["dataset"]["folder"] == "http://host/set"
 
 
 def test_the_recorded_command(monkeypatch):
