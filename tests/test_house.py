@@ -18,8 +18,8 @@ PACKAGES = ("hgn", "datagen", "tools")
 LINES = {  # of Python, in tracked files
     "hgn": 33_531,
     "datagen": 9_045,
-    "tools": 6_480,
-    "tests": 33_220,
+    "tools": 6_486,
+    "tests": 33_222,
 }
 SETTINGS = 240  # fields of the dataclasses behind the commands, *Config
 

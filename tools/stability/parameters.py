@@ -200,19 +200,29 @@ def _slope_axes() -> tuple[np.ndarray, np.ndarray]:
     return turn, turn @ np.array([1.0, 0.0, 0.0])
 
 
-def _block(rng: np.random.Generator) -> Scene:
+def _block(height: float, domain_height: float) -> Callable[[np.random.Generator], Scene]:
     """Returns a flat block of snow at the upper end of a slope. Higher blocks would roll on rough slopes."""
-    size_3, place_N3, shift_3 = _drawn(rng, (0.15, 0.07, 0.15))
-    (turn_33, down_3), middle_3 = _slope_axes(), shift_3 + np.array([0.5, 0.25, 0.25])
-    start_3 = SLOPE_START * down_3 + turn_33 @ np.array([0.0, GAP + 0.5 * size_3[1], 0.0])
-    slope = shape_obstacle("square", SLOPE_SIDE, tuple(middle_3.tolist()), turn_33, "slope")
-    rough = {"domain_size": (1.0, 0.5, 0.5), "obstacles": (replace(slope, friction=0.0),)}
-    return _body("snow", middle_3 + start_3 + place_N3 @ turn_33.T, **rough)
+
+    def scene(rng: np.random.Generator) -> Scene:
+        size_3, place_N3, shift_3 = _drawn(rng, (0.15, 0.07, 0.15))
+        (turn_33, down_3), middle_3 = _slope_axes(), shift_3 + np.array([0.5, height, 0.5])
+        start_3 = SLOPE_START * down_3 + turn_33 @ np.array([0.0, GAP + 0.5 * size_3[1], 0.0])
+        slope = shape_obstacle("square", SLOPE_SIDE, tuple(middle_3.tolist()), turn_33, "slope")
+        rough = {"domain_size": (1.0, domain_height, 1.0), "obstacles": (replace(slope, friction=0.0),)}
+        return _body("snow", middle_3 + start_3 + place_N3 @ turn_33.T, **rough)
+
+    return scene
 
 
 NOMINAL = dict(zip(INPUT_PARAMETERS, NOMINAL_P, strict=True))
 ANGLE, VISCOSITY, YOUNG = "sand_friction_angle_deg", "water_viscosity_pa_s", "youngs_modulus_pa"
 KINDS = (
+    Kind(
+        "slide on 20 degrees", "friction", (0.0, 0.1, 0.2, 0.3, 0.5, 1.0), "friction {:g}", (0.0, 1.0), 0.0, 31, slid,
+        _block(0.5, 1.0),
+    ),
+    # the floor lies within a coarsest cell of the network below the block
+    Kind("slide near the floor", "friction", (0.0, 0.2), "friction {:g}", (0.0, 1.0), 0.0, 31, slid, _block(0.25, 0.5)),
     Kind(
         "run-out of sand", ANGLE, (18.0, 24.0, 38.0, 45.0, 48.0), "{:g} degrees", INPUT_PARAMETERS[ANGLE],
         NOMINAL[ANGLE], 41, run_out, _column("sand", (0.11, 0.19, 0.11), 0.6),
@@ -224,9 +234,5 @@ KINDS = (
     Kind(
         "sag of an elastic block", YOUNG, (6e5, 3.5e5, 2e5, 1.25e5, 1e5), "{:g} Pa", INPUT_PARAMETERS[YOUNG],
         NOMINAL[YOUNG], 61, sag, _beam,
-    ),
-    Kind(
-        "slide on 20 degrees", "friction", (0.0, 0.1, 0.2, 0.3, 0.5, 1.0), "friction {:g}", (0.0, 1.0), 0.0, 31, slid,
-        _block,
     ),
 )  # fmt: skip
