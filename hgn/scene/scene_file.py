@@ -184,7 +184,7 @@ class EmitterEntry(MaterialEntry):
         require(isinstance(self.size, tuple) == (self.shape == "rectangle"), "size", rule, self.size)
         for edge in self.size if isinstance(self.size, tuple) else (self.size,):
             require(0 < edge < math.inf, "size", "finite and > 0", self.size)
-        require(any(self.velocity), "velocity", "other than zero, because particles enter along it", self.velocity)
+        require(1e-15 <= math.hypot(*self.velocity) <= 1e15, "velocity", "of length 1e-15 to 1e15", self.velocity)
         require(self.stop > self.start, "stop", f"later than start ({self.start:g})", self.stop)
 
     @property

@@ -271,6 +271,8 @@ cases(
         "small chunks": imported("lagrangebench", h5("train.h5", crumbs)),
         "a key of tuples": imported("geoelements", raw_pickle(key_of_tuples())),
         "wide cells": imported("lagrangebench", obstacle_cell_size=1e300),
+        "tiny cells": imported("lagrangebench", obstacle_cell_size=5e-324),
+        "pipe": imported("neuralmpm", lambda folder: os.mkfifo(folder / "train" / "sim_00.h5")),
         "types": imported("lagrangebench", h5("train.h5", claimed("00001/particle_type", (10**11,), "i4"))),
         "links": imported("lagrangebench", h5("train.h5", links)),
         "particles": imported("neuralmpm", h5("train/sim_0.h5", claimed("particles", (10**4, 10**6, 6), "f4"))),

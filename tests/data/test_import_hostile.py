@@ -154,7 +154,7 @@ def pickled(content):
         ("lagrangebench", claimed, r"train.h5: /00000/position must bring its content to at most"),
         ("plain", npz("00000/gravity", np.array([0, 1e14, 0])), "00000: gravity must be at most .*, the box in"),
         ("plain", meta(dt=1e-10), "dt must be a finite number > 0, from 1e-09 to 1e.09, got 1e-10"),
-        ("plain", meta(obstacle_cell_size=0), r"metadata.json: obstacle_cell_size must be > 0, got 0.0"),
+        ("plain", meta(obstacle_cell_size=0), r"metadata.json: obstacle_cell_size must be from 1.53e-05 .*got 0.0"),
         ("plain", meta(materials=["water"]), r"metadata.json: materials must be names by number, got \['water'\]"),
         ("plain", meta(materials={"1": "Wa ter"}), r"materials must be names of lower-case letters.*got 'Wa ter'"),
         ("plain", meta(boundary_types="none"), r"metadata.json: boundary_types must be finite numbers in a list"),

@@ -199,7 +199,10 @@ MISTAKES = [
     (ONE_CUBE.replace("0.05", "0.05, 0.1, 0.2"), r"groups\[0\]\.0\.1 is not a known key; a list needs brackets"),
     (None, "the file must be a mapping"),
     ({}, "groups must be a list with at least one group, or emitters"),
-    (emitter_with(velocity=[0, 0, 0]), EMITTER + r"\.velocity must be other than zero"),
+    *(
+        (emitter_with(size=1e-200, velocity=[x, x, 0]), EMITTER + r"\.velocity must be of length 1e-15 to 1e15, got")
+        for x in (0, 1e-200, 1e300)
+    ),
     (emitter_with(stop=0), EMITTER + r"\.stop must be later than start \(0\), got 0"),
     (emitter_with(start=-1), EMITTER + r"\.start must be a finite number >= 0"),
     (emitter_with(shape="cube"), EMITTER + r"\.shape must be one of disc, rectangle, got 'cube'"),

@@ -24,7 +24,7 @@ import numpy as np
 
 from hgn.data.foreign.settings import ImportConfig
 from hgn.data.foreign.tfrecord import parse_sequence_example, read_records
-from hgn.data.foreign.trajectory import FLUID, SetInfo, Trajectory, as_array, checked, floats
+from hgn.data.foreign.trajectory import FLUID, MOST_CELLS, SetInfo, Trajectory, as_array, checked, floats
 from hgn.scene.hdf5 import damage_named, open_hdf5
 from hgn.scene.material import MATERIAL_NAME
 from hgn.scene.npz import read_npz
@@ -268,7 +268,7 @@ def _of_members(name: str, members: Mapping[str, Any], info: SetInfo) -> Traject
 
 def _require_cells(name: str, cell_K3: np.ndarray, normal_K3: np.ndarray) -> None:
     lowest, highest = cell_K3.min(initial=0), cell_K3.max(initial=0)
-    require(lowest >= -1 and highest < _MOST_CELLS, f"{name}: obstacle_cell", "cells of the box", [lowest, highest])
+    require(lowest >= -1 and highest < MOST_CELLS, f"{name}: obstacle_cell", "cells of the box", [lowest, highest])
     alike = len(cell_K3) - len(np.unique(cell_K3, axis=0))
     require(alike == 0, f"{name}: obstacle_cell", "each there once", f"{alike} again")
     length_K = np.linalg.norm(normal_K3, axis=1)
@@ -324,7 +324,6 @@ _READERS: dict[str, Callable[[Path, str, SetInfo], Iterator[_Named]]] = {
     "plain": _read_hdf5,
 }
 _AGAIN = "fetch it again"
-_MOST_CELLS = 1 << 16  # largest number of cells along an axis
 _EXAMPLES = {"bounds": "[[0.1,0.9],[0.1,0.9]]", "dt": "0.0025", "radius": "0.015"}
 
 

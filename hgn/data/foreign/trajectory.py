@@ -19,6 +19,7 @@ COARSEST = 1e-3  # largest spacing of stored numbers, in radii; gravity moves a 
 SAMPLED = 100_000  # number of coordinates of a trajectory that are searched for rounding
 MOVES = 20  # number of changed coordinates above which repeated values show rounding
 MOST_RADII = 1 << 14  # largest size of the box in radii, because cells are indexed by integers
+MOST_CELLS = 1 << 16  # largest number of obstacle cells along an axis
 LARGEST = 1e15  # largest size of a number, so that float32 stores its square
 FLUID = 1  # the type of particles in files without types
 
@@ -72,8 +73,9 @@ class SetInfo:
         require(self.radius * MOST_RADII >= longest, key, rule, self.radius)
         require(self.radius <= longest, key, f"at most the box, {longest:g}", self.radius)
         cell_size = self.obstacle_cell_size
-        fits = cell_size is None or 0 < cell_size <= longest
-        require(fits, "metadata.json: obstacle_cell_size", "> 0", cell_size, f"and at most the box, {longest:g}")
+        fits = cell_size is None or longest <= cell_size * MOST_CELLS <= longest * MOST_CELLS
+        rule = f"from {longest / MOST_CELLS:.3g} to {longest:g}, the width of the box"
+        require(fits, "metadata.json: obstacle_cell_size", rule, cell_size)
         require(len(set(self.materials.values())) <= 256, "materials", "at most 256", len(set(self.materials.values())))
         if self.gravity is not None:
             rule = f"{self.dimensions} finite numbers, length per second squared"
