@@ -63,8 +63,10 @@ def run_command(main: Main | str, config_name: str) -> NoReturn:
     for name in ("stdout", "stderr"):
         if getattr(sys, name) is None:  # the process was started without this stream
             setattr(sys, name, Path(os.devnull).open("w"))  # noqa: SIM115 - open as long as the process runs
-        elif isinstance(stream := getattr(sys, name), io.TextIOWrapper) and stream.encoding.lower() != "utf-8":
-            stream.reconfigure(errors="replace")  # the encoding may be latin-1 or ASCII
+        elif isinstance(stream := getattr(sys, name), io.TextIOWrapper) and (
+            stream.errors == "strict" or stream.encoding.lower() != "utf-8"
+        ):
+            stream.reconfigure(errors="replace")  # for latin-1, ASCII, and paths that are not UTF-8
     if isinstance(stream := sys.stderr, io.TextIOWrapper) and stream is sys.__stderr__:
         messages = io.BufferedWriter(_Messages(stream.fileno(), "wb", closefd=False))
         sys.stderr = io.TextIOWrapper(messages, stream.encoding, stream.errors, line_buffering=True)

@@ -16,7 +16,7 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 33_534,
+    "hgn": 33_536,
     "datagen": 9_045,
     "tools": 6_486,
     "tests": 33_227,
