@@ -19,7 +19,7 @@ LINES = {  # of Python, in tracked files
     "hgn": 33_536,
     "datagen": 9_045,
     "tools": 6_486,
-    "tests": 33_227,
+    "tests": 33_276,
 }
 SETTINGS = 240  # fields of the dataclasses behind the commands, *Config
 

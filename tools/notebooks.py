@@ -21,7 +21,7 @@ DOCS = Path(__file__).resolve().parents[1] / "docs"
 NOTEBOOKS = {
     "quick_start": "tutorials/program.md",
     "own_data": "tutorials/train.md",
-    "inverse_problem": "how_to/gradients.md",
+    "inverse_problem": "tutorials/friction.md",
 }
 FEWER = {
     "training_scenes: 200\n": "training_scenes: 2 # 200\n  frames: 24 # 300\n",
