@@ -9,7 +9,7 @@ import base64
 import json
 import re
 import struct
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -24,13 +24,14 @@ INSTANCES = "EXT_mesh_gpu_instancing"
 VISIBILITY = "KHR_node_visibility"
 READ = (INSTANCES, VISIBILITY, "KHR_mesh_quantization")  # extensions that change geometry
 NEUTRAL = re.compile(r"[A-Z]+_(materials|texture|lights|xmp|animation|audio)\w*")  # extensions that do not change it
-TRIANGLES, STRIP, FAN = 4, 5, 6  # modes of primitives; the other modes are points and lines
+TRIANGLES, STRIP, FAN = 4, 5, 6  # modes of primitives; the modes from 0 to 3 are points and lines
 COPIES = 3  # number of copies of vertices and triangles in the search for closed bodies
 MOST_JSON_BYTES = 16 << 20  # largest JSON tree; Python takes up to 33 bytes of memory for each of its bytes
 MOST_CHARACTERS = 4096  # of a uri that names a file
 LEAST_BYTES = 1024  # memory claimed even for a primitive without content, because each takes time
 _TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
-_WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
+_INDICES = (5121, 5123, 5125)
+_WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 
 
 def read_glb(path: Path) -> tuple[np.ndarray, np.ndarray]:
@@ -42,6 +43,9 @@ def read_glb(path: Path) -> tuple[np.ndarray, np.ndarray]:
     unknown = [n for n in tree.get("extensionsRequired", ()) if n not in READ and not NEUTRAL.fullmatch(n)]
     if unknown:
         raise ValueError(f"it requires {', '.join(unknown)}, which is not read; export it without")
+    least = tree.get("asset", {}).get("minVersion", "2.0")
+    if least != "2.0":
+        raise ValueError(f"it needs glTF {least}, but 2.0 is read; export it as glTF 2.0")
     claims = Claims(path)
     file = _File(tree, binary, path.parent, claims)
     vertices, triangles, vertex_count = [np.zeros((0, 3))], [np.zeros((0, 3), np.int64)], 0
@@ -88,8 +92,8 @@ class _File:
         self.binary, self.folder, self.claims = binary, folder.resolve(), claims
         self.buffer, self.read = cache(self._buffer), cache(Path.read_bytes)  # buffers may be the same file
 
-    def placed(self) -> list[tuple[dict[str, Any], list[float], np.ndarray]]:
-        """Returns the meshes of the scene, the weights of their morph targets, and their matrices [M, 4, 4]."""
+    def placed(self) -> list[tuple[int, list[float], np.ndarray]]:
+        """Returns the number of each mesh of the scene, the weights of its morph targets, its matrices [M, 4, 4]."""
         nodes = self.tree.get("nodes", [])
         if "scenes" in self.tree:
             roots = self.tree["scenes"][self.tree.get("scene", 0)].get("nodes", [])
@@ -115,28 +119,36 @@ class _File:
             if "skin" in node:
                 raise ValueError(f"node {index} has a skin; apply the armature")
             instances = node.get("extensions", {}).get(INSTANCES, {}).get("attributes", {})
-            given = [instances.get(name) for name in ("TRANSLATION", "ROTATION", "SCALE")]
-            for i in given:
+            given = [(instances.get(name), name) for name in ("TRANSLATION", "ROTATION", "SCALE")]
+            for i, _ in given:
                 self.claims.add("instances", 1 if i is None else self.tree["accessors"][i]["count"], 128)
-            place_M44 = place_44 @ _places(*(None if i is None else self.accessor(i) for i in given))
-            mesh = self.tree["meshes"][node["mesh"]]
-            result.append((mesh, node.get("weights", mesh.get("weights", [])), place_M44))
+            kinds = ("VEC3", "VEC4", "VEC3")
+            values = [
+                None if i is None else self.accessor(i, f"node {index} has {name}", kind)
+                for (i, name), kind in zip(given, kinds, strict=True)
+            ]
+            default = self.tree["meshes"][node["mesh"]].get("weights", [])
+            result.append((node["mesh"], node.get("weights", default), place_44 @ _places(*values)))
         return result
 
-    def surfaces(self, mesh: dict[str, Any], weights: list[float]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    def surfaces(self, mesh: int, weights: list[float]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         """Yields positions [V, 3] and triangles [F, 3] of the primitives with triangles."""
-        for primitive in mesh["primitives"]:
+        for number, primitive in enumerate(self.tree["meshes"][mesh]["primitives"]):
             self.claims.add("primitives", LEAST_BYTES)
-            mode = primitive.get("mode", TRIANGLES)
-            if mode not in (TRIANGLES, STRIP, FAN):
+            mode, has = primitive.get("mode", TRIANGLES), f"primitive {number} of mesh {mesh} has"
+            if mode not in range(FAN + 1):
+                raise ValueError(f"{has} mode {mode}, which is none of 0 to {FAN}")
+            if mode < TRIANGLES:
                 continue
-            position_V3 = self.accessor(primitive["attributes"]["POSITION"]).astype(np.float64)
+            if "POSITION" not in primitive.get("attributes", {}):
+                raise ValueError(f"{has} no POSITION")
+            position_V3 = self.accessor(primitive["attributes"]["POSITION"], f"{has} POSITION").astype(np.float64)
             for target, weight in zip(primitive.get("targets", ()), weights, strict=False):
                 if weight and "POSITION" in target:
                     self.claims.add("morph targets", LEAST_BYTES + position_V3.nbytes)
-                    position_V3 = position_V3 + weight * self.accessor(target["POSITION"])
+                    position_V3 = position_V3 + weight * self.accessor(target["POSITION"], f"{has} a target")
             if "indices" in primitive:
-                index = self.accessor(primitive["indices"])[:, 0].astype(np.int64)
+                index = self.accessor(primitive["indices"], f"{has} indices", "SCALAR", _INDICES)[:, 0].astype(np.int64)
             else:
                 index = np.arange(len(position_V3))
             if index.max(initial=-1) >= len(position_V3):
@@ -150,10 +162,18 @@ class _File:
                 triangle_F3 = np.stack([np.full_like(index[2:], index[0]), index[1:-1], index[2:]], axis=1)
             yield position_V3, triangle_F3
 
-    def accessor(self, index: int) -> np.ndarray:
-        """Returns the values of an accessor, [count, width]. Normalised integers become fractions."""
+    def accessor(self, index: int, use: str, kind: str = "VEC3", codes: Collection[int] = _TYPES) -> np.ndarray:
+        """Returns the values of an accessor, [count, width]. Normalised integers become fractions.
+
+        Raises: ValueError that begins with `use` for another type than `kind`, or components other than `codes`.
+        """
         entry = self.tree["accessors"][index]
-        dtype, shape = np.dtype(_TYPES[entry["componentType"]]), (entry["count"], _WIDTHS[entry["type"]])
+        if entry["type"] != kind or entry["componentType"] not in codes:
+            raise ValueError(
+                f"{use} of type {entry['type']} with components {entry['componentType']}, not {kind} with one of "
+                f"{', '.join(map(str, codes))}"
+            )
+        dtype, shape = np.dtype(_TYPES[entry["componentType"]]), (entry["count"], _WIDTHS[kind])
         sparse = entry.get("sparse")
         if "bufferView" in entry:
             value = self._values(entry, dtype, shape)

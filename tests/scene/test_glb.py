@@ -203,7 +203,8 @@ def test_compressed_data_without_the_requirement(tmp_path, name):
 
 
 def test_glb_that_lies(tmp_path):
-    """Indices and accessors beyond the data, loops of nodes, skins, and endless instances end in one line."""
+    """Indices and accessors beyond the data, loops of nodes, skins, other versions and unknown modes and types end in
+    one line."""
 
     def broken(change):
         file = Glb()
@@ -214,6 +215,9 @@ def test_glb_that_lies(tmp_path):
     def loop(tree):
         tree["nodes"] = [{"mesh": 0}, {"children": [0, 0]}]
 
+    def part(tree, **changes):
+        tree["meshes"][0]["primitives"][0].update(changes)
+
     changes = [
         (lambda tree: tree["accessors"][0].update(count=10**9), "readable GLB"),
         (lambda tree: tree["accessors"][0].update(count=4), "vertex 7 of a primitive with 4"),
@@ -223,7 +227,20 @@ def test_glb_that_lies(tmp_path):
         (lambda tree: tree["bufferViews"][0].update(byteOffset=10**12), "readable GLB"),
         (lambda tree: tree["nodes"][0].update(skin=0), "node 0 has a skin"),
         (loop, "node 0 has two parents"),
+        (lambda tree: tree["asset"].update(minVersion="2.1"), "it needs glTF 2.1, but 2.0 is read"),
+        *((lambda tree, mode=mode: part(tree, mode=mode), "primitive 0 of mesh 0 has mode") for mode in (7, -1, "4")),
+        (lambda tree: part(tree, attributes={}), "primitive 0 of mesh 0 has no POSITION"),
+        *(
+            (lambda tree, i=i, more=more: tree["accessors"][i].update(more), f"primitive 0 of mesh 0 has {name}, not")
+            for i, more, name in (
+                (0, {"type": "VEC2"}, "POSITION of type VEC2 with components 5126"),
+                (0, {"componentType": 5130}, "POSITION of type VEC3 with components 5130"),
+                (1, {"type": "VEC3", "count": 12}, "indices of type VEC3 with components 5123"),
+                (1, {"componentType": 5126, "count": 18}, "indices of type SCALAR with components 5126"),
+            )
+        ),
     ]
     for change, message in changes:
+        path = broken(change)
         with pytest.raises(ConfigError, match=message):
-            load_mesh(broken(change))
+            load_mesh(path)
