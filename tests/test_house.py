@@ -16,10 +16,10 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 33_556,
+    "hgn": 33_571,
     "datagen": 9_045,
     "tools": 6_486,
-    "tests": 33_293,
+    "tests": 33_308,
 }
 SETTINGS = 240  # fields of the dataclasses behind the commands, *Config
 

@@ -26,7 +26,7 @@ from hgn.data.entries import REMEDY
 from hgn.data.manifest import MANIFEST_NAME, SPLITS, EpisodeEntry, Manifest, ShardEntry
 from hgn.data.shard_cache import holders
 from hgn.data.statistics import Statistics
-from hgn.data.storage import Storage, StorageError, ask, faults_outlived, is_remote, open_storage, outliving
+from hgn.data.storage import Storage, StorageError, ask, asked_once, faults_outlived, is_remote, open_storage, outliving
 from hgn.scene.episode import POSITION_MEMBER, Episode, decode_episode
 from hgn.schema import ConfigError, printable, require
 from hgn.system.patience import UnreachableError, standard_patience_s
@@ -152,6 +152,7 @@ class EpisodeStore(Episodes):
         if self._faulty_since is not None and time.monotonic() - self._looked_s > AGAIN_S:
             self.refresh()
 
+    @asked_once()
     def _later_manifest(self) -> Manifest:
         manifest = Manifest.load(self.folder, patience_s=0.0)
         if manifest.config_hash != self.manifest.config_hash:
@@ -165,6 +166,8 @@ class EpisodeStore(Episodes):
                 f"{self.folder} must keep the {self.split} shards already published, got a manifest (revision "
                 f"{manifest.revision}) without some of them; start again"
             )
+        if manifest.shards.state != self.manifest.shards.state:
+            _ = manifest.shards[-1:]  # a faulty manifest names an index that cannot be read
         return manifest
 
     def within_reach(self, indices: Sequence[int], patience_s: float) -> bool:

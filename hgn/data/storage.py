@@ -16,7 +16,8 @@ import re
 import threading
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterator
+from contextvars import ContextVar
 from io import BufferedRandom
 from pathlib import Path
 from typing import Any, TypeVar
@@ -42,6 +43,7 @@ _NETWORK_PACKAGES = {"aiohttp", "botocore", "aiobotocore", "gcsfs", "google", "a
 
 T = TypeVar("T")
 _outliving = threading.Event()
+_once = ContextVar("once", default=False)
 
 
 def faults_outlived() -> contextlib.AbstractContextManager[None]:
@@ -54,10 +56,20 @@ def outliving() -> bool:
     return _outliving.is_set()
 
 
+@contextlib.contextmanager
+def asked_once() -> Iterator[None]:
+    """Lets `ask` in this thread not repeat failed reads, because the caller reads the manifest again."""
+    token = _once.set(True)
+    try:
+        yield
+    finally:
+        _once.reset(token)
+
+
 def ask(folder: Path | str, read: Callable[[Storage], T]) -> T:
     """Returns the result of `read` for a data set. Raises: as `read`; inside `faults_outlived` UnreachableError too."""
     storage, place = open_storage(folder), str(folder)
-    if not outliving():
+    if _once.get() or not outliving():
         return read(storage)
     try:
         return patiently(lambda: read(storage), _may_pass, place, place, standard_patience_s())

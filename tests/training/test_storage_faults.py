@@ -87,7 +87,22 @@ def other_set(before):
     return json.dumps(json.loads(before) | {"config": {}, "config_hash": "0" * 64}).encode()
 
 
+def more(index, totals=()):
+    """A manifest with larger numbers than its index has."""
+
+    def content(before):
+        head = json.loads(before)
+        for part, keys in ((head["index"], index), (head["totals"]["train"], totals)):
+            part.update({key: part[key] + 1 for key in keys})
+        return json.dumps(head).encode()
+
+    return written(content)
+
+
 FAULTS = {
+    "generation": more(["generation"]),
+    "a shard more": more(["shards"], ["shards"]),
+    "an episode more": more(["shards"], ["shards", "episodes"]),
     "missing": renamed("manifest.json"),
     "folder renamed": renamed("."),
     "brace": written(b"{"),
