@@ -5,7 +5,7 @@ Shape legend: V vertices, U distinct vertices, F triangles, E directed triangle 
 
 from __future__ import annotations
 
-import io
+import codecs
 import re
 from pathlib import Path
 from typing import Any
@@ -24,10 +24,11 @@ from hgn.scene.surface import area_vectors, point_tree
 from hgn.scene.usd import read_usd_polygons
 from hgn.schema import ConfigError, Vector, near_file, require
 
-_ASCII_STL = re.compile(rb"\s*solid.*\n\s*(facet|endsolid)", re.IGNORECASE)
-# ends of solids within an STL file; they are removed, because trimesh takes a millisecond for each solid
-_SOLIDS = re.compile(rb"^[ \t]*endsolid.*\n\s*solid.*\n", re.IGNORECASE | re.MULTILINE)
-
+_FACET = re.compile(
+    rb"\bfacet(?:\s+normal)?(?:\s+\S+){3}\s+outer\s+loop((?:\s+vertex(?:\s+\S+){3}){3})\s+endloop\s+endfacet\b", re.I
+)
+_PART_OF_FACET = re.compile(rb"\bfacet\s+normal\b.*|^[^\S\n]*(facet|outer|vertex|endloop|endfacet)\b.*", re.I | re.M)
+_BINARY_FACET = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 
 SEAM = 1e-5  # largest distance of vertices at open edges that are joined, relative to the mesh's longest side
 MOST_NEAR = 100  # mean number of neighbours within SEAM above which none are joined, because pairs take memory
@@ -126,29 +127,34 @@ def _read(path: Path, field: str) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _read_polygons(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Reads STL by trimesh, which would shift or drop vertices of many OBJ files, and OBJ, PLY and USD without it."""
+    """Reads STL, OBJ, PLY and USD without trimesh, which would shift or drop vertices of many files."""
     kind = path.suffix[1:].lower()
     data = b"" if f".{kind}" in USD_ENDINGS else path.read_bytes()
-    if kind != "stl":
-        readers = {"obj": polygons_of_obj, "ply": polygons_of_ply}
-        vertex_V3, faces = readers[kind](data) if kind in readers else read_usd_polygons(path)
-        if (cut_F3 := concave_cut(vertex_V3, faces)) is not None:
-            return vertex_V3, cut_F3
-        if kind == "obj" and len({len(face) for face in faces}) > 1:
-            return vertex_V3, fans(faces)
-        return vertex_V3, trimesh.geometry.triangulate_quads(faces).reshape(-1, 3)
-    if not _ASCII_STL.match(data):
+    if kind == "stl":
+        vertex_V3 = _corners_of_stl(data).reshape(-1, 3).astype(np.float64)
+        return vertex_V3, np.arange(len(vertex_V3)).reshape(-1, 3)
+    readers = {"obj": polygons_of_obj, "ply": polygons_of_ply}
+    vertex_V3, faces = readers[kind](data) if kind in readers else read_usd_polygons(path)
+    if (cut_F3 := concave_cut(vertex_V3, faces)) is not None:
+        return vertex_V3, cut_F3
+    if kind == "obj" and len({len(face) for face in faces}) > 1:
+        return vertex_V3, fans(faces)
+    return vertex_V3, trimesh.geometry.triangulate_quads(faces).reshape(-1, 3)
+
+
+def _corners_of_stl(data: bytes) -> np.ndarray:
+    """Returns the corners of the triangles of a binary or a text STL file. Raises: ValueError if it is cut."""
+    text = data.removeprefix(codecs.BOM_UTF8).replace(b"\r", b"\n")
+    if text.lstrip()[:5].lower() != b"solid" or b"\0" in text[:200]:  # many binary files begin with `solid` too
         size = 84 + 50 * int.from_bytes(data[80:84], "little")
         if len(data) < size:
             raise ValueError(f"it has {len(data)} of {size} bytes")
-        data = data[:size]  # some programs append bytes to the triangles
-    elif b"endsolid" not in data.lower():
+        return np.frombuffer(data[84:size], _BINARY_FACET)["corners"]  # some programs append bytes to the triangles
+    if b"endsolid" not in text.lower():
         raise ValueError("it ends before endsolid")
-    else:
-        data = _SOLIDS.sub(b"", data)
-    # trimesh's processing would silently remove vertices that are not finite
-    mesh = trimesh.load_scene(io.BytesIO(data), file_type=kind, process=False, skip_materials=True).to_mesh()
-    return np.array(mesh.vertices, np.float64).reshape(-1, 3), np.array(mesh.faces, np.int64).reshape(-1, 3)
+    if part := _PART_OF_FACET.search(_FACET.sub(b"\n", text)):
+        raise ValueError(f"it has a facet that is not whole: {part[0].decode('utf-8', 'replace').strip()[:80]}")
+    return np.array(b" ".join(_FACET.findall(text)).lower().replace(b"vertex", b"").split(), np.float64)
 
 
 def _bodies(vertex_V3: np.ndarray, triangle_F3: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -18,6 +18,8 @@ FLAT = 1e-9  # smallest turn at a corner that counts as concave, as a fraction o
 # Largest number of corners of a concave face. The time of a cut grows with its square; the sum of squares is limited.
 MAXIMUM_CORNERS = 2_000
 _LINE = re.compile(rb"^[ \t]*([vf])[ \t]+(.*)$", re.MULTILINE | re.IGNORECASE)
+_SPACES = bytes.maketrans(b"\r\f\v", b"\n  ")
+_UTF_16 = re.compile(rb"\xff\xfe|\xfe\xff|[^\0]\0[^\0]\0|\0[^\0]\0[^\0]")
 _COMMENT = re.compile(rb"(?:^|[ \t])#.*", re.MULTILINE)
 _UNREAD = re.compile(rb"^[ \t]*(surf|bzp|bsp|cdp|fo|call)[ \t]", re.MULTILINE)  # free-form surfaces, and other files
 _INDICES = ("vertex_indices", "vertex_index")  # usual names of the property with a face's vertices
@@ -36,9 +38,12 @@ _TYPES = {
 def polygons_of_obj(data: bytes) -> tuple[np.ndarray, list[np.ndarray]]:
     """Returns vertices, float64 [V, 3], and the vertices of each face of an OBJ file.
 
-    Raises: ValueError for vertex 0, numbers that cannot be read, and free-form surfaces.
+    Raises: ValueError for UTF-16, vertex 0, numbers that cannot be read, and free-form surfaces.
     """
-    text = _COMMENT.sub(b"", data.removeprefix(codecs.BOM_UTF8).replace(b"\r\n", b"\n").replace(b"\r", b"\n"))
+    if _UTF_16.match(data):
+        raise ValueError("it is UTF-16 text; save it as UTF-8")
+    text = data.replace(codecs.BOM_UTF8, b"").replace(b"\r\n", b"\n").translate(_SPACES)
+    text = _COMMENT.sub(b"", text)
     if unread := _UNREAD.search(text):
         raise ValueError(f"it contains {unread[1].decode()}, which is not read; write polygons")
     vertices: list[list[bytes]] = []

@@ -113,6 +113,10 @@ FACE = b"f 1 2 3\n"
 PLY = b"ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\nelement face 1\n"
 PLY += b"property list uchar int vertex_indices\nend_header\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n"
 GOOD = TRIANGLE.encode() + FACE
+FACETS = (
+    2
+    * b"facet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\nendloop\nendfacet\n".split(b"\n")[:7]
+)
 READABLE = "ramp must be a readable {} file"
 REFUSED = [
     (
@@ -127,6 +131,10 @@ REFUSED = [
     ("a.ply", b"bad", {}, READABLE.format("PLY")),
     ("a.stl", bytes(80) + struct.pack("<I", 3) + bytes(149), {}, "it has 233 of 234 bytes"),
     ("a.stl", b"solid\nfacet normal 0 0 1\nouter loop\nvertex 0 0 0\n", {}, "it ends before endsolid"),
+    *(
+        ("a.stl", b"\n".join([b"solid", *FACETS[:first], *FACETS[last:], b"endsolid"]), {}, "that is not whole: f")
+        for first, last in ((3, 7), (5, 7), (6, 7), (12, 14), (13, 14), (2, 3))
+    ),
     ("a.glb", b"", {}, READABLE.format("GLB")),
     ("a.glb", b"glTFxxxxxx", {}, READABLE.format("GLB")),
     ("a.obj", TRIANGLE.encode() + b"f 1 2 9\n", {}, "ramp must have triangles of its 3 vertices, got vertices 0 to 8"),
@@ -135,6 +143,7 @@ REFUSED = [
         ("a.obj", GOOD + word + b" 1 2 3\n", {}, f"contains {word.decode()}, which is not read")
         for word in (b"surf", b"call", b"fo", b"bzp")
     ),
+    *(("a.obj", GOOD.decode().encode(name), {}, "it is UTF-16 text") for name in ("utf-16", "utf-16-le", "utf-16-be")),
     ("a.ply", PLY.replace(b"face 1", b"tristrips 1"), {}, "it contains tristrips, which are not read"),
     ("a.ply", PLY.replace(b"uchar int", b"uchar float"), {}, "by numbers that are not whole"),
     ("a.obj", b"v 0 0 nan\nv 1 0 0\nv 0 1 0\n" + FACE, {}, "ramp must have finite vertices, got .*nan"),
@@ -173,6 +182,7 @@ STEPS = "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\nv 0 0 1\nf 1 2 4\n"
             "# c:\\a\\\n" + STEPS,
             STEPS.replace("1 2", "1 \\\n2"),
         ),
+        *(STEPS.replace("v 1", "\fv\v1"), STEPS.replace("f 1", "\ufefff 1")),
         *(STEPS.replace("1 2 3", "-3 -2 -1").replace("1 2 4", "-4 -3 -1"), STEPS.replace("2 4", "2 -1")),
         *("usemtl a\n" + STEPS.replace("f 1 2 4", "usemtl b\nf 1 2 4"), STEPS + "f 1\nf 1 2\n#f 2 3 4\n"),
     ],
@@ -352,6 +362,22 @@ def test_each_body_is_judged_by_itself(tmp_path):
     assert notes_on_files(load_scene(tmp_path / "out.yaml")) == [
         "1 triangles are a sheet, because they enclose nothing: three_sheets"
     ]
+
+
+@pytest.mark.parametrize("word", ["plain", "mark", "\r", "\r\n", " ", "\f\n", "capitals", "name", "solids", "wide"])
+def test_spellings_of_text_stl(tmp_path, word):
+    """A mark of UTF-8, line ends, one line, capitals, names and several solids change nothing."""
+    text = trimesh.exchange.stl.export_stl_ascii(CUBE).replace("\r\n", "\n")
+    text = {
+        "mark": "\ufeff" + text,
+        "capitals": text.upper(),
+        "name": text.replace("solid ", "solid outer vertex"),
+        "solids": text.replace("endfacet", "endfacet\nendsolid one\nsolid two"),
+        "wide": text.replace(" ", " \t "),
+    }.get(word, text.replace("\n", word) if word.isspace() else text)
+    (tmp_path / "a.stl").write_bytes(text.encode())
+    body = load_mesh(tmp_path / "a.stl")
+    assert body.closed and len(body.triangle_F3) == 12
 
 
 def test_binary_stl_with_more_behind(tmp_path):
