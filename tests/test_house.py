@@ -16,10 +16,10 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 33_582,
+    "hgn": 33_586,
     "datagen": 9_045,
     "tools": 6_486,
-    "tests": 33_334,
+    "tests": 33_341,
 }
 SETTINGS = 240  # fields of the dataclasses behind the commands, *Config
 

@@ -20,6 +20,7 @@ from hgn.system.claims import count_items
 
 MAXIMUM_BYTES = 250_000  # largest size of a YAML file: PyYAML takes a CPU second for 50 kB
 MAXIMUM_NODES = 100_000  # nodes of a file
+MAXIMUM_DIGITS = 1000  # characters of a number of a file: Python does not print integers of 4,300 digits
 # bytes of a JSON file for the search of a line: it has fewer nodes then, and YAML takes a CPU second for 50 kB
 LINES_BYTES = 2 * MAXIMUM_NODES
 # of PyYAML, of thousands of digits, of deep nesting, and of tags such as `!!bool 5`
@@ -32,7 +33,7 @@ def read_yaml(path: Path) -> Any:
     """Returns the content of a YAML file as plain containers.
 
     Raises ConfigError, one line that starts with the path, for: a file that cannot be read, more than MAXIMUM_BYTES, a
-    repeated key, octal or sexagesimal numbers, and aliases that expand to more than MAXIMUM_NODES values.
+    repeated key, octal, sexagesimal or very long numbers, and aliases that expand to more than MAXIMUM_NODES values.
     """
     rule, size = f"a YAML file of at most {MAXIMUM_BYTES} bytes", path.stat().st_size
     require(size <= MAXIMUM_BYTES, str(path), rule, size, "particles belong in .npz files")
@@ -106,6 +107,9 @@ def _check(node: yaml.Node, name: str, visited: set[int], loader: _Loader) -> No
         for item in node.value:
             _check(item, name, visited, loader)
     elif node.tag.endswith((":int", ":float")):
+        if (count := len(node.value)) > MAXIMUM_DIGITS:
+            rule = f"is a number of {count} characters; at most {MAXIMUM_DIGITS} are read"
+            raise ValueError(f"line {line}: {name[:40]}: {node.value[:40]} {rule}")
         if _OCTAL.fullmatch(node.value):
             remedy = f"write {node.value.replace('0', '', 1)[:40]}, or {int(node.value.replace('_', '')[:20], 8)}"
             raise ValueError(f"line {line}: {name}: {node.value[:40]} is an octal number in YAML; {remedy}")

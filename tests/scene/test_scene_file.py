@@ -178,7 +178,14 @@ MISTAKES = [
     (b"\xff\xfe\xfa", YAML + ": it is not UTF-8 text"),
     (b"PK\x03\x04\xff", YAML + ": it is a zip file; unpack it, and give the YAML file in it"),
     ("groups: " + 1000 * "[", YAML),
-    ("cell_size: " + 5000 * "9", YAML + ": Exceeds the limit"),
+    *(
+        (
+            text.replace("N", number),
+            rf"{YAML}: line 1: .*: {number[:9]}.* is a number of {len(number)} characters; at mo",
+        )
+        for number in (5000 * "9", "0x" + 5000 * "f", "-0b" + 20_000 * "1")
+        for text in ("cell_size: N", "N", "gravity: [N, 0]", "? N\n: 1", "- {a: {? N : 0}}", "{? [N] : 1}")
+    ),
     ("cell_size: " + 400 * "9", "cell_size must be a number of at most 63 bits, got one of 1329"),
     (BOMB, ALIASES),
     ("groups: &a [*a]", ALIASES),
