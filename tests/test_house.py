@@ -18,8 +18,8 @@ PACKAGES = ("hgn", "datagen", "tools")
 LINES = {  # of Python, in tracked files
     "hgn": 33_586,
     "datagen": 9_045,
-    "tools": 6_486,
-    "tests": 33_341,
+    "tools": 6_490,
+    "tests": 33_362,
 }
 SETTINGS = 240  # fields of the dataclasses behind the commands, *Config
 
