@@ -69,7 +69,7 @@ def read_json(path: Path) -> Any:
 
 
 class _Loader(yaml.SafeLoader):
-    """Reads 1e5 as a number, as YAML 1.2 does. PyYAML requires 1.0e+5."""
+    """Reads 1e5 and -.5 as numbers, as YAML 1.2 does. PyYAML requires 1.0e+5 and -0.5."""
 
     def get_single_node(self) -> yaml.Node | None:
         node = super().get_single_node()
@@ -111,13 +111,14 @@ def _check(node: yaml.Node, name: str, visited: set[int], loader: _Loader) -> No
             rule = f"is a number of {count} characters; at most {MAXIMUM_DIGITS} are read"
             raise ValueError(f"line {line}: {name[:40]}: {node.value[:40]} {rule}")
         if _OCTAL.fullmatch(node.value):
-            remedy = f"write {node.value.replace('0', '', 1)[:40]}, or {int(node.value.replace('_', '')[:20], 8)}"
-            raise ValueError(f"line {line}: {name}: {node.value[:40]} is an octal number in YAML; {remedy}")
+            number = node.value.replace("_", "")[:4000]  # Python prints at most 4300 digits
+            remedy = ", or ".join(dict.fromkeys(str(int(number, base))[:40] for base in (10, 8)))
+            raise ValueError(f"line {line}: {name}: {node.value[:40]} is an octal number in YAML; write {remedy}")
         if _SEXAGESIMAL.fullmatch(node.value):
             remedy = "write it in decimals, or in quotes"
             raise ValueError(f"line {line}: {name}: {node.value[:40]} is a number of base 60 in YAML; {remedy}")
 
 
 _Loader.add_implicit_resolver(
-    "tag:yaml.org,2002:float", re.compile(r"[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+$"), list("-+.0123456789")
+    "tag:yaml.org,2002:float", re.compile(r"[-+]?((\d+\.?\d*|\.\d+)[eE][-+]?\d+|\.\d+)$"), list("-+.0123456789")
 )

@@ -199,7 +199,8 @@ MISTAKES = [
     ),
     (ONE_CUBE + "<<: {seed: 1}\n!!merge x: {seed: 2}\n", "line 4: the key x is given twice, first in line 3"),
     (ONE_CUBE + "seed: 010\n", "line 3: seed: 010 is an octal number in YAML; write 10, or 8"),
-    (ONE_CUBE + "cell_size: 00_17\n", "line 3: cell_size: 00_17 is an octal number"),
+    (ONE_CUBE + "seed: 007\n", "line 3: seed: 007 is an octal number in YAML; write 7$"),
+    (ONE_CUBE + "seed: -00_17\n", "line 3: seed: -00_17 is an octal number in YAML; write -17, or -15"),
     (ONE_CUBE + "gravity:\n- 0\n- -9:30\n- 0\n", "line 5: gravity: -9:30 is a number of base 60 in YAML"),
     (ONE_CUBE + "cell_size: 1:0.5\n", "line 3: cell_size: 1:0.5 is a number of base 60"),
     (ONE_CUBE.replace("0.8", "1:48"), "line 2: position: 1:48 is a number of base 60"),
@@ -385,10 +386,10 @@ def test_particles_that_cannot_be_taken(tmp_path, arrays, message):
 
 
 def test_numbers_that_are_none(tmp_path):
-    """Zero, a decimal that begins with it, a date of the name, and anchors used twice are no surprise."""
+    """Zero, decimals that begin with it or with a point, a date of the name, and anchors used twice are read."""
     text = ONE_CUBE.replace("[0.5, 0.8, 0.5]", "&middle [0.5, 0.8, 0.5]") + "obstacles:\n"
-    text += "  - {shape: cone, size: 00.1, position: [0.2, 0.2, 0.2]}\nseed: 0\ngravity: [0, -0.98e1, +0]\n"
-    assert load_scene(write(tmp_path, text)).gravity == (0, -9.8, 0)
+    text += "  - {shape: cone, size: 00.1, position: [0.2, 0.2, 0.2]}\nseed: 0\ngravity: [-.5, -0.98e1, +.5]\n"
+    assert load_scene(write(tmp_path, text)).gravity == (-0.5, -9.8, 0.5)
 
 
 @pytest.mark.parametrize(
