@@ -70,6 +70,8 @@ def _require_own_data(group: h5py.Group, path: Path, claims: Claims, visited: se
                 raise ConfigError(f"{path}: {item.name} must lie in the file itself, got data of another file")
             if item.dtype.hasobject and item.size != 1:
                 raise ConfigError(f"{path}: {item.name} must be numbers, got texts of variable length")
+            if item.dtype.kind == "c":
+                raise ConfigError(f"{path}: {item.name} must be real numbers, got {item.dtype}")
             chunk, shape = item.chunks or (), item.shape or ()
             count = math.prod(-(-length // own) for length, own in zip(shape, chunk, strict=False)) if chunk else 1
             size = item.dtype.itemsize * (math.prod(chunk) if chunk else item.size or 0)

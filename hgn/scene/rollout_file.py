@@ -31,7 +31,7 @@ from hgn.scene.hdf5 import damage_named, open_hdf5
 from hgn.scene.material import MATERIALS, require_materials
 from hgn.scene.motion import Motion
 from hgn.scene.scene import Obstacle
-from hgn.schema import Bound, ConfigError, Positive, Vector, require, require_bounds
+from hgn.schema import Bound, BoxSize, ConfigError, OrdinarySize, Vector, require, require_bounds
 from hgn.system.claims import Claims
 from hgn.system.files import make_folder, space_reserved, sync_folder, sync_written, temporary_file
 
@@ -47,7 +47,7 @@ VTKHDF_VERSION = (2, 0)  # the oldest version with temporal PolyData, for older 
 CELL_CATEGORIES = {"Vertices": 1, "Lines": 1, "Polygons": 3, "Strips": 1}
 WRITE_EVERY_S = 1.0  # interval between writes of a growing file
 LARGEST = 1e15  # largest size of a number, so that float32 stores its square
-Ordinary = Annotated[Positive[float], Bound("from 1e-15 to 1e15", lambda value: 1 / LARGEST <= value <= LARGEST)]
+FARTHEST = 1000  # largest coordinate of particles in a file, in domain sizes; a simulation diverges before
 # kinds of the numbers in datasets, as NumPy calls them
 KINDS = {"VTKHDF/Points": "f", "VTKHDF/NumberOfPoints": "iu", "hgn/reference": "f", "hgn/entry_frame": "iu"}
 FRAMES_OF_A_CHUNK = 64  # of datasets with one row for each frame
@@ -64,10 +64,10 @@ class Rollout:
     position_TN3: np.ndarray  # float32, domain units
     material_N: np.ndarray  # uint8, index into `materials`
     obstacles: tuple[Obstacle, ...]
-    domain_size: tuple[Ordinary, Ordinary, Ordinary]
-    frame_rate_hz: Ordinary
+    domain_size: BoxSize
+    frame_rate_hz: OrdinarySize
     gravity: Vector = (0.0, -9.8, 0.0)  # domain units per second squared
-    cell_size: Ordinary = 1 / 64  # edge of obstacle cells
+    cell_size: OrdinarySize = 1 / 64  # edge of obstacle cells
     # plain JSON types: weights and their sha256, the scene's specification, settings
     source: dict[str, Any] = field(default_factory=dict)
     reference_TN3: np.ndarray | None = None  # float32 [R, N, 3], ground truth at the same frame rate
@@ -395,23 +395,28 @@ def _read(file: h5py.File, claims: Claims) -> Rollout:
     if points.shape != (shown_TP.sum(), 3) or (count_T != shown_TP.sum(axis=1)).any():
         raise ConfigError(f"Points must hold {shape[0]} frames of {shape[1]} particles, got shape {points.shape}")
     position_TP3 = np.full((*shown_TP.shape, 3), np.nan, np.float32)
-    position_TP3[shown_TP] = points[()]
+    with np.errstate(over="ignore"):  # infinite places of particles are refused
+        position_TP3[shown_TP] = points[()]
     source = json.loads(own["source"][()])
     require(isinstance(source, dict), "source", "a mapping", source)
-    return Rollout(
+    rollout = Rollout(
         position_TN3=position_TP3[:, vertices:],
         material_N=material_N,
         obstacles=tuple(_read_obstacle(entry) for _, entry in sorted(own["obstacles"].items())),
         domain_size=_triple(own.attrs["domain_size"]),
-        frame_rate_hz=float(own.attrs["frame_rate_hz"]),
+        frame_rate_hz=float(own.attrs["frame_rate_hz"].item()),
         gravity=_triple(own.attrs["gravity"]),
-        cell_size=float(own.attrs["cell_size"]),
+        cell_size=float(own.attrs["cell_size"].item()),
         source=source,
         reference_TN3=own["reference"][()] if "reference" in own else None,
         entry_frame_N=entry_N if "entry_frame" in own else None,
         materials=tuple(json.loads(own.attrs["materials"])),
         dimensions=np.asarray(own.attrs.get("dimensions", 3)).item(),  # missing in older files
     )
+    for name, array in (("Points", rollout.position_TN3), ("reference", rollout.reference_TN3)):
+        size = 0.0 if array is None else float(np.fmax.reduce(np.abs(array), axis=None, initial=0.0))
+        require(size <= FARTHEST * max(rollout.domain_size), name, f"at most {FARTHEST} domain sizes, or nan", size)
+    return rollout
 
 
 def _read_obstacle(entry: h5py.Group) -> Obstacle:
@@ -436,8 +441,7 @@ def _read_motion(entry: h5py.Group) -> Motion:
         if value.shape != shape:
             raise ConfigError(f"{entry.name}: {name} must have shape {shape}, got {value.shape}")
     pivot = _triple(entry.attrs["pivot"])
-    fits = all(abs(value) <= LARGEST for value in pivot)
-    require(fits, f"{entry.name}: pivot", "finite and at most 1e15", list(pivot))
+    require(all(abs(x) <= LARGEST for x in pivot), f"{entry.name}: pivot", "finite and at most 1e15", list(pivot))
     return Motion(**arrays, pivot=pivot)
 
 

@@ -10,12 +10,12 @@ import threading
 import time
 from collections.abc import Iterator
 from functools import partial
-from typing import Any
+from typing import Any, Literal
 
 import viser
 
 from hgn.render.pictures import rollout_spacing
-from hgn.scene.rollout_file import Rollout
+from hgn.scene.rollout_file import FARTHEST, Rollout
 from hgn.schema import require
 from hgn.system.files import WRITTEN_BY_HGN
 from hgn.viewer.placed import plain
@@ -30,8 +30,10 @@ class _Film:
 
     def __init__(self, server: viser.ViserServer, rollout: Rollout) -> None:
         self.rollout = rollout
+        small = FARTHEST * max(rollout.domain_size) < 65504  # the largest number in float16
+        precision: Literal["float16", "float32"] = "float16" if small else "float32"
         self.stage = StageView(
-            server, rollout.domain_size, rollout_spacing(rollout), "float16", rollout.materials, rollout.dimensions
+            server, rollout.domain_size, rollout_spacing(rollout), precision, rollout.materials, rollout.dimensions
         )
         self.moving = []
         for index, obstacle in enumerate(rollout.obstacles):

@@ -14,7 +14,7 @@ from data.foreign_writers import metadata, write
 from data.strange_files import cases, saved
 from data.strange_pickles import key_of_tuples, keys_of_one_hash, laughing
 from data.test_index import shard
-from scene.test_rollout_file import make_rollout
+from scene.test_rollout_file import array, attribute, make_rollout, turned
 
 from hgn.data.foreign.dataset import import_set
 from hgn.data.foreign.settings import ImportConfig
@@ -148,6 +148,13 @@ cases(
     "rollout",
     {
         "points": rollout(claimed("VTKHDF/Points", (10**10, 3), "f4")),
+        **{
+            f"place at {x!r}": rollout(array("VTKHDF/Points", np.full((56, 3), x)))
+            for x in (np.float32(1e38), np.inf, 1e300)
+        },
+        "far reference": rollout(array("hgn/reference", np.full((3, 7, 3), 1e300))),
+        "complex rotations": rollout(turned(np.eye(3)[None] + 0j)),
+        "complex rate": rollout(attribute("frame_rate_hz", 60 + 0j)),
         "materials": rollout(claimed("VTKHDF/PointData/material", (10**11,), "u1")),
         "vertices": rollout(claimed("hgn/obstacles/0000/vertices", (10**10, 3), "f8")),
         "counts": rollout(claimed("VTKHDF/NumberOfPoints", (10**10,), "i8")),
