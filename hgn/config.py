@@ -38,6 +38,8 @@ from hgn.schema import (
 from hgn.solver_method import METHODS, SolverMethod
 from hgn.step_config import StepConfig
 
+MOST_OBSTACLES = 1000  # largest number of obstacles in a random scene
+FewObstacles = Annotated[NonNegative[int], Bound("at most 1,000", lambda count: count <= MOST_OBSTACLES)]
 OBSTACLE_SHAPES = ("half_box", "square", "half_sphere", "cone", "pyramid")
 MESH_SUFFIXES = (".stl", ".obj", ".ply", ".glb")
 USD_ENDINGS = (".usdc", ".usda", ".usd")
@@ -96,7 +98,7 @@ class SceneConfig:
     domain_size: BoxSize = (1.0, 1.0, 1.0)  # edges of the box, which starts at the origin
     cell_size: Positive[float] = 1 / 64  # edge of the solver's cells
     gravity: Vector = (0.0, -9.8, 0.0)  # domain units per second squared
-    obstacle_count: NonNegative[int] = 5  # number of obstacles in a scene
+    obstacle_count: FewObstacles = 5  # number of obstacles in a scene
     obstacle_shapes: tuple[str, ...] = OBSTACLE_SHAPES  # or mesh files, scaled so that the longest side is the size
     obstacle_size: tuple[float, float] = (0.1, 0.5)  # smallest and largest size of an obstacle
     group_count: NonNegative[int] = 4  # number of particle groups in a scene

@@ -16,10 +16,10 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 33_587,
+    "hgn": 33_606,
     "datagen": 9_045,
     "tools": 6_490,
-    "tests": 33_363,
+    "tests": 33_379,
 }
 SETTINGS = 240  # fields of the dataclasses behind the commands, *Config
 

@@ -291,7 +291,8 @@ def _decode_description(key: str, text: bytes) -> _Description:
         raise ConfigError(f"{key}.json must be JSON, got {error}") from None
     require_schema_version(mapping, f"{key}.json")
     description = from_mapping(_Description, mapping, f"{key}.json")
-    require_specification(description.specification, description.solver.get("settings", {}), f"{key}.json")
+    settings = description.solver.get("settings", {})
+    require_specification(description.specification, settings, description.cell_size, f"{key}.json")
     return description
 
 

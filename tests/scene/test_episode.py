@@ -146,6 +146,12 @@ def random_scene(**changes):
     return specified(kind="random", obstacles=[{key: value for key, value in record.items() if value is not None}])
 
 
+def random_scenes(count, **changes):
+    """A random scene with as many obstacles."""
+    (record,) = json.loads(random_scene(shape="half_sphere", **changes)["json"])["specification"]["obstacles"]
+    return {"json": description(specification={"kind": "random", "obstacles": count * [record]}, cell_size=1 / 512)}
+
+
 SHAPED = "{'descr': '<f4', 'fortran_order': False, 'shape': %s, }"
 BROKEN_MEMBERS: list[tuple[dict[str, bytes | None], str]] = [
     ({"json": None}, "member json is missing"),
@@ -185,13 +191,15 @@ BROKEN_MEMBERS: list[tuple[dict[str, bytes | None], str]] = [
         for name, values in {
             "shape": (None, 5, "torus"),
             "size": (None, "x", [1.0, 2.0], float("nan"), 0.0, 1e30),
-            "position": (5.0, [1.0], [float("nan"), 0.0, 0.0]),
-            "quaternion": ("abcd", [1.0], 4 * [float("inf")]),
+            "position": (5.0, [1.0], [float("nan"), 0.0, 0.0], 3 * [1e300]),
+            "quaternion": ("abcd", [1.0], 4 * [float("inf")], 4 * [1e200], 4 * [0.0], [2.0, 0.0, 0.0, 0.0]),
             "friction": ("x", float("nan"), -1.0),
             "keyframes": (5, [], [[0.0, [0.0, 0.0, 0.0]], ["a", [0.0, 0.0, 0.0]]], [[0.0, [float("nan"), 0.0, 0.0]]]),
         }.items()
         for value in values
     ),
+    (random_scenes(10_000), "json.specification.obstacles must be at most 1000, got 10000"),
+    (random_scenes(600, size=1.0), "json.specification.obstacles must be of sizes whose squares .* got 600"),
 ]
 
 

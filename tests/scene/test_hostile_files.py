@@ -50,6 +50,7 @@ from hgn.training.imported import settings_of_imported
     [
         (SolveConfig, {"scene": "s", "frames": 10**12}, "frames must be at most 1,000,000, got 1000000000000"),
         (NetworkConfig, {"levels": 10**5}, "levels must be at most 1,000, got 100000"),
+        (SceneConfig, {"obstacle_count": 10**5}, "obstacle_count must be at most 1,000, got 100000"),
         (NetworkConfig, {"width": 10**9}, "width must be at most 65,536"),
         (NetworkConfig, {"levels": 10**400}, "levels must be a number of at most 63 bits"),
         (NetworkConfig, {"cell_size": 10**400}, "cell_size must be a number of at most 63 bits"),
