@@ -44,6 +44,7 @@ LARGE_FILES = {  # shipped weights, and results that pages show
     "hgn/weights/obstacles_small.safetensors",
     "hgn/weights/own_physics.safetensors",
     "results/stability/network_h100.json",
+    "results/stability/own_scenes.webp",
     "results/stability/thrown.webp",
 }
 
