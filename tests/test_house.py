@@ -19,7 +19,7 @@ LINES = {  # of Python, in tracked files
     "hgn": 33_606,
     "datagen": 9_045,
     "tools": 6_490,
-    "tests": 33_379,
+    "tests": 33_380,
 }
 SETTINGS = 240  # fields of the dataclasses behind the commands, *Config
 
