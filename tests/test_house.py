@@ -18,8 +18,8 @@ PACKAGES = ("hgn", "datagen", "tools")
 LINES = {  # of Python, in tracked files
     "hgn": 33_606,
     "datagen": 9_045,
-    "tools": 6_490,
-    "tests": 33_380,
+    "tools": 6_500,
+    "tests": 33_415,
 }
 SETTINGS = 240  # fields of the dataclasses behind the commands, *Config
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import itertools
 import json
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,7 +20,7 @@ from typing import Any
 from hgn.command import run_command
 from hgn.renamed import current_metrics
 from hgn.scene.hdf5 import damage_named
-from hgn.schema import from_mapping, require, require_replaceable
+from hgn.schema import from_mapping, printable, require, require_replaceable
 from hgn.system.files import write_atomically, write_json
 from hgn.system.yaml_files import read_yaml
 
@@ -80,12 +81,16 @@ def main(mapping: dict[str, Any]) -> int:
 def read_run(folder: Path) -> Run:
     """Reads metrics.jsonl and the resolved configuration. Raises: ConfigError if the folder is no run of hgn.train."""
     with damage_named(f"{folder}: runs must be folders of python -m hgn.train", "take another folder"):
+        for file in (folder / "metrics.jsonl", folder / "config.yaml"):
+            if not file.is_file():  # opening a pipe would wait for ever
+                raise OSError(f"no plain file {file}")
         lines = (folder / "metrics.jsonl").read_text(encoding="utf-8").splitlines()
         settings = read_yaml(folder / "config.yaml")
         json.dumps(settings), settings["dataset"]["folder"], dict(settings.get("provenance", {}))  # read below
         records = [current_metrics(json.loads(line)) for line in lines]
         for name, value in (item for record in records for item in record.items()):
-            require(isinstance(value, int | float), f"{folder}: {name}", "a number", value)
+            drawn = isinstance(value, int | float) and not 1e100 < abs(value) < math.inf
+            require(drawn, f"{folder}: {name}", "a number of at most 1e100", value)
         _add_minutes(records)
         _add_scenes(records, settings["training"]["batch_scenes"])
         # a resumed run repeats some updates: the later record counts
@@ -133,7 +138,7 @@ def draw(runs: Sequence[Run]) -> bytes:
     if len(runs) == 1:
         _draw_one(panels, runs[0], last)
         training, dataset = runs[0].settings["training"], runs[0].settings["dataset"]
-        episodes = f"{int(last['episodes'])} training episodes, " if "episodes" in last else ""
+        episodes = f"{last['episodes']:.0f} training episodes, " if "episodes" in last else ""
         title = f"{dataset['folder']}, {episodes}{training['batch_scenes']} scenes an update, {title}"
     else:
         _draw_several(panels, runs, last)
@@ -143,7 +148,7 @@ def draw(runs: Sequence[Run]) -> bytes:
         if panel.lines:
             panel.set_yscale("log")
     shared_legend(figure, fontsize=8, loc="outside lower center", ncols=5)
-    figure.suptitle(title, fontsize=10)
+    figure.suptitle(_plain(title), fontsize=10)
     return as_png(figure)
 
 
@@ -164,7 +169,7 @@ def _draw_one(panels: Any, run: Run, last: Mapping[str, float]) -> None:
 def _draw_several(panels: Any, runs: Sequence[Run], last: Mapping[str, float]) -> None:
     for i, run in enumerate(runs):
         losses = [record for record in run.records if "loss" in record]
-        _plot(panels[0], _means(losses, "loss"), "loss", run.name, f"C{i}", against="scenes")
+        _plot(panels[0], _means(losses, "loss"), "loss", _plain(run.name), f"C{i}", against="scenes")
         for panel, against in zip(panels[1:], ("scenes", "minutes"), strict=True):
             _plot(panel, run.records, "one_step/validation", "", f"C{i}", marker="o", against=against)
     for panel, label in zip(panels, ("scenes trained on", "scenes trained on", "minutes of training"), strict=True):
@@ -193,6 +198,11 @@ def _means(records: list[dict[str, float]], key: str) -> list[dict[str, float]]:
 def _origin(run: Run) -> str:
     where = run.settings.get("provenance", {})
     return f"{where.get('device', '')}, commit {where.get('commit', '')}, {str(where.get('date', ''))[:10]}"
+
+
+def _plain(text: str) -> str:
+    """Returns a text that matplotlib draws as it is. Text between two `$` would be a formula."""
+    return printable(text).replace("$", r"\$")
 
 
 def _plot(

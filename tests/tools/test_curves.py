@@ -1,12 +1,16 @@
 """tools.curves: one run, several runs, a run that was stopped, and folders that are none."""
 
 import json
+import math
+import os
+from dataclasses import replace
 
 import pytest
 import yaml
+from matplotlib.backends.backend_agg import RendererAgg
 from PIL import Image
 
-from hgn.schema import ConfigError
+from hgn.schema import ConfigError, printable
 from tools.curves import draw, main, read_run
 
 SETTINGS = {
@@ -80,6 +84,8 @@ def test_a_folder_that_is_no_run(tmp_path):
     [
         *(("metrics.jsonl", text) for text in ("x", "[]", "{", "5", '{"loss": 1}', '{"update": [1], "time": 1}')),
         *(("metrics.jsonl", f'{{"update": 1, "time": 1, "loss": {text}}}') for text in ('"x"', "null", "[1]")),
+        *(("metrics.jsonl", f'{{"update": {update}, "time": 1}}') for update in (10**400, 1e308, -1e308)),
+        *(("metrics.jsonl", f'{{"update": 1, "time": 1, "loss": {loss}}}') for loss in (10**400, 1e308)),
         ("metrics.jsonl", '{"update": 1, "time": 1, "updates_per_second": 1e-300, "scenes_per_second": 1e308}'),
         *(("config.yaml", text) for text in ("[", "[]", "a: 1", "training:", "!!python/name:os.system", "[" * 5000)),
         ("config.yaml", yaml.safe_dump(SETTINGS | {"provenance": [1]})),
@@ -91,5 +97,34 @@ def test_damaged_runs(tmp_path, name, text):
     """One line names the folder."""
     make_run(tmp_path / "run")
     (tmp_path / "run" / name).write_text(text)
-    with pytest.raises(ConfigError, match=r"run: runs must be folders of .*, got|must be a (number, got|YAML file)"):
+    with pytest.raises(ConfigError, match=r"run: runs must be folders of .*, got|must be a (number of|YAML file)"):
         main({"runs": [str(tmp_path / "run")], "out": str(tmp_path / "curves")})
+
+
+@pytest.mark.parametrize("name", ["metrics.jsonl", "config.yaml"])
+def test_pipes_are_refused(tmp_path, name):
+    """Reading a pipe would wait for ever."""
+    file = make_run(tmp_path / "run") / name
+    file.unlink()
+    os.mkfifo(file)
+    with pytest.raises(ConfigError, match=rf"run: runs must be folders of .*, got no plain file .*{name}"):
+        read_run(tmp_path / "run")
+
+
+@pytest.mark.parametrize("episodes", [3, math.nan, math.inf])
+@pytest.mark.parametrize("name", [r"$\frac{$", r"\$\frac$ $", "\ud800", "a\0", "$a$"])
+def test_odd_texts_and_counts_are_drawn(tmp_path, monkeypatch, name, episodes):
+    """Names with dollar signs are no formulas. The picture of a number of episodes that is none exists too."""
+    drawn = set()
+    draw_text = RendererAgg.draw_text
+    monkeypatch.setattr(
+        RendererAgg, "draw_text", lambda self, *given, **more: (drawn.add(given[3]), draw_text(self, *given, **more))
+    )
+    run = read_run(make_run(tmp_path / "run"))
+    odd = replace(run, name=name, settings=run.settings | {"dataset": {"folder": name}})
+    odd.records[-1]["episodes"] = episodes
+    shown = printable(name)
+    draw([odd])
+    assert any(text.startswith(f"{shown}, {episodes} training episodes, 2 scenes") for text in drawn)
+    draw([odd, run])
+    assert shown in drawn
