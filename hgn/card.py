@@ -20,7 +20,7 @@ from hgn.data.storage import is_remote
 from hgn.scene.kinds import RANGES
 from hgn.scene.own_physics import own_ranges
 from hgn.schema import from_mapping, require
-from hgn.system.files import write_atomically
+from hgn.system.files import read_replaced, write_atomically
 
 if TYPE_CHECKING:
     from hgn.runtime.weights import WeightsInfo
@@ -59,7 +59,7 @@ def main(mapping: dict[str, Any]) -> int:
         _, info = load_weights(path)
         text = weights_card(info, config.name or path.stem, path.name, config.license)
         copy, content = folder / path.name, path.read_bytes()
-        same = not copy.exists() or copy.read_bytes() == content
+        same = not copy.exists() or read_replaced(copy) == content
         require(same, "out", f"a folder without another {path.name}", str(folder))
     else:
         assert config.data is not None

@@ -17,9 +17,9 @@ PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
     "hgn": 33_606,
-    "datagen": 9_045,
+    "datagen": 9_047,
     "tools": 6_500,
-    "tests": 33_415,
+    "tests": 33_423,
 }
 SETTINGS = 240  # fields of the dataclasses behind the commands, *Config
 

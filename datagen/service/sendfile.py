@@ -17,6 +17,8 @@ from starlette.datastructures import Headers
 from starlette.responses import PlainTextResponse, Response
 from starlette.types import Receive, Scope, Send
 
+from hgn.system.files import open_at_once
+
 EXTENSION = "http.response.zerocopysend"
 _PIECE_BYTES = 2**20
 _RANGE = re.compile(r"bytes=(\d{0,18})-(\d{0,18})")
@@ -54,7 +56,7 @@ class FileRange(Response):
             self.status_code = 206
             self.headers["content-range"] = f"bytes {start}-{stop - 1}/{self._size}"
         self.headers["content-length"] = str(stop - start)
-        file = await to_thread.run_sync(lambda: self._path.open("rb"))
+        file = await to_thread.run_sync(lambda: open_at_once(self._path))
         with file:
             await send({"type": "http.response.start", "status": self.status_code, "headers": self.raw_headers})
             if scope["method"] == "HEAD":

@@ -1,5 +1,6 @@
 """Weights and data sets of the Hugging Face Hub, from a stand-in that speaks its protocol."""
 
+import os
 import shutil
 import time
 
@@ -156,9 +157,11 @@ def test_a_card_is_of_the_weights_beside_it(hub, tmp_path):
     weights = hub.folder / "models" / "one" / "net" / "net.safetensors"
     folder = tmp_path / "folder"
     folder.mkdir()
-    (folder / "net.safetensors").write_bytes(weights.read_bytes()[:100])
-    with pytest.raises(ConfigError, match=r"out must be a folder without another net\.safetensors"):
-        card.main({"weights": str(weights), "out": str(folder)})
+    for make in (os.mkfifo, lambda path: path.write_bytes(weights.read_bytes()[:100])):
+        (folder / "net.safetensors").unlink(missing_ok=True)
+        make(folder / "net.safetensors")
+        with pytest.raises(ConfigError, match=r"out must be a folder without another net\.safetensors"):
+            card.main({"weights": str(weights), "out": str(folder)})
     assert [path.name for path in folder.iterdir()] == ["net.safetensors"]
     (folder / "net.safetensors").write_bytes(weights.read_bytes())
     assert card.main({"weights": str(weights), "out": str(folder)}) == 0

@@ -5,6 +5,7 @@ import hashlib
 import http.client
 import itertools
 import logging
+import os
 import socket
 import sys
 from asyncio.selector_events import _SelectorSocketTransport
@@ -118,9 +119,13 @@ def test_reader_that_leaves(port, file, caplog):
     assert get(port) == file.read_bytes() and not caplog.records
 
 
-def test_file_that_became_shorter(port, file):
-    """A file that was cut after it was checked ends the connection: what came is not taken for the whole."""
-    file.write_bytes(file.read_bytes()[: SIZE // 2])
+@pytest.mark.parametrize("pipe", [False, True])
+def test_file_that_became_shorter(port, file, pipe):
+    """A file that was cut after it was checked, or is a pipe, ends the connection: what came is not taken for the
+    whole."""
+    content = file.read_bytes()
+    file.unlink()
+    _ = os.mkfifo(file) if pipe else file.write_bytes(content[: SIZE // 2])
     with pytest.raises((http.client.IncompleteRead, ConnectionError)):
         get(port)
 
