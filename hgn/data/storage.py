@@ -58,7 +58,7 @@ def outliving() -> bool:
 
 @contextlib.contextmanager
 def asked_once() -> Iterator[None]:
-    """Lets `ask` in this thread not repeat failed reads, because the caller reads the manifest again."""
+    """Ends failed reads of this thread without a retry, because the caller reads the manifest again."""
     token = _once.set(True)
     try:
         yield
@@ -372,7 +372,8 @@ class _Remote(Storage):
     def _patiently(self, name: str, patience_s: float | None, read: Callable[[str], T]) -> T:
         """Reads, and retries while the server does not answer. Raises: as `Storage.manifest`."""
         url, path = f"{self._url}/{name}", f"{self._root}/{name}"
-        patience_s = standard_patience_s() if patience_s is None else patience_s
+        if patience_s is None:
+            patience_s = 0.0 if _once.get() else standard_patience_s()
         try:
             result = patiently(lambda: read(path), lambda error: _transient(error, url), url, self._url, patience_s)
         except UnreachableError as error:

@@ -102,7 +102,7 @@ def more(index, totals=()):
 FAULTS = {
     "generation": more(["generation"]),
     "a shard more": more(["shards"], ["shards"]),
-    "an episode more": more(["shards"], ["shards", "episodes"]),
+    "an episode more": more(["shards", "segment_bytes"], ["shards", "episodes"]),
     "missing": renamed("manifest.json"),
     "folder renamed": renamed("."),
     "brace": written(b"{"),
@@ -245,6 +245,17 @@ def test_answers_that_pass(data, status, body, headers):
         Server.answers += 3 * [(status, body, headers)]
         assert len(list(store.entries)) == 5
     assert not Server.answers
+
+
+def test_a_server_whose_index_is_shorter_than_its_manifest_says(data, capsys, monkeypatch):
+    """The index is not waited for, because the next manifest may be right."""
+    monkeypatch.setenv(VARIABLE, "1")
+    with answering(functools.partial(Server, directory=data.dataset.folder)) as url, faults_outlived():
+        store = EpisodeStore(url, "train")
+        with faulty(data.dataset.folder, "an episode more"):
+            assert not store.refresh() and len(store) == 5
+        assert "no answer for 0 s" in capsys.readouterr().err
+        assert not store.refresh() and len(list(store.entries)) == 5
 
 
 @pytest.mark.parametrize("name", ["brace", "empty", "html", "no text", "other set"])
