@@ -1,10 +1,11 @@
 """Motion of obstacles: interpolation between poses at keyframes.
 
-Shape legend: T keyframes, P points.
+Shape legend: T keyframes, P points, B boxes.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,6 +17,7 @@ from hgn.schema import Vector, require
 
 LEAST_S = 1e-9  # least time between two keyframes, in seconds; in less an obstacle's speed could be infinite
 FARTHEST = 1000.0  # largest translation of a keyframe, domain units: networks follow the cells on its way
+TURN_STEPS = 16  # steps in which boxes follow a turn between two keyframes
 UNIT = 1e-6  # largest difference of a rotation's product with its transpose from the identity
 Keyframes = Sequence[tuple[float, Vector]]  # times in seconds and translations in domain units
 
@@ -77,6 +79,18 @@ class Motion:
     def transform(self, time: float) -> tuple[np.ndarray, np.ndarray]:
         """Returns R, float64 [3, 3], and t, float64 [3], that map a point x of the obstacle to R x + t at a time."""
         return self.pose(time)[0], self.place(np.zeros((1, 3)), time)[0]
+
+    def boxes(self, point_P3: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Returns low and high corners, float64 [B, 3], of boxes one of which contains the points at any time."""
+        corner_83 = np.array(list(itertools.product(*zip(point_P3.min(axis=0), point_P3.max(axis=0), strict=True))))
+        steps = TURN_STEPS if np.ptp(self.rotation_T33, axis=0).any() else 1
+        pairs = itertools.pairwise([self.time_T[0], *self.time_T])
+        time_B = np.concatenate([np.linspace(begin, end, steps + 1) for begin, end in pairs])
+        place_B83 = np.stack([self.place(corner_83, time) for time in time_B])
+        # largest distance of an arc from its chord; a turn between keyframes is at most pi
+        arc = np.linalg.norm(corner_83 - self.pivot, axis=1).max() * (np.pi / steps) ** 2 / 8 if steps > 1 else 0.0
+        low_B3, high_B3 = place_B83.min(axis=1) - arc, place_B83.max(axis=1) + arc
+        return np.minimum(low_B3[:-1], low_B3[1:]), np.maximum(high_B3[:-1], high_B3[1:])
 
     def fastest(self, point_P3: np.ndarray) -> float:
         """Returns the largest mean speed of points of the obstacle between two keyframes, domain units per second."""

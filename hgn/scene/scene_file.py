@@ -21,7 +21,7 @@ from hgn.scene.distance import contains, extent
 from hgn.scene.emission import Face
 from hgn.scene.group import WALL_CELLS, Region, fill, particle_count, region_of
 from hgn.scene.material import MATERIAL_PARAMETERS, MATERIALS, material_index
-from hgn.scene.motion import Motion
+from hgn.scene.motion import AT_REST, Motion
 from hgn.scene.particle_file import read_particles
 from hgn.scene.rotation import euler_rotation
 from hgn.scene.scene import Obstacle, Scene, whole_cells
@@ -266,11 +266,7 @@ def scene_of(mapping: Mapping[str, Any], path: str | Path) -> Scene:
 
 
 def notes_on_files(scene: Scene) -> list[str]:
-    """Returns warnings about the files of a scene.
-
-    They concern meshes that are sheets, smaller than a cell (perhaps in another unit) or without a surface in the
-    domain, and stored particles inside obstacles.
-    """
+    """Returns warnings about sheets, obstacles tiny or without a surface in the domain, and particles inside one."""
     if scene.specification.get("kind") != "file":
         return []
     notes = []
@@ -285,21 +281,22 @@ def notes_on_files(scene: Scene) -> list[str]:
                 if inside := int(contains(position_N3, obstacle).sum()):
                     notes.append(f"{inside} of {count} particles of {group['particles']} lie inside {obstacle.name}")
     for entry, obstacle in zip(entries, scene.obstacles, strict=False):
-        if (name := entry.get("mesh")) is None:
-            continue
-        if not obstacle.closed:
+        name, key, unit = entry.get("mesh"), "scale", f" ({MILLIMETRES})"
+        if name is None:
+            name, key, unit = obstacle.name, "size", ""
+        elif not obstacle.closed:
             remedy = "close its holes, or write bodies that touch as two obstacles"
             notes.append(f"a sheet, not a solid, because it is not watertight: {name}; {remedy}")
         begin = _at_start(obstacle)
-        low_3, high_3 = begin.vertex_V3.min(axis=0), begin.vertex_V3.max(axis=0)
-        around = (low_3 <= 0).all() and (high_3 >= scene.domain_size).all()  # if it moves, it stays around
-        place = extent(begin.vertex_V3)
-        if obstacle.motion is None and ((low_3 > scene.domain_size) | (high_3 < 0)).any():
-            notes.append(f"outside the domain, out of reach of particles: {name} ({place}); see scale and position")
+        low_B3, high_B3 = (obstacle.motion or AT_REST).boxes(obstacle.vertex_V3)
+        around = ((low_B3 <= 0) & (high_B3 >= scene.domain_size)).all()
+        name = f"{name} ({extent(begin.vertex_V3)})"
+        if ((low_B3 > scene.domain_size) | (high_B3 < 0)).any(axis=1).all():
+            notes.append(f"outside the domain, out of reach of particles: {name}; see {key} and position")
         elif (obstacle.motion is None or around) and not _reaches(begin, scene.domain_size, scene.cell_size):
-            notes.append(f"no surface in the domain: {name} ({place}); see scale and position ({MILLIMETRES})")
-        elif (high_3 - low_3).max() < scene.cell_size:
-            notes.append(f"smaller than a cell of {scene.cell_size:.3g}: {name} ({place}); see scale")
+            notes.append(f"no surface in the domain: {name}; see {key} and position{unit}")
+        elif np.ptp(begin.vertex_V3, axis=0).max() < scene.cell_size:
+            notes.append(f"smaller than a cell of {scene.cell_size:.3g}: {name}; see {key}")
     return notes
 
 

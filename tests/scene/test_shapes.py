@@ -1,11 +1,14 @@
 """Shapes of obstacles by closed forms, and rotations."""
 
+import json
+
 import numpy as np
 import pytest
 import trimesh
 
 from hgn.config import OBSTACLE_SHAPES
 from hgn.scene.rotation import euler_rotation, quaternion_product, quaternion_rotation
+from hgn.scene.scene_file import load_scene, notes_on_files
 from hgn.scene.shapes import CLOSED_SHAPES, shape_obstacle, unit_shape
 from hgn.scene.surface import split_long_edges
 
@@ -49,3 +52,39 @@ def test_rotations():
     for matrix in (euler_rotation((12.0, -77.0, 203.0)), quaternion_rotation(left)):
         np.testing.assert_allclose(matrix @ matrix.T, np.eye(3), atol=1e-12)
         assert np.linalg.det(matrix) == pytest.approx(1.0)
+
+
+def through(*poses):
+    return {"keyframes": [{"time": time, **pose} for time, pose in enumerate(poses)]}
+
+
+AROUND, OUTSIDE = "no surface in the domain: ", "outside the domain, out of reach of particles: "
+ASIDE, TURN = {"position": [5, 0.5, 0.5]}, through({"rotation": [0, 0, -30]}, {"rotation": [0, 0, 120]})
+ARM = {"shape": None, "size": None, "position": None, "mesh": "arm.obj"}
+
+
+@pytest.mark.parametrize(
+    ("changes", "notes"),
+    [
+        ({}, []),
+        ({"size": 300}, [AROUND + "obstacle_0_half_box (x -150 to 150, y -74.5 to 75.5, "]),
+        ({"size": 1e-3}, ["smaller than a cell of 0.0156: obstacle_0_half_box"]),
+        (ASIDE, [OUTSIDE + "obstacle_0_half_box (x 4.85 to 5.15, "]),
+        (ASIDE | through({"translation": [0, 1, 0]}), [OUTSIDE]),
+        (ASIDE | through({}, {"translation": [0, 1, 0]}), [OUTSIDE]),
+        (ASIDE | through({}, {"translation": [-4.5, 0, 0]}), []),
+        (ASIDE | through({}, {"translation": [-10, 0, 0]}), []),  # through the domain, between two keyframes
+        (ARM | {"scale": 0.9} | TURN, []),  # from below the domain to its left, through a corner
+        (ARM | {"scale": 1.9} | TURN, [OUTSIDE + "arm.obj"]),
+    ],
+)
+def test_obstacles_that_reach_no_particle(tmp_path, changes, notes):
+    """Shapes around or outside the domain or smaller than a cell are noted, and bodies that stay outside in motion."""
+    arm = trimesh.creation.box(bounds=((0.98, -0.02, 0.48), (1, 0.02, 0.52)))
+    arm.export(tmp_path / "arm.obj")
+    obstacle = {"shape": "half_box", "size": 0.3, "position": [0.5, 0.5, 0.5], **changes}
+    entry = {key: value for key, value in obstacle.items() if value is not None}
+    group = {"shape": "cube", "size": 0.05, "position": [0.2, 0.8, 0.2], "material": "water"}
+    (tmp_path / "a.yaml").write_text(json.dumps({"groups": [group], "obstacles": [entry]}))
+    seen = notes_on_files(load_scene(tmp_path / "a.yaml"))
+    assert [text.startswith(note) for text, note in zip(seen, notes, strict=True)] == [True] * len(notes)
