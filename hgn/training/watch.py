@@ -71,9 +71,8 @@ class RankWatch(Callback):
         if trainer.world_size == 1:
             return
         assert isinstance(pl_module, TrainingModule)
-        self._folder.mkdir(exist_ok=True)
         self._own = self._folder / str(trainer.global_rank)
-        self._own.write_text("0")
+        self._write("0")
         now = time.monotonic()
         self._counts = {rank: ("", now) for rank in range(trainer.world_size) if rank != trainer.global_rank}
         self._woken, wake = os.pipe()
@@ -99,7 +98,7 @@ class RankWatch(Callback):
             self.lost = f"ranks {lost} ended without a message" if lost else "another rank ended, see its message"
         self._stop()
         with contextlib.suppress(OSError):
-            self._own.write_text(ENDED)
+            self._write(ENDED)
 
     def _stop(self) -> None:
         """No count is written afterwards."""
@@ -142,13 +141,17 @@ class RankWatch(Callback):
         try:
             with self._writing:
                 if not self._ended.is_set():
-                    self._own.write_text(count)
+                    self._write(count)
             for rank, (before, _) in self._counts.items():
                 if (text := self._read(rank)) != before:
                     self._counts[rank] = text, now
         except OSError:  # the folder is unreachable, so ranks may be alive
             self._counts = {rank: (before, now) for rank, (before, _) in self._counts.items()}
         return [rank for rank, (_, changed) in self._counts.items() if now - changed > SILENCE_S]
+
+    def _write(self, text: str) -> None:
+        self._folder.mkdir(exist_ok=True)  # the user may have deleted it
+        self._own.write_text(text)
 
     def _read(self, rank: int) -> str:
         try:

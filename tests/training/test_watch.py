@@ -49,6 +49,12 @@ def ranks(monkeypatch, tmp_path):
         rank._ended.set()
 
 
+@pytest.fixture(params=["folder stays", "folder is deleted"])
+def deleted(request):
+    """Deletes the folder of the counts while the ranks write them, or not."""
+    return lambda run: request.param == "folder stays" or (run / ".ranks").rename(run / "elsewhere")
+
+
 @pytest.mark.parametrize("counts", [0, 1, 3])
 @pytest.mark.parametrize("delay", [0.0, 0.7])
 def test_a_killed_rank_is_named(ranks, tmp_path, counts, delay):
@@ -67,11 +73,12 @@ def test_a_killed_rank_is_named(ranks, tmp_path, counts, delay):
 
 
 @pytest.mark.parametrize("counts", [0, 1, 3])
-def test_a_rank_that_reports_its_own_error_is_not_named(ranks, counts):
+def test_a_rank_that_reports_its_own_error_is_not_named(ranks, tmp_path, deleted, counts):
     """Even if the other rank has never read a count of it."""
     module = SimpleNamespace(update=0)
     for rank in ranks:
         rank.start(module)
+    deleted(tmp_path)
     for _ in range(counts):
         ranks[1].beaten.acquire()
     ranks[1].on_exception(ranks[1].trainer, module, ValueError("its own error"))
@@ -81,10 +88,11 @@ def test_a_rank_that_reports_its_own_error_is_not_named(ranks, counts):
     assert ranks[1].lost is None
 
 
-def test_a_rank_that_runs_is_not_named(ranks):
+def test_a_rank_that_runs_is_not_named(ranks, tmp_path, deleted):
     module = SimpleNamespace(update=0)
     for rank in ranks:
         rank.start(module)
+    deleted(tmp_path)
     ranks[0].on_exception(ranks[0].trainer, module, LOST)
     assert ranks[0].lost == "another rank ended, see its message"
 
@@ -102,7 +110,7 @@ def test_no_file_remains_after_the_training(ranks, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_a_rank_stopped_after_the_last_update_is_named(monkeypatch, ranks):
+def test_a_rank_stopped_after_the_last_update_is_named(monkeypatch, ranks, tmp_path, deleted):
     """While the others wait for it to write its part of the last checkpoint, which has no time limit after SIGTERM."""
     monkeypatch.setattr(watch, "SILENCE_S", 4 * BEAT_S)
     monkeypatch.setattr(watch, "GRACE_S", 0.0)
@@ -111,6 +119,7 @@ def test_a_rank_stopped_after_the_last_update_is_named(monkeypatch, ranks):
     for rank in ranks:
         rank.start(SimpleNamespace(update=1))
         rank.on_train_end(rank.trainer, None)
+    deleted(tmp_path)
     ranks[1].killed = True
     os.write(ranks[0].wake, bytes([signal.SIGTERM]))
     rank, text, code = ends.get(timeout=60)
