@@ -74,6 +74,7 @@ ARM = {"shape": None, "size": None, "position": None, "mesh": "arm.obj"}
         (ASIDE | through({}, {"translation": [0, 1, 0]}), [OUTSIDE]),
         (ASIDE | through({}, {"translation": [-4.5, 0, 0]}), []),
         (ASIDE | through({}, {"translation": [-10, 0, 0]}), []),  # through the domain, between two keyframes
+        (ASIDE | through({"translation": [-10, 0, 0]}, {}), []),
         (ARM | {"scale": 0.9} | TURN, []),  # from below the domain to its left, through a corner
         (ARM | {"scale": 1.9} | TURN, [OUTSIDE + "arm.obj"]),
     ],
