@@ -21,6 +21,7 @@ from lightning.pytorch.plugins.environments import (
     TorchElasticEnvironment,
 )
 from lightning.pytorch.strategies import DDPStrategy
+from torch.optim import Optimizer
 
 from hgn.schema import ConfigError
 from hgn.system.machine import memory_is_full
@@ -94,6 +95,14 @@ def save_alone(trainer: Trainer, path: Path) -> None:
     trainer.strategy.checkpoint_io.save_checkpoint(trainer._checkpoint_connector.dump_checkpoint(), path)
 
 
+def _require_shapes(optimizer: Optimizer) -> None:
+    """Raises ValueError or LookupError if Adam's restored state does not belong to its parameters."""
+    for parameter in optimizer.param_groups[0]["params"] if optimizer.state else ():
+        for name, shape in {"step": (), "exp_avg": parameter.shape, "exp_avg_sq": parameter.shape}.items():
+            if (stored := optimizer.state[parameter][name].shape) != shape:
+                raise ValueError(f"{name} of shape {list(stored)} for a parameter of {list(shape)}")
+
+
 def name_odd_parts(trainer: Trainer, path: Path) -> None:
     """Turns errors of restoring a checkpoint into a ConfigError with its path."""
 
@@ -101,6 +110,8 @@ def name_odd_parts(trainer: Trainer, path: Path) -> None:
         def call(*given: Any) -> None:
             try:
                 restore(*given)
+                for optimizer in trainer.optimizers:
+                    _require_shapes(optimizer)
             except _ODD_PARTS as error:
                 if isinstance(error, ConfigError) or memory_is_full(error):
                     raise

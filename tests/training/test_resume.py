@@ -245,6 +245,11 @@ def of_state(**changes):
     return lambda checkpoint: checkpoint["hgn"]["sampler_state"].update(changes)
 
 
+def moments(checkpoint):
+    """The optimiser's state of each parameter."""
+    return checkpoint["optimizer_states"][0]["state"]
+
+
 STATE = "checkpoint must hold the state of a training as this version writes it, got .*last.ckpt: "
 ODD = [
     (lambda checkpoint: checkpoint.pop("callbacks"), STATE + "KeyError: 'callbacks'"),
@@ -258,6 +263,11 @@ ODD = [
         }.items()
         for value in values
     ),
+    *(
+        (lambda checkpoint, name=name: moments(checkpoint)[3].update({name: torch.ones(3, 5)}), STATE + f".* {name} of")
+        for name in ("step", "exp_avg", "exp_avg_sq")
+    ),
+    (lambda checkpoint: moments(checkpoint).pop(3), STATE + "KeyError: 'step'"),
     (of_state(position=10**9), "sampler_state.position must be at most the 25 samples of epoch 0, got 1000000000"),
     *((of_state(**{key: -1}), f"{key} must be a finite number >= 0") for key in ("epoch", "position", "window")),
 ]
