@@ -34,12 +34,13 @@ _MOST = "{1,2000}"
 _PORT, _WORD = r"\d+(?:[,;)'\"]|\s(?![^\s@:]+@)|$)", rf"(?:(?!://)\S){_MOST}"
 _HOST = r"(?:[^\s/:@]{1,255}:\d{1,5}|\[?[\da-fA-F:.]{2,39}\](?::\d{1,5})?)/"
 _USER = rf"[^\s/:@]{_MOST}:{_WORD}|[^/\s?#]{_MOST}|[^/:@'\"]{_MOST}:(?=\S)(?!{_PORT})(?:(?!://)[^@]){_MOST}"
-_SECRET = r"(?:sig|token|secret|pass|pwd|cred|auth|jwt|sas|hmac|bearer|session)[\w.-]*|key(?:_?id)?|code"
+_SECRET = r"(?:sig|token|secret|pass|pwd|cred|auth|jwt|sas|hmac|bearer|session|ticket)[\w.-]*|key(?:_?id)?|code"
+_SECRET += r"|(?<![a-z])(?:pw|otp|sid)"
 
 
 def _without_value(query: re.Match[str]) -> str:
     """Returns a key and value of a URL, without the value if the key, which may be percent-encoded, names a secret."""
-    secret = re.search(rf"(?i)(?:{_SECRET})$", unquote(query[2]))
+    secret = re.search(rf"(?i)(?:{_SECRET})[\[\]]*$", unquote(query[2]))
     return f"{query[1]}{query[2]}=…" if secret else query[0]
 
 
@@ -53,8 +54,11 @@ _SECRETS = (  # pattern and replacement: for users of URLs and of addresses with
         r"\1",
     ),
     # short, because any word may start it
-    (rf"(?<![\w@.])(?!{_HOST})[\w.+-]{{1,300}}:(?!/)(?:(?!://)\S){{1,300}}@(?=[\w\[])", ""),
-    (r"([?&;#])([\w.%-]{1,300})=[^&\s'\"#;]*", _without_value),
+    (
+        rf"(?<![\w@.])(?!{_HOST})(?:[\w.+-]{{1,300}}@(?!{_HOST}))?[\w.+-]{{1,300}}:(?!/)(?:(?!://)\S){{1,300}}@(?=[\w\[])",
+        "",
+    ),
+    (r"([?&;#])([\w.%\[\]-]{1,300})=[^&\s'\"#;]*", _without_value),
     (rf"(?i)(['\"])(\+{{0,2}}(?:[\w.]+=)?{_KEY}[ \t]*[=:][ \t]*)(?!['\"])(?:'\"'\"'|(?!\1).)+", r"\1\2…"),
     (rf"(?i)(?<![\w.?&;#%-])({_KEY}['\"]?[ \t]*[=:][ \t]*)(?:{_VALUE})", r"\1…"),
     (r"(?i)(\bbearer\s+)(?=\S*\d)[^\s'\"]+", r"\1…"),
@@ -129,6 +133,7 @@ class ConfigError(ValueError):
 
 def printable(text: str) -> str:
     """Returns a text for terminals and pages, without users and signatures of URLs, secrets, and control characters."""
+    text = re.sub(r"[^\S\t-\r ]", lambda space: repr(space[0])[1:-1], text)  # these do not end a password
     for pattern, kept in _SECRETS:
         text = re.sub(pattern, kept, text)
     return "".join(c if c.isprintable() or c == "\n" else repr(c)[1:-1] for c in text)

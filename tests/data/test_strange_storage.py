@@ -254,6 +254,17 @@ def test_malformed_bodies_end(data, monkeypatch, content, pause_s):
             "h?%74oken=s&n=1&api%5Fkey=s&%73%49g=s 'h?a=1;%70%61ss=s'",
             "h?%74oken=…&n=1&api%5Fkey=…&%73%49g=… 'h?a=1;%70%61ss=…'",
         ),
+        (
+            "h?pw=s&ticket=s&otp=s&sid=s&a[token]=s&b%5Bkey%5D=s&n[]=1",
+            "h?pw=…&ticket=…&otp=…&sid=…&a[token]=…&b%5Bkey%5D=…&n[]=1",
+        ),
+        ("h?inside=1&resid=2&a[n]=3", "h?inside=1&resid=2&a[n]=3"),
+        ("got u@d.com:secret@h/a, 'u@d.com:secret@h/a'", "got h/a, 'h/a'"),
+        ("got u@127.0.0.1:80/a@b", "got u@127.0.0.1:80/a@b"),
+        (
+            "u:se\u00a0cret@h http://u:1\u00a0a b@h got u:se\u00a0cr\u2003et@h password=se\u00a0cret",
+            "h http://h got h password=…",
+        ),
         ("HF_TOKEN=s HGN_DATASET_TOKEN='s s', got api-key:s; x", "HF_TOKEN=… HGN_DATASET_TOKEN=…, got api-key:…; x"),
         ("'Authorization: Bearer s' authorization: Basic s= x", "'Authorization: …' authorization: … x"),
         (
