@@ -5,12 +5,10 @@ A run is a folder. The same command resumes it. On Ctrl-C, SIGTERM or SIGUSR1 th
 
 from __future__ import annotations
 
-import importlib
 import signal
 import sys
 from contextlib import ExitStack
 from pathlib import Path
-from threading import Thread
 from typing import TYPE_CHECKING, Any
 
 from hgn.command import run_command
@@ -67,8 +65,6 @@ def main(mapping: dict[str, Any]) -> int:
     others = more_data(config)
     stop = StopRequest()
     stop.listen()
-    # The import takes seconds. A thread makes it while the command waits for data and kernels.
-    Thread(target=importlib.import_module, args=("lightning.pytorch",)).start()
     with ExitStack() as stack:
         if first_rank():
             stack.enter_context(locked(run / ".lock", "run", "another training is in it; wait for its end, or choose"))

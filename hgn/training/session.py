@@ -55,7 +55,7 @@ def train_network(config: TrainConfig, start: Start, stop: StopRequest, publishe
 
     `published` reports how many episodes are published. Every rank calls this function.
     """
-    # No other command needs Lightning. hgn.train began to import it when it started.
+    # Importing Lightning takes seconds. It is imported after the wait for data, and by no other command.
     from lightning.pytorch import Trainer, seed_everything
 
     from hgn.training import lightning_compat

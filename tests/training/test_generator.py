@@ -1,9 +1,6 @@
 """The generator that a training starts itself: a process of its own, that makes what is missing."""
 
-import json
 import signal
-import subprocess
-import sys
 import time
 from dataclasses import replace
 from unittest import mock
@@ -11,7 +8,6 @@ from unittest import mock
 import pytest
 import yaml
 from processes import PATIENCE_S
-from training.runs import train_mapping
 
 from hgn.config import DatagenConfig, DatasetConfig, MpmConfig, SceneConfig, TrainConfig, TrainingConfig
 from hgn.data.manifest import Manifest
@@ -21,22 +17,6 @@ from hgn.system.progress import bar
 from hgn.training.dataset import wait_for_episodes
 from hgn.training.generator import Generator
 from hgn.training.stop import StopRequest
-
-# waits for data until Lightning is imported, and then ends as after a stop request
-WAITING_PROGRAM = """
-import json, sys, time
-from hgn import train
-from hgn.training import dataset
-
-def wait_for_episodes(*_):
-    end = time.monotonic() + float(sys.argv[1])
-    while "lightning.pytorch.trainer" not in sys.modules and time.monotonic() < end:
-        time.sleep(0.05)
-    print("lightning.pytorch.trainer" in sys.modules)
-
-dataset.wait_for_episodes = wait_for_episodes
-sys.exit(train.main(json.loads(sys.argv[2])))
-"""
 
 
 def small_config(folder):
@@ -110,13 +90,3 @@ def test_the_bar_counts_the_frames_that_are_waited_for(tmp_path, monkeypatch):
     assert progress.total == 3 * 40 and progress.n == 1
     assert progress.format_dict["elapsed"] == pytest.approx(5.0)
     progress.close()
-
-
-def test_lightning_is_imported_while_a_training_waits_for_data(data, tmp_path):
-    """The import takes seconds, so a thread makes it. A stop before the first episode ends as usual."""
-    mapping = json.dumps(train_mapping(data, tmp_path / "run"))
-    ended = subprocess.run(
-        [sys.executable, "-c", WAITING_PROGRAM, str(PATIENCE_S), mapping], capture_output=True, text=True, check=False
-    )
-    assert ended.stdout == "True\n" and "stopped before the first episode" in ended.stderr
-    assert ended.returncode == 0 and "Traceback" not in ended.stderr
