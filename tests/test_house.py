@@ -16,7 +16,7 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 33_633,
+    "hgn": 33_635,
     "datagen": 9_047,
     "tools": 6_500,
     "tests": 33_474,
