@@ -58,10 +58,11 @@ def main(mapping: dict[str, Any]) -> int:
                 f"training.loggers[{i}] must be installed, got {logger}; {missing_extra(error)}"
             ) from None
     folder, run = config.dataset.folder, Path(config.run)
-    if config.imported:
-        require_network_fits(config, Manifest.load(folder))
-    elif EpisodeStore.available(folder):
-        require_same_dataset(Manifest.load(folder).config, config.datagen, folder)
+    manifest = Manifest.load(folder) if config.imported or EpisodeStore.available(folder) else None
+    if manifest is not None and config.imported:
+        require_network_fits(config, manifest)
+    elif manifest is not None:
+        require_same_dataset(manifest.config, config.datagen, folder)
     others = more_data(config)
     stop = StopRequest()
     stop.listen()
@@ -72,9 +73,9 @@ def main(mapping: dict[str, Any]) -> int:
         initial = _initial_network(config, resume)
         generator = None
         # A URL is a service that generates missing episodes itself.
-        if first_rank() and config.training.generate and not is_remote(folder) and missing_scenes(config):
+        if first_rank() and config.training.generate and not is_remote(folder) and missing_scenes(config, manifest):
             on_gpu = config.training.device != "cpu" and torch.cuda.is_available()
-            if not on_gpu and (warning := warning_on_a_cpu(config)):
+            if not on_gpu and (warning := warning_on_a_cpu(config, manifest)):
                 print(warning, file=sys.stderr)
             generator = Generator(config.datagen, run / "datagen")
             stack.callback(generator.stop)
@@ -84,7 +85,8 @@ def main(mapping: dict[str, Any]) -> int:
             lost = "whole scenes are kept, scenes in the middle of their simulation begin anew"
             print(f"stopped before the first episode was published; {lost}; the same command resumes", file=sys.stderr)
             return stop.exit_code
-        if first_rank() and generator is None and (missing := missing_scenes(config, ("train", "validation"))):
+        missing = missing_scenes(config, store.manifest, ("train", "validation"))
+        if first_rank() and generator is None and missing:
             print(printable(f"{folder} has {missing} scenes, and this training generates none"), file=sys.stderr)
         stop.restart_clock(config.training.maximum_minutes)
         start = Start(store, resume, initial, precompilation)

@@ -19,7 +19,7 @@ LINES = {  # of Python, in tracked files
     "hgn": 33_635,
     "datagen": 9_047,
     "tools": 6_500,
-    "tests": 33_474,
+    "tests": 33_484,
 }
 SETTINGS = 240  # fields of the dataclasses behind the commands, *Config
 

@@ -34,13 +34,12 @@ MEAN_FILLING = 0.7  # mean number of particles of a group, divided by that of a 
 BETWEEN_LOOKS_S = 10.0  # interval between reads of the manifest for the progress line
 
 
-def missing_scenes(config: TrainConfig, splits: Sequence[str] = SPLITS) -> str:
+def missing_scenes(config: TrainConfig, manifest: Manifest | None, splits: Sequence[str] = SPLITS) -> str:
     """Returns the numbers of published and configured scenes of incomplete splits, as `1 of 2 validation, 0 of 3 test`.
 
     The text is empty if every configured episode is published.
     """
-    folder, wanted = config.dataset.folder, {split: config.dataset.scenes(split) for split in splits}
-    manifest = Manifest.load(folder) if EpisodeStore.available(folder) else None
+    wanted = {split: config.dataset.scenes(split) for split in splits}
     published = {split: manifest.published(split) if manifest else 0 for split in splits}
     return ", ".join(
         f"{published[split]} of {wanted[split]} {split}" for split in splits if published[split] < wanted[split]
@@ -140,12 +139,11 @@ def wait_for_episodes(
     return None
 
 
-def warning_on_a_cpu(config: TrainConfig) -> str | None:
+def warning_on_a_cpu(config: TrainConfig, manifest: Manifest | None) -> str | None:
     """Returns a warning with the time and space that missing episodes need on a CPU; None if less than an hour."""
-    folder, scene = config.dataset.folder, config.scene
-    scenes = sum(config.dataset.scenes(split) for split in SPLITS)
-    if EpisodeStore.available(folder):
-        scenes -= sum(Manifest.load(folder).published(split) for split in SPLITS)
+    scene = config.scene
+    published = sum(map(manifest.published, SPLITS)) if manifest is not None else 0
+    scenes = sum(map(config.dataset.scenes, SPLITS)) - published
     of_group = MEAN_FILLING * scene.particles_per_cell * (scene.group_size / scene.cell_size) ** 3
     particle_frames = scenes * config.dataset.frames * scene.group_count * of_group
     seconds = particle_frames * SOLVER_CPU_S / available_cpus()

@@ -69,12 +69,12 @@ def test_long_data_sets_are_announced_before_they_are_made(make_config, tmp_path
     """On a CPU, a data set of more than an hour is announced with time, space and the way out, before its generator
     starts. A finished one is not."""
     monkeypatch.setattr("hgn.training.dataset.available_cpus", lambda: 2)
-    line = warning_on_a_cpu(TrainConfig(dataset=DatasetConfig(folder=str(tmp_path))))
+    line = warning_on_a_cpu(TrainConfig(dataset=DatasetConfig(folder=str(tmp_path))), None)
     assert line.startswith(
         "no GPU: 825 scenes take roughly 23 hours and 10 GB here, before most of 20,000,000 updates;"
     )
     assert "dataset.test_scenes=0" in line
-    assert warning_on_a_cpu(make_config()) is None
+    assert warning_on_a_cpu(make_config(), None) is None
     monkeypatch.setattr("hgn.training.dataset.LONG_ON_A_CPU_S", 0.0)
     monkeypatch.setattr(
         "hgn.training.generator.Generator.__init__", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt)
@@ -93,6 +93,16 @@ def test_missing_scenes_without_generator(data, run, capsys):
         f"{data.dataset.folder} has 2 of 3 validation scenes, and this training generates none\n"
         in capsys.readouterr().err
     )
+
+
+@pytest.mark.parametrize("generate", [False, True])
+def test_manifest_is_read_once_for_missing_scenes(data, run, monkeypatch, generate):
+    """The start reads the manifest for imported data, for the settings, and for the episodes: not for what lacks."""
+    reads, load = [], Manifest.load
+    monkeypatch.setattr(Manifest, "load", lambda *a, **k: reads.append(a) or load(*a, **k))
+    monkeypatch.setattr("hgn.training.session.train_network", lambda *_: 0)
+    assert train.main(train_mapping(data, run, generate=generate)) == 0
+    assert len(reads) == 3
 
 
 def test_missing_data_without_generator(make_config, run):
