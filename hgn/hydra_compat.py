@@ -20,7 +20,6 @@ from typing import Any
 
 import yaml
 
-from hgn.renamed import CHOICES, REMOVED_CHOICES
 from hgn.schema import ConfigError, default_mapping, known_keys
 from hgn.system.yaml_files import read_yaml
 
@@ -184,10 +183,6 @@ def _override(argument: str, folder: Path) -> str:
     key, equals, value = argument.partition("=")
     if not equals or key.startswith("-"):
         return argument
-    if new := CHOICES.get(argument.lstrip("+")):
-        raise ConfigError(f"{argument} is called {new} now")
-    if remedy := REMOVED_CHOICES.get(key.lstrip("+"), {}).get(value):
-        raise ConfigError(f"{argument} was removed; {remedy}")
     if re.search(r"^ |[\[{$,'\"(]", value) and Path(value).is_file():  # Hydra would parse the file's name
         value = "'" + value.replace("'", "\\'").replace("${", "\\${") + "'"
     elif value and not _understood(value):

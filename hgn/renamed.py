@@ -1,14 +1,11 @@
-"""Settings of earlier releases: errors for their names on command lines, and conversion of old files.
+"""Settings in stored files of earlier releases: their present names and values.
 
-| what changed | table | on a command line | in checkpoints, weights and manifests |
-|---|---|---|---|
-| a key | KEYS | refused with the new key | loads |
-| a value | VALUES | refused with the new value | loads |
-| a setting was removed | REMOVED | refused with the reason | loads with the fixed value, else refused |
-| a choice of a config group was renamed | CHOICES | refused with the new choice | |
-| a value or a choice was removed | REMOVED_CHOICES | refused with the reason | refused |
-| a setting of the solver became a part of its method | METHODS | refused with the method | loads as the method |
-| a setting of the solver was added | BEFORE | | gets what the solver did before |
+| what changed | table | in checkpoints, weights and manifests |
+|---|---|---|
+| a key | KEYS | loads |
+| a setting was removed | REMOVED | loads with the fixed value, else refused; refused on a command line too |
+| a setting of the solver became a part of its method | METHODS | loads as the method |
+| a setting of the solver was added | BEFORE | gets what the solver did before |
 """
 
 from __future__ import annotations
@@ -55,16 +52,12 @@ def _rests_otherwise(network: Mapping[str, Any]) -> bool:
 
 
 LAST_COMMIT = "commit a0b88cb, before release 0.2.0, is the last with it"
-REPORTS_COMMIT = "commit e7e6c37 is the last with it"
-GRIDS = f"tools.error_vs_time and cases=[gallery] compare grids; {REPORTS_COMMIT}"
 TRAIN_ANEW = "leave it out; weights with another value must be trained anew"
 
 
-# `section.key`; the section is the name of the dataclass without Config: network, mpm, scene, dataset, training,
-# train, evaluate, render, bench, scaling. Fixed values of `scene` and `mpm` stay in the identity of data sets.
+# `section.key`; the section is the name of the dataclass without Config. Fixed values of `scene` and `mpm` stay in the
+# identity of data sets.
 REMOVED: dict[str, Removed] = {
-    "dataset.maximum_attempts": Removed(3),
-    "dataset.ray_address": Removed(None, "set $RAY_ADDRESS"),
     "scene.clearance_cells": Removed(2.0),
     "scene.maximum_tilted_gravity": Removed(19.6),
     **{f"mpm.{key}": Removed(value) for key, value in CONSTANTS.items()},
@@ -77,90 +70,17 @@ REMOVED: dict[str, Removed] = {
     "network.rest_levels": Removed(2, "leave it out", _rests),
     "network.static_spacing_cells": Removed(remedy=f"leave it out; {LAST_COMMIT}"),
     "network.wall_distance_cells": Removed(8.0, TRAIN_ANEW, lambda network: not _relative(network)),
-    "dataset.early_episodes": Removed(remedy="leave it out: trainings and the service generate few scenes first"),
-    "training.gradient_messages": Removed("fp32"),
-    "training.huber": Removed(),
-    "training.weight_decay": Removed(),
-    "training.grid_jitter": Removed(True),
-    "training.maximum_skipped_updates": Removed(100),
-    "training.monitor_frame_stride": Removed(4),
-    "training.monitor_particles_per_batch": Removed(32_768),
-    "training.monitor_scenes": Removed(5),
-    "training.nodes": Removed(remedy="leave it out: the launcher starts processes on every machine"),
-    "training.noise_weight_power": Removed(2.0),
-    "training.quiet_weight": Removed(4.0),
-    "evaluate.particles_per_batch": Removed(32_768),
-    "bench.public_gns": Removed(remedy=REPORTS_COMMIT),
-    "bench.rounds": Removed(50, "set seconds for a shorter measurement"),
-    "error_vs_time.earlier": Removed(remedy="leave it out: make docs draws the figures from the JSON"),
-    "error_vs_time.seconds": Removed(None, "take fewer scenes; after Ctrl-C the file has what was measured"),
-    "error_vs_time.times_last": Removed(False),
-    "scaling.rounds": Removed(20, "set seconds for a shorter measurement"),
-    "render.gif": Removed(True, "give a file that ends in .png as out for a picture without animation"),
-    "stability_network.picture": Removed(remedy="leave it out: python -m tools.render draws scenes"),
-    "stability_solver.grid_cells": Removed(remedy=GRIDS),
-    "stability_solver.picture": Removed(remedy="leave it out: make docs draws it from the JSON"),
-    "render.fps": Removed(remedy="leave it out: animations play in real time"),
-    "upload.follow": Removed(remedy="run the command again, as with watch -n 60: it copies what is new"),
-    "upload.poll_s": Removed(remedy="run the command again, as with watch -n 60: it copies what is new"),
 }
 
 # Settings of `network` in 0.1.0 that are in `step` now.
 STEP = ("rest_threshold", "wall_clearance", "obstacle_clearance")
 REMOVED |= {f"network.{key}": Removed(remedy=f"write step.{key}") for key in STEP}
 
-# Removed values of settings and config groups, by the last part of the key, and the remedy.
-_GNS_PARTICLES = {"gns_particles": LAST_COMMIT}
-REMOVED_CHOICES: dict[str, dict[Any, str]] = {
-    "cases": dict.fromkeys(("apart", "hole"), "cases=[gallery] has such scenes")
-    | dict.fromkeys(("leak", "guard"), "leave it out: tests check the same")
-    | {"convergence": REPORTS_COMMIT, "grid": GRIDS},
-    "kind": _GNS_PARTICLES,
-    "network": _GNS_PARTICLES,
-    "experiment": _GNS_PARTICLES,
-    "weights": _GNS_PARTICLES
-    | {
-        name: f"{LAST_COMMIT}; its file hgn/weights/{name}.safetensors loads"
-        for name in ("gns", "gns_no_obstacles", "no_obstacles", "obstacles_levels_3", "obstacles_steps_1")
-    },
-}
-
-# Old key to new key, as on a command line. A key stays in its section.
+# Old key to new key. A key stays in its section.
 KEYS = {
-    "half": "stored_precision",
-    "path": "backend",
-    "paths": "backends",
-    "training.path": "training.backend",
-    "training.noise_smooth": "training.noise_correlated_fraction",
-    "training.noise_at_rest": "training.noise_min_scale",
-    "training.rollout_share": "training.pushforward_fraction",
-    "training.rollout_every": "training.pushforward_every",
-    "training.rollout_scenes": "training.pushforward_scenes",
-    "training.rollout_frames": "training.pushforward_frames",
-    "training.rollout_pull": "training.pushforward_pull",
-    "training.weights": "training.init_weights",
-    "training.accelerator": "training.device",
     "scene.initial_speed_share": "scene.moving_group_fraction",
-    "shares": "coefficients",  # of hgn.average
     "cursor": "sampler_state",  # in checkpoints
 }
-
-# Old value to new value, by the last part of the new key.
-_BACKENDS = {"plain": "torch", "fast": "triton"}
-_PRECISIONS = {"highest": "fp32", "high": "tf32", "half": "fp16"}
-VALUES: dict[str, dict[Any, str]] = {
-    "backend": _BACKENDS,
-    "device": {"gpu": "cuda"},
-    "solver_device": {"gpu": "cuda"},
-    "backends": _BACKENDS,
-    "precision": _PRECISIONS,
-    "precisions": _PRECISIONS,
-    "stored_precision": {True: "fp16", False: "fp32"},
-    "system": {"trivial": "baseline"},  # in reports of tools.error_vs_time
-}
-
-# Choices of config groups, old to new, as on a command line.
-CHOICES = {"scene=mechanics": "scene=motion", "dataset=mechanics": "dataset=motion"}
 
 # Settings that data sets and weights of 0.1.0 do not have, and the values that they had in effect.
 BEFORE: dict[str, Any] = {
@@ -174,27 +94,9 @@ BEFORE: dict[str, Any] = {
     "mpm.sand_grain_diameter_m": 0.0,
 }
 
-# Prefixes of metrics in metrics.jsonl.
-METRICS = {"trivial/": "baseline/", "one_step_gain/": "baseline_ratio/", "own_states/": "pushforward/"}
-
-
-def current_metrics(record: Mapping[str, float]) -> dict[str, float]:
-    """Returns a record of metrics.jsonl with the present names."""
-    result = {}
-    for name, value in record.items():
-        old = next((prefix for prefix in METRICS if name.startswith(prefix)), "")
-        result[METRICS.get(old, "") + name.removeprefix(old)] = value
-    return result
-
-
-def current_value(key: str, value: Any) -> Any:
-    """Returns the present name of a value. `key` may be dotted, or that of an item of a list."""
-    values = VALUES.get(_last(key), {})
-    return values.get(value, value) if isinstance(value, (str, bool)) else value
-
 
 def current_names(mapping: Mapping[str, Any], section: str = "") -> dict[str, Any]:
-    """Returns a stored mapping with the present keys and values.
+    """Returns a stored mapping with the present keys.
 
     `section` is its dotted name in the configuration. Settings that are newer than the file are added, and removed
     settings are dropped. A removed setting with another value than the fixed one stays, and `from_mapping` refuses it.
@@ -209,8 +111,7 @@ def current_names(mapping: Mapping[str, Any], section: str = "") -> dict[str, An
         key = KEYS.get(key, key)
         removed = REMOVED.get(key)
         if removed is None or not removed.allows(value, mapping):
-            inner = current_names(value, key) if isinstance(value, Mapping) else current_value(key, value)
-            result[key.rpartition(".")[2]] = inner
+            result[_last(key)] = current_names(value, key) if isinstance(value, Mapping) else value
     return _current_solver(result) if section == "mpm" else result
 
 
@@ -244,7 +145,7 @@ def stored_names(mapping: Mapping[str, Any], section: str) -> dict[str, Any]:
 
     It has the first release's keys, and the fixed values of removed settings.
     """
-    old_keys = {new: old.rpartition(".")[2] for old, new in KEYS.items()}
+    old_keys = {new: _last(old) for old, new in KEYS.items()}
     owners = {key.rpartition("."): removed.value for key, removed in REMOVED.items()}
     fixed = {name: value for (owner, _, name), value in owners.items() if owner == section and value is not ANY}
     result = fixed | {old_keys.get(_join(section, key), key): value for key, value in mapping.items()}
@@ -253,15 +154,6 @@ def stored_names(mapping: Mapping[str, Any], section: str) -> dict[str, Any]:
         result |= METHODS[result.pop("method")]._asdict() | {"time_step": "adaptive" if step_s is None else "fixed"}
         result |= {"fixed_time_step_s": TAICHI_ELEMENTS_STEP_S if step_s is None else step_s}
     return result
-
-
-def renamed_remedy(key: str, value: Any) -> str | None:
-    """Returns the replacement for an old, dotted key; None for a key that was not renamed."""
-    if key not in KEYS:
-        return None
-    value = current_value(KEYS[key], value)
-    example = f"={value}" if isinstance(value, (str, int, float)) else ""
-    return f"it is called {KEYS[key]} now; write {KEYS[key]}{example}"
 
 
 def removed_remedy(section: str, key: str, value: Any) -> str | None:
@@ -280,18 +172,8 @@ def removed_remedy(section: str, key: str, value: Any) -> str | None:
     return f"it was removed and is always {removed.value} now{other}; {removed.remedy}"
 
 
-def value_remedy(key: str, value: Any) -> str:
-    """Returns the replacement for an old value; an empty text for any other value."""
-    if not isinstance(value, (str, bool)):
-        return ""
-    new = current_value(key, value)
-    renamed = "" if new is value else f"{value} is called {new} now"
-    return REMOVED_CHOICES.get(_last(key), {}).get(value, renamed)
-
-
 def _last(key: str) -> str:
-    """Returns the last part of a dotted key, without the number of an item."""
-    return key.rpartition(".")[2].partition("[")[0]
+    return key.rpartition(".")[2]
 
 
 def _join(section: str, key: str) -> str:

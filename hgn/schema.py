@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Annotated, Any, TypeVar
 from urllib.parse import unquote
 
-from hgn.renamed import KEYS, current_names, removed_remedy, renamed_remedy, value_remedy
+from hgn.renamed import current_names, removed_remedy
 from hgn.system.files import is_replaceable
 
 T = TypeVar("T")
@@ -153,10 +153,7 @@ def from_mapping(cls: type[T], mapping: object, path: _Path = "") -> T:
     for key, value in mapping.items():
         if key not in fields:
             name = _text((path, str(key)))
-            renamed = KEYS.get(name, "").rpartition(".")[2] in fields
-            remedy = removed_remedy(section_of(cls), str(key), value) or (
-                renamed_remedy(name, value) if renamed else None
-            )
+            remedy = removed_remedy(section_of(cls), str(key), value)
             if value is None and isinstance(key, (int, float)):
                 remedy = "a list needs brackets, as in [0.1, 0.2, 0.3]"
             remedy = remedy or known_keys(str(key), fields)
@@ -265,7 +262,7 @@ def require(rule_holds: bool, field: str, rule: str, value: object, remedy: str 
     """Raises ConfigError `<field> must be <rule>, got <value>; <remedy>` unless the rule holds."""
     if not rule_holds:
         choices = rule.removeprefix("one of ").split(", ") if rule.startswith("one of ") else ()
-        remedy = remedy or value_remedy(field, value) or near_name(str(value), choices)
+        remedy = remedy or near_name(str(value), choices)
         raise ConfigError(f"{field} must be {rule}, got {_shown.repr(value)}" + (f"; {remedy}" if remedy else ""))
 
 

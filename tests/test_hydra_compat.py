@@ -3,7 +3,6 @@
 import pytest
 
 from hgn.hydra_compat import compose
-from hgn.renamed import CHOICES, REMOVED_CHOICES
 from hgn.schema import ConfigError
 
 
@@ -26,14 +25,3 @@ def test_canary(tmp_path):
     with pytest.raises(ConfigError, match="weights is missing; it must be given, as in weights=…"):
         compose(tmp_path, "made", ["made"])
     assert compose(tmp_path, "made", ["made"], complete=False)[0]["weights"] == "???"
-
-
-def test_renamed_choices(tmp_path, monkeypatch):
-    """A choice of a group that was renamed is answered with its new name, one that was removed with the reason."""
-    monkeypatch.setitem(REMOVED_CHOICES, "experiment", {"moon": "take +experiment=obstacles"})
-    answers = {old: f"{old} is called {new} now" for old, new in CHOICES.items()}
-    answers["+experiment=moon"] = "+experiment=moon was removed; take +experiment=obstacles"
-    for argument, answer in answers.items():
-        with pytest.raises(ConfigError) as caught:
-            compose(tmp_path, "made", ["made", argument])
-        assert str(caught.value) == answer

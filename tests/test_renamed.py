@@ -1,24 +1,16 @@
-"""hgn.renamed: settings of earlier releases are answered with today's, and files of before load."""
+"""hgn.renamed: files of earlier releases load, or are refused with the setting that was removed."""
 
-import dataclasses
 from dataclasses import replace
-from importlib import import_module
 
 import pytest
 
-import hgn.config
-from datagen.solve import SolveConfig
 from hgn.config import DatagenConfig, MpmConfig, NetworkConfig, SceneConfig, TrainConfig
 from hgn.data.identity import dataset_identity
-from hgn.evaluate import EvaluateConfig
-from hgn.export import ExportConfig
 from hgn.network.build import build_network
-from hgn.renamed import KEYS, REMOVED, REMOVED_CHOICES, Removed, current_names, removed_remedy, stored_names
-from hgn.rollout import RolloutConfig
-from hgn.runtime.weights import WeightsInfo, find_weights, load_weights, save_weights
+from hgn.renamed import KEYS, REMOVED, Removed, current_names, stored_names
+from hgn.runtime.weights import WeightsInfo, load_weights, save_weights
 from hgn.schema import ConfigError, from_mapping, from_stored, section_of, to_mapping
 
-LAST = "commit a0b88cb, before release 0.2.0"
 SECTIONS = (SceneConfig, MpmConfig, NetworkConfig)
 
 
@@ -28,44 +20,24 @@ def removed(monkeypatch):
     monkeypatch.setitem(REMOVED, "network.depth", Removed(3, "train other weights"))
     monkeypatch.setitem(REMOVED, "network.colour", Removed())
     monkeypatch.setitem(REMOVED, "mpm.swirl", Removed(0.5))
-    monkeypatch.setitem(REMOVED, "rollout.film", Removed(remedy="render with tools.render"))
-    monkeypatch.setitem(REMOVED_CHOICES, "backend", {"abacus": "take backend=cpu"})
 
 
-ALWAYS, NETWORK = "it was removed and is always {} now", "network.{} is not a known key; "
-GIVEN = {EvaluateConfig: {"weights": "a", "data": "b"}, ExportConfig: {"checkpoint": "a", "out": "b"}}
-GIVEN |= {SolveConfig: {"scene": "a"}}
+ALWAYS = "is not a known key; it was removed and is always"
 ANSWERS = [
-    (RolloutConfig, "path", "fast", "path is not a known key; it is called backend now; write backend=triton"),
-    (EvaluateConfig, "path", "plain", "now; write backend=torch"),
-    (TrainConfig, "training.path", "auto", "it is called training.backend now; write training.backend=auto"),
-    (TrainConfig, "training.accelerator", "gpu", "is called training.device now; write training.device=cuda"),
-    (TrainConfig, "path", "fast", "path is not a known key; known keys: scene, "),  # it never had this one
-    (RolloutConfig, "backend", "fast", "backend must be one of .*, got 'fast'; fast is called triton now"),
-    (RolloutConfig, "precision", "half", "precision must be one of .*, got 'half'; half is called fp16 now"),
-    (TrainConfig, "training.precision", "highest", "training.precision must .*; highest is called fp32 now"),
-    (ExportConfig, "half", True, "write stored_precision=fp16"),
-    (TrainConfig, "network.depth", 4, f"{NETWORK.format('depth')}{ALWAYS.format(3)}, not 4; train other weights"),
-    (TrainConfig, "network.contact_gate", "cell", f"{ALWAYS.format('cell')}; leave it out"),
-    (TrainConfig, "network.rest_levels", 1, f"{ALWAYS.format(2)}, not 1; leave it out"),
-    (TrainConfig, "network.maximum_neighbours", 64, f"{ALWAYS.format(None)}, not 64; leave it"),
-    (TrainConfig, "network.static_spacing_cells", 1.0, "it was removed; leave it out; commit a0b88cb"),
-    (TrainConfig, "network.kind", "gns_particles", f"network.kind must be .*, got 'gns_particles'; {LAST}"),
-    (SolveConfig, "mpm.wall_contact", "stick", f"{ALWAYS.format('slip')}, not stick; leave it"),
-    (TrainConfig, "mpm.time_step", "fixed", "it was removed; mpm.fixed_time_step_s is null for adaptive steps"),
-    (TrainConfig, "mpm.sand_friction_law", "mohr_coulomb", "from mpm.method: mohr_coulomb with corrected, comp"),
-    (RolloutConfig, "film", 3, "film is not a known key; it was removed; render with tools.render"),
-    (RolloutConfig, "backend", "abacus", "backend must be one of .*, got 'abacus'; take backend=cpu"),
+    ("network.depth", 4, f"network.depth {ALWAYS} 3 now, not 4; train other weights"),
+    ("network.contact_gate", "cell", f"network.contact_gate {ALWAYS} cell now; leave it out"),
+    ("network.static_spacing_cells", 1.0, "it was removed; leave it out; commit a0b88cb"),
+    ("mpm.time_step", "fixed", "it was removed; mpm.fixed_time_step_s is null for adaptive steps"),
+    ("mpm.sand_friction_law", "mohr_coulomb", "from mpm.method: mohr_coulomb with corrected, comp"),
 ]
 
 
-@pytest.mark.parametrize(("config", "key", "value", "message"), ANSWERS)
-def test_old_names_are_answered(config, key, value, message, removed):
-    """An old key, value or setting is refused in one line that says what replaces it."""
-    for part in reversed(key.split(".")):
-        value = {part: value}
+@pytest.mark.parametrize(("key", "value", "message"), ANSWERS)
+def test_removed_settings_are_named(key, value, message, removed):
+    """A removed setting is refused in one line with its fixed value, or what it follows from."""
+    section, _, name = key.partition(".")
     with pytest.raises(ConfigError, match=message) as caught:
-        from_mapping(config, GIVEN.get(config, {}) | value)
+        from_mapping(TrainConfig, {section: {name: value}})
     assert "\n" not in str(caught.value)
 
 
@@ -110,7 +82,7 @@ def test_files_of_before(tmp_path, monkeypatch, removed):
 
 def test_networks_of_before():
     """They load where removed settings say what is always so now, or where these have no effect; others are refused by
-    the setting's name. So is a kind of network, and weights that shipped once."""
+    the setting's name."""
     contacts = {"contact_gate": "cell", "contact_forces": "normal", "contact_reach_cells": 3.0}
     older = {"material_embedding": 16, "wall_distance_cells": 8.0}  # keys of 0.1.0
     rests = {"rest_levels": 2, "rest_large_materials": ["sand", "snow"]}
@@ -140,11 +112,6 @@ def test_networks_of_before():
             continue
         with pytest.raises(ConfigError, match=rf"network\.{refused} is not a known key; it was removed and is always"):
             from_stored(NetworkConfig, stored, "network")
-    with pytest.raises(ConfigError, match=rf"network\.kind must be .*; {LAST}, is the last with it"):
-        from_stored(NetworkConfig, to_mapping(gns) | {"kind": "gns_particles"}, "network")
-    for name in REMOVED_CHOICES["weights"]:
-        with pytest.raises(ConfigError, match=f"got '{name}'; {LAST}"):
-            find_weights(name)
 
 
 def test_identity_keeps_its_names(monkeypatch, removed):
@@ -170,48 +137,3 @@ def test_the_table_is_sound():
     fields = {f"{section_of(cls)}.{name}" for cls in SECTIONS for name in to_mapping(cls())}
     assert not fields & (REMOVED.keys() | KEYS.keys())
     assert all(key in fields for key in KEYS.values() if key.startswith(("scene.", "mpm.", "network.")))
-
-
-FIRST_RELEASE = {  # settings of 0.1.0
-    "scene": """domain_size cell_size gravity obstacle_count obstacle_shapes obstacle_size group_count group_shapes
-        group_size materials particles_per_cell clearance_cells maximum_initial_speed initial_speed_share
-        lone_particles""",
-    "mpm": """youngs_modulus_pa poisson_ratio density_kg_m3 sand_friction_angle_deg sand_friction_law
-        sand_volume_correction snow_hardening snow_critical_compression snow_critical_stretch
-        snow_maximum_hardening water_equation water_volume_update water_minimum_volume_ratio
-        minimum_singular_value time_step fixed_time_step_s stability_fraction speed_fraction transfer_speed_m_s
-        wall_cells wall_contact collider_band_cells collider_friction collider_projection device
-        scenes_per_launch maximum_substeps_per_frame""",
-    "dataset": """folder training_scenes validation_scenes test_scenes frames frame_rate_hz seed early_episodes
-        episodes_per_shard workers maximum_attempts pool ray_address array_task array_tasks""",
-    "service": "host port connections",
-    "solve": "scene out frames frame_rate_hz mpm",
-    "upload": "data to follow poll_s",
-    "network": """kind cell_size levels message_passing_steps width velocity_history material_embedding
-        wall_distance_cells obstacle_features materials maximum_neighbours static_spacing_cells""",
-    "training": """maximum_updates maximum_minutes batch_scenes optimizer weight_decay learning_rate final_learning_rate
-        warmup_updates weights ema_decay noise_std huber noise_smooth noise_at_rest grid_jitter frame_importance
-        symmetry rollout_share rollout_every rollout_scenes rollout_frames rollout_pull seed accelerator devices
-        nodes precision path minimum_episodes generate maximum_skipped_updates log_every checkpoint_every
-        monitor_every monitor_scenes monitor_frame_stride monitor_rollout_frames monitor_particles_per_batch""",
-    "train": "scene mpm dataset network training run",
-    "export": "checkpoint out half",
-    "average": "weights out shares half",
-    "rollout": "weights out render scene seed data episode frames device path precision",
-    "evaluate": """weights data split scenes frame_stride rollout_frames particles_per_batch device path precision
-        json""",
-    "render": "out rollout others names data episode frames gif every fps size",
-}
-
-
-@pytest.mark.parametrize("section", FIRST_RELEASE)
-def test_settings_of_the_first_release_are_answered(section):
-    """Each setting of release 0.1.0 is one of today, or was renamed to one of today, or the reason of its removal is
-    given."""
-    name, others = f"{section.title()}Config", {"render": "tools.render", "service": "datagen.service.__main__"}
-    others |= {"solve": "datagen.solve", "upload": "datagen.upload"}
-    cls = vars(hgn.config).get(name) or getattr(import_module(others.get(section, f"hgn.{section}")), name)
-    fields = {field.name for field in dataclasses.fields(cls)}
-    for key in FIRST_RELEASE[section].split():
-        new = KEYS.get(f"{section}.{key}", KEYS.get(key, key)).rpartition(".")[2]
-        assert key in fields or new in fields or removed_remedy(section, key, None), key

@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import Any
 
 from hgn.command import run_command
-from hgn.renamed import current_metrics
 from hgn.scene.hdf5 import damage_named
 from hgn.schema import from_mapping, printable, require, require_replaceable
 from hgn.system.files import write_atomically, write_json
@@ -87,7 +86,7 @@ def read_run(folder: Path) -> Run:
         lines = (folder / "metrics.jsonl").read_text(encoding="utf-8").splitlines()
         settings = read_yaml(folder / "config.yaml")
         json.dumps(settings), settings["dataset"]["folder"], dict(settings.get("provenance", {}))  # read below
-        records = [current_metrics(json.loads(line)) for line in lines]
+        records = [dict(json.loads(line)) for line in lines]
         for name, value in (item for record in records for item in record.items()):
             drawn = isinstance(value, int | float) and not 1e100 < abs(value) < math.inf
             require(drawn, f"{folder}: {name}", "a number of at most 1e100", value)

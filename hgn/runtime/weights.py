@@ -19,7 +19,7 @@ from safetensors.torch import save
 from hgn.config import NetworkConfig
 from hgn.network.base import ParticleNetwork
 from hgn.network.build import build_network
-from hgn.renamed import REMOVED_CHOICES, current_names, with_step
+from hgn.renamed import current_names, with_step
 from hgn.schema import (
     ConfigError,
     NonNegative,
@@ -97,8 +97,7 @@ def find_weights(name: str, field: str = "weights") -> Path:
     if path.suffix or len(path.parts) > 1 or path.exists():
         return path
     names = ", ".join(shipped) or "none in this copy"
-    remedy = REMOVED_CHOICES["weights"].get(name) or near_name(name, shipped)
-    require(False, field, f"a file or the name of shipped weights ({names})", name, remedy=remedy)
+    require(False, field, f"a file or the name of shipped weights ({names})", name, remedy=near_name(name, shipped))
     raise AssertionError
 
 

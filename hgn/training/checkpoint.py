@@ -75,11 +75,8 @@ class Progress:
     @staticmethod
     def of(checkpoint: dict[str, Any]) -> Progress:
         section = current_names(checkpoint[SECTION])
-        guard: Any = checkpoint.get("callbacks")  # in checkpoints of 0.1.0
-        for key in ("GradientGuard", "skipped"):
-            guard = guard.get(key, 0) if isinstance(guard, dict) else 0
         state = from_stored(SamplerState, section.get("sampler_state"), "sampler_state")
-        counts = section.get("updates"), section.get("skipped", guard)
+        counts = section.get("updates"), section.get("skipped", 0)
         whole = all(type(count) is int and 0 <= count < 2**63 for count in counts)
         require(whole, "checkpoint updates, skipped", "whole numbers", counts)
         precision = section.get("precision")

@@ -141,7 +141,6 @@ class TrainingModule(LightningModule):
         progress = Progress.of(checkpoint)
         self.update, self.skipped, self.sampler_state = progress.updates, progress.skipped, progress.sampler_state
         checkpoint.pop("loops", None)  # Lightning's own counters
-        checkpoint["callbacks"].pop("GradientGuard", None)  # version 0.1.0 counted skipped updates here
         state = checkpoint["state_dict"]
         if self.averaged is None:
             for name in [name for name in state if name.startswith(AVERAGED)]:

@@ -41,7 +41,7 @@ from hgn.scene.rollout_file import read_rollout, write_rollout
 from hgn.scene.scene_file import load_scene
 from hgn.schema import ConfigError, from_mapping
 from hgn.step_config import StepConfig
-from hgn.training.checkpoint import Progress, read_checkpoint
+from hgn.training.checkpoint import read_checkpoint
 from hgn.training.imported import settings_of_imported
 
 
@@ -187,12 +187,6 @@ def test_archives_that_torch_reads_otherwise(tmp_path, change, message):
         change(path, archive)
     with pytest.raises(ConfigError, match=message):
         read_checkpoint(path)
-
-
-@pytest.mark.parametrize("callbacks", [[1], {"GradientGuard": 3}, None])
-def test_sections_of_0_1_0(callbacks):
-    section = {"updates": 3, "sampler_state": {}, 5: 1, (1, 2): 3}
-    assert Progress.of({"hgn": section, "callbacks": callbacks}).skipped == 0
 
 
 def tar():

@@ -30,7 +30,7 @@ def make_run(folder, updates=40, pause=0.0, repeated=0, error=1e-6, ranks=1):
         rates = {"updates_per_second": 1.5, "scenes_per_second": 3.0 * ranks}
         lines.append({"update": update, "time": now, "loss": 1 / (i + 1), "episodes": 3} | rates)
         if update % 10 == 9:
-            errors = {"one_step/validation": error / update, "trivial/validation_constant_velocity": 1e-5}
+            errors = {"one_step/validation": error / update, "baseline/validation_constant_velocity": 1e-5}
             lines.append({"update": update, "time": now, "rollout/mse_frame_10": 1e-4} | errors)
     (folder / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
     (folder / "config.yaml").write_text(yaml.safe_dump(SETTINGS))
