@@ -302,7 +302,7 @@ class NetworkConfig:
     velocity_history: FewLayers = 5  # m: number of past velocities in the input
     obstacle_features: bool = True  # normals of obstacle cells as inputs; false is only for scenes without obstacles
     # absolute: the paper's velocities and wall distances; relative: hgn.network.relative, exact in free motion; local:
-    # relative, and cells of coarser levels exchange messages only where cells of the finest level touch
+    # relative, and each body has cells of its own (hgn.network.grid)
     inputs: Annotated[str, one_of("absolute", "relative", "local")] = "absolute"
     materials: tuple[MaterialName, ...] = PAPER_MATERIALS  # each of the materials has its own embedding
     # number of dimensions; with 2, which only imported data have, z is constant

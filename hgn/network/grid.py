@@ -2,8 +2,12 @@
 
 Cell k of the finest level spans [k, k + 1) * cell_size + origin. A cell is active if its centre has a non-zero
 trilinear weight for some particle. The parent of cell k is floor(k / 2). It is active if one of its children is.
-Edges join active cells of one level that share a face, in both directions. With `connected`, an edge of a coarser level
-must in addition have an edge of the finest level across its face. So bodies apart exchange nothing through edges.
+Edges join active cells of one level that share a face, in both directions.
+
+With `bodies`, cells of different bodies are different cells, on all levels. A body is a set of finest cells that
+particles connect: a particle connects its eight cells. So a coarser cell belongs to one body, and a cube of space may
+have several cells. Edges join cells of the same body, on coarser levels only where an edge of the finest level crosses
+their common face. So bodies that are apart exchange nothing.
 Shape legend: N particles, C cells of a level, E directed edges of a level, S scenes.
 """
 
@@ -23,6 +27,8 @@ CORNER_83 = torch.tensor([[i >> 2 & 1, i >> 1 & 1, i & 1] for i in range(8)])
 # The 6 directions from an edge's receiver to its sender.
 DIRECTION_63 = torch.tensor([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]])
 
+EXPORTED_ROUNDS = 16  # rounds of `_bodies` in an exported graph, which has no loops; they reach across 2^15 cells
+
 
 class GridRangeError(ConfigError):
     """A particle is not finite, or too far from the origin for the grid's integer coordinates."""
@@ -30,7 +36,7 @@ class GridRangeError(ConfigError):
 
 @dataclass(frozen=True, eq=False)
 class Level:
-    """One level. Cells are sorted by key, edges by receiver."""
+    """One level. Cells are sorted by key, cells of one key by body, edges by receiver."""
 
     key_C: torch.Tensor
     sender_E: torch.Tensor
@@ -86,12 +92,12 @@ def build_hierarchy(
     origin_S3: torch.Tensor,
     cell_size: float,
     levels: int,
-    connected: bool = False,
+    bodies: bool = False,
 ) -> GridHierarchy:
     """Builds the grids of all scenes. Cells of different scenes are never neighbours.
 
-    position_N3 is in domain units. scene_N contains int64 indices into origin_S3, the finest grid's origins. With
-    `connected`, cells of coarser levels are neighbours only where finest cells on both sides of their face are active.
+    position_N3 is in domain units. scene_N contains int64 indices into origin_S3, the finest grid's origins. `bodies`
+    divides the cells among bodies.
     Raises: GridRangeError if a particle is not finite, or 65,534 cells or more from the origin on an axis.
     """
     grid_N3 = (position_N3 - origin_S3[scene_N]) / cell_size - 0.5
@@ -111,24 +117,52 @@ def build_hierarchy(
     key_N8 = pack(scene_N[:, None], base_N3.long()[:, None] + reached_N83)
     key_C, cell_N8 = unique(key_N8)
 
+    finest_count = key_C.shape[0]
+    body_C = _bodies(cell_N8, finest_count) if bodies else None
     built: list[Level] = []
     for level in range(levels):
-        edges = _edges_of_parents(built[-1], key_C.shape[0]) if connected and level > 0 else _edges(key_C)
+        edges = _edges_of_parents(built[-1], key_C.shape[0]) if bodies and level > 0 else _edges(key_C, body_C)
         sender_E, receiver_E, direction_E = edges
         if level == levels - 1:
             built.append(Level(key_C, sender_E, receiver_E, direction_E))
             break
         scene_C, coordinate_C3 = unpack(key_C)
         parent_key, parent_C = unique(pack(scene_C, coordinate_C3 >> 1))
+        if body_C is not None:
+            owned, parent_C = unique(parent_C * finest_count + body_C)
+            parent_key, body_C = parent_key[torch.div(owned, finest_count, rounding_mode="floor")], owned % finest_count
         octant_C = ((coordinate_C3 & 1) * torch.tensor([4, 2, 1], device=key_C.device)).sum(-1)
         built.append(Level(key_C, sender_E, receiver_E, direction_E, parent_C, octant_C))
         key_C = parent_key
     return GridHierarchy(tuple(built), cell_N8, weight_N8, fraction_N3)
 
 
-def _edges(key_C: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+def _bodies(cell_N8: torch.Tensor, count: int) -> torch.Tensor:
+    """Returns the body of each finest cell, int64 [C]: its lowest cell.
+
+    In each round a cell, and the cell that it links to, take the lowest link of the cells that particles connect them
+    with. Then links are followed once (as in Zhang, Azad and Hu 2020). A graph for export has a fixed number of rounds.
+    """
+    # The cells of all particles whose first cell is this one. An entry without a particle is the cell itself.
+    own_C = torch.arange(count, device=cell_N8.device)
+    cell_C8 = own_C[:, None].repeat(1, 8)
+    cell_C8 = cell_C8.scatter_reduce(0, cell_N8[:, :1].expand(-1, 8), cell_N8, "amax")
+    body_C, rounds = own_C, 0
+    while True:
+        least_C8 = body_C[cell_C8].amin(1, keepdim=True).expand(-1, 8).flatten()
+        linked_C = body_C.scatter_reduce(0, body_C[cell_C8].flatten(), least_C8, "amin")
+        linked_C = linked_C.scatter_reduce(0, cell_C8.flatten(), least_C8, "amin")
+        linked_C, rounds = linked_C[linked_C], rounds + 1
+        if rounds == EXPORTED_ROUNDS if is_exporting() else torch.equal(linked_C, body_C):
+            return linked_C
+        body_C = linked_C
+
+
+def _edges(key_C: torch.Tensor, body_C: torch.Tensor | None) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     stride_6 = (DIRECTION_63 * torch.tensor(AXIS_STRIDE)).sum(-1).to(key_C.device)
     neighbour_C6, found_C6 = find(key_C, key_C[:, None] + stride_6)
+    if body_C is not None:
+        found_C6 = found_C6 & (body_C[neighbour_C6] == body_C[:, None])
     receiver_E, direction_E = torch.nonzero(found_C6, as_tuple=True)
     return neighbour_C6[receiver_E, direction_E], receiver_E, direction_E
 

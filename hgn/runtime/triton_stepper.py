@@ -258,7 +258,9 @@ class TritonStepper:
     def _first_capacities(self) -> tuple[int, ...]:
         position_N3, scene_N = self.buffers.position_N3[: self.live], self.buffers.scene_N[: self.live].long()
         cell_size, levels = self.config.cell_size, self.config.levels
-        grid = build_hierarchy(position_N3, scene_N, self.buffers.origin_S3, cell_size=cell_size, levels=levels)
+        bodies = self.config.inputs == "local"
+        origin_S3 = self.buffers.origin_S3
+        grid = build_hierarchy(position_N3, scene_N, origin_S3, cell_size=cell_size, levels=levels, bodies=bodies)
         return first_capacities([level.cell_count for level in grid.levels], self.live)
 
     def _window(self) -> Window:
@@ -272,9 +274,11 @@ class TritonStepper:
     def _build(self, capacities: tuple[int, ...]) -> None:
         config, window = self.config, self._window()
         self.graph = None
-        # no level can have more cells than the window contains, or more than eight for each particle
-        limits = [self.scenes * math.prod(n >> i for n in window.cells) for i in range(config.levels)]
-        limits = [min(limit, 8 * self.particles) for limit in limits]
+        # No level can have more than eight cells for each particle, or more than the window contains, unless bodies
+        # divide its cells.
+        limits = [8 * self.particles] * config.levels
+        for level in range(1 if config.inputs == "local" else config.levels):
+            limits[level] = min(limits[level], self.scenes * math.prod(n >> level for n in window.cells))
         rounded = tuple(16 * math.ceil(max(1, min(c, m)) / 16) for c, m in zip(capacities, limits, strict=True))
         more = rest_numbers(self.step_config, window, self.scenes, config.levels)
         self.grid = DeviceGrid(

@@ -122,6 +122,15 @@ PUSHING = {
 }
 
 
+def apart_state(counts):
+    """In each scene two bodies that share coarser cells, but no finest cell; in the second one far from the walls."""
+    state = moving_state(counts, False, 0.08)
+    position_N3 = state.position_N3.clone()
+    position_N3[::2, 0] += 0.2
+    position_N3[state.scene_N == 1] += 0.35
+    return replace(state, position_N3=position_N3)
+
+
 @dataclass(frozen=True)
 class Case:
     """A network, a state, and the largest relative error of outputs, of all gradients, and of each gradient."""
@@ -155,7 +164,7 @@ CASES = {
     ),
     "relative, one particle": Case(lambda: moving_state((1,), False), 4e-5, RELATIVE),
     "relative, four levels": Case(
-        lambda: moving_state((23, 2), False, 0.4),
+        lambda: apart_state((40, 25)),
         4e-5,
         {"inputs": "local", "obstacle_features": False, "levels": 4, "materials": SHUFFLED},
     ),

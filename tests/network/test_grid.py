@@ -12,12 +12,12 @@ from hgn.network.grid import CORNER_83, DIRECTION_63, build_hierarchy
 SIZE = 0.25  # a power of two: centres and halves are exact
 
 
-def build(position, scene=None, origin=None, levels=2, size=SIZE, connected=False):
+def build(position, scene=None, origin=None, levels=2, size=SIZE, bodies=False):
     position = torch.as_tensor(position, dtype=torch.float64)
     scene = torch.zeros(len(position), dtype=torch.long) if scene is None else torch.as_tensor(scene)
     if origin is None:
         origin = torch.zeros(int(scene.max()) + 1 if len(scene) else 1, 3, dtype=torch.float64)
-    return build_hierarchy(position, scene, origin, size, levels, connected)
+    return build_hierarchy(position, scene, origin, size, levels, bodies)
 
 
 def cells(level):
@@ -76,22 +76,53 @@ def test_hierarchy_is_what_the_definition_says(particles, scenes):
 
 @settings(max_examples=40, deadline=None)
 @given(positions)
-@example([(0.4, 0.1, 0.1), (0.6, 0.1, 0.1), (-0.6, 0.1, 0.1)])  # of two neighbours of a coarse cell one is joined
-def test_connected_cells(particles):
-    """With `connected` a coarse edge exists iff active finest cells touch across its face; cells do not change."""
-    plain, joined = (build(particles, levels=3, connected=connected) for connected in (False, True))
-    finest = {cell[1:] for cell in cells(plain.levels[0])}
-    touching = [
-        (cell, direction, tuple(k + step for k, step in zip(cell, steps, strict=True)))
-        for cell, (direction, steps) in itertools.product(finest, enumerate(DIRECTION_63.tolist()))
-    ]
-    for depth, (level, before) in enumerate(zip(joined.levels, plain.levels, strict=True)):
-        assert torch.equal(level.key_C, before.key_C)
-        above = [(tuple(k >> depth for k in a), d, tuple(k >> depth for k in b)) for a, d, b in touching if b in finest]
-        listed = [cell[1:] for cell in cells(level)]
-        rows = zip(level.receiver_E.tolist(), level.direction_E.tolist(), level.sender_E.tolist(), strict=True)
-        edges = [(listed[receiver], direction, listed[sender]) for receiver, direction, sender in rows]
-        assert edges == sorted({edge for edge in above if edge[0] != edge[2]})
+@example([(0.4, 0.1, 0.1), (0.6, 0.1, 0.1), (-0.6, 0.1, 0.1)])
+@example([(0.1, 0.1, 0.1), (0.9, 0.1, 0.1), (0.9, 0.9, 0.1), (0.5, 0.1, 0.1), (0.1, 0.9, 0.1), (0.9, 0.5, 0.1)])
+@example([(0.125 + 0.25 * i, 0.3, 0.3) for i in range(-4, 4)])  # on planes of centres: a particle reaches four cells
+def test_cells_of_bodies(particles):
+    """With `bodies` a hierarchy is the union of those of the bodies, each alone. Particles of a body share cells,
+    directly or through others."""
+    plain, divided = (build(particles, levels=3, bodies=bodies) for bodies in (False, True))
+    reached = [set(plain.cell_N8[i].tolist()) for i in range(len(particles))]
+    bodies: list[set[int]] = []
+    for i in range(len(particles)):
+        joined = [body for body in bodies if any(reached[i] & reached[k] for k in body)]
+        bodies = [body for body in bodies if body not in joined] + [{i}.union(*joined)]
+    alone = [build([particles[i] for i in sorted(body)], levels=3) for body in bodies]
+
+    def described(grid, depth, number):
+        """Cells and edges; each cell is named by the body."""
+        level, listed = grid.levels[depth], [(number, *cell[1:]) for cell in cells(grid.levels[depth])]
+        return listed, {(listed[s], listed[r]) for s, r in zip(level.sender_E, level.receiver_E, strict=True)}
+
+    body_of = {i: number for number, body in enumerate(bodies) for i in body}
+    ancestor_N8, names = divided.cell_N8, []
+    for depth, level in enumerate(divided.levels):
+        name: dict[int, tuple[int, ...]] = {}
+        for i, row in enumerate(ancestor_N8.tolist()):
+            for cell in row:
+                assert name.setdefault(cell, (body_of[i], *cells(level)[cell][1:]))[0] == body_of[i]
+        names.append([name[cell] for cell in range(level.cell_count)])
+        expected = [described(grid, depth, number) for number, grid in enumerate(alone)]
+        assert sorted(names[-1]) == sorted(itertools.chain(*(listed for listed, _ in expected)))
+        edges = {(names[-1][s], names[-1][r]) for s, r in zip(level.sender_E, level.receiver_E, strict=True)}
+        across = set().union(*(between for _, between in expected))
+        # On coarser levels an edge needs finest cells on both sides of the face.
+        assert edges == across if depth == 0 else edges <= across
+        finest = names[0] if depth else []
+        places = {tuple(c) for c in finest}
+        for sender, receiver in across if depth else set():
+            axis = next(k for k in (1, 2, 3) if sender[k] != receiver[k])
+            step = sender[axis] - receiver[axis]
+            near = [c for c in places if (c[0], *(k >> depth for k in c[1:])) == receiver]
+            met = any((*c[:axis], c[axis] + step, *c[axis + 1 :]) in places
+                      and (c[axis] + step) >> depth == sender[axis] for c in near)  # fmt: skip
+            assert ((sender, receiver) in edges) == met
+        if level.parent_C is not None:
+            ancestor_N8 = level.parent_C[ancestor_N8]
+    for depth, level in enumerate(divided.levels[:-1]):
+        above = [(b, *(k >> 1 for k in c)) for b, *c in names[depth]]
+        assert [names[depth + 1][i] for i in level.parent_C.tolist()] == above
 
 
 @given(st.integers(0, SCENE_LIMIT - 1), st.tuples(*[st.integers(-COORDINATE_LIMIT, COORDINATE_LIMIT - 1)] * 3))

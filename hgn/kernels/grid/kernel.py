@@ -1,4 +1,5 @@
 """Builds the grid hierarchy on the device: marks, numbers and tables of cells. Nothing here waits for the host.
+With `network.inputs: local` hgn.kernels.grid.bodies divides the cells among bodies.
 
 One array of slots holds all levels of all scenes. Each level has a window of cells around the domain with a border of
 one cell, so that neighbours need no check of bounds. Shape legend: N particles, C cells of a level, L levels.
@@ -10,57 +11,20 @@ import triton
 import triton.language as tl
 
 from hgn.kernels.geometry import GEOMETRY_COLUMNS, raise_disturbed, split_slot
+from hgn.kernels.grid.bodies import number_of
+from hgn.kernels.grid.slots import OUT_OF_WINDOW, OVERFLOW, base_cell, cell_in, marked, number_in, slot_of, slots_of
 from hgn.kernels.grid.surfaces import add_drift, add_friction, surface_normals, surfaces_of
 from hgn.kernels.triton_compat import gdc_launch_dependents, gdc_wait, settle_keys
-
-OVERFLOW = tl.constexpr(1)  # status bit: a level has more active cells than its capacity
-OUT_OF_WINDOW = tl.constexpr(2)  # status bit: a particle is not finite or outside the window
-
-
-@triton.jit
-def _base(position, origin, scene, row, live, axis: tl.constexpr, cell_size):
-    x = tl.load(position + row * 3 + axis, mask=live, other=0.0)
-    u = tl.div_rn(x - tl.load(origin + scene * 3 + axis, mask=live, other=0.0), cell_size) - 0.5
-    base = tl.floor(u)
-    return base, u - base
-
-
-@triton.jit
-def _base_cell(position, origin, scene, row, live, low, geometry, cell_size):
-    """Returns the lowest of each particle's 8 cells, the particle's fractions in it, and whether the window contains
-    all 8. Cells are counted from the window's first one. The lowest cell is 0 if the window does not contain all 8."""
-    x, fx = _base(position, origin, scene, row, live, 0, cell_size)
-    y, fy = _base(position, origin, scene, row, live, 1, cell_size)
-    z, fz = _base(position, origin, scene, row, live, 2, cell_size)
-    # The subtraction is in float32, because the cell of a position far outside may exceed int32.
-    x, y, z = x - tl.load(low), y - tl.load(low + 1), z - tl.load(low + 2)
-    nx, ny, nz = tl.load(geometry + 7) - 3, tl.load(geometry + 2) - 3, tl.load(geometry + 3) - 3
-    inside = live & (x >= 0) & (y >= 0) & (z >= 0) & (x < nx) & (y < ny) & (z < nz)
-    x = tl.where(inside, x, 0.0).to(tl.int32)
-    y = tl.where(inside, y, 0.0).to(tl.int32)
-    z = tl.where(inside, z, 0.0).to(tl.int32)
-    return x, y, z, fx, fy, fz, inside
-
-
-@triton.jit
-def _slots_of(geometry, level: tl.constexpr):
-    """Reads once the numbers of a level that `_slot` needs. In `_slot` the compiler would read them for each slot."""
-    line = geometry + level * GEOMETRY_COLUMNS
-    return tl.load(line), tl.load(line + 2), tl.load(line + 3), tl.load(line + 4)
-
-
-@triton.jit
-def _slot(x, y, z, scene, slots):
-    start, ny, nz, stride = slots
-    return start + scene * stride + ((x + 1) * ny + (y + 1)) * nz + z + 1
 
 
 @triton.jit
 def mark_cells(
-    position, scene_of, origin, particle_count, low, geometry, occupied, status, cell_size,
-    LEVELS: tl.constexpr, BLOCK: tl.constexpr,
+    position, scene_of, origin, particle_count, low, geometry, occupied, root, status, cell_size,
+    LEVELS: tl.constexpr, BODIES: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Marks the slots of the cells that particles reach, and of their ancestors, in one pass for all levels.
+
+    With BODIES it marks the finest level only, and links each slot to itself in `root`.
 
     Rule: hgn.network.grid.build_hierarchy; test: tests/kernels/test_network.py.
     """
@@ -70,16 +34,16 @@ def mark_cells(
     row = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     live = row < count
     scene = tl.load(scene_of + row, mask=live, other=0)
-    x, y, z, fx, fy, fz, inside = _base_cell(position, origin, scene, row, live, low, geometry, cell_size)
+    x, y, z, fx, fy, fz, inside = base_cell(position, origin, scene, row, live, low, geometry, cell_size)
     lost = tl.sum((live & (inside == 0)).to(tl.int32), 0)
     if lost > 0:
         tl.atomic_or(status, OUT_OF_WINDOW)
     upper_x, upper_y, upper_z = x + (fx > 0).to(tl.int32), y + (fy > 0).to(tl.int32), z + (fz > 0).to(tl.int32)
     levels = ()
-    for level in tl.static_range(LEVELS):
-        levels = levels + (_slots_of(geometry, level),)  # noqa: RUF005 - Triton does not support unpacking here
+    for level in tl.static_range(1 if BODIES else LEVELS):
+        levels = levels + (slots_of(geometry, level),)  # noqa: RUF005 - Triton does not support unpacking here
         # All levels are read before the first store, because the compiler would wait for each read after a store.
-    for level in tl.static_range(LEVELS):
+    for level in tl.static_range(1 if BODIES else LEVELS):
         slots = levels[level]
         for corner in tl.static_range(8):
             cx = (upper_x if corner >> 2 & 1 else x) >> level
@@ -93,26 +57,10 @@ def mark_cells(
                 first = first & (cy != y >> level)
             if corner & 1:
                 first = first & (cz != z >> level)
-            tl.store(occupied + _slot(cx, cy, cz, scene, slots), 1, mask=first)
-
-
-@triton.jit
-def _marked(occupied, slot, ask):
-    """Returns whether the cell in a slot is active."""
-    return ask & (tl.load(occupied + slot, mask=ask, other=0) > 0)
-
-
-@triton.jit
-def _number(prefix_sum, slot, first, capacity, there):
-    """Returns the number of the cell in a slot, -1 if it is not active."""
-    cell = tl.load(prefix_sum + slot, mask=there, other=0) - 1 - first
-    return tl.where(there & (cell < capacity), cell, -1)
-
-
-@triton.jit
-def _cell(occupied, prefix_sum, slot, first, capacity, ask):
-    """Returns the number of the cell in a slot where `ask` is true, -1 if the cell is not active."""
-    return _number(prefix_sum, slot, first, capacity, _marked(occupied, slot, ask))
+            slot = slot_of(cx, cy, cz, scene, slots)
+            tl.store(occupied + slot, 1, mask=first)
+            if BODIES:
+                tl.store(root + slot, slot, mask=first)
 
 
 @triton.jit
@@ -123,50 +71,20 @@ def _write_cells(table, cell, live, occupied, prefix_sum, slots, first, capacity
     """
     there = ()
     for i in tl.static_range(COUNT):
-        there = there + (_marked(occupied, slots[i], live),)  # noqa: RUF005 - Triton does not support unpacking here
+        there = there + (marked(occupied, slots[i], live),)  # noqa: RUF005 - Triton does not support unpacking here
     numbers = ()
     for i in tl.static_range(COUNT):
-        numbers = numbers + (_number(prefix_sum, slots[i], first, capacity, there[i]),)  # noqa: RUF005
+        numbers = numbers + (number_in(prefix_sum, slots[i], first, capacity, there[i]),)  # noqa: RUF005
     for i in tl.static_range(COUNT):
         tl.store(table + i * own_capacity + cell, numbers[i], mask=live)
 
 
 @triton.jit
-def _join_ancestors(
-    neighbour, occupied, prefix_sum, geometry, scene, x, y, z, joins, DIRECTION: tl.constexpr, LEVELS: tl.constexpr
-):
-    """Writes, for one direction, the neighbours of the ancestors of those finest cells that have a neighbour there."""
-    along = z
-    if DIRECTION // 2 == 0:
-        along = x
-    elif DIRECTION // 2 == 1:
-        along = y
-    for level in tl.static_range(1, LEVELS):
-        line = geometry + level * GEOMETRY_COLUMNS
-        slots, capacity, at = _slots_of(geometry, level), tl.load(line + 5), tl.load(line + 6)
-        step = slots[1] * 0 + 1
-        if DIRECTION // 2 == 0:
-            step = slots[1] * slots[2]
-        elif DIRECTION // 2 == 1:
-            step = slots[2]
-        last = (1 << level) - 1
-        outer = (along & last) == (0 if DIRECTION % 2 == 1 else last)
-        slot = _slot(x >> level, y >> level, z >> level, scene, slots)
-        beside = slot - step if DIRECTION % 2 == 1 else slot + step
-        first = tl.load(prefix_sum + slots[0] - 1)
-        own = _number(prefix_sum, slot, first, capacity, joins & outer)
-        other = _number(prefix_sum, beside, first, capacity, joins & outer)
-        tl.store(neighbour + 6 * at + DIRECTION * capacity + own, other, mask=own >= 0)
-
-
-@triton.jit
 def fill_tables(
     occupied, prefix_sum, geometry, slot_of_cell, neighbour, parent, octant, children, counts, needed, status,
-    LEVELS: tl.constexpr, CONNECTED: tl.constexpr, OVERLAP: tl.constexpr, BLOCK: tl.constexpr,
+    LEVELS: tl.constexpr, OVERLAP: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Writes the neighbours, parent and children of each active slot's cell, int32, -1 for none.
-
-    With CONNECTED the cells of the finest level write the neighbours of their ancestors, which must be -1 before.
 
     Rule: hgn.network.grid.build_hierarchy; test: tests/kernels/test_network.py.
     """
@@ -193,12 +111,12 @@ def fill_tables(
             tl.atomic_or(status, OVERFLOW)
     local = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     slot = start + local
-    cell = _cell(occupied, prefix_sum, slot, first, capacity, local < slots)
+    cell = cell_in(occupied, prefix_sum, slot, first, capacity, local < slots)
     live = cell >= 0
     if tl.sum(live.to(tl.int32), 0) == 0:
         return
     tl.store(slot_of_cell + at + cell, local, mask=live)
-    slots_of = ()
+    slots_around = ()
     for direction in tl.static_range(6):
         step = ny * nz
         if direction // 2 == 1:
@@ -207,16 +125,9 @@ def fill_tables(
             step = step * 0 + 1
         if direction % 2 == 1:
             step = -step
-        slots_of = slots_of + (slot + step,)  # noqa: RUF005
+        slots_around = slots_around + (slot + step,)  # noqa: RUF005
+    _write_cells(neighbour + 6 * at, cell, live, occupied, prefix_sum, slots_around, first, capacity, capacity, 6)
     scene, x, y, z = split_slot(local, ny, nz, stride)
-    if CONNECTED:
-        if level == 0:
-            _write_cells(neighbour, cell, live, occupied, prefix_sum, slots_of, first, capacity, capacity, 6)
-            for direction in tl.static_range(6):
-                joins = _marked(occupied, slots_of[direction], live)
-                _join_ancestors(neighbour, occupied, prefix_sum, geometry, scene, x, y, z, joins, direction, LEVELS)
-    else:
-        _write_cells(neighbour + 6 * at, cell, live, occupied, prefix_sum, slots_of, first, capacity, capacity, 6)
     tl.store(octant + at + cell, ((x & 1) * 2 + (y & 1)) * 2 + (z & 1), mask=live)
     if level < LEVELS - 1:
         above = line + GEOMETRY_COLUMNS
@@ -224,7 +135,7 @@ def fill_tables(
         above_slot = tl.load(above) + scene * tl.load(above + 4)
         above_slot += (((x >> 1) + 1) * above_y + (y >> 1) + 1) * above_z + (z >> 1) + 1
         above_first = tl.load(prefix_sum + tl.load(above) - 1)
-        above_cell = _cell(occupied, prefix_sum, above_slot, above_first, tl.load(above + 5), live)
+        above_cell = cell_in(occupied, prefix_sum, above_slot, above_first, tl.load(above + 5), live)
         tl.store(parent + at + cell, above_cell, mask=live)
     if level > 0:
         below = line - GEOMETRY_COLUMNS
@@ -260,11 +171,11 @@ def prepare_particles(
     position, velocity, scene_of, origin, particle_count, low, geometry, occupied, prefix_sum, cell_of,
     weight_of, fraction_of, motion, coarsest_of, share_of, place_of, moments, domain, obstacle_table,
     obstacle_cell_size, features, touch_of, disturbed, wall_friction, gravity, scale, friction, moving, poses, turn,
-    surface_of, drift, scenes, cell_size, reach, capacity,
+    surface_of, drift, root, table, numbers, mask, scenes, cell_size, reach, capacity,
     HISTORY: tl.constexpr, LEVELS: tl.constexpr, MOTION: tl.constexpr, COLUMNS: tl.constexpr,
     NORMALS: tl.constexpr, OBSTACLES: tl.constexpr, SYMMETRY: tl.constexpr, FEATURES: tl.constexpr,
-    FRICTION: tl.constexpr, FRICTION_AT: tl.constexpr, MOVING: tl.constexpr, OVERLAP: tl.constexpr,
-    BLOCK: tl.constexpr,
+    FRICTION: tl.constexpr, FRICTION_AT: tl.constexpr, MOVING: tl.constexpr, BODIES: tl.constexpr,
+    OVERLAP: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Writes the 8 finest cells of each particle, its weights in them, and its fraction within the lowest cell.
 
@@ -296,8 +207,8 @@ def prepare_particles(
         column = tl.arange(0, 16)[None, :]
         at = features + row[:, None] * FEATURES + (3 * (HISTORY + LEVELS) + column)
         tl.store(at, surfaces, mask=live[:, None] & (column < 6 + 6 * NORMALS))
-    x, y, z, fx, fy, fz, inside = _base_cell(position, origin, scene, row, live, low, geometry, cell_size)
-    slots = _slots_of(geometry, 0)
+    x, y, z, fx, fy, fz, inside = base_cell(position, origin, scene, row, live, low, geometry, cell_size)
+    slots = slots_of(geometry, 0)
     # All corners are in one tensor [BLOCK, 8], so that a thread stores neighbouring elements.
     corner = tl.arange(0, 8)[None, :]
     high_x, high_y, high_z = (corner >> 2 & 1) == 1, (corner >> 1 & 1) == 1, (corner & 1) == 1
@@ -305,8 +216,8 @@ def prepare_particles(
     cy = y[:, None] + (high_y & (fy > 0)[:, None]).to(tl.int32)
     cz = z[:, None] + (high_z & (fz > 0)[:, None]).to(tl.int32)
     here = live[:, None] & (corner >= 0)
-    cell = _cell(
-        occupied, prefix_sum, _slot(cx, cy, cz, scene[:, None], slots), 0, capacity, inside[:, None] & (corner >= 0)
+    cell = cell_in(
+        occupied, prefix_sum, slot_of(cx, cy, cz, scene[:, None], slots), 0, capacity, inside[:, None] & (corner >= 0)
     )
     weight = tl.where(high_x, fx[:, None], 1 - fx[:, None])
     weight *= tl.where(high_y, fy[:, None], 1 - fy[:, None])
@@ -325,11 +236,16 @@ def prepare_particles(
         across_y, share_y, py = _coarsest_part(y, fy, high_y, LEVELS)
         across_z, share_z, pz = _coarsest_part(z, fz, high_z, LEVELS)
         share = share_x * share_y * share_z
-        above = _slots_of(geometry, LEVELS - 1)
-        slot = _slot(cx >> LEVELS - 1, cy >> LEVELS - 1, cz >> LEVELS - 1, scene[:, None], above)
-        first = tl.load(prefix_sum + above[0] - 1, mask=above[0] > 0, other=0)
-        most = tl.load(geometry + (LEVELS - 1) * GEOMETRY_COLUMNS + 5)
-        coarsest = _cell(occupied, prefix_sum, slot, first, most, inside[:, None] & across_x & across_y & across_z)
+        above = slots_of(geometry, LEVELS - 1)
+        slot = slot_of(cx >> LEVELS - 1, cy >> LEVELS - 1, cz >> LEVELS - 1, scene[:, None], above)
+        across = inside[:, None] & across_x & across_y & across_z
+        if BODIES and LEVELS > 1:
+            body = tl.load(root + slot_of(x, y, z, scene, slots), mask=inside, other=0)[:, None]
+            coarsest = number_of(table, numbers, mask, slot, body + 0 * corner, across)
+        else:
+            first = tl.load(prefix_sum + above[0] - 1, mask=above[0] > 0, other=0)
+            most = tl.load(geometry + (LEVELS - 1) * GEOMETRY_COLUMNS + 5)
+            coarsest = cell_in(occupied, prefix_sum, slot, first, most, across)
         coarsest = tl.where(share > 0, coarsest, -1)
         tl.store(coarsest_of + row[:, None] * 8 + corner, coarsest, mask=here)
         tl.store(share_of + row[:, None] * 8 + corner, share, mask=here)

@@ -16,7 +16,7 @@ import triton
 from hgn.config import MATERIAL_EMBEDDING, NetworkConfig
 from hgn.kernels.coarsest import kernel as coarsest_kernel
 from hgn.kernels.features import kernel as feature_kernel
-from hgn.kernels.grid import kernel
+from hgn.kernels.grid import bodies, kernel, slots
 from hgn.kernels.moving import MovingTable, arguments_of
 from hgn.kernels.scene_tables import SceneTable
 from hgn.kernels.triton_compat import interpreting, overlaps
@@ -32,7 +32,9 @@ PARTICLE_BLOCK = 32
 FILL_BLOCK = 4096 if interpreting() else 512  # slots of a program; the interpreter needs few programs
 SUMS = 16  # number of columns of the coarsest cells' sums, and of the decoder's padded output
 MARGIN_CELLS = 4  # margin of a window around the box that it must contain
-OVERFLOW, OUT_OF_WINDOW = kernel.OVERFLOW.value, kernel.OUT_OF_WINDOW.value
+NUMBER_BLOCK = 4096  # entries of a program
+MOST_CELLS = 8  # number of cells of a level that one particle activates at most
+OVERFLOW, OUT_OF_WINDOW = slots.OVERFLOW.value, slots.OUT_OF_WINDOW.value
 
 
 @dataclass(frozen=True)
@@ -156,6 +158,10 @@ class DeviceGrid:
             at += capacity
         assert start < 2**31, "slots are numbered in int32"
         self.largest = max(row[1] for row in rows)
+        self.divided = config.inputs == "local"  # cells are divided among bodies (hgn.kernels.grid.bodies)
+        marks, entries = rows[0][1] if self.divided else start, 0
+        if self.divided and self.levels > 1:
+            entries = triton.next_power_of_2(max(NUMBER_BLOCK, MOST_CELLS * (self.levels - 1) * particles))
 
         def integers(*shape: int) -> torch.Tensor:
             return torch.zeros(shape, dtype=torch.int32, device=device)
@@ -165,15 +171,20 @@ class DeviceGrid:
         coarsest = self.capacities[-1] if relative else 0
         self._widths, self.friction, rough = physics_widths(config), 0, coarsest * ("friction" in config.own_physics)
         drifting = coarsest * ("moving" in config.own_physics)
-        parts = [4 * at if relative else 4, *[SUMS * coarsest] * 3, SUMS * rough, 2 * coarsest, start, 8 * drifting]
+        # 8-byte entries come first, for their alignment
+        parts = [2 * entries, 4 * at if relative else 4, *[SUMS * coarsest] * 3, SUMS * rough, 2 * coarsest, marks]
+        parts += [8 * drifting, self.levels]
         self._cleared = integers(sum(parts) + sum(more))  # one launch clears all parts
         cleared = self._cleared.split([*parts, *more])
-        motion, *sums, moments, friction, disturbed, self.occupied, drift = cleared[: len(parts)]
+        table, motion, *sums, moments, friction, disturbed, self.occupied, drift, self.needed_L = cleared[: len(parts)]
         self.more_cleared = cleared[len(parts) :]
-        self.prefix_sum = integers(start)
+        self.prefix_sum, self._root, self._numbers = integers(marks), integers(marks * self.divided), integers(entries)
+        self._table = table.view(torch.int64)
+        self._owners = {"root": self._root, "table": self._table, "numbers": self._numbers, "mask": max(0, entries - 1)}
         self.slot_of_cell, self._parent, self._octant = integers(at), integers(at), integers(at)
-        self._neighbour, self._children = integers(6 * at), integers(8 * at)
-        self.counts_L, self.needed_L = integers(self.levels), integers(self.levels)
+        self._links = integers(14 * at)
+        self._neighbour, self._children = self._links.split([6 * at, 8 * at])
+        self.counts_L = integers(self.levels)
         self.status = integers(1)
         self.cell_N8 = integers(particles, 8)
         self.weight_N8 = torch.zeros(particles, 8, device=device)
@@ -217,21 +228,38 @@ class DeviceGrid:
     def build(self, particles: DeviceParticles) -> None:
         """Marks, numbers and tabulates the cells of all levels."""
         self._cleared.zero_()
-        kernel.mark_cells[(triton.cdiv(self.particles, MARK_BLOCK),)](
-            position=particles.position_N3, scene_of=particles.scene_N, origin=particles.origin_S3,
-            particle_count=particles.count, low=self.low, geometry=self.geometry, occupied=self.occupied,
-            status=self.status, cell_size=self.cell_size, LEVELS=self.levels, BLOCK=MARK_BLOCK,
-        )  # fmt: skip
+        particle_blocks, cells = (triton.cdiv(self.particles, MARK_BLOCK),), {"occupied": self.occupied}
+        places: dict[str, Any] = {
+            "position": particles.position_N3, "scene_of": particles.scene_N, "origin": particles.origin_S3,
+            "particle_count": particles.count, "low": self.low, "geometry": self.geometry, "root": self._root,
+            "cell_size": self.cell_size, "BLOCK": MARK_BLOCK,
+        }  # fmt: skip
+        kernel.mark_cells[particle_blocks](
+            **places, **cells, status=self.status, LEVELS=self.levels, BODIES=self.divided
+        )
         torch.cumsum(self.occupied, 0, dtype=torch.int32, out=self.prefix_sum)
-        connected = self.config.inputs == "local"
-        if connected:
-            self._neighbour[6 * self.capacities[0] :].fill_(-1)
-        kernel.fill_tables[(triton.cdiv(self.largest, FILL_BLOCK), self.levels)](
-            occupied=self.occupied, prefix_sum=self.prefix_sum, geometry=self.geometry,
-            slot_of_cell=self.slot_of_cell, neighbour=self._neighbour, parent=self._parent, octant=self._octant,
-            children=self._children, counts=self.counts_L, needed=self.needed_L, status=self.status,
-            LEVELS=self.levels, CONNECTED=connected, OVERLAP=overlaps(), BLOCK=FILL_BLOCK,
+        tables: dict[str, Any] = {
+            "prefix_sum": self.prefix_sum, "geometry": self.geometry, "slot_of_cell": self.slot_of_cell,
+            "neighbour": self._neighbour, "parent": self._parent, "octant": self._octant, "children": self._children,
+            "counts": self.counts_L, "needed": self.needed_L, "status": self.status, "LEVELS": self.levels,
+            "OVERLAP": overlaps(), "BLOCK": FILL_BLOCK,
+        }  # fmt: skip
+        if not self.divided:
+            kernel.fill_tables[(triton.cdiv(self.largest, FILL_BLOCK), self.levels)](**cells, **tables)
+            return
+        self._links.fill_(-1)
+        bodies.unite_cells[particle_blocks](**places)
+        finest = (triton.cdiv(len(self.occupied), FILL_BLOCK),)
+        bodies.insert_cells[finest](
+            **cells, geometry=self.geometry, root=self._root, table=self._table, mask=self._owners["mask"],
+            LEVELS=self.levels, BLOCK=FILL_BLOCK,
         )  # fmt: skip
+        if self.levels > 1:
+            bodies.number_cells[(len(self._table) // NUMBER_BLOCK,)](
+                table=self._table, numbers=self._numbers, geometry=self.geometry, needed=self.needed_L,
+                status=self.status, LEVELS=self.levels, BLOCK=NUMBER_BLOCK,
+            )  # fmt: skip
+        bodies.join_cells[finest](**cells, **self._owners, **tables)
 
     def prepare(
         self,
@@ -276,6 +304,7 @@ class DeviceGrid:
             disturbed=self.disturbed_C2, wall_friction=particles.domain_S3 if walls is None else walls,
             gravity=particles.gravity_S3, scale=scale[1], friction=self.friction_C, cell_size=self.cell_size,
             reach=CONTACT_REACH_CELLS * config.cell_size, capacity=self.capacities[0], LEVELS=self.levels,
+            **self._owners, BODIES=self.divided,
             MOTION=config.relative, COLUMNS=SUMS, **own_physics, **drift, **arguments_of(moving, particles.count),
             OVERLAP=overlap, launch_pdl=overlap,
         )  # fmt: skip
