@@ -19,7 +19,8 @@ def help_lines(mapping: Mapping[str, Any], folder: Path, config_name: str) -> It
     """Yields a command's composed configuration as YAML with comments. The command's file lies in `folder`."""
     file = folder / f"{config_name}.yaml"
     cls = dataclass_of(file)
-    comments = (field_comments(cls) if cls else {}) | _comments_in(file)
+    comments = field_comments(cls) if cls else {}
+    comments |= re.findall(r"^(\w+):[^#\n]*# (.*)$", file.read_text(encoding="utf-8"), re.MULTILINE)
     for key, value in mapping.items():
         files = sorted((folder / key).glob("*.yaml"))
         if files:
@@ -40,11 +41,6 @@ def _nested(cls: type | None, key: str) -> type | None:
     """Returns the type of a field that contains a dataclass, or None."""
     hint = typing.get_type_hints(cls).get(key) if cls else None
     return hint if isinstance(hint, type) and dataclasses.is_dataclass(hint) else None
-
-
-def _comments_in(file: Path) -> dict[str, str]:
-    """Returns the comment of each key of a YAML file."""
-    return dict(re.findall(r"^(\w+):[^#\n]*# (.*)$", file.read_text(encoding="utf-8"), re.MULTILINE))
 
 
 def _line(key: str, value: Any, comment: str | None) -> str:

@@ -133,7 +133,10 @@ def draw(runs: Sequence[Run]) -> bytes:
 
     figure, (panels,) = new_figure(1, 3, (15, 5))
     last = {name: value for record in runs[0].records for name, value in record.items()}
-    title = "; ".join(sorted({_origin(run) for run in runs}))
+    origins = [run.settings.get("provenance", {}) for run in runs]
+    title = "; ".join(
+        sorted({f"{o.get('device', '')}, commit {o.get('commit', '')}, {str(o.get('date', ''))[:10]}" for o in origins})
+    )
     if len(runs) == 1:
         _draw_one(panels, runs[0], last)
         training, dataset = runs[0].settings["training"], runs[0].settings["dataset"]
@@ -192,11 +195,6 @@ def _means(records: list[dict[str, float]], key: str) -> list[dict[str, float]]:
     step = max(1, len(records) // LOSS_POINTS)
     parts = [records[i : i + step] for i in range(0, len(records), step)]
     return [{"scenes": part[-1]["scenes"], key: sum(r[key] for r in part) / len(part)} for part in parts]
-
-
-def _origin(run: Run) -> str:
-    where = run.settings.get("provenance", {})
-    return f"{where.get('device', '')}, commit {where.get('commit', '')}, {str(where.get('date', ''))[:10]}"
 
 
 def _plain(text: str) -> str:

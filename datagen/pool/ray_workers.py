@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from datagen.pool.plan import SceneTask
-from datagen.pool.shard import pack_episode, stage_parts
+from datagen.pool.shard import stage_parts
 from datagen.pool.worker import (
     Backend,
     MadeScene,
@@ -29,6 +29,7 @@ from datagen.pool.worker import (
 from datagen.pool.worker_plan import plan_cluster
 from hgn.config import DatagenConfig
 from hgn.data.identity import dataset_identity, identity_hash
+from hgn.data.shard import episode_tar
 from hgn.schema import ConfigError
 
 _CONNECT_REMEDY = (
@@ -177,8 +178,8 @@ class _Solver:
             if cause is not None:
                 answers.append(("failed", made.task.key, cause))
             else:
-                packed = pack_episode(make_episode(made, result, self._config, config_hash))
-                answers.append(("packed", made.task.key, packed))
+                parts = episode_tar(make_episode(made, result, self._config, config_hash))
+                answers.append(("packed", made.task.key, b"".join(parts)))
         return answers
 
 

@@ -42,11 +42,6 @@ def stage_episode(folder: Path, episode: Episode) -> None:
     stage_parts(folder, episode.key, episode_tar(episode))
 
 
-def pack_episode(episode: Episode) -> bytes:
-    """Returns the tar file of one episode. Raises: ConfigError (positions that are not finite)."""
-    return b"".join(episode_tar(episode))
-
-
 def stage_parts(folder: Path, key: str, parts: Iterable[bytes]) -> None:
     """Writes the parts of an episode's tar file atomically, and appends their sha256.
 

@@ -15,7 +15,6 @@ import sys
 import threading
 import time
 from collections.abc import Sequence
-from types import TracebackType
 
 _PIECE_BYTES = 4096
 _WAITING = 256  # largest number of waiting pieces
@@ -44,9 +43,7 @@ class UnhurriedLog:
                 self._streams.append(_Stream(file))
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         _flush()
         for stream in self._streams:
             stream.close()

@@ -13,7 +13,6 @@ import threading
 import time
 from dataclasses import dataclass, field, replace
 from multiprocessing.connection import Connection
-from types import TracebackType
 from typing import Any
 
 from datagen.generate import StopSignal, generate
@@ -58,9 +57,7 @@ class Supervisor:
         self._thread.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         """Ends the pool as Ctrl-C does. Finished episodes are kept."""
         self._stopping.set()
         self._thread.join()

@@ -191,11 +191,6 @@ def dataset_token() -> str | None:
     return token
 
 
-def _token_is_for(url: str) -> bool:
-    named, address = os.environ.get(TOKEN_HOST_VARIABLE), urlsplit(url)
-    return not named or named in (address.hostname, f"{address.hostname}:{address.port}")
-
-
 class _Folder(Storage):
     """Reads a folder of this machine."""
 
@@ -251,7 +246,9 @@ class _Remote(Storage):
 
             from hgn.data.bounded_http import BoundedResponse
 
-            token = hub_token() if hub else dataset_token() if _token_is_for(url) else None
+            named, to = os.environ.get(TOKEN_HOST_VARIABLE), urlsplit(url)
+            own = not named or named in (to.hostname, f"{to.hostname}:{to.port}")
+            token = hub_token() if hub else dataset_token() if own else None
             timeout = aiohttp.ClientTimeout(total=_ANSWER_S, connect=_CONNECT_S, sock_read=_SILENCE_S)
             # a small compressed answer could expand without limit
             headers = {"Accept-Encoding": "identity"}

@@ -271,11 +271,12 @@ class FusedTrainingNetwork(FusedNetwork):
             g.encode.output, following=(packed.particle_to_cell.parts[0], packed.cell_to_particle.parts[1]),
             products=(g.particle_to_cell.by_particle, g.cell_to_particle.by_particle),
         )  # fmt: skip
+        rows = 128 if interpreting() else 64 if self.precision == "fp16" else 32  # the interpreter needs large steps
         for chunk, base, jobs, chunk_job, chunk_first in self._weight_jobs:
             weight_gradient[(len(chunk_job),)](
                 left=self.left, right=base, totals=self.totals, jobs=jobs, chunk_job=chunk_job,
                 chunk_first=chunk_first, counts=self.counts, unscale=self.unscale,
-                TILE=max(self.width, grid.features, OUT), CHUNK=chunk, STEP=self._rows_at_once(),
+                TILE=max(self.width, grid.features, OUT), CHUNK=chunk, STEP=rows,
                 PRECISION=self.precision, PIPELINED=not interpreting(), num_warps=8,
                 maxnreg=self.tuning.weight_registers,
             )  # fmt: skip
@@ -283,12 +284,6 @@ class FusedTrainingNetwork(FusedNetwork):
 
     def _gradient_operands(self) -> dict[str, Any]:
         return self._operands() | {"totals": self.totals, "unscale": self.unscale}
-
-    def _rows_at_once(self) -> int:
-        """Returns the number of rows of one step of a weight gradient. The interpreter needs large steps."""
-        if interpreting():
-            return 128
-        return 64 if self.precision == "fp16" else 32
 
     def _gradient_of(self, block: Block) -> torch.Tensor:
         """Returns the buffer of a block. It first contains the gradient of the block's output, then of its input."""

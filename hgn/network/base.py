@@ -12,7 +12,7 @@ import torch
 from torch import nn
 
 from hgn.config import MATERIAL_EMBEDDING, NetworkConfig
-from hgn.network.features import WALL_DISTANCE_CELLS, Normaliser, ParticleState, wall_distances
+from hgn.network.features import WALL_DISTANCE_CELLS, Normaliser, ParticleState
 from hgn.network.grid import GridHierarchy
 from hgn.network.mlp import LEAKY_SLOPE, MLP
 from hgn.network.own_physics import physics_columns, physics_widths
@@ -104,8 +104,9 @@ class ParticleNetwork(nn.Module, ABC):
             feature_NF, contacts = self.relative_features(state, grid)
             return self.encode_features(feature_NF, state, contacts)
         velocity_NV = self.normaliser.normalise_velocity(state.velocity_NM3).flatten(1)
-        maximum = WALL_DISTANCE_CELLS * self.config.cell_size
-        wall_N6 = wall_distances(state.position_N3, state.domain_S3[state.scene_N], maximum)
+        farthest = WALL_DISTANCE_CELLS * self.config.cell_size
+        beyond_N3 = state.domain_S3[state.scene_N] - state.position_N3
+        wall_N6 = torch.cat([state.position_N3, beyond_N3], dim=-1).clamp(-farthest, farthest) / farthest
         material_MH = self.encode.project(3, self.embedding.weight) + self.encode.first.bias
         hidden_NH = material_MH.index_select(0, state.material_N)
         self.encode.add_projection(hidden_NH, 0, velocity_NV)

@@ -17,7 +17,7 @@ Shape legend: N particles, K neighbours.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -85,8 +85,9 @@ class RestShape:
             return None
         parts, first = [], 0
         for shape, count in zip(shapes, counts, strict=True):
-            place_N3 = known[0].position_N3.new_zeros(count, 3)
-            parts.append(RestShape.none(place_N3) if shape is None else shape._from(first))
+            part = shape or RestShape.none(known[0].position_N3.new_zeros(count, 3))
+            neighbour_NK = torch.where(part.neighbour_NK < 0, -1, part.neighbour_NK + first)
+            parts.append(replace(part, neighbour_NK=neighbour_NK))
             first += count
         return RestShape(*(torch.cat([getattr(part, name) for part in parts]) for name in _TENSORS))
 
@@ -106,11 +107,6 @@ class RestShape:
 
     def to(self, device: torch.device | str, non_blocking: bool = False) -> RestShape:
         return RestShape(*(getattr(self, name).to(device, non_blocking=non_blocking) for name in _TENSORS))
-
-    def _from(self, first: int) -> RestShape:
-        """Returns the shape with row numbers that begin at `first`."""
-        neighbour_NK = torch.where(self.neighbour_NK < 0, -1, self.neighbour_NK + first)
-        return RestShape(neighbour_NK, self.position_N3, self.coefficient_NK4)
 
 
 _TENSORS = ("neighbour_NK", "position_N3", "coefficient_NK4")

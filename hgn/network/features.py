@@ -104,12 +104,6 @@ class Normaliser(nn.Module):
         return normalised * self.acceleration_std + self.acceleration_mean
 
 
-def wall_distances(position_N3: torch.Tensor, domain_N3: torch.Tensor, maximum: float) -> torch.Tensor:
-    """Returns signed distances to the domain's lower and upper planes, clamped to and divided by maximum, [N, 6]."""
-    distance_N6 = torch.cat([position_N3, domain_N3 - position_N3], dim=-1)
-    return distance_N6.clamp(-maximum, maximum) / maximum
-
-
 def material_rows(material_N: np.ndarray, materials: Sequence[str], names: Sequence[str] = MATERIALS) -> torch.Tensor:
     """Converts indices into `names` to indices into a network's material list, int64 [N].
 

@@ -50,7 +50,8 @@ def neighbour_list(position_N3: torch.Tensor, scene_N: torch.Tensor, radius: flo
     run_K = torch.repeat_interleave(length_Q)
     sender_K = torch.arange(len(run_K), device=run_K.device) + (first_NR.flatten() - end_Q + length_Q)[run_K]
     receiver_K = run_K // runs
-    near_K = _squared_distance(position_N3, sender_K, receiver_K) < radius * radius
+    offset_K3 = position_N3.index_select(0, sender_K) - position_N3.index_select(0, receiver_K)
+    near_K = offset_K3.square().sum(-1) < radius * radius
     near_E = torch.nonzero(near_K).flatten()
     sender_E, receiver_E = sender_K[near_E], receiver_K[near_E]
     offset_N1 = torch.searchsorted(receiver_E, torch.arange(len(key_N) + 1, device=receiver_E.device))
@@ -76,8 +77,3 @@ def _runs(key_N: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     first_NR = torch.searchsorted(key_N, low_NR)
     last_NR = torch.searchsorted(key_N, low_NR + 2 * REACH * AXIS_STRIDE[2], right=True)
     return first_NR, last_NR - first_NR
-
-
-def _squared_distance(position_N3: torch.Tensor, sender_E: torch.Tensor, receiver_E: torch.Tensor) -> torch.Tensor:
-    offset_E3 = position_N3.index_select(0, sender_E) - position_N3.index_select(0, receiver_E)
-    return offset_E3.square().sum(-1)

@@ -20,7 +20,6 @@ from hgn.render import PLY_ENDING
 from hgn.render.pictures import rollout_spacing
 from hgn.render.renderer import MATERIAL_COLORS, OBSTACLE_COLOR, PARTICLE_COLORS
 from hgn.scene.material import FLUIDS
-from hgn.scene.motion import Motion
 from hgn.scene.rollout_file import (
     Rollout,
     frame_velocity,
@@ -193,15 +192,11 @@ def _write_usd(path: Path, rollout: Rollout, surface: bool, progress: Callable[[
         if water is not None:
             fill(water, *next(surfaces), frame)
         for transform, motion in moving:
-            transform.Set(Gf.Matrix4d(_row_matrix(motion, frame / rollout.frame_rate_hz)), frame)
+            rotation_33, origin_3 = motion.transform(frame / rollout.frame_rate_hz)
+            rows = [[*row, 0.0] for row in rotation_33.T.tolist()]  # USD multiplies row vectors, as (x, 1) M
+            transform.Set(Gf.Matrix4d([*rows, [*origin_3.tolist(), 1.0]]), frame)
         progress()
     stage.GetRootLayer().Save()
-
-
-def _row_matrix(motion: Motion, time: float) -> list[list[float]]:
-    """Returns the pose at a time for row vectors, which USD multiplies as (x, 1) M."""
-    rotation_33, origin_3 = motion.transform(time)
-    return [[*row, 0.0] for row in rotation_33.T.tolist()] + [[*origin_3.tolist(), 1.0]]
 
 
 def _identifiers(obstacles: Sequence[Obstacle]) -> list[str]:

@@ -24,7 +24,7 @@ from hgn.scene.episode import Episode
 from hgn.scene.episode_obstacles import obstacles_of_episode
 from hgn.scene.group import WALL_CELLS
 from hgn.scene.rollout_file import Rollout
-from hgn.schema import ConfigError
+from hgn.schema import ConfigError, require
 from hgn.system.files import WRITTEN_BY_HGN, write_atomically
 
 RADIUS_IN_SPACINGS = 0.72  # the spheres overlap a little, so that they look like a body
@@ -49,7 +49,10 @@ def compare_picture(
 
     Raises ConfigError if a frame lies outside the rollout or an entry of `others` has other particles.
     """
-    check_frames(frames, rollout.frame_count)
+    require(len(frames) > 0, "frames", "one frame or more", list(frames))
+    for i, frame in enumerate(frames):
+        rule = f"in [0, {rollout.frame_count}), the frames of the rollout"
+        require(0 <= frame < rollout.frame_count, f"frames[{i}]", rule, frame)
     stage = _stage(rollout, size)
     rows = _versions(rollout, label, others)
     width, height = stage.size
@@ -189,15 +192,6 @@ def rollout_of_episode(episode: Episode, predicted_TN3: np.ndarray | None = None
         materials=episode.materials,
         dimensions=episode.dimensions,
     )
-
-
-def check_frames(frames: Sequence[int], frame_count: int) -> None:
-    """Raises ConfigError if `frames` is empty or has an entry outside [0, frame_count)."""
-    if not len(frames):
-        raise ConfigError("frames must name at least one frame, got []")
-    for i, frame in enumerate(frames):
-        if not 0 <= frame < frame_count:
-            raise ConfigError(f"frames[{i}] must be in [0, {frame_count}), the frames of the rollout, got {frame}")
 
 
 def _stage(rollout: Rollout, size: int) -> Stage:

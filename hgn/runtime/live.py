@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from numbers import Integral
-from types import TracebackType
 from typing import Any
 
 import numpy as np
@@ -57,7 +56,7 @@ class LiveSimulation:
     def __enter__(self) -> LiveSimulation:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def close(self) -> None:

@@ -27,10 +27,6 @@ MOST_WAITING = 10_000  # calls that wait for a logger; later ones are dropped
 Builder = Callable[[Path, dict[str, Any]], Logger]
 
 
-def _tensorboard(run: Path, settings: dict[str, Any]) -> Logger:
-    return TensorBoardLogger(run, name="", version="tensorboard")
-
-
 def _wandb(run: Path, settings: dict[str, Any]) -> Logger:
     # otherwise a process whose server is away would never end
     os.environ.setdefault("WANDB_FINISH_TIMEOUT", f"{standard_patience_s():.0f}")
@@ -55,7 +51,11 @@ def _mlflow(run: Path, settings: dict[str, Any]) -> Logger:
     return logger
 
 
-BUILDERS: dict[str, Builder] = {"tensorboard": _tensorboard, "wandb": _wandb, "mlflow": _mlflow}
+BUILDERS: dict[str, Builder] = {
+    "tensorboard": lambda run, settings: TensorBoardLogger(run, name="", version="tensorboard"),
+    "wandb": _wandb,
+    "mlflow": _mlflow,
+}
 
 
 def _stored_id(run: Path, kind: str, variable: str) -> str | None:

@@ -79,7 +79,10 @@ class PlaySession:
         self._bodies: WeakSet[Body] = WeakSet()  # bodies that viewers have added
         initial = InitialState.of_scene(replace(scene, obstacles=()))
         require(not scene.moves, "obstacles", "at rest for a network", "keyframes", "leave keyframes out")
-        self.obstacles: tuple[PlacedObstacle, ...] = tuple(self._placed_by(scene, folder))
+        self.obstacles: tuple[PlacedObstacle, ...] = tuple(
+            placed_by(from_mapping(ObstacleEntry, entry), folder, scene.cell_size)
+            for entry in scene.specification.get("obstacles", ())
+        )
         self._begin, self._begin_obstacles = with_obstacles(initial, self.obstacles), self.obstacles
         self.live = LiveSimulation(simulator, self._begin, maximum_particles)
         self._record_first()
@@ -243,10 +246,6 @@ class PlaySession:
         return position_N3[((position_N3 >= low_3) & (position_N3 <= high_3)).all(axis=1)]
 
     # obstacles
-
-    def _placed_by(self, scene: Scene, folder: Path) -> list[PlacedObstacle]:
-        entries = scene.specification.get("obstacles", ())
-        return [placed_by(from_mapping(ObstacleEntry, entry), folder, scene.cell_size) for entry in entries]
 
     def add_obstacle(self, entry: ObstacleEntry, folder: Path = Path()) -> PlacedObstacle:
         """Adds an obstacle of a shape, or of a mesh file in a folder. Raises ConfigError as a scene file does."""

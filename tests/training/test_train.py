@@ -257,24 +257,6 @@ def test_a_finished_run_can_go_on(finished):
     assert [rates[n] for n in (16, 20)] == pytest.approx([5e-4 * 0.2 ** (n / 20) for n in (16, 20)])
 
 
-def test_a_checkpoint_of_the_first_release(finished):
-    """It counted updates in Lightning's loops and had a scheduler and skipped updates of its own; it resumes."""
-    data, run = finished
-    path = run / "checkpoints" / "last.ckpt"
-    checkpoint = read_checkpoint(path)
-    assert checkpoint["hgn"].pop("skipped") == 0
-    checkpoint["callbacks"]["GradientGuard"] = {"skipped": 3}
-    checkpoint["hgn"]["cursor"] = checkpoint["hgn"].pop("sampler_state")
-    checkpoint["lr_schedulers"] = [{"last_epoch": 12, "base_lrs": [1e-3]}]
-    steps = checkpoint["loops"]["fit_loop"]["epoch_loop.manual_optimization.optim_step_progress"]
-    steps["total"] = {"ready": 12, "completed": 12}
-    torch.save(checkpoint, path)
-    assert train.main(train_mapping(data, run, maximum_updates=16)) == 0
-    stored = read_checkpoint(path)["hgn"]
-    assert (stored["updates"], stored["skipped"], stored["sampler_state"]["epoch"]) == (16, 3, 1)
-    assert [record["skipped_updates"] for record in metrics(run) if "loss" in record] == [0, 0, 0, 3]
-
-
 def test_training_learns(make_config, make_dataset, run):
     """On free fall with strong velocity noise, 80 updates learn to undo a good part of the noise."""
     config = make_config(training_scenes=6, frames=30)

@@ -16,7 +16,7 @@ from hgn.system.files import write_json
 from hgn.system.progress import bar
 from tools import report
 from tools.bench.config import CASES, FRAME_CASES, TRAIN_CASES, BenchConfig
-from tools.bench.contenders import Contender, Frame, MpmFrame, Train, checked_workload
+from tools.bench.contenders import Contender, Frame, MpmFrame, Train
 from tools.bench.states import TILE_PARTICLES, Workload
 from tools.bench.triton_contenders import TritonFrame, TritonTrain
 from tools.report import EXIT_RED, PASS
@@ -24,6 +24,7 @@ from tools.timing import GpuMemory, Timed, alternate, free, matmul_precision, st
 
 GPU_PARTICLES, GPU_SCENES = (TILE_PARTICLES, 40_000, 400_000), (1, 8, 32)
 CPU_PARTICLES, CPU_SCENES = (TILE_PARTICLES,), (1,)
+FRAME_CHECKED = 50_000  # particles of all scenes whose frame fits in float64
 OUT_OF_MEMORY = "out of memory"
 ROUNDS = 50  # samples of a contender
 Row = dict[str, Any]
@@ -105,7 +106,8 @@ def _prepare(
             return row | {"particles": mpm.particles, "check": PASS}, mpm
         make, backend = _maker(config, device, precision, case)
         row |= {} if backend is None else {"backend": backend}
-        checked = checked_workload(work, "frame" if case in FRAME_CASES else "train")
+        fits = work.particles * work.scenes <= (FRAME_CHECKED if case in FRAME_CASES else TILE_PARTICLES)
+        checked = work if fits else Workload(min(work.particles, TILE_PARTICLES), 1)
         row["check"] = make(network, checked, device, precision).check(precision)
         row["checked_particles"] = checked.particles * checked.scenes
         if row["check"] != PASS:

@@ -23,7 +23,7 @@ from hgn.runtime.parity import relative_error
 from hgn.runtime.simulator import Simulator
 from hgn.training.torch_updates import batch_loss
 from hgn.training.updates import build_optimizer
-from tools.bench.states import SPEED, TILE_PARTICLES, Workload, batch_of, scene_of, state_of
+from tools.bench.states import SPEED, Workload, batch_of, scene_of, state_of
 from tools.report import PASS
 from tools.timing import FrameClock, Timed, once
 
@@ -32,16 +32,8 @@ BOUNDS = {"fp32": 1e-5, "tf32": 2e-3, "fp16": 2e-3}  # relative error in the nor
 # flipped fraction is about the rounding error, and the error of the gradient about the root of this fraction.
 GRADIENT_BOUNDS = {"fp32": 1e-3, "tf32": 5e-2, "fp16": 5e-2}
 FRAME_RATE_HZ = 60.0
-CHECKED_AT_MOST = {"frame": 50_000, "train": TILE_PARTICLES}  # particles of all scenes
 MPM_ROUNDS, MPM_FRAMES = 5, 20  # samples of the solver, and frames of each
 OBSTACLE_CELL_SIZE = 1 / 64
-
-
-def checked_workload(work: Workload, what: str) -> Workload:
-    """Returns the workload, or one scene if float64 does not fit."""
-    if work.particles * work.scenes <= CHECKED_AT_MOST[what]:
-        return work
-    return Workload(min(work.particles, TILE_PARTICLES), 1)
 
 
 def bench_network(config: NetworkConfig, device: torch.device) -> ParticleNetwork:
