@@ -22,8 +22,10 @@ RUN_VARIABLE = "HGN_RUN"  # environment variable with the run's name or folder
 MESSAGE_MB = 4  # size of a message: gradients of the last layers are sent while those of the first layers are computed
 _RANKS = {"RANK": "WORLD_SIZE", "LOCAL_RANK": "LOCAL_WORLD_SIZE", "SLURM_PROCID": "SLURM_NTASKS"}
 _COUNTS = (*_RANKS.values(), "SLURM_NNODES")
-# set by mpirun and jsrun
+# variables of mpirun, jsrun, prun and flux, with their values for a single process; prun sets no count
 _MPI_COUNTS = ("OMPI_COMM_WORLD_SIZE", "PMI_SIZE", "MV2_COMM_WORLD_SIZE", "MPI_LOCALNRANKS", "JSM_NAMESPACE_SIZE")
+_SINGLE = dict.fromkeys((*_MPI_COUNTS, "FLUX_JOB_SIZE"), "1")
+_SINGLE |= dict.fromkeys(("OMPI_COMM_WORLD_RANK", "PMI_RANK", "PMIX_RANK", "FLUX_TASK_RANK"), "0")
 _RANDOM_ID = re.compile(r"[0-9a-f]{8}(-[0-9a-f]{4}){3}-[0-9a-f]{12}")
 
 
@@ -166,9 +168,9 @@ def _check_launcher() -> None:
             "process without; as in srun python -m hgn.train, or sbatch --ntasks=1"
         )
     elif not started_by_srun():
-        for name in _MPI_COUNTS:
-            rule, count = "1 without torchrun's variables", os.environ.get(name, "1")  # each process would train alone
-            require(count == "1", name, rule, count, remedy="start with torchrun or srun instead of mpirun")
+        for name, single in _SINGLE.items():  # each process would train alone
+            rule, number = f"{single} without torchrun's variables", os.environ.get(name, single)
+            require(number == single, name, rule, number, remedy="start with torchrun or srun instead")
         for name in ("LOCAL_RANK", "NODE_RANK"):  # Lightning's launcher sets them with WORLD_SIZE
             alone, rank = "WORLD_SIZE" not in os.environ, os.environ.get(name, "0")
             require(not alone or rank == "0", name, "0 without WORLD_SIZE", rank, remedy="unset it for one process")

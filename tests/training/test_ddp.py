@@ -30,11 +30,14 @@ from hgn.training.torch_updates import TorchUpdates
 ROOT = Path(__file__).resolve().parents[2]
 PROGRAM = Path(__file__).with_name("ddp_program.py")
 ADAM_BETA_1 = 0.9
+# values for one process of variables that mpirun, jsrun, prun and flux set
+ALONE = dict.fromkeys(("OMPI_COMM_WORLD_SIZE", "PMI_SIZE", "JSM_NAMESPACE_SIZE", "FLUX_JOB_SIZE"), "1")
+ALONE |= dict.fromkeys(("OMPI_COMM_WORLD_RANK", "PMI_RANK", "PMIX_RANK", "FLUX_TASK_RANK"), "0")
 LAUNCHER_VARIABLES = (
     *("HGN_RUN", "RANK", "WORLD_SIZE", "LOCAL_RANK", "LOCAL_WORLD_SIZE", "NODE_RANK", "TORCHELASTIC_RUN_ID"),
     *("TORCHELASTIC_USE_AGENT_STORE", "TORCHELASTIC_MAX_RESTARTS", "TORCH_DISABLE_SHARE_RDZV_TCP_STORE"),
-    *("SLURM_PROCID", "SLURM_NTASKS", "SLURM_NNODES", "SLURM_JOB_NAME", "SLURM_JOB_ID"),
-    *("SLURM_STEP_ID", "SLURM_STEP_NUM_TASKS", "OMPI_COMM_WORLD_SIZE", "PMI_SIZE"),
+    *(f"SLURM_{name}" for name in ("PROCID", "NTASKS", "NNODES", "JOB_NAME", "JOB_ID", "STEP_ID", "STEP_NUM_TASKS")),
+    *ALONE,
 )
 
 
@@ -226,6 +229,7 @@ BOTH = {"SLURM_PROCID": "1", "SLURM_NTASKS": "2", "RANK": "3", "LOCAL_RANK": "1"
 RANDOM_ID = "5bd6a8f0-93a5-4c5b-9b8c-0a52b6cf3d11"
 NO_RESTARTS = (("MAX_RESTARTS", "0"), ("USE_AGENT_STORE", "False"))
 RESTARTS = {"TORCHELASTIC_USE_AGENT_STORE": "True", "TORCHELASTIC_MAX_RESTARTS": "3"}
+OTHERS = "devices must be the {} processes that the launcher started on each of {} machines"
 
 
 @pytest.mark.parametrize(
@@ -261,15 +265,11 @@ def test_what_a_launcher_says(no_launcher, variables, first, started, folder):
     assert (first_rank(), layout(TrainingConfig(device="cpu")), str(default_run("small"))) == (first, started, folder)
 
 
-OTHER_COUNTS = ("OMPI_COMM_WORLD_SIZE", "PMI_SIZE", "JSM_NAMESPACE_SIZE")
-OTHERS = "devices must be the {} processes that the launcher started on each of {} machines"
-
-
 @pytest.mark.parametrize(
     ("variables", "expected"),
     [
-        ({}, (2, 1)),
-        (TORCHRUN | {"OMPI_COMM_WORLD_SIZE": "4"}, (2, 2)),
+        (ALONE, (2, 1)),
+        (TORCHRUN | dict.fromkeys(ALONE, "4"), (2, 2)),
         (TORCHRUN | {"WORLD_SIZE": "3"}, OTHERS.format(3, 1)),
         (TORCHRUN | {"LOCAL_WORLD_SIZE": "4"}, OTHERS.format(4, 1)),
         ({"SLURM_STEP_ID": "0", "SLURM_PROCID": "0", "SLURM_NTASKS": "4", "PMI_SIZE": "4"}, (2, 2)),
@@ -284,7 +284,7 @@ OTHERS = "devices must be the {} processes that the launcher started on each of 
         ({"RANK": "1", "LOCAL_RANK": "1"}, "WORLD_SIZE must be set where RANK is"),
         ({"SLURM_PROCID": "0", "SLURM_NTASKS": "4"}, "must be started with srun in a job of 4 tasks"),
         ({**SLURM, "SLURM_STEP_NUM_TASKS": "1"}, "must be started with srun in a job of 8 tasks"),
-        *(({name: "4"}, f"{name} must be 1 .*, got '4'; start with torchrun") for name in OTHER_COUNTS),
+        *(({name: "4"}, f"{name} must be {alone} .*, got '4'; start with torchrun") for name, alone in ALONE.items()),
         *(({name: "1"}, f"{name} must be 0 without WORLD_SIZE, got '1'") for name in ("LOCAL_RANK", "NODE_RANK")),
         (SLURM | {"SLURM_NNODES": "3"}, "SLURM_NTASKS must be a multiple of the 3 nodes, got 8"),
         (RESTARTS, r"STORE must be 1 in torchrun's environment .*--max-restarts 3\), got nothing"),
