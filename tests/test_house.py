@@ -16,10 +16,10 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 33_732,
+    "hgn": 33_746,
     "datagen": 9_034,
     "tools": 6_491,
-    "tests": 33_414,
+    "tests": 33_467,
 }
 SETTINGS = 240  # fields of the dataclasses behind the commands, *Config
 

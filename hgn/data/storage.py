@@ -401,16 +401,23 @@ def _transient(error: Exception, url: str) -> str | None:
         return None
     malformed = type(error.__cause__).__module__ == "aiohttp.http_exceptions"  # aiohttp invents status 400
     status = None if malformed else getattr(error, "status", None)
-    if status in (401, 403) or isinstance(error, PermissionError):
+    # 416: a proxy has an older, shorter index file
+    lasting = isinstance(status, int) and 400 <= status < 500 and status not in (408, 416, 425, 429)
+    if lasting and (status == 407 or type(error).__name__ == "ClientHttpProxyError"):
         raise StorageError(
-            f"{url} must be open to this program, got refused; set {TOKEN_VARIABLE} to the service's token (if "
-            f"{TOKEN_HOST_VARIABLE} is set, only that host receives it; object stores need their own credentials, "
-            "the Hugging Face Hub needs HF_TOKEN)"
+            f"{url} must be open to the proxy of http_proxy or https_proxy, got its answer {status}; give it the user "
+            "and password that it needs, or set no_proxy"
+        ) from None
+    if status in (401, 403) or isinstance(error, PermissionError):
+        either = url.startswith("http://") and "http" in getproxies() and _uses_proxies(url)
+        raise StorageError(
+            f"{url} must be open to this program, got refused{' by its server or the proxy of http_proxy' * either}; "
+            f"set {TOKEN_VARIABLE} to the service's token (if {TOKEN_HOST_VARIABLE} is set, only that host receives "
+            "it; object stores need their own credentials, the Hugging Face Hub needs HF_TOKEN)"
         ) from None
     if status == 410:
         raise StorageError(f"{url} is damaged at its service; delete it there and run the generator again") from None
-    # 416: a proxy has an older, shorter index file
-    if isinstance(status, int) and 400 <= status < 500 and status not in (408, 416, 425, 429):
+    if lasting:
         raise StorageError(
             f"{url} must be a file of a data set, got the answer {status}; check dataset.folder"
         ) from None

@@ -141,6 +141,11 @@ def _passing(error: Exception, url: str, field: str) -> str | None:
     from huggingface_hub import errors
 
     status = getattr(getattr(error, "response", None), "status_code", None)
+    if status == 407 or (type(error).__name__ == "ProxyError" and str(error).startswith("4")):
+        raise ConfigError(
+            f"{field} must be open to the proxy of http_proxy or https_proxy, got its answer {status or error} for "
+            f"{url}; give it the user and password that it needs, or set no_proxy"
+        ) from None
     refused = isinstance(error, errors.RepositoryNotFoundError) or status in (401, 403)
     if refused:
         remedy = "check the name; a private one needs a token in HF_TOKEN"

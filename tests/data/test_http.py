@@ -33,6 +33,20 @@ class PlainFiles(Quiet, http.server.SimpleHTTPRequestHandler):
     """Knows no ranges."""
 
 
+def refusing(status):
+    """A proxy's handler that answers with a status only."""
+
+    class Proxy(Quiet, http.server.BaseHTTPRequestHandler):
+        def do_GET(self):
+            self.send_response(status)
+            self.send_header("Content-Length", "0")
+            self.end_headers()
+
+        do_CONNECT = do_GET
+
+    return Proxy
+
+
 @contextlib.contextmanager
 def answering(handler):
     """The URL of a server of its own."""
@@ -119,6 +133,32 @@ def test_proxies_are_honoured(monkeypatch, variable):
         monkeypatch.setenv(variable, proxy)
         with pytest.raises(ConfigError, match=f"{variable.lower()} must be as http://host:port, got "):
             hgn.data.storage._uses_proxies("http://11.0.0.1/set")
+
+
+@pytest.mark.parametrize(
+    ("scheme", "status", "message"),
+    [
+        ("http", 407, "open to the proxy of http_proxy or https_proxy, got its answer 407"),
+        ("https", 407, "open to the proxy of http_proxy or https_proxy, got its answer 407"),
+        *(("https", status, f"open to the proxy of .*, got its answer {status}") for status in (401, 403, 404, 410)),
+        (
+            "http",
+            403,
+            "open to this program, got refused by its server or the proxy of http_proxy; set HGN_DATASET_TOKEN",
+        ),
+        ("https", 429, "no answer for 0 s .at last: 429"),
+    ],
+)
+def test_proxies_that_refuse_are_named(monkeypatch, scheme, status, message):
+    """A proxy's own answer is not the server's. Only a 403 for a plain address may be of either."""
+    for name in ("http_proxy", "https_proxy", "no_proxy"):
+        monkeypatch.setenv(name, "")
+    monkeypatch.setenv("HGN_PATIENCE_S", "0")
+    hgn.data.storage._remote.cache_clear()
+    with answering(refusing(status)) as address:
+        monkeypatch.setenv(f"{scheme}_proxy", address)
+        with pytest.raises((ConfigError, OSError), match=message):
+            open_storage(f"{scheme}://data.example:9/set").manifest("manifest.json")
 
 
 def test_server_without_ranges(folder, monkeypatch):

@@ -10,6 +10,7 @@ import pytest
 import torch
 from data import hub_server
 from data.hub_server import TOKEN, served
+from data.test_http import answering, refusing
 from network.states import network_of
 
 from hgn import card
@@ -71,6 +72,18 @@ def test_proxies(hub, monkeypatch, proxy, message):
     else:
         with pytest.raises(ConfigError, match=message):
             find_weights("hf://one/net")
+    huggingface_hub.close_session()
+
+
+@pytest.mark.parametrize(("scheme", "status"), [("http", 407), ("https", 407), ("https", 403)])
+def test_proxies_that_refuse_are_named(hub, monkeypatch, scheme, status):
+    """A proxy's own answer is not that of the Hub, and is not waited out."""
+    with answering(refusing(status)) as address:
+        monkeypatch.setenv("HF_ENDPOINT", f"{scheme}://data.example")
+        monkeypatch.setenv(f"{scheme}_proxy", address)
+        huggingface_hub.close_session()
+        with pytest.raises(ConfigError, match=f"weights must be open to the proxy of .*, got its answer .*{status}"):
+            hub_weights("hf://one/net")
     huggingface_hub.close_session()
 
 
