@@ -18,8 +18,8 @@ PACKAGES = ("hgn", "datagen", "tools")
 LINES = {  # of Python, in tracked files
     "hgn": 33_746,
     "datagen": 9_034,
-    "tools": 6_491,
-    "tests": 33_467,
+    "tools": 6_487,
+    "tests": 33_454,
 }
 SETTINGS = 240  # fields of the dataclasses behind the commands, *Config
 

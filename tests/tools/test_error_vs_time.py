@@ -180,19 +180,6 @@ def test_labels_of_the_figures_lie_side_by_side(monkeypatch):
     assert len(spans) == 3 and edges == sorted(edges)
 
 
-@pytest.mark.usefixtures("undrawn")
-def test_shorter_rollouts_of_the_solver(compare, simulated, monkeypatch):
-    """A shorter rollout of the solver is scored up to its end, and each setting is simulated once."""
-    monkeypatch.setattr("tools.error_vs_time.command.shipped_weights", dict)
-    report = compare(weights=None, resimulate=False, mpm_grids=[64], mpm_frames=3)
-    (scored,) = (call for call in simulated if call.frames == 3)
-    assert (scored.cells, scored.steps) == (64, [0.5, 1.0])  # of one grid side by side
-    assert {call.frames for call in simulated} == {2, 3, 4}
-    assert all(len(call.steps) == 1 for call in simulated if call is not scored)
-    assert systems(report) == ["baseline"] * 4 + ["mpm", "mpm"]
-    assert report["rows"][-1]["scenes_reached"] == {"5": 0} and report["rows"][-1]["failed_scenes"] == 0
-
-
 @pytest.mark.usefixtures("undrawn", "one_step")
 def test_a_reference_of_a_finer_grid(make_config, make_dataset, compare, simulated):
     """Data of a finer grid is the reference, and is not simulated again on its own. Solvers on finer grids get the

@@ -66,10 +66,8 @@ def main(mapping: dict[str, Any]) -> int:
 
     @functools.cache
     def launches(grid: int) -> SolverLaunches:
-        reference = resimulate and grid == reference_grid
-        most = frames if reference else min(frames, config.mpm_frames)
         cell_size = own_cell if grid == own_grid else 1 / grid
-        return SolverLaunches(solver_on_grid(mpm, cell_size, own_cell), cell_size, rate, most)
+        return SolverLaunches(solver_on_grid(mpm, cell_size, own_cell), cell_size, rate, frames)
 
     networks = network_contenders(config, device, episodes)
     solvers = solver_contenders(config, mpm, launches, own_grid, reference_grid, resimulate)
@@ -189,7 +187,7 @@ def solver_contenders(
     step = REFERENCE_STEP if resimulate else mpm.stability_fraction
 
     def solver(grid: int, step: float, perturbation: float = 0.0, **named: Any) -> SolverContender:
-        return SolverContender(launches(grid), Setting(step, perturbation), config.mpm_frames, named)
+        return SolverContender(launches(grid), Setting(step, perturbation), named)
 
     contenders = [solver(grid, step) for grid in config.mpm_grids for step in STEPS]
     if config.perturbation:

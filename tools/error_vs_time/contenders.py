@@ -114,17 +114,16 @@ class SolverContender(Contender):
 
     all_at_once = True  # a single scene uses only a few of a GPU's processors
 
-    def __init__(self, launches: SolverLaunches, setting: Setting, frames: int, named: Row | None = None) -> None:
-        """Takes the number of `frames` of scored rollouts; `named` replaces the row that the settings give."""
-        self.launches, self.setting, self.frames = launches, setting, frames
+    def __init__(self, launches: SolverLaunches, setting: Setting, named: Row | None = None) -> None:
+        """`named` replaces the row that the settings give."""
+        self.launches, self.setting = launches, setting
         grid = round(1 / launches.cell_size)
         self.row = named or {"system": "mpm", "grid": grid, "step": setting.step, "precision": "fp32"}
 
     def trials(self, episodes: Sequence[Episode], frames: int, on_frame: OnFrame) -> list[RolloutResult]:
         if on_frame is not None:
             return self.launches.simulate([(self.setting, episode) for episode in episodes], frames, on_frame)
-        trials, most = self.launches.trials(self.setting, episodes), min(frames, self.frames)
-        return [RolloutResult(trial.position_TN3[:most], trial.cause) for trial in trials]
+        return self.launches.trials(self.setting, episodes)
 
 
 class BaselineContender(Contender):

@@ -32,7 +32,6 @@ class ErrorVsTimeConfig(ReportConfig):
     # fp32, tf32, fp16 where supported; null: all on a GPU (tf32 for GNS), fp32 on a CPU
     precisions: tuple[Precision, ...] | None = None
     mpm_grids: tuple[Annotated[int, Bound("at least 8", lambda value: value >= 8)], ...] = (32, 48, 64)  # cells a unit
-    mpm_frames: FrameCount = 300  # of the solver's rollouts, which take most of the time
     resimulate: bool = True  # false: the reference is the data; with mpm_grids=[] perturbation=0 no solver runs
     # initial displacement, domain units, by which the solver is compared with itself (chaos floor); 0: no such row
     perturbation: NonNegative[float] = 1e-6
