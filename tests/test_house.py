@@ -16,10 +16,10 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 33_746,
+    "hgn": 33_751,
     "datagen": 9_034,
     "tools": 6_487,
-    "tests": 33_454,
+    "tests": 33_474,
 }
 SETTINGS = 240  # fields of the dataclasses behind the commands, *Config
 

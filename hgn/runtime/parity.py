@@ -29,7 +29,9 @@ class ParityError(ConfigError):
 # Normalised accelerations. Latent vectors have size 1 for any output, so rounding to 11 bits (fp16, tf32) changes small
 # and large outputs by the same amount: 6e-4 on an H100, in a scene at rest. The bound is 2.5 times that.
 OUTPUTS = Quantity("outputs", 0.05, least=0.03)
-GRADIENTS = Quantity("gradients", 0.3)
+# The gradient of one parameter tensor. Rounding to 11 bits changes the worst of 395 tensors by 0.03 in 5,500 particles,
+# and by up to 0.23 in 560. A gradient that is missing has the error 1. `least` is 1e-7 of the largest gradients.
+GRADIENTS = Quantity("gradients", 0.3, least=1e-7)
 
 
 def relative_error(computed: torch.Tensor, expected: torch.Tensor, least: float = 0.0) -> float:

@@ -1,6 +1,7 @@
 """Compares training kernels with PyTorch on the first batch, before the first update (bounds: hgn.runtime.parity).
 
-It compares the outputs, and the gradients of a random weighted sum of the outputs.
+It compares the outputs, and for each parameter tensor the gradient of the mean absolute output, whose terms do not
+cancel. Gradients of a sum with random signs are badly conditioned: rounding to 11 bits changes them by up to 0.7.
 
 Shape legend: N particles of all scenes, S scenes.
 """
@@ -47,10 +48,9 @@ def require_update_parity(
     if moving is not None:
         moving = moving if symmetries is None else moving_under(moving, symmetries)
         state = replace(state, moving=moving.to(updates.device))
-    generator = torch.Generator().manual_seed(0)
-    weight_N3 = torch.randn(count, 3, generator=generator).to(updates.device) * updates.share_N[:count, None]
     parameters = list(network.parameters())
     output_N3 = network.normalised_acceleration(state, origin_S3)
+    weight_N3 = output_N3.detach().sign() * updates.share_N[:count, None]
     slopes = torch.autograd.grad((output_N3 * weight_N3).sum(), parameters, allow_unused=True)
     output_error = require_parity(
         fused.output[:count, :3], output_N3.detach(), OUTPUTS, updates.precision, section="training."
@@ -60,11 +60,14 @@ def require_update_parity(
     fused.backward()
     gradients = [torch.zeros_like(parameter) for parameter in parameters]
     updates.packed.scatter(fused.totals[: updates.packed.size], gradients)
-    expected = [torch.zeros_like(p) if g is None else g for p, g in zip(parameters, slopes, strict=True)]
-    flat, expected_flat = (torch.cat([tensor.flatten() for tensor in each]) for each in (gradients, expected))
-    gradient_error = require_parity(flat, expected_flat, GRADIENTS, updates.precision, section="training.")
+    gradient_error = max(
+        require_parity(
+            own, torch.zeros_like(own) if slope is None else slope, GRADIENTS, updates.precision, section="training."
+        )
+        for own, slope in zip(gradients, slopes, strict=True)
+    )
     if updates.device.type == "cuda":
-        del output_N3, slopes, expected, expected_flat
+        del output_N3, slopes
         torch.cuda.empty_cache()  # free memory determines where episodes are stored
     return output_error, gradient_error
 

@@ -239,3 +239,23 @@ def test_wrong_kernels_are_refused():
     updates.predict(samples)
     with pytest.raises(ConfigError, match=r"must be torch on this machine.*set training.backend=torch"):
         require_update_parity(updates, episodes)
+
+
+def test_a_wrong_gradient_of_any_tensor_is_refused(monkeypatch):
+    """The gradient of each tensor is compared by itself: one that is 0 or has the wrong sign is refused, although most
+    tensors have a small part of all gradients. With fp16 kernels that are right pass."""
+    network = network_of(width=16, levels=1, message_passing_steps=1, cell_size=0.1)
+    samples, episodes = one_with_obstacles()
+    updates = updates_of(network, 2, (64,), precision="fp16", noise_std=1e-3, grid_jitter=True)
+    updates.predict(samples)
+    assert max(require_update_parity(updates, episodes)) < 0.1
+    totals, right = updates.fused.totals, updates.fused.totals.clone()
+    monkeypatch.setattr(updates.fused, "backward", lambda: None)  # `totals` has the gradients already
+    index, end = updates.packed.index.to(totals.device), 0
+    for parameter in updates.network.parameters():
+        begin, end = end, end + parameter.numel()
+        for factor in (0, -1):
+            totals.copy_(right)
+            totals[: updates.packed.size][(begin <= index) & (index < end)] *= factor
+            with pytest.raises(ConfigError, match=r"must be tf32 on this machine.*its gradients differ"):
+                require_update_parity(updates, episodes)
