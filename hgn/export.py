@@ -20,7 +20,6 @@ from hgn.system.files import require_place
 
 if TYPE_CHECKING:
     from hgn.network.base import ParticleNetwork
-    from hgn.network.features import ParticleState
 
 
 @dataclass(frozen=True)
@@ -64,8 +63,8 @@ class ExportConfig:
 
 def main(mapping: dict[str, Any]) -> int:
     """Writes the files that the settings name. Returns the exit code."""
-    from hgn.runtime.exported_step import traced_step, write_onnx, write_package
-    from hgn.runtime.simulator import Simulator
+    from hgn.runtime.exported_step import initial_arrays, traced_step, write_onnx, write_package
+    from hgn.runtime.simulator import InitialState, Simulator
     from hgn.runtime.weights import find_weights, load_weights
     from hgn.system.device import choose_device
 
@@ -92,8 +91,12 @@ def main(mapping: dict[str, Any]) -> int:
         assert config.scene is not None
         simulator = Simulator(network, info.frame_rate_hz, "torch", info=info)
         scene = load_scene(find_scene(config.scene))
+        start = InitialState.of_scene(scene)
+        rule = "without keyframes with arrays, because exported frames have no moving obstacles"
+        require(not start.moving, "scene", rule, config.scene)
         corner_F33 = barrier_pieces(all_corners(scene.obstacles), scene.cell_size, scene.domain_size)
-        write_arrays(Path(config.arrays), simulator.start([scene]), corner_F33)
+        arrays = initial_arrays(network.config, simulator.start([start]), corner_F33, start.parameters)
+        write_arrays(Path(config.arrays), arrays)
         print(config.arrays)
     if config.onnx is not None or config.package is not None:
         program = traced_step(network, info)
@@ -155,16 +158,13 @@ def change_step(network: ParticleNetwork, changes: dict[str, Any]) -> None:
     network.step = step
 
 
-def write_arrays(folder: Path, state: ParticleState, corner_F33: np.ndarray) -> None:
-    """Writes the first inputs of a step, one .npy file for each. The corners are those of `initial_arrays`."""
-    from hgn.runtime.exported_step import initial_arrays
-
-    arrays = {f"{name}.npy": array for name, array in initial_arrays(state, corner_F33).items()}
-    others = {file.name for file in folder.glob("*.npy")}
+def write_arrays(folder: Path, arrays: dict[str, np.ndarray]) -> None:
+    """Writes the first inputs of a step, one .npy file for each."""
+    others = {file.stem for file in folder.glob("*.npy")}
     require(others in (set(), set(arrays)), "arrays", "a new folder, or one that HGN wrote", str(folder))
     folder.mkdir(parents=True, exist_ok=True)
     for name, array in arrays.items():
-        np.save(folder / name, array)
+        np.save(folder / f"{name}.npy", array)
 
 
 if __name__ == "__main__":

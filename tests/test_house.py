@@ -16,10 +16,10 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 33_751,
+    "hgn": 33_818,
     "datagen": 9_034,
     "tools": 6_487,
-    "tests": 33_474,
+    "tests": 33_568,
 }
 SETTINGS = 240  # fields of the dataclasses behind the commands, *Config
 

@@ -114,7 +114,8 @@ _TENSORS = ("neighbour_NK", "position_N3", "coefficient_NK4")
 
 def elastic_columns(position_N3: torch.Tensor, rest: RestShape, scale: torch.Tensor) -> torch.Tensor:
     """Returns the columns [N, COLUMNS] of particles at these places. `scale` is s_a."""
-    own_N1 = torch.arange(len(position_N3), device=position_N3.device)[:, None]
+    count = position_N3.shape[0]  # len() would fix the size of an exported graph
+    own_N1 = torch.arange(count, device=position_N3.device)[:, None]
     offset_NK3 = position_N3[torch.where(rest.neighbour_NK < 0, own_N1, rest.neighbour_NK)] - position_N3[:, None]
     fit_N34 = offset_NK3.transpose(1, 2) @ rest.coefficient_NK4.to(position_N3)
     gradient_N33, residual_N3 = fit_N34[..., :3], fit_N34[..., 3]

@@ -133,7 +133,7 @@ def surface_friction(
     wall_N3 = torch.zeros_like(state.position_N3)
     if state.wall_friction_S3 is not None:
         wall_N3 = state.wall_friction_S3[state.scene_N]
-    columns, rough_N33 = [], wall_N6.new_zeros(len(wall_N6), 3, 3)
+    columns, rough_N33 = [], wall_N6.new_zeros(wall_N6.shape[0], 3, 3)
     if cell_N8 is not None:
         here_N4, ahead_N4 = (pad(surface, (0, 4 - surface.shape[1])) for surface in cell_N8.chunk(2, dim=1))
         first_N4 = first_surface([here_N4, ahead_N4])

@@ -2,9 +2,10 @@
 
 The graph is traced from the reference, hgn.network. It contains features, grid, network, constraints and integration.
 The numbers of particles, obstacle cells and triangles may change from frame to frame, up to LARGEST_EXPORTED. The graph
-raises no errors, so its caller checks that positions are finite. INPUTS and OUTPUTS name its tensors. `initial_arrays`
-returns the inputs of a scene.
-Shape legend: N particles, H velocities, K obstacle cells, F triangles of obstacles.
+raises no errors, so its caller checks that positions are finite. `input_names` and OUTPUTS name its tensors.
+`initial_arrays` returns the inputs of a scene.
+Shape legend: N particles, H velocities, K obstacle cells, F triangles of obstacles, P parameters, R particles with a
+rest shape (0, or N), B neighbours at rest.
 """
 
 from __future__ import annotations
@@ -18,14 +19,20 @@ from typing import Any
 import numpy as np
 import torch
 from torch import nn
+from torch.nn.functional import pad
 
+from hgn.config import NetworkConfig
 from hgn.network.barriers import Barriers, barrier_rows
 from hgn.network.base import ParticleNetwork
 from hgn.network.cell_keys import COORDINATE_LIMIT, LARGEST_EXPORTED, pack, unpack
+from hgn.network.elastic import RestShape
 from hgn.network.features import ParticleState
 from hgn.network.hgn import HierarchicalGraphNetwork
 from hgn.network.obstacles import ObstacleCells
+from hgn.network.own_physics import scaled_parameters
 from hgn.runtime.weights import WeightsInfo
+from hgn.scene.own_physics import NOMINAL_P
+from hgn.scene.rest_shape import NEIGHBOURS
 from hgn.schema import require, to_mapping
 from hgn.step.reference import accelerations, advanced
 from hgn.system.files import make_folder, sync_folder, sync_written, write_atomically
@@ -34,8 +41,20 @@ INPUTS = (
     "position", "velocity", "material", "domain_size", "gravity", "obstacle_cell", "obstacle_normal",
     "obstacle_triangle",
 )  # fmt: skip
+OWN_INPUTS = {
+    "friction": ("wall_friction", "obstacle_friction"),
+    "parameters": ("parameters",),
+    "elastic": ("rest_position", "rest_neighbour"),
+}  # the inputs that follow for each of `network.own_physics`
 OUTPUTS = ("next_position", "next_velocity")
-EXAMPLE_PARTICLES, EXAMPLE_CELLS, EXAMPLE_TRIANGLES = 64, 32, 16  # sizes for tracing; the graph does not depend on them
+# sizes for tracing; the graph does not depend on them
+EXAMPLE_PARTICLES, EXAMPLE_CELLS, EXAMPLE_TRIANGLES, EXAMPLE_RESTS = 64, 32, 16, 8
+
+
+def input_names(config: NetworkConfig) -> tuple[str, ...]:
+    """Returns the names of the graph's inputs in their order."""
+    own = (names for kind, names in OWN_INPUTS.items() if kind in config.own_physics)
+    return sum(own, INPUTS)
 
 
 class Step(nn.Module):
@@ -55,18 +74,25 @@ class Step(nn.Module):
         obstacle_cell: torch.Tensor,
         obstacle_normal: torch.Tensor,
         obstacle_triangle: torch.Tensor,
+        *own: torch.Tensor,
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Returns positions [N, 3] and velocities [N, H, 3], newest first, one frame later, in domain units and frames.
 
         `material`, int64 [N], indexes the network's materials. `domain_size` and `gravity` are [3]. `obstacle_cell` is
         int64 [K, 3] without repetition, `obstacle_normal` [K, 3]. `obstacle_triangle` [F, 3, 3] are corners. Networks
         with absolute inputs ignore gravity; networks without `obstacle_clearance` ignore triangles.
+
+        `own` are those of OWN_INPUTS that the network has: friction of the walls across x, y, z [3], and of obstacle
+        cells [K]; values of INPUT_PARAMETERS [N, P]; places at rest [R, 3], and neighbours at rest, int64 [R, B],
+        -1 for none.
         """
+        given = dict(zip(input_names(self.network.config)[len(INPUTS) :], own, strict=True))
         # Another cell, out of reach of every particle, so that the lists are never empty.
         far_13 = torch.full_like(domain_size[None], COORDINATE_LIMIT - 1).to(torch.int64)
         cell_K3 = torch.cat([obstacle_cell, far_13])
         normal_K3 = torch.cat([obstacle_normal, torch.zeros_like(domain_size[None])])
         key_K = pack(torch.zeros_like(cell_K3[:, 0]), cell_K3)
+        friction_K = pad(given["obstacle_friction"], (0, 1)) if "obstacle_friction" in given else None
         state = ParticleState(
             position_N3=position,
             velocity_NM3=velocity,
@@ -74,12 +100,28 @@ class Step(nn.Module):
             scene_N=torch.zeros_like(material),
             domain_S3=domain_size[None],
             gravity_S3=gravity[None],
-            obstacles=ObstacleCells(key_K, normal_K3, self.obstacle_cell_size),
+            obstacles=ObstacleCells(key_K, normal_K3, self.obstacle_cell_size, friction_K=friction_K),
             barriers=self._barriers(obstacle_triangle),
+            **self._own_fields(given, material),
         )
         acceleration_N3 = accelerations(self.network, state, self.network.prediction(state))
         after = advanced(state, acceleration_N3, self.network.step, self.network.config.dimensions)
         return after.position_N3, after.velocity_NM3
+
+    def _own_fields(self, given: dict[str, torch.Tensor], material_N: torch.Tensor) -> dict[str, Any]:
+        """Returns the fields of the state for own physics, except the friction of obstacles."""
+        fields: dict[str, Any] = {}
+        if "wall_friction" in given:
+            fields["wall_friction_S3"] = given["wall_friction"][None]
+        if "parameters" in given:
+            fields["parameter_NP"] = scaled_parameters(given["parameters"], material_N, self.network.config.materials)
+        if "rest_position" in given:
+            # Another particle, without neighbours, stands for all particles without a rest shape.
+            position_R3, neighbour_RB = pad(given["rest_position"], (0, 0, 0, 1)), given["rest_neighbour"]
+            rest = RestShape.of(position_R3, pad(neighbour_RB, (0, 0, 0, 1), value=-1))
+            row_N = torch.arange(material_N.shape[0], device=material_N.device).clamp(max=neighbour_RB.shape[0])
+            fields["rest"] = RestShape(rest.neighbour_NK[row_N], rest.position_N3[row_N], rest.coefficient_NK4[row_N])
+        return fields
 
     def _barriers(self, corner_F33: torch.Tensor) -> Barriers | None:
         """Returns barriers without lists of cells, because the graph finds pairs by bounding boxes."""
@@ -94,44 +136,68 @@ class Step(nn.Module):
         return Barriers(none, none, none, row_F24, scene_F=none, cell_size=cell_size, clearance=clearance)
 
 
-def initial_arrays(state: ParticleState, corner_F33: np.ndarray | None = None) -> dict[str, np.ndarray]:
+def initial_arrays(
+    config: NetworkConfig,
+    state: ParticleState,
+    corner_F33: np.ndarray | None = None,
+    parameter_NP: np.ndarray | None = None,
+) -> dict[str, np.ndarray]:
     """Returns the first inputs of the graph by name for a simulator's state of one scene.
 
     `corner_F33` contains the corners of the obstacles' triangles in domain units, from
-    `hgn.scene.barrier.barrier_pieces`; None: no triangles.
+    `hgn.scene.barrier.barrier_pieces`; None: no triangles. `parameter_NP` are the values of INPUT_PARAMETERS; None: the
+    solver's defaults.
     """
     require(state.scene_count == 1, "scenes", "one", state.scene_count)
-    cells, normals = np.zeros((0, 3), np.int64), np.zeros((0, 3), np.float32)
+    cells, normals, friction = np.zeros((0, 3), np.int64), np.zeros((0, 3), np.float32), None
     if state.obstacles is not None:
         cells = unpack(state.obstacles.key_K)[1].cpu().numpy()
-        normals = state.obstacles.normal_K3.cpu().numpy()
+        normals, friction = state.obstacles.normal_K3.cpu().numpy(), state.obstacles.friction_K
     triangles = np.zeros((0, 3, 3), np.float32) if corner_F33 is None else corner_F33.astype(np.float32)
+    if parameter_NP is None:
+        parameter_NP = np.tile(np.array(NOMINAL_P, np.float32), (len(state.position_N3), 1))
+    walls, rest = state.wall_friction_S3, state.rest
     tensors = (state.position_N3, state.velocity_NM3, state.material_N, state.domain_S3[0], state.gravity_S3[0])
-    arrays = [*(tensor.cpu().numpy() for tensor in tensors), cells, normals, triangles]
-    return dict(zip(INPUTS, arrays, strict=True))
+    arrays = dict(zip(INPUTS, [*(x.cpu().numpy() for x in tensors), cells, normals, triangles], strict=True))
+    arrays |= {
+        "wall_friction": np.zeros(3, np.float32) if walls is None else walls[0].cpu().numpy(),
+        "obstacle_friction": np.zeros(len(cells), np.float32) if friction is None else friction.cpu().numpy(),
+        "parameters": parameter_NP,
+        "rest_position": np.zeros((0, 3), np.float32) if rest is None else rest.position_N3.cpu().numpy(),
+        "rest_neighbour": np.zeros((0, NEIGHBOURS), np.int64) if rest is None else rest.neighbour_NK.cpu().numpy(),
+    }
+    return {name: arrays[name] for name in input_names(config)}
 
 
 def traced_step(network: ParticleNetwork, info: WeightsInfo) -> torch.export.ExportedProgram:
-    """Returns the graph. Raises: ConfigError for a GNS (neighbour lists cannot be exported) and for own physics."""
+    """Returns the graph. Raises: ConfigError for a GNS, because neighbour lists cannot be exported."""
     require(isinstance(network, HierarchicalGraphNetwork), "weights", "an hgn network", network.config.kind)
     assert isinstance(network, HierarchicalGraphNetwork)
-    own = list(network.config.own_physics)
-    require(not own, "weights", "a network without own_physics, which a graph has no inputs for yet", own)
     device, config = next(network.parameters()).device, network.config
     generator = torch.Generator().manual_seed(0)
-    example = (
-        torch.rand(EXAMPLE_PARTICLES, 3, generator=generator) * 0.1 + 0.3,
-        torch.randn(EXAMPLE_PARTICLES, config.velocity_history, 3, generator=generator) * 1e-3,
-        torch.zeros(EXAMPLE_PARTICLES, dtype=torch.int64),
-        torch.ones(3),
-        torch.zeros(3),
-        torch.arange(EXAMPLE_CELLS)[:, None] * torch.tensor([0, 0, 1]),
-        torch.ones(EXAMPLE_CELLS, 3),
-        torch.rand(EXAMPLE_TRIANGLES, 3, 3, generator=generator),
-    )
     particles = {0: torch.export.Dim("particles", min=1, max=LARGEST_EXPORTED)}
     cells = {0: torch.export.Dim("obstacle_cells", min=0, max=LARGEST_EXPORTED)}
     triangles = {0: torch.export.Dim("obstacle_triangles", min=0, max=LARGEST_EXPORTED)}
+    shapes = {0: torch.export.Dim("rest_shapes", min=0, max=LARGEST_EXPORTED)}
+    position_N3 = torch.rand(EXAMPLE_PARTICLES, 3, generator=generator) * 0.1 + 0.3
+    velocity_NH3 = torch.randn(EXAMPLE_PARTICLES, config.velocity_history, 3, generator=generator) * 1e-3
+    examples = {
+        "position": (position_N3, particles),
+        "velocity": (velocity_NH3, particles),
+        "material": (torch.zeros(EXAMPLE_PARTICLES, dtype=torch.int64), particles),
+        "domain_size": (torch.ones(3), None),
+        "gravity": (torch.zeros(3), None),
+        "obstacle_cell": (torch.arange(EXAMPLE_CELLS)[:, None] * torch.tensor([0, 0, 1]), cells),
+        "obstacle_normal": (torch.ones(EXAMPLE_CELLS, 3), cells),
+        "obstacle_triangle": (torch.rand(EXAMPLE_TRIANGLES, 3, 3, generator=generator), triangles),
+        "wall_friction": (torch.zeros(3), None),
+        "obstacle_friction": (torch.zeros(EXAMPLE_CELLS), cells),
+        "parameters": (torch.tensor(NOMINAL_P).repeat(EXAMPLE_PARTICLES, 1), particles),
+        "rest_position": (position_N3[:EXAMPLE_RESTS], shapes),
+        "rest_neighbour": (torch.zeros(EXAMPLE_RESTS, NEIGHBOURS, dtype=torch.int64), shapes),
+    }
+    example, dynamic = zip(*(examples[name] for name in input_names(config)), strict=True)
+    dynamic = dynamic[: len(INPUTS)] + ((dynamic[len(INPUTS) :],) if dynamic[len(INPUTS) :] else ())
     step = Step(network, info.obstacle_cell_size).eval()
     # One graph serves 0, 1 and more particles, cells and triangles.
     with (
@@ -143,7 +209,7 @@ def traced_step(network: ParticleNetwork, info: WeightsInfo) -> torch.export.Exp
         return torch.export.export(
             step,
             tuple(tensor.to(device) for tensor in example),
-            dynamic_shapes=(particles, particles, particles, None, None, cells, cells, triangles),
+            dynamic_shapes=dynamic,
             strict=False,
         )
 
@@ -158,7 +224,7 @@ def write_onnx(path: Path, program: torch.export.ExportedProgram, info: WeightsI
             program,
             (),
             dynamo=True,
-            input_names=INPUTS,
+            input_names=input_names(info.network),
             output_names=OUTPUTS,
             verbose=False,
             custom_translation_table={torch.ops.aten.index_add.default: _added_in_order},

@@ -19,13 +19,18 @@ from network.test_barriers import scattered
 from hgn import export
 from hgn.config import config_directory
 from hgn.network.barriers import Barriers
+from hgn.network.elastic import RestShape
 from hgn.network.hgn import HierarchicalGraphNetwork
-from hgn.runtime.exported_step import INPUTS, initial_arrays, write_package
-from hgn.runtime.simulator import Simulator
+from hgn.network.own_physics import scaled_parameters
+from hgn.runtime.exported_step import INPUTS, initial_arrays, input_names, write_package
+from hgn.runtime.simulator import InitialState, Simulator
 from hgn.runtime.torch_backend import Backend
 from hgn.runtime.torch_stepper import stepped
 from hgn.runtime.weights import WeightsInfo, save_weights
 from hgn.scene.barrier import barrier_of_pieces, barrier_pieces
+from hgn.scene.material import MATERIALS, OWN_PHYSICS
+from hgn.scene.own_physics import NOMINAL_P
+from hgn.scene.rest_shape import NEIGHBOURS
 from hgn.scene.scene_file import load_scene
 from hgn.schema import ConfigError, to_mapping
 
@@ -34,17 +39,39 @@ TOLERANCE = 1e-6  # of positions and displacements in a frame, domain units
 FRAMES = 4
 # At its walls random states begin, or end, for some particles, and their ways meet the triangles below.
 WALLED = {"wall_clearance": (0.1, 0.7)}
+OWN = WALLED | {"inputs": "local", "own_physics": OWN_PHYSICS, "materials": MATERIALS, "levels": 2}
 WHOLE = WALLED | {"inputs": "relative", "rest_threshold": 0.3, "obstacle_clearance": 1e-3, "levels": 1}
 SIZES = [(particles, obstacles) for particles in (1, 216, 3_000) for obstacles in (True, False)]
 CELL = 1 / 64
 ENDINGS = {"onnx": "onnx", "package": "pt2"}
 SCENE = """
+wall_friction: 0.3
 obstacles:
-  - {shape: cone, size: 0.3, position: [0.5, 0.3, 0.5], rotation: [0, 20, 10]}
+  - {shape: cone, size: 0.3, position: [0.5, 0.3, 0.5], rotation: [0, 20, 10], friction: 0.5}
   - {mesh: ramp.obj, scale: 0.4, rotation: [0, 90, 0], position: [0.5, 0.1, 0.2]}
 groups:
-  - {shape: cube, size: 0.08, position: [0.5, 0.5, 0.5], material: water, velocity: [0, -4, 0]}
+  - {shape: cube, size: 0.08, position: [0.5, 0.5, 0.5], material: water, velocity: [0, -4, 0], density_kg_m3: 1500}
 """
+# scenes with own physics, and the inputs that change their frames
+OWN_SCENES = {
+    "sand on a rough slope": (
+        "obstacles: [{shape: square, size: 0.24, position: [0.25, 0.16, 0.15], rotation: [0, 0, -25], friction: 0.6}]",
+        "{shape: cube, size: 0.06, position: [0.22, 0.23, 0.15], material: sand, velocity: [0.5, -1, 0]}",
+        ("obstacle_friction",),
+    ),
+    "elastic body on the floor": (
+        "floor_friction: 0.3",
+        "{shape: sphere, size: 0.06, position: [0.15, 0.1, 0.15], material: elastic, velocity: [0.5, -2, 0]}",
+        ("wall_friction", "rest_position", "rest_neighbour"),
+    ),
+    "mixed pool with other parameters": (
+        "floor_friction: 0.2\nwall_friction: 0.5",
+        "{shape: box, size: [0.08, 0.03, 0.08], position: [0.1, 0.12, 0.15], material: water, water_viscosity_pa_s: 8},"
+        "{shape: cube, size: 0.04, position: [0.1, 0.16, 0.15], material: sand, sand_friction_angle_deg: 20},"
+        "{shape: cube, size: 0.03, position: [0.15, 0.16, 0.15], material: elastic, youngs_modulus_pa: 3.0e+5}",
+        ("wall_friction", "parameters", "rest_position", "rest_neighbour"),
+    ),
+}
 
 
 class Written(NamedTuple):
@@ -98,11 +125,19 @@ def as_package(tmp_path_factory):
     return exported(tmp_path_factory.mktemp("package"), ("onnx", "package"), WHOLE)
 
 
-@pytest.fixture(scope="module", params=["walled", pytest.param("whole", marks=pytest.mark.slow)])
+@pytest.fixture(scope="module")
+def as_own(tmp_path_factory):
+    """A network with walls and all own physics as ONNX."""
+    return exported(tmp_path_factory.mktemp("own"), ("onnx",), OWN)
+
+
+@pytest.fixture(
+    scope="module", params=["as_own", *(pytest.param(x, marks=pytest.mark.slow) for x in ("", "as_package"))]
+)
 def as_onnx(request, tmp_path_factory):
-    """A network as ONNX: of absolute inputs on two levels with walls, or that one."""
-    if request.param == "whole":
-        return request.getfixturevalue("as_package")
+    """A network as ONNX: one of these, or one of absolute inputs on two levels with walls."""
+    if request.param:
+        return request.getfixturevalue(request.param)
     return exported(tmp_path_factory.mktemp("onnx"), ("onnx",), WALLED | {"levels": 2})
 
 
@@ -113,12 +148,42 @@ def test_onnx_is_the_step(as_onnx):
 
     network, folder = as_onnx
     session = onnxruntime.InferenceSession(folder / "new/step.onnx")
-    assert [item.name for item in session.get_inputs()] == list(INPUTS)
+    names = [item.name for item in session.get_inputs()]
+    assert names == list(input_names(network.config))
+    assert (names == list(INPUTS)) == (network.config.own_physics == ())
     declared = json.loads(session.get_modelmeta().custom_metadata_map["hgn"])
     assert declared["frame_rate_hz"] == 60.0 and declared["network"] == to_mapping(network.config)
     compare(network, lambda arrays: session.run(None, arrays))
     simulate = runpy.run_path(str(EXAMPLES / "step_onnx.py"))["simulate"]
     assert_rollout(as_onnx, simulate(str(folder / "new/step.onnx"), str(folder / "arrays"), FRAMES))
+
+
+@pytest.mark.parametrize("scene", OWN_SCENES)
+def test_own_physics_is_the_step(as_own, scene, tmp_path):
+    """ONNX Runtime computes each of 20 frames to 1e-6, and other frames if an input lacks or mixes own physics."""
+    import onnxruntime
+
+    session = onnxruntime.InferenceSession(as_own.folder / "new/step.onnx")
+    surfaces, groups, names = OWN_SCENES[scene]
+    (tmp_path / "scene.yaml").write_text(f"domain_size: [0.5, 0.5, 0.5]\n{surfaces}\ngroups: [{groups}]\n")
+    start = InitialState.of_scene(load_scene(tmp_path / "scene.yaml"))
+    simulator = Simulator(as_own.network, 60.0, "torch")
+    state = simulator.start([start])
+    largest = dict.fromkeys(names, 0.0)
+    for _ in range(20):
+        arrays, state = initial_arrays(as_own.network.config, state, None, start.parameters), simulator.step(state)
+        for name in ("", *names):
+            without = np.roll(arrays[name], 1, 0) if name.startswith("rest") else 0 * arrays.get(name, 0)
+            if name == "parameters":
+                without = np.tile(np.array(NOMINAL_P, np.float32), (len(without), 1))
+            position_N3, velocity_NM3 = session.run(None, arrays | ({name: without} if name else {}))
+            error = np.abs(position_N3 - state.position_N3.numpy()).max()
+            if name:
+                largest[name] = max(largest[name], error)
+                continue
+            assert error < TOLERANCE
+            np.testing.assert_allclose(velocity_NM3, state.velocity_NM3.numpy(), rtol=0, atol=TOLERANCE)
+    assert min(largest.values()) > 10 * TOLERANCE, largest
 
 
 @pytest.mark.slow
@@ -164,16 +229,23 @@ def test_what_is_refused(options, message):
     ("made", "values", "message"),
     [
         (gns_of, {}, "weights must be an hgn network, got 'gns'"),
-        (network_of, {"inputs": "local", "own_physics": ("friction",)}, r"without own_physics, .* got \['friction'\]"),
+        (
+            network_of,
+            {"inputs": "local", "own_physics": ("moving",)},
+            "scene must be without keyframes with arrays, .*, got",
+        ),
     ],
 )
-def test_networks_that_are_not_exported(made, values, message, tmp_path):
-    """Neighbour lists, and inputs of scenes that graphs lack, are refused."""
+def test_what_is_not_exported(made, values, message, tmp_path):
+    """Neighbour lists and moving obstacles, which graphs lack, are refused."""
     network, path = made(torch.float32, **values), tmp_path / "own.safetensors"
     save_weights(path, network, WeightsInfo(network.config, 60.0, CELL))
+    files = {"onnx": str(tmp_path / "a.onnx")}
+    if network.config.own_physics:
+        files |= {"arrays": str(tmp_path / "arrays"), "scene": "mixer"}
     with pytest.raises(ConfigError, match=message):
-        export.main({"weights": str(path), "onnx": str(tmp_path / "a.onnx")})
-    assert not (tmp_path / "a.onnx").exists()
+        export.main({"weights": str(path), **files})
+    assert not any((tmp_path / name).exists() for name in ("a.onnx", "arrays"))
 
 
 def test_a_package_is_written_first(tmp_path, monkeypatch):
@@ -228,13 +300,35 @@ def compare(network, step):
         state = replace(state, velocity_NM3=10 * state.velocity_NM3)
         if obstacles and clearance is not None:
             state = replace(state, barriers=Barriers.of([barrier_of_pieces(corner_F33, CELL, clearance)]))
-        position_N3, velocity_NM3 = step(initial_arrays(state, corner_F33 if obstacles else None))
+        state, parameter_NP = drawn_physics(state, network.config)
+        position_N3, velocity_NM3 = step(
+            initial_arrays(network.config, state, corner_F33 if obstacles else None, parameter_NP)
+        )
         after = stepped(predict, state, network.step, network.config.dimensions)
         np.testing.assert_allclose(position_N3, after.position_N3.numpy(), rtol=0, atol=TOLERANCE)
         np.testing.assert_allclose(velocity_NM3, after.velocity_NM3.numpy(), rtol=0, atol=TOLERANCE)
         if state.barriers is not None and particles > 1:
             free = stepped(predict, replace(state, barriers=None), network.step, network.config.dimensions)
             assert (free.position_N3 != after.position_N3).any(-1).float().mean() > 0.01
+
+
+def drawn_physics(state, config):
+    """The state with friction, parameters and rest shapes of the network's own physics, and the parameters' values."""
+    if not config.own_physics:
+        return state, None
+    rng, count = np.random.default_rng(1), len(state.position_N3)
+    value_NP = (np.array(NOMINAL_P) * rng.uniform(0.5, 2, (count, len(NOMINAL_P)))).astype(np.float32)
+    neighbour_NK = torch.from_numpy(rng.integers(-1, count, (count, NEIGHBOURS)))
+    state = replace(
+        state,
+        wall_friction_S3=torch.from_numpy(rng.random((1, 3), np.float32)),
+        parameter_NP=scaled_parameters(torch.from_numpy(value_NP), state.material_N, config.materials),
+        rest=RestShape.of(state.position_N3, neighbour_NK),
+    )
+    if state.obstacles is None:
+        return replace(state, rest=None), value_NP
+    friction_K = torch.from_numpy(rng.random(len(state.obstacles.key_K), np.float32))
+    return replace(state, obstacles=replace(state.obstacles, friction_K=friction_K)), value_NP
 
 
 def assert_rollout(written, found_TN3):

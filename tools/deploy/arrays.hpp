@@ -3,6 +3,7 @@
 
 #include <cstdint>
 #include <cstring>
+#include <filesystem>
 #include <fstream>
 #include <sstream>
 #include <stdexcept>
@@ -10,6 +11,7 @@
 #include <vector>
 
 struct Array {
+    std::string name;
     std::vector<int64_t> shape;
     std::string type;  // "<f4" or "<i8"
     std::vector<char> bytes;
@@ -55,9 +57,19 @@ inline void write_positions(const std::string& path, const std::vector<float>& v
 // Order and names of a step's inputs; the first two are replaced by its two outputs.
 inline const std::vector<std::string> INPUTS = {
     "position", "velocity", "material", "domain_size", "gravity", "obstacle_cell", "obstacle_normal", "obstacle_triangle"};
+// The inputs that follow if the network has them: friction, parameters of materials, elastic bodies.
+inline const std::vector<std::string> OWN_INPUTS = {
+    "wall_friction", "obstacle_friction", "parameters", "rest_position", "rest_neighbour"};
 
 inline std::vector<Array> read_arrays(const std::string& folder) {
     std::vector<Array> arrays;
-    for (const auto& name : INPUTS) arrays.push_back(read_array(folder + "/" + name + ".npy"));
+    const auto read = [&](const std::string& name, bool required) {
+        const std::string path = folder + "/" + name + ".npy";
+        if (!required && !std::filesystem::exists(path)) return;
+        arrays.push_back(read_array(path));
+        arrays.back().name = name;
+    };
+    for (const auto& name : INPUTS) read(name, true);
+    for (const auto& name : OWN_INPUTS) read(name, false);
     return arrays;
 }

@@ -17,11 +17,10 @@ int main(int count, char** words) try {
     const auto memory = Ort::MemoryInfo::CreateCpu(OrtDeviceAllocator, OrtMemTypeDefault);
     std::vector<Ort::Value> inputs;
     std::vector<const char*> names;
-    for (size_t i = 0; i < arrays.size(); i++) {
-        auto& [shape, type, bytes] = arrays[i];
+    for (auto& [name, shape, type, bytes] : arrays) {
         const auto element = type == "<f4" ? ONNX_TENSOR_ELEMENT_DATA_TYPE_FLOAT : ONNX_TENSOR_ELEMENT_DATA_TYPE_INT64;
         inputs.push_back(Ort::Value::CreateTensor(memory, bytes.data(), bytes.size(), shape.data(), shape.size(), element));
-        names.push_back(INPUTS[i].c_str());
+        names.push_back(name.c_str());
     }
     const char* outputs[] = {"next_position", "next_velocity"};
     const int64_t particles = arrays[0].shape[0];
