@@ -88,6 +88,14 @@ def keep_signal_handlers():
 
 
 @pytest.fixture
+def cache(tmp_path, monkeypatch):
+    """The folder of fetched shards, the test's own; and a first pause that is short."""
+    monkeypatch.setenv("HGN_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setattr("hgn.system.patience.FIRST_PAUSE_S", 0.01)
+    return tmp_path / "cache" / "shards"
+
+
+@pytest.fixture
 def backend(tmp_path, monkeypatch):
     folder = tmp_path / "control"
     folder.mkdir()

@@ -18,8 +18,8 @@ PACKAGES = ("hgn", "datagen", "tools")
 LINES = {  # of Python, in tracked files
     "hgn": 33_818,
     "datagen": 9_034,
-    "tools": 6_487,
-    "tests": 33_568,
+    "tools": 6_476,
+    "tests": 33_555,
 }
 SETTINGS = 240  # fields of the dataclasses behind the commands, *Config
 

@@ -11,15 +11,10 @@ import pytest
 
 import hgn.data.storage
 from hgn.data.reader import EpisodeStore
-from hgn.data.shard_cache import CACHE_VARIABLE
 from hgn.data.storage import open_storage
 from hgn.schema import ConfigError
 
-
-@pytest.fixture(autouse=True)
-def _cache(tmp_path, monkeypatch):
-    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "cache"))
-    monkeypatch.setattr("hgn.system.patience.FIRST_PAUSE_S", 0.01)
+pytestmark = pytest.mark.usefixtures("cache")
 
 
 class Quiet:

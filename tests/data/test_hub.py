@@ -21,7 +21,7 @@ from hgn.system.hub import HubPlace, hub_weights
 
 
 @pytest.fixture
-def hub(tmp_path, monkeypatch):
+def hub(tmp_path, cache, monkeypatch):
     network = network_of(torch.float32)
     info = WeightsInfo(network.config, 60.0, 1 / 64)
     models = tmp_path / "hub" / "models" / "one"
@@ -30,12 +30,10 @@ def hub(tmp_path, monkeypatch):
         save_weights(models / f"{place}.safetensors", network, info)
     (models / "none").mkdir()
     (models / "none" / "README.md").write_text("nothing")
-    monkeypatch.setenv("HGN_CACHE", str(tmp_path / "cache"))
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path / "hub_cache"))
     monkeypatch.delenv("HF_TOKEN", raising=False)
     for name in ("no_proxy", "NO_PROXY"):
         monkeypatch.setenv(name, "")  # so that it is as before after the test, though reading sets it
-    monkeypatch.setattr("hgn.system.patience.FIRST_PAUSE_S", 0.01)
     hub_weights.cache_clear()
     with served(tmp_path / "hub") as server:
         monkeypatch.setenv("HF_ENDPOINT", server.url)

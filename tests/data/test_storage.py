@@ -31,11 +31,8 @@ TOKEN = "correct-horse-battery"
 
 
 @pytest.fixture(autouse=True)
-def cache(tmp_path, monkeypatch):
-    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "cache"))
+def _token(cache, monkeypatch):
     monkeypatch.delenv(TOKEN_VARIABLE, raising=False)
-    monkeypatch.setattr("hgn.system.patience.FIRST_PAUSE_S", 0.01)
-    return tmp_path / "cache" / "shards"
 
 
 def in_memory(folder, name):

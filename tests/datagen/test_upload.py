@@ -7,19 +7,15 @@ from pathlib import Path
 import fsspec
 import pytest
 
-import hgn.system.patience
 from datagen.upload import main
 from hgn.data.manifest import Manifest
 from hgn.data.reader import EpisodeStore
-from hgn.data.shard_cache import CACHE_VARIABLE
 from hgn.schema import ConfigError
 
 
 @pytest.fixture(autouse=True)
-def store(tmp_path, monkeypatch):
-    """fsspec's memory as the object store, empty; and a cache of our own."""
-    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "cache"))
-    monkeypatch.setattr(hgn.system.patience, "FIRST_PAUSE_S", 0.01)
+def store(cache):
+    """fsspec's memory as the object store, empty."""
     files = fsspec.filesystem("memory")
     files.store.clear()
     return files

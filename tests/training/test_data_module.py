@@ -13,7 +13,7 @@ from training.runs import NETWORK, TRAINING
 from hgn.config import NetworkConfig, TrainingConfig
 from hgn.data.episode_tensors import EpisodeTensors
 from hgn.data.reader import EpisodeStore
-from hgn.data.shard_cache import CACHE_VARIABLE, LIMIT_VARIABLE
+from hgn.data.shard_cache import LIMIT_VARIABLE
 from hgn.schema import ConfigError
 from hgn.training.data_module import EpisodeDataModule, agreed_count
 from hgn.training.readers import EpisodeReader, WindowReader
@@ -100,7 +100,7 @@ def test_ranks_with_other_data_are_refused(folder, here):
 
 
 @pytest.mark.parametrize(("ahead", "room"), [(False, 1 / 3), (True, 1 / 3), (True, 2 / 3)])
-def test_data_larger_than_the_cache(make_config, make_dataset, tmp_path, monkeypatch, ahead, room):
+def test_data_larger_than_the_cache(make_config, make_dataset, cache, monkeypatch, ahead, room):
     """Shuffled in windows, an epoch fetches each shard once through a cache with room for a third of the data, and its
     batches are those of a reader that has all of it. With room for two windows no shard is waited for but the first
     window's: the order says what is needed next."""
@@ -109,7 +109,6 @@ def test_data_larger_than_the_cache(make_config, make_dataset, tmp_path, monkeyp
     sizes = [shard.bytes for shard in EpisodeStore(folder, "train").manifest.shards]
     files = fsspec.filesystem("memory")
     files.put(str(folder), "/larger", recursive=True)
-    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "cache"))
     monkeypatch.setenv(LIMIT_VARIABLE, str(room * sum(sizes) / 1e9))
     if not ahead:
         monkeypatch.setattr(EpisodeStore, "fetch_ahead", lambda store, episodes=None: None)

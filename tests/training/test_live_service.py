@@ -17,7 +17,6 @@ from datagen.pool.plan import scene_seed
 from hgn import train
 from hgn.data.manifest import Manifest
 from hgn.data.reader import EpisodeStore
-from hgn.data.shard_cache import CACHE_VARIABLE
 from hgn.data.storage import TOKEN_VARIABLE
 from hgn.training.checkpoint import read_checkpoint
 from hgn.training.torch_updates import TorchUpdates
@@ -49,8 +48,7 @@ class Service:
 
 
 @pytest.fixture
-def service(control, tmp_path, monkeypatch):
-    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "cache"))
+def service(control, cache, tmp_path, monkeypatch):
     monkeypatch.setenv(TOKEN_VARIABLE, "correct-horse-battery")
     monkeypatch.setattr(hgn.data.storage, "_AWAY_S", 0.2)
     service = Service(tmp_path / "made", tmp_path / "service.log")
@@ -105,10 +103,9 @@ def test_service_restarted_midway(make_config, service, control, tmp_path, monke
     assert cached >= {shard.sha256 for shard in EpisodeStore(service.folder, "train").manifest.shards_of("train")}
 
 
-def test_stopped_while_its_service_is_away(make_config, make_dataset, tmp_path, monkeypatch):
+def test_stopped_while_its_service_is_away(make_config, make_dataset, tmp_path, cache, monkeypatch):
     """SIGTERM that finds a training waiting for a server that is gone ends it at once, after a checkpoint of all that
     was trained on; the same command goes on there."""
-    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "cache"))
     monkeypatch.setattr(hgn.training.data_module, "LOOK_S", 0.05)
     make_dataset(make_config())
     files = fsspec.filesystem("memory")
@@ -125,7 +122,7 @@ def test_stopped_while_its_service_is_away(make_config, make_dataset, tmp_path, 
         if len(opened) == 12:
             files.cat_file = gone
             store._open_shards.clear()
-            for shard in (tmp_path / "cache").rglob("*.tar"):
+            for shard in cache.rglob("*.tar"):
                 shard.unlink()
         return real(store, index)
 
@@ -139,7 +136,7 @@ def test_stopped_while_its_service_is_away(make_config, make_dataset, tmp_path, 
     monkeypatch.undo()
     stopped = read_checkpoint(tmp_path / "run" / "checkpoints" / "last.ckpt")["hgn"]["updates"]
     assert asked and 0 < stopped <= 5  # of 2 samples each
-    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "cache"))
+    monkeypatch.setenv("HGN_CACHE", str(tmp_path / "cache"))
     assert train.main(train_mapping(config, tmp_path / "run", monitor_every=100)) == 0
 
 

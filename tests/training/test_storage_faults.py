@@ -23,7 +23,6 @@ import hgn.training.session
 from hgn import train
 from hgn.config import TrainConfig
 from hgn.data.reader import EpisodeStore, find_episode, first_episodes
-from hgn.data.shard_cache import CACHE_VARIABLE
 from hgn.data.storage import faults_outlived
 from hgn.schema import ConfigError, from_mapping
 from hgn.system.patience import VARIABLE, outlived, without_patience
@@ -36,9 +35,7 @@ HTML = b"<html><body>502 Bad Gateway</body></html>"
 
 
 @pytest.fixture(autouse=True)
-def _quick(tmp_path, monkeypatch):
-    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "cache"))
-    monkeypatch.setattr("hgn.system.patience.FIRST_PAUSE_S", 0.01)
+def _quick(cache, monkeypatch):
     monkeypatch.setattr("hgn.system.patience.LONGEST_PAUSE_S", 0.05)
     monkeypatch.setattr("hgn.data.reader.AGAIN_S", 0.0)
     monkeypatch.setattr("hgn.data.storage._AWAY_S", 0.0)

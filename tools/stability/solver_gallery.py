@@ -96,7 +96,9 @@ def measure(
         values = threads.map(lambda job: series(every[job[0]], bounds[job[1]]), jobs)
         measured = dict(zip(jobs, values, strict=True))
     grids = [str(cells) for cells in films]
-    entry["series"] = {cells: {key: _short(measured[cells, key]) for key in bounds} for cells in grids}
+    # the numbers in one line of text; in a JSON list each would take a line
+    text = {name: " ".join(f"{value:.{DIGITS}g}" for value in numbers) for name, numbers in measured.items()}
+    entry["series"] = {cells: {key: text[cells, key] for key in bounds} for cells in grids}
     rows = []
     for bound in case.measure.bounds:
         figures = {name: bound.reduced(measured[name, bound.key]) for name in every}
@@ -171,8 +173,9 @@ def _launched(
             jobs.append((index, "own", scene))
             if case.measure.far is not None:
                 jobs.append((index, "far", case.scene(cells, far=True)))
-            if cells == GRID_CELLS[0] and _has_friction(scene):
-                jobs.append((index, FRICTIONLESS, _smooth(scene)))
+            if cells == GRID_CELLS[0] and (any(scene.wall_friction) or any(o.friction for o in scene.obstacles)):
+                smooth = tuple(replace(obstacle, friction=0.0) for obstacle in scene.obstacles)
+                jobs.append((index, FRICTIONLESS, replace(scene, obstacles=smooth, wall_friction=(0.0, 0.0, 0.0))))
         config = solver_on_grid(mpm, 1 / cells, 1 / GRID_CELLS[0])
         frames = max(case.measure.frames for case in cases)
         trials = solver_trials([scene for *_, scene in jobs], config, frames, RATE_HZ)
@@ -189,20 +192,6 @@ def _launched(
 def _film(case: GalleryCase, pairs: Sequence[tuple[Scene, RolloutResult]]) -> Film:
     paths = [trial.position_TN3[: case.measure.frames] for _, trial in pairs]
     return case.film(pairs[0][0], paths, RATE_HZ)
-
-
-def _has_friction(scene: Scene) -> bool:
-    return any(scene.wall_friction) or any(obstacle.friction for obstacle in scene.obstacles)
-
-
-def _smooth(scene: Scene) -> Scene:
-    obstacles = tuple(replace(obstacle, friction=0.0) for obstacle in scene.obstacles)
-    return replace(scene, obstacles=obstacles, wall_friction=(0.0, 0.0, 0.0))
-
-
-def _short(values: Sequence[float]) -> str:
-    """Returns the numbers in one line of text; in a JSON list each would take a line."""
-    return " ".join(f"{value:.{DIGITS}g}" for value in values)
 
 
 def _finite(figures: dict[str, float]) -> dict[str, float | None]:
