@@ -19,7 +19,7 @@ LINES = {  # of Python, in tracked files
     "hgn": 33_818,
     "datagen": 9_034,
     "tools": 6_476,
-    "tests": 33_555,
+    "tests": 33_511,
 }
 SETTINGS = 240  # fields of the dataclasses behind the commands, *Config
 
