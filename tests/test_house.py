@@ -16,7 +16,7 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 33_818,
+    "hgn": 33_828,
     "datagen": 9_034,
     "tools": 6_476,
     "tests": 33_511,

@@ -1,9 +1,11 @@
 """Divides the cells of the coarser levels among bodies, with `network.inputs: local`.
 
-A body is a set of finest cells that particles connect. Its number is the lowest slot of its cells. A coarser cell
-belongs to one body, so a slot of a coarser level may have several cells. An ordered hash table (Amble and Knuth 1974)
-contains them: an entry is (slot << SLOT_BITS) + body, and 0 where it is free. An entry keeps the largest key that
-reached it, and smaller keys go on to the next entry. So the table does not depend on the order of insertions.
+A body is a set of finest cells that particles connect. Its number is the lowest slot of its cells. Links lead from
+slots to lower slots of the same body (union-find). A link is LAST - slot; in the lowest slot it is 0.
+
+A coarser cell belongs to one body, so a slot of a coarser level may have several cells. An ordered hash table (Amble
+and Knuth 1974) contains them: an entry is (slot << SLOT_BITS) + body, 0 where it is free. An entry keeps the largest
+key that reached it, and smaller keys go on to the next entry. So the order of insertions does not change the table.
 
 Rule: hgn.network.grid.build_hierarchy; test: tests/kernels/test_network.py.
 Shape legend: N particles, C cells of a level, L levels, T entries of the table.
@@ -18,7 +20,6 @@ from hgn.kernels.cell_hash import PRIME_X, PRIME_Y
 from hgn.kernels.geometry import GEOMETRY_COLUMNS, split_slot
 from hgn.kernels.grid.slots import (
     OVERFLOW,
-    base_cell,
     cell_in,
     marked,
     number_in,
@@ -28,45 +29,47 @@ from hgn.kernels.grid.slots import (
 from hgn.kernels.triton_compat import gdc_launch_dependents, settle_keys
 
 SLOT_BITS = tl.constexpr(31)
+LAST = tl.constexpr((1 << 31) - 1)
 
 
 @triton.jit
-def _body(root, slot, ask):
-    """Follows the links of slots to the lowest slot of their bodies."""
-    body = tl.load(root + slot, mask=ask, other=0, volatile=True)
-    above = tl.load(root + body, mask=ask, other=0, volatile=True)
-    while tl.max(tl.max((above != body).to(tl.int32), 1), 0) > 0:
-        body = above
-        above = tl.load(root + body, mask=ask, other=0, volatile=True)
-    return body
+def _body(links, slot, ask):
+    """Follows the links of slots to the lowest slots of their bodies."""
+    link = tl.load(links + slot, mask=ask, other=0, volatile=True)
+    while tl.max(tl.max(link, 1), 0) > 0:
+        slot = tl.where(link > 0, -link + LAST, slot)
+        link = tl.load(links + slot, mask=ask, other=0, volatile=True)
+    return slot
 
 
 @triton.jit
-def unite_cells(
-    position, scene_of, origin, particle_count, low, geometry, root, cell_size, BLOCK: tl.constexpr
-):  # fmt: skip
-    """Links the eight finest cells of each particle (union-find; a link leads to a lower slot of the same body)."""
-    count = tl.load(particle_count)
-    if tl.program_id(0) * BLOCK >= count:
+def body_of_slot(links, slot, ask):
+    """Returns the body of an active finest cell, after `insert_cells`."""
+    link = tl.load(links + slot, mask=ask, other=0)
+    return tl.where(link > 0, -link + LAST, slot)
+
+
+@triton.jit
+def unite_cells(reached, links, geometry, BLOCK: tl.constexpr):
+    """Links the cells that a particle reaches. `reached` has for a slot the bits of the corners that particles reach
+    whose lowest cell it contains."""
+    local = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)[:, None]
+    bits = tl.load(reached + local, mask=local < tl.load(geometry + 1), other=0)
+    if tl.max(tl.max(bits, 1), 0) == 0:
         return
-    row = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    live = row < count
-    scene = tl.load(scene_of + row, mask=live, other=0)
-    x, y, z, fx, fy, fz, inside = base_cell(position, origin, scene, row, live, low, geometry, cell_size)
     corner = tl.arange(0, 8)[None, :]
-    cx = x[:, None] + ((corner >> 2 & 1) & (fx > 0)[:, None].to(tl.int32))
-    cy = y[:, None] + ((corner >> 1 & 1) & (fy > 0)[:, None].to(tl.int32))
-    cz = z[:, None] + ((corner & 1) & (fz > 0)[:, None].to(tl.int32))
-    ask = inside[:, None] & (corner >= 0)
-    body = _body(root, slot_of(cx, cy, cz, scene[:, None], slots_of(geometry, 0)), ask)
-    least = tl.min(body, 1)[:, None] + 0 * corner
+    ny, nz = tl.load(geometry + 2), tl.load(geometry + 3)
+    ask = (bits >> corner & 1) > 0
+    slot = local + ((corner >> 2 & 1) * ny + (corner >> 1 & 1)) * nz + (corner & 1)
+    body = _body(links, tl.where(ask, slot, local), ask)
+    least = tl.min(tl.where(ask, body, LAST), 1)[:, None] + 0 * corner
     apart = ask & (body != least)
     while tl.max(tl.max(apart.to(tl.int32), 1), 0) > 0:
-        high, low_one = tl.maximum(body, least), tl.minimum(body, least)
-        before = tl.atomic_min(root + high, low_one, mask=apart, sem="relaxed")
+        high, low = tl.maximum(body, least), tl.minimum(body, least)
+        before = tl.atomic_max(links + high, -low + LAST, mask=apart, sem="relaxed")
         # If the upper slot was no longer the lowest of its body, the body that it led to is linked too.
-        body = tl.where(apart & (before != high), before, low_one)
-        least = low_one
+        body = tl.where(apart & (before > 0), -before + LAST, low)
+        least = low
         apart = apart & (body != least)
 
 
@@ -94,15 +97,16 @@ def number_of(table, numbers, mask, slot, body, ask):
 
 @triton.jit
 def insert_cells(
-    occupied, geometry, root, table, mask, LEVELS: tl.constexpr, BLOCK: tl.constexpr
+    occupied, prefix_sum, geometry, links, table, mask, LEVELS: tl.constexpr, BLOCK: tl.constexpr
 ):  # fmt: skip
-    """Writes the body of each finest cell to `root`, and enters its ancestors into the table."""
+    """Links each finest cell to the lowest slot of its body, and enters its ancestors into the table."""
     local = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)[:, None]
-    live = marked(occupied, local, local < tl.load(geometry + 1))
+    # The table has entries for the ancestors of as many finest cells as the level's capacity.
+    live = cell_in(occupied, prefix_sum, local, 0, tl.load(geometry + 5), local < tl.load(geometry + 1)) >= 0
     if tl.sum(tl.sum(live.to(tl.int32), 1), 0) == 0:
         return
-    body = _body(root, local, live)
-    tl.store(root + local, body, mask=live)
+    body = _body(links, local, live)
+    tl.store(links + local, -body + LAST, mask=live & (body != local))
     scene, x, y, z = split_slot(local, tl.load(geometry + 2), tl.load(geometry + 3), tl.load(geometry + 4))
     for level in tl.static_range(1, LEVELS):
         slot = slot_of(x >> level, y >> level, z >> level, scene, slots_of(geometry, level))
@@ -138,7 +142,7 @@ def number_cells(table, numbers, geometry, needed, status, LEVELS: tl.constexpr,
 
 @triton.jit
 def join_cells(
-    occupied, prefix_sum, geometry, root, table, numbers, mask, slot_of_cell, neighbour, parent, octant, children,
+    occupied, prefix_sum, geometry, links, table, numbers, mask, slot_of_cell, neighbour, parent, octant, children,
     counts, needed, status, LEVELS: tl.constexpr, OVERLAP: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Writes neighbours, parent and children of all cells, int32. `neighbour` and `children` must be -1 before.
@@ -165,16 +169,18 @@ def join_cells(
         return
     ny, nz, stride = tl.load(geometry + 2), tl.load(geometry + 3), tl.load(geometry + 4)
     scene, x, y, z = split_slot(local, ny, nz, stride)
-    body = tl.load(root + local, mask=live, other=0)
+    body = body_of_slot(links, local, live)
     tl.store(slot_of_cell + cell, local, mask=live)
     below, below_there, below_at, below_octant = cell, live, 0, ((x & 1) * 2 + (y & 1)) * 2 + (z & 1)
     tl.store(octant + cell, below_octant, mask=live)
+    ancestors = (cell,)
     for level in tl.static_range(1, LEVELS):
         line = geometry + level * GEOMETRY_COLUMNS
         most, at = tl.load(line + 5), tl.load(line + 6)
         kx, ky, kz = x >> level, y >> level, z >> level
         slot = slot_of(kx, ky, kz, scene, slots_of(geometry, level))
         own = number_of(table, numbers, mask, slot, body, live)
+        ancestors = ancestors + (own,)  # noqa: RUF005 - Triton does not support unpacking here
         there = own >= 0
         tl.store(parent + below_at + below, own, mask=below_there)
         tl.store(children + 8 * at + below_octant * most + own, below, mask=there & below_there)
@@ -189,23 +195,20 @@ def join_cells(
             step, along = nz * 0 + 1, z
         beside = local - step if direction % 2 == 1 else local + step
         joined = marked(occupied, beside, live)
-        joined = joined & (tl.load(root + beside, mask=joined, other=0) == body)
+        joined = joined & (body_of_slot(links, beside, joined) == body)
         other = number_in(prefix_sum, beside, 0, capacity, joined)
         tl.store(neighbour + direction * capacity + cell, other, mask=joined)
         for level in tl.static_range(1, LEVELS):
             line = geometry + level * GEOMETRY_COLUMNS
             most, at, last = tl.load(line + 5), tl.load(line + 6), (1 << level) - 1
             across = joined & ((along & last) == (0 if direction % 2 == 1 else last))
-            sign: tl.constexpr = -1 if direction % 2 == 1 else 1
-            kx = (x >> level) + (sign if direction // 2 == 0 else 0)
-            ky = (y >> level) + (sign if direction // 2 == 1 else 0)
-            kz = (z >> level) + (sign if direction // 2 == 2 else 0)
-            above = slots_of(geometry, level)
-            own = number_of(
-                table, numbers, mask, slot_of(x >> level, y >> level, z >> level, scene, above), body, across
-            )
-            other = number_of(table, numbers, mask, slot_of(kx, ky, kz, scene, above), body, across)
-            tl.store(neighbour + 6 * at + direction * most + own, other, mask=own >= 0)
+            kx = (x >> level) + (1 - 2 * (direction % 2) if direction // 2 == 0 else 0)
+            ky = (y >> level) + (1 - 2 * (direction % 2) if direction // 2 == 1 else 0)
+            kz = (z >> level) + (1 - 2 * (direction % 2) if direction // 2 == 2 else 0)
+            slot = slot_of(kx, ky, kz, scene, slots_of(geometry, level))
+            other = number_of(table, numbers, mask, slot, body, across)
+            own = ancestors[level]
+            tl.store(neighbour + 6 * at + direction * most + own, other, mask=across & (own >= 0))
 
 
 settle_keys(globals())

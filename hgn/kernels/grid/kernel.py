@@ -11,7 +11,7 @@ import triton
 import triton.language as tl
 
 from hgn.kernels.geometry import GEOMETRY_COLUMNS, raise_disturbed, split_slot
-from hgn.kernels.grid.bodies import number_of
+from hgn.kernels.grid.bodies import body_of_slot, number_of
 from hgn.kernels.grid.slots import OUT_OF_WINDOW, OVERFLOW, base_cell, cell_in, marked, number_in, slot_of, slots_of
 from hgn.kernels.grid.surfaces import add_drift, add_friction, surface_normals, surfaces_of
 from hgn.kernels.triton_compat import gdc_launch_dependents, gdc_wait, settle_keys
@@ -19,12 +19,13 @@ from hgn.kernels.triton_compat import gdc_launch_dependents, gdc_wait, settle_ke
 
 @triton.jit
 def mark_cells(
-    position, scene_of, origin, particle_count, low, geometry, occupied, root, status, cell_size,
+    position, scene_of, origin, particle_count, low, geometry, occupied, reached, status, cell_size,
     LEVELS: tl.constexpr, BODIES: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Marks the slots of the cells that particles reach, and of their ancestors, in one pass for all levels.
 
-    With BODIES it marks the finest level only, and links each slot to itself in `root`.
+    With BODIES it marks the finest level only, and adds the bits of the corners that a particle reaches to `reached` at
+    the particle's lowest cell.
 
     Rule: hgn.network.grid.build_hierarchy; test: tests/kernels/test_network.py.
     """
@@ -57,10 +58,15 @@ def mark_cells(
                 first = first & (cy != y >> level)
             if corner & 1:
                 first = first & (cz != z >> level)
-            slot = slot_of(cx, cy, cz, scene, slots)
-            tl.store(occupied + slot, 1, mask=first)
-            if BODIES:
-                tl.store(root + slot, slot, mask=first)
+            tl.store(occupied + slot_of(cx, cy, cz, scene, slots), 1, mask=first)
+    if BODIES:
+        bits = tl.where(fz > 0, 3, 1)
+        bits = tl.where(fy > 0, bits | bits << 2, bits)
+        bits = tl.where(fx > 0, bits | bits << 4, bits)
+        at = reached + slot_of(x, y, z, scene, levels[0])
+        # Most particles find their bits there.
+        lacks = inside & ((tl.load(at, mask=inside, other=255) & bits) != bits)
+        tl.atomic_or(at, bits, mask=lacks, sem="relaxed")
 
 
 @triton.jit
@@ -171,7 +177,7 @@ def prepare_particles(
     position, velocity, scene_of, origin, particle_count, low, geometry, occupied, prefix_sum, cell_of,
     weight_of, fraction_of, motion, coarsest_of, share_of, place_of, moments, domain, obstacle_table,
     obstacle_cell_size, features, touch_of, disturbed, wall_friction, gravity, scale, friction, moving, poses, turn,
-    surface_of, drift, root, table, numbers, mask, scenes, cell_size, reach, capacity,
+    surface_of, drift, links, table, numbers, mask, scenes, cell_size, reach, capacity,
     HISTORY: tl.constexpr, LEVELS: tl.constexpr, MOTION: tl.constexpr, COLUMNS: tl.constexpr,
     NORMALS: tl.constexpr, OBSTACLES: tl.constexpr, SYMMETRY: tl.constexpr, FEATURES: tl.constexpr,
     FRICTION: tl.constexpr, FRICTION_AT: tl.constexpr, MOVING: tl.constexpr, BODIES: tl.constexpr,
@@ -240,8 +246,8 @@ def prepare_particles(
         slot = slot_of(cx >> LEVELS - 1, cy >> LEVELS - 1, cz >> LEVELS - 1, scene[:, None], above)
         across = inside[:, None] & across_x & across_y & across_z
         if BODIES and LEVELS > 1:
-            body = tl.load(root + slot_of(x, y, z, scene, slots), mask=inside, other=0)[:, None]
-            coarsest = number_of(table, numbers, mask, slot, body + 0 * corner, across)
+            body = body_of_slot(links, slot_of(x, y, z, scene, slots), inside)
+            coarsest = number_of(table, numbers, mask, slot, body[:, None] + 0 * corner, across)
         else:
             first = tl.load(prefix_sum + above[0] - 1, mask=above[0] > 0, other=0)
             most = tl.load(geometry + (LEVELS - 1) * GEOMETRY_COLUMNS + 5)

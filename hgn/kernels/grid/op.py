@@ -32,8 +32,8 @@ PARTICLE_BLOCK = 32
 FILL_BLOCK = 4096 if interpreting() else 512  # slots of a program; the interpreter needs few programs
 SUMS = 16  # number of columns of the coarsest cells' sums, and of the decoder's padded output
 MARGIN_CELLS = 4  # margin of a window around the box that it must contain
+UNITE_BLOCK = FILL_BLOCK // 4  # slots of a program with eight corners each
 NUMBER_BLOCK = 4096  # entries of a program
-MOST_CELLS = 8  # number of cells of a level that one particle activates at most
 OVERFLOW, OUT_OF_WINDOW = slots.OVERFLOW.value, slots.OUT_OF_WINDOW.value
 
 
@@ -161,7 +161,7 @@ class DeviceGrid:
         self.divided = config.inputs == "local"  # cells are divided among bodies (hgn.kernels.grid.bodies)
         marks, entries = rows[0][1] if self.divided else start, 0
         if self.divided and self.levels > 1:
-            entries = triton.next_power_of_2(max(NUMBER_BLOCK, MOST_CELLS * (self.levels - 1) * particles))
+            entries = triton.next_power_of_2(max(NUMBER_BLOCK, (self.levels - 1) * self.capacities[0] + 1))
 
         def integers(*shape: int) -> torch.Tensor:
             return torch.zeros(shape, dtype=torch.int32, device=device)
@@ -173,17 +173,18 @@ class DeviceGrid:
         drifting = coarsest * ("moving" in config.own_physics)
         # 8-byte entries come first, for their alignment
         parts = [2 * entries, 4 * at if relative else 4, *[SUMS * coarsest] * 3, SUMS * rough, 2 * coarsest, marks]
-        parts += [8 * drifting, self.levels]
+        parts += [8 * drifting, self.levels, *[marks * self.divided] * 2]
         self._cleared = integers(sum(parts) + sum(more))  # one launch clears all parts
         cleared = self._cleared.split([*parts, *more])
-        table, motion, *sums, moments, friction, disturbed, self.occupied, drift, self.needed_L = cleared[: len(parts)]
+        table, motion, *sums, moments, friction, disturbed = cleared[:7]
+        self.occupied, drift, self.needed_L, self._reached, links = cleared[7 : len(parts)]
         self.more_cleared = cleared[len(parts) :]
-        self.prefix_sum, self._root, self._numbers = integers(marks), integers(marks * self.divided), integers(entries)
-        self._table = table.view(torch.int64)
-        self._owners = {"root": self._root, "table": self._table, "numbers": self._numbers, "mask": max(0, entries - 1)}
+        self.prefix_sum = integers(marks)
+        self._owners = {"links": links, "table": table.view(torch.int64), "numbers": integers(entries)}
+        self._owners["mask"] = max(0, entries - 1)
         self.slot_of_cell, self._parent, self._octant = integers(at), integers(at), integers(at)
-        self._links = integers(14 * at)
-        self._neighbour, self._children = self._links.split([6 * at, 8 * at])
+        self._tables = integers(14 * at)
+        self._neighbour, self._children = self._tables.split([6 * at, 8 * at])
         self.counts_L = integers(self.levels)
         self.status = integers(1)
         self.cell_N8 = integers(particles, 8)
@@ -228,38 +229,38 @@ class DeviceGrid:
     def build(self, particles: DeviceParticles) -> None:
         """Marks, numbers and tabulates the cells of all levels."""
         self._cleared.zero_()
-        particle_blocks, cells = (triton.cdiv(self.particles, MARK_BLOCK),), {"occupied": self.occupied}
-        places: dict[str, Any] = {
-            "position": particles.position_N3, "scene_of": particles.scene_N, "origin": particles.origin_S3,
-            "particle_count": particles.count, "low": self.low, "geometry": self.geometry, "root": self._root,
-            "cell_size": self.cell_size, "BLOCK": MARK_BLOCK,
-        }  # fmt: skip
-        kernel.mark_cells[particle_blocks](
-            **places, **cells, status=self.status, LEVELS=self.levels, BODIES=self.divided
-        )
+        kernel.mark_cells[(triton.cdiv(self.particles, MARK_BLOCK),)](
+            position=particles.position_N3, scene_of=particles.scene_N, origin=particles.origin_S3,
+            particle_count=particles.count, low=self.low, geometry=self.geometry, occupied=self.occupied,
+            reached=self._reached, status=self.status, cell_size=self.cell_size, LEVELS=self.levels,
+            BODIES=self.divided, BLOCK=MARK_BLOCK,
+        )  # fmt: skip
         torch.cumsum(self.occupied, 0, dtype=torch.int32, out=self.prefix_sum)
+        cells: dict[str, Any] = {
+            "occupied": self.occupied, "prefix_sum": self.prefix_sum, "geometry": self.geometry,
+            "LEVELS": self.levels, "BLOCK": FILL_BLOCK,
+        }  # fmt: skip
         tables: dict[str, Any] = {
-            "prefix_sum": self.prefix_sum, "geometry": self.geometry, "slot_of_cell": self.slot_of_cell,
-            "neighbour": self._neighbour, "parent": self._parent, "octant": self._octant, "children": self._children,
-            "counts": self.counts_L, "needed": self.needed_L, "status": self.status, "LEVELS": self.levels,
-            "OVERLAP": overlaps(), "BLOCK": FILL_BLOCK,
+            "slot_of_cell": self.slot_of_cell, "neighbour": self._neighbour, "parent": self._parent,
+            "octant": self._octant, "children": self._children, "counts": self.counts_L, "needed": self.needed_L,
+            "status": self.status, "OVERLAP": overlaps(),
         }  # fmt: skip
         if not self.divided:
             kernel.fill_tables[(triton.cdiv(self.largest, FILL_BLOCK), self.levels)](**cells, **tables)
             return
-        self._links.fill_(-1)
-        bodies.unite_cells[particle_blocks](**places)
-        finest = (triton.cdiv(len(self.occupied), FILL_BLOCK),)
-        bodies.insert_cells[finest](
-            **cells, geometry=self.geometry, root=self._root, table=self._table, mask=self._owners["mask"],
-            LEVELS=self.levels, BLOCK=FILL_BLOCK,
-        )  # fmt: skip
+        self._tables.fill_(-1)
+        finest, links, table, mask = len(self.occupied), *(self._owners[name] for name in ("links", "table", "mask"))
+        bodies.unite_cells[(triton.cdiv(finest, UNITE_BLOCK),)](
+            reached=self._reached, links=links, geometry=self.geometry, BLOCK=UNITE_BLOCK
+        )
+        blocks = (triton.cdiv(finest, FILL_BLOCK),)
+        bodies.insert_cells[blocks](**cells, links=links, table=table, mask=mask)
         if self.levels > 1:
-            bodies.number_cells[(len(self._table) // NUMBER_BLOCK,)](
-                table=self._table, numbers=self._numbers, geometry=self.geometry, needed=self.needed_L,
+            bodies.number_cells[(len(table) // NUMBER_BLOCK,)](
+                table=table, numbers=self._owners["numbers"], geometry=self.geometry, needed=self.needed_L,
                 status=self.status, LEVELS=self.levels, BLOCK=NUMBER_BLOCK,
             )  # fmt: skip
-        bodies.join_cells[finest](**cells, **self._owners, **tables)
+        bodies.join_cells[blocks](**cells, **self._owners, **tables)
 
     def prepare(
         self,

@@ -400,8 +400,8 @@ class Updates:
         )
         self.target_N3 = torch.zeros(particles, 3, device=device)
         self.share_N = torch.zeros(particles, device=device)
-        if not self.capacities:
-            self.grid = self._device_grid((16,) * config.levels)
+        for _ in range(0 if self.capacities else 2):  # bodies divide cells for which the finest level has room
+            self.grid = self._device_grid(self.capacities or (16,) * config.levels)
             self._assemble()
             self.grid.build(self.buffers)
             self.capacities = self._rounded(self.grid.needed_L.tolist())
