@@ -88,9 +88,9 @@ def _drift(report: Report) -> bytes:
 # picture: the report that it shows, and how
 FIGURES: dict[str, tuple[str, Callable[[Report], bytes]]] = {
     f"results/error_vs_time/{name}{end}.png": (f"results/error_vs_time/{name}.json", draw)
-    for name in ("obstacles", "chosen", "no_obstacles")
+    for name in ("fine", "obstacles", "chosen", "no_obstacles")
     for end, draw in (("", _error_against_time), ("_batched", _batched), ("_frames", _frames))
-    if (name, end) != ("obstacles", "_batched")
+    if (name, end) not in (("fine", ""), ("fine", "_batched"), ("obstacles", "_batched"))
 } | {
     "results/fast/drift_h100.png": ("results/fast/drift_h100.json", _drift),
     "results/obstacles/curves.png": ("results/obstacles/curves.json", _curves),
