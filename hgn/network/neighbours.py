@@ -29,10 +29,6 @@ class NeighbourList:
     sender_E: torch.Tensor  # int64, places in the sorted order
     receivers: Segments
 
-    @property
-    def edge_count(self) -> int:
-        return len(self.sender_E)
-
 
 def neighbour_list(position_N3: torch.Tensor, scene_N: torch.Tensor, radius: float) -> NeighbourList:
     """Returns all ordered pairs of particles of one scene closer than `radius`, including each particle with itself.

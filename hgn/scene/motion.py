@@ -67,10 +67,6 @@ class Motion:
         begin, end = self.translation_T3[after - 1], self.translation_T3[after]
         return turned(fraction * turn) @ self.rotation_T33[after - 1], begin + fraction * (end - begin)
 
-    def keyframes_between(self, begin: float, end: float) -> np.ndarray:
-        """Returns the times of the keyframes after `begin` and before `end`, in seconds."""
-        return np.asarray(self.time_T[(self.time_T > begin) & (self.time_T < end)])
-
     def place(self, point_P3: np.ndarray, time: float) -> np.ndarray:
         """Returns the places of the obstacle's points at a time, float64 [P, 3]."""
         rotation, translation = self.pose(time)

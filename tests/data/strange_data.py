@@ -139,11 +139,6 @@ def frames_of_nobody(file):
     file.create_dataset("hgn/entry_frame", data=np.full(100_000, 10**6), compression="gzip")
 
 
-def long_source(file):
-    del file["hgn/source"]
-    file.create_dataset("hgn/source", data=np.frombuffer(b"[" + 20_000_000 * b"[]," + b"0]", "V1"), compression="gzip")
-
-
 cases(
     "rollout",
     {

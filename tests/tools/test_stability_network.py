@@ -25,7 +25,6 @@ SCENE = {"obstacle_count": 1, "obstacle_size": [0.1, 0.2]}
 SCENE |= {"group_shapes": ["cube"], "group_count": 2, "group_size": 0.04}
 GRAVITY = (0.0, -9.8, 0.0)
 SMALL = {"frames": 3, "long_frames": 5, "scene": SCENE, "device": "cpu"}
-MATERIAL_NAMES = ("water", "sand", "snow")
 CPU = MpmConfig(device="cpu")
 
 

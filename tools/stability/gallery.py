@@ -108,12 +108,12 @@ def is_gallery(name: str) -> bool:
     return NAME.fullmatch(name) is not None
 
 
-def load_gallery(case: str = GALLERY, files: Mapping[str, Path] | None = None) -> list[GalleryCase]:
+def load_gallery(case: str = GALLERY) -> list[GalleryCase]:
     """Returns the scenes of a case such as gallery or gallery_1. Raises: ConfigError, starting with the file."""
     match = NAME.fullmatch(case)
     assert match is not None
     draw = int(match[1] or 0)
-    files = scene_files(GALLERY) if files is None else files
+    files = scene_files(GALLERY)
     require(len(files) > 0, "cases", "without gallery where conf/gallery has no scenes", case)
     return [load_case(name, file, draw) for name, file in files.items()]
 
