@@ -19,7 +19,7 @@ LINES = {  # of Python, in tracked files
     "hgn": 33_820,
     "datagen": 9_034,
     "tools": 6_476,
-    "tests": 33_505,
+    "tests": 33_520,
 }
 SETTINGS = 240  # fields of the dataclasses behind the commands, *Config
 

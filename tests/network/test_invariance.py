@@ -5,7 +5,7 @@ from functools import partial
 
 import pytest
 import torch
-from network.states import ODD_BODIES, airborne, chosen, gns_of, in_flight, network_of, scene_of
+from network.states import ODD_BODIES, airborne, chosen, gns_of, in_flight, network_of, random_state, scene_of
 
 from hgn.network.features import Normaliser
 from hgn.network.relative import balanced
@@ -73,6 +73,21 @@ def test_each_scene_is_alone(kind):
     other_N3 = network(replace(state, gravity_S3=state.gravity_S3.flip(0)))
     assert (float((other_N3 - together_N3).detach().abs().max()) > 1e-4) == network.config.relative
     assert network(chosen(state, slice(0))).shape == (0, 3)
+
+
+@pytest.mark.parametrize("gap", [0.0701, 0.0349])
+def test_bodies_apart_do_not_act_on_each_other(gap):
+    """With local inputs a body that is 2 R from others has the accelerations that it has alone, near walls, obstacles
+    and a fast body in the same coarse cells; one nearer than R acts on it."""
+    network, state = network_of(inputs="local", levels=4), random_state((90,), spread=0.06)
+    position_N3, velocity_NM3 = state.position_N3.clone(), state.velocity_NM3.clone()
+    position_N3[60:, 0] += position_N3[:60, 0].max() - position_N3[60:, 0].min() + gap
+    velocity_NM3[60:] *= 20
+    state = replace(state, position_N3=position_N3, velocity_NM3=velocity_NM3)
+    together_N3 = network(state)
+    for body in (slice(60), slice(60, 90)):
+        change = float((network(chosen(state, body)) - together_N3[body]).detach().abs().max())
+        assert change < 1e-15 if gap > 2 * network.config.cell_size else change > 1e-7, change
 
 
 @pytest.mark.parametrize(
