@@ -2,12 +2,16 @@
 
 It compares the outputs, and for each parameter tensor the gradient of the mean absolute output, whose terms do not
 cancel. Gradients of a sum with random signs are badly conditioned: rounding to 11 bits changes them by up to 0.7.
+No tensor may exceed its bound. The root mean square of all errors is compared with that of the changes in PyTorch when
+parameters change by up to ROUNDING, plus LEAST_CHANGE. Right kernels have at most 1.1 times this, and kernels whose
+backward pass lacks a direction of edges at least 2.6 times.
 
 Shape legend: N particles of all scenes, S scenes.
 """
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Sequence
 from dataclasses import replace
@@ -18,14 +22,17 @@ from hgn.data.episode_tensors import EpisodeTensors
 from hgn.kernels.update.op import Updates
 from hgn.network.elastic import RestShape
 from hgn.network.features import ParticleState
+from hgn.network.hgn import HierarchicalGraphNetwork
 from hgn.network.moving import MovingObstacles
 from hgn.network.obstacles import ObstacleCells
-from hgn.runtime.parity import GRADIENTS, OUTPUTS, require_parity
+from hgn.runtime.parity import GRADIENTS, OUTPUTS, relative_error, require_error, require_parity
 from hgn.scene.material import INPUT_PARAMETERS
 from hgn.scene.symmetry import Symmetry
 from hgn.training.symmetry import moving_under, obstacles_under
 
 CHECKED_PARTICLES = 200_000  # largest number of particles to check; autograd needs memory
+ROUNDING = 2.0**-11  # relative change of parameters, as fp16 and tf32 round them
+CHANGES, LEAST_CHANGE = 2.0, 0.01  # largest ratio, and what is added to the changes
 
 
 def require_update_parity(
@@ -48,28 +55,54 @@ def require_update_parity(
     if moving is not None:
         moving = moving if symmetries is None else moving_under(moving, symmetries)
         state = replace(state, moving=moving.to(updates.device))
-    parameters = list(network.parameters())
     output_N3 = network.normalised_acceleration(state, origin_S3)
     weight_N3 = output_N3.detach().sign() * updates.share_N[:count, None]
-    slopes = torch.autograd.grad((output_N3 * weight_N3).sum(), parameters, allow_unused=True)
+    expected = _gradients(network, output_N3, weight_N3)
     output_error = require_parity(
         fused.output[:count, :3], output_N3.detach(), OUTPUTS, updates.precision, section="training."
     )
     fused.output_gradient[:count].zero_()
     fused.output_gradient[:count, :3] = weight_N3 / fused.unscale
     fused.backward()
-    gradients = [torch.zeros_like(parameter) for parameter in parameters]
+    gradients = [torch.zeros_like(gradient) for gradient in expected]
     updates.packed.scatter(fused.totals[: updates.packed.size], gradients)
-    gradient_error = max(
-        require_parity(
-            own, torch.zeros_like(own) if slope is None else slope, GRADIENTS, updates.precision, section="training."
-        )
-        for own, slope in zip(gradients, slopes, strict=True)
-    )
+    errors = _errors(gradients, expected)
+    rounded = _rounded(network)
+    changes = _errors(_gradients(rounded, rounded.normalised_acceleration(state, origin_S3), weight_N3), expected)
+    together = replace(GRADIENTS, bound=CHANGES * (_rms(changes) + LEAST_CHANGE))
+    for error, quantity in ((_rms(errors), together), (max(errors), GRADIENTS)):
+        gradient_error = require_error(error, quantity, updates.precision, section="training.")
     if updates.device.type == "cuda":
-        del output_N3, slopes
+        del output_N3, expected, gradients
         torch.cuda.empty_cache()  # free memory determines where episodes are stored
     return output_error, gradient_error
+
+
+def _gradients(
+    network: HierarchicalGraphNetwork, output_N3: torch.Tensor, weight_N3: torch.Tensor
+) -> list[torch.Tensor]:
+    """Returns the gradients of the weighted sum of outputs by the network's parameters."""
+    parameters = list(network.parameters())
+    gradients = torch.autograd.grad((output_N3 * weight_N3).sum(), parameters, allow_unused=True)
+    return [torch.zeros_like(p) if g is None else g for p, g in zip(parameters, gradients, strict=True)]
+
+
+def _rounded(network: HierarchicalGraphNetwork) -> HierarchicalGraphNetwork:
+    """Returns a copy whose parameters differ by random factors, because stored parameters may be rounded already."""
+    rounded, generator = copy.deepcopy(network), torch.Generator().manual_seed(0)
+    with torch.no_grad():
+        for parameter in rounded.parameters():
+            change = ROUNDING * (2 * torch.rand(parameter.shape, generator=generator) - 1)
+            parameter.mul_(1 + change.to(parameter))
+    return rounded
+
+
+def _errors(computed: list[torch.Tensor], expected: list[torch.Tensor]) -> list[float]:
+    return [relative_error(x, y, GRADIENTS.least) for x, y in zip(computed, expected, strict=True)]
+
+
+def _rms(errors: list[float]) -> float:
+    return math.hypot(*errors) / len(errors) ** 0.5
 
 
 def _state(
