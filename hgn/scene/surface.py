@@ -18,7 +18,7 @@ CANDIDATES = 1.0  # number per spacing^2 and round; a dense Poisson-disk set has
 MINIMUM_ROUNDS, MAXIMUM_ROUNDS = 4, 12
 SETTLED = 0.02  # rounds end after one that adds less than this fraction
 MINIMUM_CANDIDATES = 64  # added to the number of candidates of a round
-MAXIMUM_SAMPLES, MAXIMUM_PIECES = 5_000_000, 2_000_000
+MAXIMUM_SAMPLES, MAXIMUM_PIECES = 3_000_000, 2_000_000  # samples take about 6 CPU seconds a million
 MOST_PAIRS = 5e6  # about the largest number of near pairs in memory; surfaces may lie on one another
 
 
@@ -43,15 +43,19 @@ def sample_surface(corner_F33: np.ndarray, spacing: float, rng: np.random.Genera
         )
     candidate_count = int(expected) + MINIMUM_CANDIDATES
     points, owners = np.zeros((0, 3)), np.zeros(0, np.int64)
+    trees: list[cKDTree] = []  # of the points of each round
     for round_index in range(MAXIMUM_ROUNDS):
         chosen = np.searchsorted(running, rng.random(candidate_count) * running[-1], side="right")
         owner = usable[np.minimum(chosen, len(usable) - 1)]
         point = _uniform_in_triangles(corner_F33[owner], rng)
-        if len(points):
-            near = point_tree(points).query(point, distance_upper_bound=spacing)[0]
-            free = near >= spacing  # infinite if no point is nearer
-            point, owner = point[free], owner[free]
+        order = _by_place(point, spacing)
+        for tree in trees:
+            near = tree.query(point[order], distance_upper_bound=spacing)[0]
+            order = order[near >= spacing]  # infinite if no point is nearer
+        free = np.sort(order)
+        point, owner = point[free], owner[free]
         selected = _spread_out(point, spacing)
+        trees.append(point_tree(point[selected[_by_place(point[selected], spacing)]]))
         points = np.concatenate([points, point[selected]])
         owners = np.concatenate([owners, owner[selected]])
         if round_index + 1 >= MINIMUM_ROUNDS and len(selected) < SETTLED * len(points):
@@ -107,6 +111,16 @@ def point_tree(point_S3: np.ndarray) -> cKDTree:
     return cKDTree(point_S3, balanced_tree=False)
 
 
+def _by_place(point: np.ndarray, spacing: float) -> np.ndarray:
+    """Returns an order of points in which neighbours follow one another. Searches in it take half the time."""
+    return np.argsort(_cells(point, 8 * spacing))
+
+
+def _cells(point: np.ndarray, edge: float) -> np.ndarray:
+    """Returns a number for the cell of each point. Several cells may share it."""
+    return np.asarray(np.floor(point / edge) @ (1.0, 1e5 + 3, 1e10 + 19))
+
+
 def _uniform_in_triangles(corner_S33: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     u = np.sqrt(rng.random(len(corner_S33)))[:, None]
     v = rng.random(len(corner_S33))[:, None]
@@ -117,8 +131,7 @@ def _spread_out(point: np.ndarray, spacing: float) -> np.ndarray:
     """Returns the points of a loop that drops each point too close to an earlier point that it kept."""
     if len(point) == 0:
         return np.zeros(0, np.int64)
-    cell = np.floor(point / spacing) @ (1.0, 1e5 + 3, 1e10 + 19)
-    crowd = np.unique(cell, return_counts=True)[1]
+    crowd = np.unique(_cells(point, spacing), return_counts=True)[1]
     if (crowd.astype(np.float64) ** 2).sum() > MOST_PAIRS:  # the first half, and what of the second is free of it
         half = len(point) // 2
         first = _spread_out(point[:half], spacing)

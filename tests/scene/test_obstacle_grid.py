@@ -47,6 +47,22 @@ def test_samples_cover_the_surface(shape):
     assert tree.query(pieces.mean(axis=1))[0].max() < 2 * CELL / 4
 
 
+def test_samples_are_searched_in_the_order_of_their_places(monkeypatch):
+    """Large surfaces take most of their time to compare candidates with samples. Each sample enters one tree, and the
+    places of candidates are close to one another: in any order the time is twice as long."""
+    trees, steps = set(), []
+
+    class Tree(cKDTree):
+        def query(self, point, **options):
+            trees.add(self)
+            steps.append(np.linalg.norm(np.diff(point, axis=0), axis=1))
+            return super().query(point, **options)
+
+    monkeypatch.setattr("hgn.scene.surface.point_tree", Tree)
+    point, _ = sample_surface(shape_obstacle("square", 0.3, (0.5, 0.5, 0.5), TILT).corners, CELL / 4, rng())
+    assert sum(tree.n for tree in trees) < len(point) and np.concatenate(steps).mean() < 4 * CELL
+
+
 def test_samples_and_pieces():
     """A strip far narrower than the spacing is sampled along its whole length. Pieces are short, their areas add up,
     and a box keeps only what touches it."""
@@ -146,3 +162,5 @@ def test_errors():
         build_obstacle_grid([far], 1e-2, 0)
     with pytest.raises(ConfigError, match="scale the mesh down"):
         sample_surface(1e6 * tiny.corners, CELL / 4, rng())
+    with pytest.raises(ConfigError, match=r"fewer than 3000000 samples at spacing .*, got 3.72e"):
+        build_obstacle_grid([shape_obstacle("half_box", 8.7, (4.4, 4.4, 4.4))], 1 / 32, 0, (9.0, 9.0, 9.0))
