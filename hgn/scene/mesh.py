@@ -17,7 +17,7 @@ from scipy.sparse.csgraph import connected_components
 
 from hgn.config import MESH_SUFFIXES, USD_ENDINGS, is_mesh_file
 from hgn.scene.glb import read_glb
-from hgn.scene.polygons import concave_cut, fans, polygons_of_obj, polygons_of_ply
+from hgn.scene.polygons import concave_cut, fans, polygons_of_obj, polygons_of_ply, refuse_utf_16
 from hgn.scene.rotation import euler_rotation, rotate, round_to_float32
 from hgn.scene.scene import Obstacle
 from hgn.scene.surface import area_vectors, point_tree
@@ -148,6 +148,7 @@ def _corners_of_stl(data: bytes) -> np.ndarray:
     if text.lstrip()[:5].lower() != b"solid" or b"\0" in text[:200]:  # many binary files begin with `solid` too
         size = 84 + 50 * int.from_bytes(data[80:84], "little")
         if len(data) < size:
+            refuse_utf_16(data)
             raise ValueError(f"it has {len(data)} of {size} bytes")
         return np.frombuffer(data[84:size], _BINARY_FACET)["corners"]  # some programs append bytes to the triangles
     if b"endsolid" not in text.lower():

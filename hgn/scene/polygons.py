@@ -35,13 +35,18 @@ _TYPES = {
 }  # fmt: skip; format characters of struct and NumPy
 
 
+def refuse_utf_16(data: bytes) -> None:
+    """Raises ValueError for UTF-16 text."""
+    if _UTF_16.match(data):
+        raise ValueError("it is UTF-16 text; save it as UTF-8")
+
+
 def polygons_of_obj(data: bytes) -> tuple[np.ndarray, list[np.ndarray]]:
     """Returns vertices, float64 [V, 3], and the vertices of each face of an OBJ file.
 
     Raises: ValueError for UTF-16, vertex 0, numbers that cannot be read, and free-form surfaces.
     """
-    if _UTF_16.match(data):
-        raise ValueError("it is UTF-16 text; save it as UTF-8")
+    refuse_utf_16(data)
     text = data.replace(codecs.BOM_UTF8, b"").replace(b"\r\n", b"\n").translate(_SPACES)
     text = _COMMENT.sub(b"", text)
     if unread := _UNREAD.search(text):
@@ -64,6 +69,7 @@ def polygons_of_ply(data: bytes) -> tuple[np.ndarray, list[np.ndarray]]:
     """Returns vertices and faces of a PLY file, as `polygons_of_obj`. Raises: ValueError or LookupError if damaged."""
     end = re.search(rb"end_header[ \t]*\r?\n", data)
     if end is None or not data.startswith(b"ply"):
+        refuse_utf_16(data)
         raise ValueError("it has no header of PLY")
     form, elements = "", list[tuple[str, int, list[list[str]]]]()
     for line in data[: end.start()].decode("ascii", "replace").splitlines():
