@@ -8,8 +8,6 @@ this is no point of the material once they separate (results/solver/README.md).
 Shape legend: T frames, N visible particles, C children of each, M = N C fine particles, F triangles.
 """
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -1,7 +1,5 @@
 """One run of the generator on a folder, until its part of the data set is published or a stop is requested."""
 
-from __future__ import annotations
-
 import signal
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
@@ -39,7 +37,7 @@ class StopSignal:
     def __init__(self) -> None:
         self.signal: int | None = None
 
-    def __enter__(self) -> StopSignal:
+    def __enter__(self) -> "StopSignal":
         self._previous = {number: signal.signal(number, self._note) for number in (signal.SIGINT, signal.SIGTERM)}
         return self
 

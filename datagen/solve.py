@@ -4,8 +4,6 @@ The result for your own scene is like the data from which networks learn. `pytho
 others=[rollout.vtkhdf]` draws it next to a network's rollout of the same scene, with the distance between them.
 """
 
-from __future__ import annotations
-
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path

@@ -4,8 +4,6 @@ Training then reads it with `dataset.folder=s3://bucket/obstacles`. Shards are c
 that all listed shards are complete. A second run copies only new shards.
 """
 
-from __future__ import annotations
-
 import contextlib
 from dataclasses import dataclass
 from pathlib import Path

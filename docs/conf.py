@@ -1,7 +1,5 @@
 """How Sphinx builds the site: `make docs`, warnings as errors, every reference checked."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 

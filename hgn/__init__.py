@@ -4,8 +4,6 @@ Import the public API from here (`from hgn import Simulator, load_scene`). Each 
 `import hgn` loads neither torch nor NumPy.
 """
 
-from __future__ import annotations
-
 import os
 from importlib import import_module
 from typing import TYPE_CHECKING, Any

@@ -4,8 +4,6 @@ Exit codes: 0 success, 1 machine error (full disk, no permission, existing path)
 141 closed output pipe (as in `… | head`).
 """
 
-from __future__ import annotations
-
 import errno
 import importlib
 import io

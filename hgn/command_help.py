@@ -1,7 +1,5 @@
 """Prints `--help`: a command's description, and every key with its value and comment."""
 
-from __future__ import annotations
-
 import dataclasses
 import re
 import typing

@@ -4,8 +4,6 @@ Settings that only one command has are at the top of that command's file.
 Other code sees only dataclasses, never a DictConfig. Numbers that follow from settings are properties.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, field
 from pathlib import Path

@@ -3,8 +3,6 @@
 `tests/test_hydra_compat.py` fails if a new version has changed one of them.
 """
 
-from __future__ import annotations
-
 import argparse
 import codecs
 import importlib

@@ -3,8 +3,6 @@
 Reads DeepMind's TFRecords, geoelements' npz, LagrangeBench's and NeuralMPM's HDF5, and plain npz or HDF5.
 """
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Mapping
 from pathlib import Path

@@ -8,8 +8,6 @@
 | a setting of the solver was added | BEFORE | gets what the solver did before |
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any

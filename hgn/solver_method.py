@@ -3,8 +3,6 @@
 The identity of a data set contains them under these names (see hgn.renamed).
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 

@@ -1,7 +1,5 @@
 """The settings of the constraints of a frame; hgn.step implements them."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -28,7 +26,7 @@ class StepConfig(Bounded):
         return self.rest_threshold > 0
 
     @property
-    def in_training(self) -> StepConfig:
+    def in_training(self) -> "StepConfig":
         """Returns the constraints of pushforward simulations: obstacles only, so errors at rest and walls remain."""
         return StepConfig(obstacle_clearance=self.obstacle_clearance)
 

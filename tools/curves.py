@@ -7,8 +7,6 @@ The JSON contains {"meta": provenance of the figure, "runs": [{"name", "meta": p
 "rows"}, ...]}, with a row for each record. Minutes do not include the time between a stop and the next start.
 """
 
-from __future__ import annotations
-
 import itertools
 import json
 import math

@@ -4,8 +4,6 @@ All are in frame units: domain units a frame for velocities, domain units a fram
 Shape legend: T frames, N particles.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

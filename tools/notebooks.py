@@ -5,8 +5,6 @@ notebook whose code has not changed gets the page's new text and is not run agai
 lists what is smaller, so that each notebook takes minutes on two CPU cores.
 """
 
-from __future__ import annotations
-
 import json
 import re
 import sys

@@ -9,8 +9,6 @@ If `rollout` is the name of a scene in conf/gallery, the solver simulates the sc
 simulate it too: `python -m tools.render rollout=pool_deep 'others=[mechanics]'`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path

@@ -3,8 +3,6 @@
 Shape legend: N particles.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any

@@ -1,7 +1,5 @@
 """Simulates test scenes with the solver, to the end or to its failure."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace

@@ -21,8 +21,6 @@ format. `rows(case='frame')` is the item of the list `rows` with these fields; t
 if there is no value. Lists are joined by commas, and `%` multiplies by 100.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import re

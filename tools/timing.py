@@ -1,7 +1,5 @@
 """Measures time and memory of contenders in one process after a warm-up: runs by device events, rollouts by frames."""
 
-from __future__ import annotations
-
 import gc
 import sys
 import time

@@ -6,8 +6,6 @@ the vertices, if the grid is smaller with them: a tilted sheet then needs few sa
 Shape legend: S samples, F triangles, T keyframes.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -5,8 +5,6 @@ place of the first head of each scene, and the end (SHAPE.bodies); the heads (la
 the table of lists by base node in its frame (-1: none), then these lists (see surface_kernel.LIST_HEAD).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

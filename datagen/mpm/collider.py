@@ -23,8 +23,6 @@ The nodes near a moving obstacle change. So kernels read its surface from sample
 (datagen.mpm.body_kernel), which datagen.mpm.body computes once.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Starts Taichi once in a process, on the device of the solver's config."""
 
-from __future__ import annotations
-
 import contextlib
 import ctypes
 import functools

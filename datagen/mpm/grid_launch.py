@@ -1,7 +1,5 @@
 """Runs one substep of all scenes in a launch: on a CPU, and for a scene that is large enough for a whole GPU."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import Any
 

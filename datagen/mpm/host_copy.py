@@ -5,8 +5,6 @@ while the GPU is idle. Here only the result is copied, into memory that is reuse
 is locked in its place, so that a GPU writes to it at the speed of its bus.
 """
 
-from __future__ import annotations
-
 import ctypes
 
 import numpy as np

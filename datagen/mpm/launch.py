@@ -3,8 +3,6 @@
 Shape legend: T frames, N particles of a scene, P particles of all scenes, B scenes, K constants.
 """
 
-from __future__ import annotations
-
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence

@@ -3,8 +3,6 @@
 Kernels take few arrays instead of many scalars, because each argument of a launch takes time.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Sequence
 from typing import Any, NamedTuple

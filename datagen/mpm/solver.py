@@ -4,8 +4,6 @@ The method is the paper's simulator, Taichi Elements, with the corrections that 
 Shape legend: T frames, N particles of a scene, B scenes.
 """
 
-from __future__ import annotations
-
 import contextlib
 import gc
 import math

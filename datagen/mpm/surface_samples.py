@@ -3,8 +3,6 @@
 Shape legend: P points, F triangles.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -5,8 +5,6 @@ points on the path to a node, or within half a cell, lie between I and I + 2. Al
 Shape legend: F triangles, K base nodes near triangles, L entries of all lists.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 

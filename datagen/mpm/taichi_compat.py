@@ -3,8 +3,6 @@
 `tests/datagen/mpm/test_device.py` fails if a new version has changed this work.
 """
 
-from __future__ import annotations
-
 import ast
 import functools
 from typing import Any

@@ -1,7 +1,5 @@
 """Runs whole frames of all scenes in a launch, with a team of GPU threads for each scene."""
 
-from __future__ import annotations
-
 import gc
 import time
 from collections.abc import Iterator

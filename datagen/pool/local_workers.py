@@ -3,8 +3,6 @@
 A worker ends with its parent, and ignores signals from the terminal. Its errors are sent to the parent.
 """
 
-from __future__ import annotations
-
 import contextlib
 import os
 import pkgutil

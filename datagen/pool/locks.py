@@ -5,8 +5,6 @@ share a lock on byte 1. Each episode has a byte of its own, locked by the genera
 frees the locks of a process however it ends. So no claim becomes stale, and no clock is needed.
 """
 
-from __future__ import annotations
-
 import contextlib
 import fcntl
 import os

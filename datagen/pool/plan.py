@@ -4,8 +4,6 @@ An episode is the unit of simulation, a shard the unit of publication. Training 
 the first shards are small and the first validation episode comes early.
 """
 
-from __future__ import annotations
-
 import hashlib
 import re
 from collections.abc import Iterable, Mapping, Sequence

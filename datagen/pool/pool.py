@@ -5,8 +5,6 @@ in halves, then quarters, down to single scenes. A single scene is quarantined a
 workers, and the next seed replaces it. Workers run on this machine (local_workers.py) or on Ray (ray_workers.py).
 """
 
-from __future__ import annotations
-
 import errno
 import math
 import time

@@ -1,7 +1,5 @@
 """Reports the progress of a generator to a person or a program."""
 
-from __future__ import annotations
-
 import json
 import sys
 import time

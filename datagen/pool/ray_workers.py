@@ -5,8 +5,6 @@ through Ray's object store, so only the pool's machine needs the data set's fold
 the same version of Python. An actor waits until a machine has capacity, so machines may leave and join at any time.
 """
 
-from __future__ import annotations
-
 import logging
 import os
 import time
@@ -51,7 +49,7 @@ class RayWorkerFactory:
             ) from None
         self._ray, self._config, self._backend, self._early = ray, config, backend, early
 
-    def __enter__(self) -> RayWorkerFactory:
+    def __enter__(self) -> "RayWorkerFactory":
         """Raises: ConfigError if no cluster answers."""
         address = os.environ.get("RAY_ADDRESS") or "auto"
         try:
@@ -103,7 +101,7 @@ class RayWorkerFactory:
             if not worker.answers:
                 yield worker, ("idle",)
 
-    def _start(self, kind: type, *arguments: object, **options: Any) -> RayWorker:
+    def _start(self, kind: type, *arguments: object, **options: Any) -> "RayWorker":
         # Ray neither restarts nor retries, because the pool counts a scene's deaths and replaces workers
         actor: Any = self._ray.remote(kind).options(max_restarts=0, max_task_retries=0, **options).remote(*arguments)
         return RayWorker(self._ray, actor)

@@ -1,7 +1,5 @@
 """Stages tar files of episodes one by one, joins them to shards, and verifies shards completely."""
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import os

@@ -1,7 +1,5 @@
 """Does the work of makers (draw scenes, build obstacles) and solvers (simulate); defines the interface of a worker."""
 
-from __future__ import annotations
-
 import errno
 import pickle
 import pkgutil

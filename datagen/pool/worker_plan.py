@@ -1,7 +1,5 @@
 """Plans the number of workers and their batch sizes, for one machine or a Ray cluster."""
 
-from __future__ import annotations
-
 import math
 import os
 from collections.abc import Mapping, Sequence

@@ -7,8 +7,6 @@ staged episodes that are not synced. Several generators may write to one folder:
 the first to publish an episode wins, and the manifest changes only under its lock.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import errno
 import math
@@ -90,7 +88,7 @@ class DatasetWriter:
         self._failures: list[QuarantinedScene] = []
         self._forget_published()
 
-    def __enter__(self) -> DatasetWriter:
+    def __enter__(self) -> "DatasetWriter":
         make_folder(self.folder)
         self._locks = ShardLocks(self.folder)
         try:

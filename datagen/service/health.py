@@ -4,8 +4,6 @@ The service reports its state every second. After SILENCE_S without a report the
 that hangs.
 """
 
-from __future__ import annotations
-
 import contextlib
 import fcntl
 import json
@@ -41,7 +39,7 @@ class HealthPage:
             self._end()
             self._begin()
 
-    def __enter__(self) -> HealthPage:
+    def __enter__(self) -> "HealthPage":
         self._begin()
         return self
 

@@ -5,8 +5,6 @@ service, its pool and every solver would wait too, each at its next line. Here t
 always read. Lines that the log does not accept are dropped.
 """
 
-from __future__ import annotations
-
 import contextlib
 import os
 import queue
@@ -36,7 +34,7 @@ class UnhurriedLog:
         """Returns the reason for which the last lines are not in the log."""
         return next((stream.error for stream in self._streams if stream.error), "")
 
-    def __enter__(self) -> UnhurriedLog:
+    def __enter__(self) -> "UnhurriedLog":
         _flush()
         for file in self._files:
             if not os.isatty(file):

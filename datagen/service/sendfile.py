@@ -5,8 +5,6 @@ extension `http.response.zerocopysend`, it uses the extension; datagen.service.u
 cores with eight readers this is 50 % faster than sending pieces, and no pieces are kept in memory.
 """
 
-from __future__ import annotations
-
 import os
 import re
 from pathlib import Path

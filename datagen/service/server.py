@@ -13,8 +13,6 @@ No other file of the folder can be read, nor a shard whose bytes differ from the
 must contain `Authorization: Bearer <token>`.
 """
 
-from __future__ import annotations
-
 import asyncio
 import hashlib
 import hmac

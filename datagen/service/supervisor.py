@@ -6,8 +6,6 @@ to serve, but ends if no pool has started its work. The service also ends if the
 cannot be written.
 """
 
-from __future__ import annotations
-
 import signal
 import threading
 import time
@@ -53,7 +51,7 @@ class Supervisor:
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name="pool supervisor")
 
-    def __enter__(self) -> Supervisor:
+    def __enter__(self) -> "Supervisor":
         self._thread.start()
         return self
 

@@ -3,8 +3,6 @@
 `tests/datagen/test_sendfile.py` fails if a new version changes the internals; the extension would then not work.
 """
 
-from __future__ import annotations
-
 import asyncio
 from functools import partial
 from typing import Any, BinaryIO, cast

@@ -4,8 +4,6 @@ A page places one by `<!-- figure: NAME.png: CAPTION -->`, alone in its line. `N
 folder; the picture appears under docs/_generated/figures and is not committed.
 """
 
-from __future__ import annotations
-
 import json
 import re
 import sys

@@ -1,8 +1,6 @@
 """Writes the references from the sources: the dataclasses of hgn/config.py, each command's docstring and settings, and
 the fields of documented dataclasses."""
 
-from __future__ import annotations
-
 import ast
 import dataclasses
 import functools

@@ -5,8 +5,6 @@ from each other and from any page, become links to their pages; pictures are fou
 the checkout are offered as downloads.
 """
 
-from __future__ import annotations
-
 import os
 import re
 from pathlib import Path

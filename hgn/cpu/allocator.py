@@ -4,8 +4,6 @@ The GNU C library returns large blocks to the system, which then sets 18,000 pag
 particles. This takes up to a quarter of the frame's time.
 """
 
-from __future__ import annotations
-
 import ctypes
 import functools
 import platform

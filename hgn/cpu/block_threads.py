@@ -4,8 +4,6 @@ PyTorch would split every operation among its threads. Many operations of a fram
 needs to wake up.
 """
 
-from __future__ import annotations
-
 import functools
 import os
 from collections.abc import Callable, Iterator, Sequence

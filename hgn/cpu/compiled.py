@@ -5,8 +5,6 @@ cache from the gather to the sums. The machine's C compiler compiles rows.c for 
 `$XDG_CACHE_HOME/hgn/rows` (by default `~/.cache/hgn/rows`). Without a compiler PyTorch computes the rows.
 """
 
-from __future__ import annotations
-
 import ctypes
 import functools
 import hashlib
@@ -30,7 +28,7 @@ FLAGS = ("-std=gnu11", "-O3", "-march=native", "-fno-math-errno", "-ffp-contract
 LANES = 16  # float32 numbers in a vector of AVX-512
 WIDEST = 512  # largest width whose two matrices fit on a thread's stack
 COMPILERS = ("cc", "gcc", "clang")
-_KNOWN: WeakKeyDictionary[torch.nn.Module, CompiledRows] = WeakKeyDictionary()
+_KNOWN: "WeakKeyDictionary[torch.nn.Module, CompiledRows]" = WeakKeyDictionary()
 
 
 def unsupported_reason(width: int, dtype: torch.dtype) -> str | None:
@@ -53,7 +51,7 @@ def describe(width: int) -> str:
     return "rows compiled for this CPU" if reason is None else f"rows in PyTorch ({reason})"
 
 
-def compiled_rows(network: torch.nn.Module) -> CompiledRows:
+def compiled_rows(network: torch.nn.Module) -> "CompiledRows":
     """Returns the rows of an MLP, cached while its parameters keep their addresses."""
     known = _KNOWN.get(network)
     if known is None or known.places != known.places_now():

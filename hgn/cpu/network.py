@@ -7,8 +7,6 @@ does not depend on the number of threads. With a compiler, C code computes rows 
 Shape legend: N particles, P pairs of particles and cells, C cells, E directed edges, W width.
 """
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Callable
 from functools import partial

@@ -4,8 +4,6 @@ This is the reference for hgn.cpu.compiled. If only sums are needed, gain and sh
 Shape legend: R rows, K rows of a table, S segments, W width.
 """
 
-from __future__ import annotations
-
 from functools import cached_property, lru_cache
 from typing import NamedTuple
 

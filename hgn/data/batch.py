@@ -3,8 +3,6 @@
 Shape legend: H velocity history, W = H + 2 frames, N particles of all scenes, S scenes.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -46,7 +44,7 @@ class Batch:
     rest: RestShape | None = None  # as in ParticleState
     moving: MovingObstacles | None = None  # as in ParticleState
 
-    def to(self, device: torch.device, non_blocking: bool = False) -> Batch:
+    def to(self, device: torch.device, non_blocking: bool = False) -> "Batch":
         names = ["window_WN3", "material_N", "scene_N", "domain_S3", "gravity_S3", "wall_friction_S3", "parameter_NP"]
         names += ["rest", "moving"]
         own = {name: getattr(self, name) for name in names if getattr(self, name) is not None}

@@ -3,8 +3,6 @@
 It is imported only for data sets at HTTP URLs.
 """
 
-from __future__ import annotations
-
 import asyncio
 import re
 import time

@@ -1,7 +1,5 @@
 """Defines the entries of a data set's index: episodes, shards and their totals."""
 
-from __future__ import annotations
-
 import hashlib
 import math
 import re
@@ -82,7 +80,7 @@ class SplitTotals(Bounded):
     digest: str = ""  # digest of the shards' sha256 in publication order; identifies the order of samples
     statistics: Statistics | None = None  # stored in `manifest.json` only, not with segments
 
-    def plus(self, shard: ShardEntry) -> SplitTotals:
+    def plus(self, shard: ShardEntry) -> "SplitTotals":
         """Returns the totals with one more shard."""
         return SplitTotals(
             self.shards + 1,

@@ -3,8 +3,6 @@
 Shape legend: H velocity history, T frames, N particles.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

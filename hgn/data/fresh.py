@@ -3,8 +3,6 @@
 `fresh.json` in the data set's folder stores it with their hashes. It is written once, before the first scene is made.
 """
 
-from __future__ import annotations
-
 import json
 import secrets
 from collections.abc import Iterable, Sequence

@@ -3,8 +3,6 @@
 Counts, folder, workers, device and launch size are not part of it. A data set can therefore grow on other machines.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Mapping

@@ -5,8 +5,6 @@ Katharopoulos & Fleuret 2018) draws those frames more often, with smaller loss w
 Shape legend: T frames, N particles, F = T - 1 frames with a successor.
 """
 
-from __future__ import annotations
-
 from bisect import bisect_right
 from dataclasses import dataclass
 from functools import cached_property
@@ -27,7 +25,7 @@ class DrawnBySize:
     weight_F: np.ndarray  # inverse of the relative frequency; 1 for uniform draws
 
     @staticmethod
-    def of(size_F: np.ndarray, fraction: float) -> DrawnBySize:
+    def of(size_F: np.ndarray, fraction: float) -> "DrawnBySize":
         """Returns a distribution that draws a `fraction` in proportion to size, and the rest uniformly."""
         total = size_F.sum()
         often_F = (1 - fraction) + fraction * (size_F * len(size_F) / total if total > 0 else np.ones(len(size_F)))
@@ -54,7 +52,7 @@ class FrameImportance:
     acceleration_F: np.ndarray  # root mean square over axes and particles
 
     @staticmethod
-    def of(episode: Episode, fraction: float) -> FrameImportance:
+    def of(episode: Episode, fraction: float) -> "FrameImportance":
         """Returns a distribution that draws a `fraction` in proportion to rms acceleration, and the rest uniformly."""
         step = max(1, episode.particle_count // PARTICLES)
         past_1N3 = frames_before(episode, -1)[:, ::step]

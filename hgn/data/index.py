@@ -11,8 +11,6 @@ are not published and are overwritten. The cost of a publication does not depend
 reads only new shards. If a shard is removed from the list, the whole index is written again as the next generation.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import re
@@ -117,7 +115,7 @@ class Index(Sequence[ShardEntry]):
         self.folder, self.state, self.totals = folder, state, totals
         self._read = _Read()
 
-    def continued(self, later: Index) -> Index:
+    def continued(self, later: "Index") -> "Index":
         """Returns `later`. If it is a later state of the same index, it shares the cache of this one."""
         if later.state.generation == self.state.generation != _IN_MEMORY and len(later) >= len(self):
             later._read = self._read
@@ -190,7 +188,7 @@ class Index(Sequence[ShardEntry]):
                     totals = totals.plus(shard)
         return totals.digest if totals.episodes == episodes else None
 
-    def continues(self, earlier: Index, split: str) -> bool:
+    def continues(self, earlier: "Index", split: str) -> bool:
         """Returns whether the shards of a split begin with those of `earlier`."""
         before = earlier.totals[split]
         return self.digest(split, before.episodes) == before.digest

@@ -1,7 +1,5 @@
 """Reads several data sets as one: fixed data sets first, then one that may grow."""
 
-from __future__ import annotations
-
 import hashlib
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Sequence
@@ -36,7 +34,7 @@ class PooledStore(Episodes):
         """Returns the manifest of the data set that may grow."""
         return self.own.manifest
 
-    def of_split(self, split: str) -> PooledStore:
+    def of_split(self, split: str) -> "PooledStore":
         """Returns another split of the same data sets."""
         return PooledStore(self.own.of_split(split), [store.of_split(split) for store in self.others])
 

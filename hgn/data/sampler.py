@@ -5,8 +5,6 @@ it began. Batch size and number of ranks only divide the order: every sample is 
 have the same size, so a batch may span two epochs. A `SamplerState` is the whole state of the order.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple

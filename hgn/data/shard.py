@@ -1,7 +1,5 @@
 """Writes shards as tar files, with the same bytes for the same episode, and finds the offsets of their members."""
 
-from __future__ import annotations
-
 import tarfile
 from collections.abc import Iterator
 from pathlib import Path

@@ -4,8 +4,6 @@ One process fetches a shard, and the others of this machine wait for it. `HGN_CA
 `~/.cache/hgn`). `HGN_CACHE_GB` limits its size (default: the disk's size). A full cache removes the oldest shards.
 """
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import functools

@@ -4,8 +4,6 @@ Shards of a URL are cached on this machine (`hgn.data.shard_cache`). `HGN_DATASE
 service. With `HGN_DATASET_HOST` only that host (or host:port) receives it.
 """
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import functools
@@ -66,7 +64,7 @@ def asked_once() -> Iterator[None]:
         _once.reset(token)
 
 
-def ask(folder: Path | str, read: Callable[[Storage], T]) -> T:
+def ask(folder: Path | str, read: "Callable[[Storage], T]") -> T:
     """Returns the result of `read` for a data set. Raises: as `read`; inside `faults_outlived` UnreachableError too."""
     storage, place = open_storage(folder), str(folder)
     if _once.get() or not outliving():
@@ -218,13 +216,13 @@ class _Folder(Storage):
         return path
 
 
-def _at_url(url: str) -> _Remote:
+def _at_url(url: str) -> "_Remote":
     _require_address(url)
     return _remote(url.rstrip("/"))
 
 
 @functools.lru_cache(maxsize=16)
-def _remote(url: str) -> _Remote:
+def _remote(url: str) -> "_Remote":
     return _Remote(url)
 
 

@@ -1,7 +1,5 @@
 """Verifies files by size and sha256, once in a process."""
 
-from __future__ import annotations
-
 import hashlib
 from pathlib import Path
 

@@ -5,8 +5,6 @@ At the end one launch for each type of operand and size of chunk computes weight
 Shape legend: N particles, C cells, W width.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Callable

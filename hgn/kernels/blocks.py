@@ -4,8 +4,6 @@ With tf32 operands have 10 bits of mantissa and float32's range; the host rounds
 fp16 operands have 10 bits and float16's range. With fp32, only for tests, nothing is rounded. Sums are always float32.
 """
 
-from __future__ import annotations
-
 import triton
 import triton.language as tl
 

@@ -3,8 +3,6 @@
 Shape legend: N particles, C cells.
 """
 
-from __future__ import annotations
-
 import triton
 import triton.language as tl
 

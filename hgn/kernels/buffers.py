@@ -3,8 +3,6 @@
 Shape legend: N particles, C cells, W width.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from typing import NamedTuple
 

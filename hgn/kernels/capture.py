@@ -1,7 +1,5 @@
 """Captures CUDA graphs of launches in streams that stay the same throughout a process."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 
 import torch

@@ -4,8 +4,6 @@ Nothing here reads a value back to the host. The docstring of each kernel descri
 the paper's (sec. 3.2). Shape legend: N particles, C cells, W width.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import torch

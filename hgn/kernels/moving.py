@@ -4,8 +4,6 @@ hgn.kernels.poses defines the records. A turn is a frame of a simulation or an u
 Shape legend: T turns, S scenes, J most moving obstacles of a scene, V = J S rows.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -33,7 +31,7 @@ class EpisodeMoving:
     @staticmethod
     def of(
         obstacles: tuple[MovingObstacle, ...], frame_s: float, network: NetworkConfig, device: torch.device
-    ) -> EpisodeMoving:
+    ) -> "EpisodeMoving":
         """Returns the obstacles as `network` sees them."""
         hashes = (SceneHash.of_grid(obstacle.grid, "friction" in network.own_physics) for obstacle in obstacles)
         return EpisodeMoving(obstacles, tuple(own and own.to(device) for own in hashes), frame_s)

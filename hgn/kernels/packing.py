@@ -5,8 +5,6 @@ The block of an MLP holds, in this order: the first layer's wide parts, each [hi
 and bias. Zero rows pad an output of 3 or 9 to PADDED_OUT. Padding never receives a gradient.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

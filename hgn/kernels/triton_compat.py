@@ -3,8 +3,6 @@
 tests/kernels/test_triton_compat.py fails if a new version of Triton has changed one of them.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any

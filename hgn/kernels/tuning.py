@@ -3,8 +3,6 @@
 The choices change speed, never results.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import triton
@@ -50,7 +48,7 @@ class Tuning:
     weight_registers: int | None = None  # largest number per thread in weight gradients; with 128 two programs fit
 
     @staticmethod
-    def of(precision: str) -> Tuning:
+    def of(precision: str) -> "Tuning":
         """Returns the fastest choices on an H100 at width 128."""
         if precision == "fp32":
             return Tuning(8, 4, 8, 4, 16, 4, 4, 2, 4, 1056, dense=True, loops=True, gather_block=16)

@@ -3,8 +3,6 @@
 Shape legend: Q cells of all scenes, E entries of their lists, F triangles.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -31,7 +29,7 @@ class Barriers:
     clearance: float
 
     @staticmethod
-    def of(barriers: Sequence[Barrier]) -> Barriers | None:
+    def of(barriers: Sequence[Barrier]) -> "Barriers | None":
         """Returns the barriers of a batch, with barriers[s] for scene s; None if no scene has an obstacle.
 
         Raises: ConfigError if scenes with obstacles have different cell sizes.
@@ -62,7 +60,7 @@ class Barriers:
             clearance,
         )
 
-    def to(self, device: torch.device, non_blocking: bool = False) -> Barriers:
+    def to(self, device: torch.device, non_blocking: bool = False) -> "Barriers":
         names = ("key_Q", "start_Q", "triangle_E", "row_F24", "scene_F")
         moved = {name: getattr(self, name).to(device, non_blocking=non_blocking) for name in names}
         return replace(self, **moved)

@@ -3,8 +3,6 @@
 Shape legend: N particles, W width, S scenes.
 """
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 

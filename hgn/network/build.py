@@ -1,7 +1,5 @@
 """The network that a configuration names."""
 
-from __future__ import annotations
-
 from hgn.config import NetworkConfig
 from hgn.network.base import ParticleNetwork
 from hgn.network.gns import GraphNetworkSimulator

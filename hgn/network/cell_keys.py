@@ -4,8 +4,6 @@ Sorted keys group cells by scene, and keys of neighbours differ by a constant. S
 of a batch. Shape legend: … any leading shape, B hash buckets.
 """
 
-from __future__ import annotations
-
 import math
 
 import torch

@@ -10,8 +10,6 @@ f_i = (v^n … v^{n-m+1}, n_o, d, e):
 Shape legend: N particles, m velocities, S scenes.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

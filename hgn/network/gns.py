@@ -7,8 +7,6 @@ So a particle's part is multiplied once instead of once for each edge. The funct
 Shape legend: N particles, E directed edges, W width, H hidden.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import torch

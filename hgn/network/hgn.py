@@ -8,8 +8,6 @@ Steps have the numbers of the paper's figure, which has three levels:
 Shape legend: N particles, C cells, E directed edges, W width, H hidden width of an MLP, F input features, S scenes.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import torch

@@ -5,8 +5,6 @@ once for each particle or cell, not for each pair or edge. The function is exact
 `forward` is the plain definition; `project` and `finish` are its two halves.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import torch

@@ -5,8 +5,6 @@ are 25 contiguous runs of the sorted particles. The work is proportional to the 
 Shape legend: N particles, K candidate pairs, E directed edges.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

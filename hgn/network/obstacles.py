@@ -4,8 +4,6 @@ Paper sec. 3: n_o is the normal of the obstacle cell that contains the particle.
 Shape legend: K obstacle cells of all scenes, N particles, V values of a surface, its normal first.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
@@ -29,7 +27,7 @@ class ObstacleCells:
     friction_K: torch.Tensor | None = field(default=None, kw_only=True)
 
     @staticmethod
-    def of(grids: Sequence[ObstacleGrid]) -> ObstacleCells | None:
+    def of(grids: Sequence[ObstacleGrid]) -> "ObstacleCells | None":
         """Returns the cells of a batch, with grids[s] for scene s; None if no scene has an obstacle."""
         if not any(len(grid.cell_K3) for grid in grids):
             return None
@@ -43,7 +41,7 @@ class ObstacleCells:
             friction_K = torch.from_numpy(np.concatenate([*parts]).astype(np.float32, copy=False))
         return ObstacleCells(key_K, torch.from_numpy(normal_K3), cell_size, friction_K=friction_K)
 
-    def to(self, device: torch.device, non_blocking: bool = False) -> ObstacleCells:
+    def to(self, device: torch.device, non_blocking: bool = False) -> "ObstacleCells":
         return ObstacleCells(
             self.key_K.to(device, non_blocking=non_blocking),
             self.normal_K3.to(device, non_blocking=non_blocking),

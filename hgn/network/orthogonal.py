@@ -3,8 +3,6 @@
 Shape legend: K blocks, W width.
 """
 
-from __future__ import annotations
-
 import math
 
 import torch

@@ -24,8 +24,6 @@ With `moving` v is the velocity relative to the surfaces, v - V of hgn.network.m
 Shape legend: N particles, C coarsest cells, S scenes, P parameters (in names of tensors only), K columns.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any

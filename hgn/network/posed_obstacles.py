@@ -8,8 +8,6 @@ piecewise polynomial in position and pose. Networks were trained with s = 0.
 Shape legend: N particles, K obstacle cells.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch
@@ -31,7 +29,7 @@ class Placement:
         """Moves points […, 3] of the obstacle to its pose."""
         return (position_3 - self.pivot_3) @ self.rotation_33.T + self.pivot_3 + self.translation_3
 
-    def to(self, dtype: torch.dtype) -> Placement:
+    def to(self, dtype: torch.dtype) -> "Placement":
         return Placement(*(tensor.to(dtype) for tensor in (self.rotation_33, self.pivot_3, self.translation_3)))
 
     def undo(self, position_N3: torch.Tensor) -> torch.Tensor:

@@ -26,8 +26,6 @@ them. These properties hold for any parameters:
 Shape legend: N particles, H velocities, L levels, C cells of a level, E directed edges, S scenes.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

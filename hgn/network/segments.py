@@ -4,8 +4,6 @@ The rows of a segment are contiguous, so a sum needs no atomic additions and has
 Shape legend: E rows, N segments, W width.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

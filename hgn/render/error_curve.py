@@ -3,8 +3,6 @@
 Shape legend: T frames, N particles.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import numpy as np

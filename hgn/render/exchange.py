@@ -5,8 +5,6 @@ water as a closed surface. USD and surfaces need the extra `files` (usd-core, py
 Shape legend: T frames, N particles, V vertices, F triangles.
 """
 
-from __future__ import annotations
-
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace

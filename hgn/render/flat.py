@@ -3,8 +3,6 @@
 Shape legend: N particles, P pixels.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

@@ -3,8 +3,6 @@
 Shape legend: T frames, N particles.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import io

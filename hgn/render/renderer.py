@@ -7,8 +7,6 @@ surfaces by depth, and blends them with its particle at the particle's depth. Pi
 Shape legend: N particles, P pixels, S fragments (pixels of one triangle or sphere), F triangles, L layers.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import replace

@@ -9,8 +9,6 @@
 All have the same interface. `choose` returns the fastest supported backend and reports why.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import torch

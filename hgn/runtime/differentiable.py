@@ -4,8 +4,6 @@ docs/how_to/gradients.md lists which gradients are exact, which are valid only w
 Shape legend: T frames, S scenes, N particles, M or H velocities, F triangles.
 """
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """The rule for divergence of a simulation, for all backends and for pushforward."""
 
-from __future__ import annotations
-
 import torch
 
 from hgn.step.reference import within_range

@@ -5,8 +5,6 @@ way begins at the pose of this frame and ends at that of the next one.
 Shape legend: P ways, at most one for each row of the buffers, S scenes.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 

@@ -5,8 +5,6 @@ before a training's first update, and time again when the buffers of a simulatio
 on disk. Kernels that are not in it are compiled at their first launch.
 """
 
-from __future__ import annotations
-
 import contextlib
 import sys
 import tempfile

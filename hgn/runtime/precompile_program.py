@@ -4,8 +4,6 @@ Updates and TritonStepper make their launches on tensors without memory, so no s
 exists. The tensors' sizes are guesses, on which few variants depend. Other variants are compiled at first use.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import sys

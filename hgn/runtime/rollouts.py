@@ -1,7 +1,5 @@
 """Rollouts of scenes to their end, or to the frame before they diverge."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 

@@ -5,8 +5,6 @@ other changes between frames. An output has a *row* per particle. Scenes that en
 Shape legend: T frames, N particles of all scenes, A particles that enter, M velocities of a history, S scenes.
 """
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack
@@ -73,7 +71,7 @@ class Simulation:
         self.stepper: Stepper | None = None
         self.continue_from(state)
 
-    def __enter__(self) -> Simulation:
+    def __enter__(self) -> "Simulation":
         return self
 
     def __exit__(self, *_: object) -> None:

@@ -1,7 +1,5 @@
 """The backend torch. All backends have its signature; hgn.runtime.backend chooses one for a network."""
 
-from __future__ import annotations
-
 from contextlib import AbstractContextManager, nullcontext
 
 import torch

@@ -3,8 +3,6 @@
 Shape legend: T frames, N particles of all scenes, M velocities of a history, S scenes.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 
 import torch

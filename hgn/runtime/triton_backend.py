@@ -1,7 +1,5 @@
 """The backend triton: simulations in CUDA graphs, which are kept for later simulations."""
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager

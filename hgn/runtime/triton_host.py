@@ -1,7 +1,5 @@
 """Requirements of Triton: its package and, with a GPU, a C compiler, which builds the launchers of kernels."""
 
-from __future__ import annotations
-
 import importlib.util
 import os
 import shutil

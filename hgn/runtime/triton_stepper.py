@@ -6,8 +6,6 @@ the last good frame, so no frame is computed twice.
 Shape legend: N particles of all scenes, M velocities of a history, S scenes, T frames.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace

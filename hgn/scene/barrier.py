@@ -7,8 +7,6 @@ are inside the edge planes and the box.
 Shape legend: F triangles, Q cells, E entries of their lists, C cells of a box.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 

@@ -4,8 +4,6 @@ NumPy in float64, without loops over points or triangles.
 Shape legend: P points (or point-triangle pairs), F triangles, T tree nodes.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 

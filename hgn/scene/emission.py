@@ -3,8 +3,6 @@
 Shape legend: N particles, E particles of an emitter, P points, F triangles.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from dataclasses import dataclass

@@ -5,8 +5,6 @@ read it, and a trainer can memory-map the positions. Pickles are not used.
 Shape legend: T frames, N particles, K obstacle cells, H frames before frame 0, P particles of obstacles.
 """
 
-from __future__ import annotations
-
 import io
 import json
 import math

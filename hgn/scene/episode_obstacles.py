@@ -3,8 +3,6 @@
 Shape legend: K obstacle cells, F triangles.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path

@@ -4,8 +4,6 @@ Numbers are sums, products, quotients and square roots of drawn numbers, so they
 Shape legend: P points.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -3,8 +3,6 @@
 Materials, textures, cameras, lights and animations are ignored. Skins are refused.
 """
 
-from __future__ import annotations
-
 import base64
 import json
 import re

@@ -4,8 +4,6 @@ Numbers are sums, products and square roots of those of `Generator.random()`, so
 every machine. Shape legend: N particles, P points.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 
@@ -34,7 +32,7 @@ class Region:
         outside = np.maximum(np.abs(point_P3 - np.array(self.centre)) - np.array(self.half_width), 0.0)
         return np.sqrt((outside * outside).sum(axis=1)) - self.radius
 
-    def distance(self, other: Region) -> float:
+    def distance(self, other: "Region") -> float:
         """Returns the distance to another region; negative or zero if they overlap."""
         width = np.array(self.half_width) + np.array(other.half_width)
         outside = np.maximum(np.abs(np.array(self.centre) - np.array(other.centre)) - width, 0.0)

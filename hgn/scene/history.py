@@ -5,8 +5,6 @@ any scene.
 Shape legend: H history steps, N particles, W = H + 2 window frames.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

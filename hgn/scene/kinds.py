@@ -1,7 +1,5 @@
 """The kinds of scenes for `scene.kinds`. `hgn.scene.world` makes the scenes."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import fields
 from typing import Any

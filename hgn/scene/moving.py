@@ -3,8 +3,6 @@
 Shape legend: F triangles.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -4,8 +4,6 @@ geoelements/gns stores trajectories as object arrays, which NumPy pickles. NumPy
 file. An invalid array state would make it write outside its memory.
 """
 
-from __future__ import annotations
-
 import io
 import math
 import pickle

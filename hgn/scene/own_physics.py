@@ -3,8 +3,6 @@
 Shape legend: N particles, P parameters in the order of `INPUT_PARAMETERS`.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace

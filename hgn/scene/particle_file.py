@@ -1,7 +1,5 @@
 """Particles of a group from a file: npz or USD."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

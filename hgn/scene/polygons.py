@@ -4,8 +4,6 @@ Shape legend: V vertices, K corners of a polygon, M polygons with the same numbe
 corners that are left, W polygons whose next ear is not yet found.
 """
 
-from __future__ import annotations
-
 import codecs
 import re
 import struct

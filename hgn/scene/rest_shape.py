@@ -3,8 +3,6 @@
 Shape legend: N particles, B particles of a body, K neighbours.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

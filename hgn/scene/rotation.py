@@ -1,7 +1,5 @@
 """Rotations of points by plain sums and products, so that results do not depend on a BLAS library."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

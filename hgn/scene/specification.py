@@ -1,7 +1,5 @@
 """Checks the parts of a stored scene's specification that programs read: any JSON may be in a file of a stranger."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields

@@ -7,8 +7,6 @@ ends, so particles rest at 2 and at 61 of 64 cells. A mirror therefore maps x to
 nodes. A mirror at the middle of the domain would move the walls by a cell.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from itertools import permutations, product

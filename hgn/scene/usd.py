@@ -4,8 +4,6 @@ Lengths become domain units: a metre is one domain unit, and y points up. Animat
 sample. Subdivision surfaces are their polygons.
 """
 
-from __future__ import annotations
-
 import io
 import os
 import re

@@ -6,8 +6,6 @@ bitwise on every machine. Lengths are in domain units, speeds in domain units pe
 "tilt" is the tangent of half an angle, so rotations need no sine or cosine.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 

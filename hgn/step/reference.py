@@ -19,8 +19,6 @@ The remaining deformation is reduced in the same way on cells four times as larg
 Suffixes of names: N particles, C coarsest cells, K centres of cells, F triangles, P pairs of particles and triangles.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import torch

@@ -1,7 +1,5 @@
 """Compares the content that a file claims with its size, before memory is allocated for it."""
 
-from __future__ import annotations
-
 import math
 import pickletools
 import re

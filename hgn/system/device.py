@@ -1,7 +1,5 @@
 """Chooses the device on which a command computes."""
 
-from __future__ import annotations
-
 import os
 
 import torch

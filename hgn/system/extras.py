@@ -1,7 +1,5 @@
 """Names the extra that installs a missing package."""
 
-from __future__ import annotations
-
 import importlib.util
 import sys
 

@@ -1,7 +1,5 @@
 """Reads and writes files atomically: a file appears whole or not at all."""
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import io

@@ -4,8 +4,6 @@ Data sets are read by HTTP ranges from the Hub's file addresses. huggingface_hub
 $HF_ENDPOINT names another server, and $HF_TOKEN is the token for private repositories.
 """
 
-from __future__ import annotations
-
 import functools
 import ipaddress
 import os
@@ -43,7 +41,7 @@ class HubPlace:
     is_dataset: bool
 
     @staticmethod
-    def parse(url: str, field: str) -> HubPlace:
+    def parse(url: str, field: str) -> "HubPlace":
         """Parses an address. Raises ConfigError with `field`."""
         match = _PATTERN.fullmatch(url)
         if match is None:

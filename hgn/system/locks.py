@@ -1,7 +1,5 @@
 """Locks files, or bytes of files. The kernel releases the locks of a process at its end, even after a crash."""
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import fcntl

@@ -4,8 +4,6 @@ Control groups (Linux, cgroups(7)) limit containers. A process in a container se
 machine. The system slows it above its CPU quota, and kills it above its memory limit.
 """
 
-from __future__ import annotations
-
 import math
 import os
 import re

@@ -3,8 +3,6 @@
 `HGN_PATIENCE_S` is this time in seconds. The default is two minutes.
 """
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import math

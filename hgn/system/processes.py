@@ -1,7 +1,5 @@
 """Starts child processes that end with their parent."""
 
-from __future__ import annotations
-
 import contextlib
 import ctypes
 import multiprocessing

@@ -1,7 +1,5 @@
 """The place of this process among those of a training, from variables of torchrun, Slurm and Lightning's launcher."""
 
-from __future__ import annotations
-
 import os
 
 

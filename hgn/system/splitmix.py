@@ -1,7 +1,5 @@
 """Hashes neighbouring numbers to independent ones."""
 
-from __future__ import annotations
-
 MASK = (1 << 64) - 1
 
 

@@ -4,8 +4,6 @@ In YAML 1.1 a repeated key would replace the first one, 010 would be eight, and 
 these and names the key and the line.
 """
 
-from __future__ import annotations
-
 import itertools
 import json
 import re

@@ -3,8 +3,6 @@
 This module needs no Lightning, because checkpoints consist of plain containers and tensors.
 """
 
-from __future__ import annotations
-
 import os
 import re
 import zipfile
@@ -73,7 +71,7 @@ class Progress:
     precision: str | None = None  # precision of the updates; missing in checkpoints of 0.2.0 and before
 
     @staticmethod
-    def of(checkpoint: dict[str, Any]) -> Progress:
+    def of(checkpoint: dict[str, Any]) -> "Progress":
         section = current_names(checkpoint[SECTION])
         state = from_stored(SamplerState, section.get("sampler_state"), "sampler_state")
         counts = section.get("updates"), section.get("skipped", 0)

@@ -1,7 +1,5 @@
 """Writes checkpoints in a thread during the next updates."""
 
-from __future__ import annotations
-
 import io
 import shutil
 import sys

@@ -1,7 +1,5 @@
 """Feeds chunks of updates to the trainer from a data set that may still grow."""
 
-from __future__ import annotations
-
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping

@@ -1,7 +1,5 @@
 """The data set of a training: its completeness, the wait for its episodes, and its progress."""
 
-from __future__ import annotations
-
 import math
 import sys
 import time

@@ -4,8 +4,6 @@ Launchers set environment variables. torchrun sets RANK, WORLD_SIZE and LOCAL_WO
 SLURM_NTASKS and SLURM_NNODES. Lightning's launcher sets LOCAL_RANK and NODE_RANK in a machine's other processes.
 """
 
-from __future__ import annotations
-
 import inspect
 import os
 import re

@@ -4,8 +4,6 @@ Squared errors are summed over axes and averaged over particles, in frame units:
 units per frame squared for accelerations.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any

@@ -1,7 +1,5 @@
 """The generator that a training starts if its data set is missing or incomplete."""
 
-from __future__ import annotations
-
 import json
 import sys
 from pathlib import Path

@@ -4,8 +4,6 @@ The device counts, and the host reads the counters at log lines. Counters [5]: s
 skipped updates, updates skipped in a row now, largest number skipped in a row since the last log line.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 
 import torch

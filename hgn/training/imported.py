@@ -1,7 +1,5 @@
 """Training on an imported data set, which determines the settings that are null."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

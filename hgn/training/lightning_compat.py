@@ -3,8 +3,6 @@
 `tests/training/test_lightning_compat.py` fails when a new version changes one of them.
 """
 
-from __future__ import annotations
-
 import logging
 import os
 import warnings

@@ -4,8 +4,6 @@
 MLFLOW_TRACKING_URI. A logger that fails, or waits for its server, neither ends nor delays a training.
 """
 
-from __future__ import annotations
-
 import os
 import queue
 import sys
@@ -68,7 +66,7 @@ def _store_id(run: Path, kind: str, run_id: str) -> None:
     write_atomically(run / f"{kind}_id", run_id.encode())
 
 
-def build_loggers(kinds: Iterable[str], run: Path, settings: dict[str, Any]) -> list[ThreadedLogger]:
+def build_loggers(kinds: Iterable[str], run: Path, settings: dict[str, Any]) -> "list[ThreadedLogger]":
     """Returns the loggers of this rank; only the first one has any. `settings` are logged as hyper-parameters."""
     return [ThreadedLogger(kind, run, settings) for kind in dict.fromkeys(kinds)] if first_rank() else []
 

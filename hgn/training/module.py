@@ -1,7 +1,5 @@
 """The Lightning module: a network in training, its updates, and the content of a checkpoint."""
 
-from __future__ import annotations
-
 import copy
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Measurements while a training runs: one-step errors and rollouts of fixed scenes."""
 
-from __future__ import annotations
-
 import math
 import sys
 import time

@@ -1,7 +1,5 @@
 """Muon (Jordan 2024): hidden matrices step along their orthogonalised momentum; other parameters step as in Adam."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

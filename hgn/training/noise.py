@@ -6,8 +6,6 @@
 Shape legend: W = m + 2 window frames (m velocities), N particles, F windows, S scenes, K waves.
 """
 
-from __future__ import annotations
-
 import math
 
 import torch

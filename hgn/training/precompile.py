@@ -1,7 +1,5 @@
 """Lists the kernels that a training compiles while the first episodes are generated."""
 
-from __future__ import annotations
-
 from hgn.config import SceneConfig, TrainConfig
 from hgn.kernels.update.op import UpdateSettings
 from hgn.runtime.precompile_program import PrecompileJob

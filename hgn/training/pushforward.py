@@ -16,8 +16,6 @@ Shape legend: H velocity history, F simulated frames, T = H + F + 2 frames of th
 N particles, S scenes.
 """
 
-from __future__ import annotations
-
 import functools
 import time
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """Reads the samples of a chunk from the data set: windows for backend torch, whole episodes for triton."""
 
-from __future__ import annotations
-
 import sys
 from collections import OrderedDict
 from collections.abc import Sequence

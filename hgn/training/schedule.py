@@ -1,7 +1,5 @@
 """Learning rate, moving average and measurements as functions of the number of earlier updates."""
 
-from __future__ import annotations
-
 from hgn.config import TrainingConfig
 
 FIRST_MEASUREMENT = 2_000  # smallest number of updates before the first measurement, if monitor_every is larger

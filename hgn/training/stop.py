@@ -3,8 +3,6 @@
 A signal sets a flag. The loop ends at the next update, after a checkpoint. A second Ctrl-C ends it immediately.
 """
 
-from __future__ import annotations
-
 import contextlib
 import os
 import signal

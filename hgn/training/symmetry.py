@@ -3,8 +3,6 @@
 Shape legend: W window frames, N particles, K obstacle cells, S scenes.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Pictures and animations for loggers, and hyper-parameters for TensorBoard."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -3,8 +3,6 @@
 Shape legend: as in hgn.training.pushforward.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Training updates in PyTorch, the reference: one batch, its loss, one step of the optimiser."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import torch

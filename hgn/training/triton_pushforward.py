@@ -5,8 +5,6 @@ other episode. Buffers and the captured graph are reused by the next simulation.
 Shape legend: as in hgn.training.pushforward.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from contextlib import nullcontext

@@ -4,8 +4,6 @@ While a chunk of updates runs, parameters and Adam's moments are in the kernels'
 chunk, so checkpoints do not depend on the backend.
 """
 
-from __future__ import annotations
-
 import math
 import sys
 import time

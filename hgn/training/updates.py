@@ -6,8 +6,6 @@
 | triton | hgn.training.triton_updates.TritonUpdates | up to 64, in CUDA graphs |
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any, Protocol
 

@@ -6,8 +6,6 @@ ends because others do not answer writes them to `hang_rank_<rank>` in the run's
 collective takes longer than its time-out.
 """
 
-from __future__ import annotations
-
 import contextlib
 import os
 import select

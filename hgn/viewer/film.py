@@ -3,8 +3,6 @@
 Shape legend: T frames.
 """
 
-from __future__ import annotations
-
 import contextlib
 import threading
 import time

@@ -7,8 +7,6 @@ Viewers are not trusted: a raw message may contain any value. Values are clamped
 must be in the list, and every error of an action becomes a message to its viewer.
 """
 
-from __future__ import annotations
-
 import itertools
 import sys
 import tempfile

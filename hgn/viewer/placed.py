@@ -3,8 +3,6 @@
 Shape legend: V vertices, S surface samples.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 import re
@@ -71,7 +69,7 @@ class PlacedObstacle:
         """Returns the entry for a scene file."""
         return dataclasses.replace(self.body.entry, position=self.position, rotation=self.rotation)
 
-    def turned(self, degrees: float) -> PlacedObstacle:
+    def turned(self, degrees: float) -> "PlacedObstacle":
         """Returns the obstacle rotated further about the vertical."""
         matrix = euler_rotation((0.0, degrees, 0.0)) @ self.rotation_33
         x, y, z = Rotation.from_matrix(matrix).as_euler("xyz", degrees=True)

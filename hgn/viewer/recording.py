@@ -3,8 +3,6 @@
 Shape legend: N particles, M velocities of a history, T frames.
 """
 
-from __future__ import annotations
-
 from collections import deque
 from dataclasses import dataclass
 from itertools import pairwise

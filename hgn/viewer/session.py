@@ -3,8 +3,6 @@
 Shape legend: N particles, A particles in a box, C candidates to enter.
 """
 
-from __future__ import annotations
-
 import io
 import math
 import zipfile

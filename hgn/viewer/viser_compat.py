@@ -5,8 +5,6 @@ opens its websocket below its own path. A cookie would be sent to the servers of
 `tests/viewer/test_page.py` fails if a new version has changed these parts.
 """
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import hmac

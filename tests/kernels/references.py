@@ -7,8 +7,6 @@ where a kernel computes it again, of what it computes, rounded as it rounds.
 Shape legend: R rows, N particles, C cells, E edges, W width.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

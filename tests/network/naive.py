@@ -4,8 +4,6 @@ Cells live in dictionaries, pairs and edges in Python lists, and every MLP sees 
 of first layers, no keys, no sorting. Used only to check the real network.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 from functools import cache

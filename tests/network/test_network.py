@@ -1,7 +1,5 @@
 """The network: parameter counts, the literal definition, batches, frames on a CPU, obstacles."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import partial
 

@@ -1,7 +1,5 @@
 """Checks and times the contenders of tools.bench."""
 
-from __future__ import annotations
-
 import functools
 import time
 from collections.abc import Callable

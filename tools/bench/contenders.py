@@ -4,8 +4,6 @@ A check compares a contender with PyTorch in float64 on the same input. Workload
 replaced in the check by one scene of at most one tile of particles.
 """
 
-from __future__ import annotations
-
 import copy
 from dataclasses import replace
 

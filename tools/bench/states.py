@@ -5,8 +5,6 @@ neighbours of each within R, and 1,200 active cells of size R (the tile: 97 and 
 Shape legend: N particles of all scenes, S scenes, W window frames.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

@@ -3,8 +3,6 @@
 Needs only NumPy and ONNX Runtime.
 """
 
-from __future__ import annotations
-
 import sys
 import time
 from pathlib import Path

@@ -5,8 +5,6 @@ the same test scenes. docs/concepts/judging.md states what the reference is. Wri
 OUT_batched.png and OUT_frames.png.
 """
 
-from __future__ import annotations
-
 from hgn.command import run_command
 
 if __name__ == "__main__":

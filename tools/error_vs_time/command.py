@@ -1,7 +1,5 @@
 """Chooses contenders and reference of tools.error_vs_time, and starts the run."""
 
-from __future__ import annotations
-
 import functools
 import sys
 import time

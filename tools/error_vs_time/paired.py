@@ -4,8 +4,6 @@ Median and mean of the differences are resampled over scenes; intervals are perc
 Shape legend: S scenes, B resamplings.
 """
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any

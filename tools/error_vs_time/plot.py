@@ -1,7 +1,5 @@
 """Figures of a report's JSON: error against run time, and error over the frames with the chaos floor."""
 
-from __future__ import annotations
-
 import textwrap
 from collections.abc import Mapping, Sequence
 from itertools import cycle

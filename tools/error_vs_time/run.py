@@ -3,8 +3,6 @@
 An interrupted run leaves a valid file with all that was measured.
 """
 
-from __future__ import annotations
-
 import sys
 import time
 import traceback

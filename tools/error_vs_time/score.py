@@ -4,8 +4,6 @@ Conventions: squared errors are sums over axes and means over particles, in fram
 only scenes that reached the frame. Shape legend: T frames, N particles of a scene, S scenes.
 """
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor

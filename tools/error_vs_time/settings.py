@@ -1,7 +1,5 @@
 """The options of `python -m tools.error_vs_time`."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated

@@ -5,8 +5,6 @@ particles are elsewhere than the reference's. S(a, b) = OT(a, b) - OT(a, a) / 2 
 Shape legend: B pairs of clouds, N, M particles.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

@@ -3,8 +3,6 @@
 A contender is timed only if it passes its check. The JSON contains {"meta": provenance, "rows"}.
 """
 
-from __future__ import annotations
-
 from hgn.command import run_command
 
 if __name__ == "__main__":

@@ -1,7 +1,5 @@
 """Starts the timed processes of tools.scaling, and writes their rows."""
 
-from __future__ import annotations
-
 import json
 import sys
 import tempfile

@@ -1,7 +1,5 @@
 """Settings of `python -m tools.scaling`; read without torch."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 from hgn.config import NetworkConfig, Precision

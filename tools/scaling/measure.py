@@ -4,8 +4,6 @@ A timed update on several ranks consists of noise, jitter, grid, forward and bac
 and Adam. Lightning, logging and reading of data are not included.
 """
 
-from __future__ import annotations
-
 import datetime
 import gc
 import itertools
@@ -60,7 +58,7 @@ class Contender(Timed):
     spread: float  # as SPREAD, for the timed scenes
     particles: float  # mean number of particles of one update on each device
     one_graph: bool = False  # the gradients' average is in the CUDA graph of the update
-    update: TorchUpdates | TritonUpdates | None = None  # None in processes that only wait
+    update: "TorchUpdates | TritonUpdates | None" = None  # None in processes that only wait
     check: str = PASS
     milliseconds: list[float] = field(default_factory=list)  # times of one update
     batches: int = 1  # number of updates of one sample

@@ -3,8 +3,6 @@
 Parts are modules of this package with a `main`, each with its options in conf/command/stability_PART.yaml.
 """
 
-from __future__ import annotations
-
 import importlib
 import sys
 

@@ -4,8 +4,6 @@ A measure (measures.py) maps trajectories to figures. A limit bounds one of them
 figure of the solver where the case is simulated by the solver too. A new case needs no code of its own.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -79,7 +77,7 @@ class Outcome:
     scenes: Sequence[InitialState]
     trials: Sequence[RolloutResult]
     simulator: Simulator
-    solver: Outcome | None = None  # the solver's trajectories of the same scenes
+    solver: "Outcome | None" = None  # the solver's trajectories of the same scenes
     upright: tuple[Sequence[RolloutResult], Sequence[RolloutResult]] | None = None  # network and solver
 
     @property

@@ -1,7 +1,5 @@
 """Compares the measures of a case with its limits."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from typing import Any

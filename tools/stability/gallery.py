@@ -4,8 +4,6 @@ A gallery file is a scene file with a section `measure`: frames, bounds (observa
 vary. Draw 0 is the file itself. Draw 1 is for choices between networks, draw 2 for reports, the others are free.
 """
 
-from __future__ import annotations
-
 import copy
 import functools
 import hashlib

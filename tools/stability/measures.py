@@ -4,8 +4,6 @@ A measure returns a figure, a record of figures, or a list of records; None if a
 Shape legend: T frames, N particles.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

@@ -3,8 +3,6 @@
 The cases are in network_cases.py, the measures in measures.py. If a rollout fails, the runtime must report it.
 """
 
-from __future__ import annotations
-
 import sys
 import time
 from collections.abc import Sequence

@@ -3,8 +3,6 @@
 Shape legend: N particles, K cubes.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace

@@ -4,8 +4,6 @@ The unit of a length is in OBSERVABLES: domain units, or cells of the scene file
 grid. Shape legend: T frames, N particles, S sampled frames.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -109,7 +107,7 @@ class Film:
     particles_per_cell: float  # number of particles in a cell of that size
     beside_far_TN3: np.ndarray | None = None  # places of the scene's own particles if the far body is present
 
-    def of_group(self, group: int | None) -> Film:
+    def of_group(self, group: int | None) -> "Film":
         """Returns the film of one group's particles."""
         if group is None:
             return self

@@ -6,8 +6,6 @@ parameter: a network that ignores the parameter has about this figure, so it mus
 Shape legend: T frames, N particles.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """Rows of the stability reports, their table and their JSON."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, field

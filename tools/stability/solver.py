@@ -5,8 +5,6 @@ and published experiments (water at rest, dams, columns and slopes of sand). On 
 columns need a GPU.
 """
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass

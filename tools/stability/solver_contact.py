@@ -5,8 +5,6 @@ Block, surface and gravity are turned together. Lengths are in cells, times in s
 Shape legend: T frames, N particles.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Iterator, Sequence

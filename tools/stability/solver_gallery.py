@@ -5,8 +5,6 @@ are returned for the JSON, with which networks are compared (gallery.py). Scenes
 results/stability was written are not simulated again: their stored series are compared with the present bounds.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor

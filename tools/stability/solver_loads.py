@@ -1,7 +1,5 @@
 """Stiff materials, fast impacts, and a long run."""
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 import math

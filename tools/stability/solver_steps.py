@@ -5,8 +5,6 @@ oscillates at a stable step and grows at an unstable one. Plastic flow hides the
 or an elastic solid. Sand and snow are blocks pressed into a corner, which remain stable at larger steps.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 import math

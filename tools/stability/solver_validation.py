@@ -6,8 +6,6 @@ floor is what sand bears in simple shear: a rougher floor would brake the lowest
 Shape legend: T frames, N particles.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Iterator, Sequence

@@ -3,8 +3,6 @@
 Shape legend: P particles of the boundary, D dimensions, K obstacle cells.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.spatial import KDTree
 

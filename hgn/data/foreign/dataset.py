@@ -1,7 +1,5 @@
 """Imports a set of trajectories as a data set: shards are written first, then the index, and the manifest last."""
 
-from __future__ import annotations
-
 import hashlib
 import itertools
 from collections.abc import Callable, Iterator

@@ -6,8 +6,6 @@ each level of the hierarchy has one layer of cells, and the walls in z are out o
 Shape legend: T frames, N particles, P particles of the boundary, K obstacle cells, H frames before frame 0.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 import numpy as np

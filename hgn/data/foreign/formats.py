@@ -9,8 +9,6 @@
 | plain | {split}.npz or {split}.h5, metadata.json | docs/how_to/import.md |
 """
 
-from __future__ import annotations
-
 import contextlib
 import itertools
 import math

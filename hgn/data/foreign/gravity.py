@@ -3,8 +3,6 @@
 Shape legend: T frames, N particles, D dimensions, S stretches, W frames of a stretch.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

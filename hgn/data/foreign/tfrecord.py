@@ -9,8 +9,6 @@ A record consists of its length (uint64), the length's masked CRC-32C, the bytes
     FeatureList {repeated Feature feature = 1}     Feature {BytesList bytes_list = 1}    BytesList {repeated bytes = 1}
 """
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Iterator
 from pathlib import Path

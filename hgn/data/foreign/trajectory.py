@@ -4,8 +4,6 @@ Shape legend: T frames, N particles of all kinds, n sampled particles or coordin
 dimensions, 2 or 3. K is the number of obstacle cells, or in property_NK of properties.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any

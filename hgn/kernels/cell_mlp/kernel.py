@@ -3,8 +3,6 @@
 OVERLAP means the same as in hgn.kernels.edges.kernel. Shape legend: C cells, W width.
 """
 
-from __future__ import annotations
-
 import triton
 import triton.language as tl
 

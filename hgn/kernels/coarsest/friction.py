@@ -3,8 +3,6 @@
 The rule is hgn.network.own_physics.friction_fraction, whose letters are used here. Shape legend: C coarsest cells.
 """
 
-from __future__ import annotations
-
 import triton
 import triton.language as tl
 

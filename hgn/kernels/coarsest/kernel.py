@@ -3,8 +3,6 @@
 Shape legend: N particles, C coarsest cells. The geometry table is that of hgn.kernels.geometry.
 """
 
-from __future__ import annotations
-
 import triton
 import triton.language as tl
 

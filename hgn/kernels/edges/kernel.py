@@ -12,8 +12,6 @@ the weights for the matrix units before the wait. AHEAD: a program loads the nex
 tile's rows are free. The wait and the loads of the first tile are then before the loop. Shape legend: C cells, W width.
 """
 
-from __future__ import annotations
-
 import triton
 import triton.language as tl
 

@@ -4,8 +4,6 @@ Forward of row r: h = x A + gathered[index_r] + offset_octant + b; a = leaky(h);
 Up to two products of y follow for the next kernels, with or without biases. Shape legend: R rows, W width.
 """
 
-from __future__ import annotations
-
 import triton
 import triton.language as tl
 

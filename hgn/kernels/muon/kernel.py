@@ -1,7 +1,5 @@
 """Computes Muon's momentum and steps on square blocks of the packed weights, see hgn.training.muon."""
 
-from __future__ import annotations
-
 import triton
 import triton.language as tl
 

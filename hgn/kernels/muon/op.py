@@ -1,7 +1,5 @@
 """Launches Muon's steps on the packed weights. Shape legend: K blocks, W width."""
 
-from __future__ import annotations
-
 import torch
 
 from hgn.kernels.muon.kernel import momentum_directions, step_blocks

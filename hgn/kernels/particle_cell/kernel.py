@@ -4,8 +4,6 @@ Row r of a tile is corner r % 8 of particle r // 8. Atomic additions sum up the 
 differ between runs, and the last bits of the sums may differ too. Shape legend: N particles, W width.
 """
 
-from __future__ import annotations
-
 import triton
 import triton.language as tl
 

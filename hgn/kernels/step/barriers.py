@@ -5,8 +5,6 @@ buckets of the cells (0: no obstacle), of their keys, and of the ranges of their
 addresses of the lists and of the rows of the triangles; and the bits of the cell size in float32.
 """
 
-from __future__ import annotations
-
 import triton
 import triton.language as tl
 

@@ -4,8 +4,6 @@ The rules are those of hgn.step.reference. A frame is integrated only if no earl
 Shape legend: N particles, K middles of coarsest or larger cells, T frames between two synchronisations with the host.
 """
 
-from __future__ import annotations
-
 import triton
 import triton.language as tl
 

@@ -3,8 +3,6 @@
 Shape legend: N particles, S scenes, K middles of cells.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -43,7 +41,7 @@ class RestLevel:
     slow_N3: torch.Tensor
 
     @staticmethod
-    def of(grid: DeviceGrid, cleared: Sequence[torch.Tensor]) -> RestLevel:
+    def of(grid: DeviceGrid, cleared: Sequence[torch.Tensor]) -> "RestLevel":
         """Returns a level whose sums the grid clears when it is built."""
         particles, device = grid.particles, grid.feature_NF.device
         bodies, sums = (part.view(torch.float32) for part in cleared)

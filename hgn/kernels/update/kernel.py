@@ -8,8 +8,6 @@ that row is the symmetry of the sample.
 Shape legend: N particles of all scenes, S scenes, H velocity history.
 """
 
-from __future__ import annotations
-
 import triton
 import triton.language as tl
 

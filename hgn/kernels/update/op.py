@@ -5,8 +5,6 @@ results only after the last replay. If a grid is too small, its update and later
 the buffers and continues with this update. Shape legend: K updates, S scenes, N particles of all scenes.
 """
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Callable, Sequence
@@ -111,7 +109,7 @@ class UpdateSettings:
     optimizer: str = "adam"
 
     @staticmethod
-    def of(training: TrainingConfig, obstacle_cell_size: float) -> UpdateSettings:
+    def of(training: TrainingConfig, obstacle_cell_size: float) -> "UpdateSettings":
         return UpdateSettings(
             training.batch_scenes, training.noise_std, True, obstacle_cell_size,
             training.symmetry != "none", training.noise_correlated_fraction, optimizer=training.optimizer,

@@ -4,8 +4,6 @@ The job table has a row for each product: offsets of A, B and the result, index 
 of rows per counted particle or cell, offset of the column sums (-1: none). Offsets count elements.
 """
 
-from __future__ import annotations
-
 import triton
 import triton.language as tl
 
