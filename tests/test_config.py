@@ -158,7 +158,6 @@ RULES = {
     ],
     command(StabilitySolverConfig): [
         ({"cases": ["stesp"]}, r"cases\[0\] must be one of steps"),
-        ({"cases": ["grid"]}, r"cases\[0\] must be .*, got 'grid'; tools.error_vs_time and cases=\[gallery\] compare"),
     ],
 }
 

@@ -16,10 +16,10 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 33_878,
-    "datagen": 9_034,
-    "tools": 6_476,
-    "tests": 33_546,
+    "hgn": 33_554,
+    "datagen": 8_968,
+    "tools": 6_388,
+    "tests": 33_539,
 }
 SETTINGS = 240  # fields of the dataclasses behind the commands, *Config
 
