@@ -156,9 +156,7 @@ RULES = {
         ({"precision": "fp8"}, "precision must be one of auto, fp32, tf32, fp16"),
         ({"backend": "quick"}, "backend must be one of auto, torch, triton, cpu"),
     ],
-    command(StabilitySolverConfig): [
-        ({"cases": ["stesp"]}, r"cases\[0\] must be one of steps"),
-    ],
+    command(StabilitySolverConfig): [({"cases": ["stesp"]}, r"cases\[0\] must be one of steps")],
 }
 
 

@@ -16,10 +16,10 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 33_554,
+    "hgn": 33_551,
     "datagen": 8_968,
     "tools": 6_388,
-    "tests": 33_539,
+    "tests": 33_480,
 }
 SETTINGS = 240  # fields of the dataclasses behind the commands, *Config
 

@@ -157,10 +157,7 @@ class MovingObstacles:
             yield row_N, Poses(*(tensor.to(dtype)[row_N] for tensor in self.poses.tensors))
 
     def met(
-        self,
-        still: ObstacleCells | None,
-        place: tuple[torch.Tensor, torch.Tensor, torch.Tensor],
-        steps: int,
+        self, still: ObstacleCells | None, place: tuple[torch.Tensor, torch.Tensor, torch.Tensor], steps: int
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Returns `relative.obstacle_surfaces` of moving and `still` obstacles, [N, 8], and velocities V [N, 3].
 

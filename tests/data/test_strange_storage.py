@@ -195,18 +195,7 @@ def test_malformed_bodies_end(data, monkeypatch, content, pause_s):
         *(
             (text.format(password), text.format("").replace("user:@", ""))
             for text in ("http://user:{}@host:80/a", "'http://user:{}@[::1]/a'", "user:{}@h/a", "got x, user:{}@h/a")
-            for password in (
-                "80",
-                "80ab",
-                "80#ab",
-                "80?ab",
-                "80@ab",
-                "8:0ab",
-                "pa/ss",
-                "8@a/b",
-                "a/b@c/d",
-                "a@b",
-            )
+            for password in ("80", "80ab", "80#ab", "80?ab", "80@ab", "8:0ab", "pa/ss", "8@a/b", "a/b@c/d", "a@b")
         ),
         # digits before a slash are a port, and what follows is a path
         ("http://host:80/a@b 'http://[fe80:1::2]:80/a@b'", "http://host:80/a@b 'http://[fe80:1::2]:80/a@b'"),

@@ -46,12 +46,7 @@ def main(folder):
     try:
         os.environ["RAY_ADDRESS"] = cluster.address
         dataset = DatasetConfig(
-            folder=f"{folder}/shared",
-            training_scenes=10,
-            validation_scenes=2,
-            test_scenes=0,
-            frames=6,
-            pool="ray",
+            folder=f"{folder}/shared", training_scenes=10, validation_scenes=2, test_scenes=0, frames=6, pool="ray"
         )
         killer = Killer(cluster, second)
         finished = generate(DatagenConfig(dataset=dataset), killer, lambda: False, BALLISTIC)

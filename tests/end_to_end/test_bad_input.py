@@ -83,17 +83,9 @@ VALUES = [
             *(("mpm", "defaul", "default"), ("training", "recipes", "recipe")),
         )
     ),
-    (
-        "train",
-        ["network.inputs=relativ"],
-        "network.inputs must be one of absolute, relative, local, got 'relativ'; d",
-    ),
+    ("train", ["network.inputs=relativ"], "network.inputs must be one of absolute, relative, local, got 'relativ'; d"),
     ("train", ["training.init_weights=mechanic"], "own_physics), got 'mechanic'; did you mean mechanics?"),
-    (
-        "train",
-        ["dataset.folder=hf:/datasets/a/b"],
-        "dataset.folder must be a folder or a URL, got 'hf:/datasets/a/b'",
-    ),
+    ("train", ["dataset.folder=hf:/datasets/a/b"], "dataset.folder must be a folder or a URL, got 'hf:/datasets/a/b'"),
     ("evaluate", [*EVALUATE, "data=hf//datasets/a/b"], "did you mean hf://datasets/a/b?"),
     ("evaluate", [*EVALUATE, "data=hf://dataset/a/b"], "must be of a repository of data sets, hf://datasets/USER/NAME"),
     ("evaluate", [*EVALUATE, "data=htpp://host/a"], "(Protocol not known: htpp); did you mean http?"),
@@ -169,12 +161,7 @@ RATE, SNOW = of("weights", frame_rate_hz=30.0), of("weights", materials=("snow",
 RATES = "data frame_rate_hz must be the weights' 30.0, got 60.0; take a data set or weights of the same"
 # command, arguments, fault, message
 FILES = [
-    (
-        "rollout",
-        ROLLOUT,
-        of("edit_scene", "0.8, 0.5]", "0.45, 0.5]"),
-        " inside obstacle_0_cone (particles: x 0.4",
-    ),
+    ("rollout", ROLLOUT, of("edit_scene", "0.8, 0.5]", "0.45, 0.5]"), " inside obstacle_0_cone (particles: x 0.4"),
     ("rollout", ROLLOUT, MESH, "obstacles[0].mesh must"),
     ("evaluate", EVALUATE, of("damage", "validation", truncate), " bytes, got "),
     ("evaluate", EVALUATE, of("damage", "validation", alter), ": it was altered; delete it and run the generator agai"),

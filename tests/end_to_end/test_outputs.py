@@ -7,14 +7,7 @@ import signal
 
 import ballistic_solver
 import pytest
-from end_to_end.places import (
-    COMMANDS,
-    EVALUATE,
-    OF_THE_RUN,
-    ROLLOUT,
-    content,
-    refused,
-)
+from end_to_end.places import COMMANDS, EVALUATE, OF_THE_RUN, ROLLOUT, content, refused
 from processes import exit_code
 
 from hgn import rollout

@@ -44,11 +44,7 @@ def ended(before, after, barriers, dtype=torch.float64, scene=None, **changes):
         ((0.05, 0.13), (-0.05, 0.13), (-0.05, 0.13)),  # beyond the rim
         ((0.05, 0.125 + RIM / 2), (-0.05, 0.125 + RIM / 2), (CLEARANCE, 0.125 + RIM / 2)),  # at the rim
         ((0.05, 0.125 + 2 * RIM), (-0.05, 0.125 + 2 * RIM), (-0.05, 0.125 + 2 * RIM)),
-        (
-            (CLEARANCE / 4, 0.135),
-            (-CLEARANCE / 4, 0.115),
-            (CLEARANCE / 4 + MORE, 0.115),
-        ),  # along it, from beyond
+        ((CLEARANCE / 4, 0.135), (-CLEARANCE / 4, 0.115), (CLEARANCE / 4 + MORE, 0.115)),  # along it, from beyond
     ],
 )
 def test_a_square(before, after, end, axis, sign):

@@ -11,14 +11,7 @@ from scene.test_episode import make_episode
 from scipy.ndimage import center_of_mass, label
 
 from hgn.render.error_curve import error_curve, position_error
-from hgn.render.pictures import (
-    _stage,
-    animate,
-    compare_picture,
-    particle_spacing,
-    rollout_of_episode,
-    write_picture,
-)
+from hgn.render.pictures import _stage, animate, compare_picture, particle_spacing, rollout_of_episode, write_picture
 from hgn.render.renderer import OBSTACLE_COLOR, Stage, to_bytes
 from hgn.scene.motion import Motion
 from hgn.scene.obstacle_grid import ObstacleGrid

@@ -18,13 +18,7 @@ from hgn.scene.episode_obstacles import cell_obstacles, obstacles_of_episode
 from hgn.scene.motion import Motion
 from hgn.scene.obstacle_grid import ObstacleGrid
 from hgn.scene.random_scene import generate_scene
-from hgn.scene.rollout_file import (
-    Rollout,
-    frame_velocity,
-    read_rollout,
-    write_frames,
-    write_rollout,
-)
+from hgn.scene.rollout_file import Rollout, frame_velocity, read_rollout, write_frames, write_rollout
 from hgn.scene.rotation import euler_rotation
 from hgn.scene.scene import Obstacle
 from hgn.schema import ConfigError

@@ -43,11 +43,7 @@ def test_jobs_of_simulations():
 @pytest.mark.parametrize(
     ("program", "interrupted", "expected"),
     [  # each process gets its share and the job; the counts of all are told together
-        (
-            "assert 'fp16' in sys.stdin.read(); print(10 + sum(map(int, sys.argv[1:])))",
-            False,
-            "25 kernels ready",
-        ),
+        ("assert 'fp16' in sys.stdin.read(); print(10 + sum(map(int, sys.argv[1:])))", False, "25 kernels ready"),
         (
             "sys.exit('no ptxas' if sys.argv[1] == '1' else 0)",
             False,
