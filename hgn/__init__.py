@@ -5,6 +5,7 @@ Import the public API from here (`from hgn import Simulator, load_scene`). Each 
 """
 
 import os
+import sys
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
@@ -23,8 +24,10 @@ if TYPE_CHECKING:
     from hgn.schema import ConfigError as ConfigError
 
 # OpenMP reads this when torch loads it. Otherwise its idle threads spin, and take cores from the thread for which they
-# wait. While another program runs, a training then makes at most a sixth of the updates.
-os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+# wait. While another program runs, a training then makes at most a sixth of the updates. If PyTorch was loaded before,
+# hgn/system/device.py does the same in another way.
+if "torch" not in sys.modules:
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 _MODULES = {
     "ConfigError": "hgn.schema",

@@ -16,10 +16,10 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 33_551,
+    "hgn": 33_578,
     "datagen": 8_968,
     "tools": 6_388,
-    "tests": 33_480,
+    "tests": 33_507,
 }
 SETTINGS = 240  # fields of the dataclasses behind the commands, *Config
 
