@@ -16,9 +16,9 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 33_578,
-    "datagen": 8_968,
-    "tools": 6_388,
+    "hgn": 33_570,
+    "datagen": 8_965,
+    "tools": 6_387,
     "tests": 33_507,
 }
 SETTINGS = 240  # fields of the dataclasses behind the commands, *Config

@@ -31,7 +31,7 @@ from hgn.config import MpmConfig
 from hgn.scene.emission import entry_frames
 from hgn.scene.material import MATERIAL_BITS, MATERIAL_MASK, MATERIALS, SAND
 from hgn.scene.scene import Scene, whole_cells
-from hgn.schema import ConfigError
+from hgn.schema import ConfigError, require
 from hgn.solver_method import MAXIMUM_SUBSTEPS
 
 import datagen.mpm.device  # noqa: F401  # isort: skip  # keeps Taichi's banner off stdout
@@ -132,11 +132,8 @@ class Launch(ABC):
                 self.second_fields[index] = ghost_room
                 ghost_room += self.scene_nodes
         self.all_blocks = len(scenes) * math.prod(self.blocks) + -(-ghost_room // BLOCK_NODES)
-        if max(self.blocks) > MAXIMUM_BLOCKS:
-            raise ConfigError(
-                f"domain_size must be at most {MAXIMUM_BLOCKS * BLOCK} cells a side, got {max(node_counts)}; enlarge "
-                "cell_size"
-            )
+        rule = f"at most {MAXIMUM_BLOCKS * BLOCK} cells a side"
+        require(max(self.blocks) <= MAXIMUM_BLOCKS, "domain_size", rule, max(node_counts), "enlarge cell_size")
         nodes = self.all_blocks * BLOCK_NODES * self.copies
         if max(nodes * self.entries_a_node, self.particles) >= 2**31:
             raise ConfigError(

@@ -128,8 +128,7 @@ def animation_rate(rollout: Rollout, path: str | Path, every: int) -> float:
     Raises: ConfigError if viewers play fewer per second (GIF 50, WebP 60), or if every is below 1.
     """
     kind, fastest = ("WebP", 60) if Path(path).suffix == ".webp" else ("GIF", 50)
-    if not every >= 1:
-        raise ConfigError(f"every must be at least 1, got {every}")
+    require(every >= 1, "every", "at least 1", every)
     rate = rollout.frame_rate_hz / every
     if not 0 < rate <= fastest:
         remedy = f"take every >= {math.ceil(rollout.frame_rate_hz / fastest)}"

@@ -75,14 +75,12 @@ class Episode:
     wall_friction: Vector = (0.0, 0.0, 0.0)  # Coulomb coefficients of the domain's walls across x, y and z
 
     def __post_init__(self) -> None:
-        if not _NAME.fullmatch(self.key):
-            raise ConfigError(f"key must be letters, digits, - and _ (a dot would end it), got {self.key!r}")
+        require(bool(_NAME.fullmatch(self.key)), "key", "letters, digits, - and _ (a dot would end it)", self.key)
         position = self.position_TN3
         if position.ndim != 3 or position.shape[0] < 1 or position.shape[2] != 3:
             raise ConfigError(f"{self.key}: position must have shape [frames >= 1, N, 3], got {position.shape}")
         for name in self.material_parameters:
-            if not _NAME.fullmatch(name):
-                raise ConfigError(f"{self.key}: parameter names must be letters, digits, - and _, got {name!r}")
+            require(bool(_NAME.fullmatch(name)), f"{self.key}: parameter names", "letters, digits, - and _", name)
         try:
             require_bounds(self)
         except ConfigError as error:
@@ -299,11 +297,8 @@ def _decode_description(key: str, text: bytes) -> _Description:
 def require_schema_version(mapping: object, name: str) -> None:
     """Raises ConfigError unless `mapping["schema_version"]` is the current version. Call it before other checks."""
     version = mapping.get("schema_version") if isinstance(mapping, Mapping) else None
-    if version != SCHEMA_VERSION:
-        raise ConfigError(
-            f"{name}: schema_version must be {SCHEMA_VERSION}, got {version!r}; generate the data set again with this "
-            "version, or use the version that made it"
-        )
+    remedy = "generate the data set again with this version, or use the version that made it"
+    require(version == SCHEMA_VERSION, f"{name}: schema_version", str(SCHEMA_VERSION), version, remedy)
 
 
 def _require_sound_positions(episode: Episode) -> None:

@@ -17,7 +17,7 @@ from typing import Any, TypeVar
 from urllib.parse import quote, urlsplit
 from urllib.request import getproxies
 
-from hgn.schema import ConfigError
+from hgn.schema import ConfigError, require
 from hgn.system.patience import UnreachableError, patiently
 
 PREFIX = "hf://"
@@ -84,8 +84,7 @@ def hub_weights(url: str, field: str = "weights", patience_s: float = _PATIENCE_
     place = HubPlace.parse(url, field)
     import huggingface_hub  # slow to import, and optional
 
-    if place.is_dataset:
-        raise ConfigError(f"{field} must be of a repository of weights, hf://USER/NAME, got {url!r}")
+    require(not place.is_dataset, field, "of a repository of weights, hf://USER/NAME", url)
     direct, host = getproxies().get("no", ""), urlsplit(endpoint()).hostname
     if is_loopback(endpoint()) and host not in direct.split(","):
         os.environ["no_proxy"] = f"{direct},{host}".lstrip(",")

@@ -10,7 +10,7 @@ import torch
 import torch.multiprocessing
 
 from hgn.config import TrainingConfig
-from hgn.schema import ConfigError, from_mapping
+from hgn.schema import from_mapping, require
 from hgn.system.files import write_json
 from hgn.system.machine import available_cpus
 from tools import report
@@ -42,8 +42,7 @@ def devices(config: ScalingConfig) -> tuple[str, int]:
     if config.device == "cpu" or (config.device == "auto" and gpus == 0):
         return "cpu", config.devices or 2
     wanted = config.devices or max(gpus, 1)
-    if wanted > gpus:
-        raise ConfigError(f"devices must be at most the {gpus} GPUs of this machine, got {wanted}; take device=cpu")
+    require(wanted <= gpus, "devices", f"at most the {gpus} GPUs of this machine", wanted, "take device=cpu")
     return "cuda", wanted
 
 

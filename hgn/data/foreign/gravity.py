@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from hgn.schema import ConfigError
+from hgn.schema import ConfigError, require
 
 STRETCH = 6  # number of consecutive accelerations that must agree
 CONSTANT = 0.02  # largest deviation in a stretch, relative to its mean
@@ -26,8 +26,7 @@ def estimate_gravity(paths: Sequence[np.ndarray], frame_dt_s: float) -> tuple[fl
     acceleration_SD = np.concatenate([_flights(path_TND) for path_TND in paths])
     count = len(acceleration_SD)
     remedy = f"give it, as in gravity={'[0,-9.8]' if acceleration_SD.shape[-1] == 2 else '[0,-9.8,0]'}"
-    if count < FEWEST:
-        raise ConfigError(f"gravity must be given where fewer than {FEWEST} particles fall, got {count}; {remedy}")
+    require(count >= FEWEST, "gravity", f"given where fewer than {FEWEST} particles fall", count, remedy)
     middle_D = np.median(acceleration_SD, axis=0)
     alike_S = np.linalg.norm(acceleration_SD - middle_D, axis=-1) <= ALIKE * np.linalg.norm(middle_D)
     if alike_S.mean() < 0.5:
