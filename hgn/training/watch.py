@@ -1,9 +1,9 @@
 """Ends a rank that waits for a stopped rank. Inside a collective, neither time-outs nor signals would end it.
 
 Each rank writes a count to the run's folder every BEAT_S, and reads the counts of the others. A rank that ends with an
-error of its own writes ENDED instead. PyTorch's flight recorder keeps the last collectives of each rank. A rank that
-ends because others do not answer writes them to `hang_rank_<rank>` in the run's folder, and so does PyTorch when a
-collective takes longer than its time-out.
+error of its own writes ENDED instead. Others that make no update within GRACE_S then end too. PyTorch's flight recorder
+keeps the last collectives of each rank. A rank that ends because others do not answer writes them to
+`hang_rank_<rank>` in the run's folder, and so does PyTorch when a collective takes longer than its time-out.
 """
 
 import contextlib
@@ -32,7 +32,7 @@ TRACE_S = 10.0  # longest time for writing it
 # variables of PyTorch's flight recorder: the present name, and an earlier one with the same meaning
 _BUFFER = ("TORCH_FR_BUFFER_SIZE", "TORCH_NCCL_TRACE_BUFFER_SIZE")
 _FILE = ("TORCH_FR_DUMP_TEMP_FILE", "TORCH_NCCL_DEBUG_INFO_TEMP_FILE")
-GRACE_S = 45.0  # longest time without an update after a signal; schedulers grant more
+GRACE_S = 45.0  # longest time without an update after a signal, or after the end of a rank; schedulers grant more
 
 
 def record_collectives(run: Path) -> None:
@@ -63,6 +63,7 @@ class RankWatch(Callback):
         self._writing = threading.Lock()
         self._updates_ended = False  # then the last checkpoint is written, which may take longer than GRACE_S
         self.lost: str | None = None  # description of the ranks that closed their connections
+        self._over: list[int] = []  # ranks that ended with an error of their own
         self._counts: dict[int, tuple[str, float]] = {}  # last count of each other rank, and the time of its change
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
@@ -97,6 +98,9 @@ class RankWatch(Callback):
         self._stop()
         with contextlib.suppress(OSError):
             self._write(ENDED)
+        if torch.distributed.is_initialized() and torch.distributed.get_backend() == "nccl":
+            # At the exit the group would wait for collectives that the other ranks never begin.
+            torch.distributed.distributed_c10d._abort_process_group()
 
     def _stop(self) -> None:
         """No count is written afterwards."""
@@ -115,12 +119,13 @@ class RankWatch(Callback):
         return lost
 
     def _watch(self, module: TrainingModule) -> None:
-        number, deadline, update, beats = 0, 0.0, 0, 0
+        text, code, deadline, update, beats = "", 0, 0.0, 0, 0
         while not self._ended.is_set():
             if select.select([self._woken], [], [], BEAT_S)[0]:
                 for sent in os.read(self._woken, 64):
                     if sent in BY_WEIGHT:
-                        number, deadline, update = sent, time.monotonic() + GRACE_S, module.update
+                        text, code = f"the other ranks must answer after {signal.Signals(sent).name}", 128 + sent
+                        deadline, update = time.monotonic() + GRACE_S, module.update
             beats += 1
             silent = self._silent_ranks(str(beats))
             if silent and not self._ended.is_set():
@@ -128,9 +133,12 @@ class RankWatch(Callback):
                     f"ranks {silent} must answer within {SILENCE_S:.0f} s, got nothing; run the same command again",
                     EXIT_MACHINE,
                 )
-            if number and time.monotonic() > deadline and not self._ended.is_set() and not self._updates_ended:
+            if self._over and not text:
+                text, code = f"ranks {self._over} ended, see their messages", EXIT_MACHINE
+                deadline, update = time.monotonic() + GRACE_S, module.update
+            if text and time.monotonic() > deadline and not self._ended.is_set() and not self._updates_ended:
                 if module.update == update:
-                    self._end(f"the other ranks must answer after {signal.Signals(number).name}", 128 + number)
+                    self._end(text, code)
                 deadline, update = time.monotonic() + GRACE_S, module.update
 
     def _silent_ranks(self, count: str) -> list[int]:
@@ -143,6 +151,8 @@ class RankWatch(Callback):
             for rank, (before, _) in self._counts.items():
                 if (text := self._read(rank)) != before:
                     self._counts[rank] = text, now
+                    if text == ENDED and before:  # without a count before, the file may be of an earlier run
+                        self._over.append(rank)
         except OSError:  # the folder is unreachable, so ranks may be alive
             self._counts = {rank: (before, now) for rank, (before, _) in self._counts.items()}
         return [rank for rank, (_, changed) in self._counts.items() if now - changed > SILENCE_S]
@@ -158,9 +168,10 @@ class RankWatch(Callback):
             return ""
 
     def _end(self, text: str, code: int) -> NoReturn:
-        # the recorder takes Python's lock, which the waiting thread may have
-        writer = threading.Thread(target=_write_trace, args=(int(self._own.name),), daemon=True)
-        writer.start()
-        writer.join(TRACE_S)
+        if not self._over:
+            # the recorder takes Python's lock, which the waiting thread may have
+            writer = threading.Thread(target=_write_trace, args=(int(self._own.name),), daemon=True)
+            writer.start()
+            writer.join(TRACE_S)
         print(f"error: {text}", file=sys.stderr, flush=True)
         os._exit(code)

@@ -124,3 +124,28 @@ def test_a_rank_stopped_after_the_last_update_is_named(monkeypatch, ranks, tmp_p
     os.write(ranks[0].wake, bytes([signal.SIGTERM]))
     rank, text, code = ends.get(timeout=60)
     assert rank is ranks[0] and text.startswith("ranks [1] must answer within") and code == watch.EXIT_MACHINE
+
+
+@pytest.mark.parametrize("stuck", [True, False])
+def test_a_rank_that_waits_for_one_that_ended_ends(monkeypatch, ranks, tmp_path, stuck):
+    """As NCCL's collectives do, which report no lost connection. One that still makes updates goes on."""
+    monkeypatch.setattr(watch, "GRACE_S", BEAT_S)
+    ends = Queue()
+    monkeypatch.setattr(Rank, "_end", lambda rank, text, code: (rank._ended.set(), ends.put((rank, text, code))))
+    (tmp_path / ".ranks").mkdir()
+    (tmp_path / ".ranks/1").write_text(watch.ENDED)  # of an earlier run
+
+    class Module:
+        update = property(lambda self: 1 if stuck else time.monotonic())
+
+    for rank in ranks:
+        rank.start(Module())
+    for _ in range(4):
+        ranks[0].beaten.acquire()
+    assert ends.empty()
+    ranks[1].on_exception(ranks[1].trainer, None, ValueError("its own error"))
+    if stuck:
+        assert ends.get(timeout=60) == (ranks[0], "ranks [1] ended, see their messages", watch.EXIT_MACHINE)
+    for _ in range(4 * (not stuck)):
+        ranks[0].beaten.acquire()
+    assert ends.empty()
