@@ -1,7 +1,7 @@
 """Runs all commands: Hydra composes the config, and errors that a user can mend end in one line.
 
-Exit codes: 0 success, 1 machine error (full disk, no permission, existing path), 2 invalid input, 130 Ctrl-C,
-141 closed output pipe (as in `… | head`).
+Exit codes: 0 success, 1 machine error (full disk, no permission, existing path), 2 invalid input (also a pipe or
+device in place of a file or folder), 130 Ctrl-C, 141 closed output pipe (as in `… | head`).
 """
 
 import errno
@@ -11,6 +11,7 @@ import itertools
 import os
 import re
 import select
+import stat
 import sys
 from collections.abc import Callable
 from contextlib import suppress
@@ -122,7 +123,7 @@ def _exit_code(main: Main | str, config_name: str) -> int:
             raise
         place = f": {error.filename}" if error.filename else ""
         remedy = _MACHINE_ERRORS.get(error.errno or 0, "check the disk and its network")
-        code = EXIT_INPUT if error.errno == errno.ENAMETOOLONG else EXIT_MACHINE
+        code = EXIT_INPUT if error.errno == errno.ENAMETOOLONG or _is_special(error.filename) else EXIT_MACHINE
         text = f"{error.strerror or error}{place}; {remedy} and run the same command again"
         code = _fail(str(ConfigError(text)), code)  # ConfigError shortens the text
     except (MemoryError, RuntimeError, ImportError) as error:
@@ -143,6 +144,16 @@ def _is_own_fault(error: OSError) -> bool:
         path = Path(os.fsdecode(error.filename))
         return path.parent.is_dir() and not path.is_symlink() and os.statvfs(path.parent).f_blocks > 0
     return isinstance(error, BrokenPipeError)
+
+
+def _is_special(name: object) -> bool:
+    """Returns whether a path is, or leads through, a pipe, a device or a socket."""
+    for path in (Path(str(name)), *Path(str(name)).parents):
+        with suppress(OSError):
+            kind = stat.S_IFMT(path.stat().st_mode)
+            if kind not in (stat.S_IFREG, stat.S_IFDIR):
+                return True
+    return False
 
 
 def _unread() -> bool:

@@ -11,6 +11,7 @@ import pytest
 
 from hgn.command import EXIT_UNREAD, _compose, run_command
 from hgn.schema import ConfigError
+from hgn.system.files import make_folder, write_json
 
 HEAD = "# @package _global_\n"
 
@@ -118,6 +119,17 @@ def test_full_disk_of_the_output(streams, main, code):
     assert done.returncode == code and not done.stdout
     if "stderr" not in streams:
         assert done.stderr.lower().startswith("error: no space left on") and done.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize("place", ["pipe", "pipe/a/b", "/dev/null", "/dev/null/a", "link"])
+@pytest.mark.parametrize("write", [make_folder, Path.mkdir, lambda path: write_json(path / "x", 1), os.listdir])
+def test_pipes_and_devices_in_place_of_folders(tmp_path, command, monkeypatch, place, write):
+    """They are invalid input (exit code 2) in one line, whichever setting names them."""
+    monkeypatch.chdir(tmp_path)
+    os.mkfifo("pipe")
+    Path("link").symlink_to("pipe")
+    code, _, error = command("train", main=lambda _: write(Path(place)))
+    assert code == 2 and error.startswith("error: ") and place.split("/a")[0] in error and error.count("\n") == 1
 
 
 @pytest.mark.parametrize(
