@@ -16,10 +16,10 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 33_581,
+    "hgn": 33_593,
     "datagen": 8_965,
     "tools": 6_387,
-    "tests": 33_532,
+    "tests": 33_560,
 }
 SETTINGS = 240  # fields of the dataclasses behind the commands, *Config
 

@@ -318,6 +318,22 @@ def test_a_training_outlives_a_fault(data, tmp_path, monkeypatch):
     assert metrics(run)[-1]["update"] == 20
 
 
+@pytest.mark.parametrize("every", [{"log_every": 3, "checkpoint_every": 100}, {"checkpoint_every": 2}])
+def test_a_run_whose_folder_is_deleted(data, tmp_path, monkeypatch, every):
+    """The folder is made again, and the training goes on."""
+    run, before = tmp_path / "run", callbacks.LogLines.on_train_batch_end
+
+    def deleting(lines, trainer, module, *rest):
+        if module.update == 6:
+            run.rename(tmp_path / "deleted")
+        before(lines, trainer, module, *rest)
+
+    monkeypatch.setattr(callbacks.LogLines, "on_train_batch_end", deleting)
+    monkeypatch.setenv(VARIABLE, "2")
+    assert train.main(train_mapping(data, run, loggers=[], **every)) == 0
+    assert read_checkpoint(run / "checkpoints" / "last.ckpt")["hgn"]["updates"] == metrics(run)[-1]["update"] == 12
+
+
 def test_a_run_in_a_mounted_bucket(data, tmp_path, monkeypatch):
     """Mounted object stores may have no hard links, no locks and no truncation. A run does without, and a line of
     metrics that was cut is removed as ever."""
