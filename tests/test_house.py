@@ -16,7 +16,7 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 33_593,
+    "hgn": 33_595,
     "datagen": 8_965,
     "tools": 6_387,
     "tests": 33_560,

@@ -139,6 +139,8 @@ class TrainingModule(LightningModule):
         progress = Progress.of(checkpoint)
         self.update, self.skipped, self.sampler_state = progress.updates, progress.skipped, progress.sampler_state
         checkpoint.pop("loops", None)  # Lightning's own counters
+        if not isinstance(checkpoint["callbacks"], dict):  # Lightning would resume without the lowest error
+            raise TypeError("callbacks must be a mapping")
         state = checkpoint["state_dict"]
         if self.averaged is None:
             for name in [name for name in state if name.startswith(AVERAGED)]:
