@@ -11,6 +11,7 @@ import numpy as np
 from hgn.command import run_command
 from hgn.config import StoredPrecision
 from hgn.scene.barrier import barrier_pieces
+from hgn.scene.moving import at_rest
 from hgn.scene.scene import all_corners
 from hgn.scene.scene_file import find_scene, load_scene
 from hgn.schema import FileName, NonNegative, Positive, from_mapping, require, require_bounds
@@ -87,19 +88,19 @@ def main(mapping: dict[str, Any]) -> int:
     weights = config.out or config.weights
     assert weights is not None
     network, info = load_weights(find_weights(weights), device)
+    moving = 0
     if config.arrays is not None:
         assert config.scene is not None
         simulator = Simulator(network, info.frame_rate_hz, "torch", info=info)
         scene = load_scene(find_scene(config.scene))
         start = InitialState.of_scene(scene)
-        rule = "without keyframes with arrays, because exported frames have no moving obstacles"
-        require(not start.moving, "scene", rule, config.scene)
-        corner_F33 = barrier_pieces(all_corners(scene.obstacles), scene.cell_size, scene.domain_size)
+        moving = len(start.moving)
+        corner_F33 = barrier_pieces(all_corners(at_rest(scene.obstacles)), scene.cell_size, scene.domain_size)
         arrays = initial_arrays(network.config, simulator.start([start]), corner_F33, start.parameters)
         write_arrays(Path(config.arrays), arrays)
         print(config.arrays)
     if config.onnx is not None or config.package is not None:
-        program = traced_step(network, info)
+        program = traced_step(network, info, moving)
     if config.package is not None:  # before the ONNX export, whose symbols in the graph the compiler refuses
         write_package(Path(config.package), program, info)
         print(config.package)

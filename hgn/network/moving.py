@@ -175,7 +175,9 @@ class MovingObstacles:
             way_N3 = turned(velocity_N3 - surface_N3, pose.later.rotation_V33.mT)
             for step, row in enumerate(rows):
                 own_N4 = _seen(cells, own_N3, way_N3, row_N, step / steps)
-                row.append(torch.cat([turned(own_N4[:, :3], pose.rotation_V33), own_N4[:, 3:], surface_N3], -1))
+                # a product with a slice would fix the size of an exported graph
+                normal_N3 = own_N4[:, :3].clone(memory_format=torch.contiguous_format)
+                row.append(torch.cat([turned(normal_N3, pose.rotation_V33), own_N4[:, 3:], surface_N3], -1))
         here_N7, *ahead = map(_merged, rows)
         ahead_N7 = first_surface(ahead)
         first_N7 = first_surface([here_N7, ahead_N7])

@@ -5,13 +5,15 @@ The numbers of particles, obstacle cells and triangles may change from frame to 
 raises no errors, so its caller checks that positions are finite. `input_names` and OUTPUTS name its tensors.
 `initial_arrays` returns the inputs of a scene.
 Shape legend: N particles, H velocities, K obstacle cells, F triangles of obstacles, P parameters, R particles with a
-rest shape (0, or N), B neighbours at rest.
+rest shape (0, or N), B neighbours at rest, V moving obstacles, T frames.
 """
 
 from __future__ import annotations
 
 import json
+import math
 import warnings
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -28,13 +30,15 @@ from hgn.network.cell_keys import COORDINATE_LIMIT, LARGEST_EXPORTED, pack, unpa
 from hgn.network.elastic import RestShape
 from hgn.network.features import ParticleState
 from hgn.network.hgn import HierarchicalGraphNetwork
+from hgn.network.moving import MovingObstacles, Poses
 from hgn.network.obstacles import ObstacleCells
 from hgn.network.own_physics import scaled_parameters
 from hgn.runtime.weights import WeightsInfo
+from hgn.scene.barrier import barrier_pieces
 from hgn.scene.own_physics import NOMINAL_P
 from hgn.scene.rest_shape import NEIGHBOURS
 from hgn.schema import require, to_mapping
-from hgn.step.reference import accelerations, advanced
+from hgn.step.reference import accelerations, constrained, moved, next_state
 from hgn.system.files import make_folder, sync_folder, sync_written, write_atomically
 
 INPUTS = (
@@ -45,14 +49,16 @@ OWN_INPUTS = {
     "friction": ("wall_friction", "obstacle_friction"),
     "parameters": ("parameters",),
     "elastic": ("rest_position", "rest_neighbour"),
-}  # the inputs that follow for each of `network.own_physics`
+    "moving": ("moving_pose", "moving_cell", "moving_surface", "moving_triangle"),
+}  # the inputs that follow for each of `network.own_physics`; those of `moving` only in graphs with moving obstacles
+MOST_POSES = 100_000  # largest number of frames in `moving_pose` of `initial_arrays`
 OUTPUTS = ("next_position", "next_velocity")
 # sizes for tracing; the graph does not depend on them
 EXAMPLE_PARTICLES, EXAMPLE_CELLS, EXAMPLE_TRIANGLES, EXAMPLE_RESTS = 64, 32, 16, 8
 
 
 def input_names(config: NetworkConfig) -> tuple[str, ...]:
-    """Returns the names of the graph's inputs in their order."""
+    """Returns the names of the graph's inputs in their order. Those of moving obstacles are the last."""
     own = (names for kind, names in OWN_INPUTS.items() if kind in config.own_physics)
     return sum(own, INPUTS)
 
@@ -84,9 +90,11 @@ class Step(nn.Module):
 
         `own` are those of OWN_INPUTS that the network has: friction of the walls across x, y, z [3], and of obstacle
         cells [K]; values of INPUT_PARAMETERS [N, P]; places at rest [R, 3], and neighbours at rest, int64 [R, B],
-        -1 for none.
+        -1 for none; poses x -> R x + t of moving obstacles, R and then t, in this frame and the next [2, V, 3, 4],
+        their cells, int64 [K, 4], the obstacle's number first, normals and friction of these [K, 4], and triangles
+        [V, F, 3, 3].
         """
-        given = dict(zip(input_names(self.network.config)[len(INPUTS) :], own, strict=True))
+        given = dict(zip(input_names(self.network.config)[len(INPUTS) :], own, strict=False))
         # Another cell, out of reach of every particle, so that the lists are never empty.
         far_13 = torch.full_like(domain_size[None], COORDINATE_LIMIT - 1).to(torch.int64)
         cell_K3 = torch.cat([obstacle_cell, far_13])
@@ -105,7 +113,9 @@ class Step(nn.Module):
             **self._own_fields(given, material),
         )
         acceleration_N3 = accelerations(self.network, state, self.network.prediction(state))
-        after = advanced(state, acceleration_N3, self.network.step, self.network.config.dimensions)
+        step, dimensions = self.network.step, self.network.config.dimensions
+        motion = constrained(state, moved(state, acceleration_N3), step, dimensions)
+        after = next_state(replace(state, moving=None), motion)  # the caller moves the obstacles
         return after.position_N3, after.velocity_NM3
 
     def _own_fields(self, given: dict[str, torch.Tensor], material_N: torch.Tensor) -> dict[str, Any]:
@@ -121,7 +131,28 @@ class Step(nn.Module):
             rest = RestShape.of(position_R3, pad(neighbour_RB, (0, 0, 0, 1), value=-1))
             row_N = torch.arange(material_N.shape[0], device=material_N.device).clamp(max=neighbour_RB.shape[0])
             fields["rest"] = RestShape(rest.neighbour_NK[row_N], rest.position_N3[row_N], rest.coefficient_NK4[row_N])
+        if "moving_pose" in given:
+            fields["moving"] = self._moving(*(given[name] for name in OWN_INPUTS["moving"]))
         return fields
+
+    def _moving(
+        self, pose_2V34: torch.Tensor, cell_K4: torch.Tensor, surface_K4: torch.Tensor, corner_VF33: torch.Tensor
+    ) -> MovingObstacles:
+        """Returns the moving obstacles of the frame. All pivots are 0, so that the places are t."""
+        rotation_2V33, place_2V3 = pose_2V34[..., :3], pose_2V34[..., 3]
+        change_V33 = rotation_2V33[1] @ rotation_2V33[0].mT - torch.eye(3, device=pose_2V34.device)
+        zero_V3, shift_V3 = torch.zeros_like(place_2V3[0]), place_2V3[1] - place_2V3[0]
+        poses = Poses(rotation_2V33[0], zero_V3, place_2V3[0], change_V33, shift_V3=shift_V3)
+        # Another cell, as for obstacles at rest.
+        far_K3, number_K = pad(cell_K4[:, 1:], (0, 0, 0, 1), value=COORDINATE_LIMIT - 1), pad(cell_K4[:, 0], (0, 1))
+        surface_K4 = pad(surface_K4, (0, 0, 0, 1))
+        size, friction_K = self.obstacle_cell_size, surface_K4[:, 3]
+        cells = ObstacleCells(pack(number_K, far_K3), surface_K4[:, :3], size, friction_K=friction_K)
+        barriers = self._barriers(corner_VF33.flatten(0, 1))
+        if barriers is not None:
+            number_VF = torch.ones_like(corner_VF33[:, :, 0, 0], dtype=torch.int64).cumsum(0) - 1
+            barriers = replace(barriers, scene_F=pad(number_VF.flatten(), (0, 1)))
+        return MovingObstacles(((),), (0,), 1.0, cells, barriers=barriers, poses=poses)
 
     def _barriers(self, corner_F33: torch.Tensor) -> Barriers | None:
         """Returns barriers without lists of cells, because the graph finds pairs by bounding boxes."""
@@ -166,11 +197,36 @@ def initial_arrays(
         "rest_position": np.zeros((0, 3), np.float32) if rest is None else rest.position_N3.cpu().numpy(),
         "rest_neighbour": np.zeros((0, NEIGHBOURS), np.int64) if rest is None else rest.neighbour_NK.cpu().numpy(),
     }
-    return {name: arrays[name] for name in input_names(config)}
+    if state.moving is not None:
+        arrays |= _moving_arrays(state.moving)
+    return {name: arrays[name] for name in input_names(config) if name in arrays}
 
 
-def traced_step(network: ParticleNetwork, info: WeightsInfo) -> torch.export.ExportedProgram:
-    """Returns the graph. Raises: ConfigError for a GNS, because neighbour lists cannot be exported."""
+def _moving_arrays(moving: MovingObstacles) -> dict[str, np.ndarray]:
+    """Returns the inputs for moving obstacles. Poses [T, V, 3, 4] are those of all frames until the motion ends.
+
+    Raises: ConfigError for a motion of more than MOST_POSES frames.
+    """
+    own, triangles = moving.scenes[0], [barrier_pieces(m.corner_F33, moving.cell_size) for m in moving.scenes[0]]
+    frames = math.ceil(max(m.motion.time_T[-1] for m in own) / moving.frame_s) + 2
+    require(frames <= MOST_POSES, "keyframes", f"at most {MOST_POSES} frames long with arrays", frames)
+    poses = [[np.column_stack(m.motion.transform(t * moving.frame_s)) for m in own] for t in range(frames)]
+    corner_VF33 = np.zeros((len(own), max(map(len, triangles)), 3, 3), np.float32)  # further triangles have no area
+    for corners, corner_F33 in zip(corner_VF33, triangles, strict=True):
+        corners[: len(corner_F33)] = corner_F33
+    cell_K4, surface_K4 = np.zeros((0, 4), np.int64), np.zeros((0, 4), np.float32)
+    if moving.cells is not None:
+        number_K, cell_K3 = unpack(moving.cells.key_K)
+        cell_K4 = torch.cat([number_K[:, None], cell_K3], 1).cpu().numpy()
+        surface_K4 = moving.cells.surface_rows.cpu().numpy()
+    return dict(zip(OWN_INPUTS["moving"], [np.array(poses, np.float32), cell_K4, surface_K4, corner_VF33], strict=True))
+
+
+def traced_step(network: ParticleNetwork, info: WeightsInfo, moving: int = 0) -> torch.export.ExportedProgram:
+    """Returns the graph of scenes with `moving` moving obstacles.
+
+    Raises: ConfigError for a GNS, because neighbour lists cannot be exported.
+    """
     require(isinstance(network, HierarchicalGraphNetwork), "weights", "an hgn network", network.config.kind)
     assert isinstance(network, HierarchicalGraphNetwork)
     device, config = next(network.parameters()).device, network.config
@@ -179,6 +235,8 @@ def traced_step(network: ParticleNetwork, info: WeightsInfo) -> torch.export.Exp
     cells = {0: torch.export.Dim("obstacle_cells", min=0, max=LARGEST_EXPORTED)}
     triangles = {0: torch.export.Dim("obstacle_triangles", min=0, max=LARGEST_EXPORTED)}
     shapes = {0: torch.export.Dim("rest_shapes", min=0, max=LARGEST_EXPORTED)}
+    moving_cells = {0: torch.export.Dim("moving_cells", min=0, max=LARGEST_EXPORTED)}
+    moving_triangles = {1: torch.export.Dim("moving_triangles", min=0, max=LARGEST_EXPORTED)}
     position_N3 = torch.rand(EXAMPLE_PARTICLES, 3, generator=generator) * 0.1 + 0.3
     velocity_NH3 = torch.randn(EXAMPLE_PARTICLES, config.velocity_history, 3, generator=generator) * 1e-3
     examples = {
@@ -196,7 +254,14 @@ def traced_step(network: ParticleNetwork, info: WeightsInfo) -> torch.export.Exp
         "rest_position": (position_N3[:EXAMPLE_RESTS], shapes),
         "rest_neighbour": (torch.zeros(EXAMPLE_RESTS, NEIGHBOURS, dtype=torch.int64), shapes),
     }
-    example, dynamic = zip(*(examples[name] for name in input_names(config)), strict=True)
+    if moving:
+        examples |= {
+            "moving_pose": (torch.eye(3, 4).expand(2, moving, 3, 4).clone(), None),
+            "moving_cell": (torch.arange(EXAMPLE_CELLS)[:, None] * torch.tensor([0, 0, 0, 1]), moving_cells),
+            "moving_surface": (torch.ones(EXAMPLE_CELLS, 4), moving_cells),
+            "moving_triangle": (torch.rand(moving, EXAMPLE_TRIANGLES, 3, 3, generator=generator), moving_triangles),
+        }
+    example, dynamic = zip(*(examples[name] for name in input_names(config) if name in examples), strict=True)
     dynamic = dynamic[: len(INPUTS)] + ((dynamic[len(INPUTS) :],) if dynamic[len(INPUTS) :] else ())
     step = Step(network, info.obstacle_cell_size).eval()
     # One graph serves 0, 1 and more particles, cells and triangles.
@@ -224,7 +289,7 @@ def write_onnx(path: Path, program: torch.export.ExportedProgram, info: WeightsI
             program,
             (),
             dynamo=True,
-            input_names=input_names(info.network),
+            input_names=input_names(info.network)[: len(program.graph_signature.user_inputs)],
             output_names=OUTPUTS,
             verbose=False,
             custom_translation_table={torch.ops.aten.index_add.default: _added_in_order},

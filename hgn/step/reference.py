@@ -339,7 +339,7 @@ def _pairs(
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Returns candidate pairs: particles and triangles, int64 [P]. They include every pair that meets."""
     if is_exporting():
-        return pairs_of_boxes(barriers, before_N3, after_N3)
+        return pairs_of_boxes(barriers, before_N3, after_N3, scene_N)
     before_N3, after_N3 = before_N3.detach(), after_N3.detach()
     way_N3 = after_N3 - before_N3
     pieces_N = torch.ceil(torch.linalg.vector_norm(way_N3, dim=-1) / barriers.cell_size).clamp(min=1)
@@ -360,15 +360,20 @@ def _pairs(
 
 
 def pairs_of_boxes(
-    barriers: Barriers, before_N3: torch.Tensor, after_N3: torch.Tensor
+    barriers: Barriers, before_N3: torch.Tensor, after_N3: torch.Tensor, scene_N: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Returns the pairs of triangles and particles' paths whose boxes meet, without a loop over the pieces of paths."""
+    """Returns the pairs of triangles and particles' paths whose boxes meet, without a loop over the pieces of paths.
+
+    Without scenes of the triangles (`scene_F`) all are of one scene.
+    """
     low_N3, high_N3 = torch.minimum(before_N3, after_N3), torch.maximum(before_N3, after_N3)
     low_F3, high_F3 = barriers.row_F24[:, 16:19], barriers.row_F24[:, 20:23]
     meets_NF = (low_N3[:, None, 0] <= high_F3[None, :, 0]) & (high_N3[:, None, 0] >= low_F3[None, :, 0])
     for axis in (1, 2):
         meets_NF = meets_NF & (low_N3[:, None, axis] <= high_F3[None, :, axis])
         meets_NF = meets_NF & (high_N3[:, None, axis] >= low_F3[None, :, axis])
+    if barriers.scene_F.shape[0] > 0:
+        meets_NF = meets_NF & (barriers.scene_F == scene_N[:, None])
     particle_P, triangle_P = torch.nonzero(meets_NF, as_tuple=True)
     if is_exporting():
         torch._check(particle_P.shape[0] <= LARGEST_EXPORTED)

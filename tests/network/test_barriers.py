@@ -211,7 +211,7 @@ def test_lists_hold_all_that_is_met(monkeypatch):
     tested."""
     for corner_F33, *ways in (scattered(0), scattered(7), reaching()):
         barriers = barriers_of(corner_F33)
-        for pairs, count in ((all_pairs, 200), (lambda *given: pairs_of_boxes(*given[:3]), 2000)):
+        for pairs, count in ((all_pairs, 200), (lambda *given: pairs_of_boxes(*given), 2000)):
             before_N3, after_N3 = (x_N3[:count] for x_N3 in ways)
             listed_N3 = ended(before_N3, after_N3, barriers)[0]
             with monkeypatch.context() as patch:

@@ -1,6 +1,7 @@
 // NumPy's .npy files of version 1, little-endian, in C order: what a scene's arrays and the positions are kept in.
 #pragma once
 
+#include <algorithm>
 #include <cstdint>
 #include <cstring>
 #include <filesystem>
@@ -57,9 +58,10 @@ inline void write_positions(const std::string& path, const std::vector<float>& v
 // Order and names of a step's inputs; the first two are replaced by its two outputs.
 inline const std::vector<std::string> INPUTS = {
     "position", "velocity", "material", "domain_size", "gravity", "obstacle_cell", "obstacle_normal", "obstacle_triangle"};
-// The inputs that follow if the network has them: friction, parameters of materials, elastic bodies.
+// The inputs that follow if the network has them: friction, parameters of materials, elastic bodies, moving obstacles.
 inline const std::vector<std::string> OWN_INPUTS = {
-    "wall_friction", "obstacle_friction", "parameters", "rest_position", "rest_neighbour"};
+    "wall_friction", "obstacle_friction", "parameters",     "rest_position",  "rest_neighbour",
+    "moving_pose",   "moving_cell",       "moving_surface", "moving_triangle"};
 
 inline std::vector<Array> read_arrays(const std::string& folder) {
     std::vector<Array> arrays;
@@ -72,4 +74,13 @@ inline std::vector<Array> read_arrays(const std::string& folder) {
     for (const auto& name : INPUTS) read(name, true);
     for (const auto& name : OWN_INPUTS) read(name, false);
     return arrays;
+}
+
+// The poses of moving obstacles in a frame and the next one, of those in all frames. At last the obstacles rest.
+inline Array poses_at(const Array& poses, int64_t frame) {
+    const int64_t rows = poses.shape[0], size = poses.bytes.size() / rows;
+    const auto first = poses.bytes.begin() + size * std::min(frame, rows - 2);
+    Array two{poses.name, poses.shape, poses.type, {first, first + 2 * size}};
+    two.shape[0] = 2;
+    return two;
 }

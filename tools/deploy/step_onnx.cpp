@@ -17,10 +17,14 @@ int main(int count, char** words) try {
     const auto memory = Ort::MemoryInfo::CreateCpu(OrtDeviceAllocator, OrtMemTypeDefault);
     std::vector<Ort::Value> inputs;
     std::vector<const char*> names;
-    for (auto& [name, shape, type, bytes] : arrays) {
+    const auto tensor = [&](Array& array) {
+        auto& [name, shape, type, bytes] = array;
         const auto element = type == "<f4" ? ONNX_TENSOR_ELEMENT_DATA_TYPE_FLOAT : ONNX_TENSOR_ELEMENT_DATA_TYPE_INT64;
-        inputs.push_back(Ort::Value::CreateTensor(memory, bytes.data(), bytes.size(), shape.data(), shape.size(), element));
-        names.push_back(name.c_str());
+        return Ort::Value::CreateTensor(memory, bytes.data(), bytes.size(), shape.data(), shape.size(), element);
+    };
+    for (auto& array : arrays) {
+        inputs.push_back(tensor(array));
+        names.push_back(array.name.c_str());
     }
     const char* outputs[] = {"next_position", "next_velocity"};
     const int64_t particles = arrays[0].shape[0];
@@ -32,6 +36,9 @@ int main(int count, char** words) try {
             if (!std::isfinite(position[i])) throw std::runtime_error("the simulation diverged at frame " + std::to_string(frame));
         positions.insert(positions.end(), position, position + 3 * particles);
         if (frame == frames - 1) break;
+        Array poses;
+        for (size_t i = 0; i < arrays.size(); i++)
+            if (arrays[i].name == "moving_pose") inputs[i] = tensor(poses = poses_at(arrays[i], frame));
         auto next = step.Run(Ort::RunOptions{nullptr}, names.data(), inputs.data(), inputs.size(), outputs, 2);
         inputs[0] = std::move(next[0]);
         inputs[1] = std::move(next[1]);

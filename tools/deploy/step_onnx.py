@@ -15,8 +15,10 @@ def simulate(model: str, arrays: str, frames: int) -> np.ndarray:
     """Positions float32 [frames, N, 3]."""
     session = onnxruntime.InferenceSession(model)
     inputs = {item.name: np.load(Path(arrays) / f"{item.name}.npy") for item in session.get_inputs()}
-    positions = [inputs["position"]]
+    positions, poses = [inputs["position"]], inputs.get("moving_pose", [])
     for frame in range(1, frames):
+        if len(poses):  # those of the frame before and of this frame; at last the obstacles rest
+            inputs["moving_pose"] = poses[min(frame - 1, len(poses) - 2) :][:2]
         inputs["position"], inputs["velocity"] = session.run(["next_position", "next_velocity"], inputs)
         if not np.isfinite(inputs["position"]).all():
             raise RuntimeError(f"the simulation diverged at frame {frame}")

@@ -16,8 +16,10 @@ int main(int count, char** words) try {
 
     auto arrays = read_arrays(words[2]);
     std::vector<at::Tensor> inputs;
-    for (auto& array : arrays)
-        inputs.push_back(at::from_blob(array.bytes.data(), array.shape, array.type == "<f4" ? at::kFloat : at::kLong));
+    const auto tensor = [](Array& array) {
+        return at::from_blob(array.bytes.data(), array.shape, array.type == "<f4" ? at::kFloat : at::kLong);
+    };
+    for (auto& array : arrays) inputs.push_back(tensor(array));
     const int64_t particles = inputs[0].size(0);
     std::vector<float> positions;
     const auto start = std::chrono::steady_clock::now();
@@ -27,6 +29,9 @@ int main(int count, char** words) try {
             throw std::runtime_error("the simulation diverged at frame " + std::to_string(frame));
         positions.insert(positions.end(), position.data_ptr<float>(), position.data_ptr<float>() + 3 * particles);
         if (frame == frames - 1) break;
+        Array poses;
+        for (size_t i = 0; i < arrays.size(); i++)
+            if (arrays[i].name == "moving_pose") inputs[i] = tensor(poses = poses_at(arrays[i], frame));
         auto outputs = step.run(inputs);
         inputs[0] = outputs[0];
         inputs[1] = outputs[1];
