@@ -14,7 +14,7 @@ from typing import Any
 
 import torch
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save
+from safetensors.torch import load, save
 
 from hgn.config import NetworkConfig
 from hgn.network.base import ParticleNetwork
@@ -116,8 +116,8 @@ def load_weights(
     try:
         with safe_open(path, framework="pt", device="cpu") as file:
             metadata = file.metadata() or {}
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a mapping
-    except (SafetensorError, TypeError, ValueError, RuntimeError, OverflowError) as error:
+        tensors = load(path.read_bytes())  # `file` would map them, and end the process if another one cut the file
+    except (SafetensorError, LookupError, TypeError, ValueError, RuntimeError, OverflowError) as error:
         remedy = f"python -m hgn.export checkpoint={path} out=…" if path.suffix == ".ckpt" else "export it again"
         raise ConfigError(
             f"{field} must be a safetensors file, got {path}: {str(error).splitlines()[0]}; {remedy}"

@@ -1,6 +1,8 @@
 """Inference weights: what comes out is what went in, and every file that is not ours is refused."""
 
+import contextlib
 import json
+import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -101,6 +103,21 @@ def network(**changes):
 
 def cut(kept):
     return lambda file: file.write_bytes(file.read_bytes()[: int(kept * file.stat().st_size)])
+
+
+@pytest.mark.parametrize("size", [0, 100, -4, -4000])
+def test_a_file_that_is_cut_while_it_is_read(weights, monkeypatch, size):
+    """It is refused in one line. If the tensors were mapped, their pages would end the process with SIGBUS."""
+
+    @contextlib.contextmanager
+    def cut(path, **options):
+        with safe_open(path, **options) as file:
+            os.truncate(path, size % path.stat().st_size)
+            yield file
+
+    monkeypatch.setattr("hgn.runtime.weights.safe_open", cut)
+    with pytest.raises(ConfigError, match="weights must be a safetensors file, got "):
+        load_weights(weights)
 
 
 @pytest.mark.parametrize(
