@@ -19,7 +19,7 @@ LINES = {  # of Python, in tracked files
     "hgn": 33_668,
     "datagen": 8_965,
     "tools": 6_389,
-    "tests": 33_606,
+    "tests": 33_629,
 }
 SETTINGS = 240  # fields of the dataclasses behind the commands, *Config
 
