@@ -3,7 +3,9 @@
 tests/kernels/test_triton_compat.py fails if a new version of Triton has changed one of them.
 """
 
-from collections.abc import Iterator
+import threading
+from collections.abc import Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from typing import Any
 from unittest import mock
@@ -19,6 +21,7 @@ from triton.runtime.jit import JITFunction
 TESTED_VERSIONS = ("3.6", "3.7", "3.8", "3.9")  # the ceiling in pyproject.toml is the same
 
 Launches = dict[str, tuple[Any, str]]  # a kernel and its specialisation, by a key of both
+_patching = threading.Lock()  # locked while a function of Triton is replaced
 
 
 def unsupported_reason(version: str = triton.__version__, hip: str | None = torch.version.hip) -> str | None:
@@ -62,39 +65,65 @@ def settle_keys(names: dict[str, Any]) -> None:
 
 @contextmanager
 def noted_launches() -> Iterator[Launches]:
-    """Yields a dictionary to which launches are added instead of being compiled and made."""
+    """Yields a dictionary of the kernels that launches in the block need and this process has not compiled.
+
+    No launch of this thread is made, also not of a compiled kernel. Other threads are not affected.
+    """
     launches: Launches = {}
+    own = threading.get_ident()
 
     def note(*, fn: Any, compile: dict[str, Any], **_: Any) -> bool:
+        if threading.get_ident() != own:
+            return False
         data = compile["specialization_data"]
         launches.setdefault(data, (fn.jit_function, data))
         return True
 
-    triton.knobs.runtime.jit_cache_hook = note
-    try:
-        yield launches
-    finally:
-        triton.knobs.runtime.jit_cache_hook = None
+    def prepare(self: Any, *arguments: Any, warmup: bool, **options: Any) -> Any:
+        return run(self, *arguments, warmup=warmup or threading.get_ident() == own, **options)
+
+    with _patching:
+        run = JITFunction.run
+        triton.knobs.runtime.jit_cache_hook = note
+        try:
+            with mock.patch.object(JITFunction, "run", prepare):
+                yield launches
+        finally:
+            triton.knobs.runtime.jit_cache_hook = None
 
 
 def preload(function: Any, specialization: str) -> Any:
-    """Compiles a kernel for a noted specialisation.
+    """Compiles a kernel for a noted specialisation, and the C code that launches it. Returns the kernel."""
+    return compile_launches([(function, specialization)])[0]
 
-    Triton's own function mistakes a constant for a type if the constant is a type's name, as the precision "fp16" is.
+
+def compile_launches(launches: Iterable[tuple[Any, str]], threads: int = 1) -> list[Any]:
+    """Compiles kernels as `preload` does, or loads them from the cache on disk. Returns the kernels.
+
+    Triton's compiler releases Python's lock for 85 % of its time. Triton's own function mistakes a constant for a type
+    if the constant is a type's name, as the precision "fp16" is.
     """
-    with mock.patch.object(tl.dtype, "is_dtype", lambda name: False):
-        return function.preload(specialization)
+    driver = triton.runtime.driver.active
 
+    def compiled(function: Any, specialization: str) -> Any:
+        kernel = function.preload(specialization)
+        driver.launcher_cls(kernel.src, kernel.metadata)
+        return kernel
 
-def build_launcher(kernel: Any) -> None:
-    """Compiles the C code that launches a compiled kernel."""
-    triton.runtime.driver.active.launcher_cls(kernel.src, kernel.metadata)
+    pool = ThreadPoolExecutor(threads, initializer=driver.set_current_device, initargs=(driver.get_current_device(),))
+    with _patching, mock.patch.object(tl.dtype, "is_dtype", lambda name: False):
+        try:
+            futures = [pool.submit(compiled, *launch) for launch in launches]
+            return [future.result() for future in futures]
+        finally:
+            pool.shutdown(cancel_futures=True)
 
 
 def use_target(capability: int) -> None:
     """Lets Triton compile for a GPU without a CUDA context, which would take memory that the training ranks need."""
     driver = triton.runtime.driver.active
     driver.get_current_device = lambda: 0
+    driver.set_current_device = lambda device: None
     driver.get_current_stream = lambda device: 0
     driver.get_current_target = lambda: GPUTarget("cuda", capability, 32)
 

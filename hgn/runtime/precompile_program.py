@@ -16,7 +16,7 @@ from hgn.config import NetworkConfig
 from hgn.kernels.grid.op import Window
 from hgn.kernels.moving import MovingTable
 from hgn.kernels.scene_tables import OBSTACLE_COLUMNS, SceneTable
-from hgn.kernels.triton_compat import Launches, build_launcher, noted_launches, preload, use_target
+from hgn.kernels.triton_compat import Launches, compile_launches, noted_launches, use_target
 from hgn.kernels.update.op import Updates, UpdateSettings
 from hgn.network.elastic import RestShape
 from hgn.network.features import ParticleState
@@ -141,9 +141,7 @@ def _simulation_launches(
 def compile_part(job: PrecompileJob | FrameJob, part: int, parts: int) -> int:
     """Compiles every `parts`-th kernel, starting with number `part`. Returns the number of these kernels."""
     mine = list(launches_of(job).values())[part::parts]
-    for function, data in mine:
-        build_launcher(preload(function, data))
-    return len(mine)
+    return len(compile_launches(mine))
 
 
 def job_text(job: PrecompileJob | FrameJob) -> str:

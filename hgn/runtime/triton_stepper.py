@@ -20,6 +20,7 @@ from hgn.kernels.moving import MovingTable
 from hgn.kernels.packing import pack_network
 from hgn.kernels.scene_tables import SceneTable
 from hgn.kernels.step.op import DIVERGED, DeviceStep, rest_numbers
+from hgn.kernels.triton_compat import compile_launches, noted_launches
 from hgn.kernels.tuning import Tuning
 from hgn.network.cell_keys import COORDINATE_LIMIT, pack
 from hgn.network.elastic import RestShape
@@ -34,6 +35,7 @@ from hgn.runtime.triton_host import kernel_precision
 from hgn.scene.material import INPUT_PARAMETERS
 from hgn.step.reference import rested
 from hgn.step_config import StepConfig
+from hgn.system.machine import available_cpus
 
 LOOK_FRAMES, FEWEST_FRAMES = 32, 4  # largest and smallest number of frames in a block
 CROWDED = 140  # number of particles above which a finest cell is crowded; 1.5 times the density of bodies in the data
@@ -293,10 +295,14 @@ class TritonStepper:
             self.graph = self._capture()
 
     def _capture(self) -> torch.cuda.CUDAGraph:
+        """Captures the launches of a frame. Kernels that the process has not used are compiled in parallel before."""
+        with noted_launches() as launches:
+            self._warm_up()
+        compile_launches(launches.values(), available_cpus())
         return captured([self.frame_launches], self._warm_up)[0]
 
     def _warm_up(self) -> None:
-        """Compiles the kernels without moving a particle: a non-zero status disables the integration."""
+        """Makes the launches without moving a particle: a non-zero status disables the integration."""
         self._network_pass()
         self.grid.status.fill_(OVERFLOW)
         self._integrate()

@@ -6,22 +6,28 @@ a training, and from behind, as a process might that compiles a share of them.
 
 import os
 import sys
+import threading
 from dataclasses import replace
+from types import SimpleNamespace
 
 from no_gpu import use_h100
 from triton.compiler import ASTSource
 from triton.runtime.jit import JITFunction
 
 from hgn.config import NetworkConfig
-from hgn.kernels.triton_compat import preload
+from hgn.kernels.grid.op import Window
+from hgn.kernels.triton_compat import noted_launches, preload
 from hgn.kernels.update.op import UpdateSettings
+from hgn.runtime import precompile_program, triton_stepper
 from hgn.runtime.precompile_program import FrameJob, PrecompileJob, compile_part, launches_of
+from hgn.runtime.triton_stepper import TritonStepper
 from hgn.step_config import StepConfig
 
 
 def tell(self, key, signature, device, constants, options, attributes, **_):
     """Stands for JITFunction._do_compile."""
     print(f"{self.__name__} {ASTSource(self, signature, constants, attributes).hash()} {options.hash()}")
+    return SimpleNamespace(src=None, metadata=None)
 
 
 use_h100()
@@ -59,3 +65,39 @@ assert set(launches_of(frames)) == listed and len(listed) > len(launches_of(repl
 assert more(network, StepConfig(), "tf32") > listed
 assert len(more(replace(network, levels=1), StepConfig(), "fp16") - listed) < 8
 assert len(more(network, StepConfig(obstacle_clearance=1e-3), "fp16") - listed) == 1
+
+
+# before a frame is captured all its kernels are compiled, two at a time; a launch would fail, as these have no launcher
+class Kept(TritonStepper):
+    """The stepper of launches_of, which stays."""
+
+    def _window(self):
+        steppers.append(self)
+        return Window.around((0.0, 0.0, 0.0), (1.0, 1.0, 1.0), self.config.cell_size, self.config.levels)
+
+
+def captured(parts, warm_up):
+    """Stands for hgn.kernels.capture.captured."""
+    with noted_launches() as missing:
+        for launches in (warm_up, *parts):
+            launches()
+    assert not missing, [function.__name__ for function, _ in missing.values()]
+    return [None]
+
+
+def compiled(src, *_, **options):
+    """Stands for triton.compile."""
+    compiling.append(src.fn.__name__)
+    if len(compiling) <= 2:
+        both.wait()
+    return SimpleNamespace(src=src, metadata=None)
+
+
+steppers, compiling, both = [], [], threading.Barrier(2, timeout=60)
+precompile_program._Unplaced = Kept
+triton_stepper.captured, triton_stepper.available_cpus = captured, lambda: 2
+frame = launches_of(replace(frames, sizes=frames.sizes[:1]))
+for function, _ in frame.values():
+    function.compile = compiled
+steppers[0]._capture()
+assert len(compiling) == len(frame), (compiling, len(frame))
