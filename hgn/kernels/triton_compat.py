@@ -3,6 +3,7 @@
 tests/kernels/test_triton_compat.py fails if a new version of Triton has changed one of them.
 """
 
+import functools
 import threading
 from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -16,6 +17,7 @@ import triton.language as tl
 from triton.backends.compiler import GPUTarget
 from triton.language.extra.cuda import gdc_launch_dependents as gdc_launch_dependents
 from triton.language.extra.cuda import gdc_wait as gdc_wait
+from triton.runtime.cache import triton_key
 from triton.runtime.jit import JITFunction
 
 TESTED_VERSIONS = ("3.6", "3.7", "3.8", "3.9")  # the ceiling in pyproject.toml is the same
@@ -50,6 +52,14 @@ def capability() -> int:
 def overlaps() -> bool:
     """Returns whether a kernel may start before the previous one has ended (programmatic dependent launch)."""
     return not interpreting() and capability() >= 90
+
+
+@functools.cache
+def hashing() -> threading.Thread:
+    """Starts to hash Triton's own files, for the keys of its cache on disk. This takes 0.3 s without Python's lock."""
+    thread = threading.Thread(target=triton_key, daemon=True)
+    thread.start()
+    return thread
 
 
 def settle_keys(names: dict[str, Any]) -> None:
@@ -104,6 +114,7 @@ def compile_launches(launches: Iterable[tuple[Any, str]], threads: int = 1) -> l
     if the constant is a type's name, as the precision "fp16" is.
     """
     driver = triton.runtime.driver.active
+    hashing().join()  # otherwise each thread would hash them
 
     def compiled(function: Any, specialization: str) -> Any:
         kernel = function.preload(specialization)

@@ -4,6 +4,7 @@ import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+from hgn.kernels.triton_compat import hashing
 from hgn.network.features import ParticleState
 from hgn.network.hgn import HierarchicalGraphNetwork
 from hgn.runtime.parity import ParityError
@@ -23,6 +24,8 @@ class TritonBackend(Backend):
 
     def __init__(self, network: HierarchicalGraphNetwork, precision: str = "auto") -> None:
         super().__init__(network, precision)
+        if self.device.type == "cuda":
+            hashing()  # while the scene is loaded
         self.idle: dict[int, TritonStepper] = {}  # by number of scenes
 
     @contextmanager

@@ -12,9 +12,11 @@ from types import SimpleNamespace
 
 from no_gpu import use_h100
 from triton.compiler import ASTSource
+from triton.runtime.cache import triton_key
 from triton.runtime.jit import JITFunction
 
 from hgn.config import NetworkConfig
+from hgn.kernels import triton_compat
 from hgn.kernels.grid.op import Window
 from hgn.kernels.triton_compat import noted_launches, preload
 from hgn.kernels.update.op import UpdateSettings
@@ -90,6 +92,7 @@ def compiled(src, *_, **options):
     compiling.append(src.fn.__name__)
     if len(compiling) <= 2:
         both.wait()
+    triton_key()
     return SimpleNamespace(src=src, metadata=None)
 
 
@@ -99,5 +102,8 @@ triton_stepper.captured, triton_stepper.available_cpus = captured, lambda: 2
 frame = launches_of(replace(frames, sizes=frames.sizes[:1]))
 for function, _ in frame.values():
     function.compile = compiled
+triton_key.cache_clear()
+triton_compat.hashing.cache_clear()
 steppers[0]._capture()
 assert len(compiling) == len(frame), (compiling, len(frame))
+assert triton_key.cache_info().misses == 1  # Triton's files are hashed once, not by each thread
