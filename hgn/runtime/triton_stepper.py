@@ -140,7 +140,7 @@ class TritonStepper:
         self.scale = (mean_3.float(), std_3.float())
         self.mean, self.std = normaliser.acceleration_mean.float(), normaliser.acceleration_std.float()
         self.growths = 0
-        self._careful = self._crowded(state)
+        self.half_sums = Tuning.of(self.precision).half_sums and not self._crowded(state)
         if state.moving is not None:
             turns = len(self.path_TN3) + 1  # a turn for each row of the path, and one for the frame after it
             layers, size = state.moving.layers, state.moving.cell_size
@@ -156,7 +156,7 @@ class TritonStepper:
         """
         if state.scene_count != self.scenes or len(state.position_N3) > self.particles:
             return False
-        if self.own_physics != _own_physics(self.config, state) or (not self._careful and self._crowded(state)):
+        if self.own_physics != _own_physics(self.config, state) or (self.half_sums and self._crowded(state)):
             return False
         if not self.fits_moving(state.moving):
             return False
@@ -285,14 +285,18 @@ class TritonStepper:
             config, window, rounded, scenes=self.scenes, particles=self.particles, device=self.device, more=more
         )
         self.step = DeviceStep(self.step_config, self.grid, self.barriers)
-        tuning = Tuning.of(self.precision)
-        tuning = replace(tuning, half_sums=tuning.half_sums and not self._careful)
+        tuning = replace(Tuning.of(self.precision), half_sums=self.half_sums)
         count, precision = self.buffers.count, self.precision
         self.fused = FusedNetwork(
             self.packed, self.values, self.grid, particle_count=count, precision=precision, tuning=tuning
         )
         if self.device.type == "cuda":
             self.graph = self._capture()
+
+    def sum_in_float32(self) -> None:
+        """Builds the launches of fp16 again, with sums of particles in float32. Call it before the first frame."""
+        self.half_sums = False
+        self._build(self.grid.capacities)
 
     def _capture(self) -> torch.cuda.CUDAGraph:
         """Captures the launches of a frame. Kernels that the process has not used are compiled in parallel before."""

@@ -1,6 +1,7 @@
-"""Scenes beyond int32: many blocks of particles move like a single one; tensors of more than 2^31 elements."""
+"""Scenes beyond int32, tensors of more than 2^31 elements, and room and sums of a simulation's start."""
 
 import math
+from contextlib import nullcontext
 from dataclasses import replace
 
 import pytest
@@ -12,7 +13,8 @@ from hgn.config import NetworkConfig
 from hgn.kernels import forward
 from hgn.kernels.blocks import elements
 from hgn.network.features import ParticleState
-from hgn.runtime.parity import relative_error
+from hgn.runtime.parity import ParityError, relative_error
+from hgn.runtime.triton_backend import TritonBackend
 from hgn.runtime.triton_stepper import TritonStepper, first_capacities
 from hgn.schema import ConfigError
 from tools.bench.contenders import BOUNDS, bench_network
@@ -74,6 +76,25 @@ def test_first_room():
     assert first_capacities((128_529, 23_263, 4_373, 612), 400_000) == (160_661, 32_768, 8_192, 1_224)
     assert first_capacities((65_536, 16_385), 400_000) == (131_072, 32_768)
     assert first_capacities((8,) * 5, 1) == (256, 128, 64, 32, 16)
+
+
+@pytest.mark.parametrize("fails", [False, True])
+def test_sums_are_in_float32_where_half_fails(monkeypatch, fails):
+    """Where float16 sums alone fail the check of fp16, the backend takes float32 sums; where these fail too, it refuses
+    the state."""
+    checked = []
+
+    def require_parity(stepper, *_):
+        checked.append(stepper.half_sums)
+        if stepper.half_sums or fails:
+            raise ParityError("precision must be tf32")
+
+    monkeypatch.setattr(TritonStepper, "require_parity", require_parity)
+    backend = TritonBackend(bench_network(NETWORK, CPU), "fp16")
+    for state in states():
+        with pytest.raises(ParityError) if fails else nullcontext(), backend.stepper(state):
+            pass
+    assert checked == [True, False] * 2 and backend.precision == "fp16"
 
 
 @triton.jit
