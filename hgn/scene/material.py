@@ -57,9 +57,7 @@ def material_index(name: str) -> int:
 
     Raises: ConfigError when the name is unknown.
     """
-    if name not in MATERIALS:
-        solved = f"; {', '.join(MATERIALS[len(PAPER_MATERIALS) :])} only for the solver"
-        raise ConfigError(f"material must be one of {', '.join(PAPER_MATERIALS)}{solved}, got {name!r}")
+    require(name in MATERIALS, "material", f"one of {', '.join(MATERIALS)}", name)
     return MATERIALS.index(name)
 
 

@@ -40,9 +40,9 @@ TURN_DEGREES = 360.0  # rotation for a drag across the whole window
 MAXIMUM_UPLOAD_BYTES = 64 << 20
 MAXIMUM_ACTIONS = 64  # actions that may wait for the next frame; further ones are dropped
 ABOUT = {
-    "mechanics": "any motion and gravity, exact flight",
+    "mechanics": "any motion and gravity; a body alone flies exactly",
     "obstacles": "scenes that start at rest, gravity 9.8 downwards",
-    "world": "pools, dams, slopes, small and large bodies; creeps over thousands of frames",
+    "own_physics": "pools, dams, slopes, small and large bodies; resting material creeps",
     "obstacles_small": "fast on a CPU, as obstacles with larger errors: some particles float or pass obstacles",
 }
 HELP = """

@@ -315,7 +315,7 @@ def test_thick_walls_point_outwards():
 @pytest.mark.parametrize(
     ("experiment", "change", "message"),
     [
-        (False, {}, r"dataset.folder must be one of python -m datagen without \+experiment=imported"),
+        (False, {}, r"add \+experiment=imported, or take another folder"),
         (True, {"cell_size": 0.02}, r"network.cell_size must be the data's radius of 0.015, .* got 0.02; import it"),
         (True, {"dimensions": 3}, r"network.dimensions must be the data's 2, got 3"),
         (True, {"materials": ["water"]}, r"network.materials must be all of the data's \['water', 'goop'\]"),

@@ -258,8 +258,8 @@ MISTAKES = [
     (scene_with(seed=-1), "seed must be a whole number >= 0"),
     (scene_with(seed=0.5), "seed must be a whole number"),
     (
-        group_with(material="lava"),
-        GROUP + r"\.material must be one of water, sand, snow; elastic only for the solver, got 'lava'",
+        group_with(material="snoww"),
+        GROUP + r"\.material must be one of water, sand, snow, elastic, got 'snoww'; did you mean snow\?",
     ),
     (group_with(shape="torus"), GROUP + r"\.shape must be one of cube, sphere, box"),
     (group_with(size=0), GROUP + r"\.size must be finite and > 0"),
