@@ -117,11 +117,10 @@ def main(mapping: dict[str, Any]) -> int:
 def rollout(config: RolloutConfig) -> tuple[Path, Rollout]:
     """Simulates a scene or an episode, writes the file, and returns its path and content.
 
-    The file of an episode also has the episode's true positions. Ctrl-C keeps the frames so far. Raises ConfigError for
-    bad input or a simulation that diverges, and then writes nothing.
+    The file of an episode also has the episode's true positions. Ctrl-C and a simulation that diverges keep the frames
+    so far, which a line reports. Raises ConfigError for bad input or a simulation that diverges.
     """
     from hgn.render.exchange import require_exchange, save_frames
-    from hgn.runtime.divergence import DivergedError
     from hgn.runtime.simulator import InitialState, Simulator
     from hgn.runtime.weights import find_weights, require_frame_rate
     from hgn.scene.episode_obstacles import obstacles_of_episode
@@ -177,20 +176,22 @@ def rollout(config: RolloutConfig) -> tuple[Path, Rollout]:
         materials=initial.materials,
         dimensions=initial.dimensions,
     )
-    try:
-        with closing(_shown(simulator.frames(initial, frames), frames)) as simulated:
-            written = save_frames(out, result, simulated, config.surface)
-    except DivergedError as error:
-        raise ConfigError(f"weights must keep the simulation together, got {weights}: {error}") from error
+    with closing(_shown(simulator.frames(initial, frames), frames, weights)) as simulated:
+        written = save_frames(out, result, simulated, config.surface)
     return written, result
 
 
-def _shown(simulated: Iterator[np.ndarray], count: int) -> Generator[np.ndarray]:
-    """Yields the frames, and shows a progress bar."""
+def _shown(simulated: Iterator[np.ndarray], count: int, weights: Path) -> Generator[np.ndarray]:
+    """Yields the frames, and shows a progress bar. Raises ConfigError with `weights` if the simulation diverges."""
+    from hgn.runtime.divergence import DivergedError
+
     with bar("simulating", total=count, unit="frame") as progress:
-        for position_N3 in simulated:
-            yield position_N3
-            progress.update()
+        try:
+            for position_N3 in simulated:
+                yield position_N3
+                progress.update()
+        except DivergedError as error:
+            raise ConfigError(f"weights must keep the simulation together, got {weights}: {error}") from error
 
 
 def _notes_on_physics(scene: Scene, info: WeightsInfo, weights: str) -> Iterator[str]:

@@ -16,10 +16,10 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 33_726,
+    "hgn": 33_725,
     "datagen": 8_965,
     "tools": 6_389,
-    "tests": 33_697,
+    "tests": 33_710,
 }
 SETTINGS = 240  # fields of the dataclasses behind the commands, *Config
 

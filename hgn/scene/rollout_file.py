@@ -148,7 +148,7 @@ def write_frames(path: Path, rollout: Rollout, frames: Iterable[np.ndarray]) -> 
     """Writes frames as they come, float32 [present particles, 3], and puts them into `rollout.position_TN3`.
 
     Once a second the new frames are appended to a temporary file. The file is renamed to `path` at the end, also after
-    Ctrl-C or an error of the disk. Other errors leave no file. The space for all frames is reserved first.
+    Ctrl-C, an OSError or a ConfigError. Other errors leave no file. The space for all frames is reserved first.
     Raises: OSError before the first frame if the disk has less space.
     """
     size = rollout_bytes(rollout.frame_count, rollout.particle_count, rollout.reference_TN3 is not None)
@@ -170,8 +170,8 @@ def take_frames(
 ) -> tuple[int, BaseException | None]:
     """Puts frames into `rollout.position_TN3`, and calls `each` with their number so far.
 
-    Returns the number of frames, and the interruption (Ctrl-C or an error of the disk) or None. An interruption before
-    the first frame is raised.
+    Returns the number of frames, and the interruption (Ctrl-C, an error of the disk or a ConfigError) or None. An
+    interruption before the second frame is raised.
     """
     count = 0
     try:
@@ -180,8 +180,8 @@ def take_frames(
             count += 1
             if each is not None:
                 each(count)
-    except (KeyboardInterrupt, OSError) as error:
-        if not count:
+    except (KeyboardInterrupt, OSError, ConfigError) as error:
+        if count < 2:  # frame 0 is the initial state
             raise
         return count, error
     return count, None

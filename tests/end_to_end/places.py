@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from network.states import network_of
+from network.states import network_of, silent
 from processes import exit_code
 from training.runs import train_arguments
 
@@ -93,7 +93,7 @@ class Place:
 
     def accelerate(self, by):
         """Puts weights in the place of those that throw all particles out of the domain."""
-        network = network_of(torch.float32)
+        network = silent(network_of(torch.float32))
         network.normaliser.set("acceleration", torch.full((3,), by), torch.ones(3), 0.0)
         save_weights(self.path("weights.safetensors"), network, WeightsInfo(network.config, 60.0, 1 / 64))
 

@@ -26,6 +26,7 @@ from hgn import evaluate
 from hgn.command import EXIT_INPUT, EXIT_MACHINE
 from hgn.data.storage import TOKEN_VARIABLE
 from hgn.runtime.simulator import Simulator
+from hgn.scene.rollout_file import read_rollout
 
 # command, arguments, message
 VALUES = [
@@ -196,6 +197,16 @@ def test_diverging_weights(place, capsys, monkeypatch):
     place.path("earlier/rollout.vtkhdf").write_bytes(b"an earlier hgn rollout")
     message = "weights must keep the simulation together, got weights.safetensors: the simulation diverged at frame 1:"
     check(place, "rollout", [*ROLLOUT, "out=earlier/rollout.vtkhdf"], message, capsys, monkeypatch)
+
+
+def test_frames_before_a_divergence_are_written(place, capsys, monkeypatch):
+    """A rollout that diverges at frame 3 ends as one at frame 1, but its file has the three frames before."""
+    place.accelerate(0.3)
+    code, line = refused("rollout", ROLLOUT[:-1], capsys, monkeypatch)
+    assert code == EXIT_INPUT and "weights.safetensors: the simulation diverged at frame 3:" in line
+    position_TN3 = read_rollout(place.path("made/rollout.vtkhdf")).position_TN3
+    distance_T = (position_TN3 - position_TN3[0]).mean(axis=(1, 2))
+    assert distance_T.tolist() == pytest.approx([0, 0.3, 0.9], abs=1e-2)
 
 
 def test_diverging_scenes_are_told(place, capsys):

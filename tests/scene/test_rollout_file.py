@@ -409,10 +409,12 @@ def test_files_grow(tmp_path, monkeypatch):
     assert [each.name for each in path.parent.iterdir()] == ["grown.vtkhdf"]
 
 
-@pytest.mark.parametrize("error", [KeyboardInterrupt(), OSError(28, "No space left"), ConfigError("it diverged")])
+@pytest.mark.parametrize(
+    "error", [KeyboardInterrupt(), OSError(28, "No space left"), ConfigError("it diverged"), ValueError()]
+)
 def test_interrupted_files(tmp_path, error, monkeypatch, capsys):
-    """Ctrl-C and errors of a disk keep the frames so far, other errors and those before the first frame the file of
-    before; a write that was interrupted is done again."""
+    """Ctrl-C, errors of a disk and a divergence keep the frames so far, other errors and those before the second frame
+    the file of before; a write that was interrupted is done again."""
     whole, path = growing(), tmp_path / "a.vtkhdf"
     write_rollout(path, make_rollout())
 
@@ -420,10 +422,10 @@ def test_interrupted_files(tmp_path, error, monkeypatch, capsys):
         yield from (frame_N3[: whole.present(i)] for i, frame_N3 in enumerate(whole.position_TN3[:count]))
         raise error
 
-    for count in (0, 4):
+    for count in (0, 1, 4):
         with pytest.raises(type(error)):
             write_frames(path, dataclasses.replace(whole, position_TN3=whole.position_TN3.copy()), frames(count))
-        kept = count and not isinstance(error, ConfigError)
+        kept = count == 4 and type(error) is not ValueError
         assert read_rollout(path).frame_count == (count if kept else FRAMES)
         assert capsys.readouterr().err == (f"4 of 6 frames are in {path}\n" if kept else "")
     if isinstance(error, OSError):
