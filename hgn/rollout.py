@@ -202,7 +202,8 @@ def _notes_on_physics(scene: Scene, info: WeightsInfo, weights: str) -> Iterator
         yield f"not used: {unused} of groups, which are the solver's; {weights} knows one of each material"
     frictions = np.array([*scene.wall_friction, *(obstacle.friction or 0.0 for obstacle in scene.obstacles)])
     if frictions.any() and "friction" not in inputs:
-        yield f"not used: friction of surfaces, which is the solver's; {weights} knows that of its data alone"
+        known = f"{weights} knows that of its data alone; weights=own_physics has it as input"
+        yield f"not used: friction of surfaces, which is the solver's; {known}"
     speeds = np.array([obstacle.motion.fastest(obstacle.vertex_V3) for obstacle in scene.obstacles if obstacle.motion])
     for name, (low, high) in info.own_ranges.items():
         own = {"friction": frictions, "moving": speeds}

@@ -16,10 +16,10 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 33_725,
+    "hgn": 33_724,
     "datagen": 8_965,
     "tools": 6_389,
-    "tests": 33_710,
+    "tests": 33_738,
 }
 SETTINGS = 240  # fields of the dataclasses behind the commands, *Config
 

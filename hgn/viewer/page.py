@@ -76,7 +76,6 @@ class PlayPage:
         self.ended, self.playing, self.steps = threading.Event(), True, 0
         self.diverged = False  # whether the page paused because the simulation diverged
         self.limited = False  # whether viewers were told that this drag has reached the limit of particles
-        self.viewed = threading.Event()  # set by the first viewer; the simulation waits for it
         self.actions: dict[object, tuple[Callable[[], Any], Any]] = {}
         self._queueing = threading.Lock()
         self.meshes: dict[int, viser.MeshHandle] = {}
@@ -86,7 +85,6 @@ class PlayPage:
         self.frames_a_second = 0.0
         self._add_buttons()
         self._add_mouse()
-        self.server.on_client_connect(lambda _: self.viewed.set())
         self._show()
         self._show_status()
 
@@ -119,12 +117,12 @@ class PlayPage:
             updates(partial(one.add_notification, "HGN", message, auto_close_seconds=10))
 
     def run(self) -> None:
-        """Simulates, at most in real time, from the first viewer's arrival until `close`."""
+        """Simulates, at most in real time, until `close`. Waits while there are no viewers."""
         due = updated = time.monotonic()
         frames, shown = 0, True
         while not self.ended.is_set():
             changed = self._do_all() or not shown
-            if (self.playing and self.viewed.is_set()) or self.steps:
+            if (self.playing and self.server.get_clients()) or self.steps:
                 self.steps = max(0, self.steps - 1)
                 try:
                     self.session.step()
@@ -168,7 +166,7 @@ class PlayPage:
                 self.meshes[number].wxyz = quaternion(obstacle.rotation_33)
             self.shown[number] = obstacle
         if self.chosen not in obstacles:
-            self.chosen = next(reversed(obstacles), None)
+            self.chosen = None
 
     def _show_status(self) -> None:
         session = self.session

@@ -1,6 +1,7 @@
 """The page in a real browser, headless, one session of it for all tests; skipped where there is none."""
 
 import asyncio
+import contextlib
 import errno
 import io
 import random
@@ -371,9 +372,28 @@ def test_a_film_plays_by_itself(viewer, play, tmp_path, monkeypatch):
     until_blue(viewer)
 
 
-def test_it_begins_when_somebody_looks_and_restarts_as_it_was():
-    """No frame before the first viewer. Restart goes on after a divergence, and stays paused where a viewer paused. A
-    disk that is full for a download is told, and ends nothing."""
+@contextlib.contextmanager
+def viewed(page):
+    """One viewer, without a browser."""
+    over = threading.Event()
+
+    async def view():
+        async with soak.Viewer(random.Random(0)).connected(page.address):
+            while not over.is_set():
+                await asyncio.sleep(0.05)
+
+    with ThreadPoolExecutor(1) as pool:
+        viewer = pool.submit(asyncio.run, view())
+        try:
+            yield
+        finally:
+            over.set()
+        viewer.result()
+
+
+def test_it_runs_while_somebody_looks_and_restarts_as_it_was():
+    """No frame before the first viewer, and none after the last has left. Restart goes on after a divergence, and stays
+    paused where a viewer paused. A disk that is full for a download is told, and ends nothing."""
     session = PlaySession(floating(), load_scene(CONF / "example/play.yaml"), CONF / "example")
     page = PlayPage(session, port=0)
     thread = threading.Thread(target=page.run)
@@ -385,14 +405,22 @@ def test_it_begins_when_somebody_looks_and_restarts_as_it_was():
     try:
         done(page, lambda: None)
         assert session.frame == 0 and page.playing
-        page.viewed.set()
-        until(lambda: session.frame > 0)
-        done(page, lambda: session.drop("water", (0.3, 0.8, 0.3), 0.1, speed=600.0))
-        until(lambda: page.diverged)
-        assert not page.playing
-        done(page, page.restart)
-        assert page.playing and not page.diverged
-        until(lambda: session.frame > 1)
+        with viewed(page):
+            until(lambda: session.frame > 0)
+        until(lambda: not page.server.get_clients())
+        done(page, lambda: None)
+        frame = session.frame
+        for _ in range(5):
+            done(page, lambda: None)
+        assert session.frame == frame and page.playing
+        with viewed(page):
+            until(lambda: session.frame > frame)
+            done(page, lambda: session.drop("water", (0.3, 0.8, 0.3), 0.1, speed=600.0))
+            until(lambda: page.diverged)
+            assert not page.playing
+            done(page, page.restart)
+            assert page.playing and not page.diverged
+            until(lambda: session.frame > 1)
         done(page, lambda: page.play(False))
         done(page, page.restart)
         assert not page.playing and session.frame == 0
