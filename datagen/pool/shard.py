@@ -40,7 +40,7 @@ def stage_episode(folder: Path, episode: Episode) -> None:
     stage_parts(folder, episode.key, episode_tar(episode))
 
 
-def stage_parts(folder: Path, key: str, parts: Iterable[bytes]) -> None:
+def stage_parts(folder: Path, key: str, parts: Iterable[bytes | memoryview]) -> None:
     """Writes the parts of an episode's tar file atomically, and appends their sha256.
 
     The file is not synced. `DatasetWriter` syncs it, unless its shard is packed before.

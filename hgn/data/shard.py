@@ -4,20 +4,20 @@ import tarfile
 from collections.abc import Iterator
 from pathlib import Path
 
-from hgn.scene.episode import Episode, encode_episode
+from hgn.scene.episode import Episode, encoded_parts
 from hgn.schema import ConfigError
 from hgn.system.files import open_at_once
 
 
-def episode_tar(episode: Episode) -> Iterator[bytes]:
+def episode_tar(episode: Episode) -> Iterator[bytes | memoryview]:
     """Yields the parts of an episode's tar. It has no times and owners, so its bytes depend on the episode only."""
     written = 0
-    for name, data in encode_episode(episode).items():
+    for name, parts in encoded_parts(episode).items():
         info = tarfile.TarInfo(f"{episode.key}.{name}")
-        info.size, info.mtime, info.mode = len(data), 0, 0o644
-        header, rest = info.tobuf(tarfile.GNU_FORMAT), bytes(-len(data) % tarfile.BLOCKSIZE)
-        written += len(header) + len(data) + len(rest)
-        yield from (header, data, rest)
+        info.size, info.mtime, info.mode = sum(map(len, parts)), 0, 0o644
+        header, rest = info.tobuf(tarfile.GNU_FORMAT), bytes(-info.size % tarfile.BLOCKSIZE)
+        written += len(header) + info.size + len(rest)
+        yield from (header, *parts, rest)
     yield tar_end(written)
 
 

@@ -46,6 +46,7 @@ _OPTIONAL = ("obstacle_friction", "past", "boundary")  # the last two only in im
 _NAME = re.compile(r"[A-Za-z0-9_-]+")
 _FARTHEST_CELL = 65_535  # largest coordinate of an obstacle cell; those of a network's grid have as many bits
 _FARTHEST = 1000.0  # largest coordinate, speed and gravity, in domain sizes; a network's grid reaches twice as far
+_BLOCK_PARTICLES = 1 << 17  # number of particles times number of frames whose positions are checked in one call
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,8 +179,13 @@ def encode_episode(episode: Episode) -> dict[str, bytes]:
     with sorted keys.
     Raises: ConfigError if positions are not finite, or if specification or solver cannot be written as JSON.
     """
+    return {name: b"".join(parts) for name, parts in encoded_parts(episode).items()}
+
+
+def encoded_parts(episode: Episode) -> dict[str, tuple[bytes | memoryview, ...]]:
+    """Returns the members of `encode_episode` in parts. Arrays are not copied: their parts are views of them."""
     _require_sound_positions(episode)
-    members = {
+    members: dict[str, tuple[bytes | memoryview, ...]] = {
         f"{name}.npy": _encode_array(array, _ARRAYS.get(name, _PARAMETER)[0])
         for name, array in episode.arrays().items()
     }
@@ -204,7 +210,7 @@ def encode_episode(episode: Episode) -> dict[str, bytes]:
             f"{episode.key}: specification and solver must be plain JSON (finite numbers, text, lists, mappings), "
             f"got {error}"
         ) from None
-    members[DESCRIPTION_MEMBER] = text.encode()
+    members[DESCRIPTION_MEMBER] = (text.encode(),)
     return members
 
 
@@ -302,10 +308,15 @@ def require_schema_version(mapping: object, name: str) -> None:
 
 
 def _require_sound_positions(episode: Episode) -> None:
-    # frame by frame, so that a memory map is not loaded completely
-    for frame, position_N3 in enumerate(np.asarray(episode.position_TN3)):
-        farthest = _FARTHEST * max(episode.domain_size)
-        _require_within(f"{episode.key}: position", position_N3, farthest, f" in frame {frame}")
+    # A block at a time, so that a memory map is not loaded completely. With a call per frame, threads that check
+    # episodes would delay each other, because each call waits for the interpreter's lock.
+    position_TN3, farthest = np.asarray(episode.position_TN3), _FARTHEST * max(episode.domain_size)
+    frames = max(1, _BLOCK_PARTICLES // max(episode.particle_count, 1))
+    for first in range(0, episode.frame_count, frames):
+        block = position_TN3[first : first + frames]
+        if not max(block.max(initial=0), -block.min(initial=0)) <= farthest:
+            for frame, position_N3 in enumerate(block, first):
+                _require_within(f"{episode.key}: position", position_N3, farthest, f" in frame {frame}")
 
 
 def _require_within(name: str, array: np.ndarray, farthest: float, place: str = "") -> None:
@@ -316,8 +327,8 @@ def _require_within(name: str, array: np.ndarray, farthest: float, place: str = 
         raise ConfigError(f"{name} must be {rule}, got {array[at]} at {list(at)}{place}")
 
 
-def _encode_array(array: np.ndarray, dtype: str) -> bytes:
+def _encode_array(array: np.ndarray, dtype: str) -> tuple[bytes, memoryview]:
     plain = np.ascontiguousarray(np.asarray(array), dtype=dtype)
     header = io.BytesIO()
     np.lib.format.write_array_header_1_0(header, np.lib.format.header_data_from_array_1_0(plain))
-    return b"".join((header.getvalue(), plain.data))  # one copy; write_array makes three
+    return header.getvalue(), plain.reshape(-1).view(np.uint8).data

@@ -12,6 +12,8 @@ from equality import assert_same
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from hgn.data.shard import episode_tar
+from hgn.scene import episode as episode_module
 from hgn.scene.episode import Episode, decode_episode, encode_episode
 from hgn.scene.obstacle_grid import ObstacleGrid
 from hgn.schema import ConfigError
@@ -102,9 +104,26 @@ def test_wrong_fields_are_refused(changes, message):
         make_episode(**changes)
 
 
-def test_positions_that_are_not_finite_are_refused_both_ways():
+def test_arrays_are_written_from_their_own_memory():
+    """The parts of a tar include the positions themselves: a copy of all episodes of a launch would cost seconds."""
+    episode = make_episode()
+    parts = [np.frombuffer(part, np.uint8) for part in episode_tar(episode) if len(part)]
+    assert any(np.shares_memory(part, episode.position_TN3) for part in parts)
+
+
+def test_frames_are_not_checked_one_by_one(monkeypatch):
+    """Sound positions need no call per frame: at each call a thread waits for the others that check episodes."""
+    episode, calls = make_episode(), []
+    monkeypatch.setattr(episode_module, "_require_within", lambda *arguments: calls.append(arguments))
+    encode_episode(episode)
+    assert not calls
+
+
+@pytest.mark.parametrize("frames_per_block", [1, 2, 3, 4])
+def test_positions_that_are_not_finite_are_refused_both_ways(monkeypatch, frames_per_block):
     """Neither writing nor reading lets a NaN through, and the message names frame and particle."""
     episode = make_episode()
+    monkeypatch.setattr(episode_module, "_BLOCK_PARTICLES", frames_per_block * episode.particle_count)
     position = episode.position_TN3.copy()
     position[2, 3, 1] = np.nan
     with pytest.raises(ConfigError, match=r"position must be finite, got nan at \[3, 1\] in frame 2"):
