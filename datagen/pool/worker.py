@@ -70,6 +70,7 @@ class MadeScene:
     scene: Parcel[Scene]
     obstacle_grid: ObstacleGrid | None  # None: sent later, because the solver does not need it
     collider: Parcel[Any] = field(default_factory=lambda: Parcel(None))  # the solver's form of the obstacles
+    simulated: Parcel[Any] = field(default_factory=lambda: Parcel(None))  # the scene on the solver's grid
 
 
 @dataclass(frozen=True)
@@ -144,12 +145,13 @@ def make_scene(task: SceneTask, config: DatagenConfig, backend: Backend, with_gr
         scene = generate_scene(config.scene, task.seed)
         if any(obstacle.friction is not None for obstacle in scene.obstacles):
             scene = _with_known_friction(scene, config.mpm.collider_friction)
-        # Makers build the collider. In a solver the GPU would idle while colliders are built one by one.
+        # Makers build the collider and draw fine particles. In a solver the GPU would idle meanwhile.
         finer = replace(scene, cell_size=config.reference_cell_size)
         collider = build_collider(finer, config.mpm.choices.collider_band_cells)
     except ConfigError as error:  # e.g. an obstacle does not fit; another seed may work
         return "failed", task.key, str(error)
-    made = MadeScene(task, Parcel(scene), None, Parcel(collider))
+    fine, parcel = scene_to_simulate(scene, config), Parcel(scene)
+    made = MadeScene(task, parcel, None, Parcel(collider), parcel if fine is scene else Parcel(fine))
     if with_grid:
         grid = build_grid(GridTask(task, made.scene), backend).grid
         if isinstance(grid, str):
@@ -193,7 +195,7 @@ def simulate_batch(
     results: dict[SceneTask, Any] = {}
     for frames, launch in sorted(launches.items()):
         of_launch = simulate(
-            [scene_to_simulate(made.scene.open(), config) for made in launch],
+            [made.simulated.open() for made in launch],
             solver_on_grid(config.mpm, config.reference_cell_size, config.scene.cell_size),
             frames,
             config.dataset.frame_rate_hz,

@@ -1,6 +1,7 @@
 """Scenes simulated on a finer grid than their episodes show (dataset.reference_cells)."""
 
 import json
+import pickle
 from pathlib import Path
 
 import numpy as np
@@ -11,8 +12,9 @@ from written_files import Recorder, hashes
 
 from datagen.fine import fine_scene, solver_on_grid, visible_positions
 from datagen.pool.local_workers import LocalWorkerFactory
-from datagen.pool.plan import scene_seed
+from datagen.pool.plan import SceneTask, scene_seed
 from datagen.pool.pool import Pool
+from datagen.pool.worker import make_scene, simulate_batch
 from datagen.pool.worker_plan import WorkerPlan, gpu_scenes_per_launch
 from datagen.pool.writer import DatasetWriter
 from hgn.card import data_card
@@ -168,6 +170,20 @@ def test_a_data_set_of_a_finer_grid(make_config, small_dataset, backend, threads
     assert "128 cells per unit" in data_card(manifest, "name", "mit")
     with pytest.raises(ConfigError, match="reference is"):
         generated(make_config(), backend)
+
+
+def test_makers_draw_children(make_config, backend, monkeypatch):
+    """A solver receives the scene that it simulates: while it drew children, its GPU would be idle. On the visible grid
+    this is the scene of the episode, which is sent once."""
+    task = SceneTask("train", 0, 0, scene_seed(0, "train", 0, 0))
+    config = make_config(reference_cells=128)
+    fine, coarse = (make_scene(task, c, backend)[1] for c in (config, make_config()))
+    monkeypatch.setattr("datagen.fine.fine_scene", None)
+    fine, coarse = pickle.loads(pickle.dumps((fine, coarse)))
+    assert coarse.simulated is coarse.scene
+    (result,) = simulate_batch([fine], config, backend, 1)
+    assert np.array_equal(result.position_TN3[0], fine.scene.open().position_N3)
+    assert fine.simulated.open().particle_count == 8 * fine.scene.open().particle_count
 
 
 def test_a_killed_solver_leaves_no_trace(make_config, backend, control, tmp_path, threads):
