@@ -13,6 +13,7 @@ from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
+from functools import partial
 from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
@@ -42,6 +43,7 @@ from hgn.system.processes import cause_of_exit, start_child
 
 _FRAME_REPORT_SECONDS = 1.0  # interval between a worker's reports; each is a line with progress=json
 _STAGING_THREADS = 8
+_STAGING_FRAME = 8  # frame of a launch at which the results of the launch before are staged
 _END_SECONDS = 10.0  # time in which a dismissed worker must end
 
 
@@ -162,9 +164,14 @@ class _Inbox:
         self._lock = threading.Lock()
         threading.Thread(target=self._read, args=(connection, send), name="inbox", daemon=True).start()
 
-    def batches(self) -> Iterator[list[MadeScene]]:
-        """Yields batches until the pool ends."""
-        while (batch := self._batches.get()) is not None:
+    def batches(self, before_waiting: Callable[[], None]) -> Iterator[list[MadeScene]]:
+        """Yields batches until the pool ends. Calls `before_waiting` if the next batch is not there yet."""
+        while True:
+            if self._batches.empty():
+                before_waiting()
+            batch = self._batches.get()
+            if batch is None:
+                return
             yield batch
 
     def grid(self, made: MadeScene) -> ObstacleGrid | str:
@@ -217,22 +224,36 @@ def _solve(
     on_gpu = threads is None
     if on_gpu:  # compiles kernels while the first scenes are built
         pkgutil.resolve_name(backend.warm_up)(config.scene, config.mpm, first_launch)
-    # one batch is staged while the next is simulated, so that a GPU does not wait for the disk
+    finished: list[tuple[MadeScene, Any]] = []  # scenes and results that are not being staged yet
+    staging: list[Future[None]] = []
     with ThreadPoolExecutor(max_workers=_STAGING_THREADS) as stager:
-        staging: list[Future[None]] = []
-        for batch in inbox.batches():
-            if on_gpu:  # the next batch may be sent
-                send("idle")
-            results = simulate_batch(batch, config, backend, threads, lambda count: _frame_reporter(send, count))
-            for future in staging:
-                future.result()
-            staging = [
-                stager.submit(_stage, send, config, config_hash, inbox, made, result)
-                for made, result in zip(batch, results, strict=True)
-            ]
-            send("frame", 0, 0)
-            if not on_gpu:
-                send("idle")
+
+        def stage_finished(frame: int = _STAGING_FRAME) -> None:
+            if frame >= _STAGING_FRAME:
+                staging.extend(stager.submit(_stage, send, config, config_hash, inbox, *pair) for pair in finished)
+                finished.clear()
+
+        # A batch is staged while the next is simulated, so that a GPU does not wait for the disk. Staging begins when
+        # the device is busy: its threads would delay this thread, which prepares the next launch.
+        try:
+            for batch in inbox.batches(stage_finished):
+                if on_gpu:  # the next batch may be sent
+                    send("idle")
+                reporter = partial(_frame_reporter, send, stage_finished)
+                results = simulate_batch(batch, config, backend, threads, reporter)
+                stage_finished()
+                for future in staging:
+                    future.result()
+                staging.clear()
+                finished += zip(batch, results, strict=True)
+                del results  # staged results are freed
+                if len(batch) <= _STAGING_THREADS:  # this takes little time, and a training may wait for the first ones
+                    stage_finished()
+                send("frame", 0, 0)
+                if not on_gpu:
+                    send("idle")
+        finally:  # also after an error in the next batch
+            stage_finished()
 
 
 def _stage(send: _Sender, config: DatagenConfig, config_hash: str, inbox: _Inbox, made: MadeScene, result: Any) -> None:
@@ -248,11 +269,12 @@ def _stage(send: _Sender, config: DatagenConfig, config_hash: str, inbox: _Inbox
         send("staged", made.task.key)
 
 
-def _frame_reporter(send: _Sender, scenes: int) -> Callable[[int], None]:
+def _frame_reporter(send: _Sender, on_frame: Callable[[int], None], scenes: int) -> Callable[[int], None]:
     last = 0.0
 
     def report(frame: int) -> None:
         nonlocal last
+        on_frame(frame)
         if time.monotonic() - last > _FRAME_REPORT_SECONDS:
             last = time.monotonic()
             send("frame", int(frame), scenes)

@@ -1,23 +1,26 @@
 """The pool: whatever happens to its workers, the data set comes out whole, and no process is left behind."""
 
+import contextlib
 import dataclasses
 import errno
 import multiprocessing
 import pickle
 import shutil
 import tarfile
-from concurrent.futures import ThreadPoolExecutor
+import threading
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 
+import ballistic_solver
 import numpy as np
 import pytest
 from written_files import Recorder, hashes, simulated, simulated_once
 
-from datagen.pool import pool
+from datagen.pool import local_workers, pool
 from datagen.pool.local_workers import LocalWorker, LocalWorkerFactory
 from datagen.pool.plan import SceneTask, scene_seed
 from datagen.pool.pool import Pool, Stopped
-from datagen.pool.worker import Backend, MadeScene, Parcel, Worker
+from datagen.pool.worker import Backend, MadeScene, Parcel, Worker, make_scene
 from datagen.pool.worker_plan import WorkerPlan, plan_workers, visible_gpus
 from datagen.pool.writer import DatasetWriter
 from hgn.config import DatagenConfig, DatasetConfig, MpmConfig, SceneConfig
@@ -108,6 +111,60 @@ def test_batches(make_config, backend, control, threads):
     for largest, launches in ((4, [3, 3, 3]), (8, [5, 4])):  # even ones: a small last one costs as much time
         shutil.rmtree(config.dataset.folder)
         assert generate(config, backend, WorkerPlan(1, None, 2, largest, largest)).launches == launches
+
+
+class Immediate(ThreadPoolExecutor):
+    """Runs what is submitted in the thread that submits it."""
+
+    def submit(self, function, /, *arguments):
+        future = Future()
+        future.set_result(function(*arguments))
+        return future
+
+
+@pytest.mark.parametrize(("threads", "fault"), [(1, False), (1, True), (2, False)])
+def test_staging_begins_when_the_next_launch_runs(make_config, backend, monkeypatch, threads, fault):
+    """Threads that stage a launch would delay the thread that prepares the next one. The last launch is staged without
+    a delay, and so are the one before an error and a launch with at most one scene for each thread."""
+    config = make_config(training_scenes=4, validation_scenes=0, test_scenes=0, frames=11)
+    (Path(config.dataset.folder) / ".staging").mkdir(parents=True)
+    pool_end, solver_end = multiprocessing.Pipe()
+    tasks = [SceneTask("train", i, 0, scene_seed(0, "train", i, 0)) for i in range(4)]
+    made = [make_scene(task, config, backend)[1] for task in tasks]
+    for message in (*made[:2], None, *made[2:], None):
+        pool_end.send(message)
+    pool_end.close()
+    events: list[object] = []
+    simulate = ballistic_solver.simulate
+
+    def recorded(scenes, *arguments, on_frame, **options):
+        for thread in threading.enumerate():
+            if thread.name == "inbox":  # the next launch has been received
+                thread.join()
+        if fault and events:
+            raise OSError("a fault in the second launch")
+        results = simulate(scenes, *arguments, **options)
+        for frame in range(11):
+            events.append(frame)
+            on_frame(frame)
+        return results
+
+    def send(kind, *values):
+        if kind == "staged":
+            events.append(values[0])
+
+    monkeypatch.setattr(ballistic_solver, "simulate", recorded)
+    monkeypatch.setattr(local_workers, "ThreadPoolExecutor", Immediate)
+    monkeypatch.setattr(local_workers, "_STAGING_THREADS", threads)
+    first, second = ([task.key for task in tasks[i : i + 2]] for i in (0, 2))
+    expected = pytest.raises(OSError, match="second launch") if fault else contextlib.nullcontext()
+    with expected:
+        local_workers._solve(solver_end, send, config, backend, None, None, 2)
+    begun = local_workers._STAGING_FRAME + 1
+    after = first if fault else [*range(begun), *first, *range(begun, 11), *second]
+    if threads == 2:
+        after = [*first, *range(11), *second]
+    assert events == [*range(11), *after]
 
 
 def test_scenes_are_spread_over_solvers(make_config, backend, control, threads):
