@@ -41,6 +41,9 @@ from hgn.scene.material import INPUT_PARAMETERS, LOGARITHMIC, acts_on
 from hgn.scene.own_physics import NOMINAL_P
 
 TINY = 1e-30  # lower bound of squares and divisors; avoids a division by zero
+# With local inputs `wall_contact` is 0 up to the first nearness, 1.8 R (0.063) from the plane, and 1 from the second,
+# 1.5 R (0.0525). The solver's walls act on particles up to about 4 cells of 1/64 (0.0625) from the plane.
+FREE_NEARNESS, FULL_NEARNESS = 0.4, 0.5
 VISCOSITY_PA_S = 1.0  # unit of the viscosity input log(1 + viscosity / unit)
 
 
@@ -112,6 +115,16 @@ def physics_fields(config: NetworkConfig, scenes: Sequence[Any], material_N: tor
     return fields if rest is None else fields | {"rest": rest}
 
 
+def wall_contact(wall_N6: torch.Tensor, local: bool) -> torch.Tensor:
+    """Returns from `relative.wall_nearness` how far walls can push particles, 0 to 1, [N, 6].
+
+    A network sees walls before they can push. With `local` inputs only walls that can push hold a body, so a ceiling
+    does not hold what slides down a slope below it. Otherwise walls push from where they are seen.
+    """
+    first = FREE_NEARNESS if local else 0.0
+    return ((wall_N6 - first) / (FULL_NEARNESS - first)).clamp(0, 1)
+
+
 def has_friction(state: ParticleState) -> bool:
     """Returns whether any surface of a state has friction."""
     cells = (state.obstacles, state.moving and state.moving.cells)
@@ -126,8 +139,12 @@ def surface_friction(
     *,
     velocity_N3: torch.Tensor,
     scale: torch.Tensor,
+    local: bool,
 ) -> SurfaceFriction:
-    """Returns the friction within reach, from `relative.wall_nearness`, `relative.obstacle_surfaces`, v - V and s_a."""
+    """Returns the friction within reach, from `relative.wall_nearness`, `relative.obstacle_surfaces`, v - V and s_a.
+
+    `local`: whether inputs are local.
+    """
     wall_N3 = torch.zeros_like(state.position_N3)
     if state.wall_friction_S3 is not None:
         wall_N3 = state.wall_friction_S3[state.scene_N]
@@ -138,7 +155,7 @@ def surface_friction(
         rough_N33 = first_N4[:, 3, None, None] * first_N4[:, :3, None] * first_N4[:, None, :3]
         columns = [here_N4[:, 3:], ahead_N4[:, 3:]]
     columns.append(torch.maximum(wall_N6[:, :3], wall_N6[:, 3:]) * wall_N3)
-    near_N6 = (2 * wall_N6).clamp(max=1) * torch.cat([wall_N3, wall_N3], -1)
+    near_N6 = wall_contact(wall_N6, local) * torch.cat([wall_N3, wall_N3], -1)
     next_N3 = (velocity_N3 + state.gravity_S3[state.scene_N]) / scale
     square_N1 = next_N3.square().sum(-1, keepdim=True)
     value_NK = torch.cat([rough_N33.flatten(1), near_N6, next_N3, square_N1, torch.ones_like(square_N1)], dim=-1)

@@ -35,7 +35,7 @@ from hgn.network.features import ParticleState
 from hgn.network.grid import DIRECTION_63, GridHierarchy
 from hgn.network.moving import surface_velocity
 from hgn.network.obstacles import ObstacleCells, first_surface
-from hgn.network.own_physics import SurfaceFriction, friction_fraction, has_friction, surface_friction
+from hgn.network.own_physics import SurfaceFriction, friction_fraction, has_friction, surface_friction, wall_contact
 
 CONTACT_REACH_CELLS = 3.0  # distance from a wall within which the network sees it, in finest cells
 WALL_LIMIT = 2.0  # largest wall_nearness, reached one `reach` behind the plane
@@ -88,13 +88,14 @@ def relative_features(
         ],
         dim=-1,
     )
-    normal_C33, touch_N = touched_normals(surface_normals(wall_N6, normal_N6), grid), surface_gate(wall_N6, normal_N6)
+    local, touch_N = config.inputs == "local", surface_gate(wall_N6, normal_N6)
+    normal_C33 = touched_normals(surface_normals(wall_N6, normal_N6, local), grid)
     disturbed_C, touched_C = disturbance(motion_NK, touch_N, grid)
     if surface_N3 is not None:
         velocity_N3 = velocity_N3 - surface_velocity(touch_N, surface_N3, touched_C, grid)
     friction = None
     if has_friction(state) and "friction" in config.own_physics:
-        friction = surface_friction(state, grid, wall_N6, cell_N8, velocity_N3=velocity_N3, scale=scale)
+        friction = surface_friction(state, grid, wall_N6, cell_N8, velocity_N3=velocity_N3, scale=scale, local=local)
     contacts = Contacts(disturbed_C, touched_C, normal_C33, friction)
     gate_N = (grid.weight_N8 * touched_C[grid.coarsest_cells]).sum(1)
     parts = [motion_NK, gate_N[:, None] * torch.asinh(velocity_N3 / scale), wall_N6]
@@ -163,13 +164,13 @@ def surface_gate(wall_N6: torch.Tensor, normal_N6: torch.Tensor | None) -> torch
     return gate_N if normal_N6 is None else torch.where(normal_N6.any(-1), 1, gate_N)
 
 
-def surface_normals(wall_N6: torch.Tensor, normal_N6: torch.Tensor | None) -> torch.Tensor:
-    """Returns the sum of n n^T of the surfaces within reach, [N, 3, 3].
+def surface_normals(wall_N6: torch.Tensor, normal_N6: torch.Tensor | None, local: bool) -> torch.Tensor:
+    """Returns the sum of n n^T of the surfaces that can push a particle, [N, 3, 3].
 
-    n n^T of a wall is multiplied by twice its nearness, at most 1. The obstacle's normal at the particle counts; if it
+    n n^T of a wall is multiplied by its `wall_contact`. The obstacle's normal at the particle counts; if it
     is 0, the one ahead counts. n and -n give the same n n^T, so two surfaces that face each other do not cancel.
     """
-    near_N6 = (2 * wall_N6).clamp(max=1)
+    near_N6 = wall_contact(wall_N6, local)
     normal_N33 = torch.diag_embed(near_N6[:, :3] + near_N6[:, 3:])
     if normal_N6 is None:
         return normal_N33

@@ -173,7 +173,9 @@ CASES = {
     "friction of walls": Case(
         lambda: rough_state((23, 9), 0.5, None), 1e-4, OWN | {"own_physics": ("friction",), "obstacle_features": False}
     ),
-    "friction that stops": Case(lambda: rough_state((61, 20), 30.0, 30.0, 3e-3), 1e-4, OWN),
+    "friction that stops": Case(
+        lambda: rough_state((61, 20), 30.0, 30.0, 3e-3), 2e-4, OWN
+    ),  # PyTorch in float32: 1.7e-4
     "parameters": Case(lambda: rough_state(SEVERAL), 4e-5, RELATIVE | {"own_physics": ("parameters",)}),
     "moving obstacles": Case(lambda: swept_state(CROWD), 1e-4, MOVING),
     "moving obstacles alone": Case(

@@ -140,17 +140,25 @@ def test_momentum_is_kept_where_nothing_touches(levels):
     assert float(extra_N3[state.scene_N == 0].sum(0).abs().max()) > 1e-2 * float(extra_N3.abs().max())
 
 
-@pytest.mark.parametrize("height", [0.4, 2.2, 2.98])  # R above the floor: the gate is 1, below 1, and next to 0
-def test_bodies_slip_on_a_plane(height):
+@pytest.mark.parametrize(
+    ("inputs", "height", "pushes"),
+    [
+        *(("relative", height, height < 2.9) for height in (0.4, 2.2, 2.98)),  # gates of 1, below 1, and next to 0
+        *(("local", height, height < 1.8) for height in (0.4, 1.7, 1.9)),
+    ],
+)
+def test_bodies_slip_on_a_plane(inputs, height, pushes):
     """A floor pushes a body up or down only, whatever the weights, motions and materials: along it what is added to
-    gravity sums to 0."""
-    network, state = network_of(inputs="relative"), airborne((40,))
+    gravity sums to 0. With local inputs a floor 1.8 R below does not push. `height` is in R."""
+    network, state = network_of(inputs=inputs), airborne((40,))
     low = state.position_N3[:, 1].min() - height * network.config.cell_size
-    state = replace(state, position_N3=state.position_N3 - low * torch.tensor([0.0, 1.0, 0.0]).double())
+    velocity_NM3 = state.velocity_NM3 * torch.tensor([1.0, inputs != "local", 1.0])  # none approaches the floor
+    position_N3 = state.position_N3 - low * torch.tensor([0.0, 1.0, 0.0]).double()
+    state = replace(state, position_N3=position_N3, velocity_NM3=velocity_NM3)
     extra_N3 = (network(state) - state.gravity_S3[state.scene_N]).detach()
     extra_3 = extra_N3.sum(0) / extra_N3.abs().sum()
     assert float(extra_3[::2].abs().max()) < 1e-12
-    assert height > 2.9 or float(extra_3[1].abs()) > 1e-3
+    assert pushes == (float(extra_3[1].abs()) > 1e-3) or height > 2.9
 
 
 def test_one_scale_for_all_axes():

@@ -265,7 +265,7 @@ def prepare_particles(
         one = tl.where((part == 1) | (part == 4) | (part == 6), py, tl.where((part == 2) | (part == 5), pz, px))
         other = tl.where(part == 3, px, tl.where((part == 4) | (part == 8), py, tl.where(part < 3, 1.0, pz)))
         added = tl.where(part < 9, share[:, :, None] * one * other, 0.0)
-        product = surface_normals(surfaces)
+        product = surface_normals(surfaces, BODIES)
         for i in tl.static_range(6):
             added = tl.where(part == 9 + i, share[:, :, None] * product[i][:, None, None], added)
         # The added columns are a multiple of four, because the hardware adds four at once.
@@ -275,7 +275,7 @@ def prepare_particles(
         if FRICTION > 0:
             add_friction(
                 surfaces, velocity, wall_friction, gravity, scale, scene, row, live, coarsest, share, friction,
-                features + row * FEATURES + FRICTION_AT, HISTORY, FRICTION > 3, MOVING, COLUMNS,
+                features + row * FEATURES + FRICTION_AT, HISTORY, FRICTION > 3, MOVING, BODIES, COLUMNS,
             )  # fmt: skip
         if MOVING > 0:
             add_drift(touch, surface, coarsest, share, drift)

@@ -13,9 +13,11 @@ from hgn.kernels.bodies import three_columns
 from hgn.kernels.obstacles import OBSTACLE_COLUMNS, obstacle_normals
 from hgn.kernels.poses import LATER, PLACE, POSES, RECORD, surface_motion, turned, undone
 from hgn.kernels.triton_compat import settle_keys
+from hgn.network.own_physics import FREE_NEARNESS, FULL_NEARNESS
 from hgn.network.relative import STEPS_AHEAD, WALL_LIMIT
 
 NEAREST, STEPS = tl.constexpr(WALL_LIMIT), tl.constexpr(STEPS_AHEAD)
+FREE, FULL = tl.constexpr(FREE_NEARNESS), tl.constexpr(FULL_NEARNESS)
 
 
 @triton.jit
@@ -125,12 +127,19 @@ def _first(surfaces, COUNT: tl.constexpr):
 
 
 @triton.jit
-def surface_normals(surfaces):
+def _wall_contact(nearness, LOCAL: tl.constexpr):
+    """Rule: hgn.network.own_physics.wall_contact."""
+    FIRST: tl.constexpr = FREE if LOCAL else 0.0
+    return tl.minimum(tl.maximum((nearness - FIRST) / (FULL - FIRST), 0.0), 1.0)
+
+
+@triton.jit
+def surface_normals(surfaces, LOCAL: tl.constexpr):
     """Returns products xx, yy, zz, yz, xz, xy of the normals of `surfaces_of`, summed over a particle's surfaces."""
     column = tl.arange(0, 16)[None, :]
     near = ()
     for i in tl.static_range(3):
-        sides = tl.where((column == i) | (column == i + 3), tl.minimum(2 * surfaces, 1.0), 0.0)
+        sides = tl.where((column == i) | (column == i + 3), _wall_contact(surfaces, LOCAL), 0.0)
         near = near + (tl.sum(sides, 1),)  # noqa: RUF005 - Triton does not support unpacking here
     x, y, z = _first(surfaces, 3)
     return near[0] + x * x, near[1] + y * y, near[2] + z * z, y * z, x * z, x * y
@@ -139,7 +148,7 @@ def surface_normals(surfaces):
 @triton.jit
 def add_friction(
     surfaces, velocity, wall_friction, gravity, scale, scene, row, live, cell, share, sums, features,
-    HISTORY: tl.constexpr, NORMALS: tl.constexpr, MOVING: tl.constexpr, COLUMNS: tl.constexpr,
+    HISTORY: tl.constexpr, NORMALS: tl.constexpr, MOVING: tl.constexpr, LOCAL: tl.constexpr, COLUMNS: tl.constexpr,
 ):  # fmt: skip
     """Writes the columns of friction to `features` [N]: the obstacle cells' with NORMALS, then the walls'.
 
@@ -163,8 +172,8 @@ def add_friction(
         lower = tl.sum(tl.where(column == i, surfaces, 0.0), 1)
         upper = tl.sum(tl.where(column == 3 + i, surfaces, 0.0), 1)
         tl.store(features + 2 * NORMALS + i, tl.maximum(lower, upper) * wall, mask=live)
-        value = with_column(value, 6 + i, tl.minimum(2 * lower, 1.0) * wall)
-        value = with_column(value, 9 + i, tl.minimum(2 * upper, 1.0) * wall)
+        value = with_column(value, 6 + i, _wall_contact(lower, LOCAL) * wall)
+        value = with_column(value, 9 + i, _wall_contact(upper, LOCAL) * wall)
         if MOVING == 0:
             v = tl.load(velocity + row * (3 * HISTORY) + i, mask=live, other=0.0)
             v = (v + tl.load(gravity + scene * 3 + i, mask=live, other=0.0)) / tl.load(scale)
