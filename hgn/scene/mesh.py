@@ -31,7 +31,7 @@ _PART_OF_FACET = re.compile(rb"\bfacet\s+normal\b.*|^[^\S\n]*(facet|outer|vertex
 _BINARY_FACET = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 
 SEAM = 1e-5  # largest distance of vertices at open edges that are joined, relative to the mesh's longest side
-MOST_NEAR = 100  # mean number of neighbours within SEAM above which none are joined, because pairs take memory
+MOST_NEAR = 10  # mean number of vertices in cells of this size above which none are joined, because pairs take memory
 
 
 def load_mesh(path: str | Path, field: str = "mesh", **placing: Any) -> Obstacle:
@@ -182,9 +182,10 @@ def _joined(vertex_V3: np.ndarray, triangle_F3: np.ndarray) -> np.ndarray:
     edge_E2 = np.sort(np.stack([triangle, np.roll(triangle, -1, axis=1)], -1).reshape(-1, 2), axis=1)
     edge_E2, uses_E = np.unique(edge_E2, axis=0, return_counts=True)
     border = np.unique(edge_E2[uses_E != 2])
-    tree, reach = point_tree(unique_U3[border]), SEAM * np.ptp(unique_U3[triangle].reshape(-1, 3), axis=0).max()
-    if tree.count_neighbors(tree, reach) < MOST_NEAR * len(border):
-        row, column = tree.query_pairs(reach, output_type="ndarray").T
+    reach = SEAM * (np.ptp(unique_U3[triangle].reshape(-1, 3), axis=0).max() or 1.0)  # 0 if all corners are one
+    _, inside = np.unique(np.floor(unique_U3[border] / reach), axis=0, return_counts=True)
+    if (inside**2).sum() < MOST_NEAR * len(border):
+        row, column = point_tree(unique_U3[border]).query_pairs(reach, output_type="ndarray").T
         _, label = _components(row, column, len(border))
         unique_U3[border] = unique_U3[border[np.unique(label, return_index=True)[1][label]]]
     return np.asarray(unique_U3[index.reshape(-1)])

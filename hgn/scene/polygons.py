@@ -108,6 +108,8 @@ class _Numbers:
         start = self.place
         if not properties:
             return []
+        if 4 * count > len(self.bytes) and any(entry[0] == "list" for entry in properties):  # each takes 150 bytes
+            raise ValueError(f"it has {len(self.bytes)} bytes for {count} lists, fewer than triangles need")
         try:
             return self._alike(count, properties)
         except ValueError:  # lists of different lengths, or the end of the file
@@ -156,7 +158,7 @@ class _Numbers:
         """Returns the next numbers, float64 [count, kinds]. Raises: ValueError at the end of the file."""
         if not self.order:
             last = self.place + count * len(kinds)
-            if last > len(self.words):
+            if not self.place <= last <= len(self.words):
                 raise ValueError("it is cut")
             table = self.words[self.place : last].reshape(count, len(kinds))
             self.place = last

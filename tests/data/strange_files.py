@@ -1,4 +1,4 @@
-"""Files of at most 1 MB that claim far more than they hold: weights, meshes and scenes."""
+"""Files of at most 12 MB that claim far more than they hold: weights, meshes and scenes."""
 
 import json
 import math
@@ -217,6 +217,27 @@ SHORT_LISTS = (
     + np.eye(3, dtype=np.float32).tobytes() + 50 * b"\3\0\1\2" + 19_999 * (b"\1\0" + bytes(49))
 )  # fmt: skip
 
+NEGATIVE_LISTS = (
+    b"ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
+    b"element face 300000000\nproperty list char int vertex_indices\nend_header\n0 0 0 1 0 0 0 1 0\n-1 0 1 2\n"
+)
+
+
+def empty_lists():
+    """Twelve million faces without vertices, a byte each."""
+    head = b"ply\nformat binary_little_endian 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
+    head += b"element face 12000000\nproperty list uchar int vertex_indices\nend_header\n"
+    return head + np.eye(3, dtype=np.float32).tobytes() + bytes(12_000_000)
+
+
+def cloud():
+    """The STL file of 100,000 triangles, all of them near the origin except one, so that most corners are neighbours."""
+    facets = np.zeros(100_000, [("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
+    facets["corners"] = 2e-5 * np.random.default_rng(0).random((len(facets), 3, 3), np.float32)
+    facets["corners"][0] += 1
+    return bytes(80) + struct.pack("<I", len(facets)) + facets.tobytes()
+
+
 cases(
     "mesh",
     {
@@ -249,6 +270,9 @@ cases(
         "stl of solids": saved("m.stl", 9000 * (b"solid\nfacet normal 0 0 1\nouter loop\n" + CORNERS + b"endsolid\n")),
         "ply": ply(10**11),
         "ply of short lists": saved("m.ply", SHORT_LISTS),
+        "ply of negative lists": saved("m.ply", NEGATIVE_LISTS),
+        "ply of empty lists": saved("m.ply", empty_lists),
+        "cloud of triangles": saved("m.stl", cloud),
         "binary ply": ply(10**11, "binary_little_endian", bytes(1000)),
         "ply with long lists": ply(3, "binary_little_endian", bytes(36) + b"\xff" + bytes(1000)),
         "ply of a star": saved(

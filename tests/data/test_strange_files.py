@@ -13,7 +13,7 @@ TESTS = Path(__file__).parents[1]
 assert strange_data  # which adds its files to CASES
 READ = {  # files that hold what they claim
     "mesh: primitives", "mesh: instances", "mesh: targets", "mesh: obj of polygons",
-    "mesh: obj of groups", "mesh: obj of pentagons", "mesh: obj of a spiral",
+    "mesh: cloud of triangles", "mesh: obj of groups", "mesh: obj of pentagons", "mesh: obj of a spiral",
     "mesh: obj of materials", "mesh: stl of solids", "mesh: ply of short lists", "rollout: attributes", "tar: links",
     "scene: sheet of 9000", "scene: larger obstacle", "scene: keyframes",
     "scene: sheets on one another",

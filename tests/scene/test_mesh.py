@@ -148,6 +148,7 @@ REFUSED = [
         for name in ("utf-16", "utf-16-le", "utf-16-be")
         for suffix, text in (("obj", GOOD), ("ply", PLY), ("stl", b"\n".join([b"solid a", *FACETS, b"endsolid"])))
     ),
+    ("a.ply", PLY.replace(b"3 0 1 2", b"-1 0 1 2"), {}, "it is cut"),
     ("a.ply", PLY.replace(b"face 1", b"tristrips 1"), {}, "it contains tristrips, which are not read"),
     ("a.ply", PLY.replace(b"uchar int", b"uchar float"), {}, "by numbers that are not whole"),
     ("a.obj", b"v 0 0 nan\nv 1 0 0\nv 0 1 0\n" + FACE, {}, "ramp must have finite vertices, got .*nan"),
