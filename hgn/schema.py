@@ -82,8 +82,17 @@ def one_of(*choices: str) -> Bound:
 
 
 N = TypeVar("N", int, float)
-Positive = Annotated[N, Bound("a finite number > 0", lambda value: 0 < value < math.inf)]
-NonNegative = Annotated[N, Bound("a finite number >= 0", lambda value: 0 <= value < math.inf)]
+# fp32, in which scenes are simulated, would turn other numbers into 0 or infinity
+Positive = Annotated[
+    N,
+    Bound("a finite number > 0", lambda value: 0 < value < math.inf),
+    Bound("from 1e-30 to 1e30, the range of fp32", lambda value: 1e-30 <= value <= 1e30),
+]
+NonNegative = Annotated[
+    N,
+    Bound("a finite number >= 0", lambda value: 0 <= value < math.inf),
+    Bound("at most 1e30, the range of fp32", lambda value: value <= 1e30),
+]
 Finite = Annotated[float, Bound("finite", math.isfinite)]
 Vector = tuple[Finite, Finite, Finite]
 Fraction = Annotated[N, Bound("from 0 to 1", lambda value: 0 <= value <= 1)]

@@ -406,7 +406,7 @@ def _obstacle(entry: ObstacleEntry, index: int, folder: Path) -> tuple[Obstacle,
                 shape_obstacle(entry.shape, entry.size, entry.position, euler_rotation(entry.rotation), name),
             )
         finite = bool(np.isfinite(bodies[0].vertex_V3).all())
-        require(finite, f"obstacles[{index}].size", "in the range of float32", entry.size)
+        require(finite, f"obstacles[{index}].position", "in the range of float32", entry.position)
     else:
         # importing trimesh takes a second
         from hgn.scene.mesh import load_bodies

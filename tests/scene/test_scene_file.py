@@ -228,9 +228,10 @@ MISTAKES = [
     (scene_with(cell_size=float("nan")), "cell_size must be a finite number > 0, got nan"),
     (scene_with(particles_per_cell=-1), "particles_per_cell must be a finite number > 0"),
     (scene_with(particles_per_cell=1e9), "groups must be at most 10000000 particles"),
-    (scene_with(cell_size=1e-200), "domain_size must be at most 2147483647 cells of 1e-200"),
+    (scene_with(cell_size=1e-20), "domain_size must be at most 2147483647 cells of 1e-20"),
     (group_with(size=1e300), "groups must be at most 10000000 particles together, .* got inf"),
-    (obstacle_with(size=1e300), OBSTACLE + r".size must be in the range of float32, got 1e\+300"),
+    (obstacle_with(size=1e300), OBSTACLE + r".size must be from 1e-30 to 1e30, the range of fp32, got 1e\+300"),
+    (obstacle_with(position=[0, 1e300, 0]), OBSTACLE + r".position must be in the range of float32, got .*1e\+300"),
     (scene_with(domain_size=[1, -1, 1]), r"domain_size\[1\] must be from 1e-9 to 1e9, got -1"),
     (scene_with(domain_size=[1, 1e12, 1]), r"domain_size\[1\] must be from 1e-9 to 1e9, got 1000000000000.0"),
     (
@@ -243,6 +244,11 @@ MISTAKES = [
     (scene_with(gravity=[0, float("inf"), 0]), r"gravity\[1\] must be finite, got inf"),
     (scene_with(floor_friction=-0.1), "floor_friction must be a finite number >= 0, got -0.1"),
     (scene_with(wall_friction=float("nan")), "wall_friction must be a finite number >= 0, got nan"),
+    (scene_with(wall_friction=1e39), "wall_friction must be at most 1e30, the range of fp32, got 1e.39"),
+    *(
+        (group_with(density_kg_m3=value), GROUP + r"\.density_kg_m3 must be from 1e-30 to 1e30, the range of fp32")
+        for value in (1e39, 1e-320)
+    ),
     (obstacle_with(keyframes=[{"time": 1}, {"time": 1}]), OBSTACLE + r"\.keyframes must be in order of time"),
     (obstacle_with(keyframes=[{"time": 0}, {"time": 5e-324}]), r"keyframes must be in order of time.* 1e-09 s apart"),
     (obstacle_with(keyframes=[{"time": -1}]), OBSTACLE + r"\.keyframes\[0\]\.time must be .* >= 0"),
