@@ -14,7 +14,7 @@ from hgn.scene.barrier import barrier_pieces
 from hgn.scene.moving import at_rest
 from hgn.scene.scene import all_corners
 from hgn.scene.scene_file import find_scene, load_scene
-from hgn.schema import FileName, NonNegative, Positive, from_mapping, require, require_bounds
+from hgn.schema import FileName, FolderName, NonNegative, Positive, from_mapping, require, require_bounds
 from hgn.step_config import StepConfig, WallClearance
 from hgn.system.extras import require_installed
 from hgn.system.files import require_place
@@ -38,7 +38,7 @@ class ExportConfig:
     onnx: FileName | None = None
     package: FileName | None = None  # file for a step compiled for `device`, for PyTorch's C++ (.pt2)
     device: str = "cpu"  # device of the package: cpu, cuda or cuda:1
-    arrays: str | None = None  # folder for the first inputs of a step of `scene`, as .npy files
+    arrays: FolderName | None = None  # folder for the first inputs of a step of `scene`, as .npy files
     scene: str | None = None  # a scene file, or the name of an example
 
     def __post_init__(self) -> None:
@@ -94,6 +94,8 @@ def main(mapping: dict[str, Any]) -> int:
         simulator = Simulator(network, info.frame_rate_hz, "torch", info=info)
         scene = load_scene(find_scene(config.scene))
         start = InitialState.of_scene(scene)
+        rule = "without emitters with arrays, because exported frames have no new particles"
+        require(start.emitting is None, "scene", rule, config.scene)
         moving = len(start.moving)
         corner_F33 = barrier_pieces(all_corners(at_rest(scene.obstacles)), scene.cell_size, scene.domain_size)
         arrays = initial_arrays(network.config, simulator.start([start]), corner_F33, start.parameters)

@@ -225,13 +225,14 @@ NEGATIVE_LISTS = (
 
 def empty_lists():
     """Twelve million faces without vertices, a byte each."""
-    head = b"ply\nformat binary_little_endian 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
-    head += b"element face 12000000\nproperty list uchar int vertex_indices\nend_header\n"
+    head = b"ply\nformat binary_little_endian 1.0\nelement vertex 3\n"
+    head += b"property float x\nproperty float y\nproperty float z\nelement face 12000000\n"
+    head += b"property list uchar int vertex_indices\nend_header\n"
     return head + np.eye(3, dtype=np.float32).tobytes() + bytes(12_000_000)
 
 
 def cloud():
-    """The STL file of 100,000 triangles, all of them near the origin except one, so that most corners are neighbours."""
+    """An STL file of 100,000 triangles, all near the origin except one, so that most corners are neighbours."""
     facets = np.zeros(100_000, [("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
     facets["corners"] = 2e-5 * np.random.default_rng(0).random((len(facets), 3, 3), np.float32)
     facets["corners"][0] += 1

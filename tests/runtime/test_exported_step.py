@@ -265,6 +265,7 @@ def test_onnx_runs_in_cpp(as_onnx):
         ({"checkpoint": "a", "weights": "gns"}, "weights must be null with checkpoint, got 'gns'"),
         ({"weights": "gns"}, "out must be given with weights, or onnx, package or arrays, got None"),
         ({"weights": "obstacles", "package": "a.so"}, "package must be a name that ends in .pt2, got 'a.so'"),
+        ({"weights": "obstacles", "arrays": "", "scene": "a"}, "arrays must be a folder name, got ''"),
         ({"weights": "obstacles", "arrays": "a"}, "scene must be given with arrays, and only then, got None"),
     ],
 )
@@ -290,6 +291,14 @@ def test_poses_of_a_motion_without_end(tmp_path):
     scene.write_text(MOVING_SCENE.replace("time: 0.3", "time: 3.0e+8"))
     options = {"weights": str(tmp_path / "w.safetensors"), "arrays": str(tmp_path / "arrays"), "scene": str(scene)}
     with pytest.raises(ConfigError, match="keyframes must be at most 100000 frames long with arrays, got 18000000002"):
+        export.main(options)
+    assert not (tmp_path / "arrays").exists()
+
+
+def test_scenes_with_emitters_have_no_arrays(tmp_path):
+    """They are refused by name, because the particles that enter later would be left out."""
+    options = {"weights": "mechanics", "arrays": str(tmp_path / "arrays"), "scene": "tap_over_stairs"}
+    with pytest.raises(ConfigError, match=r"scene must be without emitters with arrays, .*, got 'tap_over_stairs'"):
         export.main(options)
     assert not (tmp_path / "arrays").exists()
 
