@@ -1,8 +1,8 @@
 """Compiles Triton kernels before they are needed, in child processes.
 
 Triton compiles a kernel at its first launch, one kernel after the other, in a second or more each. This takes a minute
-before a training's first update, and time again when the buffers of a simulation grow. The children fill Triton's cache
-on disk. Kernels that are not in it are compiled at their first launch.
+before a training's first update. The children fill Triton's cache on disk. Kernels that are not in it are compiled at
+their first launch, or by the threads of hgn.kernels.triton_compat before a simulation's first frame.
 """
 
 import contextlib
