@@ -149,7 +149,7 @@ class RankWatch(Callback):
                 if not self._ended.is_set():
                     self._write(count)
             for rank, (before, _) in self._counts.items():
-                if (text := self._read(rank)) != before:
+                if (text := self._read(rank)) not in ("", before):  # "": deleted, or being written
                     self._counts[rank] = text, now
                     if text == ENDED and before:  # without a count before, the file may be of an earlier run
                         self._over.append(rank)

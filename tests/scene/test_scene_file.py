@@ -247,7 +247,7 @@ MISTAKES = [
     (scene_with(wall_friction=1e39), "wall_friction must be at most 1e30, the range of fp32, got 1e.39"),
     *(
         (group_with(density_kg_m3=value), GROUP + r"\.density_kg_m3 must be from 1e-30 to 1e30, the range of fp32")
-        for value in (1e39, 1e-320)
+        for value in (1e39, 1e-300)  # denormal numbers are 0 where a library flushes them
     ),
     (obstacle_with(keyframes=[{"time": 1}, {"time": 1}]), OBSTACLE + r"\.keyframes must be in order of time"),
     (obstacle_with(keyframes=[{"time": 0}, {"time": 5e-324}]), r"keyframes must be in order of time.* 1e-09 s apart"),

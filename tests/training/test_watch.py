@@ -128,7 +128,8 @@ def test_a_rank_stopped_after_the_last_update_is_named(monkeypatch, ranks, tmp_p
 
 @pytest.mark.parametrize("stuck", [True, False])
 def test_a_rank_that_waits_for_one_that_ended_ends(monkeypatch, ranks, tmp_path, stuck):
-    """As NCCL's collectives do, which report no lost connection. One that still makes updates goes on."""
+    """As NCCL's collectives do, which report no lost connection; also if a file is read while it is written. One that
+    still makes updates goes on."""
     monkeypatch.setattr(watch, "GRACE_S", BEAT_S)
     ends = Queue()
     monkeypatch.setattr(Rank, "_end", lambda rank, text, code: (rank._ended.set(), ends.put((rank, text, code))))
@@ -143,6 +144,10 @@ def test_a_rank_that_waits_for_one_that_ended_ends(monkeypatch, ranks, tmp_path,
     for _ in range(4):
         ranks[0].beaten.acquire()
     assert ends.empty()
+    read, torn = ranks[0]._read, iter([""])
+    monkeypatch.setattr(
+        ranks[0], "_read", lambda rank: text if (text := read(rank)) != watch.ENDED else next(torn, text)
+    )
     ranks[1].on_exception(ranks[1].trainer, None, ValueError("its own error"))
     if stuck:
         assert ends.get(timeout=60) == (ranks[0], "ranks [1] ended, see their messages", watch.EXIT_MACHINE)

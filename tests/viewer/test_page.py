@@ -211,19 +211,19 @@ def test_an_obstacle_that_is_dragged_moves(viewer, play):
     """On screen by as much as the mouse, for the network as for the eye; with Ctrl it turns about the vertical."""
     (before,) = play.session.obstacles
     begin = on_screen(play, (0.5, 0.5, 0.5))
-    drag(viewer, begin, (begin[0] + 80, begin[1]))
 
     def shown():
         moved_3 = np.subtract(play.session.obstacles[0].position, before.position)
         return on_screen(play, tuple(np.add((0.5, 0.5, 0.5), moved_3)))
 
-    until(lambda: shown() == pytest.approx((begin[0] + 80, begin[1]), abs=8))
+    end = begin[0] + 80, begin[1]
+    drag(viewer, begin, end, held_until=lambda: shown() == pytest.approx(end, abs=8))
     (after,), there = play.session.obstacles, shown()
     grid = play.session.live.scenes[0].obstacle_grid
     middle_3 = (grid.cell_K3 + 0.5).mean(axis=0) * grid.cell_size - np.subtract(after.position, (0, 0.03, 0))
     assert np.abs(middle_3).max() < 0.06
-    drag(viewer, there, (there[0] - 90, there[1]), "Control")
-    until(lambda: play.session.obstacles[0].rotation[1] == pytest.approx(-36, abs=4))
+    turned = lambda: play.session.obstacles[0].rotation[1] == pytest.approx(-36, abs=4)  # noqa: E731
+    drag(viewer, there, (there[0] - 90, there[1]), "Control", held_until=turned)
 
 
 def test_pause_step_and_back(viewer, play, monkeypatch):
