@@ -19,7 +19,7 @@ LINES = {  # of Python, in tracked files
     "hgn": 33_776,
     "datagen": 8_989,
     "tools": 6_389,
-    "tests": 33_886,
+    "tests": 33_887,
 }
 SETTINGS = 240  # fields of the dataclasses behind the commands, *Config
 

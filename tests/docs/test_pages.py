@@ -103,7 +103,8 @@ def test_names_exist():
     assert checked > 20
     for row in re.findall(r"^\| .*\| `hgn/kernels/.*\|$", (ROOT / "docs/backends.md").read_text(), re.MULTILINE):
         *_, kernels, folders, _ = row.split("|")
-        sources = "".join((ROOT / folder / "kernel.py").read_text() for folder in re.findall(r"`([\w/]+)`", folders))
+        files = [file for folder in re.findall(r"`([\w/]+)`", folders) for file in (ROOT / folder).glob("*.py")]
+        sources = "".join(file.read_text() for file in files)
         assert all(f"def {name}(" in sources for name in re.findall(r"`(\w+)`", kernels)), row
 
 
