@@ -16,7 +16,7 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 33_776,
+    "hgn": 33_773,
     "datagen": 8_989,
     "tools": 6_389,
     "tests": 33_887,

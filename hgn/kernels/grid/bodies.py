@@ -11,8 +11,6 @@ Rule: hgn.network.grid.build_hierarchy; test: tests/kernels/test_network.py.
 Shape legend: N particles, C cells of a level, L levels, T entries of the table.
 """
 
-from __future__ import annotations
-
 import triton
 import triton.language as tl
 

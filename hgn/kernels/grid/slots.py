@@ -1,7 +1,5 @@
 """Slots of cells: places in one array for all levels and scenes (hgn.kernels.grid.kernel), and the cells in them."""
 
-from __future__ import annotations
-
 import triton
 import triton.language as tl
 

@@ -398,7 +398,8 @@ class Updates:
         )
         self.target_N3 = torch.zeros(particles, 3, device=device)
         self.share_N = torch.zeros(particles, device=device)
-        for _ in range(0 if self.capacities else 2):  # bodies divide cells for which the finest level has room
+        # Bodies divide only cells for which the finest level has room, so the second measurement finds theirs.
+        for _ in range(0 if self.capacities else 1 + (config.inputs == "local")):
             self.grid = self._device_grid(self.capacities or (16,) * config.levels)
             self._assemble()
             self.grid.build(self.buffers)
