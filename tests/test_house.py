@@ -19,7 +19,7 @@ LINES = {  # of Python, in tracked files
     "hgn": 33_773,
     "datagen": 8_989,
     "tools": 6_389,
-    "tests": 33_887,
+    "tests": 33_900,
 }
 SETTINGS = 240  # fields of the dataclasses behind the commands, *Config
 

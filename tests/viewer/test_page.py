@@ -4,6 +4,7 @@ import asyncio
 import contextlib
 import errno
 import io
+import itertools
 import random
 import re
 import shutil
@@ -158,8 +159,18 @@ def on_screen(play, point):
     return SIZE[0] / 2 + scale * (offset @ right), SIZE[1] / 2 - scale * (offset @ np.cross(right, forward))
 
 
+def caught_up(page, play):
+    """Waits until the browser has drawn all that the server sent before."""
+    done(play, lambda: None)
+    mark = play.server.gui.add_markdown(f"mark {time.monotonic_ns()}")
+    page.get_by_text(mark.content).wait_for(state="attached")
+    page.evaluate("() => new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
+    mark.remove()
+
+
 def drag(page, begin, end, key=None, held_until=lambda: True):
-    """A mouse's way in steps that the page cannot miss, with the button held until a condition is met."""
+    """A mouse's way in steps, with the button held until a condition is met. The mouse trembles by a pixel meanwhile: a
+    busy browser may take the whole way for a drag's first motion, whose place it tells with the next one only."""
     if key:
         page.keyboard.down(key)
     page.mouse.move(*begin)
@@ -167,7 +178,8 @@ def drag(page, begin, end, key=None, held_until=lambda: True):
     for share in np.linspace(0, 1, 6):
         page.mouse.move(*(a + share * (b - a) for a, b in zip(begin, end, strict=True)))
         page.wait_for_timeout(50)
-    until(held_until)
+    tremble = itertools.cycle((1, 0))
+    until(lambda: held_until() or page.mouse.move(end[0] + next(tremble), end[1]))
     page.mouse.up()
     if key:
         page.keyboard.up(key)
@@ -223,6 +235,7 @@ def test_an_obstacle_that_is_dragged_moves(viewer, play):
     middle_3 = (grid.cell_K3 + 0.5).mean(axis=0) * grid.cell_size - np.subtract(after.position, (0, 0.03, 0))
     assert np.abs(middle_3).max() < 0.06
     turned = lambda: play.session.obstacles[0].rotation[1] == pytest.approx(-36, abs=4)  # noqa: E731
+    caught_up(viewer, play)
     drag(viewer, there, (there[0] - 90, there[1]), "Control", held_until=turned)
 
 
