@@ -192,12 +192,17 @@ class _File:
 
     def _values(self, entry: dict[str, Any], dtype: np.dtype[Any], shape: tuple[int, int]) -> np.ndarray:
         view = self.tree["bufferViews"][entry["bufferView"]]
-        start, offset = view.get("byteOffset", 0), entry.get("byteOffset", 0)
-        stride = max(view.get("byteStride", 0), shape[1] * dtype.itemsize)  # values never overlap
+        start, offset, stride = view.get("byteOffset", 0), entry.get("byteOffset", 0), view.get("byteStride", 0)
+        sizes = start, offset, stride, view["byteLength"], self.tree["buffers"][view["buffer"]].get("byteLength", 0)
+        if not all(isinstance(size, int) and size >= 0 for size in (*sizes, shape[0])):
+            raise ValueError(
+                f"bufferView {entry['bufferView']} has offsets or sizes that are not whole numbers of at least 0"
+            )
+        stride = max(stride, shape[1] * dtype.itemsize)  # values never overlap
         # without a copy: thousands of accessors may have one large view
         data = memoryview(self.buffer(view["buffer"]))[start : start + view["byteLength"]]
         last = offset + (shape[0] - 1) * stride + shape[1] * dtype.itemsize
-        if min(start, offset, stride, *shape) < 0 or (shape[0] and last > len(data)):
+        if shape[0] and last > len(data):
             raise ValueError(f"bufferView {entry['bufferView']} has fewer bytes than its values need")
         return np.ndarray(shape, dtype, data if shape[0] else None, offset, (stride, dtype.itemsize))
 

@@ -19,7 +19,8 @@ _LINE = re.compile(rb"^[ \t]*([vf])[ \t]+(.*)$", re.MULTILINE | re.IGNORECASE)
 _SPACES = bytes.maketrans(b"\r\f\v", b"\n  ")
 _UTF_16 = re.compile(rb"\xff\xfe|\xfe\xff|[^\0]\0[^\0]\0|\0[^\0]\0[^\0]")
 _COMMENT = re.compile(rb"(?:^|[ \t])#.*", re.MULTILINE)
-_UNREAD = re.compile(rb"^[ \t]*(surf|bzp|bsp|cdp|fo|call)[ \t]", re.MULTILINE)  # free-form surfaces, and other files
+# free-form surfaces, and other files
+_UNREAD = re.compile(rb"^[ \t]*(surf|bzp|bsp|cdp|fo|call)[ \t]", re.MULTILINE | re.IGNORECASE)
 _INDICES = ("vertex_indices", "vertex_index")  # usual names of the property with a face's vertices
 _TYPES = {
     **dict.fromkeys(("char", "int8"), "b"),
@@ -42,16 +43,17 @@ def refuse_utf_16(data: bytes) -> None:
 def polygons_of_obj(data: bytes) -> tuple[np.ndarray, list[np.ndarray]]:
     """Returns vertices, float64 [V, 3], and the vertices of each face of an OBJ file.
 
-    Raises: ValueError for UTF-16, vertex 0, numbers that cannot be read, and free-form surfaces.
+    Raises: ValueError for UTF-16, vertex 0, fewer than three coordinates, numbers that cannot be read, and free-form
+    surfaces.
     """
     refuse_utf_16(data)
     text = data.replace(codecs.BOM_UTF8, b"").replace(b"\r\n", b"\n").translate(_SPACES)
-    text = _COMMENT.sub(b"", text)
+    text = _COMMENT.sub(b"", text).replace(b"\\\n", b" ")
     if unread := _UNREAD.search(text):
         raise ValueError(f"it contains {unread[1].decode()}, which is not read; write polygons")
     vertices: list[list[bytes]] = []
     faces = []
-    for keyword, line in _LINE.findall(text.replace(b"\\\n", b" ")):
+    for keyword, line in _LINE.findall(text):
         words = line.split()
         if keyword in b"vV":
             vertices.append(words[:3])
@@ -60,7 +62,7 @@ def polygons_of_obj(data: bytes) -> tuple[np.ndarray, list[np.ndarray]]:
             if not index.all():
                 raise ValueError("a face has vertex 0, but OBJ counts from 1")
             faces.append(np.where(index > 0, index - 1, index + len(vertices)))  # negative indices count backwards
-    return np.array(vertices, np.float64).reshape(-1, 3), faces
+    return np.array(vertices, np.float64).reshape(len(vertices), 3), faces
 
 
 def polygons_of_ply(data: bytes) -> tuple[np.ndarray, list[np.ndarray]]:
@@ -161,6 +163,9 @@ class _Numbers:
             if not self.place <= last <= len(self.words):
                 raise ValueError("it is cut")
             table = self.words[self.place : last].reshape(count, len(kinds))
+            whole = np.array([_TYPES.get(kind, "d") not in "fd" for kind in kinds])
+            if len(bad := table[(table % 1 != 0) & whole]):
+                raise ValueError(f"it has {bad[0]} where its header declares whole numbers")
             self.place = last
             return table
         dtype = np.dtype([(str(i), self.order + _TYPES[kind]) for i, kind in enumerate(kinds)])

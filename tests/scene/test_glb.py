@@ -209,8 +209,10 @@ def test_glb_that_lies(tmp_path):
     def broken(change):
         file = Glb()
         file.cube()
-        change(file.tree)
-        return file.save(tmp_path / "a.glb")
+        tree = file.tree | {"buffers": [{"byteLength": len(file.data)}]}
+        change(tree)
+        file.tree = tree
+        return file.save(tmp_path / "a.glb", buffers=tree["buffers"])
 
     def loop(tree):
         tree["nodes"] = [{"mesh": 0}, {"children": [0, 0]}]
@@ -225,6 +227,18 @@ def test_glb_that_lies(tmp_path):
         (lambda tree: tree["nodes"][0].update(mesh=-1), "an entry has the number -1"),
         (lambda tree: tree["nodes"].append({"children": [-1]}), "an entry has the number -1"),
         (lambda tree: tree["bufferViews"][0].update(byteOffset=10**12), "readable GLB"),
+        *(
+            (lambda tree, kind=kind, name=name, size=size: tree[kind][0].update({name: size}), "that are not whole")
+            for kind, name in (
+                ("accessors", "count"),
+                ("accessors", "byteOffset"),
+                ("bufferViews", "byteLength"),
+                ("bufferViews", "byteOffset"),
+                ("bufferViews", "byteStride"),
+                ("buffers", "byteLength"),
+            )
+            for size in (-1, 1.5, 8.0, "8")
+        ),
         (lambda tree: tree["nodes"][0].update(skin=0), "node 0 has a skin"),
         (loop, "node 0 has two parents"),
         (lambda tree: tree["asset"].update(minVersion="2.1"), "it needs glTF 2.1, but 2.0 is read"),

@@ -140,15 +140,22 @@ REFUSED = [
     ("a.obj", TRIANGLE.encode() + b"f 1 2 9\n", {}, "ramp must have triangles of its 3 vertices, got vertices 0 to 8"),
     ("a.obj", GOOD + b"f 0 1 2\n", {}, "a face has vertex 0, but OBJ counts from 1"),
     *(
-        ("a.obj", GOOD + word + b" 1 2 3\n", {}, f"contains {word.decode()}, which is not read")
-        for word in (b"surf", b"call", b"fo", b"bzp")
+        ("a.obj", GOOD + word + b" 1 2 3\n", {}, f"contains {word.strip().decode()}, which is not read")
+        for word in (b"surf", b"call", b"fo", b"bzp", b"SURF", b"Call", b"FO", b"\tBZP")
     ),
+    ("a.obj", GOOD + b"surf\\\n 1 2 3\n", {}, "contains surf, which is not read"),
+    ("a.obj", b"v 0 0\nv 1 0\nv 0 1\nv 5 5\nv 5 6\nv 6 5\n" + FACE, {}, "readable OBJ file"),
     *(
         (f"a.{suffix}", text.decode().encode(name), {}, "it is UTF-16 text")
         for name in ("utf-16", "utf-16-le", "utf-16-be")
         for suffix, text in (("obj", GOOD), ("ply", PLY), ("stl", b"\n".join([b"solid a", *FACETS, b"endsolid"])))
     ),
     ("a.ply", PLY.replace(b"3 0 1 2", b"-1 0 1 2"), {}, "it is cut"),
+    *(
+        ("a.ply", PLY.replace(b"3 0 1 2", face), {}, "it has .* where its header declares whole numbers")
+        for face in (b"3 0 1 1.5", b"3 0.5 1 2", b"3.5 0 1 2", b"3 0 1 nan")
+    ),
+    ("a.ply", PLY.replace(b"face 1", b"face 2").replace(b"0 1 2", b"0 1 2\n4 0 1 2 1.5"), {}, "it has 1.5 where its"),
     ("a.ply", PLY.replace(b"face 1", b"tristrips 1"), {}, "it contains tristrips, which are not read"),
     ("a.ply", PLY.replace(b"uchar int", b"uchar float"), {}, "by numbers that are not whole"),
     ("a.obj", b"v 0 0 nan\nv 1 0 0\nv 0 1 0\n" + FACE, {}, "ramp must have finite vertices, got .*nan"),
