@@ -9,8 +9,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from hgn.command import run_command
-from hgn.config import MpmConfig, require_rollout_name
+from hgn.command import require_rollout_name, run_command
+from hgn.config import MpmConfig
 from hgn.scene.emission import entry_frames
 from hgn.scene.rollout_file import Rollout, rollout_bytes, write_rollout
 from hgn.scene.scene_file import find_scene, load_scene, notes_on_files

@@ -45,6 +45,7 @@ _MACHINE_ERRORS = {
     errno.ECHILD: "free some memory, or check the device,",
 }
 
+ROLLOUT_ENDINGS = (".vtkhdf", ".hdf", ".hdf5", ".h5")
 SHOW_KEYS = "--help shows the keys"
 Main = Callable[[dict[str, Any]], int | None]
 
@@ -228,3 +229,15 @@ def _with_json_as_override(arguments: list[str]) -> list[str]:
 def _fail(message: str, code: int) -> int:
     print(f"error: {printable(' '.join(message.split()))}", file=sys.stderr, flush=True)
     return code
+
+
+def require_rollout_name(field: str, name: str | None, *more: str) -> None:
+    """Refuses names of folders, pictures and other formats for a rollout file.
+
+    `more` are accepted suffixes in addition to ROLLOUT_ENDINGS.
+    """
+    *some, last = (*ROLLOUT_ENDINGS, *more)
+    made = "pictures" if more else "pictures, USD and PLY"
+    ends = name is None or Path(name).suffix in (*some, last)
+    rule = f"a name that ends in {', '.join(some)} or {last}"
+    require(ends, field, rule, name, f"tools.render makes {made} of a rollout file")

@@ -41,7 +41,6 @@ FewObstacles = Annotated[NonNegative[int], Bound("at most 1,000", lambda count: 
 OBSTACLE_SHAPES = ("half_box", "square", "half_sphere", "cone", "pyramid")
 MESH_SUFFIXES = (".stl", ".obj", ".ply", ".glb")
 USD_ENDINGS = (".usdc", ".usda", ".usd")
-ROLLOUT_ENDINGS = (".vtkhdf", ".hdf", ".hdf5", ".h5")
 GROUP_SHAPES = ("cube", "sphere")
 NETWORK_KINDS = ("hgn", "gns")
 BACKENDS = ("auto", "torch", "triton", "cpu")
@@ -75,18 +74,6 @@ def config_directory() -> Path:
 def is_mesh_file(name: str | Path) -> bool:
     """Returns whether a name has the suffix of a mesh file."""
     return Path(name).suffix.lower() in (*MESH_SUFFIXES, *USD_ENDINGS)
-
-
-def require_rollout_name(field: str, name: str | None, *more: str) -> None:
-    """Refuses names of folders, pictures and other formats for a rollout file.
-
-    `more` are accepted suffixes in addition to ROLLOUT_ENDINGS.
-    """
-    *some, last = (*ROLLOUT_ENDINGS, *more)
-    made = "pictures" if more else "pictures, USD and PLY"
-    ends = name is None or Path(name).suffix in (*some, last)
-    rule = f"a name that ends in {', '.join(some)} or {last}"
-    require(ends, field, rule, name, f"tools.render makes {made} of a rollout file")
 
 
 @dataclass(frozen=True)
@@ -327,6 +314,11 @@ class NetworkConfig:
     def relative(self) -> bool:
         """Returns whether inputs do not depend on a motion that all particles have in common."""
         return self.inputs != "absolute"
+
+    @property
+    def body_cells(self) -> bool:
+        """Returns whether each body has cells of its own (hgn.network.grid)."""
+        return self.inputs == "local"
 
     @property
     def feature_width(self) -> int:

@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from hgn.command import run_command
-from hgn.config import DEFAULT_WEIGHTS, USD_ENDINGS, SceneConfig, SimulatorConfig, require_rollout_name
+from hgn.command import require_rollout_name, run_command
+from hgn.config import DEFAULT_WEIGHTS, USD_ENDINGS, SceneConfig, SimulatorConfig
 from hgn.data.reader import find_episode
 from hgn.render import PLY_ENDING
 from hgn.scene.distance import fraction_inside

@@ -101,7 +101,7 @@ class HierarchicalGraphNetwork(ParticleNetwork):
         """Returns the cells of all levels around a state's particles."""
         if origin_S3 is None:
             origin_S3 = torch.zeros_like(state.domain_S3)
-        cell_size, levels, bodies = self.config.cell_size, self.config.levels, self.config.inputs == "local"
+        cell_size, levels, bodies = self.config.cell_size, self.config.levels, self.config.body_cells
         return build_hierarchy(state.position_N3, state.scene_N, origin_S3, cell_size, levels, bodies)
 
     def propagate(self, particle_NW: torch.Tensor, grid: GridHierarchy) -> torch.Tensor:

@@ -88,7 +88,7 @@ def relative_features(
         ],
         dim=-1,
     )
-    local, touch_N = config.inputs == "local", surface_gate(wall_N6, normal_N6)
+    local, touch_N = config.body_cells, surface_gate(wall_N6, normal_N6)
     normal_C33 = touched_normals(surface_normals(wall_N6, normal_N6, local), grid)
     disturbed_C, touched_C = disturbance(motion_NK, touch_N, grid)
     if surface_N3 is not None:

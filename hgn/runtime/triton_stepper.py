@@ -257,10 +257,8 @@ class TritonStepper:
 
     def _first_capacities(self) -> tuple[int, ...]:
         position_N3, scene_N = self.buffers.position_N3[: self.live], self.buffers.scene_N[: self.live].long()
-        cell_size, levels = self.config.cell_size, self.config.levels
-        bodies = self.config.inputs == "local"
-        origin_S3 = self.buffers.origin_S3
-        grid = build_hierarchy(position_N3, scene_N, origin_S3, cell_size=cell_size, levels=levels, bodies=bodies)
+        cell_size, levels, bodies = self.config.cell_size, self.config.levels, self.config.body_cells
+        grid = build_hierarchy(position_N3, scene_N, self.buffers.origin_S3, cell_size, levels, bodies)
         return first_capacities([level.cell_count for level in grid.levels], self.live)
 
     def _window(self) -> Window:
@@ -277,7 +275,7 @@ class TritonStepper:
         # No level can have more than eight cells for each particle, or more than the window contains, unless bodies
         # divide its cells.
         limits = [8 * self.particles] * config.levels
-        for level in range(1 if config.inputs == "local" else config.levels):
+        for level in range(1 if config.body_cells else config.levels):
             limits[level] = min(limits[level], self.scenes * math.prod(n >> level for n in window.cells))
         rounded = tuple(16 * math.ceil(max(1, min(c, m)) / 16) for c, m in zip(capacities, limits, strict=True))
         more = rest_numbers(self.step_config, window, self.scenes, config.levels)

@@ -158,9 +158,9 @@ class DeviceGrid:
             at += capacity
         assert start < 2**31, "slots are numbered in int32"
         self.largest = max(row[1] for row in rows)
-        self.divided = config.inputs == "local"  # cells are divided among bodies (hgn.kernels.grid.bodies)
-        marks, entries = rows[0][1] if self.divided else start, 0
-        if self.divided and self.levels > 1:
+        bodies = config.body_cells  # cells are divided among bodies (hgn.kernels.grid.bodies)
+        marks, entries = rows[0][1] if bodies else start, 0
+        if bodies and self.levels > 1:
             entries = triton.next_power_of_2(max(NUMBER_BLOCK, (self.levels - 1) * self.capacities[0] + 1))
 
         def integers(*shape: int) -> torch.Tensor:
@@ -173,7 +173,7 @@ class DeviceGrid:
         drifting = coarsest * ("moving" in config.own_physics)
         # 8-byte entries come first, for their alignment
         parts = [2 * entries, 4 * at if relative else 4, *[SUMS * coarsest] * 3, SUMS * rough, 2 * coarsest, marks]
-        parts += [8 * drifting, self.levels, *[marks * self.divided] * 2]
+        parts += [8 * drifting, self.levels, *[marks * bodies] * 2]
         self._cleared = integers(sum(parts) + sum(more))  # one launch clears all parts
         cleared = self._cleared.split([*parts, *more])
         table, motion, *sums, moments, friction, disturbed = cleared[:7]
@@ -233,7 +233,7 @@ class DeviceGrid:
             position=particles.position_N3, scene_of=particles.scene_N, origin=particles.origin_S3,
             particle_count=particles.count, low=self.low, geometry=self.geometry, occupied=self.occupied,
             reached=self._reached, status=self.status, cell_size=self.cell_size, LEVELS=self.levels,
-            BODIES=self.divided, BLOCK=MARK_BLOCK,
+            BODIES=self.config.body_cells, BLOCK=MARK_BLOCK,
         )  # fmt: skip
         torch.cumsum(self.occupied, 0, dtype=torch.int32, out=self.prefix_sum)
         cells: dict[str, Any] = {
@@ -245,7 +245,7 @@ class DeviceGrid:
             "octant": self._octant, "children": self._children, "counts": self.counts_L, "needed": self.needed_L,
             "status": self.status, "OVERLAP": overlaps(),
         }  # fmt: skip
-        if not self.divided:
+        if not self.config.body_cells:
             kernel.fill_tables[(triton.cdiv(self.largest, FILL_BLOCK), self.levels)](**cells, **tables)
             return
         self._tables.fill_(-1)
@@ -305,7 +305,7 @@ class DeviceGrid:
             disturbed=self.disturbed_C2, wall_friction=particles.domain_S3 if walls is None else walls,
             gravity=particles.gravity_S3, scale=scale[1], friction=self.friction_C, cell_size=self.cell_size,
             reach=CONTACT_REACH_CELLS * config.cell_size, capacity=self.capacities[0], LEVELS=self.levels,
-            **self._owners, BODIES=self.divided,
+            **self._owners, BODIES=self.config.body_cells,
             MOTION=config.relative, COLUMNS=SUMS, **own_physics, **drift, **arguments_of(moving, particles.count),
             OVERLAP=overlap, launch_pdl=overlap,
         )  # fmt: skip

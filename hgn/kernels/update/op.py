@@ -399,7 +399,7 @@ class Updates:
         self.target_N3 = torch.zeros(particles, 3, device=device)
         self.share_N = torch.zeros(particles, device=device)
         # Bodies divide only cells for which the finest level has room, so the second measurement finds theirs.
-        for _ in range(0 if self.capacities else 1 + (config.inputs == "local")):
+        for _ in range(0 if self.capacities else 1 + config.body_cells):
             self.grid = self._device_grid(self.capacities or (16,) * config.levels)
             self._assemble()
             self.grid.build(self.buffers)
