@@ -43,19 +43,12 @@ class TritonBackend(Backend):
             self.idle[state.scene_count] = stepper
 
     def _new_stepper(self, state: ParticleState, capacity: int) -> TritonStepper:
-        """Allocates a stepper and checks it. If float16 sums fail the check, it sums in float32. If this fails too,
-        precision `auto` becomes tf32 for good."""
+        """Allocates a stepper and checks it. If it fails the check, precision `auto` becomes tf32 for good."""
         stepper = TritonStepper(self.network, state, self.precision, capacity=capacity, step=self.step)
         if len(state.position_N3) > CHECKED_PARTICLES:
             return stepper
         try:
-            try:
-                stepper.require_parity(self.network, state)
-            except ParityError:
-                if not stepper.half_sums:
-                    raise
-                stepper.sum_in_float32()
-                stepper.require_parity(self.network, state)
+            stepper.require_parity(self.network, state)
             return stepper
         except ParityError as error:
             if self.precision == self.precisions[-1]:

@@ -30,7 +30,7 @@ from hgn.network.hgn import HierarchicalGraphNetwork
 from hgn.network.moving import MovingObstacles
 from hgn.network.own_physics import has_friction
 from hgn.runtime.moving_parity import require_moving_parity
-from hgn.runtime.parity import OUTPUTS, require_parity
+from hgn.runtime.parity import OUTPUTS, ParityError, require_parity
 from hgn.runtime.triton_host import kernel_precision
 from hgn.scene.material import INPUT_PARAMETERS
 from hgn.step.reference import rested
@@ -258,7 +258,8 @@ class TritonStepper:
     def _first_capacities(self) -> tuple[int, ...]:
         position_N3, scene_N = self.buffers.position_N3[: self.live], self.buffers.scene_N[: self.live].long()
         cell_size, levels, bodies = self.config.cell_size, self.config.levels, self.config.body_cells
-        grid = build_hierarchy(position_N3, scene_N, self.buffers.origin_S3, cell_size, levels, bodies)
+        origin_S3 = self.buffers.origin_S3
+        grid = build_hierarchy(position_N3, scene_N, origin_S3, cell_size, levels=levels, bodies=bodies)
         return first_capacities([level.cell_count for level in grid.levels], self.live)
 
     def _window(self) -> Window:
@@ -313,8 +314,18 @@ class TritonStepper:
     def require_parity(self, network: HierarchicalGraphNetwork, state: ParticleState, section: str = "") -> None:
         """Compares the first output, and the constraint at moving obstacles, with PyTorch's, before the first frame.
 
-        `state` is the initial state, or its first scenes. `section` contains the precision. Raises: ParityError.
+        If float16 sums fail, it sums in float32. `state` is the initial state, or its first scenes. `section` contains
+        the precision. Raises: ParityError.
         """
+        try:
+            self._require_parity(network, state, section)
+        except ParityError:
+            if not self.half_sums:
+                raise
+            self.sum_in_float32()
+            self._require_parity(network, state, section)
+
+    def _require_parity(self, network: HierarchicalGraphNetwork, state: ParticleState, section: str) -> None:
         if self.graph is None:
             self._network_pass()
         output_N3 = self.fused.output[: len(state.position_N3), :3]

@@ -135,9 +135,9 @@ class TritonScenes:
             stepper.use_values(values)
             stepper.begin(state)
             return stepper
-        capacities = None
+        capacities, half_sums = None, True
         if stepper is not None:
-            capacities = stepper.grid.capacities
+            capacities, half_sums = stepper.grid.capacities, stepper.half_sums
             self._stepper = stepper = None  # freed before the new one is allocated
         particles = 16 * math.ceil(SPARE * len(state.position_N3) / 16)
         stepper = TritonStepper(
@@ -156,6 +156,8 @@ class TritonScenes:
                 stepper.require_parity(self._network, first, "training.")
                 if device.type == "cuda":
                     torch.cuda.empty_cache()  # free memory determines where episodes are stored
+        elif stepper.half_sums and not half_sums:
+            stepper.sum_in_float32()
         stepper.use_values(values)
         self._stepper = stepper
         return stepper

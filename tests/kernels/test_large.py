@@ -78,18 +78,24 @@ def test_first_room():
     assert first_capacities((8,) * 5, 1) == (256, 128, 64, 32, 16)
 
 
+def let_half_sums_fail(monkeypatch, float_fails=False):
+    """Replaces the check of steppers. Returns the list of what it will have checked: whether sums are in float16."""
+    checked = []
+
+    def check(stepper, *_):
+        checked.append(stepper.half_sums)
+        if stepper.half_sums or float_fails:
+            raise ParityError("precision must be tf32")
+
+    monkeypatch.setattr(TritonStepper, "_require_parity", check)
+    return checked
+
+
 @pytest.mark.parametrize("fails", [False, True])
 def test_sums_are_in_float32_where_half_fails(monkeypatch, fails):
     """Where float16 sums alone fail the check of fp16, the backend takes float32 sums; where these fail too, it refuses
     the state."""
-    checked = []
-
-    def require_parity(stepper, *_):
-        checked.append(stepper.half_sums)
-        if stepper.half_sums or fails:
-            raise ParityError("precision must be tf32")
-
-    monkeypatch.setattr(TritonStepper, "require_parity", require_parity)
+    checked = let_half_sums_fail(monkeypatch, fails)
     backend = TritonBackend(bench_network(NETWORK, CPU), "fp16")
     for state in states():
         with pytest.raises(ParityError) if fails else nullcontext(), backend.stepper(state):

@@ -7,6 +7,7 @@ import pytest
 import torch
 from kernels.cases import swept
 from kernels.engines import device
+from kernels.test_large import let_half_sums_fail
 from kernels.test_training import data as data
 from network.states import network_of
 from training.test_noise import episode
@@ -188,3 +189,15 @@ def test_wrong_kernels_are_refused():
         patch.setattr(TritonScenes, "_first_scenes", another)
         with pytest.raises(ConfigError, match=r"must be torch on this machine.*set training.backend=torch"):
             refresh(fast, network, starts)
+
+
+def test_larger_buffers_sum_in_float32_too(monkeypatch):
+    """Where float16 sums fail the check, a later simulation in larger buffers sums in float32 unchecked."""
+    network = network_of(torch.float32, width=16, levels=1, message_passing_steps=1).to(device())
+    fast, _ = pools_of(network, training_of(precision="fp16"))
+    checked, steppers = let_half_sums_fail(monkeypatch), []
+    for count in (4, 40):
+        refresh(fast, network, [(episode(count, seed=1), 2)])
+        steppers.append(fast._scenes._stepper)
+    assert steppers[0] is not steppers[1] and checked == [True, False]
+    assert [stepper.fused.tuning.half_sums for stepper in steppers] == [False, False]
