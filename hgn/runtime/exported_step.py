@@ -51,7 +51,7 @@ OWN_INPUTS = {
     "elastic": ("rest_position", "rest_neighbour"),
     "moving": ("moving_pose", "moving_cell", "moving_surface", "moving_triangle"),
 }  # the inputs that follow for each of `network.own_physics`; those of `moving` only in graphs with moving obstacles
-MOST_POSES = 100_000  # largest number of frames in `moving_pose` of `initial_arrays`
+MOST_POSES = 100_000  # largest number of frames times obstacles in `moving_pose` of `initial_arrays`
 OUTPUTS = ("next_position", "next_velocity")
 # sizes for tracing; the graph does not depend on them
 EXAMPLE_PARTICLES, EXAMPLE_CELLS, EXAMPLE_TRIANGLES, EXAMPLE_RESTS = 64, 32, 16, 8
@@ -205,11 +205,13 @@ def initial_arrays(
 def _moving_arrays(moving: MovingObstacles) -> dict[str, np.ndarray]:
     """Returns the inputs for moving obstacles. Poses [T, V, 3, 4] are those of all frames until the motion ends.
 
-    Raises: ConfigError for a motion of more than MOST_POSES frames.
+    Raises: ConfigError for more than MOST_POSES poses.
     """
-    own, triangles = moving.scenes[0], [barrier_pieces(m.corner_F33, moving.cell_size) for m in moving.scenes[0]]
+    own = moving.scenes[0]
     frames = math.ceil(max(m.motion.time_T[-1] for m in own) / moving.frame_s) + 2
-    require(frames <= MOST_POSES, "keyframes", f"at most {MOST_POSES} frames long with arrays", frames)
+    rule = f"of at most {MOST_POSES} poses, frames times obstacles, with arrays"
+    require(frames * len(own) <= MOST_POSES, "keyframes", rule, frames * len(own))
+    triangles = [barrier_pieces(m.corner_F33, moving.cell_size) for m in own]
     poses = [[np.column_stack(m.motion.transform(t * moving.frame_s)) for m in own] for t in range(frames)]
     corner_VF33 = np.zeros((len(own), max(map(len, triangles)), 3, 3), np.float32)  # further triangles have no area
     for corners, corner_F33 in zip(corner_VF33, triangles, strict=True):

@@ -80,9 +80,19 @@ class Motion:
         """Returns low and high corners, float64 [B, 3], of boxes one of which contains the points at any time."""
         corner_83 = np.array(list(itertools.product(*zip(point_P3.min(axis=0), point_P3.max(axis=0), strict=True))))
         steps = TURN_STEPS if np.ptp(self.rotation_T33, axis=0).any() else 1
-        pairs = itertools.pairwise([self.time_T[0], *self.time_T])
-        time_B = np.concatenate([np.linspace(begin, end, steps + 1) for begin, end in pairs])
-        place_B83 = np.stack([self.place(corner_83, time) for time in time_B])
+        before = np.maximum(np.arange(len(self.time_T)) - 1, 0)  # the first boxes are those of the first pose
+        begin_T33, begin_T3 = self.rotation_T33[before], self.translation_T3[before]
+        turn_T3 = np.array([turning(turn_33) for turn_33 in self.rotation_T33 @ begin_T33.transpose(0, 2, 1)])
+        angle_T1 = np.linalg.norm(turn_T3, axis=1, keepdims=True)
+        cross_T133 = np.cross(np.eye(3), (turn_T3 / np.maximum(angle_T1, 1e-12))[:, None])[:, None]
+        fraction_S11 = np.linspace(0, 1, steps + 1)[:, None, None]
+        angle_TS11 = angle_T1[:, None, None] * fraction_S11
+        # Rodrigues as in `turned`, for all times together: scenes may have 30,000 keyframes
+        turn_TS33 = np.eye(3) + np.sin(angle_TS11) * cross_T133 + (1 - np.cos(angle_TS11)) * cross_T133 @ cross_T133
+        way_TS13 = begin_T3[:, None, None] + fraction_S11 * (self.translation_T3 - begin_T3)[:, None, None]
+        rotation_TS33 = turn_TS33 @ begin_T33[:, None]
+        place_TS83 = (corner_83 - self.pivot) @ rotation_TS33.swapaxes(2, 3) + self.pivot + way_TS13
+        place_B83 = place_TS83.reshape(-1, 8, 3)
         # largest distance of an arc from its chord; a turn between keyframes is at most pi
         arc = np.linalg.norm(corner_83 - self.pivot, axis=1).max() * (np.pi / steps) ** 2 / 8 if steps > 1 else 0.0
         low_B3, high_B3 = place_B83.min(axis=1) - arc, place_B83.max(axis=1) + arc

@@ -6,6 +6,7 @@ See conf/example/ for examples. Lengths are in domain units, angles in degrees, 
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 import re
 from collections.abc import Mapping, Sequence
@@ -87,8 +88,9 @@ class ObstacleEntry:
             require(self.scale is None, "scale", "left out beside shape", self.scale, "shapes take size")
             require(self.size is not None, "size", "given beside shape", self.size)
             require(self.position is not None, "position", "given beside shape", self.position)
-        self.motion()
+        _ = self.motion  # checks the keyframes
 
+    @functools.cached_property
     def motion(self) -> Motion | None:
         """Returns the motion of the obstacle, or None."""
         if not self.keyframes:
@@ -418,8 +420,7 @@ def _obstacle(entry: ObstacleEntry, index: int, folder: Path) -> tuple[Obstacle,
             translation=entry.position or (0.0, 0.0, 0.0),
             rotation=entry.rotation,
         )
-    motion = entry.motion()
-    return tuple(dataclasses.replace(body, friction=entry.friction, motion=motion) for body in bodies)
+    return tuple(dataclasses.replace(body, friction=entry.friction, motion=entry.motion) for body in bodies)
 
 
 def _require_clear(name: str, position_N3: np.ndarray, obstacles: Sequence[Obstacle], file: SceneFile) -> None:

@@ -13,7 +13,7 @@ from hgn.config import NetworkConfig
 from hgn.runtime.weights import WeightsInfo, load_weights
 from hgn.scene.mesh import load_mesh
 from hgn.scene.obstacle_grid import build_obstacle_grid
-from hgn.scene.scene_file import load_scene
+from hgn.scene.scene_file import load_scene, notes_on_files
 from hgn.schema import to_mapping
 from hgn.system.yaml_files import read_yaml
 
@@ -330,6 +330,16 @@ def scene(text):
 GROUP = "groups:\n- {shape: cube, size: 0.1, position: [0.5, 0.5, 0.5], material: sand}\n"
 
 
+def many_keyframes(folder):
+    """200 obstacles with the same 125 keyframes, of which the first is turned."""
+    times = ", ".join(f"{{time: {number}}}" for number in range(1, 125))
+    entries = [f"&k [{{time: 0, rotation: [0, 90, 0]}}, {times}]"] + 199 * ["*k"]
+    cones = "".join(f"- {{shape: cone, size: 0.1, position: [0.1, 0.1, 0.1], keyframes: {k}}}\n" for k in entries)
+    path = scene(f"{GROUP}obstacles:\n{cones}")(folder)
+    notes_on_files(load_scene(path))
+    return path
+
+
 TRI = b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf -1 -2 -3\n"
 
 
@@ -378,6 +388,7 @@ cases(
             GROUP + "obstacles:\n- shape: cone\n  size: 0.1\n  position: [0.1, 0.1, 0.1]\n  keyframes:\n"
             + "".join(f"  - {{time: {number}}}\n" for number in range(800))
         ),
+        "keyframes of many obstacles": many_keyframes,
         "long file": scene("groups: " + 990_000 * "a"),
         "long text": scene("groups: " + 240_000 * "a"),
         "deep flow": scene("groups: " + 4_000 * "["),

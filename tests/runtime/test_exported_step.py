@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import runpy
 import shutil
 import subprocess
@@ -284,13 +285,19 @@ def test_neighbour_lists_are_not_exported(tmp_path):
     assert not (tmp_path / "a.onnx").exists()
 
 
-def test_poses_of_a_motion_without_end(tmp_path):
-    """A keyframe in ten years is refused, because its poses would fill the memory."""
+@pytest.mark.parametrize(("obstacles", "last_s", "poses"), [(2, 3e8, "36000000004"), (20, 100, "120040")])
+def test_poses_of_a_motion_without_end(tmp_path, obstacles, last_s, poses):
+    """A keyframe in ten years is refused, because its poses would fill the memory; so are poses of many obstacles."""
     network, scene = network_of(torch.float32, **OWN), tmp_path / "scene.yaml"
     save_weights(tmp_path / "w.safetensors", network, WeightsInfo(network.config, 60.0, CELL))
-    scene.write_text(MOVING_SCENE.replace("time: 0.3", "time: 3.0e+8"))
+    text = MOVING_SCENE.replace("time: 0.3", f"time: {last_s:e}")
+    begin, first, last, group = re.split("(?=  - shape)|(?=groups)", text)
+    scene.write_text(begin + first + (obstacles - 1) * last + group)
     options = {"weights": str(tmp_path / "w.safetensors"), "arrays": str(tmp_path / "arrays"), "scene": str(scene)}
-    with pytest.raises(ConfigError, match="keyframes must be at most 100000 frames long with arrays, got 18000000002"):
+    with pytest.raises(
+        ConfigError,
+        match=f"keyframes must be of at most 100000 poses, frames times obstacles, with arrays, got {poses}",
+    ):
         export.main(options)
     assert not (tmp_path / "arrays").exists()
 
