@@ -1,7 +1,6 @@
 """Measures time and memory of contenders in one process after a warm-up: runs by device events, rollouts by frames."""
 
 import gc
-import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -10,7 +9,6 @@ from typing import Any, Protocol
 import numpy as np
 import torch
 
-from hgn.network.base import ParticleNetwork
 from hgn.runtime.backend import set_matmul_precision
 from hgn.scene.episode import Episode
 
@@ -176,18 +174,6 @@ class Stopwatch:
         batch = {"ms_batched": statistics(self.batched_ms)["ms"], "batch_scenes": len(self.batch)}
         timed = {"timed_frames": self.single_frames, "memory_gb": self.memory_gb}
         return statistics(self.single_ms) | batch | timed
-
-
-def compile_frames(
-    networks: Sequence[ParticleNetwork], precisions: Sequence[str], device: torch.device, particles: Sequence[int]
-) -> None:
-    """Compiles the kernels of backend triton for scenes of these sizes, in several processes."""
-    from hgn.runtime.precompile import precompile_frames  # loads Triton
-
-    ahead = precompile_frames([(each.config, each.step) for each in networks], precisions, device, particles)
-    if ahead is not None:
-        with ahead:
-            print(ahead.wait(), file=sys.stderr)
 
 
 def free(device: torch.device) -> None:

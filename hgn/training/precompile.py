@@ -3,15 +3,12 @@
 from hgn.config import SceneConfig, TrainConfig
 from hgn.kernels.update.op import UpdateSettings
 from hgn.runtime.precompile_program import PrecompileJob
-from hgn.training.errors import MONITORED_SCENES
 
 
 def job_of_training(config: TrainConfig, capability: tuple[int, int], several_ranks: bool) -> PrecompileJob:
     """Returns the kernels that a training on such a GPU needs. The distribution of scenes determines their sizes."""
     training, network = config.training, config.network
     particles, cells = _sizes(config.scene, network.levels)
-    own = [training.pushforward_scenes] if training.pushforward_fraction > 0 else []
-    monitored = training.monitor_rollout_frames >= 2
     return PrecompileJob(
         network,
         UpdateSettings.of(training, config.scene.cell_size),
@@ -21,8 +18,6 @@ def job_of_training(config: TrainConfig, capability: tuple[int, int], several_ra
         particles=training.batch_scenes * particles,
         cells=tuple(training.batch_scenes * count for count in cells),
         capability=10 * capability[0] + capability[1],
-        pushforward_scenes=tuple(own + ([MONITORED_SCENES] if monitored else [])),
-        step=config.step,
     )
 
 

@@ -14,13 +14,14 @@ from triton.backends.nvidia.compiler import CUDABackend
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "training"))
 
+from frame_launches import frame_of
 from no_gpu import use_h100
 from ptx import hazards, overwritten_tiles
 
 from hgn.config import NetworkConfig
 from hgn.kernels import triton_compat
 from hgn.kernels.update.op import UpdateSettings
-from hgn.runtime.precompile_program import FrameJob, PrecompileJob, launches_of
+from hgn.runtime.precompile_program import PrecompileJob, launches_of
 from hgn.step_config import StepConfig
 
 
@@ -53,9 +54,10 @@ def no_ptx(self, source, metadata, *_):
 settings = UpdateSettings(2, 1e-3, True, 1 / 64)
 relative = NetworkConfig(inputs="local", width=16, levels=3, message_passing_steps=1)
 of_relative = {}  # before any is compiled: what is would be launched
-for step in (StepConfig(), StepConfig(0.3, (0.02, 0.04), 1e-3)):
-    job = PrecompileJob(relative, settings, "fp16", False, False, 9000, (9000, 3000, 900), 90, (2,), step)
-    of_relative |= launches_of(job)
+constrained = StepConfig(0.3, (0.02, 0.04), 1e-3)
+for step in (StepConfig(), constrained.in_training, constrained):
+    of_relative |= frame_of(relative, step, "fp16", (9000, 3000, 900), scenes=2, particles=9000)[0]
+of_relative |= launches_of(PrecompileJob(relative, settings, "fp16", False, False, 9000, (9000, 3000, 900), 90))
 
 network = NetworkConfig(levels=1, message_passing_steps=1)
 for precision in ("fp16", "tf32"):
@@ -77,7 +79,7 @@ for precision in ("fp16", "tf32"):
 triton_compat.use_target(89)
 CUDABackend.make_ptx = no_ptx
 narrow = NetworkConfig(width=64, levels=1, message_passing_steps=1)
-for function, data in launches_of(FrameJob(((narrow, StepConfig(), "fp16"),), ((40_000, 10_000),), 89)).values():
+for function, data in frame_of(narrow, StepConfig(), "fp16", (10_000,), particles=40_000)[0].values():
     if function.fn.__module__ in ("hgn.kernels.grid.kernel", "hgn.kernels.features.kernel"):
         continue  # knows no width
     print("SHARED", function.__name__, triton_compat.preload(function, data).metadata.shared, flush=True)

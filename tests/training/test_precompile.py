@@ -7,9 +7,8 @@ import pytest
 from processes import run_compiled
 
 from hgn.config import NetworkConfig, SceneConfig, TrainConfig, TrainingConfig
-from hgn.runtime.precompile import Precompilation, frame_sizes
-from hgn.runtime.precompile_program import FrameJob, job_of, job_text
-from hgn.step_config import StepConfig
+from hgn.runtime.precompile import Precompilation
+from hgn.runtime.precompile_program import job_of, job_text
 from hgn.training.precompile import job_of_training
 
 
@@ -26,18 +25,6 @@ def test_the_job_follows_from_the_configuration():
     assert made.particles == pytest.approx(8 * 4296, rel=0.05)
     assert made.cells == pytest.approx((8 * 1419, 8 * 231), rel=0.2)  # of a measured batch
     assert job_of(job_text(made)) == made
-
-
-def test_jobs_of_simulations():
-    """Networks keep their precisions through the job's text; few and many particles, dense and spread, are among the
-    sizes, and as many as there are cases change little."""
-    small = NetworkConfig(width=16)
-    networks = ((small, StepConfig(), "fp16"), (small, StepConfig(0.1), "tf32"))
-    made = FrameJob(networks, frame_sizes([2_763, 30_000, 1, 30_000]), 90)
-    assert job_of(job_text(made)) == made
-    assert {particles for particles, _ in made.sizes} == {1, 2_763, 30_000} and len(made.sizes) == 9
-    assert min(made.sizes) == (1, 1) and max(made.sizes) == (30_000, 36_000)
-    assert len(frame_sizes(range(1, 1000))) == 9
 
 
 @pytest.mark.parametrize(

@@ -22,7 +22,6 @@ from hgn.scene.episode import Episode
 from hgn.schema import ConfigError, from_mapping, from_stored, printable, require, require_replaceable
 from hgn.system.device import choose_device
 from tools.error_vs_time.contenders import (
-    PARTICLES_AT_ONCE,
     BaselineContender,
     Contender,
     FallingContender,
@@ -36,7 +35,6 @@ from tools.error_vs_time.score import table
 from tools.error_vs_time.settings import ENDINGS, ErrorVsTimeConfig
 from tools.report import meta_of
 from tools.solver_rollouts import Setting, SolverLaunches
-from tools.timing import compile_frames
 
 REFERENCE_STEP = 0.25  # the reference's step on the data's own grid, as a fraction of the limit of stability
 STEPS = (1.0, 0.5)  # the solver's steps, as fractions of the limit of stability
@@ -72,10 +70,6 @@ def main(mapping: dict[str, Any]) -> int:
     contenders = [*networks, *baseline_contenders(store, device, wall_thickness(mpm, own_cell)), *solvers]
     for solver in solvers:
         solver.launches.add(solver.setting)
-    if whole := [contender for contender in networks if not contender.stepped]:
-        most = max(len(episode.material_N) for episode in episodes)
-        sizes = [most, 8 * most, PARTICLES_AT_ONCE]
-        compile_frames([each.network for each in whole], [each.precision for each in whole], device, sizes)
     references: Sequence[Episode] = episodes
     left_out: dict[str, str] = {}
     if resimulate:

@@ -24,7 +24,7 @@ from tools.stability.gallery import is_gallery
 from tools.stability.network_cases import FAMILIES, PARAMETERS, Context
 from tools.stability.parameters import parameter_row
 from tools.stability.row import Report, Row, table
-from tools.timing import FrameClock, compile_frames
+from tools.timing import FrameClock
 
 CaseName = Annotated[
     str, Bound(f"one of {', '.join(FAMILIES)}, gallery, gallery_NUMBER", lambda n: n in FAMILIES or is_gallery(n))
@@ -64,9 +64,6 @@ def main(mapping: dict[str, Any]) -> int:
     cases = cases_of(config, simulator)
     mpm = replace(config.mpm, device=simulator.device.type) if config.solver else None
     runner = Runner(simulator, cases, mpm)
-    if cases and not backend.stepped:
-        particles = [sum(scene.particle_count for scene in case.scenes) for case in cases]
-        compile_frames([simulator.network], [backend.precision], simulator.device, particles)
     report.meta["seconds_before_cases"] = time.monotonic() - started
     for number, case in enumerate(cases, start=1):
         print(f"case {number} of {len(cases)}: {case.name}", file=sys.stderr, flush=True)
