@@ -16,10 +16,10 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 33_805,
+    "hgn": 33_672,
     "datagen": 8_989,
-    "tools": 6_389,
-    "tests": 33_958,
+    "tools": 6_366,
+    "tests": 33_973,
 }
 SETTINGS = 240  # fields of the dataclasses behind the commands, *Config
 

@@ -4,7 +4,7 @@ import tarfile
 from collections.abc import Iterator
 from pathlib import Path
 
-from hgn.scene.episode import Episode, encoded_parts
+from hgn.scene.episode import Episode, encode_episode
 from hgn.schema import ConfigError
 from hgn.system.files import open_at_once
 
@@ -12,7 +12,7 @@ from hgn.system.files import open_at_once
 def episode_tar(episode: Episode) -> Iterator[bytes | memoryview]:
     """Yields the parts of an episode's tar. It has no times and owners, so its bytes depend on the episode only."""
     written = 0
-    for name, parts in encoded_parts(episode).items():
+    for name, parts in encode_episode(episode).items():
         info = tarfile.TarInfo(f"{episode.key}.{name}")
         info.size, info.mtime, info.mode = sum(map(len, parts)), 0, 0o644
         header, rest = info.tobuf(tarfile.GNU_FORMAT), bytes(-info.size % tarfile.BLOCKSIZE)

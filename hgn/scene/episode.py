@@ -172,18 +172,13 @@ class _Description:
     wall_friction: Vector = (0.0, 0.0, 0.0)
 
 
-def encode_episode(episode: Episode) -> dict[str, bytes]:
-    """Returns the members of an episode by their name after `<key>.`, in storage order.
+def encode_episode(episode: Episode) -> dict[str, tuple[bytes | memoryview, ...]]:
+    """Returns the members of an episode by their name after `<key>.`, in storage order, each in parts.
 
     The same episode gives the same bytes on every machine: plain `.npy` (version 1.0, little-endian, C order) and JSON
-    with sorted keys.
+    with sorted keys. Arrays are not copied: their parts are views of them.
     Raises: ConfigError if positions are not finite, or if specification or solver cannot be written as JSON.
     """
-    return {name: b"".join(parts) for name, parts in encoded_parts(episode).items()}
-
-
-def encoded_parts(episode: Episode) -> dict[str, tuple[bytes | memoryview, ...]]:
-    """Returns the members of `encode_episode` in parts. Arrays are not copied: their parts are views of them."""
     _require_sound_positions(episode)
     members: dict[str, tuple[bytes | memoryview, ...]] = {
         f"{name}.npy": _encode_array(array, _ARRAYS.get(name, _PARAMETER)[0])

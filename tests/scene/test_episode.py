@@ -19,6 +19,10 @@ from hgn.scene.obstacle_grid import ObstacleGrid
 from hgn.schema import ConfigError
 
 
+def members_of(episode):
+    return {name: b"".join(parts) for name, parts in encode_episode(episode).items()}
+
+
 def make_episode(frames=4, particles=5, cells=3, seed=0, **changes):
     generator = np.random.default_rng(seed)
     normal_K3 = generator.normal(size=(cells, 3))
@@ -48,7 +52,7 @@ def test_roundtrip(frames, particles, cells, seed):
     """Decoding returns every field bitwise, for any sizes, an empty scene and no obstacles included."""
     parameters = {"youngs_modulus": np.linspace(1, 2, particles, dtype=np.float32)}
     episode = make_episode(frames, particles, cells, seed, material_parameters=parameters)
-    members = encode_episode(episode)
+    members = members_of(episode)
     assert "parameter_youngs_modulus.npy" in members
     assert_same(episode, decode_episode(episode.key, members))
 
@@ -57,9 +61,9 @@ def test_members():
     """Memory layout and key order of the input leave no trace in the stored bytes, and NumPy and JSON alone read them.
     Members given as arrays are not copied, so that a memory map stays one."""
     episode = make_episode()
-    members, solver = encode_episode(episode), dict(reversed(episode.solver.items()))
+    members, solver = members_of(episode), dict(reversed(episode.solver.items()))
     other = dataclasses.replace(episode, position_TN3=np.asfortranarray(episode.position_TN3), solver=solver)
-    assert encode_episode(other) == members
+    assert members_of(other) == members
     position = np.load(io.BytesIO(members["position.npy"]), allow_pickle=False)
     assert np.array_equal(position, episode.position_TN3) and json.loads(members["json"])["seed"] == episode.seed
     flat = {name: np.frombuffer(data, np.uint8) for name, data in members.items()}
@@ -115,7 +119,7 @@ def test_frames_are_not_checked_one_by_one(monkeypatch):
     """Sound positions need no call per frame: at each call a thread waits for the others that check episodes."""
     episode, calls = make_episode(), []
     monkeypatch.setattr(episode_module, "_require_within", lambda *arguments: calls.append(arguments))
-    encode_episode(episode)
+    members_of(episode)
     assert not calls
 
 
@@ -127,16 +131,16 @@ def test_positions_that_are_not_finite_are_refused_both_ways(monkeypatch, frames
     position = episode.position_TN3.copy()
     position[2, 3, 1] = np.nan
     with pytest.raises(ConfigError, match=r"position must be finite, got nan at \[3, 1\] in frame 2"):
-        encode_episode(dataclasses.replace(episode, position_TN3=position))
+        members_of(dataclasses.replace(episode, position_TN3=position))
     with pytest.raises(ConfigError, match="position must be finite"):
-        decode_episode(episode.key, encode_episode(episode) | {"position.npy": npy(position)})
+        decode_episode(episode.key, members_of(episode) | {"position.npy": npy(position)})
 
 
 @pytest.mark.parametrize("value", [float("nan"), np.int64(3), {1, 2}])
 def test_what_is_not_json_is_refused(value):
     """Solver counters and specifications are plain JSON; a NaN would not be readable elsewhere."""
     with pytest.raises(ConfigError, match="must be plain JSON"):
-        encode_episode(make_episode(solver={"x": value}))
+        members_of(make_episode(solver={"x": value}))
 
 
 def npy(array, **options):
@@ -146,7 +150,7 @@ def npy(array, **options):
 
 
 def description(**changes):
-    mapping = json.loads(encode_episode(make_episode())["json"]) | changes
+    mapping = json.loads(members_of(make_episode())["json"]) | changes
     return json.dumps({key: value for key, value in mapping.items() if value is not None}).encode()
 
 
@@ -226,7 +230,7 @@ BROKEN_MEMBERS: list[tuple[dict[str, bytes | None], str]] = [
 @pytest.mark.parametrize(("changes", "message"), BROKEN_MEMBERS)
 def test_wrong_members_are_refused(changes, message):
     """A missing, foreign, cut or altered member ends in one message that names it."""
-    members: dict[str, bytes | None] = dict(encode_episode(make_episode())) | changes
+    members: dict[str, bytes | None] = dict(members_of(make_episode())) | changes
     with pytest.raises(ConfigError, match=message):
         decode_episode("train-000012", {name: data for name, data in members.items() if data is not None})
 
@@ -238,7 +242,7 @@ class Bomb:
 
 def test_nothing_is_unpickled():
     """A member with a pickled object is refused without loading it."""
-    members = encode_episode(make_episode())
+    members = members_of(make_episode())
     header = npy(np.array([None] * 5, dtype=object), allow_pickle=True)
     start = header.index(b"\n") + 1
     for data in (header[:start] + pickle.dumps(Bomb()), pickle.dumps(Bomb())):

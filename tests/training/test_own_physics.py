@@ -6,6 +6,7 @@ import ballistic_solver
 import numpy as np
 import torch
 from equality import assert_same
+from scene.test_episode import members_of
 from training.runs import train_mapping
 
 from hgn import rollout, train
@@ -15,7 +16,7 @@ from hgn.data.reader import EpisodeStore
 from hgn.export import export
 from hgn.runtime.simulator import Simulator
 from hgn.runtime.weights import load_weights
-from hgn.scene.episode import decode_episode, encode_episode
+from hgn.scene.episode import decode_episode
 from hgn.scene.moving import at_rest
 from hgn.scene.obstacle_grid import build_obstacle_grid
 from hgn.scene.own_physics import own_ranges
@@ -49,8 +50,8 @@ def test_from_shards_to_a_rollout(make_config, make_dataset, tmp_path, monkeypat
     inputs = NetworkConfig(inputs="local", own_physics=OWN)
     assert sum(make_batch([(episode, 3)], inputs).moving is not None for episode in episodes) > 0
     for episode in episodes:
-        scene, members = drawn[episode.seed], encode_episode(episode)
-        assert encode_episode(decode_episode(episode.key, members)) == members
+        scene, members = drawn[episode.seed], members_of(episode)
+        assert members_of(decode_episode(episode.key, members)) == members
         assert episode.wall_friction == scene.wall_friction
         frictions = {
             np.float32(obstacle.friction) for obstacle in at_rest(scene.obstacles) if obstacle.friction is not None
@@ -60,9 +61,9 @@ def test_from_shards_to_a_rollout(make_config, make_dataset, tmp_path, monkeypat
     # without members of their own, obstacle cells and particles have what the solver was set to
     old = next(episode for episode in episodes if len(episode.obstacle_grid.cell_K3))
     old = replace(old, obstacle_grid=replace(old.obstacle_grid, friction_K=None), material_parameters={})
-    assert old.parameters is None and decode_episode("a", encode_episode(old)).obstacle_grid.friction_K is None
+    assert old.parameters is None and decode_episode("a", members_of(old)).obstacle_grid.friction_K is None
     settings = old.solver["settings"] | {"collider_friction": 0.25, "sand_friction_angle_deg": 20.0}
-    other = decode_episode("a", encode_episode(replace(old, solver=old.solver | {"settings": settings})))
+    other = decode_episode("a", members_of(replace(old, solver=old.solver | {"settings": settings})))
     assert set(other.obstacle_grid.friction_K.tolist()) == {0.25} and set(other.parameters[:, 2].tolist()) == {20.0}
 
     place: dict = {}
