@@ -16,10 +16,10 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 33_672,
+    "hgn": 33_705,
     "datagen": 8_989,
     "tools": 6_366,
-    "tests": 33_973,
+    "tests": 34_008,
 }
 SETTINGS = 240  # fields of the dataclasses behind the commands, *Config
 

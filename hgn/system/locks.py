@@ -6,7 +6,8 @@ import fcntl
 import os
 import stat
 import struct
-from collections.abc import Iterator
+import threading
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import IO, Any
@@ -59,6 +60,17 @@ def lock_bytes(file: int, kind: int, start: int, length: int = 1, wait: bool = F
     return True
 
 
+_again: dict[Path, Callable[[], None]] = {}  # for each folder that `locked` locks, what makes and locks it again
+
+
+def make_again(folder: Path) -> None:
+    """Makes a folder if somebody has deleted it, and locks it again if this process had locked it.
+
+    Raises ConfigError as `locked` if another process has locked a folder of this name since.
+    """
+    _again.get(folder, partial(make_folder, folder))()
+
+
 @contextlib.contextmanager
 def locked(path: Path, field: str, refusal: str) -> Iterator[None]:
     """Locks a file for this process, and its folder too, because another user may delete the file.
@@ -66,8 +78,18 @@ def locked(path: Path, field: str, refusal: str) -> Iterator[None]:
     Raises ConfigError `<field> must be ...`, with `refusal`, if another process has the lock. On a file system
     without locks every process succeeds.
     """
-    make_folder(path.parent)
-    with contextlib.ExitStack() as stack:
+    stack, own, one_at_a_time = contextlib.ExitStack(), list[os.stat_result](), threading.Lock()
+
+    def again() -> None:
+        with one_at_a_time:
+            lock()
+
+    def lock() -> None:
+        make_folder(path.parent)
+        if own and os.path.samestat(own[0], path.parent.stat()):
+            return
+        own.clear()
+        stack.close()  # the locks of a folder that was deleted or renamed
         for opening in (partial(open_lock, path), partial(os.open, path.parent, os.O_RDONLY)):
             opened = opening()
             stack.callback(os.close, opened)
@@ -81,4 +103,12 @@ def locked(path: Path, field: str, refusal: str) -> Iterator[None]:
                 raise ConfigError(
                     f"{field} must be a folder of its own, got {path.parent}: {refusal} another {field}=..."
                 )
-        yield
+        own.append(os.fstat(opened))
+
+    with stack:
+        lock()
+        _again[path.parent] = again
+        try:
+            yield
+        finally:
+            del _again[path.parent]

@@ -22,7 +22,8 @@ from tqdm import tqdm
 
 from hgn.data.storage import StorageError
 from hgn.schema import ConfigError, to_mapping
-from hgn.system.files import TEMPORARY_SUFFIX, make_folder, open_at_once, write_atomically
+from hgn.system.files import TEMPORARY_SUFFIX, open_at_once, write_atomically
+from hgn.system.locks import make_again
 from hgn.system.patience import outlived
 from hgn.system.progress import bar, duration
 from hgn.training import lightning_compat
@@ -265,7 +266,7 @@ def log(trainer: Trainer, run: Path, update: int, values: dict[str, float]) -> N
     record = {"update": update, "time": time.time()} | values
 
     def append() -> None:
-        make_folder(run)  # somebody may have deleted it; checkpoints make theirs again too
+        make_again(run)
         _drop_cut_line(run / METRICS)
         with (run / METRICS).open("a", encoding="utf-8") as file:
             file.write(json.dumps(record) + "\n")

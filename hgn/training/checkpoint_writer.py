@@ -15,6 +15,7 @@ from lightning.fabric.plugins import TorchCheckpointIO
 from lightning_utilities.core.apply_func import apply_to_collection
 
 from hgn.system.files import make_folder, temporary_file, write_atomically
+from hgn.system.locks import make_again
 from hgn.system.patience import outlived
 from hgn.training.checkpoint import LAST_NAMES
 
@@ -87,6 +88,7 @@ def _keep_earlier(folder: Path) -> None:
 
 
 def _write(checkpoint: dict[str, Any], path: Path) -> None:
+    make_again(path.parent.parent)
     make_folder(path.parent)
     content = io.BytesIO()
     with _short_turns():

@@ -1,5 +1,6 @@
 """Locks of runs, data sets and caches: who has one keeps it, and what is no file is refused."""
 
+import fcntl
 import os
 import stat
 from pathlib import Path
@@ -9,7 +10,7 @@ import pytest
 from datagen.pool.locks import ShardLocks
 from hgn.data.shard_cache import CACHE_VARIABLE, CachedShard, cached_shard
 from hgn.schema import ConfigError
-from hgn.system.locks import locked
+from hgn.system.locks import locked, make_again
 
 
 def test_a_deleted_lock_file_locks(tmp_path):
@@ -20,6 +21,32 @@ def test_a_deleted_lock_file_locks(tmp_path):
         with pytest.raises(ConfigError, match="run must be a folder of its own"), locked(path, "run", "no;"):
             pass
     with locked(path, "run", "no;"):
+        pass
+
+
+def test_a_deleted_folder_is_locked_again(tmp_path):
+    """The one that is made in its place, unless another process has made and locked it before."""
+    run = tmp_path / "run"
+    refused = pytest.raises(ConfigError, match="run must be a folder of its own")
+    with locked(run / ".lock", "run", "no;"):
+        for number in range(2):
+            run.rename(tmp_path / str(number))
+            make_again(run)
+            make_again(run)
+            with refused, locked(run / ".lock", "run", "no;"):
+                pass
+            with locked(tmp_path / str(number) / ".lock", "run", "no;"):
+                pass
+        run.rename(tmp_path / "deleted")
+        run.mkdir()
+        other = os.open(run, os.O_RDONLY)
+        fcntl.flock(other, fcntl.LOCK_EX)
+        for _ in range(2):
+            with refused:
+                make_again(run)
+        os.close(other)
+        make_again(run)
+    with locked(run / ".lock", "run", "no;"):
         pass
 
 

@@ -25,6 +25,7 @@ from hgn.config import TrainConfig
 from hgn.data.reader import EpisodeStore, find_episode, first_episodes
 from hgn.data.storage import faults_outlived
 from hgn.schema import ConfigError, from_mapping
+from hgn.system.locks import locked
 from hgn.system.patience import VARIABLE, outlived, without_patience
 from hgn.training import callbacks, checkpoint_writer, monitor
 from hgn.training.checkpoint import LAST_NAMES, read_checkpoint
@@ -320,17 +321,24 @@ def test_a_training_outlives_a_fault(data, tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("every", [{"log_every": 3, "checkpoint_every": 100}, {"checkpoint_every": 2}])
 def test_a_run_whose_folder_is_deleted(data, tmp_path, monkeypatch, every):
-    """The folder is made again, and the training goes on."""
-    run, before = tmp_path / "run", callbacks.LogLines.on_train_batch_end
+    """The folder is made again and locked again, and the training goes on."""
+    run, before, refused = tmp_path / "run", callbacks.LogLines.on_train_batch_end, []
 
     def deleting(lines, trainer, module, *rest):
         if module.update == 6:
             run.rename(tmp_path / "deleted")
         before(lines, trainer, module, *rest)
+        if module.update == 9:
+            with (
+                pytest.raises(ConfigError, match="run must be a folder of its own"),
+                locked(run / ".lock", "run", "no;"),
+            ):
+                pass
+            refused.append(module.update)
 
     monkeypatch.setattr(callbacks.LogLines, "on_train_batch_end", deleting)
     monkeypatch.setenv(VARIABLE, "2")
-    assert train.main(train_mapping(data, run, loggers=[], **every)) == 0
+    assert train.main(train_mapping(data, run, loggers=[], **every)) == 0 and refused
     assert read_checkpoint(run / "checkpoints" / "last.ckpt")["hgn"]["updates"] == metrics(run)[-1]["update"] == 12
 
 
