@@ -8,13 +8,11 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, BinaryIO
 
-import numpy as np
-
 from datagen.pool.plan import ShardRange, episode_key, scene_seed
 from hgn.config import DatagenConfig
 from hgn.data.identity import dataset_identity, identity_hash
 from hgn.data.manifest import EpisodeEntry, ShardEntry
-from hgn.data.reader import read_episode
+from hgn.data.reader import FileBytes, read_episode
 from hgn.data.shard import episode_tar, locate_members, tar_end
 from hgn.data.statistics import episode_statistics, merge_statistics
 from hgn.data.verification import file_sha256
@@ -106,7 +104,7 @@ def inspect_shard(path: Path, shard: ShardRange, config: DatagenConfig) -> Shard
             f"{path} must hold {', '.join(expected)}, got {', '.join(located) or 'nothing'}; delete it and run the "
             "generator again"
         )
-    content = np.memmap(path, dtype=np.uint8, mode="r")
+    content = FileBytes(path)
     entries, statistics = [], []
     for index, (key, members) in zip(shard.indices, located.items(), strict=True):
         episode, attempt = _read_own_episode(path, content, key, members, config)
@@ -131,7 +129,7 @@ def inspect_shard(path: Path, shard: ShardRange, config: DatagenConfig) -> Shard
 
 
 def _read_own_episode(
-    path: Path, content: np.ndarray, key: str, members: dict[str, tuple[int, int]], config: DatagenConfig
+    path: Path, content: FileBytes, key: str, members: dict[str, tuple[int, int]], config: DatagenConfig
 ) -> tuple[Episode, int]:
     episode = read_episode(content, path.name, key, members, scan_positions=True)
     origin = episode.solver.get("dataset")

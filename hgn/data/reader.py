@@ -358,25 +358,38 @@ class _OpenShard:
             return None
 
 
+class FileBytes:
+    """The bytes of a file. A slice is read, not mapped: a map ends the process if the file becomes shorter."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+
+    def __len__(self) -> int:
+        return self._path.stat().st_size
+
+    def __getitem__(self, part: slice) -> np.ndarray:
+        return np.fromfile(self._path, np.uint8, part.stop - part.start, offset=part.start)
+
+
 def read_episode(
-    shard_bytes: np.ndarray,
+    shard_bytes: np.ndarray | FileBytes,
     shard_name: str,
     key: str,
     located: Mapping[str, tuple[int, int]],
     scan_positions: bool = False,
 ) -> Episode:
-    """Decodes an episode from a shard's bytes (flat uint8, mapped or in memory). Positions are a view of them.
+    """Decodes an episode from a shard's bytes (flat uint8). Positions are a view of an array.
 
     `located` gives offset and size of each member. Raises: ConfigError if a member is not within the bytes.
     """
     members: dict[str, bytes | np.ndarray] = {}
     for member, (offset, size) in located.items():
-        if offset < 0 or size < 0 or offset + size > len(shard_bytes):
+        data = shard_bytes[offset : offset + size]
+        if min(offset, size) < 0 or len(data) != size:
             raise ConfigError(
                 f"{shard_name}: {key}.{member} must lie within {len(shard_bytes)} bytes, got offset {offset} and "
                 f"{size} bytes; {REMEDY}"
             )
-        data = shard_bytes[offset : offset + size]
         members[member] = data if member == POSITION_MEMBER else data.tobytes()
     return decode_episode(key, members, scan_positions)
 

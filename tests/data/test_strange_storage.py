@@ -16,6 +16,8 @@ from data.test_http import PlainFiles, answering
 from training.runs import train_mapping
 
 from datagen import upload
+from datagen.pool.plan import ShardRange
+from datagen.pool.shard import inspect_shard
 from hgn import evaluate, export, rollout, train
 from hgn.config import NetworkConfig, TrainingConfig
 from hgn.data import storage
@@ -409,3 +411,13 @@ def test_a_shard_that_is_cut_while_it_is_read(data, monkeypatch, read):
     monkeypatch.setattr(storage, "verify_file", cut_after)
     with pytest.raises(ConfigError, match=r"must have \d+ bytes, got 512"):
         read(store)
+
+
+def test_a_shard_that_is_cut_while_a_generator_checks_it(data, monkeypatch):
+    """It is refused: the check reads a member after another, where a map of the file would end the process."""
+    entry = max(Manifest.load(data.dataset.folder).shards, key=lambda shard: len(shard.episodes))
+    path, part = Path(data.dataset.folder) / entry.name, ShardRange(entry.split, entry.first, entry.stop)
+    assert len(entry.episodes) > 1 and inspect_shard(path, part, data) == entry
+    monkeypatch.setattr("datagen.pool.shard.episode_statistics", lambda _: os.truncate(path, 512))
+    with pytest.raises(ConfigError, match="must lie within 512 bytes"):
+        inspect_shard(path, part, data)
