@@ -11,7 +11,8 @@ Shape legend: N particles, m velocities, S scenes.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -49,6 +50,12 @@ class ParticleState:
     @property
     def scene_count(self) -> int:
         return len(self.domain_S3)
+
+    def selected(self, rows_N: torch.Tensor | slice) -> "ParticleState":
+        """Returns the state with some of the particles. Scenes keep their numbers."""
+        names = ("position_N3", "velocity_NM3", "material_N", "scene_N", "parameter_NP", "rest")
+        some: dict[str, Any] = {name: value[rows_N] for name in names if (value := getattr(self, name)) is not None}
+        return replace(self, **some)
 
 
 class Normaliser(nn.Module):

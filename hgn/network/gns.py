@@ -7,8 +7,6 @@ So a particle's part is multiplied once instead of once for each edge. The funct
 Shape legend: N particles, E directed edges, W width, H hidden.
 """
 
-from dataclasses import replace
-
 import torch
 from torch import nn
 
@@ -61,13 +59,7 @@ class GraphNetworkSimulator(ParticleNetwork):
         """Returns the raw output [N, 3] for a state and its neighbour list."""
         order_N, sender_E, receivers = neighbours.order_N, neighbours.sender_E, neighbours.receivers
         # Inputs are reordered: a gather of latent states would need a sum over rows in the backward pass.
-        state = replace(
-            state,
-            position_N3=state.position_N3[order_N],
-            velocity_NM3=state.velocity_NM3[order_N],
-            material_N=state.material_N[order_N],
-            scene_N=state.scene_N[order_N],
-        )
+        state = state.selected(order_N)
         node_NW = self.encode_particles(state)
         edge_EW = self._edges(state.position_N3, sender_E, receivers.segment_E)
         for i, step in enumerate(self.steps):

@@ -16,7 +16,7 @@ import torch
 from hgn.network.barriers import Barriers
 from hgn.network.features import ParticleState
 from hgn.runtime.divergence import DivergedError, diverged
-from hgn.runtime.simulation import joined, selected
+from hgn.runtime.simulation import joined
 from hgn.runtime.simulator import InitialState, Simulator, initial_states
 from hgn.scene.barrier import Barrier
 from hgn.scene.scene import Scene
@@ -107,7 +107,7 @@ class LiveSimulation:
         """
         self._require_scene(index)
         start, state = InitialState.of(scene), self.state
-        self._put(index, start, selected(state, state.scene_N != index), self._started([start]), restart=True)
+        self._put(index, start, state.selected(state.scene_N != index), self._started([start]), restart=True)
         self.ended.pop(index, None)
 
     def add_particles(
@@ -164,7 +164,7 @@ class LiveSimulation:
         require(count <= most, "position_N3", f"at most {most} particles", count)
         device = self.simulator.device
         start = replace(
-            selected(state, torch.nonzero(mine_N)[:count, 0]),
+            state.selected(torch.nonzero(mine_N)[:count, 0]),
             position_N3=torch.tensor(position_N3, dtype=torch.float32).to(device),
             velocity_NM3=torch.tensor(velocity_NM3, dtype=torch.float32).to(device),
         )
@@ -173,7 +173,7 @@ class LiveSimulation:
             frames[index] = max(0, frames[index] + frame - self.frame)
             state = replace(state, moving=state.moving.at(frames))
         self.simulation.frame = frame
-        self._continue(selected(state, ~mine_N), start)
+        self._continue(state.selected(~mine_N), start)
 
     def _require_scene(self, index: int) -> None:
         last = len(self.scenes) - 1

@@ -107,7 +107,7 @@ class Simulation:
         old, rows_N = self.state, self._rows()
         running_S = torch.tensor([i not in self.ended for i in range(old.scene_count)], device=old.scene_N.device)
         running_A = running_S[new.scene_N]
-        entering = selected(new, running_A)
+        entering = new.selected(running_A)
         if self.ended:
             self._row_N = torch.cat([rows_N, self._row_count + torch.nonzero(running_A).flatten()])
         self._row_count += len(new.position_N3)
@@ -203,7 +203,7 @@ class Simulation:
         block_TN3[-1, ~kept_N] = torch.nan
         whole_TN3 = self._whole(block_TN3)
         self._row_N = self._rows()[kept_N]
-        self._state = selected(state, kept_N)
+        self._state = state.selected(kept_N)
         if bool(kept_N.any()):
             stepper.keep(kept_N)
         else:
@@ -220,16 +220,6 @@ class Simulation:
         whole_TN3 = block_TN3.new_full((len(block_TN3), self._row_count, 3), torch.nan)
         whole_TN3[:, self._row_N] = block_TN3
         return _finished(whole_TN3)
-
-
-@torch.inference_mode()
-def selected(state: ParticleState, selected_N: torch.Tensor) -> ParticleState:
-    """Returns a state with the selected particles. Scenes keep their numbers."""
-    some: dict[str, Any] = {name: getattr(state, name)[selected_N] for name in OF_PARTICLES}
-    for name in ("parameter_NP", "rest"):
-        if (value := getattr(state, name)) is not None:
-            some[name] = value[selected_N]
-    return replace(state, **some)
 
 
 def joined(first: ParticleState, second: ParticleState) -> dict[str, Any]:

@@ -9,7 +9,6 @@ import torch
 
 from hgn.network.features import ParticleState
 from hgn.runtime.divergence import diverged
-from hgn.runtime.simulation import selected
 from hgn.step.reference import advanced
 from hgn.step_config import StepConfig
 
@@ -45,7 +44,7 @@ class TorchStepper:
         return self.state.position_N3, self.state.velocity_NM3
 
     def keep(self, kept_N: torch.Tensor) -> None:
-        self.state = selected(self.state, kept_N)
+        self.state = self.state.selected(kept_N)
 
     def take(self, state: ParticleState) -> bool:
         self.state = state

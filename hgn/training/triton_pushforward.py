@@ -180,16 +180,5 @@ class TritonScenes:
             friction_K = value_KV[:, 3] if value_KV.shape[1] > 3 else None
             normal_K3, size = value_KV[:, :3], self._obstacle_cell_size
             obstacles = ObstacleCells(key_K[order_K], normal_K3, size, friction_K=friction_K)
-        return replace(
-            state,
-            position_N3=state.position_N3[:count],
-            velocity_NM3=state.velocity_NM3[:count],
-            material_N=state.material_N[:count].long(),
-            scene_N=state.scene_N[:count],
-            domain_S3=state.domain_S3[:scenes],
-            gravity_S3=state.gravity_S3[:scenes],
-            obstacles=obstacles,
-            wall_friction_S3=None if state.wall_friction_S3 is None else state.wall_friction_S3[:scenes],
-            parameter_NP=None if state.parameter_NP is None else state.parameter_NP[:count],
-            rest=state.rest and state.rest[:count],
-        )
+        first = state.selected(slice(count))
+        return replace(first, material_N=first.material_N.long(), obstacles=obstacles)

@@ -12,7 +12,7 @@ from hgn.config import NetworkConfig, TrainConfig, TrainingConfig
 from hgn.data.batch import make_batch
 from hgn.network.elastic import STRETCH, RestShape, elastic_columns
 from hgn.runtime.live import LiveSimulation
-from hgn.runtime.simulation import joined, selected
+from hgn.runtime.simulation import joined
 from hgn.runtime.simulator import Simulator
 from hgn.runtime.weights import find_weights, load_weights
 from hgn.scene.episode import Episode
@@ -113,8 +113,8 @@ def test_particles_come_and_go_with_their_neighbours():
     assert not expected_N9[30:55].any() and expected_N9[55:].all()
     for same in (both, replace(one, **joined(one, two))):
         assert torch.equal(found(same), expected_N9)
-    assert torch.equal(found(selected(both, both.scene_N == 1)), found(two))
-    torch.testing.assert_close(found(selected(one, torch.arange(30) % 3 > 0)), found(one)[:20], rtol=0, atol=1e-3)
+    assert torch.equal(found(both.selected(both.scene_N == 1)), found(two))
+    torch.testing.assert_close(found(one.selected(torch.arange(30) % 3 > 0)), found(one)[:20], rtol=0, atol=1e-3)
 
 
 def test_a_simulation_keeps_the_rest_shape():
