@@ -13,6 +13,7 @@ from hgn.command import require_rollout_name, run_command
 from hgn.config import MpmConfig
 from hgn.scene.emission import entry_frames
 from hgn.scene.rollout_file import Rollout, rollout_bytes, write_rollout
+from hgn.scene.scene import Scene
 from hgn.scene.scene_file import find_scene, load_scene, notes_on_files
 from hgn.schema import ConfigError, FrameCount, FrameRate, from_mapping, require_bounds, require_replaceable, to_mapping
 from hgn.system.files import require_place, space_reserved
@@ -47,34 +48,30 @@ def main(mapping: dict[str, Any]) -> int:
     scene = load_scene(file)
     for note in notes_on_files(scene):
         print(note, file=sys.stderr)
-    # Taichi takes seconds to import, so bad input is reported before.
-    from datagen.mpm.solver import SceneFailure, simulate
-
-    space = space_reserved(out, rollout_bytes(config.frames, scene.particle_count))
-    with space, bar("simulating", total=config.frames, initial=1, unit="frame") as progress:
-        (result,) = simulate(
-            [scene],
-            config.mpm,
-            config.frames,
-            config.frame_rate_hz,
-            on_frame=lambda frame: advance_to(progress, frame + 1),
-        )
-        if isinstance(result, SceneFailure):
-            raise ConfigError(f"{file} must be a scene that the solver keeps together, got {result.cause}")
-    rollout = Rollout(
-        position_TN3=result.position_TN3,
-        material_N=scene.material_N,
-        obstacles=scene.obstacles,
-        domain_size=scene.domain_size,
-        frame_rate_hz=config.frame_rate_hz,
-        gravity=scene.gravity,
-        cell_size=scene.cell_size,
-        source={"scene": config.scene, "solver": to_mapping(config.mpm)},
-        entry_frame_N=entry_frames(scene, config.frame_rate_hz) if scene.emits else None,
-    )
+    with space_reserved(out, rollout_bytes(config.frames, scene.particle_count)):
+        rollout = solved(scene, config, file)
     write_rollout(out, rollout)
     print(out)
     return 0
+
+
+def solved(scene: Scene, config: SolveConfig, file: Path) -> Rollout:
+    """Simulates the scene of a file. Raises: ConfigError for a scene that the solver cannot simulate."""
+    # Taichi takes seconds to import, so bad input is reported before.
+    from datagen.mpm.solver import SceneFailure, simulate
+
+    rate_hz = config.frame_rate_hz
+    with bar("simulating", total=config.frames, initial=1, unit="frame") as progress:
+        shown = lambda frame: advance_to(progress, frame + 1)  # noqa: E731
+        (result,) = simulate([scene], config.mpm, config.frames, rate_hz, on_frame=shown)
+    if isinstance(result, SceneFailure):
+        raise ConfigError(f"{file} must be a scene that the solver keeps together, got {result.cause}")
+    return Rollout(
+        result.position_TN3, scene.material_N, scene.obstacles, scene.domain_size, rate_hz,
+        gravity=scene.gravity, cell_size=scene.cell_size,
+        source={"scene": config.scene, "solver": to_mapping(config.mpm)},
+        entry_frame_N=entry_frames(scene, rate_hz) if scene.emits else None,
+    )  # fmt: skip
 
 
 if __name__ == "__main__":

@@ -17,20 +17,18 @@ from typing import Any
 import numpy as np
 
 from hgn.command import run_command
-from hgn.config import USD_ENDINGS, MpmConfig
+from hgn.config import USD_ENDINGS
 from hgn.data.reader import find_episode
 from hgn.render import PLY_ENDING, pictures
 from hgn.render.error_curve import error_curve, position_error
 from hgn.render.exchange import save_rollout
-from hgn.scene.emission import entry_frames
 from hgn.scene.rollout_file import Rollout, read_rollout
 from hgn.scene.scene_file import load_scene, scene_files
-from hgn.schema import ConfigError, OneOrMore, from_mapping, require, require_bounds, require_replaceable, to_mapping
+from hgn.schema import ConfigError, OneOrMore, from_mapping, require, require_bounds, require_replaceable
 from hgn.system.progress import bar
 
 PICTURES = 4  # default number of frames in the PNG
 ANIMATIONS = (".gif", ".webp")
-FRAME_RATE_HZ = 60.0  # frame rate of simulated gallery scenes
 
 
 @dataclass(frozen=True)
@@ -143,20 +141,11 @@ def _corners(rollout: Rollout) -> np.ndarray:
 
 def solver_rollout(file: Path) -> Rollout:
     """Simulates a gallery scene with the solver. Raises: ConfigError where the solver stops."""
-    from tools.solver_rollouts import solver_trials
+    from datagen.solve import SolveConfig, solved
     from tools.stability.gallery import load_case  # loads torch
 
     case = load_case(file.stem, file)
-    scene = case.scenes[0]
-    (trial,) = solver_trials([scene], MpmConfig(), case.measure.frames, FRAME_RATE_HZ)
-    if trial.cause is not None:
-        raise ConfigError(f"{file} must be a scene that the solver keeps together, got {trial.cause}")
-    return Rollout(
-        trial.position_TN3, scene.material_N, scene.obstacles, scene.domain_size, FRAME_RATE_HZ,
-        gravity=scene.gravity, cell_size=scene.cell_size,
-        source={"scene": file.stem, "solver": to_mapping(MpmConfig())},
-        entry_frame_N=entry_frames(scene, FRAME_RATE_HZ) if scene.emits else None,
-    )  # fmt: skip
+    return solved(case.scenes[0], SolveConfig(file.stem, frames=case.measure.frames), file)
 
 
 def weights_rollout(solver: Rollout, file: Path, weights: str) -> Rollout:

@@ -9,6 +9,7 @@ import pytest
 import yaml
 from runtime.stability import still_weights
 
+from datagen.mpm.solver import SceneFailure
 from hgn.config import MpmConfig
 from hgn.runtime.rollouts import RolloutResult
 from hgn.scene.scene_file import find_scene, load_scene, scene_files
@@ -290,18 +291,18 @@ def test_a_scene_is_drawn_beside_the_solver(tmp_path, monkeypatch, capsys):
     path, weights = tiny_file(tmp_path), still_weights(tmp_path)
     monkeypatch.setattr(render, "scene_files", lambda folder: {"tiny": path})
 
-    def falls(scenes, config, frames, rate_hz):
+    def falls(scenes, config, frames, rate_hz, on_frame):
         time_T11 = np.arange(frames)[:, None, None] / rate_hz
         falls_T3 = 0.5 * time_T11**2 * np.array(scenes[0].gravity)
         return [RolloutResult((scenes[0].position_N3 + falls_T3).astype(np.float32))]
 
-    monkeypatch.setattr("tools.solver_rollouts.solver_trials", falls)
+    monkeypatch.setattr("datagen.mpm.solver.simulate", falls)
     options = {"rollout": "tiny", "others": [weights], "out": str(tmp_path / "pictures"), "every": 5, "size": 64}
     assert render.main(options) == 0
     drawn = [Path(line).name for line in capsys.readouterr().out.splitlines()]
     assert drawn == ["tiny.png", "tiny.gif", "tiny_error.png"]
     assert render.main(options | {"others": [], "out": str(tmp_path / "solver.png")}) == 0
-    monkeypatch.setattr("tools.solver_rollouts.solver_trials", lambda *_: [RolloutResult(np.zeros((1, 1, 3)), "burst")])
+    monkeypatch.setattr("datagen.mpm.solver.simulate", lambda *_, **__: [SceneFailure("burst")])
     with pytest.raises(ConfigError, match=r"tiny.yaml must be a scene that the solver keeps together, got burst"):
         render.main(options)
 
