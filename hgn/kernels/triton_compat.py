@@ -141,7 +141,7 @@ def use_target(capability: int) -> None:
 
 class JitMisses:
     """Counts the kernels that this process compiles from now on, and the seconds of their compilation.
-    Kernels compiled ahead (hgn.runtime.precompile) do not count."""
+    Kernels compiled ahead (hgn.training.precompile) do not count."""
 
     def __init__(self) -> None:
         self.count, self.seconds = 0, 0.0

@@ -35,8 +35,8 @@ from hgn.training.errors import format_ratio
 from hgn.training.stop import StopRequest
 
 if TYPE_CHECKING:
-    from hgn.runtime.precompile import Precompilation
     from hgn.training.module import TrainingModule
+    from hgn.training.precompile import Precompilation
 
 
 @dataclass(frozen=True)
@@ -186,14 +186,12 @@ def precompile_kernels(config: TrainConfig, resume: Resume | None, stack: ExitSt
     if backend != "triton" or not on_gpu or not first_on_machine():
         return None
     # imported here, because backend torch does without Triton
-    from hgn.runtime.precompile import Precompilation
-    from hgn.training.precompile import job_of_training
+    from hgn.training.precompile import Precompilation, job_of_training
 
     devices, nodes = layout(training)
     config = replace(config, training=replace(training, precision=precisions[0]))
-    precompilation = Precompilation(job_of_training(config, torch.cuda.get_device_capability(), devices * nodes > 1))
-    stack.callback(precompilation.stop)
-    return precompilation
+    job = job_of_training(config, torch.cuda.get_device_capability(), devices * nodes > 1)
+    return stack.enter_context(Precompilation(job))
 
 
 def settings_of_run(config: TrainConfig) -> dict[str, Any]:

@@ -21,8 +21,8 @@ from ptx import hazards, overwritten_tiles
 from hgn.config import NetworkConfig
 from hgn.kernels import triton_compat
 from hgn.kernels.update.op import UpdateSettings
-from hgn.runtime.precompile_program import PrecompileJob, launches_of
 from hgn.step_config import StepConfig
+from hgn.training.precompile import PrecompileJob, launches_of
 
 
 @triton.jit

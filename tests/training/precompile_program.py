@@ -20,8 +20,8 @@ from hgn.kernels import triton_compat
 from hgn.kernels.triton_compat import noted_launches, preload
 from hgn.kernels.update.op import UpdateSettings
 from hgn.runtime import triton_stepper
-from hgn.runtime.precompile_program import PrecompileJob, compile_part, launches_of
 from hgn.step_config import StepConfig
+from hgn.training.precompile import PrecompileJob, compile_part, launches_of
 
 
 def tell(self, key, signature, device, constants, options, attributes, **_):

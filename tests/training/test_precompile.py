@@ -1,5 +1,6 @@
 """Kernels compiled ahead: processes that compile, what the user hears of them, and that the cache then has it all."""
 
+import json
 import re
 import sys
 
@@ -7,9 +8,8 @@ import pytest
 from processes import run_compiled
 
 from hgn.config import NetworkConfig, SceneConfig, TrainConfig, TrainingConfig
-from hgn.runtime.precompile import Precompilation
-from hgn.runtime.precompile_program import job_of, job_text
-from hgn.training.precompile import job_of_training
+from hgn.schema import from_mapping, to_mapping
+from hgn.training.precompile import Precompilation, PrecompileJob, job_of_training
 
 
 def job(batch_scenes=8):
@@ -24,7 +24,7 @@ def test_the_job_follows_from_the_configuration():
     assert made.precision == "fp16" and made.capability == 90 and made.settings.scenes == 8
     assert made.particles == pytest.approx(8 * 4296, rel=0.05)
     assert made.cells == pytest.approx((8 * 1419, 8 * 231), rel=0.2)  # of a measured batch
-    assert job_of(job_text(made)) == made
+    assert from_mapping(PrecompileJob, json.loads(json.dumps(to_mapping(made)))) == made
 
 
 @pytest.mark.parametrize(

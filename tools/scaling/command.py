@@ -12,7 +12,6 @@ import torch.multiprocessing
 from hgn.config import TrainingConfig
 from hgn.schema import from_mapping, require
 from hgn.system.files import write_json
-from hgn.system.machine import available_cpus
 from tools import report
 from tools.bench.contenders import OBSTACLE_CELL_SIZE
 from tools.report import EXIT_RED, PASS
@@ -52,8 +51,7 @@ def _compile_ahead(config: ScalingConfig, device_type: str, count: int) -> None:
         return
     # Triton, which backend torch does without, is loaded here.
     from hgn.kernels.update.op import UpdateSettings
-    from hgn.runtime.precompile import Precompilation
-    from hgn.runtime.precompile_program import PrecompileJob
+    from hgn.training.precompile import Precompilation, PrecompileJob
 
     training = TrainingConfig(batch_scenes=config.scenes)
     settings = UpdateSettings(config.scenes, training.noise_std, True, OBSTACLE_CELL_SIZE)
@@ -62,7 +60,7 @@ def _compile_ahead(config: ScalingConfig, device_type: str, count: int) -> None:
     major, minor = torch.cuda.get_device_capability()
     capability = 10 * major + minor
     job = PrecompileJob(config.network, settings, config.precision, count > 1, False, particles, cells, capability)
-    with Precompilation(job, max(1, available_cpus() - 2)) as precompilation:
+    with Precompilation(job) as precompilation:
         print(precompilation.wait(), file=sys.stderr)
 
 
