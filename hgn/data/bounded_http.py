@@ -7,6 +7,7 @@ import asyncio
 import re
 import time
 from contextvars import ContextVar
+from typing import Any
 
 import aiohttp
 from aiohttp.connector import Connection
@@ -18,6 +19,7 @@ LARGEST_BYTES = 2**29  # limit for whole files: manifests of the first release, 
 LEAST_BYTES_S, SLOW_S = 4096, 20.0
 SILENCE_S = 60.0  # limit between two pieces, seconds: aiohttp reports no error of a malformed body
 HEAD_S = 150.0  # limit for the heads of an answer and its redirects, seconds: a service may hash a shard first
+MOST_INTERIM = 100  # largest number of answers 1xx before an answer
 _deadline: ContextVar[float] = ContextVar("deadline")  # of the heads in a task; each call of fsspec is a task
 _RANGE = re.compile(r"bytes=(\d+)-(\d+)")
 
@@ -26,11 +28,30 @@ class BoundedResponse(aiohttp.ClientResponse):
     """Reads the body of an answer in pieces, up to its limit, at LEAST_BYTES_S or faster."""
 
     async def start(self, connection: Connection) -> aiohttp.ClientResponse:
-        """Reads the head. Raises: TimeoutError if it takes, with those of redirects to it, longer than HEAD_S."""
+        """Reads the head.
+
+        Raises: TimeoutError if it takes, with those of redirects to it, longer than HEAD_S; ConnectionError for more
+        than MOST_INTERIM answers before it, which aiohttp skips.
+        """
         now = time.monotonic()
         end = _deadline.get(now + HEAD_S)
         _deadline.set(end)
-        return await asyncio.wait_for(super().start(connection), end - now)
+        protocol, heads = connection.protocol, 0
+        assert protocol is not None
+        read = protocol.read
+
+        async def next_head() -> Any:
+            nonlocal heads
+            heads += 1
+            if heads > MOST_INTERIM + 1:
+                raise ConnectionError(f"it sent more than {MOST_INTERIM} interim answers")
+            return await read()
+
+        protocol.read = next_head  # type: ignore[method-assign]
+        try:
+            return await asyncio.wait_for(super().start(connection), end - now)
+        finally:
+            del protocol.read
 
     async def read(self) -> bytes:
         """Returns the body. Raises: StorageError if it is too long; ConnectionError or TimeoutError if too slow."""

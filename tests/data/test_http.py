@@ -13,6 +13,7 @@ import hgn.data.storage
 from hgn.data.reader import EpisodeStore
 from hgn.data.storage import open_storage
 from hgn.schema import ConfigError
+from hgn.system.patience import VARIABLE, UnreachableError
 
 pytestmark = pytest.mark.usefixtures("cache")
 
@@ -51,6 +52,30 @@ def answering(handler):
             yield f"http://127.0.0.1:{server.server_port}"
         finally:
             server.shutdown()
+
+
+@pytest.mark.parametrize("status", ["100 Continue", "103 Early Hints"])
+@pytest.mark.parametrize("count", [3, 10**9])
+def test_interim_answers_are_bounded(monkeypatch, status, count):
+    """A few of them may come before an answer. A server that sends no other does not answer."""
+    monkeypatch.setenv(VARIABLE, "0")
+
+    class Interim(Quiet, http.server.BaseHTTPRequestHandler):
+        def do_GET(self):
+            with contextlib.suppress(ConnectionError):
+                for _ in range(count):
+                    self.wfile.write(f"HTTP/1.1 {status}\r\n\r\n".encode())
+                self.send_response(200)
+                self.end_headers()
+                self.wfile.write(b"{}")
+
+    with answering(Interim) as url:
+        if count == 3:
+            assert open_storage(url).manifest("manifest.json") == b"{}"
+        else:
+            monkeypatch.setattr("hgn.data.bounded_http.HEAD_S", 5.0)
+            with pytest.raises(UnreachableError, match=r"\(at last: it sent more than 100 interim answers\)"):
+                open_storage(url).manifest("manifest.json")
 
 
 @pytest.mark.parametrize("attack", ["gzip bomb", "endless", "long range"])
