@@ -16,10 +16,10 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 33_670,
+    "hgn": 33_691,
     "datagen": 8_984,
     "tools": 6_353,
-    "tests": 34_021,
+    "tests": 34_046,
 }
 SETTINGS = 240  # fields of the dataclasses behind the commands, *Config
 

@@ -27,7 +27,7 @@ from hgn.data.verification import StorageError, verify_file
 from hgn.schema import ConfigError, near_name, require
 from hgn.system.extras import missing_extra
 from hgn.system.files import open_at_once, read_replaced
-from hgn.system.hub import PREFIX, HubPlace, hub_token, is_loopback
+from hgn.system.hub import PREFIX, HubPlace, hub_token, is_loopback, refused_by_proxy
 from hgn.system.patience import UnreachableError, inside, patiently, standard_patience_s
 
 TOKEN_VARIABLE = "HGN_DATASET_TOKEN"
@@ -402,10 +402,7 @@ def _transient(error: Exception, url: str) -> str | None:
     # 416: a proxy has an older, shorter index file
     lasting = isinstance(status, int) and 400 <= status < 500 and status not in (408, 416, 425, 429)
     if lasting and (status == 407 or type(error).__name__ == "ClientHttpProxyError"):
-        raise StorageError(
-            f"{url} must be open to the proxy of http_proxy or https_proxy, got its answer {status}; give it the user "
-            "and password that it needs, or set no_proxy"
-        ) from None
+        raise StorageError(refused_by_proxy(url, status)) from None
     if status in (401, 403) or isinstance(error, PermissionError):
         either = url.startswith("http://") and "http" in getproxies() and _uses_proxies(url)
         raise StorageError(

@@ -75,6 +75,12 @@ def is_loopback(url: str) -> bool:
         return host == "localhost"
 
 
+def refused_by_proxy(name: str, answer: object) -> str:
+    """Returns the message for an answer of a proxy instead of the server."""
+    rule = "open to the proxy of http_proxy or https_proxy"
+    return f"{name} must be {rule}, got its answer {answer}; give it the user and password it needs, or set no_proxy"
+
+
 @functools.lru_cache(maxsize=64)
 def hub_weights(url: str, field: str = "weights", patience_s: float = _PATIENCE_S) -> Path:
     """Downloads a weights file of a repository, the named or the only one, to huggingface_hub's cache.
@@ -139,10 +145,7 @@ def _passing(error: Exception, url: str, field: str) -> str | None:
 
     status = getattr(getattr(error, "response", None), "status_code", None)
     if status == 407 or (type(error).__name__ == "ProxyError" and str(error).startswith("4")):
-        raise ConfigError(
-            f"{field} must be open to the proxy of http_proxy or https_proxy, got its answer {status or error} for "
-            f"{url}; give it the user and password that it needs, or set no_proxy"
-        ) from None
+        raise ConfigError(refused_by_proxy(field, f"{status or error} for {url}")) from None
     refused = isinstance(error, errors.RepositoryNotFoundError) or status in (401, 403)
     if refused:
         remedy = "check the name; a private one needs a token in HF_TOKEN"
