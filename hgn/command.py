@@ -4,7 +4,9 @@ Exit codes: 0 success, 1 machine error (full disk, no permission, existing path)
 device in place of a file or folder), 130 Ctrl-C, 141 closed output pipe (as in `… | head`).
 """
 
+import atexit
 import errno
+import gc
 import importlib
 import io
 import itertools
@@ -70,6 +72,7 @@ def run_command(main: Main | str, config_name: str) -> NoReturn:
     if isinstance(stream := sys.stderr, io.TextIOWrapper) and stream is sys.__stderr__:
         messages = io.BufferedWriter(_Messages(stream.fileno(), "wb", closefd=False))
         sys.stderr = io.TextIOWrapper(messages, stream.encoding, stream.errors, line_buffering=True)
+    atexit.register(gc.freeze)  # otherwise the process searches all modules for garbage before it ends, in 0.4 s
     code: int | str | None
     try:
         try:

@@ -249,6 +249,16 @@ def test_nothing_is_open():
     assert subprocess.run(command, check=False).returncode == 0
 
 
+def test_the_end_of_a_command():
+    """A command ends without a search for garbage, which takes long among PyTorch's modules."""
+    program = "import sys; from hgn.command import run_command\nclass Garbage:\n"
+    program += "  def __init__(self): self.own = self\n  def __del__(self): print('found')\n"
+    program += "sys.argv[1:] = []; run_command(lambda _: Garbage() and None, 'bench')"
+    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[1])}
+    ended = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True, check=True)
+    assert ended.stdout == ""
+
+
 def test_other_broken_pipes_are_faults(monkeypatch):
     """Of a process or a server that the command talks to: nothing is hidden."""
 
