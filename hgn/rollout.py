@@ -18,7 +18,6 @@ import numpy as np
 
 from hgn.command import require_rollout_name, run_command
 from hgn.config import DEFAULT_WEIGHTS, USD_ENDINGS, SceneConfig, SimulatorConfig
-from hgn.data.reader import find_episode
 from hgn.render import PLY_ENDING
 from hgn.scene.distance import fraction_inside
 from hgn.scene.emission import entry_frames
@@ -143,6 +142,8 @@ def rollout(config: RolloutConfig) -> tuple[Path, Rollout]:
             print(note, file=sys.stderr)
         source["scene"] = config.scene or f"random, seed {config.random_seed}"
     else:
+        from hgn.data.reader import find_episode
+
         assert config.episode is not None  # RolloutConfig checks this
         episode = find_episode(config.data, str(config.episode))
         require_frame_rate(simulator.info, episode.frame_rate_hz)

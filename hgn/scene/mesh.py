@@ -11,13 +11,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import trimesh
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from hgn.config import MESH_SUFFIXES, USD_ENDINGS, is_mesh_file
 from hgn.scene.glb import read_glb
-from hgn.scene.polygons import concave_cut, fans, polygons_of_obj, polygons_of_ply, refuse_utf_16
+from hgn.scene.polygons import concave_cut, fans, fans_by_size, polygons_of_obj, polygons_of_ply, refuse_utf_16
 from hgn.scene.rotation import euler_rotation, rotate, round_to_float32
 from hgn.scene.scene import Obstacle
 from hgn.scene.surface import area_vectors, point_tree
@@ -127,7 +126,7 @@ def _read(path: Path, field: str) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _read_polygons(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Reads STL, OBJ, PLY and USD without trimesh, which would shift or drop vertices of many files."""
+    """Reads STL, OBJ, PLY and USD."""
     kind = path.suffix[1:].lower()
     data = b"" if f".{kind}" in USD_ENDINGS else path.read_bytes()
     if kind == "stl":
@@ -139,7 +138,7 @@ def _read_polygons(path: Path) -> tuple[np.ndarray, np.ndarray]:
         return vertex_V3, cut_F3
     if kind == "obj" and len({len(face) for face in faces}) > 1:
         return vertex_V3, fans(faces)
-    return vertex_V3, trimesh.geometry.triangulate_quads(faces).reshape(-1, 3)
+    return vertex_V3, fans_by_size(faces)
 
 
 def _corners_of_stl(data: bytes) -> np.ndarray:

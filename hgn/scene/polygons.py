@@ -209,6 +209,15 @@ def fans(faces: list[np.ndarray]) -> np.ndarray:
     return np.concatenate([face[corners[len(face)]] for face in faces])
 
 
+def fans_by_size(faces: list[np.ndarray]) -> np.ndarray:
+    """Returns the triangles of convex faces: of triangles, the halves of quads, of larger faces, int64 [F, 3]."""
+    triangle_M3, quad_M4 = (
+        np.array([face for face in faces if len(face) == size], np.int64).reshape(-1, size) for size in (3, 4)
+    )
+    larger = [fans([face]) for face in faces if len(face) > 4]
+    return np.concatenate([triangle_M3, quad_M4[:, [0, 1, 2]], quad_M4[:, [2, 3, 0]], *larger])
+
+
 def _concave(vertex_V3: np.ndarray, faces: list[np.ndarray]) -> list[tuple[np.ndarray, np.ndarray]]:
     """Returns numbers [M] and vertices [M, K] of faces that are concave or cross themselves, for each K."""
     sizes, result = np.array([len(face) for face in faces], np.int64), []

@@ -410,7 +410,7 @@ def _obstacle(entry: ObstacleEntry, index: int, folder: Path) -> tuple[Obstacle,
         finite = bool(np.isfinite(bodies[0].vertex_V3).all())
         require(finite, f"obstacles[{index}].position", "in the range of float32", entry.position)
     else:
-        # importing trimesh takes a second
+        # it imports parts of SciPy that few scenes need
         from hgn.scene.mesh import load_bodies
 
         bodies = load_bodies(

@@ -49,7 +49,7 @@ def unit_shape(shape: str) -> tuple[np.ndarray, np.ndarray, bool]:
     """Returns the shape of size 1 about the origin: vertices float64 [V, 3], triangles int32 [F, 3], whether closed."""
     closed = shape in CLOSED_SHAPES
     if is_mesh_file(shape):
-        # importing trimesh takes half a second, and few scenes need it
+        # it imports parts of SciPy that few scenes need
         from hgn.scene.mesh import load_mesh
 
         mesh = load_mesh(shape, "obstacle_shapes")

@@ -7,13 +7,13 @@ from collections.abc import Sequence
 from typing import Literal
 
 import numpy as np
-import trimesh
 import viser
 from scipy.spatial.transform import Rotation
 
 from hgn.render.renderer import BOX_COLOR, BOX_EDGES, OBSTACLE_COLOR, PARTICLE_COLORS, box_corners, to_bytes
 from hgn.scene.material import MATERIALS
 from hgn.scene.scene import Obstacle
+from hgn.scene.shapes import unit_shape
 from hgn.schema import Vector
 
 DIAMETER_IN_SPACINGS = 1.2  # the points overlap a little, so that they look like a body
@@ -57,9 +57,10 @@ class StageView:
         server.initial_camera.position = tuple(self.middle_3 + size * np.array(eye))
         server.initial_camera.look_at = tuple(self.middle_3 + size * np.array(target))
         # The box is seen from inside, so that its near walls are invisible.
-        box = trimesh.creation.box(bounds=(low_3, high_3))
+        vertex_V3, triangle_F3, _ = unit_shape("half_box")  # open at the top
+        box_V3, box_F3 = np.where(vertex_V3 > 0, high_3, low_3), np.vstack([triangle_F3, [(4, 5, 6), (4, 6, 7)]])
         self.room = self.scene.add_mesh_simple(
-            "/room", box.vertices, box.faces, color=ROOM_COLOR, side="back", flat_shading=True, cast_shadow=False
+            "/room", box_V3, box_F3, color=ROOM_COLOR, side="back", flat_shading=True, cast_shadow=False
         )
         edge_E23 = (low_3 + box_corners((1.0, 1.0, 1.0)) * (high_3 - low_3))[np.array(BOX_EDGES)]
         self.scene.add_line_segments("/edges", edge_E23, BOX_COLOR)

@@ -1,4 +1,4 @@
-"""What the runtime loads."""
+"""What the runtime and commands load."""
 
 import json
 import os
@@ -20,13 +20,20 @@ TRAINING_STACK = (
     *("lightning", "pytorch_lightning", "hydra", "omegaconf", "taichi", "webdataset", "tensorboard", "matplotlib"),
     *("hgn.training", "hgn.data", "datagen", *EXTRA_OF),
 )
+# for writing PLY, graphs, and compiled or exported networks
+OTHER_JOBS = ("trimesh", "networkx", "scipy.optimize", "torch._dynamo", "torch.onnx")
 PROGRAM = """
 import json, sys
 import hgn
 assert not {"torch", "numpy"} & sys.modules.keys()
 from hgn import Simulator, load_scene
 
-(path,) = Simulator.load(sys.argv[1]).rollout([load_scene(sys.argv[2])], 3)
+weights, scene = sys.argv[1:]
+(path,) = Simulator.load(weights).rollout([load_scene(scene)], 3)
+
+from hgn.rollout import RolloutConfig, rollout
+
+rollout(RolloutConfig(weights=weights, scene=scene, frames=3, out="path.vtkhdf"))
 print(json.dumps({"shape": path.shape, "modules": sorted(sys.modules)}))
 """
 
@@ -42,24 +49,41 @@ def test_public_names():
 
 
 def test_simulating_loads_no_training_stack(tmp_path):
-    """Loading weights and simulating a scene file imports none of Lightning, Hydra, Taichi, WebDataset, TensorBoard,
-    no package of any extra, nor the project's own training, data and generator."""
+    """Loading weights and simulating a scene file with a mesh, by the API and by hgn.rollout, imports none of
+    Lightning, Hydra, Taichi, WebDataset, TensorBoard, no package of any extra, nor the project's own training, data and
+    generator, nor what only other jobs need."""
     network = network_of(torch.float32)
     weights = tmp_path / "weights.safetensors"
     save_weights(weights, network, WeightsInfo(network.config, 60.0, 1 / 64))
     scene = tmp_path / "scene.yaml"
-    scene.write_text("groups:\n  - {shape: cube, size: 0.05, position: [0.5, 0.5, 0.5], material: water}\n")
+    (tmp_path / "floor.obj").write_text("v 0 0 0\nv 0 0 1\nv 1 0 1\nv 1 0 0\nf 1 2 3 4\n")
+    scene.write_text(
+        "obstacles:\n  - {mesh: floor.obj, scale: 0.2, position: [0.4, 0.3, 0.4]}\n"
+        "groups:\n  - {shape: cube, size: 0.05, position: [0.5, 0.5, 0.5], material: water}\n"
+    )
+    report = json.loads(printed_by(PROGRAM, str(weights), str(scene), folder=tmp_path))
+    assert report["shape"][0] == 3 and report["shape"][1] > 100
+    loaded = set(report["modules"])
+    assert "hgn.runtime.simulator" in loaded
+    assert [name for name in (*TRAINING_STACK, *OTHER_JOBS) if name in loaded] == []
+
+
+def test_pages_load_no_meshes(tmp_path):
+    """hgn.play imports no package that only other jobs need."""
+    pytest.importorskip("viser", reason="viser is not installed: pip install 'hgn[play]'")
+    loaded = printed_by("import sys, hgn.viewer.page; print(sorted(sys.modules))", folder=tmp_path)
+    assert [name for name in OTHER_JOBS if f"'{name}'" in loaded] == []
+
+
+def printed_by(program, *arguments, folder):
+    """What a program prints that ends well, without warnings."""
     process = subprocess.run(
-        [sys.executable, "-W", "error", "-c", PROGRAM, str(weights), str(scene)],
-        cwd=tmp_path,
+        [sys.executable, "-W", "error", "-c", program, *arguments],
+        cwd=folder,
         env=os.environ | {"PYTHONPATH": str(ROOT)},
         capture_output=True,
         text=True,
         timeout=PATIENCE_S,
     )
     assert process.returncode == 0, process.stderr
-    report = json.loads(process.stdout)
-    assert report["shape"][0] == 3 and report["shape"][1] > 100
-    loaded = set(report["modules"])
-    assert "hgn.runtime.simulator" in loaded
-    assert [name for name in TRAINING_STACK if name in loaded] == []
+    return process.stdout

@@ -8,7 +8,7 @@ import trimesh
 
 from hgn.scene.distance import contains
 from hgn.scene.mesh import load_bodies, load_mesh
-from hgn.scene.polygons import concave_cut
+from hgn.scene.polygons import concave_cut, fans_by_size
 from hgn.scene.scene_file import load_scene, notes_on_files
 from hgn.schema import ConfigError
 
@@ -399,3 +399,12 @@ def test_binary_stl_with_more_behind(tmp_path):
         for tail in (b"\0", b"facets of another kind", bytes(100)):
             (tmp_path / "a.stl").write_bytes(head + data[80:] + tail)
             assert load_mesh(tmp_path / "a.stl").closed
+
+
+@pytest.mark.parametrize("sizes", [(3,), (4,), (3, 4), (3, 4, 5, 7), (6,), (2, 3)])
+def test_order_of_triangles(sizes):
+    """Convex polygons become triangles in the order of trimesh. Samples of obstacles depend on the order."""
+    rng = np.random.default_rng(0)
+    faces = [rng.integers(0, 99, rng.choice(sizes)) for _ in range(40)]
+    assert np.array_equal(fans_by_size(faces), trimesh.geometry.triangulate_quads(faces))
+    assert fans_by_size([]).shape == (0, 3)
