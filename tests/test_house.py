@@ -16,10 +16,10 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("hgn", "datagen", "tools")
 
 LINES = {  # of Python, in tracked files
-    "hgn": 33_691,
+    "hgn": 33_714,
     "datagen": 8_984,
     "tools": 6_353,
-    "tests": 34_046,
+    "tests": 34_099,
 }
 SETTINGS = 240  # fields of the dataclasses behind the commands, *Config
 

@@ -5,13 +5,25 @@
 
 import logging
 import os
+import sys
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
+# Lightning needs two classes of torchmetrics for metrics, which this project logs itself. torchmetrics imports SciPy's
+# signal processing and Matplotlib, which takes as long as all of PyTorch. Import this module before Lightning.
+if "torchmetrics" not in sys.modules:
+    sys.modules["torchmetrics"] = metrics = ModuleType("torchmetrics")
+    metrics.__dict__.update(__version__="1.0.0", Metric=type("Metric", (), {}), MetricCollection=type("", (), {}))
+    import lightning.pytorch  # noqa: F401
+
+    del sys.modules["torchmetrics"]  # a logger may need all of it
+
 from lightning.pytorch import Trainer
+from lightning.pytorch import seed_everything as seed_everything
 from lightning.pytorch.plugins.environments import (
     ClusterEnvironment,
     LightningEnvironment,

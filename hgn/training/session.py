@@ -56,8 +56,6 @@ def train_network(config: TrainConfig, start: Start, stop: StopRequest, publishe
     `published` reports how many episodes are published. Every rank calls this function.
     """
     # Importing Lightning takes seconds. It is imported after the wait for data, and by no other command.
-    from lightning.pytorch import Trainer, seed_everything
-
     from hgn.training import lightning_compat
     from hgn.training.callbacks import Checkpoints, LogLines, SameWeights, Stopper
     from hgn.training.checkpoint_writer import CheckpointWriter
@@ -80,7 +78,7 @@ def train_network(config: TrainConfig, start: Start, stop: StopRequest, publishe
             )
     keep_to_quota()
     set_matmul_precision(precisions[0])
-    seed_everything(training.seed, verbose=False)
+    lightning_compat.seed_everything(training.seed, verbose=False)
     module = _module(config, start, backend, precisions)
     if backend == "triton":
         reader: ChunkReader = EpisodeReader(store, config.network, training, config.step)
@@ -97,7 +95,7 @@ def train_network(config: TrainConfig, start: Start, stop: StopRequest, publishe
     lines = LogLines(run, monitor.last, feed, published)
     final = FinalMetrics(settings_of_run(config), monitor.last, stop)
     watch = RankWatch(run)
-    trainer = Trainer(
+    trainer = lightning_compat.Trainer(
         accelerator=training.device,
         devices=devices,
         num_nodes=nodes,

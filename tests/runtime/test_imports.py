@@ -68,6 +68,16 @@ def test_simulating_loads_no_training_stack(tmp_path):
     assert [name for name in (*TRAINING_STACK, *OTHER_JOBS) if name in loaded] == []
 
 
+def test_lightning_without_metrics(tmp_path):
+    """A training imports Lightning without torchmetrics, SciPy and Matplotlib. Others can still import torchmetrics."""
+    program = "import sys; from hgn.training.lightning_compat import Trainer; print(sorted(sys.modules), end='|')"
+    loaded, other = printed_by(f"{program}; import torchmetrics; print(torchmetrics.__file__)", folder=tmp_path).split(
+        "|"
+    )
+    assert "'lightning.pytorch'" in loaded and other.strip().endswith("torchmetrics/__init__.py")
+    assert [name for name in ("torchmetrics", "scipy.signal", "matplotlib") if f"'{name}'" in loaded] == []
+
+
 def test_pages_load_no_meshes(tmp_path):
     """hgn.play imports no package that only other jobs need."""
     pytest.importorskip("viser", reason="viser is not installed: pip install 'hgn[play]'")
