@@ -19,7 +19,7 @@ LINES = {  # of Python, in tracked files
     "hgn": 33_714,
     "datagen": 8_984,
     "tools": 6_353,
-    "tests": 34_099,
+    "tests": 34_120,
 }
 SETTINGS = 240  # fields of the dataclasses behind the commands, *Config
 

@@ -342,6 +342,27 @@ def test_a_run_whose_folder_is_deleted(data, tmp_path, monkeypatch, every):
     assert read_checkpoint(run / "checkpoints" / "last.ckpt")["hgn"]["updates"] == metrics(run)[-1]["update"] == 12
 
 
+@pytest.mark.parametrize("every", [{"log_every": 3, "checkpoint_every": 100}, {"checkpoint_every": 2}])
+def test_a_run_whose_folder_is_another_trainings(data, tmp_path, monkeypatch, every):
+    """Another training begins in the place of the deleted folder: the first one ends, and writes nothing there."""
+    run, before, other = tmp_path / "run", callbacks.LogLines.on_train_batch_end, []
+
+    def deleting(lines, trainer, module, *rest):
+        if module.update == 6:
+            run.rename(tmp_path / "deleted")
+            run.mkdir()
+            other.append(os.open(run, os.O_RDONLY))
+            fcntl.flock(other[0], fcntl.LOCK_EX)
+        before(lines, trainer, module, *rest)
+
+    monkeypatch.setattr(callbacks.LogLines, "on_train_batch_end", deleting)
+    monkeypatch.setenv(VARIABLE, "2")
+    with pytest.raises(ConfigError, match="another training is in it"):
+        train.main(train_mapping(data, run, loggers=[], **every))
+    assert {path.name for path in run.iterdir()} <= {".lock"}
+    os.close(*other)
+
+
 def test_a_run_in_a_mounted_bucket(data, tmp_path, monkeypatch):
     """Mounted object stores may have no hard links, no locks and no truncation. A run does without, and a line of
     metrics that was cut is removed as ever."""
