@@ -6,7 +6,6 @@ Shape legend: P points, F triangles.
 import math
 
 import numpy as np
-from scipy import ndimage
 
 from datagen.mpm.sweep import ON_TRIANGLE, near_pairs
 from hgn.scene.distance import closest_points, contains, cross, dot, square
@@ -198,6 +197,8 @@ def closed_samples(
 
     deep = np.flatnonzero(inside.ravel() & ~near.ravel())
     if len(deep):  # the direction out leads to the surface point that is closest to the nearest node of the band
+        from scipy import ndimage
+
         feet = np.zeros((box.count, 3))
         feet[np.flatnonzero(near.ravel())] = foot
         nearest = ndimage.distance_transform_edt(~near, return_distances=False, return_indices=True)
@@ -215,6 +216,8 @@ def _inside(close: np.ndarray, box: Box, obstacle: Obstacle, cell_size: float) -
 
     No surface lies between neighbouring nodes that are farther away, so one test for each connected region is enough.
     """
+    from scipy import ndimage  # imported here, because it takes 0.2 s, and solvers need it only for moving bodies
+
     apart, inside = np.ones(box.shape, bool), np.zeros(box.shape, bool)
     apart.ravel()[close] = False
     inside.ravel()[close] = contains(box.node(close) * cell_size, obstacle)
